@@ -1,0 +1,1 @@
+"""The machine: clips in, committed samples out, exactly once."""

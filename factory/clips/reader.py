@@ -1,0 +1,67 @@
+"""What a reader is, and how a clip is named before anything of it is opened."""
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from tasks.world.clip import Clip
+
+
+class BadClip(Exception):
+    """The input is broken: says which file, which field, and how to mend it."""
+
+    def __init__(self, file: str, field: str, problem: str) -> None:
+        super().__init__(f"{file}: {field}: {problem}")
+        self.file, self.field, self.problem = file, field, problem
+
+    def __reduce__(self) -> tuple[type["BadClip"], tuple[str, str, str]]:
+        return BadClip, (self.file, self.field, self.problem)
+
+
+@dataclass(frozen=True, order=True)
+class ClipRef:
+    """Names one window of one log."""
+
+    dataset: str
+    log_id: str
+    start_ms: int  # start of the window, milliseconds since the log's first annotated instant
+    window: str = "1.5+8.0s@10Hz"
+
+    @property
+    def clip_id(self) -> str:
+        """16 hex digits, known without opening a sensor file."""
+        key = "\x1f".join((self.dataset, self.log_id, str(self.start_ms), self.window))
+        return hashlib.sha256(key.encode()).hexdigest()[:16]
+
+
+def split_of(log_id: str, val_percent: int = 10, test_percent: int = 10) -> str:
+    """train, val or test by the hash of the log id, so that windows of one log never part."""
+    bucket = int(hashlib.sha256(log_id.encode()).hexdigest()[:8], 16) % 100
+    if bucket < test_percent:
+        return "test"
+    return "val" if bucket < test_percent + val_percent else "train"
+
+
+@dataclass(frozen=True)
+class ClipIndex:
+    """What a root holds: windows to read, windows filtered (reason -> count), logs skipped or broken."""
+
+    refs: tuple[ClipRef, ...]
+    dropped: Mapping[str, int] = field(default_factory=dict)  # windows filtered, by reason
+    skipped_logs: Mapping[str, str] = field(default_factory=dict)  # log id -> reason (e.g. no annotations)
+    broken: Mapping[ClipRef, str] = field(default_factory=dict)  # unreadable logs: become failed outcomes
+
+
+class ClipReader(Protocol):
+    """Reads one data set. Readers from a user's own package satisfy it too."""
+
+    name: str
+
+    def index(self) -> ClipIndex:
+        """All windows under the root, in a stable order. Raises ValueError where the root is not this data set."""
+        ...
+
+    def read(self, ref: ClipRef) -> Clip:
+        """The validated clip. Raises BadClip."""
+        ...

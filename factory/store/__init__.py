@@ -1,0 +1,1 @@
+"""Where samples, outcomes and candidates live."""

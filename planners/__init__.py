@@ -1,0 +1,1 @@
+"""The consumer: planners, co-training, evaluation. Samples are read through factory.store.reader."""

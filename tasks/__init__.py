@@ -1,0 +1,1 @@
+"""The science: pure stages. Knows no Ray, no files, no configuration library; importing it needs numpy only."""

@@ -1,0 +1,1 @@
+"""Who drives T+H..T+2H: one file is one expert."""

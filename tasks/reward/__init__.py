@@ -1,0 +1,1 @@
+"""EPDMS and its sub-scores, rule by rule (METRIC.md)."""

@@ -1,0 +1,1 @@
+"""Ego tracking (LQR on a kinematic bicycle) and reactive traffic (IDM)."""

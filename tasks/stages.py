@@ -1,0 +1,45 @@
+"""The stages, on one screen: what the graph, the metrics, the funnel and the docs are drawn from.
+
+`clip -> perturb -> [ rollout -> expert -> rollout -> reward -> render -> write ] per attempt`
+A stage is a pure function `stage(inputs, settings, rng) -> output | Rejected`.
+"""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage of the graph."""
+
+    name: str
+    version: int  # raised by hand whenever the stage's output changes; a golden test watches
+    fan_out: str  # "clip" once per clip, "attempt" once per attempt
+    reasons: tuple[str, ...]  # every reason it may reject with
+    wants_gpu: bool = False
+
+
+@dataclass(frozen=True)
+class Rejected:
+    """A drop with its reason: data, not an error."""
+
+    stage: str
+    reason: str
+    detail: str = ""
+
+
+SUBSCORES = ("nc", "dac", "ddc", "tlc", "ep", "ttc", "lk", "hc", "ec")  # EPDMS, METRIC.md section 2
+
+STAGES: tuple[Stage, ...] = (
+    Stage("clip", 1, "clip", ("ego_standing", "broken_tracks")),
+    Stage("perturb", 1, "clip", ("no_gated_candidate", "no_good_candidate")),
+    Stage("rollout", 1, "attempt", ("ego_unstable",)),
+    Stage("expert", 1, "attempt", ("no_plan",)),
+    Stage("reward", 1, "attempt", SUBSCORES),
+    Stage("render", 1, "attempt", ("psnr", "no_asset")),
+    Stage("write", 1, "attempt", ()),
+)
+
+
+def stage_versions() -> dict[str, int]:
+    """Name -> version, as stored beside every row."""
+    return {stage.name: stage.version for stage in STAGES}

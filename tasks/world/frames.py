@@ -1,0 +1,50 @@
+"""SE(2) poses: arrays whose last axis is x [m], y [m], heading [rad]."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def wrap_angle(angle: Array) -> Array:
+    """Angles [rad] wrapped to [-pi, pi), any shape."""
+    return (np.asarray(angle) + np.pi) % (2.0 * np.pi) - np.pi
+
+
+def to_world(origin: Array, local: Array) -> Array:
+    """Poses (..., 3) given in the frame of `origin` (3,), as world poses (..., 3); heading by atan2."""
+    c, s = np.cos(origin[2]), np.sin(origin[2])
+    cl, sl = np.cos(local[..., 2]), np.sin(local[..., 2])
+    return np.stack(
+        [
+            c * local[..., 0] - s * local[..., 1] + origin[0],
+            s * local[..., 0] + c * local[..., 1] + origin[1],
+            np.arctan2(s * cl + c * sl, c * cl - s * sl),
+        ],
+        axis=-1,
+    )
+
+
+def to_local(origin: Array, world: Array) -> Array:
+    """World poses (..., 3) expressed in the frame of `origin` (3,); heading wrapped to [-pi, pi)."""
+    c, s = np.cos(origin[2]), np.sin(origin[2])
+    dx, dy = world[..., 0] - origin[0], world[..., 1] - origin[1]
+    return np.stack([c * dx + s * dy, -s * dx + c * dy, wrap_angle(world[..., 2] - origin[2])], axis=-1)
+
+
+def points_to_local(origin: Array, points: Array) -> Array:
+    """World points (..., 2) expressed in the frame of the pose `origin` (3,)."""
+    c, s = np.cos(origin[2]), np.sin(origin[2])
+    dx, dy = points[..., 0] - origin[0], points[..., 1] - origin[1]
+    return np.stack([c * dx + s * dy, -s * dx + c * dy], axis=-1)
+
+
+def box_corners(boxes: Array) -> Array:
+    """Corners (..., 4, 2) of boxes (..., 5) = centre x, y, heading, length, width; order FL, RL, RR, FR."""
+    c, s = np.cos(boxes[..., 2]), np.sin(boxes[..., 2])
+    half_length, half_width = boxes[..., 3] / 2.0, boxes[..., 4] / 2.0
+    along = np.stack([half_length, -half_length, -half_length, half_length], axis=-1)
+    across = np.stack([half_width, half_width, -half_width, -half_width], axis=-1)
+    x = boxes[..., 0, None] + c[..., None] * along - s[..., None] * across
+    y = boxes[..., 1, None] + s[..., None] * along + c[..., None] * across
+    return np.stack([x, y], axis=-1)

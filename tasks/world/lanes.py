@@ -1,0 +1,91 @@
+"""The vector map around a clip: lanes with their graph, drivable areas, crossings, lights."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum, StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Lane:
+    """One lane segment; polylines run in driving direction, world frame, metres."""
+
+    lane_id: str
+    ring: NDArray[np.float64]  # (M, 2) closed exterior ring of the lane polygon
+    centerline: NDArray[np.float64]  # (P, 3) x, y, heading [rad]
+    is_intersection: bool  # True: a lane connector inside a junction
+    drives_cars: bool  # VEHICLE and BUS lanes; bicycle lanes are kept for drawing only
+    successors: tuple[str, ...] = ()
+    predecessors: tuple[str, ...] = ()
+    left_neighbor: str | None = None  # may name a lane outside the map, or one of the opposite direction
+    right_neighbor: str | None = None
+    speed_limit_mps: float | None = None
+    left_boundary: NDArray[np.float64] | None = None  # (B, 3) x, y, z; None where the source has none
+    right_boundary: NDArray[np.float64] | None = None
+    left_mark: str = "NONE"  # AV2 lane mark type
+    right_mark: str = "NONE"
+
+    @property
+    def length_m(self) -> float:
+        return float(np.hypot(*np.diff(self.centerline[:, :2], axis=0).T).sum())
+
+
+class MapLayer(StrEnum):
+    """Polygon layers the reward looks at (METRIC.md 2a)."""
+
+    LANE = "LANE"
+    LANE_CONNECTOR = "LANE_CONNECTOR"
+    INTERSECTION = "INTERSECTION"
+    DRIVABLE_AREA = "DRIVABLE_AREA"
+    ROADBLOCK = "ROADBLOCK"
+    CARPARK_AREA = "CARPARK_AREA"
+
+
+@dataclass(frozen=True)
+class MapPolygon:
+    """One polygon of the drivable map."""
+
+    token: str  # lane id, "int_" + lane id, "da_" + area id
+    layer: MapLayer
+    ring: NDArray[np.float64]  # (M, 2) closed exterior ring
+    holes: tuple[NDArray[np.float64], ...] = ()  # closed rings
+
+
+@dataclass(frozen=True)
+class RoadMap:
+    """The map a log carries, in file order."""
+
+    lanes: Mapping[str, Lane]
+    drivable_areas: tuple[MapPolygon, ...]
+    crossings: tuple[NDArray[np.float64], ...] = ()  # closed rings (M, 2)
+    roadblock_of: Mapping[str, str] = field(default_factory=dict)  # lane id -> roadblock (connector) id
+    location: str = ""
+
+
+@dataclass(frozen=True)
+class Route:
+    """Where the ego is going (METRIC.md section 0, route of a log that has no planner's route)."""
+
+    lane_path: tuple[str, ...]  # lanes driven, in order
+    roadblock_ids: tuple[str, ...]  # roadblocks passed, in order
+    lane_ids: frozenset[str]  # all lanes of the roadblocks passed ("on route")
+
+
+class LightState(IntEnum):
+    UNKNOWN = 0
+    GREEN = 1
+    YELLOW = 2
+    RED = 3
+
+
+@dataclass(frozen=True)
+class TrafficLights:
+    """State of the light that governs each listed lane connector, per 0.1 s step of the clip."""
+
+    lane_ids: tuple[str, ...] = ()  # (L,)
+    states: NDArray[np.int8] = field(default_factory=lambda: np.zeros((0, 0), np.int8))  # (S, L) LightState
+
+
+NO_LIGHTS = TrafficLights()
