@@ -1,0 +1,38 @@
+# Everything installs into .venv beside this file; PYTHON picks the interpreter it is made from.
+PYTHON ?= python3
+VENV   := .venv
+PY     := $(VENV)/bin/python
+DEMO   := runs/demo
+
+.PHONY: install demo test unit lint format bench clean
+
+install: $(VENV)/.installed
+
+# torch first, pinned, so that nothing pulls the multi-gigabyte CUDA build in its place.
+$(VENV)/.installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(PY) -m pip install -q --upgrade pip
+	$(PY) -m pip install -q -c constraints.txt torch==2.13.0
+	$(PY) -m pip install -q -c constraints.txt -e ".[dev]"
+	touch $@
+
+demo: install
+	$(PY) -m factory.run preset=demo out=$(DEMO)
+
+test: install
+	$(PY) -m pytest -n 2 --dist loadfile
+
+lint: install
+	$(PY) -m ruff check .
+	$(PY) -m ruff format --check .
+	$(PY) -m mypy
+
+format: install
+	$(PY) -m ruff format .
+	$(PY) -m ruff check --fix .
+
+bench: install
+	$(PY) -m tests.bench
+
+clean:
+	rm -rf $(VENV) runs build *.egg-info
