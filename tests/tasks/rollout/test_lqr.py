@@ -1,0 +1,88 @@
+"""The tracker follows plans a car can drive, whatever the frame, and gives each plan the same states in any batch."""
+
+import numpy as np
+import pytest
+
+from tasks.rollout.lqr import curvature_profile, track, velocity_profile
+from tasks.world.frames import to_world, wrap_angle
+from tasks.world.vehicle import AX, HEADING, STEERING, VX, YAW_RATE, X, Y
+
+TIMES_S = 0.1 * np.arange(1, 41)
+
+
+def ego_at(x: float, y: float, heading: float, speed: float) -> np.ndarray:
+    state = np.zeros(11)
+    state[[X, Y, HEADING, VX]] = x, y, heading, speed
+    return state
+
+
+def straight(speed: float) -> np.ndarray:
+    return np.stack([speed * TIMES_S, np.zeros(40), np.zeros(40)], axis=-1)
+
+
+def arc(speed: float, curvature: float) -> np.ndarray:
+    turn = speed * curvature * TIMES_S
+    return np.stack([np.sin(turn) / curvature, (1.0 - np.cos(turn)) / curvature, turn], axis=-1)
+
+
+def test_straight_driving_at_constant_speed_stays_on_the_plan():
+    states = track(ego_at(0.0, 0.0, 0.0, 8.0), straight(8.0)[None])
+    np.testing.assert_allclose(states[0, 1:, :2], straight(8.0)[:, :2], atol=0.01)
+    np.testing.assert_allclose(states[0, :, VX], 8.0, atol=0.01)
+    np.testing.assert_allclose(states[0, :, [STEERING, YAW_RATE, HEADING]], 0.0, atol=1e-12)
+
+
+def test_a_standing_ego_with_a_standing_plan_does_not_move():
+    states = track(ego_at(5.0, -3.0, 1.2, 0.0), np.tile([5.0, -3.0, 1.2], (1, 40, 1)))
+    np.testing.assert_allclose(states[0, :, :3], np.tile([5.0, -3.0, 1.2], (41, 1)), atol=1e-12)
+
+
+def test_a_plan_to_stand_still_brings_the_ego_to_rest():
+    brake = np.minimum(TIMES_S, 2.0)
+    plan = np.stack([6.0 * brake - 1.5 * brake**2, np.zeros(40), np.zeros(40)], axis=-1)
+    states = track(ego_at(0.0, 0.0, 0.0, 6.0), plan[None])
+    assert abs(states[0, -1, VX]) < 0.3
+    assert states[0, :, AX].min() > -6.0
+
+
+def test_profiles_of_a_steady_arc_are_its_speed_and_curvature():
+    reference = np.concatenate([np.zeros((1, 3)), arc(6.0, 0.05)])[None]
+    velocity = velocity_profile(reference)
+    np.testing.assert_allclose(velocity, 6.0, rtol=0.02)  # the acceleration penalty and the chord bend it slightly
+    np.testing.assert_allclose(curvature_profile(reference, velocity), 0.05, rtol=0.02)
+
+
+def test_an_arc_is_followed_within_half_a_metre_and_steers_to_its_curvature():
+    start = ego_at(0.0, 0.0, 0.0, 6.0)
+    start[STEERING] = np.arctan(3.089 * 0.05)
+    states = track(start, arc(6.0, 0.05)[None])
+    assert np.hypot(*(states[0, 1:, :2] - arc(6.0, 0.05)[:, :2]).T).max() < 0.5
+    np.testing.assert_allclose(np.tan(states[0, -1, STEERING]) / 3.089, 0.05, rtol=0.1)
+
+
+def test_shifting_and_rotating_the_world_moves_the_states_with_it():
+    rng = np.random.default_rng(0)
+    plans = arc(7.0, 0.03)[None] + 0.2 * rng.normal(size=(5, 1, 3))
+    here = track(ego_at(0.0, 0.0, 0.0, 7.0), plans)
+    origin = np.array([120.0, -45.0, 2.9])
+    there = track(ego_at(*origin, 7.0), to_world(origin, plans))
+    moved = to_world(origin, here[..., :3])
+    np.testing.assert_allclose(there[..., :2], moved[..., :2], atol=1e-8)
+    np.testing.assert_allclose(wrap_angle(there[..., 2] - moved[..., 2]), 0.0, atol=1e-8)
+    np.testing.assert_allclose(there[..., 3:], here[..., 3:], atol=1e-6)
+
+
+def test_a_plan_gives_the_same_bits_alone_and_in_a_batch():
+    rng = np.random.default_rng(1)
+    plans = arc(9.0, -0.04)[None] + 0.3 * rng.normal(size=(37, 1, 3))
+    start = ego_at(3.0, 4.0, 0.5, 9.0)
+    together = track(start, plans)
+    for k in (0, 17, 36):
+        assert np.array_equal(track(start, plans[k : k + 1])[0], together[k])
+
+
+def test_wrong_shapes_and_nan_poses_are_refused():
+    with pytest.raises(ValueError, match="poses"):
+        track(np.zeros(11), np.zeros((40, 3)))
+    with pytest.raises(ValueError, match="finite"):
+        track(np.zeros(11), np.full((1, 40, 3), np.nan))
