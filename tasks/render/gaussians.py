@@ -1,0 +1,170 @@
+"""Anisotropic 3-D Gaussians: what a rendered scene is made of."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """N Gaussians in one frame (a block's or a vehicle box's)."""
+
+    means: F32  # (N, 3) [m]
+    quats: F32  # (N, 4) w, x, y, z; unit; columns of the rotation are the axes of the scales
+    log_scales: F32  # (N, 3) natural log of the standard deviations [m]
+    opacities: F32  # (N,) in (0, 1)
+    colours: F32  # (N, 3) rgb in [0, 1], the same from every side (SH degree 0)
+
+    def __post_init__(self) -> None:
+        n = len(self.means)
+        shapes = (self.means.shape, self.quats.shape, self.log_scales.shape, self.opacities.shape, self.colours.shape)
+        if shapes != ((n, 3), (n, 4), (n, 3), (n,), (n, 3)):
+            raise ValueError(f"Gaussians: shapes do not agree: {shapes}")
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def take(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> "Gaussians":
+        """The Gaussians at `rows` (indices or mask)."""
+        return Gaussians(
+            self.means[rows], self.quats[rows], self.log_scales[rows], self.opacities[rows], self.colours[rows]
+        )
+
+
+EMPTY = Gaussians(
+    np.zeros((0, 3), np.float32),
+    np.zeros((0, 4), np.float32),
+    np.zeros((0, 3), np.float32),
+    np.zeros(0, np.float32),
+    np.zeros((0, 3), np.float32),
+)
+
+
+def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
+    """All parts as one, in order; `EMPTY` for no parts."""
+    if not parts:
+        return EMPTY
+    return Gaussians(
+        np.concatenate([p.means for p in parts]),
+        np.concatenate([p.quats for p in parts]),
+        np.concatenate([p.log_scales for p in parts]),
+        np.concatenate([p.opacities for p in parts]),
+        np.concatenate([p.colours for p in parts]),
+    )
+
+
+def moved(gaussians: Gaussians, target_from_source: F64) -> Gaussians:
+    """The same Gaussians in another frame; `target_from_source` (4, 4) is rigid."""
+    rotation = target_from_source[:3, :3]
+    means = gaussians.means @ rotation.T + target_from_source[:3, 3]
+    quats = quat_multiply(quats_of(rotation[None])[0], gaussians.quats)
+    return Gaussians(
+        means.astype(np.float32),
+        quats.astype(np.float32),
+        gaussians.log_scales,
+        gaussians.opacities,
+        gaussians.colours,
+    )
+
+
+def mirrored(gaussians: Gaussians) -> Gaussians:
+    """Reflected at the plane y = 0 (the unseen side of a car from its seen one)."""
+    # A reflection turns R into F R with determinant -1; the covariance is the same for F R F, a rotation,
+    # whose quaternion is (w, -x, y, -z).
+    flip = np.array([1.0, -1.0, 1.0, -1.0], np.float32)
+    return Gaussians(
+        gaussians.means * np.array([1.0, -1.0, 1.0], np.float32),
+        gaussians.quats * flip,
+        gaussians.log_scales,
+        gaussians.opacities,
+        gaussians.colours,
+    )
+
+
+def quat_multiply(left: NDArray[np.floating], right: NDArray[np.floating]) -> F64:
+    """Hamilton product of quaternions (..., 4) w, x, y, z."""
+    lw, lx, ly, lz = np.moveaxis(np.asarray(left, np.float64), -1, 0)
+    rw, rx, ry, rz = np.moveaxis(np.asarray(right, np.float64), -1, 0)
+    return np.stack(
+        [
+            lw * rw - lx * rx - ly * ry - lz * rz,
+            lw * rx + lx * rw + ly * rz - lz * ry,
+            lw * ry - lx * rz + ly * rw + lz * rx,
+            lw * rz + lx * ry - ly * rx + lz * rw,
+        ],
+        axis=-1,
+    )
+
+
+def quats_of(rotations: F64) -> F64:
+    """Unit quaternions (N, 4) of rotation matrices (N, 3, 3)."""
+    m = rotations
+    # Each candidate is 4 * (largest component) * q; the one with the largest component is well conditioned.
+    candidates = np.stack(
+        [
+            np.stack(
+                [
+                    1 + m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2],
+                    m[:, 2, 1] - m[:, 1, 2],
+                    m[:, 0, 2] - m[:, 2, 0],
+                    m[:, 1, 0] - m[:, 0, 1],
+                ],
+                1,
+            ),
+            np.stack(
+                [
+                    m[:, 2, 1] - m[:, 1, 2],
+                    1 + m[:, 0, 0] - m[:, 1, 1] - m[:, 2, 2],
+                    m[:, 0, 1] + m[:, 1, 0],
+                    m[:, 0, 2] + m[:, 2, 0],
+                ],
+                1,
+            ),
+            np.stack(
+                [
+                    m[:, 0, 2] - m[:, 2, 0],
+                    m[:, 0, 1] + m[:, 1, 0],
+                    1 - m[:, 0, 0] + m[:, 1, 1] - m[:, 2, 2],
+                    m[:, 1, 2] + m[:, 2, 1],
+                ],
+                1,
+            ),
+            np.stack(
+                [
+                    m[:, 1, 0] - m[:, 0, 1],
+                    m[:, 0, 2] + m[:, 2, 0],
+                    m[:, 1, 2] + m[:, 2, 1],
+                    1 - m[:, 0, 0] - m[:, 1, 1] + m[:, 2, 2],
+                ],
+                1,
+            ),
+        ],
+        axis=1,
+    )
+    best = np.argmax(np.einsum("nii->ni", candidates), axis=1)
+    quats = candidates[np.arange(len(m)), best]
+    return np.asarray(quats / np.linalg.norm(quats, axis=1, keepdims=True))
+
+
+def rotations_of(quats: NDArray[np.floating]) -> F64:
+    """Rotation matrices (N, 3, 3) of unit quaternions (N, 4)."""
+    w, x, y, z = np.asarray(quats, np.float64).T
+    return np.stack(
+        [
+            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
+            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
+            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
+        ],
+        axis=-2,
+    )
+
+
+def covariances_of(gaussians: Gaussians) -> F64:
+    """(N, 3, 3) covariance matrices [m^2]."""
+    axes = rotations_of(gaussians.quats) * np.exp(gaussians.log_scales.astype(np.float64))[:, None, :]
+    return np.asarray(axes @ np.swapaxes(axes, 1, 2))

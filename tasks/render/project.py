@@ -1,0 +1,97 @@
+"""Gaussians in front of a camera, as ellipses on its image (EWA splatting, Zwicker et al. 2001)."""
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+NEAR_M = 0.3  # closer ones would cover the picture
+DILATION_PX2 = 0.1  # added to the screen covariance; 0.3, made for megapixels, blurs images this small (measured)
+MIN_ALPHA = 1.0 / 255.0  # a weaker contribution is not visible in 8 bits
+MAX_TANGENT_RATIO = 1.3  # the Jacobian is linearised at most this far outside the picture
+
+# Columns of a projected row.
+U, V, DEPTH, CONIC_XX, CONIC_XY, CONIC_YY, OPACITY, HALF_U, HALF_V = range(9)
+PROJECTED_SIZE = 9
+
+
+@njit(cache=True, nogil=True)
+def project(
+    means: Any,
+    quats: Any,
+    log_scales: Any,
+    opacities: Any,
+    camera_from_scene: Any,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    width: int,
+    height: int,
+) -> Any:
+    """Rows of the Gaussians that can be seen, and their ellipses.
+
+    Arrays as in `Gaussians`; `camera_from_scene` (4, 4) float64; focal lengths and centre in pixels, the centre of
+    pixel (0, 0) being at (0.5, 0.5). Returns (index (M,) int64, projected (M, 9) float32); HALF_U, HALF_V are the half
+    sizes [px] of the box outside of which the contribution is below MIN_ALPHA.
+    """
+    n = means.shape[0]
+    index = np.empty(n, np.int64)
+    out = np.empty((n, PROJECTED_SIZE), np.float32)
+    count = 0
+    r = camera_from_scene
+    left, right = -MAX_TANGENT_RATIO * cx / fx, MAX_TANGENT_RATIO * (width - cx) / fx
+    top, bottom = -MAX_TANGENT_RATIO * cy / fy, MAX_TANGENT_RATIO * (height - cy) / fy
+    for i in range(n):
+        px, py, pz = float(means[i, 0]), float(means[i, 1]), float(means[i, 2])
+        z = r[2, 0] * px + r[2, 1] * py + r[2, 2] * pz + r[2, 3]
+        if z < NEAR_M or opacities[i] <= MIN_ALPHA:
+            continue
+        x = r[0, 0] * px + r[0, 1] * py + r[0, 2] * pz + r[0, 3]
+        y = r[1, 0] * px + r[1, 1] * py + r[1, 2] * pz + r[1, 3]
+        tx, ty = x / z, y / z
+        u, v = fx * tx + cx, fy * ty + cy
+        s0, s1, s2 = math.exp(log_scales[i, 0]), math.exp(log_scales[i, 1]), math.exp(log_scales[i, 2])
+        # No ellipse reaches further than this; culling before the covariance is what makes large scenes cheap.
+        reach = math.sqrt(2.0 * math.log(255.0 * opacities[i]))
+        bound = reach * (max(s0, max(s1, s2)) * 2.0 * max(fx, fy) / z + 1.0)
+        if u + bound < 0.0 or u - bound > width or v + bound < 0.0 or v - bound > height:
+            continue
+        # Jacobian of the projection, at a point kept near the picture.
+        jx = min(max(tx, left), right)
+        jy = min(max(ty, top), bottom)
+        a, b = fx / z, fy / z
+        qw, qx, qy, qz = float(quats[i, 0]), float(quats[i, 1]), float(quats[i, 2]), float(quats[i, 3])
+        xx = 0.0
+        xy = 0.0
+        yy = 0.0
+        for axis in range(3):
+            if axis == 0:
+                ax, ay, az, s = 1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy + qw * qz), 2 * (qx * qz - qw * qy), s0
+            elif axis == 1:
+                ax, ay, az, s = 2 * (qx * qy - qw * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz + qw * qx), s1
+            else:
+                ax, ay, az, s = 2 * (qx * qz + qw * qy), 2 * (qy * qz - qw * qx), 1 - 2 * (qx * qx + qy * qy), s2
+            dx = s * (r[0, 0] * ax + r[0, 1] * ay + r[0, 2] * az)
+            dy = s * (r[1, 0] * ax + r[1, 1] * ay + r[1, 2] * az)
+            dz = s * (r[2, 0] * ax + r[2, 1] * ay + r[2, 2] * az)
+            du, dv = a * (dx - jx * dz), b * (dy - jy * dz)
+            xx += du * du
+            xy += du * dv
+            yy += dv * dv
+        xx += DILATION_PX2
+        yy += DILATION_PX2
+        half_u, half_v = reach * math.sqrt(xx), reach * math.sqrt(yy)
+        if u + half_u < 0.0 or u - half_u > width or v + half_v < 0.0 or v - half_v > height:
+            continue
+        det = xx * yy - xy * xy
+        if not det > 0.0:
+            continue
+        index[count] = i
+        out[count, U], out[count, V], out[count, DEPTH] = u, v, z
+        out[count, CONIC_XX], out[count, CONIC_XY], out[count, CONIC_YY] = yy / det, -xy / det, xx / det
+        out[count, OPACITY] = opacities[i]
+        out[count, HALF_U], out[count, HALF_V] = half_u, half_v
+        count += 1
+    return index[:count].copy(), out[:count].copy()
