@@ -1,0 +1,122 @@
+"""The seam between the science and the machine: what a run executes, said as one small protocol.
+
+The executors know clips, candidates and attempts only through `Work`. It is picklable and pure given its arguments:
+whatever the worker, the order or the retry, the same arguments give the same result.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from factory.clips.reader import ClipRef
+from tasks.stages import Rejected
+
+HUMAN = "human"  # the expert that is the log itself
+HUMAN_CANDIDATE = -1  # its only candidate index
+
+
+@dataclass(frozen=True)
+class CandidateRow:
+    """One perturbation that passed every gate and filter, in the order in which walks try it."""
+
+    index: int  # place in the clip's ordered list, 0 ...
+    vocabulary_index: int
+    end_x: float  # [m] LQR-reached end pose, frame of the logged pose at T+H
+    end_y: float  # [m]
+    end_heading: float  # [rad]
+    end_speed: float  # [m/s]
+    cell: tuple[int, int]  # (longitudinal, lateral) cell of the interleaved grid
+    score: float  # EPDMS (/14) against log replay
+    reactive_score: float  # EPDMS (/14) among reacting agents
+
+
+@dataclass(frozen=True)
+class PreparedClip:
+    """The stages `clip` and `perturb` of one clip: everything its attempts need."""
+
+    clip_id: str
+    content_digest: str
+    candidates: tuple[CandidateRow, ...]  # empty: no simulated expert has anything to try
+    gate_counts: Mapping[str, int]  # gate -> vocabulary entries it dropped, in the gates' order
+    payload: object  # tree of frozen dataclasses, dicts, tuples, numpy arrays and scalars (factory.store.cache)
+    dropped: Rejected | None = None  # why there are no candidates; the human row is scored all the same
+    seconds: Mapping[str, float] = field(default_factory=dict)  # stage -> seconds
+
+
+@dataclass(frozen=True)
+class Accepted:
+    """A sample: columns of factory.store.schema, less the ones in its BOOKKEEPING."""
+
+    row: Mapping[str, object]
+    seconds: Mapping[str, float] = field(default_factory=dict)  # stage -> seconds
+
+
+@dataclass(frozen=True)
+class Dropped:
+    """An attempt that was turned down."""
+
+    rejected: Rejected
+    subscores: Mapping[str, float] = field(default_factory=dict)  # as far as they were computed
+    seconds: Mapping[str, float] = field(default_factory=dict)
+
+
+AttemptResult = Accepted | Dropped
+
+
+@dataclass(frozen=True)
+class RunIdentity:
+    """What the rows of a run depend on besides clip, candidate and expert."""
+
+    settings: Mapping[str, object]  # flat, dotted names -> plain values; without rounds, experts, limit, executor, out
+    stage_versions: Mapping[str, int]
+    vocabulary_digest: str
+    prepare_digest: str  # of all that `prepare` depends on besides the clip: perturb, traffic, seed, stage versions
+
+    @property
+    def settings_hash(self) -> str:
+        """16 hex digits of the canonical JSON of `settings`."""
+        return hashlib.sha256(canonical_json(self.settings).encode()).hexdigest()[:16]
+
+    @property
+    def versions_json(self) -> str:
+        """`stage_versions` as it stands in the tables."""
+        return canonical_json(self.stage_versions)
+
+
+def canonical_json(value: object) -> str:
+    """JSON with sorted keys and no spaces; the same for equal values, on every machine."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
+
+
+def attempt_id(clip_id: str, candidate: int, vocabulary_digest: str, expert: str, expert_digest: str) -> str:
+    """16 hex digits: the primary key of an attempt, whatever became of it."""
+    key = "\x1f".join((clip_id, str(candidate), vocabulary_digest, expert, expert_digest))
+    return hashlib.sha256(key.encode()).hexdigest()[:16]
+
+
+class Work(Protocol):
+    """What a run does with a clip. Implementations hold reader, settings and tables, and nothing that changes."""
+
+    @property
+    def identity(self) -> RunIdentity: ...
+
+    def warm(self) -> None:
+        """Compile the kernels into their cache. Called once per machine before any worker starts."""
+        ...
+
+    def expert_digest(self, expert: str) -> str:
+        """Of the expert's inputs and settings."""
+        ...
+
+    def prepare(self, ref: ClipRef) -> PreparedClip | Rejected:
+        """Read the clip and list its candidates. Rejected: the clip stage drops it for every expert.
+
+        Raises BadClip for broken input, also for a ref whose log the index called broken.
+        """
+        ...
+
+    def attempt(self, prepared: PreparedClip, candidate: int, expert: str) -> AttemptResult:
+        """Rollout, expert, rollout, reward and render of one candidate; candidate -1 with the expert `human`."""
+        ...
