@@ -1,0 +1,91 @@
+"""Configuration: Hydra composes conf/, typed dataclasses take the result, and anything unknown is an error."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+
+T = TypeVar("T")
+
+
+class ConfigError(ValueError):
+    """The command line or a configuration file asks for something that does not exist or does not fit."""
+
+
+def conf_dir() -> Path:
+    """The folder of the configuration files: inside the installed package, else beside it in a checkout."""
+    here = Path(__file__).resolve().parent
+    for folder in (here / "conf", here.parent / "conf"):
+        if (folder / "run.yaml").is_file():
+            return folder
+    raise ConfigError(f"no conf/run.yaml in {here} or {here.parent}: the installation is incomplete, install it again")
+
+
+def compose(name: str, overrides: Sequence[str]) -> dict[str, Any]:
+    """The resolved configuration `name` with the overrides of a command line.
+
+    Raises ConfigError for a misspelt key, an unknown choice, bad syntax or a value that must be given and is not.
+    """
+    import hydra
+    from hydra.errors import HydraException
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    try:
+        with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+            config = hydra.compose(name, list(overrides))
+        resolved = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    except (HydraException, OmegaConfBaseException) as error:
+        cause = f" ({error.__cause__})" if error.__cause__ is not None else ""
+        raise ConfigError(f"{str(error).strip()}{cause}") from error
+    assert isinstance(resolved, dict)
+    return {str(key): value for key, value in resolved.items()}
+
+
+def fill(cls: type[T], values: Mapping[str, Any], where: str) -> T:
+    """The dataclass `cls` filled from a mapping.
+
+    Raises ConfigError naming every key that is unknown or whose value has the wrong type.
+    """
+    from pydantic import TypeAdapter, ValidationError
+
+    unknown = list(_unknown_keys(cls, values, where))
+    if unknown:
+        raise ConfigError(f"unknown setting {', '.join(unknown)}")
+    try:
+        return TypeAdapter(cls).validate_python(dict(values))
+    except ValidationError as error:
+        lines = [f"{where}.{'.'.join(map(str, e['loc']))}: {e['msg']} (got {e['input']!r})" for e in error.errors()]
+        raise ConfigError("; ".join(lines)) from error
+
+
+def _unknown_keys(cls: type[Any], values: Mapping[str, Any], where: str) -> list[str]:
+    hints = get_type_hints(cls)
+    names = {field.name for field in dataclasses.fields(cls)}
+    found = [f"{where}.{key}" for key in values if key not in names]
+    for name in names & set(values):
+        inner = _dataclass_in(hints[name])
+        if inner is not None and isinstance(values[name], Mapping):
+            found += _unknown_keys(inner, values[name], f"{where}.{name}")
+    return found
+
+
+def _dataclass_in(hint: Any) -> type[Any] | None:
+    options = get_args(hint) if get_origin(hint) is not None else (hint,)
+    return next((option for option in options if isinstance(option, type) and dataclasses.is_dataclass(option)), None)
+
+
+def build(spec: Mapping[str, Any], where: str) -> Any:
+    """The object a `_target_` names, called with the spec's other keys.
+
+    Raises ConfigError when the target cannot be imported or does not take these arguments.
+    """
+    from hydra.errors import InstantiationException
+    from hydra.utils import instantiate
+
+    if "_target_" not in spec:
+        raise ConfigError(f"{where}._target_ is missing: name the class to use, such as my_package.MyReader")
+    try:
+        return instantiate({key: value for key, value in spec.items() if key != "name"}, _convert_="all")
+    except InstantiationException as error:
+        raise ConfigError(f"{where}: {error}") from error
