@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tasks.experts.pdm_forecast import SAMPLE_STEPS, STEP_S, Forecast, ego_boxes
 from tasks.experts.pdm_path import DrivePath, drive_path, parallel
 from tasks.world.frames import box_corners
-from tasks.world.vehicle import HEADING, PACIFICA, VX, Vehicle, X, Y
+from tasks.world.vehicle import PACIFICA, VX, Vehicle, X, Y
 
 Array = NDArray[np.float64]
 SCORED_STEPS = 40
@@ -86,9 +86,8 @@ def proposals(
     for step in range(1, PROPOSAL_STEPS + 1):
         if step % SAMPLE_STEPS == 0:
             memory = settings.shared_lead_memory and step <= SCORED_STEPS  # beyond, the chosen one is driven alone
-            found = _leads(
-                paths, lateral, traffic, step // SAMPLE_STEPS, motion[:, step - 1], poses[:, step - 1], vehicle
-            )
+            before = motion[:, step - 1], poses[:, step - 1]
+            found = _leads(paths, lateral, traffic, step // SAMPLE_STEPS, *before, vehicle)
             leads[:, step] = _remembered(found, len(settings.speed_fractions)) if memory else np.nan_to_num(found)
         else:
             leads[:, step] = leads[:, step - 1]  # at step 1 all zeros: every proposal first brakes at its hardest

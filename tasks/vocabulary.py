@@ -1,0 +1,143 @@
+"""A vocabulary: K human trajectories of 4 s in the ego frame, and how one is picked from many windows."""
+
+import hashlib
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tasks.world.clip import HORIZON_STEPS
+from tasks.world.frames import to_local
+from tasks.world.vehicle import HEADING
+
+Array = NDArray[np.float64]
+CHUNK_ROWS = 4096  # windows whose distances to all centres are held at once: 4096 x 8192 x 8 B = 0.27 GB
+
+
+def trajectories_digest(trajectories: Array) -> str:
+    """16 hex digits of a (K, 40, 3) float64 array: its shape and its bytes, little-endian."""
+    sha = hashlib.sha256(repr(trajectories.shape).encode())
+    sha.update(np.ascontiguousarray(trajectories, dtype="<f8").tobytes())
+    return sha.hexdigest()[:16]
+
+
+def checked_trajectories(values: NDArray[np.generic], source: str) -> Array:
+    """`values` as float64 (K, 40, 3). Raises ValueError that names `source` and what is wrong with it."""
+    if not np.issubdtype(values.dtype, np.floating):
+        raise ValueError(f"{source}: trajectories are {values.dtype}, expected a floating point type")
+    if values.ndim != 3 or values.shape[1:] != (HORIZON_STEPS, 3) or len(values) == 0:
+        raise ValueError(f"{source}: trajectories have shape {values.shape}, expected (K >= 1, {HORIZON_STEPS}, 3)")
+    trajectories = values.astype(np.float64)
+    broken = np.flatnonzero(~np.isfinite(trajectories).all(axis=(1, 2)))
+    if len(broken):
+        raise ValueError(f"{source}: {len(broken)} trajectories hold NaN or infinity, the first is number {broken[0]}")
+    return trajectories
+
+
+@dataclass(frozen=True)
+class Vocabulary:
+    """K trajectories: x [m], y [m], heading [rad] in the ego frame at 0.1 .. 4.0 s.
+
+    Raises ValueError on a wrong shape or type and on values that are not finite.
+    """
+
+    trajectories: Array  # (K, 40, 3)
+    source: str = "vocabulary"  # for messages only
+    digest: str = field(init=False)  # 16 hex digits of the trajectories
+
+    def __post_init__(self) -> None:
+        trajectories = checked_trajectories(np.asarray(self.trajectories), self.source)
+        trajectories.setflags(write=False)
+        object.__setattr__(self, "trajectories", trajectories)
+        object.__setattr__(self, "digest", trajectories_digest(trajectories))
+
+    def __len__(self) -> int:
+        return len(self.trajectories)
+
+
+def human_windows(ego_states: Array, starts: NDArray[np.intp]) -> Array:
+    """What the driver of `ego_states` (S, 11) did in the 4 s after each of `starts`, (W, 40, 3) in the ego frame there.
+
+    Raises ValueError where a window reaches beyond the last state.
+    """
+    if len(starts) and int(starts.max()) + HORIZON_STEPS >= len(ego_states):
+        raise ValueError(f"a window from step {int(starts.max())} needs {HORIZON_STEPS} more of {len(ego_states)}")
+    poses = ego_states[:, : HEADING + 1]
+    windows = [to_local(poses[start], poses[start + 1 : start + 1 + HORIZON_STEPS]) for start in starts]
+    return np.array(windows).reshape(-1, HORIZON_STEPS, 3)
+
+
+def cluster(windows: Array, k: int, seed: int, iterations: int = 30) -> Array:
+    """The k windows that stand for all: k-means on the (x, y) courses, each centre replaced by its nearest window.
+
+    A real drive is kept instead of a mean of many, because a mean of drives need not be drivable.
+
+    Args:
+        windows: (N, 40, 3) in the ego frame.
+        k: how many to keep, at most the number of distinct windows.
+        seed: of the k-means++ start (Philox); equal arguments give equal results.
+        iterations: at most this many Lloyd steps; earlier when no window changes its centre.
+
+    Returns:
+        (k, 40, 3), in the order of the windows.
+
+    Raises:
+        ValueError: fewer than k distinct windows.
+    """
+    windows = checked_trajectories(windows, "windows to cluster")
+    points = windows[:, :, :2].reshape(len(windows), -1)
+    distinct = len(np.unique(points, axis=0))
+    if not 1 <= k <= distinct:
+        raise ValueError(f"k = {k} trajectories cannot be chosen from {distinct} distinct windows")
+    centers = points[_spread_start(points, k, seed)]
+    owner = np.full(len(points), -1)
+    for _ in range(iterations):
+        nearest, _ = _nearest_center(points, centers)
+        if np.array_equal(nearest, owner):
+            break
+        owner = nearest
+        sums = np.zeros_like(centers)
+        np.add.at(sums, owner, points)
+        members = np.bincount(owner, minlength=k)
+        kept = members > 0  # an emptied centre stays where it is
+        centers[kept] = sums[kept] / members[kept, None]
+    return windows[_one_window_each(points, centers)]
+
+
+def _spread_start(points: Array, k: int, seed: int) -> NDArray[np.intp]:
+    """k-means++ (Arthur and Vassilvitskii 2007): each next start is drawn with probability ~ squared distance."""
+    rng = np.random.Generator(np.random.Philox(key=seed))
+    chosen = [int(rng.integers(len(points)))]
+    distance = ((points - points[chosen[0]]) ** 2).sum(axis=1)
+    while len(chosen) < k:
+        mass = np.cumsum(distance)
+        pick = min(int(np.searchsorted(mass, rng.random() * mass[-1], side="right")), len(points) - 1)
+        chosen.append(pick)
+        distance = np.minimum(distance, ((points - points[pick]) ** 2).sum(axis=1))
+    return np.array(chosen)
+
+
+def _nearest_center(points: Array, centers: Array) -> tuple[NDArray[np.intp], Array]:
+    """Index of each point's nearest centre (the first of equals) and the squared distance to it."""
+    owner = np.empty(len(points), dtype=np.intp)
+    distance = np.empty(len(points))
+    norms = (centers**2).sum(axis=1)
+    for start in range(0, len(points), CHUNK_ROWS):
+        rows = points[start : start + CHUNK_ROWS]
+        squared = norms - 2.0 * rows @ centers.T
+        owner[start : start + CHUNK_ROWS] = squared.argmin(axis=1)
+        distance[start : start + CHUNK_ROWS] = squared.min(axis=1) + (rows**2).sum(axis=1)
+    return owner, distance
+
+
+def _one_window_each(points: Array, centers: Array) -> NDArray[np.intp]:
+    """A different window for every centre: the nearest of its own members, for an empty centre the nearest left."""
+    owner, distance = _nearest_center(points, centers)
+    order = np.lexsort((distance, owner))
+    first = order[np.unique(owner[order], return_index=True)[1]]
+    taken = np.zeros(len(points), dtype=bool)
+    taken[first] = True
+    for center in np.setdiff1d(np.arange(len(centers)), owner):
+        to_center = np.where(taken, np.inf, ((points - centers[center]) ** 2).sum(axis=1))
+        taken[int(to_center.argmin())] = True
+    return np.flatnonzero(taken)
