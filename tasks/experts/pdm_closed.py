@@ -14,13 +14,13 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from tasks.experts.pdm_drive import drive
 from tasks.experts.pdm_forecast import RADIUS_M, ego_boxes, forecast
 from tasks.experts.pdm_path import MIN_PROGRESS_M, path_length_m
 from tasks.experts.pdm_proposals import SCORED_STEPS, PdmSettings, Proposals, proposals
 from tasks.experts.protocol import Plan
 from tasks.reward.epdms import Scores, score
 from tasks.reward.prepare import prepare
+from tasks.rollout.lqr import track
 from tasks.stages import Rejected
 from tasks.world.agents import AgentTracks
 from tasks.world.clip import Scene
@@ -75,7 +75,8 @@ def plan_pdm_closed(
     lights = tuple(shapely.Polygon(polygon.ring[:, :2]) for polygon in red)
     seen = forecast(ego_state, agents, lights, vehicle)
     candidates = proposals(ego_state, centerline, seen, speed_limit_mps, settings, vehicle)
-    simulated = drive(ego_state, candidates.poses[:, : SCORED_STEPS + 1], vehicle)
+    driven = candidates.poses[:, : SCORED_STEPS + 1]
+    simulated = track(ego_state, driven[:, 1:], vehicle, planned_pose0=driven[:, 0])
     prepared = prepare(
         past_states=None,
         centerline=centerline,
