@@ -1,0 +1,140 @@
+"""Where the ego drives: the scenario kinds, its route through the lanes, and its human-like motion."""
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+
+from factory.clips.synthetic import curves
+from factory.clips.synthetic.curves import Array
+from factory.clips.synthetic.streets import Lane, Streets
+from factory.clips.synthetic.traffic import RED, Driver, Path, Signals, path_of_lanes
+from tasks.world.frames import box_corners
+from tasks.world.vehicle import PACIFICA
+
+SLOWEST_MPS = 1.2  # a log whose ego is ever slower is drawn again: a standing ego makes no clip
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One kind of drive: from a road (in or against its line's direction), towards another."""
+
+    kind: str
+    road: str
+    forward: bool
+    target: str | None
+    to_junction_m: tuple[float, float] | None  # start this far before the road's end; None: near its beginning
+
+
+APPROACH = (38.0, 80.0)
+SCENARIOS = (  # in turn, log by log; every run of seven holds every kind once
+    Scenario("straight multi-lane", "avenue", True, None, None),
+    Scenario("signalised straight", "west street", False, "avenue", APPROACH),
+    Scenario("roundabout", "west street", True, "ring road 1", APPROACH),
+    Scenario("narrow with parked cars", "narrow street", True, None, None),
+    Scenario("curve", "south avenue", True, None, None),
+    Scenario("Y-branch", "avenue", True, "left branch", APPROACH),
+    Scenario("signalised turn", "avenue", False, "narrow street", APPROACH),
+    Scenario("curve", "south avenue", False, None, None),
+    Scenario("signalised turn", "west street", False, "south avenue", APPROACH),
+    Scenario("roundabout", "ring road 2", False, "west street", APPROACH),
+    Scenario("straight multi-lane", "avenue", False, None, None),
+    Scenario("narrow with parked cars", "narrow street", False, None, None),
+    Scenario("Y-branch", "right branch", False, "avenue", APPROACH),
+    Scenario("signalised straight", "avenue", False, "west street", APPROACH),
+    Scenario("signalised turn", "south avenue", False, "avenue", APPROACH),
+    Scenario("curve", "west street", False, None, None),
+    Scenario("roundabout", "west street", True, "ring road 2", APPROACH),
+    Scenario("Y-branch", "avenue", True, "right branch", APPROACH),
+)
+
+
+def chains(streets: Streets, road: str, forward: bool) -> list[list[int]]:
+    """Lane ids of a road's VEHICLE lanes, one list per lane, inner lane first, in driving direction."""
+    line = next(r.line for r in streets.roads if r.name == road)
+    first = [
+        lane for lane in streets.lanes.values() if lane.road == road and lane.kind == "VEHICLE" and _starts(streets, lane)
+    ]
+    along = [lane for lane in first if (np.cos(lane.center[0, 2] - _near_heading(line, lane)) > 0) == forward]
+    out = []
+    for lane in along:
+        chain = [lane.lane_id]
+        while (after := next((n for n in streets.lanes[chain[-1]].successors if streets.lanes[n].road == road), None)) is not None:
+            chain.append(after)
+        out.append(chain)
+    return out
+
+
+def _starts(streets: Streets, lane: Lane) -> bool:
+    return all(streets.lanes[p].road != lane.road for p in lane.predecessors)
+
+
+def _near_heading(line: Array, lane: Lane) -> float:
+    return float(line[np.argmin(np.hypot(*(line[:, :2] - lane.center[0, :2]).T)), 2])
+
+
+def continue_lanes(streets: Streets, lane_ids: list[int], target: str | None, rng: np.random.Generator) -> list[int]:
+    """The lanes driven after `lane_ids`: the shortest way to `target`, then on at random until the town's edge."""
+    out = list(lane_ids)
+    if target is not None:
+        came_from: dict[int, int] = {out[-1]: -1}
+        queue = deque([out[-1]])
+        while queue and streets.lanes[queue[0]].road != target:
+            here = queue.popleft()
+            for n in streets.lanes[here].successors:
+                if n not in came_from:
+                    came_from[n] = here
+                    queue.append(n)
+        if not queue:
+            raise ValueError(f"no way from lane {out[-1]} to {target!r}")
+        way, here = [], queue[0]
+        while here != lane_ids[-1]:
+            way.append(here)
+            here = came_from[here]
+        out += way[::-1]
+    while streets.lanes[out[-1]].successors and len(out) < len(lane_ids) + 14:
+        out.append(int(rng.choice(streets.lanes[out[-1]].successors)))
+    return out
+
+
+def ego_path(
+    streets: Streets, scenario: Scenario, driver: Driver, rng: np.random.Generator
+) -> tuple[Path, float] | None:
+    """The ego's path and its start on it; None where this lane cannot reach the target."""
+    lanes = chains(streets, scenario.road, scenario.forward)
+    chain = lanes[int(rng.integers(len(lanes)))]
+    length = sum(float(curves.arc_length(streets.lanes[k].center)[-1]) for k in chain)
+    near = scenario.to_junction_m
+    start = float(rng.uniform(25.0, 55.0)) if near is None else length - float(rng.uniform(*near))
+    try:
+        lane_ids = continue_lanes(streets, chain, scenario.target, rng)
+    except ValueError:
+        return None
+    return path_of_lanes(streets, lane_ids, driver), start
+
+
+def centre_boxes(rear_axle: Array) -> Array:
+    """(S, 5) boxes of the ego from its rear-axle poses (S, 3)."""
+    ahead = PACIFICA.rear_axle_to_center
+    size = np.broadcast_to([PACIFICA.length, PACIFICA.width], (len(rear_axle), 2))
+    x = rear_axle[:, 0] + ahead * np.cos(rear_axle[:, 2])
+    y = rear_axle[:, 1] + ahead * np.sin(rear_axle[:, 2])
+    return np.column_stack([x, y, rear_axle[:, 2], size])
+
+
+def is_lawful(streets: Streets, path: Path, boxes: Array, signals: Signals, times_s: Array) -> bool:
+    """All corners on drivable surface at every step, and never on a connector of its way while that is red."""
+    surface = streets.surface()
+    corners = box_corners(boxes).reshape(-1, 2)
+    if not shapely.contains_xy(surface, corners[:, 0], corners[:, 1]).all():
+        return False
+    body = shapely.polygons(box_corners(boxes))
+    for lane_id in path.lane_ids:
+        lane = streets.lanes[lane_id]
+        if lane.light_group >= 0:
+            ring = shapely.Polygon(np.vstack([lane.left, lane.right[::-1]])).buffer(0.3)
+            red = np.array([signals.state(lane.light_group, float(t)) == RED for t in times_s])
+            if shapely.intersects(body[red], ring).any():
+                return False
+    return True
