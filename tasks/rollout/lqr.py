@@ -31,10 +31,14 @@ STOPPING_GAIN = 0.5
 STOPPING_SPEED_MPS = 0.2
 
 
-def track(ego_state0: Array, poses: Array, vehicle: Vehicle = PACIFICA) -> Array:
+def track(
+    ego_state0: Array, poses: Array, vehicle: Vehicle = PACIFICA, *, planned_pose0: Array | None = None
+) -> Array:
     """Simulated ego states (K, 41, 11) that follow each plan; row 0 is `ego_state0`.
 
     ego_state0: (11,) columns tasks.world.vehicle; poses: (K, 40, 3) world x, y, heading at 0.1 .. 4.0 s.
+    planned_pose0: (K, 3) where each plan says the ego is now, when that is not the ego's own pose: the proposals of
+    PDM-Closed start on their path, beside the ego.
     Raises ValueError on other shapes or non-finite poses.
     """
     poses = np.asarray(poses, dtype=np.float64)
@@ -45,7 +49,8 @@ def track(ego_state0: Array, poses: Array, vehicle: Vehicle = PACIFICA) -> Array
     if not (np.isfinite(poses).all() and np.isfinite(ego_state0).all()):
         raise ValueError("track() needs finite poses and a finite ego state")
     n_plans = poses.shape[0]
-    start = np.broadcast_to(np.asarray(ego_state0)[[X, Y, HEADING]], (n_plans, 1, 3))
+    pose0 = np.asarray(ego_state0)[[X, Y, HEADING]] if planned_pose0 is None else planned_pose0
+    start = np.broadcast_to(pose0, (n_plans, 3))[:, None]
     reference = np.concatenate([start, poses], axis=1)  # (K, 41, 3)
     velocity = velocity_profile(reference)
     curvature = curvature_profile(reference, velocity)

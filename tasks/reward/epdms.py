@@ -1,0 +1,167 @@
+"""EPDMS: the sub-scores of ego trajectories and what they add up to (METRIC.md 2)."""
+
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tasks.reward.areas import ego_areas
+from tasks.reward.boxes import ego_boxes
+from tasks.reward.collisions import no_at_fault_collision, time_to_collision, traffic_light_compliance
+from tasks.reward.comfort import history_comfort
+from tasks.reward.prepare import N_TIMES, PreparedScene
+from tasks.reward.progress import driving_direction_compliance, first_true, lane_keeping, progress_along
+from tasks.world.vehicle import EGO_STATE_SIZE
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Normalise = Literal["batch", "pairs"]
+
+WEIGHTS = {"ep": 5.0, "ttc": 5.0, "lk": 2.0, "hc": 2.0}
+EC_WEIGHT = 2.0
+MULTIPLIERS = ("nc", "dac", "tlc", "ddc")
+PROGRESS_THRESHOLD_M = 5.0
+ROWS_AT_ONCE = 512  # bounds the memory of one pass
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Scores of K trajectories; every array has K rows. A `*_index` is a time index (0.1 s), inf: never."""
+
+    nc: Array  # (K,) no at-fault collision: 0, 0.5, 1
+    dac: Array  # (K,) drivable area compliance: 0, 1
+    ddc: Array  # (K,) driving direction compliance: 0, 0.5, 1
+    tlc: Array  # (K,) traffic light compliance: 0, 1
+    ep: Array  # (K,) ego progress, 0 .. 1, relative to the batch
+    ttc: Array  # (K,) time to collision: 0, 1
+    lk: Array  # (K,) lane keeping: 0, 1
+    hc: Array  # (K,) history comfort: 0, 1
+    ep_raw_m: Array  # (K,) progress along the centreline [m]
+    multiplier: Array  # (K,) nc dac tlc ddc
+    pdm_score: Array  # (K,) multiplier (5 ep + 5 ttc + 2 lk + 2 hc) / 14
+    collision_index: Array  # (K,) first at-fault collision
+    dac_index: Array  # (K,) first off the drivable area
+    ddc_index: Array  # (K,) first with 2 m against traffic within 1 s
+    tlc_index: Array  # (K,) first on a red lane
+    ttc_index: Array  # (K,) first with a collision ahead
+    lk_index: Array  # (K,) completes 2 s off the centreline
+    hc_index: Array  # (K,) first uncomfortable; negative: in the history
+    ego_areas: Bools  # (K, 41, 3) multiple lanes, non-drivable, oncoming
+    comfort: Bools  # (K, 6) flags of history comfort, see comfort.history_comfort
+
+    def __len__(self) -> int:
+        return len(self.nc)
+
+    @property
+    def first_failures(self) -> dict[str, Array]:
+        """Sub-score -> time index (K,) at which it first fails, inf: never."""
+        return {
+            "nc": self.collision_index,
+            "dac": self.dac_index,
+            "ddc": self.ddc_index,
+            "tlc": self.tlc_index,
+            "ttc": self.ttc_index,
+            "lk": self.lk_index,
+            "hc": self.hc_index,
+        }
+
+
+def score(
+    prepared: PreparedScene, states: Array, *, normalise: Normalise = "batch", with_history: bool = True
+) -> Scores:
+    """Score simulated ego states (K, 41, 11).
+
+    normalise: "batch" relates progress to the best compliant progress of all rows, as the public scorer does with its
+    batch; "pairs" scores each row as if in a two-row batch with row 0 (its reference, usually PDM-Closed), and row 0
+    as if alone. with_history=False leaves history comfort at 1, as the public passes over the human and PDM-Closed do.
+    Raises ValueError for other shapes or non-finite states.
+    """
+    states = np.asarray(states, dtype=np.float64)
+    if states.ndim != 3 or states.shape[1:] != (N_TIMES, EGO_STATE_SIZE) or states.shape[0] == 0:
+        raise ValueError(f"states must be (K >= 1, {N_TIMES}, {EGO_STATE_SIZE}), got {states.shape}")
+    if not np.isfinite(states).all():
+        raise ValueError("states must be finite")
+    parts = [
+        _rules(prepared, states[start : start + ROWS_AT_ONCE], with_history)
+        for start in range(0, states.shape[0], ROWS_AT_ONCE)
+    ]
+    raw = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    multiplier = np.prod([raw[name] for name in MULTIPLIERS], axis=0)
+    ep = relative_progress(raw["ep_raw_m"], multiplier, normalise)
+    return _combined(Scores(ep=ep, multiplier=multiplier, pdm_score=np.zeros_like(ep), **raw))
+
+
+def _rules(prepared: PreparedScene, states: Array, with_history: bool) -> dict[str, NDArray[np.generic]]:
+    """Everything in Scores that does not depend on the other rows."""
+    boxes = ego_boxes(states, prepared.vehicle)
+    areas = ego_areas(prepared.regions, states, boxes)
+    nc, collision_index = no_at_fault_collision(prepared.obstacles, states, boxes, areas)
+    tlc, tlc_index = traffic_light_compliance(prepared.red_lanes, boxes)
+    ddc, ddc_index = driving_direction_compliance(boxes, areas)
+    ttc, ttc_index = time_to_collision(prepared.obstacles, states, boxes, areas)
+    lk, lk_index = lane_keeping(prepared.centerline, boxes, areas)
+    hc, comfort, hc_index = history_comfort(prepared.history if with_history else None, states, prepared.vehicle)
+    return {
+        "nc": nc,
+        "dac": np.where(areas.non_drivable.any(axis=1), 0.0, 1.0),
+        "ddc": ddc,
+        "tlc": tlc,
+        "ttc": ttc,
+        "lk": lk,
+        "hc": hc,
+        "ep_raw_m": progress_along(prepared.centerline, boxes),
+        "collision_index": collision_index,
+        "dac_index": first_true(areas.non_drivable),
+        "ddc_index": ddc_index,
+        "tlc_index": tlc_index,
+        "ttc_index": ttc_index,
+        "lk_index": lk_index,
+        "hc_index": hc_index,
+        "ego_areas": np.stack([areas.multiple_lanes, areas.non_drivable, areas.oncoming], axis=-1),
+        "comfort": comfort,
+    }
+
+
+def relative_progress(ep_raw_m: Array, multiplier: Array, normalise: Normalise) -> Array:
+    """EP (K,): raw progress over the best compliant one, clipped to 0 .. 1; 1 where that best is at most 5 m."""
+    compliant = ep_raw_m * multiplier
+    best = np.full_like(compliant, compliant.max()) if normalise == "batch" else np.maximum(compliant, compliant[0])
+    far_enough = best > PROGRESS_THRESHOLD_M
+    return np.where(far_enough, np.clip(ep_raw_m / np.where(far_enough, best, 1.0), 0.0, 1.0), 1.0)
+
+
+def score_with_ec(scores: Scores, ec: Array) -> Array:
+    """The final per-frame score (K,): multiplier (5 ep + 5 ttc + 2 lk + 2 hc + 2 ec) / 16; ec: (K,)."""
+    total = sum(WEIGHTS.values()) + EC_WEIGHT
+    final: Array = scores.multiplier * (_weighted(scores) + EC_WEIGHT * ec) / total
+    return final
+
+
+def human_filtered(scores: Scores, human: Scores) -> Scores:
+    """The human-penalty filter: a sub-score at which the logged human gets exactly 0 becomes 1 (METRIC.md 2l).
+
+    human: one row, scored alone and without history against its own traffic. Multiplier and score are recomputed.
+    Raises ValueError unless `human` has one row.
+    """
+    if len(human) != 1:
+        raise ValueError(f"the human must be one row, got {len(human)}")
+    forgiven: dict[str, Any] = {
+        name: np.ones(len(scores)) for name in (*MULTIPLIERS, *WEIGHTS) if getattr(human, name)[0] == 0.0
+    }
+    return _combined(replace(scores, **forgiven))
+
+
+def rows(scores: Scores, index: slice | NDArray[np.integer] | NDArray[np.bool_]) -> Scores:
+    """The chosen rows of the scores; progress stays relative to the batch it was scored in."""
+    return Scores(**{field.name: getattr(scores, field.name)[index] for field in fields(Scores)})
+
+
+def _weighted(scores: Scores) -> Array:
+    return sum((weight * getattr(scores, name) for name, weight in WEIGHTS.items()), np.zeros(len(scores)))
+
+
+def _combined(scores: Scores) -> Scores:
+    """The scores with multiplier and pdm_score made from the sub-scores."""
+    scores = replace(scores, multiplier=np.prod([getattr(scores, name) for name in MULTIPLIERS], axis=0))
+    return replace(scores, pdm_score=scores.multiplier * _weighted(scores) / sum(WEIGHTS.values()))

@@ -1,0 +1,171 @@
+"""The reward equals the public metric's recorded outputs (reference/, METRIC.md 6), sub-score by sub-score."""
+
+import importlib.util
+import json
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from tasks.reward.comfort import extended_comfort
+from tasks.reward.epdms import Scores, human_filtered, rows, score, score_with_ec
+from tasks.reward.prepare import PreparedScene, prepare
+from tasks.rollout.lqr import track
+from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.frames import wrap_angle
+from tasks.world.lanes import MapLayer, MapPolygon
+from tasks.world.vehicle import HEADING
+
+SCENES = ("7fab2350_20", "7fab2350_44", "adcf7d18_64", "adcf7d18_80", "7fab2350_104")
+EXACT = {  # ours: recorded
+    "nc": "no_at_fault_collisions",
+    "dac": "drivable_area_compliance",
+    "ddc": "driving_direction_compliance",
+    "tlc": "traffic_light_compliance",
+    "ttc": "time_to_collision_within_bound",
+    "lk": "lane_keeping",
+    "hc": "history_comfort",
+}
+CLOSE = {"ep": "ego_progress", "ep_raw_m": "ego_progress_raw_m", "pdm_score": "pdm_score"}
+
+
+@cache
+def loader(root: Path) -> ModuleType:
+    spec = importlib.util.spec_from_file_location("load_reference", root / "reference" / "load_reference.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def tracks(inputs: dict, box: np.ndarray, velocity: np.ndarray, valid: np.ndarray, tokens: list[str]) -> AgentTracks:
+    kind_of = dict(zip(inputs["object_tokens"], inputs["object_type"]))
+    return AgentTracks(
+        track_ids=tuple(tokens),
+        kinds=tuple(AgentKind(kind_of[token]) for token in tokens),
+        boxes=box,
+        velocities=velocity,
+        valid=valid,
+        center_z=np.zeros(valid.shape),
+        heights=np.ones(len(tokens)),
+    )
+
+
+def prepared_scene(
+    inputs: dict, objects: AgentTracks | None = None, red_lanes: tuple[str, ...] = (), with_past: bool = True
+) -> PreparedScene:
+    if objects is None:
+        objects = tracks(
+            inputs, inputs["object_box"], inputs["object_velocity"], inputs["object_valid"], inputs["object_tokens"]
+        )
+    return prepare(
+        past_states=inputs["past_states"] if with_past else None,
+        centerline=inputs["centerline"],
+        polygons=[
+            MapPolygon(token, MapLayer(layer), ring)
+            for token, layer, ring in zip(inputs["map_tokens"], inputs["map_layers"], inputs["map_rings"])
+        ],
+        route_lane_ids=frozenset(inputs["route_lane_ids"]),
+        objects=objects,
+        red_lanes=red_lanes,
+        ego_state0=inputs["ego_state0"],
+    )
+
+
+def world_poses(module: ModuleType, inputs: dict, proposals: np.ndarray) -> np.ndarray:
+    return module.proposal_states(inputs["ego_state0"], proposals)[:, 1:, :3]
+
+
+def assert_equal_scores(ours: Scores, recorded: dict) -> None:
+    for name, column in EXACT.items():
+        wrong = np.nonzero(getattr(ours, name) != recorded[column])[0]
+        assert wrong.size == 0, f"{name} differs in rows {wrong}"
+    for name, column in CLOSE.items():
+        np.testing.assert_allclose(getattr(ours, name), recorded[column], rtol=0, atol=1e-9, err_msg=name)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_tracked_states_scores_and_flags_equal_the_reference_at_k256(shared_root: Path, name: str) -> None:
+    module = loader(shared_root)
+    inputs, recorded = module.inputs(name), module.metrics(name, 256)
+    states = track(inputs["ego_state0"], world_poses(module, inputs, module.proposals(name, 256)))
+    difference = states - module.simulated(name, 256)
+    difference[..., HEADING] = wrap_angle(difference[..., HEADING])
+    assert np.abs(difference).max() < 1e-9
+
+    prepared = prepared_scene(inputs)
+    assert prepared.history is not None
+    np.testing.assert_allclose(prepared.history, recorded["history_states"], rtol=0, atol=1e-9)
+    ours = score(prepared, states)
+    assert_equal_scores(ours, recorded)
+    assert np.array_equal(ours.collision_index, recorded["collision_time_idx"])
+    assert np.array_equal(ours.ttc_index, recorded["ttc_time_idx"])
+    assert np.array_equal(ours.ego_areas, recorded["ego_areas"])
+    assert np.array_equal(ours.comfort, recorded["comfort_flags"])
+    np.testing.assert_allclose(ours.multiplier, recorded["multiplicative_metrics_prod"], rtol=0, atol=1e-9)
+
+    previous = recorded["prev_human_simulated_states"]
+    extended = extended_comfort(states, previous[None], interval_s=0.5)
+    assert np.array_equal(extended.ec, recorded["two_frame_extended_comfort"])
+    np.testing.assert_allclose(extended.rms, recorded["two_frame_rms"], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(score_with_ec(ours, extended.ec), recorded["score_with_ec"], rtol=0, atol=1e-9)
+
+
+def test_a_red_lane_connector_changes_exactly_what_the_reference_says(shared_root: Path) -> None:
+    module = loader(shared_root)
+    name = "7fab2350_44"
+    inputs = module.inputs(name)
+    recorded = dict(np.load(shared_root / "reference" / name / "metrics_K256_redlight.npz"))
+    states = track(inputs["ego_state0"], world_poses(module, inputs, module.proposals(name, 256)))
+    red = tuple(str(lane) for lane in np.atleast_1d(recorded["red_lane_connector"]))
+    assert_equal_scores(score(prepared_scene(inputs, red_lanes=red), states), recorded)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_official_rows_against_pdm_closed_with_the_human_filter(shared_root: Path, name: str) -> None:
+    module = loader(shared_root)
+    inputs = module.inputs(name)
+    folder = shared_root / "reference" / name
+    pdm_closed = np.load(folder / "pdm_closed.npz")["chosen_trajectory_states"][:, :3]
+    idm = np.load(folder / "idm_agents.npz")
+    proposals = module.proposals(name, 256)
+    human_poses = world_poses(module, inputs, two_hz_resampled(module, inputs))
+    for row in json.loads((folder / "official_pdm_score_rows.json").read_text())["rows"]:
+        k = row["proposal"]
+        plan = world_poses(module, inputs, proposals[k : k + 1])
+        states = track(
+            inputs["ego_state0"],
+            np.concatenate([pdm_closed[None, 1:], plan]),
+            planned_pose0=np.stack([pdm_closed[0], inputs["ego_state0"][:3]]),
+        )
+        if row["policy"] == "idm":
+            objects = tracks(
+                inputs,
+                idm[f"box_ego{k}"],
+                idm[f"vel_ego{k}"],
+                idm[f"valid_ego{k}"],
+                [str(token) for token in idm["tokens"]],
+            )
+            prepared = prepared_scene(inputs, objects)
+        else:
+            prepared = prepared_scene(inputs)
+        ours = rows(score(prepared, states), slice(1, 2))
+        human = score(prepared_scene(inputs), track(inputs["ego_state0"], human_poses), with_history=False)
+        ours_filtered = human_filtered(ours, human)
+        recorded = {key: np.array([value]) for key, value in row.items() if isinstance(value, float)}
+        for column, theirs in EXACT.items():
+            assert getattr(ours_filtered, column)[0] == recorded[theirs][0], (name, k, row["policy"], column)
+        np.testing.assert_allclose(ours_filtered.ep, recorded["ego_progress"], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(ours_filtered.multiplier, recorded["multiplicative_metrics_prod"], rtol=0, atol=1e-9)
+        # The public filter rewrites the columns, not pdm_score.
+        np.testing.assert_allclose(ours.pdm_score, recorded["pdm_score"], rtol=0, atol=1e-9)
+
+
+def two_hz_resampled(module: ModuleType, inputs: dict) -> np.ndarray:
+    """The logged human future in the ego frame, (1, 40, 3), linear between its 0.5 s poses."""
+    poses = np.concatenate([np.zeros((1, 3)), inputs["human_poses_2hz"]])
+    poses[:, 2] = np.unwrap(poses[:, 2])
+    times = 0.1 * np.arange(1, 41)
+    return np.stack([np.interp(times, 0.5 * np.arange(9), poses[:, i]) for i in range(3)], axis=-1)[None]
