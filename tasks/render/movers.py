@@ -1,0 +1,70 @@
+"""Boxes that move: where they are at an instant, and which points are theirs."""
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from tasks.render.gaussians import F64
+from tasks.world.agents import AgentTracks
+from tasks.world.clip import STEP_S
+from tasks.world.frames import wrap_angle
+
+MARGIN_M = 0.15  # boxes are drawn tightly; mirrors and noise stick out
+GROUND_CLEARANCE_M = 0.12  # the road under a car stays behind when it leaves
+
+
+def boxes_at(agents: AgentTracks, time_s: float) -> tuple[F64, NDArray[np.bool_]]:
+    """Boxes (N, 7) x, y, z of the centre, heading, length, width, height at a time since the first step; valid (N,).
+
+    Linear between steps; valid where both neighbouring steps are.
+    """
+    at = np.clip(time_s / STEP_S, 0.0, agents.n_steps - 1.0)
+    before = int(np.floor(at + 1e-6))
+    after = min(before + 1, agents.n_steps - 1)
+    share = float(np.clip(at - before, 0.0, 1.0))
+    if share < 1e-3:
+        after, share = before, 0.0
+    first, second = agents.boxes[before], agents.boxes[after]
+    xy = first[:, :2] * (1 - share) + second[:, :2] * share
+    z = agents.center_z[before] * (1 - share) + agents.center_z[after] * share
+    heading = first[:, 2] + share * wrap_angle(second[:, 2] - first[:, 2])
+    boxes = np.column_stack([xy, z, heading, first[:, 3:5], agents.heights])
+    return boxes, agents.valid[before] & agents.valid[after]
+
+
+def world_from_boxes(boxes: F64) -> F64:
+    """Poses (N, 4, 4) of boxes (N, 7): origin at the centre, x along the heading, z up."""
+    c, s = np.cos(boxes[:, 3]), np.sin(boxes[:, 3])
+    poses = np.tile(np.eye(4), (len(boxes), 1, 1))
+    poses[:, 0, 0], poses[:, 0, 1], poses[:, 1, 0], poses[:, 1, 1] = c, -s, s, c
+    poses[:, :3, 3] = boxes[:, :3]
+    return poses
+
+
+@njit(cache=True, nogil=True)
+def owners(points: Any, boxes: Any, movable: Any) -> Any:
+    """Row of the box each point (M, 3) lies in, -1 for none; the box with the nearest centre wins.
+
+    `boxes` (N, 7), `movable` (N,) False: box is not looked at.
+    """
+    out = np.full(points.shape[0], -1, np.int32)
+    cosines, sines = np.cos(boxes[:, 3]), np.sin(boxes[:, 3])
+    for i in range(points.shape[0]):
+        nearest = np.inf
+        for j in range(boxes.shape[0]):
+            if not movable[j]:
+                continue
+            dx, dy, dz = points[i, 0] - boxes[j, 0], points[i, 1] - boxes[j, 1], points[i, 2] - boxes[j, 2]
+            along = cosines[j] * dx + sines[j] * dy
+            across = cosines[j] * dy - sines[j] * dx
+            half_height = 0.5 * boxes[j, 6]
+            if abs(along) > 0.5 * boxes[j, 4] + MARGIN_M or abs(across) > 0.5 * boxes[j, 5] + MARGIN_M:
+                continue
+            if dz > half_height + MARGIN_M or dz < -half_height + GROUND_CLEARANCE_M:
+                continue
+            distance = dx * dx + dy * dy
+            if distance < nearest:
+                nearest, out[i] = distance, j
+    return out
