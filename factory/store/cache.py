@@ -1,0 +1,147 @@
+"""Prepared clips on disk, so that a later run goes on without a perturb task.
+
+A file is a plain zip of arrays (npz, no pickle) plus one JSON tree that says how frozen dataclasses, tuples, dicts and
+arrays nest. Reading it builds only dataclasses and enums of this distribution, by their fields, and nothing else.
+The zip's own checksums find damage; a damaged or foreign file counts as missing, with the reason.
+"""
+
+import dataclasses
+import enum
+import importlib
+import io
+import json
+import zipfile
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factory.store.location import Location
+
+FORMAT = 1
+PACKAGES = ("tasks.", "factory.")  # whose dataclasses and enums a file may name
+_PLAIN = (str, int, float, bool, type(None))
+
+
+class BadCacheFile(ValueError):
+    """A cache file is damaged or not one of ours."""
+
+
+def encode(value: object) -> bytes:
+    """A tree of dataclasses, enums, dicts, tuples, lists, frozensets, numpy arrays and plain scalars as bytes.
+
+    Raises TypeError naming the type of anything else.
+    """
+    arrays = _Arrays()
+    tree = json.dumps({"format": FORMAT, "root": _encode(value, arrays)})
+    sink = io.BytesIO()
+    np.savez(sink, allow_pickle=False, tree=np.frombuffer(tree.encode(), np.uint8), **arrays.by_name)
+    return sink.getvalue()
+
+
+def decode(data: bytes) -> Any:
+    """The opposite. Raises BadCacheFile."""
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as stored:
+            tree = json.loads(stored["tree"].tobytes())
+            if tree["format"] != FORMAT:
+                raise BadCacheFile(f"format {tree['format']}, this version reads {FORMAT}")
+            return _decode(tree["root"], {name: stored[name] for name in stored.files})
+    except (zipfile.BadZipFile, KeyError, ValueError, TypeError, AttributeError, ImportError, EOFError) as error:
+        raise BadCacheFile(str(error)) from error
+
+
+class ClipCache:
+    """Prepared clips by key, under the store."""
+
+    def __init__(self, location: Location) -> None:
+        self.location = location
+
+    def load(self, key: str) -> object | None:
+        """The stored value, None where there is none. Raises BadCacheFile."""
+        data = self.location.read(f"{key}.npz")
+        return None if data is None else decode(data)
+
+    def store(self, key: str, value: object) -> None:
+        """Whole or not at all."""
+        self.location.write(f"{key}.npz", encode(value))
+
+
+class _Arrays:
+    """Names arrays; one that stands twice in the tree is stored once."""
+
+    def __init__(self) -> None:
+        self.by_name: dict[str, NDArray[np.generic]] = {}
+        self._name_of: dict[int, str] = {}
+
+    def name(self, array: NDArray[np.generic]) -> str:
+        if id(array) not in self._name_of:
+            self._name_of[id(array)] = f"a{len(self.by_name)}"
+            self.by_name[self._name_of[id(array)]] = array  # also keeps its id taken
+        return self._name_of[id(array)]
+
+
+def _encode(value: Any, arrays: _Arrays) -> Any:
+    if isinstance(value, enum.Enum):
+        return {"enum": _name(type(value)), "value": value.value}
+    if isinstance(value, np.ndarray):
+        if value.dtype.hasobject:
+            raise TypeError("an array of objects cannot be cached")
+        return {"array": arrays.name(value)}
+    if isinstance(value, np.generic):
+        return {"scalar": arrays.name(np.asarray(value))}
+    if isinstance(value, _PLAIN):
+        return value
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        members = {f.name: _encode(getattr(value, f.name), arrays) for f in dataclasses.fields(value) if f.init}
+        return {"class": _name(type(value)), "members": members}
+    if isinstance(value, Mapping):
+        return {"dict": [[_encode(k, arrays), _encode(v, arrays)] for k, v in value.items()]}
+    for kind in (tuple, list):
+        if type(value) is kind:
+            return {kind.__name__: [_encode(v, arrays) for v in value]}
+    if isinstance(value, frozenset):
+        return {"frozenset": [_encode(v, arrays) for v in sorted(value)]}
+    raise TypeError(f"{_name(type(value))} cannot be cached; allowed: dataclasses of {PACKAGES}, arrays, containers")
+
+
+def _decode(node: Any, arrays: Mapping[str, NDArray[np.generic]]) -> Any:
+    if not isinstance(node, dict):
+        return node
+    if "array" in node:
+        return arrays[node["array"]]
+    if "scalar" in node:
+        return arrays[node["scalar"]][()]
+    if "class" in node:
+        kind = _class(node["class"])
+        if not dataclasses.is_dataclass(kind):
+            raise BadCacheFile(f"{node['class']} is no dataclass")
+        build: Any = kind
+        return build(**{name: _decode(child, arrays) for name, child in node["members"].items()})
+    if "enum" in node:
+        kind = _class(node["enum"])
+        if not issubclass(kind, enum.Enum):
+            raise BadCacheFile(f"{node['enum']} is no enum")
+        return kind(node["value"])
+    if "dict" in node:
+        return {_decode(k, arrays): _decode(v, arrays) for k, v in node["dict"]}
+    if "tuple" in node:
+        return tuple(_decode(child, arrays) for child in node["tuple"])
+    if "frozenset" in node:
+        return frozenset(_decode(child, arrays) for child in node["frozenset"])
+    return [_decode(child, arrays) for child in node["list"]]
+
+
+def _name(kind: type) -> str:
+    return f"{kind.__module__}:{kind.__qualname__}"
+
+
+def _class(name: str) -> Any:
+    module, _, qualname = name.partition(":")
+    if not module.startswith(PACKAGES) or "." in qualname:
+        raise BadCacheFile(f"{name} is not a class a cache file may name")
+    found = getattr(importlib.import_module(module), qualname)
+    if not isinstance(found, type) or found.__module__ != module:
+        raise BadCacheFile(f"{name} is not a class of {module}")
+    return found

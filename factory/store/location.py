@@ -1,0 +1,99 @@
+"""Where a store lives: a folder or an object-store URL, with the few file operations the store needs."""
+
+import os
+import secrets
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pyarrow import fs
+
+
+class BadLocation(ValueError):
+    """The output path cannot be used as it stands."""
+
+
+@dataclass(frozen=True)
+class Location:
+    """A folder: an absolute local path or a URL such as s3://bucket/prefix.
+
+    `options` are deltalake's `storage_options` (AWS_ENDPOINT_URL, AWS_ACCESS_KEY_ID, ...); empty on local disk.
+    """
+
+    uri: str
+    options: Mapping[str, str] = field(default_factory=dict)
+
+    @staticmethod
+    def parse(out: str | os.PathLike[str], options: Mapping[str, str] | None = None) -> "Location":
+        """Raises BadLocation for a relative path inside a submitted Ray job, whose folder is a temporary copy."""
+        text = os.fspath(out)
+        if "://" in text:
+            return Location(text.rstrip("/"), dict(options or {}))
+        path = Path(text).expanduser()
+        if not path.is_absolute() and "RAY_JOB_CONFIG_JSON_ENV_VAR" in os.environ:  # set by Ray for a job's driver
+            raise BadLocation(
+                f"out={text} is relative, and a submitted job runs in a copy: name an absolute path or a URL"
+            )
+        return Location(str(path.resolve()), dict(options or {}))
+
+    @property
+    def is_local(self) -> bool:
+        return "://" not in self.uri
+
+    def child(self, name: str) -> "Location":
+        return Location(f"{self.uri}/{name}", self.options)
+
+    def read(self, name: str) -> bytes | None:
+        """The file's bytes; None where there is no such file."""
+        filesystem, base = self.filesystem()
+        try:
+            with filesystem.open_input_stream(f"{base}/{name}", compression=None) as stream:
+                return bytes(stream.read())
+        except FileNotFoundError:
+            return None
+
+    def write(self, name: str, data: bytes) -> None:
+        """Whole file or no file: rename on local disk (flushed first), one put on an object store."""
+        if not self.is_local:
+            filesystem, base = self.filesystem()
+            with filesystem.open_output_stream(f"{base}/{name}", compression=None) as stream:
+                stream.write(data)
+            return
+        target = Path(self.uri, name)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        draft = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
+        with draft.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        draft.replace(target)
+
+    def remove(self, name: str) -> None:
+        filesystem, base = self.filesystem()
+        filesystem.delete_file(f"{base}/{name}")
+
+    def names(self) -> list[str]:
+        """Paths of all files below, relative to this folder, sorted."""
+        filesystem, base = self.filesystem()
+        found = filesystem.get_file_info(fs.FileSelector(base, recursive=True, allow_not_found=True))
+        return sorted(info.path[len(base) + 1 :] for info in found if info.type == fs.FileType.File)
+
+    def filesystem(self) -> tuple[fs.FileSystem, str]:
+        if self.is_local:
+            return fs.LocalFileSystem(), self.uri
+        if self.uri.startswith("s3://") and self.options:
+            endpoint = self.options.get("AWS_ENDPOINT_URL", "")
+            scheme, _, host = endpoint.rpartition("://")
+            return (
+                fs.S3FileSystem(
+                    access_key=self.options.get("AWS_ACCESS_KEY_ID"),
+                    secret_key=self.options.get("AWS_SECRET_ACCESS_KEY"),
+                    session_token=self.options.get("AWS_SESSION_TOKEN"),
+                    region=self.options.get("AWS_REGION"),
+                    scheme=scheme or "https",
+                    endpoint_override=host or None,
+                ),
+                self.uri.removeprefix("s3://"),
+            )
+        filesystem, base = fs.FileSystem.from_uri(self.uri)
+        return filesystem, base

@@ -1,0 +1,98 @@
+"""The table `outcomes`: what became of every attempt that is not a sample, one row per attempt_id.
+
+A row about a clip as a whole (a bad file, a standing ego) has candidate -1 and no expert; `exhausted` stands behind the
+last candidate of a walk. A newer outcome of the same attempt replaces the older one. Timings live here and nowhere else.
+"""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from enum import StrEnum
+
+import pyarrow as pa
+
+from factory.store.table import TableSpec
+
+
+class Kind(StrEnum):
+    ACCEPTED = "accepted"  # stands in `samples`, never here
+    REJECTED = "rejected"
+    FAILED = "failed"
+    EXHAUSTED = "exhausted"
+
+
+class ErrorKind(StrEnum):
+    NONE = ""
+    INPUT = "input"  # the clip is broken: waits for retry or a raised stage version
+    BUG = "bug"  # the code raised: likewise
+    SYSTEM = "system"  # a worker died, a disk was full: the next run tries again
+    POISON = "poison"  # failed(system) in QUARANTINE_AFTER runs: waits like a bug
+
+
+QUARANTINE_AFTER = 3  # runs, each with Ray's own retries
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One row of the table."""
+
+    attempt_id: str
+    clip_id: str
+    dataset: str
+    log_id: str
+    expert: str
+    expert_digest: str
+    candidate_index: int
+    kind: str  # Kind
+    settings_hash: str
+    stage_versions: str  # canonical JSON
+    stage: str = ""  # rejected: by which stage
+    reason: str = ""  # rejected: why
+    detail: str = ""
+    error_kind: str = ""  # ErrorKind
+    error: str = ""  # last lines of the traceback
+    tries: int = 1  # runs that tried it
+    n_tried: int = 0  # exhausted: length of the candidate list
+    subscores: dict[str, float] = field(default_factory=dict)  # rejected: as far as known
+    seconds: dict[str, float] = field(default_factory=dict)  # stage -> seconds
+
+
+SCHEMA = pa.schema(
+    [
+        *(
+            pa.field(name, pa.string())
+            for name in ("attempt_id", "clip_id", "dataset", "log_id", "expert", "expert_digest")
+        ),
+        pa.field("candidate_index", pa.int32()),
+        *(
+            pa.field(name, pa.string())
+            for name in (
+                "kind",
+                "settings_hash",
+                "stage_versions",
+                "stage",
+                "reason",
+                "detail",
+                "error_kind",
+                "error",
+            )
+        ),
+        pa.field("tries", pa.int32()),
+        pa.field("n_tried", pa.int32()),
+        pa.field("subscores", pa.map_(pa.string(), pa.float64())),
+        pa.field("seconds", pa.map_(pa.string(), pa.float64())),
+    ]
+)
+OUTCOMES = TableSpec("outcomes", SCHEMA, "attempt_id")
+
+
+def outcomes_table(outcomes: Sequence[Outcome]) -> pa.Table:
+    rows = [asdict(o) | {"subscores": list(o.subscores.items()), "seconds": list(o.seconds.items())} for o in outcomes]
+    return pa.Table.from_pylist(rows, schema=SCHEMA)
+
+
+def outcomes_of(table: pa.Table) -> list[Outcome]:
+    """Rows of a complete outcomes table."""
+    return [
+        Outcome(**row | {"subscores": dict(row["subscores"] or ()), "seconds": dict(row["seconds"] or ())})
+        for row in table.to_pylist()
+    ]

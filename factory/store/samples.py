@@ -1,0 +1,205 @@
+"""A store: the tables samples, candidates and outcomes, the cache beside them, and what they say is done.
+
+The sample commit is the truth. A group of results is committed in the order candidates, samples, outcomes, so that a
+crash in between loses at most the outcomes, whose attempts the next run tries again with the same result.
+"""
+
+import json
+import os
+import re
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from factory.store.cache import ClipCache
+from factory.store.candidates import CANDIDATES, ClipCandidates, candidates_of, candidates_table
+from factory.store.location import Location
+from factory.store.outcomes import OUTCOMES, Kind, Outcome, outcomes_of, outcomes_table
+from factory.store.schema import SCHEMA_VERSION, samples_spec
+from factory.store.table import KeyedTable, Shard, write_shard
+from factory.work import RunIdentity, canonical_json
+
+OnChange = Literal["stop", "keep", "redo"]
+RUN_FILE = "run.json"
+SAMPLE_STATE = [
+    "attempt_id",
+    "clip_id",
+    "expert",
+    "expert_digest",
+    "candidate_index",
+    "round",
+    "settings_hash",
+    "stage_versions",
+]
+
+
+class ChangedRun(ValueError):
+    """The run's settings, versions or expert inputs differ from the table's; the message names each difference."""
+
+
+Place = tuple[str, str]
+
+
+@dataclass(frozen=True)
+class Past:
+    """What the tables say about one attempt."""
+
+    attempt_id: str
+    kind: Kind
+    current: bool  # made under the run's own settings, versions and expert inputs
+    round: int = -1  # accepted: its round
+    outcome: Outcome | None = None  # not accepted: its row
+
+
+@dataclass(frozen=True)
+class History:
+    """What the tables say. A walk is a (clip_id, expert); the expert "" stands for the clip as a whole."""
+
+    walks: Mapping[Place, Mapping[int, Past]]  # candidate -> what became of it; a current row hides one that is not
+    stale: Mapping[Place, frozenset[str]]  # attempt_ids of rows that are not current
+    candidates: Mapping[str, ClipCandidates]  # clip_id -> its list
+
+
+class Store:
+    """One run's view of everything under `out`. Opening writes nothing."""
+
+    def __init__(
+        self, out: str | os.PathLike[str] | Location, storage_options: Mapping[str, str] | None = None
+    ) -> None:
+        self.location = out if isinstance(out, Location) else Location.parse(out, storage_options)
+        self.samples = KeyedTable(self.location.child("samples"), samples_spec())
+        self.candidates = KeyedTable(self.location.child("candidates"), CANDIDATES)
+        self.outcomes = KeyedTable(self.location.child("outcomes"), OUTCOMES)
+
+    @property
+    def cache(self) -> ClipCache:
+        return ClipCache(self.location.child("cache/prepared"))
+
+    def agree(self, identity: RunIdentity, expert_digests: Mapping[str, str], on_change: OnChange) -> None:
+        """Check the run against the one the tables were made by, and record it when it is new or a change is accepted.
+
+        Raises ChangedRun. `keep` and `redo` record the change; the newest record is what the next run is held against.
+        """
+        for expert in expert_digests:
+            if not re.fullmatch(r"[A-Za-z0-9_-]+", expert):
+                raise ChangedRun(f"expert {expert!r}: a name is letters, digits, _ and - (it becomes a folder)")
+        records = self.runs()
+        record = {
+            "settings": dict(identity.settings),
+            "settings_hash": identity.settings_hash,
+            "stage_versions": dict(identity.stage_versions),
+            "vocabulary_digest": identity.vocabulary_digest,
+            "prepare_digest": identity.prepare_digest,
+            "expert_digests": dict(expert_digests),
+        }
+        record = json.loads(canonical_json(record))
+        if not records and (len(self.samples) or len(self.outcomes)):
+            raise ChangedRun(
+                f"{self.location.uri}: {RUN_FILE} is missing beside tables with rows; restore it or take another out"
+            )
+        if records:
+            changes = differences(records[-1], record)
+            if changes and on_change == "stop":
+                raise ChangedRun(
+                    f"{self.location.uri} was made with other settings: {'; '.join(changes)}. "
+                    "Go on with on_change=keep, replace with on_change=redo, or choose another out"
+                )
+            if not changes:
+                record["expert_digests"] = records[-1]["expert_digests"] | record["expert_digests"]
+                records = records[:-1]
+        new = [*records, record]
+        if new != self.runs():
+            document = {"schema_version": SCHEMA_VERSION, "runs": new}
+            self.location.write(RUN_FILE, (json.dumps(document, indent=1, sort_keys=True) + "\n").encode())
+
+    def runs(self) -> list[dict[str, object]]:
+        """The settings the rows were made with, oldest first. Raises ChangedRun for an unreadable run.json."""
+        data = self.location.read(RUN_FILE)
+        if data is None:
+            return []
+        try:
+            document = json.loads(data)
+            version, runs = document["schema_version"], list(document["runs"])
+        except (ValueError, KeyError, TypeError) as error:
+            raise ChangedRun(f"{self.location.uri}/{RUN_FILE}: not readable: {error}") from error
+        if version != SCHEMA_VERSION:
+            raise ChangedRun(f"{self.location.uri}: schema_version {version}, this version writes {SCHEMA_VERSION}")
+        return runs
+
+    def history(self, identity: RunIdentity, expert_digests: Mapping[str, str]) -> History:
+        """Everything the tables know, samples winning over outcomes of the same attempt."""
+
+        def current(settings_hash: str, versions: str, expert: str, digest: str) -> bool:
+            return (
+                settings_hash == identity.settings_hash
+                and versions == identity.versions_json
+                and digest == expert_digests.get(expert, digest)
+            )
+
+        walks: dict[Place, dict[int, Past]] = defaultdict(dict)
+        stale: dict[Place, set[str]] = defaultdict(set)
+
+        def enter(place: Place, candidate: int, past: Past) -> None:
+            known = walks[place].get(candidate)
+            if known is None or past.current or not known.current:
+                walks[place][candidate] = past
+            if not past.current:
+                stale[place].add(past.attempt_id)
+
+        for o in outcomes_of(self.outcomes.read()):
+            is_current = current(o.settings_hash, o.stage_versions, o.expert, o.expert_digest)
+            enter((o.clip_id, o.expert), o.candidate_index, Past(o.attempt_id, Kind(o.kind), is_current, outcome=o))
+        for row in self.samples.read(SAMPLE_STATE).to_pylist():
+            is_current = current(row["settings_hash"], row["stage_versions"], row["expert"], row["expert_digest"])
+            past = Past(row["attempt_id"], Kind.ACCEPTED, is_current, round=row["round"])
+            enter((row["clip_id"], row["expert"]), row["candidate_index"], past)
+        lists = {row.clip_id: row for row in candidates_of(self.candidates.read())}
+        return History(walks, {place: frozenset(ids) for place, ids in stale.items()}, lists)
+
+    def claim(self) -> None:
+        """Make every older run's commits fail."""
+        for table in (self.candidates, self.samples, self.outcomes):
+            table.claim()
+
+    def commit(
+        self,
+        candidates: Sequence[ClipCandidates],
+        shards: Sequence[Shard],
+        outcomes: Sequence[Outcome],
+        replaced: Sequence[str] = (),
+    ) -> None:
+        """Commit one group of results; `replaced` are attempt_ids whose rows these results take the place of.
+
+        Raises DuplicateKey and AnotherWriter.
+        """
+        if candidates:
+            rows = write_shard(self.candidates.location, CANDIDATES, candidates_table(candidates))
+            self.candidates.commit([rows], drop=rows.keys)
+        accepted = [key for shard in shards for key in shard.keys]
+        self.samples.commit(shards, drop=replaced)
+        # A failed outcome stands until its attempt succeeds: then it goes, and it never stands twice.
+        files = [write_shard(self.outcomes.location, OUTCOMES, outcomes_table(outcomes))] if outcomes else []
+        self.outcomes.commit(files, drop=[*accepted, *replaced, *(o.attempt_id for o in outcomes)])
+
+    def tidy(self) -> None:
+        """Drop outcomes whose attempt is a sample: what a crash between the two commits leaves behind."""
+        self.outcomes.commit([], drop=[key for key in self.outcomes if key in self.samples])
+
+
+def differences(old: Mapping[str, object], new: Mapping[str, object]) -> list[str]:
+    """What differs between two records of run.json, in words; an expert that only one of them has is no difference."""
+    found = []
+    for part, word in (("settings", ""), ("stage_versions", "stage version "), ("expert_digests", "inputs of expert ")):
+        a, b = dict(old[part]), dict(new[part])  # type: ignore[call-overload]
+        names = sorted(set(a) & set(b)) if part == "expert_digests" else sorted(set(a) | set(b))
+        missing = "not set"
+        found += [
+            f"{word}{n}: {a.get(n, missing)} -> {b.get(n, missing)}"
+            for n in names
+            if a.get(n, missing) != b.get(n, missing)
+        ]
+    for part, word in (("vocabulary_digest", "vocabulary"), ("prepare_digest", "what perturb depends on")):
+        if old[part] != new[part] and not (part == "prepare_digest" and found):
+            found.append(f"{word}: {old[part]} -> {new[part]}")
+    return found
