@@ -205,7 +205,7 @@ def _nearest_centerline_pose(lane: Lane, pose: Array) -> tuple[float, float]:
 def _candidate_costs(lanes: Sequence[Lane], distances: Array, pose: Array) -> dict[str, float]:
     """Cost of each lane that the pose (3,) may be on."""
     costs = {}
-    for index in np.flatnonzero(distances <= MAX_LANE_DISTANCE_M):
+    for index in np.flatnonzero(distances <= MAX_LANE_DISTANCE_M).tolist():
         to_centerline, heading_error = _nearest_centerline_pose(lanes[index], pose)
         if abs(heading_error) <= MAX_HEADING_ERROR_RAD:
             costs[lanes[index].lane_id] = (
