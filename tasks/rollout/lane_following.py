@@ -1,0 +1,313 @@
+"""The path a vehicle drives: a way through the lane graph, shifted sideways as its log shows.
+
+At every fork the log decides: of all ways that start at the vehicle and are long enough, the one nearest to the logged
+track wins, the straightest where the log does not tell. Along it the vehicle keeps the lateral offset its log has there
+(people do not drive on the centreline, and pass parked cars with room), fading to the centre where the log ends; beyond
+the last lane (the map's crop) the path goes straight on.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from tasks.rollout.idm import PATH_SPACING_M
+from tasks.world.frames import wrap_angle
+from tasks.world.lanes import Lane, RoadMap
+
+Array = NDArray[np.float64]
+
+SNAP_HEADING_RAD = math.radians(60.0)
+HEADING_COST_M = 2.0  # metres of distance one radian is worth, as in the route matching (METRIC.md section 0)
+COST_CAP_M = 6.0  # a logged point farther than this from a way says no more against it
+START_COST_WEIGHT = 0.3  # of the distance at the start, against the mean distance of the log
+MAX_WAYS = 48  # ways compared at most, straightest first
+BEHIND_M = 15.0  # of path kept behind the vehicle
+LOG_POINT_SPACING_M = 2.0  # of the logged points the offset is taken from
+MAX_LOG_OFFSET_M = 4.5  # a log farther than this from the way is not followed sideways
+FADE_M = 30.0  # from the log's last offset to the centre
+SMOOTHING_POINTS = 7  # 3 m
+
+
+@dataclass(frozen=True)
+class LaneIndex:
+    """All lanes cars drive on, as flat arrays."""
+
+    lanes: tuple[Lane, ...]
+    number: Mapping[str, int]  # lane id -> index
+    points: Array  # (Q, 3) all centreline poses
+    first: NDArray[np.int64]  # (L + 1,) lane l has points first[l]..first[l + 1] - 1
+    discs: Array  # (L, 3) centre and radius of a disc around each centreline
+
+
+@dataclass(frozen=True)
+class LanePath:
+    """A way through the lane graph as points every PATH_SPACING_M."""
+
+    xy: Array  # (P, 2) [m]
+    heading: Array  # (P,) [rad], unwrapped
+    height: Array  # (P,) of the lane's boundaries [m], 0 where the map has none
+    speed_limit_mps: Array  # (P,) NaN where unknown
+    lane_entries: tuple[
+        tuple[str, float], ...
+    ]  # (lane id, path length of its start, negative behind the path), in driving order
+
+
+def index_lanes(road_map: RoadMap) -> LaneIndex:
+    """Flat arrays of the lanes cars drive on; lanes of a single point are left out."""
+    lanes = tuple(lane for lane in road_map.lanes.values() if lane.drives_cars and len(lane.centerline) >= 2)
+    points = np.concatenate([lane.centerline for lane in lanes]) if lanes else np.zeros((0, 3))
+    first = np.concatenate([[0], np.cumsum([len(lane.centerline) for lane in lanes])]).astype(np.int64)
+    discs = np.zeros((len(lanes), 3))
+    for k, lane in enumerate(lanes):
+        xy = lane.centerline[:, :2]
+        middle = 0.5 * (xy.min(axis=0) + xy.max(axis=0))
+        discs[k] = *middle, np.sqrt(((xy - middle) ** 2).sum(axis=1).max())
+    return LaneIndex(
+        lanes, {lane.lane_id: k for k, lane in enumerate(lanes)}, np.ascontiguousarray(points), first, discs
+    )
+
+
+@njit(cache=True, nogil=True)
+def _distances(
+    poses: Array, points: Array, first: NDArray[np.int64], discs: Array, reach: float
+) -> tuple[Array, Array]:
+    """Distance to and heading difference at the nearest point of every lane, (K, L) each; inf beyond `reach`."""
+    n_poses, n_lanes = poses.shape[0], discs.shape[0]
+    distance = np.full((n_poses, n_lanes), np.inf)
+    difference = np.full((n_poses, n_lanes), np.inf)
+    for i in range(n_poses):
+        x, y, h = poses[i]
+        for lane in range(n_lanes):
+            if math.hypot(x - discs[lane, 0], y - discs[lane, 1]) > discs[lane, 2] + reach:
+                continue
+            best, best_k = np.inf, 0
+            for k in range(first[lane], first[lane + 1] - 1):
+                ex, ey = points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1]
+                dx, dy = x - points[k, 0], y - points[k, 1]
+                f = (dx * ex + dy * ey) / max(ex * ex + ey * ey, 1e-12)
+                f = min(max(f, 0.0), 1.0)
+                square = (dx - f * ex) ** 2 + (dy - f * ey) ** 2
+                if square < best:
+                    best, best_k = square, k
+            if best <= reach * reach:
+                distance[i, lane] = math.sqrt(best)
+                turned = h - points[best_k, 2]
+                difference[i, lane] = abs((turned + math.pi) % (2.0 * math.pi) - math.pi)
+    return distance, difference
+
+
+def lane_costs(index: LaneIndex, poses: Array) -> tuple[Array, Array]:
+    """(distance [m], |heading difference| [rad]) of poses (K, 3) to every lane, (K, L); inf beyond COST_CAP_M."""
+    return _distances(np.ascontiguousarray(poses), index.points, index.first, index.discs, COST_CAP_M)
+
+
+def on_a_lane(distance: Array, difference: Array, snap_distance_m: float) -> NDArray[np.bool_]:
+    """(..., L) lanes a vehicle can be said to drive on."""
+    return (distance <= snap_distance_m) & (difference <= SNAP_HEADING_RAD)
+
+
+def find_path(
+    index: LaneIndex, pose: Array, log_poses: Array, snap_distance_m: float, ahead_m: float
+) -> LanePath | None:
+    """The path of the vehicle at `pose` (3,), `ahead_m` long ahead of it; None where it is on no lane.
+
+    log_poses (K, 3): where its log is over the whole clip, before and after.
+    """
+    distance, difference = lane_costs(index, pose[None])
+    starts = list(np.flatnonzero(on_a_lane(distance[0], difference[0], snap_distance_m)))
+    if not starts:
+        return None
+    starts = _with_neighbors(index, starts, distance[0], difference[0])
+    reach = _log_reach(pose, log_poses)
+    ways = _ways(index, starts, pose, reach)
+    if len(ways) > 1:
+        costs = _point_costs(*lane_costs(index, log_poses))
+        start_costs = _point_costs(distance, difference)[0]
+        scores = [costs[:, way].min(axis=1).mean() + START_COST_WEIGHT * start_costs[way[0]] for way in ways]
+        way = ways[int(np.argmin(np.round(scores, 6)))]  # rounded: a turned world must not change a tie
+    else:
+        way = ways[0]
+    return _path_of(index, _extended(index, way, pose, ahead_m), pose, log_poses, ahead_m)
+
+
+def _point_costs(distance: Array, difference: Array) -> Array:
+    return np.minimum(distance + HEADING_COST_M * difference, COST_CAP_M)
+
+
+def _with_neighbors(index: LaneIndex, starts: list[int], distance: Array, difference: Array) -> list[int]:
+    """Starts, nearest first, and the lanes beside them in the same direction: the log may change lanes."""
+    starts = sorted(starts, key=lambda k: (round(distance[k] + HEADING_COST_M * difference[k], 6), k))
+    beside = []
+    for k in starts:
+        for neighbor in (index.lanes[k].left_neighbor, index.lanes[k].right_neighbor):
+            other = index.number.get(neighbor) if neighbor is not None else None
+            if other is not None and other not in starts and difference[other] <= SNAP_HEADING_RAD:
+                beside.append(other)
+    return list(dict.fromkeys(starts + beside))
+
+
+def _log_reach(pose: Array, log_poses: Array) -> float:
+    """How far ways must go to be told apart: as far as the log gets from here."""
+    return float(np.hypot(*(log_poses[:, :2] - pose[:2]).T).max(initial=0.0)) * 1.2 + 10.0
+
+
+def _left_of_lane(lane: Lane, pose: Array) -> float:
+    """Length of the lane still ahead of a pose."""
+    xy = lane.centerline[:, :2]
+    nearest = int(np.argmin(((xy - pose[:2]) ** 2).sum(axis=1)))
+    return float(np.hypot(*np.diff(xy[nearest:], axis=0).T).sum())
+
+
+def _successors(index: LaneIndex, lane: int) -> list[int]:
+    """Following lanes, straightest first."""
+    heading = index.lanes[lane].centerline[-1, 2]
+    following = [index.number[name] for name in index.lanes[lane].successors if name in index.number]
+    turns = {k: round(abs(float(wrap_angle(index.lanes[k].centerline[-1, 2] - heading))), 6) for k in following}
+    return sorted(following, key=lambda k: (turns[k], k))
+
+
+def _ways(index: LaneIndex, starts: list[int], pose: Array, reach: float) -> list[list[int]]:
+    """Lane sequences from each start that are `reach` long or end with the map; straightest first, MAX_WAYS at most."""
+    ways: list[list[int]] = []
+    for start in starts:
+        stack = [([start], _left_of_lane(index.lanes[start], pose))]
+        while stack and len(ways) < MAX_WAYS:
+            way, length = stack.pop()
+            following = [k for k in _successors(index, way[-1]) if k not in way] if length < reach else []
+            if not following:
+                ways.append(way)
+            for k in reversed(following):
+                stack.append(([*way, k], length + index.lanes[k].length_m))
+    return ways
+
+
+def _extended(index: LaneIndex, way: list[int], pose: Array, ahead_m: float) -> list[int]:
+    """The way, straight on until it is `ahead_m` long."""
+    way = list(way)
+    length = _left_of_lane(index.lanes[way[0]], pose) + sum(index.lanes[k].length_m for k in way[1:])
+    while length < ahead_m:
+        following = [k for k in _successors(index, way[-1]) if k not in way]
+        if not following:
+            break
+        way.append(following[0])
+        length += index.lanes[way[-1]].length_m
+    return way
+
+
+def _lane_height(lane: Lane) -> Array:
+    """(P,) height of the centreline's points, from the boundaries; 0 where the map has none."""
+    if lane.left_boundary is None or lane.right_boundary is None:
+        return np.zeros(len(lane.centerline))
+    along = np.linspace(0.0, 1.0, len(lane.centerline))
+    heights = np.zeros(len(along))
+    for boundary in (lane.left_boundary, lane.right_boundary):
+        length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(boundary[:, :2], axis=0).T))])
+        heights += 0.5 * np.interp(along, length / max(length[-1], 1e-9), boundary[:, 2])
+    return np.nan_to_num(heights)
+
+
+def _path_of(index: LaneIndex, way: list[int], pose: Array, log_poses: Array, ahead_m: float) -> LanePath:
+    lanes = [index.lanes[k] for k in way]
+    xy = np.concatenate([lane.centerline[:, :2] for lane in lanes])
+    height = np.concatenate([_lane_height(lane) for lane in lanes])
+    limit = np.concatenate(
+        [np.full(len(lane.centerline), lane.speed_limit_mps or np.nan, dtype=np.float64) for lane in lanes]
+    )
+    owner = np.repeat(np.arange(len(lanes)), [len(lane.centerline) for lane in lanes])
+    keep = np.concatenate([[True], np.hypot(*np.diff(xy, axis=0).T) > 0.05])  # joints' points stand twice
+    xy, height, limit, owner = xy[keep], height[keep], limit[keep], owner[keep]
+    length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
+
+    # A window around the vehicle, straight on where the lanes end.
+    here = float(_frenet(xy, length, pose[None])[0, 0])
+    grid = here - BEHIND_M + PATH_SPACING_M * np.arange(math.ceil((BEHIND_M + ahead_m) / PATH_SPACING_M) + 1)
+    center = _at(xy, length, grid)
+    left = _normals(center)
+    offset = _log_offset(center, pose, log_poses)
+    shifted = center + offset[:, None] * left
+
+    # The shift changes lengths a little: even spacing again, everything else carried along.
+    shifted_length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(shifted, axis=0).T))])
+    even = PATH_SPACING_M * np.arange(len(grid))
+    points = _at(shifted, shifted_length, even)
+    source = np.interp(even, shifted_length, grid)  # lane length of each even point
+    nearest = np.clip(np.searchsorted(length, source, side="right") - 1, 0, len(length) - 1)
+    starts = {int(k): float(length[np.argmax(owner == k)]) for k in np.unique(owner)}
+    entries = tuple(
+        (lanes[k].lane_id, float(np.interp(at, grid, shifted_length)) + min(at - grid[0], 0.0))
+        for k, at in starts.items()
+        if at < grid[-1]
+    )
+    return LanePath(
+        xy=points,
+        heading=_chord_headings(points),
+        height=np.interp(source, length, height),
+        speed_limit_mps=limit[nearest],
+        lane_entries=entries,
+    )
+
+
+def _at(xy: Array, length: Array, at: Array) -> Array:
+    """Points of a polyline at path lengths, straight on past both ends."""
+    out = np.stack([np.interp(at, length, xy[:, 0]), np.interp(at, length, xy[:, 1])], axis=-1)
+    for beyond, end, inner in ((at - length[-1], -1, -2), (at - length[0], 0, 1)):
+        past = beyond > 0 if end == -1 else beyond < 0
+        direction = (xy[end] - xy[inner]) / np.hypot(*(xy[end] - xy[inner])) * (1.0 if end == -1 else -1.0)
+        out[past] = xy[end] + beyond[past, None] * direction
+    return out
+
+
+def _chord_headings(points: Array, reach: int = 3) -> Array:
+    """Headings (P,) of chords 2 * reach points long, unwrapped: what a body as long as a car does at a kink."""
+    n = len(points)
+    ahead, behind = np.minimum(np.arange(n) + reach, n - 1), np.maximum(np.arange(n) - reach, 0)
+    chord = points[ahead] - points[behind]
+    return np.unwrap(np.arctan2(chord[:, 1], chord[:, 0]))
+
+
+def _normals(points: Array) -> Array:
+    """(P, 2) unit vectors to the left."""
+    heading = _chord_headings(points)
+    return np.stack([-np.sin(heading), np.cos(heading)], axis=-1)
+
+
+def _frenet(xy: Array, length: Array, poses: Array) -> Array:
+    """(K, 2) path length and offset to the left of the polyline's points nearest to poses (K, >= 2)."""
+    edge = np.diff(xy, axis=0)  # (E, 2)
+    to = poses[:, None, :2] - xy[None, :-1]  # (K, E, 2)
+    square = np.maximum((edge**2).sum(axis=1), 1e-12)
+    f = np.clip((to * edge).sum(axis=2) / square, 0.0, 1.0)
+    rest = to - f[..., None] * edge
+    distance = (rest**2).sum(axis=2)
+    k = distance.argmin(axis=1)
+    row = np.arange(len(poses))
+    side = edge[k, 0] * to[row, k, 1] - edge[k, 1] * to[row, k, 0]
+    return np.stack([length[k] + f[row, k] * np.sqrt(square[k]), np.copysign(np.sqrt(distance[row, k]), side)], axis=1)
+
+
+def _log_offset(center: Array, pose: Array, log_poses: Array) -> Array:
+    """(P,) lateral offset of the log from the lane centre at every path point; the vehicle's own where the log is not."""
+    grid = PATH_SPACING_M * np.arange(len(center))
+    heading = _chord_headings(center)
+    poses = np.concatenate([pose[None], log_poses])
+    frenet = _frenet(center, grid, poses)
+    at, offset = frenet[:, 0], frenet[:, 1]
+    turned = np.abs(wrap_angle(poses[:, 2] - np.interp(at, grid, heading)))
+    usable = (np.abs(offset) <= MAX_LOG_OFFSET_M) & (turned <= SNAP_HEADING_RAD) & (at > 0.0) & (at < grid[-1])
+    if not usable[1:].any():
+        return np.zeros(len(center))  # the log is elsewhere: the start's own offset fades as it drives
+    order = np.argsort(at[1:][usable[1:]], kind="stable")
+    at, offset = at[1:][usable[1:]][order], offset[1:][usable[1:]][order]
+    chosen = [0]
+    for k in range(1, len(at)):
+        if at[k] - at[chosen[-1]] >= LOG_POINT_SPACING_M:
+            chosen.append(k)
+    profile = np.interp(grid, at[chosen], offset[chosen])
+    u = np.clip((grid - at[chosen[-1]]) / FADE_M, 0.0, 1.0)
+    profile *= 1.0 - u * u * (3.0 - 2.0 * u)
+    padded = np.pad(profile, SMOOTHING_POINTS // 2, mode="edge")
+    return np.convolve(padded, np.full(SMOOTHING_POINTS, 1.0 / SMOOTHING_POINTS), mode="valid")

@@ -1,0 +1,143 @@
+"""The driver model alone: closed forms and geometry against slow, obvious twins."""
+
+import numpy as np
+import pytest
+import shapely
+import shapely.ops
+
+from tasks.rollout.idm import (
+    Driver,
+    Paths,
+    advance,
+    boxes_overlap,
+    corners_of,
+    corridor_gap,
+    idm_acceleration,
+    pose_on_path,
+    project_on_path,
+    stop_line_gap,
+)
+from tasks.world.frames import box_corners
+
+DRIVER = Driver(1.0, 1.5, 1.0, 2.0, 4.0, 8.0, 60.0, 0.0, 20.0, 5.0, 30.0)
+
+
+def one_path(xy: np.ndarray, lines: tuple[tuple[float, int], ...] = ()) -> Paths:
+    """A single path through points 0.5 m apart."""
+    edge = np.gradient(xy, axis=0)
+    return Paths(
+        xy=xy[None],
+        heading=np.unwrap(np.arctan2(edge[:, 1], edge[:, 0]))[None],
+        height=np.zeros((1, len(xy))),
+        target_speed=np.full((1, len(xy)), 10.0),
+        line_start=np.array([0, len(lines)]),
+        line_at=np.array([at for at, _ in lines], dtype=float),
+        line_state=np.array([[state for _, state in lines]] * 41, dtype=np.uint8).reshape(41, len(lines)),
+    )
+
+
+def circle(radius: float) -> Paths:
+    step = 0.5 / radius
+    angles = np.arange(int(1.5 * np.pi / step)) * step
+    return one_path(radius * np.column_stack([np.sin(angles), 1.0 - np.cos(angles)]))
+
+
+def test_a_free_road_follows_the_closed_form() -> None:
+    """dv/dt = a (1 - (v/v0)^4) from rest integrates to t = v0/2a (artanh u + arctan u), u = v/v0."""
+    speed = 0.0
+    for step in range(1, 401):
+        _, speed = advance(speed, idm_acceleration(speed, 10.0, np.inf, 0.0, DRIVER))
+        u = speed / 10.0
+        if u < 0.95:
+            assert 5.0 * (np.arctanh(u) + np.arctan(u)) == pytest.approx(0.1 * step, abs=0.15)
+    assert speed == pytest.approx(10.0, abs=0.02)
+
+
+def test_in_equilibrium_the_gap_is_idms_own() -> None:
+    """At equal speeds and zero acceleration: gap = (s0 + v T) / sqrt(1 - (v/v0)^4)."""
+    for speed in (0.0, 3.0, 8.0):
+        gap = (1.0 + 1.5 * speed) / np.sqrt(1.0 - (speed / 10.0) ** 4)
+        assert idm_acceleration(speed, 10.0, gap, speed, DRIVER) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_too_fast_on_a_free_road_brakes_comfortably_and_a_wall_brakes_at_the_tyres_limit() -> None:
+    assert idm_acceleration(20.0, 10.0, np.inf, 0.0, DRIVER) == -2.0
+    assert idm_acceleration(20.0, 10.0, 2.0, 0.0, DRIVER) == -8.0
+
+
+def test_a_braking_car_stops_where_it_stops_and_never_reverses() -> None:
+    distance, speed = advance(0.4, -8.0)
+    assert (distance, speed) == (pytest.approx(0.4**2 / 16.0), 0.0)
+    assert advance(0.0, -8.0) == (0.0, 0.0)
+
+
+def test_overlap_equals_shapely() -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(2000):
+        a, b = (np.array([*rng.uniform(-4, 4, 2), rng.uniform(-4, 4), *rng.uniform(0.3, 6, 2)]) for _ in range(2))
+        area = shapely.Polygon(box_corners(a)).intersection(shapely.Polygon(box_corners(b))).area
+        if area > 1e-9 or area == 0.0:
+            assert boxes_overlap(a, b) == (area > 0.0)
+
+
+def test_an_absent_box_overlaps_nothing() -> None:
+    there, absent = np.array([0.0, 0.0, 0.0, 4.0, 2.0]), np.full(5, np.nan)
+    assert not boxes_overlap(there, absent) and not boxes_overlap(absent, there)
+
+
+def corridor_gap_by_shapely(xy: np.ndarray, nose: float, half_width: float, box: np.ndarray) -> float:
+    """Slow twin: the first stretch of the buffered path, in 5 cm steps, that meets the box."""
+    line, polygon = shapely.LineString(xy), shapely.Polygon(box_corners(box))
+    for ahead in np.arange(0.0, 60.0, 0.05):
+        if nose + ahead + 0.05 > line.length:
+            break
+        piece = shapely.ops.substring(line, nose + ahead, nose + ahead + 0.05)
+        if piece.buffer(half_width, cap_style="flat").intersects(polygon):
+            return float(ahead)
+    return np.inf
+
+
+@pytest.mark.parametrize("radius", [20.0, 1e5])
+def test_the_corridor_gap_equals_its_slow_twin(radius: float) -> None:
+    paths = circle(radius) if radius < 1e3 else one_path(np.column_stack([np.arange(0, 120, 0.5), np.zeros(240)]))
+    rng = np.random.default_rng(2)
+    hits = 0
+    for _ in range(60):
+        k = rng.integers(20, paths.xy.shape[1] - 40)
+        center = paths.xy[0, k] + rng.uniform(-4, 4, 2)
+        box = np.array([*center, rng.uniform(-3, 3), rng.uniform(0.5, 6), rng.uniform(0.5, 2.5)])
+        corners = np.zeros((4, 2))
+        corners_of(box, corners)
+        gap, _ = corridor_gap(
+            paths, 0, 5.0, 0.0, 0.0, 0.0, 2.3, 0.95, corners, box, np.hypot(*box[3:]) / 2.0, DRIVER
+        )  # fmt: skip
+        slow = corridor_gap_by_shapely(paths.xy[0], 7.3, 0.95, box)
+        if np.isfinite(slow) != np.isfinite(gap):  # only a graze may be judged differently
+            thinner, wider = (corridor_gap_by_shapely(paths.xy[0], 7.3, w, box) for w in (0.85, 1.05))
+            assert np.isinf(thinner) and np.isfinite(wider)
+        elif np.isfinite(slow):
+            hits += 1
+            assert gap == pytest.approx(slow, abs=0.35)
+    assert hits > 10
+
+
+def test_a_start_beside_the_path_is_kept_and_fades_without_a_jump() -> None:
+    paths = circle(30.0)
+    x0, y0, h0 = pose_on_path(paths, 0, 12.0, 0.0, 1.2, 0.1, 20.0)
+    s, left = project_on_path(paths, 0, x0, y0)
+    assert (s, left) == (pytest.approx(12.0, abs=0.05), pytest.approx(1.2, abs=0.01))
+    poses = np.array([pose_on_path(paths, 0, 12.0 + t, t, 1.2, 0.1, 20.0) for t in np.arange(0.0, 25.0, 0.1)])
+    assert np.abs(np.diff(poses[:, 2])).max() < 0.03
+    assert np.hypot(*np.diff(poses[:, :2], axis=0).T).max() < 0.12
+    assert project_on_path(paths, 0, poses[-1, 0], poses[-1, 1])[1] == pytest.approx(0.0, abs=0.01)
+
+
+def test_lines_stop_who_can_stop_and_let_pass_who_has_passed() -> None:
+    road = np.column_stack([np.arange(0, 100, 0.5), np.zeros(200)])
+    red, yellow, green = (one_path(road, ((50.0, state),)) for state in (2, 1, 0))
+    assert stop_line_gap(red, 0, 0, 40.0, 10.0, 2.0) == 10.0
+    assert stop_line_gap(green, 0, 0, 40.0, 10.0, 2.0) == np.inf
+    assert stop_line_gap(yellow, 0, 0, 20.0, 10.0, 2.0) == 30.0
+    assert stop_line_gap(yellow, 0, 0, 40.0, 10.0, 2.0) == np.inf  # 25 m needed
+    assert stop_line_gap(red, 0, 0, 50.5, 0.0, 2.0) == 0.0  # stopped with the nose over the line
+    assert stop_line_gap(red, 0, 0, 50.5, 5.0, 2.0) == np.inf

@@ -1,0 +1,298 @@
+"""The joint rollout as claims: who moves, who waits, and that nothing jumps."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import shapely
+
+from tasks.rollout.simulate import TrafficSettings, next_scene, prepare_traffic, roll_out, simulate
+from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.clip import CLIP_STEPS, NOW, STEP_S, Rollout, Scene, scene_of_clip
+from tasks.world.frames import box_corners
+from tasks.world.lanes import Lane, LightState, TrafficLights
+from tests.tasks.rollout import worlds
+from tests.tasks.rollout.worlds import Track
+
+IDM = TrafficSettings()
+
+
+def run(scene: Scene, settings: TrafficSettings = IDM) -> Rollout:
+    return simulate(scene, worlds.straight_plan(scene), settings)
+
+
+def overlap_area(agents: AgentTracks, i: int, j: int) -> float:
+    """Largest shared area [m2] over all steps."""
+    both = agents.valid[:, i] & agents.valid[:, j]
+    a, b = (shapely.polygons(box_corners(agents.boxes[both, k])) for k in (i, j))
+    return float(shapely.area(shapely.intersection(a, b)).max(initial=0.0))
+
+
+def test_a_car_alone_accelerates_towards_the_target_speed_on_its_lane() -> None:
+    rollout = run(worlds.scene(worlds.straight_road(), Track(0.0, speed=5.0)))
+    speed = rollout.agents.velocities[:, 0, 0]
+    assert rollout.simulated.tolist() == [True]
+    assert (np.diff(speed) > 0).all() and 8.0 < speed[-1] < 9.0
+    assert rollout.agents.boxes[:, 0, 1] == pytest.approx(0.0, abs=1e-9)
+    moved = np.diff(rollout.agents.boxes[:, 0, 0])
+    assert moved == pytest.approx(STEP_S * 0.5 * (speed[1:] + speed[:-1]), abs=1e-6)
+
+
+def test_the_lanes_speed_limit_replaces_the_default_target() -> None:
+    road = {"road": replace(worlds.straight_road()["road"], speed_limit_mps=4.0)}
+    speed = run(worlds.scene(road, Track(0.0, speed=4.0))).agents.velocities[:, 0, 0]
+    assert speed == pytest.approx(4.0, abs=1e-6)
+
+
+def test_a_follower_stops_behind_a_standing_car_with_the_minimum_gap() -> None:
+    """Two rollouts long: it never touches, and settles about min_gap_m behind."""
+    scene = worlds.scene(worlds.straight_road(), Track(0.0, speed=8.0), Track(32.0))
+    first = run(scene)
+    second = run(next_scene(scene, first, scene.centerline))
+    boxes = np.concatenate([first.agents.boxes, second.agents.boxes[1:]])
+    gap = boxes[:, 1, 0] - boxes[:, 0, 0] - worlds.CAR[0]
+    assert gap.min() > 0.9 and gap[-1] < 4.0
+    assert first.simulated.tolist() == [True, False]
+    assert (boxes[:, 1] == scene.agents.boxes[NOW, 1]).all()
+
+
+def test_a_follower_brakes_for_the_ego_where_the_egos_body_is() -> None:
+    """Rear axle at 30 m: the bumper it must not touch is 1.127 m behind that."""
+    scene = worlds.scene(worlds.straight_road(), Track(0.0, speed=8.0), ego=(30.0, 0.0, 0.0))
+    rollout = run(next_scene(scene, run(scene), scene.centerline))
+    nose = rollout.agents.boxes[-1, 0, 0] + worlds.CAR[0] / 2.0
+    assert 30.0 - 1.127 - 4.0 < nose < 30.0 - 1.127 - 0.9
+
+
+def test_a_car_leaves_its_first_segment_and_takes_the_fork_its_log_takes() -> None:
+    turn = np.column_stack([np.linspace(28.5, 60, 30), np.zeros(30), np.zeros(30)])
+    arc = np.radians(np.linspace(0, 90, 30))
+    bend = np.column_stack([60 + 12 * np.sin(arc), 12 - 12 * np.cos(arc), arc])
+    out = np.column_stack([np.full(36, 72.0), np.linspace(12, 40, 36), np.full(36, np.pi / 2)])
+    logged = np.concatenate([turn, bend, out])
+    assert len(logged) == CLIP_STEPS
+    scene = worlds.scene(worlds.fork(), Track(0.0, poses=logged))
+    turning = run(next_scene(scene, run(scene), scene.centerline)).agents.boxes[-1, 0]
+    assert turning[0] == pytest.approx(72.0, abs=0.3) and turning[1] > 15.0
+    assert turning[2] == pytest.approx(np.pi / 2, abs=0.05)
+
+
+def test_without_a_log_beyond_the_fork_the_straightest_way_is_taken() -> None:
+    scene = worlds.scene(worlds.fork(), Track(40.0, speed=9.0, last=NOW))
+    rollout = run(scene)
+    assert rollout.agents.valid[:, 0].all(), "a driven car goes on when its log ends"
+    assert rollout.agents.boxes[-1, 0, 0] > 70.0 and abs(rollout.agents.boxes[-1, 0, 1]) < 0.05
+
+
+def test_a_car_slows_down_before_a_curve() -> None:
+    turn = {k: v for k, v in worlds.fork().items() if k != "ahead"}
+    turn["in"] = replace(turn["in"], successors=("left",))
+    scene = worlds.scene(turn, Track(38.0, speed=10.0, last=NOW))
+    speed = np.hypot(*run(scene).agents.velocities[:, 0].T)
+    assert speed.min() < 7.0  # sqrt(3 m/s2 * 12 m) = 6 m/s
+    assert np.diff(speed).min() > -0.45
+
+
+def red_until(step: int) -> TrafficLights:
+    states = np.full((CLIP_STEPS, 1), LightState.GREEN, np.int8)
+    states[:step] = LightState.RED
+    return TrafficLights(("ahead",), states)
+
+
+def test_a_red_light_stops_and_a_green_one_lets_go() -> None:
+    def nose(until: int) -> float:
+        scene = worlds.scene(worlds.fork(), Track(30.0, speed=7.0, last=NOW), lights=red_until(until))
+        return float(run(scene).agents.boxes[-1, 0, 0] + worlds.CAR[0] / 2.0)
+
+    assert 50.0 < nose(CLIP_STEPS) < 60.0
+    assert nose(0) > 60.0
+    assert nose(CLIP_STEPS) < nose(NOW + 20)
+
+
+def test_a_stop_at_a_junction_that_only_the_log_explains_is_kept() -> None:
+    """The log stops at x = 55 (nose 57.3, entry at 60) from 2 s after T for good: a light that the map does not have."""
+    way = np.minimum(55.0, 55.0 - 8.0 * STEP_S * (NOW + 20 - np.arange(CLIP_STEPS)))
+    scene = worlds.scene(worlds.fork(), Track(0.0, poses=np.column_stack([way, 0 * way, 0 * way])))
+    first = run(scene)
+    last = run(next_scene(scene, first, scene.centerline)).agents.boxes[-1, 0, 0]
+    assert 52.0 < last < 58.0
+
+
+def test_a_car_that_stands_starts_no_sooner_than_in_its_log_and_keeps_its_box_to_the_bit() -> None:
+    way = np.maximum(0.0, (np.arange(CLIP_STEPS) - NOW - 20) * STEP_S * 5.0)
+    scene = worlds.scene(worlds.straight_road(), Track(0.0, poses=np.column_stack([way, 0 * way, 0 * way])))
+    boxes = run(scene).agents.boxes[:, 0]
+    assert (boxes[:20] == boxes[0]).all() and boxes[-1, 0] > 1.0
+
+
+def test_a_parked_car_stays_and_one_off_the_lanes_replays() -> None:
+    scene = worlds.scene(worlds.straight_road(), Track(10.0, 2.2), Track(0.0, 40.0, speed=5.0))
+    rollout = run(scene)
+    assert rollout.simulated.tolist() == [False, False]
+    assert (rollout.agents.boxes[:, 0] == scene.agents.boxes[NOW, 0]).all()
+    assert np.array_equal(rollout.agents.boxes[:, 1], scene.agents.boxes[NOW : NOW + 41, 1])
+
+
+def test_an_entering_car_waits_for_room_and_enters_driven_else_never() -> None:
+    def entry(ego_x: float) -> Rollout:
+        return run(worlds.scene(worlds.straight_road(), Track(0.0, speed=8.0, first=NOW + 10), ego=(ego_x, 0.0, 0.0)))
+
+    free = entry(200.0)
+    assert not free.agents.valid[:10, 0].any() and free.agents.valid[10:, 0].all() and free.simulated[0]
+    assert free.agents.boxes[10, 0, 0] == pytest.approx(8.0)
+    # The ego stands 25 m behind the place of first sight: the car enters once its log is 30 m away.
+    waits = entry(8.0 - 25.0)
+    first = int(np.argmax(waits.agents.valid[:, 0]))
+    assert first > 10 and waits.agents.boxes[first, 0, 0] + 17.0 - 1.461 >= 30.0
+    assert not entry(20.0).agents.valid.any()
+
+
+def test_a_pedestrian_waits_for_a_driven_car_and_then_goes_on_late() -> None:
+    """Crosses at x = 20 just when the driven car, faster than in its log, is there; the log itself is free."""
+    walker = Track(14.0, -7.0, np.pi / 2, 1.5, AgentKind.PEDESTRIAN, (0.6, 0.6))
+    car = Track(-6.0, speed=1.0)  # in the log it crawls
+    scene = worlds.scene(worlds.straight_road(), car, walker)
+    settings = replace(IDM, lookahead_m=0.01)  # a driver who does not look: the walker must
+    fast = replace(scene, agents=replace(scene.agents, velocities=scene.agents.velocities * [[[8.0], [1.0]]]))
+    rollout = simulate(fast, worlds.straight_plan(fast), settings)
+    assert overlap_area(rollout.agents, 0, 1) == 0.0
+
+
+def test_a_driven_car_stops_for_a_pedestrian_on_its_way() -> None:
+    stands = Track(25.0, 0.3, kind=AgentKind.PEDESTRIAN, size=(0.6, 0.6))
+    scene = worlds.scene(worlds.straight_road(), Track(0.0, speed=8.0), stands)
+    first = run(scene)
+    second = run(next_scene(scene, first, scene.centerline))
+    assert overlap_area(first.agents, 0, 1) == overlap_area(second.agents, 0, 1) == 0.0
+
+
+def test_replay_returns_the_log_bit_for_bit() -> None:
+    scene = worlds.scene(worlds.straight_road(), Track(0.0, speed=5.0), Track(30.0, speed=1.0, first=40, last=60))
+    rollout = run(scene, TrafficSettings(mode="replay"))
+    for name in ("boxes", "velocities", "valid", "center_z"):
+        assert np.array_equal(
+            getattr(rollout.agents, name), getattr(scene.agents, name)[NOW : NOW + 41], equal_nan=name != "valid"
+        )
+    assert not rollout.simulated.any()
+
+
+def busy_scene() -> Scene:
+    members = [
+        Track(0.0, 0.3, 0.02, 8.0),
+        Track(18.0, -0.4, speed=6.0),
+        Track(45.0, 0.2, speed=4.0, last=30),
+        Track(-30.0, 0.0, speed=9.0, first=25),
+        Track(30.0, -6.0, np.pi / 2, 1.4, AgentKind.PEDESTRIAN, (0.6, 0.6)),
+        Track(52.0, 2.3),
+    ]
+    return worlds.scene(worlds.fork(), *members, ego=(-12.0, 0.5, 0.03), ego_speed=7.0)
+
+
+def test_row_zero_is_the_scene_and_nothing_jumps() -> None:
+    scene = busy_scene()
+    agents = run(scene).agents
+    for name in ("boxes", "velocities", "valid", "center_z"):
+        assert np.array_equal(getattr(agents, name)[0], getattr(scene.agents, name)[NOW], equal_nan=name != "valid")
+    both = agents.valid[1:] & agents.valid[:-1]
+    moved = np.hypot(*np.moveaxis(np.diff(agents.boxes[..., :2], axis=0), -1, 0))[both]
+    turned = np.abs(np.diff(agents.boxes[..., 2], axis=0))[both]
+    assert moved.max() < 1.1 and turned.max() < 0.06
+
+
+def test_the_order_of_the_agents_does_not_matter() -> None:
+    scene = busy_scene()
+    order = np.array([3, 5, 0, 4, 2, 1])
+
+    def shuffled(agents: AgentTracks) -> AgentTracks:
+        return AgentTracks(
+            tuple(agents.track_ids[i] for i in order),
+            tuple(agents.kinds[i] for i in order),
+            agents.boxes[:, order],
+            agents.velocities[:, order],
+            agents.valid[:, order],
+            agents.center_z[:, order],
+            agents.heights[order],
+        )
+
+    plain = run(scene)
+    other = run(scene_of_clip(replace(scene.clip, agents=shuffled(scene.clip.agents))))
+    assert np.array_equal(plain.agents.boxes[:, order], other.agents.boxes, equal_nan=True)
+    assert np.array_equal(plain.simulated[order], other.simulated)
+
+
+def moved_scene(scene: Scene, angle: float, shift: tuple[float, float]) -> Scene:
+    """The whole world turned about the origin and shifted."""
+    c, s = np.cos(angle), np.sin(angle)
+    turn = np.array([[c, -s], [s, c]])
+
+    def poses(p: np.ndarray) -> np.ndarray:
+        return np.concatenate([p[..., :2] @ turn.T + shift, p[..., 2:3] + angle, p[..., 3:]], axis=-1)
+
+    def lane(of: Lane) -> Lane:
+        return replace(of, ring=of.ring @ turn.T + shift, centerline=poses(of.centerline))
+
+    clip = scene.clip
+    agents = replace(clip.agents, boxes=poses(clip.agents.boxes), velocities=clip.agents.velocities @ turn.T)
+    lanes = {k: lane(v) for k, v in clip.road_map.lanes.items()}
+    return scene_of_clip(
+        replace(clip, agents=agents, road_map=replace(clip.road_map, lanes=lanes), ego_states=poses(clip.ego_states))
+    )
+
+
+def test_a_shifted_and_turned_world_rolls_out_the_same() -> None:
+    scene = busy_scene()
+    angle, shift = 2.1, (3000.0, -1500.0)
+    expected, got = run(scene).agents, run(moved_scene(scene, angle, shift)).agents
+    assert np.array_equal(expected.valid, got.valid)
+    c, s = np.cos(angle), np.sin(angle)
+    xy = expected.boxes[..., :2] @ np.array([[c, s], [-s, c]]) + shift
+    assert got.boxes[..., :2][got.valid] == pytest.approx(xy[expected.valid], abs=1e-6)
+
+
+def test_the_second_rollout_starts_where_the_first_ended() -> None:
+    scene = busy_scene()
+    first = run(scene)
+    after = next_scene(scene, first, scene.centerline)
+    assert after.step == NOW + 40 and after.ego_history.shape == (16, 11)
+    assert np.array_equal(after.ego_history, first.ego_states[25:])
+    assert np.array_equal(after.agents.boxes[: NOW + 1], scene.agents.boxes[: NOW + 1], equal_nan=True)
+    assert np.array_equal(after.agents.boxes[NOW + 41 :], scene.agents.boxes[NOW + 41 :], equal_nan=True)
+    assert after.ever_simulated is not None and np.array_equal(after.ever_simulated, first.simulated)
+    second = run(after)
+    assert np.array_equal(second.agents.boxes[0], first.agents.boxes[-1], equal_nan=True)
+    driven = first.simulated
+    assert second.agents.valid[:, driven].all() and second.simulated[driven].all()
+    jump = np.hypot(*(second.agents.boxes[1, driven, :2] - second.agents.boxes[0, driven, :2]).T)
+    assert jump == pytest.approx(STEP_S * np.hypot(*second.agents.velocities[0, driven].T), abs=0.05)
+
+
+def test_a_pedestrian_made_late_in_the_first_rollout_stays_late_in_the_second() -> None:
+    walker = Track(30.0, -6.0, np.pi / 2, 1.5, AgentKind.PEDESTRIAN, (0.6, 0.6))
+    scene = worlds.scene(worlds.straight_road(), walker)
+    first = run(scene)
+    late = first.agents.boxes.copy()
+    late[21:] = late[11:31]  # it waited a second
+    rollout = replace(first, agents=replace(first.agents, boxes=late))
+    second = run(next_scene(scene, rollout, scene.centerline))
+    expected = scene.agents.boxes[NOW + 30 : NOW + 71]
+    assert second.agents.boxes == pytest.approx(expected)
+
+
+def test_a_prepared_scene_gives_the_same_rollout() -> None:
+    scene = busy_scene()
+    direct = run(scene)
+    prepared = prepare_traffic(scene, IDM)
+    again = roll_out(prepared, direct.ego_states)
+    assert np.array_equal(direct.agents.boxes, again.agents.boxes, equal_nan=True)
+
+
+def test_an_empty_street_rolls_out() -> None:
+    rollout = run(worlds.scene(worlds.straight_road()))
+    assert rollout.agents.boxes.shape == (41, 0, 5)
+
+
+def test_settings_that_mean_nothing_are_refused_by_name() -> None:
+    with pytest.raises(ValueError, match="headway_s"):
+        TrafficSettings(headway_s=0.0)
+    with pytest.raises(ValueError, match="mode"):
+        TrafficSettings(mode="idle")  # type: ignore[arg-type]
