@@ -1,0 +1,142 @@
+"""A judged drive as a sample row (columns of factory.store.schema): the world in the frame of the ego at now."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factory.store.schema import AGENT_STEPS, FIRST_FAILURES, MAP_RADIUS_M, NOW_INDEX
+from tasks.attempt import Judged
+from tasks.perturb import Candidate, end_speed_mps
+from tasks.reward.epdms import Scores
+from tasks.stages import SUBSCORES
+from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, Scene
+from tasks.world.command import driving_command
+from tasks.world.frames import points_to_local, to_local
+from tasks.world.vehicle import AX, AY, HEADING, VX, VY
+
+Array = NDArray[np.float64]
+NEAR_M = 30.0  # for the tags
+
+
+def sample_row(clip: Clip, candidate: Candidate | None, judged: Judged) -> dict[str, object]:
+    """Everything of a sample but images and bookkeeping; candidate None: the human row.
+
+    The label of a simulated row is the simulated drive, of the human row the log itself.
+    """
+    scene, pose = judged.scene, judged.scene.ego_state[: HEADING + 1]
+    human = candidate is None
+    label = judged.plan.poses if human else judged.rollout.ego_states[1:, : HEADING + 1]
+    command = driving_command(scene.centerline, pose)
+    return {
+        "clip_id": clip.clip_id,
+        "dataset": clip.dataset,
+        "log_id": clip.log_id,
+        "split": clip.split,
+        "clip_start_s": clip.start_s,
+        "now_s": scene.step * STEP_S,
+        "vocabulary_index": None if candidate is None else candidate.vocabulary_index,
+        "content_digest": clip.content_digest,
+        "licence": clip.licence,
+        "parent_states": clip.ego_states[[NOW, NOW + HORIZON_STEPS]],
+        "now_pose": pose,
+        "ego_history_10hz": to_local(pose, scene.ego_history[:, : HEADING + 1]),
+        "ego_history_2hz": to_local(pose, scene.ego_history[::5, : HEADING + 1]),
+        "ego_status": scene.ego_state[[VX, VY, AX, AY]],
+        "command": command,
+        "label_10hz": to_local(pose, label),
+        "label_2hz": to_local(pose, label[4::5]),
+        "proposal_10hz": None if human else to_local(pose, judged.plan.poses),
+        "perturbed_states": None if candidate is None else candidate.rollout.ego_states,
+        "candidate_end": None if candidate is None else np.append(candidate.end_pose, end_speed_mps(candidate)),
+        **_agents(scene.agents.overwritten(scene.step, judged.rollout.agents), scene.step, pose),
+        **_map(scene, pose),
+        **({} if candidate is None else score_columns("stage1", candidate.reactive_scores)),
+        **score_columns("stage2", judged.scores),
+        "tags": _tags(scene, command),
+    }
+
+
+def score_columns(prefix: str, scores: Scores, row: int = 1) -> dict[str, object]:
+    """Sub-scores, EPDMS (/14: there is no earlier plan to compare comfort with) and first failing times."""
+    columns: dict[str, object] = {f"{prefix}_score": float(scores.pdm_score[row])}
+    for name in SUBSCORES:
+        columns[f"{prefix}_{name}"] = None if name == "ec" else float(getattr(scores, name)[row])
+    for name in FIRST_FAILURES:
+        index = float(scores.first_failures[name][row])
+        columns[f"{prefix}_{name}_fails_s"] = index * STEP_S if np.isfinite(index) else None
+    return columns
+
+
+def _agents(tracks: AgentTracks, now: int, pose: Array) -> Mapping[str, object]:
+    window = tracks.window(now - NOW_INDEX, now - NOW_INDEX + AGENT_STEPS)
+    seen = np.flatnonzero(window.valid.any(axis=0))
+    boxes = window.boxes[:, seen].copy()
+    boxes[..., :3] = to_local(pose, boxes[..., :3])
+    absent = ~window.valid[:, seen]
+    boxes[absent] = np.nan
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    velocity = window.velocities[:, seen] @ np.array([[cos, -sin], [sin, cos]])  # into the axes of the ego
+    velocity[absent] = np.nan
+    center_z = window.center_z[:, seen].copy()
+    center_z[absent] = np.nan
+    return {
+        "agent_ids": [window.track_ids[i] for i in seen],
+        "agent_kinds": [str(window.kinds[i]) for i in seen],
+        "agent_boxes": boxes.transpose(1, 0, 2),
+        "agent_velocities": velocity.transpose(1, 0, 2),
+        "agent_valid": window.valid[:, seen].T,
+        "agent_heights": window.heights[seen],
+        "agent_center_z": center_z.T,
+    }
+
+
+def _map(scene: Scene, pose: Array) -> Mapping[str, object]:
+    road_map, clip = scene.clip.road_map, scene.clip
+
+    def near(points: Array) -> bool:
+        return bool((np.hypot(*(points[:, :2] - pose[:2]).T) <= MAP_RADIUS_M).any())
+
+    def local_ring(ring: Array) -> Array:
+        return points_to_local(pose, ring[:, :2])
+
+    lanes = [lane for lane in road_map.lanes.values() if lane.drives_cars and near(lane.centerline)]
+    areas = [area.ring for area in road_map.drivable_areas if near(area.ring) or _encloses(area.ring, pose)]
+    lights = [i for i, lane_id in enumerate(clip.lights.lane_ids) if lane_id in {lane.lane_id for lane in lanes}]
+    steps = slice(scene.step - NOW_INDEX, scene.step - NOW_INDEX + AGENT_STEPS)
+    return {
+        "lane_ids": [lane.lane_id for lane in lanes],
+        "lane_polygons": [local_ring(lane.ring) for lane in lanes],
+        "lane_centerlines": [to_local(pose, lane.centerline) for lane in lanes],
+        "lane_is_intersection": [lane.is_intersection for lane in lanes],
+        "drivable_rings": [local_ring(ring) for ring in areas],
+        "crossing_rings": [local_ring(ring) for ring in road_map.crossings if near(ring)],
+        "light_lane_ids": [clip.lights.lane_ids[i] for i in lights],
+        "light_states": clip.lights.states[steps, lights].T if lights else np.zeros((0, AGENT_STEPS), np.int8),
+        "route_lane_ids": sorted(clip.route.lane_ids),
+        "route_centerline": to_local(pose, scene.centerline),
+    }
+
+
+def _encloses(ring: Array, pose: Array) -> bool:
+    """Even-odd rule: a large drivable area may have no corner near the ego and hold it all the same."""
+    a, b = ring[:-1, :2] - pose[:2], ring[1:, :2] - pose[:2]
+    crosses = (a[:, 1] > 0) != (b[:, 1] > 0)
+    a, b = a[crosses], b[crosses]
+    at_x = a[:, 0] - a[:, 1] * (b[:, 0] - a[:, 0]) / (b[:, 1] - a[:, 1])
+    return bool((at_x > 0).sum() % 2)
+
+
+def _tags(scene: Scene, command: str) -> list[str]:
+    """What is in the scene, for filters and weights."""
+    pose, now = scene.ego_state[: HEADING + 1], scene.agents.window(scene.step, scene.step + 1)
+    distance = np.where(now.valid[0], np.hypot(*(now.boxes[0, :, :2] - pose[:2]).T), np.inf)
+    kinds = {now.kinds[i] for i in np.flatnonzero(distance < NEAR_M)}
+    tags = {
+        f"command_{command}": True,
+        "near_pedestrian": AgentKind.PEDESTRIAN in kinds,
+        "near_cyclist": AgentKind.BICYCLE in kinds,
+        "slow": abs(float(scene.ego_state[VX])) < 2.0,
+    }
+    return [name for name, present in tags.items() if present]

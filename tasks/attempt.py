@@ -1,0 +1,91 @@
+"""One attempt: from a candidate's perturbed world through an expert's plan to a judged rollout.
+
+`rollout -> expert -> rollout -> reward` of tasks.stages; rendering follows elsewhere, only for what the reward kept.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tasks.experts.pdm_closed import PdmSettings, pdm_closed_poses
+from tasks.experts.protocol import Expert, Plan
+from tasks.reward.epdms import Scores, score
+from tasks.reward.prepare import prepare_scene
+from tasks.rollout.lqr import track
+from tasks.rollout.simulate import TrafficSettings, next_scene, simulate
+from tasks.stages import Rejected
+from tasks.world.clip import Clip, Rollout, Scene, scene_of_clip
+from tasks.world.route import centerline_from
+from tasks.world.vehicle import HEADING
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ExpertGate:
+    """Which sub-scores an expert's rollout must reach (paper, supplement: S_m = 1 for all but EP, EP > 0.5)."""
+
+    full: tuple[str, ...] = ("nc", "dac", "ddc", "tlc", "ttc", "lk", "hc")  # EC needs an earlier plan: there is none
+    progress_above: float = 0.5
+
+
+@dataclass(frozen=True)
+class Judged:
+    """An expert's plan, driven and scored."""
+
+    scene: Scene  # at T+H (simulated samples) or T (human)
+    plan: Plan
+    rollout: Rollout
+    scores: Scores  # row 1 is this rollout, row 0 PDM-Closed
+
+
+def perturbed_scene(clip: Clip, stage_one: Rollout) -> Scene:
+    """The world at T+H that a candidate's rollout leads to."""
+    end = stage_one.ego_states[-1]
+    return next_scene(scene_of_clip(clip), stage_one, centerline_from(clip.road_map, clip.route, end[: HEADING + 1]))
+
+
+def drive_and_judge(
+    scene: Scene, plan: Plan, traffic: TrafficSettings, planner: PdmSettings, pdm_poses: Array | None = None
+) -> Judged:
+    """Simulate the plan with the traffic and score it in the two-row batch [PDM-Closed, plan]."""
+    rollout = simulate(scene, plan.poses, traffic)
+    pdm = pdm_closed_poses(scene, planner) if pdm_poses is None else pdm_poses
+    states = np.concatenate([track(scene.ego_state, pdm[None]), rollout.ego_states[None]])
+    return Judged(scene, plan, rollout, score(prepare_scene(scene, rollout.agents), states, normalise="pairs"))
+
+
+def verdict(scores: Scores, gate: ExpertGate, row: int = 1) -> Rejected | None:
+    """None when the row passes the gate, else the first sub-score that fails, with all of them in the detail."""
+    failed = [f"{name}={getattr(scores, name)[row]:g}" for name in gate.full if getattr(scores, name)[row] < 1.0]
+    if scores.ep[row] <= gate.progress_above:
+        failed.append(f"ep={scores.ep[row]:.3f}")
+    return Rejected("reward", failed[0].split("=")[0], " ".join(failed)) if failed else None
+
+
+def attempt(
+    scene: Scene,
+    expert: Expert,
+    gate: ExpertGate,
+    traffic: TrafficSettings,
+    planner: PdmSettings,
+    rng: np.random.Generator,
+) -> tuple[Judged, Rejected | None] | Rejected:
+    """Let `expert` plan from the perturbed scene, drive its plan and judge it.
+
+    Returns:
+        The judged drive and the verdict (None: accepted), or Rejected where the expert has no plan.
+    """
+    plan = expert.plan(scene, rng)
+    if isinstance(plan, Rejected):
+        return plan
+    judged = drive_and_judge(scene, plan, traffic, planner, plan.poses if expert.name == "pdm_closed" else None)
+    return judged, verdict(judged.scores, gate)
+
+
+def human_sample(scene: Scene, expert: Expert, planner: PdmSettings, rng: np.random.Generator) -> Judged:
+    """The logged drive from T, scored under log replay and never filtered."""
+    plan = expert.plan(scene, rng)
+    assert isinstance(plan, Plan), "the log always has a plan"
+    return drive_and_judge(scene, plan, TrafficSettings(mode="replay"), planner)

@@ -1,0 +1,204 @@
+"""Perturbation: which vocabulary trajectories take the ego somewhere new, near the log, and lawfully.
+
+Paper, section "Trajectory Perturbation" and the configuration table of its supplement. The order of the filters:
+gates on the raw end pose, LQR, gates on the reached end pose, an interleaved grid over the reached end poses, per
+cell the first trajectory in seeded order with a non-reactive EPDMS at the threshold (log replay), then the same
+threshold under reactive traffic on the kept ones only. Scores are needed only until a cell is filled, so cells are
+walked abreast: the same result as filter-then-pick at a fraction of the scores.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tasks.experts.pdm_closed import PdmSettings, pdm_closed_poses
+from tasks.reward.epdms import Scores, score
+from tasks.reward.prepare import prepare_scene
+from tasks.rollout.lqr import track
+from tasks.rollout.simulate import TrafficSettings, prepare_traffic, simulate
+from tasks.stages import Rejected
+from tasks.vocabulary import Vocabulary
+from tasks.world.clip import HORIZON_STEPS, NOW, Clip, Rollout, scene_of_clip
+from tasks.world.frames import to_local, to_world
+from tasks.world.vehicle import HEADING, VX
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PerturbSettings:
+    """Paper, supplement, table of the curation pipeline."""
+
+    max_heading_deg: float = 20.0
+    max_longitudinal_m: float = 20.0
+    max_lateral_m: float = 2.0
+    step_longitudinal_m: float = 5.0
+    step_lateral_m: float = 0.5
+    epdms_min: float = 0.8  # /14 score, without EC
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A perturbation of one clip, with the reactive rollout that proved it."""
+
+    vocabulary_index: int
+    end_pose: Array  # (3,) reached at T+H, in the frame of the logged pose at T+H
+    cell: tuple[int, int]  # longitudinal, lateral index of the grid
+    score: float  # EPDMS (/14) under log replay
+    reactive_score: float  # EPDMS (/14) under reactive traffic
+    reactive_scores: Scores  # row 1 is the candidate, row 0 PDM-Closed
+    rollout: Rollout
+
+
+@dataclass(frozen=True)
+class Perturbation:
+    """The ordered candidate list of a clip, and what each gate dropped."""
+
+    candidates: tuple[Candidate, ...]
+    gate_counts: dict[str, int]
+    considered: "Considered"
+
+
+@dataclass(frozen=True)
+class Considered:
+    """Every vocabulary trajectory that passed the raw gates, and what became of it: for `explain` and pictures."""
+
+    vocabulary_index: NDArray[np.int64]  # (G,)
+    end_pose: Array  # (G, 3) reached, in the frame of the logged pose at T+H
+    fate: tuple[str, ...]  # (G,) "reached_gate", "white_cell", "not_needed", "score", "reactive", "kept"
+    score: Array  # (G,) EPDMS under log replay, NaN where it was not needed
+
+
+def gate_failures(end_poses: Array, settings: PerturbSettings) -> dict[str, NDArray[np.bool_]]:
+    """Which end poses (..., 3), in the frame of the logged pose at T+H, each gate drops."""
+    return {
+        "longitudinal": np.abs(end_poses[..., 0]) > settings.max_longitudinal_m,
+        "lateral": np.abs(end_poses[..., 1]) > settings.max_lateral_m,
+        "heading": np.abs(end_poses[..., 2]) > np.deg2rad(settings.max_heading_deg),
+    }
+
+
+def grid_cells(end_poses: Array, settings: PerturbSettings) -> NDArray[np.int64]:
+    """Cell (..., 2) of end poses (..., 3): longitudinal and lateral index; cell (0, 0) is centred on the log."""
+    steps = np.array([settings.step_longitudinal_m, settings.step_lateral_m])
+    return np.floor(end_poses[..., :2] / steps + 0.5).astype(np.int64)
+
+
+def first_good_per_cell(
+    cell_of: NDArray[np.int64], order: NDArray[np.int64], is_good: Callable[[NDArray[np.int64]], NDArray[np.bool_]]
+) -> NDArray[np.int64]:
+    """Per cell the first member, in `order`, that is good; cells in the order of their first member.
+
+    Args:
+        cell_of: (G, 2) cell of each trajectory.
+        order: (G',) the trajectories to walk, in seeded order.
+        is_good: asked for a batch of trajectories at a time, at most once for each.
+
+    Returns:
+        (C,) the chosen trajectories.
+    """
+    queues: dict[tuple[int, int], list[int]] = {}
+    for member in order:
+        queues.setdefault((int(cell_of[member, 0]), int(cell_of[member, 1])), []).append(int(member))
+    chosen: dict[tuple[int, int], int] = {}
+    rank = 0
+    while True:
+        asked = [(cell, queue[rank]) for cell, queue in queues.items() if cell not in chosen and rank < len(queue)]
+        if not asked:
+            return np.array([chosen[cell] for cell in queues if cell in chosen], dtype=np.int64)
+        good = is_good(np.array([member for _, member in asked], dtype=np.int64))
+        chosen.update({cell: member for (cell, member), ok in zip(asked, good) if ok})
+        rank += 1
+
+
+def perturb(
+    clip: Clip,
+    vocabulary: Vocabulary,
+    settings: PerturbSettings,
+    traffic: TrafficSettings,
+    planner: PdmSettings,
+    rng: np.random.Generator,
+) -> Perturbation | Rejected:
+    """The ordered candidates of a clip.
+
+    Args:
+        clip: the recording.
+        vocabulary: trajectories (K, 40, 3) in the ego frame.
+        settings: gates, grid and threshold.
+        traffic: of the reactive check.
+        planner: PDM-Closed, the first row of every two-row batch that normalises progress.
+        rng: the clip's `perturb` stream; draws one permutation of the vocabulary.
+
+    Returns:
+        Perturbation, or Rejected "no_gated_candidate" / "no_good_candidate".
+    """
+    scene = scene_of_clip(clip)
+    start = scene.ego_state
+    target = clip.ego_states[NOW + HORIZON_STEPS, : HEADING + 1]  # the logged pose at T+H
+    walk_order = rng.permutation(len(vocabulary.trajectories))
+
+    # Only end poses are moved for all K; whole trajectories for the few that stay.
+    raw_ends = to_local(target, to_world(start[: HEADING + 1], vocabulary.trajectories[:, -1]))
+    raw_fails = gate_failures(raw_ends, settings)
+    gated = np.flatnonzero(~np.logical_or.reduce(list(raw_fails.values())))
+    counts = {f"raw_{name}": int(fails.sum()) for name, fails in raw_fails.items()}
+    if len(gated) == 0:
+        return Rejected("perturb", "no_gated_candidate", f"none of {len(raw_ends)} trajectories ends near the log")
+
+    states = track(start, to_world(start[: HEADING + 1], vocabulary.trajectories[gated]))
+    ends = to_local(target, states[:, -1, : HEADING + 1])
+    end_fails = gate_failures(ends, settings)
+    reached = ~np.logical_or.reduce(list(end_fails.values()))
+    counts |= {f"reached_{name}": int(fails.sum()) for name, fails in end_fails.items()}
+    cells = grid_cells(ends, settings)
+    black = cells.sum(axis=1) % 2 == 0  # the interleaved half of the grid
+    counts["white_cell"] = int((reached & ~black).sum())
+
+    replay = prepare_scene(scene, scene.agents.window(NOW, NOW + HORIZON_STEPS + 1))
+    pdm_states = track(start, pdm_closed_poses(scene, planner)[None])
+    scores = np.full(len(gated), np.nan)
+
+    def passes_replay(members: NDArray[np.int64]) -> NDArray[np.bool_]:
+        result = score(replay, np.concatenate([pdm_states, states[members]]), normalise="pairs")
+        scores[members] = result.pdm_score[1:]
+        return scores[members] >= settings.epdms_min
+
+    rank = np.empty(len(walk_order), dtype=np.int64)
+    rank[walk_order] = np.arange(len(walk_order))
+    usable = np.flatnonzero(reached & black)
+    kept = first_good_per_cell(cells, usable[np.argsort(rank[gated[usable]])], passes_replay)
+    counts["scored"] = int(np.isfinite(scores).sum())
+    counts["kept_by_replay"] = len(kept)
+
+    fate = np.where(~reached, "reached_gate", np.where(~black, "white_cell", "not_needed")).astype(object)
+    fate[np.isfinite(scores)] = "score"
+    fate[kept] = "reactive"
+    traffic_scene = prepare_traffic(scene, traffic)
+    candidates = []
+    for member in kept:
+        index = int(gated[member])
+        poses = to_world(start[: HEADING + 1], vocabulary.trajectories[index])
+        rollout = simulate(scene, poses, traffic, traffic_scene)
+        reactive = score(
+            prepare_scene(scene, rollout.agents),
+            np.concatenate([pdm_states, rollout.ego_states[None]]),
+            normalise="pairs",
+        )
+        if reactive.pdm_score[1] < settings.epdms_min:
+            continue
+        fate[member] = "kept"
+        cell = (int(cells[member, 0]), int(cells[member, 1]))
+        candidates.append(
+            Candidate(index, ends[member], cell, float(scores[member]), float(reactive.pdm_score[1]), reactive, rollout)
+        )
+    counts["kept"] = len(candidates)
+    if not candidates:
+        return Rejected("perturb", "no_good_candidate", ", ".join(f"{k} {v}" for k, v in counts.items()))
+    return Perturbation(tuple(candidates), counts, Considered(gated, ends, tuple(fate), scores))
+
+
+def end_speed_mps(candidate: Candidate) -> float:
+    """Ego speed at T+H [m/s]."""
+    return float(candidate.rollout.ego_states[-1, VX])
