@@ -124,11 +124,11 @@ def angle_to(ego: Array, points: Array) -> Array:
     """Angle (C,) [rad] between the heading of ego states (C, 11) and the ray from their rear axle to points (C, 2).
 
     The cosine is not clipped, as in the public metric: where rounding lifts it above 1 the angle is NaN, so a
-    perfectly aligned object is neither ahead nor behind (METRIC.md 2g).
+    perfectly aligned object is neither ahead nor behind (METRIC.md 2g); so is one centred on the rear axle.
     """
     offset = points - ego[:, [X, Y]]
-    ray = offset / np.hypot(offset[:, 0], offset[:, 1])[:, None]
     with np.errstate(invalid="ignore"):
+        ray = offset / np.hypot(offset[:, 0], offset[:, 1])[:, None]
         angle: Array = np.arccos(np.cos(ego[:, HEADING]) * ray[:, 0] + np.sin(ego[:, HEADING]) * ray[:, 1])
     return angle
 

@@ -117,7 +117,8 @@ def test_a_red_lane_connector_changes_exactly_what_the_reference_says(shared_roo
     module = loader(shared_root)
     name = "7fab2350_44"
     inputs = module.inputs(name)
-    recorded = dict(np.load(shared_root / "reference" / name / "metrics_K256_redlight.npz"))
+    with np.load(shared_root / "reference" / name / "metrics_K256_redlight.npz") as arrays:
+        recorded = dict(arrays)
     states = track(inputs["ego_state0"], world_poses(module, inputs, module.proposals(name, 256)))
     red = tuple(str(lane) for lane in np.atleast_1d(recorded["red_lane_connector"]))
     assert_equal_scores(score(prepared_scene(inputs, red_lanes=red), states), recorded)
@@ -128,8 +129,10 @@ def test_official_rows_against_pdm_closed_with_the_human_filter(shared_root: Pat
     module = loader(shared_root)
     inputs = module.inputs(name)
     folder = shared_root / "reference" / name
-    pdm_closed = np.load(folder / "pdm_closed.npz")["chosen_trajectory_states"][:, :3]
-    idm = np.load(folder / "idm_agents.npz")
+    with np.load(folder / "pdm_closed.npz") as planner:
+        pdm_closed = planner["chosen_trajectory_states"][:, :3]
+    with np.load(folder / "idm_agents.npz") as traffic:
+        idm = dict(traffic)
     proposals = module.proposals(name, 256)
     human_poses = world_poses(module, inputs, two_hz_resampled(module, inputs))
     for row in json.loads((folder / "official_pdm_score_rows.json").read_text())["rows"]:
