@@ -243,14 +243,14 @@ def read_lights(folder: Path, road_map: RoadMap, motion: LogMotion, times_s: Arr
         return TrafficLights((), np.zeros((len(times_s), 0), np.int8))
     table = read_feather(path, ("timestamp_ns", "lane_id", "state"))
     lanes, names = table["lane_id"].astype(str), table["state"].astype(str)
-    strangers = set(lanes) - road_map.lanes.keys()
+    strangers = set(lanes.tolist()) - road_map.lanes.keys()
     if strangers:
         raise BadClip(str(path), "lane_id", f"not on the map: {sorted(strangers)}")
-    unknown = set(names) - LightState.__members__.keys()
+    unknown = set(names.tolist()) - LightState.__members__.keys()
     if unknown:
         raise BadClip(str(path), "state", f"unknown state {sorted(unknown)}")
     changed_at = motion.seconds(stamps(path, table))
-    lane_ids = tuple(sorted(set(lanes)))
+    lane_ids = tuple(sorted(set(lanes.tolist())))
     states = np.full((len(times_s), len(lane_ids)), LightState.UNKNOWN, np.int8)
     for column, lane_id in enumerate(lane_ids):
         rows = np.flatnonzero(lanes == lane_id)

@@ -119,7 +119,9 @@ def seconds_since(start_ns: int, stamps_ns: NDArray[np.int64]) -> Array:
 
 def step_times(start: int, stop: int) -> Array:
     """Seconds since the log's first annotated frame at steps start..stop-1."""
-    return np.arange(start, stop) * STEP_S
+    times: Array = np.arange(start, stop, dtype=np.float64)
+    times *= STEP_S
+    return times
 
 
 def read_feather(path: Path, columns: tuple[str, ...]) -> dict[str, NDArray[np.generic]]:
@@ -302,7 +304,7 @@ def _tracks(
     city_from_ego: Rotation,
 ) -> tuple[BoxTrack, ...]:
     """Annotated boxes, given in the ego frame of their stamp, as tracks in the city frame."""
-    unknown = set(np.unique(table["category"].astype(str))) - KIND_OF_CATEGORY.keys()
+    unknown = set(table["category"].astype(str).tolist()) - KIND_OF_CATEGORY.keys()
     if unknown:
         raise BadClip(str(path), "category", f"unknown class {sorted(unknown)}")
     sizes = numbers(path, table, SIZE_COLUMNS)

@@ -1,0 +1,211 @@
+"""Roadblocks, driven lanes and centrelines on small maps whose answer is known by hand."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import shapely
+
+from tasks.world.frames import to_world
+from tasks.world.lanes import Lane, MapLayer, MapPolygon, RoadMap
+from tasks.world.polygons import (
+    Rings,
+    centerline_from_boundaries,
+    polygons_near,
+    ring_from_boundaries,
+    valid_ring,
+)
+from tasks.world.route import NoRoute, RouteFinder, centerline_from, driven_lanes, roadblocks_of, route_of_log
+
+WIDTH = 4.0
+
+
+def lane(lane_id: str, points: list[tuple[float, float]], *, motion: np.ndarray | None = None, **graph: object) -> Lane:
+    """A lane 4 m wide around a polyline; `motion` moves and turns it with the world."""
+    line = np.asarray(points, dtype=np.float64)
+    steps = np.gradient(line, axis=0)
+    normal = np.stack([-steps[:, 1], steps[:, 0]], axis=1) / np.hypot(*steps.T)[:, None]
+    left, right = line + WIDTH / 2 * normal, line - WIDTH / 2 * normal
+    if motion is not None:
+        left, right = (to_world(motion, np.column_stack([side, np.zeros(len(side))]))[:, :2] for side in (left, right))
+    fields = {"is_intersection": False, "drives_cars": True, **graph}
+    return Lane(lane_id, ring_from_boundaries(left, right), centerline_from_boundaries(left, right), **fields)
+
+
+def mapped(*lanes: Lane) -> RoadMap:
+    by_id = {lane.lane_id: lane for lane in lanes}
+    return RoadMap(by_id, (), roadblock_of=roadblocks_of(by_id))
+
+
+def two_lane_road(motion: np.ndarray | None = None) -> RoadMap:
+    """East-bound lanes a (left) and b (right), west-bound o beside a; junction j straight on to c, k left to d."""
+    return mapped(
+        lane("a", [(0, 0), (50, 0)], right_neighbor="b", left_neighbor="o", successors=("k",), motion=motion),
+        lane("b", [(0, -4), (50, -4)], left_neighbor="a", successors=("j",), motion=motion),
+        lane("o", [(50, 4), (0, 4)], left_neighbor="a", motion=motion),
+        lane("j", [(50, -4), (70, -4)], is_intersection=True, predecessors=("b",), successors=("c",), motion=motion),
+        lane(
+            "k",
+            [(50, 0), (60, 2), (66, 10), (68, 20)],
+            is_intersection=True,
+            predecessors=("a",),
+            successors=("d",),
+            motion=motion,
+        ),
+        lane("c", [(70, -4), (170, -4)], predecessors=("j",), motion=motion),
+        lane("d", [(68, 20), (68, 90)], predecessors=("k",), motion=motion),
+        lane("bike", [(0, -8), (50, -8)], drives_cars=False, left_neighbor="b", motion=motion),
+    )
+
+
+def drive(*stops: tuple[float, float], heading: float = 0.0) -> np.ndarray:
+    """Poses every 2 m from stop to stop."""
+    parts = [np.linspace(a, b, max(2, int(np.hypot(*np.subtract(b, a)) / 2))) for a, b in pairwise(stops)]
+    points = np.concatenate(parts)
+    return np.column_stack([points, np.full(len(points), heading)])
+
+
+def test_parallel_lanes_share_a_roadblock_and_opposite_ones_do_not() -> None:
+    blocks = two_lane_road().roadblock_of
+    assert blocks["a"] == blocks["b"] != blocks["o"]
+    assert blocks["j"] == f"rbc_{blocks['b']}>{blocks['c']}"
+    assert blocks["j"] != blocks["k"]
+    assert "bike" not in blocks
+
+
+def test_a_connector_at_the_edge_of_the_map_stands_alone() -> None:
+    road_map = mapped(lane("x", [(0, 0), (9, 0)], is_intersection=True, successors=("gone",)))
+    assert road_map.roadblock_of["x"] == "rbc_x"
+
+
+def test_the_route_has_all_lanes_of_the_roadblocks_passed() -> None:
+    route = route_of_log(two_lane_road(), drive((5, -4), (60, -4)))
+    assert route.lane_path == ("b", "j", "c")
+    assert route.lane_ids == {"a", "b", "j", "c"}
+
+
+def test_a_lane_change_costs_less_than_staying_off_the_lane() -> None:
+    poses = drive((5, 0), (25, 0), (30, -4), (60, -4))
+    assert driven_lanes(two_lane_road(), poses) == ("a", "b", "j")
+
+
+def test_a_wobble_over_the_line_is_no_lane_change() -> None:
+    poses = drive((5, -4), (24, -4), (26, -2.2), (28, -4), (60, -4))
+    assert driven_lanes(two_lane_road(), poses) == ("b", "j")
+
+
+def test_the_oncoming_lane_is_never_driven_against_its_direction() -> None:
+    with pytest.raises(NoRoute):
+        driven_lanes(mapped(two_lane_road().lanes["o"]), drive((5, 4), (40, 4)))
+
+
+def test_an_ego_off_the_map_has_no_route() -> None:
+    with pytest.raises(NoRoute):
+        route_of_log(two_lane_road(), drive((500, 500), (550, 500)))
+
+
+def test_poses_off_the_lanes_are_passed_over() -> None:
+    poses = np.concatenate([drive((-30, -4), (40, -4)), drive((300, 0), (320, 0))])
+    assert driven_lanes(two_lane_road(), poses) == ("b",)
+
+
+def test_the_extension_goes_straight_on_and_stops_after_its_length() -> None:
+    lanes = [lane("s0", [(0, 0), (20, 0)], successors=("turn", "s1"))]
+    lanes.append(lane("turn", [(20, 0), (28, 2), (30, 10)]))
+    lanes += [lane(f"s{i}", [(20 * i, 0), (20 * i + 20, 0)], successors=(f"s{i + 1}",)) for i in range(1, 30)]
+    route = route_of_log(mapped(*lanes), drive((2, 0), (18, 0)))
+    assert route.lane_path == tuple(f"s{i}" for i in range(9))  # 8 x 20 m reach 150 m
+
+
+def test_a_ring_road_does_not_extend_forever() -> None:
+    lanes = [lane("p", [(0, 0), (50, 0)], successors=("q",)), lane("q", [(50, 0), (100, 0)], successors=("p",))]
+    assert route_of_log(mapped(*lanes), drive((2, 0), (40, 0))).lane_path == ("p", "q")
+
+
+def test_the_centerline_joins_lanes_with_their_shared_point_twice() -> None:
+    road_map = two_lane_road()
+    route = route_of_log(road_map, drive((5, -4), (60, -4)))
+    line = centerline_from(road_map, route, np.array([10.0, -4.0, 0.0]))
+    along = np.hypot(*np.diff(line[:, :2], axis=0).T)
+    assert (along < 1e-9).sum() == 2
+    assert np.isclose(along.sum(), 170.0)
+    assert along.max() <= 0.75 + 1e-9
+    assert np.allclose(line[:, 2], 0.0)
+
+
+def test_from_a_lane_that_does_not_lead_there_the_centerline_ends_where_it_can() -> None:
+    road_map = two_lane_road()
+    route = route_of_log(road_map, drive((5, -4), (60, -4)))
+    line = centerline_from(road_map, route, np.array([10.0, 0.0, 0.0]))  # lane a only leads left, off the route
+    assert np.allclose(line[-1, :2], [50.0, 0.0])
+
+
+def test_off_the_road_the_nearest_lane_of_the_route_counts() -> None:
+    road_map = two_lane_road()
+    finder = RouteFinder(road_map, route_of_log(road_map, drive((5, -4), (60, -4))))
+    assert finder.starting_lane(np.array([10.0, -9.0, 0.0])) == "b"
+    assert finder.starting_lane(np.array([-9.0, 0.5, 0.0])) == "a"
+
+
+def test_of_overlapping_lanes_the_one_with_the_ego_s_heading_is_taken() -> None:
+    road_map = mapped(
+        lane("s", [(-20, 0), (0, 0)], successors=("straight", "left")),
+        lane("straight", [(0, 0), (30, 0)], is_intersection=True, predecessors=("s",)),
+        lane("left", [(0, 0), (10, 4), (14, 14)], is_intersection=True, predecessors=("s",)),
+    )
+    route = route_of_log(road_map, drive((-15, 0), (20, 0)))
+    both = RouteFinder(
+        road_map, type(route)(route.lane_path, (*route.roadblock_ids, "rbc_left"), frozenset(road_map.lanes))
+    )
+    assert both.starting_lane(np.array([4.0, 0.8, 0.0])) == "straight"
+    assert both.starting_lane(np.array([4.0, 0.8, 0.6])) == "left"
+
+
+def test_the_route_does_not_depend_on_where_the_world_lies() -> None:
+    motion = np.array([1200.0, -800.0, 2.4])
+    poses = drive((5, 0), (25, 0), (30, -4), (60, -4))
+    here, there = two_lane_road(), two_lane_road(motion)
+    route = route_of_log(here, poses)
+    moved_route = route_of_log(there, to_world(motion, poses))
+    assert route == moved_route
+    line = centerline_from(here, route, poses[0])
+    moved_line = centerline_from(there, moved_route, to_world(motion, poses[0]))
+    assert np.abs(to_world(motion, line)[:, :2] - moved_line[:, :2]).max() < 1e-6
+
+
+def test_centerlines_are_shared_and_cannot_be_written() -> None:
+    road_map = two_lane_road()
+    finder = RouteFinder(road_map, route_of_log(road_map, drive((5, -4), (60, -4))))
+    line = finder.centerline_from(np.array([10.0, -4.0, 0.0]))
+    assert line is finder.centerline_from(np.array([12.0, -4.3, 0.1]))
+    with pytest.raises(ValueError, match="read-only"):
+        line[0, 0] = 1.0
+
+
+def test_ring_queries_equal_shapely() -> None:
+    rng = np.random.default_rng(3)
+    polygons = [shapely.Point(*rng.uniform(-50, 50, 2)).buffer(rng.uniform(2, 20), 3) for _ in range(12)]
+    polygons.append(shapely.Polygon([(0, 0), (20, 0), (20, 20), (10, 5), (0, 20)]))  # not convex
+    rings = Rings([np.asarray(polygon.exterior.coords) for polygon in polygons])
+    for point in rng.uniform(-60, 60, (200, 2)):
+        at = shapely.Point(point)
+        assert list(rings.contains(point)) == [polygon.contains(at) for polygon in polygons]
+        assert np.abs(rings.distances(point) - [polygon.distance(at) for polygon in polygons]).max() < 1e-9
+
+
+def test_a_crossed_ring_is_repaired_to_its_largest_part() -> None:
+    bow_tie = np.array([[0, 0], [10, 10], [10, 0], [0, 6], [0, 0]], dtype=np.float64)
+    polygon = shapely.Polygon(valid_ring(bow_tie))
+    assert polygon.is_valid
+    assert 0.0 < polygon.area < 50.0
+    with pytest.raises(ValueError, match="no area"):
+        valid_ring(np.array([[0, 0], [1, 1], [2, 2], [0, 0]], dtype=np.float64))
+
+
+def test_layers_come_in_the_reference_s_order_and_only_within_the_radius() -> None:
+    road = two_lane_road()
+    area = MapPolygon("da_1", MapLayer.DRIVABLE_AREA, np.array([[0, 0], [9, 0], [9, 9], [0, 0]], dtype=np.float64))
+    far = MapPolygon("da_2", MapLayer.DRIVABLE_AREA, area.ring + 500.0)
+    road_map = RoadMap(road.lanes, (area, far), roadblock_of=road.roadblock_of)
+    tokens = [polygon.token for polygon in polygons_near(road_map, np.array([10.0, 0.0]), radius_m=45.0)]
+    assert tokens == ["a", "b", "o", "j", "k", "int_j", "int_k", "da_1"]
