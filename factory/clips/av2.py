@@ -130,7 +130,7 @@ class AV2Reader:
         stop = start + CLIP_STEPS
         if rest or start < 0 or stop > log.motion.n_steps:
             raise BadClip(str(log.motion.folder), "start_ms", f"no window of {ref.window} starts at {ref.start_ms} ms")
-        ego_states = log.ego_states[start:stop]
+        ego_states = log.ego_states[start:stop].copy()  # the log stays with the reader, the clip is the caller's
         clip = Clip(
             clip_id=ref.clip_id,
             dataset=self.name,
@@ -143,7 +143,7 @@ class AV2Reader:
             road_map=log.road_map,
             route=log.route,
             centerline=log.finder.centerline_from(ego_states[NOW, :3]),
-            lights=TrafficLights(log.lights.lane_ids, log.lights.states[start:stop]),
+            lights=TrafficLights(log.lights.lane_ids, log.lights.states[start:stop].copy()),
             cameras=log.cameras,
             images=_within(log.motion, log.images, start),
             sweeps=_within(log.motion, log.sweeps, start),

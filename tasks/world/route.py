@@ -116,12 +116,8 @@ class RouteFinder:
     """The centreline ahead of many poses on one route: prepared once, then well under a millisecond per pose."""
 
     def __init__(self, road_map: RoadMap, route: Route) -> None:
-        blocks = set(route.roadblock_ids)
-        self._lanes = {
-            lane_id: lane
-            for lane_id, lane in road_map.lanes.items()
-            if lane_id in route.lane_ids and road_map.roadblock_of[lane_id] in blocks
-        }
+        """Raises NoRoute where the map has none of the route's lanes."""
+        self._lanes = {lane_id: lane for lane_id, lane in road_map.lanes.items() if lane_id in route.lane_ids}
         if not self._lanes:
             raise NoRoute("the route names no lane of the map")
         self._ids = list(self._lanes)
