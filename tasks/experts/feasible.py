@@ -52,7 +52,7 @@ class FeasibleSettings:
     curvature_max_1pm: float = 0.2  # turning circle of a car of this size, 10 m across
     curvature_rate_max_1pms: float = 0.2  # steering wheel speed at standstill
     weight_progress: float = 1.0
-    weight_jerk: float = 0.1
+    weight_jerk: float = 0.3
     weight_lateral: float = 1.0
     weight_heading: float = 10.0
     weight_yaw_accel: float = 0.1
