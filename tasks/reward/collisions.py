@@ -80,8 +80,7 @@ def time_to_collision(obstacles: Obstacles, states: Array, boxes: Array, areas: 
 
     angle = angle_to(ego[row, time], obstacles.centroids[time + step_of, item])
     exposed = (areas.off_lane | areas.rear_axle_in_intersection)[row, time]
-    with np.errstate(invalid="ignore"):
-        violating = (angle < AHEAD_RAD) | (exposed & ~(angle > BEHIND_RAD))
+    violating = (angle < AHEAD_RAD) | (exposed & ~(angle > BEHIND_RAD))
     order = time * (max(TTC_STEPS) + 1) + step_of
     counted = _before_first_harmless(
         Contacts(row, time, item), order, violating, states.shape[0], len(obstacles.is_stopped)

@@ -113,6 +113,19 @@ def test_tracked_states_scores_and_flags_equal_the_reference_at_k256(shared_root
     np.testing.assert_allclose(score_with_ec(ours, extended.ec), recorded["score_with_ec"], rtol=0, atol=1e-9)
 
 
+def test_scores_equal_the_reference_at_k4096_where_static_objects_are_hit(shared_root: Path) -> None:
+    module = loader(shared_root)
+    name = "7fab2350_44"
+    inputs, recorded = module.inputs(name), module.metrics(name, 4096)
+    states = track(inputs["ego_state0"], world_poses(module, inputs, module.proposals(name, 4096)))
+    ours = score(prepared_scene(inputs), states)
+    assert (ours.nc == 0.5).sum() == 3
+    assert_equal_scores(ours, recorded)
+    assert np.array_equal(ours.collision_index, recorded["collision_time_idx"])
+    assert np.array_equal(ours.ttc_index, recorded["ttc_time_idx"])
+    assert np.array_equal(ours.ego_areas, recorded["ego_areas"])
+
+
 def test_a_red_lane_connector_changes_exactly_what_the_reference_says(shared_root: Path) -> None:
     module = loader(shared_root)
     name = "7fab2350_44"

@@ -1,5 +1,6 @@
 """What the sub-scores add up to, and what must not change them."""
 
+import pickle
 from dataclasses import fields, replace
 
 import numpy as np
@@ -99,6 +100,15 @@ def test_the_human_filter_forgives_zeros_only():
     forgiven = human_filtered(got, replace(human, nc=np.zeros(1)))
     assert (forgiven.nc == 1.0).all()
     np.testing.assert_allclose(forgiven.multiplier, got.dac * got.tlc * got.ddc)
+
+
+def test_a_prepared_scene_may_be_sent_to_another_process():
+    start = drive(6.0)
+    states = track(start[0, 0], plans(10))
+    prepared = street(TRAFFIC, EXTRA, ("turn",), past_of(start), ego0=start[0, 0])
+    here, there = score(prepared, states), score(pickle.loads(pickle.dumps(prepared)), states)
+    for field in fields(Scores):
+        assert np.array_equal(getattr(here, field.name), getattr(there, field.name)), field.name
 
 
 def test_bad_states_and_inputs_are_refused():
