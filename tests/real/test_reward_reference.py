@@ -9,12 +9,15 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from factory.clips.av2 import AV2Reader, log_folders
+from factory.clips.reader import ClipRef
 from tasks.reward.comfort import extended_comfort
 from tasks.reward.epdms import Scores, human_filtered, rows, score, score_with_ec
-from tasks.reward.prepare import PreparedScene, prepare
+from tasks.reward.prepare import PreparedScene, prepare, prepare_scene
 from tasks.rollout.lqr import track
 from tasks.world.agents import AgentKind, AgentTracks
-from tasks.world.frames import wrap_angle
+from tasks.world.clip import NOW, scene_of_clip
+from tasks.world.frames import to_world, wrap_angle
 from tasks.world.lanes import MapLayer, MapPolygon
 from tasks.world.vehicle import HEADING
 
@@ -38,6 +41,11 @@ def loader(root: Path) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(scope="module")
+def reader(shared_root: Path) -> AV2Reader:
+    return AV2Reader(shared_root / "data/av2/sensor/val")
 
 
 def tracks(inputs: dict, box: np.ndarray, velocity: np.ndarray, valid: np.ndarray, tokens: list[str]) -> AgentTracks:
@@ -111,6 +119,22 @@ def test_tracked_states_scores_and_flags_equal_the_reference_at_k256(shared_root
     assert np.array_equal(extended.ec, recorded["two_frame_extended_comfort"])
     np.testing.assert_allclose(extended.rms, recorded["two_frame_rms"], rtol=0, atol=1e-9)
     np.testing.assert_allclose(score_with_ec(ours, extended.ec), recorded["score_with_ec"], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["7fab2350_20", "7fab2350_44", "adcf7d18_64"])  # the log holds a whole clip there
+def test_scores_from_the_raw_log_equal_the_reference(shared_root: Path, reader: AV2Reader, name: str) -> None:
+    module = loader(shared_root)
+    log, frame = name.split("_")
+    log_id = next(log_id for log_id in log_folders(reader.root) if log_id.startswith(log))
+    scene = scene_of_clip(reader.read(ClipRef("av2", log_id, (int(frame) - NOW) * 100)))
+    poses = to_world(scene.ego_state[:3], module.proposals(name, 256))
+    ours = score(prepare_scene(scene, scene.agents.window(NOW, NOW + 41)), track(scene.ego_state, poses))
+    recorded = module.metrics(name, 256)
+    assert_equal_scores(ours, recorded)
+    assert np.array_equal(ours.collision_index, recorded["collision_time_idx"])
+    assert np.array_equal(ours.ttc_index, recorded["ttc_time_idx"])
+    assert np.array_equal(ours.ego_areas, recorded["ego_areas"])
+    assert np.array_equal(ours.comfort, recorded["comfort_flags"])
 
 
 def test_scores_equal_the_reference_at_k4096_where_static_objects_are_hit(shared_root: Path) -> None:
