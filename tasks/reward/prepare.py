@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from tasks.reward.boxes import ego_boxes, touching
 from tasks.reward.comfort import comfort_history
 from tasks.world.agents import MOVING_KINDS, AgentTracks
-from tasks.world.clip import HORIZON_STEPS, Scene
+from tasks.world.clip import HORIZON_STEPS, Clip, Scene
 from tasks.world.frames import box_corners
 from tasks.world.lanes import LightState, MapLayer, MapPolygon
 from tasks.world.polygons import polygons_near
@@ -120,28 +120,31 @@ def prepare_scene(
     Lights are red for on-route lane connectors over steps scene.step .. scene.step + 40.
     """
     clip = scene.clip
-    ego = scene.ego_state
-    center = ego_boxes(ego, vehicle)[:2]
-    lights = clip.lights
-    governed = [
-        i
-        for i, lane_id in enumerate(lights.lane_ids)
-        if lane_id in clip.route.lane_ids
-        and lane_id in clip.road_map.lanes
-        and clip.road_map.lanes[lane_id].is_intersection
-    ]
-    states = lights.states[scene.step : scene.step + N_TIMES, governed]
     return prepare(
         past_states=scene.ego_history[list(PAST_STEPS)],
         centerline=scene.centerline,
-        polygons=polygons_near(clip.road_map, center, MAP_RADIUS_M),
+        polygons=polygons_near(clip.road_map, ego_boxes(scene.ego_state, vehicle)[:2], MAP_RADIUS_M),
         route_lane_ids=clip.route.lane_ids,
         objects=agents,
-        red_lanes=(tuple(lights.lane_ids[i] for i in governed), states == LightState.RED),
+        red_lanes=_red_connectors(clip, scene.step),
         vehicle=vehicle,
-        ego_state0=ego,
+        ego_state0=scene.ego_state,
         drop_touching=drop_touching,
     )
+
+
+def _red_connectors(clip: Clip, step: int) -> tuple[tuple[str, ...], Bools]:
+    """On-route lane connectors with a light, and where it is red over steps step .. step + 40: ids (L,), (41, L)."""
+    lights, lanes = clip.lights, clip.road_map.lanes
+    governed = [
+        i
+        for i, lane_id in enumerate(lights.lane_ids)
+        if lane_id in clip.route.lane_ids and lane_id in lanes and lanes[lane_id].is_intersection
+    ]
+    if not governed:
+        return (), np.zeros((N_TIMES, 0), dtype=bool)
+    states = lights.states[step : step + N_TIMES, governed]
+    return tuple(lights.lane_ids[i] for i in governed), states == LightState.RED
 
 
 def _shape(polygon: MapPolygon) -> shapely.Polygon:

@@ -1,5 +1,7 @@
 """A user's trajectories on a clip get the scores of the public metric's path: interpolate, track, score."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from straight_street import STREET, Thing, drive, tracks
@@ -7,7 +9,7 @@ from straight_street import STREET, Thing, drive, tracks
 from tasks.reward.trajectories import at_ten_hz, score_trajectories
 from tasks.world.agents import AgentTracks
 from tasks.world.clip import CLIP_STEPS, HISTORY_STEPS, Clip
-from tasks.world.lanes import Lane, LightState, MapPolygon, RoadMap, Route, TrafficLights
+from tasks.world.lanes import NO_LIGHTS, Lane, LightState, MapPolygon, RoadMap, Route, TrafficLights
 from tasks.world.vehicle import VX, X
 
 
@@ -81,6 +83,11 @@ def test_progress_against_a_rival_is_that_of_a_two_row_batch():
         pair = score_trajectories(clip, np.stack([straight(6.5, 8), plans[k]]))
         assert got.ep[k] == pair.ep[1] < 1.0
     assert len(got) == 2
+
+
+def test_a_clip_without_lights_has_no_red_ones():
+    clip = replace(clip_on_the_street(6.0, []), lights=NO_LIGHTS)
+    assert score_trajectories(clip, straight(6.0, 40)[None]).tlc[0] == 1.0
 
 
 def test_lights_count_from_the_clips_own_time():
