@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from tasks.experts.pdm_forecast import RADIUS_M, ego_boxes, forecast
 from tasks.experts.pdm_path import MIN_PROGRESS_M, path_length_m
-from tasks.experts.pdm_proposals import SCORED_STEPS, PdmSettings, Proposals, proposals
+from tasks.experts.pdm_proposals import DEFAULTS, SCORED_STEPS, PdmSettings, Proposals, proposals
 from tasks.experts.protocol import Plan
 from tasks.reward.epdms import Scores, score
 from tasks.reward.prepare import prepare
@@ -29,9 +29,8 @@ from tasks.world.polygons import polygons_near
 from tasks.world.vehicle import HEADING, PACIFICA, Vehicle
 
 Array = NDArray[np.float64]
-DEFAULTS = PdmSettings()
 
-__all__ = ["PdmClosed", "PdmPlan", "PdmSettings", "pdm_closed_poses", "plan_pdm_closed"]
+__all__ = ["PdmClosed", "PdmPlan", "PdmSettings", "pdm_closed_poses", "plan_for", "plan_pdm_closed"]
 
 
 @dataclass(frozen=True)

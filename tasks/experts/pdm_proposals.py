@@ -35,6 +35,9 @@ class PdmSettings:
     shared_lead_memory: bool = True  # quirk: within one path, a speed inherits lead fields its own search did not write
 
 
+DEFAULTS = PdmSettings()
+
+
 @dataclass(frozen=True)
 class Proposals:
     """P = lateral x speed proposals, index = speeds * lateral + speed."""
@@ -61,14 +64,16 @@ def proposals(
     centerline: Array,
     seen: Forecast,
     speed_limit_mps: float | None,
-    settings: PdmSettings = PdmSettings(),
+    settings: PdmSettings = DEFAULTS,
     vehicle: Vehicle = PACIFICA,
 ) -> Proposals:
     """The proposals from `ego_state` (11,) along `centerline` (N, 3) through the forecast traffic.
 
     Each starts at the projection of the rear axle on its path with the ego's longitudinal speed.
-    Raises ValueError where the centerline has no length.
+    Raises ValueError where the centerline has no length or the speed limit is not positive.
     """
+    if speed_limit_mps is not None and not speed_limit_mps > 0.0:
+        raise ValueError(f"a speed limit of {speed_limit_mps} m/s cannot be driven; None means unknown")
     paths = [drive_path(parallel(centerline, offset)) for offset in settings.lateral_offsets_m]
     limit = settings.fallback_speed_mps if speed_limit_mps is None else speed_limit_mps
     targets = np.tile(np.array(settings.speed_fractions) * limit, len(paths))

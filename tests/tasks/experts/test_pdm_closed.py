@@ -192,6 +192,11 @@ def test_a_route_without_length_is_a_rejection(road: Road) -> None:
         pdm_closed_poses(scene)
 
 
+def test_a_speed_limit_of_zero_is_an_error_and_not_a_division(road: Road) -> None:
+    with pytest.raises(ValueError, match=r"0\.0 m/s cannot be driven"):
+        plan_for(road(limit=0.0))
+
+
 def test_the_digest_changes_with_every_setting() -> None:
     assert PdmClosed().digest() == PdmClosed().digest()
     assert PdmClosed(PdmSettings(headway_s=2.0)).digest() != PdmClosed().digest()
