@@ -1,7 +1,8 @@
 """The table `outcomes`: what became of every attempt that is not a sample, one row per attempt_id.
 
 A row about a clip as a whole (a bad file, a standing ego) has candidate -1 and no expert; `exhausted` stands behind the
-last candidate of a walk. A newer outcome of the same attempt replaces the older one. Timings live here and nowhere else.
+last candidate of a walk. A newer outcome of the same attempt replaces the older one.
+Timings live here and nowhere else.
 """
 
 from collections.abc import Sequence

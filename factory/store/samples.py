@@ -10,7 +10,7 @@ import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from factory.store.cache import ClipCache
 from factory.store.candidates import CANDIDATES, ClipCandidates, candidates_of, candidates_table
@@ -76,16 +76,18 @@ class Store:
     def cache(self) -> ClipCache:
         return ClipCache(self.location.child("cache/prepared"))
 
-    def agree(self, identity: RunIdentity, expert_digests: Mapping[str, str], on_change: OnChange) -> None:
-        """Check the run against the one the tables were made by, and record it when it is new or a change is accepted.
+    def agree(
+        self, identity: RunIdentity, expert_digests: Mapping[str, str], on_change: OnChange
+    ) -> list[dict[str, Any]]:
+        """Hold the run against the newest record of run.json; the records as they are to be, with this run's as newest.
 
-        Raises ChangedRun. `keep` and `redo` record the change; the newest record is what the next run is held against.
+        Writes nothing. Raises ChangedRun where they differ and on_change is "stop".
         """
         for expert in expert_digests:
             if not re.fullmatch(r"[A-Za-z0-9_-]+", expert):
                 raise ChangedRun(f"expert {expert!r}: a name is letters, digits, _ and - (it becomes a folder)")
         records = self.runs()
-        record = {
+        record: dict[str, Any] = {
             "settings": dict(identity.settings),
             "settings_hash": identity.settings_hash,
             "stage_versions": dict(identity.stage_versions),
@@ -108,12 +110,19 @@ class Store:
             if not changes:
                 record["expert_digests"] = records[-1]["expert_digests"] | record["expert_digests"]
                 records = records[:-1]
-        new = [*records, record]
-        if new != self.runs():
-            document = {"schema_version": SCHEMA_VERSION, "runs": new}
-            self.location.write(RUN_FILE, (json.dumps(document, indent=1, sort_keys=True) + "\n").encode())
+        return [*records, record]
 
-    def runs(self) -> list[dict[str, object]]:
+    def begin(self, records: Sequence[Mapping[str, object]]) -> None:
+        """The first writes of a run: record its settings, fence off older runs, tidy up after a crash."""
+        if list(records) != self.runs():
+            document = {"schema_version": SCHEMA_VERSION, "runs": list(records)}
+            self.location.write(RUN_FILE, (json.dumps(document, indent=1, sort_keys=True) + "\n").encode())
+        for table in (self.candidates, self.samples, self.outcomes):
+            table.claim()
+        # A crash between the two commits leaves a failed outcome beside the sample that its retry became.
+        self.outcomes.commit([], drop=[key for key in self.outcomes if key in self.samples])
+
+    def runs(self) -> list[dict[str, Any]]:
         """The settings the rows were made with, oldest first. Raises ChangedRun for an unreadable run.json."""
         data = self.location.read(RUN_FILE)
         if data is None:
@@ -157,11 +166,6 @@ class Store:
         lists = {row.clip_id: row for row in candidates_of(self.candidates.read())}
         return History(walks, {place: frozenset(ids) for place, ids in stale.items()}, lists)
 
-    def claim(self) -> None:
-        """Make every older run's commits fail."""
-        for table in (self.candidates, self.samples, self.outcomes):
-            table.claim()
-
     def commit(
         self,
         candidates: Sequence[ClipCandidates],
@@ -181,10 +185,6 @@ class Store:
         # A failed outcome stands until its attempt succeeds: then it goes, and it never stands twice.
         files = [write_shard(self.outcomes.location, OUTCOMES, outcomes_table(outcomes))] if outcomes else []
         self.outcomes.commit(files, drop=[*accepted, *replaced, *(o.attempt_id for o in outcomes)])
-
-    def tidy(self) -> None:
-        """Drop outcomes whose attempt is a sample: what a crash between the two commits leaves behind."""
-        self.outcomes.commit([], drop=[key for key in self.outcomes if key in self.samples])
 
 
 def differences(old: Mapping[str, object], new: Mapping[str, object]) -> list[str]:

@@ -170,7 +170,7 @@ def samples_spec(licences: Sequence[str] = ()) -> TableSpec:
 def sample_row_to_table(rows: Sequence[Mapping[str, object]]) -> pa.Table:
     """Rows (column -> value) as a table of SCHEMA.
 
-    A nullable column may be left out. Raises BadRow naming the column that is missing, unknown, misshapen or not finite.
+    A nullable column may be left out. Raises BadRow naming a column that is missing, unknown, misshapen or not finite.
     """
     tables = []
     for row in rows:

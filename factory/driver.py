@@ -1,0 +1,310 @@
+"""The driver's loop: keeps a bounded number of clips open and walks their candidates, in either executor.
+
+Attempts of one walk are a chain, walks are parallel. Results go to the gatherer, which commits them in groups.
+Everything the driver knows it can know again from the tables, so it can die at any moment.
+"""
+
+import threading
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from factory.batch import Gatherer, PendingRow
+from factory.clips.reader import ClipRef
+from factory.local import Graph, Ticket
+from factory.plan import CLIP_CANDIDATE, ClipPlan, Plan, WalkState, wants_payload
+from factory.progress import ProgressLine, Tally
+from factory.steps import Attempted, Failure, Prepared, Stamp
+from factory.store.candidates import ClipCandidates
+from factory.store.outcomes import QUARANTINE_AFTER, ErrorKind, Kind, Outcome
+from factory.store.samples import Past
+from factory.walk import Blocked, Complete, Exhausted, Step, Try, tries_before
+from factory.work import RunIdentity, attempt_id
+from tasks.stages import Rejected
+
+CLIPS_PER_WORKER = 2  # open at once: one works while the next is being prepared
+WAIT_S = 0.5
+
+
+@dataclass
+class Executed:
+    """What this run did itself, and what it found done."""
+
+    prepared: int = 0  # clip and perturb stages computed
+    from_cache: int = 0  # prepared clips taken from disk
+    attempts: int = 0
+    found_done: int = 0  # attempts settled by earlier runs
+
+    def __str__(self) -> str:
+        return (
+            f"executed {self.prepared} perturb tasks ({self.from_cache} from cache) and {self.attempts} attempts; "
+            f"found {self.found_done} attempts done"
+        )
+
+
+class Driver:
+    """The state of one run, fed by its loop one report at a time."""
+
+    def __init__(
+        self,
+        identity: RunIdentity,
+        plan: Plan,
+        digests: Mapping[str, str],
+        rounds: int,
+        policy: Callable[[Past], bool],
+        content_digests: Mapping[str, str],
+    ) -> None:
+        """content_digests: clip_id -> digest, as the table `candidates` has them."""
+        self._identity, self._digests, self._rounds, self._policy = identity, digests, rounds, policy
+        self._plan, self._content_digests = plan, content_digests
+        self.executed = Executed(found_done=plan.found_done)
+        self.notes: list[str] = []
+        self._seconds: dict[str, list[float]] = defaultdict(lambda: [0, 0.0])
+        self._fresh: set[str] = set()  # attempt_ids that failed in this run
+        self._preparing: dict[Ticket, ClipPlan] = {}
+        self._trying: dict[Ticket, tuple[ClipPlan, WalkState, Any, Stamp]] = {}
+        self._walks_left: dict[str, int] = {}
+        self._held: dict[tuple[str, str], tuple[list[PendingRow], list[Outcome]]] = {}  # redo: until the walk ends
+        self._stopping = threading.Event()
+        self._tally = Tally()
+
+    def stop(self) -> None:
+        """Begin nothing more; what is in flight is finished and committed."""
+        self._stopping.set()
+
+    @property
+    def seconds(self) -> dict[str, tuple[int, float]]:
+        """Stage -> (tasks, seconds) of this run."""
+        return {stage: (int(n), total) for stage, (n, total) in sorted(self._seconds.items())}
+
+    @property
+    def has_failures(self) -> bool:
+        """Some planned clip or walk stands at a failed attempt, from this run or an earlier one."""
+        clips = (*self._plan.todo, *self._plan.done)
+        return any(clip.failed or any(isinstance(step, Blocked) for step in clip.steps.values()) for clip in clips)
+
+    @property
+    def interrupted(self) -> bool:
+        return self._stopping.is_set()
+
+    def loop(self, graph: Graph, gatherer: Gatherer) -> None:
+        """Until nothing is left, or until stopped and drained."""
+        self._graph, self._gatherer = graph, gatherer
+        waiting = iter(self._plan.todo)
+        progress = ProgressLine(len(self._plan.todo))
+        more = True
+        while True:
+            room = len(self._walks_left) + len(self._preparing) < CLIPS_PER_WORKER * graph.parallelism
+            if more and room and gatherer.n_writing < 2 and not self.interrupted:
+                clip = next(waiting, None)
+                more = clip is not None
+                if clip is not None:
+                    self._open(clip)
+                continue
+            finished = graph.wait(WAIT_S)
+            if finished is not None:
+                self._take(*finished)
+            gatherer.send_if_due()
+            progress.show(self._tally)
+            if not self._preparing and not self._trying and not gatherer.n_writing and (not more or self.interrupted):
+                break
+        gatherer.send()
+        while gatherer.n_writing:
+            finished = graph.wait(WAIT_S)
+            if finished is not None:
+                self._take(*finished)
+        progress.show(self._tally, last=True)
+
+    def _open(self, clip: ClipPlan) -> None:
+        if wants_payload(clip):
+            self._preparing[self._graph.submit("prepare", clip.ref)] = clip
+        else:
+            self._start_walks(clip, None)
+
+    def _take(self, ticket: Ticket, report: Any) -> None:
+        if self._gatherer.finished(ticket, report):
+            return
+        if ticket in self._preparing:
+            self._take_prepared(self._preparing.pop(ticket), ticket.result, report)
+        else:
+            self._take_attempt(*self._trying.pop(ticket), ticket.result, report)
+
+    def _take_prepared(self, clip: ClipPlan, result: Any, report: Prepared | Rejected | Failure) -> None:
+        clip_id = clip.ref.clip_id
+        if (
+            isinstance(report, Prepared)
+            and self._content_digests.get(clip_id, report.content_digest) != report.content_digest
+        ):
+            report = Failure(
+                ErrorKind.INPUT,
+                f"clip {clip_id} of log {clip.ref.log_id}: content digest {report.content_digest} where the table has "
+                f"{self._content_digests[clip_id]}: the log was changed; restore it or choose another out",
+            )
+        replaced = [*clip.stale, *([clip.past.attempt_id] if clip.past is not None else [])]
+        if isinstance(report, Rejected):
+            replaced += [key for walk in clip.walks for key in walk.stale]
+        if isinstance(report, Prepared):
+            self._count(report.seconds)
+            if report.note:
+                self.notes.append(report.note)
+            if clip.listed is not None and not report.from_cache:
+                self.notes.append(f"clip {clip_id}: its prepared clip was not in the cache; prepared again")
+            self.executed.prepared += not report.from_cache
+            self.executed.from_cache += report.from_cache
+            clip.n_candidates = len(report.candidates)
+            rows = [self._candidates_row(clip.ref, report)] if clip.listed is None else []
+            self._gatherer.add(candidates=rows, replaced=replaced)
+            clip.past = None
+            self._start_walks(clip, result)
+            return
+        key = attempt_id(clip_id, CLIP_CANDIDATE, self._identity.vocabulary_digest, "", "")
+        outcome = self._outcome(clip.ref, key, "", CLIP_CANDIDATE, report, tries_before(clip.past), {}, {})
+        clip.past = Past(key, Kind(outcome.kind), True, outcome=outcome)
+        clip.failed = outcome.kind == Kind.FAILED
+        self._gatherer.add(outcomes=[outcome], replaced=replaced)
+        self._tally.rejected += not clip.failed
+        self._tally.failed += clip.failed
+        self._tally.clips += 1
+
+    def _start_walks(self, clip: ClipPlan, prepared: Any) -> None:
+        self._walks_left[clip.ref.clip_id] = len(clip.walks)
+        for walk in clip.walks:
+            self._advance(clip, walk, prepared)
+
+    def _advance(self, clip: ClipPlan, walk: WalkState, prepared: Any) -> None:
+        step = walk.step(clip.n_candidates, self._rounds, self._may_retry)
+        clip.steps[walk.expert] = step
+        if isinstance(step, Try) and not self.interrupted:
+            stamp = self._stamp(clip.ref, walk.expert, step)
+            self._trying[self._graph.submit("attempt", prepared, stamp)] = (clip, walk, prepared, stamp)
+            return
+        self._finish(clip, walk, step)
+        self._walks_left[clip.ref.clip_id] -= 1
+        if not self._walks_left[clip.ref.clip_id]:
+            del self._walks_left[clip.ref.clip_id]
+            self._tally.clips += not self.interrupted
+
+    def _finish(self, clip: ClipPlan, walk: WalkState, step: Step) -> None:
+        if walk.lacks_exhausted(step):
+            assert isinstance(step, Exhausted)
+            stamp = self._stamp(clip.ref, walk.expert, Try(step.n_tried, -1))
+            outcome = self._outcome(clip.ref, stamp.attempt_id, walk.expert, step.n_tried, step, 0, {}, {})
+            walk.known[step.n_tried] = Past(stamp.attempt_id, Kind.EXHAUSTED, True, outcome=outcome)
+            self._keep(clip, walk, outcomes=[outcome])
+        rows, outcomes = self._held.pop((clip.ref.clip_id, walk.expert), ([], []))
+        if isinstance(step, Complete | Exhausted):
+            if walk.stale:
+                self._gatherer.add(rows=rows, outcomes=outcomes, replaced=sorted(walk.stale))
+        else:  # rows of an unfinished redo are made again, so that readers see the old walk or the new one
+            self._gatherer.add(outcomes=[o for o in outcomes if o.kind == Kind.FAILED])
+
+    def _take_attempt(
+        self, clip: ClipPlan, walk: WalkState, prepared: Any, stamp: Stamp, result: Any, report: Attempted | Failure
+    ) -> None:
+        self.executed.attempts += 1
+        known = walk.known.get(stamp.candidate_index)
+        if isinstance(report, Attempted):
+            self._count(report.seconds)
+        if isinstance(report, Attempted) and report.rejected is None:
+            walk.known[stamp.candidate_index] = Past(stamp.attempt_id, Kind.ACCEPTED, True, round=stamp.round)
+            row = PendingRow(result, report.n_bytes, (stamp.round, stamp.expert))
+            self._keep(clip, walk, rows=[row])
+            self._tally.accepted += 1
+        else:
+            what = report if isinstance(report, Failure) else report.rejected
+            measured = ({}, {}) if isinstance(report, Failure) else (dict(report.subscores), dict(report.seconds))
+            assert what is not None
+            outcome = self._outcome(
+                clip.ref, stamp.attempt_id, stamp.expert, stamp.candidate_index, what, tries_before(known), *measured
+            )
+            walk.known[stamp.candidate_index] = Past(stamp.attempt_id, Kind(outcome.kind), True, outcome=outcome)
+            if outcome.kind == Kind.FAILED:
+                self._fresh.add(stamp.attempt_id)
+            self._keep(clip, walk, outcomes=[outcome])
+            self._tally.rejected += outcome.kind == Kind.REJECTED
+            self._tally.failed += outcome.kind == Kind.FAILED
+        self._advance(clip, walk, prepared)
+
+    def _keep(
+        self, clip: ClipPlan, walk: WalkState, rows: Sequence[PendingRow] = (), outcomes: Sequence[Outcome] = ()
+    ) -> None:
+        """On to the gatherer; a walk that replaces rows is held back until it ends."""
+        if not walk.stale:
+            self._gatherer.add(rows=rows, outcomes=outcomes)
+            return
+        held_rows, held_outcomes = self._held.setdefault((clip.ref.clip_id, walk.expert), ([], []))
+        held_rows.extend(rows)
+        held_outcomes.extend(outcomes)
+
+    def _may_retry(self, past: Past) -> bool:
+        return past.attempt_id not in self._fresh and self._policy(past)
+
+    def _stamp(self, ref: ClipRef, expert: str, step: Try) -> Stamp:
+        digest, vocabulary = self._digests[expert], self._identity.vocabulary_digest
+        return Stamp(
+            attempt_id(ref.clip_id, step.candidate, vocabulary, expert, digest),
+            expert,
+            digest,
+            step.round,
+            step.candidate,
+            vocabulary,
+            self._identity.settings_hash,
+            self._identity.versions_json,
+        )
+
+    def _outcome(
+        self,
+        ref: ClipRef,
+        key: str,
+        expert: str,
+        candidate: int,
+        what: Rejected | Failure | Exhausted,
+        tries: int,
+        subscores: dict[str, float],
+        seconds: dict[str, float],
+    ) -> Outcome:
+        base = Outcome(
+            attempt_id=key,
+            clip_id=ref.clip_id,
+            dataset=ref.dataset,
+            log_id=ref.log_id,
+            expert=expert,
+            expert_digest=self._digests.get(expert, ""),
+            candidate_index=candidate,
+            kind=Kind.EXHAUSTED.value,
+            settings_hash=self._identity.settings_hash,
+            stage_versions=self._identity.versions_json,
+            tries=tries + 1,
+            subscores=subscores,
+            seconds=seconds,
+        )
+        facts = asdict(base)
+        if isinstance(what, Rejected):
+            facts |= {"kind": Kind.REJECTED.value, "stage": what.stage, "reason": what.reason, "detail": what.detail}
+        elif isinstance(what, Failure):
+            poison = what.kind is ErrorKind.SYSTEM and tries + 1 >= QUARANTINE_AFTER
+            kind = ErrorKind.POISON if poison else what.kind
+            facts |= {"kind": Kind.FAILED.value, "error_kind": kind.value, "error": what.error}
+        else:
+            facts |= {"n_tried": what.n_tried}
+        return Outcome(**facts)
+
+    def _candidates_row(self, ref: ClipRef, report: Prepared) -> ClipCandidates:
+        return ClipCandidates(
+            ref.clip_id,
+            ref.dataset,
+            ref.log_id,
+            report.content_digest,
+            self._identity.prepare_digest,
+            self._identity.vocabulary_digest,
+            dict(report.gate_counts),
+            report.candidates,
+            report.dropped.stage if report.dropped is not None else "",
+            report.dropped.reason if report.dropped is not None else "",
+        )
+
+    def _count(self, seconds: Mapping[str, float]) -> None:
+        for stage, spent in seconds.items():
+            self._seconds[stage][0] += 1
+            self._seconds[stage][1] += spent

@@ -1,0 +1,160 @@
+"""Executes a run: plan against the tables, drive the tasks in one executor or the other, tell how it ended.
+
+The driver can die at any moment: what is committed is done, the rest is tried again by the next run, with the
+same result.
+"""
+
+import json
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from types import FrameType
+from typing import Literal
+
+from factory.batch import SHARD_BYTES, SHARD_SECONDS, Gatherer, WriteFailed
+from factory.clips.reader import ClipRef
+from factory.driver import Driver, Executed
+from factory.funnel import Funnel, funnel_of
+from factory.local import Graph, LocalGraph
+from factory.plan import Plan, make_plan
+from factory.store.location import BadLocation
+from factory.store.outcomes import Kind
+from factory.store.samples import ChangedRun, OnChange, Store
+from factory.store.table import AnotherWriter
+from factory.walk import retry_policy
+from factory.work import Work
+
+COMPLETE, BAD_CONFIG, COMPLETE_WITH_FAILURES, INTERRUPTED = 0, 2, 3, 4  # exit codes
+Executor = Literal["local", "ray"]
+
+
+@dataclass
+class RunSummary:
+    """How a run ended."""
+
+    exit_code: int
+    message: str = ""
+    counts: dict[str, int] = field(default_factory=dict)  # accepted, rejected, failed, exhausted, of the planned clips
+    executed: Executed = field(default_factory=Executed)
+    seconds: dict[str, tuple[int, float]] = field(default_factory=dict)  # stage -> (tasks, seconds) of this run
+    notes: list[str] = field(default_factory=list)
+    funnel: Funnel | None = None
+
+
+def execute(
+    work: Work,
+    refs: Sequence[ClipRef],
+    experts: Sequence[str],
+    rounds: int,
+    store: Store,
+    executor: Executor = "ray",
+    workers: int | None = None,
+    *,
+    on_change: OnChange = "stop",
+    retry: bool = False,
+    ray_address: str | None = None,
+    shard_bytes: int = SHARD_BYTES,
+    shard_seconds: float = SHARD_SECONDS,
+    say: Callable[[str], None] = print,
+) -> RunSummary:
+    """Make the samples of `rounds` rounds for every clip and expert, as far as the store does not hold them already.
+
+    workers: processes of a local Ray cluster, None: one per CPU. retry: try failed(input | bug) attempts again too.
+    Bad wishes come back as exit code 2 with a message and nothing written; see the module's codes for the others.
+    """
+    if not refs or not experts or rounds < 1:
+        return RunSummary(BAD_CONFIG, f"nothing to do: {len(refs)} clips, experts {list(experts)}, rounds={rounds}")
+    digests = {expert: work.expert_digest(expert) for expert in experts}
+    identity = work.identity
+    try:
+        record = store.agree(identity, digests, on_change)
+    except ChangedRun as error:
+        return RunSummary(BAD_CONFIG, str(error))
+    policy = retry_policy(retry, identity.versions_json)
+    history = store.history(identity, digests)
+    plan = make_plan(refs, experts, rounds, history, identity, on_change, policy)
+    content = {clip_id: row.content_digest for clip_id, row in history.candidates.items() if on_change != "redo"}
+    driver = Driver(identity, plan, digests, rounds, policy, content)
+    if plan.frozen:
+        driver.notes.append(f"{len(plan.frozen)} clips kept as they are: their candidates come from other settings")
+    code, message = COMPLETE, ""
+    try:
+        graph = _graph(work, store, executor, workers, ray_address) if plan.todo else None
+    except BadLocation as error:
+        return RunSummary(BAD_CONFIG, str(error))
+    try:
+        store.begin(record)
+        if graph is not None:
+            with _stop_signals(driver.stop):
+                driver.loop(graph, Gatherer(graph, store, shard_bytes, shard_seconds))
+        code = COMPLETE_WITH_FAILURES if driver.has_failures else COMPLETE
+        if driver.interrupted:
+            code, message = INTERRUPTED, "interrupted; run the same command again to go on"
+    except (AnotherWriter, WriteFailed) as error:
+        code, message = INTERRUPTED, str(error)
+    except KeyboardInterrupt:
+        code, message = INTERRUPTED, "stopped at once; run the same command again"
+    finally:
+        if graph is not None:
+            graph.close()
+    funnel = funnel_of(store, [ref.clip_id for ref in refs])
+    summary = RunSummary(code, message, _counts(plan), driver.executed, driver.seconds, driver.notes, funnel)
+    _record(store, summary)
+    for line in (*summary.notes, str(summary.executed), *([message] if message else [])):
+        say(line)
+    return summary
+
+
+def _graph(work: Work, store: Store, executor: Executor, workers: int | None, address: str | None) -> Graph:
+    if executor == "local":
+        return LocalGraph(work, store.location)
+    from factory.graph import RayGraph
+
+    return RayGraph(work, store.location, workers, address)
+
+
+@contextmanager
+def _stop_signals(stop: Callable[[], None]) -> Iterator[None]:
+    """The first SIGINT or SIGTERM drains the run, a second one ends it at once."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    asked = threading.Event()
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        if asked.is_set():
+            raise KeyboardInterrupt
+        asked.set()
+        stop()
+
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _counts(plan: Plan) -> dict[str, int]:
+    """Attempts of the planned clips by what became of them; clip-level rows among them."""
+    counts = dict.fromkeys((kind.value for kind in Kind), 0)
+    for clip in (*plan.todo, *plan.done):
+        pasts = [past for walk in clip.walks for past in walk.known.values()]
+        for past in (*pasts, *([clip.past] if clip.past is not None else [])):
+            counts[past.kind.value] += 1
+    return counts
+
+
+def _record(store: Store, summary: RunSummary) -> None:
+    """last_run.json: what the newest run did, for people and reports."""
+    document = {
+        "exit_code": summary.exit_code,
+        "message": summary.message,
+        "counts": summary.counts,
+        "executed": asdict(summary.executed),
+        "seconds": {stage: {"tasks": n, "seconds": total} for stage, (n, total) in summary.seconds.items()},
+        "notes": summary.notes,
+    }
+    store.location.write("last_run.json", (json.dumps(document, indent=1) + "\n").encode())

@@ -1,0 +1,168 @@
+"""The acceptance funnel: per expert and round, what was tried, accepted, turned down and why; from the tables alone.
+
+An attempt belongs to the round it was tried for: the number of accepted candidates before it in its walk. Two rates are
+shown. Attempts: accepted of tried. Clips: those with at least r+1 accepted samples, of all clips and of those with at
+least r; the latter is the one to hold against the rates published for the method.
+"""
+
+import io
+from collections import Counter, defaultdict
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import pyarrow as pa
+from rich.console import Console
+from rich.table import Table
+
+from factory.store.outcomes import Kind
+from factory.store.samples import Store
+
+SAMPLE_COLUMNS = ["attempt_id", "clip_id", "expert", "candidate_index"]
+OUTCOME_COLUMNS = [*SAMPLE_COLUMNS, "kind", "stage", "reason", "error_kind"]
+
+
+@dataclass(frozen=True)
+class FunnelRow:
+    """One round of one expert."""
+
+    expert: str
+    round: int
+    accepted: int  # attempts
+    rejected: int
+    failed: int
+    clips_before: int  # with at least `round` accepted samples: those this round can come from
+    clips: int  # with at least round + 1 accepted samples
+    clips_total: int  # in which this expert was to drive
+    reasons: Mapping[str, int] = field(default_factory=dict)  # "stage.reason" or "failed.kind" -> attempts
+
+    @property
+    def attempt_rate(self) -> float:
+        tried = self.accepted + self.rejected + self.failed
+        return self.accepted / tried if tried else float("nan")
+
+    @property
+    def clip_rate(self) -> float:
+        """Of the clips that had the round before."""
+        return self.clips / self.clips_before if self.clips_before else float("nan")
+
+    @property
+    def clip_rate_of_all(self) -> float:
+        return self.clips / self.clips_total if self.clips_total else float("nan")
+
+
+@dataclass(frozen=True)
+class Funnel:
+    """All rows, and what happened before any attempt."""
+
+    rows: tuple[FunnelRow, ...]
+    clips_prepared: int
+    clips_without_candidates: Mapping[str, int]  # reason -> clips
+    clip_outcomes: Mapping[str, int]  # "stage.reason" or "failed.kind" -> clips that never got to attempts
+    gates: Mapping[str, int]  # gate -> vocabulary entries dropped, all clips
+    candidates: int
+    exhausted: Mapping[str, int]  # expert -> walks that came to the end of their list
+
+    def text(self, width: int = 120) -> str:
+        """The funnel as a table for a terminal."""
+        head = f"clips prepared {self.clips_prepared}, candidates {self.candidates}"
+        for title, counts in (
+            ("dropped by gate", self.gates),
+            ("without candidates", self.clips_without_candidates),
+            ("clips dropped", self.clip_outcomes),
+            ("walks exhausted", self.exhausted),
+        ):
+            if counts:
+                head += f"\n{title}: " + ", ".join(f"{name} {n}" for name, n in counts.items())
+        table = Table("expert", "round", "tried", "accepted", "attempts %", "clips", "clips %", "of all %", "why not")
+        for r in self.rows:
+            tried = r.accepted + r.rejected + r.failed
+            why = ", ".join(f"{name} {n}" for name, n in r.reasons.items())
+            rates = (_percent(r.attempt_rate), _percent(r.clip_rate), _percent(r.clip_rate_of_all))
+            clips = f"{r.clips}/{r.clips_before}"
+            table.add_row(r.expert, str(r.round), str(tried), str(r.accepted), rates[0], clips, rates[1], rates[2], why)
+        sink = io.StringIO()
+        Console(file=sink, width=width, no_color=True).print(table)
+        return f"{head}\n{sink.getvalue()}"
+
+
+def funnel_of(store: Store, clip_ids: Collection[str] | None = None) -> Funnel:
+    """The funnel of a store, or of some of its clips."""
+    chosen = None if clip_ids is None else set(clip_ids)
+    samples = _rows(store.samples.read(SAMPLE_COLUMNS), chosen)
+    taken = {row["attempt_id"] for row in samples}
+    outcomes = [r for r in _rows(store.outcomes.read(OUTCOME_COLUMNS), chosen) if r["attempt_id"] not in taken]
+    lists = _rows(store.candidates.read(["clip_id", "n_candidates", "gate_counts", "stage", "reason"]), chosen)
+
+    walks: dict[str, dict[str, list[tuple[int, str]]]] = defaultdict(lambda: defaultdict(list))
+    clip_outcomes: Counter[str] = Counter()
+    exhausted: Counter[str] = Counter()
+    for row in samples:
+        walks[row["expert"]][row["clip_id"]].append((row["candidate_index"], ""))
+    for row in outcomes:
+        if not row["expert"]:
+            clip_outcomes[_why(row)] += 1
+        elif row["kind"] == Kind.EXHAUSTED:
+            exhausted[row["expert"]] += 1
+            walks[row["expert"]][row["clip_id"]].extend([])
+        else:
+            walks[row["expert"]][row["clip_id"]].append((row["candidate_index"], _why(row)))
+    gates: Counter[str] = Counter()
+    for row in lists:
+        gates.update(dict(row["gate_counts"] or ()))
+    without = Counter(f"{row['stage']}.{row['reason']}" for row in lists if row["reason"])
+    return Funnel(
+        rows=tuple(row for expert in sorted(walks) for row in _expert_rows(expert, walks[expert])),
+        clips_prepared=len(lists),
+        clips_without_candidates=dict(without.most_common()),
+        clip_outcomes=dict(clip_outcomes.most_common()),
+        gates=dict(gates),
+        candidates=sum(row["n_candidates"] for row in lists),
+        exhausted=dict(sorted(exhausted.items())),
+    )
+
+
+def _expert_rows(expert: str, clips: Mapping[str, list[tuple[int, str]]]) -> list[FunnelRow]:
+    accepted: Counter[int] = Counter()
+    reasons: dict[int, Counter[str]] = defaultdict(Counter)
+    for attempts in clips.values():
+        at = 0
+        for _, why in sorted(attempts):
+            if why:
+                reasons[at][why] += 1
+            else:
+                accepted[at] += 1
+                at += 1
+    rounds = max([*accepted, *reasons], default=-1) + 1
+    before = len(clips)
+    rows = []
+    for number in range(rounds):
+        whys = reasons[number]
+        failed = sum(n for why, n in whys.items() if why.startswith("failed."))
+        rows.append(
+            FunnelRow(
+                expert,
+                number,
+                accepted[number],
+                whys.total() - failed,
+                failed,
+                before,
+                accepted[number],  # one sample per clip and round
+                len(clips),
+                dict(whys.most_common()),
+            )
+        )
+        before = accepted[number]
+    return rows
+
+
+def _rows(table: pa.Table, chosen: set[str] | None) -> list[dict[str, Any]]:
+    return [row for row in table.to_pylist() if chosen is None or row["clip_id"] in chosen]
+
+
+def _why(row: Mapping[str, object]) -> str:
+    return f"failed.{row['error_kind']}" if row["kind"] == Kind.FAILED else f"{row['stage']}.{row['reason']}"
+
+
+def _percent(rate: float) -> str:
+    return "-" if rate != rate else f"{100 * rate:.1f}"

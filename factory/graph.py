@@ -1,0 +1,147 @@
+"""The graph as Ray tasks, on this machine or on a cluster; the only module that imports ray.
+
+Large results stay in the object store and travel by reference. A worker that dies is retried by Ray; what then still
+fails becomes a steps.Failure. Nothing but loopback is opened for a cluster of our own, and `ray stop` is never called.
+"""
+
+import logging
+import os
+import secrets
+from collections import deque
+from typing import Any
+
+os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")  # keeps every listener on 127.0.0.1
+os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+
+import ray
+from ray.exceptions import RayError
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+from factory.local import STEPS, WANTS, Ticket
+from factory.steps import Failure
+from factory.store.location import BadLocation, Location
+from factory.store.outcomes import ErrorKind
+from factory.work import Work
+
+MAX_RETRIES = 2  # of a task whose worker died
+PROBE_SECONDS = 120.0
+WORKER_ENV = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+FORWARDED_ENV = ("NUMBA_CACHE_DIR",)
+
+_HELD: dict[str, Any] = {}  # per worker process: the run's Work, fetched once
+
+
+class RayGraph:
+    """Graph of Ray tasks. Connects to the cluster of RAY_ADDRESS or `address`, else starts one in this machine."""
+
+    def __init__(self, work: Work, out: Location, workers: int | None = None, address: str | None = None) -> None:
+        """Raises BadLocation when some node does not see `out`."""
+        self._started = not ray.is_initialized()
+        if self._started:
+            _connect(workers, address)
+        available = int(ray.cluster_resources().get("CPU", 1))
+        self.parallelism = max(1, min(workers or available, available))
+        self._supplied: dict[str, Any] = {"work": [ray.put(work)], "out": out}  # in a list: handed over as a reference
+        self._tickets: dict[Any, Ticket] = {}
+        self._ready: deque[Any] = deque()
+        _prove_shared(out)
+        _warm_every_node(self._supplied["work"])
+
+    def submit(self, step: str, *args: Any) -> Ticket:
+        supplied = [self._supplied[name] for name in WANTS[step]]
+        report, result = _run.remote(step, len(supplied), *supplied, *args)
+        ticket = Ticket(result)
+        self._tickets[report] = ticket
+        return ticket
+
+    def wait(self, timeout_s: float) -> tuple[Ticket, Any] | None:
+        if not self._ready and self._tickets:
+            pending = list(self._tickets)
+            some, _ = ray.wait(pending, num_returns=1, timeout=timeout_s, fetch_local=True)
+            if some:
+                some, _ = ray.wait(pending, num_returns=len(pending), timeout=0, fetch_local=True)
+            self._ready.extend(some)
+        if not self._ready:
+            return None
+        reference = self._ready.popleft()
+        ticket = self._tickets.pop(reference)
+        try:
+            return ticket, ray.get(reference)
+        except RayError as error:
+            return ticket, Failure(ErrorKind.SYSTEM, f"{type(error).__name__}: {error}"[:2000])
+
+    def close(self) -> None:
+        self._tickets.clear()
+        if self._started:
+            ray.shutdown()
+
+
+@ray.remote(num_cpus=1, num_returns=2, max_retries=MAX_RETRIES)
+def _run(step: str, n_supplied: int, *args: Any) -> tuple[Any, Any]:
+    """A function of factory.steps in a worker."""
+    function: Any = STEPS[step]
+    supplied = [_held(arg) if isinstance(arg, list) else arg for arg in args[:n_supplied]]
+    report, result = function(*supplied, *args[n_supplied:])
+    return report, result
+
+
+def _held(reference: list[Any]) -> Any:
+    key = reference[0].hex()
+    if key not in _HELD:
+        _HELD.clear()
+        _HELD[key] = ray.get(reference[0])
+    return _HELD[key]
+
+
+@ray.remote(num_cpus=0)
+def _sees(out: Location, name: str, token: bytes) -> bool:
+    return out.read(name) == token
+
+
+def _connect(workers: int | None, address: str | None) -> None:
+    environment = WORKER_ENV | {name: os.environ[name] for name in FORWARDED_ENV if name in os.environ}
+    where = address or ("auto" if os.environ.get("RAY_ADDRESS") else "local")
+    own: dict[str, Any] = {"num_cpus": workers, "include_dashboard": False} if where == "local" else {}
+    ray.init(
+        address=where,
+        runtime_env={"env_vars": environment},
+        log_to_driver=False,
+        logging_level=logging.WARNING,
+        **own,
+    )
+
+
+def _nodes() -> list[str]:
+    return [node["NodeID"] for node in ray.nodes() if node["Alive"]]
+
+
+def _on(node: str) -> NodeAffinitySchedulingStrategy:
+    return NodeAffinitySchedulingStrategy(node, soft=False)
+
+
+def _prove_shared(out: Location) -> None:
+    """Every node reads what the driver wrote under `out`."""
+    nodes = _nodes()
+    if len(nodes) < 2:
+        return
+    name, token = f"probe-{secrets.token_hex(8)}", secrets.token_bytes(16)
+    out.write(name, token)
+    try:
+        answers = ray.get(
+            [_sees.options(scheduling_strategy=_on(node)).remote(out, name, token) for node in nodes],
+            timeout=PROBE_SECONDS,
+        )
+    finally:
+        out.remove(name)
+    blind = [node for node, sees in zip(nodes, answers) if not sees]
+    if blind:
+        raise BadLocation(f"out={out.uri} is not the same folder on nodes {blind}: name shared storage or a URL")
+
+
+def _warm_every_node(work: list[Any]) -> None:
+    reports = [_run.options(scheduling_strategy=_on(node)).remote("warm", 1, work) for node in _nodes()]
+    for report, _ in reports:
+        answer = ray.get(report)
+        if isinstance(answer, Failure):
+            raise RuntimeError(f"warming up: {answer.error}")

@@ -1,0 +1,70 @@
+"""The graph in this process: one task after the other, in the order of submission. For tests, breakpoints, explain."""
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from factory import steps
+from factory.store.location import Location
+from factory.work import Work
+
+
+@dataclass(eq=False)
+class Ticket:
+    """A submitted task. `result` stands for its large result and may be an argument of later tasks."""
+
+    result: Any
+
+
+class Graph(Protocol):
+    """What both executors offer: submit a function of factory.steps, wait for reports."""
+
+    parallelism: int
+
+    def submit(self, step: str, *args: Any) -> Ticket:
+        """Run `step`; arguments may be results of earlier tickets. `work` and `out` are supplied to it (WANTS)."""
+        ...
+
+    def wait(self, timeout_s: float) -> tuple[Ticket, Any] | None:
+        """A finished task and its report (a steps.Failure where it died); None when the time is up."""
+        ...
+
+    def close(self) -> None: ...
+
+
+STEPS = {"prepare": steps.prepare, "attempt": steps.attempt, "write": steps.write, "warm": steps.warm}
+WANTS = {"prepare": ("work", "out"), "attempt": ("work",), "write": ("out",), "warm": ("work",)}
+
+
+@dataclass
+class _Box:
+    value: Any = None
+
+
+class LocalGraph:
+    """Graph in this process."""
+
+    parallelism = 1
+
+    def __init__(self, work: Work, out: Location) -> None:
+        self._supplied = {"work": work, "out": out}
+        self._waiting: deque[tuple[Ticket, str, tuple[Any, ...]]] = deque()
+        work.warm()
+
+    def submit(self, step: str, *args: Any) -> Ticket:
+        ticket = Ticket(_Box())
+        self._waiting.append((ticket, step, args))
+        return ticket
+
+    def wait(self, timeout_s: float) -> tuple[Ticket, Any] | None:
+        if not self._waiting:
+            return None
+        ticket, step, args = self._waiting.popleft()
+        supplied = [self._supplied[name] for name in WANTS[step]]
+        plain = [arg.value if isinstance(arg, _Box) else arg for arg in args]
+        function: Any = STEPS[step]
+        report, ticket.result.value = function(*supplied, *plain)
+        return ticket, report
+
+    def close(self) -> None:
+        self._waiting.clear()

@@ -1,0 +1,116 @@
+"""What a run has to do: for every clip, what the tables already know about its walks, and whether anything is left."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from factory.clips.reader import ClipRef
+from factory.store.candidates import ClipCandidates
+from factory.store.outcomes import Kind
+from factory.store.samples import History, OnChange, Past
+from factory.walk import Exhausted, Step, Try, next_step
+from factory.work import HUMAN_CANDIDATE, RunIdentity
+
+Policy = Callable[[Past], bool]
+CLIP_CANDIDATE = HUMAN_CANDIDATE  # of a row about the clip as a whole (its expert is empty)
+
+
+@dataclass
+class WalkState:
+    """One (clip, expert) on its way."""
+
+    expert: str
+    known: dict[int, Past]
+    stale: frozenset[str] = frozenset()  # redo: attempt_ids whose rows this walk replaces as a whole
+
+    def step(self, n_candidates: int, rounds: int, may_retry: Policy) -> Step:
+        return next_step(self.expert, n_candidates, rounds, self.known, may_retry)
+
+    def lacks_exhausted(self, step: Step) -> bool:
+        """The walk stands at the end of its list and no outcome says so yet."""
+        return isinstance(step, Exhausted) and step.n_tried not in self.known
+
+
+@dataclass
+class ClipPlan:
+    """One clip on its way."""
+
+    ref: ClipRef
+    walks: tuple[WalkState, ...]
+    past: Past | None  # the clip-level outcome, where there is one
+    listed: ClipCandidates | None  # its row in `candidates`, where it is this run's
+    stale: frozenset[str] = frozenset()  # redo: clip-level rows to replace
+    n_candidates: int = 0
+    failed: bool = False  # the clip as a whole, in this run or for good
+    steps: dict[str, Step] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All clips of a run: those with something left to do, in order, and the others."""
+
+    todo: tuple[ClipPlan, ...]
+    done: tuple[ClipPlan, ...]
+    frozen: tuple[ClipRef, ...]  # clips whose candidate list comes from other settings: kept, never continued
+    found_done: int  # attempts that an earlier run settled
+
+
+def make_plan(
+    refs: Sequence[ClipRef],
+    experts: Sequence[str],
+    rounds: int,
+    history: History,
+    identity: RunIdentity,
+    on_change: OnChange,
+    may_retry: Policy,
+) -> Plan:
+    """Hold the wishes against the tables. Under `redo`, rows of other settings count as absent and are replaced."""
+    todo: list[ClipPlan] = []
+    done: list[ClipPlan] = []
+    frozen: list[ClipRef] = []
+    found = 0
+    for ref in refs:
+        listed = history.candidates.get(ref.clip_id)
+        if listed is not None and listed.prepare_digest != identity.prepare_digest:
+            if on_change != "redo":
+                frozen.append(ref)
+                continue
+            listed = None
+        clip = ClipPlan(
+            ref,
+            tuple(_walk(history, ref.clip_id, expert, on_change) for expert in experts),
+            _walk(history, ref.clip_id, "", on_change).known.get(CLIP_CANDIDATE),
+            listed,
+            _stale(history, ref.clip_id, "", on_change),
+            len(listed.candidates) if listed is not None else 0,
+        )
+        found += sum(past.kind in (Kind.ACCEPTED, Kind.REJECTED) for walk in clip.walks for past in walk.known.values())
+        (todo if _has_work(clip, rounds, may_retry) else done).append(clip)
+    return Plan(tuple(todo), tuple(done), tuple(frozen), found)
+
+
+def _walk(history: History, clip_id: str, expert: str, on_change: OnChange) -> WalkState:
+    known = dict(history.walks.get((clip_id, expert), {}))
+    if on_change == "redo":
+        known = {candidate: past for candidate, past in known.items() if past.current}
+    return WalkState(expert, known, _stale(history, clip_id, expert, on_change))
+
+
+def _stale(history: History, clip_id: str, expert: str, on_change: OnChange) -> frozenset[str]:
+    return history.stale.get((clip_id, expert), frozenset()) if on_change == "redo" else frozenset()
+
+
+def _has_work(clip: ClipPlan, rounds: int, may_retry: Policy) -> bool:
+    if clip.past is not None and clip.past.kind is Kind.REJECTED:
+        return False
+    if clip.past is not None and clip.past.kind is Kind.FAILED:
+        clip.failed = not may_retry(clip.past)
+        return not clip.failed
+    if clip.listed is None:
+        return True
+    clip.steps = {walk.expert: walk.step(clip.n_candidates, rounds, may_retry) for walk in clip.walks}
+    return any(isinstance(clip.steps[w.expert], Try) or w.lacks_exhausted(clip.steps[w.expert]) for w in clip.walks)
+
+
+def wants_payload(clip: ClipPlan) -> bool:
+    """Some walk has an attempt to make, so that the prepared clip is needed."""
+    return clip.listed is None or any(isinstance(step, Try) for step in clip.steps.values())

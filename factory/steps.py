@@ -1,0 +1,143 @@
+"""The tasks of the graph as plain functions; the local executor calls them, the Ray executor ships them to workers.
+
+Each returns (report, result): the small report goes to the driver, the large result stays where it was made and is
+handed to other tasks by reference. What a stage raises becomes a Failure here and nowhere else.
+"""
+
+import hashlib
+import time
+import traceback
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import pyarrow as pa
+
+from factory.clips.reader import BadClip, ClipRef
+from factory.store.cache import BadCacheFile, ClipCache
+from factory.store.location import Location
+from factory.store.outcomes import ErrorKind
+from factory.store.schema import sample_row_to_table, samples_spec
+from factory.store.table import Shard, write_shard
+from factory.work import Accepted, CandidateRow, PreparedClip, Work
+from tasks.stages import Rejected
+
+ERROR_LINES = 12  # of a traceback that an outcome keeps
+
+
+@dataclass(frozen=True)
+class Failure:
+    """An incident instead of a report."""
+
+    kind: ErrorKind
+    error: str
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """Report on a prepared clip."""
+
+    content_digest: str
+    candidates: tuple[CandidateRow, ...]
+    gate_counts: Mapping[str, int]
+    dropped: Rejected | None
+    from_cache: bool
+    note: str = ""  # why the cache was of no use, where a file was there
+    seconds: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Attempted:
+    """Report on an attempt."""
+
+    rejected: Rejected | None  # None: accepted, and the result is the row
+    n_bytes: int = 0  # of the row
+    subscores: Mapping[str, float] = field(default_factory=dict)
+    seconds: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Stamp:
+    """What the executor writes on a row: names and values of schema.BOOKKEEPING."""
+
+    attempt_id: str
+    expert: str
+    expert_digest: str
+    round: int
+    candidate_index: int
+    vocabulary_digest: str
+    settings_hash: str
+    stage_versions: str
+
+
+def cache_key(clip_id: str, prepare_digest: str) -> str:
+    """File name of a prepared clip."""
+    return f"{clip_id}-{hashlib.sha256(prepare_digest.encode()).hexdigest()[:16]}"
+
+
+def prepare(work: Work, out: Location, ref: ClipRef) -> tuple[Prepared | Rejected | Failure, PreparedClip | None]:
+    """The clip from the cache, else prepared and cached."""
+    cache, key = ClipCache(out.child("cache/prepared")), cache_key(ref.clip_id, work.identity.prepare_digest)
+    note, began = "", time.perf_counter()
+    try:
+        try:
+            stored = cache.load(key)
+        except BadCacheFile as error:
+            stored, note = None, f"cache file {key}: {error}; prepared again"
+        if isinstance(stored, PreparedClip):
+            seconds = {"cache": time.perf_counter() - began}
+            return _prepared(stored, True, note, seconds), stored
+        result = work.prepare(ref)
+        if isinstance(result, Rejected):
+            return result, None
+        if result.clip_id != ref.clip_id:
+            raise ValueError(f"prepare({ref.clip_id}) returned clip {result.clip_id}")
+        cache.store(key, result)
+        return _prepared(result, False, note, result.seconds), result
+    except Exception as error:  # the boundary where whatever a stage or a user's reader raises becomes data
+        return failure_of(error), None
+
+
+def attempt(work: Work, prepared: PreparedClip, stamp: Stamp) -> tuple[Attempted | Failure, pa.Table | None]:
+    """One attempt; an accepted one is checked against the schema here, where its traceback still means something."""
+    began = time.perf_counter()
+    try:
+        result = work.attempt(prepared, stamp.candidate_index, stamp.expert)
+        seconds = result.seconds or {"attempt": time.perf_counter() - began}
+        if not isinstance(result, Accepted):
+            return Attempted(result.rejected, 0, dict(result.subscores), seconds), None
+        row = sample_row_to_table([{**result.row, **vars(stamp)}])
+        return Attempted(None, row.nbytes, {}, seconds), row
+    except Exception as error:  # the same boundary
+        return failure_of(error), None
+
+
+def write(out: Location, *rows: pa.Table) -> tuple[Shard | Failure, None]:
+    """Rows of one partition as one shard."""
+    try:
+        return write_shard(out.child("samples"), samples_spec(), pa.concat_tables(rows)), None
+    except OSError as error:
+        return failure_of(error), None
+
+
+def warm(work: Work) -> tuple[str | Failure, None]:
+    """Kernels into the cache of this machine."""
+    try:
+        work.warm()
+    except Exception as error:  # the same boundary
+        return failure_of(error), None
+    return "", None
+
+
+def failure_of(error: BaseException) -> Failure:
+    """Broken input, an ailing machine, or a bug; with the last lines of the traceback."""
+    if isinstance(error, BadClip):
+        return Failure(ErrorKind.INPUT, str(error))
+    kind = ErrorKind.SYSTEM if isinstance(error, OSError | MemoryError) else ErrorKind.BUG
+    lines = "".join(traceback.format_exception(error)).strip().splitlines()
+    return Failure(kind, "\n".join(lines[-ERROR_LINES:]))
+
+
+def _prepared(clip: PreparedClip, from_cache: bool, note: str, seconds: Mapping[str, float]) -> Prepared:
+    return Prepared(
+        clip.content_digest, clip.candidates, dict(clip.gate_counts), clip.dropped, from_cache, note, dict(seconds)
+    )

@@ -1,0 +1,133 @@
+"""A small, deterministic Work with real numbers: candidates and rows come from a Philox stream of (clip, candidate)."""
+
+import hashlib
+import os
+import signal
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from factory.clips.reader import BadClip, ClipRef
+from factory.store.columns import Column
+from factory.store.schema import BOOKKEEPING, FIELDS
+from factory.work import Accepted, AttemptResult, CandidateRow, Dropped, PreparedClip, RunIdentity
+from tasks.stages import Rejected
+
+VERSIONS = {"clip": 1, "perturb": 1, "rollout": 1, "expert": 1, "reward": 1, "render": 1, "write": 1}
+RAGGED = {"N": 3, "L": 4, "P": 5, "D": 2, "X": 1, "S": 1, "R": 2, "C": 1, "I": 2, "T": 1}
+
+
+def refs(n: int) -> list[ClipRef]:
+    """n clips of two logs."""
+    return [ClipRef("toy", f"log{i % 2}", 1000 * i) for i in range(n)]
+
+
+def stream(*words: object) -> np.random.Generator:
+    key = int.from_bytes(hashlib.sha256(repr(words).encode()).digest()[:16], "little")
+    return np.random.Generator(np.random.Philox(key=key))
+
+
+def value_of(column: Column, shape: Sequence[int | str], rng: np.random.Generator) -> object:
+    """Any value that fits the column."""
+    if shape and (column.dtype in ("struct", "string", "binary") or any(isinstance(s, str) for s in shape[1:])):
+        first = shape[0]
+        return [value_of(column, shape[1:], rng) for _ in range(RAGGED[first] if isinstance(first, str) else first)]
+    if column.dtype == "struct":
+        return {member.name: value_of(member, member.shape, rng) for member in column.members}
+    if column.dtype == "string":
+        return f"word{rng.integers(9)}"
+    if column.dtype == "binary":
+        return rng.bytes(12)
+    sizes = [RAGGED[s] if isinstance(s, str) else s for s in shape]
+    return (rng.random(sizes) * 3.0).astype(column.dtype)
+
+
+def row_of(rng: np.random.Generator) -> dict[str, object]:
+    """A full row less the bookkeeping."""
+    return {f.name: value_of(f, f.shape, rng) for f in FIELDS if f.name not in BOOKKEEPING}
+
+
+@dataclass(frozen=True)
+class ToyWork:
+    """Accepts a candidate by its own chance; `trouble` maps log_id:start_ms[:candidate] to what goes wrong there."""
+
+    n_candidates: int = 6
+    threshold: float = 0.5
+    settings: Mapping[str, object] = field(default_factory=dict)
+    versions: Mapping[str, int] = field(default_factory=lambda: dict(VERSIONS))
+    prepare_digest: str = "perturb-1"
+    digests: Mapping[str, str] = field(default_factory=dict)
+    trouble: Mapping[str, str] = field(default_factory=dict)
+    content: str = "content"
+    seconds: float = 0.0  # of sleep per task
+    journal: str = ""  # a file that gets one line per task that really ran
+
+    @property
+    def identity(self) -> RunIdentity:
+        settings = {"reward.threshold": self.threshold, **self.settings}
+        return RunIdentity(settings, self.versions, "vocabulary-1", self.prepare_digest)
+
+    def warm(self) -> None:
+        self._note("warm")
+
+    def expert_digest(self, expert: str) -> str:
+        return self.digests.get(expert, f"{expert}-1")
+
+    def prepare(self, ref: ClipRef) -> PreparedClip | Rejected:
+        self._note(f"prepare {ref.log_id}:{ref.start_ms}")
+        time.sleep(self.seconds)
+        trouble = self._trouble(f"{ref.log_id}:{ref.start_ms}")
+        if trouble == "standing":
+            return Rejected("clip", "ego_standing")
+        empty = trouble == "no_candidates"
+        rng = stream(ref.clip_id, "perturb")
+        scores = rng.random((0 if empty else self.n_candidates, 2))
+        candidates = tuple(
+            CandidateRow(i, 10 * i, float(a), float(b), 0.1, 5.0, (i, -i), float(a), float(b))
+            for i, (a, b) in enumerate(scores)
+        )
+        payload = {"name": f"{ref.log_id}:{ref.start_ms}", "states": rng.random((6, 41, 3)), "kinds": ("a", "b")}
+        dropped = Rejected("perturb", "no_gated_candidate") if empty else None
+        counts = {"heading": 7, "lateral": 3}
+        return PreparedClip(ref.clip_id, self.content, candidates, counts, payload, dropped, {"perturb": 0.1})
+
+    def attempt(self, prepared: PreparedClip, candidate: int, expert: str) -> AttemptResult:
+        payload = prepared.payload
+        assert isinstance(payload, dict)
+        name = f"{payload['name']}:{expert}:{candidate}"
+        self._note(f"attempt {name}")
+        time.sleep(self.seconds)
+        self._trouble(name)
+        rng = stream(prepared.clip_id, "attempt", expert, candidate)
+        chance = float(rng.random())
+        if expert != "human" and chance < self.threshold:
+            return Dropped(Rejected("reward", "nc" if chance < self.threshold / 2 else "ep"), {"nc": chance})
+        row = row_of(rng)
+        row["clip_id"], row["content_digest"] = prepared.clip_id, prepared.content_digest
+        row["label_10hz"] = payload["states"][candidate % 6, 1:].astype(np.float32)
+        return Accepted(row, {"reward": 0.01})
+
+    def _note(self, line: str) -> None:
+        if self.journal:
+            with open(self.journal, "a") as file:
+                file.write(line + "\n")
+
+    def _trouble(self, name: str) -> str:
+        trouble = self.trouble.get(name, "")
+        if trouble == "bad":
+            raise BadClip("toy.feather", "tx_m", "holds NaN; take the log out")
+        if trouble == "bug":
+            raise ZeroDivisionError("a bug in a stage")
+        if trouble == "disk":
+            raise OSError("no space left")
+        if trouble == "die":
+            os.kill(os.getpid(), signal.SIGKILL)
+        return trouble
+
+
+def ran(journal: str, word: str) -> int:
+    """Tasks of a kind that really ran."""
+    with open(journal) as file:
+        return sum(line.startswith(word) for line in file)
