@@ -39,7 +39,9 @@ def bezier(start: Array, end: Array, reach: float = 0.39, step_m: float = 1.0) -
     return resample(points, step_m, start[2], end[2])
 
 
-def resample(points: Array, step_m: float, first_heading: float | None = None, last_heading: float | None = None) -> Array:
+def resample(
+    points: Array, step_m: float, first_heading: float | None = None, last_heading: float | None = None
+) -> Array:
     """Poses every ~step_m along a polyline (N, >=2); headings are those of the chords, ends may be given."""
     xy = points[:, :2]
     s = arc_length(xy)

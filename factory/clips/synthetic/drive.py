@@ -86,11 +86,21 @@ def parked_cars(streets: Streets, rng: np.random.Generator) -> tuple[Track, ...]
             s = 16.0
             while s < s_line[-1] - 16.0:
                 if rng.random() < 0.8:
-                    length, width, height = 4.4 + rng.uniform(-0.4, 0.5), 1.8 + rng.uniform(-0.06, 0.06), rng.uniform(1.42, 1.8)
+                    length, width, height = (
+                        4.4 + rng.uniform(-0.4, 0.5),
+                        1.8 + rng.uniform(-0.06, 0.06),
+                        rng.uniform(1.42, 1.8),
+                    )
                     d = -(road.half_width - 0.18 - width / 2 + rng.uniform(-0.04, 0.04))
                     pose = curves.advance(curves.at(line, s_line, s), 0.0, d, rng.uniform(-0.012, 0.012))
                     cars.append(
-                        Track(f"parked-{len(cars):03d}", "REGULAR_VEHICLE", (length, width, height), pose[None], int(rng.integers(1 << 30)))
+                        Track(
+                            f"parked-{len(cars):03d}",
+                            "REGULAR_VEHICLE",
+                            (length, width, height),
+                            pose[None],
+                            int(rng.integers(1 << 30)),
+                        )
                     )
                 s += rng.uniform(6.0, 7.2)
     return tuple(cars)
@@ -112,7 +122,12 @@ def plan_drive(
 
 
 def _attempt(
-    streets: Streets, parked: tuple[Track, ...], scenario: Scenario, steps: int, rng: np.random.Generator, density: float
+    streets: Streets,
+    parked: tuple[Track, ...],
+    scenario: Scenario,
+    steps: int,
+    rng: np.random.Generator,
+    density: float,
 ) -> Drive | None:
     total = steps + WARM_STEPS
     times = (np.arange(total) - WARM_STEPS) * STEP_S
@@ -204,7 +219,9 @@ def _cyclists(streets: Streets, world: _World, centre: Array, signals: Signals, 
     for k, lane in enumerate(lanes):
         if rng.random() > 0.45 * density:
             continue
-        driver = Driver(speed_factor=float(rng.uniform(3.6, 5.6)) / lane.speed_mps, front_m=0.9, half_width_m=0.3, gap_m=1.0)
+        driver = Driver(
+            speed_factor=float(rng.uniform(3.6, 5.6)) / lane.speed_mps, front_m=0.9, half_width_m=0.3, gap_m=1.0
+        )
         path = path_of_lanes(streets, continue_lanes(streets, [lane.lane_id], None, rng), driver)
         start = float(rng.uniform(0.0, 50.0))
         s, _v = drive(path, start, 4.0, driver, world.seen(), signals, times)

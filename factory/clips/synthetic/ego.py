@@ -54,13 +54,17 @@ def chains(streets: Streets, road: str, forward: bool) -> list[list[int]]:
     """Lane ids of a road's VEHICLE lanes, one list per lane, inner lane first, in driving direction."""
     line = next(r.line for r in streets.roads if r.name == road)
     first = [
-        lane for lane in streets.lanes.values() if lane.road == road and lane.kind == "VEHICLE" and _starts(streets, lane)
+        lane
+        for lane in streets.lanes.values()
+        if lane.road == road and lane.kind == "VEHICLE" and _starts(streets, lane)
     ]
     along = [lane for lane in first if (np.cos(lane.center[0, 2] - _near_heading(line, lane)) > 0) == forward]
     out = []
     for lane in along:
         chain = [lane.lane_id]
-        while (after := next((n for n in streets.lanes[chain[-1]].successors if streets.lanes[n].road == road), None)) is not None:
+        while (
+            after := next((n for n in streets.lanes[chain[-1]].successors if streets.lanes[n].road == road), None)
+        ) is not None:
             chain.append(after)
         out.append(chain)
     return out

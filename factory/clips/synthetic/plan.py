@@ -39,7 +39,8 @@ def build_streets(rng: np.random.Generator) -> Streets:
     bend = 1.0 / float(rng.uniform(62.0, 80.0))
     avenue_line = curves.from_curvature(mouth(0.0), [(float(rng.uniform(225, 260)), 0.0)])
     south_line = curves.from_curvature(
-        mouth(-np.pi / 2), [(float(rng.uniform(30, 45)), 0.0), (1.35 / bend, bend), (45.0, 0.0), (60.0, -0.006), (60.0, 0.0)]
+        mouth(-np.pi / 2),
+        [(float(rng.uniform(30, 45)), 0.0), (1.35 / bend, bend), (45.0, 0.0), (60.0, -0.006), (60.0, 0.0)],
     )
     north_line = curves.from_curvature(mouth(np.pi / 2 + lean), [(270.0, 0.0)])
     sway = side / float(rng.uniform(75.0, 95.0))

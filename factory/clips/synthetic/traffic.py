@@ -152,7 +152,9 @@ def drive(
 
 def _follow(gap: float, v: float, lead_v: float, driver: Driver) -> float:
     """IDM's interaction term (Treiber et al. 2000)."""
-    wanted = driver.gap_m + max(0.0, v * driver.headway_s + v * (v - lead_v) / (2 * np.sqrt(driver.accel * driver.brake)))
+    wanted = driver.gap_m + max(
+        0.0, v * driver.headway_s + v * (v - lead_v) / (2 * np.sqrt(driver.accel * driver.brake))
+    )
     return driver.accel * (1.0 - (wanted / max(gap, 0.3)) ** 2)
 
 

@@ -1,0 +1,298 @@
+"""Procedural textures as compiled functions of surface coordinates (u, v) [m]: nothing depends on the camera.
+
+Every pattern knows the pixel's footprint on the surface (fu, fv) [m] and fades out below it, so that pictures do not
+alias and one place has one colour from near and far. Colours are (r, g, b) in 0..1, before light.
+"""
+
+import math
+
+from numba import njit
+
+# Materials
+ASPHALT, ROAD, PAVING, KERB, GRASS, FACADE, ROOF_TILES, FLAT_ROOF, BARK, LEAVES, PAINTED, CABIN, WHEEL, GLOW, METAL, \
+    CLOTH, SIGN, TREELINE, CARGO, BUS_SIDE, SPOKES, ISLAND_STONE, DARK = range(23)  # fmt: skip
+ALPHA_TESTED = (LEAVES, TREELINE, SPOKES)
+
+
+RGB = tuple[float, float, float]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def chance(x: int, y: int, seed: int) -> float:
+    """A fixed random number in [0, 1) of an integer cell."""
+    h = (x * 374761393 + y * 668265263 + seed * 1442695041) & 0xFFFFFFFF
+    h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
+    h = ((h ^ (h >> 15)) * 668265263) & 0xFFFFFFFF
+    return ((h ^ (h >> 16)) & 0xFFFFFF) / 16777216.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def noise(u: float, v: float, seed: int) -> float:
+    """Value noise in [0, 1) with cells of size 1."""
+    iu, iv = math.floor(u), math.floor(v)
+    a, b = u - iu, v - iv
+    a, b = a * a * (3 - 2 * a), b * b * (3 - 2 * b)
+    x, y = int(iu), int(iv)
+    top = chance(x, y, seed) * (1 - a) + chance(x + 1, y, seed) * a
+    low = chance(x, y + 1, seed) * (1 - a) + chance(x + 1, y + 1, seed) * a
+    return top * (1 - b) + low * b
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def visible(size: float, footprint: float) -> float:
+    """How much of a pattern of that size survives a pixel of that footprint (1 near, 0 far)."""
+    return min(1.0, max(0.0, 1.6 * size / footprint - 0.8))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def inside(x: float, low: float, high: float, footprint: float) -> float:
+    """Share of a pixel of that footprint at x that lies in [low, high]."""
+    return (
+        min(1.0, max(0.0, (min(x, high) - max(x, low)) / footprint + 0.5))
+        if x < low or x > high
+        else min(1.0, min(x - low, high - x) / footprint + 0.5)
+    )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def grain(u: float, v: float, seed: int, footprint: float) -> float:
+    """Three octaves of fine noise around 0: stones of 6, 2 and 0.7 cm."""
+    out = 0.0
+    size = 0.06
+    for k in range(3):
+        seen = visible(size, footprint)
+        if seen <= 0.0:
+            break
+        out += seen * (noise(u / size, v / size, seed + k) - 0.5)
+        size *= 0.35
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def asphalt(x: float, y: float, footprint: float) -> RGB:
+    """Worn asphalt in world coordinates: broad tones, repairs, cracks, grain."""
+    tone = 0.335 + 0.07 * (noise(x / 9.0, y / 9.0, 1) - 0.5) + 0.07 * (noise(x / 1.7, y / 1.7, 2) - 0.5)
+    patch_u, patch_v = (x * 0.8 + y * 0.6) / 7.0, (y * 0.8 - x * 0.6) / 11.0
+    if chance(int(math.floor(patch_u)), int(math.floor(patch_v)), 5) < 0.22:
+        tone *= 0.86
+    blotch = noise(x / 0.45, y / 0.45, 3) - 0.5
+    tone += 0.07 * visible(0.45, footprint) * blotch
+    seen = visible(0.10, footprint)
+    if seen > 0.0:
+        bend_x, bend_y = x + 0.5 * noise(x / 0.9, y / 0.9, 7), y + 0.5 * noise(x / 0.9, y / 0.9, 8)
+        ridge = abs(noise(bend_x / 2.6, bend_y / 2.6, 4) - 0.5)
+        if ridge < 0.018 and noise(x / 14.0, y / 14.0, 6) > 0.42:
+            tone -= 0.16 * seen * (1 - ridge / 0.018)
+        tone += 0.20 * grain(x, y, 11, footprint)
+    return tone, tone * 1.005, tone * 1.02
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def paving(u: float, v: float, seed: int, footprint: float) -> RGB:
+    """Concrete slabs of 60 x 40 cm."""
+    row = math.floor(v / 0.4)
+    shifted = u + 0.3 * (row % 2)
+    column = math.floor(shifted / 0.6)
+    seen = visible(0.4, footprint)
+    tone = (
+        0.56
+        + 0.09 * seen * (chance(int(column), int(row), seed) - 0.5)
+        + 0.06 * (noise(u / 2.3, v / 2.3, seed + 1) - 0.5)
+    )
+    du, dv = shifted - column * 0.6, v - row * 0.4
+    joint = max(
+        1 - min(du, 0.6 - du) / max(0.008, footprint * 0.7), 1 - min(dv, 0.4 - dv) / max(0.008, footprint * 0.7)
+    )
+    if joint > 0:
+        tone -= 0.2 * joint * visible(0.1, footprint)
+    tone += 0.12 * grain(u, v, seed + 2, footprint)
+    spot = noise(u / 0.25, v / 0.25, seed + 4)
+    if spot > 0.86:
+        tone -= 0.3 * (spot - 0.86) * visible(0.2, footprint) * 2
+    return tone * 1.01, tone * 0.985, tone * 0.94
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def grass(x: float, y: float, footprint: float) -> RGB:
+    """A lawn with tufts and bare spots."""
+    broad = noise(x / 6.0, y / 6.0, 21)
+    tuft = (noise(x / 0.5, y / 0.5, 22) - 0.5) * visible(0.5, footprint)
+    blade = (noise(x / 0.09, y / 0.09, 23) - 0.5) * visible(0.09, footprint)
+    blade += (noise(x / 0.03, y / 0.03, 24) - 0.5) * visible(0.03, footprint)
+    tone = 0.85 + 0.35 * tuft + 0.5 * blade
+    bare = min(1.0, max(0.0, (broad - 0.62) * 5))
+    return (0.27 + 0.12 * bare) * tone, (0.36 - 0.02 * bare) * tone, (0.15 + 0.07 * bare) * tone
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def wall(u: float, v: float, style: int, seed: int, footprint: float) -> RGB:
+    """Brick (styles 0-2), plaster (3-6) or concrete panels (7), stained from above."""
+    stain = 1.0 + 0.16 * (noise(u / 1.3, v / 4.0, seed) - 0.5) + 0.10 * (noise(u / 0.4, v / 0.9, seed + 1) - 0.5)
+    if style <= 2:
+        row = math.floor(v / 0.085)
+        shifted = u + 0.12 * (row % 2)
+        column = math.floor(shifted / 0.24)
+        seen = visible(0.085, footprint)
+        tone = stain * (1 + 0.34 * seen * (chance(int(column), int(row), seed) - 0.5))
+        du, dv = shifted - column * 0.24, v - row * 0.085
+        mortar = visible(0.05, footprint) if (du < 0.014 or dv < 0.014) else 0.0
+        if style == 0:
+            r, g, b = 0.55 * tone, 0.30 * tone, 0.23 * tone
+        elif style == 1:
+            r, g, b = 0.46 * tone, 0.33 * tone, 0.26 * tone
+        else:
+            r, g, b = 0.66 * tone, 0.54 * tone, 0.40 * tone
+        return r + (0.62 - r) * mortar, g + (0.59 - g) * mortar, b + (0.55 - b) * mortar
+    rough = stain + 0.22 * grain(u, v, seed + 3, footprint)
+    if style == 3:
+        return 0.80 * rough, 0.74 * rough, 0.62 * rough
+    if style == 4:
+        return 0.72 * rough, 0.60 * rough, 0.42 * rough
+    if style == 5:
+        return 0.62 * rough, 0.66 * rough, 0.68 * rough
+    if style == 6:
+        return 0.74 * rough, 0.55 * rough, 0.47 * rough
+    joint = 0.75 if (u % 3.0 < 0.03 or v % 1.6 < 0.03) and footprint < 0.3 else 1.0
+    return 0.60 * rough * joint, 0.59 * rough * joint, 0.57 * rough * joint
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def pane(u: float, v: float, cell: int, seed: int) -> RGB:
+    """Glass seen from the street: a dark room, a curtain, a bit of sky; u, v in 0..1 over the pane."""
+    kind = chance(cell, 3, seed)
+    sky = 0.16 + 0.30 * max(0.0, v - 0.35 + 0.25 * (u - 0.5)) * chance(cell, 4, seed)
+    r, g, b = 0.10 + sky * 0.8, 0.12 + sky * 0.95, 0.15 + sky * 1.1
+    if kind < 0.35 and abs(u - 0.5) > 0.17 + 0.2 * chance(cell, 5, seed):
+        fold = 0.85 + 0.15 * math.sin(u * 60.0)
+        r, g, b = 0.74 * fold, 0.70 * fold, 0.62 * fold
+    elif kind > 0.7 and v > 0.3 + 0.6 * chance(cell, 6, seed):
+        r, g, b = 0.62, 0.60, 0.55
+    elif kind > 0.62 and kind < 0.66:
+        r, g, b = 0.85, 0.74, 0.48
+    return r, g, b
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def facade(u: float, v: float, width: float, height: float, seed: int, fu: float, fv: float) -> RGB:
+    """A house front: plinth, shops or doors at street level, floors of windows, cornice. Everything by `seed`."""
+    fp = max(fu, fv)
+    style = int(chance(seed, 1, 77) * 8)
+    ground = 3.3 + chance(seed, 2, 77) * 0.9
+    floor_height = 2.9 + chance(seed, 3, 77) * 0.5
+    bays = max(1.0, math.floor(width / (2.1 + 1.2 * chance(seed, 4, 77))))
+    spacing = width / bays
+    trim = 0.55 + 0.35 * chance(seed, 5, 77)
+    r, g, b = wall(u, v, style, seed, fp)
+    bay = math.floor(u / spacing)
+    x = u - bay * spacing
+    shops = chance(seed, 6, 77) < 0.55
+    if v > ground:
+        floor = math.floor((v - ground) / floor_height)
+        y = v - ground - floor * floor_height
+        if ground + (floor + 1) * floor_height < height - 0.3:
+            half = spacing * (0.21 + 0.12 * chance(seed, 7, 77))
+            low, high = 0.75 + 0.2 * chance(seed, 8, 77), floor_height - 0.42
+            left, right = spacing / 2 - half, spacing / 2 + half
+            surround = inside(x, left - 0.14, right + 0.14, fu) * inside(y, low - 0.16, high + 0.16, fv)
+            r, g, b = r + (trim - r) * surround, g + (trim * 0.97 - g) * surround, b + (trim * 0.92 - b) * surround
+            sill = inside(y, low - 0.42, low - 0.16, fv) * inside(x, left - 0.1, right + 0.1, fu)
+            r, g, b = r * (1 - 0.28 * sill), g * (1 - 0.28 * sill), b * (1 - 0.28 * sill)
+            opening = inside(x, left, right, fu) * inside(y, low, high, fv)
+            if opening > 0.0:
+                pu, pv = (x - left) / (right - left), (y - low) / (high - low)
+                pr, pg, pb = pane(pu, pv, int(bay) * 31 + int(floor), seed)
+                frame = 1.0 - inside(x, left + 0.07, right - 0.07, fu) * inside(y, low + 0.07, high - 0.07, fv)
+                frame = max(
+                    frame, inside(pu, 0.46, 0.54, fu / (right - left)), inside(pv, 0.66, 0.71, fv / (high - low))
+                )
+                tone = 0.88 if chance(seed, 9, 77) < 0.7 else 0.22
+                shade = 1.0 - 0.55 * inside(y, high - 0.16, high, fv)
+                pr, pg, pb = (
+                    (pr + (tone - pr) * frame) * shade,
+                    (pg + (tone - pg) * frame) * shade,
+                    (pb + (tone - pb) * frame) * shade,
+                )
+                r, g, b = r + (pr - r) * opening, g + (pg - g) * opening, b + (pb - b) * opening
+        band = inside(y, 0.0, 0.16, fv)
+        r, g, b = r + (trim * 0.9 - r) * band, g + (trim * 0.88 - g) * band, b + (trim * 0.84 - b) * band
+    elif shops:
+        r, g, b = shopfront(u, v, ground, seed, fu, fv)
+    else:
+        left, right = spacing * 0.25, spacing * 0.75
+        is_door = chance(int(bay), 12, seed) < 0.3
+        low, high = (0.12, 2.35) if is_door else (1.0, 2.5)
+        opening = inside(x, left, right, fu) * inside(v, low, high, fv)
+        if is_door:
+            hue = chance(int(bay), 13, seed)
+            panel = 0.75 + 0.25 * inside((v * 1.4) % 1.0, 0.12, 0.88, fv * 1.4) * inside(
+                (x - left) / (right - left) * 2 % 1.0, 0.15, 0.85, fu
+            )
+            pr, pg, pb = (0.16 + 0.34 * hue) * panel, (0.20 + 0.10 * hue) * panel, (0.30 - 0.2 * hue) * panel
+        else:
+            pr, pg, pb = pane((x - left) / (right - left), (v - low) / (high - low), int(bay), seed + 1)
+            frame = 1.0 - inside(x, left + 0.08, right - 0.08, fu) * inside(v, low + 0.08, high - 0.08, fv)
+            pr, pg, pb = pr + (0.85 - pr) * frame, pg + (0.85 - pg) * frame, pb + (0.82 - pb) * frame
+        r, g, b = r + (pr - r) * opening, g + (pg - g) * opening, b + (pb - b) * opening
+        plinth = inside(v, -1.0, 0.5, fv) * (1 - opening)
+        r, g, b = r * (1 - 0.4 * plinth), g * (1 - 0.4 * plinth), b * (1 - 0.38 * plinth)
+    top = inside(v, height - 0.45, height + 1.0, fv)
+    return r + (trim - r) * top, g + (trim * 0.97 - g) * top, b + (trim * 0.92 - b) * top
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def shopfront(u: float, v: float, ground: float, seed: int, fu: float, fv: float) -> RGB:
+    """Shops of 4.6 m: sign with letters, window with goods, door, stall riser."""
+    shop = int(math.floor(u / 4.6))
+    x = u - shop * 4.6
+    hue = chance(shop, 21, seed)
+    sr, sg, sb = 0.15 + 0.65 * chance(shop, 22, seed), 0.15 + 0.4 * hue, 0.15 + 0.5 * chance(shop, 23, seed)
+    if v > ground - 0.85:
+        letter = 0.0
+        y = (v - ground + 0.68) / 0.42
+        if 0.0 < y < 1.0 and 0.5 < x < 3.9 and chance(int(x / 0.34), 24, seed + shop) > 0.12:
+            stroke = chance(int(x / 0.085), int(y * 4), seed + 9 * shop) > 0.45
+            letter = visible(0.12, max(fu, fv)) * 0.85 if stroke and (x / 0.34) % 1.0 < 0.78 else 0.0
+        edge = 1.0 - inside(x, 0.1, 4.5, fu) * inside(v, ground - 0.8, ground - 0.12, fv)
+        tone = 0.92 if hue < 0.7 else 0.1
+        sr, sg, sb = sr + (tone - sr) * letter, sg + (tone - sg) * letter, sb + (tone * 0.95 - sb) * letter
+        return sr * (1 - 0.5 * edge), sg * (1 - 0.5 * edge), sb * (1 - 0.5 * edge)
+    door = x > 3.35
+    low = 0.1 if door else 0.55
+    left, right = (3.5, 4.4) if door else (0.25, 3.3)
+    glass = inside(x, left, right, fu) * inside(v, low, ground - 1.0, fv)
+    bar = 0.0 if door else inside(x, 1.72, 1.82, fu)
+    goods = noise(x / 0.35, v / 0.45, seed + shop) * visible(0.35, max(fu, fv)) if v < 1.9 else 0.3
+    gr = 0.13 + 0.45 * goods * chance(int(x / 0.35), int(v / 0.45), seed + 1) + 0.10 * v / ground
+    gg = 0.14 + 0.40 * goods * chance(int(x / 0.35), int(v / 0.45), seed + 2) + 0.11 * v / ground
+    gb = 0.16 + 0.36 * goods * chance(int(x / 0.35), int(v / 0.45), seed + 3) + 0.13 * v / ground
+    glass *= 1 - bar
+    fr, fg, fb = sr * 0.6 + 0.1, sg * 0.6 + 0.1, sb * 0.6 + 0.1
+    return fr + (gr - fr) * glass, fg + (gg - fg) * glass, fb + (gb - fb) * glass
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def leaf_here(u: float, v: float, seed: int) -> bool:
+    """Is there a leaf at this place of a twig's card (in metres)?"""
+    for k in range(2):
+        size = 0.17 if k == 0 else 0.24
+        iu, iv = math.floor(u / size), math.floor(v / size)
+        cx, cy = chance(int(iu), int(iv), seed + 3 + 9 * k), chance(int(iu), int(iv), seed + 4 + 9 * k)
+        x, y = u / size - iu - 0.35 - 0.3 * cx, v / size - iv - 0.35 - 0.3 * cy
+        turn = 6.283 * chance(int(iu), int(iv), seed + 5)
+        along, across = x * math.cos(turn) + y * math.sin(turn), y * math.cos(turn) - x * math.sin(turn)
+        if along * along / 0.20 + across * across / 0.07 < 1.0:
+            return True
+    return False
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def opaque_at(material: int, u: float, v: float, seed: int) -> bool:
+    """The cut-out materials' masks."""
+    if material == LEAVES:
+        return u * u + v * v < 0.8 and leaf_here(u, v, seed)
+    if material == TREELINE:
+        top = 5.0 + 7.0 * noise(u / 16.0, 0.5, 41) + 3.0 * noise(u / 4.0, 0.5, 42) + 1.2 * noise(u / 1.1, 0.5, 43)
+        return v < top
+    radius = math.sqrt(u * u + v * v)
+    spoke = abs(math.atan2(v, u) * 9.0 / math.pi % 1.0 - 0.5) > 0.44
+    return 0.29 < radius < 0.345 or (radius < 0.3 and spoke) or radius < 0.04
