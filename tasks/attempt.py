@@ -6,20 +6,16 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tasks.experts.pdm_closed import PdmSettings, pdm_closed_poses
+from tasks.experts.pdm_closed import PdmSettings, plan_for
 from tasks.experts.protocol import Expert, Plan
 from tasks.reward.epdms import Scores, score
 from tasks.reward.prepare import prepare_scene
-from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficSettings, next_scene, simulate
 from tasks.stages import Rejected
 from tasks.world.clip import Clip, Rollout, Scene, scene_of_clip
 from tasks.world.route import centerline_from
 from tasks.world.vehicle import HEADING
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -46,13 +42,10 @@ def perturbed_scene(clip: Clip, stage_one: Rollout) -> Scene:
     return next_scene(scene_of_clip(clip), stage_one, centerline_from(clip.road_map, clip.route, end[: HEADING + 1]))
 
 
-def drive_and_judge(
-    scene: Scene, plan: Plan, traffic: TrafficSettings, planner: PdmSettings, pdm_poses: Array | None = None
-) -> Judged:
+def drive_and_judge(scene: Scene, plan: Plan, traffic: TrafficSettings, planner: PdmSettings) -> Judged:
     """Simulate the plan with the traffic and score it in the two-row batch [PDM-Closed, plan]."""
     rollout = simulate(scene, plan.poses, traffic)
-    pdm = pdm_closed_poses(scene, planner) if pdm_poses is None else pdm_poses
-    states = np.concatenate([track(scene.ego_state, pdm[None]), rollout.ego_states[None]])
+    states = np.stack([plan_for(scene, planner).driven, rollout.ego_states])
     return Judged(scene, plan, rollout, score(prepare_scene(scene, rollout.agents), states, normalise="pairs"))
 
 
@@ -80,7 +73,7 @@ def attempt(
     plan = expert.plan(scene, rng)
     if isinstance(plan, Rejected):
         return plan
-    judged = drive_and_judge(scene, plan, traffic, planner, plan.poses if expert.name == "pdm_closed" else None)
+    judged = drive_and_judge(scene, plan, traffic, planner)
     return judged, verdict(judged.scores, gate)
 
 

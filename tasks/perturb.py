@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.experts.pdm_closed import PdmSettings, pdm_closed_poses
+from tasks.experts.pdm_closed import PdmSettings, plan_for
 from tasks.reward.epdms import Scores, score
 from tasks.reward.prepare import prepare_scene
 from tasks.rollout.lqr import track
@@ -157,7 +157,7 @@ def perturb(
     counts["white_cell"] = int((reached & ~black).sum())
 
     replay = prepare_scene(scene, scene.agents.window(NOW, NOW + HORIZON_STEPS + 1))
-    pdm_states = track(start, pdm_closed_poses(scene, planner)[None])
+    pdm_states = plan_for(scene, planner).driven[None]
     scores = np.full(len(gated), np.nan)
 
     def passes_replay(members: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -47,6 +47,11 @@ class PdmPlan:
         """(40, 3) of the chosen proposal, world frame, 0.1 .. 4.0 s."""
         return self.proposals.poses[self.chosen, 1 : SCORED_STEPS + 1]
 
+    @property
+    def driven(self) -> Array:
+        """(41, 11) the chosen proposal as the tracker drives it, its own first pose as reference row 0."""
+        return self.simulated[self.chosen]
+
 
 def plan_pdm_closed(
     *,
@@ -124,7 +129,7 @@ def starting_speed_limit(scene: Scene) -> float | None:
 
 
 def pdm_closed_poses(scene: Scene, settings: PdmSettings = DEFAULTS) -> Array:
-    """(40, 3) world poses of PDM-Closed's plan: also row 0 of the reward's two-row batch."""
+    """(40, 3) world poses of PDM-Closed's plan."""
     return plan_for(scene, settings).poses
 
 
