@@ -7,15 +7,18 @@ above, below, left and right; across a depth edge only the side that the pixel's
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from tasks.kernels import kernel
 from tasks.render.gaussians import F32, F64
 
 NEAR_M = 0.5
 SEE_THROUGH_PX = 5  # how far around a pixel its occluders are looked for
 OCCLUDED_RATIO = 0.85  # a return is hidden when returns on both sides are nearer than this share of its depth
 EDGE_RATIO = 1.25  # depths further apart than this belong to two surfaces
+MAX_BEYOND_PX = 2  # a pixel that is not between two returns is not the same surface much further
+SMOOTH_PX = 2  # window of 5 x 5: noise of the lidar and of its poses, a few cm, ripples the road
+SMOOTH_RATIO = 1.06  # depths further apart are not averaged
 COLOUR_SIGMA = 0.06  # rgb distance that makes a neighbour half as trustworthy
 
 
@@ -41,10 +44,11 @@ def dense_depth(
 
     `rgb` (H, W, 3) in [0, 1]. Where nothing is near enough the depth stays 0 and the label -2.
     """
-    return _fill(depth, label, np.ascontiguousarray(rgb, np.float32), max_gap_px[0], max_gap_px[1])
+    filled, labels = _fill(depth, label, np.ascontiguousarray(rgb, np.float32), max_gap_px[0], max_gap_px[1])
+    return _smooth(filled, labels), labels
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _zbuffer(points: Any, labels: Any, camera_from_world: Any, k: Any, width: int, height: int) -> Any:
     depth = np.zeros((height, width), np.float32)
     label = np.full((height, width), -2, np.int32)
@@ -65,7 +69,7 @@ def _zbuffer(points: Any, labels: Any, camera_from_world: Any, k: Any, width: in
     return depth, label
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _nearer(depth: Any, y: int, x: int, dy: int, dx: int, limit: float) -> bool:
     """Whether a strip of three pixels' width in direction (dy, dx) holds a return nearer than `limit`."""
     height, width = depth.shape
@@ -77,7 +81,7 @@ def _nearer(depth: Any, y: int, x: int, dy: int, dx: int, limit: float) -> bool:
     return False
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _hidden(depth: Any) -> Any:
     """Returns with nearer ones on opposite sides. One side alone is a depth edge, or the road further down."""
     height, width = depth.shape
@@ -93,7 +97,7 @@ def _hidden(depth: Any) -> Any:
     return hidden
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fill(depth: Any, label: Any, rgb: Any, gap_x: int, gap_y: int) -> Any:
     height, width = depth.shape
     out, out_label = depth.copy(), label.copy()
@@ -120,7 +124,8 @@ def _fill(depth: Any, label: Any, rgb: Any, gap_x: int, gap_y: int) -> Any:
                         break
                 if trust[side] > 0.0 and (best < 0 or trust[side] > trust[best]):
                     best = side
-            if best < 0:
+            between = (trust[0] > 0.0 and trust[1] > 0.0) or (trust[2] > 0.0 and trust[3] > 0.0)
+            if best < 0 or not (between or near[best] * MAX_BEYOND_PX >= 1.0):
                 continue
             total, inverse = 0.0, 0.0
             for side in range(4):
@@ -133,3 +138,32 @@ def _fill(depth: Any, label: Any, rgb: Any, gap_x: int, gap_y: int) -> Any:
             out[y, x] = total / inverse
             out_label[y, x] = labels[best]
     return out, out_label
+
+
+@kernel
+def _smooth(depth: Any, label: Any) -> Any:
+    """Mean inverse depth over symmetric pairs of pixels of the same surface: leaves planes as they are."""
+    height, width = depth.shape
+    out = depth.copy()
+    for y in range(height):
+        for x in range(width):
+            z = depth[y, x]
+            if z == 0.0:
+                continue
+            total, inverse = 1.0, 1.0 / z
+            for dy in range(SMOOTH_PX + 1):
+                for dx in range(-SMOOTH_PX, SMOOTH_PX + 1):
+                    if dy == 0 and dx <= 0:
+                        continue
+                    y0, y1, x0, x1 = y - dy, y + dy, x - dx, x + dx
+                    if y0 < 0 or y1 >= height or min(x0, x1) < 0 or max(x0, x1) >= width:
+                        continue
+                    a, b = depth[y0, x0], depth[y1, x1]
+                    if a == 0.0 or b == 0.0 or label[y0, x0] != label[y, x] or label[y1, x1] != label[y, x]:
+                        continue
+                    mean = 0.5 * (1.0 / a + 1.0 / b)
+                    if max(mean * z, 1.0 / (mean * z)) < SMOOTH_RATIO and max(a, b) < EDGE_RATIO * min(a, b):
+                        total += 2.0
+                        inverse += 2.0 * mean
+            out[y, x] = total / inverse
+    return out

@@ -3,9 +3,9 @@
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from tasks.kernels import kernel
 from tasks.render.gaussians import F64
 from tasks.world.agents import AgentTracks
 from tasks.world.clip import STEP_S
@@ -43,7 +43,7 @@ def world_from_boxes(boxes: F64) -> F64:
     return poses
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def owners(points: Any, boxes: Any, movable: Any) -> Any:
     """Row of the box each point (M, 3) lies in, -1 for none; the box with the nearest centre wins.
 

@@ -4,7 +4,8 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
+
+from tasks.kernels import kernel
 
 NEAR_M = 0.3  # closer ones would cover the picture
 DILATION_PX2 = 0.1  # added to the screen covariance; 0.3, made for megapixels, blurs images this small (measured)
@@ -16,7 +17,7 @@ U, V, DEPTH, CONIC_XX, CONIC_XY, CONIC_YY, OPACITY, HALF_U, HALF_V = range(9)
 PROJECTED_SIZE = 9
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def project(
     means: Any,
     quats: Any,

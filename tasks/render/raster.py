@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from tasks.kernels import kernel
 from tasks.render.gaussians import F32, F64, Gaussians
 from tasks.render.project import (
     CONIC_XX,
@@ -113,7 +113,7 @@ def gather(splats: Splats, image: F32, n: int) -> tuple[F32, F32]:
     return all_sums, all_weights
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _tile_range(row: Any, tiles_x: int, tiles_y: int) -> Any:
     x0 = max(0, int(np.floor((row[U] - row[HALF_U]) / TILE)))
     x1 = min(tiles_x, int(np.floor((row[U] + row[HALF_U]) / TILE)) + 1)
@@ -122,7 +122,7 @@ def _tile_range(row: Any, tiles_x: int, tiles_y: int) -> Any:
     return x0, x1, y0, y1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _deal(projected: Any, width: int, height: int) -> Any:
     """Counting sort of (tile, splat) pairs: rows come nearest first, so every tile's list does too."""
     tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
@@ -146,7 +146,7 @@ def _deal(projected: Any, width: int, height: int) -> Any:
     return start, pairs
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _row_alphas(row: Any, x0: int, y: int, alphas: Any) -> None:
     """Alphas of one Gaussian on the 16 pixels of a tile's row; exp by a polynomial (relative error < 1e-5)."""
     f = np.float32
@@ -169,7 +169,7 @@ def _row_alphas(row: Any, x0: int, y: int, alphas: Any) -> None:
         alphas[k] = alpha if alpha >= f(MIN_ALPHA) else f(0.0)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _blend(
     projected: Any, colours: Any, tile_start: Any, tile_splats: Any, behind: Any, width: int, height: int
 ) -> Any:
@@ -216,7 +216,7 @@ def _blend(
     return rgb, depth, alpha
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _is_opaque(light: Any, rows: int, columns: int) -> bool:
     for y in range(rows):
         for k in range(columns):
@@ -225,7 +225,7 @@ def _is_opaque(light: Any, rows: int, columns: int) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _gather(projected: Any, tile_start: Any, tile_splats: Any, image: Any) -> Any:
     f = np.float32
     height, width = image.shape[:2]

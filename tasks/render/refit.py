@@ -1,7 +1,7 @@
 """Colours that make the photos come out: a few sweeps of SART over the blending weights.
 
-With fixed geometry a picture is linear in the Gaussians' colours. Each photo's residual is carried back with the weights
-it was blended with and divided by their sum (Andersen and Kak 1984), photo after photo in a fixed order.
+With fixed geometry a picture is linear in the Gaussians' colours. Each photo's residual is carried back with the
+weights it was blended with and divided by their sum (Andersen and Kak 1984), photo after photo in a fixed order.
 """
 
 from collections.abc import Callable, Sequence

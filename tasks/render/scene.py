@@ -1,9 +1,9 @@
 """The Gaussian scene of a block of driving, built from its coloured points: lidar sweeps and photos with known poses.
 
-Lidar gives each photo a sparse depth image, gaps are closed along surfaces, what lidar does not reach gets its depth from
-neighbouring photos; every pixel becomes a disc, discs that others look through are dropped, the closest look at each
-surface is kept, and the colours are refitted so that the photos come out. What lies in the box of a vehicle, pedestrian or
-bicycle goes to that track's own Gaussians, in box coordinates.
+Lidar gives each photo a sparse depth image, gaps are closed along surfaces, what lidar does not reach gets its depth
+from neighbouring photos; every pixel becomes a disc, discs that others look through are dropped, the closest look at
+each surface is kept, and the colours are refitted so that the photos come out. What lies in the box of a vehicle,
+pedestrian or bicycle goes to that track's own Gaussians, in box coordinates.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,18 +15,20 @@ from numpy.typing import NDArray
 from tasks.render.boxes import box_gaussians
 from tasks.render.depth import dense_depth, sparse_depth
 from tasks.render.gaussians import EMPTY, F32, F64, Gaussians, concatenate, moved
-from tasks.render.movers import boxes_at, owners, world_from_boxes
+from tasks.render.movers import GROUND_CLEARANCE_M, boxes_at, owners, world_from_boxes
 from tasks.render.raster import rasterize
 from tasks.render.refit import refit_colours
 from tasks.render.sky import SkyCollector, SkyMap, directions
 from tasks.render.stereo import FAR_M, MAX_BASELINE_M, MIN_BASELINE_M, sweep_depth
 from tasks.render.surfels import Discs, concatenate_discs, count_free_space, discs_of_photo, gaussians_of, thin
 from tasks.world.agents import MOVING_KINDS, AgentKind, AgentTracks
+from tasks.world.vehicle import PACIFICA
 
 GUESS_PENALTY = 1.5  # on the rank of discs whose depth is not from lidar
 MIRROR_PENALTY = 4.0
 MIN_NODE_GAUSSIANS = 40  # a track seen less is drawn as a plain box
 CHUNK_DISCS = 2_000_000  # discs thinned together before all are: bounds the memory, about 130 MB
+EGO_MARGIN_M = 0.3
 FUSED_VOXEL_M = 0.07
 SHALLOW = -2  # label of a pixel without lidar
 
@@ -72,6 +74,7 @@ class RenderAsset:
     sky: SkyMap
     psnr_db: float  # of the photos held out against their rendering; NaN when none was
     n_held_out: int = 0
+    digest: str = ""  # of all of the above; filled by whoever stores the scene
 
 
 def psnr(a: NDArray[np.generic], b: NDArray[np.generic]) -> float:
@@ -177,7 +180,8 @@ def _fuse(sweeps: Sequence[Sweep], tracks: _Tracks) -> tuple[F64, dict[int, F64]
     """Lidar points that stay (M, 3) local, and those of each track in its box's frame; both thinned by voxels."""
     static, moving = [np.zeros((0, 3))], dict[int, list[F64]]()
     for sweep in sweeps:
-        points = sweep.points.astype(np.float64) @ sweep.world_from_ego[:3, :3].T + sweep.world_from_ego[:3, 3]
+        outside = sweep.points[~_on_ego(sweep.points)]
+        points = outside.astype(np.float64) @ sweep.world_from_ego[:3, :3].T + sweep.world_from_ego[:3, 3]
         boxes, valid = tracks.at(sweep.time_s)
         owner = owners(points, boxes, valid)
         static.append(_voxels(points[owner < 0]))
@@ -186,6 +190,13 @@ def _fuse(sweeps: Sequence[Sweep], tracks: _Tracks) -> tuple[F64, dict[int, F64]
             mine = points[owner == j]
             moving.setdefault(int(j), []).append((mine - poses[j, :3, 3]) @ poses[j, :3, :3])
     return _voxels(np.concatenate(static)), {j: _voxels(np.concatenate(parts)) for j, parts in sorted(moving.items())}
+
+
+def _on_ego(points: F32) -> NDArray[np.bool_]:
+    """Returns from the ego's own body (M,): left in, they would hang over the road as a trail."""
+    x, y = points[:, 0], points[:, 1]
+    along = (x > -PACIFICA.rear_length - EGO_MARGIN_M) & (x < PACIFICA.front_length + EGO_MARGIN_M)
+    return np.asarray(along & (np.abs(y) < PACIFICA.half_width + EGO_MARGIN_M) & (points[:, 2] > GROUND_CLEARANCE_M))
 
 
 def _voxels(points: F64) -> F64:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tasks.render.gaussians import F32, F64
 
 FAR_M = 1.0e4  # stands for the sky
-LEVELS_M = tuple(float(z) for z in 1.0 / np.linspace(1.0 / 5.0, 1.0 / 160.0, 28)) + (FAR_M,)
+LEVELS_M = (*(float(z) for z in 1.0 / np.linspace(1.0 / 5.0, 1.0 / 160.0, 28)), FAR_M)
 WINDOW_PX = 7
 MIN_BASELINE_M, MAX_BASELINE_M = 0.3, 6.0  # less: no parallax; more: nothing in common
 UNSEEN_COST = 0.25  # of a pixel whose hypothesis lies outside the other photo

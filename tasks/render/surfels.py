@@ -4,19 +4,19 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from tasks.kernels import kernel
 from tasks.render.gaussians import F32, F64, Gaussians, quats_of
 
-SIGMA_PER_PIXEL = 0.55  # standard deviation of a disc in units of the pixel spacing on its surface
+SIGMA_PER_PIXEL = 0.5  # standard deviation of a disc in units of the pixel spacing on its surface (measured)
 FLATNESS = 0.1  # thickness as a share of the short side
-OPACITY = 0.95
+OPACITY = 0.7
 MAX_ELONGATION = 8.0  # a disc on the road far ahead is that much longer than wide at most
 SMOOTH_RATIO = 1.3  # neighbouring pixels whose depths differ by more do not share a surface
-LEVELS = 14  # voxel sides 2^0 .. 2^13 times FINEST_M
-FINEST_M = 0.01
-COVERED = 0.6  # share of a voxel's face that must be covered before another disc there is superfluous
+LEVELS = 11  # voxel sides 2^0 .. 2^10 times FINEST_M
+FINEST_M = 0.16
+COVERED = 0.7  # share of a voxel's face that must be covered before another disc there is superfluous
 STRIDE = 8  # most voxels along a disc's long side that its area is spread over
 
 
@@ -123,7 +123,7 @@ def thin(discs: Discs, fineness: float) -> NDArray[np.intp]:
     return order[kept]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _slot(keys: Any, key: int, mask: int) -> int:
     """Where a key is, or the free place it would take, in an open-addressed table."""
     at = ((key * -7046029254386353131) >> 20) & mask
@@ -132,12 +132,12 @@ def _slot(keys: Any, key: int, mask: int) -> int:
     return at
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _key(x: float, y: float, z: float, side: float, level: int) -> int:
     return (((int(x / side) << 19) | int(y / side)) << 19 | int(z / side)) << 4 | level
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _thin(points: Any, across: Any, down: Any, fineness: float) -> Any:
     n = points.shape[0]
     size = 1 << 16
@@ -209,7 +209,7 @@ def gaussians_of(discs: Discs, origin: F64) -> Gaussians:
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def count_free_space(points: Any, camera_from_world: Any, k: Any, depth: Any, in_front: Any, agreeing: Any) -> None:
     """Adds to `in_front` (M,) where a photo looks through a point (M, 3), to `agreeing` where it sees it.
 

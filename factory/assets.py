@@ -1,0 +1,127 @@
+"""The Gaussian scene of a clip's block: built once, kept on disk under the digest of what it is built from.
+
+A block is the clip's window of its log: the sensor files between its first and its last step. Whoever comes first
+builds the scene; the file appears by an atomic rename, so that two workers that build the same one do no harm.
+"""
+
+import hashlib
+import json
+import logging
+import os
+import tempfile
+import zipfile
+from dataclasses import asdict, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factory.sensors import load_sensors
+from tasks.render.gaussians import Gaussians
+from tasks.render.scene import RenderAsset, build_asset
+from tasks.render.settings import RenderSettings
+from tasks.render.sky import SkyMap
+from tasks.world.clip import Clip
+
+ASSET_VERSION = 1  # raised by hand when the same sensors give another scene
+log = logging.getLogger(__name__)
+
+
+def asset_for(clip: Clip, settings: RenderSettings, cache_dir: str | Path) -> RenderAsset | None:
+    """The scene of the clip's block with its digest; None where the clip has no photos to take colours from.
+
+    Raises BadClip where a sensor file is broken, ValueError for a camera the rig does not have.
+    """
+    wanted = [file for file in clip.images if not settings.cameras or file.sensor in settings.cameras]
+    if not wanted:
+        return None
+    path = Path(cache_dir) / f"block-{block_id(clip, settings)}.npz"
+    if path.exists():
+        try:
+            return read_asset(path)
+        except (ValueError, KeyError, OSError, zipfile.BadZipFile) as error:
+            log.warning("%s is damaged (%s) and is built again", path, error)
+    data = load_sensors(clip, settings.cameras, settings.width, settings.height)
+    asset = build_asset(data.photos, data.sweeps, clip.agents, settings.asset)
+    asset = replace(asset, digest=asset_digest(asset))
+    write_asset(path, asset)
+    return asset
+
+
+def block_id(clip: Clip, settings: RenderSettings) -> str:
+    """16 hex digits of everything the scene depends on but the sensor files' content, known without opening them."""
+    digest = hashlib.sha256()
+    made_of = (ASSET_VERSION, clip.dataset, clip.log_id, clip.start_s, clip.content_digest)
+    how = (settings.width, settings.height, sorted(settings.cameras), asdict(settings.asset))
+    digest.update(json.dumps([made_of, how], sort_keys=True).encode())
+    for file in (*clip.images, *clip.sweeps):
+        digest.update(f"{file.sensor}\x1f{Path(file.uri).name}\x1f{file.time_s!r}".encode())
+        digest.update(np.ascontiguousarray(file.world_from_ego).tobytes())
+    return digest.hexdigest()[:16]
+
+
+def asset_digest(asset: RenderAsset) -> str:
+    """16 hex digits of the scene's content."""
+    digest = hashlib.sha256()
+    for name, array in sorted(_arrays(asset).items()):
+        digest.update(f"{name}\x1f{array.dtype.str}\x1f{array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()[:16]
+
+
+def write_asset(path: Path, asset: RenderAsset) -> None:
+    """Writes beside the path and renames."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=".block-", suffix=".npz")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            arrays: dict[str, Any] = _arrays(asset) | {"digest": np.array(asset.digest)}
+            np.savez(file, **arrays)
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def read_asset(path: Path) -> RenderAsset:
+    """The stored scene. Raises ValueError where its content is not what its digest says."""
+    with np.load(path, allow_pickle=False) as stored:
+        arrays = {name: stored[name] for name in stored.files}
+    names = [str(name) for name in arrays["node_ids"]]
+    starts = np.concatenate([[0], np.cumsum(arrays["node_sizes"])])
+    every = _gaussians(arrays, "node")
+    asset = RenderAsset(
+        origin=arrays["origin"],
+        background=_gaussians(arrays, "background"),
+        nodes={name: every.take(np.arange(a, b)) for name, a, b in zip(names, starts[:-1], starts[1:])},
+        sky=SkyMap(arrays["sky"]),
+        psnr_db=float(arrays["psnr_db"]),
+        n_held_out=int(arrays["n_held_out"]),
+        digest=str(arrays["digest"]),
+    )
+    if asset_digest(asset) != asset.digest:
+        raise ValueError("the content does not match its digest")
+    return asset
+
+
+def _arrays(asset: RenderAsset) -> dict[str, NDArray[Any]]:
+    nodes = list(asset.nodes.items())
+    out: dict[str, NDArray[Any]] = {
+        "origin": asset.origin,
+        "sky": asset.sky.rgb,
+        "psnr_db": np.array(asset.psnr_db),
+        "n_held_out": np.array(asset.n_held_out),
+        "node_ids": np.array([name for name, _ in nodes], dtype=np.str_),
+        "node_sizes": np.array([len(node) for _, node in nodes], np.int64),
+    }
+    for field in fields(Gaussians):
+        whole = getattr(asset.background, field.name)
+        out[f"background_{field.name}"] = whole
+        parts = [getattr(node, field.name) for _, node in nodes]
+        out[f"node_{field.name}"] = np.concatenate(parts) if parts else whole[:0]
+    return out
+
+
+def _gaussians(arrays: dict[str, NDArray[Any]], prefix: str) -> Gaussians:
+    return Gaussians(**{field.name: arrays[f"{prefix}_{field.name}"] for field in fields(Gaussians)})

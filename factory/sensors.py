@@ -1,0 +1,94 @@
+"""Opens what a clip's sensor files point to: photos and lidar sweeps as arrays."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from factory.clips.av2_log import read_feather
+from factory.clips.reader import BadClip
+from tasks.render.scene import Photo, Sweep
+from tasks.render.views import undistorted
+from tasks.world.camera import Camera, SensorFile
+from tasks.world.clip import Clip
+
+XYZ = ("x", "y", "z")
+
+
+@dataclass(frozen=True)
+class SensorData:
+    """What the sensors saw during a clip, in file order."""
+
+    photos: tuple[Photo, ...]  # without distortion, at the size asked for
+    sweeps: tuple[Sweep, ...]
+
+
+def load_sensors(clip: Clip, cameras: Sequence[str] | None, width: int, height: int) -> SensorData:
+    """All sweeps and the photos of the named cameras (None or empty: of all), resized to width x height.
+
+    Raises BadClip where a file is missing, broken or not of its camera's size, ValueError for an unknown camera.
+    """
+    chosen = {camera.name: camera for camera in chosen_cameras(clip.cameras, cameras)}
+    photos = tuple(_photo(file, chosen[file.sensor], width, height) for file in clip.images if file.sensor in chosen)
+    return SensorData(photos, tuple(_sweep(file) for file in clip.sweeps))
+
+
+def chosen_cameras(rig: Sequence[Camera], names: Sequence[str] | None) -> tuple[Camera, ...]:
+    """The named cameras in the order of `names`; the whole rig for none. Raises ValueError for an unknown name."""
+    if not names:
+        return tuple(rig)
+    by_name = {camera.name: camera for camera in rig}
+    unknown = [name for name in names if name not in by_name]
+    if unknown:
+        raise ValueError(f"render.cameras: no camera {', '.join(unknown)}; this rig has {', '.join(by_name) or 'none'}")
+    return tuple(by_name[name] for name in names)
+
+
+def encode_jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
+    """An rgb image (H, W, 3) as JPEG bytes; quality 1..100."""
+    done, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
+    if not done:
+        raise ValueError(f"no JPEG of an image of shape {image.shape}")
+    return data.tobytes()
+
+
+def decode_image(data: bytes, name: str) -> NDArray[np.uint8]:
+    """Encoded bytes (JPEG or PNG) as rgb (H, W, 3). Raises BadClip that names `name`."""
+    if not data:
+        raise BadClip(name, "image", "the file is empty")
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    if image is None:
+        raise BadClip(name, "image", "not an image that can be decoded")
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def _photo(file: SensorFile, camera: Camera, width: int, height: int) -> Photo:
+    try:
+        data = Path(file.uri).read_bytes()
+    except OSError as error:
+        raise BadClip(file.uri, "image", f"cannot be read: {error.strerror}") from error
+    image = decode_image(data, file.uri)
+    if image.shape[:2] != (camera.height, camera.width):
+        size = f"{image.shape[1]}x{image.shape[0]}"
+        raise BadClip(file.uri, "size", f"{size}, but {camera.name} takes {camera.width}x{camera.height}")
+    flat = undistorted(image, camera)
+    shrinks = width < camera.width
+    small = cv2.resize(flat, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    pinhole = camera.resized(width, height)
+    return Photo(
+        camera=camera.name,
+        time_s=file.time_s,
+        rgb=np.asarray(small, np.uint8),
+        intrinsics=pinhole.intrinsics,
+        world_from_camera=file.world_from_ego @ pinhole.ego_from_camera,
+    )
+
+
+def _sweep(file: SensorFile) -> Sweep:
+    """Points in the ego frame, as Argoverse 2 stores them (motion-compensated feather with x, y, z). Raises BadClip."""
+    table = read_feather(Path(file.uri), XYZ)
+    points = np.stack([table[name] for name in XYZ], axis=1).astype(np.float32)
+    return Sweep(time_s=file.time_s, points=points, world_from_ego=file.world_from_ego)

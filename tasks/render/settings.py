@@ -1,0 +1,50 @@
+"""What is rendered, and how large."""
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+from tasks.render.scene import AssetSettings
+
+
+class RenderMode(StrEnum):
+    AUTO = "auto"  # from the block's scene where its sensors allow one, else no images
+    MAP = "map"  # lanes, paint and boxes on plain ground; marked as such
+    NONE = "none"
+
+
+class ImageSource(StrEnum):
+    """Where a sample's images come from."""
+
+    PHOTO = "photo"
+    RENDER = "render"
+    MAP = "map"
+    NONE = "none"
+
+
+class Frames(StrEnum):
+    ALL = "all"
+    HISTORY = "history"
+    NOW = "now"
+
+
+# Steps of 0.1 s relative to the sample's now, at 2 Hz.
+STEPS_OF = {
+    Frames.ALL: tuple(range(-15, 41, 5)),
+    Frames.HISTORY: tuple(range(-15, 1, 5)),
+    Frames.NOW: (0,),
+}
+
+
+@dataclass(frozen=True)
+class RenderSettings:
+    """The render stage's settings."""
+
+    mode: RenderMode = RenderMode.AUTO
+    frames: Frames = Frames.HISTORY
+    cameras: tuple[str, ...] = ()  # by name; empty: every camera of the rig
+    width: int = 320  # pixels
+    height: int = 180
+    jpeg_quality: int = 90
+    psnr_min: float = 0.0  # [dB] a block whose held-out photos come out worse is refused; 0: none is
+    map_rig: str = "three_front"  # cameras of a clip without a rig of its own, for mode=map
+    asset: AssetSettings = field(default_factory=AssetSettings)

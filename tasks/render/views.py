@@ -1,0 +1,86 @@
+"""What the rig sees from poses nobody drove, with the agents where the simulation put them."""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tasks.render.gaussians import F64
+from tasks.render.movers import STEP_S, boxes_at
+from tasks.render.scene import RenderAsset, render_photo, scene_at
+from tasks.world.agents import AgentTracks
+from tasks.world.camera import Camera
+from tasks.world.vehicle import HEADING, X, Y
+
+VISIBLE_M = 150.0  # agents further away are not drawn
+
+
+def render_views(
+    asset: RenderAsset,
+    cameras: Sequence[Camera],
+    world_from_ego: F64,
+    agents: AgentTracks,
+    steps: Sequence[int],
+    width: int,
+    height: int,
+) -> NDArray[np.uint8]:
+    """Images (F, C, height, width, 3) rgb.
+
+    `world_from_ego` (F, 4, 4) in 3-D (`pose_on_ground`), `steps` (F,) rows of `agents` at these instants. The images
+    are those of ideal pinholes, `camera.resized(width, height)` with distortion zero: photos are undistorted before
+    they enter the scene.
+    """
+    out = np.empty((len(steps), len(cameras), height, width, 3), np.uint8)
+    for f, step in enumerate(steps):
+        boxes, valid = boxes_at(agents, step * STEP_S)
+        offsets = boxes[:, :2] - world_from_ego[f, :2, 3]
+        near = valid & (np.hypot(offsets[:, 0], offsets[:, 1]) < VISIBLE_M)
+        rows = np.flatnonzero(near)
+        scene = scene_at(asset, [agents.track_ids[j] for j in rows], [agents.kinds[j] for j in rows], boxes[rows])
+        for c, camera in enumerate(cameras):
+            pinhole = camera.resized(width, height)
+            pose = world_from_ego[f] @ pinhole.ego_from_camera
+            image = render_photo(asset, scene, pinhole.intrinsics, pose, (width, height))
+            out[f, c] = np.rint(image * 255.0).astype(np.uint8)
+    return out
+
+
+def undistorted(image: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
+    """The photo (H, W, 3) an ideal pinhole of the same intrinsics would have taken; outside of the photo: edge colours.
+
+    Radial model of `Camera.distortion`: r' = r (1 + k1 r^2 + k2 r^4 + k3 r^6).
+    """
+    if not np.any(camera.distortion):
+        return image
+    height, width = image.shape[:2]
+    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    fx, fy, cx, cy = (camera.intrinsics[i, j] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    x, y = (u - cx) / fx, (v - cy) / fy
+    r2 = x * x + y * y
+    k1, k2, k3 = camera.distortion
+    stretch = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    map_x = (fx * x * stretch + cx - 0.5).astype(np.float32)
+    map_y = (fy * y * stretch + cy - 0.5).astype(np.float32)
+    return np.asarray(cv2.remap(image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+
+
+def pose_on_ground(logged: F64, ego_states: F64) -> F64:
+    """3-D poses (F, 4, 4) of planar ego states (F, 11), standing on the road as the log knows it.
+
+    `logged` (S, 4, 4) world_from_ego: each state takes height, roll and pitch from the plane under the nearest logged
+    pose.
+    """
+    xy = ego_states[:, [X, Y]]
+    distance = np.linalg.norm(logged[None, :, :2, 3] - xy[:, None, :], axis=-1)
+    base = logged[np.argmin(distance, axis=1)]
+    up = base[:, :3, 2]
+    out = np.tile(np.eye(4), (len(xy), 1, 1))
+    out[:, :2, 3] = xy
+    offset = xy - base[:, :2, 3]
+    out[:, 2, 3] = base[:, 2, 3] - (offset * up[:, :2]).sum(axis=1) / up[:, 2]
+    flat = np.stack([np.cos(ego_states[:, HEADING]), np.sin(ego_states[:, HEADING])], axis=-1)
+    forward = np.column_stack([flat, -(flat * up[:, :2]).sum(axis=1) / up[:, 2]])
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    out[:, :3, 0], out[:, :3, 1], out[:, :3, 2] = forward, np.cross(up, forward), up
+    return out
