@@ -235,7 +235,7 @@ def read_scenario(path: Path) -> tuple[dict[str, Any], str]:
 
 def _source(scenario: Mapping[str, Any], file: str) -> tuple[str, Source]:
     name = scenario["metadata"].get("dataset")
-    if name not in SOURCES:
+    if not isinstance(name, str) or name not in SOURCES:
         problem = f"{name!r} is not supported; conversions of {', '.join(SOURCES)} are"
         raise BadClip(file, "metadata.dataset", problem)
     return name, SOURCES[name]
@@ -246,7 +246,7 @@ def read_motion(scenario: Mapping[str, Any], file: str) -> Motion:
     n_frames, tracks = int(scenario["length"]), scenario["tracks"]
     _, source = _source(scenario, file)
     sdc_id = scenario["metadata"].get("sdc_id")
-    if sdc_id not in tracks:
+    if not isinstance(sdc_id, str | int) or sdc_id not in tracks:
         raise BadClip(file, "metadata.sdc_id", f"missing, or names no track: {sdc_id!r}")
     at = frame_positions(sample_times(scenario["metadata"], n_frames, file))
     states, segments = ego_segments(read_track(tracks, sdc_id, n_frames, file), source, at)

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from shapely.geometry import LineString, Polygon
 
 from factory.clips.reader import BadClip
@@ -30,6 +31,7 @@ CAR_LANE_KINDS = frozenset({"LANE_SURFACE_STREET", "LANE_SURFACE_UNSTRUCTURE", "
 LANE_KINDS = CAR_LANE_KINDS | {"LANE_BIKE_LANE"}
 HALF_WIDTH_M = 1.75  # of a lane that comes without a polygon (FORMATS: connectors buffered by ~1.75 m)
 BIKE_HALF_WIDTH_M = 0.75
+MAX_LANE_M = 20_000.0  # longer is a broken coordinate, and would ask for any amount of points
 JOINT_M = 0.5  # end-to-start distance of joined lanes: precision 1.00, recall 0.99-1.00 on two known scenes
 MPH = 0.44704
 
@@ -64,7 +66,7 @@ def raw_lanes(features: Mapping[str, Any], source: str, file: str) -> dict[str, 
             continue
         if kind not in LANE_KINDS:
             raise BadClip(file, f"{field}.type", f"unknown lane class {kind!r}")
-        line = _resampled(points(feature, "polyline", file, field))
+        line = _resampled(points(feature, "polyline", file, field), file, field)
         if line is None:  # a lane shorter than a centimetre leads nowhere
             continue
         ring = _ring(feature, line, kind, file, field)
@@ -74,11 +76,11 @@ def raw_lanes(features: Mapping[str, Any], source: str, file: str) -> dict[str, 
             line=line,
             ring=ring,
             has_polygon="polygon" in feature,
-            interpolating=None if "interpolating" not in feature else bool(feature["interpolating"]),
+            interpolating=_flag(feature, "interpolating", file, field),
             entry=_ids(feature.get("entry_lanes")),
             exit=_ids(feature.get("exit_lanes")),
-            left=_neighbour(feature.get("left_neighbor"), nearest=-1),
-            right=_neighbour(feature.get("right_neighbor"), nearest=0),
+            left=_neighbour(feature, "left_neighbor", -1, file, field),
+            right=_neighbour(feature, "right_neighbor", 0, file, field),
             speed_limit_mps=_speed_limit(feature, source),
         )
     if not any(lane.kind in CAR_LANE_KINDS for lane in lanes.values()):
@@ -129,18 +131,15 @@ def connector_ids(lanes: Mapping[str, RawLane], lit: frozenset[str]) -> frozense
 
 
 def _forking_merging_crossing(lanes: Mapping[str, RawLane]) -> set[str]:
-    """Lanes that share a start or an end with another lane, or cross one at more than 10 degrees inside both."""
+    """Lanes that share a start or an end with another lane, or cross one."""
     ids = list(lanes)
-    ends = np.array([[lanes[i].line[0], lanes[i].line[-1]] for i in ids])
     found: set[str] = set()
-    for side in (0, 1):
-        close = np.hypot(*(ends[:, None, side] - ends[None, :, side]).T) < JOINT_M
-        np.fill_diagonal(close, False)
-        found.update(ids[k] for k in np.flatnonzero(close.any(axis=0)))
+    for end in (0, -1):
+        shared = cKDTree([lanes[i].line[end] for i in ids]).query_pairs(JOINT_M)
+        found.update(ids[k] for pair in shared for k in pair)
     inner = [LineString(lanes[i].line[1:-1] if len(lanes[i].line) > 3 else lanes[i].line) for i in ids]
-    for a, b in shapely.STRtree(inner).query(inner, predicate="crosses").T:
-        found.update((ids[a], ids[b]))
-    return found
+    crossing, _ = shapely.STRtree(inner).query(inner, predicate="crosses")
+    return found | {ids[k] for k in crossing}
 
 
 def _ring(
@@ -150,25 +149,30 @@ def _ring(
         ring = closed_ring(points(feature, "polygon", file, field))
         if ring is not None:
             return ring
-    half = BIKE_HALF_WIDTH_M if kind == "LANE_BIKE_LANE" else _half_width(feature)
+    half = BIKE_HALF_WIDTH_M if kind == "LANE_BIKE_LANE" else _half_width(feature, file, field)
     return np.asarray(LineString(line).buffer(half, cap_style="flat").exterior.coords)
 
 
-def _half_width(feature: Mapping[str, Any]) -> float:
+def _half_width(feature: Mapping[str, Any], file: str, field: str) -> float:
     """Half of the lane's median width where Waymo's converter measured it to the painted lines, else the default."""
     if "width" not in feature:
         return HALF_WIDTH_M
-    widths = np.asarray(feature["width"], dtype=np.float64)
+    try:
+        widths = np.asarray(feature["width"], dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise BadClip(file, f"{field}.width", f"not numbers ({error})") from error
     measured = widths[(widths > 1.0) & (widths < 3.0)]  # zeros: no line on that side; more: not this lane's line
     return float(np.median(measured)) if len(measured) else HALF_WIDTH_M
 
 
-def _resampled(line: NDArray[np.float64]) -> NDArray[np.float64] | None:
+def _resampled(line: NDArray[np.float64], file: str, field: str) -> NDArray[np.float64] | None:
     """The line at uniform arc length, <= 0.75 m apart; None when it has no length."""
     line = line[np.concatenate([[True], np.hypot(*np.diff(line, axis=0).T) > 1e-6])]
     length = arc_lengths(line)[-1]
     if length < 0.01:
         return None
+    if length > MAX_LANE_M:
+        raise BadClip(file, f"{field}.polyline", f"a lane of {length:.0f} m")
     return resample(line, max(2, int(np.ceil(length / CENTERLINE_SPACING_M)) + 1))
 
 
@@ -178,14 +182,25 @@ def _ids(value: object) -> tuple[str, ...] | None:
     return tuple(str(item) for item in value)
 
 
-def _neighbour(value: object, nearest: int) -> str | None:
+def _flag(feature: Mapping[str, Any], name: str, file: str, field: str) -> bool | None:
+    value = feature.get(name)
+    if not isinstance(value, bool | np.bool_ | None):
+        raise BadClip(file, f"{field}.{name}", f"{value!r} is neither true nor false")
+    return None if value is None else bool(value)
+
+
+def _neighbour(feature: Mapping[str, Any], name: str, nearest: int, file: str, field: str) -> str | None:
     """Nearest neighbour: nuPlan lists ids from left to right, Waymo dicts with index ranges (the longest counts)."""
-    if not isinstance(value, Sequence) or isinstance(value, str) or not value:
+    value = feature.get(name)
+    if not isinstance(value, Sequence) or isinstance(value, str | bytes) or not value:
         return None
-    if all(isinstance(item, dict) and "feature_id" in item for item in value):
-        longest = max(value, key=lambda item: int(item.get("self_end_index", 0)) - int(item.get("self_start_index", 0)))
+    if not isinstance(value[nearest], dict):
+        return str(value[nearest])
+    try:
+        longest = max(value, key=lambda item: int(item["self_end_index"]) - int(item["self_start_index"]))
         return str(longest["feature_id"])
-    return str(value[nearest])
+    except (KeyError, TypeError, ValueError) as error:
+        raise BadClip(file, f"{field}.{name}", f"no feature_id with an index range ({error!r})") from error
 
 
 def _speed_limit(feature: Mapping[str, Any], source: str) -> float | None:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from shapely.geometry import Polygon
 
 from factory.clips.reader import BadClip
@@ -88,13 +89,12 @@ def lane_graph(raw: Mapping[str, RawLane]) -> dict[str, tuple[str, ...]]:
                     exits[entry].setdefault(lane_id)
         return {lane_id: tuple(found) for lane_id, found in exits.items()}
     ids = list(raw)
-    starts = np.array([raw[i].line[0] for i in ids])
-    ends = np.array([raw[i].line[-1] for i in ids])
-    kinds = np.array([raw[i].kind in CAR_LANE_KINDS for i in ids])
-    joined = np.hypot(*(ends[:, None] - starts[None]).transpose(2, 0, 1)) < JOINT_M
-    joined &= kinds[:, None] == kinds[None]  # a car lane does not lead onto a bicycle lane
-    np.fill_diagonal(joined, False)
-    return {lane_id: tuple(ids[k] for k in np.flatnonzero(joined[row])) for row, lane_id in enumerate(ids)}
+    joined = cKDTree([raw[i].line[0] for i in ids]).query_ball_point([raw[i].line[-1] for i in ids], JOINT_M)
+    drives = [raw[i].kind in CAR_LANE_KINDS for i in ids]  # a car lane does not lead onto a bicycle lane
+    return {
+        lane_id: tuple(ids[k] for k in sorted(joined[row]) if k != row and drives[k] == drives[row])
+        for row, lane_id in enumerate(ids)
+    }
 
 
 def neighbours(raw: Mapping[str, RawLane], connectors: frozenset[str]) -> tuple[dict[str, str], dict[str, str]]:
@@ -129,14 +129,12 @@ def _beside(lanes: list[RawLane], side: float) -> dict[str, str]:
     ray, other = shapely.STRtree(shapes).query(rays, predicate="intersects")
     gap = shapely.distance(starts[ray], shapely.intersection(rays[ray], shapes[other])) - own_edge[ray]
     seen = (other != owner[ray]) & (np.abs(gap) < NEIGHBOUR_GAP_M)
-    votes = np.zeros((len(lanes), len(lanes)), np.int64)
-    np.add.at(votes, (owner[ray[seen]], other[seen]), 1)
-    best = votes.argmax(axis=1)
-    return {
-        lane.lane_id: lanes[best[row]].lane_id
-        for row, lane in enumerate(lanes)
-        if votes[row, best[row]] >= NEIGHBOUR_VOTES
-    }
+    pairs, votes = np.unique(np.stack([owner[ray[seen]], other[seen]]), axis=1, return_counts=True)
+    best: dict[int, tuple[int, int]] = {}  # lane -> (votes, the lane beside it)
+    for (row, beside), count in zip(pairs.T.tolist(), votes.tolist(), strict=True):
+        if count >= NEIGHBOUR_VOTES and count > best.get(row, (0, 0))[0]:
+            best[row] = (count, beside)
+    return {lanes[row].lane_id: lanes[beside].lane_id for row, (_, beside) in best.items()}
 
 
 def traffic_lights(states: Mapping[str, Any], n_steps: int, file: str) -> TrafficLights:
@@ -146,13 +144,13 @@ def traffic_lights(states: Mapping[str, Any], n_steps: int, file: str) -> Traffi
         field = f"dynamic_map_states[{key}]"
         try:
             lane_id, names = str(light["lane"]), list(light["state"]["object_state"])
-        except (KeyError, TypeError) as error:
+        except (KeyError, TypeError, IndexError) as error:
             raise BadClip(file, field, f"no lane or no state.object_state ({error!r})") from error
         if len(names) != n_steps:
             raise BadClip(file, f"{field}.state.object_state", f"{len(names)} steps, the log has {n_steps}")
-        unknown = {name for name in names if name not in LIGHT_STATES}
+        unknown = [name for name in names if not isinstance(name, str | None) or name not in LIGHT_STATES]
         if unknown:
-            raise BadClip(file, f"{field}.state.object_state", f"unknown light states {sorted(map(str, unknown))}")
+            raise BadClip(file, f"{field}.state.object_state", f"unknown light states, first {unknown[0]!r}")
         row = np.array([LIGHT_STATES[name] for name in names], np.int8)
         of_lane[lane_id] = np.maximum(of_lane[lane_id], row) if lane_id in of_lane else row
     columns = list(of_lane.values())

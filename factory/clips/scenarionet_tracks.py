@@ -102,7 +102,7 @@ def frame_positions(times: Array) -> Array:
     return np.interp(steps, times, np.arange(len(times)))
 
 
-def read_track(tracks: Mapping[str, Any], track_id: str, n_frames: int, file: str) -> Track:
+def read_track(tracks: Mapping[Any, Any], track_id: str | int, n_frames: int, file: str) -> Track:
     """One checked track. Raises BadClip naming the field that is missing, misshapen or not finite where valid."""
     field = f"tracks[{track_id}].state"
     state = tracks[track_id].get("state") if isinstance(tracks[track_id], dict) else None
@@ -112,7 +112,7 @@ def read_track(tracks: Mapping[str, Any], track_id: str, n_frames: int, file: st
         if name not in state:
             raise BadClip(file, f"{field}.{name}", "missing")
     valid = _numbers(state["valid"], (n_frames,), file, f"{field}.valid") > 0.5
-    position = np.asarray(state["position"], dtype=np.float64)
+    position = _floats(state["position"], file, f"{field}.position")
     if position.ndim != 2 or position.shape[0] != n_frames or position.shape[1] not in (2, 3):
         raise BadClip(file, f"{field}.position", f"shape {position.shape}, expected ({n_frames}, 3)")
     if position.shape[1] == 2:
@@ -133,7 +133,7 @@ def agent_tracks(tracks: Mapping[str, Any], sdc_id: str, at: Array, n_frames: in
     ids, kinds, rows = [], [], []
     for track_id in (key for key in tracks if str(key) != sdc_id):
         kind = tracks[track_id].get("type") if isinstance(tracks[track_id], dict) else None
-        if kind not in KINDS:
+        if not isinstance(kind, str) or kind not in KINDS:
             raise BadClip(file, f"tracks[{track_id}].type", f"unknown class {kind!r}")
         track = read_track(tracks, track_id, n_frames, file)
         if not track.valid.any():
@@ -270,12 +270,16 @@ def _least_third_difference(log: Array, weight: Array, smoothing: float) -> Arra
 
 def _numbers(value: object, shape: tuple[int, ...], file: str, field: str) -> Array:
     """An array of the shape given; a trailing axis of one is dropped."""
-    try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise BadClip(file, field, f"not numbers ({error})") from error
+    array = _floats(value, file, field)
     if array.ndim == len(shape) + 1 and array.shape[-1] == 1:
         array = array[..., 0]
     if array.shape != shape:
         raise BadClip(file, field, f"shape {array.shape}, expected {shape}")
     return array
+
+
+def _floats(value: object, file: str, field: str) -> Array:
+    try:
+        return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise BadClip(file, field, f"not numbers ({error})") from error
