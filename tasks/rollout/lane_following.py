@@ -118,7 +118,7 @@ def find_path(
     log_poses (K, 3): where its log is over the whole clip, before and after.
     """
     distance, difference = lane_costs(index, pose[None])
-    starts = list(np.flatnonzero(on_a_lane(distance[0], difference[0], snap_distance_m)))
+    starts: list[int] = np.flatnonzero(on_a_lane(distance[0], difference[0], snap_distance_m)).tolist()
     if not starts:
         return None
     starts = _with_neighbors(index, starts, distance[0], difference[0])
@@ -140,7 +140,7 @@ def _point_costs(distance: Array, difference: Array) -> Array:
 
 def _with_neighbors(index: LaneIndex, starts: list[int], distance: Array, difference: Array) -> list[int]:
     """Starts, nearest first, and the lanes beside them in the same direction: the log may change lanes."""
-    starts = sorted(starts, key=lambda k: (round(distance[k] + HEADING_COST_M * difference[k], 6), k))
+    starts = sorted(starts, key=lambda k: (round(float(distance[k] + HEADING_COST_M * difference[k]), 6), k))
     beside = []
     for k in starts:
         for neighbor in (index.lanes[k].left_neighbor, index.lanes[k].right_neighbor):
@@ -224,15 +224,15 @@ def _path_of(index: LaneIndex, way: list[int], pose: Array, log_poses: Array, ah
 
     # A window around the vehicle, straight on where the lanes end.
     here = float(_frenet(xy, length, pose[None])[0, 0])
-    grid = here - BEHIND_M + PATH_SPACING_M * np.arange(math.ceil((BEHIND_M + ahead_m) / PATH_SPACING_M) + 1)
+    grid: Array = here - BEHIND_M + PATH_SPACING_M * np.arange(math.ceil((BEHIND_M + ahead_m) / PATH_SPACING_M) + 1)
     center = _at(xy, length, grid)
     left = _normals(center)
-    offset = _log_offset(center, pose, log_poses)
+    offset = _log_offset(center, log_poses)
     shifted = center + offset[:, None] * left
 
     # The shift changes lengths a little: even spacing again, everything else carried along.
     shifted_length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(shifted, axis=0).T))])
-    even = PATH_SPACING_M * np.arange(len(grid))
+    even: Array = PATH_SPACING_M * np.arange(len(grid))
     points = _at(shifted, shifted_length, even)
     source = np.interp(even, shifted_length, grid)  # lane length of each even point
     nearest = np.clip(np.searchsorted(length, source, side="right") - 1, 0, len(length) - 1)
@@ -275,33 +275,37 @@ def _normals(points: Array) -> Array:
     return np.stack([-np.sin(heading), np.cos(heading)], axis=-1)
 
 
+@njit(cache=True, nogil=True)
 def _frenet(xy: Array, length: Array, poses: Array) -> Array:
     """(K, 2) path length and offset to the left of the polyline's points nearest to poses (K, >= 2)."""
-    edge = np.diff(xy, axis=0)  # (E, 2)
-    to = poses[:, None, :2] - xy[None, :-1]  # (K, E, 2)
-    square = np.maximum((edge**2).sum(axis=1), 1e-12)
-    f = np.clip((to * edge).sum(axis=2) / square, 0.0, 1.0)
-    rest = to - f[..., None] * edge
-    distance = (rest**2).sum(axis=2)
-    k = distance.argmin(axis=1)
-    row = np.arange(len(poses))
-    side = edge[k, 0] * to[row, k, 1] - edge[k, 1] * to[row, k, 0]
-    return np.stack([length[k] + f[row, k] * np.sqrt(square[k]), np.copysign(np.sqrt(distance[row, k]), side)], axis=1)
+    out = np.empty((poses.shape[0], 2))
+    for i in range(poses.shape[0]):
+        best = np.inf
+        for k in range(xy.shape[0] - 1):
+            ex, ey = xy[k + 1, 0] - xy[k, 0], xy[k + 1, 1] - xy[k, 1]
+            dx, dy = poses[i, 0] - xy[k, 0], poses[i, 1] - xy[k, 1]
+            f = (dx * ex + dy * ey) / max(ex * ex + ey * ey, 1e-12)
+            f = min(max(f, 0.0), 1.0)
+            square = (dx - f * ex) ** 2 + (dy - f * ey) ** 2
+            if square < best:
+                best = square
+                out[i, 0] = length[k] + f * (length[k + 1] - length[k])
+                out[i, 1] = math.copysign(math.sqrt(square), ex * dy - ey * dx)
+    return out
 
 
-def _log_offset(center: Array, pose: Array, log_poses: Array) -> Array:
-    """(P,) lateral offset of the log from the lane centre at every path point; the vehicle's own where the log is not."""
+def _log_offset(center: Array, log_poses: Array) -> Array:
+    """(P,) lateral offset of the log from the lane centre at every path point; 0 where the log is elsewhere."""
     grid = PATH_SPACING_M * np.arange(len(center))
     heading = _chord_headings(center)
-    poses = np.concatenate([pose[None], log_poses])
-    frenet = _frenet(center, grid, poses)
+    frenet = _frenet(center, grid, log_poses)
     at, offset = frenet[:, 0], frenet[:, 1]
-    turned = np.abs(wrap_angle(poses[:, 2] - np.interp(at, grid, heading)))
+    turned = np.abs(wrap_angle(log_poses[:, 2] - np.interp(at, grid, heading)))
     usable = (np.abs(offset) <= MAX_LOG_OFFSET_M) & (turned <= SNAP_HEADING_RAD) & (at > 0.0) & (at < grid[-1])
-    if not usable[1:].any():
-        return np.zeros(len(center))  # the log is elsewhere: the start's own offset fades as it drives
-    order = np.argsort(at[1:][usable[1:]], kind="stable")
-    at, offset = at[1:][usable[1:]][order], offset[1:][usable[1:]][order]
+    if not usable.any():
+        return np.zeros(len(center))  # the start's own offset fades as the vehicle drives
+    order = np.argsort(at[usable], kind="stable")
+    at, offset = at[usable][order], offset[usable][order]
     chosen = [0]
     for k in range(1, len(at)):
         if at[k] - at[chosen[-1]] >= LOG_POINT_SPACING_M:

@@ -1,16 +1,18 @@
 """Ego and traffic for H seconds: the joint rollout (METRIC.md sections 1 and 5), and the scene it leads to.
 
-The ego is tracked first, since it follows its plan whatever the traffic does; then the traffic answers to it. Who drives:
+The ego is tracked first, since it follows its plan whatever the traffic does; then the traffic answers to it.
 
-* a vehicle on a lane (within `snap_distance_m` of a centreline, heading within 60 degrees) is driven by IDM along its way
-  through the lane graph; one beside the lanes replays its log until it is on one;
-* a vehicle that its whole log shows standing stays where it is; one that stands now does not start before its log does,
-  and one that its log stops at a junction stops there as long: the log is all we have of lights and signs not in the map;
-* a driven vehicle goes on when its log ends, a replayed one leaves with its log;
-* a vehicle first seen later enters at the first logged step where its box is free, with room of the minimum gap, and the
-  ego is `enter_clearance_m` away, and is driven from then on; else never. Parked cars and other kinds appear by their log;
-* pedestrians, cyclists and replayed vehicles walk their log and wait before a step into a driven vehicle, then go on late
-  along the same log. They do not wait for the ego: its reward must not profit from their care.
+* A vehicle on a lane (within `snap_distance_m` of a centreline, heading within 60 degrees) is driven by IDM along its
+  way through the lane graph; one beside the lanes replays its log until it is on one.
+* A vehicle that its whole log shows standing stays where it is; one that stands now does not start before its log
+  does; one that its log stops at a junction stops there as long. The log is all we have of lights and signs that are
+  not in the map.
+* A driven vehicle goes on when its log ends; a replayed one leaves with its log.
+* A vehicle first seen later enters at the first logged step where its box is free, with the minimum gap at both ends,
+  and the ego's centre is `enter_clearance_m` away, and is driven from then on; else never. Parked cars, pedestrians and
+  things appear by their log.
+* Pedestrians, cyclists and replayed vehicles walk their log; before a step into a driven vehicle they wait, then go on
+  late along the same log. They do not wait for the ego: its reward must not profit from their care.
 """
 
 from dataclasses import dataclass, replace
@@ -100,7 +102,7 @@ def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
 
     join, hold = np.full(n, NEVER), np.zeros(n, dtype=np.int64)
     found: list[LanePath | None] = [None] * n
-    for i in np.flatnonzero(is_vehicle & ~standing):
+    for i in np.flatnonzero(is_vehicle & ~standing).tolist():
         driven_before = bool(moved[i] and now.valid[start, i])
         step = start if driven_before else _join_step(index, scene, i, settings.snap_distance_m)
         if step == NEVER:

@@ -123,7 +123,7 @@ def test_the_corridor_gap_equals_its_slow_twin(radius: float) -> None:
 
 def test_a_start_beside_the_path_is_kept_and_fades_without_a_jump() -> None:
     paths = circle(30.0)
-    x0, y0, h0 = pose_on_path(paths, 0, 12.0, 0.0, 1.2, 0.1, 20.0)
+    x0, y0, _ = pose_on_path(paths, 0, 12.0, 0.0, 1.2, 0.1, 20.0)
     s, left = project_on_path(paths, 0, x0, y0)
     assert (s, left) == (pytest.approx(12.0, abs=0.05), pytest.approx(1.2, abs=0.01))
     poses = np.array([pose_on_path(paths, 0, 12.0 + t, t, 1.2, 0.1, 20.0) for t in np.arange(0.0, 25.0, 0.1)])

@@ -110,7 +110,7 @@ def test_a_red_light_stops_and_a_green_one_lets_go() -> None:
 
 
 def test_a_stop_at_a_junction_that_only_the_log_explains_is_kept() -> None:
-    """The log stops at x = 55 (nose 57.3, entry at 60) from 2 s after T for good: a light that the map does not have."""
+    """The log stops at x = 55 (nose 57.3, entry at 60) from 2 s after T on: a light the map does not have."""
     way = np.minimum(55.0, 55.0 - 8.0 * STEP_S * (NOW + 20 - np.arange(CLIP_STEPS)))
     scene = worlds.scene(worlds.fork(), Track(0.0, poses=np.column_stack([way, 0 * way, 0 * way])))
     first = run(scene)
@@ -148,14 +148,22 @@ def test_an_entering_car_waits_for_room_and_enters_driven_else_never() -> None:
 
 
 def test_a_pedestrian_waits_for_a_driven_car_and_then_goes_on_late() -> None:
-    """Crosses at x = 20 just when the driven car, faster than in its log, is there; the log itself is free."""
-    walker = Track(14.0, -7.0, np.pi / 2, 1.5, AgentKind.PEDESTRIAN, (0.6, 0.6))
-    car = Track(-6.0, speed=1.0)  # in the log it crawls
-    scene = worlds.scene(worlds.straight_road(), car, walker)
-    settings = replace(IDM, lookahead_m=0.01)  # a driver who does not look: the walker must
-    fast = replace(scene, agents=replace(scene.agents, velocities=scene.agents.velocities * [[[8.0], [1.0]]]))
-    rollout = simulate(fast, worlds.straight_plan(fast), settings)
-    assert overlap_area(rollout.agents, 0, 1) == 0.0
+    """It crosses at x = 14 just when a car is there whose driver does not look (no lookahead)."""
+    walker = Track(14.0, kind=AgentKind.PEDESTRIAN, size=(0.6, 0.6), poses=walk(14.0, -3.6, 1.0))
+    scene = worlds.scene(worlds.straight_road(), Track(-6.0, speed=8.0), walker)
+    agents = run(scene, replace(IDM, lookahead_m=0.01)).agents
+    by_log = agents.boxes.copy()
+    by_log[:, 1] = scene.agents.boxes[NOW : NOW + 41, 1]
+    assert overlap_area(replace(agents, boxes=by_log), 0, 1) > 0.1
+    assert overlap_area(agents, 0, 1) == 0.0
+    y = agents.boxes[:, 1, 1]
+    assert y[-1] < by_log[-1, 1, 1] - 0.3 and y[-1] > y[25] + 0.3
+
+
+def walk(x: float, y: float, speed: float) -> np.ndarray:
+    """(96, 3) poses of one who walks along +y and is at (x, y) at NOW."""
+    way = y + speed * STEP_S * (np.arange(CLIP_STEPS) - NOW)
+    return np.column_stack([np.full(CLIP_STEPS, x), way, np.full(CLIP_STEPS, np.pi / 2)])
 
 
 def test_a_driven_car_stops_for_a_pedestrian_on_its_way() -> None:

@@ -48,8 +48,8 @@ def fork() -> dict[str, Lane]:
         "ahead": lane(
             "ahead", [(60.0, 0.0), (85.0, 0.0)], predecessors=("in",), successors=("east",), is_intersection=True
         ),
-        "north": lane("north", [(72.0, 12.0), (72.0, 300.0)], predecessors=("left",)),
-        "east": lane("east", [(85.0, 0.0), (400.0, 0.0)], predecessors=("ahead",)),
+        "north": lane("north", [(72.0, 12.0), (72.0, 300.0)]),
+        "east": lane("east", [(85.0, 0.0), (400.0, 0.0)]),
     }
 
 
