@@ -25,6 +25,8 @@ from tasks.world.route import roadblocks_of
 
 SEAM_M = 0.3  # gaps up to twice this between neighbouring lane polygons are closed in the drivable area
 SIMPLIFY_M = 0.05
+SURFACE_MARGIN_M = 50.0
+PIECE_POINTS, PIECE_M, SEAM_OVERLAP_M = 256, 10.0, 0.1  # see pieces()
 NEIGHBOUR_GAP_M = 0.6  # between the edges of two lanes that lie side by side
 NEIGHBOUR_REACH_M = 8.0
 NEIGHBOUR_PROBES = np.array([0.1, 0.3, 0.5, 0.7, 0.9])  # fractions of the lane's length
@@ -161,16 +163,20 @@ def _drivable_areas(features: Mapping[str, Any], raw: Mapping[str, RawLane], fil
     """Union of all car lanes, connectors buffered, and of the drivable surface where the file has its outline.
 
     nuScenes' and nuPlan's converters write that outline as closed `boundary_<i>` rings, islands and outer rings alike:
-    a point is drivable where an odd number of them encloses it. Measured on nuScenes: it holds 100.0 % of the lane area
-    and 1.4 times as much in all.
+    a point is drivable where an odd number of them encloses it. On the seven nuScenes scenes they hold 100.0 % of the
+    lane polygons' area, and parking, shoulders and mouths of side streets besides. A nuScenes outline may go on for
+    kilometres beyond the lanes of the file: what is further than 50 m from their convex hull is left out.
     """
     shapes = [Polygon(lane.ring) for lane in raw.values() if lane.kind in CAR_LANE_KINDS]
     outline = [points(f, "polyline", file, f"map_features[{k}]") for k, f in features.items() if _is_outline(k, f)]
     if outline and all(len(ring) > 3 and np.allclose(ring[0], ring[-1]) for ring in outline):
         rings = [ring for ring in map(closed_ring, outline) if ring is not None]
-        shapes.append(shapely.symmetric_difference_all([Polygon(ring) for ring in rings]))
+        surface = shapely.symmetric_difference_all([Polygon(ring) for ring in rings])
+        near = shapely.convex_hull(shapely.MultiPolygon(shapes)).buffer(SURFACE_MARGIN_M)
+        shapes.append(shapely.intersection(surface, near))
     merged = shapely.union_all(shapes).buffer(SEAM_M, join_style="mitre").buffer(-SEAM_M, join_style="mitre")
-    parts = sorted(shapely.get_parts(merged.simplify(SIMPLIFY_M)), key=lambda part: -part.area)
+    whole = sorted(shapely.get_parts(merged.simplify(SIMPLIFY_M)), key=lambda part: -part.area)
+    parts = [piece for part in whole for piece in pieces(part)]
     return tuple(
         MapPolygon(
             token=f"da_{index}",
@@ -180,6 +186,21 @@ def _drivable_areas(features: Mapping[str, Any], raw: Mapping[str, RawLane], fil
         )
         for index, part in enumerate(parts)
     )
+
+
+def pieces(polygon: Polygon) -> list[Polygon]:
+    """The polygon halved across its longer side until no piece has more than 256 points; halves overlap by 0.1 m.
+
+    A town's surface is one polygon of 5,000 points: whole, it would be tested and stored with every clip.
+    """
+    x0, y0, x1, y1 = polygon.bounds
+    if shapely.get_num_coordinates(polygon) <= PIECE_POINTS or max(x1 - x0, y1 - y0) < PIECE_M:
+        return [polygon]
+    x, y = ((x0 + x1) / 2.0, y1) if x1 - x0 >= y1 - y0 else (x1, (y0 + y1) / 2.0)
+    low = shapely.box(x0, y0, x + SEAM_OVERLAP_M, y + SEAM_OVERLAP_M)
+    high = shapely.box(x0 if x == x1 else x, y0 if y == y1 else y, x1, y1)
+    found = [part for half in (low, high) for part in shapely.get_parts(shapely.intersection(polygon, half))]
+    return [piece for part in found if part.geom_type == "Polygon" for piece in pieces(part)]
 
 
 def _is_outline(key: object, feature: object) -> bool:

@@ -6,10 +6,12 @@ import pickle
 import numpy as np
 import pytest
 import scenarionet_scenarios as town
+import shapely
 from shapely.geometry import Point, Polygon
 
 from factory.clips.reader import BadClip, ClipRef
 from factory.clips.scenarionet import ScenarioNetReader, read_log
+from factory.clips.scenarionet_map import pieces
 from factory.clips.scenarionet_tracks import SLOPE_STEPS, slope_velocities
 from tasks.world.agents import AgentKind
 from tasks.world.clip import CLIP_STEPS, NOW
@@ -154,6 +156,17 @@ def test_islands_of_the_drivable_surface_stay_holes(tmp_path):
     surface = max((Polygon(a.ring, a.holes) for a in log.road_map.drivable_areas), key=lambda p: p.area)
     assert surface.contains(Point(150.0, 5.0)) and not surface.contains(Point(155.0, 7.0))
     assert len(log.road_map.crossings) == 1
+
+
+def test_a_surface_of_many_points_is_cut_into_overlapping_pieces_of_the_same_union():
+    angle = np.linspace(0, 2 * np.pi, 3001)[:-1]
+    radius = 200 + 10 * np.sin(40 * angle)
+    disc = Point(0, 0).buffer(30, quad_segs=200)
+    blob = Polygon(np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])).difference(disc)
+    cut = pieces(blob)
+    assert max(shapely.get_num_coordinates(cut)) <= 256
+    assert shapely.union_all(cut).symmetric_difference(blob).area < 1e-6 * blob.area
+    assert sum(piece.area for piece in cut) > blob.area  # they overlap: no point is lost on a seam
 
 
 def test_a_neighbour_of_the_other_direction_is_found_by_geometry(tmp_path):

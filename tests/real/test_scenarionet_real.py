@@ -1,0 +1,156 @@
+"""Seven nuScenes scenes through the ScenarioNet reader: what data/FORMATS.md claims, and what a clip must be like."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+from shapely.geometry import Polygon
+
+from factory.clips.reader import ClipIndex
+from factory.clips.scenarionet import ScenarioNetReader, read_log, scenario_files
+from tasks.world.agents import AgentKind
+from tasks.world.clip import CLIP_STEPS, NOW, Clip
+from tasks.world.polygons import Rings
+from tasks.world.vehicle import AX, AY, HEADING, VX, VY, X, Y
+
+
+@pytest.fixture(scope="module")
+def root(shared_root: Path) -> Path:
+    return shared_root / "data" / "scenarionet" / "nuscenes"
+
+
+@pytest.fixture(scope="module")
+def logs(root: Path):
+    return {log_id: read_log(path) for log_id, path in scenario_files(root).items()}
+
+
+@pytest.fixture(scope="module")
+def index(root: Path) -> ClipIndex:
+    return ScenarioNetReader(root).index()
+
+
+@pytest.fixture(scope="module")
+def clips(root: Path, index: ClipIndex) -> list[Clip]:
+    reader = ScenarioNetReader(root)
+    return [reader.read(ref) for ref in index.refs]
+
+
+def test_the_seven_scenes_give_61_windows_and_15_that_stand(index):
+    counts = {}
+    for ref in index.refs:
+        counts[ref.log_id[-4:]] = counts.get(ref.log_id[-4:], 0) + 1
+    assert counts == {"0061": 10, "0655": 11, "0757": 9, "0796": 11, "1077": 11, "1100": 9}
+    assert index.dropped == {"ego_standing": 15}  # all of 0553, and where 0757 and 1100 only wait
+    assert not index.broken and not index.skipped_logs
+
+
+def test_joined_lanes_meet_and_point_the_same_way(logs):
+    gaps, turns = [], []
+    for log in logs.values():
+        lanes = log.road_map.lanes
+        for lane in lanes.values():
+            for successor in lane.successors:
+                end, start = lane.centerline[-1], lanes[successor].centerline[0]
+                gaps.append(np.hypot(*(start - end)[:2]))
+                turns.append(abs(np.angle(np.exp(1j * (start[2] - end[2])))))
+    assert len(gaps) > 2000 and max(gaps) < 0.5
+    assert np.quantile(turns, 0.99) < np.radians(30)
+
+
+def test_connectors_join_two_lanes_but_for_those_at_the_map_s_rim(logs):
+    connectors = [lane for log in logs.values() for lane in log.road_map.lanes.values() if lane.is_intersection]
+    joined = [bool(lane.successors) and bool(lane.predecessors) for lane in connectors]
+    assert len(connectors) == 1104 and np.mean(joined) > 0.9
+
+
+def test_lanes_beside_each_other_know_of_each_other_on_the_side_of_traffic(logs):
+    """Singapore drives on the left, Boston on the right: oncoming lanes are to the right there, to the left here."""
+    for log in logs.values():
+        lanes = log.road_map.lanes
+        sides = {"left": 0, "right": 0}
+        for lane in lanes.values():
+            for side, other in (("left", lane.left_neighbor), ("right", lane.right_neighbor)):
+                if other is not None:
+                    ahead = lane.centerline[-1, :2] - lane.centerline[0, :2]
+                    oncoming = lanes[other].centerline[-1, :2] - lanes[other].centerline[0, :2]
+                    sides[side] += bool(ahead @ oncoming < 0)
+        expected = "right" if log.road_map.location.startswith("singapore") else "left"
+        unexpected = "left" if expected == "right" else "right"
+        assert sides[expected] > 10 * max(1, sides[unexpected])
+
+
+def test_the_drivable_area_holds_all_lanes_and_the_ego(logs):
+    for log in logs.values():
+        surface = shapely.union_all([Polygon(area.ring, area.holes) for area in log.road_map.drivable_areas])
+        lanes = shapely.union_all([Polygon(lane.ring) for lane in log.road_map.lanes.values()])
+        assert lanes.difference(surface.buffer(0.1)).area < 1e-3 * lanes.area
+        assert 1.02 * lanes.area < surface.area < 2.5 * lanes.area
+        ego = log.motion.ego_states[log.motion.segment >= 0]
+        assert shapely.contains_xy(surface, ego[:, X], ego[:, Y]).all()
+
+
+def test_the_ego_drives_like_a_car(clips):
+    for clip in clips:
+        states = clip.ego_states
+        assert np.hypot(states[:, AX], states[:, AY]).max() < 4.0
+        assert np.abs(np.diff(states[:, AX])).max() / 0.1 < 4.0
+        assert np.abs(states[:, VY]).max() < 0.3 and states[:, VX].min() > -0.1
+        assert np.abs(np.diff(np.unwrap(states[:, HEADING]))).max() / 0.1 < 0.6
+        travelled = np.cumsum(states[:-1, VX]) * 0.1
+        assert travelled[-1] == pytest.approx(np.hypot(*np.diff(states[:, [X, Y]], axis=0).T).sum(), abs=0.6)
+
+
+def test_the_smooth_ego_stays_with_the_log(logs, root):
+    from factory.clips.scenarionet import read_scenario
+
+    for log_id, path in scenario_files(root).items():
+        scenario, _ = read_scenario(path)
+        stored = np.asarray(scenario["tracks"]["ego"]["state"]["position"])[:, :2]
+        motion = logs[log_id].motion
+        on = motion.segment >= 0
+        off = (motion.ego_states[:, [X, Y]] - stored)[on]
+        heading = motion.ego_states[on, HEADING]
+        along = np.abs(np.cos(heading) * off[:, 0] + np.sin(heading) * off[:, 1])
+        across = np.abs(-np.sin(heading) * off[:, 0] + np.cos(heading) * off[:, 1])
+        assert along.max() < 0.25 and across.max() < 0.03
+
+
+def test_every_window_is_on_its_route_and_has_road_ahead(clips):
+    for clip in clips:
+        rings = Rings([clip.road_map.lanes[lane_id].ring for lane_id in clip.route.lane_ids])
+        assert np.mean([rings.contains(state[:2]).any() for state in clip.ego_states]) > 0.9
+        line = clip.centerline
+        assert np.hypot(*(line[:, :2] - clip.ego_states[NOW, :2]).T).min() < 2.0
+        driven = np.hypot(*np.diff(clip.ego_states[NOW:, [X, Y]], axis=0).T).sum()
+        nearest = int(np.hypot(*(line[:, :2] - clip.ego_states[NOW, :2]).T).argmin())
+        assert np.hypot(*np.diff(line[nearest:, :2], axis=0).T).sum() > driven
+
+
+def test_nothing_valid_is_missing_and_agents_move_as_they_are_seen_to(clips):
+    for clip in clips:
+        agents = clip.agents
+        assert agents.valid.any(axis=0).all() and agents.n_steps == CLIP_STEPS
+        assert np.isfinite(agents.boxes[agents.valid]).all() and np.isfinite(agents.velocities[agents.valid]).all()
+        for k, kind in enumerate(agents.kinds):
+            seen = agents.valid[:, k]
+            speed = np.hypot(*agents.velocities[seen, k].T)
+            limit = {AgentKind.VEHICLE: 35.0, AgentKind.BICYCLE: 15.0, AgentKind.PEDESTRIAN: 4.0}.get(kind, 1.5)
+            assert speed.max() < limit
+        moved = np.diff(agents.boxes[..., :2], axis=0)
+        both = agents.valid[1:] & agents.valid[:-1]
+        assert np.abs(moved[both] - 0.1 * agents.velocities[1:][both]).max() < 1.0
+
+
+def test_the_ego_never_overlaps_the_box_of_an_agent_s_first_sight(clips):
+    """No track is the ego's own: none stays on its rear axle."""
+    for clip in clips:
+        distance = np.hypot(*np.moveaxis(clip.agents.boxes[..., :2] - clip.ego_states[:, None, [X, Y]], -1, 0))
+        assert np.nanmax(distance, axis=0).min() > 1.0
+
+
+def test_the_source_is_named_and_nothing_is_rendered(clips):
+    for clip in clips:
+        assert clip.licence == "CC BY-NC-SA 4.0 (nuScenes via ScenarioNet)"
+        assert not clip.cameras and not clip.images and not clip.sweeps and not clip.lights.lane_ids
+        assert clip.road_map.location.partition("-")[0] in ("singapore", "boston")
