@@ -1,0 +1,71 @@
+"""The synthetic town as a data set: written once into a cache folder, then read like any Argoverse 2 logs."""
+
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from dataclasses import asdict, replace
+from pathlib import Path
+
+from factory.clips.av2 import AV2Reader
+from factory.clips.reader import ClipIndex, ClipRef
+from factory.clips.synthetic.write import TownSettings, write_town
+from tasks.world.clip import Clip
+
+TOWN_VERSION = 1  # raise by hand whenever the same seed gives other bytes
+
+
+class SyntheticReader:
+    """Clips of a seed's town. It is test data and a first look, no replacement for real logs.
+
+    The town is written on first use, into a folder named by everything that its bytes depend on, and moved there
+    whole: parallel workers and killed processes never leave or see half a town.
+    """
+
+    name = "synthetic"
+
+    def __init__(
+        self, cache_dir: str | Path, n_clips: int = 12, seed: int = 0, settings: TownSettings | None = None
+    ) -> None:
+        """Raises ValueError for n_clips < 1 or impossible settings."""
+        if n_clips < 1:
+            raise ValueError(f"clips.n: a town needs at least one clip, not {n_clips}")
+        self.cache_dir = Path(cache_dir).expanduser().absolute()
+        self.n_clips, self.seed, self.settings = n_clips, seed, settings or TownSettings()
+        self._logs: AV2Reader | None = None
+
+    @property
+    def root(self) -> Path:
+        """Where this town's logs lie, or will."""
+        key = json.dumps([TOWN_VERSION, self.n_clips, self.seed, asdict(self.settings)])
+        return self.cache_dir / f"town-{self.seed}-{hashlib.sha256(key.encode()).hexdigest()[:16]}"
+
+    def index(self) -> ClipIndex:
+        """The first n_clips windows, in the order of the logs."""
+        index = self._reader().index()
+        return replace(index, refs=index.refs[: self.n_clips])
+
+    def read(self, ref: ClipRef) -> Clip:
+        """The validated clip. Raises BadClip."""
+        return self._reader().read(ref)
+
+    def _reader(self) -> AV2Reader:
+        if self._logs is None:
+            if not self.root.is_dir():
+                self._write()
+            self._logs = AV2Reader(self.root, name=self.name)
+        return self._logs
+
+    def _write(self) -> None:
+        self.cache_dir.mkdir(parents=True, exist_ok=True)
+        unfinished = Path(tempfile.mkdtemp(prefix=f".{self.root.name}-", dir=self.cache_dir))
+        try:
+            write_town(unfinished, self.n_clips, self.seed, self.settings)
+            try:
+                os.rename(unfinished, self.root)
+            except OSError:
+                if not self.root.is_dir():  # else another worker was first, with the same bytes
+                    raise
+        finally:
+            shutil.rmtree(unfinished, ignore_errors=True)
