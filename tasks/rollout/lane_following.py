@@ -30,6 +30,7 @@ LOG_POINT_SPACING_M = 2.0  # of the logged points the offset is taken from
 MAX_LOG_OFFSET_M = 4.5  # a log farther than this from the way is not followed sideways
 FADE_M = 30.0  # from the log's last offset to the centre
 SMOOTHING_POINTS = 7  # 3 m
+END_CHORD_M = 5.0  # a lane's last few points may be noise
 
 
 @dataclass(frozen=True)
@@ -224,7 +225,8 @@ def _path_of(index: LaneIndex, way: list[int], pose: Array, log_poses: Array, ah
 
     # A window around the vehicle, straight on where the lanes end.
     here = float(_frenet(xy, length, pose[None])[0, 0])
-    grid: Array = here - BEHIND_M + PATH_SPACING_M * np.arange(math.ceil((BEHIND_M + ahead_m) / PATH_SPACING_M) + 1)
+    n_points = math.ceil((BEHIND_M + ahead_m) / PATH_SPACING_M) + 1
+    grid = here - BEHIND_M + PATH_SPACING_M * np.arange(n_points, dtype=np.float64)
     center = _at(xy, length, grid)
     left = _normals(center)
     offset = _log_offset(center, log_poses)
@@ -232,7 +234,7 @@ def _path_of(index: LaneIndex, way: list[int], pose: Array, log_poses: Array, ah
 
     # The shift changes lengths a little: even spacing again, everything else carried along.
     shifted_length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(shifted, axis=0).T))])
-    even: Array = PATH_SPACING_M * np.arange(len(grid))
+    even = PATH_SPACING_M * np.arange(n_points, dtype=np.float64)
     points = _at(shifted, shifted_length, even)
     source = np.interp(even, shifted_length, grid)  # lane length of each even point
     nearest = np.clip(np.searchsorted(length, source, side="right") - 1, 0, len(length) - 1)
@@ -252,12 +254,13 @@ def _path_of(index: LaneIndex, way: list[int], pose: Array, log_poses: Array, ah
 
 
 def _at(xy: Array, length: Array, at: Array) -> Array:
-    """Points of a polyline at path lengths, straight on past both ends."""
+    """Points of a polyline at path lengths, straight on past both ends (as its last END_CHORD_M point)."""
     out = np.stack([np.interp(at, length, xy[:, 0]), np.interp(at, length, xy[:, 1])], axis=-1)
-    for beyond, end, inner in ((at - length[-1], -1, -2), (at - length[0], 0, 1)):
-        past = beyond > 0 if end == -1 else beyond < 0
-        direction = (xy[end] - xy[inner]) / np.hypot(*(xy[end] - xy[inner])) * (1.0 if end == -1 else -1.0)
-        out[past] = xy[end] + beyond[past, None] * direction
+    chord = min(END_CHORD_M, float(length[-1]))
+    before, after = at < 0.0, at > length[-1]
+    inner = [np.array([np.interp(s, length, xy[:, k]) for k in (0, 1)]) for s in (chord, float(length[-1]) - chord)]
+    out[before] = xy[0] + (inner[0] - xy[0]) / np.hypot(*(inner[0] - xy[0])) * at[before, None]
+    out[after] = xy[-1] + (xy[-1] - inner[1]) / np.hypot(*(xy[-1] - inner[1])) * (at[after, None] - length[-1])
     return out
 
 

@@ -154,10 +154,10 @@ def test_a_pedestrian_waits_for_a_driven_car_and_then_goes_on_late() -> None:
     agents = run(scene, replace(IDM, lookahead_m=0.01)).agents
     by_log = agents.boxes.copy()
     by_log[:, 1] = scene.agents.boxes[NOW : NOW + 41, 1]
-    assert overlap_area(replace(agents, boxes=by_log), 0, 1) > 0.1
+    assert overlap_area(replace(agents, boxes=by_log), 0, 1) > 0.05
     assert overlap_area(agents, 0, 1) == 0.0
     y = agents.boxes[:, 1, 1]
-    assert y[-1] < by_log[-1, 1, 1] - 0.3 and y[-1] > y[25] + 0.3
+    assert y[-1] < by_log[-1, 1, 1] - 0.2 and y[-1] > y[25] + 0.3
 
 
 def walk(x: float, y: float, speed: float) -> np.ndarray:
