@@ -42,13 +42,14 @@ class Batch:
     candidates: list[ClipCandidates] = field(default_factory=list)
     outcomes: list[Outcome] = field(default_factory=list)
     replaced: list[str] = field(default_factory=list)  # attempt_ids whose old rows go
+    unlisted: list[str] = field(default_factory=list)  # clip_ids whose candidate list goes
     shards: list[Shard] = field(default_factory=list)
     writing: int = 0
     opened: float = 0.0
 
     @property
     def is_empty(self) -> bool:
-        return not (self.rows or self.candidates or self.outcomes or self.replaced)
+        return not (self.rows or self.candidates or self.outcomes or self.replaced or self.unlisted)
 
     @property
     def largest(self) -> int:
@@ -82,6 +83,7 @@ class Gatherer:
         candidates: Sequence[ClipCandidates] = (),
         outcomes: Sequence[Outcome] = (),
         replaced: Sequence[str] = (),
+        unlisted: Sequence[str] = (),
     ) -> None:
         """Results that must become visible together."""
         if self._open.is_empty:
@@ -91,6 +93,7 @@ class Gatherer:
         self._open.candidates.extend(candidates)
         self._open.outcomes.extend(outcomes)
         self._open.replaced.extend(replaced)
+        self._open.unlisted.extend(unlisted)
 
     def send_if_due(self) -> None:
         batch = self._open
@@ -122,4 +125,4 @@ class Gatherer:
         return True
 
     def _commit(self, batch: Batch) -> None:
-        self._store.commit(batch.candidates, batch.shards, batch.outcomes, batch.replaced)
+        self._store.commit(batch.candidates, batch.shards, batch.outcomes, batch.replaced, batch.unlisted)

@@ -162,7 +162,8 @@ class Driver:
         outcome = self._outcome(clip.ref, key, "", CLIP_CANDIDATE, report, tries_before(clip.past), {}, {})
         clip.past = Past(key, Kind(outcome.kind), True, outcome=outcome)
         clip.failed = outcome.kind == Kind.FAILED
-        self._gatherer.add(outcomes=[outcome], replaced=replaced)
+        unlisted = [clip_id] if isinstance(report, Rejected) else []
+        self._gatherer.add(outcomes=[outcome], replaced=replaced, unlisted=unlisted)
         self._tally.rejected += not clip.failed
         self._tally.failed += clip.failed
         self._tally.clips += 1

@@ -73,7 +73,12 @@ def execute(
     except ChangedRun as error:
         return RunSummary(BAD_CONFIG, str(error))
     policy = retry_policy(retry, identity.versions_json)
-    history = store.history(identity, digests)
+    try:
+        history = store.history(identity, digests)
+    except OSError as error:
+        return RunSummary(
+            BAD_CONFIG, f"{error}; python -m factory.store.verify {store.location.uri} says what is damaged"
+        )
     plan = make_plan(refs, experts, rounds, history, identity, on_change, policy)
     content = {clip_id: row.content_digest for clip_id, row in history.candidates.items() if on_change != "redo"}
     driver = Driver(identity, plan, digests, rounds, policy, content)

@@ -172,14 +172,14 @@ class Store:
         shards: Sequence[Shard],
         outcomes: Sequence[Outcome],
         replaced: Sequence[str] = (),
+        unlisted: Sequence[str] = (),
     ) -> None:
-        """Commit one group of results; `replaced` are attempt_ids whose rows these results take the place of.
+        """Commit one group of results, in place of the rows of attempts `replaced` and the lists of clips `unlisted`.
 
         Raises DuplicateKey and AnotherWriter.
         """
-        if candidates:
-            rows = write_shard(self.candidates.location, CANDIDATES, candidates_table(candidates))
-            self.candidates.commit([rows], drop=rows.keys)
+        lists = [write_shard(self.candidates.location, CANDIDATES, candidates_table(candidates))] if candidates else []
+        self.candidates.commit(lists, drop=[*unlisted, *(row.clip_id for row in candidates)])
         accepted = [key for shard in shards for key in shard.keys]
         self.samples.commit(shards, drop=replaced)
         # A failed outcome stands until its attempt succeeds: then it goes, and it never stands twice.

@@ -13,6 +13,7 @@ import json
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import pyarrow as pa
@@ -101,9 +102,12 @@ class KeyedTable:
         self._delta: DeltaTable | None = None
         if DeltaTable.is_deltatable(location.uri, storage_options=dict(location.options)):
             self._delta = DeltaTable(location.uri, storage_options=dict(location.options))
-        self._path_of: dict[str, str] = {}  # key -> file
-        for path, rows in self.files([spec.key]):
-            self._path_of.update(dict.fromkeys(rows[spec.key].to_pylist(), path))
+
+    @cached_property
+    def _path_of(self) -> dict[str, str]:
+        """Key -> the file it stands in."""
+        key = self.spec.key
+        return {k: path for path, rows in self.files([key]) for k in rows[key].to_pylist()}
 
     @property
     def version(self) -> int | None:
@@ -167,6 +171,7 @@ class KeyedTable:
                 new[key] = shard.path
         if not add and not dropped:
             return
+        path_of = self._path_of  # as it was before the transaction
         touched = {self._path_of[key] for key in dropped}
         live = self.live_files() if touched else {}
         kept = [rest for path in sorted(touched) if (rest := self._without(path, live[path], dropped)) is not None]
@@ -182,9 +187,9 @@ class KeyedTable:
                 actions.append(AddAction(path, shard.size, shard.partition, now_ms, True, stats))
         self._transact(actions)
         for key in dropped:
-            del self._path_of[key]
+            del path_of[key]
         for written in (*kept, *add):
-            self._path_of.update(dict.fromkeys(written.keys, written.path))
+            path_of.update(dict.fromkeys(written.keys, written.path))
 
     def _without(self, path: str, partition: Mapping[str, str], dropped: set[str]) -> Shard | None:
         rows = self.read_file(path, partition)

@@ -1,0 +1,146 @@
+"""Reads samples without Ray or Hydra: `SampleTable(path)`.
+
+A table is a snapshot: what is committed after it was opened is not in it. Samples are ordered by attempt_id, whatever
+files they stand in; `iterate` goes file by file instead, which is what a pass over everything wants.
+
+    samples = SampleTable("runs/demo")
+    print(len(samples), samples.schema)
+    sample = samples[0]                       # dict: column -> array, text, number or None
+    front = image_of(sample, "front", 0.0)    # (height, width, 3) uint8 RGB
+    batch = to_torch(sample)
+"""
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from factory.store.location import Location
+from factory.store.schema import samples_spec, table_to_rows
+from factory.store.table import KeyedTable
+
+if TYPE_CHECKING:
+    import torch
+
+Sample = dict[str, Any]
+TIME_TOLERANCE_S = 0.05
+
+
+class SampleTable:
+    """The samples of one store, read-only."""
+
+    def __init__(self, path: str | os.PathLike[str], storage_options: Mapping[str, str] | None = None) -> None:
+        """path: the run's `out` or its folder `samples`. Raises FileNotFoundError where there is no table."""
+        location = Location.parse(path, storage_options)
+        here = KeyedTable(location, samples_spec())
+        self._table = here if here.version is not None else KeyedTable(location.child("samples"), samples_spec())
+        if self._table.version is None:
+            raise FileNotFoundError(f"{location.uri}: no table of samples here or in its folder samples")
+        self._partitions = self._table.live_files()
+        places = [
+            (key, path, row)
+            for path, keys in self._table.files(["attempt_id"])
+            for row, key in enumerate(keys["attempt_id"].to_pylist())
+        ]
+        self._places = sorted(places)
+        self._index = {key: i for i, (key, _, _) in enumerate(self._places)}
+        self._file = lru_cache(maxsize=32)(self._open)
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    @property
+    def schema(self) -> pa.Schema:
+        """Arrow schema with unit, frame and shape in each field's metadata."""
+        return self._table.spec.schema
+
+    @property
+    def attempt_ids(self) -> tuple[str, ...]:
+        """In the table's order."""
+        return tuple(key for key, _, _ in self._places)
+
+    def table(self, columns: Sequence[str] | None = None) -> pa.Table:
+        """Some columns of all samples, ordered by attempt_id; reads nothing but these columns."""
+        wanted = list(self.schema.names if columns is None else columns)
+        rows = self._table.read(wanted if "attempt_id" in wanted else [*wanted, "attempt_id"])
+        return rows.sort_by("attempt_id").select(wanted)
+
+    def __getitem__(self, which: int | str) -> Sample:
+        """One sample by place or attempt_id. Raises IndexError or KeyError."""
+        return self.sample(which)
+
+    def sample(self, which: int | str, columns: Sequence[str] | None = None) -> Sample:
+        """One sample, or some of its columns; reads the row group it stands in."""
+        _, path, row = self._places[self._index[which] if isinstance(which, str) else which]
+        file = self._file(path)
+        group = 0
+        while row >= file.metadata.row_group(group).num_rows:
+            row -= file.metadata.row_group(group).num_rows
+            group += 1
+        (sample,) = self._rows(path, [group], columns, slice(row, row + 1))
+        return sample
+
+    def __iter__(self) -> Iterator[Sample]:
+        return self.iterate()
+
+    def iterate(self, columns: Sequence[str] | None = None) -> Iterator[Sample]:
+        """Every sample once, file by file, one row group in memory."""
+        for path in sorted(self._partitions):
+            for group in range(self._file(path).metadata.num_row_groups):
+                yield from self._rows(path, [group], columns, slice(None))
+
+    def _rows(self, path: str, groups: list[int], columns: Sequence[str] | None, rows: slice) -> list[Sample]:
+        partition = self._partitions[path]
+        names = list(self.schema.names if columns is None else columns)
+        unknown = sorted(set(names) - set(self.schema.names))
+        if unknown:
+            raise KeyError(f"no columns {unknown}")
+        stored = self._file(path).read_row_groups(groups, columns=[n for n in names if n not in partition])
+        start, stop, _ = rows.indices(stored.num_rows)
+        stored = stored.slice(start, stop - start)
+        arrays = [
+            pa.repeat(pa.scalar(partition[n]).cast(self.schema.field(n).type), stored.num_rows)
+            if n in partition
+            else stored[n].cast(self.schema.field(n).type)
+            for n in names
+        ]
+        return table_to_rows(pa.table(arrays, schema=pa.schema([self.schema.field(n) for n in names])))
+
+    def _open(self, path: str) -> pq.ParquetFile:
+        filesystem, base = self._table.location.filesystem()
+        return pq.ParquetFile(f"{base}/{path}", filesystem=filesystem, page_checksum_verification=True)
+
+
+def image_of(sample: Mapping[str, Any], camera: str, time_s: float) -> NDArray[np.uint8]:
+    """One image (height, width, 3) uint8 RGB; time_s relative to the sample's now, within 0.05 s.
+
+    Raises KeyError where the sample has no such image, ValueError where it cannot be decoded.
+    """
+    import cv2
+
+    for image in sample["images"] or ():
+        if image["camera"] == camera and abs(image["time_s"] - time_s) <= TIME_TOLERANCE_S:
+            pixels = cv2.imdecode(np.frombuffer(image["jpeg"], np.uint8), cv2.IMREAD_COLOR)
+            if pixels is None:
+                raise ValueError(f"{sample.get('attempt_id', 'sample')}: image {camera} at {time_s} s is not a JPEG")
+            return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+    have = sorted({(i["camera"], round(float(i["time_s"]), 3)) for i in sample["images"] or ()})
+    raise KeyError(f"no image of camera {camera!r} at {time_s} s; there are {have}, source {sample['image_source']}")
+
+
+def to_torch(sample: Mapping[str, Any]) -> "dict[str, torch.Tensor]":
+    """The numeric columns as tensors (copies); ragged, text, struct and null columns are left out."""
+    import torch
+
+    tensors = {}
+    for name, value in sample.items():
+        if isinstance(value, np.ndarray) and value.dtype.kind in "bif":
+            tensors[name] = torch.from_numpy(value.copy())
+        elif isinstance(value, bool | int | float):
+            tensors[name] = torch.tensor(value)
+    return tensors

@@ -1,0 +1,100 @@
+"""Checks a store from its files alone: `python -m factory.store.verify OUT`.
+
+Damage is what must not be: a file of the log that is missing or fails its checksums, a key twice, a round out of order.
+Orphans are harmless: files no commit names, left behind by a run that died; readers ignore them.
+"""
+
+import sys
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from factory.store.samples import Store
+from factory.store.table import KeyedTable
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What verify found."""
+
+    n_samples: int
+    damage: tuple[str, ...]
+    orphans: tuple[str, ...]  # relative to `out`
+
+
+def verify(store: Store) -> Verdict:
+    """Read every live file with its checksums, and hold the tables against each other."""
+    damage: list[str] = []
+    orphans: list[str] = []
+    for table in (store.samples, store.candidates, store.outcomes):
+        damage += _damaged_files(table)
+        orphans += _orphans(table)
+    if damage:
+        return Verdict(0, (*damage, "keys and rounds were not checked: mend the files first"), tuple(orphans))
+    damage += _twice(store) + _broken_rounds(store)
+    known = {run["settings_hash"] for run in store.runs()}
+    for name in sorted(set(store.samples.read(["settings_hash"])["settings_hash"].to_pylist()) - known):
+        damage.append(f"samples: settings_hash {name} is not in run.json")
+    return Verdict(len(store.samples), tuple(damage), tuple(orphans))
+
+
+def _damaged_files(table: KeyedTable) -> list[str]:
+    found = []
+    for path, partition in sorted(table.live_files().items()):
+        try:
+            table.read_file(path, partition)
+        except OSError as error:
+            found.append(str(error))
+    return found
+
+
+def _orphans(table: KeyedTable) -> list[str]:
+    live = set(table.live_files())
+    names = [name for name in table.location.names() if not name.startswith("_delta_log/")]
+    return [f"{table.spec.name}/{name}" for name in names if name not in live]
+
+
+def _twice(store: Store) -> list[str]:
+    found = []
+    for table in (store.samples, store.candidates, store.outcomes):
+        seen: set[str] = set()
+        for path, rows in table.files([table.spec.key]):
+            for key in rows[table.spec.key].to_pylist():
+                if key in seen:
+                    found.append(f"{table.spec.name}: {key} stands twice, again in {path}")
+                seen.add(key)
+    return found
+
+
+def _broken_rounds(store: Store) -> list[str]:
+    """Rounds of a walk count 0, 1, 2 ... in the order of its candidates."""
+    walks: dict[tuple[str, str], list[tuple[int, int]]] = defaultdict(list)
+    for row in store.samples.read(["clip_id", "expert", "candidate_index", "round"]).to_pylist():
+        walks[row["clip_id"], row["expert"]].append((row["candidate_index"], row["round"]))
+    return [
+        f"samples: clip {clip_id}, expert {expert}: candidates and rounds {sorted(rows)}"
+        for (clip_id, expert), rows in sorted(walks.items())
+        if [number for _, number in sorted(rows)] != list(range(len(rows)))
+    ]
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Print the verdict; 0 sound, 1 damaged, 2 no store there."""
+    if len(arguments) != 1:
+        print("usage: python -m factory.store.verify OUT", file=sys.stderr)
+        return 2
+    store = Store(arguments[0])
+    if store.samples.version is None and store.outcomes.version is None:
+        print(f"{store.location.uri}: no store here", file=sys.stderr)
+        return 2
+    verdict = verify(store)
+    for line in verdict.damage:
+        print(f"DAMAGED {line}")
+    for line in verdict.orphans:
+        print(f"orphan  {line}")
+    print(f"{verdict.n_samples} samples, {len(verdict.damage)} damages, {len(verdict.orphans)} orphans")
+    return 1 if verdict.damage else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,80 @@
+"""Prepared clips on disk: exact, and no way for a file to run code."""
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from factory.store.cache import BadCacheFile, ClipCache, decode, encode
+from factory.store.location import Location
+from factory.work import CandidateRow
+from tasks.stages import Rejected
+from tasks.world.agents import AgentKind, AgentTracks
+
+
+def forged(tree: object) -> bytes:
+    sink = io.BytesIO()
+    np.savez(sink, tree=np.frombuffer(json.dumps(tree).encode(), np.uint8))
+    return sink.getvalue()
+
+
+def tracks() -> AgentTracks:
+    rng = np.random.default_rng(0)
+    return AgentTracks(
+        ("1", "2"),
+        (AgentKind.VEHICLE, AgentKind.PEDESTRIAN),
+        rng.random((4, 2, 5)),
+        rng.random((4, 2, 2)),
+        np.array([[True, False]] * 4),
+        rng.random((4, 2)),
+        np.array([1.5, 1.8]),
+    )
+
+
+def test_a_tree_of_dataclasses_comes_back_exactly() -> None:
+    value = {"tracks": tracks(), "lanes": frozenset({"a", "b"}), "pair": (np.float64(0.1), None), 3: [True, "x"]}
+    back = decode(encode(value))
+    assert list(back) == list(value) and back["lanes"] == value["lanes"] and back["pair"] == value["pair"]
+    assert back["tracks"].kinds == tracks().kinds and isinstance(back["tracks"].kinds[0], AgentKind)
+    for name in ("boxes", "velocities", "valid", "center_z", "heights"):
+        assert np.array_equal(getattr(back["tracks"], name), getattr(tracks(), name))
+        assert getattr(back["tracks"], name).dtype == getattr(tracks(), name).dtype
+
+
+def test_an_array_that_stands_twice_is_stored_once() -> None:
+    big = np.random.default_rng(0).random(10_000)
+    assert len(encode((big, big, {"again": big}))) < 1.1 * len(encode((big,)))
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["os:system", "subprocess:Popen", "factory.store.cache:io.BytesIO", "factory.steps:warm", "tasks.stages:nothing"],
+)
+def test_a_file_cannot_name_what_is_not_a_dataclass_of_ours(name: str) -> None:
+    with pytest.raises(BadCacheFile):
+        decode(forged({"format": 1, "root": {"class": name, "members": {}}}))
+
+
+def test_what_cannot_be_stored_is_refused_when_written() -> None:
+    with pytest.raises(TypeError, match="cannot be cached"):
+        encode({"f": open})
+    with pytest.raises(TypeError, match="objects"):
+        encode(np.array([object()]))
+
+
+def test_damage_is_found_and_absence_is_none(tmp_path: Path) -> None:
+    cache = ClipCache(Location.parse(tmp_path))
+    assert cache.load("x") is None
+    cache.store("x", (Rejected("clip", "ego_standing"), CandidateRow(0, 1, 0.0, 0.0, 0.0, 0.0, (0, 1), 1.0, 1.0)))
+    assert cache.load("x") == (
+        Rejected("clip", "ego_standing"),
+        CandidateRow(0, 1, 0.0, 0.0, 0.0, 0.0, (0, 1), 1.0, 1.0),
+    )
+    path = tmp_path / "x.npz"
+    for damage in (path.read_bytes()[:-100], b"", b"PK"):
+        path.write_bytes(damage)
+        with pytest.raises(BadCacheFile):
+            cache.load("x")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["x.npz"]  # no drafts left

@@ -1,0 +1,97 @@
+"""Reading samples: no Ray, no Hydra, little I/O; and verify, which reads everything."""
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from factory.execute import execute
+from factory.store.reader import SampleTable, image_of, to_torch
+from factory.store.samples import Store
+from factory.store.verify import main, verify
+from tests.factory.toy import ToyWork, refs
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    path = tmp_path_factory.mktemp("reader") / "out"
+    execute(ToyWork(), refs(3), ["recovery", "human"], 2, Store(path), "local", say=lambda line: None)
+    yield path
+
+
+def test_samples_are_the_same_by_place_key_iteration_and_table(out: Path) -> None:
+    samples = SampleTable(out)
+    assert len(samples) == len(SampleTable(out / "samples")) == 9
+    by_key = {sample["attempt_id"]: sample for sample in samples}
+    scores = samples.table(["stage2_score", "attempt_id"])
+    for i, key in enumerate(samples.attempt_ids):
+        for one in (samples[i], samples[key], by_key[key]):
+            assert one["attempt_id"] == key
+            assert np.array_equal(one["agent_boxes"], by_key[key]["agent_boxes"])
+            assert one["stage2_score"] == scores["stage2_score"][i].as_py()
+    assert samples.sample(0, ["round", "label_2hz"]).keys() == {"round", "label_2hz"}
+    assert samples.schema.field("label_10hz").metadata[b"frame"] == b"ego at now"
+
+
+def test_a_table_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=str(tmp_path)):
+        SampleTable(tmp_path)
+    with pytest.raises(FileNotFoundError):
+        SampleTable(tmp_path / "nowhere")
+
+
+def test_the_reader_imports_neither_ray_nor_hydra_nor_torch(out: Path) -> None:
+    code = (
+        "import sys; from factory.store.reader import SampleTable; SampleTable(sys.argv[1])[0];"
+        "sys.exit(bool({'ray', 'hydra', 'torch', 'cv2'} & set(sys.modules)))"
+    )
+    assert subprocess.run([sys.executable, "-c", code, str(out)], check=False).returncode == 0
+
+
+def test_one_image_is_decoded_as_rgb() -> None:
+    red = np.zeros((20, 30, 3), np.uint8)
+    red[..., 0] = 250
+    jpeg = cv2.imencode(".jpg", red[..., ::-1])[1].tobytes()
+    sample = {"images": [{"camera": "front", "time_s": -0.5, "jpeg": jpeg}], "image_source": "render"}
+    image = image_of(sample, "front", -0.5)
+    assert image.shape == (20, 30, 3) and image[..., 0].min() > 200 and image[..., 2].max() < 50
+    with pytest.raises(KeyError, match="front"):
+        image_of(sample, "front", 0.0)
+    with pytest.raises(KeyError, match="source none"):
+        image_of({"images": None, "image_source": "none"}, "front", 0.0)
+
+
+def test_tensors_hold_the_numeric_columns(out: Path) -> None:
+    sample = SampleTable(out)[0]
+    tensors = to_torch(sample)
+    assert tuple(tensors["label_10hz"].shape) == (40, 3)
+    assert np.array_equal(tensors["agent_valid"].numpy(), sample["agent_valid"])
+    assert "clip_id" not in tensors and "cameras" not in tensors
+
+
+def test_verify_tells_damage_from_orphans(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert verify(Store(out)).damage == () and main([str(out)]) == 0
+    shard = sorted((out / "samples").rglob("*.parquet"))[0]
+    orphan = shard.with_name("part-left-behind.parquet")
+    orphan.write_bytes(shard.read_bytes())
+    verdict = verify(Store(out))
+    assert verdict.damage == () and verdict.orphans == (f"samples/{orphan.relative_to(out / 'samples')}",)
+    orphan.unlink()
+
+    data = shard.read_bytes()
+    flipped = bytearray(data)
+    flipped[len(data) // 3] ^= 1
+    shard.write_bytes(bytes(flipped))
+    assert main([str(out)]) == 1 and shard.name in capsys.readouterr().out
+    shard.unlink()
+    assert any(shard.name in line for line in verify(Store(out)).damage)
+    shard.write_bytes(data)
+    assert verify(Store(out)).damage == ()
+
+
+def test_verify_of_nothing_says_so(tmp_path: Path) -> None:
+    assert main([str(tmp_path)]) == 2 and main([]) == 2

@@ -1,0 +1,26 @@
+"""The tables of a store as plain values, for comparison: timings left out, rows in the order of their keys."""
+
+from pathlib import Path
+
+import pyarrow as pa
+
+from factory.store.location import Location
+from factory.store.samples import Store
+
+
+def tables_of(out: Path | Location) -> tuple[pa.Table, list[object], list[object]]:
+    """(samples, outcomes, candidates)."""
+    store = Store(out)
+    samples = store.samples.read().sort_by("attempt_id")
+    outcomes = store.outcomes.read().drop_columns(["seconds"]).sort_by("attempt_id").to_pylist()
+    candidates = store.candidates.read().sort_by("clip_id").to_pylist()
+    return samples, outcomes, candidates
+
+
+def assert_same_tables(a: Path | Location, b: Path | Location) -> None:
+    """Identical rows, every column but timings."""
+    left, right = tables_of(a), tables_of(b)
+    assert left[0]["attempt_id"].to_pylist() == right[0]["attempt_id"].to_pylist()
+    assert left[0].equals(right[0])
+    assert left[1] == right[1]
+    assert left[2] == right[2]

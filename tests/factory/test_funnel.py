@@ -1,0 +1,41 @@
+"""The funnel counts from the tables alone."""
+
+from pathlib import Path
+
+import pytest
+
+from factory.execute import execute
+from factory.funnel import FunnelRow, _expert_rows, funnel_of
+from factory.store.samples import Store
+from tests.factory.toy import ToyWork, refs
+
+
+def test_an_attempt_belongs_to_the_round_it_was_tried_for() -> None:
+    clips = {
+        "a": [(0, "reward.nc"), (1, ""), (2, "reward.ep"), (3, "")],
+        "b": [(0, ""), (1, "reward.nc")],
+        "c": [(0, "failed.bug")],
+    }
+    first, second = _expert_rows("recovery", clips)[:2]
+    assert first == FunnelRow("recovery", 0, 2, 1, 1, 3, 2, 3, {"reward.nc": 1, "failed.bug": 1})
+    assert second == FunnelRow("recovery", 1, 1, 2, 0, 2, 1, 3, {"reward.ep": 1, "reward.nc": 1})
+    assert first.attempt_rate == 0.5 and first.clip_rate == pytest.approx(2 / 3)
+    assert second.clip_rate == 0.5 and second.clip_rate_of_all == pytest.approx(1 / 3)
+
+
+def test_the_funnel_adds_up_to_the_tables(tmp_path: Path) -> None:
+    work = ToyWork(trouble={"log0:0": "standing", "log1:1000": "no_candidates", "log0:2000:recovery:1": "bug"})
+    store = Store(tmp_path)
+    summary = execute(work, refs(6), ["recovery", "human"], 3, store, "local", say=lambda line: None)
+    funnel = funnel_of(store)
+    assert funnel == summary.funnel
+    assert sum(row.accepted for row in funnel.rows) == summary.counts["accepted"] == len(store.samples)
+    assert sum(row.rejected for row in funnel.rows) == summary.counts["rejected"] - 1
+    assert sum(row.failed for row in funnel.rows) == summary.counts["failed"] == 1
+    assert funnel.clip_outcomes == {"clip.ego_standing": 1}
+    assert funnel.clips_without_candidates == {"perturb.no_gated_candidate": 1}
+    assert funnel.clips_prepared == 5 and funnel.candidates == 24 and funnel.gates == {"heading": 35, "lateral": 15}
+    (human,) = [row for row in funnel.rows if row.expert == "human"]
+    assert (human.accepted, human.clips_total) == (5, 5)
+    assert "reward.nc" in funnel.text() and "failed.bug 1" in funnel.text()
+    assert funnel_of(store, []).rows == ()

@@ -1,0 +1,235 @@
+"""A run in the local executor: resume, nested rounds, failures, changed settings; the store is real."""
+
+import os
+import re
+import signal
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import pyarrow.compute as pc
+import pytest
+
+from factory.execute import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, RunSummary, execute
+from factory.store.samples import Store
+from factory.store.verify import verify
+from tests.factory.tables import assert_same_tables, tables_of
+from tests.factory.toy import VERSIONS, ToyWork, ran, refs
+
+EXPERTS = ["recovery", "pdm_closed", "human"]
+
+
+def run(out: Path, work: ToyWork | None = None, rounds: int = 2, n: int = 4, **options: object) -> RunSummary:
+    return execute(
+        work or ToyWork(),
+        refs(n),
+        EXPERTS,
+        rounds,
+        Store(out),
+        "local",
+        say=lambda line: None,
+        **options,  # type: ignore[arg-type]
+    )
+
+
+def test_the_same_command_again_executes_nothing(tmp_path: Path) -> None:
+    journal = str(tmp_path / "journal")
+    first = run(tmp_path / "out", ToyWork(journal=journal))
+    tasks = ran(journal, "")
+    second = run(tmp_path / "out", ToyWork(journal=journal))
+    assert first.exit_code == second.exit_code == COMPLETE
+    assert ran(journal, "") == tasks and second.executed.attempts == 0
+    assert second.executed.found_done == first.executed.attempts
+    assert second.counts == first.counts
+
+
+def test_five_rounds_after_two_are_five_rounds_and_perturb_nothing_again(tmp_path: Path) -> None:
+    journal = str(tmp_path / "journal")
+    run(tmp_path / "nested", ToyWork(journal=journal), rounds=2)
+    assert ran(journal, "prepare") == 4
+    later = run(tmp_path / "nested", ToyWork(journal=journal), rounds=5)
+    assert ran(journal, "prepare") == 4 and later.executed.prepared == 0
+    direct = run(tmp_path / "direct", rounds=5)
+    assert later.executed.attempts + later.executed.found_done == direct.executed.attempts
+    assert_same_tables(tmp_path / "nested", tmp_path / "direct")
+
+
+def test_a_lost_cache_is_prepared_again_and_said(tmp_path: Path) -> None:
+    run(tmp_path / "out", rounds=1)
+    for path in (tmp_path / "out/cache/prepared").iterdir():
+        path.write_bytes(path.read_bytes()[:50])
+    later = run(tmp_path / "out", rounds=3)
+    assert later.executed.prepared > 0
+    assert any("prepared again" in note for note in later.notes)
+    run(tmp_path / "direct", rounds=3)
+    assert_same_tables(tmp_path / "out", tmp_path / "direct")
+
+
+def test_every_attempt_has_one_row_in_one_table(tmp_path: Path) -> None:
+    summary = run(tmp_path / "out", rounds=5)
+    samples, outcomes, _ = tables_of(tmp_path / "out")
+    keys = samples["attempt_id"].to_pylist() + [o["attempt_id"] for o in outcomes]  # type: ignore[index]
+    assert len(keys) == len(set(keys)) == sum(summary.counts.values())
+    assert verify(Store(tmp_path / "out")).damage == ()
+
+
+def test_a_walk_that_runs_out_of_candidates_is_exhausted_once(tmp_path: Path) -> None:
+    run(tmp_path / "out", ToyWork(threshold=0.99), rounds=1)
+    run(tmp_path / "out", ToyWork(threshold=0.99), rounds=3)
+    _, outcomes, _ = tables_of(tmp_path / "out")
+    exhausted = [o for o in outcomes if o["kind"] == "exhausted"]  # type: ignore[index]
+    assert len(exhausted) == 8 and {o["n_tried"] for o in exhausted} == {6}  # type: ignore[index]
+
+
+def test_a_clip_without_candidates_still_gives_its_human_sample(tmp_path: Path) -> None:
+    summary = run(tmp_path / "out", ToyWork(trouble={"log0:0": "no_candidates", "log1:1000": "standing"}), n=2)
+    samples, outcomes, candidates = tables_of(tmp_path / "out")
+    assert samples["expert"].to_pylist() == ["human"] and summary.exit_code == COMPLETE
+    assert [c["reason"] for c in candidates] == ["no_gated_candidate"]  # type: ignore[index]
+    assert sorted((o["kind"], o["reason"]) for o in outcomes) == [  # type: ignore[index]
+        ("exhausted", ""),
+        ("exhausted", ""),
+        ("rejected", "ego_standing"),
+    ]
+
+
+def test_broken_input_and_bugs_are_rows_with_a_reason_and_hurt_nobody_else(tmp_path: Path) -> None:
+    work = ToyWork(trouble={"log0:0": "bad", "log1:1000:recovery:0": "bug"})
+    summary = run(tmp_path / "out", work)
+    assert summary.exit_code == COMPLETE_WITH_FAILURES
+    _, outcomes, _ = tables_of(tmp_path / "out")
+    failed = {o["error_kind"]: o["error"] for o in outcomes if o["kind"] == "failed"}  # type: ignore[index]
+    assert "toy.feather: tx_m" in failed["input"] and "ZeroDivisionError: a bug in a stage" in failed["bug"]
+    again = run(tmp_path / "out", work)
+    assert again.exit_code == COMPLETE_WITH_FAILURES and again.executed.attempts == 0
+    mended = run(tmp_path / "out", ToyWork(), retry=True)
+    assert mended.exit_code == COMPLETE
+    run(tmp_path / "never", ToyWork())
+    assert_same_tables(tmp_path / "out", tmp_path / "never")
+
+
+def test_a_system_failure_is_tried_by_the_next_run_and_quarantined_after_three(tmp_path: Path) -> None:
+    work = ToyWork(trouble={"log0:0:recovery:0": "disk"})
+    for tries in (1, 2, 3):
+        assert run(tmp_path / "out", work).exit_code == COMPLETE_WITH_FAILURES
+        (row,) = [o for o in tables_of(tmp_path / "out")[1] if o["kind"] == "failed"]  # type: ignore[index]
+        assert (row["tries"], row["error_kind"]) == (tries, "poison" if tries == 3 else "system")  # type: ignore[index]
+    assert run(tmp_path / "out", work).executed.attempts == 0
+    assert run(tmp_path / "out", retry=True).exit_code == COMPLETE
+    run(tmp_path / "never", ToyWork())
+    assert_same_tables(tmp_path / "out", tmp_path / "never")
+
+
+@pytest.mark.parametrize(
+    ("work", "named"),
+    [
+        (ToyWork(threshold=0.6), "reward.threshold: 0.5 -> 0.6"),
+        (ToyWork(settings={"render.size": [4, 2]}), r"render.size: not set -> \[4, 2\]"),
+        (ToyWork(versions=VERSIONS | {"reward": 2}), "stage version reward: 1 -> 2"),
+        (ToyWork(digests={"recovery": "table-2"}), "inputs of expert recovery: recovery-1 -> table-2"),
+        (ToyWork(prepare_digest="perturb-2"), "what perturb depends on: perturb-1 -> perturb-2"),
+    ],
+)
+def test_a_changed_run_stops_and_names_the_difference(tmp_path: Path, work: ToyWork, named: str) -> None:
+    run(tmp_path / "out", rounds=1, n=1)
+    before = tables_of(tmp_path / "out")
+    summary = run(tmp_path / "out", work, rounds=2, n=1)
+    assert summary.exit_code == BAD_CONFIG
+    assert re.search(named, summary.message)
+    assert tables_of(tmp_path / "out")[1:] == before[1:]
+
+
+def test_keep_goes_on_and_records_both(tmp_path: Path) -> None:
+    run(tmp_path / "out", n=2)
+    changed = ToyWork(threshold=0.1)
+    assert run(tmp_path / "out", changed, n=4, on_change="keep").exit_code == COMPLETE
+    hashes = tables_of(tmp_path / "out")[0]["settings_hash"].unique().to_pylist()
+    assert sorted(hashes) == sorted({ToyWork().identity.settings_hash, changed.identity.settings_hash})
+    assert len(Store(tmp_path / "out").runs()) == 2
+    assert run(tmp_path / "out", changed, n=4).exit_code == COMPLETE
+
+
+def test_keep_never_continues_a_walk_on_another_candidate_list(tmp_path: Path) -> None:
+    run(tmp_path / "out", n=2, rounds=1)
+    kept = tables_of(tmp_path / "out")[0]
+    summary = run(tmp_path / "out", ToyWork(prepare_digest="perturb-2"), n=2, rounds=3, on_change="keep")
+    assert summary.executed.attempts == 0 and "2 clips kept as they are" in summary.notes[0]
+    assert tables_of(tmp_path / "out")[0].equals(kept)
+
+
+def test_redo_replaces_every_row_and_is_the_same_as_a_fresh_run(tmp_path: Path) -> None:
+    run(tmp_path / "out", rounds=3)
+    changed = ToyWork(threshold=0.3, prepare_digest="perturb-2", trouble={"log0:0": "standing"})
+    assert run(tmp_path / "out", changed, rounds=2, on_change="redo").exit_code == COMPLETE
+    run(tmp_path / "fresh", changed, rounds=2)
+    assert_same_tables(tmp_path / "out", tmp_path / "fresh")
+    assert run(tmp_path / "out", changed, rounds=2, on_change="redo").executed.attempts == 0
+
+
+def test_a_redo_that_fails_midway_keeps_the_old_walk(tmp_path: Path) -> None:
+    run(tmp_path / "out", rounds=3, n=1)
+    old = tables_of(tmp_path / "out")[0]
+    changed = ToyWork(threshold=0.3, trouble={"log0:0:recovery:1": "bug"})
+    assert run(tmp_path / "out", changed, rounds=3, n=1, on_change="redo").exit_code == COMPLETE_WITH_FAILURES
+    mine = pc.equal(old["expert"], "recovery")
+    now = tables_of(tmp_path / "out")[0]
+    assert now.filter(pc.equal(now["expert"], "recovery")).equals(old.filter(mine))
+    mended = replace(changed, trouble={})
+    assert run(tmp_path / "out", mended, rounds=3, n=1, on_change="redo", retry=True).exit_code == COMPLETE
+    run(tmp_path / "fresh", mended, rounds=3, n=1)
+    assert_same_tables(tmp_path / "out", tmp_path / "fresh")
+
+
+def test_a_changed_log_under_the_same_clip_id_is_refused_by_name(tmp_path: Path) -> None:
+    run(tmp_path / "out", rounds=1, n=1)
+    for path in (tmp_path / "out/cache/prepared").iterdir():
+        path.unlink()
+    summary = run(tmp_path / "out", ToyWork(content="other"), rounds=3, n=1)
+    assert summary.exit_code == COMPLETE_WITH_FAILURES
+    (row,) = [o for o in tables_of(tmp_path / "out")[1] if o["kind"] == "failed"]  # type: ignore[index]
+    assert "content digest other where the table has content" in row["error"]  # type: ignore[index]
+
+
+def test_zero_inputs_write_nothing(tmp_path: Path) -> None:
+    assert run(tmp_path / "out", n=0).exit_code == BAD_CONFIG
+    assert run(tmp_path / "out", rounds=0).exit_code == BAD_CONFIG
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_stopped_run_goes_on_where_it_was(tmp_path: Path) -> None:
+    timer = threading.Timer(0.6, os.kill, (os.getpid(), signal.SIGTERM))
+    timer.start()
+    summary = run(tmp_path / "out", ToyWork(seconds=0.05))
+    timer.join()
+    assert summary.exit_code == INTERRUPTED
+    assert run(tmp_path / "out").exit_code == COMPLETE
+    run(tmp_path / "never")
+    assert_same_tables(tmp_path / "out", tmp_path / "never")
+
+
+def test_a_run_that_is_overtaken_stops_and_loses_nothing(tmp_path: Path) -> None:
+    overtaken = Store(tmp_path / "out")
+
+    class Overtaking(ToyWork):
+        def warm(self) -> None:
+            pass
+
+        def attempt(self, prepared, candidate, expert):  # type: ignore[no-untyped-def]
+            if expert == "human" and prepared.payload["name"] == "log1:1000":
+                run(tmp_path / "out")  # the same command, started a second time meanwhile
+            return super().attempt(prepared, candidate, expert)
+
+    summary = execute(Overtaking(), refs(4), EXPERTS, 2, overtaken, "local", shard_seconds=0.0, say=lambda line: None)
+    assert summary.exit_code == INTERRUPTED and "another run has taken over" in summary.message
+    run(tmp_path / "never")
+    assert_same_tables(tmp_path / "out", tmp_path / "never")
+
+
+def test_shards_close_by_size_and_commits_are_groups(tmp_path: Path) -> None:
+    run(tmp_path / "out", shard_bytes=1)
+    run(tmp_path / "one")
+    many, one = Store(tmp_path / "out").samples, Store(tmp_path / "one").samples
+    assert len(many.live_files()) > len(one.live_files())
+    assert len(one.live_files()) == 5  # partitions: two rounds of two experts, and human
+    assert (one.version or 0) <= 3  # created, claimed, one group
+    assert_same_tables(tmp_path / "out", tmp_path / "one")
