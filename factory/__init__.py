@@ -8,7 +8,7 @@ from pathlib import Path
 def _claim_sibling(name: str) -> None:
     """Make `import <name>` mean the package installed beside this one.
 
-    `python -m factory.run` puts the working directory first on the path, where a user's own `tasks.py` would shadow ours.
+    `python -m factory.run` puts the working directory first on the path: a user's own `tasks.py` would shadow ours.
     """
     if name in sys.modules:
         return

@@ -31,9 +31,14 @@ def load_sensors(clip: Clip, cameras: Sequence[str] | None, width: int, height: 
 
     Raises BadClip where a file is missing, broken or not of its camera's size, ValueError for an unknown camera.
     """
-    chosen = {camera.name: camera for camera in chosen_cameras(clip.cameras, cameras)}
-    photos = tuple(_photo(file, chosen[file.sensor], width, height) for file in clip.images if file.sensor in chosen)
+    photos = load_photos(clip.images, chosen_cameras(clip.cameras, cameras), width, height)
     return SensorData(photos, tuple(_sweep(file) for file in clip.sweeps))
+
+
+def load_photos(files: Sequence[SensorFile], cameras: Sequence[Camera], width: int, height: int) -> tuple[Photo, ...]:
+    """The files that `cameras` took, without distortion, resized to width x height. Raises BadClip."""
+    took = {camera.name: camera for camera in cameras}
+    return tuple(_photo(file, took[file.sensor], width, height) for file in files if file.sensor in took)
 
 
 def chosen_cameras(rig: Sequence[Camera], names: Sequence[str] | None) -> tuple[Camera, ...]:

@@ -169,8 +169,7 @@ def perturb(
     rank[walk_order] = np.arange(len(walk_order))
     usable = np.flatnonzero(reached & black)
     kept = first_good_per_cell(cells, usable[np.argsort(rank[gated[usable]])], passes_replay)
-    counts["scored"] = int(np.isfinite(scores).sum())
-    counts["kept_by_replay"] = len(kept)
+    counts["replay_score"] = int((scores < settings.epdms_min).sum())
 
     fate = np.where(~reached, "reached_gate", np.where(~black, "white_cell", "not_needed")).astype(object)
     fate[np.isfinite(scores)] = "score"
@@ -193,7 +192,7 @@ def perturb(
         candidates.append(
             Candidate(index, ends[member], cell, float(scores[member]), float(reactive.pdm_score[1]), reactive, rollout)
         )
-    counts["kept"] = len(candidates)
+    counts["reactive_score"] = len(kept) - len(candidates)
     if not candidates:
         return Rejected("perturb", "no_good_candidate", ", ".join(f"{k} {v}" for k, v in counts.items()))
     return Perturbation(tuple(candidates), counts, Considered(gated, ends, tuple(fate), scores))

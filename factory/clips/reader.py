@@ -56,7 +56,10 @@ class ClipIndex:
 class ClipReader(Protocol):
     """Reads one data set. Readers from a user's own package satisfy it too."""
 
-    name: str
+    @property
+    def name(self) -> str:
+        """Of the data set; part of every clip id."""
+        ...
 
     def index(self) -> ClipIndex:
         """All windows under the root, in a stable order. Raises ValueError where the root is not this data set."""

@@ -20,7 +20,10 @@ class Plan:
 class Expert(Protocol):
     """Plans H seconds from a scene. Pure: the same scene and rng give the same plan."""
 
-    name: str
+    @property
+    def name(self) -> str:
+        """As in `experts=[...]`."""
+        ...
 
     def digest(self) -> str:
         """Identifies the expert's inputs and settings (tables, constants); part of the attempt id."""

@@ -1,0 +1,164 @@
+"""The render stage: a sample's images, from the block's scene, the log's own photos, or drawn from the map.
+
+A clip whose block can be rendered is; one without cameras or lidar is written with image_source=none and no images.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factory.assets import asset_for
+from factory.sensors import chosen_cameras, encode_jpeg, load_photos
+from tasks.attempt import Judged
+from tasks.perturb import Candidate
+from tasks.render.map_drawing import draw_map_views
+from tasks.render.rigs import RIGS
+from tasks.render.scene import RenderAsset
+from tasks.render.settings import STEPS_OF, ImageSource, RenderMode, RenderSettings
+from tasks.render.views import pose_on_ground, render_views
+from tasks.stages import Rejected
+from tasks.world.agents import AgentTracks
+from tasks.world.camera import Camera
+from tasks.world.clip import NOW, STEP_S, Clip
+
+NO_IMAGES: dict[str, object] = {"cameras": None, "images": None, "image_source": str(ImageSource.NONE)}
+PHOTO_SLACK_S = 0.06  # a photo belongs to an instant of the 2 Hz grid when it was taken this close to it
+
+
+@dataclass(frozen=True)
+class Imaging:
+    """What a sample's image columns are made from."""
+
+    settings: RenderSettings
+    cache_dir: str
+
+    def block_verdict(self, clip: Clip) -> Rejected | None:
+        """Build the clip's block, once, and say whether it is good enough to be rendered from.
+
+        Raises BadClip for a broken sensor file.
+        """
+        if not self._has_block(clip):
+            return None
+        asset = _block(clip, self.settings, self.cache_dir)
+        if asset.psnr_db < self.settings.psnr_min:
+            return Rejected("render", "psnr", f"block at {asset.psnr_db:.2f} dB, below {self.settings.psnr_min:g}")
+        return None
+
+    def pictures(self, clip: Clip, candidate: Candidate | None, judged: Judged) -> dict[str, object]:
+        """The image columns of a sample.
+
+        A human sample of a clip with photos keeps the photos; everything else is drawn at the simulated poses.
+        """
+        if self.settings.mode is RenderMode.MAP:
+            rig = clip.cameras or RIGS[self.settings.map_rig]
+            return self._drawn(clip, judged, None, chosen_cameras(rig, self.settings.cameras))
+        if not self._has_block(clip):
+            return NO_IMAGES
+        cameras = chosen_cameras(clip.cameras, self.settings.cameras)
+        if candidate is None:
+            return self._photos(clip, judged, cameras)
+        return self._drawn(clip, judged, _block(clip, self.settings, self.cache_dir), cameras)
+
+    def _has_block(self, clip: Clip) -> bool:
+        return self.settings.mode is RenderMode.AUTO and bool(clip.cameras and clip.images and clip.sweeps)
+
+    def _drawn(
+        self, clip: Clip, judged: Judged, asset: RenderAsset | None, cameras: Sequence[Camera]
+    ) -> dict[str, object]:
+        scene, rollout = judged.scene, judged.rollout
+        offsets = STEPS_OF[self.settings.frames]
+        driven = np.concatenate([scene.ego_history, rollout.ego_states[1:]])  # rows -15 .. 40 around now
+        poses = pose_on_ground(clip.world_from_ego, driven[[offset + NOW for offset in offsets]])
+        agents = scene.agents.overwritten(scene.step, rollout.agents)
+        steps = [scene.step + offset for offset in offsets]
+        images = self._draw(clip, asset, cameras, poses, agents, steps)
+        found = [
+            self._image(camera.name, offset * STEP_S, poses[f], images[f, c])
+            for f, offset in enumerate(offsets)
+            for c, camera in enumerate(cameras)
+        ]
+        source = ImageSource.MAP if asset is None else ImageSource.RENDER
+        measured: dict[str, object] = {}
+        if asset is not None:
+            measured = {"asset_digest": asset.digest, "psnr": asset.psnr_db if np.isfinite(asset.psnr_db) else None}
+        return {"cameras": self._rig(cameras), "images": found, "image_source": str(source), **measured}
+
+    def _draw(
+        self,
+        clip: Clip,
+        asset: RenderAsset | None,
+        cameras: Sequence[Camera],
+        poses: NDArray[np.float64],
+        agents: AgentTracks,
+        steps: Sequence[int],
+    ) -> NDArray[np.uint8]:
+        size = (self.settings.width, self.settings.height)
+        if asset is None:
+            return draw_map_views(clip.road_map, cameras, poses, agents, steps, *size)
+        return render_views(asset, cameras, poses, agents, steps, *size)
+
+    def _photos(self, clip: Clip, judged: Judged, cameras: Sequence[Camera]) -> dict[str, object]:
+        now_s = judged.scene.step * STEP_S
+        wanted = [now_s + offset * STEP_S for offset in STEPS_OF[self.settings.frames]]
+        files = [file for file in clip.images if min(abs(file.time_s - at) for at in wanted) <= PHOTO_SLACK_S]
+        photos = load_photos(files, cameras, self.settings.width, self.settings.height)
+        poses = {(file.sensor, file.time_s): file.world_from_ego for file in files}
+        found = [
+            self._image(photo.camera, photo.time_s - now_s, poses[photo.camera, photo.time_s], photo.rgb)
+            for photo in photos
+        ]
+        return {"cameras": self._rig(cameras), "images": found, "image_source": str(ImageSource.PHOTO)}
+
+    def _image(
+        self, camera: str, time_s: float, pose: NDArray[np.float64], rgb: NDArray[np.uint8]
+    ) -> dict[str, object]:
+        return {
+            "camera": camera,
+            "time_s": float(time_s),
+            "ego_pose": pose.ravel(),
+            "jpeg": encode_jpeg(rgb, self.settings.jpeg_quality),
+        }
+
+    def _rig(self, cameras: Sequence[Camera]) -> list[dict[str, object]]:
+        """The pinholes the images were drawn with: resized, without distortion."""
+        resized = [camera.resized(self.settings.width, self.settings.height) for camera in cameras]
+        return [
+            {
+                "name": camera.name,
+                "width": camera.width,
+                "height": camera.height,
+                "intrinsics": camera.intrinsics.ravel(),
+                "distortion": np.zeros(3),
+                "ego_from_camera": camera.ego_from_camera.ravel(),
+            }
+            for camera in resized
+        ]
+
+
+def _block(clip: Clip, settings: RenderSettings, cache_dir: str) -> RenderAsset:
+    asset = _kept(_Key(clip, settings, cache_dir))
+    assert asset is not None, "asked for a block only where there are photos"
+    return asset
+
+
+class _Key:
+    """Hashes a clip by its id, so that a worker keeps the last blocks it used."""
+
+    def __init__(self, clip: Clip, settings: RenderSettings, cache_dir: str) -> None:
+        self.clip, self.settings, self.cache_dir = clip, settings, cache_dir
+        self._key = (clip.clip_id, clip.content_digest, repr(settings), cache_dir)
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Key) and self._key == other._key
+
+
+@lru_cache(maxsize=2)
+def _kept(key: _Key) -> RenderAsset | None:
+    return asset_for(key.clip, key.settings, Path(key.cache_dir))

@@ -1,0 +1,164 @@
+"""The stages behind the machine: what `factory.work.Work` asks for, done with real clips and the science of tasks/."""
+
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+
+from factory.clips.reader import BadClip, ClipReader, ClipRef
+from factory.imaging import Imaging
+from factory.rows import sample_row
+from factory.work import HUMAN, Accepted, AttemptResult, CandidateRow, Dropped, PreparedClip, RunIdentity
+from tasks.attempt import ExpertGate, Judged, attempt, human_sample, perturbed_scene
+from tasks.chance import stream
+from tasks.experts.pdm_closed import PdmSettings
+from tasks.experts.protocol import Expert
+from tasks.perturb import Candidate, Perturbation, PerturbSettings, end_speed_mps, perturb
+from tasks.render.settings import RenderSettings
+from tasks.reward.epdms import Scores
+from tasks.rollout.simulate import TrafficSettings
+from tasks.stages import SUBSCORES, Rejected
+from tasks.vocabulary import Vocabulary
+from tasks.world.clip import Clip, scene_of_clip
+
+
+@dataclass(frozen=True)
+class PerturbedClip:
+    """The payload of a prepared clip."""
+
+    clip: Clip
+    candidates: tuple[Candidate, ...]
+
+
+@dataclass(frozen=True)
+class Trace:
+    """One attempt with everything it went through, for pictures and explanations."""
+
+    candidate: Candidate | None
+    judged: Judged | None  # None where the expert had no plan
+    rejected: Rejected | None  # None: the reward accepts it
+
+
+class Stopwatch:
+    """Seconds by stage."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def of(self, stage: str) -> Iterator[None]:
+        """Adds the time spent inside to the stage."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
+
+
+@dataclass(frozen=True)
+class FactoryWork:
+    """Reader, settings and tables of one run; pure given its arguments."""
+
+    reader: ClipReader
+    broken: Mapping[ClipRef, str]
+    vocabulary: Vocabulary
+    experts: Mapping[str, Expert]
+    perturb: PerturbSettings
+    traffic: TrafficSettings
+    pdm: PdmSettings
+    gate: ExpertGate
+    render: RenderSettings
+    seed: int
+    identity: RunIdentity
+    cache_dir: str  # of reconstructed blocks
+
+    def warm(self) -> None:
+        """Compile every kernel into the on-disk cache."""
+        from factory.warm import compile_kernels
+
+        compile_kernels()
+
+    def expert_digest(self, expert: str) -> str:
+        """Of the expert's inputs and settings."""
+        return self.experts[expert].digest()
+
+    def prepare(self, ref: ClipRef) -> PreparedClip | Rejected:
+        """Read the clip, check that its block can be rendered, list its candidates."""
+        if ref in self.broken:
+            raise BadClip(ref.log_id, "log", self.broken[ref])
+        watch = Stopwatch()
+        with watch.of("clip"):
+            clip = self.reader.read(ref)
+        with watch.of("render"):
+            blocked = self.imaging.block_verdict(clip)
+        if blocked is not None:
+            return blocked
+        with watch.of("perturb"):
+            found = perturb(
+                clip, self.vocabulary, self.perturb, self.traffic, self.pdm, stream(self.seed, clip.clip_id, "perturb")
+            )
+        listed = found if isinstance(found, Perturbation) else None
+        candidates = listed.candidates if listed else ()
+        return PreparedClip(
+            clip_id=clip.clip_id,
+            content_digest=clip.content_digest,
+            candidates=tuple(_candidate_row(index, candidate) for index, candidate in enumerate(candidates)),
+            gate_counts=listed.gate_counts if listed else {},
+            payload=PerturbedClip(clip, candidates),
+            dropped=found if isinstance(found, Rejected) else None,
+            seconds=watch.seconds,
+        )
+
+    def attempt(self, prepared: PreparedClip, candidate: int, expert: str) -> AttemptResult:
+        """Rollout, expert, rollout, reward and render of one candidate; candidate -1 is the human drive."""
+        watch = Stopwatch()
+        payload = prepared.payload
+        assert isinstance(payload, PerturbedClip)
+        with watch.of("reward"):
+            trace = self.trace(payload, candidate, expert)
+        if trace.judged is None or trace.rejected is not None:
+            assert trace.rejected is not None
+            return Dropped(trace.rejected, _subscores(trace.judged.scores) if trace.judged else {}, watch.seconds)
+        with watch.of("render"):
+            pictures = self.imaging.pictures(payload.clip, trace.candidate, trace.judged)
+        return Accepted(sample_row(payload.clip, trace.candidate, trace.judged) | pictures, watch.seconds)
+
+    def trace(self, payload: PerturbedClip, candidate: int, expert: str) -> Trace:
+        """The same attempt up to the reward's verdict, nothing left out."""
+        clip, driver = payload.clip, self.experts[expert]
+        rng = stream(self.seed, clip.clip_id, f"expert.{expert}", candidate)
+        if expert == HUMAN:
+            return Trace(None, human_sample(scene_of_clip(clip), driver, self.pdm, rng), None)
+        chosen = payload.candidates[candidate]
+        scene = perturbed_scene(clip, chosen.rollout)
+        result = attempt(scene, driver, self.gate, self.traffic, self.pdm, rng)
+        if isinstance(result, Rejected):
+            return Trace(chosen, None, result)
+        return Trace(chosen, *result)
+
+    @property
+    def imaging(self) -> Imaging:
+        """The render stage with this run's settings."""
+        return Imaging(self.render, self.cache_dir)
+
+
+def _candidate_row(index: int, candidate: Candidate) -> CandidateRow:
+    x, y, heading = (float(value) for value in candidate.end_pose)
+    return CandidateRow(
+        index=index,
+        vocabulary_index=candidate.vocabulary_index,
+        end_x=x,
+        end_y=y,
+        end_heading=heading,
+        end_speed=end_speed_mps(candidate),
+        cell=candidate.cell,
+        score=candidate.score,
+        reactive_score=candidate.reactive_score,
+    )
+
+
+def _subscores(scores: Scores) -> dict[str, float]:
+    named = {name: float(getattr(scores, name)[1]) for name in SUBSCORES if name != "ec"}
+    return named | {"score": float(scores.pdm_score[1])} if np.isfinite(scores.pdm_score[1]) else named

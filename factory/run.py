@@ -1,0 +1,102 @@
+"""`python -m factory.run`: real clips in, committed training samples out.
+
+    python -m factory.run rounds=5                                      the synthetic town
+    python -m factory.run clips=av2 clips.root=<logs> vocabulary.file=<human.npy> rounds=5
+    python -m factory.run preset=demo out=runs/demo                     small and quick
+    python -m factory.run ... dry_run=true                              what it would take
+    python -m factory.run ... --cfg                                     the settings, resolved
+
+The same command again goes on where the last one stopped. Exit codes: 0 complete, 2 bad settings or no clip (nothing is
+written), 3 complete with failed attempts, 4 interrupted and resumable.
+"""
+
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from factory.config import ConfigError, compose, conf_dir
+
+BAD_CONFIG = 2
+
+
+def main(argv: Sequence[str]) -> int:
+    """The command; returns the exit code."""
+    if {"-h", "--help"} & set(argv):
+        print(help_text())
+        return 0
+    try:
+        if "--cfg" in argv:
+            print(settings_text([argument for argument in argv if argument != "--cfg"]))
+            return 0
+        return run(argv)
+    except ConfigError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return BAD_CONFIG
+
+
+def help_text() -> str:
+    """Usage, the keys of conf/run.yaml with their comments, and the choices of every group. Imports nothing heavy."""
+    folder = conf_dir()
+    groups = sorted(path for path in folder.iterdir() if path.is_dir())
+    choices = "\n".join(
+        f"  {group.name}: {', '.join(sorted(p.stem for p in group.glob('*.yaml')))}" for group in groups
+    )
+    keys = (folder / "run.yaml").read_text().split("_self_", 1)[1].split("\n\n", 1)[1]
+    return f"{__doc__}\nchoices\n{choices}\n\nkeys and defaults\n{keys}"
+
+
+def settings_text(overrides: Sequence[str]) -> str:
+    """The composed settings as YAML."""
+    from omegaconf import OmegaConf
+
+    return OmegaConf.to_yaml(OmegaConf.create(compose("run", overrides)))
+
+
+def run(overrides: Sequence[str]) -> int:
+    """Plan, execute, commit, report."""
+    from factory.calibrate import calibrate, plan_text
+    from factory.execute import execute
+    from factory.report import write_report
+    from factory.settings import assemble, load_config
+    from factory.store.location import BadLocation, Location
+    from factory.store.samples import Store
+
+    config = load_config(overrides)
+    if os.environ.get("RAY_JOB_CONFIG_JSON_ENV_VAR") and "://" not in config.out and not Path(config.out).is_absolute():
+        raise ConfigError(
+            f"out={config.out}: inside a submitted job the working directory is a copy that is thrown away; "
+            "give an absolute path or a URL that every node sees"
+        )
+    assembled = assemble(config)
+    refs = [*assembled.index.refs, *assembled.index.broken][: config.limit]
+    print(plan_text(assembled, refs), flush=True)
+    if config.dry_run:
+        print(calibrate(assembled, refs))
+        return 0
+    try:
+        store = Store(Location.parse(config.out))
+    except BadLocation as error:
+        raise ConfigError(str(error)) from error
+    summary = execute(
+        assembled.work,
+        refs,
+        config.experts,
+        config.rounds,
+        store,
+        config.executor,
+        config.workers,
+        on_change=config.on_change,
+        retry=config.retry_failed,
+    )
+    if summary.message:
+        print(summary.message, file=sys.stderr)
+    if summary.exit_code == BAD_CONFIG or summary.funnel is None:
+        return summary.exit_code
+    print(summary.funnel.text())
+    print(write_report(store, assembled))
+    return summary.exit_code
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,204 @@
+"""The settings of a run, typed, and the run they make: reader, vocabulary, experts, work."""
+
+import dataclasses
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from factory.clips.reader import ClipIndex, ClipReader
+from factory.config import ConfigError, build, compose, fill
+from factory.pipeline import FactoryWork
+from factory.vocabulary import (
+    build_recovery_table,
+    load_recovery_table,
+    load_vocabulary,
+    save_recovery_table,
+    train_windows,
+)
+from factory.work import RunIdentity, canonical_json
+from tasks.attempt import ExpertGate
+from tasks.experts.human import Human
+from tasks.experts.pdm_closed import PdmClosed, PdmSettings
+from tasks.experts.protocol import Expert
+from tasks.experts.recovery import Recovery, RecoverySettings, RecoveryTable
+from tasks.kinematic_vocabulary import kinematic_trajectories
+from tasks.perturb import PerturbSettings
+from tasks.render.settings import RenderSettings
+from tasks.rollout.simulate import TrafficSettings
+from tasks.stages import stage_versions
+from tasks.vocabulary import Vocabulary
+
+KINEMATIC_K = 1024
+
+
+@dataclass(frozen=True)
+class VocabularyChoice:
+    """Which trajectories perturb the ego."""
+
+    file: str | None = None
+    k: int | None = None
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Everything on the command line of `python -m factory.run`; conf/run.yaml says what each key means."""
+
+    clips: dict[str, Any]
+    perturb: PerturbSettings
+    traffic: TrafficSettings
+    pdm: PdmSettings
+    expert: dict[str, dict[str, Any]]
+    reward: ExpertGate
+    render: RenderSettings
+    vocabulary: VocabularyChoice
+    rounds: int
+    experts: tuple[str, ...]
+    executor: Literal["ray", "local"]
+    workers: int | None
+    limit: int | None
+    seed: int
+    out: str
+    on_change: Literal["stop", "keep", "redo"]
+    retry_failed: bool
+    dry_run: bool
+
+    def __post_init__(self) -> None:
+        if self.rounds < 1:
+            raise ValueError(f"rounds={self.rounds}: at least one round is needed")
+        if not self.experts or len(set(self.experts)) != len(self.experts):
+            raise ValueError(f"experts={list(self.experts)}: name each expert once, at least one")
+        for name in ("limit", "workers"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"{name}={value}: must be positive, or null for no bound")
+        unknown = [name for name in self.experts if name not in self.expert]
+        if unknown:
+            raise ValueError(f"experts: {unknown} is not among {sorted(self.expert)}; add your own with +expert.<name>")
+
+
+@dataclass(frozen=True)
+class Run:
+    """A configured run: what to read and what to do with it."""
+
+    config: RunConfig
+    reader: ClipReader
+    index: ClipIndex
+    work: FactoryWork
+
+
+def load_config(overrides: Sequence[str], name: str = "run") -> RunConfig:
+    """The typed settings of a command line. Raises ConfigError."""
+    return fill(RunConfig, compose(name, overrides), name)
+
+
+def open_reader(clips: Mapping[str, Any]) -> tuple[ClipReader, ClipIndex]:
+    """The reader of the chosen clips, and what its root holds. Raises ConfigError where that is nothing."""
+    reader: ClipReader = build(clips, "clips")
+    try:
+        index = reader.index()
+    except ValueError as error:
+        raise ConfigError(f"clips: {error}") from error
+    if not index.refs and not index.broken:
+        reasons = [f"{reason} x{count}" for reason, count in index.dropped.items()]
+        reasons += [f"{log}: {reason}" for log, reason in index.skipped_logs.items()]
+        raise ConfigError(
+            f"clips: no clip found under {clips.get('root', 'its root')} ({'; '.join(reasons) or 'empty'})"
+        )
+    return reader, index
+
+
+def assemble(config: RunConfig) -> Run:
+    """Open the reader, load the vocabulary, prepare the experts. Raises ConfigError with what to mend."""
+    reader, index = open_reader(config.clips)
+    try:
+        vocabulary = choose_vocabulary(config.vocabulary)
+        experts = {name: build_expert(name, config, reader, index, vocabulary) for name in config.experts}
+    except ValueError as error:
+        raise error if isinstance(error, ConfigError) else ConfigError(str(error)) from error
+    work = FactoryWork(
+        reader=reader,
+        broken=index.broken,
+        vocabulary=vocabulary,
+        experts=experts,
+        perturb=config.perturb,
+        traffic=config.traffic,
+        pdm=config.pdm,
+        gate=config.reward,
+        render=config.render,
+        seed=config.seed,
+        identity=identity_of(config, vocabulary),
+        cache_dir=cache_folder(config),
+    )
+    return Run(config, reader, index, work)
+
+
+def choose_vocabulary(choice: VocabularyChoice) -> Vocabulary:
+    """The file's trajectories, or the kinematic vocabulary where no file is named."""
+    if choice.file is not None:
+        return load_vocabulary(choice.file, choice.k)
+    return Vocabulary(kinematic_trajectories(choice.k or KINEMATIC_K, seed=0), source="kinematic")
+
+
+def build_expert(name: str, config: RunConfig, reader: ClipReader, index: ClipIndex, vocabulary: Vocabulary) -> Expert:
+    """One of the built-in kinds, or a user's `_target_`."""
+    spec = dict(config.expert[name])
+    match spec.pop("kind", None):
+        case "human":
+            return Human()
+        case "pdm_closed":
+            return PdmClosed(config.pdm)
+        case "recovery":
+            sources = {key: spec.pop(key) for key in ("table", "vocabularies")}
+            settings = fill(RecoverySettings, spec, f"expert.{name}")
+            return Recovery(recovery_table(config, reader, index, **sources), settings)
+        case None:
+            expert: Expert = build(spec, f"expert.{name}")
+            return expert
+        case other:
+            raise ConfigError(f"expert.{name}.kind={other} is none of human, pdm_closed, recovery; or give _target_")
+
+
+def recovery_table(
+    config: RunConfig, reader: ClipReader, index: ClipIndex, table: str | None, vocabularies: Sequence[str]
+) -> RecoveryTable:
+    """The named table, else one of all TRAIN windows and the vocabulary files, kept in the run's cache."""
+    if table is not None:
+        return load_recovery_table(table)
+    files = [*vocabularies, *([config.vocabulary.file] if config.vocabulary.file else [])]
+    loaded = [load_vocabulary(file) for file in dict.fromkeys(files)]
+    train = sorted(ref.clip_id for ref in index.refs)
+    key = hashlib.sha256(canonical_json([train, [v.digest for v in loaded]]).encode()).hexdigest()[:16]
+    cached = Path(cache_folder(config)) / f"recovery-{key}.npz"
+    if cached.is_file():
+        return load_recovery_table(cached)
+    built = build_recovery_table([train_windows(reader)], loaded)
+    save_recovery_table(cached, built, {"clips": len(train), "vocabularies": files})
+    return built
+
+
+def identity_of(config: RunConfig, vocabulary: Vocabulary) -> RunIdentity:
+    """What the rows depend on besides clip, candidate and expert. Where data lies and who works on it is not in it."""
+    science: dict[str, Any] = {
+        "perturb": config.perturb,
+        "traffic": config.traffic,
+        "pdm": config.pdm,
+        "reward": config.reward,
+        "render": config.render,
+    }
+    settings: dict[str, object] = {"seed": config.seed, "vocabulary": vocabulary.digest}
+    for group, value in science.items():
+        settings |= {f"{group}.{key}": plain for key, plain in dataclasses.asdict(value).items()}
+    versions = stage_versions()
+    early = [settings[key] for key in sorted(settings) if not key.startswith(("reward.", "render."))]
+    gate = config.render.psnr_min
+    prepared = canonical_json([early, gate, versions["clip"], versions["perturb"], versions["rollout"]])
+    return RunIdentity(settings, versions, vocabulary.digest, hashlib.sha256(prepared.encode()).hexdigest()[:16])
+
+
+def cache_folder(config: RunConfig) -> str:
+    """Where blocks and tables are kept: beside the run's tables when `out` is a folder, else in the user's cache."""
+    if "://" in config.out:
+        return str(Path.home() / ".cache" / "driving-data-factory" / "assets")
+    return str(Path(config.out).absolute() / "cache")

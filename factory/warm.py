@@ -1,0 +1,63 @@
+"""Compiles every kernel once, into the on-disk cache, before workers start."""
+
+import numpy as np
+
+from tasks.render.gaussians import Gaussians
+from tasks.render.raster import rasterize
+from tasks.rollout.simulate import TrafficSettings, simulate
+from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.clip import CLIP_STEPS, NOW, Clip, scene_of_clip
+from tasks.world.lanes import Lane, RoadMap, Route
+
+
+def compile_kernels() -> None:
+    """Runs the traffic and the rasteriser on the smallest scene that reaches all of their kernels."""
+    scene = scene_of_clip(tiny_clip())
+    ahead = np.stack([np.arange(1, 41) * 0.5, np.zeros(40), np.zeros(40)], axis=1)
+    simulate(scene, ahead, TrafficSettings())
+    one = Gaussians(
+        means=np.array([[0.0, 0.0, 5.0]], np.float32),
+        quats=np.array([[1.0, 0.0, 0.0, 0.0]], np.float32),
+        log_scales=np.full((1, 3), -1.0, np.float32),
+        opacities=np.array([0.9], np.float32),
+        colours=np.full((1, 3), 0.5, np.float32),
+    )
+    intrinsics = np.array([[16.0, 0.0, 8.0], [0.0, 16.0, 8.0], [0.0, 0.0, 1.0]])
+    rasterize(one, intrinsics, np.eye(4), 16, 16, np.zeros((16, 16, 3), np.float32))
+
+
+def tiny_clip() -> Clip:
+    """A straight road with the ego and one car ahead, both at 5 m/s."""
+    steps = np.arange(CLIP_STEPS)
+    way = np.arange(-50.0, 151.0, 1.0)
+    centre = np.stack([way, np.zeros_like(way), np.zeros_like(way)], axis=1)
+    ring = np.array([[-50.0, -2.0], [150.0, -2.0], [150.0, 2.0], [-50.0, 2.0], [-50.0, -2.0]])
+    lane = Lane("lane", ring, centre, is_intersection=False, drives_cars=True)
+    ego = np.zeros((CLIP_STEPS, 11))
+    ego[:, 0], ego[:, 3] = (steps - NOW) * 0.5, 5.0
+    pose = np.tile(np.eye(4), (CLIP_STEPS, 1, 1))
+    pose[:, 0, 3] = ego[:, 0]
+    boxes = np.zeros((CLIP_STEPS, 1, 5))
+    boxes[:, 0] = np.stack([ego[:, 0] + 20.0, *np.zeros((2, CLIP_STEPS)), *np.full((2, CLIP_STEPS), [[4.5], [2.0]])], 1)
+    car = AgentTracks(
+        track_ids=("car",),
+        kinds=(AgentKind.VEHICLE,),
+        boxes=boxes,
+        velocities=np.tile([5.0, 0.0], (CLIP_STEPS, 1, 1)),
+        valid=np.ones((CLIP_STEPS, 1), bool),
+        center_z=np.full((CLIP_STEPS, 1), 0.75),
+        heights=np.array([1.5]),
+    )
+    return Clip(
+        clip_id="warm",
+        dataset="warm",
+        log_id="warm",
+        split="train",
+        start_s=0.0,
+        ego_states=ego,
+        world_from_ego=pose,
+        agents=car,
+        road_map=RoadMap({"lane": lane}, (), (), {"lane": "rb_lane"}),
+        route=Route(("lane",), ("rb_lane",), frozenset({"lane"})),
+        centerline=centre,
+    )
