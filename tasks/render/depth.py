@@ -44,7 +44,10 @@ def dense_depth(
 
     `rgb` (H, W, 3) in [0, 1]. Where nothing is near enough the depth stays 0 and the label -2.
     """
-    filled, labels = _fill(depth, label, np.ascontiguousarray(rgb, np.float32), max_gap_px[0], max_gap_px[1])
+    colours = np.ascontiguousarray(rgb, np.float32)
+    filled, labels = depth, label
+    for _ in range(2):  # the first pass fills rows and columns that hold returns, the second what lies between them
+        filled, labels = _fill(filled, labels, colours, max_gap_px[0], max_gap_px[1])
     return _smooth(filled, labels), labels
 
 

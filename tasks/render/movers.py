@@ -12,6 +12,8 @@ from tasks.world.clip import STEP_S
 from tasks.world.frames import wrap_angle
 
 MARGIN_M = 0.15  # boxes are drawn tightly; mirrors and noise stick out
+BEYOND_M = 0.25  # around a driving box nothing is trusted to be the street
+DRIVING_M = 1.0
 GROUND_CLEARANCE_M = 0.12  # the road under a car stays behind when it leaves
 
 
@@ -41,6 +43,48 @@ def world_from_boxes(boxes: F64) -> F64:
     poses[:, 0, 0], poses[:, 0, 1], poses[:, 1, 0], poses[:, 1, 1] = c, -s, s, c
     poses[:, :3, 3] = boxes[:, :3]
     return poses
+
+
+def driving(agents: AgentTracks) -> NDArray[np.bool_]:
+    """(N,) tracks that leave their place at some time; the others may be taken for part of the street."""
+    first = np.argmax(agents.valid, axis=0)
+    start = agents.boxes[first, np.arange(len(agents)), :2]
+    away = np.linalg.norm(agents.boxes[..., :2] - start, axis=-1)
+    return np.asarray((np.where(agents.valid, away, 0.0) > DRIVING_M).any(axis=0))
+
+
+@kernel
+def behind_boxes(points: Any, eye: Any, boxes: Any, moving: Any) -> Any:
+    """Whether the sight line from `eye` (3,) to a point (M, 3), and a little further, meets a moving box (M,).
+
+    Such a pixel shows the mover, its shadow or its edge: nothing that stays.
+    """
+    out = np.zeros(points.shape[0], np.bool_)
+    cosines, sines = np.cos(boxes[:, 3]), np.sin(boxes[:, 3])
+    for i in range(points.shape[0]):
+        for j in range(boxes.shape[0]):
+            if not moving[j] or out[i]:
+                continue
+            ex, ey, ez = eye[0] - boxes[j, 0], eye[1] - boxes[j, 1], eye[2] - boxes[j, 2]
+            dx, dy, dz = points[i, 0] - eye[0], points[i, 1] - eye[1], points[i, 2] - eye[2]
+            enter, leave = 0.0, 1.0 + BEYOND_M / max(np.sqrt(dx * dx + dy * dy + dz * dz), 1e-3)
+            for axis in range(3):
+                if axis == 0:
+                    start, step, half = cosines[j] * ex + sines[j] * ey, cosines[j] * dx + sines[j] * dy, boxes[j, 4]
+                elif axis == 1:
+                    start, step, half = cosines[j] * ey - sines[j] * ex, cosines[j] * dy - sines[j] * dx, boxes[j, 5]
+                else:
+                    start, step, half = ez, dz, boxes[j, 6]
+                half = 0.5 * half + BEYOND_M
+                if abs(step) < 1e-9:
+                    if abs(start) > half:
+                        leave = -1.0
+                    continue
+                a, b = (-half - start) / step, (half - start) / step
+                enter, leave = max(enter, min(a, b)), min(leave, max(a, b))
+            if enter <= leave:
+                out[i] = True
+    return out
 
 
 @kernel

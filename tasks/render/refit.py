@@ -5,9 +5,10 @@ weights it was blended with and divided by their sum (Andersen and Kak 1984), ph
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tasks.render.gaussians import F32, F64, Gaussians
 from tasks.render.raster import gather, shade, splat
@@ -16,27 +17,41 @@ RELAXATION = 0.6
 PRIOR_WEIGHT = 0.3  # weight (in pixels) that keeps barely visible Gaussians near their colour
 
 
+@dataclass(frozen=True)
+class FitPhoto:
+    """A photo to be reproduced."""
+
+    rgb: F32  # (H, W, 3) in [0, 1]
+    intrinsics: F64  # (3, 3)
+    scene_from_camera: F64  # (4, 4)
+    backdrop: F32  # (H, W, 3)
+    passing: NDArray[np.bool_]  # (H, W) pixels that say nothing about the background
+
+
 def refit_colours(
     scene_of: Callable[[int], Gaussians],
-    photos: Sequence[tuple[F32, F64, F64, F32]],
+    photos: Sequence[FitPhoto],
     colours: F32,
-    rows_of: Callable[[int], np.ndarray],
+    rows_of: Callable[[int], NDArray[np.intp]],
+    n_background: int,
     sweeps: int,
 ) -> F32:
     """Colours (G, 3) after `sweeps` passes.
 
-    `photos`: (rgb (H, W, 3) in [0, 1], intrinsics, scene_from_camera, background (H, W, 3)); `scene_of(i)` the
-    Gaussians of photo i, `rows_of(i)` the row in `colours` of each of them.
+    `scene_of(i)` the Gaussians of photo i, `rows_of(i)` the row in `colours` of each of them; the first `n_background`
+    rows are the background's, which must not learn the colour of a car that drives by.
     """
     colours = colours.copy()
     for _ in range(sweeps):
-        for i, (rgb, intrinsics, scene_from_camera, background) in enumerate(photos):
-            height, width = rgb.shape[:2]
+        for i, photo in enumerate(photos):
+            height, width = photo.rgb.shape[:2]
             rows, scene = rows_of(i), scene_of(i)
-            splats = splat(scene, intrinsics, scene_from_camera, width, height)
-            now = replace(scene, colours=colours[rows])
-            view = shade(splats, now.colours, background)
-            sums, weights = gather(splats, rgb - view.rgb, len(scene))
+            splats = splat(scene, photo.intrinsics, photo.scene_from_camera, width, height)
+            residual = photo.rgb - shade(splats, colours[rows], photo.backdrop).rgb
+            sums, weights = gather(splats, residual, len(scene))
+            if photo.passing.any():
+                street_only = np.where(photo.passing[..., None], np.float32(0.0), residual)
+                sums[rows < n_background] = gather(splats, street_only, len(scene))[0][rows < n_background]
             step = RELAXATION * sums / (weights + PRIOR_WEIGHT)[:, None]
             colours[rows] = np.clip(colours[rows] + step, 0.0, 1.0)
     return colours

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from tasks.render.boxes import box_gaussians
 from tasks.render.depth import dense_depth, sparse_depth
 from tasks.render.gaussians import EMPTY, F32, F64, Gaussians, concatenate, moved
-from tasks.render.movers import GROUND_CLEARANCE_M, boxes_at, owners, world_from_boxes
+from tasks.render.movers import GROUND_CLEARANCE_M, behind_boxes, boxes_at, driving, owners, world_from_boxes
 from tasks.render.raster import rasterize
-from tasks.render.refit import refit_colours
+from tasks.render.refit import FitPhoto, refit_colours
 from tasks.render.sky import SkyCollector, SkyMap, directions
 from tasks.render.stereo import FAR_M, MAX_BASELINE_M, MIN_BASELINE_M, sweep_depth
 from tasks.render.surfels import Discs, concatenate_discs, count_free_space, discs_of_photo, gaussians_of, thin
@@ -136,7 +136,7 @@ def build_asset(
     background, nodes = _discs(train, seen, tracks, settings)
     sky = _sky(train, seen)
     asset = RenderAsset(origin, background, nodes, sky, float("nan"))
-    asset = _refit(asset, train, tracks, settings.refit_sweeps)
+    asset = _refit(asset, train, seen, tracks, settings.refit_sweeps)
     if not held_out:
         return asset
     scores = [
@@ -165,6 +165,7 @@ class _Tracks:
         self._agents, self._origin = agents, origin
         self.ids = agents.track_ids if agents is not None else ()
         self.kinds = agents.kinds if agents is not None else ()
+        self.driving = driving(agents) if agents is not None else np.zeros(0, bool)
         self._movable = np.array([kind in MOVING_KINDS for kind in self.kinds], bool)
 
     def at(self, time_s: float) -> tuple[F64, NDArray[np.bool_]]:
@@ -210,11 +211,12 @@ def _voxels(points: F64) -> F64:
 
 @dataclass(frozen=True)
 class _Seen:
-    """What a photo shows: depth [m] (0: nothing known), label (-1 background, track row, SHALLOW), sky."""
+    """What a photo shows, (H, W) each."""
 
-    depth: F32
-    label: NDArray[np.int32]
+    depth: F32  # [m]; 0: nothing known
+    label: NDArray[np.int32]  # -1 background, row of a track, SHALLOW
     sky: NDArray[np.bool_]
+    passing: NDArray[np.bool_]  # pixels at or behind something that drives: no witnesses of the street
 
 
 def _see(
@@ -248,7 +250,13 @@ def _see(
     else:
         guess, sky = hints[0], unknown & (bright | (hints[0] == 0.0))
     depth = np.where(unknown & ~sky, guess, depth).astype(np.float32)
-    return _Seen(depth, label, sky)
+    seen_to = (
+        directions(photo.intrinsics, photo.world_from_camera, width, height)
+        * np.where(depth > 0, depth, FAR_M)[..., None]
+    )
+    eye = photo.world_from_camera[:3, 3]
+    passing = behind_boxes(seen_to.reshape(-1, 3) + eye, eye, boxes, valid & tracks.driving).reshape(height, width)
+    return _Seen(depth, label, sky, passing)
 
 
 def _looks_like_sky(rgb: F32) -> NDArray[np.bool_]:
@@ -309,8 +317,8 @@ def _discs(
         for j in np.unique(owner[known & (owner >= 0)]):
             mine = discs.take(np.flatnonzero(known & (owner == j)))
             nodes.setdefault(int(j), []).append(mine.moved(np.linalg.inv(poses[j])))
-        stays = discs.take(np.flatnonzero(known & (owner < 0) & (label < 0)))
-        background.append(_carved(stays, photos, carvers))
+        rows = np.flatnonzero(known & (owner < 0) & (label < 0) & ~sight.passing.reshape(-1))
+        background.append(_carved(discs.take(rows), label[rows] == SHALLOW, photos, carvers))
         if sum(len(b.points) for b in background) > CHUNK_DISCS:
             background = [_thinned(background, settings.fineness)]
     whole = _thinned(background, settings.fineness)
@@ -329,13 +337,13 @@ def _thinned(parts: list[Discs], fineness: float) -> Discs:
     return discs.take(thin(discs, fineness))
 
 
-def _carved(discs: Discs, photos: Sequence[Photo], carvers: Sequence[F32]) -> Discs:
-    """Without the discs that more photos look through than see."""
+def _carved(discs: Discs, guessed: NDArray[np.bool_], photos: Sequence[Photo], carvers: Sequence[F32]) -> Discs:
+    """Without the discs that more photos look through than see; one that lidar saw is lost to two photos at least."""
     in_front, agreeing = np.zeros(len(discs.points), np.int32), np.zeros(len(discs.points), np.int32)
     for photo, depth in zip(photos, carvers):
         camera_from_world = np.ascontiguousarray(np.linalg.inv(photo.world_from_camera))
         count_free_space(discs.points, camera_from_world, photo.intrinsics, depth, in_front, agreeing)
-    return discs.take(np.flatnonzero((in_front < 2) | (in_front <= agreeing)))
+    return discs.take(np.flatnonzero((in_front <= agreeing) | ((in_front < 2) & ~guessed)))
 
 
 def _sky(photos: Sequence[Photo], seen: Sequence[_Seen]) -> SkyMap:
@@ -343,7 +351,7 @@ def _sky(photos: Sequence[Photo], seen: Sequence[_Seen]) -> SkyMap:
     for photo, sight in zip(photos, seen):
         height, width = sight.depth.shape
         rays = directions(photo.intrinsics, photo.world_from_camera, width, height)
-        use = sight.sky | (rays[..., 2] < -0.02)
+        use = (sight.sky | (rays[..., 2] < -0.02)) & ~sight.passing
         collector.add(rays[use], photo.rgb[use].astype(np.float32) / 255.0)
     return collector.finish()
 
@@ -364,7 +372,9 @@ def _picture(asset: RenderAsset, photo: Photo, tracks: _Tracks) -> F32:
     return render_photo(asset, scene, photo.intrinsics, pose, (width, height))
 
 
-def _refit(asset: RenderAsset, photos: Sequence[Photo], tracks: _Tracks, sweeps: int) -> RenderAsset:
+def _refit(
+    asset: RenderAsset, photos: Sequence[Photo], seen: Sequence[_Seen], tracks: _Tracks, sweeps: int
+) -> RenderAsset:
     """The same scene with refitted colours."""
     names = list(asset.nodes)
     parts = [asset.background, *(asset.nodes[name] for name in names)]
@@ -386,10 +396,13 @@ def _refit(asset: RenderAsset, photos: Sequence[Photo], tracks: _Tracks, sweeps:
         return np.concatenate([np.arange(starts[k], starts[k + 1]) for k in spans])
 
     inputs = []
-    for photo in photos:
+    for photo, sight in zip(photos, seen):
         height, width = photo.rgb.shape[:2]
         backdrop = asset.sky.seen_by(photo.intrinsics, photo.world_from_camera, width, height)
-        inputs.append((photo.rgb.astype(np.float32) / 255.0, photo.intrinsics, photo.world_from_camera, backdrop))
-    colours = refit_colours(scene_of, inputs, np.concatenate([p.colours for p in parts]), rows_of, sweeps)
+        rgb = photo.rgb.astype(np.float32) / 255.0
+        inputs.append(FitPhoto(rgb, photo.intrinsics, photo.world_from_camera, backdrop, sight.passing))
+    colours = refit_colours(
+        scene_of, inputs, np.concatenate([p.colours for p in parts]), rows_of, len(asset.background), sweeps
+    )
     fitted = [replace(p, colours=colours[starts[k] : starts[k + 1]]) for k, p in enumerate(parts)]
     return replace(asset, background=fitted[0], nodes=dict(zip(names, fitted[1:])))

@@ -1,0 +1,109 @@
+"""Poses on the road, distortion, frames of a simulated drive, and drawings of the map."""
+
+import numpy as np
+import pytest
+import street
+
+from tasks.render.map_drawing import GROUND, ROAD, SKY, WHITE, clip_near, draw_map_views
+from tasks.render.rigs import RIGS, pinhole
+from tasks.render.scene import RenderAsset, psnr
+from tasks.render.views import pose_on_ground, render_views, undistorted
+from tasks.world.camera import Camera
+from tasks.world.lanes import Lane, MapLayer, MapPolygon, RoadMap
+from tasks.world.vehicle import EGO_STATE_SIZE, HEADING, X, Y
+
+
+def states(x: float, y: float, heading: float) -> np.ndarray:
+    out = np.zeros((1, EGO_STATE_SIZE))
+    out[0, X], out[0, Y], out[0, HEADING] = x, y, heading
+    return out
+
+
+def slope(x: float, grade: float) -> np.ndarray:
+    """A logged pose on a road that climbs along x."""
+    angle = np.arctan(grade)
+    pose = np.eye(4)
+    pose[:3, :3] = [[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]]
+    pose[:3, 3] = x, 0.0, grade * x
+    return pose
+
+
+def test_a_logged_pose_comes_back() -> None:
+    logged = np.stack([slope(x, 0.1) for x in range(10)])
+    np.testing.assert_allclose(pose_on_ground(logged, states(4.0, 0.0, 0.0))[0], logged[4], atol=1e-12)
+
+
+def test_a_perturbed_pose_stands_on_the_plane_of_the_road() -> None:
+    logged = np.stack([slope(x, 0.1) for x in range(10)])
+    pose = pose_on_ground(logged, states(4.3, 1.2, 0.4))[0]
+    assert pose[2, 3] == pytest.approx(0.43)
+    np.testing.assert_allclose(pose[:3, :3].T @ pose[:3, :3], np.eye(3), atol=1e-12)
+    assert np.linalg.det(pose[:3, :3]) == pytest.approx(1.0)
+    assert np.arctan2(pose[1, 0], pose[0, 0]) == pytest.approx(0.4)
+    assert pose[2, 0] / np.hypot(pose[0, 0], pose[1, 0]) == pytest.approx(0.1 * np.cos(0.4))
+
+
+def test_undistorting_undoes_the_radial_model() -> None:
+    camera = Camera(
+        "c", 64, 48, np.array([[60.0, 0, 32], [0, 60.0, 24], [0, 0, 1]]), np.array([-0.2, 0.05, 0.0]), np.eye(4)
+    )
+    v, u = np.meshgrid(np.arange(48) + 0.5, np.arange(64) + 0.5, indexing="ij")
+    x, y = (u - 32) / 60, (v - 24) / 60
+    ideal = np.stack([128 + 200 * x, 128 + 200 * y, 0 * x], -1)  # linear in the ideal ray
+    # What the lens makes of it: at a distorted pixel, the colour of the ideal ray that lands there (by iteration).
+    xi, yi = x.copy(), y.copy()
+    for _ in range(30):
+        r2 = xi**2 + yi**2
+        xi, yi = x / (1 + r2 * (-0.2 + 0.05 * r2)), y / (1 + r2 * (-0.2 + 0.05 * r2))
+    photo = np.rint(np.stack([128 + 200 * xi, 128 + 200 * yi, 0 * xi], -1)).clip(0, 255).astype(np.uint8)
+    flat = undistorted(photo, camera).astype(np.float64)
+    assert np.abs(flat - ideal)[4:-4, 4:-4].max() < 2.0
+    assert undistorted(photo, camera.__class__(**{**camera.__dict__, "distortion": np.zeros(3)})) is photo
+
+
+def test_frames_show_agents_where_the_simulation_put_them(street_asset: RenderAsset) -> None:
+    rig = [Camera("front", street.WIDTH, street.HEIGHT, street.INTRINSICS, np.zeros(3), street.EGO_FROM_CAMERA)]
+    poses = np.stack([street.ego_pose(3.0), street.ego_pose(4.5, 0.5)])
+    images = render_views(street_asset, rig, poses, street.tracks(), [8, 11], street.WIDTH, street.HEIGHT)
+    assert images.shape == (2, 1, street.HEIGHT, street.WIDTH, 3) and images.dtype == np.uint8
+    for image, (x, y, time_s) in zip(images[:, 0], [(3.0, 0.0, 0.8), (4.5, 0.5, 1.1)]):
+        assert psnr(image, street.photo(x, y, time_s).rgb) > 24.0
+
+
+def road() -> RoadMap:
+    edge = np.array([[-50.0, 2.0, 0.0], [100.0, 2.0, 0.0]])
+    ring = np.array([[-50.0, -2], [100, -2], [100, 2], [-50, 2], [-50, -2]])
+    centerline = np.column_stack([np.linspace(-50, 100, 50), np.zeros(50), np.zeros(50)])
+    right = edge * [1, -1, 1]
+    lane = Lane("a", ring, centerline, False, True, left_boundary=edge, right_boundary=right, left_mark="SOLID_WHITE")
+    area = MapPolygon("da_1", MapLayer.DRIVABLE_AREA, ring * [1, 3])
+    return RoadMap({"a": lane}, (area,))
+
+
+def test_the_map_drawing_has_true_perspective() -> None:
+    camera = pinhole("front", 0.0, 90.0, 200, 100)  # focal length 100 px, 1.6 m above the ground, 1.5 m ahead
+    image = draw_map_views(road(), [camera], np.eye(4)[None], street.tracks(), [0], 200, 100)[0, 0]
+    assert tuple(image[10, 100]) == SKY and tuple(image[95, 100]) == ROAD and tuple(image[53, 3]) == GROUND
+    # The paint at y = 2 m is, at depth z, at u = 100 - 100 * 2 / z and v = 50 + 100 * 1.6 / z.
+    row = 90
+    depth = 160.0 / (row + 0.5 - 50.0)
+    columns = np.flatnonzero((image[row] == WHITE).all(axis=-1))
+    assert np.mean(columns) + 0.5 == pytest.approx(100.0 - 200.0 / depth, abs=1.5)
+
+
+def test_the_map_drawing_shows_boxes_and_a_named_rig_has_every_side() -> None:
+    rig = RIGS["ring_six"]
+    assert len({camera.name for camera in rig}) == 6
+    images = draw_map_views(road(), rig, np.eye(4)[None], street.tracks(), [0], 160, 90)
+    assert len({image.tobytes() for image in images[0]}) == 6
+    agents = street.tracks()
+    gone = type(agents)(**{**agents.__dict__, "valid": np.zeros_like(agents.valid)})
+    without = draw_map_views(road(), rig[:1], np.eye(4)[None], gone, [0], 160, 90)
+    assert (images[0, 0] != without[0, 0]).any(axis=-1).mean() > 0.01
+
+
+def test_clipping_keeps_what_is_ahead_of_the_near_plane() -> None:
+    square = np.array([[-1.0, 0, -1.0], [1, 0, -1], [1, 0, 3], [-1, 0, 3]])
+    clipped = clip_near(square)
+    assert clipped[:, 2].min() == pytest.approx(0.3) and len(clipped) == 4
+    assert len(clip_near(square - [0, 0, 10.0])) == 0
