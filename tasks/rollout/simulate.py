@@ -15,8 +15,9 @@ The ego is tracked first, since it follows its plan whatever the traffic does; t
   late along the same log. They do not wait for the ego: its reward must not profit from their care.
 """
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,7 +108,7 @@ def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
         step = start if driven_before else _join_step(index, scene, i, settings.snap_distance_m)
         if step == NEVER:
             continue
-        pose = now.boxes[start, i, :3] if step == start else log.boxes[step, i, :3]
+        pose = (now.boxes[start, i, :3] if step == start else log.boxes[step, i, :3]).copy()
         logged = log.boxes[np.flatnonzero(log.valid[:, i])[::LOG_STRIDE], i, :3]
         found[i] = find_path(index, pose, logged, settings.snap_distance_m, ahead_m)
         if found[i] is None:  # a driven car that left the map
@@ -168,8 +169,8 @@ def roll_out(traffic: TrafficScene, ego_states: Array, vehicle: Vehicle = PACIFI
         start,
         _world(scene.clip.agents),
         _world(window, row=0),
-        traffic.cast,
-        traffic.paths,
+        Cast(*_writable(traffic.cast)),
+        Paths(*_writable(traffic.paths)),
         ego_boxes,
         ego_velocities,
         _driver(traffic.settings),
@@ -209,7 +210,12 @@ def straight_path(pose: Array, ahead_m: float) -> LanePath:
 
 def _world(agents: AgentTracks, row: int | None = None) -> World:
     arrays = (agents.boxes, agents.velocities, agents.valid, agents.center_z)
-    return World(*(np.ascontiguousarray(a if row is None else a[row]) for a in arrays))
+    return World(*_writable(a if row is None else a[row] for a in arrays))
+
+
+def _writable(arrays: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
+    """Arrays as the kernel was compiled for; a shared object store hands out read-only ones."""
+    return (np.require(a, requirements=["C", "W"]) for a in arrays)
 
 
 def _driver(settings: TrafficSettings) -> Driver:

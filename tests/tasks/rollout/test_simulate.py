@@ -294,6 +294,19 @@ def test_a_prepared_scene_gives_the_same_rollout() -> None:
     assert np.array_equal(direct.agents.boxes, again.agents.boxes, equal_nan=True)
 
 
+def test_a_read_only_scene_gives_the_same_rollout() -> None:
+    """As a shared object store hands it out."""
+    expected = run(busy_scene())
+    scene = busy_scene()
+    prepared = prepare_traffic(scene, IDM)
+    assert prepared.cast is not None and prepared.paths is not None
+    agents, ego = scene.agents, scene.clip.ego_states
+    for array in (*prepared.cast, *prepared.paths, agents.boxes, agents.velocities, agents.valid, agents.center_z, ego):
+        array.flags.writeable = False
+    for rollout in (roll_out(prepared, expected.ego_states), run(scene)):
+        assert np.array_equal(rollout.agents.boxes, expected.agents.boxes, equal_nan=True)
+
+
 def test_an_empty_street_rolls_out() -> None:
     rollout = run(worlds.scene(worlds.straight_road()))
     assert rollout.agents.boxes.shape == (41, 0, 5)
