@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from tasks.rollout.idm import PATH_SPACING_M
+from tasks.rollout.corridor import PATH_SPACING_M
 from tasks.world.frames import wrap_angle
 from tasks.world.lanes import Lane, RoadMap
 

@@ -22,17 +22,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.rollout.idm import (
-    CLOSED,
-    CLOSED_IF_STOPPABLE,
-    OPEN,
-    PATH_SPACING_M,
-    Cast,
-    Driver,
-    Paths,
-    World,
-    drive,
-)
+from tasks.rollout.corridor import PATH_SPACING_M, Paths
+from tasks.rollout.idm import CLOSED, CLOSED_IF_STOPPABLE, OPEN, Cast, Driver, World, drive
 from tasks.rollout.lane_following import BEHIND_M, LaneIndex, LanePath, find_path, index_lanes, lane_costs, on_a_lane
 from tasks.rollout.lqr import track
 from tasks.world.agents import MOVING_KINDS, AgentKind, AgentTracks

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from factory.clips.av2 import AV2Reader
-from tasks.rollout.idm import boxes_overlap
+from tasks.rollout.corridor import boxes_overlap
 from tasks.rollout.simulate import TrafficSettings, next_scene, prepare_traffic, roll_out, simulate
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, Rollout, Scene, scene_of_clip

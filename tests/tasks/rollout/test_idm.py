@@ -5,18 +5,8 @@ import pytest
 import shapely
 import shapely.ops
 
-from tasks.rollout.idm import (
-    Driver,
-    Paths,
-    advance,
-    boxes_overlap,
-    corners_of,
-    corridor_gap,
-    idm_acceleration,
-    pose_on_path,
-    project_on_path,
-    stop_line_gap,
-)
+from tasks.rollout.corridor import Paths, boxes_overlap, corners_of, corridor_gap, pose_on_path, project_on_path
+from tasks.rollout.idm import Driver, advance, idm_acceleration, stop_line_gap
 from tasks.world.frames import box_corners
 
 DRIVER = Driver(1.0, 1.5, 1.0, 2.0, 4.0, 8.0, 60.0, 0.0, 20.0, 5.0, 30.0)
@@ -109,7 +99,7 @@ def test_the_corridor_gap_equals_its_slow_twin(radius: float) -> None:
         corners = np.zeros((4, 2))
         corners_of(box, corners)
         gap, _ = corridor_gap(
-            paths, 0, 5.0, 0.0, 0.0, 0.0, 2.3, 0.95, corners, box, np.hypot(*box[3:]) / 2.0, DRIVER
+            paths, 0, 5.0, 0.0, 0.0, 0.0, 2.3, 0.95, corners, box, np.hypot(*box[3:]) / 2.0, 20.0, 60.0
         )  # fmt: skip
         slow = corridor_gap_by_shapely(paths.xy[0], 7.3, 0.95, box)
         if np.isfinite(slow) != np.isfinite(gap):  # only a graze may be judged differently
