@@ -1,0 +1,61 @@
+"""SIGKILL of the driver at five moments, then the same command again: the same tables, and only lost work is redone."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from factory.execute import execute
+from factory.store.samples import Store
+from factory.store.verify import verify
+from tests.chaos.killed_driver import EXPERTS, MOMENTS
+from tests.factory.tables import assert_same_tables
+from tests.factory.toy import ToyWork, ran, refs
+
+ROOT = Path(__file__).parents[2]
+
+
+def drive(out: Path, executor: str, moment: str, journal: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "tests.chaos.killed_driver", str(out), executor, moment, str(journal)]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False, timeout=120)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("undisturbed") / "out"
+    execute(ToyWork(), refs(5), EXPERTS, 2, Store(out), "local", say=lambda line: None)
+    return out
+
+
+def check(tmp_path: Path, undisturbed: Path, executor: str, moment: str) -> None:
+    out, journal = tmp_path / "out", tmp_path / "journal"
+    killed = drive(out, executor, moment, journal)
+    assert killed.returncode == -9, killed.stderr
+    made = ran(str(journal), "attempt")
+    store = Store(out)
+    settled = len(store.samples) + sum(kind == "rejected" for kind in store.outcomes.read()["kind"].to_pylist())
+    again = drive(out, "local", "never", journal)  # either executor resumes the other's run
+    assert again.returncode == 0, again.stderr
+    assert_same_tables(out, undisturbed)
+    assert verify(Store(out)).damage == ()
+    total = len(Store(undisturbed).samples) + sum(
+        kind == "rejected" for kind in Store(undisturbed).outcomes.read()["kind"].to_pylist()
+    )
+    redone = ran(str(journal), "attempt") - made
+    assert redone == total - settled, "a settled attempt was executed again, or a lost one was not"
+    assert f"and {redone} attempts; found {settled} attempts done" in again.stdout
+    assert ran(str(journal), "prepare") == 5 or moment == "a clip was just prepared"
+
+
+@pytest.mark.parametrize("moment", [m for m in MOMENTS if m != "never"])
+def test_a_killed_run_ends_in_the_same_tables(tmp_path: Path, undisturbed: Path, moment: str) -> None:
+    check(tmp_path, undisturbed, "local", moment)
+
+
+@pytest.mark.ray
+@pytest.mark.slow
+def test_a_killed_ray_run_ends_in_the_same_tables(tmp_path: Path, undisturbed: Path) -> None:
+    check(tmp_path, undisturbed, "ray", "samples are committed, outcomes are not")

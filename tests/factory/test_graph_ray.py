@@ -1,0 +1,64 @@
+"""The same graph as Ray tasks: identical rows, dead workers survived, poison contained."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from factory.execute import COMPLETE, COMPLETE_WITH_FAILURES, execute
+from factory.graph import ray  # with the environment that keeps it on loopback
+from factory.store.samples import Store
+from factory.store.verify import verify
+from tests.factory.tables import assert_same_tables, tables_of
+from tests.factory.toy import ToyWork, ran, refs
+
+pytestmark = [pytest.mark.ray, pytest.mark.slow]
+EXPERTS = ["recovery", "pdm_closed", "human"]
+
+
+def run(out: Path, executor: str, work: ToyWork, rounds: int, workers: int, n: int = 5):  # type: ignore[no-untyped-def]
+    return execute(work, refs(n), EXPERTS, rounds, Store(out), executor, workers, say=lambda line: None)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def two_cpus() -> Iterator[None]:
+    """A cluster that outlives the runs of this module: starting one takes seven seconds."""
+    ray.init(address="local", num_cpus=2, include_dashboard=False, log_to_driver=False)
+    yield
+    ray.shutdown()
+
+
+def test_local_and_ray_with_one_worker_make_identical_rows(tmp_path: Path) -> None:
+    run(tmp_path / "local", "local", ToyWork(), 5, 1)
+    run(tmp_path / "one", "ray", ToyWork(), 2, 1)
+    assert not ray.is_initialized(), "a cluster that the run started is left behind"
+    assert run(tmp_path / "one", "local", ToyWork(), 5, 1).executed.prepared == 0
+    assert_same_tables(tmp_path / "local", tmp_path / "one")
+
+
+@pytest.mark.usefixtures("two_cpus")
+def test_local_and_ray_with_two_workers_make_identical_rows(tmp_path: Path) -> None:
+    run(tmp_path / "local", "local", ToyWork(), 5, 1)
+    assert run(tmp_path / "two", "ray", ToyWork(), 5, 2).exit_code == COMPLETE
+    assert ray.is_initialized(), "a cluster that the run found must stay"
+    assert_same_tables(tmp_path / "local", tmp_path / "two")
+
+
+@pytest.mark.usefixtures("two_cpus")
+def test_a_clip_that_kills_its_workers_hurts_nobody_else(tmp_path: Path) -> None:
+    journal = str(tmp_path / "journal")
+    poison = ToyWork(trouble={"log0:2000:recovery:0": "die", "log1:1000": "bad"}, journal=journal)
+    summary = run(tmp_path / "out", "ray", poison, 2, 2)
+    assert summary.exit_code == COMPLETE_WITH_FAILURES
+    assert ran(journal, "attempt log0:2000:recovery:0") == 3  # once and two retries
+    failed = {o["error_kind"] for o in tables_of(tmp_path / "out")[1] if o["kind"] == "failed"}  # type: ignore[index]
+    assert failed == {"system", "input"}
+    assert (
+        execute(
+            ToyWork(), refs(5), EXPERTS, 2, Store(tmp_path / "out"), "local", retry=True, say=lambda line: None
+        ).exit_code
+        == COMPLETE
+    )
+    run(tmp_path / "never", "local", ToyWork(), 2, 1)
+    assert_same_tables(tmp_path / "out", tmp_path / "never")
+    assert verify(Store(tmp_path / "out")).damage == ()
