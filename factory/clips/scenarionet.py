@@ -103,11 +103,12 @@ class ScenarioNetReader:
             except BadClip as error:
                 broken[ClipRef(self.name, log_id, 0)] = str(error)
                 continue
-            n_steps = len(motion.segment)
+            driven = np.flatnonzero(motion.segment >= 0)  # the first window begins where the ego's drive does
+            first, n_steps = (int(driven[0]), int(driven[-1] - driven[0]) + 1) if len(driven) else (0, 0)
             starts = window_starts(n_steps, self.windows)
             if not starts:
-                skipped[log_id] = f"{n_steps * STEP_S:.1f} s long, a clip needs {CLIP_STEPS * STEP_S:.1f} s"
-            for start in starts:
+                skipped[log_id] = f"{n_steps * STEP_S:.1f} s of driving, a clip needs {CLIP_STEPS * STEP_S:.1f} s"
+            for start in (first + offset for offset in starts):
                 window = slice(start, start + CLIP_STEPS)
                 segment = motion.segment[window]
                 reason = drop_reason(

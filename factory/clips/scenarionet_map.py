@@ -1,6 +1,7 @@
 """From ScenarioNet's map features to a RoadMap: lane graph, neighbours, drivable area, crossings, lights."""
 
 from collections.abc import Mapping
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -171,7 +172,7 @@ def _drivable_areas(features: Mapping[str, Any], raw: Mapping[str, RawLane], fil
     outline = [points(f, "polyline", file, f"map_features[{k}]") for k, f in features.items() if _is_outline(k, f)]
     if outline and all(len(ring) > 3 and np.allclose(ring[0], ring[-1]) for ring in outline):
         rings = [ring for ring in map(closed_ring, outline) if ring is not None]
-        surface = shapely.symmetric_difference_all([Polygon(ring) for ring in rings])
+        surface = reduce(shapely.symmetric_difference, [Polygon(ring) for ring in rings], Polygon())
         near = shapely.convex_hull(shapely.MultiPolygon(shapes)).buffer(SURFACE_MARGIN_M)
         shapes.append(shapely.intersection(surface, near))
     merged = shapely.union_all(shapes).buffer(SEAM_M, join_style="mitre").buffer(-SEAM_M, join_style="mitre")

@@ -2,13 +2,11 @@
 
 What the files hold (public converters, checked on seven nuScenes scenes) and what is done about it:
 * Invalid frames hold zeros and the last frame's velocity is 0, so `valid` masks everything and velocities are not read.
-* nuScenes' ego comes from the CAN bus, 50 Hz thinned by five: a lost message is a step 40 % too long (0.5 m at 12 m/s),
-  and where the bus ends before the log the rest is interpolated keyframes, 1-3 m away. Such a jump ends a segment; no
-  clip reaches across it. Without a CAN bus the ego is a line between 2 Hz keyframes, in truth 0.4-0.6 s apart.
-* So the ego is smoothed first: the x(t) that minimises |x - log|^2 + lambda |third difference|^2, whose gain falls to a
-  half at lambda^(-1/6) / 0.1 s = 3.2 rad/s for lambda = 1000. On the seven scenes it moves the ego by at most 0.25 m
-  along and 0.02 m across its way and takes the greatest |a| from 60 to 3.1 m/s2. Speeds and accelerations are
-  those of a quadratic fitted over +-0.3 s, as in the metric's reference scenes.
+* nuScenes' ego comes from the CAN bus on a clock of its own (scenarionet_canbus.py), or, without one, is a line between
+  2 Hz keyframes that are in truth 0.4-0.6 s apart. A jump that is left ends a segment; no clip reaches across it.
+* The ego is smoothed: the x(t) that minimises |x - log|^2 + lambda |third difference|^2, whose gain falls to a half
+  at lambda^(-1/6) / 0.1 s = 3.9 rad/s for lambda = 300. On the seven scenes |a| is then at most 3.1 m/s2 and the
+  jerk 3.7 m/s3. Speeds and accelerations are those of a quadratic over +-0.3 s, as in the metric's reference scenes.
 * Agents: nuScenes' are lines between keyframes. Velocity = least-squares slope over +-0.5 s, below 0.1 m/s set to 0.
 """
 
@@ -20,10 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
-from scipy.ndimage import median_filter
 from scipy.signal import savgol_filter
 
 from factory.clips.reader import BadClip
+from factory.clips.scenarionet_canbus import jumps, on_log_clock
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.clip import STEP_S
 from tasks.world.frames import wrap_angle
@@ -42,7 +40,6 @@ KINDS = {
     "OTHER": AgentKind.GENERIC_OBJECT,
     "UNSET": AgentKind.GENERIC_OBJECT,
 }
-JUMP_M, JUMP_S = 0.3, 0.03  # a 0.1 s step this far (plus this long at its speed) off the median step is a jump
 KEYFRAME_STEPS = 5
 MAX_GAP_S = 0.55  # between two frames; longer ones cannot be filled in
 SLOPE_STEPS = 5  # +-0.55 s holds five steps to each side
@@ -57,14 +54,17 @@ class Source:
     licence: str
     origin_to_rear_axle_m: float  # from the stored ego position back along the heading
     smoothing: float  # lambda of the ego's smoother
+    can_bus: bool  # the ego's frames are thinned 50 Hz messages
 
 
 # nuScenes stores the ego pose, whose origin is the rear axle. Waymo's converter stores the box centre, nuPlan's the
 # EgoState's waypoint, which is the centre too. The Pacifica's own offset keeps its box on the logged box.
 SOURCES = {
-    "nuscenes": Source("CC BY-NC-SA 4.0 (nuScenes via ScenarioNet)", 0.0, 1000.0),
-    "waymo": Source("Waymo Open Dataset licence, non-commercial (via ScenarioNet)", PACIFICA.rear_axle_to_center, 10.0),
-    "nuplan": Source("CC BY-NC-SA 4.0 (nuPlan via ScenarioNet)", PACIFICA.rear_axle_to_center, 10.0),
+    "nuscenes": Source("CC BY-NC-SA 4.0 (nuScenes via ScenarioNet)", 0.0, 300.0, True),
+    "waymo": Source(
+        "Waymo Open Dataset licence, non-commercial (via ScenarioNet)", PACIFICA.rear_axle_to_center, 10.0, False
+    ),
+    "nuplan": Source("CC BY-NC-SA 4.0 (nuPlan via ScenarioNet)", PACIFICA.rear_axle_to_center, 10.0, False),
 }
 
 
@@ -208,19 +208,19 @@ def ego_segments(track: Track, source: Source, at: Array) -> tuple[Array, list[t
     Steps outside every segment hold NaN. Columns 7..10 (steering and rates) are 0, as NAVSIM initialises an ego.
     """
     position, heading, valid = resampled(track, at)
+    xy = position[:, :2]
+    if source.can_bus and len(xy) > 1 and _keyframe_weights(xy).all():
+        xy, heading, valid = on_log_clock(xy, heading, valid)
     states = np.full((len(at), EGO_STATE_SIZE), np.nan)
-    segments = _continuous(position[:, :2], valid)
+    segments = _continuous(xy, valid)
     for start, stop in segments:
-        states[start:stop] = _smooth_drive(position[start:stop, :2], heading[start:stop], source)
+        states[start:stop] = _smooth_drive(xy[start:stop], heading[start:stop], source)
     return states, segments
 
 
 def _continuous(xy: Array, valid: Mask) -> list[tuple[int, int]]:
     """Runs of valid steps without a jump, long enough for the quadratic fit."""
-    step = np.diff(xy, axis=0)
-    usual = np.stack([median_filter(column, 11, mode="nearest") for column in step.T], axis=1)
-    jumps = np.hypot(*(step - usual).T) > JUMP_M + JUMP_S / STEP_S * np.hypot(*usual.T)
-    broken = jumps | ~valid[1:] | ~valid[:-1]
+    broken = jumps(xy) | ~valid[1:] | ~valid[:-1]
     edges = [0, *(np.flatnonzero(broken) + 1).tolist(), len(xy)]
     return [(a, b) for a, b in pairwise(edges) if b - a >= FIT_STEPS and valid[a:b].all()]
 
