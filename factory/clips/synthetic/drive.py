@@ -6,9 +6,18 @@ import numpy as np
 
 from factory.clips.synthetic import curves
 from factory.clips.synthetic.curves import Array
-from factory.clips.synthetic.ego import SLOWEST_MPS, Scenario, centre_boxes, continue_lanes, ego_path, is_lawful
+from factory.clips.synthetic.ego import (
+    SLOWEST_MPS,
+    Scenario,
+    centre_boxes,
+    continue_lanes,
+    ego_path,
+    is_lawful,
+    tracked,
+)
 from factory.clips.synthetic.streets import Road, Streets
 from factory.clips.synthetic.traffic import (
+    CYCLE_S,
     RED,
     STEP_S,
     Driver,
@@ -20,13 +29,13 @@ from factory.clips.synthetic.traffic import (
     overlaps,
     path_of_lanes,
 )
-from tasks.world.vehicle import PACIFICA
+from tasks.world.vehicle import PACIFICA, VX
 
 WARM_STEPS = 40  # simulated before the log starts, so that it starts in the middle of things
 SPAWN_RADIUS_M = 130.0
-TRIES = 60
+TRIES = 200
 EGO = Driver(
-    1.0, accel=1.2, brake=1.5, jerk=2.0, headway_s=1.6, gap_m=3.0, lateral_accel=1.7,
+    1.0, accel=1.2, brake=1.5, jerk=2.0, headway_s=1.6, gap_m=3.0, lateral_accel=1.7, yaw_accel=0.7,
     front_m=PACIFICA.front_length, half_width_m=PACIFICA.half_width,
 )  # fmt: skip
 FLEET = (  # AV2 category, length, width, height, share
@@ -56,22 +65,28 @@ class _World:
         self.steps = steps
         self.tracks: list[Track] = []
         self.boxes = np.full((steps, 0, 5), np.nan)
-        self.ego: tuple[Array, Array] | None = None  # boxes, speeds
+        self.egos: list[tuple[int, Array, Array]] = []  # first step, boxes, speeds: the ego, and the ego as tracked
 
     def add(self, track: Track, margin_m: float) -> bool:
         """Adds the track unless it comes closer than the margin to an earlier one or endangers the ego."""
         boxes = track.boxes()
         if overlaps(boxes, self.boxes, margin_m).any():
             return False
-        if self.ego is not None and endangers(*self.ego, boxes[:, None]).any():
+        if self.threatened_by(boxes[:, None]):
             return False
         self.tracks.append(track)
         self.boxes = np.concatenate([self.boxes, boxes[:, None]], axis=1)
         return True
 
+    def threatened_by(self, others: Array) -> bool:
+        """Does anybody of `others` (S, J, 5) endanger the ego?"""
+        return any(
+            bool(endangers(boxes, speed, others[start : start + len(boxes)]).any()) for start, boxes, speed in self.egos
+        )
+
     def seen(self) -> Array:
         """(S, J, 5) everybody, the ego too."""
-        return self.boxes if self.ego is None else np.concatenate([self.boxes, self.ego[0][:, None]], axis=1)
+        return np.concatenate([self.boxes, self.egos[0][1][:, None]], axis=1) if self.egos else self.boxes
 
 
 def parked_cars(streets: Streets, rng: np.random.Generator) -> tuple[Track, ...]:
@@ -111,7 +126,7 @@ def plan_drive(
 ) -> Drive:
     """A drive of `steps` steps of 0.1 s; drawn again until the ego keeps moving, keeps the law and is in no danger.
 
-    Raises RuntimeError after 60 draws (not seen).
+    Raises RuntimeError after 200 draws (not seen).
     """
     for attempt in range(TRIES):
         rng = np.random.default_rng([*seed, attempt])
@@ -131,7 +146,6 @@ def _attempt(
 ) -> Drive | None:
     total = steps + WARM_STEPS
     times = (np.arange(total) - WARM_STEPS) * STEP_S
-    signals = Signals(float(rng.uniform(0.0, 32.0)))
     ego_driver = replace(EGO, speed_factor=float(rng.uniform(0.86, 1.0)))
     planned = ego_path(streets, scenario, ego_driver, rng)
     if planned is None:
@@ -139,6 +153,7 @@ def _attempt(
     path, start = planned
     if start + WARM_STEPS * STEP_S * 9.0 + 60.0 > path.s[-1]:
         return None
+    signals = _signals(path, start, float(times[0]), rng)
     world = _World(total)
     near = curves.at(path.poses, path.s, start + 70.0)[:2]
     for car in parked:
@@ -155,11 +170,13 @@ def _attempt(
     rear = curves.offset(rear, wander)
     rear[:, 2] += np.gradient(wander, s)
     boxes = centre_boxes(rear)
-    if not is_lawful(streets, path, boxes, signals, times):
+    world.egos = [(0, boxes, v)]
+    for start_step, states in tracked(rear[WARM_STEPS:], v[WARM_STEPS:]):
+        world.egos.append((WARM_STEPS + start_step, centre_boxes(states[:, :3]), states[:, VX]))
+    if not all(is_lawful(streets, path, b, signals, times[a : a + len(b)]) for a, b, _ in world.egos):
         return None
-    if len(world.tracks) and (overlaps(boxes, world.boxes, 0.1).any() or endangers(boxes, v, world.boxes).any()):
+    if world.threatened_by(world.boxes):
         return None
-    world.ego = (boxes, v)
     centre = boxes[WARM_STEPS + steps // 2, :2]
     _cyclists(streets, world, centre, signals, times, rng, density)
     _cars(streets, world, centre, signals, times, rng, density)
@@ -170,6 +187,15 @@ def _attempt(
         if not np.isnan(t.poses[WARM_STEPS:, 0]).all()
     )
     return Drive(scenario.kind, rear[WARM_STEPS:], v[WARM_STEPS:], tracks, signals, times[WARM_STEPS:])
+
+
+def _signals(path: Path, start: float, start_time_s: float, rng: np.random.Generator) -> Signals:
+    """Lights that turn green 8 s before to 4 s after the ego would reach its stop line unhindered: it may have to brake."""
+    for line, group in path.stops:
+        if 0.0 < line - start < 130.0 and group >= 0:
+            arrival = start_time_s + (line - start) / 9.0
+            return Signals(float(rng.uniform(-4.0, 8.0)) + group * CYCLE_S / 2 - arrival)
+    return Signals(float(rng.uniform(0.0, CYCLE_S)))
 
 
 def _vehicle(world: _World, name: str, path: Path, start: float, speed: float, fleet: int, signals: Signals, times: Array,

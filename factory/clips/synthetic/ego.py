@@ -9,10 +9,13 @@ import shapely
 from factory.clips.synthetic import curves
 from factory.clips.synthetic.curves import Array
 from factory.clips.synthetic.streets import Lane, Streets
-from factory.clips.synthetic.traffic import RED, Driver, Path, Signals, path_of_lanes
+from factory.clips.synthetic.traffic import RED, STEP_S, Driver, Path, Signals, path_of_lanes
+from tasks.rollout.lqr import track
+from tasks.world.clip import HISTORY_STEPS, HORIZON_STEPS
 from tasks.world.frames import box_corners
-from tasks.world.vehicle import PACIFICA
+from tasks.world.vehicle import AX, AY, EGO_STATE_SIZE, PACIFICA, VX
 
+EGO_SMOOTH_M = 3.2  # rounds the lanes' joints: steering that a person would do
 SLOWEST_MPS = 1.2  # a log whose ego is ever slower is drawn again: a standing ego makes no clip
 
 
@@ -115,7 +118,22 @@ def ego_path(
         lane_ids = continue_lanes(streets, chain, scenario.target, rng)
     except ValueError:
         return None
-    return path_of_lanes(streets, lane_ids, driver), start
+    return path_of_lanes(streets, lane_ids, driver, EGO_SMOOTH_M), start
+
+
+def tracked(rear_axle: Array, speed: Array) -> list[tuple[int, Array]]:
+    """What the factory's own tracker makes of the ego: (first step, states (41, 11)) for starts every second.
+
+    A log is kept only if these, too, are lawful and safe: then its windows score well as human samples. (Comfort is not
+    asked for: the public tracker starts with straight wheels, so a start in a tight turn always jerks.)
+    """
+    states = np.zeros((len(rear_axle), EGO_STATE_SIZE))
+    states[:, :3] = rear_axle
+    states[:, VX] = speed
+    states[:, AX] = np.gradient(speed, STEP_S)
+    states[:, AY] = speed * np.gradient(np.unwrap(rear_axle[:, 2]), STEP_S)
+    starts = range(HISTORY_STEPS, len(states) - HORIZON_STEPS, 10)
+    return [(a, track(states[a], states[None, a + 1 : a + 1 + HORIZON_STEPS, :3])[0]) for a in starts]
 
 
 def centre_boxes(rear_axle: Array) -> Array:

@@ -59,7 +59,9 @@ def scan(stage: Stage, world_from_ego: Array, beams: int, azimuths: int) -> Swee
         inverse_depth = plane[:, 0] * x + plane[:, 1] * y + plane[:, 2]
         met = (hit >= 0) & (inverse_depth > 1.0 / (2 * RANGE_M[1]))
         distance[mine[met]] = 1.0 / (inverse_depth[met] * local[met, 2])
-        facing = np.abs(np.einsum("ij,ij->i", stage.mesh.normals[hit[met]] @ world_from_ego[:3, :3], direction[mine[met]]))
+        facing = np.abs(
+            np.einsum("ij,ij->i", stage.mesh.normals[hit[met]] @ world_from_ego[:3, :3], direction[mine[met]])
+        )
         intensity[mine[met]] = _reflectance(stage, hit[met]) * (0.35 + 0.65 * facing)
     keep = np.flatnonzero((distance > RANGE_M[0]) & (distance < RANGE_M[1]))  # false for NaN
     return Sweep(

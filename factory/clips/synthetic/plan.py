@@ -17,10 +17,10 @@ from factory.clips.synthetic.streets import (
 )
 
 JUNCTION_REACH_M = 17.0  # crossroads: centre to the arms' mouths
-RING_M = 16.0  # roundabout: radius of the ring lane's centre
+RING_M = 19.0  # roundabout: radius of the ring lane's centre
 RING_WIDTH_M = 5.0
-ROUNDABOUT_REACH_M = 31.0
-RING_ZONE_RAD = 0.42  # half angle of the part of the ring that belongs to one arm
+ROUNDABOUT_REACH_M = 38.0
+RING_ZONE_RAD = 0.44  # half angle of the part of the ring that belongs to one arm
 TURN_SPEED_MPS = 8.0
 EAST_WEST, NORTH_SOUTH = 0, 1  # signal groups
 

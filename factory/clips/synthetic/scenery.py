@@ -44,7 +44,9 @@ def build_scenery(streets: Streets, rng: np.random.Generator) -> Scenery:
     for k, road in enumerate(streets.roads):
         _road(b, road, k)
     for junction in streets.junctions:
-        fan = np.stack([np.broadcast_to(junction.center, junction.ring[1:].shape), junction.ring[:-1], junction.ring[1:]], 1)
+        fan = np.stack(
+            [np.broadcast_to(junction.center, junction.ring[1:].shape), junction.ring[:-1], junction.ring[1:]], 1
+        )
         b.triangles(_lift(fan, 0.0), np.zeros((len(fan), 3, 2)), tx.ASPHALT)
         for kerb in junction.kerbs:
             _kerb(b, kerb, min(PAVEMENT_M, 2.6) if junction.name == "branch" else PAVEMENT_M)
@@ -69,7 +71,9 @@ def _lift(xy: Array, z: float) -> Array:
 def _stations(line: Array) -> NDArray[np.int64]:
     """Indices of a 1 m curve at which a ribbon is cut: denser in bends."""
     turned = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(line[:, 2])))])
-    wanted = np.cumsum(np.concatenate([[0.0], np.maximum(np.diff(turned) / 0.03, np.hypot(*np.diff(line[:, :2], axis=0).T) / 10.0)]))
+    wanted = np.cumsum(
+        np.concatenate([[0.0], np.maximum(np.diff(turned) / 0.03, np.hypot(*np.diff(line[:, :2], axis=0).T) / 10.0)])
+    )
     picks = np.searchsorted(wanted, np.arange(0.0, wanted[-1], 1.0))
     return np.unique(np.append(picks, len(line) - 1))
 
@@ -96,7 +100,9 @@ def _road_marks(roads: tuple[Road, ...]) -> Array:
                 line(side * k * road.lane_width, 0.07, 9.0, 3.5)
             outer = road.lanes * road.lane_width
             if road.strip == "park":
-                rows.append([*sorted((side * outer, side * (outer + 2.1))), 14.0, length - 14.0, 6.4, 0.1, 0.0, 0.0, 0.0])
+                rows.append(
+                    [*sorted((side * outer, side * (outer + 2.1))), 14.0, length - 14.0, 6.4, 0.1, 0.0, 0.0, 0.0]
+                )
             line(side * outer, 0.07, *((3.0, 1.0) if road.strip == "park" else (0.0, 0.0)))
         for has, near, sign in ((road.crossing_at_start, 0.0, 1.0), (road.crossing_at_end, length, -1.0)):
             if has:
@@ -149,7 +155,9 @@ def _island(b: Builder, center: Array, radius: float, rng: np.random.Generator) 
     for k in range(5):
         turn = 2 * np.pi * k / 5 + 0.4
         _tree(b, center + 6.0 * np.array([np.cos(turn), np.sin(turn)]), 0.5, rng, 0.7)
-    b.tube((center[0], center[1], 0.6), (center[0], center[1], 5.0), 0.9, tx.ISLAND_STONE, (0.62, 0.60, 0.56), 3, 8, 0.5)
+    b.tube(
+        (center[0], center[1], 0.6), (center[0], center[1], 5.0), 0.9, tx.ISLAND_STONE, (0.62, 0.60, 0.56), 3, 8, 0.5
+    )
 
 
 def _plain(b: Builder, middle: Array, reach: float) -> None:
@@ -170,11 +178,16 @@ def _plain(b: Builder, middle: Array, reach: float) -> None:
 
 def _reserved(streets: Streets) -> list[shapely.Geometry]:
     """Streets with their pavements: no house stands there."""
-    roads = [shapely.LineString(road.line[:, :2]).buffer(road.half_width + PAVEMENT_M + 0.05, cap_style="flat") for road in streets.roads]
+    roads = [
+        shapely.LineString(road.line[:, :2]).buffer(road.half_width + PAVEMENT_M + 0.05, cap_style="flat")
+        for road in streets.roads
+    ]
     return roads + [shapely.Polygon(j.ring).buffer(PAVEMENT_M + 0.6) for j in streets.junctions]
 
 
-def _houses(b: Builder, streets: Streets, taken: list[shapely.Geometry], rng: np.random.Generator) -> list[shapely.Geometry]:
+def _houses(
+    b: Builder, streets: Streets, taken: list[shapely.Geometry], rng: np.random.Generator
+) -> list[shapely.Geometry]:
     """Rows of houses along both sides of every street; returns what is taken now."""
     streets_area = shapely.unary_union(taken)
     shapely.prepare(streets_area)
@@ -187,11 +200,20 @@ def _houses(b: Builder, streets: Streets, taken: list[shapely.Geometry], rng: np
             while s < s_line[-1] - 8.0:
                 width, depth = float(rng.uniform(9.0, 19.0)), float(rng.uniform(9.0, 13.0))
                 setback = float(rng.choice([0.0, 0.0, 0.4, 2.5]))
-                front = curves.advance(curves.at(line, s_line, s + width / 2), 0.0, -(road.half_width + PAVEMENT_M + 0.15 + setback))
-                corners = np.array([curves.advance(front, x, -y)[:2] for x, y in ((-width / 2, 0), (width / 2, 0), (width / 2, depth), (-width / 2, depth))])
+                front = curves.advance(
+                    curves.at(line, s_line, s + width / 2), 0.0, -(road.half_width + PAVEMENT_M + 0.15 + setback)
+                )
+                corners = np.array(
+                    [
+                        curves.advance(front, x, -y)[:2]
+                        for x, y in ((-width / 2, 0), (width / 2, 0), (width / 2, depth), (-width / 2, depth))
+                    ]
+                )
                 plot = shapely.Polygon(corners)
-                if not streets_area.intersects(plot) and not any(plot.intersects(other) for other in built[-40:]) and not any(
-                    plot.intersects(other) for other in built
+                if (
+                    not streets_area.intersects(plot)
+                    and not any(plot.intersects(other) for other in built[-40:])
+                    and not any(plot.intersects(other) for other in built)
                 ):
                     built.append(plot)
                     _house(b, corners, tall * float(rng.uniform(0.75, 1.35)) + 1.2, int(rng.integers(1 << 20)), rng)
@@ -211,9 +233,19 @@ def _house(b: Builder, corners: Array, height: float, seed: int, rng: np.random.
         b.face([top[0], top[1], ridge[1], ridge[0]], tx.ROOF_TILES, colour, seed)
         b.face([top[2], top[3], ridge[0], ridge[1]], tx.ROOF_TILES, colour, seed)
         for a, z, peak in ((top[1], top[2], ridge[1]), (top[3], top[0], ridge[0])):
-            b.triangles(np.array([[a, z, peak]]), np.array([[(0, 0), (6, 0), (3, 3)]], float), tx.ISLAND_STONE, (0.62, 0.56, 0.48))
+            b.triangles(
+                np.array([[a, z, peak]]),
+                np.array([[(0, 0), (6, 0), (3, 3)]], float),
+                tx.ISLAND_STONE,
+                (0.62, 0.56, 0.48),
+            )
         chimney = ridge[0] * 0.7 + ridge[1] * 0.3
-        b.box((float(chimney[0]), float(chimney[1]), float(chimney[2])), (0.8, 0.6, 1.8), tx.ISLAND_STONE, (0.45, 0.28, 0.22))
+        b.box(
+            (float(chimney[0]), float(chimney[1]), float(chimney[2])),
+            (0.8, 0.6, 1.8),
+            tx.ISLAND_STONE,
+            (0.45, 0.28, 0.22),
+        )
     else:
         b.face(list(top), tx.FLAT_ROOF, (0.45, 0.45, 0.45))
     along = (corners[1] - corners[0]) / np.hypot(*(corners[1] - corners[0]))
@@ -224,8 +256,18 @@ def _house(b: Builder, corners: Array, height: float, seed: int, rng: np.random.
         for k in range(int(width / 4.6)):
             if rng.random() < 0.45:
                 a, z = corners[1] - along * (4.6 * k + 0.2), corners[1] - along * (4.6 * k + 4.3)
-                colour = np.array([(0.55, 0.12, 0.12), (0.14, 0.32, 0.24), (0.16, 0.22, 0.42), (0.78, 0.70, 0.52)])[int(rng.integers(4))]
-                edge = [[*(p + outward * out), h] for p, out, h in ((a, 1.1, ground - 1.35), (z, 1.1, ground - 1.35), (z, 0.02, ground - 0.85), (a, 0.02, ground - 0.85))]
+                colour = np.array([(0.55, 0.12, 0.12), (0.14, 0.32, 0.24), (0.16, 0.22, 0.42), (0.78, 0.70, 0.52)])[
+                    int(rng.integers(4))
+                ]
+                edge = [
+                    [*(p + outward * out), h]
+                    for p, out, h in (
+                        (a, 1.1, ground - 1.35),
+                        (z, 1.1, ground - 1.35),
+                        (z, 0.02, ground - 0.85),
+                        (a, 0.02, ground - 0.85),
+                    )
+                ]
                 b.face(np.array(edge), tx.CLOTH, colour, seed)
                 lip = [edge[0], edge[1], [*edge[1][:2], edge[1][2] - 0.25], [*edge[0][:2], edge[0][2] - 0.25]]
                 b.face(np.array(lip), tx.CLOTH, colour * 0.85, seed)
@@ -261,7 +303,9 @@ def _trees(b: Builder, streets: Streets, taken: list[shapely.Geometry], rng: np.
             s_line = curves.arc_length(line)
             for s in np.arange(12.0, s_line[-1] - 4.0, step):
                 if rng.random() < 0.62:
-                    at = curves.advance(curves.at(line, s_line, s + float(rng.uniform(-2, 2))), 0.0, -(road.half_width + 0.75))
+                    at = curves.advance(
+                        curves.at(line, s_line, s + float(rng.uniform(-2, 2))), 0.0, -(road.half_width + 0.75)
+                    )
                     _tree(b, at[:2], KERB_M, rng, float(rng.uniform(0.65, 1.0)))
             for s in np.arange(3.0, s_line[-1], 7.0):
                 back = float(rng.uniform(2.5, 24.0))
@@ -274,7 +318,16 @@ def _tree(b: Builder, at: Array, z: float, rng: np.random.Generator, size: float
     """A trunk and a crown of twigs: cards with leaves cut out, lit as parts of a round crown."""
     x, y = float(at[0]), float(at[1])
     trunk = 2.5 * size**0.5 + 0.4
-    b.tube((x, y, z), (x, y, z + trunk + 1.0), 0.15 * size + 0.05, tx.BARK, (0.33, 0.27, 0.21), int(rng.integers(1 << 16)), 7, 0.7)
+    b.tube(
+        (x, y, z),
+        (x, y, z + trunk + 1.0),
+        0.15 * size + 0.05,
+        tx.BARK,
+        (0.33, 0.27, 0.21),
+        int(rng.integers(1 << 16)),
+        7,
+        0.7,
+    )
     radius, tall = 1.75 * size, 2.1 * size
     n = int(64 * size)
     outward = rng.normal(size=(n, 3))
@@ -286,9 +339,19 @@ def _tree(b: Builder, at: Array, z: float, rng: np.random.Generator, size: float
     two /= np.linalg.norm(two, axis=1, keepdims=True)
     half = 0.85
     centre = centre + np.array([x, y, z + trunk + tall * 0.75])
-    corners = np.stack([centre - half * one - half * two, centre + half * one - half * two, centre + half * one + half * two, centre - half * one + half * two], 1)
+    corners = np.stack(
+        [
+            centre - half * one - half * two,
+            centre + half * one - half * two,
+            centre + half * one + half * two,
+            centre - half * one + half * two,
+        ],
+        1,
+    )
     uv = np.broadcast_to(np.array([(-half, -half), (half, -half), (half, half), (-half, half)]), (n, 4, 2))
-    base = np.array([(0.27, 0.38, 0.13), (0.22, 0.33, 0.14), (0.33, 0.40, 0.14), (0.40, 0.36, 0.13)])[int(rng.integers(4))]
+    base = np.array([(0.27, 0.38, 0.13), (0.22, 0.33, 0.14), (0.33, 0.40, 0.14), (0.40, 0.36, 0.13)])[
+        int(rng.integers(4))
+    ]
     depth = 0.62 + 0.38 * np.linalg.norm((centre - [x, y, z + trunk + tall * 0.75]) / [radius, radius, tall], axis=1)
     colour = base * depth[:, None] * rng.uniform(0.8, 1.15, (n, 1))
     b.quads(corners, uv, tx.LEAVES, colour, rng.integers(1 << 16, size=n), normals=outward)
@@ -307,12 +370,22 @@ def _furniture(b: Builder, streets: Streets, rng: np.random.Generator) -> None:
                 b.box((float(arm[0]), float(arm[1]), 7.45), (0.5, 0.5, 0.14), tx.METAL, (0.5, 0.5, 0.5))
             for s in np.arange(22.0, s_line[-1] - 4.0, 27.0):
                 kind = rng.random()
-                at = curves.advance(curves.at(line, s_line, s + float(rng.uniform(-5, 5))), 0.0, -(road.half_width + 0.5))
+                at = curves.advance(
+                    curves.at(line, s_line, s + float(rng.uniform(-5, 5))), 0.0, -(road.half_width + 0.5)
+                )
                 x, y = float(at[0]), float(at[1])
                 if kind < 0.5:
                     b.tube((x, y, KERB_M), (x, y, 2.75), 0.035, tx.METAL, (0.55, 0.55, 0.55), sides=5)
                     facing = np.array([-np.cos(at[2]), -np.sin(at[2]), 0.0])
-                    b.disc(np.array([x, y, 2.45]) + 0.05 * facing, facing, 0.32, tx.SIGN, seed=int(rng.integers(99)), sides=14, uv_scale=1 / 0.32)
+                    b.disc(
+                        np.array([x, y, 2.45]) + 0.05 * facing,
+                        facing,
+                        0.32,
+                        tx.SIGN,
+                        seed=int(rng.integers(99)),
+                        sides=14,
+                        uv_scale=1 / 0.32,
+                    )
                 elif kind < 0.8:
                     b.tube((x, y, KERB_M), (x, y, 1.0), 0.24, tx.METAL, (0.16, 0.28, 0.18), sides=8)
                 else:
@@ -334,9 +407,13 @@ def _signal(b: Builder, pose: Array, width: float) -> Mesh:
         x, y = float(at[0] + 0.18 * facing[0]), float(at[1] + 0.18 * facing[1])
         one = np.array([-facing[1], facing[0], 0.0])
         front = np.array([x, y, z]) + 0.16 * facing
-        plate = [front + sx * 0.28 * one + np.array([0, 0, sz * 0.68]) for sx, sz in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+        plate = [
+            front + sx * 0.28 * one + np.array([0, 0, sz * 0.68]) for sx, sz in ((-1, -1), (1, -1), (1, 1), (-1, 1))
+        ]
         b.face(np.array(plate), tx.DARK, (0.06, 0.06, 0.06))
         b.box((x, y, z), (0.26, 0.26, 1.1), tx.DARK, (0.08, 0.09, 0.08))
         for k in range(3):
-            lamps.disc(front + 0.02 * facing + np.array([0, 0, 0.38 - 0.38 * k]), facing, 0.15, tx.GLOW, LAMP_OFF, sides=10)
+            lamps.disc(
+                front + 0.02 * facing + np.array([0, 0, 0.38 - 0.38 * k]), facing, 0.15, tx.GLOW, LAMP_OFF, sides=10
+            )
     return lamps.mesh()

@@ -71,6 +71,7 @@ class Driver:
     headway_s: float = 1.4
     gap_m: float = 2.5
     lateral_accel: float = 2.0
+    yaw_accel: float = 1.2  # rad/s2
     front_m: float = 2.3  # path point to front bumper
     half_width_m: float = 0.95
 
@@ -96,9 +97,11 @@ def path_of_lanes(streets: Streets, lane_ids: list[int], driver: Driver, smooth_
     xy = xy + gaussian_filter1d(xy - _chord(xy), smooth_m / (even[1]), axis=0, mode="nearest") - (xy - _chord(xy))
     poses = curves.resample(xy, 1.0, float(line[0, 2]))
     s = curves.arc_length(poses)
-    curvature = np.abs(gaussian_filter1d(np.gradient(np.unwrap(poses[:, 2]), s), 2.0))
+    curvature = gaussian_filter1d(np.gradient(np.unwrap(poses[:, 2]), s), 2.0)
+    winding = np.abs(gaussian_filter1d(np.gradient(curvature, s), 2.0))
     posted = np.interp(s, s_raw, np.concatenate(limits)) * driver.speed_factor
-    limit = np.minimum(posted, np.sqrt(driver.lateral_accel / np.maximum(curvature, 1e-6)))
+    limit = np.minimum(posted, np.sqrt(driver.lateral_accel / np.maximum(np.abs(curvature), 1e-6)))
+    limit = np.minimum(limit, np.sqrt(driver.yaw_accel / np.maximum(winding, 1e-6)))
     for i in range(len(limit) - 2, -1, -1):
         limit[i] = min(limit[i], np.sqrt(limit[i + 1] ** 2 + 2 * 0.8 * driver.brake * (s[i + 1] - s[i])))
     return Path(poses, s, limit, tuple(stops), tuple(lane_ids))

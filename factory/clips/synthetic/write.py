@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.feather
+import shapely
 from scipy.spatial.transform import Rotation
 
 from factory.clips.synthetic.curves import Array
@@ -80,7 +81,9 @@ def write_log(
     (folder / "map").mkdir(exist_ok=True)
     content = json.dumps(_vector_map(town.streets, drive), separators=(",", ":"))
     (folder / "map" / f"log_map_archive_{folder.name}____{town.name}_city_0.json").write_text(content, encoding="utf-8")
-    (folder / "LICENSE").write_text(f"{LICENCE}\nMade by the data factory's synthetic town; test data.\n", encoding="utf-8")
+    (folder / "LICENSE").write_text(
+        f"{LICENCE}\nMade by the data factory's synthetic town; test data.\n", encoding="utf-8"
+    )
     _sensors(folder, town, drive, rig, settings, stamps, threads)
     return folder
 
@@ -175,7 +178,13 @@ def _calibration(folder: Path, rig: tuple[Camera, ...]) -> None:
     names = [camera.name for camera in rig]
     k = np.array([camera.intrinsics for camera in rig])
     zero = np.zeros(len(rig))
-    intrinsics = {"sensor_name": names, "fx_px": k[:, 0, 0], "fy_px": k[:, 1, 1], "cx_px": k[:, 0, 2], "cy_px": k[:, 1, 2]}
+    intrinsics = {
+        "sensor_name": names,
+        "fx_px": k[:, 0, 0],
+        "fy_px": k[:, 1, 1],
+        "cx_px": k[:, 0, 2],
+        "cy_px": k[:, 1, 2],
+    }
     intrinsics |= {"k1": zero, "k2": zero, "k3": zero}
     intrinsics |= {f"{side}_px": np.array([getattr(c, side) for c in rig], np.uint16) for side in ("height", "width")}
     _feather(folder / "calibration" / "intrinsics.feather", intrinsics)
@@ -194,9 +203,7 @@ def _quaternion(rotation: Array) -> Array:
 
 def _near_lanes(streets: Streets, drive: Drive) -> list[Lane]:
     middle = drive.ego[len(drive.ego) // 2, :2]
-    return [
-        lane for lane in streets.lanes.values() if np.hypot(*(lane.center[:, :2] - middle).T).min() < MAP_RANGE_M
-    ]
+    return [lane for lane in streets.lanes.values() if np.hypot(*(lane.center[:, :2] - middle).T).min() < MAP_RANGE_M]
 
 
 def _vector_map(streets: Streets, drive: Drive) -> dict[str, dict[str, object]]:
@@ -206,9 +213,9 @@ def _vector_map(streets: Streets, drive: Drive) -> dict[str, dict[str, object]]:
             "id": lane.lane_id,
             "is_intersection": lane.is_intersection,
             "lane_type": lane.kind,
-            "left_lane_boundary": _points(lane.left),
+            "left_lane_boundary": _points(_thinned(lane.left)),
             "left_lane_mark_type": lane.left_mark,
-            "right_lane_boundary": _points(lane.right),
+            "right_lane_boundary": _points(_thinned(lane.right)),
             "right_lane_mark_type": lane.right_mark,
             "successors": lane.successors,
             "predecessors": lane.predecessors,
@@ -217,7 +224,9 @@ def _vector_map(streets: Streets, drive: Drive) -> dict[str, dict[str, object]]:
         }
         for lane in _near_lanes(streets, drive)
     }
-    areas = {str(1 + k): {"area_boundary": _points(ring), "id": 1 + k} for k, ring in enumerate(streets.areas)}
+    areas = {
+        str(1 + k): {"area_boundary": _points(_simplified(ring)), "id": 1 + k} for k, ring in enumerate(streets.areas)
+    }
     crossings = {
         str(501 + k): {"edge1": _points(crossing.edge1), "edge2": _points(crossing.edge2), "id": 501 + k}
         for k, crossing in enumerate(streets.crossings)
@@ -226,7 +235,12 @@ def _vector_map(streets: Streets, drive: Drive) -> dict[str, dict[str, object]]:
 
 
 def _points(line: Array) -> list[dict[str, float]]:
-    return [{"x": round(float(x), 4), "y": round(float(y), 4), "z": 0.0} for x, y in _thinned(line[:, :2])]
+    return [{"x": round(float(x), 4), "y": round(float(y), 4), "z": 0.0} for x, y in line[:, :2]]
+
+
+def _simplified(ring: Array) -> Array:
+    """The ring without the points that lie within 1 cm of its other edges."""
+    return np.asarray(shapely.Polygon(ring).simplify(0.01).exterior.coords)[:-1]
 
 
 def _thinned(line: Array) -> Array:
