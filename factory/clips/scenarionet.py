@@ -25,6 +25,7 @@ from factory.clips.scenarionet_tracks import (
     agent_tracks,
     ego_segments,
     frame_positions,
+    ground_height,
     read_track,
     sample_times,
 )
@@ -250,11 +251,13 @@ def read_motion(scenario: Mapping[str, Any], file: str) -> Motion:
     if not isinstance(sdc_id, str | int) or sdc_id not in tracks:
         raise BadClip(file, "metadata.sdc_id", f"missing, or names no track: {sdc_id!r}")
     at = frame_positions(sample_times(scenario["metadata"], n_frames, file))
-    states, segments = ego_segments(read_track(tracks, sdc_id, n_frames, file), source, at)
+    ego = read_track(tracks, sdc_id, n_frames, file)
+    states, segments = ego_segments(ego, source, at)
     segment = np.full(len(at), -1, np.int64)
     for number, (start, stop) in enumerate(segments):
         segment[start:stop] = number
-    return Motion(states, segment, agent_tracks(tracks, str(sdc_id), at, n_frames, file))
+    ground = ground_height(ego, at, file)
+    return Motion(states, segment, agent_tracks(tracks, str(sdc_id), at, n_frames, ground, file))
 
 
 def read_log(path: Path) -> ScenarioLog:
@@ -286,7 +289,7 @@ def read_log(path: Path) -> ScenarioLog:
 
 
 def _flat_poses(ego_states: Array) -> Array:
-    """(S, 4, 4) rear-axle poses on the plane z = 0: the format's ego has no height, roll or pitch."""
+    """(S, 4, 4) rear-axle poses on the plane z = 0, the road: the format's ego has no roll or pitch."""
     assert ego_states.shape[1] == EGO_STATE_SIZE
     poses = np.tile(np.eye(4), (len(ego_states), 1, 1))
     c, s = np.cos(ego_states[:, HEADING]), np.sin(ego_states[:, HEADING])

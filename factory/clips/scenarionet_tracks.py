@@ -128,8 +128,19 @@ def read_track(tracks: Mapping[Any, Any], track_id: str | int, n_frames: int, fi
     return Track(position, heading, valid, size)
 
 
-def agent_tracks(tracks: Mapping[str, Any], sdc_id: str, at: Array, n_frames: int, file: str) -> AgentTracks:
-    """All tracks but the ego at the fractional frames `at` (S,). Raises BadClip."""
+def ground_height(ego: Track, at: Array, file: str) -> Array:
+    """(S,) height of the road under the ego: below Waymo's box centre; 0 where the file keeps the ego at z = 0."""
+    if not ego.position[ego.valid, 2].any():
+        return np.zeros(len(at))
+    if not np.isfinite(ego.size[2]):
+        raise BadClip(file, "tracks[sdc].state.height", "missing, and the ego is not at z = 0")
+    return resampled(ego, at)[0][:, 2] - ego.size[2] / 2.0
+
+
+def agent_tracks(
+    tracks: Mapping[Any, Any], sdc_id: str, at: Array, n_frames: int, ground: Array, file: str
+) -> AgentTracks:
+    """All tracks but the ego at the fractional frames `at` (S,), heights above `ground` (S,). Raises BadClip."""
     ids, kinds, rows = [], [], []
     for track_id in (key for key in tracks if str(key) != sdc_id):
         kind = tracks[track_id].get("type") if isinstance(tracks[track_id], dict) else None
@@ -152,7 +163,7 @@ def agent_tracks(tracks: Mapping[str, Any], sdc_id: str, at: Array, n_frames: in
         boxes[seen, column] = np.column_stack(
             [position[seen, :2], heading[seen], np.broadcast_to(track.size[:2], (seen.sum(), 2))]
         )
-        z[seen, column] = track.size[2] / 2.0 if flat else position[seen, 2]
+        z[seen, column] = track.size[2] / 2.0 if flat else (position[:, 2] - ground)[seen]
     return AgentTracks(
         track_ids=tuple(ids),
         kinds=tuple(kinds),

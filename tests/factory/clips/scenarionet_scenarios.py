@@ -183,8 +183,10 @@ def waymo(n=N_FRAMES, ego=None):
     features["8"] = {"type": "ROAD_EDGE_BOUNDARY", "polyline": np.array([(0, -9, 0), (100, -9, 0)], np.float32)}
     features["9"] = {"type": "STOP_SIGN", "lane": [1], "position": np.zeros(3, np.float32)}
     tracks = _tracks("17", ego, n)
+    tracks["17"]["state"]["position"][:, 2] = 1.56 / 2  # the centre of the ego's box
     for track in tracks.values():
         state = track["state"]
+        state["position"][:, 2] += 12.5 * state["valid"]  # metres above the sea
         for name in ("length", "width", "height"):
             state[name] = state[name][:, 0]
         track["state"] = {k: v.astype(np.float32) for k, v in state.items()} | {"valid": state["valid"] > 0}
