@@ -12,7 +12,7 @@ from tasks.world.clip import STEP_S
 from tasks.world.frames import wrap_angle
 
 MARGIN_M = 0.15  # boxes are drawn tightly; mirrors and noise stick out
-BEYOND_M = 0.25  # around a driving box nothing is trusted to be the street
+BEYOND_M = 0.12  # around a driving box nothing is trusted to be the street
 DRIVING_M = 1.0
 GROUND_CLEARANCE_M = 0.12  # the road under a car stays behind when it leaves
 

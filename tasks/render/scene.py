@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tasks.render.boxes import box_gaussians
+from tasks.render.choose import BACKGROUND, Look, choose, count_free_space, with_mirror_image
 from tasks.render.depth import dense_depth, sparse_depth
 from tasks.render.gaussians import EMPTY, F32, F64, Gaussians, concatenate, moved
 from tasks.render.movers import GROUND_CLEARANCE_M, behind_boxes, boxes_at, driving, owners, world_from_boxes
@@ -20,14 +21,11 @@ from tasks.render.raster import rasterize
 from tasks.render.refit import FitPhoto, refit_colours
 from tasks.render.sky import SkyCollector, SkyMap, directions
 from tasks.render.stereo import FAR_M, MAX_BASELINE_M, MIN_BASELINE_M, sweep_depth
-from tasks.render.surfels import Discs, concatenate_discs, count_free_space, discs_of_photo, gaussians_of, thin
+from tasks.render.surfels import discs_of_photo, gaussians_of
 from tasks.world.agents import MOVING_KINDS, AgentKind, AgentTracks
 from tasks.world.vehicle import PACIFICA
 
-GUESS_PENALTY = 1.5  # on the rank of discs whose depth is not from lidar
-MIRROR_PENALTY = 4.0
-MIN_NODE_GAUSSIANS = 40  # a track seen less is drawn as a plain box
-CHUNK_DISCS = 2_000_000  # discs thinned together before all are: bounds the memory, about 130 MB
+MIN_NODE_DISCS = 40  # a track seen less is drawn as a plain box
 EGO_MARGIN_M = 0.3
 FUSED_VOXEL_M = 0.07
 SHALLOW = -2  # label of a pixel without lidar
@@ -58,8 +56,7 @@ class AssetSettings:
     """How a scene is built. Pixels are those of the photos handed in."""
 
     max_gap_px: tuple[int, int] = (12, 24)  # columns, rows that are interpolated between lidar returns
-    fineness: float = 1.0  # voxels per pixel spacing; larger keeps more Gaussians
-    refit_sweeps: int = 3
+    refit_sweeps: int = 2
     hold_out_every: int = 8  # photo i of a camera with i % n == n // 2 only measures; 0: none is held out
     stereo_photos: int = 4  # neighbours compared where lidar does not reach
 
@@ -133,7 +130,7 @@ def build_asset(
     tracks = _Tracks(agents, origin)
     static, per_track = _fuse(sweeps, tracks)
     seen = [_see(p, train, static, per_track, tracks, settings) for p in train]
-    background, nodes = _discs(train, seen, tracks, settings)
+    background, nodes = _discs(train, seen, tracks)
     sky = _sky(train, seen)
     asset = RenderAsset(origin, background, nodes, sky, float("nan"))
     asset = _refit(asset, train, seen, tracks, settings.refit_sweeps)
@@ -296,54 +293,52 @@ def _neighbours(photo: Photo, others: Sequence[Photo], n: int) -> list[tuple[F32
     return [(o.rgb.astype(np.float32) / 255.0, o.intrinsics, o.world_from_camera) for o in best]
 
 
-def _discs(
-    photos: Sequence[Photo], seen: Sequence[_Seen], tracks: _Tracks, settings: AssetSettings
-) -> tuple[Gaussians, dict[str, Gaussians]]:
-    """Discs of all photos, carved, dealt to background and tracks, thinned."""
+def _discs(photos: Sequence[Photo], seen: Sequence[_Seen], tracks: _Tracks) -> tuple[Gaussians, dict[str, Gaussians]]:
+    """Discs of all photos, carved, dealt to background and tracks, the closest looks kept."""
     # Only what lidar or the sky says may carve: a guess must not drill holes.
     carvers = [np.where(s.sky, FAR_M, np.where(s.label == SHALLOW, 0.0, s.depth)).astype(np.float32) for s in seen]
-    background: list[Discs] = []
-    nodes: dict[int, list[Discs]] = {}
+    looks = []
     for photo, sight in zip(photos, seen):
-        penalty = np.where(sight.label == SHALLOW, GUESS_PENALTY, 1.0).astype(np.float32)
-        discs = discs_of_photo(
-            photo.rgb.astype(np.float32) / 255.0, sight.depth, penalty, photo.intrinsics, photo.world_from_camera
-        )
-        label = sight.label.reshape(-1)
+        rgb = photo.rgb.astype(np.float32) / 255.0
+        discs = discs_of_photo(rgb, sight.depth, sight.label, photo.intrinsics, photo.world_from_camera)
         boxes, valid = tracks.at(photo.time_s)
-        owner = owners(discs.points, boxes, valid)
-        known = np.isfinite(discs.rank)
         poses = world_from_boxes(boxes)
-        for j in np.unique(owner[known & (owner >= 0)]):
-            mine = discs.take(np.flatnonzero(known & (owner == j)))
-            nodes.setdefault(int(j), []).append(mine.moved(np.linalg.inv(poses[j])))
-        rows = np.flatnonzero(known & (owner < 0) & (label < 0) & ~sight.passing.reshape(-1))
-        background.append(_carved(discs.take(rows), label[rows] == SHALLOW, photos, carvers))
-        if sum(len(b.points) for b in background) > CHUNK_DISCS:
-            background = [_thinned(background, settings.fineness)]
-    whole = _thinned(background, settings.fineness)
-    out = {}
-    for j, parts in sorted(nodes.items()):
-        if tracks.kinds[j] == AgentKind.VEHICLE:
-            parts = [*parts, *(part.mirrored(MIRROR_PENALTY) for part in parts)]
-        node = _thinned(parts, settings.fineness)
-        if len(node.points) >= MIN_NODE_GAUSSIANS:
-            out[tracks.ids[j]] = gaussians_of(node, np.zeros(3))
-    return gaussians_of(whole, np.zeros(3)) if len(whole.points) else EMPTY, out
+        owner = owners(discs.points, boxes, valid)
+        at = (discs.pixels[:, 0], discs.pixels[:, 1])
+        label, guessed = sight.label[at], sight.label[at] == SHALLOW
+        street = (owner < 0) & (label < 0) & ~sight.passing[at]
+        street[street] = _witnessed(discs.points[street], guessed[street], photos, carvers)
+        keep = np.flatnonzero(street | (owner >= 0))
+        looks.append(
+            Look(
+                discs.take(keep),
+                owner[keep],
+                guessed[keep],
+                sight.depth,
+                photo.intrinsics,
+                photo.world_from_camera,
+                {int(j): poses[j] for j in np.flatnonzero(valid)},
+            )
+        )
+    kept = choose(looks)
+    nodes = {}
+    for j, discs in kept.items():
+        if j == BACKGROUND or len(discs.points) < MIN_NODE_DISCS:
+            continue
+        whole = with_mirror_image(discs) if tracks.kinds[j] == AgentKind.VEHICLE else discs
+        nodes[tracks.ids[j]] = gaussians_of(whole, np.zeros(3))
+    return gaussians_of(kept[BACKGROUND], np.zeros(3)) if BACKGROUND in kept else EMPTY, nodes
 
 
-def _thinned(parts: list[Discs], fineness: float) -> Discs:
-    discs = concatenate_discs(parts)
-    return discs.take(thin(discs, fineness))
-
-
-def _carved(discs: Discs, guessed: NDArray[np.bool_], photos: Sequence[Photo], carvers: Sequence[F32]) -> Discs:
-    """Without the discs that more photos look through than see; one that lidar saw is lost to two photos at least."""
-    in_front, agreeing = np.zeros(len(discs.points), np.int32), np.zeros(len(discs.points), np.int32)
+def _witnessed(
+    points: F64, guessed: NDArray[np.bool_], photos: Sequence[Photo], carvers: Sequence[F32]
+) -> NDArray[np.bool_]:
+    """Which points (M, 3) not more photos look through than see; one that lidar saw is lost to two at least."""
+    in_front, agreeing = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
     for photo, depth in zip(photos, carvers):
         camera_from_world = np.ascontiguousarray(np.linalg.inv(photo.world_from_camera))
-        count_free_space(discs.points, camera_from_world, photo.intrinsics, depth, in_front, agreeing)
-    return discs.take(np.flatnonzero((in_front <= agreeing) | ((in_front < 2) & ~guessed)))
+        count_free_space(points, camera_from_world, photo.intrinsics, depth, in_front, agreeing)
+    return np.asarray((in_front <= agreeing) | ((in_front < 2) & ~guessed))
 
 
 def _sky(photos: Sequence[Photo], seen: Sequence[_Seen]) -> SkyMap:

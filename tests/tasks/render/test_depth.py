@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
+from tasks.render.choose import BACKGROUND, Look, choose
 from tasks.render.depth import dense_depth, sparse_depth
+from tasks.render.gaussians import covariances_of
 from tasks.render.sky import SkyCollector, directions
-from tasks.render.surfels import discs_of_photo, gaussians_of, thin
+from tasks.render.surfels import discs_of_photo, gaussians_of
 
 INTRINSICS = np.array([[80.0, 0.0, 40.0], [0.0, 80.0, 30.0], [0.0, 0.0, 1.0]])
 WIDTH, HEIGHT = 80, 60
@@ -59,23 +61,45 @@ def test_a_point_seen_through_a_nearer_surface_is_removed() -> None:
     assert depth[30, 70] == pytest.approx(20.0) and label[30, 70] == len(points) - 1
 
 
+def look(colour: tuple[float, float, float], depth: float, ahead: float) -> Look:
+    """A wall that faces a camera `ahead` metres down the road."""
+    zs, pose = np.full((HEIGHT, WIDTH), depth, np.float32), np.eye(4)
+    pose[2, 3] = ahead
+    rgb = np.broadcast_to(np.array(colour, np.float32), (HEIGHT, WIDTH, 3))
+    discs = discs_of_photo(rgb, zs, np.full((HEIGHT, WIDTH), -1, np.int32), INTRINSICS, pose)
+    n = len(discs.points)
+    return Look(discs, np.full(n, BACKGROUND, np.int32), np.zeros(n, bool), zs, INTRINSICS, pose, {})
+
+
 def test_the_closest_look_at_a_surface_is_the_one_that_is_kept() -> None:
-    depth_near, depth_far = np.full((HEIGHT, WIDTH), 4.0, np.float32), np.full((HEIGHT, WIDTH), 16.0, np.float32)
-    ones = np.ones((HEIGHT, WIDTH), np.float32)
-    red, blue = np.zeros((2, HEIGHT, WIDTH, 3), np.float32)
-    red[..., 0], blue[..., 2] = 1.0, 1.0
-    closer = np.eye(4)
-    closer[2, 3] = 12.0  # the same wall at z = 16
-    near = discs_of_photo(red, depth_near, ones, INTRINSICS, closer)
-    far = discs_of_photo(blue, depth_far, ones, INTRINSICS, np.eye(4))
-    both = type(near)(*(np.concatenate([getattr(far, f), getattr(near, f)]) for f in near.__dataclass_fields__))
-    kept = both.take(thin(both, 1.0))
-    middle = np.abs(kept.points[:, :2]).max(axis=1) < 1.0  # both photos see it
-    assert kept.rgb[middle, 0].mean() > 0.9
-    assert kept.rgb[~middle, 2].any()
-    gaussians = gaussians_of(kept, np.zeros(3))
-    assert np.isfinite(gaussians.log_scales).all()
-    np.testing.assert_allclose(np.linalg.norm(gaussians.quats, axis=1), 1.0, atol=1e-5)
+    near, far = look((1, 0, 0), 4.0, 12.0), look((0, 0, 1), 16.0, 0.0)  # the same wall at z = 16
+    for order in ((near, far), (far, near)):
+        kept = choose(order)[BACKGROUND]
+        middle = np.abs(kept.points[:, :2]).max(axis=1) < 1.2  # both photos see it
+        assert (kept.rgb[middle] == [1, 0, 0]).all()
+        outside = np.abs(kept.points[:, 0]) > 3.0
+        assert outside.any() and (kept.rgb[outside] == [0, 0, 1]).all()
+
+
+def test_a_second_photo_from_the_same_place_adds_nothing() -> None:
+    first = look((0.5, 0.5, 0.5), 9.0, 0.0)
+    assert len(choose([first, first])[BACKGROUND].points) == len(first.discs.points)
+
+
+def test_discs_become_flat_gaussians_that_lie_in_their_surface() -> None:
+    gaussians = gaussians_of(look((1, 1, 1), 4.0, 0.0).discs, np.zeros(3))
+    covariances = covariances_of(gaussians)
+    assert np.sqrt(covariances[:, 2, 2]).max() < 0.2 * np.sqrt(covariances[:, 0, 0]).min()
+    assert np.abs(np.linalg.norm(gaussians.quats, axis=1) - 1.0).max() < 1e-5
+
+
+def test_a_plain_wall_needs_few_discs_and_a_patterned_one_all() -> None:
+    zs, label = np.full((HEIGHT, WIDTH), 9.0, np.float32), np.full((HEIGHT, WIDTH), -1, np.int32)
+    noise = np.random.default_rng(0).uniform(0, 1, (HEIGHT, WIDTH, 3)).astype(np.float32)
+    plain = discs_of_photo(0 * noise, zs, label, INTRINSICS, np.eye(4))
+    patterned = discs_of_photo(noise, zs, label, INTRINSICS, np.eye(4))
+    assert len(plain.points) == HEIGHT * WIDTH // 16
+    assert len(patterned.points) > 0.98 * HEIGHT * WIDTH
 
 
 def test_the_sky_is_the_colour_that_was_seen_in_its_direction() -> None:
