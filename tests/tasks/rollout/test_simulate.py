@@ -133,6 +133,21 @@ def test_a_parked_car_stays_and_one_off_the_lanes_replays() -> None:
     assert np.array_equal(rollout.agents.boxes[:, 1], scene.agents.boxes[NOW : NOW + 41, 1])
 
 
+def test_a_parked_car_hidden_at_first_appears_where_the_log_sees_it_even_near_the_ego() -> None:
+    scene = worlds.scene(worlds.straight_road(), Track(10.0, 2.2, first=NOW + 5, last=NOW + 8), ego=(0.0, 0.0, 0.0))
+    agents = run(scene).agents
+    assert agents.valid[:, 0].tolist() == [False] * 5 + [True] * 36
+    assert (agents.boxes[5:, 0] == scene.agents.boxes[NOW + 5, 0]).all()
+
+
+def test_a_driven_car_follows_the_height_of_its_lane() -> None:
+    edge = np.array([[-100.0, 0.0, -5.0], [500.0, 0.0, 25.0]])  # 5 % uphill
+    road = {"road": replace(worlds.straight_road()["road"], left_boundary=edge, right_boundary=edge)}
+    agents = run(worlds.scene(road, Track(0.0, speed=8.0))).agents
+    rise = agents.center_z[:, 0] - agents.center_z[0, 0]
+    assert rise == pytest.approx(0.05 * (agents.boxes[:, 0, 0] - agents.boxes[0, 0, 0]), abs=0.03)
+
+
 def test_an_entering_car_waits_for_room_and_enters_driven_else_never() -> None:
     def entry(ego_x: float) -> Rollout:
         return run(worlds.scene(worlds.straight_road(), Track(0.0, speed=8.0, first=NOW + 10), ego=(ego_x, 0.0, 0.0)))
