@@ -1,0 +1,1 @@
+"""Benchmarks: commands that print tables. Never part of the tests."""

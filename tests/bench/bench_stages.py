@@ -1,0 +1,85 @@
+"""Times the stages on real logs (or the synthetic town where there are none), and the reward by batch size."""
+
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from factory.clips.av2 import AV2Reader
+from factory.clips.reader import ClipReader
+from factory.clips.synthetic.reader import SyntheticReader
+from tasks.attempt import ExpertGate, attempt, perturbed_scene
+from tasks.chance import stream
+from tasks.experts.pdm_closed import PdmClosed, PdmSettings
+from tasks.kinematic_vocabulary import kinematic_trajectories
+from tasks.perturb import Perturbation, PerturbSettings, perturb
+from tasks.reward.epdms import score
+from tasks.reward.prepare import prepare_scene
+from tasks.rollout.lqr import track
+from tasks.rollout.simulate import TrafficSettings, prepare_traffic, simulate
+from tasks.vocabulary import Vocabulary
+from tasks.world.clip import NOW, scene_of_clip
+from tasks.world.frames import to_world
+
+PUBLIC_MS_PER_TRAJECTORY = 20.0  # the public implementation, one core (METRIC.md)
+
+
+def milliseconds(call: Callable[[], object], repeats: int) -> float:
+    """Median time of one call, after one that warms up."""
+    call()
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - start)
+    return 1e3 * float(np.median(times))
+
+
+def main(root: Path) -> None:
+    """Prints two tables."""
+    reader: ClipReader = AV2Reader(root) if root.is_dir() else SyntheticReader("~/.cache/driving-data-factory/towns", 3)
+    ref = reader.index().refs[0]
+    clip = reader.read(ref)
+    scene = scene_of_clip(clip)
+    print(f"clip {ref.clip_id} of {reader.name}, {len(clip.agents)} tracks; one thread\n")
+
+    print("| K | track ms | score ms | ms per trajectory | public / ours |\n|---|---|---|---|---|")
+    prepared = prepare_scene(scene, clip.agents.window(NOW, NOW + 41))
+    for k in (1, 2, 256, 4096):
+        poses = to_world(scene.ego_state[:3], kinematic_trajectories(k, 0))
+        states = track(scene.ego_state, poses)
+        tracked = milliseconds(lambda poses=poses: track(scene.ego_state, poses), 3)
+        scored = milliseconds(lambda states=states: score(prepared, states), 3)
+        each = (tracked + scored) / k
+        print(f"| {k} | {tracked:.1f} | {scored:.1f} | {each:.3f} | {PUBLIC_MS_PER_TRAJECTORY / each:.0f} |")
+
+    settings, pdm = TrafficSettings(), PdmSettings()
+    vocabulary = Vocabulary(kinematic_trajectories(1024, 0), source="kinematic")
+
+    def perturbed() -> Perturbation:
+        found = perturb(clip, vocabulary, PerturbSettings(), settings, pdm, stream(0, clip.clip_id, "perturb"))
+        assert isinstance(found, Perturbation), found
+        return found
+
+    candidate = perturbed().candidates[0]
+    second = perturbed_scene(clip, candidate.rollout)
+    plan = candidate.rollout.ego_states[1:, :3]
+    rng = stream(0, clip.clip_id, "bench")
+    rows = {
+        "read a further clip of the log": lambda: reader.read(ref),
+        "perturb (K = 1,024)": perturbed,
+        "prepare traffic": lambda: prepare_traffic(scene, settings),
+        "reactive rollout": lambda: simulate(scene, plan, settings),
+        "prepare the reward": lambda: prepare_scene(scene, candidate.rollout.agents),
+        "PDM-Closed's plan": lambda: PdmClosed().plan(second, rng),
+        "whole attempt (pdm_closed)": lambda: attempt(second, PdmClosed(), ExpertGate(), settings, pdm, rng),
+    }
+    print("\n| step | ms |\n|---|---|")
+    for name, call in rows.items():
+        print(f"| {name} | {milliseconds(call, 5):.1f} |")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else "../shared/data/av2/sensor/val"))
