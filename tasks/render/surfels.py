@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.kernels import kernel
 from tasks.render.gaussians import F32, F64, Gaussians, quats_of
 
 SIGMA_PER_PIXEL = 0.5  # standard deviation of a disc in units of its spacing on the surface (measured: .45 .. .55)
