@@ -12,10 +12,12 @@ from tasks.experts.protocol import Expert, Plan
 from tasks.reward.epdms import Scores, score
 from tasks.reward.prepare import prepare_scene
 from tasks.rollout.simulate import TrafficSettings, next_scene, simulate
-from tasks.stages import Rejected
+from tasks.stages import SUBSCORES, Rejected
 from tasks.world.clip import Clip, Rollout, Scene, scene_of_clip
 from tasks.world.route import centerline_from
 from tasks.world.vehicle import HEADING
+
+_JUDGED = tuple(name for name in SUBSCORES if name not in ("ep", "ec"))
 
 
 @dataclass(frozen=True)
@@ -24,6 +26,11 @@ class ExpertGate:
 
     full: tuple[str, ...] = ("nc", "dac", "ddc", "tlc", "ttc", "lk", "hc")  # EC needs an earlier plan: there is none
     progress_above: float = 0.5
+
+    def __post_init__(self) -> None:
+        unknown = [name for name in self.full if name not in _JUDGED]
+        if unknown:
+            raise ValueError(f"full names {', '.join(unknown)}; an expert's drive is judged by {', '.join(_JUDGED)}")
 
 
 @dataclass(frozen=True)
@@ -51,8 +58,8 @@ def drive_and_judge(scene: Scene, plan: Plan, traffic: TrafficSettings, planner:
 
 def verdict(scores: Scores, gate: ExpertGate, row: int = 1) -> Rejected | None:
     """None when the row passes the gate, else the first sub-score that fails, with all of them in the detail."""
-    failed = [f"{name}={getattr(scores, name)[row]:g}" for name in gate.full if getattr(scores, name)[row] < 1.0]
-    if scores.ep[row] <= gate.progress_above:
+    failed = [f"{name}={getattr(scores, name)[row]:g}" for name in gate.full if getattr(scores, name)[row] != 1.0]
+    if not scores.ep[row] > gate.progress_above:
         failed.append(f"ep={scores.ep[row]:.3f}")
     return Rejected("reward", failed[0].split("=")[0], " ".join(failed)) if failed else None
 

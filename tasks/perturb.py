@@ -38,6 +38,11 @@ class PerturbSettings:
     step_lateral_m: float = 0.5
     epdms_min: float = 0.8  # /14 score, without EC
 
+    def __post_init__(self) -> None:
+        for name in ("step_longitudinal_m", "step_lateral_m"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"perturb {name} must be positive, not {getattr(self, name)}")
+
 
 @dataclass(frozen=True)
 class Candidate:
