@@ -3,10 +3,11 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.world.frames import points_to_local, wrap_angle
+from tasks.world.frames import to_local, wrap_angle
 
 LOOKAHEAD_M = 20.0  # NAVSIM: the route 20 m ahead decides ...
-LATERAL_M = 2.0  # ... left or right where it lies more than 2 m to a side
+LATERAL_M = 2.0  # ... left or right where it lies 2 m or more to a side
+SPACING_M = 0.5  # the route is looked at this densely, however few points it came with
 
 
 def driving_command(centerline: NDArray[np.float64], pose: NDArray[np.float64]) -> str:
@@ -20,11 +21,17 @@ def driving_command(centerline: NDArray[np.float64], pose: NDArray[np.float64]) 
     """
     steps = np.hypot(*np.diff(centerline[:, :2], axis=0).T)
     arc = np.concatenate([[0.0], np.cumsum(steps)])
-    gaps = np.hypot(*(centerline[:, :2] - pose[:2]).T) + np.abs(wrap_angle(centerline[:, 2] - pose[2]))
+    columns = (centerline[:, 0], centerline[:, 1], np.unwrap(centerline[:, 2]))
+
+    def at(lengths: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.stack([np.interp(lengths, arc, column) for column in columns], axis=-1)
+
+    along = np.append(np.arange(0.0, arc[-1], SPACING_M), arc[-1])
+    route = at(along)
+    gaps = np.hypot(*(route[:, :2] - pose[:2]).T) + np.abs(wrap_angle(route[:, 2] - pose[2]))
     nearest = int(np.argmin(gaps))
-    ahead = arc[nearest] + LOOKAHEAD_M
+    ahead = along[nearest] + LOOKAHEAD_M
     if ahead > arc[-1]:
         return "unknown"
-    target = np.array([np.interp(ahead, arc, centerline[:, 0]), np.interp(ahead, arc, centerline[:, 1])])
-    side = float(points_to_local(centerline[nearest], target)[1])
+    side = float(to_local(route[nearest], at(ahead))[1])
     return "left" if side >= LATERAL_M else "right" if side <= -LATERAL_M else "straight"
