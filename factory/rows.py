@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from factory.store.schema import AGENT_STEPS, FIRST_FAILURES, MAP_RADIUS_M, NOW_INDEX
 from tasks.attempt import Judged
 from tasks.perturb import Candidate, end_speed_mps
+from tasks.render.views import pose_on_ground
 from tasks.reward.epdms import Scores
 from tasks.stages import SUBSCORES
 from tasks.world.agents import AgentKind, AgentTracks
@@ -41,6 +42,7 @@ def sample_row(clip: Clip, candidate: Candidate | None, judged: Judged) -> dict[
         "licence": clip.licence,
         "parent_states": clip.ego_states[[NOW, NOW + HORIZON_STEPS]],
         "now_pose": pose,
+        "world_from_ego": pose_on_ground(clip.world_from_ego, scene.ego_state[None])[0],
         "ego_history_10hz": to_local(pose, scene.ego_history[:, : HEADING + 1]),
         "ego_history_2hz": to_local(pose, scene.ego_history[::5, : HEADING + 1]),
         "ego_status": scene.ego_state[[VX, VY, AX, AY]],
@@ -95,15 +97,16 @@ def _agents(tracks: AgentTracks, now: int, pose: Array) -> Mapping[str, object]:
 def _map(scene: Scene, pose: Array) -> Mapping[str, object]:
     road_map, clip = scene.clip.road_map, scene.clip
 
-    def near(points: Array) -> bool:
-        return bool((np.hypot(*(points[:, :2] - pose[:2]).T) <= MAP_RADIUS_M).any())
+    def near(line: Array) -> bool:
+        return _distance_m(line, pose) <= MAP_RADIUS_M
 
     def local_ring(ring: Array) -> Array:
         return points_to_local(pose, ring[:, :2])
 
     lanes = [lane for lane in road_map.lanes.values() if lane.drives_cars and near(lane.centerline)]
     areas = [area.ring for area in road_map.drivable_areas if near(area.ring) or _encloses(area.ring, pose)]
-    lights = [i for i, lane_id in enumerate(clip.lights.lane_ids) if lane_id in {lane.lane_id for lane in lanes}]
+    shown = {lane.lane_id for lane in lanes}
+    lights = [i for i, lane_id in enumerate(clip.lights.lane_ids) if lane_id in shown]
     steps = slice(scene.step - NOW_INDEX, scene.step - NOW_INDEX + AGENT_STEPS)
     return {
         "lane_ids": [lane.lane_id for lane in lanes],
@@ -117,6 +120,14 @@ def _map(scene: Scene, pose: Array) -> Mapping[str, object]:
         "route_lane_ids": sorted(clip.route.lane_ids),
         "route_centerline": to_local(pose, scene.centerline),
     }
+
+
+def _distance_m(line: Array, pose: Array) -> float:
+    """To the nearest point of a polyline (P >= 2, >= 2), its long edges included."""
+    start, edge = line[:-1, :2], np.diff(line[:, :2], axis=0)
+    square = np.maximum((edge**2).sum(axis=1), 1e-12)  # repeated points make edges of no length
+    share = np.clip(((pose[:2] - start) * edge).sum(axis=1) / square, 0.0, 1.0)
+    return float(np.hypot(*(start + share[:, None] * edge - pose[:2]).T).min())
 
 
 def _encloses(ring: Array, pose: Array) -> bool:
