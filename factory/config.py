@@ -75,8 +75,8 @@ def _dataclass_in(hint: Any) -> type[Any] | None:
     return next((option for option in options if isinstance(option, type) and dataclasses.is_dataclass(option)), None)
 
 
-def build(spec: Mapping[str, Any], where: str) -> Any:
-    """The object a `_target_` names, called with the spec's other keys.
+def build(spec: Mapping[str, Any], where: str, labels: Sequence[str] = ("name",)) -> Any:
+    """The object a `_target_` names, called with the spec's other keys. `labels` are for the configuration alone.
 
     Raises ConfigError when the target cannot be imported or does not take these arguments.
     """
@@ -86,6 +86,6 @@ def build(spec: Mapping[str, Any], where: str) -> Any:
     if "_target_" not in spec:
         raise ConfigError(f"{where}._target_ is missing: name the class to use, such as my_package.MyReader")
     try:
-        return instantiate({key: value for key, value in spec.items() if key != "name"}, _convert_="all")
+        return instantiate({key: value for key, value in spec.items() if key not in labels}, _convert_="all")
     except InstantiationException as error:
         raise ConfigError(f"{where}: {error}") from error

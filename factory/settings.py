@@ -42,6 +42,14 @@ class VocabularyChoice:
 
 
 @dataclass(frozen=True)
+class RecoverySources:
+    """What the recovery table is made from."""
+
+    table: str | None = None  # an artefact; None: the TRAIN windows of the run's clips and `vocabularies`
+    vocabularies: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class RunConfig:
     """Everything on the command line of `python -m factory.run`; conf/run.yaml says what each key means."""
 
@@ -96,6 +104,7 @@ def load_config(overrides: Sequence[str], name: str = "run") -> RunConfig:
 def open_reader(clips: Mapping[str, Any]) -> tuple[ClipReader, ClipIndex]:
     """The reader of the chosen clips, and what its root holds. Raises ConfigError where that is nothing."""
     reader: ClipReader = build(clips, "clips")
+    _must_have(reader, ("name", "index", "read"), "clips", "a reader (factory.clips.reader.ClipReader)")
     try:
         index = reader.index()
     except ValueError as error:
@@ -142,31 +151,37 @@ def choose_vocabulary(choice: VocabularyChoice) -> Vocabulary:
 
 
 def build_expert(name: str, config: RunConfig, reader: ClipReader, index: ClipIndex, vocabulary: Vocabulary) -> Expert:
-    """One of the built-in kinds, or a user's `_target_`."""
-    spec = dict(config.expert[name])
+    """One of the built-in kinds, or a user's `_target_`. Raises ConfigError for what the expert does not take."""
+    spec, where = dict(config.expert[name]), f"expert.{name}"
     match spec.pop("kind", None):
-        case "human":
-            return Human()
-        case "pdm_closed":
-            return PdmClosed(config.pdm)
+        case "human" | "pdm_closed" as kind:
+            if spec:
+                raise ConfigError(f"unknown setting {', '.join(f'{where}.{key}' for key in spec)}")
+            return Human() if kind == "human" else PdmClosed(config.pdm)
         case "recovery":
-            sources = {key: spec.pop(key) for key in ("table", "vocabularies")}
-            settings = fill(RecoverySettings, spec, f"expert.{name}")
-            return Recovery(recovery_table(config, reader, index, **sources), settings)
+            of_table: dict[str, Any] = {key: spec.pop(key) for key in ("table", "vocabularies") if key in spec}
+            sources = fill(RecoverySources, of_table, where)
+            settings = fill(RecoverySettings, spec, where)
+            return Recovery(recovery_table(config, reader, index, sources), settings)
         case None:
-            expert: Expert = build(spec, f"expert.{name}")
+            expert: Expert = build(spec, where, labels=())
+            _must_have(expert, ("name", "digest", "plan"), where, "an expert (tasks.experts.protocol.Expert)")
             return expert
         case other:
-            raise ConfigError(f"expert.{name}.kind={other} is none of human, pdm_closed, recovery; or give _target_")
+            raise ConfigError(f"{where}.kind={other} is none of human, pdm_closed, recovery; or give _target_")
 
 
-def recovery_table(
-    config: RunConfig, reader: ClipReader, index: ClipIndex, table: str | None, vocabularies: Sequence[str]
-) -> RecoveryTable:
+def _must_have(plugged: object, members: Sequence[str], where: str, what: str) -> None:
+    missing = [member for member in members if not hasattr(plugged, member)]
+    if missing:
+        raise ConfigError(f"{where}: {type(plugged).__name__} is not {what}: it has no {', '.join(missing)}")
+
+
+def recovery_table(config: RunConfig, reader: ClipReader, index: ClipIndex, sources: RecoverySources) -> RecoveryTable:
     """The named table, else one of all TRAIN windows and the vocabulary files, kept in the run's cache."""
-    if table is not None:
-        return load_recovery_table(table)
-    files = [*vocabularies, *([config.vocabulary.file] if config.vocabulary.file else [])]
+    if sources.table is not None:
+        return load_recovery_table(sources.table)
+    files = [*sources.vocabularies, *([config.vocabulary.file] if config.vocabulary.file else [])]
     loaded = [load_vocabulary(file) for file in dict.fromkeys(files)]
     train = sorted(ref.clip_id for ref in index.refs)
     key = hashlib.sha256(canonical_json([train, [v.digest for v in loaded]]).encode()).hexdigest()[:16]
