@@ -1,0 +1,189 @@
+"""Perturbation: gates and grid in closed form, the lazy walk against its slow twin, and its promises on a street."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from tasks.chance import stream
+from tasks.experts.pdm_closed import PdmSettings
+from tasks.kinematic_vocabulary import kinematic_trajectories
+from tasks.perturb import (
+    Perturbation,
+    PerturbSettings,
+    end_speed_mps,
+    first_good_per_cell,
+    gate_failures,
+    grid_cells,
+    perturb,
+)
+from tasks.rollout.simulate import TrafficSettings
+from tasks.stages import STAGES, Rejected
+from tasks.vocabulary import Vocabulary
+from tasks.world.clip import HORIZON_STEPS, NOW, Clip
+from tasks.world.frames import to_local
+from tests.tasks.streets import moved, street_clip
+
+SETTINGS = PerturbSettings()
+
+
+def perturbed(
+    clip: Clip, trajectories: NDArray[np.float64], settings: PerturbSettings = SETTINGS, seed: int = 0
+) -> Perturbation | Rejected:
+    rng = stream(seed, clip.clip_id, "perturb")
+    return perturb(clip, Vocabulary(trajectories), settings, TrafficSettings(), PdmSettings(), rng)
+
+
+@pytest.fixture(scope="module")
+def trajectories() -> NDArray[np.float64]:
+    return kinematic_trajectories(500, seed=0)
+
+
+@pytest.fixture(scope="module")
+def found(trajectories: NDArray[np.float64]) -> Perturbation:
+    result = perturbed(street_clip(), trajectories)
+    assert isinstance(result, Perturbation)
+    return result
+
+
+@pytest.mark.parametrize(
+    ("gate", "column", "limit"), [("longitudinal", 0, 20.0), ("lateral", 1, 2.0), ("heading", 2, np.deg2rad(20.0))]
+)
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_gate_keeps_its_limit_and_drops_what_lies_beyond(gate: str, column: int, limit: float, sign: float) -> None:
+    ends = np.zeros((3, 3))
+    ends[:, column] = sign * np.array([0.0, limit, limit + 1e-6])
+    fails = gate_failures(ends, SETTINGS)
+    assert fails[gate].tolist() == [False, False, True]
+    assert not any(fails[other].any() for other in fails if other != gate)
+
+
+def test_the_grid_is_five_metres_by_half_a_metre_with_the_log_in_the_middle_of_a_cell() -> None:
+    ends = [[0, 0], [2.49, 0.249], [-2.49, -0.249], [2.51, 0], [0, 0.251], [-2.51, -0.251], [20, 2], [-20, -2]]
+    cells = grid_cells(np.column_stack([np.array(ends, float), np.zeros(len(ends))]), SETTINGS)
+    assert cells.tolist() == [[0, 0], [0, 0], [0, 0], [1, 0], [0, 1], [-1, -1], [4, 4], [-4, -4]]
+
+
+@pytest.mark.parametrize("name", ["step_longitudinal_m", "step_lateral_m"])
+def test_a_grid_without_a_step_is_refused(name: str) -> None:
+    with pytest.raises(ValueError, match=name):
+        PerturbSettings(**{name: 0.0})
+
+
+def filter_then_pick(cells: NDArray[np.int64], order: Sequence[int], good: Sequence[bool]) -> list[int]:
+    """The slow twin: every score first, then per cell the first good one of the order; cells as first met."""
+    met: dict[tuple[int, ...], None] = {tuple(cells[member].tolist()): None for member in order}
+    kept = [member for member in order if good[member]]
+    firsts = [next((m for m in kept if tuple(cells[m].tolist()) == cell), None) for cell in met]
+    return [member for member in firsts if member is not None]
+
+
+@given(st.data())
+def test_the_lazy_walk_equals_filter_then_pick(data: st.DataObject) -> None:
+    n = data.draw(st.integers(0, 30))
+    cell = st.tuples(st.integers(-2, 2), st.integers(-2, 2))
+    cells = np.array(data.draw(st.lists(cell, min_size=n, max_size=n)), dtype=np.int64).reshape(-1, 2)
+    good = np.array(data.draw(st.lists(st.booleans(), min_size=n, max_size=n)), dtype=bool)
+    order = data.draw(st.permutations(range(n)))[: data.draw(st.integers(0, n))]
+    asked: list[int] = []
+
+    def is_good(members: NDArray[np.int64]) -> NDArray[np.bool_]:
+        asked.extend(members.tolist())
+        return good[members]
+
+    chosen = first_good_per_cell(cells, np.array(order, dtype=np.int64), is_good)
+    assert chosen.tolist() == filter_then_pick(cells, order, good.tolist())
+    assert len(asked) == len(set(asked)), "nothing is scored twice"
+    taken = {tuple(cells[m].tolist()): order.index(m) for m in chosen}
+    assert all(order.index(m) <= taken.get(tuple(cells[m].tolist()), n) for m in asked), "nothing behind the chosen one"
+
+
+def test_candidates_sit_on_black_cells_within_the_gates_one_per_cell(found: Perturbation) -> None:
+    assert len(found.candidates) > 10
+    cells = [candidate.cell for candidate in found.candidates]
+    assert all(sum(cell) % 2 == 0 for cell in cells)
+    assert len(set(cells)) == len(cells)
+    target = street_clip().ego_states[NOW + HORIZON_STEPS, :3]
+    for candidate in found.candidates:
+        end = to_local(target, candidate.rollout.ego_states[-1, :3])
+        np.testing.assert_allclose(candidate.end_pose, end, atol=1e-9)
+        assert not any(gate_failures(end[None], SETTINGS)[gate][0] for gate in ("longitudinal", "lateral", "heading"))
+        assert tuple(grid_cells(end[None], SETTINGS)[0]) == candidate.cell
+
+
+def test_candidates_pass_the_threshold_twice_and_carry_the_rollout_that_proved_it(found: Perturbation) -> None:
+    for candidate in found.candidates:
+        assert candidate.score >= SETTINGS.epdms_min
+        assert candidate.reactive_score >= SETTINGS.epdms_min
+        assert candidate.reactive_scores.pdm_score[1] == candidate.reactive_score
+        assert candidate.rollout.start_step == NOW
+        assert end_speed_mps(candidate) == candidate.rollout.ego_states[-1, 3]
+
+
+def test_every_gated_trajectory_has_a_fate_and_the_counts_agree_with_it(
+    found: Perturbation, trajectories: NDArray[np.float64]
+) -> None:
+    fates, considered = list(found.considered.fate), found.considered
+    kept = {int(considered.vocabulary_index[i]) for i, fate in enumerate(fates) if fate == "kept"}
+    assert kept == {candidate.vocabulary_index for candidate in found.candidates}
+    assert np.isfinite(considered.score[[fate in ("score", "reactive", "kept") for fate in fates]]).all()
+    assert np.isnan(considered.score[[fate not in ("score", "reactive", "kept") for fate in fates]]).all()
+    assert found.gate_counts["white_cell"] == fates.count("white_cell")
+    assert found.gate_counts["replay_score"] == fates.count("score")
+    assert found.gate_counts["reactive_score"] == fates.count("reactive")
+    raw = [found.gate_counts[f"raw_{gate}"] for gate in ("longitudinal", "lateral", "heading")]
+    assert max(raw) <= len(trajectories) - len(fates) <= sum(raw)
+
+
+def test_the_same_seed_gives_the_same_list_and_another_seed_another_order(
+    found: Perturbation, trajectories: NDArray[np.float64]
+) -> None:
+    again, other = perturbed(street_clip(), trajectories), perturbed(street_clip(), trajectories, seed=1)
+    assert isinstance(again, Perturbation)
+    assert isinstance(other, Perturbation)
+    assert [c.vocabulary_index for c in again.candidates] == [c.vocabulary_index for c in found.candidates]
+    for a, b in zip(again.candidates, found.candidates, strict=True):
+        np.testing.assert_array_equal(a.rollout.ego_states, b.rollout.ego_states)
+        assert (a.score, a.reactive_score) == (b.score, b.reactive_score)
+    assert [c.vocabulary_index for c in other.candidates] != [c.vocabulary_index for c in found.candidates]
+
+
+def test_candidates_come_in_the_order_in_which_the_seeded_walk_met_their_cells(
+    found: Perturbation, trajectories: NDArray[np.float64]
+) -> None:
+    walk = stream(0, "street", "perturb").permutation(len(trajectories)).tolist()
+    considered = found.considered
+    black = [i for i, fate in enumerate(considered.fate) if fate not in ("reached_gate", "white_cell")]
+    cells = grid_cells(considered.end_pose, SETTINGS)
+    first_met: dict[tuple[int, int], int] = {}
+    for i in black:
+        cell = (int(cells[i, 0]), int(cells[i, 1]))
+        rank = walk.index(int(considered.vocabulary_index[i]))
+        first_met[cell] = min(rank, first_met.get(cell, rank))
+    ranks = [first_met[candidate.cell] for candidate in found.candidates]
+    assert ranks == sorted(ranks)
+
+
+def test_moving_the_world_moves_the_candidates_along(found: Perturbation, trajectories: NDArray[np.float64]) -> None:
+    elsewhere = perturbed(moved(street_clip(), np.array([900.0, -400.0, 2.5])), trajectories)
+    assert isinstance(elsewhere, Perturbation)
+    assert [c.vocabulary_index for c in elsewhere.candidates] == [c.vocabulary_index for c in found.candidates]
+    for a, b in zip(elsewhere.candidates, found.candidates, strict=True):
+        np.testing.assert_allclose(a.end_pose, b.end_pose, atol=1e-6)
+        assert a.reactive_score == pytest.approx(b.reactive_score, abs=1e-6)
+
+
+def test_a_clip_that_nothing_can_follow_is_rejected_with_a_listed_reason() -> None:
+    reasons = next(stage.reasons for stage in STAGES if stage.name == "perturb")
+    standing = np.zeros((3, 40, 3))  # ends 32 m behind the log
+    result = perturbed(street_clip(), standing)
+    assert isinstance(result, Rejected)
+    assert (result.stage, result.reason) == ("perturb", "no_gated_candidate")
+    unreachable = perturbed(street_clip(), kinematic_trajectories(60, 0), PerturbSettings(epdms_min=1.1))
+    assert isinstance(unreachable, Rejected)
+    assert unreachable.reason == "no_good_candidate"
+    assert "replay_score" in unreachable.detail
+    assert {result.reason, unreachable.reason} <= set(reasons)
