@@ -107,7 +107,7 @@ def execute(
     funnel = funnel_of(store, [ref.clip_id for ref in refs])
     summary = RunSummary(code, message, _counts(plan), driver.executed, driver.seconds, driver.notes, funnel)
     _record(store, summary)
-    for line in (*summary.notes, str(summary.executed), *([message] if message else [])):
+    for line in (*summary.notes, str(summary.executed)):
         say(line)
     return summary
 

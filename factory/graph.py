@@ -13,6 +13,7 @@ from typing import Any
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")  # keeps every listener on 127.0.0.1
 os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+os.environ.setdefault("RAY_task_oom_retries", "2")  # Ray's own default retries a task that runs out of memory for ever
 
 import ray
 from ray.exceptions import RayError
@@ -45,8 +46,12 @@ class RayGraph:
         self._supplied: dict[str, Any] = {"work": [ray.put(work)], "out": out}  # in a list: handed over as a reference
         self._tickets: dict[Any, Ticket] = {}
         self._ready: deque[Any] = deque()
-        _prove_shared(out)
-        _warm_every_node(self._supplied["work"])
+        try:
+            _prove_shared(out)
+            _warm_every_node(self._supplied["work"])
+        except BaseException:
+            self.close()
+            raise
 
     def submit(self, step: str, *args: Any) -> Ticket:
         supplied = [self._supplied[name] for name in WANTS[step]]

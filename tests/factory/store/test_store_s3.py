@@ -1,0 +1,74 @@
+"""The same store behind an object-store URL, against a local S3 server."""
+
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from factory.execute import execute
+from factory.store.location import BadLocation, Location
+from factory.store.reader import SampleTable
+from factory.store.samples import Store
+from factory.store.verify import verify
+from tests.factory.tables import assert_same_tables
+from tests.factory.toy import ToyWork, refs
+
+BUCKET = "bucket"
+
+
+@pytest.fixture(scope="module")
+def s3() -> Iterator[dict[str, str]]:
+    """Storage options of a server in its own process: in a thread of this one it would wait for deltalake's lock."""
+    boto3 = pytest.importorskip("boto3")
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    quiet = subprocess.DEVNULL
+    server = subprocess.Popen(
+        [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)], stdout=quiet, stderr=quiet
+    )
+    try:
+        for _ in range(100):
+            with socket.socket() as client:
+                if client.connect_ex(("127.0.0.1", port)) == 0:
+                    break
+            time.sleep(0.1)
+        url = f"http://127.0.0.1:{port}"
+        keys = {"aws_access_key_id": "a", "aws_secret_access_key": "b", "region_name": "us-east-1"}
+        boto3.client("s3", endpoint_url=url, **keys).create_bucket(Bucket=BUCKET)
+        yield {
+            "AWS_ENDPOINT_URL": url,
+            "AWS_ACCESS_KEY_ID": "a",
+            "AWS_SECRET_ACCESS_KEY": "b",
+            "AWS_REGION": "us-east-1",
+            "AWS_ALLOW_HTTP": "true",
+            "AWS_S3_ALLOW_UNSAFE_RENAME": "true",
+        }
+    finally:
+        server.terminate()
+        server.wait(timeout=10)
+
+
+def test_a_bucket_holds_the_same_rows_as_a_folder(s3: dict[str, str], tmp_path: Path) -> None:
+    url = f"s3://{BUCKET}/runs/one"
+    for rounds in (1, 3):
+        for out in (Store(url, s3), Store(tmp_path)):
+            summary = execute(ToyWork(), refs(3), ["recovery", "human"], rounds, out, "local", say=lambda line: None)
+            assert summary.exit_code == 0
+    assert summary.executed.prepared == 0
+    assert_same_tables(Location.parse(url, s3), tmp_path)
+    assert verify(Store(url, s3)).damage == () and verify(Store(url, s3)).orphans == ()
+    samples = SampleTable(url, s3)
+    assert samples[0]["label_10hz"].shape == (40, 3) and len(samples) == len(SampleTable(tmp_path))
+
+
+def test_a_relative_path_inside_a_submitted_job_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert Location.parse("runs/x").uri.startswith("/")
+    monkeypatch.setenv("RAY_JOB_CONFIG_JSON_ENV_VAR", "{}")
+    with pytest.raises(BadLocation, match="absolute path or a URL"):
+        Location.parse("runs/x")
+    assert Location.parse("/data/x").uri == "/data/x"
