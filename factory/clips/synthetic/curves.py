@@ -12,7 +12,7 @@ def from_curvature(start: Array, pieces: list[tuple[float, float]], step_m: floa
     Curvature is averaged over `ramp_m`, so that a car can follow it without a jump of the steering wheel.
     """
     length = sum(p[0] for p in pieces)
-    n = max(2, int(round(length / step_m)))
+    n = max(2, round(length / step_m))
     step = length / n
     at = (np.arange(n) + 0.5) * step
     edges = np.cumsum([0.0] + [p[0] for p in pieces])

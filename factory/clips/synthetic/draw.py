@@ -136,8 +136,20 @@ def paint(stage: Stage, camera: Camera, world_from_ego: Array) -> NDArray[np.uin
     image = np.empty((camera.height, camera.width, 3), np.uint8)
     mesh = stage.mesh
     shade(
-        seen.ids, seen.planes, mesh.normals, mesh.material, mesh.colour, mesh.extent, mesh.seed, stage.marks,
-        np.ascontiguousarray(world_from_camera[:3, 3]), np.ascontiguousarray(rays), stage.sun.direction, stage.sun.view,
-        stage.shadow, stage.sky_seed, image,
-    )  # fmt: skip
+        seen.ids,
+        seen.planes,
+        mesh.normals,
+        mesh.material,
+        mesh.colour,
+        mesh.extent,
+        mesh.seed,
+        stage.marks,
+        np.ascontiguousarray(world_from_camera[:3, 3]),
+        np.ascontiguousarray(rays),
+        stage.sun.direction,
+        stage.sun.view,
+        stage.shadow,
+        stage.sky_seed,
+        image,
+    )
     return image

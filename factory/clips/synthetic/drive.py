@@ -10,9 +10,9 @@ from factory.clips.synthetic.ego import (
     SLOWEST_MPS,
     Scenario,
     centre_boxes,
-    continue_lanes,
     ego_path,
     is_lawful,
+    on_at_random,
     tracked,
 )
 from factory.clips.synthetic.streets import Road, Streets
@@ -34,10 +34,19 @@ from tasks.world.vehicle import PACIFICA, VX
 WARM_STEPS = 40  # simulated before the log starts, so that it starts in the middle of things
 SPAWN_RADIUS_M = 130.0
 TRIES = 200
+JUNCTION_CLEAR_M = 28.0  # no parked car this near to the ends of a street
 EGO = Driver(
-    1.0, accel=1.2, brake=1.5, jerk=2.0, headway_s=1.6, gap_m=3.0, lateral_accel=1.7, yaw_accel=0.7,
-    front_m=PACIFICA.front_length, half_width_m=PACIFICA.half_width,
-)  # fmt: skip
+    1.0,
+    accel=1.2,
+    brake=1.5,
+    jerk=2.0,
+    headway_s=1.6,
+    gap_m=3.0,
+    lateral_accel=1.7,
+    yaw_accel=0.7,
+    front_m=PACIFICA.front_length,
+    half_width_m=PACIFICA.half_width,
+)
 FLEET = (  # AV2 category, length, width, height, share
     ("REGULAR_VEHICLE", 4.5, 1.84, 1.48, 0.62),
     ("REGULAR_VEHICLE", 4.85, 1.95, 1.78, 0.22),
@@ -91,15 +100,15 @@ class _World:
 
 def parked_cars(streets: Streets, rng: np.random.Generator) -> tuple[Track, ...]:
     """Cars in the parking strips: part of the town, the same in all its logs (poses of one step)."""
-    cars = []
+    cars: list[Track] = []
     for road in streets.roads:
         if road.strip != "park":
             continue
         for forward in (True, False):
             line = road.line if forward else curves.reverse(road.line)
             s_line = curves.arc_length(line)
-            s = 16.0
-            while s < s_line[-1] - 16.0:
+            s = JUNCTION_CLEAR_M
+            while s < s_line[-1] - JUNCTION_CLEAR_M:
                 if rng.random() < 0.8:
                     length, width, height = (
                         4.4 + rng.uniform(-0.4, 0.5),
@@ -145,12 +154,9 @@ def _attempt(
     density: float,
 ) -> Drive | None:
     total = steps + WARM_STEPS
-    times = (np.arange(total) - WARM_STEPS) * STEP_S
+    times: Array = (np.arange(total, dtype=np.float64) - WARM_STEPS) * STEP_S
     ego_driver = replace(EGO, speed_factor=float(rng.uniform(0.86, 1.0)))
-    planned = ego_path(streets, scenario, ego_driver, rng)
-    if planned is None:
-        return None
-    path, start = planned
+    path, start = ego_path(streets, scenario, ego_driver, rng)
     if start + WARM_STEPS * STEP_S * 9.0 + 60.0 > path.s[-1]:
         return None
     signals = _signals(path, start, float(times[0]), rng)
@@ -190,7 +196,7 @@ def _attempt(
 
 
 def _signals(path: Path, start: float, start_time_s: float, rng: np.random.Generator) -> Signals:
-    """Lights that turn green 8 s before to 4 s after the ego would reach its stop line unhindered: it may have to brake."""
+    """Lights that turn green 8 s before to 4 s after the ego would reach the stop line unhindered: it may brake."""
     for line, group in path.stops:
         if 0.0 < line - start < 130.0 and group >= 0:
             arrival = start_time_s + (line - start) / 9.0
@@ -198,8 +204,17 @@ def _signals(path: Path, start: float, start_time_s: float, rng: np.random.Gener
     return Signals(float(rng.uniform(0.0, CYCLE_S)))
 
 
-def _vehicle(world: _World, name: str, path: Path, start: float, speed: float, fleet: int, signals: Signals, times: Array,
-             rng: np.random.Generator) -> bool:  # fmt: skip
+def _vehicle(
+    world: _World,
+    name: str,
+    path: Path,
+    start: float,
+    speed: float,
+    fleet: int,
+    signals: Signals,
+    times: Array,
+    rng: np.random.Generator,
+) -> bool:
     category, length, width, height, _ = FLEET[fleet]
     stretch = float(rng.uniform(0.96, 1.04))
     driver = Driver(front_m=length * stretch / 2, half_width_m=width / 2)
@@ -209,15 +224,30 @@ def _vehicle(world: _World, name: str, path: Path, start: float, speed: float, f
     return world.add(Track(name, category, (length * stretch, width, height), poses, int(rng.integers(1 << 30))), 0.35)
 
 
-def _lead(streets: Streets, world: _World, path: Path, start: float, speed: float, signals: Signals, times: Array,
-          rng: np.random.Generator) -> None:  # fmt: skip
+def _lead(
+    streets: Streets,
+    world: _World,
+    path: Path,
+    start: float,
+    speed: float,
+    signals: Signals,
+    times: Array,
+    rng: np.random.Generator,
+) -> None:
     """A vehicle in front of the ego, on the ego's own way."""
     own = path_of_lanes(streets, list(path.lane_ids), Driver(float(rng.uniform(0.88, 1.02))))
     _vehicle(world, "lead", own, start, speed, int(rng.choice(3, p=[0.7, 0.2, 0.1])), signals, times, rng)
 
 
-def _cars(streets: Streets, world: _World, centre: Array, signals: Signals, times: Array, rng: np.random.Generator,
-          density: float) -> None:  # fmt: skip
+def _cars(
+    streets: Streets,
+    world: _World,
+    centre: Array,
+    signals: Signals,
+    times: Array,
+    rng: np.random.Generator,
+    density: float,
+) -> None:
     spawns = []
     for lane in streets.lanes.values():
         if lane.kind != "VEHICLE" or lane.is_intersection or lane.road == "ring":
@@ -231,15 +261,22 @@ def _cars(streets: Streets, world: _World, centre: Array, signals: Signals, time
     shares = np.array([f[-1] for f in FLEET])
     for k, (_to_end, lane_id, at) in enumerate(sorted(spawns)):
         driver = Driver(float(rng.uniform(0.82, 1.02)))
-        path = path_of_lanes(streets, continue_lanes(streets, [lane_id], None, rng), driver)
+        path = path_of_lanes(streets, on_at_random(streets, [lane_id], rng), driver)
         narrow = streets.lanes[lane_id].speed_mps < 10.0
         fleet = 0 if narrow else int(rng.choice(len(FLEET), p=shares))
         speed = float(np.interp(at, path.s, path.limit)) * float(rng.uniform(0.5, 0.95))
         _vehicle(world, f"vehicle-{k:03d}", path, at, speed, fleet, signals, times, rng)
 
 
-def _cyclists(streets: Streets, world: _World, centre: Array, signals: Signals, times: Array, rng: np.random.Generator,
-              density: float) -> None:  # fmt: skip
+def _cyclists(
+    streets: Streets,
+    world: _World,
+    centre: Array,
+    signals: Signals,
+    times: Array,
+    rng: np.random.Generator,
+    density: float,
+) -> None:
     lanes = [lane for lane in streets.lanes.values() if lane.kind == "BIKE"]
     lanes = [lane for lane in lanes if np.hypot(*(lane.center[len(lane.center) // 2, :2] - centre)) < SPAWN_RADIUS_M]
     for k, lane in enumerate(lanes):
@@ -248,7 +285,7 @@ def _cyclists(streets: Streets, world: _World, centre: Array, signals: Signals, 
         driver = Driver(
             speed_factor=float(rng.uniform(3.6, 5.6)) / lane.speed_mps, front_m=0.9, half_width_m=0.3, gap_m=1.0
         )
-        path = path_of_lanes(streets, continue_lanes(streets, [lane.lane_id], None, rng), driver)
+        path = path_of_lanes(streets, on_at_random(streets, [lane.lane_id], rng), driver)
         start = float(rng.uniform(0.0, 50.0))
         s, _v = drive(path, start, 4.0, driver, world.seen(), signals, times)
         poses = curves.offset(curves.at(path.poses, path.s, s), -0.15)
@@ -256,8 +293,15 @@ def _cyclists(streets: Streets, world: _World, centre: Array, signals: Signals, 
         world.add(Track(f"cyclist-{k:02d}", "BICYCLIST", (1.75, 0.62, 1.72), poses, int(rng.integers(1 << 30))), 0.3)
 
 
-def _walkers(streets: Streets, world: _World, centre: Array, signals: Signals, times: Array, rng: np.random.Generator,
-             density: float) -> None:  # fmt: skip
+def _walkers(
+    streets: Streets,
+    world: _World,
+    centre: Array,
+    signals: Signals,
+    times: Array,
+    rng: np.random.Generator,
+    density: float,
+) -> None:
     """Pedestrians on the pavements, and on the crosswalks while the cars they cross have red."""
     size = (0.55, 0.6, 1.75)
     for road in streets.roads:

@@ -81,44 +81,44 @@ def _near_heading(line: Array, lane: Lane) -> float:
     return float(line[np.argmin(np.hypot(*(line[:, :2] - lane.center[0, :2]).T)), 2])
 
 
-def continue_lanes(streets: Streets, lane_ids: list[int], target: str | None, rng: np.random.Generator) -> list[int]:
-    """The lanes driven after `lane_ids`: the shortest way to `target`, then on at random until the town's edge."""
+def way_to(streets: Streets, lane_id: int, road: str) -> list[int] | None:
+    """The lanes after `lane_id` on the way with the fewest lanes to `road`; None where there is none."""
+    came_from: dict[int, int] = {lane_id: -1}
+    queue = deque([lane_id])
+    while queue and streets.lanes[queue[0]].road != road:
+        here = queue.popleft()
+        for following in streets.lanes[here].successors:
+            if following not in came_from:
+                came_from[following] = here
+                queue.append(following)
+    if not queue:
+        return None
+    way = [queue[0]]
+    while came_from[way[-1]] != lane_id:
+        way.append(came_from[way[-1]])
+    return way[::-1]
+
+
+def on_at_random(streets: Streets, lane_ids: list[int], rng: np.random.Generator) -> list[int]:
+    """The same lanes and up to 14 more, turning at random."""
     out = list(lane_ids)
-    if target is not None:
-        came_from: dict[int, int] = {out[-1]: -1}
-        queue = deque([out[-1]])
-        while queue and streets.lanes[queue[0]].road != target:
-            here = queue.popleft()
-            for n in streets.lanes[here].successors:
-                if n not in came_from:
-                    came_from[n] = here
-                    queue.append(n)
-        if not queue:
-            raise ValueError(f"no way from lane {out[-1]} to {target!r}")
-        way, here = [], queue[0]
-        while here != lane_ids[-1]:
-            way.append(here)
-            here = came_from[here]
-        out += way[::-1]
     while streets.lanes[out[-1]].successors and len(out) < len(lane_ids) + 14:
         out.append(int(rng.choice(streets.lanes[out[-1]].successors)))
     return out
 
 
-def ego_path(
-    streets: Streets, scenario: Scenario, driver: Driver, rng: np.random.Generator
-) -> tuple[Path, float] | None:
-    """The ego's path and its start on it; None where this lane cannot reach the target."""
-    lanes = chains(streets, scenario.road, scenario.forward)
-    chain = lanes[int(rng.integers(len(lanes)))]
-    length = sum(float(curves.arc_length(streets.lanes[k].center)[-1]) for k in chain)
+def ego_path(streets: Streets, scenario: Scenario, driver: Driver, rng: np.random.Generator) -> tuple[Path, float]:
+    """The ego's path and its start on it [m]."""
     near = scenario.to_junction_m
-    start = float(rng.uniform(25.0, 55.0)) if near is None else length - float(rng.uniform(*near))
-    try:
-        lane_ids = continue_lanes(streets, chain, scenario.target, rng)
-    except ValueError:
-        return None
-    return path_of_lanes(streets, lane_ids, driver, EGO_SMOOTH_M), start
+    starts = chains(streets, scenario.road, scenario.forward)
+    for k in rng.permutation(len(starts)):
+        chain = starts[k]
+        way = [] if scenario.target is None else way_to(streets, chain[-1], scenario.target)
+        if way is not None:
+            length = sum(float(curves.arc_length(streets.lanes[lane].center)[-1]) for lane in chain)
+            start = float(rng.uniform(25.0, 55.0)) if near is None else length - float(rng.uniform(*near))
+            return path_of_lanes(streets, on_at_random(streets, chain + way, rng), driver, EGO_SMOOTH_M), start
+    raise ValueError(f"no way from {scenario.road!r} to {scenario.target!r}")
 
 
 def tracked(rear_axle: Array, speed: Array) -> list[tuple[int, Array]]:

@@ -1,5 +1,6 @@
 """Cars, trucks, buses, pedestrians and cyclists as meshes in their own frame: x forward, y left, z up from the road."""
 
+import itertools
 from functools import lru_cache
 
 import numpy as np
@@ -9,13 +10,27 @@ from factory.clips.synthetic.mesh import Builder, Mesh
 from factory.clips.synthetic.traffic import Track
 
 CAR_PAINT = (
-    (0.62, 0.64, 0.66), (0.12, 0.12, 0.13), (0.85, 0.85, 0.84), (0.36, 0.38, 0.40), (0.50, 0.08, 0.09), (0.11, 0.20, 0.42),
-    (0.18, 0.30, 0.24), (0.70, 0.62, 0.50), (0.74, 0.72, 0.70), (0.60, 0.30, 0.10),
-)  # fmt: skip
+    (0.62, 0.64, 0.66),
+    (0.12, 0.12, 0.13),
+    (0.85, 0.85, 0.84),
+    (0.36, 0.38, 0.40),
+    (0.50, 0.08, 0.09),
+    (0.11, 0.20, 0.42),
+    (0.18, 0.30, 0.24),
+    (0.70, 0.62, 0.50),
+    (0.74, 0.72, 0.70),
+    (0.60, 0.30, 0.10),
+)
 CLOTHES = (
-    (0.20, 0.24, 0.40), (0.55, 0.12, 0.14), (0.14, 0.14, 0.15), (0.66, 0.64, 0.58), (0.18, 0.38, 0.30), (0.75, 0.55, 0.18),
-    (0.36, 0.20, 0.38), (0.30, 0.45, 0.62),
-)  # fmt: skip
+    (0.20, 0.24, 0.40),
+    (0.55, 0.12, 0.14),
+    (0.14, 0.14, 0.15),
+    (0.66, 0.64, 0.58),
+    (0.18, 0.38, 0.30),
+    (0.75, 0.55, 0.18),
+    (0.36, 0.20, 0.38),
+    (0.30, 0.45, 0.62),
+)
 HEAD_LIGHT, TAIL_LIGHT, PLATE = (0.95, 0.95, 0.88), (0.62, 0.05, 0.05), (0.86, 0.84, 0.70)
 STRIDE_M = 1.4  # a pedestrian's two steps
 
@@ -74,10 +89,19 @@ def _car(length: float, width: float, height: float, look: int) -> Mesh:
     f, r, w, h = length / 2, -length / 2, width / 2, height
     estate = height > 1.6 or look % 3 == 0
     belt = 0.60 * h
-    hull = [(f - 0.02, 0.22), (f, 0.48), (f - 0.06, 0.66), (f - 0.28, 0.74), (f - 1.12, belt), (r + 0.10 if estate else r + 0.55, belt + 0.02),
-            (r + 0.04, belt - 0.02), (r, 0.55), (r + 0.05, 0.24)]  # fmt: skip
-    for (x0, z0), (x1, z1) in zip(hull[:-1], hull[1:], strict=True):
-        shade = tuple(0.96 * c for c in paint)
+    hull = [
+        (f - 0.02, 0.22),
+        (f, 0.48),
+        (f - 0.06, 0.66),
+        (f - 0.28, 0.74),
+        (f - 1.12, belt),
+        (r + 0.10 if estate else r + 0.55, belt + 0.02),
+        (r + 0.04, belt - 0.02),
+        (r, 0.55),
+        (r + 0.05, 0.24),
+    ]
+    for (x0, z0), (x1, z1) in itertools.pairwise(hull):
+        shade = 0.96 * np.array(paint)
         b.face(
             [(x0, w, z0), (x0, -w, z0), (x1, -w, z1), (x1, w, z1)], tx.DARK if z0 < 0.3 or z1 < 0.3 else tx.METAL, shade
         )
@@ -93,11 +117,26 @@ def _car(length: float, width: float, height: float, look: int) -> Mesh:
     inner = w - 0.06
     top = w - 0.24
     for side in (-1.0, 1.0):
-        b.face([(base_r, side * inner, belt), (base_f, side * inner, belt), (roof_f, side * top, h), (roof_r, side * top, h)],
-               tx.CABIN, paint, look, [(0, 0), (1, 0), (1, 1), (0, 1)])  # fmt: skip
+        b.face(
+            [
+                (base_r, side * inner, belt),
+                (base_f, side * inner, belt),
+                (roof_f, side * top, h),
+                (roof_r, side * top, h),
+            ],
+            tx.CABIN,
+            paint,
+            look,
+            [(0, 0), (1, 0), (1, 1), (0, 1)],
+        )
     for x0, x1 in ((base_f, roof_f), (base_r, roof_r)):
-        b.face([(x0, -inner, belt), (x0, inner, belt), (x1, top, h), (x1, -top, h)], tx.CABIN, (0.14, 0.15, 0.17), look,
-               [(0.08, 0.05), (0.44, 0.05), (0.44, 0.95), (0.08, 0.95)])  # fmt: skip
+        b.face(
+            [(x0, -inner, belt), (x0, inner, belt), (x1, top, h), (x1, -top, h)],
+            tx.CABIN,
+            (0.14, 0.15, 0.17),
+            look,
+            [(0.08, 0.05), (0.44, 0.05), (0.44, 0.95), (0.08, 0.95)],
+        )
     b.face([(roof_r, -top, h), (roof_f, -top, h), (roof_f, top, h), (roof_r, top, h)], tx.METAL, paint)
     for side in (-1.0, 1.0):
         lo, hi = side * (w - 0.38), side * (w - 0.04)
@@ -132,8 +171,13 @@ def _truck(length: float, width: float, height: float, look: int) -> Mesh:
     cab = f - 1.9
     b.box(((cab + f) / 2, 0.0, 1.0), (1.9, width * 0.92, 1.1), tx.METAL, paint)
     b.box(((cab + f) / 2 - 0.05, 0.0, 1.95), (1.8, width * 0.92, 0.8), tx.CABIN, paint, look, 0.92)
-    b.face([(f - 0.02, w * 0.8, 1.5), (f - 0.02, -w * 0.8, 1.5), (f - 0.11, -w * 0.76, 2.25), (f - 0.11, w * 0.76, 2.25)], tx.CABIN,
-           (0.14, 0.15, 0.17), look, [(0.08, 0.05), (0.44, 0.05), (0.44, 0.95), (0.08, 0.95)])  # fmt: skip
+    b.face(
+        [(f - 0.02, w * 0.8, 1.5), (f - 0.02, -w * 0.8, 1.5), (f - 0.11, -w * 0.76, 2.25), (f - 0.11, w * 0.76, 2.25)],
+        tx.CABIN,
+        (0.14, 0.15, 0.17),
+        look,
+        [(0.08, 0.05), (0.44, 0.05), (0.44, 0.95), (0.08, 0.95)],
+    )
     box_r, box_f = r, cab - 0.15
     for side in (-1.0, 1.0):
         b.face(
@@ -142,10 +186,26 @@ def _truck(length: float, width: float, height: float, look: int) -> Mesh:
             paint,
             look,
         )
-        b.face([(f + 0.004, side * (w - 0.5), 0.62), (f + 0.004, side * (w - 0.15), 0.62), (f + 0.004, side * (w - 0.15), 0.85),
-                (f + 0.004, side * (w - 0.5), 0.85)], tx.GLOW, HEAD_LIGHT)  # fmt: skip
-        b.face([(r - 0.006, side * (w - 0.3), 0.9), (r - 0.006, side * (w - 0.08), 0.9), (r - 0.006, side * (w - 0.08), 1.2),
-                (r - 0.006, side * (w - 0.3), 1.2)], tx.GLOW, TAIL_LIGHT)  # fmt: skip
+        b.face(
+            [
+                (f + 0.004, side * (w - 0.5), 0.62),
+                (f + 0.004, side * (w - 0.15), 0.62),
+                (f + 0.004, side * (w - 0.15), 0.85),
+                (f + 0.004, side * (w - 0.5), 0.85),
+            ],
+            tx.GLOW,
+            HEAD_LIGHT,
+        )
+        b.face(
+            [
+                (r - 0.006, side * (w - 0.3), 0.9),
+                (r - 0.006, side * (w - 0.08), 0.9),
+                (r - 0.006, side * (w - 0.08), 1.2),
+                (r - 0.006, side * (w - 0.3), 1.2),
+            ],
+            tx.GLOW,
+            TAIL_LIGHT,
+        )
     for x in (box_r, box_f):
         b.face([(x, -w, 0.85), (x, w, 0.85), (x, w, height), (x, -w, height)], tx.CARGO, paint, look)
     b.face(
@@ -205,8 +265,13 @@ def _cyclist(look: int, phase: int) -> Mesh:
     skin = ((0.80, 0.62, 0.50), (0.55, 0.38, 0.28), (0.70, 0.52, 0.40), (0.36, 0.24, 0.18))[look % 4]
     for x in (-0.52, 0.52):
         b.disc(np.array([x, 0.0, 0.345]), np.array([0.0, 1.0, 0.0]), 0.345, tx.SPOKES, (0.08, 0.08, 0.08), sides=14)
-    for foot, head in (((-0.52, 0, 0.345), (-0.1, 0, 0.85)), ((-0.05, 0, 0.3), (0.42, 0, 0.85)), ((-0.15, 0, 0.8), (0.42, 0, 0.82)),
-                       ((-0.05, 0, 0.3), (-0.18, 0, 0.9)), ((0.52, 0, 0.345), (0.40, 0, 1.0))):  # fmt: skip
+    for foot, head in (
+        ((-0.52, 0, 0.345), (-0.1, 0, 0.85)),
+        ((-0.05, 0, 0.3), (0.42, 0, 0.85)),
+        ((-0.15, 0, 0.8), (0.42, 0, 0.82)),
+        ((-0.05, 0, 0.3), (-0.18, 0, 0.9)),
+        ((0.52, 0, 0.345), (0.40, 0, 1.0)),
+    ):
         b.tube(foot, head, 0.022, tx.METAL, frame, sides=5)
     b.tube((0.38, -0.28, 1.0), (0.38, 0.28, 1.0), 0.02, tx.DARK, (0.1, 0.1, 0.1), sides=5)
     turn = 2 * np.pi * phase / 16

@@ -36,6 +36,11 @@ def merged(parts: list[Mesh]) -> Mesh:
     return Mesh(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Mesh)))
 
 
+def lifted(xy: Array, z: float) -> Array:
+    """Points (..., >= 2) at height z, (..., 3)."""
+    return np.concatenate([xy[..., :2], np.full((*xy.shape[:-1], 1), z)], axis=-1)
+
+
 Colour = tuple[float, float, float] | Array
 
 
@@ -77,9 +82,16 @@ class Builder:
             )
         )
 
-    def quads(self, corners: Array, uv: Array, material: int, colour: Colour = (1.0, 1.0, 1.0),
-              seed: int | NDArray[np.int64] = 0, extent: tuple[float, float] = (0.0, 0.0),
-              normals: Array | None = None) -> None:  # fmt: skip
+    def quads(
+        self,
+        corners: Array,
+        uv: Array,
+        material: int,
+        colour: Colour = (1.0, 1.0, 1.0),
+        seed: int | NDArray[np.int64] = 0,
+        extent: tuple[float, float] = (0.0, 0.0),
+        normals: Array | None = None,
+    ) -> None:
         """Faces of four corners (Q, 4, 3) with uv (Q, 4, 2), each split along its 0-2 diagonal."""
         order = [0, 1, 2, 0, 2, 3]
         points = corners[:, order].reshape(-1, 3, 3)
@@ -94,8 +106,17 @@ class Builder:
             None if normals is None else np.repeat(normals, 2, axis=0),
         )
 
-    def strip(self, left: Array, right: Array, u: Array, v_left: float, v_right: float, material: int,
-              colour: Colour = (1.0, 1.0, 1.0), seed: int = 0) -> None:  # fmt: skip
+    def strip(
+        self,
+        left: Array,
+        right: Array,
+        u: Array,
+        v_left: float,
+        v_right: float,
+        material: int,
+        colour: Colour = (1.0, 1.0, 1.0),
+        seed: int = 0,
+    ) -> None:
         """A ribbon between two polylines (N, 3); u along, v across."""
         corners = np.stack([left[:-1], right[:-1], right[1:], left[1:]], axis=1)
         n = len(corners)
@@ -103,16 +124,30 @@ class Builder:
         vv = np.broadcast_to([v_left, v_right, v_right, v_left], (n, 4))
         self.quads(corners, np.stack([uu, vv], axis=-1), material, colour, seed)
 
-    def face(self, corners: list[tuple[float, float, float]] | Array, material: int, colour: Colour = (1.0, 1.0, 1.0),
-             seed: int = 0, uv: list[tuple[float, float]] | None = None, extent: tuple[float, float] | None = None) -> None:  # fmt: skip
+    def face(
+        self,
+        corners: list[tuple[float, float, float]] | Array,
+        material: int,
+        colour: Colour = (1.0, 1.0, 1.0),
+        seed: int = 0,
+        uv: list[tuple[float, float]] | None = None,
+        extent: tuple[float, float] | None = None,
+    ) -> None:
         """One quad; without `uv` its coordinates are metres along the first edge and across it."""
         c = np.asarray(corners, np.float64)
         width, height = float(np.linalg.norm(c[1] - c[0])), float(np.linalg.norm(c[3] - c[0]))
         coords = np.asarray(uv if uv is not None else [(0, 0), (width, 0), (width, height), (0, height)], np.float64)
         self.quads(c[None], coords[None], material, colour, seed, extent if extent is not None else (width, height))
 
-    def box(self, centre: tuple[float, float, float], size: tuple[float, float, float], material: int,
-            colour: Colour = (1.0, 1.0, 1.0), seed: int = 0, taper: float = 1.0) -> None:  # fmt: skip
+    def box(
+        self,
+        centre: tuple[float, float, float],
+        size: tuple[float, float, float],
+        material: int,
+        colour: Colour = (1.0, 1.0, 1.0),
+        seed: int = 0,
+        taper: float = 1.0,
+    ) -> None:
         """An upright box (no floor); the top is `taper` times the bottom."""
         x, y, z = centre
         a, b, h = size[0] / 2, size[1] / 2, size[2] / 2
@@ -123,8 +158,17 @@ class Builder:
             self.face([low[i], low[j], top[j], top[i]], material, colour, seed, extent=(0.0, 0.0))
         self.face(top, material, colour, seed, extent=(0.0, 0.0))
 
-    def tube(self, foot: tuple[float, float, float], head: tuple[float, float, float], radius: float, material: int,
-             colour: Colour = (1.0, 1.0, 1.0), seed: int = 0, sides: int = 6, taper: float = 1.0) -> None:  # fmt: skip
+    def tube(
+        self,
+        foot: tuple[float, float, float],
+        head: tuple[float, float, float],
+        radius: float,
+        material: int,
+        colour: Colour = (1.0, 1.0, 1.0),
+        seed: int = 0,
+        sides: int = 6,
+        taper: float = 1.0,
+    ) -> None:
         """A prism between two points with smooth normals."""
         a, b = np.asarray(foot, np.float64), np.asarray(head, np.float64)
         axis = (b - a) / np.linalg.norm(b - a)
@@ -142,8 +186,17 @@ class Builder:
         )
         self.quads(corners, uv, material, colour, seed, normals=(ring[:-1] + ring[1:]) / 2)
 
-    def disc(self, centre: Array, axis: Array, radius: float, material: int, colour: Colour = (1.0, 1.0, 1.0),
-             seed: int = 0, sides: int = 10, uv_scale: float = 1.0) -> None:  # fmt: skip
+    def disc(
+        self,
+        centre: Array,
+        axis: Array,
+        radius: float,
+        material: int,
+        colour: Colour = (1.0, 1.0, 1.0),
+        seed: int = 0,
+        sides: int = 10,
+        uv_scale: float = 1.0,
+    ) -> None:
         """A disc facing along `axis`; u to its right, v up, offsets from the centre times `uv_scale`."""
         axis = np.asarray(axis, np.float64) / np.linalg.norm(axis)
         one = np.cross([0.0, 0.0, 1.0], axis)

@@ -1,4 +1,8 @@
-"""Where the town's streets lie: the seeded plan that streets.py's builder turns into lanes and surfaces."""
+"""Where the town's streets lie: the seeded plan that streets.py's builder turns into lanes and surfaces.
+
+A tree of roads around signalised crossroads: an avenue (2+2 lanes) east to a Y-branch, a curved avenue south, a narrow
+street with parked cars north, a winding street west to a roundabout.
+"""
 
 import numpy as np
 import shapely
@@ -82,7 +86,7 @@ def _crossroads(b: _Builder, arms: list[_Arm]) -> None:
 
 def _y_branch(b: _Builder, stem: _Arm, rng: np.random.Generator) -> None:
     """The avenue's inner lane goes to the left branch, the outer one to the right branch."""
-    inward = stem.pose + [0, 0, np.pi]
+    inward = curves.advance(stem.pose, 0.0, turn=np.pi)
     branches = []
     for name, sign in (("right branch", -1.0), ("left branch", 1.0)):
         angle = sign * float(rng.uniform(0.42, 0.55))
@@ -101,7 +105,7 @@ def _y_branch(b: _Builder, stem: _Arm, rng: np.random.Generator) -> None:
 
 def _roundabout(b: _Builder, stem: _Arm, rng: np.random.Generator) -> None:
     """Four arms around a single-lane ring, driven counter-clockwise; arcs between the arms are ordinary lanes."""
-    inward = stem.pose + [0, 0, np.pi]
+    inward = curves.advance(stem.pose, 0.0, turn=np.pi)
     center = curves.advance(inward, ROUNDABOUT_REACH_M)
     first_angle = float(stem.pose[2])
     arms = [stem]

@@ -60,8 +60,8 @@ def rasterise(
                 x_low, x_high, y_low, y_high = min(x_low, px), max(x_high, px), min(y_low, py), max(y_high, py)
         if x_high < 0 or y_high < 0 or x_low > width or y_low > height:
             continue
-        row_low, row_high = max(0, int(math.ceil(y_low - 0.5))), min(height - 1, int(math.floor(y_high - 0.5)))
-        left, right = max(0, int(math.ceil(x_low - 0.5))), min(width - 1, int(math.floor(x_high - 0.5)))
+        row_low, row_high = max(0, math.ceil(y_low - 0.5)), min(height - 1, math.floor(y_high - 0.5))
+        left, right = max(0, math.ceil(x_low - 0.5)), min(width - 1, math.floor(x_high - 0.5))
         if row_low > row_high or left > right:
             continue
         det = 0.0
@@ -82,7 +82,7 @@ def rasterise(
             ky += e[i, 1] * h[i, 3]
             kc += e[i, 2] * h[i, 3]
         kind = material[t]
-        cut_out = kind == LEAVES or kind == TREELINE or kind == SPOKES
+        cut_out = kind in (LEAVES, TREELINE, SPOKES)
         if wants_planes or cut_out:
             p = np.zeros(9)
             for i in range(3):
@@ -106,7 +106,7 @@ def rasterise(
             if stop < start:
                 continue
             key_row = ky * y + kc
-            for column in range(int(math.ceil(start)), int(math.floor(stop)) + 1):
+            for column in range(math.ceil(start), math.floor(stop) + 1):
                 x = column + 0.5
                 key = np.float32(kx * x + key_row)
                 if key > keys[row, column]:

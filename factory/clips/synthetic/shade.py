@@ -84,9 +84,21 @@ def sky(dx: float, dy: float, dz: float, sun: NDArray[np.float64], seed: int) ->
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def surface_colour(
-    kind: int, u: float, v: float, x: float, y: float, fu: float, fv: float, r: float, g: float, b: float,
-    extent_u: float, extent_v: float, seed: int, marks: NDArray[np.float64],
-) -> RGB:  # fmt: skip
+    kind: int,
+    u: float,
+    v: float,
+    x: float,
+    y: float,
+    fu: float,
+    fv: float,
+    r: float,
+    g: float,
+    b: float,
+    extent_u: float,
+    extent_v: float,
+    seed: int,
+    marks: NDArray[np.float64],
+) -> RGB:
     """Colour before light of a material; (r, g, b) is the triangle's own colour, `extent` the size of its face [m]."""
     fp = max(fu, fv)
     if kind == tx.ROAD:
@@ -100,7 +112,7 @@ def surface_colour(
     if kind == tx.FACADE:
         return tx.facade(u, v, extent_u, extent_v, seed, fu, fv)
     if kind == tx.LEAVES:
-        tone = 0.62 + 0.75 * chance(int(math.floor(u / 0.17)), int(math.floor(v / 0.17)), seed)
+        tone = 0.62 + 0.75 * chance(math.floor(u / 0.17), math.floor(v / 0.17), seed)
         return r * tone, g * tone, b * tone
     if kind == tx.KERB:
         joint = 0.7 if u % 1.0 < 0.02 and fu < 0.2 else 1.0
@@ -188,7 +200,7 @@ def lit_by_sun(
     sx = sun_view[0, 0] * x + sun_view[0, 1] * y + sun_view[0, 2] * z + sun_view[0, 3] - 0.5
     sy = sun_view[1, 0] * x + sun_view[1, 1] * y + sun_view[1, 2] * z + sun_view[1, 3] - 0.5
     key = sun_view[3, 0] * x + sun_view[3, 1] * y + sun_view[3, 2] * z + sun_view[3, 3] + bias
-    column, row = int(math.floor(sx)), int(math.floor(sy))
+    column, row = math.floor(sx), math.floor(sy)
     if row < 0 or column < 0 or row + 1 >= shadow.shape[0] or column + 1 >= shadow.shape[1]:
         return 1.0
     a, b = sx - column, sy - row
@@ -250,9 +262,21 @@ def shade(
                     wx, wy, wz = origin[0] + dx * depth, origin[1] + dy * depth, origin[2] + dz * depth
                     kind = material[t]
                     r, g, b = surface_colour(
-                        kind, u, v, wx, wy, fu, fv, colour[t, 0], colour[t, 1], colour[t, 2],
-                        extent[t, 0], extent[t, 1], seed[t], marks,
-                    )  # fmt: skip
+                        kind,
+                        u,
+                        v,
+                        wx,
+                        wy,
+                        fu,
+                        fv,
+                        colour[t, 0],
+                        colour[t, 1],
+                        colour[t, 2],
+                        extent[t, 0],
+                        extent[t, 1],
+                        seed[t],
+                        marks,
+                    )
                     if kind != tx.GLOW:
                         nx, ny, nz = normals[t, 0], normals[t, 1], normals[t, 2]
                         if kind != tx.LEAVES and nx * dx + ny * dy + nz * dz > 0:

@@ -1,9 +1,9 @@
 """The road network of the town: roads, junctions, lanes with their graph, drivable areas, crossings.
 
-The plan is a tree of roads around a signalised crossroads J: an avenue (2+2 lanes) east to a Y-branch, a curved
-avenue south, a narrow street with parked cars north, a winding street west to a roundabout. Traffic drives on the right.
+Traffic drives on the right. Where the streets lie is plan.py's matter.
 """
 
+import itertools
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -137,16 +137,16 @@ class _Builder:
     def road(self, road: Road) -> tuple[_Arm, _Arm]:
         """Lanes of a road in segments of ~80 m; returns the arms at its first and second end."""
         self.roads.append(road)
-        n_cuts = max(1, int(round(curves.arc_length(road.line)[-1] / 80.0)))
+        n_cuts = max(1, round(curves.arc_length(road.line)[-1] / 80.0))
         bounds = np.linspace(0, len(road.line) - 1, n_cuts + 1).astype(int)
         chains: dict[tuple[bool, int], list[int]] = {}
-        for a, b in zip(bounds[:-1], bounds[1:], strict=True):
+        for a, b in itertools.pairwise(bounds):
             innermost = [self._segment(road, road.line[a : b + 1], forward, chains) for forward in (True, False)]
             for here, other in (innermost, innermost[::-1]):
                 self.lanes[here].left_neighbor = other
         for (forward, _), chain in chains.items():
             ordered = chain if forward else chain[::-1]
-            for before, after in zip(ordered[:-1], ordered[1:], strict=True):
+            for before, after in itertools.pairwise(ordered):
                 self.join(before, after)
             crossing = road.crossing_at_end if forward else road.crossing_at_start
             self.lanes[ordered[-1]].stop_before_end = STOP_LINE_M if crossing else 0.5
@@ -160,7 +160,7 @@ class _Builder:
         )
         second = _Arm(
             road,
-            road.line[-1] + [0, 0, np.pi],
+            curves.advance(road.line[-1], 0.0, turn=np.pi),
             [chains[True, k][-1] for k in range(road.lanes)],
             [chains[False, k][-1] for k in range(road.lanes)],
         )
@@ -217,7 +217,7 @@ class _Builder:
             left = curves.advance(arm.pose, 0.0, arm.road.half_width)
             right = curves.advance(after.pose, 0.0, -after.road.half_width)
             parts.append(curves.advance(arm.pose, 0.0, -arm.road.half_width)[None, :2])
-            start, end = left + [0, 0, np.pi], right
+            start, end = curves.advance(left, 0.0, turn=np.pi), right
             kerb = _rounded(start, end, center, round_to) if round_to else curves.bezier(start, end, 0.42)
             kerbs.append(kerb)
             parts.append(kerb[:, :2])

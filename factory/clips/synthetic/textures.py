@@ -9,8 +9,31 @@ import math
 from numba import njit
 
 # Materials
-ASPHALT, ROAD, PAVING, KERB, GRASS, FACADE, ROOF_TILES, FLAT_ROOF, BARK, LEAVES, PAINTED, CABIN, WHEEL, GLOW, METAL, \
-    CLOTH, SIGN, TREELINE, CARGO, BUS_SIDE, SPOKES, ISLAND_STONE, DARK = range(23)  # fmt: skip
+(
+    ASPHALT,
+    ROAD,
+    PAVING,
+    KERB,
+    GRASS,
+    FACADE,
+    ROOF_TILES,
+    FLAT_ROOF,
+    BARK,
+    LEAVES,
+    PAINTED,
+    CABIN,
+    WHEEL,
+    GLOW,
+    METAL,
+    CLOTH,
+    SIGN,
+    TREELINE,
+    CARGO,
+    BUS_SIDE,
+    SPOKES,
+    ISLAND_STONE,
+    DARK,
+) = range(23)
 ALPHA_TESTED = (LEAVES, TREELINE, SPOKES)
 
 
@@ -73,7 +96,7 @@ def asphalt(x: float, y: float, footprint: float) -> RGB:
     """Worn asphalt in world coordinates: broad tones, repairs, cracks, grain."""
     tone = 0.335 + 0.07 * (noise(x / 9.0, y / 9.0, 1) - 0.5) + 0.07 * (noise(x / 1.7, y / 1.7, 2) - 0.5)
     patch_u, patch_v = (x * 0.8 + y * 0.6) / 7.0, (y * 0.8 - x * 0.6) / 11.0
-    if chance(int(math.floor(patch_u)), int(math.floor(patch_v)), 5) < 0.22:
+    if chance(math.floor(patch_u), math.floor(patch_v), 5) < 0.22:
         tone *= 0.86
     blotch = noise(x / 0.45, y / 0.45, 3) - 0.5
     tone += 0.07 * visible(0.45, footprint) * blotch
@@ -242,7 +265,7 @@ def facade(u: float, v: float, width: float, height: float, seed: int, fu: float
 @njit(cache=True, nogil=True, error_model="numpy")
 def shopfront(u: float, v: float, ground: float, seed: int, fu: float, fv: float) -> RGB:
     """Shops of 4.6 m: sign with letters, window with goods, door, stall riser."""
-    shop = int(math.floor(u / 4.6))
+    shop = math.floor(u / 4.6)
     x = u - shop * 4.6
     hue = chance(shop, 21, seed)
     sr, sg, sb = 0.15 + 0.65 * chance(shop, 22, seed), 0.15 + 0.4 * hue, 0.15 + 0.5 * chance(shop, 23, seed)

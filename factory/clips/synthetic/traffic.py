@@ -162,7 +162,7 @@ def _follow(gap: float, v: float, lead_v: float, driver: Driver) -> float:
 
 
 def _on_path(path: Path, driver: Driver, others: Array) -> tuple[Array, Array]:
-    """Rear end (S, J) along the path of everybody in the driver's corridor (inf: not in it), and their speed along it."""
+    """Where along the path everybody in the driver's corridor ends (S, J) (inf: not in it), and speeds along it."""
     steps, n = others.shape[:2]
     if n == 0:
         return np.full((steps, 1), np.inf), np.zeros((steps, 1))

@@ -4,15 +4,18 @@ Argoverse 2's layout (Wilson et al. 2021): annotations, ego poses, calibration, 
 """
 
 import json
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.feather
 import shapely
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from factory.clips.synthetic.curves import Array
@@ -24,6 +27,8 @@ from factory.clips.synthetic.streets import Lane, Streets
 from factory.clips.synthetic.town import LOG_STEPS, STEPS_PER_IMAGE, WINDOWS_PER_LOG, Town, log_name, plan_log
 from factory.clips.synthetic.traffic import GREEN, RED, YELLOW
 from tasks.world.camera import Camera
+
+Stamps = NDArray[np.int64]
 
 LICENCE = "Apache-2.0 (synthetic)"
 ANNOTATION_RANGE_M = 100.0
@@ -89,7 +94,13 @@ def write_log(
 
 
 def _sensors(
-    folder: Path, town: Town, drive: Drive, rig: tuple[Camera, ...], settings: TownSettings, stamps: Array, threads: int
+    folder: Path,
+    town: Town,
+    drive: Drive,
+    rig: tuple[Camera, ...],
+    settings: TownSettings,
+    stamps: Stamps,
+    threads: int,
 ) -> None:
     if not rig and not settings.lidar_beams:
         return
@@ -115,21 +126,21 @@ def _sensors(
         list(pool.map(record, range(0, LOG_STEPS, STEPS_PER_IMAGE)))
 
 
-def _feather(path: Path, columns: dict[str, Array | pa.Array | list[str]]) -> None:
+def _feather(path: Path, columns: Mapping[str, Any]) -> None:
     pyarrow.feather.write_feather(pa.table(columns), path)
 
 
-def _yaw_columns(yaw: Array) -> dict[str, Array]:
+def _yaw_columns(yaw: Array) -> dict[str, Any]:
     zero = np.zeros(len(yaw))
     return {"qw": np.cos(yaw / 2), "qx": zero, "qy": zero, "qz": np.sin(yaw / 2)}
 
 
-def _poses(drive: Drive, stamps: Array) -> dict[str, Array]:
+def _poses(drive: Drive, stamps: Stamps) -> dict[str, Any]:
     place = {"tx_m": drive.ego[:, 0], "ty_m": drive.ego[:, 1], "tz_m": np.full(len(stamps), REAR_AXLE_Z_M)}
     return {"timestamp_ns": stamps, **_yaw_columns(drive.ego[:, 2]), **place}
 
 
-def _annotations(drive: Drive, stamps: Array) -> dict[str, Array | list[str]]:
+def _annotations(drive: Drive, stamps: Stamps) -> dict[str, Any]:
     """One row per box and frame, box pose in the ego frame of that frame."""
     rows: list[tuple[int, int]] = []  # (step, track)
     poses = np.stack([track.poses for track in drive.tracks], axis=1)
@@ -155,7 +166,7 @@ def _annotations(drive: Drive, stamps: Array) -> dict[str, Array | list[str]]:
     }
 
 
-def _lights(streets: Streets, drive: Drive, stamps: Array) -> dict[str, Array | list[str]]:
+def _lights(streets: Streets, drive: Drive, stamps: Stamps) -> dict[str, Any]:
     """A row per frame and light-governed connector of the map; empty where it has none."""
     governed = [lane for lane in _near_lanes(streets, drive) if lane.light_group >= 0]
     if not governed:
@@ -206,7 +217,7 @@ def _near_lanes(streets: Streets, drive: Drive) -> list[Lane]:
     return [lane for lane in streets.lanes.values() if np.hypot(*(lane.center[:, :2] - middle).T).min() < MAP_RANGE_M]
 
 
-def _vector_map(streets: Streets, drive: Drive) -> dict[str, dict[str, object]]:
+def _vector_map(streets: Streets, drive: Drive) -> dict[str, dict[str, Any]]:
     """The vector map around the drive; a neighbour's or successor's id may lie outside it, as in Argoverse's crops."""
     lanes = {
         str(lane.lane_id): {
