@@ -32,6 +32,7 @@ class PendingRow:
     result: Any
     n_bytes: int
     partition: tuple[int, str]  # round, expert
+    licence: str
 
 
 @dataclass
@@ -125,4 +126,5 @@ class Gatherer:
         return True
 
     def _commit(self, batch: Batch) -> None:
-        self._store.commit(batch.candidates, batch.shards, batch.outcomes, batch.replaced, batch.unlisted)
+        licences = {row.licence for rows in batch.rows.values() for row in rows}
+        self._store.commit(batch.candidates, batch.shards, batch.outcomes, batch.replaced, batch.unlisted, licences)

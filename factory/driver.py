@@ -160,7 +160,7 @@ class Driver:
             return
         key = attempt_id(clip_id, CLIP_CANDIDATE, self._identity.vocabulary_digest, "", "")
         outcome = self._outcome(clip.ref, key, "", CLIP_CANDIDATE, report, tries_before(clip.past), {}, {})
-        clip.past = Past(key, Kind(outcome.kind), True, outcome=outcome)
+        clip.past = _past(outcome)
         clip.failed = outcome.kind == Kind.FAILED
         unlisted = [clip_id] if isinstance(report, Rejected) else []
         self._gatherer.add(outcomes=[outcome], replaced=replaced, unlisted=unlisted)
@@ -191,7 +191,7 @@ class Driver:
             assert isinstance(step, Exhausted)
             stamp = self._stamp(clip.ref, walk.expert, Try(step.n_tried, -1))
             outcome = self._outcome(clip.ref, stamp.attempt_id, walk.expert, step.n_tried, step, 0, {}, {})
-            walk.known[step.n_tried] = Past(stamp.attempt_id, Kind.EXHAUSTED, True, outcome=outcome)
+            walk.known[step.n_tried] = _past(outcome)
             self._keep(clip, walk, outcomes=[outcome])
         rows, outcomes = self._held.pop((clip.ref.clip_id, walk.expert), ([], []))
         if isinstance(step, Complete | Exhausted):
@@ -209,7 +209,7 @@ class Driver:
             self._count(report.seconds)
         if isinstance(report, Attempted) and report.rejected is None:
             walk.known[stamp.candidate_index] = Past(stamp.attempt_id, Kind.ACCEPTED, True, round=stamp.round)
-            row = PendingRow(result, report.n_bytes, (stamp.round, stamp.expert))
+            row = PendingRow(result, report.n_bytes, (stamp.round, stamp.expert), report.licence)
             self._keep(clip, walk, rows=[row])
             self._tally.accepted += 1
         else:
@@ -219,7 +219,7 @@ class Driver:
             outcome = self._outcome(
                 clip.ref, stamp.attempt_id, stamp.expert, stamp.candidate_index, what, tries_before(known), *measured
             )
-            walk.known[stamp.candidate_index] = Past(stamp.attempt_id, Kind(outcome.kind), True, outcome=outcome)
+            walk.known[stamp.candidate_index] = _past(outcome)
             if outcome.kind == Kind.FAILED:
                 self._fresh.add(stamp.attempt_id)
             self._keep(clip, walk, outcomes=[outcome])
@@ -309,3 +309,8 @@ class Driver:
         for stage, spent in seconds.items():
             self._seconds[stage][0] += 1
             self._seconds[stage][1] += spent
+
+
+def _past(outcome: Outcome) -> Past:
+    kind = Kind(outcome.kind)
+    return Past(outcome.attempt_id, kind, True, -1, outcome.error_kind, outcome.tries, outcome.stage_versions)

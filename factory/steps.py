@@ -16,7 +16,7 @@ from factory.clips.reader import BadClip, ClipRef
 from factory.store.cache import BadCacheFile, ClipCache
 from factory.store.location import Location
 from factory.store.outcomes import ErrorKind
-from factory.store.schema import sample_row_to_table, samples_spec
+from factory.store.schema import SAMPLES, sample_row_to_table
 from factory.store.table import Shard, write_shard
 from factory.work import Accepted, CandidateRow, PreparedClip, Work
 from tasks.stages import Rejected
@@ -51,6 +51,7 @@ class Attempted:
 
     rejected: Rejected | None  # None: accepted, and the result is the row
     n_bytes: int = 0  # of the row
+    licence: str = ""  # of its source
     subscores: Mapping[str, float] = field(default_factory=dict)
     seconds: Mapping[str, float] = field(default_factory=dict)
 
@@ -104,9 +105,9 @@ def attempt(work: Work, prepared: PreparedClip, stamp: Stamp) -> tuple[Attempted
         result = work.attempt(prepared, stamp.candidate_index, stamp.expert)
         seconds = result.seconds or {"attempt": time.perf_counter() - began}
         if not isinstance(result, Accepted):
-            return Attempted(result.rejected, 0, dict(result.subscores), seconds), None
+            return Attempted(result.rejected, subscores=dict(result.subscores), seconds=seconds), None
         row = sample_row_to_table([{**result.row, **vars(stamp)}])
-        return Attempted(None, row.nbytes, {}, seconds), row
+        return Attempted(None, row.nbytes, str(result.row["licence"]), seconds=seconds), row
     except Exception as error:  # the same boundary
         return failure_of(error), None
 
@@ -114,7 +115,7 @@ def attempt(work: Work, prepared: PreparedClip, stamp: Stamp) -> tuple[Attempted
 def write(out: Location, *rows: pa.Table) -> tuple[Shard | Failure, None]:
     """Rows of one partition as one shard."""
     try:
-        return write_shard(out.child("samples"), samples_spec(), pa.concat_tables(rows)), None
+        return write_shard(out.child("samples"), SAMPLES, pa.concat_tables(rows)), None
     except OSError as error:
         return failure_of(error), None
 

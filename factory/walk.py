@@ -8,7 +8,7 @@ on would give later samples another round than in a run without the incident, an
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from factory.store.outcomes import ErrorKind, Kind, Outcome
+from factory.store.outcomes import ErrorKind, Kind
 from factory.store.samples import Past
 from factory.work import HUMAN, HUMAN_CANDIDATE
 
@@ -75,8 +75,7 @@ def retry_policy(retry: bool, versions_json: str) -> Callable[[Past], bool]:
     versions than the failure's, all."""
 
     def may_retry(past: Past) -> bool:
-        assert past.outcome is not None
-        return retry or past.outcome.error_kind == ErrorKind.SYSTEM or past.outcome.stage_versions != versions_json
+        return retry or past.error_kind == ErrorKind.SYSTEM or past.stage_versions != versions_json
 
     return may_retry
 
@@ -88,5 +87,4 @@ def never(past: Past) -> bool:
 
 def tries_before(past: Past | None) -> int:
     """Runs that already failed at this attempt for the system's sake."""
-    outcome: Outcome | None = past.outcome if past is not None else None
-    return outcome.tries if outcome is not None and outcome.error_kind == ErrorKind.SYSTEM else 0
+    return past.tries if past is not None and past.error_kind == ErrorKind.SYSTEM else 0

@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from factory.store.location import Location
-from factory.store.schema import samples_spec, table_to_rows
+from factory.store.schema import SAMPLES, table_to_rows
 from factory.store.table import KeyedTable
 
 if TYPE_CHECKING:
@@ -37,8 +37,8 @@ class SampleTable:
     def __init__(self, path: str | os.PathLike[str], storage_options: Mapping[str, str] | None = None) -> None:
         """path: the run's `out` or its folder `samples`. Raises FileNotFoundError where there is no table."""
         location = Location.parse(path, storage_options)
-        here = KeyedTable(location, samples_spec())
-        self._table = here if here.version is not None else KeyedTable(location.child("samples"), samples_spec())
+        here = KeyedTable(location, SAMPLES)
+        self._table = here if here.version is not None else KeyedTable(location.child("samples"), SAMPLES)
         if self._table.version is None:
             raise FileNotFoundError(f"{location.uri}: no table of samples here or in its folder samples")
         self._partitions = self._table.live_files()

@@ -8,30 +8,23 @@ import json
 import os
 import re
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 from factory.store.cache import ClipCache
 from factory.store.candidates import CANDIDATES, ClipCandidates, candidates_of, candidates_table
 from factory.store.location import Location
-from factory.store.outcomes import OUTCOMES, Kind, Outcome, outcomes_of, outcomes_table
-from factory.store.schema import SCHEMA_VERSION, samples_spec
+from factory.store.outcomes import OUTCOMES, Kind, Outcome, outcomes_table
+from factory.store.schema import LICENCES_PROPERTY, SAMPLES, SCHEMA_VERSION
 from factory.store.table import KeyedTable, Shard, write_shard
 from factory.work import RunIdentity, canonical_json
 
 OnChange = Literal["stop", "keep", "redo"]
 RUN_FILE = "run.json"
-SAMPLE_STATE = [
-    "attempt_id",
-    "clip_id",
-    "expert",
-    "expert_digest",
-    "candidate_index",
-    "round",
-    "settings_hash",
-    "stage_versions",
-]
+STATE = ["attempt_id", "clip_id", "expert", "expert_digest", "candidate_index", "settings_hash", "stage_versions"]
+SAMPLE_STATE = [*STATE, "round"]
+OUTCOME_STATE = [*STATE, "kind", "error_kind", "tries"]
 
 
 class ChangedRun(ValueError):
@@ -41,7 +34,7 @@ class ChangedRun(ValueError):
 Place = tuple[str, str]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Past:
     """What the tables say about one attempt."""
 
@@ -49,7 +42,9 @@ class Past:
     kind: Kind
     current: bool  # made under the run's own settings, versions and expert inputs
     round: int = -1  # accepted: its round
-    outcome: Outcome | None = None  # not accepted: its row
+    error_kind: str = ""  # failed: ErrorKind
+    tries: int = 0  # failed: runs that tried it
+    stage_versions: str = ""  # failed: under which
 
 
 @dataclass(frozen=True)
@@ -68,7 +63,7 @@ class Store:
         self, out: str | os.PathLike[str] | Location, storage_options: Mapping[str, str] | None = None
     ) -> None:
         self.location = out if isinstance(out, Location) else Location.parse(out, storage_options)
-        self.samples = KeyedTable(self.location.child("samples"), samples_spec())
+        self.samples = KeyedTable(self.location.child("samples"), SAMPLES)
         self.candidates = KeyedTable(self.location.child("candidates"), CANDIDATES)
         self.outcomes = KeyedTable(self.location.child("outcomes"), OUTCOMES)
 
@@ -156,9 +151,11 @@ class Store:
             if not past.current:
                 stale[place].add(past.attempt_id)
 
-        for o in outcomes_of(self.outcomes.read()):
-            is_current = current(o.settings_hash, o.stage_versions, o.expert, o.expert_digest)
-            enter((o.clip_id, o.expert), o.candidate_index, Past(o.attempt_id, Kind(o.kind), is_current, outcome=o))
+        for row in self.outcomes.read(OUTCOME_STATE).to_pylist():
+            is_current = current(row["settings_hash"], row["stage_versions"], row["expert"], row["expert_digest"])
+            error_kind, tries, versions = row["error_kind"], row["tries"], row["stage_versions"]
+            past = Past(row["attempt_id"], Kind(row["kind"]), is_current, -1, error_kind, tries, versions)
+            enter((row["clip_id"], row["expert"]), row["candidate_index"], past)
         for row in self.samples.read(SAMPLE_STATE).to_pylist():
             is_current = current(row["settings_hash"], row["stage_versions"], row["expert"], row["expert_digest"])
             past = Past(row["attempt_id"], Kind.ACCEPTED, is_current, round=row["round"])
@@ -173,6 +170,7 @@ class Store:
         outcomes: Sequence[Outcome],
         replaced: Sequence[str] = (),
         unlisted: Sequence[str] = (),
+        licences: Collection[str] = (),
     ) -> None:
         """Commit one group of results, in place of the rows of attempts `replaced` and the lists of clips `unlisted`.
 
@@ -181,10 +179,18 @@ class Store:
         lists = [write_shard(self.candidates.location, CANDIDATES, candidates_table(candidates))] if candidates else []
         self.candidates.commit(lists, drop=[*unlisted, *(row.clip_id for row in candidates)])
         accepted = [key for shard in shards for key in shard.keys]
+        self._note_licences(licences)
         self.samples.commit(shards, drop=replaced)
         # A failed outcome stands until its attempt succeeds: then it goes, and it never stands twice.
         files = [write_shard(self.outcomes.location, OUTCOMES, outcomes_table(outcomes))] if outcomes else []
         self.outcomes.commit(files, drop=[*accepted, *replaced, *(o.attempt_id for o in outcomes)])
+
+    def _note_licences(self, licences: Collection[str]) -> None:
+        """The table's own metadata names every licence of its rows, before the first such row is there."""
+        known = self.samples.properties.get(LICENCES_PROPERTY, "")
+        named = {line for line in (*known.split("; "), *licences) if line}
+        if "; ".join(sorted(named)) != known:
+            self.samples.set_property(LICENCES_PROPERTY, "; ".join(sorted(named)))
 
 
 def differences(old: Mapping[str, object], new: Mapping[str, object]) -> list[str]:

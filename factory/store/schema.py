@@ -161,10 +161,10 @@ BOOKKEEPING = (
 )
 
 
-def samples_spec(licences: Sequence[str] = ()) -> TableSpec:
-    """The table `samples`; its properties carry schema_version and the licences of the sources."""
-    properties = {"factory.schema_version": str(SCHEMA_VERSION), "factory.licences": "; ".join(sorted(set(licences)))}
-    return TableSpec("samples", SCHEMA, "attempt_id", ("round", "expert"), properties)
+LICENCES_PROPERTY = "factory.licences"  # of the table `samples`: the licences of its rows' sources, "; " between
+SAMPLES = TableSpec(
+    "samples", SCHEMA, "attempt_id", ("round", "expert"), {"factory.schema_version": str(SCHEMA_VERSION)}
+)
 
 
 def sample_row_to_table(rows: Sequence[Mapping[str, object]]) -> pa.Table:

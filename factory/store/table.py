@@ -191,6 +191,21 @@ class KeyedTable:
         for written in (*kept, *add):
             path_of.update(dict.fromkeys(written.keys, written.path))
 
+    @property
+    def properties(self) -> Mapping[str, str]:
+        """The table's own metadata; empty before its first commit."""
+        if self._delta is None:
+            return {}
+        return {name: value for name, value in self._delta.metadata().configuration.items() if value is not None}
+
+    def set_property(self, name: str, value: str) -> None:
+        """One more commit, of metadata. Raises AnotherWriter."""
+        table = self._delta if self._delta is not None else self._create()
+        version = table.version()
+        table.alter.set_table_properties({name: value}, raise_if_not_exists=False)
+        table.update_incremental()
+        self._check_alone(version)
+
     def _without(self, path: str, partition: Mapping[str, str], dropped: set[str]) -> Shard | None:
         rows = self.read_file(path, partition)
         rows = rows.filter(pc.invert(pc.is_in(rows[self.spec.key], value_set=pa.array(sorted(dropped), pa.string()))))
@@ -213,7 +228,11 @@ class KeyedTable:
             raise AnotherWriter(f"{self.spec.name}: another run has taken over {self.location.uri}") from error
         version = table.version()
         table.update_incremental()
-        if table.version() != version + 1:
+        self._check_alone(version)
+
+    def _check_alone(self, version: int) -> None:
+        """Between `version` and now there was one commit, our own."""
+        if self.version != version + 1:
             raise AnotherWriter(f"{self.spec.name}: another run has taken over {self.location.uri}")
 
     def _create(self) -> DeltaTable:

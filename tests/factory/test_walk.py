@@ -3,14 +3,13 @@
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from factory.store.outcomes import ErrorKind, Kind, Outcome
+from factory.store.outcomes import ErrorKind, Kind
 from factory.store.samples import Past
 from factory.walk import Blocked, Complete, Exhausted, Step, Try, never, next_step, retry_policy
 
 
 def past(kind: Kind, round_: int = -1, error: str = "", versions: str = "v1") -> Past:
-    outcome = Outcome("id", "clip", "d", "l", "e", "", 0, kind, "s", versions, error_kind=error)
-    return Past("id", kind, True, round_, None if kind is Kind.ACCEPTED else outcome)
+    return Past("id", kind, True, round_, error, 1, versions)
 
 
 def walk(accepts: list[bool], rounds: int, known: dict[int, Past] | None = None) -> tuple[dict[int, Past], Step, int]:

@@ -37,6 +37,13 @@ def test_samples_are_the_same_by_place_key_iteration_and_table(out: Path) -> Non
     assert samples.schema.field("label_10hz").metadata[b"frame"] == b"ego at now"
 
 
+def test_the_tables_metadata_names_version_and_licences(out: Path) -> None:
+    properties = Store(out).samples.properties
+    licences = set(SampleTable(out).table(["licence"])["licence"].to_pylist())
+    assert properties["factory.schema_version"] == "1"
+    assert set(properties["factory.licences"].split("; ")) == licences and len(licences) > 1
+
+
 def test_a_table_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=str(tmp_path)):
         SampleTable(tmp_path)
