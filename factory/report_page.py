@@ -1,0 +1,441 @@
+"""The text of report.html: one file with its style, its pictures and nothing fetched from anywhere.
+
+What data brings in (log ids, messages, paths) passes through `el`, which escapes it.
+"""
+
+import base64
+import html
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from factory.funnel import Funnel, FunnelRow
+from factory.report_html import Html, el
+from factory.report_plot import FATES, EndPoint, fate_mark, scatter
+from factory.report_style import STYLE
+from tasks.perturb import PerturbSettings
+
+# Paper (DESIGN.md, "words"): clips with a sample of the round, in % of those with one of the round before.
+PAPER_CLIP_PERCENT = {"pdm_closed": (63, 85, 83, 83, 84), "recovery": (43, 80, 78, 78, 78)}
+REASON_WORDS = {
+    "nc": "collision at fault",
+    "dac": "left the drivable area",
+    "ddc": "against the driving direction",
+    "tlc": "ran a red light",
+    "ep": "too little progress",
+    "ttc": "time to collision",
+    "lk": "lane keeping",
+    "hc": "uncomfortable against the history",
+    "no_plan": "the expert found no plan",
+    "ego_unstable": "the ego could not be tracked",
+    "psnr": "block reconstructed too poorly",
+    "no_asset": "block cannot be rendered",
+    "ego_standing": "ego stands",
+    "broken_tracks": "broken tracks",
+    "no_gated_candidate": "no trajectory passes the gates",
+    "no_good_candidate": "no trajectory scores well enough",
+    "input": "input is broken",
+    "bug": "the code raised",
+    "system": "machine trouble",
+    "poison": "machine trouble again and again",
+}
+GATE_WORDS = {
+    "raw_longitudinal": "raw end pose too far along",
+    "raw_lateral": "raw end pose too far aside",
+    "raw_heading": "raw end pose turned too far",
+    "reached_longitudinal": "reached end pose too far along",
+    "reached_lateral": "reached end pose too far aside",
+    "reached_heading": "reached end pose turned too far",
+    "white_cell": "in a cell the grid leaves out",
+    "scored": "scored against log replay",
+    "kept_by_replay": "good against log replay",
+    "kept": "good among reacting agents: candidates",
+}
+MAX_POINTS = 4000  # in the scatter; more would make the file heavy and show nothing new
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A JPEG with its caption; `data` None where there is none, and the caption says why."""
+
+    data: bytes | None
+    caption: str
+    detail: str = ""
+    tone: str = ""  # accepted | rejected | ""
+
+
+@dataclass(frozen=True)
+class Strip:
+    """What the cameras of one sample saw."""
+
+    title: str
+    source: str
+    now: tuple[Picture, ...]
+    earlier: tuple[Picture, ...] = ()
+
+
+@dataclass(frozen=True)
+class FailedRow:
+    """A failed attempt, or a failed clip where `expert` is empty."""
+
+    log_id: str
+    clip_id: str
+    expert: str
+    kind: str
+    tries: int
+    error: str
+
+
+@dataclass(frozen=True)
+class Report:
+    """Everything on the page."""
+
+    where: str
+    status: str
+    status_tone: str  # good | warn | bad
+    facts: Mapping[str, str]
+    funnel: Funnel
+    sources: Mapping[str, int]  # image_source -> samples
+    stage_seconds: Mapping[str, tuple[int, float]]  # stage -> tasks, seconds of the newest run
+    notes: Sequence[str] = ()
+    examples: Sequence[Picture] = ()
+    n_rejected: int = 0  # simulated attempts
+    strips: Sequence[Strip] = ()
+    end_points: Sequence[EndPoint] = ()
+    grid: PerturbSettings = field(default_factory=PerturbSettings)
+    failed: Sequence[FailedRow] = ()
+    n_failed: int = 0
+    filtered_windows: Mapping[str, int] = field(default_factory=dict)
+    skipped_logs: Mapping[str, str] = field(default_factory=dict)
+    broken_logs: Mapping[str, str] = field(default_factory=dict)
+    settings: Mapping[str, str] = field(default_factory=dict)
+
+
+def page(report: Report) -> str:
+    """The whole file."""
+    body = [
+        _header(report),
+        _funnel(report.funnel),
+        _reasons(report.funnel),
+        _gates(report.funnel),
+        _examples(report.examples, report.n_rejected),
+        _frames(report),
+        _coverage(report.end_points, report.grid),
+        _seconds(report),
+        _trouble(report),
+        _settings(report.settings),
+    ]
+    head = el(
+        "head",
+        Html('<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'),
+        Html('<meta name="color-scheme" content="light dark">'),
+        el("title", f"Driving data factory: {report.where}"),
+        el("style", Html(STYLE)),
+    )
+    document = el("html", head, el("body", el("main", *body)), lang="en")
+    return f"<!doctype html>\n{document}\n"
+
+
+def _section(title: str, lead: str, *content: Html) -> Html:
+    return el("section", el("h2", title), el("p", lead, class_="lead"), *content)
+
+
+def _header(report: Report) -> Html:
+    rows = report.funnel.rows
+    tried = sum(r.accepted + r.rejected + r.failed for r in rows)
+    samples = sum(r.accepted for r in rows)
+    simulated = [r for r in rows if r.expert != "human"]
+    n_simulated = sum(r.accepted for r in simulated)
+    attempts = sum(r.accepted + r.rejected + r.failed for r in simulated)
+    tiles = (
+        ("samples", samples, f"{n_simulated} simulated, {samples - n_simulated} logged"),
+        ("attempts", tried, f"{_percent(n_simulated, attempts)} of the simulated accepted"),
+        ("clips", report.funnel.clips_prepared, f"{report.funnel.candidates} candidates"),
+        ("failed", report.n_failed, "see the list below" if report.n_failed else "nothing broke"),
+    )
+    return el(
+        "header",
+        el("div", el("h1", "Driving data factory"), el("span", report.status, class_=f"pill {report.status_tone}")),
+        el("p", report.where, class_="path"),
+        el(
+            "div",
+            *(
+                el("div", el("b", f"{value:,}"), el("span", name), el("small", note), class_="tile", data_count=name)
+                for name, value, note in tiles
+            ),
+            class_="tiles",
+        ),
+        el("dl", *(el("div", el("dt", k), el("dd", v)) for k, v in report.facts.items())),
+        *(el("p", note, class_="note") for note in report.notes),
+    )
+
+
+def _funnel(funnel: Funnel) -> Html:
+    head = (
+        "expert",
+        "round",
+        "tried",
+        "accepted",
+        "of attempts",
+        "clips",
+        "of clips of the round before",
+        "paper",
+        "of all clips",
+    )
+    table = _table(head, [_funnel_row(row) for row in funnel.rows], "funnel")
+    lead = (
+        "Round r holds the (r+1)-th accepted sample of each clip and expert. Of attempts: accepted of tried. Of clips: "
+        "clips with a sample of this round, of those with one of the round before; that is the rate to hold against "
+        "the paper's, which the mark on the bar shows."
+    )
+    extra = [
+        f"{expert}: {count} {'walk' if count == 1 else 'walks'} came to the end of the candidate list"
+        for expert, count in funnel.exhausted.items()
+    ]
+    return _section("Acceptance funnel", lead, table, *(el("p", line, class_="note") for line in extra))
+
+
+def _funnel_row(row: FunnelRow) -> list[Html]:
+    published = PAPER_CLIP_PERCENT.get(row.expert, ())
+    paper = published[row.round] if row.round < len(published) else None
+    tried = row.accepted + row.rejected + row.failed
+    return [
+        el("th", row.expert, scope="row"),
+        _number(row.round),
+        _number(tried),
+        _number(row.accepted),
+        el("td", _bar(row.attempt_rate)),
+        el("td", f"{row.clips} / {row.clips_before}", class_="n"),
+        el("td", _bar(row.clip_rate, paper)),
+        el("td", f"{paper} %" if paper is not None else "-", class_="n dim"),
+        el("td", _bar(row.clip_rate_of_all)),
+    ]
+
+
+def _reasons(funnel: Funnel) -> Html:
+    experts = list(dict.fromkeys(row.expert for row in funnel.rows if row.reasons))
+    counts: dict[str, dict[str, int]] = {}
+    for row in funnel.rows:
+        for reason, count in row.reasons.items():
+            per_expert = counts.setdefault(reason, dict.fromkeys(experts, 0))
+            per_expert[row.expert] += count
+    clip_reasons = {**funnel.clip_outcomes, **funnel.clips_without_candidates}
+    most = max((max(per.values()) for per in counts.values()), default=1)
+    order = sorted(counts, key=lambda reason: (-sum(counts[reason].values()), reason))
+    rows = [
+        [_reason_cell(reason)]
+        + [el("td", _count_bar(counts[reason][expert], most)) for expert in experts]
+        + [_number(sum(counts[reason].values()))]
+        for reason in order
+    ]
+    content = (
+        [_table(("stage and reason", *experts, "all"), rows, "reasons")]
+        if rows
+        else [_nothing("No attempt was turned down.")]
+    )
+    if clip_reasons:
+        content.append(el("h3", "Clips that never came to a simulated attempt"))
+        content.append(
+            _table(
+                ("stage and reason", "clips"), [[_reason_cell(k), _number(n)] for k, n in clip_reasons.items()], "clips"
+            )
+        )
+    lead = "Every attempt that is not a sample has a reason: the first sub-score below its threshold, or what failed."
+    return _section("Why attempts fell", lead, *content)
+
+
+def _reason_cell(reason: str) -> Html:
+    words = REASON_WORDS.get(reason.rpartition(".")[2], "")
+    return el("th", reason, el("small", words), scope="row")
+
+
+def _gates(funnel: Funnel) -> Html:
+    most = max(funnel.gates.values(), default=1)
+    rows = [
+        [
+            el("th", gate, scope="row"),
+            el("td", GATE_WORDS.get(gate, ""), class_="dim"),
+            el("td", _count_bar(count, most)),
+        ]
+        for gate, count in funnel.gates.items()
+    ]
+    lead = (
+        f"What perturb did with the vocabulary, summed over {funnel.clips_prepared} clips. The raw gates count "
+        "independently: one trajectory may fall to several."
+    )
+    content = _table(("gate", "", "trajectories"), rows, "gates") if rows else _nothing("No clip was perturbed.")
+    return _section("Perturbation gates", lead, content)
+
+
+def _examples(examples: Sequence[Picture], n_rejected: int) -> Html:
+    key = el(
+        "p",
+        *(
+            el("span", el("i", class_=f"key {name}"), text)
+            for name, text in (
+                ("logged", "logged drive"),
+                ("perturbed", "perturbation, T to T+H"),
+                ("expert", "expert, T+H to T+2H"),
+                ("ego", "ego at T+H"),
+            )
+        ),
+        class_="keys",
+    )
+    lead = "Seen from above at T+H, the ego pointing up; 80 m from bottom to top."
+    groups = []
+    for tone in ("accepted", "rejected"):
+        chosen = [picture for picture in examples if picture.tone == tone]
+        groups.append(el("h3", tone.capitalize()))
+        missing = f"No simulated attempt was {tone}."
+        if tone == "rejected" and n_rejected:
+            missing = f"None of the {n_rejected} can be drawn: other settings, or clips that are not in this run."
+        groups.append(el("div", *(_figure(p) for p in chosen), class_="cards") if chosen else _nothing(missing))
+    return _section("Examples", lead, key, *groups)
+
+
+def _frames(report: Report) -> Html:
+    total = sum(report.sources.values())
+    counts = ", ".join(f"{count} of {total} samples: {source}" for source, count in sorted(report.sources.items()))
+    words = (
+        "photo: the log's own image. render: drawn from the block's reconstruction at the simulated poses. "
+        "map: lanes and boxes drawn. none: no images."
+    )
+    strips = [
+        el(
+            "div",
+            el("h3", strip.title, " ", el("span", strip.source, class_="pill plain")),
+            el("div", *(_figure(p) for p in strip.now), class_="cams"),
+            *([el("div", *(_figure(p) for p in strip.earlier), class_="cams small")] if strip.earlier else []),
+            class_="strip",
+        )
+        for strip in report.strips
+    ]
+    content = strips or [_nothing("No sample of this store has images.")]
+    return _section("Camera frames", words, el("p", f"image_source: {counts or 'no samples'}", class_="note"), *content)
+
+
+def _figure(picture: Picture) -> Html:
+    if picture.data is None:
+        shown = el("div", "no picture", class_="missing")
+    else:
+        data = base64.b64encode(picture.data).decode()
+        shown = Html(f'<img alt="{html.escape(picture.caption)}" loading="lazy" src="data:image/jpeg;base64,{data}">')
+    detail = [el("small", picture.detail)] if picture.detail else []
+    return el("figure", shown, el("figcaption", picture.caption, *detail), class_=picture.tone or None)
+
+
+def _coverage(points: Sequence[EndPoint], grid: PerturbSettings) -> Html:
+    counts = {fate: sum(p.fate == fate for p in points) for fate in FATES}
+    lead = (
+        f"Candidates' end poses in the frame of the logged pose at T+H: {grid.max_longitudinal_m:g} m along and "
+        f"{grid.max_lateral_m:g} m aside, in an interleaved grid of {grid.step_longitudinal_m:g} m x "
+        f"{grid.step_lateral_m:g} m. Accepted: by any expert."
+    )
+    shown = [fate for fate in FATES if counts[fate] or fate != "failed"]
+    keys = el("p", *(el("span", fate_mark(fate), f"{fate} {counts[fate]}") for fate in shown), class_="keys")
+    if not points:
+        return _section("Coverage of end points", lead, _nothing("There are no candidates."))
+    step = -(-len(points) // MAX_POINTS)
+    plot = scatter(points, points[::step], grid)
+    note = [el("p", f"Every {step}th of {len(points)} points is drawn.", class_="note")] if step > 1 else []
+    return _section("Coverage of end points", lead, keys, plot, *note)
+
+
+def _seconds(report: Report) -> Html:
+    samples = sum(row.accepted for row in report.funnel.rows)
+    most = max((seconds for _, seconds in report.stage_seconds.values()), default=0.0)
+    rows = [
+        [
+            el("th", stage, scope="row"),
+            _number(tasks),
+            el("td", _count_bar(seconds, most, f"{seconds:.1f}")),
+            el("td", f"{seconds / tasks:.3f}" if tasks else "-", class_="n"),
+        ]
+        for stage, (tasks, seconds) in report.stage_seconds.items()
+    ]
+    lead = f"Worker seconds of the newest run; the store holds {samples} samples."
+    content = (
+        _table(("stage", "tasks", "seconds", "per task"), rows, "seconds")
+        if rows
+        else _nothing("The newest run had nothing left to do.")
+    )
+    return _section("Seconds per stage", lead, content)
+
+
+def _trouble(report: Report) -> Html:
+    content: list[Html] = []
+    if report.failed:
+        rows = [
+            [
+                el("th", row.log_id, el("small", f"clip {row.clip_id}"), scope="row"),
+                el("td", row.expert or "the clip as a whole"),
+                el("td", row.kind, el("small", REASON_WORDS.get(row.kind, ""))),
+                _number(row.tries),
+                el("td", el("pre", row.error)),
+            ]
+            for row in report.failed
+        ]
+        content.append(_table(("log", "expert", "kind", "tries", "error"), rows, "failed"))
+        if report.n_failed > len(report.failed):
+            content.append(el("p", f"{len(report.failed)} of {report.n_failed} are shown.", class_="note"))
+    else:
+        content.append(_nothing("No attempt failed."))
+    for title, named in (
+        ("Filtered windows", {k: f"{n} windows" for k, n in report.filtered_windows.items()}),
+        ("Skipped logs", report.skipped_logs),
+        ("Broken logs", report.broken_logs),
+    ):
+        rows = [[el("th", k, scope="row"), el("td", v)] for k, v in named.items()]
+        if rows:
+            content += [el("h3", f"{title} ({len(rows)})"), _table(("what", "why"), rows, "")]
+        else:
+            content.append(_nothing(f"{title}: none."))
+    return _section("What did not come through", "Failed attempts, and what the reader left out.", *content)
+
+
+def _settings(settings: Mapping[str, str]) -> Html:
+    rows = [[el("th", k, scope="row"), el("td", v)] for k, v in settings.items()]
+    return el(
+        "details",
+        el("summary", f"Settings of the newest run ({len(rows)})"),
+        _table(("setting", "value"), rows, "settings"),
+    )
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[Html]], name: str) -> Html:
+    """A table that scrolls sideways on a narrow screen."""
+    top = el("thead", el("tr", *(el("th", title, scope="col") for title in head)))
+    return el("div", el("table", top, el("tbody", *(el("tr", *row) for row in rows)), class_=name), class_="wide")
+
+
+def _number(value: int) -> Html:
+    return el("td", f"{value:,}", class_="n")
+
+
+def _bar(rate: float, mark_percent: float | None = None) -> Html:
+    """A share as a bar with its number; a mark where the published share would end."""
+    if rate != rate:
+        return el("span", "-", class_="dim")
+    mark = (
+        [el("i", style=f"left:{mark_percent:g}%", title=f"paper {mark_percent:g} %")]
+        if mark_percent is not None
+        else []
+    )
+    track = el("span", el("span", style=f"width:{100 * rate:.1f}%"), *mark, class_="track")
+    return el("span", track, el("span", f"{100 * rate:.1f} %", class_="value"), class_="bar")
+
+
+def _count_bar(count: float, most: float, text: str | None = None) -> Html:
+    """A count beside others; none is a dash."""
+    if not count and text is None:
+        return el("span", "-", class_="dim")
+    share = 100 * count / most if most else 0.0
+    track = el("span", el("span", style=f"width:{share:.1f}%"), class_="track")
+    return el("span", track, el("span", text if text is not None else f"{count:,}", class_="value"), class_="bar count")
+
+
+def _nothing(text: str) -> Html:
+    return el("p", text, class_="nothing")
+
+
+def _percent(part: int, whole: int) -> str:
+    return f"{100 * part / whole:.1f} %" if whole else "-"

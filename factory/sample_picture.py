@@ -1,0 +1,165 @@
+"""Pictures of stored samples, from the row alone: the world from above, and what the cameras saw."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from factory.bev import BACKGROUND, EXPERT, LOGGED, PERTURBED, Boxes, MapShapes, Path, draw_bev
+from factory.store.schema import NOW_INDEX
+from tasks.world.frames import to_local
+from tasks.world.lanes import LightState
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+Row = Mapping[str, Any]
+
+BEV_COLUMNS = (
+    "now_pose",
+    "parent_states",
+    "label_10hz",
+    "perturbed_states",
+    "agent_kinds",
+    "agent_boxes",
+    "lane_ids",
+    "lane_polygons",
+    "drivable_rings",
+    "crossing_rings",
+    "light_lane_ids",
+    "light_states",
+    "route_lane_ids",
+)
+TILE_PX = (416, 234)  # width, height of a camera in the sheet
+INK = (30, 30, 30)
+
+
+def sample_bev(row: Row, logged: Array | None = None, size_px: tuple[int, int] = (480, 480)) -> Image:
+    """A sample from above at its now, the ego pointing up.
+
+    Args:
+        row: at least BEV_COLUMNS of a sample.
+        logged: (M, >=3) the log's drive from T on, world frame; None: the row's own two logged poses are joined.
+        size_px: width, height.
+    """
+    lanes = dict(zip(row["lane_ids"], row["lane_polygons"]))
+    red = {
+        lane_id
+        for lane_id, states in zip(row["light_lane_ids"], row["light_states"])
+        if states[NOW_INDEX] == LightState.RED
+    }
+    shapes = MapShapes(
+        roads=row["drivable_rings"],
+        route=[lanes[i] for i in row["route_lane_ids"] if i in lanes],
+        crossings=row["crossing_rings"],
+        lanes=list(lanes.values()),
+        red=[lanes[i] for i in sorted(red) if i in lanes],
+    )
+    boxes = np.asarray(row["agent_boxes"], dtype=float).reshape(len(row["agent_kinds"]), -1, 5)
+    here = np.zeros(3)
+    return draw_bev(
+        here, shapes, Boxes(boxes[:, NOW_INDEX], row["agent_kinds"]), here, _paths(row, logged), "", size_px
+    )
+
+
+def _paths(row: Row, logged: Array | None) -> list[Path]:
+    pose = np.asarray(row["now_pose"], dtype=float)
+    label = np.concatenate([np.zeros((1, 3)), row["label_10hz"]])
+    if row["perturbed_states"] is None:
+        return [Path(label, LOGGED, "logged drive = label")]
+    known, name = (logged, "logged") if logged is not None else (row["parent_states"], "logged at T and T+H, joined")
+    return [
+        Path(to_local(pose, np.asarray(known, dtype=float)[:, :3]), LOGGED, name, dashed=logged is not None),
+        Path(to_local(pose, np.asarray(row["perturbed_states"])[:, :3]), PERTURBED, "perturbed"),
+        Path(label, EXPERT, "expert (simulated) = label"),
+    ]
+
+
+def images_at_now(row: Row) -> list[dict[str, Any]]:
+    """Each camera's image nearest to now, in the order of the row."""
+    nearest: dict[str, dict[str, Any]] = {}
+    for image in row["images"] or ():
+        known = nearest.get(image["camera"])
+        if known is None or abs(image["time_s"]) < abs(known["time_s"]):
+            nearest[image["camera"]] = image
+    return list(nearest.values())
+
+
+def earlier_images(row: Row, camera: str) -> list[dict[str, Any]]:
+    """What one camera saw up to now, in order of time."""
+    taken = [image for image in row["images"] or () if image["camera"] == camera and image["time_s"] < 0.1]
+    return sorted(taken, key=lambda image: float(image["time_s"]))
+
+
+def front_camera(row: Row) -> str | None:
+    """The camera with images whose optical axis points most nearly ahead."""
+    seen = {image["camera"] for image in row["images"] or ()}
+    rig = [camera for camera in row["cameras"] or () if camera["name"] in seen]
+    if not rig:
+        return None
+    return str(max(rig, key=lambda camera: float(np.reshape(camera["ego_from_camera"], (4, 4))[0, 2]))["name"])
+
+
+def decoded(image: Mapping[str, Any]) -> Image:
+    """RGB (height, width, 3). Raises ValueError where the bytes are no picture."""
+    data = np.frombuffer(image["jpeg"], np.uint8)
+    pixels = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
+    if pixels is None:
+        raise ValueError(f"image of camera {image['camera']} at {image['time_s']:.1f} s cannot be decoded")
+    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+def fitted(image: Image, width: int, height: int) -> Image:
+    """The image scaled into width x height pixels, its aspect kept, padded with the background."""
+    scale = min(width / image.shape[1], height / image.shape[0])
+    size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    sheet = np.full((height, width, 3), BACKGROUND, np.uint8)
+    top, left = (height - size[1]) // 2, (width - size[0]) // 2
+    sheet[top : top + size[1], left : left + size[0]] = small
+    return sheet
+
+
+def encoded(image: Image, suffix: str = ".jpg") -> bytes:
+    """RGB as the bytes of a JPEG (quality 85) or PNG file."""
+    options = [cv2.IMWRITE_JPEG_QUALITY, 85] if suffix == ".jpg" else []
+    done, data = cv2.imencode(suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR), options)
+    assert done, f"OpenCV cannot write {suffix}"
+    return bytes(data)
+
+
+def sample_sheet(row: Row, logged: Array | None = None, bev_px: int = 720) -> Image:
+    """Top-down view and all cameras at now, side by side; two cameras a row."""
+    images = images_at_now(row)
+    tiles = [_tile(image) for image in images] or [_note(f"no images: image_source is {row['image_source']}")]
+    if len(tiles) % 2 and len(tiles) > 1:
+        tiles.append(np.full_like(tiles[0], BACKGROUND))
+    columns = min(2, len(tiles))
+    strip = np.concatenate(
+        [np.concatenate(tiles[i : i + columns], axis=1) for i in range(0, len(tiles), columns)], axis=0
+    )
+    height = max(bev_px, strip.shape[0])
+    return np.concatenate([_padded(sample_bev(row, logged, (bev_px, bev_px)), height), _padded(strip, height)], axis=1)
+
+
+def _tile(image: Mapping[str, Any]) -> Image:
+    text = f"{image['camera']}  {image['time_s']:+.1f} s"
+    try:
+        tile = fitted(decoded(image), *TILE_PX)
+    except ValueError as error:
+        return _note(str(error))
+    cv2.putText(tile, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 3, cv2.LINE_AA)
+    cv2.putText(tile, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1, cv2.LINE_AA)
+    return tile
+
+
+def _note(text: str) -> Image:
+    tile = np.full((TILE_PX[1], TILE_PX[0], 3), BACKGROUND, np.uint8)
+    cv2.putText(tile, text[:60], (12, TILE_PX[1] // 2), cv2.FONT_HERSHEY_SIMPLEX, 0.42, INK, 1, cv2.LINE_AA)
+    return tile
+
+
+def _padded(image: Image, height: int) -> Image:
+    below = np.full((height - image.shape[0], image.shape[1], 3), BACKGROUND, np.uint8)
+    return np.concatenate([image, below], axis=0)

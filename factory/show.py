@@ -1,0 +1,277 @@
+"""`python -m factory.show out=<folder or URL>`: what a store holds.
+
+    python -m factory.show out=runs/demo                  counts, acceptance funnel, the newest run
+    python -m factory.show out=runs/demo list=true        sample ids, one a line
+    python -m factory.show out=runs/demo sample=0         one sample: numbers, and a picture in the current folder
+    python -m factory.show out=runs/demo sample=3fa9      the same by its id, or the beginning of it
+    python -m factory.show out=runs/demo sample=0 to=x.png    ... the picture there (a folder, or a file ending in .png)
+    python -m factory.show out=runs/demo failed=true      failed attempts: file, field, message, how to retry
+
+Exit codes: 0 shown, 2 bad arguments, or nothing there to show.
+"""
+
+import json
+import sys
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from factory.store.samples import Store
+
+BAD_ARGUMENTS = 2
+EXIT_WORDS = {0: "complete", 3: "complete with failed attempts", 4: "interrupted, the same command goes on"}
+RETRY = {
+    "input": "mend or take out the named file, then run the same command with retry_failed=true",
+    "bug": "run the same command with retry_failed=true once the code or the plug-in is mended",
+    "system": "the next run of the same command tries it again by itself",
+    "poison": "it brought workers down in several runs; retry_failed=true tries it once more",
+}
+
+
+class Refused(ValueError):
+    """The request cannot be answered; the message says why."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """The command line."""
+
+    out: str
+    sample: str | None = None  # attempt_id, its beginning, or an ordinal
+    failed: bool = False
+    list: bool = False
+    to: str | None = None
+
+
+def main(argv: Sequence[str]) -> int:
+    """The command; returns the exit code."""
+    if {"-h", "--help"} & set(argv):
+        print(__doc__)
+        return 0
+    try:
+        request = parse(argv)
+        for line in answer(request):
+            print(line)
+    except Refused as error:
+        print(f"error: {error}", file=sys.stderr)
+        return BAD_ARGUMENTS
+    return 0
+
+
+def parse(argv: Sequence[str]) -> Request:
+    """key=value arguments. Raises Refused for an unknown key, a missing value or a contradiction."""
+    known = {f.name: f.type for f in fields(Request)}
+    given: dict[str, Any] = {}
+    for argument in argv:
+        key, equals, value = argument.partition("=")
+        if key not in known or not equals or not value:
+            raise Refused(f"{argument!r}: expected one of {', '.join(f'{name}=...' for name in known)}; see --help")
+        if key in given:
+            raise Refused(f"{key} is given twice")
+        given[key] = _truth(key, value) if known[key] is bool else value
+    if "out" not in given:
+        raise Refused("out=<folder or URL of a run> is missing; see --help")
+    request = Request(**given)
+    if sum((request.sample is not None, request.failed, request.list)) > 1:
+        raise Refused("choose one of sample=, failed=true and list=true")
+    if request.to is not None and request.sample is None:
+        raise Refused("to= says where the picture of sample= goes; give sample= too")
+    return request
+
+
+def _truth(key: str, value: str) -> bool:
+    if value.lower() not in ("true", "false"):
+        raise Refused(f"{key}={value}: must be true or false")
+    return value.lower() == "true"
+
+
+def answer(request: Request) -> Iterable[str]:
+    """The lines to print. Raises Refused where there is nothing to show."""
+    store = _open(request.out)
+    if request.failed:
+        return failed_lines(store)
+    if request.list:
+        return sample_ids(store)
+    if request.sample is not None:
+        return sample_lines(store, find(store, request.sample), request.to)
+    return status_lines(store)
+
+
+def _open(out: str) -> "Store":
+    from deltalake.exceptions import DeltaError
+
+    from factory.store.location import BadLocation
+    from factory.store.samples import Store
+
+    try:
+        store = Store(out)
+    except (BadLocation, OSError, DeltaError) as error:
+        raise Refused(f"out={out}: {error}") from error
+    if store.samples.version is None and store.outcomes.version is None and store.candidates.version is None:
+        raise Refused(f"no store at {store.location.uri}: give the out= of a run of python -m factory.run")
+    return store
+
+
+def sample_ids(store: "Store") -> list[str]:
+    """In the order of ordinals. Raises Refused where there are none."""
+    ids = sorted(store.samples)
+    if not ids:
+        raise Refused(f"{store.location.uri} holds no sample; without sample= it shows why")
+    return ids
+
+
+def find(store: "Store", which: str) -> str:
+    """The attempt_id meant by an ordinal, an id or the beginning of one. Raises Refused."""
+    ids = sample_ids(store)
+    if which.isascii() and which.isdecimal() and int(which) < len(ids):
+        return ids[int(which)]
+    found = [key for key in ids if key.startswith(which)]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise Refused(f"sample={which} is the beginning of {len(found)} ids: {', '.join(found[:8])}")
+    dropped = [row for row in store.outcomes.read().to_pylist() if row["attempt_id"].startswith(which)]
+    if len(dropped) == 1:
+        row = dropped[0]
+        why = row["error"] or f"{row['stage']}.{row['reason']} {row['detail']}".strip(". ")
+        raise Refused(f"{row['attempt_id']} is no sample but a {row['kind']} attempt of {row['expert']}: {why}")
+    raise Refused(f"no sample {which}: ids begin otherwise, ordinals go from 0 to {len(ids) - 1}; see list=true")
+
+
+def status_lines(store: "Store") -> Iterable[str]:
+    """Tables, counts, funnel and the newest run."""
+    from factory.funnel import funnel_of
+
+    samples = store.samples.read(["expert", "round", "split", "image_source", "dataset"]).to_pylist()
+    outcomes = Counter(store.outcomes.read(["kind"])["kind"].to_pylist())
+    yield f"store       {store.location.uri}"
+    for table in (store.samples, store.candidates, store.outcomes):
+        version = "not there yet" if table.version is None else f"version {table.version}"
+        yield f"{table.spec.name:<12}{len(table):,} rows, {len(table.live_files())} files, {version}"
+    for title in ("dataset", "split", "image_source"):
+        counts = Counter(row[title] for row in samples)
+        yield f"{title:<14}" + (", ".join(f"{name} {n}" for name, n in sorted(counts.items())) or "no samples")
+    yield "not samples   " + (", ".join(f"{kind} {n}" for kind, n in sorted(outcomes.items())) or "none")
+    yield ""
+    yield funnel_of(store).text().rstrip()
+    yield ""
+    yield from _last_run(store)
+
+
+def _last_run(store: "Store") -> Iterable[str]:
+    data = store.location.read("last_run.json")
+    if data is None:
+        yield "newest run    did not finish; run the same command again to go on"
+        return
+    run = json.loads(data)
+    yield f"newest run    exit code {run['exit_code']}: {EXIT_WORDS.get(run['exit_code'], 'see its output')}"
+    executed = ", ".join(f"{name} {count}" for name, count in run["executed"].items())
+    yield f"executed      {executed}"
+    seconds = ", ".join(f"{stage} {s['seconds']:.1f} ({s['tasks']})" for stage, s in run["seconds"].items())
+    yield f"seconds       {seconds or 'nothing was left to do'}  (tasks in brackets)"
+    for note in (*([run["message"]] if run["message"] else []), *run["notes"]):
+        yield f"note          {note}"
+    if store.location.read("report.html") is not None:
+        yield f"report        {store.location.uri}/report.html"
+
+
+def failed_lines(store: "Store") -> Iterable[str]:
+    """Every failed attempt with its message, and how to try it again."""
+    rows = [row for row in store.outcomes.read().to_pylist() if row["kind"] == "failed"]
+    kinds = Counter(row["error_kind"] for row in rows)
+    yield f"{len(rows)} failed" + (": " + ", ".join(f"{kind} {n}" for kind, n in sorted(kinds.items())) if rows else "")
+    for row in sorted(rows, key=lambda row: (row["log_id"], row["clip_id"], row["expert"], row["candidate_index"])):
+        what = f"expert {row['expert']}, candidate {row['candidate_index']}" if row["expert"] else "the clip as a whole"
+        yield ""
+        yield f"{row['attempt_id']}  {row['error_kind']}, tried in {row['tries']} runs"
+        yield f"  log {row['log_id']}, clip {row['clip_id']}, {what}"
+        yield from (f"  | {line}" for line in row["error"].splitlines())
+    for kind in sorted(kinds):
+        yield ""
+        yield f"to retry {kind}: {RETRY.get(kind, 'run the same command with retry_failed=true')}"
+
+
+def sample_lines(store: "Store", attempt_id: str, to: str | None) -> Iterable[str]:
+    """One sample's numbers; writes its picture and says where it is."""
+    from factory.sample_picture import encoded, sample_sheet
+    from factory.store.reader import SampleTable
+
+    row = SampleTable(store.location.uri, store.location.options)[attempt_id]
+    yield from _numbers(row)
+    path = _picture_path(attempt_id, to)
+    picture = encoded(sample_sheet(row, logged_drive(store, row)), ".png")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(picture)
+    except OSError as error:
+        raise Refused(f"to={to}: the picture cannot be written: {error}") from error
+    yield f"picture       {path.resolve()}"
+
+
+def logged_drive(store: "Store", row: dict[str, Any]) -> "NDArray[np.float64] | None":
+    """(81, 3) the log from T to T+2H, world frame, from the prepared clip; None where the cache has it no more."""
+    from factory.pipeline import PerturbedClip
+    from factory.steps import cache_key
+    from factory.store.cache import BadCacheFile
+    from factory.work import PreparedClip
+    from tasks.world.clip import NOW
+    from tasks.world.vehicle import HEADING
+
+    digests = {run["settings_hash"]: run["prepare_digest"] for run in store.runs()}
+    if row["settings_hash"] not in digests:
+        return None
+    try:
+        stored = store.cache.load(cache_key(row["clip_id"], digests[row["settings_hash"]]))
+    except BadCacheFile:
+        return None
+    if not isinstance(stored, PreparedClip) or not isinstance(stored.payload, PerturbedClip):
+        return None
+    return stored.payload.clip.ego_states[NOW:, : HEADING + 1]
+
+
+def _numbers(row: dict[str, Any]) -> Iterable[str]:
+    from tasks.stages import SUBSCORES
+
+    yield f"sample        {row['attempt_id']}"
+    yield f"clip          {row['clip_id']}, {row['dataset']} log {row['log_id']} at {row['clip_start_s']:.1f} s"
+    yield f"              split {row['split']}, licence {row['licence'] or '-'}"
+    yield f"expert        {row['expert']}, round {row['round']}, candidate {row['candidate_index']}"
+    vx, vy, ax, ay = row["ego_status"]
+    yield f"ego           {vx:.2f}, {vy:.2f} m/s; {ax:.2f}, {ay:.2f} m/s2; command {row['command']}"
+    if row["candidate_end"] is not None:
+        x, y, heading, speed = row["candidate_end"]
+        yield f"perturbed by  {x:+.2f} m along, {y:+.2f} m aside, {57.29578 * heading:+.1f} deg, at {speed:.2f} m/s"
+    x, y, heading = row["label_10hz"][-1]
+    yield f"label         ends {x:+.2f} m ahead, {y:+.2f} m left, turned {57.29578 * heading:+.1f} deg after 4 s"
+    images, source = row["images"] or (), row["image_source"]
+    cameras = ", ".join(dict.fromkeys(image["camera"] for image in images))
+    tags = ", ".join(row["tags"]) or "-"
+    yield f"world         {len(row['agent_ids'])} agents, {len(row['lane_ids'])} lanes; tags {tags}"
+    yield f"images        {len(images)} from source {source}" + (f": {cameras}" if cameras else "")
+    if row["psnr"] is not None:
+        yield f"block         {row['psnr']:.2f} dB"
+    yield f"scores        {'':11}" + "".join(f"{name:>7}" for name in (*SUBSCORES, "EPDMS"))
+    for prefix, title in (("stage1", "perturbed"), ("stage2", "expert")):
+        values = [row[f"{prefix}_{name}"] for name in (*SUBSCORES, "score")]
+        if any(value is not None for value in values):
+            texts = ("-" if value is None else f"{value:.3f}" for value in values)
+            yield f"              {title:<11}" + "".join(f"{text:>7}" for text in texts)
+
+
+def _picture_path(attempt_id: str, to: str | None) -> Path:
+    target = Path(to or ".").expanduser()
+    if target.suffix.lower() == ".png":
+        return target
+    if target.suffix and not target.is_dir():
+        raise Refused(f"to={to}: the picture is a PNG; name a file ending in .png, or a folder")
+    return target / f"sample_{attempt_id}.png"
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
