@@ -1,0 +1,202 @@
+"""One attempt: what the gate lets through, how the second stage starts, and what stays untouched."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tasks.attempt import ExpertGate, Judged, attempt, human_sample, perturbed_scene, verdict
+from tasks.chance import stream
+from tasks.experts.human import Human
+from tasks.experts.pdm_closed import PdmClosed, PdmSettings
+from tasks.experts.protocol import Expert, Plan
+from tasks.experts.recovery import Recovery, RecoveryTable
+from tasks.kinematic_vocabulary import kinematic_trajectories
+from tasks.perturb import Perturbation, PerturbSettings, perturb
+from tasks.reward.epdms import Scores
+from tasks.rollout.simulate import TrafficSettings, simulate
+from tasks.stages import STAGES, SUBSCORES, Rejected
+from tasks.vocabulary import Vocabulary
+from tasks.world.clip import HORIZON_STEPS, NOW, Clip, Rollout, Scene, scene_of_clip
+from tasks.world.frames import to_world
+from tests.tasks.streets import moved, same_poses, street_clip
+
+GATE = ExpertGate()
+RNG = np.random.default_rng(0)  # no expert here draws from it
+
+
+def scores(**values: float) -> Scores:
+    """Two rows: row 0 all zero, row 1 perfect but for `values`."""
+    row: dict[str, NDArray[np.float64]] = {field.name: np.array([0.0, 1.0]) for field in fields(Scores)}
+    return Scores(**row | {name: np.array([0.0, value]) for name, value in values.items()})  # type: ignore[arg-type]
+
+
+def shift(speed: float, side_m: float) -> NDArray[np.float64]:
+    """(40, 3) at constant speed to `side_m` to the left within 2.5 s."""
+    step = np.arange(1, HORIZON_STEPS + 1)
+    share = np.minimum(step / 25.0, 1.0)
+    slope = side_m * 6.0 * share * (1.0 - share) / (2.5 * speed)
+    return np.column_stack([0.1 * speed * step, side_m * share**2 * (3.0 - 2.0 * share), np.arctan(slope)])
+
+
+def first_stage(clip: Clip) -> Rollout:
+    """Ends 0.7 m to the left of the log."""
+    return simulate(scene_of_clip(clip), to_world(clip.ego_states[NOW, :3], shift(8.0, 0.7)), TrafficSettings())
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    clip = street_clip()
+    return perturbed_scene(clip, first_stage(clip))
+
+
+@pytest.fixture(scope="module")
+def table() -> RecoveryTable:
+    """Drives of all kinds, and some that only move over."""
+    shifts = [shift(speed, side) for speed in (7.0, 8.0, 9.0) for side in (-1.5, -1.0, -0.7, -0.4, 0.4, 0.7, 1.0, 1.5)]
+    return RecoveryTable(np.concatenate([kinematic_trajectories(2000, seed=1), shifts]))
+
+
+def tried(scene: Scene, expert: Expert) -> tuple[Judged, Rejected | None]:
+    result = attempt(scene, expert, GATE, TrafficSettings(), PdmSettings(), RNG)
+    assert not isinstance(result, Rejected)
+    return result
+
+
+def test_a_drive_with_every_sub_score_one_and_progress_above_a_half_is_accepted() -> None:
+    assert verdict(scores(), GATE) is None
+    assert verdict(scores(ep=0.5001), GATE) is None
+
+
+@pytest.mark.parametrize("name", [name for name in SUBSCORES if name not in ("ep", "ec")])
+@pytest.mark.parametrize("value", [0.0, 0.5, float("nan")])
+def test_half_of_a_sub_score_fails_and_is_named(name: str, value: float) -> None:
+    rejected = verdict(scores(**{name: value}), GATE)
+    assert rejected is not None
+    assert (rejected.stage, rejected.reason) == ("reward", name)
+    assert f"{name}={value:g}" in rejected.detail
+
+
+@pytest.mark.parametrize("value", [0.5, 0.0, float("nan")])
+def test_half_the_progress_is_not_enough(value: float) -> None:
+    rejected = verdict(scores(ep=value), GATE)
+    assert rejected is not None
+    assert rejected.reason == "ep"
+
+
+def test_the_first_failing_sub_score_is_the_reason_and_all_stand_in_the_detail() -> None:
+    rejected = verdict(scores(ep=0.2, ttc=0.0, dac=0.0), GATE)
+    assert rejected == Rejected("reward", "dac", "dac=0 ttc=0 ep=0.200")
+
+
+def test_extended_comfort_is_never_asked_for_and_an_unknown_sub_score_is_refused() -> None:
+    assert "ec" not in GATE.full
+    for wrong in ("ec", "comfort"):
+        with pytest.raises(ValueError, match=wrong):
+            ExpertGate(full=("nc", wrong))
+
+
+def test_every_reason_of_the_gate_is_in_the_list_of_stages() -> None:
+    reasons = next(stage.reasons for stage in STAGES if stage.name == "reward")
+    assert {*GATE.full, "ep"} <= set(reasons)
+
+
+def test_the_second_stage_starts_from_the_first_one_s_world() -> None:
+    clip = street_clip()
+    rollout = first_stage(clip)
+    scene = perturbed_scene(clip, rollout)
+    assert scene.step == NOW + HORIZON_STEPS
+    np.testing.assert_array_equal(scene.ego_state, rollout.ego_states[-1])
+    np.testing.assert_array_equal(scene.ego_history, rollout.ego_states[-16:])  # the simulated last 1.5 s
+    np.testing.assert_array_equal(scene.agents.boxes[NOW : scene.step + 1], rollout.agents.boxes)
+    np.testing.assert_array_equal(scene.agents.boxes[:NOW], clip.agents.boxes[:NOW])
+    np.testing.assert_array_equal(scene.agents.boxes[scene.step + 1 :], clip.agents.boxes[scene.step + 1 :])
+    np.testing.assert_array_equal(scene.ever_simulated, rollout.simulated)
+
+
+def test_the_second_rollout_continues_ego_and_traffic_without_a_jump(scene: Scene) -> None:
+    judged, _ = tried(scene, PdmClosed())
+    np.testing.assert_array_equal(judged.rollout.ego_states[0], scene.ego_state)
+    np.testing.assert_array_equal(judged.rollout.agents.boxes[0], scene.agents.boxes[scene.step])
+    cars = judged.rollout.simulated
+    assert cars.any()
+    way = np.hypot(*np.moveaxis(np.diff(judged.rollout.agents.boxes[:, cars, :2], axis=0), -1, 0))
+    assert np.nanmax(way) < 1.5  # at most 15 m/s in a step of 0.1 s
+
+
+def test_both_experts_recover_from_beside_the_lane_s_middle(scene: Scene, table: RecoveryTable) -> None:
+    for expert in (PdmClosed(), Recovery(table)):
+        judged, rejected = tried(scene, expert)
+        assert rejected is None, f"{expert.name}: {rejected}"
+        assert all(getattr(judged.scores, name)[1] == 1.0 for name in GATE.full)
+        assert judged.scores.ep[1] > 0.5
+        assert abs(judged.rollout.ego_states[-1, 1]) < abs(scene.ego_state[1])
+
+
+def test_the_verdict_over_a_clip_s_list_agrees_with_its_scores(table: RecoveryTable) -> None:
+    clip = street_clip()
+    listed = perturb(
+        clip, Vocabulary(kinematic_trajectories(250, 0)), PerturbSettings(), TrafficSettings(), PdmSettings(),
+        stream(0, clip.clip_id, "perturb"),
+    )  # fmt: skip
+    assert isinstance(listed, Perturbation)
+    accepted, rejected = 0, 0
+    for candidate in listed.candidates[:12]:
+        judged, verdict_ = tried(perturbed_scene(clip, candidate.rollout), Recovery(table))
+        passes = all(getattr(judged.scores, n)[1] == 1.0 for n in GATE.full) and judged.scores.ep[1] > 0.5
+        assert (verdict_ is None) == passes
+        accepted, rejected = accepted + passes, rejected + (not passes)
+    assert accepted > 0
+    assert rejected > 0
+
+
+def test_an_expert_without_a_plan_is_a_rejection_not_an_error(scene: Scene) -> None:
+    at_the_end = replace(scene, centerline=np.repeat(scene.centerline[-1:], 2, axis=0))
+    result = attempt(at_the_end, PdmClosed(), GATE, TrafficSettings(), PdmSettings(), RNG)
+    assert isinstance(result, Rejected)
+    assert (result.stage, result.reason) == ("expert", "no_plan")
+
+
+class OffTheRoad:
+    """A human who does not look."""
+
+    name = "human"
+
+    def digest(self) -> str:
+        return "blind"
+
+    def plan(self, scene: Scene, rng: np.random.Generator) -> Plan:
+        way = scene.ego_state[3] * 0.1 * np.arange(1, HORIZON_STEPS + 1)
+        return Plan(np.column_stack([way, -0.3 * way, np.full(len(way), -0.29)]))
+
+
+def test_a_human_drive_is_scored_and_never_filtered() -> None:
+    clip = street_clip()
+    judged = human_sample(scene_of_clip(clip), OffTheRoad(), PdmSettings(), RNG)
+    assert verdict(judged.scores, GATE) is not None
+    assert judged.scores.dac[1] == 0.0
+    assert judged.scene.step == NOW
+
+
+def test_around_the_human_everybody_does_what_the_log_says() -> None:
+    clip = street_clip()
+    judged = human_sample(scene_of_clip(clip), Human(), PdmSettings(), RNG)
+    np.testing.assert_array_equal(judged.plan.poses, clip.ego_states[NOW + 1 : NOW + 41, :3])
+    np.testing.assert_array_equal(judged.rollout.agents.boxes, clip.agents.boxes[NOW : NOW + 41])
+    assert not judged.rollout.simulated.any()
+    assert judged.scores.pdm_score[1] > 0.8
+
+
+@pytest.mark.parametrize("origin", [(350.0, -120.0, 0.0), (-40.0, 900.0, 2.2)])
+def test_moving_the_world_moves_a_whole_attempt_along(table: RecoveryTable, origin: tuple[float, ...]) -> None:
+    here, frame = street_clip(), np.array(origin)
+    there = moved(here, frame)
+    for expert in (PdmClosed(), Recovery(table)):
+        (a, rejected_a), (b, rejected_b) = (
+            tried(perturbed_scene(clip, first_stage(clip)), expert) for clip in (here, there)
+        )
+        assert rejected_a == rejected_b
+        assert same_poses(to_world(frame, a.rollout.ego_states), b.rollout.ego_states[..., :3], 1e-5)
+        assert same_poses(to_world(frame, a.rollout.agents.boxes), b.rollout.agents.boxes[..., :3], 1e-5)
+        assert a.scores.pdm_score[1] == pytest.approx(b.scores.pdm_score[1], abs=1e-6)
