@@ -102,12 +102,19 @@ def shade(splats: Splats, colours: F32, background: F32) -> View:
     return View(rgb, depth, alpha)
 
 
-def gather(splats: Splats, image: F32, n: int) -> tuple[F32, F32]:
+def gather(
+    splats: Splats, image: F32, n: int, masked: NDArray[np.bool_] | None = None, n_masked: int = 0
+) -> tuple[F32, F32]:
     """Carries an image back to the Gaussians: (sum of weight * image (N, 3), sum of weight (N,)) with the weights
-    that `shade` blends with; `image` (H, W, 3); n = number of Gaussians in the scene."""
-    sums, weights = _gather(
-        splats.projected, splats.tile_start, splats.tile_splats, np.ascontiguousarray(image, np.float32)
-    )
+    that `shade` blends with.
+
+    `image` (H, W, 3); n = number of Gaussians in the scene; the first `n_masked` of them get nothing from the pixels
+    `masked` (H, W).
+    """
+    pixels = np.empty((*image.shape[:2], 4), np.float32)
+    pixels[..., :3] = image
+    pixels[..., 3] = 1.0 if masked is None else ~masked
+    sums, weights = _gather(splats.projected, splats.tile_start, splats.tile_splats, pixels, splats.index < n_masked)
     all_sums, all_weights = np.zeros((n, 3), np.float32), np.zeros(n, np.float32)
     all_sums[splats.index], all_weights[splats.index] = sums, weights
     return all_sums, all_weights
@@ -226,14 +233,14 @@ def _is_opaque(light: Any, rows: int, columns: int) -> bool:
 
 
 @kernel
-def _gather(projected: Any, tile_start: Any, tile_splats: Any, image: Any) -> Any:
+def _gather(projected: Any, tile_start: Any, tile_splats: Any, image: Any, is_masked: Any) -> Any:
     f = np.float32
     height, width = image.shape[:2]
     tiles_x = (width + TILE - 1) // TILE
     sums = np.zeros((projected.shape[0], 3), np.float32)
     weights = np.zeros(projected.shape[0], np.float32)
     light = np.empty((TILE, TILE), np.float32)
-    pixels = np.zeros((3, TILE, TILE), np.float32)
+    pixels = np.zeros((4, TILE, TILE), np.float32)
     alphas = np.empty(TILE, np.float32)
     lanes = np.empty((4, TILE), np.float32)  # sums per column, so that the loop has no reduction
     for t in range(tile_start.shape[0] - 1):
@@ -244,7 +251,7 @@ def _gather(projected: Any, tile_start: Any, tile_splats: Any, image: Any) -> An
         for y in range(rows):
             for k in range(columns):
                 light[y, k] = f(1.0)  # pixels outside the image carry no weight
-                for channel in range(3):
+                for channel in range(4):
                     pixels[channel, y, k] = image[y0 + y, x0 + k, channel]
         for j in range(tile_start[t], tile_start[t + 1]):
             i = tile_splats[j]
@@ -252,11 +259,13 @@ def _gather(projected: Any, tile_start: Any, tile_splats: Any, image: Any) -> An
             first = max(0, int(np.floor(g[V] - g[HALF_V])) - y0)
             last = min(rows, int(np.floor(g[V] + g[HALF_V])) - y0 + 1)
             lanes[:] = f(0.0)
+            ignores_mask = f(0.0) if is_masked[i] else f(1.0)
             for y in range(first, last):
                 _row_alphas(g, x0, y0 + y, alphas)
                 for k in range(TILE):
                     w = alphas[k] * light[y, k]
                     light[y, k] -= w
+                    w *= max(pixels[3, y, k], ignores_mask)
                     lanes[0, k] += w * pixels[0, y, k]
                     lanes[1, k] += w * pixels[1, y, k]
                     lanes[2, k] += w * pixels[2, y, k]

@@ -48,10 +48,7 @@ def refit_colours(
             rows, scene = rows_of(i), scene_of(i)
             splats = splat(scene, photo.intrinsics, photo.scene_from_camera, width, height)
             residual = photo.rgb - shade(splats, colours[rows], photo.backdrop).rgb
-            sums, weights = gather(splats, residual, len(scene))
-            if photo.passing.any():
-                street_only = np.where(photo.passing[..., None], np.float32(0.0), residual)
-                sums[rows < n_background] = gather(splats, street_only, len(scene))[0][rows < n_background]
+            sums, weights = gather(splats, residual, len(scene), photo.passing, n_background)
             step = RELAXATION * sums / (weights + PRIOR_WEIGHT)[:, None]
             colours[rows] = np.clip(colours[rows] + step, 0.0, 1.0)
     return colours

@@ -346,8 +346,8 @@ def _sky(photos: Sequence[Photo], seen: Sequence[_Seen]) -> SkyMap:
     for photo, sight in zip(photos, seen):
         height, width = sight.depth.shape
         rays = directions(photo.intrinsics, photo.world_from_camera, width, height)
-        use = (sight.sky | (rays[..., 2] < -0.02)) & ~sight.passing
-        collector.add(rays[use], photo.rgb[use].astype(np.float32) / 255.0)
+        use = ~sight.passing
+        collector.add(rays[use], photo.rgb[use].astype(np.float32) / 255.0, sight.sky[use])
     return collector.finish()
 
 

@@ -3,16 +3,20 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from tasks.render.gaussians import F32, F64
 
 ROWS, COLUMNS = 256, 1024  # elevation +90 deg .. -90 deg, azimuth -180 deg .. 180 deg
 
+SKY_WEIGHT = 1.0e4  # against one pixel of something else in the same direction
+
 
 @dataclass(frozen=True)
 class SkyMap:
-    """Infinitely far colours; below the horizon the mean colour of the street, so that a hole is no hole to the sky."""
+    """Infinitely far colours. Where no photo saw sky: the mean colour seen in that direction, so that a hole in the
+    scene is no hole to the sky."""
 
     rgb: F32  # (ROWS, COLUMNS, 3) in [0, 1], world directions
 
@@ -45,19 +49,20 @@ def _cells(rays: F64) -> tuple[F64, F64]:
 
 
 class SkyCollector:
-    """Averages what photos show of the sky (and, below the horizon, of the street)."""
+    """Averages what photos show of the sky (and, with next to no weight, of the street)."""
 
     def __init__(self) -> None:
         self._sums = np.zeros((ROWS * COLUMNS, 4))
 
-    def add(self, rays: F64, rgb: F32) -> None:
-        """Colours (M, 3) in [0, 1] seen in directions (M, 3)."""
+    def add(self, rays: F64, rgb: F32, is_sky: NDArray[np.bool_]) -> None:
+        """Colours (M, 3) in [0, 1] seen in directions (M, 3), and whether it was sky (M,)."""
+        weight = np.where(is_sky, SKY_WEIGHT, 1.0)
         rows, columns = _cells(rays)
         cell = np.clip(np.rint(rows), 0, ROWS - 1).astype(np.intp) * COLUMNS
         cell += np.rint(columns).astype(np.intp) % COLUMNS
         for channel in range(3):
-            self._sums[:, channel] += np.bincount(cell, rgb[:, channel], ROWS * COLUMNS)
-        self._sums[:, 3] += np.bincount(cell, minlength=ROWS * COLUMNS)
+            self._sums[:, channel] += np.bincount(cell, weight * rgb[:, channel], ROWS * COLUMNS)
+        self._sums[:, 3] += np.bincount(cell, weight, ROWS * COLUMNS)
 
     def finish(self) -> SkyMap:
         """Cells nobody looked at take the colour of the nearest one that was; plain grey without any photo."""
@@ -65,7 +70,7 @@ class SkyCollector:
         seen = sums[..., 3] > 0
         if not seen.any():
             return SkyMap(np.full((ROWS, COLUMNS, 3), 0.7, np.float32))
-        colours = sums[..., :3] / np.maximum(sums[..., 3:], 1.0)
+        colours = sums[..., :3] / np.maximum(sums[..., 3:], 1e-9)
         out = np.empty((ROWS, COLUMNS, 3), np.float32)
         for half in (slice(0, ROWS // 2), slice(ROWS // 2, ROWS)):  # sky and street do not fill each other
             there = seen[half] if seen[half].any() else seen

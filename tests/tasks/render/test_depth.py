@@ -108,7 +108,7 @@ def test_the_sky_is_the_colour_that_was_seen_in_its_direction() -> None:
     colours = np.zeros((60, 80, 3), np.float32)
     colours[..., 0] = np.linspace(0, 1, 80)[None, :]
     collector = SkyCollector()
-    collector.add(rays[up], colours[up])
+    collector.add(rays[up], colours[up], np.ones(up.sum(), bool))
     sky = collector.finish()
     pose = np.array([[0, 0, 1.0, 50.0], [-1, 0, 0, -9.0], [0, -1, 0, 3.0], [0, 0, 0, 1]])  # elsewhere, same heading
     seen = sky.seen_by(INTRINSICS, pose, 80, 60)
