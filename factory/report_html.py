@@ -22,6 +22,39 @@ def el(tag: str, *children: object, **attributes: object) -> Html:
     return Html(f"<{tag}{named}>{inner}</{tag}>")
 
 
-def join(parts: Sequence[Html], separator: str = "") -> Html:
-    """Markup side by side."""
-    return Html(separator.join(parts))
+def table(head: Sequence[str], rows: Sequence[Sequence[Html]], name: str) -> Html:
+    """A table that scrolls sideways on a narrow screen."""
+    top = el("thead", el("tr", *(el("th", title, scope="col") for title in head)))
+    return el("div", el("table", top, el("tbody", *(el("tr", *row) for row in rows)), class_=name), class_="wide")
+
+
+def number(value: int) -> Html:
+    """A cell."""
+    return el("td", f"{value:,}", class_="n")
+
+
+def bar(rate: float, mark_percent: float | None = None) -> Html:
+    """A share as a bar with its number; a mark where the published share would end."""
+    if rate != rate:
+        return el("span", "-", class_="dim")
+    mark = (
+        [el("i", style=f"left:{mark_percent:g}%", title=f"paper {mark_percent:g} %")]
+        if mark_percent is not None
+        else []
+    )
+    track = el("span", el("span", style=f"width:{100 * rate:.1f}%"), *mark, class_="track")
+    return el("span", track, el("span", f"{100 * rate:.1f} %", class_="value"), class_="bar")
+
+
+def count_bar(count: float, most: float, text: str | None = None) -> Html:
+    """A count beside others; none is a dash."""
+    if not count and text is None:
+        return el("span", "-", class_="dim")
+    share = 100 * count / most if most else 0.0
+    track = el("span", el("span", style=f"width:{share:.1f}%"), class_="track")
+    return el("span", track, el("span", text if text is not None else f"{count:,}", class_="value"), class_="bar count")
+
+
+def nothing(text: str) -> Html:
+    """Said where a list is empty."""
+    return el("p", text, class_="nothing")

@@ -5,11 +5,12 @@ What data brings in (log ids, messages, paths) passes through `el`, which escape
 
 import base64
 import html
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from factory.funnel import Funnel, FunnelRow
-from factory.report_html import Html, el
+from factory.report_html import Html, bar, count_bar, el, nothing, number, table
 from factory.report_plot import FATES, EndPoint, fate_mark, scatter
 from factory.report_style import STYLE
 from tasks.perturb import PerturbSettings
@@ -46,9 +47,8 @@ GATE_WORDS = {
     "reached_lateral": "reached end pose too far aside",
     "reached_heading": "reached end pose turned too far",
     "white_cell": "in a cell the grid leaves out",
-    "scored": "scored against log replay",
-    "kept_by_replay": "good against log replay",
-    "kept": "good among reacting agents: candidates",
+    "replay_score": "scored too low against log replay",
+    "reactive_score": "scored too low among reacting agents",
 }
 MAX_POINTS = 4000  # in the scatter; more would make the file heavy and show nothing new
 
@@ -149,7 +149,7 @@ def _header(report: Report) -> Html:
     tiles = (
         ("samples", samples, f"{n_simulated} simulated, {samples - n_simulated} logged"),
         ("attempts", tried, f"{_percent(n_simulated, attempts)} of the simulated accepted"),
-        ("clips", report.funnel.clips_prepared, f"{report.funnel.candidates} candidates"),
+        ("clips prepared", report.funnel.clips_prepared, f"{report.funnel.candidates} candidates"),
         ("failed", report.n_failed, "see the list below" if report.n_failed else "nothing broke"),
     )
     return el(
@@ -170,28 +170,18 @@ def _header(report: Report) -> Html:
 
 
 def _funnel(funnel: Funnel) -> Html:
-    head = (
-        "expert",
-        "round",
-        "tried",
-        "accepted",
-        "of attempts",
-        "clips",
-        "of clips of the round before",
-        "paper",
-        "of all clips",
-    )
-    table = _table(head, [_funnel_row(row) for row in funnel.rows], "funnel")
+    head = ("expert", "round", "tried", "accepted", "of attempts", "clips", "of clips before", "paper", "of all clips")
+    rates = table(head, [_funnel_row(row) for row in funnel.rows], "funnel")
     lead = (
         "Round r holds the (r+1)-th accepted sample of each clip and expert. Of attempts: accepted of tried. Of clips: "
         "clips with a sample of this round, of those with one of the round before; that is the rate to hold against "
         "the paper's, which the mark on the bar shows."
     )
-    extra = [
-        f"{expert}: {count} {'walk' if count == 1 else 'walks'} came to the end of the candidate list"
+    ended = [
+        el("p", f"{expert}: {count} {'walk' if count == 1 else 'walks'} came to the end of the list", class_="note")
         for expert, count in funnel.exhausted.items()
     ]
-    return _section("Acceptance funnel", lead, table, *(el("p", line, class_="note") for line in extra))
+    return _section("Acceptance funnel", lead, rates, *ended)
 
 
 def _funnel_row(row: FunnelRow) -> list[Html]:
@@ -200,14 +190,14 @@ def _funnel_row(row: FunnelRow) -> list[Html]:
     tried = row.accepted + row.rejected + row.failed
     return [
         el("th", row.expert, scope="row"),
-        _number(row.round),
-        _number(tried),
-        _number(row.accepted),
-        el("td", _bar(row.attempt_rate)),
+        number(row.round),
+        number(tried),
+        number(row.accepted),
+        el("td", bar(row.attempt_rate)),
         el("td", f"{row.clips} / {row.clips_before}", class_="n"),
-        el("td", _bar(row.clip_rate, paper)),
+        el("td", bar(row.clip_rate, paper)),
         el("td", f"{paper} %" if paper is not None else "-", class_="n dim"),
-        el("td", _bar(row.clip_rate_of_all)),
+        el("td", bar(row.clip_rate_of_all)),
     ]
 
 
@@ -218,27 +208,21 @@ def _reasons(funnel: Funnel) -> Html:
         for reason, count in row.reasons.items():
             per_expert = counts.setdefault(reason, dict.fromkeys(experts, 0))
             per_expert[row.expert] += count
-    clip_reasons = {**funnel.clip_outcomes, **funnel.clips_without_candidates}
+    clip_reasons = Counter(funnel.clip_outcomes) + Counter(funnel.clips_without_candidates)
     most = max((max(per.values()) for per in counts.values()), default=1)
     order = sorted(counts, key=lambda reason: (-sum(counts[reason].values()), reason))
     rows = [
         [_reason_cell(reason)]
-        + [el("td", _count_bar(counts[reason][expert], most)) for expert in experts]
-        + [_number(sum(counts[reason].values()))]
+        + [el("td", count_bar(counts[reason][expert], most)) for expert in experts]
+        + [number(sum(counts[reason].values()))]
         for reason in order
     ]
-    content = (
-        [_table(("stage and reason", *experts, "all"), rows, "reasons")]
-        if rows
-        else [_nothing("No attempt was turned down.")]
-    )
+    head = ("stage and reason", *experts, "all")
+    content = [table(head, rows, "reasons") if rows else nothing("No attempt was turned down.")]
     if clip_reasons:
+        listed = [[_reason_cell(reason), number(count)] for reason, count in clip_reasons.most_common()]
         content.append(el("h3", "Clips that never came to a simulated attempt"))
-        content.append(
-            _table(
-                ("stage and reason", "clips"), [[_reason_cell(k), _number(n)] for k, n in clip_reasons.items()], "clips"
-            )
-        )
+        content.append(table(("stage and reason", "clips"), listed, "clips"))
     lead = "Every attempt that is not a sample has a reason: the first sub-score below its threshold, or what failed."
     return _section("Why attempts fell", lead, *content)
 
@@ -254,15 +238,15 @@ def _gates(funnel: Funnel) -> Html:
         [
             el("th", gate, scope="row"),
             el("td", GATE_WORDS.get(gate, ""), class_="dim"),
-            el("td", _count_bar(count, most)),
+            el("td", count_bar(count, most)),
         ]
         for gate, count in funnel.gates.items()
     ]
     lead = (
-        f"What perturb did with the vocabulary, summed over {funnel.clips_prepared} clips. The raw gates count "
-        "independently: one trajectory may fall to several."
+        f"Vocabulary trajectories that perturb dropped, summed over {funnel.clips_prepared} clips; {funnel.candidates} "
+        "became candidates. Gates count independently: one trajectory may fall to several."
     )
-    content = _table(("gate", "", "trajectories"), rows, "gates") if rows else _nothing("No clip was perturbed.")
+    content = table(("gate", "", "dropped"), rows, "gates") if rows else nothing("No clip was perturbed.")
     return _section("Perturbation gates", lead, content)
 
 
@@ -280,7 +264,7 @@ def _examples(examples: Sequence[Picture], n_rejected: int) -> Html:
         ),
         class_="keys",
     )
-    lead = "Seen from above at T+H, the ego pointing up; 80 m from bottom to top."
+    lead = "Seen from above at T+H, the ego pointing up; 60 m from bottom to top."
     groups = []
     for tone in ("accepted", "rejected"):
         chosen = [picture for picture in examples if picture.tone == tone]
@@ -288,7 +272,7 @@ def _examples(examples: Sequence[Picture], n_rejected: int) -> Html:
         missing = f"No simulated attempt was {tone}."
         if tone == "rejected" and n_rejected:
             missing = f"None of the {n_rejected} can be drawn: other settings, or clips that are not in this run."
-        groups.append(el("div", *(_figure(p) for p in chosen), class_="cards") if chosen else _nothing(missing))
+        groups.append(el("div", *(_figure(p) for p in chosen), class_="cards") if chosen else nothing(missing))
     return _section("Examples", lead, key, *groups)
 
 
@@ -309,7 +293,7 @@ def _frames(report: Report) -> Html:
         )
         for strip in report.strips
     ]
-    content = strips or [_nothing("No sample of this store has images.")]
+    content = strips or [nothing("No sample of this store has images.")]
     return _section("Camera frames", words, el("p", f"image_source: {counts or 'no samples'}", class_="note"), *content)
 
 
@@ -333,7 +317,7 @@ def _coverage(points: Sequence[EndPoint], grid: PerturbSettings) -> Html:
     shown = [fate for fate in FATES if counts[fate] or fate != "failed"]
     keys = el("p", *(el("span", fate_mark(fate), f"{fate} {counts[fate]}") for fate in shown), class_="keys")
     if not points:
-        return _section("Coverage of end points", lead, _nothing("There are no candidates."))
+        return _section("Coverage of end points", lead, nothing("There are no candidates."))
     step = -(-len(points) // MAX_POINTS)
     plot = scatter(points, points[::step], grid)
     note = [el("p", f"Every {step}th of {len(points)} points is drawn.", class_="note")] if step > 1 else []
@@ -346,17 +330,17 @@ def _seconds(report: Report) -> Html:
     rows = [
         [
             el("th", stage, scope="row"),
-            _number(tasks),
-            el("td", _count_bar(seconds, most, f"{seconds:.1f}")),
+            number(tasks),
+            el("td", count_bar(seconds, most, f"{seconds:.1f}")),
             el("td", f"{seconds / tasks:.3f}" if tasks else "-", class_="n"),
         ]
         for stage, (tasks, seconds) in report.stage_seconds.items()
     ]
     lead = f"Worker seconds of the newest run; the store holds {samples} samples."
     content = (
-        _table(("stage", "tasks", "seconds", "per task"), rows, "seconds")
+        table(("stage", "tasks", "seconds", "per task"), rows, "seconds")
         if rows
-        else _nothing("The newest run had nothing left to do.")
+        else nothing("The newest run had nothing left to do.")
     )
     return _section("Seconds per stage", lead, content)
 
@@ -369,16 +353,16 @@ def _trouble(report: Report) -> Html:
                 el("th", row.log_id, el("small", f"clip {row.clip_id}"), scope="row"),
                 el("td", row.expert or "the clip as a whole"),
                 el("td", row.kind, el("small", REASON_WORDS.get(row.kind, ""))),
-                _number(row.tries),
+                number(row.tries),
                 el("td", el("pre", row.error)),
             ]
             for row in report.failed
         ]
-        content.append(_table(("log", "expert", "kind", "tries", "error"), rows, "failed"))
+        content.append(table(("log", "expert", "kind", "tries", "error"), rows, "failed"))
         if report.n_failed > len(report.failed):
             content.append(el("p", f"{len(report.failed)} of {report.n_failed} are shown.", class_="note"))
     else:
-        content.append(_nothing("No attempt failed."))
+        content.append(nothing("No attempt failed."))
     for title, named in (
         ("Filtered windows", {k: f"{n} windows" for k, n in report.filtered_windows.items()}),
         ("Skipped logs", report.skipped_logs),
@@ -386,9 +370,9 @@ def _trouble(report: Report) -> Html:
     ):
         rows = [[el("th", k, scope="row"), el("td", v)] for k, v in named.items()]
         if rows:
-            content += [el("h3", f"{title} ({len(rows)})"), _table(("what", "why"), rows, "")]
+            content += [el("h3", f"{title} ({len(rows)})"), table(("what", "why"), rows, "left-out")]
         else:
-            content.append(_nothing(f"{title}: none."))
+            content.append(nothing(f"{title}: none."))
     return _section("What did not come through", "Failed attempts, and what the reader left out.", *content)
 
 
@@ -397,44 +381,8 @@ def _settings(settings: Mapping[str, str]) -> Html:
     return el(
         "details",
         el("summary", f"Settings of the newest run ({len(rows)})"),
-        _table(("setting", "value"), rows, "settings"),
+        table(("setting", "value"), rows, "settings"),
     )
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[Html]], name: str) -> Html:
-    """A table that scrolls sideways on a narrow screen."""
-    top = el("thead", el("tr", *(el("th", title, scope="col") for title in head)))
-    return el("div", el("table", top, el("tbody", *(el("tr", *row) for row in rows)), class_=name), class_="wide")
-
-
-def _number(value: int) -> Html:
-    return el("td", f"{value:,}", class_="n")
-
-
-def _bar(rate: float, mark_percent: float | None = None) -> Html:
-    """A share as a bar with its number; a mark where the published share would end."""
-    if rate != rate:
-        return el("span", "-", class_="dim")
-    mark = (
-        [el("i", style=f"left:{mark_percent:g}%", title=f"paper {mark_percent:g} %")]
-        if mark_percent is not None
-        else []
-    )
-    track = el("span", el("span", style=f"width:{100 * rate:.1f}%"), *mark, class_="track")
-    return el("span", track, el("span", f"{100 * rate:.1f} %", class_="value"), class_="bar")
-
-
-def _count_bar(count: float, most: float, text: str | None = None) -> Html:
-    """A count beside others; none is a dash."""
-    if not count and text is None:
-        return el("span", "-", class_="dim")
-    share = 100 * count / most if most else 0.0
-    track = el("span", el("span", style=f"width:{share:.1f}%"), class_="track")
-    return el("span", track, el("span", text if text is not None else f"{count:,}", class_="value"), class_="bar count")
-
-
-def _nothing(text: str) -> Html:
-    return el("p", text, class_="nothing")
 
 
 def _percent(part: int, whole: int) -> str:

@@ -33,11 +33,12 @@ dd{margin:0;overflow-wrap:anywhere;font-size:14px}
 table{border-collapse:collapse;width:100%;font-size:13.5px}
 th,td{text-align:left;padding:6px 14px 6px 0;border-bottom:1px solid var(--line);vertical-align:top}
 thead th{color:var(--dim);font-weight:500;font-size:12px;vertical-align:bottom}
-tbody th{font-weight:600}
+tbody th{font-weight:600;white-space:nowrap}
+table.failed th,table.settings th,table.left-out th{white-space:normal;overflow-wrap:anywhere}
 tbody tr:last-child>*{border-bottom:0}
 .n{font-variant-numeric:tabular-nums;white-space:nowrap}
 table.settings th,table.settings td,td pre{font-family:ui-monospace,Menlo,Consolas,monospace;font-size:12px}
-table.settings td,tbody th{overflow-wrap:anywhere}
+table.settings td{overflow-wrap:anywhere}
 pre{margin:0;white-space:pre-wrap;overflow-wrap:anywhere;max-height:14em;overflow-y:auto;min-width:280px}
 .bar{display:flex;align-items:center;gap:9px;min-width:130px}
 .track{position:relative;flex:1;height:10px;border-radius:5px;background:var(--track)}

@@ -93,12 +93,14 @@ def earlier_images(row: Row, camera: str) -> list[dict[str, Any]]:
 
 
 def front_camera(row: Row) -> str | None:
-    """The camera with images whose optical axis points most nearly ahead."""
+    """The camera with images that looks ahead; the first of the rig among those within 1 % of the straightest."""
     seen = {image["camera"] for image in row["images"] or ()}
     rig = [camera for camera in row["cameras"] or () if camera["name"] in seen]
     if not rig:
         return None
-    return str(max(rig, key=lambda camera: float(np.reshape(camera["ego_from_camera"], (4, 4))[0, 2]))["name"])
+    return str(
+        max(rig, key=lambda camera: round(float(np.reshape(camera["ego_from_camera"], (4, 4))[0, 2]), 2))["name"]
+    )
 
 
 def decoded(image: Mapping[str, Any]) -> Image:

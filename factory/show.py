@@ -257,7 +257,7 @@ def _numbers(row: dict[str, Any]) -> Iterable[str]:
     if row["psnr"] is not None:
         yield f"block         {row['psnr']:.2f} dB"
     yield f"scores        {'':11}" + "".join(f"{name:>7}" for name in (*SUBSCORES, "EPDMS"))
-    for prefix, title in (("stage1", "perturbed"), ("stage2", "expert")):
+    for prefix, title in (("stage1", "perturbed"), ("stage2", "driven")):
         values = [row[f"{prefix}_{name}"] for name in (*SUBSCORES, "score")]
         if any(value is not None for value in values):
             texts = ("-" if value is None else f"{value:.3f}" for value in values)
