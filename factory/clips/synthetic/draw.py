@@ -21,7 +21,7 @@ from tasks.world.camera import Camera
 SAMPLES = 2  # per pixel and axis
 SHADOW_TEXEL_M = 0.2
 SHADOW_SIZE = 1500  # texels: 300 m around the drive
-STANDING_RANGE_M = 420.0  # of the drive's middle
+STANDING_RANGE_M = 330.0  # of the drive's middle
 MOVING_RANGE_M = 120.0  # of the ego
 NO_PLANES = np.zeros((0, 9))
 

@@ -47,7 +47,7 @@ def build_scenery(streets: Streets, rng: np.random.Generator) -> Scenery:
         fan = np.stack(
             [np.broadcast_to(junction.center, junction.ring[1:].shape), junction.ring[:-1], junction.ring[1:]], 1
         )
-        b.triangles(lifted(fan, 0.0), np.zeros((len(fan), 3, 2)), tx.ASPHALT)
+        b.triangles(lifted(fan, 0.0), fan, tx.ASPHALT)
         for kerb in junction.kerbs:
             _kerb(b, kerb, min(PAVEMENT_M, 2.6) if junction.name == "branch" else PAVEMENT_M)
         if junction.island_radius:
@@ -147,7 +147,7 @@ def _island(b: Builder, center: Array, radius: float, rng: np.random.Generator) 
     b.strip(foot, top, s, 0.0, 0.16, tx.KERB)
     b.strip(top, lifted(inner, 0.22), s, 0.16, 1.4, tx.PAVING)
     fan = np.stack([np.broadcast_to([*center, 0.9], (40, 3)), lifted(inner[:-1], 0.22), lifted(inner[1:], 0.22)], 1)
-    b.triangles(fan, np.zeros((40, 3, 2)), tx.GRASS)
+    b.triangles(fan, fan[..., :2], tx.GRASS)
     for k in range(5):
         turn = 2 * np.pi * k / 5 + 0.4
         plant_tree(b, center + 6.0 * np.array([np.cos(turn), np.sin(turn)]), 0.5, rng, 0.7)
@@ -164,7 +164,8 @@ def _plain(b: Builder, middle: Array, reach: float) -> None:
         for i in range(8)
         for j in range(8)
     ]
-    b.quads(lifted(np.array(cells) + middle, PLAIN_Z), np.zeros((64, 4, 2)), tx.GRASS)
+    corners = np.array(cells) + middle
+    b.quads(lifted(corners, PLAIN_Z), corners, tx.GRASS)
     angle = np.linspace(0, 2 * np.pi, 97)
     ring = middle + reach * 1.05 * np.column_stack([np.cos(angle), np.sin(angle)])
     for factor, height, tone in ((1.0, 16.0, (0.20, 0.27, 0.17)), (0.93, 12.0, (0.25, 0.32, 0.18))):

@@ -187,7 +187,7 @@ def surface_colour(
         tone = 0.88 + 0.24 * noise(u / 0.06, v / 0.09, seed)
         return r * tone, g * tone, b * tone
     if kind == tx.ISLAND_STONE or kind == tx.FLAT_ROOF:
-        tone = 0.9 + 0.2 * noise(x / 0.6, y / 0.6, 81) + 0.2 * grain(x, y, 82, fp)
+        tone = 0.9 + 0.2 * noise(u / 0.6, v / 0.6, 81) + 0.2 * grain(u, v, 82, fp)
         return r * tone, g * tone, b * tone
     return r, g, b
 

@@ -106,7 +106,7 @@ def asphalt(x: float, y: float, footprint: float) -> RGB:
         ridge = abs(noise(bend_x / 2.6, bend_y / 2.6, 4) - 0.5)
         if ridge < 0.018 and noise(x / 14.0, y / 14.0, 6) > 0.42:
             tone -= 0.16 * seen * (1 - ridge / 0.018)
-        tone += 0.20 * grain(x, y, 11, footprint)
+        tone += 0.13 * grain(x, y, 11, footprint)
     return tone, tone * 1.005, tone * 1.02
 
 
