@@ -15,8 +15,6 @@ from factory.clips.synthetic.write import LICENCE, TownSettings, write_town
 from tasks.world.lanes import LightState
 
 SMALL = TownSettings(("ring_front_center", "ring_rear_left"), width=64, height=36, lidar_beams=8, lidar_azimuths=90)
-    cameras=("ring_front_center", "ring_rear_left"), width=64, height=36, lidar_beams=8, lidar_azimuths=90
-)
 
 
 def digests(root: Path) -> dict[str, str]:
