@@ -10,7 +10,7 @@ from tasks.render.gaussians import F32, F64, Gaussians, quats_of
 
 SIGMA_PER_PIXEL = 0.5  # standard deviation of a disc in units of its spacing on the surface (measured: .45 .. .55)
 FLATNESS = 0.1  # thickness as a share of the short side
-OPACITY = 0.7  # several discs overlap everywhere; measured against .6 .. .95
+OPACITY = 0.8  # several discs overlap everywhere; measured .7 .. .95: less is better where photos were, more beside
 MAX_ELONGATION = 8.0  # a disc on the road far ahead is that much longer than wide at most
 BEND = 0.02  # change of slope of the inverse depth, as a share of it, up to which pixels lie on one surface
 STEEP = 1.3  # neighbouring pixels whose depths differ by more do not share a surface

@@ -1,0 +1,151 @@
+"""Sensor files opened, broken ones named, and scenes stored."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pyarrow as pa
+import pyarrow.feather
+import pytest
+
+from factory.assets import asset_for, block_id, read_asset
+from factory.clips.reader import BadClip
+from factory.sensors import chosen_cameras, decode_image, encode_jpeg, load_sensors
+from tasks.render.scene import AssetSettings, psnr
+from tasks.render.settings import RenderSettings
+from tasks.world.agents import AgentTracks
+from tasks.world.camera import Camera, SensorFile
+from tasks.world.clip import CLIP_STEPS, Clip
+from tasks.world.lanes import RoadMap, Route
+from tasks.world.vehicle import EGO_STATE_SIZE
+
+SETTINGS = RenderSettings(width=48, height=32, asset=AssetSettings(hold_out_every=0, refit_sweeps=1))
+FRONT = np.array([[0.0, 0.0, 1.0, 1.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 1.5], [0.0, 0.0, 0.0, 1.0]])
+
+
+def smooth_image(seed: int) -> np.ndarray:
+    small = np.random.default_rng(seed).uniform(60, 200, (4, 6, 3)).astype(np.float32)
+    return cv2.resize(small, (96, 64), interpolation=cv2.INTER_CUBIC).clip(0, 255).astype(np.uint8)
+
+
+@pytest.fixture
+def clip(tmp_path: Path) -> Clip:
+    """Three photos of one camera and two sweeps of flat ground."""
+    images, sweeps = [], []
+    x, y = np.meshgrid(np.linspace(2.0, 30.0, 60), np.linspace(-8.0, 8.0, 60))
+    for k in range(3):
+        pose = np.eye(4)
+        pose[0, 3] = 2.0 * k
+        image = tmp_path / f"{k}.jpg"
+        image.write_bytes(encode_jpeg(smooth_image(1), 95))
+        images.append(SensorFile("front", str(image), 0.5 * k, pose))
+        points = tmp_path / f"{k}.feather"
+        table = {"x": x.ravel(), "y": y.ravel(), "z": 0 * x.ravel()}
+        pyarrow.feather.write_feather(pa.table({n: v.astype(np.float32) for n, v in table.items()}), str(points))
+        sweeps.append(SensorFile("lidar", str(points), 0.5 * k, pose))
+    intrinsics = np.array([[60.0, 0.0, 48.0], [0.0, 60.0, 32.0], [0.0, 0.0, 1.0]])
+    agents = AgentTracks(
+        (), (), np.zeros((CLIP_STEPS, 0, 5)), np.zeros((CLIP_STEPS, 0, 2)), np.zeros((CLIP_STEPS, 0), bool),
+        np.zeros((CLIP_STEPS, 0)), np.zeros(0),
+    )  # fmt: skip
+    return Clip(
+        clip_id="c",
+        dataset="test",
+        log_id="log",
+        split="train",
+        start_s=0.0,
+        ego_states=np.zeros((CLIP_STEPS, EGO_STATE_SIZE)),
+        world_from_ego=np.tile(np.eye(4), (CLIP_STEPS, 1, 1)),
+        agents=agents,
+        road_map=RoadMap({}, ()),
+        route=Route((), (), frozenset()),
+        centerline=np.zeros((2, 3)),
+        cameras=(Camera("front", 96, 64, intrinsics, np.zeros(3), FRONT),),
+        images=tuple(images),
+        sweeps=tuple(sweeps),
+    )
+
+
+def test_photos_come_at_the_size_asked_for_with_intrinsics_and_pose_to_match(clip: Clip) -> None:
+    data = load_sensors(clip, None, 48, 32)
+    assert [photo.rgb.shape for photo in data.photos] == [(32, 48, 3)] * 3
+    assert [photo.time_s for photo in data.photos] == [0.0, 0.5, 1.0]
+    np.testing.assert_allclose(data.photos[0].intrinsics, [[30, 0, 24], [0, 30, 16], [0, 0, 1]])
+    np.testing.assert_allclose(data.photos[2].world_from_camera[:3, 3], [5.0, 0.0, 1.5])
+    assert psnr(data.photos[0].rgb, cv2.resize(smooth_image(1), (48, 32), interpolation=cv2.INTER_AREA)) > 35.0
+    assert len(data.sweeps) == 3 and data.sweeps[1].points.shape == (3600, 3)
+
+
+def test_jpeg_keeps_colours_and_their_order() -> None:
+    image = smooth_image(2)
+    image[..., 0] = 230
+    back = decode_image(encode_jpeg(image, 95), "x")
+    assert psnr(back, image) > 35.0
+
+
+def test_a_missing_camera_is_named_with_those_there_are(clip: Clip) -> None:
+    with pytest.raises(ValueError, match="no camera rear; this rig has front"):
+        chosen_cameras(clip.cameras, ["rear"])
+
+
+@pytest.mark.parametrize("content", [b"", b"not a jpeg", encode_jpeg(smooth_image(0), 90)[:60]])
+def test_a_broken_image_is_a_bad_clip_that_names_the_file(clip: Clip, content: bytes) -> None:
+    Path(clip.images[1].uri).write_bytes(content)
+    with pytest.raises(BadClip, match=r"1\.jpg: image"):
+        load_sensors(clip, None, 48, 32)
+
+
+def test_a_missing_or_wrongly_sized_image_is_a_bad_clip(clip: Clip) -> None:
+    Path(clip.images[0].uri).unlink()
+    with pytest.raises(BadClip, match=r"0\.jpg: image: cannot be read"):
+        load_sensors(clip, None, 48, 32)
+    Path(clip.images[0].uri).write_bytes(encode_jpeg(smooth_image(0)[:50], 90))
+    with pytest.raises(BadClip, match=r"size: 96x50, but front takes 96x64"):
+        load_sensors(clip, None, 48, 32)
+
+
+def test_a_broken_sweep_is_a_bad_clip_that_names_file_and_column(clip: Clip) -> None:
+    path = Path(clip.sweeps[1].uri)
+    path.write_bytes(path.read_bytes()[:200])
+    with pytest.raises(BadClip, match=r"1\.feather"):
+        load_sensors(clip, None, 48, 32)
+    pyarrow.feather.write_feather(pa.table({"x": [1.0], "y": [1.0]}), str(path))
+    with pytest.raises(BadClip, match=r"1\.feather: z"):
+        load_sensors(clip, None, 48, 32)
+
+
+def test_a_block_is_built_once_and_read_back_the_same(clip: Clip, tmp_path: Path) -> None:
+    first = asset_for(clip, SETTINGS, tmp_path / "cache")
+    assert first is not None and len(first.background) > 100 and len(first.digest) == 16
+    for file in clip.images:
+        Path(file.uri).unlink()  # a second build would fail
+    again = asset_for(clip, SETTINGS, tmp_path / "cache")
+    assert again is not None and again.digest == first.digest
+    assert again.background.colours.tobytes() == first.background.colours.tobytes()
+
+
+def test_a_damaged_block_is_noticed_and_built_again(clip: Clip, tmp_path: Path) -> None:
+    first = asset_for(clip, SETTINGS, tmp_path)
+    path = tmp_path / f"block-{block_id(clip, SETTINGS)}.npz"
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    again = asset_for(clip, SETTINGS, tmp_path)
+    assert first is not None and again is not None and again.digest == first.digest
+    assert read_asset(path).digest == first.digest
+    assert not list(tmp_path.glob(".block-*"))
+
+
+def test_a_clip_without_photos_has_no_scene(clip: Clip, tmp_path: Path) -> None:
+    assert asset_for(replace(clip, images=()), SETTINGS, tmp_path) is None
+
+
+def test_another_size_or_window_is_another_block(clip: Clip) -> None:
+    ids = {
+        block_id(clip, SETTINGS),
+        block_id(clip, replace(SETTINGS, width=96)),
+        block_id(replace(clip, start_s=1.0), SETTINGS),
+        block_id(replace(clip, sweeps=clip.sweeps[:1]), SETTINGS),
+    }
+    assert len(ids) == 4
+    assert block_id(clip, replace(SETTINGS, jpeg_quality=50)) == block_id(clip, SETTINGS)
