@@ -36,7 +36,7 @@ def encode(value: object) -> bytes:
     arrays = _Arrays()
     tree = json.dumps({"format": FORMAT, "root": _encode(value, arrays)})
     sink = io.BytesIO()
-    np.savez(sink, allow_pickle=False, tree=np.frombuffer(tree.encode(), np.uint8), **arrays.by_name)
+    np.savez_compressed(sink, allow_pickle=False, tree=np.frombuffer(tree.encode(), np.uint8), **arrays.by_name)
     return sink.getvalue()
 
 

@@ -41,7 +41,10 @@ def value_of(column: Column, shape: Sequence[int | str], rng: np.random.Generato
     if column.dtype == "binary":
         return rng.bytes(12)
     sizes = [RAGGED[s] if isinstance(s, str) else s for s in shape]
-    return (rng.random(sizes) * 3.0).astype(column.dtype)
+    value = rng.random(sizes) * 3.0
+    if column.nan:
+        value[value > 2.5] = np.nan
+    return value.astype(column.dtype)
 
 
 def row_of(rng: np.random.Generator) -> dict[str, object]:

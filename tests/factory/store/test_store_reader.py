@@ -31,7 +31,7 @@ def test_samples_are_the_same_by_place_key_iteration_and_table(out: Path) -> Non
     for i, key in enumerate(samples.attempt_ids):
         for one in (samples[i], samples[key], by_key[key]):
             assert one["attempt_id"] == key
-            assert np.array_equal(one["agent_boxes"], by_key[key]["agent_boxes"])
+            assert np.array_equal(one["agent_boxes"], by_key[key]["agent_boxes"], equal_nan=True)
             assert one["stage2_score"] == scores["stage2_score"][i].as_py()
     assert samples.sample(0, ["round", "label_2hz"]).keys() == {"round", "label_2hz"}
     assert samples.schema.field("label_10hz").metadata[b"frame"] == b"ego at now"
