@@ -1,0 +1,153 @@
+"""Perturb and attempt on one Argoverse 2 clip: the lazy walk equals its slow twin, and both experts are heard."""
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from factory.clips.av2 import AV2Reader
+from tasks.attempt import ExpertGate, Judged, attempt, perturbed_scene
+from tasks.chance import stream
+from tasks.experts.pdm_closed import PdmClosed, PdmSettings, plan_for
+from tasks.experts.protocol import Expert
+from tasks.experts.recovery import Recovery, RecoveryTable
+from tasks.perturb import Perturbation, PerturbSettings, gate_failures, grid_cells, perturb
+from tasks.reward.epdms import score
+from tasks.reward.prepare import prepare_scene
+from tasks.rollout.lqr import track
+from tasks.rollout.simulate import TrafficSettings, simulate
+from tasks.stages import SUBSCORES, Rejected
+from tasks.vocabulary import Vocabulary
+from tasks.world.clip import HORIZON_STEPS, NOW, Clip, scene_of_clip
+from tasks.world.frames import to_local, to_world
+
+LOG, START_MS = "adcf7d18-0510-35b0-a2fa-b4cea13a6d76", 6000
+K = 600  # of the 8,192 human trajectories
+SETTINGS, TRAFFIC, PDM, GATE = PerturbSettings(), TrafficSettings(), PdmSettings(), ExpertGate()
+
+
+@pytest.fixture(scope="module")
+def human(shared_root: Path) -> NDArray[np.float64]:
+    return np.load(shared_root / "data" / "vocabulary" / "human_8192x40x3.npy")
+
+
+@pytest.fixture(scope="module")
+def clip(shared_root: Path) -> Clip:
+    reader = AV2Reader(shared_root / "data" / "av2" / "sensor" / "val" / LOG)
+    return reader.read(next(ref for ref in reader.index().refs if ref.start_ms == START_MS))
+
+
+@pytest.fixture(scope="module")
+def experts(human: NDArray[np.float64]) -> tuple[Expert, ...]:
+    return PdmClosed(PDM), Recovery(RecoveryTable(human))
+
+
+def listed(clip: Clip, human: NDArray[np.float64]) -> Perturbation:
+    found = perturb(clip, Vocabulary(human[:K]), SETTINGS, TRAFFIC, PDM, stream(0, clip.clip_id, "perturb"))
+    assert isinstance(found, Perturbation)
+    return found
+
+
+@pytest.fixture(scope="module")
+def found(clip: Clip, human: NDArray[np.float64]) -> Perturbation:
+    return listed(clip, human)
+
+
+def test_the_lazy_walk_equals_scoring_everything_first(
+    clip: Clip, human: NDArray[np.float64], found: Perturbation
+) -> None:
+    """The slow twin: drive and score all K, filter by gates, colour and score, pick the first per cell, then react."""
+    scene = scene_of_clip(clip)
+    start, target = scene.ego_state, clip.ego_states[NOW + HORIZON_STEPS, :3]
+    poses = to_world(start[:3], human[:K].astype(np.float64))
+    raw = to_local(target, poses[:, -1])
+    states = track(start, poses)
+    ends = to_local(target, states[:, -1, :3])
+    inside = np.ones(K, bool)
+    for pose in (raw, ends):
+        for fails in gate_failures(pose, SETTINGS).values():
+            inside &= ~fails
+    cells = grid_cells(ends, SETTINGS)
+    inside &= cells.sum(axis=1) % 2 == 0
+    pdm = plan_for(scene, PDM).driven[None]
+    candidates = np.flatnonzero(inside)
+    replay = prepare_scene(scene, scene.agents.window(NOW, NOW + HORIZON_STEPS + 1))
+    scores = np.full(K, np.nan)
+    scores[candidates] = score(replay, np.concatenate([pdm, states[candidates]]), normalise="pairs").pdm_score[1:]
+
+    first: dict[tuple[int, int], int | None] = {}
+    for index in stream(0, clip.clip_id, "perturb").permutation(K).tolist():
+        if inside[index]:
+            cell = (int(cells[index, 0]), int(cells[index, 1]))
+            if first.setdefault(cell, None) is None and scores[index] >= SETTINGS.epdms_min:
+                first[cell] = index
+    expected = []
+    for index in (index for index in first.values() if index is not None):
+        rollout = simulate(scene, poses[index], TRAFFIC)
+        rows = np.concatenate([pdm, rollout.ego_states[None]])
+        reactive = score(prepare_scene(scene, rollout.agents), rows, normalise="pairs").pdm_score[1]
+        if reactive >= SETTINGS.epdms_min:
+            expected.append((index, scores[index], reactive))
+
+    assert [c.vocabulary_index for c in found.candidates] == [index for index, _, _ in expected]
+    np.testing.assert_allclose([c.score for c in found.candidates], [s for _, s, _ in expected], atol=1e-12)
+    np.testing.assert_allclose([c.reactive_score for c in found.candidates], [r for _, _, r in expected], atol=1e-12)
+    asked = int(np.isfinite(found.considered.score).sum())
+    assert asked < len(candidates), f"lazy: {asked} scores instead of {len(candidates)}"
+
+
+def outcomes(clip: Clip, found: Perturbation, expert: Expert, n: int) -> list[tuple[str, float, bytes]]:
+    """Reason (empty: accepted), score and driven states of the first n attempts."""
+    out = []
+    for index, candidate in enumerate(found.candidates[:n]):
+        rng = stream(0, clip.clip_id, f"expert.{expert.name}", index)
+        result = attempt(perturbed_scene(clip, candidate.rollout), expert, GATE, TRAFFIC, PDM, rng)
+        if isinstance(result, Rejected):
+            out.append((result.reason, np.nan, b""))
+            continue
+        judged, rejected = result
+        out.append((_checked(judged, rejected), float(judged.scores.pdm_score[1]), judged.rollout.ego_states.tobytes()))
+    return out
+
+
+def _checked(judged: Judged, rejected: Rejected | None) -> str:
+    passes = all(getattr(judged.scores, name)[1] == 1.0 for name in GATE.full) and judged.scores.ep[1] > 0.5
+    assert passes == (rejected is None)
+    return "" if rejected is None else rejected.reason
+
+
+def test_both_experts_are_accepted_on_some_candidates_and_rejected_for_listed_reasons_on_others(
+    clip: Clip, experts: tuple[Expert, ...], found: Perturbation
+) -> None:
+    for expert in experts:
+        reasons = Counter(reason for reason, _, _ in outcomes(clip, found, expert, len(found.candidates)))
+        assert reasons[""] >= 1, f"{expert.name}: {dict(reasons)}"
+        assert sum(reasons.values()) > reasons[""], f"{expert.name} passes everywhere: is anything judged?"
+        assert set(reasons) <= {"", *SUBSCORES, "no_plan"}
+
+
+def test_the_same_clip_gives_the_same_bytes_again(
+    clip: Clip, human: NDArray[np.float64], experts: tuple[Expert, ...], found: Perturbation
+) -> None:
+    again = listed(clip, human)
+    assert again.gate_counts == found.gate_counts
+    assert [c.vocabulary_index for c in again.candidates] == [c.vocabulary_index for c in found.candidates]
+    for a, b in zip(again.candidates, found.candidates, strict=True):
+        assert a.rollout.ego_states.tobytes() == b.rollout.ego_states.tobytes()
+        assert a.rollout.agents.boxes.tobytes() == b.rollout.agents.boxes.tobytes()
+    for expert in experts:
+        assert outcomes(clip, again, expert, 2) == outcomes(clip, found, expert, 2)
+
+
+def test_an_attempt_does_not_depend_on_the_ones_before(
+    clip: Clip, experts: tuple[Expert, ...], found: Perturbation
+) -> None:
+    """An attempt gives the same result second or alone: nothing is handed from one to the next."""
+    recovery = experts[1]
+    after_one = outcomes(clip, found, recovery, 2)
+    alone = perturbed_scene(clip, found.candidates[1].rollout)
+    result = attempt(alone, recovery, GATE, TRAFFIC, PDM, stream(0, clip.clip_id, "expert.recovery", 1))
+    assert not isinstance(result, Rejected)
+    assert result[0].rollout.ego_states.tobytes() == after_one[1][2]
