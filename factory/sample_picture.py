@@ -31,7 +31,8 @@ BEV_COLUMNS = (
     "light_states",
     "route_lane_ids",
 )
-TILE_PX = (416, 234)  # width, height of a camera in the sheet
+TILE_PX = (400, 240)  # width, height of a camera in the sheet, its caption included
+CAPTION_PX = 22
 INK = (30, 30, 30)
 
 
@@ -132,33 +133,36 @@ def encoded(image: Image, suffix: str = ".jpg") -> bytes:
 
 
 def sample_sheet(row: Row, logged: Array | None = None, bev_px: int = 720) -> Image:
-    """Top-down view and all cameras at now, side by side; two cameras a row."""
-    images = images_at_now(row)
-    tiles = [_tile(image) for image in images] or [_note(f"no images: image_source is {row['image_source']}")]
-    if len(tiles) % 2 and len(tiles) > 1:
-        tiles.append(np.full_like(tiles[0], BACKGROUND))
-    columns = min(2, len(tiles))
-    strip = np.concatenate(
-        [np.concatenate(tiles[i : i + columns], axis=1) for i in range(0, len(tiles), columns)], axis=0
-    )
+    """Top-down view and all cameras at now, side by side; up to three cameras in one column, more in two."""
+    tiles = [_tile(image) for image in images_at_now(row)] or [
+        _note(f"no images: image_source is {row['image_source']}")
+    ]
+    columns = 1 if len(tiles) <= 3 else 2
+    tiles += [np.full_like(tiles[0], BACKGROUND)] * (-len(tiles) % columns)
+    rows = [np.concatenate(tiles[i : i + columns], axis=1) for i in range(0, len(tiles), columns)]
+    strip = np.concatenate(rows, axis=0)
     height = max(bev_px, strip.shape[0])
-    return np.concatenate([_padded(sample_bev(row, logged, (bev_px, bev_px)), height), _padded(strip, height)], axis=1)
+    bev = sample_bev(row, logged, (bev_px, bev_px))
+    return np.concatenate([_padded(bev, height), _padded(strip, height)], axis=1)
 
 
 def _tile(image: Mapping[str, Any]) -> Image:
-    text = f"{image['camera']}  {image['time_s']:+.1f} s"
+    """One camera over its caption, with a margin."""
     try:
-        tile = fitted(decoded(image), *TILE_PX)
+        pixels = decoded(image)
     except ValueError as error:
         return _note(str(error))
-    cv2.putText(tile, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 3, cv2.LINE_AA)
-    cv2.putText(tile, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1, cv2.LINE_AA)
-    return tile
+    tile = fitted(pixels, TILE_PX[0] - 8, TILE_PX[1] - CAPTION_PX - 4)
+    tile = cv2.copyMakeBorder(tile, 4, CAPTION_PX, 4, 4, cv2.BORDER_CONSTANT, value=BACKGROUND)
+    return _written(tile, f"{image['camera']}  {image['time_s']:+.1f} s", TILE_PX[1] - 7)
 
 
 def _note(text: str) -> Image:
-    tile = np.full((TILE_PX[1], TILE_PX[0], 3), BACKGROUND, np.uint8)
-    cv2.putText(tile, text[:60], (12, TILE_PX[1] // 2), cv2.FONT_HERSHEY_SIMPLEX, 0.42, INK, 1, cv2.LINE_AA)
+    return _written(np.full((TILE_PX[1], TILE_PX[0], 3), BACKGROUND, np.uint8), text[:60], TILE_PX[1] // 2)
+
+
+def _written(tile: Image, text: str, baseline: int) -> Image:
+    cv2.putText(tile, text, (8, baseline), cv2.FONT_HERSHEY_SIMPLEX, 0.42, INK, 1, cv2.LINE_AA)
     return tile
 
 
