@@ -153,8 +153,9 @@ def _tile(image: Mapping[str, Any]) -> Image:
     except ValueError as error:
         return _note(str(error))
     tile = fitted(pixels, TILE_PX[0] - 8, TILE_PX[1] - CAPTION_PX - 4)
-    tile = cv2.copyMakeBorder(tile, 4, CAPTION_PX, 4, 4, cv2.BORDER_CONSTANT, value=BACKGROUND)
-    return _written(tile, f"{image['camera']}  {image['time_s']:+.1f} s", TILE_PX[1] - 7)
+    framed = np.full((TILE_PX[1], TILE_PX[0], 3), BACKGROUND, np.uint8)
+    framed[4:-CAPTION_PX, 4:-4] = tile
+    return _written(framed, f"{image['camera']}  {image['time_s']:+.1f} s", TILE_PX[1] - 7)
 
 
 def _note(text: str) -> Image:

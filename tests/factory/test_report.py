@@ -225,13 +225,13 @@ def test_rejected_examples_are_the_same_with_and_without_the_cache(tmp_path: Pat
                 f"vocabulary.file={shared_root}/data/vocabulary/human_8192x40x3.npy",
                 "vocabulary.k=512",
                 "experts=[recovery]",
-                "rounds=1",
+                "rounds=9",
                 f"out={tmp_path}",
             ]
         )
     )
     store = Store(tmp_path)
-    execute(run.work, run.index.refs[:1], run.config.experts, 1, store, "local", say=lambda line: None)
+    execute(run.work, run.index.refs[:1], run.config.experts, 9, store, "local", say=lambda line: None)
     line = write_report(store, run)
     first = (tmp_path / FILE).read_text()
     assert str(tmp_path / FILE) in line
