@@ -37,15 +37,18 @@ class RayGraph:
     """Graph of Ray tasks. Connects to the cluster of RAY_ADDRESS or `address`, else starts one in this machine."""
 
     def __init__(self, work: Work, out: Location, workers: int | None = None, address: str | None = None) -> None:
-        """Raises BadLocation when some node does not see `out`."""
-        self._started = not ray.is_initialized()
-        if self._started:
-            _connect(workers, address)
+        """workers: CPUs of a cluster started here, tasks at once on one that is there already; None: all its CPUs.
+
+        Raises BadLocation when some node does not see `out`.
+        """
+        self._connected = not ray.is_initialized()
+        self._is_ours = self._connected and _connect(workers, address)
         available = int(ray.cluster_resources().get("CPU", 1))
         self.parallelism = max(1, min(workers or available, available))
         self._supplied: dict[str, Any] = {"work": [ray.put(work)], "out": out}  # in a list: handed over as a reference
         self._tickets: dict[Any, Ticket] = {}
         self._ready: deque[Any] = deque()
+        self._held_back: deque[tuple[Ticket, str, tuple[Any, ...]]] = deque()
         try:
             _prove_shared(out)
             _warm_every_node(self._supplied["work"])
@@ -54,11 +57,18 @@ class RayGraph:
             raise
 
     def submit(self, step: str, *args: Any) -> Ticket:
-        supplied = [self._supplied[name] for name in WANTS[step]]
-        report, result = _run.remote(step, len(supplied), *supplied, *args)
-        ticket = Ticket(result)
-        self._tickets[report] = ticket
+        ticket = Ticket(None)
+        self._held_back.append((ticket, step, args))
+        self._dispatch()
         return ticket
+
+    def _dispatch(self) -> None:
+        """A cluster of our own queues what its CPUs do not take; on a shared one the rest is held back here."""
+        while self._held_back and (self._is_ours or len(self._tickets) < self.parallelism):
+            ticket, step, args = self._held_back.popleft()
+            supplied = [self._supplied[name] for name in WANTS[step]]
+            report, ticket.result = _run.remote(step, len(supplied), *supplied, *args)
+            self._tickets[report] = ticket
 
     def wait(self, timeout_s: float) -> tuple[Ticket, Any] | None:
         if not self._ready and self._tickets:
@@ -71,6 +81,7 @@ class RayGraph:
             return None
         reference = self._ready.popleft()
         ticket = self._tickets.pop(reference)
+        self._dispatch()
         try:
             return ticket, ray.get(reference)
         except RayError as error:
@@ -78,7 +89,7 @@ class RayGraph:
 
     def close(self) -> None:
         self._tickets.clear()
-        if self._started:
+        if self._connected:
             ray.shutdown()
 
 
@@ -104,7 +115,8 @@ def _sees(out: Location, name: str, token: bytes) -> bool:
     return out.read(name) == token
 
 
-def _connect(workers: int | None, address: str | None) -> None:
+def _connect(workers: int | None, address: str | None) -> bool:
+    """Join the cluster of `address` or RAY_ADDRESS, else start one in this machine (then True)."""
     environment = WORKER_ENV | {name: os.environ[name] for name in FORWARDED_ENV if name in os.environ}
     where = address or ("auto" if os.environ.get("RAY_ADDRESS") else "local")
     own: dict[str, Any] = {"num_cpus": workers, "include_dashboard": False} if where == "local" else {}
@@ -115,6 +127,7 @@ def _connect(workers: int | None, address: str | None) -> None:
         logging_level=logging.WARNING,
         **own,
     )
+    return where == "local"
 
 
 def _nodes() -> list[str]:

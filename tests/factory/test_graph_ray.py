@@ -28,24 +28,17 @@ def two_cpus() -> Iterator[None]:
     ray.shutdown()
 
 
-def test_local_and_ray_with_one_worker_make_identical_rows(tmp_path: Path) -> None:
+def test_local_and_ray_with_one_and_two_workers_make_identical_rows(tmp_path: Path, two_cpus: None) -> None:
     run(tmp_path / "local", "local", ToyWork(), 5, 1)
-    run(tmp_path / "one", "ray", ToyWork(), 2, 1)
-    assert not ray.is_initialized(), "a cluster that the run started is left behind"
+    assert run(tmp_path / "one", "ray", ToyWork(), 2, 1).exit_code == COMPLETE
     assert run(tmp_path / "one", "local", ToyWork(), 5, 1).executed.prepared == 0
-    assert_same_tables(tmp_path / "local", tmp_path / "one")
-
-
-@pytest.mark.usefixtures("two_cpus")
-def test_local_and_ray_with_two_workers_make_identical_rows(tmp_path: Path) -> None:
-    run(tmp_path / "local", "local", ToyWork(), 5, 1)
     assert run(tmp_path / "two", "ray", ToyWork(), 5, 2).exit_code == COMPLETE
     assert ray.is_initialized(), "a cluster that the run found must stay"
+    assert_same_tables(tmp_path / "local", tmp_path / "one")
     assert_same_tables(tmp_path / "local", tmp_path / "two")
 
 
-@pytest.mark.usefixtures("two_cpus")
-def test_a_clip_that_kills_its_workers_hurts_nobody_else(tmp_path: Path) -> None:
+def test_a_clip_that_kills_its_workers_hurts_nobody_else(tmp_path: Path, two_cpus: None) -> None:
     journal = str(tmp_path / "journal")
     poison = ToyWork(trouble={"log0:2000:recovery:0": "die", "log1:1000": "bad"}, journal=journal)
     summary = run(tmp_path / "out", "ray", poison, 2, 2)
