@@ -1,9 +1,11 @@
 """One decorator for every compiled kernel: cached on disk, GIL released, no fastmath, no parallel reductions.
 
-Numba's own cache does not notice an edit in a callee that lives in another file, so the cache folder is named by a
-digest of all sources that hold kernels: one edit anywhere starts a new folder. NUMBA_CACHE_DIR, when set, is left alone.
+Numba's own cache does not notice an edit in a callee or of a constant that lives in another file, so the cache folder
+is named by a digest of all sources that hold kernels or the constants of kernels: one edit anywhere starts a new
+folder. NUMBA_CACHE_DIR, when set, is left alone.
 """
 
+import ast
 import hashlib
 import os
 from collections.abc import Callable
@@ -13,21 +15,36 @@ from typing import Any, TypeVar
 import numba
 
 F = TypeVar("F", bound=Callable[..., Any])
+_ROOT = Path(__file__).resolve().parent.parent
 _PACKAGES = ("tasks", "factory")
+_MARKS = (b"tasks.kernels import", b"njit")
 
 
-def kernel_sources() -> list[Path]:
-    """Every source file that holds a kernel, sorted."""
-    root = Path(__file__).resolve().parent.parent
+def kernel_sources(root: Path = _ROOT) -> list[Path]:
+    """Every source file that holds a kernel, and every one that such a file takes a constant from, sorted."""
     files = (path for package in _PACKAGES for path in (root / package).rglob("*.py"))
-    return sorted(path for path in files if b"tasks.kernels import" in path.read_bytes())
+    waiting = [path for path in files if any(mark in path.read_bytes() for mark in _MARKS)]
+    found: set[Path] = set()
+    while waiting:
+        path = waiting.pop()
+        if path not in found:
+            found.add(path)
+            waiting += _constants_from(path, root)
+    return sorted(found)
 
 
-def sources_digest() -> str:
+def _constants_from(path: Path, root: Path) -> list[Path]:
+    imports = (node for node in ast.parse(path.read_bytes()).body if isinstance(node, ast.ImportFrom))
+    named = (node.module for node in imports if node.module and any(alias.name.isupper() for alias in node.names))
+    modules = (root.joinpath(*module.split(".")).with_suffix(".py") for module in named)
+    return [module for module in modules if module.is_file()]
+
+
+def sources_digest(root: Path = _ROOT) -> str:
     """16 hex digits over all kernel sources and numba's version."""
     sha = hashlib.sha256(numba.__version__.encode())
-    for path in kernel_sources():
-        sha.update(path.name.encode() + b"\0" + path.read_bytes())
+    for path in kernel_sources(root):
+        sha.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
     return sha.hexdigest()[:16]
 
 

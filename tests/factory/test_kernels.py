@@ -1,0 +1,97 @@
+"""Compiled kernels: the cache follows their sources and constants; nothing in them depends on threads or fast maths."""
+
+import ast
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tasks.kernels import cache_dir, kernel_sources, sources_digest
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+
+
+def test_every_source_that_compiles_something_is_in_the_digest() -> None:
+    """Found another way: by the names that the syntax tree imports."""
+    listed = set(kernel_sources())
+    for package in ("tasks", "factory"):
+        for path in (REPOSITORY / package).rglob("*.py"):
+            nodes = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)]
+            compiles = any(
+                node.module in ("numba", "tasks.kernels") and {"njit", "jit", "kernel"} & {a.name for a in node.names}
+                for node in nodes
+            )
+            assert not compiles or path in listed, path
+
+
+def test_no_kernel_may_add_in_another_order_on_another_machine() -> None:
+    for path in kernel_sources():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.keyword):
+                assert node.arg not in ("fastmath", "parallel"), path
+            if isinstance(node, ast.Name | ast.Attribute):
+                assert getattr(node, "id", getattr(node, "attr", "")) != "prange", path
+
+
+@pytest.fixture
+def small_house(tmp_path: Path) -> Path:
+    """A kernel that takes one constant from another file, beside a file that has nothing to do with it."""
+    (tmp_path / "tasks").mkdir()
+    (tmp_path / "factory").mkdir()
+    (tmp_path / "tasks" / "speed.py").write_text("from tasks.units import STEP_S\nLIMIT = 3.0\n")
+    (tmp_path / "tasks" / "units.py").write_text("STEP_S = 0.1\n")
+    (tmp_path / "tasks" / "words.py").write_text("HELLO = 'hello'\n")
+    (tmp_path / "factory" / "fast.py").write_text(
+        "from tasks.kernels import kernel\nfrom tasks.speed import LIMIT\nfrom tasks.words import greet\n"
+    )
+    return tmp_path
+
+
+@pytest.mark.parametrize("edited", ["factory/fast.py", "tasks/speed.py", "tasks/units.py"])
+def test_an_edit_of_a_kernel_or_of_a_constant_it_uses_starts_a_new_cache(small_house: Path, edited: str) -> None:
+    before = sources_digest(small_house)
+    assert sources_digest(small_house) == before
+    with (small_house / edited).open("a") as file:
+        file.write("# edited\n")
+    assert sources_digest(small_house) != before
+
+
+def test_an_edit_elsewhere_keeps_the_cache(small_house: Path) -> None:
+    before = sources_digest(small_house)
+    with (small_house / "tasks" / "words.py").open("a") as file:
+        file.write("# edited\n")
+    assert sources_digest(small_house) == before
+
+
+def test_the_cache_lies_in_the_user_s_cache_folder_named_by_the_digest(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", "/somewhere")
+    assert cache_dir() == Path("/somewhere/driving-data-factory") / f"kernels-{sources_digest()}"
+
+
+def cache_asked_for(**environment: str) -> str:
+    code = "import tasks.kernels, numba; print(numba.config.CACHE_DIR)"
+    env = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"} | environment
+    env |= {"PYTHONPATH": str(REPOSITORY)}
+    return subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True).stdout.strip()
+
+
+def test_a_cache_folder_named_in_the_environment_is_left_alone(tmp_path: Path) -> None:
+    assert cache_asked_for(NUMBA_CACHE_DIR=str(tmp_path)) == str(tmp_path)
+    assert cache_asked_for() == str(cache_dir())
+
+
+def test_a_kernel_gives_the_bytes_of_its_own_python() -> None:
+    """No reordered sums: compiled and interpreted addition agree to the last bit."""
+    from tasks.kernels import kernel
+
+    def total(values: np.ndarray) -> float:
+        out = 0.0
+        for value in values:
+            out += value * value
+        return out
+
+    values = np.random.default_rng(0).normal(size=10_001)
+    assert kernel(total)(values) == total(values)
