@@ -6,7 +6,7 @@ again from their prepared clips, which gives the same result. Which examples are
 
 import json
 from collections import Counter
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -46,6 +46,7 @@ FILE = "report.html"
 N_EXAMPLES = 6
 N_STRIPS = 4
 N_FAILED = 50
+PER_VALUE = 200
 MAX_PREPARED_AGAIN = 2  # clips whose prepared form is gone from the cache: a few seconds each
 BEV_PX = (640, 640)  # 80 m
 CAMERA_PX = 320  # width of a camera frame on the page
@@ -55,6 +56,21 @@ STATUS = {  # exit code -> words, tone
     4: ("interrupted: the same command goes on", "warn"),
 }
 LABELS = ("attempt_id", "clip_id", "log_id", "dataset", "licence", "expert", "round", "candidate_index", "image_source")
+OUTCOME_LABELS = (
+    "attempt_id",
+    "clip_id",
+    "log_id",
+    "expert",
+    "candidate_index",
+    "kind",
+    "settings_hash",
+    "stage",
+    "reason",
+    "detail",
+    "error_kind",
+    "error",
+    "tries",
+)
 Row = Mapping[str, Any]
 T = TypeVar("T")
 
@@ -121,7 +137,7 @@ def gather(
     last = json.loads(store.location.read("last_run.json") or b"{}")
     labels = store.samples.read(LABELS).to_pylist()
     taken = {row["attempt_id"] for row in labels}
-    outcomes = [row for row in store.outcomes.read().to_pylist() if row["attempt_id"] not in taken]
+    outcomes = [row for row in store.outcomes.read(OUTCOME_LABELS).to_pylist() if row["attempt_id"] not in taken]
     rejected = [o for o in outcomes if o["kind"] == Kind.REJECTED and o["expert"] and o["candidate_index"] >= 0]
     failed = sorted((o for o in outcomes if o["kind"] == Kind.FAILED), key=lambda o: o["attempt_id"])
     word, tone = STATUS.get(last.get("exit_code"), ("unfinished", "bad"))
@@ -158,18 +174,26 @@ def gather(
     )
 
 
-def spread(rows: Sequence[T], keys: Callable[[T], Sequence[Hashable]], order: Callable[[T], str]) -> "list[T]":
-    """The rows, each next one the least like those before it: fewest repeats over its keys, then `order`.
+def spread(rows: Iterable[T], keys: Callable[[T], Sequence[Hashable]], order: Callable[[T], str]) -> list[T]:
+    """A few rows, each next one the least like those before it: fewest repeats over its keys, then `order`.
 
-    Only as many as are wanted should be taken from the front; the same rows in any order give the same list.
+    The same rows in any order give the same list. Of each value of the first key at most PER_VALUE rows are looked at,
+    so that a table of any size costs one pass.
     """
-    left = sorted(rows, key=order)
+    seen: Counter[Hashable] = Counter()
+    left: list[tuple[tuple[tuple[int, Hashable], ...], T]] = []
+    for row in sorted(rows, key=order):
+        slots = tuple(enumerate(keys(row)))
+        seen[slots[0]] += 1
+        if seen[slots[0]] <= PER_VALUE:
+            left.append((slots, row))
     used: Counter[tuple[int, Hashable]] = Counter()
     chosen: list[T] = []
-    while left and len(chosen) < 4 * N_EXAMPLES:
-        best = min(range(len(left)), key=lambda i: (sum(used[slot] for slot in enumerate(keys(left[i]))), i))
-        chosen.append(left.pop(best))
-        used.update(enumerate(keys(chosen[-1])))
+    while left and len(chosen) < 4 * N_EXAMPLES:  # some of them may turn out not to be drawable
+        best = min(range(len(left)), key=lambda i: (sum(used[slot] for slot in left[i][0]), i))
+        slots, row = left.pop(best)
+        chosen.append(row)
+        used.update(slots)
     return chosen
 
 
