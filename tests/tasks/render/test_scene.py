@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 import street
 
+from tasks.render import choose, depth, movers, project, raster
 from tasks.render.scene import AssetSettings, Photo, RenderAsset, build_asset, psnr, render_photo, scene_at
+from tasks.render.warm import compile_kernels
 from tasks.world.agents import AgentKind
 
 SIZE = (street.WIDTH, street.HEIGHT)
@@ -111,3 +113,11 @@ def test_psnr_in_closed_form() -> None:
 def test_no_photos_no_scene() -> None:
     with pytest.raises(ValueError, match="no photos"):
         build_asset([], [], None, AssetSettings())
+
+
+def test_the_smallest_scene_reaches_every_kernel_of_the_room() -> None:
+    compile_kernels()
+    modules = (choose, depth, movers, project, raster)
+    kernels = [value for module in modules for value in vars(module).values() if hasattr(value, "signatures")]
+    assert len(kernels) > 10
+    assert [kernel.__name__ for kernel in kernels if not kernel.signatures] == []
