@@ -58,6 +58,12 @@ def _pick(palette: tuple[tuple[float, float, float], ...], look: int) -> tuple[f
     return palette[look % len(palette)]
 
 
+def _ground_shade(b: Builder, length: float, width: float) -> None:
+    """The dark under a vehicle, where no sky reaches."""
+    f, w = 0.48 * length, 0.48 * width
+    b.face([(-f, -w, 0.02), (f, -w, 0.02), (f, w, 0.02), (-f, w, 0.02)], tx.DARK, (0.10, 0.10, 0.10))
+
+
 def _wheels(b: Builder, axles: tuple[float, ...], half_width: float, radius: float) -> None:
     for x in axles:
         for side in (-1.0, 1.0):
@@ -159,6 +165,7 @@ def _car(length: float, width: float, height: float, look: int) -> Mesh:
         (0.06, 0.06, 0.06),
     )
     b.face([(r + 0.1, -w, 0.2), (f - 0.1, -w, 0.2), (f - 0.1, w, 0.2), (r + 0.1, w, 0.2)], tx.DARK, (0.04, 0.04, 0.04))
+    _ground_shade(b, length, width)
     _wheels(b, (f - 0.85, r + 0.85), w, 0.33)
     return b.mesh()
 
@@ -212,6 +219,7 @@ def _truck(length: float, width: float, height: float, look: int) -> Mesh:
         [(box_r, -w, height), (box_f, -w, height), (box_f, w, height), (box_r, w, height)], tx.METAL, (0.8, 0.8, 0.8)
     )
     b.box((0.0, 0.0, 0.68), (length * 0.94, width * 0.5, 0.36), tx.DARK, (0.07, 0.07, 0.07))
+    _ground_shade(b, length, width)
     _wheels(b, (f - 1.0, r + 1.3), w - 0.02, 0.45)
     return b.mesh()
 
@@ -229,6 +237,7 @@ def _bus(length: float, width: float, height: float, look: int) -> Mesh:
         for x, light in ((f + 0.006, HEAD_LIGHT), (r - 0.006, TAIL_LIGHT)):
             lo, hi = side * (w - 0.45), side * (w - 0.12)
             b.face([(x, lo, 0.6), (x, hi, 0.6), (x, hi, 0.85), (x, lo, 0.85)], tx.GLOW, light)
+    _ground_shade(b, length, width)
     _wheels(b, (f - 2.4, r + 3.0), w, 0.48)
     return b.mesh()
 

@@ -55,7 +55,7 @@ def _house(b: Builder, corners: Array, height: float, seed: int, rng: np.random.
     for i in range(4):
         j = (i + 1) % 4
         b.face([low[j], low[i], top[i], top[j]], tx.FACADE, seed=seed if i % 2 == 0 else seed + 1)
-    if tx.chance.py_func(seed, 1, 78) < 0.45 and height < 14.0:
+    if tx.chance(seed, 1, 78) < 0.45 and height < 14.0:
         ridge = (top[[0, 1]] + top[[3, 2]]) / 2 + [0, 0, 0.32 * float(np.hypot(*(corners[3] - corners[0])))]
         colour = ((0.46, 0.22, 0.15), (0.28, 0.27, 0.29), (0.38, 0.25, 0.18))[seed % 3]
         b.face([top[0], top[1], ridge[1], ridge[0]], tx.ROOF_TILES, colour, seed)
@@ -78,8 +78,8 @@ def _house(b: Builder, corners: Array, height: float, seed: int, rng: np.random.
         b.face(list(top), tx.FLAT_ROOF, (0.45, 0.45, 0.45))
     along = (corners[1] - corners[0]) / np.hypot(*(corners[1] - corners[0]))
     outward = (corners[0] - corners[3]) / np.hypot(*(corners[0] - corners[3]))
-    ground = 3.3 + tx.chance.py_func(seed, 2, 77) * 0.9
-    if tx.chance.py_func(seed, 6, 77) < 0.55:
+    ground = 3.3 + tx.chance(seed, 2, 77) * 0.9
+    if tx.chance(seed, 6, 77) < 0.55:
         width = float(np.hypot(*(corners[1] - corners[0])))
         for k in range(int(width / 4.6)):
             if rng.random() < 0.45:
@@ -100,7 +100,7 @@ def _house(b: Builder, corners: Array, height: float, seed: int, rng: np.random.
                 lip = [edge[0], edge[1], [*edge[1][:2], edge[1][2] - 0.25], [*edge[0][:2], edge[0][2] - 0.25]]
                 b.face(np.array(lip), tx.CLOTH, colour * 0.85, seed)
     elif height > 8.0:
-        floor = 2.9 + tx.chance.py_func(seed, 3, 77) * 0.5
+        floor = 2.9 + tx.chance(seed, 3, 77) * 0.5
         width = float(np.hypot(*(corners[1] - corners[0])))
         for z in np.arange(ground + 0.1, height - 3.0, floor):
             for x in np.arange(2.0, width - 3.0, 5.4):

@@ -8,15 +8,15 @@ Visible is the largest `key`, interpolated the same way: 1/w for a camera, heigh
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from factory.clips.synthetic.compiled import drawing_njit
 from factory.clips.synthetic.textures import LEAVES, SPOKES, TREELINE, opaque_at
 
 NEAR_M = 0.15
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@drawing_njit
 def rasterise(
     vertices: NDArray[np.float64],  # (T, 3, 3) world
     uv: NDArray[np.float64],  # (T, 3, 2)

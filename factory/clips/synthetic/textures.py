@@ -6,7 +6,7 @@ alias and one place has one colour from near and far. Colours are (r, g, b) in 0
 
 import math
 
-from numba import njit
+from factory.clips.synthetic.compiled import drawing_njit
 
 # Materials
 (
@@ -40,7 +40,7 @@ ALPHA_TESTED = (LEAVES, TREELINE, SPOKES)
 RGB = tuple[float, float, float]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@drawing_njit
 def chance(x: int, y: int, seed: int) -> float:
     """A fixed random number in [0, 1) of an integer cell."""
     h = (x * 374761393 + y * 668265263 + seed * 1442695041) & 0xFFFFFFFF
@@ -49,7 +49,7 @@ def chance(x: int, y: int, seed: int) -> float:
     return ((h ^ (h >> 16)) & 0xFFFFFF) / 16777216.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@drawing_njit
 def noise(u: float, v: float, seed: int) -> float:
     """Value noise in [0, 1) with cells of size 1."""
     iu, iv = math.floor(u), math.floor(v)
@@ -61,13 +61,13 @@ def noise(u: float, v: float, seed: int) -> float:
     return top * (1 - b) + low * b
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@drawing_njit
 def visible(size: float, footprint: float) -> float:
     """How much of a pattern of that size survives a pixel of that footprint (1 near, 0 far)."""
     return min(1.0, max(0.0, 1.6 * size / footprint - 0.8))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@drawing_njit
 def inside(x: float, low: float, high: float, footprint: float) -> float:
     """Share of a pixel of that footprint at x that lies in [low, high]."""
     return (
@@ -77,7 +77,7 @@ def inside(x: float, low: float, high: float, footprint: float) -> float:
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@drawing_njit
 def grain(u: float, v: float, seed: int, footprint: float) -> float:
     """Three octaves of fine noise around 0: stones of 6, 2 and 0.7 cm."""
     out = 0.0
@@ -91,7 +91,7 @@ def grain(u: float, v: float, seed: int, footprint: float) -> float:
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@drawing_njit
 def asphalt(x: float, y: float, footprint: float) -> RGB:
     """Worn asphalt in world coordinates: broad tones, repairs, cracks, grain."""
     tone = 0.335 + 0.07 * (noise(x / 9.0, y / 9.0, 1) - 0.5) + 0.07 * (noise(x / 1.7, y / 1.7, 2) - 0.5)
@@ -110,7 +110,7 @@ def asphalt(x: float, y: float, footprint: float) -> RGB:
     return tone, tone * 1.005, tone * 1.02
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@drawing_njit
 def paving(u: float, v: float, seed: int, footprint: float) -> RGB:
     """Concrete slabs of 60 x 40 cm."""
     row = math.floor(v / 0.4)
@@ -135,7 +135,7 @@ def paving(u: float, v: float, seed: int, footprint: float) -> RGB:
     return tone * 1.01, tone * 0.985, tone * 0.94
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@drawing_njit
 def grass(x: float, y: float, footprint: float) -> RGB:
     """A lawn with tufts and bare spots."""
     broad = noise(x / 6.0, y / 6.0, 21)
@@ -147,7 +147,7 @@ def grass(x: float, y: float, footprint: float) -> RGB:
     return (0.27 + 0.12 * bare) * tone, (0.36 - 0.02 * bare) * tone, (0.15 + 0.07 * bare) * tone
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@drawing_njit
 def wall(u: float, v: float, style: int, seed: int, footprint: float) -> RGB:
     """Brick (styles 0-2), plaster (3-6) or concrete panels (7), stained from above."""
     stain = 1.0 + 0.16 * (noise(u / 1.3, v / 4.0, seed) - 0.5) + 0.10 * (noise(u / 0.4, v / 0.9, seed + 1) - 0.5)
@@ -158,7 +158,7 @@ def wall(u: float, v: float, style: int, seed: int, footprint: float) -> RGB:
         seen = visible(0.085, footprint)
         tone = stain * (1 + 0.34 * seen * (chance(int(column), int(row), seed) - 0.5))
         du, dv = shifted - column * 0.24, v - row * 0.085
-        mortar = visible(0.05, footprint) if (du < 0.014 or dv < 0.014) else 0.0
+        mortar = max(inside(du, 0.0, 0.014, footprint), inside(dv, 0.0, 0.014, footprint)) * visible(0.06, footprint)
         if style == 0:
             r, g, b = 0.55 * tone, 0.30 * tone, 0.23 * tone
         elif style == 1:
@@ -179,7 +179,7 @@ def wall(u: float, v: float, style: int, seed: int, footprint: float) -> RGB:
     return 0.60 * rough * joint, 0.59 * rough * joint, 0.57 * rough * joint
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@drawing_njit
 def pane(u: float, v: float, cell: int, seed: int) -> RGB:
     """Glass seen from the street: a dark room, a curtain, a bit of sky; u, v in 0..1 over the pane."""
     kind = chance(cell, 3, seed)
@@ -195,7 +195,7 @@ def pane(u: float, v: float, cell: int, seed: int) -> RGB:
     return r, g, b
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@drawing_njit
 def facade(u: float, v: float, width: float, height: float, seed: int, fu: float, fv: float) -> RGB:
     """A house front: plinth, shops or doors at street level, floors of windows, cornice. Everything by `seed`."""
     fp = max(fu, fv)
@@ -262,7 +262,7 @@ def facade(u: float, v: float, width: float, height: float, seed: int, fu: float
     return r + (trim - r) * top, g + (trim * 0.97 - g) * top, b + (trim * 0.92 - b) * top
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@drawing_njit
 def shopfront(u: float, v: float, ground: float, seed: int, fu: float, fv: float) -> RGB:
     """Shops of 4.6 m: sign with letters, window with goods, door, stall riser."""
     shop = math.floor(u / 4.6)
@@ -285,15 +285,18 @@ def shopfront(u: float, v: float, ground: float, seed: int, fu: float, fv: float
     glass = inside(x, left, right, fu) * inside(v, low, ground - 1.0, fv)
     bar = 0.0 if door else inside(x, 1.72, 1.82, fu)
     goods = noise(x / 0.35, v / 0.45, seed + shop) * visible(0.35, max(fu, fv)) if v < 1.9 else 0.3
-    gr = 0.13 + 0.45 * goods * chance(int(x / 0.35), int(v / 0.45), seed + 1) + 0.10 * v / ground
-    gg = 0.14 + 0.40 * goods * chance(int(x / 0.35), int(v / 0.45), seed + 2) + 0.11 * v / ground
-    gb = 0.16 + 0.36 * goods * chance(int(x / 0.35), int(v / 0.45), seed + 3) + 0.13 * v / ground
+    column, row = math.floor(x / 0.35), math.floor(v / 0.45)
+    goods *= 0.2 + 0.8 * chance(column, row, seed + 1)
+    warm = chance(column, row, seed + 2) - 0.5
+    gr = 0.12 + goods * (0.52 + 0.25 * warm) + 0.10 * v / ground
+    gg = 0.13 + goods * 0.46 + 0.11 * v / ground
+    gb = 0.15 + goods * (0.38 - 0.25 * warm) + 0.13 * v / ground
     glass *= 1 - bar
     fr, fg, fb = sr * 0.6 + 0.1, sg * 0.6 + 0.1, sb * 0.6 + 0.1
     return fr + (gr - fr) * glass, fg + (gg - fg) * glass, fb + (gb - fb) * glass
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@drawing_njit
 def leaf_here(u: float, v: float, seed: int) -> bool:
     """Is there a leaf at this place of a twig's card (in metres)?"""
     for k in range(2):
@@ -308,7 +311,7 @@ def leaf_here(u: float, v: float, seed: int) -> bool:
     return False
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@drawing_njit
 def opaque_at(material: int, u: float, v: float, seed: int) -> bool:
     """The cut-out materials' masks."""
     if material == LEAVES:
