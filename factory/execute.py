@@ -7,6 +7,7 @@ same result.
 import json
 import signal
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
@@ -66,6 +67,9 @@ def execute(
     """
     if not refs or not experts or rounds < 1:
         return RunSummary(BAD_CONFIG, f"nothing to do: {len(refs)} clips, experts {list(experts)}, rounds={rounds}")
+    twice = [clip_id for clip_id, n in Counter(ref.clip_id for ref in refs).items() if n > 1]
+    if twice or len(set(experts)) < len(experts):
+        return RunSummary(BAD_CONFIG, f"named twice: clips {twice[:3]}, experts {list(experts)}")
     digests = {expert: work.expert_digest(expert) for expert in experts}
     identity = work.identity
     try:
@@ -89,6 +93,8 @@ def execute(
         graph = _graph(work, store, executor, workers, ray_address) if plan.todo else None
     except BadLocation as error:
         return RunSummary(BAD_CONFIG, str(error))
+    except KeyboardInterrupt:
+        return RunSummary(INTERRUPTED, "stopped before anything was begun")
     try:
         store.begin(record)
         if graph is not None:
@@ -106,7 +112,8 @@ def execute(
             graph.close()
     funnel = funnel_of(store, [ref.clip_id for ref in refs])
     summary = RunSummary(code, message, _counts(plan), driver.executed, driver.seconds, driver.notes, funnel)
-    _record(store, summary)
+    if driver.executed.attempts or driver.executed.prepared or code:
+        _record(store, summary)
     for line in (*summary.notes, str(summary.executed)):
         say(line)
     return summary
@@ -153,7 +160,7 @@ def _counts(plan: Plan) -> dict[str, int]:
 
 
 def _record(store: Store, summary: RunSummary) -> None:
-    """last_run.json: what the newest run did, for people and reports."""
+    """last_run.json: what the newest run that did anything did, for people and reports."""
     document = {
         "exit_code": summary.exit_code,
         "message": summary.message,

@@ -190,7 +190,9 @@ def test_a_changed_log_under_the_same_clip_id_is_refused_by_name(tmp_path: Path)
     assert "content digest other where the table has content" in row["error"]  # type: ignore[index]
 
 
-def test_zero_inputs_write_nothing(tmp_path: Path) -> None:
+def test_zero_inputs_and_double_ones_write_nothing(tmp_path: Path) -> None:
+    double = execute(ToyWork(), refs(2) * 2, EXPERTS, 1, Store(tmp_path / "out"), "local")
+    assert double.exit_code == BAD_CONFIG and refs(1)[0].clip_id in double.message
     assert run(tmp_path / "out", n=0).exit_code == BAD_CONFIG
     assert run(tmp_path / "out", rounds=0).exit_code == BAD_CONFIG
     assert not (tmp_path / "out").exists()

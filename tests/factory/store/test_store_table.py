@@ -1,13 +1,18 @@
 """Exactly once: two-step commits, unique keys, one writer, damage that is found."""
 
+import io
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from factory.steps import Stamp
 from factory.store.location import Location
+from factory.store.schema import SAMPLES, sample_row_to_table
 from factory.store.table import AnotherWriter, DuplicateKey, KeyedTable, Shard, TableSpec, write_shard
+from tests.factory.toy import row_of, stream
 
 SPEC = TableSpec(
     "things",
@@ -99,6 +104,31 @@ def test_row_groups_stay_below_32_mb(location: Location) -> None:
     metadata = pq.ParquetFile(f"{location.uri}/{written.path}").metadata
     sizes = [metadata.row_group(i).total_byte_size for i in range(metadata.num_row_groups)]
     assert metadata.num_row_groups == 2 and big.slice(0, metadata.row_group(0).num_rows).nbytes <= 32 * 2**20, sizes
+
+
+class Counting(io.FileIO):
+    """A file that counts the bytes read from it."""
+
+    n_bytes = 0
+
+    def read(self, size: int | None = -1) -> bytes:  # type: ignore[override]
+        data = super().read(-1 if size is None else size)
+        self.n_bytes += len(data)
+        return data
+
+
+def test_a_query_on_scores_reads_kilobytes_of_a_shard(location: Location) -> None:
+    rng = stream("images")
+    made = []
+    for i in range(40):
+        image = {"camera": "front", "time_s": 0.0, "ego_pose": np.eye(4).ravel(), "jpeg": rng.bytes(2**20)}
+        stamp = Stamp(f"id{i:02d}", "recovery", "d", 0, i, "v", "s", "{}")
+        made.append(row_of(rng) | vars(stamp) | {"images": [image]})
+    written = write_shard(location, SAMPLES, sample_row_to_table(made))
+    assert written.size > 40 * 2**20
+    counting = Counting(f"{location.uri}/{written.path}")
+    scores = pq.ParquetFile(pa.PythonFile(counting, "r")).read(["attempt_id", "stage2_score"])
+    assert scores.num_rows == 40 and counting.n_bytes < 300 * 2**10, counting.n_bytes
 
 
 def test_other_engines_read_the_same_rows(location: Location) -> None:
