@@ -9,6 +9,11 @@ from factory.clips.synthetic.draw import _cast as cast
 from factory.clips.synthetic.lidar import MOUNT_M, scan
 from factory.clips.synthetic.mesh import Builder
 from factory.clips.synthetic.rig import CAMERA_NAMES, REAR_AXLE_Z_M, build_rig, world_from_ego
+from factory.clips.synthetic.scenery import _signal as signal_mast
+from factory.clips.synthetic.scenery import lamps_lit
+from factory.clips.synthetic.traffic import GREEN as GREEN_LIGHT
+from factory.clips.synthetic.traffic import RED as RED_LIGHT
+from factory.clips.synthetic.traffic import YELLOW as YELLOW_LIGHT
 
 FRONT = build_rig(("ring_front_center",), 320, 180)[0]
 SIDE = build_rig(("ring_side_left",), 320, 180)[0]
@@ -131,6 +136,16 @@ def test_the_lidar_measures_the_road_and_a_wall_where_they_are() -> None:
     assert np.hypot(*(points[ground] - MOUNT_M)[:, :2].T).min() > 3.0
     assert sweep.laser_number.max() < 24
     assert (np.diff(sweep.offset_ns[sweep.laser_number == 3]) > 0).all()
+
+
+@pytest.mark.parametrize(("state", "height"), [(RED_LIGHT, 3.38), (YELLOW_LIGHT, 3.0), (GREEN_LIGHT, 2.62)])
+def test_a_signal_shows_one_lamp_red_above_yellow_above_green(state: int, height: float) -> None:
+    lamps = lamps_lit(signal_mast(Builder(), np.zeros(3), 3.5), state)
+    bright = lamps.colour.max(axis=1) > 0.5
+    heights = lamps.vertices[bright][..., 2].mean(axis=1)
+    assert bright.sum() == len(lamps) / 3
+    assert np.abs(heights - height).min() < 0.1
+    assert {round(float(h), 1) for h in heights[:10]} <= {round(height + d, 1) for d in (-0.1, 0.0, 0.1)}
 
 
 def test_cameras_look_where_their_names_say() -> None:

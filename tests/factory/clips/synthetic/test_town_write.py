@@ -26,10 +26,16 @@ def digests(root: Path) -> dict[str, str]:
 
 
 @pytest.fixture(scope="module")
-def town(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("town")
-    write_town(root, 2 * WINDOWS_PER_LOG, 0, SMALL)
-    return root
+def reader(tmp_path_factory: pytest.TempPathFactory) -> SyntheticReader:
+    """Two logs; the second is not used to its end."""
+    reader = SyntheticReader(tmp_path_factory.mktemp("towns"), WINDOWS_PER_LOG + 1, 0, SMALL)
+    reader.index()
+    return reader
+
+
+@pytest.fixture
+def town(reader: SyntheticReader) -> Path:
+    return reader.root
 
 
 def test_the_same_seed_gives_the_same_bytes_with_any_number_of_threads(town: Path, tmp_path: Path) -> None:
@@ -65,11 +71,9 @@ def test_a_log_has_argoverse_2s_files(town: Path) -> None:
     assert len(list((log / "map").glob("log_map_archive_*.json"))) == 1
 
 
-def test_the_reader_yields_exactly_the_clips_asked_for(tmp_path: Path) -> None:
-    n = WINDOWS_PER_LOG + 1
-    reader = SyntheticReader(tmp_path, n, 0, SMALL)
+def test_the_reader_yields_exactly_the_clips_asked_for(reader: SyntheticReader) -> None:
     refs = reader.index().refs
-    assert len(refs) == n
+    assert len(refs) == WINDOWS_PER_LOG + 1
     clip = reader.read(refs[-1])
     assert (clip.dataset, clip.licence) == ("synthetic", LICENCE)
     assert {camera.name for camera in clip.cameras} == set(SMALL.cameras)
