@@ -1,15 +1,19 @@
 """The Gaussian scene of a clip's block: built once, kept on disk under the digest of what it is built from.
 
-A block is the clip's window of its log: the sensor files between its first and its last step. Whoever comes first
-builds the scene; the file appears by an atomic rename, so that two workers that build the same one do no harm.
+A block is a stretch of a log that several clips lie in (tasks.world.clip.Block). Whoever comes first on a machine
+builds the scene while the others wait for it; the file appears by an atomic rename, so that a killed builder leaves
+nothing half done.
 """
 
+import fcntl
 import hashlib
 import json
 import logging
 import os
 import tempfile
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from factory.sensors import load_sensors
+from factory.sensors import block_of, chosen_cameras, load_sensors
 from tasks.render.gaussians import Gaussians
 from tasks.render.scene import RenderAsset, build_asset
 from tasks.render.settings import RenderSettings
@@ -33,29 +37,40 @@ def asset_for(clip: Clip, settings: RenderSettings, cache_dir: str | Path) -> Re
 
     Raises BadClip where a sensor file is broken, ValueError for a camera the rig does not have.
     """
-    wanted = [file for file in clip.images if not settings.cameras or file.sensor in settings.cameras]
-    if not wanted:
+    block, cameras = block_of(clip), chosen_cameras(clip.cameras, settings.cameras)
+    if not {camera.name for camera in cameras} & {file.sensor for file in block.images}:
         return None
     path = Path(cache_dir) / f"block-{block_id(clip, settings)}.npz"
-    if path.exists():
-        try:
-            return read_asset(path)
-        except (ValueError, KeyError, OSError, zipfile.BadZipFile) as error:
-            log.warning("%s is damaged (%s) and is built again", path, error)
-    data = load_sensors(clip, settings.cameras, settings.width, settings.height)
-    asset = build_asset(data.photos, data.sweeps, clip.agents, settings.asset)
-    asset = replace(asset, digest=asset_digest(asset))
-    write_asset(path, asset)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with only_builder(path):
+        if path.exists():
+            try:
+                return read_asset(path)
+            except (ValueError, KeyError, OSError, zipfile.BadZipFile) as error:
+                log.warning("%s is damaged (%s) and is built again", path, error)
+        data = load_sensors(block, cameras, settings.width, settings.height)
+        asset = build_asset(data.photos, data.sweeps, block.agents, settings.asset)
+        asset = replace(asset, digest=asset_digest(asset))
+        write_asset(path, asset)
     return asset
+
+
+@contextmanager
+def only_builder(path: Path) -> Iterator[None]:
+    """Held by one process of the machine at a time; the kernel frees it when its holder dies."""
+    with path.with_suffix(".lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
 
 
 def block_id(clip: Clip, settings: RenderSettings) -> str:
     """16 hex digits of everything the scene depends on but the sensor files' content, known without opening them."""
     digest = hashlib.sha256()
-    made_of = (ASSET_VERSION, clip.dataset, clip.log_id, clip.start_s, clip.content_digest)
+    block = block_of(clip)
+    made_of = (ASSET_VERSION, clip.dataset, clip.log_id, block.start_s, clip.content_digest)
     how = (settings.width, settings.height, sorted(settings.cameras), asdict(settings.asset))
     digest.update(json.dumps([made_of, how], sort_keys=True).encode())
-    for file in (*clip.images, *clip.sweeps):
+    for file in (*block.images, *block.sweeps):
         digest.update(f"{file.sensor}\x1f{Path(file.uri).name}\x1f{file.time_s!r}".encode())
         digest.update(np.ascontiguousarray(file.world_from_ego).tobytes())
     return digest.hexdigest()[:16]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factory.assets import asset_for
-from factory.sensors import chosen_cameras, encode_jpeg, load_photos
+from factory.sensors import block_of, chosen_cameras, encode_jpeg, load_photos
 from tasks.attempt import Judged
 from tasks.perturb import Candidate
 from tasks.render.map_drawing import draw_map_views
@@ -64,7 +64,8 @@ class Imaging:
         return self._drawn(clip, judged, _block(clip, self.settings, self.cache_dir), cameras)
 
     def _has_block(self, clip: Clip) -> bool:
-        return self.settings.mode is RenderMode.AUTO and bool(clip.cameras and clip.images and clip.sweeps)
+        block = block_of(clip)
+        return self.settings.mode is RenderMode.AUTO and bool(clip.cameras and block.images and block.sweeps)
 
     def _drawn(
         self, clip: Clip, judged: Judged, asset: RenderAsset | None, cameras: Sequence[Camera]

@@ -13,26 +13,31 @@ from factory.clips.reader import BadClip
 from tasks.render.scene import Photo, Sweep
 from tasks.render.views import undistorted
 from tasks.world.camera import Camera, SensorFile
-from tasks.world.clip import Clip
+from tasks.world.clip import Block, Clip
 
 XYZ = ("x", "y", "z")
 
 
 @dataclass(frozen=True)
 class SensorData:
-    """What the sensors saw during a clip, in file order."""
+    """What the sensors saw during a block, in file order."""
 
     photos: tuple[Photo, ...]  # without distortion, at the size asked for
     sweeps: tuple[Sweep, ...]
 
 
-def load_sensors(clip: Clip, cameras: Sequence[str] | None, width: int, height: int) -> SensorData:
-    """All sweeps and the photos of the named cameras (None or empty: of all), resized to width x height.
+def block_of(clip: Clip) -> Block:
+    """What the clip is rendered from: its block, else its own window."""
+    return clip.block or Block(clip.start_s, clip.agents, clip.images, clip.sweeps)
 
-    Raises BadClip where a file is missing, broken or not of its camera's size, ValueError for an unknown camera.
+
+def load_sensors(block: Block, cameras: Sequence[Camera], width: int, height: int) -> SensorData:
+    """All sweeps of the block and the photos its `cameras` took, resized to width x height.
+
+    Raises BadClip where a file is missing, broken or not of its camera's size.
     """
-    photos = load_photos(clip.images, chosen_cameras(clip.cameras, cameras), width, height)
-    return SensorData(photos, tuple(_sweep(file) for file in clip.sweeps))
+    photos = load_photos(block.images, cameras, width, height)
+    return SensorData(photos, tuple(_sweep(file) for file in block.sweeps))
 
 
 def load_photos(files: Sequence[SensorFile], cameras: Sequence[Camera], width: int, height: int) -> tuple[Photo, ...]:

@@ -36,7 +36,7 @@ from factory.clips.validate import validate_clip
 from factory.clips.windows import WindowSettings, drop_reason, window_starts
 from tasks.world.agents import AgentTracks
 from tasks.world.camera import Camera, SensorFile
-from tasks.world.clip import CLIP_STEPS, NOW, STEP_S, Clip
+from tasks.world.clip import CLIP_STEPS, NOW, STEP_S, Block, Clip
 from tasks.world.lanes import LightState, RoadMap, Route, TrafficLights
 from tasks.world.route import NoRoute, RouteFinder, route_of_log
 
@@ -48,6 +48,7 @@ INTRINSICS, EXTRINSICS = "calibration/intrinsics.feather", "calibration/egovehic
 SPLITS = ("train", "val", "test")
 ROUTE_SAMPLE_STEPS = 2  # the route looks at the ego every 0.2 s
 CACHED_LOGS = 2
+BLOCK_STEPS, BLOCK_STRIDE_STEPS = 200, 100  # of the stretches that are reconstructed
 
 
 @dataclass(frozen=True)
@@ -145,8 +146,9 @@ class AV2Reader:
             centerline=log.finder.centerline_from(ego_states[NOW, :3]),
             lights=TrafficLights(log.lights.lane_ids, log.lights.states[start:stop].copy()),
             cameras=log.cameras,
-            images=_within(log.motion, log.images, start),
-            sweeps=_within(log.motion, log.sweeps, start),
+            images=_within(log.motion, log.images, start, CLIP_STEPS),
+            sweeps=_within(log.motion, log.sweeps, start, CLIP_STEPS),
+            block=_block(log, start) if log.images else None,
             licence=log.licence,
             content_digest=log.content_digest,
         )
@@ -294,9 +296,23 @@ def _stamped(motion: LogMotion, sensor: str, folder: Path, suffix: str) -> list[
     return [(sensor, files[i], float(times_s[i])) for i in np.argsort(times_s, kind="stable")]
 
 
-def _within(motion: LogMotion, files: tuple[tuple[str, Path, float], ...], start: int) -> tuple[SensorFile, ...]:
-    """The sensor files between the first and the last step of the window that starts at step `start`."""
-    first, last = start * STEP_S, (start + CLIP_STEPS - 1) * STEP_S
+def _block(log: AV2Log, start: int) -> Block:
+    """The block of the clip that starts at step `start`: 20 s that begin at a multiple of 10 s, so that it holds it."""
+    first = start // BLOCK_STRIDE_STEPS * BLOCK_STRIDE_STEPS
+    n_steps = min(BLOCK_STEPS, log.motion.n_steps - first)
+    return Block(
+        start_s=first * STEP_S,
+        agents=_seen(log.agents.window(first, first + n_steps)),
+        images=_within(log.motion, log.images, first, n_steps),
+        sweeps=_within(log.motion, log.sweeps, first, n_steps),
+    )
+
+
+def _within(
+    motion: LogMotion, files: tuple[tuple[str, Path, float], ...], start: int, n_steps: int
+) -> tuple[SensorFile, ...]:
+    """The sensor files between the first and the last of `n_steps` steps from step `start` on."""
+    first, last = start * STEP_S, (start + n_steps - 1) * STEP_S
     inside = [entry for entry in files if first - SAME_FRAME_S < entry[2] <= last + SAME_FRAME_S]
     if not inside:
         return ()

@@ -18,6 +18,16 @@ CLIP_STEPS = HISTORY_STEPS + 1 + 2 * HORIZON_STEPS  # 96
 
 
 @dataclass(frozen=True)
+class Block:
+    """The stretch of a log that is reconstructed as one scene; several clips lie in it and share it."""
+
+    start_s: float  # since the log's first annotated instant; times of the files below count from here
+    agents: AgentTracks  # 10 Hz from `start_s` on
+    images: tuple[SensorFile, ...]
+    sweeps: tuple[SensorFile, ...]
+
+
+@dataclass(frozen=True)
 class Clip:
     """History 1.5 s before T, then 2H, at 10 Hz; all poses in the map's metric world frame."""
 
@@ -36,6 +46,7 @@ class Clip:
     cameras: tuple[Camera, ...] = ()
     images: tuple[SensorFile, ...] = ()  # 2 Hz or denser, within the clip
     sweeps: tuple[SensorFile, ...] = ()  # lidar, within the clip
+    block: Block | None = None  # what the clip is rendered from; None: it has no photos
     licence: str = ""
     content_digest: str = ""  # of everything the clip was read from, but pixels and points
 

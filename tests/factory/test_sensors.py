@@ -11,7 +11,7 @@ import pytest
 
 from factory.assets import asset_for, block_id, read_asset
 from factory.clips.reader import BadClip
-from factory.sensors import chosen_cameras, decode_image, encode_jpeg, load_sensors
+from factory.sensors import block_of, chosen_cameras, decode_image, encode_jpeg, load_sensors
 from tasks.render.scene import AssetSettings, psnr
 from tasks.render.settings import RenderSettings
 from tasks.world.agents import AgentTracks
@@ -68,7 +68,7 @@ def clip(tmp_path: Path) -> Clip:
 
 
 def test_photos_come_at_the_size_asked_for_with_intrinsics_and_pose_to_match(clip: Clip) -> None:
-    data = load_sensors(clip, None, 48, 32)
+    data = load_sensors(block_of(clip), clip.cameras, 48, 32)
     assert [photo.rgb.shape for photo in data.photos] == [(32, 48, 3)] * 3
     assert [photo.time_s for photo in data.photos] == [0.0, 0.5, 1.0]
     np.testing.assert_allclose(data.photos[0].intrinsics, [[30, 0, 24], [0, 30, 16], [0, 0, 1]])
@@ -93,26 +93,26 @@ def test_a_missing_camera_is_named_with_those_there_are(clip: Clip) -> None:
 def test_a_broken_image_is_a_bad_clip_that_names_the_file(clip: Clip, content: bytes) -> None:
     Path(clip.images[1].uri).write_bytes(content)
     with pytest.raises(BadClip, match=r"1\.jpg: image"):
-        load_sensors(clip, None, 48, 32)
+        load_sensors(block_of(clip), clip.cameras, 48, 32)
 
 
 def test_a_missing_or_wrongly_sized_image_is_a_bad_clip(clip: Clip) -> None:
     Path(clip.images[0].uri).unlink()
     with pytest.raises(BadClip, match=r"0\.jpg: image: cannot be read"):
-        load_sensors(clip, None, 48, 32)
+        load_sensors(block_of(clip), clip.cameras, 48, 32)
     Path(clip.images[0].uri).write_bytes(encode_jpeg(smooth_image(0)[:50], 90))
     with pytest.raises(BadClip, match=r"size: 96x50, but front takes 96x64"):
-        load_sensors(clip, None, 48, 32)
+        load_sensors(block_of(clip), clip.cameras, 48, 32)
 
 
 def test_a_broken_sweep_is_a_bad_clip_that_names_file_and_column(clip: Clip) -> None:
     path = Path(clip.sweeps[1].uri)
     path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(BadClip, match=r"1\.feather"):
-        load_sensors(clip, None, 48, 32)
+        load_sensors(block_of(clip), clip.cameras, 48, 32)
     pyarrow.feather.write_feather(pa.table({"x": [1.0], "y": [1.0]}), str(path))
     with pytest.raises(BadClip, match=r"1\.feather: z"):
-        load_sensors(clip, None, 48, 32)
+        load_sensors(block_of(clip), clip.cameras, 48, 32)
 
 
 def test_a_block_is_built_once_and_read_back_the_same(clip: Clip, tmp_path: Path) -> None:
