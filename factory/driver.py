@@ -91,8 +91,11 @@ class Driver:
     def loop(self, graph: Graph, gatherer: Gatherer) -> None:
         """Until nothing is left, or until stopped and drained."""
         self._graph, self._gatherer = graph, gatherer
+        with ProgressLine(len(self._plan.todo)) as progress:
+            self._work_through(graph, gatherer, progress)
+
+    def _work_through(self, graph: Graph, gatherer: Gatherer, progress: ProgressLine) -> None:
         waiting = iter(self._plan.todo)
-        progress = ProgressLine(len(self._plan.todo))
         more = True
         while True:
             room = len(self._walks_left) + len(self._preparing) < CLIPS_PER_WORKER * graph.parallelism

@@ -42,13 +42,18 @@ class ProgressLine:
             self._bar.add_task("", total=self.total, text="")
             self._bar.start()
 
+    def __enter__(self) -> "ProgressLine":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
     def show(self, tally: Tally, last: bool = False) -> None:
         """Update the bar; without a terminal print a line every 15 s and at the end."""
         now = time.monotonic()
         if self._bar is not None:
             self._bar.update(self._bar.task_ids[0], completed=tally.clips, text=self.text(tally, now - self._began))
-            if last:
-                self._bar.stop()
         elif last or now - self._said >= LINE_EVERY_S:
             self._said = now
             text = self.text(tally, now - self._began)
