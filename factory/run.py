@@ -13,9 +13,14 @@ written), 3 complete with failed attempts, 4 interrupted and resumable.
 import os
 import sys
 from collections.abc import Sequence
+from itertools import zip_longest
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from factory.config import ConfigError, compose, conf_dir
+
+if TYPE_CHECKING:
+    from factory.clips.reader import ClipRef
 
 BAD_CONFIG = 2
 
@@ -33,6 +38,20 @@ def main(argv: Sequence[str]) -> int:
     except ConfigError as error:
         print(f"error: {error}", file=sys.stderr)
         return BAD_CONFIG
+
+
+def dealt(refs: Sequence["ClipRef"], hands: int) -> list["ClipRef"]:
+    """The clips in the order of work: log by log, the logs in groups of `hands` whose clips alternate.
+
+    Each worker then begins with a log, and so a block, of its own instead of waiting for another's reconstruction.
+    Rows do not depend on the order.
+    """
+    logs: dict[str, list["ClipRef"]] = {}
+    for ref in refs:
+        logs.setdefault(ref.log_id, []).append(ref)
+    queues = list(logs.values())
+    groups = [queues[i : i + hands] for i in range(0, len(queues), hands)]
+    return [ref for group in groups for turn in zip_longest(*group) for ref in turn if ref is not None]
 
 
 def help_text() -> str:
@@ -69,7 +88,8 @@ def run(overrides: Sequence[str]) -> int:
             "give an absolute path or a URL that every node sees"
         )
     assembled = assemble(config)
-    refs = [*assembled.index.refs, *assembled.index.broken][: config.limit]
+    wanted = [*assembled.index.refs, *assembled.index.broken][: config.limit]
+    refs = dealt(wanted, config.workers or os.cpu_count() or 1)
     print(plan_text(assembled, refs), flush=True)
     if config.dry_run:
         print(calibrate(assembled, refs))
