@@ -120,4 +120,5 @@ def test_the_smallest_scene_reaches_every_kernel_of_the_room() -> None:
     modules = (choose, depth, movers, project, raster)
     kernels = [value for module in modules for value in vars(module).values() if hasattr(value, "signatures")]
     assert len(kernels) > 10
-    assert [kernel.__name__ for kernel in kernels if not kernel.signatures] == []
+    inlined = {"_nearer", "_row_alphas", "_tile_range", "_is_opaque"}  # part of their callers, no entry points
+    assert {kernel.__name__ for kernel in kernels if not kernel.signatures} <= inlined
