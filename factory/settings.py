@@ -25,6 +25,7 @@ from tasks.experts.protocol import Expert
 from tasks.experts.recovery import Recovery, RecoverySettings, RecoveryTable
 from tasks.kinematic_vocabulary import kinematic_trajectories
 from tasks.perturb import PerturbSettings
+from tasks.render.rigs import RIGS
 from tasks.render.settings import RenderSettings
 from tasks.rollout.simulate import TrafficSettings
 from tasks.stages import stage_versions
@@ -39,6 +40,10 @@ class VocabularyChoice:
 
     file: str | None = None
     k: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.k is not None and self.k < 1:
+            raise ValueError(f"k={self.k}: must be positive, or null for the whole file")
 
 
 @dataclass(frozen=True)
@@ -84,6 +89,8 @@ class RunConfig:
         unknown = [name for name in self.experts if name not in self.expert]
         if unknown:
             raise ValueError(f"experts: {unknown} is not among {sorted(self.expert)}; add your own with +expert.<name>")
+        if self.render.map_rig not in RIGS:
+            raise ValueError(f"render.map_rig={self.render.map_rig} is not among {', '.join(RIGS)}")
 
 
 @dataclass(frozen=True)

@@ -100,6 +100,8 @@ def test_a_misspelt_override_is_an_error_that_names_it(override: str, named: str
         ("traffic.headway_s=-1", "headway_s must be positive"),
         ("reward.full=[nc,comfort]", "comfort"),
         ("render.mode=photo", r"run\.render\.mode"),
+        ("render.map_rig=five_front", r"map_rig=five_front is not among .*three_front"),
+        ("vocabulary.k=0", "k=0: must be positive"),
     ],
 )
 def test_a_value_of_the_wrong_kind_is_an_error_that_names_it(override: str, message: str) -> None:
