@@ -299,7 +299,7 @@ GOLDEN: dict[str, Golden] = {
     "render": Golden(
         1,
         {
-            "rendered": (713.690132, 34.7981707),
+            "rendered": (714.185541, 34.8770657),
             "drawn": (1001.11158, 15.1497572),
         },
         tolerance=1e-3,
