@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,7 @@ from factory.clips.reader import BadClip, ClipReader, ClipRef
 from factory.imaging import Imaging
 from factory.rows import sample_row
 from factory.work import HUMAN, Accepted, AttemptResult, CandidateRow, Dropped, PreparedClip, RunIdentity
-from tasks.attempt import ExpertGate, Judged, attempt, human_sample, perturbed_scene
+from tasks.attempt import ExpertGate, Judged, Timed, attempt, has_route, human_sample, perturbed_scene
 from tasks.chance import stream
 from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.protocol import Expert
@@ -91,6 +91,8 @@ class FactoryWork:
         watch = Stopwatch()
         with watch.of("clip"):
             clip = self.reader.read(ref)
+        if not has_route(clip.centerline):
+            return Rejected("clip", "route_ended", "the log ends at the end of its route")
         with watch.of("render"):
             blocked = self.imaging.block_verdict(clip)
         if blocked is not None:
@@ -105,7 +107,7 @@ class FactoryWork:
             clip_id=clip.clip_id,
             content_digest=clip.content_digest,
             candidates=tuple(_candidate_row(index, candidate) for index, candidate in enumerate(candidates)),
-            gate_counts=listed.gate_counts if listed else {},
+            gate_counts=found.counts if isinstance(found, Rejected) else found.gate_counts,
             payload=PerturbedClip(clip, candidates),
             dropped=found if isinstance(found, Rejected) else None,
             seconds=watch.seconds,
@@ -116,8 +118,7 @@ class FactoryWork:
         watch = Stopwatch()
         payload = prepared.payload
         assert isinstance(payload, PerturbedClip)
-        with watch.of("reward"):
-            trace = self.trace(payload, candidate, expert)
+        trace = self.trace(payload, candidate, expert, watch.of)
         if trace.judged is None or trace.rejected is not None:
             assert trace.rejected is not None
             return Dropped(trace.rejected, _subscores(trace.judged.scores) if trace.judged else {}, watch.seconds)
@@ -125,15 +126,22 @@ class FactoryWork:
             pictures = self.imaging.pictures(payload.clip, trace.candidate, trace.judged)
         return Accepted(sample_row(payload.clip, trace.candidate, trace.judged) | pictures, watch.seconds)
 
-    def trace(self, payload: PerturbedClip, candidate: int, expert: str) -> Trace:
+    def trace(
+        self,
+        payload: PerturbedClip,
+        candidate: int,
+        expert: str,
+        timed: Timed = nullcontext,
+    ) -> Trace:
         """The same attempt up to the reward's verdict, nothing left out."""
         clip, driver = payload.clip, self.experts[expert]
         rng = stream(self.seed, clip.clip_id, f"expert.{expert}", candidate)
         if expert == HUMAN:
-            return Trace(None, human_sample(scene_of_clip(clip), driver, self.pdm, rng), None)
+            return Trace(None, human_sample(scene_of_clip(clip), driver, self.pdm, rng, timed), None)
         chosen = payload.candidates[candidate]
-        scene = perturbed_scene(clip, chosen.rollout)
-        result = attempt(scene, driver, self.gate, self.traffic, self.pdm, rng)
+        with timed("rollout"):
+            scene = perturbed_scene(clip, chosen.rollout)
+        result = attempt(scene, driver, self.gate, self.traffic, self.pdm, rng, timed)
         if isinstance(result, Rejected):
             return Trace(chosen, None, result)
         return Trace(chosen, *result)

@@ -3,11 +3,15 @@
 `rollout -> expert -> rollout -> reward` of tasks.stages; rendering follows elsewhere, only for what the reward kept.
 """
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tasks.experts.pdm_closed import PdmSettings, plan_for
+from tasks.experts.pdm_path import MIN_PROGRESS_M, path_length_m
 from tasks.experts.protocol import Expert, Plan
 from tasks.reward.epdms import Scores, score
 from tasks.reward.prepare import prepare_scene
@@ -18,6 +22,9 @@ from tasks.world.route import centerline_from
 from tasks.world.vehicle import HEADING
 
 _JUDGED = tuple(name for name in SUBSCORES if name not in ("ep", "ec"))
+
+
+Timed = Callable[[str], AbstractContextManager[object]]
 
 
 @dataclass(frozen=True)
@@ -49,11 +56,21 @@ def perturbed_scene(clip: Clip, stage_one: Rollout) -> Scene:
     return next_scene(scene_of_clip(clip), stage_one, centerline_from(clip.road_map, clip.route, end[: HEADING + 1]))
 
 
-def drive_and_judge(scene: Scene, plan: Plan, traffic: TrafficSettings, planner: PdmSettings) -> Judged:
+def has_route(centerline: NDArray[np.float64]) -> bool:
+    """Whether any route is left to drive along: without it nobody can plan and progress has no meaning."""
+    return path_length_m(centerline) > MIN_PROGRESS_M
+
+
+def drive_and_judge(
+    scene: Scene, plan: Plan, traffic: TrafficSettings, planner: PdmSettings, timed: Timed = nullcontext
+) -> Judged:
     """Simulate the plan with the traffic and score it in the two-row batch [PDM-Closed, plan]."""
-    rollout = simulate(scene, plan.poses, traffic)
-    states = np.stack([plan_for(scene, planner).driven, rollout.ego_states])
-    return Judged(scene, plan, rollout, score(prepare_scene(scene, rollout.agents), states, normalise="pairs"))
+    with timed("rollout"):
+        rollout = simulate(scene, plan.poses, traffic)
+    with timed("reward"):
+        states = np.stack([plan_for(scene, planner).driven, rollout.ego_states])
+        scores = score(prepare_scene(scene, rollout.agents), states, normalise="pairs")
+    return Judged(scene, plan, rollout, scores)
 
 
 def verdict(scores: Scores, gate: ExpertGate, row: int = 1) -> Rejected | None:
@@ -71,21 +88,29 @@ def attempt(
     traffic: TrafficSettings,
     planner: PdmSettings,
     rng: np.random.Generator,
+    timed: Timed = nullcontext,
 ) -> tuple[Judged, Rejected | None] | Rejected:
     """Let `expert` plan from the perturbed scene, drive its plan and judge it.
 
+    `timed(stage)` is entered around the work of each stage, for whoever wants to know where the time goes.
+
     Returns:
-        The judged drive and the verdict (None: accepted), or Rejected where the expert has no plan.
+        The judged drive and the verdict (None: accepted); Rejected where the route ends or the expert has no plan.
     """
-    plan = expert.plan(scene, rng)
+    if not has_route(scene.centerline):
+        return Rejected("rollout", "route_ended", "the perturbed ego stands at the end of its route")
+    with timed("expert"):
+        plan = expert.plan(scene, rng)
     if isinstance(plan, Rejected):
         return plan
-    judged = drive_and_judge(scene, plan, traffic, planner)
+    judged = drive_and_judge(scene, plan, traffic, planner, timed)
     return judged, verdict(judged.scores, gate)
 
 
-def human_sample(scene: Scene, expert: Expert, planner: PdmSettings, rng: np.random.Generator) -> Judged:
+def human_sample(
+    scene: Scene, expert: Expert, planner: PdmSettings, rng: np.random.Generator, timed: Timed = nullcontext
+) -> Judged:
     """The logged drive from T, scored under log replay and never filtered."""
     plan = expert.plan(scene, rng)
     assert isinstance(plan, Plan), "the log always has a plan"
-    return drive_and_judge(scene, plan, TrafficSettings(mode="replay"), planner)
+    return drive_and_judge(scene, plan, TrafficSettings(mode="replay"), planner, timed)

@@ -150,7 +150,9 @@ def perturb(
     gated = np.flatnonzero(~np.logical_or.reduce(list(raw_fails.values())))
     counts = {f"raw_{name}": int(fails.sum()) for name, fails in raw_fails.items()}
     if len(gated) == 0:
-        return Rejected("perturb", "no_gated_candidate", f"none of {len(raw_ends)} trajectories ends near the log")
+        return Rejected(
+            "perturb", "no_gated_candidate", f"none of {len(raw_ends)} trajectories ends near the log", counts
+        )
 
     states = track(start, to_world(start[: HEADING + 1], vocabulary.trajectories[gated]))
     ends = to_local(target, states[:, -1, : HEADING + 1])
@@ -199,7 +201,7 @@ def perturb(
         )
     counts["reactive_score"] = len(kept) - len(candidates)
     if not candidates:
-        return Rejected("perturb", "no_good_candidate", ", ".join(f"{k} {v}" for k, v in counts.items()))
+        return Rejected("perturb", "no_good_candidate", ", ".join(f"{k} {v}" for k, v in counts.items()), counts)
     return Perturbation(tuple(candidates), counts, Considered(gated, ends, tuple(fate), scores))
 
 

@@ -4,7 +4,8 @@
 A stage is a pure function `stage(inputs, settings, rng) -> output | Rejected`.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True)
@@ -25,14 +26,15 @@ class Rejected:
     stage: str
     reason: str
     detail: str = ""
+    counts: Mapping[str, int] = field(default_factory=dict)  # what was counted on the way, such as drops by gate
 
 
 SUBSCORES = ("nc", "dac", "ddc", "tlc", "ep", "ttc", "lk", "hc", "ec")  # EPDMS, METRIC.md section 2
 
 STAGES: tuple[Stage, ...] = (
-    Stage("clip", 1, "clip", ("ego_standing", "broken_tracks")),
+    Stage("clip", 1, "clip", ("ego_standing", "broken_tracks", "route_ended")),
     Stage("perturb", 1, "clip", ("no_gated_candidate", "no_good_candidate")),
-    Stage("rollout", 1, "attempt", ("ego_unstable",)),
+    Stage("rollout", 1, "attempt", ("route_ended",)),
     Stage("expert", 1, "attempt", ("no_plan",)),
     Stage("reward", 1, "attempt", SUBSCORES),
     Stage("render", 1, "attempt", ("psnr", "no_asset")),

@@ -8,8 +8,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from tasks.kernels import kernel
 
 Array = NDArray[np.float64]
 
@@ -28,7 +29,7 @@ class Paths(NamedTuple):
     line_state: NDArray[np.uint8]  # (41, Q) OPEN, CLOSED_IF_STOPPABLE, CLOSED at every step of the rollout
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fade(travelled: float, length: float) -> tuple[float, float]:
     """(value, slope) of a smooth step from 1 down to 0 over `length`."""
     u = travelled / length
@@ -38,7 +39,7 @@ def _fade(travelled: float, length: float) -> tuple[float, float]:
     return 1.0 - u * u * u * (10.0 + u * (6.0 * u - 15.0)), -30.0 * u * u * (1.0 - u) * (1.0 - u) / length
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def pose_on_path(
     paths: Paths, m: int, s: float, travelled: float, offset: float, turn: float, blend_length: float
 ) -> tuple[float, float, float]:
@@ -58,7 +59,7 @@ def pose_on_path(
     return x, y, h + turn * keep + math.atan(offset * slope)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def project_on_path(paths: Paths, m: int, x: float, y: float) -> tuple[float, float]:
     """(path length, offset to the left) of the point of path m nearest to (x, y)."""
     xy = paths.xy[m]
@@ -77,7 +78,7 @@ def project_on_path(paths: Paths, m: int, x: float, y: float) -> tuple[float, fl
     return best_s, best_offset
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def corners_of(box: Array, out: Array) -> None:
     """Corners (4, 2) of a box, in turn around it."""
     c, s = math.cos(box[2]), math.sin(box[2])
@@ -88,7 +89,7 @@ def corners_of(box: Array, out: Array) -> None:
         out[i, 1] = box[1] + s * u + c * v
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def boxes_overlap(a: Array, b: Array) -> bool:
     """Do two boxes share area (separating axis test; touching is not overlapping)?"""
     dx, dy = b[0] - a[0], b[1] - a[1]
@@ -106,7 +107,7 @@ def boxes_overlap(a: Array, b: Array) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _range_in_strip(corners: Array, x: float, y: float, heading: float, half_width: float) -> tuple[float, float]:
     """Nearest and farthest distance along `heading` of what a box has inside the strip |across| <= half_width."""
     c, s = math.cos(heading), math.sin(heading)
@@ -126,7 +127,7 @@ def _range_in_strip(corners: Array, x: float, y: float, heading: float, half_wid
     return low, high
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def corridor_gap(
     paths: Paths,
     m: int,

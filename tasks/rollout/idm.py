@@ -13,9 +13,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from tasks.kernels import kernel
 from tasks.rollout.corridor import (
     PATH_SPACING_M,
     Paths,
@@ -72,7 +72,7 @@ class World(NamedTuple):
     center_z: Array
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def idm_acceleration(speed: float, target_speed: float, gap: float, lead_speed: float, driver: Driver) -> float:
     """Acceleration [m/s2]; gap = inf on a free road."""
     gap = max(gap, SMALLEST_GAP_M)
@@ -87,7 +87,7 @@ def idm_acceleration(speed: float, target_speed: float, gap: float, lead_speed: 
     return max(free - driver.accel * ratio * ratio, -hardest)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def advance(speed: float, acceleration: float) -> tuple[float, float]:
     """(distance [m], speed [m/s]) after STEP_S at constant acceleration, standing still once stopped."""
     new_speed = speed + acceleration * STEP_S
@@ -96,7 +96,7 @@ def advance(speed: float, acceleration: float) -> tuple[float, float]:
     return 0.5 * (speed + new_speed) * STEP_S, new_speed
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def stop_line_gap(paths: Paths, m: int, step: int, nose: float, speed: float, decel: float) -> float:
     """Distance [m] from the bumper at path length `nose` to the nearest closed stop line."""
     gap = np.inf
@@ -110,7 +110,7 @@ def stop_line_gap(paths: Paths, m: int, step: int, nose: float, speed: float, de
     return gap
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _touches_driven(box: Array, row: Array, mode: NDArray[np.int64], but: int) -> bool:
     for j in range(mode.shape[0]):  # noqa: SIM110 (compiled)
         if j != but and mode[j] == DRIVEN and boxes_overlap(box, row[j]):
@@ -118,7 +118,7 @@ def _touches_driven(box: Array, row: Array, mode: NDArray[np.int64], but: int) -
     return False
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _is_free(box: Array, row: Array, mode: NDArray[np.int64], ego: Array, margin: float) -> bool:
     """Is a box, lengthened by `margin` at both ends, clear of everyone present and of the ego?"""
     grown = box.copy()
@@ -131,7 +131,7 @@ def _is_free(box: Array, row: Array, mode: NDArray[np.int64], ego: Array, margin
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def drive(
     start: int,
     log: World,

@@ -11,9 +11,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from tasks.kernels import kernel
 from tasks.rollout.corridor import PATH_SPACING_M
 from tasks.world.frames import wrap_angle
 from tasks.world.lanes import Lane, RoadMap
@@ -72,7 +72,7 @@ def index_lanes(road_map: RoadMap) -> LaneIndex:
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _distances(
     poses: Array, points: Array, first: NDArray[np.int64], discs: Array, reach: float
 ) -> tuple[Array, Array]:
@@ -278,7 +278,7 @@ def _normals(points: Array) -> Array:
     return np.stack([-np.sin(heading), np.cos(heading)], axis=-1)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _frenet(xy: Array, length: Array, poses: Array) -> Array:
     """(K, 2) path length and offset to the left of the polyline's points nearest to poses (K, >= 2)."""
     out = np.empty((poses.shape[0], 2))
@@ -299,7 +299,7 @@ def _frenet(xy: Array, length: Array, poses: Array) -> Array:
 
 def _log_offset(center: Array, log_poses: Array) -> Array:
     """(P,) lateral offset of the log from the lane centre at every path point; 0 where the log is elsewhere."""
-    grid = PATH_SPACING_M * np.arange(len(center))
+    grid = PATH_SPACING_M * np.arange(len(center), dtype=np.float64)
     heading = _chord_headings(center)
     frenet = _frenet(center, grid, log_poses)
     at, offset = frenet[:, 0], frenet[:, 1]

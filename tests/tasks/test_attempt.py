@@ -151,11 +151,11 @@ def test_the_verdict_over_a_clip_s_list_agrees_with_its_scores(table: RecoveryTa
     assert rejected > 0
 
 
-def test_an_expert_without_a_plan_is_a_rejection_not_an_error(scene: Scene) -> None:
+def test_a_route_that_has_ended_is_a_rejection_not_an_error(scene: Scene) -> None:
     at_the_end = replace(scene, centerline=np.repeat(scene.centerline[-1:], 2, axis=0))
     result = attempt(at_the_end, PdmClosed(), GATE, TrafficSettings(), PdmSettings(), RNG)
     assert isinstance(result, Rejected)
-    assert (result.stage, result.reason) == ("expert", "no_plan")
+    assert (result.stage, result.reason) == ("rollout", "route_ended")
 
 
 class OffTheRoad:
