@@ -12,7 +12,7 @@ written), 3 complete with failed attempts, 4 interrupted and resumable.
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -46,7 +46,7 @@ def dealt(refs: Sequence["ClipRef"], hands: int) -> list["ClipRef"]:
     Each worker then begins with a log, and so a block, of its own instead of waiting for another's reconstruction.
     Rows do not depend on the order.
     """
-    logs: dict[str, list["ClipRef"]] = {}
+    logs: dict[str, list[ClipRef]] = {}
     for ref in refs:
         logs.setdefault(ref.log_id, []).append(ref)
     queues = list(logs.values())
@@ -70,6 +70,12 @@ def settings_text(overrides: Sequence[str]) -> str:
     from omegaconf import OmegaConf
 
     return OmegaConf.to_yaml(OmegaConf.create(compose("run", overrides)))
+
+
+def seconds_text(seconds: Mapping[str, tuple[int, float]]) -> str:
+    """Stage -> (tasks, seconds) of this run as a small table; seconds add up over the workers."""
+    lines = [f"{stage:<12}{n:>8}{total:>10.1f}{total / n:>10.2f}" for stage, (n, total) in seconds.items() if n]
+    return "\n".join([f"{'stage':<12}{'tasks':>8}{'seconds':>10}{'each':>10}", *lines])
 
 
 def run(overrides: Sequence[str]) -> int:
@@ -114,6 +120,8 @@ def run(overrides: Sequence[str]) -> int:
     if summary.exit_code == BAD_CONFIG or summary.funnel is None:
         return summary.exit_code
     print(summary.funnel.text())
+    if summary.seconds:
+        print(seconds_text(summary.seconds))
     print(write_report(store, assembled))
     return summary.exit_code
 

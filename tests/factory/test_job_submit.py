@@ -1,0 +1,162 @@
+"""`ray job submit --working-dir .` on a head node of its own: runs, resumes, and leaves the heavy folders at home."""
+
+import os
+import secrets
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from factory.store.reader import SampleTable
+
+pytestmark = [pytest.mark.ray, pytest.mark.slow]
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+RAY = (sys.executable, "-m", "ray.scripts.scripts")
+LISTENERS = (
+    "--port",
+    "--dashboard-port",
+    "--dashboard-agent-listen-port",
+    "--dashboard-agent-grpc-port",
+    "--runtime-env-agent-port",
+    "--metrics-export-port",
+    "--ray-client-server-port",
+)
+UPLOADED = ("factory", "tasks", "planners", "conf", "pyproject.toml", ".rayignore", ".gitignore")
+LEFT_AT_HOME = (  # what lies in a checkout that was worked with
+    "runs/demo/samples/shard.parquet",
+    ".venv/lib/library.py",
+    ".git/objects/pack",
+    ".mypy_cache/cache.json",
+    ".hypothesis/examples",
+    "factory/__pycache__/run.pyc",
+    "build/lib/factory.py",
+    "tests/test_something.py",
+)
+
+
+@dataclass(frozen=True)
+class Head:
+    """A running head node."""
+
+    address: str  # of the dashboard
+    folder: Path  # of its sessions
+    environment: dict[str, str]
+
+    def submit(self, checkout: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+        """`ray job submit` as the README has it; waits for the job's end."""
+        command = [*RAY, "job", "submit", "--address", self.address, "--working-dir", ".", "--"]
+        command += ["python", "-m", "factory.run", *arguments]
+        return subprocess.run(
+            command, cwd=checkout, env=self.environment, capture_output=True, text=True, timeout=240
+        )
+
+
+def free_ports(count: int) -> list[int]:
+    with ExitStack() as stack:
+        sockets = [stack.enter_context(socket.socket()) for _ in range(count)]
+        for each in sockets:
+            each.bind(("127.0.0.1", 0))
+        return [each.getsockname()[1] for each in sockets]
+
+
+@pytest.fixture(scope="module")
+def head() -> Iterator[Head]:
+    """`ray start --head` on loopback, with a token of its own; ended by its pid (`ray stop` would end every Ray)."""
+    environment = {key: value for key, value in os.environ.items() if not key.startswith(("RAY_", "PYTHONPATH"))}
+    environment |= {
+        "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
+        "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
+        "RAY_USAGE_STATS_ENABLED": "0",
+        "RAY_AUTH_MODE": "token",
+        "RAY_AUTH_TOKEN": secrets.token_hex(32),
+        "OMP_NUM_THREADS": "1",
+    }
+    folder = Path(tempfile.mkdtemp(prefix="ray-", dir="/tmp"))  # short: Ray's sockets lie below it
+    ports = free_ports(len(LISTENERS))
+    listeners = [text for flag, port in zip(LISTENERS, ports) for text in (flag, str(port))]
+    command = [*RAY, "start", "--head", "--block", "--node-ip-address=127.0.0.1", "--dashboard-host=127.0.0.1"]
+    command += ["--include-dashboard=true", "--num-cpus=2", f"--temp-dir={folder}", *listeners]
+    with open(folder / "head.log", "w") as log:
+        process = subprocess.Popen(command, env=environment, stdout=log, stderr=subprocess.STDOUT, cwd=folder)
+    head = Head(f"http://127.0.0.1:{ports[1]}", folder, environment)
+    try:
+        _wait_until_it_answers(head, process)
+        yield head
+    finally:
+        process.send_signal(signal.SIGTERM)
+        process.wait(60)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _wait_until_it_answers(head: Head, process: "subprocess.Popen[bytes]") -> None:
+    command = [*RAY, "job", "list", "--address", head.address]
+    for _ in range(60):
+        assert process.poll() is None, (head.folder / "head.log").read_text()
+        if subprocess.run(command, env=head.environment, capture_output=True).returncode == 0:
+            return
+        time.sleep(1.0)
+    raise AssertionError((head.folder / "head.log").read_text())
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    """The project as a user has it who has already worked with it: with results, environment and caches beside it."""
+    root = tmp_path / "checkout"
+    root.mkdir()
+    for name in UPLOADED:
+        source = REPOSITORY / name
+        if source.is_dir():
+            shutil.copytree(source, root / name, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copy(source, root / name)
+    for name in LEFT_AT_HOME:
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_bytes(b"\0" * 1_000_000)
+    return root
+
+
+def test_a_submitted_job_makes_the_table_and_the_same_command_resumes(
+    head: Head, checkout: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    command = (
+        "clips.n_clips=1",
+        "clips.settings.cameras=[]",
+        "clips.settings.lidar_beams=0",
+        f"clips.cache_dir={tmp_path / 'towns'}",
+        "vocabulary.k=64",
+        "experts=[human]",
+        "render=none",
+        f"out={out}",
+    )
+    first = head.submit(checkout, *command)
+    assert first.returncode == 0, first.stdout + first.stderr
+    assert "succeeded" in first.stdout
+    assert len(SampleTable(out)) == 1
+
+    packages = list(head.folder.glob("session_*/runtime_resources/working_dir_files/_ray_pkg_*/"))
+    assert packages, "the uploaded working directory is unpacked there"
+    arrived = {p.relative_to(package).as_posix() for package in packages for p in package.rglob("*") if p.is_file()}
+    assert {"factory/run.py", "tasks/perturb.py", "conf/run.yaml"} <= arrived
+    assert not set(LEFT_AT_HOME) & arrived
+
+    again = head.submit(checkout, *command)
+    assert again.returncode == 0, again.stdout + again.stderr
+    assert "executed 0 perturb tasks" in again.stdout
+    assert "found 1 attempts done" in again.stdout
+    assert len(SampleTable(out)) == 1
+
+    lost = head.submit(checkout, *command[:-1], "out=runs/here")
+    assert lost.returncode != 0
+    assert "give an absolute path or a URL" in lost.stdout + lost.stderr
+    assert "exit code 2" in lost.stdout + lost.stderr
