@@ -1,30 +1,17 @@
 """Times a reactive rollout on real logs and prints the table of it.
 
-python tests/bench/bench_rollout.py ../shared/data/av2/sensor/val
+python -m tests.bench.bench_rollout ../shared/data/av2/sensor/val
 """
 
 import sys
-import time
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-
-import numpy as np
 
 from factory.clips.av2 import AV2Reader
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out
 from tasks.world.clip import NOW, scene_of_clip
-
-
-def milliseconds(call: Callable[[], object], repeats: int = 15) -> float:
-    """Median time of one call."""
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - start)
-    return 1e3 * float(np.median(times))
+from tests.bench.timing import milliseconds
 
 
 def main(root: Path) -> None:
@@ -42,9 +29,9 @@ def main(root: Path) -> None:
         paths = sum(path is not None for path in traffic.lane_paths)
         print(
             f"| {ref.log_id[:8]} | {ref.start_ms / 1e3:.0f} | {int(clip.agents.valid[NOW].sum())} | {paths} "
-            f"| {milliseconds(partial(prepare_traffic, scene, settings)):.1f} "
-            f"| {milliseconds(partial(track, scene.ego_state, poses)):.1f} "
-            f"| {milliseconds(partial(roll_out, traffic, states)):.1f} |"
+            f"| {milliseconds(partial(prepare_traffic, scene, settings), 15):.1f} "
+            f"| {milliseconds(partial(track, scene.ego_state, poses), 15):.1f} "
+            f"| {milliseconds(partial(roll_out, traffic, states), 15):.1f} |"
         )
 
 

@@ -1,11 +1,7 @@
 """Times the stages on real logs (or the synthetic town where there are none), and the reward by batch size."""
 
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
-
-import numpy as np
 
 from factory.clips.av2 import AV2Reader
 from factory.clips.reader import ClipReader
@@ -22,19 +18,9 @@ from tasks.rollout.simulate import TrafficSettings, prepare_traffic, simulate
 from tasks.vocabulary import Vocabulary
 from tasks.world.clip import NOW, scene_of_clip
 from tasks.world.frames import to_world
+from tests.bench.timing import milliseconds
 
 PUBLIC_MS_PER_TRAJECTORY = 20.0  # the public implementation, one core (METRIC.md)
-
-
-def milliseconds(call: Callable[[], object], repeats: int) -> float:
-    """Median time of one call, after one that warms up."""
-    call()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - start)
-    return 1e3 * float(np.median(times))
 
 
 def main(root: Path) -> None:
