@@ -19,6 +19,7 @@ from factory.vocabulary import (
 )
 from factory.work import RunIdentity, canonical_json
 from tasks.attempt import ExpertGate
+from tasks.caches import user_cache
 from tasks.experts.human import Human
 from tasks.experts.pdm_closed import PdmClosed, PdmSettings
 from tasks.experts.protocol import Expert
@@ -222,5 +223,5 @@ def identity_of(config: RunConfig, vocabulary: Vocabulary) -> RunIdentity:
 def cache_folder(config: RunConfig) -> str:
     """Where blocks and tables are kept: beside the run's tables when `out` is a folder, else in the user's cache."""
     if "://" in config.out:
-        return str(Path.home() / ".cache" / "driving-data-factory" / "assets")
+        return str(user_cache() / "assets")
     return str(Path(config.out).absolute() / "cache")

@@ -14,6 +14,8 @@ from typing import Any, TypeVar
 
 import numba
 
+from tasks.caches import user_cache
+
 F = TypeVar("F", bound=Callable[..., Any])
 _ROOT = Path(__file__).resolve().parent.parent
 _PACKAGES = ("tasks", "factory")
@@ -50,8 +52,7 @@ def sources_digest(root: Path = _ROOT) -> str:
 
 def cache_dir() -> Path:
     """Where the compiled kernels of exactly these sources are kept."""
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return base / "driving-data-factory" / f"kernels-{sources_digest()}"
+    return user_cache() / f"kernels-{sources_digest()}"
 
 
 if not os.environ.get("NUMBA_CACHE_DIR"):

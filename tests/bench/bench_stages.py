@@ -25,7 +25,7 @@ PUBLIC_MS_PER_TRAJECTORY = 20.0  # the public implementation, one core (METRIC.m
 
 def main(root: Path) -> None:
     """Prints two tables."""
-    reader: ClipReader = AV2Reader(root) if root.is_dir() else SyntheticReader("~/.cache/driving-data-factory/towns", 3)
+    reader: ClipReader = AV2Reader(root) if root.is_dir() else SyntheticReader(n_clips=3)
     ref = reader.index().refs[0]
     clip = reader.read(ref)
     scene = scene_of_clip(clip)

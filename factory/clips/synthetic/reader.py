@@ -11,9 +11,9 @@ from pathlib import Path
 from factory.clips.av2 import AV2Reader
 from factory.clips.reader import ClipIndex, ClipRef
 from factory.clips.synthetic.write import TownSettings, write_town
+from tasks.caches import user_cache
 from tasks.world.clip import Clip
 
-CACHE = Path.home() / ".cache" / "driving-data-factory" / "towns"
 TOWN_VERSION = 1  # raise by hand whenever the same seed gives other bytes
 
 
@@ -27,12 +27,16 @@ class SyntheticReader:
     name = "synthetic"
 
     def __init__(
-        self, cache_dir: str | Path = CACHE, n_clips: int = 12, seed: int = 0, settings: TownSettings | None = None
+        self,
+        cache_dir: str | Path | None = None,
+        n_clips: int = 12,
+        seed: int = 0,
+        settings: TownSettings | None = None,
     ) -> None:
-        """Raises ValueError for n_clips < 1."""
+        """cache_dir: where towns are kept; None: in the user's cache. Raises ValueError for n_clips < 1."""
         if n_clips < 1:
             raise ValueError(f"clips.n_clips: a town needs at least one clip, not {n_clips}")
-        self.cache_dir = Path(cache_dir).expanduser().absolute()
+        self.cache_dir = Path(cache_dir or user_cache() / "towns").expanduser().absolute()
         self.n_clips, self.seed, self.settings = n_clips, seed, settings or TownSettings()
         self._logs: AV2Reader | None = None
 

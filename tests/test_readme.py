@@ -1,0 +1,96 @@
+"""README.md and docs/configuration.md keep their word: python blocks run, commands are ones the programs take."""
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from factory.explain import split_arguments
+from factory.run import main as run_main
+from factory.settings import load_config
+from factory.show import main as show_main
+from tasks.kernels import cache_dir as kernel_cache_dir
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+PAGES = ("README.md", "docs/configuration.md")
+
+
+def blocks(page: str, language: str) -> list[str]:
+    """The fenced blocks of that language ('' where none is named), in order."""
+    text = (REPOSITORY / page).read_text()
+    return [body for named, body in re.findall(r"^```(\w*)\n(.*?)^```$", text, re.M | re.S) if named == language]
+
+
+def commands(page: str) -> list[list[str]]:
+    """The command lines of the unnamed blocks as lists of words: continued lines joined, comments left out."""
+    joined = "\n".join(blocks(page, "")).replace("\\\n", " ")
+    return [words for line in joined.splitlines() if (words := shlex.split(line, comments=True))]
+
+
+ALL_COMMANDS = [command for page in PAGES for command in commands(page)]
+PYTHON_BLOCKS = blocks("README.md", "python")
+
+
+@pytest.fixture(scope="module")
+def demo_home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with `runs/demo` as `make demo` leaves it, but of one clip and tiny pictures."""
+    home = tmp_path_factory.mktemp("readme")
+    tiny = (
+        "clips.n_clips=1",
+        f"clips.cache_dir={home / 'towns'}",
+        "clips.settings.width=64",
+        "clips.settings.height=36",
+        "clips.settings.cameras=[ring_front_center]",
+        "vocabulary.k=64",
+        "experts=[human]",
+        "render.frames=now",
+        "render.width=64",
+        "render.height=36",
+        "executor=local",
+    )
+    assert run_main([*tiny, f"out={home / 'runs' / 'demo'}"]) == 0
+    return home
+
+
+@pytest.mark.parametrize("block", PYTHON_BLOCKS, ids=range(len(PYTHON_BLOCKS)))
+def test_python_runs_as_written_without_ray_or_hydra(demo_home: Path, block: str) -> None:
+    code = block + "\nimport sys\nassert not {'ray', 'hydra'} & set(sys.modules)\n"
+    env = os.environ | {"PYTHONPATH": str(REPOSITORY), "XDG_CACHE_HOME": str(demo_home / "cache")}
+    env["NUMBA_CACHE_DIR"] = str(kernel_cache_dir())  # a town of its own, but not a second compilation
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=demo_home, env=env, capture_output=True, text=True, timeout=200
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip()
+
+
+@pytest.mark.parametrize("command", ALL_COMMANDS, ids=" ".join)
+def test_every_command_is_one_its_program_takes(
+    command: list[str], demo_home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if command[:3] == ["ray", "job", "submit"]:
+        assert command[3:8] == ["--address", "http://127.0.0.1:8265", "--working-dir", ".", "--"]
+        command = command[8:]
+    match command:
+        case ["make", target]:
+            assert re.search(rf"^{target}:", (REPOSITORY / "Makefile").read_text(), re.M)
+        case ["python", "-m", "factory.run", "--help"]:
+            assert run_main(["--help"]) == 0
+        case ["python", "-m", "factory.run", *arguments]:
+            load_config([argument for argument in arguments if argument != "--cfg"])
+        case ["python", "-m", "factory.explain", *arguments]:
+            load_config(split_arguments(arguments)[1])
+        case ["python", "-m", "factory.show", *arguments]:
+            monkeypatch.chdir(demo_home)
+            assert show_main(arguments) == 0, capsys.readouterr().err
+        case _:
+            pytest.fail(f"no program takes {' '.join(command)}")
+
+
+def test_there_is_something_to_check() -> None:
+    assert len(PYTHON_BLOCKS) == 2
+    assert len(ALL_COMMANDS) >= 10
