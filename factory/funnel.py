@@ -1,8 +1,8 @@
 """The acceptance funnel: per expert and round, what was tried, accepted, turned down and why; from the tables alone.
 
-An attempt belongs to the round it was tried for: the number of accepted candidates before it in its walk. Two rates are
-shown. Attempts: accepted of tried. Clips: those with at least r+1 accepted samples, of all clips and of those with at
-least r; the latter is the one to hold against the rates published for the method.
+An attempt belongs to the round it was tried for: the number of accepted candidates before it in its walk. The rates.
+Attempts: accepted of tried. First try: of the clips that had the round before, those accepted without a second try, as
+one random draw a round would be. Clips: those with at least r+1 accepted samples, of those with at least r and of all.
 """
 
 import io
@@ -35,6 +35,7 @@ class FunnelRow:
     clips: int  # with at least round + 1 accepted samples
     clips_total: int  # in which this expert was to drive
     reasons: Mapping[str, int] = field(default_factory=dict)  # "stage.reason" or "failed.kind" -> attempts
+    first_tries: int = 0  # clips whose first attempt of this round was accepted
 
     @property
     def attempt_rate(self) -> float:
@@ -45,6 +46,11 @@ class FunnelRow:
     def clip_rate(self) -> float:
         """Of the clips that had the round before."""
         return self.clips / self.clips_before if self.clips_before else float("nan")
+
+    @property
+    def first_try_rate(self) -> float:
+        """Of the clips that had the round before: accepted without a second try, as one random draw would be."""
+        return self.first_tries / self.clips_before if self.clips_before else float("nan")
 
     @property
     def clip_rate_of_all(self) -> float:
@@ -74,13 +80,18 @@ class Funnel:
         ):
             if counts:
                 head += f"\n{title}: " + ", ".join(f"{name} {n}" for name, n in counts.items())
-        table = Table("expert", "round", "tried", "accepted", "attempts %", "clips", "clips %", "of all %", "why not")
+        table = Table(
+            "expert", "round", "tried", "accepted", "attempts %", "1st try %", "clips", "clips %", "of all %", "why not"
+        )
         for r in self.rows:
             tried = r.accepted + r.rejected + r.failed
             why = ", ".join(f"{name} {n}" for name, n in r.reasons.items())
             rates = (_percent(r.attempt_rate), _percent(r.clip_rate), _percent(r.clip_rate_of_all))
+            first = _percent(r.first_try_rate)
             clips = f"{r.clips}/{r.clips_before}"
-            table.add_row(r.expert, str(r.round), str(tried), str(r.accepted), rates[0], clips, rates[1], rates[2], why)
+            table.add_row(
+                r.expert, str(r.round), str(tried), str(r.accepted), rates[0], first, clips, rates[1], rates[2], why
+            )
         sink = io.StringIO()
         Console(file=sink, width=width, no_color=True).print(table)
         return f"{head}\n{sink.getvalue()}"
@@ -124,15 +135,18 @@ def funnel_of(store: Store, clip_ids: Collection[str] | None = None) -> Funnel:
 
 def _expert_rows(expert: str, clips: Mapping[str, list[tuple[int, str]]]) -> list[FunnelRow]:
     accepted: Counter[int] = Counter()
+    first_tries: Counter[int] = Counter()
     reasons: dict[int, Counter[str]] = defaultdict(Counter)
     for attempts in clips.values():
-        at = 0
+        at, fresh = 0, True
         for _, why in sorted(attempts):
             if why:
                 reasons[at][why] += 1
+                fresh = False
             else:
                 accepted[at] += 1
-                at += 1
+                first_tries[at] += fresh
+                at, fresh = at + 1, True
     rounds = max([*accepted, *reasons], default=-1) + 1
     before = len(clips)
     rows = []
@@ -150,6 +164,7 @@ def _expert_rows(expert: str, clips: Mapping[str, list[tuple[int, str]]]) -> lis
                 accepted[number],  # one sample per clip and round
                 len(clips),
                 dict(whys.most_common()),
+                first_tries[number],
             )
         )
         before = accepted[number]

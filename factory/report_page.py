@@ -170,12 +170,22 @@ def _header(report: Report) -> Html:
 
 
 def _funnel(funnel: Funnel) -> Html:
-    head = ("expert", "round", "tried", "accepted", "of attempts", "clips", "of clips before", "paper", "of all clips")
+    head = (
+        "expert",
+        "round",
+        "tried",
+        "accepted",
+        "of attempts",
+        "of first tries",
+        "clips",
+        "of clips before",
+        "paper",
+    )
     rates = table(head, [_funnel_row(row) for row in funnel.rows], "funnel")
     lead = (
-        "Round r holds the (r+1)-th accepted sample of each clip and expert. Of attempts: accepted of tried. Of clips: "
-        "clips with a sample of this round, of those with one of the round before; that is the rate to hold against "
-        "the paper's, which the mark on the bar shows."
+        "Round r holds the (r+1)-th accepted sample of each clip and expert. Of attempts: accepted of tried. Of first "
+        "tries: clips accepted without a second try in this round, as one random draw would be. Of clips before: clips "
+        "with a sample of this round, of those with one of the round before; the mark on the bar shows the paper's."
     )
     ended = [
         el("p", f"{expert}: {count} {'walk' if count == 1 else 'walks'} came to the end of the list", class_="note")
@@ -194,10 +204,10 @@ def _funnel_row(row: FunnelRow) -> list[Html]:
         number(tried),
         number(row.accepted),
         el("td", bar(row.attempt_rate)),
+        el("td", bar(row.first_try_rate, paper)),
         el("td", f"{row.clips} / {row.clips_before}", class_="n"),
         el("td", bar(row.clip_rate, paper)),
         el("td", f"{paper} %" if paper is not None else "-", class_="n dim"),
-        el("td", bar(row.clip_rate_of_all)),
     ]
 
 

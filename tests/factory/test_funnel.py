@@ -17,8 +17,9 @@ def test_an_attempt_belongs_to_the_round_it_was_tried_for() -> None:
         "c": [(0, "failed.bug")],
     }
     first, second = _expert_rows("recovery", clips)[:2]
-    assert first == FunnelRow("recovery", 0, 2, 1, 1, 3, 2, 3, {"reward.nc": 1, "failed.bug": 1})
+    assert first == FunnelRow("recovery", 0, 2, 1, 1, 3, 2, 3, {"reward.nc": 1, "failed.bug": 1}, 1)
     assert second == FunnelRow("recovery", 1, 1, 2, 0, 2, 1, 3, {"reward.ep": 1, "reward.nc": 1})
+    assert first.first_try_rate == pytest.approx(1 / 3) and second.first_try_rate == 0.0  # clip b; nobody
     assert first.attempt_rate == 0.5 and first.clip_rate == pytest.approx(2 / 3)
     assert second.clip_rate == 0.5 and second.clip_rate_of_all == pytest.approx(1 / 3)
 
