@@ -85,7 +85,7 @@ class Funnel:
         )
         for r in self.rows:
             tried = r.accepted + r.rejected + r.failed
-            why = ", ".join(f"{name} {n}" for name, n in r.reasons.items())
+            why = ", ".join(f"{name.removeprefix('reward.')} {n}" for name, n in r.reasons.items())
             rates = (_percent(r.attempt_rate), _percent(r.clip_rate), _percent(r.clip_rate_of_all))
             first = _percent(r.first_try_rate)
             clips = f"{r.clips}/{r.clips_before}"

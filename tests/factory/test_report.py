@@ -131,7 +131,7 @@ def test_the_funnel_on_the_page_counts_what_the_tables_hold(store: Store, text: 
     assert {(r[0], int(r[1])): int(r[3]) for r in rows if int(r[3])} == accepted
     attempts = [o for o in store.outcomes.read().to_pylist() if o["expert"] and o["kind"] != "exhausted"]
     assert sum(int(r[2]) for r in rows) == len(store.samples) + len(attempts)
-    for name, round_number, *_, paper, _ in rows:
+    for name, round_number, *_, paper in rows:
         published = PAPER_CLIP_PERCENT.get(name)
         assert paper == (f"{published[int(round_number)]} %" if published else "-")
 
