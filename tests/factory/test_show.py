@@ -36,7 +36,7 @@ def test_status_counts_the_tables(out: Path, capsys: pytest.CaptureFixture[str])
     assert f"samples     {len(store.samples)} rows" in text
     assert f"outcomes    {len(store.outcomes)} rows" in text
     assert "failed 2" in text and "exit code 3: complete with failed attempts" in text
-    assert "recovery" in text and "reward.nc" in text
+    assert "recovery" in text and "nc " in text
 
 
 def test_list_gives_the_ids_that_sample_takes(out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
