@@ -28,7 +28,7 @@ from tasks.render.settings import RenderSettings
 from tasks.render.sky import SkyMap
 from tasks.world.clip import Clip
 
-ASSET_VERSION = 1  # raised by hand when the same sensors give another scene
+ASSET_VERSION = 2  # raised by hand when the same sensors give another scene
 log = logging.getLogger(__name__)
 
 

@@ -52,19 +52,25 @@ def choose(looks: Sequence[Look]) -> dict[int, Discs]:
                 if pose is None:
                     continue
                 camera = np.ascontiguousarray(np.linalg.inv(look.scene_from_camera) @ pose)
-                whole = concatenate_discs(parts)
-                kept[owner] = [whole]
-                _cover(
-                    whole.points, whole.across, whole.down, whole.spacing, camera, look.intrinsics, look.depth, covered
-                )
+                for part in parts:
+                    _cover(
+                        part.points, part.across, part.down, part.spacing, camera, look.intrinsics, look.depth, covered
+                    )
             rows, columns = look.discs.pixels.T
             new = np.flatnonzero(mine & ~covered[rows, columns])
             for owner in np.unique(look.owner[new]):
                 part = look.discs.take(new[look.owner[new] == owner])
                 if owner != BACKGROUND:
                     part = part.moved(np.linalg.inv(look.scene_from_box[int(owner)]).astype(np.float64))
-                kept.setdefault(int(owner), []).append(part)
+                _append(kept.setdefault(int(owner), []), part)
     return {owner: concatenate_discs(parts) for owner, parts in sorted(kept.items())}
+
+
+def _append(parts: list[Discs], part: Discs) -> None:
+    """Keeps the parts few and each disc copied few times: a part joins the one before unless that is twice as large."""
+    while parts and len(parts[-1].points) < 2 * len(part.points):
+        part = concatenate_discs([parts.pop(), part])
+    parts.append(part)
 
 
 def with_mirror_image(discs: Discs) -> Discs:

@@ -54,8 +54,8 @@ def driving(agents: AgentTracks) -> NDArray[np.bool_]:
 
 
 @kernel
-def behind_boxes(points: Any, eye: Any, boxes: Any, moving: Any) -> Any:
-    """Whether the sight line from `eye` (3,) to a point (M, 3), and a little further, meets a moving box (M,).
+def behind_boxes(points: Any, eye: Any, boxes: Any) -> Any:
+    """Whether the sight line from `eye` (3,) to a point (M, 3), and a little further, meets a moving box (N, 7): (M,).
 
     Such a pixel shows the mover, its shadow or its edge: nothing that stays.
     """
@@ -63,8 +63,6 @@ def behind_boxes(points: Any, eye: Any, boxes: Any, moving: Any) -> Any:
     cosines, sines = np.cos(boxes[:, 3]), np.sin(boxes[:, 3])
     for i in range(points.shape[0]):
         for j in range(boxes.shape[0]):
-            if not moving[j] or out[i]:
-                continue
             ex, ey, ez = eye[0] - boxes[j, 0], eye[1] - boxes[j, 1], eye[2] - boxes[j, 2]
             dx, dy, dz = points[i, 0] - eye[0], points[i, 1] - eye[1], points[i, 2] - eye[2]
             enter, leave = 0.0, 1.0 + BEYOND_M / max(np.sqrt(dx * dx + dy * dy + dz * dz), 1e-3)
@@ -84,6 +82,7 @@ def behind_boxes(points: Any, eye: Any, boxes: Any, moving: Any) -> Any:
                 enter, leave = max(enter, min(a, b)), min(leave, max(a, b))
             if enter <= leave:
                 out[i] = True
+                break
     return out
 
 

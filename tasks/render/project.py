@@ -10,6 +10,7 @@ from tasks.kernels import kernel
 NEAR_M = 0.3  # closer ones would cover the picture
 DILATION_PX2 = 0.1  # added to the screen covariance; 0.3, made for megapixels, blurs images this small (measured)
 MIN_ALPHA = 1.0 / 255.0  # a weaker contribution is not visible in 8 bits
+MAX_REACH = math.sqrt(2.0 * math.log(1.0 / MIN_ALPHA))  # standard deviations at which opacity 1 falls to MIN_ALPHA
 MAX_TANGENT_RATIO = 1.3  # the Jacobian is linearised at most this far outside the picture
 
 # Columns of a projected row.
@@ -53,12 +54,13 @@ def project(
         y = r[1, 0] * px + r[1, 1] * py + r[1, 2] * pz + r[1, 3]
         tx, ty = x / z, y / z
         u, v = fx * tx + cx, fy * ty + cy
-        s0, s1, s2 = math.exp(log_scales[i, 0]), math.exp(log_scales[i, 1]), math.exp(log_scales[i, 2])
         # No ellipse reaches further than this; culling before the covariance is what makes large scenes cheap.
-        reach = math.sqrt(2.0 * math.log(255.0 * opacities[i]))
-        bound = reach * (max(s0, max(s1, s2)) * 2.0 * max(fx, fy) / z + 1.0)
+        longest = math.exp(max(log_scales[i, 0], max(log_scales[i, 1], log_scales[i, 2])))
+        bound = MAX_REACH * (longest * 2.0 * max(fx, fy) / z + 1.0)
         if u + bound < 0.0 or u - bound > width or v + bound < 0.0 or v - bound > height:
             continue
+        s0, s1, s2 = math.exp(log_scales[i, 0]), math.exp(log_scales[i, 1]), math.exp(log_scales[i, 2])
+        reach = math.sqrt(2.0 * math.log(opacities[i] / MIN_ALPHA))
         # Jacobian of the projection, at a point kept near the picture.
         jx = min(max(tx, left), right)
         jy = min(max(ty, top), bottom)

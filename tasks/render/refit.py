@@ -45,10 +45,10 @@ def refit_colours(
     for _ in range(sweeps):
         for i, photo in enumerate(photos):
             height, width = photo.rgb.shape[:2]
-            rows, scene = rows_of(i), scene_of(i)
-            splats = splat(scene, photo.intrinsics, photo.scene_from_camera, width, height)
+            splats = splat(scene_of(i), photo.intrinsics, photo.scene_from_camera, width, height)
+            rows = rows_of(i)[splats.index]
             residual = photo.rgb - shade(splats, colours[rows], photo.backdrop).rgb
-            sums, weights = gather(splats, residual, len(scene), photo.passing, n_background)
+            sums, weights = gather(splats, residual, photo.passing, n_background)
             step = RELAXATION * sums / (weights + PRIOR_WEIGHT)[:, None]
             colours[rows] = np.clip(colours[rows] + step, 0.0, 1.0)
     return colours

@@ -56,7 +56,7 @@ class AssetSettings:
     """How a scene is built. Pixels are those of the photos handed in."""
 
     max_gap_px: tuple[int, int] = (12, 24)  # columns, rows that are interpolated between lidar returns
-    refit_sweeps: int = 2
+    refit_sweeps: int = 1  # a second one gains 0.02 .. 0.08 dB for a third of the time
     hold_out_every: int = 8  # photo i of a camera with i % n == n // 2 only measures; 0: none is held out
     stereo_photos: int = 4  # neighbours compared where lidar does not reach
 
@@ -242,7 +242,7 @@ def _see(
     neighbours = _neighbours(photo, others, settings.stereo_photos)
     hints = _hints(depth)
     if neighbours:
-        guess, cost, sky_cost = sweep_depth(rgb, hints, neighbours, photo.intrinsics, photo.world_from_camera)
+        guess, cost, sky_cost = sweep_depth(rgb, hints, neighbours, photo.intrinsics, photo.world_from_camera, unknown)
         sky = unknown & ((bright & (sky_cost < 1.3 * cost + 0.03)) | (guess >= FAR_M))
     else:
         guess, sky = hints[0], unknown & (bright | (hints[0] == 0.0))
@@ -252,7 +252,7 @@ def _see(
         * np.where(depth > 0, depth, FAR_M)[..., None]
     )
     eye = photo.world_from_camera[:3, 3]
-    passing = behind_boxes(seen_to.reshape(-1, 3) + eye, eye, boxes, valid & tracks.driving).reshape(height, width)
+    passing = behind_boxes(seen_to.reshape(-1, 3) + eye, eye, boxes[valid & tracks.driving]).reshape(height, width)
     return _Seen(depth, label, sky, passing)
 
 
@@ -287,7 +287,7 @@ def _neighbours(photo: Photo, others: Sequence[Photo], n: int) -> list[tuple[F32
     for i, other in enumerate(others):
         baseline = float(np.linalg.norm(other.world_from_camera[:3, 3] - photo.world_from_camera[:3, 3]))
         same_way = float(other.world_from_camera[:3, 2] @ photo.world_from_camera[:3, 2]) > 0.9
-        if MIN_BASELINE_M <= baseline <= MAX_BASELINE_M and same_way:
+        if MIN_BASELINE_M <= baseline <= MAX_BASELINE_M and same_way and other.rgb.shape == photo.rgb.shape:
             candidates.append((abs(np.log(baseline)), i))
     best = [others[i] for _, i in sorted(candidates)[:n]]
     return [(o.rgb.astype(np.float32) / 255.0, o.intrinsics, o.world_from_camera) for o in best]

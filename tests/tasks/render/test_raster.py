@@ -158,7 +158,7 @@ def test_gathering_white_gives_the_blending_weights() -> None:
     scene = cloud(500, seed=8)
     splats = splat(scene, INTRINSICS, np.eye(4), WIDTH, HEIGHT)
     white = np.ones((HEIGHT, WIDTH, 3), np.float32)
-    sums, weights = gather(splats, white, len(scene))
+    sums, weights = gather(splats, white)
     np.testing.assert_allclose(sums, np.repeat(weights[:, None], 3, 1), rtol=1e-5)
     alpha = rasterize(scene, INTRINSICS, np.eye(4), WIDTH, HEIGHT, BLACK).alpha
     assert weights.sum() == pytest.approx(alpha.sum(), rel=1e-4)
