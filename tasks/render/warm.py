@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from tasks.render.scene import AssetSettings, Photo, RenderAsset, Sweep, build_asset
+from tasks.render.scene import AssetSettings, RenderAsset, build_asset
+from tasks.render.sensed import Photo, Sweep
 from tasks.world.agents import AgentKind, AgentTracks
 
 FRONT = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 1.5], [0.0, 0.0, 0.0, 1.0]])

@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from tasks.render.scene import AssetSettings, Photo, Sweep, build_asset
+from tasks.render.scene import AssetSettings, build_asset
+from tasks.render.sensed import Photo, Sweep
 
 EGO_HEIGHT_M = 0.93  # of KITTI's IMU above the ground
 FRAMES = range(20, 52, 2)

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import street
 
-from tasks.render import choose, depth, movers, project, raster
-from tasks.render.scene import AssetSettings, Photo, RenderAsset, build_asset, psnr, render_photo, scene_at
+from tasks.render import choose, depth, movers, project, raster, stereo
+from tasks.render.scene import AssetSettings, RenderAsset, build_asset, psnr, render_photo, scene_at
+from tasks.render.sensed import Photo
 from tasks.render.warm import compile_kernels
 from tasks.world.agents import AgentKind
 
@@ -117,7 +118,7 @@ def test_no_photos_no_scene() -> None:
 
 def test_the_smallest_scene_reaches_every_kernel_of_the_room() -> None:
     compile_kernels()
-    modules = (choose, depth, movers, project, raster)
+    modules = (choose, depth, movers, project, raster, stereo)
     kernels = [value for module in modules for value in vars(module).values() if hasattr(value, "signatures")]
     assert len(kernels) > 10
     inlined = {"_nearer", "_row_alphas", "_tile_range", "_is_opaque"}  # part of their callers, no entry points
