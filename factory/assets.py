@@ -15,14 +15,16 @@ import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, fields, replace
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from factory.sensors import block_of, chosen_cameras, load_sensors
+from factory.sensors import block_of, chosen_cameras, load_sensors, load_sweeps
 from tasks.render.gaussians import Gaussians
+from tasks.render.lidar_only import lidar_asset
 from tasks.render.scene import RenderAsset, build_asset
 from tasks.render.settings import RenderSettings
 from tasks.render.sky import SkyMap
@@ -32,13 +34,35 @@ ASSET_VERSION = 2  # raised by hand when the same sensors give another scene
 log = logging.getLogger(__name__)
 
 
-def asset_for(clip: Clip, settings: RenderSettings, cache_dir: str | Path) -> RenderAsset | None:
-    """The scene of the clip's block with its digest; None where the clip has no photos to take colours from.
+class Sensing(Enum):
+    """What a clip's block was seen by."""
 
+    PHOTOS = "photos"  # and lidar
+    LIDAR_ONLY = "lidar_only"
+    NOTHING = "nothing"
+
+
+def sensing(clip: Clip, settings: RenderSettings) -> Sensing:
+    """What the block can be made of; nothing without a rig to look through.
+
+    Raises ValueError for a camera the rig does not have.
+    """
+    block, cameras = block_of(clip), chosen_cameras(clip.cameras, settings.cameras)
+    if not cameras or not block.sweeps:
+        return Sensing.NOTHING
+    seen = {camera.name for camera in cameras} & {file.sensor for file in block.images}
+    return Sensing.PHOTOS if seen else Sensing.LIDAR_ONLY
+
+
+def asset_for(clip: Clip, settings: RenderSettings, cache_dir: str | Path) -> RenderAsset | None:
+    """The scene of the clip's block with its digest; None where the clip has nothing to make one from.
+
+    Made of photos and lidar, or of lidar alone (`sensing`).
     Raises BadClip where a sensor file is broken, ValueError for a camera the rig does not have.
     """
     block, cameras = block_of(clip), chosen_cameras(clip.cameras, settings.cameras)
-    if not {camera.name for camera in cameras} & {file.sensor for file in block.images}:
+    made_of = sensing(clip, settings)
+    if made_of is Sensing.NOTHING:
         return None
     path = Path(cache_dir) / f"block-{block_id(clip, settings)}.npz"
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -48,8 +72,11 @@ def asset_for(clip: Clip, settings: RenderSettings, cache_dir: str | Path) -> Re
                 return read_asset(path)
             except (ValueError, KeyError, OSError, zipfile.BadZipFile) as error:
                 log.warning("%s is damaged (%s) and is built again", path, error)
-        data = load_sensors(block, cameras, settings.width, settings.height)
-        asset = build_asset(data.photos, data.sweeps, block.agents, settings.asset)
+        if made_of is Sensing.PHOTOS:
+            data = load_sensors(block, cameras, settings.width, settings.height)
+            asset = build_asset(data.photos, data.sweeps, block.agents, settings.asset)
+        else:
+            asset = lidar_asset(load_sweeps(block.sweeps, with_intensity=True), block.agents)
         asset = replace(asset, digest=asset_digest(asset))
         write_asset(path, asset)
     return asset

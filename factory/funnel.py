@@ -133,6 +133,14 @@ def funnel_of(store: Store, clip_ids: Collection[str] | None = None) -> Funnel:
     )
 
 
+def image_sources_text(store: Store) -> str:
+    """One line: how many samples have images from where, those from lidar alone apart."""
+    rows = store.samples.read(["image_source", "tags"]).to_pylist()
+    lidar = "render (lidar only)"
+    counts = Counter(lidar if "lidar_only" in row["tags"] else str(row["image_source"]) for row in rows)
+    return "images: " + (", ".join(f"{source} {n}" for source, n in sorted(counts.items())) or "no samples")
+
+
 def _expert_rows(expert: str, clips: Mapping[str, list[tuple[int, str]]]) -> list[FunnelRow]:
     accepted: Counter[int] = Counter()
     first_tries: Counter[int] = Counter()

@@ -1,6 +1,7 @@
 """The render stage: a sample's images, from the block's scene, the log's own photos, or drawn from the map.
 
 A clip whose block can be rendered is; one without cameras or lidar is written with image_source=none and no images.
+Lidar without photos gives grey pictures near its sweeps, tagged `lidar_only`.
 """
 
 from collections.abc import Sequence
@@ -11,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from factory.assets import asset_for
+from factory.assets import Sensing, asset_for, sensing
 from factory.sensors import block_of, chosen_cameras, encode_jpeg, load_photos
 from tasks.attempt import Judged
 from tasks.perturb import Candidate
@@ -24,8 +25,10 @@ from tasks.stages import Rejected
 from tasks.world.agents import AgentTracks
 from tasks.world.camera import Camera
 from tasks.world.clip import NOW, STEP_S, Clip
+from tasks.world.vehicle import X, Y
 
 NO_IMAGES: dict[str, object] = {"cameras": None, "images": None, "image_source": str(ImageSource.NONE)}
+LIDAR_ONLY = "lidar_only"  # tag of a sample whose images show lidar returns in grey, not what a camera would have seen
 PHOTO_SLACK_S = 0.06  # a photo belongs to an instant of the 2 Hz grid when it was taken this close to it
 
 
@@ -41,7 +44,7 @@ class Imaging:
 
         Raises BadClip for a broken sensor file.
         """
-        if not self._has_block(clip):
+        if self._sensing(clip) is not Sensing.PHOTOS:
             return None
         asset = _block(clip, self.settings, self.cache_dir)
         if asset.psnr_db < self.settings.psnr_min:
@@ -49,31 +52,42 @@ class Imaging:
         return None
 
     def pictures(self, clip: Clip, candidate: Candidate | None, judged: Judged) -> dict[str, object]:
-        """The image columns of a sample.
+        """The image columns of a sample, and the `tags` they add to its own.
 
         A human sample of a clip with photos keeps the photos; everything else is drawn at the simulated poses.
         """
         if self.settings.mode is RenderMode.MAP:
             rig = clip.cameras or RIGS[self.settings.map_rig]
             return self._drawn(clip, judged, None, chosen_cameras(rig, self.settings.cameras))
-        if not self._has_block(clip):
+        made_of = self._sensing(clip)
+        if made_of is Sensing.NOTHING or (made_of is Sensing.LIDAR_ONLY and not self._near_sweeps(clip, judged)):
             return NO_IMAGES
         cameras = chosen_cameras(clip.cameras, self.settings.cameras)
-        if candidate is None:
+        if made_of is Sensing.PHOTOS and candidate is None:
             return self._photos(clip, judged, cameras)
-        return self._drawn(clip, judged, _block(clip, self.settings, self.cache_dir), cameras)
+        images = self._drawn(clip, judged, _block(clip, self.settings, self.cache_dir), cameras)
+        return images | {"tags": [LIDAR_ONLY]} if made_of is Sensing.LIDAR_ONLY else images
 
-    def _has_block(self, clip: Clip) -> bool:
-        block = block_of(clip)
-        return self.settings.mode is RenderMode.AUTO and bool(clip.cameras and block.images and block.sweeps)
+    def _sensing(self, clip: Clip) -> Sensing:
+        return sensing(clip, self.settings) if self.settings.mode is RenderMode.AUTO else Sensing.NOTHING
+
+    def _near_sweeps(self, clip: Clip, judged: Judged) -> bool:
+        """Whether every pose to be drawn is within reach of a place that a sweep was taken from."""
+        places = np.stack([file.world_from_ego[:2, 3] for file in block_of(clip).sweeps])
+        offsets = self._ego_states(judged)[:, None, [X, Y]] - places
+        return bool((np.linalg.norm(offsets, axis=-1).min(axis=1) < self.settings.lidar_only_reach_m).all())
+
+    def _ego_states(self, judged: Judged) -> NDArray[np.float64]:
+        """(F, 11) at the instants that are drawn."""
+        driven = np.concatenate([judged.scene.ego_history, judged.rollout.ego_states[1:]])  # rows -15 .. 40 around now
+        return driven[[offset + NOW for offset in STEPS_OF[self.settings.frames]]]
 
     def _drawn(
         self, clip: Clip, judged: Judged, asset: RenderAsset | None, cameras: Sequence[Camera]
     ) -> dict[str, object]:
         scene, rollout = judged.scene, judged.rollout
         offsets = STEPS_OF[self.settings.frames]
-        driven = np.concatenate([scene.ego_history, rollout.ego_states[1:]])  # rows -15 .. 40 around now
-        poses = pose_on_ground(clip.world_from_ego, driven[[offset + NOW for offset in offsets]])
+        poses = pose_on_ground(clip.world_from_ego, self._ego_states(judged))
         agents = scene.agents.overwritten(scene.step, rollout.agents)
         steps = [scene.step + offset for offset in offsets]
         images = self._draw(clip, asset, cameras, poses, agents, steps)
@@ -142,7 +156,7 @@ class Imaging:
 
 def _block(clip: Clip, settings: RenderSettings, cache_dir: str) -> RenderAsset:
     asset = _kept(_Key(clip, settings, cache_dir))
-    assert asset is not None, "asked for a block only where there are photos"
+    assert asset is not None, "asked for a block only where there are sensors"
     return asset
 
 

@@ -124,7 +124,9 @@ class FactoryWork:
             return Dropped(trace.rejected, _subscores(trace.judged.scores) if trace.judged else {}, watch.seconds)
         with watch.of("render"):
             pictures = self.imaging.pictures(payload.clip, trace.candidate, trace.judged)
-        return Accepted(sample_row(payload.clip, trace.candidate, trace.judged) | pictures, watch.seconds)
+        row = sample_row(payload.clip, trace.candidate, trace.judged)
+        tags = [*row["tags"], *pictures.get("tags", ())]  # type: ignore[misc]
+        return Accepted(row | pictures | {"tags": tags}, watch.seconds)
 
     def trace(
         self,

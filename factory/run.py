@@ -82,6 +82,7 @@ def run(overrides: Sequence[str]) -> int:
     """Plan, execute, commit, report."""
     from factory.calibrate import calibrate, plan_text
     from factory.execute import execute
+    from factory.funnel import image_sources_text
     from factory.report import write_report
     from factory.settings import assemble, load_config
     from factory.store.location import BadLocation, Location
@@ -120,6 +121,7 @@ def run(overrides: Sequence[str]) -> int:
     if summary.exit_code == BAD_CONFIG or summary.funnel is None:
         return summary.exit_code
     print(summary.funnel.text())
+    print(image_sources_text(store))
     if summary.seconds:
         print(seconds_text(summary.seconds))
     print(write_report(store, assembled))

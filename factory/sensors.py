@@ -15,7 +15,7 @@ from tasks.render.views import undistorted
 from tasks.world.camera import Camera, SensorFile
 from tasks.world.clip import Block, Clip
 
-XYZ = ("x", "y", "z")
+XYZ, INTENSITY = ("x", "y", "z"), "intensity"
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ def load_sensors(block: Block, cameras: Sequence[Camera], width: int, height: in
     Raises BadClip where a file is missing, broken or not of its camera's size.
     """
     photos = load_photos(block.images, cameras, width, height)
-    return SensorData(photos, tuple(_sweep(file) for file in block.sweeps))
+    return SensorData(photos, load_sweeps(block.sweeps))
 
 
 def load_photos(files: Sequence[SensorFile], cameras: Sequence[Camera], width: int, height: int) -> tuple[Photo, ...]:
@@ -97,8 +97,13 @@ def _photo(file: SensorFile, camera: Camera, width: int, height: int) -> Photo:
     )
 
 
-def _sweep(file: SensorFile) -> Sweep:
-    """Points in the ego frame, as Argoverse 2 stores them (motion-compensated feather with x, y, z). Raises BadClip."""
-    table = read_feather(Path(file.uri), XYZ)
+def load_sweeps(files: Sequence[SensorFile], with_intensity: bool = False) -> tuple[Sweep, ...]:
+    """Sweeps as Argoverse 2 stores them: motion-compensated points in the ego frame. Raises BadClip."""
+    return tuple(_sweep(file, with_intensity) for file in files)
+
+
+def _sweep(file: SensorFile, with_intensity: bool) -> Sweep:
+    table = read_feather(Path(file.uri), (*XYZ, INTENSITY) if with_intensity else XYZ)
     points = np.stack([table[name] for name in XYZ], axis=1).astype(np.float32)
-    return Sweep(time_s=file.time_s, points=points, world_from_ego=file.world_from_ego)
+    intensity = table[INTENSITY].astype(np.uint8) if with_intensity else None
+    return Sweep(file.time_s, points, file.world_from_ego, intensity)

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from tasks.render.gaussians import Gaussians
-from tasks.render.raster import rasterize
+from tasks.render.warm import compile_kernels as compile_render_kernels
 from tasks.rollout.simulate import TrafficSettings, simulate
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.clip import CLIP_STEPS, NOW, Clip, scene_of_clip
@@ -11,19 +10,11 @@ from tasks.world.lanes import Lane, RoadMap, Route
 
 
 def compile_kernels() -> None:
-    """Runs the traffic and the rasteriser on the smallest scene that reaches all of their kernels."""
+    """Runs the traffic and the render room on the smallest scene that reaches all of their kernels."""
     scene = scene_of_clip(tiny_clip())
     ahead = np.stack([np.arange(1, 41) * 0.5, np.zeros(40), np.zeros(40)], axis=1)
     simulate(scene, ahead, TrafficSettings())
-    one = Gaussians(
-        means=np.array([[0.0, 0.0, 5.0]], np.float32),
-        quats=np.array([[1.0, 0.0, 0.0, 0.0]], np.float32),
-        log_scales=np.full((1, 3), -1.0, np.float32),
-        opacities=np.array([0.9], np.float32),
-        colours=np.full((1, 3), 0.5, np.float32),
-    )
-    intrinsics = np.array([[16.0, 0.0, 8.0], [0.0, 16.0, 8.0], [0.0, 0.0, 1.0]])
-    rasterize(one, intrinsics, np.eye(4), 16, 16, np.zeros((16, 16, 3), np.float32))
+    compile_render_kernels()
 
 
 def tiny_clip() -> Clip:

@@ -1,9 +1,11 @@
 """render=map: lanes, paint, crossings and boxes in perspective on plain ground. A drawing, not a photo, and marked so.
 
-The ground is the plane under the ego; maps of many data sets have no heights.
+The ground is a plane parallel to the ego's own, at the height of the lane boundaries around it; where the map has no
+heights, the plane through the ego's origin.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import cv2
@@ -18,6 +20,7 @@ from tasks.world.lanes import RoadMap
 
 NEAR_M = 0.3
 VISIBLE_M = 90.0
+NEAR_GROUND_M = 15.0
 SHIFT = 4  # cv2 draws with 1/16 pixel
 PAINT_WIDTH_M = 0.15
 DASH_M, GAP_M = 3.0, 6.0
@@ -39,11 +42,29 @@ def draw_map_views(
     """Images (F, C, height, width, 3) rgb; arguments as `tasks.render.views.render_views`."""
     out = np.empty((len(steps), len(cameras), height, width, 3), np.uint8)
     for f, step in enumerate(steps):
-        ground = _ground_shapes(road_map, world_from_ego[f])
-        faces = _box_faces(agents, step, world_from_ego[f])
+        pose = world_from_ego[f].copy()
+        pose[:3, 3] += ground_height(road_map, pose) * pose[:3, 2]
+        ground, faces = _ground_shapes(road_map, pose), _box_faces(agents, step, pose)
         for c, camera in enumerate(cameras):
-            out[f, c] = _draw(ground, faces, camera.resized(width, height))
+            mount = camera.resized(width, height)
+            lifted = np.linalg.inv(pose) @ world_from_ego[f] @ mount.ego_from_camera
+            out[f, c] = _draw(ground, faces, replace(mount, ego_from_camera=lifted))
     return out
+
+
+def ground_height(road_map: RoadMap, world_from_ego: F64) -> float:
+    """Height [m] of the road over the ego's origin, along the ego's up axis: Argoverse 2 counts from the rear axle.
+
+    Median over the lane boundaries within NEAR_GROUND_M; 0 where none has heights (all z are the same 0) or none is
+    near.
+    """
+    lines = [line for lane in road_map.lanes.values() for line in (lane.left_boundary, lane.right_boundary)]
+    points = np.concatenate([np.zeros((0, 3)), *(line for line in lines if line is not None and line.shape[1] == 3)])
+    if not points[:, 2].any():
+        return 0.0
+    offsets = points - world_from_ego[:3, 3]
+    near = np.hypot(offsets[:, 0], offsets[:, 1]) < NEAR_GROUND_M
+    return float(np.median(offsets[near] @ world_from_ego[:3, 2])) if near.any() else 0.0
 
 
 Shape = tuple[F64, tuple[int, int, int]]  # polygon (M, 3) in the ego frame, colour

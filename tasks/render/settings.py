@@ -46,5 +46,6 @@ class RenderSettings:
     height: int = 180
     jpeg_quality: int = 90
     psnr_min: float = 0.0  # [dB] a block whose held-out photos come out worse is refused; 0: none is
+    lidar_only_reach_m: float = 15.0  # without photos: images only this close to where a sweep was taken; 0: none
     map_rig: str = "three_front"  # cameras of a clip without a rig of its own, for mode=map
     asset: AssetSettings = field(default_factory=AssetSettings)

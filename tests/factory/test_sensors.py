@@ -9,7 +9,7 @@ import pyarrow as pa
 import pyarrow.feather
 import pytest
 
-from factory.assets import asset_for, block_id, read_asset
+from factory.assets import Sensing, asset_for, block_id, read_asset, sensing
 from factory.clips.reader import BadClip
 from factory.sensors import block_of, chosen_cameras, decode_image, encode_jpeg, load_sensors
 from tasks.render.scene import AssetSettings, psnr
@@ -136,8 +136,28 @@ def test_a_damaged_block_is_noticed_and_built_again(clip: Clip, tmp_path: Path) 
     assert not list(tmp_path.glob(".block-*"))
 
 
-def test_a_clip_without_photos_has_no_scene(clip: Clip, tmp_path: Path) -> None:
-    assert asset_for(replace(clip, images=()), SETTINGS, tmp_path) is None
+def test_a_clip_without_lidar_or_without_a_rig_has_no_scene(clip: Clip, tmp_path: Path) -> None:
+    assert asset_for(replace(clip, images=(), sweeps=()), SETTINGS, tmp_path) is None
+    assert asset_for(replace(clip, cameras=(), images=()), SETTINGS, tmp_path) is None
+
+
+def test_a_clip_with_lidar_alone_has_a_grey_scene_of_unknown_quality(clip: Clip, tmp_path: Path) -> None:
+    for file in clip.sweeps:
+        table = pyarrow.feather.read_table(file.uri)
+        grey = pa.array(np.arange(len(table)) % 100, pa.uint8())
+        pyarrow.feather.write_feather(table.append_column("intensity", grey), file.uri)
+    unseen = replace(clip, images=())
+    assert sensing(unseen, SETTINGS) is Sensing.LIDAR_ONLY and sensing(clip, SETTINGS) is Sensing.PHOTOS
+    asset = asset_for(unseen, SETTINGS, tmp_path)
+    assert asset is not None and np.isnan(asset.psnr_db) and len(asset.background) > 1000
+    assert np.ptp(asset.background.colours, axis=1).max() == 0.0
+    again = asset_for(unseen, SETTINGS, tmp_path)
+    assert again is not None and again.digest == asset.digest
+
+
+def test_lidar_without_intensity_is_a_bad_clip_where_there_are_no_photos(clip: Clip, tmp_path: Path) -> None:
+    with pytest.raises(BadClip, match=r"0\.feather: intensity: column is missing"):
+        asset_for(replace(clip, images=()), SETTINGS, tmp_path)
 
 
 def test_another_size_or_window_is_another_block(clip: Clip) -> None:

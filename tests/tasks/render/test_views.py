@@ -1,10 +1,12 @@
 """Poses on the road, distortion, frames of a simulated drive, and drawings of the map."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import street
 
-from tasks.render.map_drawing import GROUND, ROAD, SKY, WHITE, clip_near, draw_map_views
+from tasks.render.map_drawing import GROUND, ROAD, SKY, WHITE, clip_near, draw_map_views, ground_height
 from tasks.render.rigs import RIGS, pinhole
 from tasks.render.scene import RenderAsset, psnr
 from tasks.render.views import pose_on_ground, render_views, undistorted
@@ -89,6 +91,27 @@ def test_the_map_drawing_has_true_perspective() -> None:
     depth = 160.0 / (row + 0.5 - 50.0)
     columns = np.flatnonzero((image[row] == WHITE).all(axis=-1))
     assert np.mean(columns) + 0.5 == pytest.approx(100.0 - 200.0 / depth, abs=1.5)
+
+
+def lifted_road(z: float) -> RoadMap:
+    lane = road().lanes["a"]
+    lines = [np.column_stack([np.linspace(-50, 100, 151), np.full(151, side), np.full(151, z)]) for side in (2.0, -2.0)]
+    return RoadMap({"a": replace(lane, left_boundary=lines[0], right_boundary=lines[1])}, road().drivable_areas)
+
+
+def test_the_ground_of_the_drawing_lies_where_the_map_has_its_lane_boundaries() -> None:
+    pose = slope(0.0, 0.0)
+    pose[2, 3] = 12.33  # the rear axle, a third of a metre above the road
+    assert ground_height(lifted_road(12.0), pose) == pytest.approx(-0.33)
+    assert ground_height(road(), pose) == 0.0  # a map without heights
+    camera = pinhole("front", 0.0, 90.0, 200, 100)
+    args = (pose[None], street.tracks(), [0], 200, 100)
+    low = draw_map_views(lifted_road(12.0), [camera], *args)[0, 0]
+    higher = np.eye(4)
+    higher[2, 3] = 0.33
+    mounted = replace(camera, ego_from_camera=higher @ camera.ego_from_camera)
+    high = draw_map_views(lifted_road(12.33), [mounted], *args)[0, 0]
+    np.testing.assert_array_equal(low[60:], high[60:])
 
 
 def test_the_map_drawing_shows_boxes_and_a_named_rig_has_every_side() -> None:
