@@ -14,7 +14,6 @@ import os
 import sys
 from collections.abc import Mapping, Sequence
 from itertools import zip_longest
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from factory.config import ConfigError, compose, conf_dir
@@ -89,11 +88,10 @@ def run(overrides: Sequence[str]) -> int:
     from factory.store.samples import Store
 
     config = load_config(overrides)
-    if os.environ.get("RAY_JOB_CONFIG_JSON_ENV_VAR") and "://" not in config.out and not Path(config.out).is_absolute():
-        raise ConfigError(
-            f"out={config.out}: inside a submitted job the working directory is a copy that is thrown away; "
-            "give an absolute path or a URL that every node sees"
-        )
+    try:
+        store = Store(Location.parse(config.out))
+    except BadLocation as error:
+        raise ConfigError(str(error)) from error
     assembled = assemble(config)
     wanted = [*assembled.index.refs, *assembled.index.broken][: config.limit]
     refs = dealt(wanted, config.workers or os.cpu_count() or 1)
@@ -101,10 +99,6 @@ def run(overrides: Sequence[str]) -> int:
     if config.dry_run:
         print(calibrate(assembled, refs))
         return 0
-    try:
-        store = Store(Location.parse(config.out))
-    except BadLocation as error:
-        raise ConfigError(str(error)) from error
     summary = execute(
         assembled.work,
         refs,

@@ -156,5 +156,5 @@ def test_a_submitted_job_makes_the_table_and_the_same_command_resumes(
 
     lost = head.submit(checkout, *command[:-1], "out=runs/here")
     assert lost.returncode != 0
-    assert "give an absolute path or a URL" in lost.stdout + lost.stderr
+    assert "name an absolute path or a URL" in lost.stdout + lost.stderr
     assert "exit code 2" in lost.stdout + lost.stderr
