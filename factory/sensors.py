@@ -84,8 +84,9 @@ def _photo(file: SensorFile, camera: Camera, width: int, height: int) -> Photo:
     if image.shape[:2] != (camera.height, camera.width):
         size = f"{image.shape[1]}x{image.shape[0]}"
         raise BadClip(file.uri, "size", f"{size}, but {camera.name} takes {camera.width}x{camera.height}")
-    flat = undistorted(image, camera)
-    shrinks = width < camera.width
+    left, top, w, h = camera.window(width, height)
+    flat = undistorted(image, camera)[top : top + h, left : left + w]
+    shrinks = width < w
     small = cv2.resize(flat, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
     pinhole = camera.resized(width, height)
     return Photo(

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from tasks.render.boxes import box_gaussians
 from tasks.render.choose import with_mirror_image
-from tasks.render.gaussians import EMPTY, F32, F64
+from tasks.render.gaussians import EMPTY, F32, F64, concatenate
 from tasks.render.movers import owners, world_from_boxes
 from tasks.render.scene import MIN_NODE_DISCS, RenderAsset
 from tasks.render.sensed import Sweep, Tracks, on_ego, shifted, voxel_rows
@@ -26,6 +27,7 @@ NEIGHBOUR = 4  # the size of a disc is the distance to this one
 PER_RANGE = (0.004, 0.015)  # least and most of it, as a share of the distance to the sensor
 RING_GAP_PER_M = 0.004  # gap between rings on flat ground / distance^2: 0.4 deg between beams, 1.7 m above the road
 MAX_RING_GAP_M = 1.5
+INNER_SHARE = 0.9  # of a mover's box: a plain one behind its returns, for few come back from dark paint and windows
 
 
 def lidar_asset(sweeps: Sequence[Sweep], agents: AgentTracks | None) -> RenderAsset:
@@ -39,6 +41,7 @@ def lidar_asset(sweeps: Sequence[Sweep], agents: AgentTracks | None) -> RenderAs
     tracks = Tracks(agents, origin)
     static: list[Discs] = []
     moving: dict[int, list[Discs]] = {}
+    sizes: dict[int, F64] = {}
     for sweep in sweeps:
         pose = shifted(sweep.world_from_ego, -origin)
         discs = _discs(sweep).moved(pose)
@@ -47,6 +50,7 @@ def lidar_asset(sweeps: Sequence[Sweep], agents: AgentTracks | None) -> RenderAs
         static.append(discs.take(owner < 0))
         poses = world_from_boxes(boxes)
         for j in np.unique(owner[owner >= 0]):
+            sizes[int(j)] = boxes[j, 4:7]
             moving.setdefault(int(j), []).append(
                 discs.take(owner == j).moved(np.linalg.inv(poses[j]).astype(np.float64))
             )
@@ -55,7 +59,8 @@ def lidar_asset(sweeps: Sequence[Sweep], agents: AgentTracks | None) -> RenderAs
         whole = _thinned(parts)
         if len(whole.points) >= MIN_NODE_DISCS:
             whole = with_mirror_image(whole) if tracks.kinds[j] == AgentKind.VEHICLE else whole
-            nodes[tracks.ids[j]] = gaussians_of(whole, np.zeros(3))
+            inner = box_gaussians(sizes[j] * INNER_SHARE, tracks.kinds[j])
+            nodes[tracks.ids[j]] = concatenate([gaussians_of(whole, np.zeros(3)), inner])
     street = _thinned(static)
     background = gaussians_of(street, np.zeros(3)) if len(street.points) else EMPTY
     return RenderAsset(origin, background, nodes, plain_sky(), float("nan"))

@@ -77,6 +77,13 @@ def test_photos_come_at_the_size_asked_for_with_intrinsics_and_pose_to_match(cli
     assert len(data.sweeps) == 3 and data.sweeps[1].points.shape == (3600, 3)
 
 
+def test_a_photo_of_another_shape_is_cut_in_the_middle_and_pixels_stay_square(clip: Clip) -> None:
+    photo = load_sensors(block_of(clip), clip.cameras, 24, 32).photos[0]
+    np.testing.assert_allclose(photo.intrinsics, [[30, 0, 12], [0, 30, 16], [0, 0, 1]])
+    whole = cv2.resize(smooth_image(1), (48, 32), interpolation=cv2.INTER_AREA)
+    assert psnr(photo.rgb, whole[:, 12:36]) > 35.0
+
+
 def test_jpeg_keeps_colours_and_their_order() -> None:
     image = smooth_image(2)
     image[..., 0] = 230
