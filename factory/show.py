@@ -11,6 +11,7 @@ Exit codes: 0 shown, 2 bad arguments, or nothing there to show.
 """
 
 import json
+import signal
 import sys
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -274,4 +275,5 @@ def _picture_path(attempt_id: str, to: str | None) -> Path:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `... list=true | head` ends quietly
     sys.exit(main(sys.argv[1:]))
