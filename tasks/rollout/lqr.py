@@ -31,9 +31,7 @@ STOPPING_GAIN = 0.5
 STOPPING_SPEED_MPS = 0.2
 
 
-def track(
-    ego_state0: Array, poses: Array, vehicle: Vehicle = PACIFICA, *, planned_pose0: Array | None = None
-) -> Array:
+def track(ego_state0: Array, poses: Array, vehicle: Vehicle = PACIFICA, *, planned_pose0: Array | None = None) -> Array:
     """Simulated ego states (K, 41, 11) that follow each plan; row 0 is `ego_state0`.
 
     ego_state0: (11,) columns tasks.world.vehicle; poses: (K, 40, 3) world x, y, heading at 0.1 .. 4.0 s.
