@@ -19,8 +19,14 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 demo: install
 	$(PY) -m factory.run preset=demo out=$(DEMO)
 
+# Kernels are compiled once before two test processes would both do it.
 test: install
+	$(PY) -m factory.warm
 	$(PY) -m pytest -n 2 --dist loadfile
+
+unit: install
+	$(PY) -m factory.warm
+	$(PY) -m pytest -n 2 --dist loadfile --ignore tests/real --ignore tests/chaos -m "not ray"
 
 lint: install
 	$(PY) -m ruff check .

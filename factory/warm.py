@@ -1,4 +1,7 @@
-"""Compiles every kernel once, into the on-disk cache, before workers start."""
+"""Compiles every kernel once, into the on-disk cache, before workers start: `python -m factory.warm`."""
+
+import tempfile
+from pathlib import Path
 
 import numpy as np
 
@@ -15,6 +18,15 @@ def compile_kernels() -> None:
     ahead = np.stack([np.arange(1, 41) * 0.5, np.zeros(40), np.zeros(40)], axis=1)
     simulate(scene, ahead, TrafficSettings())
     compile_render_kernels()
+
+
+def compile_town_kernels() -> None:
+    """Writes the smallest log of the synthetic town into a folder that is thrown away."""
+    from factory.clips.synthetic.write import TownSettings, write_town
+
+    settings = TownSettings(cameras=("ring_front_center",), width=16, height=16, lidar_beams=1, lidar_azimuths=8)
+    with tempfile.TemporaryDirectory() as folder:
+        write_town(Path(folder), 1, 0, settings, threads=1)
 
 
 def tiny_clip() -> Clip:
@@ -52,3 +64,8 @@ def tiny_clip() -> Clip:
         route=Route(("lane",), ("rb_lane",), frozenset({"lane"})),
         centerline=centre,
     )
+
+
+if __name__ == "__main__":
+    compile_kernels()
+    compile_town_kernels()

@@ -31,23 +31,24 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def check(tmp_path: Path, undisturbed: Path, executor: str, moment: str) -> None:
-    out, journal = tmp_path / "out", tmp_path / "journal"
-    killed = drive(out, executor, moment, journal)
+    # Two journals: workers of a killed Ray driver may still finish what they have in hand.
+    out, before, after = tmp_path / "out", tmp_path / "before", tmp_path / "after"
+    killed = drive(out, executor, moment, before)
     assert killed.returncode == -9, killed.stderr
-    made = ran(str(journal), "attempt")
     store = Store(out)
     settled = len(store.samples) + sum(kind == "rejected" for kind in store.outcomes.read()["kind"].to_pylist())
-    again = drive(out, "local", "never", journal)  # either executor resumes the other's run
+    again = drive(out, "local", "never", after)  # either executor resumes the other's run
     assert again.returncode == 0, again.stderr
     assert_same_tables(out, undisturbed)
     assert verify(Store(out)).damage == ()
     total = len(Store(undisturbed).samples) + sum(
         kind == "rejected" for kind in Store(undisturbed).outcomes.read()["kind"].to_pylist()
     )
-    redone = ran(str(journal), "attempt") - made
+    redone = ran(str(after), "attempt")
     assert redone == total - settled, "a settled attempt was executed again, or a lost one was not"
     assert f"and {redone} attempts; found {settled} attempts done" in again.stdout
-    assert ran(str(journal), "prepare") == 5 or moment == "a clip was just prepared"
+    if executor == "local" and moment != "a clip was just prepared":
+        assert ran(str(before), "prepare") + ran(str(after), "prepare") == 5
 
 
 @pytest.mark.parametrize("moment", [m for m in MOMENTS if m != "never"])
