@@ -2,11 +2,11 @@
 
 import hashlib
 import os
-from pathlib import Path
 import signal
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
