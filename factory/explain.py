@@ -65,10 +65,10 @@ def explain(argv: Sequence[str]) -> int:
     """Compose the settings, run the clip, print and draw."""
     import cv2
 
-    from factory.drawing import attempt_picture, candidates_picture, film
+    from factory.look.drawing import attempt_picture, candidates_picture, film
+    from factory.look.video import write_mp4
     from factory.pipeline import FactoryWork, PerturbedClip
     from factory.settings import RunConfig, assemble
-    from factory.video import write_mp4
     from factory.work import HUMAN, HUMAN_CANDIDATE
     from tasks.chance import stream
     from tasks.perturb import Perturbation, perturb

@@ -82,7 +82,7 @@ def run(overrides: Sequence[str]) -> int:
     from factory.calibrate import calibrate, plan_text
     from factory.execute import execute
     from factory.funnel import image_sources_text
-    from factory.report import write_report
+    from factory.look.report import write_report
     from factory.settings import assemble, load_config
     from factory.store.location import BadLocation, Location
     from factory.store.samples import Store

@@ -200,7 +200,7 @@ def failed_lines(store: "Store") -> Iterable[str]:
 
 def sample_lines(store: "Store", attempt_id: str, to: str | None) -> Iterable[str]:
     """One sample's numbers; writes its picture and says where it is."""
-    from factory.sample_picture import encoded, sample_sheet
+    from factory.look.sample_picture import encoded, sample_sheet
     from factory.store.reader import SampleTable
 
     row = SampleTable(store.location.uri, store.location.options)[attempt_id]

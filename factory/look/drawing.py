@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from factory.bev import EXPERT, LOGGED, PERTURBED, Boxes, MapShapes, Path, draw_bev
+from factory.look.bev import EXPERT, LOGGED, PERTURBED, Boxes, MapShapes, Path, draw_bev
 from tasks.attempt import Judged
 from tasks.perturb import Candidate, Considered
 from tasks.world.clip import NOW, Clip

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from factory.report_html import Html, el
+from factory.look.report_html import Html, el
 from tasks.perturb import PerturbSettings
 
 FATES = ("accepted", "rejected", "failed", "untried")

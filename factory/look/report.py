@@ -16,12 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factory.clips.reader import BadClip, ClipRef
-from factory.drawing import attempt_picture
 from factory.funnel import funnel_of
-from factory.pipeline import FactoryWork, PerturbedClip
-from factory.report_page import FailedRow, Picture, Report, Strip, page
-from factory.report_plot import EndPoint
-from factory.sample_picture import (
+from factory.look.drawing import attempt_picture
+from factory.look.report_page import FailedRow, Picture, Report, Strip, page
+from factory.look.report_plot import EndPoint
+from factory.look.sample_picture import (
     BEV_COLUMNS,
     decoded,
     earlier_images,
@@ -31,6 +30,7 @@ from factory.sample_picture import (
     images_at_now,
     sample_bev,
 )
+from factory.pipeline import FactoryWork, PerturbedClip
 from factory.settings import Run
 from factory.steps import cache_key
 from factory.store.cache import BadCacheFile

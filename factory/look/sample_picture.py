@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from factory.bev import BACKGROUND, EXPERT, LOGGED, PERTURBED, Boxes, MapShapes, Path, draw_bev
+from factory.look.bev import BACKGROUND, EXPERT, LOGGED, PERTURBED, Boxes, MapShapes, Path, draw_bev
 from factory.store.schema import NOW_INDEX
 from tasks.world.frames import to_local
 from tasks.world.lanes import LightState

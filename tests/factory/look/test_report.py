@@ -13,10 +13,10 @@ import pytest
 
 from factory.clips.reader import ClipRef
 from factory.execute import execute
-from factory.report import FILE, RunFacts, gather, spread, write_report
-from factory.report_page import PAPER_CLIP_PERCENT, Picture, page
-from factory.report_plot import EndPoint, scatter
-from factory.sample_picture import decoded, encoded, fitted, sample_sheet
+from factory.look.report import FILE, RunFacts, gather, spread, write_report
+from factory.look.report_page import PAPER_CLIP_PERCENT, Picture, page
+from factory.look.report_plot import EndPoint, scatter
+from factory.look.sample_picture import decoded, encoded, fitted, sample_sheet
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
 from factory.work import AttemptResult, Dropped, PreparedClip

@@ -10,9 +10,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from factory.funnel import Funnel, FunnelRow
-from factory.report_html import Html, bar, count_bar, el, nothing, number, table
-from factory.report_plot import FATES, EndPoint, fate_mark, scatter
-from factory.report_style import STYLE
+from factory.look.report_html import Html, bar, count_bar, el, nothing, number, table
+from factory.look.report_plot import FATES, EndPoint, fate_mark, scatter
+from factory.look.report_style import STYLE
 from tasks.perturb import PerturbSettings
 
 # Paper (DESIGN.md, "words"): clips with a sample of the round, in % of those with one of the round before.

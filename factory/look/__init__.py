@@ -1,0 +1,1 @@
+"""What people look at: pictures, films and the report page."""
