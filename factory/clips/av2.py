@@ -5,10 +5,8 @@ YELLOW | RED; a state holds until the lane's next row), which the synthetic town
 """
 
 import hashlib
-from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,14 +29,11 @@ from factory.clips.av2_log import (
     world_from_ego_at,
 )
 from factory.clips.av2_map import map_file, read_map
-from factory.clips.reader import BadClip, ClipIndex, ClipRef, split_of
-from factory.clips.validate import validate_clip
-from factory.clips.windows import WindowSettings, drop_reason, window_starts
-from tasks.world.agents import AgentTracks
+from factory.clips.logs import Drive, LogReader, Recorded, WholeLog, present, route_of_drive
+from factory.clips.reader import BadClip
 from tasks.world.camera import Camera, SensorFile
-from tasks.world.clip import CLIP_STEPS, NOW, STEP_S, Block, Clip
-from tasks.world.lanes import LightState, RoadMap, Route, TrafficLights
-from tasks.world.route import NoRoute, RouteFinder, route_of_log
+from tasks.world.clip import STEP_S, Block
+from tasks.world.lanes import LightState, RoadMap, TrafficLights
 
 Array = NDArray[np.float64]
 
@@ -46,124 +41,51 @@ LICENCE = "CC BY-NC-SA 4.0 (Argoverse 2)"
 LIGHTS = "traffic_lights.feather"
 INTRINSICS, EXTRINSICS = "calibration/intrinsics.feather", "calibration/egovehicle_SE3_sensor.feather"
 SPLITS = ("train", "val", "test")
-ROUTE_SAMPLE_STEPS = 2  # the route looks at the ego every 0.2 s
-CACHED_LOGS = 2
 BLOCK_STEPS, BLOCK_STRIDE_STEPS = 200, 100  # of the stretches that are reconstructed
 
 
 @dataclass(frozen=True)
-class AV2Log:
-    """One log, whole: what its windows are cut from."""
+class AV2Log(WholeLog):
+    """One log, whole, with its rig and where its photos and sweeps lie."""
 
     motion: LogMotion
-    ego_states: Array  # (S, 11) every 0.1 s
-    agents: AgentTracks  # S steps
-    road_map: RoadMap
-    route: Route
-    finder: RouteFinder
-    lights: TrafficLights  # S steps
     cameras: tuple[Camera, ...]
     images: tuple[tuple[str, Path, float], ...]  # camera, file, seconds since the first annotated frame
     sweeps: tuple[tuple[str, Path, float], ...]
-    licence: str
-    content_digest: str
 
 
-class AV2Reader:
-    """Clips of a folder of Argoverse 2 sensor logs, of one of its train/val/test folders, or of one log.
+class AV2Reader(LogReader[AV2Log]):
+    """Clips of a folder of Argoverse 2 sensor logs, of one of its train/val/test folders, or of one log."""
 
-    Keeps the last two logs it read; workers get a reader without them.
-    """
+    data_set = "av2"
 
-    def __init__(
-        self,
-        root: str | Path,
-        stride_s: float = 1.0,
-        name: str = "av2",
-        min_top_speed_mps: float = 0.5,
-    ) -> None:
-        """name: the data set's name, part of every clip id. Raises ValueError for an impossible stride."""
-        self.root = Path(root).expanduser().absolute()
-        self.name = name
-        self.windows = WindowSettings(stride_s=stride_s, min_top_speed_mps=min_top_speed_mps)
-        self._stride_steps = self.windows.stride_steps
-        self._logs: dict[str, AV2Log] = {}
+    def logs(self) -> dict[str, Path]:
+        """Log id -> folder. Raises ValueError where the root holds no log."""
+        return log_folders(self.root)
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_logs": {}}
+    def drive(self, path: Path) -> Drive | str:
+        """Ego and agents of the log in this folder. A log whose frames nobody annotated is skipped. Raises BadClip."""
+        if not (path / ANNOTATIONS).is_file():
+            return f"no {ANNOTATIONS}"
+        map_file(path)
+        motion = read_motion(path)
+        times_s = step_times(0, motion.n_steps)
+        segment = np.where(observed_at(motion, times_s), 0, -1)
+        return Drive(ego_states_at(motion, times_s), agents_at(motion, times_s), segment)
 
-    def index(self) -> ClipIndex:
-        """All windows of all logs, ordered by log id and time. Raises ValueError where the root holds no log."""
-        refs: list[ClipRef] = []
-        dropped: Counter[str] = Counter()
-        skipped: dict[str, str] = {}
-        broken: dict[ClipRef, str] = {}
-        for log_id, folder in log_folders(self.root).items():
-            if not (folder / ANNOTATIONS).is_file():
-                skipped[log_id] = f"no {ANNOTATIONS}"
-                continue
-            try:
-                map_file(folder)
-                motion = read_motion(folder)
-                times_s = step_times(0, motion.n_steps)
-                ego_states, agents = ego_states_at(motion, times_s), agents_at(motion, times_s)
-            except BadClip as error:
-                broken[ClipRef(self.name, log_id, 0)] = str(error)
-                continue
-            observed = observed_at(motion, times_s)
-            starts = window_starts(motion.n_steps, self.windows)
-            if not starts:
-                skipped[log_id] = f"{motion.n_steps * STEP_S:.1f} s long, a clip needs {CLIP_STEPS * STEP_S:.1f} s"
-            for start in starts:
-                stop = start + CLIP_STEPS
-                window = agents.window(start, stop)
-                reason = drop_reason(ego_states[start:stop], window, observed[start:stop], self.windows)
-                if reason is None:
-                    refs.append(ClipRef(self.name, log_id, round(start * STEP_S * 1000)))
-                else:
-                    dropped[reason] += 1
-        return ClipIndex(tuple(refs), dict(dropped), skipped, broken)
+    def load(self, path: Path) -> AV2Log:
+        """The log in this folder. Raises BadClip."""
+        return read_log(path)
 
-    def read(self, ref: ClipRef) -> Clip:
-        """The validated clip. Raises BadClip."""
-        log = self._log(ref)
-        start, rest = divmod(ref.start_ms, round(STEP_S * 1000))
-        stop = start + CLIP_STEPS
-        if rest or start < 0 or stop > log.motion.n_steps:
-            raise BadClip(str(log.motion.folder), "start_ms", f"no window of {ref.window} starts at {ref.start_ms} ms")
-        ego_states = log.ego_states[start:stop].copy()  # the log stays with the reader, the clip is the caller's
-        clip = Clip(
-            clip_id=ref.clip_id,
-            dataset=self.name,
-            log_id=ref.log_id,
-            split=split_of(ref.log_id),
-            start_s=start * STEP_S,
-            ego_states=ego_states,
+    def recorded(self, log: AV2Log, start: int, stop: int) -> Recorded:
+        """Poses, rig, photos and sweeps of a window, and the block that it is rendered from."""
+        return Recorded(
             world_from_ego=world_from_ego_at(log.motion, step_times(start, stop)),
-            agents=_seen(log.agents.window(start, stop)),
-            road_map=log.road_map,
-            route=log.route,
-            centerline=log.finder.centerline_from(ego_states[NOW, :3]),
-            lights=TrafficLights(log.lights.lane_ids, log.lights.states[start:stop].copy()),
             cameras=log.cameras,
-            images=_within(log.motion, log.images, start, CLIP_STEPS),
-            sweeps=_within(log.motion, log.sweeps, start, CLIP_STEPS),
+            images=_within(log.motion, log.images, start, stop - start),
+            sweeps=_within(log.motion, log.sweeps, start, stop - start),
             block=_block(log, start) if log.images else None,
-            licence=log.licence,
-            content_digest=log.content_digest,
         )
-        return validate_clip(clip, str(log.motion.folder))
-
-    def _log(self, ref: ClipRef) -> AV2Log:
-        if ref.log_id not in self._logs:
-            folder = log_folders(self.root).get(ref.log_id)
-            if folder is None or ref.dataset != self.name:
-                raise BadClip(str(self.root), "log_id", f"no log {ref.log_id} of data set {ref.dataset} here")
-            log = read_log(folder)
-            while len(self._logs) >= CACHED_LOGS:
-                del self._logs[next(iter(self._logs))]
-            self._logs[ref.log_id] = log
-        return self._logs[ref.log_id]
 
 
 def log_folders(root: Path) -> dict[str, Path]:
@@ -188,18 +110,14 @@ def read_log(folder: Path) -> AV2Log:
     ego_states = ego_states_at(motion, times_s)
     vector_map = map_file(folder)
     road_map = read_map(vector_map)
-    try:
-        route = route_of_log(road_map, ego_states[::ROUTE_SAMPLE_STEPS, :3])
-    except NoRoute as error:
-        raise BadClip(str(vector_map), "lane_segments", str(error)) from error
     cameras = read_cameras(folder)
     return AV2Log(
+        file=str(folder),
         motion=motion,
         ego_states=ego_states,
         agents=agents_at(motion, times_s),
         road_map=road_map,
-        route=route,
-        finder=RouteFinder(road_map, route),
+        route=route_of_drive(road_map, ego_states[:, :3], str(vector_map), "lane_segments"),
         lights=read_lights(folder, road_map, motion, times_s),
         cameras=cameras,
         images=tuple(
@@ -302,7 +220,7 @@ def _block(log: AV2Log, start: int) -> Block:
     n_steps = min(BLOCK_STEPS, log.motion.n_steps - first)
     return Block(
         start_s=first * STEP_S,
-        agents=_seen(log.agents.window(first, first + n_steps)),
+        agents=present(log.agents.window(first, first + n_steps)),
         images=_within(log.motion, log.images, first, n_steps),
         sweeps=_within(log.motion, log.sweeps, first, n_steps),
     )
@@ -319,18 +237,4 @@ def _within(
     poses = world_from_ego_at(motion, np.array([time_s for _, _, time_s in inside]))
     return tuple(
         SensorFile(sensor, str(path), time_s - first, pose) for (sensor, path, time_s), pose in zip(inside, poses)
-    )
-
-
-def _seen(agents: AgentTracks) -> AgentTracks:
-    """Only the tracks that are present at one of the steps or more."""
-    seen = np.flatnonzero(agents.valid.any(axis=0))
-    return AgentTracks(
-        track_ids=tuple(agents.track_ids[i] for i in seen),
-        kinds=tuple(agents.kinds[i] for i in seen),
-        boxes=agents.boxes[:, seen],
-        velocities=agents.velocities[:, seen],
-        valid=agents.valid[:, seen],
-        center_z=agents.center_z[:, seen],
-        heights=agents.heights[seen],
     )

@@ -7,16 +7,17 @@ their folders in `dataset_mapping.pkl` (file name -> folder relative to the data
 """
 
 import hashlib
-from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from factory.clips.reader import BadClip, ClipIndex, ClipRef, split_of
+from factory.clips.logs import STEP_MS, Drive, LogReader, Recorded, WholeLog, route_of_drive
+from factory.clips.reader import BadClip
 from factory.clips.restricted_pickle import MAX_FILE_BYTES, load_plain
 from factory.clips.scenarionet_map import road_map, traffic_lights
 from factory.clips.scenarionet_tracks import (
@@ -29,144 +30,54 @@ from factory.clips.scenarionet_tracks import (
     read_track,
     sample_times,
 )
-from factory.clips.validate import validate_clip
-from factory.clips.windows import WindowSettings, drop_reason, window_starts
-from tasks.world.agents import AgentTracks
-from tasks.world.clip import CLIP_STEPS, NOW, STEP_S, Clip
-from tasks.world.lanes import RoadMap, Route, TrafficLights
-from tasks.world.route import NoRoute, RouteFinder, route_of_log
+from tasks.world.lanes import TrafficLights
 from tasks.world.vehicle import EGO_STATE_SIZE, HEADING, X, Y
 
 Array = NDArray[np.float64]
 
 SUMMARY, MAPPING = "dataset_summary.pkl", "dataset_mapping.pkl"
-ROUTE_SAMPLE_STEPS = 2  # the route looks at the ego every 0.2 s
-CACHED_LOGS = 2
 
 
 @dataclass(frozen=True)
-class Motion:
-    """What moves in one log, every 0.1 s."""
+class ScenarioLog(WholeLog):
+    """One log, whole, with the segments of its drive."""
 
-    ego_states: Array  # (S, 11), NaN where the log has no continuous drive
-    segment: NDArray[np.int64]  # (S,) number of the continuous drive a step belongs to, -1: none
-    agents: AgentTracks  # S steps
+    motion: Drive
 
 
-@dataclass(frozen=True)
-class ScenarioLog:
-    """One log, whole: what its windows are cut from."""
-
-    file: str
-    motion: Motion
-    road_map: RoadMap
-    route: Route
-    finder: RouteFinder
-    lights: TrafficLights  # S steps
-    licence: str
-    content_digest: str
-
-
-class ScenarioNetReader:
+class ScenarioNetReader(LogReader[ScenarioLog]):
     """Clips of one scenario pickle, of a folder of them, or of a ScenarioNet database folder.
 
-    A log's id is its file's name without the suffix. Keeps the last two logs it read; workers get a reader without.
+    A log's id is its file's name without the suffix.
     """
 
-    def __init__(
-        self,
-        root: str | Path,
-        stride_s: float = 1.0,
-        name: str = "scenarionet",
-        min_top_speed_mps: float = 0.5,
-    ) -> None:
-        """name: the data set's name, part of every clip id. Raises ValueError for an impossible stride."""
-        self.root = Path(root).expanduser().absolute()
-        self.name = name
-        self.windows = WindowSettings(stride_s=stride_s, min_top_speed_mps=min_top_speed_mps)
-        self._stride_steps = self.windows.stride_steps
-        self._logs: dict[str, ScenarioLog] = {}
-        self._files: dict[str, Path] | None = None
+    data_set = "scenarionet"
+    length_is = "of driving"
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_logs": {}}
+    @cached_property
+    def _files(self) -> dict[str, Path]:
+        return scenario_files(self.root)
 
-    def index(self) -> ClipIndex:
-        """All windows of all logs, ordered by log id and time. Raises ValueError where the root holds no scenario."""
-        refs: list[ClipRef] = []
-        dropped: Counter[str] = Counter()
-        skipped: dict[str, str] = {}
-        broken: dict[ClipRef, str] = {}
-        for log_id, path in self._scenario_files().items():
-            try:
-                scenario, _ = read_scenario(path)
-                motion = read_motion(scenario, str(path))
-            except BadClip as error:
-                broken[ClipRef(self.name, log_id, 0)] = str(error)
-                continue
-            driven = np.flatnonzero(motion.segment >= 0)  # the first window begins where the ego's drive does
-            first, n_steps = (int(driven[0]), int(driven[-1] - driven[0]) + 1) if len(driven) else (0, 0)
-            starts = window_starts(n_steps, self.windows)
-            if not starts:
-                skipped[log_id] = f"{n_steps * STEP_S:.1f} s of driving, a clip needs {CLIP_STEPS * STEP_S:.1f} s"
-            for start in (first + offset for offset in starts):
-                window = slice(start, start + CLIP_STEPS)
-                segment = motion.segment[window]
-                reason = drop_reason(
-                    motion.ego_states[window],
-                    motion.agents.window(window.start, window.stop),
-                    (segment >= 0) & (segment == segment[0]),
-                    self.windows,
-                )
-                if reason is None:
-                    refs.append(ClipRef(self.name, log_id, round(start * STEP_S * 1000)))
-                else:
-                    dropped[reason] += 1
-        return ClipIndex(tuple(refs), dict(dropped), skipped, broken)
-
-    def read(self, ref: ClipRef) -> Clip:
-        """The validated clip. Raises BadClip."""
-        log = self._log(ref)
-        start, rest = divmod(ref.start_ms, round(STEP_S * 1000))
-        stop = start + CLIP_STEPS
-        if rest or start < 0 or stop > len(log.motion.segment):
-            raise BadClip(log.file, "start_ms", f"no window of {ref.window} starts at {ref.start_ms} ms")
-        ego_states = log.motion.ego_states[start:stop]
-        if not np.isfinite(ego_states).all():
-            raise BadClip(log.file, "tracks[sdc]", f"the ego's drive is broken within the window at {ref.start_ms} ms")
-        clip = Clip(
-            clip_id=ref.clip_id,
-            dataset=self.name,
-            log_id=ref.log_id,
-            split=split_of(ref.log_id),
-            start_s=start * STEP_S,
-            ego_states=ego_states,
-            world_from_ego=_flat_poses(ego_states),
-            agents=_seen(log.motion.agents.window(start, stop)),
-            road_map=log.road_map,
-            route=log.route,
-            centerline=log.finder.centerline_from(ego_states[NOW, :3]),
-            lights=TrafficLights(log.lights.lane_ids, log.lights.states[start:stop]),
-            licence=log.licence,
-            content_digest=log.content_digest,
-        )
-        return validate_clip(clip, log.file)
-
-    def _scenario_files(self) -> dict[str, Path]:
-        if self._files is None:
-            self._files = scenario_files(self.root)
+    def logs(self) -> dict[str, Path]:
+        """Log id -> pickle, listed once. Raises ValueError where the root holds no scenario."""
         return self._files
 
-    def _log(self, ref: ClipRef) -> ScenarioLog:
-        if ref.log_id not in self._logs:
-            path = self._scenario_files().get(ref.log_id)
-            if path is None or ref.dataset != self.name:
-                raise BadClip(str(self.root), "log_id", f"no log {ref.log_id} of data set {ref.dataset} here")
-            log = read_log(path)
-            while len(self._logs) >= CACHED_LOGS:
-                del self._logs[next(iter(self._logs))]
-            self._logs[ref.log_id] = log
-        return self._logs[ref.log_id]
+    def drive(self, path: Path) -> Drive:
+        """Ego and agents of the scenario in this file. Raises BadClip."""
+        scenario, _ = read_scenario(path)
+        return read_motion(scenario, str(path))
+
+    def load(self, path: Path) -> ScenarioLog:
+        """The scenario in this file. Raises BadClip."""
+        return read_log(path)
+
+    def recorded(self, log: ScenarioLog, start: int, stop: int) -> Recorded:
+        """The ego's poses, the format has no sensors. Raises BadClip where the ego's drive is broken."""
+        ego_states = log.motion.ego_states[start:stop]
+        if not np.isfinite(ego_states).all():
+            problem = f"the ego's drive is broken within the window at {start * STEP_MS} ms"
+            raise BadClip(log.file, "tracks[sdc]", problem)
+        return Recorded(_flat_poses(ego_states))
 
 
 def scenario_files(root: Path) -> dict[str, Path]:
@@ -243,7 +154,7 @@ def _source(scenario: Mapping[str, Any], file: str) -> tuple[str, Source]:
     return name, SOURCES[name]
 
 
-def read_motion(scenario: Mapping[str, Any], file: str) -> Motion:
+def read_motion(scenario: Mapping[str, Any], file: str) -> Drive:
     """Ego and agents of a scenario every 0.1 s. Raises BadClip."""
     n_frames, tracks = int(scenario["length"]), scenario["tracks"]
     _, source = _source(scenario, file)
@@ -257,7 +168,7 @@ def read_motion(scenario: Mapping[str, Any], file: str) -> Motion:
     for number, (start, stop) in enumerate(segments):
         segment[start:stop] = number
     ground = ground_height(ego, at, file)
-    return Motion(states, segment, agent_tracks(tracks, str(sdc_id), at, n_frames, ground, file))
+    return Drive(states, agent_tracks(tracks, str(sdc_id), at, n_frames, ground, file), segment)
 
 
 def read_log(path: Path) -> ScenarioLog:
@@ -269,19 +180,16 @@ def read_log(path: Path) -> ScenarioLog:
     n_frames, metadata = int(scenario["length"]), scenario["metadata"]
     lights = traffic_lights(scenario["dynamic_map_states"], n_frames, file)
     lanes = road_map(scenario["map_features"], lights.lane_ids, name, str(metadata.get("map", "")), file)
-    poses = motion.ego_states[motion.segment >= 0, :3]
-    try:
-        route = route_of_log(lanes, poses[::ROUTE_SAMPLE_STEPS])
-    except NoRoute as error:
-        raise BadClip(file, "map_features", str(error)) from error
+    route = route_of_drive(lanes, motion.ego_states[motion.segment >= 0, :3], file, "map_features")
     frames = np.floor(frame_positions(sample_times(metadata, n_frames, file)) + 1e-9).astype(int)
     known = [column for column, lane_id in enumerate(lights.lane_ids) if lane_id in lanes.lanes]
     return ScenarioLog(
         file=file,
         motion=motion,
+        ego_states=motion.ego_states,
+        agents=motion.agents,
         road_map=lanes,
         route=route,
-        finder=RouteFinder(lanes, route),
         lights=TrafficLights(tuple(lights.lane_ids[c] for c in known), lights.states[frames][:, known]),
         licence=source.licence,
         content_digest=digest,
@@ -296,18 +204,3 @@ def _flat_poses(ego_states: Array) -> Array:
     poses[:, 0, 0], poses[:, 0, 1], poses[:, 1, 0], poses[:, 1, 1] = c, -s, s, c
     poses[:, 0, 3], poses[:, 1, 3] = ego_states[:, X], ego_states[:, Y]
     return poses
-
-
-def _seen(agents: AgentTracks) -> AgentTracks:
-    """Only the tracks that are present at one of the steps or more."""
-    seen = np.flatnonzero(agents.valid.any(axis=0))
-    return replace(
-        agents,
-        track_ids=tuple(agents.track_ids[i] for i in seen),
-        kinds=tuple(agents.kinds[i] for i in seen),
-        boxes=agents.boxes[:, seen],
-        velocities=agents.velocities[:, seen],
-        valid=agents.valid[:, seen],
-        center_z=agents.center_z[:, seen],
-        heights=agents.heights[seen],
-    )

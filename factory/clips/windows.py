@@ -20,13 +20,15 @@ class WindowSettings:
     min_top_speed_mps: float = 0.5  # an ego that never reaches it stands
     max_speed_mps: float = 100.0  # a track that moves faster between two steps has changed its object
 
+    def __post_init__(self) -> None:
+        """Raises ValueError where the stride is no positive multiple of 0.1 s."""
+        if self.stride_steps < 1 or abs(self.stride_steps * STEP_S - self.stride_s) > 1e-6:
+            raise ValueError(f"stride_s must be a positive multiple of {STEP_S} s, not {self.stride_s}")
+
     @property
     def stride_steps(self) -> int:
-        """Raises ValueError where the stride is no positive multiple of 0.1 s."""
-        steps = round(self.stride_s / STEP_S)
-        if steps < 1 or abs(steps * STEP_S - self.stride_s) > 1e-6:
-            raise ValueError(f"stride_s must be a positive multiple of {STEP_S} s, not {self.stride_s}")
-        return steps
+        """The stride in steps of 0.1 s."""
+        return round(self.stride_s / STEP_S)
 
 
 def window_starts(n_steps: int, settings: WindowSettings) -> range:
