@@ -2,20 +2,17 @@
 
 Numba's own cache does not notice an edit in a callee or of a constant that lives in another file, so the cache folder
 is named by a digest of all sources that hold kernels or the constants of kernels: one edit anywhere starts a new
-folder. Where the sources lie does not matter: a clone, a wheel and the upload of a submitted job share what one of them
-compiled. NUMBA_CACHE_DIR, when set, is left alone.
+folder. NUMBA_CACHE_DIR, when set, is left alone.
 """
 
 import ast
 import hashlib
 import os
 from collections.abc import Callable
-from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
-from numba.core.caching import CacheImpl, _CacheLocator
 
 from tasks.caches import user_cache
 
@@ -58,38 +55,8 @@ def cache_dir() -> Path:
     return user_cache() / f"kernels-{sources_digest()}"
 
 
-class KernelLocator(_CacheLocator):
-    """Files a kernel of this project by its module, where numba's own locators go by the path of the checkout."""
-
-    def __init__(self, function: Callable[..., Any]) -> None:
-        self._module, self._line = function.__module__, function.__code__.co_firstlineno
-
-    @classmethod
-    def from_function(cls, py_func: Callable[..., Any], py_file: str) -> "KernelLocator | None":
-        if not Path(py_file).is_relative_to(_ROOT) or py_func.__module__.split(".")[0] not in _PACKAGES:
-            return None
-        locator = cls(py_func)
-        locator.ensure_cache_path()
-        return locator
-
-    def get_cache_path(self) -> str:
-        return str(Path(numba.config.CACHE_DIR) / self._module)
-
-    def get_source_stamp(self) -> str:
-        return _digest_here()
-
-    def get_disambiguator(self) -> str:
-        return str(self._line)
-
-
-@cache
-def _digest_here() -> str:
-    return sources_digest()
-
-
 if not os.environ.get("NUMBA_CACHE_DIR"):
     numba.config.CACHE_DIR = str(cache_dir())
-CacheImpl._locator_classes = [KernelLocator, *CacheImpl._locator_classes]
 
 
 def kernel(function: F) -> F:

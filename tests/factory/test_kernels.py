@@ -2,7 +2,6 @@
 
 import ast
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -96,34 +95,3 @@ def test_a_kernel_gives_the_bytes_of_its_own_python() -> None:
 
     values = np.random.default_rng(0).normal(size=10_001)
     assert kernel(total)(values) == total(values)
-
-
-def test_a_copy_of_the_sources_elsewhere_finds_what_was_compiled_here(tmp_path: Path) -> None:
-    """As the upload of a submitted job does; an edit in either place is compiled anew."""
-    code = (
-        "import sys; from tasks.doubling import twice; assert twice(3) == int(sys.argv[1]); "
-        "print(sum(twice.stats.cache_hits.values()), sum(twice.stats.cache_misses.values()))"
-    )
-
-    def hits_and_misses(root: Path, expected: int) -> str:
-        env = os.environ | {"PYTHONPATH": str(root), "XDG_CACHE_HOME": str(tmp_path / "cache")}
-        env.pop("NUMBA_CACHE_DIR", None)
-        command = [sys.executable, "-c", code, str(expected)]
-        done = subprocess.run(command, cwd=root, env=env, capture_output=True, text=True)
-        assert done.returncode == 0, done.stderr
-        return done.stdout.strip()
-
-    for name in ("here", "there"):
-        folder = tmp_path / name / "tasks"
-        folder.mkdir(parents=True)
-        for source in ("kernels.py", "caches.py"):
-            shutil.copy(REPOSITORY / "tasks" / source, folder)
-        (folder / "doubling.py").write_text(
-            "from tasks.kernels import kernel\n\n@kernel\ndef twice(x):\n    return 2 * x\n"
-        )
-    assert hits_and_misses(tmp_path / "here", 6) == "0 1"
-    assert hits_and_misses(tmp_path / "there", 6) == "1 0"
-    (tmp_path / "there" / "tasks" / "doubling.py").write_text(
-        "from tasks.kernels import kernel\n\n@kernel\ndef twice(x):\n    return 3 * x\n"
-    )
-    assert hits_and_misses(tmp_path / "there", 9) == "0 1"
