@@ -63,20 +63,12 @@ def write_log(folder: Path, seconds: float = 11.6, speed: float = SPEED) -> Path
     )
 
     cone_x = 60.0 - speed * (frame_ns - START_NS) * 1e-9
+    car = np.column_stack([np.full(n_frames, 20.0), np.zeros((n_frames, 2))])
+    cone = np.column_stack([cone_x, np.full(n_frames, -3.0), np.zeros(n_frames)])
     tables = []
     for track, category, size, where in (
-        (
-            "car",
-            "REGULAR_VEHICLE",
-            (4.5, 1.9, 1.6),
-            np.column_stack([np.full(n_frames, 20.0), np.zeros((n_frames, 2))]),
-        ),
-        (
-            "cone",
-            "CONSTRUCTION_CONE",
-            (0.4, 0.4, 0.7),
-            np.column_stack([cone_x, np.full(n_frames, -3.0), np.zeros(n_frames)]),
-        ),
+        ("car", "REGULAR_VEHICLE", (4.5, 1.9, 1.6), car),
+        ("cone", "CONSTRUCTION_CONE", (0.4, 0.4, 0.7), cone),
     ):
         sizes = {name: np.full(n_frames, value) for name, value in zip(("length_m", "width_m", "height_m"), size)}
         names = {"track_uuid": [track] * n_frames, "category": [category] * n_frames}
@@ -242,10 +234,8 @@ def test_images_and_sweeps_carry_the_pose_of_their_stamp(log: Path) -> None:
     write_table(log / "calibration" / "egovehicle_SE3_sensor.feather", {"sensor_name": ["front"], **mount})
     reader = AV2Reader(log)
     first, second, third = (reader.read(ref) for ref in reader.index().refs)
-    assert first.cameras[0].intrinsics[1, 1] == 510.0 and (first.cameras[0].width, first.cameras[0].height) == (
-        640,
-        480,
-    )
+    camera = first.cameras[0]
+    assert camera.intrinsics[1, 1] == 510.0 and (camera.width, camera.height) == (640, 480)
     assert [round(image.time_s, 9) for image in second.images] == [0.03] and not third.images
     assert np.allclose(second.images[0].world_from_ego[:2, 3], road(np.array(SPEED * 1.03), np.array(0.0)))
     assert [round(clip.sweeps[0].time_s, 9) for clip in (first, second, third)] == [2.5, 1.5, 0.5]
