@@ -99,7 +99,7 @@ def explain(argv: Sequence[str]) -> int:
     print("gated trajectories: " + ", ".join(f"{fate} {count}" for fate, count in fates.most_common()))
     cv2.imwrite(f"{stem}_candidates.png", candidates_picture(clip, found.considered)[..., ::-1])
 
-    payload = PerturbedClip(clip, found.candidates)
+    payload = PerturbedClip(ref, clip, found.candidates)
     order = [HUMAN_CANDIDATE] if expert == HUMAN else range(min(own.tries, len(found.candidates)))
     shown = None
     for candidate in order:

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from tasks.chance import stream
 from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.protocol import Expert
 from tasks.perturb import Candidate, Perturbation, PerturbSettings, end_speed_mps, perturb
-from tasks.render.settings import RenderSettings
+from tasks.render.settings import RenderMode, RenderSettings
 from tasks.reward.epdms import Scores
 from tasks.rollout.simulate import TrafficSettings
 from tasks.stages import SUBSCORES, Rejected
@@ -26,8 +26,9 @@ from tasks.world.clip import Clip, scene_of_clip
 
 @dataclass(frozen=True)
 class PerturbedClip:
-    """The payload of a prepared clip."""
+    """The payload of a prepared clip. It is cached without its sensor files: where data lies may change."""
 
+    ref: ClipRef
     clip: Clip
     candidates: tuple[Candidate, ...]
 
@@ -94,11 +95,9 @@ class FactoryWork:
         if not has_route(clip.centerline):
             return Rejected("clip", "route_ended", "the log ends at the end of its route")
         with watch.of("render"):
-            blocked = self.imaging.block_verdict(clip)
-        if blocked is not None:
-            return blocked
+            blocked = self._block_verdict(clip)
         with watch.of("perturb"):
-            found = perturb(
+            found = blocked or perturb(
                 clip, self.vocabulary, self.perturb, self.traffic, self.pdm, stream(self.seed, clip.clip_id, "perturb")
             )
         listed = found if isinstance(found, Perturbation) else None
@@ -108,10 +107,15 @@ class FactoryWork:
             content_digest=clip.content_digest,
             candidates=tuple(_candidate_row(index, candidate) for index, candidate in enumerate(candidates)),
             gate_counts=found.counts if isinstance(found, Rejected) else found.gate_counts,
-            payload=PerturbedClip(clip, candidates),
+            payload=PerturbedClip(ref, replace(clip, images=(), sweeps=(), block=None), candidates),
             dropped=found if isinstance(found, Rejected) else None,
             seconds=watch.seconds,
         )
+
+    def content_digest(self, ref: ClipRef) -> str | None:
+        """Of what the clip would be read from now; None where the reader cannot tell."""
+        digest = getattr(self.reader, "digest", None)
+        return None if digest is None else str(digest(ref))
 
     def attempt(self, prepared: PreparedClip, candidate: int, expert: str) -> AttemptResult:
         """Rollout, expert, rollout, reward and render of one candidate; candidate -1 is the human drive."""
@@ -123,7 +127,7 @@ class FactoryWork:
             assert trace.rejected is not None
             return Dropped(trace.rejected, _subscores(trace.judged.scores) if trace.judged else {}, watch.seconds)
         with watch.of("render"):
-            pictures = self.imaging.pictures(payload.clip, trace.candidate, trace.judged)
+            pictures = self.imaging.pictures(self._with_sensors(payload), trace.candidate, trace.judged)
         row = sample_row(payload.clip, trace.candidate, trace.judged)
         tags = [*row["tags"], *pictures.get("tags", ())]  # type: ignore[misc]
         return Accepted(row | pictures | {"tags": tags}, watch.seconds)
@@ -147,6 +151,18 @@ class FactoryWork:
         if isinstance(result, Rejected):
             return Trace(chosen, None, result)
         return Trace(chosen, *result)
+
+    def _block_verdict(self, clip: Clip) -> Rejected | None:
+        """Asked for before perturb work is spent. Without a gate a block is built here only if it will be needed."""
+        if self.render.psnr_min > 0.0 or set(self.experts) - {HUMAN}:
+            return self.imaging.block_verdict(clip)
+        return None
+
+    def _with_sensors(self, payload: PerturbedClip) -> Clip:
+        if self.render.mode is not RenderMode.AUTO:
+            return payload.clip
+        now = self.reader.read(payload.ref)
+        return replace(payload.clip, images=now.images, sweeps=now.sweeps, block=now.block)
 
     @property
     def imaging(self) -> Imaging:

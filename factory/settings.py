@@ -186,19 +186,31 @@ def _must_have(plugged: object, members: Sequence[str], where: str, what: str) -
 
 
 def recovery_table(config: RunConfig, reader: ClipReader, index: ClipIndex, sources: RecoverySources) -> RecoveryTable:
-    """The named table, else one of all TRAIN windows and the vocabulary files, kept in the run's cache."""
+    """The named table, else one of all TRAIN windows and the vocabulary files, kept in the user's cache."""
     if sources.table is not None:
         return load_recovery_table(sources.table)
     files = [*sources.vocabularies, *([config.vocabulary.file] if config.vocabulary.file else [])]
     loaded = [load_vocabulary(file) for file in dict.fromkeys(files)]
-    train = sorted(ref.clip_id for ref in index.refs)
-    key = hashlib.sha256(canonical_json([train, [v.digest for v in loaded]]).encode()).hexdigest()[:16]
-    cached = Path(cache_folder(config)) / f"recovery-{key}.npz"
+    digests = log_digests(reader, index)
+    if digests is None:
+        return build_recovery_table([train_windows(reader)], loaded)
+    made_of = [stage_versions()["clip"], digests, sorted(ref.clip_id for ref in index.refs), [v.digest for v in loaded]]
+    key = hashlib.sha256(canonical_json(made_of).encode()).hexdigest()[:16]
+    cached = user_cache() / "tables" / f"recovery-{key}.npz"
     if cached.is_file():
         return load_recovery_table(cached)
     built = build_recovery_table([train_windows(reader)], loaded)
-    save_recovery_table(cached, built, {"clips": len(train), "vocabularies": files})
+    save_recovery_table(cached, built, {"clips": len(index.refs), "vocabularies": files})
     return built
+
+
+def log_digests(reader: ClipReader, index: ClipIndex) -> list[str] | None:
+    """Content digest of every log; None where the reader cannot tell them without reading the clips."""
+    digest = getattr(reader, "digest", None)
+    if digest is None:
+        return None
+    first_of_log = {ref.log_id: ref for ref in reversed(index.refs)}
+    return [str(digest(first_of_log[log_id])) for log_id in sorted(first_of_log)]
 
 
 def identity_of(config: RunConfig, vocabulary: Vocabulary) -> RunIdentity:
@@ -214,9 +226,14 @@ def identity_of(config: RunConfig, vocabulary: Vocabulary) -> RunIdentity:
     for group, value in science.items():
         settings |= {f"{group}.{key}": plain for key, plain in dataclasses.asdict(value).items()}
     versions = stage_versions()
-    early = [settings[key] for key in sorted(settings) if not key.startswith(("reward.", "render."))]
-    gate = config.render.psnr_min
-    prepared = canonical_json([early, gate, versions["clip"], versions["perturb"], versions["rollout"]])
+    early: dict[str, object] = {
+        key: value for key, value in settings.items() if not key.startswith(("reward.", "render."))
+    }
+    stages = ["clip", "perturb", "rollout", "expert", "reward"]
+    if config.render.psnr_min > 0.0:  # then the block's verdict is part of what is prepared
+        early |= {key: value for key, value in settings.items() if key.startswith("render.")}
+        stages.append("render")
+    prepared = canonical_json([early, {stage: versions[stage] for stage in stages}])
     return RunIdentity(settings, versions, vocabulary.digest, hashlib.sha256(prepared.encode()).hexdigest()[:16])
 
 

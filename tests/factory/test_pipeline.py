@@ -1,0 +1,101 @@
+"""The work behind the machine: what its digests cover, what a block's verdict drops, and data that moves."""
+
+import dataclasses
+import shutil
+from pathlib import Path
+
+import pytest
+
+from factory.clips.synthetic.reader import SyntheticReader
+from factory.clips.synthetic.write import TownSettings
+from factory.pipeline import FactoryWork
+from factory.settings import assemble, identity_of, load_config
+from factory.work import HUMAN, HUMAN_CANDIDATE, Accepted, Dropped, PreparedClip
+from tasks import stages
+from tasks.kinematic_vocabulary import kinematic_trajectories
+from tasks.vocabulary import Vocabulary
+
+SMALL = TownSettings(cameras=("ring_front_center",), width=64, height=36, lidar_beams=16, lidar_azimuths=300)
+VOCABULARY = Vocabulary(kinematic_trajectories(3, 0))
+SIZE = ["render.width=64", "render.height=36", "vocabulary.k=300", "experts=[pdm_closed,human]"]
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One clip's log, with one small camera and a lidar."""
+    reader = SyntheticReader(tmp_path_factory.mktemp("town"), 1, 0, SMALL)
+    reader.index()
+    return reader.root
+
+
+def work_on(root: Path, out: Path, *overrides: str) -> FactoryWork:
+    return assemble(load_config(["clips=av2", f"clips.root={root}", f"out={out}", *SIZE, *overrides])).work
+
+
+def prepared_by(work: FactoryWork) -> PreparedClip:
+    prepared = work.prepare(work.reader.index().refs[0])
+    assert isinstance(prepared, PreparedClip)
+    return prepared
+
+
+def first_sample(work: FactoryWork, prepared: PreparedClip) -> Accepted:
+    results = (work.attempt(prepared, row.index, "pdm_closed") for row in prepared.candidates)
+    return next(result for result in results if isinstance(result, Accepted))
+
+
+def test_a_block_below_the_gate_drops_the_experts_and_keeps_the_human(town: Path, tmp_path: Path) -> None:
+    work = work_on(town, tmp_path, "render.psnr_min=60")
+    prepared = prepared_by(work)
+    assert prepared.dropped is not None and (prepared.dropped.stage, prepared.dropped.reason) == ("render", "psnr")
+    assert prepared.candidates == ()
+    human = work.attempt(prepared, HUMAN_CANDIDATE, HUMAN)
+    assert isinstance(human, Accepted) and human.row["image_source"] == "photo"
+
+
+def test_a_prepared_clip_is_rendered_also_where_its_data_has_moved(town: Path, tmp_path: Path) -> None:
+    prepared = prepared_by(work_on(town, tmp_path / "a"))
+    here = first_sample(work_on(town, tmp_path / "a"), prepared)
+    moved = tmp_path / "elsewhere"
+    shutil.copytree(town, moved)
+    there = first_sample(work_on(moved, tmp_path / "b"), prepared)
+    assert here.row["image_source"] == there.row["image_source"] == "render"
+    assert here.row["images"][0]["jpeg"] == there.row["images"][0]["jpeg"]  # type: ignore[index]
+
+
+def test_a_rejected_attempt_is_no_sample(town: Path, tmp_path: Path) -> None:
+    work = work_on(town, tmp_path, "reward.progress_above=2.0", "render=none")
+    prepared = prepared_by(work)
+    results = [work.attempt(prepared, row.index, "pdm_closed") for row in prepared.candidates[:2]]
+    assert results and all(isinstance(result, Dropped) for result in results)
+
+
+@pytest.mark.parametrize(
+    ("override", "prepares_anew"),
+    [
+        ("perturb.epdms_min=0.7", True),
+        ("traffic=replay", True),
+        ("seed=1", True),
+        ("reward.progress_above=0.6", False),  # judges attempts only
+        ("render.width=128", False),
+        ("rounds=5", False),
+    ],
+)
+def test_what_a_prepared_clip_depends_on(override: str, prepares_anew: bool) -> None:
+    before = identity_of(load_config([]), VOCABULARY).prepare_digest
+    after = identity_of(load_config([override]), VOCABULARY).prepare_digest
+    assert (before != after) == prepares_anew
+
+
+def test_with_a_gate_the_block_s_settings_are_part_of_what_is_prepared() -> None:
+    small, large = (
+        identity_of(load_config(["render.psnr_min=27", f"render.width={width}"]), VOCABULARY) for width in (64, 128)
+    )
+    assert small.prepare_digest != large.prepare_digest
+
+
+@pytest.mark.parametrize("stage", ["clip", "perturb", "rollout", "expert", "reward"])
+def test_a_raised_stage_before_the_attempts_prepares_anew(stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = identity_of(load_config([]), VOCABULARY).prepare_digest
+    raised = [dataclasses.replace(s, version=s.version + (s.name == stage)) for s in stages.STAGES]
+    monkeypatch.setattr(stages, "STAGES", tuple(raised))
+    assert identity_of(load_config([]), VOCABULARY).prepare_digest != before
