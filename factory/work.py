@@ -110,6 +110,10 @@ class Work(Protocol):
         """Of the expert's inputs and settings."""
         ...
 
+    def content_digest(self, ref: ClipRef) -> str | None:
+        """Of what the clip would be read from now, without preparing it; None where the reader cannot tell."""
+        ...
+
     def prepare(self, ref: ClipRef) -> PreparedClip | Rejected:
         """Read the clip and list its candidates. Rejected: the clip stage drops it for every expert.
 

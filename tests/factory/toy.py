@@ -65,6 +65,7 @@ class ToyWork:
     digests: Mapping[str, str] = field(default_factory=dict)
     trouble: Mapping[str, str] = field(default_factory=dict)
     content: str = "content"
+    tells_content: bool = True  # before it prepares
     seconds: float = 0.0  # of sleep per task
     journal: str = ""  # a file that gets one line per task that really ran
 
@@ -78,6 +79,9 @@ class ToyWork:
 
     def expert_digest(self, expert: str) -> str:
         return self.digests.get(expert, f"{expert}-1")
+
+    def content_digest(self, ref: ClipRef) -> str | None:
+        return self.content if self.tells_content else None
 
     def prepare(self, ref: ClipRef) -> PreparedClip | Rejected:
         self._note(f"prepare {ref.log_id}:{ref.start_ms}")
