@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -126,8 +127,23 @@ def open_reader(clips: Mapping[str, Any]) -> tuple[ClipReader, ClipIndex]:
     return reader, index
 
 
+def refuse_relative_root(clips: Mapping[str, Any]) -> None:
+    """Raises ConfigError for a relative clips.root inside a submitted Ray job, whose folder is a temporary copy."""
+    root = clips.get("root")
+    if (
+        "RAY_JOB_CONFIG_JSON_ENV_VAR" in os.environ
+        and isinstance(root, str)
+        and not Path(root).expanduser().is_absolute()
+    ):
+        raise ConfigError(
+            f"clips.root={root} is relative, and a submitted job runs in a copy of the working directory: "
+            "name an absolute path that every node sees"
+        )
+
+
 def assemble(config: RunConfig) -> Run:
     """Open the reader, load the vocabulary, prepare the experts. Raises ConfigError with what to mend."""
+    refuse_relative_root(config.clips)
     reader, index = open_reader(config.clips)
     try:
         vocabulary = choose_vocabulary(config.vocabulary)
@@ -188,6 +204,10 @@ def _must_have(plugged: object, members: Sequence[str], where: str, what: str) -
 def recovery_table(config: RunConfig, reader: ClipReader, index: ClipIndex, sources: RecoverySources) -> RecoveryTable:
     """The named table, else one of all TRAIN windows and the vocabulary files, kept in the user's cache."""
     if sources.table is not None:
+        if sources.vocabularies:
+            raise ConfigError(
+                "expert.recovery: give table or vocabularies; a finished table takes no more trajectories"
+            )
         return load_recovery_table(sources.table)
     files = [*sources.vocabularies, *([config.vocabulary.file] if config.vocabulary.file else [])]
     loaded = [load_vocabulary(file) for file in dict.fromkeys(files)]

@@ -1,0 +1,33 @@
+"""What a command line may not ask for, said before anything is written."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from factory.config import ConfigError
+from factory.settings import assemble, load_config, refuse_relative_root
+from factory.vocabulary import save_recovery_table
+from tasks.experts.recovery import RecoveryTable
+from tasks.kinematic_vocabulary import kinematic_trajectories
+
+
+def test_a_relative_root_in_a_submitted_job_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    refuse_relative_root({"root": "logs"})  # on one's own machine it is fine
+    monkeypatch.setenv("RAY_JOB_CONFIG_JSON_ENV_VAR", "{}")
+    refuse_relative_root({"root": "/data/logs"})
+    refuse_relative_root({"n_clips": 3})
+    with pytest.raises(ConfigError, match=r"clips\.root=logs is relative"):
+        refuse_relative_root({"root": "logs"})
+
+
+def test_a_finished_table_takes_no_vocabularies(shared_root: Path, tmp_path: Path) -> None:
+    table = tmp_path / "table.npz"
+    save_recovery_table(table, RecoveryTable(kinematic_trajectories(5, 0)), {})
+    asked = [f"clips.root={shared_root / 'data/av2/sensor/val'}", "clips=av2", f"expert.recovery.table={table}"]
+    run = assemble(load_config([*asked, f"out={tmp_path / 'out'}", "experts=[recovery]"]))
+    assert len(run.work.experts["recovery"].table) == 5  # type: ignore[attr-defined]
+    assert not (tmp_path / "out").exists()
+    np.save(tmp_path / "more.npy", kinematic_trajectories(5, 1))
+    with pytest.raises(ConfigError, match="table or vocabularies"):
+        assemble(load_config([*asked, f"expert.recovery.vocabularies=[{tmp_path / 'more.npy'}]", "experts=[recovery]"]))
