@@ -30,7 +30,7 @@ from factory.clips.av2_log import (
 )
 from factory.clips.av2_map import map_file, read_map
 from factory.clips.logs import Drive, LogReader, Recorded, WholeLog, present, route_of_drive
-from factory.clips.reader import BadClip
+from factory.clips.reader import BadClip, ClipRef
 from tasks.world.camera import Camera, SensorFile
 from tasks.world.clip import STEP_S, Block
 from tasks.world.lanes import LightState, RoadMap, TrafficLights
@@ -76,6 +76,10 @@ class AV2Reader(LogReader[AV2Log]):
     def load(self, path: Path) -> AV2Log:
         """The log in this folder. Raises BadClip."""
         return read_log(path)
+
+    def digest(self, ref: ClipRef) -> str:
+        """The clip's content digest, from the bytes of its log's files alone. Raises BadClip."""
+        return content_digest(self.path_of(ref))
 
     def recorded(self, log: AV2Log, start: int, stop: int) -> Recorded:
         """Poses, rig, photos and sweeps of a window, and the block that it is rendered from."""

@@ -9,6 +9,9 @@ To write a reader, subclass `LogReader` and give it four things; AV2Reader has a
   more;
 * `recorded(log, start, stop)`: what else belongs to one window, which is the ego's pose in space, cameras and photos.
 
+A fifth, `digest(ref) -> str`, is optional: the clip's content digest as `read` would give it, found without reading the
+clip. With it a run sees that a log was changed though its clips lie prepared in the cache.
+
 Wherever the input is broken, raise `BadClip(file, field, how to mend it)`. Units: metres, radians, seconds, one world
 frame per log; the columns of ego states are named in tasks.world.vehicle, absent agents hold NaN and valid = False.
 """
@@ -182,6 +185,13 @@ class LogReader(ABC, Generic[Log]):
         )
         return validate_clip(clip, log.file)
 
+    def path_of(self, ref: ClipRef) -> Path:
+        """The file or folder of the clip's log. Raises BadClip where there is none."""
+        path = self.logs().get(ref.log_id)
+        if path is None or ref.dataset != self.name:
+            raise BadClip(str(self.root), "log_id", f"no log {ref.log_id} of data set {ref.dataset} here")
+        return path
+
     def _drop_reason(self, drive: Drive, start: int, stop: int) -> str | None:
         segment = drive.segment[start:stop]
         unbroken = (segment >= 0) & (segment == segment[0])
@@ -189,10 +199,7 @@ class LogReader(ABC, Generic[Log]):
 
     def _log(self, ref: ClipRef) -> Log:
         if ref.log_id not in self._logs:
-            path = self.logs().get(ref.log_id)
-            if path is None or ref.dataset != self.name:
-                raise BadClip(str(self.root), "log_id", f"no log {ref.log_id} of data set {ref.dataset} here")
-            log = self.load(path)
+            log = self.load(self.path_of(ref))
             while len(self._logs) >= CACHED_LOGS:
                 del self._logs[next(iter(self._logs))]
             self._logs[ref.log_id] = log

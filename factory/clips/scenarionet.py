@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factory.clips.logs import STEP_MS, Drive, LogReader, Recorded, WholeLog, route_of_drive
-from factory.clips.reader import BadClip
+from factory.clips.reader import BadClip, ClipRef
 from factory.clips.restricted_pickle import MAX_FILE_BYTES, load_plain
 from factory.clips.scenarionet_map import road_map, traffic_lights
 from factory.clips.scenarionet_tracks import (
@@ -70,6 +70,10 @@ class ScenarioNetReader(LogReader[ScenarioLog]):
     def load(self, path: Path) -> ScenarioLog:
         """The scenario in this file. Raises BadClip."""
         return read_log(path)
+
+    def digest(self, ref: ClipRef) -> str:
+        """The clip's content digest, from the bytes of its log's file alone. Raises BadClip."""
+        return hashlib.sha256(_bytes_of(self.path_of(ref))).hexdigest()
 
     def recorded(self, log: ScenarioLog, start: int, stop: int) -> Recorded:
         """The ego's poses, the format has no sensors. Raises BadClip where the ego's drive is broken."""
@@ -128,13 +132,7 @@ def _is_pickle_name(name: object) -> bool:
 
 def read_scenario(path: Path) -> tuple[dict[str, Any], str]:
     """The scenario dict and the sha256 of its file. Raises BadClip naming the field that is missing."""
-    file = str(path)
-    try:
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise BadClip(file, "size", f"more than {MAX_FILE_BYTES} bytes")
-        data = path.read_bytes()
-    except OSError as error:
-        raise BadClip(file, "file", f"cannot be read: {error}") from error
+    file, data = str(path), _bytes_of(path)
     scenario = load_plain(data, file)
     if not isinstance(scenario, dict):
         raise BadClip(file, "scenario", f"holds a {type(scenario).__name__}, not a dict")
@@ -144,6 +142,16 @@ def read_scenario(path: Path) -> tuple[dict[str, Any], str]:
     if not isinstance(scenario.get("length"), int | np.integer):
         raise BadClip(file, "length", "missing or not a number of frames")
     return scenario, hashlib.sha256(data).hexdigest()
+
+
+def _bytes_of(path: Path) -> bytes:
+    """All of a scenario's file. Raises BadClip."""
+    try:
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise BadClip(str(path), "size", f"more than {MAX_FILE_BYTES} bytes")
+        return path.read_bytes()
+    except OSError as error:
+        raise BadClip(str(path), "file", f"cannot be read: {error}") from error
 
 
 def _source(scenario: Mapping[str, Any], file: str) -> tuple[str, Source]:
