@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from factory.clips.reader import ClipRef
-from factory.store.candidates import ClipCandidates
+from factory.store.candidates import Listed
 from factory.store.outcomes import Kind
 from factory.store.samples import History, OnChange, Past
 from factory.walk import Exhausted, Step, Try, next_step
@@ -37,7 +37,7 @@ class ClipPlan:
     ref: ClipRef
     walks: tuple[WalkState, ...]
     past: Past | None  # the clip-level outcome, where there is one
-    listed: ClipCandidates | None  # its row in `candidates`, where it is this run's
+    listed: Listed | None  # its row in `candidates`, where it is this run's
     stale: frozenset[str] = frozenset()  # redo: clip-level rows to replace
     n_candidates: int = 0
     failed: bool = False  # the clip as a whole, in this run or for good
@@ -81,7 +81,7 @@ def make_plan(
             _walk(history, ref.clip_id, "", on_change).known.get(CLIP_CANDIDATE),
             listed,
             _stale(history, ref.clip_id, "", on_change),
-            len(listed.candidates) if listed is not None else 0,
+            listed.n_candidates if listed is not None else 0,
         )
         found += sum(past.kind in (Kind.ACCEPTED, Kind.REJECTED) for walk in clip.walks for past in walk.known.values())
         (todo if _has_work(clip, rounds, may_retry) else done).append(clip)

@@ -1,11 +1,11 @@
 """The table `candidates`: one row per prepared clip with its ordered candidate list and what each gate dropped."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 
 import pyarrow as pa
 
-from factory.store.table import TableSpec
+from factory.store.table import KeyedTable, TableSpec
 from factory.work import CandidateRow
 
 
@@ -23,6 +23,15 @@ class ClipCandidates:
     candidates: tuple[CandidateRow, ...]
     stage: str = ""  # why there are none
     reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Listed:
+    """What a run must know of a clip's row; the candidates themselves stay in the table and in the prepared clip."""
+
+    prepare_digest: str
+    content_digest: str
+    n_candidates: int
 
 
 CANDIDATE = pa.struct(
@@ -64,10 +73,7 @@ def candidates_table(rows: Sequence[ClipCandidates]) -> pa.Table:
     )
 
 
-def candidates_of(table: pa.Table) -> list[ClipCandidates]:
-    """Rows of a complete candidates table."""
-    out = []
-    for row in table.drop_columns(["n_candidates"]).to_pylist():
-        candidates = tuple(CandidateRow(**c | {"cell": tuple(c["cell"])}) for c in row["candidates"])
-        out.append(ClipCandidates(**row | {"gate_counts": dict(row["gate_counts"] or ()), "candidates": candidates}))
-    return out
+def listed_of(table: KeyedTable) -> dict[str, Listed]:
+    """clip_id -> what the table says of the clip."""
+    rows = table.read(["clip_id", *(field.name for field in fields(Listed))])
+    return {row.pop("clip_id"): Listed(**row) for row in rows.to_pylist()}

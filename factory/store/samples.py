@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from factory.store.cache import ClipCache
-from factory.store.candidates import CANDIDATES, ClipCandidates, candidates_of, candidates_table
+from factory.store.candidates import CANDIDATES, ClipCandidates, Listed, candidates_table, listed_of
 from factory.store.location import Location
 from factory.store.outcomes import OUTCOMES, Kind, Outcome, outcomes_table
 from factory.store.schema import LICENCES_PROPERTY, SAMPLES, SCHEMA_VERSION
@@ -53,7 +53,7 @@ class History:
 
     walks: Mapping[Place, Mapping[int, Past]]  # candidate -> what became of it; a current row hides one that is not
     stale: Mapping[Place, frozenset[str]]  # attempt_ids of rows that are not current
-    candidates: Mapping[str, ClipCandidates]  # clip_id -> its list
+    candidates: Mapping[str, Listed]  # clip_id -> what is known of its list
 
 
 class Store:
@@ -160,8 +160,7 @@ class Store:
             is_current = current(row["settings_hash"], row["stage_versions"], row["expert"], row["expert_digest"])
             past = Past(row["attempt_id"], Kind.ACCEPTED, is_current, round=row["round"])
             enter((row["clip_id"], row["expert"]), row["candidate_index"], past)
-        lists = {row.clip_id: row for row in candidates_of(self.candidates.read())}
-        return History(walks, {place: frozenset(ids) for place, ids in stale.items()}, lists)
+        return History(walks, {place: frozenset(ids) for place, ids in stale.items()}, listed_of(self.candidates))
 
     def commit(
         self,
