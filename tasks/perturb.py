@@ -7,6 +7,7 @@ threshold under reactive traffic on the kept ones only. Scores are needed only u
 walked abreast: the same result as filter-then-pick at a fraction of the scores.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -39,9 +40,12 @@ class PerturbSettings:
     epdms_min: float = 0.8  # /14 score, without EC
 
     def __post_init__(self) -> None:
-        for name in ("step_longitudinal_m", "step_lateral_m"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"perturb {name} must be positive, not {getattr(self, name)}")
+        gates = ("max_heading_deg", "max_longitudinal_m", "max_lateral_m")
+        for name in (*gates, "step_longitudinal_m", "step_lateral_m"):
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise ValueError(f"perturb {name} must be positive and finite, not {getattr(self, name)}")
+        if not 0.0 <= self.epdms_min <= 1.0:
+            raise ValueError(f"perturb epdms_min must be from 0 to 1, not {self.epdms_min}")
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """What is rendered, and how large."""
 
+import math
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -49,3 +50,17 @@ class RenderSettings:
     lidar_only_reach_m: float = 15.0  # without photos: images only this close to where a sweep was taken; 0: none
     map_rig: str = "three_front"  # cameras of a clip without a rig of its own, for mode=map
     asset: AssetSettings = field(default_factory=AssetSettings)
+
+    def __post_init__(self) -> None:
+        bounds = {
+            "width": (16, math.inf),
+            "height": (16, math.inf),
+            "jpeg_quality": (1, 100),
+            "psnr_min": (0.0, math.inf),
+            "lidar_only_reach_m": (0.0, math.inf),
+        }
+        for name, (low, high) in bounds.items():
+            value = getattr(self, name)
+            if not (math.isfinite(value) and low <= value <= high):
+                wanted = f"from {low:g} to {high:g}" if high < math.inf else f"finite and at least {low:g}"
+                raise ValueError(f"render {name} must be {wanted}, not {value}")

@@ -67,10 +67,19 @@ def test_the_grid_is_five_metres_by_half_a_metre_with_the_log_in_the_middle_of_a
     assert cells.tolist() == [[0, 0], [0, 0], [0, 0], [1, 0], [0, 1], [-1, -1], [4, 4], [-4, -4]]
 
 
-@pytest.mark.parametrize("name", ["step_longitudinal_m", "step_lateral_m"])
-def test_a_grid_without_a_step_is_refused(name: str) -> None:
-    with pytest.raises(ValueError, match=name):
-        PerturbSettings(**{name: 0.0})
+@pytest.mark.parametrize(
+    "name", ["max_heading_deg", "max_longitudinal_m", "max_lateral_m", "step_longitudinal_m", "step_lateral_m"]
+)
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf])
+def test_gates_and_steps_are_positive_and_finite(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=f"{name} must be positive and finite"):
+        PerturbSettings(**{name: value})
+
+
+@pytest.mark.parametrize("value", [-0.1, 1.1, np.nan])
+def test_a_threshold_that_no_score_can_have_is_refused(value: float) -> None:
+    with pytest.raises(ValueError, match="epdms_min must be from 0 to 1"):
+        PerturbSettings(epdms_min=value)
 
 
 def filter_then_pick(cells: NDArray[np.int64], order: Sequence[int], good: Sequence[bool]) -> list[int]:
@@ -176,14 +185,22 @@ def test_moving_the_world_moves_the_candidates_along(found: Perturbation, trajec
         assert a.reactive_score == pytest.approx(b.reactive_score, abs=1e-6)
 
 
+def sideways(offsets_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(K, 40, 3) at the street's 8 m/s, ending so far to the left and along the road again."""
+    s = np.arange(1, 41) / 40
+    y = offsets_m[:, None] * (3 * s**2 - 2 * s**3)
+    heading = np.arctan2(offsets_m[:, None] * (6 * s - 6 * s**2), 32.0)
+    return np.stack([np.broadcast_to(32.0 * s, y.shape), y, heading], axis=-1)
+
+
 def test_a_clip_that_nothing_can_follow_is_rejected_with_a_listed_reason() -> None:
     reasons = next(stage.reasons for stage in STAGES if stage.name == "perturb")
     standing = np.zeros((3, 40, 3))  # ends 32 m behind the log
     result = perturbed(street_clip(), standing)
     assert isinstance(result, Rejected)
     assert (result.stage, result.reason) == ("perturb", "no_gated_candidate")
-    unreachable = perturbed(street_clip(), kinematic_trajectories(60, 0), PerturbSettings(epdms_min=1.1))
-    assert isinstance(unreachable, Rejected)
-    assert unreachable.reason == "no_good_candidate"
-    assert "replay_score" in unreachable.detail
-    assert {result.reason, unreachable.reason} <= set(reasons)
+    off_road = perturbed(street_clip(), sideways(np.arange(8.0, 14.0, 0.25)), PerturbSettings(max_lateral_m=30.0))
+    assert isinstance(off_road, Rejected)
+    assert off_road.reason == "no_good_candidate"
+    assert off_road.counts["replay_score"] > 0 and "replay_score" in off_road.detail
+    assert {result.reason, off_road.reason} <= set(reasons)
