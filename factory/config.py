@@ -29,12 +29,16 @@ def compose(name: str, overrides: Sequence[str]) -> dict[str, Any]:
     import hydra
     from hydra.errors import HydraException
     from omegaconf import OmegaConf
-    from omegaconf.errors import OmegaConfBaseException
+    from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
     try:
         with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
             config = hydra.compose(name, list(overrides))
         resolved = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    except MissingMandatoryValue as error:
+        key = str(error.full_key)
+        what = "<folder>" if key.endswith("root") else "<value>"
+        raise ConfigError(f"{key} is missing: give {key}={what}") from error
     except (HydraException, OmegaConfBaseException) as error:
         cause = f" ({error.__cause__})" if error.__cause__ is not None else ""
         raise ConfigError(f"{str(error).strip()}{cause}") from error
@@ -55,8 +59,13 @@ def fill(cls: type[T], values: Mapping[str, Any], where: str) -> T:
     try:
         return TypeAdapter(cls).validate_python(dict(values))
     except ValidationError as error:
-        lines = [f"{where}.{'.'.join(map(str, e['loc']))}: {e['msg']} (got {e['input']!r})" for e in error.errors()]
-        raise ConfigError("; ".join(lines)) from error
+        raise ConfigError("; ".join(_line(where, e["loc"], e["msg"], e["input"]) for e in error.errors())) from error
+
+
+def _line(where: str, loc: Sequence[str | int], message: str, value: object) -> str:
+    """One fault; a whole group of settings is not printed, its message names the one that is wrong."""
+    got = "" if not loc or isinstance(value, Mapping) else f" (got {value!r})"
+    return f"{'.'.join(map(str, (where, *loc)))}: {message.removeprefix('Value error, ')}{got}"
 
 
 def _unknown_keys(cls: type[Any], values: Mapping[str, Any], where: str) -> list[str]:

@@ -47,9 +47,14 @@ def test_help_loads_nothing_heavy(tmp_path: Path) -> None:
     assert done.stdout.splitlines()[-1] == "loaded []", done.stderr
 
 
-def test_a_bad_command_ends_with_two_names_the_key_and_writes_nothing(tmp_path: Path) -> None:
-    done = python(tmp_path, "-m", "factory.run", "round=3", "out=here")
+@pytest.mark.parametrize(
+    ("override", "named"), [("round=3", "round"), ("render.width=0", "width"), ("perturb.epdms_min=1.5", "epdms_min")]
+)
+def test_a_bad_command_ends_with_two_names_the_key_and_writes_nothing(
+    tmp_path: Path, override: str, named: str
+) -> None:
+    done = python(tmp_path, "-m", "factory.run", override, "out=here")
     assert done.returncode == 2
-    assert "round" in done.stderr
+    assert named in done.stderr
     assert "Traceback" not in done.stderr
     assert list(tmp_path.iterdir()) == []

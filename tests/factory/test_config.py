@@ -1,6 +1,7 @@
 """Configuration: every choice complete and equal to its dataclass, everything unknown an error that names it."""
 
 import dataclasses
+import math
 import shutil
 import subprocess
 import sys
@@ -78,12 +79,58 @@ def test_the_run_s_keys_are_those_of_its_dataclass() -> None:
         ("traffic=fast", "traffic/fast"),
         ("colour=red", "colour"),
         ("rounds", "rounds"),
-        ("clips=av2", "clips.root"),  # must be given
     ],
 )
 def test_a_misspelt_override_is_an_error_that_names_it(override: str, named: str) -> None:
     with pytest.raises(ConfigError, match=named.replace(".", r"\.").replace("/", ".")):
         load_config([override])
+
+
+@pytest.mark.parametrize(
+    ("clips", "message"),
+    [
+        ("av2", "clips.root is missing: give clips.root=<folder>"),
+        ("custom", "clips._target_ is missing: give clips._target_=<value>"),
+    ],
+)
+def test_a_value_that_must_be_given_is_asked_for_by_its_key(clips: str, message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_config([f"clips={clips}"])
+    assert str(caught.value) == message
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("rounds=0", "run: rounds=0: at least one round is needed"),
+        ("perturb.epdms_min=2", "run.perturb: perturb epdms_min must be from 0 to 1, not 2.0"),
+        ("rounds=many", r"run.rounds: Input should be a valid integer, unable to parse string .* \(got 'many'\)"),
+    ],
+)
+def test_an_error_says_what_was_given_but_never_prints_a_whole_group(override: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=rf"^{message}$"):
+        load_config([override])
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("width", (0, 15, -320)),
+        ("height", (0, 15)),
+        ("jpeg_quality", (0, 101)),
+        ("psnr_min", (-1.0, math.nan, math.inf)),
+        ("lidar_only_reach_m", (-0.1, math.nan, math.inf)),
+    ],
+)
+def test_render_settings_out_of_range_are_refused(name: str, values: tuple[float, ...]) -> None:
+    for value in values:
+        with pytest.raises(ConfigError, match=f"render {name} must be"):
+            fill(RenderSettings, {name: value}, "render")
+
+
+def test_render_settings_at_their_bounds_are_taken() -> None:
+    for quality in (1, 100):
+        RenderSettings(width=16, height=16, jpeg_quality=quality, psnr_min=0.0, lidar_only_reach_m=0.0)
 
 
 @pytest.mark.parametrize(
@@ -181,7 +228,9 @@ def test_every_configuration_file_is_listed_as_package_data() -> None:
 
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["setuptools"]
     assert project["package-dir"] == {"factory.conf": "conf"}
-    assert project["package-data"]["factory.conf"] == ["**/*.yaml"]
+    assert project["package-data"] == {"*": ["*.yaml"]}
+    folders = {path.parent.relative_to(REPOSITORY) for path in (REPOSITORY / "conf").rglob("*.yaml")}
+    assert {".".join(("factory", *folder.parts)) for folder in folders} <= set(project["packages"])
     assert {path.suffix for path in (REPOSITORY / "conf").rglob("*") if path.is_file()} == {".yaml"}
 
 
