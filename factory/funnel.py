@@ -133,9 +133,9 @@ def funnel_of(store: Store, clip_ids: Collection[str] | None = None) -> Funnel:
     )
 
 
-def image_sources_text(store: Store) -> str:
-    """One line: how many samples have images from where, those from lidar alone apart."""
-    rows = store.samples.read(["image_source", "tags"]).to_pylist()
+def image_sources_text(store: Store, clip_ids: Collection[str]) -> str:
+    """One line: how many samples of these clips have images from where, those from lidar alone apart."""
+    rows = _rows(store.samples.read(["clip_id", "image_source", "tags"]), set(clip_ids))
     lidar = "render (lidar only)"
     counts = Counter(lidar if "lidar_only" in row["tags"] else str(row["image_source"]) for row in rows)
     return "images: " + (", ".join(f"{source} {n}" for source, n in sorted(counts.items())) or "no samples")

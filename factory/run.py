@@ -115,7 +115,7 @@ def run(overrides: Sequence[str]) -> int:
     if summary.exit_code == BAD_CONFIG or summary.funnel is None:
         return summary.exit_code
     print(summary.funnel.text())
-    print(image_sources_text(store))
+    print(image_sources_text(store, [ref.clip_id for ref in refs]))
     if summary.seconds:
         print(seconds_text(summary.seconds))
     print(write_report(store, assembled))

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from factory.execute import execute
-from factory.funnel import FunnelRow, _expert_rows, funnel_of
+from factory.funnel import FunnelRow, _expert_rows, funnel_of, image_sources_text
 from factory.store.samples import Store
 from tests.factory.toy import ToyWork, refs
 
@@ -41,3 +41,14 @@ def test_the_funnel_adds_up_to_the_tables(tmp_path: Path) -> None:
     wide = funnel.text(width=200)
     assert "nc " in wide and "failed.bug 1" in wide
     assert funnel_of(store, []).rows == ()
+
+
+def test_image_sources_are_counted_over_the_clips_asked_for(tmp_path: Path) -> None:
+    store, clips = Store(tmp_path), refs(4)
+    execute(ToyWork(), clips, ["human"], 1, store, "local", say=lambda line: None)
+    counted = [
+        sum(int(part.rsplit(" ", 1)[1]) for part in image_sources_text(store, ids).removeprefix("images: ").split(", "))
+        for ids in ([ref.clip_id for ref in clips], [clips[0].clip_id])
+    ]
+    assert counted == [4, 1]
+    assert image_sources_text(store, []) == "images: no samples"
