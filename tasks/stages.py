@@ -16,7 +16,6 @@ class Stage:
     version: int  # raised by hand whenever the stage's output changes; a golden test watches
     fan_out: str  # "clip" once per clip, "attempt" once per attempt
     reasons: tuple[str, ...]  # every reason it may reject with
-    wants_gpu: bool = False
 
 
 @dataclass(frozen=True)
@@ -37,7 +36,7 @@ STAGES: tuple[Stage, ...] = (
     Stage("rollout", 1, "attempt", ("route_ended",)),
     Stage("expert", 1, "attempt", ("no_plan",)),
     Stage("reward", 1, "attempt", SUBSCORES),
-    Stage("render", 1, "attempt", ("psnr", "no_asset")),
+    Stage("render", 1, "attempt", ("psnr",)),
     Stage("write", 1, "attempt", ()),
 )
 

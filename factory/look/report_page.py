@@ -29,7 +29,6 @@ REASON_WORDS = {
     "no_plan": "the expert found no plan",
     "ego_unstable": "the ego could not be tracked",
     "psnr": "block reconstructed too poorly",
-    "no_asset": "block cannot be rendered",
     "ego_standing": "ego stands",
     "broken_tracks": "broken tracks",
     "no_gated_candidate": "no trajectory passes the gates",
