@@ -70,37 +70,39 @@ def explain(argv: Sequence[str]) -> int:
     from factory.pipeline import FactoryWork, PerturbedClip
     from factory.settings import RunConfig, assemble
     from factory.work import HUMAN, HUMAN_CANDIDATE
-    from tasks.chance import stream
-    from tasks.perturb import Perturbation, perturb
-    from tasks.stages import SUBSCORES
+    from tasks.stages import SUBSCORES, Rejected
 
     own, overrides = split_arguments(argv)
     expert, to = own.expert, Path(own.to)
     config = fill(RunConfig, compose("run", overrides) | {"experts": [expert]}, "run")
     run = assemble(config)
-    ref = find(run.index.refs, own.clip)
+    ref = find((*run.index.refs, *run.index.broken), own.clip)
     work: FactoryWork = run.work
     began = time.perf_counter()
-    clip = run.reader.read(ref)
+    made = work.considered(ref)
+    if isinstance(made, Rejected):
+        print(f"clip {ref.clip_id}: log {ref.log_id} at {ref.start_ms / 1000:.1f} s")
+        print(f"rejected by {made.stage}: {made.reason}: {made.detail}")
+        return 0
+    clip, found = made.clip, made.found
     print(
         f"clip {ref.clip_id}: log {ref.log_id} at {ref.start_ms / 1000:.1f} s, {clip.split}, {len(clip.agents)} tracks"
     )
     to.mkdir(parents=True, exist_ok=True)
     stem = to / f"{ref.clip_id}_{expert}"
 
-    found = perturb(
-        clip, work.vocabulary, work.perturb, work.traffic, work.pdm, stream(work.seed, clip.clip_id, "perturb")
-    )
-    if not isinstance(found, Perturbation):
-        print(f"no candidates: {found.reason}: {found.detail}")
-        return 0
-    print("dropped by gate: " + ", ".join(f"{gate} {count}" for gate, count in found.gate_counts.items()))
-    fates = Counter(found.considered.fate)
-    print("gated trajectories: " + ", ".join(f"{fate} {count}" for fate, count in fates.most_common()))
-    cv2.imwrite(f"{stem}_candidates.png", candidates_picture(clip, found.considered)[..., ::-1])
+    if isinstance(found, Rejected):
+        print(f"no candidates: rejected by {found.stage}: {found.reason}: {found.detail}")
+        if expert != HUMAN:
+            return 0
+    else:
+        print("dropped by gate: " + ", ".join(f"{gate} {count}" for gate, count in found.gate_counts.items()))
+        fates = Counter(found.considered.fate)
+        print("gated trajectories: " + ", ".join(f"{fate} {count}" for fate, count in fates.most_common()))
+        cv2.imwrite(f"{stem}_candidates.png", candidates_picture(clip, found.considered)[..., ::-1])
 
-    payload = PerturbedClip(ref, clip, found.candidates)
-    order = [HUMAN_CANDIDATE] if expert == HUMAN else range(min(own.tries, len(found.candidates)))
+    payload = PerturbedClip(ref, clip, made.candidates)
+    order = [HUMAN_CANDIDATE] if expert == HUMAN else range(min(own.tries, len(made.candidates)))
     shown = None
     for candidate in order:
         trace = work.trace(payload, candidate, expert)

@@ -34,6 +34,33 @@ class PerturbedClip:
 
 
 @dataclass(frozen=True)
+class Considered:
+    """A clip that attempts can start from, whole, and what became of its candidates."""
+
+    clip: Clip
+    found: Perturbation | Rejected  # Rejected by render or perturb: no simulated expert has anything to try
+    seconds: Mapping[str, float]  # by stage
+
+    @property
+    def candidates(self) -> tuple[Candidate, ...]:
+        """Those that attempts start from."""
+        return () if isinstance(self.found, Rejected) else self.found.candidates
+
+
+class BrokenLog(BadClip):
+    """A log that the index could not read; its message is the index's, which names file and field itself."""
+
+    def __init__(self, log_id: str, said: str) -> None:
+        super().__init__(log_id, "log", said)
+
+    def __str__(self) -> str:
+        return self.problem
+
+    def __reduce__(self) -> tuple[type["BrokenLog"], tuple[str, str]]:  # type: ignore[override]
+        return BrokenLog, (self.file, self.problem)
+
+
+@dataclass(frozen=True)
 class Trace:
     """One attempt with everything it went through, for pictures and explanations."""
 
@@ -87,8 +114,24 @@ class FactoryWork:
 
     def prepare(self, ref: ClipRef) -> PreparedClip | Rejected:
         """Read the clip, check that its block can be rendered, list its candidates."""
+        made = self.considered(ref)
+        if isinstance(made, Rejected):
+            return made
+        clip, found = made.clip, made.found
+        return PreparedClip(
+            clip_id=clip.clip_id,
+            content_digest=clip.content_digest,
+            candidates=tuple(_candidate_row(index, candidate) for index, candidate in enumerate(made.candidates)),
+            gate_counts=found.counts if isinstance(found, Rejected) else found.gate_counts,
+            payload=PerturbedClip(ref, replace(clip, images=(), sweeps=(), block=None), made.candidates),
+            dropped=found if isinstance(found, Rejected) else None,
+            seconds=made.seconds,
+        )
+
+    def considered(self, ref: ClipRef) -> Considered | Rejected:
+        """All that `prepare` decides, and every gated trajectory's fate. Rejected: for every expert. Raises BadClip."""
         if ref in self.broken:
-            raise BadClip(ref.log_id, "log", self.broken[ref])
+            raise BrokenLog(ref.log_id, self.broken[ref])
         watch = Stopwatch()
         with watch.of("clip"):
             clip = self.reader.read(ref)
@@ -100,17 +143,7 @@ class FactoryWork:
             found = blocked or perturb(
                 clip, self.vocabulary, self.perturb, self.traffic, self.pdm, stream(self.seed, clip.clip_id, "perturb")
             )
-        listed = found if isinstance(found, Perturbation) else None
-        candidates = listed.candidates if listed else ()
-        return PreparedClip(
-            clip_id=clip.clip_id,
-            content_digest=clip.content_digest,
-            candidates=tuple(_candidate_row(index, candidate) for index, candidate in enumerate(candidates)),
-            gate_counts=found.counts if isinstance(found, Rejected) else found.gate_counts,
-            payload=PerturbedClip(ref, replace(clip, images=(), sweeps=(), block=None), candidates),
-            dropped=found if isinstance(found, Rejected) else None,
-            seconds=watch.seconds,
-        )
+        return Considered(clip, found, watch.seconds)
 
     def content_digest(self, ref: ClipRef) -> str | None:
         """Of what the clip would be read from now; None where the reader cannot tell."""

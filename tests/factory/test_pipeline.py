@@ -1,18 +1,21 @@
 """The work behind the machine: what its digests cover, what a block's verdict drops, and data that moves."""
 
 import dataclasses
+import pickle
 import shutil
 from pathlib import Path
 
 import pytest
 
+from factory.clips.reader import BadClip
 from factory.clips.synthetic.reader import SyntheticReader
 from factory.clips.synthetic.write import TownSettings
-from factory.pipeline import FactoryWork
+from factory.pipeline import Considered, FactoryWork
 from factory.settings import assemble, identity_of, load_config
 from factory.work import HUMAN, HUMAN_CANDIDATE, Accepted, Dropped, PreparedClip
 from tasks import stages
 from tasks.kinematic_vocabulary import kinematic_trajectories
+from tasks.perturb import Perturbation
 from tasks.vocabulary import Vocabulary
 
 SMALL = TownSettings(cameras=("ring_front_center",), width=64, height=36, lidar_beams=16, lidar_azimuths=300)
@@ -67,6 +70,28 @@ def test_a_rejected_attempt_is_no_sample(town: Path, tmp_path: Path) -> None:
     prepared = prepared_by(work)
     results = [work.attempt(prepared, row.index, "pdm_closed") for row in prepared.candidates[:2]]
     assert results and all(isinstance(result, Dropped) for result in results)
+
+
+def test_a_broken_log_fails_with_the_index_s_own_words(town: Path, tmp_path: Path) -> None:
+    root = tmp_path / "logs"
+    shutil.copytree(town, root)
+    (next(root.glob("*/annotations.feather"))).write_bytes(b"no table")
+    work = work_on(root, tmp_path)
+    ((ref, said),) = work.broken.items()
+    assert "annotations.feather: " in said
+    with pytest.raises(BadClip) as raised:
+        work.prepare(ref)
+    assert str(raised.value) == said == str(pickle.loads(pickle.dumps(raised.value)))
+
+
+def test_what_is_considered_is_what_is_prepared(town: Path, tmp_path: Path) -> None:
+    work = work_on(town, tmp_path, "render=none")
+    made = work.considered(work.reader.index().refs[0])
+    assert isinstance(made, Considered) and isinstance(made.found, Perturbation)
+    assert [row.vocabulary_index for row in prepared_by(work).candidates] == [
+        candidate.vocabulary_index for candidate in made.candidates
+    ]
+    assert made.found.considered.fate.count("kept") == len(made.candidates) > 0
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,57 @@
+"""`explain` tells the run's own decisions: what is rejected before the attempts, and logs that cannot be read."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from factory import pipeline
+from factory.clips.synthetic.reader import SyntheticReader
+from factory.clips.synthetic.write import TownSettings
+from factory.explain import main
+from factory.settings import assemble, load_config
+
+SMALL = TownSettings(cameras=("ring_front_center",), width=64, height=36, lidar_beams=16, lidar_azimuths=300)
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A clip's log and a copy of it with broken annotations."""
+    reader = SyntheticReader(tmp_path_factory.mktemp("town"), 1, 0, SMALL)
+    reader.index()
+    (log,) = (path for path in reader.root.iterdir() if path.is_dir())
+    shutil.copytree(log, reader.root / "broken")
+    (reader.root / "broken" / "annotations.feather").write_bytes(b"no table")
+    return reader.root
+
+
+def arguments(logs: Path, out: Path, *more: str) -> list[str]:
+    size = ["render.width=64", "render.height=36", "vocabulary.k=300"]
+    return ["clips=av2", f"clips.root={logs}", f"out={out}", *size, *more]
+
+
+def test_a_block_below_the_gate_is_why_there_are_no_candidates(
+    logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    gated = arguments(logs, tmp_path, "render.psnr_min=60", f"to={tmp_path}")
+    assert main([*gated, "clip=0"]) == 0
+    assert "no candidates: rejected by render: psnr: block at" in capsys.readouterr().out
+    assert main([*gated, "clip=0", "expert=human"]) == 0  # the human drive is a sample all the same
+    told = capsys.readouterr().out
+    assert "rejected by render: psnr" in told and "candidate -1  accepted" in told
+
+
+def test_a_clip_whose_route_ends_is_told_as_the_run_tells_it(
+    logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pipeline, "has_route", lambda centerline: False)
+    assert main([*arguments(logs, tmp_path), "clip=0"]) == 0
+    assert "rejected by clip: route_ended: the log ends at the end of its route" in capsys.readouterr().out
+
+
+def test_a_broken_log_is_found_and_told_in_the_index_s_words(
+    logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ((ref, said),) = assemble(load_config(arguments(logs, tmp_path))).index.broken.items()
+    assert main([*arguments(logs, tmp_path), f"clip={ref.clip_id[:8]}"]) == 3
+    assert capsys.readouterr().err == f"bad clip: {said}\n"
