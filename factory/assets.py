@@ -12,7 +12,7 @@ import logging
 import os
 import tempfile
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, fields, replace
 from enum import Enum
@@ -22,15 +22,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from factory.sensors import block_of, chosen_cameras, load_sensors, load_sweeps
+from factory.sensors import block_of, chosen_cameras, load_sensors, load_sweeps, taken_by
 from tasks.render.gaussians import Gaussians
 from tasks.render.lidar_only import lidar_asset
 from tasks.render.scene import RenderAsset, build_asset
 from tasks.render.settings import RenderSettings
 from tasks.render.sky import SkyMap
+from tasks.render.stereo import MAX_BASELINE_M, MIN_BASELINE_M
+from tasks.world.camera import SensorFile
 from tasks.world.clip import Clip
 
 ASSET_VERSION = 2  # raised by hand when the same sensors give another scene
+PARALLAX_SHARE = 0.9  # without lidar, a photo with no other in stereo reach shows sky alone; so few may be like that
 log = logging.getLogger(__name__)
 
 
@@ -38,26 +41,39 @@ class Sensing(Enum):
     """What a clip's block was seen by."""
 
     PHOTOS = "photos"  # and lidar
+    PHOTOS_ONLY = "photos_only"  # depth from parallax alone
     LIDAR_ONLY = "lidar_only"
     NOTHING = "nothing"
 
 
 def sensing(clip: Clip, settings: RenderSettings) -> Sensing:
-    """What the block can be made of; nothing without a rig to look through.
+    """What the block can be made of; nothing without a rig to look through, or without lidar and parallax.
 
     Raises ValueError for a camera the rig does not have.
     """
     block, cameras = block_of(clip), chosen_cameras(clip.cameras, settings.cameras)
-    if not cameras or not block.sweeps:
-        return Sensing.NOTHING
-    seen = {camera.name for camera in cameras} & {file.sensor for file in block.images}
-    return Sensing.PHOTOS if seen else Sensing.LIDAR_ONLY
+    photos = taken_by(cameras, block.images)
+    if block.sweeps and cameras:
+        return Sensing.PHOTOS if photos else Sensing.LIDAR_ONLY
+    return Sensing.PHOTOS_ONLY if photos and _with_parallax(photos) >= PARALLAX_SHARE else Sensing.NOTHING
+
+
+def _with_parallax(photos: Sequence[SensorFile]) -> float:
+    """Share of the photos that another of the same camera lies at a useful distance from for depth by comparison."""
+    places: dict[str, list[NDArray[np.float64]]] = {}
+    for file in photos:
+        places.setdefault(file.sensor, []).append(file.world_from_ego[:3, 3])
+    found = 0
+    for mine in places.values():
+        apart = np.linalg.norm(np.stack(mine)[:, None] - np.stack(mine), axis=-1)
+        found += int(((apart >= MIN_BASELINE_M) & (apart <= MAX_BASELINE_M)).any(axis=1).sum())
+    return found / len(photos)
 
 
 def asset_for(clip: Clip, settings: RenderSettings, cache_dir: str | Path) -> RenderAsset | None:
     """The scene of the clip's block with its digest; None where the clip has nothing to make one from.
 
-    Made of photos and lidar, or of lidar alone (`sensing`).
+    Made of photos and lidar, or of either alone (`sensing`).
     Raises BadClip where a sensor file is broken, ValueError for a camera the rig does not have.
     """
     block, cameras = block_of(clip), chosen_cameras(clip.cameras, settings.cameras)
@@ -72,7 +88,7 @@ def asset_for(clip: Clip, settings: RenderSettings, cache_dir: str | Path) -> Re
                 return read_asset(path)
             except (ValueError, KeyError, OSError, zipfile.BadZipFile) as error:
                 log.warning("%s is damaged (%s) and is built again", path, error)
-        if made_of is Sensing.PHOTOS:
+        if made_of is not Sensing.LIDAR_ONLY:
             data = load_sensors(block, cameras, settings.width, settings.height)
             asset = build_asset(data.photos, data.sweeps, block.agents, settings.asset)
         else:

@@ -1,7 +1,8 @@
 """The render stage: a sample's images, from the block's scene, the log's own photos, or drawn from the map.
 
-A clip whose block can be rendered is; one without cameras or lidar is written with image_source=none and no images.
-Lidar without photos gives grey pictures near its sweeps, tagged `lidar_only`.
+A human sample of a clip with photos keeps them, whatever its block. Every other sample is drawn from the block where
+`factory.assets.sensing` finds something to make it of, else written with image_source=none and no images. Lidar without
+photos gives grey pictures near its sweeps, tagged `lidar_only`; photos without lidar coarse ones, tagged `photos_only`.
 """
 
 from collections.abc import Sequence
@@ -13,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factory.assets import Sensing, asset_for, sensing
-from factory.sensors import block_of, chosen_cameras, encode_jpeg, load_photos
+from factory.clips.reader import BadClip
+from factory.sensors import block_of, chosen_cameras, encode_jpeg, load_photos, taken_by
 from tasks.attempt import Judged
 from tasks.perturb import Candidate
 from tasks.render.map_drawing import draw_map_views
@@ -23,12 +25,15 @@ from tasks.render.settings import STEPS_OF, ImageSource, RenderMode, RenderSetti
 from tasks.render.views import pose_on_ground, render_views
 from tasks.stages import Rejected
 from tasks.world.agents import AgentTracks
-from tasks.world.camera import Camera
+from tasks.world.camera import Camera, SensorFile
 from tasks.world.clip import NOW, STEP_S, Clip
 from tasks.world.vehicle import X, Y
 
 NO_IMAGES: dict[str, object] = {"cameras": None, "images": None, "image_source": str(ImageSource.NONE)}
-LIDAR_ONLY = "lidar_only"  # tag of a sample whose images show lidar returns in grey, not what a camera would have seen
+TAG_OF = {
+    Sensing.LIDAR_ONLY: "lidar_only",  # images show lidar returns in grey, not what a camera would have seen
+    Sensing.PHOTOS_ONLY: "photos_only",  # no lidar: depth is guessed from parallax, markings shear off the photos' path
+}
 PHOTO_SLACK_S = 0.06  # a photo belongs to an instant of the 2 Hz grid when it was taken this close to it
 
 
@@ -44,7 +49,9 @@ class Imaging:
 
         Raises BadClip for a broken sensor file.
         """
-        if self._sensing(clip) is not Sensing.PHOTOS:
+        if self.settings.mode is not RenderMode.AUTO:
+            return None
+        if sensing(clip, self.settings) not in (Sensing.PHOTOS, Sensing.PHOTOS_ONLY):
             return None
         asset = _block(clip, self.settings, self.cache_dir)
         if asset.psnr_db < self.settings.psnr_min:
@@ -55,21 +62,21 @@ class Imaging:
         """The image columns of a sample, and the `tags` they add to its own.
 
         A human sample of a clip with photos keeps the photos; everything else is drawn at the simulated poses.
+        Raises BadClip for a broken sensor file, and for a human sample that lacks some of its photos.
         """
         if self.settings.mode is RenderMode.MAP:
             rig = clip.cameras or RIGS[self.settings.map_rig]
             return self._drawn(clip, judged, None, chosen_cameras(rig, self.settings.cameras))
-        made_of = self._sensing(clip)
-        if made_of is Sensing.NOTHING or (made_of is Sensing.LIDAR_ONLY and not self._near_sweeps(clip, judged)):
+        if self.settings.mode is RenderMode.NONE:
             return NO_IMAGES
         cameras = chosen_cameras(clip.cameras, self.settings.cameras)
-        if made_of is Sensing.PHOTOS and candidate is None:
+        if candidate is None and taken_by(cameras, (*clip.images, *block_of(clip).images)):
             return self._photos(clip, judged, cameras)
+        made_of = sensing(clip, self.settings)
+        if made_of is Sensing.NOTHING or (made_of is Sensing.LIDAR_ONLY and not self._near_sweeps(clip, judged)):
+            return NO_IMAGES
         images = self._drawn(clip, judged, _block(clip, self.settings, self.cache_dir), cameras)
-        return images | {"tags": [LIDAR_ONLY]} if made_of is Sensing.LIDAR_ONLY else images
-
-    def _sensing(self, clip: Clip) -> Sensing:
-        return sensing(clip, self.settings) if self.settings.mode is RenderMode.AUTO else Sensing.NOTHING
+        return images | {"tags": [TAG_OF[made_of]]} if made_of in TAG_OF else images
 
     def _near_sweeps(self, clip: Clip, judged: Judged) -> bool:
         """Whether every pose to be drawn is within reach of a place that a sweep was taken from."""
@@ -118,8 +125,11 @@ class Imaging:
 
     def _photos(self, clip: Clip, judged: Judged, cameras: Sequence[Camera]) -> dict[str, object]:
         now_s = judged.scene.step * STEP_S
-        wanted = [now_s + offset * STEP_S for offset in STEPS_OF[self.settings.frames]]
-        files = [file for file in clip.images if min(abs(file.time_s - at) for at in wanted) <= PHOTO_SLACK_S]
+        files = [
+            photo_at(clip, camera.name, now_s + offset * STEP_S)
+            for offset in STEPS_OF[self.settings.frames]
+            for camera in cameras
+        ]
         photos = load_photos(files, cameras, self.settings.width, self.settings.height)
         poses = {(file.sensor, file.time_s): file.world_from_ego for file in files}
         found = [
@@ -152,6 +162,21 @@ class Imaging:
             }
             for camera in resized
         ]
+
+
+def photo_at(clip: Clip, camera: str, time_s: float) -> SensorFile:
+    """The clip's photo of a camera nearest to a time since its first step. Raises BadClip where none is near."""
+    mine = [file for file in clip.images if file.sensor == camera]
+    nearest = min(mine, key=lambda file: abs(file.time_s - time_s), default=None)
+    if nearest is None or abs(nearest.time_s - time_s) > PHOTO_SLACK_S:
+        at_s = clip.start_s + time_s
+        raise BadClip(
+            f"log {clip.log_id}",
+            f"camera {camera}",
+            f"no photo within {PHOTO_SLACK_S:g} s of {at_s:.2f} s of the log ({time_s:.2f} s of the clip): "
+            "restore the missing file, or leave the camera out by render.cameras=[...]",
+        )
+    return nearest
 
 
 def _block(clip: Clip, settings: RenderSettings, cache_dir: str) -> RenderAsset:

@@ -46,6 +46,12 @@ def load_photos(files: Sequence[SensorFile], cameras: Sequence[Camera], width: i
     return tuple(_photo(file, took[file.sensor], width, height) for file in files if file.sensor in took)
 
 
+def taken_by(cameras: Sequence[Camera], files: Sequence[SensorFile]) -> tuple[SensorFile, ...]:
+    """The files that one of the `cameras` took, in their order."""
+    names = {camera.name for camera in cameras}
+    return tuple(file for file in files if file.sensor in names)
+
+
 def chosen_cameras(rig: Sequence[Camera], names: Sequence[str] | None) -> tuple[Camera, ...]:
     """The named cameras in the order of `names`; the whole rig for none. Raises ValueError for an unknown name."""
     if not names:

@@ -148,6 +148,23 @@ def test_a_clip_without_lidar_or_without_a_rig_has_no_scene(clip: Clip, tmp_path
     assert asset_for(replace(clip, cameras=(), images=()), SETTINGS, tmp_path) is None
 
 
+def test_photos_without_lidar_are_a_scene_where_they_lie_close_enough_for_parallax(clip: Clip) -> None:
+    def spaced(metres: float) -> Clip:
+        poses = [np.eye(4) for _ in clip.images]
+        for k, pose in enumerate(poses):
+            pose[0, 3] = metres * k
+        images = tuple(replace(file, world_from_ego=pose) for file, pose in zip(clip.images, poses))
+        return replace(clip, images=images, sweeps=())
+
+    made_of = {metres: sensing(spaced(metres), SETTINGS) for metres in (0.0, 2.0, 7.0)}
+    assert made_of == {0.0: Sensing.NOTHING, 2.0: Sensing.PHOTOS_ONLY, 7.0: Sensing.NOTHING}
+
+
+def test_a_clip_with_photos_alone_has_a_scene(clip: Clip, tmp_path: Path) -> None:
+    asset = asset_for(replace(clip, sweeps=()), replace(SETTINGS, asset=AssetSettings(hold_out_every=3)), tmp_path)
+    assert asset is not None and asset.n_held_out == 1 and np.isfinite(asset.psnr_db) and len(asset.digest) == 16
+
+
 def test_a_clip_with_lidar_alone_has_a_grey_scene_of_unknown_quality(clip: Clip, tmp_path: Path) -> None:
     for file in clip.sweeps:
         table = pyarrow.feather.read_table(file.uri)
