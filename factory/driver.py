@@ -53,11 +53,9 @@ class Driver:
         digests: Mapping[str, str],
         rounds: int,
         policy: Callable[[Past], bool],
-        content_digests: Mapping[str, str],
     ) -> None:
-        """content_digests: clip_id -> digest, as the table `candidates` has them."""
         self._identity, self._digests, self._rounds, self._policy = identity, digests, rounds, policy
-        self._plan, self._content_digests = plan, content_digests
+        self._plan = plan
         self.executed = Executed(found_done=plan.found_done)
         self.notes: list[str] = []
         self._seconds: dict[str, list[float]] = defaultdict(lambda: [0, 0.0])
@@ -121,7 +119,7 @@ class Driver:
 
     def _open(self, clip: ClipPlan) -> None:
         if wants_payload(clip):
-            self._preparing[self._graph.submit("prepare", clip.ref)] = clip
+            self._preparing[self._graph.submit("prepare", clip.ref, clip.content)] = clip
         else:
             self._start_walks(clip, None)
 
@@ -135,15 +133,6 @@ class Driver:
 
     def _take_prepared(self, clip: ClipPlan, result: Any, report: Prepared | Rejected | Failure) -> None:
         clip_id = clip.ref.clip_id
-        if (
-            isinstance(report, Prepared)
-            and self._content_digests.get(clip_id, report.content_digest) != report.content_digest
-        ):
-            report = Failure(
-                ErrorKind.INPUT,
-                f"clip {clip_id} of log {clip.ref.log_id}: content digest {report.content_digest} where the table has "
-                f"{self._content_digests[clip_id]}: the log was changed; restore it or choose another out",
-            )
         replaced = [*clip.stale, *([clip.past.attempt_id] if clip.past is not None else [])]
         if isinstance(report, Rejected):
             replaced += [key for walk in clip.walks for key in walk.stale]
@@ -151,12 +140,13 @@ class Driver:
             self._count(report.seconds)
             if report.note:
                 self.notes.append(report.note)
-            if clip.listed is not None and not report.from_cache:
+            elif clip.listed is not None and not report.from_cache:
                 self.notes.append(f"clip {clip_id}: its prepared clip was not in the cache; prepared again")
             self.executed.prepared += not report.from_cache
             self.executed.from_cache += report.from_cache
             clip.n_candidates = len(report.candidates)
-            rows = [self._candidates_row(clip.ref, report)] if clip.listed is None else []
+            is_listed = clip.listed is not None and clip.listed.content_digest == report.content_digest
+            rows = [] if is_listed else [self._candidates_row(clip.ref, report)]
             self._gatherer.add(candidates=rows, replaced=replaced)
             clip.past = None
             self._start_walks(clip, result)

@@ -84,8 +84,7 @@ def execute(
             BAD_CONFIG, f"{error}; python -m factory.store.verify {store.location.uri} says what is damaged"
         )
     plan = make_plan(refs, experts, rounds, history, identity, on_change, policy)
-    content = {clip_id: row.content_digest for clip_id, row in history.candidates.items() if on_change != "redo"}
-    driver = Driver(identity, plan, digests, rounds, policy, content)
+    driver = Driver(identity, plan, digests, rounds, policy)
     if plan.frozen:
         driver.notes.append(f"{len(plan.frozen)} clips kept as they are: their candidates come from other settings")
     code, message = COMPLETE, ""

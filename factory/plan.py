@@ -38,8 +38,9 @@ class ClipPlan:
     walks: tuple[WalkState, ...]
     past: Past | None  # the clip-level outcome, where there is one
     listed: Listed | None  # its row in `candidates`, where it is this run's
-    stale: frozenset[str] = frozenset()  # redo: clip-level rows to replace
-    n_candidates: int = 0
+    stale: frozenset[str]  # redo: clip-level rows to replace
+    n_candidates: int
+    content: str | None  # digest that the rows which are to stay were made from
     failed: bool = False  # the clip as a whole, in this run or for good
     steps: dict[str, Step] = field(default_factory=dict)
 
@@ -68,6 +69,7 @@ def make_plan(
     done: list[ClipPlan] = []
     frozen: list[ClipRef] = []
     found = 0
+    others = {clip_id for clip_id, expert in history.walks if expert not in ("", *experts)}
     for ref in refs:
         listed = history.candidates.get(ref.clip_id)
         if listed is not None and listed.prepare_digest != identity.prepare_digest:
@@ -75,13 +77,17 @@ def make_plan(
                 frozen.append(ref)
                 continue
             listed = None
+        walks = tuple(_walk(history, ref.clip_id, expert, on_change) for expert in experts)
+        whole = _walk(history, ref.clip_id, "", on_change)
+        stays = on_change != "redo" or any(walk.known and not walk.stale for walk in walks) or ref.clip_id in others
         clip = ClipPlan(
             ref,
-            tuple(_walk(history, ref.clip_id, expert, on_change) for expert in experts),
-            _walk(history, ref.clip_id, "", on_change).known.get(CLIP_CANDIDATE),
+            walks,
+            whole.known.get(CLIP_CANDIDATE),
             listed,
-            _stale(history, ref.clip_id, "", on_change),
+            whole.stale,
             listed.n_candidates if listed is not None else 0,
+            listed.content_digest if listed is not None and stays else None,
         )
         found += sum(past.kind in (Kind.ACCEPTED, Kind.REJECTED) for walk in clip.walks for past in walk.known.values())
         (todo if _has_work(clip, rounds, may_retry) else done).append(clip)
@@ -90,13 +96,11 @@ def make_plan(
 
 def _walk(history: History, clip_id: str, expert: str, on_change: OnChange) -> WalkState:
     known = dict(history.walks.get((clip_id, expert), {}))
-    if on_change == "redo":
-        known = {candidate: past for candidate, past in known.items() if past.current}
-    return WalkState(expert, known, _stale(history, clip_id, expert, on_change))
-
-
-def _stale(history: History, clip_id: str, expert: str, on_change: OnChange) -> frozenset[str]:
-    return history.stale.get((clip_id, expert), frozenset()) if on_change == "redo" else frozenset()
+    stale = history.stale.get((clip_id, expert), frozenset()) if on_change == "redo" else frozenset()
+    if stale:  # the walk is made anew from its first candidate; what an earlier redo failed at stands
+        stale |= {past.attempt_id for past in known.values()}
+        known = {i: past for i, past in known.items() if past.current and past.kind is Kind.FAILED}
+    return WalkState(expert, known, stale)
 
 
 def _has_work(clip: ClipPlan, rounds: int, may_retry: Policy) -> bool:
@@ -112,5 +116,6 @@ def _has_work(clip: ClipPlan, rounds: int, may_retry: Policy) -> bool:
 
 
 def wants_payload(clip: ClipPlan) -> bool:
-    """Some walk has an attempt to make, so that the prepared clip is needed."""
-    return clip.listed is None or any(isinstance(step, Try) for step in clip.steps.values())
+    """Some walk has an attempt to make, or preparing failed before, so that the prepared clip is needed."""
+    tries = any(isinstance(step, Try) for step in clip.steps.values())
+    return clip.listed is None or clip.past is not None or tries

@@ -75,8 +75,13 @@ def cache_key(clip_id: str, prepare_digest: str) -> str:
     return f"{clip_id}-{hashlib.sha256(prepare_digest.encode()).hexdigest()[:16]}"
 
 
-def prepare(work: Work, out: Location, ref: ClipRef) -> tuple[Prepared | Rejected | Failure, PreparedClip | None]:
-    """The clip from the cache, else prepared and cached."""
+def prepare(
+    work: Work, out: Location, ref: ClipRef, wanted_content: str | None = None
+) -> tuple[Prepared | Rejected | Failure, PreparedClip | None]:
+    """The clip from the cache, else prepared and cached; wanted_content: the digest that its stored rows are made of.
+
+    A log that was changed is an input failure where its rows are to be continued, else its cached clip is not used.
+    """
     cache, key = ClipCache(out.child("cache/prepared")), cache_key(ref.clip_id, work.identity.prepare_digest)
     note, began = "", time.perf_counter()
     try:
@@ -84,18 +89,31 @@ def prepare(work: Work, out: Location, ref: ClipRef) -> tuple[Prepared | Rejecte
             stored = cache.load(key)
         except BadCacheFile as error:
             stored, note = None, f"cache file {key}: {error}; prepared again"
+        found = work.content_digest(ref) if stored is not None or wanted_content is not None else None
+        _refuse_changed(ref, found, wanted_content)
+        if isinstance(stored, PreparedClip) and found not in (None, stored.content_digest):
+            stored, note = None, f"cache file {key}: log {ref.log_id} was changed since; prepared again"
         if isinstance(stored, PreparedClip):
+            _refuse_changed(ref, stored.content_digest, wanted_content)
             seconds = {"cache": time.perf_counter() - began}
             return _prepared(stored, True, note, seconds), stored
         result = work.prepare(ref)
         if isinstance(result, Rejected):
+            _refuse_changed(ref, f"none ({result.reason})", wanted_content)  # the clip had candidates
             return result, None
         if result.clip_id != ref.clip_id:
             raise ValueError(f"prepare({ref.clip_id}) returned clip {result.clip_id}")
+        _refuse_changed(ref, result.content_digest, wanted_content)
         cache.store(key, result)
         return _prepared(result, False, note, result.seconds), result
     except Exception as error:  # the boundary where whatever a stage or a user's reader raises becomes data
         return failure_of(error), None
+
+
+def _refuse_changed(ref: ClipRef, found: str | None, wanted: str | None) -> None:
+    if None not in (found, wanted) and found != wanted:
+        problem = f"content digest {found} where the table has {wanted} for clip {ref.clip_id}: the log was changed"
+        raise BadClip(f"log {ref.log_id}", "clip", f"{problem}; restore it or choose another out")
 
 
 def attempt(work: Work, prepared: PreparedClip, stamp: Stamp) -> tuple[Attempted | Failure, pa.Table | None]:

@@ -180,14 +180,66 @@ def test_a_redo_that_fails_midway_keeps_the_old_walk(tmp_path: Path) -> None:
     assert_same_tables(tmp_path / "out", tmp_path / "fresh")
 
 
-def test_a_changed_log_under_the_same_clip_id_is_refused_by_name(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("is_cached", "changed", "found"),
+    [
+        (True, ToyWork(content="other"), "other"),
+        (False, ToyWork(content="other"), "other"),
+        (False, ToyWork(content="other", tells_content=False), "other"),
+        (False, ToyWork(trouble={"log0:0": "standing"}, tells_content=False), "none (ego_standing)"),
+    ],
+)
+def test_a_changed_log_under_the_same_clip_id_is_refused_by_name(
+    tmp_path: Path, is_cached: bool, changed: ToyWork, found: str
+) -> None:
     run(tmp_path / "out", rounds=1, n=1)
-    for path in (tmp_path / "out/cache/prepared").iterdir():
+    before = tables_of(tmp_path / "out")
+    for path in [] if is_cached else (tmp_path / "out/cache/prepared").iterdir():
         path.unlink()
-    summary = run(tmp_path / "out", ToyWork(content="other"), rounds=3, n=1)
+    summary = run(tmp_path / "out", changed, rounds=3, n=1)
     assert summary.exit_code == COMPLETE_WITH_FAILURES
-    (row,) = [o for o in tables_of(tmp_path / "out")[1] if o["kind"] == "failed"]  # type: ignore[index]
-    assert "content digest other where the table has content" in row["error"]  # type: ignore[index]
+    samples, outcomes, candidates = tables_of(tmp_path / "out")
+    (row,) = [o for o in outcomes if o["kind"] == "failed"]  # type: ignore[index]
+    assert row["error_kind"] == "input"  # type: ignore[index]
+    assert f"log log0: clip: content digest {found} where the table has content" in row["error"]  # type: ignore[index]
+    assert_same_rows(samples, before[0])
+    assert candidates == before[2]
+
+
+def test_a_restored_log_goes_on(tmp_path: Path) -> None:
+    run(tmp_path / "out", rounds=1)
+    run(tmp_path / "out", ToyWork(content="other"), rounds=3)
+    assert run(tmp_path / "out", rounds=3, retry=True).exit_code == COMPLETE
+    run(tmp_path / "never", rounds=3)
+    assert_same_tables(tmp_path / "out", tmp_path / "never")
+
+
+def test_redo_reads_a_changed_log_anew_in_spite_of_the_cache(tmp_path: Path) -> None:
+    run(tmp_path / "out", rounds=2)
+    changed = ToyWork(threshold=0.3, content="other")
+    assert run(tmp_path / "out", changed, on_change="redo").exit_code == COMPLETE
+    run(tmp_path / "fresh", changed)
+    assert_same_tables(tmp_path / "out", tmp_path / "fresh")
+    assert run(tmp_path / "out", changed, rounds=3).exit_code == COMPLETE
+
+
+def test_redo_refuses_a_changed_log_whose_rows_are_to_stay(tmp_path: Path) -> None:
+    run(tmp_path / "out", rounds=1, n=1)
+    before = tables_of(tmp_path / "out")
+    changed = ToyWork(digests={"recovery": "table-2"}, content="other")
+    assert run(tmp_path / "out", changed, rounds=1, n=1, on_change="redo").exit_code == COMPLETE_WITH_FAILURES
+    samples, _, candidates = tables_of(tmp_path / "out")
+    assert_same_rows(samples, before[0])
+    assert candidates == before[2]
+
+
+def test_redo_makes_a_walk_of_mixed_settings_anew(tmp_path: Path) -> None:
+    run(tmp_path / "out", rounds=1)
+    changed = ToyWork(threshold=0.1)
+    run(tmp_path / "out", changed, rounds=3, on_change="keep")
+    assert run(tmp_path / "out", changed, rounds=3, on_change="redo").exit_code == COMPLETE
+    run(tmp_path / "fresh", changed, rounds=3)
+    assert_same_tables(tmp_path / "out", tmp_path / "fresh")
 
 
 def test_zero_inputs_and_double_ones_write_nothing(tmp_path: Path) -> None:
