@@ -33,7 +33,7 @@ SUBSCORES = ("nc", "dac", "ddc", "tlc", "ep", "ttc", "lk", "hc", "ec")  # EPDMS,
 STAGES: tuple[Stage, ...] = (
     Stage("clip", 1, "clip", ("ego_standing", "broken_tracks", "route_ended")),
     Stage("perturb", 1, "clip", ("no_gated_candidate", "no_good_candidate")),
-    Stage("rollout", 1, "attempt", ("route_ended",)),
+    Stage("rollout", 2, "attempt", ("route_ended",)),
     Stage("expert", 1, "attempt", ("no_plan",)),
     Stage("reward", 1, "attempt", SUBSCORES),
     Stage("render", 1, "attempt", ("psnr",)),

@@ -6,7 +6,9 @@ All agents look at the same instant and then move together, so their order does 
 ego included, that reaches into the corridor the driver's own body will sweep along its path; speeds never go below
 zero. The published parameters are kept. Unlike the public traffic a driver brakes harder than `b` only where stopping
 behind the leader's own emergency stop needs it, and never harder than tyres can: logged drivers follow closer than s*
-and would otherwise all stamp on the brake at the first step. Compiled: tens of agents for 4 s take some milliseconds.
+and would otherwise all stamp on the brake at the first step. A vehicle that replays its log takes the wheel, along its
+logged way, as soon as a driven vehicle there asks for more than `b`; it stays at it for the rest of the rollout.
+Compiled: tens of agents for 4 s take some milliseconds.
 """
 
 import math
@@ -55,11 +57,12 @@ class Cast(NamedTuple):
     """Who does what, N agents; steps are the clip's."""
 
     path: NDArray[np.int64]  # (N,) index of its path, -1: none
+    logged_path: NDArray[np.int64]  # (N,) index of the path along its own log, for one that may have to brake; -1: none
     join_step: NDArray[np.int64]  # (N,) logged step from which it is driven, if it has a path
     hold_until: NDArray[np.int64]  # (N,) a car that stands in its log does not start before
     clock: NDArray[np.int64]  # (N,) step of its log it is at when the rollout starts
     standing: NDArray[np.bool_]  # (N,) parked
-    moving_kind: NDArray[np.bool_]  # (N,) vehicle, pedestrian or bicycle: waits rather than walk into a driven car
+    moving_kind: NDArray[np.bool_]  # (N,) vehicle, pedestrian or bicycle: does not walk into a driven car
     enters_clear: NDArray[np.bool_]  # (N,) vehicles that may only enter with clearance to the ego
 
 
@@ -81,10 +84,16 @@ def idm_acceleration(speed: float, target_speed: float, gap: float, lead_speed: 
     closing = speed * (speed - lead_speed) / (2.0 * math.sqrt(driver.accel * driver.decel))
     desired = driver.min_gap + max(0.0, speed * driver.headway + closing)
     ratio = desired / gap
+    hardest = min(max(driver.decel, needed_deceleration(speed, gap, lead_speed, driver)), driver.emergency_decel)
+    return max(free - driver.accel * ratio * ratio, -hardest)
+
+
+@kernel
+def needed_deceleration(speed: float, gap: float, lead_speed: float, driver: Driver) -> float:
+    """[m/s2] that stops half the minimum gap behind a leader which makes an emergency stop now."""
     lead_stop = max(lead_speed, 0.0) ** 2 / (2.0 * driver.emergency_decel)
     room = max(gap - 0.5 * driver.min_gap, SMALLEST_GAP_M) + lead_stop
-    hardest = min(max(driver.decel, speed * speed / (2.0 * room)), driver.emergency_decel)
-    return max(free - driver.accel * ratio * ratio, -hardest)
+    return speed * speed / (2.0 * room)
 
 
 @kernel
@@ -108,6 +117,49 @@ def stop_line_gap(paths: Paths, m: int, step: int, nose: float, speed: float, de
         if room >= 0.0 or (room > -STOP_LINE_TOLERANCE_M and speed < 1.0):
             gap = min(gap, max(room, 0.0))
     return gap
+
+
+@kernel
+def _start_on(paths: Paths, m: int, box: Array, velocity: Array, driver: Driver) -> tuple[float, float, float, float]:
+    """(path length, offset to the left, turn, speed) of a vehicle that starts to follow path m."""
+    s, left = project_on_path(paths, m, box[0], box[1])
+    difference = box[2] - pose_on_path(paths, m, s, 0.0, left, 0.0, driver.blend_length)[2]
+    turn = (difference + math.pi) % (2.0 * math.pi) - math.pi
+    return s, left, turn, max(0.0, velocity[0] * math.cos(box[2]) + velocity[1] * math.sin(box[2]))
+
+
+@kernel
+def _gap_to(
+    paths: Paths, m: int, s: float, travelled: float, offset: float, turn: float, box: Array,
+    other: Array, corners: Array, radius: float, driver: Driver,
+) -> tuple[float, float]:  # fmt: skip
+    """(gap [m] from the bumper of `box` along its path to an other box, path heading there); inf: not in the way."""
+    if not math.hypot(other[0] - box[0], other[1] - box[1]) <= driver.lookahead + box[3] + radius:
+        return np.inf, 0.0  # also where it is absent (NaN)
+    return corridor_gap(
+        paths, m, s, travelled, offset, turn, 0.5 * box[3], 0.5 * box[4] + driver.corridor_margin,
+        corners, other, radius, driver.blend_length, driver.lookahead,
+    )  # fmt: skip
+
+
+@kernel
+def _must_brake(
+    paths: Paths, m: int, i: int, box: Array, velocity: Array,
+    boxes: Array, velocities: Array, mode: NDArray[np.int64], corners: Array, radius: Array, driver: Driver,
+) -> bool:  # fmt: skip
+    """Does a driven vehicle on path m ask agent i, at `box`, for more than the comfortable deceleration?"""
+    s, left, turn, speed = _start_on(paths, m, box, velocity, driver)
+    if 0.5 * speed * speed <= driver.decel * SMALLEST_GAP_M:
+        return False  # too slow to need it at any gap
+    for j in range(mode.shape[0]):
+        if j == i or mode[j] != DRIVEN:
+            continue
+        gap, h = _gap_to(paths, m, s, 0.0, left, turn, box, boxes[j], corners[j], radius[j], driver)
+        if gap < np.inf:
+            lead_speed = velocities[j, 0] * math.cos(h) + velocities[j, 1] * math.sin(h)
+            if needed_deceleration(speed, gap, lead_speed, driver) > driver.decel:
+                return True
+    return False
 
 
 @kernel
@@ -155,51 +207,55 @@ def drive(
     center_z = np.full((n_rows, n), np.nan)
     boxes[0], velocities[0], valid[0], center_z[0] = now.boxes, now.velocities, now.valid, now.center_z
 
-    mode = np.zeros(n, np.int64)
+    mode, path = np.zeros(n, np.int64), np.full(n, -1)
     clock = cast.clock.copy()
     s, travelled, speed = np.zeros(n), np.zeros(n), np.zeros(n)
     offset, turn, base_z = np.zeros(n), np.zeros(n), np.zeros(n)
     was_driven = np.zeros(n, np.bool_)
     corners = np.zeros((n + 1, 4, 2))
     radius = np.zeros(n + 1)
-    fresh = np.zeros(n, np.int64)
+    fresh, takes = np.zeros(n, np.int64), np.full(n, -1)
 
     for i in range(n):
         if now.valid[i]:
             mode[i] = STANDING if cast.standing[i] else REPLAYED
 
-    for t in range(n_rows):
-        # Who is on the lane and due takes the wheel, at its own pose and speed.
-        for i in range(n):
-            m = cast.path[i]
-            if mode[i] != REPLAYED or m < 0 or clock[i] < cast.join_step[i] or not valid[t, i]:
-                continue
-            at, left = project_on_path(paths, m, boxes[t, i, 0], boxes[t, i, 1])
-            if abs(left) > driver.largest_offset:
-                continue
-            mode[i] = DRIVEN
-            s[i], offset[i], travelled[i] = at, left, 0.0
-            k = min(max(round(at / PATH_SPACING_M), 0), paths.heading.shape[1] - 1)
-            difference = boxes[t, i, 2] - pose_on_path(paths, m, at, 0.0, left, 0.0, driver.blend_length)[2]
-            turn[i] = (difference + math.pi) % (2.0 * math.pi) - math.pi
-            base_z[i] = center_z[t, i] - paths.height[m, k]
-            h = boxes[t, i, 2]
-            speed[i] = max(0.0, velocities[t, i, 0] * math.cos(h) + velocities[t, i, 1] * math.sin(h))
-        if t == n_rows - 1:
-            break
-
+    for t in range(n_rows - 1):
         for j in range(n + 1):
             box = ego_boxes[t] if j == n else boxes[t, j]
             corners_of(box, corners[j])
             radius[j] = 0.5 * math.hypot(box[3], box[4])
 
+        # Who is on the lane and due takes the wheel, at its own pose and speed; so does who must brake on its log.
+        for i in range(n):
+            takes[i] = -1
+            if mode[i] != REPLAYED or not valid[t, i]:
+                continue
+            m = cast.path[i]
+            if m >= 0 and clock[i] >= cast.join_step[i]:
+                left = project_on_path(paths, m, boxes[t, i, 0], boxes[t, i, 1])[1]
+                if abs(left) <= driver.largest_offset:
+                    takes[i] = m
+            m = cast.logged_path[i]
+            if takes[i] < 0 and m >= 0 and _must_brake(
+                paths, m, i, boxes[t, i], velocities[t, i], boxes[t], velocities[t], mode, corners, radius, driver
+            ):  # fmt: skip
+                takes[i] = m
+        for i in range(n):
+            m = takes[i]
+            if m >= 0:
+                mode[i], path[i], travelled[i] = DRIVEN, m, 0.0
+                s[i], offset[i], turn[i], speed[i] = _start_on(paths, m, boxes[t, i], velocities[t, i], driver)
+                k = min(max(round(s[i] / PATH_SPACING_M), 0), paths.heading.shape[1] - 1)
+                base_z[i] = center_z[t, i] - paths.height[m, k]
+
         # Everyone driven looks at row t and moves to row t + 1.
         for i in range(n):
             if mode[i] != DRIVEN:
                 continue
-            m = cast.path[i]
+            m = path[i]
             length, width = boxes[t, i, 3], boxes[t, i, 4]
-            held = start + t < cast.hold_until[i] and travelled[i] == 0.0
+            held = start + t < cast.hold_until[i] and travelled[i] == 0.0 and m == cast.path[i]
             step_m, new_speed = 0.0, 0.0
             if not held:
                 was_driven[i] = True
@@ -213,13 +269,9 @@ def drive(
                     if j == i or (j < n and mode[j] == ABSENT) or (j < n and not valid[t, j]):
                         continue
                     other = ego_boxes[t] if j == n else boxes[t, j]
-                    away = math.hypot(other[0] - boxes[t, i, 0], other[1] - boxes[t, i, 1])
-                    if away > driver.lookahead + length + radius[j]:
-                        continue
-                    gap, h = corridor_gap(
-                        paths, m, s[i], travelled[i], offset[i], turn[i], 0.5 * length,
-                        0.5 * width + driver.corridor_margin, corners[j], other, radius[j],
-                        driver.blend_length, driver.lookahead,
+                    gap, h = _gap_to(
+                        paths, m, s[i], travelled[i], offset[i], turn[i], boxes[t, i],
+                        other, corners[j], radius[j], driver,
                     )  # fmt: skip
                     if gap < np.inf:
                         v = ego_velocities[t] if j == n else velocities[t, j]
@@ -242,14 +294,15 @@ def drive(
             center_z[t + 1, i] = base_z[i] + paths.height[m, k]
             valid[t + 1, i] = True
 
-        # The others: the parked stay, the replayed take the next step of their log unless a driven car is there.
+        # The others: the parked stay, the replayed take the next step of their log; who cannot brake along it (who
+        # walks or cycles, or reverses) not where a driven car is.
         for i in range(n):
             if mode[i] == STANDING:
                 boxes[t + 1, i], center_z[t + 1, i], valid[t + 1, i] = boxes[t, i], center_z[t, i], True
                 velocities[t + 1, i] = 0.0
             elif mode[i] == REPLAYED:
                 k = min(clock[i] + 1, n_log - 1)
-                if cast.moving_kind[i] and valid[t, i] and log.valid[k, i]:
+                if cast.moving_kind[i] and cast.logged_path[i] < 0 and valid[t, i] and log.valid[k, i]:
                     blocked = _touches_driven(log.boxes[k, i], boxes[t + 1], mode, i)
                     if blocked and not _touches_driven(boxes[t, i], boxes[t + 1], mode, i):
                         boxes[t + 1, i], center_z[t + 1, i], valid[t + 1, i] = boxes[t, i], center_z[t, i], True

@@ -3,7 +3,7 @@
 At every fork the log decides: of all ways that start at the vehicle and are long enough, the one nearest to the logged
 track wins, the straightest where the log does not tell. Along it the vehicle keeps the lateral offset its log has there
 (people do not drive on the centreline, and pass parked cars with room), fading to the centre where the log ends; beyond
-the last lane (the map's crop) the path goes straight on.
+the last lane (the map's crop) the path goes straight on. Off the lanes a vehicle's own log is its path.
 """
 
 import math
@@ -31,6 +31,7 @@ MAX_LOG_OFFSET_M = 4.5  # a log farther than this from the way is not followed s
 FADE_M = 30.0  # from the log's last offset to the centre
 SMOOTHING_POINTS = 7  # 3 m
 END_CHORD_M = 5.0  # a lane's last few points may be noise
+LOGGED_PATH_SPACING_M = 1.0  # of the logged points that make a path: boxes jitter by decimetres
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class LaneIndex:
 
 @dataclass(frozen=True)
 class LanePath:
-    """A way through the lane graph as points every PATH_SPACING_M."""
+    """A way through the lane graph, or over no lanes, as points every PATH_SPACING_M."""
 
     xy: Array  # (P, 2) [m]
     heading: Array  # (P,) [rad], unwrapped
@@ -133,6 +134,48 @@ def find_path(
     else:
         way = ways[0]
     return _path_of(index, _extended(index, way, pose, ahead_m), pose, log_poses, ahead_m)
+
+
+def logged_path(track: Array, ahead_m: float) -> LanePath | None:
+    """The path along a vehicle's own log, straight on past its end.
+
+    track (K, 5): x, y, heading, height, speed where it is and then step by step; its speeds are the path's limits.
+    None where it hardly moves, or not the way it faces (reversing).
+    """
+    chosen: list[int] = []
+    for k, point in enumerate(track):
+        if not chosen or np.hypot(*(point[:2] - track[chosen[-1], :2])) >= LOGGED_PATH_SPACING_M:
+            chosen.append(k)
+    if len(chosen) < 2:
+        return None
+    points = track[chosen]
+    edge = np.diff(points[:, :2], axis=0)
+    if (np.abs(wrap_angle(np.arctan2(edge[:, 1], edge[:, 0]) - points[:-1, 2])) > SNAP_HEADING_RAD).any():
+        return None
+    length = np.concatenate([[0.0], np.cumsum(np.hypot(*edge.T))])
+    n_points = math.ceil((BEHIND_M + ahead_m) / PATH_SPACING_M) + 1
+    grid = PATH_SPACING_M * np.arange(n_points, dtype=np.float64) - BEHIND_M
+    xy = _at(points[:, :2], length, grid)
+    return LanePath(
+        xy=xy,
+        heading=_chord_headings(xy),
+        height=np.interp(grid, length, points[:, 3]),
+        speed_limit_mps=np.interp(grid, length, points[:, 4]),
+        lane_entries=(),
+    )
+
+
+def straight_path(pose: Array, ahead_m: float) -> LanePath:
+    """A path straight on, for a car that has left the map and its log."""
+    along = np.arange(math.ceil((BEHIND_M + ahead_m) / PATH_SPACING_M) + 1) * PATH_SPACING_M - BEHIND_M
+    direction = np.array([np.cos(pose[2]), np.sin(pose[2])])
+    return LanePath(
+        xy=pose[:2] + along[:, None] * direction,
+        heading=np.full(len(along), pose[2]),
+        height=np.zeros(len(along)),
+        speed_limit_mps=np.full(len(along), np.nan),
+        lane_entries=(),
+    )
 
 
 def _point_costs(distance: Array, difference: Array) -> Array:

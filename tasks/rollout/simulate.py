@@ -3,7 +3,8 @@
 The ego is tracked first, since it follows its plan whatever the traffic does; then the traffic answers to it.
 
 * A vehicle on a lane (within `snap_distance_m` of a centreline, heading within 60 degrees) is driven by IDM along its
-  way through the lane graph; one beside the lanes replays its log until it is on one.
+  way through the lane graph; one beside the lanes replays its log until it is on one. Where a driven vehicle on its
+  logged way leaves it no room to go on without braking harder than comfort, it is driven by IDM along that way instead.
 * A vehicle that its whole log shows standing stays where it is; one that stands now does not start before its log
   does; one that its log stops at a junction stops there as long. The log is all we have of lights and signs that are
   not in the map.
@@ -11,8 +12,8 @@ The ego is tracked first, since it follows its plan whatever the traffic does; t
 * A vehicle first seen later enters at the first logged step where its box is free, with the minimum gap at both ends,
   and the ego's centre is `enter_clearance_m` away, and is driven from then on; else never. Parked cars, pedestrians and
   things appear by their log.
-* Pedestrians, cyclists and replayed vehicles walk their log; before a step into a driven vehicle they wait, then go on
-  late along the same log. They do not wait for the ego: its reward must not profit from their care.
+* Pedestrians and cyclists walk their log; before a step into a driven vehicle they wait, then go on late along the
+  same log. Neither they nor replayed vehicles wait for the ego: its reward must not profit from their care.
 """
 
 from collections.abc import Iterable, Iterator
@@ -24,7 +25,16 @@ from numpy.typing import NDArray
 
 from tasks.rollout.corridor import PATH_SPACING_M, Paths
 from tasks.rollout.idm import CLOSED, CLOSED_IF_STOPPABLE, OPEN, Cast, Driver, World, drive
-from tasks.rollout.lane_following import BEHIND_M, LaneIndex, LanePath, find_path, index_lanes, lane_costs, on_a_lane
+from tasks.rollout.lane_following import (
+    LaneIndex,
+    LanePath,
+    find_path,
+    index_lanes,
+    lane_costs,
+    logged_path,
+    on_a_lane,
+    straight_path,
+)
 from tasks.rollout.lqr import track
 from tasks.world.agents import MOVING_KINDS, AgentKind, AgentTracks
 from tasks.world.clip import HORIZON_STEPS, STEP_S, Rollout, Scene
@@ -93,31 +103,37 @@ def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
     ahead_m = _path_length(scene, settings)
 
     join, hold = np.full(n, NEVER), np.zeros(n, dtype=np.int64)
+    clock = _clocks(scene)
     found: list[LanePath | None] = [None] * n
+    logged_ways: list[LanePath | None] = [None] * n
     for i in np.flatnonzero(is_vehicle & ~standing).tolist():
         driven_before = bool(moved[i] and now.valid[start, i])
         step = start if driven_before else _join_step(index, scene, i, settings.snap_distance_m)
+        if step != start:
+            logged_ways[i] = logged_path(_logged_track(scene, i, int(clock[i])), ahead_m)
         if step == NEVER:
             continue
         pose = (now.boxes[start, i, :3] if step == start else log.boxes[step, i, :3]).copy()
         logged = log.boxes[np.flatnonzero(log.valid[:, i])[::LOG_STRIDE], i, :3]
         found[i] = find_path(index, pose, logged, settings.snap_distance_m, ahead_m)
         if found[i] is None:  # a driven car that left the map
-            found[i] = straight_path(pose, ahead_m)
+            found[i] = logged_path(_logged_track(scene, i, int(clock[i])), ahead_m) or straight_path(pose, ahead_m)
         if driven_before:
             join[i] = 0  # wherever its log is by now
         else:
             join[i], hold[i] = step, _start_step(log, i, step)
+    numbers = _numbered(found + logged_ways)
     cast = Cast(
-        path=_numbered(found),
+        path=numbers[:n],
+        logged_path=numbers[n:],
         join_step=join,
         hold_until=hold,
-        clock=_clocks(scene),
+        clock=clock,
         standing=standing,
         moving_kind=moving_kind,
         enters_clear=is_vehicle & ~standing,
     )
-    return TrafficScene(scene, settings, cast, _stacked(scene, settings, found), tuple(found))
+    return TrafficScene(scene, settings, cast, _stacked(scene, settings, found, logged_ways), tuple(found))
 
 
 def simulate(
@@ -183,19 +199,6 @@ def next_scene(scene: Scene, rollout: Rollout, centerline: Array) -> Scene:
         agents=scene.agents.overwritten(rollout.start_step, rollout.agents),
         centerline=centerline,
         ever_simulated=moved,
-    )
-
-
-def straight_path(pose: Array, ahead_m: float) -> LanePath:
-    """A path straight on, for a car that has left the map."""
-    along = np.arange(int(np.ceil((BEHIND_M + ahead_m) / PATH_SPACING_M)) + 1) * PATH_SPACING_M - BEHIND_M
-    direction = np.array([np.cos(pose[2]), np.sin(pose[2])])
-    return LanePath(
-        xy=pose[:2] + along[:, None] * direction,
-        heading=np.full(len(along), pose[2]),
-        height=np.zeros(len(along)),
-        speed_limit_mps=np.full(len(along), np.nan),
-        lane_entries=(),
     )
 
 
@@ -277,27 +280,44 @@ def _clocks(scene: Scene) -> NDArray[np.int64]:
     return clock
 
 
+def _logged_track(scene: Scene, i: int, clock: int) -> Array:
+    """(K, 5) x, y, heading, height, speed of agent i: where it is, if it is there, then its log after step `clock`."""
+
+    def columns(agents: AgentTracks, steps: slice) -> Array:
+        seen = agents.valid[steps, i]
+        speed = np.hypot(*agents.velocities[steps, i].T)
+        return np.column_stack([agents.boxes[steps, i, :3], agents.center_z[steps, i], speed])[seen]
+
+    here = columns(scene.agents, slice(scene.step, scene.step + 1))
+    return np.concatenate([here, columns(scene.clip.agents, slice(clock + 1, None))])
+
+
 def _numbered(found: list[LanePath | None]) -> NDArray[np.int64]:
     has = np.array([path is not None for path in found], dtype=bool)
     return np.where(has, np.cumsum(has) - 1, -1)
 
 
-def _stacked(scene: Scene, settings: TrafficSettings, found: list[LanePath | None]) -> Paths:
-    chosen = [(i, path) for i, path in enumerate(found) if path is not None]
-    n_points = len(chosen[0][1].xy) if chosen else 2
+def _stacked(
+    scene: Scene, settings: TrafficSettings, found: list[LanePath | None], logged_ways: list[LanePath | None]
+) -> Paths:
+    """As `_numbered` counts them; a logged way needs no stop lines, its own speeds tell."""
+    chosen = [path for path in found + logged_ways if path is not None]
+    n_points = len(chosen[0].xy) if chosen else 2
     line_at: list[float] = []
     line_state: list[NDArray[np.uint8]] = []
     line_start = [0]
-    for i, path in chosen:
-        for at, state in [*_light_lines(scene, path), *_logged_stops(scene, path, i)]:
-            line_at.append(at)
-            line_state.append(state)
-        line_start.append(len(line_at))
+    for i, path in enumerate(found):
+        if path is not None:
+            for at, state in [*_light_lines(scene, path), *_logged_stops(scene, path, i)]:
+                line_at.append(at)
+                line_state.append(state)
+            line_start.append(len(line_at))
+    line_start += [len(line_at)] * (len(chosen) + 1 - len(line_start))
     return Paths(
-        xy=np.array([path.xy for _, path in chosen]).reshape(-1, n_points, 2),
-        heading=np.array([path.heading for _, path in chosen]).reshape(-1, n_points),
-        height=np.array([path.height for _, path in chosen]).reshape(-1, n_points),
-        target_speed=np.array([_target_speed(path, settings) for _, path in chosen]).reshape(-1, n_points),
+        xy=np.array([path.xy for path in chosen]).reshape(-1, n_points, 2),
+        heading=np.array([path.heading for path in chosen]).reshape(-1, n_points),
+        height=np.array([path.height for path in chosen]).reshape(-1, n_points),
+        target_speed=np.array([_target_speed(path, settings) for path in chosen]).reshape(-1, n_points),
         line_start=np.array(line_start, dtype=np.int64),
         line_at=np.array(line_at, dtype=np.float64),
         line_state=np.array(line_state, dtype=np.uint8).reshape(-1, HORIZON_STEPS + 1).T.copy(),

@@ -247,7 +247,7 @@ GOLDEN: dict[str, Golden] = {
         },
     ),
     "rollout": Golden(
-        1,
+        2,
         {
             "first idm ego": (31.1562574, 0.259936504),
             "first idm boxes": (179.467451, 1.28283393),

@@ -74,6 +74,18 @@ def test_driven_cars_move_as_their_velocity_says_and_turn_like_cars(clips: list[
             assert turned.max(initial=0.0) < 0.15
 
 
+def test_no_vehicle_stops_harder_than_tyres_can(clips: list[Clip]) -> None:
+    """Also not one that replays its log towards a driven car."""
+    settings = TrafficSettings()
+    for clip in clips:
+        is_vehicle = np.array([kind == AgentKind.VEHICLE for kind in clip.agents.kinds])
+        for _, rollout in two_rollouts(clip, settings):
+            agents = rollout.agents
+            speed: NDArray[np.float64] = np.hypot(*np.moveaxis(agents.velocities, -1, 0))
+            lost = -np.diff(speed, axis=0)[(agents.valid[1:] & agents.valid[:-1]) & is_vehicle]
+            assert lost.max(initial=0.0) < settings.emergency_decel * STEP_S + 0.3  # logged velocities are noisy
+
+
 def test_driven_cars_stay_within_reach_of_a_lane(clips: list[Clip]) -> None:
     """At the end of H, 9 of 10 are within 2.5 m of a centreline; the others drove straight on off the map's crop."""
     distances = []

@@ -6,7 +6,7 @@ import shapely
 import shapely.ops
 
 from tasks.rollout.corridor import Paths, boxes_overlap, corners_of, corridor_gap, pose_on_path, project_on_path
-from tasks.rollout.idm import Driver, advance, idm_acceleration, stop_line_gap
+from tasks.rollout.idm import Driver, advance, idm_acceleration, needed_deceleration, stop_line_gap
 from tasks.world.frames import box_corners
 
 DRIVER = Driver(1.0, 1.5, 1.0, 2.0, 4.0, 8.0, 60.0, 0.0, 20.0, 5.0, 30.0)
@@ -53,6 +53,13 @@ def test_in_equilibrium_the_gap_is_idms_own() -> None:
 def test_too_fast_on_a_free_road_brakes_comfortably_and_a_wall_brakes_at_the_tyres_limit() -> None:
     assert idm_acceleration(20.0, 10.0, np.inf, 0.0, DRIVER) == -2.0
     assert idm_acceleration(20.0, 10.0, 2.0, 0.0, DRIVER) == -8.0
+
+
+def test_the_needed_deceleration_stops_half_the_minimum_gap_behind_the_leaders_emergency_stop() -> None:
+    for speed, gap, lead in ((10.0, 20.0, 0.0), (12.0, 6.0, 8.0)):
+        needed = needed_deceleration(speed, gap, lead, DRIVER)
+        left = gap + lead**2 / (2.0 * DRIVER.emergency_decel) - speed**2 / (2.0 * needed)
+        assert left == pytest.approx(0.5 * DRIVER.min_gap)
 
 
 def test_a_braking_car_stops_where_it_stops_and_never_reverses() -> None:

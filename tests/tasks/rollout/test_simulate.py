@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import shapely
 
+from tasks.rollout.lane_following import logged_path
 from tasks.rollout.simulate import TrafficSettings, next_scene, prepare_traffic, roll_out, simulate
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.clip import CLIP_STEPS, NOW, STEP_S, Rollout, Scene, scene_of_clip
@@ -131,6 +132,54 @@ def test_a_parked_car_stays_and_one_off_the_lanes_replays() -> None:
     assert rollout.simulated.tolist() == [False, False]
     assert (rollout.agents.boxes[:, 0] == scene.agents.boxes[NOW, 0]).all()
     assert np.array_equal(rollout.agents.boxes[:, 1], scene.agents.boxes[NOW : NOW + 41, 1])
+
+
+WAITING_CAR = Track(57.0, speed=1.0)  # driven: creeps up to the ego ahead and stays across x = 58
+BEHIND_EGO = (63.6, 0.0, 0.0)
+
+
+def test_a_car_that_crosses_off_the_lanes_replays_to_the_bit_until_it_must_brake_for_a_driven_car() -> None:
+    crossing = Track(58.0, -30.0, np.pi / 2, 8.0)
+    scene = worlds.scene(worlds.straight_road(), WAITING_CAR, crossing, ego=BEHIND_EGO)
+    rollout = run(scene)
+    agents, logged = rollout.agents, scene.agents.boxes[NOW : NOW + 41, 1]
+    late = int(np.argmax((agents.boxes[:, 1] != logged).any(axis=1)))
+    assert 10 < late < 30 and rollout.simulated.tolist() == [True, True]
+    speed = agents.velocities[:, 1, 1]
+    assert np.diff(speed).min() > -IDM.emergency_decel * STEP_S - 1e-9 and speed[-1] < 3.0
+    assert agents.boxes[:, 1, 0] == pytest.approx(58.0, abs=1e-6)
+    assert overlap_area(agents, 0, 1) == 0.0
+    assert overlap_area(replace(agents, boxes=np.stack([agents.boxes[:, 0], logged], axis=1)), 0, 1) > 1.0
+    second = run(next_scene(scene, rollout, scene.centerline))
+    assert overlap_area(second.agents, 0, 1) == 0.0 and second.agents.velocities[-1, 1, 1] < 0.1
+
+
+def test_a_car_that_touches_a_driven_one_does_not_drive_through_it() -> None:
+    scene = worlds.scene(worlds.straight_road(), WAITING_CAR, Track(58.0, -3.0, np.pi / 2, 3.0), ego=BEHIND_EGO)
+    y = run(scene).agents.boxes[:, 1, 1]
+    assert y[-1] < -3.0 + 3.0 * STEP_S + 3.0**2 / (2.0 * IDM.emergency_decel) + 0.1  # stopped, one step late
+    assert -np.diff(y, 2).min() < IDM.emergency_decel * STEP_S**2 + 1e-9
+
+
+def test_a_replayed_car_waits_neither_for_the_ego_nor_for_a_driven_car_beside_its_way() -> None:
+    beside = Track(20.0, speed=8.0)
+    scene = worlds.scene(worlds.straight_road(), beside, Track(80.0, -20.0, np.pi / 2, 8.0), ego=(79.0, 0.0, 0.0))
+    rollout = run(scene)
+    assert rollout.simulated.tolist() == [True, False]
+    assert np.array_equal(rollout.agents.boxes[:, 1], scene.agents.boxes[NOW : NOW + 41, 1])
+
+
+def test_a_log_is_a_path_unless_it_stands_or_reverses() -> None:
+    along = np.arange(0.0, 30.0, 0.4)
+    track = np.column_stack([along, 0.05 * (-1.0) ** np.arange(75), 0 * along, 0.1 * along, np.full(75, 4.0)])
+    path = logged_path(track, 50.0)
+    assert path is not None and np.hypot(*np.diff(path.xy, axis=0).T) == pytest.approx(0.5, abs=0.01)
+    assert np.abs(path.xy[:, 1]).max() < 0.3 and path.xy[-1, 0] == pytest.approx(50.0, abs=0.6)
+    assert path.height == pytest.approx(0.1 * np.clip(path.xy[:, 0], 0.0, 29.6), abs=0.2)
+    reversing = track.copy()
+    reversing[:, 2] = np.pi
+    for none in (reversing, track[:2], track[:0]):
+        assert logged_path(none, 50.0) is None
 
 
 def test_a_parked_car_hidden_at_first_appears_where_the_log_sees_it_even_near_the_ego() -> None:
