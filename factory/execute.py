@@ -73,17 +73,18 @@ def execute(
     digests = {expert: work.expert_digest(expert) for expert in experts}
     identity = work.identity
     try:
-        record = store.agree(identity, digests, on_change)
+        records = store.agree(identity, digests, on_change)
+        history = store.history(identity, digests)
+        if on_change == "stop" and records[-1]["on_change"] == "keep":
+            on_change = "keep"
+        policy = retry_policy(retry, identity.versions_json)
+        plan = make_plan(refs, experts, rounds, history, identity, on_change, policy)
     except ChangedRun as error:
         return RunSummary(BAD_CONFIG, str(error))
-    policy = retry_policy(retry, identity.versions_json)
-    try:
-        history = store.history(identity, digests)
     except OSError as error:
         return RunSummary(
             BAD_CONFIG, f"{error}; python -m factory.store.verify {store.location.uri} says what is damaged"
         )
-    plan = make_plan(refs, experts, rounds, history, identity, on_change, policy)
     driver = Driver(identity, plan, digests, rounds, policy)
     if plan.frozen:
         driver.notes.append(f"{len(plan.frozen)} clips kept as they are: their candidates come from other settings")
@@ -95,7 +96,7 @@ def execute(
     except KeyboardInterrupt:
         return RunSummary(INTERRUPTED, "stopped before anything was begun")
     try:
-        store.begin(record)
+        store.begin(records)
         if graph is not None:
             with _stop_signals(driver.stop):
                 driver.loop(graph, Gatherer(graph, store, shard_bytes, shard_seconds))

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from factory.clips.reader import ClipRef
 from factory.store.candidates import Listed
 from factory.store.outcomes import Kind
-from factory.store.samples import History, OnChange, Past
+from factory.store.samples import WAYS_OUT, ChangedRun, History, OnChange, Past
 from factory.walk import Exhausted, Step, Try, next_step
 from factory.work import HUMAN_CANDIDATE, RunIdentity
 
@@ -64,7 +64,12 @@ def make_plan(
     on_change: OnChange,
     may_retry: Policy,
 ) -> Plan:
-    """Hold the wishes against the tables. Under `redo`, rows of other settings count as absent and are replaced."""
+    """Hold the wishes against the tables.
+
+    Rows of other settings: under `redo` they count as absent and are replaced, under `keep` they count as done. Raises
+    ChangedRun where there are some under `stop`, and where `redo` would replace the candidate list of other rows.
+    """
+    _refuse_mixing(refs, experts, history, identity, on_change)
     todo: list[ClipPlan] = []
     done: list[ClipPlan] = []
     frozen: list[ClipRef] = []
@@ -92,6 +97,26 @@ def make_plan(
         found += sum(past.kind in (Kind.ACCEPTED, Kind.REJECTED) for walk in clip.walks for past in walk.known.values())
         (todo if _has_work(clip, rounds, may_retry) else done).append(clip)
     return Plan(tuple(todo), tuple(done), tuple(frozen), found)
+
+
+def _refuse_mixing(
+    refs: Sequence[ClipRef], experts: Sequence[str], history: History, identity: RunIdentity, on_change: OnChange
+) -> None:
+    relisted = {clip_id for clip_id, row in history.candidates.items() if row.prepare_digest != identity.prepare_digest}
+    if on_change == "stop":
+        old = {clip_id for clip_id, expert in history.stale if expert in ("", *experts)} | relisted
+        mixed = [ref for ref in refs if ref.clip_id in old]
+        if mixed:
+            where = f"clip {mixed[0].clip_id} of log {mixed[0].log_id}"
+            raise ChangedRun(f"{len(mixed)} of {len(refs)} clips, as {where}, hold rows of other settings. {WAYS_OUT}")
+    if on_change == "redo":
+        wanted = {ref.clip_id for ref in refs} & relisted
+        left = sorted({expert for clip_id, expert in history.walks if clip_id in wanted} - {"", *experts})
+        if left:
+            raise ChangedRun(
+                f"redo replaces candidate lists that rows of {', '.join(left)} stand on: name these experts too, or "
+                "choose another out"
+            )
 
 
 def _walk(history: History, clip_id: str, expert: str, on_change: OnChange) -> WalkState:

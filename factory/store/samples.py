@@ -22,13 +22,14 @@ from factory.work import RunIdentity, canonical_json
 
 OnChange = Literal["stop", "keep", "redo"]
 RUN_FILE = "run.json"
+WAYS_OUT = "Go on with on_change=keep, replace with on_change=redo, or choose another out"
 STATE = ["attempt_id", "clip_id", "expert", "expert_digest", "candidate_index", "settings_hash", "stage_versions"]
 SAMPLE_STATE = [*STATE, "round"]
 OUTCOME_STATE = [*STATE, "kind", "error_kind", "tries"]
 
 
 class ChangedRun(ValueError):
-    """The run's settings, versions or expert inputs differ from the table's; the message names each difference."""
+    """The run's settings, versions or expert inputs differ from the table's; the message says where."""
 
 
 Place = tuple[str, str]
@@ -76,7 +77,9 @@ class Store:
     ) -> list[dict[str, Any]]:
         """Hold the run against the newest record of run.json; the records as they are to be, with this run's as newest.
 
-        Writes nothing. Raises ChangedRun where they differ and on_change is "stop".
+        A record's on_change says whether rows of older records may stand among its own ("keep"). A run that says
+        "stop" and changes nothing goes on under the record that it finds. Expert digests are those of all experts so
+        far. Writes nothing. Raises ChangedRun where they differ and on_change is "stop".
         """
         for expert in expert_digests:
             if not re.fullmatch(r"[A-Za-z0-9_-]+", expert):
@@ -89,6 +92,7 @@ class Store:
             "vocabulary_digest": identity.vocabulary_digest,
             "prepare_digest": identity.prepare_digest,
             "expert_digests": dict(expert_digests),
+            "on_change": on_change,
         }
         record = json.loads(canonical_json(record))
         if not records and (len(self.samples) or len(self.outcomes)):
@@ -98,12 +102,11 @@ class Store:
         if records:
             changes = differences(records[-1], record)
             if changes and on_change == "stop":
-                raise ChangedRun(
-                    f"{self.location.uri} was made with other settings: {'; '.join(changes)}. "
-                    "Go on with on_change=keep, replace with on_change=redo, or choose another out"
-                )
+                raise ChangedRun(f"{self.location.uri} was made with other settings: {'; '.join(changes)}. {WAYS_OUT}")
+            record["expert_digests"] = records[-1]["expert_digests"] | record["expert_digests"]
+            if on_change == "stop":
+                record["on_change"] = records[-1].get("on_change", "stop")
             if not changes:
-                record["expert_digests"] = records[-1]["expert_digests"] | record["expert_digests"]
                 records = records[:-1]
         return [*records, record]
 

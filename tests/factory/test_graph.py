@@ -4,6 +4,7 @@ import os
 import re
 import signal
 import threading
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,11 +20,18 @@ from tests.factory.toy import VERSIONS, ToyWork, ran, refs
 EXPERTS = ["recovery", "pdm_closed", "human"]
 
 
-def run(out: Path, work: ToyWork | None = None, rounds: int = 2, n: int = 4, **options: object) -> RunSummary:
+def run(
+    out: Path,
+    work: ToyWork | None = None,
+    rounds: int = 2,
+    n: int = 4,
+    experts: Sequence[str] = EXPERTS,
+    **options: object,
+) -> RunSummary:
     return execute(
         work or ToyWork(),
         refs(n),
-        EXPERTS,
+        experts,
         rounds,
         Store(out),
         "local",
@@ -147,6 +155,52 @@ def test_keep_goes_on_and_records_both(tmp_path: Path) -> None:
     assert sorted(hashes) == sorted({ToyWork().identity.settings_hash, changed.identity.settings_hash})
     assert len(Store(tmp_path / "out").runs()) == 2
     assert run(tmp_path / "out", changed, n=4).exit_code == COMPLETE
+
+
+def test_a_redo_of_some_clips_leaves_the_others_to_be_decided(tmp_path: Path) -> None:
+    changed = ToyWork(threshold=0.3)
+    run(tmp_path / "out", n=4)
+    assert run(tmp_path / "out", changed, n=1, on_change="redo").exit_code == COMPLETE
+    assert run(tmp_path / "out", changed, n=1).exit_code == COMPLETE
+    before = tables_of(tmp_path / "out")
+    stopped = run(tmp_path / "out", changed, n=4)
+    assert stopped.exit_code == BAD_CONFIG
+    assert f"3 of 4 clips, as clip {refs(2)[1].clip_id} of log log1, hold rows of other settings" in stopped.message
+    assert_same_rows(tables_of(tmp_path / "out")[0], before[0])
+    assert run(tmp_path / "out", changed, n=4, on_change="redo").exit_code == COMPLETE
+    assert run(tmp_path / "out", changed, n=4).executed.attempts == 0
+    run(tmp_path / "fresh", changed, n=4)
+    assert_same_tables(tmp_path / "out", tmp_path / "fresh")
+
+
+def test_keep_holds_until_something_else_is_said(tmp_path: Path) -> None:
+    run(tmp_path / "out", n=4)
+    changed = ToyWork(threshold=0.3)
+    run(tmp_path / "out", changed, n=1, on_change="redo")
+    assert run(tmp_path / "out", changed, n=4, on_change="keep").exit_code == COMPLETE
+    assert run(tmp_path / "out", changed, n=4, rounds=3).exit_code == COMPLETE
+    run(tmp_path / "out", changed, n=1, on_change="redo")
+    assert run(tmp_path / "out", changed, n=4).exit_code == BAD_CONFIG
+
+
+def test_redo_takes_no_candidate_list_from_under_other_experts(tmp_path: Path) -> None:
+    changed = ToyWork(settings={"seed": 1}, prepare_digest="perturb-2")
+    run(tmp_path / "out")
+    before = tables_of(tmp_path / "out")
+    refused = run(tmp_path / "out", changed, experts=["pdm_closed"], on_change="redo")
+    assert refused.exit_code == BAD_CONFIG and "rows of human, recovery stand on" in refused.message
+    assert tables_of(tmp_path / "out")[2] == before[2]
+    assert run(tmp_path / "out", changed, n=1, on_change="redo").exit_code == COMPLETE
+    assert run(tmp_path / "out", changed, experts=["another"]).exit_code == BAD_CONFIG  # it would skip clips 1 to 3
+
+
+def test_a_changed_expert_is_seen_after_a_run_without_it(tmp_path: Path) -> None:
+    run(tmp_path / "out", rounds=1)
+    changed = ToyWork(threshold=0.3)
+    run(tmp_path / "out", changed, experts=["human"], on_change="redo")
+    stopped = run(tmp_path / "out", replace(changed, digests={"recovery": "table-2"}))
+    assert stopped.exit_code == BAD_CONFIG
+    assert "inputs of expert recovery: recovery-1 -> table-2" in stopped.message
 
 
 def test_keep_never_continues_a_walk_on_another_candidate_list(tmp_path: Path) -> None:
