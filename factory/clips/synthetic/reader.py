@@ -53,7 +53,16 @@ class SyntheticReader:
 
     def read(self, ref: ClipRef) -> Clip:
         """The validated clip. Raises BadClip."""
-        return self._reader().read(ref)
+        clip = self._reader().read(ref)
+        return replace(clip, content_digest=self._with_sensors(clip.content_digest))
+
+    def digest(self, ref: ClipRef) -> str:
+        """The clip's content digest, without reading it. Raises BadClip."""
+        return self._with_sensors(self._reader().digest(ref))
+
+    def _with_sensors(self, digest: str) -> str:
+        """Sensor settings change the pixels and points, which Argoverse's digest leaves out."""
+        return hashlib.sha256(f"{digest}{json.dumps(asdict(self.settings))}".encode()).hexdigest()
 
     def _reader(self) -> AV2Reader:
         if self._logs is None:
