@@ -198,12 +198,13 @@ class Driver:
     ) -> None:
         self.executed.attempts += 1
         known = walk.known.get(stamp.candidate_index)
+        replaced = [known.attempt_id] if known is not None else []  # under keep perhaps of other expert inputs
         if isinstance(report, Attempted):
             self._count(report.seconds)
         if isinstance(report, Attempted) and report.rejected is None:
             walk.known[stamp.candidate_index] = Past(stamp.attempt_id, Kind.ACCEPTED, True, round=stamp.round)
             row = PendingRow(result, report.n_bytes, (stamp.round, stamp.expert), report.licence)
-            self._keep(clip, walk, rows=[row])
+            self._keep(clip, walk, rows=[row], replaced=replaced)
             self._tally.accepted += 1
         else:
             what = report if isinstance(report, Failure) else report.rejected
@@ -215,17 +216,22 @@ class Driver:
             walk.known[stamp.candidate_index] = _past(outcome)
             if outcome.kind == Kind.FAILED:
                 self._fresh.add(stamp.attempt_id)
-            self._keep(clip, walk, outcomes=[outcome])
+            self._keep(clip, walk, outcomes=[outcome], replaced=replaced)
             self._tally.rejected += outcome.kind == Kind.REJECTED
             self._tally.failed += outcome.kind == Kind.FAILED
         self._advance(clip, walk, prepared)
 
     def _keep(
-        self, clip: ClipPlan, walk: WalkState, rows: Sequence[PendingRow] = (), outcomes: Sequence[Outcome] = ()
+        self,
+        clip: ClipPlan,
+        walk: WalkState,
+        rows: Sequence[PendingRow] = (),
+        outcomes: Sequence[Outcome] = (),
+        replaced: Sequence[str] = (),
     ) -> None:
         """On to the gatherer; a walk that replaces rows is held back until it ends."""
         if not walk.stale:
-            self._gatherer.add(rows=rows, outcomes=outcomes)
+            self._gatherer.add(rows=rows, outcomes=outcomes, replaced=replaced)
             return
         held_rows, held_outcomes = self._held.setdefault((clip.ref.clip_id, walk.expert), ([], []))
         held_rows.extend(rows)

@@ -7,7 +7,7 @@ one random draw a round would be. Clips: those with at least r+1 accepted sample
 
 import io
 from collections import Counter, defaultdict
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,9 +16,10 @@ from rich.console import Console
 from rich.table import Table
 
 from factory.store.outcomes import Kind
-from factory.store.samples import Store
+from factory.store.samples import MADE_UNDER, Store, run_number
 
-SAMPLE_COLUMNS = ["attempt_id", "clip_id", "expert", "candidate_index"]
+Row = Mapping[str, Any]
+SAMPLE_COLUMNS = [*MADE_UNDER, "clip_id", "candidate_index"]
 OUTCOME_COLUMNS = [*SAMPLE_COLUMNS, "kind", "stage", "reason", "error_kind"]
 
 
@@ -101,8 +102,8 @@ def funnel_of(store: Store, clip_ids: Collection[str] | None = None) -> Funnel:
     """The funnel of a store, or of some of its clips."""
     chosen = None if clip_ids is None else set(clip_ids)
     samples = _rows(store.samples.read(SAMPLE_COLUMNS), chosen)
-    taken = {row["attempt_id"] for row in samples}
-    outcomes = [r for r in _rows(store.outcomes.read(OUTCOME_COLUMNS), chosen) if r["attempt_id"] not in taken]
+    outcomes = _rows(store.outcomes.read(OUTCOME_COLUMNS), chosen)
+    samples, outcomes = _newest(samples, outcomes, run_number(store.runs()))
     lists = _rows(store.candidates.read(["clip_id", "n_candidates", "gate_counts", "stage", "reason"]), chosen)
 
     walks: dict[str, dict[str, list[tuple[int, str]]]] = defaultdict(lambda: defaultdict(list))
@@ -179,7 +180,21 @@ def _expert_rows(expert: str, clips: Mapping[str, list[tuple[int, str]]]) -> lis
     return rows
 
 
-def _rows(table: pa.Table, chosen: set[str] | None) -> list[dict[str, Any]]:
+def _newest(samples: list[Row], outcomes: list[Row], run_of: Callable[[Row], int]) -> tuple[list[Row], list[Row]]:
+    """One row per clip, expert and candidate: that of the newest run; of one run the sample.
+
+    So a candidate counts once, and what a redo failed at is seen, not the old sample that it was to replace.
+    """
+    newest: dict[tuple[str, str, int], tuple[int, Row]] = {}
+    for row in (*outcomes, *samples):
+        place, run = (row["clip_id"], row["expert"], row["candidate_index"]), run_of(row)
+        if place not in newest or run >= newest[place][0]:
+            newest[place] = run, row
+    rows = [row for _, row in newest.values()]
+    return [row for row in rows if "kind" not in row], [row for row in rows if "kind" in row]
+
+
+def _rows(table: pa.Table, chosen: set[str] | None) -> list[Row]:
     return [row for row in table.to_pylist() if chosen is None or row["clip_id"] in chosen]
 
 

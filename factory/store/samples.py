@@ -8,7 +8,7 @@ import json
 import os
 import re
 from collections import defaultdict
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -24,6 +24,7 @@ OnChange = Literal["stop", "keep", "redo"]
 RUN_FILE = "run.json"
 WAYS_OUT = "Go on with on_change=keep, replace with on_change=redo, or choose another out"
 STATE = ["attempt_id", "clip_id", "expert", "expert_digest", "candidate_index", "settings_hash", "stage_versions"]
+MADE_UNDER = ["attempt_id", "expert", "expert_digest", "settings_hash", "stage_versions"]
 SAMPLE_STATE = [*STATE, "round"]
 OUTCOME_STATE = [*STATE, "kind", "error_kind", "tries"]
 
@@ -111,14 +112,28 @@ class Store:
         return [*records, record]
 
     def begin(self, records: Sequence[Mapping[str, object]]) -> None:
-        """The first writes of a run: record its settings, fence off older runs, tidy up after a crash."""
+        """The first writes of a run: record its settings, fence off older runs, tidy up after a crash.
+
+        A crash between two commits leaves a failed outcome beside the sample that its retry became; it goes. One that
+        is newer than the sample of the same attempt, of a redo that failed, stays.
+        """
         if list(records) != self.runs():
             document = {"schema_version": SCHEMA_VERSION, "runs": list(records)}
             self.location.write(RUN_FILE, (json.dumps(document, indent=1, sort_keys=True) + "\n").encode())
         for table in (self.candidates, self.samples, self.outcomes):
             table.claim()
-        # A crash between the two commits leaves a failed outcome beside the sample that its retry became.
-        self.outcomes.commit([], drop=[key for key in self.outcomes if key in self.samples])
+        twice = {key for key in self.outcomes if key in self.samples}
+        if twice:
+            age = run_number(records)
+            samples, outcomes = (
+                {
+                    row["attempt_id"]: age(row)
+                    for row in table.read(MADE_UNDER).to_pylist()
+                    if row["attempt_id"] in twice
+                }
+                for table in (self.samples, self.outcomes)
+            )
+            self.outcomes.commit([], drop=[key for key in twice if outcomes[key] <= samples[key]])
 
     def runs(self) -> list[dict[str, Any]]:
         """The settings the rows were made with, oldest first. Raises ChangedRun for an unreadable run.json."""
@@ -193,6 +208,21 @@ class Store:
         named = {line for line in (*known.split("; "), *licences) if line}
         if "; ".join(sorted(named)) != known:
             self.samples.set_property(LICENCES_PROPERTY, "; ".join(sorted(named)))
+
+
+def run_number(records: Sequence[Mapping[str, Any]]) -> Callable[[Mapping[str, Any]], int]:
+    """Of a row with the columns MADE_UNDER: the place of the newest record that it could be made under, -1 for none."""
+    made: dict[tuple[str, str], list[tuple[int, Mapping[str, str]]]] = defaultdict(list)
+    for number, record in enumerate(records):
+        key = record["settings_hash"], canonical_json(record["stage_versions"])
+        made[key].insert(0, (number, record["expert_digests"]))
+
+    def of(row: Mapping[str, Any]) -> int:
+        expert, digest = row["expert"], row["expert_digest"]
+        found = made.get((row["settings_hash"], row["stage_versions"]), [])
+        return next((number for number, digests in found if digests.get(expert, digest) == digest), -1)
+
+    return of
 
 
 def differences(old: Mapping[str, object], new: Mapping[str, object]) -> list[str]:

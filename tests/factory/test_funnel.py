@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from factory.execute import execute
+from factory.execute import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, execute
 from factory.funnel import FunnelRow, _expert_rows, funnel_of, image_sources_text
 from factory.store.samples import Store
 from tests.factory.toy import ToyWork, refs
@@ -52,3 +52,32 @@ def test_image_sources_are_counted_over_the_clips_asked_for(tmp_path: Path) -> N
     ]
     assert counted == [4, 1]
     assert image_sources_text(store, []) == "images: no samples"
+
+
+def test_a_candidate_counts_once_though_its_failure_was_mended_with_other_inputs(tmp_path: Path) -> None:
+    broken = ToyWork(trouble={"log0:0:pdm_closed:0": "bug"})
+    mended = ToyWork(digests={"pdm_closed": "pdm_closed-2"})
+    execute(broken, refs(1), ["pdm_closed"], 2, Store(tmp_path), "local", say=lambda line: None)
+    store = Store(tmp_path)
+    execute(mended, refs(1), ["pdm_closed"], 9, store, "local", on_change="keep", retry=True, say=lambda line: None)
+    tried = sum(row.accepted + row.rejected + row.failed for row in funnel_of(store).rows)
+    assert tried == mended.n_candidates
+    assert "failed" not in store.outcomes.read(["kind"])["kind"].to_pylist()
+
+
+def test_a_redo_that_failed_is_seen_and_not_mended_by_the_next_run(tmp_path: Path) -> None:
+    def run(work: ToyWork, **options: object) -> int:
+        summary = execute(work, refs(1), ["recovery"], 2, Store(tmp_path), "local", say=lambda line: None, **options)  # type: ignore[arg-type]
+        return summary.exit_code
+
+    run(ToyWork(threshold=0.3))
+    first = min(Store(tmp_path).samples.read(["candidate_index"])["candidate_index"].to_pylist())
+    broken = ToyWork(threshold=0.29, trouble={f"log0:0:recovery:{first}": "bug"})
+    for _ in range(2):
+        assert run(broken, on_change="redo") == COMPLETE_WITH_FAILURES
+        assert sum(row.failed for row in funnel_of(Store(tmp_path)).rows) == 1
+    for _ in range(2):
+        assert run(broken) == BAD_CONFIG
+    assert run(broken, on_change="keep") == COMPLETE_WITH_FAILURES
+    assert run(ToyWork(threshold=0.29), on_change="redo", retry=True) == COMPLETE
+    assert sum(row.failed for row in funnel_of(Store(tmp_path)).rows) == 0

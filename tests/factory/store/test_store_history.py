@@ -3,9 +3,12 @@
 import pickle
 from pathlib import Path
 
+import pytest
+
 from factory.execute import execute
 from factory.store.candidates import Listed
-from factory.store.samples import Store
+from factory.store.outcomes import Kind, Outcome
+from factory.store.samples import OnChange, Store
 from tests.factory.toy import ToyWork, refs
 
 
@@ -15,3 +18,20 @@ def test_of_candidate_lists_only_their_length_is_kept(tmp_path: Path) -> None:
     listed = Store(tmp_path).history(work.identity, {}).candidates
     assert listed == {ref.clip_id: Listed("perturb-1", "content", 200) for ref in refs(20)}
     assert len(pickle.dumps(listed)) < 200 * len(listed)  # bytes; a list of 200 candidates takes 20 kB
+
+
+@pytest.mark.parametrize(("threshold", "on_change", "stays"), [(0.0, "stop", 0), (0.1, "keep", 1)])
+def test_a_failure_beside_its_sample_goes_unless_it_is_newer(
+    tmp_path: Path, threshold: float, on_change: OnChange, stays: int
+) -> None:
+    first, later = ToyWork(threshold=0.0), ToyWork(threshold=threshold)
+    execute(first, refs(1), ["recovery"], 1, Store(tmp_path), "local", say=lambda line: None)
+    store = Store(tmp_path)
+    store.begin(store.agree(later.identity, {"recovery": "recovery-1"}, on_change))
+    (sample,) = store.samples.read(["attempt_id", "clip_id"]).to_pylist()
+    made = later.identity.settings_hash, later.identity.versions_json
+    key, clip_id = sample["attempt_id"], sample["clip_id"]
+    failed = Outcome(key, clip_id, "toy", "log0", "recovery", "recovery-1", 0, Kind.FAILED, *made)
+    store.commit([], [], [failed])
+    store.begin(store.runs())
+    assert (len(store.samples), len(store.outcomes)) == (1, stays)
