@@ -304,7 +304,8 @@ def drive(
                 k = min(clock[i] + 1, n_log - 1)
                 if cast.moving_kind[i] and cast.logged_path[i] < 0 and valid[t, i] and log.valid[k, i]:
                     blocked = _touches_driven(log.boxes[k, i], boxes[t + 1], mode, i)
-                    if blocked and not _touches_driven(boxes[t, i], boxes[t + 1], mode, i):
+                    # One that walks goes on once it is touched; a vehicle would drive through.
+                    if blocked and (cast.enters_clear[i] or not _touches_driven(boxes[t, i], boxes[t + 1], mode, i)):
                         boxes[t + 1, i], center_z[t + 1, i], valid[t + 1, i] = boxes[t, i], center_z[t, i], True
                         velocities[t + 1, i] = 0.0
                         continue
