@@ -137,7 +137,11 @@ def gather(
     last = json.loads(store.location.read("last_run.json") or b"{}")
     labels = store.samples.read(LABELS).to_pylist()
     taken = {row["attempt_id"] for row in labels}
-    outcomes = [row for row in store.outcomes.read(OUTCOME_LABELS).to_pylist() if row["attempt_id"] not in taken]
+    outcomes = [  # a failure beside a sample of its id is a redo that failed: it stays to be seen
+        row
+        for row in store.outcomes.read(OUTCOME_LABELS).to_pylist()
+        if row["attempt_id"] not in taken or row["kind"] == Kind.FAILED
+    ]
     rejected = [o for o in outcomes if o["kind"] == Kind.REJECTED and o["expert"] and o["candidate_index"] >= 0]
     failed = sorted((o for o in outcomes if o["kind"] == Kind.FAILED), key=lambda o: o["attempt_id"])
     word, tone = STATUS.get(last.get("exit_code"), ("unfinished", "bad"))

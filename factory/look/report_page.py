@@ -27,7 +27,7 @@ REASON_WORDS = {
     "lk": "lane keeping",
     "hc": "uncomfortable against the history",
     "no_plan": "the expert found no plan",
-    "ego_unstable": "the ego could not be tracked",
+    "route_ended": "no route is left to drive along",
     "psnr": "block reconstructed too poorly",
     "ego_standing": "ego stands",
     "broken_tracks": "broken tracks",
