@@ -4,7 +4,7 @@ VENV   := .venv
 PY     := $(VENV)/bin/python
 DEMO   := runs/demo
 
-.PHONY: install demo test unit lint format bench clean
+.PHONY: install demo test unit lint format bench bench-reward clean
 
 install: $(VENV)/.installed
 
@@ -39,6 +39,9 @@ format: install
 
 bench: install
 	$(PY) -m tests.bench
+
+bench-reward: install
+	OMP_NUM_THREADS=1 $(PY) -m tests.bench.bench_reward
 
 clean:
 	rm -rf $(VENV) runs build *.egg-info

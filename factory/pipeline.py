@@ -9,7 +9,7 @@ import numpy as np
 
 from factory.clips.reader import BadClip, ClipReader, ClipRef
 from factory.imaging import Imaging
-from factory.rows import sample_row
+from factory.rows import label_columns, sample_row
 from factory.work import HUMAN, Accepted, AttemptResult, CandidateRow, Dropped, PreparedClip, RunIdentity
 from tasks.attempt import ExpertGate, Judged, Timed, attempt, has_route, human_sample, perturbed_scene
 from tasks.chance import stream
@@ -18,6 +18,7 @@ from tasks.experts.protocol import Expert
 from tasks.perturb import Candidate, Perturbation, PerturbSettings, end_speed_mps, perturb
 from tasks.render.settings import RenderMode, RenderSettings
 from tasks.reward.epdms import Scores
+from tasks.reward.labels import Labelling, vocabulary_labels
 from tasks.rollout.simulate import TrafficSettings
 from tasks.stages import SUBSCORES, Rejected
 from tasks.vocabulary import Vocabulary
@@ -97,6 +98,7 @@ class FactoryWork:
     traffic: TrafficSettings
     pdm: PdmSettings
     gate: ExpertGate
+    labelling: Labelling | None  # None: samples have no vocabulary labels
     render: RenderSettings
     seed: int
     identity: RunIdentity
@@ -151,7 +153,7 @@ class FactoryWork:
         return None if digest is None else str(digest(ref))
 
     def attempt(self, prepared: PreparedClip, candidate: int, expert: str) -> AttemptResult:
-        """Rollout, expert, rollout, reward and render of one candidate; candidate -1 is the human drive."""
+        """Rollout, expert, rollout, reward, labels and render of one candidate; candidate -1 is the human drive."""
         watch = Stopwatch()
         payload = prepared.payload
         assert isinstance(payload, PerturbedClip)
@@ -159,11 +161,12 @@ class FactoryWork:
         if trace.judged is None or trace.rejected is not None:
             assert trace.rejected is not None
             return Dropped(trace.rejected, _subscores(trace.judged.scores) if trace.judged else {}, watch.seconds)
+        labels = self._labels(trace.judged, watch)
         with watch.of("render"):
             pictures = self.imaging.pictures(self._with_sensors(payload), trace.candidate, trace.judged)
         row = sample_row(payload.clip, trace.candidate, trace.judged)
         tags = [*row["tags"], *pictures.get("tags", ())]  # type: ignore[misc]
-        return Accepted(row | pictures | {"tags": tags}, watch.seconds)
+        return Accepted(row | labels | pictures | {"tags": tags}, watch.seconds)
 
     def trace(
         self,
@@ -184,6 +187,13 @@ class FactoryWork:
         if isinstance(result, Rejected):
             return Trace(chosen, None, result)
         return Trace(chosen, *result)
+
+    def _labels(self, judged: Judged, watch: Stopwatch) -> dict[str, object]:
+        """Columns of the vocabulary labels; none in a run without them."""
+        if self.labelling is None:
+            return {}
+        with watch.of("labels"):
+            return label_columns(vocabulary_labels(self.labelling, judged.scene, judged.prepared, judged.rival))
 
     def _block_verdict(self, clip: Clip) -> Rejected | None:
         """Asked for before perturb work is spent. Without a gate a block is built here only if it will be needed."""

@@ -10,6 +10,7 @@ from tasks.attempt import Judged
 from tasks.perturb import Candidate, end_speed_mps
 from tasks.render.views import pose_on_ground
 from tasks.reward.epdms import Scores
+from tasks.reward.label_bytes import VocabularyLabels, encode
 from tasks.stages import SUBSCORES
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, Scene
@@ -22,7 +23,7 @@ NEAR_M = 30.0  # for the tags
 
 
 def sample_row(clip: Clip, candidate: Candidate | None, judged: Judged) -> dict[str, object]:
-    """Everything of a sample but images and bookkeeping; candidate None: the human row.
+    """Everything of a sample but images, vocabulary labels and bookkeeping; candidate None: the human row.
 
     The label of a simulated row is the simulated drive, of the human row the log itself.
     """
@@ -57,6 +58,18 @@ def sample_row(clip: Clip, candidate: Candidate | None, judged: Judged) -> dict[
         **({} if candidate is None else score_columns("stage1", candidate.reactive_scores)),
         **score_columns("stage2", judged.scores),
         "tags": _tags(scene, command),
+    }
+
+
+def label_columns(labels: VocabularyLabels) -> dict[str, object]:
+    """The scores of a vocabulary from the sample's scene; factory.store.reader.labels_of reads them."""
+    subscores, progress = encode(labels)
+    return {
+        "label_vocabulary": labels.vocabulary,
+        "label_traffic": labels.traffic,
+        "label_reference_progress_m": labels.reference_progress_m,
+        "label_subscores": subscores,
+        "label_progress": progress,
     }
 
 

@@ -29,6 +29,7 @@ from tasks.kinematic_vocabulary import kinematic_trajectories
 from tasks.perturb import PerturbSettings
 from tasks.render.rigs import RIGS
 from tasks.render.settings import RenderSettings
+from tasks.reward.labels import Labelling
 from tasks.rollout.simulate import TrafficSettings
 from tasks.stages import stage_versions
 from tasks.vocabulary import Vocabulary
@@ -57,6 +58,22 @@ class RecoverySources:
 
 
 @dataclass(frozen=True)
+class RewardSettings(ExpertGate):
+    """What an expert's drive must reach, and the vocabulary labels that stand in every sample."""
+
+    labels: Literal["vocabulary", "none"] = "vocabulary"
+    traffic: Literal["replay", "idm"] = "replay"  # that of the sample's own judged drive, or one that answers to each
+    label_vocabulary: str | None = None  # another .npy file (K, 40, 3); None: the run's vocabulary
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.labels == "none" and self.label_vocabulary is not None:
+            raise ValueError(
+                f"label_vocabulary={self.label_vocabulary} is for labels=vocabulary, but labels=none: leave one out"
+            )
+
+
+@dataclass(frozen=True)
 class RunConfig:
     """Everything on the command line of `python -m factory.run`; conf/run.yaml says what each key means."""
 
@@ -65,7 +82,7 @@ class RunConfig:
     traffic: TrafficSettings
     pdm: PdmSettings
     expert: dict[str, dict[str, Any]]
-    reward: ExpertGate
+    reward: RewardSettings
     render: RenderSettings
     vocabulary: VocabularyChoice
     rounds: int
@@ -147,6 +164,7 @@ def assemble(config: RunConfig) -> Run:
     reader, index = open_reader(config.clips)
     try:
         vocabulary = choose_vocabulary(config.vocabulary)
+        labelling = choose_labelling(config, vocabulary)
         experts = {name: build_expert(name, config, reader, index, vocabulary) for name in config.experts}
     except ValueError as error:
         raise error if isinstance(error, ConfigError) else ConfigError(str(error)) from error
@@ -159,9 +177,10 @@ def assemble(config: RunConfig) -> Run:
         traffic=config.traffic,
         pdm=config.pdm,
         gate=config.reward,
+        labelling=labelling,
         render=config.render,
         seed=config.seed,
-        identity=identity_of(config, vocabulary),
+        identity=identity_of(config, vocabulary, labelling),
         cache_dir=cache_folder(config),
     )
     return Run(config, reader, index, work)
@@ -172,6 +191,15 @@ def choose_vocabulary(choice: VocabularyChoice) -> Vocabulary:
     if choice.file is not None:
         return load_vocabulary(choice.file, choice.k)
     return Vocabulary(kinematic_trajectories(choice.k or KINEMATIC_K, seed=0), source="kinematic")
+
+
+def choose_labelling(config: RunConfig, vocabulary: Vocabulary) -> Labelling | None:
+    """What samples are labelled with, None for nothing. Raises ValueError that names a vocabulary file."""
+    if config.reward.labels == "none":
+        return None
+    named = config.reward.label_vocabulary
+    chosen = vocabulary if named is None else load_vocabulary(named)
+    return Labelling(chosen, dataclasses.replace(config.traffic, mode=config.reward.traffic))
 
 
 def build_expert(name: str, config: RunConfig, reader: ClipReader, index: ClipIndex, vocabulary: Vocabulary) -> Expert:
@@ -233,7 +261,7 @@ def log_digests(reader: ClipReader, index: ClipIndex) -> list[str] | None:
     return [str(digest(first_of_log[log_id])) for log_id in sorted(first_of_log)]
 
 
-def identity_of(config: RunConfig, vocabulary: Vocabulary) -> RunIdentity:
+def identity_of(config: RunConfig, vocabulary: Vocabulary, labelling: Labelling | None) -> RunIdentity:
     """What the rows depend on besides clip, candidate and expert. Where data lies and who works on it is not in it."""
     science: dict[str, Any] = {
         "perturb": config.perturb,
@@ -245,6 +273,7 @@ def identity_of(config: RunConfig, vocabulary: Vocabulary) -> RunIdentity:
     settings: dict[str, object] = {"seed": config.seed, "vocabulary": vocabulary.digest}
     for group, value in science.items():
         settings |= {f"{group}.{key}": plain for key, plain in dataclasses.asdict(value).items()}
+    settings["reward.label_vocabulary"] = None if labelling is None else labelling.vocabulary.digest
     versions = stage_versions()
     early: dict[str, object] = {
         key: value for key, value in settings.items() if not key.startswith(("reward.", "render."))

@@ -5,6 +5,7 @@
     python -m factory.show out=runs/demo sample=0         one sample: numbers, and a picture in the current folder
     python -m factory.show out=runs/demo sample=3fa9      the same by its id, or the beginning of it
     python -m factory.show out=runs/demo sample=0 to=x.png    ... the picture there (a folder, or a file ending in .png)
+    python -m factory.show out=runs/av2 sample=0 vocabulary=human.npy   ... with every labelled trajectory by its score
     python -m factory.show out=runs/demo failed=true      failed attempts: file, field, message, how to retry
 
 Exit codes: 0 shown, 2 bad arguments, or nothing there to show.
@@ -48,6 +49,7 @@ class Request:
     failed: bool = False
     list: bool = False
     to: str | None = None
+    vocabulary: str | None = None  # .npy that the labels are of; without it the kinematic one, where they are of that
 
 
 def main(argv: Sequence[str]) -> int:
@@ -83,6 +85,8 @@ def parse(argv: Sequence[str]) -> Request:
         raise Refused("choose one of sample=, failed=true and list=true")
     if request.to is not None and request.sample is None:
         raise Refused("to= says where the picture of sample= goes; give sample= too")
+    if request.vocabulary is not None and request.sample is None:
+        raise Refused("vocabulary= is drawn in the picture of sample=; give sample= too")
     return request
 
 
@@ -100,7 +104,7 @@ def answer(request: Request) -> Iterable[str]:
     if request.list:
         return sample_ids(store)
     if request.sample is not None:
-        return sample_lines(store, find(store, request.sample), request.to)
+        return sample_lines(store, find(store, request.sample), request)
     return status_lines(store)
 
 
@@ -198,21 +202,62 @@ def failed_lines(store: "Store") -> Iterable[str]:
         yield f"to retry {kind}: {RETRY.get(kind, 'run the same command with retry_failed=true')}"
 
 
-def sample_lines(store: "Store", attempt_id: str, to: str | None) -> Iterable[str]:
+def sample_lines(store: "Store", attempt_id: str, request: Request) -> Iterable[str]:
     """One sample's numbers; writes its picture and says where it is."""
     from factory.look.sample_picture import encoded, sample_sheet
     from factory.store.reader import SampleTable
 
-    row = SampleTable(store.location.uri, store.location.options)[attempt_id]
+    try:
+        row = SampleTable(store.location.uri, store.location.options)[attempt_id]
+    except ValueError as error:  # of another schema version
+        raise Refused(str(error)) from error
+    path = _picture_path(attempt_id, request.to)
+    drawn = labelled_trajectories(row, request.vocabulary)
     yield from _numbers(row)
-    path = _picture_path(attempt_id, to)
-    picture = encoded(sample_sheet(row, logged_drive(store, row)), ".png")
+    yield from _label_lines(row, drawn is not None)
+    picture = encoded(sample_sheet(row, logged_drive(store, row), vocabulary=drawn), ".png")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(picture)
     except OSError as error:
-        raise Refused(f"to={to}: the picture cannot be written: {error}") from error
+        raise Refused(f"to={request.to}: the picture cannot be written: {error}") from error
     yield f"picture       {path.resolve()}"
+
+
+def labelled_trajectories(row: dict[str, Any], file: str | None) -> "NDArray[np.float64] | None":
+    """(K, 40, 3) that the row's labels are of; None where they are of a file that was not named.
+
+    Raises Refused where the named file holds others, or the row has no labels.
+    """
+    from factory.settings import VocabularyChoice, choose_vocabulary
+    from factory.store.reader import labels_of
+
+    if row["label_vocabulary"] is None and file is None:
+        return None
+    try:
+        found = choose_vocabulary(VocabularyChoice(file, len(labels_of(row))))
+    except ValueError as error:
+        raise Refused(str(error)) from error
+    if found.digest == row["label_vocabulary"]:
+        return found.trajectories
+    if file is not None:
+        raise Refused(f"vocabulary={file} is {found.digest}, the sample's labels are of {row['label_vocabulary']}")
+    return None
+
+
+def _label_lines(row: dict[str, Any], drawn: bool) -> Iterable[str]:
+    from factory.store.reader import labels_of
+
+    if row["label_vocabulary"] is None:
+        yield "labels        none"
+        return
+    labels = labels_of(row)
+    scores = labels.pdm_score()
+    yield f"labels        {len(labels):,} trajectories of vocabulary {labels.vocabulary}, traffic {labels.traffic}"
+    above = (scores > 0.0).mean()
+    yield f"              EPDMS {scores.max():.3f} at best, {scores.mean():.3f} on average, {above:.0%} above 0"
+    if not drawn:
+        yield "              vocabulary=<its .npy> draws them"
 
 
 def logged_drive(store: "Store", row: dict[str, Any]) -> "NDArray[np.float64] | None":

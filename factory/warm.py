@@ -1,23 +1,80 @@
 """Compiles every kernel once, into the on-disk cache, before workers start: `python -m factory.warm`."""
 
+import os
+import subprocess
+import sys
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import numba
 import numpy as np
+from numpy.typing import NDArray
 
+from tasks.attempt import drive_and_judge
+from tasks.experts.pdm_closed import PdmSettings
+from tasks.experts.protocol import Plan
+from tasks.kernels import sources_digest
+from tasks.kinematic_vocabulary import kinematic_trajectories
 from tasks.render.warm import compile_kernels as compile_render_kernels
-from tasks.rollout.simulate import TrafficSettings, simulate
+from tasks.reward.labels import Labelling, vocabulary_labels
+from tasks.reward.verdicts import INDEX_FROM_ROWS
+from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out_many, simulate
+from tasks.vocabulary import Vocabulary
 from tasks.world.agents import AgentKind, AgentTracks
-from tasks.world.clip import CLIP_STEPS, NOW, Clip, scene_of_clip
+from tasks.world.clip import CLIP_STEPS, NOW, Clip, Scene, scene_of_clip
 from tasks.world.lanes import Lane, RoadMap, Route
 
 
 def compile_kernels() -> None:
-    """Runs the traffic and the render room on the smallest scene that reaches all of their kernels."""
-    scene = scene_of_clip(tiny_clip())
-    ahead = np.stack([np.arange(1, 41) * 0.5, np.zeros(40), np.zeros(40)], axis=1)
-    simulate(scene, ahead, TrafficSettings())
+    """Compiles what is not in the cache yet, each part in a process of its own, as many at once as there are cores.
+
+    Raises RuntimeError with a part's last words where it fails.
+    """
+    done = Path(numba.config.CACHE_DIR) / f"compiled-{sources_digest()}"
+    if done.exists():
+        return
+    print("compiling kernels, once for this version: about a minute on two cores", file=sys.stderr, flush=True)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        list(pool.map(_compile_part, PARTS))
+    done.parent.mkdir(parents=True, exist_ok=True)
+    done.touch()
+
+
+def _compile_part(name: str) -> None:
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    command = [sys.executable, "-m", "factory.warm", name]
+    ended = subprocess.run(command, env=environment, capture_output=True, text=True)  # noqa: S603 (our own module)
+    if ended.returncode != 0:
+        raise RuntimeError(f"compiling the kernels of {name} failed: {ended.stderr[-2000:]}")
+
+
+def _judge() -> None:
+    """Tracks, plans and scores, a few trajectories and many."""
+    scene, ahead = _tiny_scene()
+    replay = TrafficSettings(mode="replay")
+    judged = drive_and_judge(scene, Plan(ahead), replay, PdmSettings())
+    labelling = Labelling(Vocabulary(kinematic_trajectories(INDEX_FROM_ROWS, 0)), replay)
+    vocabulary_labels(labelling, scene, judged.prepared, judged.rival)
+
+
+def _drive() -> None:
+    """Traffic around one ego and around several."""
+    scene, ahead = _tiny_scene()
+    ego_states = simulate(scene, ahead, TrafficSettings()).ego_states
+    roll_out_many(prepare_traffic(scene, TrafficSettings()), np.stack([ego_states] * 2))
+
+
+def _render() -> None:
     compile_render_kernels()
+
+
+PARTS = {"judge": _judge, "drive": _drive, "render": _render}  # the longest first
+
+
+def _tiny_scene() -> tuple[Scene, NDArray[np.float64]]:
+    ahead = np.stack([np.arange(1, 41) * 0.5, np.zeros(40), np.zeros(40)], axis=1)
+    return scene_of_clip(tiny_clip()), ahead
 
 
 def compile_town_kernels() -> None:
@@ -67,5 +124,8 @@ def tiny_clip() -> Clip:
 
 
 if __name__ == "__main__":
-    compile_kernels()
-    compile_town_kernels()
+    if len(sys.argv) > 1:
+        PARTS[sys.argv[1]]()
+    else:
+        compile_kernels()
+        compile_town_kernels()

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.experts.pdm_closed import PdmSettings, plan_for
+from tasks.experts.pdm_closed import PdmClosed, PdmPlan, PdmSettings, plan_for
 from tasks.experts.pdm_path import MIN_PROGRESS_M, path_length_m
 from tasks.experts.protocol import Expert, Plan
 from tasks.reward.epdms import Scores, score
-from tasks.reward.prepare import prepare_scene
+from tasks.reward.prepare import PreparedScene, prepare_scene
 from tasks.rollout.simulate import TrafficSettings, next_scene, simulate
 from tasks.stages import SUBSCORES, Rejected
 from tasks.world.clip import Clip, Rollout, Scene, scene_of_clip
@@ -48,6 +48,8 @@ class Judged:
     plan: Plan
     rollout: Rollout
     scores: Scores  # row 1 is this rollout, row 0 PDM-Closed
+    prepared: PreparedScene  # the scene among the rollout's agents
+    rival: NDArray[np.float64]  # (41, 11) PDM-Closed as the tracker drives it
 
 
 def perturbed_scene(clip: Clip, stage_one: Rollout) -> Scene:
@@ -62,15 +64,24 @@ def has_route(centerline: NDArray[np.float64]) -> bool:
 
 
 def drive_and_judge(
-    scene: Scene, plan: Plan, traffic: TrafficSettings, planner: PdmSettings, timed: Timed = nullcontext
+    scene: Scene,
+    plan: Plan,
+    traffic: TrafficSettings,
+    planner: PdmSettings,
+    timed: Timed = nullcontext,
+    pdm_plan: PdmPlan | None = None,
 ) -> Judged:
-    """Simulate the plan with the traffic and score it in the two-row batch [PDM-Closed, plan]."""
+    """Simulate the plan with the traffic and score it in the two-row batch [PDM-Closed, plan].
+
+    pdm_plan: plan_for(scene, planner), where it is known already.
+    """
     with timed("rollout"):
         rollout = simulate(scene, plan.poses, traffic)
     with timed("reward"):
-        states = np.stack([plan_for(scene, planner).driven, rollout.ego_states])
-        scores = score(prepare_scene(scene, rollout.agents), states, normalise="pairs")
-    return Judged(scene, plan, rollout, scores)
+        rival = (pdm_plan or plan_for(scene, planner)).driven
+        prepared = prepare_scene(scene, rollout.agents)
+        scores = score(prepared, np.stack([rival, rollout.ego_states]), normalise="pairs")
+    return Judged(scene, plan, rollout, scores, prepared, rival)
 
 
 def verdict(scores: Scores, gate: ExpertGate, row: int = 1) -> Rejected | None:
@@ -99,11 +110,12 @@ def attempt(
     """
     if not has_route(scene.centerline):
         return Rejected("rollout", "route_ended", "the perturbed ego stands at the end of its route")
-    with timed("expert"):
-        plan = expert.plan(scene, rng)
+    with timed("expert"):  # which may be the very planner that progress is held against: it plans once
+        pdm_plan = plan_for(scene, planner) if expert == PdmClosed(planner) else None
+        plan = expert.plan(scene, rng) if pdm_plan is None else Plan(pdm_plan.poses)
     if isinstance(plan, Rejected):
         return plan
-    judged = drive_and_judge(scene, plan, traffic, planner, timed)
+    judged = drive_and_judge(scene, plan, traffic, planner, timed, pdm_plan)
     return judged, verdict(judged.scores, gate)
 
 

@@ -63,3 +63,23 @@ def kernel(function: F) -> F:
     """Compile `function` with numba on first call."""
     compiled: F = numba.njit(cache=True, nogil=True)(function)
     return compiled
+
+
+def inlined(function: F) -> F:
+    """Compile `function` into each kernel that calls it, so that loops over it, or in it, vectorise.
+
+    A division by zero gives inf or NaN in it, as in numpy: raising would need a branch.
+    """
+    compiled: F = numba.njit(cache=True, nogil=True, forceinline=True, error_model="numpy")(function)
+    return compiled
+
+
+def inner_kernel(function: F) -> F:
+    """Compile `function` for kernels to call: it counts no references to the arrays in its arguments.
+
+    Numba counts them, atomically, wherever a tuple of arrays is handed on, which can cost more than the work. Such a
+    function allocates nothing (it would not compile) and returns numbers only: an array it returned would be freed
+    under its owner's hands.
+    """
+    compiled: F = numba.njit(cache=True, nogil=True, _nrt=False)(function)
+    return compiled

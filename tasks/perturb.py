@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from tasks.experts.pdm_closed import PdmSettings, plan_for
 from tasks.reward.epdms import Scores, score
-from tasks.reward.prepare import prepare_scene
+from tasks.reward.prepare import among, prepare_scene
 from tasks.rollout.lqr import track
-from tasks.rollout.simulate import TrafficSettings, prepare_traffic, simulate
+from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out
 from tasks.stages import Rejected
 from tasks.vocabulary import Vocabulary
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip, Rollout, scene_of_clip
@@ -188,11 +188,9 @@ def perturb(
     traffic_scene = prepare_traffic(scene, traffic)
     candidates = []
     for member in kept:
-        index = int(gated[member])
-        poses = to_world(start[: HEADING + 1], vocabulary.trajectories[index])
-        rollout = simulate(scene, poses, traffic, traffic_scene)
+        rollout = roll_out(traffic_scene, states[member].copy())
         reactive = score(
-            prepare_scene(scene, rollout.agents),
+            among(replay, rollout.agents, start),
             np.concatenate([pdm_states, rollout.ego_states[None]]),
             normalise="pairs",
         )
@@ -200,6 +198,7 @@ def perturb(
             continue
         fate[member] = "kept"
         cell = (int(cells[member, 0]), int(cells[member, 1]))
+        index = int(gated[member])
         candidates.append(
             Candidate(index, ends[member], cell, float(scores[member]), float(reactive.pdm_score[1]), reactive, rollout)
         )

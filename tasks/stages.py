@@ -37,7 +37,7 @@ STAGES: tuple[Stage, ...] = (
     Stage("expert", 1, "attempt", ("no_plan",)),
     Stage("reward", 1, "attempt", SUBSCORES),
     Stage("render", 1, "attempt", ("psnr",)),
-    Stage("write", 1, "attempt", ()),
+    Stage("write", 2, "attempt", ()),
 )
 
 

@@ -41,6 +41,7 @@ class Path:
     colour: Colour
     label: str
     dashed: bool = False
+    width_px: int = 2
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,7 @@ def draw_bev(
     for ring in shapes.lanes:
         cv2.polylines(image, [pixels(ring)], True, LANE_EDGE, 1, cv2.LINE_AA, _SHIFT)
     for path in paths:
-        _polyline(image, pixels(path.poses), path.colour, path.dashed)
+        _polyline(image, pixels(path.poses), path)
     for box, kind in zip(agents.boxes, agents.kinds):
         if np.isfinite(box).all():
             corners = box_corners(box)
@@ -114,12 +115,11 @@ def draw_bev(
     return image
 
 
-def _polyline(image: NDArray[np.uint8], points: NDArray[np.int32], colour: Colour, dashed: bool) -> None:
-    if not dashed:
-        cv2.polylines(image, [points], False, colour, 2, cv2.LINE_AA, _SHIFT)
-        return
-    for start in range(0, len(points) - 1, 4):
-        cv2.polylines(image, [points[start : start + 3]], False, colour, 2, cv2.LINE_AA, _SHIFT)
+def _polyline(image: NDArray[np.uint8], points: NDArray[np.int32], path: Path) -> None:
+    every, length = (4, 3) if path.dashed else (len(points), len(points))
+    for start in range(0, len(points) - 1, every):
+        piece = points[start : start + length]
+        cv2.polylines(image, [piece], False, path.colour, path.width_px, cv2.LINE_AA, _SHIFT)
 
 
 def _captions(image: NDArray[np.uint8], title: str, paths: Sequence[Path]) -> None:

@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from factory.look.bev import BACKGROUND, EXPERT, LOGGED, PERTURBED, Boxes, MapShapes, Path, draw_bev
+from factory.look.bev import BACKGROUND, EXPERT, LOGGED, PERTURBED, Boxes, Colour, MapShapes, Path, draw_bev
+from factory.store.reader import labels_of
 from factory.store.schema import NOW_INDEX
 from tasks.world.frames import to_local
 from tasks.world.lanes import LightState
@@ -34,15 +35,20 @@ BEV_COLUMNS = (
 TILE_PX = (400, 240)  # width, height of a camera in the sheet, its caption included
 CAPTION_PX = 22
 INK = (30, 30, 30)
+SCORE_COLOURS = ((228, 190, 184), (235, 190, 80), (50, 150, 90))  # at 0, 0.5, 1
+MOST_LINES = 800  # of a vocabulary: more would hide the map
 
 
-def sample_bev(row: Row, logged: Array | None = None, size_px: tuple[int, int] = (480, 480)) -> Image:
+def sample_bev(
+    row: Row, logged: Array | None = None, size_px: tuple[int, int] = (480, 480), vocabulary: Array | None = None
+) -> Image:
     """A sample from above at its now, the ego pointing up.
 
     Args:
         row: at least BEV_COLUMNS of a sample.
         logged: (M, >=3) the log's drive from T on, world frame; None: the row's own two logged poses are joined.
         size_px: width, height.
+        vocabulary: (K, 40, 3) the trajectories that the row's labels are of, to be drawn in the colour of their score.
     """
     lanes = dict(zip(row["lane_ids"], row["lane_polygons"]))
     red = {
@@ -59,9 +65,24 @@ def sample_bev(row: Row, logged: Array | None = None, size_px: tuple[int, int] =
     )
     boxes = np.asarray(row["agent_boxes"], dtype=float).reshape(len(row["agent_kinds"]), -1, 5)
     here = np.zeros(3)
-    return draw_bev(
-        here, shapes, Boxes(boxes[:, NOW_INDEX], row["agent_kinds"]), here, _paths(row, logged), "", size_px
-    )
+    paths = [*(_scored_paths(row, vocabulary) if vocabulary is not None else ()), *_paths(row, logged)]
+    return draw_bev(here, shapes, Boxes(boxes[:, NOW_INDEX], row["agent_kinds"]), here, paths, "", size_px)
+
+
+def _scored_paths(row: Row, vocabulary: Array) -> list[Path]:
+    """Thin lines from the ego for every n-th trajectory, the best on top; the worst and the best have a caption."""
+    shown = slice(None, None, -(-len(vocabulary) // MOST_LINES))
+    scores = labels_of(row).pdm_score()[shown]
+    lines = np.concatenate([np.zeros((len(scores), 1, 3)), vocabulary[shown]], axis=1)
+    order = np.argsort(scores, kind="stable")
+    captions = {i: f"vocabulary: EPDMS {scores[i]:.2f}" for i in (order[0], order[-1])}
+    return [Path(lines[i], _score_colour(scores[i]), captions.get(i, ""), width_px=1) for i in order]
+
+
+def _score_colour(score: float) -> Colour:
+    """Red at 0, yellow at a half, green at 1."""
+    red, green, blue = (np.interp(score, (0.0, 0.5, 1.0), channel) for channel in zip(*SCORE_COLOURS))
+    return round(red), round(green), round(blue)
 
 
 def _paths(row: Row, logged: Array | None) -> list[Path]:
@@ -132,7 +153,7 @@ def encoded(image: Image, suffix: str = ".jpg") -> bytes:
     return bytes(data)
 
 
-def sample_sheet(row: Row, logged: Array | None = None, bev_px: int = 720) -> Image:
+def sample_sheet(row: Row, logged: Array | None = None, bev_px: int = 720, vocabulary: Array | None = None) -> Image:
     """Top-down view and all cameras at now, side by side; up to three cameras in one column, more in two."""
     tiles = [_tile(image) for image in images_at_now(row)] or [
         _note(f"no images: image_source is {row['image_source']}")
@@ -142,7 +163,7 @@ def sample_sheet(row: Row, logged: Array | None = None, bev_px: int = 720) -> Im
     rows = [np.concatenate(tiles[i : i + columns], axis=1) for i in range(0, len(tiles), columns)]
     strip = np.concatenate(rows, axis=0)
     height = max(bev_px, strip.shape[0])
-    bev = sample_bev(row, logged, (bev_px, bev_px))
+    bev = sample_bev(row, logged, (bev_px, bev_px), vocabulary)
     return np.concatenate([_padded(bev, height), _padded(strip, height)], axis=1)
 
 

@@ -7,6 +7,7 @@ files they stand in; `iterate` goes file by file instead, which is what a pass o
     print(len(samples), samples.schema)
     sample = samples[0]                       # dict: column -> array, text, number or None
     front = image_of(sample, "front", 0.0)    # (height, width, 3) uint8 RGB
+    labels = labels_of(sample)                # the scores of a whole vocabulary from this sample's scene
     batch = to_torch(sample)
 """
 
@@ -21,26 +22,40 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from factory.store.location import Location
-from factory.store.schema import SAMPLES, table_to_rows
+from factory.store.schema import SAMPLES, SCHEMA_VERSION, VERSION_PROPERTY, table_to_rows
 from factory.store.table import KeyedTable
+from tasks.reward.label_bytes import VocabularyLabels, decode
 
 if TYPE_CHECKING:
     import torch
 
 Sample = dict[str, Any]
 TIME_TOLERANCE_S = 0.05
+LABEL_COLUMNS = (
+    "label_vocabulary",
+    "label_traffic",
+    "label_reference_progress_m",
+    "label_subscores",
+    "label_progress",
+)
 
 
 class SampleTable:
     """The samples of one store, read-only."""
 
     def __init__(self, path: str | os.PathLike[str], storage_options: Mapping[str, str] | None = None) -> None:
-        """path: the run's `out` or its folder `samples`. Raises FileNotFoundError where there is no table."""
+        """path: the run's `out` or its folder `samples`.
+
+        Raises FileNotFoundError where there is no table, ValueError where its columns are those of another version.
+        """
         location = Location.parse(path, storage_options)
         here = KeyedTable(location, SAMPLES)
         self._table = here if here.version is not None else KeyedTable(location.child("samples"), SAMPLES)
         if self._table.version is None:
             raise FileNotFoundError(f"{location.uri}: no table of samples here or in its folder samples")
+        version = self._table.properties.get(VERSION_PROPERTY)
+        if version != str(SCHEMA_VERSION):
+            raise ValueError(f"{location.uri}: schema_version {version}, this version reads {SCHEMA_VERSION}")
         self._partitions = self._table.live_files()
         places = [
             (key, path, row)
@@ -131,6 +146,30 @@ def image_of(sample: Mapping[str, Any], camera: str, time_s: float) -> NDArray[n
             return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), dtype=np.uint8)
     have = sorted({(i["camera"], round(float(i["time_s"]), 3)) for i in sample["images"] or ()})
     raise KeyError(f"no image of camera {camera!r} at {time_s} s; there are {have}, source {sample['image_source']}")
+
+
+def labels_of(sample: Mapping[str, Any], vocabulary: str | None = None) -> VocabularyLabels:
+    """Sub-scores and progress of every vocabulary trajectory from the sample's scene, from the columns LABEL_COLUMNS.
+
+    vocabulary: digest of the trajectories that they are meant for. Raises ValueError where the sample has no labels,
+    has those of another vocabulary, or its bytes are damaged.
+    """
+    name = f"sample {sample.get('attempt_id', '')}".strip()
+    if sample["label_subscores"] is None:
+        raise ValueError(f"{name} has no vocabulary labels: its run had reward.labels=none")
+    digest = sample["label_vocabulary"]
+    if vocabulary not in (None, digest):
+        raise ValueError(f"{name} has labels of vocabulary {digest}, not of {vocabulary}: load the file of that digest")
+    try:
+        return decode(
+            sample["label_subscores"],
+            sample["label_progress"],
+            vocabulary=digest,
+            traffic=sample["label_traffic"],
+            reference_progress_m=sample["label_reference_progress_m"],
+        )
+    except ValueError as error:
+        raise ValueError(f"{name}: label_{error}") from error
 
 
 def to_torch(sample: Mapping[str, Any]) -> "dict[str, torch.Tensor]":

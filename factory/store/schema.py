@@ -12,7 +12,7 @@ from factory.store.columns import BadRow, Column
 from factory.store.table import TableSpec
 from tasks.stages import SUBSCORES
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 MAP_RADIUS_M = 64.0
 AGENT_STEPS = 56  # -1.5 .. 4.0 s at 10 Hz; index 15 is now
 NOW_INDEX = 15
@@ -133,7 +133,25 @@ def _sensors() -> tuple[Column, ...]:
         Column("psnr", "float64", unit="dB", about="of the block's reconstruction", nullable=True),
         Column("asset_digest", "string", about="of the reconstruction the images were rendered from", nullable=True),
         Column("tags", "string", ("T",), about="what is in the scene"),
-        Column("vocabulary_labels", "binary", about="sub-scores of the whole vocabulary", nullable=True),
+    )
+
+
+def _labels() -> tuple[Column, ...]:
+    """Scores of a whole vocabulary from now; all null in a run without them (reward.labels=none)."""
+    return (
+        Column("label_vocabulary", "string", about="digest of the K trajectories that are labelled", nullable=True),
+        Column("label_traffic", "string", about="replay: the row's own; idm: it answers to each", nullable=True),
+        Column(
+            "label_reference_progress_m",
+            "float64",
+            unit="m",
+            about="compliant progress of PDM-Closed; EP is relative to it",
+            nullable=True,
+        ),
+        Column(
+            "label_subscores", "binary", about="NC DDC DAC TLC TTC LK HC of K trajectories, as below", nullable=True
+        ),
+        Column("label_progress", "binary", about="progress of K trajectories along the route, as below", nullable=True),
     )
 
 
@@ -144,6 +162,7 @@ FIELDS: tuple[Column, ...] = (
     *_scores("stage1", "the perturbation, T .. T+H"),
     *_scores("stage2", "the expert, T+H .. T+2H (human: T .. T+H)"),
     *_sensors(),
+    *_labels(),
 )
 SCHEMA = pa.schema([field.arrow_field for field in FIELDS], metadata={"schema_version": str(SCHEMA_VERSION)})
 COLUMNS: Mapping[str, Column] = {field.name: field for field in FIELDS}
@@ -162,9 +181,8 @@ BOOKKEEPING = (
 
 
 LICENCES_PROPERTY = "factory.licences"  # of the table `samples`: the licences of its rows' sources, "; " between
-SAMPLES = TableSpec(
-    "samples", SCHEMA, "attempt_id", ("round", "expert"), {"factory.schema_version": str(SCHEMA_VERSION)}
-)
+VERSION_PROPERTY = "factory.schema_version"  # of the table `samples`
+SAMPLES = TableSpec("samples", SCHEMA, "attempt_id", ("round", "expert"), {VERSION_PROPERTY: str(SCHEMA_VERSION)})
 
 
 def sample_row_to_table(rows: Sequence[Mapping[str, object]]) -> pa.Table:

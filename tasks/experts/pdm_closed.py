@@ -14,9 +14,10 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from tasks.experts.pdm_forecast import RADIUS_M, ego_boxes, forecast
+from tasks.experts.pdm_forecast import RADIUS_M, ego_box, forecast
 from tasks.experts.pdm_path import MIN_PROGRESS_M, path_length_m
-from tasks.experts.pdm_proposals import DEFAULTS, SCORED_STEPS, PdmSettings, Proposals, proposals
+from tasks.experts.pdm_proposals import SCORED_STEPS, Proposals, proposals
+from tasks.experts.pdm_settings import DEFAULTS, PdmSettings
 from tasks.experts.protocol import Plan
 from tasks.reward.epdms import Scores, score
 from tasks.reward.prepare import prepare
@@ -26,7 +27,7 @@ from tasks.world.agents import AgentTracks
 from tasks.world.clip import Scene
 from tasks.world.lanes import LightState, MapLayer, MapPolygon
 from tasks.world.polygons import polygons_near
-from tasks.world.vehicle import HEADING, PACIFICA, Vehicle
+from tasks.world.vehicle import EGO_STATE_SIZE, HEADING, PACIFICA, Vehicle
 
 Array = NDArray[np.float64]
 
@@ -69,12 +70,13 @@ def plan_pdm_closed(
 
     agents: only their first step is looked at; polygons: the map within 100 m; red_lane_ids: connectors that are red
     now, of which the on-route ones matter; speed_limit_mps: of the lane the centerline starts on, None where unknown.
-    Raises ValueError where the centerline has no length.
+    Raises ValueError where the ego state, the centerline or a valid agent is misshapen or not finite, the centerline
+    has no length, or the speed limit is not positive.
     """
+    _refuse_nonsense(ego_state, agents)
+    red_on_route = red_lane_ids & route_lane_ids
     red = [
-        polygon
-        for polygon in polygons
-        if polygon.layer is MapLayer.LANE_CONNECTOR and polygon.token in red_lane_ids & route_lane_ids
+        polygon for polygon in polygons if polygon.layer is MapLayer.LANE_CONNECTOR and polygon.token in red_on_route
     ]
     lights = tuple(shapely.Polygon(polygon.ring[:, :2]) for polygon in red)
     seen = forecast(ego_state, agents, lights, vehicle)
@@ -95,6 +97,19 @@ def plan_pdm_closed(
     return PdmPlan(candidates, simulated, scores, int(np.argmax(scores.pdm_score)))
 
 
+def _refuse_nonsense(ego_state: Array, agents: AgentTracks) -> None:
+    if np.shape(ego_state) != (EGO_STATE_SIZE,) or not np.isfinite(ego_state).all():
+        raise ValueError(f"ego_state must be ({EGO_STATE_SIZE},) finite numbers, got {np.asarray(ego_state).tolist()}")
+    n = len(agents)
+    shapes = agents.boxes.shape[1:], agents.velocities.shape[1:], agents.valid.shape[1:]
+    if agents.n_steps < 1 or shapes != ((n, 5), (n, 2), (n,)):
+        raise ValueError(f"agents: {n} tracks need boxes (S >= 1, {n}, 5), velocities, valid; got {shapes} per step")
+    known = np.isfinite(agents.boxes[0]).all(axis=1) & np.isfinite(agents.velocities[0]).all(axis=1)
+    if (agents.valid[0] & ~known).any():
+        unknown = agents.track_ids[np.flatnonzero(agents.valid[0] & ~known)[0]]
+        raise ValueError(f"agents: track {unknown} is valid at the first step but its box or velocity is not finite")
+
+
 def plan_for(scene: Scene, settings: PdmSettings = DEFAULTS, vehicle: Vehicle = PACIFICA) -> PdmPlan:
     """PDM-Closed from a scene, seeing its agents and lights at the scene's step only."""
     clip = scene.clip
@@ -104,7 +119,7 @@ def plan_for(scene: Scene, settings: PdmSettings = DEFAULTS, vehicle: Vehicle = 
         for lane_id, state in zip(lights.lane_ids, lights.states[scene.step] if lights.lane_ids else ())
         if state == LightState.RED
     }
-    center = ego_boxes(scene.ego_state[: HEADING + 1], vehicle)[:2]
+    center = ego_box(scene.ego_state[: HEADING + 1], vehicle)[:2]
     return plan_pdm_closed(
         ego_state=scene.ego_state,
         centerline=scene.centerline,

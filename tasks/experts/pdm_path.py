@@ -1,53 +1,30 @@
-"""A polyline that can be driven by arc length (METRIC.md section 4)."""
+"""Parallel polylines that can be driven by arc length (METRIC.md section 4). Compiled."""
 
-from dataclasses import dataclass
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
-import shapely
-import shapely.ops
 from numpy.typing import NDArray
 
-from tasks.world.frames import wrap_angle
+from tasks.experts.pdm_shapes import to_segment
+from tasks.kernels import kernel
 
 Array = NDArray[np.float64]
+HALF_TURN = math.pi
 MIN_PROGRESS_M = 1e-5  # interpolation never asks for the very first point: joints may repeat it
+_REPEATED_M2 = 1e-300  # below it the inverse of a squared length would overflow
+_TIE_M2 = 1e-6  # segments whose squared distance is this near the least are looked at again, in the exact arithmetic
 
 
-@dataclass(frozen=True)
-class DrivePath:
-    """A path by arc length."""
+class DrivePaths(NamedTuple):
+    """L parallel paths of P points, world frame."""
 
-    poses: Array  # (P, 3) x, y [m], unwrapped heading [rad], world frame
-    progress: Array  # (P,) arc length of each pose [m], not decreasing (lane joints repeat a point)
-    line: shapely.LineString
-
-    @property
-    def length_m(self) -> float:
-        return float(self.progress[-1])
-
-    def at(self, progress: Array) -> Array:
-        """Poses (..., 3) at arc lengths (...) [m]: linear in x, y and unwrapped heading, clipped to the path's ends."""
-        distance = np.clip(progress, MIN_PROGRESS_M, self.length_m)
-        # side="left": the segment found starts strictly before the distance, so a repeated point divides by nothing
-        above = np.clip(np.searchsorted(self.progress, distance), 1, len(self.progress) - 1)
-        below = above - 1
-        slope = (self.poses[above] - self.poses[below]) / (self.progress[above] - self.progress[below])[..., None]
-        out = slope * (distance - self.progress[below])[..., None] + self.poses[below]
-        out[..., 2] = np.arctan2(np.sin(out[..., 2]), np.cos(out[..., 2]))
-        return out
-
-    def project(self, points: Array) -> Array:
-        """Arc length [m] of the nearest point of the path to each of `points` (..., 2)."""
-        found: Array = shapely.line_locate_point(self.line, shapely.points(points))
-        return found
-
-    def ahead(self, start_m: float, stop_m: float) -> shapely.LineString:
-        """The part between two arc lengths, made of the path's own points where at least two lie inside."""
-        start_m, stop_m = float(np.clip(start_m, 0.0, self.length_m)), float(np.clip(stop_m, 0.0, self.length_m))
-        inside = (start_m <= self.progress) & (self.progress <= stop_m)
-        if np.count_nonzero(inside) > 1:
-            return shapely.LineString(self.poses[inside, :2])
-        return shapely.ops.substring(self.line, start_m, stop_m)
+    x: Array  # (L, P) [m]
+    y: Array  # (L, P) [m]
+    heading: Array  # (L, P) [rad], unwrapped along the path
+    progress: Array  # (L, P) arc length [m], not decreasing (lane joints repeat a point)
+    inverse_square: Array  # (L, P - 1) 1 / squared length of each segment [1/m2], 0 where a point is repeated
 
 
 def path_length_m(poses: Array) -> float:
@@ -55,24 +32,96 @@ def path_length_m(poses: Array) -> float:
     return float(np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1).sum())
 
 
-def drive_path(poses: Array) -> DrivePath:
-    """The path through `poses` (P, 3). Raises ValueError where it has no length."""
-    poses = np.array(poses, dtype=np.float64)
-    if poses.ndim != 2 or poses.shape[1] != 3 or len(poses) < 2:
-        raise ValueError(f"a path needs poses of shape (P >= 2, 3), got {poses.shape}")
-    poses[:, 2] = np.unwrap(poses[:, 2])
-    steps = np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1)
-    progress = np.concatenate([[0.0], np.cumsum(steps)])
-    if progress[-1] <= MIN_PROGRESS_M:
-        raise ValueError("a path needs a length")
-    return DrivePath(poses, progress, shapely.LineString(poses[:, :2]))
+def drive_paths(centerline: Array, offsets_m: Sequence[float]) -> DrivePaths:
+    """`centerline` (P >= 2, 3) moved sideways by each of the L offsets, to the left where positive; headings stay.
+
+    Raises ValueError where the centerline is no such array, is not finite, or one of the paths has no length.
+    """
+    centerline = np.array(centerline, dtype=np.float64)  # a copy: kernels compile once more for read-only arrays
+    if centerline.ndim != 2 or centerline.shape[1] != 3 or len(centerline) < 2:
+        raise ValueError(f"centerline must be (P >= 2, 3) x, y, heading, got {centerline.shape}")
+    if not np.isfinite(centerline).all():
+        raise ValueError("centerline holds NaN or infinite values; leave such points out")
+    paths = _moved_sideways(centerline, np.asarray(offsets_m, dtype=np.float64))
+    if paths.progress[:, -1].min() <= MIN_PROGRESS_M:
+        raise ValueError("centerline needs a length: all its points are one")
+    return paths
 
 
-def parallel(poses: Array, offset_m: float) -> Array:
-    """`poses` (P, 3) moved sideways, to the left where `offset_m` > 0; headings stay."""
-    side = poses[:, 2] + np.pi / 2.0
-    moved = poses.copy()
-    moved[:, 0] += np.cos(side) * offset_m
-    moved[:, 1] += np.sin(side) * offset_m
-    moved[:, 2] = wrap_angle(moved[:, 2])
-    return moved
+@kernel
+def _moved_sideways(centerline: Array, offsets_m: Array) -> DrivePaths:
+    n_paths, n_points = offsets_m.shape[0], centerline.shape[0]
+    x, y, heading, progress = np.empty((4, n_paths, n_points))
+    inverse_square = np.zeros((n_paths, n_points - 1))
+    for path in range(n_paths):
+        unwrap = 0.0
+        for k in range(n_points):
+            side = centerline[k, 2] + HALF_TURN / 2.0
+            x[path, k] = centerline[k, 0] + math.cos(side) * offsets_m[path]
+            y[path, k] = centerline[k, 1] + math.sin(side) * offsets_m[path]
+            here = wrapped(centerline[k, 2])
+            if k == 0:
+                heading[path, k], progress[path, k] = here, 0.0
+                continue
+            turn = here - wrapped(centerline[k - 1, 2])
+            if abs(turn) >= HALF_TURN:
+                unwrap += wrapped(turn) - turn
+            heading[path, k] = here + unwrap
+            dx, dy = x[path, k] - x[path, k - 1], y[path, k] - y[path, k - 1]
+            square = dx * dx + dy * dy
+            progress[path, k] = progress[path, k - 1] + math.sqrt(square)
+            if square > _REPEATED_M2:
+                inverse_square[path, k - 1] = 1.0 / square
+    return DrivePaths(x, y, heading, progress, inverse_square)
+
+
+@kernel
+def wrapped(angle: float) -> float:
+    """An angle [rad] in [-pi, pi)."""
+    return (angle + HALF_TURN) % (2.0 * HALF_TURN) - HALF_TURN
+
+
+@kernel
+def pose_at(paths: DrivePaths, path: int, progress: float) -> tuple[float, float, float]:
+    """x, y, heading at an arc length [m]: linear in x, y and unwrapped heading, clipped to the path's ends."""
+    along = paths.progress[path]
+    last = along.shape[0] - 1
+    distance = min(max(progress, MIN_PROGRESS_M), along[last])
+    # the segment found starts strictly before the distance, so a repeated point divides by nothing
+    k = min(max(np.searchsorted(along, distance), 1), last) - 1
+    length, rest = along[k + 1] - along[k], distance - along[k]
+    x, y, heading = paths.x[path], paths.y[path], paths.heading[path]
+    h = (heading[k + 1] - heading[k]) / length * rest + heading[k]
+    return (
+        (x[k + 1] - x[k]) / length * rest + x[k],
+        (y[k + 1] - y[k]) / length * rest + y[k],
+        math.atan2(math.sin(h), math.cos(h)),
+    )
+
+
+@kernel
+def project(paths: DrivePaths, path: int, px: float, py: float) -> float:
+    """Arc length [m] of the point of a path nearest to (px, py), the first of several.
+
+    The least squared distance is found over all segments, then the few that come near it are compared with the
+    arithmetic of GEOS, so that ties between segments fall as they do for the public planner.
+    """
+    x, y, along, inverse = paths.x[path], paths.y[path], paths.progress[path], paths.inverse_square[path]
+    squares = np.empty(inverse.shape[0])
+    next_x, next_y = x[1:], y[1:]
+    for k in range(inverse.shape[0]):
+        ex, ey = next_x[k] - x[k], next_y[k] - y[k]
+        ux, uy = px - x[k], py - y[k]
+        t = min(max((ux * ex + uy * ey) * inverse[k], 0.0), 1.0)
+        rx, ry = ux - t * ex, uy - t * ey
+        squares[k] = rx * rx + ry * ry
+    bound = squares.min()
+    bound += _TIE_M2 * (1.0 + bound)
+    nearest, found = np.inf, 0.0
+    for k in range(inverse.shape[0]):
+        if squares[k] <= bound:
+            ex, ey = x[k + 1] - x[k], y[k + 1] - y[k]
+            distance, fraction = to_segment(px, py, x[k], y[k], x[k + 1], y[k + 1])
+            if distance < nearest:
+                nearest, found = distance, along[k] + fraction * math.sqrt(ex * ex + ey * ey)
+    return found

@@ -1,41 +1,28 @@
-"""PDM's fifteen proposals: IDM at five target speeds along three parallel paths (METRIC.md section 4).
+"""PDM's fifteen proposals: IDM at five target speeds along three parallel paths (METRIC.md section 4). Compiled.
 
-All proposals advance together. What does not depend on them (who stands in a path's corridor when, and how far along
-the path) is found once for all 25 forecast samples; each step is then one distance call over (proposal, object) pairs.
+What does not depend on them (who stands in a path's corridor when, and how far along the path) is found once for all
+forecast samples; then each proposal is driven in steps of 0.1 s, a path's speeds side by side from slow to fast.
 """
 
+import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 
-from tasks.experts.pdm_forecast import SAMPLE_STEPS, STEP_S, Forecast, ego_boxes
-from tasks.experts.pdm_path import DrivePath, drive_path, parallel
-from tasks.world.frames import box_corners
+from tasks.experts.pdm_corridor import corridors, lead_progress
+from tasks.experts.pdm_forecast import SAMPLE_STEPS, STEP_S, Forecast, Things
+from tasks.experts.pdm_path import DrivePaths, drive_paths, pose_at, project
+from tasks.experts.pdm_settings import DEFAULTS, PdmSettings
+from tasks.experts.pdm_shapes import rings_distance
+from tasks.kernels import kernel
 from tasks.world.vehicle import PACIFICA, VX, Vehicle, X, Y
 
 Array = NDArray[np.float64]
 SCORED_STEPS = 40
 PROPOSAL_STEPS = 50  # the chosen one is driven on to 5 s
-
-
-@dataclass(frozen=True)
-class PdmSettings:
-    """Constants of PDM-Closed as published with NAVSIM (METRIC.md section 4)."""
-
-    speed_fractions: tuple[float, ...] = (0.2, 0.4, 0.6, 0.8, 1.0)  # of the lane's speed limit
-    lateral_offsets_m: tuple[float, ...] = (0.0, -1.0, 1.0)  # + is to the left
-    fallback_speed_mps: float = 15.0  # where the lane has no speed limit
-    min_gap_m: float = 1.0
-    headway_s: float = 1.5
-    accel_max_mps2: float = 1.5
-    decel_max_mps2: float = 3.0
-    exponent: int = 10
-    shared_lead_memory: bool = True  # quirk: within one path, a speed inherits lead fields its own search did not write
-
-
-DEFAULTS = PdmSettings()
+SAMPLES = PROPOSAL_STEPS // SAMPLE_STEPS + 1
 
 
 @dataclass(frozen=True)
@@ -47,16 +34,25 @@ class Proposals:
     leads: Array  # (P, 51, 3) lead's arc length [m], velocity [m/s], own half length on a free road [m]
 
 
-@dataclass(frozen=True)
-class _Traffic:
-    """Objects in the corridor of each path, L paths, S samples, M objects with red lights last."""
+class Driver(NamedTuple):
+    """The intelligent driver model's constants, and the faults it keeps (tasks.experts.pdm_settings)."""
 
-    polygons: NDArray[np.object_]  # (S, M)
-    in_corridor: NDArray[np.bool_]  # (L, S, M)
-    progress: Array  # (L, S, M) arc length of the centroid [m]
-    speed: Array  # (M,) [m/s], 0 for standing things
-    heading: Array  # (M,)
-    is_light: NDArray[np.bool_]  # (M,)
+    min_gap_m: float
+    headway_s: float
+    accel_max_mps2: float
+    decel_max_mps2: float
+    exponent: float
+    shared_lead_memory: bool
+    brakes_at_first_step: bool
+    speed_below_zero: bool
+
+
+class BodySize(NamedTuple):
+    """The ego's footprint [m]."""
+
+    rear_axle_to_center: float
+    half_length: float
+    half_width: float
 
 
 def proposals(
@@ -70,123 +66,148 @@ def proposals(
     """The proposals from `ego_state` (11,) along `centerline` (N, 3) through the forecast traffic.
 
     Each starts at the projection of the rear axle on its path with the ego's longitudinal speed.
-    Raises ValueError where the centerline has no length or the speed limit is not positive.
+    Raises ValueError where the centerline is misshapen, not finite or without length, or the speed limit not positive.
     """
-    if speed_limit_mps is not None and not speed_limit_mps > 0.0:
-        raise ValueError(f"a speed limit of {speed_limit_mps} m/s cannot be driven; None means unknown")
-    paths = [drive_path(parallel(centerline, offset)) for offset in settings.lateral_offsets_m]
-    limit = settings.fallback_speed_mps if speed_limit_mps is None else speed_limit_mps
-    targets = np.tile(np.array(settings.speed_fractions) * limit, len(paths))
-    lateral = np.repeat(np.arange(len(paths)), len(settings.speed_fractions))
-    start = np.array([float(path.project(ego_state[[X, Y]])) for path in paths])
-    reach_m = abs(targets).max() * PROPOSAL_STEPS * STEP_S
-    traffic = _traffic(paths, start, reach_m, seen, vehicle)
-
-    count = len(targets)
-    motion = np.zeros((count, PROPOSAL_STEPS + 1, 2))
-    leads = np.zeros((count, PROPOSAL_STEPS + 1, 3))
-    poses = np.zeros((count, PROPOSAL_STEPS + 1, 3))
-    motion[:, 0, 0], motion[:, 0, 1] = start[lateral], ego_state[VX]
-    poses[:, 0] = _on_paths(paths, lateral, motion[:, 0, 0])
-    for step in range(1, PROPOSAL_STEPS + 1):
-        if step % SAMPLE_STEPS == 0:
-            memory = settings.shared_lead_memory and step <= SCORED_STEPS  # beyond, the chosen one is driven alone
-            before = motion[:, step - 1], poses[:, step - 1]
-            found = _leads(paths, lateral, traffic, step // SAMPLE_STEPS, *before, vehicle)
-            leads[:, step] = _remembered(found, len(settings.speed_fractions)) if memory else np.nan_to_num(found)
-        else:
-            leads[:, step] = leads[:, step - 1]  # at step 1 all zeros: every proposal first brakes at its hardest
-        motion[:, step] = idm_step(motion[:, step - 1], leads[:, step], targets, settings)
-        poses[:, step] = _on_paths(paths, lateral, motion[:, step, 0])
-    return Proposals(poses, motion, leads)
-
-
-def idm_step(motion: Array, leads: Array, target_mps: Array, settings: PdmSettings) -> Array:
-    """One Euler step of 0.1 s of the intelligent driver model (Treiber et al. 2000), rows (P, 2) progress, speed.
-
-    s* = gap + v T + v (v - v_lead) / (2 sqrt(a b));  dv/dt = a (1 - (v / v0)^n - (s* / s)^2), clipped to [-b, a].
-    The speed is not clipped at 0, as published.
-    """
-    progress, speed = motion[:, 0], motion[:, 1]
-    closing = speed * (speed - leads[:, 1]) / (2.0 * np.sqrt(settings.accel_max_mps2 * settings.decel_max_mps2))
-    wanted = settings.min_gap_m + speed * settings.headway_s + closing
-    gap = np.maximum(leads[:, 0] - progress - leads[:, 2], settings.min_gap_m)
-    accel = settings.accel_max_mps2 * (1.0 - (speed / target_mps) ** settings.exponent - (wanted / gap) ** 2)
-    accel = np.clip(accel, -settings.decel_max_mps2, settings.accel_max_mps2)
-    return np.stack([progress + STEP_S * speed, speed + STEP_S * accel], axis=-1)
-
-
-def _on_paths(paths: list[DrivePath], lateral: NDArray[np.intp], progress: Array) -> Array:
-    poses = np.empty((len(lateral), 3))
-    for index, path in enumerate(paths):
-        here = lateral == index
-        poses[here] = path.at(progress[here])
-    return poses
-
-
-def _traffic(paths: list[DrivePath], start: Array, reach_m: float, seen: Forecast, vehicle: Vehicle) -> _Traffic:
-    samples = PROPOSAL_STEPS // SAMPLE_STEPS + 1
-    lights = np.empty((samples, len(seen.red_lights)), dtype=object)
-    lights[:] = seen.red_lights
-    polygons = np.concatenate([seen.polygons(samples), lights], axis=1)
-    ignored = np.concatenate([seen.touches_ego, np.array(seen.red_light_holds_ego, dtype=bool)])
-    in_corridor = np.zeros((len(paths), *polygons.shape), dtype=bool)
-    progress = np.zeros((len(paths), *polygons.shape))
-    centroids = shapely.centroid(polygons)
-    for index, path in enumerate(paths):
-        corridor = shapely.buffer(
-            path.ahead(start[index], start[index] + reach_m), vehicle.half_width, cap_style="square"
+    if speed_limit_mps is not None and not 0.0 < speed_limit_mps < math.inf:
+        raise ValueError(
+            f"speed_limit_mps: {speed_limit_mps} m/s cannot be driven; it must be positive and finite, None is unknown"
         )
-        shapely.prepare(corridor)
-        in_corridor[index] = shapely.intersects(corridor, polygons) & ~ignored
-        inside = in_corridor[index]
-        progress[index][inside] = shapely.line_locate_point(path.line, centroids[inside])
-    n_lights = len(seen.red_lights)
-    return _Traffic(
-        polygons=polygons,
-        in_corridor=in_corridor,
-        progress=progress,
-        speed=np.concatenate([seen.speed * seen.is_agent, np.zeros(n_lights)]),
-        heading=np.concatenate([seen.boxes[:, 2], np.zeros(n_lights)]),
-        is_light=np.concatenate([np.zeros(len(seen.boxes), dtype=bool), np.ones(n_lights, dtype=bool)]),
+    paths = drive_paths(centerline, settings.lateral_offsets_m)
+    limit = settings.fallback_speed_mps if speed_limit_mps is None else speed_limit_mps
+    targets = np.array(settings.speed_fractions) * limit
+    start = np.array([project(paths, i, ego_state[X], ego_state[Y]) for i in range(len(settings.lateral_offsets_m))])
+    things = seen.things(SAMPLES)
+    swept = corridors(paths, start, targets.max() * PROPOSAL_STEPS * STEP_S, vehicle.half_width)
+    progress = lead_progress(paths, swept, things)
+    body = BodySize(vehicle.rear_axle_to_center, vehicle.half_length, vehicle.half_width)
+    return Proposals(*_drive(paths, things, progress, start, ego_state[VX], targets, driver(settings), body))
+
+
+def driver(settings: PdmSettings) -> Driver:
+    """The settings that each step needs."""
+    return Driver(
+        settings.min_gap_m,
+        settings.headway_s,
+        settings.accel_max_mps2,
+        settings.decel_max_mps2,
+        float(settings.exponent),
+        settings.shared_lead_memory,
+        settings.brakes_at_first_step,
+        settings.speed_below_zero,
     )
 
 
-def _leads(
-    paths: list[DrivePath],
-    lateral: NDArray[np.intp],
-    traffic: _Traffic,
-    sample: int,
-    motion: Array,
-    poses: Array,
-    vehicle: Vehicle,
-) -> Array:
-    """(P, 3) lead of each proposal; NaN marks a field that the search does not write."""
-    ahead = traffic.in_corridor[lateral, sample] & (traffic.progress[lateral, sample] > motion[:, :1])
-    proposal, thing = np.nonzero(ahead)
-    distance = np.full(ahead.shape, np.inf)
-    footprints = shapely.polygons(box_corners(ego_boxes(poses, vehicle)))
-    distance[proposal, thing] = shapely.distance(footprints[proposal], traffic.polygons[sample, thing])
+@kernel
+def idm_step(progress: float, speed: float, lead: Array, target_mps: float, idm: Driver) -> tuple[float, float]:
+    """One Euler step of 0.1 s of the intelligent driver model (Treiber et al. 2000): progress [m], speed [m/s].
 
-    found = np.full((len(lateral), 3), np.nan)
-    free = ~ahead.any(axis=1)
-    found[free, 0] = np.array([path.line.length for path in paths])[lateral[free]]
-    found[free, 2] = vehicle.half_length
-    if not free.all():
-        led = ~free
-        nearest = distance[led].argmin(axis=1)
-        found[led, 0] = motion[led, 0] + distance[led].min(axis=1)
-        relative = traffic.heading[nearest] - poses[led, 2]
-        # a red light is a lead whose velocity is never written: 0, or what the slower proposal left there
-        found[led, 1] = np.where(traffic.is_light[nearest], np.nan, traffic.speed[nearest] * np.cos(relative))
-    return found
+    s* = gap + v T + v (v - v_lead) / (2 sqrt(a b));  dv/dt = a (1 - (v / v0)^n - (s* / s)^2), clipped to [-b, a].
+    lead: (3,) its arc length [m], velocity [m/s], and what is kept off the gap to it [m].
+    """
+    closing = speed * (speed - lead[1]) / (2.0 * math.sqrt(idm.accel_max_mps2 * idm.decel_max_mps2))
+    wanted = idm.min_gap_m + speed * idm.headway_s + closing
+    gap = max(lead[0] - progress - lead[2], idm.min_gap_m)
+    accel = idm.accel_max_mps2 * (1.0 - (speed / target_mps) ** idm.exponent - (wanted / gap) ** 2)
+    after = speed + STEP_S * min(max(accel, -idm.decel_max_mps2), idm.accel_max_mps2)
+    return progress + STEP_S * speed, after if idm.speed_below_zero else max(after, 0.0)
 
 
-def _remembered(found: Array, speeds: int) -> Array:
-    """Fills unwritten fields with the last value written by a slower proposal of the same path, else 0."""
-    out = found.reshape(-1, speeds, 3).copy()
-    last = np.zeros((len(out), 3))
-    for index in range(speeds):
-        last = np.where(np.isnan(out[:, index]), last, out[:, index])
-        out[:, index] = last
-    return out.reshape(found.shape)
+@kernel
+def _drive(
+    paths: DrivePaths,
+    things: Things,
+    lead_progress_m: Array,
+    start_m: Array,
+    speed0_mps: float,
+    targets_mps: Array,
+    idm: Driver,
+    body: BodySize,
+) -> tuple[Array, Array, Array]:
+    """poses (P, 51, 3), motion (P, 51, 2) and leads (P, 51, 3) of Proposals. lead_progress_m: (L, S, M)."""
+    n_paths, n_speeds = start_m.shape[0], targets_mps.shape[0]
+    poses = np.empty((n_paths * n_speeds, PROPOSAL_STEPS + 1, 3))
+    motion = np.empty((n_paths * n_speeds, PROPOSAL_STEPS + 1, 2))
+    leads = np.zeros((n_paths * n_speeds, PROPOSAL_STEPS + 1, 3))
+    footprint = np.empty((2, 4))
+    for path in range(n_paths):
+        first = path * n_speeds
+        for p in range(first, first + n_speeds):
+            motion[p, 0, 0], motion[p, 0, 1] = start_m[path], speed0_mps
+            poses[p, 0, 0], poses[p, 0, 1], poses[p, 0, 2] = pose_at(paths, path, start_m[path])
+        for step in range(1, PROPOSAL_STEPS + 1):
+            looks = step % SAMPLE_STEPS == 0 or (step == 1 and not idm.brakes_at_first_step)
+            shared = idm.shared_lead_memory and step <= SCORED_STEPS  # beyond, the chosen one is driven alone
+            written = np.zeros(3)
+            for p in range(first, first + n_speeds):
+                progress, speed = motion[p, step - 1, 0], motion[p, step - 1, 1]
+                if looks:
+                    if not shared:
+                        written[:] = 0.0
+                    _set_footprint(poses[p, step - 1], body, footprint)
+                    sample = step // SAMPLE_STEPS
+                    nearest = _nearest_ahead(things, lead_progress_m[path, sample], sample, progress, footprint)
+                    _write_lead(paths, path, things, nearest, progress, poses[p, step - 1, 2], body, written)
+                    leads[p, step] = written
+                else:
+                    leads[p, step] = leads[p, step - 1]  # before the first search all zeros: no gap, so it brakes hard
+                after = idm_step(progress, speed, leads[p, step], targets_mps[p - first], idm)
+                motion[p, step, 0], motion[p, step, 1] = after
+                poses[p, step, 0], poses[p, step, 1], poses[p, step, 2] = pose_at(paths, path, after[0])
+    return poses, motion, leads
+
+
+@kernel
+def _write_lead(
+    paths: DrivePaths,
+    path: int,
+    things: Things,
+    nearest: tuple[float, int],
+    progress: float,
+    heading: float,
+    body: BodySize,
+    lead: Array,
+) -> None:
+    """Write into `lead` (3,) what a search found: arc length, velocity, own half length on a free road.
+
+    A free road leaves the velocity as it was, a thing the half length, a red light both: what was there is the memory.
+    """
+    distance, thing = nearest
+    if thing < 0:
+        lead[0], lead[2] = paths.progress[path, -1], body.half_length
+        return
+    lead[0] = progress + distance
+    if not things.is_light[thing]:
+        lead[1] = things.speed[thing] * math.cos(things.heading[thing] - heading)
+
+
+@kernel
+def _nearest_ahead(things: Things, ahead_m: Array, sample: int, progress: float, footprint: Array) -> tuple[float, int]:
+    """Distance [m] from the footprint (2, 4) to the nearest thing farther along than `progress`, and which; -1: none.
+
+    ahead_m: (M,) arc length of each thing in the corridor, NaN for those that are not in it.
+    """
+    nearest, found = np.inf, -1
+    x, y = 0.5 * (footprint[0, 0] + footprint[0, 2]), 0.5 * (footprint[1, 0] + footprint[1, 2])
+    own_radius = math.hypot(footprint[0, 0] - x, footprint[1, 0] - y)
+    for m in range(ahead_m.shape[0]):
+        if ahead_m[m] > progress:
+            between = math.hypot(things.center_x[sample, m] - x, things.center_y[sample, m] - y)
+            if between - things.radius[m] - own_radius <= nearest:
+                of_ring = slice(things.first[m], things.first[m + 1])
+                ring_x, ring_y = things.x[sample, of_ring], things.y[sample, of_ring]
+                distance = rings_distance(footprint[0], footprint[1], ring_x, ring_y)
+                if distance < nearest:
+                    nearest, found = distance, m
+    return nearest, found
+
+
+@kernel
+def _set_footprint(pose: Array, body: BodySize, out: Array) -> None:
+    """Corners (2, 4) x, y of the ego's body, its rear axle at `pose` (3,)."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    x, y = pose[0] + body.rear_axle_to_center * c, pose[1] + body.rear_axle_to_center * s
+    for i in range(4):
+        along = body.half_length if i == 0 or i == 3 else -body.half_length
+        across = body.half_width if i < 2 else -body.half_width
+        out[0, i] = x + c * along - s * across
+        out[1, i] = y + s * along + c * across

@@ -28,21 +28,6 @@ def ego_boxes(states: Array, vehicle: Vehicle) -> Array:
     )
 
 
-def front_edges(boxes: Array) -> Array:
-    """The front edge of boxes (..., 5), as boxes of length zero."""
-    heading, half_length = boxes[..., 2], boxes[..., 3] / 2.0
-    edges = boxes.copy()
-    edges[..., 0] += half_length * np.cos(heading)
-    edges[..., 1] += half_length * np.sin(heading)
-    edges[..., 3] = 0.0
-    return edges
-
-
-def circumradius(boxes: Array) -> Array:
-    """Radius (...) [m] of the circle around each box."""
-    return 0.5 * np.hypot(boxes[..., 3], boxes[..., 4])
-
-
 def touching(first: Array, second: Array) -> Bools:
     """Whether boxes (..., 5) intersect pairwise, touching included (separating axes).
 

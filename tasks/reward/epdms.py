@@ -1,18 +1,13 @@
 """EPDMS: the sub-scores of ego trajectories and what they add up to (METRIC.md 2)."""
 
 from dataclasses import dataclass, fields, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.reward.areas import ego_areas
-from tasks.reward.boxes import ego_boxes
-from tasks.reward.collisions import no_at_fault_collision, time_to_collision, traffic_light_compliance
-from tasks.reward.comfort import history_comfort
-from tasks.reward.prepare import N_TIMES, PreparedScene
-from tasks.reward.progress import driving_direction_compliance, first_true, lane_keeping, progress_along
-from tasks.world.vehicle import EGO_STATE_SIZE
+from tasks.reward.prepare import PreparedScene
+from tasks.reward.verdicts import Verdicts, judge
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -22,7 +17,6 @@ WEIGHTS = {"ep": 5.0, "ttc": 5.0, "lk": 2.0, "hc": 2.0}
 EC_WEIGHT = 2.0
 MULTIPLIERS = ("nc", "dac", "tlc", "ddc")
 PROGRESS_THRESHOLD_M = 5.0
-ROWS_AT_ONCE = 512  # bounds the memory of one pass
 
 
 @dataclass(frozen=True)
@@ -77,54 +71,21 @@ def score(
     as if alone. with_history=False leaves history comfort at 1, as the public passes over the human and PDM-Closed do.
     Raises ValueError for other shapes or non-finite states.
     """
-    states = np.asarray(states, dtype=np.float64)
-    if states.ndim != 3 or states.shape[1:] != (N_TIMES, EGO_STATE_SIZE) or states.shape[0] == 0:
-        raise ValueError(f"states must be (K >= 1, {N_TIMES}, {EGO_STATE_SIZE}), got {states.shape}")
-    if not np.isfinite(states).all():
-        raise ValueError("states must be finite")
-    parts = [
-        _rules(prepared, states[start : start + ROWS_AT_ONCE], with_history)
-        for start in range(0, states.shape[0], ROWS_AT_ONCE)
-    ]
-    raw = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return combined(judge(prepared, states, with_history=with_history), normalise)
+
+
+def combined(verdicts: Verdicts, normalise: Normalise = "batch") -> Scores:
+    """What verdicts on K trajectories add up to; `normalise` as in `score`."""
+    raw = verdicts._asdict()
     multiplier = np.prod([raw[name] for name in MULTIPLIERS], axis=0)
-    ep = relative_progress(raw["ep_raw_m"], multiplier, normalise)
+    ep = relative_progress(verdicts.ep_raw_m, multiplier, normalise)
     return _combined(Scores(ep=ep, multiplier=multiplier, pdm_score=np.zeros_like(ep), **raw))
-
-
-def _rules(prepared: PreparedScene, states: Array, with_history: bool) -> dict[str, NDArray[np.generic]]:
-    """Everything in Scores that does not depend on the other rows."""
-    boxes = ego_boxes(states, prepared.vehicle)
-    areas = ego_areas(prepared.regions, states, boxes)
-    nc, collision_index = no_at_fault_collision(prepared.obstacles, states, boxes, areas)
-    tlc, tlc_index = traffic_light_compliance(prepared.red_lanes, boxes)
-    ddc, ddc_index = driving_direction_compliance(boxes, areas)
-    ttc, ttc_index = time_to_collision(prepared.obstacles, states, boxes, areas)
-    lk, lk_index = lane_keeping(prepared.centerline, boxes, areas)
-    hc, comfort, hc_index = history_comfort(prepared.history if with_history else None, states, prepared.vehicle)
-    return {
-        "nc": nc,
-        "dac": np.where(areas.non_drivable.any(axis=1), 0.0, 1.0),
-        "ddc": ddc,
-        "tlc": tlc,
-        "ttc": ttc,
-        "lk": lk,
-        "hc": hc,
-        "ep_raw_m": progress_along(prepared.centerline, boxes),
-        "collision_index": collision_index,
-        "dac_index": first_true(areas.non_drivable),
-        "ddc_index": ddc_index,
-        "tlc_index": tlc_index,
-        "ttc_index": ttc_index,
-        "lk_index": lk_index,
-        "hc_index": hc_index,
-        "ego_areas": np.stack([areas.multiple_lanes, areas.non_drivable, areas.oncoming], axis=-1),
-        "comfort": comfort,
-    }
 
 
 def relative_progress(ep_raw_m: Array, multiplier: Array, normalise: Normalise) -> Array:
     """EP (K,): raw progress over the best compliant one, clipped to 0 .. 1; 1 where that best is at most 5 m."""
+    if normalise not in get_args(Normalise):
+        raise ValueError(f"normalise must be one of {get_args(Normalise)}, got {normalise!r}")
     compliant = ep_raw_m * multiplier
     best = np.full_like(compliant, compliant.max()) if normalise == "batch" else np.maximum(compliant, compliant[0])
     far_enough = best > PROGRESS_THRESHOLD_M

@@ -1,17 +1,22 @@
 """Everything the reward asks of a scene, made once and used for any number of ego trajectories (METRIC.md 2)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 
 from tasks.reward.boxes import ego_boxes, touching
+from tasks.reward.centerline import Centerline, index_centerline
 from tasks.reward.comfort import comfort_history
+from tasks.reward.lights import RedLanes, index_red_lanes
+from tasks.reward.map_index import MapIndex, index_map
+from tasks.reward.obstacles import Obstacles, index_obstacles, unindexed
 from tasks.world.agents import MOVING_KINDS, AgentTracks
+from tasks.world.bounds import LARGEST, all_within
 from tasks.world.clip import HORIZON_STEPS, Clip, Scene
-from tasks.world.frames import box_corners
 from tasks.world.lanes import LightState, MapLayer, MapPolygon
 from tasks.world.polygons import polygons_near
 from tasks.world.vehicle import EGO_STATE_SIZE, PACIFICA, Vehicle
@@ -24,51 +29,39 @@ MAP_RADIUS_M = 100.0
 PAST_STEPS = (0, 5, 10, 15)  # of the 1.5 s history at 10 Hz: -1.5, -1.0, -0.5, 0 s
 STOPPED_SPEED_MPS = 0.05
 LANE_LAYERS = frozenset({MapLayer.LANE, MapLayer.LANE_CONNECTOR})
-DRIVABLE_LAYERS = frozenset(
-    {MapLayer.ROADBLOCK, MapLayer.INTERSECTION, MapLayer.DRIVABLE_AREA, MapLayer.CARPARK_AREA}
-)  # lanes themselves are not in it
 
 
-@dataclass(frozen=True)
-class Regions:
-    """R distinct map polygons with the parts they play; polygons with the same rings are one region."""
-
-    shapes: NDArray[np.object_]  # (R,) shapely polygons, prepared
-    bounds: Array  # (R, 4) min x, min y, max x, max y [m]
-    is_lane: Bools  # (R,) lane or lane connector
-    is_on_route: Bools  # (R,) a lane of the route
-    is_drivable: Bools  # (R,)
-    is_intersection: Bools  # (R,)
-
-
-@dataclass(frozen=True)
-class Obstacles:
-    """N objects over 41 steps of 0.1 s, world frame."""
-
-    boxes: Array  # (41, N, 5) centre x, y, heading, length, width; NaN when absent
-    centroids: Array  # (41, N, 2) of the box polygons [m]; NaN when absent
-    is_stopped: Bools  # (N,) no road user, or at most 0.05 m/s when first seen
-    collision_score: Array  # (N,) what an at-fault collision leaves of NC: 0 for road users, else 0.5
-
-
-@dataclass(frozen=True)
-class RedLanes:
-    """L on-route lane connectors whose light is red at some time."""
-
-    shapes: NDArray[np.object_]  # (L,) shapely polygons, prepared
-    is_red: Bools  # (41, L)
+# A scene is prepared several times among different objects: by a planner, for its score, for every rollout.
+_indexed_map = lru_cache(maxsize=4)(index_map)
 
 
 @dataclass(frozen=True)
 class PreparedScene:
-    """A scene ready to score ego trajectories of 4 s at 10 Hz; steps 0..40, 0 is now."""
+    """A scene ready to score ego trajectories of 4 s at 10 Hz; steps 0..40, 0 is now. Arrays only: it pickles."""
 
     vehicle: Vehicle
     history: Array | None  # (14, 11) ego states at -1.5 .. -0.2 s; None: history comfort is not judged
-    centerline: shapely.LineString
-    regions: Regions
-    obstacles: Obstacles
+    centerline: Centerline
+    map_index: MapIndex
+    obstacles: Obstacles  # to be looked at one by one
     red_lanes: RedLanes
+
+    @cached_property
+    def indexed_obstacles(self) -> Obstacles:
+        """The same objects, quicker to look up; made when first asked for, since only many trajectories repay it."""
+        radius_m = float(np.hypot(self.vehicle.half_length, self.vehicle.half_width))
+        plain = self.obstacles
+        return index_obstacles(plain.boxes, plain.is_stopped, plain.collision_score, radius_m)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Arrays that a shared object store hands out read-only are copied: the kernels are compiled for others."""
+        self.__dict__.update({name: _writable(value) for name, value in state.items()})
+
+
+def _writable(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return np.require(value, requirements=["C", "W"])
+    return type(value)._make(map(_writable, value)) if hasattr(value, "_make") else value
 
 
 def prepare(
@@ -90,14 +83,15 @@ def prepare(
     lane connectors that are red at all times, or (ids, (41, L) mask); lanes that are not among `polygons` are out of
     reach and left out; ego_state0: (11,), by default the last past state.
     drop_touching: objects whose box touches the ego's at step 0 are left out for good, as the public log replay does.
-    Raises ValueError for wrong shapes, and when drop_touching has no ego state to look at.
+    Raises ValueError, naming the argument, for wrong shapes, ego states or a centreline that are not finite, a
+    centreline without length, polygons that bound no area or cross themselves, and when drop_touching has no ego
+    state to look at.
     """
-    if past_states is not None and past_states.shape != (len(PAST_STEPS), EGO_STATE_SIZE):
-        raise ValueError(f"past_states must be (4, 11), got {past_states.shape}")
-    if centerline.ndim != 2 or centerline.shape[0] < 2 or centerline.shape[1] < 2:
-        raise ValueError(f"centerline must be (P >= 2, >= 2), got {centerline.shape}")
-    if objects.n_steps < N_TIMES:
-        raise ValueError(f"objects must span at least {N_TIMES} steps, got {objects.n_steps}")
+    if past_states is not None:
+        _check_states("past_states", past_states, (len(PAST_STEPS), EGO_STATE_SIZE))
+    if ego_state0 is not None:
+        _check_states("ego_state0", ego_state0, (EGO_STATE_SIZE,))
+    _check_objects(objects)
     if ego_state0 is None and past_states is not None:
         ego_state0 = past_states[-1]
     if ego_state0 is None and drop_touching:
@@ -105,10 +99,10 @@ def prepare(
     return PreparedScene(
         vehicle=vehicle,
         history=None if past_states is None else comfort_history(past_states),
-        centerline=shapely.LineString(centerline[:, :2]),
-        regions=_regions(polygons, route_lane_ids),
+        centerline=index_centerline(centerline),
+        map_index=_indexed_map(tuple(polygons), route_lane_ids),
         obstacles=_obstacles(objects.window(0, N_TIMES), ego_state0 if drop_touching else None, vehicle),
-        red_lanes=_red_lanes(red_lanes, polygons),
+        red_lanes=_red(red_lanes, polygons),
     )
 
 
@@ -133,6 +127,16 @@ def prepare_scene(
     )
 
 
+def among(prepared: PreparedScene, objects: AgentTracks, ego_state0: Array | None) -> PreparedScene:
+    """The same scene among other objects: tracks of at least 41 steps, row 0 is now.
+
+    Those that touch the ego at `ego_state0` (11,) are left out for good; None: nobody is. Raises ValueError for tracks
+    of other shapes.
+    """
+    _check_objects(objects)
+    return replace(prepared, obstacles=_obstacles(objects.window(0, N_TIMES), ego_state0, prepared.vehicle))
+
+
 def _red_connectors(clip: Clip, step: int) -> tuple[tuple[str, ...], Bools]:
     """On-route lane connectors with a light, and where it is red over steps step .. step + 40: ids (L,), (41, L)."""
     lights, lanes = clip.lights, clip.road_map.lanes
@@ -147,68 +151,69 @@ def _red_connectors(clip: Clip, step: int) -> tuple[tuple[str, ...], Bools]:
     return tuple(lights.lane_ids[i] for i in governed), states == LightState.RED
 
 
-def _shape(polygon: MapPolygon) -> shapely.Polygon:
-    return shapely.Polygon(polygon.ring[:, :2], [hole[:, :2] for hole in polygon.holes])
+def _check_states(name: str, states: Array, shape: tuple[int, ...]) -> None:
+    if states.shape != shape:
+        raise ValueError(f"{name} must be {shape}, got {states.shape}")
+    if not all_within(states):
+        raise ValueError(f"{name} must be finite and at most {LARGEST:g}, it holds NaN, infinity or more")
 
 
-def _regions(polygons: Sequence[MapPolygon], route_lane_ids: frozenset[str]) -> Regions:
-    index: dict[tuple[bytes, ...], int] = {}
-    shapes: list[shapely.Polygon] = []
-    parts: list[list[bool]] = []  # is_lane, is_on_route, is_drivable, is_intersection
-    for polygon in polygons:
-        key = tuple(ring.tobytes() for ring in (polygon.ring, *polygon.holes))
-        if key not in index:
-            index[key] = len(shapes)
-            shapes.append(_shape(polygon))
-            parts.append([False] * 4)
-        is_lane = polygon.layer in LANE_LAYERS
-        plays = (
-            is_lane,
-            is_lane and polygon.token in route_lane_ids,
-            polygon.layer in DRIVABLE_LAYERS,
-            polygon.layer is MapLayer.INTERSECTION,
-        )
-        parts[index[key]] = [a or b for a, b in zip(parts[index[key]], plays)]
-    array = np.array(shapes, dtype=object)
-    shapely.prepare(array)
-    table = np.array(parts, dtype=bool).reshape(-1, 4)
-    bounds = shapely.bounds(array).reshape(-1, 4)
-    return Regions(array, bounds, table[:, 0], table[:, 1], table[:, 2], table[:, 3])
+def _check_objects(objects: AgentTracks) -> None:
+    if objects.n_steps < N_TIMES:
+        raise ValueError(f"objects must span at least {N_TIMES} steps, got {objects.n_steps}")
+    shape = (objects.n_steps, len(objects))
+    wanted = {"valid": shape, "boxes": (*shape, 5), "velocities": (*shape, 2)}
+    for name, expected in wanted.items():
+        found = getattr(objects, name).shape
+        if found != expected:
+            raise ValueError(f"objects.{name} must be {expected} for {len(objects)} objects, got {found}")
+    if len(objects.kinds) != len(objects):
+        raise ValueError(f"objects.kinds must name {len(objects)} objects, got {len(objects.kinds)}")
+    absent = ~objects.valid.astype(bool) | np.isnan(objects.boxes).any(axis=-1)
+    wrong = {
+        "boxes": ~(np.abs(objects.boxes) <= LARGEST).all(axis=-1) | (objects.boxes[..., 3:] < 0.0).any(axis=-1),
+        "velocities": ~(np.abs(objects.velocities) <= LARGEST).all(axis=-1),
+    }
+    for name, where in wrong.items():
+        if (where & ~absent).any():
+            step, i = np.argwhere(where & ~absent)[0]
+            raise ValueError(
+                f"objects.{name} of {objects.track_ids[i]} at step {step} are {getattr(objects, name)[step, i]}: they "
+                f"must be finite, at most {LARGEST:g}, sizes not negative; where it is absent its box is NaN"
+            )
 
 
 def _obstacles(objects: AgentTracks, ego_state0: Array | None, vehicle: Vehicle) -> Obstacles:
-    boxes = np.where(objects.valid[..., None], objects.boxes, np.nan)
-    keep = objects.valid.any(axis=0)
+    present = objects.valid & np.isfinite(objects.boxes).all(axis=-1)
+    boxes = np.where(present[..., None], objects.boxes, np.nan)
+    keep = present.any(axis=0)
     if ego_state0 is not None:
         keep &= ~touching(ego_boxes(ego_state0, vehicle), boxes[0])
-    boxes = boxes[:, keep]
-    columns = np.nonzero(keep)[0]
-
-    # Velocity and class are those of the first appearance, as in the public observation.
-    first_seen = objects.valid.argmax(axis=0)[columns]
-    speed = np.hypot(*objects.velocities[first_seen, columns].T)
-    is_agent = np.array([objects.kinds[i] in MOVING_KINDS for i in columns], dtype=bool)
-
-    centroids = np.full((*boxes.shape[:2], 2), np.nan)
-    present = np.isfinite(boxes).all(axis=-1)
-    centroids[present] = shapely.get_coordinates(shapely.centroid(shapely.polygons(box_corners(boxes[present]))))
-    return Obstacles(
-        boxes=boxes,
-        centroids=centroids,
-        is_stopped=~is_agent | (speed <= STOPPED_SPEED_MPS),
-        collision_score=np.where(is_agent, 0.0, 0.5),
-    )
+    is_stopped, collision_score = liability(objects)
+    return unindexed(boxes[:, keep], is_stopped[keep], collision_score[keep])
 
 
-def _red_lanes(red_lanes: tuple[str, ...] | tuple[tuple[str, ...], Bools], polygons: Sequence[MapPolygon]) -> RedLanes:
+def liability(objects: AgentTracks) -> tuple[Bools, Array]:
+    """Whether each object counts as stopped (N,), and what an at-fault collision with it leaves of NC (N,).
+
+    Velocity and class are those of the first appearance, as in the public observation (METRIC.md 2).
+    """
+    first_seen = objects.valid.argmax(axis=0)
+    velocity = objects.velocities[first_seen, np.arange(len(objects))]
+    is_agent = np.array([kind in MOVING_KINDS for kind in objects.kinds], dtype=bool)
+    is_stopped = ~is_agent | (np.hypot(velocity[:, 0], velocity[:, 1]) <= STOPPED_SPEED_MPS)
+    return is_stopped, np.where(is_agent, 0.0, 0.5)
+
+
+def _red(red_lanes: tuple[str, ...] | tuple[tuple[str, ...], Bools], polygons: Sequence[MapPolygon]) -> RedLanes:
     if len(red_lanes) == 2 and isinstance(red_lanes[1], np.ndarray):
         lane_ids, is_red = red_lanes
     else:
         lane_ids, is_red = red_lanes, np.ones((N_TIMES, len(red_lanes)), dtype=bool)
     if is_red.shape != (N_TIMES, len(lane_ids)):
         raise ValueError(f"the mask of red lanes must be ({N_TIMES}, {len(lane_ids)}), got {is_red.shape}")
-    shape_of = {polygon.token: polygon for polygon in polygons if polygon.layer in LANE_LAYERS}
-    columns = [i for i, lane_id in enumerate(lane_ids) if lane_id in shape_of and is_red[:, i].any()]
-    shapes = np.array([_shape(shape_of[lane_ids[i]]) for i in columns], dtype=object)
-    shapely.prepare(shapes)
-    return RedLanes(shapes, is_red[:, columns])
+    if is_red.dtype != np.bool_:
+        raise ValueError(f"the mask of red lanes must be bool, got {is_red.dtype}")
+    lanes = {polygon.token: polygon for polygon in polygons if polygon.layer in LANE_LAYERS}
+    columns = [i for i, lane_id in enumerate(lane_ids) if lane_id in lanes and is_red[:, i].any()]
+    return index_red_lanes([lanes[lane_ids[i]] for i in columns], is_red[:, columns])

@@ -2,7 +2,8 @@
 
 Stage one scores the logged frame, stage two the synthetic frames that start near where a plan may end. Every group of
 follow-up frames exists for the frame now and for the one 0.5 s before. All columns (each sub-score, the score) are
-aggregated alike; extended comfort belongs to a now/previous pair and stands in both rows.
+aggregated alike; extended comfort belongs to a now/previous pair and stands in both rows. The human-penalty filter is
+for logged frames: stage one comes both ways, stage two has no other.
 """
 
 from collections.abc import Sequence
@@ -10,6 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from tasks.reward.one_stage import FrameScores, means_of
 
 Array = NDArray[np.float64]
 
@@ -20,7 +23,7 @@ WEIGHT_VARIANCE_M2 = 0.1
 class Group:
     """One stage-one frame and its M follow-up frames, C columns."""
 
-    stage_one: Array  # (C,)
+    stage_one: FrameScores  # C columns
     endpoint_xy: Array  # (2,) last pose of the plan made in stage one, as predicted, world [m]
     stage_two: Array  # (M, C)
     starts_xy: Array  # (M, 2) rear axle at the start of each follow-up frame, world [m]
@@ -30,15 +33,16 @@ class Group:
 class TwoStageScores:
     """Means over all scenarios, per column."""
 
-    stage_one: Array  # (C,) plain mean of the stage-one rows
+    stage_one: FrameScores  # plain mean of the stage-one rows
     stage_two: Array  # (C,) plain mean of the stage-two rows
-    final: Array  # (C,) mean of stage one times weighted stage two
+    final: FrameScores  # mean of stage one times weighted stage two
 
 
 def follow_up_weights(endpoint_xy: Array, starts_xy: Array) -> Array:
     """Weights (M,), sum 1, of follow-up frames that start at (M, 2) for a plan that ends at (2,).
 
-    Gaussian in the distance, variance 0.1 m^2; uniform where all frames are too far (beyond 1.92 m) for a weight.
+    Gaussian in the distance, variance 0.1 m^2; uniform where all frames are too far (beyond 1.92 m) for a weight, or a
+    distance is NaN.
     """
     distance_sq = ((starts_xy - endpoint_xy) ** 2).sum(axis=-1)
     weights: Array = np.exp(-distance_sq / (2.0 * WEIGHT_VARIANCE_M2))
@@ -48,15 +52,15 @@ def follow_up_weights(endpoint_xy: Array, starts_xy: Array) -> Array:
     return weights / total
 
 
-def group_scores(group: Group) -> Array:
-    """Columns (C,) of one group: stage one times the weighted mean of stage two.
+def group_scores(group: Group) -> FrameScores:
+    """Columns of one group: stage one times the weighted mean of stage two.
 
     Raises ValueError when the group has no follow-up frame.
     """
     if len(group.stage_two) == 0:
         raise ValueError("a group needs at least one follow-up frame")
-    product: Array = group.stage_one * (follow_up_weights(group.endpoint_xy, group.starts_xy) @ group.stage_two)
-    return product
+    after: Array = follow_up_weights(group.endpoint_xy, group.starts_xy) @ group.stage_two
+    return FrameScores(group.stage_one.unfiltered * after, group.stage_one.filtered * after)
 
 
 def aggregate(scenarios: Sequence[tuple[Group, Group]]) -> TwoStageScores:
@@ -64,9 +68,8 @@ def aggregate(scenarios: Sequence[tuple[Group, Group]]) -> TwoStageScores:
     if not scenarios:
         raise ValueError("nothing to aggregate")
     groups = [group for pair in scenarios for group in pair]
-    final = np.mean([(group_scores(now) + group_scores(previous)) / 2.0 for now, previous in scenarios], axis=0)
     return TwoStageScores(
-        stage_one=np.mean([group.stage_one for group in groups], axis=0),
+        stage_one=means_of([group.stage_one for group in groups]),
         stage_two=np.mean(np.concatenate([group.stage_two for group in groups]), axis=0),
-        final=final,
+        final=means_of([means_of([group_scores(now), group_scores(before)]) for now, before in scenarios]),
     )

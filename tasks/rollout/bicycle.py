@@ -8,52 +8,41 @@ One explicit Euler step of 0.1 s. Speed is not clipped at zero, as in the public
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tasks.kernels import inlined
+from tasks.trig import sincos, wrap
 from tasks.world.clip import STEP_S
-from tasks.world.frames import wrap_angle
-from tasks.world.vehicle import (
-    AX,
-    EGO_STATE_SIZE,
-    HEADING,
-    PACIFICA,
-    STEERING,
-    STEERING_RATE,
-    VX,
-    YAW_ACCEL,
-    YAW_RATE,
-    Vehicle,
-    X,
-    Y,
-)
-
-Array = NDArray[np.float64]
 
 MAX_STEERING_RAD = np.pi / 3.0
 ACCEL_TIME_CONSTANT_S = 0.2
 STEERING_TIME_CONSTANT_S = 0.05
+ACCEL_SHARE = STEP_S / (STEP_S + ACCEL_TIME_CONSTANT_S)  # of a command that is reached within a step
+STEERING_SHARE = STEP_S / (STEP_S + STEERING_TIME_CONSTANT_S)
 
 
-def step(state: Array, accel_command: Array, steering_rate_command: Array, vehicle: Vehicle = PACIFICA) -> Array:
-    """The states (K, 11) 0.1 s later.
+@inlined
+def actuate(accel: float, steering: float, accel_command: float, rate_command: float) -> tuple[float, float, float]:
+    """Acceleration [m/s^2], steering angle [rad] and steering rate [rad/s] 0.1 s later.
 
-    state: (K, 11), columns tasks.world.vehicle; accel_command: (K,) [m/s^2]; steering_rate_command: (K,) [rad/s].
-    Lateral velocity and acceleration of the result are zero.
+    The rate is the one wanted: the clipping of the angle does not show in it.
     """
-    dt = STEP_S
-    heading, speed, steering = state[:, HEADING], state[:, VX], state[:, STEERING]
-    accel = dt / (dt + ACCEL_TIME_CONSTANT_S) * (accel_command - state[:, AX]) + state[:, AX]
-    wanted_steering = dt / (dt + STEERING_TIME_CONSTANT_S) * (steering_rate_command * dt) + steering
-    steering_rate = (wanted_steering - steering) / dt
+    steering_rate = STEERING_SHARE * rate_command
+    wanted = steering + steering_rate * STEP_S
+    wanted = wanted if wanted < MAX_STEERING_RAD else MAX_STEERING_RAD
+    wanted = wanted if wanted > -MAX_STEERING_RAD else -MAX_STEERING_RAD
+    return accel + ACCEL_SHARE * (accel_command - accel), wanted, steering_rate
 
-    after = np.zeros((state.shape[0], EGO_STATE_SIZE))
-    after[:, X] = state[:, X] + speed * np.cos(heading) * dt
-    after[:, Y] = state[:, Y] + speed * np.sin(heading) * dt
-    after[:, HEADING] = wrap_angle(heading + speed * np.tan(steering) / vehicle.wheel_base * dt)
-    after[:, VX] = speed + accel * dt
-    after[:, AX] = accel
-    after[:, STEERING] = np.clip(steering + steering_rate * dt, -MAX_STEERING_RAD, MAX_STEERING_RAD)
-    after[:, STEERING_RATE] = steering_rate
-    after[:, YAW_RATE] = after[:, VX] * np.tan(after[:, STEERING]) / vehicle.wheel_base
-    after[:, YAW_ACCEL] = (after[:, YAW_RATE] - state[:, YAW_RATE]) / dt
-    return after
+
+@inlined
+def travel(x: float, y: float, heading: float, speed: float, path_curvature: float) -> tuple[float, float, float]:
+    """Rear-axle pose 0.1 s later; path_curvature: tan(steering) / wheel base [1/m]."""
+    sine, cosine = sincos(heading)
+    step_m = speed * STEP_S
+    return x + step_m * cosine, y + step_m * sine, wrap(heading + step_m * path_curvature)
+
+
+@inlined
+def path_curvature(steering: float, wheel_base: float) -> float:
+    """Curvature [1/m] of the rear axle's path at a steering angle [rad]."""
+    sine, cosine = sincos(steering)
+    return sine / (cosine * wheel_base)

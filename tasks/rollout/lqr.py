@@ -1,34 +1,79 @@
 """LQR trajectory tracker on the kinematic bicycle, as the public metric drives a plan (METRIC.md 1a).
 
-Per plan, a velocity and a curvature profile are fitted to the poses (regularised least squares); per step, a scalar
-LQR over a 1 s horizon gives the acceleration and another the steering rate.
+Per plan, a velocity and a curvature profile are fitted to the poses (tasks.rollout.profiles); per step, a scalar LQR
+over a 1 s horizon gives the acceleration and another the steering rate.
 
-Two identities make it fast. The normal matrix of the velocity fit does not depend on the plan, because the heading
-enters only through cos^2 + sin^2 = 1: the whole fit is one constant 40 x 40 matrix. The curvature fit, written in
-curvatures instead of their rates, is tridiagonal: minimise
-    sum_i (dh_i - v_i dt k_i)^2 + 1e-2 sum_i ((k_{i+1} - k_i) / dt)^2 + 1e-10 k_0^2.
+The horizon needs no simulation. Its ten steps have the lengths s_i = (v + w i) dt with w = accel dt, and per step
+    lateral += s_i heading;  heading += s_i (steering / L - curvature_i);  steering += dt rate,
+so after it the heading is linear and the lateral error quadratic in (v, w), with weights that are polynomials in i.
+With k_i = steering / L - curvature_i and K_j = sum_i binomial(i, j) k_i, they grow by
+    turn = dt (v K_0 + w K_1)
+    bend = dt^2 (v^2 (9 K_0 - K_1) + v w (45 K_0 + 7 K_1 - 3 K_2) + w^2 (44 K_1 - 4 K_2 - 3 K_3)).
+A unit steering rate adds the same with k_i = i dt / L. Sums with binomial weights take additions only.
 """
 
-from functools import cache
+from math import comb
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.rollout import bicycle
+from tasks.kernels import inlined, kernel
+from tasks.rollout.bicycle import actuate, path_curvature, travel
+from tasks.rollout.profiles import TRACKING_STEPS, Plans, empty_plans, fit_curvatures, fit_speeds
+from tasks.trig import sincos, wrap
+from tasks.world.bounds import LARGEST, all_within
 from tasks.world.clip import HORIZON_STEPS, STEP_S
-from tasks.world.frames import wrap_angle
-from tasks.world.vehicle import EGO_STATE_SIZE, HEADING, PACIFICA, STEERING, VX, Vehicle, X, Y
+from tasks.world.vehicle import (
+    AX,
+    AY,
+    EGO_STATE_SIZE,
+    HEADING,
+    PACIFICA,
+    STEERING,
+    STEERING_RATE,
+    VX,
+    VY,
+    YAW_ACCEL,
+    YAW_RATE,
+    Vehicle,
+    X,
+    Y,
+)
 
 Array = NDArray[np.float64]
+Sums = tuple[float, float, float, float]
 
-TRACKING_STEPS = 10  # LQR horizon, 1 s
 Q_VELOCITY, R_ACCEL = 10.0, 1.0
 Q_LATERAL, Q_HEADING, R_STEERING_RATE = 1.0, 10.0, 1.0  # the steering angle itself costs nothing
-ACCEL_PENALTY = 1e-4  # the public "jerk penalty": its difference matrix penalises accelerations (METRIC.md 1a)
-CURVATURE_RATE_PENALTY = 1e-2
-INITIAL_CURVATURE_PENALTY = 1e-10
 STOPPING_GAIN = 0.5
 STOPPING_SPEED_MPS = 0.2
+
+HORIZON_S = TRACKING_STEPS * STEP_S
+ACCEL_GAIN = HORIZON_S * Q_VELOCITY / (HORIZON_S * Q_VELOCITY * HORIZON_S + R_ACCEL)
+
+BLOCK = 64  # plans simulated side by side; their scratch stays in the second-level cache
+ANY = -1  # length of an axis in a wanted shape
+TILE = 8  # plans written out side by side: one cache line of each row of scratch
+
+# sum_i binomial(i, j) and sum_i i binomial(i, j) over the horizon, j = 0 .. 3
+N = TRACKING_STEPS
+ONES = (float(N), float(comb(N, 2)), float(comb(N, 3)), float(comb(N, 4)))
+RAMP = (ONES[1], 2.0 * ONES[2] + ONES[1], 3.0 * ONES[3] + 2.0 * ONES[2], 4.0 * comb(N, 5) + 3.0 * ONES[3])
+
+
+class Motions(NamedTuple):
+    """Scratch for the simulated states of a block of B plans; instants first, 41 of them."""
+
+    x: Array  # (41, B) rear axle, world frame [m]
+    y: Array  # (41, B)
+    heading: Array  # (41, B) [rad]
+    speed: Array  # (41, B) [m/s]
+    accel: Array  # (41, B) [m/s^2]
+    steering: Array  # (41, B) [rad]
+    steering_rate: Array  # (41, B) [rad/s]
+    yaw_rate: Array  # (41, B) [rad/s]
+    curvature: Array  # (41, B) tan(steering) / wheel base [1/m]
 
 
 def track(ego_state0: Array, poses: Array, vehicle: Vehicle = PACIFICA, *, planned_pose0: Array | None = None) -> Array:
@@ -37,122 +82,217 @@ def track(ego_state0: Array, poses: Array, vehicle: Vehicle = PACIFICA, *, plann
     ego_state0: (11,) columns tasks.world.vehicle; poses: (K, 40, 3) world x, y, heading at 0.1 .. 4.0 s.
     planned_pose0: (K, 3) where each plan says the ego is now, when that is not the ego's own pose: the proposals of
     PDM-Closed start on their path, beside the ego.
-    Raises ValueError on other shapes or non-finite poses.
+    Raises ValueError, with the field's name, on other shapes or values that are not finite.
     """
-    poses = np.asarray(poses, dtype=np.float64)
-    if poses.ndim != 3 or poses.shape[1:] != (HORIZON_STEPS, 3) or np.shape(ego_state0) != (EGO_STATE_SIZE,):
-        raise ValueError(
-            f"track() needs ego_state0 (11,) and poses (K, 40, 3), got {np.shape(ego_state0)} and {poses.shape}"
-        )
-    if not (np.isfinite(poses).all() and np.isfinite(ego_state0).all()):
-        raise ValueError("track() needs finite poses and a finite ego state")
-    n_plans = poses.shape[0]
-    pose0 = np.asarray(ego_state0)[[X, Y, HEADING]] if planned_pose0 is None else planned_pose0
-    start = np.broadcast_to(pose0, (n_plans, 3))[:, None]
-    reference = np.concatenate([start, poses], axis=1)  # (K, 41, 3)
-    velocity = velocity_profile(reference)
-    curvature = curvature_profile(reference, velocity)
-    padding = np.repeat(curvature[:, -1:], TRACKING_STEPS, axis=1)
-    padded_curvature = np.concatenate([curvature, padding], axis=1)
+    ego = _checked("ego_state0", ego_state0, (EGO_STATE_SIZE,))
+    plans = _checked("poses", poses, (ANY, HORIZON_STEPS, 3))
+    if planned_pose0 is None:
+        starts = ego[None, : HEADING + 1]
+    else:
+        starts = _checked("planned_pose0", planned_pose0, (len(plans), 3))
+    return _followed(ego, np.zeros(3), starts, plans, vehicle)
 
-    states = np.empty((n_plans, HORIZON_STEPS + 1, EGO_STATE_SIZE))
-    states[:, 0] = ego_state0
-    for k in range(HORIZON_STEPS):
-        target = min(k + TRACKING_STEPS, HORIZON_STEPS - 1)
-        horizon = padded_curvature[:, k : k + TRACKING_STEPS].copy()
-        horizon[:, target - k :] = curvature[:, target, None]
-        accel, steering_rate = _commands(states[:, k], reference[:, k], velocity[:, target], horizon, vehicle)
-        states[:, k + 1] = bicycle.step(states[:, k], accel, steering_rate, vehicle)
+
+def track_local(ego_state0: Array, trajectories: Array, vehicle: Vehicle = PACIFICA) -> Array:
+    """Simulated ego states (K, 41, 11), world frame, that follow each trajectory given in the ego's frame.
+
+    ego_state0: (11,) as for `track`; trajectories: (K, 40, 3) x, y, heading at 0.1 .. 4.0 s in the frame of
+    `ego_state0`, as a vocabulary holds them. The same as track() of their world poses, without those in memory.
+    Raises ValueError, with the field's name, on other shapes or values that are not finite.
+    """
+    ego = _checked("ego_state0", ego_state0, (EGO_STATE_SIZE,))
+    plans = _checked("trajectories", trajectories, (ANY, HORIZON_STEPS, 3))
+    return _followed(ego, ego[: HEADING + 1], np.zeros((1, 3)), plans, vehicle)
+
+
+def _checked(name: str, value: Array, shape: tuple[int, ...]) -> Array:
+    """`value` as a finite float64 array of `shape`, where ANY stands for the number of plans."""
+    array = np.asarray(value, dtype=np.float64)
+    if array.ndim != len(shape) or any(want not in (ANY, have) for want, have in zip(shape, array.shape)):
+        wanted = ", ".join("K" if want == ANY else str(want) for want in shape)
+        raise ValueError(f"{name} must have the shape ({wanted}), got {array.shape}")
+    if not all_within(array):
+        worst = np.argwhere(~(np.abs(array) <= LARGEST))[0].tolist()
+        raise ValueError(f"{name} must be finite and at most {LARGEST:g}, element {worst} is not")
+    return array
+
+
+def _followed(ego: Array, frame: Array, starts: Array, poses: Array, vehicle: Vehicle) -> Array:
+    states = np.empty((len(poses), HORIZON_STEPS + 1, EGO_STATE_SIZE))
+    ego, frame, starts, poses = (_read_only(array) for array in (ego, frame, starts, poses))
+    _follow(ego, frame, starts, poses, float(vehicle.wheel_base), states)
     return states
 
 
-def velocity_profile(reference: Array) -> Array:
-    """Fitted speeds (K, 40) [m/s] at the starts of the displacements of `reference` (K, 41, 3)."""
-    delta = np.diff(reference[:, :, :2], axis=1)
-    heading = reference[:, :-1, 2]
-    forward = delta[..., 0] * np.cos(heading) + delta[..., 1] * np.sin(heading)
-    fit = _velocity_fit()
-    velocity = np.zeros_like(forward)
-    for i in range(HORIZON_STEPS):  # not a matrix product: the same bits for any number of plans
-        velocity += forward[:, i, None] * fit[:, i]
-    return velocity
+def _read_only(array: Array) -> Array:
+    """A contiguous view that may not be written: one compiled kernel serves arrays of both kinds."""
+    view = np.ascontiguousarray(array).view()
+    view.flags.writeable = False
+    return view
 
 
-@cache
-def _velocity_fit() -> Array:
-    """(40, 40) matrix from forward displacements [m] to fitted speeds [m/s]."""
-    n = HORIZON_STEPS
-    integrate = np.tril(np.full((n, n), STEP_S**2), k=-1)  # unknowns: v0, a_0 .. a_38; displacement = sum
-    integrate = np.concatenate([np.full((n, 1), STEP_S), integrate[:, : n - 1]], axis=1)
-    # The public matrix of "first differences" keeps the -1 band only, but for its last row.
-    penalty = np.zeros((n - 2, n))
-    penalty[:, 1 : n - 1] = -np.eye(n - 2)
-    penalty[-1, -1] = 1.0
-    unknowns = np.linalg.solve(integrate.T @ integrate + ACCEL_PENALTY * penalty.T @ penalty, integrate.T)
-    return integrate @ unknowns / STEP_S
+@kernel
+def _follow(ego: Array, frame: Array, starts: Array, poses: Array, wheel_base: float, states: Array) -> None:
+    """Fill `states` (K, 41, 11); starts (1 or K, 3) and poses (K, 40, 3) are in `frame` (3,)."""
+    plans, motions = empty_plans(BLOCK), _empty_motions(BLOCK)
+    for first in range(0, len(poses), BLOCK):
+        n_plans = min(BLOCK, len(poses) - first)
+        _gather(starts, poses, first, n_plans, plans)
+        _place(frame, n_plans, plans)
+        fit_speeds(n_plans, plans)
+        fit_curvatures(n_plans, plans)
+        _start(ego, wheel_base, n_plans, motions)
+        for t in range(HORIZON_STEPS):
+            _steer(plans, t, n_plans, wheel_base, motions)
+            _move(t, n_plans, wheel_base, motions)
+        _write(ego, motions, states[first : first + n_plans])
 
 
-def curvature_profile(reference: Array, velocity: Array) -> Array:
-    """Fitted curvatures (K, 40) [1/m] from the heading steps of `reference` (K, 41, 3) and speeds (K, 40)."""
-    step_m = velocity * STEP_S
-    heading_step = wrap_angle(np.diff(reference[:, :, 2], axis=1))
-    coupling = CURVATURE_RATE_PENALTY / STEP_S**2
-    diagonal = step_m**2 + 2.0 * coupling
-    diagonal[:, 0] += INITIAL_CURVATURE_PENALTY - coupling
-    diagonal[:, -1] -= coupling
-    right = step_m * heading_step
-    for i in range(1, HORIZON_STEPS):  # Thomas: symmetric tridiagonal with off-diagonal -coupling
-        factor = coupling / diagonal[:, i - 1]
-        diagonal[:, i] -= factor * coupling
-        right[:, i] += factor * right[:, i - 1]
-    curvature = np.empty_like(right)
-    curvature[:, -1] = right[:, -1] / diagonal[:, -1]
-    for i in range(HORIZON_STEPS - 2, -1, -1):
-        curvature[:, i] = (right[:, i] + coupling * curvature[:, i + 1]) / diagonal[:, i]
-    return curvature
+@inlined
+def _gather(starts: Array, poses: Array, first: int, n_plans: int, plans: Plans) -> None:
+    """The block's poses as they are given, into `x`, `y`, `heading`."""
+    for b in range(n_plans):
+        start = starts[min(first + b, len(starts) - 1)]
+        plans.x[0, b], plans.y[0, b], plans.heading[0, b] = start[X], start[Y], start[HEADING]
+        for t in range(HORIZON_STEPS):
+            pose = poses[first + b, t]
+            plans.x[t + 1, b], plans.y[t + 1, b], plans.heading[t + 1, b] = pose[X], pose[Y], pose[HEADING]
 
 
+@inlined
+def _place(frame: Array, n_plans: int, plans: Plans) -> None:
+    """From poses in `frame` to world poses, with cos and sin of their headings."""
+    sine, cosine = sincos(frame[HEADING])
+    for t in range(HORIZON_STEPS + 1):
+        for b in range(n_plans):
+            x, y, heading = plans.x[t, b], plans.y[t, b], wrap(plans.heading[t, b] + frame[HEADING])
+            plans.x[t, b] = cosine * x - sine * y + frame[X]
+            plans.y[t, b] = sine * x + cosine * y + frame[Y]
+            plans.heading[t, b] = heading
+            plans.sin[t, b], plans.cos[t, b] = sincos(heading)
+
+
+@inlined
+def _empty_motions(size: int) -> Motions:
+    shape = (HORIZON_STEPS + 1, size)
+    return Motions(
+        x=np.empty(shape),
+        y=np.empty(shape),
+        heading=np.empty(shape),
+        speed=np.empty(shape),
+        accel=np.empty(shape),
+        steering=np.empty(shape),
+        steering_rate=np.empty(shape),
+        yaw_rate=np.empty(shape),
+        curvature=np.empty(shape),
+    )
+
+
+@inlined
+def _start(ego: Array, wheel_base: float, n_plans: int, motions: Motions) -> None:
+    """Every plan of the block starts as the ego is."""
+    curvature = path_curvature(ego[STEERING], wheel_base)
+    for b in range(n_plans):
+        motions.x[0, b], motions.y[0, b], motions.heading[0, b] = ego[X], ego[Y], ego[HEADING]
+        motions.speed[0, b], motions.accel[0, b], motions.steering[0, b] = ego[VX], ego[AX], ego[STEERING]
+        motions.yaw_rate[0, b], motions.curvature[0, b] = ego[YAW_RATE], curvature
+
+
+@inlined
+def _steer(plans: Plans, t: int, n_plans: int, wheel_base: float, motions: Motions) -> None:
+    """Speed, acceleration and steering at t + 1, by the LQR's commands at t."""
+    ahead = min(t + TRACKING_STEPS, HORIZON_STEPS - 1)
+    for b in range(n_plans):
+        dx, dy = motions.x[t, b] - plans.x[t, b], motions.y[t, b] - plans.y[t, b]
+        accel_command, rate_command = _commands(
+            dy * plans.cos[t, b] - dx * plans.sin[t, b],
+            wrap(motions.heading[t, b] - plans.heading[t, b]),
+            motions.speed[t, b],
+            motions.steering[t, b],
+            plans.speed[ahead, b],
+            _binomial_sums(plans.curvature, t, b),
+            wheel_base,
+        )
+        accel, steering, rate = actuate(motions.accel[t, b], motions.steering[t, b], accel_command, rate_command)
+        motions.accel[t + 1, b], motions.steering[t + 1, b], motions.steering_rate[t + 1, b] = accel, steering, rate
+        motions.speed[t + 1, b] = motions.speed[t, b] + accel * STEP_S
+
+
+@inlined
+def _binomial_sums(values: Array, t: int, b: int) -> Sums:
+    """sum_i binomial(i, j) values[t + i, b] over the horizon, j = 0 .. 3."""
+    zeroth, first, second, third = 0.0, 0.0, 0.0, 0.0
+    for i in range(TRACKING_STEPS - 1, -1, -1):
+        zeroth += values[t + i, b]
+        if i > 0:
+            first += zeroth
+        if i > 1:
+            second += first
+        if i > 2:
+            third += second
+    return zeroth, first, second, third
+
+
+@inlined
+def _grown(k: Sums, speed: float, w: float) -> tuple[float, float]:
+    """`turn` / dt and `bend` / dt^2 of the module's docstring."""
+    turn = speed * k[0] + w * k[1]
+    vv = (N - 1.0) * k[0] - k[1]
+    vw = ONES[1] * k[0] + (N - 3.0) * k[1] - 3.0 * k[2]
+    ww = (ONES[1] - 1.0) * k[1] - 4.0 * k[2] - 3.0 * k[3]
+    return turn, speed * (speed * vv + w * vw) + w * w * ww
+
+
+@inlined
 def _commands(
-    state: Array, reference: Array, target_speed: Array, curvature: Array, vehicle: Vehicle
-) -> tuple[Array, Array]:
-    """Acceleration (K,) and steering rate (K,) for states (K, 11).
+    lateral: float, heading: float, speed: float, steering: float, target_speed: float, path: Sums, wheel_base: float
+) -> tuple[float, float]:
+    """Acceleration [m/s^2] and steering rate [rad/s] for the errors `lateral` [m] and `heading` [rad].
 
-    reference: (K, 3) pose of this step; target_speed: (K,) 1 s ahead; curvature: (K, 10) over the horizon.
+    target_speed: of the plan 1 s ahead; path: binomial sums of its curvature over that second.
     """
-    speed = state[:, VX]
-    speed_error = speed - target_speed
-    horizon_s = TRACKING_STEPS * STEP_S
-    accel = -horizon_s * Q_VELOCITY / (horizon_s * Q_VELOCITY * horizon_s + R_ACCEL) * speed_error
-
-    speeds = speed[:, None] + accel[:, None] * (STEP_S * np.arange(TRACKING_STEPS))
-    steering_rate = _steering_rate(state, reference, speeds * STEP_S, curvature, vehicle)
-
-    stopping = (target_speed <= STOPPING_SPEED_MPS) & (speed <= STOPPING_SPEED_MPS)
-    accel = np.where(stopping, -STOPPING_GAIN * speed_error, accel)
-    return accel, np.where(stopping, 0.0, steering_rate)
-
-
-def _steering_rate(state: Array, reference: Array, step_m: Array, curvature: Array, vehicle: Vehicle) -> Array:
-    """Steering rate (K,) [rad/s] that minimises the error one horizon ahead.
-
-    Linearised error dynamics per step of length step_m[:, t] = v dt:
-        lateral += v dt heading;  heading += v dt (steering / L - curvature);  steering += dt rate.
-    """
-    dx, dy = state[:, X] - reference[:, 0], state[:, Y] - reference[:, 1]
-    c, s = np.cos(reference[:, 2]), np.sin(reference[:, 2])
-    lateral = -dx * s + dy * c
-    heading = wrap_angle(state[:, HEADING] - reference[:, 2])
-
-    # heading error before step t, free response and response to a unit steering rate
-    steps = np.arange(TRACKING_STEPS)
-    turn_free = np.cumsum(step_m * (state[:, STEERING, None] / vehicle.wheel_base - curvature), axis=1)
-    turn_unit = np.cumsum(step_m / vehicle.wheel_base * (steps * STEP_S), axis=1)
-    lateral_free = lateral + (step_m[:, 0] * heading) + (step_m[:, 1:] * (heading[:, None] + turn_free[:, :-1])).sum(1)
-    lateral_unit = (step_m[:, 1:] * turn_unit[:, :-1]).sum(1)
-    heading_free = heading + turn_free[:, -1]
-    heading_free = np.arctan2(np.sin(heading_free), np.cos(heading_free))
-    heading_unit = turn_unit[:, -1]
-
+    dt, per_wheel_base = STEP_S, 1.0 / wheel_base
+    accel = -ACCEL_GAIN * (speed - target_speed)
+    w = accel * dt
+    own = steering * per_wheel_base
+    k = (own * ONES[0] - path[0], own * ONES[1] - path[1], own * ONES[2] - path[2], own * ONES[3] - path[3])
+    turn, bend = _grown(k, speed, w)
+    lateral_free = lateral + dt * (speed * ONES[0] + w * ONES[1]) * heading + dt * dt * bend
+    heading_free = wrap(heading + dt * turn)
+    turn_unit, bend_unit = _grown(RAMP, speed, w)
+    lateral_unit = dt * dt * dt * per_wheel_base * bend_unit
+    heading_unit = dt * dt * per_wheel_base * turn_unit
     pull = lateral_unit * Q_LATERAL * lateral_free + heading_unit * Q_HEADING * heading_free
     weight = lateral_unit * Q_LATERAL * lateral_unit + heading_unit * Q_HEADING * heading_unit + R_STEERING_RATE
-    return -pull / weight
+    stopping = (target_speed <= STOPPING_SPEED_MPS) & (speed <= STOPPING_SPEED_MPS)
+    return -STOPPING_GAIN * (speed - target_speed) if stopping else accel, 0.0 if stopping else -pull / weight
+
+
+@inlined
+def _move(t: int, n_plans: int, wheel_base: float, motions: Motions) -> None:
+    """Pose and yaw rate at t + 1; the pose moves with the speed and steering of t."""
+    for b in range(n_plans):
+        motions.x[t + 1, b], motions.y[t + 1, b], motions.heading[t + 1, b] = travel(
+            motions.x[t, b], motions.y[t, b], motions.heading[t, b], motions.speed[t, b], motions.curvature[t, b]
+        )
+        curvature = path_curvature(motions.steering[t + 1, b], wheel_base)
+        motions.curvature[t + 1, b] = curvature
+        motions.yaw_rate[t + 1, b] = motions.speed[t + 1, b] * curvature
+
+
+@inlined
+def _write(ego: Array, motions: Motions, states: Array) -> None:
+    """State rows (B, 41, 11) of a block; row 0 is `ego` (11,)."""
+    for tile in range(0, len(states), TILE):
+        for b in range(tile, min(tile + TILE, len(states))):
+            for column in range(EGO_STATE_SIZE):
+                states[b, 0, column] = ego[column]
+        for t in range(1, HORIZON_STEPS + 1):
+            for b in range(tile, min(tile + TILE, len(states))):
+                row = states[b, t]
+                row[X], row[Y], row[HEADING] = motions.x[t, b], motions.y[t, b], motions.heading[t, b]
+                row[VX], row[VY] = motions.speed[t, b], 0.0
+                row[AX], row[AY] = motions.accel[t, b], 0.0
+                row[STEERING], row[STEERING_RATE] = motions.steering[t, b], motions.steering_rate[t, b]
+                row[YAW_RATE] = motions.yaw_rate[t, b]
+                row[YAW_ACCEL] = (motions.yaw_rate[t, b] - motions.yaw_rate[t - 1, b]) * (1.0 / STEP_S)

@@ -43,9 +43,9 @@ class MapLayer(StrEnum):
     CARPARK_AREA = "CARPARK_AREA"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MapPolygon:
-    """One polygon of the drivable map."""
+    """One polygon of the drivable map; its identity is the object's, so that what is made of it can be kept."""
 
     token: str  # lane id, "int_" + lane id, "da_" + area id
     layer: MapLayer
@@ -53,9 +53,9 @@ class MapPolygon:
     holes: tuple[NDArray[np.float64], ...] = ()  # closed rings
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RoadMap:
-    """The map a log carries, in file order."""
+    """The map a log carries, in file order; its identity is the object's, so that what is made of it can be kept."""
 
     lanes: Mapping[str, Lane]
     drivable_areas: tuple[MapPolygon, ...]

@@ -4,6 +4,7 @@ Plain numpy: a query on a route's dozen lanes costs less than one shapely call p
 """
 
 from collections.abc import Sequence
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,16 +102,28 @@ def polygons_near(road_map: RoadMap, center_xy: Array, radius_m: float = MAP_RAD
     """Every polygon of the drivable map within `radius_m` of a point (2,), in the reference's order.
 
     LANE, LANE_CONNECTOR, INTERSECTION (one per intersection lane), DRIVABLE_AREA, each in file order; only lanes
-    that cars drive (METRIC.md section 0).
+    that cars drive (METRIC.md section 0). The same map gives the same objects again.
     """
-    lanes = [lane for lane in road_map.lanes.values() if lane.drives_cars]
-    every: list[MapPolygon] = []
-    every += [MapPolygon(lane.lane_id, MapLayer.LANE, lane.ring) for lane in lanes if not lane.is_intersection]
-    connectors = [lane for lane in lanes if lane.is_intersection]
-    every += [MapPolygon(lane.lane_id, MapLayer.LANE_CONNECTOR, lane.ring) for lane in connectors]
-    every += [MapPolygon(f"int_{lane.lane_id}", MapLayer.INTERSECTION, lane.ring) for lane in connectors]
-    every += road_map.drivable_areas
-    if not every:
+    if road_map not in _DRIVABLE:
+        every = _drivable_map(road_map)
+        _DRIVABLE[road_map] = every, Rings([polygon.ring for polygon in every]) if every else None
+    every, rings = _DRIVABLE[road_map]
+    if rings is None:
         return ()
-    near = Rings([polygon.ring for polygon in every]).distances(np.asarray(center_xy)[:2]) <= radius_m
+    near = rings.distances(np.asarray(center_xy)[:2]) <= radius_m
     return tuple(polygon for polygon, is_near in zip(every, near, strict=True) if is_near)
+
+
+# Laid out once per map: an attempt asks several times, and finding what is near costs less than laying it out.
+_DRIVABLE: WeakKeyDictionary[RoadMap, tuple[tuple[MapPolygon, ...], Rings | None]] = WeakKeyDictionary()
+
+
+def _drivable_map(road_map: RoadMap) -> tuple[MapPolygon, ...]:
+    lanes = [lane for lane in road_map.lanes.values() if lane.drives_cars]
+    connectors = [lane for lane in lanes if lane.is_intersection]
+    return (
+        *(MapPolygon(lane.lane_id, MapLayer.LANE, lane.ring) for lane in lanes if not lane.is_intersection),
+        *(MapPolygon(lane.lane_id, MapLayer.LANE_CONNECTOR, lane.ring) for lane in connectors),
+        *(MapPolygon(f"int_{lane.lane_id}", MapLayer.INTERSECTION, lane.ring) for lane in connectors),
+        *road_map.drivable_areas,
+    )

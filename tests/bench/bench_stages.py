@@ -1,4 +1,4 @@
-"""Times the stages on real logs (or the synthetic town where there are none), and the reward by batch size."""
+"""Times the stages on real logs, or on the synthetic town where there are none."""
 
 import sys
 from pathlib import Path
@@ -11,35 +11,20 @@ from tasks.chance import stream
 from tasks.experts.pdm_closed import PdmClosed, PdmSettings
 from tasks.kinematic_vocabulary import kinematic_trajectories
 from tasks.perturb import Perturbation, PerturbSettings, perturb
-from tasks.reward.epdms import score
 from tasks.reward.prepare import prepare_scene
-from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, simulate
 from tasks.vocabulary import Vocabulary
-from tasks.world.clip import NOW, scene_of_clip
-from tasks.world.frames import to_world
+from tasks.world.clip import scene_of_clip
 from tests.bench.timing import milliseconds
-
-PUBLIC_MS_PER_TRAJECTORY = 20.0  # the public implementation, one core (METRIC.md)
 
 
 def main(root: Path) -> None:
-    """Prints two tables."""
+    """Prints the table."""
     reader: ClipReader = AV2Reader(root) if root.is_dir() else SyntheticReader(n_clips=3)
     ref = reader.index().refs[0]
     clip = reader.read(ref)
     scene = scene_of_clip(clip)
     print(f"clip {ref.clip_id} of {reader.name}, {len(clip.agents)} tracks; one thread\n")
-
-    print("| K | track ms | score ms | ms per trajectory | public / ours |\n|---|---|---|---|---|")
-    prepared = prepare_scene(scene, clip.agents.window(NOW, NOW + 41))
-    for k in (1, 2, 256, 4096):
-        poses = to_world(scene.ego_state[:3], kinematic_trajectories(k, 0))
-        states = track(scene.ego_state, poses)
-        tracked = milliseconds(lambda poses=poses: track(scene.ego_state, poses), 3)
-        scored = milliseconds(lambda states=states: score(prepared, states), 3)
-        each = (tracked + scored) / k
-        print(f"| {k} | {tracked:.1f} | {scored:.1f} | {each:.3f} | {PUBLIC_MS_PER_TRAJECTORY / each:.0f} |")
 
     settings, pdm = TrafficSettings(), PdmSettings()
     vocabulary = Vocabulary(kinematic_trajectories(1024, 0), source="kinematic")
@@ -62,7 +47,7 @@ def main(root: Path) -> None:
         "PDM-Closed's plan": lambda: PdmClosed().plan(second, rng),
         "whole attempt (pdm_closed)": lambda: attempt(second, PdmClosed(), ExpertGate(), settings, pdm, rng),
     }
-    print("\n| step | ms |\n|---|---|")
+    print("| step | ms |\n|---|---|")
     for name, call in rows.items():
         print(f"| {name} | {milliseconds(call, 5):.1f} |")
 

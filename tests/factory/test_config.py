@@ -13,8 +13,7 @@ import yaml
 
 from factory.clips.reader import ClipIndex
 from factory.config import ConfigError, build, compose, conf_dir, fill
-from factory.settings import RecoverySources, RunConfig, build_expert, load_config, open_reader
-from tasks.attempt import ExpertGate
+from factory.settings import RecoverySources, RewardSettings, RunConfig, build_expert, load_config, open_reader
 from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.recovery import RecoverySettings
 from tasks.kinematic_vocabulary import kinematic_trajectories
@@ -29,7 +28,8 @@ GROUPS = [
     ("traffic/idm", TrafficSettings()),
     ("traffic/replay", TrafficSettings(mode="replay")),
     ("pdm/navsim", PdmSettings()),
-    ("reward/epdms", ExpertGate()),
+    ("pdm/corrected", PdmSettings(shared_lead_memory=False, brakes_at_first_step=False, speed_below_zero=False)),
+    ("reward/epdms", RewardSettings()),
     ("render/auto", RenderSettings()),
     ("render/map", RenderSettings(mode=RenderMode.MAP)),
     ("render/none", RenderSettings(mode=RenderMode.NONE)),
@@ -66,7 +66,7 @@ def test_the_run_s_keys_are_those_of_its_dataclass() -> None:
     config = load_config([])
     assert (config.rounds, config.executor, config.limit) == (1, "ray", None)
     assert config.perturb == PerturbSettings()
-    assert config.reward == ExpertGate()
+    assert config.reward == RewardSettings()
 
 
 @pytest.mark.parametrize(

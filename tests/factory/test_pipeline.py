@@ -106,21 +106,22 @@ def test_what_is_considered_is_what_is_prepared(town: Path, tmp_path: Path) -> N
     ],
 )
 def test_what_a_prepared_clip_depends_on(override: str, prepares_anew: bool) -> None:
-    before = identity_of(load_config([]), VOCABULARY).prepare_digest
-    after = identity_of(load_config([override]), VOCABULARY).prepare_digest
+    before = identity_of(load_config([]), VOCABULARY, None).prepare_digest
+    after = identity_of(load_config([override]), VOCABULARY, None).prepare_digest
     assert (before != after) == prepares_anew
 
 
 def test_with_a_gate_the_block_s_settings_are_part_of_what_is_prepared() -> None:
     small, large = (
-        identity_of(load_config(["render.psnr_min=27", f"render.width={width}"]), VOCABULARY) for width in (64, 128)
+        identity_of(load_config(["render.psnr_min=27", f"render.width={width}"]), VOCABULARY, None)
+        for width in (64, 128)
     )
     assert small.prepare_digest != large.prepare_digest
 
 
 @pytest.mark.parametrize("stage", ["clip", "perturb", "rollout", "expert", "reward"])
 def test_a_raised_stage_before_the_attempts_prepares_anew(stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    before = identity_of(load_config([]), VOCABULARY).prepare_digest
+    before = identity_of(load_config([]), VOCABULARY, None).prepare_digest
     raised = [dataclasses.replace(s, version=s.version + (s.name == stage)) for s in stages.STAGES]
     monkeypatch.setattr(stages, "STAGES", tuple(raised))
-    assert identity_of(load_config([]), VOCABULARY).prepare_digest != before
+    assert identity_of(load_config([]), VOCABULARY, None).prepare_digest != before

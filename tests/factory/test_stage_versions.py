@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from factory.clips.av2 import AV2Reader
 from factory.clips.scenarionet import ScenarioNetReader
-from factory.rows import sample_row
+from factory.rows import label_columns, sample_row
 from factory.store.schema import SCHEMA
 from tasks.attempt import Judged, perturbed_scene
 from tasks.chance import stream
@@ -29,6 +29,7 @@ from tasks.render.rigs import RIGS
 from tasks.render.scene import AssetSettings, build_asset
 from tasks.render.views import render_views
 from tasks.reward.epdms import Scores, score
+from tasks.reward.label_bytes import VocabularyLabels
 from tasks.reward.prepare import prepare_scene
 from tasks.rollout.simulate import TrafficSettings, simulate
 from tasks.stages import STAGES, stage_versions
@@ -194,8 +195,8 @@ def rows() -> dict[str, object]:
     onward = Rollout(far.step, straight_states(far)[0], clip.agents.window(far.step, far.step + 41), rollout.simulated)
     out: dict[str, object] = {}
     for kind, row in (
-        ("simulated", sample_row(clip, candidate, Judged(far, Plan(slow_plan(far)), onward, scores))),
-        ("human", sample_row(clip, None, Judged(near, Plan(slow_plan(near)), rollout, scores))),
+        ("simulated", sample_row(clip, candidate, judged(far, onward, scores))),
+        ("human", sample_row(clip, None, judged(near, rollout, scores))),
     ):
         numbers = [np.zeros(0)]
         for name in sorted(row):
@@ -204,7 +205,22 @@ def rows() -> dict[str, object]:
             numbers += [np.ravel(part) for part in many if isinstance(part, np.ndarray | float)]
         out[kind] = np.concatenate(numbers)
         out[f"{kind} text"] = text_of(sorted(name for name, value in row.items() if value is not None))
+    halves, whole = np.arange(20) % 3 / 2.0, np.arange(20) % 2 * 1.0
+    metres = np.linspace(0.0, 70.0, 20)
+    labels = label_columns(
+        VocabularyLabels(
+            "digest", "replay", 20.0, halves, whole, halves[::-1], whole, whole[::-1], whole, whole, metres
+        )
+    )
+    out |= {name: np.frombuffer(value, np.uint8) for name, value in labels.items() if isinstance(value, bytes)}
+    out["labels text"] = text_of(labels)
     return out | {"schema": text_of(f"{field.name} {field.type}" for field in SCHEMA)}
+
+
+def judged(scene: Scene, rollout: Rollout, scores: Scores) -> Judged:
+    """A drive straight on as if it had been scored so."""
+    prepared = prepare_scene(scene, rollout.agents)
+    return Judged(scene, Plan(slow_plan(scene)), rollout, scores, prepared, rollout.ego_states)
 
 
 def text_of(lines: Iterable[str]) -> NDArray[np.uint8]:
@@ -305,13 +321,16 @@ GOLDEN: dict[str, Golden] = {
         tolerance=1e-3,
     ),
     "write": Golden(
-        1,
+        2,
         {
             "simulated": (492.175951, 17.1899041),
             "simulated text": (2952.74832, 8.00567927),
             "human": (652.576569, -14.5853737),
             "human text": (2473.67526, 5.81133534),
-            "schema": (5283.1421, 9.32047711),
+            "label_subscores": (549.77183, 63.7185064),
+            "label_progress": (478.196993, -18.9944372),
+            "labels text": (947.357383, -11.9462762),
+            "schema": (5374.357, 10.1952164),
         },
     ),
 }

@@ -11,9 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from factory.clips.reader import BadClip, ClipRef
+from factory.rows import label_columns
 from factory.store.columns import Column
 from factory.store.schema import BOOKKEEPING, FIELDS
 from factory.work import Accepted, AttemptResult, CandidateRow, Dropped, PreparedClip, RunIdentity
+from tasks.reward.label_bytes import HALVES, WHOLES, VocabularyLabels
 from tasks.stages import Rejected
 
 VERSIONS = {"clip": 1, "perturb": 1, "rollout": 1, "expert": 1, "reward": 1, "render": 1, "write": 1}
@@ -48,9 +50,17 @@ def value_of(column: Column, shape: Sequence[int | str], rng: np.random.Generato
     return value.astype(column.dtype)
 
 
+def labels_of_stream(rng: np.random.Generator, k: int = 20) -> VocabularyLabels:
+    """Any scores of k trajectories."""
+    scores = {name: rng.integers(0, 3, k) / 2.0 for name in HALVES}
+    scores |= {name: rng.integers(0, 2, k) * 1.0 for name in WHOLES}
+    return VocabularyLabels("vocabulary-1", "replay", 20.0, ep_raw_m=rng.random(k) * 60.0, **scores)
+
+
 def row_of(rng: np.random.Generator) -> dict[str, object]:
     """A full row less the bookkeeping."""
-    return {f.name: value_of(f, f.shape, rng) for f in FIELDS if f.name not in BOOKKEEPING}
+    row = {f.name: value_of(f, f.shape, rng) for f in FIELDS if f.name not in BOOKKEEPING}
+    return row | label_columns(labels_of_stream(rng))
 
 
 @dataclass(frozen=True)

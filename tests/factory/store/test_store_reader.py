@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from factory.execute import execute
-from factory.store.reader import SampleTable, image_of, to_torch
+from factory.store.reader import LABEL_COLUMNS, SampleTable, image_of, labels_of, to_torch
 from factory.store.samples import Store
 from factory.store.verify import main, verify
-from tests.factory.toy import ToyWork, refs
+from tasks.reward.label_bytes import VocabularyLabels
+from tests.factory.toy import ToyWork, refs, row_of, stream
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +41,7 @@ def test_samples_are_the_same_by_place_key_iteration_and_table(out: Path) -> Non
 def test_the_tables_metadata_names_version_and_licences(out: Path) -> None:
     properties = Store(out).samples.properties
     licences = set(SampleTable(out).table(["licence"])["licence"].to_pylist())
-    assert properties["factory.schema_version"] == "1"
+    assert properties["factory.schema_version"] == "2"
     assert set(properties["factory.licences"].split("; ")) == licences and len(licences) > 1
 
 
@@ -51,10 +52,48 @@ def test_a_table_that_is_not_there_is_named(tmp_path: Path) -> None:
         SampleTable(tmp_path / "nowhere")
 
 
+def test_a_table_of_another_version_is_named(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    execute(ToyWork(), refs(1), ["human"], 1, store, "local", say=lambda line: None)
+    store.samples.set_property("factory.schema_version", "1")
+    with pytest.raises(ValueError, match=f"{tmp_path}.*schema_version 1, this version reads 2"):
+        SampleTable(tmp_path)
+
+
+def test_vocabulary_labels_come_back_from_the_table(out: Path) -> None:
+    row = row_of(stream("labels"))
+    meant = labels_of(row)
+    for sample in SampleTable(out).iterate((*LABEL_COLUMNS, "attempt_id")):
+        labels = labels_of(sample, vocabulary="vocabulary-1")
+        assert len(labels) == len(meant) and labels.traffic == "replay"
+    assert SampleTable(out)[0].keys() >= {*LABEL_COLUMNS}
+    assert isinstance(meant, VocabularyLabels) and 0.0 <= meant.pdm_score().min() < meant.pdm_score().max() <= 1.0
+
+
+def test_labels_that_cannot_be_read_say_why() -> None:
+    sample = row_of(stream("labels")) | {"attempt_id": "a7"}
+    with pytest.raises(ValueError, match="sample a7 has labels of vocabulary vocabulary-1, not of another"):
+        labels_of(sample, vocabulary="another")
+    with pytest.raises(ValueError, match=r"sample a7 has no vocabulary labels.*reward\.labels=none"):
+        labels_of(sample | dict.fromkeys(LABEL_COLUMNS))
+    damaged = bytearray(sample["label_progress"])  # type: ignore[arg-type]
+    damaged[3] ^= 8
+    with pytest.raises(ValueError, match=r"sample a7: label_progress: .*checksum"):
+        labels_of(sample | {"label_progress": bytes(damaged)})
+
+
 def test_the_reader_imports_neither_ray_nor_hydra_nor_torch(out: Path) -> None:
     code = (
         "import sys; from factory.store.reader import SampleTable; SampleTable(sys.argv[1])[0];"
         "sys.exit(bool({'ray', 'hydra', 'torch', 'cv2'} & set(sys.modules)))"
+    )
+    assert subprocess.run([sys.executable, "-c", code, str(out)], check=False).returncode == 0
+
+
+def test_reading_labels_loads_no_kernels(out: Path) -> None:
+    code = (
+        "import sys; from factory.store.reader import SampleTable, labels_of; labels_of(SampleTable(sys.argv[1])[0]);"
+        "sys.exit(bool({'numba', 'shapely', 'scipy'} & set(sys.modules)))"
     )
     assert subprocess.run([sys.executable, "-c", code, str(out)], check=False).returncode == 0
 

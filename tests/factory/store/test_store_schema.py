@@ -84,4 +84,4 @@ def test_absent_agents_may_be_nan_and_nullable_columns_may_be_left_out() -> None
         if column.nullable:
             del row[name]
     back = table_to_rows(sample_row_to_table([row]))[0]
-    assert back["stage1_nc"] is None and back["images"] is None and back["vocabulary_labels"] is None
+    assert back["stage1_nc"] is None and back["images"] is None and back["label_progress"] is None

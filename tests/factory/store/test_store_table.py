@@ -97,13 +97,13 @@ def test_a_flipped_byte_is_found(location: Location) -> None:
         KeyedTable(location, SPEC).read()
 
 
-def test_row_groups_stay_below_32_mb(location: Location) -> None:
+def test_row_groups_stay_below_4_mb(location: Location) -> None:
     spec = TableSpec("big", pa.schema([("key", pa.string()), ("blob", pa.binary())]), "key")
-    big = pa.table({"key": list("abcde"), "blob": [bytes([i]) * (9 * 2**20) for i in range(5)]}, schema=spec.schema)
+    big = pa.table({"key": list("abcde"), "blob": [bytes([i]) * (3 * 2**19) for i in range(5)]}, schema=spec.schema)
     written = write_shard(location, spec, big)
     metadata = pq.ParquetFile(f"{location.uri}/{written.path}").metadata
     sizes = [metadata.row_group(i).total_byte_size for i in range(metadata.num_row_groups)]
-    assert metadata.num_row_groups == 2 and big.slice(0, metadata.row_group(0).num_rows).nbytes <= 32 * 2**20, sizes
+    assert metadata.num_row_groups == 3 and big.slice(0, metadata.row_group(0).num_rows).nbytes <= 4 * 2**20, sizes
 
 
 class Counting(io.FileIO):

@@ -2,13 +2,14 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from tasks.experts.pdm_closed import PdmClosed, PdmSettings, pdm_closed_poses, plan_for
 from tasks.experts.pdm_forecast import forecast
-from tasks.experts.pdm_proposals import idm_step, proposals
+from tasks.experts.pdm_proposals import driver, idm_step, proposals
 from tasks.experts.protocol import Plan
 from tasks.stages import Rejected
 from tasks.world.agents import AgentKind, AgentTracks
@@ -25,6 +26,32 @@ CAR = (4.5, 1.9)
 def test_every_proposal_brakes_at_its_hardest_for_the_first_tenth_of_a_second(road: Road) -> None:
     speed = plan_for(road(speed=8.0)).proposals.progress_velocity[:, :, 1]
     np.testing.assert_allclose(speed[:, 1], 8.0 - 0.3, atol=1e-12)
+
+
+def test_corrected_the_first_tenth_of_a_second_follows_the_model_on_the_road_it_sees(road: Road) -> None:
+    start, limit, fractions = 8.0, 10.0, np.array(PdmSettings().speed_fractions)
+    settings = PdmSettings(brakes_at_first_step=False)
+    speed = plan_for(road(speed=start, limit=limit), settings).proposals.progress_velocity[:5, :, 1]
+    gap = 400.0 - 50.0 - PACIFICA.half_length  # to the end of the route
+    wanted = 1.0 + start * 1.5 + start * start / (2.0 * np.sqrt(1.5 * 3.0))
+    accel = 1.5 * (1.0 - (start / (fractions * limit)) ** 10 - (wanted / gap) ** 2)
+    np.testing.assert_allclose(speed[:, 1], start + 0.1 * np.clip(accel, -3.0, 1.5), atol=1e-12)
+    assert speed[4, 1] > start > speed[0, 1]
+
+
+def test_a_stop_before_an_oncoming_car_overshoots_as_published_and_corrected_it_stands(
+    road: Road, objects: Objects
+) -> None:
+    near = np.array([1.0, -10.0, 0.0])  # at the least gap: the hardest braking, 0.3 m/s in a step
+    published, corrected = PdmSettings(), PdmSettings(speed_below_zero=False)
+    np.testing.assert_allclose(idm_step(0.0, 0.2, near, 15.0, driver(published)), [0.02, -0.1], atol=1e-12)
+    np.testing.assert_allclose(idm_step(0.0, 0.2, near, 15.0, driver(corrected)), [0.02, 0.0], atol=1e-12)
+
+    scene = road(speed=3.0, agents=objects([[85.0, 0.0, np.pi, *CAR]], [8.0], [AgentKind.VEHICLE]))
+    assert plan_for(scene, published).proposals.progress_velocity[..., 1].min() < 0.0
+    motion = plan_for(scene, corrected).proposals.progress_velocity
+    assert motion[..., 1].min() == 0.0
+    assert (np.diff(motion[..., 0], axis=1) >= 0.0).all()
 
 
 def test_on_a_free_road_speeds_tend_to_their_fraction_of_the_limit(road: Road) -> None:
@@ -55,8 +82,8 @@ def test_idm_keeps_the_speed_where_the_closed_form_says_so() -> None:
     speed, target = 8.0, 15.0
     wanted = settings.min_gap_m + speed * settings.headway_s
     gap = wanted / np.sqrt(1.0 - (speed / target) ** settings.exponent)  # equal speeds: dv/dt = 0 at this gap
-    after = idm_step(np.array([[3.0, speed]]), np.array([[3.0 + gap, speed, 0.0]]), np.array([target]), settings)
-    np.testing.assert_allclose(after, [[3.8, speed]], atol=1e-12)
+    after = idm_step(3.0, speed, np.array([3.0 + gap, speed, 0.0]), target, driver(settings))
+    np.testing.assert_allclose(after, [3.8, speed], atol=1e-12)
 
 
 def test_a_standing_car_ahead_stops_every_proposal_on_its_path(road: Road, objects: Objects) -> None:
@@ -193,8 +220,51 @@ def test_a_route_without_length_is_a_rejection(road: Road) -> None:
 
 
 def test_a_speed_limit_of_zero_is_an_error_and_not_a_division(road: Road) -> None:
-    with pytest.raises(ValueError, match=r"0\.0 m/s cannot be driven"):
+    with pytest.raises(ValueError, match=r"speed_limit_mps: 0\.0 m/s cannot be driven"):
         plan_for(road(limit=0.0))
+
+
+def test_an_ego_state_with_a_nan_is_an_error(road: Road) -> None:
+    scene = road()
+    history = scene.ego_history.copy()
+    history[-1, 3] = np.nan
+    with pytest.raises(ValueError, match=r"ego_state must be \(11,\) finite numbers"):
+        plan_for(replace(scene, ego_history=history))
+    with pytest.raises(ValueError, match=r"ego_state must be \(11,\) finite numbers"):
+        plan_for(replace(scene, ego_history=history[:, :4]))
+
+
+def test_a_centerline_with_a_nan_is_an_error(road: Road) -> None:
+    scene = road()
+    line = scene.centerline.copy()
+    line[3, 1] = np.nan
+    with pytest.raises(ValueError, match="centerline holds NaN"):
+        plan_for(replace(scene, centerline=line))
+
+
+def test_a_valid_object_without_a_box_is_an_error_that_names_it(road: Road, objects: Objects) -> None:
+    agents = objects([[80.0, 0.0, 0.0, *CAR], [90.0, 0.0, 0.0, *CAR]], [0.0, 0.0], [AgentKind.VEHICLE] * 2)
+    agents.boxes[:, 1, 3] = np.nan
+    with pytest.raises(ValueError, match="agents: track track1 is valid"):
+        plan_for(road(agents=agents))
+    with pytest.raises(ValueError, match="agents: 2 tracks need boxes"):
+        plan_for(road(agents=replace(agents, boxes=agents.boxes[..., :4])))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [
+        ({"speed_fractions": ()}, "speed_fractions"),
+        ({"speed_fractions": (0.5, -0.1)}, "speed_fractions"),
+        ({"lateral_offsets_m": (0.0, np.nan)}, "lateral_offsets_m"),
+        ({"min_gap_m": 0.0}, "min_gap_m"),
+        ({"fallback_speed_mps": np.inf}, "fallback_speed_mps"),
+        ({"headway_s": -1.0}, "headway_s"),
+    ],
+)
+def test_settings_that_make_no_sense_are_named(wrong: dict[str, Any], named: str) -> None:
+    with pytest.raises(ValueError, match=f"pdm {named} must be"):
+        PdmSettings(**wrong)
 
 
 def test_the_digest_changes_with_every_setting() -> None:

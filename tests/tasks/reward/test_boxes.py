@@ -3,7 +3,7 @@
 import numpy as np
 import shapely
 
-from tasks.reward.boxes import ego_boxes, front_edges, touching
+from tasks.reward.boxes import ego_boxes, touching
 from tasks.world.frames import box_corners
 from tasks.world.vehicle import PACIFICA
 
@@ -33,4 +33,3 @@ def test_the_ego_body_reaches_from_rear_to_front_bumper():
     corners = box_corners(ego_boxes(state, PACIFICA))
     np.testing.assert_allclose(corners[:, 0], [4.049, -1.127, -1.127, 4.049])
     np.testing.assert_allclose(corners[:, 1], [1.1485, 1.1485, -1.1485, -1.1485])
-    np.testing.assert_allclose(front_edges(ego_boxes(state, PACIFICA)), [4.049, 0, 0, 0, 2.297])

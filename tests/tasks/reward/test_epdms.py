@@ -8,6 +8,7 @@ import pytest
 from straight_street import Thing, drive, past_of, rectangle, street, tracks
 
 from tasks.reward.epdms import Scores, human_filtered, rows, score, score_with_ec
+from tasks.reward.map_index import index_map
 from tasks.reward.prepare import prepare
 from tasks.rollout.lqr import track
 from tasks.world.agents import AgentKind
@@ -127,7 +128,6 @@ def test_bad_states_and_inputs_are_refused():
 
 
 def test_a_scene_without_map_and_traffic_is_off_road():
-    empty = street()
-    bare = replace(empty, regions=type(empty.regions)(np.empty(0, object), np.empty((0, 4)), *np.zeros((4, 0), bool)))
+    bare = replace(street(), map_index=index_map((), frozenset()))
     got = score(bare, drive(5.0))
     assert got.dac[0] == 0.0 and got.nc[0] == 1.0 and got.ddc[0] == 0.5

@@ -70,10 +70,12 @@ def test_a_short_return_to_the_centreline_resets_lane_keeping():
 
 
 def test_two_polygons_with_one_ring_are_one_region_and_keep_both_parts():
-    twice = [
-        rectangle("x", MapLayer.LANE_CONNECTOR, (0, -2), (9, 2)),
-        rectangle("int_x", MapLayer.INTERSECTION, (0, -2), (9, 2)),
+    turn = [
+        rectangle("x", MapLayer.LANE_CONNECTOR, (0, 6), (30, 12)),
+        rectangle("int_x", MapLayer.INTERSECTION, (0, 6), (30, 12)),
     ]
-    regions = street(extra=twice).regions
-    assert len(regions.shapes) == 4
-    assert regions.is_lane[3] and regions.is_intersection[3] and regions.is_drivable[3] and not regions.is_on_route[3]
+    states = drive(3.0, x=2.0, y=9.0)
+    inside, without_lane = score(street(extra=turn), states), score(street(extra=turn[1:]), states)
+    assert inside.dac[0] == 1.0 and without_lane.dac[0] == 1.0  # drivable as an intersection
+    assert not inside.ego_areas[0, :, 0].any()  # one lane, not two
+    assert inside.ddc[0] == without_lane.ddc[0] == 1.0  # off the route, but within an intersection

@@ -5,8 +5,16 @@ import pytest
 import shapely
 import shapely.ops
 
-from tasks.rollout.corridor import Paths, boxes_overlap, corners_of, corridor_gap, pose_on_path, project_on_path
-from tasks.rollout.idm import Driver, advance, idm_acceleration, needed_deceleration, stop_line_gap
+from tasks.rollout.corridor import Paths, Way, boxes_overlap, corridor_gap, pose_on_path, project_on_path
+from tasks.rollout.idm import (
+    Driver,
+    advance,
+    following_acceleration,
+    free_acceleration,
+    needed_deceleration,
+    stop_line_gap,
+)
+from tasks.rollout.stretches import stretches_of
 from tasks.world.frames import box_corners
 
 DRIVER = Driver(1.0, 1.5, 1.0, 2.0, 4.0, 8.0, 60.0, 0.0, 20.0, 5.0, 30.0)
@@ -15,15 +23,22 @@ DRIVER = Driver(1.0, 1.5, 1.0, 2.0, 4.0, 8.0, 60.0, 0.0, 20.0, 5.0, 30.0)
 def one_path(xy: np.ndarray, lines: tuple[tuple[float, int], ...] = ()) -> Paths:
     """A single path through points 0.5 m apart."""
     edge = np.gradient(xy, axis=0)
+    heading = np.unwrap(np.arctan2(edge[:, 1], edge[:, 0]))[None]
     return Paths(
         xy=xy[None],
-        heading=np.unwrap(np.arctan2(edge[:, 1], edge[:, 0]))[None],
+        heading=heading,
         height=np.zeros((1, len(xy))),
         target_speed=np.full((1, len(xy)), 10.0),
+        stretches=stretches_of(xy[None], heading),
         line_start=np.array([0, len(lines)]),
         line_at=np.array([at for at, _ in lines], dtype=float),
         line_state=np.array([[state for _, state in lines]] * 41, dtype=np.uint8).reshape(41, len(lines)),
     )
+
+
+def idm_acceleration(speed: float, target_speed: float, gap: float, lead_speed: float, driver: Driver) -> float:
+    free = free_acceleration(speed, target_speed, driver)
+    return following_acceleration(free, speed, gap, lead_speed, driver)
 
 
 def circle(radius: float) -> Paths:
@@ -103,11 +118,7 @@ def test_the_corridor_gap_equals_its_slow_twin(radius: float) -> None:
         k = rng.integers(20, paths.xy.shape[1] - 40)
         center = paths.xy[0, k] + rng.uniform(-4, 4, 2)
         box = np.array([*center, rng.uniform(-3, 3), rng.uniform(0.5, 6), rng.uniform(0.5, 2.5)])
-        corners = np.zeros((4, 2))
-        corners_of(box, corners)
-        gap, _ = corridor_gap(
-            paths, 0, 5.0, 0.0, 0.0, 0.0, 2.3, 0.95, corners, box, np.hypot(*box[3:]) / 2.0, 20.0, 60.0
-        )  # fmt: skip
+        gap, _ = corridor_gap(paths, Way(0, 5.0, 0.0, 0.0, 0.0, 2.3, 0.95), box, np.hypot(*box[3:]) / 2.0, 20.0, 60.0)
         slow = corridor_gap_by_shapely(paths.xy[0], 7.3, 0.95, box)
         if np.isfinite(slow) != np.isfinite(gap):  # only a graze may be judged differently
             thinner, wider = (corridor_gap_by_shapely(paths.xy[0], 7.3, w, box) for w in (0.85, 1.05))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tasks.rollout.lqr import curvature_profile, track, velocity_profile
+from tasks.rollout.lqr import track, track_local
 from tasks.world.frames import to_world, wrap_angle
 from tasks.world.vehicle import AX, HEADING, STEERING, VX, YAW_RATE, X, Y
 
@@ -45,13 +45,6 @@ def test_a_plan_to_stand_still_brings_the_ego_to_rest():
     assert states[0, :, AX].min() > -6.0
 
 
-def test_profiles_of_a_steady_arc_are_its_speed_and_curvature():
-    reference = np.concatenate([np.zeros((1, 3)), arc(6.0, 0.05)])[None]
-    velocity = velocity_profile(reference)
-    np.testing.assert_allclose(velocity, 6.0, rtol=0.02)  # the acceleration penalty and the chord bend it slightly
-    np.testing.assert_allclose(curvature_profile(reference, velocity), 0.05, rtol=0.02)
-
-
 def test_an_arc_is_followed_within_half_a_metre_and_steers_to_its_curvature():
     start = ego_at(0.0, 0.0, 0.0, 6.0)
     start[STEERING] = np.arctan(3.089 * 0.05)
@@ -81,8 +74,41 @@ def test_a_plan_gives_the_same_bits_alone_and_in_a_batch():
         assert np.array_equal(track(start, plans[k : k + 1])[0], together[k])
 
 
-def test_wrong_shapes_and_nan_poses_are_refused():
-    with pytest.raises(ValueError, match="poses"):
-        track(np.zeros(11), np.zeros((40, 3)))
-    with pytest.raises(ValueError, match="finite"):
-        track(np.zeros(11), np.full((1, 40, 3), np.nan))
+def test_no_plans_give_no_states():
+    assert track(np.zeros(11), np.zeros((0, 40, 3))).shape == (0, 41, 11)
+
+
+def test_read_only_and_strided_plans_are_driven_as_they_are():
+    plans = np.repeat(arc(9.0, -0.04)[None], 6, axis=0)
+    plans[:, :, 1] += 0.1 * np.arange(6)[:, None]
+    expected = track_local(ego_at(0.0, 0.0, 0.0, 9.0), plans)
+    strided = np.asfortranarray(plans)[::2]
+    plans.flags.writeable = False
+    assert np.array_equal(track_local(ego_at(0.0, 0.0, 0.0, 9.0), plans), expected)
+    assert np.array_equal(track_local(ego_at(0.0, 0.0, 0.0, 9.0), strided), expected[::2])
+
+
+@pytest.mark.parametrize(
+    ("field", "change"),
+    [
+        ("ego_state0", {"ego_state0": np.zeros(10)}),
+        ("ego_state0", {"ego_state0": np.full(11, np.nan)}),
+        ("poses", {"poses": np.zeros((40, 3))}),
+        ("poses", {"poses": np.zeros((2, 41, 3))}),
+        ("poses", {"poses": np.full((2, 40, 3), np.inf)}),
+        ("planned_pose0", {"planned_pose0": np.zeros((1, 3))}),
+        ("planned_pose0", {"planned_pose0": np.zeros(3)}),
+        ("planned_pose0", {"planned_pose0": np.full((2, 3), np.nan)}),
+    ],
+)
+def test_what_makes_no_sense_is_refused_by_its_name(field: str, change: dict[str, np.ndarray]):
+    good = {"ego_state0": np.zeros(11), "poses": np.zeros((2, 40, 3)), "planned_pose0": np.zeros((2, 3))}
+    with pytest.raises(ValueError, match=f"^{field} must"):
+        track(**(good | change))
+
+
+def test_a_bad_value_is_named_with_its_place():
+    trajectories = np.zeros((5, 40, 3))
+    trajectories[3, 7, 1] = np.nan
+    with pytest.raises(ValueError, match=r"trajectories must be finite and at most 1e\+08, element \[3, 7, 1\] is not"):
+        track_local(np.zeros(11), trajectories)

@@ -379,5 +379,9 @@ def test_an_empty_street_rolls_out() -> None:
 def test_settings_that_mean_nothing_are_refused_by_name() -> None:
     with pytest.raises(ValueError, match="headway_s"):
         TrafficSettings(headway_s=0.0)
+    with pytest.raises(ValueError, match="lookahead_m"):
+        TrafficSettings(lookahead_m=np.inf)
+    with pytest.raises(ValueError, match="min_gap_m"):
+        TrafficSettings(min_gap_m=-1.0)
     with pytest.raises(ValueError, match="mode"):
         TrafficSettings(mode="idle")  # type: ignore[arg-type]

@@ -136,3 +136,75 @@ def straight_plan(of: Scene, speed: float | None = None) -> NDArray[np.float64]:
     way = v * STEP_S * np.arange(1, 41)
     h = state[HEADING]
     return np.column_stack([state[X] + way * np.cos(h), state[Y] + way * np.sin(h), np.full(40, h)])
+
+
+def random_scene(seed: int) -> Scene:
+    """A fork with a lane beside it and up to 16 agents that get in each other's way; an ego among them."""
+    rng = np.random.default_rng(seed)
+    lanes = fork() | {"beside": lane("beside", [(-100.0, 3.5), (55.0, 3.5), (150.0, 30.0)])}
+    makers = (_on_lane, _on_lane, _crossing, _walking, _parked, _reversing, _starting)
+    members = [makers[rng.integers(len(makers))](rng) for _ in range(rng.integers(1, 17))]
+    ego = (float(rng.uniform(-60.0, 70.0)), float(rng.choice([0.0, 0.4, 3.5, 60.0])), float(rng.normal(0.0, 0.05)))
+    return scene(lanes, *members, ego=ego, ego_speed=float(rng.choice([0.0, 4.0, 10.0])))
+
+
+def random_egos(of: Scene, seed: int, n: int) -> NDArray[np.float64]:
+    """States (n, 41, 11) of egos from the scene's pose on, each at a speed and a yaw rate of its own."""
+    rng = np.random.default_rng(seed)
+    out = np.zeros((n, 41, EGO_STATE_SIZE))
+    out[:, 0] = of.ego_state
+    out[:, :, VX] = rng.choice([0.0, 2.0, 6.0, 12.0], (n, 1))
+    out[:, :, HEADING] = of.ego_state[HEADING] + rng.choice([0.0, 0.1, -0.3], (n, 1)) * STEP_S * np.arange(41)
+    way = STEP_S * out[:, 1:, VX]
+    out[:, 1:, X] = of.ego_state[X] + np.cumsum(way * np.cos(out[:, 1:, HEADING]), axis=1)
+    out[:, 1:, Y] = of.ego_state[Y] + np.cumsum(way * np.sin(out[:, 1:, HEADING]), axis=1)
+    return out
+
+
+def _seen(rng: np.random.Generator) -> dict[str, int]:
+    """Half of all are there from the start; the others come later, and some leave."""
+    first = int(rng.choice([0, 0, 0, rng.integers(NOW, NOW + 40)]))
+    return {"first": first, "last": int(rng.choice([CLIP_STEPS - 1, CLIP_STEPS - 1, first + 25]))}
+
+
+def _on_lane(rng: np.random.Generator) -> Track:
+    size = CAR if rng.random() < 0.8 else (12.0, 2.6)
+    y = float(rng.choice([0.0, 3.5])) + float(rng.normal(0.0, 0.4))
+    return Track(
+        float(rng.uniform(-80.0, 70.0)), y, float(rng.normal(0.0, 0.05)), float(rng.uniform(0.0, 12.0)), size=size,
+        **_seen(rng),
+    )  # fmt: skip
+
+
+def _crossing(rng: np.random.Generator) -> Track:
+    speed = float(rng.uniform(2.0, 10.0))
+    return Track(float(rng.uniform(-20.0, 80.0)), -float(rng.uniform(4.0, 35.0)), np.pi / 2, speed, **_seen(rng))
+
+
+def _walking(rng: np.random.Generator) -> Track:
+    kind, size = (
+        (AgentKind.PEDESTRIAN, (0.6, 0.6)) if rng.random() < 0.7 else (AgentKind.BICYCLE, (1.8, 0.6))
+    )  # fmt: skip
+    heading = float(rng.choice([np.pi / 2, 0.0]))
+    return Track(
+        float(rng.uniform(-20.0, 70.0)), float(rng.uniform(-4.0, 1.0)), heading, float(rng.uniform(0.3, 2.0)),
+        kind, size, **_seen(rng),
+    )  # fmt: skip
+
+
+def _parked(rng: np.random.Generator) -> Track:
+    kind = AgentKind.VEHICLE if rng.random() < 0.7 else AgentKind.BARRIER
+    return Track(float(rng.uniform(-60.0, 80.0)), float(rng.choice([-1.9, 1.7, 5.6])), kind=kind, **_seen(rng))
+
+
+def _reversing(rng: np.random.Generator) -> Track:
+    way = STEP_S * (np.arange(CLIP_STEPS) - NOW) * float(rng.uniform(1.0, 3.0))
+    poses = np.column_stack(
+        [np.full(CLIP_STEPS, float(rng.uniform(0.0, 60.0))), way - 6.0, np.full(CLIP_STEPS, -np.pi / 2)]
+    )
+    return Track(0.0, poses=poses, **_seen(rng))
+
+
+def _starting(rng: np.random.Generator) -> Track:
+    way = float(rng.uniform(-60.0, 50.0)) + np.maximum(0.0, STEP_S * (np.arange(CLIP_STEPS) - NOW - 15) * 6.0)
+    return Track(0.0, poses=np.column_stack([way, 0.0 * way, 0.0 * way]), **_seen(rng))

@@ -11,11 +11,11 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from tasks.reward.areas import EgoAreas
-from tasks.reward.boxes import circumradius, front_edges, touching
-from tasks.reward.prepare import Obstacles, RedLanes
 from tasks.world.frames import box_corners
 from tasks.world.vehicle import HEADING, VX, VY, X, Y
+from tests.tasks.reward.slow.areas import EgoAreas
+from tests.tasks.reward.slow.boxes import circumradius, front_edges, touching
+from tests.tasks.reward.slow.prepare import Obstacles, RedLanes
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -6,9 +6,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from tasks.reward.prepare import Regions
 from tasks.world.frames import box_corners
 from tasks.world.vehicle import X, Y
+from tests.tasks.reward.slow.prepare import Regions
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -4,7 +4,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from tasks.reward.areas import EgoAreas
+from tests.tasks.reward.slow.areas import EgoAreas
 
 Array = NDArray[np.float64]
 

@@ -1,0 +1,73 @@
+"""Bytes and reading time of vocabulary labels: K = 16,384 reference proposals from samples of two real logs."""
+
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+
+from factory.execute import execute
+from factory.settings import assemble, load_config
+from factory.store.reader import LABEL_COLUMNS, SampleTable, labels_of
+from factory.store.samples import Store
+from tests.bench.timing import milliseconds
+from tests.real.reference_scenes import loader
+
+K = 16384
+
+
+def main(shared: Path, n_random: int = 20) -> None:
+    """Makes two samples a clip (simulated and human), stores them, prints one table."""
+    with tempfile.TemporaryDirectory() as folder:
+        vocabulary, out = Path(folder) / "proposals.npy", Path(folder) / "out"
+        np.save(vocabulary, loader(shared).proposals("7fab2350_20", K))
+        overrides = (
+            "clips=av2",
+            f"clips.root={shared / 'data/av2/sensor/val'}",
+            f"vocabulary.file={shared / 'data/vocabulary/human_8192x40x3.npy'}",
+            "vocabulary.k=1000",
+            f"reward.label_vocabulary={vocabulary}",
+            "experts=[pdm_closed,human]",
+            "render=none",
+            f"out={out}",
+        )
+        run = assemble(load_config(overrides))
+        store = Store(out)
+        summary = execute(
+            run.work, run.index.refs, run.config.experts, 1, store, "local", shard_seconds=1e9, say=lambda line: None
+        )
+        n, seconds = summary.seconds["labels"]
+        table = SampleTable(out)
+        places = np.random.default_rng(0).integers(0, len(table), n_random).tolist()
+        stored = table.sample(0, LABEL_COLUMNS)
+
+        def one_pass() -> None:
+            for sample in table.iterate(LABEL_COLUMNS):
+                labels_of(sample)
+
+        def at_random() -> None:
+            for place in places:
+                labels_of(table.sample(place, LABEL_COLUMNS))
+
+        print(f"{len(table)} samples, K = {K:,}\n\n| labels of one sample | |\n|---|---|")
+        print(f"| stored, mean | {compressed_bytes(store) / len(table) / 1e3:.1f} kB |")
+        print(f"| driven and scored | {seconds / n:.2f} s |")
+        print(f"| read and decoded in a pass over all | {milliseconds(one_pass, 5) / len(table):.2f} ms |")
+        print(f"| read and decoded at random, file open | {milliseconds(at_random, 5) / n_random:.2f} ms |")
+        print(f"| decoded | {milliseconds(lambda: labels_of(stored), 50):.2f} ms |")
+
+
+def compressed_bytes(store: Store) -> int:
+    """Of all label columns of all samples."""
+    total = 0
+    for path in store.samples.live_files():
+        metadata = pq.ParquetFile(f"{store.samples.location.uri}/{path}").metadata
+        groups = (metadata.row_group(i) for i in range(metadata.num_row_groups))
+        columns = (group.column(j) for group in groups for j in range(group.num_columns))
+        total += sum(column.total_compressed_size for column in columns if column.path_in_schema in LABEL_COLUMNS)
+    return total
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else "../shared"))

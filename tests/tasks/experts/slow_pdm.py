@@ -1,0 +1,340 @@
+"""PDM-Closed's forecast, paths and proposals written with shapely: the slow twin of tasks.experts.pdm_*.
+
+Geometry is shapely's own, so a corridor is what the public planner's is, to the last corner of its round joins.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+import shapely.ops
+from numpy.typing import NDArray
+
+from tasks.experts.pdm_settings import DEFAULTS, PdmSettings
+from tasks.world.agents import MOVING_KINDS, AgentKind, AgentTracks
+from tasks.world.frames import box_corners, wrap_angle
+from tasks.world.vehicle import HEADING, PACIFICA, VX, Vehicle, X, Y
+
+Array = NDArray[np.float64]
+STEP_S = 0.1
+SAMPLE_STEPS = 2  # one forecast per 0.2 s: step i of the plan sees sample i // 2
+RADIUS_M = 100.0  # from the ego centre
+NEAREST = {AgentKind.VEHICLE: 50, AgentKind.PEDESTRIAN: 25, AgentKind.BICYCLE: 10}
+NEAREST_STATIC = 50
+MIN_PROGRESS_M = 1e-5  # interpolation never asks for the very first point: joints may repeat it
+SCORED_STEPS = 40
+PROPOSAL_STEPS = 50  # the chosen one is driven on to 5 s
+
+
+@dataclass(frozen=True)
+class DrivePath:
+    """A path by arc length."""
+
+    poses: Array  # (P, 3) x, y [m], unwrapped heading [rad], world frame
+    progress: Array  # (P,) arc length of each pose [m], not decreasing (lane joints repeat a point)
+    line: shapely.LineString
+
+    @property
+    def length_m(self) -> float:
+        return float(self.progress[-1])
+
+    def at(self, progress: Array) -> Array:
+        """Poses (..., 3) at arc lengths (...) [m]: linear in x, y and unwrapped heading, clipped to the path's ends."""
+        distance = np.clip(progress, MIN_PROGRESS_M, self.length_m)
+        # side="left": the segment found starts strictly before the distance, so a repeated point divides by nothing
+        above = np.clip(np.searchsorted(self.progress, distance), 1, len(self.progress) - 1)
+        below = above - 1
+        slope = (self.poses[above] - self.poses[below]) / (self.progress[above] - self.progress[below])[..., None]
+        out = slope * (distance - self.progress[below])[..., None] + self.poses[below]
+        out[..., 2] = np.arctan2(np.sin(out[..., 2]), np.cos(out[..., 2]))
+        return out
+
+    def project(self, points: Array) -> Array:
+        """Arc length [m] of the nearest point of the path to each of `points` (..., 2)."""
+        found: Array = shapely.line_locate_point(self.line, shapely.points(points))
+        return found
+
+    def ahead(self, start_m: float, stop_m: float) -> shapely.LineString:
+        """The part between two arc lengths, made of the path's own points where at least two lie inside."""
+        start_m, stop_m = float(np.clip(start_m, 0.0, self.length_m)), float(np.clip(stop_m, 0.0, self.length_m))
+        inside = (start_m <= self.progress) & (self.progress <= stop_m)
+        if np.count_nonzero(inside) > 1:
+            return shapely.LineString(self.poses[inside, :2])
+        return shapely.ops.substring(self.line, start_m, stop_m)
+
+
+def path_length_m(poses: Array) -> float:
+    """Length [m] of the polyline through `poses` (P, >= 2)."""
+    return float(np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1).sum())
+
+
+def drive_path(poses: Array) -> DrivePath:
+    """The path through `poses` (P, 3). Raises ValueError where it has no length."""
+    poses = np.array(poses, dtype=np.float64)
+    if poses.ndim != 2 or poses.shape[1] != 3 or len(poses) < 2:
+        raise ValueError(f"a path needs poses of shape (P >= 2, 3), got {poses.shape}")
+    poses[:, 2] = np.unwrap(poses[:, 2])
+    steps = np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1)
+    progress = np.concatenate([[0.0], np.cumsum(steps)])
+    if progress[-1] <= MIN_PROGRESS_M:
+        raise ValueError("a path needs a length")
+    return DrivePath(poses, progress, shapely.LineString(poses[:, :2]))
+
+
+def parallel(poses: Array, offset_m: float) -> Array:
+    """`poses` (P, 3) moved sideways, to the left where `offset_m` > 0; headings stay."""
+    side = poses[:, 2] + np.pi / 2.0
+    moved = poses.copy()
+    moved[:, 0] += np.cos(side) * offset_m
+    moved[:, 1] += np.sin(side) * offset_m
+    moved[:, 2] = wrap_angle(moved[:, 2])
+    return moved
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """M objects as seen now: standing ones first, then vehicles, pedestrians, bicycles, each by distance."""
+
+    track: NDArray[np.intp]  # (M,) column in the agents it was made from
+    boxes: Array  # (M, 5) now
+    drift: Array  # (M, 2) velocity used to move the box [m/s]: along its heading or straight against it
+    speed: Array  # (M,) [m/s]
+    is_agent: NDArray[np.bool_]  # (M,) vehicles, pedestrians and bicycles
+    touches_ego: NDArray[np.bool_]  # (M,) at the start; such objects are ignored for good
+    red_lights: tuple[shapely.Polygon, ...] = ()  # on-route connectors that are red now, kept red
+    red_light_holds_ego: tuple[bool, ...] = ()  # the ego's footprint lies within it already: it is no lead
+
+    def polygons(self, samples: int) -> NDArray[np.object_]:
+        """(samples, M) shapely polygons at 0, 0.2, 0.4 ... s."""
+        times = np.arange(samples) * SAMPLE_STEPS * STEP_S
+        corners = box_corners(self.boxes)[None] + (times[:, None, None] * self.drift[None])[:, :, None]
+        polygons: NDArray[np.object_] = shapely.polygons(corners)
+        return polygons
+
+    def tracks(self, agents: AgentTracks, steps: int) -> AgentTracks:
+        """The forecast as (steps,) tracks for the reward; objects that touch the ego now are left out."""
+        keep = ~self.touches_ego
+        index = self.track[keep]
+        times = (np.arange(steps) // SAMPLE_STEPS) * SAMPLE_STEPS * STEP_S
+        boxes = np.repeat(self.boxes[keep][None], steps, axis=0)
+        boxes[..., :2] += times[:, None, None] * self.drift[keep][None]
+        seen = agents.velocities[0, index]  # the reward asks for the measured velocity, not the drift
+        return AgentTracks(
+            track_ids=tuple(agents.track_ids[i] for i in index),
+            kinds=tuple(agents.kinds[i] for i in index),
+            boxes=boxes,
+            velocities=np.repeat(seen[None], steps, axis=0),
+            valid=np.ones((steps, len(index)), bool),
+            center_z=np.repeat(agents.center_z[:1, index], steps, axis=0),
+            heights=agents.heights[index],
+        )
+
+
+def ego_boxes(poses: Array, vehicle: Vehicle = PACIFICA) -> Array:
+    """Footprints (..., 5) of rear-axle poses (..., 3)."""
+    heading = poses[..., 2]
+    x = poses[..., 0] + vehicle.rear_axle_to_center * np.cos(heading)
+    y = poses[..., 1] + vehicle.rear_axle_to_center * np.sin(heading)
+    size = np.broadcast_to([vehicle.length, vehicle.width], (*heading.shape, 2))
+    return np.concatenate([np.stack([x, y, heading], axis=-1), size], axis=-1)
+
+
+def forecast(
+    ego_state: Array,
+    agents: AgentTracks,
+    red_lights: tuple[shapely.Polygon, ...] = (),
+    vehicle: Vehicle = PACIFICA,
+) -> Forecast:
+    """The objects to reckon with, seen from `ego_state` (11,): `agents` at its first step, none further than 100 m.
+
+    The nearest 50 vehicles, 25 pedestrians, 10 bicycles and 50 standing objects, by the distance of their centres to
+    the ego's. Source: METRIC.md section 4.
+    """
+    ego_box = ego_boxes(ego_state[[X, Y, HEADING]], vehicle)
+    boxes, velocities = agents.boxes[0], agents.velocities[0]
+    distance = np.hypot(boxes[:, 0] - ego_box[0], boxes[:, 1] - ego_box[1])
+    near = agents.valid[0] & (distance <= RADIUS_M)
+    kinds = np.array([str(kind) for kind in agents.kinds], dtype=object)
+    moving = np.isin(kinds, [str(kind) for kind in MOVING_KINDS])
+
+    def nearest(wanted: NDArray[np.bool_], count: int) -> NDArray[np.intp]:
+        found = np.flatnonzero(wanted & near)
+        return found[np.argsort(distance[found], kind="stable")][:count]
+
+    groups = [nearest(~moving, NEAREST_STATIC)]
+    groups += [nearest(kinds == str(kind), count) for kind, count in NEAREST.items()]
+    track = np.concatenate(groups)
+    speed = np.hypot(velocities[track, 0], velocities[track, 1])
+    heading = boxes[track, 2]
+    forward = np.abs(wrap_angle(heading - np.arctan2(velocities[track, 1], velocities[track, 0]))) < np.pi / 2.0
+    direction = np.where(forward, heading, heading + np.pi)
+    drift = (speed * moving[track])[:, None] * np.stack([np.cos(direction), np.sin(direction)], axis=-1)
+    ego_polygon = shapely.polygons(box_corners(ego_box))
+    touches = shapely.intersects(ego_polygon, shapely.polygons(box_corners(boxes[track])))
+    return Forecast(
+        track=track,
+        boxes=boxes[track],
+        drift=drift,
+        speed=speed,
+        is_agent=moving[track],
+        touches_ego=np.asarray(touches, dtype=bool).reshape(len(track)),
+        red_lights=red_lights,
+        red_light_holds_ego=tuple(bool(shapely.within(ego_polygon, light)) for light in red_lights),
+    )
+
+
+@dataclass(frozen=True)
+class Proposals:
+    """P = lateral x speed proposals, index = speeds * lateral + speed."""
+
+    poses: Array  # (P, 51, 3) rear axle on the path, world frame
+    progress_velocity: Array  # (P, 51, 2) arc length [m], speed [m/s]
+    leads: Array  # (P, 51, 3) lead's arc length [m], velocity [m/s], own half length on a free road [m]
+
+
+@dataclass(frozen=True)
+class _Traffic:
+    """Objects in the corridor of each path, L paths, S samples, M objects with red lights last."""
+
+    polygons: NDArray[np.object_]  # (S, M)
+    in_corridor: NDArray[np.bool_]  # (L, S, M)
+    progress: Array  # (L, S, M) arc length of the centroid [m]
+    speed: Array  # (M,) [m/s], 0 for standing things
+    heading: Array  # (M,)
+    is_light: NDArray[np.bool_]  # (M,)
+
+
+def proposals(
+    ego_state: Array,
+    centerline: Array,
+    seen: Forecast,
+    speed_limit_mps: float | None,
+    settings: PdmSettings = DEFAULTS,
+    vehicle: Vehicle = PACIFICA,
+) -> Proposals:
+    """The proposals from `ego_state` (11,) along `centerline` (N, 3) through the forecast traffic.
+
+    Each starts at the projection of the rear axle on its path with the ego's longitudinal speed.
+    Raises ValueError where the centerline has no length or the speed limit is not positive.
+    """
+    if speed_limit_mps is not None and not speed_limit_mps > 0.0:
+        raise ValueError(f"a speed limit of {speed_limit_mps} m/s cannot be driven; None means unknown")
+    paths = [drive_path(parallel(centerline, offset)) for offset in settings.lateral_offsets_m]
+    limit = settings.fallback_speed_mps if speed_limit_mps is None else speed_limit_mps
+    targets = np.tile(np.array(settings.speed_fractions) * limit, len(paths))
+    lateral = np.repeat(np.arange(len(paths)), len(settings.speed_fractions))
+    start = np.array([float(path.project(ego_state[[X, Y]])) for path in paths])
+    reach_m = abs(targets).max() * PROPOSAL_STEPS * STEP_S
+    traffic = _traffic(paths, start, reach_m, seen, vehicle)
+
+    count = len(targets)
+    motion = np.zeros((count, PROPOSAL_STEPS + 1, 2))
+    leads = np.zeros((count, PROPOSAL_STEPS + 1, 3))
+    poses = np.zeros((count, PROPOSAL_STEPS + 1, 3))
+    motion[:, 0, 0], motion[:, 0, 1] = start[lateral], ego_state[VX]
+    poses[:, 0] = _on_paths(paths, lateral, motion[:, 0, 0])
+    for step in range(1, PROPOSAL_STEPS + 1):
+        if step % SAMPLE_STEPS == 0 or (step == 1 and not settings.brakes_at_first_step):
+            memory = settings.shared_lead_memory and step <= SCORED_STEPS  # beyond, the chosen one is driven alone
+            before = motion[:, step - 1], poses[:, step - 1]
+            found = _leads(paths, lateral, traffic, step // SAMPLE_STEPS, *before, vehicle)
+            leads[:, step] = _remembered(found, len(settings.speed_fractions)) if memory else np.nan_to_num(found)
+        else:
+            leads[:, step] = leads[:, step - 1]  # at step 1 all zeros: every proposal first brakes at its hardest
+        motion[:, step] = idm_step(motion[:, step - 1], leads[:, step], targets, settings)
+        poses[:, step] = _on_paths(paths, lateral, motion[:, step, 0])
+    return Proposals(poses, motion, leads)
+
+
+def idm_step(motion: Array, leads: Array, target_mps: Array, settings: PdmSettings) -> Array:
+    """One Euler step of 0.1 s of the intelligent driver model (Treiber et al. 2000), rows (P, 2) progress, speed.
+
+    s* = gap + v T + v (v - v_lead) / (2 sqrt(a b));  dv/dt = a (1 - (v / v0)^n - (s* / s)^2), clipped to [-b, a].
+    The speed is not clipped at 0 where settings.speed_below_zero.
+    """
+    progress, speed = motion[:, 0], motion[:, 1]
+    closing = speed * (speed - leads[:, 1]) / (2.0 * np.sqrt(settings.accel_max_mps2 * settings.decel_max_mps2))
+    wanted = settings.min_gap_m + speed * settings.headway_s + closing
+    gap = np.maximum(leads[:, 0] - progress - leads[:, 2], settings.min_gap_m)
+    accel = settings.accel_max_mps2 * (1.0 - (speed / target_mps) ** settings.exponent - (wanted / gap) ** 2)
+    accel = np.clip(accel, -settings.decel_max_mps2, settings.accel_max_mps2)
+    after = speed + STEP_S * accel
+    return np.stack(
+        [progress + STEP_S * speed, after if settings.speed_below_zero else np.maximum(after, 0.0)], axis=-1
+    )
+
+
+def _on_paths(paths: list[DrivePath], lateral: NDArray[np.intp], progress: Array) -> Array:
+    poses = np.empty((len(lateral), 3))
+    for index, path in enumerate(paths):
+        here = lateral == index
+        poses[here] = path.at(progress[here])
+    return poses
+
+
+def _traffic(paths: list[DrivePath], start: Array, reach_m: float, seen: Forecast, vehicle: Vehicle) -> _Traffic:
+    samples = PROPOSAL_STEPS // SAMPLE_STEPS + 1
+    lights = np.empty((samples, len(seen.red_lights)), dtype=object)
+    lights[:] = seen.red_lights
+    polygons = np.concatenate([seen.polygons(samples), lights], axis=1)
+    ignored = np.concatenate([seen.touches_ego, np.array(seen.red_light_holds_ego, dtype=bool)])
+    in_corridor = np.zeros((len(paths), *polygons.shape), dtype=bool)
+    progress = np.zeros((len(paths), *polygons.shape))
+    centroids = shapely.centroid(polygons)
+    for index, path in enumerate(paths):
+        corridor = shapely.buffer(
+            path.ahead(start[index], start[index] + reach_m), vehicle.half_width, cap_style="square"
+        )
+        shapely.prepare(corridor)
+        in_corridor[index] = shapely.intersects(corridor, polygons) & ~ignored
+        inside = in_corridor[index]
+        progress[index][inside] = shapely.line_locate_point(path.line, centroids[inside])
+    n_lights = len(seen.red_lights)
+    return _Traffic(
+        polygons=polygons,
+        in_corridor=in_corridor,
+        progress=progress,
+        speed=np.concatenate([seen.speed * seen.is_agent, np.zeros(n_lights)]),
+        heading=np.concatenate([seen.boxes[:, 2], np.zeros(n_lights)]),
+        is_light=np.concatenate([np.zeros(len(seen.boxes), dtype=bool), np.ones(n_lights, dtype=bool)]),
+    )
+
+
+def _leads(
+    paths: list[DrivePath],
+    lateral: NDArray[np.intp],
+    traffic: _Traffic,
+    sample: int,
+    motion: Array,
+    poses: Array,
+    vehicle: Vehicle,
+) -> Array:
+    """(P, 3) lead of each proposal; NaN marks a field that the search does not write."""
+    ahead = traffic.in_corridor[lateral, sample] & (traffic.progress[lateral, sample] > motion[:, :1])
+    proposal, thing = np.nonzero(ahead)
+    distance = np.full(ahead.shape, np.inf)
+    footprints = shapely.polygons(box_corners(ego_boxes(poses, vehicle)))
+    distance[proposal, thing] = shapely.distance(footprints[proposal], traffic.polygons[sample, thing])
+
+    found = np.full((len(lateral), 3), np.nan)
+    free = ~ahead.any(axis=1)
+    found[free, 0] = np.array([path.line.length for path in paths])[lateral[free]]
+    found[free, 2] = vehicle.half_length
+    if not free.all():
+        led = ~free
+        nearest = distance[led].argmin(axis=1)
+        found[led, 0] = motion[led, 0] + distance[led].min(axis=1)
+        relative = traffic.heading[nearest] - poses[led, 2]
+        # a red light is a lead whose velocity is never written: 0, or what the slower proposal left there
+        found[led, 1] = np.where(traffic.is_light[nearest], np.nan, traffic.speed[nearest] * np.cos(relative))
+    return found
+
+
+def _remembered(found: Array, speeds: int) -> Array:
+    """Fills unwritten fields with the last value written by a slower proposal of the same path, else 0."""
+    out = found.reshape(-1, speeds, 3).copy()
+    last = np.zeros((len(out), 3))
+    for index in range(speeds):
+        last = np.where(np.isnan(out[:, index]), last, out[:, index])
+        out[:, index] = last
+    return out.reshape(found.shape)

@@ -1,0 +1,60 @@
+"""Oriented boxes in the plane: where the ego's body is, and which boxes touch.
+
+Boxes are arrays whose last axis is centre x [m], centre y [m], heading [rad], length [m], width [m], as in AgentTracks.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tasks.world.vehicle import HEADING, Vehicle, X, Y
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+
+def ego_boxes(states: Array, vehicle: Vehicle) -> Array:
+    """The ego's body (..., 5) at states (..., 11); the state's pose is the rear axle."""
+    heading = states[..., HEADING]
+    shift = vehicle.rear_axle_to_center
+    return np.stack(
+        [
+            states[..., X] + shift * np.cos(heading),
+            states[..., Y] + shift * np.sin(heading),
+            heading,
+            np.full(heading.shape, vehicle.length),
+            np.full(heading.shape, vehicle.width),
+        ],
+        axis=-1,
+    )
+
+
+def front_edges(boxes: Array) -> Array:
+    """The front edge of boxes (..., 5), as boxes of length zero."""
+    heading, half_length = boxes[..., 2], boxes[..., 3] / 2.0
+    edges = boxes.copy()
+    edges[..., 0] += half_length * np.cos(heading)
+    edges[..., 1] += half_length * np.sin(heading)
+    edges[..., 3] = 0.0
+    return edges
+
+
+def circumradius(boxes: Array) -> Array:
+    """Radius (...) [m] of the circle around each box."""
+    return 0.5 * np.hypot(boxes[..., 3], boxes[..., 4])
+
+
+def touching(first: Array, second: Array) -> Bools:
+    """Whether boxes (..., 5) intersect pairwise, touching included (separating axes).
+
+    A pair with a NaN does not touch.
+    """
+    dx, dy = second[..., 0] - first[..., 0], second[..., 1] - first[..., 1]
+    turn = second[..., 2] - first[..., 2]
+    c, s = np.abs(np.cos(turn)), np.abs(np.sin(turn))
+    near: Bools = np.ones(dx.shape, dtype=bool)
+    for one, other in ((first, second), (second, first)):
+        along = np.cos(one[..., 2]) * dx + np.sin(one[..., 2]) * dy
+        across = np.cos(one[..., 2]) * dy - np.sin(one[..., 2]) * dx
+        near &= 2.0 * np.abs(along) <= one[..., 3] + other[..., 3] * c + other[..., 4] * s
+        near &= 2.0 * np.abs(across) <= one[..., 4] + other[..., 3] * s + other[..., 4] * c
+    return near

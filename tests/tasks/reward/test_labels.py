@@ -1,0 +1,153 @@
+"""Vocabulary labels of a scene: the reward's own scores, whatever the chunks, among the traffic that was asked for."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tasks.attempt import Judged, drive_and_judge, human_sample, perturbed_scene
+from tasks.experts.human import Human
+from tasks.experts.pdm_closed import PdmSettings
+from tasks.experts.protocol import Plan
+from tasks.kinematic_vocabulary import kinematic_trajectories
+from tasks.reward.epdms import Scores, score
+from tasks.reward.label_bytes import HALVES, WHOLES, VocabularyLabels
+from tasks.reward.labels import Labelling, vocabulary_labels
+from tasks.reward.prepare import prepare_scene
+from tasks.reward.reactive import reactive_scores
+from tasks.rollout.lqr import track
+from tasks.rollout.simulate import TrafficSettings, simulate
+from tasks.vocabulary import Vocabulary
+from tasks.world.clip import NOW, Scene, scene_of_clip
+from tasks.world.frames import to_world
+from tests.tasks.streets import street_clip
+
+REPLAY, IDM = TrafficSettings(mode="replay"), TrafficSettings()
+VOCABULARY = Vocabulary(kinematic_trajectories(60, 3))
+KEPT = (*HALVES, *WHOLES, "ep_raw_m")
+
+
+def ahead(scene: Scene, speed_mps: float) -> NDArray[np.float64]:
+    """(40, 3) straight on from the scene's ego."""
+    way = speed_mps * 0.1 * np.arange(1, 41)
+    return to_world(scene.ego_state[:3], np.column_stack([way, np.zeros((40, 2))]))
+
+
+def straight_on(speeds: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(S, 40, 3) at constant speeds (S,) [m/s]."""
+    way = speeds[:, None] * 0.1 * np.arange(1, 41)
+    return np.stack([way, np.zeros_like(way), np.zeros_like(way)], axis=-1)
+
+
+@pytest.fixture(scope="module")
+def simulated() -> Judged:
+    """Four seconds at half the log's speed, which the traffic behind answered to, then four more."""
+    first = scene_of_clip(street_clip())
+    scene = perturbed_scene(street_clip(), simulate(first, ahead(first, 4.0), IDM))
+    return drive_and_judge(scene, Plan(ahead(scene, 6.0)), IDM, PdmSettings())
+
+
+@pytest.fixture(scope="module")
+def human() -> Judged:
+    return human_sample(scene_of_clip(street_clip()), Human(), PdmSettings(), np.random.default_rng(0))
+
+
+def labelled(
+    judged: Judged, traffic: TrafficSettings = REPLAY, vocabulary: Vocabulary = VOCABULARY
+) -> VocabularyLabels:
+    return vocabulary_labels(Labelling(vocabulary, traffic), judged.scene, judged.prepared, judged.rival)
+
+
+def in_pairs(judged: Judged, agents_of: str) -> Scores:
+    """PDM-Closed and the vocabulary in one call of the reward, among the rollout's agents or the log's."""
+    scene = judged.scene
+    log = scene.clip.agents.window(scene.step, scene.step + 41)
+    prepared = prepare_scene(scene, judged.rollout.agents if agents_of == "rollout" else log)
+    driven = track(scene.ego_state, to_world(scene.ego_state[:3], VOCABULARY.trajectories))
+    return score(prepared, np.concatenate([judged.rival[None], driven]), normalise="pairs")
+
+
+def assert_labels_are(labels: VocabularyLabels, scores: Scores) -> None:
+    for name in KEPT:
+        np.testing.assert_array_equal(getattr(labels, name), getattr(scores, name)[1:], err_msg=name)
+    np.testing.assert_array_equal(labels.ep(), scores.ep[1:])
+    np.testing.assert_allclose(labels.pdm_score(), scores.pdm_score[1:], rtol=0, atol=1e-15)
+
+
+def test_labels_are_the_reward_s_scores_in_pairs_with_pdm_closed(simulated: Judged) -> None:
+    labels = labelled(simulated)
+    assert_labels_are(labels, in_pairs(simulated, "rollout"))
+    assert labels.vocabulary == VOCABULARY.digest and labels.traffic == "replay"
+    assert len({*np.round(labels.pdm_score(), 3)}) > 10, "a vocabulary of all kinds of drives"
+
+
+def test_in_one_batch_they_are_those_of_the_batch(simulated: Judged) -> None:
+    driven = track(simulated.scene.ego_state, to_world(simulated.scene.ego_state[:3], VOCABULARY.trajectories))
+    batch = score(simulated.prepared, np.concatenate([simulated.rival[None], driven]))
+    np.testing.assert_array_equal(labelled(simulated).ep("batch"), batch.ep[1:])
+
+
+def test_the_judged_drive_itself_is_labelled_as_it_was_judged(simulated: Judged) -> None:
+    start = simulated.scene.ego_state[:3]
+    local = simulated.plan.poses - [*start[:2], 0.0]  # the street runs along x and the ego with it
+    labels = labelled(simulated, vocabulary=Vocabulary(local[None]))
+    for name in KEPT:
+        assert getattr(labels, name)[0] == pytest.approx(getattr(simulated.scores, name)[1], abs=1e-9), name
+    assert labels.pdm_score()[0] == pytest.approx(simulated.scores.pdm_score[1], abs=1e-9)
+
+
+def test_a_simulated_sample_meets_its_simulated_traffic_and_not_the_log(simulated: Judged) -> None:
+    labels, among_log = labelled(simulated), in_pairs(simulated, "log")
+    differ = [name for name in KEPT if (getattr(labels, name) != getattr(among_log, name)[1:]).any()]
+    assert {"nc", "ttc"} <= set(differ), "the log's traffic does other harm here: replaying it would be seen"
+
+
+def test_a_human_sample_meets_the_log(human: Judged) -> None:
+    assert human.scene.step == NOW
+    assert_labels_are(labelled(human), in_pairs(human, "log"))
+
+
+def test_chunks_leave_every_label_as_it_is(simulated: Judged, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = labelled(simulated)
+    monkeypatch.setattr("tasks.reward.labels.TRAJECTORIES_AT_ONCE", 7)
+    chunked = labelled(simulated)
+    for name in KEPT:
+        np.testing.assert_array_equal(getattr(chunked, name), getattr(whole, name))
+    assert chunked.reference_progress_m == whole.reference_progress_m
+
+
+def test_reacting_traffic_answers_to_each_trajectory(human: Judged) -> None:
+    """Each label is that of a rollout of its own; the car ahead, free to go, makes way that the log's does not."""
+    scene = human.scene
+    some = Vocabulary(np.concatenate([VOCABULARY.trajectories[:6], straight_on(np.arange(14.0, 22.0))]))
+    labels = labelled(human, IDM, some)
+    assert labels.traffic == "idm"
+    poses = to_world(scene.ego_state[:3], some.trajectories)
+    for i, pose in enumerate(poses):
+        rollout = simulate(scene, pose, IDM)
+        alone = score(prepare_scene(scene, rollout.agents), rollout.ego_states[None])
+        for name in KEPT:
+            assert getattr(labels, name)[i] == getattr(alone, name)[0], (i, name)
+    replayed = labelled(human, REPLAY, some)
+    assert (labels.nc[6:] > replayed.nc[6:]).any() and (labels.ttc[6:] > replayed.ttc[6:]).any()
+
+
+def test_reactive_scores_are_in_pairs_with_row_0_and_rows_do_not_see_each_other(human: Judged) -> None:
+    scene = human.scene
+    poses = to_world(scene.ego_state[:3], VOCABULARY.trajectories[:5])
+    states = np.concatenate([human.rival[None], track(scene.ego_state, poses)])
+    scores = reactive_scores(scene, states, IDM)
+    labels = labelled(human, IDM, Vocabulary(VOCABULARY.trajectories[:5]))
+    assert_labels_are(labels, scores)
+    assert labels.reference_progress_m == scores.ep_raw_m[0] * scores.multiplier[0]
+    fewer = reactive_scores(scene, states[[0, 4]], IDM)
+    assert fewer.pdm_score[1] == scores.pdm_score[4]
+
+
+def test_a_reference_at_fault_leaves_no_progress_to_be_held_against(human: Judged) -> None:
+    off_road = human.rival.copy()
+    off_road[:, 1] += 30.0
+    labels = labelled(replace(human, rival=off_road))
+    assert labels.reference_progress_m == 0.0
+    np.testing.assert_array_equal(labels.ep()[labels.multiplier == 1.0], 1.0)

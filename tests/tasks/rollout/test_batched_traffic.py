@@ -1,0 +1,177 @@
+"""The traffic against its slow twin, and against many egos at once: the same to the last bit."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from tasks.rollout.simulate import (
+    Rollouts,
+    TrafficScene,
+    TrafficSettings,
+    next_scene,
+    prepare_traffic,
+    roll_out,
+    roll_out_many,
+)
+from tasks.world.agents import AgentTracks
+from tasks.world.clip import NOW, Rollout
+from tasks.world.vehicle import HEADING, PACIFICA, VX, X, Y
+from tests.tasks.rollout import slow_corridor, slow_idm, worlds
+
+Array = NDArray[np.float64]
+
+IDM = TrafficSettings()
+seeds = st.integers(0, 2**31)
+
+
+def slow_roll_out(traffic: TrafficScene, ego_states: Array) -> Rollout:
+    """As `roll_out`, by the twin that looks at every pair at every step."""
+    scene, of = traffic.scene, traffic.settings
+    window = scene.agents.window(scene.step, scene.step + 41)
+    assert traffic.cast is not None and traffic.paths is not None
+    paths = traffic.paths._asdict()
+    del paths["stretches"]
+    heading, speed = ego_states[:, HEADING], ego_states[:, VX]
+    cos, sin = np.cos(heading), np.sin(heading)
+    size = np.full((41, 2), (PACIFICA.length, PACIFICA.width))
+    x, y = (ego_states[:, k] + PACIFICA.rear_axle_to_center * d for k, d in ((X, cos), (Y, sin)))
+    driver = slow_idm.Driver(
+        of.min_gap_m, of.headway_s, of.accel_max, of.decel_max, of.exponent, of.emergency_decel, of.lookahead_m,
+        of.corridor_margin_m, of.blend_length_m, of.snap_distance_m + 2.0, of.enter_clearance_m,
+    )  # fmt: skip
+    boxes, velocities, valid, center_z, driven = slow_idm.drive(
+        scene.step,
+        slow_world(scene.clip.agents, slice(None)),
+        slow_world(scene.agents, scene.step),
+        slow_idm.Cast(*traffic.cast),
+        slow_corridor.Paths(**paths),
+        np.column_stack([x, y, heading, size]),
+        np.column_stack([cos * speed, sin * speed]),
+        driver,
+    )
+    agents = replace(window, boxes=boxes, velocities=velocities, valid=valid, center_z=center_z)
+    return Rollout(scene.step, ego_states, agents, driven)
+
+
+def slow_world(agents: AgentTracks, steps: int | slice) -> slow_idm.World:
+    return slow_idm.World(
+        *(np.ascontiguousarray(a[steps]) for a in (agents.boxes, agents.velocities, agents.valid, agents.center_z))
+    )
+
+
+def stages(seed: int, of: TrafficSettings = IDM) -> list[tuple[TrafficScene, Array]]:
+    """A random world and eight egos in it, and the world that the first of them leaves behind, with eight others."""
+    scene = worlds.random_scene(seed)
+    egos = worlds.random_egos(scene, seed, 8)
+    first = prepare_traffic(scene, of)
+    after = next_scene(scene, roll_out(first, egos[0]), scene.centerline)
+    return [(first, egos), (prepare_traffic(after, of), worlds.random_egos(after, seed + 1, 8))]
+
+
+def assert_same(rollout: Rollout, other: Rollout) -> None:
+    for name in ("boxes", "velocities", "valid", "center_z"):
+        assert getattr(rollout.agents, name).tobytes() == getattr(other.agents, name).tobytes(), name
+    assert rollout.simulated.tolist() == other.simulated.tolist()
+
+
+def assert_row_is(rollouts: Rollouts, b: int, rollout: Rollout) -> None:
+    for name in ("boxes", "velocities", "valid"):
+        assert getattr(rollouts, name)[b].tobytes() == getattr(rollout.agents, name).tobytes(), name
+    assert rollouts.simulated[b].tolist() == rollout.simulated.tolist()
+
+
+@given(seeds)
+@settings(max_examples=25, deadline=None)
+def test_the_traffic_equals_its_slow_twin(seed: int) -> None:
+    for traffic, egos in stages(seed):
+        for ego in egos[:3]:
+            assert_same(roll_out(traffic, ego), slow_roll_out(traffic, ego))
+
+
+@given(seeds, st.sampled_from([0.5, 3.0, 20.0]), st.sampled_from([3.0, 25.0, 200.0]))
+@settings(max_examples=15, deadline=None)
+def test_so_it_does_under_other_settings(seed: int, blend_length_m: float, lookahead_m: float) -> None:
+    """Also where the corridor reaches beyond the path's end."""
+    of = TrafficSettings(blend_length_m=blend_length_m, lookahead_m=lookahead_m, min_gap_m=3.0, emergency_decel=5.0)
+    for traffic, egos in stages(seed, of):
+        assert_same(roll_out(traffic, egos[0]), slow_roll_out(traffic, egos[0]))
+
+
+@given(seeds)
+@settings(max_examples=25, deadline=None)
+def test_each_of_many_rollouts_is_that_of_its_ego_alone(seed: int) -> None:
+    for traffic, egos in stages(seed):
+        rollouts = roll_out_many(traffic, egos)
+        for b, ego in enumerate(egos):
+            assert_row_is(rollouts, b, roll_out(traffic, ego))
+
+
+def test_the_random_worlds_reach_every_rule() -> None:
+    """Someone brakes on its log, someone waits, someone is kept out, and what the ego does changes what others do."""
+    braked, waited, kept_out, answers = 0, 0, 0, 0
+    for seed in range(30):
+        for traffic, egos in stages(seed):
+            assert traffic.cast is not None
+            start, log = traffic.scene.step, traffic.scene.clip.agents
+            logged = log.window(start, start + 41)
+            rollouts = [roll_out(traffic, ego) for ego in egos]
+            for rollout in rollouts:
+                agents = rollout.agents
+                walks = traffic.cast.moving_kind & (traffic.cast.logged_path < 0) & ~rollout.simulated
+                late = (
+                    (agents.boxes != logged.boxes).any(axis=(0, 2))
+                    & agents.valid.all(axis=0)
+                    & logged.valid.all(axis=0)
+                )
+                braked += int((rollout.simulated & (traffic.cast.path < 0)).sum())
+                waited += int((walks & late & ~traffic.cast.standing).sum())
+                kept_out += int((logged.valid & ~agents.valid).any(axis=0).sum())
+                answers += agents.boxes.tobytes() != rollouts[0].agents.boxes.tobytes()
+    assert min(braked, waited, kept_out, answers) > 20
+
+
+def test_the_other_egos_of_a_batch_do_not_matter() -> None:
+    for traffic, egos in stages(3):
+        together = roll_out_many(traffic, egos)
+        turned = roll_out_many(traffic, egos[::-1])
+        apart = [roll_out_many(traffic, egos[b : b + 1]) for b in range(len(egos))]
+        for name in ("boxes", "velocities", "valid", "simulated"):
+            whole = getattr(together, name)
+            assert whole.tobytes() == np.ascontiguousarray(getattr(turned, name)[::-1]).tobytes()
+            assert whole.tobytes() == np.concatenate([getattr(part, name) for part in apart]).tobytes()
+
+
+def test_replay_answers_no_ego_and_copies_nothing() -> None:
+    scene = worlds.random_scene(1)
+    rollouts = roll_out_many(prepare_traffic(scene, TrafficSettings(mode="replay")), worlds.random_egos(scene, 1, 5))
+    assert np.shares_memory(rollouts.boxes, scene.agents.boxes)
+    for name in ("boxes", "velocities", "valid"):
+        logged = getattr(scene.agents, name)[NOW : NOW + 41]
+        assert all(row.tobytes() == logged.tobytes() for row in getattr(rollouts, name))
+    assert rollouts.simulated.shape == (5, len(scene.agents)) and not rollouts.simulated.any()
+
+
+def test_an_empty_street_and_no_ego_at_all() -> None:
+    empty = worlds.scene(worlds.straight_road())
+    assert roll_out_many(prepare_traffic(empty, IDM), worlds.random_egos(empty, 0, 3)).boxes.shape == (3, 41, 0, 5)
+    scene = worlds.random_scene(0)
+    none = roll_out_many(prepare_traffic(scene, IDM), np.zeros((0, 41, 11)))
+    assert none.boxes.shape == (0, 41, len(scene.agents), 5)
+
+
+def test_states_that_are_none_are_refused_by_name() -> None:
+    scene = worlds.random_scene(0)
+    traffic, egos = prepare_traffic(scene, IDM), worlds.random_egos(scene, 0, 2)
+    for wrong in (egos[0], egos[:, :40], egos[..., :10]):
+        with pytest.raises(ValueError, match="ego_states"):
+            roll_out_many(traffic, wrong)
+    egos[1, 3, X] = np.nan
+    with pytest.raises(ValueError, match="ego_states of ego 1"):
+        roll_out_many(traffic, egos)
+    for one in (egos[1], egos[0, :40], egos[0, :, :10]):
+        with pytest.raises(ValueError, match="ego_states"):
+            roll_out(traffic, one)
