@@ -6,17 +6,13 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from tasks.reward.formula import EC_WEIGHT, MULTIPLIERS, WEIGHTS, share_of_best
 from tasks.reward.prepare import PreparedScene
 from tasks.reward.verdicts import Verdicts, judge
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Normalise = Literal["batch", "pairs"]
-
-WEIGHTS = {"ep": 5.0, "ttc": 5.0, "lk": 2.0, "hc": 2.0}
-EC_WEIGHT = 2.0
-MULTIPLIERS = ("nc", "dac", "tlc", "ddc")
-PROGRESS_THRESHOLD_M = 5.0
 
 
 @dataclass(frozen=True)
@@ -88,8 +84,7 @@ def relative_progress(ep_raw_m: Array, multiplier: Array, normalise: Normalise) 
         raise ValueError(f"normalise must be one of {get_args(Normalise)}, got {normalise!r}")
     compliant = ep_raw_m * multiplier
     best = np.full_like(compliant, compliant.max()) if normalise == "batch" else np.maximum(compliant, compliant[0])
-    far_enough = best > PROGRESS_THRESHOLD_M
-    return np.where(far_enough, np.clip(ep_raw_m / np.where(far_enough, best, 1.0), 0.0, 1.0), 1.0)
+    return share_of_best(ep_raw_m, best)
 
 
 def score_with_ec(scores: Scores, ec: Array) -> Array:

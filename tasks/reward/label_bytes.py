@@ -15,6 +15,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from tasks.reward.formula import WEIGHTS, share_of_best
+
 Array = NDArray[np.float64]
 Bits = NDArray[np.uint8]
 Normalise = Literal["pairs", "batch", "masked"]
@@ -25,8 +27,6 @@ N_PLANES = 2 * len(HALVES) + len(WHOLES)
 UNITS_PER_M = 128
 MAX_PROGRESS_M = 65535 / UNITS_PER_M
 CRC_BYTES = 4
-WEIGHTS = {"ep": 5.0, "ttc": 5.0, "lk": 2.0, "hc": 2.0}  # METRIC.md 2k
-PROGRESS_THRESHOLD_M = 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,8 +64,7 @@ class VocabularyLabels:
         if normalise == "batch":
             best = np.full_like(best, best.max())
         gained_m = compliant_m if normalise == "masked" else self.ep_raw_m
-        far_enough = best > PROGRESS_THRESHOLD_M
-        return np.where(far_enough, np.clip(gained_m / np.where(far_enough, best, 1.0), 0.0, 1.0), 1.0)
+        return share_of_best(gained_m, best)
 
     def pdm_score(self, normalise: Normalise = "pairs") -> Array:
         """(K,) multiplier (5 ep + 5 ttc + 2 lk + 2 hc) / 14."""

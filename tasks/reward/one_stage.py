@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.reward.epdms import MULTIPLIERS, WEIGHTS, Scores, human_filtered, score_with_ec
+from tasks.reward.epdms import Scores, human_filtered, score_with_ec
+from tasks.reward.formula import MULTIPLIERS, WEIGHTS
 
 Array = NDArray[np.float64]
 

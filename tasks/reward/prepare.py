@@ -25,7 +25,6 @@ Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 N_TIMES = HORIZON_STEPS + 1
-MAP_RADIUS_M = 100.0
 PAST_STEPS = (0, 5, 10, 15)  # of the 1.5 s history at 10 Hz: -1.5, -1.0, -0.5, 0 s
 STOPPED_SPEED_MPS = 0.05
 LANE_LAYERS = frozenset({MapLayer.LANE, MapLayer.LANE_CONNECTOR})
@@ -117,7 +116,7 @@ def prepare_scene(
     return prepare(
         past_states=scene.ego_history[list(PAST_STEPS)],
         centerline=scene.centerline,
-        polygons=polygons_near(clip.road_map, ego_boxes(scene.ego_state, vehicle)[:2], MAP_RADIUS_M),
+        polygons=polygons_near(clip.road_map, ego_boxes(scene.ego_state, vehicle)[:2]),
         route_lane_ids=clip.route.lane_ids,
         objects=agents,
         red_lanes=_red_connectors(clip, scene.step),

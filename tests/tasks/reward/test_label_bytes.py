@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from tasks.reward import epdms, label_bytes
-from tasks.reward.epdms import MULTIPLIERS, relative_progress
+from tasks.reward.epdms import relative_progress
+from tasks.reward.formula import MULTIPLIERS
 from tasks.reward.label_bytes import (
     CRC_BYTES,
     HALVES,
@@ -94,11 +94,6 @@ def test_masked_progress_is_that_of_the_compliant_metres() -> None:
     np.testing.assert_allclose(labels.pdm_score("masked")[:3], [11.5 / 14.0, 5.5 / 14.0, 0.0], rtol=0, atol=1e-15)
     short = replace(labels, reference_progress_m=5.0, ep_raw_m=labels.ep_raw_m / 10.0)
     np.testing.assert_array_equal(short.ep("masked"), ones)
-
-
-def test_weights_and_threshold_are_the_reward_s() -> None:
-    assert label_bytes.WEIGHTS == epdms.WEIGHTS
-    assert label_bytes.PROGRESS_THRESHOLD_M == epdms.PROGRESS_THRESHOLD_M
 
 
 @pytest.mark.parametrize("k", [1, 7, 8, 9, 1024, 16384])
