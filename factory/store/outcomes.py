@@ -89,11 +89,3 @@ OUTCOMES = TableSpec("outcomes", SCHEMA, "attempt_id")
 def outcomes_table(outcomes: Sequence[Outcome]) -> pa.Table:
     rows = [asdict(o) | {"subscores": list(o.subscores.items()), "seconds": list(o.seconds.items())} for o in outcomes]
     return pa.Table.from_pylist(rows, schema=SCHEMA)
-
-
-def outcomes_of(table: pa.Table) -> list[Outcome]:
-    """Rows of a complete outcomes table."""
-    return [
-        Outcome(**row | {"subscores": dict(row["subscores"] or ()), "seconds": dict(row["seconds"] or ())})
-        for row in table.to_pylist()
-    ]

@@ -15,7 +15,6 @@ from tasks.world.vehicle import PACIFICA
 
 Array = NDArray[np.float64]
 
-SAMPLE_STEP_S = 0.2  # spacing of the poses that driven_lanes expects
 MAX_LANE_DISTANCE_M = 1.0
 MAX_HEADING_ERROR_RAD = 1.2
 COST_PER_M_TO_LANE, COST_PER_RAD, COST_PER_M_TO_CENTERLINE = 2.0, 2.0, 0.5

@@ -34,7 +34,6 @@ from factory.clips.synthetic.compiled import drawing_njit
     ISLAND_STONE,
     DARK,
 ) = range(23)
-ALPHA_TESTED = (LEAVES, TREELINE, SPOKES)
 
 
 RGB = tuple[float, float, float]
