@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from tasks.render.asset import RenderAsset
 from tasks.render.boxes import box_gaussians
 from tasks.render.choose import with_mirror_image
 from tasks.render.gaussians import EMPTY, F32, F64, concatenate
 from tasks.render.movers import owners, world_from_boxes
-from tasks.render.scene import MIN_NODE_DISCS, RenderAsset
+from tasks.render.scene import MIN_NODE_DISCS
 from tasks.render.sensed import Sweep, Tracks, on_ego, shifted, voxel_rows
 from tasks.render.sky import COLUMNS, ROWS, SkyMap
 from tasks.render.surfels import Discs, concatenate_discs, gaussians_of

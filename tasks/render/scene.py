@@ -6,17 +6,17 @@ each surface is kept, and the colours are refitted so that the photos come out. 
 pedestrian or bicycle goes to that track's own Gaussians, in box coordinates.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.render.boxes import box_gaussians
+from tasks.render.asset import RenderAsset, psnr, scene_at
 from tasks.render.choose import BACKGROUND, Look, choose, count_free_space, with_mirror_image
-from tasks.render.gaussians import EMPTY, F32, F64, Gaussians, concatenate, moved
+from tasks.render.engine import Pinhole, Vehicles, render
+from tasks.render.gaussians import EMPTY, F32, F64, Gaussians
 from tasks.render.movers import owners, world_from_boxes
-from tasks.render.raster import rasterize
 from tasks.render.refit import FitPhoto, refit_colours
 from tasks.render.sensed import Photo, Sweep, Tracks, fuse, shifted
 from tasks.render.sight import SHALLOW, Seen, see
@@ -36,51 +36,6 @@ class AssetSettings:
     refit_sweeps: int = 1  # a second one gains 0.02 .. 0.08 dB for a third of the time
     hold_out_every: int = 8  # photo i of a camera with i % n == n // 2 only measures; 0: none is held out
     stereo_photos: int = 4  # neighbours compared where lidar does not reach
-
-
-@dataclass(frozen=True)
-class RenderAsset:
-    """A block's scene. World coordinates minus `origin` everywhere, so that float32 is exact to less than a mm."""
-
-    origin: F64  # (3,) world [m]
-    background: Gaussians
-    nodes: Mapping[str, Gaussians]  # track id -> Gaussians in box coordinates (centre; x along the heading)
-    sky: SkyMap
-    psnr_db: float  # of the photos held out against their rendering; NaN when none was
-    n_held_out: int = 0
-    digest: str = ""  # of all of the above; filled by whoever stores the scene
-
-
-def psnr(a: NDArray[np.generic], b: NDArray[np.generic]) -> float:
-    """Peak signal-to-noise ratio [dB] of two images of the same type: uint8 (peak 255) or float (peak 1)."""
-    peak = 255.0 if a.dtype == np.uint8 else 1.0
-    error = float(np.mean((a.astype(np.float64) - b.astype(np.float64)) ** 2))
-    return float("inf") if error == 0.0 else 10.0 * float(np.log10(peak**2 / error))
-
-
-def scene_at(asset: RenderAsset, track_ids: Sequence[str], kinds: Sequence[AgentKind], boxes: F64) -> Gaussians:
-    """Background and the named tracks at `boxes` (N, 7) x, y, z, heading, length, width, height in the world.
-
-    A track without Gaussians of its own is a plain shaded box: nobody is invisible.
-    """
-    local = boxes - np.concatenate([asset.origin, np.zeros(4)])
-    poses = world_from_boxes(local)
-    parts = [asset.background]
-    for j, track_id in enumerate(track_ids):
-        node = asset.nodes.get(track_id)
-        if node is None:
-            node = box_gaussians(boxes[j, 4:7], kinds[j])
-        parts.append(moved(node, poses[j]))
-    return concatenate(parts)
-
-
-def render_photo(
-    asset: RenderAsset, scene: Gaussians, intrinsics: F64, world_from_camera: F64, size: tuple[int, int]
-) -> F32:
-    """(H, W, 3) rgb in [0, 1] of a composed scene; `size` width, height."""
-    local = shifted(world_from_camera, -asset.origin)
-    backdrop = asset.sky.seen_by(intrinsics, local, *size)
-    return np.clip(rasterize(scene, intrinsics, local, *size, backdrop).rgb, 0.0, 1.0)
 
 
 def build_asset(
@@ -193,10 +148,10 @@ def _members(asset: RenderAsset, tracks: Tracks, time_s: float) -> tuple[list[in
 def _picture(asset: RenderAsset, photo: Photo, tracks: Tracks) -> F32:
     """The rendering of a photo (pose local) as the scene was at its time."""
     rows, boxes = _members(asset, tracks, photo.time_s)
-    scene = scene_at(asset, [tracks.ids[j] for j in rows], [tracks.kinds[j] for j in rows], boxes[rows])
+    present = Vehicles(tuple(tracks.ids[j] for j in rows), tuple(tracks.kinds[j] for j in rows), boxes[rows])
     height, width = photo.rgb.shape[:2]
-    pose = shifted(photo.world_from_camera, asset.origin)
-    return render_photo(asset, scene, photo.intrinsics, pose, (width, height))
+    camera = Pinhole(photo.intrinsics, shifted(photo.world_from_camera, asset.origin), width, height)
+    return render(asset, [camera], present)[0].rgb
 
 
 def _refit(

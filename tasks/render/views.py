@@ -6,11 +6,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tasks.render.asset import RenderAsset
+from tasks.render.engine import Backend, Pinhole, render, vehicles_at
 from tasks.render.gaussians import F64
-from tasks.render.movers import STEP_S, boxes_at
-from tasks.render.scene import RenderAsset, render_photo, scene_at
 from tasks.world.agents import AgentTracks
 from tasks.world.camera import Camera
+from tasks.world.clip import STEP_S
 from tasks.world.vehicle import HEADING, X, Y
 
 VISIBLE_M = 150.0  # agents further away are not drawn
@@ -24,6 +25,7 @@ def render_views(
     steps: Sequence[int],
     width: int,
     height: int,
+    backend: Backend = Backend.CPU,
 ) -> NDArray[np.uint8]:
     """Images (F, C, height, width, 3) rgb.
 
@@ -32,17 +34,12 @@ def render_views(
     they enter the scene.
     """
     out = np.empty((len(steps), len(cameras), height, width, 3), np.uint8)
+    rig = [camera.resized(width, height) for camera in cameras]
     for f, step in enumerate(steps):
-        boxes, valid = boxes_at(agents, step * STEP_S)
-        offsets = boxes[:, :2] - world_from_ego[f, :2, 3]
-        near = valid & (np.hypot(offsets[:, 0], offsets[:, 1]) < VISIBLE_M)
-        rows = np.flatnonzero(near)
-        scene = scene_at(asset, [agents.track_ids[j] for j in rows], [agents.kinds[j] for j in rows], boxes[rows])
-        for c, camera in enumerate(cameras):
-            pinhole = camera.resized(width, height)
-            pose = world_from_ego[f] @ pinhole.ego_from_camera
-            image = render_photo(asset, scene, pinhole.intrinsics, pose, (width, height))
-            out[f, c] = np.rint(image * 255.0).astype(np.uint8)
+        there = vehicles_at(agents, step * STEP_S, world_from_ego[f, :2, 3], VISIBLE_M)
+        eyes = [Pinhole(c.intrinsics, world_from_ego[f] @ c.ego_from_camera, width, height) for c in rig]
+        for c, view in enumerate(render(asset, eyes, there, backend)):
+            out[f, c] = np.rint(view.rgb * 255.0).astype(np.uint8)
     return out
 
 

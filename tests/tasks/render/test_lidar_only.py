@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import street
 
+from tasks.render.engine import Pinhole, Vehicles, render
 from tasks.render.lidar_only import BRIGHTEST, DARKEST, grey_of, lidar_asset
-from tasks.render.scene import render_photo, scene_at
 from tasks.world.agents import AgentKind
 
 
@@ -20,8 +20,8 @@ def seen(bright: int) -> np.ndarray:
     asset = lidar_asset(sweeps, street.tracks())
     assert np.isnan(asset.psnr_db) and list(asset.nodes) == ["car"]
     view = street.photo(4.5, 0.8, 1.1)
-    scene = scene_at(asset, ["car"], [AgentKind.VEHICLE], street.car_box(1.1)[None])
-    return render_photo(asset, scene, view.intrinsics, view.world_from_camera, (street.WIDTH, street.HEIGHT))
+    camera = Pinhole(view.intrinsics, view.world_from_camera, street.WIDTH, street.HEIGHT)
+    return render(asset, [camera], Vehicles(("car",), (AgentKind.VEHICLE,), street.car_box(1.1)[None]))[0].rgb
 
 
 def test_the_near_road_is_closed_and_as_bright_as_its_returns() -> None:

@@ -5,19 +5,25 @@ import pytest
 import street
 
 from tasks.render import choose, depth, movers, project, raster, stereo
-from tasks.render.scene import AssetSettings, RenderAsset, build_asset, psnr, render_photo, scene_at
+from tasks.render.asset import RenderAsset, psnr
+from tasks.render.engine import NOBODY, Pinhole, Vehicles, render
+from tasks.render.scene import AssetSettings, build_asset
 from tasks.render.sensed import Photo
 from tasks.render.warm import compile_kernels
 from tasks.world.agents import AgentKind
 
-SIZE = (street.WIDTH, street.HEIGHT)
+
+def car_at(box: np.ndarray, name: str = "car") -> Vehicles:
+    return Vehicles((name,), (AgentKind.VEHICLE,), box[None])
+
+
+def picture(asset: RenderAsset, pose: np.ndarray, vehicles: Vehicles) -> np.ndarray:
+    camera = Pinhole(street.INTRINSICS, pose, street.WIDTH, street.HEIGHT)
+    return np.rint(render(asset, [camera], vehicles)[0].rgb * 255).astype(np.uint8)
 
 
 def rendered(asset: RenderAsset, truth: Photo, with_car: bool = True) -> np.ndarray:
-    ids, boxes = (["car"], street.car_box(truth.time_s)[None]) if with_car else ([], np.zeros((0, 7)))
-    scene = scene_at(asset, ids, [AgentKind.VEHICLE] * len(ids), boxes)
-    image = render_photo(asset, scene, truth.intrinsics, truth.world_from_camera, SIZE)
-    return np.rint(image * 255).astype(np.uint8)
+    return picture(asset, truth.world_from_camera, car_at(street.car_box(truth.time_s)) if with_car else NOBODY)
 
 
 @pytest.mark.parametrize(("y", "least_db"), [(0.0, 26.0), (1.0, 24.0), (-1.5, 23.0)])
@@ -58,11 +64,10 @@ def test_what_the_car_hid_is_the_road_behind_it(street_asset: RenderAsset) -> No
 
 
 def test_a_track_nobody_photographed_is_a_visible_box(street_asset: RenderAsset) -> None:
-    box = np.array([[14.0, -2.0, 0.8, 0.0, *street.CAR]])
+    box = np.array([14.0, -2.0, 0.8, 0.0, *street.CAR])
     view = street.photo(4.5, 0.0, 1.125, with_car=False)
     empty = rendered(street_asset, view, with_car=False).astype(np.int64)
-    scene = scene_at(street_asset, ["stranger"], [AgentKind.VEHICLE], box)
-    drawn = render_photo(street_asset, scene, view.intrinsics, view.world_from_camera, SIZE) * 255
+    drawn = picture(street_asset, view.world_from_camera, car_at(box, "stranger"))
     changed = (np.abs(drawn - empty).max(axis=-1) > 20).mean()
     assert changed > 0.01
 
@@ -99,9 +104,8 @@ def test_the_same_input_gives_the_same_scene_and_the_world_may_lie_anywhere(stre
         settings,
     )
     truth = street.photo(1.5, 0.5, 0.4, with_car=False)
-    scene = scene_at(there, [], [], np.zeros((0, 7)))
-    image = render_photo(there, scene, truth.intrinsics, moved(truth.world_from_camera), SIZE)
-    assert psnr(np.rint(image * 255).astype(np.uint8), rendered(here, truth, with_car=False)) > 35.0
+    image = picture(there, moved(truth.world_from_camera), NOBODY)
+    assert psnr(image, rendered(here, truth, with_car=False)) > 35.0
 
 
 def test_psnr_in_closed_form() -> None:

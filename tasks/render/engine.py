@@ -1,0 +1,96 @@
+"""The one function that draws a scene: `render(asset, cameras, vehicles, backend) -> rgb, depth, alpha` per camera.
+
+`cpu` is the compiled tile rasteriser of this room: the same input gives the same bytes. Cameras are ideal pinholes: a
+camera's distortion is taken out of its photos before they enter a scene (`views.undistorted`), so that images at new
+poses need none.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from types import MappingProxyType
+
+import numpy as np
+
+from tasks.render.asset import RenderAsset, scene_at
+from tasks.render.gaussians import F32, F64, Gaussians
+from tasks.render.movers import boxes_at
+from tasks.render.raster import View, rasterize
+from tasks.render.sensed import shifted
+from tasks.world.agents import AgentKind, AgentTracks
+
+
+class Backend(StrEnum):
+    CPU = "cpu"
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """A camera without distortion somewhere in the world. Raises ValueError for arrays that are no camera."""
+
+    intrinsics: F64  # (3, 3) pixels, without skew, the centre of pixel (0, 0) at (0.5, 0.5)
+    world_from_camera: F64  # (4, 4) rigid; camera x right, y down, z forward
+    width: int  # pixels
+    height: int
+
+    def __post_init__(self) -> None:
+        shapes = (self.intrinsics.shape, self.world_from_camera.shape)
+        if shapes != ((3, 3), (4, 4)):
+            raise ValueError(f"Pinhole: intrinsics, pose are {shapes[0]}, {shapes[1]}, expected (3, 3) and (4, 4)")
+        if not (np.isfinite(self.intrinsics).all() and np.isfinite(self.world_from_camera).all()):
+            raise ValueError("Pinhole: intrinsics or pose hold NaN or infinity")
+        if min(self.intrinsics[0, 0], self.intrinsics[1, 1], self.width, self.height) <= 0:
+            raise ValueError("Pinhole: focal lengths, width and height must be positive")
+
+
+@dataclass(frozen=True)
+class Vehicles:
+    """Who is in the scene, and where: vehicles, pedestrians and bicycles."""
+
+    track_ids: tuple[str, ...]
+    kinds: tuple[AgentKind, ...]
+    boxes: F64  # (N, 7) x, y, z of the centre, heading, length, width, height; world [m, rad]
+
+
+NOBODY = Vehicles((), (), np.zeros((0, 7)))
+
+
+def vehicles_at(agents: AgentTracks, time_s: float, around: F64 | None = None, reach_m: float = np.inf) -> Vehicles:
+    """The tracks that are there at a time since their first step; given a place `around` (2,), those within reach."""
+    boxes, valid = boxes_at(agents, time_s)
+    if around is not None:
+        valid = valid & (np.hypot(*(boxes[:, :2] - around).T) < reach_m)
+    rows = np.flatnonzero(valid)
+    return Vehicles(tuple(agents.track_ids[j] for j in rows), tuple(agents.kinds[j] for j in rows), boxes[rows])
+
+
+def render(
+    asset: RenderAsset,
+    cameras: Sequence[Pinhole],
+    vehicles: Vehicles = NOBODY,
+    backend: Backend = Backend.CPU,
+) -> list[View]:
+    """What each of the `cameras` sees of the scene with `vehicles` in it: rgb in [0, 1], depth [m], alpha.
+
+    Behind everything is the sky, so that a camera which sees no Gaussian gets a picture of the sky map with alpha 0,
+    never a black one.
+    """
+    scene = scene_at(asset, vehicles.track_ids, vehicles.kinds, vehicles.boxes)
+    local = [replace(camera, world_from_camera=shifted(camera.world_from_camera, -asset.origin)) for camera in cameras]
+    backdrops = [asset.sky.seen_by(c.intrinsics, c.world_from_camera, c.width, c.height) for c in local]
+    views = RASTERISERS[backend](scene, local, backdrops)
+    return [replace(view, rgb=np.clip(view.rgb, 0.0, 1.0)) for view in views]
+
+
+Rasteriser = Callable[[Gaussians, Sequence[Pinhole], Sequence[F32]], list[View]]
+"""Gaussians, cameras and (H, W, 3) backdrops in one frame -> views; colours may leave [0, 1]."""
+
+
+def _on_cpu(scene: Gaussians, cameras: Sequence[Pinhole], backdrops: Sequence[F32]) -> list[View]:
+    return [
+        rasterize(scene, camera.intrinsics, camera.world_from_camera, camera.width, camera.height, backdrop)
+        for camera, backdrop in zip(cameras, backdrops)
+    ]
+
+
+RASTERISERS: Mapping[Backend, Rasteriser] = MappingProxyType({Backend.CPU: _on_cpu})
