@@ -4,38 +4,59 @@ python -m tests.bench.bench_rollout ../shared/data/av2/sensor/val
 """
 
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+
+import numpy as np
 
 from factory.clips.av2 import AV2Reader
 from tasks.kinematic_vocabulary import kinematic_trajectories
 from tasks.rollout.lqr import track_local
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out, roll_out_many
-from tasks.world.clip import NOW, scene_of_clip
+from tasks.world.clip import NOW, Scene, scene_of_clip
 from tests.bench.timing import cpu_milliseconds
 
-N_EGOS = 256
+N_EGOS, NEAREST = 256, 25
+
+
+def among_nearest(scene: Scene) -> Scene:
+    """The scene with only the NEAREST agents that are there now."""
+    agents = scene.agents
+    away = np.linalg.norm(agents.boxes[NOW, :, :2] - scene.ego_state[:2], axis=-1)
+    rows = np.sort(np.argsort(np.where(agents.valid[NOW], away, np.inf), kind="stable")[:NEAREST])
+    few = replace(
+        agents,
+        track_ids=tuple(agents.track_ids[row] for row in rows),
+        kinds=tuple(agents.kinds[row] for row in rows),
+        boxes=agents.boxes[:, rows],
+        velocities=agents.velocities[:, rows],
+        valid=agents.valid[:, rows],
+        center_z=agents.center_z[:, rows],
+        heights=agents.heights[rows],
+    )
+    return replace(scene, clip=replace(scene.clip, agents=few), agents=few)
 
 
 def main(root: Path) -> None:
-    """One row per third clip: who is there, and milliseconds per part of a rollout."""
+    """Two rows per third clip, 25 agents and all of them: who is there, and milliseconds per part of a rollout."""
     reader, settings = AV2Reader(root), TrafficSettings()
     trajectories = kinematic_trajectories(N_EGOS, 0)
     print(f"| log | start s | agents now | with a path | prepare ms | one ego ms | {N_EGOS} egos ms |")
     print("|---|---|---|---|---|---|---|")
     for ref in reader.index().refs[::3]:
-        clip = reader.read(ref)
-        scene = scene_of_clip(clip)
-        traffic = prepare_traffic(scene, settings)
-        states = track_local(scene.ego_state, trajectories)
-        paths = sum(path is not None for path in traffic.lane_paths)
-        print(
-            f"| {ref.log_id[:8]} | {ref.start_ms / 1e3:.0f} | {int(clip.agents.valid[NOW].sum())} | {paths} "
-            f"| {cpu_milliseconds(partial(prepare_traffic, scene, settings), 5):.1f} "
-            f"| {cpu_milliseconds(partial(roll_out, traffic, states[0]), 40):.2f} "
-            f"| {cpu_milliseconds(partial(roll_out_many, traffic, states), 5):.0f} |",
-            flush=True,
-        )
+        whole = scene_of_clip(reader.read(ref))
+        for scene in (among_nearest(whole), whole):
+            traffic = prepare_traffic(scene, settings)
+            states = track_local(scene.ego_state, trajectories)
+            paths = sum(path is not None for path in traffic.lane_paths)
+            print(
+                f"| {ref.log_id[:8]} | {ref.start_ms / 1e3:.0f} | {int(scene.agents.valid[NOW].sum())} | {paths} "
+                f"| {cpu_milliseconds(partial(prepare_traffic, scene, settings), 5):.1f} "
+                f"| {cpu_milliseconds(partial(roll_out, traffic, states[0]), 40):.2f} "
+                f"| {cpu_milliseconds(partial(roll_out_many, traffic, states), 5):.0f} |",
+                flush=True,
+            )
 
 
 if __name__ == "__main__":
