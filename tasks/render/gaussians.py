@@ -1,27 +1,38 @@
 """Anisotropic 3-D Gaussians: what a rendered scene is made of."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tasks.render import sh
+
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
+_NO_SH = np.zeros((0, 0, 3), np.float32)
 
 
 @dataclass(frozen=True)
 class Gaussians:
-    """N Gaussians in one frame (a block's or a vehicle box's)."""
+    """N Gaussians in one frame (a block's or a vehicle box's).
+
+    Raises ValueError where the arrays' shapes do not agree.
+    """
 
     means: F32  # (N, 3) [m]
     quats: F32  # (N, 4) w, x, y, z; unit; columns of the rotation are the axes of the scales
     log_scales: F32  # (N, 3) natural log of the standard deviations [m]
     opacities: F32  # (N,) in (0, 1)
-    colours: F32  # (N, 3) rgb in [0, 1], the same from every side (SH degree 0)
+    colours: F32  # (N, 3) rgb, what all sides have in common (SH degree 0); in [0, 1] where there is no more than that
+    sh_rest: F32 = field(default_factory=lambda: _NO_SH)  # (N, M, 3), M in 0, 3, 8, 15: degrees 1 to 3, tasks.render.sh
 
     def __post_init__(self) -> None:
         n = len(self.means)
+        if self.sh_rest is _NO_SH:
+            object.__setattr__(self, "sh_rest", np.zeros((n, 0, 3), np.float32))
+        if self.sh_rest.shape not in [(n, count, 3) for count in sh.COUNTS]:
+            raise ValueError(f"Gaussians: sh_rest is {self.sh_rest.shape}, expected ({n}, 0 or 3 or 8 or 15, 3)")
         shapes = (self.means.shape, self.quats.shape, self.log_scales.shape, self.opacities.shape, self.colours.shape)
         if shapes != ((n, 3), (n, 4), (n, 3), (n,), (n, 3)):
             raise ValueError(f"Gaussians: shapes do not agree: {shapes}")
@@ -32,7 +43,12 @@ class Gaussians:
     def take(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> "Gaussians":
         """The Gaussians at `rows` (indices or mask)."""
         return Gaussians(
-            self.means[rows], self.quats[rows], self.log_scales[rows], self.opacities[rows], self.colours[rows]
+            self.means[rows],
+            self.quats[rows],
+            self.log_scales[rows],
+            self.opacities[rows],
+            self.colours[rows],
+            self.sh_rest[rows],
         )
 
 
@@ -46,20 +62,29 @@ EMPTY = Gaussians(
 
 
 def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
-    """All parts as one, in order; `EMPTY` for no parts."""
+    """All parts as one, in order, with the most coefficients of any; `EMPTY` for no parts."""
     if not parts:
         return EMPTY
+    sh_rest = np.zeros((sum(len(p) for p in parts), max(p.sh_rest.shape[1] for p in parts), 3), np.float32)
+    start = 0
+    for part in parts:
+        sh_rest[start : start + len(part), : part.sh_rest.shape[1]] = part.sh_rest
+        start += len(part)
     return Gaussians(
         np.concatenate([p.means for p in parts]),
         np.concatenate([p.quats for p in parts]),
         np.concatenate([p.log_scales for p in parts]),
         np.concatenate([p.opacities for p in parts]),
         np.concatenate([p.colours for p in parts]),
+        sh_rest,
     )
 
 
 def moved(gaussians: Gaussians, target_from_source: F64) -> Gaussians:
-    """The same Gaussians in another frame; `target_from_source` (4, 4) is rigid."""
+    """The same Gaussians in another frame; `target_from_source` (4, 4) is rigid.
+
+    The light turns along: who looks at a moved vehicle sees what its own frame says for that side.
+    """
     rotation = target_from_source[:3, :3]
     means = gaussians.means @ rotation.T + target_from_source[:3, 3]
     quats = quat_multiply(quats_of(rotation[None])[0], gaussians.quats)
@@ -69,6 +94,7 @@ def moved(gaussians: Gaussians, target_from_source: F64) -> Gaussians:
         gaussians.log_scales,
         gaussians.opacities,
         gaussians.colours,
+        sh.turned(gaussians.sh_rest, rotation),
     )
 
 
@@ -83,6 +109,7 @@ def mirrored(gaussians: Gaussians) -> Gaussians:
         gaussians.log_scales,
         gaussians.opacities,
         gaussians.colours,
+        sh.turned(gaussians.sh_rest, np.diag([1.0, -1.0, 1.0])),
     )
 
 

@@ -31,21 +31,22 @@ def project(
     cy: float,
     width: int,
     height: int,
+    first: int,
+    last: int,
 ) -> Any:
-    """Rows of the Gaussians that can be seen, and their ellipses.
+    """Which of the Gaussians `first` to `last` can be seen, and their ellipses.
 
-    Arrays as in `Gaussians`; `camera_from_scene` (4, 4) float64; focal lengths and centre in pixels, the centre of
-    pixel (0, 0) being at (0.5, 0.5). Returns (index (M,) int64, projected (M, 9) float32); HALF_U, HALF_V are the half
-    sizes [px] of the box outside of which the contribution is below MIN_ALPHA.
+    Arrays as in `Gaussians`, quaternions of any length; `camera_from_scene` (4, 4) float64; focal lengths and centre in
+    pixels, the centre of pixel (0, 0) being at (0.5, 0.5). Returns (index (M,) int64, projected (M, 9) float32);
+    HALF_U, HALF_V are the half sizes [px] of the box outside of which the contribution is below MIN_ALPHA.
     """
-    n = means.shape[0]
-    index = np.empty(n, np.int64)
-    out = np.empty((n, PROJECTED_SIZE), np.float32)
+    index = np.empty(last - first, np.int64)
+    out = np.empty((last - first, PROJECTED_SIZE), np.float32)
     count = 0
     r = camera_from_scene
     left, right = -MAX_TANGENT_RATIO * cx / fx, MAX_TANGENT_RATIO * (width - cx) / fx
     top, bottom = -MAX_TANGENT_RATIO * cy / fy, MAX_TANGENT_RATIO * (height - cy) / fy
-    for i in range(n):
+    for i in range(first, last):
         px, py, pz = float(means[i, 0]), float(means[i, 1]), float(means[i, 2])
         z = r[2, 0] * px + r[2, 1] * py + r[2, 2] * pz + r[2, 3]
         if z < NEAR_M or opacities[i] <= MIN_ALPHA:
@@ -66,6 +67,8 @@ def project(
         jy = min(max(ty, top), bottom)
         a, b = fx / z, fy / z
         qw, qx, qy, qz = float(quats[i, 0]), float(quats[i, 1]), float(quats[i, 2]), float(quats[i, 3])
+        shorten = 1.0 / math.sqrt(qw * qw + qx * qx + qy * qy + qz * qz)
+        qw, qx, qy, qz = qw * shorten, qx * shorten, qy * shorten, qz * shorten
         xx = 0.0
         xy = 0.0
         yy = 0.0

@@ -14,8 +14,9 @@ from tasks.render.gaussians import (
     quats_of,
     rotations_of,
 )
+from tasks.render.pixels import MAX_ALPHA
 from tasks.render.project import DILATION_PX2, MAX_TANGENT_RATIO, MIN_ALPHA, NEAR_M
-from tasks.render.raster import MAX_ALPHA, gather, rasterize, splat
+from tasks.render.raster import gather, rasterize, splat
 
 INTRINSICS = np.array([[60.0, 0.0, 37.0], [0.0, 58.0, 22.0], [0.0, 0.0, 1.0]])
 WIDTH, HEIGHT = 75, 45  # no multiple of a tile
