@@ -2,10 +2,12 @@
 
 import os
 import re
+import shutil
 import signal
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import pyarrow.compute as pc
@@ -40,6 +42,29 @@ def run(
     )
 
 
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """The folder that an undisturbed run leaves, made once: to compare with."""
+
+    @cache
+    def made(rounds: int, n: int) -> Path:
+        out = tmp_path_factory.mktemp("plain") / "out"
+        run(out, rounds=rounds, n=n)
+        return out
+
+    return lambda rounds=2, n=4: made(rounds, n)
+
+
+@pytest.fixture
+def begun(plain: Callable[..., Path], tmp_path: Path) -> Callable[..., Path]:
+    """A copy of such a folder, to go on in."""
+
+    def copied(rounds: int = 2, n: int = 4) -> Path:
+        return shutil.copytree(plain(rounds, n), tmp_path / "out")
+
+    return copied
+
+
 def test_the_same_command_again_executes_nothing(tmp_path: Path) -> None:
     journal = str(tmp_path / "journal")
     first = run(tmp_path / "out", ToyWork(journal=journal))
@@ -62,15 +87,16 @@ def test_five_rounds_after_two_are_five_rounds_and_perturb_nothing_again(tmp_pat
     assert_same_tables(tmp_path / "nested", tmp_path / "direct")
 
 
-def test_a_lost_cache_is_prepared_again_and_said(tmp_path: Path) -> None:
-    run(tmp_path / "out", rounds=1)
+def test_a_lost_cache_is_prepared_again_and_said(
+    tmp_path: Path, begun: Callable[..., Path], plain: Callable[..., Path]
+) -> None:
+    begun(rounds=1)
     for path in (tmp_path / "out/cache/prepared").iterdir():
         path.write_bytes(path.read_bytes()[:50])
     later = run(tmp_path / "out", rounds=3)
     assert later.executed.prepared > 0
     assert any("prepared again" in note for note in later.notes)
-    run(tmp_path / "direct", rounds=3)
-    assert_same_tables(tmp_path / "out", tmp_path / "direct")
+    assert_same_tables(tmp_path / "out", plain(rounds=3))
 
 
 def test_every_attempt_has_one_row_in_one_table(tmp_path: Path) -> None:
@@ -101,7 +127,9 @@ def test_a_clip_without_candidates_still_gives_its_human_sample(tmp_path: Path) 
     ]
 
 
-def test_broken_input_and_bugs_are_rows_with_a_reason_and_hurt_nobody_else(tmp_path: Path) -> None:
+def test_broken_input_and_bugs_are_rows_with_a_reason_and_hurt_nobody_else(
+    tmp_path: Path, plain: Callable[..., Path]
+) -> None:
     work = ToyWork(trouble={"log0:0": "bad", "log1:1000:recovery:0": "bug"})
     summary = run(tmp_path / "out", work)
     assert summary.exit_code == COMPLETE_WITH_FAILURES
@@ -112,11 +140,12 @@ def test_broken_input_and_bugs_are_rows_with_a_reason_and_hurt_nobody_else(tmp_p
     assert again.exit_code == COMPLETE_WITH_FAILURES and again.executed.attempts == 0
     mended = run(tmp_path / "out", ToyWork(), retry=True)
     assert mended.exit_code == COMPLETE
-    run(tmp_path / "never", ToyWork())
-    assert_same_tables(tmp_path / "out", tmp_path / "never")
+    assert_same_tables(tmp_path / "out", plain())
 
 
-def test_a_system_failure_is_tried_by_the_next_run_and_quarantined_after_three(tmp_path: Path) -> None:
+def test_a_system_failure_is_tried_by_the_next_run_and_quarantined_after_three(
+    tmp_path: Path, plain: Callable[..., Path]
+) -> None:
     work = ToyWork(trouble={"log0:0:recovery:0": "disk"})
     for tries in (1, 2, 3):
         assert run(tmp_path / "out", work).exit_code == COMPLETE_WITH_FAILURES
@@ -124,8 +153,7 @@ def test_a_system_failure_is_tried_by_the_next_run_and_quarantined_after_three(t
         assert (row["tries"], row["error_kind"]) == (tries, "poison" if tries == 3 else "system")  # type: ignore[index]
     assert run(tmp_path / "out", work).executed.attempts == 0
     assert run(tmp_path / "out", retry=True).exit_code == COMPLETE
-    run(tmp_path / "never", ToyWork())
-    assert_same_tables(tmp_path / "out", tmp_path / "never")
+    assert_same_tables(tmp_path / "out", plain())
 
 
 @pytest.mark.parametrize(
@@ -138,8 +166,10 @@ def test_a_system_failure_is_tried_by_the_next_run_and_quarantined_after_three(t
         (ToyWork(prepare_digest="perturb-2"), "what perturb depends on: perturb-1 -> perturb-2"),
     ],
 )
-def test_a_changed_run_stops_and_names_the_difference(tmp_path: Path, work: ToyWork, named: str) -> None:
-    run(tmp_path / "out", rounds=1, n=1)
+def test_a_changed_run_stops_and_names_the_difference(
+    tmp_path: Path, work: ToyWork, named: str, begun: Callable[..., Path]
+) -> None:
+    begun(rounds=1, n=1)
     before = tables_of(tmp_path / "out")
     summary = run(tmp_path / "out", work, rounds=2, n=1)
     assert summary.exit_code == BAD_CONFIG
@@ -147,8 +177,8 @@ def test_a_changed_run_stops_and_names_the_difference(tmp_path: Path, work: ToyW
     assert tables_of(tmp_path / "out")[1:] == before[1:]
 
 
-def test_keep_goes_on_and_records_both(tmp_path: Path) -> None:
-    run(tmp_path / "out", n=2)
+def test_keep_goes_on_and_records_both(tmp_path: Path, begun: Callable[..., Path]) -> None:
+    begun(n=2)
     changed = ToyWork(threshold=0.1)
     assert run(tmp_path / "out", changed, n=4, on_change="keep").exit_code == COMPLETE
     hashes = tables_of(tmp_path / "out")[0]["settings_hash"].unique().to_pylist()
@@ -157,9 +187,9 @@ def test_keep_goes_on_and_records_both(tmp_path: Path) -> None:
     assert run(tmp_path / "out", changed, n=4).exit_code == COMPLETE
 
 
-def test_a_redo_of_some_clips_leaves_the_others_to_be_decided(tmp_path: Path) -> None:
+def test_a_redo_of_some_clips_leaves_the_others_to_be_decided(tmp_path: Path, begun: Callable[..., Path]) -> None:
     changed = ToyWork(threshold=0.3)
-    run(tmp_path / "out", n=4)
+    begun(n=4)
     assert run(tmp_path / "out", changed, n=1, on_change="redo").exit_code == COMPLETE
     assert run(tmp_path / "out", changed, n=1).exit_code == COMPLETE
     before = tables_of(tmp_path / "out")
@@ -173,8 +203,8 @@ def test_a_redo_of_some_clips_leaves_the_others_to_be_decided(tmp_path: Path) ->
     assert_same_tables(tmp_path / "out", tmp_path / "fresh")
 
 
-def test_keep_holds_until_something_else_is_said(tmp_path: Path) -> None:
-    run(tmp_path / "out", n=4)
+def test_keep_holds_until_something_else_is_said(tmp_path: Path, begun: Callable[..., Path]) -> None:
+    begun(n=4)
     changed = ToyWork(threshold=0.3)
     run(tmp_path / "out", changed, n=1, on_change="redo")
     assert run(tmp_path / "out", changed, n=4, on_change="keep").exit_code == COMPLETE
@@ -183,9 +213,9 @@ def test_keep_holds_until_something_else_is_said(tmp_path: Path) -> None:
     assert run(tmp_path / "out", changed, n=4).exit_code == BAD_CONFIG
 
 
-def test_redo_takes_no_candidate_list_from_under_other_experts(tmp_path: Path) -> None:
+def test_redo_takes_no_candidate_list_from_under_other_experts(tmp_path: Path, begun: Callable[..., Path]) -> None:
     changed = ToyWork(settings={"seed": 1}, prepare_digest="perturb-2")
-    run(tmp_path / "out")
+    begun()
     before = tables_of(tmp_path / "out")
     refused = run(tmp_path / "out", changed, experts=["pdm_closed"], on_change="redo")
     assert refused.exit_code == BAD_CONFIG and "rows of human, recovery stand on" in refused.message
@@ -194,8 +224,8 @@ def test_redo_takes_no_candidate_list_from_under_other_experts(tmp_path: Path) -
     assert run(tmp_path / "out", changed, experts=["another"]).exit_code == BAD_CONFIG  # it would skip clips 1 to 3
 
 
-def test_a_changed_expert_is_seen_after_a_run_without_it(tmp_path: Path) -> None:
-    run(tmp_path / "out", rounds=1)
+def test_a_changed_expert_is_seen_after_a_run_without_it(tmp_path: Path, begun: Callable[..., Path]) -> None:
+    begun(rounds=1)
     changed = ToyWork(threshold=0.3)
     run(tmp_path / "out", changed, experts=["human"], on_change="redo")
     stopped = run(tmp_path / "out", replace(changed, digests={"recovery": "table-2"}))
@@ -203,16 +233,16 @@ def test_a_changed_expert_is_seen_after_a_run_without_it(tmp_path: Path) -> None
     assert "inputs of expert recovery: recovery-1 -> table-2" in stopped.message
 
 
-def test_keep_never_continues_a_walk_on_another_candidate_list(tmp_path: Path) -> None:
-    run(tmp_path / "out", n=2, rounds=1)
+def test_keep_never_continues_a_walk_on_another_candidate_list(tmp_path: Path, begun: Callable[..., Path]) -> None:
+    begun(n=2, rounds=1)
     kept = tables_of(tmp_path / "out")[0]
     summary = run(tmp_path / "out", ToyWork(prepare_digest="perturb-2"), n=2, rounds=3, on_change="keep")
     assert summary.executed.attempts == 0 and "2 clips kept as they are" in summary.notes[0]
     assert_same_rows(tables_of(tmp_path / "out")[0], kept)
 
 
-def test_redo_replaces_every_row_and_is_the_same_as_a_fresh_run(tmp_path: Path) -> None:
-    run(tmp_path / "out", rounds=3)
+def test_redo_replaces_every_row_and_is_the_same_as_a_fresh_run(tmp_path: Path, begun: Callable[..., Path]) -> None:
+    begun(rounds=3)
     changed = ToyWork(threshold=0.3, prepare_digest="perturb-2", trouble={"log0:0": "standing"})
     assert run(tmp_path / "out", changed, rounds=2, on_change="redo").exit_code == COMPLETE
     run(tmp_path / "fresh", changed, rounds=2)
@@ -220,8 +250,8 @@ def test_redo_replaces_every_row_and_is_the_same_as_a_fresh_run(tmp_path: Path) 
     assert run(tmp_path / "out", changed, rounds=2, on_change="redo").executed.attempts == 0
 
 
-def test_a_redo_that_fails_midway_keeps_the_old_walk(tmp_path: Path) -> None:
-    run(tmp_path / "out", rounds=3, n=1)
+def test_a_redo_that_fails_midway_keeps_the_old_walk(tmp_path: Path, begun: Callable[..., Path]) -> None:
+    begun(rounds=3, n=1)
     old = tables_of(tmp_path / "out")[0]
     changed = ToyWork(threshold=0.3, trouble={"log0:0:recovery:1": "bug"})
     assert run(tmp_path / "out", changed, rounds=3, n=1, on_change="redo").exit_code == COMPLETE_WITH_FAILURES
@@ -244,9 +274,9 @@ def test_a_redo_that_fails_midway_keeps_the_old_walk(tmp_path: Path) -> None:
     ],
 )
 def test_a_changed_log_under_the_same_clip_id_is_refused_by_name(
-    tmp_path: Path, is_cached: bool, changed: ToyWork, found: str
+    tmp_path: Path, is_cached: bool, changed: ToyWork, found: str, begun: Callable[..., Path]
 ) -> None:
-    run(tmp_path / "out", rounds=1, n=1)
+    begun(rounds=1, n=1)
     before = tables_of(tmp_path / "out")
     for path in [] if is_cached else (tmp_path / "out/cache/prepared").iterdir():
         path.unlink()
@@ -260,16 +290,15 @@ def test_a_changed_log_under_the_same_clip_id_is_refused_by_name(
     assert candidates == before[2]
 
 
-def test_a_restored_log_goes_on(tmp_path: Path) -> None:
-    run(tmp_path / "out", rounds=1)
+def test_a_restored_log_goes_on(tmp_path: Path, begun: Callable[..., Path], plain: Callable[..., Path]) -> None:
+    begun(rounds=1)
     run(tmp_path / "out", ToyWork(content="other"), rounds=3)
     assert run(tmp_path / "out", rounds=3, retry=True).exit_code == COMPLETE
-    run(tmp_path / "never", rounds=3)
-    assert_same_tables(tmp_path / "out", tmp_path / "never")
+    assert_same_tables(tmp_path / "out", plain(rounds=3))
 
 
-def test_redo_reads_a_changed_log_anew_in_spite_of_the_cache(tmp_path: Path) -> None:
-    run(tmp_path / "out", rounds=2)
+def test_redo_reads_a_changed_log_anew_in_spite_of_the_cache(tmp_path: Path, begun: Callable[..., Path]) -> None:
+    begun(rounds=2)
     changed = ToyWork(threshold=0.3, content="other")
     assert run(tmp_path / "out", changed, on_change="redo").exit_code == COMPLETE
     run(tmp_path / "fresh", changed)
@@ -277,8 +306,8 @@ def test_redo_reads_a_changed_log_anew_in_spite_of_the_cache(tmp_path: Path) -> 
     assert run(tmp_path / "out", changed, rounds=3).exit_code == COMPLETE
 
 
-def test_redo_refuses_a_changed_log_whose_rows_are_to_stay(tmp_path: Path) -> None:
-    run(tmp_path / "out", rounds=1, n=1)
+def test_redo_refuses_a_changed_log_whose_rows_are_to_stay(tmp_path: Path, begun: Callable[..., Path]) -> None:
+    begun(rounds=1, n=1)
     before = tables_of(tmp_path / "out")
     changed = ToyWork(digests={"recovery": "table-2"}, content="other")
     assert run(tmp_path / "out", changed, rounds=1, n=1, on_change="redo").exit_code == COMPLETE_WITH_FAILURES
@@ -287,8 +316,8 @@ def test_redo_refuses_a_changed_log_whose_rows_are_to_stay(tmp_path: Path) -> No
     assert candidates == before[2]
 
 
-def test_redo_makes_a_walk_of_mixed_settings_anew(tmp_path: Path) -> None:
-    run(tmp_path / "out", rounds=1)
+def test_redo_makes_a_walk_of_mixed_settings_anew(tmp_path: Path, begun: Callable[..., Path]) -> None:
+    begun(rounds=1)
     changed = ToyWork(threshold=0.1)
     run(tmp_path / "out", changed, rounds=3, on_change="keep")
     assert run(tmp_path / "out", changed, rounds=3, on_change="redo").exit_code == COMPLETE
@@ -304,18 +333,17 @@ def test_zero_inputs_and_double_ones_write_nothing(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_a_stopped_run_goes_on_where_it_was(tmp_path: Path) -> None:
+def test_a_stopped_run_goes_on_where_it_was(tmp_path: Path, plain: Callable[..., Path]) -> None:
     timer = threading.Timer(0.6, os.kill, (os.getpid(), signal.SIGTERM))
     timer.start()
     summary = run(tmp_path / "out", ToyWork(seconds=0.05))
     timer.join()
     assert summary.exit_code == INTERRUPTED
     assert run(tmp_path / "out").exit_code == COMPLETE
-    run(tmp_path / "never")
-    assert_same_tables(tmp_path / "out", tmp_path / "never")
+    assert_same_tables(tmp_path / "out", plain())
 
 
-def test_a_run_that_is_overtaken_stops_and_loses_nothing(tmp_path: Path) -> None:
+def test_a_run_that_is_overtaken_stops_and_loses_nothing(tmp_path: Path, plain: Callable[..., Path]) -> None:
     overtaken = Store(tmp_path / "out")
 
     class Overtaking(ToyWork):
@@ -329,15 +357,13 @@ def test_a_run_that_is_overtaken_stops_and_loses_nothing(tmp_path: Path) -> None
 
     summary = execute(Overtaking(), refs(4), EXPERTS, 2, overtaken, "local", shard_seconds=0.0, say=lambda line: None)
     assert summary.exit_code == INTERRUPTED and "another run has taken over" in summary.message
-    run(tmp_path / "never")
-    assert_same_tables(tmp_path / "out", tmp_path / "never")
+    assert_same_tables(tmp_path / "out", plain())
 
 
-def test_shards_close_by_size_and_commits_are_groups(tmp_path: Path) -> None:
+def test_shards_close_by_size_and_commits_are_groups(tmp_path: Path, plain: Callable[..., Path]) -> None:
     run(tmp_path / "out", shard_bytes=1)
-    run(tmp_path / "one")
-    many, one = Store(tmp_path / "out").samples, Store(tmp_path / "one").samples
+    many, one = Store(tmp_path / "out").samples, Store(plain()).samples
     assert len(many.live_files()) > len(one.live_files())
     assert len(one.live_files()) == 5  # partitions: two rounds of two experts, and human
     assert one.version == 3  # created, claimed, licences named, one group
-    assert_same_tables(tmp_path / "out", tmp_path / "one")
+    assert_same_tables(tmp_path / "out", plain())
