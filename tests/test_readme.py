@@ -7,13 +7,15 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numba
 import pytest
 
+from factory.clips.synthetic.reader import SyntheticReader
 from factory.explain import split_arguments
 from factory.run import main as run_main
 from factory.settings import load_config
 from factory.show import main as show_main
-from tasks.kernels import cache_dir as kernel_cache_dir
+from tasks.caches import user_cache
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 PAGES = ("README.md", "docs/configuration.md")
@@ -37,7 +39,10 @@ PYTHON_BLOCKS = blocks("README.md", "python")
 
 @pytest.fixture(scope="module")
 def demo_home(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with `runs/demo` as `make demo` leaves it, but of one clip and tiny pictures."""
+    """A folder with `runs/demo` as `make demo` leaves it, but of one clip and tiny pictures.
+
+    `cache` is its user's cache; the town of three clips in it is the demo's, with the same tiny pictures.
+    """
     home = tmp_path_factory.mktemp("readme")
     tiny = (
         "clips.n_clips=1",
@@ -53,6 +58,10 @@ def demo_home(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "executor=local",
     )
     assert run_main([*tiny, f"out={home / 'runs' / 'demo'}"]) == 0
+    asked_for = SyntheticReader(home / "cache" / user_cache().name / "towns", 3).root
+    asked_for.parent.mkdir(parents=True)
+    (drawn,) = (home / "towns").iterdir()  # one log, which holds three clips
+    asked_for.symlink_to(drawn)
     return home
 
 
@@ -60,7 +69,7 @@ def demo_home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_python_runs_as_written_without_ray_or_hydra(demo_home: Path, block: str) -> None:
     code = block + "\nimport sys\nassert not {'ray', 'hydra'} & set(sys.modules)\n"
     env = os.environ | {"PYTHONPATH": str(REPOSITORY), "XDG_CACHE_HOME": str(demo_home / "cache")}
-    env["NUMBA_CACHE_DIR"] = str(kernel_cache_dir())  # a town of its own, but not a second compilation
+    env["NUMBA_CACHE_DIR"] = numba.config.CACHE_DIR  # a cache of its own for towns, but no second compilation
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=demo_home, env=env, capture_output=True, text=True, timeout=200
     )
