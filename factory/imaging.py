@@ -121,7 +121,7 @@ class Imaging:
         size = (self.settings.width, self.settings.height)
         if asset is None:
             return draw_map_views(clip.road_map, cameras, poses, agents, steps, *size)
-        return render_views(asset, cameras, poses, agents, steps, *size)
+        return render_views(asset, cameras, poses, agents, steps, *size, self.settings.backend)
 
     def _photos(self, clip: Clip, judged: Judged, cameras: Sequence[Camera]) -> dict[str, object]:
         now_s = judged.scene.step * STEP_S

@@ -16,6 +16,7 @@ from tasks.chance import stream
 from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.protocol import Expert
 from tasks.perturb import Candidate, Perturbation, PerturbSettings, end_speed_mps, perturb
+from tasks.render.engine import check
 from tasks.render.settings import RenderMode, RenderSettings
 from tasks.reward.epdms import Scores
 from tasks.reward.labels import Labelling, vocabulary_labels
@@ -105,9 +106,11 @@ class FactoryWork:
     cache_dir: str  # of reconstructed blocks
 
     def warm(self) -> None:
-        """Compile every kernel into the on-disk cache."""
+        """Compile every kernel into the on-disk cache. Raises BackendMissing where this node lacks what draws."""
         from factory.warm import compile_kernels
 
+        if self.render.mode is RenderMode.AUTO:
+            check(self.render.backend)
         compile_kernels()
 
     def expert_digest(self, expert: str) -> str:

@@ -27,8 +27,10 @@ from tasks.experts.protocol import Expert
 from tasks.experts.recovery import Recovery, RecoverySettings, RecoveryTable
 from tasks.kinematic_vocabulary import kinematic_trajectories
 from tasks.perturb import PerturbSettings
+from tasks.render import engine
+from tasks.render.gsplat_backend import BackendMissing
 from tasks.render.rigs import RIGS
-from tasks.render.settings import RenderSettings
+from tasks.render.settings import RenderMode, RenderSettings
 from tasks.reward.labels import Labelling
 from tasks.rollout.simulate import TrafficSettings
 from tasks.stages import stage_versions
@@ -158,9 +160,20 @@ def refuse_relative_root(clips: Mapping[str, Any]) -> None:
         )
 
 
+def refuse_missing_backend(config: RunConfig) -> None:
+    """Raises ConfigError where images are to be drawn with what this machine lacks; a cluster's nodes say so later."""
+    if config.render.mode is not RenderMode.AUTO or (config.executor == "ray" and "RAY_ADDRESS" in os.environ):
+        return
+    try:
+        engine.check(config.render.backend)
+    except BackendMissing as error:
+        raise ConfigError(str(error)) from error
+
+
 def assemble(config: RunConfig) -> Run:
     """Open the reader, load the vocabulary, prepare the experts. Raises ConfigError with what to mend."""
     refuse_relative_root(config.clips)
+    refuse_missing_backend(config)
     reader, index = open_reader(config.clips)
     try:
         vocabulary = choose_vocabulary(config.vocabulary)

@@ -1,6 +1,7 @@
 """The one function that draws a scene: `render(asset, cameras, vehicles, backend) -> rgb, depth, alpha` per camera.
 
-`cpu` is the compiled tile rasteriser of this room: the same input gives the same bytes. Cameras are ideal pinholes: a
+Two backends with one face. `cpu` is the compiled tile rasteriser of this room: the same input gives the same bytes.
+`gsplat` draws the same Gaussians with CUDA, equal up to the last bits of 8-bit colours. Both draw ideal pinholes: a
 camera's distortion is taken out of its photos before they enter a scene (`views.undistorted`), so that images at new
 poses need none.
 """
@@ -22,6 +23,7 @@ from tasks.world.agents import AgentKind, AgentTracks
 
 class Backend(StrEnum):
     CPU = "cpu"
+    GSPLAT = "gsplat"
 
 
 @dataclass(frozen=True)
@@ -69,28 +71,44 @@ def render(
     cameras: Sequence[Pinhole],
     vehicles: Vehicles = NOBODY,
     backend: Backend = Backend.CPU,
+    threads: int = 1,
 ) -> list[View]:
     """What each of the `cameras` sees of the scene with `vehicles` in it: rgb in [0, 1], depth [m], alpha.
 
     Behind everything is the sky, so that a camera which sees no Gaussian gets a picture of the sky map with alpha 0,
-    never a black one.
+    never a black one. `threads` are the CPU backend's and change no byte. Raises BackendMissing where the backend
+    cannot work on this machine.
     """
     scene = scene_at(asset, vehicles.track_ids, vehicles.kinds, vehicles.boxes)
     local = [replace(camera, world_from_camera=shifted(camera.world_from_camera, -asset.origin)) for camera in cameras]
     backdrops = [asset.sky.seen_by(c.intrinsics, c.world_from_camera, c.width, c.height) for c in local]
-    views = RASTERISERS[backend](scene, local, backdrops)
+    views = RASTERISERS[backend](scene, local, backdrops, threads)
     return [replace(view, rgb=np.clip(view.rgb, 0.0, 1.0)) for view in views]
 
 
-Rasteriser = Callable[[Gaussians, Sequence[Pinhole], Sequence[F32]], list[View]]
-"""Gaussians, cameras and (H, W, 3) backdrops in one frame -> views; colours may leave [0, 1]."""
+def check(backend: Backend) -> None:
+    """Raises BackendMissing where the backend cannot work on this machine, with how to mend it."""
+    if backend is Backend.GSPLAT:
+        from tasks.render.gsplat_backend import require
+
+        require()
 
 
-def _on_cpu(scene: Gaussians, cameras: Sequence[Pinhole], backdrops: Sequence[F32]) -> list[View]:
+Rasteriser = Callable[[Gaussians, Sequence[Pinhole], Sequence[F32], int], list[View]]
+"""Gaussians, cameras and (H, W, 3) backdrops in one frame, threads -> views; colours may leave [0, 1]."""
+
+
+def _on_cpu(scene: Gaussians, cameras: Sequence[Pinhole], backdrops: Sequence[F32], threads: int) -> list[View]:
     return [
-        rasterize(scene, camera.intrinsics, camera.world_from_camera, camera.width, camera.height, backdrop)
+        rasterize(scene, camera.intrinsics, camera.world_from_camera, camera.width, camera.height, backdrop, threads)
         for camera, backdrop in zip(cameras, backdrops)
     ]
 
 
-RASTERISERS: Mapping[Backend, Rasteriser] = MappingProxyType({Backend.CPU: _on_cpu})
+def _with_gsplat(scene: Gaussians, cameras: Sequence[Pinhole], backdrops: Sequence[F32], threads: int) -> list[View]:
+    from tasks.render.gsplat_backend import rasterize_all  # torch is loaded only where it is asked for
+
+    return rasterize_all(scene, cameras, backdrops)
+
+
+RASTERISERS: Mapping[Backend, Rasteriser] = MappingProxyType({Backend.CPU: _on_cpu, Backend.GSPLAT: _with_gsplat})

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass, field
 from enum import StrEnum
 
+from tasks.render.engine import Backend
 from tasks.render.scene import AssetSettings
 
 
@@ -41,6 +42,7 @@ class RenderSettings:
     """The render stage's settings."""
 
     mode: RenderMode = RenderMode.AUTO
+    backend: Backend = Backend.CPU
     frames: Frames = Frames.HISTORY
     cameras: tuple[str, ...] = ()  # by name; empty: every camera of the rig
     width: int = 320  # pixels

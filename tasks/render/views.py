@@ -31,7 +31,7 @@ def render_views(
 
     `world_from_ego` (F, 4, 4) in 3-D (`pose_on_ground`), `steps` (F,) rows of `agents` at these instants. The images
     are those of ideal pinholes, `camera.resized(width, height)` with distortion zero: photos are undistorted before
-    they enter the scene.
+    they enter the scene. Raises BackendMissing where the backend cannot work on this machine.
     """
     out = np.empty((len(steps), len(cameras), height, width, 3), np.uint8)
     rig = [camera.resized(width, height) for camera in cameras]

@@ -13,7 +13,16 @@ import yaml
 
 from factory.clips.reader import ClipIndex
 from factory.config import ConfigError, build, compose, conf_dir, fill
-from factory.settings import RecoverySources, RewardSettings, RunConfig, build_expert, load_config, open_reader
+from factory.settings import (
+    RecoverySources,
+    RewardSettings,
+    RunConfig,
+    assemble,
+    build_expert,
+    load_config,
+    open_reader,
+    refuse_missing_backend,
+)
 from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.recovery import RecoverySettings
 from tasks.kinematic_vocabulary import kinematic_trajectories
@@ -238,3 +247,13 @@ def test_an_installation_without_configuration_says_so(tmp_path: Path, monkeypat
     monkeypatch.setattr("factory.config.__file__", str(tmp_path / "factory" / "config.py"))
     with pytest.raises(ConfigError, match=r"no conf/run\.yaml .* install it again"):
         conf_dir()
+
+
+def test_a_backend_this_machine_lacks_is_refused_before_anything_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "gsplat", None)
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    with pytest.raises(ConfigError, match=r"render\.backend=gsplat needs torch and gsplat"):
+        assemble(load_config(["render.backend=gsplat", "clips=av2", "clips.root=/nowhere"]))
+    refuse_missing_backend(load_config(["render=none", "render.backend=gsplat"]))  # nothing is drawn with it
+    with pytest.raises(ConfigError, match=r"run\.render\.backend"):
+        load_config(["render.backend=gpu"])
