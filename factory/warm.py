@@ -87,7 +87,7 @@ def compile_town_kernels() -> None:
 
 
 def tiny_clip() -> Clip:
-    """A straight road with the ego and one car ahead, both at 5 m/s."""
+    """A straight road with the ego and a car ahead, and a car that drives beside the road; all at 5 m/s."""
     steps = np.arange(CLIP_STEPS)
     way = np.arange(-50.0, 151.0, 1.0)
     centre = np.stack([way, np.zeros_like(way), np.zeros_like(way)], axis=1)
@@ -97,16 +97,16 @@ def tiny_clip() -> Clip:
     ego[:, 0], ego[:, 3] = (steps - NOW) * 0.5, 5.0
     pose = np.tile(np.eye(4), (CLIP_STEPS, 1, 1))
     pose[:, 0, 3] = ego[:, 0]
-    boxes = np.zeros((CLIP_STEPS, 1, 5))
-    boxes[:, 0] = np.stack([ego[:, 0] + 20.0, *np.zeros((2, CLIP_STEPS)), *np.full((2, CLIP_STEPS), [[4.5], [2.0]])], 1)
-    car = AgentTracks(
-        track_ids=("car",),
-        kinds=(AgentKind.VEHICLE,),
+    boxes = np.tile([[0.0, 0.0, 0.0, 4.5, 2.0], [0.0, 30.0, 0.0, 4.5, 2.0]], (CLIP_STEPS, 1, 1))
+    boxes[..., 0] = ego[:, :1] + 20.0
+    cars = AgentTracks(
+        track_ids=("ahead", "beside"),
+        kinds=(AgentKind.VEHICLE, AgentKind.VEHICLE),
         boxes=boxes,
-        velocities=np.tile([5.0, 0.0], (CLIP_STEPS, 1, 1)),
-        valid=np.ones((CLIP_STEPS, 1), bool),
-        center_z=np.full((CLIP_STEPS, 1), 0.75),
-        heights=np.array([1.5]),
+        velocities=np.tile([5.0, 0.0], (CLIP_STEPS, 2, 1)),
+        valid=np.ones((CLIP_STEPS, 2), bool),
+        center_z=np.full((CLIP_STEPS, 2), 0.75),
+        heights=np.array([1.5, 1.5]),
     )
     return Clip(
         clip_id="warm",
@@ -116,7 +116,7 @@ def tiny_clip() -> Clip:
         start_s=0.0,
         ego_states=ego,
         world_from_ego=pose,
-        agents=car,
+        agents=cars,
         road_map=RoadMap({"lane": lane}, (), (), {"lane": "rb_lane"}),
         route=Route(("lane",), ("rb_lane",), frozenset({"lane"})),
         centerline=centre,
