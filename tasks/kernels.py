@@ -1,5 +1,7 @@
 """One decorator for every compiled kernel: cached on disk, GIL released, no fastmath, no parallel reductions.
 
+None gets the entry for C programs that numba compiles by default: nobody calls it.
+
 Numba's own cache does not notice an edit in a callee or of a constant that lives in another file, so the cache folder
 is named by a digest of all sources that hold kernels or the constants of kernels: one edit anywhere starts a new
 folder. NUMBA_CACHE_DIR, when set, is left alone.
@@ -61,16 +63,24 @@ if not os.environ.get("NUMBA_CACHE_DIR"):
 
 def kernel(function: F) -> F:
     """Compile `function` with numba on first call."""
-    compiled: F = numba.njit(cache=True, nogil=True)(function)
+    compiled: F = numba.njit(cache=True, nogil=True, no_cfunc_wrapper=True)(function)
     return compiled
 
 
 def inlined(function: F) -> F:
     """Compile `function` into each kernel that calls it, so that loops over it, or in it, vectorise.
 
-    A division by zero gives inf or NaN in it, as in numpy: raising would need a branch.
+    A division by zero gives inf or NaN in it, as in numpy: raising would need a branch. Python cannot call it: taking
+    tuples of arrays from Python and giving them back would take longer to compile than the function.
     """
-    compiled: F = numba.njit(cache=True, nogil=True, forceinline=True, error_model="numpy")(function)
+    compiled: F = numba.njit(
+        cache=True,
+        nogil=True,
+        forceinline=True,
+        error_model="numpy",
+        no_cfunc_wrapper=True,
+        no_cpython_wrapper=True,
+    )(function)
     return compiled
 
 
@@ -81,5 +91,5 @@ def inner_kernel(function: F) -> F:
     function allocates nothing (it would not compile) and returns numbers only: an array it returned would be freed
     under its owner's hands.
     """
-    compiled: F = numba.njit(cache=True, nogil=True, _nrt=False)(function)
+    compiled: F = numba.njit(cache=True, nogil=True, no_cfunc_wrapper=True, _nrt=False)(function)
     return compiled

@@ -15,5 +15,5 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 def drawing_njit(function: F) -> F:
     """Compile `function` with numba on first call."""
-    compiled: F = njit(cache=True, nogil=True, error_model="numpy")(function)
+    compiled: F = njit(cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)(function)
     return compiled

@@ -5,6 +5,7 @@ from decimal import Decimal, localcontext
 import numpy as np
 import pytest
 
+from tasks.kernels import kernel
 from tasks.rollout.lqr import BLOCK
 from tasks.rollout.profiles import (
     COUPLING,
@@ -19,14 +20,19 @@ from tests.tasks.rollout import slow_lqr
 TIMES_S = 0.1 * np.arange(41)
 
 
+@kernel
+def fit(n_plans: int, plans: Plans) -> None:
+    fit_speeds(n_plans, plans)
+    fit_curvatures(n_plans, plans)
+
+
 def fitted(reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Speeds (K, 40) and curvatures (K, 50) of plans (K, 41, 3)."""
     x, y, heading = (np.ascontiguousarray(column.T) for column in np.moveaxis(reference, -1, 0))
     steps = np.full((40, len(reference)), np.nan)  # what scratch holds from before must not show
     padded = np.full((40 + TRACKING_STEPS, len(reference)), np.nan)
     plans = Plans(x, y, heading, np.cos(heading), np.sin(heading), steps, padded, steps.copy(), steps[0].copy())
-    fit_speeds(len(reference), plans)
-    fit_curvatures(len(reference), plans)
+    fit(len(reference), plans)
     return plans.speed.T, plans.curvature.T
 
 
