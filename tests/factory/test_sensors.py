@@ -9,8 +9,9 @@ import pyarrow as pa
 import pyarrow.feather
 import pytest
 
-from factory.assets import Sensing, asset_for, block_id, read_asset, sensing
+from factory.assets import Sensing, asset_for, block_id, sensing
 from factory.clips.reader import BadClip
+from factory.scene_file import read_scene
 from factory.sensors import block_of, chosen_cameras, decode_image, encode_jpeg, load_sensors
 from tasks.render.scene import AssetSettings, psnr
 from tasks.render.settings import RenderSettings
@@ -132,15 +133,26 @@ def test_a_block_is_built_once_and_read_back_the_same(clip: Clip, tmp_path: Path
     assert again.background.colours.tobytes() == first.background.colours.tobytes()
 
 
-def test_a_damaged_block_is_noticed_and_built_again(clip: Clip, tmp_path: Path) -> None:
+def test_a_scene_says_which_stretch_of_driving_it_stands_for(clip: Clip, tmp_path: Path) -> None:
+    asset = asset_for(clip, SETTINGS, tmp_path)
+    assert asset is not None and asset.block is not None
+    assert (asset.block.dataset, asset.block.log_id) == ("test", "log")
+    assert (asset.block.start_s, asset.block.end_s) == (0.0, 1.0)
+    assert (asset.block.low.tolist(), asset.block.high.tolist()) == ([0.0, 0.0], [4.0, 0.0])
+
+
+def test_a_damaged_block_is_noticed_and_built_again(
+    clip: Clip, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     first = asset_for(clip, SETTINGS, tmp_path)
-    path = tmp_path / f"block-{block_id(clip, SETTINGS)}.npz"
+    path = tmp_path / f"block-{block_id(clip, SETTINGS)}.safetensors"
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     again = asset_for(clip, SETTINGS, tmp_path)
     assert first is not None and again is not None and again.digest == first.digest
-    assert read_asset(path).digest == first.digest
-    assert not list(tmp_path.glob(".block-*"))
+    assert f"{path}: cannot be read" in caplog.text and "built again" in caplog.text
+    assert read_scene(path).digest == first.digest
+    assert not list(tmp_path.glob(".scene-*"))
 
 
 def test_a_clip_without_lidar_or_without_a_rig_has_no_scene(clip: Clip, tmp_path: Path) -> None:

@@ -1,0 +1,162 @@
+"""A block's scene as one file: tensors in safetensors, everything else as JSON in its header.
+
+| tensor | shape | what |
+|---|---|---|
+| `origin` | (3,) float64 | world [m] of the local frame's zero |
+| `background.<field>` | (N, ...) | the street: one tensor for each field of `Gaussians` |
+| `nodes.<i>.<field>` | (N_i, ...) | the i-th track, in its box's frame |
+| `sky` | (rows, columns, 3) | colours by direction |
+| `exposures` | (P, 3, 4) | what each photo made of the light, where they were aligned |
+
+The header's entry `scene` holds the rest: format, the nodes' track ids, quality photo by photo, the photos of the
+exposures, the block's range, and the digest over all of it. No code runs when a file is read.
+"""
+
+import hashlib
+import json
+import math
+import os
+import tempfile
+from collections.abc import Mapping
+from dataclasses import asdict, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+
+from tasks.render.asset import BlockRange, Exposure, RenderAsset, ViewQuality
+from tasks.render.gaussians import Gaussians
+from tasks.render.sky import SkyMap
+
+FORMAT, VERSION = "driving-data-factory scene", 1
+KEY = "scene"  # one entry: safetensors writes several in no fixed order
+SUFFIX = ".safetensors"
+Tensors = Mapping[str, NDArray[Any]]
+
+
+class BadScene(ValueError):
+    """The file is no scene, or damaged: says which file and what."""
+
+
+def write_scene(path: Path, asset: RenderAsset) -> RenderAsset:
+    """Writes beside the path and renames; returns the scene with its digest."""
+    tensors, described = tensors_of(asset), described_by(asset)
+    digest = digest_of(tensors, described)
+    data = save(dict(tensors), metadata={KEY: _json(described | {"digest": digest})})
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=".scene-", suffix=SUFFIX)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+    return replace(asset, digest=digest)
+
+
+def read_scene(path: Path) -> RenderAsset:
+    """The stored scene. Raises BadScene that names the file, where it is no scene or not what its digest says."""
+    try:
+        with safe_open(path, framework="numpy") as file:
+            header = (file.metadata() or {}).get(KEY)
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+    except (SafetensorError, OSError) as error:
+        raise BadScene(f"{path}: cannot be read: {error}") from error
+    if header is None:
+        raise BadScene(f"{path}: no scene: its header has no entry {KEY!r}")
+    try:
+        described = json.loads(header)
+        if (described["format"], described["version"]) != (FORMAT, VERSION):
+            found = f"{described['format']!r} {described['version']}"
+            raise BadScene(f"{path}: format {found}, this version reads {FORMAT!r} {VERSION}")
+        stated = described.pop("digest")
+        if digest_of(tensors, described) != stated:
+            raise BadScene(f"{path}: the content does not match its digest {stated}")
+        return scene_of(tensors, described, stated)
+    except (KeyError, TypeError, ValueError) as error:
+        if isinstance(error, BadScene):
+            raise
+        raise BadScene(f"{path}: damaged: {type(error).__name__} {error}") from error
+
+
+def tensors_of(asset: RenderAsset) -> dict[str, NDArray[Any]]:
+    """The scene's arrays by their names in the file, contiguous."""
+    out: dict[str, NDArray[Any]] = {"origin": asset.origin, "sky": asset.sky.rgb}
+    parts = {"background": asset.background} | {f"nodes.{i}": node for i, node in enumerate(asset.nodes.values())}
+    for name, part in parts.items():
+        out |= {f"{name}.{field.name}": getattr(part, field.name) for field in fields(Gaussians)}
+    if asset.exposures:
+        out["exposures"] = np.stack([exposure.affine for exposure in asset.exposures])
+    return {name: np.ascontiguousarray(array) for name, array in out.items()}
+
+
+def described_by(asset: RenderAsset) -> dict[str, Any]:
+    """What of the scene is no array, as plain JSON values; NaN is null."""
+    block = asset.block
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "nodes": list(asset.nodes),
+        "psnr_db": _number(asset.psnr_db),
+        "n_held_out": asset.n_held_out,
+        "views": [
+            asdict(view) | {"psnr_db": _number(view.psnr_db), "ssim": _number(view.ssim)} for view in asset.views
+        ],
+        "exposures": [[exposure.camera, exposure.time_s] for exposure in asset.exposures],
+        "block": None if block is None else asdict(block) | {"low": block.low.tolist(), "high": block.high.tolist()},
+    }
+
+
+def scene_of(tensors: Tensors, described: Mapping[str, Any], digest: str) -> RenderAsset:
+    """The opposite of `tensors_of` and `described_by`. Raises KeyError, TypeError, ValueError where one is absent."""
+
+    def part(name: str) -> Gaussians:
+        return Gaussians(**{field.name: tensors[f"{name}.{field.name}"] for field in fields(Gaussians)})
+
+    views = [view | {name: _nan(view[name]) for name in ("psnr_db", "ssim")} for view in described["views"]]
+    block = described["block"]
+    if block is not None:
+        block = BlockRange(**block | {side: np.array(block[side], np.float64) for side in ("low", "high")})
+    return RenderAsset(
+        origin=tensors["origin"],
+        background=part("background"),
+        nodes={name: part(f"nodes.{i}") for i, name in enumerate(described["nodes"])},
+        sky=SkyMap(tensors["sky"]),
+        psnr_db=_nan(described["psnr_db"]),
+        n_held_out=described["n_held_out"],
+        digest=digest,
+        views=tuple(ViewQuality(**view) for view in views),
+        exposures=tuple(
+            Exposure(camera, time_s, tensors["exposures"][i])
+            for i, (camera, time_s) in enumerate(described["exposures"])
+        ),
+        block=block,
+    )
+
+
+def digest_of(tensors: Tensors, described: Mapping[str, Any]) -> str:
+    """16 hex digits of the scene's content."""
+    digest = hashlib.sha256(_json(described).encode())
+    for name, array in sorted(tensors.items()):
+        digest.update(f"\x1f{name}\x1f{array.dtype.str}\x1f{array.shape}\x1f".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()[:16]
+
+
+def _json(value: Mapping[str, Any]) -> str:
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
+
+
+def _number(value: float) -> float | str | None:
+    """A number as JSON has it: NaN is null, infinity (a photo without a fault) a word."""
+    if math.isnan(value):
+        return None
+    return value if math.isfinite(value) else str(value)
+
+
+def _nan(value: float | str | None) -> float:
+    return float("nan") if value is None else float(value)
