@@ -196,7 +196,8 @@ def _motion(states: Array, raw: Array, out: Array) -> None:
         raw[t] = math.sqrt(states[t, AX] * states[t, AX] + states[t, AY] * states[t, AY])
     smooth_accel(raw, out[0])
     jerk_of(out[0], out[1])
-    raw[:] = states[:, HEADING]
+    for t in range(len(states)):  # a slice assigned to a slice compiles for 5 s more
+        raw[t] = states[t, HEADING]
     unwrap(raw)
     yaw_rate_of(raw, out[2])
     plan_yaw_accel_of(raw, out[3])
