@@ -113,16 +113,15 @@ def explain(argv: Sequence[str]) -> int:
                 *trace.candidate.end_pose[:2], trace.candidate.end_pose[2] * 57.29578
             )
         )
-        verdict = (
-            "accepted" if trace.rejected is None else f"rejected by {trace.rejected.stage}: {trace.rejected.detail}"
-        )
+        rejected = trace.rejected or work.unfit(clip, trace)
+        verdict = "accepted" if rejected is None else f"rejected by {rejected.stage}: {rejected.detail}"
         print(f"candidate {candidate:2d}{end}  {verdict}")
         if trace.judged is not None:
             shown = trace
             scores = trace.judged.scores
             named = [f"{name} {getattr(scores, name)[1]:.2f}" for name in SUBSCORES if name != "ec"]
             print(f"    EPDMS {scores.pdm_score[1]:.3f}  " + "  ".join(named))
-        if trace.rejected is None:
+        if rejected is None:
             break
     if shown is not None and shown.judged is not None:
         title = f"{expert}: {'accepted' if shown.rejected is None else shown.rejected.detail}"

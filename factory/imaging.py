@@ -18,15 +18,16 @@ from factory.clips.reader import BadClip
 from factory.sensors import block_of, chosen_cameras, encode_jpeg, load_photos, taken_by
 from tasks.attempt import Judged
 from tasks.perturb import Candidate
+from tasks.render.gate import unfit
 from tasks.render.map_drawing import draw_map_views
 from tasks.render.rigs import RIGS
 from tasks.render.scene import RenderAsset
-from tasks.render.settings import STEPS_OF, ImageSource, RenderMode, RenderSettings
+from tasks.render.settings import STEPS_OF, ImageSource, PsnrGate, RenderMode, RenderSettings
 from tasks.render.views import pose_on_ground, render_views
 from tasks.stages import Rejected
 from tasks.world.agents import AgentTracks
 from tasks.world.camera import Camera, SensorFile
-from tasks.world.clip import NOW, STEP_S, Clip
+from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip
 from tasks.world.vehicle import X, Y
 
 NO_IMAGES: dict[str, object] = {"cameras": None, "images": None, "image_source": str(ImageSource.NONE)}
@@ -34,6 +35,8 @@ TAG_OF = {
     Sensing.LIDAR_ONLY: "lidar_only",  # images show lidar returns in grey, not what a camera would have seen
     Sensing.PHOTOS_ONLY: "photos_only",  # no lidar: depth is guessed from parallax, markings shear off the photos' path
 }
+LOW_PSNR = "low_psnr"  # tag: held-out photos of the block come out worse than psnr_min
+GATE_STRIDE = 5  # steps of 0.1 s between the pictures that are looked at: 2 Hz
 PHOTO_SLACK_S = 0.06  # a photo belongs to an instant of the 2 Hz grid when it was taken this close to it
 
 
@@ -54,7 +57,7 @@ class Imaging:
         if sensing(clip, self.settings) not in (Sensing.PHOTOS, Sensing.PHOTOS_ONLY):
             return None
         asset = _block(clip, self.settings, self.cache_dir)
-        if asset.psnr_db < self.settings.psnr_min:
+        if self._below(asset) and self.settings.psnr_gate is PsnrGate.REJECT:
             return Rejected("render", "psnr", f"block at {asset.psnr_db:.2f} dB, below {self.settings.psnr_min:g}")
         return None
 
@@ -75,8 +78,36 @@ class Imaging:
         made_of = sensing(clip, self.settings)
         if made_of is Sensing.NOTHING or (made_of is Sensing.LIDAR_ONLY and not self._near_sweeps(clip, judged)):
             return NO_IMAGES
-        images = self._drawn(clip, judged, _block(clip, self.settings, self.cache_dir), cameras)
-        return images | {"tags": [TAG_OF[made_of]]} if made_of in TAG_OF else images
+        asset = _block(clip, self.settings, self.cache_dir)
+        tags = [TAG_OF[made_of]] if made_of in TAG_OF else []
+        if self._below(asset):
+            tags.append(LOW_PSNR)
+        return self._drawn(clip, judged, asset, cameras) | {"tags": tags}
+
+    def unfit(self, clip: Clip, candidate: Candidate, judged: Judged) -> Rejected | None:
+        """Why a simulated drive cannot be shown: what `tasks.render.gate` finds on its pictures from T to T+2H.
+
+        None where nothing is rendered from photos: lidar's grey pictures have gaps between its beams, and a reach of
+        their own instead. Raises BadClip for a broken sensor file.
+        """
+        if self.settings.mode is not RenderMode.AUTO or not self.settings.gate.enabled:
+            return None
+        if sensing(clip, self.settings) not in (Sensing.PHOTOS, Sensing.PHOTOS_ONLY):
+            return None
+        states = np.concatenate([candidate.rollout.ego_states, judged.rollout.ego_states[1:]])[::GATE_STRIDE]
+        return unfit(
+            _block(clip, self.settings, self.cache_dir),
+            chosen_cameras(clip.cameras, self.settings.cameras),
+            pose_on_ground(clip.world_from_ego, states),
+            judged.scene.agents.overwritten(judged.scene.step, judged.rollout.agents),
+            range(candidate.rollout.start_step, judged.scene.step + HORIZON_STEPS + 1, GATE_STRIDE),
+            (self.settings.width, self.settings.height),
+            self.settings.gate,
+            self.settings.backend,
+        )
+
+    def _below(self, asset: RenderAsset) -> bool:
+        return asset.psnr_db < self.settings.psnr_min  # not so where nothing was held out: NaN
 
     def _near_sweeps(self, clip: Clip, judged: Judged) -> bool:
         """Whether every pose to be drawn is within reach of a place that a sweep was taken from."""

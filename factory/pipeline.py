@@ -156,7 +156,7 @@ class FactoryWork:
         return None if digest is None else str(digest(ref))
 
     def attempt(self, prepared: PreparedClip, candidate: int, expert: str) -> AttemptResult:
-        """Rollout, expert, rollout, reward, labels and render of one candidate; candidate -1 is the human drive."""
+        """Rollout, expert, rollout, reward, render and labels of one candidate; candidate -1 is the human drive."""
         watch = Stopwatch()
         payload = prepared.payload
         assert isinstance(payload, PerturbedClip)
@@ -164,9 +164,13 @@ class FactoryWork:
         if trace.judged is None or trace.rejected is not None:
             assert trace.rejected is not None
             return Dropped(trace.rejected, _subscores(trace.judged.scores) if trace.judged else {}, watch.seconds)
-        labels = self._labels(trace.judged, watch)
         with watch.of("render"):
-            pictures = self.imaging.pictures(self._with_sensors(payload), trace.candidate, trace.judged)
+            sensed = self._with_sensors(payload)
+            unfit = self.unfit(sensed, trace)
+            if unfit is not None:
+                return Dropped(unfit, _subscores(trace.judged.scores), watch.seconds)
+            pictures = self.imaging.pictures(sensed, trace.candidate, trace.judged)
+        labels = self._labels(trace.judged, watch)
         row = sample_row(payload.clip, trace.candidate, trace.judged)
         tags = [*row["tags"], *pictures.get("tags", ())]  # type: ignore[misc]
         return Accepted(row | labels | pictures | {"tags": tags}, watch.seconds)
@@ -191,6 +195,15 @@ class FactoryWork:
             return Trace(chosen, None, result)
         return Trace(chosen, *result)
 
+    def unfit(self, clip: Clip, trace: Trace) -> Rejected | None:
+        """Why the pictures of an accepted drive are no sample's; `clip` with its sensor files. Raises BadClip.
+
+        The human drive is never filtered.
+        """
+        if trace.candidate is None or trace.judged is None:
+            return None
+        return self.imaging.unfit(clip, trace.candidate, trace.judged)
+
     def _labels(self, judged: Judged, watch: Stopwatch) -> dict[str, object]:
         """Columns of the vocabulary labels; none in a run without them."""
         if self.labelling is None:
@@ -200,7 +213,7 @@ class FactoryWork:
 
     def _block_verdict(self, clip: Clip) -> Rejected | None:
         """Asked for before perturb work is spent. Without a gate a block is built here only if it will be needed."""
-        if self.render.psnr_min > 0.0 or set(self.experts) - {HUMAN}:
+        if self.render.refuses_blocks or set(self.experts) - {HUMAN}:
             return self.imaging.block_verdict(clip)
         return None
 

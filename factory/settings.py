@@ -292,7 +292,7 @@ def identity_of(config: RunConfig, vocabulary: Vocabulary, labelling: Labelling 
         key: value for key, value in settings.items() if not key.startswith(("reward.", "render."))
     }
     stages = ["clip", "perturb", "rollout", "expert", "reward"]
-    if config.render.psnr_min > 0.0:  # then the block's verdict is part of what is prepared
+    if config.render.refuses_blocks:  # then the block's verdict is part of what is prepared
         early |= {key: value for key, value in settings.items() if key.startswith("render.")}
         stages.append("render")
     prepared = canonical_json([early, {stage: versions[stage] for stage in stages}])

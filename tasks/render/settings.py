@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 from tasks.render.engine import Backend
+from tasks.render.gate import GateSettings
 from tasks.render.scene import AssetSettings
 
 
@@ -12,6 +13,11 @@ class RenderMode(StrEnum):
     AUTO = "auto"  # from the block's scene where its sensors allow one, else no images
     MAP = "map"  # lanes, paint and boxes on plain ground; marked as such
     NONE = "none"
+
+
+class PsnrGate(StrEnum):
+    REJECT = "reject"  # before perturb work is spent on the block
+    MARK = "mark"  # samples are kept, tagged low_psnr
 
 
 class ImageSource(StrEnum):
@@ -48,7 +54,9 @@ class RenderSettings:
     width: int = 320  # pixels
     height: int = 180
     jpeg_quality: int = 90
-    psnr_min: float = 0.0  # [dB] a block whose held-out photos come out worse is refused; 0: none is
+    psnr_min: float = 0.0  # [dB] what a block's held-out photos must come out with; 0: anything
+    psnr_gate: PsnrGate = PsnrGate.REJECT  # what becomes of a block below psnr_min
+    gate: GateSettings = field(default_factory=GateSettings)  # what every rendered picture of a drive must come up to
     lidar_only_reach_m: float = 15.0  # without photos: images only this close to where a sweep was taken; 0: none
     map_rig: str = "three_front"  # cameras of a clip without a rig of its own, for mode=map
     asset: AssetSettings = field(default_factory=AssetSettings)
@@ -66,3 +74,8 @@ class RenderSettings:
             if not (math.isfinite(value) and low <= value <= high):
                 wanted = f"from {low:g} to {high:g}" if high < math.inf else f"finite and at least {low:g}"
                 raise ValueError(f"render {name} must be {wanted}, not {value}")
+
+    @property
+    def refuses_blocks(self) -> bool:
+        """Whether a block can be too poor for any of its clips to be perturbed."""
+        return self.psnr_min > 0.0 and self.psnr_gate is PsnrGate.REJECT

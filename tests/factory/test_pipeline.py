@@ -55,6 +55,30 @@ def test_a_block_below_the_gate_drops_the_experts_and_keeps_the_human(town: Path
     assert isinstance(human, Accepted) and human.row["image_source"] == "photo"
 
 
+def test_a_marked_block_keeps_its_candidates_and_tags_its_samples(town: Path, tmp_path: Path) -> None:
+    work = work_on(town, tmp_path, "render.psnr_min=60", "render.psnr_gate=mark")
+    prepared = prepared_by(work)
+    assert prepared.dropped is None
+    marked = first_sample(work, prepared)
+    assert marked.row["image_source"] == "render" and "low_psnr" in marked.row["tags"]  # type: ignore[operator]
+    human = work.attempt(prepared, HUMAN_CANDIDATE, HUMAN)
+    assert isinstance(human, Accepted) and "low_psnr" not in human.row["tags"]  # type: ignore[operator]
+
+
+def test_a_drive_that_cannot_be_shown_is_dropped_and_the_human_s_is_not(town: Path, tmp_path: Path) -> None:
+    strict = work_on(town, tmp_path, "render.gate.contrast_min=1.0")
+    prepared = prepared_by(strict)
+    results = [strict.attempt(prepared, row.index, "pdm_closed") for row in prepared.candidates]
+    dropped = [result for result in results if isinstance(result, Dropped) and result.rejected.stage == "render"]
+    assert dropped and {result.rejected.reason for result in dropped} == {"blank"}
+    assert not any(isinstance(result, Accepted) for result in results)
+    assert dropped[0].subscores["nc"] == 1.0  # the reward had accepted it
+    assert isinstance(strict.attempt(prepared, HUMAN_CANDIDATE, HUMAN), Accepted)
+    for override in ("render.gate.enabled=false", "render=none", "render=map"):
+        lenient = work_on(town, tmp_path, "render.gate.contrast_min=1.0", override)
+        assert isinstance(first_sample(lenient, prepared), Accepted)
+
+
 def test_a_prepared_clip_is_rendered_also_where_its_data_has_moved(town: Path, tmp_path: Path) -> None:
     prepared = prepared_by(work_on(town, tmp_path / "a"))
     here = first_sample(work_on(town, tmp_path / "a"), prepared)
@@ -102,6 +126,8 @@ def test_what_is_considered_is_what_is_prepared(town: Path, tmp_path: Path) -> N
         ("seed=1", True),
         ("reward.progress_above=0.6", False),  # judges attempts only
         ("render.width=128", False),
+        ("render.gate.hole_max=0.5", False),
+        ("render.psnr_min=27", True),
         ("rounds=5", False),
     ],
 )
@@ -117,6 +143,14 @@ def test_with_a_gate_the_block_s_settings_are_part_of_what_is_prepared() -> None
         for width in (64, 128)
     )
     assert small.prepare_digest != large.prepare_digest
+
+
+def test_a_gate_that_only_marks_prepares_nothing_anew() -> None:
+    plain, marking = (
+        identity_of(load_config(overrides), VOCABULARY, None).prepare_digest
+        for overrides in ([], ["render.psnr_min=27", "render.psnr_gate=mark"])
+    )
+    assert plain == marking
 
 
 @pytest.mark.parametrize("stage", ["clip", "perturb", "rollout", "expert", "reward"])

@@ -5,7 +5,7 @@ with the stage's version. They are compared to 1e-6 (colours: 1e-3), far above w
 """
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import astuple, dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +24,8 @@ from tasks.experts.protocol import Plan
 from tasks.experts.recovery import Recovery, RecoveryTable
 from tasks.kinematic_vocabulary import kinematic_trajectories
 from tasks.perturb import Candidate, Perturbation, PerturbSettings, perturb
+from tasks.render.engine import NOBODY, Pinhole
+from tasks.render.gate import GateSettings, composed, measures
 from tasks.render.map_drawing import draw_map_views
 from tasks.render.rigs import RIGS
 from tasks.render.scene import AssetSettings, build_asset
@@ -178,7 +180,9 @@ def pictures() -> dict[str, object]:
     pose = clip.world_from_ego[NOW : NOW + 1] * 1.0
     pose[:, 2, 3] = 0.0
     drawn = draw_map_views(clip.road_map, RIGS["front"], pose, clip.agents, [NOW], 128, 72)
-    return {"rendered": blocks(seen), "drawn": blocks(drawn)}
+    eye = Pinhole(front.intrinsics, aside[0] @ front.ego_from_camera, street.WIDTH, street.HEIGHT)
+    (found,) = measures(composed(asset, NOBODY, aside[0, :3, 3], 30.0), [eye], aside[0], GateSettings())
+    return {"rendered": blocks(seen), "drawn": blocks(drawn), "gate": astuple(found)}
 
 
 def rows() -> dict[str, object]:
@@ -313,10 +317,11 @@ GOLDEN: dict[str, Golden] = {
         },
     ),
     "render": Golden(
-        1,
+        2,
         {
-            "rendered": (714.185541, 34.8770657),
+            "rendered": (714.36471, 34.8568599),
             "drawn": (1001.11158, 15.1497572),
+            "gate": (0.198662185, -0.00442765673),
         },
         tolerance=1e-3,
     ),
