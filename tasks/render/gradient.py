@@ -11,26 +11,11 @@ from numpy.typing import NDArray
 
 from tasks.render import sh
 from tasks.render.gaussians import F32, F64, Gaussians, quat_multiply, quats_of
-from tasks.render.pixels_gradient import (
-    PEAK,
-    QX,
-    QXX,
-    QXY,
-    QY,
-    QYY,
-    SUMS_SIZE,
-    W_BLUE,
-    W_DEPTH,
-    W_RED,
-    Q,
-    add_pairs,
-    blend_gradient,
-)
-from tasks.render.project import CONIC_XX, CONIC_XY, CONIC_YY, OPACITY
-from tasks.render.project_gradient import BACK_SIZE, LOG_SCALE, MEAN, QUAT, project_gradient
+from tasks.render.pixels_gradient import PEAK, SUMS_SIZE, W_BLUE, W_RED, add_pairs, blend_gradient
+from tasks.render.project_gradient import project_gradient
 from tasks.render.raster import GAUSSIANS_CHUNK, TILES_CHUNK, Trace, pinhole
 from tasks.render.threads import in_chunks
-from tasks.render.tiles import tile_counts, tiles_of
+from tasks.render.tiles import pair_starts
 
 
 @dataclass(frozen=True)
@@ -63,27 +48,17 @@ def backward(
     the order in depth changes the picture jumps, and its jumps have no derivative: alpha beyond the cap counts as flat.
     Raises ValueError where shapes are not the view's.
     """
-    splats = trace.splats
-    upstream, totals = _by_sums(trace, d_rgb, d_depth, d_alpha)
-    sums = _sums(trace, upstream, totals, threads)
-
-    projected = splats.projected
-    a, b, c = projected[:, CONIC_XX], projected[:, CONIC_XY], projected[:, CONIC_YY]
-    by_ellipse = np.empty((len(sums), 6), np.float32)
-    by_ellipse[:, 0] = a * sums[:, QX] + b * sums[:, QY]
-    by_ellipse[:, 1] = b * sums[:, QX] + c * sums[:, QY]
-    by_ellipse[:, 2] = -0.5 * sums[:, QXX]
-    by_ellipse[:, 3] = -sums[:, QXY]
-    by_ellipse[:, 4] = -0.5 * sums[:, QYY]
-    by_ellipse[:, 5] = sums[:, W_DEPTH]
-
+    splats, n, count = trace.splats, len(trace.splats.index), gaussians.sh_rest.shape[1]
+    pair_start = pair_starts(splats.tiles)
+    pairs = _pairs(trace, pair_start, d_rgb, d_depth, d_alpha, threads)
     center = np.ascontiguousarray(np.linalg.inv(splats.camera_from_scene)[:3, 3])
-    d_seen = np.ascontiguousarray(sums[:, W_RED : W_BLUE + 1])
-    back = np.empty((len(sums), BACK_SIZE), np.float32)
-    d_means = np.zeros((len(sums), 3), np.float32)
+    sums = np.empty((n, SUMS_SIZE), np.float32)
+    shapes = ((n, 3), (n, 4), (n, 3), (n,), (n, 2), (n, 3), (n, count, 3))
+    means, quats, log_scales, logits, screen, colours, sh_rest = (np.empty(shape, np.float32) for shape in shapes)
 
-    def run(first: int, last: int) -> tuple[F64, F32, F32]:
-        d_camera = np.zeros(6)
+    def run(first: int, last: int) -> F64:
+        camera = np.zeros(6)
+        add_pairs(pair_start, pairs, first, last, sums)
         project_gradient(
             gaussians.means,
             gaussians.quats,
@@ -93,79 +68,79 @@ def backward(
             splats.width,
             splats.height,
             splats.index,
-            projected,
-            by_ellipse,
+            splats.projected,
+            sums,
             first,
             last,
-            back,
-            d_camera,
+            means,
+            quats,
+            log_scales,
+            logits,
+            screen,
+            camera,
         )
-        d_colours, d_rest = sh.seen_gradient(
-            gaussians.means, gaussians.colours, gaussians.sh_rest, center, splats.index, d_seen, first, last, d_means
+        by_direction = sh.seen_gradient(
+            gaussians.means,
+            gaussians.colours,
+            gaussians.sh_rest,
+            center,
+            splats.index,
+            sums[:, W_RED : W_BLUE + 1],
+            first,
+            last,
+            means,
+            colours,
+            sh_rest,
         )
         # To the directions, a camera moved by v is as a scene moved by v; turning it changes none of them.
-        d_camera[:3] += splats.camera_from_scene[:3, :3] @ d_means[first:last].sum(axis=0, dtype=np.float64)
-        return d_camera, d_colours, d_rest
+        camera[:3] += splats.camera_from_scene[:3, :3] @ by_direction
+        return camera
 
-    parts = in_chunks(run, len(sums), GAUSSIANS_CHUNK, threads) or [run(0, 0)]
+    camera = np.sum([np.zeros(6), *in_chunks(run, n, GAUSSIANS_CHUNK, threads)], axis=0)
     return Gradients(
-        index=splats.index,
-        means=back[:, MEAN] + d_means,
-        quats=back[:, QUAT],
-        log_scales=back[:, LOG_SCALE],
-        logits=sums[:, Q] * (1.0 - projected[:, OPACITY]),
-        colours=np.concatenate([part[1] for part in parts]),
-        sh_rest=np.concatenate([part[2] for part in parts]),
-        screen=by_ellipse[:, :2],
-        peak=sums[:, PEAK],
-        camera=np.sum([part[0] for part in parts], axis=0),
+        splats.index, means, quats, log_scales, logits, colours, sh_rest, screen, sums[:, PEAK].copy(), camera
     )
 
 
-def _by_sums(trace: Trace, d_rgb: F32, d_depth: F32 | None, d_alpha: F32 | None) -> tuple[F32, F32]:
-    """Derivatives (H, W, 5) by rgb, sum of weight * depth, sum of weight; and those times the sums, added up (H, W)."""
-    view = trace.view
-    shapes = [d_rgb.shape] + [d.shape for d in (d_depth, d_alpha) if d is not None]
-    if shapes[0] != view.rgb.shape or any(shape != view.alpha.shape for shape in shapes[1:]):
+def _pairs(
+    trace: Trace,
+    pair_start: NDArray[np.int64],
+    d_rgb: F32,
+    d_depth: F32 | None,
+    d_alpha: F32 | None,
+    threads: int,
+) -> F32:
+    """(pairs, 11) columns of tasks.render.pixels_gradient, Gaussian by Gaussian."""
+    splats, view = trace.splats, trace.view
+    by_depth = np.zeros_like(view.alpha) if d_depth is None else np.ascontiguousarray(d_depth, np.float32)
+    by_alpha = np.zeros_like(view.alpha) if d_alpha is None else np.ascontiguousarray(d_alpha, np.float32)
+    shapes = (d_rgb.shape, by_depth.shape, by_alpha.shape)
+    if shapes != (view.rgb.shape, view.alpha.shape, view.alpha.shape):
         raise ValueError(f"backward: upstream shapes {shapes} do not fit a view of {view.rgb.shape}")
-    upstream = np.zeros((*view.alpha.shape, 5), np.float32)
-    upstream[..., :3] = d_rgb
-    if d_depth is not None:  # depth = (sum of weight * depth) / alpha
-        covered = np.where(view.alpha > 0.0, view.alpha, np.float32(1.0))
-        upstream[..., 3] = d_depth / covered
-        upstream[..., 4] = -upstream[..., 3] * view.depth
-    if d_alpha is not None:
-        upstream[..., 4] += d_alpha
-    totals = np.einsum("hwc,hwc->hw", upstream[..., :3], view.rgb)
-    totals += view.alpha * (upstream[..., 3] * view.depth + upstream[..., 4])
-    return upstream, totals
+    by_rgb = np.ascontiguousarray(d_rgb, np.float32)
+    out = np.empty((len(splats.tile_splats), SUMS_SIZE), np.float32)
 
-
-def _sums(trace: Trace, upstream: F32, totals: F32, threads: int) -> F32:
-    """(M, 11) columns of tasks.render.pixels_gradient, added up over the tiles of each Gaussian."""
-    splats = trace.splats
-    pair_start = tile_counts(splats.projected, *tiles_of(splats.width, splats.height))
-    rows = np.zeros((len(splats.tile_splats), SUMS_SIZE), np.float32)
-    sums = np.empty((len(splats.index), SUMS_SIZE), np.float32)
-
-    def run_tiles(first: int, last: int) -> None:
+    def run(first: int, last: int) -> None:
         blend_gradient(
             splats.projected,
-            trace.colours,
+            splats.tiles,
             splats.tile_start,
             splats.tile_splats,
             trace.tile_end,
             pair_start,
-            upstream,
-            totals,
+            by_rgb,
+            by_depth,
+            by_alpha,
+            view.rgb,
+            view.depth,
+            view.alpha,
             first,
             last,
-            rows,
+            out,
         )
 
-    in_chunks(run_tiles, len(trace.tile_end), TILES_CHUNK, threads)
-    in_chunks(lambda first, last: add_pairs(pair_start, rows, first, last, sums), len(sums), GAUSSIANS_CHUNK, threads)
-    return sums
+    in_chunks(run, len(trace.tile_end), TILES_CHUNK, threads)
+    return out
 
 
 def unmoved(gradients: Gradients, target_from_source: F64) -> Gradients:

@@ -4,104 +4,182 @@ from typing import Any
 
 import numpy as np
 
-from tasks.kernels import kernel
-from tasks.render.pixels import MAX_ALPHA, row_alphas
-from tasks.render.project import DEPTH, HALF_V, U, V
-from tasks.render.tiles import TILE_HEIGHT, TILE_WIDTH, tile_range
+from tasks.kernels import inlined, kernel
+from tasks.render.fused import fma
+from tasks.render.pixels import BATCH, MAX_ALPHA, NOTHING, STRIDE, TABLE_SIZE, alpha_at, fetch
+from tasks.render.project import TILE
 
-# What a tile adds to the derivatives of one of its Gaussians: moments of q = dL/d(log alpha) about its centre ...
-Q, QX, QY, QXX, QXY, QYY = range(6)
+# What a tile adds to the derivatives of one of its Gaussians: moments, about its centre, of q = dL/d(log alpha) ...
+Q, Q_X, Q_Y, Q_XX, Q_XY, Q_YY = range(6)
 W_DEPTH, W_RED, W_GREEN, W_BLUE, PEAK = range(6, 11)  # ... weight times upstream, and the largest weight
 SUMS_SIZE = 11
+# Channels of a tile's buffer after light that still passes and the rest of the total: the upstream derivatives.
+RED_AT, GREEN_AT, BLUE_AT, DEPTH_AT, WEIGHT_AT = (np.uint64(channel * STRIDE) for channel in range(2, 7))
+LANE = np.uint64(TILE)
+
+
+@inlined
+def _log_alpha_gradient(opaque: Any, seen: Any, behind: Any) -> Any:
+    """alpha dL/dalpha: its own share of the pixel less what it hides; flat where alpha is capped."""
+    q = seen - behind * (opaque / (np.float32(1.0) - opaque))
+    return q if opaque < MAX_ALPHA else NOTHING
+
+
+@kernel
+def _load(
+    buffer: Any,
+    x0: int,
+    y0: int,
+    d_rgb: Any,
+    d_depth: Any,
+    d_alpha: Any,
+    rgb: Any,
+    depth: Any,
+    alpha: Any,
+) -> None:
+    """A tile's upstream derivatives by rgb, sum of weight * depth and sum of weight; and in channel 1 those times the
+    sums themselves, added up, background included. Pixels outside the picture carry no light."""
+    height, width = alpha.shape
+    buffer[:] = NOTHING
+    for y in range(min(TILE, height - y0)):
+        for x in range(min(TILE, width - x0)):
+            at, row, column = np.uint64(y * TILE + x), y0 + y, x0 + x
+            covered, mean_depth = alpha[row, column], depth[row, column]
+            by_depth = d_depth[row, column] / covered if covered > NOTHING else NOTHING
+            by_weight = d_alpha[row, column] - by_depth * mean_depth  # depth = (sum of weight * depth) / alpha
+            total = covered * (by_depth * mean_depth + by_weight)
+            for channel in range(3):
+                by_channel = d_rgb[row, column, channel]
+                buffer[at + np.uint64((2 + channel) * STRIDE)] = by_channel
+                total += by_channel * rgb[row, column, channel]
+            buffer[at] = np.float32(1.0)
+            buffer[at + np.uint64(STRIDE)] = total
+            buffer[at + DEPTH_AT] = by_depth
+            buffer[at + WEIGHT_AT] = by_weight
 
 
 @kernel
 def blend_gradient(
     projected: Any,
-    colours: Any,
+    tiles: Any,
     tile_start: Any,
     tile_splats: Any,
     ends: Any,
     pair_start: Any,
-    upstream: Any,
-    totals: Any,
+    d_rgb: Any,
+    d_depth: Any,
+    d_alpha: Any,
+    rgb: Any,
+    depth: Any,
+    alpha: Any,
     first_tile: int,
     last_tile: int,
-    rows_out: Any,
+    out: Any,
 ) -> None:
-    """Fills a row of `rows_out` (pairs, 11), zero before, for each Gaussian on each of some tiles, as far as blended.
+    """Fills a row of `out` (pairs, 11) for each Gaussian on each of some tiles; zero where it was not blended.
 
-    `upstream` (H, W, 5): derivatives by red, green, blue, sum of weight * depth, sum of weight; `totals` (H, W): those
-    times the sums themselves, added up, background included. With v a Gaussian's share of that per weight, what lies
-    behind it is the total minus what has been seen, so that one walk from front to back is enough.
+    With v a Gaussian's share of the loss per weight, what lies behind it is the total less what has been seen, so that
+    one walk from front to back is enough.
     """
-    f = np.float32
-    height, width = totals.shape
-    tiles_x, tiles_y = (width + TILE_WIDTH - 1) // TILE_WIDTH, (height + TILE_HEIGHT - 1) // TILE_HEIGHT
-    light = np.empty((TILE_HEIGHT, TILE_WIDTH), np.float32)
-    rest = np.empty((TILE_HEIGHT, TILE_WIDTH), np.float32)
-    pull = np.empty((5, TILE_HEIGHT, TILE_WIDTH), np.float32)
-    alphas = np.empty(TILE_WIDTH, np.float32)
-    lanes = np.empty((SUMS_SIZE, TILE_WIDTH), np.float32)
+    width = alpha.shape[1]
+    tiles_x = (width + TILE - 1) // TILE
+    buffer = np.empty(7 * STRIDE, np.float32)
+    lanes = np.empty(SUMS_SIZE * TILE, np.float32)
+    table, spans = np.empty((BATCH, TABLE_SIZE), np.float32), np.empty((BATCH, 2), np.int64)
+    step = np.uint64(STRIDE)
     for t in range(first_tile, last_tile):
         tx, ty = t % tiles_x, t // tiles_x
-        x0, y0 = tx * TILE_WIDTH, ty * TILE_HEIGHT
-        rows = min(TILE_HEIGHT, height - y0)
-        columns = min(TILE_WIDTH, width - x0)
-        light[:], rest[:], pull[:] = f(0.0), f(0.0), f(0.0)
-        for y in range(rows):
-            for k in range(columns):
-                light[y, k] = f(1.0)  # pixels outside the image carry no weight
-                rest[y, k] = totals[y0 + y, x0 + k]
-                for channel in range(5):
-                    pull[channel, y, k] = upstream[y0 + y, x0 + k, channel]
-        for j in range(tile_start[t], ends[t]):
-            i = tile_splats[j]
-            g = projected[i]
-            first = max(0, int(np.floor(g[V] - g[HALF_V])) - y0)
-            last = min(rows, int(np.floor(g[V] + g[HALF_V])) - y0 + 1)
-            red, green, blue, z = colours[i, 0], colours[i, 1], colours[i, 2], g[DEPTH]
-            lanes[:] = f(0.0)
-            for y in range(first, last):
-                row_alphas(g, x0, y0 + y, alphas)
-                dy = f(y0 + y + 0.5) - g[V]
-                for k in range(TILE_WIDTH):
-                    opaque = alphas[k]
-                    w = opaque * light[y, k]
-                    light[y, k] -= w
-                    v = red * pull[0, y, k] + green * pull[1, y, k] + blue * pull[2, y, k]
-                    v += z * pull[3, y, k] + pull[4, y, k]
-                    rest[y, k] -= w * v
-                    q = w * v - rest[y, k] * (opaque / (f(1.0) - opaque))
-                    q = q if opaque < f(MAX_ALPHA) else f(0.0)
-                    dx = f(x0 + k + 0.5) - g[U]
-                    lanes[Q, k] += q
-                    lanes[QX, k] += q * dx
-                    lanes[QY, k] += q * dy
-                    lanes[QXX, k] += q * dx * dx
-                    lanes[QXY, k] += q * dx * dy
-                    lanes[QYY, k] += q * dy * dy
-                    lanes[W_DEPTH, k] += w * pull[3, y, k]
-                    lanes[W_RED, k] += w * pull[0, y, k]
-                    lanes[W_GREEN, k] += w * pull[1, y, k]
-                    lanes[W_BLUE, k] += w * pull[2, y, k]
-                    lanes[PEAK, k] = max(lanes[PEAK, k], w)
-            left, right, top, _ = tile_range(g, tiles_x, tiles_y)
-            out = rows_out[pair_start[i] + (ty - top) * (right - left) + tx - left]
-            for channel in range(PEAK):
-                total = f(0.0)
-                for k in range(TILE_WIDTH):
-                    total += lanes[channel, k]
-                out[channel] = total
-            out[PEAK] = lanes[PEAK].max()
+        x0, y0 = tx * TILE, ty * TILE
+        _load(buffer, x0, y0, d_rgb, d_depth, d_alpha, rgb, depth, alpha)
+        for batch in range(tile_start[t], ends[t], BATCH):
+            n = min(BATCH, ends[t] - batch)
+            fetch(projected, tile_splats, batch, n, x0, y0, table, spans)
+            for j in range(n):
+                u, v, z, a, b, c = table[j, 0], table[j, 1], table[j, 2], table[j, 3], table[j, 4], table[j, 5]
+                opacity, cut = table[j, 6], table[j, 7]
+                red, green, blue = table[j, 8], table[j, 9], table[j, 10]
+                lanes[:] = NOTHING
+                for y in range(spans[j, 0], spans[j, 1]):
+                    dy = np.float32(y) - v
+                    b_dy, c_dy2, dy2 = b * dy, c * dy * dy, dy * dy
+                    row = np.uint64(y * TILE)
+                    for k in range(TILE):
+                        at, lane = row + np.uint64(k), np.uint64(k)
+                        dx = np.float32(k) - u
+                        opaque = alpha_at(a, b_dy, c_dy2, dx, opacity, cut)
+                        light = buffer[at]
+                        w = opaque * light
+                        buffer[at] = light - w
+                        by_red, by_green, by_blue = buffer[at + RED_AT], buffer[at + GREEN_AT], buffer[at + BLUE_AT]
+                        by_depth = buffer[at + DEPTH_AT]
+                        share = fma(z, by_depth, buffer[at + WEIGHT_AT])
+                        seen = w * fma(red, by_red, fma(green, by_green, fma(blue, by_blue, share)))
+                        behind = buffer[at + step] - seen
+                        buffer[at + step] = behind
+                        q = _log_alpha_gradient(opaque, seen, behind)
+                        q_x = q * dx
+                        lanes[lane] += q
+                        lane += LANE
+                        lanes[lane] += q_x
+                        lane += LANE
+                        lanes[lane] = fma(q, dy, lanes[lane])
+                        lane += LANE
+                        lanes[lane] = fma(q_x, dx, lanes[lane])
+                        lane += LANE
+                        lanes[lane] = fma(q_x, dy, lanes[lane])
+                        lane += LANE
+                        lanes[lane] = fma(q, dy2, lanes[lane])
+                        lane += LANE
+                        lanes[lane] = fma(w, by_depth, lanes[lane])
+                        lane += LANE
+                        lanes[lane] = fma(w, by_red, lanes[lane])
+                        lane += LANE
+                        lanes[lane] = fma(w, by_green, lanes[lane])
+                        lane += LANE
+                        lanes[lane] = fma(w, by_blue, lanes[lane])
+                        lane += LANE
+                        lanes[lane] += max(w - lanes[lane], NOTHING)  # the larger; a plain max is stored under a mask
+                _fold(lanes, out, _row(tiles, pair_start, tile_splats[batch + j], tx, ty))
+        for j in range(ends[t], tile_start[t + 1]):
+            row = _row(tiles, pair_start, tile_splats[j], tx, ty)
+            for channel in range(SUMS_SIZE):
+                out[row, channel] = NOTHING
+
+
+@kernel
+def _row(tiles: Any, pair_start: Any, i: int, tx: int, ty: int) -> Any:
+    """Where the pair of a Gaussian and a tile stands among the rows of sums."""
+    return np.uint64(pair_start[i] + (ty - tiles[i, 2]) * (tiles[i, 1] - tiles[i, 0]) + tx - tiles[i, 0])
+
+
+@kernel
+def _fold(lanes: Any, out: Any, row: Any) -> None:
+    """Adds up the 16 columns of each channel, halves onto halves; of PEAK takes the largest."""
+    for channel in range(PEAK):
+        start = np.uint64(channel * TILE)
+        for k in range(8):
+            lanes[start + np.uint64(k)] += lanes[start + np.uint64(k + 8)]
+        for k in range(4):
+            lanes[start + np.uint64(k)] += lanes[start + np.uint64(k + 4)]
+        first, second = (
+            lanes[start] + lanes[start + np.uint64(2)],
+            lanes[start + np.uint64(1)] + lanes[start + np.uint64(3)],
+        )
+        out[row, channel] = first + second
+    largest = NOTHING
+    for k in range(TILE):
+        largest = max(largest, lanes[np.uint64(PEAK * TILE + k)])
+    out[row, PEAK] = largest
 
 
 @kernel
 def add_pairs(pair_start: Any, rows: Any, first: int, last: int, out: Any) -> None:
     """Adds up the rows (pairs, 11) of each Gaussian from `first` to `last` into `out` (M, 11) float32."""
     for i in range(first, last):
+        start = np.uint64(pair_start[i])
         for channel in range(SUMS_SIZE):
-            total = np.float32(0.0)
-            for j in range(pair_start[i], pair_start[i + 1]):
-                total = max(total, rows[j, channel]) if channel == PEAK else total + rows[j, channel]
-            out[i, channel] = total
+            out[i, channel] = rows[start, channel]
+        for j in range(start + np.uint64(1), np.uint64(pair_start[i + 1])):
+            for channel in range(PEAK):
+                out[i, channel] += rows[j, channel]
+            out[i, PEAK] = max(out[i, PEAK], rows[j, PEAK])

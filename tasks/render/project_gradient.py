@@ -6,13 +6,8 @@ from typing import Any
 import numpy as np
 
 from tasks.kernels import kernel
-from tasks.render.project import CONIC_XX, CONIC_XY, CONIC_YY, MAX_TANGENT_RATIO
-
-# Columns of the upstream row of a Gaussian.
-D_U, D_V, D_XX, D_XY, D_YY, D_DEPTH = range(6)
-# Columns of the result.
-MEAN, QUAT, LOG_SCALE = slice(0, 3), slice(3, 7), slice(7, 10)
-BACK_SIZE = 10
+from tasks.render.pixels_gradient import Q_X, Q_XX, Q_XY, Q_Y, Q_YY, W_DEPTH, Q
+from tasks.render.project import CONIC_XX, CONIC_XY, CONIC_YY, MAX_TANGENT_RATIO, OPACITY
 
 
 @kernel
@@ -29,17 +24,22 @@ def project_gradient(
     height: int,
     index: Any,
     projected: Any,
-    upstream: Any,
+    sums: Any,
     first: int,
     last: int,
-    out: Any,
+    d_means: Any,
+    d_quats: Any,
+    d_log_scales: Any,
+    d_logits: Any,
+    d_screen: Any,
     d_pose: Any,
 ) -> None:
-    """Fills `out` (M, 10) float32: d mean, d quaternion as given (any length), d log-scale, for rows `first` to `last`.
+    """Fills the derivatives by mean, quaternion as given (any length), log-scale, opacity's logit and place on the
+    picture, each (M, ...) float32, for rows `first` to `last`.
 
-    Scene, camera, `index` and `projected` as for and from `project`; `upstream` (M, 6) the derivatives by U, V, the
-    three conic entries (CONIC_XY counts for both off-diagonals) and DEPTH. Adds to `d_pose` (6,) float64 the derivative
-    by a small motion of the camera: x' = x + v + w cross x in camera coordinates, v [m] before w [rad].
+    Scene, camera, `index` and `projected` as for and from `project`; `sums` (M, 11) as tasks.render.pixels_gradient has
+    them. Adds to `d_pose` (6,) float64 the derivative by a small motion of the camera: x' = x + v + w cross x in camera
+    coordinates, v [m] before w [rad].
     """
     r = camera_from_scene
     left, right = -MAX_TANGENT_RATIO * cx / fx, MAX_TANGENT_RATIO * (width - cx) / fx
@@ -65,9 +65,14 @@ def project_gradient(
         axes[0, 2], axes[2, 0] = 2 * (qx * qz + qw * qy), 2 * (qx * qz - qw * qy)
         axes[1, 2], axes[2, 1] = 2 * (qy * qz - qw * qx), 2 * (qy * qz + qw * qx)
 
-        # d covariance = -conic (d conic) conic.
         cxx, cxy, cyy = float(projected[k, CONIC_XX]), float(projected[k, CONIC_XY]), float(projected[k, CONIC_YY])
-        gxx, gxy, gyy = float(upstream[k, D_XX]), 0.5 * float(upstream[k, D_XY]), float(upstream[k, D_YY])
+        # The exponent is -(cxx dx^2 + 2 cxy dx dy + cyy dy^2) / 2, dx and dy from the centre to the pixel.
+        d_u = cxx * sums[k, Q_X] + cxy * sums[k, Q_Y]
+        d_v = cxy * sums[k, Q_X] + cyy * sums[k, Q_Y]
+        d_screen[k, 0], d_screen[k, 1] = d_u, d_v
+        d_logits[k] = sums[k, Q] * (1.0 - projected[k, OPACITY])
+        # d covariance = -conic (d conic) conic.
+        gxx, gxy, gyy = -0.5 * float(sums[k, Q_XX]), -0.5 * float(sums[k, Q_XY]), -0.5 * float(sums[k, Q_YY])
         left_xx, left_xy = cxx * gxx + cxy * gxy, cxx * gxy + cxy * gyy
         left_yx, left_yy = cxy * gxx + cyy * gxy, cxy * gxy + cyy * gyy
         d_xx = -(left_xx * cxx + left_xy * cxy)
@@ -90,22 +95,22 @@ def project_gradient(
             d_jx -= d_du * a * dz
             d_jy -= d_dv * b * dz
             gx, gy, gz = a * d_du, b * d_dv, -a * jx * d_du - b * jy * d_dv
-            out[k, 7 + axis] = gx * dx + gy * dy + gz * dz
+            d_log_scales[k, axis] = gx * dx + gy * dy + gz * dz
             turn_x += dy * gz - dz * gy
             turn_y += dz * gx - dx * gz
             turn_z += dx * gy - dy * gx
             for row in range(3):
                 d_axes[row, axis] = scale * (r[0, row] * gx + r[1, row] * gy + r[2, row] * gz)
 
-        d_tx, d_ty = fx * float(upstream[k, D_U]), fy * float(upstream[k, D_V])
+        d_tx, d_ty = fx * d_u, fy * d_v
         if left < tx < right:
             d_tx += d_jx
         if top < ty < bottom:
             d_ty += d_jy
         d_x, d_y = d_tx / z, d_ty / z
-        d_z = float(upstream[k, D_DEPTH]) - (d_tx * tx + d_ty * ty + d_a * a + d_b * b) / z
+        d_z = float(sums[k, W_DEPTH]) - (d_tx * tx + d_ty * ty + d_a * a + d_b * b) / z
         for column in range(3):
-            out[k, column] = r[0, column] * d_x + r[1, column] * d_y + r[2, column] * d_z
+            d_means[k, column] = r[0, column] * d_x + r[1, column] * d_y + r[2, column] * d_z
         d_pose[0] += d_x
         d_pose[1] += d_y
         d_pose[2] += d_z
@@ -121,5 +126,5 @@ def project_gradient(
         d_qy = 2.0 * (qw * twist_y + qx * both_xy + qz * both_yz - 2.0 * qy * (g[0, 0] + g[2, 2]))
         d_qz = 2.0 * (qw * twist_z + qx * both_xz + qy * both_yz - 2.0 * qz * (g[0, 0] + g[1, 1]))
         along = d_qw * qw + d_qx * qx + d_qy * qy + d_qz * qz  # a longer quaternion is the same rotation
-        out[k, 3], out[k, 4] = shorten * (d_qw - along * qw), shorten * (d_qx - along * qx)
-        out[k, 5], out[k, 6] = shorten * (d_qy - along * qy), shorten * (d_qz - along * qz)
+        d_quats[k, 0], d_quats[k, 1] = shorten * (d_qw - along * qw), shorten * (d_qx - along * qx)
+        d_quats[k, 2], d_quats[k, 3] = shorten * (d_qy - along * qy), shorten * (d_qz - along * qz)

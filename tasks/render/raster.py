@@ -5,7 +5,7 @@ pixels to Gaussians, is tasks/render/gradient.py. Work is dealt to threads in fi
 order that could change: the same input gives the same bytes, on any number of threads.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tasks.render import sh
 from tasks.render.gaussians import F32, F64, Gaussians
 from tasks.render.pixels import blend, carry_back
-from tasks.render.project import project
+from tasks.render.project import BLUE, DEPTH, PROJECTED_SIZE, RED, project
 from tasks.render.threads import in_chunks
 from tasks.render.tiles import deal
 
@@ -35,7 +35,8 @@ class Splats:
     """The Gaussians of one view, projected, sorted and dealt out to tiles."""
 
     index: NDArray[np.int64]  # (M,) rows in the scene, ascending
-    projected: F32  # (M, 9) columns of tasks.render.project
+    projected: F32  # (M, 16) columns of tasks.render.project; rows are cache lines
+    tiles: NDArray[np.int32]  # (M, 4) tiles x0 <= x < x1, y0 <= y < y1 that each touches
     tile_start: NDArray[np.int64]  # (tiles + 1,) into tile_splats
     tile_splats: NDArray[np.int32]  # (pairs,) rows of `projected`, by tile, nearest first
     intrinsics: F64  # (3, 3) [px]
@@ -49,8 +50,7 @@ class Trace:
     """A view and what the way back from it needs."""
 
     view: View
-    splats: Splats
-    colours: F32  # (M, 3) rgb of `splats` as seen from the camera
+    splats: Splats  # with the colours they were blended with
     tile_end: NDArray[np.int64]  # (tiles,) how far into `tile_splats` each tile was blended before it was opaque
 
 
@@ -60,8 +60,8 @@ def splat(
     """Projects and sorts. `intrinsics` (3, 3) pixels, without skew; `scene_from_camera` (4, 4) rigid."""
     camera_from_scene = np.ascontiguousarray(np.linalg.inv(scene_from_camera))
 
-    def run(first: int, last: int) -> tuple[NDArray[np.int64], F32]:
-        index, projected = project(
+    def run(first: int, last: int) -> tuple[NDArray[np.int64], F32, NDArray[np.int32]]:
+        index, projected, tiles = project(
             gaussians.means,
             gaussians.quats,
             gaussians.log_scales,
@@ -73,12 +73,20 @@ def splat(
             first,
             last,
         )
-        return index, projected
+        return index, projected, tiles
 
     parts = in_chunks(run, len(gaussians), GAUSSIANS_CHUNK, threads) or [run(0, 0)]
-    index, projected = (np.concatenate(arrays) for arrays in zip(*parts))
-    tile_start, tile_splats = deal(projected, width, height, threads)
-    return Splats(index, projected, tile_start, tile_splats, intrinsics, camera_from_scene, width, height)
+    index, tiles = (np.concatenate([part[k] for part in parts]) for k in (0, 2))
+    projected = np.concatenate([part[1] for part in parts], out=_cache_lines(len(index)))
+    tile_start, tile_splats = deal(projected[:, DEPTH], tiles, width, height, threads)
+    return Splats(index, projected, tiles, tile_start, tile_splats, intrinsics, camera_from_scene, width, height)
+
+
+def _cache_lines(n: int) -> F32:
+    """Room for projected rows (n, 16), each of which is one line of the processor's cache (64 bytes)."""
+    room = np.empty((n + 1) * PROJECTED_SIZE, np.float32)
+    first = -room.ctypes.data % 64 // 4
+    return room[first : first + n * PROJECTED_SIZE].reshape(n, PROJECTED_SIZE)
 
 
 def pinhole(intrinsics: F64) -> tuple[float, float, float, float]:
@@ -115,23 +123,33 @@ def trace(
 ) -> Trace:
     """As `rasterize`, with what `tasks.render.gradient.backward` needs."""
     splats = splat(gaussians, intrinsics, scene_from_camera, width, height, threads)
-    colours = colours_seen(gaussians, scene_from_camera[:3, 3], splats.index)
-    view, tile_end = _shade(splats, colours, background, threads)
-    return Trace(view, splats, colours, tile_end)
+    splats.projected[:, RED : BLUE + 1] = colours_seen(gaussians, scene_from_camera[:3, 3], splats.index, threads)
+    view, tile_end = _shade(splats, background, threads)
+    return Trace(view, splats, tile_end)
 
 
-def colours_seen(gaussians: Gaussians, camera_center: F64, index: NDArray[np.int64]) -> F32:
+def colours_seen(gaussians: Gaussians, camera_center: F64, index: NDArray[np.int64], threads: int = 1) -> F32:
     """rgb (M, 3) of the Gaussians at `index` (M,), as seen from `camera_center` (3,) in their frame; never negative."""
-    center = np.ascontiguousarray(camera_center, np.float64)
-    return np.asarray(sh.seen(gaussians.means, gaussians.colours, gaussians.sh_rest, center, index))
+    if gaussians.sh_rest.shape[1] == 0:
+        return np.maximum(gaussians.colours[index], np.float32(0.0))
+    center, out = np.ascontiguousarray(camera_center, np.float64), np.empty((len(index), 3), np.float32)
+
+    def run(first: int, last: int) -> None:
+        sh.seen(gaussians.means, gaussians.colours, gaussians.sh_rest, center, index, first, last, out)
+
+    in_chunks(run, len(index), GAUSSIANS_CHUNK, threads)
+    return out
 
 
 def shade(splats: Splats, colours: F32, background: F32, threads: int = 1) -> View:
     """The picture of sorted splats; `colours` (M, 3) of the Gaussians at `splats.index`."""
-    return _shade(splats, colours, background, threads)[0]
+    projected = _cache_lines(len(splats.index))
+    projected[:] = splats.projected
+    projected[:, RED : BLUE + 1] = colours
+    return _shade(replace(splats, projected=projected), background, threads)[0]
 
 
-def _shade(splats: Splats, colours: F32, background: F32, threads: int) -> tuple[View, NDArray[np.int64]]:
+def _shade(splats: Splats, background: F32, threads: int) -> tuple[View, NDArray[np.int64]]:
     height, width = splats.height, splats.width
     behind = np.ascontiguousarray(np.broadcast_to(background, (height, width, 3)), np.float32)
     view = View(
@@ -144,7 +162,6 @@ def _shade(splats: Splats, colours: F32, background: F32, threads: int) -> tuple
     def run(first: int, last: int) -> None:
         blend(
             splats.projected,
-            colours,
             splats.tile_start,
             splats.tile_splats,
             behind,

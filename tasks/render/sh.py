@@ -74,12 +74,12 @@ def basis(directions: Any, count: int) -> Any:
 
 
 @kernel
-def seen(means: Any, colours: Any, sh_rest: Any, center: Any, index: Any) -> Any:
-    """rgb (M, 3) float32, never negative, of the Gaussians at `index` (M,) as seen from `center` (3,) float64."""
-    out = np.empty((index.shape[0], 3), np.float32)
+def seen(means: Any, colours: Any, sh_rest: Any, center: Any, index: Any, first: int, last: int, out: Any) -> None:
+    """Fills rgb (M, 3), never negative, of the Gaussians at `index` (M,) as seen from `center` (3,) float64, for rows
+    `first` to `last`."""
     count = sh_rest.shape[1]
     values = np.empty(15, np.float64)
-    for k in range(index.shape[0]):
+    for k in range(first, last):
         i = index[k]
         x, y, z = means[i, 0] - center[0], means[i, 1] - center[1], means[i, 2] - center[2]
         scale = 1.0 / np.sqrt(x * x + y * y + z * z)
@@ -89,19 +89,26 @@ def seen(means: Any, colours: Any, sh_rest: Any, center: Any, index: Any) -> Any
             for m in range(count):
                 total += values[m] * sh_rest[i, m, c]
             out[k, c] = max(total, 0.0)
-    return out
 
 
 @kernel
 def seen_gradient(
-    means: Any, colours: Any, sh_rest: Any, center: Any, index: Any, d_seen: Any, first: int, last: int, d_means: Any
+    means: Any,
+    colours: Any,
+    sh_rest: Any,
+    center: Any,
+    index: Any,
+    d_seen: Any,
+    first: int,
+    last: int,
+    d_means: Any,
+    d_colours: Any,
+    d_rest: Any,
 ) -> Any:
-    """What a change of `seen` (M, 3) means for colours (last - first, 3) and sh_rest (last - first, count, 3) of the
-    rows `first` to `last` of `index`; adds to `d_means` (M, 3), for the direction turns with the mean."""
+    """Fills what a change of `seen` (M, 3) means for colours (M, 3) and sh_rest (M, count, 3), for rows `first` to
+    `last`. Adds to `d_means` (M, 3), for the direction turns with the mean; returns the sum (3,) of what it added."""
     count = sh_rest.shape[1]
-    d_colours = np.empty((last - first, 3), np.float32)
-    d_rest = np.empty((last - first, count, 3), np.float32)
-    values, slopes = np.empty(15, np.float64), np.zeros((15, 3), np.float64)
+    values, slopes, added = np.empty(15, np.float64), np.zeros((15, 3), np.float64), np.zeros(3, np.float64)
     for k in range(first, last):
         i = index[k]
         x, y, z = means[i, 0] - center[0], means[i, 1] - center[1], means[i, 2] - center[2]
@@ -115,18 +122,22 @@ def seen_gradient(
             for m in range(count):
                 total += values[m] * sh_rest[i, m, c]
             upstream = float(d_seen[k, c]) if total >= 0.0 else 0.0
-            d_colours[k - first, c] = upstream
+            d_colours[k, c] = upstream
             for m in range(count):
-                d_rest[k - first, m, c] = upstream * values[m]
+                d_rest[k, m, c] = upstream * values[m]
                 pull = upstream * sh_rest[i, m, c]
                 gx += pull * slopes[m, 0]
                 gy += pull * slopes[m, 1]
                 gz += pull * slopes[m, 2]
         along = gx * x + gy * y + gz * z  # a longer direction is the same direction
-        d_means[k, 0] += scale * (gx - along * x)
-        d_means[k, 1] += scale * (gy - along * y)
-        d_means[k, 2] += scale * (gz - along * z)
-    return d_colours, d_rest
+        gx, gy, gz = scale * (gx - along * x), scale * (gy - along * y), scale * (gz - along * z)
+        d_means[k, 0] += gx
+        d_means[k, 1] += gy
+        d_means[k, 2] += gz
+        added[0] += gx
+        added[1] += gy
+        added[2] += gz
+    return added
 
 
 def turned(sh_rest: F32, matrix: F64) -> F32:

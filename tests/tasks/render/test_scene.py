@@ -125,6 +125,5 @@ def test_the_smallest_scene_reaches_every_kernel_of_the_room() -> None:
     modules = (choose, depth, movers, pixels, project, stereo, tiles)
     kernels = [value for module in modules for value in vars(module).values() if hasattr(value, "signatures")]
     assert len(kernels) > 10
-    inlined = {"_nearer", "row_alphas", "tile_range", "_is_opaque"}  # part of their callers, no entry points
-    inlined.add("tile_counts")  # of the way back, which no scene of photos and points needs
+    inlined = {"_nearer", "alpha_at", "fetch", "most_light"}  # part of their callers, no entry points
     assert {kernel.__name__ for kernel in kernels if not kernel.signatures} <= inlined
