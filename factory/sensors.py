@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 
 from factory.clips.av2_log import read_feather
 from factory.clips.reader import BadClip
-from tasks.render.sensed import Photo, Sweep
+from tasks.render.sensed import Photo, Sweep, on_ego
 from tasks.render.views import undistorted
 from tasks.world.camera import Camera, SensorFile
 from tasks.world.clip import Block, Clip
 
 XYZ, INTENSITY = ("x", "y", "z"), "intensity"
+NO_PICTURE = 1.0  # standard deviation [grey levels] that a photo has at least, at night too
 
 
 @dataclass(frozen=True)
@@ -94,6 +95,12 @@ def _photo(file: SensorFile, camera: Camera, width: int, height: int) -> Photo:
     flat = undistorted(image, camera)[top : top + h, left : left + w]
     shrinks = width < w
     small = cv2.resize(flat, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    if small.std() < NO_PICTURE:
+        raise BadClip(
+            file.uri,
+            "image",
+            "one colour all over, no picture of a street: restore it, or leave the camera out by render.cameras=[...]",
+        )
     pinhole = camera.resized(width, height)
     return Photo(
         camera=camera.name,
@@ -112,5 +119,7 @@ def load_sweeps(files: Sequence[SensorFile], with_intensity: bool = False) -> tu
 def _sweep(file: SensorFile, with_intensity: bool) -> Sweep:
     table = read_feather(Path(file.uri), (*XYZ, INTENSITY) if with_intensity else XYZ)
     points = np.stack([table[name] for name in XYZ], axis=1).astype(np.float32)
+    if on_ego(points).all():
+        raise BadClip(file.uri, "x y z", f"none of the {len(points)} returns lies outside of the ego's own body")
     intensity = table[INTENSITY].astype(np.uint8) if with_intensity else None
     return Sweep(file.time_s, points, file.world_from_ego, intensity)

@@ -156,7 +156,11 @@ def read_cameras(folder: Path) -> tuple[Camera, ...]:
         ego_from_camera[:3, :3] = turned[mount_of[name]]
         ego_from_camera[:3, 3] = poses[mount_of[name], 4:]
         intrinsics = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        cameras.append(Camera(str(name), int(width), int(height), intrinsics, np.array(distortion), ego_from_camera))
+        try:
+            camera = Camera(str(name), int(width), int(height), intrinsics, np.array(distortion), ego_from_camera)
+        except ValueError as error:
+            raise BadClip(str(path), "calibration", str(error)) from error
+        cameras.append(camera)
     return tuple(cameras)
 
 

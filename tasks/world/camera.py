@@ -5,17 +5,37 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+ROTATION_SLACK = 1e-3  # of calibrations written with few digits
+
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera with radial distortion, mounted on the ego. Camera frame: x right, y down, z forward."""
+    """A pinhole camera with radial distortion, mounted on the ego. Camera frame: x right, y down, z forward.
+
+    Raises ValueError that names camera and field for what is no calibration.
+    """
 
     name: str
     width: int  # pixels
     height: int
     intrinsics: NDArray[np.float64]  # (3, 3) pixels
     distortion: NDArray[np.float64]  # (3,) k1, k2, k3; zeros for an undistorted image
-    ego_from_camera: NDArray[np.float64]  # (4, 4)
+    ego_from_camera: NDArray[np.float64]  # (4, 4) rigid
+
+    def __post_init__(self) -> None:
+        for name, shape in (("intrinsics", (3, 3)), ("distortion", (3,)), ("ego_from_camera", (4, 4))):
+            array = getattr(self, name)
+            if np.shape(array) != shape:
+                raise ValueError(f"camera {self.name}: {name}: shape {np.shape(array)}, expected {shape}")
+            if not np.isfinite(array).all():
+                raise ValueError(f"camera {self.name}: {name}: NaN or infinity")
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"camera {self.name}: size: {self.width}x{self.height} pixels")
+        if min(self.intrinsics[0, 0], self.intrinsics[1, 1]) <= 0.0:
+            raise ValueError(f"camera {self.name}: intrinsics: focal lengths must be positive")
+        turned = self.ego_from_camera[:3, :3]
+        if np.abs(turned @ turned.T - np.eye(3)).max() > ROTATION_SLACK or np.linalg.det(turned) < 0.0:
+            raise ValueError(f"camera {self.name}: ego_from_camera: not a rotation and a shift")
 
     def window(self, width: int, height: int) -> tuple[int, int, int, int]:
         """Left, top, width, height [px] of the largest centred part of the image with the shape width : height."""

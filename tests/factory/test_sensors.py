@@ -97,7 +97,10 @@ def test_a_missing_camera_is_named_with_those_there_are(clip: Clip) -> None:
         chosen_cameras(clip.cameras, ["rear"])
 
 
-@pytest.mark.parametrize("content", [b"", b"not a jpeg", encode_jpeg(smooth_image(0), 90)[:60]])
+WHOLE = encode_jpeg(smooth_image(0), 90)
+
+
+@pytest.mark.parametrize("content", [b"", b"not a jpeg", WHOLE[:60], WHOLE[: len(WHOLE) // 2], WHOLE[:-20]])
 def test_a_broken_image_is_a_bad_clip_that_names_the_file(clip: Clip, content: bytes) -> None:
     Path(clip.images[1].uri).write_bytes(content)
     with pytest.raises(BadClip, match=r"1\.jpg: image"):
@@ -110,6 +113,23 @@ def test_a_missing_or_wrongly_sized_image_is_a_bad_clip(clip: Clip) -> None:
         load_sensors(block_of(clip), clip.cameras, 48, 32)
     Path(clip.images[0].uri).write_bytes(encode_jpeg(smooth_image(0)[:50], 90))
     with pytest.raises(BadClip, match=r"size: 96x50, but front takes 96x64"):
+        load_sensors(block_of(clip), clip.cameras, 48, 32)
+
+
+@pytest.mark.parametrize("grey", [0, 255])
+def test_a_photo_of_a_dead_camera_is_a_bad_clip_and_never_a_black_frame(clip: Clip, grey: int) -> None:
+    Path(clip.images[2].uri).write_bytes(encode_jpeg(np.full((64, 96, 3), grey, np.uint8), 90))
+    with pytest.raises(BadClip, match=r"2\.jpg: image: one colour all over, .* render\.cameras="):
+        load_sensors(block_of(clip), clip.cameras, 48, 32)
+    dark = (smooth_image(0) // 16).astype(np.uint8)  # a night: 3 to 12 of 255
+    Path(clip.images[2].uri).write_bytes(encode_jpeg(dark, 90))
+    assert len(load_sensors(block_of(clip), clip.cameras, 48, 32).photos) == 3
+
+
+def test_a_sweep_that_sees_nothing_but_the_ego_is_a_bad_clip(clip: Clip) -> None:
+    inside = {name: np.full(5, value, np.float32) for name, value in (("x", 1.0), ("y", 0.0), ("z", 1.0))}
+    pyarrow.feather.write_feather(pa.table(inside), clip.sweeps[1].uri)
+    with pytest.raises(BadClip, match=r"1\.feather: x y z: none of the 5 returns lies outside"):
         load_sensors(block_of(clip), clip.cameras, 48, 32)
 
 

@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.feather
 import pytest
 
-from factory.clips.av2 import AV2Reader
+from factory.clips.av2 import AV2Reader, read_cameras
 from factory.clips.reader import BadClip, ClipRef
 from tasks.world.agents import AgentKind
 from tasks.world.clip import CLIP_STEPS, NOW
@@ -217,21 +217,43 @@ def test_light_phases_hold_until_the_next_row(log: Path) -> None:
     assert (lights.states[:10, 0] == LightState.GREEN).all() and (lights.states[10:, 0] == LightState.RED).all()
 
 
+def calibrate(log: Path, **changed: float) -> None:
+    """One camera, its intrinsics or mount changed."""
+    (log / "calibration").mkdir()
+    numbers = {"fx_px": 500.0, "fy_px": 510.0, "cx_px": 320.0, "cy_px": 240.0, "k1": 0.0, "k2": 0.0, "k3": 0.0}
+    shape = {"height_px": 480, "width_px": 640}
+    intrinsics = {name: changed.get(name, value) for name, value in (numbers | shape).items()}
+    write_table(
+        log / "calibration" / "intrinsics.feather",
+        {"sensor_name": ["front"], **{k: [v] for k, v in intrinsics.items()}},
+    )
+    mount = pose_columns(1, 0.0, np.array([1.0, 0.0, 1.4]))
+    mount |= {name: np.array([value]) for name, value in changed.items() if name in mount}
+    write_table(log / "calibration" / "egovehicle_SE3_sensor.feather", {"sensor_name": ["front"], **mount})
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"width_px": 0}, r"intrinsics\.feather: calibration: camera front: size: 0x480"),
+        ({"fx_px": -500.0}, "camera front: intrinsics: focal lengths must be positive"),
+        ({"cx_px": float("nan")}, r"intrinsics\.feather: cx_px: holds NaN"),
+        ({"qw": 0.5}, r"SE3_sensor\.feather: qw qx qy qz: a quaternion is not of unit length"),
+    ],
+)
+def test_a_calibration_that_is_none_is_named(log: Path, changed: dict[str, float], said: str) -> None:
+    calibrate(log, **changed)
+    with pytest.raises(BadClip, match=said):
+        read_cameras(log)
+
+
 def test_images_and_sweeps_carry_the_pose_of_their_stamp(log: Path) -> None:
     camera_ns, lidar_ns = START_NS + 1_030_000_000, START_NS + 2_500_000_000
     (log / "sensors" / "cameras" / "front").mkdir(parents=True)
     (log / "sensors" / "lidar").mkdir()
     (log / "sensors" / "cameras" / "front" / f"{camera_ns}.jpg").touch()
     (log / "sensors" / "lidar" / f"{lidar_ns}.feather").touch()
-    (log / "calibration").mkdir()
-    numbers = {"fx_px": 500.0, "fy_px": 510.0, "cx_px": 320.0, "cy_px": 240.0, "k1": 0.0, "k2": 0.0, "k3": 0.0}
-    shape = {"height_px": 480, "width_px": 640}
-    write_table(
-        log / "calibration" / "intrinsics.feather",
-        {"sensor_name": ["front"], **{k: [v] for k, v in (numbers | shape).items()}},
-    )
-    mount = pose_columns(1, 0.0, np.array([1.0, 0.0, 1.4]))
-    write_table(log / "calibration" / "egovehicle_SE3_sensor.feather", {"sensor_name": ["front"], **mount})
+    calibrate(log)
     reader = AV2Reader(log)
     first, second, third = (reader.read(ref) for ref in reader.index().refs)
     camera = first.cameras[0]
