@@ -50,13 +50,13 @@ def build_asset(
     origin = np.round(photos[0].world_from_camera[:3, 3])
     photos = [replace(p, world_from_camera=shifted(p.world_from_camera, -origin)) for p in photos]
     sweeps = [replace(s, world_from_ego=shifted(s.world_from_ego, -origin)) for s in sweeps]
-    held_out = _held_out(photos, settings.hold_out_every)
+    held_out = held_out_rows(photos, settings.hold_out_every)
     train = [p for i, p in enumerate(photos) if i not in held_out]
     tracks = Tracks(agents, origin)
     static, per_track = fuse(sweeps, tracks)
     seen = [see(p, train, static, per_track, tracks, settings.max_gap_px, settings.stereo_photos) for p in train]
-    background, nodes = _discs(train, seen, tracks)
-    sky = _sky(train, seen)
+    background, nodes = surfaces(train, seen, tracks)
+    sky = sky_of(train, seen)
     asset = RenderAsset(origin, background, nodes, sky, float("nan"))
     asset = _refit(asset, train, seen, tracks, settings.refit_sweeps)
     if not held_out:
@@ -67,7 +67,8 @@ def build_asset(
     return replace(asset, psnr_db=float(np.mean(scores)), n_held_out=len(scores))
 
 
-def _held_out(photos: Sequence[Photo], every: int) -> frozenset[int]:
+def held_out_rows(photos: Sequence[Photo], every: int) -> frozenset[int]:
+    """Indices of the photos that only measure: of each camera every `every`-th, from the middle of the first on."""
     if every == 0:
         return frozenset()
     count: dict[str, int] = {}
@@ -80,7 +81,7 @@ def _held_out(photos: Sequence[Photo], every: int) -> frozenset[int]:
     return frozenset(out)
 
 
-def _discs(photos: Sequence[Photo], seen: Sequence[Seen], tracks: Tracks) -> tuple[Gaussians, dict[str, Gaussians]]:
+def surfaces(photos: Sequence[Photo], seen: Sequence[Seen], tracks: Tracks) -> tuple[Gaussians, dict[str, Gaussians]]:
     """Discs of all photos, carved, dealt to background and tracks, the closest looks kept."""
     # Only what lidar or the sky says may carve: a guess must not drill holes.
     carvers = [np.where(s.sky, FAR_M, np.where(s.label == SHALLOW, 0.0, s.depth)).astype(np.float32) for s in seen]
@@ -128,7 +129,8 @@ def _witnessed(
     return np.asarray((in_front <= agreeing) | ((in_front < 2) & ~guessed))
 
 
-def _sky(photos: Sequence[Photo], seen: Sequence[Seen]) -> SkyMap:
+def sky_of(photos: Sequence[Photo], seen: Sequence[Seen]) -> SkyMap:
+    """What the photos show of the sky."""
     collector = SkyCollector()
     for photo, sight in zip(photos, seen):
         height, width = sight.depth.shape

@@ -1,0 +1,1 @@
+"""Reconstruction by optimisation: Gaussians, sky, exposure and small pose corrections fitted to photos and lidar."""

@@ -1,0 +1,79 @@
+"""How far a picture is from a photo, and which way it should change: L1 and SSIM (Wang et al. 2004)."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tasks.render.gaussians import F32
+
+WINDOW, SIGMA = 11, 1.5  # pixels, as in the paper
+C1, C2 = 0.01**2, 0.03**2  # for a range of 1
+_TAPS = cv2.getGaussianKernel(WINDOW, SIGMA, cv2.CV_32F)
+
+
+@dataclass(frozen=True)
+class Target:
+    """A photo and what of it every comparison needs."""
+
+    rgb: F32  # (H, W, 3) in [0, 1]
+    mean: F32  # (H, W, 3) under the window
+    variance: F32  # (H, W, 3) under the window
+    weight: F32  # (H, W) 0: the pixel says nothing
+
+
+def target_of(rgb: NDArray[np.uint8], ignored: NDArray[np.bool_] | None = None) -> Target:
+    """`rgb` (H, W, 3), `ignored` (H, W) pixels to leave out."""
+    image = rgb.astype(np.float32) / np.float32(255.0)
+    mean = _blur(image)
+    weight = np.ones(rgb.shape[:2], np.float32) if ignored is None else (~ignored).astype(np.float32)
+    return Target(image, mean, _blur(image * image) - mean * mean, weight)
+
+
+def _blur(image: F32) -> F32:
+    """Windowed mean (H, W, C), zeros beyond the border: symmetric, so it is its own adjoint."""
+    return np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, _TAPS, _TAPS, borderType=cv2.BORDER_CONSTANT), np.float32)
+
+
+def ssim(rgb: F32, target: Target) -> tuple[float, F32]:
+    """Mean structural similarity over weighted pixels and channels, and its gradient (H, W, 3)."""
+    f = np.float32
+    x, y, mu_y = rgb, target.rgb, target.mean
+    blurred = _blur(np.concatenate([x, x * x, x * y], axis=-1))
+    mu_x = blurred[..., :3]
+    cross = blurred[..., 6:] - mu_x * mu_y
+    spread = blurred[..., 3:6] - mu_x * mu_x + target.variance
+    a1, a2 = f(2) * mu_x * mu_y + f(C1), f(2) * cross + f(C2)
+    b1, b2 = mu_x * mu_x + mu_y * mu_y + f(C1), spread + f(C2)
+    share = target.weight[..., None] / f(3.0 * max(float(target.weight.sum()), 1.0))
+    inverse = f(1) / (b1 * b2)
+    value = a1 * a2 * inverse
+    by_xx = -share * value / b2
+    by_xy = share * f(2) * a1 * inverse
+    by_mean = share * f(2) * (mu_y * (a2 - a1) * inverse - mu_x * value / b1) - f(2) * mu_x * by_xx
+    back = _blur(np.concatenate([by_mean, by_xx, by_xy], axis=-1))
+    gradient = back[..., :3] + f(2) * x * back[..., 3:6] + y * back[..., 6:]
+    return float((share * value).sum()), np.asarray(gradient, np.float32)
+
+
+def photo_loss(rgb: F32, target: Target, ssim_weight: float) -> tuple[float, F32]:
+    """(1 - w) L1 + w (1 - SSIM) of a picture (H, W, 3), and its gradient (H, W, 3)."""
+    share = target.weight[..., None] / np.float32(3.0 * max(float(target.weight.sum()), 1.0))
+    off = rgb - target.rgb
+    loss = (1.0 - ssim_weight) * float((share * np.abs(off)).sum())
+    gradient = np.float32(1.0 - ssim_weight) * share * np.sign(off)
+    if ssim_weight > 0.0:
+        similarity, by_rgb = ssim(rgb, target)
+        loss += ssim_weight * (1.0 - similarity)
+        gradient -= np.float32(ssim_weight) * by_rgb
+    return loss, gradient
+
+
+def depth_loss(depth: F32, known: F32, weight: float) -> tuple[float, F32]:
+    """`weight` times the mean error of inverse depth [1/m] where `known` (H, W) > 0, and its gradient by `depth`."""
+    use = (known > 0.0) & (depth > 0.0)
+    inverse = np.where(use, 1.0 / np.where(use, depth, 1.0), 0.0)
+    off = np.where(use, inverse - 1.0 / np.where(use, known, 1.0), 0.0)
+    scale = weight / max(int(use.sum()), 1)
+    return scale * float(np.abs(off).sum()), (-scale * np.sign(off) * inverse * inverse).astype(np.float32)

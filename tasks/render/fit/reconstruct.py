@@ -1,0 +1,220 @@
+"""A block's scene fitted to its photos: one photo an iteration, all of it a function of the inputs and the seed."""
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tasks.render.asset import Exposure, RenderAsset, ViewQuality, psnr
+from tasks.render.fit.backdrop import backdrop, backdrop_gradient
+from tasks.render.fit.density import refine
+from tasks.render.fit.exposure import exposed, exposed_gradient, matrix_of
+from tasks.render.fit.losses import depth_loss, photo_loss, ssim
+from tasks.render.fit.poses import between, corrected
+from tasks.render.fit.road import lay_flat
+from tasks.render.fit.schedule import decayed, photo_at
+from tasks.render.fit.settings import FitSettings
+from tasks.render.fit.start import Problem, Shot, prepare
+from tasks.render.fit.state import BACKGROUND, FitState
+from tasks.render.gaussians import F32, F64, Gaussians, concatenate, moved
+from tasks.render.gradient import Gradients, backward, unmoved
+from tasks.render.movers import world_from_boxes
+from tasks.render.project import DEPTH
+from tasks.render.raster import Trace, trace
+from tasks.render.sensed import Photo, Sweep
+from tasks.render.sky import COLUMNS, ROWS, SkyMap
+from tasks.world.agents import AgentTracks
+
+REPORT_EVERY = 100
+Progress = Callable[[int, float, float], None]  # iteration, mean loss and mean PSNR [dB] of the last REPORT_EVERY
+
+
+@dataclass(frozen=True)
+class Part:
+    """Consecutive Gaussians of a composed scene that share an owner."""
+
+    first: int
+    rows: NDArray[np.int64]  # (M,) in the state
+    scene_from_owner: F64 | None  # (4, 4); None: the background's, which is the scene's
+
+
+def reconstruct(
+    photos: Sequence[Photo],
+    sweeps: Sequence[Sweep],
+    agents: AgentTracks | None,
+    settings: FitSettings,
+    progress: Progress | None = None,
+    held_out: Collection[int] | None = None,
+) -> RenderAsset:
+    """The scene of one block. `agents`: 10 Hz tracks whose first step is time 0 of photos and sweeps.
+
+    Whoever wants to stop and go on calls `prepare`, `advance` and `finish`, which this is made of.
+    Raises ValueError without photos to train on.
+    """
+    problem, state = prepare(photos, sweeps, agents, settings, held_out)
+    advance(problem, state, settings, settings.iterations, progress)
+    return finish(problem, state, settings)
+
+
+def advance(
+    problem: Problem, state: FitState, settings: FitSettings, until: int, progress: Progress | None = None
+) -> None:
+    """Fits on, in place, to iteration `until`. In how many calls the iterations are done makes no difference."""
+    losses, scores = [], []
+    while state.iteration < min(until, settings.iterations):
+        loss, score = _iterate(problem, state, settings)
+        losses.append(loss)
+        scores.append(score)
+        state.iteration += 1
+        at, last = state.iteration, settings.refine_until * settings.iterations
+        if at % settings.refine_every == 0 and settings.refine_from <= at <= last:
+            refine(state, settings)
+        if progress is not None and at % REPORT_EVERY == 0:
+            progress(at, float(np.mean(losses)), float(np.mean(scores)))
+            losses, scores = [], []
+
+
+def _iterate(problem: Problem, state: FitState, settings: FitSettings) -> tuple[float, float]:
+    row = photo_at(state.iteration, len(problem.train), settings.seed)
+    shot = problem.train[row]
+    camera = corrected(shot.photo.world_from_camera, state.learned["poses"].values[row])
+    scene, parts = compose(problem, state, shot.photo.time_s)
+    seen = _look(state, scene, shot.photo, camera, settings.threads)
+    colours = state.learned["exposure"].values[row]
+    picture = exposed(seen.view.rgb, colours)
+    loss, d_picture = photo_loss(picture, shot.target, settings.ssim_weight)
+    d_rgb, d_colours = exposed_gradient(seen.view.rgb, colours, d_picture)
+    d_depth = None
+    if shot.lidar_depth is not None:
+        off, d_depth = depth_loss(seen.view.depth, shot.lidar_depth, settings.depth_weight)
+        loss += off
+    back = backward(seen, scene, d_rgb, d_depth, threads=settings.threads)
+    _step_world(state, settings, row, back, d_colours)
+    cells, d_cells = backdrop_gradient(d_rgb * (1.0 - seen.view.alpha)[..., None], shot.photo.intrinsics, camera)
+    progress = state.iteration / settings.iterations
+    state.learned["sky"].step(cells, d_cells, decayed(settings.sky_rate, settings.rate_end, progress))
+    depths = seen.splats.projected[:, DEPTH]
+    for part in parts:
+        _step_part(state, settings, part, back, depths)
+    if problem.road is not None:
+        rows = back.index[: np.searchsorted(back.index, len(parts[0].rows))]  # the background's are their own rows
+        means, quats, log_scales = (state.learned[name].values for name in ("means", "quats", "log_scales"))
+        flat = rows[state.road[rows]]
+        lay_flat(means, quats, log_scales, flat, problem.road, settings.road_slack, settings.road_thickness)
+    return loss, psnr(np.clip(picture, 0.0, 1.0), shot.target.rgb)
+
+
+def compose(problem: Problem, state: FitState, time_s: float) -> tuple[Gaussians, list[Part]]:
+    """All Gaussians that are there at a time, in the scene, and whose they are; the background's come first."""
+    every = state.gaussians()
+    n = int(np.searchsorted(state.owner, 0))
+    rows = np.arange(n)
+    scenes, parts = [every.take(rows) if n < len(every) else every], [Part(0, rows, None)]
+    boxes, valid = problem.tracks.at(time_s)
+    frames = world_from_boxes(boxes)
+    for j in np.flatnonzero(valid):
+        rows = np.arange(np.searchsorted(state.owner, j), np.searchsorted(state.owner, j, side="right"))
+        if len(rows):
+            parts.append(Part(n, rows, frames[j]))
+            scenes.append(moved(every.take(rows), frames[j]))
+            n += len(rows)
+    return (scenes[0] if len(scenes) == 1 else concatenate(scenes)), parts
+
+
+def _look(state: FitState, scene: Gaussians, photo: Photo, camera: F64, threads: int) -> Trace:
+    height, width = photo.rgb.shape[:2]
+    behind = backdrop(state.learned["sky"].values, photo.intrinsics, camera, width, height)
+    return trace(scene, photo.intrinsics, camera, width, height, behind, threads)
+
+
+def _step_world(state: FitState, settings: FitSettings, row: int, back: Gradients, d_colours: F32) -> None:
+    """Exposure and pose of the photo."""
+    progress, at = state.iteration / settings.iterations, np.array([row])
+    rate = decayed(settings.exposure_rate, settings.rate_end, progress)
+    state.learned["exposure"].step(at, d_colours[None], rate)
+    if state.iteration >= settings.pose_from:
+        fall = decayed(1.0, settings.rate_end, progress)
+        poses = state.learned["poses"]
+        # Shift and turn step by different rates: the gradient's own size does not matter to Adam.
+        before = poses.values[row].copy()
+        poses.step(at, back.camera[None].astype(np.float32), fall)
+        rates = np.repeat([settings.shift_rate, settings.turn_rate], 3).astype(np.float32)
+        poses.values[row] = before + rates * (poses.values[row] - before)
+
+
+def _step_part(state: FitState, settings: FitSettings, part: Part, back: Gradients, depths: F32) -> None:
+    span = slice(*np.searchsorted(back.index, [part.first, part.first + len(part.rows)]))
+    mine = Gradients(**{name: getattr(back, name)[span] for name in _PER_GAUSSIAN}, camera=back.camera)
+    if part.scene_from_owner is not None:
+        mine = unmoved(mine, part.scene_from_owner)
+    rows = part.rows[mine.index - part.first]
+    learned = state.learned
+    state.nearest[rows] = np.minimum(state.nearest[rows], depths[span])
+    state.wanted[rows] += np.hypot(mine.screen[:, 0], mine.screen[:, 1])
+    progress = state.iteration / settings.iterations
+    fall = decayed(1.0, settings.rate_end, progress)
+    opacity = 1.0 / (1.0 + np.exp(-learned["logits"].values[rows, 0]))
+    d_logits = mine.logits + settings.opacity_weight / len(state) * opacity * (1.0 - opacity)
+    d_scales = mine.log_scales + settings.scale_weight / len(state) * np.exp(learned["log_scales"].values[rows])
+    mean_rate = decayed(settings.mean_rate, settings.mean_rate_end, progress)
+    learned["means"].step(rows, mine.means, mean_rate, state.nearest[rows])
+    learned["quats"].step(rows, mine.quats, fall * settings.quat_rate)
+    learned["log_scales"].step(rows, d_scales.astype(np.float32), fall * settings.scale_rate)
+    learned["logits"].step(rows, d_logits[:, None].astype(np.float32), fall * settings.opacity_rate)
+    learned["colours"].step(rows, mine.colours, fall * settings.colour_rate)
+    if mine.sh_rest.shape[1]:
+        learned["sh_rest"].step(rows, mine.sh_rest.reshape(len(rows), -1), fall * settings.sh_rate)
+
+
+_PER_GAUSSIAN = ("index", "means", "quats", "log_scales", "logits", "colours", "sh_rest", "screen", "peak")
+
+
+def picture_of(problem: Problem, state: FitState, photo: Photo, threads: int = 1) -> F32:
+    """What the fit makes of a photo of the block that it need not have seen (H, W, 3).
+
+    Pose correction and exposure are those learned from the same camera, between the photos before and after.
+    `photo.world_from_camera` is local (minus `problem.origin`).
+    """
+    row_pose, row_colour = corrections_at(problem, state, photo.camera, photo.time_s)
+    camera = corrected(photo.world_from_camera, row_pose)
+    scene, _ = compose(problem, state, photo.time_s)
+    return np.clip(exposed(_look(state, scene, photo, camera, threads).view.rgb, row_colour), 0.0, 1.0)
+
+
+def corrections_at(problem: Problem, state: FitState, camera: str, time_s: float) -> tuple[F32, F32]:
+    """Pose correction (6,) and exposure (12,) of a camera at a time; zeros for one that no photo was learned from."""
+    rows = [i for i, shot in enumerate(problem.train) if shot.photo.camera == camera]
+    poses, colours = state.learned["poses"].values, state.learned["exposure"].values
+    if not rows:
+        return np.zeros(poses.shape[1], np.float32), np.zeros(colours.shape[1], np.float32)
+    times = np.array([problem.train[i].photo.time_s for i in rows])
+    return between(times, poses[rows], time_s), between(times, colours[rows], time_s)
+
+
+def finish(problem: Problem, state: FitState, settings: FitSettings) -> RenderAsset:
+    """The scene as it is rendered, with the PSNR of the photos held out."""
+    every = state.gaussians()
+    quats = every.quats / np.linalg.norm(every.quats, axis=1, keepdims=True)
+    every = Gaussians(every.means, quats, every.log_scales, every.opacities, every.colours, every.sh_rest)
+    nodes = {problem.tracks.ids[j]: every.take(state.owner == j) for j in np.unique(state.owner[state.owner >= 0])}
+    views = tuple(_quality(problem, state, shot, settings.threads) for shot in problem.held_out)
+    return RenderAsset(
+        problem.origin,
+        every.take(state.owner == BACKGROUND),
+        nodes,
+        SkyMap(np.clip(state.learned["sky"].values, 0.0, 1.0).reshape(ROWS, COLUMNS, 3)),
+        float(np.mean([view.psnr_db for view in views])) if views else float("nan"),
+        len(views),
+        views=views,
+        exposures=tuple(
+            Exposure(shot.photo.camera, shot.photo.time_s, np.column_stack(matrix_of(row)))
+            for shot, row in zip(problem.train, state.learned["exposure"].values)
+        ),
+    )
+
+
+def _quality(problem: Problem, state: FitState, shot: Shot, threads: int) -> ViewQuality:
+    picture = picture_of(problem, state, shot.photo, threads)
+    photo = shot.photo
+    return ViewQuality(photo.camera, photo.time_s, psnr(picture, shot.target.rgb), ssim(picture, shot.target)[0], True)

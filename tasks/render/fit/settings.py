@@ -1,0 +1,63 @@
+"""What the fit is told."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """Budgets are counts of iterations, one photo each; lengths in metres unless said otherwise.
+
+    The rates are about twice those of Kerbl et al. 2023, for budgets of some thousand iterations.
+    """
+
+    iterations: int = 8000
+    seed: int = 0
+    threads: int = 2
+    hold_out_every: int = 8  # photo i of a camera with i % n == n // 2 only measures; 0: none is held out
+    # Where it starts.
+    start_gaussians: int = 90_000
+    most_gaussians: int = 130_000
+    start_opacity: float = 0.5
+    max_gap_px: tuple[int, int] = (12, 24)  # columns, rows that are interpolated between lidar returns
+    stereo_photos: int = 4
+    sh_degree: int = 0  # 0 to 3
+    # Loss.
+    ssim_weight: float = 0.2
+    depth_weight: float = 0.0  # of the mean absolute error of inverse depth [1/m] where lidar knows it
+    opacity_weight: float = 0.0
+    scale_weight: float = 0.0
+    # Step sizes of Adam; each falls exponentially to `rate_end` of itself.
+    mean_rate: float = 8e-4  # times the nearest viewing depth
+    quat_rate: float = 4e-3
+    scale_rate: float = 2e-2
+    opacity_rate: float = 8e-2
+    colour_rate: float = 1.2e-2
+    sh_rate: float = 6e-4
+    sky_rate: float = 4e-3
+    exposure_rate: float = 1e-3
+    turn_rate: float = 5e-5  # [rad] of the pose corrections
+    shift_rate: float = 5e-4  # [m]
+    pose_from: int = 500  # iteration at which poses start to move
+    rate_end: float = 0.1
+    mean_rate_end: float = 0.02
+    # Density: relocation and growth of 3DGS as Markov chain Monte Carlo (Kheradmand et al. 2024).
+    refine_every: int = 100
+    refine_from: int = 300
+    refine_until: float = 0.8  # share of the iterations
+    growth: float = 0.03
+    dead_opacity: float = 0.01
+    jitter: float = 0.5  # how far from its source a copy is put, in standard deviations of it
+    # Road.
+    road: bool = True
+    road_slack: float = 0.02  # how far a road Gaussian may leave the lidar's surface
+    road_thickness: float = 0.005
+
+    def __post_init__(self) -> None:
+        for name in ("iterations", "threads", "start_gaussians", "most_gaussians", "refine_every"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"fit {name} must be 1 or more, not {getattr(self, name)}")
+        if self.sh_degree not in range(4):
+            raise ValueError(f"fit sh_degree must be 0 to 3, not {self.sh_degree}")
+        for name in ("ssim_weight", "refine_until", "rate_end", "mean_rate_end"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"fit {name} must be from 0 to 1, not {getattr(self, name)}")

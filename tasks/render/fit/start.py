@@ -1,0 +1,158 @@
+"""From photos and lidar to where the fit begins."""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tasks.render import sh
+from tasks.render.depth import sparse_depth
+from tasks.render.fit import exposure, poses
+from tasks.render.fit.adam import Learned
+from tasks.render.fit.losses import Target, target_of
+from tasks.render.fit.road import Road, above_road, find_road, lay_flat
+from tasks.render.fit.settings import FitSettings
+from tasks.render.fit.state import BACKGROUND, FitState, logits_of
+from tasks.render.gaussians import F32, F64, Gaussians, concatenate, rotations_of
+from tasks.render.movers import behind_boxes
+from tasks.render.scene import held_out_rows, sky_of, surfaces
+from tasks.render.sensed import Photo, Sweep, Tracks, fuse, shifted
+from tasks.render.sight import Seen, see
+from tasks.render.sky import directions
+from tasks.render.stereo import FAR_M
+from tasks.render.threads import in_chunks
+from tasks.world.agents import AgentTracks
+
+ROAD_TOP_M = 0.08  # a Gaussian that starts no further from the road's surface belongs to it
+UPRIGHT = 0.5  # unless it stands: the least vertical part of its normal
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A photo as the fit uses it, in the block's local frame."""
+
+    photo: Photo
+    target: Target
+    lidar_depth: F32 | None  # (H, W) [m], 0 where no return falls; None: not asked for
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is to be fitted. The same photos, sweeps, agents and settings give the same problem."""
+
+    origin: F64  # (3,) world [m]
+    train: tuple[Shot, ...]
+    held_out: tuple[Shot, ...]
+    tracks: Tracks
+    road: Road | None
+
+
+def prepare(
+    photos: Sequence[Photo],
+    sweeps: Sequence[Sweep],
+    agents: AgentTracks | None,
+    settings: FitSettings,
+    held_out: Collection[int] | None = None,
+) -> tuple[Problem, FitState]:
+    """The problem and its first state. `held_out`: indices of photos that only measure, else as `settings` says.
+
+    Raises ValueError without photos to train on.
+    """
+    out = held_out_rows(photos, settings.hold_out_every) if held_out is None else frozenset(held_out)
+    if len(photos) <= len(out):
+        raise ValueError(f"reconstruct: {len(photos)} photos, of which {len(out)} are held out: none to learn from")
+    origin = np.round(photos[0].world_from_camera[:3, 3])
+    local = [replace(p, world_from_camera=shifted(p.world_from_camera, -origin)) for p in photos]
+    tracks = Tracks(agents, origin)
+    train = [p for i, p in enumerate(local) if i not in out]
+    static, per_track = fuse([replace(s, world_from_ego=shifted(s.world_from_ego, -origin)) for s in sweeps], tracks)
+
+    def look(first: int, last: int) -> list[Seen]:
+        gap, n = settings.max_gap_px, settings.stereo_photos
+        return [see(p, train, static, per_track, tracks, gap, n) for p in train[first:last]]
+
+    seen = [s for part in in_chunks(look, len(train), 1, settings.threads) for s in part]
+    background, nodes = surfaces(train, seen, tracks)
+    eyes = np.stack([p.world_from_camera[:3, 3] for p in train])
+    road = find_road(static, eyes) if settings.road else None
+    state = _first_state(background, [nodes.get(i) for i in tracks.ids], sky_of(train, seen).rgb, train, road, settings)
+    unknown = [track_id not in nodes for track_id in tracks.ids]
+    shots = [_shot(p, static, tracks, np.array(unknown, bool), settings) for p in local]
+    problem = Problem(
+        origin,
+        tuple(shot for i, shot in enumerate(shots) if i not in out),
+        tuple(shot for i, shot in enumerate(shots) if i in out),
+        tracks,
+        road,
+    )
+    return problem, state
+
+
+def _shot(photo: Photo, static: F64, tracks: Tracks, unknown: NDArray[np.bool_], settings: FitSettings) -> Shot:
+    """A photo, without what moves and has no Gaussians of its own: it would be painted on the street."""
+    height, width = photo.rgb.shape[:2]
+    boxes, valid = tracks.at(photo.time_s)
+    hidden = None
+    if (valid & unknown).any():
+        eye = photo.world_from_camera[:3, 3]
+        far = directions(photo.intrinsics, photo.world_from_camera, width, height).reshape(-1, 3) * FAR_M + eye
+        hidden = behind_boxes(far, eye, boxes[valid & unknown]).reshape(height, width)
+    depth = None
+    if settings.depth_weight > 0.0:
+        labels = np.full(len(static), BACKGROUND, np.int32)
+        depth, _ = sparse_depth(static, labels, photo.intrinsics, photo.world_from_camera, width, height)
+    return Shot(photo, target_of(photo.rgb, hidden), depth)
+
+
+def _first_state(
+    background: Gaussians,
+    nodes: Sequence[Gaussians | None],
+    sky: F32,
+    train: Sequence[Photo],
+    road: Road | None,
+    settings: FitSettings,
+) -> FitState:
+    """Tracks keep all their discs; of the background's as many as are wanted, each as much larger."""
+    rng = np.random.Generator(np.random.Philox(key=[settings.seed, 2**33]))
+    parts = [_thinned(background, settings.start_gaussians, rng)] + [node for node in nodes if node is not None]
+    owner = [np.full(len(parts[0]), BACKGROUND)] + [np.full(len(n), j) for j, n in enumerate(nodes) if n is not None]
+    start = concatenate(parts)
+    owners = np.concatenate(owner).astype(np.int32)
+    on_road = np.zeros(len(start), bool)
+    if road is not None:
+        with np.errstate(invalid="ignore"):
+            flat = np.abs(rotations_of(start.quats)[:, 2, 2]) > UPRIGHT
+            on_road = (np.abs(above_road(start.means, road)) < ROAD_TOP_M) & flat & (owners == BACKGROUND)
+        lay_flat(
+            start.means,
+            start.quats,
+            start.log_scales,
+            np.flatnonzero(on_road),
+            road,
+            settings.road_slack,
+            settings.road_thickness,
+        )
+    opacities = np.full((len(start), 1), settings.start_opacity, np.float32)
+    learned = {
+        "means": Learned.of(start.means),
+        "quats": Learned.of(start.quats),
+        "log_scales": Learned.of(start.log_scales),
+        "logits": Learned.of(logits_of(opacities)),
+        "colours": Learned.of(start.colours),
+        "sh_rest": Learned.of(np.zeros((len(start), 3 * sh.COUNTS[settings.sh_degree]))),
+        "sky": Learned.of(sky.reshape(-1, 3)),
+        "exposure": Learned.of(np.zeros((len(train), exposure.SIZE))),
+        "poses": Learned.of(np.zeros((len(train), poses.SIZE))),
+    }
+    nearest = np.full(len(start), np.inf, np.float32)
+    return FitState(0, learned, owners, on_road, nearest, np.zeros(len(start), np.float32))
+
+
+def _thinned(gaussians: Gaussians, n: int, rng: np.random.Generator) -> Gaussians:
+    if len(gaussians) <= n:
+        return gaussians
+    rows = np.sort(rng.choice(len(gaussians), n, replace=False))
+    kept = gaussians.take(rows)
+    larger = np.array([0.5, 0.5, 0.0], np.float32) * np.log(len(gaussians) / n)
+    return replace(kept, log_scales=(kept.log_scales + larger).astype(np.float32))

@@ -1,0 +1,109 @@
+"""Exposure, poses, sky: what is learned about the photos beside the street."""
+
+import numpy as np
+import pytest
+
+from tasks.render.fit.backdrop import backdrop, backdrop_gradient
+from tasks.render.fit.exposure import affine_between, aligned, exposed, exposed_gradient
+from tasks.render.fit.poses import between, corrected, motion
+from tasks.render.fit.schedule import decayed, photo_at
+from tasks.render.gaussians import Gaussians
+from tasks.render.gradient import backward
+from tasks.render.raster import trace
+from tasks.render.sky import COLUMNS, ROWS, SkyMap
+
+RNG = np.random.default_rng(3)
+K = np.array([[20.0, 0.0, 10.0], [0.0, 20.0, 8.0], [0.0, 0.0, 1.0]])
+SIZE = (20, 16)
+
+
+def test_exposure_gradient_agrees_with_finite_differences() -> None:
+    rgb, upstream = RNG.uniform(0, 1, (4, 5, 3)), RNG.normal(size=(4, 5, 3)).astype(np.float32)
+    row = RNG.normal(0.0, 0.1, 12).astype(np.float32)
+    d_rgb, d_row = exposed_gradient(rgb.astype(np.float32), row, upstream)
+    for k in range(12):
+        step = np.zeros(12, np.float32)
+        step[k] = 0.01
+        both = [exposed(rgb.astype(np.float32), row + sign * step).astype(np.float64) for sign in (1, -1)]
+        assert d_row[k] == pytest.approx(((both[0] - both[1]) * upstream).sum() / 0.02, rel=1e-3, abs=1e-3)
+    moved = exposed((rgb + 0.01 * d_rgb).astype(np.float32), row) - exposed(rgb.astype(np.float32), row)
+    assert (moved * upstream).sum() == pytest.approx(0.01 * (d_rgb**2).sum(), rel=1e-3)
+
+
+def test_an_affine_colour_is_found_again() -> None:
+    row = np.array([0.1, 0.02, 0.0, 0.0, -0.1, 0.03, 0.0, 0.0, 0.05, 0.02, 0.0, -0.03], np.float32)
+    source = RNG.uniform(0, 1, (500, 3)).astype(np.float32)
+    np.testing.assert_allclose(affine_between(source, exposed(source, row), 1e-6), row, atol=1e-3)
+    assert not affine_between(np.zeros((0, 3)), np.zeros((0, 3))).any()
+
+
+def test_cameras_of_an_instant_agree_on_shared_lidar_points_after_alignment() -> None:
+    truth = RNG.uniform(0.2, 0.8, (300, 3))
+    seen = np.zeros((3, 300), bool)
+    seen[0, :200], seen[1, 100:] = True, True  # the third shares nothing
+    colours = np.stack([truth * 0.9, truth * 1.1 + 0.02, truth])
+    rows = aligned(colours, seen)
+    now = [exposed(c.astype(np.float32), row) for c, row in zip(colours, rows)]
+    before = np.abs(colours[0] - colours[1])[100:200].mean()
+    assert np.abs(now[0] - now[1])[100:200].mean() < 0.1 * before
+    assert not rows[2].any()
+
+
+def test_a_motion_is_rigid_and_small_ones_add_up() -> None:
+    row = np.array([0.1, -0.2, 0.3, 0.4, -0.5, 0.6])
+    np.testing.assert_allclose(motion(row)[:3, :3] @ motion(row)[:3, :3].T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(motion(1e-4 * row) @ motion(1e-4 * row), motion(2e-4 * row), atol=1e-7)
+    np.testing.assert_array_equal(motion(np.zeros(6)), np.eye(4))
+
+
+def test_the_rasterisers_camera_gradient_is_that_of_a_pose_row() -> None:
+    n = 30
+    depth = RNG.uniform(3.0, 9.0, n)
+    means = np.stack([RNG.uniform(-0.3, 0.3, n) * depth, RNG.uniform(-0.3, 0.3, n) * depth, depth], 1)
+    scene = Gaussians(
+        means.astype(np.float32),
+        np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
+        np.full((n, 3), np.log(0.5), np.float32),
+        np.full(n, 0.4, np.float32),
+        RNG.uniform(0, 1, (n, 3)).astype(np.float32),
+    )
+    upstream = np.ones((SIZE[1], SIZE[0], 3), np.float32) * np.linspace(-1, 1, SIZE[0], dtype=np.float32)[None, :, None]
+
+    def value(row: np.ndarray) -> float:
+        view = trace(scene, K, corrected(np.eye(4), row), *SIZE, np.zeros(3, np.float32)).view
+        return float((view.rgb.astype(np.float64) * upstream).sum())
+
+    slopes = backward(trace(scene, K, np.eye(4), *SIZE, np.zeros(3, np.float32)), scene, upstream).camera
+    for axis in (0, 4):  # to the right, and turned about the vertical: what the upstream looks at
+        step = np.zeros(6)
+        step[axis] = 1e-3
+        assert slopes[axis] == pytest.approx((value(step) - value(-step)) / 2e-3, rel=0.05)
+
+
+def test_between_two_photos_a_correction_is_the_mean_of_theirs() -> None:
+    rows = np.array([[2.0, 0.0], [0.0, 4.0]], np.float32)
+    np.testing.assert_allclose(between(np.array([1.0, 0.0]), rows, 0.5), [1.0, 2.0])
+    np.testing.assert_allclose(between(np.array([1.0, 0.0]), rows, 7.0), rows[0])
+
+
+def test_the_learned_sky_is_looked_up_as_the_stored_one_is() -> None:
+    cells = RNG.uniform(0, 1, (ROWS, COLUMNS, 3)).astype(np.float32)
+    pose = motion(np.array([1.0, 2.0, 3.0, 0.3, -2.9, 0.2]))
+    seen = backdrop(cells.reshape(-1, 3), K, pose, *SIZE)
+    np.testing.assert_allclose(seen, SkyMap(cells).seen_by(K, pose, *SIZE), atol=1e-5)
+    upstream = RNG.normal(size=seen.shape).astype(np.float32)
+    rows, gradient = backdrop_gradient(upstream, K, pose)
+    # The look-up is linear: <upstream, backdrop(cells)> = <gradient, cells>.
+    assert float((gradient * cells.reshape(-1, 3)[rows]).sum()) == pytest.approx(
+        float((upstream * seen).sum()), rel=1e-3
+    )
+
+
+def test_every_photo_is_looked_at_once_a_round() -> None:
+    looked = [photo_at(i, 7, 5) for i in range(21)]
+    assert [sorted(looked[k : k + 7]) for k in (0, 7, 14)] == [list(range(7))] * 3
+    assert looked[:7] != looked[7:14]
+
+
+def test_rates_fall_exponentially() -> None:
+    assert [decayed(2.0, 0.01, p) for p in (0.0, 0.5, 1.0)] == pytest.approx([2.0, 0.2, 0.02])

@@ -1,0 +1,113 @@
+"""The loop, on a few small photos of the closed-form street."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import street
+
+from tasks.render.asset import psnr
+from tasks.render.engine import Pinhole, Vehicles, render
+from tasks.render.fit.reconstruct import advance, finish, picture_of, reconstruct
+from tasks.render.fit.settings import FitSettings
+from tasks.render.fit.start import Problem, prepare
+from tasks.render.fit.state import FitState
+from tasks.render.sensed import Photo, Sweep
+from tasks.world.agents import AgentKind
+
+SETTINGS = FitSettings(
+    iterations=24,
+    start_gaussians=1500,
+    most_gaussians=1700,
+    refine_every=6,
+    refine_from=6,
+    pose_from=4,
+    stereo_photos=1,
+    threads=1,
+)
+
+
+def few() -> tuple[list[Photo], list[Sweep]]:
+    """Every other row and column of five photos."""
+    photos, sweeps = street.drive(5)
+    half = np.diag([0.5, 0.5, 1.0])
+    small = [replace(p, rgb=np.ascontiguousarray(p.rgb[::2, ::2]), intrinsics=half @ p.intrinsics) for p in photos]
+    return small, sweeps[::2]
+
+
+@pytest.fixture(scope="module")
+def prepared() -> tuple[Problem, FitState]:
+    photos, sweeps = few()
+    return prepare(photos, sweeps, street.tracks(), SETTINGS, held_out=[2])
+
+
+def fresh(state: FitState) -> FitState:
+    return FitState.from_arrays(state.arrays())
+
+
+def test_a_held_out_photo_comes_out_better_with_every_round(prepared: tuple[Problem, FitState]) -> None:
+    problem, state = prepared[0], fresh(prepared[1])
+    shot = problem.held_out[0]
+    scores = []
+    for until in (0, 8, 24):
+        advance(problem, state, SETTINGS, until)
+        scores.append(psnr(picture_of(problem, state, shot.photo), shot.target.rgb))
+    assert scores[1] > scores[0] + 1.0
+    assert scores[2] > scores[1]
+    assert len(state) > len(prepared[1])
+    assert finish(problem, state, SETTINGS).psnr_db == pytest.approx(scores[2])
+
+
+def test_a_fit_that_was_stored_and_resumed_equals_the_uninterrupted_one_bit_for_bit(
+    prepared: tuple[Problem, FitState],
+) -> None:
+    problem = prepared[0]
+    straight, broken = fresh(prepared[1]), fresh(prepared[1])
+    advance(problem, straight, SETTINGS, 15)
+    for until in (1, 7, 15):
+        broken = FitState.from_arrays(broken.arrays())
+        advance(problem, broken, SETTINGS, until)
+    assert straight.arrays().keys() == broken.arrays().keys()
+    for name, array in straight.arrays().items():
+        np.testing.assert_array_equal(array, broken.arrays()[name], err_msg=name)
+
+
+def test_the_number_of_threads_changes_no_bit(prepared: tuple[Problem, FitState]) -> None:
+    one, two = fresh(prepared[1]), fresh(prepared[1])
+    advance(prepared[0], one, SETTINGS, 8)
+    advance(prepared[0], two, replace(SETTINGS, threads=2), 8)
+    for name, array in one.arrays().items():
+        np.testing.assert_array_equal(array, two.arrays()[name], err_msg=name)
+
+
+def test_a_car_is_learned_in_its_own_box_and_can_be_put_elsewhere(prepared: tuple[Problem, FitState]) -> None:
+    problem, state = prepared[0], fresh(prepared[1])
+    start = state.learned["colours"].values[state.owner == 0].copy()
+    advance(problem, state, replace(SETTINGS, refine_from=1000), 12)
+    assert not np.array_equal(start, state.learned["colours"].values[state.owner == 0])
+    asset = finish(problem, state, SETTINGS)
+    box = street.car_box(0.0)
+    box[:2] = 14.0, -2.0
+    photo = problem.train[0].photo
+    pose = photo.world_from_camera.copy()
+    pose[:3, 3] += problem.origin
+    moved = Vehicles(("car",), (AgentKind.VEHICLE,), box[None])
+    picture = render(asset, [Pinhole(photo.intrinsics, pose, 64, 36)], moved)[0].rgb
+    u = int(50 * (1.0 * 2.0 / 12.0) + 32)  # 2 m to the right, 12 m ahead of the camera
+    red, green, _ = picture[19:22, u - 1 : u + 2].mean(axis=(0, 1))
+    assert red > 2.0 * green
+
+
+def test_road_gaussians_stay_on_the_road(prepared: tuple[Problem, FitState]) -> None:
+    problem, state = prepared[0], fresh(prepared[1])
+    advance(problem, state, SETTINGS, 12)
+    heights = state.learned["means"].values[state.road, 2]
+    assert state.road.sum() > 100
+    assert np.abs(heights + problem.origin[2]).max() < SETTINGS.road_slack + 0.01
+
+
+def test_progress_is_told_and_photos_are_needed() -> None:
+    with pytest.raises(ValueError, match="none to learn from"):
+        reconstruct([], [], None, SETTINGS)
+    with pytest.raises(ValueError, match="iterations"):
+        FitSettings(iterations=0)
