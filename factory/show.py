@@ -5,9 +5,12 @@
     python -m factory.show out=runs/demo sample=0         one sample: numbers, and a picture in the current folder
     python -m factory.show out=runs/demo sample=3fa9      the same by its id, or the beginning of it
     python -m factory.show out=runs/demo sample=0 to=x.png    ... the picture there (a folder, or a file ending in .png)
+    python -m factory.show out=runs/demo sample=0 film=true   ... and a film of it beside the picture (.mp4)
     python -m factory.show out=runs/av2 sample=0 vocabulary=human.npy   ... with every labelled trajectory by its score
     python -m factory.show out=runs/demo failed=true      failed attempts: file, field, message, how to retry
 
+Where the block's scene is still in the run's cache, a sample's picture also shows the log's photos, the scene from the
+same poses, and the sample's now as seen from up to 2 m to either side.
 Exit codes: 0 shown, 2 bad arguments, or nothing there to show.
 """
 
@@ -24,7 +27,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from factory.look.seen_again import Seen
     from factory.store.samples import Store
+    from tasks.render.asset import RenderAsset
 
 BAD_ARGUMENTS = 2
 EXIT_WORDS = {0: "complete", 3: "complete with failed attempts", 4: "interrupted, the same command goes on"}
@@ -49,6 +54,7 @@ class Request:
     failed: bool = False
     list: bool = False
     to: str | None = None
+    film: bool = False
     vocabulary: str | None = None  # .npy that the labels are of; without it the kinematic one, where they are of that
 
 
@@ -85,6 +91,8 @@ def parse(argv: Sequence[str]) -> Request:
         raise Refused("choose one of sample=, failed=true and list=true")
     if request.to is not None and request.sample is None:
         raise Refused("to= says where the picture of sample= goes; give sample= too")
+    if request.film and request.sample is None:
+        raise Refused("film=true is of sample=; give sample= too")
     if request.vocabulary is not None and request.sample is None:
         raise Refused("vocabulary= is drawn in the picture of sample=; give sample= too")
     return request
@@ -205,6 +213,7 @@ def failed_lines(store: "Store") -> Iterable[str]:
 def sample_lines(store: "Store", attempt_id: str, request: Request) -> Iterable[str]:
     """One sample's numbers; writes its picture and says where it is."""
     from factory.look.sample_picture import encoded, sample_sheet
+    from factory.look.seen_again import again_sheet, digest_of, film, scene_of, stacked
     from factory.store.reader import SampleTable
 
     try:
@@ -215,13 +224,36 @@ def sample_lines(store: "Store", attempt_id: str, request: Request) -> Iterable[
     drawn = labelled_trajectories(row, request.vocabulary)
     yield from _numbers(row)
     yield from _label_lines(row, drawn is not None)
-    picture = encoded(sample_sheet(row, logged_drive(store, row), vocabulary=drawn), ".png")
+    logged = logged_drive(store, row)
+    sheets = [sample_sheet(row, logged, vocabulary=drawn)]
+    digest = digest_of(store, row)
+    scene = None if digest is None else scene_of(store, digest)
+    if digest is not None and scene is None:
+        yield f"              scene {digest} is not in the run's cache: nothing is rendered anew"
+    if scene is not None and (again := again_sheet(*seen_again(store, row, scene))) is not None:
+        sheets.append(again)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(picture)
+        path.write_bytes(encoded(stacked(sheets), ".png"))
+        yield f"picture       {path.resolve()}"
+        if request.film:
+            from factory.look.video import write_mp4
+
+            write_mp4(path.with_suffix(".mp4"), film(row, scene, logged))
+            yield f"film          {path.with_suffix('.mp4').resolve()}"
     except OSError as error:
         raise Refused(f"to={request.to}: the picture cannot be written: {error}") from error
-    yield f"picture       {path.resolve()}"
+
+
+def seen_again(
+    store: "Store", row: dict[str, Any], scene: "RenderAsset"
+) -> "tuple[list[tuple[Seen, Seen]], list[Seen]]":
+    """The log's photos nearest in time with their renderings, and the row's now from the side."""
+    from factory.look.seen_again import from_the_side, photographed, real_and_rendered
+
+    photos = photographed(store, row, scene)
+    pairs = [] if photos is None else real_and_rendered(scene, photos, row["clip_start_s"] + row["now_s"])
+    return pairs, from_the_side(scene, row)
 
 
 def labelled_trajectories(row: dict[str, Any], file: str | None) -> "NDArray[np.float64] | None":

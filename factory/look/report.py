@@ -30,6 +30,7 @@ from factory.look.sample_picture import (
     images_at_now,
     sample_bev,
 )
+from factory.look.seen_again import VIEW_COLUMNS, Seen, from_the_side, photographed, real_and_rendered, scene_of
 from factory.pipeline import FactoryWork, PerturbedClip
 from factory.settings import Run
 from factory.steps import cache_key
@@ -39,6 +40,7 @@ from factory.store.reader import SampleTable
 from factory.store.samples import Store
 from factory.work import HUMAN, PreparedClip
 from tasks.perturb import PerturbSettings
+from tasks.render.settings import ImageSource
 from tasks.world.clip import NOW
 from tasks.world.vehicle import HEADING
 
@@ -240,7 +242,7 @@ def _strips(store: Store, labels: Sequence[Row]) -> list[Strip]:
     order = spread(pictured, lambda r: (r["image_source"], r["expert"], r["clip_id"]), lambda r: str(r["attempt_id"]))
     strips = []
     for row in order[:N_STRIPS]:
-        sample = table.sample(row["attempt_id"], ("cameras", "images", "image_source"))
+        sample = table.sample(row["attempt_id"], VIEW_COLUMNS)
         front = front_camera(sample)
         earlier = earlier_images(sample, front) if front is not None else []
         strips.append(
@@ -249,9 +251,27 @@ def _strips(store: Store, labels: Sequence[Row]) -> list[Strip]:
                 row["image_source"],
                 tuple(_frame(image, CAMERA_PX) for image in images_at_now(sample)),
                 tuple(_frame(image, CAMERA_PX // 2) for image in earlier) if len(earlier) > 1 else (),
+                *(_seen_again(store, sample) if row["image_source"] == ImageSource.RENDER else ()),
             )
         )
     return strips
+
+
+def _seen_again(store: Store, sample: Row) -> tuple[tuple[Picture, ...], tuple[Picture, ...]]:
+    """Photos with their renderings, and now from the side; nothing where the scene is not at hand."""
+    scene = scene_of(store, str(sample["asset_digest"]))
+    if scene is None:
+        return (), ()
+    photos = photographed(store, sample, scene)
+    now_s = sample["clip_start_s"] + sample["now_s"]
+    pairs = [] if photos is None else real_and_rendered(scene, photos, now_s, (front_camera(photos) or "",))
+    shown = [seen for pair in pairs for seen in pair]
+    return tuple(_again(seen) for seen in shown), tuple(_again(seen) for seen in from_the_side(scene, sample))
+
+
+def _again(seen: Seen) -> Picture:
+    height = round(CAMERA_PX * seen.pixels.shape[0] / seen.pixels.shape[1])
+    return Picture(encoded(fitted(seen.pixels, CAMERA_PX, height)), seen.caption)
 
 
 def _frame(image: Mapping[str, Any], width: int) -> Picture:

@@ -13,46 +13,11 @@ from factory.funnel import Funnel, FunnelRow
 from factory.look.report_html import Html, bar, count_bar, el, nothing, number, table
 from factory.look.report_plot import FATES, EndPoint, fate_mark, scatter
 from factory.look.report_style import STYLE
+from factory.look.report_words import GATE_WORDS, REASON_WORDS
 from tasks.perturb import PerturbSettings
 
 # Paper (DESIGN.md, "words"): clips with a sample of the round, in % of those with one of the round before.
 PAPER_CLIP_PERCENT = {"pdm_closed": (63, 85, 83, 83, 84), "recovery": (43, 80, 78, 78, 78)}
-REASON_WORDS = {
-    "nc": "collision at fault",
-    "dac": "left the drivable area",
-    "ddc": "against the driving direction",
-    "tlc": "ran a red light",
-    "ep": "too little progress",
-    "ttc": "time to collision",
-    "lk": "lane keeping",
-    "hc": "uncomfortable against the history",
-    "no_plan": "the expert found no plan",
-    "route_ended": "no route is left to drive along",
-    "psnr": "block reconstructed too poorly",
-    "holes": "rendered where nothing was seen",
-    "lens_covered": "something covers the lens",
-    "blank": "nothing to be seen on a picture",
-    "blurred": "a picture without detail",
-    "ego_standing": "ego stands",
-    "broken_tracks": "broken tracks",
-    "no_gated_candidate": "no trajectory passes the gates",
-    "no_good_candidate": "no trajectory scores well enough",
-    "input": "input is broken",
-    "bug": "the code raised",
-    "system": "machine trouble",
-    "poison": "machine trouble again and again",
-}
-GATE_WORDS = {
-    "raw_longitudinal": "raw end pose too far along",
-    "raw_lateral": "raw end pose too far aside",
-    "raw_heading": "raw end pose turned too far",
-    "reached_longitudinal": "reached end pose too far along",
-    "reached_lateral": "reached end pose too far aside",
-    "reached_heading": "reached end pose turned too far",
-    "white_cell": "in a cell the grid leaves out",
-    "replay_score": "scored too low against log replay",
-    "reactive_score": "scored too low among reacting agents",
-}
 MAX_POINTS = 4000  # in the scatter; more would make the file heavy and show nothing new
 
 
@@ -74,6 +39,8 @@ class Strip:
     source: str
     now: tuple[Picture, ...]
     earlier: tuple[Picture, ...] = ()
+    photos: tuple[Picture, ...] = ()  # the log's, each followed by the scene seen from its pose
+    aside: tuple[Picture, ...] = ()  # the same instant from beside the ego
 
 
 @dataclass(frozen=True)
@@ -301,13 +268,22 @@ def _frames(report: Report) -> Html:
             "div",
             el("h3", strip.title, " ", el("span", strip.source, class_="pill plain")),
             el("div", *(_figure(p) for p in strip.now), class_="cams"),
-            *([el("div", *(_figure(p) for p in strip.earlier), class_="cams small")] if strip.earlier else []),
+            *_row("", strip.earlier, "cams small"),
+            *_row("Photo and rendering of the same pose", strip.photos, "cams"),
+            *_row("The same instant from the side", strip.aside, "cams small"),
             class_="strip",
         )
         for strip in report.strips
     ]
     content = strips or [nothing("No sample of this store has images.")]
     return _section("Camera frames", words, el("p", f"image_source: {counts or 'no samples'}", class_="note"), *content)
+
+
+def _row(title: str, pictures: Sequence[Picture], style: str) -> list[Html]:
+    if not pictures:
+        return []
+    head = [el("p", title, class_="note")] if title else []
+    return [*head, el("div", *(_figure(p) for p in pictures), class_=style)]
 
 
 def _figure(picture: Picture) -> Html:

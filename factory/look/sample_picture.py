@@ -1,6 +1,6 @@
 """Pictures of stored samples, from the row alone: the world from above, and what the cameras saw."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import cv2
@@ -19,6 +19,7 @@ Row = Mapping[str, Any]
 
 BEV_COLUMNS = (
     "now_pose",
+    "ego_history_10hz",
     "parent_states",
     "label_10hz",
     "perturbed_states",
@@ -40,21 +41,24 @@ MOST_LINES = 800  # of a vocabulary: more would hide the map
 
 
 def sample_bev(
-    row: Row, logged: Array | None = None, size_px: tuple[int, int] = (480, 480), vocabulary: Array | None = None
+    row: Row,
+    logged: Array | None = None,
+    size_px: tuple[int, int] = (480, 480),
+    vocabulary: Array | None = None,
+    step: int = NOW_INDEX,
 ) -> Image:
-    """A sample from above at its now, the ego pointing up.
+    """A sample from above, at its now or another step, the ego pointing up.
 
     Args:
         row: at least BEV_COLUMNS of a sample.
         logged: (M, >=3) the log's drive from T on, world frame; None: the row's own two logged poses are joined.
         size_px: width, height.
         vocabulary: (K, 40, 3) the trajectories that the row's labels are of, to be drawn in the colour of their score.
+        step: index of the row's 10 Hz steps, -1.5 .. 4.0 s around now.
     """
     lanes = dict(zip(row["lane_ids"], row["lane_polygons"]))
     red = {
-        lane_id
-        for lane_id, states in zip(row["light_lane_ids"], row["light_states"])
-        if states[NOW_INDEX] == LightState.RED
+        lane_id for lane_id, states in zip(row["light_lane_ids"], row["light_states"]) if states[step] == LightState.RED
     }
     shapes = MapShapes(
         roads=row["drivable_rings"],
@@ -64,9 +68,14 @@ def sample_bev(
         red=[lanes[i] for i in sorted(red) if i in lanes],
     )
     boxes = np.asarray(row["agent_boxes"], dtype=float).reshape(len(row["agent_kinds"]), -1, 5)
-    here = np.zeros(3)
+    here = ego_way(row)[step]
     paths = [*(_scored_paths(row, vocabulary) if vocabulary is not None else ()), *_paths(row, logged)]
-    return draw_bev(here, shapes, Boxes(boxes[:, NOW_INDEX], row["agent_kinds"]), here, paths, "", size_px)
+    return draw_bev(here, shapes, Boxes(boxes[:, step], row["agent_kinds"]), here, paths, "", size_px)
+
+
+def ego_way(row: Row) -> Array:
+    """(56, 3) poses at 10 Hz, -1.5 .. 4.0 s around now, in the ego frame at now: what led here, then the label."""
+    return np.concatenate([row["ego_history_10hz"], row["label_10hz"]]).astype(np.float64)
 
 
 def _scored_paths(row: Row, vocabulary: Array) -> list[Path]:
@@ -155,31 +164,41 @@ def encoded(image: Image, suffix: str = ".jpg") -> bytes:
 
 def sample_sheet(row: Row, logged: Array | None = None, bev_px: int = 720, vocabulary: Array | None = None) -> Image:
     """Top-down view and all cameras at now, side by side; up to three cameras in one column, more in two."""
-    tiles = [_tile(image) for image in images_at_now(row)] or [
-        _note(f"no images: image_source is {row['image_source']}")
+    tiles = [_stored(image) for image in images_at_now(row)] or [
+        note(f"no images: image_source is {row['image_source']}")
     ]
-    columns = 1 if len(tiles) <= 3 else 2
-    tiles += [np.full_like(tiles[0], BACKGROUND)] * (-len(tiles) % columns)
-    rows = [np.concatenate(tiles[i : i + columns], axis=1) for i in range(0, len(tiles), columns)]
-    strip = np.concatenate(rows, axis=0)
-    height = max(bev_px, strip.shape[0])
-    bev = sample_bev(row, logged, (bev_px, bev_px), vocabulary)
-    return np.concatenate([_padded(bev, height), _padded(strip, height)], axis=1)
+    return beside(sample_bev(row, logged, (bev_px, bev_px), vocabulary), tiles)
 
 
-def _tile(image: Mapping[str, Any]) -> Image:
-    """One camera over its caption, with a margin."""
+def beside(bev: Image, tiles: Sequence[Image]) -> Image:
+    """A top-down view and tiles to the right of it, in one column up to three, else in two."""
+    strip = in_rows(tiles, 1 if len(tiles) <= 3 else 2)
+    height = max(bev.shape[0], strip.shape[0])
+    return np.concatenate([padded(bev, height), padded(strip, height)], axis=1)
+
+
+def in_rows(tiles: Sequence[Image], columns: int) -> Image:
+    """Tiles of one size, row by row, the last row filled up with background."""
+    whole = [*tiles, *([np.full_like(tiles[0], BACKGROUND)] * (-len(tiles) % columns))]
+    return np.concatenate([np.concatenate(whole[i : i + columns], axis=1) for i in range(0, len(whole), columns)])
+
+
+def _stored(image: Mapping[str, Any]) -> Image:
     try:
-        pixels = decoded(image)
+        return tile(decoded(image), f"{image['camera']}  {image['time_s']:+.1f} s")
     except ValueError as error:
-        return _note(str(error))
-    tile = fitted(pixels, TILE_PX[0] - 8, TILE_PX[1] - CAPTION_PX - 4)
-    framed = np.full((TILE_PX[1], TILE_PX[0], 3), BACKGROUND, np.uint8)
-    framed[4:-CAPTION_PX, 4:-4] = tile
-    return _written(framed, f"{image['camera']}  {image['time_s']:+.1f} s", TILE_PX[1] - 7)
+        return note(str(error))
 
 
-def _note(text: str) -> Image:
+def tile(pixels: Image, caption: str, size_px: tuple[int, int] = TILE_PX) -> Image:
+    """A picture over its caption, with a margin; `size_px` width, height."""
+    framed = np.full((size_px[1], size_px[0], 3), BACKGROUND, np.uint8)
+    framed[4:-CAPTION_PX, 4:-4] = fitted(pixels, size_px[0] - 8, size_px[1] - CAPTION_PX - 4)
+    return _written(framed, caption, size_px[1] - 7)
+
+
+def note(text: str) -> Image:
+    """A tile of words."""
     return _written(np.full((TILE_PX[1], TILE_PX[0], 3), BACKGROUND, np.uint8), text[:60], TILE_PX[1] // 2)
 
 
@@ -188,6 +207,7 @@ def _written(tile: Image, text: str, baseline: int) -> Image:
     return tile
 
 
-def _padded(image: Image, height: int) -> Image:
+def padded(image: Image, height: int) -> Image:
+    """The image with background below."""
     below = np.full((height - image.shape[0], image.shape[1], 3), BACKGROUND, np.uint8)
     return np.concatenate([image, below], axis=0)

@@ -1,0 +1,38 @@
+"""What reasons and gates are called on the page."""
+
+REASON_WORDS = {
+    "nc": "collision at fault",
+    "dac": "left the drivable area",
+    "ddc": "against the driving direction",
+    "tlc": "ran a red light",
+    "ep": "too little progress",
+    "ttc": "time to collision",
+    "lk": "lane keeping",
+    "hc": "uncomfortable against the history",
+    "no_plan": "the expert found no plan",
+    "route_ended": "no route is left to drive along",
+    "psnr": "block reconstructed too poorly",
+    "holes": "rendered where nothing was seen",
+    "lens_covered": "something covers the lens",
+    "blank": "nothing to be seen on a picture",
+    "blurred": "a picture without detail",
+    "ego_standing": "ego stands",
+    "broken_tracks": "broken tracks",
+    "no_gated_candidate": "no trajectory passes the gates",
+    "no_good_candidate": "no trajectory scores well enough",
+    "input": "input is broken",
+    "bug": "the code raised",
+    "system": "machine trouble",
+    "poison": "machine trouble again and again",
+}
+GATE_WORDS = {
+    "raw_longitudinal": "raw end pose too far along",
+    "raw_lateral": "raw end pose too far aside",
+    "raw_heading": "raw end pose turned too far",
+    "reached_longitudinal": "reached end pose too far along",
+    "reached_lateral": "reached end pose too far aside",
+    "reached_heading": "reached end pose turned too far",
+    "white_cell": "in a cell the grid leaves out",
+    "replay_score": "scored too low against log replay",
+    "reactive_score": "scored too low among reacting agents",
+}
