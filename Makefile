@@ -4,7 +4,7 @@ VENV   := .venv
 PY     := $(VENV)/bin/python
 DEMO   := runs/demo
 
-.PHONY: install demo test unit lint format bench bench-reward clean
+.PHONY: install demo test unit lint format bench bench-reward bench-render clean
 
 install: $(VENV)/.installed
 
@@ -42,6 +42,10 @@ bench: install
 
 bench-reward: install
 	OMP_NUM_THREADS=1 $(PY) -m tests.bench.bench_reward
+
+# SCENE=<file> adds the row of a scene that a reconstruction wrote.
+bench-render: install
+	$(PY) -m tests.bench.bench_render $(SCENE)
 
 clean:
 	rm -rf $(VENV) runs build *.egg-info
