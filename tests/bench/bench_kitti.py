@@ -78,6 +78,7 @@ def main() -> None:
     root, options = Path(sys.argv[1]), dict(option.split("=", 1) for option in sys.argv[2:])
     out = Path(options.pop("out", "out/bench_kitti"))
     validate = options.pop("validate", "0") == "1"
+    threads = int(options.pop("threads", "2"))
     kinds = {field.name: type(getattr(FitSettings(), field.name)) for field in fields(FitSettings)}
     settings = replace(FitSettings(), **{k: kinds[k](float(v)) for k, v in options.items()})
     out.mkdir(parents=True, exist_ok=True)
@@ -86,12 +87,12 @@ def main() -> None:
     frames = [f for f in range(len(drive.times_s)) if not (validate and f % 8 == 4)]
     held_out = [i for i, f in enumerate(frames) if f % 8 == (0 if validate else 4)]
     started = time.perf_counter()
-    problem, state = prepare(drive.photos("image_02", frames), drive.fused(), None, settings, held_out)
+    problem, state = prepare(drive.photos("image_02", frames), drive.fused(), None, settings, held_out, threads)
     prepared = time.perf_counter()
 
     def told(iteration: int, loss: float, score: float) -> None:
         if iteration % 500 == 0:
-            now = [picture_of(problem, state, s.photo, settings.threads) for s in problem.held_out]
+            now = [picture_of(problem, state, s.photo, threads) for s in problem.held_out]
             seconds = time.perf_counter() - prepared
             held = scores(now, [s.photo for s in problem.held_out])
             print(
@@ -99,10 +100,10 @@ def main() -> None:
                 flush=True,
             )
 
-    advance(problem, state, settings, settings.iterations, told)
+    advance(problem, state, settings, settings.iterations, told, threads)
     fitted = time.perf_counter()
     np.savez(out / "state.npz", **state.arrays())
-    asset = finish(problem, state, settings)
+    asset = finish(problem, state, threads)
 
     local = [
         replace(p, world_from_camera=shifted(p.world_from_camera, -problem.origin))
@@ -112,7 +113,7 @@ def main() -> None:
         replace(p, world_from_camera=shifted(p.world_from_camera, -problem.origin))
         for p in drive.photos("image_03", frames)
     ]
-    beside = Beside(problem, state, {p.time_s: p.world_from_camera for p in local}, settings.threads)
+    beside = Beside(problem, state, {p.time_s: p.world_from_camera for p in local}, threads)
     test = [right[i] for i in held_out]
     train = [p for i, p in enumerate(right) if i not in held_out]
     chosen = [train[i] for i in np.linspace(0, len(train) - 1, FITTED_FRAMES).astype(int)]
@@ -122,7 +123,7 @@ def main() -> None:
     turned = [exposed(beside.picture(p, row), colour) for p in test]
 
     print(f"| {settings.iterations} iterations | held-out PSNR [dB] / SSIM |\n|---|---|")
-    own = [picture_of(problem, state, s.photo, settings.threads) for s in problem.held_out]
+    own = [picture_of(problem, state, s.photo, threads) for s in problem.held_out]
     print(f"| image_02 | {scores(own, [s.photo for s in problem.held_out])} |")
     print(f"| image_03 raw | {scores(raw, test)} |")
     print(f"| image_03 affine | {scores([np.clip(exposed(p, plain), 0, 1) for p in raw], test)} |")

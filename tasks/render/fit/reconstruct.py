@@ -46,24 +46,30 @@ def reconstruct(
     settings: FitSettings,
     progress: Progress | None = None,
     held_out: Collection[int] | None = None,
+    threads: int = 2,
 ) -> RenderAsset:
     """The scene of one block. `agents`: 10 Hz tracks whose first step is time 0 of photos and sweeps.
 
     Whoever wants to stop and go on calls `prepare`, `advance` and `finish`, which this is made of.
     Raises ValueError without photos to train on.
     """
-    problem, state = prepare(photos, sweeps, agents, settings, held_out)
-    advance(problem, state, settings, settings.iterations, progress)
-    return finish(problem, state, settings)
+    problem, state = prepare(photos, sweeps, agents, settings, held_out, threads)
+    advance(problem, state, settings, settings.iterations, progress, threads)
+    return finish(problem, state, threads)
 
 
 def advance(
-    problem: Problem, state: FitState, settings: FitSettings, until: int, progress: Progress | None = None
+    problem: Problem,
+    state: FitState,
+    settings: FitSettings,
+    until: int,
+    progress: Progress | None = None,
+    threads: int = 2,
 ) -> None:
     """Fits on, in place, to iteration `until`. In how many calls the iterations are done makes no difference."""
     losses, scores = [], []
     while state.iteration < min(until, settings.iterations):
-        loss, score = _iterate(problem, state, settings)
+        loss, score = _iterate(problem, state, settings, threads)
         losses.append(loss)
         scores.append(score)
         state.iteration += 1
@@ -75,12 +81,12 @@ def advance(
             losses, scores = [], []
 
 
-def _iterate(problem: Problem, state: FitState, settings: FitSettings) -> tuple[float, float]:
+def _iterate(problem: Problem, state: FitState, settings: FitSettings, threads: int) -> tuple[float, float]:
     row = photo_at(state.iteration, len(problem.train), settings.seed)
     shot = problem.train[row]
     camera = corrected(shot.photo.world_from_camera, state.learned["poses"].values[row])
     scene, parts = compose(problem, state, shot.photo.time_s)
-    seen = _look(state, scene, shot.photo, camera, settings.threads)
+    seen = _look(state, scene, shot.photo, camera, threads)
     colours = state.learned["exposure"].values[row]
     picture = exposed(seen.view.rgb, colours)
     loss, d_picture = photo_loss(picture, shot.target, settings.ssim_weight)
@@ -89,7 +95,7 @@ def _iterate(problem: Problem, state: FitState, settings: FitSettings) -> tuple[
     if shot.lidar_depth is not None:
         off, d_depth = depth_loss(seen.view.depth, shot.lidar_depth, settings.depth_weight)
         loss += off
-    back = backward(seen, scene, d_rgb, d_depth, threads=settings.threads)
+    back = backward(seen, scene, d_rgb, d_depth, threads=threads)
     _step_world(state, settings, row, back, d_colours)
     cells, d_cells = backdrop_gradient(d_rgb * (1.0 - seen.view.alpha)[..., None], shot.photo.intrinsics, camera)
     progress = state.iteration / settings.iterations
@@ -192,13 +198,13 @@ def corrections_at(problem: Problem, state: FitState, camera: str, time_s: float
     return between(times, poses[rows], time_s), between(times, colours[rows], time_s)
 
 
-def finish(problem: Problem, state: FitState, settings: FitSettings) -> RenderAsset:
+def finish(problem: Problem, state: FitState, threads: int = 2) -> RenderAsset:
     """The scene as it is rendered, with the PSNR of the photos held out."""
     every = state.gaussians()
     quats = every.quats / np.linalg.norm(every.quats, axis=1, keepdims=True)
     every = Gaussians(every.means, quats, every.log_scales, every.opacities, every.colours, every.sh_rest)
     nodes = {problem.tracks.ids[j]: every.take(state.owner == j) for j in np.unique(state.owner[state.owner >= 0])}
-    views = tuple(_quality(problem, state, shot, settings.threads) for shot in problem.held_out)
+    views = tuple(_quality(problem, state, shot, threads) for shot in problem.held_out)
     return RenderAsset(
         problem.origin,
         every.take(state.owner == BACKGROUND),

@@ -12,7 +12,6 @@ class FitSettings:
 
     iterations: int = 8000
     seed: int = 0
-    threads: int = 2
     hold_out_every: int = 8  # photo i of a camera with i % n == n // 2 only measures; 0: none is held out
     # Where it starts.
     start_gaussians: int = 90_000
@@ -53,7 +52,7 @@ class FitSettings:
     road_thickness: float = 0.005
 
     def __post_init__(self) -> None:
-        for name in ("iterations", "threads", "start_gaussians", "most_gaussians", "refine_every"):
+        for name in ("iterations", "start_gaussians", "most_gaussians", "refine_every"):
             if getattr(self, name) < 1:
                 raise ValueError(f"fit {name} must be 1 or more, not {getattr(self, name)}")
         if self.sh_degree not in range(4):

@@ -54,8 +54,10 @@ def prepare(
     agents: AgentTracks | None,
     settings: FitSettings,
     held_out: Collection[int] | None = None,
+    threads: int = 2,
 ) -> tuple[Problem, FitState]:
     """The problem and its first state. `held_out`: indices of photos that only measure, else as `settings` says.
+    The number of `threads` changes no bit, here and in all of the fit.
 
     Raises ValueError without photos to train on.
     """
@@ -72,7 +74,7 @@ def prepare(
         gap, n = settings.max_gap_px, settings.stereo_photos
         return [see(p, train, static, per_track, tracks, gap, n) for p in train[first:last]]
 
-    seen = [s for part in in_chunks(look, len(train), 1, settings.threads) for s in part]
+    seen = [s for part in in_chunks(look, len(train), 1, threads) for s in part]
     background, nodes = surfaces(train, seen, tracks)
     eyes = np.stack([p.world_from_camera[:3, 3] for p in train])
     road = find_road(static, eyes) if settings.road else None

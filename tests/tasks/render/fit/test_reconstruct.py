@@ -23,7 +23,6 @@ SETTINGS = FitSettings(
     refine_from=6,
     pose_from=4,
     stereo_photos=1,
-    threads=1,
 )
 
 
@@ -55,7 +54,7 @@ def test_a_held_out_photo_comes_out_better_with_every_round(prepared: tuple[Prob
     assert scores[1] > scores[0] + 1.0
     assert scores[2] > scores[1]
     assert len(state) > len(prepared[1])
-    assert finish(problem, state, SETTINGS).psnr_db == pytest.approx(scores[2])
+    assert finish(problem, state).psnr_db == pytest.approx(scores[2])
 
 
 def test_a_fit_that_was_stored_and_resumed_equals_the_uninterrupted_one_bit_for_bit(
@@ -74,8 +73,8 @@ def test_a_fit_that_was_stored_and_resumed_equals_the_uninterrupted_one_bit_for_
 
 def test_the_number_of_threads_changes_no_bit(prepared: tuple[Problem, FitState]) -> None:
     one, two = fresh(prepared[1]), fresh(prepared[1])
-    advance(prepared[0], one, SETTINGS, 8)
-    advance(prepared[0], two, replace(SETTINGS, threads=2), 8)
+    advance(prepared[0], one, SETTINGS, 8, threads=1)
+    advance(prepared[0], two, SETTINGS, 8, threads=2)
     for name, array in one.arrays().items():
         np.testing.assert_array_equal(array, two.arrays()[name], err_msg=name)
 
@@ -85,7 +84,7 @@ def test_a_car_is_learned_in_its_own_box_and_can_be_put_elsewhere(prepared: tupl
     start = state.learned["colours"].values[state.owner == 0].copy()
     advance(problem, state, replace(SETTINGS, refine_from=1000), 12)
     assert not np.array_equal(start, state.learned["colours"].values[state.owner == 0])
-    asset = finish(problem, state, SETTINGS)
+    asset = finish(problem, state)
     box = street.car_box(0.0)
     box[:2] = 14.0, -2.0
     photo = problem.train[0].photo
