@@ -18,12 +18,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from factory.fitting import fitted
 from factory.scene_file import SUFFIX, BadScene, read_scene, write_scene
 from factory.sensors import block_of, chosen_cameras, load_sensors, load_sweeps, taken_by
 from tasks.render.asset import BlockRange, RenderAsset
 from tasks.render.lidar_only import lidar_asset
 from tasks.render.scene import build_asset
-from tasks.render.settings import RenderSettings
+from tasks.render.settings import RenderSettings, SceneFrom
 from tasks.render.stereo import MAX_BASELINE_M, MIN_BASELINE_M
 from tasks.world.camera import SensorFile
 from tasks.world.clip import Block, Clip
@@ -66,10 +67,10 @@ def _with_parallax(photos: Sequence[SensorFile]) -> float:
     return found / len(photos)
 
 
-def asset_for(clip: Clip, settings: RenderSettings, cache_dir: str | Path) -> RenderAsset | None:
+def asset_for(clip: Clip, settings: RenderSettings, cache_dir: str | Path, threads: int = 1) -> RenderAsset | None:
     """The scene of the clip's block with its digest; None where the clip has nothing to make one from.
 
-    Made of photos and lidar, or of either alone (`sensing`).
+    Made of photos and lidar, or of either alone (`sensing`); the same on any number of threads.
     Raises BadClip where a sensor file is broken, ValueError for a camera the rig does not have.
     """
     block, cameras = block_of(clip), chosen_cameras(clip.cameras, settings.cameras)
@@ -86,7 +87,10 @@ def asset_for(clip: Clip, settings: RenderSettings, cache_dir: str | Path) -> Re
                 log.warning("%s; it is built again", error)
         if made_of is not Sensing.LIDAR_ONLY:
             data = load_sensors(block, cameras, settings.width, settings.height)
-            asset = build_asset(data.photos, data.sweeps, block.agents, settings.asset)
+            if settings.scene is SceneFrom.FIT:
+                asset = fitted(path, data, block.agents, settings.fit, threads)
+            else:
+                asset = build_asset(data.photos, data.sweeps, block.agents, settings.asset)
         else:
             asset = lidar_asset(load_sweeps(block.sweeps, with_intensity=True), block.agents)
         return write_scene(path, replace(asset, block=range_of(clip, block)))
@@ -113,7 +117,8 @@ def block_id(clip: Clip, settings: RenderSettings) -> str:
     digest = hashlib.sha256()
     block = block_of(clip)
     made_of = (ASSET_VERSION, clip.dataset, clip.log_id, block.start_s, clip.content_digest)
-    how = (settings.width, settings.height, sorted(settings.cameras), asdict(settings.asset))
+    made = settings.fit if settings.scene is SceneFrom.FIT else settings.asset
+    how = (settings.width, settings.height, sorted(settings.cameras), asdict(made))
     digest.update(json.dumps([made_of, how], sort_keys=True).encode())
     for file in (*block.images, *block.sweeps):
         digest.update(f"{file.sensor}\x1f{Path(file.uri).name}\x1f{file.time_s!r}".encode())

@@ -11,11 +11,12 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from factory.batch import Gatherer, PendingRow
+from factory.blocks import BlockOf, BlockQueue, Build
 from factory.clips.reader import ClipRef
 from factory.local import Graph, Ticket
 from factory.plan import CLIP_CANDIDATE, ClipPlan, Plan, WalkState, wants_payload
 from factory.progress import ProgressLine, Tally
-from factory.steps import Attempted, Failure, Prepared, Stamp
+from factory.steps import Attempted, Failure, Prepared, Reconstructed, Stamp
 from factory.store.candidates import ClipCandidates
 from factory.store.outcomes import QUARANTINE_AFTER, ErrorKind, Kind, Outcome
 from factory.store.samples import Past
@@ -53,13 +54,17 @@ class Driver:
         digests: Mapping[str, str],
         rounds: int,
         policy: Callable[[Past], bool],
+        block_of: BlockOf = lambda ref: None,
+        doing: Callable[[], str] = str,
     ) -> None:
+        """block_of: name of the block that is to be built before a clip; doing: how far long tasks are."""
         self._identity, self._digests, self._rounds, self._policy = identity, digests, rounds, policy
-        self._plan = plan
+        self._plan, self._block_of, self._doing = plan, block_of, doing
         self.executed = Executed(found_done=plan.found_done)
         self.notes: list[str] = []
         self._seconds: dict[str, list[float]] = defaultdict(lambda: [0, 0.0])
         self._fresh: set[str] = set()  # attempt_ids that failed in this run
+        self._building: dict[Ticket, Build] = {}
         self._preparing: dict[Ticket, ClipPlan] = {}
         self._trying: dict[Ticket, tuple[ClipPlan, WalkState, Any, Stamp]] = {}
         self._walks_left: dict[str, int] = {}
@@ -89,26 +94,27 @@ class Driver:
     def loop(self, graph: Graph, gatherer: Gatherer) -> None:
         """Until nothing is left, or until stopped and drained."""
         self._graph, self._gatherer = graph, gatherer
-        with ProgressLine(len(self._plan.todo)) as progress:
+        with ProgressLine(len(self._plan.todo), doing=self._doing) as progress:
             self._work_through(graph, gatherer, progress)
 
     def _work_through(self, graph: Graph, gatherer: Gatherer, progress: ProgressLine) -> None:
-        waiting = iter(self._plan.todo)
-        more = True
+        self._queue = BlockQueue(self._plan.todo, self._block_of, graph.parallelism)
         while True:
             room = len(self._walks_left) + len(self._preparing) < CLIPS_PER_WORKER * graph.parallelism
-            if more and room and gatherer.n_writing < 2 and not self.interrupted:
-                clip = next(waiting, None)
-                more = clip is not None
-                if clip is not None:
-                    self._open(clip)
-                continue
+            if gatherer.n_writing < 2 and not self.interrupted:
+                begun = self._queue.next(room)
+                if begun is not None:
+                    self._open(begun)
+                    continue
             finished = graph.wait(WAIT_S)
             if finished is not None:
                 self._take(*finished)
             gatherer.send_if_due()
             progress.show(self._tally)
-            if not self._preparing and not self._trying and not gatherer.n_writing and (not more or self.interrupted):
+            idle = not self._preparing and not self._trying and not gatherer.n_writing
+            if idle and (
+                self.interrupted or not self._queue
+            ):  # a block half built is left: the next run goes on with it
                 break
         gatherer.send()
         while gatherer.n_writing:
@@ -117,19 +123,32 @@ class Driver:
                 self._take(*finished)
         progress.show(self._tally, last=True)
 
-    def _open(self, clip: ClipPlan) -> None:
-        if wants_payload(clip):
-            self._preparing[self._graph.submit("prepare", clip.ref, clip.content)] = clip
+    def _open(self, what: ClipPlan | Build) -> None:
+        if isinstance(what, Build):
+            threads = max(1, self._graph.cores // self._queue.at_once)
+            self._building[self._graph.submit("reconstruct", what.ref, threads)] = what
+        elif wants_payload(what):
+            self._preparing[self._graph.submit("prepare", what.ref, what.content)] = what
         else:
-            self._start_walks(clip, None)
+            self._start_walks(what, None)
 
     def _take(self, ticket: Ticket, report: Any) -> None:
         if self._gatherer.finished(ticket, report):
             return
-        if ticket in self._preparing:
+        if ticket in self._building:
+            self._take_block(self._building.pop(ticket), report)
+        elif ticket in self._preparing:
             self._take_prepared(self._preparing.pop(ticket), ticket.result, report)
         else:
             self._take_attempt(*self._trying.pop(ticket), ticket.result, report)
+
+    def _take_block(self, build: Build, report: Reconstructed | Failure) -> None:
+        if isinstance(report, Reconstructed):
+            self._count(report.seconds)
+        else:
+            last = report.error.splitlines()[-1]
+            self.notes.append(f"block {build.block} failed ({last}); it is tried again for each of its clips")
+        self._queue.built(build.block)
 
     def _take_prepared(self, clip: ClipPlan, result: Any, report: Prepared | Rejected | Failure) -> None:
         clip_id = clip.ref.clip_id

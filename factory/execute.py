@@ -85,7 +85,7 @@ def execute(
         return RunSummary(
             BAD_CONFIG, f"{error}; python -m factory.store.verify {store.location.uri} says what is damaged"
         )
-    driver = Driver(identity, plan, digests, rounds, policy)
+    driver = Driver(identity, plan, digests, rounds, policy, work.block, work.doing)
     if plan.frozen:
         driver.notes.append(f"{len(plan.frozen)} clips kept as they are: their candidates come from other settings")
     code, message = COMPLETE, ""

@@ -19,7 +19,7 @@ import ray
 from ray.exceptions import RayError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from factory.local import STEPS, WANTS, Ticket
+from factory.local import STEPS, WANTS, Ticket, cores_of
 from factory.steps import Failure
 from factory.store.location import BadLocation, Location
 from factory.store.outcomes import ErrorKind
@@ -45,6 +45,7 @@ class RayGraph:
         self._is_ours = self._connected and _connect(workers, address)
         available = int(ray.cluster_resources().get("CPU", 1))
         self.parallelism = max(1, min(workers or available, available))
+        self.cores = min(self.parallelism, *(n for n in _cores_by_node() if n))
         self._supplied: dict[str, Any] = {"work": [ray.put(work)], "out": out}  # in a list: handed over as a reference
         self._tickets: dict[Any, Ticket] = {}
         self._ready: deque[Any] = deque()
@@ -67,7 +68,8 @@ class RayGraph:
         while self._held_back and (self._is_ours or len(self._tickets) < self.parallelism):
             ticket, step, args = self._held_back.popleft()
             supplied = [self._supplied[name] for name in WANTS[step]]
-            report, ticket.result = _run.remote(step, len(supplied), *supplied, *args)
+            task = _run.options(num_cpus=cores_of(step, args))
+            report, ticket.result = task.remote(step, len(supplied), *supplied, *args)
             self._tickets[report] = ticket
 
     def wait(self, timeout_s: float) -> tuple[Ticket, Any] | None:
@@ -132,6 +134,10 @@ def _connect(workers: int | None, address: str | None) -> bool:
 
 def _nodes() -> list[str]:
     return [node["NodeID"] for node in ray.nodes() if node["Alive"]]
+
+
+def _cores_by_node() -> list[int]:
+    return [int(node["Resources"].get("CPU", 0)) for node in ray.nodes() if node["Alive"]]
 
 
 def _on(node: str) -> NodeAffinitySchedulingStrategy:

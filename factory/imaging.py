@@ -47,6 +47,10 @@ class Imaging:
     settings: RenderSettings
     cache_dir: str
 
+    def build(self, clip: Clip, threads: int) -> None:
+        """Make sure of the clip's block in the cache. Raises BadClip for a broken sensor file."""
+        asset_for(clip, self.settings, self.cache_dir, threads)
+
     def block_verdict(self, clip: Clip) -> Rejected | None:
         """Build the clip's block, once, and say whether it is good enough to be rendered from.
 

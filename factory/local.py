@@ -1,5 +1,6 @@
 """The graph in this process: one task after the other, in the order of submission. For tests, breakpoints, explain."""
 
+import os
 from collections import deque
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -19,7 +20,8 @@ class Ticket:
 class Graph(Protocol):
     """What both executors offer: submit a function of factory.steps, wait for reports."""
 
-    parallelism: int
+    parallelism: int  # tasks at once
+    cores: int  # that one task can have
 
     def submit(self, step: str, *args: Any) -> Ticket:
         """Run `step`; arguments may be results of earlier tickets. `work` and `out` are supplied to it (WANTS)."""
@@ -32,8 +34,25 @@ class Graph(Protocol):
     def close(self) -> None: ...
 
 
-STEPS = {"prepare": steps.prepare, "attempt": steps.attempt, "write": steps.write, "warm": steps.warm}
-WANTS = {"prepare": ("work", "out"), "attempt": ("work",), "write": ("out",), "warm": ("work",)}
+STEPS = {
+    "reconstruct": steps.reconstruct,
+    "prepare": steps.prepare,
+    "attempt": steps.attempt,
+    "write": steps.write,
+    "warm": steps.warm,
+}
+WANTS = {
+    "reconstruct": ("work",),
+    "prepare": ("work", "out"),
+    "attempt": ("work",),
+    "write": ("out",),
+    "warm": ("work",),
+}
+
+
+def cores_of(step: str, args: tuple[Any, ...]) -> int:
+    """That a task uses: a reconstruction is told how many threads it has."""
+    return int(args[1]) if step == "reconstruct" else 1
 
 
 @dataclass
@@ -47,6 +66,7 @@ class LocalGraph:
     parallelism = 1
 
     def __init__(self, work: Work, out: Location) -> None:
+        self.cores = os.cpu_count() or 1
         self._supplied = {"work": work, "out": out}
         self._waiting: deque[tuple[Ticket, str, tuple[Any, ...]]] = deque()
         work.warm()

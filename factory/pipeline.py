@@ -4,10 +4,12 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from factory.clips.reader import BadClip, ClipReader, ClipRef
+from factory.fitting import fits_going_on
 from factory.imaging import Imaging
 from factory.rows import label_columns, sample_row
 from factory.work import HUMAN, Accepted, AttemptResult, CandidateRow, Dropped, PreparedClip, RunIdentity
@@ -17,7 +19,7 @@ from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.protocol import Expert
 from tasks.perturb import Candidate, Perturbation, PerturbSettings, end_speed_mps, perturb
 from tasks.render.engine import check
-from tasks.render.settings import RenderMode, RenderSettings
+from tasks.render.settings import RenderMode, RenderSettings, SceneFrom
 from tasks.reward.epdms import Scores
 from tasks.reward.labels import Labelling, vocabulary_labels
 from tasks.rollout.simulate import TrafficSettings
@@ -111,7 +113,7 @@ class FactoryWork:
 
         if self.render.mode is RenderMode.AUTO:
             check(self.render.backend)
-        compile_kernels()
+        compile_kernels(["judge", "fit" if self.render.scene is SceneFrom.FIT else "render", "drive"])
 
     def expert_digest(self, expert: str) -> str:
         """Of the expert's inputs and settings."""
@@ -154,6 +156,25 @@ class FactoryWork:
         """Of what the clip would be read from now; None where the reader cannot tell."""
         digest = getattr(self.reader, "digest", None)
         return None if digest is None else str(digest(ref))
+
+    def block(self, ref: ClipRef) -> str | None:
+        """The reader's name of the clip's block; None where it has none, or this run does not render from blocks."""
+        named = getattr(self.reader, "block", None)
+        if named is None or ref in self.broken or not self._wants_blocks or self.render.mode is not RenderMode.AUTO:
+            return None
+        name = named(ref)
+        return None if name is None else str(name)
+
+    def reconstruct(self, ref: ClipRef, threads: int) -> Mapping[str, float]:
+        """The clip's block into this machine's cache. Raises BadClip."""
+        watch = Stopwatch()
+        with watch.of("reconstruct"):
+            self.imaging.build(self.reader.read(ref), threads)
+        return watch.seconds
+
+    def doing(self) -> str:
+        """The fits that are going on here."""
+        return "; ".join(fits_going_on(Path(self.cache_dir)))
 
     def attempt(self, prepared: PreparedClip, candidate: int, expert: str) -> AttemptResult:
         """Rollout, expert, rollout, reward, render and labels of one candidate; candidate -1 is the human drive."""
@@ -213,9 +234,11 @@ class FactoryWork:
 
     def _block_verdict(self, clip: Clip) -> Rejected | None:
         """Asked for before perturb work is spent. Without a gate a block is built here only if it will be needed."""
-        if self.render.refuses_blocks or set(self.experts) - {HUMAN}:
-            return self.imaging.block_verdict(clip)
-        return None
+        return self.imaging.block_verdict(clip) if self._wants_blocks else None
+
+    @property
+    def _wants_blocks(self) -> bool:
+        return self.render.refuses_blocks or bool(set(self.experts) - {HUMAN})
 
     def _with_sensors(self, payload: PerturbedClip) -> Clip:
         if self.render.mode is not RenderMode.AUTO:

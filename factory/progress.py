@@ -1,7 +1,9 @@
 """How far a run is: a bar on a terminal, plain lines elsewhere."""
 
+import math
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TextIO
 
@@ -9,6 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 LINE_EVERY_S = 15.0
+ASK_EVERY_S = 2.0  # how far long tasks are
 
 
 @dataclass
@@ -27,9 +30,12 @@ class ProgressLine:
 
     total: int
     stream: TextIO = field(default_factory=lambda: sys.stderr)
+    doing: Callable[[], str] = str  # how far long tasks are
     _began: float = field(default_factory=time.monotonic)
     _said: float = field(default_factory=time.monotonic)
     _bar: Progress | None = None
+    _told: str = ""
+    _asked: float = -math.inf
 
     def __post_init__(self) -> None:
         if self.stream.isatty():
@@ -63,4 +69,10 @@ class ProgressLine:
         rate = tally.clips / elapsed_s if elapsed_s > 0 else 0.0
         left = f"{(self.total - tally.clips) / rate:.0f} s" if rate > 0 else "?"
         counts = f"{tally.accepted} accepted, {tally.rejected} rejected, {tally.failed} failed"
-        return f"{rate:.2f} clips/s  {counts}  ETA {left}"
+        return "  ".join(filter(None, [f"{rate:.2f} clips/s", counts, f"ETA {left}", self._doing()]))
+
+    def _doing(self) -> str:
+        now = time.monotonic()
+        if now - self._asked >= ASK_EVERY_S:
+            self._asked, self._told = now, self.doing()
+        return self._told

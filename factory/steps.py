@@ -46,6 +46,13 @@ class Prepared:
 
 
 @dataclass(frozen=True)
+class Reconstructed:
+    """Report on a block that is in the cache now."""
+
+    seconds: Mapping[str, float]
+
+
+@dataclass(frozen=True)
 class Attempted:
     """Report on an attempt."""
 
@@ -135,6 +142,14 @@ def write(out: Location, *rows: pa.Table) -> tuple[Shard | Failure, None]:
     try:
         return write_shard(out.child("samples"), SAMPLES, pa.concat_tables(rows)), None
     except OSError as error:
+        return failure_of(error), None
+
+
+def reconstruct(work: Work, ref: ClipRef, threads: int) -> tuple[Reconstructed | Failure, None]:
+    """The block that the clip is rendered from, into the cache of this machine."""
+    try:
+        return Reconstructed(work.reconstruct(ref, threads)), None
+    except Exception as error:  # the same boundary
         return failure_of(error), None
 
 

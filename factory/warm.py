@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.protocol import Plan
 from tasks.kernels import sources_digest
 from tasks.kinematic_vocabulary import kinematic_trajectories
+from tasks.render.warm import compile_fit_kernels
 from tasks.render.warm import compile_kernels as compile_render_kernels
 from tasks.reward.labels import Labelling, vocabulary_labels
 from tasks.reward.verdicts import INDEX_FROM_ROWS
@@ -26,19 +28,22 @@ from tasks.world.clip import CLIP_STEPS, NOW, Clip, Scene, scene_of_clip
 from tasks.world.lanes import Lane, RoadMap, Route
 
 
-def compile_kernels() -> None:
+def compile_kernels(parts: Sequence[str]) -> None:
     """Compiles what is not in the cache yet, each part in a process of its own, as many at once as there are cores.
 
     Raises RuntimeError with a part's last words where it fails.
     """
-    done = Path(numba.config.CACHE_DIR) / f"compiled-{sources_digest()}"
-    if done.exists():
+    missing = [name for name in parts if not _marker(name).exists()]
+    if not missing:
         return
-    print("compiling kernels, once for this version: about a minute on two cores", file=sys.stderr, flush=True)
+    print("compiling kernels, once for this version: a minute or two on two cores", file=sys.stderr, flush=True)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        list(pool.map(_compile_part, PARTS))
-    done.parent.mkdir(parents=True, exist_ok=True)
-    done.touch()
+        list(pool.map(_compile_part, missing))
+
+
+def _marker(name: str) -> Path:
+    """The file that says that a part is in the cache."""
+    return Path(numba.config.CACHE_DIR) / f"compiled-{sources_digest()}-{name}"
 
 
 def _compile_part(name: str) -> None:
@@ -47,6 +52,8 @@ def _compile_part(name: str) -> None:
     ended = subprocess.run(command, env=environment, capture_output=True, text=True)  # noqa: S603 (our own module)
     if ended.returncode != 0:
         raise RuntimeError(f"compiling the kernels of {name} failed: {ended.stderr[-2000:]}")
+    _marker(name).parent.mkdir(parents=True, exist_ok=True)
+    _marker(name).touch()
 
 
 def _judge() -> None:
@@ -66,10 +73,17 @@ def _drive() -> None:
 
 
 def _render() -> None:
+    """Scenes that are built and drawn."""
     compile_render_kernels()
 
 
-PARTS = {"judge": _judge, "drive": _drive, "render": _render}  # the longest first
+def _fit() -> None:
+    """The same, and scenes that are fitted: in one process, for they share kernels."""
+    compile_render_kernels()
+    compile_fit_kernels()
+
+
+PARTS = {"judge": _judge, "drive": _drive, "render": _render, "fit": _fit}
 
 
 def _tiny_scene() -> tuple[Scene, NDArray[np.float64]]:
@@ -127,5 +141,5 @@ if __name__ == "__main__":
     if len(sys.argv) > 1:
         PARTS[sys.argv[1]]()
     else:
-        compile_kernels()
+        compile_kernels(["judge", "fit", "drive"])
         compile_town_kernels()

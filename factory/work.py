@@ -114,6 +114,18 @@ class Work(Protocol):
         """Of what the clip would be read from now, without preparing it; None where the reader cannot tell."""
         ...
 
+    def block(self, ref: ClipRef) -> str | None:
+        """Name of the block that the clip is rendered from, known without reading it; None: nothing to build ahead."""
+        ...
+
+    def reconstruct(self, ref: ClipRef, threads: int) -> Mapping[str, float]:
+        """Build the clip's block into this machine's cache; seconds by stage. Raises BadClip."""
+        ...
+
+    def doing(self) -> str:
+        """How far long tasks on this machine are, for a progress line; empty where there are none."""
+        ...
+
     def prepare(self, ref: ClipRef) -> PreparedClip | Rejected:
         """Read the clip and list its candidates. Rejected: the clip stage drops it for every expert.
 

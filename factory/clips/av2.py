@@ -6,6 +6,7 @@ YELLOW | RED; a state holds until the lane's next row), which the synthetic town
 
 import hashlib
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,7 @@ from factory.clips.av2_log import (
     world_from_ego_at,
 )
 from factory.clips.av2_map import map_file, read_map
-from factory.clips.logs import Drive, LogReader, Recorded, WholeLog, present, route_of_drive
+from factory.clips.logs import STEP_MS, Drive, LogReader, Recorded, WholeLog, present, route_of_drive
 from factory.clips.reader import BadClip, ClipRef
 from tasks.world.camera import Camera, SensorFile
 from tasks.world.clip import STEP_S, Block
@@ -80,6 +81,17 @@ class AV2Reader(LogReader[AV2Log]):
     def digest(self, ref: ClipRef) -> str:
         """The clip's content digest, from the bytes of its log's files alone. Raises BadClip."""
         return content_digest(self.path_of(ref))
+
+    def block(self, ref: ClipRef) -> str | None:
+        """Log and second at which the block begins that the clip is rendered from; None where the log has no photos."""
+        if ref.log_id not in self._photographed:
+            return None
+        first = ref.start_ms // STEP_MS // BLOCK_STRIDE_STEPS * BLOCK_STRIDE_STEPS
+        return f"{ref.log_id}@{first * STEP_S:g}s"
+
+    @cached_property
+    def _photographed(self) -> frozenset[str]:
+        return frozenset(log_id for log_id, folder in self.logs().items() if (folder / "sensors" / "cameras").is_dir())
 
     def recorded(self, log: AV2Log, start: int, stop: int) -> Recorded:
         """Poses, rig, photos and sweeps of a window, and the block that it is rendered from."""

@@ -10,7 +10,9 @@ To write a reader, subclass `LogReader` and give it four things; AV2Reader has a
 * `recorded(log, start, stop)`: what else belongs to one window, which is the ego's pose in space, cameras and photos.
 
 A fifth, `digest(ref) -> str`, is optional: the clip's content digest as `read` would give it, found without reading the
-clip. With it a run sees that a log was changed though its clips lie prepared in the cache.
+clip. With it a run sees that a log was changed though its clips lie prepared in the cache. A sixth, optional too,
+`block(ref) -> str | None`, names the block that the clip is rendered from, as cheaply; with it the block is built once,
+as a task of its own, before its clips are prepared.
 
 Wherever the input is broken, raise `BadClip(file, field, how to mend it)`. Units: metres, radians, seconds, one world
 frame per log; the columns of ego states are named in tasks.world.vehicle, absent agents hold NaN and valid = False.

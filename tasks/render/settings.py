@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 from tasks.render.engine import Backend
+from tasks.render.fit.settings import FitSettings
 from tasks.render.gate import GateSettings
 from tasks.render.scene import AssetSettings
 
@@ -13,6 +14,13 @@ class RenderMode(StrEnum):
     AUTO = "auto"  # from the block's scene where its sensors allow one, else no images
     MAP = "map"  # lanes, paint and boxes on plain ground; marked as such
     NONE = "none"
+
+
+class SceneFrom(StrEnum):
+    """How photos become a block's scene."""
+
+    DISCS = "discs"  # built from depth in one go: seconds a block
+    FIT = "fit"  # the same, then fitted to the photos: render.fit says how long
 
 
 class PsnrGate(StrEnum):
@@ -59,7 +67,9 @@ class RenderSettings:
     gate: GateSettings = field(default_factory=GateSettings)  # what every rendered picture of a drive must come up to
     lidar_only_reach_m: float = 15.0  # without photos: images only this close to where a sweep was taken; 0: none
     map_rig: str = "three_front"  # cameras of a clip without a rig of its own, for mode=map
+    scene: SceneFrom = SceneFrom.DISCS
     asset: AssetSettings = field(default_factory=AssetSettings)
+    fit: FitSettings = field(default_factory=FitSettings)
 
     def __post_init__(self) -> None:
         bounds = {

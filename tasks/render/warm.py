@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from tasks.render.fit.reconstruct import reconstruct
+from tasks.render.fit.settings import FitSettings
 from tasks.render.scene import AssetSettings, RenderAsset, build_asset
 from tasks.render.sensed import Photo, Sweep
 from tasks.world.agents import AgentKind, AgentTracks
@@ -11,6 +13,18 @@ FRONT = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 
 
 def compile_kernels() -> RenderAsset:
     """Builds and measures a scene of two 32 x 32 photos, some ground and one box that drives."""
+    return build_asset(*_seen(), AssetSettings(refit_sweeps=1, hold_out_every=3))
+
+
+def compile_fit_kernels() -> RenderAsset:
+    """Fits such a scene, each step of the fit at least once."""
+    settings = FitSettings(
+        iterations=4, start_gaussians=200, most_gaussians=300, refine_every=2, refine_from=2, pose_from=0
+    )
+    return reconstruct(*_seen(), settings, held_out=[1])
+
+
+def _seen() -> tuple[list[Photo], list[Sweep], AgentTracks]:
     x, y = np.meshgrid(np.linspace(2.0, 20.0, 40), np.linspace(-6.0, 6.0, 40))
     ground = np.stack([x, y, 0.0 * x], axis=-1).reshape(-1, 3).astype(np.float32)
     intrinsics = np.array([[20.0, 0.0, 16.0], [0.0, 20.0, 16.0], [0.0, 0.0, 1.0]])
@@ -31,4 +45,4 @@ def compile_kernels() -> RenderAsset:
         np.full((3, 1), 0.8),
         np.array([1.6]),
     )
-    return build_asset(photos, sweeps, agents, AssetSettings(refit_sweeps=1, hold_out_every=3))
+    return photos, sweeps, agents

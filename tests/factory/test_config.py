@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
 from factory.clips.reader import ClipIndex
 from factory.config import ConfigError, build, compose, conf_dir, fill
@@ -55,8 +54,9 @@ def plain(value: object) -> object:
 
 
 def group(name: str) -> dict[str, Any]:
-    loaded: dict[str, Any] = yaml.safe_load((conf_dir() / f"{name}.yaml").read_text())
-    return loaded
+    folder, choice = name.split("/")
+    chosen: dict[str, Any] = compose("run", [f"{folder}={choice}"])[folder]
+    return chosen
 
 
 @pytest.mark.parametrize(("name", "defaults"), GROUPS, ids=[name for name, _ in GROUPS])
@@ -67,7 +67,7 @@ def test_a_group_holds_exactly_the_fields_of_its_dataclass_with_the_same_default
 
 def test_the_recovery_expert_s_file_holds_all_its_settings() -> None:
     defaults = dataclasses.asdict(RecoverySources()) | dataclasses.asdict(RecoverySettings())
-    assert group("expert/recovery") == {"kind": "recovery"} | plain(defaults)  # type: ignore[operator]
+    assert compose("run", [])["expert"]["recovery"] == {"kind": "recovery"} | plain(defaults)  # type: ignore[operator]
 
 
 def test_the_run_s_keys_are_those_of_its_dataclass() -> None:

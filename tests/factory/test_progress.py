@@ -20,3 +20,10 @@ def test_the_time_left_follows_from_the_rate() -> None:
     assert progress.text(Tally(clips=2), elapsed_s=4.0).startswith("0.50 clips/s")
     assert progress.text(Tally(clips=2), elapsed_s=4.0).endswith("ETA 16 s")
     assert progress.text(Tally(), elapsed_s=4.0).endswith("ETA ?")
+
+
+def test_the_line_ends_with_how_far_long_tasks_are() -> None:
+    stream = io.StringIO()
+    with ProgressLine(10, stream, doing=lambda: "fit 500/8000") as progress:
+        progress.show(Tally(clips=2), last=True)
+    assert stream.getvalue().endswith("  fit 500/8000\n")

@@ -9,12 +9,15 @@ import pyarrow as pa
 import pyarrow.feather
 import pytest
 
+from factory import fitting
 from factory.assets import Sensing, asset_for, block_id, sensing
 from factory.clips.reader import BadClip
 from factory.scene_file import read_scene
 from factory.sensors import block_of, chosen_cameras, decode_image, encode_jpeg, load_sensors
+from tasks.render.fit import reconstruct
+from tasks.render.fit.settings import FitSettings
 from tasks.render.scene import AssetSettings, psnr
-from tasks.render.settings import RenderSettings
+from tasks.render.settings import RenderSettings, SceneFrom
 from tasks.world.agents import AgentTracks
 from tasks.world.camera import Camera, SensorFile
 from tasks.world.clip import CLIP_STEPS, Clip
@@ -225,3 +228,56 @@ def test_another_size_or_window_is_another_block(clip: Clip) -> None:
     }
     assert len(ids) == 4
     assert block_id(clip, replace(SETTINGS, jpeg_quality=50)) == block_id(clip, SETTINGS)
+
+
+FIT = FitSettings(iterations=20, hold_out_every=3, start_gaussians=400, most_gaussians=500, stereo_photos=2, road=False)
+FITTED = RenderSettings(width=48, height=32, scene=SceneFrom.FIT, fit=FIT)
+
+
+def test_a_killed_fit_goes_on_to_the_same_bytes(
+    clip: Clip,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    undisturbed = asset_for(clip, FITTED, tmp_path / "one")
+    assert undisturbed is not None and np.isfinite(undisturbed.psnr_db) and undisturbed.n_held_out > 0
+
+    monkeypatch.setattr(fitting, "STRETCH", 8)
+    monkeypatch.setattr(reconstruct, "REPORT_EVERY", 10)
+    advance, starts, said = fitting.advance, [], []  # type: ignore[var-annotated]
+
+    def killed_at_16(problem, state, *rest):  # type: ignore[no-untyped-def]
+        starts.append(state.iteration)
+        if starts == [0, 8, 16]:
+            said.extend(fitting.fits_going_on(tmp_path / "two"))
+            raise KeyboardInterrupt
+        advance(problem, state, *rest)
+
+    monkeypatch.setattr(fitting, "advance", killed_at_16)
+    with pytest.raises(KeyboardInterrupt):
+        asset_for(clip, FITTED, tmp_path / "two")
+    begun = tmp_path / "two" / f"block-{block_id(clip, FITTED)}.fit.npz"
+    assert begun.exists()
+    again = asset_for(clip, FITTED, tmp_path / "two")
+    assert again is not None and again.digest == undisturbed.digest
+    assert starts == [0, 8, 16, 16] and not begun.exists()
+    assert len(said) == 1 and said[0].startswith("fit 10/20, "), "how far it is can be asked from outside"
+    assert fitting.fits_going_on(tmp_path / "two") == [], "what has ended is not going on"
+
+
+def test_a_damaged_half_fit_is_said_and_begun_again(
+    clip: Clip,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    begun = tmp_path / f"block-{block_id(clip, FITTED)}.fit.npz"
+    begun.write_bytes(b"half")
+    assert asset_for(clip, FITTED, tmp_path) is not None
+    assert f"{begun} is damaged" in caplog.text and not begun.exists()
+
+
+def test_only_the_settings_that_make_the_scene_are_in_its_name(clip: Clip) -> None:
+    discs = replace(FITTED, scene=SceneFrom.DISCS)
+    longer = replace(FITTED, fit=replace(FIT, iterations=30))
+    assert len({block_id(clip, each) for each in (discs, FITTED, longer)}) == 3
+    assert block_id(clip, replace(longer, scene=SceneFrom.DISCS)) == block_id(clip, discs)

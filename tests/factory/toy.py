@@ -77,6 +77,7 @@ class ToyWork:
     content: str = "content"
     tells_content: bool = True  # before it prepares
     seconds: float = 0.0  # of sleep per task
+    blocks: bool = False  # a log is a block
     journal: str = ""  # a file that gets one line per task that really ran
 
     @property
@@ -92,6 +93,18 @@ class ToyWork:
 
     def content_digest(self, ref: ClipRef) -> str | None:
         return self.content if self.tells_content else None
+
+    def block(self, ref: ClipRef) -> str | None:
+        return ref.log_id if self.blocks else None
+
+    def reconstruct(self, ref: ClipRef, threads: int) -> Mapping[str, float]:
+        self._note(f"reconstruct {ref.log_id}")
+        time.sleep(self.seconds)
+        self._trouble(ref.log_id)
+        return {"reconstruct": 0.5}
+
+    def doing(self) -> str:
+        return ""
 
     def prepare(self, ref: ClipRef) -> PreparedClip | Rejected:
         self._note(f"prepare {ref.log_id}:{ref.start_ms}")

@@ -60,6 +60,10 @@ class SyntheticReader:
         """The clip's content digest, without reading it. Raises BadClip."""
         return self._with_sensors(self._reader().digest(ref))
 
+    def block(self, ref: ClipRef) -> str | None:
+        """Of the clip, as an Argoverse 2 log's."""
+        return self._reader().block(ref)
+
     def _with_sensors(self, digest: str) -> str:
         """Sensor settings change the pixels and points, which Argoverse's digest leaves out."""
         return hashlib.sha256(f"{digest}{json.dumps(asdict(self.settings))}".encode()).hexdigest()
