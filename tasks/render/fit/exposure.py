@@ -19,6 +19,13 @@ def exposed(rgb: F32, row: F32) -> F32:
     return np.asarray(rgb @ matrix.T + offset, np.float32)
 
 
+def inverse(row: F32) -> F32:
+    """The row (12,) that takes back what `row` does. Raises LinAlgError where that cannot be."""
+    matrix, offset = matrix_of(row)
+    back = np.linalg.inv(matrix.astype(np.float64))
+    return np.concatenate([(back - np.eye(3)).ravel(), -back @ offset]).astype(np.float32)
+
+
 def exposed_gradient(rgb: F32, row: F32, d_exposed: F32) -> tuple[F32, F32]:
     """Gradients by rgb (H, W, 3) and by the row (12,)."""
     matrix, _ = matrix_of(row)

@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 
 from tasks.render import sh
 from tasks.render.depth import sparse_depth
-from tasks.render.fit import exposure, poses
+from tasks.render.fit import poses
 from tasks.render.fit.adam import Learned
+from tasks.render.fit.instants import exposures_of, in_agreement
 from tasks.render.fit.losses import Target, target_of
 from tasks.render.fit.road import Road, above_road, find_road, lay_flat
 from tasks.render.fit.settings import FitSettings
@@ -75,10 +76,13 @@ def prepare(
         return [see(p, train, static, per_track, tracks, gap, n) for p in train[first:last]]
 
     seen = [s for part in in_chunks(look, len(train), 1, threads) for s in part]
-    background, nodes = surfaces(train, seen, tracks)
+    exposures = exposures_of(train, seen, static)
+    alike = in_agreement(train, exposures)
+    background, nodes = surfaces(alike, seen, tracks)
     eyes = np.stack([p.world_from_camera[:3, 3] for p in train])
     road = find_road(static, eyes) if settings.road else None
-    state = _first_state(background, [nodes.get(i) for i in tracks.ids], sky_of(train, seen).rgb, train, road, settings)
+    cars = [nodes.get(i) for i in tracks.ids]
+    state = _first_state(background, cars, sky_of(alike, seen).rgb, exposures, road, settings)
     unknown = [track_id not in nodes for track_id in tracks.ids]
     shots = [_shot(p, static, tracks, np.array(unknown, bool), settings) for p in local]
     problem = Problem(
@@ -111,7 +115,7 @@ def _first_state(
     background: Gaussians,
     nodes: Sequence[Gaussians | None],
     sky: F32,
-    train: Sequence[Photo],
+    exposures: F32,
     road: Road | None,
     settings: FitSettings,
 ) -> FitState:
@@ -144,8 +148,8 @@ def _first_state(
         "colours": Learned.of(start.colours),
         "sh_rest": Learned.of(np.zeros((len(start), 3 * sh.COUNTS[settings.sh_degree]))),
         "sky": Learned.of(sky.reshape(-1, 3)),
-        "exposure": Learned.of(np.zeros((len(train), exposure.SIZE))),
-        "poses": Learned.of(np.zeros((len(train), poses.SIZE))),
+        "exposure": Learned.of(exposures),
+        "poses": Learned.of(np.zeros((len(exposures), poses.SIZE))),
     }
     nearest = np.full(len(start), np.inf, np.float32)
     return FitState(0, learned, owners, on_road, nearest, np.zeros(len(start), np.float32))

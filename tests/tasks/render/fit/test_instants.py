@@ -1,0 +1,76 @@
+"""Cameras of one instant that do not agree about brightness."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import street
+
+from tasks.render.fit.exposure import exposed, inverse
+from tasks.render.fit.instants import exposures_of, in_agreement, instants
+from tasks.render.fit.settings import FitSettings
+from tasks.render.fit.start import prepare
+from tasks.render.sensed import Photo, Tracks, fuse
+from tasks.render.sight import see
+
+DARKER = np.array([-0.3, 0, 0, 0, -0.25, 0, 0, 0, -0.2, 0.02, 0.0, 0.01], np.float32)
+
+
+def developed(photo: Photo, row: np.ndarray) -> Photo:
+    rgb = np.clip(exposed(photo.rgb.astype(np.float32) / 255.0, row), 0.0, 1.0)
+    return replace(photo, rgb=np.rint(255 * rgb).astype(np.uint8))
+
+
+def pair() -> list[Photo]:
+    """Two cameras, half a metre apart, at one instant; the right one is darker."""
+    left = street.photo(2.0, 0.25, 0.5, with_car=False)
+    right = replace(street.photo(2.0, -0.25, 0.5, with_car=False), camera="right")
+    return [left, developed(right, DARKER)]
+
+
+def test_a_row_is_taken_back_by_its_inverse() -> None:
+    rgb = np.random.default_rng(0).uniform(0, 1, (5, 3)).astype(np.float32)
+    np.testing.assert_allclose(exposed(exposed(rgb, DARKER), inverse(DARKER)), rgb, atol=1e-6)
+
+
+def test_an_instant_holds_each_camera_once() -> None:
+    at = [("a", 0.00), ("b", 0.01), ("a", 0.02), ("b", 0.10), ("a", 0.12)]
+    photos = [replace(pair()[0], camera=name, time_s=time) for name, time in at]
+    assert instants(photos) == [[0, 1], [2], [3, 4]]
+
+
+def test_photos_of_an_instant_come_out_alike_on_what_both_see() -> None:
+    photos = pair()
+    tracks = Tracks(None, np.zeros(3))
+    static, _ = fuse([street.sweep(x, 0.1 * x, with_car=False) for x in (0.0, 1.0, 2.0, 3.0)], tracks)
+    seen = [see(p, photos, static, {}, tracks, (12, 24), 1) for p in photos]
+    rows = exposures_of(photos, seen, static)
+    alike = in_agreement(photos, rows)
+    ground = slice(50, 70), slice(20, 100)
+
+    def off(a: Photo, b: Photo) -> float:
+        return float(np.abs(a.rgb[ground].mean(axis=(0, 1)) - b.rgb[ground].mean(axis=(0, 1))).max())
+
+    assert off(*alike) < 0.15 * off(*photos)
+    for photo, row, common in zip(photos, rows, alike):
+        back = developed(common, row)
+        assert np.abs(back.rgb[ground].astype(int) - photo.rgb[ground]).mean() < 2.0, (
+            "its exposure gives the photo back"
+        )
+
+
+def test_one_camera_alone_is_left_as_it_is() -> None:
+    photos, sweeps = street.drive(3, with_car=False)
+    _, state = prepare(photos, sweeps, None, FitSettings(start_gaussians=200, stereo_photos=1), held_out=[])
+    assert not state.learned["exposure"].values.any()
+
+
+def test_the_fit_begins_with_the_exposures_of_its_photos() -> None:
+    photos = pair() + [replace(p, time_s=1.0) for p in pair()]
+    sweeps = [street.sweep(x, 0.1 * x, with_car=False) for x in (0.0, 1.0, 2.0)]
+    _, state = prepare(photos, sweeps, None, FitSettings(start_gaussians=200, stereo_photos=1), held_out=[])
+    rows = state.learned["exposure"].values
+    grey = np.full((1, 3), 0.4, np.float32)
+    common = exposed(grey, inverse(rows[0]))  # what the left camera shows as this grey
+    np.testing.assert_allclose(exposed(common, rows[1]), exposed(grey, DARKER), atol=0.02)
+    assert state.learned["exposure"].values[0] == pytest.approx(state.learned["exposure"].values[2])
