@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tasks.render import sh
 from tasks.render.gaussians import F32, F64, Gaussians, quat_multiply, quats_of
-from tasks.render.pixels_gradient import PEAK, SUMS_SIZE, W_BLUE, W_RED, add_pairs, blend_gradient
+from tasks.render.pixels_gradient import SUMS_SIZE, W_BLUE, W_RED, add_pairs, blend_gradient
 from tasks.render.project_gradient import project_gradient
 from tasks.render.raster import GAUSSIANS_CHUNK, TILES_CHUNK, Trace, pinhole
 from tasks.render.threads import in_chunks
@@ -30,7 +30,6 @@ class Gradients:
     colours: F32  # (M, 3)
     sh_rest: F32  # (M, count, 3)
     screen: F32  # (M, 2) [1/px] by the centre on the picture, u and v: how much density control wants it elsewhere
-    peak: F32  # (M,) the largest weight it has on any pixel; 0 for one that is hidden
     camera: F64  # (6,) by v [1/m], w [1/rad] of a camera motion x' = x + v + w cross x, x in camera coordinates
 
 
@@ -97,9 +96,7 @@ def backward(
         return camera
 
     camera = np.sum([np.zeros(6), *in_chunks(run, n, GAUSSIANS_CHUNK, threads)], axis=0)
-    return Gradients(
-        splats.index, means, quats, log_scales, logits, colours, sh_rest, screen, sums[:, PEAK].copy(), camera
-    )
+    return Gradients(splats.index, means, quats, log_scales, logits, colours, sh_rest, screen, camera)
 
 
 def _pairs(
@@ -161,6 +158,5 @@ def unmoved(gradients: Gradients, target_from_source: F64) -> Gradients:
         gradients.colours,
         np.einsum("ba,nbc->nac", turn, gradients.sh_rest).astype(np.float32),
         gradients.screen,
-        gradients.peak,
         gradients.camera,
     )

@@ -14,9 +14,8 @@ MAX_REACH = math.sqrt(2.0 * math.log(1.0 / MIN_ALPHA))  # standard deviations at
 MAX_TANGENT_RATIO = 1.3  # the Jacobian is linearised at most this far outside the picture
 TILE = 16  # pixels along a tile's side; a row is two vector registers (measured: 8 wide is slower)
 
-# Columns of a projected row, which fills one cache line. Where a pixel's exponent is below CUT, alpha is below
-# MIN_ALPHA; colours are filled in by whoever shades.
-U, V, DEPTH, CONIC_XX, CONIC_XY, CONIC_YY, OPACITY, CUT, TOP, BOTTOM, RED, GREEN, BLUE = range(13)
+# Columns of a projected row, which fills one cache line; colours are filled in by whoever shades.
+U, V, DEPTH, CONIC_XX, CONIC_XY, CONIC_YY, OPACITY, LOG_OPACITY, TOP, BOTTOM, RED, GREEN, BLUE = range(13)
 PROJECTED_SIZE = 16
 
 
@@ -65,8 +64,8 @@ def project(
         if u + bound < 0.0 or u - bound > width or v + bound < 0.0 or v - bound > height:
             continue
         s0, s1, s2 = math.exp(log_scales[i, 0]), math.exp(log_scales[i, 1]), math.exp(log_scales[i, 2])
-        cut = -math.log(opacities[i] / MIN_ALPHA)
-        reach = math.sqrt(-2.0 * cut)
+        log_opacity = math.log(opacities[i])
+        reach = math.sqrt(2.0 * (log_opacity - math.log(MIN_ALPHA)))
         # Jacobian of the projection, at a point kept near the picture.
         jx = min(max(tx, left), right)
         jy = min(max(ty, top), bottom)
@@ -103,7 +102,7 @@ def project(
         index[count] = i
         out[count, U], out[count, V], out[count, DEPTH] = u, v, z
         out[count, CONIC_XX], out[count, CONIC_XY], out[count, CONIC_YY] = yy / det, -xy / det, xx / det
-        out[count, OPACITY], out[count, CUT] = opacities[i], cut
+        out[count, OPACITY], out[count, LOG_OPACITY] = opacities[i], log_opacity
         out[count, TOP], out[count, BOTTOM] = y0, y1
         tiles[count, 0], tiles[count, 1] = int(x0) // TILE, (int(x1) - 1) // TILE + 1
         tiles[count, 2], tiles[count, 3] = int(y0) // TILE, (int(y1) - 1) // TILE + 1

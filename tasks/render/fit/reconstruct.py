@@ -173,7 +173,7 @@ def _step_part(state: FitState, settings: FitSettings, part: Part, back: Gradien
         learned["sh_rest"].step(rows, mine.sh_rest.reshape(len(rows), -1), fall * settings.sh_rate)
 
 
-_PER_GAUSSIAN = ("index", "means", "quats", "log_scales", "logits", "colours", "sh_rest", "screen", "peak")
+_PER_GAUSSIAN = ("index", "means", "quats", "log_scales", "logits", "colours", "sh_rest", "screen")
 
 
 def picture_of(problem: Problem, state: FitState, photo: Photo, threads: int = 1) -> F32:
