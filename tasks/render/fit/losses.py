@@ -1,11 +1,13 @@
 """How far a picture is from a photo, and which way it should change: L1 and SSIM (Wang et al. 2004)."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tasks.kernels import kernel
 from tasks.render.gaussians import F32
 
 WINDOW, SIGMA = 11, 1.5  # pixels, as in the paper
@@ -38,23 +40,53 @@ def _blur(image: F32) -> F32:
 
 def ssim(rgb: F32, target: Target) -> tuple[float, F32]:
     """Mean structural similarity over weighted pixels and channels, and its gradient (H, W, 3)."""
-    f = np.float32
-    x, y, mu_y = rgb, target.rgb, target.mean
-    blurred = _blur(np.concatenate([x, x * x, x * y], axis=-1))
-    mu_x = blurred[..., :3]
-    cross = blurred[..., 6:] - mu_x * mu_y
-    spread = blurred[..., 3:6] - mu_x * mu_x + target.variance
-    a1, a2 = f(2) * mu_x * mu_y + f(C1), f(2) * cross + f(C2)
-    b1, b2 = mu_x * mu_x + mu_y * mu_y + f(C1), spread + f(C2)
-    share = target.weight[..., None] / f(3.0 * max(float(target.weight.sum()), 1.0))
-    inverse = f(1) / (b1 * b2)
-    value = a1 * a2 * inverse
-    by_xx = -share * value / b2
-    by_xy = share * f(2) * a1 * inverse
-    by_mean = share * f(2) * (mu_y * (a2 - a1) * inverse - mu_x * value / b1) - f(2) * mu_x * by_xx
-    back = _blur(np.concatenate([by_mean, by_xx, by_xy], axis=-1))
-    gradient = back[..., :3] + f(2) * x * back[..., 3:6] + y * back[..., 6:]
-    return float((share * value).sum()), np.asarray(gradient, np.float32)
+    back = np.empty((*rgb.shape[:2], 9), np.float32)
+    share = target.weight / np.float32(3.0 * max(float(target.weight.sum()), 1.0))
+    total = _similarity(_blur(_products(rgb, target.rgb)), target.mean, target.variance, share, back)
+    return total, _along(_blur(back), rgb, target.rgb)
+
+
+@kernel
+def _products(x: Any, y: Any) -> Any:
+    """x, x^2, xy (H, W, 9), the three channels of each together."""
+    out = np.empty((x.shape[0], x.shape[1], 9), np.float32)
+    for i in range(x.shape[0]):
+        for j in range(x.shape[1]):
+            for c in range(3):
+                a, b = x[i, j, c], y[i, j, c]
+                out[i, j, c], out[i, j, c + 3], out[i, j, c + 6] = a, a * a, a * b
+    return out
+
+
+@kernel
+def _similarity(blurred: Any, mean: Any, variance: Any, share: Any, back: Any) -> float:
+    """Sum of share times similarity; fills its derivatives by `blurred` (H, W, 9), the windowed `_products`."""
+    total = 0.0
+    for i in range(blurred.shape[0]):
+        for j in range(blurred.shape[1]):
+            for c in range(3):
+                mu_x, mu_y = blurred[i, j, c], mean[i, j, c]
+                cross = blurred[i, j, c + 6] - mu_x * mu_y
+                spread = blurred[i, j, c + 3] - mu_x * mu_x + variance[i, j, c]
+                a1, a2 = 2.0 * mu_x * mu_y + C1, 2.0 * cross + C2
+                b1, b2 = mu_x * mu_x + mu_y * mu_y + C1, spread + C2
+                value, s = a1 * a2 / (b1 * b2), share[i, j]
+                by_xx = -s * value / b2
+                by_mean = 2.0 * s * (mu_y * (a2 - a1) / (b1 * b2) - mu_x * value / b1) - 2.0 * mu_x * by_xx
+                back[i, j, c], back[i, j, c + 3], back[i, j, c + 6] = by_mean, by_xx, 2.0 * s * a1 / (b1 * b2)
+                total += s * value
+    return total
+
+
+@kernel
+def _along(back: Any, x: Any, y: Any) -> Any:
+    """Derivatives by x (H, W, 3), from those by x, x^2 and xy (H, W, 9)."""
+    out = np.empty_like(x)
+    for i in range(x.shape[0]):
+        for j in range(x.shape[1]):
+            for c in range(3):
+                out[i, j, c] = back[i, j, c] + 2.0 * x[i, j, c] * back[i, j, c + 3] + y[i, j, c] * back[i, j, c + 6]
+    return out
 
 
 def photo_loss(rgb: F32, target: Target, ssim_weight: float) -> tuple[float, F32]:

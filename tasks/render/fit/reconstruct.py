@@ -97,7 +97,7 @@ def _iterate(problem: Problem, state: FitState, settings: FitSettings, threads: 
         loss += off
     back = backward(seen, scene, d_rgb, d_depth, threads=threads)
     _step_world(state, settings, row, back, d_colours)
-    cells, d_cells = backdrop_gradient(d_rgb * (1.0 - seen.view.alpha)[..., None], shot.photo.intrinsics, camera)
+    cells, d_cells = backdrop_gradient(d_rgb, seen.view.alpha, shot.photo.intrinsics, camera)
     progress = state.iteration / settings.iterations
     state.learned["sky"].step(cells, d_cells, decayed(settings.sky_rate, settings.rate_end, progress))
     depths = seen.splats.projected[:, DEPTH]
@@ -130,7 +130,7 @@ def compose(problem: Problem, state: FitState, time_s: float) -> tuple[Gaussians
 
 def _look(state: FitState, scene: Gaussians, photo: Photo, camera: F64, threads: int) -> Trace:
     height, width = photo.rgb.shape[:2]
-    behind = backdrop(state.learned["sky"].values, photo.intrinsics, camera, width, height)
+    behind = backdrop(state.learned["sky"].values, photo.intrinsics, camera, width, height, threads)
     return trace(scene, photo.intrinsics, camera, width, height, behind, threads)
 
 

@@ -92,10 +92,12 @@ def test_the_learned_sky_is_looked_up_as_the_stored_one_is() -> None:
     seen = backdrop(cells.reshape(-1, 3), K, pose, *SIZE)
     np.testing.assert_allclose(seen, SkyMap(cells).seen_by(K, pose, *SIZE), atol=1e-5)
     upstream = RNG.normal(size=seen.shape).astype(np.float32)
-    rows, gradient = backdrop_gradient(upstream, K, pose)
-    # The look-up is linear: <upstream, backdrop(cells)> = <gradient, cells>.
+    alpha = np.full(seen.shape[:2], 0.25, np.float32)
+    alpha[:4] = 1.0
+    rows, gradient = backdrop_gradient(upstream, alpha, K, pose)
+    # The look-up is linear: <upstream, (1 - alpha) backdrop(cells)> = <gradient, cells>.
     assert float((gradient * cells.reshape(-1, 3)[rows]).sum()) == pytest.approx(
-        float((upstream * seen).sum()), rel=1e-3
+        float((upstream * seen)[4:].sum()) * 0.75, rel=1e-3
     )
 
 
