@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from factory.clips.kitti import read_drive
+from factory.clips.kitti import read_drive, steadied
 from tasks.render.asset import psnr
 from tasks.render.engine import Pinhole, render
 from tasks.render.fit.exposure import affine_between, exposed
@@ -83,7 +83,7 @@ def main() -> None:
     settings = replace(FitSettings(), **{k: kinds[k](float(v)) for k, v in options.items()})
     out.mkdir(parents=True, exist_ok=True)
 
-    drive = read_drive(root)
+    drive = steadied(read_drive(root))
     frames = [f for f in range(len(drive.times_s)) if not (validate and f % 8 == 4)]
     held_out = [i for i, f in enumerate(frames) if f % 8 == (0 if validate else 4)]
     started = time.perf_counter()

@@ -5,8 +5,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from factory.clips.kitti import EARTH_RADIUS_M, IMU_HEIGHT_M, read_drive
+from factory.clips.kitti import EARTH_RADIUS_M, IMU_HEIGHT_M, KittiDrive, read_drive, steadied
 from factory.clips.reader import BadClip
 
 DATE = "2011_09_26"
@@ -63,6 +65,26 @@ def test_sweeps_stand_on_the_road_and_land_in_the_same_world(root: Path) -> None
     np.testing.assert_allclose(sweep.points[0], [6.0, 0.0, IMU_HEIGHT_M], atol=1e-6)
     point = sweep.world_from_ego @ np.append(sweep.points[0], 1.0)
     np.testing.assert_allclose(point[:3], [10.0, 6.0, 0.0], atol=1e-5)
+
+
+def test_poses_stamped_in_ticks_are_moved_to_when_the_cameras_were_triggered(tmp_path: Path) -> None:
+    """Ten metres a second and a steady turn, every 103.2 ms, stamped and posed at the closest tick of 10 ms."""
+
+    def poses(times: NDArray[np.float64]) -> NDArray[np.float64]:
+        out = np.tile(np.eye(4), (len(times), 1, 1))
+        out[:, :3, :3] = Rotation.from_rotvec(0.3 * times[:, None] * [0.0, 0.0, 1.0]).as_matrix()
+        out[:, 0, 3] = 10.0 * times
+        return out
+
+    true = 0.1032 * np.arange(60)
+    stamps = np.rint(true * 100) / 100
+    drive = steadied(KittiDrive(tmp_path, {}, poses(stamps), stamps))
+    assert np.abs(poses(stamps)[:, 0, 3] - 10.0 * true).max() > 0.04
+    np.testing.assert_allclose(drive.times_s, true, atol=0.002)
+    np.testing.assert_allclose(drive.world_from_imu, poses(drive.times_s), atol=1e-6)
+    assert np.ptp(np.diff(drive.world_from_imu[:, 0, 3])) < 0.01
+    with pytest.raises(ValueError, match="8 or more"):
+        steadied(KittiDrive(tmp_path, {}, poses(true[:7]), true[:7]))
 
 
 def test_a_missing_image_is_named(root: Path) -> None:
