@@ -8,7 +8,7 @@ photos of training frames. Settings are those of `FitSettings`, for instance ite
 
 import sys
 import time
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import cv2
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factory.clips.kitti import read_drive, steadied
+from factory.scene_file import write_scene
 from tasks.render.asset import psnr
 from tasks.render.engine import Pinhole, render
 from tasks.render.fit.exposure import affine_between, exposed
@@ -31,7 +32,17 @@ F32, F64 = NDArray[np.float32], NDArray[np.float64]
 FITTED_FRAMES = 12  # of image_03's training frames, for its affine colour and rigid correction
 STEPS = np.array([0.02, 0.02, 0.02, 5e-4, 5e-4, 5e-4])  # [m], [rad] of the finite differences
 SHIFTS_M = (-1.0, 0.0, 1.0)
-SHOWN = (12, 36, 60, 84)
+SHOWN = (10, 34, 58, 82)  # frames trained on
+SHOWN_AT = (1000, 2000, 4000)  # iterations
+SETTINGS = replace(
+    FitSettings(),
+    start_gaussians=160_000,
+    most_gaussians=200_000,
+    ssim_weight=0.1,
+    turn_rate=3e-4,
+    shift_rate=1e-3,
+    pose_from=100,
+)
 
 
 class Beside:
@@ -52,7 +63,7 @@ class Beside:
         """Correction and affine colour (12,) that fit `photos` best: Gauss-Newton on what the affine leaves over."""
         row = np.zeros(6)
         truth = np.concatenate([p.rgb.reshape(-1, 3) / 255.0 for p in photos])
-        for _ in range(3 if rigid else 0):
+        for _ in range(2 if rigid else 0):
             base = self._flat(photos, row)
             colour = affine_between(base, truth)
             slopes = np.stack([self._flat(photos, row + s) - self._flat(photos, row - s) for s in np.diag(STEPS)], -1)
@@ -66,85 +77,88 @@ class Beside:
         return np.concatenate([self.picture(p, row).reshape(-1, 3) for p in photos])
 
 
+@dataclass(frozen=True)
+class Trial:
+    """A fit under way, and the photos that it is measured by; poses local."""
+
+    problem: Problem
+    state: FitState
+    beside: Beside
+    test: list[Photo]  # image_03 of the frames held out
+    chosen: list[Photo]  # image_03 of some frames trained on
+    threads: int
+
+    def row(self) -> str:
+        """Held-out image_02; image_03 as it comes, with an affine colour, and with a rigid correction as well."""
+        shots = self.problem.held_out
+        own = [picture_of(self.problem, self.state, s.photo, self.threads) for s in shots]
+        raw = [self.beside.picture(p, np.zeros(6)) for p in self.test]
+        _, plain = self.beside.fitted(self.chosen, rigid=False)
+        rigid, colour = self.beside.fitted(self.chosen, rigid=True)
+        affine = [exposed(p, plain) for p in raw]
+        turned = [exposed(self.beside.picture(p, rigid), colour) for p in self.test]
+        print("    extrinsic [cm]", np.round(100 * rigid[:3], 2), "[deg]", np.round(np.degrees(rigid[3:]), 3))
+        beside = " | ".join(scores(pictures, self.test) for pictures in (raw, affine, turned))
+        return f"{scores(own, [s.photo for s in shots])} | {beside}"
+
+
 def scores(pictures: list[F32], photos: list[Photo]) -> str:
     """Mean PSNR and SSIM."""
     targets = [target_of(p.rgb) for p in photos]
-    both = [(psnr(image, t.rgb), ssim(image, t)[0]) for image, t in zip(pictures, targets)]
+    clipped = [np.clip(image, 0.0, 1.0) for image in pictures]
+    both = [(psnr(image, t.rgb), ssim(image, t)[0]) for image, t in zip(clipped, targets)]
     return "{:.2f} / {:.3f}".format(*np.mean(both, axis=0))
 
 
+def local(photos: list[Photo], origin: F64) -> list[Photo]:
+    """With poses minus `origin` (3,)."""
+    return [replace(p, world_from_camera=shifted(p.world_from_camera, -origin)) for p in photos]
+
+
 def main() -> None:
-    """Trains, prints a table, writes pictures, the state and the Gaussians."""
+    """Trains, prints a table, writes pictures, the state and the scene."""
     root, options = Path(sys.argv[1]), dict(option.split("=", 1) for option in sys.argv[2:])
     out = Path(options.pop("out", "out/bench_kitti"))
-    validate = options.pop("validate", "0") == "1"
-    threads = int(options.pop("threads", "2"))
+    validate, threads = options.pop("validate", "0") == "1", int(options.pop("threads", "2"))
     kinds = {field.name: type(getattr(FitSettings(), field.name)) for field in fields(FitSettings)}
-    settings = replace(FitSettings(), **{k: kinds[k](float(v)) for k, v in options.items()})
+    settings = replace(SETTINGS, **{k: kinds[k](float(v)) for k, v in options.items()})
     out.mkdir(parents=True, exist_ok=True)
 
     drive = steadied(read_drive(root))
     frames = [f for f in range(len(drive.times_s)) if not (validate and f % 8 == 4)]
     held_out = [i for i, f in enumerate(frames) if f % 8 == (0 if validate else 4)]
-    started = time.perf_counter()
-    problem, state = prepare(drive.photos("image_02", frames), drive.fused(), None, settings, held_out, threads)
-    prepared = time.perf_counter()
+    photos, started = drive.photos("image_02", frames), time.perf_counter()
+    problem, state = prepare(photos, drive.fused(), None, settings, held_out, threads)
+    left, right = (local(p, problem.origin) for p in (photos, drive.photos("image_03", frames)))
+    trained = [p for i, p in enumerate(right) if i not in held_out]
+    chosen = [trained[i] for i in np.linspace(0, len(trained) - 1, FITTED_FRAMES).astype(int)]
+    beside = Beside(problem, state, {p.time_s: p.world_from_camera for p in left}, threads)
+    trial = Trial(problem, state, beside, [right[i] for i in held_out], chosen, threads)
 
-    def told(iteration: int, loss: float, score: float) -> None:
-        if iteration % 500 == 0:
-            now = [picture_of(problem, state, s.photo, threads) for s in problem.held_out]
-            seconds = time.perf_counter() - prepared
-            held = scores(now, [s.photo for s in problem.held_out])
-            print(
-                f"{iteration}: loss {loss:.4f}, training photos {score:.2f} dB, held out {held}, {seconds:.0f} s",
-                flush=True,
-            )
+    print(f"{time.perf_counter() - started:.0f} s to prepare {len(state)} Gaussians, {state.road.sum()} of them road")
+    print("| iterations | s | Gaussians | training | image_02 | image_03 raw | affine | affine + extrinsic |")
+    seconds = 0.0
+    told: list[float] = []
+    for until in [at for at in SHOWN_AT if at < settings.iterations] + [settings.iterations]:
+        started = time.perf_counter()
+        advance(problem, state, settings, until, lambda at, loss, score: told.append(score), threads)
+        seconds += time.perf_counter() - started
+        np.savez(out / "state.npz", **state.arrays())
+        mean = np.mean(told[-5:]) if told else np.nan  # of the last 500 iterations
+        print(f"| {until} | {seconds:.0f} | {len(state)} | {mean:.2f} | {trial.row()} |", flush=True)
 
-    advance(problem, state, settings, settings.iterations, told, threads)
-    fitted = time.perf_counter()
-    np.savez(out / "state.npz", **state.arrays())
-    asset = finish(problem, state, threads)
-
-    local = [
-        replace(p, world_from_camera=shifted(p.world_from_camera, -problem.origin))
-        for p in drive.photos("image_02", frames)
-    ]
-    right = [
-        replace(p, world_from_camera=shifted(p.world_from_camera, -problem.origin))
-        for p in drive.photos("image_03", frames)
-    ]
-    beside = Beside(problem, state, {p.time_s: p.world_from_camera for p in local}, threads)
-    test = [right[i] for i in held_out]
-    train = [p for i, p in enumerate(right) if i not in held_out]
-    chosen = [train[i] for i in np.linspace(0, len(train) - 1, FITTED_FRAMES).astype(int)]
-    raw = [beside.picture(p, np.zeros(6)) for p in test]
-    _, plain = beside.fitted(chosen, rigid=False)
-    row, colour = beside.fitted(chosen, rigid=True)
-    turned = [exposed(beside.picture(p, row), colour) for p in test]
-
-    print(f"| {settings.iterations} iterations | held-out PSNR [dB] / SSIM |\n|---|---|")
-    own = [picture_of(problem, state, s.photo, threads) for s in problem.held_out]
-    print(f"| image_02 | {scores(own, [s.photo for s in problem.held_out])} |")
-    print(f"| image_03 raw | {scores(raw, test)} |")
-    print(f"| image_03 affine | {scores([np.clip(exposed(p, plain), 0, 1) for p in raw], test)} |")
-    print(f"| image_03 affine + extrinsic | {scores([np.clip(p, 0, 1) for p in turned], test)} |")
-    print(f"{len(state)} Gaussians, {state.road.sum()} of them road")
-    print(f"preparing {prepared - started:.0f} s, fitting {fitted - prepared:.0f} s")
-    print("extrinsic [cm]", np.round(100 * row[:3], 2), "[deg]", np.round(np.degrees(row[3:]), 3))
-
-    np.savez(out / "gaussians.npz", **{f.name: getattr(asset.background, f.name) for f in fields(asset.background)})
+    asset = write_scene(out / "kitti.safetensors", finish(problem, state, threads))
     for frame in SHOWN:
-        photo = local[frames.index(frame)]
+        photo = left[frames.index(frame)]
         pose = corrected(photo.world_from_camera, corrections_at(problem, state, photo.camera, photo.time_s)[0])
-        strip = [photo.rgb]
+        height, width = photo.rgb.shape[:2]
+        strip = []
         for shift in SHIFTS_M:
-            there = pose @ np.block(
-                [[np.eye(3), np.array([[shift], [0.0], [0.0]])], [np.zeros((1, 3)), np.ones((1, 1))]]
-            )
-            height, width = photo.rgb.shape[:2]
-            eye = Pinhole(photo.intrinsics, shifted(there, problem.origin), width, height)
-            strip.append(np.rint(255 * render(asset, [eye])[0].rgb).astype(np.uint8))
-        cv2.imwrite(str(out / f"shifted_{frame:03d}.png"), np.vstack(strip)[..., ::-1])
+            there = pose.copy()
+            there[:3, 3] += problem.origin + shift * pose[:3, 0]
+            strip.append(render(asset, [Pinhole(photo.intrinsics, there, width, height)], threads=threads)[0].rgb)
+        picture = np.rint(255 * np.clip(np.vstack(strip), 0, 1)).astype(np.uint8)[..., ::-1]
+        cv2.imwrite(str(out / f"shifted_{frame:03d}.png"), picture)
 
 
 if __name__ == "__main__":
