@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from tasks.render.asset import RenderAsset, psnr, scene_at
 from tasks.render.choose import BACKGROUND, Look, choose, count_free_space, with_mirror_image
 from tasks.render.engine import Pinhole, Vehicles, render
+from tasks.render.features import triangulated
 from tasks.render.gaussians import EMPTY, F32, F64, Gaussians
 from tasks.render.movers import owners, world_from_boxes
 from tasks.render.refit import FitPhoto, refit_colours
@@ -54,6 +55,7 @@ def build_asset(
     train = [p for i, p in enumerate(photos) if i not in held_out]
     tracks = Tracks(agents, origin)
     static, per_track = fuse(sweeps, tracks)
+    static = static if sweeps else triangulated(train, tracks)
     seen = [see(p, train, static, per_track, tracks, settings.max_gap_px, settings.stereo_photos) for p in train]
     background, nodes = surfaces(train, seen, tracks)
     sky = sky_of(train, seen)

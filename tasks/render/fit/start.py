@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from tasks.render import sh
 from tasks.render.depth import sparse_depth
+from tasks.render.features import triangulated
 from tasks.render.fit import poses
 from tasks.render.fit.adam import Learned
 from tasks.render.fit.instants import exposures_of, in_agreement
@@ -70,6 +71,7 @@ def prepare(
     tracks = Tracks(agents, origin)
     train = [p for i, p in enumerate(local) if i not in out]
     static, per_track = fuse([replace(s, world_from_ego=shifted(s.world_from_ego, -origin)) for s in sweeps], tracks)
+    static = static if sweeps else triangulated(train, tracks)
 
     def look(first: int, last: int) -> list[Seen]:
         gap, n = settings.max_gap_px, settings.stereo_photos
