@@ -108,12 +108,14 @@ class FactoryWork:
     cache_dir: str  # of reconstructed blocks
 
     def warm(self) -> None:
-        """Compile every kernel into the on-disk cache. Raises BackendMissing where this node lacks what draws."""
+        """Compile the kernels of this run into the on-disk cache. Raises BackendMissing where this node lacks what draws."""
         from factory.warm import compile_kernels
 
+        parts = ["judge", "drive"]
         if self.render.mode is RenderMode.AUTO:
             check(self.render.backend)
-        compile_kernels(["judge", "fit" if self.render.scene is SceneFrom.FIT else "render", "drive"])
+            parts.insert(1, "fit" if self.render.scene is SceneFrom.FIT else "render")
+        compile_kernels(parts)
 
     def expert_digest(self, expert: str) -> str:
         """Of the expert's inputs and settings."""

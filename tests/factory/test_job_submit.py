@@ -56,7 +56,9 @@ class Head:
         """`ray job submit` as the README has it; waits for the job's end."""
         command = [*RAY, "job", "submit", "--address", self.address, "--working-dir", ".", "--"]
         command += ["python", "-m", "factory.run", *arguments]
-        return subprocess.run(command, cwd=checkout, env=self.environment, capture_output=True, text=True, timeout=240)
+        return subprocess.run(
+            command, cwd=checkout, env=self.environment, capture_output=True, text=True, timeout=600
+        )  # kernels are compiled again for the uploaded copy
 
 
 def free_ports(count: int) -> list[int]:
