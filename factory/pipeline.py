@@ -108,7 +108,7 @@ class FactoryWork:
     cache_dir: str  # of reconstructed blocks
 
     def warm(self) -> None:
-        """Compile the kernels of this run into the on-disk cache. Raises BackendMissing where this node lacks what draws."""
+        """This run's kernels into the on-disk cache. Raises BackendMissing where this node lacks what is to draw."""
         from factory.warm import compile_kernels
 
         parts = ["judge", "drive"]
