@@ -29,7 +29,7 @@ from tasks.render.stereo import MAX_BASELINE_M, MIN_BASELINE_M
 from tasks.world.camera import SensorFile
 from tasks.world.clip import Block, Clip
 
-ASSET_VERSION = 2  # raised by hand when the same sensors give another scene
+ASSET_VERSION = 3  # raised by hand when the same sensors give another scene
 PARALLAX_SHARE = 0.9  # without lidar, a photo with no other in stereo reach shows sky alone; so few may be like that
 log = logging.getLogger(__name__)
 
@@ -113,7 +113,7 @@ def only_builder(path: Path) -> Iterator[None]:
 
 
 def block_id(clip: Clip, settings: RenderSettings) -> str:
-    """16 hex digits of everything the scene depends on but the sensor files' content, known without opening them."""
+    """16 hex digits of everything the scene depends on; of the sensor files, which are not opened, names and sizes."""
     digest = hashlib.sha256()
     block = block_of(clip)
     made_of = (ASSET_VERSION, clip.dataset, clip.log_id, block.start_s, clip.content_digest)
@@ -121,6 +121,8 @@ def block_id(clip: Clip, settings: RenderSettings) -> str:
     how = (settings.width, settings.height, sorted(settings.cameras), asdict(made))
     digest.update(json.dumps([made_of, how], sort_keys=True).encode())
     for file in (*block.images, *block.sweeps):
-        digest.update(f"{file.sensor}\x1f{Path(file.uri).name}\x1f{file.time_s!r}".encode())
+        path = Path(file.uri)
+        size = path.stat().st_size if path.is_file() else None  # one that is missing is named when it is read
+        digest.update(f"{file.sensor}\x1f{path.name}\x1f{size}\x1f{file.time_s!r}".encode())
         digest.update(np.ascontiguousarray(file.world_from_ego).tobytes())
     return digest.hexdigest()[:16]
