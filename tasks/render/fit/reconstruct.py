@@ -27,6 +27,7 @@ from tasks.render.sky import COLUMNS, ROWS, SkyMap
 from tasks.world.agents import AgentTracks
 
 REPORT_EVERY = 100
+VIEW_MARGIN_M = 0.5  # how far Gaussians of a track may reach beyond its box
 Progress = Callable[[int, float, float], None]  # iteration, mean loss and mean PSNR [dB] of the last REPORT_EVERY
 
 
@@ -85,7 +86,7 @@ def _iterate(problem: Problem, state: FitState, settings: FitSettings, threads: 
     row = photo_at(state.iteration, len(problem.train), settings.seed)
     shot = problem.train[row]
     camera = corrected(shot.photo.world_from_camera, state.learned["poses"].values[row])
-    scene, parts = compose(problem, state, shot.photo.time_s)
+    scene, parts = compose(problem, state, shot.photo)
     seen = _look(state, scene, shot.photo, camera, threads)
     colours = state.learned["exposure"].values[row]
     picture = exposed(seen.view.rgb, colours)
@@ -101,8 +102,7 @@ def _iterate(problem: Problem, state: FitState, settings: FitSettings, threads: 
     progress = state.iteration / settings.iterations
     state.learned["sky"].step(cells, d_cells, decayed(settings.sky_rate, settings.rate_end, progress))
     depths = seen.splats.projected[:, DEPTH]
-    for part in parts:
-        _step_part(state, settings, part, back, depths)
+    _step_gaussians(state, settings, *_of_owners(back, parts), depths)
     if problem.road is not None:
         rows = back.index[: np.searchsorted(back.index, len(parts[0].rows))]  # the background's are their own rows
         means, quats, log_scales = (state.learned[name].values for name in ("means", "quats", "log_scales"))
@@ -111,21 +111,35 @@ def _iterate(problem: Problem, state: FitState, settings: FitSettings, threads: 
     return loss, psnr(np.clip(picture, 0.0, 1.0), shot.target.rgb)
 
 
-def compose(problem: Problem, state: FitState, time_s: float) -> tuple[Gaussians, list[Part]]:
-    """All Gaussians that are there at a time, in the scene, and whose they are; the background's come first."""
+def compose(problem: Problem, state: FitState, photo: Photo) -> tuple[Gaussians, list[Part]]:
+    """All Gaussians that a photo (pose local) may show, in the scene, and whose they are; the background's first."""
     every = state.gaussians()
     n = int(np.searchsorted(state.owner, 0))
     rows = np.arange(n)
     scenes, parts = [every.take(rows) if n < len(every) else every], [Part(0, rows, None)]
-    boxes, valid = problem.tracks.at(time_s)
+    boxes, valid = problem.tracks.at(photo.time_s)
     frames = world_from_boxes(boxes)
-    for j in np.flatnonzero(valid):
+    for j in np.flatnonzero(valid & _in_view(boxes, photo)):
         rows = np.arange(np.searchsorted(state.owner, j), np.searchsorted(state.owner, j, side="right"))
         if len(rows):
             parts.append(Part(n, rows, frames[j]))
             scenes.append(moved(every.take(rows), frames[j]))
             n += len(rows)
     return (scenes[0] if len(scenes) == 1 else concatenate(scenes)), parts
+
+
+def _in_view(boxes: F64, photo: Photo) -> NDArray[np.bool_]:
+    """Whether a ball around each box (N, 7) reaches into the photo's pyramid: (N,)."""
+    radius = 0.5 * np.linalg.norm(boxes[:, 4:], axis=1) + VIEW_MARGIN_M
+    height, width = photo.rgb.shape[:2]
+    camera_from_scene = np.linalg.inv(photo.world_from_camera)
+    at = boxes[:, :3] @ camera_from_scene[:3, :3].T + camera_from_scene[:3, 3]
+    seen = at[:, 2] > -radius
+    for axis, size in enumerate((width, height)):
+        focal, middle = photo.intrinsics[axis, axis], photo.intrinsics[axis, 2]
+        slope = max(middle, size - middle) / focal
+        seen &= np.abs(at[:, axis]) < slope * at[:, 2] + radius * np.hypot(1.0, slope)
+    return np.asarray(seen)
 
 
 def _look(state: FitState, scene: Gaussians, photo: Photo, camera: F64, threads: int) -> Trace:
@@ -149,14 +163,24 @@ def _step_world(state: FitState, settings: FitSettings, row: int, back: Gradient
         poses.values[row] = before + rates * (poses.values[row] - before)
 
 
-def _step_part(state: FitState, settings: FitSettings, part: Part, back: Gradients, depths: F32) -> None:
-    span = slice(*np.searchsorted(back.index, [part.first, part.first + len(part.rows)]))
-    mine = Gradients(**{name: getattr(back, name)[span] for name in _PER_GAUSSIAN}, camera=back.camera)
-    if part.scene_from_owner is not None:
-        mine = unmoved(mine, part.scene_from_owner)
-    rows = part.rows[mine.index - part.first]
+def _of_owners(back: Gradients, parts: Sequence[Part]) -> tuple[NDArray[np.int64], Gradients]:
+    """The gradients in the frames that the Gaussians are learned in, and their rows in the state."""
+    rows, pieces = [], []
+    for part in parts:
+        span = slice(*np.searchsorted(back.index, [part.first, part.first + len(part.rows)]))
+        piece = Gradients(**{name: getattr(back, name)[span] for name in _PER_GAUSSIAN}, camera=back.camera)
+        pieces.append(piece if part.scene_from_owner is None else unmoved(piece, part.scene_from_owner))
+        rows.append(part.rows[piece.index - part.first])
+    together = {name: np.concatenate([getattr(piece, name) for piece in pieces]) for name in _PER_GAUSSIAN}
+    return np.concatenate(rows), Gradients(**together, camera=back.camera)
+
+
+def _step_gaussians(
+    state: FitState, settings: FitSettings, rows: NDArray[np.int64], mine: Gradients, depths: F32
+) -> None:
+    """Steps `rows` (M,), at `depths` (M,) in the photo."""
     learned = state.learned
-    state.nearest[rows] = np.minimum(state.nearest[rows], depths[span])
+    state.nearest[rows] = np.minimum(state.nearest[rows], depths)
     state.wanted[rows] += np.hypot(mine.screen[:, 0], mine.screen[:, 1])
     progress = state.iteration / settings.iterations
     fall = decayed(1.0, settings.rate_end, progress)
@@ -184,7 +208,7 @@ def picture_of(problem: Problem, state: FitState, photo: Photo, threads: int = 1
     """
     row_pose, row_colour = corrections_at(problem, state, photo.camera, photo.time_s)
     camera = corrected(photo.world_from_camera, row_pose)
-    scene, _ = compose(problem, state, photo.time_s)
+    scene, _ = compose(problem, state, photo)
     return np.clip(exposed(_look(state, scene, photo, camera, threads).view.rgb, row_colour), 0.0, 1.0)
 
 

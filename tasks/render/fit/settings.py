@@ -14,7 +14,8 @@ class FitSettings:
     seed: int = 0
     hold_out_every: int = 8  # photo i of a camera with i % n == n // 2 only measures; 0: none is held out
     # Where it starts.
-    start_gaussians: int = 90_000
+    start_gaussians: int = 90_000  # of the background
+    start_node_gaussians: int = 3_000  # of each track, at most
     most_gaussians: int = 130_000
     start_opacity: float = 0.5
     max_gap_px: tuple[int, int] = (12, 24)  # columns, rows that are interpolated between lidar returns
@@ -52,7 +53,7 @@ class FitSettings:
     road_thickness: float = 0.005
 
     def __post_init__(self) -> None:
-        for name in ("iterations", "start_gaussians", "most_gaussians", "refine_every"):
+        for name in ("iterations", "start_gaussians", "start_node_gaussians", "most_gaussians", "refine_every"):
             if getattr(self, name) < 1:
                 raise ValueError(f"fit {name} must be 1 or more, not {getattr(self, name)}")
         if self.sh_degree not in range(4):

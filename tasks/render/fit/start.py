@@ -121,12 +121,15 @@ def _first_state(
     road: Road | None,
     settings: FitSettings,
 ) -> FitState:
-    """Tracks keep all their discs; of the background's as many as are wanted, each as much larger."""
+    """Of the background's and of each track's discs as many as are wanted, each as much larger."""
     rng = np.random.Generator(np.random.Philox(key=[settings.seed, 2**33]))
-    parts = [_thinned(background, settings.start_gaussians, rng)] + [node for node in nodes if node is not None]
-    owner = [np.full(len(parts[0]), BACKGROUND)] + [np.full(len(n), j) for j, n in enumerate(nodes) if n is not None]
+    parts, owner = [_thinned(background, settings.start_gaussians, rng)], [BACKGROUND]
+    for j, node in enumerate(nodes):
+        if node is not None:
+            parts.append(_thinned(node, settings.start_node_gaussians, rng))
+            owner.append(j)
     start = concatenate(parts)
-    owners = np.concatenate(owner).astype(np.int32)
+    owners = np.repeat(owner, [len(part) for part in parts]).astype(np.int32)
     on_road = np.zeros(len(start), bool)
     if road is not None:
         with np.errstate(invalid="ignore"):
