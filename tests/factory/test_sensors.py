@@ -1,5 +1,6 @@
 """Sensor files opened, broken ones named, and scenes stored."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -150,10 +151,18 @@ def test_a_block_is_built_once_and_read_back_the_same(clip: Clip, tmp_path: Path
     first = asset_for(clip, SETTINGS, tmp_path / "cache")
     assert first is not None and len(first.background) > 100 and len(first.digest) == 16
     for file in clip.images:
-        Path(file.uri).unlink()  # a second build would fail
+        Path(file.uri).write_bytes(bytes(Path(file.uri).stat().st_size))  # a second build would fail
     again = asset_for(clip, SETTINGS, tmp_path / "cache")
     assert again is not None and again.digest == first.digest
     assert again.background.colours.tobytes() == first.background.colours.tobytes()
+
+
+def test_a_photo_of_another_size_makes_another_block(clip: Clip, tmp_path: Path) -> None:
+    before = block_id(clip, SETTINGS)
+    Path(clip.images[0].uri).write_bytes(b"junk")
+    assert block_id(clip, SETTINGS) != before
+    with pytest.raises(BadClip, match=re.escape(clip.images[0].uri)):
+        asset_for(clip, SETTINGS, tmp_path)
 
 
 def test_a_scene_says_which_stretch_of_driving_it_stands_for(clip: Clip, tmp_path: Path) -> None:
