@@ -143,6 +143,17 @@ def fused(typing_context: Any, a: Any, b: Any, c: Any) -> Any:
 
 
 @intrinsic
+def root(typing_context: Any, values: Any) -> Any:
+    """Square roots; NaN of what is negative."""
+
+    def build(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        kind = ir.FunctionType(_VECTOR, [_VECTOR])
+        return builder.call(cgutils.get_or_insert_function(builder.module, kind, "llvm.sqrt.v16f32"), arguments)
+
+    return lanes(lanes), build
+
+
+@intrinsic
 def smaller(typing_context: Any, a: Any, b: Any) -> Any:
     """The smaller of each lane; b where a is NaN."""
 
