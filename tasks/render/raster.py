@@ -130,8 +130,6 @@ def trace(
 
 def colours_seen(gaussians: Gaussians, camera_center: F64, index: NDArray[np.int64], threads: int = 1) -> F32:
     """rgb (M, 3) of the Gaussians at `index` (M,), as seen from `camera_center` (3,) in their frame; never negative."""
-    if gaussians.sh_rest.shape[1] == 0:
-        return np.maximum(gaussians.colours[index], np.float32(0.0))
     center, out = np.ascontiguousarray(camera_center, np.float64), np.empty((len(index), 3), np.float32)
 
     def run(first: int, last: int) -> None:

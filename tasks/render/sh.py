@@ -81,9 +81,10 @@ def seen(means: Any, colours: Any, sh_rest: Any, center: Any, index: Any, first:
     values = np.empty(15, np.float64)
     for k in range(first, last):
         i = index[k]
-        x, y, z = means[i, 0] - center[0], means[i, 1] - center[1], means[i, 2] - center[2]
-        scale = 1.0 / np.sqrt(x * x + y * y + z * z)
-        _basis(x * scale, y * scale, z * scale, count, values)
+        if count:
+            x, y, z = means[i, 0] - center[0], means[i, 1] - center[1], means[i, 2] - center[2]
+            scale = 1.0 / np.sqrt(x * x + y * y + z * z)
+            _basis(x * scale, y * scale, z * scale, count, values)
         for c in range(3):
             total = float(colours[i, c])
             for m in range(count):
@@ -111,6 +112,10 @@ def seen_gradient(
     values, slopes, added = np.empty(15, np.float64), np.zeros((15, 3), np.float64), np.zeros(3, np.float64)
     for k in range(first, last):
         i = index[k]
+        if count == 0:
+            for c in range(3):
+                d_colours[k, c] = d_seen[k, c] if colours[i, c] >= 0.0 else 0.0
+            continue
         x, y, z = means[i, 0] - center[0], means[i, 1] - center[1], means[i, 2] - center[2]
         scale = 1.0 / np.sqrt(x * x + y * y + z * z)
         x, y, z = x * scale, y * scale, z * scale

@@ -22,13 +22,14 @@ def deal(
     """
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
     order = _nearest_first(np.ascontiguousarray(depths))
-    counts = np.zeros((-(-len(order) // CHUNK), tiles_x * tiles_y), np.int64)
+    corners = np.zeros((-(-len(order) // CHUNK), tiles_y + 1, tiles_x + 1), np.int64)
     in_chunks(
-        lambda first, last: _count(tiles, order, tiles_x, first, last, counts[first // CHUNK]),
+        lambda first, last: _mark_corners(tiles, order, first, last, corners[first // CHUNK]),
         len(order),
         CHUNK,
         threads,
     )
+    counts = corners.cumsum(axis=1).cumsum(axis=2)[:, :-1, :-1].reshape(len(corners), tiles_x * tiles_y)
     start = np.concatenate([[0], np.cumsum(counts.sum(axis=0))])
     before = np.cumsum(counts, axis=0) - counts  # a tile's ellipses of the nearer chunks come first
     places = start[:-1] + before
@@ -70,12 +71,15 @@ def _nearest_first(depths: Any) -> Any:
 
 
 @kernel
-def _count(tiles: Any, order: Any, tiles_x: int, first: int, last: int, counts: Any) -> None:
+def _mark_corners(tiles: Any, order: Any, first: int, last: int, corners: Any) -> None:
+    """Summed along both axes, `corners` (tiles_y + 1, tiles_x + 1) counts the ellipses on each tile."""
     for at in range(first, last):
         i = order[at]
-        for ty in range(tiles[i, 2], tiles[i, 3]):
-            for tx in range(tiles[i, 0], tiles[i, 1]):
-                counts[ty * tiles_x + tx] += 1
+        x0, x1, y0, y1 = tiles[i, 0], tiles[i, 1], tiles[i, 2], tiles[i, 3]
+        corners[y0, x0] += 1
+        corners[y0, x1] -= 1
+        corners[y1, x0] -= 1
+        corners[y1, x1] += 1
 
 
 @kernel

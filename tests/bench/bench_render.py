@@ -24,7 +24,7 @@ from tests.tasks.render.slow_raster import slow, slow_render
 
 WIDTH, HEIGHT = 480, 270
 INTRINSICS = np.array([[0.6 * WIDTH, 0.0, WIDTH / 2], [0.0, 0.6 * WIDTH, HEIGHT / 2], [0.0, 0.0, 1.0]])
-SIGMA_PX = 2.28  # gives 3.6 tiles per Gaussian
+SIGMA_PX = 2.155  # gives 3.6 tiles per Gaussian
 REPEATS = 15
 TWIN_EVERY = 40  # tiles; the twin is timed on so many and the rest is reckoned
 BLACK = np.zeros(3, np.float32)
