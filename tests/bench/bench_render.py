@@ -2,6 +2,7 @@
 
 Row one is a seeded cloud of 100,000 Gaussians; row two, where a scene file is named, the street of that scene from the
 middle of its block. The clock is the wall's; CPU time stands beside it, for a machine that does other things as well.
+Before them comes the peak memory of a large picture.
 """
 
 import argparse
@@ -20,11 +21,13 @@ from tasks.render.gaussians import Gaussians
 from tasks.render.gradient import backward
 from tasks.render.project import TILE
 from tasks.render.raster import Splats, splat, trace
+from tests.bench.timing import memory_mb
 from tests.tasks.render.slow_raster import slow, slow_render
 
 WIDTH, HEIGHT = 480, 270
 INTRINSICS = np.array([[0.6 * WIDTH, 0.0, WIDTH / 2], [0.0, 0.6 * WIDTH, HEIGHT / 2], [0.0, 0.0, 1.0]])
 SIGMA_PX = 2.155  # gives 3.6 tiles per Gaussian
+LARGE = (2048, 1536)
 REPEATS = 15
 TWIN_EVERY = 40  # tiles; the twin is timed on so many and the rest is reckoned
 BLACK = np.zeros(3, np.float32)
@@ -120,9 +123,30 @@ def row(name: str, scene: Gaussians, camera: NDArray[np.float64], threads: int) 
         )
 
 
+def memory() -> None:
+    """Prints how much more memory than before the seeded cloud takes at its peak when drawn large, there and back."""
+    intrinsics = INTRINSICS.copy()
+    intrinsics[:2] *= LARGE[0] / WIDTH
+    scene, view = cloud(100_000), (intrinsics, np.eye(4), *LARGE, BLACK)
+    upstream = np.ones((LARGE[1], LARGE[0], 3), np.float32)
+    warm = trace(scene.take(np.arange(9)), *view)
+    backward(warm, scene, upstream)
+    del warm
+    before = memory_mb("VmRSS")
+    Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew here
+    record = trace(scene, *view)
+    there = memory_mb("VmHWM") - before
+    backward(record, scene, upstream)
+    print(
+        f"\n{LARGE[0]}x{LARGE[1]}, {len(scene):,} Gaussians, {len(record.splats.tile_splats):,} intersections: "
+        f"peak memory {there:.0f} MB forward, {memory_mb('VmHWM') - before:.0f} MB forward + backward"
+    )
+
+
 def main(scene: Path | None = None, threads: int = 2) -> None:
     """Prints the table; the second row only where a scene file is given."""
     torch.set_num_threads(threads)
+    memory()  # first, for what others leave behind would be used again
     print(
         f"\nrasteriser, {WIDTH}x{HEIGHT}, {threads} threads, load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores\n"
     )

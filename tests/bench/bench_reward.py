@@ -20,7 +20,7 @@ from tasks.reward.epdms import score
 from tasks.reward.prepare import PreparedScene, prepare_scene
 from tasks.rollout.lqr import track_local
 from tasks.world.clip import NOW, scene_of_clip
-from tests.bench.timing import cpu_milliseconds
+from tests.bench.timing import cpu_milliseconds, memory_mb
 from tests.real.reference_scenes import RECORDED_K, SCENES, loader, prepared_scene
 
 PUBLIC_MS_PER_TRAJECTORY = 20.0  # the public implementation, one core (METRIC.md)
@@ -42,10 +42,10 @@ def measured(prepared: Callable[[], PreparedScene], ego_state: np.ndarray, traje
     ready = prepared()
     states = track_local(ego_state, trajectories[:1])
     score(ready, states)
-    before = _memory_mb("VmRSS")
+    before = memory_mb("VmRSS")
     Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew here
     score(ready, track_local(ego_state, trajectories))
-    peak = _memory_mb("VmHWM") - before
+    peak = memory_mb("VmHWM") - before
 
     repeats = 5 if len(trajectories) > 1000 else 40
     states = track_local(ego_state, trajectories)
@@ -95,11 +95,6 @@ def main(root: Path) -> None:
 
 def _recorded(name: str, k: int) -> bool:
     return k <= 256 or k in RECORDED_K.get(name, ())
-
-
-def _memory_mb(field: str) -> float:
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return float(next(line.split()[1] for line in lines if line.startswith(field))) / 1024.0
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
@@ -14,6 +15,12 @@ def milliseconds(call: Callable[[], object], repeats: int) -> float:
 def cpu_milliseconds(call: Callable[[], object], repeats: int) -> float:
     """Median CPU time of one call, after one that warms up."""
     return _median_ms(call, repeats, time.process_time)
+
+
+def memory_mb(field: str) -> float:
+    """This process's memory now ("VmRSS") or at its peak ("VmHWM")."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return float(next(line.split()[1] for line in lines if line.startswith(field))) / 1024.0
 
 
 def _median_ms(call: Callable[[], object], repeats: int, clock: Callable[[], float]) -> float:
