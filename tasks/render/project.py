@@ -15,6 +15,7 @@ from tasks.render.lanes import LANES, fill, fused, larger, load, root, smaller, 
 NEAR_M = 0.3  # closer ones would cover the picture
 DILATION_PX2 = 0.1  # added to the screen covariance; 0.3, made for megapixels, blurs images this small (measured)
 MIN_ALPHA = 1.0 / 255.0  # a weaker contribution is not visible in 8 bits
+MAX_REACH = math.sqrt(2.0 * math.log(1.0 / MIN_ALPHA))  # standard deviations at which opacity 1 falls to MIN_ALPHA
 MAX_TANGENT_RATIO = 1.3  # the Jacobian is linearised at most this far outside the picture
 TILE = 16  # pixels along a tile's side; a row is one value of tasks.render.lanes
 
@@ -181,6 +182,7 @@ def project(
     block = np.zeros(BLOCK_SIZE, np.float32)
     rows, centre = turned_by(camera_from_scene)
     limits = tangent_limits(fx, fy, cx, cy, width, height)
+    middle_u, middle_v = width / 2.0, height / 2.0
     for start in range(first, last, LANES):
         n = min(LANES, last - start)
         for k in range(n):
@@ -190,9 +192,12 @@ def project(
             i, lane = start + k, np.uint64(k)
             if not (block[Z + lane] >= NEAR_M and opacities[i] > MIN_ALPHA):
                 continue
+            u, v = float(block[X + lane]), float(block[Y + lane])
+            half_u, half_v = MAX_REACH * block[HALF_U + lane], MAX_REACH * block[HALF_V + lane]
+            if abs(u - middle_u) > half_u + middle_u or abs(v - middle_v) > half_v + middle_v:
+                continue  # beside the picture: most of a long street is
             log_opacity = math.log(opacities[i])
             reach = math.sqrt(2.0 * (log_opacity - math.log(MIN_ALPHA)))
-            u, v = float(block[X + lane]), float(block[Y + lane])
             half_u, half_v = reach * block[HALF_U + lane], reach * block[HALF_V + lane]
             # Pixels whose centres the box of the ellipse holds; as floats, for they can be too far for integers.
             x0, x1 = max(np.ceil(u - half_u - 0.5), 0.0), min(np.floor(u + half_u + 0.5), float(width))
@@ -208,4 +213,4 @@ def project(
             tiles[count, 0], tiles[count, 1] = int(x0) // TILE, (int(x1) - 1) // TILE + 1
             tiles[count, 2], tiles[count, 3] = int(y0) // TILE, (int(y1) - 1) // TILE + 1
             count += 1
-    return index[:count].copy(), out[:count].copy(), tiles[:count].copy()
+    return index[:count], out[:count], tiles[:count]

@@ -75,9 +75,17 @@ def splat(
         )
         return index, projected, tiles
 
-    parts = in_chunks(run, len(gaussians), GAUSSIANS_CHUNK, threads) or [run(0, 0)]
-    index, tiles = (np.concatenate([part[k] for part in parts]) for k in (0, 2))
-    projected = np.concatenate([part[1] for part in parts], out=_cache_lines(len(index)))
+    parts = in_chunks(run, len(gaussians), GAUSSIANS_CHUNK, threads)
+    start = np.cumsum([0, *(len(part[0]) for part in parts)])
+    index, projected = np.empty(start[-1], np.int64), _cache_lines(start[-1])
+    tiles = np.empty((start[-1], 4), np.int32)
+
+    def place(first: int, last: int) -> None:
+        for k in range(first, last):
+            for whole, part in zip((index, projected, tiles), parts[k]):
+                whole[start[k] : start[k + 1]] = part
+
+    in_chunks(place, len(parts), 1, threads)
     tile_start, tile_splats = deal(projected[:, DEPTH], tiles, width, height, threads)
     return Splats(index, projected, tiles, tile_start, tile_splats, intrinsics, camera_from_scene, width, height)
 
