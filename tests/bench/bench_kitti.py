@@ -39,6 +39,7 @@ SETTINGS = replace(
     start_gaussians=160_000,
     most_gaussians=200_000,
     ssim_weight=0.1,
+    opaque_weight=0.1,
     turn_rate=3e-4,
     shift_rate=1e-3,
     pose_from=100,

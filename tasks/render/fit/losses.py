@@ -109,3 +109,10 @@ def depth_loss(depth: F32, known: F32, weight: float) -> tuple[float, F32]:
     off = np.where(use, inverse - 1.0 / np.where(use, known, 1.0), 0.0)
     scale = weight / max(int(use.sum()), 1)
     return scale * float(np.abs(off).sum()), (-scale * np.sign(off) * inverse * inverse).astype(np.float32)
+
+
+def opaque_loss(alpha: F32, ground: NDArray[np.bool_], weight: float) -> tuple[float, F32]:
+    """`weight` times the light that passes where the picture is `ground` (H, W), as a mean over all of it, and its
+    gradient by `alpha`."""
+    scale = np.float32(weight / alpha.size)
+    return float(scale * (1.0 - alpha[ground]).sum()), np.where(ground, -scale, np.float32(0.0))

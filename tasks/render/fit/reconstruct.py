@@ -10,7 +10,7 @@ from tasks.render.asset import Exposure, RenderAsset, ViewQuality, psnr
 from tasks.render.fit.backdrop import backdrop, backdrop_gradient
 from tasks.render.fit.density import refine
 from tasks.render.fit.exposure import exposed, exposed_gradient, matrix_of
-from tasks.render.fit.losses import depth_loss, photo_loss, ssim
+from tasks.render.fit.losses import depth_loss, opaque_loss, photo_loss, ssim
 from tasks.render.fit.poses import between, corrected
 from tasks.render.fit.road import lay_flat
 from tasks.render.fit.schedule import decayed, photo_at
@@ -96,7 +96,11 @@ def _iterate(problem: Problem, state: FitState, settings: FitSettings, threads: 
     if shot.lidar_depth is not None:
         off, d_depth = depth_loss(seen.view.depth, shot.lidar_depth, settings.depth_weight)
         loss += off
-    back = backward(seen, scene, d_rgb, d_depth, threads=threads)
+    d_alpha = None
+    if settings.opaque_weight > 0.0:
+        through, d_alpha = opaque_loss(seen.view.alpha, shot.ground, settings.opaque_weight)
+        loss += through
+    back = backward(seen, scene, d_rgb, d_depth, d_alpha, threads)
     _step_world(state, settings, row, back, d_colours)
     cells, d_cells = backdrop_gradient(d_rgb, seen.view.alpha, shot.photo.intrinsics, camera)
     progress = state.iteration / settings.iterations

@@ -25,6 +25,7 @@ class FitSettings:
     ssim_weight: float = 0.2
     depth_weight: float = 0.0  # of the mean absolute error of inverse depth [1/m] where lidar knows it
     opacity_weight: float = 0.0
+    opaque_weight: float = 0.0  # of the mean light that passes where a photo looks at the ground
     scale_weight: float = 0.0
     # Step sizes of Adam; each falls exponentially to `rate_end` of itself.
     mean_rate: float = 8e-4  # times the nearest viewing depth

@@ -27,6 +27,7 @@ from tasks.render.threads import in_chunks
 from tasks.world.agents import AgentTracks
 
 ROAD_TOP_M = 0.08  # a Gaussian that starts no further from the road's surface belongs to it
+LOOKS_DOWN = 0.05  # sine of the angle below the horizon from which on a ray meets the ground
 UPRIGHT = 0.5  # unless it stands: the least vertical part of its normal
 
 
@@ -37,6 +38,7 @@ class Shot:
     photo: Photo
     target: Target
     lidar_depth: F32 | None  # (H, W) [m], 0 where no return falls; None: not asked for
+    ground: NDArray[np.bool_]  # (H, W) looks down, so that no sky can be behind
 
 
 @dataclass(frozen=True)
@@ -100,17 +102,19 @@ def prepare(
 def _shot(photo: Photo, static: F64, tracks: Tracks, unknown: NDArray[np.bool_], settings: FitSettings) -> Shot:
     """A photo, without what moves and has no Gaussians of its own: it would be painted on the street."""
     height, width = photo.rgb.shape[:2]
+    rays = directions(photo.intrinsics, photo.world_from_camera, width, height)
     boxes, valid = tracks.at(photo.time_s)
     hidden = None
     if (valid & unknown).any():
         eye = photo.world_from_camera[:3, 3]
-        far = directions(photo.intrinsics, photo.world_from_camera, width, height).reshape(-1, 3) * FAR_M + eye
+        far = rays.reshape(-1, 3) * FAR_M + eye
         hidden = behind_boxes(far, eye, boxes[valid & unknown]).reshape(height, width)
     depth = None
     if settings.depth_weight > 0.0:
         labels = np.full(len(static), BACKGROUND, np.int32)
         depth, _ = sparse_depth(static, labels, photo.intrinsics, photo.world_from_camera, width, height)
-    return Shot(photo, target_of(photo.rgb, hidden), depth)
+    ground = rays[..., 2] < -LOOKS_DOWN * np.linalg.norm(rays, axis=-1)
+    return Shot(photo, target_of(photo.rgb, hidden), depth, ground)
 
 
 def _first_state(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tasks.render.fit.losses import depth_loss, photo_loss, ssim, target_of
+from tasks.render.fit.losses import depth_loss, opaque_loss, photo_loss, ssim, target_of
 
 RNG = np.random.default_rng(0)
 PHOTO = RNG.integers(0, 256, (17, 23, 3)).astype(np.uint8)
@@ -68,3 +68,10 @@ def test_depth_loss_is_the_mean_error_of_inverse_depth() -> None:
     loss, gradient = depth_loss(depth, known, 2.0)
     assert loss == pytest.approx(2.0 * (0.05 + 0.025) / 2)
     np.testing.assert_allclose(gradient, [[0.0, 1.0 / 25.0], [-1.0 / 64.0, 0.0]], rtol=1e-6)
+
+
+def test_light_that_passes_where_there_is_ground_is_lost() -> None:
+    alpha, ground = np.array([[0.2, 0.9], [0.5, 1.0]], np.float32), np.array([[False, False], [True, True]])
+    loss, gradient = opaque_loss(alpha, ground, 0.4)
+    assert loss == pytest.approx(0.4 * 0.5 / 4)
+    np.testing.assert_allclose(gradient, [[0.0, 0.0], [-0.1, -0.1]])
