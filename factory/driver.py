@@ -159,7 +159,11 @@ class Driver:
             self._count(report.seconds)
             if report.note:
                 self.notes.append(report.note)
-            elif clip.listed is not None and not report.from_cache:
+            elif (
+                clip.listed is not None
+                and clip.listed.prepare_digest == self._identity.prepare_digest
+                and not report.from_cache
+            ):
                 self.notes.append(f"clip {clip_id}: its prepared clip was not in the cache; prepared again")
             self.executed.prepared += not report.from_cache
             self.executed.from_cache += report.from_cache

@@ -122,7 +122,12 @@ class FactoryWork:
         return self.experts[expert].digest()
 
     def prepare(self, ref: ClipRef) -> PreparedClip | Rejected:
-        """Read the clip, check that its block can be rendered, list its candidates."""
+        """Read the clip, check that its block can be rendered, list its candidates.
+
+        In a run of `human` alone the clip is read and nothing more: its drive needs no block and no candidates.
+        """
+        if not self._simulates:
+            return self._unlisted(ref)
         made = self.considered(ref)
         if isinstance(made, Rejected):
             return made
@@ -139,13 +144,10 @@ class FactoryWork:
 
     def considered(self, ref: ClipRef) -> Considered | Rejected:
         """All that `prepare` decides, and every gated trajectory's fate. Rejected: for every expert. Raises BadClip."""
-        if ref in self.broken:
-            raise BrokenLog(ref.log_id, self.broken[ref])
         watch = Stopwatch()
-        with watch.of("clip"):
-            clip = self.reader.read(ref)
-        if not has_route(clip.centerline):
-            return Rejected("clip", "route_ended", "the log ends at the end of its route")
+        clip = self._read(ref, watch)
+        if isinstance(clip, Rejected):
+            return clip
         with watch.of("render"):
             blocked = self._block_verdict(clip)
         with watch.of("perturb"):
@@ -153,6 +155,23 @@ class FactoryWork:
                 clip, self.vocabulary, self.perturb, self.traffic, self.pdm, stream(self.seed, clip.clip_id, "perturb")
             )
         return Considered(clip, found, watch.seconds)
+
+    def _read(self, ref: ClipRef, watch: Stopwatch) -> Clip | Rejected:
+        if ref in self.broken:
+            raise BrokenLog(ref.log_id, self.broken[ref])
+        with watch.of("clip"):
+            clip = self.reader.read(ref)
+        if not has_route(clip.centerline):
+            return Rejected("clip", "route_ended", "the log ends at the end of its route")
+        return clip
+
+    def _unlisted(self, ref: ClipRef) -> PreparedClip | Rejected:
+        watch = Stopwatch()
+        clip = self._read(ref, watch)
+        if isinstance(clip, Rejected):
+            return clip
+        payload = PerturbedClip(ref, replace(clip, images=(), sweeps=(), block=None), ())
+        return PreparedClip(clip.clip_id, clip.content_digest, (), {}, payload, seconds=watch.seconds)
 
     def content_digest(self, ref: ClipRef) -> str | None:
         """Of what the clip would be read from now; None where the reader cannot tell."""
@@ -162,7 +181,7 @@ class FactoryWork:
     def block(self, ref: ClipRef) -> str | None:
         """The reader's name of the clip's block; None where it has none, or this run does not render from blocks."""
         named = getattr(self.reader, "block", None)
-        if named is None or ref in self.broken or not self._wants_blocks or self.render.mode is not RenderMode.AUTO:
+        if named is None or ref in self.broken or not self._simulates or self.render.mode is not RenderMode.AUTO:
             return None
         name = named(ref)
         return None if name is None else str(name)
@@ -236,11 +255,11 @@ class FactoryWork:
 
     def _block_verdict(self, clip: Clip) -> Rejected | None:
         """Asked for before perturb work is spent. Without a gate a block is built here only if it will be needed."""
-        return self.imaging.block_verdict(clip) if self._wants_blocks else None
+        return self.imaging.block_verdict(clip) if self.render.refuses_blocks or self._simulates else None
 
     @property
-    def _wants_blocks(self) -> bool:
-        return self.render.refuses_blocks or bool(set(self.experts) - {HUMAN})
+    def _simulates(self) -> bool:
+        return bool(set(self.experts) - {HUMAN})
 
     def _with_sensors(self, payload: PerturbedClip) -> Clip:
         if self.render.mode is not RenderMode.AUTO:

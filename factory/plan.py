@@ -8,7 +8,7 @@ from factory.store.candidates import Listed
 from factory.store.outcomes import Kind
 from factory.store.samples import WAYS_OUT, ChangedRun, History, OnChange, Past
 from factory.walk import Exhausted, Step, Try, next_step
-from factory.work import HUMAN_CANDIDATE, RunIdentity
+from factory.work import HUMAN_CANDIDATE, UNLISTED, RunIdentity
 
 Policy = Callable[[Past], bool]
 CLIP_CANDIDATE = HUMAN_CANDIDATE  # of a row about the clip as a whole (its expert is empty)
@@ -76,12 +76,14 @@ def make_plan(
     found = 0
     others = {clip_id for clip_id, expert in history.walks if expert not in ("", *experts)}
     for ref in refs:
-        listed = history.candidates.get(ref.clip_id)
-        if listed is not None and listed.prepare_digest != identity.prepare_digest:
+        stored = listed = history.candidates.get(ref.clip_id)
+        if stored is not None and _of_other_settings(stored, identity):
             if on_change != "redo":
                 frozen.append(ref)
                 continue
-            listed = None
+            stored = listed = None
+        if stored is not None and UNLISTED == stored.prepare_digest != identity.prepare_digest:
+            listed = None  # its drive is stored, its candidates are to be found
         walks = tuple(_walk(history, ref.clip_id, expert, on_change) for expert in experts)
         whole = _walk(history, ref.clip_id, "", on_change)
         stays = on_change != "redo" or any(walk.known and not walk.stale for walk in walks) or ref.clip_id in others
@@ -92,7 +94,7 @@ def make_plan(
             listed,
             whole.stale,
             listed.n_candidates if listed is not None else 0,
-            listed.content_digest if listed is not None and stays else None,
+            stored.content_digest if stored is not None and stays else None,
         )
         found += sum(past.kind in (Kind.ACCEPTED, Kind.REJECTED) for walk in clip.walks for past in walk.known.values())
         (todo if _has_work(clip, rounds, may_retry) else done).append(clip)
@@ -102,7 +104,7 @@ def make_plan(
 def _refuse_mixing(
     refs: Sequence[ClipRef], experts: Sequence[str], history: History, identity: RunIdentity, on_change: OnChange
 ) -> None:
-    relisted = {clip_id for clip_id, row in history.candidates.items() if row.prepare_digest != identity.prepare_digest}
+    relisted = {clip_id for clip_id, row in history.candidates.items() if _of_other_settings(row, identity)}
     if on_change == "stop":
         old = {clip_id for clip_id, expert in history.stale if expert in ("", *experts)} | relisted
         mixed = [ref for ref in refs if ref.clip_id in old]
@@ -117,6 +119,10 @@ def _refuse_mixing(
                 f"redo replaces candidate lists that rows of {', '.join(left)} stand on: name these experts too, or "
                 "choose another out"
             )
+
+
+def _of_other_settings(stored: Listed, identity: RunIdentity) -> bool:
+    return stored.prepare_digest not in (identity.prepare_digest, UNLISTED) and identity.prepare_digest != UNLISTED
 
 
 def _walk(history: History, clip_id: str, expert: str, on_change: OnChange) -> WalkState:

@@ -18,7 +18,7 @@ from factory.vocabulary import (
     save_recovery_table,
     train_windows,
 )
-from factory.work import RunIdentity, canonical_json
+from factory.work import HUMAN, UNLISTED, RunIdentity, canonical_json
 from tasks.attempt import ExpertGate
 from tasks.caches import user_cache
 from tasks.experts.human import Human
@@ -296,7 +296,8 @@ def identity_of(config: RunConfig, vocabulary: Vocabulary, labelling: Labelling 
         early |= {key: value for key, value in settings.items() if key.startswith("render.")}
         stages.append("render")
     prepared = canonical_json([early, {stage: versions[stage] for stage in stages}])
-    return RunIdentity(settings, versions, vocabulary.digest, hashlib.sha256(prepared.encode()).hexdigest()[:16])
+    digest = hashlib.sha256(prepared.encode()).hexdigest()[:16]
+    return RunIdentity(settings, versions, vocabulary.digest, UNLISTED if set(config.experts) == {HUMAN} else digest)
 
 
 def cache_folder(config: RunConfig) -> str:

@@ -15,6 +15,7 @@ from tasks.stages import Rejected
 
 HUMAN = "human"  # the expert that is the log itself
 HUMAN_CANDIDATE = -1  # its only candidate index
+UNLISTED = "unlisted"  # prepare_digest of clips prepared for the log's own drive alone: no perturb work, no list
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,8 @@ class RunIdentity:
     settings: Mapping[str, object]  # flat, dotted names -> plain values; without rounds, experts, limit, executor, out
     stage_versions: Mapping[str, int]
     vocabulary_digest: str
-    prepare_digest: str  # of all that `prepare` depends on besides the clip: perturb, traffic, seed, stage versions
+    prepare_digest: str  # of all that `prepare` depends on besides the clip: perturb, traffic, seed, stage versions;
+    # UNLISTED in a run of `human` alone
 
     @property
     def settings_hash(self) -> str:

@@ -18,7 +18,7 @@ from factory.store.location import Location
 from factory.store.outcomes import OUTCOMES, Kind, Outcome, outcomes_table
 from factory.store.schema import LICENCES_PROPERTY, SAMPLES, SCHEMA_VERSION
 from factory.store.table import KeyedTable, Shard, write_shard
-from factory.work import RunIdentity, canonical_json
+from factory.work import UNLISTED, RunIdentity, canonical_json
 
 OnChange = Literal["stop", "keep", "redo"]
 RUN_FILE = "run.json"
@@ -105,6 +105,8 @@ class Store:
             if changes and on_change == "stop":
                 raise ChangedRun(f"{self.location.uri} was made with other settings: {'; '.join(changes)}. {WAYS_OUT}")
             record["expert_digests"] = records[-1]["expert_digests"] | record["expert_digests"]
+            if identity.prepare_digest == UNLISTED:  # lists of earlier runs stay what they are
+                record["prepare_digest"] = records[-1]["prepare_digest"]
             if on_change == "stop":
                 record["on_change"] = records[-1].get("on_change", "stop")
             if not changes:
@@ -238,6 +240,10 @@ def differences(old: Mapping[str, object], new: Mapping[str, object]) -> list[st
             if a.get(n, missing) != b.get(n, missing)
         ]
     for part, word in (("vocabulary_digest", "vocabulary"), ("prepare_digest", "what perturb depends on")):
-        if old[part] != new[part] and not (part == "prepare_digest" and found):
+        if (
+            old[part] != new[part]
+            and UNLISTED not in (old[part], new[part])
+            and not (part == "prepare_digest" and found)
+        ):
             found.append(f"{word}: {old[part]} -> {new[part]}")
     return found

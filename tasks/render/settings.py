@@ -62,12 +62,12 @@ class RenderSettings:
     width: int = 320  # pixels
     height: int = 180
     jpeg_quality: int = 90
-    psnr_min: float = 0.0  # [dB] what a block's held-out photos must come out with; 0: anything
+    psnr_min: float = 27.0  # [dB] what a block's held-out photos must come out with; 0: anything
     psnr_gate: PsnrGate = PsnrGate.REJECT  # what becomes of a block below psnr_min
     gate: GateSettings = field(default_factory=GateSettings)  # what every rendered picture of a drive must come up to
     lidar_only_reach_m: float = 15.0  # without photos: images only this close to where a sweep was taken; 0: none
     map_rig: str = "three_front"  # cameras of a clip without a rig of its own, for mode=map
-    scene: SceneFrom = SceneFrom.DISCS
+    scene: SceneFrom = SceneFrom.FIT
     asset: AssetSettings = field(default_factory=AssetSettings)
     fit: FitSettings = field(default_factory=FitSettings)
 
@@ -88,4 +88,4 @@ class RenderSettings:
     @property
     def refuses_blocks(self) -> bool:
         """Whether a block can be too poor for any of its clips to be perturbed."""
-        return self.psnr_min > 0.0 and self.psnr_gate is PsnrGate.REJECT
+        return self.mode is RenderMode.AUTO and self.psnr_min > 0.0 and self.psnr_gate is PsnrGate.REJECT

@@ -16,6 +16,7 @@ import pytest
 from factory.execute import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, RunSummary, execute
 from factory.store.samples import Store
 from factory.store.verify import verify
+from factory.work import UNLISTED
 from tests.factory.tables import assert_same_rows, assert_same_tables, tables_of
 from tests.factory.toy import VERSIONS, ToyWork, ran, refs
 
@@ -367,3 +368,21 @@ def test_shards_close_by_size_and_commits_are_groups(tmp_path: Path, plain: Call
     assert len(one.live_files()) == 5  # partitions: two rounds of two experts, and human
     assert one.version == 3  # created, claimed, licences named, one group
     assert_same_tables(tmp_path / "out", plain())
+
+
+def test_simulated_experts_after_the_log_s_own_drive_leave_what_one_run_leaves(
+    tmp_path: Path, plain: Callable[..., Path]
+) -> None:
+    """A run of `human` alone lists no candidates; whoever comes after lists them, and says when the log was changed."""
+    alone = ToyWork(prepare_digest=UNLISTED)
+    assert run(tmp_path, alone, experts=["human"]).exit_code == COMPLETE
+    again = run(tmp_path, alone, experts=["human"])
+    assert (again.executed.prepared, again.executed.attempts) == (0, 0), "nothing is left of it"
+    changed = run(tmp_path, ToyWork(content="another"))
+    assert changed.exit_code == COMPLETE_WITH_FAILURES and changed.counts["failed"] == 4
+    assert run(tmp_path, retry=True).exit_code == COMPLETE
+    assert_same_tables(tmp_path, plain())
+    journal = tmp_path / "journal"
+    after = run(tmp_path, replace(alone, journal=str(journal)), experts=["human"])
+    assert after.exit_code == COMPLETE and ran(journal, "prepare") == 0, "the lists stay"
+    assert_same_tables(tmp_path, plain())

@@ -12,7 +12,7 @@ from factory.clips.synthetic.reader import SyntheticReader
 from factory.clips.synthetic.write import TownSettings
 from factory.pipeline import Considered, FactoryWork
 from factory.settings import assemble, identity_of, load_config
-from factory.work import HUMAN, HUMAN_CANDIDATE, Accepted, Dropped, PreparedClip
+from factory.work import HUMAN, HUMAN_CANDIDATE, UNLISTED, Accepted, Dropped, PreparedClip
 from tasks import stages
 from tasks.kinematic_vocabulary import kinematic_trajectories
 from tasks.perturb import Perturbation
@@ -20,7 +20,8 @@ from tasks.vocabulary import Vocabulary
 
 SMALL = TownSettings(cameras=("ring_front_center",), width=64, height=36, lidar_beams=16, lidar_azimuths=300)
 VOCABULARY = Vocabulary(kinematic_trajectories(3, 0))
-SIZE = ["render.width=64", "render.height=36", "vocabulary.k=300", "experts=[pdm_closed,human]"]
+SIZE = ["render.width=64", "render.height=36", "render.scene=discs", "render.psnr_min=0", "vocabulary.k=300"]
+SIZE += ["experts=[pdm_closed,human]"]
 
 
 @pytest.fixture(scope="module")
@@ -125,9 +126,9 @@ def test_what_is_considered_is_what_is_prepared(town: Path, tmp_path: Path) -> N
         ("traffic=replay", True),
         ("seed=1", True),
         ("reward.progress_above=0.6", False),  # judges attempts only
-        ("render.width=128", False),
-        ("render.gate.hole_max=0.5", False),
-        ("render.psnr_min=27", True),
+        ("render.width=128", True),  # another block, which may be refused
+        ("render.psnr_min=0", True),
+        ("experts=[pdm_closed]", False),
         ("rounds=5", False),
     ],
 )
@@ -137,18 +138,16 @@ def test_what_a_prepared_clip_depends_on(override: str, prepares_anew: bool) -> 
     assert (before != after) == prepares_anew
 
 
-def test_with_a_gate_the_block_s_settings_are_part_of_what_is_prepared() -> None:
-    small, large = (
-        identity_of(load_config(["render.psnr_min=27", f"render.width={width}"]), VOCABULARY, None)
-        for width in (64, 128)
-    )
-    assert small.prepare_digest != large.prepare_digest
+def test_without_a_gate_the_block_s_settings_are_no_part_of_what_is_prepared() -> None:
+    for free in (["render.psnr_min=0"], ["render=none"]):
+        small, large = (identity_of(load_config([*free, f"render.width={w}"]), VOCABULARY, None) for w in (64, 128))
+        assert small.prepare_digest == large.prepare_digest
 
 
 def test_a_gate_that_only_marks_prepares_nothing_anew() -> None:
     plain, marking = (
         identity_of(load_config(overrides), VOCABULARY, None).prepare_digest
-        for overrides in ([], ["render.psnr_min=27", "render.psnr_gate=mark"])
+        for overrides in (["render.psnr_min=0"], ["render.psnr_gate=mark"])
     )
     assert plain == marking
 
@@ -159,3 +158,15 @@ def test_a_raised_stage_before_the_attempts_prepares_anew(stage: str, monkeypatc
     raised = [dataclasses.replace(s, version=s.version + (s.name == stage)) for s in stages.STAGES]
     monkeypatch.setattr(stages, "STAGES", tuple(raised))
     assert identity_of(load_config([]), VOCABULARY, None).prepare_digest != before
+
+
+def test_the_log_s_own_drive_alone_needs_no_candidates_and_no_block(town: Path, tmp_path: Path) -> None:
+    work = work_on(town, tmp_path, "experts=[human]", "render.psnr_min=60")
+    ref = work.reader.index().refs[0]
+    assert work.block(ref) is None and work_on(town, tmp_path).block(ref) is not None
+    prepared = work.prepare(ref)
+    assert isinstance(prepared, PreparedClip)
+    assert prepared.candidates == () and prepared.dropped is None and work.identity.prepare_digest == UNLISTED
+    accepted = work.attempt(prepared, HUMAN_CANDIDATE, "human")
+    assert isinstance(accepted, Accepted) and accepted.row["image_source"] == "photo"
+    assert not list(tmp_path.rglob("block-*"))

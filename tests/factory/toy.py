@@ -14,7 +14,7 @@ from factory.clips.reader import BadClip, ClipRef
 from factory.rows import label_columns
 from factory.store.columns import Column
 from factory.store.schema import BOOKKEEPING, FIELDS
-from factory.work import Accepted, AttemptResult, CandidateRow, Dropped, PreparedClip, RunIdentity
+from factory.work import UNLISTED, Accepted, AttemptResult, CandidateRow, Dropped, PreparedClip, RunIdentity
 from tasks.reward.label_bytes import HALVES, WHOLES, VocabularyLabels
 from tasks.stages import Rejected
 
@@ -119,6 +119,8 @@ class ToyWork:
             CandidateRow(i, 10 * i, float(a), float(b), 0.1, 5.0, (i, -i), float(a), float(b))
             for i, (a, b) in enumerate(scores)
         )
+        if self.prepare_digest == UNLISTED:
+            candidates = ()
         payload = {"name": f"{ref.log_id}:{ref.start_ms}", "states": rng.random((6, 41, 3)), "kinds": ("a", "b")}
         dropped = Rejected("perturb", "no_gated_candidate") if empty else None
         counts = {"heading": 7, "lateral": 3}
