@@ -33,11 +33,12 @@ FITTED_FRAMES = 12  # of image_03's training frames, for its affine colour and r
 STEPS = np.array([0.02, 0.02, 0.02, 5e-4, 5e-4, 5e-4])  # [m], [rad] of the finite differences
 SHIFTS_M = (-1.0, 0.0, 1.0)
 SHOWN = (10, 34, 58, 82)  # frames trained on
-SHOWN_AT = (1000, 2000, 4000)  # iterations
+SHOWN_AT = (2000, 4000)  # iterations
 SETTINGS = replace(
     FitSettings(),
-    start_gaussians=160_000,
-    most_gaussians=200_000,
+    start_gaussians=200_000,
+    most_gaussians=230_000,
+    road_share=0.4,
     ssim_weight=0.1,
     opaque_weight=0.1,
     turn_rate=3e-4,

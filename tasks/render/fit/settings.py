@@ -15,6 +15,7 @@ class FitSettings:
     hold_out_every: int = 8  # photo i of a camera with i % n == n // 2 only measures; 0: none is held out
     # Where it starts.
     start_gaussians: int = 90_000  # of the background
+    road_share: float = 1.0  # of the discs on the road, against those elsewhere, how many are taken
     start_node_gaussians: int = 3_000  # of each track, at most
     most_gaussians: int = 130_000
     start_opacity: float = 0.5
@@ -57,6 +58,8 @@ class FitSettings:
         for name in ("iterations", "start_gaussians", "start_node_gaussians", "most_gaussians", "refine_every"):
             if getattr(self, name) < 1:
                 raise ValueError(f"fit {name} must be 1 or more, not {getattr(self, name)}")
+        if self.road_share <= 0.0:
+            raise ValueError(f"fit road_share must be above 0, not {self.road_share}")
         if self.sh_degree not in range(4):
             raise ValueError(f"fit sh_degree must be 0 to 3, not {self.sh_degree}")
         for name in ("ssim_weight", "refine_until", "rate_end", "mean_rate_end"):

@@ -127,18 +127,16 @@ def _first_state(
 ) -> FitState:
     """Of the background's and of each track's discs as many as are wanted, each as much larger."""
     rng = np.random.Generator(np.random.Philox(key=[settings.seed, 2**33]))
-    parts, owner = [_thinned(background, settings.start_gaussians, rng)], [BACKGROUND]
+    weight = np.where(_lies_on(background, road), settings.road_share, 1.0)
+    parts, owner = [_thinned(background, settings.start_gaussians, weight, rng)], [BACKGROUND]
     for j, node in enumerate(nodes):
         if node is not None:
-            parts.append(_thinned(node, settings.start_node_gaussians, rng))
+            parts.append(_thinned(node, settings.start_node_gaussians, np.ones(len(node)), rng))
             owner.append(j)
     start = concatenate(parts)
     owners = np.repeat(owner, [len(part) for part in parts]).astype(np.int32)
-    on_road = np.zeros(len(start), bool)
+    on_road = _lies_on(start, road) & (owners == BACKGROUND)
     if road is not None:
-        with np.errstate(invalid="ignore"):
-            flat = np.abs(rotations_of(start.quats)[:, 2, 2]) > UPRIGHT
-            on_road = (np.abs(above_road(start.means, road)) < ROAD_TOP_M) & flat & (owners == BACKGROUND)
         lay_flat(
             start.means,
             start.quats,
@@ -164,10 +162,20 @@ def _first_state(
     return FitState(0, learned, owners, on_road, nearest, np.zeros(len(start), np.float32))
 
 
-def _thinned(gaussians: Gaussians, n: int, rng: np.random.Generator) -> Gaussians:
+def _lies_on(gaussians: Gaussians, road: Road | None) -> NDArray[np.bool_]:
+    if road is None:
+        return np.zeros(len(gaussians), bool)
+    flat = np.abs(rotations_of(gaussians.quats)[:, 2, 2]) > UPRIGHT
+    with np.errstate(invalid="ignore"):
+        return np.asarray((np.abs(above_road(gaussians.means, road)) < ROAD_TOP_M) & flat)
+
+
+def _thinned(gaussians: Gaussians, n: int, weight: F64, rng: np.random.Generator) -> Gaussians:
+    """`n` of them by `weight`, each as much larger as there are fewer of its kind."""
     if len(gaussians) <= n:
         return gaussians
-    rows = np.sort(rng.choice(len(gaussians), n, replace=False))
+    rows = np.sort(rng.choice(len(gaussians), n, replace=False, p=weight / weight.sum()))
     kept = gaussians.take(rows)
-    larger = np.array([0.5, 0.5, 0.0], np.float32) * np.log(len(gaussians) / n)
+    fewer = np.maximum(weight.sum() / (n * weight[rows]), 1.0)
+    larger = np.array([0.5, 0.5, 0.0]) * np.log(fewer)[:, None]
     return replace(kept, log_scales=(kept.log_scales + larger).astype(np.float32))

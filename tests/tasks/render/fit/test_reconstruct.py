@@ -110,3 +110,15 @@ def test_progress_is_told_and_photos_are_needed() -> None:
         reconstruct([], [], None, SETTINGS)
     with pytest.raises(ValueError, match="iterations"):
         FitSettings(iterations=0)
+
+
+def test_a_plain_road_can_start_with_fewer_and_larger_gaussians(prepared: tuple[Problem, FitState]) -> None:
+    photos, sweeps = few()
+    _, sparse = prepare(photos, sweeps, street.tracks(), replace(SETTINGS, road_share=0.25), held_out=[2])
+    _, usual = prepared
+    assert len(sparse) == len(usual)
+    assert sparse.road.sum() < 0.7 * usual.road.sum()
+    sizes = [np.median(state.learned["log_scales"].values[state.road, 0]) for state in (sparse, usual)]
+    assert sizes[0] > sizes[1] + 0.1
+    with pytest.raises(ValueError, match="road_share"):
+        replace(SETTINGS, road_share=0.0)
