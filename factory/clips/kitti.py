@@ -107,8 +107,8 @@ def read_drive(root: Path, date: str = "2011_09_26", drive: str = "0001") -> Kit
 def steadied(drive: KittiDrive) -> KittiDrive:
     """The drive with its poses at the moments when the cameras were triggered.
 
-    The scanner that triggers them turns at a steady rate; stamps and poses are those of the closest tick of 10 ms, up to
-    8 cm from where a photo of drive 0001 was taken. The rate is the stamps' own, with what little it drifts (a cubic).
+    The scanner that triggers them turns at a steady rate; stamps and poses are those of the closest tick of 10 ms, up
+    to 8 cm from where a photo of drive 0001 was taken. The rate is the stamps' own, with what it drifts (a cubic).
     """
     stamps, frames = drive.times_s, np.arange(len(drive.times_s))
     if len(frames) < 8:
