@@ -1,6 +1,8 @@
-"""Draws the town: rasterise at two samples per pixel and axis, then shade what is visible.
+"""Draws the town: rasterise, shade what is visible in each half pixel, and blur as a lens does.
 
 Textures live in surface coordinates and the sun's shadows in a depth map, so a place looks the same from everywhere.
+Nothing finer than a pixel may be left in a picture: it would shimmer from photo to photo, and no scene that is learned
+from photos could tell how. One shading per pixel differs by 30 to 36 dB from the picture with 64, four by 35 to 40.
 """
 
 from dataclasses import dataclass
@@ -18,7 +20,9 @@ from factory.clips.synthetic.shade import shade
 from factory.clips.synthetic.textures import TREELINE
 from tasks.world.camera import Camera
 
-SAMPLES = 2  # per pixel and axis
+CELLS = 2  # shaded places per pixel and axis
+SAMPLES = 2  # per cell and axis, of what is visible
+OPTICS = (0.125, 0.375, 0.375, 0.125)  # weights of the cells in a pixel and one beside it: 0.46 pixels of blur
 SHADOW_TEXEL_M = 0.2
 SHADOW_SIZE = 1500  # texels: 300 m around the drive
 STANDING_RANGE_M = 330.0  # of the drive's middle
@@ -129,11 +133,12 @@ def look(stage: Stage, view: Array, width: int, height: int) -> Visible:
 
 def paint(stage: Stage, camera: Camera, world_from_ego: Array) -> NDArray[np.uint8]:
     """(H, W, 3) RGB picture of the stage by a camera of the ego at `world_from_ego` (4, 4)."""
-    scale = np.diag([SAMPLES, SAMPLES, 1.0])
+    per_pixel, margin = CELLS * SAMPLES, SAMPLES  # of one cell: what the optics reach beyond the picture's edge
+    scale = np.array([[per_pixel, 0.0, margin], [0.0, per_pixel, margin], [0.0, 0.0, 1.0]])
     world_from_camera = world_from_ego @ camera.ego_from_camera
     view, rays = camera_view(scale @ camera.intrinsics, world_from_camera)
-    seen = look(stage, view, camera.width * SAMPLES, camera.height * SAMPLES)
-    image = np.empty((camera.height, camera.width, 3), np.uint8)
+    cells = np.empty((CELLS * camera.height + 2, CELLS * camera.width + 2, 3), np.float32)
+    seen = look(stage, view, SAMPLES * cells.shape[1], SAMPLES * cells.shape[0])
     mesh = stage.mesh
     shade(
         seen.ids,
@@ -150,6 +155,14 @@ def paint(stage: Stage, camera: Camera, world_from_ego: Array) -> NDArray[np.uin
         stage.sun.view,
         stage.shadow,
         stage.sky_seed,
-        image,
+        cells,
     )
-    return image
+    return _through_optics(cells)
+
+
+def _through_optics(cells: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """(H, W, 3) of cells (2 H + 2, 2 W + 2, 3) in [0, 255]."""
+    n_rows, n_columns = len(cells) - 3, cells.shape[1] - 3
+    rows = np.sum([weight * cells[k : n_rows + k : CELLS] for k, weight in enumerate(OPTICS)], axis=0)
+    both = np.sum([weight * rows[:, k : n_columns + k : CELLS] for k, weight in enumerate(OPTICS)], axis=0)
+    return np.asarray(np.rint(both), np.uint8)

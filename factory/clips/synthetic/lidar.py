@@ -14,7 +14,7 @@ from factory.clips.synthetic.curves import Array
 from factory.clips.synthetic.draw import Stage, camera_view, look
 
 MOUNT_M = np.array([1.2, 0.0, 1.62])  # in the ego frame
-ELEVATIONS_DEG = (-24.0, 14.0)
+ELEVATIONS_DEG = (-22.5, 22.5)  # as high as the cameras look: what no beam meets, photos have to guess
 RANGE_M = (1.5, 110.0)
 VIEW_SAMPLES = (640, 440)  # of one 90 degree view: 0.18 degrees apart in its middle
 _REFLECTANCE = {tx.ROAD: 0.22, tx.ASPHALT: 0.20, tx.GLOW: 0.9, tx.SIGN: 0.95, tx.LEAVES: 0.35, tx.CABIN: 0.08}

@@ -51,7 +51,7 @@ def road_surface(x: float, y: float, u: float, d: float, marks: NDArray[np.float
     if cover > 0.0:
         wear = (
             0.92
-            - 0.5 * max(0.0, noise(x / 0.13, y / 0.13, 31) - 0.55) * visible(0.13, fp)
+            - 0.25 * max(0.0, noise(x / 0.13, y / 0.13, 31) - 0.55) * visible(0.13, fp)
             - 0.15 * noise(x / 2.0, y / 2.0, 32)
         )
         cover *= wear
@@ -71,7 +71,7 @@ def sky(dx: float, dy: float, dz: float, sun: NDArray[np.float64], seed: int) ->
     u, v = dx * plane, dy * plane
     cloud, size = 0.0, 0.5
     scale = 0.9
-    for k in range(5):
+    for k in range(4):
         cloud += size * noise(u * scale + 17.0, v * scale, seed + k)
         size *= 0.52
         scale *= 2.13
@@ -112,7 +112,7 @@ def surface_colour(
     if kind == tx.FACADE:
         return tx.facade(u, v, extent_u, extent_v, seed, fu, fv)
     if kind == tx.LEAVES:
-        tone = 0.62 + 0.75 * chance(math.floor(u / 0.17), math.floor(v / 0.17), seed)
+        tone = 0.85 + 0.3 * chance(math.floor(u / 0.17), math.floor(v / 0.17), seed)
         return r * tone, g * tone, b * tone
     if kind == tx.KERB:
         joint = 0.7 if u % 1.0 < 0.02 and fu < 0.2 else 1.0
@@ -227,9 +227,9 @@ def shade(
     sun_view: NDArray[np.float64],  # (4, 4)
     shadow: NDArray[np.float32],
     sky_seed: int,
-    image: NDArray[np.uint8],  # (H, W, 3) out, RGB
+    image: NDArray[np.float32],  # (H, W, 3) out, RGB in [0, 255]
 ) -> None:
-    """Each pixel is the mean of its 2 x 2 samples; a triangle that covers several of them is shaded once."""
+    """Each cell is the mean of its 2 x 2 samples; a triangle that covers several of them is shaded once."""
     height, width = image.shape[:2]
     for row in range(height):
         for column in range(width):
@@ -293,11 +293,11 @@ def shade(
                         r *= ambient * 0.93 + 0.86 * direct
                         g *= ambient + 0.80 * direct
                         b *= ambient * 1.10 + 0.70 * direct
-                    haze = 1.0 - math.exp(-depth / 1100.0)
+                    haze = 1.0 - math.exp(-depth / 2200.0)
                     r, g, b = r + (0.84 - r) * haze, g + (0.88 - g) * haze, b + (0.93 - b) * haze
                 red += count * r
                 green += count * g
                 blue += count * b
-            image[row, column, 0] = np.uint8(min(255.0, max(0.0, red * 63.75)))
-            image[row, column, 1] = np.uint8(min(255.0, max(0.0, green * 63.75)))
-            image[row, column, 2] = np.uint8(min(255.0, max(0.0, blue * 63.75)))
+            image[row, column, 0] = min(255.0, max(0.0, red * 63.75))
+            image[row, column, 1] = min(255.0, max(0.0, green * 63.75))
+            image[row, column, 2] = min(255.0, max(0.0, blue * 63.75))

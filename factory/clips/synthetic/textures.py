@@ -98,14 +98,14 @@ def asphalt(x: float, y: float, footprint: float) -> RGB:
     if chance(math.floor(patch_u), math.floor(patch_v), 5) < 0.22:
         tone *= 0.86
     blotch = noise(x / 0.45, y / 0.45, 3) - 0.5
-    tone += 0.07 * visible(0.45, footprint) * blotch
+    tone += 0.05 * visible(0.45, footprint) * blotch
     seen = visible(0.10, footprint)
     if seen > 0.0:
         bend_x, bend_y = x + 0.5 * noise(x / 0.9, y / 0.9, 7), y + 0.5 * noise(x / 0.9, y / 0.9, 8)
         ridge = abs(noise(bend_x / 2.6, bend_y / 2.6, 4) - 0.5)
         if ridge < 0.018 and noise(x / 14.0, y / 14.0, 6) > 0.42:
-            tone -= 0.16 * seen * (1 - ridge / 0.018)
-        tone += 0.13 * grain(x, y, 11, footprint)
+            tone -= 0.11 * seen * (1 - ridge / 0.018)
+        tone += 0.05 * grain(x, y, 11, footprint)
     return tone, tone * 1.005, tone * 1.02
 
 
@@ -127,7 +127,7 @@ def paving(u: float, v: float, seed: int, footprint: float) -> RGB:
     )
     if joint > 0:
         tone -= 0.2 * joint * visible(0.1, footprint)
-    tone += 0.12 * grain(u, v, seed + 2, footprint)
+    tone += 0.05 * grain(u, v, seed + 2, footprint)
     spot = noise(u / 0.25, v / 0.25, seed + 4)
     if spot > 0.86:
         tone -= 0.3 * (spot - 0.86) * visible(0.2, footprint) * 2
@@ -141,7 +141,7 @@ def grass(x: float, y: float, footprint: float) -> RGB:
     tuft = (noise(x / 0.5, y / 0.5, 22) - 0.5) * visible(0.5, footprint)
     blade = (noise(x / 0.09, y / 0.09, 23) - 0.5) * visible(0.09, footprint)
     blade += (noise(x / 0.03, y / 0.03, 24) - 0.5) * visible(0.03, footprint)
-    tone = 0.85 + 0.35 * tuft + 0.5 * blade
+    tone = 0.85 + 0.3 * tuft + 0.25 * blade
     bare = min(1.0, max(0.0, (broad - 0.62) * 5))
     return (0.27 + 0.12 * bare) * tone, (0.36 - 0.02 * bare) * tone, (0.15 + 0.07 * bare) * tone
 
@@ -155,7 +155,7 @@ def wall(u: float, v: float, style: int, seed: int, footprint: float) -> RGB:
         shifted = u + 0.12 * (row % 2)
         column = math.floor(shifted / 0.24)
         seen = visible(0.085, footprint)
-        tone = stain * (1 + 0.34 * seen * (chance(int(column), int(row), seed) - 0.5))
+        tone = stain * (1 + 0.2 * seen * (chance(int(column), int(row), seed) - 0.5))
         du, dv = shifted - column * 0.24, v - row * 0.085
         mortar = max(inside(du, 0.0, 0.014, footprint), inside(dv, 0.0, 0.014, footprint)) * visible(0.06, footprint)
         if style == 0:
@@ -165,7 +165,7 @@ def wall(u: float, v: float, style: int, seed: int, footprint: float) -> RGB:
         else:
             r, g, b = 0.66 * tone, 0.54 * tone, 0.40 * tone
         return r + (0.62 - r) * mortar, g + (0.59 - g) * mortar, b + (0.55 - b) * mortar
-    rough = stain + 0.22 * grain(u, v, seed + 3, footprint)
+    rough = stain + 0.1 * grain(u, v, seed + 3, footprint)
     if style == 3:
         return 0.80 * rough, 0.74 * rough, 0.62 * rough
     if style == 4:

@@ -15,7 +15,7 @@ from factory.clips.synthetic.traffic import Track
 LOGS_PER_TOWN = len(SCENARIOS)  # then another town of the same plan, with other lengths, bends, houses
 LOG_STEPS = 116  # annotated frames of a log, 11.5 s
 WINDOWS_PER_LOG = 3  # of 9.5 s at stride 1 s
-STEPS_PER_IMAGE = 5  # 2 Hz, and so the lidar
+STEPS_PER_SWEEP = 5  # 2 Hz
 
 
 @dataclass(frozen=True)

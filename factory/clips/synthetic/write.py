@@ -24,7 +24,7 @@ from factory.clips.synthetic.drive import Drive
 from factory.clips.synthetic.lidar import scan
 from factory.clips.synthetic.rig import REAR_AXLE_Z_M, build_rig, world_from_ego
 from factory.clips.synthetic.streets import Lane, Streets
-from factory.clips.synthetic.town import LOG_STEPS, STEPS_PER_IMAGE, WINDOWS_PER_LOG, Town, log_name, plan_log
+from factory.clips.synthetic.town import LOG_STEPS, STEPS_PER_SWEEP, WINDOWS_PER_LOG, Town, log_name, plan_log
 from factory.clips.synthetic.traffic import GREEN, RED, YELLOW
 from tasks.world.camera import Camera
 
@@ -47,7 +47,8 @@ class TownSettings:
     width: int = 320  # pixels
     height: int = 180
     jpeg_quality: int = 92
-    lidar_beams: int = 32  # 0: no lidar
+    steps_per_photo: int = 5  # of 0.1 s: 5 is 2 Hz, as fast as samples want them; 1 is 10 Hz, for scenes to learn from
+    lidar_beams: int = 64  # 0: no lidar
     lidar_azimuths: int = 900
 
     def __post_init__(self) -> None:
@@ -55,6 +56,8 @@ class TownSettings:
         build_rig(self.cameras, self.width, self.height)
         if self.width < 16 or self.height < 16 or not 1 <= self.jpeg_quality <= 100:
             raise ValueError(f"impossible picture: {self.width}x{self.height}, quality {self.jpeg_quality}")
+        if self.steps_per_photo < 1 or STEPS_PER_SWEEP % self.steps_per_photo:
+            raise ValueError(f"steps_per_photo must divide {STEPS_PER_SWEEP}, not {self.steps_per_photo}")
         if self.lidar_beams < 0 or self.lidar_azimuths < 1:
             raise ValueError(f"impossible lidar: {self.lidar_beams} beams, {self.lidar_azimuths} azimuths")
 
@@ -116,14 +119,14 @@ def _sensors(
             picture = cv2.cvtColor(paint(stage, camera, pose), cv2.COLOR_RGB2BGR)
             _ok, jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, settings.jpeg_quality])
             (folder / "sensors" / "cameras" / camera.name / f"{stamp}.jpg").write_bytes(jpeg.tobytes())
-        if settings.lidar_beams:
+        if settings.lidar_beams and step % STEPS_PER_SWEEP == 0:
             sweep = scan(stage, pose, settings.lidar_beams, settings.lidar_azimuths)
             columns = {axis: pa.array(sweep.points[:, k]) for k, axis in enumerate("xyz")}
             columns |= {name: pa.array(getattr(sweep, name)) for name in ("intensity", "laser_number", "offset_ns")}
             _feather(folder / "sensors" / "lidar" / f"{stamp}.feather", columns)
 
     with ThreadPoolExecutor(max_workers=threads) as pool:
-        list(pool.map(record, range(0, LOG_STEPS, STEPS_PER_IMAGE)))
+        list(pool.map(record, range(0, LOG_STEPS, settings.steps_per_photo if rig else STEPS_PER_SWEEP)))
 
 
 def _feather(path: Path, columns: Mapping[str, Any]) -> None:

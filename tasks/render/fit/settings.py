@@ -14,6 +14,9 @@ class FitSettings:
     seed: int = 0
     hold_out_every: int = 8  # photo i of a camera with i % n == n // 2 only measures; 0: none is held out
     # Where it starts.
+    start_every: int = (
+        1  # every n-th instant's photos say where there are surfaces: photos that hardly differ, less work
+    )
     start_gaussians: int = 90_000  # of the background
     road_share: float = 1.0  # of the discs on the road, against those elsewhere, how many are taken
     start_node_gaussians: int = 3_000  # of each track, at most
@@ -36,7 +39,7 @@ class FitSettings:
     colour_rate: float = 1.2e-2
     sh_rate: float = 6e-4
     sky_rate: float = 4e-3
-    exposure_rate: float = 1e-3
+    exposure_rate: float = 1e-3  # 0: the cameras agree, nothing is aligned
     turn_rate: float = 5e-5  # [rad] of the pose corrections
     shift_rate: float = 5e-4  # [m]
     pose_from: int = 500  # iteration at which poses start to move
@@ -55,7 +58,14 @@ class FitSettings:
     road_thickness: float = 0.005
 
     def __post_init__(self) -> None:
-        for name in ("iterations", "start_gaussians", "start_node_gaussians", "most_gaussians", "refine_every"):
+        for name in (
+            "iterations",
+            "start_every",
+            "start_gaussians",
+            "start_node_gaussians",
+            "most_gaussians",
+            "refine_every",
+        ):
             if getattr(self, name) < 1:
                 raise ValueError(f"fit {name} must be 1 or more, not {getattr(self, name)}")
         if self.road_share <= 0.0:

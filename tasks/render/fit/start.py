@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from tasks.render import sh
 from tasks.render.depth import sparse_depth
 from tasks.render.features import triangulated
-from tasks.render.fit import poses
+from tasks.render.fit import exposure, poses
 from tasks.render.fit.adam import Learned
-from tasks.render.fit.instants import exposures_of, in_agreement
+from tasks.render.fit.instants import exposures_of, in_agreement, instants
 from tasks.render.fit.losses import Target, target_of
 from tasks.render.fit.road import Road, above_road, find_road, lay_flat
 from tasks.render.fit.settings import FitSettings
@@ -75,13 +75,18 @@ def prepare(
     static, per_track = fuse([replace(s, world_from_ego=shifted(s.world_from_ego, -origin)) for s in sweeps], tracks)
     static = static if sweeps else triangulated(train, tracks)
 
+    first_seen = [i for k, group in enumerate(instants(train)) if k % settings.start_every == 0 for i in group]
+    looked_at = [train[i] for i in sorted(first_seen)]
+
     def look(first: int, last: int) -> list[Seen]:
         gap, n = settings.max_gap_px, settings.stereo_photos
-        return [see(p, train, static, per_track, tracks, gap, n) for p in train[first:last]]
+        return [see(p, train, static, per_track, tracks, gap, n) for p in looked_at[first:last]]
 
-    seen = [s for part in in_chunks(look, len(train), 1, threads) for s in part]
-    exposures = exposures_of(train, seen, static)
-    alike = in_agreement(train, exposures)
+    seen = [s for part in in_chunks(look, len(looked_at), 1, threads) for s in part]
+    exposures = np.zeros((len(train), exposure.SIZE), np.float32)
+    if settings.exposure_rate > 0.0:
+        exposures = _exposures(train, looked_at, exposures_of(looked_at, seen, static))
+    alike = in_agreement(looked_at, exposures[sorted(first_seen)])
     background, nodes = surfaces(alike, seen, tracks)
     eyes = np.stack([p.world_from_camera[:3, 3] for p in train])
     road = find_road(static, eyes) if settings.road else None
@@ -97,6 +102,16 @@ def prepare(
         road,
     )
     return problem, state
+
+
+def _exposures(photos: Sequence[Photo], known: Sequence[Photo], rows: F32) -> F32:
+    """Rows (N, 12) of all photos from those (M, 12) of some: of the same camera, between the times before and after."""
+    out = np.zeros((len(photos), exposure.SIZE), np.float32)
+    for i, photo in enumerate(photos):
+        mine = [k for k, other in enumerate(known) if other.camera == photo.camera]
+        if mine:
+            out[i] = poses.between(np.array([known[k].time_s for k in mine]), rows[mine], photo.time_s)
+    return out
 
 
 def _shot(photo: Photo, static: F64, tracks: Tracks, unknown: NDArray[np.bool_], settings: FitSettings) -> Shot:

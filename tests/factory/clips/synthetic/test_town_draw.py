@@ -130,9 +130,9 @@ def test_the_lidar_measures_the_road_and_a_wall_where_they_are() -> None:
     wall = np.abs(points[:, 0] - 25.0) < 1e-3
     ground = np.abs(points[:, 2] + REAR_AXLE_Z_M) < 1e-3
     assert wall.sum() > 200
-    assert ground.sum() > 2000
+    assert ground.sum() > 1500
     assert (wall | ground).all()
-    assert not (points[:, 0] > 25.01).any()
+    assert not (points[:, 0] > 25.5).any()  # a beam at the foot of the wall may meet the lawn that far behind
     assert np.hypot(*(points[ground] - MOUNT_M)[:, :2].T).min() > 3.0
     assert sweep.laser_number.max() < 24
     assert (np.diff(sweep.offset_ns[sweep.laser_number == 3]) > 0).all()

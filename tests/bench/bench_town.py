@@ -1,0 +1,158 @@
+"""A block of the synthetic town, reconstructed and looked at where no photo was: `python -m tests.bench.bench_town`.
+
+The painter of the town knows what is to be seen from everywhere: from held-out photos' poses, from 2 m to either side,
+turned by 20 degrees, and with every vehicle put 3 m ahead and 0.8 m to the left. Only photos, lidar, poses and boxes go
+into the scene. Options: log=0 width=320 height=180 out=out/bench_town threads=2 and the settings of `FitSettings`.
+A camera that would be within 0.6 m of somebody's box is left out. With moved vehicles all pixels count whose sight line
+meets the box of one of them within 40 m, whatever else is in front.
+"""
+
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from factory.clips.av2 import AV2Reader
+from factory.clips.synthetic.draw import Theatre, paint
+from factory.clips.synthetic.drive import Drive
+from factory.clips.synthetic.town import log_name, plan_log
+from factory.clips.synthetic.write import TownSettings, write_log
+from factory.sensors import block_of, load_sensors
+from tasks.render.fit.reconstruct import advance, finish
+from tasks.render.fit.settings import FitSettings
+from tasks.render.fit.start import prepare
+from tasks.render.scene import held_out_rows
+from tasks.render.sensed import Photo
+from tasks.world.camera import Camera
+from tests.bench.town_truth import MOVED_M, Compared, Painter, Truth, beside, sideways
+
+SETTINGS = FitSettings(
+    iterations=4000,
+    start_gaussians=100_000,
+    most_gaussians=150_000,
+    start_node_gaussians=2_000,
+    start_every=4,
+    stereo_photos=0,  # lidar reaches as high as the cameras
+    mean_rate=3.2e-3,
+    quat_rate=8e-3,
+    scale_rate=4e-2,
+    opacity_rate=0.16,
+    colour_rate=2.4e-2,
+    sky_rate=1e-2,
+    exposure_rate=0.0,  # the town's cameras agree, and know where they are
+    pose_from=1_000_000,
+)
+CENTRE = "ring_front_center"
+SHOWN = 6  # pictures of each kind
+
+
+def painter(theatre: Theatre) -> Painter:
+    """Paints what a photo's camera would see at a time since the log's start."""
+
+    def painted(time_s: float, photo: Photo) -> NDArray[np.uint8]:
+        height, width = photo.rgb.shape[:2]
+        camera = Camera(photo.camera, width, height, photo.intrinsics, np.zeros(3), np.eye(4))
+        return paint(theatre.at(round(10.0 * time_s)), camera, photo.world_from_camera)
+
+    return painted
+
+
+def with_moved_vehicles(drive: Drive) -> Drive:
+    """The drive with its vehicles put MOVED_M from where they are."""
+    tracks = []
+    for track in drive.tracks:
+        if track.category not in ("PEDESTRIAN", "BICYCLIST"):
+            c, s = np.cos(track.poses[:, 2]), np.sin(track.poses[:, 2])
+            off = np.stack([MOVED_M[0] * c - MOVED_M[1] * s, MOVED_M[0] * s + MOVED_M[1] * c, 0.0 * c], axis=1)
+            track = replace(track, poses=track.poses + off)
+        tracks.append(track)
+    return replace(drive, tracks=tuple(tracks))
+
+
+def row(name: str, views: Sequence[Compared]) -> str:
+    """A line of the table: mean PSNR and SSIM of the views, and the worst."""
+    scores = np.array([(view.psnr_db, view.ssim) for view in views])
+    return (
+        f"| {name} | {scores[:, 0].mean():.2f} | {scores[:, 1].mean():.3f} | {scores[:, 0].min():.1f} | {len(views)} |"
+    )
+
+
+def picture(views: Sequence[Compared]) -> NDArray[np.uint8]:
+    """Truth, rendering and four times their difference side by side, one view below the other."""
+    chosen = [views[i] for i in np.linspace(0, len(views) - 1, min(SHOWN, len(views))).astype(int)]
+    rows = []
+    for view in chosen:
+        off = np.clip(4.0 * np.abs(view.picture - view.truth), 0.0, 1.0)
+        shown = [view.truth, view.picture, off if view.inside is None else np.where(view.inside[..., None], off, 0.3)]
+        rows.append(np.hstack(shown))
+    return np.rint(255.0 * np.vstack(rows)).astype(np.uint8)
+
+
+def main() -> None:
+    """Writes the log, trains, prints a table, writes pictures."""
+    options = dict(option.split("=", 1) for option in sys.argv[1:])
+    log, threads = int(options.pop("log", "0")), int(options.pop("threads", "2"))
+    width, height = int(options.pop("width", "320")), int(options.pop("height", "180"))
+    out = Path(options.pop("out", "out/bench_town"))
+    kinds = {field.name: type(getattr(SETTINGS, field.name)) for field in fields(FitSettings)}
+    settings = replace(SETTINGS, **{k: kinds[k](float(v)) for k, v in options.items()})
+
+    town, drive = plan_log(0, log)
+    root = out / f"log{log}-{width}x{height}"
+    if not root.exists():
+        began = time.perf_counter()
+        write_log(
+            root / log_name(0, log), town, drive, TownSettings(width=width, height=height, steps_per_photo=1), log
+        )
+        print(f"writing the log {time.perf_counter() - began:.0f} s", flush=True)
+    reader = AV2Reader(root, name="synthetic")
+    clip = reader.read(reader.index().refs[0])
+    block = block_of(clip)
+    data = load_sensors(block, clip.cameras, width, height)
+    began, cpu = time.perf_counter(), time.process_time()
+    problem, state = prepare(data.photos, data.sweeps, block.agents, settings, threads=threads)
+    prepared = time.perf_counter()
+    print(f"{len(data.photos)} photos, {len(data.sweeps)} sweeps, prepared {prepared - began:.0f} s", flush=True)
+
+    def told(iteration: int, loss: float, score: float) -> None:
+        if iteration % 500 == 0:
+            seconds = time.perf_counter() - prepared
+            print(f"{iteration}: loss {loss:.4f}, training photos {score:.2f} dB, {seconds:.0f} s", flush=True)
+
+    advance(problem, state, settings, settings.iterations, told, threads)
+    asset = finish(problem, state, threads)
+    seconds, cpu_s = time.perf_counter() - began, time.process_time() - cpu
+
+    photos = [data.photos[i] for i in sorted(held_out_rows(data.photos, settings.hold_out_every))]
+    ahead = {photo.time_s: photo for photo in photos if photo.camera == CENTRE}
+    views = Truth(
+        asset,
+        block.agents,
+        painter(Theatre(town.scenery, drive, town.sun_azimuth, town.sun_elevation, town.sky_seed)),
+        painter(Theatre(town.scenery, with_moved_vehicles(drive), town.sun_azimuth, town.sun_elevation, town.sky_seed)),
+    )
+    kinds_of_view = {
+        "held out": views.compared(photos),
+        "2 m to the left": views.compared([sideways(p, ahead[p.time_s], 2.0) for p in photos]),
+        "2 m to the right": views.compared([sideways(p, ahead[p.time_s], -2.0) for p in photos]),
+        "turned 20 degrees left": views.compared([beside(p, left_rad=np.deg2rad(20.0)) for p in photos]),
+        "turned 20 degrees right": views.compared([beside(p, left_rad=-np.deg2rad(20.0)) for p in photos]),
+        "moved vehicles, inside their boxes": views.compared_moved(photos),
+    }
+    print(f"\n| log {log} at {width}x{height} | PSNR [dB] | SSIM | worst [dB] | views |\n|---|---|---|---|---|")
+    print(f"| held-out photos (JPEG) | {asset.psnr_db:.2f} | | | {asset.n_held_out} |")
+    for name, compared in kinds_of_view.items():
+        print(row(name, compared))
+        path = out / f"log{log}-{name.replace(' ', '-').replace(',', '')}.png"
+        cv2.imwrite(str(path), cv2.cvtColor(picture(compared), cv2.COLOR_RGB2BGR))
+    took = f"{seconds:.0f} s on {threads} threads, CPU {cpu_s:.0f} s"
+    print(f"\n{settings.iterations} iterations, {len(state)} Gaussians, {took}")
+
+
+if __name__ == "__main__":
+    main()

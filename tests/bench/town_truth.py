@@ -1,0 +1,125 @@
+"""What a scene shows from poses where no photo was taken, beside what the painter of the town shows from there."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tasks.render.asset import RenderAsset, psnr
+from tasks.render.engine import Pinhole, Vehicles, render, vehicles_at
+from tasks.render.fit.losses import ssim, target_of
+from tasks.render.gaussians import F32, F64
+from tasks.render.movers import behind_boxes
+from tasks.render.sensed import Photo
+from tasks.render.sky import directions
+from tasks.render.stereo import FAR_M
+from tasks.world.agents import AgentKind, AgentTracks
+
+Painter = Callable[[float, Photo], NDArray[np.uint8]]  # time, photo (its camera and pose): the truth there
+MOVED_M = (3.0, 0.8)  # ahead and to the left, of every vehicle
+NEAR_M = 40.0  # vehicles looked at
+LEAST_PIXELS = 40  # inside their boxes, that a view counts
+IN_THE_WAY_M = 0.6  # no camera is put this near to a box
+
+
+@dataclass(frozen=True)
+class Compared:
+    """One view."""
+
+    truth: F32  # (H, W, 3) in [0, 1]
+    picture: F32
+    inside: NDArray[np.bool_] | None = None  # (H, W) what counts; None: all
+
+    @property
+    def psnr_db(self) -> float:
+        if self.inside is None:
+            return psnr(self.picture, self.truth)
+        return psnr(self.picture[self.inside], self.truth[self.inside])
+
+    @property
+    def ssim(self) -> float:
+        target = target_of(np.rint(255.0 * self.truth).astype(np.uint8), None if self.inside is None else ~self.inside)
+        return ssim(self.picture, target)[0]
+
+
+def beside(photo: Photo, left_m: float = 0.0, left_rad: float = 0.0) -> Photo:
+    """The photo's camera moved along the street's left of its own direction and turned about the vertical, level.
+
+    Its pixels stay: they are not what is seen from there.
+    """
+    pose = photo.world_from_camera.copy()
+    pose[:3, 3] -= left_m * pose[:3, 0]
+    c, s = np.cos(left_rad), np.sin(left_rad)
+    pose[:3, :3] = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ pose[:3, :3]
+    return replace(photo, world_from_camera=pose)
+
+
+def sideways(photo: Photo, ego: Photo, left_m: float) -> Photo:
+    """The photo's camera where it is when the car, which looks as camera `ego` does, drives further to the left."""
+    pose = photo.world_from_camera.copy()
+    pose[:3, 3] -= left_m * ego.world_from_camera[:3, 0]
+    return replace(photo, world_from_camera=pose)
+
+
+def moved_on(boxes: F64, kinds: Sequence[AgentKind]) -> F64:
+    """Boxes (N, 7) of vehicles put MOVED_M from where they are; the others' as they are."""
+    out = boxes.copy()
+    rows = np.array([kind == AgentKind.VEHICLE for kind in kinds], bool)
+    c, s = np.cos(boxes[rows, 3]), np.sin(boxes[rows, 3])
+    out[rows, 0] += MOVED_M[0] * c - MOVED_M[1] * s
+    out[rows, 1] += MOVED_M[0] * s + MOVED_M[1] * c
+    return out
+
+
+class Truth:
+    """A scene held against the painter."""
+
+    def __init__(self, asset: RenderAsset, agents: AgentTracks, painter: Painter, painter_moved: Painter) -> None:
+        """`painter_moved` paints the street with its vehicles where `moved_on` puts them."""
+        self.asset, self.agents, self.painter, self.painter_moved = asset, agents, painter, painter_moved
+
+    def compared(self, photos: Sequence[Photo]) -> list[Compared]:
+        """Of cameras where and when `photos` say (world); those inside somebody are left out."""
+        out = []
+        for photo in photos:
+            there = vehicles_at(self.agents, photo.time_s)
+            if not _in_the_way(photo, there.boxes):
+                out.append(Compared(_unit(self.painter(photo.time_s, photo)), self._seen(photo, there)))
+        return out
+
+    def compared_moved(self, photos: Sequence[Photo]) -> list[Compared]:
+        """The same with moved vehicles, inside the boxes of those near; views that show little of them are left out."""
+        out = []
+        for photo in photos:
+            there = vehicles_at(self.agents, photo.time_s)
+            boxes = moved_on(there.boxes, there.kinds)
+            eye = photo.world_from_camera[:3, 3]
+            vehicle = np.array([kind == AgentKind.VEHICLE for kind in there.kinds], bool)
+            near = vehicle & (np.linalg.norm(boxes[:, :3] - eye, axis=1) < NEAR_M)
+            if _in_the_way(photo, boxes) or not near.any():
+                continue
+            height, width = photo.rgb.shape[:2]
+            rays = directions(photo.intrinsics, photo.world_from_camera, width, height).reshape(-1, 3)
+            inside = behind_boxes(rays * FAR_M + eye, eye, boxes[near]).reshape(height, width)
+            if inside.sum() >= LEAST_PIXELS:
+                truth = _unit(self.painter_moved(photo.time_s, photo))
+                out.append(Compared(truth, self._seen(photo, replace(there, boxes=boxes)), inside))
+        return out
+
+    def _seen(self, photo: Photo, there: Vehicles) -> F32:
+        height, width = photo.rgb.shape[:2]
+        eye = Pinhole(photo.intrinsics, photo.world_from_camera, width, height)
+        return np.clip(render(self.asset, [eye], there)[0].rgb, 0.0, 1.0)
+
+
+def _in_the_way(photo: Photo, boxes: F64) -> bool:
+    off = photo.world_from_camera[:3, 3] - boxes[:, :3]
+    along = np.cos(boxes[:, 3]) * off[:, 0] + np.sin(boxes[:, 3]) * off[:, 1]
+    across = np.cos(boxes[:, 3]) * off[:, 1] - np.sin(boxes[:, 3]) * off[:, 0]
+    out = np.maximum(np.abs(along) - boxes[:, 4] / 2, np.abs(across) - boxes[:, 5] / 2)
+    return bool((out < IN_THE_WAY_M).any())
+
+
+def _unit(rgb: NDArray[np.uint8]) -> F32:
+    return rgb.astype(np.float32) / np.float32(255.0)
