@@ -37,8 +37,8 @@ SHOWN = (10, 34, 58, 82)  # frames trained on
 SHOWN_AT = (1000, 2000, 4000)  # iterations
 SETTINGS = replace(
     FitSettings(),
-    start_gaussians=200_000,
-    most_gaussians=230_000,
+    start_gaussians=240_000,
+    most_gaussians=280_000,
     road_share=0.4,
     ssim_weight=0.1,
     opaque_weight=0.1,
