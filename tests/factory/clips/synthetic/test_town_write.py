@@ -110,5 +110,7 @@ def test_impossible_settings_are_refused_by_name() -> None:
         SyntheticReader("anywhere", 0)
     with pytest.raises(ValueError, match="unknown cameras"):
         TownSettings(cameras=("roof",))
+    with pytest.raises(ValueError, match="steps_per_photo must divide 5"):
+        TownSettings(steps_per_photo=2)
     with pytest.raises(ValueError, match="quality 0"):
         TownSettings(jpeg_quality=0)
