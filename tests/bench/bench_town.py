@@ -44,6 +44,7 @@ SETTINGS = FitSettings(
     opacity_rate=0.16,
     colour_rate=2.4e-2,
     sky_rate=1e-2,
+    opaque_weight=0.1,  # a road with holes is no road
     exposure_rate=0.0,  # the town's cameras agree, and know where they are
     pose_from=1_000_000,
 )
