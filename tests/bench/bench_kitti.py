@@ -35,19 +35,7 @@ STEPS = np.array([0.02, 0.02, 0.02, 5e-4, 5e-4, 5e-4])  # [m], [rad] of the fini
 SHIFTS_M = (-1.0, 0.0, 1.0)
 SHOWN = (10, 34, 58, 82)  # frames trained on
 SHOWN_AT = (1000, 2000, 4000)  # iterations
-SETTINGS = replace(
-    FitSettings(),
-    start_gaussians=240_000,
-    most_gaussians=280_000,
-    road_share=0.4,
-    ssim_weight=0.1,
-    opaque_weight=0.1,
-    mean_rate=1.6e-3,
-    mean_rate_end=0.04,
-    turn_rate=3e-4,
-    shift_rate=1e-3,
-    pose_from=100,
-)
+SETTINGS = replace(FitSettings(), start_gaussians=240_000, most_gaussians=280_000)
 
 
 class Beside:

@@ -14,25 +14,23 @@ class FitSettings:
     seed: int = 0
     hold_out_every: int = 8  # photo i of a camera with i % n == n // 2 only measures; 0: none is held out
     # Where it starts.
-    start_every: int = (
-        1  # every n-th instant's photos say where there are surfaces: photos that hardly differ, less work
-    )
-    start_gaussians: int = 90_000  # of the background
-    road_share: float = 1.0  # of the discs on the road, against those elsewhere, how many are taken
+    start_every: int = 1  # every n-th instant's photos say where surfaces are: less work where photos hardly differ
+    start_gaussians: int = 200_000  # of the background
+    road_share: float = 0.4  # of the discs on the road, against those elsewhere, how many are taken
     start_node_gaussians: int = 3_000  # of each track, at most
-    most_gaussians: int = 130_000
+    most_gaussians: int = 250_000
     start_opacity: float = 0.5
     max_gap_px: tuple[int, int] = (12, 24)  # columns, rows that are interpolated between lidar returns
     stereo_photos: int = 4
     sh_degree: int = 0  # 0 to 3
     # Loss.
-    ssim_weight: float = 0.2
+    ssim_weight: float = 0.1
     depth_weight: float = 0.0  # of the mean absolute error of inverse depth [1/m] where lidar knows it
     opacity_weight: float = 0.0
-    opaque_weight: float = 0.0  # of the mean light that passes where a photo looks at the ground
+    opaque_weight: float = 0.1  # of the mean light that passes where a photo looks at the ground
     scale_weight: float = 0.0
     # Step sizes of Adam; each falls exponentially to `rate_end` of itself.
-    mean_rate: float = 8e-4  # times the nearest viewing depth
+    mean_rate: float = 1.6e-3  # times the nearest viewing depth
     quat_rate: float = 4e-3
     scale_rate: float = 2e-2
     opacity_rate: float = 8e-2
@@ -40,11 +38,11 @@ class FitSettings:
     sh_rate: float = 6e-4
     sky_rate: float = 4e-3
     exposure_rate: float = 1e-3  # 0: the cameras agree, nothing is aligned
-    turn_rate: float = 5e-5  # [rad] of the pose corrections
-    shift_rate: float = 5e-4  # [m]
-    pose_from: int = 500  # iteration at which poses start to move
+    turn_rate: float = 3e-4  # [rad] of the pose corrections
+    shift_rate: float = 1e-3  # [m]
+    pose_from: int = 100  # iteration at which poses start to move
     rate_end: float = 0.1
-    mean_rate_end: float = 0.02
+    mean_rate_end: float = 0.04
     # Density: relocation and growth of 3DGS as Markov chain Monte Carlo (Kheradmand et al. 2024).
     refine_every: int = 100
     refine_from: int = 300

@@ -112,10 +112,12 @@ def test_progress_is_told_and_photos_are_needed() -> None:
         FitSettings(iterations=0)
 
 
-def test_a_plain_road_can_start_with_fewer_and_larger_gaussians(prepared: tuple[Problem, FitState]) -> None:
+def test_a_plain_road_can_start_with_fewer_and_larger_gaussians() -> None:
     photos, sweeps = few()
-    _, sparse = prepare(photos, sweeps, street.tracks(), replace(SETTINGS, road_share=0.25), held_out=[2])
-    _, usual = prepared
+    sparse, usual = (
+        prepare(photos, sweeps, street.tracks(), replace(SETTINGS, road_share=share), held_out=[2])[1]
+        for share in (0.25, 1.0)
+    )
     assert len(sparse) == len(usual)
     assert sparse.road.sum() < 0.7 * usual.road.sum()
     sizes = [np.median(state.learned["log_scales"].values[state.road, 0]) for state in (sparse, usual)]
