@@ -11,7 +11,7 @@ from factory.clips.synthetic.write import TownSettings
 from factory.explain import main
 from factory.settings import assemble, load_config
 
-SMALL = TownSettings(cameras=("ring_front_center",), width=64, height=36, lidar_beams=16, lidar_azimuths=300)
+SMALL = TownSettings(cameras=("ring_front_center",), width=64, height=36, lidar_beams=32, lidar_azimuths=300)
 
 
 @pytest.fixture(scope="module")

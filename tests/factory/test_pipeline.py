@@ -18,7 +18,7 @@ from tasks.kinematic_vocabulary import kinematic_trajectories
 from tasks.perturb import Perturbation
 from tasks.vocabulary import Vocabulary
 
-SMALL = TownSettings(cameras=("ring_front_center",), width=64, height=36, lidar_beams=16, lidar_azimuths=300)
+SMALL = TownSettings(cameras=("ring_front_center",), width=64, height=36, lidar_beams=32, lidar_azimuths=300)
 VOCABULARY = Vocabulary(kinematic_trajectories(3, 0))
 SIZE = ["render.width=64", "render.height=36", "render.scene=discs", "render.psnr_min=0", "vocabulary.k=300"]
 SIZE += ["experts=[pdm_closed,human]"]
