@@ -11,6 +11,7 @@ from tasks.render.depth import sparse_depth
 from tasks.render.features import triangulated
 from tasks.render.fit import exposure, poses
 from tasks.render.fit.adam import Learned
+from tasks.render.fit.body import unseen_body
 from tasks.render.fit.instants import exposures_of, in_agreement, instants
 from tasks.render.fit.losses import Target, target_of
 from tasks.render.fit.road import Road, above_road, find_road, lay_flat
@@ -24,7 +25,7 @@ from tasks.render.sight import Seen, see
 from tasks.render.sky import directions
 from tasks.render.stereo import FAR_M
 from tasks.render.threads import in_chunks
-from tasks.world.agents import AgentTracks
+from tasks.world.agents import AgentKind, AgentTracks
 
 ROAD_TOP_M = 0.08  # a Gaussian that starts no further from the road's surface belongs to it
 LOOKS_DOWN = 0.05  # sine of the angle below the horizon from which on a ray meets the ground
@@ -91,7 +92,8 @@ def prepare(
     eyes = np.stack([p.world_from_camera[:3, 3] for p in train])
     road = find_road(static, eyes) if settings.road else None
     cars = [nodes.get(i) for i in tracks.ids]
-    state = _first_state(background, cars, sky_of(alike, seen).rgb, exposures, road, settings)
+    bodies = _bodies(cars, tracks, [p.time_s for p in train])
+    state = _first_state(background, cars, bodies, sky_of(alike, seen).rgb, exposures, road, settings)
     unknown = [track_id not in nodes for track_id in tracks.ids]
     shots = [_shot(p, static, tracks, np.array(unknown, bool), settings) for p in local]
     problem = Problem(
@@ -112,6 +114,18 @@ def _exposures(photos: Sequence[Photo], known: Sequence[Photo], rows: F32) -> F3
         if mine:
             out[i] = poses.between(np.array([known[k].time_s for k in mine]), rows[mine], photo.time_s)
     return out
+
+
+def _bodies(nodes: Sequence[Gaussians | None], tracks: Tracks, times_s: Sequence[float]) -> list[Gaussians | None]:
+    """Of each track that is a vehicle with Gaussians what no photo shows."""
+    sizes = np.zeros((len(nodes), 3))
+    for time_s in times_s:
+        boxes, valid = tracks.at(time_s)
+        sizes[valid] = boxes[valid, 4:]
+    return [
+        unseen_body(node, size) if node is not None and kind == AgentKind.VEHICLE else None
+        for node, size, kind in zip(nodes, sizes, tracks.kinds)
+    ]
 
 
 def _shot(photo: Photo, static: F64, tracks: Tracks, unknown: NDArray[np.bool_], settings: FitSettings) -> Shot:
@@ -135,6 +149,7 @@ def _shot(photo: Photo, static: F64, tracks: Tracks, unknown: NDArray[np.bool_],
 def _first_state(
     background: Gaussians,
     nodes: Sequence[Gaussians | None],
+    bodies: Sequence[Gaussians | None],
     sky: F32,
     exposures: F32,
     road: Road | None,
@@ -144,9 +159,12 @@ def _first_state(
     rng = np.random.Generator(np.random.Philox(key=[settings.seed, 2**33]))
     weight = np.where(_lies_on(background, road), settings.road_share, 1.0)
     parts, owner = [_thinned(background, settings.start_gaussians, weight, rng)], [BACKGROUND]
-    for j, node in enumerate(nodes):
+    for j, (node, body) in enumerate(zip(nodes, bodies)):
         if node is not None:
             parts.append(_thinned(node, settings.start_node_gaussians, np.ones(len(node)), rng))
+            owner.append(j)
+        if body is not None:
+            parts.append(body)
             owner.append(j)
     start = concatenate(parts)
     owners = np.repeat(owner, [len(part) for part in parts]).astype(np.int32)
@@ -161,7 +179,8 @@ def _first_state(
             settings.road_slack,
             settings.road_thickness,
         )
-    opacities = np.full((len(start), 1), settings.start_opacity, np.float32)
+    bodily = np.repeat([any(part is body for body in bodies) for part in parts], [len(part) for part in parts])
+    opacities = np.where(bodily, start.opacities, np.float32(settings.start_opacity))[:, None]
     learned = {
         "means": Learned.of(start.means),
         "quats": Learned.of(start.quats),

@@ -18,7 +18,7 @@ from tasks.world.agents import AgentKind
 SETTINGS = FitSettings(
     iterations=24,
     start_gaussians=1500,
-    most_gaussians=1700,
+    most_gaussians=2200,
     refine_every=6,
     refine_from=6,
     pose_from=4,
