@@ -9,7 +9,6 @@ import argparse
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +20,7 @@ from tasks.render.gaussians import Gaussians
 from tasks.render.gradient import backward
 from tasks.render.project import TILE
 from tasks.render.raster import Splats, splat, trace
-from tests.bench.timing import memory_mb
+from tests.bench.timing import cpu_milliseconds, memory_mb, milliseconds
 from tests.tasks.render.slow_raster import slow, slow_render
 
 WIDTH, HEIGHT = 480, 270
@@ -32,14 +31,6 @@ REPEATS = 15
 TWIN_EVERY = 40  # tiles; the twin is timed on so many and the rest is reckoned
 BLACK = np.zeros(3, np.float32)
 EYE_M = 1.6
-
-
-@dataclass(frozen=True)
-class Spent:
-    """Medians of one call, seconds."""
-
-    wall: float
-    cpu: float
 
 
 def cloud(n: int) -> Gaussians:
@@ -78,18 +69,6 @@ def street_view(scene: Path) -> tuple[Gaussians, NDArray[np.float64]]:
     return street, best
 
 
-def spent(call: Callable[[], object]) -> Spent:
-    """Of one call, after one that warms up."""
-    call()
-    walls, cpus = [], []
-    for _ in range(REPEATS):
-        wall, cpu = time.perf_counter(), time.process_time()
-        call()
-        walls.append(time.perf_counter() - wall)
-        cpus.append(time.process_time() - cpu)
-    return Spent(float(np.median(walls)), float(np.median(cpus)))
-
-
 def twin_seconds(scene: Gaussians, camera: NDArray[np.float64], splats: Splats, there_and_back: bool) -> float:
     """What the torch twin would take, given each tile's Gaussians: a sample of the tiles, times their number."""
     columns, tiles = -(-WIDTH // TILE), range(0, len(splats.tile_start) - 1, TWIN_EVERY)
@@ -107,19 +86,22 @@ def twin_seconds(scene: Gaussians, camera: NDArray[np.float64], splats: Splats, 
 
 
 def row(name: str, scene: Gaussians, camera: NDArray[np.float64], threads: int) -> None:
-    """Prints the scene's line of each of the two tables."""
+    """Prints the scene's two lines of the table, there and there and back."""
     view = (scene, INTRINSICS, camera, WIDTH, HEIGHT, BLACK, threads)
     record = trace(*view)
     pairs, seen = len(record.splats.tile_splats), len(record.splats.index)
     upstream = np.random.default_rng(1).normal(size=record.view.rgb.shape).astype(np.float32)
-    there = spent(lambda: trace(*view))
-    both = spent(lambda: backward(trace(*view), scene, upstream, threads=threads))
     about = f"{name} | {len(scene):,} | {seen:,} | {pairs / max(seen, 1):.1f}"
-    for what, took, back in (("forward", there, False), ("forward + backward", both, True)):
-        twin = twin_seconds(scene, camera, record.splats, back)
+    calls: list[tuple[str, Callable[[], object], bool]] = [
+        ("forward", lambda: trace(*view), False),
+        ("forward + backward", lambda: backward(trace(*view), scene, upstream, threads=threads), True),
+    ]
+    for what, call, back in calls:
+        wall_s = milliseconds(call, REPEATS) / 1e3
+        twin_s = twin_seconds(scene, camera, record.splats, back)
         print(
-            f"| {about} | {what} | {1e3 * took.wall:.0f} | {1e3 * took.cpu:.0f} | {1 / took.wall:.1f} "
-            f"| {WIDTH * HEIGHT / took.wall / 1e6:.1f} | {pairs / took.wall / 1e6:.1f} | {twin / took.wall:.0f}x |"
+            f"| {about} | {what} | {1e3 * wall_s:.0f} | {cpu_milliseconds(call, REPEATS):.0f} | {1 / wall_s:.1f} "
+            f"| {WIDTH * HEIGHT / wall_s / 1e6:.1f} | {pairs / wall_s / 1e6:.1f} | {twin_s / wall_s:.0f}x |"
         )
 
 
