@@ -124,3 +124,11 @@ def test_a_plain_road_can_start_with_fewer_and_larger_gaussians() -> None:
     assert sizes[0] > sizes[1] + 0.1
     with pytest.raises(ValueError, match="road_share"):
         replace(SETTINGS, road_share=0.0)
+
+
+def test_without_lidar_the_street_is_fitted_from_parallax_alone() -> None:
+    photos, _ = few()
+    started, fitted = (
+        reconstruct(photos, [], street.tracks(), replace(SETTINGS, iterations=n), held_out=[2]).psnr_db for n in (1, 24)
+    )
+    assert fitted > started + 0.5 and fitted > 18.0
