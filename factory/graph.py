@@ -45,7 +45,9 @@ class RayGraph:
         self._is_ours = self._connected and _connect(workers, address)
         available = int(ray.cluster_resources().get("CPU", 1))
         self.parallelism = max(1, min(workers or available, available))
-        self.cores = min(self.parallelism, *(n for n in _cores_by_node() if n))
+        self.cores = min(
+            [self.parallelism, *filter(None, _cores_by_node())]
+        )  # none yet where a cluster grows from nothing
         self._supplied: dict[str, Any] = {"work": [ray.put(work)], "out": out}  # in a list: handed over as a reference
         self._tickets: dict[Any, Ticket] = {}
         self._ready: deque[Any] = deque()
