@@ -1,0 +1,72 @@
+"""What a planner is: settings, model, loss, decode. One file is one planner.
+
+A planner's file has a frozen dataclass of settings and a `Planner` made from it:
+
+    class Mine(Planner):
+        name = "mine"
+        def __init__(self, settings: MySettings, arrays: Mapping[str, NDArray]) -> None: ...
+
+`arrays` are what it is built around and does not learn, such as a vocabulary or anchors: `fixed_arrays` makes them when
+a training begins, and checkpoints carry them.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from planners.batch import Batch, Needs
+
+FloatArray = NDArray[np.floating[Any]]
+
+
+@dataclass(frozen=True)
+class TrainingData:
+    """What a planner may look at when it is built for a training."""
+
+    labels_2hz: Callable[[], FloatArray]  # (n, 8, 3) of every sample to be trained on; read when called
+    label_vocabulary: str | None  # digest of the vocabulary that all samples are labelled with; None: no labels
+
+
+class Planner(nn.Module, ABC):
+    """From what a car sees to where it goes in the next 4 s."""
+
+    name: ClassVar[str]
+
+    def __init__(self, settings: Any, arrays: Mapping[str, FloatArray]) -> None:
+        """settings: the planner's own frozen dataclass. Raises ValueError where an array has the wrong shape."""
+        super().__init__()
+        self.settings, self.arrays = settings, dict(arrays)
+
+    @classmethod
+    def fixed_arrays(cls, settings: Any, data: TrainingData) -> dict[str, FloatArray]:
+        """What the planner is built around, from files the settings name or from the training data.
+
+        Raises ValueError with the setting to mend.
+        """
+        return {}
+
+    @property
+    @abstractmethod
+    def needs(self) -> Needs:
+        """What it reads of a sample."""
+
+    @abstractmethod
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
+        """Weighted scalar terms whose sum is minimised.
+
+        Terms that imitate count samples with `batch.imitate` only, and are divided by the whole batch: a mean over the
+        mixture in which a sample without a label weighs nothing (paper, eq. 5).
+        """
+
+    @abstractmethod
+    def plan(self, batch: Batch) -> Tensor:
+        """Plans (B, 8, 3) at 0.5 .. 4.0 s or (B, 40, 3) at 0.1 .. 4.0 s; the same for the same batch, always."""
+
+    def forward(self, batch: Batch) -> dict[str, Tensor]:
+        """The losses: what a distributed wrapper calls."""
+        return self.losses(batch)
