@@ -72,6 +72,19 @@ class Batch:
     def __len__(self) -> int:
         return len(self.attempt_ids)
 
+    def parts(self, n: int) -> "list[Batch]":
+        """The same samples in n batches of equal size, in order. Raises ValueError where they do not divide."""
+        if len(self) % n:
+            raise ValueError(f"a batch of {len(self)} does not divide into {n} parts of equal size")
+        size = len(self) // n
+
+        def cut(value: Any, start: int) -> Any:
+            if isinstance(value, Mapping):
+                return {k: cut(v, start) for k, v in value.items()}
+            return None if value is None else value[start : start + size]
+
+        return [replace(self, **{f.name: cut(getattr(self, f.name), i * size) for f in fields(self)}) for i in range(n)]
+
     def to(self, device: torch.device | str) -> "Batch":
         """The same on a device."""
 

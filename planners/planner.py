@@ -4,6 +4,7 @@ A planner's file has a frozen dataclass of settings and a `Planner` made from it
 
     class Mine(Planner):
         name = "mine"
+        settings_type = MySettings
         def __init__(self, settings: MySettings, arrays: Mapping[str, NDArray]) -> None: ...
 
 `arrays` are what it is built around and does not learn, such as a vocabulary or anchors: `fixed_arrays` makes them when
@@ -36,6 +37,7 @@ class Planner(nn.Module, ABC):
     """From what a car sees to where it goes in the next 4 s."""
 
     name: ClassVar[str]
+    settings_type: ClassVar[type]  # the frozen dataclass that `settings` is
 
     def __init__(self, settings: Any, arrays: Mapping[str, FloatArray]) -> None:
         """settings: the planner's own frozen dataclass. Raises ValueError where an array has the wrong shape."""

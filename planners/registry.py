@@ -1,0 +1,53 @@
+"""Planners by name: the built-in ones, or a class of a user's own package."""
+
+import importlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from factory.config import ConfigError, fill
+from planners.planner import FloatArray, Planner
+
+BUILT_IN = {
+    "constant_velocity": "planners.constant_velocity:ConstantVelocity",
+    "ego_mlp": "planners.ego_mlp:EgoMlp",
+    "ltf": "planners.ltf:Ltf",
+    "diffusiondrive": "planners.diffusiondrive:DiffusionDrive",
+    "gtrs_dense": "planners.gtrs_dense:GtrsDense",
+}
+
+
+@dataclass(frozen=True)
+class PlannerChoice:
+    """A planner and its settings, as conf/planner/*.yaml and checkpoints name it."""
+
+    name: str  # one of BUILT_IN, or my.module:MyPlanner
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
+def planner_class(name: str) -> type[Planner]:
+    """The class of a planner. Raises ConfigError where there is none of that name."""
+    target = BUILT_IN.get(name, name)
+    module, found, attribute = target.partition(":")
+    if not found:
+        raise ConfigError(f"planner.name={name}: none of {', '.join(BUILT_IN)}; or name a class, my.module:MyPlanner")
+    try:
+        cls = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise ConfigError(f"planner.name={name}: {error}") from error
+    if not (isinstance(cls, type) and issubclass(cls, Planner)):
+        raise ConfigError(f"planner.name={name} is not a planners.planner.Planner")
+    return cls
+
+
+def settings_of(choice: PlannerChoice) -> Any:
+    """The planner's own settings. Raises ConfigError for one that it does not have."""
+    return fill(planner_class(choice.name).settings_type, choice.settings, "planner.settings")
+
+
+def build_planner(choice: PlannerChoice, arrays: Mapping[str, FloatArray]) -> Planner:
+    """The planner around its fixed arrays. Raises ConfigError."""
+    try:
+        return planner_class(choice.name)(settings_of(choice), arrays)
+    except ValueError as error:
+        raise ConfigError(f"planner {choice.name}: {error}") from error
