@@ -1,0 +1,84 @@
+"""What a training writes of itself: CSV files to compare, TensorBoard (and wandb, if it is installed) to watch."""
+
+import csv
+import importlib.util
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+LOSSES, VALIDATION = "losses.csv", "validation.csv"
+
+
+class Curves:
+    """Writes the curves of one training; rows of steps that will be computed again are dropped first."""
+
+    def __init__(self, out: Path, first_step: int) -> None:
+        """first_step: the step the training begins with; losses of it and later ones are dropped."""
+        from torch.utils.tensorboard import SummaryWriter
+
+        out.mkdir(parents=True, exist_ok=True)
+        self._files = {LOSSES: _Rows(out / LOSSES, first_step), VALIDATION: _Rows(out / VALIDATION, first_step + 1)}
+        self._board = SummaryWriter(str(out / "tensorboard"), purge_step=first_step)
+        self._wandb = _wandb_run(out)
+
+    def loss(self, step: int, rate: float, terms: Mapping[str, float]) -> None:
+        """The losses that step `step` began with."""
+        row = {"total": sum(terms.values()), **terms, "learning_rate": rate}
+        self._write(LOSSES, "loss", step, row)
+
+    def validation(self, step: int, measured: Mapping[str, float]) -> None:
+        """What the planner was worth after `step` steps."""
+        self._write(VALIDATION, "validation", step, measured)
+
+    def close(self) -> None:
+        """Flush everything."""
+        for rows in self._files.values():
+            rows.close()
+        self._board.close()
+        if self._wandb is not None:
+            self._wandb.finish()
+
+    def _write(self, name: str, prefix: str, step: int, row: Mapping[str, float]) -> None:
+        self._files[name].write({"step": step, **row})
+        for key, value in row.items():
+            self._board.add_scalar(f"{prefix}/{key}", value, step)
+        if self._wandb is not None:
+            self._wandb.log({f"{prefix}/{key}": value for key, value in row.items()}, step=step)
+
+
+class _Rows:
+    """A CSV file whose first column is the step; numbers are written so that they read back the same."""
+
+    def __init__(self, path: Path, first_step: int) -> None:
+        kept = []
+        if path.exists():
+            with path.open(newline="") as old:
+                kept = [row for row in csv.DictReader(old) if int(row["step"]) < first_step]
+        self._file = path.open("w", newline="")
+        self._writer: csv.DictWriter[str] | None = None
+        for row in kept:
+            self._row(row)
+
+    def write(self, row: Mapping[str, Any]) -> None:
+        self._row({key: repr(value) if isinstance(value, float) else value for key, value in row.items()})
+        self._file.flush()
+
+    def close(self) -> None:
+        self._file.close()
+
+    def _row(self, row: Mapping[str, Any]) -> None:
+        if self._writer is None:
+            self._writer = csv.DictWriter(self._file, list(row))
+            self._writer.writeheader()
+        self._writer.writerow(row)
+
+
+def _wandb_run(out: Path) -> Any:
+    """A run that writes offline unless the user's environment says otherwise; None where wandb is not installed."""
+    if importlib.util.find_spec("wandb") is None:
+        return None
+    import wandb
+
+    os.environ.setdefault("WANDB_MODE", "offline")
+    return wandb.init(project="driving-data-factory", name=out.name, dir=str(out), resume="allow", id=out.name)

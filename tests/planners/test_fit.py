@@ -1,0 +1,163 @@
+"""A training goes on after any interruption as if there had been none, and writes what it did."""
+
+import csv
+import json
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from factory.config import ConfigError
+from planners.batch import Batch
+from planners.checkpoint import checkpoints, digest, load_planner, newest
+from planners.curves import LOSSES, VALIDATION
+from planners.fit import Loop, Stopped, fit, total_steps
+from planners.optim import TrainingSettings
+from planners.registry import PlannerChoice, build_planner
+from planners.world import World
+from tests.planners.toy import Toy, ToyBatches, ToySettings, toy_batch
+
+ALONE = World(0, 1, torch.device("cpu"))
+TRAINING = TrainingSettings(epochs=3, batch_size=4, learning_rate=0.01, schedule="cosine", optimiser="adamw")
+
+
+def toy() -> Toy:
+    torch.manual_seed(0)
+    return Toy(ToySettings(), {})
+
+
+def train(out: Path, batches: ToyBatches, resume: Path | None = None, **loop: Any) -> Toy:
+    planner = toy()
+    steps = total_steps(batches, TRAINING, None)
+    fit(planner, batches, TRAINING, Loop(**{"seed": 1, "steps": steps, **loop}), ALONE, out, {}, resume, measured)
+    return planner
+
+
+def measured(planner: Any) -> dict[str, float]:
+    return {"weight": float(planner.net[0].weight.detach().sum())}
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+class Interrupted(ToyBatches):
+    """Sends this process a signal while it hands out a batch."""
+
+    def __init__(self, n: int, size: int, after: int) -> None:
+        super().__init__(n, size)
+        self.after = after
+
+    def epoch(self, epoch: int) -> Iterator[Batch]:
+        for batch in super().epoch(epoch):
+            self.after -= 1
+            if self.after == 0:
+                os.kill(os.getpid(), signal.SIGTERM)
+            yield batch
+
+
+def test_the_loss_falls_and_every_step_is_written(tmp_path: Path) -> None:
+    train(tmp_path, ToyBatches(20, 4), log_every=4)
+    curve = rows(tmp_path / LOSSES)
+    assert [int(row["step"]) for row in curve] == list(range(15))
+    total = [float(row["total"]) for row in curve]
+    assert sum(total[-5:]) < sum(total[:5])
+    assert float(curve[0]["learning_rate"]) == 0.01
+    assert float(curve[3]["total"]) == pytest.approx(float(curve[3]["imitation"]) + float(curve[3]["size"]))
+    assert len(rows(tmp_path / VALIDATION)) == 1
+    assert list((tmp_path / "tensorboard").iterdir())
+
+
+@pytest.mark.parametrize("stop_after", [1, 5, 7])  # within an epoch of five batches, at its end, in the next
+def test_an_interrupted_training_resumes_to_the_identical_curve_and_weights(tmp_path: Path, stop_after: int) -> None:
+    whole = train(tmp_path / "whole", ToyBatches(20, 4), validate_every=5)
+    out = tmp_path / "cut"
+    with pytest.raises(Stopped, match=f"after step {stop_after} of 15"):
+        train(out, Interrupted(20, 4, stop_after), validate_every=5)
+    resumed = train(out, ToyBatches(20, 4), newest(out), validate_every=5)
+    assert (out / LOSSES).read_text() == (tmp_path / "whole" / LOSSES).read_text()
+    assert (out / VALIDATION).read_text() == (tmp_path / "whole" / VALIDATION).read_text()
+    for name, value in whole.state_dict().items():
+        assert torch.equal(value, resumed.state_dict()[name]), name
+
+
+def test_a_killed_training_repeats_what_came_after_its_last_checkpoint(tmp_path: Path) -> None:
+    class Killed(Exception):
+        pass
+
+    class Dying(ToyBatches):
+        def epoch(self, epoch: int) -> Iterator[Batch]:
+            for batch in super().epoch(epoch):
+                if self.at == {"epoch": 1, "next": 4}:
+                    raise Killed
+                yield batch
+
+    whole = tmp_path / "whole"
+    train(whole, ToyBatches(20, 4), checkpoint_every=3, log_every=1)
+    out = tmp_path / "cut"
+    with pytest.raises(Killed):
+        train(out, Dying(20, 4), checkpoint_every=3, log_every=1)
+    assert [int(row["step"]) for row in rows(out / LOSSES)] == list(range(8))
+    assert newest(out).name == "00000006"
+    train(out, ToyBatches(20, 4), newest(out), checkpoint_every=3, log_every=1)
+    assert (out / LOSSES).read_text() == (whole / LOSSES).read_text()
+
+
+def test_parts_of_a_batch_add_up_to_the_batch(tmp_path: Path) -> None:
+    """Without anything random in the model, accumulation changes nothing but rounding."""
+    results = []
+    for parts in (1, 2, 4):
+        torch.manual_seed(0)
+        planner = Toy(ToySettings(dropout=0.0), {})
+        fit(planner, ToyBatches(20, 4), TRAINING, Loop(1, 10, parts), ALONE, tmp_path / str(parts), {})
+        results.append(planner.net[0].weight.detach())
+    torch.testing.assert_close(results[1], results[0], rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(results[2], results[0], rtol=1e-4, atol=1e-6)
+
+
+def test_a_loss_that_is_no_number_stops_the_training_with_its_step(tmp_path: Path) -> None:
+    class Poisoned(ToyBatches):
+        def epoch(self, epoch: int) -> Iterator[Batch]:
+            for i, batch in enumerate(super().epoch(epoch)):
+                if i == 2:
+                    batch.plan_2hz[0] = torch.nan
+                yield batch
+
+    with pytest.raises(FloatingPointError, match="loss of step 2 .*imitation nan"):
+        train(tmp_path, Poisoned(20, 4))
+
+
+def test_a_checkpoint_is_the_planner_and_only_the_newest_stay(tmp_path: Path) -> None:
+    trained = train(tmp_path, ToyBatches(20, 4), checkpoint_every=4)
+    assert [path.name for path in checkpoints(tmp_path)] == ["00000012", "00000015"]
+    loaded = load_planner(tmp_path)
+    batch = toy_batch(torch.arange(3).numpy())
+    assert torch.equal(loaded.plan(batch), trained.eval().plan(batch))
+    assert len(digest(tmp_path)) == 16
+    assert digest(tmp_path) != digest(checkpoints(tmp_path)[0])
+
+
+def test_a_checkpoint_of_another_planner_is_refused_by_name(tmp_path: Path) -> None:
+    train(tmp_path, ToyBatches(20, 4))
+    record = newest(tmp_path) / "record.json"
+    changed = json.loads(record.read_text())
+    changed["planner"]["settings"]["hidden"] = 9
+    record.write_text(json.dumps(changed))
+    with pytest.raises(ConfigError, match=r"not a checkpoint of this .*net.0.weight is \(8, 8\), not \(9, 8\)"):
+        load_planner(tmp_path)
+
+
+def test_folders_without_a_checkpoint_and_planners_nobody_knows_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no checkpoint here"):
+        load_planner(tmp_path)
+    with pytest.raises(ConfigError, match=r"planner.name=nope: none of constant_velocity"):
+        build_planner(PlannerChoice("nope"), {})
+    with pytest.raises(ConfigError, match="is not a planners.planner.Planner"):
+        build_planner(PlannerChoice("json:JSONDecoder"), {})
+    with pytest.raises(ConfigError, match="planner.settings.hiden"):
+        build_planner(PlannerChoice("tests.planners.toy:Toy", {"hiden": 3}), {})
