@@ -226,5 +226,5 @@ def _stop_asked() -> Iterator[_Asked]:
     try:
         yield asked
     finally:
-        for what, handler in old.items():
-            signal.signal(what, handler)
+        for number, handler in old.items():
+            signal.signal(number, handler)

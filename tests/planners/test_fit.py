@@ -128,7 +128,7 @@ def test_a_loss_that_is_no_number_stops_the_training_with_its_step(tmp_path: Pat
                     batch.plan_2hz[0] = torch.nan
                 yield batch
 
-    with pytest.raises(FloatingPointError, match="loss of step 2 .*imitation nan"):
+    with pytest.raises(FloatingPointError, match=r"loss of step 2 .*imitation nan"):
         train(tmp_path, Poisoned(20, 4))
 
 
@@ -155,9 +155,9 @@ def test_a_checkpoint_of_another_planner_is_refused_by_name(tmp_path: Path) -> N
 def test_folders_without_a_checkpoint_and_planners_nobody_knows_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no checkpoint here"):
         load_planner(tmp_path)
-    with pytest.raises(ConfigError, match=r"planner.name=nope: none of constant_velocity"):
+    with pytest.raises(ConfigError, match=r"planner\.name=nope: none of constant_velocity"):
         build_planner(PlannerChoice("nope"), {})
-    with pytest.raises(ConfigError, match="is not a planners.planner.Planner"):
+    with pytest.raises(ConfigError, match=r"is not a planners\.planner\.Planner"):
         build_planner(PlannerChoice("json:JSONDecoder"), {})
-    with pytest.raises(ConfigError, match="planner.settings.hiden"):
+    with pytest.raises(ConfigError, match=r"planner\.settings\.hiden"):
         build_planner(PlannerChoice("tests.planners.toy:Toy", {"hiden": 3}), {})
