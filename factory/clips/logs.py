@@ -102,11 +102,15 @@ class LogReader(ABC, Generic[Log]):
         stride_s: float = 1.0,
         name: str | None = None,
         min_top_speed_mps: float = 0.5,
+        first_window: int = 0,
     ) -> None:
-        """name: the data set's name, part of every clip id. Raises ValueError for an impossible stride."""
+        """name: the data set's name, part of every clip id; first_window: of each log, skips those before it.
+
+        Raises ValueError for an impossible stride or first window.
+        """
         self.root = Path(root).expanduser().absolute()
         self.name = self.data_set if name is None else name
-        self.windows = WindowSettings(stride_s=stride_s, min_top_speed_mps=min_top_speed_mps)
+        self.windows = WindowSettings(stride_s, min_top_speed_mps, first_window)
         self._logs: dict[str, Log] = {}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -147,7 +151,8 @@ class LogReader(ABC, Generic[Log]):
             first, n_steps = (int(driven[0]), int(driven[-1] - driven[0]) + 1) if len(driven) else (0, 0)
             starts = window_starts(n_steps, self.windows)  # the first window begins where the ego's drive does
             if not starts:
-                skipped[log_id] = f"{n_steps * STEP_S:.1f} s {self.length_is}, a clip needs {CLIP_STEPS * STEP_S:.1f} s"
+                needs_s = (self.windows.first_step + CLIP_STEPS) * STEP_S
+                skipped[log_id] = f"{n_steps * STEP_S:.1f} s {self.length_is}, a clip needs {needs_s:.1f} s"
             for start in (first + offset for offset in starts):
                 reason = self._drop_reason(drive, start, start + CLIP_STEPS)
                 if reason is None:

@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import tempfile
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -65,25 +66,32 @@ class SyntheticReader:
         return self._reader().block(ref)
 
     def _with_sensors(self, digest: str) -> str:
-        """Sensor settings change the pixels and points, which Argoverse's digest leaves out."""
-        return hashlib.sha256(f"{digest}{json.dumps(asdict(self.settings))}".encode()).hexdigest()
+        return sensed_digest(digest, self.settings)
 
     def _reader(self) -> AV2Reader:
         if self._logs is None:
-            if not self.root.is_dir():
-                self._write()
+            make_whole(self.root, lambda folder: write_town(folder, self.n_clips, self.seed, self.settings))
             self._logs = AV2Reader(self.root, name=self.name)
         return self._logs
 
-    def _write(self) -> None:
-        self.cache_dir.mkdir(parents=True, exist_ok=True)
-        unfinished = Path(tempfile.mkdtemp(prefix=f".{self.root.name}-", dir=self.cache_dir))
+
+def sensed_digest(digest: str, settings: TownSettings) -> str:
+    """A log's digest with what the sensors record: pixels and points, which Argoverse's digest leaves out."""
+    return hashlib.sha256(f"{digest}{json.dumps(asdict(settings))}".encode()).hexdigest()
+
+
+def make_whole(root: Path, write: Callable[[Path], object]) -> None:
+    """The folder `root` with what `write` writes into it, unless it is there: whole or not at all."""
+    if root.is_dir():
+        return
+    root.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = Path(tempfile.mkdtemp(prefix=f".{root.name}-", dir=root.parent))
+    try:
+        write(unfinished)
         try:
-            write_town(unfinished, self.n_clips, self.seed, self.settings)
-            try:
-                os.rename(unfinished, self.root)
-            except OSError:
-                if not self.root.is_dir():  # else another worker was first, with the same bytes
-                    raise
-        finally:
-            shutil.rmtree(unfinished, ignore_errors=True)
+            os.rename(unfinished, root)
+        except OSError:
+            if not root.is_dir():  # else another worker was first, with the same bytes
+                raise
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)

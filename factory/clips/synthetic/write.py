@@ -4,7 +4,7 @@ Argoverse 2's layout (Wilson et al. 2021): annotations, ego poses, calibration, 
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -70,8 +70,12 @@ def write_town(out: Path, n_clips: int, seed: int, settings: TownSettings, threa
     """
     if n_clips < 1:
         raise ValueError(f"a town needs at least one clip, not {n_clips}")
-    n_logs = -(-n_clips // WINDOWS_PER_LOG)
-    return [write_log(out / log_name(seed, i), *plan_log(seed, i), settings, i, threads) for i in range(n_logs)]
+    return write_logs(out, range(-(-n_clips // WINDOWS_PER_LOG)), seed, settings, threads)
+
+
+def write_logs(out: Path, indices: Iterable[int], seed: int, settings: TownSettings, threads: int = 2) -> list[Path]:
+    """Writes these logs of the seed under `out`; a log's bytes depend on its index, not on the others."""
+    return [write_log(out / log_name(seed, i), *plan_log(seed, i), settings, i, threads) for i in indices]
 
 
 def write_log(

@@ -1,0 +1,108 @@
+"""Several towns as one data set: a few logs of each seed's town, for studies that split their clips by town."""
+
+import hashlib
+import json
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+from factory.clips.av2 import SPLITS, AV2Reader
+from factory.clips.reader import ClipRef
+from factory.clips.synthetic.reader import TOWN_VERSION, make_whole, sensed_digest
+from factory.clips.synthetic.town import LOGS_PER_TOWN, log_name
+from factory.clips.synthetic.write import TownSettings, write_logs
+from tasks.caches import user_cache
+from tasks.world.clip import Clip
+
+PAINTERS = 2  # threads; a log's bytes do not depend on them
+
+
+@dataclass(frozen=True)
+class TownFolder:
+    """The chosen logs of one seed's town, and the folder that holds them or will."""
+
+    seed: int
+    indices: tuple[int, ...]
+    root: Path
+
+    def logs(self) -> dict[str, Path]:
+        """Log id -> folder, of logs that may not be written yet."""
+        return {name: self.root / name for name in (log_name(self.seed, index) for index in self.indices)}
+
+
+class SyntheticTownsReader(AV2Reader):
+    """Clips of the towns of several seeds; no seed's clips depend on which other seeds are read.
+
+    A town has eighteen kinds of drives. Of each town the next `logs_per_town` are taken, so that a few towns hold every
+    kind. Each town is written on first use into a folder of its own and moved there whole: indexing writes them all,
+    before a run's workers start, and a reader elsewhere writes those it reads from.
+    """
+
+    data_set = "synthetic"
+
+    def __init__(
+        self,
+        seeds: Sequence[int] | None = None,
+        first_seed: int = 0,
+        n_towns: int = 1,
+        logs_per_town: int = 3,
+        split: str = "train",
+        first_window: int = 0,
+        cache_dir: str | Path | None = None,
+        settings: TownSettings | None = None,
+    ) -> None:
+        """seeds: None: `n_towns` of them from `first_seed` on; split: of every clip, whatever its log's hash says.
+
+        Raises ValueError for repeated or no seeds, an unknown split, or more logs than a town has kinds of drives.
+        """
+        chosen = list(range(first_seed, first_seed + n_towns)) if seeds is None else list(seeds)
+        if not chosen or min(chosen) < 0 or len(set(chosen)) < len(chosen):
+            raise ValueError(f"clips.seeds: each town's seed once, 0 or more, at least one; not {chosen}")
+        if split not in SPLITS:
+            raise ValueError(f"clips.split={split} is none of {', '.join(SPLITS)}")
+        if not 1 <= logs_per_town <= LOGS_PER_TOWN:
+            raise ValueError(f"clips.logs_per_town={logs_per_town}: a town has 1 to {LOGS_PER_TOWN} logs")
+        super().__init__(cache_dir or user_cache() / "towns", first_window=first_window)
+        self.split, self.settings = split, settings or TownSettings()
+        self.towns = tuple(self._town(seed, logs_per_town) for seed in chosen)
+
+    def logs(self) -> dict[str, Path]:
+        """Of all towns, in the order of the seeds; writes the towns that are missing."""
+        for number, town in enumerate(self.towns, 1):
+            self._write(town, f"town {number} of {len(self.towns)}")
+        return {name: folder for town in self.towns for name, folder in town.logs().items()}
+
+    def path_of(self, ref: ClipRef) -> Path:
+        """The folder of the clip's log; writes its town if it is missing. Raises BadClip where there is none."""
+        for town in self.towns:
+            if ref.log_id in town.logs() and ref.dataset == self.name:
+                self._write(town, "town")
+                return town.logs()[ref.log_id]
+        return super().path_of(ref)
+
+    def read(self, ref: ClipRef) -> Clip:
+        """The validated clip, of this reader's split. Raises BadClip."""
+        clip = super().read(ref)
+        return replace(clip, split=self.split, content_digest=self._of_here(clip.content_digest))
+
+    def digest(self, ref: ClipRef) -> str:
+        """The clip's content digest, without reading it. Raises BadClip."""
+        return self._of_here(super().digest(ref))
+
+    def _of_here(self, digest: str) -> str:
+        return sensed_digest(f"{digest}{self.split}", self.settings)
+
+    def _town(self, seed: int, n_logs: int) -> TownFolder:
+        indices = tuple((seed * n_logs + i) % LOGS_PER_TOWN for i in range(n_logs))
+        key = json.dumps([TOWN_VERSION, "logs", indices, seed, asdict(self.settings)])
+        return TownFolder(seed, indices, self.root / f"town-{seed}-{hashlib.sha256(key.encode()).hexdigest()[:16]}")
+
+    def _write(self, town: TownFolder, which: str) -> None:
+        if town.root.is_dir():
+            return
+        began = time.monotonic()
+        make_whole(town.root, lambda folder: write_logs(folder, town.indices, town.seed, self.settings, PAINTERS))
+        told = f"{which}: seed {town.seed}, {len(town.indices)} logs painted in {time.monotonic() - began:.0f} s"
+        print(told, file=sys.stderr, flush=True)
