@@ -89,18 +89,10 @@ def load_planner(path: str | Path) -> Planner:
             arrays = {name: stored[name] for name in stored.files}
     except (OSError, ValueError, zipfile.BadZipFile) as error:
         raise ConfigError(f"{folder / ARRAYS}: {error}: restore the checkpoint") from error
-    choice = PlannerChoice(record["planner"]["name"], without_weight_files(record["planner"]["settings"]))
+    choice = PlannerChoice(**record["planner"])
     planner = build_planner(choice, arrays)
     load_weights(planner, folder)
     return planner.eval()
-
-
-def without_weight_files(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings of a planner whose weights come from a checkpoint: the files it began with are not needed again."""
-    return {
-        name: without_weight_files(value) if isinstance(value, Mapping) else None if name == "weights" else value
-        for name, value in settings.items()
-    }
 
 
 def load_weights(planner: Planner, folder: Path) -> None:
