@@ -41,15 +41,23 @@ class TwoStageScores:
 def follow_up_weights(endpoint_xy: Array, starts_xy: Array) -> Array:
     """Weights (M,), sum 1, of follow-up frames that start at (M, 2) for a plan that ends at (2,).
 
-    Gaussian in the distance, variance 0.1 m^2; uniform where all frames are too far (beyond 1.92 m) for a weight, or a
-    distance is NaN.
+    Gaussian in the distance, variance 0.1 m^2; uniform where `is_uniform`.
     """
-    distance_sq = ((starts_xy - endpoint_xy) ** 2).sum(axis=-1)
-    weights: Array = np.exp(-distance_sq / (2.0 * WEIGHT_VARIANCE_M2))
-    total = weights.sum()
-    if np.isnan(total) or np.isclose(total, 0.0):
+    weights = _gaussian(endpoint_xy, starts_xy)
+    if is_uniform(endpoint_xy, starts_xy):
         return np.full(len(weights), 1.0 / len(weights))
-    return weights / total
+    return weights / weights.sum()
+
+
+def is_uniform(endpoint_xy: Array, starts_xy: Array) -> bool:
+    """Whether all frames are too far (beyond 1.92 m) for a weight, or a distance is NaN."""
+    total = float(_gaussian(endpoint_xy, starts_xy).sum())
+    return bool(np.isnan(total) or np.isclose(total, 0.0))
+
+
+def _gaussian(endpoint_xy: Array, starts_xy: Array) -> Array:
+    weights: Array = np.exp(-((starts_xy - endpoint_xy) ** 2).sum(axis=-1) / (2.0 * WEIGHT_VARIANCE_M2))
+    return weights
 
 
 def group_scores(group: Group) -> FrameScores:
