@@ -1,0 +1,46 @@
+"""The mean of several scorers."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from planners.batch import ImageLayout
+from planners.ensemble import Ensemble, mean_scores
+from tests.planners.test_gtrs_dense import TINY, labelled, planner
+
+
+def test_an_ensemble_of_one_is_that_model() -> None:
+    batch, _ = labelled(4)
+    model = planner().eval()
+    assert torch.equal(Ensemble([("one", model)]).plan(batch), model.plan(batch))
+
+
+def test_scores_are_averaged_as_probabilities_before_they_are_weighted() -> None:
+    batch, _ = labelled(4)
+    models = [planner(seed=seed).eval() for seed in range(3)]
+    together = Ensemble([(str(i), model) for i, model in enumerate(models)])
+    each = [model.scores(batch) for model in models]
+    scores = together.scores(batch)
+    torch.testing.assert_close(scores["ep"], (each[0]["ep"] + each[1]["ep"] + each[2]["ep"]) / 3)
+    torch.testing.assert_close(scores["imitation"].sum(dim=1), torch.ones(4))
+    assert torch.equal(together.plan(batch), models[0].choices[models[0].choose(mean_scores(each))])
+
+
+def test_the_sure_one_outvotes_two_that_doubt() -> None:
+    one, two = ({"ep": torch.tensor([[0.9, 0.2]])}, {"ep": torch.tensor([[0.4, 0.6]])})
+    torch.testing.assert_close(mean_scores([one, two, two])["ep"], torch.tensor([[1.7 / 3, 1.4 / 3]]))
+
+
+def test_members_that_have_nothing_to_average_are_refused_by_name() -> None:
+    with pytest.raises(ValueError, match="one model at least"):
+        Ensemble([])
+    with pytest.raises(ValueError, match=r"b\.pt chooses from vocabulary .* and a\.pt from"):
+        Ensemble([("a.pt", planner()), ("b.pt", planner(k=12))])
+    with pytest.raises(ValueError, match=r"b\.pt sees .*width=96.* and a\.pt sees .*width=64"):
+        Ensemble([("a.pt", planner()), ("b.pt", planner(replace(TINY, image=ImageLayout(width=96, height=32))))])
+
+
+def test_it_asks_for_the_picture_and_no_labels() -> None:
+    needs = Ensemble([("one", planner())]).needs
+    assert needs.image == TINY.image and needs.labels is None
