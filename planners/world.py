@@ -1,5 +1,6 @@
 """The processes of one training: which of them this is, and what they tell each other."""
 
+import gc
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -45,26 +46,30 @@ class World:
 
 
 @contextmanager
-def joined(device: str) -> Iterator[World]:
+def joined(device: str, place: torch.device | None = None) -> Iterator[World]:
     """The world this process was started into: alone, by torchrun, or a group that stands already (Ray Train).
 
-    device: auto | cpu | cuda. Raises ValueError for cuda where there is none.
+    device: auto | cpu | cuda; place: the device itself, where that is known. Raises ValueError for cuda where there is
+    none.
     """
     if device == "cuda" and not torch.cuda.is_available():
         raise ValueError(
             "device=cuda, but PyTorch sees no GPU here: leave device=auto, or install a CUDA build of torch"
         )
-    local = int(os.environ.get("LOCAL_RANK", 0))
-    on_gpu = device != "cpu" and torch.cuda.is_available()
-    place = torch.device("cuda", local) if on_gpu else torch.device("cpu")
-    if on_gpu:
+    if place is None:
+        on_gpu = device != "cpu" and torch.cuda.is_available()
+        place = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0))) if on_gpu else torch.device("cpu")
+    if place.type == "cuda":
         torch.cuda.set_device(place)
     started = not dist.is_initialized() and int(os.environ.get("WORLD_SIZE", 1)) > 1
     if started:
-        dist.init_process_group("nccl" if on_gpu else "gloo")
+        dist.init_process_group("nccl" if place.type == "cuda" else "gloo")
     try:
         group = dist.is_initialized()
         yield World(dist.get_rank() if group else 0, dist.get_world_size() if group else 1, place)
+        if started:
+            dist.barrier()  # a process that leaves first takes the connections of the others down
     finally:
         if started:
+            gc.collect()  # a wrapper that is still about would keep the group's threads beyond the interpreter's end
             dist.destroy_process_group()
