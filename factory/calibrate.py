@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from factory.clips.reader import ClipRef
 from factory.settings import Run
 from factory.store.schema import BOOKKEEPING, sample_row_to_table
-from factory.work import HUMAN, HUMAN_CANDIDATE, Accepted
+from factory.work import HUMAN_CANDIDATE, LOGGED, Accepted
 from tasks.stages import Rejected
 
 CALIBRATION_CLIPS = 3
@@ -61,8 +61,8 @@ def measure(run: Run, refs: Sequence[ClipRef]) -> Calibration:
         sums.candidates += len(prepared.candidates)
         sums.seconds.update(prepared.seconds)
         for expert in run.config.experts:
-            wanted = 1 if expert == HUMAN else run.config.rounds
-            tries = [HUMAN_CANDIDATE] if expert == HUMAN else range(len(prepared.candidates))
+            wanted = 1 if expert in LOGGED else run.config.rounds
+            tries = [HUMAN_CANDIDATE] if expert in LOGGED else range(len(prepared.candidates))
             for candidate in tries:
                 result = run.work.attempt(prepared, candidate, expert)
                 sums.attempts += 1

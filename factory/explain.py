@@ -69,7 +69,7 @@ def explain(argv: Sequence[str]) -> int:
     from factory.look.video import write_mp4
     from factory.pipeline import FactoryWork, PerturbedClip
     from factory.settings import RunConfig, assemble
-    from factory.work import HUMAN, HUMAN_CANDIDATE
+    from factory.work import HUMAN_CANDIDATE, LOGGED
     from tasks.stages import SUBSCORES, Rejected
 
     own, overrides = split_arguments(argv)
@@ -93,7 +93,7 @@ def explain(argv: Sequence[str]) -> int:
 
     if isinstance(found, Rejected):
         print(f"no candidates: rejected by {found.stage}: {found.reason}: {found.detail}")
-        if expert != HUMAN:
+        if expert not in LOGGED:
             return 0
     else:
         print("dropped by gate: " + ", ".join(f"{gate} {count}" for gate, count in found.gate_counts.items()))
@@ -101,8 +101,8 @@ def explain(argv: Sequence[str]) -> int:
         print("gated trajectories: " + ", ".join(f"{fate} {count}" for fate, count in fates.most_common()))
         cv2.imwrite(f"{stem}_candidates.png", candidates_picture(clip, found.considered)[..., ::-1])
 
-    payload = PerturbedClip(ref, clip, made.candidates)
-    order = [HUMAN_CANDIDATE] if expert == HUMAN else range(min(own.tries, len(made.candidates)))
+    payload = PerturbedClip(ref, clip, made.candidates, made.before)
+    order = [HUMAN_CANDIDATE] if expert in LOGGED else range(min(own.tries, len(made.candidates)))
     shown = None
     for candidate in order:
         trace = work.trace(payload, candidate, expert)

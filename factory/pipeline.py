@@ -11,12 +11,35 @@ import numpy as np
 from factory.clips.reader import BadClip, ClipReader, ClipRef
 from factory.fitting import fits_going_on
 from factory.imaging import Imaging
-from factory.rows import label_columns, sample_row
-from factory.work import HUMAN, Accepted, AttemptResult, CandidateRow, Dropped, PreparedClip, RunIdentity
-from tasks.attempt import ExpertGate, Judged, Timed, attempt, has_route, human_sample, perturbed_scene
+from factory.rows import earlier_lineage, label_columns, sample_row
+from factory.work import (
+    BENCHMARK,
+    HUMAN,
+    HUMAN_BEFORE,
+    LOGGED,
+    Accepted,
+    AttemptResult,
+    CandidateRow,
+    Dropped,
+    PreparedClip,
+    RunIdentity,
+)
+from tasks.attempt import (
+    ExpertGate,
+    Judged,
+    Timed,
+    attempt,
+    follow_up,
+    half_a_second_before,
+    has_route,
+    human_sample,
+    perturbed_scene,
+)
 from tasks.chance import stream
+from tasks.experts.follow_up import BEFORE_STEPS, FollowUp
 from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.protocol import Expert
+from tasks.hard_scenes import BenchmarkClip
 from tasks.perturb import Candidate, Perturbation, PerturbSettings, end_speed_mps, perturb
 from tasks.render.engine import check
 from tasks.render.settings import RenderMode, RenderSettings, SceneFrom
@@ -25,7 +48,7 @@ from tasks.reward.labels import Labelling, vocabulary_labels
 from tasks.rollout.simulate import TrafficSettings
 from tasks.stages import SUBSCORES, Rejected
 from tasks.vocabulary import Vocabulary
-from tasks.world.clip import Clip, scene_of_clip
+from tasks.world.clip import STEP_S, Clip, scene_of_clip
 
 
 @dataclass(frozen=True)
@@ -35,6 +58,7 @@ class PerturbedClip:
     ref: ClipRef
     clip: Clip
     candidates: tuple[Candidate, ...]
+    before: Clip | None = None  # of a benchmark: the same log's window 0.5 s earlier
 
 
 @dataclass(frozen=True)
@@ -44,6 +68,7 @@ class Considered:
     clip: Clip
     found: Perturbation | Rejected  # Rejected by render or perturb: no simulated expert has anything to try
     seconds: Mapping[str, float]  # by stage
+    before: Clip | None = None  # of a benchmark: the same log's window 0.5 s earlier
 
     @property
     def candidates(self) -> tuple[Candidate, ...]:
@@ -131,15 +156,18 @@ class FactoryWork:
         made = self.considered(ref)
         if isinstance(made, Rejected):
             return made
-        clip, found = made.clip, made.found
+        clip, found = _bare(made.clip), made.found
+        before = None if made.before is None else _bare(made.before)
+        rollouts = tuple((i, candidate.rollout) for i, candidate in enumerate(made.candidates))
         return PreparedClip(
             clip_id=clip.clip_id,
             content_digest=clip.content_digest,
             candidates=tuple(_candidate_row(index, candidate) for index, candidate in enumerate(made.candidates)),
             gate_counts=found.counts if isinstance(found, Rejected) else found.gate_counts,
-            payload=PerturbedClip(ref, replace(clip, images=(), sweeps=(), block=None), made.candidates),
+            payload=PerturbedClip(ref, clip, made.candidates, before),
             dropped=found if isinstance(found, Rejected) else None,
             seconds=made.seconds,
+            scenes=None if before is None else BenchmarkClip(clip, before, rollouts),
         )
 
     def considered(self, ref: ClipRef) -> Considered | Rejected:
@@ -148,13 +176,16 @@ class FactoryWork:
         clip = self._read(ref, watch)
         if isinstance(clip, Rejected):
             return clip
+        before = self._earlier(ref, watch)
+        if isinstance(before, Rejected):
+            return before
         with watch.of("render"):
             blocked = self._block_verdict(clip)
         with watch.of("perturb"):
             found = blocked or perturb(
                 clip, self.vocabulary, self.perturb, self.traffic, self.pdm, stream(self.seed, clip.clip_id, "perturb")
             )
-        return Considered(clip, found, watch.seconds)
+        return Considered(clip, found, watch.seconds, before)
 
     def _read(self, ref: ClipRef, watch: Stopwatch) -> Clip | Rejected:
         if ref in self.broken:
@@ -165,12 +196,25 @@ class FactoryWork:
             return Rejected("clip", "route_ended", "the log ends at the end of its route")
         return clip
 
+    def _earlier(self, ref: ClipRef, watch: Stopwatch) -> Clip | Rejected | None:
+        """The window 0.5 s before a clip that was read; None where nobody asks for it."""
+        if not set(self.experts) & BENCHMARK:
+            return None
+        earlier = _earlier_ref(ref)
+        if earlier.start_ms < 0:
+            return Rejected("clip", "no_earlier_frame", f"the log begins {ref.start_ms} ms before the clip")
+        try:
+            with watch.of("clip"):
+                return self.reader.read(earlier)
+        except BadClip as error:  # the clip itself was read: what lies before it is no drive
+            return Rejected("clip", "no_earlier_frame", str(error))
+
     def _unlisted(self, ref: ClipRef) -> PreparedClip | Rejected:
         watch = Stopwatch()
         clip = self._read(ref, watch)
         if isinstance(clip, Rejected):
             return clip
-        payload = PerturbedClip(ref, replace(clip, images=(), sweeps=(), block=None), ())
+        payload = PerturbedClip(ref, _bare(clip), ())
         return PreparedClip(clip.clip_id, clip.content_digest, (), {}, payload, seconds=watch.seconds)
 
     def content_digest(self, ref: ClipRef) -> str | None:
@@ -207,13 +251,17 @@ class FactoryWork:
             assert trace.rejected is not None
             return Dropped(trace.rejected, _subscores(trace.judged.scores) if trace.judged else {}, watch.seconds)
         with watch.of("render"):
-            sensed = self._with_sensors(payload)
+            sensed = self._with_sensors(payload, expert)
             unfit = self.unfit(sensed, trace)
             if unfit is not None:
                 return Dropped(unfit, _subscores(trace.judged.scores), watch.seconds)
-            pictures = self.imaging.pictures(sensed, trace.candidate, trace.judged)
-        labels = self._labels(trace.judged, watch)
-        row = sample_row(payload.clip, trace.candidate, trace.judged)
+        judged = self._sampled(trace, expert)
+        with watch.of("render"):
+            pictures = self.imaging.pictures(sensed, trace.candidate, judged)
+        labels = self._labels(judged, watch)
+        row = sample_row(judged.scene.clip, trace.candidate, judged)
+        if expert == HUMAN_BEFORE:
+            row |= earlier_lineage(payload.clip)
         tags = [*row["tags"], *pictures.get("tags", ())]  # type: ignore[misc]
         return Accepted(row | labels | pictures | {"tags": tags}, watch.seconds)
 
@@ -227,9 +275,13 @@ class FactoryWork:
         """The same attempt up to the reward's verdict, nothing left out."""
         clip, driver = payload.clip, self.experts[expert]
         rng = stream(self.seed, clip.clip_id, f"expert.{expert}", candidate)
-        if expert == HUMAN:
-            return Trace(None, human_sample(scene_of_clip(clip), driver, self.pdm, rng, timed), None)
+        if expert in LOGGED:
+            logged = scene_of_clip(_driven(payload, expert))
+            return Trace(None, human_sample(logged, driver, self.pdm, rng, timed), None)
         chosen = payload.candidates[candidate]
+        if isinstance(driver, FollowUp):
+            led_to = follow_up(clip, chosen.rollout, driver, self.traffic, timed)
+            return Trace(chosen, None, led_to) if isinstance(led_to, Rejected) else Trace(chosen, led_to, None)
         with timed("rollout"):
             scene = perturbed_scene(clip, chosen.rollout)
         result = attempt(scene, driver, self.gate, self.traffic, self.pdm, rng, timed)
@@ -246,6 +298,15 @@ class FactoryWork:
             return None
         return self.imaging.unfit(clip, trace.candidate, trace.judged)
 
+    def _sampled(self, trace: Trace, expert: str) -> Judged:
+        """The drive as the sample tells it; of the earlier frame of a pair, only after all that the pair shares."""
+        assert trace.judged is not None
+        driver = self.experts[expert]
+        if not (isinstance(driver, FollowUp) and driver.before):
+            return trace.judged
+        assert trace.candidate is not None
+        return half_a_second_before(trace.judged, trace.candidate.rollout, driver.settings)
+
     def _labels(self, judged: Judged, watch: Stopwatch) -> dict[str, object]:
         """Columns of the vocabulary labels; none in a run without them."""
         if self.labelling is None:
@@ -261,16 +322,34 @@ class FactoryWork:
     def _simulates(self) -> bool:
         return bool(set(self.experts) - {HUMAN})
 
-    def _with_sensors(self, payload: PerturbedClip) -> Clip:
+    def _with_sensors(self, payload: PerturbedClip, expert: str) -> Clip:
+        clip = _driven(payload, expert)
         if self.render.mode is not RenderMode.AUTO:
-            return payload.clip
-        now = self.reader.read(payload.ref)
-        return replace(payload.clip, images=now.images, sweeps=now.sweeps, block=now.block)
+            return clip
+        now = self.reader.read(_earlier_ref(payload.ref) if expert == HUMAN_BEFORE else payload.ref)
+        return replace(clip, images=now.images, sweeps=now.sweeps, block=now.block)
 
     @property
     def imaging(self) -> Imaging:
         """The render stage with this run's settings."""
         return Imaging(self.render, self.cache_dir)
+
+
+def _bare(clip: Clip) -> Clip:
+    """Without its sensor files: where data lies may change."""
+    return replace(clip, images=(), sweeps=(), block=None)
+
+
+def _earlier_ref(ref: ClipRef) -> ClipRef:
+    return replace(ref, start_ms=ref.start_ms - round(1000 * BEFORE_STEPS * STEP_S))
+
+
+def _driven(payload: PerturbedClip, expert: str) -> Clip:
+    """The window at whose T the expert's sample has its now, or begins its perturbation."""
+    if expert != HUMAN_BEFORE:
+        return payload.clip
+    assert payload.before is not None, "prepared by a run without benchmark experts"
+    return payload.before
 
 
 def _candidate_row(index: int, candidate: Candidate) -> CandidateRow:

@@ -79,8 +79,9 @@ def seconds_text(seconds: Mapping[str, tuple[int, float]]) -> str:
 
 def run(overrides: Sequence[str]) -> int:
     """Plan, execute, commit, report."""
+    from factory.benchmark import NEEDED, write_benchmark
     from factory.calibrate import calibrate, plan_text
-    from factory.execute import execute
+    from factory.execute import COMPLETE, execute
     from factory.funnel import image_sources_text
     from factory.look.report import write_report
     from factory.settings import assemble, load_config
@@ -118,6 +119,8 @@ def run(overrides: Sequence[str]) -> int:
     print(image_sources_text(store, [ref.clip_id for ref in refs]))
     if summary.seconds:
         print(seconds_text(summary.seconds))
+    if set(config.experts) >= NEEDED and summary.exit_code == COMPLETE:
+        print(write_benchmark(store, refs, assembled.work.identity, config.rounds, config.benchmark))
     print(write_report(store, assembled))
     return summary.exit_code
 

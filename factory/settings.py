@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from factory.benchmark import BenchmarkSettings
 from factory.clips.reader import ClipIndex, ClipReader
 from factory.config import ConfigError, build, compose, fill
 from factory.pipeline import FactoryWork
@@ -18,9 +19,10 @@ from factory.vocabulary import (
     save_recovery_table,
     train_windows,
 )
-from factory.work import HUMAN, UNLISTED, RunIdentity, canonical_json
+from factory.work import BENCHMARK, FOLLOW_UP_BEFORE, HUMAN, UNLISTED, RunIdentity, canonical_json
 from tasks.attempt import ExpertGate
 from tasks.caches import user_cache
+from tasks.experts.follow_up import FollowUp
 from tasks.experts.human import Human
 from tasks.experts.pdm_closed import PdmClosed, PdmSettings
 from tasks.experts.protocol import Expert
@@ -37,6 +39,10 @@ from tasks.stages import stage_versions
 from tasks.vocabulary import Vocabulary
 
 KINEMATIC_K = 1024
+KINDS = ("human", "pdm_closed", "recovery", "human_before", "follow_up", "follow_up_before")  # of built-in experts
+ABSENT = object()
+# Settings that came later: at what held before there was a choice they are left out, so that older tables go on.
+ADDED: dict[str, object] = {"perturb.interleaved": True, "perturb.order": "drawn", "perturb.at_most": None}
 
 
 @dataclass(frozen=True)
@@ -87,6 +93,7 @@ class RunConfig:
     reward: RewardSettings
     render: RenderSettings
     vocabulary: VocabularyChoice
+    benchmark: BenchmarkSettings
     rounds: int
     experts: tuple[str, ...]
     executor: Literal["ray", "local"]
@@ -219,10 +226,10 @@ def build_expert(name: str, config: RunConfig, reader: ClipReader, index: ClipIn
     """One of the built-in kinds, or a user's `_target_`. Raises ConfigError for what the expert does not take."""
     spec, where = dict(config.expert[name]), f"expert.{name}"
     match spec.pop("kind", None):
-        case "human" | "pdm_closed" as kind:
+        case "human" | "human_before" | "pdm_closed" | "follow_up" | "follow_up_before" as kind:
             if spec:
                 raise ConfigError(f"unknown setting {', '.join(f'{where}.{key}' for key in spec)}")
-            return Human() if kind == "human" else PdmClosed(config.pdm)
+            return _without_settings(kind, config.pdm)
         case "recovery":
             of_table: dict[str, Any] = {key: spec.pop(key) for key in ("table", "vocabularies") if key in spec}
             sources = fill(RecoverySources, of_table, where)
@@ -233,7 +240,17 @@ def build_expert(name: str, config: RunConfig, reader: ClipReader, index: ClipIn
             _must_have(expert, ("name", "digest", "plan"), where, "an expert (tasks.experts.protocol.Expert)")
             return expert
         case other:
-            raise ConfigError(f"{where}.kind={other} is none of human, pdm_closed, recovery; or give _target_")
+            raise ConfigError(f"{where}.kind={other} is none of {', '.join(KINDS)}; or give _target_")
+
+
+def _without_settings(kind: str, pdm: PdmSettings) -> Expert:
+    match kind:
+        case "human" | "human_before":
+            return Human(kind)
+        case "pdm_closed":
+            return PdmClosed(pdm)
+        case _:
+            return FollowUp(pdm, before=kind == FOLLOW_UP_BEFORE)
 
 
 def _must_have(plugged: object, members: Sequence[str], where: str, what: str) -> None:
@@ -286,6 +303,7 @@ def identity_of(config: RunConfig, vocabulary: Vocabulary, labelling: Labelling 
     settings: dict[str, object] = {"seed": config.seed, "vocabulary": vocabulary.digest}
     for group, value in science.items():
         settings |= {f"{group}.{key}": plain for key, plain in dataclasses.asdict(value).items()}
+    settings = {key: plain for key, plain in settings.items() if plain != ADDED.get(key, ABSENT)}
     settings["reward.label_vocabulary"] = None if labelling is None else labelling.vocabulary.digest
     versions = stage_versions()
     early: dict[str, object] = {
@@ -295,7 +313,10 @@ def identity_of(config: RunConfig, vocabulary: Vocabulary, labelling: Labelling 
     if config.render.refuses_blocks:  # then the block's verdict is part of what is prepared
         early |= {key: value for key, value in settings.items() if key.startswith("render.")}
         stages.append("render")
-    prepared = canonical_json([early, {stage: versions[stage] for stage in stages}])
+    made_of: list[object] = [early, {stage: versions[stage] for stage in stages}]
+    if set(config.experts) & BENCHMARK:  # then a prepared clip has its earlier frame
+        made_of.append("earlier frame")
+    prepared = canonical_json(made_of)
     digest = hashlib.sha256(prepared.encode()).hexdigest()[:16]
     return RunIdentity(settings, versions, vocabulary.digest, UNLISTED if set(config.experts) == {HUMAN} else digest)
 

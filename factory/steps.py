@@ -16,6 +16,7 @@ from factory.clips.reader import BadClip, ClipRef
 from factory.store.cache import BadCacheFile, ClipCache
 from factory.store.location import Location
 from factory.store.outcomes import ErrorKind
+from factory.store.scenes import SceneFiles
 from factory.store.schema import SAMPLES, sample_row_to_table
 from factory.store.table import Shard, write_shard
 from factory.work import Accepted, CandidateRow, PreparedClip, Work
@@ -102,6 +103,7 @@ def prepare(
             stored, note = None, f"cache file {key}: log {ref.log_id} was changed since; prepared again"
         if isinstance(stored, PreparedClip):
             _refuse_changed(ref, stored.content_digest, wanted_content)
+            _keep_scenes(out, stored)
             seconds = {"cache": time.perf_counter() - began}
             return _prepared(stored, True, note, seconds), stored
         result = work.prepare(ref)
@@ -112,9 +114,16 @@ def prepare(
             raise ValueError(f"prepare({ref.clip_id}) returned clip {result.clip_id}")
         _refuse_changed(ref, result.content_digest, wanted_content)
         cache.store(key, result)
+        _keep_scenes(out, result)
         return _prepared(result, False, note, result.seconds), result
     except Exception as error:  # the boundary where whatever a stage or a user's reader raises becomes data
         return failure_of(error), None
+
+
+def _keep_scenes(out: Location, clip: PreparedClip) -> None:
+    """Before any attempt, so that no row stands without them; written anew each time, they may be of older settings."""
+    if clip.scenes is not None:
+        SceneFiles(out.child("scenes")).store(clip.scenes)
 
 
 def _refuse_changed(ref: ClipRef, found: str | None, wanted: str | None) -> None:

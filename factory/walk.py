@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from factory.store.outcomes import ErrorKind, Kind
 from factory.store.samples import Past
-from factory.work import HUMAN, HUMAN_CANDIDATE
+from factory.work import HUMAN_CANDIDATE, LOGGED
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Try:
 
 @dataclass(frozen=True)
 class Complete:
-    """The walk has all samples it was asked for (`human`: its one attempt is done)."""
+    """The walk has all samples it was asked for (a LOGGED expert: its one attempt is done)."""
 
 
 @dataclass(frozen=True)
@@ -46,14 +46,14 @@ Step = Try | Complete | Exhausted | Blocked
 
 def candidate_order(expert: str, n_candidates: int) -> Sequence[int]:
     """Candidate indices in the order in which a walk of this expert tries them."""
-    return (HUMAN_CANDIDATE,) if expert == HUMAN else range(n_candidates)
+    return (HUMAN_CANDIDATE,) if expert in LOGGED else range(n_candidates)
 
 
 def next_step(
     expert: str, n_candidates: int, rounds: int, known: Mapping[int, Past], may_retry: Callable[[Past], bool]
 ) -> Step:
-    """Where the walk stands. `human` has one attempt in round 0 whatever `rounds` is."""
-    wanted = 1 if expert == HUMAN else rounds
+    """Where the walk stands. A LOGGED expert has one attempt in round 0 whatever `rounds` is."""
+    wanted = 1 if expert in LOGGED else rounds
     accepted = 0
     for candidate in candidate_order(expert, n_candidates):
         if accepted == wanted:
@@ -67,7 +67,7 @@ def next_step(
             if past.round != accepted:
                 return Blocked(candidate, f"stored as round {past.round}, the walk makes it {accepted}")
             accepted += 1
-    return Complete() if accepted == wanted or expert == HUMAN else Exhausted(n_candidates)
+    return Complete() if accepted == wanted or expert in LOGGED else Exhausted(n_candidates)
 
 
 def retry_policy(retry: bool, versions_json: str) -> Callable[[Past], bool]:

@@ -8,13 +8,20 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from factory.clips.reader import ClipRef
 from tasks.stages import Rejected
 
+if TYPE_CHECKING:
+    from tasks.hard_scenes import BenchmarkClip
+
 HUMAN = "human"  # the expert that is the log itself
-HUMAN_CANDIDATE = -1  # its only candidate index
+HUMAN_BEFORE = "human_before"  # the same 0.5 s earlier, for benchmarks
+LOGGED = frozenset({HUMAN, HUMAN_BEFORE})  # one attempt each, in round 0
+FOLLOW_UP, FOLLOW_UP_BEFORE = "follow_up", "follow_up_before"
+BENCHMARK = frozenset({HUMAN_BEFORE, FOLLOW_UP, FOLLOW_UP_BEFORE})  # whose clips need an earlier frame and scenes
+HUMAN_CANDIDATE = -1  # the only candidate index of LOGGED experts
 UNLISTED = "unlisted"  # prepare_digest of clips prepared for the log's own drive alone: no perturb work, no list
 
 
@@ -44,6 +51,7 @@ class PreparedClip:
     payload: object  # tree of frozen dataclasses, dicts, tuples, numpy arrays and scalars (factory.store.cache)
     dropped: Rejected | None = None  # why there are no candidates; the human row is scored all the same
     seconds: Mapping[str, float] = field(default_factory=dict)  # stage -> seconds
+    scenes: "BenchmarkClip | None" = None  # to be kept beside the tables before any row of the clip is
 
 
 @dataclass(frozen=True)
@@ -136,5 +144,5 @@ class Work(Protocol):
         ...
 
     def attempt(self, prepared: PreparedClip, candidate: int, expert: str) -> AttemptResult:
-        """Rollout, expert, rollout, reward and render of one candidate; candidate -1 with the expert `human`."""
+        """Rollout, expert, rollout, reward and render of one candidate; candidate -1 with LOGGED experts."""
         ...

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tasks.experts.follow_up import BEFORE_STEPS, FollowUp
 from tasks.experts.pdm_closed import PdmClosed, PdmPlan, PdmSettings, plan_for
 from tasks.experts.pdm_path import MIN_PROGRESS_M, path_length_m
 from tasks.experts.protocol import Expert, Plan
@@ -17,7 +18,7 @@ from tasks.reward.epdms import Scores, score
 from tasks.reward.prepare import PreparedScene, prepare_scene
 from tasks.rollout.simulate import TrafficSettings, next_scene, simulate
 from tasks.stages import SUBSCORES, Rejected
-from tasks.world.clip import Clip, Rollout, Scene, scene_of_clip
+from tasks.world.clip import HORIZON_STEPS, NOW, Clip, Rollout, Scene, scene_of_clip
 from tasks.world.route import centerline_from
 from tasks.world.vehicle import HEADING
 
@@ -52,10 +53,10 @@ class Judged:
     rival: NDArray[np.float64]  # (41, 11) PDM-Closed as the tracker drives it
 
 
-def perturbed_scene(clip: Clip, stage_one: Rollout) -> Scene:
-    """The world at T+H that a candidate's rollout leads to."""
-    end = stage_one.ego_states[-1]
-    return next_scene(scene_of_clip(clip), stage_one, centerline_from(clip.road_map, clip.route, end[: HEADING + 1]))
+def perturbed_scene(clip: Clip, stage_one: Rollout, steps: int = HORIZON_STEPS) -> Scene:
+    """The world at T+H that a candidate's rollout leads to; or `steps` of 0.1 s after T, on its way there."""
+    pose = stage_one.ego_states[steps, : HEADING + 1]
+    return next_scene(scene_of_clip(clip), stage_one, centerline_from(clip.road_map, clip.route, pose), steps)
 
 
 def has_route(centerline: NDArray[np.float64]) -> bool:
@@ -78,10 +79,14 @@ def drive_and_judge(
     with timed("rollout"):
         rollout = simulate(scene, plan.poses, traffic)
     with timed("reward"):
-        rival = (pdm_plan or plan_for(scene, planner)).driven
-        prepared = prepare_scene(scene, rollout.agents)
-        scores = score(prepared, np.stack([rival, rollout.ego_states]), normalise="pairs")
-    return Judged(scene, plan, rollout, scores, prepared, rival)
+        return judge(scene, plan, rollout, pdm_plan or plan_for(scene, planner))
+
+
+def judge(scene: Scene, plan: Plan, rollout: Rollout, pdm_plan: PdmPlan) -> Judged:
+    """Score a rollout from the scene in the two-row batch [PDM-Closed, rollout]."""
+    prepared = prepare_scene(scene, rollout.agents)
+    scores = score(prepared, np.stack([pdm_plan.driven, rollout.ego_states]), normalise="pairs")
+    return Judged(scene, plan, rollout, scores, prepared, pdm_plan.driven)
 
 
 def verdict(scores: Scores, gate: ExpertGate, row: int = 1) -> Rejected | None:
@@ -126,3 +131,31 @@ def human_sample(
     plan = expert.plan(scene, rng)
     assert isinstance(plan, Plan), "the log always has a plan"
     return drive_and_judge(scene, plan, TrafficSettings(mode="replay"), planner, timed)
+
+
+def follow_up(
+    clip: Clip, stage_one: Rollout, expert: FollowUp, traffic: TrafficSettings, timed: Timed = nullcontext
+) -> Judged | Rejected:
+    """PDM-Closed from T+H of a candidate's rollout, scored and never filtered.
+
+    The same for both frames of a pair, also where it is Rejected: a route that has ended at either has no follow-up.
+    """
+    with timed("rollout"):
+        scene = perturbed_scene(clip, stage_one)
+        before = perturbed_scene(clip, stage_one, HORIZON_STEPS - BEFORE_STEPS)
+    if not (has_route(scene.centerline) and has_route(before.centerline)):
+        return Rejected("rollout", "route_ended", "the perturbed ego stands at the end of its route")
+    with timed("expert"):
+        pdm_plan = plan_for(scene, expert.settings)
+    return drive_and_judge(scene, Plan(pdm_plan.poses), traffic, expert.settings, timed, pdm_plan)
+
+
+def half_a_second_before(judged: Judged, stage_one: Rollout, planner: PdmSettings) -> Judged:
+    """A follow-up's drive seen from its earlier frame: the last 0.5 s of the perturbation, then what came of it."""
+    kept = HORIZON_STEPS - BEFORE_STEPS
+    scene = perturbed_scene(judged.scene.clip, stage_one, kept)
+    states = np.concatenate([stage_one.ego_states[kept:], judged.rollout.ego_states[1 : kept + 1]])
+    world = judged.scene.agents.overwritten(judged.scene.step, judged.rollout.agents)
+    agents = world.window(NOW + kept, NOW + kept + HORIZON_STEPS + 1)
+    rollout = Rollout(scene.step, states, agents, stage_one.simulated | judged.rollout.simulated)
+    return judge(scene, Plan(states[1:, : HEADING + 1]), rollout, plan_for(scene, planner))

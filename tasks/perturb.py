@@ -5,11 +5,14 @@ gates on the raw end pose, LQR, gates on the reached end pose, an interleaved gr
 cell the first trajectory in seeded order with a non-reactive EPDMS at the threshold (log replay), then the same
 threshold under reactive traffic on the kept ones only. Scores are needed only until a cell is filled, so cells are
 walked abreast: the same result as filter-then-pick at a fraction of the scores.
+
+For benchmarks the grid may be dense, and the candidates in an order in which the first few already lie all over it.
 """
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +41,9 @@ class PerturbSettings:
     step_longitudinal_m: float = 5.0
     step_lateral_m: float = 0.5
     epdms_min: float = 0.8  # /14 score, without EC
+    interleaved: bool = True  # every second cell of the grid, as on a chessboard; False: every cell
+    order: Literal["drawn", "spread"] = "drawn"  # of the candidates: as drawn, or see spread_out
+    at_most: int | None = None  # candidates a clip; None: all there are
 
     def __post_init__(self) -> None:
         gates = ("max_heading_deg", "max_longitudinal_m", "max_lateral_m")
@@ -46,6 +52,8 @@ class PerturbSettings:
                 raise ValueError(f"perturb {name} must be positive and finite, not {getattr(self, name)}")
         if not 0.0 <= self.epdms_min <= 1.0:
             raise ValueError(f"perturb epdms_min must be from 0 to 1, not {self.epdms_min}")
+        if self.at_most is not None and self.at_most < 1:
+            raise ValueError(f"perturb at_most must be positive, or null for no bound, not {self.at_most}")
 
 
 @dataclass(frozen=True)
@@ -122,6 +130,37 @@ def first_good_per_cell(
         rank += 1
 
 
+def in_turn(n: int, is_good: Callable[[int], bool], at_most: int) -> list[int]:
+    """The first `at_most` good ones of 0 .. n-1."""
+    taken: list[int] = []
+    for member in range(n):
+        if len(taken) == at_most:
+            break
+        if is_good(member):
+            taken.append(member)
+    return taken
+
+
+def spread_out(points: Array, is_good: Callable[[int], bool], at_most: int) -> list[int]:
+    """Good points (P, 2) in farthest-point order: the nearest to the origin, then always the farthest from those taken.
+
+    So that any first few lie all over the place (Gonzalez 1985). Ties go to the first. Points are asked about once, in
+    that order, until `at_most` are taken.
+    """
+    taken: list[int] = []
+    reach = -np.hypot(points[:, 0], points[:, 1])  # how much a point is wanted; -inf once it was asked about
+    while len(taken) < at_most and np.isfinite(reach).any():
+        member = int(np.argmax(reach))
+        reach[member] = -np.inf
+        if not is_good(member):
+            continue
+        distance = np.hypot(*(points - points[member]).T)
+        asked = np.isneginf(reach)
+        reach = np.where(asked, -np.inf, np.minimum(reach, distance) if taken else distance)
+        taken.append(member)
+    return taken
+
+
 def perturb(
     clip: Clip,
     vocabulary: Vocabulary,
@@ -164,7 +203,7 @@ def perturb(
     reached = ~np.logical_or.reduce(list(end_fails.values()))
     counts |= {f"reached_{name}": int(fails.sum()) for name, fails in end_fails.items()}
     cells = grid_cells(ends, settings)
-    black = cells.sum(axis=1) % 2 == 0  # the interleaved half of the grid
+    black = (cells.sum(axis=1) % 2 == 0) | (not settings.interleaved)  # the interleaved half of the grid
     counts["white_cell"] = int((reached & ~black).sum())
 
     replay = prepare_scene(scene, scene.agents.window(NOW, NOW + HORIZON_STEPS + 1))
@@ -184,25 +223,39 @@ def perturb(
 
     fate = np.where(~reached, "reached_gate", np.where(~black, "white_cell", "not_needed")).astype(object)
     fate[np.isfinite(scores)] = "score"
-    fate[kept] = "reactive"
     traffic_scene = prepare_traffic(scene, traffic)
-    candidates = []
-    for member in kept:
+    proven: dict[int, Candidate] = {}
+
+    def passes_reactive(place: int) -> bool:
+        member = int(kept[place])
         rollout = roll_out(traffic_scene, states[member].copy())
         reactive = score(
             among(replay, rollout.agents, start),
             np.concatenate([pdm_states, rollout.ego_states[None]]),
             normalise="pairs",
         )
-        if reactive.pdm_score[1] < settings.epdms_min:
-            continue
-        fate[member] = "kept"
-        cell = (int(cells[member, 0]), int(cells[member, 1]))
-        index = int(gated[member])
-        candidates.append(
-            Candidate(index, ends[member], cell, float(scores[member]), float(reactive.pdm_score[1]), reactive, rollout)
-        )
-    counts["reactive_score"] = len(kept) - len(candidates)
+        good = bool(reactive.pdm_score[1] >= settings.epdms_min)
+        fate[member] = "kept" if good else "reactive"
+        if good:
+            proven[place] = Candidate(
+                vocabulary_index=int(gated[member]),
+                end_pose=ends[member],
+                cell=(int(cells[member, 0]), int(cells[member, 1])),
+                score=float(scores[member]),
+                reactive_score=float(reactive.pdm_score[1]),
+                reactive_scores=reactive,
+                rollout=rollout,
+            )
+        return good
+
+    at_most = len(kept) if settings.at_most is None else settings.at_most
+    fate[kept] = "not_needed"
+    if settings.order == "spread":
+        places = spread_out(ends[kept, :2], passes_reactive, at_most)
+    else:
+        places = in_turn(len(kept), passes_reactive, at_most)
+    candidates = [proven[place] for place in places]
+    counts["reactive_score"] = int((fate == "reactive").sum())
     if not candidates:
         return Rejected("perturb", "no_good_candidate", ", ".join(f"{k} {v}" for k, v in counts.items()), counts)
     return Perturbation(tuple(candidates), counts, Considered(gated, ends, tuple(fate), scores))

@@ -38,7 +38,7 @@ from factory.store.cache import BadCacheFile
 from factory.store.outcomes import Kind
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
-from factory.work import HUMAN, PreparedClip
+from factory.work import LOGGED, PreparedClip
 from tasks.perturb import PerturbSettings
 from tasks.render.settings import ImageSource
 from tasks.world.clip import NOW
@@ -209,7 +209,7 @@ def _accepted_examples(
     if not labels:
         return []
     table = SampleTable(store.location.uri, store.location.options)
-    simulated = [row for row in labels if row["expert"] != HUMAN]
+    simulated = [row for row in labels if row["expert"] not in LOGGED]
     order = spread(simulated, lambda r: (r["expert"], r["clip_id"], r["round"]), lambda r: str(r["attempt_id"]))
     pictures = []
     for row in order[:N_EXAMPLES]:

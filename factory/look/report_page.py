@@ -14,6 +14,7 @@ from factory.look.report_html import Html, bar, count_bar, el, nothing, number, 
 from factory.look.report_plot import FATES, EndPoint, fate_mark, scatter
 from factory.look.report_style import STYLE
 from factory.look.report_words import GATE_WORDS, REASON_WORDS
+from factory.work import LOGGED
 from tasks.perturb import PerturbSettings
 
 # Paper (DESIGN.md, "words"): clips with a sample of the round, in % of those with one of the round before.
@@ -113,7 +114,7 @@ def _header(report: Report) -> Html:
     rows = report.funnel.rows
     tried = sum(r.accepted + r.rejected + r.failed for r in rows)
     samples = sum(r.accepted for r in rows)
-    simulated = [r for r in rows if r.expert != "human"]
+    simulated = [r for r in rows if r.expert not in LOGGED]
     n_simulated = sum(r.accepted for r in simulated)
     attempts = sum(r.accepted + r.rejected + r.failed for r in simulated)
     tiles = (

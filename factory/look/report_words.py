@@ -17,6 +17,7 @@ REASON_WORDS = {
     "blank": "nothing to be seen on a picture",
     "blurred": "a picture without detail",
     "ego_standing": "ego stands",
+    "no_earlier_frame": "the log begins too late for a frame before it",
     "broken_tracks": "broken tracks",
     "no_gated_candidate": "no trajectory passes the gates",
     "no_good_candidate": "no trajectory scores well enough",

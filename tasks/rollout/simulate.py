@@ -251,17 +251,17 @@ def _ego_boxes(ego_states: Array, vehicle: Vehicle) -> tuple[Array, Array]:
     return boxes, np.stack([cos * vx - sin * vy, sin * vx + cos * vy], axis=-1)
 
 
-def next_scene(scene: Scene, rollout: Rollout, centerline: Array) -> Scene:
-    """The scene H seconds on: the rollout's world up to its last row, the log after it.
+def next_scene(scene: Scene, rollout: Rollout, centerline: Array, steps: int = HORIZON_STEPS) -> Scene:
+    """The scene `steps` of 0.1 s into a rollout: the rollout's world up to then, the log after it.
 
-    centerline (P, 3): the route ahead of the ego's new pose.
+    centerline (P, 3): the route ahead of the ego's new pose; steps: at least as many as a scene has history.
     """
     moved = rollout.simulated if scene.ever_simulated is None else rollout.simulated | scene.ever_simulated
     return Scene(
         clip=scene.clip,
-        step=rollout.start_step + HORIZON_STEPS,
-        ego_history=rollout.ego_states[-len(scene.ego_history) :],
-        agents=scene.agents.overwritten(rollout.start_step, rollout.agents),
+        step=rollout.start_step + steps,
+        ego_history=rollout.ego_states[steps + 1 - len(scene.ego_history) : steps + 1],
+        agents=scene.agents.overwritten(rollout.start_step, rollout.agents.window(0, steps + 1)),
         centerline=centerline,
         ever_simulated=moved,
     )

@@ -31,8 +31,10 @@ from tasks.rollout.simulate import TrafficSettings
 from tasks.vocabulary import Vocabulary
 
 REPOSITORY = Path(__file__).resolve().parents[2]
+DENSE = PerturbSettings(max_longitudinal_m=8.0, step_longitudinal_m=1.0, interleaved=False, order="spread", at_most=32)
 GROUPS = [
     ("perturb/paper", PerturbSettings()),
+    ("perturb/dense", DENSE),
     ("traffic/idm", TrafficSettings()),
     ("traffic/replay", TrafficSettings(mode="replay")),
     ("pdm/navsim", PdmSettings()),
@@ -166,7 +168,8 @@ def test_a_value_of_the_wrong_kind_is_an_error_that_names_it(override: str, mess
 
 
 def test_an_unknown_expert_is_an_error_and_lists_the_known() -> None:
-    with pytest.raises(ConfigError, match=r"\['mine'\] is not among \['human', 'pdm_closed', 'recovery'\]"):
+    known = r"\['follow_up', 'follow_up_before', 'human', 'human_before', 'pdm_closed', 'recovery'\]"
+    with pytest.raises(ConfigError, match=rf"\['mine'\] is not among {known}"):
         load_config(["experts=[human,mine]"])
 
 

@@ -1,6 +1,7 @@
 """Perturbation: gates and grid in closed form, the lazy walk against its slow twin, and its promises on a street."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,7 +19,9 @@ from tasks.perturb import (
     first_good_per_cell,
     gate_failures,
     grid_cells,
+    in_turn,
     perturb,
+    spread_out,
 )
 from tasks.rollout.simulate import TrafficSettings
 from tasks.stages import STAGES, Rejected
@@ -204,3 +207,57 @@ def test_a_clip_that_nothing_can_follow_is_rejected_with_a_listed_reason() -> No
     assert off_road.reason == "no_good_candidate"
     assert off_road.counts["replay_score"] > 0 and "replay_score" in off_road.detail
     assert {result.reason, off_road.reason} <= set(reasons)
+
+
+def test_spread_begins_at_the_log_and_then_halves_the_largest_gaps() -> None:
+    line = np.column_stack([np.arange(-8.0, 9.0), np.zeros(17)])
+    order = spread_out(line, lambda _: True, 9)
+    assert line[order, 0].tolist() == [0.0, -8.0, 8.0, -4.0, 4.0, -6.0, -2.0, 2.0, 6.0]
+    assert sorted(spread_out(line, lambda _: True, 99)) == list(range(17))
+    assert spread_out(np.zeros((3, 2)), lambda _: True, 2) == [0, 1]
+    assert spread_out(np.zeros((0, 2)), lambda _: True, 2) == []
+
+
+@given(st.data())
+def test_a_bad_point_leaves_no_mark_on_the_spread(data: st.DataObject) -> None:
+    n = data.draw(st.integers(0, 20))
+    coordinate = st.integers(-9, 9)
+    points = np.array(data.draw(st.lists(st.tuples(coordinate, coordinate), min_size=n, max_size=n)), float)
+    points = points.reshape(-1, 2)
+    good = np.array(data.draw(st.lists(st.booleans(), min_size=n, max_size=n)), bool)
+    at_most = data.draw(st.integers(1, 22))
+    asked: list[int] = []
+
+    def is_good(member: int) -> bool:
+        asked.append(member)
+        return bool(good[member])
+
+    taken = spread_out(points, is_good, at_most)
+    only_good = np.flatnonzero(good)
+    assert taken == only_good[spread_out(points[good], lambda _: True, at_most)].tolist()
+    assert len(set(asked)) == len(asked)
+    assert len(taken) == min(at_most, good.sum())
+    assert in_turn(n, is_good, at_most) == only_good[:at_most].tolist()
+
+
+def test_a_dense_grid_takes_every_cell_and_the_first_of_its_spread_are_those_of_a_longer_one(
+    trajectories: NDArray[np.float64],
+) -> None:
+    dense = PerturbSettings(max_longitudinal_m=8.0, step_longitudinal_m=1.0, interleaved=False, order="spread")
+    every = perturbed(street_clip(), trajectories, dense)
+    few = perturbed(street_clip(), trajectories, replace(dense, at_most=5))
+    drawn = perturbed(street_clip(), trajectories, replace(dense, order="drawn"))
+    assert isinstance(every, Perturbation) and isinstance(few, Perturbation) and isinstance(drawn, Perturbation)
+    cells = [candidate.cell for candidate in every.candidates]
+    assert {sum(cell) % 2 for cell in cells} == {0, 1} and len(set(cells)) == len(cells)
+    assert every.gate_counts["white_cell"] == 0
+    assert [c.vocabulary_index for c in few.candidates] == [c.vocabulary_index for c in every.candidates[:5]]
+    assert {c.vocabulary_index for c in drawn.candidates} == {c.vocabulary_index for c in every.candidates}
+    ends = np.array([candidate.end_pose[:2] for candidate in every.candidates])
+    assert np.hypot(*ends[0]) == np.hypot(*ends.T).min()
+    assert few.considered.fate.count("kept") == 5 and "not_needed" in few.considered.fate
+
+
+def test_a_bound_without_room_is_refused() -> None:
+    with pytest.raises(ValueError, match="at_most must be positive"):
+        PerturbSettings(at_most=0)
