@@ -4,9 +4,11 @@ A clip has a logged frame now (at T) and one 0.5 s before; and for each follow-u
 0.5 s before. Planning reads the samples, scoring the scenes: neither needs the other.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
+from factory.store.reader import Sample
 from tasks.world.clip import Scene
 
 LOGGED_KINDS = ("human", "human_before")
@@ -55,3 +57,33 @@ class ClipScenes:
     clip_id: str
     logged: FramePair
     follow_ups: Mapping[int, FramePair]  # candidate index -> scenes
+
+
+class Benchmark(Protocol):
+    """Frames to plan from and to drive in, fixed before any planner is scored."""
+
+    @property
+    def digest(self) -> str:
+        """Of everything that scores depend on."""
+        ...
+
+    @property
+    def keys(self) -> Sequence[FrameKey]:
+        """Every frame, clip by clip."""
+        ...
+
+    def image_source(self, key: FrameKey) -> str:
+        """photo, render, map or none."""
+        ...
+
+    def stream(self, columns: Sequence[str]) -> Iterator[tuple[FrameKey, Sample]]:
+        """Every frame once, in whatever order is quick, with some columns of its sample (docs/formats.md)."""
+        ...
+
+    def sample(self, key: FrameKey) -> Sample:
+        """A whole row."""
+        ...
+
+    def scenes(self, clip_id: str) -> ClipScenes:
+        """The worlds of a clip's frames."""
+        ...

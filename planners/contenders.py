@@ -1,0 +1,162 @@
+"""Who is evaluated, by what `planner=` says.
+
+    human, pdm_closed          bounds that know the world: the log's own drive, and the privileged planner
+    constant_velocity          needs no training
+    runs/my_training           a training's folder or one of its checkpoints
+    my.module:MyPlanner        a class, or anything called without arguments, of a user's own package
+
+A user's planner has one of two faces:
+
+    def plan(self, sample: Mapping[str, Any]) -> (8, 3) or (40, 3)       one sample, docs/formats.md, as_shown
+    needs: planners.batch.Needs; def plan(self, batch: planners.batch.Batch) -> (B, 8 or 40, 3)
+
+Poses are x, y [m], heading [rad] of the rear axle in the ego frame at now, at 0.5 .. 4.0 s or 0.1 .. 4.0 s. Where it
+has a text `digest`, that tells its versions apart, else the bytes of its module's file do.
+"""
+
+import hashlib
+import importlib
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from factory.config import ConfigError, compose
+from planners import checkpoint
+from planners.batch import Batch, Needs
+from planners.frames import FrameKey
+from planners.planner import Planner
+from planners.registry import BUILT_IN, PlannerChoice, build_planner
+from planners.scoring import PreparedClip, human_plans, pdm_plans
+from planners.shown import as_shown, batch_of
+from tasks.reward.trajectories import at_ten_hz
+
+Array = NDArray[np.float64]
+Privileged = Callable[[PreparedClip], Mapping[FrameKey, Array]]
+
+PRIVILEGED: Mapping[str, Privileged] = {"human": human_plans, "pdm_closed": pdm_plans}
+UNTRAINED = ("constant_velocity",)
+
+
+@dataclass(frozen=True)
+class Contender:
+    """Someone to be evaluated."""
+
+    label: str  # names its folder and its rows
+    digest: str  # the same digest plans the same
+    load: Callable[[], Any] | None = None  # with one of the faces above; None: privileged
+    privileged: Privileged | None = None
+
+
+def contender(spec: str, label: str | None = None) -> Contender:
+    """Who `spec` names. Raises ConfigError where it is nobody."""
+    name = label or spec.strip("/").replace("/", "_").replace(":", ".")
+    if spec in PRIVILEGED:
+        return Contender(name, spec, privileged=PRIVILEGED[spec])
+    if spec in UNTRAINED:
+        return Contender(name, spec, partial(_built, spec))
+    if Path(spec).is_dir():
+        return Contender(name, checkpoint.digest(spec), partial(checkpoint.load_planner, spec))
+    if ":" in spec:
+        made = _imported(spec)
+        return Contender(name, _digest_of(made), lambda: made)
+    known = ", ".join([*PRIVILEGED, *UNTRAINED])
+    if spec in BUILT_IN:
+        raise ConfigError(f"planner={spec} has to be trained first: name its training's folder; untrained: {known}")
+    raise ConfigError(f"planner={spec}: neither a folder nor one of {known}; or name a class, my.module:MyPlanner")
+
+
+def contenders(
+    planner: str | None, planners: Sequence[str] | Mapping[str, str] | None, bounds: bool
+) -> list[Contender]:
+    """All that are asked for, each once, the bounds first. Raises ConfigError for nobody, or two of one label."""
+    named: list[tuple[str | None, str]] = []
+    if isinstance(planners, Mapping):
+        named += planners.items()
+    else:
+        named += [(None, spec) for spec in planners or ()]
+    named += [(None, planner)] if planner is not None else []
+    if not named:
+        raise ConfigError("planner is missing: give planner=<training folder> or planners=[human,...]")
+    first = [(None, name) for name in (*PRIVILEGED, *UNTRAINED) if bounds]
+    found = [contender(spec, label) for label, spec in dict.fromkeys([*first, *named])]
+    labels = [one.label for one in found]
+    twice = sorted({label for label in labels if labels.count(label) > 1})
+    if twice:
+        raise ConfigError(f"planners: two are called {', '.join(twice)}: give planners={{a: folder, b: folder}}")
+    return found
+
+
+def composed(name: str, argv: Sequence[str]) -> dict[str, Any]:
+    """The values of conf/<name>.yaml and a command line, with `planner=` as text. Raises ConfigError.
+
+    Hydra would take it for a choice among conf/planner, which are planners to be trained.
+    """
+    who = [argument for argument in argv if argument.startswith("planner=")]
+    values = compose(name, [argument for argument in argv if argument not in who])
+    return values | ({"planner": who[-1].split("=", 1)[1]} if who else {})
+
+
+def needs_of(made: Any) -> Needs | None:
+    """What a planner reads of a batch; None: it takes samples."""
+    return getattr(made, "needs", None)
+
+
+def plans_of(made: Any, samples: Sequence[Mapping[str, Any]], device: str = "cpu") -> Array:
+    """(B, 40, 3) plans of a planner with either face. Raises ValueError, naming the sample, for what is no plan."""
+    shown = [as_shown(sample) for sample in samples]
+    needs = needs_of(made)
+    if needs is None:
+        plans = [np.asarray(made.plan(sample), dtype=np.float64) for sample in shown]
+    else:
+        batch = batch_of(shown, needs).to(device)
+        with torch.inference_mode():
+            plans = list(_as_array(made.plan(batch), batch))
+    for sample, plan in zip(samples, plans):
+        if plan.shape not in ((8, 3), (40, 3)) or not np.isfinite(plan).all():
+            raise ValueError(f"sample {sample['attempt_id']}: a plan must be (8 or 40, 3) finite, got {plan.shape}")
+    return np.concatenate([at_ten_hz(plan[None]) for plan in plans])
+
+
+def _as_array(plans: Any, batch: Batch) -> Array:
+    array = plans.detach().double().cpu().numpy() if isinstance(plans, torch.Tensor) else np.asarray(plans, np.float64)
+    if array.ndim != 3 or len(array) != len(batch):
+        raise ValueError(f"plan() of a batch of {len(batch)} returned {array.shape}, not ({len(batch)}, 8 or 40, 3)")
+    return array
+
+
+def _built(name: str) -> Planner:
+    return build_planner(PlannerChoice(name), {}).eval()
+
+
+def _imported(spec: str) -> Any:
+    """The user's planner. Raises ConfigError."""
+    module, _, attribute = spec.partition(":")
+    try:
+        target = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(f"planner={spec}: {error}; is its folder on PYTHONPATH?") from error
+    if isinstance(target, type) and issubclass(target, Planner):
+        return build_planner(PlannerChoice(spec), {}).eval()
+    if not callable(target):
+        raise ConfigError(f"planner={spec} is a {type(target).__name__}: name a class or a function that makes one")
+    try:
+        made = target()
+    except TypeError as error:
+        raise ConfigError(f"planner={spec}: it must be made without arguments: {error}") from error
+    if not callable(getattr(made, "plan", None)):
+        raise ConfigError(f"planner={spec}: a {type(made).__name__} has no method plan(sample) or plan(batch)")
+    return made
+
+
+def _digest_of(made: Any) -> str:
+    own = getattr(made, "digest", None)
+    if isinstance(own, str):
+        return own
+    return hashlib.sha256(Path(inspect.getfile(type(made))).read_bytes()).hexdigest()[:16]

@@ -1,0 +1,206 @@
+"""`python -m planners.evaluate benchmark=<out> planner=<who>`: EPDMS of planners on a benchmark, one stage and two.
+
+    python -m planners.evaluate benchmark=runs/hard planner=runs/ltf
+    python -m planners.evaluate benchmark=runs/hard planners=[runs/ltf,human,my.module:MyPlanner] out=eval
+    python -m planners.evaluate benchmark=runs/hard planners={real: runs/a, with_sim: runs/b}
+
+The benchmark is the folder that `python -m factory.run preset=hard_benchmark` made. Who may stand under `planner=`, and
+what a planner of one's own looks like, planners/contenders.py says. Every planner gets a folder: its plans, a row of
+sub-scores for each frame (frames.parquet, frames.csv), and record.json, written last. A planner that is done is not
+planned or scored again unless it, the benchmark or the rules changed; the same command goes on after a kill. All
+planners of a command share what scoring prepares of a frame, so name several at once.
+
+    summary.csv, summary.png      all planners of this command
+    one_stage                     the logged frames, as navtest: published tables hold the unfiltered score
+    stage_one, stage_two, final   as navhard; final is the product of both stages, filtered in published tables
+    uniform                       share of clips none of whose follow-ups starts near the plan's end
+"""
+
+import json
+import os
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from factory.config import ConfigError, conf_dir, fill
+from planners.aggregation import SummaryLine, lines_of, summarise
+from planners.benchmark_folder import BenchmarkFolder
+from planners.contenders import Contender, composed, contenders, needs_of, plans_of
+from planners.eval_record import is_done, write_record
+from planners.frames import Benchmark, FrameKey
+from planners.plan_file import read_plans, write_plans
+from planners.progress import Counter
+from planners.score_rows import FrameRow, read_rows, write_rows
+from planners.score_table import table_text, write_table
+from planners.scoring import Plans, Rules, prepare_clip, score_clip
+from planners.shown import columns_shown
+from planners.tags import TAG_COLUMNS, tags_of
+from tasks.experts.pdm_closed import PdmSettings
+from tasks.rollout.simulate import TrafficSettings
+from tasks.stages import stage_versions
+
+BAD_CONFIG = 2
+
+
+@dataclass(frozen=True)
+class EvaluateSettings:
+    """The keys of conf/evaluate.yaml."""
+
+    benchmark: str
+    out: str
+    planner: str | None = None
+    planners: list[str] | dict[str, str] | None = None
+    bounds: bool = True  # human, pdm_closed and constant_velocity too
+    one_stage_traffic: TrafficSettings = field(default_factory=lambda: TrafficSettings(mode="replay"))
+    two_stage_traffic: TrafficSettings = field(default_factory=TrafficSettings)
+    pdm: PdmSettings = field(default_factory=PdmSettings)
+    batch_size: int = 16
+    device: str = "cpu"
+    limit: int | None = None  # clips
+
+    def __post_init__(self) -> None:
+        if self.batch_size < 1 or (self.limit is not None and self.limit < 1):
+            raise ValueError("batch_size and limit must be at least 1")
+
+    @property
+    def rules(self) -> Rules:
+        """What the scores depend on beside planner and benchmark."""
+        return Rules(self.one_stage_traffic, self.two_stage_traffic, self.pdm)
+
+
+def evaluate(benchmark: Benchmark, who: Sequence[Contender], settings: EvaluateSettings) -> list[SummaryLine]:
+    """Plan, score, write; the lines of all planners in their order.
+
+    Raises ConfigError where a planner cannot plan from this benchmark, before any is planned.
+    """
+    out = Path(settings.out)
+    keys = _keys(benchmark, settings.limit)
+    shared = {
+        "benchmark_digest": benchmark.digest,
+        "clips": len({key.clip_id for key in keys}),
+        "rules": json.loads(json.dumps(asdict(settings.rules))),  # as it comes back from a file
+        "stage_versions": stage_versions(),
+    }
+    identities = {one.label: {"planner_digest": one.digest, **shared} for one in who}
+    waiting = [one for one in who if not is_done(out / one.label, identities[one.label])]
+    check_needs(benchmark, keys, waiting)
+    plans: dict[str, Plans] = {}
+    for one in waiting:
+        (out / one.label).mkdir(parents=True, exist_ok=True)
+        if one.load is not None:
+            plans[one.label] = _planned(benchmark, keys, one, out / one.label, identities[one.label], settings)
+    if waiting:
+        rows = _scored(benchmark, keys, waiting, plans, settings.rules)
+        for one in waiting:
+            write_rows(out / one.label, rows[one.label])
+            write_record(out / one.label, {**identities[one.label], "planner": one.label, "frames": len(keys)})
+    lines = [line for one in who for line in lines_of(one.label, summarise(read_rows(out / one.label)))]
+    write_table(out, lines)
+    return lines
+
+
+def check_needs(benchmark: Benchmark, keys: Sequence[FrameKey], who: Sequence[Contender]) -> None:
+    """Raises ConfigError for a planner that needs images of a benchmark that lacks some, naming a frame."""
+    blind = [key for key in keys if benchmark.image_source(key) == "none"]
+    for one in who if blind else ():
+        needs = None if one.load is None else needs_of(one.load())
+        if needs is not None and needs.image is not None:
+            raise ConfigError(
+                f"planner {one.label} needs images, and {len(blind)} of {len(keys)} frames have none, "
+                f"such as {blind[0]}: make the benchmark with cameras (render=..., not render=none)"
+            )
+
+
+def _keys(benchmark: Benchmark, limit: int | None) -> list[FrameKey]:
+    clips = list(dict.fromkeys(key.clip_id for key in benchmark.keys))[:limit]
+    return [key for key in benchmark.keys if key.clip_id in set(clips)]
+
+
+def _planned(
+    benchmark: Benchmark,
+    keys: Sequence[FrameKey],
+    one: Contender,
+    folder: Path,
+    identity: Mapping[str, Any],
+    settings: EvaluateSettings,
+) -> Plans:
+    """The plans of one planner, stored as soon as they are all made."""
+    who = {name: identity[name] for name in ("planner_digest", "benchmark_digest", "clips")}
+    stored = read_plans(folder, who)
+    if stored is not None:
+        return stored
+    assert one.load is not None
+    made = one.load()
+    if hasattr(made, "to"):
+        made = made.to(settings.device)
+    needs, wanted = needs_of(made), set(keys)
+    frames = benchmark.stream(columns_shown(images=needs is None or needs.image is not None))
+    frames = (frame for frame in frames if frame[0] in wanted)
+    plans: dict[FrameKey, Any] = {}
+    with Counter(f"{one.label}: frames planned", len(keys)) as progress:
+        while part := list(islice(frames, settings.batch_size)):
+            try:
+                made_here = plans_of(made, [sample for _, sample in part], settings.device)
+            except ValueError as error:
+                raise ConfigError(f"planner {one.label}: {error}") from error
+            plans.update(zip((key for key, _ in part), made_here))
+            progress.show(len(plans))
+    write_plans(folder, who, plans)
+    return plans
+
+
+def _scored(
+    benchmark: Benchmark, keys: Sequence[FrameKey], who: Sequence[Contender], plans: Mapping[str, Plans], rules: Rules
+) -> dict[str, list[FrameRow]]:
+    """The rows of every planner, clip by clip: what is prepared of a clip serves all and is let go."""
+    rows: dict[str, list[FrameRow]] = {one.label: [] for one in who}
+    clips = list(dict.fromkeys(key.clip_id for key in keys))
+    tags = {key: tags_of(sample) for key, sample in benchmark.stream(TAG_COLUMNS)}
+    spent = 0.0
+    with Counter("clips scored", len(clips)) as progress:
+        for done, clip_id in enumerate(clips, start=1):
+            prepared = prepare_clip(benchmark.scenes(clip_id), rules)
+            began = time.perf_counter()
+            for one in who:
+                own = plans[one.label] if one.privileged is None else one.privileged(prepared)
+                rows[one.label] += score_clip(prepared, own, tags)
+            spent += time.perf_counter() - began
+            n_rows = sum(map(len, rows.values()))
+            progress.show(done, f"{1000.0 * spent / n_rows:.1f} ms a frame and planner")
+    return rows
+
+
+def settings_of(argv: Sequence[str]) -> EvaluateSettings:
+    """The settings of a command line. Raises ConfigError."""
+    return fill(EvaluateSettings, composed("evaluate", argv), "evaluate")
+
+
+def help_text() -> str:
+    """Usage and the keys of conf/evaluate.yaml."""
+    return f"{__doc__}\n{(conf_dir() / 'evaluate.yaml').read_text()}"
+
+
+def main(argv: Sequence[str]) -> int:
+    """The command; 2 with a message for what cannot be evaluated."""
+    if {"-h", "--help"} & set(argv):
+        print(help_text())
+        return 0
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    try:
+        settings = settings_of(argv)
+        benchmark = BenchmarkFolder(settings.benchmark)
+        lines = evaluate(benchmark, contenders(settings.planner, settings.planners, settings.bounds), settings)
+    except (ConfigError, FileNotFoundError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return BAD_CONFIG
+    print(table_text(lines))
+    print(f"look at {Path(settings.out) / 'summary.png'}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
