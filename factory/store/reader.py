@@ -40,6 +40,22 @@ LABEL_COLUMNS = (
 )
 
 
+def sample_table(path: str | os.PathLike[str], storage_options: Mapping[str, str] | None = None) -> KeyedTable:
+    """The table of samples at a run's `out`, or at its folder `samples`.
+
+    Raises FileNotFoundError where there is none, ValueError where its columns are those of another version.
+    """
+    location = Location.parse(path, storage_options)
+    here = KeyedTable(location, SAMPLES)
+    table = here if here.version is not None else KeyedTable(location.child("samples"), SAMPLES)
+    if table.version is None:
+        raise FileNotFoundError(f"{location.uri}: no table of samples here or in its folder samples")
+    version = table.properties.get(VERSION_PROPERTY)
+    if version != str(SCHEMA_VERSION):
+        raise ValueError(f"{location.uri}: schema_version {version}, this version reads {SCHEMA_VERSION}")
+    return table
+
+
 class SampleTable:
     """The samples of one store, read-only."""
 
@@ -48,14 +64,7 @@ class SampleTable:
 
         Raises FileNotFoundError where there is no table, ValueError where its columns are those of another version.
         """
-        location = Location.parse(path, storage_options)
-        here = KeyedTable(location, SAMPLES)
-        self._table = here if here.version is not None else KeyedTable(location.child("samples"), SAMPLES)
-        if self._table.version is None:
-            raise FileNotFoundError(f"{location.uri}: no table of samples here or in its folder samples")
-        version = self._table.properties.get(VERSION_PROPERTY)
-        if version != str(SCHEMA_VERSION):
-            raise ValueError(f"{location.uri}: schema_version {version}, this version reads {SCHEMA_VERSION}")
+        self._table = sample_table(path, storage_options)
         self._partitions = self._table.live_files()
         places = [
             (key, path, row)
