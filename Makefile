@@ -4,7 +4,7 @@ VENV   := .venv
 PY     := $(VENV)/bin/python
 DEMO   := runs/demo
 
-.PHONY: install demo test unit lint format bench bench-reward bench-render clean
+.PHONY: install demo test unit lint format bench bench-reward bench-render bench-loader clean
 
 install: $(VENV)/.installed
 
@@ -46,6 +46,10 @@ bench-reward: install
 # SCENE=<file> adds the row of a scene that a reconstruction wrote.
 bench-render: install
 	$(PY) -m tests.bench.bench_render $(SCENE)
+
+# TABLE=<out of a run with images> takes its pictures, THREADS=<n> as many threads as the machine has cores.
+bench-loader: install
+	OMP_NUM_THREADS=1 $(PY) -m tests.bench.bench_loader threads=$(or $(THREADS),2) $(if $(TABLE),table=$(TABLE))
 
 clean:
 	rm -rf $(VENV) runs build *.egg-info

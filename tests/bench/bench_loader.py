@@ -1,0 +1,158 @@
+"""The loader against the raw decoder: samples a second from the same JPEGs, on the same threads.
+
+    python -m tests.bench.bench_loader [threads=2] [table=<out of a run with images>]
+
+Without a table one is made of the nuScenes keyframe's photos, or of noise where they are not at hand: 400 samples,
+three cameras of 512 x 288 and, fewer of them, of 1920 x 1080, at four instants, of which a planner sees the last.
+"""
+
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from factory.store.reader import SampleTable
+from planners.batch import ImageLayout, Needs
+from planners.data import DataSettings, make_feed, open_data
+from planners.loader import Loader
+from planners.mix import MixSettings
+from tests.planners.samples import FRONT_YAWS, camera, jpeg, sample, write_table
+
+SHARED = Path("../shared")
+PHOTOS = "data/nuscenes_frame"
+BATCH = 16
+PASSES = 3
+
+
+def main(threads: int = 2, table: str | None = None, n: int = 400) -> None:
+    """Prints one table."""
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    print(f"{threads} threads, batches of {BATCH}, best of {PASSES} passes\n")
+    print("| samples | picture | raw decode, samples/s | loader, in memory | | loader, windows | |")
+    print("|---|---|---|---|---|---|---|")
+    if table is not None:
+        row(table, ImageLayout(), threads, "the table's own")
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        for (width, height), count, layouts in (
+            ((512, 288), n, ((1090, 274), (1024, 256), (512, 128))),
+            ((1920, 1080), n // 10, ((2048, 512), (1024, 256))),
+        ):
+            out = Path(folder) / f"{width}"
+            write_table(out, [photographed(i, width, height) for i in range(count)], group_rows=group_rows(width))
+            for layout in layouts:
+                row(str(out), ImageLayout(width=layout[0], height=layout[1]), threads, f"3 x {width} x {height}")
+
+
+def row(table: str, layout: ImageLayout, threads: int, name: str) -> None:
+    """One line: raw, with all in memory, and from windows that are read again in every pass."""
+    jpegs = [
+        [np.frombuffer(image["jpeg"], np.uint8) for image in one["images"] if image["time_s"] == 0.0]
+        for one in SampleTable(table).iterate(["images"])
+    ]
+    needs = Needs(image=layout)
+    dataset = open_data(DataSettings(real=table, sim=() if only_real(table) else table), needs)
+    total_mb = make_feed(dataset, needs).size.sum() / 2**20
+    loaders = [
+        Loader(dataset, needs, MixSettings(shuffle_mb=mb), BATCH, workers=threads)
+        for mb in (int(4 * total_mb) + 1, max(1, int(total_mb / 4)))
+    ]
+    cameras = len(make_feed(dataset, needs).cameras[0])
+    shown = [chosen[:cameras] for chosen in jpegs]
+    raw = fastest(lambda: decode_all(shown, threads))
+    rates = [fastest(lambda loader=loader: count(loader)) for loader in loaders]
+    columns = " | ".join(f"{rate:.0f} | {100 * rate / raw:.0f} %" for rate in rates)
+    print(f"| {len(jpegs)}, {name} | {layout.width} x {layout.height} | {raw:.0f} | {columns} |", flush=True)
+
+
+def only_real(table: str) -> bool:
+    return set(SampleTable(table).table(["expert"])["expert"].to_pylist()) == {"human"}
+
+
+def decode_all(jpegs: list[list[NDArray[np.uint8]]], threads: int) -> int:
+    """The raw decoder: every JPEG in full, eight samples a task, results dropped."""
+
+    def some(start: int) -> None:
+        for images in jpegs[start : start + 8]:
+            for image in images:
+                cv2.imdecode(image, cv2.IMREAD_COLOR)
+
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(some, range(0, len(jpegs), 8)))
+    return len(jpegs)
+
+
+def count(loader: Loader) -> int:
+    """Samples of the next epoch."""
+    return sum(len(batch) for batch in loader.epoch(int(loader.state()["epoch"])))
+
+
+def fastest(run: Callable[[], int]) -> float:
+    """Samples a second, of one pass that warms up and PASSES that count."""
+    run()
+    rates = []
+    for _ in range(PASSES):
+        start = time.perf_counter()
+        rates.append(run() / (time.perf_counter() - start))
+    return max(rates)
+
+
+def photographed(number: int, width: int, height: int) -> dict[str, object]:
+    """A human sample with three front cameras at four instants."""
+    photos = views(width, height)
+    images = [
+        {
+            "camera": name,
+            "time_s": time_s,
+            "ego_pose": np.eye(4).reshape(16),
+            "jpeg": photos[(number + i) % len(photos)] + f"{number} {time_s}".encode(),  # no two are stored as one
+        }
+        for time_s in (-1.5, -1.0, -0.5, 0.0)
+        for i, name in enumerate(FRONT_YAWS)
+    ]
+    cameras = [camera(name, yaw, width, height) for name, yaw in FRONT_YAWS.items()]
+    return sample(number, cameras=cameras, images=images, image_source="photo")
+
+
+_VIEWS: dict[tuple[int, int], list[bytes]] = {}
+
+
+def views(width: int, height: int) -> list[bytes]:
+    """Different JPEGs of one size and of quality 90, the factory's own."""
+    if (width, height) not in _VIEWS:
+        _VIEWS[width, height] = [
+            jpeg(cv2.resize(photo, (width, height), interpolation=cv2.INTER_AREA), 90) for photo in photos()
+        ]
+    return _VIEWS[width, height]
+
+
+def photos() -> Iterator[NDArray[np.uint8]]:
+    """RGB pictures 16 : 9."""
+    files = sorted((SHARED / PHOTOS).rglob("*.jpg"))
+    for file in files:
+        photo = cv2.imread(str(file))[..., ::-1]
+        for shift in range(0, 90, 30):  # other blocks of the same photo
+            yield np.ascontiguousarray(photo[shift:, shift:])
+    if not files:
+        for seed in range(12):
+            rng = np.random.default_rng(seed)
+            small = rng.integers(0, 256, (135, 240, 3), dtype=np.uint8)
+            yield cv2.resize(small, (1920, 1080), interpolation=cv2.INTER_CUBIC)
+
+
+def group_rows(width: int) -> int:
+    """As many as the factory's writer puts into a row group of 4 MB."""
+    return max(1, 2**22 // (12 * len(views(width, width * 9 // 16)[0])))
+
+
+if __name__ == "__main__":
+    given = dict(argument.split("=", 1) for argument in sys.argv[1:])
+    main(int(given.get("threads", 2)), given.get("table"), int(given.get("n", 400)))
