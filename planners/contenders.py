@@ -23,22 +23,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
-from numpy.typing import NDArray
-
 from factory.config import ConfigError, compose
 from planners import checkpoint
-from planners.batch import Batch, Needs
-from planners.frames import FrameKey
+from planners.batch import Needs
 from planners.planner import Planner
 from planners.registry import BUILT_IN, PlannerChoice, build_planner
-from planners.scoring import PreparedClip, human_plans, pdm_plans
-from planners.shown import as_shown, batch_of
-from tasks.reward.trajectories import at_ten_hz
+from planners.scoring import Plans, PreparedClip, human_plans, pdm_plans
 
-Array = NDArray[np.float64]
-Privileged = Callable[[PreparedClip], Mapping[FrameKey, Array]]
+Privileged = Callable[[PreparedClip], Plans]
 
 PRIVILEGED: Mapping[str, Privileged] = {"human": human_plans, "pdm_closed": pdm_plans}
 UNTRAINED = ("constant_velocity",)
@@ -106,29 +98,6 @@ def composed(name: str, argv: Sequence[str]) -> dict[str, Any]:
 def needs_of(made: Any) -> Needs | None:
     """What a planner reads of a batch; None: it takes samples."""
     return getattr(made, "needs", None)
-
-
-def plans_of(made: Any, samples: Sequence[Mapping[str, Any]], device: str = "cpu") -> Array:
-    """(B, 40, 3) plans of a planner with either face. Raises ValueError, naming the sample, for what is no plan."""
-    shown = [as_shown(sample) for sample in samples]
-    needs = needs_of(made)
-    if needs is None:
-        plans = [np.asarray(made.plan(sample), dtype=np.float64) for sample in shown]
-    else:
-        batch = batch_of(shown, needs).to(device)
-        with torch.inference_mode():
-            plans = list(_as_array(made.plan(batch), batch))
-    for sample, plan in zip(samples, plans):
-        if plan.shape not in ((8, 3), (40, 3)) or not np.isfinite(plan).all():
-            raise ValueError(f"sample {sample['attempt_id']}: a plan must be (8 or 40, 3) finite, got {plan.shape}")
-    return np.concatenate([at_ten_hz(plan[None]) for plan in plans])
-
-
-def _as_array(plans: Any, batch: Batch) -> Array:
-    array = plans.detach().double().cpu().numpy() if isinstance(plans, torch.Tensor) else np.asarray(plans, np.float64)
-    if array.ndim != 3 or len(array) != len(batch):
-        raise ValueError(f"plan() of a batch of {len(batch)} returned {array.shape}, not ({len(batch)}, 8 or 40, 3)")
-    return array
 
 
 def _built(name: str) -> Planner:

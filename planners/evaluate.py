@@ -22,22 +22,19 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from itertools import islice
 from pathlib import Path
-from typing import Any
 
 from factory.config import ConfigError, conf_dir, fill
 from planners.aggregation import SummaryLine, lines_of, summarise
 from planners.benchmark_folder import BenchmarkFolder
-from planners.contenders import Contender, composed, contenders, needs_of, plans_of
+from planners.contenders import Contender, composed, contenders, needs_of
 from planners.eval_record import is_done, write_record
 from planners.frames import Benchmark, FrameKey
-from planners.plan_file import read_plans, write_plans
+from planners.planning import all_plans
 from planners.progress import Counter
 from planners.score_rows import FrameRow, read_rows, write_rows
 from planners.score_table import table_text, write_table
 from planners.scoring import Plans, Rules, prepare_clip, score_clip
-from planners.shown import columns_shown
 from planners.tags import TAG_COLUMNS, tags_of
 from tasks.experts.pdm_closed import PdmSettings
 from tasks.rollout.simulate import TrafficSettings
@@ -59,12 +56,14 @@ class EvaluateSettings:
     two_stage_traffic: TrafficSettings = field(default_factory=TrafficSettings)
     pdm: PdmSettings = field(default_factory=PdmSettings)
     batch_size: int = 16
+    planners_at_once: int = 8  # in memory, planning from one reading of the samples
     device: str = "cpu"
     limit: int | None = None  # clips
 
     def __post_init__(self) -> None:
-        if self.batch_size < 1 or (self.limit is not None and self.limit < 1):
-            raise ValueError("batch_size and limit must be at least 1")
+        for name in ("batch_size", "planners_at_once", "limit"):
+            if getattr(self, name) is not None and getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
 
     @property
     def rules(self) -> Rules:
@@ -79,20 +78,24 @@ def evaluate(benchmark: Benchmark, who: Sequence[Contender], settings: EvaluateS
     """
     out = Path(settings.out)
     keys = _keys(benchmark, settings.limit)
+    n_clips = len({key.clip_id for key in keys})
     shared = {
         "benchmark_digest": benchmark.digest,
-        "clips": len({key.clip_id for key in keys}),
+        "clips": n_clips,
         "rules": json.loads(json.dumps(asdict(settings.rules))),  # as it comes back from a file
         "stage_versions": stage_versions(),
     }
     identities = {one.label: {"planner_digest": one.digest, **shared} for one in who}
     waiting = [one for one in who if not is_done(out / one.label, identities[one.label])]
     check_needs(benchmark, keys, waiting)
-    plans: dict[str, Plans] = {}
     for one in waiting:
         (out / one.label).mkdir(parents=True, exist_ok=True)
-        if one.load is not None:
-            plans[one.label] = _planned(benchmark, keys, one, out / one.label, identities[one.label], settings)
+    planning = [
+        (one, out / one.label, {"planner_digest": one.digest, "benchmark_digest": benchmark.digest, "clips": n_clips})
+        for one in waiting
+        if one.load is not None
+    ]
+    plans = all_plans(benchmark, keys, planning, settings.batch_size, settings.planners_at_once, settings.device)
     if waiting:
         rows = _scored(benchmark, keys, waiting, plans, settings.rules)
         for one in waiting:
@@ -118,39 +121,6 @@ def check_needs(benchmark: Benchmark, keys: Sequence[FrameKey], who: Sequence[Co
 def _keys(benchmark: Benchmark, limit: int | None) -> list[FrameKey]:
     clips = list(dict.fromkeys(key.clip_id for key in benchmark.keys))[:limit]
     return [key for key in benchmark.keys if key.clip_id in set(clips)]
-
-
-def _planned(
-    benchmark: Benchmark,
-    keys: Sequence[FrameKey],
-    one: Contender,
-    folder: Path,
-    identity: Mapping[str, Any],
-    settings: EvaluateSettings,
-) -> Plans:
-    """The plans of one planner, stored as soon as they are all made."""
-    who = {name: identity[name] for name in ("planner_digest", "benchmark_digest", "clips")}
-    stored = read_plans(folder, who)
-    if stored is not None:
-        return stored
-    assert one.load is not None
-    made = one.load()
-    if hasattr(made, "to"):
-        made = made.to(settings.device)
-    needs, wanted = needs_of(made), set(keys)
-    frames = benchmark.stream(columns_shown(images=needs is None or needs.image is not None))
-    frames = (frame for frame in frames if frame[0] in wanted)
-    plans: dict[FrameKey, Any] = {}
-    with Counter(f"{one.label}: frames planned", len(keys)) as progress:
-        while part := list(islice(frames, settings.batch_size)):
-            try:
-                made_here = plans_of(made, [sample for _, sample in part], settings.device)
-            except ValueError as error:
-                raise ConfigError(f"planner {one.label}: {error}") from error
-            plans.update(zip((key for key, _ in part), made_here))
-            progress.show(len(plans))
-    write_plans(folder, who, plans)
-    return plans
 
 
 def _scored(

@@ -22,9 +22,10 @@ from factory.look.sample_picture import decoded, earlier_images, fitted, front_c
 from factory.look.video import write_mp4
 from factory.store.reader import Sample
 from planners.benchmark_folder import BenchmarkFolder
-from planners.contenders import Contender, composed, contender, plans_of
+from planners.contenders import Contender, composed, contender
 from planners.evaluate import check_needs
 from planners.frames import Benchmark, FrameKey
+from planners.planning import plans_of
 from planners.scoring import PreparedClip, PreparedPair, Rules, prepare_clip, score_pair
 from tasks.experts.pdm_closed import PdmSettings
 from tasks.reward.one_stage import COLUMNS, FrameScores

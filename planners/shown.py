@@ -21,30 +21,43 @@ from planners.frames import LOGGED_KINDS
 
 SCORES = ("stage1_", "stage2_", *LABEL_COLUMNS)
 LATER_NAN = ("agent_boxes", "agent_velocities", "agent_center_z")
+LATER_ZERO = ("agent_valid", "light_states")
+EGO_COLUMNS = ("attempt_id", "expert", "command", "ego_status", "ego_history_2hz")
+BEV_COLUMNS = (
+    "drivable_rings",
+    "lane_polygons",
+    "lane_centerlines",
+    "crossing_rings",
+    "route_centerline",
+    "agent_kinds",
+    "agent_boxes",
+    "agent_valid",
+)
 
 
 def as_shown(sample: Mapping[str, Any]) -> Sample:
-    """A copy of the sample without what comes after now."""
+    """A copy of a sample, or of some of its columns, without what comes after now."""
     shown: Sample = {name: value for name, value in sample.items() if not name.startswith(SCORES)}
     for name in ("label_10hz", "label_2hz", "proposal_10hz"):
         if shown.get(name) is not None:
             shown[name] = np.zeros_like(shown[name])
-    for name in LATER_NAN:
-        shown[name] = np.array(sample[name])
-        shown[name][:, NOW_INDEX + 1 :] = np.nan
-    for name in ("agent_valid", "light_states"):
-        shown[name] = np.array(sample[name])
-        shown[name][:, NOW_INDEX + 1 :] = 0
-    if sample["expert"] in LOGGED_KINDS:
+    for names, unknown in ((LATER_NAN, np.nan), (LATER_ZERO, 0)):
+        for name in shown.keys() & set(names):
+            shown[name] = np.array(sample[name])
+            if len(shown[name]):
+                shown[name][:, NOW_INDEX + 1 :] = unknown
+    if "parent_states" in shown and sample["expert"] in LOGGED_KINDS:
         shown["parent_states"] = np.array(sample["parent_states"])
         shown["parent_states"][1] = np.nan
     return shown
 
 
-def columns_shown(images: bool) -> list[str]:
-    """The columns that have to be read for it. images: whether the pictures too."""
-    unread = (*SCORES, *(() if images else ("images",)))
-    return [name for name in SCHEMA.names if not name.startswith(unread)]
+def columns_shown(needs: Needs | None) -> list[str]:
+    """The columns that have to be read of a sample for a batch with these needs; None: all that may be shown."""
+    if needs is None:
+        return [name for name in SCHEMA.names if not name.startswith(SCORES)]
+    bev = BEV_COLUMNS if needs.bev is not None else ()
+    return [*EGO_COLUMNS, *bev, *(("cameras", "images") if needs.image is not None else ())]
 
 
 def batch_of(samples: Sequence[Mapping[str, Any]], needs: Needs) -> Batch:

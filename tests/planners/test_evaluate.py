@@ -14,11 +14,12 @@ from small_benchmark import StreetBenchmark, straight
 from torch import Tensor
 
 from factory.config import ConfigError
-from planners.batch import Batch, ImageLayout, Needs
-from planners.contenders import Contender, contender, contenders, plans_of
+from planners.batch import Batch, BevLayout, ImageLayout, Needs
+from planners.contenders import Contender, contender, contenders
 from planners.eval_record import read_record
 from planners.evaluate import EvaluateSettings, evaluate, help_text, main, settings_of
 from planners.frames import FrameKey
+from planners.planning import all_plans, plans_of
 from planners.score_rows import read_rows
 from planners.shown import as_shown
 from tasks.reward.one_stage import COLUMNS
@@ -52,6 +53,18 @@ class Seeing(SteadyBatch):
     """Needs pictures."""
 
     needs = Needs(image=ImageLayout())
+
+
+class FromAbove(SteadyBatch):
+    """Sees a raster and the nearest vehicle, and stops where one is near."""
+
+    needs = Needs(bev=BevLayout(cell_m=1.0), n_agents=1)
+
+    def plan(self, batch: Batch) -> Tensor:
+        assert batch.bev is not None and batch.agents is not None and batch.agents_valid is not None
+        assert batch.bev.shape == (len(batch), 1, 32, 64) and batch.bev.any()
+        near = batch.agents_valid[:, 0] & (batch.agents[:, 0, 0] < 20.0)
+        return super().plan(batch) * (~near)[:, None, None]
 
 
 class Dazed:
@@ -127,6 +140,21 @@ def test_a_kill_while_scoring_keeps_the_plans(
     assert Steady.planned == 12
     for a, b in zip(killed, evaluate(benchmark, who, settings(tmp_path / "whole"))):
         np.testing.assert_array_equal(a.columns, b.columns)
+
+
+@pytest.mark.parametrize(("at_once", "batch_size"), [(1, 5), (2, 3), (8, 100)])
+def test_planners_plan_the_same_alone_and_together(
+    benchmark: StreetBenchmark, tmp_path: Path, at_once: int, batch_size: int
+) -> None:
+    who = named("test_evaluate:Steady", "test_evaluate:SteadyBatch", "test_evaluate:FromAbove")
+    planning = [(one, tmp_path, {"who": one.label}) for one in who]
+    found = all_plans(benchmark, benchmark.keys, planning, batch_size, at_once, "cpu")
+    assert list(found) == [one.label for one in who]
+    steady, batch, above = (found[one.label] for one in who)
+    for key in benchmark.keys:
+        np.testing.assert_allclose(steady[key], batch[key], atol=1e-5)
+    # the car ahead is 30 m away; follow-ups came nearer to it where they drove faster than it, and none did
+    assert all((above[key] == batch[key]).all() for key in benchmark.keys)
 
 
 def test_a_record_says_what_was_evaluated(benchmark: StreetBenchmark, tmp_path: Path) -> None:

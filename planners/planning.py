@@ -1,0 +1,120 @@
+"""The plans of a benchmark's frames, by planners with either face (planners/contenders.py).
+
+Several planners plan from one reading of the samples: what is decoded for one serves all that need the same.
+"""
+
+from collections.abc import Mapping, Sequence
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from factory.config import ConfigError
+from planners.batch import Batch, Needs
+from planners.contenders import Contender, needs_of
+from planners.frames import Benchmark, FrameKey
+from planners.plan_file import read_plans, write_plans
+from planners.progress import Counter
+from planners.scoring import Plans
+from planners.shown import as_shown, batch_of, columns_shown
+from tasks.reward.trajectories import at_ten_hz
+
+Array = NDArray[np.float64]
+Samples = Sequence[Mapping[str, Any]]
+
+
+def plans_of(made: Any, samples: Samples, device: str = "cpu") -> Array:
+    """(B, 40, 3) plans of one planner. Raises ValueError, naming the sample, for what is no plan."""
+    return _answers(made, _shown_to(needs_of(made), samples, device), samples)
+
+
+def all_plans(
+    benchmark: Benchmark,
+    keys: Sequence[FrameKey],
+    who: Sequence[tuple[Contender, Path, Mapping[str, Any]]],
+    batch_size: int,
+    at_once: int,
+    device: str,
+) -> dict[str, Plans]:
+    """The plans of every planner, by label; read from its folder where they are there.
+
+    who: each with its folder and what identifies its plans there; at_once: planners in memory at a time. Plans are
+    stored as soon as those planners are through. Raises ConfigError naming planner and sample for what is no plan.
+    """
+    plans: dict[str, Plans] = {}
+    waiting = []
+    for one, folder, identity in who:
+        stored = read_plans(folder, identity)
+        if stored is None:
+            waiting.append((one, folder, identity))
+        else:
+            plans[one.label] = stored
+    for first in range(0, len(waiting), at_once):
+        group = waiting[first : first + at_once]
+        found = _planned(benchmark, keys, [one for one, _, _ in group], batch_size, device)
+        for one, folder, identity in group:
+            write_plans(folder, identity, found[one.label])
+        plans.update(found)
+    return plans
+
+
+def _planned(
+    benchmark: Benchmark, keys: Sequence[FrameKey], who: Sequence[Contender], batch_size: int, device: str
+) -> dict[str, dict[FrameKey, Array]]:
+    made = {one.label: _loaded(one, device) for one in who}
+    needs = {label: needs_of(planner) for label, planner in made.items()}
+    kinds = list(dict.fromkeys(needs.values()))
+    columns = dict.fromkeys(name for kind in kinds for name in columns_shown(kind))
+    wanted = set(keys)
+    frames = (frame for frame in benchmark.stream(list(columns)) if frame[0] in wanted)
+    plans: dict[str, dict[FrameKey, Array]] = {label: {} for label in made}
+    name = who[0].label if len(who) == 1 else f"{len(who)} planners"
+    done = 0
+    with Counter(f"{name}: frames planned", len(keys)) as progress:
+        while part := list(islice(frames, batch_size)):
+            samples = [sample for _, sample in part]
+            for kind in kinds:
+                shown = _shown_to(kind, samples, device)
+                for label in (label for label in made if needs[label] == kind):
+                    try:
+                        answers = _answers(made[label], shown, samples)
+                    except ValueError as error:
+                        raise ConfigError(f"planner {label}: {error}") from error
+                    plans[label].update(zip((key for key, _ in part), answers))
+            done += len(part)
+            progress.show(done)
+    return plans
+
+
+def _loaded(one: Contender, device: str) -> Any:
+    assert one.load is not None
+    made = one.load()
+    return made.to(device) if isinstance(made, torch.nn.Module) else made
+
+
+def _shown_to(needs: Needs | None, samples: Samples, device: str) -> Batch | Samples:
+    shown = [as_shown(sample) for sample in samples]
+    return shown if needs is None else batch_of(shown, needs).to(device)
+
+
+def _answers(made: Any, shown: Batch | Samples, samples: Samples) -> Array:
+    if isinstance(shown, Batch):
+        with torch.inference_mode():
+            plans = list(_as_array(made.plan(shown), shown))
+    else:
+        plans = [np.asarray(made.plan(sample), dtype=np.float64) for sample in shown]
+    for sample, plan in zip(samples, plans):
+        if plan.shape not in ((8, 3), (40, 3)) or not np.isfinite(plan).all():
+            name = f"sample {sample['attempt_id']}"
+            raise ValueError(f"{name}: a plan must be (8 or 40, 3) finite numbers, got {plan.shape}")
+    return np.concatenate([at_ten_hz(plan[None]) for plan in plans])
+
+
+def _as_array(plans: Any, batch: Batch) -> Array:
+    array = plans.detach().double().cpu().numpy() if isinstance(plans, torch.Tensor) else np.asarray(plans, np.float64)
+    if array.ndim != 3 or len(array) != len(batch):
+        raise ValueError(f"plan() of a batch of {len(batch)} returned {array.shape}, not ({len(batch)}, 8 or 40, 3)")
+    return array
