@@ -17,22 +17,14 @@ from factory.store.reader import LABEL_COLUMNS, Sample
 from factory.store.schema import NOW_INDEX, SCHEMA
 from planners.batch import COMMANDS, Batch, Needs
 from planners.bev import bev_raster, nearest_agents
+from planners.data import BEV_COLUMNS
 from planners.frames import LOGGED_KINDS
+from planners.images import stitched
 
 SCORES = ("stage1_", "stage2_", *LABEL_COLUMNS)
 LATER_NAN = ("agent_boxes", "agent_velocities", "agent_center_z")
 LATER_ZERO = ("agent_valid", "light_states")
 EGO_COLUMNS = ("attempt_id", "expert", "command", "ego_status", "ego_history_2hz")
-BEV_COLUMNS = (
-    "drivable_rings",
-    "lane_polygons",
-    "lane_centerlines",
-    "crossing_rings",
-    "route_centerline",
-    "agent_kinds",
-    "agent_boxes",
-    "agent_valid",
-)
 
 
 def as_shown(sample: Mapping[str, Any]) -> Sample:
@@ -66,8 +58,6 @@ def batch_of(samples: Sequence[Mapping[str, Any]], needs: Needs) -> Batch:
     for sample in samples:
         try:
             if needs.image is not None:
-                from planners.images import stitched
-
                 pictures.append(stitched(sample, needs.image).transpose(2, 0, 1))
             if needs.bev is not None:
                 rasters.append(bev_raster(sample, needs.bev))
