@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from samples import grey_pictures, sample, write_table
@@ -22,6 +23,7 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rows += [sample(i, "pdm_closed", **grey_pictures(20 * i)) for i in range(4, 8)]
     for row in rows:
         row["agent_kinds"] = ["VEHICLE"] * len(row["agent_kinds"])
+        row["agent_boxes"] = np.nan_to_num(row["agent_boxes"], nan=2.0)
     out = tmp_path_factory.mktemp("samples")
     write_table(out, rows)
     return out
