@@ -42,7 +42,7 @@ def save_checkpoint(
     unfinished = folder.with_name(f".{folder.name}.{os.getpid()}")
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir(parents=True)
-    who = {"planner": {"name": planner.name, "settings": asdict(planner.settings)}, "step": step}
+    who = {"planner": {"name": planner.name, "settings": as_record(planner.settings)}, "step": step}
     (unfinished / RECORD).write_text(json.dumps({**who, **record}, indent=1))
     save_file({k: v.contiguous() for k, v in planner.state_dict().items()}, unfinished / WEIGHTS)
     np.savez(unfinished / ARRAYS, **planner.arrays)  # type: ignore[arg-type]
@@ -52,6 +52,12 @@ def save_checkpoint(
     for old in checkpoints(out)[:-KEPT]:
         shutil.rmtree(old)
     return folder
+
+
+def as_record(settings: Any) -> dict[str, Any]:
+    """A planner's settings as a checkpoint keeps them."""
+    plain: dict[str, Any] = json.loads(json.dumps(asdict(settings)))
+    return plain
 
 
 def checkpoints(out: Path) -> list[Path]:

@@ -114,10 +114,8 @@ def fit(
         return float(sum(values[-1]))
 
     def check(step: int) -> None:
-        if validate is not None:
-            measured = validate(planner)
-            if curves is not None:
-                curves.validation(step, measured)
+        if validate is not None and curves is not None:
+            curves.validation(step, validate(planner))
 
     with _stop_asked() as asked, Counter("steps", loop.steps, first, quiet=not world.writes) as counter:
         step, loss = first, float("nan")
