@@ -140,8 +140,7 @@ def test_vovnet_takes_blue_first_and_gates_every_channel() -> None:
     with torch.no_grad():
         red, stem = model.enter(image), model.state_dict()["stem.stem_1/conv.weight"]
         stem[:, [0, 2]] = stem[:, [2, 0]]
-        mean, std = model.get_buffer("mean"), model.get_buffer("std")
-        flipped = model.get_submodule("stem")((image - mean) / std)
+        flipped = model.get_submodule("stem")(model.normalised(image))
         torch.testing.assert_close(red, flipped)
         gate = model.get_submodule("stage5.OSA5_3.ese")
         gate.fc.weight.zero_()  # type: ignore[union-attr]
@@ -172,6 +171,15 @@ def test_weights_from_a_file_come_back_without_its_classifier(tmp_path: Path, su
     image = torch.randint(0, 256, (2, 3, 32, 32), dtype=torch.uint8)
     for got, expected in zip(model.eval()["image"](image), source.eval()(image)):
         assert torch.equal(got, expected)
+
+
+def test_pictures_are_normalised_as_imagenet_and_other_inputs_are_left_alone() -> None:
+    model = build_backbone(SMALL)
+    mean, std = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
+    image = torch.randint(0, 256, (2, 3, 4, 4), dtype=torch.uint8)
+    expected = ((image.permute(0, 2, 3, 1) / 255 - mean) / std).permute(0, 3, 1, 2)
+    torch.testing.assert_close(model.normalised(image), expected, rtol=1e-5, atol=1e-5)
+    assert torch.equal(model.normalised(expected), expected)
 
 
 def test_no_file_is_recorded_as_none() -> None:
