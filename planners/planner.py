@@ -12,11 +12,13 @@ a training begins, and checkpoints carry them.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
@@ -72,3 +74,15 @@ class Planner(nn.Module, ABC):
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         """The losses: what a distributed wrapper calls."""
         return self.losses(batch)
+
+
+@contextmanager
+def evaluating(model: nn.Module) -> Iterator[None]:
+    """Evaluation mode without gradients inside, the mode of before after it: for `plan`, whoever calls it."""
+    before = model.training
+    model.eval()
+    try:
+        with torch.no_grad():
+            yield
+    finally:
+        model.train(before)

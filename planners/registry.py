@@ -11,6 +11,7 @@ from planners.planner import FloatArray, Planner
 BUILT_IN = {
     "constant_velocity": "planners.constant_velocity:ConstantVelocity",
     "ego_mlp": "planners.ego_mlp:EgoMlp",
+    "ego_mlp_bev": "planners.ego_mlp:EgoMlpBev",
     "ltf": "planners.ltf:Ltf",
     "diffusiondrive": "planners.diffusiondrive:DiffusionDrive",
     "gtrs_dense": "planners.gtrs_dense:GtrsDense",

@@ -1,0 +1,41 @@
+"""Goes straight on at the speed of now: the least that a planner may do."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from planners.batch import COMMANDS, Batch, Needs
+from planners.planner import FloatArray, Planner
+
+_VX = len(COMMANDS)  # its place in Batch.status
+
+
+@dataclass(frozen=True)
+class ConstantVelocitySettings:
+    """Nothing to set."""
+
+
+class ConstantVelocity(Planner):
+    """Speed stays, the heading does not turn; learns nothing."""
+
+    name: ClassVar[str] = "constant_velocity"
+    settings_type = ConstantVelocitySettings
+
+    def __init__(self, settings: ConstantVelocitySettings, arrays: Mapping[str, FloatArray]) -> None:
+        super().__init__(settings, arrays)
+
+    @property
+    def needs(self) -> Needs:
+        return Needs()
+
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
+        """Raises ValueError: there is nothing to train."""
+        raise ValueError("constant_velocity has nothing to train: evaluate it as it is")
+
+    def plan(self, batch: Batch) -> Tensor:
+        times_s = torch.arange(1, 9, device=batch.status.device) * 0.5
+        ahead = batch.status[:, _VX, None].float() * times_s
+        return torch.stack([ahead, torch.zeros_like(ahead), torch.zeros_like(ahead)], -1)
