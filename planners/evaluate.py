@@ -41,6 +41,7 @@ from tasks.rollout.simulate import TrafficSettings
 from tasks.stages import stage_versions
 
 BAD_CONFIG = 2
+MOST_UNIFORM = 0.2  # share of clips in the uniform fallback
 
 
 @dataclass(frozen=True)
@@ -144,6 +145,16 @@ def _scored(
     return rows
 
 
+def fallback_notes(lines: Sequence[SummaryLine]) -> list[str]:
+    """A line for each planner with more clips in the uniform fallback than a two-stage score should rest on."""
+    return [
+        f"{line.planner}: {100.0 * line.uniform_share:.0f} % of its plans end beyond 1.92 m of every follow-up, "
+        f"whose scores then weigh the same; above {100.0 * MOST_UNIFORM:.0f} % stage two says little of this planner\n"
+        for line in lines
+        if (line.stage, line.human_filter) == ("final", "filtered") and line.uniform_share > MOST_UNIFORM
+    ]
+
+
 def settings_of(argv: Sequence[str]) -> EvaluateSettings:
     """The settings of a command line. Raises ConfigError."""
     return fill(EvaluateSettings, composed("evaluate", argv), "evaluate")
@@ -168,6 +179,7 @@ def main(argv: Sequence[str]) -> int:
         print(f"error: {error}", file=sys.stderr)
         return BAD_CONFIG
     print(table_text(lines))
+    print("".join(fallback_notes(lines)), end="")
     print(f"look at {Path(settings.out) / 'summary.png'}")
     return 0
 

@@ -50,7 +50,7 @@ class ReplaySettings:
     benchmark: str
     out: str
     planner: str = "pdm_closed"
-    clip: str = "0"  # clip id or its beginning, or the clip's place
+    clip: int | str = 0  # clip id or its beginning, or the clip's place
     follow_up: int | None = None
     two_stage_traffic: TrafficSettings = field(default_factory=TrafficSettings)
     pdm: PdmSettings = field(default_factory=PdmSettings)
@@ -74,7 +74,7 @@ def film(shown: Shown, logged: Array | None) -> Iterator[Image]:
     scene, drive = frame.scene, shown.rollout
     camera = front_camera(shown.sample)
     pictures = earlier_images(shown.sample, camera) if camera else []
-    ways = [Way(shown.plan, EXPERT, "plan", dashed=True), Way(drive.ego_states, PERTURBED, "drive")]
+    ways = [Way(drive.ego_states, PERTURBED, "drive"), Way(shown.plan, EXPERT, "plan", dashed=True)]
     ways += [] if logged is None else [Way(logged, LOGGED, "logged", dashed=True)]
     for row in range(-HISTORY_STEPS, HORIZON_STEPS + 1):
         step = scene.step + row
@@ -194,7 +194,7 @@ def main(argv: Sequence[str]) -> int:
         settings = settings_of(argv)
         benchmark = BenchmarkFolder(settings.benchmark)
         one = contender(settings.planner)
-        clip_id = find_clip(benchmark, settings.clip)
+        clip_id = find_clip(benchmark, str(settings.clip))
         check_needs(benchmark, [key for key in benchmark.keys if key.clip_id == clip_id], [one])
         rules = Rules(two_stage=settings.two_stage_traffic, pdm=settings.pdm)
         write_mp4(Path(settings.out), replay(benchmark, one, clip_id, rules, settings.follow_up))

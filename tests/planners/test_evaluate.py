@@ -17,7 +17,7 @@ from factory.config import ConfigError
 from planners.batch import Batch, BevLayout, ImageLayout, Needs
 from planners.contenders import Contender, contender, contenders
 from planners.eval_record import read_record
-from planners.evaluate import EvaluateSettings, evaluate, help_text, main, settings_of
+from planners.evaluate import EvaluateSettings, evaluate, fallback_notes, help_text, main, settings_of
 from planners.frames import FrameKey
 from planners.planning import all_plans, plans_of
 from planners.score_rows import read_rows
@@ -65,6 +65,13 @@ class FromAbove(SteadyBatch):
         assert batch.bev.shape == (len(batch), 1, 32, 64) and batch.bev.any()
         near = batch.agents_valid[:, 0] & (batch.agents[:, 0, 0] < 20.0)
         return super().plan(batch) * (~near)[:, None, None]
+
+
+class Racing:
+    """Ends 80 m ahead, where no follow-up starts."""
+
+    def plan(self, sample: Mapping[str, Any]) -> np.ndarray:
+        return straight(20.0)
 
 
 class Dazed:
@@ -155,6 +162,14 @@ def test_planners_plan_the_same_alone_and_together(
         np.testing.assert_allclose(steady[key], batch[key], atol=1e-5)
     # the car ahead is 30 m away; follow-ups came nearer to it where they drove faster than it, and none did
     assert all((above[key] == batch[key]).all() for key in benchmark.keys)
+
+
+def test_a_planner_whose_plans_end_far_from_the_follow_ups_is_pointed_out(
+    benchmark: StreetBenchmark, tmp_path: Path
+) -> None:
+    lines = evaluate(benchmark, named("test_evaluate:Steady", "test_evaluate:Racing"), settings(tmp_path))
+    (note,) = fallback_notes(lines)
+    assert note.startswith("test_evaluate.Racing: 100 % of its plans")
 
 
 def test_a_record_says_what_was_evaluated(benchmark: StreetBenchmark, tmp_path: Path) -> None:

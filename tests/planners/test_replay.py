@@ -53,6 +53,7 @@ def test_a_clip_or_follow_up_that_is_not_there_is_named(benchmark: StreetBenchma
 
 def test_the_command_line_is_typed() -> None:
     assert settings_of(["benchmark=x"]) == ReplaySettings(benchmark="x", out="replay.mp4")
+    assert [settings_of(["benchmark=x", f"clip={text}"]).clip for text in ("3", "ab12")] == [3, "ab12"]
     assert settings_of(["benchmark=x", "planner=my.module:Mine"]).planner == "my.module:Mine"
     with pytest.raises(ConfigError, match="clp"):
         settings_of(["benchmark=x", "clp=0"])
