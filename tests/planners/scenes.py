@@ -1,20 +1,48 @@
 """Batches whose pictures decide everything: small enough for a network to learn by heart in seconds."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
-from planners.batch import Batch, ImageLayout
+from planners.backbone import BackboneSettings
+from planners.batch import Batch, BevLayout, ImageLayout
+from planners.transfuser import FusionSettings
 from tasks.reward.label_bytes import VocabularyLabels
 
 PICTURE = ImageLayout(width=64, height=32)
+FUSION = FusionSettings(
+    backbone=BackboneSettings("small", widths=(16, 32, 64, 64)),
+    latent_size=32,
+    image_tokens=(1, 2),
+    latent_tokens=(1, 1),
+    layers=1,
+    heads=2,
+    expansion=2,
+    dropout=0.0,
+    bev_channels=8,
+)
 
 
 def vocabulary(k: int, seed: int = 0) -> np.ndarray:
     """k arcs (k, 40, 3) of different speed and curvature."""
     rng = np.random.default_rng(seed)
+    return arcs(rng.uniform(0.5, 12.0, k), rng.uniform(-0.25, 0.25, k))
+
+
+def four_ways(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Arcs (n, 40, 3), variations of slow, fast, left and right, and colours (n, 3) in 0 .. 1 that say which."""
+    way, vary = np.arange(n) % 4, np.random.default_rng(seed).uniform(-1.0, 1.0, n)
+    speeds = np.array([3.0, 10.0, 6.0, 6.0])[way] * (1.0 + 0.2 * vary)
+    yaw_rates = np.array([0.0, 0.0, 0.2, -0.2])[way] + 0.05 * vary
+    return arcs(speeds, yaw_rates), np.stack([way % 2, way // 2, 0.5 + 0.5 * vary], axis=1)
+
+
+def arcs(speeds: np.ndarray, yaw_rates: np.ndarray) -> np.ndarray:
+    """Arcs (n, 40, 3) of n speeds [m/s] and yaw rates [rad/s]."""
     time = np.arange(1, 41)[None] * 0.1
-    heading = rng.uniform(-0.25, 0.25, (k, 1)) * time
-    step = rng.uniform(0.5, 12.0, (k, 1)) * 0.1 * np.ones_like(time)
+    heading = yaw_rates[:, None] * time
+    step = speeds[:, None] * 0.1 * np.ones_like(time)
     xy = np.cumsum(np.stack([step * np.cos(heading), step * np.sin(heading)], axis=-1), axis=1)
     return np.concatenate([xy, heading[..., None]], axis=-1)
 
@@ -45,10 +73,14 @@ def labels(n: int, trajectories: np.ndarray, seed: int = 0) -> tuple[dict[str, t
     return tensors, torch.tensor(np.stack(final), dtype=torch.float32)
 
 
-def batch(n: int, plans: np.ndarray, layout: ImageLayout = PICTURE, seed: int = 0, **more: object) -> Batch:
-    """n scenes with pictures of coarse random blocks and plans (n, 40, 3)."""
-    rng = np.random.default_rng(seed)
+def batch(
+    n: int, plans: np.ndarray, layout: ImageLayout = PICTURE, colours: np.ndarray | None = None, **more: object
+) -> Batch:
+    """n scenes with plans (n, 40, 3) and pictures of coarse random blocks, or of one of the colours (n, 3) each."""
+    rng = np.random.default_rng(0)
     coarse = rng.integers(0, 256, (n, 3, layout.height // 8, layout.width // 8), dtype=np.uint8)
+    if colours is not None:
+        coarse[:] = (255 * colours).astype(np.uint8)[:, :, None, None]
     status = np.zeros((n, 8), np.float32)
     status[:, 1], status[:, 4] = 1.0, 5.0
     at_10hz = torch.tensor(plans, dtype=torch.float32)
@@ -62,4 +94,22 @@ def batch(n: int, plans: np.ndarray, layout: ImageLayout = PICTURE, seed: int = 
         torch.ones(n, dtype=torch.bool),
         image=torch.tensor(coarse.repeat(8, axis=2).repeat(8, axis=3)),
         **more,  # type: ignore[arg-type]
+    )
+
+
+def with_surroundings(batch: Batch, layout: BevLayout, n_agents: int, seed: int = 0) -> Batch:
+    """The same with a random raster from above and random vehicles, the last of them missing."""
+    rng = np.random.default_rng(seed)
+    n = len(batch)
+    bev = rng.integers(0, 7, (n, 1, *layout.shape), dtype=np.uint8)
+    agents = np.concatenate(
+        [rng.uniform(-20, 20, (n, n_agents, 2)), rng.uniform(-3, 3, (n, n_agents, 1)), np.full((n, n_agents, 2), 3.0)],
+        axis=2,
+    )
+    valid = np.arange(n_agents)[None].repeat(n, axis=0) < n_agents - 1
+    return replace(
+        batch,
+        bev=torch.tensor(bev),
+        agents=torch.tensor(agents, dtype=torch.float32),
+        agents_valid=torch.tensor(valid),
     )

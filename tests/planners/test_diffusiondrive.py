@@ -1,0 +1,134 @@
+"""DiffusionDrive: its size, whom it imitates, and that it learns 32 pictures by heart."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from factory.config import conf_dir, fill
+from planners.batch import Batch, BevLayout
+from planners.diffusiondrive import DiffusionDrive, DiffusionDriveSettings
+from planners.optim import TrainingSettings
+from planners.planner import TrainingData
+from tests.planners import scenes
+
+WAYS = 4
+TINY = DiffusionDriveSettings(
+    image=scenes.PICTURE,
+    bev=BevLayout(cell_m=8.0),
+    fusion=scenes.FUSION,
+    width=64,
+    hidden=128,
+    heads=2,
+    layers=1,
+    agents=3,
+)
+
+
+def scene_batch(n: int) -> Batch:
+    plans, colours = scenes.four_ways(n)
+    return scenes.with_surroundings(scenes.batch(n, plans, colours=colours), TINY.bev, TINY.agents)
+
+
+def planner(settings: DiffusionDriveSettings = TINY, n_anchors: int = WAYS) -> DiffusionDrive:
+    torch.manual_seed(0)
+    return DiffusionDrive(settings, {"anchors": scenes.four_ways(n_anchors)[0][:, 4::5, :2]})
+
+
+def summed(terms: dict[str, torch.Tensor]) -> torch.Tensor:
+    return torch.stack(list(terms.values())).sum()
+
+
+def test_the_papers_size_is_61_million_parameters() -> None:
+    with torch.device("meta"):
+        model = DiffusionDrive(DiffusionDriveSettings(), {"anchors": np.zeros((20, 8, 2))})
+    assert sum(p.numel() for p in model.parameters()) == pytest.approx(61e6, rel=0.1)
+
+
+def test_a_plan_has_eight_poses_and_is_the_same_every_time_whatever_else_is_in_the_batch() -> None:
+    batch, model = scene_batch(4), planner()
+    first = model.plan(batch)
+    torch.manual_seed(9)
+    assert first.shape == (4, 8, 3) and torch.equal(model.plan(batch), first)
+    torch.testing.assert_close(torch.cat([model.plan(part) for part in batch.parts(4)]), first, atol=1e-4, rtol=1e-4)
+    assert not first.requires_grad and first[..., 2].abs().max() <= torch.pi
+
+
+def test_losses_reach_every_parameter_also_where_nothing_imitates() -> None:
+    batch = scene_batch(4)
+    nothing = replace(
+        batch, imitate=torch.zeros(4, dtype=torch.bool), plan_2hz=torch.full_like(batch.plan_2hz, float("nan"))
+    )
+    for one in (batch, nothing):
+        model = planner()
+        terms = model(one)
+        summed(terms).backward()
+        for name, parameter in model.named_parameters():
+            assert parameter.grad is not None and parameter.grad.isfinite().all(), name
+    assert terms["confidence"].item() == 0.0 and terms["regression"].item() == 0.0 and terms["bev"].item() > 0.0
+    assert all((parameter.grad == 0).all() for parameter in model.decoder.parameters())
+
+
+def test_imitation_is_divided_by_the_whole_batch() -> None:
+    batch, model = scene_batch(4), planner(replace(TINY, dropout=0.0)).eval()
+
+    def terms(imitate: list[bool]) -> dict[str, torch.Tensor]:
+        torch.manual_seed(0)
+        return model.losses(replace(batch, imitate=torch.tensor(imitate)))
+
+    both, one, other = (
+        terms([True, False, True, False]),
+        terms([True] + [False] * 3),
+        terms([False] * 2 + [True, False]),
+    )
+    for name in ("confidence", "regression"):
+        torch.testing.assert_close(both[name], one[name] + other[name])
+
+
+@pytest.mark.parametrize("offsets_from", ["noisy", "anchors"])
+def test_before_it_learns_its_plans_are_near_what_they_are_told_from(offsets_from: str) -> None:
+    model = planner(replace(TINY, offsets_from=offsets_from))
+    plans = model.plan(scene_batch(4))[..., :2]
+    off_m = (plans[:, None] - model.anchors).norm(dim=-1).mean(dim=-1).min(dim=1).values
+    assert (off_m < 3.0).all()
+
+
+def test_bf16_gives_finite_losses_and_plans_in_full_precision() -> None:
+    batch, model = scene_batch(2), planner()
+    with torch.autocast("cpu", torch.bfloat16):
+        terms = model(batch)
+        summed(terms).backward()
+        plan = model.plan(batch)
+    assert all(term.isfinite() and term.dtype == torch.float32 for term in terms.values())
+    assert plan.dtype == torch.float32 and plan.isfinite().all()
+
+
+def test_anchors_come_from_a_file_or_from_the_plans_to_be_trained_on(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    data = TrainingData(lambda: scenes.four_ways(40)[0][:, 4::5], None)
+    made = DiffusionDrive.fixed_arrays(replace(TINY, n_anchors=4), data)["anchors"]
+    assert made.shape == (4, 8, 2)
+    assert sorted(made[:, -1, 0].round()) == pytest.approx([12.0, 22.0, 22.0, 40.0], abs=3.0)
+    file = tmp_path / "anchors.npy"
+    np.save(file, made)
+    again = DiffusionDrive.fixed_arrays(replace(TINY, anchors=str(file)), TrainingData(lambda: np.zeros(0), None))
+    assert np.array_equal(again["anchors"], made)
+
+
+def test_a_batch_that_lacks_something_is_refused() -> None:
+    batch, model = scene_batch(2), planner()
+    with pytest.raises(ValueError, match="without view from above or agents"):
+        model.losses(replace(batch, bev=None))
+    with pytest.raises(ValueError, match="without images"):
+        model.plan(replace(batch, image=None))
+
+
+@pytest.mark.parametrize("name", ["diffusiondrive", "diffusiondrive_small"])
+def test_its_configuration_fills_its_settings(name: str) -> None:
+    values = OmegaConf.to_container(OmegaConf.load(conf_dir() / "planner" / f"{name}.yaml"))
+    settings = fill(DiffusionDriveSettings, values["settings"], "settings")
+    fill(TrainingSettings, values["training"], "training")
+    with torch.device("meta"):
+        DiffusionDrive(settings, {"anchors": np.zeros((20, 8, 2))})
+    assert (settings == DiffusionDriveSettings()) != name.endswith("small")
