@@ -24,8 +24,9 @@ from planners.anchors import read_array
 from planners.attention import Decoder, Layer
 from planners.backbone import BackboneSettings
 from planners.batch import Batch, ImageLayout, Needs
-from planners.planner import FloatArray, Planner, TrainingData
-from planners.tokens import PictureTokens
+from planners.planner import FloatArray, Planner, TrainingData, evaluating
+from planners.tokens import FusedTokens, PictureTokens
+from planners.transfuser import FusionSettings
 from planners.weighting import IMITATION, SUBSCORES, WEIGHTINGS, WeightingName, choose
 from tasks.reward.label_bytes import HALVES, Normalise
 from tasks.vocabulary import Vocabulary
@@ -59,11 +60,12 @@ class GtrsDenseSettings:
     weighting: WeightingName = "release"
     normalise: Normalise = "masked"  # of the labels' EP
     image: ImageLayout = field(default_factory=ImageLayout)
-    encoder: Literal["picture"] = "picture"  # what trajectories attend to
-    backbone: BackboneSettings = field(default_factory=BackboneSettings)
+    encoder: Literal["fused", "picture"] = "fused"  # as published with ResNet-34; with V2-99
+    fusion: FusionSettings = field(default_factory=FusionSettings)  # of the fused encoder
+    backbone: BackboneSettings = field(default_factory=lambda: BackboneSettings("vovnet99"))  # of the other
     width: int = 256
     heads: int = 8
-    feedforward: int = 1024
+    hidden: int = 1024
     layers: int = 3
     kept: float = 0.5  # share of the vocabulary in a training step
     velocity_noise_mps: tuple[float, float] = (1.0, 0.2)  # deviation along and across, in training
@@ -84,7 +86,7 @@ class TrajectoryScorer(nn.Module):
 
     def __init__(self, settings: GtrsDenseSettings) -> None:
         super().__init__()
-        width, hidden = settings.width, settings.feedforward
+        width, hidden = settings.width, settings.hidden
         self.embed = nn.Sequential(nn.Linear(3 * 40, hidden), nn.ReLU(), nn.Linear(hidden, width))
         self.among = Layer(width, settings.heads, 4 * width, crosses=False)
         self.decoder = Decoder(width, settings.heads, hidden, settings.layers)
@@ -117,7 +119,11 @@ class GtrsDense(Planner):
         self.label_digest, self.choice_digest = vocabulary.digest, choices.digest
         self.register_buffer("trajectories", torch.tensor(vocabulary.trajectories).float(), persistent=False)
         self.register_buffer("choices", torch.tensor(choices.trajectories).float(), persistent=False)
-        self.tokens = PictureTokens(settings.backbone, settings.image, settings.width)
+        self.tokens: nn.Module
+        if settings.encoder == "fused":
+            self.tokens = FusedTokens(settings.fusion, settings.width)
+        else:
+            self.tokens = PictureTokens(settings.backbone, settings.image, settings.width)
         self.scorer = TrajectoryScorer(settings)
 
     @classmethod
@@ -166,10 +172,10 @@ class GtrsDense(Planner):
             terms[name] = weight * F.binary_cross_entropy_with_logits(logits[name], whole)
         return terms
 
-    @torch.no_grad()
     def scores(self, batch: Batch) -> dict[str, Tensor]:
         """Probabilities (B, K) of every trajectory to choose from: the sub-scores, and `imitation` that sums to 1."""
-        logits = self._logits(batch, self.get_buffer("choices"))
+        with evaluating(self):
+            logits = self._logits(batch, self.get_buffer("choices"))
         return {name: value.softmax(dim=1) if name == IMITATION else value.sigmoid() for name, value in logits.items()}
 
     def choose(self, scores: Mapping[str, Tensor]) -> Tensor:

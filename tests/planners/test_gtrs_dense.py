@@ -5,10 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from omegaconf import OmegaConf
 
+from factory.config import conf_dir, fill
 from planners.backbone import BackboneSettings
 from planners.batch import Batch, ImageLayout
 from planners.gtrs_dense import GtrsDense, GtrsDenseSettings, imitated, shifted
+from planners.optim import TrainingSettings
 from planners.planner import TrainingData
 from planners.weighting import SUBSCORES
 from tasks.vocabulary import Vocabulary
@@ -21,7 +24,7 @@ TINY = GtrsDenseSettings(
     backbone=BackboneSettings("small", widths=(8, 16, 16, 32)),
     width=32,
     heads=2,
-    feedforward=64,
+    hidden=64,
     layers=1,
 )
 EXACT = replace(TINY, kept=1.0, velocity_noise_mps=(0.0, 0.0), image_shift=0.0)
@@ -203,8 +206,29 @@ def test_settings_that_contradict_themselves_are_refused() -> None:
         planner(replace(TINY, image=ImageLayout(width=100, height=32)))
 
 
-def test_v2_99_has_the_papers_83_million_parameters() -> None:
-    settings = GtrsDenseSettings(encoder="picture", backbone=BackboneSettings("vovnet99"))
+@pytest.mark.parametrize(("encoder", "millions"), [("fused", 67), ("picture", 83)])
+def test_the_papers_sizes_are_67_million_parameters_with_resnet_34_and_83_with_v2_99(
+    encoder: str, millions: int
+) -> None:
     with torch.device("meta"):
-        model = GtrsDense(settings, {"vocabulary": scenes.vocabulary(2)})
-    assert sum(p.numel() for p in model.parameters()) == pytest.approx(83e6, rel=0.1)
+        model = GtrsDense(GtrsDenseSettings(encoder=encoder), {"vocabulary": scenes.vocabulary(2)})
+    assert sum(p.numel() for p in model.parameters()) == pytest.approx(millions * 1e6, rel=0.1)
+
+
+def test_the_fused_encoder_learns_too() -> None:
+    batch, _ = labelled(2)
+    model = planner(replace(TINY, encoder="fused", fusion=scenes.FUSION))
+    torch.stack(list(model(batch).values())).sum().backward()
+    assert all(parameter.grad is not None for parameter in model.parameters())
+    assert model.tokens(batch.image).shape == (2, 64, 32)
+
+
+@pytest.mark.parametrize("name", ["gtrs_dense", "gtrs_dense_v2_99", "gtrs_dense_small"])
+def test_its_configuration_fills_its_settings(name: str) -> None:
+    values = OmegaConf.to_container(OmegaConf.load(conf_dir() / "planner" / f"{name}.yaml"))
+    settings = fill(GtrsDenseSettings, values["settings"], "settings")
+    fill(TrainingSettings, values["training"], "training")
+    with torch.device("meta"):
+        GtrsDense(settings, {"vocabulary": scenes.vocabulary(2)})
+    if not name.endswith("small"):
+        assert replace(settings, backbone=GtrsDenseSettings().backbone, encoder="fused") == GtrsDenseSettings()
