@@ -11,6 +11,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -18,7 +19,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from factory.store.reader import SampleTable
+from factory.store.reader import TIME_TOLERANCE_S, SampleTable
 from planners.batch import ImageLayout, Needs
 from planners.data import DataSettings, make_feed, open_data
 from planners.loader import Loader
@@ -31,50 +32,76 @@ BATCH = 16
 PASSES = 3
 
 
+@dataclass
+class Rate:
+    """The best of several passes."""
+
+    per_second: float = 0.0  # samples, by the clock
+    cpu_ms: float = float("inf")  # of this process, a sample: what other programs' load spares
+
+    def time(self, run: Callable[[], int]) -> None:
+        """One more pass; `run` returns its samples."""
+        clock, cpu = time.perf_counter(), time.process_time()
+        n = run()
+        self.per_second = max(self.per_second, n / (time.perf_counter() - clock))
+        self.cpu_ms = min(self.cpu_ms, 1e3 * (time.process_time() - cpu) / n)
+
+
 def main(threads: int = 2, table: str | None = None, n: int = 400) -> None:
     """Prints one table."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    print(f"{threads} threads, batches of {BATCH}, best of {PASSES} passes\n")
-    print("| samples | picture | raw decode, samples/s | loader, in memory | | loader, windows | |")
+    print(f"{threads} threads, batches of {BATCH}, best of {PASSES} passes: samples/s, CPU ms a sample\n")
+    print("| samples | picture | raw decode | loader, in memory | share of raw | loader, windows | share of raw |")
     print("|---|---|---|---|---|---|---|")
     if table is not None:
-        row(table, ImageLayout(), threads, "the table's own")
+        compare(table, ImageLayout(), threads, "of the table")
         return
     with tempfile.TemporaryDirectory() as folder:
         for (width, height), count, layouts in (
-            ((512, 288), n, ((1090, 274), (1024, 256), (512, 128))),
-            ((1920, 1080), n // 10, ((2048, 512), (1024, 256))),
+            ((512, 288), n, ((1092, 274), (1024, 256), (512, 128))),
+            ((1920, 1080), n // 8, ((2048, 512), (1024, 256))),
         ):
             out = Path(folder) / f"{width}"
             write_table(out, [photographed(i, width, height) for i in range(count)], group_rows=group_rows(width))
             for layout in layouts:
-                row(str(out), ImageLayout(width=layout[0], height=layout[1]), threads, f"3 x {width} x {height}")
+                compare(str(out), ImageLayout(width=layout[0], height=layout[1]), threads, f"of 3 x {width} x {height}")
 
 
-def row(table: str, layout: ImageLayout, threads: int, name: str) -> None:
+def compare(table: str, layout: ImageLayout, threads: int, name: str) -> None:
     """One line: raw, with all in memory, and from windows that are read again in every pass."""
-    jpegs = [
-        [np.frombuffer(image["jpeg"], np.uint8) for image in one["images"] if image["time_s"] == 0.0]
-        for one in SampleTable(table).iterate(["images"])
-    ]
     needs = Needs(image=layout)
-    dataset = open_data(DataSettings(real=table, sim=() if only_real(table) else table), needs)
-    total_mb = make_feed(dataset, needs).size.sum() / 2**20
-    loaders = [
-        Loader(dataset, needs, MixSettings(shuffle_mb=mb), BATCH, workers=threads)
-        for mb in (int(4 * total_mb) + 1, max(1, int(total_mb / 4)))
+    experts = set(SampleTable(table).table(["expert"])["expert"].to_pylist())
+    dataset = open_data(
+        DataSettings(real=table if "human" in experts else (), sim=table if experts != {"human"} else ()), needs
+    )
+    feed = make_feed(dataset, needs)
+    wanted = dict(zip(dataset.rows.attempt_id.tolist(), feed.cameras))
+    jpegs = [
+        [
+            np.frombuffer(image["jpeg"], np.uint8)
+            for image in one["images"]
+            if abs(image["time_s"]) <= TIME_TOLERANCE_S and image["camera"] in wanted[one["attempt_id"]]
+        ]
+        for one in SampleTable(table).iterate(["attempt_id", "images"])
     ]
-    cameras = len(make_feed(dataset, needs).cameras[0])
-    shown = [chosen[:cameras] for chosen in jpegs]
-    raw = fastest(lambda: decode_all(shown, threads))
-    rates = [fastest(lambda loader=loader: count(loader)) for loader in loaders]
-    columns = " | ".join(f"{rate:.0f} | {100 * rate / raw:.0f} %" for rate in rates)
-    print(f"| {len(jpegs)}, {name} | {layout.width} x {layout.height} | {raw:.0f} | {columns} |", flush=True)
-
-
-def only_real(table: str) -> bool:
-    return set(SampleTable(table).table(["expert"])["expert"].to_pylist()) == {"human"}
+    total_mb = feed.size.sum() / 2**20
+    runs: list[Callable[[], int]] = [lambda: decode_all(jpegs, threads)]
+    for shuffle_mb in (int(2 * total_mb) + 1, max(1, int(total_mb / 4))):
+        loader = Loader(dataset, needs, MixSettings(shuffle_mb=shuffle_mb), BATCH, workers=threads)
+        runs.append(lambda loader=loader: count(loader))  # type: ignore[misc]
+    rates = [Rate() for _ in runs]
+    for run in runs:
+        run()  # warms up; the loader that keeps samples has read them then
+    for _ in range(PASSES):
+        for rate, run in zip(rates, runs):  # in turns, so that they share the machine's moods
+            rate.time(run)
+    raw = rates[0]
+    columns = [f"{raw.per_second:.0f}, {raw.cpu_ms:.2f} ms"]
+    for rate in rates[1:]:
+        columns.append(f"{rate.per_second:.0f}, {rate.cpu_ms:.2f} ms")
+        columns.append(f"{100 * rate.per_second / raw.per_second:.0f} %, by CPU {100 * raw.cpu_ms / rate.cpu_ms:.0f} %")
+    print(f"| {len(jpegs)} {name} | {layout.width} x {layout.height} | {' | '.join(columns)} |", flush=True)
 
 
 def decode_all(jpegs: list[list[NDArray[np.uint8]]], threads: int) -> int:
@@ -93,16 +120,6 @@ def decode_all(jpegs: list[list[NDArray[np.uint8]]], threads: int) -> int:
 def count(loader: Loader) -> int:
     """Samples of the next epoch."""
     return sum(len(batch) for batch in loader.epoch(int(loader.state()["epoch"])))
-
-
-def fastest(run: Callable[[], int]) -> float:
-    """Samples a second, of one pass that warms up and PASSES that count."""
-    run()
-    rates = []
-    for _ in range(PASSES):
-        start = time.perf_counter()
-        rates.append(run() / (time.perf_counter() - start))
-    return max(rates)
 
 
 def photographed(number: int, width: int, height: int) -> dict[str, object]:

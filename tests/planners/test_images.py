@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from planners.batch import ImageLayout
-from planners.images import REDUCED, chosen_cameras, jpeg_size, stitch, stitched
+from planners.images import chosen_cameras, jpeg_size, stitch, stitched
 from tests.planners.samples import FRONT_YAWS, Pixels, grey_pictures, jpeg, pictures, plain
 
 PUBLIC = ImageLayout(width=512, height=128)
@@ -107,7 +107,6 @@ def test_decoding_at_a_fraction_is_near_to_decoding_in_full() -> None:
         stitch([data], layout, picture)
         mean = cv2.resize(full, (layout.width, layout.height), interpolation=cv2.INTER_AREA)
         assert np.abs(picture.astype(int) - mean).mean() < 1.0
-    assert list(REDUCED) == [1, 2, 4, 8]
 
 
 def test_a_small_picture_is_enlarged_and_a_huge_one_averaged() -> None:
@@ -130,7 +129,7 @@ def test_what_cannot_be_stitched_says_why() -> None:
     headless = [image | {"jpeg": image["jpeg"][:200]} for image in sample["images"]]
     with pytest.raises(ValueError, match="not a JPEG"):
         stitched(sample | {"images": headless}, PUBLIC)
-    with pytest.raises(ValueError, match="nothing is left"):
+    with pytest.raises(ValueError, match="leave nothing of an image of 32 x 18"):
         stitched(sample, ImageLayout(sides_cut=0.5))
 
 
