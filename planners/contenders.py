@@ -54,7 +54,8 @@ def contender(spec: str, label: str | None = None) -> Contender:
     if spec in UNTRAINED:
         return Contender(name, spec, partial(_built, spec))
     if Path(spec).is_dir():
-        return Contender(name, checkpoint.digest(spec), partial(checkpoint.load_planner, spec))
+        newest = checkpoint.newest(Path(spec))  # now: a training may go on and write others
+        return Contender(name, checkpoint.digest(newest), partial(checkpoint.load_planner, newest))
     if ":" in spec:
         made = _imported(spec)
         return Contender(name, _digest_of(made), lambda: made)

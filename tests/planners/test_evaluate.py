@@ -12,9 +12,12 @@ import pytest
 import torch
 from small_benchmark import StreetBenchmark, straight
 from torch import Tensor
+from toy import Toy, ToySettings
 
 from factory.config import ConfigError
+from planners.aggregation import SummaryLine
 from planners.batch import Batch, BevLayout, ImageLayout, Needs
+from planners.checkpoint import save_checkpoint
 from planners.contenders import Contender, contender, contenders
 from planners.eval_record import read_record
 from planners.evaluate import EvaluateSettings, evaluate, fallback_notes, help_text, main, settings_of
@@ -131,6 +134,27 @@ def test_a_planner_that_is_done_is_left_until_it_changes(benchmark: StreetBenchm
     assert Steady.planned == 24
     evaluate(StreetBenchmark(("a",)), [replace(who[0], digest="other")], settings(tmp_path))  # other clips
     assert Steady.planned == 30
+
+
+def test_a_checkpoint_is_scored_again_when_its_weights_changed(benchmark: StreetBenchmark, tmp_path: Path) -> None:
+    training, out = tmp_path / "training", tmp_path / "out"
+
+    def scored(step: int, weight: float) -> tuple[list[SummaryLine], str]:
+        toy = Toy(ToySettings(), {})
+        for parameter in toy.parameters():
+            torch.nn.init.constant_(parameter, weight)
+        save_checkpoint(training, step, toy, {}, {})
+        lines = evaluate(benchmark, [contender(str(training), "toy")], settings(out))
+        return lines, read_record(out / "toy")["planner_digest"]
+
+    first, digest = scored(1, 0.0)  # it stands where it is
+    same, same_digest = scored(2, 0.0)
+    other, other_digest = scored(3, 0.1)
+    assert digest == same_digest != other_digest
+    for line, again, moved in zip(first, same, other):
+        np.testing.assert_array_equal(line.columns, again.columns)
+        assert line.stage == moved.stage
+    assert any((line.columns != moved.columns).any() for line, moved in zip(first, other))
 
 
 def test_a_kill_while_scoring_keeps_the_plans(
