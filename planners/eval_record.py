@@ -30,6 +30,11 @@ def read_record(folder: Path) -> dict[str, Any]:
     return record
 
 
+def forget(folder: Path) -> None:
+    """From here on the folder is not done: what it holds is about to be replaced."""
+    (folder / RECORD).unlink(missing_ok=True)
+
+
 def is_done(folder: Path, identity: Mapping[str, Any]) -> bool:
     """Whether the folder holds what `identity` (planner, benchmark, rules) describes, whole."""
     if not (folder / RECORD).is_file():

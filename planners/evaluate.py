@@ -28,7 +28,7 @@ from factory.config import ConfigError, conf_dir, fill
 from planners.aggregation import SummaryLine, lines_of, summarise
 from planners.benchmark_folder import BenchmarkFolder
 from planners.contenders import Contender, composed, contenders, needs_of
-from planners.eval_record import is_done, write_record
+from planners.eval_record import forget, is_done, write_record
 from planners.frames import Benchmark, FrameKey
 from planners.planning import all_plans
 from planners.progress import Counter
@@ -100,6 +100,7 @@ def evaluate(benchmark: Benchmark, who: Sequence[Contender], settings: EvaluateS
     if waiting:
         rows = _scored(benchmark, keys, waiting, plans, settings.rules)
         for one in waiting:
+            forget(out / one.label)
             write_rows(out / one.label, rows[one.label])
             write_record(out / one.label, {**identities[one.label], "planner": one.label, "frames": len(keys)})
     lines = [line for one in who for line in lines_of(one.label, summarise(read_rows(out / one.label)))]

@@ -188,6 +188,19 @@ def test_planners_plan_the_same_alone_and_together(
     assert all((above[key] == batch[key]).all() for key in benchmark.keys)
 
 
+def test_rows_of_other_rules_never_stand_under_an_older_record(
+    benchmark: StreetBenchmark, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    who, first = named("test_evaluate:Steady"), settings(tmp_path)
+    expected = evaluate(benchmark, who, first)
+    with monkeypatch.context() as patch:
+        patch.setattr("planners.evaluate.write_record", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            evaluate(benchmark, who, replace(first, two_stage_traffic=first.one_stage_traffic))
+    for a, b in zip(expected, evaluate(benchmark, who, first)):
+        np.testing.assert_array_equal(a.columns, b.columns)
+
+
 def test_a_planner_whose_plans_end_far_from_the_follow_ups_is_pointed_out(
     benchmark: StreetBenchmark, tmp_path: Path
 ) -> None:
