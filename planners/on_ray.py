@@ -1,10 +1,13 @@
-"""A training as Ray Train processes, on this machine or on a cluster; the only module of the planners that imports ray.
+"""Trainings on this machine's or a cluster's Ray; the only module of the planners that imports it.
 
 Checkpoints and curves are written by the training itself under `out`, which every node must see.
 """
 
 import os
-from typing import TYPE_CHECKING, Any
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import ray
 from ray.train import RunConfig, ScalingConfig
@@ -14,6 +17,8 @@ from planners.world import joined
 
 if TYPE_CHECKING:
     from planners.train import TrainConfig
+
+T = TypeVar("T")
 
 
 def train_on_ray(config: "TrainConfig") -> None:
@@ -50,3 +55,26 @@ def _connect() -> None:
     """To the cluster of RAY_ADDRESS or of the submitted job, else to one of this machine's own, on loopback."""
     there = "RAY_ADDRESS" in os.environ
     ray.init(address=None if there else "local", include_dashboard=None if there else False, log_to_driver=True)
+
+
+def each_on_ray(
+    one: Callable[..., int], items: Sequence[T], out: Path, cpus: float, gpus: float, stop: threading.Event
+) -> Iterator[tuple[T, int]]:
+    """one(item, out) as a task for each item; yields results as they come. After `stop` nothing new begins."""
+    started = not ray.is_initialized()
+    if started:
+        _connect()
+    try:
+        task = ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=0)(one)
+        waiting = {task.remote(item, out.absolute()): item for item in items}
+        while waiting:
+            done, _ = ray.wait(list(waiting), num_returns=1, timeout=1.0)
+            for reference in done:
+                yield waiting.pop(reference), ray.get(reference)
+            if stop.is_set():
+                for reference in waiting:
+                    ray.cancel(reference)
+                return
+    finally:
+        if started:
+            ray.shutdown()

@@ -146,6 +146,7 @@ def train(config: TrainConfig, world: World) -> None:
     backbones = load_pretrained(planner) if resume_from is None else read_record(resume_from)["backbones"]
     record = {
         "trained": identity,
+        "samples": {"real": int((~dataset.rows.simulated).sum()), "simulated": int(dataset.rows.simulated.sum())},
         "backbones": backbones,
         "parameters": sum(parameter.numel() for parameter in planner.parameters()),
     }

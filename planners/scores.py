@@ -1,0 +1,35 @@
+"""The scores of evaluated planners, as plain numbers."""
+
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from planners.aggregation import lines_of, score_of, summarise
+from planners.score_rows import read_rows
+
+STAGES = ("one_stage", "stage_one", "stage_two", "final")
+
+
+def scores_of(folder: Path) -> dict[str, float]:
+    """Of one evaluated planner: name_of(stage, filter) -> EPDMS in percent, and its share of uniform fallbacks."""
+    found = {}
+    for line in lines_of(folder.name, summarise(read_rows(folder))):
+        found[name_of(line.stage, line.human_filter)] = 100.0 * score_of(line.columns)
+        if line.stage == "final":
+            found["uniform_share"] = line.uniform_share
+    return found
+
+
+def name_of(stage: str, human_filter: str) -> str:
+    """Column of a score; stage two is never filtered."""
+    return stage if stage == "stage_two" else f"{stage}_{human_filter}"
+
+
+def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Rows of equal columns; numbers with four decimals are enough for scores in percent."""
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        for row in rows:
+            writer.writerow({k: f"{v:.4f}" if isinstance(v, float) else v for k, v in row.items()})

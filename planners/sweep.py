@@ -1,0 +1,163 @@
+"""Many trainings and their evaluation, resumable: what is done is not done again.
+
+A training is a process of `python -m planners.train`; on one machine `jobs` of them run side by side, on a Ray cluster
+each is a task. All are then evaluated on one benchmark by one process, which prepares every frame once.
+"""
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from planners.progress import Counter
+
+DONE, LOG = "sweep.json", "train.log"
+INTERRUPTED = 4
+LOOK_EVERY_S = 0.5
+
+
+@dataclass(frozen=True)
+class Training:
+    """One training of a sweep."""
+
+    label: str  # names its folder; unique in the sweep
+    overrides: tuple[str, ...]  # of planners.train, but `out`
+    facts: Mapping[str, Any] = field(default_factory=dict)  # its columns in the sweep's tables
+
+
+@dataclass(frozen=True)
+class Means:
+    """How a sweep runs."""
+
+    executor: Literal["process", "ray"] = "process"
+    jobs: int | None = None  # at a time; None: one a core
+    minutes: float | None = None  # after which nothing new begins, and what runs is saved and stopped
+    gpus: float = 0.0  # of each training on Ray
+    cpus: float = 1.0
+
+
+class SweepFailed(Exception):
+    """Trainings that ended with an error; the others are done."""
+
+
+def folder_of(out: Path, training: Training) -> Path:
+    """Where a training lies under the sweep's folder."""
+    return out / "trainings" / training.label
+
+
+def is_done(out: Path, training: Training) -> bool:
+    """Whether it was trained to its end with these overrides."""
+    path = folder_of(out, training) / DONE
+    return path.is_file() and json.loads(path.read_text()) == list(training.overrides)
+
+
+def train_all(trainings: Sequence[Training], out: Path, means: Means) -> bool:
+    """Train what is not done; False where time ran out or somebody interrupted before all were.
+
+    Raises ValueError for two trainings of one label, SweepFailed with what each failed training said last.
+    """
+    labels = [training.label for training in trainings]
+    if len(set(labels)) < len(labels):
+        raise ValueError(f"labels {sorted({x for x in labels if labels.count(x) > 1})} stand for several trainings")
+    left = [training for training in trainings if not is_done(out, training)]
+    before = len(trainings) - len(left)
+    stop = threading.Event()
+    failed: list[str] = []
+    with Counter("trainings", len(trainings), before) as counter, _stops(stop, means.minutes):
+        done = before
+        for training, code in _codes(left, out, means, stop):
+            if code == 0:
+                done += 1
+            elif code != INTERRUPTED:
+                failed.append(f"{training.label} (exit {code}): {_last_words(folder_of(out, training) / LOG)}")
+            counter.show(done, training.label)
+    if failed:
+        raise SweepFailed("; ".join(failed))
+    return all(is_done(out, training) for training in trainings)
+
+
+def train_one(training: Training, out: Path, stop: Callable[[], bool] = lambda: False) -> int:
+    """Train one in a process of its own and note that it is done; returns its exit code."""
+    if stop():
+        return INTERRUPTED
+    folder = folder_of(out, training)
+    folder.mkdir(parents=True, exist_ok=True)
+    command = [sys.executable, "-m", "planners.train", *training.overrides, f"out={folder}"]
+    with (folder / LOG).open("w") as log:
+        environment = {"OMP_NUM_THREADS": "1", **os.environ}
+        child = subprocess.Popen(command, stdout=log, stderr=log, env=environment)  # noqa: S603 - a list, no shell
+        asked = False
+        while (code := child.poll()) is None:
+            if stop() and not asked:
+                child.send_signal(signal.SIGTERM)
+                asked = True
+            time.sleep(LOOK_EVERY_S)
+    if asked and code == -signal.SIGTERM:  # it had not begun yet
+        return INTERRUPTED
+    if code == 0:
+        (folder / DONE).write_text(json.dumps(list(training.overrides)))
+    return code
+
+
+def _codes(
+    trainings: Sequence[Training], out: Path, means: Means, stop: threading.Event
+) -> Iterator[tuple[Training, int]]:
+    """Exit codes as trainings end."""
+    if means.executor == "ray":
+        from planners.on_ray import each_on_ray
+
+        yield from each_on_ray(train_one, trainings, out, means.cpus, means.gpus, stop)
+        return
+    with ThreadPoolExecutor(means.jobs or os.cpu_count() or 1) as pool:
+        futures = {pool.submit(train_one, training, out, stop.is_set): training for training in trainings}
+        for future in as_completed(futures):
+            yield futures[future], future.result()
+
+
+@contextlib.contextmanager
+def _stops(stop: threading.Event, minutes: float | None) -> Iterator[None]:
+    """Sets the event after so many minutes, or at SIGINT and SIGTERM."""
+    timer = threading.Timer(60.0 * minutes, stop.set) if minutes is not None else None
+    old: dict[int, Any] = {}
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            old[number] = signal.signal(number, lambda *_: stop.set())
+    if timer is not None:
+        timer.daemon = True
+        timer.start()
+    try:
+        yield
+    finally:
+        if timer is not None:
+            timer.cancel()
+        for what, handler in old.items():
+            signal.signal(what, handler)
+
+
+def evaluate_all(trainings: Sequence[Training], out: Path, benchmark: str, *more: str) -> Path:
+    """Evaluate all trainings on a benchmark; those that are evaluated already are not again. Returns the folder.
+
+    more: further overrides of planners.evaluate. Raises SweepFailed.
+    """
+    evaluations = out / "evaluations"
+    named = ",".join(f"{training.label}: '{folder_of(out, training)}'" for training in trainings)
+    command = [sys.executable, "-m", "planners.evaluate", f"benchmark={benchmark}", f"planners={{{named}}}", *more]
+    environment = {"OMP_NUM_THREADS": "1", **os.environ}
+    code = subprocess.run([*command, f"out={evaluations}"], env=environment).returncode  # noqa: S603 - a list, no shell
+    if code != 0:
+        raise SweepFailed(f"the evaluation ended with exit {code}")
+    return evaluations
+
+
+def _last_words(log: Path) -> str:
+    lines = log.read_text().strip().splitlines() if log.is_file() else []
+    return lines[-1] if lines else "it said nothing"
