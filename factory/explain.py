@@ -113,7 +113,7 @@ def explain(argv: Sequence[str]) -> int:
                 *trace.candidate.end_pose[:2], trace.candidate.end_pose[2] * 57.29578
             )
         )
-        rejected = trace.rejected or work.unfit(clip, trace)
+        rejected = trace.rejected or work.unfit(clip, trace, expert)
         verdict = "accepted" if rejected is None else f"rejected by {rejected.stage}: {rejected.detail}"
         print(f"candidate {candidate:2d}{end}  {verdict}")
         if trace.judged is not None:

@@ -17,6 +17,7 @@ from factory.assets import Sensing, asset_for, sensing
 from factory.clips.reader import BadClip
 from factory.sensors import block_of, chosen_cameras, encode_jpeg, load_photos, taken_by
 from tasks.attempt import Judged
+from tasks.experts.follow_up import BEFORE_STEPS
 from tasks.perturb import Candidate
 from tasks.render.gate import unfit
 from tasks.render.map_drawing import draw_map_views
@@ -88,8 +89,10 @@ class Imaging:
             tags.append(LOW_PSNR)
         return self._drawn(clip, judged, asset, cameras) | {"tags": tags}
 
-    def unfit(self, clip: Clip, candidate: Candidate, judged: Judged) -> Rejected | None:
+    def unfit(self, clip: Clip, candidate: Candidate, judged: Judged, pair: bool = False) -> Rejected | None:
         """Why a simulated drive cannot be shown: what `tasks.render.gate` finds on its pictures from T to T+2H.
+
+        pair: on those that a benchmark's follow-up and its earlier frame show, the same for both.
 
         None where nothing is rendered from photos: lidar's grey pictures have gaps between its beams, and a reach of
         their own instead. Raises BadClip for a broken sensor file.
@@ -98,13 +101,18 @@ class Imaging:
             return None
         if sensing(clip, self.settings) not in (Sensing.PHOTOS, Sensing.PHOTOS_ONLY):
             return None
-        states = np.concatenate([candidate.rollout.ego_states, judged.rollout.ego_states[1:]])[::GATE_STRIDE]
+        start, now = candidate.rollout.start_step, judged.scene.step
+        steps: Sequence[int] = range(start, now + HORIZON_STEPS + 1, GATE_STRIDE)
+        if pair:
+            shown = STEPS_OF[self.settings.frames]
+            steps = sorted({at + offset for at in (now - BEFORE_STEPS, now) for offset in shown})
+        states = np.concatenate([candidate.rollout.ego_states, judged.rollout.ego_states[1:]])
         return unfit(
             _block(clip, self.settings, self.cache_dir),
             chosen_cameras(clip.cameras, self.settings.cameras),
-            pose_on_ground(clip.world_from_ego, states),
-            judged.scene.agents.overwritten(judged.scene.step, judged.rollout.agents),
-            range(candidate.rollout.start_step, judged.scene.step + HORIZON_STEPS + 1, GATE_STRIDE),
+            pose_on_ground(clip.world_from_ego, states[[step - start for step in steps]]),
+            judged.scene.agents.overwritten(now, judged.rollout.agents),
+            steps,
             (self.settings.width, self.settings.height),
             self.settings.gate,
             self.settings.backend,

@@ -252,7 +252,7 @@ class FactoryWork:
             return Dropped(trace.rejected, _subscores(trace.judged.scores) if trace.judged else {}, watch.seconds)
         with watch.of("render"):
             sensed = self._with_sensors(payload, expert)
-            unfit = self.unfit(sensed, trace)
+            unfit = self.unfit(sensed, trace, expert)
             if unfit is not None:
                 return Dropped(unfit, _subscores(trace.judged.scores), watch.seconds)
         judged = self._sampled(trace, expert)
@@ -289,14 +289,15 @@ class FactoryWork:
             return Trace(chosen, None, result)
         return Trace(chosen, *result)
 
-    def unfit(self, clip: Clip, trace: Trace) -> Rejected | None:
+    def unfit(self, clip: Clip, trace: Trace, expert: str) -> Rejected | None:
         """Why the pictures of an accepted drive are no sample's; `clip` with its sensor files. Raises BadClip.
 
         The human drive is never filtered.
         """
         if trace.candidate is None or trace.judged is None:
             return None
-        return self.imaging.unfit(clip, trace.candidate, trace.judged)
+        pair = isinstance(self.experts[expert], FollowUp)
+        return self.imaging.unfit(clip, trace.candidate, trace.judged, pair)
 
     def _sampled(self, trace: Trace, expert: str) -> Judged:
         """The drive as the sample tells it; of the earlier frame of a pair, only after all that the pair shares."""

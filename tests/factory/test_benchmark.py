@@ -200,6 +200,7 @@ def test_a_pair_falls_together_at_the_pictures(tmp_path: Path) -> None:
     pair = [strict.attempt(prepared, 0, expert) for expert in ("follow_up", "follow_up_before")]
     assert all(isinstance(result, Dropped) and result.rejected.reason == "blank" for result in pair)
     assert pair[0].rejected == pair[1].rejected  # type: ignore[union-attr]
+    assert "at step 50" in pair[0].rejected.detail  # type: ignore[union-attr]
     drawn = assemble(load_config(overrides(tmp_path, *lenient, settings=SMALL))).work
     for expert, at in (("human_before", -1), ("follow_up", 0), ("follow_up_before", 0)):
         result = drawn.attempt(prepared, at, expert)
