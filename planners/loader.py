@@ -138,9 +138,8 @@ class Loader:
                 lines.append(f"and {order.sim_per_epoch} times a simulated one, {passes}")
         lines.append(f"plans to imitate: {self.mix.imitation}")
         for side in sides:
-            gigabytes = side.size.sum() / 2**30
-            held = "stay in memory" if side.fits else f"are shuffled in windows of {side.window_bytes / 2**30:.2f} GiB"
-            lines.append(f"{len(side)} samples of {gigabytes:.2f} GiB {held}")
+            held = "stay in memory" if side.fits else f"are shuffled in windows of {side.window_bytes / 2**20:.0f} MB"
+            lines.append(f"{len(side)} samples of {side.size.sum() / 2**20:.1f} MB {held}")
         return "\n".join(lines)
 
     def _settings(self) -> dict[str, Any]:
