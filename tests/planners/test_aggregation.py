@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from made_rows import clip_rows, row
 
 from planners.aggregation import by_clip, lines_of, score_of, summarise
 from planners.frames import FrameKey
 from planners.score_rows import FrameRow, read_rows, write_rows
 from tasks.reward.one_stage import COLUMNS, FrameScores
+from tests.planners.made_rows import clip_rows, row
 
 SCORE = COLUMNS.index("score")
 

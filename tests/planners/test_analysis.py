@@ -7,10 +7,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from made_rows import clip_rows
 
 from planners.analysis import analyse, main
 from planners.score_rows import FrameRow, write_rows
+from tests.planners.made_rows import clip_rows
 
 
 def rows() -> list[FrameRow]:

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_benchmark import StreetBenchmark, straight, write_benchmark_folder
 
 from factory.config import ConfigError
 from planners.benchmark_folder import BenchmarkFolder
@@ -13,6 +12,7 @@ from planners.contenders import contenders
 from planners.evaluate import EvaluateSettings, evaluate, main
 from planners.score_rows import read_rows
 from planners.scoring import Rules, prepare_clip, score_clip
+from tests.planners.small_benchmark import StreetBenchmark, straight, write_benchmark_folder
 
 
 @pytest.fixture(scope="module")

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_rows import clip_rows
 
 from planners.aggregation import ClipResult, by_clip
 from planners.bootstrap import paired_interval
 from planners.compare import CompareSettings, compare, measured, text_of
+from tests.planners.made_rows import clip_rows
 
 SETTINGS = CompareSettings(a="", b="", draws=500)
 

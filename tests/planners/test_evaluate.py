@@ -10,9 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 import torch
-from small_benchmark import StreetBenchmark, straight
 from torch import Tensor
-from toy import Toy, ToySettings
 
 from factory.config import ConfigError
 from planners.aggregation import SummaryLine
@@ -26,6 +24,8 @@ from planners.planning import all_plans, plans_of
 from planners.score_rows import read_rows
 from planners.shown import as_shown
 from tasks.reward.one_stage import COLUMNS
+from tests.planners.small_benchmark import StreetBenchmark, straight
+from tests.planners.toy import Toy, ToySettings
 
 SCORE = COLUMNS.index("score")
 

@@ -3,12 +3,12 @@
 import cv2
 import numpy as np
 import pytest
-from small_benchmark import StreetBenchmark
 
 from factory.config import ConfigError
 from planners.contenders import contender
 from planners.replay import HOLD, ReplaySettings, find_clip, replay, settings_of
 from planners.scoring import Rules
+from tests.planners.small_benchmark import StreetBenchmark
 
 INSTANTS = 15 + 41  # -1.5 .. 4 s
 

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_benchmark import clip_scenes, same_plan_everywhere, straight
 
 from planners.frames import FrameKey
 from planners.scoring import (
@@ -27,6 +26,7 @@ from tasks.world.clip import HORIZON_STEPS, NOW, scene_of_clip
 from tasks.world.frames import to_world
 from tasks.world.lanes import MapLayer, MapPolygon
 from tasks.world.vehicle import HEADING
+from tests.planners.small_benchmark import clip_scenes, same_plan_everywhere, straight
 from tests.tasks.streets import rectangle, street_clip
 
 SCORE = COLUMNS.index("score")

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from samples import grey_pictures, sample, write_table
 
 from factory.store.reader import SampleTable
 from planners.batch import BevLayout, ImageLayout, Needs
@@ -13,6 +12,7 @@ from planners.index import DataSettings, open_dataset
 from planners.loader import Loader
 from planners.mix import MixSettings
 from planners.shown import as_shown, batch_of, columns_shown
+from tests.planners.samples import grey_pictures, sample, write_table
 
 NEEDS = Needs(image=ImageLayout(width=48, height=12), bev=BevLayout(cell_m=1.0), n_agents=3)
 
