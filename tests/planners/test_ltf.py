@@ -136,6 +136,7 @@ def test_weights_are_for_the_picture_and_the_latent_starts_at_random(tmp_path: P
     assert not torch.equal(model.fusion.latent.get_parameter("conv1.weight"), source.fusion.latent.conv1.weight)
 
 
+@pytest.mark.slow
 def test_it_learns_32_pictures_by_heart() -> None:
     """Status and command are the same for all: without the picture the error stays at 8 m."""
     settings = replace(
@@ -148,7 +149,7 @@ def test_it_learns_32_pictures_by_heart() -> None:
     model = planner(settings).train()
     samples = made_batch(model.needs, 32)
     optimiser = torch.optim.Adam(model.parameters(), fused=True)
-    error, steps = float("inf"), 240
+    error, steps = float("inf"), 200
     for step in range(steps):
         rate = 4e-3 * min((step + 1) / 20, 0.5 + 0.5 * math.cos(math.pi * step / steps))
         optimiser.param_groups[0]["lr"] = rate
