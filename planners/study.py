@@ -1,0 +1,186 @@
+"""`python -m planners.study`: does simulated data make planners better? Trains, evaluates and compares; docs/study.md.
+
+    python -m planners.study vocabulary=<K x 40 x 3>.npy           all of it
+    python -m planners.study ... minutes=25                          a part of it: what is done stays done
+    python -m planners.study ... parts=[main,rounds]                 some comparisons only
+
+Every comparison is made twice: with equal passes over a planner's own data, as the paper does, and with equal optimiser
+steps, since more data in equal passes is more training as well. Tables go to `report`: `trainings.csv` (each training),
+`comparisons.csv` (means over seeds, differences with paired bootstrap intervals over clips and seeds), `bounds.csv`,
+`curves.csv`, and pictures. Exit codes: 0 complete, 2 bad settings, 3 a training failed, 4 not complete yet, resumable.
+"""
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from factory.config import ConfigError, compose, fill
+from planners.aggregation import ClipResult, by_clip
+from planners.checkpoint import read_record
+from planners.compare import CompareSettings, compare
+from planners.index import DataSettings, open_dataset
+from planners.scaling_figure import Curve, Point, draw_curves
+from planners.scaling_law import FEWEST, fit_scaling
+from planners.score_rows import read_rows
+from planners.scores import name_of, scores_of, write_csv
+from planners.study_figures import draw_learning
+from planners.study_plan import Comparison, Setup, StudySettings, comparisons, trainings
+from planners.sweep import Means, SweepFailed, Training, evaluate_all, folder_of, train_all
+
+BAD_CONFIG, FAILED, INTERRUPTED = 2, 3, 4
+BOUNDS = ("human", "pdm_closed", "constant_velocity")
+SHOWN = {"one_stage": "unfiltered", "stage_one": "filtered", "stage_two": "none", "final": "filtered"}  # as published
+
+
+def run(settings: StudySettings) -> int:
+    """Train, evaluate, compare, draw; the exit code."""
+    out, report = Path(settings.out), Path(settings.report)
+    wanted = comparisons(settings)
+    planned = trainings(wanted, settings, matched_samples(settings) if "psnr" in settings.parts else None)
+    if not train_all(planned, out, Means(jobs=settings.jobs, minutes=settings.minutes)):
+        print("not all trainings are done: the same command goes on", file=sys.stderr)
+        return INTERRUPTED
+    evaluations = evaluate_all(planned, out, settings.benchmark)
+    report.mkdir(parents=True, exist_ok=True)
+    rows = [row_of(training, out, evaluations) for training in planned]
+    write_csv(report / "trainings.csv", rows)
+    write_csv(report / "bounds.csv", [{"planner": name, **scores_of(evaluations / name)} for name in BOUNDS])
+    write_csv(report / "comparisons.csv", compared(wanted, evaluations))
+    curves = curves_of(rows) if "rounds" in settings.parts else []
+    if curves:
+        write_csv(report / "curves.csv", [curve.row() for curve in curves])
+        draw_curves(curves, "two-stage EPDMS", report / "scaling.png")
+    draw_learning({t.label: folder_of(out, t) for t in planned if t.facts["seed"] == 0}, report / "learning.png")
+    print(text_of(wanted, evaluations))
+    print(f"tables and pictures: {report}")
+    return 0
+
+
+def matched_samples(settings: StudySettings) -> int:
+    """The number of simulated samples of which both sides of the PSNR bound have at least as many.
+
+    Raises ConfigError where one side has none.
+    """
+    every = DataSettings(sim=settings.data, experts=("pdm_closed",), max_round=settings.rounds - 1)
+    try:
+        low = open_dataset(replace(every, psnr_max=settings.psnr_db))
+        high = open_dataset(replace(every, psnr_min=settings.psnr_db))
+    except ValueError as error:
+        raise ConfigError(f"part psnr: {error}; leave it out of parts, or choose another psnr_db") from error
+    return min(len(low), len(high))
+
+
+def row_of(training: Training, out: Path, evaluations: Path) -> dict[str, Any]:
+    """One training and its scores."""
+    record = read_record(folder_of(out, training))
+    return {
+        **training.facts,
+        "parameters": record["parameters"],
+        "optimiser_steps": record["trained"]["steps"],
+        "real": record["samples"]["real"],
+        "simulated": record["samples"]["simulated"],
+        **scores_of(evaluations / training.label),
+    }
+
+
+def compared(wanted: Sequence[Comparison], evaluations: Path) -> list[dict[str, Any]]:
+    """A row for each comparison and stage: mean over seeds in percent, difference from the reference, interval."""
+    rows = []
+    for one in wanted:
+        for stage, human_filter in SHOWN.items():
+            row: dict[str, Any] = {"part": one.part, **one.setup.facts(), "seeds": one.seeds, "stage": stage}
+            row["epdms"] = mean_of(one.setup, one.seeds, evaluations, stage, human_filter)
+            row |= {"reference": "", "difference": "", "low": "", "high": ""}
+            if one.reference is not None:
+                found = compare(
+                    clips_of(one.reference, one.seeds, evaluations), clips_of(one.setup, one.seeds, evaluations), RULES
+                )[stage, human_filter]
+                row |= {"reference": one.reference.label, "difference": 100.0 * found.difference}
+                row |= {"low": 100.0 * found.low, "high": 100.0 * found.high}
+            rows.append(row)
+    return rows
+
+
+RULES = CompareSettings(a="", b="")  # draws, confidence and seed as `python -m planners.compare` has them
+
+
+def clips_of(setup: Setup, seeds: int, evaluations: Path) -> list[list[ClipResult]]:
+    """The scored clips of each seed's training."""
+    return [_clips(evaluations / f"{setup.label}-{seed}") for seed in range(seeds)]
+
+
+@lru_cache(maxsize=None)
+def _clips(folder: Path) -> list[ClipResult]:
+    return by_clip(read_rows(folder))
+
+
+_scores = lru_cache(maxsize=None)(scores_of)
+
+
+def mean_of(setup: Setup, seeds: int, evaluations: Path, stage: str, human_filter: str) -> float:
+    """EPDMS in percent."""
+    name = name_of(stage, human_filter)
+    return float(np.mean([_scores(evaluations / f"{setup.label}-{seed}")[name] for seed in range(seeds)]))
+
+
+def curves_of(rows: Sequence[Mapping[str, Any]]) -> list[Curve]:
+    """Two-stage EPDMS over the number of samples: one curve for each planner, expert, imitation and budget."""
+    usual = {"traffic": "reactive", "sim_ratio": "natural", "psnr": "any", "real_share": 1.0}
+    rows = [row for row in rows if all(row[key] == value for key, value in usual.items())]
+    names = ("planner", "data", "imitation", "budget")
+    kinds = list(dict.fromkeys(tuple(row[name] for name in names) for row in rows if row["rounds"] > 0))
+    score, curves = name_of("final", SHOWN["final"]), []
+    for planner, data, imitation, budget in kinds:
+        mine = [
+            row
+            for row in rows
+            if (row["planner"], row["budget"]) == (planner, budget)
+            and (
+                (row["data"], row["imitation"]) == (data, imitation) or (row["rounds"], row["imitation"]) == (0, "all")
+            )
+        ]
+        points = tuple(Point(row["real"] + row["simulated"], row[score]) for row in mine)
+        if len({point.samples for point in points}) >= FEWEST:
+            law = fit_scaling([p.samples for p in points], [p.score for p in points])
+            label = f"{data}, rewards only" if imitation == "real" else data
+            curves.append(Curve(f"{planner}, equal {budget}", label, points, law))
+    return curves
+
+
+def text_of(wanted: Sequence[Comparison], evaluations: Path) -> str:
+    """The main comparisons' two-stage scores, to be printed."""
+    lines = [f"{'trained on':<52}{'EPDMS':>8}{'difference':>12}   95 % interval"]
+    for row in compared([one for one in wanted if one.part == "main"], evaluations):
+        if row["stage"] == "final":
+            setup = Setup(**{name: row[name] for name in Setup.__dataclass_fields__})
+            line = f"{setup.label:<52}{row['epdms']:8.2f}"
+            if row["reference"]:
+                line += f"{row['difference']:+12.2f}   {row['low']:+.2f} .. {row['high']:+.2f}"
+            lines.append(line)
+    for name in BOUNDS:
+        lines.append(f"{name:<52}{scores_of(evaluations / name)[name_of('final', SHOWN['final'])]:8.2f}")
+    return "\n".join(lines)
+
+
+def main(argv: Sequence[str]) -> int:
+    """The command; returns the exit code."""
+    if {"-h", "--help"} & set(argv):
+        print(__doc__)
+        return 0
+    try:
+        return run(fill(StudySettings, compose("study", argv), "study"))
+    except (ConfigError, ValueError, FileNotFoundError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return BAD_CONFIG
+    except SweepFailed as error:
+        print(f"error: {error}", file=sys.stderr)
+        return FAILED
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

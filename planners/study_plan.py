@@ -1,0 +1,214 @@
+"""What the study compares: setups, each trained with several seeds, and which of them is held against which."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+from planners.sweep import Training
+
+Data = Literal["real", "recovery", "pdm_closed"]
+SHARES = (0.25, 0.5, 1.0)
+RATIOS = (0.25, 0.5, 0.75)
+MULTI = ("diffusiondrive", "gtrs_dense")  # the planners of everything but the main table
+
+
+@dataclass(frozen=True)
+class StudySettings:
+    """The keys of conf/study.yaml."""
+
+    data: str
+    replay: str
+    benchmark: str
+    val: str
+    out: str
+    report: str
+    planners: dict[str, str]
+    vocabulary: str
+    rounds: int
+    seeds: int
+    curve_seeds: int
+    epochs: int
+    steps: int
+    psnr_db: float
+    parts: tuple[str, ...]
+    jobs: int | None = None
+    minutes: float | None = None
+
+    def __post_init__(self) -> None:
+        unknown = sorted(set(self.parts) - set(PARTS))
+        if unknown or not self.parts:
+            raise ValueError(f"parts={list(self.parts)}: some of {', '.join(PARTS)}")
+        missing = sorted({"ltf", *MULTI} - set(self.planners))
+        if missing:
+            raise ValueError(f"planners lacks {', '.join(missing)}")
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What one planner is trained on, and how long."""
+
+    planner: str
+    data: Data  # real samples, and those of this expert
+    rounds: int  # simulated ones, 0 with real samples alone
+    budget: Literal["epochs", "steps"]  # equal passes over its own data (the paper), or equal optimiser steps
+    imitation: Literal["all", "real", "none"] = "all"
+    traffic: Literal["reactive", "replay"] = "reactive"
+    sim_ratio: float | Literal["natural"] = "natural"
+    psnr: Literal["any", "low", "high"] = "any"
+    real_share: float = 1.0
+
+    @property
+    def label(self) -> str:
+        """Names it; what is as usual is left out."""
+        parts = [self.planner, self.data if self.rounds == 0 else f"{self.data}{self.rounds}", self.budget]
+        parts += {"all": [], "real": ["rewards_only"], "none": ["no_imitation"]}[self.imitation]
+        parts += [self.traffic] if self.traffic != "reactive" else []
+        parts += [f"ratio{self.sim_ratio}"] if self.sim_ratio != "natural" else []
+        parts += [f"psnr_{self.psnr}"] if self.psnr != "any" else []
+        parts += [f"share{self.real_share}"] if self.real_share < 1.0 else []
+        return "-".join(parts)
+
+    def training(self, settings: StudySettings, seed: int, matched: int | None) -> Training:
+        """matched: simulated samples where their number is held equal, as for psnr."""
+        simulated = settings.replay if self.traffic == "replay" else settings.data
+        overrides = [
+            f"planner={settings.planners[self.planner]}",
+            f"data.real=[{settings.data}]",
+            f"data.sim=[{simulated if self.rounds else ''}]",
+            f"data.val=[{settings.val}]",
+            f"data.real_share={self.real_share}",
+            f"mix.imitation={self.imitation}",
+            f"mix.sim_ratio={self.sim_ratio}",
+            f"planner.training.epochs={settings.epochs}",
+            f"seed={seed}",
+            "workers=1",
+            "validate_every=100",
+        ]
+        if self.planner == "gtrs_dense":
+            overrides.append(f"planner.settings.vocabulary={settings.vocabulary}")
+        if self.budget == "steps":
+            overrides.append(f"steps={settings.steps}")
+        if self.rounds:
+            overrides += [f"data.experts=[{self.data}]", f"data.max_round={self.rounds - 1}"]
+        if self.psnr == "low":
+            overrides += [f"data.psnr_max={settings.psnr_db}"]
+        elif self.rounds:
+            overrides += [f"data.psnr_min={settings.psnr_db}"]
+        if matched is not None and self.psnr != "any":
+            overrides += [f"data.limit_sim={matched}"]
+        return Training(f"{self.label}-{seed}", tuple(overrides), {**self.facts(), "seed": seed})
+
+    def facts(self) -> dict[str, Any]:
+        """Its columns in the tables."""
+        return dict(vars(self))
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A setup, and the one that it is held against; None: it is itself what others are held against."""
+
+    part: str
+    setup: Setup
+    reference: Setup | None
+    seeds: int
+
+
+def comparisons(settings: StudySettings) -> list[Comparison]:
+    """All of the chosen parts."""
+    return [found for part in settings.parts for found in PARTS[part](settings)]
+
+
+def _main(settings: StudySettings) -> Iterator[Comparison]:
+    for planner in settings.planners:
+        for budget in BUDGETS:
+            real = Setup(planner, "real", 0, budget)
+            yield Comparison("main", real, None, settings.seeds)
+            for expert in EXPERTS:
+                yield Comparison("main", Setup(planner, expert, settings.rounds, budget), real, settings.seeds)
+            if planner == "gtrs_dense":
+                alone = Setup(planner, "pdm_closed", settings.rounds, budget, imitation="real")
+                yield Comparison("main", alone, real, settings.seeds)
+
+
+def _rounds(settings: StudySettings) -> Iterator[Comparison]:
+    for base in _series():
+        for budget in BUDGETS:
+            real = Setup(base.planner, "real", 0, budget)
+            yield Comparison("rounds", real, None, settings.curve_seeds)
+            for rounds in range(1, settings.rounds + 1):
+                setup = replace(base, rounds=rounds, budget=budget)
+                yield Comparison("rounds", setup, real, settings.curve_seeds)
+
+
+def _traffic(settings: StudySettings) -> Iterator[Comparison]:
+    for planner in MULTI:
+        for rounds in sorted({1, (settings.rounds + 1) // 2, settings.rounds}):
+            for budget in BUDGETS:
+                reactive = Setup(planner, "pdm_closed", rounds, budget)
+                yield Comparison("traffic", reactive, None, settings.curve_seeds)
+                yield Comparison("traffic", replace(reactive, traffic="replay"), reactive, settings.curve_seeds)
+
+
+def _ratio(settings: StudySettings) -> Iterator[Comparison]:
+    for planner in MULTI:
+        for budget in BUDGETS:
+            natural = Setup(planner, "pdm_closed", settings.rounds, budget)
+            yield Comparison("ratio", natural, None, settings.curve_seeds)
+            for ratio in RATIOS:
+                yield Comparison("ratio", replace(natural, sim_ratio=ratio), natural, settings.curve_seeds)
+
+
+def _psnr(settings: StudySettings) -> Iterator[Comparison]:
+    for planner in MULTI:
+        for budget in BUDGETS:
+            low = Setup(planner, "pdm_closed", settings.rounds, budget, psnr="low")
+            yield Comparison("psnr", low, None, settings.curve_seeds)
+            yield Comparison("psnr", replace(low, psnr="high"), low, settings.curve_seeds)
+
+
+def _rewards(settings: StudySettings) -> Iterator[Comparison]:
+    """With real samples alone: is imitation needed there?"""
+    for budget in BUDGETS:
+        real = Setup("gtrs_dense", "real", 0, budget)
+        yield Comparison("rewards", real, None, settings.curve_seeds)
+        yield Comparison("rewards", replace(real, imitation="none"), real, settings.curve_seeds)
+
+
+def _real_share(settings: StudySettings) -> Iterator[Comparison]:
+    for planner in MULTI:
+        imitation: Literal["all", "real"] = "real" if planner == "gtrs_dense" else "all"
+        for share in SHARES:
+            for budget in BUDGETS:
+                real = Setup(planner, "real", 0, budget, real_share=share)
+                both = Setup(planner, "pdm_closed", settings.rounds, budget, imitation=imitation, real_share=share)
+                yield Comparison("real_share", real, None, settings.curve_seeds)
+                yield Comparison("real_share", both, real, settings.curve_seeds)
+
+
+def _series() -> Sequence[Setup]:
+    """What is drawn over rounds."""
+    imitating = [Setup(planner, expert, 1, "epochs") for planner in MULTI for expert in EXPERTS]
+    return [*imitating, Setup("gtrs_dense", "pdm_closed", 1, "epochs", imitation="real")]
+
+
+BUDGETS: tuple[Literal["epochs", "steps"], ...] = ("epochs", "steps")
+EXPERTS: tuple[Data, ...] = ("recovery", "pdm_closed")
+PARTS = {
+    "main": _main,
+    "rounds": _rounds,
+    "traffic": _traffic,
+    "ratio": _ratio,
+    "psnr": _psnr,
+    "rewards": _rewards,
+    "real_share": _real_share,
+}
+
+
+def trainings(found: Sequence[Comparison], settings: StudySettings, matched: int | None) -> list[Training]:
+    """Every setup with every seed that some comparison asks for, each once."""
+    seeds: dict[Setup, int] = {}
+    for one in found:
+        for setup in (one.setup, one.reference):
+            if setup is not None:
+                seeds[setup] = max(seeds.get(setup, 0), one.seeds)
+    return [setup.training(settings, seed, matched) for setup, count in seeds.items() for seed in range(count)]
