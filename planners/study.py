@@ -13,7 +13,7 @@ steps, since more data in equal passes is more training as well. Tables go to `r
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -114,12 +114,12 @@ def clips_of(setup: Setup, seeds: int, evaluations: Path) -> list[list[ClipResul
     return [_clips(evaluations / f"{setup.label}-{seed}") for seed in range(seeds)]
 
 
-@lru_cache(maxsize=None)
+@cache
 def _clips(folder: Path) -> list[ClipResult]:
     return by_clip(read_rows(folder))
 
 
-_scores = lru_cache(maxsize=None)(scores_of)
+_scores = cache(scores_of)
 
 
 def mean_of(setup: Setup, seeds: int, evaluations: Path, stage: str, human_filter: str) -> float:
