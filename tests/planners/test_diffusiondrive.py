@@ -8,7 +8,8 @@ import torch
 from omegaconf import OmegaConf
 
 from factory.config import conf_dir, fill
-from planners.batch import Batch, BevLayout
+from planners.anchors import cluster_anchors
+from planners.batch import Batch, BevLayout, ImageLayout
 from planners.diffusiondrive import DiffusionDrive, DiffusionDriveSettings
 from planners.optim import TrainingSettings
 from planners.planner import TrainingData
@@ -19,17 +20,17 @@ TINY = DiffusionDriveSettings(
     image=scenes.PICTURE,
     bev=BevLayout(cell_m=8.0),
     fusion=scenes.FUSION,
-    width=64,
-    hidden=128,
+    width=48,
+    hidden=96,
     heads=2,
     layers=1,
     agents=3,
 )
 
 
-def scene_batch(n: int) -> Batch:
+def scene_batch(n: int, image: ImageLayout = TINY.image) -> Batch:
     plans, colours = scenes.four_ways(n)
-    return scenes.with_surroundings(scenes.batch(n, plans, colours=colours), TINY.bev, TINY.agents)
+    return scenes.with_surroundings(scenes.batch(n, plans, image, colours), TINY.bev, TINY.agents)
 
 
 def planner(settings: DiffusionDriveSettings = TINY, n_anchors: int = WAYS) -> DiffusionDrive:
@@ -114,6 +115,40 @@ def test_anchors_come_from_a_file_or_from_the_plans_to_be_trained_on(tmp_path) -
     np.save(file, made)
     again = DiffusionDrive.fixed_arrays(replace(TINY, anchors=str(file)), TrainingData(lambda: np.zeros(0), None))
     assert np.array_equal(again["anchors"], made)
+
+
+@pytest.mark.slow
+def test_it_learns_32_pictures_by_heart() -> None:
+    """Status and command are the same for all: who does not look is metres off."""
+    settings = replace(
+        TINY,
+        image=ImageLayout(width=32, height=32),
+        fusion=replace(scenes.FUSION, image_tokens=(1, 1)),
+        offsets_from="anchors",
+        dropout=0.0,
+        confidence_weight=50.0,
+        agent_class_weight=0.1,
+        agent_box_weight=0.01,
+        bev_weight=0.1,
+    )
+    torch.manual_seed(0)
+    batch = scene_batch(32, settings.image)
+    model = DiffusionDrive(settings, {"anchors": cluster_anchors(batch.plan_2hz.numpy(), WAYS, seed=0)})
+    optimiser = torch.optim.Adam(model.parameters(), betas=(0.9, 0.99))
+    steps, error_m = 400, float("inf")
+    for step in range(steps):
+        optimiser.param_groups[0]["lr"] = 5e-3 * min((step + 1) / 30, 1 - step / steps)
+        optimiser.zero_grad()
+        summed(model(batch)).backward()
+        optimiser.step()
+        if step >= 240 and step % 10 == 0:
+            error_m = (model.plan(batch) - batch.plan_2hz)[..., :2].norm(dim=-1).mean().item()
+            if error_m < 0.1:
+                break
+    assert error_m < 0.1
+    assert batch.image is not None
+    blind = model.plan(replace(batch, image=torch.full_like(batch.image, 128)))
+    assert (blind - batch.plan_2hz)[..., :2].norm(dim=-1).mean() > 1.0
 
 
 def test_a_batch_that_lacks_something_is_refused() -> None:
