@@ -14,7 +14,7 @@ import os
 import shutil
 import zipfile
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from safetensors.torch import load_file, save_file
 
 from factory.config import ConfigError
 from planners.planner import Planner
-from planners.registry import PlannerChoice, build_planner
+from planners.registry import PlannerChoice, build_planner, planner_class
 
 FOLDER = "checkpoints"
 RECORD, WEIGHTS, ARRAYS, TRAINING = "record.json", "weights.safetensors", "arrays.npz", "training.pt"
@@ -86,16 +86,25 @@ def read_record(path: Path) -> dict[str, Any]:
     return record
 
 
-def load_planner(path: str | Path) -> Planner:
-    """The trained planner of a checkpoint or a training's newest one, ready to plan. Raises ConfigError."""
+def load_planner(path: str | Path, changed: Mapping[str, Any] | None = None) -> Planner:
+    """The trained planner of a checkpoint or a training's newest one, ready to plan.
+
+    changed: settings of planning alone (`Planner.free_settings`) that are to be others than it was trained with.
+    Raises ConfigError.
+    """
     folder = newest(Path(path))
     record = read_record(folder)
+    choice = PlannerChoice(**record["planner"])
+    bound = sorted(set(changed or {}) - planner_class(choice.name).free_settings)
+    if bound:
+        free = ", ".join(sorted(planner_class(choice.name).free_settings)) or "none"
+        raise ConfigError(f"{folder}: {', '.join(bound)} of {choice.name} cannot change after training; free: {free}")
+    choice = replace(choice, settings={**choice.settings, **(changed or {})})
     try:
         with np.load(folder / ARRAYS, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
     except (OSError, ValueError, zipfile.BadZipFile) as error:
         raise ConfigError(f"{folder / ARRAYS}: {error}: restore the checkpoint") from error
-    choice = PlannerChoice(**record["planner"])
     planner = build_planner(choice, arrays)
     load_weights(planner, folder)
     return planner.eval()

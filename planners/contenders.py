@@ -3,6 +3,7 @@
     human, pdm_closed          bounds that know the world: the log's own drive, and the privileged planner
     constant_velocity          needs no training
     runs/my_training           a training's folder or one of its checkpoints
+    runs/a+runs/b              the ensemble of several trainings of gtrs_dense
     my.module:MyPlanner        a class, or anything called without arguments, of a user's own package
 
 A user's planner has one of two faces:
@@ -17,6 +18,7 @@ has a text `digest`, that tells its versions apart, else the bytes of its module
 import hashlib
 import importlib
 import inspect
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -26,6 +28,8 @@ from typing import Any
 from factory.config import ConfigError, compose
 from planners import checkpoint
 from planners.batch import Needs
+from planners.ensemble import Ensemble
+from planners.gtrs_dense import GtrsDense
 from planners.planner import Planner
 from planners.registry import BUILT_IN, PlannerChoice, build_planner
 from planners.scoring import Plans, PreparedClip, human_plans, pdm_plans
@@ -46,16 +50,19 @@ class Contender:
     privileged: Privileged | None = None
 
 
-def contender(spec: str, label: str | None = None) -> Contender:
-    """Who `spec` names. Raises ConfigError where it is nobody."""
+def contender(spec: str, label: str | None = None, changed: Mapping[str, Any] | None = None) -> Contender:
+    """Who `spec` names; changed: settings of trained planners, see load_planner. Raises ConfigError for nobody."""
     name = label or spec.strip("/").replace("/", "_").replace(":", ".")
     if spec in PRIVILEGED:
         return Contender(name, spec, privileged=PRIVILEGED[spec])
     if spec in UNTRAINED:
         return Contender(name, spec, partial(_built, spec))
-    if Path(spec).is_dir():
-        newest = checkpoint.newest(Path(spec))  # now: a training may go on and write others
-        return Contender(name, checkpoint.digest(newest), partial(checkpoint.load_planner, newest))
+    members = spec.split("+")
+    if all(Path(member).is_dir() for member in members):
+        newest = [checkpoint.newest(Path(member)) for member in members]  # now: trainings may go on and write others
+        parts = [*map(checkpoint.digest, newest), *([json.dumps(changed, sort_keys=True)] if changed else [])]
+        digest = parts[0] if len(parts) == 1 else hashlib.sha256(" ".join(parts).encode()).hexdigest()[:16]
+        return Contender(name, digest, partial(_trained, newest, changed))
     if ":" in spec:
         made = _imported(spec)
         return Contender(name, _digest_of(made), lambda: made)
@@ -66,7 +73,10 @@ def contender(spec: str, label: str | None = None) -> Contender:
 
 
 def contenders(
-    planner: str | None, planners: Sequence[str] | Mapping[str, str] | None, bounds: bool
+    planner: str | None,
+    planners: Sequence[str] | Mapping[str, str] | None,
+    bounds: bool,
+    changed: Mapping[str, Any] | None = None,
 ) -> list[Contender]:
     """All that are asked for, each once, the bounds first. Raises ConfigError for nobody, or two of one label."""
     named: list[tuple[str | None, str]] = []
@@ -78,7 +88,7 @@ def contenders(
     if not named:
         raise ConfigError("planner is missing: give planner=<training folder> or planners=[human,...]")
     first = [(None, name) for name in (*PRIVILEGED, *UNTRAINED) if bounds]
-    found = [contender(spec, label) for label, spec in dict.fromkeys([*first, *named])]
+    found = [contender(spec, label, changed) for label, spec in dict.fromkeys([*first, *named])]
     labels = [one.label for one in found]
     twice = sorted({label for label in labels if labels.count(label) > 1})
     if twice:
@@ -99,6 +109,21 @@ def composed(name: str, argv: Sequence[str]) -> dict[str, Any]:
 def needs_of(made: Any) -> Needs | None:
     """What a planner reads of a batch; None: it takes samples."""
     return getattr(made, "needs", None)
+
+
+def _trained(folders: Sequence[Path], changed: Mapping[str, Any] | None) -> Planner | Ensemble:
+    """One planner, or the ensemble of several. Raises ConfigError where they cannot be one."""
+    models = [(str(folder), checkpoint.load_planner(folder, changed)) for folder in folders]
+    if len(models) == 1:
+        return models[0][1]
+    scoring = [(name, model) for name, model in models if isinstance(model, GtrsDense)]
+    others = [f"{name} ({model.name})" for name, model in models if not isinstance(model, GtrsDense)]
+    if others:
+        raise ConfigError(f"an ensemble averages the scores of gtrs_dense models, not {', '.join(others)}")
+    try:
+        return Ensemble(scoring).eval()
+    except ValueError as error:
+        raise ConfigError(f"ensemble: {error}") from error
 
 
 def _built(name: str) -> Planner:

@@ -3,6 +3,7 @@
     python -m planners.evaluate benchmark=runs/hard planner=runs/ltf
     python -m planners.evaluate benchmark=runs/hard planners=[runs/ltf,human,my.module:MyPlanner] out=eval
     python -m planners.evaluate benchmark=runs/hard planners={real: runs/a, with_sim: runs/b}
+    python -m planners.evaluate benchmark=runs/hard planner=runs/gtrs +settings.inference_entries=8192
 
 The benchmark is the folder that `python -m factory.run preset=hard_benchmark` made. Who may stand under `planner=`, and
 what a planner of one's own looks like, planners/contenders.py says. Every planner gets a folder: its plans, a row of
@@ -23,6 +24,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 from factory.config import ConfigError, conf_dir, fill
 from planners.aggregation import SummaryLine, lines_of, summarise
@@ -52,6 +54,7 @@ class EvaluateSettings:
     out: str
     planner: str | None = None
     planners: list[str] | dict[str, str] | None = None
+    settings: dict[str, Any] = field(default_factory=dict)  # of planning, of all trained planners
     bounds: bool = True  # human, pdm_closed and constant_velocity too
     one_stage_traffic: TrafficSettings = field(default_factory=lambda: TrafficSettings(mode="replay"))
     two_stage_traffic: TrafficSettings = field(default_factory=TrafficSettings)
@@ -175,7 +178,9 @@ def main(argv: Sequence[str]) -> int:
     try:
         settings = settings_of(argv)
         benchmark = BenchmarkFolder(settings.benchmark)
-        lines = evaluate(benchmark, contenders(settings.planner, settings.planners, settings.bounds), settings)
+        lines = evaluate(
+            benchmark, contenders(settings.planner, settings.planners, settings.bounds, settings.settings), settings
+        )
     except (ConfigError, FileNotFoundError) as error:
         print(f"error: {error}", file=sys.stderr)
         return BAD_CONFIG

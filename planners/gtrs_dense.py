@@ -110,6 +110,7 @@ class GtrsDense(Planner):
 
     name: ClassVar[str] = "gtrs_dense"
     settings_type: ClassVar[type] = GtrsDenseSettings
+    free_settings = frozenset({"weighting", "inference_entries"})
     settings: GtrsDenseSettings
 
     def __init__(self, settings: GtrsDenseSettings, arrays: Mapping[str, FloatArray]) -> None:

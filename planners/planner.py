@@ -40,6 +40,7 @@ class Planner(nn.Module, ABC):
 
     name: ClassVar[str]
     settings_type: ClassVar[type]  # the frozen dataclass that `settings` is
+    free_settings: ClassVar[frozenset[str]] = frozenset()  # of planning alone: they may be changed after training
 
     def __init__(self, settings: Any, arrays: Mapping[str, FloatArray]) -> None:
         """settings: the planner's own frozen dataclass. Raises ValueError where an array has the wrong shape."""
