@@ -29,7 +29,7 @@ from planners.scaling_law import FEWEST, fit_scaling
 from planners.score_rows import read_rows
 from planners.scores import name_of, scores_of, write_csv
 from planners.study_figures import draw_learning
-from planners.study_plan import Comparison, Setup, StudySettings, comparisons, trainings
+from planners.study_plan import Comparison, Setup, StudySettings, comparisons, ensembles, trainings
 from planners.sweep import Means, SweepFailed, Training, evaluate_all, folder_of, train_all
 
 BAD_CONFIG, FAILED, INTERRUPTED = 2, 3, 4
@@ -45,7 +45,7 @@ def run(settings: StudySettings) -> int:
     if not train_all(planned, out, Means(jobs=settings.jobs, minutes=settings.minutes)):
         print("not all trainings are done: the same command goes on", file=sys.stderr)
         return INTERRUPTED
-    evaluations = evaluate_all(planned, out, settings.benchmark)
+    evaluations = evaluate_all(planned, out, settings.benchmark, others=ensembles(wanted, out))
     report.mkdir(parents=True, exist_ok=True)
     rows = [row_of(training, out, evaluations) for training in planned]
     write_csv(report / "trainings.csv", rows)

@@ -2,13 +2,15 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal
 
-from planners.sweep import Training
+from planners.sweep import TRAININGS, Training
 
 Data = Literal["real", "recovery", "pdm_closed"]
 SHARES = (0.25, 0.5, 1.0)
 RATIOS = (0.25, 0.5, 0.75)
+ENSEMBLE = "ensemble"  # stands for a planner; nothing is trained for it
 MULTI = ("diffusiondrive", "gtrs_dense")  # the planners of everything but the main table
 
 
@@ -185,6 +187,22 @@ def _real_share(settings: StudySettings) -> Iterator[Comparison]:
                 yield Comparison("real_share", both, real, settings.curve_seeds)
 
 
+def _ensemble(settings: StudySettings) -> Iterator[Comparison]:
+    """The mean of what three kinds of data taught, held against rewards alone, as in the paper."""
+    for budget in BUDGETS:
+        for member in members_of(budget, settings.rounds):
+            yield Comparison("ensemble", member, None, settings.curve_seeds)
+        alone = members_of(budget, settings.rounds)[-1]
+        together = Setup(ENSEMBLE, "pdm_closed", settings.rounds, budget)
+        yield Comparison("ensemble", together, alone, settings.curve_seeds)
+
+
+def members_of(budget: Literal["epochs", "steps"], rounds: int) -> list[Setup]:
+    """Of an ensemble: recovery, planner, rewards only."""
+    imitating = [Setup("gtrs_dense", expert, rounds, budget) for expert in EXPERTS]
+    return [*imitating, replace(imitating[-1], imitation="real")]
+
+
 def _series() -> Sequence[Setup]:
     """What is drawn over rounds."""
     imitating = [Setup(planner, expert, 1, "epochs") for planner in MULTI for expert in EXPERTS]
@@ -201,6 +219,7 @@ PARTS = {
     "psnr": _psnr,
     "rewards": _rewards,
     "real_share": _real_share,
+    "ensemble": _ensemble,
 }
 
 
@@ -209,6 +228,18 @@ def trainings(found: Sequence[Comparison], settings: StudySettings, matched: int
     seeds: dict[Setup, int] = {}
     for one in found:
         for setup in (one.setup, one.reference):
-            if setup is not None:
+            if setup is not None and setup.planner != ENSEMBLE:
                 seeds[setup] = max(seeds.get(setup, 0), one.seeds)
     return [setup.training(settings, seed, matched) for setup, count in seeds.items() for seed in range(count)]
+
+
+def ensembles(found: Sequence[Comparison], out: Path) -> dict[str, str]:
+    """Label -> trainings joined by plus, as planners.evaluate takes them."""
+    specs = {}
+    for one in found:
+        if one.setup.planner == ENSEMBLE:
+            members = members_of(one.setup.budget, one.setup.rounds)
+            for seed in range(one.seeds):
+                folders = [str(out / TRAININGS / f"{member.label}-{seed}") for member in members]
+                specs[f"{one.setup.label}-{seed}"] = "+".join(folders)
+    return specs

@@ -20,7 +20,7 @@ from typing import Any, Literal
 
 from planners.progress import Counter
 
-DONE, LOG = "sweep.json", "train.log"
+TRAININGS, DONE, LOG = "trainings", "sweep.json", "train.log"
 INTERRUPTED = 4
 LOOK_EVERY_S = 0.5
 
@@ -51,7 +51,7 @@ class SweepFailed(Exception):
 
 def folder_of(out: Path, training: Training) -> Path:
     """Where a training lies under the sweep's folder."""
-    return out / "trainings" / training.label
+    return out / TRAININGS / training.label
 
 
 def is_done(out: Path, training: Training) -> bool:
@@ -143,13 +143,16 @@ def _stops(stop: threading.Event, minutes: float | None) -> Iterator[None]:
             signal.signal(what, handler)
 
 
-def evaluate_all(trainings: Sequence[Training], out: Path, benchmark: str, *more: str) -> Path:
+def evaluate_all(
+    trainings: Sequence[Training], out: Path, benchmark: str, *more: str, others: Mapping[str, str] | None = None
+) -> Path:
     """Evaluate all trainings on a benchmark; those that are evaluated already are not again. Returns the folder.
 
-    more: further overrides of planners.evaluate. Raises SweepFailed.
+    more: further overrides of planners.evaluate; others: further planners, by label. Raises SweepFailed.
     """
     evaluations = out / "evaluations"
-    named = ",".join(f"{training.label}: '{folder_of(out, training)}'" for training in trainings)
+    who = {training.label: str(folder_of(out, training)) for training in trainings} | dict(others or {})
+    named = ",".join(f"{label}: '{spec}'" for label, spec in who.items())
     command = [sys.executable, "-m", "planners.evaluate", f"benchmark={benchmark}", f"planners={{{named}}}", *more]
     environment = {"OMP_NUM_THREADS": "1", **os.environ}
     code = subprocess.run([*command, f"out={evaluations}"], env=environment).returncode  # noqa: S603 - a list, no shell

@@ -1,0 +1,78 @@
+"""The study's plan: what is compared with what, and that nothing is trained twice."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from factory.config import compose, fill
+from planners.study_plan import ENSEMBLE, PARTS, StudySettings, comparisons, ensembles, trainings
+
+
+def settings(**changes: Any) -> StudySettings:
+    values = compose("study", ["vocabulary=voc.npy"])
+    return fill(StudySettings, {**values, **changes}, "study")
+
+
+def test_every_family_is_trained_with_and_without_simulation_in_equal_epochs_and_in_equal_steps() -> None:
+    found = comparisons(settings(parts=("main",)))
+    for planner in ("ltf", "diffusiondrive", "gtrs_dense"):
+        for budget in ("epochs", "steps"):
+            mine = [c for c in found if (c.setup.planner, c.setup.budget) == (planner, budget)]
+            assert {c.setup.data for c in mine} == {"real", "recovery", "pdm_closed"}
+            for one in mine:
+                assert (one.reference is None) == (one.setup.rounds == 0)
+                if one.reference is not None:
+                    assert (one.reference.planner, one.reference.data, one.reference.budget) == (
+                        planner,
+                        "real",
+                        budget,
+                    )
+
+
+def test_a_training_is_planned_once_with_as_many_seeds_as_anyone_asks_for() -> None:
+    everything = settings()
+    planned = trainings(comparisons(everything), everything, matched=7)
+    labels = [training.label for training in planned]
+    assert len(set(labels)) == len(labels) == len({training.overrides for training in planned})
+    assert {t.facts["seed"] for t in planned if t.label.startswith("gtrs_dense-pdm_closed5-steps-")} >= {0, 1, 2}
+
+
+def test_a_setup_differs_from_its_reference_in_what_its_part_is_about() -> None:
+    about = {"traffic": "traffic", "ratio": "sim_ratio", "psnr": "psnr", "rewards": "imitation"}
+    for one in comparisons(settings()):
+        if one.reference is not None and one.part in about:
+            differs = {k for k, v in one.setup.facts().items() if v != one.reference.facts()[k]}
+            assert differs == {about[one.part]}, one
+
+
+def test_budgets_and_bounds_become_overrides() -> None:
+    everything = settings()
+    by_label = {t.label: t.overrides for t in trainings(comparisons(everything), everything, matched=7)}
+    assert not any(o.startswith("steps=") for o in by_label["ltf-real-epochs-0"])
+    assert f"steps={everything.steps}" in by_label["ltf-real-steps-0"]
+    low, high = (by_label[f"gtrs_dense-pdm_closed5-epochs-psnr_{side}-1"] for side in ("low", "high"))
+    assert {"data.psnr_max=27.0", "data.limit_sim=7"} <= set(low)
+    assert {"data.psnr_min=27.0", "data.limit_sim=7"} <= set(high)
+    assert "data.psnr_min=27.0" in by_label["ltf-recovery5-epochs-0"]
+    assert f"data.sim=[{everything.replay}]" in by_label["gtrs_dense-pdm_closed1-epochs-replay-0"]
+
+
+def test_ensembles_are_made_of_trainings_that_are_planned(tmp_path: Path) -> None:
+    chosen = settings(parts=("ensemble",))
+    found = comparisons(chosen)
+    planned = {str(tmp_path / "trainings" / t.label) for t in trainings(found, chosen, None)}
+    specs = ensembles(found, tmp_path)
+    assert len(specs) == 2 * chosen.curve_seeds
+    for label, spec in specs.items():
+        assert label.startswith(ENSEMBLE)
+        assert set(spec.split("+")) <= planned
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"), [({"parts": ["mian"]}, "parts="), ({"planners": {"ltf": "ltf"}}, "planners lacks")]
+)
+def test_plans_that_cannot_be_are_refused(changes: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        settings(**changes)
+    assert set(compose("study", ["vocabulary=v"])["parts"]) == set(PARTS)
