@@ -4,7 +4,7 @@ VENV   := .venv
 PY     := $(VENV)/bin/python
 DEMO   := runs/demo
 
-.PHONY: install demo test unit lint format bench bench-reward bench-render bench-loader clean
+.PHONY: install demo test unit lint format bench bench-reward bench-render bench-loader bench-planners study study-data clean
 
 install: $(VENV)/.installed
 
@@ -50,6 +50,26 @@ bench-render: install
 # TABLE=<out of a run with images> takes its pictures, THREADS=<n> as many threads as the machine has cores.
 bench-loader: install
 	OMP_NUM_THREADS=1 $(PY) -m tests.bench.bench_loader threads=$(or $(THREADS),2) $(if $(TABLE),table=$(TABLE))
+
+# DEVICE=cuda: one training step of every planner at the paper's settings, samples/s and memory.
+bench-planners: install
+	$(PY) -m tests.bench.bench_planners device=$(or $(DEVICE),cpu)
+
+# The co-training study of docs/study.md. MINUTES=25: a part of it; the same command goes on where it stopped.
+STUDY := runs/study
+TRAIN := clips=synthetic_towns clips.first_seed=1 clips.n_towns=17 clips.logs_per_town=3 clips.split=train
+HELD  := clips=synthetic_towns clips.first_seed=101 clips.n_towns=6 clips.logs_per_town=6 clips.first_window=1 clips.split=test
+TOWN  := render=town render.psnr_gate=mark $(if $(MINUTES),minutes=$(MINUTES))
+LABEL := vocabulary.k=32768 reward.label_vocabulary=$(STUDY)/labels.npy
+
+study-data: install
+	test -f $(STUDY)/labels.npy || $(PY) -m factory.vocabulary kinematic=true k=1024 out=$(STUDY)/labels.npy
+	$(PY) -m factory.run $(TRAIN) $(TOWN) $(LABEL) rounds=5 out=$(STUDY)/train
+	$(PY) -m factory.run $(TRAIN) $(TOWN) $(LABEL) rounds=5 traffic=replay experts=[pdm_closed] out=$(STUDY)/replay
+	$(PY) -m factory.run preset=hard_benchmark $(HELD) $(TOWN) vocabulary.k=131072 out=$(STUDY)/hard
+
+study: install
+	OMP_NUM_THREADS=1 $(PY) -m planners.study vocabulary=$(STUDY)/labels.npy $(if $(MINUTES),minutes=$(MINUTES))
 
 clean:
 	rm -rf $(VENV) runs build *.egg-info

@@ -58,11 +58,13 @@ def execute(
     ray_address: str | None = None,
     shard_bytes: int = SHARD_BYTES,
     shard_seconds: float = SHARD_SECONDS,
+    minutes: float | None = None,
     say: Callable[[str], None] = print,
 ) -> RunSummary:
     """Make the samples of `rounds` rounds for every clip and expert, as far as the store does not hold them already.
 
     workers: processes of a local Ray cluster, None: one per CPU. retry: try failed(input | bug) attempts again too.
+    minutes: after which nothing new is begun, as after an interruption.
     Bad wishes come back as exit code 2 with a message and nothing written; see the module's codes for the others.
     """
     if not refs or not experts or rounds < 1:
@@ -98,7 +100,7 @@ def execute(
     try:
         store.begin(records)
         if graph is not None:
-            with _stop_signals(driver.stop):
+            with _stop_signals(driver.stop), _alarm(driver.stop, minutes):
                 driver.loop(graph, Gatherer(graph, store, shard_bytes, shard_seconds))
         code = COMPLETE_WITH_FAILURES if driver.has_failures else COMPLETE
         if driver.interrupted:
@@ -147,6 +149,21 @@ def _stop_signals(stop: Callable[[], None]) -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def _alarm(stop: Callable[[], None], minutes: float | None) -> Iterator[None]:
+    """Drains the run after so many minutes."""
+    timer = threading.Timer(60.0 * (minutes or 0.0), stop)
+    timer.daemon = True
+    if minutes == 0.0:
+        stop()
+    elif minutes is not None:
+        timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def _counts(plan: Plan) -> dict[str, int]:

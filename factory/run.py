@@ -110,6 +110,7 @@ def run(overrides: Sequence[str]) -> int:
         config.workers,
         on_change=config.on_change,
         retry=config.retry_failed,
+        minutes=config.minutes,
     )
     if summary.message:
         print(summary.message, file=sys.stderr)

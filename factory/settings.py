@@ -103,6 +103,7 @@ class RunConfig:
     out: str
     on_change: Literal["stop", "keep", "redo"]
     retry_failed: bool
+    minutes: float | None
     dry_run: bool
 
     def __post_init__(self) -> None:
@@ -110,6 +111,8 @@ class RunConfig:
             raise ValueError(f"rounds={self.rounds}: at least one round is needed")
         if not self.experts or len(set(self.experts)) != len(self.experts):
             raise ValueError(f"experts={list(self.experts)}: name each expert once, at least one")
+        if self.minutes is not None and not self.minutes >= 0.0:
+            raise ValueError(f"minutes={self.minutes}: must not be negative, or null for no bound")
         for name in ("limit", "workers"):
             value = getattr(self, name)
             if value is not None and value < 1:

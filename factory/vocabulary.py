@@ -1,6 +1,7 @@
 """`python -m factory.vocabulary`: vocabularies and recovery tables out of a data set's own TRAIN logs.
 
     python -m factory.vocabulary clips=av2 clips.root=<logs> k=1024 out=vocabulary.npy
+    python -m factory.vocabulary kinematic=true k=1024 out=labels.npy
     python -m factory.vocabulary clips=av2 clips.root=<logs> table=recovery.npz vocabularies=[human_8192x40x3.npy]
 
 `clips` and `clips.*` are those of `python -m factory.run`; the other keys are the fields of `VocabularySettings`.
@@ -25,6 +26,7 @@ from numpy.typing import NDArray
 from factory.clips.reader import BadClip, ClipReader
 from factory.config import ConfigError, build, compose, fill
 from tasks.experts.recovery import RecoveryTable
+from tasks.kinematic_vocabulary import kinematic_trajectories
 from tasks.vocabulary import Vocabulary, checked_trajectories, cluster, human_windows
 from tasks.world.clip import CLIP_STEPS, HORIZON_STEPS, STEP_S
 
@@ -43,6 +45,13 @@ class VocabularySettings:
     table: str | None = None  # a recovery table: .npz, with a .json beside it
     vocabularies: tuple[str, ...] = ()  # files whose trajectories go into the table too
     every_s: float = 0.5  # a window starts this often
+    kinematic: bool = (
+        False  # out: k seeded kinematic trajectories, as a run without vocabulary.file has; reads no clips
+    )
+
+    def __post_init__(self) -> None:
+        if self.kinematic and (self.out is None or self.table is not None):
+            raise ValueError("kinematic=true makes a vocabulary: give out=<file>.npy, and no table")
 
 
 @dataclass(frozen=True)
@@ -200,6 +209,14 @@ def run(settings: VocabularySettings, reader: ClipReader) -> list[str]:
     return lines
 
 
+def write_kinematic(settings: VocabularySettings) -> str:
+    """Writes the kinematic vocabulary of `k` and `seed`; a line of report."""
+    assert settings.out is not None
+    vocabulary = Vocabulary(kinematic_trajectories(settings.k, settings.seed), source="kinematic")
+    save_vocabulary(settings.out, vocabulary, {"source": "kinematic", "seed": settings.seed})
+    return f"{settings.out}: {len(vocabulary)} kinematic trajectories, {vocabulary.digest}"
+
+
 def parsed(arguments: Sequence[str]) -> tuple[VocabularySettings, list[str]]:
     """The settings, and the overrides that choose the clips. Raises ConfigError."""
     from omegaconf import OmegaConf
@@ -230,6 +247,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0 if arguments else 2
     try:
         settings, of_clips = parsed(arguments)
+        if settings.kinematic:
+            print(write_kinematic(settings))
+            return 0
         lines = run(settings, build(compose("run", of_clips)["clips"], "clips"))
     except ValueError as error:  # ConfigError is one
         print(f"error: {error}", file=sys.stderr)

@@ -66,6 +66,15 @@ def begun(plain: Callable[..., Path], tmp_path: Path) -> Callable[..., Path]:
     return copied
 
 
+def test_when_minutes_are_up_nothing_new_begins_and_the_same_command_goes_on(
+    plain: Callable[..., Path], tmp_path: Path
+) -> None:
+    cut = run(tmp_path / "out", minutes=0.0)
+    assert cut.exit_code == INTERRUPTED and "run the same command again" in cut.message
+    assert run(tmp_path / "out", minutes=60.0).exit_code == COMPLETE
+    assert_same_tables(tmp_path / "out", plain())
+
+
 def test_the_same_command_again_executes_nothing(tmp_path: Path) -> None:
     journal = str(tmp_path / "journal")
     first = run(tmp_path / "out", ToyWork(journal=journal))

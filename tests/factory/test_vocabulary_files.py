@@ -9,6 +9,7 @@ import pytest
 
 from factory.clips.reader import BadClip, ClipIndex, ClipRef
 from factory.config import ConfigError
+from factory.settings import VocabularyChoice, choose_vocabulary
 from factory.vocabulary import (
     VocabularySettings,
     build_recovery_table,
@@ -170,3 +171,13 @@ def test_a_bad_command_ends_with_two(capsys: pytest.CaptureFixture[str]) -> None
     assert main(["k=3"]) == 2
     assert "nothing to build" in capsys.readouterr().err
     assert main(["--help"]) == 0
+
+
+def test_the_kinematic_vocabulary_is_written_as_a_run_has_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "labels.npy"
+    assert main(["kinematic=true", "k=16", f"out={file}"]) == 0
+    assert load_vocabulary(file).digest == choose_vocabulary(VocabularyChoice(k=16)).digest
+    assert main(["kinematic=true", "table=t.npz"]) == 2
+    assert "kinematic=true makes a vocabulary" in capsys.readouterr().err
