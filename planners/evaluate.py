@@ -63,6 +63,7 @@ class EvaluateSettings:
     planners_at_once: int = 8  # in memory, planning from one reading of the samples
     device: str = "cpu"
     limit: int | None = None  # clips
+    tables: bool = True  # of all planners of the command
 
     def __post_init__(self) -> None:
         for name in ("batch_size", "planners_at_once", "limit"):
@@ -107,7 +108,8 @@ def evaluate(benchmark: Benchmark, who: Sequence[Contender], settings: EvaluateS
             write_rows(out / one.label, rows[one.label])
             write_record(out / one.label, {**identities[one.label], "planner": one.label, "frames": len(keys)})
     lines = [line for one in who for line in lines_of(one.label, summarise(read_rows(out / one.label)))]
-    write_table(out, lines)
+    if settings.tables:
+        write_table(out, lines)
     return lines
 
 
@@ -186,7 +188,8 @@ def main(argv: Sequence[str]) -> int:
         return BAD_CONFIG
     print(table_text(lines))
     print("".join(fallback_notes(lines)), end="")
-    print(f"look at {Path(settings.out) / 'summary.png'}")
+    if settings.tables:
+        print(f"look at {Path(settings.out) / 'summary.png'}")
     return 0
 
 

@@ -151,7 +151,7 @@ def run(settings: ScalingSettings) -> int:
     if not train_all(trainings, out, settings.means):
         print("not all trainings are done: the same command goes on", file=sys.stderr)
         return INTERRUPTED
-    evaluations = evaluate_all(trainings, out, settings.benchmark, *settings.evaluate)
+    evaluations = evaluate_all(trainings, out, settings.benchmark, *settings.evaluate, jobs=settings.jobs)
     rows = []
     for training in trainings:
         samples = read_record(folder_of(out, training))["samples"]

@@ -45,7 +45,7 @@ def run(settings: StudySettings) -> int:
     if not train_all(planned, out, Means(jobs=settings.jobs, minutes=settings.minutes)):
         print("not all trainings are done: the same command goes on", file=sys.stderr)
         return INTERRUPTED
-    evaluations = evaluate_all(planned, out, settings.benchmark, others=ensembles(wanted, out))
+    evaluations = evaluate_all(planned, out, settings.benchmark, others=ensembles(wanted, out), jobs=settings.jobs)
     report.mkdir(parents=True, exist_ok=True)
     rows = [row_of(training, out, evaluations) for training in planned]
     write_csv(report / "trainings.csv", rows)

@@ -22,6 +22,7 @@ from planners.progress import Counter
 
 TRAININGS, DONE, LOG = "trainings", "sweep.json", "train.log"
 INTERRUPTED = 4
+EVALUATED_TOGETHER = 12  # planners in one process
 LOOK_EVERY_S = 0.5
 
 
@@ -144,20 +145,38 @@ def _stops(stop: threading.Event, minutes: float | None) -> Iterator[None]:
 
 
 def evaluate_all(
-    trainings: Sequence[Training], out: Path, benchmark: str, *more: str, others: Mapping[str, str] | None = None
+    trainings: Sequence[Training],
+    out: Path,
+    benchmark: str,
+    *more: str,
+    others: Mapping[str, str] | None = None,
+    jobs: int | None = None,
 ) -> Path:
     """Evaluate all trainings on a benchmark; those that are evaluated already are not again. Returns the folder.
 
-    more: further overrides of planners.evaluate; others: further planners, by label. Raises SweepFailed.
+    Processes of planners.evaluate share the planners, a few each at a time, so that a kill costs little.
+    more: overrides of theirs; others: further planners, by label; jobs: processes at a time, None: one a core.
+    Raises SweepFailed.
     """
     evaluations = out / "evaluations"
-    who = {training.label: str(folder_of(out, training)) for training in trainings} | dict(others or {})
-    named = ",".join(f"{label}: '{spec}'" for label, spec in who.items())
-    command = [sys.executable, "-m", "planners.evaluate", f"benchmark={benchmark}", f"planners={{{named}}}", *more]
+    who = [(training.label, str(folder_of(out, training))) for training in trainings] + list((others or {}).items())
+    parts = [who[i : i + EVALUATED_TOGETHER] for i in range(0, len(who), EVALUATED_TOGETHER)]
+    base = [sys.executable, "-m", "planners.evaluate", f"benchmark={benchmark}", *more, f"out={evaluations}"]
     environment = {"OMP_NUM_THREADS": "1", **os.environ}
-    code = subprocess.run([*command, f"out={evaluations}"], env=environment).returncode  # noqa: S603 - a list, no shell
-    if code != 0:
-        raise SweepFailed(f"the evaluation ended with exit {code}")
+
+    def evaluate(part: Sequence[tuple[str, str]], *how: str) -> None:
+        named = ",".join(f"{label}: '{spec}'" for label, spec in part)
+        command = [*base, f"planners={{{named}}}", *how]
+        ended = subprocess.run(command, env=environment, capture_output=True, text=True)  # noqa: S603 - a list, no shell
+        if ended.returncode != 0:
+            raise SweepFailed(f"the evaluation ended with exit {ended.returncode}: {ended.stderr.strip()[-500:]}")
+
+    with Counter("evaluations", len(who)) as counter, ThreadPoolExecutor(jobs or os.cpu_count() or 1) as pool:
+        done = 0
+        for part, _ in zip(parts, pool.map(lambda part: evaluate(part, "bounds=false", "tables=false"), parts)):
+            done += len(part)
+            counter.show(done)
+    evaluate(who)  # nothing is left but the bounds and the tables of all
     return evaluations
 
 
