@@ -11,14 +11,21 @@ import numba
 import pytest
 
 from factory.clips.synthetic.reader import SyntheticReader
+from factory.config import compose, fill
 from factory.explain import split_arguments
 from factory.run import main as run_main
 from factory.settings import load_config
 from factory.show import main as show_main
+from planners.analysis import AnalysisSettings
+from planners.compare import CompareSettings
+from planners.evaluate import settings_of as evaluate_settings
+from planners.replay import settings_of as replay_settings
+from planners.scaling import ScalingSettings
+from planners.train import TrainConfig
 from tasks.caches import user_cache
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-PAGES = ("README.md", "docs/configuration.md")
+PAGES = ("README.md", "docs/configuration.md", "docs/training.md")
 
 
 def blocks(page: str, language: str) -> list[str]:
@@ -90,16 +97,40 @@ def test_every_command_is_one_its_program_takes(
         case ["python", "-m", "factory.run", "--help"]:
             assert run_main(["--help"]) == 0
         case ["python", "-m", "factory.run", *arguments]:
-            load_config([argument for argument in arguments if argument != "--cfg"])
+            load_config(given(arguments))
         case ["python", "-m", "factory.explain", *arguments]:
             load_config(split_arguments(arguments)[1])
         case ["python", "-m", "factory.show", *arguments]:
             monkeypatch.chdir(demo_home)
             assert show_main(arguments) == 0, capsys.readouterr().err
+        case ["python", "-m", "planners.train", *arguments] | [
+            "torchrun",
+            "--nproc-per-node",
+            "8",
+            "-m",
+            "planners.train",
+            *arguments,
+        ]:
+            fill(TrainConfig, compose("train", given(arguments)), "train")
+        case ["python", "-m", "planners.evaluate" | "planners.ensemble", *arguments]:
+            evaluate_settings([argument for argument in arguments if not argument.startswith("models=")])
+        case ["python", "-m", "planners.compare", *arguments]:
+            fill(CompareSettings, compose("compare", arguments), "compare")
+        case ["python", "-m", "planners.scaling", *arguments]:
+            fill(ScalingSettings, compose("scaling", arguments), "scaling")
+        case ["python", "-m", "planners.replay", *arguments]:
+            replay_settings(arguments)
+        case ["python", "-m", "planners.analysis", *arguments]:
+            fill(AnalysisSettings, dict(argument.split("=", 1) for argument in arguments), "analysis")
         case _:
             pytest.fail(f"no program takes {' '.join(command)}")
 
 
+def given(arguments: list[str]) -> list[str]:
+    """Without what stands for the user's own, and what is no setting."""
+    return [argument for argument in arguments if argument not in ("...", "--cfg")]
+
+
 def test_there_is_something_to_check() -> None:
     assert len(PYTHON_BLOCKS) == 2
-    assert len(ALL_COMMANDS) >= 10
+    assert len(ALL_COMMANDS) >= 20
