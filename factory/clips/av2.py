@@ -31,7 +31,7 @@ from factory.clips.av2_log import (
 )
 from factory.clips.av2_map import map_file, read_map
 from factory.clips.logs import STEP_MS, Drive, LogReader, Recorded, WholeLog, present, route_of_drive
-from factory.clips.reader import BadClip, ClipRef
+from factory.clips.reader import SPLITS, BadClip, ClipRef
 from tasks.world.camera import Camera, SensorFile
 from tasks.world.clip import STEP_S, Block
 from tasks.world.lanes import LightState, RoadMap, TrafficLights
@@ -41,7 +41,6 @@ Array = NDArray[np.float64]
 LICENCE = "CC BY-NC-SA 4.0 (Argoverse 2)"
 LIGHTS = "traffic_lights.feather"
 INTRINSICS, EXTRINSICS = "calibration/intrinsics.feather", "calibration/egovehicle_SE3_sensor.feather"
-SPLITS = ("train", "val", "test")
 BLOCK_STEPS, BLOCK_STRIDE_STEPS = 200, 100  # of the stretches that are reconstructed
 
 

@@ -20,7 +20,7 @@ frame per log; the columns of ego states are named in tasks.world.vehicle, absen
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -29,7 +29,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from factory.clips.reader import BadClip, ClipIndex, ClipRef, split_of
+from factory.clips.reader import SPLITS, BadClip, ClipIndex, ClipRef, split_of
 from factory.clips.validate import validate_clip
 from factory.clips.windows import WindowSettings, drop_reason, window_starts
 from tasks.world.agents import AgentTracks
@@ -103,14 +103,20 @@ class LogReader(ABC, Generic[Log]):
         name: str | None = None,
         min_top_speed_mps: float = 0.5,
         first_window: int = 0,
+        only: Sequence[str] = (),
+        split: str | None = None,
     ) -> None:
         """name: the data set's name, part of every clip id; first_window: of each log, skips those before it.
 
-        Raises ValueError for an impossible stride or first window.
+        only: ids of the logs to take, of all that are there where none is named; split: of every clip, whatever its
+        log's hash says. Raises ValueError for an impossible stride, first window or split.
         """
+        if split is not None and split not in SPLITS:
+            raise ValueError(f"clips.split={split} is none of {', '.join(SPLITS)}; null: by the hash of the log's id")
         self.root = Path(root).expanduser().absolute()
         self.name = self.data_set if name is None else name
         self.windows = WindowSettings(stride_s, min_top_speed_mps, first_window)
+        self.only, self.split = tuple(only), split
         self._logs: dict[str, Log] = {}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -138,7 +144,7 @@ class LogReader(ABC, Generic[Log]):
         dropped: Counter[str] = Counter()
         skipped: dict[str, str] = {}
         broken: dict[ClipRef, str] = {}
-        for log_id, path in self.logs().items():
+        for log_id, path in self._chosen().items():
             try:
                 drive = self.drive(path)
             except BadClip as error:
@@ -174,7 +180,7 @@ class LogReader(ABC, Generic[Log]):
             clip_id=ref.clip_id,
             dataset=self.name,
             log_id=ref.log_id,
-            split=split_of(ref.log_id),
+            split=self.split or split_of(ref.log_id),
             start_s=start * STEP_S,
             ego_states=ego_states,
             world_from_ego=recorded.world_from_ego,
@@ -191,6 +197,13 @@ class LogReader(ABC, Generic[Log]):
             content_digest=log.content_digest,
         )
         return validate_clip(clip, log.file)
+
+    def _chosen(self) -> Mapping[str, Path]:
+        logs = self.logs()
+        unknown = [log_id for log_id in self.only if log_id not in logs]
+        if unknown:
+            raise ValueError(f"clips.only: no log {', '.join(unknown)} under {self.root}; there are {', '.join(logs)}")
+        return {log_id: logs[log_id] for log_id in logs if not self.only or log_id in self.only}
 
     def path_of(self, ref: ClipRef) -> Path:
         """The file or folder of the clip's log. Raises BadClip where there is none."""

@@ -7,6 +7,8 @@ from typing import Protocol
 
 from tasks.world.clip import Clip
 
+SPLITS = ("train", "val", "test")
+
 
 class BadClip(Exception):
     """The input is broken: says which file, which field, and how to mend it."""

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from factory.clips.av2 import SPLITS, AV2Reader
+from factory.clips.av2 import AV2Reader
 from factory.clips.reader import ClipRef
 from factory.clips.synthetic.reader import TOWN_VERSION, make_whole, sensed_digest
 from factory.clips.synthetic.town import LOGS_PER_TOWN, log_name
@@ -60,12 +60,10 @@ class SyntheticTownsReader(AV2Reader):
         chosen = list(range(first_seed, first_seed + n_towns)) if seeds is None else list(seeds)
         if not chosen or min(chosen) < 0 or len(set(chosen)) < len(chosen):
             raise ValueError(f"clips.seeds: each town's seed once, 0 or more, at least one; not {chosen}")
-        if split not in SPLITS:
-            raise ValueError(f"clips.split={split} is none of {', '.join(SPLITS)}")
         if not 1 <= logs_per_town <= LOGS_PER_TOWN:
             raise ValueError(f"clips.logs_per_town={logs_per_town}: a town has 1 to {LOGS_PER_TOWN} logs")
-        super().__init__(cache_dir or user_cache() / "towns", first_window=first_window)
-        self.split, self.settings = split, settings or TownSettings()
+        super().__init__(cache_dir or user_cache() / "towns", first_window=first_window, split=split)
+        self.settings = settings or TownSettings()
         self.towns = tuple(self._town(seed, logs_per_town) for seed in chosen)
 
     def logs(self) -> dict[str, Path]:
@@ -85,7 +83,7 @@ class SyntheticTownsReader(AV2Reader):
     def read(self, ref: ClipRef) -> Clip:
         """The validated clip, of this reader's split. Raises BadClip."""
         clip = super().read(ref)
-        return replace(clip, split=self.split, content_digest=self._of_here(clip.content_digest))
+        return replace(clip, content_digest=self._of_here(clip.content_digest))
 
     def digest(self, ref: ClipRef) -> str:
         """The clip's content digest, without reading it. Raises BadClip."""

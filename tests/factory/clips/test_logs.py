@@ -131,3 +131,17 @@ def test_two_logs_are_kept_and_none_travels(reader: StreetReader) -> None:
 def test_a_window_that_is_not_there_is_refused(reader: StreetReader, log_id: str, start_ms: int, problem: str) -> None:
     with pytest.raises(BadClip, match=problem):
         reader.read(ClipRef("street", log_id, start_ms))
+
+
+def test_logs_can_be_chosen_and_put_into_a_split(tmp_path: Path) -> None:
+    for name in ("a", "b", "c"):
+        (tmp_path / f"{name}.txt").write_text("150 0 999")
+    some = StreetReader(tmp_path, only=["c", "a"], split="val")
+    refs = some.index().refs
+    assert {ref.log_id for ref in refs} == {"a", "c"}
+    assert {some.read(ref).split for ref in refs} == {"val"}
+    assert refs == tuple(ref for ref in StreetReader(tmp_path).index().refs if ref.log_id != "b")
+    with pytest.raises(ValueError, match=r"no log d under .*; there are a, b, c"):
+        StreetReader(tmp_path, only=["d"]).index()
+    with pytest.raises(ValueError, match=r"clips\.split=dev"):
+        StreetReader(tmp_path, split="dev")
