@@ -26,7 +26,7 @@ test: install
 
 unit: install
 	$(PY) -m factory.warm
-	$(PY) -m pytest -n 2 --dist loadfile --ignore tests/real --ignore tests/chaos -m "not ray"
+	$(PY) -m pytest -n 2 --dist loadfile --ignore tests/real --ignore tests/chaos -m "not ray and not slow"
 
 lint: install
 	$(PY) -m ruff check .

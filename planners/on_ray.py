@@ -3,6 +3,7 @@
 Checkpoints and curves are written by the training itself under `out`, which every node must see.
 """
 
+import logging
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -10,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import ray
-from ray.train import RunConfig, ScalingConfig
+from ray.train import RunConfig, ScalingConfig, WorkerGroupError
 from ray.train.torch import TorchConfig, TorchTrainer, get_device
 
 from planners.world import joined
@@ -39,6 +40,9 @@ def train_on_ray(config: "TrainConfig") -> None:
             ),
             run_config=RunConfig(name="ray", storage_path=os.path.abspath(config.out)),
         ).fit()
+    except WorkerGroupError as error:
+        cause = next(iter(error.worker_failures.values()))
+        raise getattr(cause, "_base_exc", cause) from error  # Ray wraps what a process raised with its traceback
     finally:
         if started:
             ray.shutdown()
@@ -54,7 +58,9 @@ def _part(settings: dict[str, Any]) -> None:
 def _connect() -> None:
     """To the cluster of RAY_ADDRESS or of the submitted job, else to one of this machine's own, on loopback."""
     there = "RAY_ADDRESS" in os.environ
-    ray.init(address=None if there else "local", include_dashboard=None if there else False, log_to_driver=True)
+    ray.init(
+        address=None if there else "local", include_dashboard=None if there else False, logging_level=logging.WARNING
+    )
 
 
 def each_on_ray(

@@ -82,6 +82,7 @@ def test_the_status_tells_32_plans_only_where_it_differs() -> None:
     assert errors_after(blind(), replace(batch, status=telling), 600, 1e-2) < 0.1
 
 
+@pytest.mark.slow
 def test_it_learns_32_rasters_by_heart() -> None:
     model = shown()
     assert errors_after(model, made_batch(model.needs, 32), 400, 5e-3) < 0.1

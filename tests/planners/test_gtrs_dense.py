@@ -42,6 +42,7 @@ def labelled(n: int, k: int = K) -> tuple[Batch, torch.Tensor]:
     return scenes.batch(n, trajectories[final.argmax(1)], labels=labels), final
 
 
+@pytest.mark.slow
 def test_it_learns_to_rank_the_best_trajectory_of_32_scenes_first() -> None:
     batch, final = labelled(32)
     model = planner(EXACT)

@@ -4,6 +4,7 @@ import socket
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 import torch.multiprocessing as mp
 
@@ -65,6 +66,7 @@ def without_chance(rank: int, out: Path) -> None:
     _train(rank, out, 10, dropout=0.0)
 
 
+@pytest.mark.slow
 def test_two_processes_resume_to_the_identical_curve(tmp_path: Path) -> None:
     in_two(whole, tmp_path / "whole")
     in_two(first_half, tmp_path / "cut")
@@ -72,6 +74,7 @@ def test_two_processes_resume_to_the_identical_curve(tmp_path: Path) -> None:
     assert (tmp_path / "cut" / LOSSES).read_text() == (tmp_path / "whole" / LOSSES).read_text()
 
 
+@pytest.mark.slow
 def test_two_processes_compute_what_one_does(tmp_path: Path) -> None:
     """Nothing random in the model: halves of a batch in two processes have the gradient of the whole."""
     in_two(without_chance, tmp_path / "two")
