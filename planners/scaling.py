@@ -12,7 +12,7 @@ Exit codes: 0 complete, 2 bad settings, 3 a training failed, 4 interrupted or ou
 import itertools
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,7 +24,7 @@ from planners.scores import name_of, scores_of, write_csv
 from planners.sweep import Means, SweepFailed, Training, evaluate_all, folder_of, train_all
 
 BAD_CONFIG, FAILED, INTERRUPTED = 2, 3, 4
-ALL_EXPERTS = "all"
+ALL_EXPERTS = EVERYONE = "all"
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class ScalingSettings:
     real_shares: tuple[float, ...]
     seeds: tuple[int, ...]
     steps: int | None = None
-    train: tuple[str, ...] = ()
+    train: dict[str, tuple[str, ...]] = field(default_factory=dict)
     evaluate: tuple[str, ...] = ()
     stage: Literal["one_stage", "stage_one", "stage_two", "final"] = "final"
     human_filter: Literal["filtered", "unfiltered"] = "filtered"
@@ -66,6 +66,9 @@ class ScalingSettings:
             values = getattr(self, name)
             if not values or len(set(values)) < len(values):
                 raise ValueError(f"{name}={list(values)}: at least one, each once")
+        unknown = sorted(set(self.train) - {EVERYONE, *self.planners})
+        if unknown:
+            raise ValueError(f"train: {', '.join(unknown)} is none of {EVERYONE}, {', '.join(self.planners)}")
         if min(self.rounds) < 0:
             raise ValueError(f"rounds={list(self.rounds)}: 0 is real samples alone, 1 the first round with them")
 
@@ -111,7 +114,8 @@ def trainings_of(settings: ScalingSettings) -> list[Training]:
             *([f"data.max_round={rounds - 1}"] if rounds else []),
             *([f"data.experts=[{expert}]"] if rounds and expert != ALL_EXPERTS else []),
             *([f"steps={settings.steps}"] if settings.steps is not None else []),
-            *settings.train,
+            *settings.train.get(EVERYONE, ()),
+            *settings.train.get(planner, ()),
         ]
         label = "-".join(str(value) for value in facts.values() if value != "")
         found[label] = Training(label, tuple(overrides), facts)
