@@ -43,7 +43,7 @@ def learning_rate(settings: TrainingSettings, step: int, steps: int) -> float:
 
 
 def build_optimiser(settings: TrainingSettings, model: nn.Module) -> torch.optim.Optimizer:
-    """Adam or AdamW over everything that learns."""
+    """Adam or AdamW over everything that learns, in one kernel for all parameters."""
     kind = torch.optim.Adam if settings.optimiser == "adam" else torch.optim.AdamW
     learns = [parameter for parameter in model.parameters() if parameter.requires_grad]
-    return kind(learns, lr=settings.learning_rate, weight_decay=settings.weight_decay)
+    return kind(learns, lr=settings.learning_rate, weight_decay=settings.weight_decay, fused=True)

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import cv2
 import torch
 
 from factory.config import ConfigError, compose, fill
@@ -119,6 +120,7 @@ def main(argv: Sequence[str]) -> int:
 def train(config: TrainConfig, world: World) -> None:
     """The part of one process. Raises ConfigError or ValueError for what does not fit, Stopped when interrupted."""
     training, out = config.training, Path(config.out).absolute()
+    cv2.setNumThreads(1)  # pictures are decoded side by side already
     settings = settings_of(config.planner)
     dataset = open_data(config.data, mix=config.mix)
     torch.manual_seed(config.seed)
