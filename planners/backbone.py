@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from planners.backbone_base import STRIDES, Backbone, BackboneSettings
@@ -79,11 +80,14 @@ def _load(backbone: Backbone, path: Path, prefix: str) -> None:
 def _read(path: Path) -> Mapping[str, Tensor]:
     if not path.is_file():
         raise ValueError(f"backbone.pretrained: there is no file {path}")
-    if path.suffix == ".safetensors":
-        from safetensors.torch import load_file
-
-        return load_file(path)
-    content: Any = torch.load(path, map_location="cpu", weights_only=True)
+    try:
+        content: Any = (
+            load_file(path)
+            if path.suffix == ".safetensors"
+            else torch.load(path, map_location="cpu", weights_only=True)
+        )
+    except Exception as error:  # whatever a damaged file, or an object that is no tensor, raises
+        raise ValueError(f"backbone.pretrained: {path} cannot be read as weights: {error}") from error
     for wrapper in ("state_dict", "model"):  # as trainers wrap their checkpoints
         if isinstance(content, Mapping) and isinstance(content.get(wrapper), Mapping):
             content = content[wrapper]

@@ -5,7 +5,8 @@
                              arrays.npz          what the planner is built around: vocabulary, anchors
                              training.pt         optimiser and loader; only tensors and plain values are read back
 
-A checkpoint is written beside its place and moved there whole. Nothing in it can run code when it is read.
+A checkpoint is written beside its place and moved there whole. No file of it holds code; a planner of a user's own
+package is imported by the name that the record gives, from what is installed.
 """
 
 import hashlib
@@ -20,6 +21,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from factory.config import ConfigError
@@ -111,8 +113,11 @@ def load_planner(path: str | Path, changed: Mapping[str, Any] | None = None) -> 
 
 
 def load_weights(planner: Planner, folder: Path) -> None:
-    """Raises ConfigError where the weights are another model's, naming what differs."""
-    stored = load_file(folder / WEIGHTS)
+    """Raises ConfigError where the weights are damaged or another model's, naming what differs."""
+    try:
+        stored = load_file(folder / WEIGHTS)
+    except (OSError, SafetensorError) as error:
+        raise ConfigError(f"{folder / WEIGHTS}: {error}: restore the checkpoint") from error
     own = planner.state_dict()
     wrong = [f"{name} is missing" for name in own if name not in stored]
     wrong += [f"{name} is unknown" for name in stored if name not in own]

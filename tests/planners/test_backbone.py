@@ -216,3 +216,19 @@ def test_a_wrong_weights_file_is_refused_by_name(tmp_path: Path) -> None:
         load_pretrained(build_backbone(BackboneSettings(name="small", pretrained=str(tmp_path / "absent.pth"))))
     with pytest.raises(ValueError, match="give 4"):
         build_backbone(BackboneSettings(name="small", widths=(8, 16)))
+
+
+class NoTensor:
+    """What no weights file may hold: reading it would have to build it."""
+
+
+@pytest.mark.parametrize("suffix", [".safetensors", ".pth"])
+def test_a_file_that_is_damaged_or_holds_objects_is_refused_by_name(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"weights{suffix}"
+    if suffix == ".pth":
+        torch.save({"conv1.weight": NoTensor()}, path)
+    else:
+        path.write_bytes(b"not weights")
+    model = build_backbone(BackboneSettings("small", pretrained=str(path)))
+    with pytest.raises(ValueError, match=r"weights\..* cannot be read as weights"):
+        load_pretrained(model)

@@ -161,3 +161,11 @@ def test_folders_without_a_checkpoint_and_planners_nobody_knows_are_refused(tmp_
         build_planner(PlannerChoice("json:JSONDecoder"), {})
     with pytest.raises(ConfigError, match=r"planner\.settings\.hiden"):
         build_planner(PlannerChoice("tests.planners.toy:Toy", {"hiden": 3}), {})
+
+
+def test_damaged_weights_are_named(tmp_path: Path) -> None:
+    train(tmp_path, ToyBatches(20, 4))
+    weights = newest(tmp_path) / "weights.safetensors"
+    weights.write_bytes(weights.read_bytes()[:40])
+    with pytest.raises(ConfigError, match=r"weights\.safetensors: .*restore the checkpoint"):
+        load_planner(tmp_path)
