@@ -12,7 +12,7 @@ from planners.batch import COMMANDS, BevLayout, ImageLayout, Needs
 from planners.bev import bev_raster, nearest_agents
 from planners.data import BEV_COLUMNS, PLAN_COLUMNS
 from planners.decode import BatchBuffer, StoredRows, count_labels
-from planners.files import files_of, group_bytes, group_rows, leaves
+from planners.files import Footers, files_of, group_bytes, group_rows, leaves
 from planners.images import stitched
 from tasks.world.agents import AgentKind
 from tests.planners.samples import grey_pictures, labels, sample, write_table
@@ -120,3 +120,30 @@ def test_sizes_are_those_of_the_footer(table: Path) -> None:
     sizes = group_bytes(parquet, ["label_2hz", "ego_status"])
     assert sizes.tolist() == [[size["label_2hz.list.element.list.element"], size["ego_status.list.element"]]]
     assert group_rows(parquet).tolist() == [3]
+
+
+def test_a_footer_is_parsed_once(table: Path) -> None:
+    (file,) = files_of(table)
+    (again,) = files_of(table)
+    first = file.open()
+    content = Path(file.path).read_bytes()
+    Path(file.path).write_bytes(content[:-8] + bytes(8))  # no reader would find the footer now
+    try:
+        assert again.open().metadata == first.metadata
+        assert again.open().read_row_group(0, columns=leaves(first, PLAN_COLUMNS)).num_rows == 3
+    finally:
+        Path(file.path).write_bytes(content)
+
+
+def test_footers_are_kept_up_to_their_bytes_and_the_last_used_stay(table: Path) -> None:
+    (file,) = files_of(table)
+    footer = file.open().metadata
+    footers = Footers(2 * footer.serialized_size)
+    for name in "ab":
+        footers.keep(name, footer)
+    assert footers.of("a") is footer
+    footers.keep("c", footer)
+    assert [footers.of(name) for name in "abc"] == [footer, None, footer]
+    small = Footers(footer.serialized_size - 1)
+    small.keep("a", footer)
+    assert small.of("a") is None
