@@ -21,7 +21,7 @@ from planners.checkpoint import read_record
 from planners.scaling_figure import Curve, Point, draw_curves
 from planners.scaling_law import FEWEST, fit_scaling
 from planners.scores import name_of, scores_of, write_csv
-from planners.sweep import Means, SweepFailed, Training, evaluate_all, folder_of, train_all
+from planners.sweep import EVALUATIONS, Means, SweepFailed, Training, evaluate_all, folder_of, train_all
 
 BAD_CONFIG, FAILED, INTERRUPTED = 2, 3, 4
 ALL_EXPERTS = EVERYONE = "all"
@@ -152,11 +152,14 @@ def curves_of(rows: Sequence[dict[str, Any]], settings: ScalingSettings) -> list
 def run(settings: ScalingSettings) -> int:
     """Train, evaluate, fit, draw; the exit code."""
     out, trainings = Path(settings.out), trainings_of(settings)
-    if not train_all(trainings, out, settings.means):
-        print("not all trainings are done: the same command goes on", file=sys.stderr)
+    means = settings.means
+    if not (
+        train_all(trainings, out, means)
+        and evaluate_all(trainings, out, settings.benchmark, *settings.evaluate, means=means)
+    ):
+        print("not all is trained and evaluated yet: the same command goes on", file=sys.stderr)
         return INTERRUPTED
-    evaluations = evaluate_all(trainings, out, settings.benchmark, *settings.evaluate, jobs=settings.jobs)
-    rows = []
+    evaluations, rows = out / EVALUATIONS, []
     for training in trainings:
         samples = read_record(folder_of(out, training))["samples"]
         rows.append(

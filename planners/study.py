@@ -11,6 +11,7 @@ steps, since more data in equal passes is more training as well. Tables go to `r
 """
 
 import sys
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
@@ -29,8 +30,8 @@ from planners.scaling_law import FEWEST, fit_scaling
 from planners.score_rows import read_rows
 from planners.scores import name_of, scores_of, write_csv
 from planners.study_figures import draw_learning
-from planners.study_plan import Comparison, Setup, StudySettings, comparisons, ensembles, trainings
-from planners.sweep import Means, SweepFailed, Training, evaluate_all, folder_of, train_all
+from planners.study_plan import Comparison, Setup, Sizes, StudySettings, comparisons, ensembles, trainings
+from planners.sweep import EVALUATIONS, Means, SweepFailed, Training, evaluate_all, folder_of, train_all
 
 BAD_CONFIG, FAILED, INTERRUPTED = 2, 3, 4
 BOUNDS = ("human", "pdm_closed", "constant_velocity")
@@ -41,17 +42,21 @@ def run(settings: StudySettings) -> int:
     """Train, evaluate, compare, draw; the exit code."""
     out, report = Path(settings.out), Path(settings.report)
     wanted = comparisons(settings)
-    planned = trainings(wanted, settings, matched_samples(settings) if "psnr" in settings.parts else None)
-    if not train_all(planned, out, Means(jobs=settings.jobs, minutes=settings.minutes)):
-        print("not all trainings are done: the same command goes on", file=sys.stderr)
+    planned = trainings(wanted, settings, sizes_of(settings))
+    means = Means(jobs=settings.jobs, minutes=settings.minutes)
+    evaluations = out / EVALUATIONS
+    if not (
+        train_all(planned, out, means)
+        and evaluate_all(planned, out, settings.benchmark, others=ensembles(wanted, out), means=means)
+    ):
+        print("not all is trained and evaluated yet: the same command goes on", file=sys.stderr)
         return INTERRUPTED
-    evaluations = evaluate_all(planned, out, settings.benchmark, others=ensembles(wanted, out), jobs=settings.jobs)
     report.mkdir(parents=True, exist_ok=True)
     rows = [row_of(training, out, evaluations) for training in planned]
     write_csv(report / "trainings.csv", rows)
     write_csv(report / "bounds.csv", [{"planner": name, **scores_of(evaluations / name)} for name in BOUNDS])
     write_csv(report / "comparisons.csv", compared(wanted, evaluations))
-    curves = curves_of(rows) if "rounds" in settings.parts else []
+    curves = curves_of(wanted, rows)
     if curves:
         write_csv(report / "curves.csv", [curve.row() for curve in curves])
         draw_curves(curves, "two-stage EPDMS", report / "scaling.png")
@@ -61,24 +66,25 @@ def run(settings: StudySettings) -> int:
     return 0
 
 
-def matched_samples(settings: StudySettings) -> int:
-    """The number of simulated samples of which both sides of the PSNR bound have at least as many.
-
-    Raises ConfigError where one side has none.
-    """
-    every = DataSettings(sim=settings.data, experts=("pdm_closed",), max_round=settings.rounds - 1)
+def sizes_of(settings: StudySettings) -> Sizes:
+    """What the plan depends on. Raises ConfigError where one side of the PSNR bound has no samples and is asked for."""
+    sim = DataSettings(sim=settings.data, experts=("pdm_closed",), max_round=settings.rounds - 1)
+    high = open_dataset(replace(sim, psnr_min=settings.psnr_db))
+    steps = settings.epochs * ((len(open_dataset(DataSettings(real=settings.data))) + len(high)) // settings.batch_size)
+    if "psnr" not in settings.parts:
+        return Sizes(steps)
     try:
-        low = open_dataset(replace(every, psnr_max=settings.psnr_db))
-        high = open_dataset(replace(every, psnr_min=settings.psnr_db))
+        low = open_dataset(replace(sim, psnr_max=settings.psnr_db))
     except ValueError as error:
         raise ConfigError(f"part psnr: {error}; leave it out of parts, or choose another psnr_db") from error
-    return min(len(low), len(high))
+    return Sizes(steps, min(len(low), len(high)))
 
 
 def row_of(training: Training, out: Path, evaluations: Path) -> dict[str, Any]:
     """One training and its scores."""
     record = read_record(folder_of(out, training))
     return {
+        "training": training.label,
         **training.facts,
         "parameters": record["parameters"],
         "optimiser_steps": record["trained"]["steps"],
@@ -93,7 +99,7 @@ def compared(wanted: Sequence[Comparison], evaluations: Path) -> list[dict[str, 
     rows = []
     for one in wanted:
         for stage, human_filter in SHOWN.items():
-            row: dict[str, Any] = {"part": one.part, **one.setup.facts(), "seeds": one.seeds, "stage": stage}
+            row: dict[str, Any] = {**one.facts, "stage": stage}
             row["epdms"] = mean_of(one.setup, one.seeds, evaluations, stage, human_filter)
             row |= {"reference": "", "difference": "", "low": "", "high": ""}
             if one.reference is not None:
@@ -128,42 +134,37 @@ def mean_of(setup: Setup, seeds: int, evaluations: Path, stage: str, human_filte
     return float(np.mean([_scores(evaluations / f"{setup.label}-{seed}")[name] for seed in range(seeds)]))
 
 
-def curves_of(rows: Sequence[Mapping[str, Any]]) -> list[Curve]:
+def curves_of(wanted: Sequence[Comparison], rows: Sequence[Mapping[str, Any]]) -> list[Curve]:
     """Two-stage EPDMS over the number of samples: one curve for each planner, expert, imitation and budget."""
-    usual = {"traffic": "reactive", "sim_ratio": "natural", "psnr": "any", "real_share": 1.0}
-    rows = [row for row in rows if all(row[key] == value for key, value in usual.items())]
-    names = ("planner", "data", "imitation", "budget")
-    kinds = list(dict.fromkeys(tuple(row[name] for name in names) for row in rows if row["rounds"] > 0))
-    score, curves = name_of("final", SHOWN["final"]), []
-    for planner, data, imitation, budget in kinds:
-        mine = [
-            row
-            for row in rows
-            if (row["planner"], row["budget"]) == (planner, budget)
-            and (
-                (row["data"], row["imitation"]) == (data, imitation) or (row["rounds"], row["imitation"]) == (0, "all")
-            )
-        ]
-        points = tuple(Point(row["real"] + row["simulated"], row[score]) for row in mine)
-        if len({point.samples for point in points}) >= FEWEST:
-            law = fit_scaling([p.samples for p in points], [p.score for p in points])
-            label = f"{data}, rewards only" if imitation == "real" else data
-            curves.append(Curve(f"{planner}, equal {budget}", label, points, law))
+    score, points = name_of("final", SHOWN["final"]), defaultdict[str, list[Point]](list)
+    for row in rows:
+        points[row["training"].rpartition("-")[0]].append(Point(row["real"] + row["simulated"], row[score]))
+    series = defaultdict[tuple[str, str], dict[Setup, None]](dict)
+    for one in wanted:
+        if one.part == "rounds" and one.reference is not None:
+            name = f"{one.setup.data}, rewards only" if one.setup.imitation == "real" else one.setup.data
+            series[f"{one.setup.planner}, equal {one.budget}", name] |= {one.reference: None, one.setup: None}
+    curves = []
+    for (planner, name), setups in series.items():
+        found = tuple(point for setup in setups for point in points[setup.label])
+        enough = len({point.samples for point in found}) >= FEWEST
+        law = fit_scaling([p.samples for p in found], [p.score for p in found]) if enough else None
+        curves.append(Curve(planner, name, found, law))
     return curves
 
 
 def text_of(wanted: Sequence[Comparison], evaluations: Path) -> str:
     """The main comparisons' two-stage scores, to be printed."""
-    lines = [f"{'trained on':<52}{'EPDMS':>8}{'difference':>12}   95 % interval"]
+    lines = [f"{'trained on':<36}{'equal':>8}{'EPDMS':>8}{'difference':>12}   95 % interval"]
     for row in compared([one for one in wanted if one.part == "main"], evaluations):
         if row["stage"] == "final":
-            setup = Setup(**{name: row[name] for name in Setup.__dataclass_fields__})
-            line = f"{setup.label:<52}{row['epdms']:8.2f}"
+            trained_on = f"{row['planner']}-{row['data']}" + ("-rewards_only" if row["imitation"] == "real" else "")
+            line = f"{trained_on:<36}{row['budget']:>8}{row['epdms']:8.2f}"
             if row["reference"]:
                 line += f"{row['difference']:+12.2f}   {row['low']:+.2f} .. {row['high']:+.2f}"
             lines.append(line)
     for name in BOUNDS:
-        lines.append(f"{name:<52}{scores_of(evaluations / name)[name_of('final', SHOWN['final'])]:8.2f}")
+        lines.append(f"{name:<44}{scores_of(evaluations / name)[name_of('final', SHOWN['final'])]:8.2f}")
     return "\n".join(lines)
 
 

@@ -8,6 +8,7 @@ from typing import Any, Literal
 from planners.sweep import TRAININGS, Training
 
 Data = Literal["real", "recovery", "pdm_closed"]
+Budget = Literal["epochs", "steps"]
 SHARES = (0.25, 0.5, 1.0)
 RATIOS = (0.25, 0.5, 0.75)
 ENSEMBLE = "ensemble"  # stands for a planner; nothing is trained for it
@@ -30,7 +31,7 @@ class StudySettings:
     seeds: int
     curve_seeds: int
     epochs: int
-    steps: int
+    batch_size: int
     psnr_db: float
     parts: tuple[str, ...]
     jobs: int | None = None
@@ -46,13 +47,21 @@ class StudySettings:
 
 
 @dataclass(frozen=True)
+class Sizes:
+    """What the tables hold, as far as the plan depends on it."""
+
+    steps: int  # of budget=steps: those of `epochs` passes over all real and pdm_closed samples
+    matched: int | None = None  # simulated samples on either side of psnr_db where their number is held equal
+
+
+@dataclass(frozen=True)
 class Setup:
     """What one planner is trained on, and how long."""
 
     planner: str
     data: Data  # real samples, and those of this expert
     rounds: int  # simulated ones, 0 with real samples alone
-    budget: Literal["epochs", "steps"]  # equal passes over its own data (the paper), or equal optimiser steps
+    budget: Budget  # equal passes over its own data (the paper), or equal optimiser steps
     imitation: Literal["all", "real", "none"] = "all"
     traffic: Literal["reactive", "replay"] = "reactive"
     sim_ratio: float | Literal["natural"] = "natural"
@@ -70,8 +79,8 @@ class Setup:
         parts += [f"share{self.real_share}"] if self.real_share < 1.0 else []
         return "-".join(parts)
 
-    def training(self, settings: StudySettings, seed: int, matched: int | None) -> Training:
-        """matched: simulated samples where their number is held equal, as for psnr."""
+    def training(self, settings: StudySettings, seed: int, sizes: Sizes) -> Training:
+        """One of its trainings."""
         simulated = settings.replay if self.traffic == "replay" else settings.data
         overrides = [
             f"planner={settings.planners[self.planner]}",
@@ -82,6 +91,7 @@ class Setup:
             f"mix.imitation={self.imitation}",
             f"mix.sim_ratio={self.sim_ratio}",
             f"planner.training.epochs={settings.epochs}",
+            f"planner.training.batch_size={settings.batch_size}",
             f"seed={seed}",
             "workers=1",
             "validate_every=100",
@@ -89,20 +99,16 @@ class Setup:
         if self.planner == "gtrs_dense":
             overrides.append(f"planner.settings.vocabulary={settings.vocabulary}")
         if self.budget == "steps":
-            overrides.append(f"steps={settings.steps}")
+            overrides.append(f"steps={sizes.steps}")
         if self.rounds:
             overrides += [f"data.experts=[{self.data}]", f"data.max_round={self.rounds - 1}"]
         if self.psnr == "low":
             overrides += [f"data.psnr_max={settings.psnr_db}"]
         elif self.rounds:
             overrides += [f"data.psnr_min={settings.psnr_db}"]
-        if matched is not None and self.psnr != "any":
-            overrides += [f"data.limit_sim={matched}"]
-        return Training(f"{self.label}-{seed}", tuple(overrides), {**self.facts(), "seed": seed})
-
-    def facts(self) -> dict[str, Any]:
-        """Its columns in the tables."""
-        return dict(vars(self))
+        if self.psnr != "any":
+            overrides += [f"data.limit_sim={sizes.matched}"]
+        return Training(f"{self.label}-{seed}", tuple(overrides), {**vars(self), "seed": seed})
 
 
 @dataclass(frozen=True)
@@ -113,11 +119,28 @@ class Comparison:
     setup: Setup
     reference: Setup | None
     seeds: int
+    budget: Budget = "epochs"  # that of the comparison
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Its columns in the tables."""
+        return {"part": self.part, **vars(self.setup), "budget": self.budget, "seeds": self.seeds}
 
 
 def comparisons(settings: StudySettings) -> list[Comparison]:
     """All of the chosen parts."""
-    return [found for part in settings.parts for found in PARTS[part](settings)]
+    found = []
+    for one in (one for part in settings.parts for one in PARTS[part](settings)):
+        reference = None if one.reference is None else trained(one.reference, settings.rounds)
+        setup = trained(one.setup, settings.rounds)
+        found.append(replace(one, setup=setup, reference=reference, budget=one.setup.budget))
+    return found
+
+
+def trained(setup: Setup, rounds: int) -> Setup:
+    """What is trained for it: all real and pdm_closed samples are what equal steps are counted by, in one training."""
+    is_whole = replace(setup, planner="", imitation="all") == Setup("", "pdm_closed", rounds, "steps")
+    return replace(setup, budget="epochs") if is_whole and setup.planner != ENSEMBLE else setup
 
 
 def _main(settings: StudySettings) -> Iterator[Comparison]:
@@ -137,14 +160,15 @@ def _rounds(settings: StudySettings) -> Iterator[Comparison]:
         for budget in BUDGETS:
             real = Setup(base.planner, "real", 0, budget)
             yield Comparison("rounds", real, None, settings.curve_seeds)
-            for rounds in range(1, settings.rounds + 1):
+            every = range(1, settings.rounds + 1)
+            for rounds in every if budget == "epochs" else _few(settings.rounds):
                 setup = replace(base, rounds=rounds, budget=budget)
                 yield Comparison("rounds", setup, real, settings.curve_seeds)
 
 
 def _traffic(settings: StudySettings) -> Iterator[Comparison]:
     for planner in MULTI:
-        for rounds in sorted({1, (settings.rounds + 1) // 2, settings.rounds}):
+        for rounds in _few(settings.rounds):
             for budget in BUDGETS:
                 reactive = Setup(planner, "pdm_closed", rounds, budget)
                 yield Comparison("traffic", reactive, None, settings.curve_seeds)
@@ -161,11 +185,11 @@ def _ratio(settings: StudySettings) -> Iterator[Comparison]:
 
 
 def _psnr(settings: StudySettings) -> Iterator[Comparison]:
+    """As many samples on either side: equal epochs are equal steps."""
     for planner in MULTI:
-        for budget in BUDGETS:
-            low = Setup(planner, "pdm_closed", settings.rounds, budget, psnr="low")
-            yield Comparison("psnr", low, None, settings.curve_seeds)
-            yield Comparison("psnr", replace(low, psnr="high"), low, settings.curve_seeds)
+        low = Setup(planner, "pdm_closed", settings.rounds, "epochs", psnr="low")
+        yield Comparison("psnr", low, None, settings.curve_seeds)
+        yield Comparison("psnr", replace(low, psnr="high"), low, settings.curve_seeds)
 
 
 def _rewards(settings: StudySettings) -> Iterator[Comparison]:
@@ -197,10 +221,15 @@ def _ensemble(settings: StudySettings) -> Iterator[Comparison]:
         yield Comparison("ensemble", together, alone, settings.curve_seeds)
 
 
-def members_of(budget: Literal["epochs", "steps"], rounds: int) -> list[Setup]:
+def members_of(budget: Budget, rounds: int) -> list[Setup]:
     """Of an ensemble: recovery, planner, rewards only."""
     imitating = [Setup("gtrs_dense", expert, rounds, budget) for expert in EXPERTS]
-    return [*imitating, replace(imitating[-1], imitation="real")]
+    return [trained(member, rounds) for member in (*imitating, replace(imitating[-1], imitation="real"))]
+
+
+def _few(rounds: int) -> list[int]:
+    """The first, the middle and the last."""
+    return sorted({1, (rounds + 1) // 2, rounds})
 
 
 def _series() -> Sequence[Setup]:
@@ -209,7 +238,7 @@ def _series() -> Sequence[Setup]:
     return [*imitating, Setup("gtrs_dense", "pdm_closed", 1, "epochs", imitation="real")]
 
 
-BUDGETS: tuple[Literal["epochs", "steps"], ...] = ("epochs", "steps")
+BUDGETS: tuple[Budget, ...] = ("epochs", "steps")
 EXPERTS: tuple[Data, ...] = ("recovery", "pdm_closed")
 PARTS = {
     "main": _main,
@@ -223,14 +252,14 @@ PARTS = {
 }
 
 
-def trainings(found: Sequence[Comparison], settings: StudySettings, matched: int | None) -> list[Training]:
+def trainings(found: Sequence[Comparison], settings: StudySettings, sizes: Sizes) -> list[Training]:
     """Every setup with every seed that some comparison asks for, each once."""
     seeds: dict[Setup, int] = {}
     for one in found:
         for setup in (one.setup, one.reference):
             if setup is not None and setup.planner != ENSEMBLE:
                 seeds[setup] = max(seeds.get(setup, 0), one.seeds)
-    return [setup.training(settings, seed, matched) for setup, count in seeds.items() for seed in range(count)]
+    return [setup.training(settings, seed, sizes) for setup, count in seeds.items() for seed in range(count)]
 
 
 def ensembles(found: Sequence[Comparison], out: Path) -> dict[str, str]:

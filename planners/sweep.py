@@ -20,7 +20,7 @@ from typing import Any, Literal
 
 from planners.progress import Counter
 
-TRAININGS, DONE, LOG = "trainings", "sweep.json", "train.log"
+TRAININGS, EVALUATIONS, DONE, LOG = "trainings", "evaluations", "sweep.json", "train.log"
 INTERRUPTED = 4
 EVALUATED_TOGETHER = 12  # planners in one process
 LOOK_EVERY_S = 0.5
@@ -44,6 +44,17 @@ class Means:
     minutes: float | None = None  # after which nothing new begins, and what runs is saved and stopped
     gpus: float = 0.0  # of each training on Ray
     cpus: float = 1.0
+    began: float = field(default_factory=time.monotonic)  # what the minutes are counted from
+
+    @property
+    def at_once(self) -> int:
+        """Processes."""
+        return self.jobs or os.cpu_count() or 1
+
+    @property
+    def left_s(self) -> float | None:
+        """Until nothing new begins."""
+        return None if self.minutes is None else max(0.0, self.began + 60.0 * self.minutes - time.monotonic())
 
 
 class SweepFailed(Exception):
@@ -73,7 +84,7 @@ def train_all(trainings: Sequence[Training], out: Path, means: Means) -> bool:
     before = len(trainings) - len(left)
     stop = threading.Event()
     failed: list[str] = []
-    with Counter("trainings", len(trainings), before) as counter, _stops(stop, means.minutes):
+    with Counter("trainings", len(trainings), before) as counter, _stops(stop, means.left_s):
         done = before
         for training, code in _codes(left, out, means, stop):
             if code == 0:
@@ -118,16 +129,16 @@ def _codes(
 
         yield from each_on_ray(train_one, trainings, out, means.cpus, means.gpus, stop)
         return
-    with ThreadPoolExecutor(means.jobs or os.cpu_count() or 1) as pool:
+    with ThreadPoolExecutor(means.at_once) as pool:
         futures = {pool.submit(train_one, training, out, stop.is_set): training for training in trainings}
         for future in as_completed(futures):
             yield futures[future], future.result()
 
 
 @contextlib.contextmanager
-def _stops(stop: threading.Event, minutes: float | None) -> Iterator[None]:
-    """Sets the event after so many minutes, or at SIGINT and SIGTERM."""
-    timer = threading.Timer(60.0 * minutes, stop.set) if minutes is not None else None
+def _stops(stop: threading.Event, after_s: float | None) -> Iterator[None]:
+    """Sets the event after so many seconds, or at SIGINT and SIGTERM."""
+    timer = threading.Timer(after_s, stop.set) if after_s is not None else None
     old: dict[int, Any] = {}
     if threading.current_thread() is threading.main_thread():
         for number in (signal.SIGINT, signal.SIGTERM):
@@ -150,34 +161,41 @@ def evaluate_all(
     benchmark: str,
     *more: str,
     others: Mapping[str, str] | None = None,
-    jobs: int | None = None,
-) -> Path:
-    """Evaluate all trainings on a benchmark; those that are evaluated already are not again. Returns the folder.
+    means: Means | None = None,
+) -> bool:
+    """Evaluate all trainings on a benchmark, into `out`/evaluations; those that are evaluated already are not again.
 
     Processes of planners.evaluate share the planners, a few each at a time, so that a kill costs little.
-    more: overrides of theirs; others: further planners, by label; jobs: processes at a time, None: one a core.
-    Raises SweepFailed.
+    more: overrides of theirs; others: further planners, by label. False where time ran out or somebody interrupted
+    before all were. Raises SweepFailed.
     """
-    evaluations = out / "evaluations"
+    means, stop = means or Means(), threading.Event()
     who = [(training.label, str(folder_of(out, training))) for training in trainings] + list((others or {}).items())
     parts = [who[i : i + EVALUATED_TOGETHER] for i in range(0, len(who), EVALUATED_TOGETHER)]
-    base = [sys.executable, "-m", "planners.evaluate", f"benchmark={benchmark}", *more, f"out={evaluations}"]
+    base = [sys.executable, "-m", "planners.evaluate", f"benchmark={benchmark}", *more, f"out={out / EVALUATIONS}"]
     environment = {"OMP_NUM_THREADS": "1", **os.environ}
 
-    def evaluate(part: Sequence[tuple[str, str]], *how: str) -> None:
+    def evaluate(part: Sequence[tuple[str, str]], *how: str) -> bool:
+        if stop.is_set():
+            return False
         named = ",".join(f"{label}: '{spec}'" for label, spec in part)
         command = [*base, f"planners={{{named}}}", *how]
         ended = subprocess.run(command, env=environment, capture_output=True, text=True)  # noqa: S603 - a list, no shell
         if ended.returncode != 0:
             raise SweepFailed(f"the evaluation ended with exit {ended.returncode}: {ended.stderr.strip()[-500:]}")
+        return True
 
-    with Counter("evaluations", len(who)) as counter, ThreadPoolExecutor(jobs or os.cpu_count() or 1) as pool:
+    with (
+        Counter("evaluations", len(who)) as counter,
+        ThreadPoolExecutor(means.at_once) as pool,
+        _stops(stop, means.left_s),
+    ):
         done = 0
-        for part, _ in zip(parts, pool.map(lambda part: evaluate(part, "bounds=false", "tables=false"), parts)):
-            done += len(part)
+        ends = pool.map(lambda part: evaluate(part, "bounds=false", "tables=false"), parts)
+        for part, was_done in zip(parts, ends):
+            done += len(part) * was_done
             counter.show(done)
-    evaluate(who)  # nothing is left but the bounds and the tables of all
-    return evaluations
+        return done == len(who) and evaluate(who)  # nothing is left but the bounds and the tables of all
 
 
 def _last_words(log: Path) -> str:

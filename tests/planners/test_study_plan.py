@@ -6,7 +6,9 @@ from typing import Any
 import pytest
 
 from factory.config import compose, fill
-from planners.study_plan import ENSEMBLE, PARTS, StudySettings, comparisons, ensembles, trainings
+from planners.study_plan import ENSEMBLE, PARTS, Sizes, StudySettings, comparisons, ensembles, trainings
+
+SIZES = Sizes(steps=600, matched=7)
 
 
 def settings(**changes: Any) -> StudySettings:
@@ -18,7 +20,7 @@ def test_every_family_is_trained_with_and_without_simulation_in_equal_epochs_and
     found = comparisons(settings(parts=("main",)))
     for planner in ("ltf", "diffusiondrive", "gtrs_dense"):
         for budget in ("epochs", "steps"):
-            mine = [c for c in found if (c.setup.planner, c.setup.budget) == (planner, budget)]
+            mine = [c for c in found if (c.setup.planner, c.budget) == (planner, budget)]
             assert {c.setup.data for c in mine} == {"real", "recovery", "pdm_closed"}
             for one in mine:
                 assert (one.reference is None) == (one.setup.rounds == 0)
@@ -32,25 +34,35 @@ def test_every_family_is_trained_with_and_without_simulation_in_equal_epochs_and
 
 def test_a_training_is_planned_once_with_as_many_seeds_as_anyone_asks_for() -> None:
     everything = settings()
-    planned = trainings(comparisons(everything), everything, matched=7)
+    planned = trainings(comparisons(everything), everything, SIZES)
     labels = [training.label for training in planned]
     assert len(set(labels)) == len(labels) == len({training.overrides for training in planned})
-    assert {t.facts["seed"] for t in planned if t.label.startswith("gtrs_dense-pdm_closed5-steps-")} >= {0, 1, 2}
+    assert {t.facts["seed"] for t in planned if t.label.startswith("gtrs_dense-pdm_closed5-epochs-")} >= {0, 1, 2}
 
 
 def test_a_setup_differs_from_its_reference_in_what_its_part_is_about() -> None:
     about = {"traffic": "traffic", "ratio": "sim_ratio", "psnr": "psnr", "rewards": "imitation"}
     for one in comparisons(settings()):
         if one.reference is not None and one.part in about:
-            differs = {k for k, v in one.setup.facts().items() if v != one.reference.facts()[k]}
-            assert differs == {about[one.part]}, one
+            differs = {k for k, v in vars(one.setup).items() if v != vars(one.reference)[k]}
+            assert differs - {"budget"} == {about[one.part]}, one
+
+
+def test_equal_steps_are_those_of_all_that_there_is_which_is_trained_once() -> None:
+    found = [one for one in comparisons(settings(parts=("main",))) if one.setup.data == "pdm_closed"]
+    assert {one.budget for one in found} == {"epochs", "steps"}
+    assert {one.setup.budget for one in found} == {"epochs"}
+    assert {(one.budget, one.reference.budget) for one in found if one.reference} == {
+        ("epochs", "epochs"),
+        ("steps", "steps"),
+    }
 
 
 def test_budgets_and_bounds_become_overrides() -> None:
     everything = settings()
-    by_label = {t.label: t.overrides for t in trainings(comparisons(everything), everything, matched=7)}
+    by_label = {t.label: t.overrides for t in trainings(comparisons(everything), everything, SIZES)}
     assert not any(o.startswith("steps=") for o in by_label["ltf-real-epochs-0"])
-    assert f"steps={everything.steps}" in by_label["ltf-real-steps-0"]
+    assert "steps=600" in by_label["ltf-real-steps-0"]
     low, high = (by_label[f"gtrs_dense-pdm_closed5-epochs-psnr_{side}-1"] for side in ("low", "high"))
     assert {"data.psnr_max=27.0", "data.limit_sim=7"} <= set(low)
     assert {"data.psnr_min=27.0", "data.limit_sim=7"} <= set(high)
@@ -61,7 +73,7 @@ def test_budgets_and_bounds_become_overrides() -> None:
 def test_ensembles_are_made_of_trainings_that_are_planned(tmp_path: Path) -> None:
     chosen = settings(parts=("ensemble",))
     found = comparisons(chosen)
-    planned = {str(tmp_path / "trainings" / t.label) for t in trainings(found, chosen, None)}
+    planned = {str(tmp_path / "trainings" / t.label) for t in trainings(found, chosen, SIZES)}
     specs = ensembles(found, tmp_path)
     assert len(specs) == 2 * chosen.curve_seeds
     for label, spec in specs.items():
