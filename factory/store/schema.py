@@ -182,7 +182,14 @@ BOOKKEEPING = (
 
 LICENCES_PROPERTY = "factory.licences"  # of the table `samples`: the licences of its rows' sources, "; " between
 VERSION_PROPERTY = "factory.schema_version"  # of the table `samples`
-SAMPLES = TableSpec("samples", SCHEMA, "attempt_id", ("round", "expert"), {VERSION_PROPERTY: str(SCHEMA_VERSION)})
+SAMPLES = TableSpec(
+    "samples",
+    SCHEMA,
+    "attempt_id",
+    partition_by=("round", "expert"),
+    properties={VERSION_PROPERTY: str(SCHEMA_VERSION)},
+    packed=("images.list.element.jpeg",),
+)
 
 
 def sample_row_to_table(rows: Sequence[Mapping[str, object]]) -> pa.Table:

@@ -46,6 +46,7 @@ class TableSpec:
     key: str
     partition_by: tuple[str, ...] = ()
     properties: Mapping[str, str] | None = None
+    packed: tuple[str, ...] = ()  # leaves whose values are compressed already, as their paths in a file
 
     @property
     def file_schema(self) -> pa.Schema:
@@ -67,7 +68,8 @@ def write_shard(location: Location, spec: TableSpec, rows: pa.Table) -> Shard:
     """Write rows of ONE partition, sorted by key, as one file under the table's folder. Idempotent.
 
     Page checksums are on and row groups hold at most 4 MB, or one row. Arrow's own schema is left out of the file, so
-    that every engine reads plain lists as the Delta log says.
+    that every engine reads plain lists as the Delta log says. The table's packed leaves are stored as they are: neither
+    zstd nor a dictionary makes a JPEG smaller, and every reader would have to undo them.
     """
     rows = rows.select(spec.schema.names).cast(spec.schema).sort_by(spec.key)
     partition = {}
@@ -78,11 +80,13 @@ def write_shard(location: Location, spec: TableSpec, rows: pa.Table) -> Shard:
     body = rows.drop_columns(list(spec.partition_by))
     group_rows = max(1, int(ROW_GROUP_BYTES // max(1, body.nbytes // max(1, body.num_rows))))
     sink = pa.BufferOutputStream()
+    leaves = [path for field in body.schema for path in _leaf_paths(field.name, field.type)]
     pq.write_table(
         body,
         sink,
         row_group_size=group_rows,
-        compression="zstd",
+        compression={path: "none" if path in spec.packed else "zstd" for path in leaves},
+        use_dictionary=[path for path in leaves if path not in spec.packed],
         write_page_checksum=True,
         write_page_index=True,
         store_schema=False,
@@ -92,6 +96,15 @@ def write_shard(location: Location, spec: TableSpec, rows: pa.Table) -> Shard:
     path = f"{folder}part-{hashlib.sha256(data).hexdigest()[:32]}.parquet"
     location.write(path, data)
     return Shard(path, len(data), partition, keys)
+
+
+def _leaf_paths(path: str, kind: pa.DataType) -> list[str]:
+    """The paths in a file of the leaves under a column or member."""
+    if pa.types.is_struct(kind):
+        return [leaf for member in kind for leaf in _leaf_paths(f"{path}.{member.name}", member.type)]
+    if pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind):
+        return _leaf_paths(f"{path}.list.element", kind.value_type)
+    return [path]
 
 
 class KeyedTable:

@@ -268,7 +268,7 @@ def test_a_damaged_file_is_named(tmp_path: Path) -> None:
     content = bytearray(path.read_bytes())
     metadata = pq.ParquetFile(path).metadata.row_group(0)
     chunk = next(c for c in map(metadata.column, range(metadata.num_columns)) if c.path_in_schema.endswith("jpeg"))
-    content[chunk.dictionary_page_offset + chunk.total_compressed_size // 2] ^= 1
+    content[chunk.data_page_offset + chunk.total_compressed_size // 2] ^= 1
     path.write_bytes(bytes(content))
     with pytest.raises(OSError, match=f"{tmp_path}.*part-.*(CRC|checksum)"):
         list(Loader(data, NEEDS, MixSettings(), BATCH).epoch(0))

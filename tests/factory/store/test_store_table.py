@@ -131,6 +131,21 @@ def test_a_query_on_scores_reads_kilobytes_of_a_shard(location: Location) -> Non
     assert scores.num_rows == 40 and counting.n_bytes < 300 * 2**10, counting.n_bytes
 
 
+def test_jpegs_are_stored_as_they_are_and_all_else_with_dictionaries_and_zstd(location: Location) -> None:
+    image = {"camera": "front", "time_s": 0.0, "ego_pose": np.eye(4).ravel(), "jpeg": bytes(10_000)}
+    stamp = Stamp("id", "recovery", "d", 0, 0, "v", "s", "{}")
+    row = row_of(stream("images")) | vars(stamp) | {"images": [image]}
+    written = write_shard(location, SAMPLES, sample_row_to_table([row]))
+    group = pq.ParquetFile(f"{location.uri}/{written.path}").metadata.row_group(0)
+    leaves = {leaf.path_in_schema: leaf for leaf in map(group.column, range(group.num_columns))}
+    (jpeg,) = (leaves.pop(path) for path in SAMPLES.packed)
+    assert jpeg.compression == "UNCOMPRESSED" and "RLE_DICTIONARY" not in jpeg.encodings
+    assert 10_000 < jpeg.total_compressed_size < 10_100
+    assert {leaf.compression for leaf in leaves.values()} == {"ZSTD"}
+    flags = {path for path, leaf in leaves.items() if leaf.physical_type == "BOOLEAN"}  # have no dictionaries
+    assert {path for path, leaf in leaves.items() if "RLE_DICTIONARY" not in leaf.encodings} == flags
+
+
 def test_other_engines_read_the_same_rows(location: Location) -> None:
     table = KeyedTable(location, SPEC)
     table.commit([shard(location, "ab", 1.5), shard(location, "c", 2.5, round_=1)])
