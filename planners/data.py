@@ -3,6 +3,7 @@
 What is wrong with the data is said by table, sample and setting, before anything is decoded.
 """
 
+import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -22,10 +23,9 @@ __all__ = ["DataSettings", "Dataset", "Feed", "make_feed", "mixed_samples", "ope
 
 PLAN_COLUMNS = ("command", "ego_status", "ego_history_2hz", "label_2hz", "label_10hz")
 IMAGE_COLUMNS = ("images.camera", "images.time_s", "images.jpeg")
+AGENT_COLUMNS = ("agent_kinds", "agent_boxes", "agent_valid")
 BEV_COLUMNS = (
-    "agent_kinds",
-    "agent_boxes",
-    "agent_valid",
+    *AGENT_COLUMNS,
     "lane_polygons",
     "lane_centerlines",
     "drivable_rings",
@@ -42,7 +42,7 @@ class Feed:
     needs: Needs
     columns: tuple[str, ...]
     cameras: tuple[tuple[str, ...], ...]  # (n) of each sample's picture, left to right; empty without images
-    size: Index  # (n,) bytes that a sample takes in memory before it is decoded, about
+    size: Index  # (n,) bytes that a sample takes in memory between its batches, about
 
 
 def open_data(settings: DataSettings, needs: Needs | None = None, mix: MixSettings | None = None) -> Dataset:
@@ -78,6 +78,8 @@ def make_feed(dataset: Dataset, needs: Needs) -> Feed:
         size[here] = sizes
         for sample, chosen in zip(here.tolist(), names):
             cameras[sample] = chosen
+    if needs.bev is not None:
+        size += math.prod((len(needs.bev.times_s), *needs.bev.shape))  # its raster is kept beside it
     return Feed(dataset, needs, columns, tuple(cameras), size)
 
 

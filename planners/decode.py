@@ -17,8 +17,8 @@ from torch import Tensor
 from factory.store.columns import Column
 from factory.store.reader import LABEL_COLUMNS, TIME_TOLERANCE_S, labels_of
 from factory.store.schema import COLUMNS
-from planners.batch import COMMANDS, Batch, Needs
-from planners.data import BEV_COLUMNS
+from planners.batch import COMMANDS, Batch, BevLayout, Needs
+from planners.data import AGENT_COLUMNS, BEV_COLUMNS
 from planners.images import Bytes, stitch
 from tasks.reward.label_bytes import CRC_BYTES
 
@@ -35,6 +35,7 @@ class StoredRows:
             self._jpegs = _jpegs_at_now(table["images"].combine_chunks(), cameras)
             table = table.drop_columns(["images"])
         self._values = {name: _values(COLUMNS[name], table[name].combine_chunks()) for name in table.column_names}
+        self._rasters: dict[tuple[int, BevLayout], NDArray[np.uint8]] = {}
 
     def value(self, column: str, row: int) -> Any:
         """A value as the sample reader gives it: an array, a list of arrays, a text or a number."""
@@ -43,6 +44,14 @@ class StoredRows:
     def values(self, columns: Sequence[str], row: int) -> dict[str, Any]:
         """Several columns of a row."""
         return {column: self._values[column](row) for column in columns}
+
+    def raster(self, row: int, layout: BevLayout) -> NDArray[np.uint8]:
+        """The row seen from above (T, rows, columns), drawn once: a raster is smaller than the map it is drawn from."""
+        from planners.bev import bev_raster
+
+        if (row, layout) not in self._rasters:
+            self._rasters[row, layout] = bev_raster(self.values(BEV_COLUMNS, row), layout)
+        return self._rasters[row, layout]
 
     def jpegs(self, row: int) -> tuple[Bytes, ...]:
         """The images at now of the row's cameras, left to right."""
@@ -86,11 +95,11 @@ class BatchBuffer:
         if needs.image is not None:
             stitch(stored.jpegs(row), needs.image, arrays["image"][i])
         if needs.bev is not None:
-            from planners.bev import bev_raster, nearest_agents
-
-            seen = stored.values(BEV_COLUMNS, row)
-            arrays["bev"][i] = bev_raster(seen, needs.bev)
+            arrays["bev"][i] = stored.raster(row, needs.bev)
             if needs.n_agents:
+                from planners.bev import nearest_agents
+
+                seen = stored.values(AGENT_COLUMNS, row)
                 arrays["agents"][i], arrays["agents_valid"][i] = nearest_agents(seen, needs.bev, needs.n_agents)
         if needs.labels is not None:
             labels = labels_of(stored.values(LABEL_COLUMNS, row), needs.labels)

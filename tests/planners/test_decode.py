@@ -72,6 +72,14 @@ def test_every_column_is_read_as_the_sample_reader_reads_it(table: Path) -> None
                 assert one == other, name
 
 
+def test_a_raster_is_drawn_once(table: Path) -> None:
+    rows, other = stored(table, list(BEV_COLUMNS)), BevLayout(cell_m=4.0)
+    for number, expected in enumerate(SampleTable(table)):
+        first = rows.raster(number, BEV)
+        assert np.array_equal(first, bev_raster(expected, BEV)) and rows.raster(number, BEV) is first
+        assert np.array_equal(rows.raster(number, other), bev_raster(expected, other))
+
+
 def test_a_batch_is_what_its_rows_say(table: Path) -> None:
     samples = SampleTable(table)
     needs = Needs(image=IMAGE, bev=BEV, n_agents=2, labels="vocabulary-1", normalise="batch")
