@@ -28,13 +28,19 @@ LABELS = ("nc", "dac", "ddc", "tlc", "ttc", "lk", "hc", "ep")
 class StoredRows:
     """Some rows of one row group."""
 
-    def __init__(self, table: pa.Table, cameras: Sequence[tuple[str, ...]]) -> None:
-        """table: each column in one chunk, with the plain lists of a file. cameras: (rows) of each row's picture."""
+    def __init__(self, table: pa.Table, cameras: Sequence[tuple[str, ...]], in_place: bool = False) -> None:
+        """
+        Args:
+            table: each column in one chunk, with the plain lists of a file.
+            cameras: (rows) of each row's picture; none for rows that are not asked for.
+            in_place: pictures stay where they are in the table, which then stays as a whole. Else they are copied, so
+                that the images of other cameras and instants can go.
+        """
         self._jpegs: list[tuple[Bytes, ...]] = []
         if "images" in table.column_names:
-            self._jpegs = _jpegs_at_now(table["images"].combine_chunks(), cameras)
+            self._jpegs = _jpegs_at_now(_whole(table["images"]), cameras, in_place)
             table = table.drop_columns(["images"])
-        self._values = {name: _values(COLUMNS[name], table[name].combine_chunks()) for name in table.column_names}
+        self._values = {name: _values(COLUMNS[name], _whole(table[name])) for name in table.column_names}
         self._rasters: dict[tuple[int, BevLayout], NDArray[np.uint8]] = {}
 
     def value(self, column: str, row: int) -> Any:
@@ -125,8 +131,12 @@ def count_labels(stored: StoredRows, row: int) -> int:
     return (len(stored.value("label_progress", row)) - CRC_BYTES) // 2
 
 
-def _jpegs_at_now(images: pa.ListArray, cameras: Sequence[tuple[str, ...]]) -> list[tuple[Bytes, ...]]:
-    """Copies of the bytes, so that the images of other cameras and instants can go."""
+def _whole(column: pa.ChunkedArray) -> pa.Array:
+    """In one piece. Of a single chunk `combine_chunks` would make a copy."""
+    return column.chunk(0) if column.num_chunks == 1 else column.combine_chunks()
+
+
+def _jpegs_at_now(images: pa.ListArray, cameras: Sequence[tuple[str, ...]], in_place: bool) -> list[tuple[Bytes, ...]]:
     starts, entries = images.offsets.to_numpy(), images.values
     at_now = np.flatnonzero(np.abs(entries.field("time_s").to_numpy()) <= TIME_TOLERANCE_S)
     names = entries.field("camera").take(pa.array(at_now)).to_pylist()
@@ -137,10 +147,11 @@ def _jpegs_at_now(images: pa.ListArray, cameras: Sequence[tuple[str, ...]]) -> l
     ends = np.frombuffer(jpeg.buffers()[1], np.int32)[jpeg.offset : jpeg.offset + len(jpeg) + 1]
     flat = np.frombuffer(data, np.uint8)
 
-    def copy(entry: int) -> Bytes:
-        return flat[ends[entry] : ends[entry + 1]].copy()
+    def jpeg_of(entry: int) -> Bytes:
+        stored = flat[ends[entry] : ends[entry + 1]]
+        return stored if in_place else stored.copy()
 
-    return [tuple(copy(found[row, name]) for name in chosen) for row, chosen in enumerate(cameras)]
+    return [tuple(jpeg_of(found[row, name]) for name in chosen) for row, chosen in enumerate(cameras)]
 
 
 def _values(column: Column, stored: pa.Array) -> Callable[[int], Any]:

@@ -53,12 +53,15 @@ class DataSettings:
     limit_sim: int | None = None  # as many simulated samples, drawn from those that the rest leaves
     seed: int = 0  # of the two draws; a smaller share or limit is a part of a larger one
     storage_options: dict[str, str] = field(default_factory=dict)  # of object stores, as deltalake calls them
+    copy: str | None = None  # folder of this machine for a compact copy of what is read, see planners.local_copy
 
     def __post_init__(self) -> None:
         if not 0.0 < self.real_share <= 1.0:
             raise ValueError(f"real_share={self.real_share}: must be above 0 and at most 1")
         if self.limit_sim is not None and self.limit_sim < 1:
             raise ValueError(f"limit_sim={self.limit_sim}: must be at least 1; data.sim=[] leaves simulation out")
+        if self.copy is not None and "://" in self.copy:
+            raise ValueError(f"data.copy={self.copy}: must be a folder of this machine")
 
     def tables(self, part: str) -> tuple[str, ...]:
         """The tables of `real`, `sim` or `val`."""

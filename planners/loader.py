@@ -140,6 +140,10 @@ class Loader:
         for side in sides:
             held = "stay in memory" if side.fits else f"are shuffled in windows of {side.window_bytes / 2**20:.0f} MB"
             lines.append(f"{len(side)} samples of {side.size.sum() / 2**20:.1f} MB {held}")
+        if copies := self._memory.copies:
+            there = sum(copy.path.exists() for copy in copies.values())
+            rest = "" if there == len(copies) else ", the others when they are first read"
+            lines.append(f"{there} of {len(copies)} files are copied to {self.dataset.settings.copy}{rest}")
         return "\n".join(lines)
 
     def _settings(self) -> dict[str, Any]:

@@ -1,7 +1,8 @@
 """Rows in memory: windows are read ahead in the order in which an epoch needs them, two of a side at a time.
 
 A row group is read once per window, file by file, and of it only the rows that are wanted. A side that fits into one
-window is read once and stays.
+window is read once and stays. Rows of a local copy are mapped: they are pages that the system may take back and read
+again, and count as the window's memory all the same.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -11,11 +12,13 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 
 from planners.data import Feed
 from planners.decode import StoredRows
 from planners.files import leaves
 from planners.index import Index
+from planners.local_copy import copies_of
 from planners.mix import WindowKey
 
 AHEAD = 2  # windows of a side that are in memory, the one in use among them
@@ -69,6 +72,7 @@ class Memory:
     def __init__(self, feed: Feed, staying: Mapping[int, Index]) -> None:
         """staying: side -> its samples, for those that fit into one window."""
         self._feed, self._staying = feed, staying
+        self.copies = copies_of(feed)
         self._stay: dict[int, _Reading] = {}
         self._checked: set[tuple[int, int]] = set()  # row groups whose pages were found undamaged
 
@@ -122,23 +126,36 @@ class Memory:
 
     def _load(self, number: int, samples: Index) -> dict[int, Place]:
         """Rows of one file."""
-        rows, feed = self._feed.dataset.rows, self._feed
-        file, groups = feed.dataset.files[number], rows.group[samples]
-        needed = np.unique(groups)
-        parquet = file.open(check_pages=not all((number, int(g)) in self._checked for g in needed))
-        paths = leaves(parquet, feed.columns)
+        file = self._feed.dataset.files[number]
+        groups = self._feed.dataset.rows.group[samples]
         found: dict[int, Place] = {}
         try:
-            for group in needed.tolist():
-                inside = samples[groups == group]
-                table = parquet.read_row_group(group, columns=paths, use_threads=False)
-                if len(inside) < table.num_rows:
-                    table = table.take(rows.place[inside])
-                else:
-                    inside = inside[np.argsort(rows.place[inside])]
-                stored = StoredRows(table, [feed.cameras[sample] for sample in inside])
-                found |= {sample: (stored, row) for row, sample in enumerate(inside.tolist())}
+            read = self._reader(number, np.unique(groups))
+            for group in np.unique(groups).tolist():
+                found |= self._rows(read(group), samples[groups == group], number in self.copies)
                 self._checked.add((number, group))
+        except FileNotFoundError:
+            raise  # names its file
         except OSError as error:
             raise OSError(f"{file.table}: {file.path}: {error}") from error
         return found
+
+    def _reader(self, number: int, groups: Index) -> Callable[[int], pa.Table]:
+        """Row group -> its rows, from the file's copy where there is to be one."""
+        if number in self.copies:
+            return self.copies[number].open().read_row_group
+        checked = all((number, group) in self._checked for group in groups.tolist())
+        parquet = self._feed.dataset.files[number].open(check_pages=not checked)
+        paths = leaves(parquet, self._feed.columns)
+        return lambda group: parquet.read_row_group(group, columns=paths, use_threads=False)
+
+    def _rows(self, table: pa.Table, samples: Index, mapped: bool) -> dict[int, Place]:
+        """Those of a row group that are wanted. Of one that is mapped nothing needs to be cut: it takes no memory."""
+        places = self._feed.dataset.rows.place[samples]
+        if len(samples) < table.num_rows and not mapped:
+            table, places = table.take(places), np.arange(len(samples))
+        cameras: list[tuple[str, ...]] = [()] * table.num_rows
+        for sample, place in zip(samples.tolist(), places.tolist()):
+            cameras[place] = self._feed.cameras[sample]
+        stored = StoredRows(table, cameras, in_place=mapped)
+        return {sample: (stored, place) for sample, place in zip(samples.tolist(), places.tolist())}

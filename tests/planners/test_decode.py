@@ -111,6 +111,17 @@ def test_a_batch_is_what_its_rows_say(table: Path) -> None:
     assert batch.bev[0].any() and batch.agents_valid[0].any() and not batch.agents_valid[1].any()
 
 
+@pytest.mark.parametrize("in_place", [False, True])
+def test_pictures_leave_the_table_or_stay_in_it(table: Path, in_place: bool) -> None:
+    (file,) = files_of(table)
+    parquet = file.open()
+    read = parquet.read_row_group(0, columns=leaves(parquet, ["images.camera", "images.time_s", "images.jpeg"]))
+    whole = read["images"].chunk(0).values.field("jpeg").buffers()[2]
+    for pictures in (StoredRows(read, [("left", "front")] * 3, in_place).jpegs(row) for row in range(3)):
+        for picture in pictures:
+            assert (whole.address <= picture.ctypes.data < whole.address + whole.size) == in_place
+
+
 def test_of_a_struct_single_members_are_read(table: Path) -> None:
     (file,) = files_of(table)
     parquet = file.open()
