@@ -5,7 +5,9 @@
 
 Trains one planner for every combination of the axes (planners, experts, rounds, sim_ratios, imitation, real_shares,
 seeds), evaluates all on one benchmark, and fits S(N) = a log^2 N + b log N + c per curve. Writes `scaling.csv` (one row
-a training), `curves.csv` (a, b, c, residuals, saturation) and `scaling.png`. The same command goes on where it stopped.
+a training), `comparisons.csv` (means over seeds, differences from real samples alone with paired bootstrap intervals
+over clips and seeds), `bounds.csv`, `curves.csv` (a, b, c, residuals, saturation) and `scaling.png`. The same command
+goes on where it stopped.
 Exit codes: 0 complete, 2 bad settings, 3 a training failed, 4 interrupted or out of minutes, and resumable.
 """
 
@@ -20,6 +22,7 @@ from factory.config import ConfigError, compose, fill
 from planners.checkpoint import read_record
 from planners.scaling_figure import Curve, Point, draw_curves
 from planners.scaling_law import FEWEST, fit_scaling
+from planners.scaling_table import bounds, compared, text_of
 from planners.scores import name_of, scores_of, write_csv
 from planners.sweep import EVALUATIONS, Means, SweepFailed, Training, evaluate_all, folder_of, train_all
 
@@ -50,6 +53,7 @@ class ScalingSettings:
     imitation: tuple[Literal["all", "real", "none"], ...]
     real_shares: tuple[float, ...]
     seeds: tuple[int, ...]
+    report: str | None = None
     steps: int | None = None
     train: dict[str, tuple[str, ...]] = field(default_factory=dict)
     evaluate: tuple[str, ...] = ()
@@ -171,13 +175,19 @@ def run(settings: ScalingSettings) -> int:
                 **scores_of(evaluations / training.label),
             }
         )
-    write_csv(out / "scaling.csv", rows)
+    report = Path(settings.report or settings.out)
+    report.mkdir(parents=True, exist_ok=True)
+    differences = compared(trainings, evaluations)
     curves = curves_of(rows, settings)
-    write_csv(out / "curves.csv", [curve.row() for curve in curves])
-    draw_curves(curves, f"{settings.stage} EPDMS", out / "scaling.png")
+    tables = {"scaling": rows, "comparisons": differences, "curves": [curve.row() for curve in curves]}
+    for name, table in (tables | {"bounds": bounds(evaluations)}).items():
+        if table:
+            write_csv(report / f"{name}.csv", table)
+    draw_curves(curves, f"{settings.stage} EPDMS", report / "scaling.png")
+    print(text_of(differences, settings.stage))
     for curve in curves:
         print(curve.text())
-    print(f"look at {out / 'scaling.png'}; tables: {out / 'scaling.csv'}, {out / 'curves.csv'}")
+    print(f"tables and picture: {report}")
     return 0
 
 

@@ -9,6 +9,8 @@ from planners.aggregation import lines_of, score_of, summarise
 from planners.score_rows import read_rows
 
 STAGES = ("one_stage", "stage_one", "stage_two", "final")
+SHOWN = {"one_stage": "unfiltered", "stage_one": "filtered", "stage_two": "none", "final": "filtered"}  # as published
+BOUNDS = ("human", "pdm_closed", "constant_velocity")
 
 
 def scores_of(folder: Path) -> dict[str, float]:

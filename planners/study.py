@@ -28,14 +28,12 @@ from planners.index import DataSettings, open_dataset
 from planners.scaling_figure import Curve, Point, draw_curves
 from planners.scaling_law import FEWEST, fit_scaling
 from planners.score_rows import read_rows
-from planners.scores import name_of, scores_of, write_csv
+from planners.scores import BOUNDS, SHOWN, name_of, scores_of, write_csv
 from planners.study_figures import draw_learning
 from planners.study_plan import Comparison, Setup, Sizes, StudySettings, comparisons, ensembles, trainings
 from planners.sweep import EVALUATIONS, Means, SweepFailed, Training, evaluate_all, folder_of, train_all
 
 BAD_CONFIG, FAILED, INTERRUPTED = 2, 3, 4
-BOUNDS = ("human", "pdm_closed", "constant_velocity")
-SHOWN = {"one_stage": "unfiltered", "stage_one": "filtered", "stage_two": "none", "final": "filtered"}  # as published
 
 
 def run(settings: StudySettings) -> int:

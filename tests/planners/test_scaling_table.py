@@ -1,0 +1,73 @@
+"""A sweep's tables: each setup is held against real samples alone of its own planner, seed by seed."""
+
+from pathlib import Path
+
+import pytest
+
+from planners.scaling import ScalingSettings, SweepData, trainings_of
+from planners.scaling_table import bounds, compared, text_of
+from planners.score_rows import write_rows
+from planners.sweep import Training
+from tests.planners.made_rows import clip_rows
+
+SCORES = {0: 0.5, 1: 0.6, 2: 0.75}  # by rounds
+
+
+def sweep(tmp_path: Path, rounds: tuple[int, ...], end_m: float = 0.0) -> list[Training]:
+    """Two planners and seeds, evaluated on three clips; the second planner and seed are better by 0.01 and 0.02."""
+    settings = ScalingSettings(
+        data=SweepData(("real",), ("sim",)),
+        benchmark="bench",
+        out=str(tmp_path),
+        planners=("ltf", "ego_mlp"),
+        experts=("recovery", "pdm_closed"),
+        rounds=rounds,
+        sim_ratios=("natural",),
+        imitation=("all",),
+        real_shares=(1.0,),
+        seeds=(1, 0),
+    )
+    trainings = trainings_of(settings)
+    for training in trainings:
+        facts = training.facts
+        score = SCORES[facts["rounds"]] + 0.01 * (facts["planner"] == "ego_mlp") + 0.02 * facts["seed"]
+        evaluated(tmp_path / training.label, score, end_m)
+    return trainings
+
+
+def evaluated(folder: Path, score: float, end_m: float = 0.0) -> None:
+    folder.mkdir()
+    follow_ups = [((score, score), (0.0, 0.0), (0.0, 0.0))]
+    ends = ((end_m, 0.0), (end_m, 0.0))
+    write_rows(folder, [row for clip in "abc" for row in clip_rows(clip, score, (score, score), ends, follow_ups)])
+
+
+def test_every_setup_is_held_against_real_samples_alone_of_its_planner(tmp_path: Path) -> None:
+    rows = compared(sweep(tmp_path, (0, 1, 2)), tmp_path)
+    assert len(rows) == 2 * (1 + 2 * 2) * 4
+    for row in rows:
+        assert (row["seeds"], row["uniform_share"]) == (2, 0.0)
+        if row["rounds"] == 0:
+            assert row["difference"] == row["low"] == row["high"] == ""
+        elif row["stage"] != "final":  # the product of both stages
+            expected = 100.0 * (SCORES[row["rounds"]] - SCORES[0])
+            assert [row["difference"], row["low"], row["high"]] == pytest.approx([expected] * 3)
+    (one,) = [r for r in rows if (r["planner"], r["rounds"], r["stage"]) == ("ego_mlp", 0, "one_stage")]
+    assert [one["lowest_seed"], one["epdms"], one["highest_seed"]] == pytest.approx([51.0, 52.0, 53.0])
+    assert "+25.00   +25.00 .. +25.00" in text_of(rows, "stage_two")
+
+
+def test_a_sweep_without_real_samples_alone_has_no_differences(tmp_path: Path) -> None:
+    rows = compared(sweep(tmp_path, (1, 2)), tmp_path)
+    assert rows and all(row["difference"] == "" for row in rows)
+
+
+def test_plans_that_end_far_from_every_follow_up_are_counted(tmp_path: Path) -> None:
+    assert {row["uniform_share"] for row in compared(sweep(tmp_path, (0,), end_m=50.0), tmp_path)} == {1.0}
+
+
+def test_bounds_are_those_that_were_evaluated(tmp_path: Path) -> None:
+    assert bounds(tmp_path) == []
+    evaluated(tmp_path / "pdm_closed", 0.8)
+    (row,) = bounds(tmp_path)
+    assert row["planner"] == "pdm_closed" and row["stage_two"] == pytest.approx(80.0)
