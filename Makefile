@@ -4,7 +4,7 @@ VENV   := .venv
 PY     := $(VENV)/bin/python
 DEMO   := runs/demo
 
-.PHONY: install demo test unit lint format bench bench-reward bench-render bench-loader bench-planners study study-data clean
+.PHONY: install demo test unit lint format bench bench-reward bench-render bench-loader bench-planners study study-data study-logs study-logs-data clean
 
 install: $(VENV)/.installed
 
@@ -74,6 +74,59 @@ study-data: install
 
 study: install
 	OMP_NUM_THREADS=1 $(PY) -m planners.study vocabulary=$(STUDY)/labels.npy $(if $(MINUTES),minutes=$(MINUTES))
+
+# The part of the study without images (docs/study_logs.md): real logs, split by log. Every command of it goes on where it
+# stopped. SHARED holds data/av2, data/scenarionet and data/vocabulary. FOLDS=av2_7fab2350: some of it.
+SHARED ?= ../shared
+LOGS   := runs/study_logs
+REPORT ?= docs/study/logs
+FOLDS  ?= av2_7fab2350 av2_adcf7d18 nuscenes
+HUMAN  := $(SHARED)/data/vocabulary/human_8192x40x3.npy
+AV2    := clips=av2 clips.root=$(SHARED)/data/av2/sensor/val clips.stride_s=0.5
+NUSC   := clips=scenarionet clips.root=$(SHARED)/data/scenarionet/nuscenes clips.stride_s=1.0
+7FAB   := 7fab2350-7eaf-3b7e-a39d-6937a4c1bede
+ADCF   := adcf7d18-0510-35b0-a2fa-b4cea13a6d76
+SCENE  := sd_nuscenes_v1.0-mini_scene-
+# A fold is named after what it holds out. steps: of equal optimiser steps, about those of the largest data set's epochs.
+av2_7fab2350 := $(AV2)
+av2_7fab2350_train := [$(ADCF)]
+av2_7fab2350_test := [$(7FAB)]
+av2_7fab2350_steps := 300
+av2_adcf7d18 := $(AV2)
+av2_adcf7d18_train := [$(7FAB)]
+av2_adcf7d18_test := [$(ADCF)]
+av2_adcf7d18_steps := 300
+nuscenes := $(NUSC)
+nuscenes_train := [$(SCENE)0061,$(SCENE)0553,$(SCENE)0757,$(SCENE)0796,$(SCENE)1077]
+nuscenes_test := [$(SCENE)0655,$(SCENE)1100]
+nuscenes_steps := 1000
+
+study-logs-data: install
+	@test -f $(HUMAN) || { echo "no logs at $(SHARED)/data: give SHARED=<folder with data/av2, data/scenarionet, data/vocabulary>"; exit 2; }
+	$(foreach fold,$(FOLDS),$(call fold_data,$(fold)))
+
+define fold_data
+$(PY) -m factory.run $($(1)) clips.only=$($(1)_train) clips.split=train $(BLIND) rounds=5 out=$(LOGS)/$(1)/train
+$(PY) -m factory.run preset=hard_benchmark $($(1)) clips.only=$($(1)_test) clips.split=test clips.first_window=1 $(BLIND) out=$(LOGS)/$(1)/hard
+
+endef
+
+study-logs: study-logs-data
+	$(foreach fold,$(FOLDS),$(call fold_sweeps,$(fold)))
+
+define fold_sweeps
+$(call sweep,$(1),epochs,ego_mlp_bev_small,null) $(call learn,$(comma)$(RASTER))
+$(call sweep,$(1),steps,ego_mlp_bev_small,$($(1)_steps)) $(call learn,$(comma)$(RASTER))
+$(call sweep,$(1),ego_mlp,ego_mlp_small,$($(1)_steps)) rounds=[0,5] $(call learn)
+
+endef
+sweep = OMP_NUM_THREADS=1 $(PY) -m planners.scaling data.real=[$(LOGS)/$(1)/train] data.sim=[$(LOGS)/$(1)/train] data.val=[$(LOGS)/$(1)/hard] \
+	benchmark=$(LOGS)/$(1)/hard planners=[$(3)] experts=[recovery,pdm_closed] seeds=[0,1,2,3,4] steps=$(4) \
+	out=$(LOGS)/$(1)/$(2) report=$(REPORT)/$(1)/$(2) $(if $(MINUTES),minutes=$(MINUTES))
+learn = "+train={all: ['workers=1','validate_every=50','planner.training.batch_size=8','planner.training.epochs=40'$(1)]}"
+RASTER := 'planner.settings.bev.cell_m=1.0'
+comma := ,
+BLIND := render=none reward.labels=none vocabulary.file=$(HUMAN) executor=local
 
 clean:
 	rm -rf $(VENV) runs build *.egg-info
