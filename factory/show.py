@@ -106,7 +106,7 @@ def _truth(key: str, value: str) -> bool:
 
 def answer(request: Request) -> Iterable[str]:
     """The lines to print. Raises Refused where there is nothing to show."""
-    store = _open(request.out)
+    store = open_store(request.out)
     if request.failed:
         return failed_lines(store)
     if request.list:
@@ -116,7 +116,8 @@ def answer(request: Request) -> Iterable[str]:
     return status_lines(store)
 
 
-def _open(out: str) -> "Store":
+def open_store(out: str) -> "Store":
+    """Raises Refused where there is no run."""
     from deltalake.exceptions import DeltaError
 
     from factory.store.location import BadLocation

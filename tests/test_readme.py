@@ -13,6 +13,7 @@ import pytest
 from factory.clips.synthetic.reader import SyntheticReader
 from factory.config import compose, fill
 from factory.explain import split_arguments
+from factory.export import main as export_main
 from factory.run import main as run_main
 from factory.settings import load_config
 from factory.show import main as show_main
@@ -103,6 +104,9 @@ def test_every_command_is_one_its_program_takes(
         case ["python", "-m", "factory.show", *arguments]:
             monkeypatch.chdir(demo_home)
             assert show_main(arguments) == 0, capsys.readouterr().err
+        case ["python", "-m", "factory.export", *arguments]:
+            monkeypatch.chdir(demo_home)
+            assert export_main(arguments) == 0, capsys.readouterr().err
         case ["python", "-m", "planners.train", *arguments] | [
             "torchrun",
             "--nproc-per-node",

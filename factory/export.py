@@ -1,0 +1,116 @@
+"""`python -m factory.export mcap|mp4 out=<folder or URL> sample=<id>`: samples as files for other tools.
+
+    python -m factory.export mcap out=runs/demo sample=0             one sample for Foxglove, Lichtblick or Rerun
+    python -m factory.export mcap out=runs/demo every=10 to=looks    every tenth sample, a file each
+    python -m factory.export mp4 out=runs/demo sample=3fa9           a drive as H.264, from above and from the cameras
+
+`sample` is an ordinal, an id or the beginning of one, `to` a folder (the current one) or, for one sample, a file.
+Exit codes: 0 written, 2 bad arguments, or nothing there to export.
+"""
+
+import signal
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from factory.show import BAD_ARGUMENTS, Refused, find, logged_drive, open_store, sample_ids
+from factory.store.samples import Store
+
+Row = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Request:
+    """The command line behind the format."""
+
+    out: str
+    sample: str | None = None
+    every: int | None = None
+    to: str = "."
+
+
+def main(argv: Sequence[str]) -> int:
+    """The command; returns the exit code."""
+    if {"-h", "--help"} & set(argv) or not argv:
+        print(__doc__)
+        return 0 if argv else BAD_ARGUMENTS
+    try:
+        if argv[0] not in FORMATS:
+            raise Refused(f"{argv[0]!r}: the first word is one of {', '.join(FORMATS)}; see --help")
+        for path in export(argv[0], parse(argv[1:])):
+            print(path.resolve())
+    except Refused as error:
+        print(f"error: {error}", file=sys.stderr)
+        return BAD_ARGUMENTS
+    return 0
+
+
+def parse(argv: Sequence[str]) -> Request:
+    """key=value arguments. Raises Refused for an unknown key, a missing value or a contradiction."""
+    known = [field.name for field in fields(Request)]
+    given: dict[str, Any] = {}
+    for argument in argv:
+        key, equals, value = argument.partition("=")
+        if key not in known or not equals or not value or key in given:
+            raise Refused(f"{argument!r}: expected {', '.join(f'{name}=...' for name in known)}, each once; see --help")
+        given[key] = value
+    if "out" not in given:
+        raise Refused("out=<folder or URL of a run> is missing; see --help")
+    if ("sample" in given) == ("every" in given):
+        raise Refused("give either sample=<id> or every=<n>; see --help")
+    if "every" in given:
+        if not (given["every"].isascii() and given["every"].isdecimal() and int(given["every"])):
+            raise Refused(f"every={given['every']}: must be 1 or more")
+        given["every"] = int(given["every"])
+    return Request(**given)
+
+
+def export(kind: str, request: Request) -> Iterator[Path]:
+    """Write the files; their paths as they are written. Raises Refused where there is nothing, or no file can be."""
+    from factory.store.reader import SampleTable
+
+    store, target = open_store(request.out), Path(request.to).expanduser()
+    if request.sample is not None:
+        chosen = [find(store, request.sample)]
+    else:
+        chosen = sample_ids(store)[:: request.every]
+    is_file = target.suffix == f".{kind}" and not target.is_dir()
+    if is_file and request.every is not None:
+        raise Refused(f"to={request.to}: every=... writes a file for each sample; name a folder")
+    try:
+        table = SampleTable(store.location.uri, store.location.options)
+        for attempt_id in chosen:
+            path = target if is_file else target / f"sample_{attempt_id}.{kind}"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            FORMATS[kind](store, table[attempt_id], path)
+            yield path
+    except (OSError, ValueError) as error:  # no such folder, another schema version
+        raise Refused(f"{store.location.uri}: {error}") from error
+
+
+def write_mcap(store: Store, row: Row, path: Path) -> None:
+    """The sample as an MCAP episode."""
+    from factory.look.episode_messages import episode_messages, metadata_of
+    from factory.store.episodes import episode_bytes
+
+    path.write_bytes(episode_bytes(episode_messages(row, logged_drive(store, dict(row))), metadata_of(row)))
+
+
+def write_film(store: Store, row: Row, path: Path) -> None:
+    """The sample's drive at 10 Hz."""
+    from factory.look.seen_again import digest_of, film, scene_of
+    from factory.look.video import write_mp4
+
+    digest = digest_of(store, row)
+    scene = None if digest is None else scene_of(store, digest)
+    write_mp4(path, film(row, scene, logged_drive(store, dict(row))))
+
+
+FORMATS: Mapping[str, Callable[[Store, Row, Path], None]] = {"mcap": write_mcap, "mp4": write_film}
+
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `... | head` ends quietly
+    sys.exit(main(sys.argv[1:]))

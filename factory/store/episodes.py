@@ -1,0 +1,53 @@
+"""MCAP episodes: one sample each, for people to look at in Foxglove, Lichtblick or Rerun.
+
+Chunked, zstd-compressed, with CRCs and an index, as those tools want it; the bytes depend on the sample alone.
+"""
+
+import io
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+from mcap.well_known import MessageEncoding, SchemaEncoding
+from mcap.writer import CompressionType, Writer
+from mcap_protobuf.schema import register_schema
+
+LIBRARY = "driving-data-factory"
+CHUNK_BYTES = 1 << 20
+
+
+class Timed(Protocol):
+    """A message: see factory.look.episode_messages.Message."""
+
+    @property
+    def topic(self) -> str: ...
+    @property
+    def time_ns(self) -> int: ...
+    @property
+    def content(self) -> Any: ...
+
+
+def episode_bytes(messages: Sequence[Timed], metadata: Mapping[str, str]) -> bytes:
+    """An MCAP file of messages, in their order; metadata stands under the name `sample`."""
+    stream = io.BytesIO()
+    writer = Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD, enable_data_crcs=True)
+    writer.start(library=LIBRARY)
+    writer.add_metadata("sample", dict(metadata))
+    channels: dict[str, int] = {}
+    for sequence, message in enumerate(messages):
+        if message.topic not in channels:
+            channels[message.topic] = _channel(writer, message)
+        is_json = isinstance(message.content, Mapping)
+        data = json.dumps(message.content, sort_keys=True).encode() if is_json else message.content.SerializeToString()
+        writer.add_message(channels[message.topic], message.time_ns, data, message.time_ns, sequence)
+    writer.finish()
+    return stream.getvalue()
+
+
+def _channel(writer: Writer, message: Timed) -> int:
+    if isinstance(message.content, Mapping):
+        name = message.topic.strip("/").capitalize()
+        schema = writer.register_schema(name, SchemaEncoding.JSONSchema, json.dumps({"type": "object"}).encode())
+        return writer.register_channel(message.topic, MessageEncoding.JSON, schema)
+    schema = register_schema(writer, type(message.content))
+    return writer.register_channel(message.topic, MessageEncoding.Protobuf, schema)
