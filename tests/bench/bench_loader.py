@@ -11,7 +11,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -52,12 +52,13 @@ def main(threads: int = 2, table: str | None = None, n: int = 400) -> None:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     print(f"{threads} threads, batches of {BATCH}, best of {PASSES} passes: samples/s, CPU ms a sample\n")
-    print("| samples | picture | raw decode | loader, in memory | share of raw | loader, windows | share of raw |")
-    print("|---|---|---|---|---|---|---|")
-    if table is not None:
-        compare(table, ImageLayout(), threads, "of the table")
-        return
+    ways = ("loader, in memory", "loader, windows", "windows, from the copy")
+    print(f"| samples | picture | raw decode | {' | '.join(f'{way} | share of raw' for way in ways)} |")
+    print("|---" * (3 + 2 * len(ways)) + "|")
     with tempfile.TemporaryDirectory() as folder:
+        if table is not None:
+            compare(table, ImageLayout(), threads, "of the table", f"{folder}/copy")
+            return
         for (width, height), count, layouts in (
             ((512, 288), n, ((1092, 274), (1024, 256), (512, 128))),
             ((1920, 1080), n // 8, ((2048, 512), (1024, 256))),
@@ -65,16 +66,16 @@ def main(threads: int = 2, table: str | None = None, n: int = 400) -> None:
             out = Path(folder) / f"{width}"
             write_table(out, [photographed(i, width, height) for i in range(count)], group_rows=group_rows(width))
             for layout in layouts:
-                compare(str(out), ImageLayout(width=layout[0], height=layout[1]), threads, f"of 3 x {width} x {height}")
+                picture, name = ImageLayout(width=layout[0], height=layout[1]), f"of 3 x {width} x {height}"
+                compare(str(out), picture, threads, name, f"{folder}/copy")
 
 
-def compare(table: str, layout: ImageLayout, threads: int, name: str) -> None:
-    """One line: raw, with all in memory, and from windows that are read again in every pass."""
+def compare(table: str, layout: ImageLayout, threads: int, name: str, copy: str) -> None:
+    """One line: raw, with all in memory, and from windows that are read again in every pass, of the table or a copy."""
     needs = Needs(image=layout)
     experts = set(SampleTable(table).table(["expert"])["expert"].to_pylist())
-    dataset = open_data(
-        DataSettings(real=table if "human" in experts else (), sim=table if experts != {"human"} else ()), needs
-    )
+    settings = DataSettings(real=table if "human" in experts else (), sim=table if experts != {"human"} else ())
+    dataset = open_data(settings, needs)
     feed = make_feed(dataset, needs)
     wanted = dict(zip(dataset.rows.attempt_id.tolist(), feed.cameras))
     jpegs = [
@@ -87,12 +88,14 @@ def compare(table: str, layout: ImageLayout, threads: int, name: str) -> None:
     ]
     total_mb = feed.size.sum() / 2**20
     runs: list[Callable[[], int]] = [lambda: decode_all(jpegs, threads)]
-    for shuffle_mb in (int(2 * total_mb) + 1, max(1, int(total_mb / 4))):
-        loader = Loader(dataset, needs, MixSettings(shuffle_mb=shuffle_mb), BATCH, workers=threads)
+    whole, window = MixSettings(shuffle_mb=int(2 * total_mb) + 1), MixSettings(shuffle_mb=max(1, int(total_mb / 4)))
+    copied = replace(dataset, settings=replace(settings, copy=copy))
+    for data, mix in ((dataset, whole), (dataset, window), (copied, window)):
+        loader = Loader(data, needs, mix, BATCH, workers=threads)
         runs.append(lambda loader=loader: count(loader))  # type: ignore[misc]
     rates = [Rate() for _ in runs]
     for run in runs:
-        run()  # warms up; the loader that keeps samples has read them then
+        run()  # warms up; the loader that keeps samples has read them then, the copy is made
     for _ in range(PASSES):
         for rate, run in zip(rates, runs):  # in turns, so that they share the machine's moods
             rate.time(run)
