@@ -7,6 +7,7 @@ same result.
 import json
 import signal
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -22,9 +23,9 @@ from factory.local import Graph, LocalGraph
 from factory.plan import Plan, make_plan
 from factory.store.location import BadLocation
 from factory.store.outcomes import Kind
-from factory.store.samples import ChangedRun, OnChange, Store
+from factory.store.samples import CURRENT_RUN, ChangedRun, OnChange, Store
 from factory.store.table import AnotherWriter
-from factory.walk import retry_policy
+from factory.walk import Try, retry_policy
 from factory.work import Work
 
 COMPLETE, BAD_CONFIG, COMPLETE_WITH_FAILURES, INTERRUPTED = 0, 2, 3, 4  # exit codes
@@ -42,6 +43,7 @@ class RunSummary:
     seconds: dict[str, tuple[int, float]] = field(default_factory=dict)  # stage -> (tasks, seconds) of this run
     notes: list[str] = field(default_factory=list)
     funnel: Funnel | None = None
+    began_ms: int = 0  # since 1970; 0: nothing was left to do
 
 
 def execute(
@@ -90,7 +92,7 @@ def execute(
     driver = Driver(identity, plan, digests, rounds, policy, work.block, work.doing)
     if plan.frozen:
         driver.notes.append(f"{len(plan.frozen)} clips kept as they are: their candidates come from other settings")
-    code, message = COMPLETE, ""
+    code, message, began_ms = COMPLETE, "", 0
     try:
         graph = _graph(work, store, executor, workers, ray_address) if plan.todo else None
     except BadLocation as error:
@@ -100,6 +102,7 @@ def execute(
     try:
         store.begin(records)
         if graph is not None:
+            began_ms = _announce(store, plan, experts, rounds)
             with _stop_signals(driver.stop), _alarm(driver.stop, minutes):
                 driver.loop(graph, Gatherer(graph, store, shard_bytes, shard_seconds))
         code = COMPLETE_WITH_FAILURES if driver.has_failures else COMPLETE
@@ -113,8 +116,9 @@ def execute(
         if graph is not None:
             graph.close()
     funnel = funnel_of(store, [ref.clip_id for ref in refs])
-    summary = RunSummary(code, message, _counts(plan), driver.executed, driver.seconds, driver.notes, funnel)
-    if driver.executed.attempts or driver.executed.prepared or code:
+    counts = _counts(plan)
+    summary = RunSummary(code, message, counts, driver.executed, driver.seconds, driver.notes, funnel, began_ms)
+    if began_ms or code:
         _record(store, summary)
     for line in (*summary.notes, str(summary.executed)):
         say(line)
@@ -176,9 +180,32 @@ def _counts(plan: Plan) -> dict[str, int]:
     return counts
 
 
+def _announce(store: Store, plan: Plan, experts: Sequence[str], rounds: int) -> int:
+    """current_run.json: when the run began and how many walks it has before it, for who watches; the beginning."""
+    walks = [
+        step
+        for clip in plan.todo
+        for walk in clip.walks
+        if (step := clip.steps.get(walk.expert)) is None or isinstance(step, Try) or walk.lacks_exhausted(step)
+    ]
+    began_ms = int(time.time() * 1000)
+    document = {
+        "began_ms": began_ms,
+        "clips": len(plan.todo) + len(plan.done),
+        "clips_left": len(plan.todo),
+        "walks_left": len(walks),
+        "experts": list(experts),
+        "rounds": rounds,
+    }
+    store.location.write(CURRENT_RUN, (json.dumps(document, indent=1) + "\n").encode())
+    return began_ms
+
+
 def _record(store: Store, summary: RunSummary) -> None:
     """last_run.json: what the newest run that did anything did, for people and reports."""
     document = {
+        "began_ms": summary.began_ms,
+        "ended_ms": int(time.time() * 1000),
         "exit_code": summary.exit_code,
         "message": summary.message,
         "counts": summary.counts,

@@ -7,7 +7,7 @@ one random draw a round would be. Clips: those with at least r+1 accepted sample
 
 import io
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -21,6 +21,7 @@ from factory.store.samples import MADE_UNDER, Store, run_number
 Row = Mapping[str, Any]
 SAMPLE_COLUMNS = [*MADE_UNDER, "clip_id", "candidate_index"]
 OUTCOME_COLUMNS = [*SAMPLE_COLUMNS, "kind", "stage", "reason", "error_kind"]
+LIST_COLUMNS = ["clip_id", "n_candidates", "gate_counts", "stage", "reason"]
 
 
 @dataclass(frozen=True)
@@ -103,9 +104,17 @@ def funnel_of(store: Store, clip_ids: Collection[str] | None = None) -> Funnel:
     chosen = None if clip_ids is None else set(clip_ids)
     samples = _rows(store.samples.read(SAMPLE_COLUMNS), chosen)
     outcomes = _rows(store.outcomes.read(OUTCOME_COLUMNS), chosen)
-    samples, outcomes = _newest(samples, outcomes, run_number(store.runs()))
-    lists = _rows(store.candidates.read(["clip_id", "n_candidates", "gate_counts", "stage", "reason"]), chosen)
+    return funnel_of_rows(samples, outcomes, _rows(store.candidates.read(LIST_COLUMNS), chosen), store.runs())
 
+
+def funnel_of_rows(
+    samples: Sequence[Row], outcomes: Sequence[Row], lists: Sequence[Row], runs: Sequence[Mapping[str, Any]]
+) -> Funnel:
+    """The same of rows in hand, with the columns SAMPLE_COLUMNS, OUTCOME_COLUMNS and LIST_COLUMNS.
+
+    runs: the records of run.json, oldest first.
+    """
+    samples, outcomes = _newest(samples, outcomes, run_number(runs))
     walks: dict[str, dict[str, list[tuple[int, str]]]] = defaultdict(lambda: defaultdict(list))
     clip_outcomes: Counter[str] = Counter()
     exhausted: Counter[str] = Counter()
@@ -180,7 +189,9 @@ def _expert_rows(expert: str, clips: Mapping[str, list[tuple[int, str]]]) -> lis
     return rows
 
 
-def _newest(samples: list[Row], outcomes: list[Row], run_of: Callable[[Row], int]) -> tuple[list[Row], list[Row]]:
+def _newest(
+    samples: Sequence[Row], outcomes: Sequence[Row], run_of: Callable[[Row], int]
+) -> tuple[list[Row], list[Row]]:
     """One row per clip, expert and candidate: that of the newest run; of one run the sample.
 
     So a candidate counts once, and what a redo failed at is seen, not the old sample that it was to replace.

@@ -12,6 +12,7 @@ import pytest
 
 from factory.clips.synthetic.reader import SyntheticReader
 from factory.config import compose, fill
+from factory.dashboard import parse as dashboard_parse
 from factory.explain import split_arguments
 from factory.export import main as export_main
 from factory.run import main as run_main
@@ -26,7 +27,7 @@ from planners.train import TrainConfig
 from tasks.caches import user_cache
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-PAGES = ("README.md", "docs/configuration.md", "docs/training.md")
+PAGES = ("README.md", "docs/configuration.md", "docs/dashboard.md", "docs/training.md")
 
 
 def blocks(page: str, language: str) -> list[str]:
@@ -107,6 +108,8 @@ def test_every_command_is_one_its_program_takes(
         case ["python", "-m", "factory.export", *arguments]:
             monkeypatch.chdir(demo_home)
             assert export_main(arguments) == 0, capsys.readouterr().err
+        case ["python", "-m", "factory.dashboard", *arguments]:
+            dashboard_parse(arguments)
         case ["python", "-m", "planners.train", *arguments] | [
             "torchrun",
             "--nproc-per-node",

@@ -20,6 +20,7 @@ from factory.funnel import funnel_of
 from factory.look.drawing import attempt_picture
 from factory.look.report_page import FailedRow, Picture, Report, Strip, page
 from factory.look.report_plot import EndPoint
+from factory.look.report_words import STATUS
 from factory.look.sample_picture import (
     BEV_COLUMNS,
     decoded,
@@ -28,6 +29,7 @@ from factory.look.sample_picture import (
     fitted,
     front_camera,
     images_at_now,
+    nearer,
     sample_bev,
 )
 from factory.look.seen_again import VIEW_COLUMNS, Seen, from_the_side, photographed, real_and_rendered, scene_of
@@ -52,11 +54,6 @@ PER_VALUE = 200
 MAX_PREPARED_AGAIN = 2  # clips whose prepared form is gone from the cache: a few seconds each
 BEV_PX = (640, 640)  # 80 m
 CAMERA_PX = 320  # width of a camera frame on the page
-STATUS = {  # exit code -> words, tone
-    0: ("complete", "good"),
-    3: ("complete, with failed attempts", "warn"),
-    4: ("interrupted: the same command goes on", "warn"),
-}
 LABELS = ("attempt_id", "clip_id", "log_id", "dataset", "licence", "expert", "round", "candidate_index", "image_source")
 OUTCOME_LABELS = (
     "attempt_id",
@@ -219,7 +216,7 @@ def _accepted_examples(
         scores = f"EPDMS {_score(sample['stage1_score'])} perturbed, {_score(sample['stage2_score'])} expert"
         pictures.append(
             Picture(
-                encoded(_nearer(image)),
+                encoded(nearer(image)),
                 f"{row['expert']}, round {row['round']}",
                 f"{scores}; {sample['command']}; log {row['log_id']}; sample {row['attempt_id']}",
                 "accepted",
@@ -295,13 +292,6 @@ def _end_points(store: Store, labels: Sequence[Row], outcomes: Sequence[Row]) ->
     ]
 
 
-def _nearer(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The inner 60 m of 80 m, the ego staying at 6/10 of the height; the legend goes, the page has its own."""
-    size = image.shape[0]
-    top, side = round(0.6 * size / 4), size // 8
-    return np.ascontiguousarray(image[top : top + 3 * size // 4, side : side + 3 * size // 4])
-
-
 def _score(value: float | None) -> str:
     return "-" if value is None else f"{value:.3f}"
 
@@ -332,7 +322,7 @@ class Again:
         detail = f"{outcome['detail']}; log {outcome['log_id']}; candidate {outcome['candidate_index']}"
         if trace.rejected is not None and trace.rejected.reason != outcome["reason"]:
             detail = f"made again it fell to {trace.rejected.reason}: this attempt is not reproducible. {detail}"
-        return Picture(encoded(_nearer(image)), caption, detail, "rejected")
+        return Picture(encoded(nearer(image)), caption, detail, "rejected")
 
     def _clip(self, clip_id: str) -> PerturbedClip | None:
         if clip_id not in self._known:

@@ -13,12 +13,10 @@ from factory.funnel import Funnel, FunnelRow
 from factory.look.report_html import Html, bar, count_bar, el, nothing, number, table
 from factory.look.report_plot import FATES, EndPoint, fate_mark, scatter
 from factory.look.report_style import STYLE
-from factory.look.report_words import GATE_WORDS, REASON_WORDS
+from factory.look.report_words import GATE_WORDS, PAPER_CLIP_PERCENT, REASON_WORDS
 from factory.work import LOGGED
 from tasks.perturb import PerturbSettings
 
-# Paper (DESIGN.md, "words"): clips with a sample of the round, in % of those with one of the round before.
-PAPER_CLIP_PERCENT = {"pdm_closed": (63, 85, 83, 83, 84), "recovery": (43, 80, 78, 78, 78)}
 MAX_POINTS = 4000  # in the scatter; more would make the file heavy and show nothing new
 
 

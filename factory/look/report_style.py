@@ -1,11 +1,20 @@
-"""The style of report.html: system fonts, both colour schemes, one column on a phone."""
+"""The style of report.html and of the dashboard: system fonts, both colour schemes, one column on a phone."""
 
-STYLE = """
-:root{--bg:#f6f7f8;--card:#fff;--ink:#1b2026;--dim:#68727d;--line:#e3e6e9;--track:#eceff1;--accent:#2078c8;
---good:#1f8a5f;--bad:#c9463a;--warn:#b7791f;--cell:#e9f0f6;--perturbed:#e07a20;--logged:#6e6e6e}
-@media (prefers-color-scheme:dark){:root{--bg:#12161b;--card:#1a2027;--ink:#e6eaee;--dim:#95a1ad;--line:#2c343d;
---track:#2a323b;--accent:#5aa5ea;--good:#4fc08d;--bad:#ef7a6d;--warn:#e0ac52;--cell:#222c37;--logged:#a5a5a5}}
-*{box-sizing:border-box}
+LIGHT = (
+    "--bg:#f6f7f8;--card:#fff;--ink:#1b2026;--dim:#68727d;--line:#e3e6e9;--track:#eceff1;--accent:#2078c8;"
+    "--good:#1f8a5f;--bad:#c9463a;--warn:#b7791f;--cell:#e9f0f6;--perturbed:#e07a20;--logged:#6e6e6e"
+)
+DARK = (
+    "--bg:#12161b;--card:#1a2027;--ink:#e6eaee;--dim:#95a1ad;--line:#2c343d;--track:#2a323b;--accent:#5aa5ea;"
+    "--good:#4fc08d;--bad:#ef7a6d;--warn:#e0ac52;--cell:#222c37;--logged:#a5a5a5"
+)
+COLOURS = f"""
+:root{{{LIGHT}}}
+@media (prefers-color-scheme:dark){{:root{{{DARK}}}}}
+"""
+STYLE = (
+    COLOURS
+    + """*{box-sizing:border-box}
 body{margin:0;background:var(--bg);color:var(--ink);font:15px/1.5 system-ui,-apple-system,"Segoe UI",Roboto,sans-serif}
 main{max-width:1120px;margin:0 auto;padding:28px 20px 60px}
 header,section,details{background:var(--card);border:1px solid var(--line);border-radius:12px;
@@ -74,3 +83,4 @@ details[open] summary{margin-bottom:10px}
 @media (max-width:600px){main{padding:10px 8px 40px}header,section,details{padding:16px 14px;border-radius:10px}}
 @media print{body{background:#fff}section,header{break-inside:avoid}}
 """
+)

@@ -1,6 +1,7 @@
 """Pictures of stored samples, from the row alone: the world from above, and what the cameras saw."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -46,6 +47,7 @@ def sample_bev(
     size_px: tuple[int, int] = (480, 480),
     vocabulary: Array | None = None,
     step: int = NOW_INDEX,
+    legend: bool = True,
 ) -> Image:
     """A sample from above, at its now or another step, the ego pointing up.
 
@@ -55,6 +57,7 @@ def sample_bev(
         size_px: width, height.
         vocabulary: (K, 40, 3) the trajectories that the row's labels are of, to be drawn in the colour of their score.
         step: index of the row's 10 Hz steps, -1.5 .. 4.0 s around now.
+        legend: whether the paths' names are written below.
     """
     lanes = dict(zip(row["lane_ids"], row["lane_polygons"]))
     red = {
@@ -70,7 +73,16 @@ def sample_bev(
     boxes = np.asarray(row["agent_boxes"], dtype=float).reshape(len(row["agent_kinds"]), -1, 5)
     here = ego_way(row)[step]
     paths = [*(_scored_paths(row, vocabulary) if vocabulary is not None else ()), *_paths(row, logged)]
+    if not legend:
+        paths = [replace(path, label="") for path in paths]
     return draw_bev(here, shapes, Boxes(boxes[:, step], row["agent_kinds"]), here, paths, "", size_px)
+
+
+def nearer(image: Image) -> Image:
+    """Of a square top-down picture the inner 60 m of 80 m, the ego staying at 6/10 of the height; the legend goes."""
+    size = image.shape[0]
+    top, side = round(0.6 * size / 4), size // 8
+    return np.ascontiguousarray(image[top : top + 3 * size // 4, side : side + 3 * size // 4])
 
 
 def ego_way(row: Row) -> Array:

@@ -22,6 +22,7 @@ from factory.work import UNLISTED, RunIdentity, canonical_json
 
 OnChange = Literal["stop", "keep", "redo"]
 RUN_FILE = "run.json"
+CURRENT_RUN = "current_run.json"  # what the newest run set out to do; over once last_run.json has its began_ms
 WAYS_OUT = "Go on with on_change=keep, replace with on_change=redo, or choose another out"
 STATE = ["attempt_id", "clip_id", "expert", "expert_digest", "candidate_index", "settings_hash", "stage_versions"]
 MADE_UNDER = ["attempt_id", "expert", "expert_digest", "settings_hash", "stage_versions"]

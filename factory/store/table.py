@@ -64,6 +64,16 @@ class Shard:
     keys: tuple[str, ...]
 
 
+@dataclass(frozen=True)
+class LiveFile:
+    """One file that the log names."""
+
+    partition: Mapping[str, str]
+    n_bytes: int
+    n_rows: int
+    written_ms: int  # since 1970: when its rows came into the table, or were rewritten without others
+
+
 def write_shard(location: Location, spec: TableSpec, rows: pa.Table) -> Shard:
     """Write rows of ONE partition, sorted by key, as one file under the table's folder. Idempotent.
 
@@ -137,11 +147,32 @@ class KeyedTable:
 
     def live_files(self) -> dict[str, Mapping[str, str]]:
         """Path -> partition values of every file that the log names."""
+        return {path: file.partition for path, file in self.file_facts().items()}
+
+    def file_facts(self) -> dict[str, LiveFile]:
+        """Path -> what the log says of every file that it names; reads no file."""
         if self._delta is None:
             return {}
-        actions = pa.table(self._delta.get_add_actions(flatten=True)).to_pylist()
-        names = self.spec.partition_by
-        return {a["path"]: {n: str(a[f"partition.{n}"]) for n in names} for a in actions}
+        parts = {name: f"partition.{name}" for name in self.spec.partition_by}
+        facts = ["path", "size_bytes", "num_records", "modification_time"]
+        actions = pa.table(self._delta.get_add_actions(flatten=True)).select([*facts, *parts.values()])
+        return {
+            a["path"]: LiveFile(
+                {name: str(a[part]) for name, part in parts.items()},
+                a["size_bytes"],
+                a["num_records"] or 0,
+                a["modification_time"],
+            )
+            for a in actions.to_pylist()
+        }
+
+    def refresh(self) -> None:
+        """For a reader: see what was committed since the table was opened or last refreshed."""
+        if self._delta is not None:
+            self._delta.update_incremental()
+        elif DeltaTable.is_deltatable(self.location.uri, storage_options=dict(self.location.options)):
+            self._delta = DeltaTable(self.location.uri, storage_options=dict(self.location.options))
+        self.__dict__.pop("_path_of", None)
 
     def files(self, columns: Sequence[str] | None = None) -> Iterable[tuple[str, pa.Table]]:
         """(path, its rows) for every live file, in path order; columns None: all, partition columns included."""

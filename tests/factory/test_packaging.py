@@ -40,7 +40,8 @@ def test_the_wheel_holds_every_module_every_setting_and_no_test(wheel: Path) -> 
         f"factory/conf/{path.relative_to(REPOSITORY / 'conf').as_posix()}"
         for path in (REPOSITORY / "conf").rglob("*.yaml")
     }
-    assert inside == modules | settings
+    page = {path.relative_to(REPOSITORY).as_posix() for path in (REPOSITORY / "factory/board/static").iterdir()}
+    assert inside == modules | settings | page
 
 
 def test_installed_it_works_beside_a_stranger_s_tasks_py(wheel: Path, tmp_path: Path) -> None:

@@ -1,0 +1,155 @@
+"""Pictures of samples, made when they are asked for and kept in bounded memory: GET /picture/<attempt_id>/<name>.
+
+    front.jpg           what the camera that looks ahead saw at now
+    <n>.jpg             the n-th stored image, n as in the sample's `images`
+    bev.jpg             seen from above; step=0..55 (-1.5 .. 4.0 s at 10 Hz, 15 is now), size=300 or 600
+
+A sample's row is read by its file and row group: one group, never a file. Stored JPEGs go out as they are, unless they
+are wider than WIDE_PX and small=1 asks for less.
+"""
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from factory.board.gallery import BadRequest, NotThere, place_of
+from factory.board.watch import Snapshot
+from factory.look.sample_picture import decoded, encoded, fitted, front_camera, images_at_now, nearer, sample_bev
+from factory.store.location import Location
+from factory.store.schema import AGENT_STEPS, SCHEMA, table_to_rows
+
+BEV_SIZES = (300, 600)  # divisible by 3 and 4
+WIDE_PX = 640
+KEPT_BYTES = 64 * 2**20  # of pictures
+KEPT_ROWS = 32  # whole samples of some 0.2 to 2 MB
+KEPT_FILES = 16  # their footers
+LEFT_OUT = ("label_subscores", "label_progress")  # large, and not shown
+Sample = Mapping[str, Any]
+
+
+class KeptBytes:
+    """Values by key up to a sum of bytes; the least recently used go first. Safe to use from many threads."""
+
+    def __init__(self, most: int = KEPT_BYTES) -> None:
+        self._most, self._held = most, 0
+        self._values: OrderedDict[tuple[object, ...], bytes] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, key: tuple[object, ...], make: Callable[[], bytes]) -> bytes:
+        """The value, made now where it is not kept."""
+        with self._lock:
+            if key in self._values:
+                self._values.move_to_end(key)
+                return self._values[key]
+        made = make()
+        with self._lock:
+            if key not in self._values and len(made) <= self._most:
+                self._values[key] = made
+                self._held += len(made)
+            while self._held > self._most:
+                self._held -= len(self._values.popitem(last=False)[1])
+        return made
+
+
+class Pictures:
+    """Of one table of samples."""
+
+    def __init__(self, samples: Location) -> None:
+        self._location = samples
+        self._kept = KeptBytes()
+        self._lock = threading.Lock()
+        self._file = lru_cache(maxsize=KEPT_FILES)(self._open)
+        self._row = lru_cache(maxsize=KEPT_ROWS)(self._read)
+
+    def row(self, shot: Snapshot, attempt_id: str) -> Sample:
+        """The whole row but its labels. Raises NotThere."""
+        path, row, partition = self._place(shot, attempt_id)
+        with self._lock:  # the card's two pictures ask at once; one of them reads
+            return self._row(path, row, partition)
+
+    def front(self, shot: Snapshot, attempt_id: str) -> bytes:
+        """JPEG, small. Raises NotThere where the sample has no image."""
+
+        def make() -> bytes:
+            row = self.row(shot, attempt_id)
+            name = front_camera(row)
+            found = [image for image in images_at_now(row) if image["camera"] == name]
+            if not found:
+                raise NotThere(f"{attempt_id} has no image: image_source is {row['image_source']}")
+            return _jpeg(found[0], small=True)
+
+        return self._kept.get((*self._place(shot, attempt_id), "front"), make)
+
+    def image(self, shot: Snapshot, attempt_id: str, index: int, small: bool = False) -> bytes:
+        """JPEG of the n-th stored image. Raises NotThere."""
+
+        def make() -> bytes:
+            images = self.row(shot, attempt_id)["images"] or ()
+            if index >= len(images):
+                raise NotThere(f"{attempt_id} has {len(images)} images, none of number {index}")
+            return _jpeg(images[index], small)
+
+        return self._kept.get((*self._place(shot, attempt_id), index, small), make)
+
+    def bev(self, shot: Snapshot, attempt_id: str, size_px: int, step: int) -> bytes:
+        """JPEG, square. Raises BadRequest for another size or step, NotThere."""
+        if size_px not in BEV_SIZES or not 0 <= step < AGENT_STEPS:
+            raise BadRequest(f"size={size_px} step={step}: size is one of {BEV_SIZES}, step 0 to {AGENT_STEPS - 1}")
+
+        def make() -> bytes:
+            size = (size_px * 4 // 3,) * 2  # `nearer` keeps three quarters
+            return encoded(nearer(sample_bev(self.row(shot, attempt_id), None, size, step=step, legend=False)))
+
+        return self._kept.get((*self._place(shot, attempt_id), "bev", size_px, step), make)
+
+    def _place(self, shot: Snapshot, attempt_id: str) -> tuple[str, int, tuple[tuple[str, str], ...]]:
+        (row,) = shot.newest_first.slice(place_of(shot, attempt_id), 1).to_pylist()
+        partition = (("round", str(row["round"])), ("expert", row["expert"]))
+        return shot.sample_paths[row["_file"]], row["_row"], partition
+
+    def _read(self, path: str, row: int, partition: tuple[tuple[str, str], ...]) -> Sample:
+        values = dict(partition)
+        file = self._file(path)
+        group = 0
+        while row >= file.metadata.row_group(group).num_rows:
+            row -= file.metadata.row_group(group).num_rows
+            group += 1
+        names = [name for name in SCHEMA.names if name not in LEFT_OUT]
+        stored = file.read_row_groups([group], columns=[n for n in names if n not in values]).slice(row, 1)
+        fields = [SCHEMA.field(name) for name in names]
+        arrays = [
+            pa.array([values[f.name]]).cast(f.type) if f.name in values else stored[f.name].cast(f.type) for f in fields
+        ]
+        return table_to_rows(pa.table(arrays, schema=pa.schema(fields)))[0]
+
+    def _open(self, path: str) -> pq.ParquetFile:
+        filesystem, base = self._location.filesystem()
+        return pq.ParquetFile(f"{base}/{path}", filesystem=filesystem, page_checksum_verification=True)
+
+
+def _jpeg(image: Mapping[str, Any], small: bool) -> bytes:
+    """As it is stored, or not wider than WIDE_PX. Raises NotThere where it cannot be decoded to be made smaller."""
+    if not small:
+        return bytes(image["jpeg"])
+    try:
+        pixels = decoded(image) if _width(image["jpeg"]) > WIDE_PX else None
+    except ValueError as error:
+        raise NotThere(str(error)) from error
+    if pixels is None:
+        return bytes(image["jpeg"])
+    return encoded(fitted(pixels, WIDE_PX, round(WIDE_PX * pixels.shape[0] / pixels.shape[1])))
+
+
+def _width(jpeg: bytes) -> int:
+    """Of the picture, at an eighth of the cost of decoding it."""
+    eighth = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_REDUCED_GRAYSCALE_8)
+    if eighth is None:
+        raise ValueError("a stored image cannot be decoded")
+    return 8 * eighth.shape[1]

@@ -1,0 +1,72 @@
+// Elements, numbers and questions to the server. Text from data only ever becomes text nodes.
+
+const SVG = "http://www.w3.org/2000/svg";
+
+function built(node, attributes, children) {
+  for (const [name, value] of Object.entries(attributes ?? {})) {
+    if (value === null || value === undefined || value === false) continue;
+    if (name.startsWith("on")) node.addEventListener(name.slice(2), value);
+    else if (name === "style") Object.entries(value).forEach(([k, v]) => node.style.setProperty(k, v));
+    else node.setAttribute(name, value === true ? "" : value);
+  }
+  node.append(...children.flat(2).filter((child) => child !== null && child !== undefined));
+  return node;
+}
+
+export const h = (tag, attributes, ...children) => built(document.createElement(tag), attributes, children);
+export const s = (tag, attributes, ...children) => built(document.createElementNS(SVG, tag), attributes, children);
+
+export const count = (n) => n.toLocaleString("en-US");
+export const percent = (share) => (share === null ? "-" : `${(100 * share).toFixed(1)} %`);
+export const score = (value) => (value === null ? "-" : value.toFixed(3));
+export const clock = (ms) => new Date(ms).toLocaleTimeString([], { hour: "2-digit", minute: "2-digit" });
+export const plural = (n, word) => `${count(n)} ${word}${n === 1 ? "" : "s"}`;
+
+export function span(seconds) {
+  if (seconds < 90) return `${Math.round(seconds)} s`;
+  if (seconds < 5400) return `${Math.round(seconds / 60)} min`;
+  if (seconds < 172800) return `${(seconds / 3600).toFixed(1)} h`;
+  return `${(seconds / 86400).toFixed(1)} days`;
+}
+
+export function bytes(n) {
+  const [unit, size] = n >= 1e9 ? ["GB", 1e9] : n >= 1e6 ? ["MB", 1e6] : ["kB", 1e3];
+  return `${(n / size).toFixed(n / size < 10 ? 1 : 0)} ${unit}`;
+}
+
+export async function ask(path) {
+  const answer = await fetch(path);
+  const body = await answer.json();
+  if (!answer.ok) throw new Error(body.error ?? answer.statusText);
+  return body;
+}
+
+export const section = (title, lead, ...content) =>
+  h("section", null, h("h2", null, title), lead ? h("p", { class: "lead" }, lead) : null, ...content);
+
+export function table(name, head, rows) {
+  const top = h("thead", null, h("tr", null, head.map((title) => h("th", { scope: "col" }, title))));
+  return h("div", { class: "wide" }, h("table", { class: name }, top, h("tbody", null, rows)));
+}
+
+export function bar(share, text, mark) {
+  const track = h("span", { class: "track" }, h("span", { style: { width: `${100 * (share ?? 0)}%` } }));
+  if (mark !== null && mark !== undefined) {
+    track.append(h("i", { style: { left: `${100 * mark}%` }, title: `paper ${Math.round(100 * mark)} %` }));
+  }
+  return h("span", { class: "bar" }, track, h("span", { class: "value" }, text));
+}
+
+export function picture(item, name, alt, query = "") {
+  const image = h("img", { alt, loading: "lazy", decoding: "async" });
+  image.addEventListener("load", () => image.setAttribute("data-loaded", image.naturalWidth));
+  image.addEventListener("error", () => image.replaceWith(h("span", { class: "missing" }, "no picture")));
+  image.src = `/picture/${item.attempt_id}/${name}?v=${item.file}${query}`;
+  return image;
+}
+
+export const EXPERT_WORDS = {
+  human: "the logged drive itself",
+  pdm_closed: "plans by rule and scores its own proposals",
+  recovery: "steers back to the logged drive",
+};

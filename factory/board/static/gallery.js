@@ -1,0 +1,39 @@
+// Samples as cards, by page, with filters that stand in the address.
+
+import { ask, count, h, picture, plural, score } from "./dom.js";
+
+const FILTERS = { expert: "expert", round: "round", image_source: "images", command: "command", log_id: "log" };
+const ORDERS = { newest: "newest first", worst: "lowest score first", best: "highest score first" };
+
+export function card(item) {
+  const front = item.image_source === "none" ? null : picture(item, "front.jpg", "front camera");
+  const bev = picture(item, "bev.jpg", "from above: logged grey, perturbed orange, expert blue");
+  const words = [h("b", null, item.expert), ` round ${item.round}, ${item.command} `, h("span", { class: "score" }, score(item.stage2_score)),
+    h("small", null, `${item.log_id}`)];
+  return h("a", { class: "card", href: `#/sample/${item.attempt_id}`, "data-id": item.attempt_id },
+    h("span", { class: `views${front ? "" : " alone"}` }, front, bev), h("span", { class: "words" }, words));
+}
+
+export async function galleryPage(query) {
+  const wanted = new URLSearchParams(query);
+  const [page, overview] = await Promise.all([ask(`/api/samples?${wanted}`), ask("/api/overview")]);
+  const address = (changes) => {
+    const next = new URLSearchParams(query);
+    Object.entries(changes).forEach(([k, v]) => (v ? next.set(k, v) : next.delete(k)));
+    return `#/gallery?${next}`;
+  };
+  const go = (name) => (event) => (location.hash = address({ [name]: event.target.value, page: "" }));
+  const choice = (name, title, values) => h("label", null, title, h("select", { onchange: go(name), name },
+    values.map(([value, text]) => h("option", { value, selected: (wanted.get(name) ?? "") === value }, text))));
+  const filters = Object.entries(FILTERS).filter(([name]) => overview.facets[name].length > 1).map(([name, title]) =>
+    choice(name, title, [["", "all"], ...overview.facets[name].map((v) => [v, v])]));
+  const order = choice("order", "order", Object.entries(ORDERS).map(([k, v]) => [k === "newest" ? "" : k, v]));
+  const steps = h("div", { class: "pager" },
+    h("a", { class: `button${page.page > 1 ? "" : " off"}`, href: page.page > 1 ? address({ page: String(page.page - 1) }) : null, "data-go": "back" }, "← back"),
+    h("span", { id: "total" }, `${plural(page.total, "sample")}, page ${count(page.page)} of ${count(page.pages)}`),
+    h("a", { class: `button${page.page < page.pages ? "" : " off"}`, href: page.page < page.pages ? address({ page: String(page.page + 1) }) : null, "data-go": "on" }, "on →"));
+  const key = h("p", { class: "keys" }, h("span", null, h("i", { class: "key logged" }), "logged"), h("span", null, h("i", { class: "key perturbed" }), "perturbed"),
+    h("span", null, h("i", { class: "key expert" }), "expert"), h("span", null, h("i", { class: "key ego" }), "ego"), h("span", null, h("b", { class: "score" }, "1.000"), "EPDMS of the expert's drive"));
+  const cards = page.items.length ? h("div", { class: "cards" }, page.items.map(card)) : h("p", { class: "nothing" }, "No sample fits.");
+  return [h("section", null, h("h2", null, "Samples"), h("div", { class: "filters" }, filters, order), key, cards, steps)];
+}

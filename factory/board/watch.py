@@ -1,0 +1,243 @@
+"""The tables of a run, read anew as they grow: only what was committed since, and only the columns the page needs.
+
+Files of a table are immutable and named by their content, so each is read once; a commit costs its own files. What is
+kept of a sample is some 300 bytes: its scores and lineage, and the file and row that its pictures stand in.
+
+Tables are looked at in the order outcomes, samples, candidates, the opposite of the order of a commit. In between an
+attempt of the newest group may be missing, and one that failed and then succeeded may stand in both, which the funnel
+knows to count once; the next look sees the whole group.
+"""
+
+import json
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from factory.store.samples import CURRENT_RUN, Store
+from factory.store.table import KeyedTable, LiveFile
+
+SAMPLE_COLUMNS = (
+    "attempt_id",
+    "clip_id",
+    "dataset",
+    "log_id",
+    "split",
+    "licence",
+    "expert",
+    "expert_digest",
+    "round",
+    "candidate_index",
+    "settings_hash",
+    "stage_versions",
+    "command",
+    "image_source",
+    "psnr",
+    "stage1_score",
+    "stage2_score",
+    "candidate_end",
+)
+OUTCOME_COLUMNS = (
+    "attempt_id",
+    "clip_id",
+    "log_id",
+    "expert",
+    "expert_digest",
+    "candidate_index",
+    "kind",
+    "settings_hash",
+    "stage_versions",
+    "stage",
+    "reason",
+    "detail",
+    "error_kind",
+    "error",
+    "tries",
+    "seconds",
+)
+CANDIDATE_COLUMNS = ("clip_id", "n_candidates", "gate_counts", "stage", "reason", "candidates")
+LOOK_EVERY_S = 2.0
+Numbers = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Part:
+    """What is kept of one file; `rows` has the columns _file, _row and _written_ms beside those of the table."""
+
+    rows: pa.Table
+    seconds: Mapping[str, tuple[int, float]] = field(default_factory=dict)  # outcomes: stage -> attempts, seconds
+    end_points: Numbers | None = None  # candidates: (N, 2) x, y [m], frame of the logged pose at T+H
+
+
+class Watched:
+    """One table and the parts of it that were read."""
+
+    def __init__(self, table: KeyedTable, columns: Sequence[str]) -> None:
+        self.table, self._columns = table, list(columns)
+        self.files: Mapping[str, LiveFile] = {}
+        self.parts: dict[str, Part] = {}
+        self.paths: list[str] = []  # by the number in _file
+        self._seen: int | None = None
+
+    def look(self) -> bool:
+        """Read what was committed since; whether anything was."""
+        self.table.refresh()
+        if self.table.version == self._seen:
+            return False
+        files = self.table.file_facts()
+        parts = {}
+        for path, file in sorted(files.items()):
+            parts[path] = self.parts[path] if path in self.parts else self._read(path, file)
+        self.files, self.parts, self._seen = files, parts, self.table.version
+        return True
+
+    def rows(self) -> pa.Table:
+        """All of them."""
+        if not self.parts:
+            names = [name for name in self._columns if name not in ("seconds", "candidates")]
+            schema = pa.schema([self.table.spec.schema.field(name) for name in names])
+            return _placed(schema.empty_table(), 0, 0)
+        return pa.concat_tables([part.rows for part in self.parts.values()])
+
+    def _read(self, path: str, file: LiveFile) -> Part:
+        rows = self.table.read_file(path, file.partition, self._columns)
+        self.paths.append(path)
+        seconds, ends = {}, None
+        if "seconds" in self._columns:
+            seconds, rows = seconds_of(rows["seconds"]), rows.drop_columns(["seconds"])
+        if "candidates" in self._columns:
+            ends, rows = end_points_of(rows["candidates"]), rows.drop_columns(["candidates"])
+        return Part(_placed(rows, len(self.paths) - 1, file.written_ms), seconds, ends)
+
+
+def _placed(rows: pa.Table, file: int, written_ms: int) -> pa.Table:
+    n = rows.num_rows
+    rows = rows.append_column("_file", pa.repeat(pa.scalar(file, pa.int32()), n))
+    rows = rows.append_column("_row", pa.array(np.arange(n), pa.int32()))
+    return rows.append_column("_written_ms", pa.repeat(pa.scalar(written_ms, pa.int64()), n))
+
+
+def seconds_of(column: pa.ChunkedArray) -> dict[str, tuple[int, float]]:
+    """Stage -> (attempts, seconds) of a column of maps."""
+    totals: dict[str, tuple[int, float]] = {}
+    for row in column.to_pylist():
+        for stage, spent in row or ():
+            n, total = totals.get(stage, (0, 0.0))
+            totals[stage] = n + 1, total + spent
+    return totals
+
+
+def end_points_of(column: pa.ChunkedArray) -> Numbers:
+    """(N, 2) where the candidates of all rows end."""
+    flat = pc.list_flatten(column)
+    x, y = (pc.struct_field(flat, name).to_numpy().astype(np.float32) for name in ("end_x", "end_y"))
+    return np.stack([x, y], axis=1)
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """The run at one instant. Row tables have the columns named above, and _file, _row, _written_ms."""
+
+    version: str  # of the three tables, "-" for one that is not there yet
+    taken_s: float  # since 1970
+    samples: pa.Table
+    outcomes: pa.Table
+    candidates: pa.Table
+    sample_paths: Sequence[str]  # by _file
+    candidate_paths: Sequence[str]
+    sample_bytes: int
+    seconds: Mapping[str, tuple[int, float]]  # stage -> attempts, seconds: of rejected attempts
+    end_points: Numbers  # (N, 2) of all candidates
+    runs: Sequence[Mapping[str, Any]]  # records of run.json, oldest first
+    last: Mapping[str, Any]  # last_run.json, empty where there is none
+    current: Mapping[str, Any]  # current_run.json, likewise
+
+    @property
+    def last_commit_ms(self) -> int:
+        """Of rows, since 1970; 0: none."""
+        newest = [pc.max(t["_written_ms"]).as_py() for t in (self.samples, self.outcomes, self.candidates)]
+        return max((ms for ms in newest if ms is not None), default=0)
+
+    @property
+    def live(self) -> bool:
+        """A run was announced that has not told how it ended."""
+        return bool(self.current) and self.current["began_ms"] != self.last.get("began_ms")
+
+    @cached_property
+    def sample_rows(self) -> list[dict[str, Any]]:
+        """As dicts."""
+        return self.samples.to_pylist()
+
+    @cached_property
+    def outcome_rows(self) -> list[dict[str, Any]]:
+        return self.outcomes.to_pylist()
+
+    @cached_property
+    def newest_first(self) -> pa.Table:
+        """Samples: those committed last first, and by attempt_id within a file's time."""
+        return self.samples.sort_by([("_written_ms", "descending"), ("attempt_id", "ascending")])
+
+
+class Watch:
+    """Takes snapshots of one store; safe to ask from many threads."""
+
+    def __init__(self, store: Store, look_every_s: float = LOOK_EVERY_S) -> None:
+        self.store = store
+        self._every_s = look_every_s
+        self._outcomes = Watched(store.outcomes, OUTCOME_COLUMNS)
+        self._samples = Watched(store.samples, SAMPLE_COLUMNS)
+        self._candidates = Watched(store.candidates, CANDIDATE_COLUMNS)
+        self._lock = threading.Lock()
+        self._snapshot: Snapshot | None = None
+        self._due_s = 0.0
+        self._told: tuple[bytes | None, ...] = ()
+
+    def now(self) -> Snapshot:
+        """The newest snapshot; the tables are looked at again where the last look is some seconds old."""
+        with self._lock:
+            if self._snapshot is None or time.monotonic() >= self._due_s:
+                began = time.monotonic()
+                self._snapshot = self._look(self._snapshot)
+                cost = time.monotonic() - began
+                self._due_s = time.monotonic() + max(self._every_s, 4.0 * cost if self._every_s else 0.0)
+            return self._snapshot
+
+    def _look(self, known: Snapshot | None) -> Snapshot:
+        tables = (self._outcomes, self._samples, self._candidates)
+        changed = [table.look() for table in tables]
+        told = tuple(self.store.location.read(name) for name in ("run.json", "last_run.json", CURRENT_RUN))
+        if known is not None and not any(changed) and told == self._told:
+            return known
+        self._told = told
+        ends = [part.end_points for part in self._candidates.parts.values() if part.end_points is not None]
+        return Snapshot(
+            version=".".join("-" if t.table.version is None else str(t.table.version) for t in tables),
+            taken_s=time.time(),
+            samples=self._samples.rows(),
+            outcomes=self._outcomes.rows(),
+            candidates=self._candidates.rows(),
+            sample_paths=tuple(self._samples.paths),
+            candidate_paths=tuple(self._candidates.paths),
+            sample_bytes=sum(file.n_bytes for file in self._samples.files.values()),
+            seconds=_summed([part.seconds for part in self._outcomes.parts.values()]),
+            end_points=np.concatenate([np.zeros((0, 2), np.float32), *ends]),
+            runs=self.store.runs(),
+            last=json.loads(told[1] or b"{}"),
+            current=json.loads(told[2] or b"{}"),
+        )
+
+
+def _summed(parts: Sequence[Mapping[str, tuple[int, float]]]) -> dict[str, tuple[int, float]]:
+    total: dict[str, tuple[int, float]] = {}
+    for part in parts:
+        for stage, (n, seconds) in part.items():
+            had, spent = total.get(stage, (0, 0.0))
+            total[stage] = had + n, spent + seconds
+    return dict(sorted(total.items()))

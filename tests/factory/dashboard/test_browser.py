@@ -1,0 +1,96 @@
+"""In a real browser: the numbers on the page are the tables', pictures load, the console stays empty."""
+
+import re
+import shutil
+import subprocess
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from factory.board.server import Board, Server
+from factory.store.samples import Store
+from tests.factory.dashboard.runs import EVIL, counted, run
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on the PATH"),
+]
+Dump = Callable[[str], str]
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("run")
+    run(folder, 1)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def dump(out: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Dump]:
+    """Address -> the page's elements once it has come to rest; a word on the console fails."""
+    profile = tmp_path_factory.mktemp("profile")
+    with Server(Board(Store(out), look_every_s=0.0), "127.0.0.1", 0) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+
+        def dumped(address: str, width: int = 1440) -> str:
+            command = [
+                str(CHROMIUM),
+                "--headless=new",
+                "--no-sandbox",
+                "--disable-gpu",
+                "--enable-logging=stderr",
+                f"--user-data-dir={profile}",
+                f"--window-size={width},6000",
+                "--virtual-time-budget=10000",
+                "--dump-dom",
+                f"http://127.0.0.1:{server.server_address[1]}/{address}",
+            ]
+            done = subprocess.run(command, capture_output=True, text=True, timeout=200)
+            assert "CONSOLE" not in done.stderr, done.stderr
+            assert "data-ready" in done.stdout, done.stdout
+            return done.stdout
+
+        yield dumped
+        server.shutdown()
+
+
+def tiles(page: str) -> dict[str, str]:
+    return dict(re.findall(r'data-count="(\w+)"[^>]*><b>([^<]*)</b>', page))
+
+
+def test_the_overview_shows_the_tables_also_after_more_was_committed(out: Path, dump: Dump) -> None:
+    for rounds in (1, 2):
+        run(out, rounds)
+        page, wanted = dump("#/"), counted(out)
+        shown = tiles(page)
+        assert {name: int(shown[name]) for name in ("samples", "attempts", "clips", "failed")} == {
+            name: wanted[name] for name in ("samples", "attempts", "clips", "failed")
+        }
+        totals = re.findall(r'data-reason="([^"]*)".*?</tr>', page)
+        assert set(totals) == set(wanted["reasons"])
+        rows = re.findall(
+            r"<tr><th scope=\"row\">(\w+)(?:<small>[^<]*</small>)?</th>" + 3 * r'<td class="n">(\d+)</td>', page
+        )
+        accepted = {(expert, int(number)): int(n) for expert, number, _, n in rows if int(n)}
+        assert accepted == wanted["accepted"]
+        simulated = min(6, wanted["simulated"])
+        assert page.count("data-loaded") == 2 * simulated and "no picture" not in page
+
+
+def test_the_gallery_and_a_sample_show_their_pictures_and_nothing_from_data_is_markup(out: Path, dump: Dump) -> None:
+    page = dump("#/gallery?expert=recovery")
+    ids = re.findall(r'data-id="(\w+)"', page)
+    wanted = [r for r in Store(out).samples.read(["attempt_id", "expert"]).to_pylist() if r["expert"] == "recovery"]
+    assert sorted(ids) == sorted(r["attempt_id"] for r in wanted)
+    assert page.count("data-loaded") == 2 * len(ids)
+    page = dump(f"#/sample/{ids[0]}")
+    assert page.count("data-loaded") == len(Store(out).samples.read(["images"])["images"][0])
+    assert 'data-score="nc"' in page and 'data-kind="rejected"' in page
+    assert EVIL not in dump("#/failed") and "a bug in a stage" in dump("#/failed")
+
+
+def test_a_wrong_address_says_so(dump: Dump) -> None:
+    assert "there is no page nowhere" in dump("#/nowhere")
