@@ -3,9 +3,9 @@
     total = sum_i w_i log p_i + group log(sum_j v_j p_j)
 
 over probabilities p: what multiplies in EPDMS (nc, dac, ddc, tlc) and imitation in logarithms of their own, what is
-averaged there (ttc, ep, lk, hc) under one. Both weightings are those of GTRS, navsim/agents/gtrs_dense/hydra_model.py
-(read in OpenDriveLab/SimScale 04cda10 and woxihuanjiangguo/ZTRS 3593a03, which agree). Neither weighs hc, for which
-those models have no head.
+averaged there (ttc, ep, lk, hc) under one. `release` and `proposals` are those of GTRS,
+navsim/agents/gtrs_dense/hydra_model.py (read in OpenDriveLab/SimScale 04cda10 and woxihuanjiangguo/ZTRS 3593a03, which
+agree). Neither weighs hc, for which those models have no head.
 """
 
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ from torch import Tensor
 IMITATION = "imitation"
 SUBSCORES = ("nc", "dac", "ddc", "tlc", "ttc", "lk", "hc", "ep")  # EPDMS without EC, which compares two plans
 
-WeightingName = Literal["release", "proposals"]
+WeightingName = Literal["release", "proposals", "close"]
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,10 @@ WEIGHTINGS: dict[WeightingName, Weighting] = {
     # 87.0 and 86.6 in its comment are of navtest's range
     "proposals": Weighting(
         {IMITATION: 0.01, "tlc": 0.1, "nc": 0.5, "dac": 0.5, "ddc": 0.5}, 3.0, {"ttc": 5.0, "ep": 5.0, "lk": 2.0}
+    ),
+    # ours: `release` with ten times its imitation, for small planners over hundreds of trajectories
+    "close": Weighting(
+        {IMITATION: 0.3, "tlc": 0.1, "nc": 0.1, "dac": 0.9, "ddc": 0.2}, 6.0, {"ttc": 7.0, "ep": 7.0, "lk": 3.0}
     ),
 }
 
