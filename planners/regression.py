@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from planners.batch import Batch
+from planners.batch import COMMANDS, Batch
 
 
 def bounded_heading(poses: Tensor) -> Tensor:
@@ -20,3 +20,10 @@ def imitation_l1(plan: Tensor, batch: Batch) -> Tensor:
     """
     error = (plan.float() - batch.plan_2hz).abs().mean(dim=(1, 2))
     return torch.where(batch.imitate, error, 0.0).mean()
+
+
+def straight_on(batch: Batch) -> Tensor:
+    """(B, 8, 3) poses at 0.5 .. 4.0 s of an ego that keeps the speed of now and does not turn."""
+    times_s = torch.arange(1, 9, device=batch.status.device) * 0.5
+    ahead = batch.status[:, len(COMMANDS), None].float() * times_s
+    return torch.stack([ahead, torch.zeros_like(ahead), torch.zeros_like(ahead)], -1)

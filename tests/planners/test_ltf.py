@@ -12,6 +12,7 @@ from torch import nn
 
 from planners.backbone import BackboneSettings, load_pretrained
 from planners.batch import Batch, BevLayout, ImageLayout
+from planners.constant_velocity import ConstantVelocity, ConstantVelocitySettings
 from planners.ltf import Ltf, LtfSettings
 from planners.transfuser import FusionSettings, LatentFusion
 from tests.planners.made_batch import made_batch
@@ -45,6 +46,19 @@ def planner(settings: LtfSettings = TINY) -> Ltf:
 @cache
 def batch(n: int = 4) -> Batch:
     return made_batch(planner().needs, n)
+
+
+def test_from_constant_velocity_a_head_that_says_nothing_keeps_the_speed() -> None:
+    settings = replace(TINY, plan_from="constant_velocity")
+    from_zero, from_speed = planner(), planner(settings)
+    for one in (from_zero, from_speed):
+        last = one.plan_head[-1]
+        assert isinstance(last, nn.Linear)
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+    straight = ConstantVelocity(ConstantVelocitySettings(), {}).plan(batch())
+    assert torch.equal(from_speed.plan(batch()), straight)
+    assert not from_zero.plan(batch()).any() and straight.any()
 
 
 def test_the_papers_size_is_56_million_parameters() -> None:

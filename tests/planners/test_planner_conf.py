@@ -59,4 +59,5 @@ def test_small_planners_take_a_step(name: str) -> None:
 def test_ltf_small_is_narrow_and_not_another_planner() -> None:
     small = settings_of(choice("ltf_small"))
     assert small.fusion.backbone == BackboneSettings(name="small")
-    assert (small.trajectory_weight, small.bev_weight) == (LtfSettings().trajectory_weight, LtfSettings().bev_weight)
+    assert small.trajectory_weight == LtfSettings().trajectory_weight
+    assert small.layers > 1 and small.agents > 0 and small.bev_weight > 0.0
