@@ -4,15 +4,15 @@
     <n>.jpg             the n-th stored image, n as in the sample's `images`
     bev.jpg             seen from above; step=0..55 (-1.5 .. 4.0 s at 10 Hz, 15 is now), size=300 or 600
 
-A sample's row is read by its file and row group: one group, never a file. Stored JPEGs go out as they are, unless they
-are wider than WIDE_PX and small=1 asks for less.
+A sample's row is read by its file and row group: one group, never a file, and the latest groups are kept. Stored JPEGs
+go out as they are, unless they are wider than WIDE_PX and small=1 asks for less.
 """
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import cv2
 import numpy as np
@@ -21,28 +21,38 @@ import pyarrow.parquet as pq
 
 from factory.board.gallery import BadRequest, NotThere, place_of
 from factory.board.watch import Snapshot
-from factory.look.sample_picture import decoded, encoded, fitted, front_camera, images_at_now, nearer, sample_bev
+from factory.look.sample_picture import (
+    BEV_COLUMNS,
+    decoded,
+    encoded,
+    fitted,
+    front_camera,
+    images_at_now,
+    nearer,
+    sample_bev,
+)
 from factory.store.location import Location
-from factory.store.schema import AGENT_STEPS, SCHEMA, table_to_rows
+from factory.store.schema import AGENT_STEPS, SAMPLES, SCHEMA, table_to_rows
 
 BEV_SIZES = (300, 600)  # divisible by 3 and 4
 WIDE_PX = 640
 KEPT_BYTES = 64 * 2**20  # of pictures
-KEPT_ROWS = 32  # whole samples of some 0.2 to 2 MB
+KEPT_GROUP_BYTES = 128 * 2**20  # of row groups, some 4 MB each: neighbours in the gallery stand in one
 KEPT_FILES = 16  # their footers
-LEFT_OUT = ("label_subscores", "label_progress")  # large, and not shown
+COLUMNS = tuple(name for name in SCHEMA.names if name not in ("label_subscores", "label_progress"))  # of a row
 Sample = Mapping[str, Any]
+Value = TypeVar("Value")
 
 
-class KeptBytes:
-    """Values by key up to a sum of bytes; the least recently used go first. Safe to use from many threads."""
+class Kept(Generic[Value]):
+    """Values by key up to a sum of sizes; the least recently used go first. Safe to use from many threads."""
 
-    def __init__(self, most: int = KEPT_BYTES) -> None:
-        self._most, self._held = most, 0
-        self._values: OrderedDict[tuple[object, ...], bytes] = OrderedDict()
+    def __init__(self, most: int, size: Callable[[Value], int]) -> None:
+        self._most, self._size, self._held = most, size, 0
+        self._values: OrderedDict[tuple[object, ...], Value] = OrderedDict()
         self._lock = threading.Lock()
 
-    def get(self, key: tuple[object, ...], make: Callable[[], bytes]) -> bytes:
+    def get(self, key: tuple[object, ...], make: Callable[[], Value]) -> Value:
         """The value, made now where it is not kept."""
         with self._lock:
             if key in self._values:
@@ -50,11 +60,11 @@ class KeptBytes:
                 return self._values[key]
         made = make()
         with self._lock:
-            if key not in self._values and len(made) <= self._most:
+            if key not in self._values and self._size(made) <= self._most:
                 self._values[key] = made
-                self._held += len(made)
+                self._held += self._size(made)
             while self._held > self._most:
-                self._held -= len(self._values.popitem(last=False)[1])
+                self._held -= self._size(self._values.popitem(last=False)[1])
         return made
 
 
@@ -63,40 +73,48 @@ class Pictures:
 
     def __init__(self, samples: Location) -> None:
         self._location = samples
-        self._kept = KeptBytes()
+        self._kept: Kept[bytes] = Kept(KEPT_BYTES, len)
+        self._groups: Kept[pa.Table] = Kept(KEPT_GROUP_BYTES, lambda group: int(group.nbytes))
         self._lock = threading.Lock()
         self._file = lru_cache(maxsize=KEPT_FILES)(self._open)
-        self._row = lru_cache(maxsize=KEPT_ROWS)(self._read)
 
-    def row(self, shot: Snapshot, attempt_id: str) -> Sample:
-        """The whole row but its labels. Raises NotThere."""
+    def row(self, shot: Snapshot, attempt_id: str, columns: Sequence[str] = COLUMNS) -> Sample:
+        """Some columns of one sample. Raises NotThere."""
         path, row, partition = self._place(shot, attempt_id)
-        with self._lock:  # the card's two pictures ask at once; one of them reads
-            return self._row(path, row, partition)
+        with self._lock:  # the pictures of a page ask at once; one of them reads for all
+            file = self._file(path)
+            group = 0
+            while row >= file.metadata.row_group(group).num_rows:
+                row -= file.metadata.row_group(group).num_rows
+                group += 1
+            stored = self._groups.get((path, group), lambda: self._read(file, group, partition))
+        fields = [SCHEMA.field(name) for name in columns]
+        arrays = [stored[f.name].slice(row, 1).cast(f.type) for f in fields]
+        return table_to_rows(pa.table(arrays, schema=pa.schema(fields)))[0]
 
     def front(self, shot: Snapshot, attempt_id: str) -> bytes:
         """JPEG, small. Raises NotThere where the sample has no image."""
 
         def make() -> bytes:
-            row = self.row(shot, attempt_id)
+            row = self.row(shot, attempt_id, ("cameras", "images", "image_source"))
             name = front_camera(row)
             found = [image for image in images_at_now(row) if image["camera"] == name]
             if not found:
                 raise NotThere(f"{attempt_id} has no image: image_source is {row['image_source']}")
             return _jpeg(found[0], small=True)
 
-        return self._kept.get((*self._place(shot, attempt_id), "front"), make)
+        return self._kept.get((*self._place(shot, attempt_id)[:2], "front"), make)
 
     def image(self, shot: Snapshot, attempt_id: str, index: int, small: bool = False) -> bytes:
         """JPEG of the n-th stored image. Raises NotThere."""
 
         def make() -> bytes:
-            images = self.row(shot, attempt_id)["images"] or ()
+            images = self.row(shot, attempt_id, ("images",))["images"] or ()
             if index >= len(images):
                 raise NotThere(f"{attempt_id} has {len(images)} images, none of number {index}")
             return _jpeg(images[index], small)
 
-        return self._kept.get((*self._place(shot, attempt_id), index, small), make)
+        return self._kept.get((*self._place(shot, attempt_id)[:2], index, small), make)
 
     def bev(self, shot: Snapshot, attempt_id: str, size_px: int, step: int) -> bytes:
         """JPEG, square. Raises BadRequest for another size or step, NotThere."""
@@ -105,29 +123,25 @@ class Pictures:
 
         def make() -> bytes:
             size = (size_px * 4 // 3,) * 2  # `nearer` keeps three quarters
-            return encoded(nearer(sample_bev(self.row(shot, attempt_id), None, size, step=step, legend=False)))
+            return encoded(
+                nearer(sample_bev(self.row(shot, attempt_id, BEV_COLUMNS), None, size, step=step, legend=False))
+            )
 
-        return self._kept.get((*self._place(shot, attempt_id), "bev", size_px, step), make)
+        return self._kept.get((*self._place(shot, attempt_id)[:2], "bev", size_px, step), make)
 
-    def _place(self, shot: Snapshot, attempt_id: str) -> tuple[str, int, tuple[tuple[str, str], ...]]:
-        (row,) = shot.newest_first.slice(place_of(shot, attempt_id), 1).to_pylist()
-        partition = (("round", str(row["round"])), ("expert", row["expert"]))
-        return shot.sample_paths[row["_file"]], row["_row"], partition
+    def _place(self, shot: Snapshot, attempt_id: str) -> tuple[str, int, Mapping[str, object]]:
+        """Its file, its row in it, and what the file's path says."""
+        at = place_of(shot, attempt_id)
+        file, row, *partition = (
+            shot.newest_first[name][at].as_py() for name in ("_file", "_row", *SAMPLES.partition_by)
+        )
+        return shot.sample_paths[file], row, dict(zip(SAMPLES.partition_by, partition))
 
-    def _read(self, path: str, row: int, partition: tuple[tuple[str, str], ...]) -> Sample:
-        values = dict(partition)
-        file = self._file(path)
-        group = 0
-        while row >= file.metadata.row_group(group).num_rows:
-            row -= file.metadata.row_group(group).num_rows
-            group += 1
-        names = [name for name in SCHEMA.names if name not in LEFT_OUT]
-        stored = file.read_row_groups([group], columns=[n for n in names if n not in values]).slice(row, 1)
-        fields = [SCHEMA.field(name) for name in names]
-        arrays = [
-            pa.array([values[f.name]]).cast(f.type) if f.name in values else stored[f.name].cast(f.type) for f in fields
-        ]
-        return table_to_rows(pa.table(arrays, schema=pa.schema(fields)))[0]
+    def _read(self, file: pq.ParquetFile, group: int, partition: Mapping[str, object]) -> pa.Table:
+        rows = file.read_row_groups([group], columns=[name for name in COLUMNS if name not in partition])
+        for name, value in partition.items():
+            rows = rows.append_column(name, pa.repeat(pa.scalar(value, SCHEMA.field(name).type), rows.num_rows))
+        return rows
 
     def _open(self, path: str) -> pq.ParquetFile:
         filesystem, base = self._location.filesystem()

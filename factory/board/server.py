@@ -172,6 +172,8 @@ class Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     server_version, sys_version = "factory", ""
     timeout = 60
+    disable_nagle_algorithm = True  # with it, and headers and body sent apart, an answer waits 40 ms for nothing
+    wbufsize = -1
 
     def do_GET(self) -> None:
         names = self.server.host_names

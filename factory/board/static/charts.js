@@ -3,7 +3,7 @@
 import { clock, count, h, s, span } from "./dom.js";
 
 export function timeline(t) {
-  const [width, height, foot] = [1000, 150, 22];
+  const [width, height] = [1000, 150];
   const most = Math.max(1, ...t.attempts);
   const step = width / t.attempts.length;
   const tall = (n) => ((height - 6) * n) / most;
@@ -15,18 +15,14 @@ export function timeline(t) {
       s("rect", { x: i * step + 1, width: Math.max(1, step - 2), y: height - tall(n), height: tall(n), class: kind });
     return [s("g", null, s("title", null, tip), rect(attempts, "tried"), rect(samples, "made"))];
   });
-  const ends = [
-    s("text", { x: 0, y: height + foot - 5 }, clock(t.began_ms)),
-    s("text", { x: width, y: height + foot - 5, "text-anchor": "end" }, clock(t.ended_ms)),
-  ];
   const line = s("line", { x1: 0, x2: width, y1: height, y2: height, class: "axis-line" });
-  const drawn = { viewBox: `0 0 ${width} ${height + foot}`, role: "img", "aria-label": "attempts and samples by time", class: "timeline" };
-  return s("svg", drawn, bars, line, ends);
+  const drawn = { viewBox: `0 0 ${width} ${height}`, preserveAspectRatio: "none", role: "img", "aria-label": "attempts and samples by time", class: "timeline" };
+  return h("div", null, s("svg", drawn, bars, line), h("p", { class: "times" }, h("span", null, clock(t.began_ms)), h("span", null, clock(t.ended_ms))));
 }
 
 export function heat(title, cells, reachAlong, reachAside, kind) {
   const [ny, nx] = [cells.length, cells[0].length];
-  const [left, top, width, height, foot] = [34, 6, 460, 216, 36];
+  const [left, top, width, height, foot] = [40, 16, 454, 208, 26];
   const [dx, dy] = [width / nx, height / ny];
   const most = Math.max(1, ...cells.flat());
   const marks = [s("rect", { x: left, y: top, width, height, class: "plane" })];
@@ -45,13 +41,11 @@ export function heat(title, cells, reachAlong, reachAside, kind) {
   marks.push(s("line", across), s("line", up));
   for (const part of [-1, 0, 1]) {
     const [x, y] = [left + (width * (part + 1)) / 2, top + (height * (1 - part)) / 2];
-    const sign = (v) => (v > 0 ? `+${v}` : `${v}`);
+    const sign = (v) => (v > 0 ? `+${v}` : v < 0 ? `${v}` : "0");
     const anchor = ["start", "middle", "end"][part + 1];
-    marks.push(s("text", { x, y: top + height + 14, "text-anchor": anchor }, sign(part * reachAlong)));
+    marks.push(s("text", { x, y: top + height + 18, "text-anchor": anchor }, sign(part * reachAlong)));
     marks.push(s("text", { x: left - 5, y: y + 4, "text-anchor": "end" }, sign(part * reachAside)));
   }
-  const middle = { x: left + width / 2, y: top + height + 30, "text-anchor": "middle" };
-  marks.push(s("text", middle, "metres behind and ahead of the log; metres to its right and left"));
   const total = cells.flat().reduce((a, b) => a + b, 0);
   const caption = h("figcaption", null, h("b", null, title), ` ${count(total)}, at most ${count(most)} in a cell`);
   return h("figure", { class: "heat" }, s("svg", { viewBox: `0 0 ${left + width + 8} ${top + height + foot}`, role: "img", "aria-label": title }, marks), caption);
@@ -59,7 +53,7 @@ export function heat(title, cells, reachAlong, reachAside, kind) {
 
 export function ends(siblings, reachAlong, reachAside) {
   // Where the candidates of one clip end, by what became of them.
-  const [left, top, width, height, foot] = [34, 8, 460, 200, 22];
+  const [left, top, width, height, foot] = [40, 16, 454, 192, 24];
   const known = siblings.filter((one) => one.end_x_m !== null);
   const x = (m) => left + (width * (m + reachAlong)) / (2 * reachAlong);
   const y = (m) => top + (height * (reachAside - m)) / (2 * reachAside);
@@ -78,8 +72,8 @@ export function ends(siblings, reachAlong, reachAside) {
         : s("circle", { cx: u, cy: v, r: one.here ? 7 : 5, class: `mark ${one.kind}${one.here ? " here" : ""}` }, tip),
     );
   }
-  marks.push(s("text", { x: left, y: top + height + 14 }, `-${reachAlong} m`));
-  marks.push(s("text", { x: left + width, y: top + height + 14, "text-anchor": "end" }, `+${reachAlong} m`));
+  marks.push(s("text", { x: left, y: top + height + 18 }, `-${reachAlong} m`));
+  marks.push(s("text", { x: left + width, y: top + height + 18, "text-anchor": "end" }, `+${reachAlong} m`));
   marks.push(s("text", { x: left - 4, y: top + 10, "text-anchor": "end" }, `+${reachAside}`));
   marks.push(s("text", { x: left - 4, y: top + height, "text-anchor": "end" }, `-${reachAside}`));
   return s("svg", { viewBox: `0 0 ${left + width + 8} ${top + height + foot}`, role: "img", "aria-label": "where the candidates end", class: "ends" }, marks);

@@ -44,8 +44,10 @@ export async function ask(path) {
 export const section = (title, lead, ...content) =>
   h("section", null, h("h2", null, title), lead ? h("p", { class: "lead" }, lead) : null, ...content);
 
+// A title that ends in * is of a column that a narrow screen leaves out; its cells have the class roomy.
 export function table(name, head, rows) {
-  const top = h("thead", null, h("tr", null, head.map((title) => h("th", { scope: "col" }, title))));
+  const titled = (title) => h("th", { scope: "col", class: title.endsWith("*") ? "roomy" : null }, title.replace("*", ""));
+  const top = h("thead", null, h("tr", null, head.map(titled)));
   return h("div", { class: "wide" }, h("table", { class: name }, top, h("tbody", null, rows)));
 }
 

@@ -49,7 +49,7 @@ function progress(t) {
 function looks(newest) {
   const lead = "The newest simulated samples. Each is a drive that no human drove: the ego was put off its logged path (orange), and an expert drove on from there (blue).";
   const cards = newest.items.map((item) => card(item));
-  return section("What it looks like", lead, cards.length ? h("div", { class: "cards" }, cards) : h("p", { class: "nothing" }, "There is no simulated sample yet."),
+  return section("What it looks like", lead, cards.length ? h("div", { class: "cards looks" }, cards) : h("p", { class: "nothing" }, "There is no simulated sample yet."),
     h("p", null, h("a", { href: "#/gallery" }, "All samples")));
 }
 
@@ -60,34 +60,34 @@ function funnel(o) {
       h("th", { scope: "row" }, step.what, h("small", null, step.name)),
       h("td", null, bar(most ? step.left / most : 0, count(step.left))),
       h("td", { class: "n" }, step.dropped ? `-${count(step.dropped)}` : ""),
-      h("td", { class: "n dim" }, most ? percent(step.left / most) : "-")));
-  return section("From perturbation to sample", "How many of the perturbed drives are left after each stage.", table("steps", ["after", "left", "fell", "of all"], rows));
+      h("td", { class: "n dim roomy" }, most ? percent(step.left / most) : "-")));
+  return section("From perturbation to sample", "How many of the perturbed drives are left after each stage.", table("steps", ["after", "left", "fell", "of all*"], rows));
 }
 
 function acceptance(o) {
   const rows = o.acceptance.map((a) =>
     h("tr", null,
       h("th", { scope: "row" }, a.expert, a.round === 0 ? h("small", null, EXPERT_WORDS[a.expert] ?? "") : null),
-      h("td", { class: "n" }, count(a.round)), h("td", { class: "n" }, count(a.tried)), h("td", { class: "n" }, count(a.accepted)),
+      h("td", { class: "n" }, count(a.round)), h("td", { class: "n roomy" }, count(a.tried)), h("td", { class: "n roomy" }, count(a.accepted)),
       h("td", null, bar(a.attempt_rate, percent(a.attempt_rate))),
-      h("td", null, bar(a.first_try_rate, percent(a.first_try_rate), a.paper)),
+      h("td", { class: "roomy" }, bar(a.first_try_rate, percent(a.first_try_rate), a.paper)),
       h("td", null, bar(a.clip_rate, percent(a.clip_rate), a.paper)),
-      h("td", { class: "n dim" }, a.paper === null ? "-" : `${Math.round(100 * a.paper)} %`)));
+      h("td", { class: "n dim roomy" }, a.paper === null ? "-" : `${Math.round(100 * a.paper)} %`)));
   const lead = "Round r holds the (r+1)-th accepted sample of each clip and expert. Of attempts: accepted of tried. Of first tries: clips accepted without a second try, as one random draw a round would be. Of clips: clips with a sample of this round, of those with one of the round before; the orange marks and the last column are the paper's.";
   const ended = Object.entries(o.exhausted).map(([expert, n]) => h("p", { class: "note" }, `${expert}: ${plural(n, "walk")} came to the end of the candidates`));
-  return section("Acceptance by round and expert", lead, table("acceptance", ["expert", "round", "tried", "accepted", "of attempts", "of first tries", "of clips", "paper"], rows), ended);
+  return section("Acceptance by round and expert", lead, table("acceptance", ["expert", "round", "tried*", "accepted*", "of attempts", "of first tries*", "of clips", "paper*"], rows), ended);
 }
 
 function reasons(o) {
   const experts = [...new Set(o.reasons.flatMap((r) => Object.keys(r.by_expert)))].sort();
-  const most = Math.max(1, ...o.reasons.flatMap((r) => Object.values(r.by_expert)));
+  const most = Math.max(1, ...o.reasons.map((r) => r.total));
   const rows = o.reasons.map((r) =>
     h("tr", { "data-reason": r.reason }, h("th", { scope: "row" }, r.words || r.reason, h("small", null, r.reason)),
-      experts.map((e) => h("td", null, r.by_expert[e] ? bar(r.by_expert[e] / most, count(r.by_expert[e])) : h("span", { class: "dim" }, "-"))),
-      h("td", { class: "n" }, count(r.total))));
+      experts.map((e) => h("td", { class: "roomy" }, r.by_expert[e] ? bar(r.by_expert[e] / most, count(r.by_expert[e])) : h("span", { class: "dim" }, "-"))),
+      h("td", null, bar(r.total / most, count(r.total)))));
   const clips = o.clip_reasons.map((r) => h("tr", null, h("th", { scope: "row" }, r.words || r.reason, h("small", null, r.reason)), h("td", { class: "n" }, count(r.total))));
   return section("Why the rest was not accepted", "Every attempt that is not a sample has one reason: the first sub-score below its threshold, or what failed.",
-    rows.length ? table("reasons", ["reason", ...experts, "all"], rows) : h("p", { class: "nothing" }, "No attempt was turned down."),
+    rows.length ? table("reasons", ["reason", ...experts.map((e) => `${e}*`), "all"], rows) : h("p", { class: "nothing" }, "No attempt was turned down."),
     clips.length ? [h("h3", null, "Clips that never came to a simulated attempt"), table("clips", ["reason", "clips"], clips)] : null);
 }
 
@@ -111,7 +111,7 @@ function times(o) {
 function coverage(o) {
   const c = o.coverage;
   const maps = [heat("candidates", c.candidates, c.reach_along_m, c.reach_aside_m, "untried-cell"), heat("accepted", c.accepted, c.reach_along_m, c.reach_aside_m, "accepted-cell")];
-  return section("Coverage of end points", "Where perturbed drives end after four seconds, relative to where the logged drive was. Darker: more of them.",
+  return section("Coverage of end points", "Where perturbed drives end after four seconds, relative to where the logged drive was: metres behind and ahead of it from left to right, to its right and left from bottom to top. Darker: more of them.",
     h("div", { class: "heats" }, maps), c.beyond ? h("p", { class: "note" }, `${count(c.beyond)} end outside.`) : null);
 }
 

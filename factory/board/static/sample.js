@@ -73,6 +73,7 @@ function cameras(w) {
       const link = h("a", { href: `/picture/${w.item.attempt_id}/${file}?v=${w.item.file}`, target: "_blank", rel: "noopener" }, picture(w.item, file, `${name} at ${t} s`, "&small=1"));
       return h("figure", { class: Number(t) === 0 ? "now" : null }, link, h("figcaption", null, Number(t) === 0 ? "now" : `${t} s`));
     }))));
+  requestAnimationFrame(() => strips.forEach((strip) => (strip.lastChild.scrollLeft = strip.lastChild.scrollWidth))); // to now
   return section("Cameras", `${plural(w.images.length, "image")}; a click opens one as it is stored.`, strips);
 }
 
@@ -85,10 +86,10 @@ function siblings(w, grid) {
     h("td", null, one.kind === "accepted" ? (one.here ? h("b", null, "this sample") : h("a", { href: `#/sample/${one.attempt_id}` }, `accepted, round ${one.round}`)) : one.kind),
     h("td", null, one.words || one.reason, one.words ? h("small", null, one.reason) : null),
     h("td", { class: "n" }, one.end_x_m === null ? "-" : `${one.end_x_m.toFixed(1)}, ${one.end_y_m.toFixed(2)}`),
-    h("td", { class: "dim" }, one.detail)));
+    h("td", { class: "dim roomy" }, one.detail)));
   const lead = `The perturbations of this clip in the order in which ${w.item.expert} tried them: ${fell} were turned down. Each round goes on until one is accepted.`;
   const key = h("p", { class: "keys" }, ["accepted", "rejected", "untried"].map((kind) => h("span", null, h("i", { class: `dot ${kind}` }), kind)));
-  return section("Siblings", lead, key, ends(all, grid.reach_along_m, grid.reach_aside_m), table("siblings", ["#", "became", "why", "ends at x, y [m]", "detail"], rows));
+  return section("Siblings", lead, key, ends(all, grid.reach_along_m, grid.reach_aside_m), table("siblings", ["#", "became", "why", "ends at x, y [m]", "detail*"], rows));
 }
 
 function lineage(w) {

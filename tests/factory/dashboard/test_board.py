@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from factory.board.pictures import KeptBytes
+from factory.board.pictures import Kept
 from factory.board.server import SERVED, STATIC, Board, Server
 from factory.dashboard import main, parse
 from factory.show import Refused
@@ -221,8 +221,8 @@ def test_another_host_name_is_refused_on_loopback(served: tuple[str, int]) -> No
     assert status == 403 and b"evil.example" in body
 
 
-def test_kept_bytes_are_bounded_and_the_latest_used_stay() -> None:
-    kept, made = KeptBytes(10), []
+def test_what_is_kept_is_bounded_and_the_latest_used_stay() -> None:
+    kept, made = Kept(10, len), []
 
     def make(name: str, size: int) -> bytes:
         return kept.get((name,), lambda: made.append(name) or bytes(size))  # type: ignore[func-returns-value]
