@@ -77,6 +77,15 @@ def test_the_numbers_are_those_of_the_tables_while_a_run_goes_on(tmp_path: Path)
     assert told(get(board, "/api/overview")) == counted(tmp_path)
 
 
+def test_a_run_that_has_only_begun_is_shown(tmp_path: Path) -> None:
+    Store(tmp_path).begin([])
+    board = Board(Store(tmp_path), look_every_s=0.0)
+    overview = get(board, "/api/overview")
+    assert told(overview) == counted(tmp_path) and overview["counts"]["samples"] == 0
+    assert get(board, "/api/samples?simulated=1")["items"] == [] == get(board, "/api/failed")["items"]
+    get(board, "/api/samples/nobody", 404)
+
+
 def test_only_new_files_are_read(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     board = Board(Store(out), look_every_s=0.0)
     first = get(board, "/api/overview")

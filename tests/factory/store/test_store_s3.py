@@ -1,5 +1,6 @@
 """The same store behind an object-store URL, against a local S3 server."""
 
+import json
 import socket
 import subprocess
 import sys
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from factory.board.server import Board
 from factory.execute import execute
 from factory.store.location import BadLocation, Location
 from factory.store.reader import SampleTable
@@ -64,6 +66,19 @@ def test_a_bucket_holds_the_same_rows_as_a_folder(s3: dict[str, str], tmp_path: 
     assert verify(Store(url, s3)).damage == () and verify(Store(url, s3)).orphans == ()
     samples = SampleTable(url, s3)
     assert samples[0]["label_10hz"].shape == (40, 3) and len(samples) == len(SampleTable(tmp_path))
+
+
+def test_the_dashboard_follows_a_run_in_a_bucket(s3: dict[str, str]) -> None:
+    url = f"s3://{BUCKET}/runs/two"
+    board = None
+    for rounds in (1, 2):
+        out = Store(url, s3)
+        assert execute(ToyWork(), refs(2), ["recovery"], rounds, out, "local", say=lambda line: None).exit_code == 0
+        board = board or Board(Store(url, s3), look_every_s=0.0)
+        assert json.loads(board.answer("/api/overview").body)["counts"]["samples"] == len(out.samples)
+    (item,) = json.loads(board.answer("/api/samples?size=1").body)["items"]
+    for target in (f"/api/samples/{item['attempt_id']}", f"/picture/{item['attempt_id']}/bev.jpg"):
+        assert board.answer(target).status == 200
 
 
 def test_a_relative_path_inside_a_submitted_job_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
