@@ -101,7 +101,7 @@ class Throughput:
     samples_per_hour: float | None
     walks_done: int | None  # of a live run: (clip, expert) walks that ended since it began
     walks: int | None
-    eta_s: float | None
+    eta_s: float | None  # null too where the run is quiet
 
 
 @dataclass(frozen=True)
@@ -221,14 +221,17 @@ def _funnel(shot: Snapshot) -> Funnel:
 
 def _state(shot: Snapshot, now_s: float) -> State:
     last_ms = shot.last_commit_ms
-    quiet_s = now_s - max(last_ms, shot.current.get("began_ms", 0)) / 1000.0
     if shot.live:
-        if quiet_s > QUIET_S:
+        if _quiet(shot, now_s):
             text = "nothing was committed for a while: a long reconstruction, or the run is gone; then run it again"
             return State("quiet", "warn", True, text, last_ms)
         return State("running", "live", True, "", last_ms)
     word, tone = STATUS.get(shot.last.get("exit_code", -1), ("no run has told how it ended", "warn"))
     return State(word, tone, False, "", last_ms)
+
+
+def _quiet(shot: Snapshot, now_s: float) -> bool:
+    return now_s - max(shot.last_commit_ms, shot.current.get("began_ms", 0)) / 1000.0 > QUIET_S
 
 
 def _facts(shot: Snapshot) -> dict[str, str]:
@@ -333,7 +336,7 @@ def _throughput(shot: Snapshot, now_s: float) -> Throughput:
         made / hours if hours > 0 else None,
         done,
         walks,
-        eta,
+        None if _quiet(shot, now_s) else eta,
     )
 
 

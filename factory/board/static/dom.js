@@ -19,7 +19,13 @@ export const s = (tag, attributes, ...children) => built(document.createElementN
 export const count = (n) => n.toLocaleString("en-US");
 export const percent = (share) => (share === null ? "-" : `${(100 * share).toFixed(1)} %`);
 export const score = (value) => (value === null ? "-" : value.toFixed(3));
-export const clock = (ms) => new Date(ms).toLocaleTimeString([], { hour: "2-digit", minute: "2-digit" });
+
+const OLD_MS = 20 * 3600 * 1000; // then the day is told too
+export function clock(ms) {
+  const day = Date.now() - ms > OLD_MS ? { month: "short", day: "numeric" } : {};
+  return new Date(ms).toLocaleString([], { ...day, hour: "2-digit", minute: "2-digit" });
+}
+
 export const plural = (n, word) => `${count(n)} ${word}${n === 1 ? "" : "s"}`;
 
 export function span(seconds) {

@@ -11,8 +11,10 @@ import cv2
 import numpy as np
 import pytest
 
+from factory.board.overview import QUIET_S, overview
 from factory.board.pictures import Kept
 from factory.board.server import SERVED, STATIC, Board, Server
+from factory.board.watch import Watch
 from factory.dashboard import main, parse
 from factory.show import Refused
 from factory.store.reader import SampleTable
@@ -39,20 +41,19 @@ def get(board: Board, target: str, status: int = 200) -> Any:
 
 
 def test_the_numbers_are_those_of_the_tables(out: Path, board: Board) -> None:
-    overview = get(board, "/api/overview")
-    assert told(overview) == counted(out)
-    assert overview["state"]["word"] == "complete, with failed attempts"
+    answer = get(board, "/api/overview")
+    assert told(answer) == counted(out)
+    assert answer["state"]["word"] == "complete, with failed attempts"
     assert (
-        overview["steps"][0]["left"] - sum(step["dropped"] for step in overview["steps"])
-        == (overview["steps"][-1]["left"])
+        answer["steps"][0]["left"] - sum(step["dropped"] for step in answer["steps"]) == (answer["steps"][-1]["left"])
     )
-    assert overview["steps"][-1]["left"] == overview["counts"]["simulated"]
-    assert sum(overview["throughput"]["samples"]) == overview["counts"]["samples"]
+    assert answer["steps"][-1]["left"] == answer["counts"]["simulated"]
+    assert sum(answer["throughput"]["samples"]) == answer["counts"]["samples"]
     ends = [
         row["candidate_end"] for row in Store(out).samples.read(["candidate_end"]).to_pylist() if row["candidate_end"]
     ]
     inside = sum(abs(end[0]) <= 20 and abs(end[1]) <= 2 for end in ends)
-    assert np.sum(overview["coverage"]["accepted"]) == inside
+    assert np.sum(answer["coverage"]["accepted"]) == inside
 
 
 def test_the_numbers_are_those_of_the_tables_while_a_run_goes_on(tmp_path: Path) -> None:
@@ -61,18 +62,18 @@ def test_the_numbers_are_those_of_the_tables_while_a_run_goes_on(tmp_path: Path)
 
     def watching() -> None:  # what it raised would only be a failed attempt
         before = counted(tmp_path)
-        overview = get(board, "/api/overview")
+        answer = get(board, "/api/overview")
         if counted(tmp_path) == before:  # no commit in between
-            seen.append((before, overview))
+            seen.append((before, answer))
 
     run(tmp_path, 2, watching)
     assert seen[-1][0]["samples"] > seen[0][0]["samples"]
-    for tables, overview in seen:
-        assert told(overview) == tables
-        assert overview["state"]["live"] and overview["state"]["word"] == "running"
-        assert 0 <= overview["throughput"]["walks_done"] <= overview["throughput"]["walks"] == 6 * 3
-    overview = get(board, "/api/overview")
-    assert told(overview) == counted(tmp_path) and not overview["state"]["live"]
+    for tables, answer in seen:
+        assert told(answer) == tables
+        assert answer["state"]["live"] and answer["state"]["word"] == "running"
+        assert 0 <= answer["throughput"]["walks_done"] <= answer["throughput"]["walks"] == 6 * 3
+    answer = get(board, "/api/overview")
+    assert told(answer) == counted(tmp_path) and not answer["state"]["live"]
     run(tmp_path, 3)
     assert told(get(board, "/api/overview")) == counted(tmp_path)
 
@@ -80,10 +81,24 @@ def test_the_numbers_are_those_of_the_tables_while_a_run_goes_on(tmp_path: Path)
 def test_a_run_that_has_only_begun_is_shown(tmp_path: Path) -> None:
     Store(tmp_path).begin([])
     board = Board(Store(tmp_path), look_every_s=0.0)
-    overview = get(board, "/api/overview")
-    assert told(overview) == counted(tmp_path) and overview["counts"]["samples"] == 0
+    answer = get(board, "/api/overview")
+    assert told(answer) == counted(tmp_path) and answer["counts"]["samples"] == 0
     assert get(board, "/api/samples?simulated=1")["items"] == [] == get(board, "/api/failed")["items"]
     get(board, "/api/samples/nobody", 404)
+
+
+def test_a_run_that_went_silent_is_said_to_be_quiet_and_to_have_no_end_in_sight(tmp_path: Path) -> None:
+    run(tmp_path, 1, n=2)
+    shot = Watch(Store(tmp_path)).now()
+    began = shot.current["began_ms"]
+    assert shot.last["began_ms"] == began and not shot.live
+    (tmp_path / "last_run.json").unlink()
+    shot = Watch(Store(tmp_path)).now()
+    last_s = shot.last_commit_ms / 1000.0
+    soon, late = (overview(shot, "", last_s + waited) for waited in (1.0, QUIET_S + 1.0))
+    assert (soon.state.word, late.state.word) == ("running", "quiet")
+    assert soon.throughput.walks_done == soon.throughput.walks == 6 and soon.throughput.eta_s == 0.0
+    assert late.throughput.eta_s is None
 
 
 def test_only_new_files_are_read(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
