@@ -62,10 +62,13 @@ def serve(request: Request) -> int:
     store = open_store(request.out)
     from factory.board.server import LOOPBACK, Board, Server
 
+    board = Board(store)
     try:
-        server = Server(Board(store), request.host, request.port)
+        server = Server(board, request.host, request.port)
     except OSError as error:
         raise Refused(f"host={request.host} port={request.port}: {error}; choose another port=") from error
+    print(f"reading {store.location.uri}", flush=True)
+    board.answer("/api/overview")  # now, not when the page is opened
     host = f"[{request.host}]" if ":" in request.host else request.host
     print(f"{store.location.uri} is shown at http://{host}:{server.server_address[1]}/ until Ctrl-C", flush=True)
     if request.host not in LOOPBACK:

@@ -98,8 +98,9 @@ def measure(out: Path) -> None:
     began = time.perf_counter()
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
         assert server.stdout is not None
-        port = int(server.stdout.readline().split(":")[-1].split("/")[0])
-        _row("command started", time.perf_counter() - began, _read(server.pid))
+        said = next(line for line in server.stdout if "http:" in line)
+        port = int(said.split(":")[-1].split("/")[0])
+        _row("command started, the tables read", time.perf_counter() - began, _read(server.pid))
         try:
             asked(port, server.pid)
         finally:
