@@ -10,9 +10,10 @@ Exit codes: 0 ended, 2 bad arguments, nothing there to show, or the port is take
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
-from factory.show import BAD_ARGUMENTS, Refused, open_store
+from factory.arguments import BAD_ARGUMENTS, Refused, parse
+from factory.show import open_store
 
 PORT = 8266  # Ray's own dashboard is at 8265
 
@@ -25,6 +26,10 @@ class Request:
     port: int = PORT
     host: str = "127.0.0.1"
 
+    def __post_init__(self) -> None:
+        if self.port >= 2**16:
+            raise ValueError(f"port={self.port}: must be a number below 65536, 0 for any free one")
+
 
 def main(argv: Sequence[str]) -> int:
     """The command; returns the exit code."""
@@ -32,29 +37,10 @@ def main(argv: Sequence[str]) -> int:
         print(__doc__)
         return 0
     try:
-        return serve(parse(argv))
+        return serve(parse(Request, argv))
     except Refused as error:
         print(f"error: {error}", file=sys.stderr)
         return BAD_ARGUMENTS
-
-
-def parse(argv: Sequence[str]) -> Request:
-    """key=value arguments. Raises Refused for an unknown key, a missing value or a port that is none."""
-    known = [f.name for f in fields(Request)]
-    given: dict[str, str] = {}
-    for argument in argv:
-        key, equals, value = argument.partition("=")
-        if key not in known or not equals or not value:
-            raise Refused(f"{argument!r}: expected one of {', '.join(f'{name}=...' for name in known)}; see --help")
-        if key in given:
-            raise Refused(f"{key} is given twice")
-        given[key] = value
-    if "out" not in given:
-        raise Refused("out=<folder or URL of a run> is missing; see --help")
-    port = given.get("port", str(PORT))
-    if not (port.isascii() and port.isdecimal() and int(port) < 2**16):
-        raise Refused(f"port={port}: must be a number below 65536, 0 for any free one")
-    return Request(given["out"], int(port), given.get("host", "127.0.0.1"))
 
 
 def serve(request: Request) -> int:

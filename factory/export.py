@@ -11,11 +11,12 @@ Exit codes: 0 written, 2 bad arguments, or nothing there to export.
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from factory.show import BAD_ARGUMENTS, Refused, find, logged_drive, open_store, sample_ids
+from factory.arguments import BAD_ARGUMENTS, Refused, parse
+from factory.show import find, logged_drive, open_store, sample_ids
 from factory.store.samples import Store
 
 Row = Mapping[str, Any]
@@ -30,6 +31,12 @@ class Request:
     every: int | None = None
     to: str = "."
 
+    def __post_init__(self) -> None:
+        if (self.sample is None) == (self.every is None):
+            raise ValueError("give either sample=<id> or every=<n>; see --help")
+        if self.every == 0:
+            raise ValueError("every=0: must be 1 or more")
+
 
 def main(argv: Sequence[str]) -> int:
     """The command; returns the exit code."""
@@ -39,32 +46,12 @@ def main(argv: Sequence[str]) -> int:
     try:
         if argv[0] not in FORMATS:
             raise Refused(f"{argv[0]!r}: the first word is one of {', '.join(FORMATS)}; see --help")
-        for path in export(argv[0], parse(argv[1:])):
+        for path in export(argv[0], parse(Request, argv[1:])):
             print(path.resolve())
     except Refused as error:
         print(f"error: {error}", file=sys.stderr)
         return BAD_ARGUMENTS
     return 0
-
-
-def parse(argv: Sequence[str]) -> Request:
-    """key=value arguments. Raises Refused for an unknown key, a missing value or a contradiction."""
-    known = [field.name for field in fields(Request)]
-    given: dict[str, Any] = {}
-    for argument in argv:
-        key, equals, value = argument.partition("=")
-        if key not in known or not equals or not value or key in given:
-            raise Refused(f"{argument!r}: expected {', '.join(f'{name}=...' for name in known)}, each once; see --help")
-        given[key] = value
-    if "out" not in given:
-        raise Refused("out=<folder or URL of a run> is missing; see --help")
-    if ("sample" in given) == ("every" in given):
-        raise Refused("give either sample=<id> or every=<n>; see --help")
-    if "every" in given:
-        if not (given["every"].isascii() and given["every"].isdecimal() and int(given["every"])):
-            raise Refused(f"every={given['every']}: must be 1 or more")
-        given["every"] = int(given["every"])
-    return Request(**given)
 
 
 def export(kind: str, request: Request) -> Iterator[Path]:

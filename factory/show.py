@@ -19,9 +19,11 @@ import signal
 import sys
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from factory.arguments import BAD_ARGUMENTS, Refused, parse
 
 if TYPE_CHECKING:
     import numpy as np
@@ -31,7 +33,6 @@ if TYPE_CHECKING:
     from factory.store.samples import Store
     from tasks.render.asset import RenderAsset
 
-BAD_ARGUMENTS = 2
 EXIT_WORDS = {0: "complete", 3: "complete with failed attempts", 4: "interrupted, the same command goes on"}
 RETRY = {
     "input": "mend or take out the named file, then run the same command with retry_failed=true",
@@ -39,10 +40,6 @@ RETRY = {
     "system": "the next run of the same command tries it again by itself",
     "poison": "it brought workers down in several runs; retry_failed=true tries it once more",
 }
-
-
-class Refused(ValueError):
-    """The request cannot be answered; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +54,16 @@ class Request:
     film: bool = False
     vocabulary: str | None = None  # .npy that the labels are of; without it the kinematic one, where they are of that
 
+    def __post_init__(self) -> None:
+        if sum((self.sample is not None, self.failed, self.list)) > 1:
+            raise ValueError("choose one of sample=, failed=true and list=true")
+        if self.to is not None and self.sample is None:
+            raise ValueError("to= says where the picture of sample= goes; give sample= too")
+        if self.film and self.sample is None:
+            raise ValueError("film=true is of sample=; give sample= too")
+        if self.vocabulary is not None and self.sample is None:
+            raise ValueError("vocabulary= is drawn in the picture of sample=; give sample= too")
+
 
 def main(argv: Sequence[str]) -> int:
     """The command; returns the exit code."""
@@ -64,44 +71,13 @@ def main(argv: Sequence[str]) -> int:
         print(__doc__)
         return 0
     try:
-        request = parse(argv)
+        request = parse(Request, argv)
         for line in answer(request):
             print(line)
     except Refused as error:
         print(f"error: {error}", file=sys.stderr)
         return BAD_ARGUMENTS
     return 0
-
-
-def parse(argv: Sequence[str]) -> Request:
-    """key=value arguments. Raises Refused for an unknown key, a missing value or a contradiction."""
-    known = {f.name: f.type for f in fields(Request)}
-    given: dict[str, Any] = {}
-    for argument in argv:
-        key, equals, value = argument.partition("=")
-        if key not in known or not equals or not value:
-            raise Refused(f"{argument!r}: expected one of {', '.join(f'{name}=...' for name in known)}; see --help")
-        if key in given:
-            raise Refused(f"{key} is given twice")
-        given[key] = _truth(key, value) if known[key] is bool else value
-    if "out" not in given:
-        raise Refused("out=<folder or URL of a run> is missing; see --help")
-    request = Request(**given)
-    if sum((request.sample is not None, request.failed, request.list)) > 1:
-        raise Refused("choose one of sample=, failed=true and list=true")
-    if request.to is not None and request.sample is None:
-        raise Refused("to= says where the picture of sample= goes; give sample= too")
-    if request.film and request.sample is None:
-        raise Refused("film=true is of sample=; give sample= too")
-    if request.vocabulary is not None and request.sample is None:
-        raise Refused("vocabulary= is drawn in the picture of sample=; give sample= too")
-    return request
-
-
-def _truth(key: str, value: str) -> bool:
-    if value.lower() not in ("true", "false"):
-        raise Refused(f"{key}={value}: must be true or false")
-    return value.lower() == "true"
 
 
 def answer(request: Request) -> Iterable[str]:

@@ -10,9 +10,10 @@ from pathlib import Path
 import numba
 import pytest
 
+from factory.arguments import parse
 from factory.clips.synthetic.reader import SyntheticReader
 from factory.config import compose, fill
-from factory.dashboard import parse as dashboard_parse
+from factory.dashboard import Request as DashboardRequest
 from factory.explain import split_arguments
 from factory.export import main as export_main
 from factory.run import main as run_main
@@ -109,7 +110,7 @@ def test_every_command_is_one_its_program_takes(
             monkeypatch.chdir(demo_home)
             assert export_main(arguments) == 0, capsys.readouterr().err
         case ["python", "-m", "factory.dashboard", *arguments]:
-            dashboard_parse(arguments)
+            parse(DashboardRequest, arguments)
         case ["python", "-m", "planners.train", *arguments] | [
             "torchrun",
             "--nproc-per-node",

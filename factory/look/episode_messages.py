@@ -26,12 +26,11 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from factory.look.bev import EXPERT, LOGGED, PERTURBED, Colour
+from factory.look.bev import AGENT_COLOURS, EXPERT, LOGGED, OBJECT, PERTURBED, Colour
 from factory.look.sample_picture import ego_way
 from factory.store.columns import Column
 from factory.store.schema import FIELDS, FIRST_FAILURES, NOW_INDEX
 from tasks.stages import SUBSCORES
-from tasks.world.agents import AgentKind
 from tasks.world.frames import to_local
 from tasks.world.vehicle import PACIFICA
 
@@ -45,12 +44,6 @@ EGO_HEIGHT_M = 1.777  # of the body that PACIFICA is; nothing is scored by it
 LINE_M, TRAJECTORY_M = 0.08, 0.25
 ROAD, LANE, CENTRE, CROSSING, ROUTE = (120, 120, 120), (170, 170, 170), (90, 120, 150), (200, 180, 90), (90, 170, 110)
 OURS: Colour = (60, 120, 220)
-KIND_COLOURS: Mapping[str, Colour] = {
-    AgentKind.VEHICLE: (230, 140, 60),
-    AgentKind.PEDESTRIAN: (210, 70, 110),
-    AgentKind.BICYCLE: (150, 90, 200),
-}
-OTHER_COLOUR: Colour = (150, 150, 150)
 
 
 @dataclass(frozen=True)
@@ -201,7 +194,7 @@ def _agents(row: Row) -> Iterator[Message]:
             entity = SceneEntity(timestamp=_stamp(time_ns), frame_id=NOW, id=row["agent_ids"][i])
             entity.metadata.add(key="kind", value=kind)
             at = (x, y, float(z) if np.isfinite(z) else height / 2.0)
-            _add_cube(entity, at, heading, (length, width, height), KIND_COLOURS.get(kind, OTHER_COLOUR))
+            _add_cube(entity, at, heading, (length, width, height), AGENT_COLOURS.get(kind, OBJECT))
             update.entities.append(entity)
         yield Message("/agents", time_ns, update)
 

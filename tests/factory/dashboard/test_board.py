@@ -11,12 +11,12 @@ import cv2
 import numpy as np
 import pytest
 
+from factory.arguments import Refused, parse
 from factory.board.overview import QUIET_S, overview
 from factory.board.pictures import Kept
 from factory.board.server import SERVED, STATIC, Board, Server
 from factory.board.watch import Watch
-from factory.dashboard import main, parse
-from factory.show import Refused
+from factory.dashboard import Request, main
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
 from tests.factory.dashboard.runs import EVIL, REFS, VIEW, counted, run, told
@@ -266,8 +266,8 @@ def test_the_command_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFi
     assert main([f"out={tmp_path / 'nothing'}"]) == 2
     assert "no store at" in capsys.readouterr().err
     with pytest.raises(Refused, match="port"):
-        parse(["out=x", "port=99999"])
-    assert (parse(["out=x"]).host, parse(["out=x", "port=0"]).port) == ("127.0.0.1", 0)
+        parse(Request, ["out=x", "port=99999"])
+    assert (parse(Request, ["out=x"]).host, parse(Request, ["out=x", "port=0"]).port) == ("127.0.0.1", 0)
 
 
 def test_a_taken_port_is_said(out: Path, served: tuple[str, int], capsys: pytest.CaptureFixture[str]) -> None:
