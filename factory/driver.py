@@ -13,6 +13,7 @@ from typing import Any
 from factory.batch import Gatherer, PendingRow
 from factory.blocks import BlockOf, BlockQueue, Build
 from factory.clips.reader import ClipRef
+from factory.episodes import Episodes
 from factory.local import Graph, Ticket
 from factory.plan import CLIP_CANDIDATE, ClipPlan, Plan, WalkState, wants_payload
 from factory.progress import ProgressLine, Tally
@@ -36,11 +37,13 @@ class Executed:
     from_cache: int = 0  # prepared clips taken from disk
     attempts: int = 0
     found_done: int = 0  # attempts settled by earlier runs
+    episodes: int = 0  # files written
 
     def __str__(self) -> str:
+        episodes = f"; wrote {self.episodes} episodes" if self.episodes else ""
         return (
             f"executed {self.prepared} perturb tasks ({self.from_cache} from cache) and {self.attempts} attempts; "
-            f"found {self.found_done} attempts done"
+            f"found {self.found_done} attempts done{episodes}"
         )
 
 
@@ -91,9 +94,11 @@ class Driver:
     def interrupted(self) -> bool:
         return self._stopping.is_set()
 
-    def loop(self, graph: Graph, gatherer: Gatherer) -> None:
+    def loop(self, graph: Graph, gatherer: Gatherer, episodes: Episodes | None = None) -> None:
         """Until nothing is left, or until stopped and drained."""
-        self._graph, self._gatherer = graph, gatherer
+        self._graph, self._gatherer, self._episodes = graph, gatherer, episodes
+        if episodes is not None:
+            gatherer.committed = episodes.committed
         with ProgressLine(len(self._plan.todo), doing=self._doing) as progress:
             self._work_through(graph, gatherer, progress)
 
@@ -117,10 +122,13 @@ class Driver:
             ):  # a block half built is left: the next run goes on with it
                 break
         gatherer.send()
-        while gatherer.n_writing:
+        while gatherer.n_writing or (self._episodes is not None and self._episodes.is_due):
+            if self.interrupted and self._episodes is not None:
+                self._episodes.stop()
             finished = graph.wait(WAIT_S)
             if finished is not None:
                 self._take(*finished)
+            progress.show(self._tally)
         progress.show(self._tally, last=True)
 
     def _open(self, what: ClipPlan | Build) -> None:
@@ -134,6 +142,9 @@ class Driver:
 
     def _take(self, ticket: Ticket, report: Any) -> None:
         if self._gatherer.finished(ticket, report):
+            return
+        if self._episodes is not None and self._episodes.finished(ticket, report):
+            self.executed.episodes = self._episodes.written
             return
         if ticket in self._building:
             self._take_block(self._building.pop(ticket), report)

@@ -18,6 +18,7 @@ from typing import Literal
 from factory.batch import SHARD_BYTES, SHARD_SECONDS, Gatherer, WriteFailed
 from factory.clips.reader import ClipRef
 from factory.driver import Driver, Executed
+from factory.episodes import Episodes
 from factory.funnel import Funnel, funnel_of
 from factory.local import Graph, LocalGraph
 from factory.plan import Plan, make_plan
@@ -61,12 +62,14 @@ def execute(
     shard_bytes: int = SHARD_BYTES,
     shard_seconds: float = SHARD_SECONDS,
     minutes: float | None = None,
+    episodes: int = 0,
     say: Callable[[str], None] = print,
 ) -> RunSummary:
     """Make the samples of `rounds` rounds for every clip and expert, as far as the store does not hold them already.
 
     workers: processes of a local Ray cluster, None: one per CPU. retry: try failed(input | bug) attempts again too.
-    minutes: after which nothing new is begun, as after an interruption.
+    minutes: after which nothing new is begun, as after an interruption. episodes: an MCAP file for one sample in so
+    many, 0 for none.
     Bad wishes come back as exit code 2 with a message and nothing written; see the module's codes for the others.
     """
     if not refs or not experts or rounds < 1:
@@ -83,6 +86,7 @@ def execute(
             on_change = "keep"
         policy = retry_policy(retry, identity.versions_json)
         plan = make_plan(refs, experts, rounds, history, identity, on_change, policy)
+        pictured = Episodes(store, episodes, refs) if episodes else None
     except ChangedRun as error:
         return RunSummary(BAD_CONFIG, str(error))
     except OSError as error:
@@ -94,7 +98,8 @@ def execute(
         driver.notes.append(f"{len(plan.frozen)} clips kept as they are: their candidates come from other settings")
     code, message, began_ms = COMPLETE, "", 0
     try:
-        graph = _graph(work, store, executor, workers, ray_address) if plan.todo else None
+        is_due = plan.todo or (pictured is not None and pictured.is_due)
+        graph = _graph(work, store, executor, workers, ray_address) if is_due else None
     except BadLocation as error:
         return RunSummary(BAD_CONFIG, str(error))
     except KeyboardInterrupt:
@@ -104,8 +109,15 @@ def execute(
         if graph is not None:
             began_ms = _announce(store, plan, experts, rounds)
             with _stop_signals(driver.stop), _alarm(driver.stop, minutes):
-                driver.loop(graph, Gatherer(graph, store, shard_bytes, shard_seconds))
+                if pictured is not None:
+                    pictured.begin(graph)
+                driver.loop(graph, Gatherer(graph, store, shard_bytes, shard_seconds), pictured)
+                if pictured is not None:
+                    pictured.tidy()
         code = COMPLETE_WITH_FAILURES if driver.has_failures else COMPLETE
+        if pictured is not None and pictured.errors:
+            text = f"{len(pictured.errors)} episodes were not written ({pictured.errors[0]})"
+            code, message = INTERRUPTED, f"{text}; run the same command again to write them"
         if driver.interrupted:
             code, message = INTERRUPTED, "interrupted; run the same command again to go on"
     except (AnotherWriter, WriteFailed) as error:

@@ -79,10 +79,9 @@ def export(kind: str, request: Request) -> Iterator[Path]:
 
 def write_mcap(store: Store, row: Row, path: Path) -> None:
     """The sample as an MCAP episode."""
-    from factory.look.episode_messages import episode_messages, metadata_of
-    from factory.store.episodes import episode_bytes
+    from factory.look.episode_messages import episode_of
 
-    path.write_bytes(episode_bytes(episode_messages(row, logged_drive(store, dict(row))), metadata_of(row)))
+    path.write_bytes(episode_of(row, logged_drive(store, dict(row))))
 
 
 def write_film(store: Store, row: Row, path: Path) -> None:

@@ -39,6 +39,7 @@ STEPS = {
     "prepare": steps.prepare,
     "attempt": steps.attempt,
     "write": steps.write,
+    "episodes": steps.episodes,
     "warm": steps.warm,
 }
 WANTS = {
@@ -46,6 +47,7 @@ WANTS = {
     "prepare": ("work", "out"),
     "attempt": ("work",),
     "write": ("out",),
+    "episodes": ("work", "out"),
     "warm": ("work",),
 }
 

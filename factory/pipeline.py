@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factory.clips.reader import BadClip, ClipReader, ClipRef
 from factory.fitting import fits_going_on
@@ -48,7 +49,8 @@ from tasks.reward.labels import Labelling, vocabulary_labels
 from tasks.rollout.simulate import TrafficSettings
 from tasks.stages import SUBSCORES, Rejected
 from tasks.vocabulary import Vocabulary
-from tasks.world.clip import STEP_S, Clip, scene_of_clip
+from tasks.world.clip import NOW, STEP_S, Clip, scene_of_clip
+from tasks.world.vehicle import HEADING
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,13 @@ class PerturbedClip:
     clip: Clip
     candidates: tuple[Candidate, ...]
     before: Clip | None = None  # of a benchmark: the same log's window 0.5 s earlier
+
+
+def logged_poses(prepared: object) -> NDArray[np.float64] | None:
+    """(81, 3) the log from T to T+2H, world frame, of a prepared clip; None of what is none, or is another work's."""
+    if not isinstance(prepared, PreparedClip) or not isinstance(prepared.payload, PerturbedClip):
+        return None
+    return prepared.payload.clip.ego_states[NOW:, : HEADING + 1]
 
 
 @dataclass(frozen=True)

@@ -111,6 +111,7 @@ def run(overrides: Sequence[str]) -> int:
         on_change=config.on_change,
         retry=config.retry_failed,
         minutes=config.minutes,
+        episodes=config.one_episode_in,
     )
     if summary.message:
         print(summary.message, file=sys.stderr)

@@ -104,6 +104,7 @@ class RunConfig:
     on_change: Literal["stop", "keep", "redo"]
     retry_failed: bool
     minutes: float | None
+    episodes: int | Literal["none", "all"]
     dry_run: bool
 
     def __post_init__(self) -> None:
@@ -113,6 +114,8 @@ class RunConfig:
             raise ValueError(f"experts={list(self.experts)}: name each expert once, at least one")
         if self.minutes is not None and not self.minutes >= 0.0:
             raise ValueError(f"minutes={self.minutes}: must not be negative, or null for no bound")
+        if self.one_episode_in < 0 or self.episodes == 0:
+            raise ValueError(f"episodes={self.episodes}: must be none, all, or n for one sample in n")
         for name in ("limit", "workers"):
             value = getattr(self, name)
             if value is not None and value < 1:
@@ -122,6 +125,11 @@ class RunConfig:
             raise ValueError(f"experts: {unknown} is not among {sorted(self.expert)}; add your own with +expert.<name>")
         if self.render.map_rig not in RIGS:
             raise ValueError(f"render.map_rig={self.render.map_rig} is not among {', '.join(RIGS)}")
+
+    @property
+    def one_episode_in(self) -> int:
+        """Samples; 0 for no episode at all."""
+        return {"none": 0, "all": 1}[self.episodes] if isinstance(self.episodes, str) else self.episodes
 
 
 @dataclass(frozen=True)

@@ -271,23 +271,17 @@ def _label_lines(row: dict[str, Any], drawn: bool) -> Iterable[str]:
 
 def logged_drive(store: "Store", row: dict[str, Any]) -> "NDArray[np.float64] | None":
     """(81, 3) the log from T to T+2H, world frame, from the prepared clip; None where the cache has it no more."""
-    from factory.pipeline import PerturbedClip
+    from factory.pipeline import logged_poses
     from factory.steps import cache_key
     from factory.store.cache import BadCacheFile
-    from factory.work import PreparedClip
-    from tasks.world.clip import NOW
-    from tasks.world.vehicle import HEADING
 
     digests = {run["settings_hash"]: run["prepare_digest"] for run in store.runs()}
     if row["settings_hash"] not in digests:
         return None
     try:
-        stored = store.cache.load(cache_key(row["clip_id"], digests[row["settings_hash"]]))
+        return logged_poses(store.cache.load(cache_key(row["clip_id"], digests[row["settings_hash"]])))
     except BadCacheFile:
         return None
-    if not isinstance(stored, PreparedClip) or not isinstance(stored.payload, PerturbedClip):
-        return None
-    return stored.payload.clip.ego_states[NOW:, : HEADING + 1]
 
 
 def _numbers(row: dict[str, Any]) -> Iterable[str]:

@@ -16,6 +16,7 @@ from factory.clips.reader import BadClip, ClipRef
 from factory.store.cache import BadCacheFile, ClipCache
 from factory.store.location import Location
 from factory.store.outcomes import ErrorKind
+from factory.store.reader import samples_of
 from factory.store.scenes import SceneFiles
 from factory.store.schema import SAMPLES, sample_row_to_table
 from factory.store.table import Shard, write_shard
@@ -62,6 +63,23 @@ class Attempted:
     licence: str = ""  # of its source
     subscores: Mapping[str, float] = field(default_factory=dict)
     seconds: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class EpisodesOf:
+    """Samples of one committed file whose episodes are to be written."""
+
+    path: str  # in the table `samples`
+    partition: Mapping[str, str]
+    refs: Mapping[str, ClipRef]  # attempt_id -> its clip
+
+
+@dataclass(frozen=True)
+class EpisodesWritten:
+    """Report on them: files that stand now, and why others do not."""
+
+    written: int
+    errors: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -152,6 +170,30 @@ def write(out: Location, *rows: pa.Table) -> tuple[Shard | Failure, None]:
         return write_shard(out.child("samples"), SAMPLES, pa.concat_tables(rows)), None
     except OSError as error:
         return failure_of(error), None
+
+
+def episodes(work: Work, out: Location, wanted: EpisodesOf) -> tuple[EpisodesWritten | Failure, None]:
+    """Committed samples as MCAP files beside their table; the log's drive comes from the prepared clip."""
+    from factory.look.episode_messages import episode_of
+    from factory.pipeline import logged_poses
+    from factory.store.episodes import FOLDER, episode_name
+
+    written, errors = 0, []
+    try:
+        for row in samples_of(out.child("samples"), wanted.path, wanted.partition, wanted.refs):
+            key = row["attempt_id"]
+            report, clip = prepare(work, out, wanted.refs[key], row["content_digest"])
+            if clip is None:
+                errors.append(f"clip {row['clip_id']}: {report.error if isinstance(report, Failure) else report}")
+                continue
+            try:
+                out.child(FOLDER).write(episode_name(row), episode_of(row, logged_poses(clip)))
+                written += 1
+            except Exception as error:  # one that cannot be made costs no other
+                errors.append(f"sample {key}: {failure_of(error).error.splitlines()[-1]}")
+    except Exception as error:  # the same boundary
+        return failure_of(error), None
+    return EpisodesWritten(written, tuple(errors)), None
 
 
 def reconstruct(work: Work, ref: ClipRef, threads: int) -> tuple[Reconstructed | Failure, None]:

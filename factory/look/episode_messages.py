@@ -29,6 +29,7 @@ from scipy.spatial.transform import Rotation
 from factory.look.bev import AGENT_COLOURS, EXPERT, LOGGED, OBJECT, PERTURBED, Colour
 from factory.look.sample_picture import ego_way
 from factory.store.columns import Column
+from factory.store.episodes import episode_bytes
 from factory.store.schema import FIELDS, FIRST_FAILURES, NOW_INDEX
 from tasks.stages import SUBSCORES
 from tasks.world.frames import to_local
@@ -70,6 +71,11 @@ def episode_messages(row: Row, logged: Array | None = None) -> list[Message]:
         Message("/sample", _time_ns(row, -NOW_INDEX * STEP_S), facts_of(row)),
     ]
     return sorted(found, key=lambda message: message.time_ns)
+
+
+def episode_of(row: Row, logged: Array | None = None) -> bytes:
+    """The sample as one MCAP file."""
+    return episode_bytes(episode_messages(row, logged), metadata_of(row))
 
 
 def facts_of(row: Row) -> dict[str, Any]:

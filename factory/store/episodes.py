@@ -3,8 +3,10 @@
 Chunked, zstd-compressed, with CRCs and an index, as those tools want it; the bytes depend on the sample alone.
 """
 
+import hashlib
 import io
 import json
+import zlib
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
@@ -12,6 +14,7 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import register_schema
 
+FOLDER = "episodes"  # beside the table, of those that a run writes
 LIBRARY = "driving-data-factory"
 CHUNK_BYTES = 1 << 20
 
@@ -25,6 +28,17 @@ class Timed(Protocol):
     def time_ns(self) -> int: ...
     @property
     def content(self) -> Any: ...
+
+
+def is_chosen(attempt_id: str, every: int) -> bool:
+    """One sample in `every`, by its id alone; 1: all, 0: none."""
+    return every > 0 and zlib.crc32(attempt_id.encode()) % every == 0
+
+
+def episode_name(row: Mapping[str, Any]) -> str:
+    """The file of a sample's row, by its attempt_id, settings_hash and stage_versions."""
+    made_under = hashlib.sha256(f"{row['settings_hash']}\x1f{row['stage_versions']}".encode()).hexdigest()[:8]
+    return f"{row['attempt_id']}-{made_under}.mcap"
 
 
 def episode_bytes(messages: Sequence[Timed], metadata: Mapping[str, str]) -> bytes:

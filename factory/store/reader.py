@@ -12,7 +12,7 @@ files they stand in; `iterate` goes file by file instead, which is what a pass o
 """
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from factory.store.location import Location
-from factory.store.schema import SAMPLES, SCHEMA_VERSION, VERSION_PROPERTY, table_to_rows
+from factory.store.schema import SAMPLES, SCHEMA, SCHEMA_VERSION, VERSION_PROPERTY, table_to_rows
 from factory.store.table import KeyedTable
 from tasks.reward.label_bytes import VocabularyLabels, decode
 
@@ -119,25 +119,45 @@ class SampleTable:
                 yield from self._rows(path, [group], columns, slice(None))
 
     def _rows(self, path: str, groups: list[int], columns: Sequence[str] | None, rows: slice) -> list[Sample]:
-        partition = self._partitions[path]
-        names = list(self.schema.names if columns is None else columns)
-        unknown = sorted(set(names) - set(self.schema.names))
-        if unknown:
-            raise KeyError(f"no columns {unknown}")
-        stored = self._file(path).read_row_groups(groups, columns=[n for n in names if n not in partition])
-        start, stop, _ = rows.indices(stored.num_rows)
-        stored = stored.slice(start, stop - start)
-        arrays = [
-            pa.repeat(pa.scalar(partition[n]).cast(self.schema.field(n).type), stored.num_rows)
-            if n in partition
-            else stored[n].cast(self.schema.field(n).type)
-            for n in names
-        ]
-        return table_to_rows(pa.table(arrays, schema=pa.schema([self.schema.field(n) for n in names])))
+        return _read_rows(self._file(path), groups, self._partitions[path], columns, rows)
 
     def _open(self, path: str) -> pq.ParquetFile:
-        filesystem, base = self._table.location.filesystem()
-        return pq.ParquetFile(f"{base}/{path}", filesystem=filesystem, page_checksum_verification=True)
+        return _opened(self._table.location, path)
+
+
+def samples_of(
+    table: Location, path: str, partition: Mapping[str, str], attempt_ids: Collection[str]
+) -> Iterator[Sample]:
+    """Some whole rows of one file of a table of samples; reads the row groups they stand in, one at a time."""
+    file = _opened(table, path)
+    for group in range(file.metadata.num_row_groups):
+        keys = file.read_row_group(group, columns=["attempt_id"])["attempt_id"].to_pylist()
+        for i in (i for i, key in enumerate(keys) if key in attempt_ids):
+            yield from _read_rows(file, [group], partition, None, slice(i, i + 1))
+
+
+def _opened(table: Location, path: str) -> pq.ParquetFile:
+    filesystem, base = table.filesystem()
+    return pq.ParquetFile(f"{base}/{path}", filesystem=filesystem, page_checksum_verification=True)
+
+
+def _read_rows(
+    file: pq.ParquetFile, groups: list[int], partition: Mapping[str, str], columns: Sequence[str] | None, rows: slice
+) -> list[Sample]:
+    names = list(SCHEMA.names if columns is None else columns)
+    unknown = sorted(set(names) - set(SCHEMA.names))
+    if unknown:
+        raise KeyError(f"no columns {unknown}")
+    stored = file.read_row_groups(groups, columns=[n for n in names if n not in partition])
+    start, stop, _ = rows.indices(stored.num_rows)
+    stored = stored.slice(start, stop - start)
+    arrays = [
+        pa.repeat(pa.scalar(partition[n]).cast(SCHEMA.field(n).type), stored.num_rows)
+        if n in partition
+        else stored[n].cast(SCHEMA.field(n).type)
+        for n in names
+    ]
+    return table_to_rows(pa.table(arrays, schema=pa.schema([SCHEMA.field(n) for n in names])))
 
 
 def image_of(sample: Mapping[str, Any], camera: str, time_s: float) -> NDArray[np.uint8]:

@@ -9,6 +9,7 @@ from factory.execute import COMPLETE, COMPLETE_WITH_FAILURES, execute
 from factory.graph import ray  # with the environment that keeps it on loopback
 from factory.store.samples import Store
 from factory.store.verify import verify
+from tests.factory.filmed import FilmedWork
 from tests.factory.tables import assert_same_tables, tables_of
 from tests.factory.toy import ToyWork, ran, refs
 
@@ -36,6 +37,17 @@ def test_local_and_ray_with_one_and_two_workers_make_identical_rows(tmp_path: Pa
     assert ray.is_initialized(), "a cluster that the run found must stay"
     assert_same_tables(tmp_path / "local", tmp_path / "one")
     assert_same_tables(tmp_path / "local", tmp_path / "two")
+
+
+def test_workers_write_the_same_episodes_as_one_process(tmp_path: Path, two_cpus: None) -> None:
+    for executor in ("local", "ray"):
+        store = Store(tmp_path / executor)
+        execute(FilmedWork(), refs(3), EXPERTS, 2, store, executor, 2, episodes=1, say=lambda line: None)  # type: ignore[arg-type]
+    local, ray_s = (
+        {path.name: path.read_bytes() for path in (tmp_path / executor / "episodes").iterdir()}
+        for executor in ("local", "ray")
+    )
+    assert local == ray_s and len(local) == len(Store(tmp_path / "ray").samples)
 
 
 def test_a_clip_that_kills_its_workers_hurts_nobody_else(tmp_path: Path, two_cpus: None) -> None:

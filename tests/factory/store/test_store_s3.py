@@ -16,6 +16,7 @@ from factory.store.location import BadLocation, Location
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
 from factory.store.verify import verify
+from tests.factory.filmed import FilmedWork
 from tests.factory.tables import assert_same_tables
 from tests.factory.toy import ToyWork, refs
 
@@ -66,6 +67,21 @@ def test_a_bucket_holds_the_same_rows_as_a_folder(s3: dict[str, str], tmp_path: 
     assert verify(Store(url, s3)).damage == () and verify(Store(url, s3)).orphans == ()
     samples = SampleTable(url, s3)
     assert samples[0]["label_10hz"].shape == (40, 3) and len(samples) == len(SampleTable(tmp_path))
+
+
+def test_a_bucket_holds_the_same_episodes_as_a_folder_and_makes_up_for_lost_ones(
+    s3: dict[str, str], tmp_path: Path
+) -> None:
+    url = f"s3://{BUCKET}/runs/filmed"
+    for out in (Store(url, s3), Store(tmp_path)):
+        execute(FilmedWork(), refs(2), ["recovery"], 1, out, "local", episodes=1, say=lambda line: None)
+    there, here = Location.parse(url, s3).child("episodes"), Location.parse(tmp_path).child("episodes")
+    names = here.names()
+    assert names and there.names() == names
+    assert [there.read(name) for name in names] == [here.read(name) for name in names]
+    there.remove(names[0])
+    again = execute(FilmedWork(), refs(2), ["recovery"], 1, Store(url, s3), "local", episodes=1, say=lambda line: None)
+    assert again.executed.episodes == 1 and there.read(names[0]) == here.read(names[0])
 
 
 def test_the_dashboard_follows_a_run_in_a_bucket(s3: dict[str, str]) -> None:
