@@ -1,8 +1,9 @@
-"""`python -m factory.export mcap|mp4 out=<folder or URL> sample=<id>`: samples as files for other tools.
+"""`python -m factory.export mcap|mp4|rerun out=<folder or URL> sample=<id>`: samples as files for other tools.
 
     python -m factory.export mcap out=runs/demo sample=0             one sample for Foxglove, Lichtblick or Rerun
     python -m factory.export mcap out=runs/demo every=10 to=looks    every tenth sample, a file each
     python -m factory.export mp4 out=runs/demo sample=3fa9           a drive as H.264, from above and from the cameras
+    python -m factory.export rerun out=runs/demo sample=0            a .rrd, with Rerun's SDK (pip install rerun-sdk)
 
 `sample` is an ordinal, an id or the beginning of one, `to` a folder (the current one) or, for one sample, a file.
 Exit codes: 0 written, 2 bad arguments, or nothing there to export.
@@ -63,17 +64,18 @@ def export(kind: str, request: Request) -> Iterator[Path]:
         chosen = [find(store, request.sample)]
     else:
         chosen = sample_ids(store)[:: request.every]
-    is_file = target.suffix == f".{kind}" and not target.is_dir()
+    suffix = SUFFIXES.get(kind, f".{kind}")
+    is_file = target.suffix == suffix and not target.is_dir()
     if is_file and request.every is not None:
         raise Refused(f"to={request.to}: every=... writes a file for each sample; name a folder")
     try:
         table = SampleTable(store.location.uri, store.location.options)
         for attempt_id in chosen:
-            path = target if is_file else target / f"sample_{attempt_id}.{kind}"
+            path = target if is_file else target / f"sample_{attempt_id}{suffix}"
             path.parent.mkdir(parents=True, exist_ok=True)
             FORMATS[kind](store, table[attempt_id], path)
             yield path
-    except (OSError, ValueError) as error:  # no such folder, another schema version
+    except (OSError, ValueError, ImportError) as error:  # no such folder, another schema version, no SDK
         raise Refused(f"{store.location.uri}: {error}") from error
 
 
@@ -94,7 +96,19 @@ def write_film(store: Store, row: Row, path: Path) -> None:
     write_mp4(path, film(row, scene, logged_drive(store, dict(row))))
 
 
-FORMATS: Mapping[str, Callable[[Store, Row, Path], None]] = {"mcap": write_mcap, "mp4": write_film}
+def write_rerun(store: Store, row: Row, path: Path) -> None:
+    """The sample as a Rerun recording."""
+    from factory.look.rerun_log import write_recording
+
+    write_recording(path, row, logged_drive(store, dict(row)))
+
+
+SUFFIXES = {"rerun": ".rrd"}  # where they are not the format's name
+FORMATS: Mapping[str, Callable[[Store, Row, Path], None]] = {
+    "mcap": write_mcap,
+    "mp4": write_film,
+    "rerun": write_rerun,
+}
 
 
 if __name__ == "__main__":
