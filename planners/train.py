@@ -2,6 +2,7 @@
 
     python -m planners.train planner=ltf data.real=[runs/town] data.sim=[runs/town] out=runs/ltf
     python -m planners.train planner=gtrs_dense planner.settings.vocabulary=<K x 40 x 3>.npy mix.sim_ratio=0.5 ...
+    python -m planners.train planner=ltf init_from=runs/ltf ...  trains a planner further, on other data
     torchrun --nproc-per-node 8 -m planners.train ...          on the GPUs of a node
     python -m planners.train executor=ray ray.processes=8 ray.gpus=1 ...    on a Ray cluster
     python -m planners.train ... --cfg                          the settings, resolved
@@ -23,7 +24,7 @@ import torch
 
 from factory.config import ConfigError, compose, fill
 from planners.backbone import load_pretrained
-from planners.checkpoint import as_record, checkpoints, newest, read_record
+from planners.checkpoint import as_record, checkpoints, digest, load_weights, newest, read_record
 from planners.data import Dataset, DataSettings, open_data
 from planners.fit import Loop, Stopped, fit, total_steps
 from planners.loader import Loader
@@ -62,6 +63,7 @@ class TrainConfig:
     data: DataSettings
     steps: int | None
     seed: int
+    init_from: str | None
     out: str
     executor: Literal["process", "ray"]
     device: Literal["auto", "cpu", "cuda"]
@@ -145,7 +147,7 @@ def train(config: TrainConfig, world: World) -> None:
     check = validation(config.data, planner, world, config.workers) if config.data.val else None
     identity = _identity(config, dataset, steps, world)
     resume_from = _begun(out, config, identity)
-    backbones = load_pretrained(planner) if resume_from is None else read_record(resume_from)["backbones"]
+    backbones = _first_weights(planner, config) if resume_from is None else read_record(resume_from)["backbones"]
     record = {
         "trained": identity,
         "samples": {"real": int((~dataset.rows.simulated).sum()), "simulated": int(dataset.rows.simulated.sum())},
@@ -177,6 +179,16 @@ def _planner(config: TrainConfig, settings: Any, dataset: Dataset) -> Planner:
     return build_planner(config.planner, arrays)
 
 
+def _first_weights(planner: Planner, config: TrainConfig) -> dict[str, str]:
+    """Fills in the weights that a training begins with; backbone -> where its weights are from."""
+    if config.init_from is None:
+        return load_pretrained(planner)
+    folder = newest(Path(config.init_from))
+    load_weights(planner, folder)
+    backbones: dict[str, str] = read_record(folder)["backbones"]
+    return backbones
+
+
 def _identity(config: TrainConfig, dataset: Dataset, steps: int, world: World) -> dict[str, Any]:
     """All that the loss curve depends on beside the planner; a folder is gone on with only where it is the same."""
     values = {
@@ -185,6 +197,7 @@ def _identity(config: TrainConfig, dataset: Dataset, steps: int, world: World) -
         "samples": dataset.digest,
         "steps": steps,
         "seed": config.seed,
+        "init_from": None if config.init_from is None else digest(config.init_from),
         "precision": config.precision,
         "accumulate": config.accumulate,
         "processes": world.size,
@@ -215,6 +228,7 @@ def _plan_text(config: TrainConfig, record: Mapping[str, Any], loader: Loader, r
     return "\n".join(
         [
             f"{config.planner.name}: {record['parameters']:,} parameters; pretrained backbones: {weights}",
+            *([] if config.init_from is None else [f"weights to begin with: {newest(Path(config.init_from))}"]),
             loader.text(),
             f"{record['trained']['steps']} steps; {begins}; out: {config.out}",
         ]

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
-from planners.checkpoint import newest, read_record
+from planners.checkpoint import load_planner, newest, read_record
 from planners.curves import LOSSES, VALIDATION
 from planners.train import main
 from tests.planners.samples import sample, write_table
@@ -75,6 +76,24 @@ def test_a_killed_training_goes_on_to_the_identical_curve(table: str, tmp_path: 
     assert (cut / LOSSES).read_text() == (whole / LOSSES).read_text()
 
 
+def test_a_planner_is_trained_further_from_the_weights_of_another_training(
+    table: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    assert main(command(table, first)) == 0
+    further = ("seed=5", "steps=1", f"init_from={first}", "planner.training.learning_rate=1e-9")
+    assert main(command(table, second, *further)) == 0
+    assert f"weights to begin with: {newest(first)}" in capsys.readouterr().out
+    begun, learnt = (load_planner(folder).state_dict() for folder in (second, first))
+    for name, weights in learnt.items():
+        torch.testing.assert_close(begun[name], weights, rtol=0.0, atol=1e-8)
+    assert main(command(table, second, *further[:2], further[3])) == 2
+    assert "init_from" in capsys.readouterr().err
+    assert main(command(table, tmp_path / "third", f"init_from={first}", "+planner.settings.hidden=9")) == 2
+    assert "(9, " in capsys.readouterr().err
+    assert not (tmp_path / "third").exists()
+
+
 def test_another_planner_or_other_settings_do_not_go_on_in_a_folder(
     table: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -101,6 +120,7 @@ def test_another_planner_or_other_settings_do_not_go_on_in_a_folder(
         (("planner.training.batch_size=100",), "lower planner.training.batch_size"),
         (("accumulate=3",), "accumulate=3"),
         (("device=cuda",), "device=cuda"),
+        (("init_from=nowhere",), "nowhere: no checkpoint"),
         (("planner=gtrs_dense_small",), "vocabulary"),
     ],
 )
