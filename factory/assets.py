@@ -77,7 +77,7 @@ def asset_for(clip: Clip, settings: RenderSettings, cache_dir: str | Path, threa
     made_of = sensing(clip, settings)
     if made_of is Sensing.NOTHING:
         return None
-    path = Path(cache_dir) / f"block-{block_id(clip, settings)}{SUFFIX}"
+    path = scene_path(clip, settings, cache_dir)
     path.parent.mkdir(parents=True, exist_ok=True)
     with only_builder(path):
         if path.exists():
@@ -94,6 +94,11 @@ def asset_for(clip: Clip, settings: RenderSettings, cache_dir: str | Path, threa
         else:
             asset = lidar_asset(load_sweeps(block.sweeps, with_intensity=True), block.agents)
         return write_scene(path, replace(asset, block=range_of(clip, block)))
+
+
+def scene_path(clip: Clip, settings: RenderSettings, cache_dir: str | Path) -> Path:
+    """Where the scene of the clip's block is kept."""
+    return Path(cache_dir) / f"block-{block_id(clip, settings)}{SUFFIX}"
 
 
 def range_of(clip: Clip, block: Block) -> BlockRange:

@@ -70,7 +70,7 @@ class Gatherer:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._graph, self._store, self._clock = graph, store, clock
-        self.committed: Callable[[Sequence[str]], None] = lambda paths: None  # told new files of the table of samples
+        self.committed: Callable[[Sequence[Shard], float], None] = lambda shards, seconds: None  # told of every commit
         self._shard_bytes, self._shard_seconds = shard_bytes, shard_seconds
         self._open = Batch()
         self._written_by: dict[Ticket, Batch] = {}
@@ -128,5 +128,6 @@ class Gatherer:
 
     def _commit(self, batch: Batch) -> None:
         licences = {row.licence for rows in batch.rows.values() for row in rows}
+        began = time.perf_counter()
         self._store.commit(batch.candidates, batch.shards, batch.outcomes, batch.replaced, batch.unlisted, licences)
-        self.committed([shard.path for shard in batch.shards])
+        self.committed(batch.shards, time.perf_counter() - began)

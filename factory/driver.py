@@ -15,12 +15,14 @@ from factory.blocks import BlockOf, BlockQueue, Build
 from factory.clips.reader import ClipRef
 from factory.episodes import Episodes
 from factory.local import Graph, Ticket
+from factory.metrics import RunMetrics
 from factory.plan import CLIP_CANDIDATE, ClipPlan, Plan, WalkState, wants_payload
 from factory.progress import ProgressLine, Tally
 from factory.steps import Attempted, Failure, Prepared, Reconstructed, Stamp
 from factory.store.candidates import ClipCandidates
 from factory.store.outcomes import QUARANTINE_AFTER, ErrorKind, Kind, Outcome
 from factory.store.samples import Past
+from factory.store.table import Shard
 from factory.walk import Blocked, Complete, Exhausted, Step, Try, tries_before
 from factory.work import RunIdentity, attempt_id
 from tasks.stages import Rejected
@@ -94,11 +96,10 @@ class Driver:
     def interrupted(self) -> bool:
         return self._stopping.is_set()
 
-    def loop(self, graph: Graph, gatherer: Gatherer, episodes: Episodes | None = None) -> None:
+    def loop(self, graph: Graph, gatherer: Gatherer, metrics: RunMetrics, episodes: Episodes | None = None) -> None:
         """Until nothing is left, or until stopped and drained."""
-        self._graph, self._gatherer, self._episodes = graph, gatherer, episodes
-        if episodes is not None:
-            gatherer.committed = episodes.committed
+        self._graph, self._gatherer, self._metrics, self._episodes = graph, gatherer, metrics, episodes
+        gatherer.committed = self._committed
         with ProgressLine(len(self._plan.todo), doing=self._doing) as progress:
             self._work_through(graph, gatherer, progress)
 
@@ -116,6 +117,7 @@ class Driver:
                 self._take(*finished)
             gatherer.send_if_due()
             progress.show(self._tally)
+            self._show_state()
             idle = not self._preparing and not self._trying and not gatherer.n_writing
             if idle and (
                 self.interrupted or not self._queue
@@ -131,6 +133,22 @@ class Driver:
             progress.show(self._tally)
         progress.show(self._tally, last=True)
 
+    def _committed(self, shards: Sequence[Shard], seconds: float) -> None:
+        self._metrics.committed(shards, seconds)
+        if self._episodes is not None:
+            self._episodes.committed([shard.path for shard in shards])
+
+    def _show_state(self) -> None:
+        in_flight = {
+            "walks": sum(self._walks_left.values()),
+            "attempts": len(self._trying),
+            "clips": len(self._preparing),
+            "blocks": len(self._building),
+            "batches": self._gatherer.n_writing,
+        }
+        clips = len(self._plan.todo)
+        self._metrics.state(clips, clips - self._tally.clips, in_flight)
+
     def _open(self, what: ClipPlan | Build) -> None:
         if isinstance(what, Build):
             threads = max(1, self._graph.cores // self._queue.at_once)
@@ -141,6 +159,7 @@ class Driver:
             self._start_walks(what, None)
 
     def _take(self, ticket: Ticket, report: Any) -> None:
+        self._metrics.task(ticket.step, ticket.queued_s, report)
         if self._gatherer.finished(ticket, report):
             return
         if self._episodes is not None and self._episodes.finished(ticket, report):
@@ -191,6 +210,7 @@ class Driver:
         clip.failed = outcome.kind == Kind.FAILED
         unlisted = [clip_id] if isinstance(report, Rejected) else []
         self._gatherer.add(outcomes=[outcome], replaced=replaced, unlisted=unlisted)
+        self._metrics.outcome(outcome, None)
         self._tally.rejected += not clip.failed
         self._tally.failed += clip.failed
         self._tally.clips += 1
@@ -220,6 +240,7 @@ class Driver:
             outcome = self._outcome(clip.ref, stamp.attempt_id, walk.expert, step.n_tried, step, 0, {}, {})
             walk.known[step.n_tried] = _past(outcome)
             self._keep(clip, walk, outcomes=[outcome])
+            self._metrics.outcome(outcome, None)
         rows, outcomes = self._held.pop((clip.ref.clip_id, walk.expert), ([], []))
         if isinstance(step, Complete | Exhausted):
             if walk.stale:
@@ -240,6 +261,7 @@ class Driver:
             row = PendingRow(result, report.n_bytes, (stamp.round, stamp.expert), report.licence)
             self._keep(clip, walk, rows=[row], replaced=replaced)
             self._tally.accepted += 1
+            self._metrics.accepted(stamp.expert, stamp.round)
         else:
             what = report if isinstance(report, Failure) else report.rejected
             measured = ({}, {}) if isinstance(report, Failure) else (dict(report.subscores), dict(report.seconds))
@@ -251,6 +273,7 @@ class Driver:
             if outcome.kind == Kind.FAILED:
                 self._fresh.add(stamp.attempt_id)
             self._keep(clip, walk, outcomes=[outcome], replaced=replaced)
+            self._metrics.outcome(outcome, stamp.round)
             self._tally.rejected += outcome.kind == Kind.REJECTED
             self._tally.failed += outcome.kind == Kind.FAILED
         self._advance(clip, walk, prepared)

@@ -21,6 +21,7 @@ from factory.driver import Driver, Executed
 from factory.episodes import Episodes
 from factory.funnel import Funnel, funnel_of
 from factory.local import Graph, LocalGraph
+from factory.metrics import RunMetrics
 from factory.plan import Plan, make_plan
 from factory.store.location import BadLocation
 from factory.store.outcomes import Kind
@@ -108,10 +109,11 @@ def execute(
         store.begin(records)
         if graph is not None:
             began_ms = _announce(store, plan, experts, rounds)
+            metrics = RunMetrics(graph.recorder, store.location)
             with _stop_signals(driver.stop), _alarm(driver.stop, minutes):
                 if pictured is not None:
                     pictured.begin(graph)
-                driver.loop(graph, Gatherer(graph, store, shard_bytes, shard_seconds), pictured)
+                driver.loop(graph, Gatherer(graph, store, shard_bytes, shard_seconds), metrics, pictured)
                 if pictured is not None:
                     pictured.tidy()
         code = COMPLETE_WITH_FAILURES if driver.has_failures else COMPLETE

@@ -1,4 +1,4 @@
-"""The graph as Ray tasks, on this machine or on a cluster; the only module that imports ray.
+"""The graph as Ray tasks, on this machine or on a cluster. With factory.ray_metrics, all that imports ray here.
 
 Large results stay in the object store and travel by reference. A worker that dies is retried by Ray; what then still
 fails becomes a steps.Failure. Nothing but loopback is opened for a cluster of our own, and `ray stop` is never called.
@@ -7,6 +7,7 @@ fails becomes a steps.Failure. Nothing but loopback is opened for a cluster of o
 import logging
 import os
 import secrets
+import time
 from collections import deque
 from typing import Any
 
@@ -20,6 +21,8 @@ from ray.exceptions import RayError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from factory.local import STEPS, WANTS, Ticket, cores_of
+from factory.metrics import Recorder
+from factory.ray_metrics import RayRecorder
 from factory.steps import Failure
 from factory.store.location import BadLocation, Location
 from factory.store.outcomes import ErrorKind
@@ -48,6 +51,7 @@ class RayGraph:
         self.cores = min(
             [self.parallelism, *filter(None, _cores_by_node())]
         )  # none yet where a cluster grows from nothing
+        self.recorder: Recorder = RayRecorder()
         self._supplied: dict[str, Any] = {"work": [ray.put(work)], "out": out}  # in a list: handed over as a reference
         self._tickets: dict[Any, Ticket] = {}
         self._ready: deque[Any] = deque()
@@ -60,7 +64,7 @@ class RayGraph:
             raise
 
     def submit(self, step: str, *args: Any) -> Ticket:
-        ticket = Ticket(None)
+        ticket = Ticket(step, None)
         self._held_back.append((ticket, step, args))
         self._dispatch()
         return ticket
@@ -87,9 +91,11 @@ class RayGraph:
         ticket = self._tickets.pop(reference)
         self._dispatch()
         try:
-            return ticket, ray.get(reference)
+            report, worked_s = ray.get(reference)
         except RayError as error:
-            return ticket, Failure(ErrorKind.SYSTEM, f"{type(error).__name__}: {error}"[:2000])
+            report, worked_s = Failure(ErrorKind.SYSTEM, f"{type(error).__name__}: {error}"[:2000]), 0.0
+        ticket.queued_s = max(0.0, time.monotonic() - ticket.submitted - worked_s)
+        return ticket, report
 
     def close(self) -> None:
         self._tickets.clear()
@@ -99,11 +105,12 @@ class RayGraph:
 
 @ray.remote(num_cpus=1, num_returns=2, max_retries=MAX_RETRIES)
 def _run(step: str, n_supplied: int, *args: Any) -> tuple[Any, Any]:
-    """A function of factory.steps in a worker."""
+    """A function of factory.steps in a worker: its report with the seconds it took, and its result."""
+    began = time.perf_counter()
     function: Any = STEPS[step]
     supplied = [_held(arg) if isinstance(arg, list) else arg for arg in args[:n_supplied]]
     report, result = function(*supplied, *args[n_supplied:])
-    return report, result
+    return (report, time.perf_counter() - began), result
 
 
 def _held(reference: list[Any]) -> Any:
@@ -168,6 +175,6 @@ def _prove_shared(out: Location) -> None:
 def _warm_every_node(work: list[Any]) -> None:
     reports = [_run.options(scheduling_strategy=_on(node)).remote("warm", 1, work) for node in _nodes()]
     for report, _ in reports:
-        answer = ray.get(report)
+        answer, _ = ray.get(report)
         if isinstance(answer, Failure):
             raise RuntimeError(f"warming up: {answer.error}")

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from factory.assets import Sensing, asset_for, sensing
+from factory.assets import Sensing, asset_for, scene_path, sensing
 from factory.clips.reader import BadClip
 from factory.sensors import block_of, chosen_cameras, encode_jpeg, load_photos, taken_by
 from tasks.attempt import Judged
@@ -48,9 +48,16 @@ class Imaging:
     settings: RenderSettings
     cache_dir: str
 
-    def build(self, clip: Clip, threads: int) -> None:
-        """Make sure of the clip's block in the cache. Raises BadClip for a broken sensor file."""
-        asset_for(clip, self.settings, self.cache_dir, threads)
+    def build(self, clip: Clip, threads: int) -> tuple[bool, float | None]:
+        """Make sure of the clip's block in the cache: whether it was there, and its PSNR in dB where it has one.
+
+        Raises BadClip for a broken sensor file.
+        """
+        found = sensing(clip, self.settings) is not Sensing.NOTHING and (
+            scene_path(clip, self.settings, self.cache_dir).exists()
+        )
+        asset = asset_for(clip, self.settings, self.cache_dir, threads)
+        return found, asset.psnr_db if asset is not None and np.isfinite(asset.psnr_db) else None
 
     def block_verdict(self, clip: Clip) -> Rejected | None:
         """Build the clip's block, once, and say whether it is good enough to be rendered from.
@@ -226,6 +233,12 @@ def _block(clip: Clip, settings: RenderSettings, cache_dir: str) -> RenderAsset:
     asset = _kept(_Key(clip, settings, cache_dir))
     assert asset is not None, "asked for a block only where there are sensors"
     return asset
+
+
+def scene_lookups() -> tuple[int, int]:
+    """How often a scene was wanted in this process: found in its memory, read or built."""
+    info = _kept.cache_info()
+    return info.hits, info.misses
 
 
 class _Key:

@@ -1,11 +1,13 @@
 """The graph in this process: one task after the other, in the order of submission. For tests, breakpoints, explain."""
 
 import os
+import time
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from factory import steps
+from factory.metrics import NoRecorder, Recorder
 from factory.store.location import Location
 from factory.work import Work
 
@@ -14,7 +16,10 @@ from factory.work import Work
 class Ticket:
     """A submitted task. `result` stands for its large result and may be an argument of later tasks."""
 
+    step: str
     result: Any
+    submitted: float = field(default_factory=time.monotonic)
+    queued_s: float = 0.0  # once it is finished: from submission to report, less the time at work
 
 
 class Graph(Protocol):
@@ -22,6 +27,7 @@ class Graph(Protocol):
 
     parallelism: int  # tasks at once
     cores: int  # that one task can have
+    recorder: Recorder  # of metrics
 
     def submit(self, step: str, *args: Any) -> Ticket:
         """Run `step`; arguments may be results of earlier tickets. `work` and `out` are supplied to it (WANTS)."""
@@ -69,12 +75,13 @@ class LocalGraph:
 
     def __init__(self, work: Work, out: Location) -> None:
         self.cores = os.cpu_count() or 1
+        self.recorder: Recorder = NoRecorder()
         self._supplied = {"work": work, "out": out}
         self._waiting: deque[tuple[Ticket, str, tuple[Any, ...]]] = deque()
         work.warm()
 
     def submit(self, step: str, *args: Any) -> Ticket:
-        ticket = Ticket(_Box())
+        ticket = Ticket(step, _Box())
         self._waiting.append((ticket, step, args))
         return ticket
 
@@ -85,6 +92,7 @@ class LocalGraph:
         supplied = [self._supplied[name] for name in WANTS[step]]
         plain = [arg.value if isinstance(arg, _Box) else arg for arg in args]
         function: Any = STEPS[step]
+        ticket.queued_s = time.monotonic() - ticket.submitted
         report, ticket.result.value = function(*supplied, *plain)
         return ticket, report
 

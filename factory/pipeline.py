@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from factory.clips.reader import BadClip, ClipReader, ClipRef
 from factory.fitting import fits_going_on
-from factory.imaging import Imaging
+from factory.imaging import Imaging, scene_lookups
 from factory.rows import earlier_lineage, label_columns, sample_row
 from factory.work import (
     BENCHMARK,
@@ -20,6 +20,7 @@ from factory.work import (
     LOGGED,
     Accepted,
     AttemptResult,
+    Built,
     CandidateRow,
     Dropped,
     PreparedClip,
@@ -239,12 +240,12 @@ class FactoryWork:
         name = named(ref)
         return None if name is None else str(name)
 
-    def reconstruct(self, ref: ClipRef, threads: int) -> Mapping[str, float]:
+    def reconstruct(self, ref: ClipRef, threads: int) -> Built:
         """The clip's block into this machine's cache. Raises BadClip."""
         watch = Stopwatch()
         with watch.of("reconstruct"):
-            self.imaging.build(self.reader.read(ref), threads)
-        return watch.seconds
+            found, psnr_db = self.imaging.build(self.reader.read(ref), threads)
+        return Built(watch.seconds, found, psnr_db)
 
     def doing(self) -> str:
         """The fits that are going on here."""
@@ -259,11 +260,12 @@ class FactoryWork:
         if trace.judged is None or trace.rejected is not None:
             assert trace.rejected is not None
             return Dropped(trace.rejected, _subscores(trace.judged.scores) if trace.judged else {}, watch.seconds)
+        before = scene_lookups()
         with watch.of("render"):
             sensed = self._with_sensors(payload, expert)
             unfit = self.unfit(sensed, trace, expert)
             if unfit is not None:
-                return Dropped(unfit, _subscores(trace.judged.scores), watch.seconds)
+                return Dropped(unfit, _subscores(trace.judged.scores), watch.seconds, _at_hand(before))
         judged = self._sampled(trace, expert)
         with watch.of("render"):
             pictures = self.imaging.pictures(sensed, trace.candidate, judged)
@@ -272,7 +274,7 @@ class FactoryWork:
         if expert == HUMAN_BEFORE:
             row |= earlier_lineage(payload.clip)
         tags = [*row["tags"], *pictures.get("tags", ())]  # type: ignore[misc]
-        return Accepted(row | labels | pictures | {"tags": tags}, watch.seconds)
+        return Accepted(row | labels | pictures | {"tags": tags}, watch.seconds, _at_hand(before))
 
     def trace(
         self,
@@ -343,6 +345,12 @@ class FactoryWork:
     def imaging(self) -> Imaging:
         """The render stage with this run's settings."""
         return Imaging(self.render, self.cache_dir)
+
+
+def _at_hand(before: tuple[int, int]) -> bool | None:
+    """Whether every scene wanted since `before` was in memory; None where none was."""
+    hits, misses = scene_lookups()
+    return None if (hits, misses) == before else misses == before[1]
 
 
 def _bare(clip: Clip) -> Clip:

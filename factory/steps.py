@@ -52,6 +52,8 @@ class Reconstructed:
     """Report on a block that is in the cache now."""
 
     seconds: Mapping[str, float]
+    from_cache: bool
+    psnr_db: float | None
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,8 @@ class Attempted:
     licence: str = ""  # of its source
     subscores: Mapping[str, float] = field(default_factory=dict)
     seconds: Mapping[str, float] = field(default_factory=dict)
+    scene_at_hand: bool | None = None
+    psnr_db: float | None = None  # of the block that an accepted one is drawn from
 
 
 @dataclass(frozen=True)
@@ -157,9 +161,19 @@ def attempt(work: Work, prepared: PreparedClip, stamp: Stamp) -> tuple[Attempted
         result = work.attempt(prepared, stamp.candidate_index, stamp.expert)
         seconds = result.seconds or {"attempt": time.perf_counter() - began}
         if not isinstance(result, Accepted):
-            return Attempted(result.rejected, subscores=dict(result.subscores), seconds=seconds), None
+            subscores, at_hand = dict(result.subscores), result.scene_at_hand
+            return Attempted(result.rejected, subscores=subscores, seconds=seconds, scene_at_hand=at_hand), None
         row = sample_row_to_table([{**result.row, **vars(stamp)}])
-        return Attempted(None, row.nbytes, str(result.row["licence"]), seconds=seconds), row
+        (psnr_db,) = row["psnr"].to_pylist()
+        report = Attempted(
+            None,
+            row.nbytes,
+            str(result.row["licence"]),
+            seconds=seconds,
+            scene_at_hand=result.scene_at_hand,
+            psnr_db=psnr_db,
+        )
+        return report, row
     except Exception as error:  # the same boundary
         return failure_of(error), None
 
@@ -199,7 +213,8 @@ def episodes(work: Work, out: Location, wanted: EpisodesOf) -> tuple[EpisodesWri
 def reconstruct(work: Work, ref: ClipRef, threads: int) -> tuple[Reconstructed | Failure, None]:
     """The block that the clip is rendered from, into the cache of this machine."""
     try:
-        return Reconstructed(work.reconstruct(ref, threads)), None
+        built = work.reconstruct(ref, threads)
+        return Reconstructed(built.seconds, built.from_cache, built.psnr_db), None
     except Exception as error:  # the same boundary
         return failure_of(error), None
 

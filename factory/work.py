@@ -60,6 +60,7 @@ class Accepted:
 
     row: Mapping[str, object]
     seconds: Mapping[str, float] = field(default_factory=dict)  # stage -> seconds
+    scene_at_hand: bool | None = None  # the worker had the scene to draw in its memory; None: nothing was drawn
 
 
 @dataclass(frozen=True)
@@ -69,9 +70,19 @@ class Dropped:
     rejected: Rejected
     subscores: Mapping[str, float] = field(default_factory=dict)  # as far as they were computed
     seconds: Mapping[str, float] = field(default_factory=dict)
+    scene_at_hand: bool | None = None
 
 
 AttemptResult = Accepted | Dropped
+
+
+@dataclass(frozen=True)
+class Built:
+    """A clip's block is in this machine's cache."""
+
+    seconds: Mapping[str, float]  # by stage
+    from_cache: bool  # it was there
+    psnr_db: float | None = None  # of its held-out photos; None where there are none
 
 
 @dataclass(frozen=True)
@@ -128,8 +139,8 @@ class Work(Protocol):
         """Name of the block that the clip is rendered from, known without reading it; None: nothing to build ahead."""
         ...
 
-    def reconstruct(self, ref: ClipRef, threads: int) -> Mapping[str, float]:
-        """Build the clip's block into this machine's cache; seconds by stage. Raises BadClip."""
+    def reconstruct(self, ref: ClipRef, threads: int) -> Built:
+        """Build the clip's block into this machine's cache. Raises BadClip."""
         ...
 
     def doing(self) -> str:

@@ -33,14 +33,14 @@ def test_no_arrow_points_backwards(package: str) -> None:
         assert not wrong, f"{path.relative_to(ROOT)} imports {sorted(wrong)}"
 
 
-def test_only_the_graph_and_trainings_on_a_cluster_import_ray() -> None:
+def test_only_the_graph_its_metrics_and_trainings_on_a_cluster_import_ray() -> None:
     users = {
         str(path.relative_to(ROOT))
         for package in ("factory", "planners")
         for path in (ROOT / package).rglob("*.py")
         if "ray" in imported_modules(path)
     }
-    assert users <= {"factory/graph.py", "planners/on_ray.py"}
+    assert users == {"factory/graph.py", "factory/ray_metrics.py", "planners/on_ray.py"}
 
 
 def test_no_module_shadows_the_standard_library() -> None:
@@ -53,6 +53,10 @@ def loaded_by(statement: str) -> set[str]:
     code = f"import sys\n{statement}\nprint(' '.join(sorted({{m.split('.')[0] for m in sys.modules}})))"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     return set(out.stdout.split())
+
+
+def test_a_run_in_this_process_needs_no_ray() -> None:
+    assert "ray" not in loaded_by("import factory.run, factory.execute, factory.metrics, factory.pipeline")
 
 
 def test_importing_the_science_needs_numpy_only() -> None:

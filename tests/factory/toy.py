@@ -14,7 +14,7 @@ from factory.clips.reader import BadClip, ClipRef
 from factory.rows import label_columns
 from factory.store.columns import Column
 from factory.store.schema import BOOKKEEPING, FIELDS
-from factory.work import UNLISTED, Accepted, AttemptResult, CandidateRow, Dropped, PreparedClip, RunIdentity
+from factory.work import UNLISTED, Accepted, AttemptResult, Built, CandidateRow, Dropped, PreparedClip, RunIdentity
 from tasks.reward.label_bytes import HALVES, WHOLES, VocabularyLabels
 from tasks.stages import Rejected
 
@@ -97,11 +97,11 @@ class ToyWork:
     def block(self, ref: ClipRef) -> str | None:
         return ref.log_id if self.blocks else None
 
-    def reconstruct(self, ref: ClipRef, threads: int) -> Mapping[str, float]:
+    def reconstruct(self, ref: ClipRef, threads: int) -> Built:
         self._note(f"reconstruct {ref.log_id}")
         time.sleep(self.seconds)
         self._trouble(ref.log_id)
-        return {"reconstruct": 0.5}
+        return Built({"reconstruct": 0.5}, from_cache=False, psnr_db=28.0)
 
     def doing(self) -> str:
         return ""
