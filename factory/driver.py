@@ -132,13 +132,14 @@ class Driver:
                 self._take(*finished)
             progress.show(self._tally)
         progress.show(self._tally, last=True)
+        self._show_state(last=True)
 
     def _committed(self, shards: Sequence[Shard], seconds: float) -> None:
         self._metrics.committed(shards, seconds)
         if self._episodes is not None:
             self._episodes.committed([shard.path for shard in shards])
 
-    def _show_state(self) -> None:
+    def _show_state(self, last: bool = False) -> None:
         in_flight = {
             "walks": sum(self._walks_left.values()),
             "attempts": len(self._trying),
@@ -147,7 +148,7 @@ class Driver:
             "batches": self._gatherer.n_writing,
         }
         clips = len(self._plan.todo)
-        self._metrics.state(clips, clips - self._tally.clips, in_flight)
+        self._metrics.state(clips, clips - self._tally.clips, in_flight, last)
 
     def _open(self, what: ClipPlan | Build) -> None:
         if isinstance(what, Build):

@@ -20,7 +20,7 @@ from factory.clips.reader import ClipRef
 from factory.driver import Driver, Executed
 from factory.episodes import Episodes
 from factory.funnel import Funnel, funnel_of
-from factory.local import Graph, LocalGraph
+from factory.local import ClusterLacks, Graph, LocalGraph
 from factory.metrics import RunMetrics
 from factory.plan import Plan, make_plan
 from factory.store.location import BadLocation
@@ -60,6 +60,7 @@ def execute(
     on_change: OnChange = "stop",
     retry: bool = False,
     ray_address: str | None = None,
+    gpu_share: float = 0.0,
     shard_bytes: int = SHARD_BYTES,
     shard_seconds: float = SHARD_SECONDS,
     minutes: float | None = None,
@@ -69,6 +70,7 @@ def execute(
     """Make the samples of `rounds` rounds for every clip and expert, as far as the store does not hold them already.
 
     workers: processes of a local Ray cluster, None: one per CPU. retry: try failed(input | bug) attempts again too.
+    gpu_share: of a GPU, that every attempt claims on Ray; 0 where it draws without.
     minutes: after which nothing new is begun, as after an interruption. episodes: an MCAP file for one sample in so
     many, 0 for none.
     Bad wishes come back as exit code 2 with a message and nothing written; see the module's codes for the others.
@@ -100,8 +102,8 @@ def execute(
     code, message, began_ms = COMPLETE, "", 0
     try:
         is_due = plan.todo or (pictured is not None and pictured.is_due)
-        graph = _graph(work, store, executor, workers, ray_address) if is_due else None
-    except BadLocation as error:
+        graph = _graph(work, store, executor, workers, ray_address, gpu_share) if is_due else None
+    except (BadLocation, ClusterLacks) as error:
         return RunSummary(BAD_CONFIG, str(error))
     except KeyboardInterrupt:
         return RunSummary(INTERRUPTED, "stopped before anything was begun")
@@ -139,12 +141,14 @@ def execute(
     return summary
 
 
-def _graph(work: Work, store: Store, executor: Executor, workers: int | None, address: str | None) -> Graph:
+def _graph(
+    work: Work, store: Store, executor: Executor, workers: int | None, address: str | None, gpu_share: float
+) -> Graph:
     if executor == "local":
         return LocalGraph(work, store.location)
     from factory.graph import RayGraph
 
-    return RayGraph(work, store.location, workers, address)
+    return RayGraph(work, store.location, workers, address, gpu_share)
 
 
 @contextmanager

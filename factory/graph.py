@@ -17,10 +17,11 @@ os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
 os.environ.setdefault("RAY_task_oom_retries", "2")  # Ray's own default retries a task that runs out of memory for ever
 
 import ray
+from ray.autoscaler.sdk import request_resources
 from ray.exceptions import RayError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from factory.local import STEPS, WANTS, Ticket, cores_of
+from factory.local import STEPS, WANTS, ClusterLacks, Ticket, cores_of
 from factory.metrics import Recorder
 from factory.ray_metrics import RayRecorder
 from factory.steps import Failure
@@ -30,6 +31,7 @@ from factory.work import Work
 
 MAX_RETRIES = 2  # of a task whose worker died
 PROBE_SECONDS = 120.0
+GPU_WAIT_S = 900.0  # for the first node with one to come
 WORKER_ENV = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 FORWARDED_ENV = ("NUMBA_CACHE_DIR",)
 
@@ -39,26 +41,30 @@ _HELD: dict[str, Any] = {}  # per worker process: the run's Work, fetched once
 class RayGraph:
     """Graph of Ray tasks. Connects to the cluster of RAY_ADDRESS or `address`, else starts one in this machine."""
 
-    def __init__(self, work: Work, out: Location, workers: int | None = None, address: str | None = None) -> None:
+    def __init__(
+        self, work: Work, out: Location, workers: int | None = None, address: str | None = None, gpu_share: float = 0.0
+    ) -> None:
         """workers: CPUs of a cluster started here, tasks at once on one that is there already; None: all its CPUs.
 
-        Raises BadLocation when some node does not see `out`.
+        More workers than a cluster has CPUs now are what makes one grow that can. gpu_share: of a GPU, claimed by every
+        attempt; on a cluster without one, it is asked for one and waited for.
+        Raises BadLocation when some node does not see `out`, ClusterLacks when no GPU comes.
         """
         self._connected = not ray.is_initialized()
         self._is_ours = self._connected and _connect(workers, address)
         available = int(ray.cluster_resources().get("CPU", 1))
-        self.parallelism = max(1, min(workers or available, available))
-        self.cores = min(
-            [self.parallelism, *filter(None, _cores_by_node())]
-        )  # none yet where a cluster grows from nothing
+        self.parallelism = max(1, min(workers or available, available) if self._is_ours else workers or available)
+        self.cores = min(filter(None, _cores_by_node()), default=1)  # none yet where a cluster grows from nothing
+        self.cores = min(self.cores, self.parallelism)
         self.recorder: Recorder = RayRecorder()
         self._supplied: dict[str, Any] = {"work": [ray.put(work)], "out": out}  # in a list: handed over as a reference
         self._tickets: dict[Any, Ticket] = {}
         self._ready: deque[Any] = deque()
         self._held_back: deque[tuple[Ticket, str, tuple[Any, ...]]] = deque()
         try:
+            self._gpu_share = gpu_share if gpu_share and _has_gpu(wait=not self._is_ours) else 0.0
             _prove_shared(out)
-            _warm_every_node(self._supplied["work"])
+            _warm_every_node(self._supplied["work"], with_gpu_only=self._gpu_share > 0.0)
         except BaseException:
             self.close()
             raise
@@ -74,7 +80,7 @@ class RayGraph:
         while self._held_back and (self._is_ours or len(self._tickets) < self.parallelism):
             ticket, step, args = self._held_back.popleft()
             supplied = [self._supplied[name] for name in WANTS[step]]
-            task = _run.options(num_cpus=cores_of(step, args))
+            task = _run.options(num_cpus=cores_of(step, args), num_gpus=self._gpu_share if step == "attempt" else None)
             report, ticket.result = task.remote(step, len(supplied), *supplied, *args)
             self._tickets[report] = ticket
 
@@ -149,6 +155,27 @@ def _cores_by_node() -> list[int]:
     return [int(node["Resources"].get("CPU", 0)) for node in ray.nodes() if node["Alive"]]
 
 
+def _has_gpu(wait: bool) -> bool:
+    """Some node has a GPU; where none has, one is asked for and waited for."""
+    if _gpu_nodes() or not wait:
+        return bool(_gpu_nodes())
+    request_resources(bundles=[{"GPU": 1}])
+    began = time.monotonic()
+    while not _gpu_nodes():
+        if time.monotonic() - began > GPU_WAIT_S:
+            raise ClusterLacks(
+                f"no node of the cluster has a GPU, and none came in {GPU_WAIT_S:.0f} s: start one, or draw with "
+                "render.backend=cpu"
+            )
+        time.sleep(min(2.0, GPU_WAIT_S))
+    request_resources(bundles=[])  # the attempts themselves hold it from now on
+    return True
+
+
+def _gpu_nodes() -> set[str]:
+    return {node["NodeID"] for node in ray.nodes() if node["Alive"] and node["Resources"].get("GPU", 0)}
+
+
 def _on(node: str) -> NodeAffinitySchedulingStrategy:
     return NodeAffinitySchedulingStrategy(node, soft=False)
 
@@ -172,8 +199,11 @@ def _prove_shared(out: Location) -> None:
         raise BadLocation(f"out={out.uri} is not the same folder on nodes {blind}: name shared storage or a URL")
 
 
-def _warm_every_node(work: list[Any]) -> None:
-    reports = [_run.options(scheduling_strategy=_on(node)).remote("warm", 1, work) for node in _nodes()]
+def _warm_every_node(work: list[Any], with_gpu_only: bool) -> None:
+    """Kernels on every node; what attempts draw with where they are made: on all nodes, or on those with a GPU."""
+    nodes = _nodes()
+    draws = _gpu_nodes() if with_gpu_only else set(nodes)
+    reports = [_run.options(scheduling_strategy=_on(n)).remote("warm", 1, work, n in draws) for n in nodes]
     for report, _ in reports:
         answer, _ = ray.get(report)
         if isinstance(answer, Failure):

@@ -12,6 +12,10 @@ from factory.store.location import Location
 from factory.work import Work
 
 
+class ClusterLacks(ValueError):
+    """The cluster has no node that the run could use."""
+
+
 @dataclass(eq=False)
 class Ticket:
     """A submitted task. `result` stands for its large result and may be an argument of later tasks."""

@@ -186,10 +186,10 @@ class RunMetrics:
             self._add(SAMPLES, len(shard.keys), **where)
             self._add(BYTES, shard.size, **where)
 
-    def state(self, clips: int, left: int, in_flight: Mapping[str, int]) -> None:
-        """How things stand; may be called as often as one likes."""
+    def state(self, clips: int, left: int, in_flight: Mapping[str, int], last: bool = False) -> None:
+        """How things stand; may be called as often as one likes, and at the end."""
         now = self._clock()
-        if now - self._gauges_at >= GAUGES_EVERY_S:
+        if last or now - self._gauges_at >= GAUGES_EVERY_S:
             self._gauges_at = now
             self._add(CLIPS, clips)
             self._add(CLIPS_LEFT, left)

@@ -43,7 +43,7 @@ from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.protocol import Expert
 from tasks.hard_scenes import BenchmarkClip
 from tasks.perturb import Candidate, Perturbation, PerturbSettings, end_speed_mps, perturb
-from tasks.render.engine import check
+from tasks.render.engine import Backend, check
 from tasks.render.settings import RenderMode, RenderSettings, SceneFrom
 from tasks.reward.epdms import Scores
 from tasks.reward.labels import Labelling, vocabulary_labels
@@ -142,13 +142,14 @@ class FactoryWork:
     identity: RunIdentity
     cache_dir: str  # of reconstructed blocks
 
-    def warm(self) -> None:
-        """This run's kernels into the on-disk cache. Raises BackendMissing where this node lacks what is to draw."""
+    def warm(self, draws: bool = True) -> None:
+        """This run's kernels into the on-disk cache. Raises BackendMissing where one that draws lacks the means."""
         from factory.warm import compile_kernels
 
         parts = ["judge", "drive"]
         if self.render.mode is RenderMode.AUTO:
-            check(self.render.backend)
+            if draws:
+                check(self.render.backend)
             parts.insert(1, "fit" if self.render.scene is SceneFrom.FIT else "render")
         compile_kernels(parts)
 
@@ -340,6 +341,11 @@ class FactoryWork:
             return clip
         now = self.reader.read(_earlier_ref(payload.ref) if expert == HUMAN_BEFORE else payload.ref)
         return replace(clip, images=now.images, sweeps=now.sweeps, block=now.block)
+
+    @property
+    def draws_on_gpu(self) -> bool:
+        """Attempts of this run draw pictures with CUDA."""
+        return self.render.mode is RenderMode.AUTO and self.render.backend is Backend.GSPLAT and self._simulates
 
     @property
     def imaging(self) -> Imaging:

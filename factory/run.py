@@ -108,6 +108,7 @@ def run(overrides: Sequence[str]) -> int:
         store,
         config.executor,
         config.workers,
+        gpu_share=config.gpu_share if assembled.work.draws_on_gpu else 0.0,
         on_change=config.on_change,
         retry=config.retry_failed,
         minutes=config.minutes,

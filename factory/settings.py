@@ -98,6 +98,7 @@ class RunConfig:
     experts: tuple[str, ...]
     executor: Literal["ray", "local"]
     workers: int | None
+    gpu_share: float
     limit: int | None
     seed: int
     out: str
@@ -120,6 +121,8 @@ class RunConfig:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ValueError(f"{name}={value}: must be positive, or null for no bound")
+        if not 0.0 <= self.gpu_share <= 1.0:
+            raise ValueError(f"gpu_share={self.gpu_share}: the share of one GPU that an attempt claims, 0 to 1")
         unknown = [name for name in self.experts if name not in self.expert]
         if unknown:
             raise ValueError(f"experts: {unknown} is not among {sorted(self.expert)}; add your own with +expert.<name>")

@@ -219,10 +219,10 @@ def reconstruct(work: Work, ref: ClipRef, threads: int) -> tuple[Reconstructed |
         return failure_of(error), None
 
 
-def warm(work: Work) -> tuple[str | Failure, None]:
+def warm(work: Work, draws: bool) -> tuple[str | Failure, None]:
     """Kernels into the cache of this machine."""
     try:
-        work.warm()
+        work.warm(draws)
     except Exception as error:  # the same boundary
         return failure_of(error), None
     return "", None

@@ -123,8 +123,11 @@ class Work(Protocol):
     @property
     def identity(self) -> RunIdentity: ...
 
-    def warm(self) -> None:
-        """Compile the kernels into their cache. Called once per machine before any worker starts."""
+    def warm(self, draws: bool = True) -> None:
+        """Compile the kernels into their cache. Called once per machine before any worker starts.
+
+        draws: attempts are made on this machine, so that it must have what they draw with.
+        """
         ...
 
     def expert_digest(self, expert: str) -> str:

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from factory.execute import COMPLETE, COMPLETE_WITH_FAILURES, execute
+from factory import graph
+from factory.execute import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, execute
 from factory.graph import ray  # with the environment that keeps it on loopback
 from factory.store.samples import Store
 from factory.store.verify import verify
@@ -23,8 +24,8 @@ def run(out: Path, executor: str, work: ToyWork, rounds: int, workers: int, n: i
 
 @pytest.fixture(scope="module")
 def two_cpus() -> Iterator[None]:
-    """A cluster that outlives the runs of this module: starting one takes seven seconds."""
-    ray.init(address="local", num_cpus=2, include_dashboard=False, log_to_driver=False)
+    """A cluster, with a GPU in name, that outlives the runs of this module: starting one takes seven seconds."""
+    ray.init(address="local", num_cpus=2, num_gpus=1, include_dashboard=False, log_to_driver=False)
     yield
     ray.shutdown()
 
@@ -48,6 +49,34 @@ def test_workers_write_the_same_episodes_as_one_process(tmp_path: Path, two_cpus
         for executor in ("local", "ray")
     )
     assert local == ray_s and len(local) == len(Store(tmp_path / "ray").samples)
+
+
+def test_attempts_claim_their_share_of_a_gpu(tmp_path: Path, two_cpus: None) -> None:
+    journal = str(tmp_path / "journal")
+    summary = execute(
+        ToyWork(journal=journal),
+        refs(2),
+        ["recovery"],
+        1,
+        Store(tmp_path / "out"),
+        gpu_share=0.5,
+        say=lambda line: None,
+    )
+    assert summary.exit_code == COMPLETE
+    tries = [line for line in Path(journal).read_text().splitlines() if line.startswith("attempt")]
+    assert len(tries) == summary.executed.attempts > 0
+    assert all(line.endswith("on gpu 0") for line in tries)
+
+
+def test_a_cluster_without_a_gpu_is_waited_for_and_then_named(
+    tmp_path: Path, two_cpus: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(graph, "_gpu_nodes", set)
+    monkeypatch.setattr(graph, "GPU_WAIT_S", 0.1)
+    store = Store(tmp_path / "out")
+    summary = execute(ToyWork(), refs(1), ["human"], 1, store, gpu_share=0.5, say=lambda line: None)
+    assert summary.exit_code == BAD_CONFIG and "render.backend=cpu" in summary.message
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_clip_that_kills_its_workers_hurts_nobody_else(tmp_path: Path, two_cpus: None) -> None:

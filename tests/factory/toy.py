@@ -85,7 +85,7 @@ class ToyWork:
         settings = {"reward.threshold": self.threshold, **self.settings}
         return RunIdentity(settings, self.versions, "vocabulary-1", self.prepare_digest)
 
-    def warm(self) -> None:
+    def warm(self, draws: bool = True) -> None:
         self._note("warm")
 
     def expert_digest(self, expert: str) -> str:
@@ -130,7 +130,7 @@ class ToyWork:
         payload = prepared.payload
         assert isinstance(payload, dict)
         name = f"{payload['name']}:{expert}:{candidate}"
-        self._note(f"attempt {name}")
+        self._note(f"attempt {name} on gpu {os.environ.get('CUDA_VISIBLE_DEVICES', '')}")
         time.sleep(self.seconds)
         self._trouble(name)
         rng = stream(prepared.clip_id, "attempt", expert, candidate)
