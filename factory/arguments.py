@@ -1,7 +1,9 @@
 """key=value arguments of the commands that look at a run, as a typed dataclass of theirs."""
 
-from collections.abc import Sequence
+import sys
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import MISSING, fields
+from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_type_hints
 
 if TYPE_CHECKING:
@@ -15,6 +17,20 @@ class Refused(ValueError):
     """The request cannot be answered; the message says why."""
 
 
+def answer(about: str, shape: type[Request], argv: Sequence[str], lines: Callable[[Request], Iterable[str]]) -> int:
+    """A whole command: help, arguments, its lines printed as they come; the exit code."""
+    if {"-h", "--help"} & set(argv):
+        print(about)
+        return 0
+    try:
+        for line in lines(parse(shape, argv)):
+            print(line, flush=True)
+    except Refused as error:
+        print(f"error: {error}", file=sys.stderr)
+        return BAD_ARGUMENTS
+    return 0
+
+
 def parse(shape: type[Request], argv: Sequence[str]) -> Request:
     """A request out of arguments; its fields are the keys, each a str, an int or a bool, or one of these and None.
 
@@ -26,7 +42,10 @@ def parse(shape: type[Request], argv: Sequence[str]) -> Request:
     for argument in argv:
         key, equals, value = argument.partition("=")
         if key not in kinds or not equals or not value:
-            raise Refused(f"{argument!r}: expected one of {', '.join(f'{name}=...' for name in kinds)}; see --help")
+            near = "" if key in kinds else "".join(get_close_matches(key, kinds, 1, 0.6))
+            meant = f"; did you mean {near}=?" if near else ""
+            known = ", ".join(f"{name}=..." for name in kinds)
+            raise Refused(f"{argument!r}: expected one of {known}; see --help{meant}")
         if key in given:
             raise Refused(f"{key} is given twice")
         given[key] = _value(key, value, kinds[key])

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from factory.arguments import BAD_ARGUMENTS, Refused, parse
-from factory.show import open_store
+from factory.status import open_store
 
 PORT = 8266  # Ray's own dashboard is at 8265
 

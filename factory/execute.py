@@ -5,6 +5,7 @@ same result.
 """
 
 import json
+import os
 import signal
 import threading
 import time
@@ -65,6 +66,7 @@ def execute(
     shard_seconds: float = SHARD_SECONDS,
     minutes: float | None = None,
     episodes: int = 0,
+    command: Sequence[str] | None = None,
     say: Callable[[str], None] = print,
 ) -> RunSummary:
     """Make the samples of `rounds` rounds for every clip and expert, as far as the store does not hold them already.
@@ -72,7 +74,7 @@ def execute(
     workers: processes of a local Ray cluster, None: one per CPU. retry: try failed(input | bug) attempts again too.
     gpu_share: of a GPU, that every attempt claims on Ray; 0 where it draws without.
     minutes: after which nothing new is begun, as after an interruption. episodes: an MCAP file for one sample in so
-    many, 0 for none.
+    many, 0 for none. command: the settings as they were given, kept for `retry`.
     Bad wishes come back as exit code 2 with a message and nothing written; see the module's codes for the others.
     """
     if not refs or not experts or rounds < 1:
@@ -110,7 +112,7 @@ def execute(
     try:
         store.begin(records)
         if graph is not None:
-            began_ms = _announce(store, plan, experts, rounds)
+            began_ms = _announce(store, plan, experts, rounds, command)
             metrics = RunMetrics(graph.recorder, store.location)
             with _stop_signals(driver.stop), _alarm(driver.stop, minutes):
                 if pictured is not None:
@@ -198,7 +200,7 @@ def _counts(plan: Plan) -> dict[str, int]:
     return counts
 
 
-def _announce(store: Store, plan: Plan, experts: Sequence[str], rounds: int) -> int:
+def _announce(store: Store, plan: Plan, experts: Sequence[str], rounds: int, command: Sequence[str] | None) -> int:
     """current_run.json: when the run began and how many walks it has before it, for who watches; the beginning."""
     walks = [
         step
@@ -214,6 +216,8 @@ def _announce(store: Store, plan: Plan, experts: Sequence[str], rounds: int) -> 
         "walks_left": len(walks),
         "experts": list(experts),
         "rounds": rounds,
+        "folder": os.getcwd(),
+        "command": None if command is None else list(command),
     }
     store.location.write(CURRENT_RUN, (json.dumps(document, indent=1) + "\n").encode())
     return began_ms

@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from factory.arguments import BAD_ARGUMENTS, Refused, parse
-from factory.show import find, logged_drive, open_store, sample_ids
+from factory.show import find, logged_drive, sample_ids
+from factory.status import open_store
 from factory.store.samples import Store
 
 Row = Mapping[str, Any]

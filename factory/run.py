@@ -39,6 +39,11 @@ def main(argv: Sequence[str]) -> int:
         return BAD_CONFIG
 
 
+def plan(argv: Sequence[str]) -> int:
+    """The command `python -m factory plan`: dry_run=true."""
+    return main(argv if {"-h", "--help", "--cfg"} & set(argv) else [*argv, "dry_run=true"])
+
+
 def dealt(refs: Sequence["ClipRef"], hands: int) -> list["ClipRef"]:
     """The clips in the order of work: log by log, the logs in groups of `hands` whose clips alternate.
 
@@ -83,7 +88,7 @@ def run(overrides: Sequence[str]) -> int:
     from factory.calibrate import calibrate, plan_text
     from factory.execute import COMPLETE, execute
     from factory.funnel import image_sources_text
-    from factory.look.report import write_report
+    from factory.report import remember, write_report
     from factory.settings import assemble, load_config
     from factory.store.location import BadLocation, Location
     from factory.store.samples import Store
@@ -113,6 +118,7 @@ def run(overrides: Sequence[str]) -> int:
         retry=config.retry_failed,
         minutes=config.minutes,
         episodes=config.one_episode_in,
+        command=overrides,
     )
     if summary.message:
         print(summary.message, file=sys.stderr)
@@ -124,7 +130,10 @@ def run(overrides: Sequence[str]) -> int:
         print(seconds_text(summary.seconds))
     if set(config.experts) >= NEEDED and summary.exit_code == COMPLETE:
         print(write_benchmark(store, refs, assembled.work.identity, config.rounds, config.benchmark))
-    print(write_report(store, assembled))
+    remember(store, assembled)
+    where = store.location.uri
+    print(f"report: {write_report(store)}")
+    print(f"look at samples: python -m factory.dashboard out={where}")
     return summary.exit_code
 
 

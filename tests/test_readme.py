@@ -16,6 +16,7 @@ from factory.config import compose, fill
 from factory.dashboard import Request as DashboardRequest
 from factory.explain import split_arguments
 from factory.export import main as export_main
+from factory.report import main as report_main
 from factory.run import main as run_main
 from factory.settings import load_config
 from factory.show import main as show_main
@@ -111,6 +112,9 @@ def test_every_command_is_one_its_program_takes(
             assert export_main(arguments) == 0, capsys.readouterr().err
         case ["python", "-m", "factory.dashboard", *arguments]:
             parse(DashboardRequest, arguments)
+        case ["python", "-m", "factory.report", *arguments]:
+            monkeypatch.chdir(demo_home)
+            assert report_main(arguments) == 0, capsys.readouterr().err
         case ["python", "-m", "planners.train", *arguments] | [
             "torchrun",
             "--nproc-per-node",

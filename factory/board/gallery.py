@@ -9,7 +9,7 @@ import pyarrow.compute as pc
 
 from factory.board.watch import Snapshot
 from factory.look.report_words import REASON_WORDS
-from factory.show import RETRY
+from factory.status import RETRY
 from factory.store.outcomes import Kind
 from factory.store.table import KeyedTable
 from factory.work import LOGGED
@@ -309,7 +309,7 @@ def failures(shot: Snapshot, page: int = 1, size: int = 50) -> Failures:
             row["candidate_index"],
             row["error_kind"],
             REASON_WORDS.get(row["error_kind"], ""),
-            RETRY.get(row["error_kind"], "run the same command with retry_failed=true"),
+            RETRY[row["error_kind"]],
             row["tries"],
             row["error"],
         )

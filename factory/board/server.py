@@ -148,9 +148,14 @@ def _static(name: str) -> Answer:
         raise NotThere(f"no file {name}")
     body = SERVED[name].read_bytes()
     if name == "board.css":
-        themes = f':root[data-theme="light"]{{{LIGHT}}}\n:root[data-theme="dark"]{{{DARK}}}\n'
-        body = (STYLE + themes).encode() + body
+        body = style().encode()
     return Answer(200, f"{KINDS[SERVED[name].suffix]}; charset=utf-8", body, "no-cache")
+
+
+def style() -> str:
+    """The page's style sheet."""
+    themes = f':root[data-theme="light"]{{{LIGHT}}}\n:root[data-theme="dark"]{{{DARK}}}\n'
+    return STYLE + themes + (STATIC / "board.css").read_text()
 
 
 class Server(ThreadingHTTPServer):

@@ -67,7 +67,7 @@ def test_failed_names_file_field_and_how_to_retry(out: Path, capsys: pytest.Capt
     assert code == 0
     assert "2 failed: bug 1, input 1" in text
     assert "toy.feather: tx_m: holds NaN" in text and "ZeroDivisionError" in text
-    assert text.count("retry_failed=true") == 2
+    assert text.count("factory retry out=") == 2
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,6 @@
 // Which page is shown, what keys do, and when numbers are asked for again.
 
-import { ask, clock, h } from "./dom.js";
+import { ask, clock, h, still } from "./dom.js";
 import { failedPage } from "./failed.js";
 import { galleryPage } from "./gallery.js";
 import { overviewPage } from "./overview.js";
@@ -57,7 +57,7 @@ async function watch() {
     pill.textContent = "no answer";
     pill.className = "pill bad";
   }
-  setTimeout(watch, wait);
+  if (!still) setTimeout(watch, wait);
 }
 
 const go = (name) => document.querySelector(`[data-go="${name}"]`)?.click();
@@ -73,7 +73,7 @@ function toggle() {
     ? document.documentElement.dataset.theme === "dark"
     : matchMedia("(prefers-color-scheme: dark)").matches;
   document.documentElement.dataset.theme = dark ? "light" : "dark";
-  localStorage.setItem("theme", document.documentElement.dataset.theme);
+  if (!still) localStorage.setItem("theme", document.documentElement.dataset.theme);
 }
 
 const KEYS = {
@@ -101,7 +101,7 @@ addEventListener("keydown", (event) => {
 addEventListener("hashchange", () => show());
 document.getElementById("theme").addEventListener("click", toggle);
 document.getElementById("help").addEventListener("click", KEYS["?"]);
-const stored = localStorage.getItem("theme");
+const stored = still ? null : localStorage.getItem("theme"); // a file may have no storage
 if (stored === "dark" || stored === "light") document.documentElement.dataset.theme = stored;
 show();
 watch();

@@ -40,7 +40,25 @@ export function bytes(n) {
   return `${(n / size).toFixed(n / size < 10 ? 1 : 0)} ${unit}`;
 }
 
+// A report is this page with its answers and some pictures inside (factory/board/still.py); there is no server then.
+const kept = JSON.parse(document.getElementById("kept")?.textContent ?? "null");
+export const still = kept !== null;
+export const extra = kept?.extra ?? null;
+export const holds = (id) => !still || `/api/samples/${id}` in kept.answers;
+export const jpeg = (base64) => `data:image/jpeg;base64,${base64}`;
+
+export function address(item, name, query = "") {
+  if (!still) return `/picture/${item.attempt_id}/${name}?v=${item.file}${query}`;
+  const data = kept.pictures[`${item.attempt_id}/${name}`];
+  return data ? jpeg(data) : null;
+}
+
 export async function ask(path) {
+  if (still) {
+    const found = kept.answers[path.replace(/\?$/, "")];
+    if (!found) throw new Error("this report holds some of the samples; the dashboard shows all of them");
+    return found;
+  }
   const answer = await fetch(path);
   const body = await answer.json();
   if (!answer.ok) throw new Error(body.error ?? answer.statusText);
@@ -66,10 +84,12 @@ export function bar(share, text, mark) {
 }
 
 export function picture(item, name, alt, query = "") {
-  const image = h("img", { alt, loading: "lazy", decoding: "async" });
+  const image = h("img", still ? { alt } : { alt, loading: "lazy", decoding: "async" });
   image.addEventListener("load", () => image.setAttribute("data-loaded", image.naturalWidth));
   image.addEventListener("error", () => image.replaceWith(h("span", { class: "missing" }, "no picture")));
-  image.src = `/picture/${item.attempt_id}/${name}?v=${item.file}${query}`;
+  const source = address(item, name, query);
+  if (source === null) return h("span", { class: "missing" }, "no picture");
+  image.src = source;
   return image;
 }
 

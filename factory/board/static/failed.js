@@ -13,5 +13,6 @@ export async function failedPage(query) {
     h("td", null, h("pre", null, one.error), h("small", null, `to retry: ${one.retry}`))));
   const go = (page, text, name) => h("a", { class: "button", href: `#/failed?page=${page}`, "data-go": name }, text);
   const pager = f.pages > 1 ? h("div", { class: "pager" }, f.page > 1 ? go(f.page - 1, "← back", "back") : null, h("span", null, `page ${f.page} of ${f.pages}`), f.page < f.pages ? go(f.page + 1, "on →", "on") : null) : null;
-  return [section("Failed attempts", `${plural(f.total, "attempt")} broke instead of being judged. They do not count as turned down.`, table("failed", ["log", "attempt", "kind", "tries", "error"], rows), pager)];
+  const some = f.items.length < f.total && !pager ? h("p", { class: "note" }, `${count(f.items.length)} of them are shown.`) : null;
+  return [section("Failed attempts", `${plural(f.total, "attempt")} broke instead of being judged. They do not count as turned down.`, table("failed", ["log", "attempt", "kind", "tries", "error"], rows), some, pager)];
 }

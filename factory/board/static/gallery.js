@@ -1,6 +1,6 @@
 // Samples as cards, by page, with filters that stand in the address.
 
-import { ask, count, h, picture, plural, score } from "./dom.js";
+import { ask, count, h, picture, plural, score, still } from "./dom.js";
 
 const FILTERS = { expert: "expert", round: "round", image_source: "images", command: "command", log_id: "log" };
 const ORDERS = { newest: "newest first", worst: "lowest score first", best: "highest score first" };
@@ -35,5 +35,9 @@ export async function galleryPage(query) {
   const key = h("p", { class: "keys" }, h("span", null, h("i", { class: "key logged" }), "logged"), h("span", null, h("i", { class: "key perturbed" }), "perturbed"),
     h("span", null, h("i", { class: "key expert" }), "expert"), h("span", null, h("i", { class: "key ego" }), "ego"), h("span", null, h("b", { class: "score" }, "1.000"), "EPDMS of the expert's drive"));
   const cards = page.items.length ? h("div", { class: "cards" }, page.items.map(card)) : h("p", { class: "nothing" }, "No sample fits.");
+  if (still) {
+    const some = h("p", { class: "lead", id: "total" }, `${count(page.items.length)} of ${plural(page.total, "sample")}: the newest, and some as unlike each other as can be.`);
+    return [h("section", null, h("h2", null, "Samples"), some, key, cards)];
+  }
   return [h("section", null, h("h2", null, "Samples"), h("div", { class: "filters" }, filters, order), key, cards, steps)];
 }

@@ -1,12 +1,13 @@
 // The first page: what was made, how much was accepted, why the rest was not, what it looks like.
 
 import { heat, timeline } from "./charts.js";
-import { EXPERT_WORDS, ask, bar, bytes, clock, count, h, percent, plural, section, span, table } from "./dom.js";
+import { EXPERT_WORDS, ask, bar, bytes, clock, count, extra, h, percent, plural, section, span, table } from "./dom.js";
+import { extraSections } from "./extra.js";
 import { card } from "./gallery.js";
 
 export async function overviewPage() {
   const [o, newest] = await Promise.all([ask("/api/overview"), ask("/api/samples?size=6&simulated=1")]);
-  return [header(o), looks(newest), funnel(o), acceptance(o), reasons(o), throughput(o), times(o), coverage(o), trouble(o), gates(o)];
+  return [header(o), looks(newest), funnel(o), acceptance(o), reasons(o), throughput(o), times(o), coverage(o), trouble(o), gates(o), ...extraSections()];
 }
 
 function header(o) {
@@ -35,7 +36,7 @@ function header(o) {
   return h("header", null, h("div", null, h("h1", null, o.where.split("/").filter(Boolean).pop()), ...state), h("p", { class: "path" }, o.where),
     h("p", { class: "story" }, told), s.detail ? h("p", { class: "note" }, s.detail) : null, progress(o.throughput),
     h("div", { class: "tiles" }, tiles),
-    h("dl", null, Object.entries(o.facts).map(([k, v]) => h("div", null, h("dt", null, k), h("dd", null, v)))),
+    h("dl", null, Object.entries({ ...o.facts, ...extra?.facts }).map(([k, v]) => h("div", null, h("dt", null, k), h("dd", null, v)))),
     o.notes.map((note) => h("p", { class: "note" }, note)));
 }
 

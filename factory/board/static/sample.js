@@ -1,7 +1,7 @@
 // One sample: its cameras, its drive from above, its scores, where it comes from, and its siblings.
 
 import { ends } from "./charts.js";
-import { ask, h, picture, plural, score, section, table } from "./dom.js";
+import { address, ask, h, holds, picture, plural, score, section, still, table } from "./dom.js";
 
 const STEPS = 56;
 const NOW = 15;
@@ -25,15 +25,15 @@ function head(w) {
 }
 
 function player(w) {
-  const address = (step) => `/picture/${w.item.attempt_id}/bev.jpg?v=${w.item.file}&size=600&step=${step}`;
-  const image = h("img", { src: address(NOW), alt: "the scene from above", class: "bev", width: 600, height: 600 });
+  const at = (step) => address(w.item, "bev.jpg", `&size=600&step=${step}`);
+  const image = h("img", { src: at(NOW), alt: "the scene from above", class: "bev", width: 600, height: 600 });
   const time = h("output", null, "0.0 s: now");
   const range = h("input", { type: "range", min: 0, max: STEPS - 1, value: NOW, "aria-label": "time" });
   const button = h("button", { type: "button", "data-go": "play" }, "▶ play");
   let timer = 0;
   const show = () => {
     const t = (Number(range.value) - NOW) / 10;
-    image.src = address(range.value);
+    image.src = at(range.value);
     time.textContent = `${t > 0 ? "+" : ""}${t.toFixed(1)} s${t ? "" : ": now"}`;
   };
   const tick = () => {
@@ -51,7 +51,7 @@ function player(w) {
   });
   const key = h("p", { class: "keys" }, h("span", null, h("i", { class: "key logged" }), "logged"), h("span", null, h("i", { class: "key perturbed" }), "perturbed, before now"),
     h("span", null, h("i", { class: "key expert" }), "expert, from now: the label"));
-  return section("From above", "60 m from bottom to top, the ego pointing up. Now is 0 s: what led here before it, the label after it.", key, image, h("div", { class: "player" }, button, range, time));
+  return section("From above", "60 m from bottom to top, the ego pointing up. Now is 0 s: what led here before it, the label after it.", key, image, still ? null : h("div", { class: "player" }, button, range, time));
 }
 
 function scores(w) {
@@ -70,11 +70,11 @@ function cameras(w) {
       const found = w.images.find((i) => i.camera === name && i.time_s.toFixed(1) === t);
       if (!found) return h("figure", null, h("div", { class: "missing" }, "none"));
       const file = `${found.index}.jpg`;
-      const link = h("a", { href: `/picture/${w.item.attempt_id}/${file}?v=${w.item.file}`, target: "_blank", rel: "noopener" }, picture(w.item, file, `${name} at ${t} s`, "&small=1"));
+      const link = h(still ? "span" : "a", { href: still ? null : address(w.item, file), target: "_blank", rel: "noopener" }, picture(w.item, file, `${name} at ${t} s`, "&small=1"));
       return h("figure", { class: Number(t) === 0 ? "now" : null }, link, h("figcaption", null, Number(t) === 0 ? "now" : `${t} s`));
     }))));
   requestAnimationFrame(() => strips.forEach((strip) => (strip.lastChild.scrollLeft = strip.lastChild.scrollWidth))); // to now
-  return section("Cameras", `${plural(w.images.length, "image")}; a click opens one as it is stored.`, strips);
+  return section("Cameras", still ? "At now, made smaller." : `${plural(w.images.length, "image")}; a click opens one as it is stored.`, strips);
 }
 
 function siblings(w, grid) {
@@ -83,7 +83,7 @@ function siblings(w, grid) {
   const fell = all.filter((one) => one.kind === "rejected").length;
   const rows = all.map((one) => h("tr", { class: one.here ? "here" : one.kind, "data-kind": one.kind },
     h("td", { class: "n" }, one.candidate_index),
-    h("td", null, one.kind === "accepted" ? (one.here ? h("b", null, "this sample") : h("a", { href: `#/sample/${one.attempt_id}` }, `accepted, round ${one.round}`)) : one.kind),
+    h("td", null, one.kind === "accepted" ? (one.here ? h("b", null, "this sample") : h(holds(one.attempt_id) ? "a" : "span", { href: `#/sample/${one.attempt_id}` }, `accepted, round ${one.round}`)) : one.kind),
     h("td", null, one.words || one.reason, one.words ? h("small", null, one.reason) : null),
     h("td", { class: "n" }, one.end_x_m === null ? "-" : `${one.end_x_m.toFixed(1)}, ${one.end_y_m.toFixed(2)}`),
     h("td", { class: "dim roomy" }, one.detail)));

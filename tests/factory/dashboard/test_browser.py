@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from factory.board.server import Board, Server
+from factory.report import main as report_main
 from factory.store.samples import Store
 from tests.factory.dashboard.browser import Tab
 from tests.factory.dashboard.runs import EVIL, counted, run
@@ -19,7 +20,7 @@ pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on the PATH"),
 ]
-Dump = Callable[[str], str]
+Dump = Callable[..., str]
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +37,8 @@ def dump(out: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Dump]:
     with Server(Board(Store(out), look_every_s=0.0), "127.0.0.1", 0) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
 
-        def dumped(address: str, width: int = 1440) -> str:
+        def dumped(address: str, width: int = 1440, at: str = "") -> str:
+            base = at or f"http://127.0.0.1:{server.server_address[1]}/"
             command = [
                 str(CHROMIUM),
                 "--headless=new",
@@ -47,7 +49,7 @@ def dump(out: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Dump]:
                 f"--window-size={width},6000",
                 "--virtual-time-budget=10000",
                 "--dump-dom",
-                f"http://127.0.0.1:{server.server_address[1]}/{address}",
+                f"{base}{address}",
             ]
             done = subprocess.run(command, capture_output=True, text=True, timeout=200)
             assert "CONSOLE" not in done.stderr, done.stderr
@@ -136,6 +138,23 @@ def follow(tab: Tab, address: str, out: Path) -> None:
     assert tab.value("getComputedStyle(document.body).backgroundColor") != before
     tab.press("?")
     assert tab.value("document.getElementById('keys').open")
+
+
+def test_a_report_is_the_same_page_in_one_file(out: Path, dump: Dump) -> None:
+    run(out, 2)
+    assert report_main([f"out={out}"]) == 0
+    at, wanted = f"file://{out / 'report.html'}", counted(out)
+    page = dump("#/", at=at)
+    shown = tiles(page)
+    assert {name: int(shown[name]) for name in ("samples", "attempts", "clips", "failed")} == {
+        name: wanted[name] for name in ("samples", "attempts", "clips", "failed")
+    }
+    assert page.count("data-loaded") == 2 * min(6, wanted["simulated"]) and "no picture" not in page
+    page = dump("#/gallery", at=at)
+    ids = re.findall(r'data-id="(\w+)"', page)
+    assert ids and page.count("data-loaded") == 2 * len(ids)
+    assert 'data-score="nc"' in dump(f"#/sample/{ids[0]}", at=at)
+    assert "a bug in a stage" in dump("#/failed", at=at)
 
 
 def test_a_wrong_address_says_so(dump: Dump) -> None:

@@ -11,7 +11,7 @@ import pytest
 from factory.clips.synthetic.reader import SyntheticReader
 from factory.clips.synthetic.write import TownSettings
 from factory.execute import execute
-from factory.look.report import RunFacts, gather
+from factory.look.examples import strips_of
 from factory.look.report_words import REASON_WORDS
 from factory.look.sample_picture import decoded, sample_bev
 from factory.look.seen_again import (
@@ -137,7 +137,7 @@ def test_show_writes_the_picture_and_the_film(
 
 
 def test_the_report_shows_photos_with_their_renderings_and_the_view_from_the_side(store: Store) -> None:
-    strips = {strip.source: strip for strip in gather(store, RunFacts(), lambda row: None, lambda clip: None).strips}
+    strips = {strip.source: strip for strip in strips_of(store)}
     assert len(strips["render"].photos) == 2 and len(strips["render"].aside) == len(ASIDE_M)
     assert strips["photo"].photos == strips["photo"].aside == ()
 
