@@ -62,15 +62,20 @@ HELD  := clips=synthetic_towns clips.first_seed=101 clips.n_towns=6 clips.logs_p
 TOWN  := render=town render.psnr_gate=mark $(if $(MINUTES),minutes=$(MINUTES))
 LABEL := vocabulary.k=32768 reward.label_vocabulary=$(STUDY)/labels.npy
 
-# Both runs over the training clips render from the same blocks.
+# No drive is refused: what the label is worth is the question.
+OPEN  := reward.full=[] reward.progress_above=-1
+
+# All runs over the training clips render from the same blocks.
 study-data: install
-	mkdir -p $(STUDY)/blocks $(STUDY)/train $(STUDY)/replay
+	mkdir -p $(STUDY)/blocks $(STUDY)/train $(STUDY)/replay $(STUDY)/control
 	ln -sfn ../blocks $(STUDY)/train/cache
 	ln -sfn ../blocks $(STUDY)/replay/cache
+	ln -sfn ../blocks $(STUDY)/control/cache
 	test -f $(STUDY)/labels.npy || $(PY) -m factory.vocabulary kinematic=true k=512 out=$(STUDY)/labels.npy
 	$(PY) -m factory.run $(TRAIN) $(TOWN) $(LABEL) rounds=5 out=$(STUDY)/train
 	$(PY) -m factory.run preset=hard_benchmark $(HELD) $(TOWN) vocabulary.k=131072 out=$(STUDY)/hard
 	$(PY) -m factory.run $(TRAIN) $(TOWN) $(LABEL) rounds=5 traffic=replay experts=[pdm_closed] out=$(STUDY)/replay
+	$(PY) -m factory.run $(TRAIN) $(TOWN) $(LABEL) rounds=5 $(OPEN) experts=[logged] out=$(STUDY)/control
 
 study: install
 	OMP_NUM_THREADS=1 $(PY) -m planners.study vocabulary=$(STUDY)/labels.npy $(if $(MINUTES),minutes=$(MINUTES))

@@ -39,7 +39,15 @@ from tasks.stages import stage_versions
 from tasks.vocabulary import Vocabulary
 
 KINEMATIC_K = 1024
-KINDS = ("human", "pdm_closed", "recovery", "human_before", "follow_up", "follow_up_before")  # of built-in experts
+KINDS = (
+    "human",
+    "pdm_closed",
+    "recovery",
+    "logged",
+    "human_before",
+    "follow_up",
+    "follow_up_before",
+)  # of built-in experts
 ABSENT = object()
 # Settings that came later: at what held before there was a choice they are left out, so that older tables go on.
 ADDED: dict[str, object] = {"perturb.interleaved": True, "perturb.order": "drawn", "perturb.at_most": None}
@@ -240,7 +248,7 @@ def build_expert(name: str, config: RunConfig, reader: ClipReader, index: ClipIn
     """One of the built-in kinds, or a user's `_target_`. Raises ConfigError for what the expert does not take."""
     spec, where = dict(config.expert[name]), f"expert.{name}"
     match spec.pop("kind", None):
-        case "human" | "human_before" | "pdm_closed" | "follow_up" | "follow_up_before" as kind:
+        case "human" | "human_before" | "logged" | "pdm_closed" | "follow_up" | "follow_up_before" as kind:
             if spec:
                 raise ConfigError(f"unknown setting {', '.join(f'{where}.{key}' for key in spec)}")
             return _without_settings(kind, config.pdm)
@@ -259,7 +267,7 @@ def build_expert(name: str, config: RunConfig, reader: ClipReader, index: ClipIn
 
 def _without_settings(kind: str, pdm: PdmSettings) -> Expert:
     match kind:
-        case "human" | "human_before":
+        case "human" | "human_before" | "logged":
             return Human(kind)
         case "pdm_closed":
             return PdmClosed(pdm)

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from planners.sweep import TRAININGS, Training
 
-Data = Literal["real", "recovery", "pdm_closed"]
+Data = Literal["real", "recovery", "pdm_closed", "logged"]
 Budget = Literal["epochs", "steps"]
 SHARES = (0.25, 0.5, 1.0)
 RATIOS = (0.25, 0.5, 0.75)
@@ -21,6 +21,7 @@ class StudySettings:
 
     data: str
     replay: str
+    control: str
     benchmark: str
     val: str
     out: str
@@ -82,6 +83,8 @@ class Setup:
     def training(self, settings: StudySettings, seed: int, sizes: Sizes) -> Training:
         """One of its trainings."""
         simulated = settings.replay if self.traffic == "replay" else settings.data
+        if self.data == "logged":
+            simulated = settings.control
         overrides = [
             f"planner={settings.planners[self.planner]}",
             f"data.real=[{settings.data}]",
@@ -211,6 +214,14 @@ def _real_share(settings: StudySettings) -> Iterator[Comparison]:
                 yield Comparison("real_share", both, real, settings.curve_seeds)
 
 
+def _control(settings: StudySettings) -> Iterator[Comparison]:
+    """The same perturbed states with the log's future for a label; in equal steps, as nothing of it is filtered."""
+    for planner in settings.planners:
+        expert = Setup(planner, "pdm_closed", settings.rounds, "steps")
+        yield Comparison("control", expert, None, settings.curve_seeds)
+        yield Comparison("control", replace(expert, data="logged"), expert, settings.curve_seeds)
+
+
 def _ensemble(settings: StudySettings) -> Iterator[Comparison]:
     """The mean of what three kinds of data taught, held against rewards alone, as in the paper."""
     for budget in BUDGETS:
@@ -248,6 +259,7 @@ PARTS = {
     "psnr": _psnr,
     "rewards": _rewards,
     "real_share": _real_share,
+    "control": _control,
     "ensemble": _ensemble,
 }
 

@@ -11,7 +11,11 @@ from tasks.world.vehicle import HEADING
 
 @dataclass(frozen=True)
 class Human:
-    """Replays the log from the scene's step; it makes the real samples."""
+    """Replays the log from the scene's step. At T, `human`, it makes the real samples.
+
+    From a perturbed state, `logged`, it goes to where the log's driver was at each moment, however far that is: what
+    a planner would be taught without a pseudo-expert.
+    """
 
     name: str = "human"
 

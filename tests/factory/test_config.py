@@ -168,7 +168,7 @@ def test_a_value_of_the_wrong_kind_is_an_error_that_names_it(override: str, mess
 
 
 def test_an_unknown_expert_is_an_error_and_lists_the_known() -> None:
-    known = r"\['follow_up', 'follow_up_before', 'human', 'human_before', 'pdm_closed', 'recovery'\]"
+    known = r"\['follow_up', 'follow_up_before', 'human', 'human_before', 'logged', 'pdm_closed', 'recovery'\]"
     with pytest.raises(ConfigError, match=rf"\['mine'\] is not among {known}"):
         load_config(["experts=[human,mine]"])
 

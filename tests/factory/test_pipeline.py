@@ -5,6 +5,7 @@ import pickle
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from factory.clips.reader import BadClip
@@ -17,6 +18,8 @@ from tasks import stages
 from tasks.kinematic_vocabulary import kinematic_trajectories
 from tasks.perturb import Perturbation
 from tasks.vocabulary import Vocabulary
+from tasks.world.clip import HORIZON_STEPS, NOW
+from tasks.world.frames import to_local
 
 SMALL = TownSettings(cameras=("ring_front_center",), width=64, height=36, lidar_beams=32, lidar_azimuths=300)
 VOCABULARY = Vocabulary(kinematic_trajectories(3, 0))
@@ -95,6 +98,20 @@ def test_a_rejected_attempt_is_no_sample(town: Path, tmp_path: Path) -> None:
     prepared = prepared_by(work)
     results = [work.attempt(prepared, row.index, "pdm_closed") for row in prepared.candidates[:2]]
     assert results and all(isinstance(result, Dropped) for result in results)
+
+
+def test_with_an_open_gate_the_log_s_future_is_the_label_of_every_perturbed_state(town: Path, tmp_path: Path) -> None:
+    work = work_on(town, tmp_path, "reward.full=[]", "reward.progress_above=-1", "render=none", "experts=[logged]")
+    prepared = prepared_by(work)
+    log = work.reader.read(work.reader.index().refs[0]).ego_states
+    results = [work.attempt(prepared, row.index, "logged") for row in prepared.candidates[:4]]
+    assert len(results) == 4
+    for result in results:
+        assert isinstance(result, Accepted)
+        now = np.asarray(result.row["now_pose"])
+        assert np.hypot(*(now - log[NOW + HORIZON_STEPS, :3])[:2]) > 0.3  # perturbed
+        wanted = to_local(now, log[NOW + HORIZON_STEPS + 1 : NOW + 2 * HORIZON_STEPS + 1, :3])
+        np.testing.assert_allclose(result.row["proposal_10hz"], wanted, atol=1e-4)  # type: ignore[arg-type]
 
 
 def test_a_broken_log_fails_with_the_index_s_own_words(town: Path, tmp_path: Path) -> None:

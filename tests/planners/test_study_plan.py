@@ -68,6 +68,8 @@ def test_budgets_and_bounds_become_overrides() -> None:
     assert {"data.psnr_min=27.0", "data.limit_sim=7"} <= set(high)
     assert "data.psnr_min=27.0" in by_label["ltf-recovery5-epochs-0"]
     assert f"data.sim=[{everything.replay}]" in by_label["gtrs_dense-pdm_closed1-epochs-replay-0"]
+    control = by_label["ltf-logged5-steps-1"]
+    assert {f"data.sim=[{everything.control}]", "data.experts=[logged]", "steps=600"} <= set(control)
 
 
 def test_ensembles_are_made_of_trainings_that_are_planned(tmp_path: Path) -> None:
