@@ -51,13 +51,18 @@ def quantile(q: float, by: str, metric: str, more: str = "") -> str:
     return f"histogram_quantile({q}, sum by (le, {by}) (rate({of(metric + '_bucket', more)}[$__rate_interval])))"
 
 
+def share(some: str, all_of_it: str) -> str:
+    """A ratio that is 0 where there is nothing to count yet: a counter that never counted has no series."""
+    return f"({some} or 0 * {all_of_it}) / {all_of_it}"
+
+
 RUN_ROWS = (
     Row(
         "At a glance",
         (
             Panel("Samples", {"": f"sum({of('factory_samples_total')})"}, kind="stat", about="Committed."),
             Panel("Samples a minute", {"": f"60 * sum(rate({of('factory_samples_total')}[10m]))"}, kind="stat"),
-            Panel("Attempts accepted", {"": f"sum({ACCEPTED}) / sum({TRIED})"}, "percentunit", kind="stat"),
+            Panel("Attempts accepted", {"": share(f"sum({ACCEPTED})", f"sum({TRIED})")}, "percentunit", kind="stat"),
             Panel("Failed", {"": f"sum({of('factory_outcomes_total', FAILED)}) or vector(0)"}, kind="stat"),
             Panel("Clips left", {"": f"sum({of('factory_clips_left')})"}, kind="stat"),
             Panel(
@@ -74,14 +79,22 @@ RUN_ROWS = (
         (
             Panel(
                 "Attempts accepted, by expert",
-                {"{{expert}}": f"sum by (expert) (increase({ACCEPTED}[1h])) / sum by (expert) (increase({TRIED}[1h]))"},
+                {
+                    "{{expert}}": share(
+                        f"sum by (expert) (increase({ACCEPTED}[1h]))", f"sum by (expert) (increase({TRIED}[1h]))"
+                    )
+                },
                 "percentunit",
                 "Over the hour before.",
                 most=1.0,
             ),
             Panel(
                 "Attempts accepted, by expert and round",
-                {"{{expert}} {{round}}": f"sum by (expert, round) ({ACCEPTED}) / sum by (expert, round) ({TRIED})"},
+                {
+                    "{{expert}} {{round}}": share(
+                        f"sum by (expert, round) ({ACCEPTED})", f"sum by (expert, round) ({TRIED})"
+                    )
+                },
                 "percentunit",
                 "Since the drivers began. The paper has clips, not attempts: see the run's own dashboard for those.",
                 most=1.0,
@@ -167,8 +180,10 @@ MACHINE_ROWS = (
             Panel(
                 "Found in the cache",
                 {
-                    "{{cache}}": f"sum by (cache) ({of('factory_cache_lookups_total', HITS)}) "
-                    f"/ sum by (cache) ({of('factory_cache_lookups_total')})"
+                    "{{cache}}": share(
+                        f"sum by (cache) ({of('factory_cache_lookups_total', HITS)})",
+                        f"sum by (cache) ({of('factory_cache_lookups_total')})",
+                    )
                 },
                 "percentunit",
                 most=1.0,
