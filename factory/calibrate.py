@@ -6,12 +6,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from factory.clips.reader import ClipRef
+from factory.funnel import funnel_of
 from factory.settings import Run
+from factory.store.samples import Store
 from factory.store.schema import BOOKKEEPING, sample_row_to_table
 from factory.work import HUMAN_CANDIDATE, LOGGED, Accepted
 from tasks.stages import Rejected
 
 CALIBRATION_CLIPS = 3
+PER_CLIP = ("clip", "perturb", "reconstruct")  # stages that are no part of an attempt
 
 
 def plan_text(run: Run, refs: Sequence[ClipRef]) -> str:
@@ -81,21 +84,55 @@ def _bytes_of(result: Accepted) -> int:
     return int(sample_row_to_table([{**blank, **result.row}]).nbytes)
 
 
-def calibrate(run: Run, refs: Sequence[ClipRef]) -> str:
-    """The expected size of the whole run as a text."""
+def calibrate(run: Run, refs: Sequence[ClipRef], store: Store | None = None) -> str:
+    """The expected size of the whole run as a text; with `store`, also by the acceptance its tables show."""
     sums = measure(run, refs)
     if sums.clips == 0:
         return "\n".join(["nothing could be measured:", *sums.notes])
     factor = len(refs) / sums.clips
     core_hours = sum(sums.seconds.values()) * factor / 3600.0
     cores = run.config.workers or os.cpu_count() or 1
+    total = f"{core_hours:.2f} core-hours ({core_hours / cores:.2f} h on {cores} cores)"
+    if run.work.draws_on_gpu:  # a drawing attempt holds its share of a GPU from its first stage to its last
+        spent = sum(seconds for stage, seconds in sums.seconds.items() if stage not in PER_CLIP)
+        total += f", {spent * run.config.gpu_share * factor / 3600.0:.2f} GPU-hours"
     lines = [
         f"measured on {sums.clips} clips: {sums.candidates / sums.clips:.1f} candidates a clip, "
         f"{sums.accepted} of {sums.attempts} attempts accepted",
-        *(f"  {stage:8s} {seconds / sums.clips:8.2f} s a clip" for stage, seconds in sums.seconds.items()),
+        f"  {'stage':<12}{'s a clip':>10}{'core-hours':>12}",
+        *(
+            f"  {stage:<12}{seconds / sums.clips:>10.2f}{seconds * factor / 3600.0:>12.2f}"
+            for stage, seconds in sums.seconds.items()
+        ),
         f"expected for {len(refs)} clips: {sums.attempts * factor:.0f} attempts, {sums.accepted * factor:.0f} samples, "
-        f"{sums.row_bytes * factor / 1e9:.3f} GB before compression, "
-        f"{core_hours:.2f} core-hours ({core_hours / cores:.2f} h on {cores} cores)",
+        f"{sums.row_bytes * factor / 1e9:.3f} GB before compression, {total}",
+        *(by_the_tables(store, run.config.experts, run.config.rounds, len(refs)) if store is not None else ()),
         *sums.notes,
     ]
     return "\n".join(lines)
+
+
+def by_the_tables(store: Store, experts: Sequence[str], rounds: int, n_clips: int) -> list[str]:
+    """For every expert with attempts in the tables: what so many clips come to at its rates there.
+
+    Rounds that the tables do not hold go on at the rates of the last one they do.
+    """
+    found: list[str] = []
+    for expert in experts:
+        rows = [row for row in funnel_of(store).rows if row.expert == expert and row.clips_before]
+        if not rows:
+            continue
+        wanted = 1 if expert in LOGGED else rounds
+        left, attempts, samples = float(n_clips), 0.0, 0.0
+        for number in range(wanted):
+            row = rows[min(number, len(rows) - 1)]
+            attempts += left * (row.accepted + row.rejected + row.failed) / row.clips_before
+            left *= row.clip_rate
+            samples += left
+        tried = sum(row.accepted + row.rejected + row.failed for row in rows)
+        rate = 100.0 * sum(row.accepted for row in rows) / tried if tried else 0.0
+        found.append(
+            f"  {expert}: {rate:.1f} % of {tried} attempts on {rows[0].clips_total} clips were accepted; "
+            f"{attempts:.0f} attempts, {samples:.0f} samples"
+        )
+    return [f"by the acceptance measured in {store.location.uri}:", *found] if found else []

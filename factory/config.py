@@ -1,7 +1,9 @@
 """Configuration: Hydra composes conf/, typed dataclasses take the result, and anything unknown is an error."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
@@ -41,9 +43,30 @@ def compose(name: str, overrides: Sequence[str]) -> dict[str, Any]:
         raise ConfigError(f"{key} is missing: give {key}={what}") from error
     except (HydraException, OmegaConfBaseException) as error:
         cause = f" ({error.__cause__})" if error.__cause__ is not None else ""
-        raise ConfigError(f"{str(error).strip()}{cause}") from error
+        raise ConfigError(f"{str(error).strip()}{cause}{_meant(name, str(error))}") from error
     assert isinstance(resolved, dict)
     return {str(key): value for key, value in resolved.items()}
+
+
+def _meant(name: str, message: str) -> str:
+    """For a key that does not exist: the one that was perhaps meant."""
+    import hydra
+    from omegaconf import OmegaConf
+
+    missed = re.search(r"Could not override '([\w.]+)'", message)
+    if missed is None:
+        return ""
+    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        known = list(_dotted(OmegaConf.to_container(hydra.compose(name)), ""))
+    near = get_close_matches(missed[1], known, n=1, cutoff=0.6)
+    return f"\ndid you mean {near[0]}=?" if near else ""
+
+
+def _dotted(tree: Any, prefix: str) -> Iterator[str]:
+    for key, value in tree.items():
+        yield f"{prefix}{key}"
+        if isinstance(value, Mapping):
+            yield from _dotted(value, f"{prefix}{key}.")
 
 
 def fill(cls: type[T], values: Mapping[str, Any], where: str) -> T:

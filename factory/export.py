@@ -14,12 +14,14 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from factory.arguments import BAD_ARGUMENTS, Refused, parse
 from factory.show import find, logged_drive, sample_ids
 from factory.status import open_store
-from factory.store.samples import Store
+
+if TYPE_CHECKING:
+    from factory.store.samples import Store
 
 Row = Mapping[str, Any]
 
@@ -80,14 +82,14 @@ def export(kind: str, request: Request) -> Iterator[Path]:
         raise Refused(f"{store.location.uri}: {error}") from error
 
 
-def write_mcap(store: Store, row: Row, path: Path) -> None:
+def write_mcap(store: "Store", row: Row, path: Path) -> None:
     """The sample as an MCAP episode."""
     from factory.look.episode_messages import episode_of
 
     path.write_bytes(episode_of(row, logged_drive(store, dict(row))))
 
 
-def write_film(store: Store, row: Row, path: Path) -> None:
+def write_film(store: "Store", row: Row, path: Path) -> None:
     """The sample's drive at 10 Hz."""
     from factory.look.seen_again import digest_of, film, scene_of
     from factory.look.video import write_mp4
@@ -97,7 +99,7 @@ def write_film(store: Store, row: Row, path: Path) -> None:
     write_mp4(path, film(row, scene, logged_drive(store, dict(row))))
 
 
-def write_rerun(store: Store, row: Row, path: Path) -> None:
+def write_rerun(store: "Store", row: Row, path: Path) -> None:
     """The sample as a Rerun recording."""
     from factory.look.rerun_log import write_recording
 
@@ -105,7 +107,7 @@ def write_rerun(store: Store, row: Row, path: Path) -> None:
 
 
 SUFFIXES = {"rerun": ".rrd"}  # where they are not the format's name
-FORMATS: Mapping[str, Callable[[Store, Row, Path], None]] = {
+FORMATS: Mapping[str, Callable[["Store", Row, Path], None]] = {
     "mcap": write_mcap,
     "mp4": write_film,
     "rerun": write_rerun,

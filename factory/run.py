@@ -103,7 +103,7 @@ def run(overrides: Sequence[str]) -> int:
     refs = dealt(wanted, config.workers or os.cpu_count() or 1)
     print(plan_text(assembled, refs), flush=True)
     if config.dry_run:
-        print(calibrate(assembled, refs))
+        print(calibrate(assembled, refs, store))
         return 0
     summary = execute(
         assembled.work,

@@ -10,6 +10,7 @@ from pathlib import Path
 import numba
 import pytest
 
+from factory.__main__ import main as door_main
 from factory.arguments import parse
 from factory.clips.synthetic.reader import SyntheticReader
 from factory.config import compose, fill
@@ -98,6 +99,15 @@ def test_every_command_is_one_its_program_takes(
     match command:
         case ["make", target]:
             assert re.search(rf"^{target}:", (REPOSITORY / "Makefile").read_text(), re.M)
+        case ["source", *_]:
+            assert door_main(["completion", "bash"]) == 0
+        case ["python", "-m", "factory"]:
+            assert door_main(["--help"]) == 0
+        case ["python", "-m", "factory", "plan" | "run", *arguments]:
+            load_config(given(arguments))
+        case ["python", "-m", "factory", *arguments]:
+            monkeypatch.chdir(demo_home)
+            assert door_main(arguments) == 0, capsys.readouterr().err
         case ["python", "-m", "factory.run", "--help"]:
             assert run_main(["--help"]) == 0
         case ["python", "-m", "factory.run", *arguments]:

@@ -52,6 +52,11 @@ class Location:
         except FileNotFoundError:
             return None
 
+    def has(self, name: str) -> bool:
+        """There is such a file."""
+        filesystem, base = self.filesystem()
+        return bool(filesystem.get_file_info(f"{base}/{name}").type == fs.FileType.File)
+
     def write(self, name: str, data: bytes) -> None:
         """Whole file or no file: rename on local disk (flushed first), one put on an object store."""
         if not self.is_local:

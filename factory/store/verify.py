@@ -80,6 +80,10 @@ def _broken_rounds(store: Store) -> list[str]:
 
 def main(arguments: Sequence[str]) -> int:
     """Print the verdict; 0 sound, 1 damaged, 2 no store there."""
+    if {"-h", "--help"} & set(arguments):
+        print(f"{__doc__}\nExit codes: 0 sound, 1 damaged, 2 no run there.")
+        return 0
+    arguments = [argument.removeprefix("out=") for argument in arguments]
     if len(arguments) != 1:
         print("usage: python -m factory.store.verify OUT", file=sys.stderr)
         return 2

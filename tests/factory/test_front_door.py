@@ -1,0 +1,193 @@
+"""`python -m factory ...`: one door, suggestions, completion, lineage, retry; exit codes."""
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from factory.__main__ import main
+from factory.commands import COMMANDS
+from factory.completion import candidates, settings_of
+from factory.execute import execute
+from factory.store.samples import Store
+from tests.factory.filmed import FilmedWork
+from tests.factory.toy import ToyWork, refs
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+HEAVY = ("numpy", "ray", "torch", "hydra", "omegaconf", "pyarrow", "deltalake", "numba", "cv2", "rich")
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Samples with episodes, rejections, an attempt that raised."""
+    folder = tmp_path_factory.mktemp("out")
+    work = FilmedWork(trouble={"log0:2000:recovery:1": "bug"})
+    given = ["executor=local", "episodes=all", f"out={folder}", "rounds=2"]
+    store = Store(folder)
+    execute(work, refs(4), ["recovery", "human"], 2, store, "local", episodes=1, command=given, say=lambda line: None)
+    return folder
+
+
+def ask(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
+    code = main(arguments)
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def light(code: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Runs it where nothing heavy may be imported."""
+    script = f"import sys\n{code}\nassert not set({HEAVY}) & set(sys.modules), set({HEAVY}) & set(sys.modules)"
+    env = os.environ | {"PYTHONPATH": str(REPOSITORY)}
+    return subprocess.run([sys.executable, "-c", script, *arguments], env=env, capture_output=True, text=True)
+
+
+def test_every_command_is_listed_and_helps_itself_without_heavy_imports() -> None:
+    listed = light("from factory.__main__ import main; assert main(['--help']) == 0")
+    assert listed.returncode == 0, listed.stderr
+    assert all(f"  {name} " in listed.stdout and command.about in listed.stdout for name, command in COMMANDS.items())
+    needs_more = {"explain", "vocabulary", "scene", "verify"}
+    asked = [name for name in COMMANDS if name not in needs_more]
+    shown = light(f"from factory.__main__ import main\nfor name in {asked}: assert main([name, '--help']) == 0, name")
+    assert shown.returncode == 0, shown.stderr
+    assert shown.stdout.lower().count("exit codes") >= len(asked)
+
+
+@pytest.mark.parametrize("name", ["explain", "vocabulary", "scene", "verify"])
+def test_the_others_help_too(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert ask(capsys, name, "--help")[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "meant"),
+    [
+        (("stauts", "out=x"), "did you mean status?"),
+        (("xyzzy",), "there is no command xyzzy; see --help"),
+        (("status", "outt=x"), "did you mean out=?"),
+        (("show", "smaple=0"), "did you mean sample=?"),
+        (("run", "rounsd=3"), "did you mean rounds=?"),
+        (("run", "render.widht=3"), "did you mean render.width=?"),
+    ],
+)
+def test_a_mistyped_word_gets_a_suggestion_and_ends_with_2(
+    arguments: tuple[str, ...], meant: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, text, error = ask(capsys, *arguments)
+    assert code == 2 and not text and meant in error
+
+
+def test_status_funnel_and_failed_are_what_show_shows(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, status, _ = ask(capsys, "status", f"out={out}")
+    assert code == 0 and status == ask(capsys, "show", f"out={out}")[1]
+    code, funnel, _ = ask(capsys, "funnel", f"out={out}")
+    assert code == 0 and funnel.strip() in status
+    code, failed, _ = ask(capsys, "failed", f"out={out}")
+    assert code == 0 and failed == ask(capsys, "show", f"out={out}", "failed=true")[1]
+    assert "ZeroDivisionError" in failed and "python -m factory retry" in failed
+
+
+def test_lineage_goes_from_the_run_to_the_file(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    store = Store(out)
+    row = next(
+        row
+        for row in store.samples.read(["attempt_id", "clip_id", "expert", "round", "candidate_index"]).to_pylist()
+        if row["expert"] == "recovery" and row["candidate_index"] > row["round"]
+    )
+    code, text, _ = ask(capsys, "lineage", row["attempt_id"][:12], f"out={out}")
+    assert code == 0
+    titles = [line for line in text.splitlines() if not line.startswith(" ")]
+    assert titles == ["run", "clip", "candidate", "attempt", "sample"]
+    facts = dict(line.strip().split(None, 1) for line in text.splitlines() if line.startswith("  "))
+    assert facts["clip"] == row["clip_id"] and facts["attempt"] == row["attempt_id"]
+    assert facts["round"] == str(row["round"]) and "rejected by reward." in facts["tried"]
+    assert Path(facts["file"]).is_file() and (out / facts["episode"]).is_file()
+    assert (out / facts["prepared"].split()[-1]).is_file() or "prepared clip" in text
+
+
+def test_lineage_of_what_is_no_sample_says_what_became_of_it(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rejected = next(o for o in Store(out).outcomes.read().to_pylist() if o["kind"] == "rejected")
+    code, text, _ = ask(capsys, "lineage", f"out={out}", f"sample={rejected['attempt_id']}")
+    assert code == 0 and "no sample" in text and f"reward.{rejected['reason']}" in text
+    assert ask(capsys, "lineage", "zz", f"out={out}")[0] == 2
+
+
+def test_retry_says_what_and_how_and_leaves_the_rest_alone(
+    out: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[list[str]] = []
+
+    def run(argv: Sequence[str]) -> int:
+        asked.append(list(argv))
+        return 0
+
+    monkeypatch.setattr("factory.run.main", run)
+    monkeypatch.chdir(out)
+    code, text, _ = ask(capsys, "retry", f"out={out}", "dry_run=true")
+    assert code == 0 and "1 failed: bug 1" in text and "ZeroDivisionError" in text and not asked
+    assert f"python -m factory run executor=local episodes=all rounds=2 out={out} retry_failed=true" in text
+    assert ask(capsys, "retry", f"out={out}", "workers=1")[0] == 0
+    assert asked == [["executor=local", "episodes=all", "rounds=2", "workers=1", f"out={out}", "retry_failed=true"]]
+
+
+def test_retry_of_a_run_without_failures_or_without_a_record_does_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    execute(ToyWork(), refs(1), ["human"], 1, Store(tmp_path / "fine"), "local", say=lambda line: None)
+    assert ask(capsys, "retry", f"out={tmp_path / 'fine'}")[:2] == (0, "0 failed\n")
+    work = ToyWork(trouble={"log0:0:human:-1": "bug"})
+    execute(work, refs(1), ["human"], 1, Store(tmp_path / "old"), "local", say=lambda line: None)
+    code, _, error = ask(capsys, "retry", f"out={tmp_path / 'old'}")
+    assert code == 2 and "records no settings" in error
+
+
+def test_completion_knows_commands_keys_groups_and_choices() -> None:
+    assert set(candidates([], "")) == set(COMMANDS)
+    assert {"clips=", "rounds=", "render.width=", "vocabulary.file="} <= set(candidates(["run"], ""))
+    assert "rounds=" not in candidates(["run", "rounds=5"], "")
+    assert set(candidates(["run"], "clips=")) >= {"clips=av2", "clips=synthetic"}
+    assert set(candidates(["run"], "executor=")) == {"executor=ray", "executor=local"}
+    assert set(candidates(["plan"], "on_change=")) == {"on_change=stop", "on_change=keep", "on_change=redo"}
+    assert "clips.root=" in candidates(["run", "clips=av2"], "") and "clips.root=" not in candidates(["run"], "")
+    assert set(candidates(["show"], "film=")) == {"film=true", "film=false"}
+    assert set(candidates(["export"], "m")) == {"mcap", "mp4", "rerun"}
+    assert {"dry_run=", "workers="} <= set(candidates(["retry"], ""))
+    assert not list(candidates(["nothing"], ""))
+
+
+def test_every_key_that_is_completed_is_one_the_run_takes() -> None:
+    from factory.config import compose
+
+    def has(tree: object, key: str) -> bool:
+        for part in key.split("."):
+            if not isinstance(tree, dict) or part not in tree:
+                return False
+            tree = tree[part]
+        return True
+
+    groups, settings = {"preset"}, compose("run", [])
+    unknown = [key for key in settings_of([]) if key not in groups and not has(settings, key)]
+    assert unknown == []
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")
+def test_bash_completes_the_end_of_the_line(tmp_path: Path) -> None:
+    script = tmp_path / "ask.bash"
+    script.write_text(
+        f'source <("{sys.executable}" -m factory completion bash)\n'
+        'asked() { COMP_LINE=$1 COMP_POINT=${#1}; COMPREPLY=(); $2 2>/dev/null; echo "${COMPREPLY[*]}"; }\n'
+        "asked 'factory sta' _factory_complete\nasked 'python -m factory run executor=l' _factory_python\n"
+        "asked 'factory run clips=sc' _factory_complete\nasked 'python setup.py ' _factory_python\n"
+    )
+    env = os.environ | {"PYTHONPATH": str(REPOSITORY)}
+    done = subprocess.run(["bash", str(script)], env=env, capture_output=True, text=True)
+    assert done.stdout.splitlines() == ["status", "local", "scenarionet", ""], done.stderr
+
+
+def test_completion_is_quick_and_another_shell_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    done = light("from factory.completion import complete; complete(['factory run clips='])")
+    assert done.returncode == 0 and "clips=av2" in done.stdout, done.stderr
+    assert ask(capsys, "completion", "fish")[0] == 2
+    assert "compdef _factory_complete factory" in ask(capsys, "completion", "zsh")[1]
