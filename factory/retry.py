@@ -5,6 +5,7 @@
     python -m factory retry out=runs/demo executor=local    with other settings of the run beside the recorded ones
 
 The settings are those of the newest start of the run (current_run.json); attempts that are settled are not touched.
+Code that they name (`_target_`) is not called on the word of a table: give those settings again.
 Exit codes: those of the run; 2 too where there is no run, or it recorded no settings; 0 where nothing failed.
 """
 
@@ -55,8 +56,8 @@ def retry(argv: Sequence[str]) -> int:
     print("\n".join(failed_lines(store)))
     if "failed" not in store.outcomes.read(["kind"])["kind"].to_pylist():
         return 0
-    folder, recorded = recorded_command(store)
     others = [argument for argument in argv if argument.partition("=")[0] not in ("out", "dry_run")]
+    folder, recorded = recorded_command(store, others)
     command = [*recorded, *others, f"out={store.location.uri}", "retry_failed=true"]
     print(f"\nin {folder}: python -m factory run {shlex.join(command)}", flush=True)
     if given.get("dry_run", "false").lower() == "true":
@@ -66,17 +67,25 @@ def retry(argv: Sequence[str]) -> int:
     return run(command)
 
 
-def recorded_command(store: "Store") -> tuple[str, list[str]]:
-    """The folder that the newest start was given in, and its settings. Raises Refused where none is recorded."""
+def recorded_command(store: "Store", given: Sequence[str] = ()) -> tuple[str, list[str]]:
+    """The folder that the newest start was given in, and its settings less those that are `given`.
+
+    Raises Refused where none is recorded, and where they name code: a table is data, whoever wrote it, and what is
+    called on its behalf must be said by who runs it.
+    """
     from factory.store.samples import CURRENT_RUN
 
     document = json.loads(store.location.read(CURRENT_RUN) or b"{}")
+    where = f"{store.location.uri}/{CURRENT_RUN}"
     if document.get("command") is None:
-        raise Refused(
-            f"{store.location.uri}/{CURRENT_RUN} records no settings: run the same command with retry_failed=true"
-        )
+        raise Refused(f"{where} records no settings: run the same command with retry_failed=true")
     mine = ("out=", "retry_failed=", "dry_run=")
-    return str(document["folder"]), [word for word in document["command"] if not word.startswith(mine)]
+    words = [str(word) for word in document["command"]]
+    words = [word for word in words if not word.startswith(mine) and word not in given]
+    code = [word for word in words if "_target_" in word or word.startswith("-")]
+    if code:
+        raise Refused(f"{where} names code to be called: if you trust it, give it yourself: {shlex.join(code)}")
+    return str(document["folder"]), words
 
 
 if __name__ == "__main__":

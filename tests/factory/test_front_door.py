@@ -1,5 +1,6 @@
 """`python -m factory ...`: one door, suggestions, completion, lineage, retry; exit codes."""
 
+import json
 import os
 import shutil
 import subprocess
@@ -13,7 +14,7 @@ from factory.__main__ import main
 from factory.commands import COMMANDS
 from factory.completion import candidates, settings_of
 from factory.execute import execute
-from factory.store.samples import Store
+from factory.store.samples import CURRENT_RUN, Store
 from tests.factory.filmed import FilmedWork
 from tests.factory.toy import ToyWork, refs
 
@@ -130,6 +131,30 @@ def test_retry_says_what_and_how_and_leaves_the_rest_alone(
     assert f"python -m factory run executor=local episodes=all rounds=2 out={out} retry_failed=true" in text
     assert ask(capsys, "retry", f"out={out}", "workers=1")[0] == 0
     assert asked == [["executor=local", "episodes=all", "rounds=2", "workers=1", f"out={out}", "retry_failed=true"]]
+
+
+def test_retry_calls_no_code_that_a_table_alone_names(
+    out: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[list[str]] = []
+
+    def run(argv: Sequence[str]) -> int:
+        asked.append(list(argv))
+        return 0
+
+    monkeypatch.setattr("factory.run.main", run)
+    monkeypatch.chdir(out)
+    location, named = Store(out).location, "+expert.mine._target_=my_package.MyExpert"
+    kept = location.read(CURRENT_RUN)
+    document = {"folder": str(out), "command": ["rounds=2", named]}
+    location.write(CURRENT_RUN, json.dumps(document).encode())
+    try:
+        code, _, error = ask(capsys, "retry", f"out={out}")
+        assert code == 2 and named in error and not asked
+        assert ask(capsys, "retry", f"out={out}", named)[0] == 0
+    finally:
+        location.write(CURRENT_RUN, kept or b"{}")
+    assert asked == [["rounds=2", named, f"out={out}", "retry_failed=true"]]
 
 
 def test_retry_of_a_run_without_failures_or_without_a_record_does_nothing(
