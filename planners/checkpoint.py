@@ -25,7 +25,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from factory.config import ConfigError
-from planners.planner import Planner
+from planners.planner import FloatArray, Planner
 from planners.registry import PlannerChoice, build_planner, planner_class
 
 FOLDER = "checkpoints"
@@ -102,14 +102,18 @@ def load_planner(path: str | Path, changed: Mapping[str, Any] | None = None) -> 
         free = ", ".join(sorted(planner_class(choice.name).free_settings)) or "none"
         raise ConfigError(f"{folder}: {', '.join(bound)} of {choice.name} cannot change after training; free: {free}")
     choice = replace(choice, settings={**choice.settings, **(changed or {})})
-    try:
-        with np.load(folder / ARRAYS, allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
-        raise ConfigError(f"{folder / ARRAYS}: {error}: restore the checkpoint") from error
-    planner = build_planner(choice, arrays)
+    planner = build_planner(choice, load_arrays(folder))
     load_weights(planner, folder)
     return planner.eval()
+
+
+def load_arrays(folder: Path) -> dict[str, FloatArray]:
+    """What a checkpoint's planner is built around, by name. Raises ConfigError."""
+    try:
+        with np.load(folder / ARRAYS, allow_pickle=False) as stored:
+            return {name: stored[name] for name in stored.files}
+    except (OSError, ValueError, zipfile.BadZipFile) as error:
+        raise ConfigError(f"{folder / ARRAYS}: {error}: restore the checkpoint") from error
 
 
 def load_weights(planner: Planner, folder: Path) -> None:

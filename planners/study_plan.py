@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from planners.sweep import TRAININGS, Training
 
-Data = Literal["real", "recovery", "pdm_closed", "logged"]
+Data = Literal["begin", "real", "recovery", "pdm_closed", "logged"]
 Budget = Literal["epochs", "steps"]
 SHARES = (0.25, 0.5, 1.0)
 RATIOS = (0.25, 0.5, 0.75)
@@ -22,6 +22,8 @@ class StudySettings:
     data: str
     replay: str
     control: str
+    begin: str | None
+    begin_epochs: int
     benchmark: str
     val: str
     out: str
@@ -60,7 +62,7 @@ class Setup:
     """What one planner is trained on, and how long."""
 
     planner: str
-    data: Data  # real samples, and those of this expert
+    data: Data  # real samples, and those of this expert; `begin`: the real samples that all are trained on first
     rounds: int  # simulated ones, 0 with real samples alone
     budget: Budget  # equal passes over its own data (the paper), or equal optimiser steps
     imitation: Literal["all", "real", "none"] = "all"
@@ -85,20 +87,23 @@ class Setup:
         simulated = settings.replay if self.traffic == "replay" else settings.data
         if self.data == "logged":
             simulated = settings.control
+        begins = self.data == "begin"
         overrides = [
             f"planner={settings.planners[self.planner]}",
-            f"data.real=[{settings.data}]",
+            f"data.real=[{settings.begin if begins else settings.data}]",
             f"data.sim=[{simulated if self.rounds else ''}]",
             f"data.val=[{settings.val}]",
             f"data.real_share={self.real_share}",
             f"mix.imitation={self.imitation}",
             f"mix.sim_ratio={self.sim_ratio}",
-            f"planner.training.epochs={settings.epochs}",
+            f"planner.training.epochs={settings.begin_epochs if begins else settings.epochs}",
             f"planner.training.batch_size={settings.batch_size}",
             f"seed={seed}",
             "workers=1",
             "validate_every=100",
         ]
+        if settings.begin and not begins:
+            overrides.append(f"init_from={Path(settings.out) / TRAININGS / begin(self.planner).label_of(0)}")
         if self.planner == "gtrs_dense":
             overrides.append(f"planner.settings.vocabulary={settings.vocabulary}")
         if self.budget == "steps":
@@ -111,7 +116,16 @@ class Setup:
             overrides += [f"data.psnr_min={settings.psnr_db}"]
         if self.psnr != "any":
             overrides += [f"data.limit_sim={sizes.matched}"]
-        return Training(f"{self.label}-{seed}", tuple(overrides), {**vars(self), "seed": seed})
+        return Training(self.label_of(seed), tuple(overrides), {**vars(self), "seed": seed})
+
+    def label_of(self, seed: int) -> str:
+        """Names one of its trainings."""
+        return f"{self.label}-{seed}"
+
+
+def begin(planner: str) -> Setup:
+    """What a planner is before the study: trained on real samples of other towns."""
+    return Setup(planner, "begin", 0, "epochs")
 
 
 @dataclass(frozen=True)
@@ -131,8 +145,9 @@ class Comparison:
 
 
 def comparisons(settings: StudySettings) -> list[Comparison]:
-    """All of the chosen parts."""
-    found = []
+    """All of the chosen parts, behind the trainings that all begin with."""
+    first = settings.planners if settings.begin else ()
+    found = [Comparison("begin", begin(planner), None, 1) for planner in first]
     for one in (one for part in settings.parts for one in PARTS[part](settings)):
         reference = None if one.reference is None else trained(one.reference, settings.rounds)
         setup = trained(one.setup, settings.rounds)

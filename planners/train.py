@@ -24,7 +24,7 @@ import torch
 
 from factory.config import ConfigError, compose, fill
 from planners.backbone import load_pretrained
-from planners.checkpoint import as_record, checkpoints, digest, load_weights, newest, read_record
+from planners.checkpoint import as_record, checkpoints, digest, load_arrays, load_weights, newest, read_record
 from planners.data import Dataset, DataSettings, open_data
 from planners.fit import Loop, Stopped, fit, total_steps
 from planners.loader import Loader
@@ -172,6 +172,11 @@ def train(config: TrainConfig, world: World) -> None:
 
 
 def _planner(config: TrainConfig, settings: Any, dataset: Dataset) -> Planner:
+    """The planner, built around what the samples give it; trained further, around what it was trained with."""
+    if config.init_from is not None:
+        before = read_record(Path(config.init_from))["planner"]
+        if before == {"name": config.planner.name, "settings": as_record(settings)}:
+            return build_planner(config.planner, load_arrays(newest(Path(config.init_from))))
     try:
         arrays = planner_class(config.planner.name).fixed_arrays(settings, dataset.training_data())
     except (ValueError, OSError) as error:

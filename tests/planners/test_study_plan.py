@@ -20,7 +20,7 @@ def test_every_family_is_trained_with_and_without_simulation_in_equal_epochs_and
     found = comparisons(settings(parts=("main",)))
     for planner in ("ltf", "diffusiondrive", "gtrs_dense"):
         for budget in ("epochs", "steps"):
-            mine = [c for c in found if (c.setup.planner, c.budget) == (planner, budget)]
+            mine = [c for c in found if (c.part, c.setup.planner, c.budget) == ("main", planner, budget)]
             assert {c.setup.data for c in mine} == {"real", "recovery", "pdm_closed"}
             for one in mine:
                 assert (one.reference is None) == (one.setup.rounds == 0)
@@ -30,6 +30,20 @@ def test_every_family_is_trained_with_and_without_simulation_in_equal_epochs_and
                         "real",
                         budget,
                     )
+
+
+def test_every_training_begins_with_what_the_same_planner_learnt_in_other_towns() -> None:
+    everything = settings(out="here", begin="elsewhere")
+    planned = trainings(comparisons(everything), everything, SIZES)
+    first = {t.label: t for t in planned if t.facts["data"] == "begin"}
+    assert set(first) == {f"{planner}-begin-epochs-0" for planner in everything.planners}
+    for training in planned:
+        mine = f"init_from=here/trainings/{training.facts['planner']}-begin-epochs-0"
+        assert (mine in training.overrides) == (training.label not in first)
+        assert ("data.real=[elsewhere]" in training.overrides) == (training.label in first)
+    alone = settings(begin=None)
+    planned = trainings(comparisons(alone), alone, SIZES)
+    assert not any("begin" in t.label or any(o.startswith("init_from") for o in t.overrides) for t in planned)
 
 
 def test_a_training_is_planned_once_with_as_many_seeds_as_anyone_asks_for() -> None:

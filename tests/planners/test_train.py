@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -82,12 +83,16 @@ def test_a_planner_is_trained_further_from_the_weights_of_another_training(
     first, second = tmp_path / "first", tmp_path / "second"
     assert main(command(table, first)) == 0
     further = ("seed=5", "steps=1", f"init_from={first}", "planner.training.learning_rate=1e-9")
-    assert main(command(table, second, *further)) == 0
+    assert main(command(table, second, *further, sim=False)) == 0
     assert f"weights to begin with: {newest(first)}" in capsys.readouterr().out
     begun, learnt = (load_planner(folder).state_dict() for folder in (second, first))
     for name, weights in learnt.items():
         torch.testing.assert_close(begun[name], weights, rtol=0.0, atol=1e-8)
-    assert main(command(table, second, *further[:2], further[3])) == 2
+    assert main(command(table, tmp_path / "alone", "steps=1", sim=False)) == 0
+    arrays = {f: load_planner(tmp_path / f).arrays["mean_plan"] for f in ("first", "second", "alone")}
+    np.testing.assert_array_equal(arrays["second"], arrays["first"])  # what it was built around stays, on other data
+    assert not np.array_equal(arrays["alone"], arrays["first"])
+    assert main(command(table, second, *further[:2], further[3], sim=False)) == 2
     assert "init_from" in capsys.readouterr().err
     assert main(command(table, tmp_path / "third", f"init_from={first}", "+planner.settings.hidden=9")) == 2
     assert "(9, " in capsys.readouterr().err

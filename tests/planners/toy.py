@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from planners.batch import Batch, Needs
-from planners.planner import FloatArray, Planner
+from planners.planner import FloatArray, Planner, TrainingData
 
 
 @dataclass(frozen=True)
@@ -27,6 +27,10 @@ class Toy(Planner):
         self.net = nn.Sequential(
             nn.Linear(8, settings.hidden), nn.ReLU(), nn.Dropout(settings.dropout), nn.Linear(settings.hidden, 24)
         )
+
+    @classmethod
+    def fixed_arrays(cls, settings: ToySettings, data: TrainingData) -> dict[str, FloatArray]:
+        return {"mean_plan": data.labels_2hz().mean(axis=0)}
 
     @property
     def needs(self) -> Needs:
