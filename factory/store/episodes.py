@@ -7,9 +7,12 @@ import hashlib
 import io
 import json
 import zlib
+from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
+from mcap.records import Footer
+from mcap.stream_reader import MAGIC_SIZE, StreamReader
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import register_schema
@@ -17,6 +20,7 @@ from mcap_protobuf.schema import register_schema
 FOLDER = "episodes"  # beside the table, of those that a run writes
 LIBRARY = "driving-data-factory"
 CHUNK_BYTES = 1 << 20
+DATA_END_BYTES = 1 + 8 + 4  # opcode, length, checksum of everything before
 
 
 class Timed(Protocol):
@@ -56,6 +60,23 @@ def episode_bytes(messages: Sequence[Timed], metadata: Mapping[str, str]) -> byt
         writer.add_message(channels[message.topic], message.time_ns, data, message.time_ns, sequence)
     writer.finish()
     return stream.getvalue()
+
+
+def check_episode(data: bytes) -> None:
+    """Hold an MCAP file against its two checksums, of all but its last bytes (mcap.dev/spec, Data End and Footer).
+
+    Raises ValueError, with the reason, where it is not whole.
+    """
+    try:
+        last = deque(StreamReader(io.BytesIO(data)).records, maxlen=1)[0]
+    except Exception as error:  # whatever damaged records, or a broken zstd frame, raise
+        raise ValueError(str(error) or type(error).__name__) from error
+    if not isinstance(last, Footer) or not DATA_END_BYTES < last.summary_start < len(data):
+        raise ValueError("it ends before its footer")
+    content, summary = data[: last.summary_start - DATA_END_BYTES], data[last.summary_start : -MAGIC_SIZE - 4]
+    data_end = data[len(content) : last.summary_start]
+    if zlib.crc32(content) != int.from_bytes(data_end[-4:], "little") or zlib.crc32(summary) != last.summary_crc:
+        raise ValueError("its checksum is another")
 
 
 def _channel(writer: Writer, message: Timed) -> int:

@@ -1,7 +1,9 @@
 """Checks a store from its files alone: `python -m factory.store.verify OUT`.
 
-Damage is what must not be: a file of the log that is missing or fails its checksums, a key twice, a round out of order.
-Orphans are harmless: files no commit names, left behind by a run that died; readers ignore them.
+Damage is what must not be: a file of the log that is missing or fails its checksums, a key twice, a round out of order,
+an episode that is not whole.
+Orphans are harmless: files no commit names, left behind by a run that died, and episodes of rows that were replaced;
+readers ignore them.
 """
 
 import sys
@@ -9,6 +11,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from factory.store.episodes import FOLDER, check_episode, episode_name
 from factory.store.samples import Store
 from factory.store.table import KeyedTable
 
@@ -23,7 +26,7 @@ class Verdict:
 
 
 def verify(store: Store) -> Verdict:
-    """Read every live file with its checksums, and hold the tables against each other."""
+    """Read every live file and episode with its checksums, and hold the tables against each other."""
     damage: list[str] = []
     orphans: list[str] = []
     for table in (store.samples, store.candidates, store.outcomes):
@@ -32,6 +35,8 @@ def verify(store: Store) -> Verdict:
     if damage:
         return Verdict(0, (*damage, "keys and rounds were not checked: mend the files first"), tuple(orphans))
     damage += _twice(store) + _broken_rounds(store)
+    broken, outdated = _episodes(store)
+    damage, orphans = damage + broken, orphans + outdated
     known = {run["settings_hash"] for run in store.runs()}
     for name in sorted(set(store.samples.read(["settings_hash"])["settings_hash"].to_pylist()) - known):
         damage.append(f"samples: settings_hash {name} is not in run.json")
@@ -76,6 +81,23 @@ def _broken_rounds(store: Store) -> list[str]:
         for (clip_id, expert), rows in sorted(walks.items())
         if [number for _, number in sorted(rows)] != list(range(len(rows)))
     ]
+
+
+def _episodes(store: Store) -> tuple[list[str], list[str]]:
+    """Damaged episodes, and files beside them that are no episode of a row that is there."""
+    folder = store.location.child(FOLDER)
+    rows = store.samples.read(["attempt_id", "settings_hash", "stage_versions"]).to_pylist()
+    live = {episode_name(row) for row in rows}
+    damage, orphans = [], []
+    for name in folder.names():
+        if name not in live:
+            orphans.append(f"{FOLDER}/{name}")
+            continue
+        try:
+            check_episode(folder.read(name) or b"")
+        except ValueError as error:
+            damage.append(f"{FOLDER}/{name}: {error}; remove it, the command that made the run writes it again")
+    return damage, orphans
 
 
 def main(arguments: Sequence[str]) -> int:

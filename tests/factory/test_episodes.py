@@ -13,6 +13,7 @@ from factory.settings import load_config
 from factory.store.episodes import FOLDER, episode_name, is_chosen
 from factory.store.location import Location
 from factory.store.samples import Store
+from factory.store.verify import verify
 from tests.factory.filmed import FilmedWork
 from tests.factory.toy import refs
 
@@ -141,3 +142,20 @@ def test_the_setting(text: str, every: int) -> None:
 def test_a_setting_that_says_nothing_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="episodes"):
         load_config([f"episodes={text}"])
+
+
+def test_verify_finds_every_flipped_bit_of_an_episode_and_tells_outdated_ones(whole: Path, tmp_path: Path) -> None:
+    run(tmp_path)
+    assert verify(Store(tmp_path)).damage == () and verify(Store(tmp_path)).orphans == ()
+    path = tmp_path / FOLDER / min(there(whole))
+    data = path.read_bytes()
+    for at in range(8, len(data) - 8, len(data) // 40):
+        flipped = bytearray(data)
+        flipped[at] ^= 4
+        path.write_bytes(flipped)
+        assert [path.name in line for line in verify(Store(tmp_path)).damage] == [True], f"byte {at} of {len(data)}"
+    path.write_bytes(data[: len(data) // 2])
+    assert len(verify(Store(tmp_path)).damage) == 1
+    path.rename(path.with_name(path.name.replace(path.name[:4], "0000")))
+    verdict = verify(Store(tmp_path))
+    assert verdict.damage == () and len(verdict.orphans) == 1
