@@ -18,9 +18,11 @@ import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from factory.board.gallery import BadRequest, NotThere, place_of
 from factory.board.watch import Snapshot
+from factory.look.episode_messages import episode_of
 from factory.look.sample_picture import (
     BEV_COLUMNS,
     decoded,
@@ -31,7 +33,8 @@ from factory.look.sample_picture import (
     nearer,
     sample_bev,
 )
-from factory.store.location import Location
+from factory.show import logged_drive
+from factory.store.samples import Store
 from factory.store.schema import AGENT_STEPS, SAMPLES, SCHEMA, table_to_rows
 
 BEV_SIZES = (300, 600)  # divisible by 3 and 4
@@ -39,8 +42,11 @@ WIDE_PX = 640
 KEPT_BYTES = 64 * 2**20  # of pictures
 KEPT_GROUP_BYTES = 128 * 2**20  # of row groups, some 4 MB each: neighbours in the gallery stand in one
 KEPT_FILES = 16  # their footers
+KEPT_DRIVES = 4096  # logs' drives of 2 kB, read from prepared clips
+MADE_FROM = ("clip_id", "settings_hash")  # what tells a row's prepared clip
 COLUMNS = tuple(name for name in SCHEMA.names if name not in ("label_subscores", "label_progress"))  # of a row
 Sample = Mapping[str, Any]
+Array = NDArray[np.float64]
 Value = TypeVar("Value")
 
 
@@ -69,10 +75,12 @@ class Kept(Generic[Value]):
 
 
 class Pictures:
-    """Of one table of samples."""
+    """Of one store's samples."""
 
-    def __init__(self, samples: Location) -> None:
-        self._location = samples
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._location = store.samples.location
+        self._logged: Kept[Array | None] = Kept(KEPT_DRIVES, lambda drive: 1)
         self._kept: Kept[bytes] = Kept(KEPT_BYTES, len)
         self._groups: Kept[pa.Table] = Kept(KEPT_GROUP_BYTES, lambda group: int(group.nbytes))
         self._lock = threading.Lock()
@@ -123,11 +131,22 @@ class Pictures:
 
         def make() -> bytes:
             size = (size_px * 4 // 3,) * 2  # `nearer` keeps three quarters
-            return encoded(
-                nearer(sample_bev(self.row(shot, attempt_id, BEV_COLUMNS), None, size, step=step, legend=False))
-            )
+            row = self.row(shot, attempt_id, (*BEV_COLUMNS, *MADE_FROM))
+            return encoded(nearer(sample_bev(row, self._logged_drive(row), size, step=step, legend=False)))
 
         return self._kept.get((*self._place(shot, attempt_id)[:2], "bev", size_px, step), make)
+
+    def episode(self, shot: Snapshot, attempt_id: str) -> bytes:
+        """The sample as an MCAP file, see docs/formats.md. Raises NotThere, also for a row that makes none."""
+        row = self.row(shot, attempt_id)
+        try:
+            return episode_of(row, self._logged_drive(row))
+        except ValueError as error:
+            raise NotThere(f"{attempt_id} makes no episode: {error}") from error
+
+    def _logged_drive(self, row: Sample) -> Array | None:
+        made_from = tuple(row[name] for name in MADE_FROM)
+        return self._logged.get(made_from, lambda: logged_drive(self._store, dict(row)))
 
     def _place(self, shot: Snapshot, attempt_id: str) -> tuple[str, int, Mapping[str, object]]:
         """Its file, its row in it, and what the file's path says."""

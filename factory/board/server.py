@@ -8,6 +8,7 @@
 | `/api/samples/<attempt_id>` | factory.board.gallery.Whole |
 | `/api/failed?page=1` | factory.board.gallery.Failures |
 | `/picture/<attempt_id>/<name>.jpg` | a JPEG, see factory.board.pictures |
+| `/episode/<attempt_id>.mcap` | the sample for Foxglove, Lichtblick or Rerun |
 
 Answers of /api/ are JSON whose fields are those of the named dataclasses; an error is `{"error": why}` with 400 (a
 question put wrongly), 403 (asked under another host name), 404 (not there) or 503 (the tables cannot be read now).
@@ -69,7 +70,7 @@ class Board:
     def __init__(self, store: Store, look_every_s: float = LOOK_EVERY_S) -> None:
         self.watch = Watch(store, look_every_s)
         self._store = store
-        self._pictures = Pictures(store.samples.location)
+        self._pictures = Pictures(store)
 
     def answer(self, target: str) -> Answer:
         """The answer to GET `target`, path and query."""
@@ -104,6 +105,9 @@ class Board:
                 return _json(failures(self.watch.now(), _number(query, "page", 1)))
             case ["picture", attempt_id, name]:
                 return self._picture(_checked(attempt_id), name, query)
+            case ["episode", name]:
+                attempt_id = _checked(name.removesuffix(".mcap"))
+                return Answer(200, "application/octet-stream", self._pictures.episode(self.watch.now(), attempt_id))
         raise NotThere(f"nothing is at {parts.path}")
 
     def _picture(self, attempt_id: str, name: str, query: dict[str, str]) -> Answer:

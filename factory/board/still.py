@@ -35,7 +35,7 @@ def still_page(store: Store, extra: Mapping[str, Any]) -> bytes:
 
     extra: what the live page does not show: facts, settings, left_out, rejected, strips (static/extra.js reads it).
     """
-    shot, pictures = Watch(store).now(), Pictures(store.samples.location)
+    shot, pictures = Watch(store).now(), Pictures(store)
     looks = gallery(shot, {"simulated": "1"}, 1, N_LOOKS)
     shown = _shown(shot, [item.attempt_id for item in looks.items])
     items = [item_of(shot, row) for row in shown]

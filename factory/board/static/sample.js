@@ -20,8 +20,13 @@ function head(w) {
   const link = (id, text, go) => h("a", { class: `button${id ? "" : " off"}`, href: id ? `#/sample/${id}` : null, "data-go": go }, text);
   const facts = Object.entries(w.facts).map(([k, v]) => h("div", null, h("dt", null, k), h("dd", null, v)));
   return h("header", null,
-    h("div", null, h("h1", null, `${i.expert}, round ${i.round}`), h("span", { class: "pill plain" }, i.image_source), h("span", { class: "space" }), link(w.newer, "← newer", "back"), link(w.older, "older →", "on")),
+    h("div", null, h("h1", null, `${i.expert}, round ${i.round}`), h("span", { class: "pill plain" }, i.image_source), h("span", { class: "space" }), episode(i), link(w.newer, "← newer", "back"), link(w.older, "older →", "on")),
     h("p", { class: "path" }, `sample ${i.attempt_id}, log ${i.log_id}`), h("dl", null, facts));
+}
+
+function episode(i) {
+  if (still) return null;
+  return h("a", { class: "button", href: `/episode/${i.attempt_id}.mcap`, download: `sample_${i.attempt_id}.mcap`, title: "for Foxglove, Lichtblick or Rerun" }, "↓ MCAP");
 }
 
 function player(w) {

@@ -2,6 +2,7 @@
 
 import http.client
 import json
+import shutil
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +18,11 @@ from factory.board.pictures import Kept
 from factory.board.server import SERVED, STATIC, Board, Server
 from factory.board.watch import Watch
 from factory.dashboard import Request, main
+from factory.execute import execute
+from factory.export import main as export_main
+from factory.look.sample_picture import encoded, nearer, sample_bev
+from factory.settings import assemble, load_config
+from factory.show import logged_drive
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
 from tests.factory.dashboard.runs import EVIL, REFS, VIEW, counted, run, told
@@ -169,6 +175,37 @@ def test_pictures_are_those_of_the_row(out: Path, board: Board) -> None:
     get(board, f"/picture/{attempt_id}/{len(images)}.jpg", 404)
     get(board, f"/picture/{attempt_id}/bev.jpg?size=9999", 400)
     get(board, f"/picture/{attempt_id}/bev.jpg?step=56", 400)
+    assert "no episode" in get(board, f"/episode/{attempt_id}.mcap", 404)["error"], "its poses are made up"
+
+
+def test_the_whole_logged_drive_is_in_the_picture_and_the_episode_where_the_prepared_clip_is_there(
+    tmp_path: Path,
+) -> None:
+    made = [
+        "clips=synthetic_towns",
+        f"clips.cache_dir={tmp_path / 'towns'}",
+        "clips.n_towns=1",
+        "clips.logs_per_town=1",
+    ]
+    made += ["clips.settings.cameras=[]", "clips.settings.lidar_beams=0", "render=none", "vocabulary.k=2000"]
+    work = assemble(load_config([*made, "experts=[pdm_closed]", f"out={tmp_path / 'out'}"])).work
+    store = Store(tmp_path / "out")
+    execute(work, work.reader.index().refs[:1], ["pdm_closed"], 1, store, "local", say=lambda line: None)
+    table = SampleTable(tmp_path / "out")
+    row = table[table.attempt_ids[0]]
+    drive = logged_drive(store, row)
+    assert drive is not None and len(drive) == 81
+    shown = {}
+    for name, logged in (("whole", drive), ("joined", None)):
+        shown[name] = encoded(nearer(sample_bev(row, logged, (400, 400), legend=False)))
+    target = f"/picture/{row['attempt_id']}/bev.jpg"
+    assert shown["whole"] != shown["joined"]
+    assert Board(store).answer(target).body == shown["whole"]
+    path = tmp_path / "one.mcap"
+    assert export_main(["mcap", f"out={tmp_path / 'out'}", "sample=0", f"to={path}"]) == 0
+    assert Board(store).answer(f"/episode/{row['attempt_id']}.mcap").body == path.read_bytes()
+    shutil.rmtree(tmp_path / "out" / "cache")
+    assert Board(store).answer(target).body == shown["joined"]
 
 
 @pytest.mark.parametrize(
@@ -182,6 +219,8 @@ def test_pictures_are_those_of_the_row(out: Path, board: Board) -> None:
         ("/static/", 404),
         ("/picture/nobody/bev.jpg", 404),
         ("/picture/..%2F/bev.jpg", 404),
+        ("/episode/nobody.mcap", 404),
+        ("/episode/..%2F..%2Fone.mcap", 404),
         ("/elsewhere", 404),
         ("/api/samples?page=0", 400),
         ("/api/samples?page=-1", 400),
