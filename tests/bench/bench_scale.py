@@ -1,0 +1,135 @@
+"""The task graph itself, with stages that only wait: what a cluster of several nodes gains, and what the driver bears.
+
+    python -m tests.bench.bench_scale                                the same run on 1, 2 and 4 nodes of this machine
+    python -m tests.bench.bench_scale nodes=1 attempts=100000 wait_ms=0      a long run, as fast as it goes
+
+Nodes are Ray's own (`ray start` on loopback), with `cpus` each in name; stages sleep, so that the cores of this machine
+are no limit before the graph is. A row carries `row_kb` of incompressible bytes for its pictures. `ideal` is the time
+that all the sleeping takes on so many CPUs. Memory and CPU time are the driver's.
+"""
+
+import json
+import math
+import resource
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from factory.arguments import Refused, parse
+from factory.clips.reader import ClipRef
+from factory.execute import COMPLETE, execute
+from factory.graph import ray  # with the environment that keeps it on loopback
+from factory.store.samples import Store
+from factory.work import Accepted, AttemptResult, PreparedClip
+from tests.factory.toy import ToyWork, stream
+
+EXPERTS = ("pdm_closed", "recovery")
+CANDIDATES = 16  # of a clip; half of them are accepted, so that five rounds take ten
+
+
+@dataclass(frozen=True)
+class Request:
+    """The command line."""
+
+    nodes: str = "1,2,4"
+    cpus: int = 2  # of each node
+    attempts: int = 2000  # about
+    wait_ms: int = 200  # of a stage
+    rounds: int = 5
+    row_kb: int = 20
+
+
+@dataclass(frozen=True)
+class WaitingWork(ToyWork):
+    """Rows with some weight."""
+
+    row_kb: int = 20
+
+    def attempt(self, prepared: PreparedClip, candidate: int, expert: str) -> AttemptResult:
+        result = super().attempt(prepared, candidate, expert)
+        if not isinstance(result, Accepted):
+            return result
+        noise = stream(prepared.clip_id, "picture", candidate).bytes(self.row_kb * 1024)
+        image: Any = result.row["images"]
+        return replace(result, row={**result.row, "images": [{**image[0], "jpeg": noise}]})
+
+
+def main(argv: Sequence[str]) -> int:
+    """Prints one table."""
+    if {"-h", "--help"} & set(argv):
+        print(__doc__)
+        return 0
+    try:
+        request = parse(Request, argv)
+    except Refused as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print(f"{request.cpus} CPUs a node, stages of {request.wait_ms} ms, rows of {request.row_kb} kB")
+    print(f"{'nodes':>5}{'attempts':>10}{'samples':>9}{'seconds':>9}{'ideal':>8}{'efficiency':>12}{'per s':>8}"
+          f"{'driver CPU ms':>15}{'driver MB':>11}{'commits':>9}{'files':>7}{'MB':>8}")  # fmt: skip
+    for nodes in request.nodes.split(","):
+        print(measured(request, int(nodes)), flush=True)
+    return 0
+
+
+def measured(request: Request, nodes: int) -> str:
+    """A row of the table: a run on so many nodes."""
+    from ray.cluster_utils import Cluster
+
+    per_clip = len(EXPERTS) * min(2 * request.rounds, CANDIDATES)
+    refs = [ClipRef("waiting", f"log{i // 50}", 1000 * i) for i in range(math.ceil(request.attempts / per_clip))]
+    work = WaitingWork(n_candidates=CANDIDATES, seconds=request.wait_ms / 1000, row_kb=request.row_kb)
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": request.cpus, "include_dashboard": False})
+    try:
+        for _ in range(nodes - 1):
+            cluster.add_node(num_cpus=request.cpus)
+        ray.init(address=cluster.address, log_to_driver=False)
+        with tempfile.TemporaryDirectory() as folder:
+            return _row(request, nodes, refs, work, Path(folder) / "out")
+    finally:
+        ray.shutdown()
+        cluster.shutdown()
+
+
+def _row(request: Request, nodes: int, refs: Sequence[ClipRef], work: WaitingWork, out: Path) -> str:
+    ray.get([_warm.remote() for _ in range(4 * nodes * request.cpus)])  # worker processes, that take seconds to start
+    before, began = _cpu_s(), time.perf_counter()
+    summary = execute(work, refs, EXPERTS, request.rounds, Store(out), "ray", say=lambda line: None)
+    took, cpu_s = time.perf_counter() - began, _cpu_s() - before
+    if summary.exit_code != COMPLETE:
+        raise RuntimeError(f"the run ended with {summary.exit_code}: {summary.message} {summary.counts}")
+    attempts = summary.executed.attempts
+    ideal = work.seconds * (attempts + summary.executed.prepared) / (nodes * request.cpus)
+    store = Store(out)
+    files = list(out.rglob("*.parquet"))
+    size = sum(path.stat().st_size for path in files) / 2**20
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return (f"{nodes:5d}{attempts:10d}{len(store.samples):9d}{took:9.1f}{ideal:8.1f}{100 * ideal / took:11.1f}%"
+            f"{attempts / took:8.1f}{1000 * cpu_s / attempts:15.2f}{peak:11.0f}{_commits(out):9d}{len(files):7d}"
+            f"{size:8.0f}")  # fmt: skip
+
+
+@ray.remote(num_cpus=1)
+def _warm() -> None:
+    import factory.steps  # noqa: F401
+
+    time.sleep(0.2)
+
+
+def _cpu_s() -> float:
+    used: Any = resource.getrusage(resource.RUSAGE_SELF)
+    return float(used.ru_utime + used.ru_stime)
+
+
+def _commits(out: Path) -> int:
+    """Of all tables."""
+    logs = list(out.rglob("_delta_log/*.json"))
+    return sum(any("commitInfo" in json.loads(line) for line in path.read_text().splitlines()) for path in logs)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
