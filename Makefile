@@ -4,7 +4,7 @@ VENV   := .venv
 PY     := $(VENV)/bin/python
 DEMO   := runs/demo
 
-.PHONY: install demo test unit lint format bench bench-reward bench-render bench-loader bench-planners study study-data study-logs study-logs-data clean
+.PHONY: install demo test unit lint format bench bench-reward bench-render bench-loader bench-planners bench-scale study study-data study-logs study-logs-data clean
 
 install: $(VENV)/.installed
 
@@ -55,9 +55,14 @@ bench-loader: install
 bench-planners: install
 	$(PY) -m tests.bench.bench_planners device=$(or $(DEVICE),cpu)
 
+# The same run on 1, 2 and 4 nodes of this machine, with stages that only wait.
+bench-scale: install
+	$(PY) -m tests.bench.bench_scale
+
 # The co-training study of docs/study.md. MINUTES=25: a part of it; the same command goes on where it stopped.
 STUDY := runs/study
 TRAIN := clips=synthetic_towns clips.first_seed=1 clips.n_towns=17 clips.logs_per_town=3 clips.split=train
+BEGIN := clips=synthetic_towns clips.first_seed=201 clips.n_towns=32 clips.logs_per_town=6 clips.split=train clips.settings.steps_per_photo=5 clips.settings.lidar_beams=0
 HELD  := clips=synthetic_towns clips.first_seed=101 clips.n_towns=6 clips.logs_per_town=6 clips.first_window=1 clips.split=test
 TOWN  := render=town render.psnr_gate=mark $(if $(MINUTES),minutes=$(MINUTES))
 LABEL := vocabulary.k=32768 reward.label_vocabulary=$(STUDY)/labels.npy
@@ -72,6 +77,7 @@ study-data: install
 	ln -sfn ../blocks $(STUDY)/replay/cache
 	ln -sfn ../blocks $(STUDY)/control/cache
 	test -f $(STUDY)/labels.npy || $(PY) -m factory.vocabulary kinematic=true k=512 out=$(STUDY)/labels.npy
+	$(PY) -m factory.run $(BEGIN) $(TOWN) $(LABEL) experts=[human] rounds=1 out=$(STUDY)/begin
 	$(PY) -m factory.run $(TRAIN) $(TOWN) $(LABEL) rounds=5 out=$(STUDY)/train
 	$(PY) -m factory.run preset=hard_benchmark $(HELD) $(TOWN) vocabulary.k=131072 out=$(STUDY)/hard
 	$(PY) -m factory.run $(TRAIN) $(TOWN) $(LABEL) rounds=5 traffic=replay experts=[pdm_closed] out=$(STUDY)/replay
