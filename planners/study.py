@@ -70,7 +70,8 @@ def sizes_of(settings: StudySettings) -> Sizes:
     """What the plan depends on. Raises ConfigError where one side of the PSNR bound has no samples and is asked for."""
     sim = DataSettings(sim=settings.data, experts=("pdm_closed",), max_round=settings.rounds - 1)
     high = open_dataset(replace(sim, psnr_min=settings.psnr_db))
-    steps = settings.epochs * ((len(open_dataset(DataSettings(real=settings.data))) + len(high)) // settings.batch_size)
+    real = sum(len(open_dataset(DataSettings(real=table))) for table in (settings.data, settings.begin) if table)
+    steps = settings.epochs * ((real + len(high)) // settings.batch_size)
     if "psnr" not in settings.parts:
         return Sizes(steps)
     try:

@@ -62,7 +62,7 @@ class Setup:
     """What one planner is trained on, and how long."""
 
     planner: str
-    data: Data  # real samples, and those of this expert; `begin`: the real samples that all are trained on first
+    data: Data  # real samples, and those of this expert; `begin`: real samples of other towns alone, where all begin
     rounds: int  # simulated ones, 0 with real samples alone
     budget: Budget  # equal passes over its own data (the paper), or equal optimiser steps
     imitation: Literal["all", "real", "none"] = "all"
@@ -88,9 +88,10 @@ class Setup:
         if self.data == "logged":
             simulated = settings.control
         begins = self.data == "begin"
+        real = [settings.begin] if begins else [settings.data, *([settings.begin] if settings.begin else [])]
         overrides = [
             f"planner={settings.planners[self.planner]}",
-            f"data.real=[{settings.begin if begins else settings.data}]",
+            f"data.real=[{','.join(str(table) for table in real)}]",
             f"data.sim=[{simulated if self.rounds else ''}]",
             f"data.val=[{settings.val}]",
             f"data.real_share={self.real_share}",

@@ -33,14 +33,15 @@ def test_every_family_is_trained_with_and_without_simulation_in_equal_epochs_and
 
 
 def test_every_training_begins_with_what_the_same_planner_learnt_in_other_towns() -> None:
-    everything = settings(out="here", begin="elsewhere")
+    everything = settings(out="here", data="made", begin="elsewhere")
     planned = trainings(comparisons(everything), everything, SIZES)
     first = {t.label: t for t in planned if t.facts["data"] == "begin"}
     assert set(first) == {f"{planner}-begin-epochs-0" for planner in everything.planners}
     for training in planned:
         mine = f"init_from=here/trainings/{training.facts['planner']}-begin-epochs-0"
         assert (mine in training.overrides) == (training.label not in first)
-        assert ("data.real=[elsewhere]" in training.overrides) == (training.label in first)
+        real = "elsewhere" if training.label in first else "made,elsewhere"
+        assert f"data.real=[{real}]" in training.overrides
     alone = settings(begin=None)
     planned = trainings(comparisons(alone), alone, SIZES)
     assert not any("begin" in t.label or any(o.startswith("init_from") for o in t.overrides) for t in planned)
