@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from factory.arguments import BAD_ARGUMENTS, Refused, parse
+from factory.arguments import Refused, answer
 from factory.status import open_store
 
 if TYPE_CHECKING:
@@ -40,16 +40,7 @@ class Request:
 
 def main(argv: Sequence[str]) -> int:
     """The command; returns the exit code."""
-    if {"-h", "--help"} & set(argv):
-        print(__doc__)
-        return 0
-    try:
-        request = parse(Request, argv)
-        print(write_report(open_store(request.out), request.to))
-    except Refused as error:
-        print(f"error: {error}", file=sys.stderr)
-        return BAD_ARGUMENTS
-    return 0
+    return answer(__doc__ or "", Request, argv, lambda request: [write_report(open_store(request.out), request.to)])
 
 
 def write_report(store: "Store", to: str | None = None) -> str:

@@ -2,7 +2,8 @@
 
     front.jpg           what the camera that looks ahead saw at now
     <n>.jpg             the n-th stored image, n as in the sample's `images`
-    bev.jpg             seen from above; step=0..55 (-1.5 .. 4.0 s at 10 Hz, 15 is now), size=300 or 600
+    bev.jpg             seen from above; step=0..55 (-1.5 .. 4.0 s at 10 Hz, 15 is now), size=300, or 600 with the whole
+                        logged drive, for which the prepared clip is read: 70 ms, too long for a gallery's page
 
 A sample's row is read by its file and row group: one group, never a file, and the latest groups are kept. Stored JPEGs
 go out as they are, unless they are wider than WIDE_PX and small=1 asks for less.
@@ -37,7 +38,8 @@ from factory.show import logged_drive
 from factory.store.samples import Store
 from factory.store.schema import AGENT_STEPS, SAMPLES, SCHEMA, table_to_rows
 
-BEV_SIZES = (300, 600)  # divisible by 3 and 4
+LARGE_PX = 600
+BEV_SIZES = (300, LARGE_PX)  # divisible by 3 and 4
 WIDE_PX = 640
 KEPT_BYTES = 64 * 2**20  # of pictures
 KEPT_GROUP_BYTES = 128 * 2**20  # of row groups, some 4 MB each: neighbours in the gallery stand in one
@@ -132,7 +134,8 @@ class Pictures:
         def make() -> bytes:
             size = (size_px * 4 // 3,) * 2  # `nearer` keeps three quarters
             row = self.row(shot, attempt_id, (*BEV_COLUMNS, *MADE_FROM))
-            return encoded(nearer(sample_bev(row, self._logged_drive(row), size, step=step, legend=False)))
+            logged = self._logged_drive(row) if size_px == LARGE_PX else None
+            return encoded(nearer(sample_bev(row, logged, size, step=step, legend=False)))
 
         return self._kept.get((*self._place(shot, attempt_id)[:2], "bev", size_px, step), make)
 

@@ -10,16 +10,17 @@ that all the sleeping takes on so many CPUs. Memory and CPU time are the driver'
 
 import json
 import math
+import re
 import resource
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from factory.arguments import Refused, parse
+from factory.arguments import answer
 from factory.clips.reader import ClipRef
 from factory.execute import COMPLETE, execute
 from factory.graph import ray  # with the environment that keeps it on loopback
@@ -42,6 +43,15 @@ class Request:
     rounds: int = 5
     row_kb: int = 20
 
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"[1-9]\d*(,[1-9]\d*)*", self.nodes):
+            raise ValueError(f"nodes={self.nodes}: give numbers with commas between them, as 1,2,4")
+
+    @property
+    def each(self) -> list[int]:
+        """Numbers of nodes."""
+        return [int(number) for number in self.nodes.split(",")]
+
 
 @dataclass(frozen=True)
 class WaitingWork(ToyWork):
@@ -58,22 +68,13 @@ class WaitingWork(ToyWork):
         return replace(result, row={**result.row, "images": [{**image[0], "jpeg": noise}]})
 
 
-def main(argv: Sequence[str]) -> int:
-    """Prints one table."""
-    if {"-h", "--help"} & set(argv):
-        print(__doc__)
-        return 0
-    try:
-        request = parse(Request, argv)
-    except Refused as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    print(f"{request.cpus} CPUs a node, stages of {request.wait_ms} ms, rows of {request.row_kb} kB")
-    print(f"{'nodes':>5}{'attempts':>10}{'samples':>9}{'seconds':>9}{'ideal':>8}{'efficiency':>12}{'per s':>8}"
-          f"{'driver CPU ms':>15}{'driver MB':>11}{'commits':>9}{'files':>7}{'MB':>8}")  # fmt: skip
-    for nodes in request.nodes.split(","):
-        print(measured(request, int(nodes)), flush=True)
-    return 0
+def lines(request: Request) -> Iterator[str]:
+    """The table, a row for each number of nodes."""
+    yield f"{request.cpus} CPUs a node, stages of {request.wait_ms} ms, rows of {request.row_kb} kB"
+    yield (f"{'nodes':>5}{'attempts':>10}{'samples':>9}{'seconds':>9}{'ideal':>8}{'efficiency':>12}{'per s':>8}"
+           f"{'driver CPU ms':>15}{'driver MB':>11}{'commits':>9}{'files':>7}{'MB':>8}")  # fmt: skip
+    for nodes in request.each:
+        yield measured(request, nodes)
 
 
 def measured(request: Request, nodes: int) -> str:
@@ -132,4 +133,4 @@ def _commits(out: Path) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(answer(__doc__ or "", Request, sys.argv[1:], lines))

@@ -118,16 +118,22 @@ def test_lineage_of_what_is_no_sample_says_what_became_of_it(out: Path, capsys: 
     assert ask(capsys, "lineage", "zz", f"out={out}")[0] == 2
 
 
-def test_retry_says_what_and_how_and_leaves_the_rest_alone(
-    out: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[list[str]] = []
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """The arguments of every run that a command would begin; none is begun."""
+    found: list[list[str]] = []
 
     def run(argv: Sequence[str]) -> int:
-        asked.append(list(argv))
+        found.append(list(argv))
         return 0
 
     monkeypatch.setattr("factory.run.main", run)
+    return found
+
+
+def test_retry_says_what_and_how_and_leaves_the_rest_alone(
+    out: Path, asked: list[list[str]], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(out)
     code, text, _ = ask(capsys, "retry", f"out={out}", "dry_run=true")
     assert code == 0 and "1 failed: bug 1" in text and "ZeroDivisionError" in text and not asked
@@ -137,15 +143,8 @@ def test_retry_says_what_and_how_and_leaves_the_rest_alone(
 
 
 def test_retry_calls_no_code_that_a_table_alone_names(
-    out: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    out: Path, asked: list[list[str]], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[list[str]] = []
-
-    def run(argv: Sequence[str]) -> int:
-        asked.append(list(argv))
-        return 0
-
-    monkeypatch.setattr("factory.run.main", run)
     monkeypatch.chdir(out)
     location, named = Store(out).location, "+expert.mine._target_=my_package.MyExpert"
     kept = location.read(CURRENT_RUN)

@@ -197,10 +197,12 @@ def test_the_whole_logged_drive_is_in_the_picture_and_the_episode_where_the_prep
     assert drive is not None and len(drive) == 81
     shown = {}
     for name, logged in (("whole", drive), ("joined", None)):
-        shown[name] = encoded(nearer(sample_bev(row, logged, (400, 400), legend=False)))
-    target = f"/picture/{row['attempt_id']}/bev.jpg"
+        shown[name] = encoded(nearer(sample_bev(row, logged, (800, 800), legend=False)))
+    target = f"/picture/{row['attempt_id']}/bev.jpg?size=600"
     assert shown["whole"] != shown["joined"]
     assert Board(store).answer(target).body == shown["whole"]
+    small = encoded(nearer(sample_bev(row, None, (400, 400), legend=False)))
+    assert Board(store).answer(target.removesuffix("?size=600")).body == small, "a gallery reads no prepared clips"
     path = tmp_path / "one.mcap"
     assert export_main(["mcap", f"out={tmp_path / 'out'}", "sample=0", f"to={path}"]) == 0
     assert Board(store).answer(f"/episode/{row['attempt_id']}.mcap").body == path.read_bytes()
