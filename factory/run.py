@@ -116,6 +116,7 @@ def run(overrides: Sequence[str]) -> int:
         gpu_share=config.gpu_share if assembled.work.draws_on_gpu else 0.0,
         on_change=config.on_change,
         retry=config.retry_failed,
+        shard_seconds=config.shard_seconds,
         minutes=config.minutes,
         episodes=config.one_episode_in,
         command=overrides,

@@ -113,6 +113,7 @@ class RunConfig:
     on_change: Literal["stop", "keep", "redo"]
     retry_failed: bool
     minutes: float | None
+    shard_seconds: float
     episodes: int | Literal["none", "all"]
     dry_run: bool
 
@@ -123,6 +124,8 @@ class RunConfig:
             raise ValueError(f"experts={list(self.experts)}: name each expert once, at least one")
         if self.minutes is not None and not self.minutes >= 0.0:
             raise ValueError(f"minutes={self.minutes}: must not be negative, or null for no bound")
+        if not self.shard_seconds > 0.0:
+            raise ValueError(f"shard_seconds={self.shard_seconds}: must be positive")
         if self.one_episode_in < 0 or self.episodes == 0:
             raise ValueError(f"episodes={self.episodes}: must be none, all, or n for one sample in n")
         for name in ("limit", "workers"):

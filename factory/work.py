@@ -8,6 +8,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Protocol
 
 from factory.clips.reader import ClipRef
@@ -95,12 +96,12 @@ class RunIdentity:
     prepare_digest: str  # of all that `prepare` depends on besides the clip: perturb, traffic, seed, stage versions;
     # UNLISTED in a run of `human` alone
 
-    @property
+    @cached_property
     def settings_hash(self) -> str:
         """16 hex digits of the canonical JSON of `settings`."""
         return hashlib.sha256(canonical_json(self.settings).encode()).hexdigest()[:16]
 
-    @property
+    @cached_property
     def versions_json(self) -> str:
         """`stage_versions` as it stands in the tables."""
         return canonical_json(self.stage_versions)

@@ -4,6 +4,7 @@ import os
 import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 
 from pyarrow import fs
@@ -86,19 +87,23 @@ class Location:
     def filesystem(self) -> tuple[fs.FileSystem, str]:
         if self.is_local:
             return fs.LocalFileSystem(), self.uri
-        if self.uri.startswith("s3://") and self.options:
-            endpoint = self.options.get("AWS_ENDPOINT_URL", "")
-            scheme, _, host = endpoint.rpartition("://")
-            return (
-                fs.S3FileSystem(
-                    access_key=self.options.get("AWS_ACCESS_KEY_ID"),
-                    secret_key=self.options.get("AWS_SECRET_ACCESS_KEY"),
-                    session_token=self.options.get("AWS_SESSION_TOKEN"),
-                    region=self.options.get("AWS_REGION"),
-                    scheme=scheme or "https",
-                    endpoint_override=host or None,
-                ),
-                self.uri.removeprefix("s3://"),
-            )
-        filesystem, base = fs.FileSystem.from_uri(self.uri)
-        return filesystem, base
+        return _remote(os.getpid(), self.uri, tuple(sorted(self.options.items())))
+
+
+@lru_cache(maxsize=64)
+def _remote(process: int, uri: str, options: tuple[tuple[str, str], ...]) -> tuple[fs.FileSystem, str]:
+    """A client that keeps its connections, which a forked `process` must not share, and the folder's path there."""
+    if uri.startswith("s3://") and options:
+        given = dict(options)
+        scheme, _, host = given.get("AWS_ENDPOINT_URL", "").rpartition("://")
+        client = fs.S3FileSystem(
+            access_key=given.get("AWS_ACCESS_KEY_ID"),
+            secret_key=given.get("AWS_SECRET_ACCESS_KEY"),
+            session_token=given.get("AWS_SESSION_TOKEN"),
+            region=given.get("AWS_REGION"),
+            scheme=scheme or "https",
+            endpoint_override=host or None,
+        )
+        return client, uri.removeprefix("s3://")
+    client, base = fs.FileSystem.from_uri(uri)
+    return client, base

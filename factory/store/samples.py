@@ -7,8 +7,9 @@ crash in between loses at most the outcomes, whose attempts the next run tries a
 import json
 import os
 import re
+import sys
 from collections import defaultdict
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -172,12 +173,12 @@ class Store:
             if not past.current:
                 stale[place].add(past.attempt_id)
 
-        for row in self.outcomes.read(OUTCOME_STATE).to_pylist():
+        for row in _rows(self.outcomes, OUTCOME_STATE):
             is_current = current(row["settings_hash"], row["stage_versions"], row["expert"], row["expert_digest"])
-            error_kind, tries, versions = row["error_kind"], row["tries"], row["stage_versions"]
+            error_kind, tries, versions = row["error_kind"], row["tries"], sys.intern(row["stage_versions"])
             past = Past(row["attempt_id"], Kind(row["kind"]), is_current, -1, error_kind, tries, versions)
             enter((row["clip_id"], row["expert"]), row["candidate_index"], past)
-        for row in self.samples.read(SAMPLE_STATE).to_pylist():
+        for row in _rows(self.samples, SAMPLE_STATE):
             is_current = current(row["settings_hash"], row["stage_versions"], row["expert"], row["expert_digest"])
             past = Past(row["attempt_id"], Kind.ACCEPTED, is_current, round=row["round"])
             enter((row["clip_id"], row["expert"]), row["candidate_index"], past)
@@ -211,6 +212,12 @@ class Store:
         named = {line for line in (*known.split("; "), *licences) if line}
         if "; ".join(sorted(named)) != known:
             self.samples.set_property(LICENCES_PROPERTY, "; ".join(sorted(named)))
+
+
+def _rows(table: KeyedTable, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """Row by row; no more than a file's at a time."""
+    for _, rows in table.files(columns):
+        yield from rows.to_pylist()
 
 
 def run_number(records: Sequence[Mapping[str, Any]]) -> Callable[[Mapping[str, Any]], int]:

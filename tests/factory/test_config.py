@@ -150,6 +150,7 @@ def test_render_settings_at_their_bounds_are_taken() -> None:
         ("rounds=many", r"run\.rounds: .*'many'"),
         ("rounds=0", "rounds=0"),
         ("limit=0", "limit=0"),
+        ("shard_seconds=0", "shard_seconds=0"),
         ("executor=spark", r"run\.executor: .*'spark'"),
         ("experts=[]", "at least one"),
         ("experts=[human,human]", "each expert once"),

@@ -1,13 +1,16 @@
 """Exactly once: two-step commits, unique keys, one writer, damage that is found."""
 
 import io
+import threading
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+import factory.store.table as table_module
 from factory.steps import Stamp
 from factory.store.location import Location
 from factory.store.schema import SAMPLES, sample_row_to_table
@@ -72,6 +75,32 @@ def test_replacing_rows_is_one_transaction_that_keeps_their_neighbours(location:
     assert table.version == (before or 0) + 1
     table.commit([shard(location, "d", 3.0)])
     assert content(location)["d"] == 3.0
+
+
+def test_an_object_stores_files_are_read_side_by_side_and_come_in_order(
+    location: Location, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    KeyedTable(location, SPEC).commit([shard(location, key, round_=i) for i, key in enumerate("abcd")])
+    table = KeyedTable(Location(f"file://{location.uri}"), SPEC)
+    two, plainly = threading.Barrier(2), table_module.read_parquet
+
+    def with_another(*args: Any) -> pa.Table:
+        two.wait(timeout=30)  # for ever alone, were they read one after the other
+        return plainly(*args)
+
+    monkeypatch.setattr(table_module, "read_parquet", with_another)
+    found = list(table.files())
+    assert [path for path, _ in found] == sorted(path for path, _ in found)
+    assert [rows["key"].to_pylist() for _, rows in found] == [["a"], ["b"], ["c"], ["d"]]
+
+
+def test_a_damaged_file_of_an_object_store_is_named(location: Location) -> None:
+    KeyedTable(location, SPEC).commit([shard(location, "a"), shard(location, "b", round_=1)])
+    table = KeyedTable(Location(f"file://{location.uri}"), SPEC)
+    path = sorted(table.live_files())[1]
+    Path(location.uri, path).write_bytes(b"PAR1")
+    with pytest.raises(OSError, match=path):
+        list(table.files())
 
 
 def test_the_newest_run_writes_and_the_older_one_fails_clearly(location: Location) -> None:
