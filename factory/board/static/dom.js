@@ -17,7 +17,7 @@ export const h = (tag, attributes, ...children) => built(document.createElement(
 export const s = (tag, attributes, ...children) => built(document.createElementNS(SVG, tag), attributes, children);
 
 export const count = (n) => n.toLocaleString("en-US");
-export const percent = (share) => (share === null ? "-" : `${(100 * share).toFixed(1)} %`);
+export const percent = (share) => (share === null ? "-" : `${(100 * share).toFixed(1)}\u00a0%`);
 export const score = (value) => (value === null ? "-" : value.toFixed(3));
 
 const OLD_MS = 20 * 3600 * 1000; // then the day is told too

@@ -4,7 +4,9 @@ Argoverse 2's layout (Wilson et al. 2021): annotations, ego poses, calibration, 
 """
 
 import json
-from collections.abc import Iterable, Mapping
+import sys
+import time
+from collections.abc import Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -73,9 +75,20 @@ def write_town(out: Path, n_clips: int, seed: int, settings: TownSettings, threa
     return write_logs(out, range(-(-n_clips // WINDOWS_PER_LOG)), seed, settings, threads)
 
 
-def write_logs(out: Path, indices: Iterable[int], seed: int, settings: TownSettings, threads: int = 2) -> list[Path]:
-    """Writes these logs of the seed under `out`; a log's bytes depend on its index, not on the others."""
-    return [write_log(out / log_name(seed, i), *plan_log(seed, i), settings, i, threads) for i in indices]
+def write_logs(out: Path, indices: Collection[int], seed: int, settings: TownSettings, threads: int = 2) -> list[Path]:
+    """Writes these logs of the seed under `out`; a log's bytes depend on its index, not on the others.
+
+    Logs with sensors take seconds each, so how far it is goes to stderr.
+    """
+    folders, began = [], time.monotonic()
+    for number, i in enumerate(indices, start=1):
+        folders.append(write_log(out / log_name(seed, i), *plan_log(seed, i), settings, i, threads))
+        if settings.cameras or settings.lidar_beams:
+            left_s = (time.monotonic() - began) / number * (len(indices) - number)
+            print(
+                f"town {seed}: log {number} of {len(indices)} painted  ETA {left_s:.0f} s", file=sys.stderr, flush=True
+            )
+    return folders
 
 
 def write_log(

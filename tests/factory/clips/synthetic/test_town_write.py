@@ -38,8 +38,11 @@ def town(reader: SyntheticReader) -> Path:
     return reader.root
 
 
-def test_the_same_seed_gives_the_same_bytes_with_any_number_of_threads(town: Path, tmp_path: Path) -> None:
+def test_the_same_seed_gives_the_same_bytes_with_any_number_of_threads(
+    town: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     write_town(tmp_path, 1, 0, SMALL, threads=1)
+    assert "town 0: log 1 of 1 painted" in capsys.readouterr().err
     shorter, longer = digests(tmp_path), digests(town)
     assert shorter
     assert shorter.items() <= longer.items()
@@ -96,9 +99,10 @@ def test_a_town_is_written_once_and_never_seen_half(tmp_path: Path, monkeypatch:
     assert len(SyntheticReader(tmp_path, 1, 0, blind).index().refs) == 1
 
 
-def test_another_seed_gives_another_town(town: Path, tmp_path: Path) -> None:
+def test_another_seed_gives_another_town(town: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     blind = TownSettings(cameras=(), lidar_beams=0)
     folder = write_town(tmp_path, 1, 1, blind)[0]
+    assert capsys.readouterr().err == ""  # no line where nothing is waited for
     first = sorted(town.iterdir())[0]
     name = "city_SE3_egovehicle.feather"
     assert (folder / name).read_bytes() != (first / name).read_bytes()
