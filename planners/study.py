@@ -5,9 +5,11 @@
     python -m planners.study ... parts=[main,rounds]                 some comparisons only
 
 Every comparison is made twice: with equal passes over a planner's own data, as the paper does, and with equal optimiser
-steps, since more data in equal passes is more training as well. Tables go to `report`: `trainings.csv` (each training),
-`comparisons.csv` (means over seeds, differences with paired bootstrap intervals over clips and seeds), `bounds.csv`,
-`curves.csv`, and pictures. Exit codes: 0 complete, 2 bad settings, 3 a training failed, 4 not complete yet, resumable.
+steps, since more data in equal passes is more training as well. One seed of one part is trained and evaluated after the
+other; when the minutes are out, what is evaluated is in the tables, with the number of its seeds. Tables go to
+`report`: `trainings.csv` (each training), `comparisons.csv` (means over seeds, differences with paired bootstrap
+intervals over clips and seeds), `bounds.csv`, `curves.csv`, and pictures. Exit codes: 0 complete, 2 bad settings,
+3 a training failed, 4 not complete yet, resumable.
 """
 
 import sys
@@ -30,40 +32,48 @@ from planners.scaling_law import FEWEST, fit_scaling
 from planners.score_rows import read_rows
 from planners.scores import BOUNDS, SHOWN, name_of, scores_of, write_csv
 from planners.study_figures import draw_learning
-from planners.study_plan import Comparison, Setup, Sizes, StudySettings, comparisons, ensembles, trainings
+from planners.study_plan import Comparison, Portion, Setup, Sizes, StudySettings, comparisons, portions, so_far
 from planners.sweep import EVALUATIONS, Means, SweepFailed, Training, evaluate_all, folder_of, train_all
 
 BAD_CONFIG, FAILED, INTERRUPTED = 2, 3, 4
 
 
 def run(settings: StudySettings) -> int:
-    """Train, evaluate, compare, draw; the exit code."""
-    out, report = Path(settings.out), Path(settings.report)
-    wanted = comparisons(settings)
-    planned = trainings(wanted, settings, sizes_of(settings))
-    means = Means(jobs=settings.jobs, minutes=settings.minutes)
-    evaluations = out / EVALUATIONS
-    first = [training for training in planned if training.facts["data"] == "begin"]
-    if not (
-        train_all(first, out, means)
-        and train_all(planned, out, means)
-        and evaluate_all(planned, out, settings.benchmark, others=ensembles(wanted, out), means=means)
-    ):
-        print("not all is trained and evaluated yet: the same command goes on", file=sys.stderr)
+    """Train, evaluate, compare, draw, one seed of one part after the other; the exit code."""
+    out, wanted, means = Path(settings.out), comparisons(settings), Means(jobs=settings.jobs, minutes=settings.minutes)
+    planned, done = portions(wanted, settings, sizes_of(settings)), list[Portion]()
+    for portion in planned:
+        print(f"{portion.part}, seed {portion.seed}", file=sys.stderr)
+        if not train_all(portion.trainings, out, means):
+            break
+        if not evaluate_all(portion.trainings, out, settings.benchmark, others=portion.ensembles, means=means):
+            break
+        done.append(portion)
+    standing = so_far(wanted, {label for portion in done for label in portion.labels})
+    if done:
+        write_report(standing, [training for portion in done for training in portion.trainings], settings)
+    if len(done) < len(planned):
+        print(f"{len(done)} of {len(planned)} seeds of parts are done: the same command goes on", file=sys.stderr)
         return INTERRUPTED
+    return 0
+
+
+def write_report(standing: Sequence[Comparison], trained: Sequence[Training], settings: StudySettings) -> None:
+    """The tables and pictures of what is evaluated."""
+    out, report = Path(settings.out), Path(settings.report)
+    evaluations = out / EVALUATIONS
     report.mkdir(parents=True, exist_ok=True)
-    rows = [row_of(training, out, evaluations) for training in planned]
+    rows = [row_of(training, out, evaluations) for training in trained]
     write_csv(report / "trainings.csv", rows)
     write_csv(report / "bounds.csv", [{"planner": name, **scores_of(evaluations / name)} for name in BOUNDS])
-    write_csv(report / "comparisons.csv", compared(wanted, evaluations))
-    curves = curves_of(wanted, rows)
+    write_csv(report / "comparisons.csv", compared(standing, evaluations))
+    curves = curves_of(standing, rows)
     if curves:
         write_csv(report / "curves.csv", [curve.row() for curve in curves])
         draw_curves(curves, "two-stage EPDMS", report / "scaling.png")
-    draw_learning({t.label: folder_of(out, t) for t in planned if t.facts["seed"] == 0}, report / "learning.png")
-    print(text_of(wanted, evaluations))
+    draw_learning({t.label: folder_of(out, t) for t in trained if t.facts["seed"] == 0}, report / "learning.png")
+    print(text_of(standing, evaluations))
     print(f"tables and pictures: {report}")
-    return 0
 
 
 def sizes_of(settings: StudySettings) -> Sizes:
@@ -156,16 +166,16 @@ def curves_of(wanted: Sequence[Comparison], rows: Sequence[Mapping[str, Any]]) -
 
 def text_of(wanted: Sequence[Comparison], evaluations: Path) -> str:
     """The main comparisons' two-stage scores, to be printed."""
-    lines = [f"{'trained on':<36}{'equal':>8}{'EPDMS':>8}{'difference':>12}   95 % interval"]
+    lines = [f"{'trained on':<36}{'equal':>8}{'seeds':>7}{'EPDMS':>8}{'difference':>12}   95 % interval"]
     for row in compared([one for one in wanted if one.part == "main"], evaluations):
         if row["stage"] == "final":
             trained_on = f"{row['planner']}-{row['data']}" + ("-rewards_only" if row["imitation"] == "real" else "")
-            line = f"{trained_on:<36}{row['budget']:>8}{row['epdms']:8.2f}"
+            line = f"{trained_on:<36}{row['budget']:>8}{row['seeds']:7}{row['epdms']:8.2f}"
             if row["reference"]:
                 line += f"{row['difference']:+12.2f}   {row['low']:+.2f} .. {row['high']:+.2f}"
             lines.append(line)
     for name in BOUNDS:
-        lines.append(f"{name:<44}{scores_of(evaluations / name)[name_of('final', SHOWN['final'])]:8.2f}")
+        lines.append(f"{name:<51}{scores_of(evaluations / name)[name_of('final', SHOWN['final'])]:8.2f}")
     return "\n".join(lines)
 
 

@@ -1,7 +1,8 @@
 """What the study compares: setups, each trained with several seeds, and which of them is held against which."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, Literal
 
@@ -280,23 +281,49 @@ PARTS = {
 }
 
 
-def trainings(found: Sequence[Comparison], settings: StudySettings, sizes: Sizes) -> list[Training]:
-    """Every setup with every seed that some comparison asks for, each once."""
-    seeds: dict[Setup, int] = {}
-    for one in found:
-        for setup in (one.setup, one.reference):
-            if setup is not None and setup.planner != ENSEMBLE:
-                seeds[setup] = max(seeds.get(setup, 0), one.seeds)
-    return [setup.training(settings, seed, sizes) for setup, count in seeds.items() for seed in range(count)]
+@dataclass(frozen=True)
+class Portion:
+    """One seed of one part: what is trained and evaluated before anything else begins."""
+
+    part: str
+    seed: int
+    trainings: tuple[Training, ...]  # that no portion before it asked for
+    ensembles: dict[str, str]  # label -> trainings joined by plus, as planners.evaluate takes them
+
+    @property
+    def labels(self) -> list[str]:
+        """What is evaluated."""
+        return [*(training.label for training in self.trainings), *self.ensembles]
 
 
-def ensembles(found: Sequence[Comparison], out: Path) -> dict[str, str]:
-    """Label -> trainings joined by plus, as planners.evaluate takes them."""
-    specs = {}
-    for one in found:
-        if one.setup.planner == ENSEMBLE:
-            members = members_of(one.setup.budget, one.setup.rounds)
-            for seed in range(one.seeds):
-                folders = [str(out / TRAININGS / f"{member.label}-{seed}") for member in members]
-                specs[f"{one.setup.label}-{seed}"] = "+".join(folders)
-    return specs
+def portions(found: Sequence[Comparison], settings: StudySettings, sizes: Sizes) -> list[Portion]:
+    """Every setup with every seed that some comparison asks for, each once: part by part, in each seed by seed."""
+    planned, seen = [], set[tuple[Setup, int]]()
+    for part in dict.fromkeys(one.part for one in found):
+        mine = [one for one in found if one.part == part]
+        for seed in range(max(one.seeds for one in mine)):
+            asked = [one for one in mine if seed < one.seeds]
+            setups = dict.fromkeys(s for one in asked for s in (one.setup, one.reference) if s is not None)
+            new = [s for s in setups if (s, seed) not in seen]
+            seen |= {(s, seed) for s in new}
+            new_trainings = tuple(s.training(settings, seed, sizes) for s in new if s.planner != ENSEMBLE)
+            joined = {s.label_of(seed): _joined(s, seed, Path(settings.out)) for s in new if s.planner == ENSEMBLE}
+            planned.append(Portion(part, seed, new_trainings, joined))
+    return planned
+
+
+def _joined(ensemble: Setup, seed: int, out: Path) -> str:
+    members = members_of(ensemble.budget, ensemble.rounds)
+    return "+".join(str(out / TRAININGS / member.label_of(seed)) for member in members)
+
+
+def so_far(found: Sequence[Comparison], evaluated: Collection[str]) -> list[Comparison]:
+    """Those comparisons of which both sides are evaluated with the same seeds, with as many seeds as that."""
+    standing = [replace(one, seeds=_seeds_of(one, evaluated)) for one in found]
+    return [one for one in standing if one.seeds]
+
+
+def _seeds_of(one: Comparison, evaluated: Collection[str]) -> int:
+    sides = [setup for setup in (one.setup, one.reference) if setup is not None]
+    done = (all(setup.label_of(seed) in evaluated for setup in sides) for seed in range(one.seeds))
+    return sum(takewhile(bool, done))

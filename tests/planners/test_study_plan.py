@@ -1,12 +1,12 @@
 """The study's plan: what is compared with what, and that nothing is trained twice."""
 
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from factory.config import compose, fill
-from planners.study_plan import ENSEMBLE, PARTS, Sizes, StudySettings, comparisons, ensembles, trainings
+from planners.study_plan import ENSEMBLE, PARTS, Sizes, StudySettings, comparisons, portions, so_far
+from planners.sweep import Training
 
 SIZES = Sizes(steps=600, matched=7)
 
@@ -14,6 +14,10 @@ SIZES = Sizes(steps=600, matched=7)
 def settings(**changes: Any) -> StudySettings:
     values = compose("study", ["vocabulary=voc.npy"])
     return fill(StudySettings, {**values, **changes}, "study")
+
+
+def trainings(chosen: StudySettings) -> list[Training]:
+    return [t for portion in portions(comparisons(chosen), chosen, SIZES) for t in portion.trainings]
 
 
 def test_every_family_is_trained_with_and_without_simulation_in_equal_epochs_and_in_equal_steps() -> None:
@@ -34,7 +38,7 @@ def test_every_family_is_trained_with_and_without_simulation_in_equal_epochs_and
 
 def test_every_training_begins_with_what_the_same_planner_learnt_in_other_towns() -> None:
     everything = settings(out="here", data="made", begin="elsewhere")
-    planned = trainings(comparisons(everything), everything, SIZES)
+    planned = trainings(everything)
     first = {t.label: t for t in planned if t.facts["data"] == "begin"}
     assert set(first) == {f"{planner}-begin-epochs-0" for planner in everything.planners}
     for training in planned:
@@ -43,13 +47,13 @@ def test_every_training_begins_with_what_the_same_planner_learnt_in_other_towns(
         real = "elsewhere" if training.label in first else "made,elsewhere"
         assert f"data.real=[{real}]" in training.overrides
     alone = settings(begin=None)
-    planned = trainings(comparisons(alone), alone, SIZES)
+    planned = trainings(alone)
     assert not any("begin" in t.label or any(o.startswith("init_from") for o in t.overrides) for t in planned)
 
 
 def test_a_training_is_planned_once_with_as_many_seeds_as_anyone_asks_for() -> None:
     everything = settings()
-    planned = trainings(comparisons(everything), everything, SIZES)
+    planned = trainings(everything)
     labels = [training.label for training in planned]
     assert len(set(labels)) == len(labels) == len({training.overrides for training in planned})
     assert {t.facts["seed"] for t in planned if t.label.startswith("gtrs_dense-pdm_closed5-epochs-")} >= {0, 1, 2}
@@ -75,7 +79,7 @@ def test_equal_steps_are_those_of_all_that_there_is_which_is_trained_once() -> N
 
 def test_budgets_and_bounds_become_overrides() -> None:
     everything = settings()
-    by_label = {t.label: t.overrides for t in trainings(comparisons(everything), everything, SIZES)}
+    by_label = {t.label: t.overrides for t in trainings(everything)}
     assert not any(o.startswith("steps=") for o in by_label["ltf-real-epochs-0"])
     assert "steps=600" in by_label["ltf-real-steps-0"]
     low, high = (by_label[f"gtrs_dense-pdm_closed5-epochs-psnr_{side}-1"] for side in ("low", "high"))
@@ -87,15 +91,45 @@ def test_budgets_and_bounds_become_overrides() -> None:
     assert {f"data.sim=[{everything.control}]", "data.experts=[logged]", "steps=600"} <= set(control)
 
 
-def test_ensembles_are_made_of_trainings_that_are_planned(tmp_path: Path) -> None:
-    chosen = settings(parts=("ensemble",))
+def test_ensembles_are_made_of_trainings_that_are_planned_before_them() -> None:
+    chosen = settings(parts=("ensemble",), out="here")
+    trained = set[str]()
+    made = 0
+    for portion in portions(comparisons(chosen), chosen, SIZES):
+        trained |= {f"here/trainings/{t.label}" for t in portion.trainings}
+        made += len(portion.ensembles)
+        for label, spec in portion.ensembles.items():
+            assert label.startswith(ENSEMBLE)
+            assert set(spec.split("+")) <= trained
+    assert made == 2 * chosen.curve_seeds
+
+
+def test_one_seed_of_one_part_is_done_after_the_other() -> None:
+    chosen = settings(parts=("main", "control"))
+    planned = portions(comparisons(chosen), chosen, SIZES)
+    assert [(p.part, p.seed) for p in planned] == [
+        ("begin", 0),
+        *(("main", seed) for seed in range(3)),
+        *(("control", seed) for seed in range(2)),
+    ]
+    for portion in planned:
+        assert {t.facts["seed"] for t in portion.trainings} == {portion.seed}
+    assert {t.facts["data"] for p in planned if p.part == "control" for t in p.trainings} == {"logged"}
+
+
+def test_comparisons_so_far_have_the_seeds_that_both_sides_have() -> None:
+    chosen = settings(parts=("main",))
     found = comparisons(chosen)
-    planned = {str(tmp_path / "trainings" / t.label) for t in trainings(found, chosen, SIZES)}
-    specs = ensembles(found, tmp_path)
-    assert len(specs) == 2 * chosen.curve_seeds
-    for label, spec in specs.items():
-        assert label.startswith(ENSEMBLE)
-        assert set(spec.split("+")) <= planned
+    begun, first, second, _ = portions(found, chosen, SIZES)
+    assert {c.part for c in so_far(found, begun.labels)} == {"begin"}
+    whole = so_far(found, [*begun.labels, *first.labels])
+    assert [c.setup for c in whole] == [c.setup for c in found]
+    assert {c.seeds for c in whole} == {1}
+    without = [label for label in second.labels if label != "ltf-real-steps-1"]
+    for one in so_far(found, [*begun.labels, *first.labels, *without]):
+        is_affected = "ltf-real-steps" in (one.setup.label, one.reference and one.reference.label)
+        assert one.seeds == (1 if is_affected or one.part == "begin" else 2), one
+    assert so_far(found, second.labels) == []
 
 
 @pytest.mark.parametrize(
