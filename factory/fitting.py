@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from factory.pace import time_text
 from factory.sensors import SensorData
 from tasks.render.asset import RenderAsset
 from tasks.render.fit.reconstruct import advance, finish
@@ -38,8 +39,8 @@ def fitted(
 
     def say(iteration: int, loss: float, psnr_db: float) -> None:
         per_s = (iteration - first) / (time.monotonic() - began)
-        left_s = (settings.iterations - iteration) / per_s
-        text = f"fit {iteration}/{settings.iterations}, {per_s:.1f} iterations/s, {psnr_db:.1f} dB, ETA {left_s:.0f} s"
+        left = time_text((settings.iterations - iteration) / per_s)
+        text = f"fit {iteration}/{settings.iterations}, {per_s:.1f} iterations/s, {psnr_db:.1f} dB, ETA {left}"
         log.info("%s: %s, loss %.4f", path.stem, text, loss)
         said.write_text(json.dumps({"block": path.stem, "text": text}))
 

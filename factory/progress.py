@@ -10,6 +10,8 @@ from typing import TextIO
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
+from factory.pace import rate_text, time_text
+
 LINE_EVERY_S = 15.0
 ASK_EVERY_S = 2.0  # how far long tasks are
 
@@ -67,9 +69,9 @@ class ProgressLine:
 
     def text(self, tally: Tally, elapsed_s: float) -> str:
         rate = tally.clips / elapsed_s if elapsed_s > 0 else 0.0
-        left = f"{(self.total - tally.clips) / rate:.0f} s" if rate > 0 else "?"
+        left = time_text((self.total - tally.clips) / rate) if rate > 0 else "?"
         counts = f"{tally.accepted} accepted, {tally.rejected} rejected, {tally.failed} failed"
-        return "  ".join(filter(None, [f"{rate:.2f} clips/s", counts, f"ETA {left}", self._doing()]))
+        return "  ".join(filter(None, [rate_text(rate, " clips"), counts, f"ETA {left}", self._doing()]))
 
     def _doing(self) -> str:
         now = time.monotonic()

@@ -49,8 +49,16 @@ def failed(argv: Sequence[str]) -> int:
     return answer(str(__doc__), Request, argv, lambda request: failed_lines(open_store(request.out)))
 
 
+class NothingThere(Refused):
+    """No run has written here."""
+
+    def __init__(self, uri: str) -> None:
+        super().__init__(f"no store at {uri}: give the out= of a run of python -m factory.run")
+        self.uri = uri
+
+
 def open_store(out: str) -> "Store":
-    """Raises Refused where there is no run."""
+    """Raises NothingThere where there is no run, Refused where there can be none."""
     from deltalake.exceptions import DeltaError
 
     from factory.store.location import BadLocation
@@ -61,7 +69,7 @@ def open_store(out: str) -> "Store":
     except (BadLocation, OSError, DeltaError) as error:
         raise Refused(f"out={out}: {error}") from error
     if store.samples.version is None and store.outcomes.version is None and store.candidates.version is None:
-        raise Refused(f"no store at {store.location.uri}: give the out= of a run of python -m factory.run")
+        raise NothingThere(store.location.uri)
     return store
 
 

@@ -8,6 +8,8 @@ from typing import TextIO
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
+from factory.pace import rate_text, time_text
+
 LINE_EVERY_S = 15.0
 
 
@@ -57,5 +59,5 @@ class Counter:
     def text(self, done: int, elapsed_s: float, note: str) -> str:
         """Rate, time left, note."""
         rate = (done - self.before) / elapsed_s if elapsed_s > 0 else 0.0
-        left = f"{(self.total - done) / rate:.0f} s" if rate > 0 else "?"
-        return "  ".join(filter(None, [f"{rate:.2f}/s", f"ETA {left}", note]))
+        left = time_text((self.total - done) / rate) if rate > 0 else "?"
+        return "  ".join(filter(None, [rate_text(rate), f"ETA {left}", note]))

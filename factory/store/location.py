@@ -9,6 +9,8 @@ from pathlib import Path
 
 from pyarrow import fs
 
+REMOTE = ("s3", "gs", "abfs", "abfss", "file")  # what both Arrow and Delta write to
+
 
 class BadLocation(ValueError):
     """The output path cannot be used as it stands."""
@@ -26,9 +28,11 @@ class Location:
 
     @staticmethod
     def parse(out: str | os.PathLike[str], options: Mapping[str, str] | None = None) -> "Location":
-        """Raises BadLocation for a relative path inside a submitted Ray job, whose folder is a temporary copy."""
+        """Raises BadLocation for an unknown kind of URL, and for a relative path in a submitted Ray job's own copy."""
         text = os.fspath(out)
         if "://" in text:
+            if text.partition("://")[0] not in REMOTE:
+                raise BadLocation(f"out={text}: name a folder, or a URL of {', '.join(REMOTE)}://")
             return Location(text.rstrip("/"), dict(options or {}))
         path = Path(text).expanduser()
         if not path.is_absolute() and "RAY_JOB_CONFIG_JSON_ENV_VAR" in os.environ:  # set by Ray for a job's driver

@@ -28,6 +28,7 @@ from factory.clips.synthetic.rig import REAR_AXLE_Z_M, build_rig, world_from_ego
 from factory.clips.synthetic.streets import Lane, Streets
 from factory.clips.synthetic.town import LOG_STEPS, STEPS_PER_SWEEP, WINDOWS_PER_LOG, Town, log_name, plan_log
 from factory.clips.synthetic.traffic import GREEN, RED, YELLOW
+from factory.pace import time_text
 from tasks.world.camera import Camera
 
 Stamps = NDArray[np.int64]
@@ -84,10 +85,8 @@ def write_logs(out: Path, indices: Collection[int], seed: int, settings: TownSet
     for number, i in enumerate(indices, start=1):
         folders.append(write_log(out / log_name(seed, i), *plan_log(seed, i), settings, i, threads))
         if settings.cameras or settings.lidar_beams:
-            left_s = (time.monotonic() - began) / number * (len(indices) - number)
-            print(
-                f"town {seed}: log {number} of {len(indices)} painted  ETA {left_s:.0f} s", file=sys.stderr, flush=True
-            )
+            left = time_text((time.monotonic() - began) / number * (len(indices) - number))
+            print(f"town {seed}: log {number} of {len(indices)} painted  ETA {left}", file=sys.stderr, flush=True)
     return folders
 
 

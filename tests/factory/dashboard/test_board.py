@@ -17,7 +17,7 @@ from factory.board.overview import QUIET_S, overview
 from factory.board.pictures import Kept
 from factory.board.server import SERVED, STATIC, Board, Server
 from factory.board.watch import Watch
-from factory.dashboard import Request, main
+from factory.dashboard import Request, awaited, main
 from factory.execute import execute
 from factory.export import main as export_main
 from factory.look.sample_picture import encoded, nearer, sample_bev
@@ -60,6 +60,20 @@ def test_the_numbers_are_those_of_the_tables(out: Path, board: Board) -> None:
     ]
     inside = sum(abs(end[0]) <= 20 and abs(end[1]) <= 2 for end in ends)
     assert np.sum(answer["coverage"]["accepted"]) == inside
+
+
+def test_a_run_that_is_still_to_begin_is_waited_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    stores: list[Store] = []
+    waiting = threading.Thread(target=lambda: stores.append(awaited(str(tmp_path), look_every_s=0.01)))
+    waiting.start()
+    waiting.join(0.2)
+    assert waiting.is_alive()
+    run(tmp_path, 1)
+    waiting.join(60.0)
+    assert get(Board(stores[0], look_every_s=0.0), "/api/overview")["counts"]["samples"] > 0
+    assert capsys.readouterr().out.count("waiting for a run to begin") == 1
+    with pytest.raises(Refused, match="gopher"):
+        awaited("gopher://bucket/run")
 
 
 def test_the_numbers_are_those_of_the_tables_while_a_run_goes_on(tmp_path: Path) -> None:

@@ -97,6 +97,12 @@ def test_the_dashboard_follows_a_run_in_a_bucket(s3: dict[str, str]) -> None:
         assert board.answer(target).status == 200
 
 
+@pytest.mark.parametrize("url", ["gopher://bucket/run", "S3://bucket/run", "://run"])
+def test_an_unknown_kind_of_url_is_refused(url: str) -> None:
+    with pytest.raises(BadLocation, match="a URL of s3, "):
+        Location.parse(url)
+
+
 def test_a_relative_path_inside_a_submitted_job_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     assert Location.parse("runs/x").uri.startswith("/")
     monkeypatch.setenv("RAY_JOB_CONFIG_JSON_ENV_VAR", "{}")
