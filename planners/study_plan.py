@@ -143,7 +143,13 @@ class Comparison:
     @property
     def facts(self) -> dict[str, Any]:
         """Its columns in the tables."""
-        return {"part": self.part, **vars(self.setup), "budget": self.budget, "seeds": self.seeds}
+        return {
+            "part": self.part,
+            "setup": self.setup.label,
+            **vars(self.setup),
+            "budget": self.budget,
+            "seeds": self.seeds,
+        }
 
 
 def comparisons(settings: StudySettings) -> list[Comparison]:
