@@ -17,7 +17,7 @@ from torch import Tensor
 from factory.store.columns import Column
 from factory.store.reader import LABEL_COLUMNS, TIME_TOLERANCE_S, labels_of
 from factory.store.schema import COLUMNS
-from planners.batch import COMMANDS, Batch, BevLayout, Needs
+from planners.batch import COMMANDS, Batch, BevLayout, ImageLayout, Needs
 from planners.data import AGENT_COLUMNS, BEV_COLUMNS
 from planners.images import Bytes, stitch
 from tasks.reward.label_bytes import CRC_BYTES
@@ -42,6 +42,7 @@ class StoredRows:
             table = table.drop_columns(["images"])
         self._values = {name: _values(COLUMNS[name], _whole(table[name])) for name in table.column_names}
         self._rasters: dict[tuple[int, BevLayout], NDArray[np.uint8]] = {}
+        self._pictures: dict[tuple[int, ImageLayout], NDArray[np.uint8]] = {}
 
     def value(self, column: str, row: int) -> Any:
         """A value as the sample reader gives it: an array, a list of arrays, a text or a number."""
@@ -63,17 +64,34 @@ class StoredRows:
         """The images at now of the row's cameras, left to right."""
         return self._jpegs[row]
 
+    def picture(self, row: int, layout: ImageLayout, out: NDArray[np.uint8], keep: bool = False) -> None:
+        """Write the row's wide picture into `out`; keep: it is decoded once and stays, beside its smaller JPEGs."""
+        kept = self._pictures.get((row, layout))
+        if kept is not None:
+            out[:] = kept
+            return
+        stitch(self.jpegs(row), layout, out)
+        if keep:
+            self._pictures[row, layout] = out.copy()
+
 
 class BatchBuffer:
     """A batch of `size` samples whose tensors are still to be filled; samples may be filled by several threads."""
 
-    def __init__(self, size: int, needs: Needs, n_labels: int, pinned: bool = False) -> None:
-        """n_labels: K of the vocabulary; pinned: in memory that a GPU copies from while others compute."""
+    def __init__(
+        self, size: int, needs: Needs, n_labels: int, pinned: bool = False, keep_pictures: bool = False
+    ) -> None:
+        """
+        Args:
+            n_labels: K of the vocabulary.
+            pinned: in memory that a GPU copies from while others compute.
+            keep_pictures: what is decoded stays with its row, for the next pass.
+        """
 
         def empty(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
             return torch.empty((size, *shape), dtype=dtype, pin_memory=pinned)
 
-        self._needs = needs
+        self._needs, self._keep_pictures = needs, keep_pictures
         self._tensors: dict[str, Tensor] = {
             "status": empty(len(COMMANDS) + 4),
             "history": empty(4, 3),
@@ -99,7 +117,7 @@ class BatchBuffer:
         arrays["plan_2hz"][i] = stored.value("label_2hz", row)
         arrays["plan_10hz"][i] = stored.value("label_10hz", row)
         if needs.image is not None:
-            stitch(stored.jpegs(row), needs.image, arrays["image"][i])
+            stored.picture(row, needs.image, arrays["image"][i], self._keep_pictures)
         if needs.bev is not None:
             arrays["bev"][i] = stored.raster(row, needs.bev)
             if needs.n_agents:

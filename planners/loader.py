@@ -4,7 +4,8 @@
     for batch in loader.epoch(0): ...
     state = loader.state()      # after any batch; `resume(state)` in another process goes on with the next one
 
-Threads read and decode ahead: OpenCV, zlib and Arrow do their work without the interpreter's lock.
+Threads read and decode ahead: OpenCV, zlib and Arrow do their work without the interpreter's lock. Of a data set whose
+decoded pictures fit into the memory for shuffling each picture is decoded once.
 """
 
 import json
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 from planners.batch import Batch, Needs
 from planners.data import Dataset, make_feed, mixed_samples
 from planners.decode import BatchBuffer, count_labels
-from planners.mix import EpochOrder, MixSettings, make_order
+from planners.mix import EpochOrder, MixSettings, Side, make_order
 from planners.windows import Inline, Memory, Place, Window
 
 STATE_VERSION = 1
@@ -64,6 +65,7 @@ class Loader:
         self._order = make_order(samples, mix, batch_size, seed)
         staying = {side.number: side.rows for side in self._order.sides if side.fits}
         self._memory = Memory(self._feed, staying)
+        self._pictures_bytes = _kept_pictures(self._order.sides, needs, mix)
         sha = sha256(dataset.digest.encode())
         if len(staying) < len(self._order.sides):  # windows depend on where samples stand
             sha.update(samples.group.tobytes() + samples.size.tobytes())
@@ -140,6 +142,8 @@ class Loader:
         for side in sides:
             held = "stay in memory" if side.fits else f"are shuffled in windows of {side.window_bytes / 2**20:.0f} MB"
             lines.append(f"{len(side)} samples of {side.size.sum() / 2**20:.1f} MB {held}")
+        if self._pictures_bytes:
+            lines.append(f"{self._pictures_bytes / 2**20:.1f} MB of pictures stay decoded beside them")
         if copies := self._memory.copies:
             there = sum(copy.path.exists() for copy in copies.values())
             rest = "" if there == len(copies) else ", the others when they are first read"
@@ -188,7 +192,8 @@ class Loader:
         by_window = {window: self._memory.rows(order.keys[window]) for window in np.unique(windows).tolist()}
         rows = [by_window[window][sample] for sample, window in zip(samples.tolist(), windows.tolist())]
         n_labels = count_labels(*rows[0]) if self._needs.labels is not None else 0
-        return _Pending(self, samples, rows, BatchBuffer(len(rows), self._needs, n_labels, self._pinned), decoders)
+        buffer = BatchBuffer(len(rows), self._needs, n_labels, self._pinned, keep_pictures=self._pictures_bytes > 0)
+        return _Pending(self, samples, rows, buffer, decoders)
 
 
 class _Pending:
@@ -222,6 +227,15 @@ class _Pending:
                 self._buffer.fill(i, *self._rows[i])
             except Exception as error:
                 raise ValueError(f"{self._loader.dataset.name(int(self._samples[i]))}: {error}") from error
+
+
+def _kept_pictures(sides: Sequence[Side], needs: Needs, mix: MixSettings) -> int:
+    """Bytes of the decoded pictures of all samples where they fit into mix.shuffle_mb beside the samples, else 0."""
+    if needs.image is None or not all(side.fits for side in sides):
+        return 0
+    pictures = sum(map(len, sides)) * needs.image.height * needs.image.width * 3
+    samples = sum(int(side.size.sum()) for side in sides)
+    return pictures if samples + pictures <= mix.shuffle_mb * 2**20 else 0
 
 
 def _windows(order: EpochOrder, rows: NDArray[np.int64], windows: NDArray[np.int64], first: int) -> list[Window]:

@@ -52,7 +52,7 @@ def main(threads: int = 2, table: str | None = None, n: int = 400) -> None:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     print(f"{threads} threads, batches of {BATCH}, best of {PASSES} passes: samples/s, CPU ms a sample\n")
-    ways = ("loader, in memory", "loader, windows", "windows, from the copy")
+    ways = ("pictures in memory", "samples in memory", "windows", "windows, from the copy")
     print(f"| samples | picture | raw decode | {' | '.join(f'{way} | share of raw' for way in ways)} |")
     print("|---" * (3 + 2 * len(ways)) + "|")
     with tempfile.TemporaryDirectory() as folder:
@@ -71,7 +71,7 @@ def main(threads: int = 2, table: str | None = None, n: int = 400) -> None:
 
 
 def compare(table: str, layout: ImageLayout, threads: int, name: str, copy: str) -> None:
-    """One line: raw, with all in memory, and from windows that are read again in every pass, of the table or a copy."""
+    """One line: raw; with pictures or samples in memory; from windows that are read in every pass, or of a copy."""
     needs = Needs(image=layout)
     experts = set(SampleTable(table).table(["expert"])["expert"].to_pylist())
     settings = DataSettings(real=table if "human" in experts else (), sim=table if experts != {"human"} else ())
@@ -88,10 +88,14 @@ def compare(table: str, layout: ImageLayout, threads: int, name: str, copy: str)
     ]
     total_mb = feed.size.sum() / 2**20
     runs: list[Callable[[], int]] = [lambda: decode_all(jpegs, threads)]
-    whole, window = MixSettings(shuffle_mb=int(2 * total_mb) + 1), MixSettings(shuffle_mb=max(1, int(total_mb / 4)))
+    pictures_mb = len(dataset) * layout.height * layout.width * 3 / 2**20
+    whole = MixSettings(shuffle_mb=int(2 * total_mb + pictures_mb) + 1)
+    window = MixSettings(shuffle_mb=max(1, int(total_mb / 4)))
     copied = replace(dataset, settings=replace(settings, copy=copy))
-    for data, mix in ((dataset, whole), (dataset, window), (copied, window)):
+    for data, mix in ((dataset, whole), (dataset, whole), (dataset, window), (copied, window)):
         loader = Loader(data, needs, mix, BATCH, workers=threads)
+        if len(runs) == 2:
+            loader._pictures_bytes = 0  # the same without room for decoded pictures
         runs.append(lambda loader=loader: count(loader))  # type: ignore[misc]
     rates = [Rate() for _ in runs]
     for run in runs:

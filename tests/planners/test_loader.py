@@ -16,6 +16,7 @@ import torch
 from planners.batch import Batch, ImageLayout, Needs
 from planners.data import Dataset, DataSettings, open_data
 from planners.files import SampleFile
+from planners.images import stitch
 from planners.loader import Loader
 from planners.mix import MixSettings, Weights, make_order
 from tests.factory.store.test_store_s3 import BUCKET, s3
@@ -215,6 +216,41 @@ def test_what_fits_is_read_once_and_stays(data: Dataset, monkeypatch: pytest.Mon
     for epoch in range(3):
         assert sum(1 for _ in loader.epoch(epoch)) > 2
     assert len(reads) == n_groups(data)
+
+
+def counted_pictures(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Grows by one whenever a picture is decoded."""
+    decoded: list[int] = []
+
+    def watched(*arguments: Any) -> None:
+        decoded.append(1)
+        stitch(*arguments)
+
+    monkeypatch.setattr("planners.decode.stitch", watched)
+    return decoded
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_pictures_that_fit_are_decoded_once(data: Dataset, monkeypatch: pytest.MonkeyPatch, workers: int) -> None:
+    anew = [list(Loader(data, NEEDS, MixSettings(), BATCH).epoch(epoch)) for epoch in range(3)]
+    decoded = counted_pictures(monkeypatch)
+    loader = Loader(data, NEEDS, MixSettings(), BATCH, workers=workers)
+    assert "of pictures stay decoded" in loader.text()
+    for epoch in range(3):
+        for batch, expected in zip(loader.epoch(epoch), anew[epoch], strict=True):
+            assert_same(batch, expected)
+    assert len(decoded) == len(data)
+
+
+@pytest.mark.usefixtures("windows")
+def test_pictures_that_do_not_fit_are_decoded_in_every_pass(data: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    decoded = counted_pictures(monkeypatch)
+    three_mb = Needs(image=ImageLayout(width=512, height=32))
+    loader = Loader(data, three_mb, MixSettings(shuffle_mb=2), BATCH)
+    assert "pictures" not in loader.text()
+    for epoch in range(2):
+        assert sum(1 for _ in loader.epoch(epoch)) == 8
+    assert len(decoded) == 2 * len(data)
 
 
 def test_windows_read_a_row_group_once_a_pass(data: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
