@@ -16,14 +16,15 @@ from torch.nn import functional as F
 from planners.batch import Batch, BevLayout, Needs
 from planners.bev import BevClass
 from planners.planner import FloatArray, Planner, evaluating
-from planners.regression import imitation_l1
+from planners.regression import PlanFrom, imitation_l1, planned_from
 
 
 @dataclass(frozen=True)
 class EgoMlpSettings:
-    """Widths of the hidden layers."""
+    """Of the one that sees its status alone."""
 
-    hidden: tuple[int, ...] = (512, 512, 512)
+    hidden: tuple[int, ...] = (512, 512, 512)  # widths of the hidden layers
+    plan_from: PlanFrom = "zero"  # what the regressed poses are added to
 
 
 class EgoMlp(Planner):
@@ -55,7 +56,8 @@ class EgoMlp(Planner):
             return self._poses(batch)
 
     def _poses(self, batch: Batch) -> Tensor:
-        return self.layers(self.features(batch)).float().view(-1, 8, 3)
+        poses = self.layers(self.features(batch)).float().view(-1, 8, 3)
+        return planned_from(self.settings.plan_from, poses, batch)
 
 
 @dataclass(frozen=True)

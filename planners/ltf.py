@@ -6,7 +6,7 @@ picture of 2048 x 512: 56 M parameters (SimScale, supplement, table 4).
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from planners.auxiliary import AgentHead, BevHead, agent_losses, bev_loss
 from planners.batch import Batch, BevLayout, ImageLayout, Needs
 from planners.planner import FloatArray, Planner, evaluating
-from planners.regression import bounded_heading, imitation_l1, straight_on
+from planners.regression import PlanFrom, bounded_heading, imitation_l1, planned_from
 from planners.transfuser import FusionSettings, LatentFusion
 
 
@@ -30,7 +30,7 @@ class LtfSettings:
     layers: int = 3
     heads: int = 8
     dropout: float = 0.0
-    plan_from: Literal["zero", "constant_velocity"] = "zero"  # what the regressed positions are added to
+    plan_from: PlanFrom = "zero"  # what the regressed positions are added to
     agents: int = 30
     trajectory_weight: float = 10.0
     agent_class_weight: float = 10.0
@@ -71,9 +71,7 @@ class Ltf(Planner):
         keys = torch.cat([cells, self.status(batch.status)[:, None]], 1) + self.key_position
         queries = self.decoder(self.queries.expand(len(batch), -1, -1), keys)
         plan = bounded_heading(self.plan_head(queries[:, 0]).float().view(-1, 8, 3))
-        if self.settings.plan_from == "constant_velocity":
-            plan = plan + straight_on(batch)
-        return plan, queries[:, 1:], fused.bev
+        return planned_from(self.settings.plan_from, plan, batch), queries[:, 1:], fused.bev
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         assert batch.bev is not None and batch.agents is not None and batch.agents_valid is not None

@@ -1,11 +1,14 @@
 """What planners that regress one plan share: its decoding, and the loss that imitates."""
 
 import math
+from typing import Literal
 
 import torch
 from torch import Tensor
 
 from planners.batch import COMMANDS, Batch
+
+PlanFrom = Literal["zero", "constant_velocity"]  # what regressed poses are added to
 
 
 def bounded_heading(poses: Tensor) -> Tensor:
@@ -20,6 +23,11 @@ def imitation_l1(plan: Tensor, batch: Batch) -> Tensor:
     """
     error = (plan.float() - batch.plan_2hz).abs().mean(dim=(1, 2))
     return torch.where(batch.imitate, error, 0.0).mean()
+
+
+def planned_from(base: PlanFrom, regressed: Tensor, batch: Batch) -> Tensor:
+    """The plans (B, 8, 3) of what was regressed."""
+    return regressed + straight_on(batch) if base == "constant_velocity" else regressed
 
 
 def straight_on(batch: Batch) -> Tensor:

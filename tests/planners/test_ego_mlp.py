@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch import nn
 
 from planners.batch import Batch, BevLayout, Needs
 from planners.constant_velocity import ConstantVelocity, ConstantVelocitySettings
@@ -67,6 +68,19 @@ def test_labels_that_are_not_to_be_imitated_weigh_nothing(model: Planner) -> Non
     assert model.losses(perfect)["trajectory"].item() == 0.0
     off = replace(perfect, plan_2hz=perfect.plan_2hz + 0.5, imitate=torch.tensor([True, True, True, False]))
     assert model.losses(off)["trajectory"].item() == pytest.approx(0.5 * 3 / 4, rel=1e-4)
+
+
+@pytest.mark.parametrize("model", [blind(), shown()])
+def test_from_constant_velocity_layers_that_say_nothing_keep_the_speed(model: EgoMlp) -> None:
+    from_speed = type(model)(replace(model.settings, plan_from="constant_velocity"), {})
+    batch, straight = made_batch(model.needs, 4), ConstantVelocity(ConstantVelocitySettings(), {})
+    for one in (model, from_speed):
+        last = one.layers[-1]
+        assert isinstance(last, nn.Linear)
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+    assert torch.equal(from_speed.plan(batch), straight.plan(batch))
+    assert straight.plan(batch).any() and not model.plan(batch).any()
 
 
 def test_one_is_blind_and_the_other_is_not_called_so() -> None:
