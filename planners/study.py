@@ -8,8 +8,8 @@ Every comparison is made twice: with equal passes over a planner's own data, as 
 steps, since more data in equal passes is more training as well. One seed of one part is trained and evaluated after the
 other; when the minutes are out, the tables hold those that are done, and say with how many seeds. Tables go to
 `report`: `trainings.csv` (each training), `comparisons.csv` (means over seeds, differences with paired bootstrap
-intervals over clips and seeds), `bounds.csv`, `curves.csv`, and pictures. Exit codes: 0 complete, 2 bad settings,
-3 a training failed, 4 not complete yet, resumable.
+intervals over clips and seeds), `tables.md` (the same to be read), `bounds.csv`, `curves.csv`, and
+pictures. Exit codes: 0 complete, 2 bad settings, 3 a training failed, 4 not complete yet, resumable.
 """
 
 import sys
@@ -31,8 +31,9 @@ from planners.scaling_figure import Curve, Point, draw_curves
 from planners.scaling_law import FEWEST, fit_scaling
 from planners.score_rows import read_rows
 from planners.scores import BOUNDS, SHOWN, name_of, scores_of, write_csv
-from planners.study_figures import draw_learning
+from planners.study_figures import draw_differences, draw_learning
 from planners.study_plan import Comparison, Portion, Setup, Sizes, StudySettings, comparisons, portions, so_far
+from planners.study_tables import markdown_of
 from planners.sweep import EVALUATIONS, Means, SweepFailed, Training, evaluate_all, folder_of, train_all
 
 BAD_CONFIG, FAILED, INTERRUPTED = 2, 3, 4
@@ -68,10 +69,14 @@ def write_report(standing: Sequence[Comparison], trained: Sequence[Training], se
     write_csv(report / "bounds.csv", [{"planner": name, **scores_of(evaluations / name)} for name in BOUNDS])
     found = compared(standing, evaluations)
     write_csv(report / "comparisons.csv", found)
+    (report / "tables.md").write_text(markdown_of(found))
     curves = curves_of(standing, rows)
     if curves:
         write_csv(report / "curves.csv", [curve.row() for curve in curves])
         draw_curves(curves, "two-stage EPDMS", report / "scaling.png")
+    differences = [row for row in found if row["reference"]]
+    if differences:
+        draw_differences(differences, report / "differences.png")
     draw_learning({t.label: folder_of(out, t) for t in trained if t.facts["seed"] == 0}, report / "learning.png")
     print(text_of(found, evaluations))
     print(f"tables and pictures: {report}")
@@ -116,7 +121,8 @@ def compared(wanted: Sequence[Comparison], evaluations: Path) -> list[dict[str, 
             intervals = compare(a, b, RULES)
         for stage, human_filter in SHOWN.items():
             row: dict[str, Any] = {**one.facts, "stage": stage}
-            row["epdms"] = mean_of(one.setup, one.seeds, evaluations, stage, human_filter)
+            each = scores_of_seeds(one.setup, one.seeds, evaluations, stage, human_filter)
+            row |= {"epdms": float(np.mean(each)), "each": " ".join(f"{score:.1f}" for score in each)}
             row |= {"reference": "", "difference": "", "low": "", "high": ""}
             if one.reference is not None:
                 found = intervals[stage, human_filter]
@@ -142,10 +148,10 @@ def _clips(folder: Path) -> list[ClipResult]:
 _scores = cache(scores_of)
 
 
-def mean_of(setup: Setup, seeds: int, evaluations: Path, stage: str, human_filter: str) -> float:
-    """EPDMS in percent."""
+def scores_of_seeds(setup: Setup, seeds: int, evaluations: Path, stage: str, human_filter: str) -> list[float]:
+    """EPDMS of each seed, in percent."""
     name = name_of(stage, human_filter)
-    return float(np.mean([_scores(evaluations / f"{setup.label}-{seed}")[name] for seed in range(seeds)]))
+    return [_scores(evaluations / f"{setup.label}-{seed}")[name] for seed in range(seeds)]
 
 
 def curves_of(wanted: Sequence[Comparison], rows: Sequence[Mapping[str, Any]]) -> list[Curve]:

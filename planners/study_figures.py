@@ -1,19 +1,26 @@
-"""Learning curves of many trainings on one sheet: whether each ran past its plateau."""
+"""The study in pictures: learning curves of many trainings, and what each comparison came to."""
 
 import csv
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from planners.curves import LOSSES, VALIDATION
+from planners.study_tables import words_of
 
 COLUMNS = 6
 SMOOTH_STEPS = 20  # of which a loss that is drawn is the mean
+DRAWN = {"stage_two": "stage two", "final": "final"}
+CLEAR, OPEN = "#1f6fb4", "#9aa4ad"  # an interval without and with zero
 
 
 def draw_learning(folders: Mapping[str, Path], path: Path) -> None:
-    """A small panel for each training: its loss (left axis), and its distance from held-out human plans (right)."""
+    """Whether each ran past its plateau.
+
+    A small panel for each training: its loss (left axis), and its distance from held-out human plans (right).
+    """
     import matplotlib
 
     matplotlib.use("Agg")
@@ -44,6 +51,42 @@ def draw_learning(folders: Mapping[str, Path], path: Path) -> None:
     figure.tight_layout(rect=(0, 0, 1, 0.98))
     figure.savefig(path, dpi=100)
     pyplot.close(figure)
+
+
+def draw_differences(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Every comparison's difference in percent points with its interval, in both stages and in the whole score.
+
+    rows: those of comparisons.csv that have a reference.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    n = sum(row["stage"] == "final" for row in rows)
+    figure, axes = pyplot.subplots(1, len(DRAWN), figsize=(11.0, 1.0 + 0.2 * n), sharey=True, squeeze=False)
+    for panel, (stage, title) in zip(axes.flat, DRAWN.items()):
+        chosen = [row for row in rows if row["stage"] == stage]
+        for y, row in enumerate(chosen):
+            color = CLEAR if row["low"] > 0.0 or row["high"] < 0.0 else OPEN
+            panel.plot([row["low"], row["high"]], [y, y], color=color, linewidth=2)
+            panel.plot(row["difference"], y, "o", color=color, markersize=4)
+        for y in range(1, n):
+            if chosen[y]["part"] != chosen[y - 1]["part"]:
+                panel.axhline(y - 0.5, color="#d0d5da", linewidth=0.8)
+        panel.axvline(0.0, color="black", linewidth=0.8)
+        panel.set_yticks(range(n), [difference_label(row) for row in chosen], fontsize=7)
+        panel.set_title(f"{title}: difference in EPDMS points", fontsize=9)
+        panel.tick_params(axis="x", labelsize=7)
+    axes.flat[0].set_ylim(n - 0.5, -0.5)
+    figure.tight_layout()
+    figure.savefig(path, dpi=100)
+    pyplot.close(figure)
+
+
+def difference_label(row: Mapping[str, Any]) -> str:
+    """Which comparison a line stands for."""
+    return f"{row['part']}: {row['planner']} {words_of(row)} (equal {row['budget']}, {row['seeds']} seeds)"
 
 
 def column(path: Path, name: str) -> tuple[np.ndarray, np.ndarray]:

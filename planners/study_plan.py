@@ -153,14 +153,14 @@ class Comparison:
 
 
 def comparisons(settings: StudySettings) -> list[Comparison]:
-    """All of the chosen parts, behind the trainings that all begin with."""
+    """All of the chosen parts, each once, behind the trainings that all begin with."""
     first = settings.planners if settings.begin else ()
     found = [Comparison("begin", begin(planner), None, 1) for planner in first]
     for one in (one for part in settings.parts for one in PARTS[part](settings)):
         reference = None if one.reference is None else trained(one.reference, settings.rounds)
         setup = trained(one.setup, settings.rounds)
         found.append(replace(one, setup=setup, reference=reference, budget=one.setup.budget))
-    return found
+    return list(dict.fromkeys(found))
 
 
 def trained(setup: Setup, rounds: int) -> Setup:
@@ -248,17 +248,22 @@ def _control(settings: StudySettings) -> Iterator[Comparison]:
 def _ensemble(settings: StudySettings) -> Iterator[Comparison]:
     """The mean of what three kinds of data taught, held against rewards alone, as in the paper."""
     for budget in BUDGETS:
-        for member in members_of(budget, settings.rounds):
+        members = _members(budget, settings.rounds)
+        for member in members:
             yield Comparison("ensemble", member, None, settings.curve_seeds)
-        alone = members_of(budget, settings.rounds)[-1]
         together = Setup(ENSEMBLE, "pdm_closed", settings.rounds, budget)
-        yield Comparison("ensemble", together, alone, settings.curve_seeds)
+        yield Comparison("ensemble", together, members[-1], settings.curve_seeds)
 
 
 def members_of(budget: Budget, rounds: int) -> list[Setup]:
-    """Of an ensemble: recovery, planner, rewards only."""
+    """The trainings of an ensemble."""
+    return [trained(member, rounds) for member in _members(budget, rounds)]
+
+
+def _members(budget: Budget, rounds: int) -> list[Setup]:
+    """Recovery, planner, rewards only."""
     imitating = [Setup("gtrs_dense", expert, rounds, budget) for expert in EXPERTS]
-    return [trained(member, rounds) for member in (*imitating, replace(imitating[-1], imitation="real"))]
+    return [*imitating, replace(imitating[-1], imitation="real")]
 
 
 def _few(rounds: int) -> list[int]:

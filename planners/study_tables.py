@@ -1,0 +1,65 @@
+"""The study's comparisons as Markdown: a table for each part, to be read, or copied into a document."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import groupby
+from typing import Any
+
+from planners.scores import SHOWN
+
+Row = Mapping[str, Any]  # of comparisons.csv
+HEAD = ("planner", "trained on", "equal", "seeds", *(stage.replace("_", " ") for stage in SHOWN), "final of each seed")
+
+
+def markdown_of(rows: Sequence[Row]) -> str:
+    """EPDMS in percent; in brackets the difference from the reference with its interval, bold where that excludes 0.
+
+    rows: those of comparisons.csv, a comparison's stages one after the other. A row that is itself a reference stands
+    in front of what is held against it.
+    """
+    lines = []
+    for part, of_part in groupby(rows, key=lambda row: row["part"]):
+        lines += [f"## {part}", "", _line(HEAD), _line(["---"] * len(HEAD))]
+        lines += [_line(_cells(stages)) for stages in _by_comparison(list(of_part))]
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _by_comparison(rows: Sequence[Row]) -> Iterator[dict[str, Row]]:
+    """The rows of one comparison after the other, by stage."""
+    for first in range(0, len(rows), len(SHOWN)):
+        yield {row["stage"]: row for row in rows[first : first + len(SHOWN)]}
+
+
+def _cells(stages: Mapping[str, Row]) -> list[str]:
+    final = stages["final"]
+    scores = [_score(stages[stage]) for stage in SHOWN]
+    return [f"`{final['planner']}`", words_of(final), final["budget"], str(final["seeds"]), *scores, final["each"]]
+
+
+def _score(row: Row) -> str:
+    text = f"{row['epdms']:.1f}"
+    if not row["reference"]:
+        return text
+    bold = "**" if row["low"] > 0.0 or row["high"] < 0.0 else ""
+    return f"{text} ({bold}{row['difference']:+.1f}{bold}: {row['low']:+.1f} .. {row['high']:+.1f})"
+
+
+def words_of(row: Row) -> str:
+    """What a planner was trained on, in words; what is as usual is left out."""
+    if row["data"] == "begin":
+        return "other towns"
+    said = ["real"] if row["rounds"] == 0 else [f"+ {row['data']}", *_rounds(row["rounds"])]
+    said += {"all": [], "real": ["rewards only"], "none": ["no imitation"]}[row["imitation"]]
+    said += ["replayed traffic"] if row["traffic"] == "replay" else []
+    said += [f"sim ratio {row['sim_ratio']}"] if row["sim_ratio"] != "natural" else []
+    said += {"any": [], "low": ["low PSNR"], "high": ["high PSNR"]}[row["psnr"]]
+    said += [f"{100.0 * row['real_share']:.0f} % of the real"] if row["real_share"] < 1.0 else []
+    return ", ".join(said)
+
+
+def _rounds(rounds: int) -> list[str]:
+    return ["1 round"] if rounds == 1 else [f"{rounds} rounds"]
+
+
+def _line(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"

@@ -1,0 +1,64 @@
+"""The study's tables in words, and its picture of all differences."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from PIL import Image
+
+from planners.scores import SHOWN
+from planners.study_figures import draw_differences
+from planners.study_plan import PARTS, Comparison, Setup, StudySettings, comparisons
+from planners.study_tables import markdown_of, words_of
+from tests.planners.test_study_plan import settings
+
+
+def rows_of(
+    one: Comparison, epdms: float, difference: tuple[float, float, float] | None = None
+) -> list[dict[str, Any]]:
+    against = dict(zip(("difference", "low", "high"), difference or ("", "", "")))
+    reference = {"reference": "some" if difference else "", **against}
+    return [{**one.facts, "stage": stage, "epdms": epdms, "each": "1.0 2.0", **reference} for stage in SHOWN]
+
+
+REAL = Setup("ltf", "real", 0, "steps")
+MORE = Setup("ltf", "pdm_closed", 5, "steps")
+
+
+def test_a_difference_is_bold_where_its_interval_leaves_out_zero() -> None:
+    real, more = (Comparison("main", setup, None, 2, "steps") for setup in (REAL, MORE))
+    clear, open_, worse = (5.04, 0.96, 10.0), (5.0, -1.0, 10.0), (-5.0, -9.0, -1.0)
+    found = [*rows_of(real, 30.0), *rows_of(more, 35.04, clear), *rows_of(more, 35.0, open_), *rows_of(more, 25, worse)]
+    lines = markdown_of(found).splitlines()
+    assert lines[0] == "## main"
+    assert lines[4] == "| `ltf` | real | steps | 2 | 30.0 | 30.0 | 30.0 | 30.0 | 1.0 2.0 |"
+    assert lines[5].count("35.0 (**+5.0**: +1.0 .. +10.0)") == len(SHOWN)
+    assert lines[6].count("35.0 (+5.0: -1.0 .. +10.0)") == len(SHOWN)
+    assert lines[7].count("25.0 (**-5.0**: -9.0 .. -1.0)") == len(SHOWN)
+    assert {line.count("|") for line in lines[2:8]} == {10}
+
+
+def test_every_part_has_its_own_table() -> None:
+    found = [*rows_of(Comparison("main", REAL, None, 3), 1.0), *rows_of(Comparison("ratio", MORE, None, 2), 2.0)]
+    heads = [line for line in markdown_of(found).splitlines() if line.startswith("##")]
+    assert heads == ["## main", "## ratio"]
+
+
+def told_apart(chosen: StudySettings, part: str) -> list[tuple[str, str, str]]:
+    mine = [one for one in comparisons(chosen) if one.part == part]
+    return [(one.facts["planner"], words_of(one.facts), one.facts["budget"]) for one in mine]
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_no_two_setups_of_a_part_are_called_the_same(part: str) -> None:
+    said = told_apart(settings(), part)
+    assert len(set(said)) == len(said) > 1
+
+
+def test_all_differences_are_drawn_on_one_sheet(tmp_path: Path) -> None:
+    one = Comparison("main", MORE, REAL, 3)
+    few, many = tmp_path / "few.png", tmp_path / "many.png"
+    draw_differences(rows_of(one, 1.0, (1.0, 0.5, 1.5)), few)
+    draw_differences(rows_of(one, 1.0, (1.0, -0.5, 1.5)) * 40, many)
+    with Image.open(few) as a, Image.open(many) as b:
+        assert b.height > 4 * a.height and a.getextrema()[0][0] < 128
