@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +28,7 @@ class ClipResult:
         """Pairs."""
         return 0 if self.groups is None else len(self.groups[0].stage_two)
 
-    @property
+    @cached_property
     def two_stage(self) -> TwoStageScores | None:
         """Of this clip alone."""
         return None if self.groups is None else aggregate([self.groups])

@@ -22,7 +22,7 @@ from planners.progress import Counter
 
 TRAININGS, EVALUATIONS, DONE, LOG = "trainings", "evaluations", "sweep.json", "train.log"
 INTERRUPTED = 4
-EVALUATED_TOGETHER = 12  # planners in one process
+EVALUATED_TOGETHER = 12  # planners in one process at the most
 LOOK_EVERY_S = 0.5
 
 
@@ -171,7 +171,8 @@ def evaluate_all(
     """
     means, stop = means or Means(), threading.Event()
     who = [(training.label, str(folder_of(out, training))) for training in trainings] + list((others or {}).items())
-    parts = [who[i : i + EVALUATED_TOGETHER] for i in range(0, len(who), EVALUATED_TOGETHER)]
+    together = min(EVALUATED_TOGETHER, max(1, -(-len(who) // means.at_once)))
+    parts = [who[i : i + together] for i in range(0, len(who), together)]
     base = [sys.executable, "-m", "planners.evaluate", f"benchmark={benchmark}", *more, f"out={out / EVALUATIONS}"]
     environment = {"OMP_NUM_THREADS": "1", **os.environ}
 
