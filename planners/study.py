@@ -37,6 +37,7 @@ from planners.study_tables import markdown_of
 from planners.sweep import EVALUATIONS, Means, SweepFailed, Training, evaluate_all, folder_of, train_all
 
 BAD_CONFIG, FAILED, INTERRUPTED = 2, 3, 4
+CURVES = {"final": ("two-stage EPDMS", "scaling.png"), "stage_two": ("EPDMS of stage two", "scaling_stage_two.png")}
 
 
 def run(settings: StudySettings) -> int:
@@ -70,10 +71,12 @@ def write_report(standing: Sequence[Comparison], trained: Sequence[Training], se
     found = compared(standing, evaluations)
     write_csv(report / "comparisons.csv", found)
     (report / "tables.md").write_text(markdown_of(found))
-    curves = curves_of(standing, rows)
-    if curves:
-        write_csv(report / "curves.csv", [curve.row() for curve in curves])
-        draw_curves(curves, "two-stage EPDMS", report / "scaling.png")
+    curves = {stage: curves_of(standing, rows, stage) for stage in CURVES}
+    if any(curves.values()):
+        lines = [{"stage": stage, **curve.row()} for stage, drawn in curves.items() for curve in drawn]
+        write_csv(report / "curves.csv", lines)
+        for stage, (title, name) in CURVES.items():
+            draw_curves(curves[stage], title, report / name)
     differences = [row for row in found if row["reference"]]
     if differences:
         draw_differences(differences, report / "differences.png")
@@ -154,9 +157,9 @@ def scores_of_seeds(setup: Setup, seeds: int, evaluations: Path, stage: str, hum
     return [_scores(evaluations / f"{setup.label}-{seed}")[name] for seed in range(seeds)]
 
 
-def curves_of(wanted: Sequence[Comparison], rows: Sequence[Mapping[str, Any]]) -> list[Curve]:
-    """Two-stage EPDMS over the number of samples: one curve for each planner, expert, imitation and budget."""
-    score, points = name_of("final", SHOWN["final"]), defaultdict[str, list[Point]](list)
+def curves_of(wanted: Sequence[Comparison], rows: Sequence[Mapping[str, Any]], stage: str) -> list[Curve]:
+    """A stage's EPDMS over the number of samples: one curve for each planner, expert, imitation and budget."""
+    score, points = name_of(stage, SHOWN[stage]), defaultdict[str, list[Point]](list)
     for row in rows:
         points[row["training"].rpartition("-")[0]].append(Point(row["real"] + row["simulated"], row[score]))
     series = defaultdict[tuple[str, str], dict[Setup, None]](dict)
