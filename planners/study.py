@@ -6,7 +6,7 @@
 
 Every comparison is made twice: with equal passes over a planner's own data, as the paper does, and with equal optimiser
 steps, since more data in equal passes is more training as well. One seed of one part is trained and evaluated after the
-other; when the minutes are out, the tables hold those that are done, and say with how many seeds. Tables go to
+other; when the minutes are out, the tables hold what is done, and say with how many seeds. Tables go to
 `report`: `trainings.csv` (each training), `comparisons.csv` (means over seeds, differences with paired bootstrap
 intervals over clips and seeds), `tables.md` (the same to be read), `bounds.csv`, `curves.csv`, and
 pictures. Exit codes: 0 complete, 2 bad settings, 3 a training failed, 4 not complete yet, resumable.
@@ -34,7 +34,17 @@ from planners.scores import BOUNDS, SHOWN, name_of, scores_of, write_csv
 from planners.study_figures import draw_differences, draw_learning
 from planners.study_plan import Comparison, Portion, Setup, Sizes, StudySettings, comparisons, portions, so_far
 from planners.study_tables import markdown_of
-from planners.sweep import EVALUATIONS, Means, SweepFailed, Training, evaluate_all, folder_of, train_all
+from planners.sweep import (
+    EVALUATIONS,
+    Means,
+    SweepFailed,
+    Training,
+    evaluate_all,
+    folder_of,
+    is_done,
+    is_evaluated,
+    train_all,
+)
 
 BAD_CONFIG, FAILED, INTERRUPTED = 2, 3, 4
 CURVES = {"final": ("two-stage EPDMS", "scaling.png"), "stage_two": ("EPDMS of stage two", "scaling_stage_two.png")}
@@ -43,21 +53,32 @@ CURVES = {"final": ("two-stage EPDMS", "scaling.png"), "stage_two": ("EPDMS of s
 def run(settings: StudySettings) -> int:
     """Train, evaluate, compare, draw, one seed of one part after the other; the exit code."""
     out, wanted, means = Path(settings.out), comparisons(settings), Means(jobs=settings.jobs, minutes=settings.minutes)
-    planned, done = portions(wanted, settings, sizes_of(settings)), list[Portion]()
+    planned = portions(wanted, settings, sizes_of(settings))
     for portion in planned:
         print(f"{portion.part}, seed {portion.seed}", file=sys.stderr)
         if not train_all(portion.trainings, out, means):
             break
         if not evaluate_all(portion.trainings, out, settings.benchmark, others=portion.ensembles, means=means):
             break
-        done.append(portion)
-    standing = so_far(wanted, {label for portion in done for label in portion.labels})
+    done = evaluated(planned, out)
     if done:
-        write_report(standing, [training for portion in done for training in portion.trainings], settings)
-    if len(done) < len(planned):
-        print(f"{len(done)} of {len(planned)} seeds of parts are done: the same command goes on", file=sys.stderr)
+        trained = [training for portion in planned for training in portion.trainings if training.label in done]
+        write_report(so_far(wanted, done), trained, settings)
+    n = sum(len(portion.labels) for portion in planned)
+    if len(done) < n:
+        print(f"{len(done)} of {n} planners are evaluated: the same command goes on", file=sys.stderr)
         return INTERRUPTED
     return 0
+
+
+def evaluated(planned: Sequence[Portion], out: Path) -> set[str]:
+    """Labels of all that is trained to its end and evaluated as it is now, by this command or one before it."""
+    trainings = [training for portion in planned for training in portion.trainings if is_done(out, training)]
+    trained = {training.label: str(folder_of(out, training)) for training in trainings}
+    folders = set(trained.values())
+    joined = [(label, spec) for portion in planned for label, spec in portion.ensembles.items()]
+    whole = {label: spec for label, spec in joined if folders.issuperset(spec.split("+"))}
+    return {label for label, spec in (trained | whole).items() if is_evaluated(out, label, spec)}
 
 
 def write_report(standing: Sequence[Comparison], trained: Sequence[Training], settings: StudySettings) -> None:

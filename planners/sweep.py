@@ -18,7 +18,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from planners import eval_record
+from planners.contenders import contender
 from planners.progress import Counter
+from planners.scores import BOUNDS
 
 TRAININGS, EVALUATIONS, DONE, LOG = "trainings", "evaluations", "sweep.json", "train.log"
 INTERRUPTED = 4
@@ -197,6 +200,15 @@ def evaluate_all(
             done += len(part) * was_done
             counter.show(done)
         return done == len(who) and evaluate(who)  # nothing is left but the bounds and the tables of all
+
+
+def is_evaluated(out: Path, label: str, spec: str) -> bool:
+    """Whether who `spec` names stands under `label` as it is now, evaluated as the bounds were last."""
+    bound, mine = (out / EVALUATIONS / name for name in (BOUNDS[-1], label))
+    if not (bound / eval_record.RECORD).is_file():
+        return False
+    shared = {k: v for k, v in eval_record.read_record(bound).items() if k not in ("planner", "planner_digest")}
+    return eval_record.is_done(mine, {"planner_digest": contender(spec).digest, **shared})
 
 
 def _last_words(log: Path) -> str:
