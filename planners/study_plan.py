@@ -329,9 +329,13 @@ def _joined(ensemble: Setup, seed: int, out: Path) -> str:
 
 
 def so_far(found: Sequence[Comparison], evaluated: Collection[str]) -> list[Comparison]:
-    """Those comparisons of which both sides are evaluated with the same seeds, with as many seeds as that."""
-    standing = [replace(one, seeds=_seeds_of(one, evaluated)) for one in found]
-    return [one for one in standing if one.seeds]
+    """Comparisons of which both sides are evaluated with the same seeds, all of a part with equally many."""
+    standing = [(one, _seeds_of(one, evaluated)) for one in found]
+    of_part: dict[str, int] = {}
+    for one, seeds in standing:
+        if seeds:
+            of_part[one.part] = min(seeds, of_part.get(one.part, seeds))
+    return [replace(one, seeds=of_part[one.part]) for one, seeds in standing if seeds]
 
 
 def _seeds_of(one: Comparison, evaluated: Collection[str]) -> int:
