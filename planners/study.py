@@ -6,10 +6,10 @@
 
 Every comparison is made twice: with equal passes over a planner's own data, as the paper does, and with equal optimiser
 steps, since more data in equal passes is more training as well. One seed of one part is trained and evaluated after the
-other; when the minutes are out, the tables hold what is done, and say with how many seeds. Tables go to
-`report`: `trainings.csv` (each training), `comparisons.csv` (means over seeds, differences with paired bootstrap
-intervals over clips and seeds), `tables.md` (the same to be read), `bounds.csv`, `curves.csv`, and
-pictures. Exit codes: 0 complete, 2 bad settings, 3 a training failed, 4 not complete yet, resumable.
+other; when the minutes are out, the tables hold what is done, and say with how many seeds. Tables go to `report`:
+`trainings.csv` (each training), `comparisons.csv` (means over seeds, differences with paired bootstrap intervals over
+clips and seeds), `tables.md` (the same to be read), `bounds.csv`, `curves.csv`, and pictures. Exit codes: 0 complete,
+2 bad settings, 3 a training failed, 4 not complete yet, resumable.
 """
 
 import sys

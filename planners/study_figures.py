@@ -3,14 +3,19 @@
 import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from PIL import Image
 
 from planners.curves import LOSSES, VALIDATION
-from planners.study_tables import words_of
+from planners.study_tables import is_clear, words_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 COLUMNS = 6
+COLOURS = 32
 SMOOTH_STEPS = 20  # of which a loss that is drawn is the mean
 DRAWN = {"stage_two": "stage two", "final": "final"}
 CLEAR, OPEN = "#1f6fb4", "#9aa4ad"  # an interval without and with zero
@@ -49,7 +54,7 @@ def draw_learning(folders: Mapping[str, Path], path: Path) -> None:
         "loss (blue), mean distance from held-out human plans [m] (orange), over optimiser steps", fontsize=9
     )
     figure.tight_layout(rect=(0, 0, 1, 0.98))
-    figure.savefig(path, dpi=100)
+    _save(figure, path)
     pyplot.close(figure)
 
 
@@ -68,7 +73,7 @@ def draw_differences(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     for panel, (stage, title) in zip(axes.flat, DRAWN.items()):
         chosen = [row for row in rows if row["stage"] == stage]
         for y, row in enumerate(chosen):
-            color = CLEAR if row["low"] > 0.0 or row["high"] < 0.0 else OPEN
+            color = CLEAR if is_clear(row) else OPEN
             panel.plot([row["low"], row["high"]], [y, y], color=color, linewidth=2)
             panel.plot(row["difference"], y, "o", color=color, markersize=4)
         for y in range(1, n):
@@ -80,13 +85,22 @@ def draw_differences(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
         panel.tick_params(axis="x", labelsize=7)
     axes.flat[0].set_ylim(n - 0.5, -0.5)
     figure.tight_layout()
-    figure.savefig(path, dpi=100)
+    _save(figure, path)
     pyplot.close(figure)
 
 
 def difference_label(row: Mapping[str, Any]) -> str:
     """Which comparison a line stands for."""
-    return f"{row['part']}: {row['planner']} {words_of(row)} (equal {row['budget']}, {row['seeds']} seeds)"
+    seeds = "1 seed" if row["seeds"] == 1 else f"{row['seeds']} seeds"
+    return f"{row['part']}: {row['planner']} {words_of(row)} (equal {row['budget']}, {seeds})"
+
+
+def _save(figure: "Figure", path: Path) -> None:
+    """A sheet of eighty panels in full colour has 1.5 MB, in a few colours a quarter of it."""
+    figure.savefig(path, dpi=100)
+    with Image.open(path) as drawn:
+        few = drawn.convert("RGB").quantize(COLOURS)
+    few.save(path, optimize=True)
 
 
 def column(path: Path, name: str) -> tuple[np.ndarray, np.ndarray]:

@@ -40,8 +40,13 @@ def _score(row: Row) -> str:
     text = f"{row['epdms']:.1f}"
     if not row["reference"]:
         return text
-    bold = "**" if row["low"] > 0.0 or row["high"] < 0.0 else ""
+    bold = "**" if is_clear(row) else ""
     return f"{text} ({bold}{row['difference']:+.1f}{bold}: {row['low']:+.1f} .. {row['high']:+.1f})"
+
+
+def is_clear(row: Row) -> bool:
+    """Whether zero lies outside of the interval of a row that has a reference."""
+    return bool(row["low"] > 0.0 or row["high"] < 0.0)
 
 
 def words_of(row: Row) -> str:
