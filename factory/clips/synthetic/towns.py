@@ -2,34 +2,18 @@
 
 import hashlib
 import json
-import sys
-import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from factory.clips.av2 import AV2Reader
 from factory.clips.reader import ClipRef
-from factory.clips.synthetic.reader import TOWN_VERSION, make_whole, sensed_digest
-from factory.clips.synthetic.town import LOGS_PER_TOWN, log_name
-from factory.clips.synthetic.write import TownSettings, write_logs
+from factory.clips.synthetic.painters import TownFolder, write_all
+from factory.clips.synthetic.reader import TOWN_VERSION, sensed_digest
+from factory.clips.synthetic.town import LOGS_PER_TOWN
+from factory.clips.synthetic.write import TownSettings
 from tasks.caches import user_cache
 from tasks.world.clip import Clip
-
-PAINTERS = 2  # threads; a log's bytes do not depend on them
-
-
-@dataclass(frozen=True)
-class TownFolder:
-    """The chosen logs of one seed's town, and the folder that holds them or will."""
-
-    seed: int
-    indices: tuple[int, ...]
-    root: Path
-
-    def logs(self) -> dict[str, Path]:
-        """Log id -> folder, of logs that may not be written yet."""
-        return {name: self.root / name for name in (log_name(self.seed, index) for index in self.indices)}
 
 
 class SyntheticTownsReader(AV2Reader):
@@ -68,15 +52,14 @@ class SyntheticTownsReader(AV2Reader):
 
     def logs(self) -> dict[str, Path]:
         """Of all towns, in the order of the seeds; writes the towns that are missing."""
-        for number, town in enumerate(self.towns, 1):
-            self._write(town, f"town {number} of {len(self.towns)}")
+        write_all(self.towns, self.settings)
         return {name: folder for town in self.towns for name, folder in town.logs().items()}
 
     def path_of(self, ref: ClipRef) -> Path:
         """The folder of the clip's log; writes its town if it is missing. Raises BadClip where there is none."""
         for town in self.towns:
             if ref.log_id in town.logs() and ref.dataset == self.name:
-                self._write(town, "town")
+                write_all([town], self.settings)
                 return town.logs()[ref.log_id]
         return super().path_of(ref)
 
@@ -96,11 +79,3 @@ class SyntheticTownsReader(AV2Reader):
         indices = tuple((seed * n_logs + i) % LOGS_PER_TOWN for i in range(n_logs))
         key = json.dumps([TOWN_VERSION, "logs", indices, seed, asdict(self.settings)])
         return TownFolder(seed, indices, self.root / f"town-{seed}-{hashlib.sha256(key.encode()).hexdigest()[:16]}")
-
-    def _write(self, town: TownFolder, which: str) -> None:
-        if town.root.is_dir():
-            return
-        began = time.monotonic()
-        make_whole(town.root, lambda folder: write_logs(folder, town.indices, town.seed, self.settings, PAINTERS))
-        told = f"{which}: seed {town.seed}, {len(town.indices)} logs painted in {time.monotonic() - began:.0f} s"
-        print(told, file=sys.stderr, flush=True)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-import factory.clips.synthetic.towns as towns_module
+import factory.clips.synthetic.painters as painters_module
 from factory.clips.reader import BadClip, ClipRef
 from factory.clips.synthetic.reader import SyntheticReader
 from factory.clips.synthetic.town import LOGS_PER_TOWN
@@ -69,13 +69,13 @@ def test_a_town_is_written_once_and_only_where_it_is_read(
     assert [town.root.is_dir() for town in made.towns] == [False, True]
     made.index()
     assert [town.root.is_dir() for town in made.towns] == [True, True]
-    assert "town 1 of 2: seed 0, 1 logs painted" in capsys.readouterr().err
+    assert "town 1 of 1: seed 0, 1 logs painted" in capsys.readouterr().err
 
     def killed(out: Path, *_rest: object) -> None:
         (out / "half").mkdir()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(towns_module, "write_logs", killed)
+    monkeypatch.setattr(painters_module, "write_logs", killed)
     assert len(reader_of(tmp_path, [0, 1]).index().refs) == 6
     unfinished = reader_of(tmp_path, [2])
     with pytest.raises(KeyboardInterrupt):

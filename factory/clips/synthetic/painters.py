@@ -1,0 +1,104 @@
+"""Several towns at once, each written by a process of its own: planning a drive is Python, and holds the interpreter.
+
+    python -m factory.clips.synthetic.painters <a town as JSON>       what such a process runs
+
+Only towns with sensors are worth a process, which starts in seconds: a log without cameras and lidar is written in two.
+"""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from factory.clips.synthetic.reader import make_whole
+from factory.clips.synthetic.town import log_name
+from factory.clips.synthetic.write import TownSettings, write_logs
+from factory.pace import time_text
+
+THREADS = 2  # of a town that is painted alone; a log's bytes do not depend on them
+MOST_PAINTERS = 8  # processes; each takes half a gigabyte
+LOOK_EVERY_S = 0.1
+
+
+@dataclass(frozen=True)
+class TownFolder:
+    """The chosen logs of one seed's town, and the folder that holds them or will."""
+
+    seed: int
+    indices: tuple[int, ...]
+    root: Path
+
+    def logs(self) -> dict[str, Path]:
+        """Log id -> folder, of logs that may not be written yet."""
+        return {name: self.root / name for name in (log_name(self.seed, index) for index in self.indices)}
+
+
+def write_one(town: TownFolder, settings: TownSettings, threads: int = THREADS) -> None:
+    """Writes the town whole, unless it is there."""
+    make_whole(town.root, lambda folder: write_logs(folder, town.indices, town.seed, settings, threads))
+
+
+def write_all(towns: Sequence[TownFolder], settings: TownSettings) -> None:
+    """Writes the towns that are missing, as many at once as there are cores; how far it is goes to stderr.
+
+    Raises RuntimeError where a town could not be written: what its process said stands on stderr, and the towns that
+    others were writing are given up. Interrupted, it leaves whole towns and nothing else.
+    """
+    missing = [town for town in towns if not town.root.is_dir()]
+    at_once = min(len(missing), os.cpu_count() or 1, MOST_PAINTERS) if settings.cameras or settings.lidar_beams else 1
+    progress = _Progress(len(missing))
+    if at_once <= 1:
+        for town in missing:
+            write_one(town, settings)
+            progress.show(town)
+        return
+    waiting, painting = deque(missing), dict[subprocess.Popen[bytes], TownFolder]()
+    try:
+        while waiting or painting:
+            while waiting and len(painting) < at_once:
+                town = waiting.popleft()
+                painting[_painter(town, settings)] = town
+            for child in [child for child in painting if child.poll() is not None]:
+                town = painting.pop(child)
+                if child.returncode != 0:
+                    raise RuntimeError(f"town {town.seed}: its process ended with exit {child.returncode}, see above")
+                progress.show(town)
+            time.sleep(LOOK_EVERY_S)
+    finally:
+        for child in painting:
+            child.send_signal(signal.SIGINT)  # it removes what it has begun
+        for child in painting:
+            child.wait()
+
+
+class _Progress:
+    def __init__(self, total: int) -> None:
+        self._total, self._done, self._began = total, 0, time.monotonic()
+
+    def show(self, town: TownFolder) -> None:
+        self._done += 1
+        left = (time.monotonic() - self._began) / self._done * (self._total - self._done)
+        told = f"town {self._done} of {self._total}: seed {town.seed}, {len(town.indices)} logs painted"
+        print(f"{told}  ETA {time_text(left)}", file=sys.stderr, flush=True)
+
+
+def _painter(town: TownFolder, settings: TownSettings) -> "subprocess.Popen[bytes]":
+    told = {"seed": town.seed, "indices": town.indices, "root": str(town.root), "settings": asdict(settings)}
+    return subprocess.Popen([sys.executable, "-m", __name__, json.dumps(told)])  # noqa: S603 - a list, no shell
+
+
+def main(told: str) -> None:
+    """A painter's process: one town, on one core."""
+    town = json.loads(told)
+    folder = TownFolder(town["seed"], tuple(town["indices"]), Path(town["root"]))
+    write_one(folder, TownSettings(**town["settings"]), threads=1)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

@@ -1,0 +1,73 @@
+"""Towns with sensors are written by processes side by side: the same bytes, whole or not at all."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from factory.clips.synthetic.painters import TownFolder, write_all, write_one
+from factory.clips.synthetic.write import TownSettings
+
+SMALL = TownSettings(cameras=("ring_front_center",), width=32, height=18, lidar_beams=0)
+PATIENCE_S = 60.0
+
+
+def towns_in(folder: Path) -> list[TownFolder]:
+    return [TownFolder(seed, (2,), folder / f"town-{seed}") for seed in (5, 6)]
+
+
+@pytest.fixture(autouse=True)
+def two_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+
+
+def test_towns_painted_side_by_side_have_the_bytes_of_one_painted_here(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    towns, here = towns_in(tmp_path / "beside"), towns_in(tmp_path / "here")[1]
+    write_all(towns, SMALL)
+    assert "town 2 of 2" in capfd.readouterr().err
+    write_one(here, SMALL)
+    capfd.readouterr()
+    files = [path.relative_to(here.root) for path in sorted(here.root.rglob("*")) if path.is_file()]
+    assert sum(path.suffix == ".jpg" for path in files) == 24
+    for path in files:
+        assert (here.root / path).read_bytes() == (towns[1].root / path).read_bytes()
+    assert sorted(path.name for path in (tmp_path / "beside").iterdir()) == ["town-5", "town-6"]
+    write_all(towns, SMALL)
+    assert not capfd.readouterr().err, "what is there is not written again"
+
+
+def test_a_town_that_cannot_be_written_is_named(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").write_text("no folder")
+    with pytest.raises(RuntimeError, match=r"town [56]: its process ended with exit 1"):
+        write_all(towns_in(tmp_path / "file"), SMALL)
+    assert "file" in capfd.readouterr().err
+
+
+INTERRUPTED = """
+import os, signal, sys
+from pathlib import Path
+from factory.clips.synthetic.painters import TownFolder, write_all
+from factory.clips.synthetic.write import TownSettings
+signal.signal(signal.SIGINT, signal.default_int_handler)  # where the shell of a background job ignores it
+os.cpu_count = lambda: 2
+write_all([TownFolder(seed, (0, 1, 2, 3), Path(sys.argv[1]) / f"town-{seed}") for seed in (5, 6)], TownSettings())
+"""
+
+
+def test_an_interrupted_command_leaves_nothing_unfinished(tmp_path: Path) -> None:
+    command = subprocess.Popen([sys.executable, "-c", INTERRUPTED, str(tmp_path)], stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + PATIENCE_S
+    while len(list(tmp_path.glob(".town-*"))) < 2 and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert len(list(tmp_path.glob(".town-*"))) == 2
+    command.send_signal(signal.SIGINT)
+    _out, said = command.communicate(timeout=PATIENCE_S)
+    assert command.returncode != 0
+    assert "KeyboardInterrupt" in said
+    assert not list(tmp_path.iterdir())
