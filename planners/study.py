@@ -6,7 +6,8 @@
 
 Every comparison is made twice: with equal passes over a planner's own data, as the paper does, and with equal optimiser
 steps, since more data in equal passes is more training as well. One seed of one part is trained and evaluated after the
-other; when the minutes are out, the tables hold what is done, and say with how many seeds. Tables go to `report`:
+other; when the minutes are out, the tables hold what is done, and say with how many seeds. They hold every part that is
+evaluated in `out`, whichever were asked for now. Tables go to `report`:
 `trainings.csv` (each training), `comparisons.csv` (means over seeds, differences with paired bootstrap intervals over
 clips and seeds), `tables.md` (the same to be read), `bounds.csv`, `curves.csv`, and pictures. Exit codes: 0 complete,
 2 bad settings, 3 a training failed, 4 not complete yet, resumable.
@@ -32,7 +33,17 @@ from planners.scaling_law import FEWEST, fit_scaling
 from planners.score_rows import read_rows
 from planners.scores import BOUNDS, SHOWN, name_of, scores_of, write_csv
 from planners.study_figures import draw_differences, draw_learning
-from planners.study_plan import Comparison, Portion, Setup, Sizes, StudySettings, comparisons, portions, so_far
+from planners.study_plan import (
+    Comparison,
+    Portion,
+    Setup,
+    Sizes,
+    StudySettings,
+    comparisons,
+    portions,
+    so_far,
+    with_all_parts,
+)
 from planners.study_tables import markdown_of
 from planners.sweep import (
     EVALUATIONS,
@@ -52,21 +63,25 @@ CURVES = {"final": ("two-stage EPDMS", "scaling.png"), "stage_two": ("EPDMS of s
 
 def run(settings: StudySettings) -> int:
     """Train, evaluate, compare, draw, one seed of one part after the other; the exit code."""
-    out, wanted, means = Path(settings.out), comparisons(settings), Means(jobs=settings.jobs, minutes=settings.minutes)
-    planned = portions(wanted, settings, sizes_of(settings))
-    for portion in planned:
+    out, means = Path(settings.out), Means(jobs=settings.jobs, minutes=settings.minutes)
+    sizes, whole = sizes_of(settings), with_all_parts(settings)
+    asked = portions(comparisons(settings), settings, sizes)
+    for portion in asked:
         print(f"{portion.part}, seed {portion.seed}", file=sys.stderr)
         if not train_all(portion.trainings, out, means):
             break
         if not evaluate_all(portion.trainings, out, settings.benchmark, others=portion.ensembles, means=means):
             break
+    wanted = comparisons(whole)
+    planned = portions(wanted, whole, sizes)
     done = evaluated(planned, out)
     if done:
         trained = [training for portion in planned for training in portion.trainings if training.label in done]
         write_report(so_far(wanted, done), trained, settings)
-    n = sum(len(portion.labels) for portion in planned)
-    if len(done) < n:
-        print(f"{len(done)} of {n} planners are evaluated: the same command goes on", file=sys.stderr)
+    labels = [label for portion in asked for label in portion.labels]
+    if missing := set(labels) - done:
+        n = len(labels)
+        print(f"{n - len(missing)} of {n} planners are evaluated: the same command goes on", file=sys.stderr)
         return INTERRUPTED
     return 0
 
@@ -112,11 +127,11 @@ def sizes_of(settings: StudySettings) -> Sizes:
     high = open_dataset(replace(sim, psnr_min=settings.psnr_db))
     real = sum(len(open_dataset(DataSettings(real=table))) for table in (settings.data, settings.begin) if table)
     steps = settings.epochs * ((real + len(high)) // settings.batch_size)
-    if "psnr" not in settings.parts:
-        return Sizes(steps)
     try:
         low = open_dataset(replace(sim, psnr_max=settings.psnr_db))
     except ValueError as error:
+        if "psnr" not in settings.parts:
+            return Sizes(steps)
         raise ConfigError(f"part psnr: {error}; leave it out of parts, or choose another psnr_db") from error
     return Sizes(steps, min(len(low), len(high)))
 

@@ -163,6 +163,11 @@ def comparisons(settings: StudySettings) -> list[Comparison]:
     return list(dict.fromkeys(found))
 
 
+def with_all_parts(settings: StudySettings) -> StudySettings:
+    """The whole study: the chosen parts, then the others."""
+    return replace(settings, parts=tuple(dict.fromkeys((*settings.parts, *PARTS))))
+
+
 def trained(setup: Setup, rounds: int) -> Setup:
     """What is trained for it: all real and pdm_closed samples are what equal steps are counted by, in one training."""
     is_whole = replace(setup, planner="", imitation="all") == Setup("", "pdm_closed", rounds, "steps")

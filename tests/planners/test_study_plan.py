@@ -5,7 +5,16 @@ from typing import Any
 import pytest
 
 from factory.config import compose, fill
-from planners.study_plan import ENSEMBLE, PARTS, Sizes, StudySettings, comparisons, portions, so_far
+from planners.study_plan import (
+    ENSEMBLE,
+    PARTS,
+    Sizes,
+    StudySettings,
+    comparisons,
+    portions,
+    so_far,
+    with_all_parts,
+)
 from planners.sweep import Training
 
 SIZES = Sizes(steps=600, matched=7)
@@ -49,6 +58,15 @@ def test_every_training_begins_with_what_the_same_planner_learnt_in_other_towns(
     alone = settings(begin=None)
     planned = trainings(alone)
     assert not any("begin" in t.label or any(o.startswith("init_from") for o in t.overrides) for t in planned)
+
+
+def test_tables_hold_all_parts_whichever_are_trained_now() -> None:
+    some = settings(parts=("ratio", "main"))
+    whole = with_all_parts(some)
+    assert whole.parts[:2] == some.parts
+    assert sorted(whole.parts) == sorted(PARTS)
+    mine, every = ({t.label: t.overrides for t in trainings(chosen)} for chosen in (some, whole))
+    assert mine.items() < every.items(), "a training is the same whichever parts ask for it"
 
 
 def test_a_training_is_planned_once_with_as_many_seeds_as_anyone_asks_for() -> None:
