@@ -40,8 +40,8 @@ class Gaussians:
     def __len__(self) -> int:
         return len(self.means)
 
-    def take(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> "Gaussians":
-        """The Gaussians at `rows` (indices or mask)."""
+    def take(self, rows: NDArray[np.bool_] | NDArray[np.intp] | slice) -> "Gaussians":
+        """The Gaussians at `rows` (indices or mask); a slice copies nothing."""
         return Gaussians(
             self.means[rows],
             self.quats[rows],

@@ -119,16 +119,15 @@ def compose(problem: Problem, state: FitState, photo: Photo) -> tuple[Gaussians,
     """All Gaussians that a photo (pose local) may show, in the scene, and whose they are; the background's first."""
     every = state.gaussians()
     n = int(np.searchsorted(state.owner, 0))
-    rows = np.arange(n)
-    scenes, parts = [every.take(rows) if n < len(every) else every], [Part(0, rows, None)]
+    scenes, parts = [every.take(slice(n))], [Part(0, np.arange(n), None)]
     boxes, valid = problem.tracks.at(photo.time_s)
     frames = world_from_boxes(boxes)
     for j in np.flatnonzero(valid & _in_view(boxes, photo)):
-        rows = np.arange(np.searchsorted(state.owner, j), np.searchsorted(state.owner, j, side="right"))
-        if len(rows):
-            parts.append(Part(n, rows, frames[j]))
-            scenes.append(moved(every.take(rows), frames[j]))
-            n += len(rows)
+        mine = slice(*np.searchsorted(state.owner, [j, j + 1]))
+        if mine.start < mine.stop:
+            parts.append(Part(n, np.arange(mine.start, mine.stop), frames[j]))
+            scenes.append(moved(every.take(mine), frames[j]))
+            n += mine.stop - mine.start
     return (scenes[0] if len(scenes) == 1 else concatenate(scenes)), parts
 
 
