@@ -31,7 +31,8 @@ class BlockQueue:
         self._built: set[str] = set()
         self._block_of = block_of
         needed = {block_of(clip.ref) for clip in clips if wants_payload(clip)} - {None}
-        self.at_once = max(1, min(workers, len(needed)))
+        self.n_blocks = len(needed)
+        self.at_once = max(1, min(workers, self.n_blocks))
 
     def __bool__(self) -> bool:
         """Some clip has not been handed out."""

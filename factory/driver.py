@@ -14,6 +14,7 @@ from factory.batch import Gatherer, PendingRow
 from factory.blocks import BlockOf, BlockQueue, Build
 from factory.clips.reader import ClipRef
 from factory.episodes import Episodes
+from factory.forecast import Forecast, Work
 from factory.local import Graph, Ticket
 from factory.metrics import RunMetrics
 from factory.plan import CLIP_CANDIDATE, ClipPlan, Plan, WalkState, wants_payload
@@ -24,7 +25,7 @@ from factory.store.outcomes import QUARANTINE_AFTER, ErrorKind, Kind, Outcome
 from factory.store.samples import Past
 from factory.store.table import Shard
 from factory.walk import Blocked, Complete, Exhausted, Step, Try, tries_before
-from factory.work import RunIdentity, attempt_id
+from factory.work import LOGGED, RunIdentity, attempt_id
 from tasks.stages import Rejected
 
 CLIPS_PER_WORKER = 2  # open at once: one works while the next is being prepared
@@ -76,6 +77,10 @@ class Driver:
         self._held: dict[tuple[str, str], tuple[list[PendingRow], list[Outcome]]] = {}  # redo: until the walk ends
         self._stopping = threading.Event()
         self._tally = Tally()
+        self._wanted = {
+            (clip.ref.clip_id, walk.expert): _wanted(walk, rounds) for clip in plan.todo for walk in clip.walks
+        }
+        self._forecast = Forecast(Work(), Work(left=sum(self._wanted.values())))
 
     def stop(self) -> None:
         """Begin nothing more; what is in flight is finished and committed."""
@@ -100,11 +105,12 @@ class Driver:
         """Until nothing is left, or until stopped and drained."""
         self._graph, self._gatherer, self._metrics, self._episodes = graph, gatherer, metrics, episodes
         gatherer.committed = self._committed
-        with ProgressLine(len(self._plan.todo), doing=self._doing) as progress:
+        with ProgressLine(len(self._plan.todo), self._forecast.left_s, doing=self._doing) as progress:
             self._work_through(graph, gatherer, progress)
 
     def _work_through(self, graph: Graph, gatherer: Gatherer, progress: ProgressLine) -> None:
         self._queue = BlockQueue(self._plan.todo, self._block_of, graph.parallelism)
+        self._forecast.blocks.left = self._queue.n_blocks
         while True:
             room = len(self._walks_left) + len(self._preparing) < CLIPS_PER_WORKER * graph.parallelism
             if gatherer.n_writing < 2 and not self.interrupted:
@@ -174,8 +180,9 @@ class Driver:
             self._take_attempt(*self._trying.pop(ticket), ticket.result, report)
 
     def _take_block(self, build: Build, report: Reconstructed | Failure) -> None:
+        self._forecast.blocks.finish(1)
         if isinstance(report, Reconstructed):
-            self._count(report.seconds)
+            self._count(report.seconds, self._forecast.blocks)
         else:
             last = report.error.splitlines()[-1]
             self.notes.append(f"block {build.block} failed ({last}); it is tried again for each of its clips")
@@ -187,7 +194,7 @@ class Driver:
         if isinstance(report, Rejected):
             replaced += [key for walk in clip.walks for key in walk.stale]
         if isinstance(report, Prepared):
-            self._count(report.seconds)
+            self._count(report.seconds, self._forecast.samples)
             if report.note:
                 self.notes.append(report.note)
             elif (
@@ -215,6 +222,8 @@ class Driver:
         self._tally.rejected += not clip.failed
         self._tally.failed += clip.failed
         self._tally.clips += 1
+        for walk in clip.walks:
+            self._settle(clip, walk)
 
     def _start_walks(self, clip: ClipPlan, prepared: Any) -> None:
         self._walks_left[clip.ref.clip_id] = len(clip.walks)
@@ -234,7 +243,16 @@ class Driver:
             del self._walks_left[clip.ref.clip_id]
             self._tally.clips += not self.interrupted
 
+    def _settle(self, clip: ClipPlan, walk: WalkState, n: int | None = None) -> None:
+        """`n` of the samples that the walk was to make are behind it, None: all, made or not."""
+        key = clip.ref.clip_id, walk.expert
+        n = self._wanted[key] if n is None else min(n, self._wanted[key])
+        self._wanted[key] -= n
+        self._forecast.samples.finish(n)
+
     def _finish(self, clip: ClipPlan, walk: WalkState, step: Step) -> None:
+        if not isinstance(step, Try):
+            self._settle(clip, walk)
         if walk.lacks_exhausted(step):
             assert isinstance(step, Exhausted)
             stamp = self._stamp(clip.ref, walk.expert, Try(step.n_tried, -1))
@@ -256,12 +274,13 @@ class Driver:
         known = walk.known.get(stamp.candidate_index)
         replaced = [known.attempt_id] if known is not None else []  # under keep perhaps of other expert inputs
         if isinstance(report, Attempted):
-            self._count(report.seconds)
+            self._count(report.seconds, self._forecast.samples)
         if isinstance(report, Attempted) and report.rejected is None:
             walk.known[stamp.candidate_index] = Past(stamp.attempt_id, Kind.ACCEPTED, True, round=stamp.round)
             row = PendingRow(result, report.n_bytes, (stamp.round, stamp.expert), report.licence)
             self._keep(clip, walk, rows=[row], replaced=replaced)
             self._tally.accepted += 1
+            self._settle(clip, walk, 1)
             self._metrics.accepted(stamp.expert, stamp.round)
         else:
             what = report if isinstance(report, Failure) else report.rejected
@@ -362,10 +381,17 @@ class Driver:
             report.dropped.reason if report.dropped is not None else "",
         )
 
-    def _count(self, seconds: Mapping[str, float]) -> None:
+    def _count(self, seconds: Mapping[str, float], work: Work) -> None:
+        work.spent_s += sum(seconds.values())
         for stage, spent in seconds.items():
             self._seconds[stage][0] += 1
             self._seconds[stage][1] += spent
+
+
+def _wanted(walk: WalkState, rounds: int) -> int:
+    """Samples that the walk is still to make, as far as its list lasts."""
+    found = sum(past.kind is Kind.ACCEPTED for past in walk.known.values())
+    return max(0, (1 if walk.expert in LOGGED else rounds) - found)
 
 
 def _past(outcome: Outcome) -> Past:

@@ -31,6 +31,7 @@ class ProgressLine:
     """Shows a Tally against `total` clips."""
 
     total: int
+    left_s: Callable[[float], float | None]  # seconds of the run so far -> seconds left, if that is known
     stream: TextIO = field(default_factory=lambda: sys.stderr)
     doing: Callable[[], str] = str  # how far long tasks are
     _began: float = field(default_factory=time.monotonic)
@@ -69,7 +70,8 @@ class ProgressLine:
 
     def text(self, tally: Tally, elapsed_s: float) -> str:
         rate = tally.clips / elapsed_s if elapsed_s > 0 else 0.0
-        left = time_text((self.total - tally.clips) / rate) if rate > 0 else "?"
+        left_s = self.left_s(elapsed_s)
+        left = "?" if left_s is None else time_text(left_s)
         counts = f"{tally.accepted} accepted, {tally.rejected} rejected, {tally.failed} failed"
         return "  ".join(filter(None, [rate_text(rate, " clips"), counts, f"ETA {left}", self._doing()]))
 
