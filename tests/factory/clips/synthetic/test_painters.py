@@ -25,6 +25,7 @@ def two_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
 
 
+@pytest.mark.slow
 def test_towns_painted_side_by_side_have_the_bytes_of_one_painted_here(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
