@@ -189,6 +189,7 @@ def test_a_log_that_begins_too_late_is_left_out_with_its_reason(work: FactoryWor
     assert (result.stage, result.reason) == ("clip", "no_earlier_frame")
 
 
+@pytest.mark.slow
 def test_a_pair_falls_together_at_the_pictures(tmp_path: Path) -> None:
     small = ["clips.settings.width=64", "clips.settings.height=36", "clips.settings.lidar_azimuths=300"]
     small += ["clips.settings.steps_per_photo=5"]

@@ -144,6 +144,7 @@ def test_a_setting_that_says_nothing_is_refused(text: str) -> None:
         load_config([f"episodes={text}"])
 
 
+@pytest.mark.slow
 def test_verify_finds_every_flipped_bit_of_an_episode_and_tells_outdated_ones(whole: Path, tmp_path: Path) -> None:
     run(tmp_path)
     assert verify(Store(tmp_path)).damage == () and verify(Store(tmp_path)).orphans == ()

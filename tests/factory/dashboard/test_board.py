@@ -76,6 +76,7 @@ def test_a_run_that_is_still_to_begin_is_waited_for(tmp_path: Path, capsys: pyte
         awaited("gopher://bucket/run")
 
 
+@pytest.mark.slow
 def test_the_numbers_are_those_of_the_tables_while_a_run_goes_on(tmp_path: Path) -> None:
     board = Board(Store(tmp_path), look_every_s=0.0)
     seen: list[tuple[dict[str, Any], dict[str, Any]]] = []
@@ -192,6 +193,7 @@ def test_pictures_are_those_of_the_row(out: Path, board: Board) -> None:
     assert "no episode" in get(board, f"/episode/{attempt_id}.mcap", 404)["error"], "its poses are made up"
 
 
+@pytest.mark.slow
 def test_the_whole_logged_drive_is_in_the_picture_and_the_episode_where_the_prepared_clip_is_there(
     tmp_path: Path,
 ) -> None:

@@ -59,6 +59,7 @@ def test_a_sample_s_sheet_holds_the_world_and_its_cameras(store: Store) -> None:
     assert sample_sheet({**sample, "images": None}).shape == (720, 720 + 400, 3)
 
 
+@pytest.mark.slow
 def test_rejected_examples_are_the_same_with_and_without_the_cache(tmp_path: Path, shared_root: Path) -> None:
     run = assemble(
         load_config(

@@ -56,6 +56,7 @@ def s3() -> Iterator[dict[str, str]]:
         server.wait(timeout=10)
 
 
+@pytest.mark.slow
 def test_a_bucket_holds_the_same_rows_as_a_folder(s3: dict[str, str], tmp_path: Path) -> None:
     url = f"s3://{BUCKET}/runs/one"
     for rounds in (1, 3):

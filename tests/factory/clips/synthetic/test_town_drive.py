@@ -122,6 +122,7 @@ def test_the_same_seed_plans_the_same_drive() -> None:
     assert [t.track_id for t in log.tracks] == [t.track_id for t in again.tracks]
 
 
+@pytest.mark.slow
 def test_the_logged_ego_scores_as_a_good_driver(tmp_path: Path) -> None:
     """Collision, drivable area, direction, lights, time to collision, lane keeping: all 1, in every window."""
     n = 3 * WINDOWS_PER_LOG

@@ -51,6 +51,7 @@ def test_nine_towns_of_two_logs_have_every_kind_of_drive_once(folder: Path) -> N
     assert sorted(indices) == list(range(LOGS_PER_TOWN))
 
 
+@pytest.mark.slow
 def test_a_log_has_the_same_bytes_whatever_logs_are_written_beside_it(tmp_path: Path) -> None:
     write_town(tmp_path / "all", 4, 3, BLIND)
     alone = write_logs(tmp_path / "one", [1], 3, BLIND)[0]
@@ -60,6 +61,7 @@ def test_a_log_has_the_same_bytes_whatever_logs_are_written_beside_it(tmp_path: 
         assert path.read_bytes() == (tmp_path / "all" / path.relative_to(tmp_path / "one")).read_bytes()
 
 
+@pytest.mark.slow
 def test_a_town_is_written_once_and_only_where_it_is_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
