@@ -334,13 +334,16 @@ def _joined(ensemble: Setup, seed: int, out: Path) -> str:
 
 
 def so_far(found: Sequence[Comparison], evaluated: Collection[str]) -> list[Comparison]:
-    """Comparisons of which both sides are evaluated with the same seeds, all of a part with equally many."""
-    standing = [(one, _seeds_of(one, evaluated)) for one in found]
+    """Comparisons of which both sides are evaluated with the same seeds, all of a part with equally many.
+
+    A part is left out as long as nothing of it is held against anything: other parts share what it would begin with.
+    """
+    standing = [(one, seeds) for one in found if (seeds := _seeds_of(one, evaluated))]
     of_part: dict[str, int] = {}
     for one, seeds in standing:
-        if seeds:
-            of_part[one.part] = min(seeds, of_part.get(one.part, seeds))
-    return [replace(one, seeds=of_part[one.part]) for one, seeds in standing if seeds]
+        of_part[one.part] = min(seeds, of_part.get(one.part, seeds))
+    open_parts = {one.part for one in found if one.reference} - {one.part for one, _ in standing if one.reference}
+    return [replace(one, seeds=of_part[one.part]) for one, _ in standing if one.part not in open_parts]
 
 
 def _seeds_of(one: Comparison, evaluated: Collection[str]) -> int:

@@ -150,6 +150,12 @@ def test_comparisons_so_far_have_the_seeds_that_both_sides_have() -> None:
     assert so_far(found, second.labels) == []
 
 
+def test_a_part_of_which_only_others_trainings_are_there_is_left_out() -> None:
+    asked, whole = settings(parts=("rewards",)), settings()
+    labels = [label for portion in portions(comparisons(asked), asked, SIZES) for label in portion.labels]
+    assert {c.part for c in so_far(comparisons(whole), labels)} == {"begin", "rewards"}
+
+
 @pytest.mark.parametrize(
     ("changes", "said"), [({"parts": ["mian"]}, "parts="), ({"planners": {"ltf": "ltf"}}, "planners lacks")]
 )

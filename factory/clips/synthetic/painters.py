@@ -67,7 +67,10 @@ def write_all(towns: Sequence[TownFolder], settings: TownSettings) -> None:
             for child in [child for child in painting if child.poll() is not None]:
                 town = painting.pop(child)
                 if child.returncode != 0:
-                    raise RuntimeError(f"town {town.seed}: its process ended with exit {child.returncode}, see above")
+                    ended = f"its process ended with exit {child.returncode} and said above why"
+                    raise RuntimeError(
+                        f"town {town.seed}: {ended}; towns that are written stay, the same command goes on"
+                    )
                 progress.show(town)
             time.sleep(LOOK_EVERY_S)
     finally:
