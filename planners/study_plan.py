@@ -153,10 +153,12 @@ class Comparison:
 
 
 def comparisons(settings: StudySettings) -> list[Comparison]:
-    """All of the chosen parts, each once, behind the trainings that all begin with."""
-    first = settings.planners if settings.begin else ()
+    """All of the chosen parts, each once, behind the trainings that their planners begin with."""
+    chosen = [one for part in settings.parts for one in PARTS[part](settings)]
+    asked = {one.setup.planner for one in chosen}
+    first = [planner for planner in settings.planners if planner in asked] if settings.begin else []
     found = [Comparison("begin", begin(planner), None, 1) for planner in first]
-    for one in (one for part in settings.parts for one in PARTS[part](settings)):
+    for one in chosen:
         reference = None if one.reference is None else trained(one.reference, settings.rounds)
         setup = trained(one.setup, settings.rounds)
         found.append(replace(one, setup=setup, reference=reference, budget=one.setup.budget))

@@ -55,6 +55,8 @@ def test_every_training_begins_with_what_the_same_planner_learnt_in_other_towns(
         assert (mine in training.overrides) == (training.label not in first)
         real = "elsewhere" if training.label in first else "made,elsewhere"
         assert f"data.real=[{real}]" in training.overrides
+    two = trainings(settings(begin="elsewhere", parts=("ratio",)))
+    assert {t.facts["planner"] for t in two} == {"diffusiondrive", "gtrs_dense"}, "nothing else is trained for a part"
     alone = settings(begin=None)
     planned = trainings(alone)
     assert not any("begin" in t.label or any(o.startswith("init_from") for o in t.overrides) for t in planned)

@@ -51,6 +51,7 @@ class TownSettings:
     height: int = 180
     jpeg_quality: int = 92
     steps_per_photo: int = 5  # of 0.1 s: 5 is 2 Hz, as fast as samples want them; 1 is 10 Hz, for scenes to learn from
+    photo_steps: int = LOG_STEPS  # of a log, from its first, that are photographed; the three windows' histories are 36
     lidar_beams: int = 64  # 0: no lidar
     lidar_azimuths: int = 900
 
@@ -61,6 +62,8 @@ class TownSettings:
             raise ValueError(f"impossible picture: {self.width}x{self.height}, quality {self.jpeg_quality}")
         if self.steps_per_photo < 1 or STEPS_PER_SWEEP % self.steps_per_photo:
             raise ValueError(f"steps_per_photo must divide {STEPS_PER_SWEEP}, not {self.steps_per_photo}")
+        if not 1 <= self.photo_steps <= LOG_STEPS:
+            raise ValueError(f"photo_steps must be 1 to {LOG_STEPS}, the steps of a log, not {self.photo_steps}")
         if self.lidar_beams < 0 or self.lidar_azimuths < 1:
             raise ValueError(f"impossible lidar: {self.lidar_beams} beams, {self.lidar_azimuths} azimuths")
 
@@ -129,20 +132,23 @@ def _sensors(
     if settings.lidar_beams:
         (folder / "sensors" / "lidar").mkdir(parents=True, exist_ok=True)
 
+    photographed = range(0, settings.photo_steps if rig else 0, settings.steps_per_photo)
+    swept = range(0, LOG_STEPS if settings.lidar_beams else 0, STEPS_PER_SWEEP)
+
     def record(step: int) -> None:
         stage, pose, stamp = theatre.at(step), world_from_ego(drive.ego[step]), int(stamps[step])
-        for camera in rig:
+        for camera in rig if step in photographed else ():
             picture = cv2.cvtColor(paint(stage, camera, pose), cv2.COLOR_RGB2BGR)
             _ok, jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, settings.jpeg_quality])
             (folder / "sensors" / "cameras" / camera.name / f"{stamp}.jpg").write_bytes(jpeg.tobytes())
-        if settings.lidar_beams and step % STEPS_PER_SWEEP == 0:
+        if step in swept:
             sweep = scan(stage, pose, settings.lidar_beams, settings.lidar_azimuths)
             columns = {axis: pa.array(sweep.points[:, k]) for k, axis in enumerate("xyz")}
             columns |= {name: pa.array(getattr(sweep, name)) for name in ("intensity", "laser_number", "offset_ns")}
             _feather(folder / "sensors" / "lidar" / f"{stamp}.feather", columns)
 
     with ThreadPoolExecutor(max_workers=threads) as pool:
-        list(pool.map(record, range(0, LOG_STEPS, settings.steps_per_photo if rig else STEPS_PER_SWEEP)))
+        list(pool.map(record, sorted({*photographed, *swept})))
 
 
 def _feather(path: Path, columns: Mapping[str, Any]) -> None:

@@ -1,6 +1,7 @@
 """The town on disk: Argoverse 2's layout, the same bytes for the same seed, whole or not there."""
 
 import hashlib
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,10 +11,12 @@ import pytest
 
 import factory.clips.synthetic.reader as reader_module
 from factory.clips.synthetic.reader import SyntheticReader
-from factory.clips.synthetic.town import WINDOWS_PER_LOG
+from factory.clips.synthetic.town import LOG_STEPS, STEPS_PER_SWEEP, WINDOWS_PER_LOG
 from factory.clips.synthetic.write import LICENCE, TownSettings, write_town
+from tasks.world.clip import Clip
 from tasks.world.lanes import LightState
 
+HISTORY_S = 1.5
 SMALL = TownSettings(("ring_front_center", "ring_rear_left"), width=64, height=36, lidar_beams=8, lidar_azimuths=90)
 
 
@@ -99,6 +102,23 @@ def test_a_town_is_written_once_and_never_seen_half(tmp_path: Path, monkeypatch:
     assert len(SyntheticReader(tmp_path, 1, 0, blind).index().refs) == 1
 
 
+def _until_now(clip: Clip) -> dict[tuple[str, str], bytes]:
+    """Photos of a clip's history by camera and stamp."""
+    shown = [file for file in clip.images if file.time_s <= HISTORY_S + 1e-6]
+    return {(file.sensor, Path(file.uri).name): Path(file.uri).read_bytes() for file in shown}
+
+
+def test_36_photo_steps_are_what_the_histories_of_a_logs_windows_show(reader: SyntheticReader, tmp_path: Path) -> None:
+    short = SyntheticReader(tmp_path, WINDOWS_PER_LOG, 0, replace(SMALL, photo_steps=36))
+    for ref, whole in zip(short.index().refs, reader.index().refs):
+        few, many = (_until_now(clip) for clip in (short.read(ref), reader.read(whole)))
+        assert few == many
+        assert len(many) == len(SMALL.cameras) * 4
+    taken = sorted(short.root.rglob("*.jpg"))
+    assert len(taken) == len(SMALL.cameras) * 8, "2 Hz from 0 to 3.5 s, none that no window shows"
+    assert len(list(short.root.rglob("lidar/*.feather"))) == len(range(0, LOG_STEPS, STEPS_PER_SWEEP))
+
+
 def test_another_seed_gives_another_town(town: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     blind = TownSettings(cameras=(), lidar_beams=0)
     folder = write_town(tmp_path, 1, 1, blind)[0]
@@ -118,3 +138,5 @@ def test_impossible_settings_are_refused_by_name() -> None:
         TownSettings(steps_per_photo=2)
     with pytest.raises(ValueError, match="quality 0"):
         TownSettings(jpeg_quality=0)
+    with pytest.raises(ValueError, match="photo_steps must be 1 to 116"):
+        TownSettings(photo_steps=117)
