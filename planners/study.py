@@ -8,9 +8,9 @@ Every comparison is made twice: with equal passes over a planner's own data, as 
 steps, since more data in equal passes is more training as well. One seed of one part is trained and evaluated after the
 other; when the minutes are out, the tables hold what is done, and say with how many seeds. They hold every part that is
 evaluated in `out`, whichever were asked for now. Tables go to `report`:
-`trainings.csv` (each training), `comparisons.csv` (means over seeds, differences with paired bootstrap intervals over
-clips and seeds), `tables.md` (the same to be read), `bounds.csv`, `curves.csv`, and pictures. Exit codes: 0 complete,
-2 bad settings, 3 a training failed, 4 not complete yet, resumable.
+`trainings.csv` (each training), `clips.csv` (its score on each clip), `comparisons.csv` (means over seeds, differences
+with paired bootstrap intervals over clips and seeds), `tables.md` (to be read), `bounds.csv`, `curves.csv`, and
+pictures. Exit codes: 0 complete, 2 bad settings, 3 a training failed, 4 not complete yet, resumable.
 """
 
 import sys
@@ -26,6 +26,7 @@ import numpy as np
 from factory.config import ConfigError, compose, fill
 from planners.aggregation import ClipResult, by_clip
 from planners.checkpoint import read_record
+from planners.clip_table import write_clips
 from planners.compare import CompareSettings, compare
 from planners.index import DataSettings, open_dataset
 from planners.scaling_figure import Curve, Point, draw_curves
@@ -104,6 +105,7 @@ def write_report(standing: Sequence[Comparison], trained: Sequence[Training], se
     rows = [row_of(training, out, evaluations) for training in trained]
     write_csv(report / "trainings.csv", rows)
     write_csv(report / "bounds.csv", [{"planner": name, **scores_of(evaluations / name)} for name in BOUNDS])
+    write_clips(report / "clips.csv", {training.label: _clips(evaluations / training.label) for training in trained})
     found = compared(standing, evaluations)
     write_csv(report / "comparisons.csv", found)
     (report / "tables.md").write_text(markdown_of(found))

@@ -7,7 +7,8 @@ import pytest
 
 from planners.aggregation import ClipResult, by_clip
 from planners.bootstrap import paired_interval
-from planners.compare import CompareSettings, compare, measured, text_of
+from planners.compare import CompareSettings, compare, text_of
+from planners.measured import measured
 from tests.planners.made_rows import clip_rows
 
 SETTINGS = CompareSettings(a="", b="", draws=500)

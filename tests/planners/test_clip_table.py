@@ -1,0 +1,71 @@
+"""A study's clips.csv: intervals drawn from it are those drawn from the runs themselves."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from planners.clip_table import FACTS, read_clips, write_clips
+from planners.compare import BAD_CONFIG, CompareSettings, compare, intervals, main
+from planners.measured import measured
+from tests.planners.test_bootstrap import run
+
+SETTINGS = CompareSettings(a="", b="", draws=500)
+RUNS = {"real-0": run(), "real-1": run(0.05), "sim-0": run(0.11), "sim-1": run(0.02)}
+
+
+@pytest.fixture
+def table(tmp_path: Path) -> Path:
+    write_clips(tmp_path / "clips.csv", RUNS)
+    return tmp_path / "clips.csv"
+
+
+def test_what_is_read_is_what_was_scored(table: Path) -> None:
+    found, scored = read_clips(table, ["sim-0", "real-1"]), measured([RUNS["sim-0"], RUNS["real-1"]], "score")
+    assert list(found) == [
+        ("one_stage", "unfiltered"),
+        ("stage_one", "filtered"),
+        ("stage_two", "none"),
+        ("final", "filtered"),
+    ]
+    for name, values in found.items():
+        assert values.clips == scored[name].clips
+        np.testing.assert_allclose(values.scores, scored[name].scores, atol=1e-6)
+        np.testing.assert_array_equal(values.weights, scored[name].weights)
+
+
+def test_intervals_of_the_table_are_those_of_the_runs(table: Path) -> None:
+    sides = ["real-0", "real-1"], ["sim-0", "sim-1"]
+    of_runs = compare(*([RUNS[label] for label in side] for side in sides), SETTINGS)
+    of_table = intervals(*(read_clips(table, side) for side in sides), SETTINGS)
+    for name, found in of_table.items():
+        for what in ("a", "b", "difference", "low", "high"):
+            assert getattr(found, what) == pytest.approx(getattr(of_runs[name], what), abs=2e-6)
+
+
+def test_the_command_compares_columns_and_refuses_what_is_none(table: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sides = [f"table={table}", "a=[real-0,real-1]", "b=[sim-0,sim-1]"]
+    assert main([*sides, f"out={table.parent / 'out.csv'}"]) == 0
+    assert "stage_two" in capsys.readouterr().out
+    assert (table.parent / "out.csv").read_text().count("\n") == 5
+    assert main([f"table={table}", "a=real-0", "b=sim-7"]) == BAD_CONFIG
+    assert "no run sim-7; it has real-0, real-1, sim-0, sim-1" in capsys.readouterr().err
+    assert main([*sides, "column=nc"]) == BAD_CONFIG
+    assert "holds scores alone" in capsys.readouterr().err
+    assert main([f"table={table.parent / 'none.csv'}", "a=real-0", "b=sim-0"]) == BAD_CONFIG
+    assert "none.csv" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("planner,score\na,1\n", "its columns must begin with"),
+        ("", "its columns"),
+        ("{head},a\nfinal,filtered,c,1,x\n", "'x'"),
+    ],
+)
+def test_what_is_no_such_table_is_said(tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / "clips.csv"
+    path.write_text(text.format(head=",".join(FACTS)))
+    with pytest.raises(ValueError, match=f"clips.csv.*{said}"):
+        read_clips(path, ["a"])
