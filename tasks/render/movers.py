@@ -62,9 +62,17 @@ def behind_boxes(points: Any, eye: Any, boxes: Any) -> Any:
     out = np.zeros(points.shape[0], np.bool_)
     cosines, sines = np.cos(boxes[:, 3]), np.sin(boxes[:, 3])
     for i in range(points.shape[0]):
+        dx, dy, dz = points[i, 0] - eye[0], points[i, 1] - eye[1], points[i, 2] - eye[2]
+        length = dx * dx + dy * dy + dz * dz
         for j in range(boxes.shape[0]):
             ex, ey, ez = eye[0] - boxes[j, 0], eye[1] - boxes[j, 1], eye[2] - boxes[j, 2]
-            dx, dy, dz = points[i, 0] - eye[0], points[i, 1] - eye[1], points[i, 2] - eye[2]
+            reach = 0.0  # of a ball around the box, squared: most lines miss most balls, which is soon known
+            for k in range(4, 7):
+                half = 0.5 * boxes[j, k] + 2.0 * BEYOND_M
+                reach += half * half
+            along = ex * dx + ey * dy + ez * dz
+            if (ex * ex + ey * ey + ez * ez - reach) * length > along * along:
+                continue
             enter, leave = 0.0, 1.0 + BEYOND_M / max(np.sqrt(dx * dx + dy * dy + dz * dz), 1e-3)
             for axis in range(3):
                 if axis == 0:

@@ -59,7 +59,7 @@ def find_road(points: F64, eyes: F64) -> Road | None:
 def _spaced(eyes: F64) -> Sequence[F64]:
     kept = [eyes[0]]
     for eye in eyes:
-        if min(np.linalg.norm(eye[:2] - other[:2]) for other in kept) >= ALONG_M:
+        if np.linalg.norm(np.array(kept)[:, :2] - eye[:2], axis=1).min() >= ALONG_M:
             kept.append(eye)
     return kept
 
