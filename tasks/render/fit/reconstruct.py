@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tasks.render.asset import Exposure, RenderAsset, ViewQuality, psnr
-from tasks.render.fit.backdrop import backdrop, backdrop_gradient
+from tasks.render.fit.backdrop import SkyCells, backdrop, backdrop_gradient, sky_cells
 from tasks.render.fit.density import refine
 from tasks.render.fit.exposure import exposed, exposed_gradient, matrix_of
 from tasks.render.fit.losses import depth_loss, opaque_loss, photo_loss, ssim
@@ -87,7 +87,8 @@ def _iterate(problem: Problem, state: FitState, settings: FitSettings, threads: 
     shot = problem.train[row]
     camera = corrected(shot.photo.world_from_camera, state.learned["poses"].values[row])
     scene, parts = compose(problem, state, shot.photo)
-    seen = _look(state, scene, shot.photo, camera, threads)
+    sky = _sky_behind(shot.photo, camera, threads)
+    seen = _look(state, scene, shot.photo, camera, sky, threads)
     colours = state.learned["exposure"].values[row]
     picture = exposed(seen.view.rgb, colours)
     loss, d_picture = photo_loss(picture, shot.target, settings.ssim_weight)
@@ -102,7 +103,7 @@ def _iterate(problem: Problem, state: FitState, settings: FitSettings, threads: 
         loss += through
     back = backward(seen, scene, d_rgb, d_depth, d_alpha, threads)
     _step_world(state, settings, row, back, d_colours)
-    cells, d_cells = backdrop_gradient(d_rgb, seen.view.alpha, shot.photo.intrinsics, camera)
+    cells, d_cells = backdrop_gradient(d_rgb, seen.view.alpha, sky)
     progress = state.iteration / settings.iterations
     state.learned["sky"].step(cells, d_cells, decayed(settings.sky_rate, settings.rate_end, progress))
     depths = seen.splats.projected[:, DEPTH]
@@ -145,9 +146,14 @@ def _in_view(boxes: F64, photo: Photo) -> NDArray[np.bool_]:
     return np.asarray(seen)
 
 
-def _look(state: FitState, scene: Gaussians, photo: Photo, camera: F64, threads: int) -> Trace:
+def _sky_behind(photo: Photo, camera: F64, threads: int) -> SkyCells:
     height, width = photo.rgb.shape[:2]
-    behind = backdrop(state.learned["sky"].values, photo.intrinsics, camera, width, height, threads)
+    return sky_cells(photo.intrinsics, camera, width, height, threads)
+
+
+def _look(state: FitState, scene: Gaussians, photo: Photo, camera: F64, sky: SkyCells, threads: int) -> Trace:
+    height, width = photo.rgb.shape[:2]
+    behind = backdrop(state.learned["sky"].values, sky, threads)
     return trace(scene, photo.intrinsics, camera, width, height, behind, threads)
 
 
@@ -212,7 +218,8 @@ def picture_of(problem: Problem, state: FitState, photo: Photo, threads: int = 1
     row_pose, row_colour = corrections_at(problem, state, photo.camera, photo.time_s)
     camera = corrected(photo.world_from_camera, row_pose)
     scene, _ = compose(problem, state, photo)
-    return np.clip(exposed(_look(state, scene, photo, camera, threads).view.rgb, row_colour), 0.0, 1.0)
+    seen = _look(state, scene, photo, camera, _sky_behind(photo, camera, threads), threads)
+    return np.clip(exposed(seen.view.rgb, row_colour), 0.0, 1.0)
 
 
 def corrections_at(problem: Problem, state: FitState, camera: str, time_s: float) -> tuple[F32, F32]:

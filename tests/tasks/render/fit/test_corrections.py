@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tasks.render.fit.backdrop import backdrop, backdrop_gradient
+from tasks.render.fit.backdrop import backdrop, backdrop_gradient, sky_cells
 from tasks.render.fit.exposure import affine_between, aligned, exposed, exposed_gradient
 from tasks.render.fit.poses import between, corrected, motion
 from tasks.render.fit.schedule import decayed, photo_at
@@ -89,12 +89,12 @@ def test_between_two_photos_a_correction_is_the_mean_of_theirs() -> None:
 def test_the_learned_sky_is_looked_up_as_the_stored_one_is() -> None:
     cells = RNG.uniform(0, 1, (ROWS, COLUMNS, 3)).astype(np.float32)
     pose = motion(np.array([1.0, 2.0, 3.0, 0.3, -2.9, 0.2]))
-    seen = backdrop(cells.reshape(-1, 3), K, pose, *SIZE)
+    seen = backdrop(cells.reshape(-1, 3), sky_cells(K, pose, *SIZE))
     np.testing.assert_allclose(seen, SkyMap(cells).seen_by(K, pose, *SIZE), atol=1e-5)
     upstream = RNG.normal(size=seen.shape).astype(np.float32)
     alpha = np.full(seen.shape[:2], 0.25, np.float32)
     alpha[:4] = 1.0
-    rows, gradient = backdrop_gradient(upstream, alpha, K, pose)
+    rows, gradient = backdrop_gradient(upstream, alpha, sky_cells(K, pose, *SIZE))
     # The look-up is linear: <upstream, (1 - alpha) backdrop(cells)> = <gradient, cells>.
     assert float((gradient * cells.reshape(-1, 3)[rows]).sum()) == pytest.approx(
         float((upstream * seen)[4:].sum()) * 0.75, rel=1e-3
