@@ -1,5 +1,6 @@
 """A study's clips.csv: intervals drawn from it are those drawn from the runs themselves."""
 
+import csv
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from planners.clip_table import FACTS, read_clips, write_clips
 from planners.compare import BAD_CONFIG, CompareSettings, compare, intervals, main
 from planners.measured import measured
+from planners.scores import SHOWN
 from tests.planners.test_bootstrap import run
 
 SETTINGS = CompareSettings(a="", b="", draws=500)
@@ -69,3 +71,30 @@ def test_what_is_no_such_table_is_said(tmp_path: Path, text: str, said: str) -> 
     path.write_text(text.format(head=",".join(FACTS)))
     with pytest.raises(ValueError, match=f"clips.csv.*{said}"):
         read_clips(path, ["a"])
+
+
+STUDY = Path(__file__).parents[2] / "docs" / "study"
+
+
+def test_the_studys_comparisons_are_those_of_its_clips() -> None:
+    with (STUDY / "comparisons.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    with (STUDY / "clips.csv").open(newline="") as file:
+        there = set(next(csv.reader(file)))
+    checked, drawn = 0, 0
+    for row in rows:
+        a, b = ([f"{row[side]}-{seed}" for seed in range(int(row["seeds"]))] for side in ("reference", "setup"))
+        if not row["reference"] or not there.issuperset([*a, *b]):
+            continue
+        name = next(name for name in SHOWN.items() if name[0] == row["stage"])
+        of_a, of_b = (read_clips(STUDY / "clips.csv", side)[name] for side in (a, b))
+        mean_a, mean_b = (100.0 * (x.scores * x.weights).sum() / x.weights.sum() for x in (of_a, of_b))
+        assert mean_b == pytest.approx(float(row["epdms"]), abs=1e-3)
+        assert mean_b - mean_a == pytest.approx(float(row["difference"]), abs=2e-3)
+        checked += 1
+        if row["stage"] == "final" and drawn < 3:  # with all draws, of which each takes a second
+            found = intervals({name: of_a}, {name: of_b}, CompareSettings(a="", b=""))[name]
+            assert 100.0 * found.low == pytest.approx(float(row["low"]), abs=2e-3)
+            assert 100.0 * found.high == pytest.approx(float(row["high"]), abs=2e-3)
+            drawn += 1
+    assert checked >= 64 and drawn == 3
