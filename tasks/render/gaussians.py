@@ -2,10 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tasks.kernels import kernel
 from tasks.render import sh
 
 F32 = NDArray[np.float32]
@@ -87,7 +89,7 @@ def moved(gaussians: Gaussians, target_from_source: F64) -> Gaussians:
     """
     rotation = target_from_source[:3, :3]
     means = gaussians.means @ rotation.T + target_from_source[:3, 3]
-    quats = quat_multiply(quats_of(rotation[None])[0], gaussians.quats)
+    quats = turned_quats(quats_of(rotation[None])[0], gaussians.quats)
     return Gaussians(
         means.astype(np.float32),
         quats.astype(np.float32),
@@ -113,69 +115,56 @@ def mirrored(gaussians: Gaussians) -> Gaussians:
     )
 
 
-def quat_multiply(left: NDArray[np.floating], right: NDArray[np.floating]) -> F64:
-    """Hamilton product of quaternions (..., 4) w, x, y, z."""
-    lw, lx, ly, lz = np.moveaxis(np.asarray(left, np.float64), -1, 0)
-    rw, rx, ry, rz = np.moveaxis(np.asarray(right, np.float64), -1, 0)
-    return np.stack(
-        [
-            lw * rw - lx * rx - ly * ry - lz * rz,
-            lw * rx + lx * rw + ly * rz - lz * ry,
-            lw * ry - lx * rz + ly * rw + lz * rx,
-            lw * rz + lx * ry - ly * rx + lz * rw,
-        ],
-        axis=-1,
-    )
+def turned_quats(turn: F64, quats: NDArray[np.floating]) -> F64:
+    """Hamilton products turn * quats of a quaternion (4,) w, x, y, z and many (N, 4)."""
+    return np.asarray(_turned_quats(turn, quats))
+
+
+@kernel
+def _turned_quats(turn: Any, quats: Any) -> Any:
+    lw, lx, ly, lz = turn
+    out = np.empty((len(quats), 4))
+    for i in range(len(quats)):
+        rw, rx, ry, rz = quats[i]
+        out[i, 0] = lw * rw - lx * rx - ly * ry - lz * rz
+        out[i, 1] = lw * rx + lx * rw + ly * rz - lz * ry
+        out[i, 2] = lw * ry - lx * rz + ly * rw + lz * rx
+        out[i, 3] = lw * rz + lx * ry - ly * rx + lz * rw
+    return out
 
 
 def quats_of(rotations: F64) -> F64:
     """Unit quaternions (N, 4) of rotation matrices (N, 3, 3)."""
-    m = rotations
-    # Each candidate is 4 * (largest component) * q; the one with the largest component is well conditioned.
-    candidates = np.stack(
-        [
-            np.stack(
-                [
-                    1 + m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2],
-                    m[:, 2, 1] - m[:, 1, 2],
-                    m[:, 0, 2] - m[:, 2, 0],
-                    m[:, 1, 0] - m[:, 0, 1],
-                ],
-                1,
-            ),
-            np.stack(
-                [
-                    m[:, 2, 1] - m[:, 1, 2],
-                    1 + m[:, 0, 0] - m[:, 1, 1] - m[:, 2, 2],
-                    m[:, 0, 1] + m[:, 1, 0],
-                    m[:, 0, 2] + m[:, 2, 0],
-                ],
-                1,
-            ),
-            np.stack(
-                [
-                    m[:, 0, 2] - m[:, 2, 0],
-                    m[:, 0, 1] + m[:, 1, 0],
-                    1 - m[:, 0, 0] + m[:, 1, 1] - m[:, 2, 2],
-                    m[:, 1, 2] + m[:, 2, 1],
-                ],
-                1,
-            ),
-            np.stack(
-                [
-                    m[:, 1, 0] - m[:, 0, 1],
-                    m[:, 0, 2] + m[:, 2, 0],
-                    m[:, 1, 2] + m[:, 2, 1],
-                    1 - m[:, 0, 0] - m[:, 1, 1] + m[:, 2, 2],
-                ],
-                1,
-            ),
-        ],
-        axis=1,
-    )
-    best = np.argmax(np.einsum("nii->ni", candidates), axis=1)
-    quats = candidates[np.arange(len(m)), best]
-    return np.asarray(quats / np.linalg.norm(quats, axis=1, keepdims=True))
+    return np.asarray(_quats_of(np.ascontiguousarray(rotations, np.float64)))
+
+
+@kernel
+def _quats_of(rotations: Any) -> Any:
+    out = np.empty((len(rotations), 4))
+    for i in range(len(rotations)):
+        m = rotations[i]
+        # Each is 4 * (one component) * q; the one with the largest component is well conditioned.
+        squares = (
+            1 + m[0, 0] + m[1, 1] + m[2, 2],
+            1 + m[0, 0] - m[1, 1] - m[2, 2],
+            1 - m[0, 0] + m[1, 1] - m[2, 2],
+            1 - m[0, 0] - m[1, 1] + m[2, 2],
+        )
+        best = 0
+        for k in range(1, 4):
+            if squares[k] > squares[best]:
+                best = k
+        if best == 0:
+            w, x, y, z = squares[0], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
+        elif best == 1:
+            w, x, y, z = m[2, 1] - m[1, 2], squares[1], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]
+        elif best == 2:
+            w, x, y, z = m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], squares[2], m[1, 2] + m[2, 1]
+        else:
+            w, x, y, z = m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], squares[3]
+        length = np.sqrt(w * w + x * x + y * y + z * z)
+        out[i, 0], out[i, 1], out[i, 2], out[i, 3] = w / length, x / length, y / length, z / length
+    return out
 
 
 def rotations_of(quats: NDArray[np.floating]) -> F64:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tasks.render import sh
-from tasks.render.gaussians import F32, F64, Gaussians, quat_multiply, quats_of
+from tasks.render.gaussians import F32, F64, Gaussians, quats_of, turned_quats
 from tasks.render.pixels_gradient import SUMS_SIZE, W_BLUE, W_RED, add_pairs, blend_gradient
 from tasks.render.project_gradient import project_gradient
 from tasks.render.raster import GAUSSIANS_CHUNK, TILES_CHUNK, Trace, pinhole
@@ -152,7 +152,7 @@ def unmoved(gradients: Gradients, target_from_source: F64) -> Gradients:
     return Gradients(
         gradients.index,
         (gradients.means @ rotation).astype(np.float32),
-        quat_multiply(inverse, gradients.quats).astype(np.float32),
+        turned_quats(inverse, gradients.quats).astype(np.float32),
         gradients.log_scales,
         gradients.logits,
         gradients.colours,
