@@ -89,6 +89,34 @@ def draw_differences(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     pyplot.close(figure)
 
 
+def draw_agreement(points: Mapping[str, Sequence[tuple[float, float, bool]]], path: Path) -> None:
+    """Differences of a study made again over those of the first, a panel for each stage, blue where both are clear.
+
+    points: stage -> (first, second, whether both are clear), percent points of EPDMS.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(1, len(points), figsize=(3.6 * len(points), 3.8), squeeze=False)
+    for panel, (stage, drawn) in zip(axes.flat, points.items()):
+        for clear, color in ((False, OPEN), (True, CLEAR)):
+            chosen = [(one, other) for one, other, is_clear in drawn if is_clear == clear]
+            panel.plot(*np.array(chosen).reshape(-1, 2).T, "o", color=color, markersize=4)
+        panel.axline((0.0, 0.0), slope=1.0, color="black", linewidth=0.8)
+        panel.axhline(0.0, color="#d0d5da", linewidth=0.8, zorder=0)
+        panel.axvline(0.0, color="#d0d5da", linewidth=0.8, zorder=0)
+        panel.set_aspect("equal", adjustable="datalim")
+        panel.set_title(f"{stage.replace('_', ' ')}: difference in EPDMS points", fontsize=8)
+        panel.set_xlabel("first", fontsize=8)
+        panel.set_ylabel("again", fontsize=8)
+        panel.tick_params(labelsize=7)
+    figure.tight_layout()
+    _save(figure, path)
+    pyplot.close(figure)
+
+
 def difference_label(row: Mapping[str, Any]) -> str:
     """Which comparison a line stands for."""
     seeds = "1 seed" if row["seeds"] == 1 else f"{row['seeds']} seeds"

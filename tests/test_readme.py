@@ -21,6 +21,7 @@ from factory.report import main as report_main
 from factory.run import main as run_main
 from factory.settings import load_config
 from factory.show import main as show_main
+from planners.agreement import AgreementSettings
 from planners.analysis import AnalysisSettings
 from planners.compare import CompareSettings
 from planners.evaluate import settings_of as evaluate_settings
@@ -138,6 +139,8 @@ def test_every_command_is_one_its_program_takes(
             evaluate_settings([argument for argument in arguments if not argument.startswith("models=")])
         case ["python", "-m", "planners.compare", *arguments]:
             fill(CompareSettings, compose("compare", arguments), "compare")
+        case ["python", "-m", "planners.agreement", *arguments]:
+            fill(AgreementSettings, dict(argument.split("=", 1) for argument in arguments), "agreement")
         case ["python", "-m", "planners.scaling", *arguments]:
             fill(ScalingSettings, compose("scaling", arguments), "scaling")
         case ["python", "-m", "planners.replay", *arguments]:
