@@ -5,9 +5,9 @@
     python -m planners.study ... parts=[main,rounds]                 some comparisons only
 
 Every comparison is made twice: with equal passes over a planner's own data, as the paper does, and with equal optimiser
-steps, since more data in equal passes is more training as well. One seed of one part is trained and evaluated after the
-other; when the minutes are out, the tables hold what is done, and say with how many seeds. They hold every part that is
-evaluated in `out`, whichever were asked for now. Tables go to `report`:
+steps, since more data in equal passes is more training as well. Seeds of parts are trained and evaluated one after the
+other, small ones together; when the minutes are out, the tables hold what is done, and say with how many seeds. They
+hold every part that is evaluated in `out`, whichever were asked for now. Tables go to `report`:
 `trainings.csv` (each training), `clips.csv` (its score on each clip), `comparisons.csv` (means over seeds, differences
 with paired bootstrap intervals over clips and seeds), `tables.md` (to be read), `bounds.csv`, `curves.csv`, and
 pictures. Exit codes: 0 complete, 2 bad settings, 3 a training failed, 4 not complete yet, resumable.
@@ -41,6 +41,7 @@ from planners.study_plan import (
     Sizes,
     StudySettings,
     comparisons,
+    legs,
     portions,
     so_far,
     with_all_parts,
@@ -67,11 +68,13 @@ def run(settings: StudySettings) -> int:
     out, means = Path(settings.out), Means(jobs=settings.jobs, minutes=settings.minutes)
     sizes, whole = sizes_of(settings), with_all_parts(settings)
     asked = portions(comparisons(settings), settings, sizes)
-    for portion in asked:
-        print(f"{portion.part}, seed {portion.seed}", file=sys.stderr)
-        if not train_all(portion.trainings, out, means):
+    for leg in legs(asked):
+        print("; ".join(f"{portion.part}, seed {portion.seed}" for portion in leg), file=sys.stderr)
+        trainings = [training for portion in leg for training in portion.trainings]
+        others = {label: spec for portion in leg for label, spec in portion.ensembles.items()}
+        if not train_all(trainings, out, means):
             break
-        if not evaluate_all(portion.trainings, out, settings.benchmark, others=portion.ensembles, means=means):
+        if not evaluate_all(trainings, out, settings.benchmark, others=others, means=means):
             break
     wanted = comparisons(whole)
     planned = portions(wanted, whole, sizes)

@@ -285,6 +285,7 @@ def _series() -> Sequence[Setup]:
 
 
 BUDGETS: tuple[Budget, ...] = ("epochs", "steps")
+PLANNERS_OF_LEG = 24
 EXPERTS: tuple[Data, ...] = ("recovery", "pdm_closed")
 PARTS = {
     "main": _main,
@@ -301,7 +302,7 @@ PARTS = {
 
 @dataclass(frozen=True)
 class Portion:
-    """One seed of one part: what is trained and evaluated before anything else begins."""
+    """One seed of one part: what is asked for first, and what the tables say of it."""
 
     part: str
     seed: int
@@ -328,6 +329,21 @@ def portions(found: Sequence[Comparison], settings: StudySettings, sizes: Sizes)
             joined = {s.label_of(seed): _joined(s, seed, Path(settings.out)) for s in new if s.planner == ENSEMBLE}
             planned.append(Portion(part, seed, new_trainings, joined))
     return planned
+
+
+def legs(planned: Sequence[Portion]) -> list[list[Portion]]:
+    """Portions that are trained at once and then evaluated at once: cores idle at the end of either.
+
+    What all begin with is done before; else as many portions, one after the other, as make PLANNERS_OF_LEG.
+    """
+    found: list[list[Portion]] = []
+    for portion in planned:
+        last = found[-1] if found else []
+        if not last or last[-1].part == "begin" or sum(len(p.labels) for p in last) >= PLANNERS_OF_LEG:
+            found.append([portion])
+        else:
+            last.append(portion)
+    return found
 
 
 def _joined(ensemble: Setup, seed: int, out: Path) -> str:

@@ -25,7 +25,7 @@ from planners.scores import BOUNDS
 
 TRAININGS, EVALUATIONS, DONE, LOG = "trainings", "evaluations", "sweep.json", "train.log"
 INTERRUPTED = 4
-EVALUATED_TOGETHER = 12  # planners in one process at the most
+EVALUATED_TOGETHER = 24  # planners in one process at the most
 LOOK_EVERY_S = 0.5
 
 
@@ -174,8 +174,7 @@ def evaluate_all(
     """
     means, stop = means or Means(), threading.Event()
     who = [(training.label, str(folder_of(out, training))) for training in trainings] + list((others or {}).items())
-    together = min(EVALUATED_TOGETHER, max(1, -(-len(who) // means.at_once)))
-    parts = [who[i : i + together] for i in range(0, len(who), together)]
+    parts = shares_of(who, means.at_once)
     base = [sys.executable, "-m", "planners.evaluate", f"benchmark={benchmark}", *more, f"out={out / EVALUATIONS}"]
     environment = {"OMP_NUM_THREADS": "1", **os.environ}
 
@@ -200,6 +199,12 @@ def evaluate_all(
             done += len(part) * was_done
             counter.show(done)
         return done == len(who) and evaluate(who)  # nothing is left but the bounds and the tables of all
+
+
+def shares_of(who: Sequence[tuple[str, str]], at_once: int) -> list[Sequence[tuple[str, str]]]:
+    """What each process evaluates, taken in turn: neighbours are of one kind, and kinds take different times."""
+    n = min(at_once * -(-len(who) // (at_once * EVALUATED_TOGETHER)), len(who))
+    return [who[i::n] for i in range(n)]
 
 
 def is_evaluated(out: Path, label: str, spec: str) -> bool:

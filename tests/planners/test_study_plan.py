@@ -8,9 +8,11 @@ from factory.config import compose, fill
 from planners.study_plan import (
     ENSEMBLE,
     PARTS,
+    PLANNERS_OF_LEG,
     Sizes,
     StudySettings,
     comparisons,
+    legs,
     portions,
     so_far,
     with_all_parts,
@@ -135,6 +137,19 @@ def test_one_seed_of_one_part_is_done_after_the_other() -> None:
     for portion in planned:
         assert {t.facts["seed"] for t in portion.trainings} == {portion.seed}
     assert {t.facts["data"] for p in planned if p.part == "control" for t in p.trainings} == {"logged"}
+
+
+def test_small_portions_are_trained_at_once_but_never_with_what_they_begin_with() -> None:
+    chosen = settings(parts=("main", "control", "rewards"))
+    planned = portions(comparisons(chosen), chosen, SIZES)
+    found = legs(planned)
+    assert [portion for leg in found for portion in leg] == planned
+    assert [portion.part for portion in found[0]] == ["begin"]
+    for leg in found[1:]:
+        sizes = [len(portion.labels) for portion in leg]
+        assert sum(sizes[:-1]) < PLANNERS_OF_LEG
+        assert sum(sizes) >= PLANNERS_OF_LEG or leg is found[-1]
+    assert len(found) < len(planned) - 2
 
 
 def test_comparisons_so_far_have_the_seeds_that_both_sides_have() -> None:

@@ -7,7 +7,19 @@ import pytest
 
 from planners.checkpoint import read_record
 from planners.scaling import ScalingSettings, SweepData, curves_of, trainings_of
-from planners.sweep import INTERRUPTED, LOG, Means, SweepFailed, Training, folder_of, is_done, train_all, train_one
+from planners.sweep import (
+    EVALUATED_TOGETHER,
+    INTERRUPTED,
+    LOG,
+    Means,
+    SweepFailed,
+    Training,
+    folder_of,
+    is_done,
+    shares_of,
+    train_all,
+    train_one,
+)
 from tests.planners.test_train import command, table
 
 __all__ = ["table"]
@@ -89,6 +101,17 @@ def test_what_runs_when_time_is_up_is_saved_and_nothing_new_begins(table: str, t
     assert not is_done(tmp_path, long)
     assert not train_all([small(table, "next")], tmp_path, Means(minutes=0.0))
     assert not folder_of(tmp_path, small(table, "next")).exists()
+
+
+@pytest.mark.parametrize(("n", "processes"), [(0, 0), (1, 1), (16, 2), (48, 2), (49, 4)])
+def test_processes_evaluate_all_planners_and_as_many_of_each_kind(n: int, processes: int) -> None:
+    who = [(f"{'slow' if i < n / 2 else 'fast'}-{i}", "folder") for i in range(n)]
+    shares = shares_of(who, 2)
+    assert len(shares) == processes
+    assert sorted(one for share in shares for one in share) == sorted(who)
+    assert all(len(share) <= EVALUATED_TOGETHER for share in shares)
+    slow = [sum(label.startswith("slow") for label, _ in share) for share in shares]
+    assert not slow or max(slow) - min(slow) <= 1
 
 
 def test_two_trainings_of_one_label_are_refused(tmp_path: Path) -> None:
