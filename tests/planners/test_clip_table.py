@@ -76,7 +76,9 @@ def test_what_is_no_such_table_is_said(tmp_path: Path, text: str, said: str) -> 
 STUDY = Path(__file__).parents[2] / "docs" / "study"
 
 
-@pytest.mark.parametrize(("study", "least"), [(STUDY, 64), (STUDY / "again", 200)], ids=["study", "again"])
+@pytest.mark.parametrize(
+    ("study", "least"), [(STUDY, 64), (STUDY / "again", 300), (STUDY / "long", 12)], ids=["study", "again", "long"]
+)
 def test_the_studys_comparisons_are_those_of_its_clips(study: Path, least: int) -> None:
     with (study / "comparisons.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
