@@ -50,10 +50,11 @@ class Layer(nn.Module):
         self.drop = nn.Dropout(dropout)
 
     def forward(self, x: Tensor, memory: Tensor | None = None) -> Tensor:
-        """x (B, Q, width), memory (B, N, width) where the layer crosses."""
+        """x (B, Q, width), or (1, Q, width) for B times the same; memory (B, N, width) where the layer crosses."""
         x = self.own_norm(x + self.drop(self.own(x, x)))
         if self.cross is not None and self.cross_norm is not None:
             assert memory is not None
+            x = x.expand(len(memory), -1, -1)
             x = self.cross_norm(x + self.drop(self.cross(x, memory)))
         return self.feedforward_norm(x + self.drop(self.feedforward(x)))
 

@@ -101,7 +101,9 @@ class TrajectoryScorer(nn.Module):
     def forward(self, trajectories: Tensor, tokens: Tensor, status: Tensor) -> dict[str, Tensor]:
         """Trajectories (K, 40, 3), tokens (B, N, width), status (B, 8) to float32 logits (B, K) by name."""
         queries = self.among(self.embed(trajectories.flatten(1))[None])
-        seen = self.decoder(queries.expand(len(tokens), -1, -1), tokens) + self.status(status)[:, None]
+        if self.training:  # else what they have seen of each other is worked out once; gradients would round otherwise
+            queries = queries.expand(len(tokens), -1, -1)
+        seen = self.decoder(queries, tokens) + self.status(status)[:, None]
         return {name: head(seen).squeeze(-1).float() for name, head in self.heads.items()}
 
 

@@ -285,7 +285,7 @@ def _series() -> Sequence[Setup]:
 
 
 BUDGETS: tuple[Budget, ...] = ("epochs", "steps")
-PLANNERS_OF_LEG = 24
+PLANNERS_OF_LEG = 48
 EXPERTS: tuple[Data, ...] = ("recovery", "pdm_closed")
 PARTS = {
     "main": _main,

@@ -111,16 +111,23 @@ def train_one(training: Training, out: Path, stop: Callable[[], bool] = lambda: 
         environment = {"OMP_NUM_THREADS": "1", **os.environ}
         child = subprocess.Popen(command, stdout=log, stderr=log, env=environment)  # noqa: S603 - a list, no shell
         asked = False
-        while (code := child.poll()) is None:
+        while (code := _ended(child, LOOK_EVERY_S)) is None:
             if stop() and not asked:
                 child.send_signal(signal.SIGTERM)
                 asked = True
-            time.sleep(LOOK_EVERY_S)
     if asked and code == -signal.SIGTERM:  # it had not begun yet
         return INTERRUPTED
     if code == 0:
         (folder / DONE).write_text(json.dumps(list(training.overrides)))
     return code
+
+
+def _ended(child: subprocess.Popen[bytes], within_s: float) -> int | None:
+    """Its exit code as soon as there is one; None where it goes on for longer."""
+    try:
+        return child.wait(within_s)
+    except subprocess.TimeoutExpired:
+        return None
 
 
 def _codes(
