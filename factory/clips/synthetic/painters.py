@@ -2,21 +2,26 @@
 
     python -m factory.clips.synthetic.painters <a town as JSON>       what such a process runs
 
+The process that waits for them owns the folders they write in. To stop them it kills them and removes those: an
+interrupt is an exception in Python, and one that arrives while a kernel is compiled or loaded is lost in a callback.
+They end with it, however it ends: it holds the other end of the pipe that is their standard input.
+
 Only towns with sensors are worth a process, which starts in seconds: a log without cameras and lidar is written in two.
 """
 
 import json
 import os
-import signal
+import shutil
 import subprocess
 import sys
+import threading
 import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from factory.clips.synthetic.reader import make_whole
+from factory.clips.synthetic.reader import finish_whole, make_whole, unfinished_folder
 from factory.clips.synthetic.town import log_name
 from factory.clips.synthetic.write import TownSettings, write_logs
 from factory.pace import time_text
@@ -39,9 +44,9 @@ class TownFolder:
         return {name: self.root / name for name in (log_name(self.seed, index) for index in self.indices)}
 
 
-def write_one(town: TownFolder, settings: TownSettings, threads: int = THREADS) -> None:
+def write_one(town: TownFolder, settings: TownSettings) -> None:
     """Writes the town whole, unless it is there."""
-    make_whole(town.root, lambda folder: write_logs(folder, town.indices, town.seed, settings, threads))
+    make_whole(town.root, lambda folder: write_logs(folder, town.indices, town.seed, settings, THREADS))
 
 
 def write_all(towns: Sequence[TownFolder], settings: TownSettings) -> None:
@@ -58,12 +63,14 @@ def write_all(towns: Sequence[TownFolder], settings: TownSettings) -> None:
             write_one(town, settings)
             progress.show(town)
         return
-    waiting, painting = deque(missing), dict[subprocess.Popen[bytes], TownFolder]()
+    waiting, painting, begun = deque(missing), dict[subprocess.Popen[bytes], TownFolder](), list[Path]()
+    lifeline, held = os.pipe()
     try:
         while waiting or painting:
             while waiting and len(painting) < at_once:
                 town = waiting.popleft()
-                painting[_painter(town, settings)] = town
+                begun.append(unfinished_folder(town.root))
+                painting[_painter(town, begun[-1], settings, lifeline)] = town
             for child in [child for child in painting if child.poll() is not None]:
                 town = painting.pop(child)
                 if child.returncode != 0:
@@ -74,10 +81,14 @@ def write_all(towns: Sequence[TownFolder], settings: TownSettings) -> None:
                 progress.show(town)
             time.sleep(LOOK_EVERY_S)
     finally:
+        os.close(held)
+        os.close(lifeline)
         for child in painting:
-            child.send_signal(signal.SIGINT)  # it removes what it has begun
+            child.kill()
         for child in painting:
             child.wait()
+        for folder in begun:
+            shutil.rmtree(folder, ignore_errors=True)  # where its town is whole, it is gone
 
 
 class _Progress:
@@ -91,16 +102,27 @@ class _Progress:
         print(f"{told}  ETA {time_text(left)}", file=sys.stderr, flush=True)
 
 
-def _painter(town: TownFolder, settings: TownSettings) -> "subprocess.Popen[bytes]":
+def _painter(town: TownFolder, unfinished: Path, settings: TownSettings, lifeline: int) -> "subprocess.Popen[bytes]":
     told = {"seed": town.seed, "indices": town.indices, "root": str(town.root), "settings": asdict(settings)}
-    return subprocess.Popen([sys.executable, "-m", __name__, json.dumps(told)])  # noqa: S603 - a list, no shell
+    command = [sys.executable, "-m", __name__, json.dumps(told | {"unfinished": str(unfinished)})]
+    return subprocess.Popen(command, stdin=lifeline)  # noqa: S603 - a list, no shell
 
 
 def main(told: str) -> None:
     """A painter's process: one town, on one core."""
+    threading.Thread(target=_end_with_input, daemon=True).start()
     town = json.loads(told)
-    folder = TownFolder(town["seed"], tuple(town["indices"]), Path(town["root"]))
-    write_one(folder, TownSettings(**town["settings"]), threads=1)
+    settings = TownSettings(**town["settings"])
+
+    def write(folder: Path) -> None:
+        write_logs(folder, town["indices"], town["seed"], settings, threads=1)
+
+    finish_whole(Path(town["unfinished"]), Path(town["root"]), write)
+
+
+def _end_with_input() -> None:
+    os.read(sys.stdin.fileno(), 1)
+    os._exit(1)
 
 
 if __name__ == "__main__":

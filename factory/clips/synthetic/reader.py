@@ -82,10 +82,18 @@ def sensed_digest(digest: str, settings: TownSettings) -> str:
 
 def make_whole(root: Path, write: Callable[[Path], object]) -> None:
     """The folder `root` with what `write` writes into it, unless it is there: whole or not at all."""
-    if root.is_dir():
-        return
+    if not root.is_dir():
+        finish_whole(unfinished_folder(root), root, write)
+
+
+def unfinished_folder(root: Path) -> Path:
+    """A new empty folder beside `root`, to become it."""
     root.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = Path(tempfile.mkdtemp(prefix=f".{root.name}-", dir=root.parent))
+    return Path(tempfile.mkdtemp(prefix=f".{root.name}-", dir=root.parent))
+
+
+def finish_whole(unfinished: Path, root: Path, write: Callable[[Path], object]) -> None:
+    """Has `unfinished` written and renames it to `root`; it is gone afterwards, whatever happened."""
     try:
         write(unfinished)
         try:

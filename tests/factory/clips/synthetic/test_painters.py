@@ -44,10 +44,11 @@ def test_towns_painted_side_by_side_have_the_bytes_of_one_painted_here(
 
 
 def test_a_town_that_cannot_be_written_is_named(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "file").write_text("no folder")
-    with pytest.raises(RuntimeError, match=r"town [56]: its process ended with exit 1"):
-        write_all(towns_in(tmp_path / "file"), SMALL)
-    assert "file" in capfd.readouterr().err
+    (tmp_path / "town-5").write_text("no folder")
+    with pytest.raises(RuntimeError, match=r"town 5: its process ended with exit 1"):
+        write_all(towns_in(tmp_path), SMALL)
+    assert str(tmp_path / "town-5") in capfd.readouterr().err
+    assert not list(tmp_path.glob(".town-*"))
 
 
 INTERRUPTED = """
@@ -55,20 +56,34 @@ import os, signal, sys
 from pathlib import Path
 from factory.clips.synthetic.painters import TownFolder, write_all
 from factory.clips.synthetic.write import TownSettings
-signal.signal(signal.SIGINT, signal.default_int_handler)  # where the shell of a background job ignores it
+signal.signal(signal.SIGTERM, signal.default_int_handler)
+signal.signal(signal.SIGINT, signal.SIG_IGN)  # of the processes it starts, too
 os.cpu_count = lambda: 2
 write_all([TownFolder(seed, (0, 1, 2, 3), Path(sys.argv[1]) / f"town-{seed}") for seed in (5, 6)], TownSettings())
 """
 
 
-def test_an_interrupted_command_leaves_nothing_unfinished(tmp_path: Path) -> None:
-    command = subprocess.Popen([sys.executable, "-c", INTERRUPTED, str(tmp_path)], stderr=subprocess.PIPE, text=True)
+def begun_in(folder: Path) -> "subprocess.Popen[str]":
+    """The command, with both towns begun."""
+    command = subprocess.Popen([sys.executable, "-c", INTERRUPTED, str(folder)], stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + PATIENCE_S
-    while len(list(tmp_path.glob(".town-*"))) < 2 and time.monotonic() < deadline:
+    while len(list(folder.glob(".town-*/*"))) < 2 and time.monotonic() < deadline:
         time.sleep(0.1)
-    assert len(list(tmp_path.glob(".town-*"))) == 2
-    command.send_signal(signal.SIGINT)
-    _out, said = command.communicate(timeout=PATIENCE_S)
+    assert len(list(folder.glob(".town-*/*"))) == 2
+    return command
+
+
+def test_an_interrupted_command_leaves_nothing_unfinished_whatever_its_processes_hear(tmp_path: Path) -> None:
+    with begun_in(tmp_path) as command:
+        command.send_signal(signal.SIGTERM)
+        _out, said = command.communicate(timeout=PATIENCE_S)
     assert command.returncode != 0
     assert "KeyboardInterrupt" in said
     assert not list(tmp_path.iterdir())
+
+
+def test_processes_end_with_a_command_that_is_killed(tmp_path: Path) -> None:
+    with begun_in(tmp_path) as command:
+        command.kill()
+        command.communicate(timeout=PATIENCE_S)  # their stderr is its own: it ends with the last of them
+    assert not list(tmp_path.glob("town-*"))
