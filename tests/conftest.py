@@ -1,8 +1,17 @@
-"""Where tests on real data find it."""
+"""Where tests on real data find it, and how properties are tested: with the same examples on every machine, untimed.
+
+`--hypothesis-profile=search` looks for new examples instead.
+"""
 
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
+
+UNTIMED = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])  # kernels compile at their first call
+settings.register_profile("search", UNTIMED)
+settings.register_profile("repeatable", UNTIMED, derandomize=True)
+settings.load_profile("repeatable")
 
 
 @pytest.fixture(scope="session")

@@ -1,6 +1,6 @@
 """Walks: rounds are nested, incidents stop them, and where one stands follows from the tables alone."""
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from factory.store.outcomes import ErrorKind, Kind
@@ -25,7 +25,6 @@ def walk(accepts: list[bool], rounds: int, known: dict[int, Past] | None = None)
 LISTS = st.lists(st.booleans(), max_size=12)
 
 
-@settings(deadline=None)
 @given(LISTS, st.integers(1, 4), st.integers(0, 4))
 def test_more_rounds_go_on_where_fewer_stopped(accepts: list[bool], rounds: int, more: int) -> None:
     first, _, made = walk(accepts, rounds)
@@ -34,7 +33,6 @@ def test_more_rounds_go_on_where_fewer_stopped(accepts: list[bool], rounds: int,
     assert (resumed, step, made + made_later) == (direct, direct_step, made_directly)
 
 
-@settings(deadline=None)
 @given(LISTS, st.integers(1, 4), st.sets(st.integers(0, 11)))
 def test_any_lost_results_are_made_again_the_same(accepts: list[bool], rounds: int, lost: set[int]) -> None:
     whole, step, _ = walk(accepts, rounds)

@@ -4,7 +4,7 @@ from decimal import Decimal, localcontext
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from tasks import trig
@@ -12,7 +12,6 @@ from tasks.kernels import kernel
 
 PI = Decimal("3.14159265358979323846264338327950288419716939937510582097494459230781640628620899")
 ANGLES = st.floats(-1e6, 1e6)
-COMPILED = settings(deadline=None)  # the first call compiles
 
 
 def exact_sine(angle: float, shift_quarters: int = 0) -> Decimal:
@@ -64,14 +63,12 @@ def test_no_digits_are_lost_next_to_the_zeros_and_extremes():
             assert units_off(cosine, exact_sine(angle, 1)) <= 2.5
 
 
-@COMPILED
 @given(angle=ANGLES)
 def test_sine_is_odd_and_cosine_even_to_the_last_bit(angle: float):
     sine, cosine = sincos(angle)
     assert sincos(-angle) == (-sine, cosine)
 
 
-@COMPILED
 @given(angles=st.lists(ANGLES, min_size=1, max_size=37))
 def test_a_long_loop_gives_the_bits_of_single_calls(angles: list[float]):
     together = np.empty((2, len(angles)))
@@ -79,7 +76,6 @@ def test_a_long_loop_gives_the_bits_of_single_calls(angles: list[float]):
     assert np.array_equal(together.T, [sincos(angle) for angle in angles])
 
 
-@COMPILED
 @given(angle=ANGLES)
 def test_a_wrapped_angle_is_the_same_direction_between_minus_pi_and_pi(angle: float):
     wrapped = wrap(angle)
@@ -87,7 +83,6 @@ def test_a_wrapped_angle_is_the_same_direction_between_minus_pi_and_pi(angle: fl
     assert abs(np.remainder(angle - wrapped + 1.0, 2.0 * np.pi) - 1.0) < 1e-9
 
 
-@COMPILED
 @given(angle=st.floats(-np.pi, np.pi, exclude_max=True))
 def test_an_angle_in_range_stays_as_it_is(angle: float):
     wrapped = wrap(angle)

@@ -112,7 +112,7 @@ def assert_equals_its_slow_twin(world: World, limit: float | None, chosen: PdmSe
     np.testing.assert_allclose(fast.poses, slow.poses, rtol=0.0, atol=1e-9)
 
 
-@settings(deadline=None, max_examples=80)
+@settings(max_examples=80)
 @given(
     shape=st.sampled_from(SHAPES),
     n_objects=st.integers(0, 25),
@@ -139,7 +139,7 @@ def test_a_hundred_objects_around_every_shape_of_path_equal_their_slow_twin(shap
     assert_equals_its_slow_twin(world_of(shape, 100, False, False, seed=3), None, PdmSettings())
 
 
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 @given(st.integers(0, 2**32 - 1))
 def test_boxes_and_bent_polygons_are_as_far_apart_as_shapely_says(seed: int) -> None:
     rng = np.random.default_rng(seed)

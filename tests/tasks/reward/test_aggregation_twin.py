@@ -12,7 +12,7 @@ from tasks.reward.one_stage import COLUMNS, FrameScores, columns_of, frame_score
 from tasks.reward.two_stage import Group, aggregate, follow_up_weights
 from tests.tasks.reward.slow import aggregation as slow
 
-BRIEF = settings(deadline=None, max_examples=50)
+BRIEF = settings(max_examples=50)
 HALVES, WHOLES = st.sampled_from([0.0, 0.5, 1.0]), st.sampled_from([0.0, 1.0])
 ROWS = st.fixed_dictionaries(
     dict.fromkeys(("nc", "ddc"), HALVES)

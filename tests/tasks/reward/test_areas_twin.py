@@ -59,7 +59,7 @@ def drives(rng: np.random.Generator, n: int) -> np.ndarray:
     return states
 
 
-@settings(deadline=None, max_examples=80)
+@settings(max_examples=80)
 @given(small_maps(step=0.0), st.integers(0, 2**32 - 1))
 def test_flags_equal_the_numpy_version(polygons: list[MapPolygon], seed: int) -> None:
     states = drives(np.random.default_rng(seed), 6)
@@ -68,7 +68,7 @@ def test_flags_equal_the_numpy_version(polygons: list[MapPolygon], seed: int) ->
     assert np.array_equal(flags_along(polygons, route, states, PACIFICA), as_flags(slow))
 
 
-@settings(deadline=None, max_examples=80)
+@settings(max_examples=80)
 @given(st.data(), st.sampled_from([0.25, 1.0]), st.integers(0, 2**32 - 1))
 def test_a_corner_on_a_boundary_is_outside(data: st.DataObject, step: float, seed: int) -> None:
     polygons = data.draw(small_maps(step))
@@ -77,7 +77,7 @@ def test_a_corner_on_a_boundary_is_outside(data: st.DataObject, step: float, see
     assert np.array_equal(flags_along(polygons, frozenset(), states, EXACT), as_flags(slow))
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(small_maps(step=0.0), st.integers(0, 2**32 - 1))
 def test_the_rear_axle_is_in_the_intersections_of_the_numpy_version(polygons: list[MapPolygon], seed: int) -> None:
     crossings = [replace(polygon, layer=MapLayer.INTERSECTION) for polygon in polygons[::2]]

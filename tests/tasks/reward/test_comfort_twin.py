@@ -53,7 +53,7 @@ def drives(draw: st.DrawFn, n_rows: int) -> np.ndarray:
     return states
 
 
-@settings(deadline=None, max_examples=150)
+@settings(max_examples=150)
 @given(past=drives(4), states=drives(41))
 def test_flags_and_first_step_equal_the_slow_twin(past: np.ndarray, states: np.ndarray) -> None:
     history = comfort_history(past)
@@ -64,7 +64,7 @@ def test_flags_and_first_step_equal_the_slow_twin(past: np.ndarray, states: np.n
     assert np.isinf(first) == flags.all() == (comfortable[0] == 1.0)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(now=drives(41), other=drives(41), previous=drives(41), interval_s=st.sampled_from([0.1, 0.3, 0.5]))
 def test_extended_comfort_equals_the_slow_twin(
     now: np.ndarray, other: np.ndarray, previous: np.ndarray, interval_s: float
@@ -105,7 +105,7 @@ def test_the_written_weights_are_scipys() -> None:
         np.testing.assert_allclose(weights[name], theirs, rtol=0, atol=1e-12)
 
 
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 @given(st.lists(st.floats(-10.0, 10.0) | st.sampled_from([0.0, np.pi, -np.pi, 2 * np.pi]), min_size=1, max_size=55))
 def test_unwrapping_is_numpys(angles: list[float]) -> None:
     unwrapped = np.array(angles)

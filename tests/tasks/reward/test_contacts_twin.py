@@ -159,20 +159,20 @@ def worlds(draw: st.DrawFn) -> World:
     return moved(world, np.array(origin))
 
 
-@settings(deadline=None, max_examples=400)
+@settings(max_examples=400)
 @given(worlds())
 def test_both_rules_equal_the_numpy_version(world: World) -> None:
     np.testing.assert_array_equal(contacts(world, indexed(world)), slow_contacts(world))
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(worlds())
 def test_objects_without_an_index_give_the_same(world: World) -> None:
     plain = unindexed(world.boxes, world.is_stopped, world.collision_score)
     np.testing.assert_array_equal(contacts(world, plain), contacts(world, indexed(world)))
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(world=worlds(), seed=st.integers(0, 1000))
 def test_the_order_of_objects_changes_nothing(world: World, seed: int) -> None:
     order = np.random.default_rng(seed).permutation(len(world.is_stopped))

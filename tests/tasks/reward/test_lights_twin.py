@@ -36,7 +36,7 @@ def mask(rng: np.random.Generator, lanes: list[MapPolygon]) -> np.ndarray:
     return rng.random((41, len(lanes))) < rng.choice([0.0, 0.02, 0.5, 1.0], len(lanes))
 
 
-@settings(deadline=None, max_examples=80)
+@settings(max_examples=80)
 @given(small_maps(step=0.0), st.integers(0, 2**32 - 1))
 def test_the_first_red_instant_equals_the_shapely_version(polygons: list[MapPolygon], seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -46,7 +46,7 @@ def test_the_first_red_instant_equals_the_shapely_version(polygons: list[MapPoly
     assert np.array_equal(ours, slow_first_reds(lanes, is_red, states, PACIFICA))
 
 
-@settings(deadline=None, max_examples=80)
+@settings(max_examples=80)
 @given(small_maps(step=0.25), st.integers(0, 2**32 - 1))
 def test_touching_a_red_lane_counts(polygons: list[MapPolygon], seed: int) -> None:
     rng = np.random.default_rng(seed)

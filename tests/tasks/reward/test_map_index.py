@@ -48,7 +48,7 @@ def telling_points(polygons: list[MapPolygon], seed: int, step: float) -> np.nda
     return np.concatenate([*anywhere, snapped, corners, crossings, between])
 
 
-@settings(deadline=None, max_examples=150)
+@settings(max_examples=150)
 @given(st.data(), st.sampled_from([0.0, 0.25, 1.0]), st.integers(0, 1000))
 def test_every_point_is_in_the_regions_that_shapely_says(data: st.DataObject, step: float, seed: int) -> None:
     polygons = data.draw(small_maps(step))
@@ -67,7 +67,7 @@ def square(token: str, x: float, y: float, side: float, layer: MapLayer = MapLay
     return MapPolygon(token, layer, ring)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(small_maps(step=0.0), st.integers(0, 1000))
 def test_the_order_of_polygons_changes_nothing(polygons: list[MapPolygon], seed: int) -> None:
     points = telling_points(polygons, seed, step=0.0)
@@ -79,7 +79,7 @@ def test_the_order_of_polygons_changes_nothing(polygons: list[MapPolygon], seed:
     assert np.array_equal(found.parts, again.parts)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(small_maps(step=0.0), st.integers(0, 1000), st.sampled_from([(0.0, 4e3), (2.2, -7e3), (-0.7, 5e5)]))
 def test_moving_the_world_changes_nothing(polygons: list[MapPolygon], seed: int, motion: tuple[float, float]) -> None:
     c, s = np.cos(motion[0]), np.sin(motion[0])

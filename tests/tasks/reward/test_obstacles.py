@@ -33,7 +33,7 @@ def seen_from(obstacles: Obstacles, t: int, x: float, y: float) -> np.ndarray:
     return obstacles.items[obstacles.starts[cell] : obstacles.starts[cell + 1]]
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(
     seed=st.integers(0, 2**32 - 1),
     n_items=st.integers(1, 30),

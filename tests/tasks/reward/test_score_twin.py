@@ -26,7 +26,7 @@ def assert_same(ours: Scores, theirs: Scores) -> None:
             np.testing.assert_array_equal(one, other, err_msg=field.name)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(seed=st.integers(0, 2**32 - 1), with_history=st.booleans())
 def test_kernels_equal_the_slow_twin_on_random_worlds(seed: int, with_history: bool) -> None:
     world = random_world(seed)
@@ -94,7 +94,7 @@ def assert_bits(ours: Scores, whole: Scores, index: np.ndarray | slice = slice(N
         assert getattr(ours, field.name).tobytes() == getattr(whole, field.name)[index].tobytes(), field.name
 
 
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 @given(
     seed=st.integers(0, 2**32 - 1),
     shift=st.tuples(st.floats(-500.0, 500.0), st.floats(-500.0, 500.0)),

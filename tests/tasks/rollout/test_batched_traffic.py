@@ -85,7 +85,7 @@ def assert_row_is(rollouts: Rollouts, b: int, rollout: Rollout) -> None:
 
 
 @given(seeds)
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_the_traffic_equals_its_slow_twin(seed: int) -> None:
     for traffic, egos in stages(seed):
         for ego in egos[:3]:
@@ -93,7 +93,7 @@ def test_the_traffic_equals_its_slow_twin(seed: int) -> None:
 
 
 @given(seeds, st.sampled_from([0.5, 3.0, 20.0]), st.sampled_from([3.0, 25.0, 200.0]))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_so_it_does_under_other_settings(seed: int, blend_length_m: float, lookahead_m: float) -> None:
     """Also where the corridor reaches beyond the path's end."""
     of = TrafficSettings(blend_length_m=blend_length_m, lookahead_m=lookahead_m, min_gap_m=3.0, emergency_decel=5.0)
@@ -102,7 +102,7 @@ def test_so_it_does_under_other_settings(seed: int, blend_length_m: float, looka
 
 
 @given(seeds)
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_each_of_many_rollouts_is_that_of_its_ego_alone(seed: int) -> None:
     for traffic, egos in stages(seed):
         rollouts = roll_out_many(traffic, egos)

@@ -1,7 +1,7 @@
 """The compiled tracker gives the states of the slow twin, whatever the plan, the batch and the frame."""
 
 import numpy as np
-from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from tasks.rollout.lqr import STOPPING_SPEED_MPS, track, track_local
@@ -9,7 +9,7 @@ from tasks.world.frames import to_world, wrap_angle
 from tasks.world.vehicle import AX, AY, HEADING, STEERING, VX, VY, YAW_RATE, Vehicle, X, Y
 from tests.tasks.rollout import slow_lqr
 
-DRIVEN = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+DRIVEN = settings(max_examples=60)
 SPEEDS = st.sampled_from([0.0, 0.19, 0.21, 1.0, 9.0, 30.0, -2.0]) | st.floats(-3.0, 30.0)
 
 
