@@ -19,5 +19,5 @@ def shared_root() -> Path:
     """The folder of real logs and reference numbers beside the checkout; skips the test where it is missing."""
     root = Path(__file__).resolve().parents[2] / "shared"
     if not (root / "reference").is_dir():
-        pytest.skip(f"real logs and reference numbers are not at {root}")
+        pytest.skip(f"real logs and reference numbers are no part of the project, and {root} has none")
     return root

@@ -140,7 +140,7 @@ def test_a_map_without_polygons_holds_nothing() -> None:
 
 def test_an_index_survives_pickling() -> None:
     index = index_map([square("a", 0.0, 0.0, 4.0), square("b", 2.0, 2.0, 4.0)], NOBODY)
-    copy = pickle.loads(pickle.dumps(index))
+    copy = pickle.loads(pickle.dumps(index))  # bytes of our own: so Ray hands an index to a task
     points = np.random.default_rng(0).uniform(-1.0, 7.0, (200, 2))
     assert np.array_equal(held(copy, points), held(index, points))
 

@@ -84,7 +84,7 @@ def test_a_prepared_scene_from_a_store_of_read_only_memory_scores_the_same() -> 
     whole = score(prepared, states)
     buffers: list[pickle.PickleBuffer] = []
     body = pickle.dumps(prepared, protocol=5, buffer_callback=buffers.append)
-    again = pickle.loads(body, buffers=[bytes(buffer.raw()) for buffer in buffers])
+    again = pickle.loads(body, buffers=[bytes(buffer.raw()) for buffer in buffers])  # our own, as Ray's store gives it
     assert again.centerline.segments.flags.writeable and again.map_index.cells.flags.writeable
     assert_bits(score(again, states), whole)
 
