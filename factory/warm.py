@@ -8,14 +8,13 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from tasks.attempt import drive_and_judge
 from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.protocol import Plan
-from tasks.kernels import sources_digest
+from tasks.kernels import cache_dir, machine
 from tasks.kinematic_vocabulary import kinematic_trajectories
 from tasks.render.warm import compile_fit_kernels
 from tasks.render.warm import compile_kernels as compile_render_kernels
@@ -43,7 +42,7 @@ def compile_kernels(parts: Sequence[str]) -> None:
 
 def _marker(name: str) -> Path:
     """The file that says that a part is in the cache."""
-    return Path(numba.config.CACHE_DIR) / f"compiled-{sources_digest()}-{name}"
+    return cache_dir() / f"compiled-{machine()}-{name}"
 
 
 def _compile_part(name: str) -> None:

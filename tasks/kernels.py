@@ -2,18 +2,22 @@
 
 None gets the entry for C programs that numba compiles by default: nobody calls it.
 
-Numba's own cache does not notice an edit in a callee or of a constant that lives in another file, so the cache folder
-is named by a digest of all sources that hold kernels or the constants of kernels: one edit anywhere starts a new
-folder. NUMBA_CACHE_DIR, when set, is left alone.
+Numba's own cache does not notice an edit in a callee or of a constant that lives in another file, and starts anew where
+the same files lie in another folder, as every upload of a Ray job does. So compiled kernels lie in a folder named by a
+digest of all sources that hold kernels or the constants of kernels, and in it by their place in the project: one edit
+anywhere starts a new folder, a copy elsewhere starts none. Numba itself tells apart the processors that share a folder.
+The folder lies in NUMBA_CACHE_DIR where that is set, else in the user's cache.
 """
 
 import ast
 import hashlib
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
+import llvmlite.binding as llvm
 import numba
 
 from tasks.caches import user_cache
@@ -54,11 +58,57 @@ def sources_digest(root: Path = _ROOT) -> str:
 
 def cache_dir() -> Path:
     """Where the compiled kernels of exactly these sources are kept."""
-    return user_cache() / f"kernels-{sources_digest()}"
+    return Path(os.environ.get("NUMBA_CACHE_DIR") or user_cache()) / f"kernels-{_DIGEST}"
 
 
-if not os.environ.get("NUMBA_CACHE_DIR"):
-    numba.config.CACHE_DIR = str(cache_dir())
+def machine() -> str:
+    """What a compiled kernel runs on, beside its sources: 8 hex digits of Python's version and the processor's kind."""
+    processor = llvm.get_host_cpu_name() + llvm.get_host_cpu_features().flatten()
+    return hashlib.sha256(f"{sys.version_info[:2]} {processor}".encode()).hexdigest()[:8]
+
+
+_DIGEST = sources_digest()
+
+
+class KernelLocator:
+    """Where numba keeps a function of this project, whatever folder the project lies in (NUMBA_CACHE_LOCATOR_CLASSES).
+
+    The methods are those that numba.core.caching calls.
+    """
+
+    def __init__(self, line: int, inside: Path) -> None:
+        self._line = line
+        self._inside = inside
+
+    @classmethod
+    def from_function(cls, function: Callable[..., Any], file: str) -> Self | None:
+        """The locator of a function; None, so that numba asks its own, where the file is not this project's."""
+        path = Path(file).resolve()
+        if not any(path.is_relative_to(_ROOT / package) for package in _PACKAGES):
+            return None
+        locator = cls(function.__code__.co_firstlineno, path.relative_to(_ROOT).with_suffix(""))
+        locator.ensure_cache_path()
+        return locator
+
+    def ensure_cache_path(self) -> None:
+        """Raises OSError where the folder cannot be made."""
+        Path(self.get_cache_path()).mkdir(parents=True, exist_ok=True)
+
+    def get_cache_path(self) -> str:
+        """A folder for each source file."""
+        return str(cache_dir() / self._inside)
+
+    def get_source_stamp(self) -> str:
+        """What must be the same for a cached kernel to be used."""
+        return _DIGEST
+
+    def get_disambiguator(self) -> str:
+        """Tells apart functions of one name in one file."""
+        return str(self._line)
+
+
+_NUMBAS_OWN = "UserProvidedCacheLocator,InTreeCacheLocator,UserWideCacheLocator,IPythonCacheLocator,ZipCacheLocator"
+numba.config.CACHE_LOCATOR_CLASSES = f"{__name__}.{KernelLocator.__name__},{_NUMBAS_OWN}"
 
 
 def kernel(function: F) -> F:

@@ -7,7 +7,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numba
 import pytest
 
 from factory.__main__ import main as door_main
@@ -29,6 +28,7 @@ from planners.replay import settings_of as replay_settings
 from planners.scaling import ScalingSettings
 from planners.train import TrainConfig
 from tasks.caches import user_cache
+from tasks.kernels import cache_dir
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 PAGES = ("README.md", "docs/configuration.md", "docs/dashboard.md", "docs/training.md")
@@ -82,7 +82,7 @@ def demo_home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_python_runs_as_written_without_ray_or_hydra(demo_home: Path, block: str) -> None:
     code = block + "\nimport sys\nassert not {'ray', 'hydra'} & set(sys.modules)\n"
     env = os.environ | {"PYTHONPATH": str(REPOSITORY), "XDG_CACHE_HOME": str(demo_home / "cache")}
-    env["NUMBA_CACHE_DIR"] = numba.config.CACHE_DIR  # a cache of its own for towns, but no second compilation
+    env["NUMBA_CACHE_DIR"] = str(cache_dir().parent)  # a cache of its own for towns, but no second compilation
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=demo_home, env=env, capture_output=True, text=True, timeout=200
     )

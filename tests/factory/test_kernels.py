@@ -2,6 +2,7 @@
 
 import ast
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -9,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tasks.kernels import cache_dir, kernel_sources, sources_digest
+from tasks.kernels import KernelLocator, cache_dir, kernel_sources, sources_digest
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -69,19 +70,54 @@ def test_an_edit_elsewhere_keeps_the_cache(small_house: Path) -> None:
 
 def test_the_cache_lies_in_the_user_s_cache_folder_named_by_the_digest(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", "/somewhere")
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
     assert cache_dir() == Path("/somewhere/driving-data-factory") / f"kernels-{sources_digest()}"
 
 
-def cache_asked_for(**environment: str) -> str:
-    code = "import tasks.kernels, numba; print(numba.config.CACHE_DIR)"
+SQUARED = """
+from tasks.kernels import kernel
+
+@kernel
+def squared(x):
+    return x * x
+"""
+CALL_IT = """
+from tasks.squares import squared
+assert squared(3.0) == 9.0
+print(sum(squared.stats.cache_hits.values()), sum(squared.stats.cache_misses.values()))
+"""
+
+
+def copy_with_one_kernel(folder: Path) -> Path:
+    """The project's decorator and one kernel, as a job's upload would lie in a folder of its own."""
+    for name in ("__init__", "kernels", "caches"):
+        target = folder / "tasks" / f"{name}.py"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(REPOSITORY / "tasks" / f"{name}.py", target)
+    (folder / "tasks" / "squares.py").write_text(SQUARED)
+    return folder
+
+
+def hits_and_misses(project: Path, **environment: str) -> str:
     env = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"} | environment
-    env |= {"PYTHONPATH": str(REPOSITORY)}
-    return subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True).stdout.strip()
+    env |= {"PYTHONPATH": str(project)}
+    done = subprocess.run([sys.executable, "-c", CALL_IT], env=env, cwd=project, capture_output=True, text=True)
+    return done.stdout.strip() or done.stderr
 
 
-def test_a_cache_folder_named_in_the_environment_is_left_alone(tmp_path: Path) -> None:
-    assert cache_asked_for(NUMBA_CACHE_DIR=str(tmp_path)) == str(tmp_path)
-    assert cache_asked_for() == str(cache_dir())
+@pytest.mark.parametrize("named_by", ["NUMBA_CACHE_DIR", "XDG_CACHE_HOME"])
+def test_a_copy_of_the_project_elsewhere_compiles_nothing_again(tmp_path: Path, named_by: str) -> None:
+    where = {named_by: str(tmp_path / "cache")}
+    first, second = (copy_with_one_kernel(tmp_path / name) for name in ("upload_1", "upload_2"))
+    assert hits_and_misses(first, **where) == "0 1"
+    assert hits_and_misses(second, **where) == "1 0"
+    with (second / "tasks" / "squares.py").open("a") as file:
+        file.write("LIMIT = 3.0\n")
+    assert hits_and_misses(second, **where) == "0 1"
+
+
+def test_a_kernel_of_somebody_else_is_left_to_numba() -> None:
+    assert KernelLocator.from_function(test_a_kernel_of_somebody_else_is_left_to_numba, __file__) is None
 
 
 def test_a_kernel_gives_the_bytes_of_its_own_python() -> None:
