@@ -32,7 +32,7 @@ SUBSCORES = ("nc", "dac", "ddc", "tlc", "ep", "ttc", "lk", "hc", "ec")  # EPDMS,
 PICTURE_FAULTS = ("holes", "lens_covered", "blank", "blurred")  # tasks.render.gate
 
 STAGES: tuple[Stage, ...] = (
-    Stage("clip", 1, "clip", ("ego_standing", "broken_tracks", "route_ended", "no_earlier_frame")),
+    Stage("clip", 2, "clip", ("ego_standing", "broken_tracks", "route_ended", "no_earlier_frame")),
     Stage("perturb", 1, "clip", ("no_gated_candidate", "no_good_candidate")),
     Stage("rollout", 2, "attempt", ("route_ended",)),
     Stage("expert", 1, "attempt", ("no_plan",)),

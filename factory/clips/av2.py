@@ -32,6 +32,7 @@ from factory.clips.av2_log import (
 from factory.clips.av2_map import map_file, read_map
 from factory.clips.logs import STEP_MS, Drive, LogReader, Recorded, WholeLog, present, route_of_drive
 from factory.clips.reader import SPLITS, BadClip, ClipRef
+from factory.clips.splits import folder_split
 from tasks.world.camera import Camera, SensorFile
 from tasks.world.clip import STEP_S, Block
 from tasks.world.lanes import LightState, RoadMap, TrafficLights
@@ -143,6 +144,7 @@ def read_log(folder: Path) -> AV2Log:
         sweeps=tuple(_stamped(motion, "lidar", folder / "sensors" / "lidar", ".feather")),
         licence=_licence(folder),
         content_digest=content_digest(folder),
+        split=folder_split(folder),
     )
 
 

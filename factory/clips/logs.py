@@ -21,7 +21,7 @@ frame per log; the columns of ego states are named in tasks.world.vehicle, absen
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
@@ -66,6 +66,7 @@ class WholeLog:
     lights: TrafficLights  # S steps
     licence: str
     content_digest: str  # sha256 of everything the clips are computed from, but pixels and points
+    split: str | None = field(default=None, kw_only=True)  # the data set's own; None: by the hash of the log's id
 
     @cached_property
     def finder(self) -> RouteFinder:
@@ -109,10 +110,10 @@ class LogReader(ABC, Generic[Log]):
         """name: the data set's name, part of every clip id; first_window: of each log, skips those before it.
 
         only: ids of the logs to take, of all that are there where none is named; split: of every clip, whatever its
-        log's hash says. Raises ValueError for an impossible stride, first window or split.
+        data set says. Raises ValueError for an impossible stride, first window or split.
         """
         if split is not None and split not in SPLITS:
-            raise ValueError(f"clips.split={split} is none of {', '.join(SPLITS)}; null: by the hash of the log's id")
+            raise ValueError(f"clips.split={split} is none of {', '.join(SPLITS)}; null: the data set's own")
         self.root = Path(root).expanduser().absolute()
         self.name = self.data_set if name is None else name
         self.windows = WindowSettings(stride_s, min_top_speed_mps, first_window)
@@ -180,7 +181,7 @@ class LogReader(ABC, Generic[Log]):
             clip_id=ref.clip_id,
             dataset=self.name,
             log_id=ref.log_id,
-            split=self.split or split_of(ref.log_id),
+            split=self.split or log.split or split_of(ref.log_id),
             start_s=start * STEP_S,
             ego_states=ego_states,
             world_from_ego=recorded.world_from_ego,

@@ -30,6 +30,7 @@ from factory.clips.scenarionet_tracks import (
     read_track,
     sample_times,
 )
+from factory.clips.splits import folder_split, nuscenes_split, waymo_split
 from tasks.world.lanes import TrafficLights
 from tasks.world.vehicle import EGO_STATE_SIZE, HEADING, X, Y
 
@@ -201,7 +202,14 @@ def read_log(path: Path) -> ScenarioLog:
         lights=TrafficLights(tuple(lights.lane_ids[c] for c in known), lights.states[frames][:, known]),
         licence=source.licence,
         content_digest=digest,
+        split=_own_split(path, metadata),
     )
+
+
+def _own_split(path: Path, metadata: Mapping[str, Any]) -> str | None:
+    """The folder's, else the list's of the data set that was converted; nuPlan's files do not say theirs."""
+    source = metadata.get("source_file")
+    return folder_split(path) or nuscenes_split(path.stem) or (waymo_split(source) if isinstance(source, str) else None)
 
 
 def _flat_poses(ego_states: Array) -> Array:

@@ -28,7 +28,7 @@ def _lineage() -> tuple[Column, ...]:
         Column("clip_id", "string", about="hash of data set, log, start time and window"),
         Column("dataset", "string"),
         Column("log_id", "string"),
-        Column("split", "string", about="train, val or test, by log"),
+        Column("split", "string", about="train, val or test: the data set's own, else by log"),
         Column("clip_start_s", "float64", unit="s", about="first step of the clip since the log's first instant"),
         Column("now_s", "float64", unit="s", about="now since the clip's first step: 5.5 simulated, 1.5 human"),
         Column("expert", "string", about="who drives the label; partition"),
