@@ -11,6 +11,7 @@ from typing import Any, Literal
 from factory.benchmark import BenchmarkSettings
 from factory.clips.reader import ClipIndex, ClipReader
 from factory.config import ConfigError, build, compose, fill
+from factory.job import in_submitted_job
 from factory.pipeline import FactoryWork
 from factory.vocabulary import (
     build_recovery_table,
@@ -181,11 +182,7 @@ def open_reader(clips: Mapping[str, Any]) -> tuple[ClipReader, ClipIndex]:
 def refuse_relative_root(clips: Mapping[str, Any]) -> None:
     """Raises ConfigError for a relative clips.root inside a submitted Ray job, whose folder is a temporary copy."""
     root = clips.get("root")
-    if (
-        "RAY_JOB_CONFIG_JSON_ENV_VAR" in os.environ
-        and isinstance(root, str)
-        and not Path(root).expanduser().is_absolute()
-    ):
+    if in_submitted_job() and isinstance(root, str) and not Path(root).expanduser().is_absolute():
         raise ConfigError(
             f"clips.root={root} is relative, and a submitted job runs in a copy of the working directory: "
             "name an absolute path that every node sees"

@@ -9,6 +9,8 @@ from pathlib import Path
 
 from pyarrow import fs
 
+from factory.job import in_submitted_job
+
 REMOTE = ("s3", "gs", "abfs", "abfss", "file")  # what both Arrow and Delta write to
 
 
@@ -35,7 +37,7 @@ class Location:
                 raise BadLocation(f"out={text}: name a folder, or a URL of {', '.join(REMOTE)}://")
             return Location(text.rstrip("/"), dict(options or {}))
         path = Path(text).expanduser()
-        if not path.is_absolute() and "RAY_JOB_CONFIG_JSON_ENV_VAR" in os.environ:  # set by Ray for a job's driver
+        if not path.is_absolute() and in_submitted_job():
             raise BadLocation(
                 f"out={text} is relative, and a submitted job runs in a copy: name an absolute path or a URL"
             )

@@ -21,6 +21,27 @@ def test_a_relative_root_in_a_submitted_job_is_refused(monkeypatch: pytest.Monke
         refuse_relative_root({"root": "logs"})
 
 
+@pytest.mark.parametrize(
+    ("job", "named", "default"),
+    [
+        (False, None, "runs/synthetic"),
+        (True, None, "/home/someone/driving-data-factory/runs/synthetic"),
+        (False, "/data/runs", "/data/runs/synthetic"),
+        (True, "s3://bucket/runs", "s3://bucket/runs/synthetic"),
+    ],
+)
+def test_results_lie_below_one_root_that_a_submitted_job_can_keep(
+    monkeypatch: pytest.MonkeyPatch, job: bool, named: str | None, default: str
+) -> None:
+    monkeypatch.setenv("HOME", "/home/someone")
+    for variable, value in {"RAY_JOB_CONFIG_JSON_ENV_VAR": "{}" if job else None, "FACTORY_RUNS": named}.items():
+        monkeypatch.delenv(variable, raising=False)
+        if value is not None:
+            monkeypatch.setenv(variable, value)
+    assert load_config([]).out == default
+    assert load_config(["out=elsewhere"]).out == "elsewhere"
+
+
 def test_a_finished_table_takes_no_vocabularies(shared_root: Path, tmp_path: Path) -> None:
     table = tmp_path / "table.npz"
     save_recovery_table(table, RecoveryTable(kinematic_trajectories(5, 0)), {})
