@@ -1,4 +1,4 @@
-"""From the rows of one planner to its scores: one stage, each stage of two, and their product (METRIC.md 2l, 3)."""
+"""From the rows of one planner to its scores: one stage, each of two stages, their product (docs/reward.md 2l, 3)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

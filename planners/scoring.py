@@ -1,4 +1,4 @@
-"""Plans scored on frames as the public benchmark does it (METRIC.md 1, 2 and 3).
+"""Plans scored on frames as the public benchmark does it (docs/reward.md 1, 2 and 3).
 
 A frame's plan is driven by the tracker, the traffic answers to it or replays its log, and the drive is scored in the
 two-row batch [PDM-Closed, plan]: progress is relative to PDM-Closed among the traffic that answered to the plan. Where

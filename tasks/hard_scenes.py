@@ -1,6 +1,6 @@
 """The scenes of a two-stage benchmark: what a planner is driven and scored from, apart from any sample.
 
-Stage one is the log at T, stage two where candidates' rollouts lead at T+H (METRIC.md section 3). Each has a frame
+Stage one is the log at T, stage two where candidates' rollouts lead at T+H (docs/reward.md 3). Each has a frame
 0.5 s earlier, so that extended comfort is defined.
 """
 

@@ -28,7 +28,7 @@ class Rejected:
     counts: Mapping[str, int] = field(default_factory=dict)  # what was counted on the way, such as drops by gate
 
 
-SUBSCORES = ("nc", "dac", "ddc", "tlc", "ep", "ttc", "lk", "hc", "ec")  # EPDMS, METRIC.md section 2
+SUBSCORES = ("nc", "dac", "ddc", "tlc", "ep", "ttc", "lk", "hc", "ec")  # EPDMS, docs/reward.md 2
 PICTURE_FAULTS = ("holes", "lens_covered", "blank", "blurred")  # tasks.render.gate
 
 STAGES: tuple[Stage, ...] = (

@@ -1,8 +1,8 @@
 """What moves in an Argoverse 2 sensor log: ego poses and annotated boxes, resampled to steps of 0.1 s.
 
-Step k stands 0.1 k seconds after the first annotated frame. The rules are those of METRIC.md section 6, found to
+Step k stands 0.1 k seconds after the first annotated frame. The rules are those of docs/reward.md 6, found to
 reproduce its recorded states: linear interpolation between poses, boxes placed by the ego pose of their frame,
-velocities by least squares. File format: data/FORMATS.md.
+velocities by least squares. File format: that of argoverse/av2-api.
 """
 
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""An Argoverse 2 vector map (log_map_archive_*.json) as a RoadMap. Format: Wilson et al. 2021, data/FORMATS.md."""
+"""An Argoverse 2 vector map (log_map_archive_*.json) as a RoadMap. Format: Wilson et al. 2021, argoverse/av2-api."""
 
 import json
 from pathlib import Path

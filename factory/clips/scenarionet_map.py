@@ -104,7 +104,7 @@ def neighbours(raw: Mapping[str, RawLane], connectors: frozenset[str]) -> tuple[
     """(left, right) lane id -> the lane beside it, in either driving direction.
 
     The file's own links where it has any, else by geometry: rays to the side from five points of a lane; the lane whose
-    polygon begins where its own ends, seen by at least two of the rays. Connectors have none (METRIC.md section 0 joins
+    polygon begins where its own ends, seen by at least two of the rays. Connectors have none (docs/reward.md 0 joins
     them by what they connect).
     """
     if any(lane.left or lane.right for lane in raw.values()):

@@ -1,6 +1,6 @@
 """What reasons, gates and ends of a run are called on the pages, and the published rates beside ours."""
 
-# Paper (DESIGN.md, "words"): clips with a sample of the round, in % of those with one of the round before.
+# SimScale: clips with a sample of the round, in % of those with one of the round before.
 PAPER_CLIP_PERCENT = {"pdm_closed": (63, 85, 83, 83, 84), "recovery": (43, 80, 78, 78, 78)}
 STATUS = {  # exit code -> words, tone
     0: ("complete", "good"),

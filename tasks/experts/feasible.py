@@ -19,7 +19,7 @@ answers with a kick that no human would give. The QPs find the nearest motion th
 3. x, y from h and v by the midpoint rule: the poses are those of a car, whatever the linearisation left out.
 
 Where the start state itself breaks a bound, the bound is widened to what the largest rate allows from there, so that
-both problems always have a solution. Limits are those of the reward's comfort rules (METRIC.md 2i) with a margin,
+both problems always have a solution. Limits are those of the reward's comfort rules (docs/reward.md 2i) with a margin,
 because the tracker adds its own.
 """
 

@@ -1,4 +1,4 @@
-"""The planner expert: PDM-Closed (Dauner et al. 2023), as the public metric runs it (METRIC.md section 4).
+"""The planner expert: PDM-Closed (Dauner et al. 2023), as the public metric runs it (docs/reward.md 4).
 
 Fifteen proposals along the route are driven by the tracker, scored against a constant-velocity forecast of the others,
 and the first best PROPOSAL (not its simulated states) is the plan. Red lights: an on-route lane connector that is red

@@ -1,4 +1,4 @@
-"""Who stands in the corridor that the ego may sweep along a path, when, and how far along (METRIC.md section 4).
+"""Who stands in the corridor that the ego may sweep along a path, when, and how far along (docs/reward.md 4).
 
 The corridor itself is made by GEOS, as for the public planner: its buffer drops shallow bends of the path and cuts its
 round joins into chords, which moves the edge by up to 5 mm from where half a width would put it, and an object that

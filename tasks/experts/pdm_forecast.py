@@ -1,4 +1,4 @@
-"""What PDM-Closed believes the others will do: keep their velocity (METRIC.md section 4)."""
+"""What PDM-Closed believes the others will do: keep their velocity (docs/reward.md 4)."""
 
 import math
 from dataclasses import dataclass
@@ -108,7 +108,7 @@ def forecast(
     """The objects to reckon with, seen from `ego_state` (11,): `agents` at its first step, none further than 100 m.
 
     The nearest 50 vehicles, 25 pedestrians, 10 bicycles and 50 standing objects, by the distance of their centres to
-    the ego's. Source: METRIC.md section 4.
+    the ego's. Source: docs/reward.md 4.
     """
     ego = ego_box(ego_state[[X, Y, HEADING]], vehicle)
     distance = np.hypot(agents.boxes[0, :, 0] - ego[0], agents.boxes[0, :, 1] - ego[1])

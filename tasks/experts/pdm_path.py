@@ -1,4 +1,4 @@
-"""Parallel polylines that can be driven by arc length (METRIC.md section 4). Compiled."""
+"""Parallel polylines that can be driven by arc length (docs/reward.md 4). Compiled."""
 
 import math
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""PDM's fifteen proposals: IDM at five target speeds along three parallel paths (METRIC.md section 4). Compiled.
+"""PDM's fifteen proposals: IDM at five target speeds along three parallel paths (docs/reward.md 4). Compiled.
 
 What does not depend on them (who stands in a path's corridor when, and how far along the path) is found once for all
 forecast samples; then each proposal is driven in steps of 0.1 s, a path's speeds side by side from slow to fast.

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class PdmSettings:
-    """PDM-Closed as published with NAVSIM (METRIC.md section 4); raises ValueError where a value makes no sense.
+    """PDM-Closed as published with NAVSIM (docs/reward.md 4); raises ValueError where a value makes no sense.
 
     The three switches at the end are faults of the published planner, kept so that plans and progress compare with
     everything published; False corrects each.

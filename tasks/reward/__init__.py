@@ -1,1 +1,1 @@
-"""EPDMS and its sub-scores, rule by rule (METRIC.md)."""
+"""EPDMS and its sub-scores, rule by rule (docs/reward.md)."""

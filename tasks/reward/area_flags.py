@@ -1,4 +1,4 @@
-"""Which parts of the map the ego's body is on (METRIC.md 2a).
+"""Which parts of the map the ego's body is on (docs/reward.md 2a).
 
 Each step is one loop over all points of a trajectory. Calls with arrays inside of these loops would cost more than
 the work: numba counts references to every one of them.

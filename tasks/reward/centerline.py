@@ -1,4 +1,4 @@
-"""The route's centreline, indexed once: where along it a point lies, and whether points are off it (METRIC.md 2f, 2h).
+"""The route's centreline, indexed once: where along it a point lies, whether points are off it (docs/reward.md 2f, 2h).
 
 Both answers are GEOS' to the last bit: the same differences, products and quotients, on the segments that can matter.
 Which can, circles around chunks of segments say for the place along the line, and a grid of cells for "off it".

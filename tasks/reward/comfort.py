@@ -1,4 +1,4 @@
-"""History comfort and two-frame extended comfort (METRIC.md 2i, 2j).
+"""History comfort and two-frame extended comfort (docs/reward.md 2i, 2j).
 
 The six limits hold on a series of 55 rows: 14 of history, then the 41 of the trajectory. It is judged one quantity at a
 time, each a contiguous row of scratch.
@@ -83,7 +83,7 @@ def comfort_along(
 ) -> float:
     """The first uncomfortable step, inf where there is none; a step of the history is negative (-15 .. -2).
 
-    History comfort is the conjunction of the flags (METRIC.md 2i).
+    History comfort is the conjunction of the flags (docs/reward.md 2i).
     """
     judged, lon, lat, magnitude, heading = scratch[:N_FLAGS], scratch[6], scratch[7], scratch[8], scratch[9]
     before = len(history)

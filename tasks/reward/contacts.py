@@ -1,4 +1,4 @@
-"""No at-fault collision and time to collision of one trajectory (METRIC.md 2b, 2g).
+"""No at-fault collision and time to collision of one trajectory (docs/reward.md 2b, 2g).
 
 Both rules walk through the contacts of the ego's body in time and stop looking at an object once a contact with it was
 harmless.
@@ -123,7 +123,7 @@ def _angle_to(x: float, y: float, heading: float, other: Box) -> float:
     """Angle [rad] between a heading [rad] and the ray from (x, y) [m] to the centroid of a box.
 
     The cosine is not clipped, as in the public metric: where rounding lifts it above 1 the angle is NaN, so a
-    perfectly aligned object is neither ahead nor behind (METRIC.md 2g); so is one centred on (x, y). The last bit
+    perfectly aligned object is neither ahead nor behind (docs/reward.md 2g); so is one centred on (x, y). The last bit
     decides there, so the heading's sine and cosine are the machine's own, as numpy's are, not the body's.
     """
     cos, sin = math.cos(heading), math.sin(heading)

@@ -12,7 +12,7 @@ from tasks.world.vehicle import HEADING, VX, VY, X, Y
 
 Array = NDArray[np.float64]
 
-# Bits of an instant's flags (METRIC.md 2a)
+# Bits of an instant's flags (docs/reward.md 2a)
 MULTIPLE_LANES = 1  # corners in more than one lane, and no lane holds all four
 NON_DRIVABLE = 2  # some corner is in no drivable polygon
 ONCOMING = 4  # the centre is in no lane of the route

@@ -1,4 +1,4 @@
-"""EPDMS: the sub-scores of ego trajectories and what they add up to (METRIC.md 2)."""
+"""EPDMS: the sub-scores of ego trajectories and what they add up to (docs/reward.md 2)."""
 
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, get_args
@@ -95,7 +95,7 @@ def score_with_ec(scores: Scores, ec: Array) -> Array:
 
 
 def human_filtered(scores: Scores, human: Scores) -> Scores:
-    """The human-penalty filter: a sub-score at which the logged human gets exactly 0 becomes 1 (METRIC.md 2l).
+    """The human-penalty filter: a sub-score at which the logged human gets exactly 0 becomes 1 (docs/reward.md 2l).
 
     human: one row, scored alone and without history against its own traffic. Multiplier and score are recomputed.
     Raises ValueError unless `human` has one row.

@@ -1,4 +1,4 @@
-"""What sub-scores weigh in a score, and what progress counts as (METRIC.md 2k). Needs numpy only."""
+"""What sub-scores weigh in a score, and what progress counts as (docs/reward.md 2k). Needs numpy only."""
 
 import numpy as np
 from numpy.typing import NDArray

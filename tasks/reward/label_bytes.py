@@ -54,7 +54,7 @@ class VocabularyLabels:
         return self.nc * self.dac * self.tlc * self.ddc
 
     def ep(self, normalise: Normalise = "pairs") -> Array:
-        """(K,) ego progress, 0 .. 1 (METRIC.md 2k): in pairs with PDM-Closed, or in one batch of it and all K.
+        """(K,) ego progress, 0 .. 1 (docs/reward.md 2k): in pairs with PDM-Closed, or in one batch of it and all K.
 
         "masked" is in pairs too, but what is divided is the compliant progress, as SimScale labels its vocabulary
         (PROGRESS_MODE=gen_gt): 0 for a trajectory with a multiplier of 0, unless nothing counts as progress.

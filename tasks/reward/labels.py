@@ -1,4 +1,4 @@
-"""Reward labels of a sample: every trajectory of a vocabulary driven from its scene and scored (METRIC.md 1 and 2)."""
+"""Reward labels of a sample: a whole vocabulary driven from its scene and scored (docs/reward.md 1 and 2)."""
 
 from dataclasses import dataclass
 from functools import partial

@@ -1,4 +1,4 @@
-"""Keeping to the lane's middle and to its direction (METRIC.md 2e, 2h)."""
+"""Keeping to the lane's middle and to its direction (docs/reward.md 2e, 2h)."""
 
 import math
 

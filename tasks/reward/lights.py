@@ -1,4 +1,4 @@
-"""Whether the ego's body is on a lane connector whose light is red (METRIC.md 2d)."""
+"""Whether the ego's body is on a lane connector whose light is red (docs/reward.md 2d)."""
 
 import math
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""The map around the ego, laid out so that the regions that hold a point are found at once (METRIC.md 2a).
+"""The map around the ego, laid out so that the regions that hold a point are found at once (docs/reward.md 2a).
 
 A grid covers every polygon. A cell that no edge touches lies in the same regions everywhere, so it names one set of
 regions. A crossed cell names the set of its middle and lists its edges: on the way from the middle to a point of the

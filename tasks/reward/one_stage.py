@@ -1,4 +1,4 @@
-"""A frame's final score, and the means of a one-stage evaluation (METRIC.md 2k, 2l).
+"""A frame's final score, and the means of a one-stage evaluation (docs/reward.md 2k, 2l).
 
 Published one-stage tables hold the UNFILTERED score beside FILTERED sub-scores; two-stage ones are filtered throughout.
 So every number here comes both ways and is named.

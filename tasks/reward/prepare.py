@@ -1,4 +1,4 @@
-"""Everything the reward asks of a scene, made once and used for any number of ego trajectories (METRIC.md 2)."""
+"""Everything the reward asks of a scene, made once and used for any number of ego trajectories (docs/reward.md 2)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -195,7 +195,7 @@ def _obstacles(objects: AgentTracks, ego_state0: Array | None, vehicle: Vehicle)
 def liability(objects: AgentTracks) -> tuple[Bools, Array]:
     """Whether each object counts as stopped (N,), and what an at-fault collision with it leaves of NC (N,).
 
-    Velocity and class are those of the first appearance, as in the public observation (METRIC.md 2).
+    Velocity and class are those of the first appearance, as in the public observation (docs/reward.md 2).
     """
     first_seen = objects.valid.argmax(axis=0)
     velocity = objects.velocities[first_seen, np.arange(len(objects))]

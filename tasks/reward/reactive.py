@@ -42,7 +42,7 @@ def reactive_scores(scene: Scene, states: Array, traffic: TrafficSettings) -> Sc
 
 
 def _stopped_when_first_seen(rollouts: Rollouts) -> Bools:
-    """(B, N) whether each agent's speed is next to nothing at its first appearance (METRIC.md 2)."""
+    """(B, N) whether each agent's speed is next to nothing at its first appearance (docs/reward.md 2)."""
     first = rollouts.valid.argmax(axis=1)[:, None, :, None]
     velocity = np.take_along_axis(rollouts.velocities, first, axis=1)[:, 0]
     return np.hypot(velocity[..., 0], velocity[..., 1]) <= STOPPED_SPEED_MPS

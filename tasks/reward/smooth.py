@@ -1,4 +1,4 @@
-"""Savitzky-Golay filters of the comfort rules (METRIC.md 2i): a polynomial fitted to every window of samples.
+"""Savitzky-Golay filters of the comfort rules (docs/reward.md 2i): a polynomial fitted to every window of samples.
 
 Inside, a filter is a weighted sum of its window. The first and last half window of rows are the polynomial fitted to
 the first or last window, evaluated at the rows' own places. Every filter ends by rounding to 8 decimals, as the public

@@ -1,4 +1,4 @@
-"""Score one's own trajectories on a clip: poses in, sub-scores out (METRIC.md 1 and 2)."""
+"""Score one's own trajectories on a clip: poses in, sub-scores out (docs/reward.md 1 and 2)."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,4 +1,4 @@
-"""navhard's two-stage aggregation: a planner's score times what happens where its plan ends (METRIC.md 3).
+"""navhard's two-stage aggregation: a planner's score times what happens where its plan ends (docs/reward.md 3).
 
 Stage one scores the logged frame, stage two the synthetic frames that start near where a plan may end. Every group of
 follow-up frames exists for the frame now and for the one 0.5 s before. All columns (each sub-score, the score) are

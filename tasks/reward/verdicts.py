@@ -1,4 +1,4 @@
-"""Every rule applied to every trajectory, one trajectory after the other (METRIC.md 2); no row depends on another."""
+"""Every rule applied to every trajectory, one after the other (docs/reward.md 2); no row depends on another."""
 
 import math
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""Kinematic bicycle with first-order actuators: the ego's motion model (METRIC.md 1b).
+"""Kinematic bicycle with first-order actuators: the ego's motion model (docs/reward.md 1b).
 
     ax'    = ax + dt / (dt + 0.2) (accel_cmd - ax)          steer' = steer + dt / (dt + 0.05) dt rate_cmd
     x      += v cos(h) dt        y += v sin(h) dt            h += v tan(steer) / L dt      (old v, old steer)

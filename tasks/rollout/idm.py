@@ -1,4 +1,4 @@
-"""The Intelligent Driver Model: how hard one driver brakes or accelerates (Treiber et al. 2000; METRIC.md 5).
+"""The Intelligent Driver Model: how hard one driver brakes or accelerates (Treiber et al. 2000; docs/reward.md 5).
 
     dv/dt = a [1 - (v / v0)^delta - (s* / gap)^2],   s* = s0 + v T + v (v - v_lead) / (2 sqrt(a b))
 

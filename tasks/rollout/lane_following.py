@@ -27,7 +27,7 @@ from tasks.rollout.stretches import PATH_SPACING_M
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-HEADING_COST_M = 2.0  # metres of distance one radian is worth, as in the route matching (METRIC.md section 0)
+HEADING_COST_M = 2.0  # metres of distance one radian is worth, as in the route matching (docs/reward.md 0)
 START_COST_WEIGHT = 0.3  # of the distance at the start, against the mean distance of the log
 MAX_WAYS = 48  # ways compared at most, straightest first
 BEHIND_M = 15.0  # of path kept behind the vehicle

@@ -1,4 +1,4 @@
-"""LQR trajectory tracker on the kinematic bicycle, as the public metric drives a plan (METRIC.md 1a).
+"""LQR trajectory tracker on the kinematic bicycle, as the public metric drives a plan (docs/reward.md 1a).
 
 Per plan, a velocity and a curvature profile are fitted to the poses (tasks.rollout.profiles); per step, a scalar LQR
 over a 1 s horizon gives the acceleration and another the steering rate.

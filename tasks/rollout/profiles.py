@@ -1,4 +1,4 @@
-"""Speeds and curvatures fitted to the poses of a plan, and what the tracker looks at of them (METRIC.md 1a).
+"""Speeds and curvatures fitted to the poses of a plan, and what the tracker looks at of them (docs/reward.md 1a).
 
 Both fits are regularised least squares, and both are banded systems in the right unknowns, so that 40 instants cost
 40 short steps:

@@ -1,4 +1,4 @@
-"""Ego and traffic for H seconds: the joint rollout (METRIC.md sections 1 and 5), and the scene it leads to.
+"""Ego and traffic for H seconds: the joint rollout (docs/reward.md 1 and 5), and the scene it leads to.
 
 The ego is tracked first, since it follows its plan whatever the traffic does; then the traffic answers to it.
 
@@ -53,7 +53,7 @@ LOG_STRIDE = 3  # every third logged pose tells a way
 
 @dataclass(frozen=True)
 class TrafficSettings:
-    """How the others move. IDM's parameters are the public benchmark's (METRIC.md section 5)."""
+    """How the others move. IDM's parameters are the public benchmark's (docs/reward.md 5)."""
 
     mode: Literal["idm", "replay"] = "idm"
     target_speed_mps: float = 10.0  # where the lane has no speed limit

@@ -19,7 +19,7 @@ class AgentKind(StrEnum):
     GENERIC_OBJECT = "GENERIC_OBJECT"
 
 
-MOVING_KINDS = frozenset({AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.BICYCLE})  # "Agent" in METRIC.md 2b
+MOVING_KINDS = frozenset({AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.BICYCLE})  # "Agent" in docs/reward.md 2b
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ class Lane:
 
 
 class MapLayer(StrEnum):
-    """Polygon layers the reward looks at (METRIC.md 2a)."""
+    """Polygon layers the reward looks at (docs/reward.md 2a)."""
 
     LANE = "LANE"
     LANE_CONNECTOR = "LANE_CONNECTOR"
@@ -66,7 +66,7 @@ class RoadMap:
 
 @dataclass(frozen=True)
 class Route:
-    """Where the ego is going (METRIC.md section 0, route of a log that has no planner's route)."""
+    """Where the ego is going (docs/reward.md 0, route of a log that has no planner's route)."""
 
     lane_path: tuple[str, ...]  # lanes driven, in order
     roadblock_ids: tuple[str, ...]  # roadblocks passed, in order

@@ -13,8 +13,8 @@ from tasks.world.lanes import MapLayer, MapPolygon, RoadMap
 
 Array = NDArray[np.float64]
 
-CENTERLINE_SPACING_M = 0.75  # METRIC.md section 0
-MAP_RADIUS_M = 100.0  # METRIC.md section 0
+CENTERLINE_SPACING_M = 0.75  # docs/reward.md 0
+MAP_RADIUS_M = 100.0  # docs/reward.md 0
 
 
 def arc_lengths(polyline: Array) -> Array:
@@ -40,7 +40,7 @@ def with_headings(points: Array) -> Array:
 def centerline_from_boundaries(left: Array, right: Array) -> Array:
     """Centreline (P, 3) x, y, heading: mean of the two boundaries (B, 2+), P = max(2, ceil(L / 0.75) + 1).
 
-    L is the mean of the two lengths; each boundary is resampled uniformly by arc length (METRIC.md section 0).
+    L is the mean of the two lengths; each boundary is resampled uniformly by arc length (docs/reward.md 0).
     """
     length = (arc_lengths(left)[-1] + arc_lengths(right)[-1]) / 2.0
     n_points = max(2, int(np.ceil(length / CENTERLINE_SPACING_M)) + 1)
@@ -102,7 +102,7 @@ def polygons_near(road_map: RoadMap, center_xy: Array, radius_m: float = MAP_RAD
     """Every polygon of the drivable map within `radius_m` of a point (2,), in the reference's order.
 
     LANE, LANE_CONNECTOR, INTERSECTION (one per intersection lane), DRIVABLE_AREA, each in file order; only lanes
-    that cars drive (METRIC.md section 0). The same map gives the same objects again.
+    that cars drive (docs/reward.md 0). The same map gives the same objects again.
     """
     if road_map not in _DRIVABLE:
         every = _drivable_map(road_map)

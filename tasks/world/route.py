@@ -1,6 +1,6 @@
 """Where a log was going: roadblocks, the lanes driven, and the centreline ahead of any pose.
 
-METRIC.md section 0, "Route and map of a log that has no planner's route". Works for any map with a lane graph.
+docs/reward.md 0, "Route and map of a log that has no planner's route". Works for any map with a lane graph.
 """
 
 from collections.abc import Mapping, Sequence

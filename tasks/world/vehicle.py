@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, fields
 
-# Columns of an ego state row (METRIC.md section 0). The pose is the REAR AXLE in the world frame;
+# Columns of an ego state row (docs/reward.md 0). The pose is the REAR AXLE in the world frame;
 # velocity and acceleration are in the ego body frame.
 X, Y, HEADING, VX, VY, AX, AY, STEERING, STEERING_RATE, YAW_RATE, YAW_ACCEL = range(11)
 EGO_STATE_SIZE = 11
@@ -11,7 +11,7 @@ EGO_STATE_SIZE = 11
 
 @dataclass(frozen=True)
 class Vehicle:
-    """Body of a car; lengths in metres. Defaults: Chrysler Pacifica, METRIC.md section 0.
+    """Body of a car; lengths in metres. Defaults: Chrysler Pacifica, docs/reward.md 0.
 
     It is used on every data set by default, so that scores are comparable. Raises ValueError for a length that is not
     finite and positive, naming the field.

@@ -23,7 +23,7 @@ from tasks.world.clip import NOW, scene_of_clip
 from tests.bench.timing import cpu_milliseconds, memory_mb
 from tests.real.reference_scenes import RECORDED_K, SCENES, loader, prepared_scene
 
-PUBLIC_MS_PER_TRAJECTORY = 20.0  # the public implementation, one core (METRIC.md)
+PUBLIC_MS_PER_TRAJECTORY = 20.0  # the public implementation, one core
 SIZES = (1, 256, 4096, 16384)
 
 

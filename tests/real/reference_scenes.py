@@ -1,4 +1,4 @@
-"""The public metric's recorded scenes as inputs of our reward (METRIC.md 6)."""
+"""The public metric's recorded scenes as inputs of our reward (docs/reward.md 6)."""
 
 import importlib.util
 from functools import cache

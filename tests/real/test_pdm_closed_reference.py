@@ -1,4 +1,4 @@
-"""PDM-Closed equals the public planner's recorded proposals, states, scores and choice (METRIC.md 4 and 6)."""
+"""PDM-Closed equals the public planner's recorded proposals, states, scores and choice (docs/reward.md 4 and 6)."""
 
 import json
 from itertools import pairwise

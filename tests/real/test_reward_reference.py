@@ -1,4 +1,4 @@
-"""The reward equals the public metric's recorded outputs (reference/, METRIC.md 6), sub-score by sub-score."""
+"""The reward equals the public metric's recorded outputs (reference/, docs/reward.md 6), sub-score by sub-score."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Seven nuScenes scenes through the ScenarioNet reader: what data/FORMATS.md claims, and what a clip must be like."""
+"""Seven nuScenes scenes through the ScenarioNet reader: what the format promises, and what a clip must be like."""
 
 from pathlib import Path
 

@@ -210,7 +210,7 @@ def _boxes_touch(a: Array, b: Array) -> NDArray[np.bool_]:
 
 
 def endangers(ego: Array, speeds: Array, others: Array, margin_m: float = 0.15) -> NDArray[np.bool_]:
-    """(J,): would the ego (S, 5), going straight on for up to 0.9 s, touch that track? (METRIC.md 2g, stricter.)"""
+    """(J,): would the ego (S, 5), straight on for up to 0.9 s, touch that track? Stricter than docs/reward.md 2g."""
     danger = np.zeros(others.shape[1], bool)
     for ahead in (0, 3, 6, 9):
         moved = ego[: len(ego) - ahead].copy()

@@ -148,7 +148,7 @@ def forecast(
     """The objects to reckon with, seen from `ego_state` (11,): `agents` at its first step, none further than 100 m.
 
     The nearest 50 vehicles, 25 pedestrians, 10 bicycles and 50 standing objects, by the distance of their centres to
-    the ego's. Source: METRIC.md section 4.
+    the ego's. Source: docs/reward.md 4.
     """
     ego_box = ego_boxes(ego_state[[X, Y, HEADING]], vehicle)
     boxes, velocities = agents.boxes[0], agents.velocities[0]

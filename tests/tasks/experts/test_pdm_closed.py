@@ -1,4 +1,4 @@
-"""PDM-Closed on a straight road, where its proposals are known in closed form (METRIC.md section 4)."""
+"""PDM-Closed on a straight road, where its proposals are known in closed form (docs/reward.md 4)."""
 
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""PDM-Closed's compiled proposals equal their slow twin, which asks shapely, on random worlds (METRIC.md section 4)."""
+"""PDM-Closed's compiled proposals equal their slow twin, which asks shapely, on random worlds (docs/reward.md 4)."""
 
 from dataclasses import fields
 from typing import NamedTuple

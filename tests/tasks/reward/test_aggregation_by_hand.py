@@ -1,4 +1,4 @@
-"""Aggregation against numbers worked out on paper, each beside its arithmetic (METRIC.md 2k, 2l, 3)."""
+"""Aggregation against numbers worked out on paper, each beside its arithmetic (docs/reward.md 2k, 2l, 3)."""
 
 import math
 from dataclasses import fields

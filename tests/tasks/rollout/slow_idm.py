@@ -1,4 +1,4 @@
-"""Slow twin of the traffic: every pair at every step, one ego at a time (Treiber et al. 2000; METRIC.md 5).
+"""Slow twin of the traffic: every pair at every step, one ego at a time (Treiber et al. 2000; docs/reward.md 5).
 
     dv/dt = a [1 - (v / v0)^delta - (s* / gap)^2],   s* = s0 + v T + v (v - v_lead) / (2 sqrt(a b))
 

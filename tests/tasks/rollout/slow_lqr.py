@@ -1,4 +1,4 @@
-"""LQR trajectory tracker on the kinematic bicycle, as the public metric drives a plan (METRIC.md 1a).
+"""LQR trajectory tracker on the kinematic bicycle, as the public metric drives a plan (docs/reward.md 1a).
 
 Per plan, a velocity and a curvature profile are fitted to the poses (regularised least squares); per step, a scalar
 LQR over a 1 s horizon gives the acceleration and another the steering rate.
@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 TRACKING_STEPS = 10  # LQR horizon, 1 s
 Q_VELOCITY, R_ACCEL = 10.0, 1.0
 Q_LATERAL, Q_HEADING, R_STEERING_RATE = 1.0, 10.0, 1.0  # the steering angle itself costs nothing
-ACCEL_PENALTY = 1e-4  # the public "jerk penalty": its difference matrix penalises accelerations (METRIC.md 1a)
+ACCEL_PENALTY = 1e-4  # the public "jerk penalty": its difference matrix penalises accelerations (docs/reward.md 1a)
 CURVATURE_RATE_PENALTY = 1e-2
 INITIAL_CURVATURE_PENALTY = 1e-10
 STOPPING_GAIN = 0.5

@@ -1,5 +1,6 @@
 """The slow, obvious twin of the score formula, the human-penalty filter and both aggregations: one row, one column, one
-number at a time (METRIC.md 2k, 2l, 3). A row is a dict of floats; extended comfort is NaN where no frame came before.
+number at a time (docs/reward.md 2k, 2l, 3). A row is a dict of floats; extended comfort is NaN without an earlier
+frame.
 """
 
 import math

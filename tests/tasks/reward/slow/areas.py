@@ -1,4 +1,4 @@
-"""Which parts of the map the ego's body is on (METRIC.md 2a)."""
+"""Which parts of the map the ego's body is on (docs/reward.md 2a)."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""No at-fault collision, time to collision, red lights (METRIC.md 2b, 2d, 2g).
+"""No at-fault collision, time to collision, red lights (docs/reward.md 2b, 2d, 2g).
 
 Both collision rules keep, per trajectory, a list of objects they stop looking at once a contact was harmless. An
 object's contacts therefore count exactly up to its first harmless one, which is how they are evaluated here: all
@@ -123,7 +123,7 @@ def angle_to(ego: Array, points: Array) -> Array:
     """Angle (C,) [rad] between the heading of ego states (C, 11) and the ray from their rear axle to points (C, 2).
 
     The cosine is not clipped, as in the public metric: where rounding lifts it above 1 the angle is NaN, so a
-    perfectly aligned object is neither ahead nor behind (METRIC.md 2g); so is one centred on the rear axle.
+    perfectly aligned object is neither ahead nor behind (docs/reward.md 2g); so is one centred on the rear axle.
     """
     offset = points - ego[:, [X, Y]]
     with np.errstate(invalid="ignore"):

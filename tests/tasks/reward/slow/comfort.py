@@ -1,4 +1,4 @@
-"""History comfort and two-frame extended comfort (METRIC.md 2i, 2j)."""
+"""History comfort and two-frame extended comfort (docs/reward.md 2i, 2j)."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""The slow, obvious twin of the reward: numpy and shapely, one rule after the other (METRIC.md 2)."""
+"""The slow, obvious twin of the reward: numpy and shapely, one rule after the other (docs/reward.md 2)."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,4 +1,4 @@
-"""Everything the reward asks of a scene, made once and used for any number of ego trajectories (METRIC.md 2)."""
+"""Everything the reward asks of a scene, made once and used for any number of ego trajectories (docs/reward.md 2)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 N_TIMES = HORIZON_STEPS + 1
-MAP_RADIUS_M = 100.0  # METRIC.md section 0
+MAP_RADIUS_M = 100.0  # docs/reward.md 0
 PAST_STEPS = (0, 5, 10, 15)  # of the 1.5 s history at 10 Hz: -1.5, -1.0, -0.5, 0 s
 STOPPED_SPEED_MPS = 0.05
 LANE_LAYERS = frozenset({MapLayer.LANE, MapLayer.LANE_CONNECTOR})

@@ -1,4 +1,4 @@
-"""How the ego moves along its route: progress, driving direction, lane keeping (METRIC.md 2e, 2f, 2h)."""
+"""How the ego moves along its route: progress, driving direction, lane keeping (docs/reward.md 2e, 2f, 2h)."""
 
 import numpy as np
 import shapely
