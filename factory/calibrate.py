@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from factory.clips.reader import ClipRef
 from factory.funnel import funnel_of
+from factory.paper import setup_text
 from factory.settings import Run
 from factory.store.samples import Store
 from factory.store.schema import BOOKKEEPING, sample_row_to_table
@@ -29,6 +30,7 @@ def plan_text(run: Run, refs: Sequence[ClipRef]) -> str:
     vocabulary = run.work.vocabulary
     lines.append(f"vocabulary: {len(vocabulary)} trajectories ({vocabulary.source}, {vocabulary.digest})")
     lines.append(f"experts: {', '.join(config.experts)}; rounds: {config.rounds}; out: {config.out}")
+    lines.append(setup_text(config, vocabulary))
     return "\n".join(lines)
 
 

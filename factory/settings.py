@@ -60,10 +60,13 @@ class VocabularyChoice:
 
     file: str | None = None
     k: int | None = None
+    human: bool = False  # whether a file must be given
 
     def __post_init__(self) -> None:
         if self.k is not None and self.k < 1:
             raise ValueError(f"k={self.k}: must be positive, or null for the whole file")
+        if self.human and self.file is None:
+            raise ValueError("file is missing: give vocabulary.file=<.npy (K, 40, 3) of human trajectories>")
 
 
 @dataclass(frozen=True)
