@@ -20,7 +20,7 @@ from planners.plan_file import read_plans, write_plans
 from planners.progress import Counter
 from planners.scoring import Plans
 from planners.shown import as_shown, batch_of, columns_shown
-from tasks.reward.trajectories import at_ten_hz
+from tasks.trajectories import at_ten_hz
 
 Array = NDArray[np.float64]
 Samples = Sequence[Mapping[str, Any]]

@@ -19,10 +19,10 @@ from tasks.reward.comfort import extended_comfort
 from tasks.reward.epdms import Scores, rows, score
 from tasks.reward.one_stage import COLUMNS, FrameScores, frame_scores
 from tasks.reward.prepare import N_TIMES, PreparedScene, among, prepare_scene
-from tasks.reward.trajectories import at_ten_hz
 from tasks.reward.two_stage import follow_up_weights
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficScene, TrafficSettings, prepare_traffic, roll_out
+from tasks.trajectories import at_ten_hz
 from tasks.world.clip import HORIZON_STEPS, Scene
 from tasks.world.frames import to_local, to_world
 from tasks.world.vehicle import HEADING

@@ -14,6 +14,7 @@ from tasks.reward.comfort import extended_comfort
 from tasks.reward.epdms import Scores, human_filtered, rows, score, score_with_ec
 from tasks.reward.prepare import prepare_scene
 from tasks.rollout.lqr import track
+from tasks.trajectories import score_trajectories
 from tasks.world.clip import NOW, scene_of_clip
 from tasks.world.frames import to_world, wrap_angle
 from tasks.world.vehicle import HEADING
@@ -155,6 +156,25 @@ def test_official_rows_against_pdm_closed_with_the_human_filter(shared_root: Pat
         np.testing.assert_allclose(ours_filtered.multiplier, recorded["multiplicative_metrics_prod"], rtol=0, atol=1e-9)
         # The public filter rewrites the columns, not pdm_score.
         np.testing.assert_allclose(ours.pdm_score, recorded["pdm_score"], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["7fab2350_20", "7fab2350_44", "adcf7d18_64"])  # the log holds a whole clip there
+def test_score_trajectories_equals_the_official_scores_from_the_raw_log(
+    shared_root: Path, reader: AV2Reader, name: str
+) -> None:
+    """Poses and a clip in, PDM-Closed as the reference by default: the public pdm_score() to 1e-9."""
+    log, frame = name.split("_")
+    log_id = next(log_id for log_id in log_folders(reader.root) if log_id.startswith(log))
+    clip = reader.read(ClipRef("av2", log_id, (int(frame) - NOW) * 100))
+    recorded = json.loads((shared_root / "reference" / name / "official_pdm_score_rows.json").read_text())["rows"]
+    replayed = [row for row in recorded if row["policy"] == "log_replay"]
+    assert len(replayed) == 8
+    proposals = loader(shared_root).proposals(name, 256)[[row["proposal"] for row in replayed]]
+    ours = score_trajectories(clip, proposals)
+    for ours_name, theirs in (("ep", "ego_progress"), ("pdm_score", "pdm_score")):
+        expected = [row[theirs] for row in replayed]
+        np.testing.assert_allclose(getattr(ours, ours_name), expected, rtol=0, atol=1e-9, err_msg=theirs)
+    assert len(set(np.round(ours.pdm_score, 6))) > 2
 
 
 def two_hz_resampled(module: ModuleType, inputs: dict) -> np.ndarray:

@@ -16,7 +16,7 @@ from factory.clips.synthetic.town import LOG_STEPS, WINDOWS_PER_LOG, plan_log
 from factory.clips.synthetic.traffic import GREEN, RED, YELLOW, Driver, Signals, drive, overlaps
 from factory.clips.synthetic.traffic import Path as LanePath
 from factory.clips.synthetic.write import TownSettings, write_town
-from tasks.reward.trajectories import score_trajectories
+from tasks.trajectories import score_trajectories
 from tasks.world.clip import NOW
 from tasks.world.frames import box_corners, to_local
 

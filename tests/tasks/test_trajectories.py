@@ -4,13 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from straight_street import STREET, Thing, drive, tracks
 
-from tasks.reward.trajectories import at_ten_hz, score_trajectories
+from tasks.experts.pdm_closed import plan_for
+from tasks.trajectories import at_ten_hz, score_trajectories
 from tasks.world.agents import AgentTracks
-from tasks.world.clip import CLIP_STEPS, HISTORY_STEPS, Clip
+from tasks.world.clip import CLIP_STEPS, HISTORY_STEPS, Clip, scene_of_clip
+from tasks.world.frames import to_local
 from tasks.world.lanes import NO_LIGHTS, Lane, LightState, MapPolygon, RoadMap, Route, TrafficLights
 from tasks.world.vehicle import VX, X
+from tests.tasks.reward.straight_street import STREET, Thing, drive, tracks
 
 
 def clip_on_the_street(speed: float, things: list[Thing], red_from_step: int | None = None) -> Clip:
@@ -71,18 +73,49 @@ def test_plans_at_2_hz_are_joined_linearly_also_across_the_heading_jump():
 def test_going_on_in_the_lane_is_perfect_and_ramming_the_car_ahead_is_not():
     clip = clip_on_the_street(6.0, [Thing(30.0, 0.0, 0.0, (2.0, 0.0))])
     assert clip.ego_states[HISTORY_STEPS, VX] == 6.0
-    got = score_trajectories(clip, np.stack([straight(6.0, 40), straight(9.0, 40)]))
+    got = score_trajectories(clip, np.stack([straight(6.0, 40), straight(9.0, 40)]), reference="batch")
     assert got.pdm_score[0] == 1.0 and got.nc.tolist() == [1.0, 0.0]
 
 
-def test_progress_against_a_rival_is_that_of_a_two_row_batch():
+def test_progress_against_a_reference_is_that_of_a_two_row_batch():
     clip = clip_on_the_street(6.0, [])
     plans = np.stack([straight(6.0, 8), straight(5.0, 8)])
-    got = score_trajectories(clip, plans, rival=straight(6.5, 8))
+    got = score_trajectories(clip, plans, reference=straight(6.5, 8))
     for k in range(2):
-        pair = score_trajectories(clip, np.stack([straight(6.5, 8), plans[k]]))
+        pair = score_trajectories(clip, np.stack([straight(6.5, 8), plans[k]]), reference="batch")
         assert got.ep[k] == pair.ep[1] < 1.0
     assert len(got) == 2
+
+
+def test_a_car_that_stands_alone_is_perfect_in_its_own_batch_and_makes_no_progress_against_pdm_closed():
+    clip = clip_on_the_street(0.0, [])
+    standing = np.zeros((1, 40, 3))
+    alone = score_trajectories(clip, standing, reference="batch")
+    assert alone.pdm_score[0] == 1.0 and alone.ep_raw_m[0] == 0.0
+    judged = score_trajectories(clip, standing)
+    assert judged.ep[0] == 0.0
+    np.testing.assert_allclose(judged.pdm_score, 9.0 / 14.0, rtol=0, atol=1e-12)  # all but EP's 5 of 14
+    np.testing.assert_array_equal(score_trajectories(clip, standing, reference="pdm_closed").ep, judged.ep)
+
+
+def test_the_default_reference_is_pdm_closed_s_plan_and_a_row_depends_on_no_other():
+    clip = clip_on_the_street(6.0, [])
+    scene = scene_of_clip(clip)
+    of_pdm = to_local(scene.ego_state[:3], plan_for(scene).poses)
+    plans = np.stack([straight(6.0, 40), straight(5.0, 40), straight(0.5, 40)])
+    got = score_trajectories(clip, plans)
+    np.testing.assert_allclose(got.ep, score_trajectories(clip, plans, reference=of_pdm).ep, rtol=0, atol=1e-9)
+    for k in range(3):
+        assert got.pdm_score[k] == score_trajectories(clip, plans[k : k + 1]).pdm_score[0]
+
+
+def test_an_unknown_reference_and_a_route_without_length_are_refused_by_name():
+    clip = clip_on_the_street(6.0, [])
+    with pytest.raises(ValueError, match="'idm'"):
+        score_trajectories(clip, straight(6.0, 40)[None], reference="idm")
+    nowhere = replace(clip, centerline=np.zeros((2, 3)))
+    with pytest.raises(ValueError, match="centerline must have a length"):
+        score_trajectories(nowhere, straight(6.0, 40)[None])
 
 
 def test_a_clip_without_lights_has_no_red_ones():
