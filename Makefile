@@ -4,19 +4,31 @@ VENV   := .venv
 PY     := $(VENV)/bin/python
 DEMO   := runs/demo
 
+# PyTorch, which the planners and the tests need, the factory does not. On Linux its CPU build, 200 MB instead of
+# gigabytes of CUDA: PyPI has no version with the label +cpu, so nothing but TORCH_INDEX, or a wheel that pip's own
+# configuration points to, can satisfy it. With CUDA: make test TORCH=torch==2.13.0, or another label and its index.
+TORCH       ?= torch==2.13.0$(if $(filter Linux,$(shell uname -s)),+cpu)
+TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
+
 .PHONY: install demo test unit lint format bench bench-reward bench-render bench-loader bench-planners bench-scale bench-memory study study-data study-logs study-logs-data clean
 
 install: $(VENV)/.installed
 
-# torch first, pinned, so that nothing pulls the multi-gigabyte CUDA build in its place.
-$(VENV)/.installed: pyproject.toml constraints.txt
+# What a run needs; make demo installs no more.
+$(VENV)/.run: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(PY) -m pip install -q --upgrade pip
-	$(PY) -m pip install -q -c constraints.txt torch==2.13.0
+	$(PY) -m pip install -q -c constraints.txt -e ".[run]"
+	touch $@
+
+# PyTorch comes by itself, so that its index is asked for nothing else; what it needs in turn comes with the rest.
+$(VENV)/.installed: $(VENV)/.run
+	$(PY) -m pip install -q -c constraints.txt --no-deps --extra-index-url $(TORCH_INDEX) $(TORCH) || \
+		{ echo "no $(TORCH): give TORCH= and TORCH_INDEX= (see the Makefile)"; exit 1; }
 	$(PY) -m pip install -q -c constraints.txt -e ".[dev]"
 	touch $@
 
-demo: install
+demo: $(VENV)/.run
 	$(PY) -m factory.run preset=demo out=$(DEMO)
 
 # Kernels are compiled once before two test processes would both do it.

@@ -1,5 +1,6 @@
 """The machine: clips in, committed samples out, exactly once."""
 
+import importlib
 import importlib.util
 import sys
 from pathlib import Path
@@ -25,3 +26,5 @@ def _claim_sibling(name: str) -> None:
 
 
 _claim_sibling("tasks")
+
+__version__: str = importlib.import_module("tasks").__version__

@@ -3,12 +3,14 @@
 python -m factory run preset=demo out=runs/demo
 python -m factory status out=runs/demo
 python -m factory <command> --help
+python -m factory --version
 """
 
 import signal
 import sys
 from collections.abc import Sequence
 
+from factory import __version__
 from factory.arguments import BAD_ARGUMENTS
 from factory.commands import COMMANDS, nearest
 
@@ -24,6 +26,9 @@ def main(argv: Sequence[str]) -> int:
     if not argv or argv[0] in ("-h", "--help", "help"):
         print(help_text())
         return 0 if argv else BAD_ARGUMENTS
+    if argv[0] in ("-V", "--version"):
+        print(f"driving-data-factory {__version__}")
+        return 0
     name, *rest = argv
     if name == "complete":  # what the shell's completion asks
         from factory.completion import complete

@@ -4,6 +4,7 @@ import dataclasses
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from difflib import get_close_matches
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
@@ -14,6 +15,13 @@ T = TypeVar("T")
 
 class ConfigError(ValueError):
     """The command line or a configuration file asks for something that does not exist or does not fit."""
+
+
+def need_run_extra(*modules: str) -> None:
+    """Raises ConfigError with the line that installs them where one of these modules is not there."""
+    missing = [module for module in modules if find_spec(module) is None]
+    if missing:
+        raise ConfigError(f"{', '.join(missing)} not installed: pip install -e \".[run]\" in the checkout")
 
 
 def conf_dir() -> Path:
@@ -30,6 +38,7 @@ def compose(name: str, overrides: Sequence[str]) -> dict[str, Any]:
 
     Raises ConfigError for a misspelt key, an unknown choice, bad syntax or a value that must be given and is not.
     """
+    need_run_extra("hydra", "omegaconf")
     import hydra
     from hydra.errors import HydraException
     from omegaconf import OmegaConf
@@ -77,6 +86,7 @@ def fill(cls: type[T], values: Mapping[str, Any], where: str) -> T:
 
     Raises ConfigError naming every key that is unknown or whose value has the wrong type.
     """
+    need_run_extra("pydantic")
     from pydantic import TypeAdapter, ValidationError
 
     unknown = list(_unknown_keys(cls, values, where))

@@ -71,9 +71,10 @@ def help_text() -> str:
 
 def settings_text(overrides: Sequence[str]) -> str:
     """The composed settings as YAML."""
+    config = compose("run", overrides)
     from omegaconf import OmegaConf
 
-    return OmegaConf.to_yaml(OmegaConf.create(compose("run", overrides)))
+    return OmegaConf.to_yaml(OmegaConf.create(config))
 
 
 def seconds_text(seconds: Mapping[str, tuple[int, float]]) -> str:

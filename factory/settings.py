@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from factory.benchmark import BenchmarkSettings
 from factory.clips.reader import ClipIndex, ClipReader
-from factory.config import ConfigError, build, compose, fill
+from factory.config import ConfigError, build, compose, fill, need_run_extra
 from factory.job import in_submitted_job
 from factory.pipeline import FactoryWork
 from factory.vocabulary import (
@@ -162,7 +162,10 @@ class Run:
 
 def load_config(overrides: Sequence[str], name: str = "run") -> RunConfig:
     """The typed settings of a command line. Raises ConfigError."""
-    return fill(RunConfig, compose(name, overrides), name)
+    config = fill(RunConfig, compose(name, overrides), name)
+    if config.executor == "ray":
+        need_run_extra("ray")
+    return config
 
 
 def open_reader(clips: Mapping[str, Any]) -> tuple[ClipReader, ClipIndex]:

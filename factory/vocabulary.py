@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factory.clips.reader import BadClip, ClipReader
-from factory.config import ConfigError, build, compose, fill
+from factory.config import ConfigError, build, compose, fill, need_run_extra
 from tasks.experts.recovery import RecoveryTable
 from tasks.kinematic_vocabulary import kinematic_trajectories
 from tasks.vocabulary import Vocabulary, checked_trajectories, cluster, human_windows
@@ -219,6 +219,7 @@ def write_kinematic(settings: VocabularySettings) -> str:
 
 def parsed(arguments: Sequence[str]) -> tuple[VocabularySettings, list[str]]:
     """The settings, and the overrides that choose the clips. Raises ConfigError."""
+    need_run_extra("omegaconf")
     from omegaconf import OmegaConf
 
     of_clips = [argument for argument in arguments if argument.lstrip("+").split("=")[0].split(".")[0] == "clips"]

@@ -23,7 +23,7 @@ from factory.store.schema import FIRST_FAILURES
 from tasks.stages import SUBSCORES
 
 TIMELINE = "log"  # time since the log's first instant
-INSTALL = "rerun-sdk is not installed: pip install 'driving-data-factory[rerun]', or pip install rerun-sdk"
+INSTALL = "rerun-sdk is not installed: pip install rerun-sdk"
 
 
 class RerunMissing(ImportError):

@@ -19,7 +19,7 @@ from tasks.render.gaussians import F32, Gaussians
 from tasks.render.project import DILATION_PX2, NEAR_M
 from tasks.render.raster import View
 
-HOW_TO_MEND = "install them (pip install 'driving-data-factory[gpu]'), or draw with render.backend=cpu"
+HOW_TO_MEND = 'install them (pip install -e ".[gpu]" in the checkout), or draw with render.backend=cpu'
 
 
 class BackendMissing(RuntimeError):
