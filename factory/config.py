@@ -21,7 +21,7 @@ def need_run_extra(*modules: str) -> None:
     """Raises ConfigError with the line that installs them where one of these modules is not there."""
     missing = [module for module in modules if find_spec(module) is None]
     if missing:
-        raise ConfigError(f"{', '.join(missing)} not installed: pip install -e \".[run]\" in the checkout")
+        raise ConfigError(f'{", ".join(missing)} not installed: pip install -e ".[run]" in the checkout')
 
 
 def conf_dir() -> Path:

@@ -6,7 +6,7 @@ from importlib.util import find_spec
 from tasks import __version__ as __version__
 
 if find_spec("torch") is None:
-    _MISSING = "planners need PyTorch: pip install -e \".[planners]\" in the checkout (make install for its CPU build)"
+    _MISSING = 'planners need PyTorch: pip install -e ".[planners]" in the checkout (make install for its CPU build)'
     if sys.argv[0] == "-m":  # `python -m planners.<command>` imports this package first: one line, no traceback
         print(f"error: {_MISSING}", file=sys.stderr)
         sys.exit(2)

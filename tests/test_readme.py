@@ -29,6 +29,7 @@ from planners.scaling import ScalingSettings
 from planners.train import TrainConfig
 from tasks.caches import user_cache
 from tasks.kernels import cache_dir
+from tests.factory.installs import SMALL, as_if_installed
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 PAGES = ("README.md", "docs/configuration.md", "docs/dashboard.md", "docs/training.md")
@@ -79,12 +80,12 @@ def demo_home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("block", PYTHON_BLOCKS, ids=range(len(PYTHON_BLOCKS)))
-def test_python_runs_as_written_without_ray_or_hydra(demo_home: Path, block: str) -> None:
-    code = block + "\nimport sys\nassert not {'ray', 'hydra'} & set(sys.modules)\n"
-    env = os.environ | {"PYTHONPATH": str(REPOSITORY), "XDG_CACHE_HOME": str(demo_home / "cache")}
+def test_python_runs_as_written_in_the_small_install(demo_home: Path, tmp_path: Path, block: str) -> None:
+    path = f"{as_if_installed(SMALL, tmp_path)}{os.pathsep}{REPOSITORY}"
+    env = os.environ | {"PYTHONPATH": path, "XDG_CACHE_HOME": str(demo_home / "cache")}
     env["NUMBA_CACHE_DIR"] = str(cache_dir().parent)  # a cache of its own for towns, but no second compilation
     done = subprocess.run(
-        [sys.executable, "-c", code], cwd=demo_home, env=env, capture_output=True, text=True, timeout=200
+        [sys.executable, "-c", block], cwd=demo_home, env=env, capture_output=True, text=True, timeout=200
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip()

@@ -1,6 +1,7 @@
 """The wheel holds the right packages and the configuration files, and works far from the checkout."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -23,9 +24,10 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
             shutil.copytree(REPOSITORY / name, sources / name, ignore=shutil.ignore_patterns("__pycache__"))
         else:
             shutil.copy(REPOSITORY / name, sources / name)
-    command = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation", "-w", str(dist), "."]
+    command = [sys.executable, "-m", "pip", "wheel", "-v", "--no-deps", "--no-build-isolation", "-w", str(dist), "."]
     built = subprocess.run(command, cwd=sources, capture_output=True, text=True, timeout=200)
     assert built.returncode == 0, built.stderr
+    assert not re.search(r"Warning: |Deprecat", built.stdout + built.stderr), "setuptools has nothing to complain of"
     return next(dist.glob("*.whl"))
 
 
@@ -40,8 +42,9 @@ def test_the_wheel_holds_every_module_every_setting_and_no_test(wheel: Path) -> 
         f"factory/conf/{path.relative_to(REPOSITORY / 'conf').as_posix()}"
         for path in (REPOSITORY / "conf").rglob("*.yaml")
     }
+    typed = {f"{package}/py.typed" for package in ("factory", "tasks", "planners")}
     page = {path.relative_to(REPOSITORY).as_posix() for path in (REPOSITORY / "factory/board/static").iterdir()}
-    assert inside == modules | settings | page
+    assert inside == modules | settings | typed | page
 
 
 def test_installed_it_works_beside_a_stranger_s_tasks_py(wheel: Path, tmp_path: Path) -> None:

@@ -1,0 +1,179 @@
+"""What each install brings: nothing undeclared, nothing unused, and without PyTorch and CUDA what needs neither."""
+
+import ast
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from packaging.utils import canonicalize_name
+
+from tests.factory.installs import PROJECT, REPOSITORY, SMALL, as_if_installed, closure, declared
+
+OURS = {"tasks", "factory", "planners"}
+DISTRIBUTIONS = {  # of modules whose distribution has another name
+    "PIL": "pillow",
+    "cv2": "opencv-python-headless",
+    "foxglove_schemas_protobuf": "foxglove-schemas-protobuf",
+    "google": "protobuf",
+    "hydra": "hydra-core",
+    "mcap_protobuf": "mcap-protobuf-support",
+    "rerun": "rerun-sdk",
+}
+UNSEEN = {  # declared without an import statement of ours
+    "gsplat": "tasks.render.gsplat_backend imports it by name",
+    "packaging": "torch.utils.cpp_extension imports it when gsplat compiles",
+    "tensorboard": "torch.utils.tensorboard imports it",
+}
+RAY_ONLY = {"factory/graph.py", "factory/ray_metrics.py"}  # loaded by executor=ray alone
+GPU = re.compile(r"torch|triton|nvidia|cuda|cudnn|nccl|gsplat")
+
+
+def imports(package: str, at_import: bool = False) -> dict[str, set[str]]:
+    """Distribution -> files of the package that import it; at_import: as they are loaded, not within functions."""
+    found: dict[str, set[str]] = {}
+    for path in sorted((REPOSITORY / package).rglob("*.py")):
+        for module in _modules(ast.parse(path.read_text()), at_import):
+            word = module.partition(".")[0]
+            if word not in sys.stdlib_module_names | OURS:
+                name = canonicalize_name(DISTRIBUTIONS.get(word, word))
+                found.setdefault(name, set()).add(path.relative_to(REPOSITORY).as_posix())
+    return found
+
+
+def _modules(node: ast.AST, at_import: bool) -> Iterator[str]:
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.If) and ast.unparse(child.test) == "TYPE_CHECKING":
+            continue
+        if at_import and isinstance(child, ast.FunctionDef):
+            continue
+        if isinstance(child, ast.Import):
+            yield from (alias.name for alias in child.names)
+        elif isinstance(child, ast.ImportFrom) and child.level == 0 and child.module:
+            yield child.module
+        else:
+            yield from _modules(child, at_import)
+
+
+@pytest.mark.parametrize(
+    ("package", "extras"),
+    [("tasks", ("run",)), ("factory", ("run", "rerun", "gpu")), ("planners", ("planners", "wandb"))],
+)
+def test_every_import_is_declared_where_it_belongs(package: str, extras: tuple[str, ...]) -> None:
+    allowed = set().union(*map(declared, extras))
+    undeclared = {name: files for name, files in imports(package).items() if name not in allowed}
+    assert not undeclared
+
+
+@pytest.mark.parametrize("package", ["tasks", "factory"])
+def test_what_the_small_install_lacks_is_imported_within_functions(package: str) -> None:
+    lacking = {
+        name: rest
+        for name, files in imports(package, at_import=True).items()
+        if name not in declared(SMALL) and (rest := files - RAY_ONLY)
+    }
+    assert not lacking
+
+
+def test_every_declared_package_is_imported() -> None:
+    imported = {name for package in OURS for name in imports(package)}
+    extras = [extra for extra in PROJECT["optional-dependencies"] if extra != "dev"]
+    unused = set().union(*map(declared, extras)) - imported - set(UNSEEN)
+    assert not unused
+
+
+def test_what_make_installs_is_pinned() -> None:
+    pinned = {line.partition("==")[0] for line in (REPOSITORY / "constraints.txt").read_text().splitlines()}
+    assert not (declared("planners") | declared("gpu")) - pinned - {"packaging"}
+
+
+def test_a_run_brings_neither_pytorch_nor_cuda() -> None:
+    brought = closure("run")
+    assert {"ray", "hydra-core", "numba"} <= brought, "the closure is worked out"
+    assert not [name for name in brought if GPU.search(name)]
+
+
+def test_the_small_install_has_neither_ray_nor_hydra() -> None:
+    small = closure(SMALL)
+    assert len(small) < 40 and not small & {"ray", "hydra-core", "omegaconf", "pydantic"}
+
+
+COMMANDS = [
+    pytest.param(["factory.run", "preset=demo"], '-e ".[run]"', id="run"),
+    pytest.param(["factory", "run", "preset=demo", "--cfg"], '-e ".[run]"', id="run --cfg"),
+    pytest.param(["factory", "explain", "preset=demo", "clip=0"], '-e ".[run]"', id="explain"),
+    pytest.param(["factory.vocabulary", "kinematic=true", "k=8", "out=v.npy"], '-e ".[run]"', id="vocabulary"),
+    pytest.param(["planners.train", "planner=ego_mlp_small"], '-e ".[planners]"', id="train"),
+]
+
+
+@pytest.mark.parametrize(("command", "line"), COMMANDS)
+def test_a_command_that_needs_an_extra_names_the_line_that_installs_it(
+    command: list[str], line: str, tmp_path: Path
+) -> None:
+    hidden = as_if_installed(SMALL, tmp_path / "small")
+    env = os.environ | {"PYTHONPATH": f"{hidden}{os.pathsep}{REPOSITORY}"}
+    done = subprocess.run(
+        [sys.executable, "-m", *command], cwd=tmp_path, env=env, capture_output=True, text=True, timeout=100
+    )
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1 and line in done.stderr
+    assert list(tmp_path.iterdir()) == [hidden], "nothing is written"
+
+
+def test_the_version_stands_in_one_place() -> None:
+    import factory
+    import planners
+    import tasks
+
+    assert factory.__version__ == planners.__version__ == tasks.__version__
+    assert f"\n## {tasks.__version__} - 20" in (REPOSITORY / "CHANGELOG.md").read_text()
+    shown = subprocess.run([sys.executable, "-m", "factory", "--version"], cwd=REPOSITORY, capture_output=True)
+    assert shown.stdout.decode() == f"driving-data-factory {tasks.__version__}\n"
+
+
+def pip_would_install(report: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """pip's own resolution, of the checkout, without any configuration of this machine but its certificates.
+
+    Skips the test where PyPI is out of reach.
+    """
+    env = {name: value for name, value in os.environ.items() if not name.startswith("PIP_")}
+    certificates = subprocess.run(
+        [sys.executable, "-m", "pip", "config", "get", "global.cert"], capture_output=True, text=True
+    )
+    env |= {"PIP_CONFIG_FILE": os.devnull, "PIP_RETRIES": "1", "PIP_TIMEOUT": "15"}
+    if "PIP_CERT" in os.environ or certificates.returncode == 0:
+        env["PIP_CERT"] = os.environ.get("PIP_CERT", certificates.stdout.strip())
+    command = [sys.executable, "-m", "pip", "install", "--dry-run", "--ignore-installed", "--report", str(report)]
+    done = subprocess.run([*command, *arguments], cwd=REPOSITORY, env=env, capture_output=True, text=True, timeout=250)
+    if done.returncode and re.search(r"from versions: none|connection broken|Temporary failure", done.stderr):
+        pytest.skip("PyPI cannot be reached from here")
+    return done
+
+
+@pytest.mark.slow
+def test_pip_asks_for_neither_pytorch_nor_cuda_for_the_demo(tmp_path: Path) -> None:
+    requirements = [str(text) for extra in (SMALL, "run") for text in _own(extra)]
+    done = pip_would_install(tmp_path / "report.json", "-c", "constraints.txt", *requirements)
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "report.json").read_text())
+    names = {canonicalize_name(item["metadata"]["name"]) for item in report["install"]}
+    assert {"ray", "hydra-core"} <= names and not [name for name in names if GPU.search(name)]
+
+
+def test_no_cuda_build_on_pypi_satisfies_what_the_tests_install(tmp_path: Path) -> None:
+    made = subprocess.run(
+        ["make", "-n", "-B", "install"], cwd=REPOSITORY, capture_output=True, text=True, check=True
+    ).stdout
+    (wanted,) = set(re.findall(r"torch==[\w.+]*\w", made))
+    assert wanted.endswith("+cpu") and re.search(r"--extra-index-url https://download\.pytorch\.org/whl/cpu ", made)
+    done = pip_would_install(tmp_path / "report.json", "--no-deps", wanted)
+    assert done.returncode == 1 and f"No matching distribution found for {wanted}" in done.stderr
+
+
+def _own(extra: str) -> list[str]:
+    return list(PROJECT["optional-dependencies"][extra] if extra else PROJECT["dependencies"])
