@@ -65,6 +65,17 @@ def test_the_index_is_what_the_rows_say(out: str) -> None:
     assert "recovery: 30 (10 of round 0, 10 of round 1, 10 of round 2)" in data.text()
 
 
+def test_plans_to_learn_from_are_found_in_every_shard_and_row_group(tmp_path: Path) -> None:
+    """A sample's plan is its number; shards of 7 rows in row groups of 3, the samples' order not that of the file."""
+    numbers = np.random.default_rng(0).permutation(20)
+    plans = np.broadcast_to(numbers[:, None, None], (20, 8, 3)).astype(np.float32)
+    rows = [sample(int(n), label_2hz=plan) for n, plan in zip(numbers, plans)]
+    write_table(tmp_path / "out", rows, shard_rows=7, group_rows=3)
+    data = open_data(DataSettings(real=str(tmp_path / "out")))
+    assert data.rows.group.max() == 2 and len(data.files) == 3
+    assert data.labels_2hz()[:, 4, 1].tolist() == list(range(20))
+
+
 @pytest.mark.parametrize(
     ("settings", "count", "kept"),
     [

@@ -6,6 +6,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from factory.rows import label_columns
 from factory.store.reader import LABEL_COLUMNS, SampleTable, labels_of
 from factory.store.schema import COLUMNS
 from planners.batch import COMMANDS, BevLayout, ImageLayout, Needs
@@ -14,6 +15,7 @@ from planners.data import BEV_COLUMNS, PLAN_COLUMNS
 from planners.decode import BatchBuffer, StoredRows, count_labels
 from planners.files import Footers, files_of, group_bytes, group_rows, leaves
 from planners.images import stitched
+from tasks.reward.label_bytes import VocabularyLabels
 from tasks.world.agents import AgentKind
 from tests.planners.samples import grey_pictures, labels, sample, write_table
 
@@ -109,6 +111,26 @@ def test_a_batch_is_what_its_rows_say(table: Path) -> None:
         assert np.array_equal(batch.labels["ddc"][i], meant.ddc)
         assert np.array_equal(batch.labels["ep"][i], meant.ep("batch").astype(np.float32))
     assert batch.bev[0].any() and batch.agents_valid[0].any() and not batch.agents_valid[1].any()
+
+
+@pytest.mark.parametrize(
+    ("normalise", "expected"),
+    [("pairs", [1.0, 0.25, 0.75]), ("batch", [1.0, 0.125, 0.375]), ("masked", [1.0, 0.25, 0.0])],
+)
+def test_progress_is_normalised_as_the_planner_asks(tmp_path: Path, normalise: str, expected: list[float]) -> None:
+    """PDM-Closed gets 20 m far. The first drives 40 m and is faultless, the second 5 m, the third 15 m off the road."""
+    one = np.ones(3)
+    made = VocabularyLabels(
+        "vocabulary-1", "idm", 20.0, one, np.array([1.0, 1.0, 0.0]), *[one] * 5, ep_raw_m=np.array([40.0, 5.0, 15.0])
+    )
+    write_table(tmp_path / "out", [sample(0, **label_columns(made))])
+    (file,) = files_of(tmp_path / "out")
+    parquet = file.open()
+    needed = leaves(parquet, [*PLAN_COLUMNS, *LABEL_COLUMNS])
+    buffer = BatchBuffer(1, Needs(labels="vocabulary-1", normalise=normalise), 3)  # type: ignore[arg-type]
+    buffer.fill(0, StoredRows(parquet.read_row_group(0, columns=needed), [()]), 0)
+    batch = buffer.batch(["a"], np.array([False]), np.array([True]))
+    assert batch.labels is not None and batch.labels["ep"][0].tolist() == expected
 
 
 @pytest.mark.parametrize("in_place", [False, True])

@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 from factory.config import conf_dir, fill
 from planners.anchors import cluster_anchors
 from planners.batch import Batch, BevLayout, ImageLayout
-from planners.diffusiondrive import DiffusionDrive, DiffusionDriveSettings
+from planners.diffusiondrive import DiffusionDrive, DiffusionDriveSettings, from_unit, to_unit
 from planners.optim import TrainingSettings
 from planners.planner import TrainingData
 from tests.planners import scenes
@@ -86,6 +86,54 @@ def test_imitation_is_divided_by_the_whole_batch() -> None:
     )
     for name in ("confidence", "regression"):
         torch.testing.assert_close(both[name], one[name] + other[name])
+
+
+class Told(torch.nn.Module):
+    """A decoder that always answers with the same plans and confidences, and notes what it was asked."""
+
+    def __init__(self, plans: torch.Tensor) -> None:
+        super().__init__()
+        self.plans, self.points, self.steps = plans, list[torch.Tensor](), list[list[int]]()
+
+    def forward(
+        self, points: torch.Tensor, base: torch.Tensor, step: torch.Tensor, *scene: torch.Tensor
+    ) -> list[tuple[torch.Tensor, torch.Tensor]]:
+        self.points.append(points)
+        self.steps.append(step.tolist())
+        n, anchors = points.shape[:2]
+        return [(self.plans.expand(n, -1, -1, -1), torch.arange(float(anchors)).expand(n, -1))]
+
+
+def test_planning_starts_at_noise_step_8_and_goes_by_ddim_from_10_to_9() -> None:
+    """By hand, with the cumulated products of the schedule; the public code's truncated loop."""
+    batch, model = scene_batch(2), planner()
+    model.decoder = told = Told(model.anchors.roll(1, 0)[None] + 0.5)
+    plan = model.plan(batch)
+    betas = np.linspace(1e-4**0.5, 0.02**0.5, 1000) ** 2
+    kept = torch.tensor(np.cumprod(1.0 - betas))
+    clean, noise = to_unit(model.anchors).double(), model.first_noise.double()
+    start = kept[8].sqrt() * clean + (1.0 - kept[8]).sqrt() * noise
+    answer = to_unit(told.plans[0]).double()
+    told_noise = (start - kept[10].sqrt() * answer) / (1.0 - kept[10]).sqrt()
+    second = kept[9].sqrt() * answer.clamp(-1.0, 1.0) + (1.0 - kept[9]).sqrt() * told_noise
+    assert told.steps == [[10, 10], [0, 0]]
+    for found, expected in zip(told.points, (start, second)):
+        torch.testing.assert_close(found[0].double(), from_unit(expected.clamp(-1.0, 1.0)), atol=1e-3, rtol=0.0)
+    torch.testing.assert_close(plan, told.plans[0, -1].expand(2, -1, -1))  # the surest of the last answer
+
+
+def test_an_anchor_is_learned_from_noise_of_the_step_that_the_decoder_is_told() -> None:
+    batch, model = scene_batch(4), planner()
+    model.decoder = told = Told(torch.zeros(1, WAYS, 8, 3))
+    torch.manual_seed(5)
+    model.losses(batch)
+    torch.manual_seed(5)
+    steps = torch.randint(0, 50, (4,))
+    noise = torch.randn(4, *model.anchors.shape)
+    assert told.steps == [steps.tolist()] and len(set(steps.tolist())) > 1
+    kept = torch.tensor(np.cumprod(1.0 - np.linspace(1e-4**0.5, 0.02**0.5, 1000) ** 2)).float()[steps].view(4, 1, 1, 1)
+    noisy = kept.sqrt() * to_unit(model.anchors) + (1.0 - kept).sqrt() * noise
+    torch.testing.assert_close(told.points[0], from_unit(noisy.clamp(-1.0, 1.0)), atol=1e-3, rtol=0.0)
 
 
 @pytest.mark.parametrize("offsets_from", ["noisy", "anchors"])

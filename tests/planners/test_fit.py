@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 import os
 import signal
 from collections.abc import Iterator
@@ -108,16 +109,99 @@ def test_a_killed_training_repeats_what_came_after_its_last_checkpoint(tmp_path:
     assert (out / LOSSES).read_text() == (whole / LOSSES).read_text()
 
 
-def test_parts_of_a_batch_add_up_to_the_batch(tmp_path: Path) -> None:
-    """Without anything random in the model, accumulation changes nothing but rounding."""
-    results = []
-    for parts in (1, 2, 4):
-        torch.manual_seed(0)
-        planner = Toy(ToySettings(dropout=0.0), {})
-        fit(planner, ToyBatches(20, 4), TRAINING, Loop(1, 10, parts), ALONE, tmp_path / str(parts), {})
-        results.append(planner.net[0].weight.detach())
-    torch.testing.assert_close(results[1], results[0], rtol=1e-4, atol=1e-6)
-    torch.testing.assert_close(results[2], results[0], rtol=1e-4, atol=1e-6)
+class Sgd(torch.optim.SGD):
+    """A step is the rate times the gradient, so that a wrong gradient shows: Adam's steps are the same for its double.
+
+    Keeps the rates that it stepped with.
+    """
+
+    def __init__(self, training: TrainingSettings, planner: torch.nn.Module) -> None:
+        super().__init__(planner.parameters(), lr=training.learning_rate)
+        self.rates: list[float] = []
+
+    def step(self, *arguments: Any) -> None:  # type: ignore[override]
+        self.rates += [group["lr"] for group in self.param_groups]
+        super().step(*arguments)
+
+
+@pytest.fixture
+def stepped_by(monkeypatch: pytest.MonkeyPatch) -> list[Sgd]:
+    """The optimisers of the trainings of a test, all of them Sgd."""
+    made: list[Sgd] = []
+
+    def build(training: TrainingSettings, planner: torch.nn.Module) -> Sgd:
+        made.append(Sgd(training, planner))
+        return made[-1]
+
+    monkeypatch.setattr("planners.fit.build_optimiser", build)
+    return made
+
+
+def without_chance() -> Toy:
+    torch.manual_seed(0)
+    return Toy(ToySettings(dropout=0.0), {})
+
+
+def gradient_of_the_first_batch(planner: Toy) -> tuple[torch.Tensor, ...]:
+    (batch,) = ToyBatches(4, 4).epoch(0)
+    return torch.autograd.grad(torch.stack(list(planner.losses(batch).values())).sum(), list(planner.parameters()))
+
+
+@pytest.mark.parametrize("parts", [1, 2, 4])
+def test_a_step_goes_against_the_gradient_of_the_whole_batch_whatever_parts_it_is_computed_in(
+    tmp_path: Path, stepped_by: list[Sgd], parts: int
+) -> None:
+    planner, training = without_chance(), TrainingSettings(epochs=1, batch_size=4, learning_rate=0.1)
+    expected = [p.detach() - 0.1 * g for p, g in zip(planner.parameters(), gradient_of_the_first_batch(planner))]
+    fit(planner, ToyBatches(4, 4), training, Loop(1, 1, parts), ALONE, tmp_path, {})
+    for found, wanted in zip(planner.parameters(), expected):
+        torch.testing.assert_close(found.detach(), wanted, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("share", [0.25, 4.0])
+def test_a_gradient_above_the_clip_is_shortened_to_it_and_one_below_is_left_alone(
+    tmp_path: Path, stepped_by: list[Sgd], share: float
+) -> None:
+    planner = without_chance()
+    gradient = gradient_of_the_first_batch(planner)
+    norm = float(torch.cat([g.flatten() for g in gradient]).norm())
+    training = TrainingSettings(epochs=1, batch_size=4, learning_rate=0.1, gradient_clip=share * norm)
+    before = [p.detach().clone() for p in planner.parameters()]
+    fit(planner, ToyBatches(4, 4), training, Loop(1, 1), ALONE, tmp_path, {})
+    for was, found, full in zip(before, planner.parameters(), gradient):
+        torch.testing.assert_close(was - found.detach(), 0.1 * min(share, 1.0) * full, rtol=1e-4, atol=1e-6)
+
+
+def test_the_rate_of_a_step_is_the_schedules_and_the_one_that_is_logged(tmp_path: Path, stepped_by: list[Sgd]) -> None:
+    training = TrainingSettings(epochs=3, batch_size=4, learning_rate=0.01, schedule="cosine", warmup_steps=3)
+    fit(without_chance(), ToyBatches(20, 4), training, Loop(1, 15, log_every=4), ALONE, tmp_path, {})
+    (optimiser,) = stepped_by
+    logged = [float(row["learning_rate"]) for row in rows(tmp_path / LOSSES)]
+    assert optimiser.rates == pytest.approx(logged, rel=1e-5)
+    assert optimiser.rates[:4] == pytest.approx([0.01 / 3, 0.02 / 3, 0.01, 0.01])
+    assert optimiser.rates[-1] == pytest.approx(0.005 * (1.0 + math.cos(math.pi * 11 / 12)))
+
+
+class Dice(Toy):
+    """Notes what a step draws."""
+
+    name = "tests.planners.test_fit:Dice"
+
+    def losses(self, batch: Batch) -> dict[str, torch.Tensor]:
+        self.drawn = [*getattr(self, "drawn", []), float(torch.rand(()))]
+        return super().losses(batch)
+
+
+def test_every_step_of_every_rank_draws_its_own_and_the_same_again(tmp_path: Path) -> None:
+    def drawn(rank: int, seed: int = 1) -> list[float]:
+        planner = Dice(ToySettings(), {})  # what was drawn to build it does not matter
+        world = World(rank, 1, torch.device("cpu"))
+        fit(planner, ToyBatches(20, 4), TRAINING, Loop(seed, 5), world, tmp_path / f"{rank}-{seed}", {})
+        return list(planner.drawn)
+
+    first, second = drawn(0), drawn(1)
+    assert len({*first, *second, *drawn(0, seed=2)}) == 15
+    assert drawn(0) == first and drawn(1) == second
 
 
 def test_a_loss_that_is_no_number_stops_the_training_with_its_step(tmp_path: Path) -> None:

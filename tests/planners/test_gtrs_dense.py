@@ -114,7 +114,12 @@ def test_all_parameters_get_a_gradient_with_imitation_and_a_head_switched_off() 
     batch, _ = labelled(2)
     model = planner(replace(TINY, imitation=0.0, rewards=replace(TINY.rewards, hc=0.0)))
     torch.stack(list(model(batch).values())).sum().backward()
-    assert all(parameter.grad is not None for parameter in model.parameters())
+    for name, parameter in model.named_parameters():
+        assert parameter.grad is not None, f"{name}: processes wait for the gradient of every parameter"
+        if name.startswith(("scorer.heads.imitation", "scorer.heads.hc")):
+            assert (parameter.grad == 0.0).all(), f"{name} is switched off"
+    for head in set(SUBSCORES) - {"hc"}:
+        assert model.scorer.heads[head][0].weight.grad.abs().sum() > 0.0, head
 
 
 def test_a_training_step_sees_half_the_vocabulary_by_torchs_own_dice() -> None:

@@ -1,5 +1,6 @@
 """The study's plan: what is compared with what, and that nothing is trained twice."""
 
+import re
 from typing import Any
 
 import pytest
@@ -111,6 +112,13 @@ def test_budgets_and_bounds_become_overrides() -> None:
     assert f"data.sim=[{everything.replay}]" in by_label["gtrs_dense-pdm_closed1-epochs-replay-0"]
     control = by_label["ltf-logged5-steps-1"]
     assert {f"data.sim=[{everything.control}]", "data.experts=[logged]", "steps=600"} <= set(control)
+
+
+def test_a_label_names_how_many_rounds_are_learned_from_and_rounds_count_from_0() -> None:
+    for training in trainings(settings()):
+        rounds = [o.removeprefix("data.max_round=") for o in training.overrides if o.startswith("data.max_round=")]
+        named = re.match(r"[a-z_]+-(?:recovery|pdm_closed|logged)(\d+)-", training.label)
+        assert rounds == ([str(int(named[1]) - 1)] if named else []), training.label
 
 
 def test_ensembles_are_made_of_trainings_that_are_planned_before_them() -> None:
