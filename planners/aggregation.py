@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,19 @@ from tasks.reward.one_stage import COLUMNS, FrameScores, means_of
 from tasks.reward.two_stage import Group, TwoStageScores, aggregate, is_uniform
 
 Array = NDArray[np.float64]
+
+HumanFilter = Literal["unfiltered", "filtered"]
+# Every score that tables hold: stage, human filter. No human drove from a follow-up frame, so nothing filters there.
+MEASURES: tuple[tuple[str, str], ...] = (
+    ("one_stage", "unfiltered"),
+    ("one_stage", "filtered"),
+    ("stage_one", "unfiltered"),
+    ("stage_one", "filtered"),
+    ("stage_two", "none"),  # navhard's: the mean over groups of weighted means
+    ("follow_ups", "none"),  # the plain mean of follow-up rows, which no published table holds
+    ("final", "unfiltered"),
+    ("final", "filtered"),
+)
 
 
 @dataclass(frozen=True)
@@ -52,8 +66,8 @@ class SummaryLine:
     """One line of the table of all planners."""
 
     planner: str
-    stage: str  # one_stage | stage_one | stage_two | final
-    human_filter: str  # unfiltered | filtered | none: stage two is never filtered
+    stage: str  # of MEASURES
+    human_filter: str  # of MEASURES
     columns: Array  # (C,) COLUMNS
     n_clips: int
     n_frames: int
@@ -94,21 +108,30 @@ def summarise(rows: Sequence[FrameRow]) -> Summary:
 
 def lines_of(planner: str, summary: Summary) -> list[SummaryLine]:
     """The lines of one planner."""
-
-    two, pairs = summary.two_stage, summary.n_follow_ups
-    sides: dict[str, tuple[FrameScores, int]] = {"one_stage": (summary.one_stage, summary.n_clips)}
-    if two is not None:
-        sides["stage_one"] = two.stage_one, 2 * summary.n_two_stage
-        sides["stage_two"] = FrameScores(two.stage_two, two.stage_two), 2 * pairs
-        sides["final"] = two.final, 2 * (summary.n_two_stage + pairs)
+    logged, follow_ups = 2 * summary.n_two_stage, 2 * summary.n_follow_ups
+    n_frames = {"one_stage": summary.n_clips, "stage_one": logged, "final": logged + follow_ups}
     lines = []
-    for stage, (scores, n_frames) in sides.items():
+    for stage, human_filter in MEASURES:
+        if stage != "one_stage" and summary.two_stage is None:
+            continue
+        columns = columns_at(summary.one_stage, summary.two_stage, stage, human_filter)
         n_clips = summary.n_clips if stage == "one_stage" else summary.n_two_stage
         shares = (summary.uniform_share, summary.uniform_share_before) if stage == "final" else (np.nan, np.nan)
-        for name in ("none",) if stage == "stage_two" else ("unfiltered", "filtered"):
-            columns = scores.filtered if name == "filtered" else scores.unfiltered
-            lines.append(SummaryLine(planner, stage, name, columns, n_clips, n_frames, *shares))
+        frames = n_frames.get(stage, follow_ups)
+        lines.append(SummaryLine(planner, stage, human_filter, columns, n_clips, frames, *shares))
     return lines
+
+
+def columns_at(one_stage: FrameScores, two_stage: TwoStageScores | None, stage: str, human_filter: str) -> Array:
+    """COLUMNS (C,) of one of MEASURES. two_stage is needed for all but one_stage."""
+    if stage == "one_stage":
+        scores = one_stage
+    else:
+        assert two_stage is not None
+        if stage in ("stage_two", "follow_ups"):
+            return two_stage.stage_two if stage == "stage_two" else two_stage.follow_ups
+        scores = two_stage.stage_one if stage == "stage_one" else two_stage.final
+    return scores.filtered if human_filter == "filtered" else scores.unfiltered
 
 
 def score_of(columns: Array) -> float:

@@ -15,11 +15,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from factory.config import ConfigError, fill
-from planners.scores import SHOWN
+from planners.aggregation import MEASURES
+from planners.scores import title_of
 from planners.study_figures import draw_agreement
 
 BAD_CONFIG = 2
-FACTS = ("setup", "reference", "budget", "stage")  # which comparison
+FACTS = ("setup", "reference", "budget", "stage", "human_filter")  # which comparison
 NUMBERS = ("difference", "low", "high")
 Key = tuple[str, ...]  # FACTS
 
@@ -49,7 +50,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class Agreement:
-    """Of one stage."""
+    """Of one score."""
 
     both: int  # comparisons that both studies made
     clear: int  # in the first
@@ -80,13 +81,15 @@ def read_differences(folder: Path) -> dict[Key, Difference]:
     return found
 
 
-def pairs_of(first: Mapping[Key, Difference], second: Mapping[Key, Difference], stage: str) -> dict[Key, Pair]:
-    """What both compared in a stage."""
-    return {key: (one, second[key]) for key, one in first.items() if key[-1] == stage and key in second}
+def pairs_of(
+    first: Mapping[Key, Difference], second: Mapping[Key, Difference], measure: tuple[str, str]
+) -> dict[Key, Pair]:
+    """What both compared in one of MEASURES."""
+    return {key: (one, second[key]) for key, one in first.items() if key[-2:] == measure and key in second}
 
 
 def agreement(pairs: Sequence[Pair]) -> Agreement:
-    """Counts of one stage."""
+    """Counts of one score."""
     clear = [pair for pair in pairs if pair[0].is_clear]
     same = [(one, other) for one, other in clear if one.difference * other.difference > 0.0]
     again = sum(other.is_clear for _, other in same)
@@ -99,16 +102,18 @@ def agreement(pairs: Sequence[Pair]) -> Agreement:
     )
 
 
-def text_of(stages: Mapping[str, Mapping[Key, Pair]]) -> str:
+def text_of(found: Mapping[tuple[str, str], Mapping[Key, Pair]]) -> str:
     """A table to be printed, then each clear difference of the first that has not its sign in the second."""
-    lines = [f"{'stage':<10}{'both':>6}{'clear':>7}{'same sign':>11}{'clear again':>13}{'clearly otherwise':>19}"]
+    counts = f"{'both':>6}{'clear':>7}{'same sign':>11}{'clear again':>13}{'clearly otherwise':>19}"
+    lines = [f"{'stage':<11}{'filter':<10}{counts}"]
     otherwise = []
-    for stage, pairs in stages.items():
+    for (stage, human_filter), pairs in found.items():
         n = agreement(list(pairs.values()))
-        lines.append(f"{stage:<10}{n.both:>6}{n.clear:>7}{n.same_sign:>11}{n.clear_again:>13}{n.clearly_otherwise:>19}")
-        for (setup, reference, budget, _), (one, other) in pairs.items():
+        counts = f"{n.both:>6}{n.clear:>7}{n.same_sign:>11}{n.clear_again:>13}{n.clearly_otherwise:>19}"
+        lines.append(f"{stage:<11}{human_filter:<10}{counts}")
+        for (setup, reference, budget, *_), (one, other) in pairs.items():
             if one.is_clear and one.difference * other.difference <= 0.0:
-                what = f"{setup} against {reference}, equal {budget}, {stage}"
+                what = f"{setup} against {reference}, equal {budget}, {stage} {human_filter}"
                 otherwise.append(f"{what}: {_words(one)}, then {_words(other)}")
     return "\n".join([*lines, *otherwise])
 
@@ -128,8 +133,9 @@ def main(argv: Sequence[str]) -> int:
             raise ConfigError(f"{wrong[0]}: give key=value: first=, second=, out=")
         settings = fill(AgreementSettings, dict(word.split("=", 1) for word in argv), "agreement")
         first, second = (read_differences(Path(folder)) for folder in (settings.first, settings.second))
-        stages = {stage: pairs_of(first, second, stage) for stage in SHOWN}
-        if not any(stages.values()):
+        pairs = {measure: pairs_of(first, second, measure) for measure in MEASURES}
+        stages = {measure: both for measure, both in pairs.items() if both}
+        if not stages:
             raise ConfigError(f"{settings.first} and {settings.second} have no comparison in common")
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
@@ -137,10 +143,10 @@ def main(argv: Sequence[str]) -> int:
     print(text_of(stages))
     if settings.out is not None:
         points = {
-            stage: [
-                (one.difference, other.difference, one.is_clear and other.is_clear) for one, other in pairs.values()
+            title_of(*measure): [
+                (one.difference, other.difference, one.is_clear and other.is_clear) for one, other in both.values()
             ]
-            for stage, pairs in stages.items()
+            for measure, both in stages.items()
         }
         draw_agreement(points, Path(settings.out))
         print(f"look at {settings.out}")

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from planners.aggregation import ClipResult
+from planners.aggregation import MEASURES, ClipResult
 from planners.measured import Measured, measured
-from planners.scores import SHOWN, write_csv
+from planners.scores import write_csv
 
 FACTS = ("stage", "human_filter", "clip", "frames")  # frames: what the clip counts in a mean
 
@@ -21,7 +21,7 @@ def write_clips(path: Path, runs: Mapping[str, Sequence[ClipResult]]) -> None:
     """One column for each run, by its label. Raises ValueError where they are not over the same clips."""
     found = measured(list(runs.values()), "score")
     rows = []
-    for name in SHOWN.items():
+    for name in MEASURES:
         for k, clip in enumerate(found[name].clips if name in found else ()):
             facts = dict(zip(FACTS, (*name, clip, int(found[name].weights[0, k]))))
             rows.append(facts | dict(zip(runs, (100.0 * found[name].scores[:, k]).tolist())))

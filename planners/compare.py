@@ -22,6 +22,7 @@ from planners.clip_table import read_clips
 from planners.eval_record import read_record
 from planners.measured import Measured, check_same_clips, measured
 from planners.score_rows import read_rows
+from planners.score_table import FILTERS_NOTE
 from tasks.reward.one_stage import COLUMNS
 
 BAD_CONFIG = 2
@@ -76,7 +77,7 @@ def text_of(found: Mapping[tuple[str, str], Interval], confidence: float) -> str
             f"{stage:<10} {human_filter:<11}{one.a:9.4f}{one.b:9.4f}{one.difference:+9.4f}"
             f"   {one.low:+.4f} .. {one.high:+.4f}{'  *' if one.is_clear else ''}"
         )
-    return "\n".join([*lines, f"*: zero lies outside the {percent} interval"])
+    return "\n".join([*lines, f"*: zero lies outside the {percent} interval", *FILTERS_NOTE])
 
 
 def write_csv(path: Path, found: Mapping[tuple[str, str], Interval]) -> None:

@@ -12,8 +12,12 @@ planned or scored again unless it, the benchmark or the rules changed; the same 
 planners of a command share what scoring prepares of a frame, so name several at once.
 
     summary.csv, summary.png      all planners of this command
-    one_stage                     the logged frames, as navtest: published tables hold the unfiltered score
-    stage_one, stage_two, final   as navhard; final is the product of both stages, filtered in published tables
+    one_stage                     the logged frames, as navtest
+    stage_one, stage_two, final   as navhard: stage two weighted by how near a follow-up starts to the plan's end,
+                                  final the product of both stages
+    follow_ups                    the plain mean of the follow-up rows; no published table holds it
+    unfiltered, filtered          without and with the human-penalty filter: the former compares with the paper's
+                                  tables, the latter with today's leaderboard
     uniform                       share of clips none of whose follow-ups starts near the plan's end
 """
 

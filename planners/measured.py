@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from planners.aggregation import ClipResult
+from planners.aggregation import MEASURES, ClipResult, columns_at
 from tasks.reward.one_stage import COLUMNS
 
 Array = NDArray[np.float64]
@@ -18,7 +18,7 @@ class Measured:
 
     clips: tuple[str, ...]
     scores: Array  # (S, C)
-    weights: Array  # (S, C) frames that a clip's score is the mean of
+    weights: Array  # (S, C) how much a clip's score counts in a mean: rows or groups that it is the mean of
 
 
 def measured(runs: Sequence[Sequence[ClipResult]], column: str) -> dict[tuple[str, str], Measured]:
@@ -28,33 +28,30 @@ def measured(runs: Sequence[Sequence[ClipResult]], column: str) -> dict[tuple[st
     """
     check_same_clips(runs)
     found = {}
-    for name in (("one_stage", f) for f in ("unfiltered", "filtered")):
-        found[name] = _of_stage(runs, *name, column)
-    for stage in ("stage_one", "stage_two", "final"):
-        two_stage = [[clip for clip in run if clip.groups is not None] for run in runs]
-        for human_filter in ("none",) if stage == "stage_two" else ("unfiltered", "filtered"):
-            if two_stage[0]:
-                found[stage, human_filter] = _of_stage(two_stage, stage, human_filter, column)
+    for stage, human_filter in MEASURES:
+        mine = [[clip for clip in run if stage == "one_stage" or clip.groups is not None] for run in runs]
+        if mine[0]:
+            found[stage, human_filter] = _of_stage(mine, stage, human_filter, column)
     return {name: values for name, values in found.items() if np.isfinite(values.scores).all()}
 
 
 def _of_stage(runs: Sequence[Sequence[ClipResult]], stage: str, human_filter: str, column: str) -> Measured:
-    both = np.array([[_one(clip, stage, human_filter, column) for clip in run] for run in runs], dtype=np.float64)
-    return Measured(tuple(clip.clip_id for clip in runs[0]), both[..., 0], both[..., 1])
-
-
-def _one(clip: ClipResult, stage: str, human_filter: str, column: str) -> tuple[float, float]:
-    """Score and number of frames."""
     place = COLUMNS.index(column)
-    if stage == "one_stage":
-        scores, count = clip.one_stage, 1
-    else:
-        two = clip.two_stage
-        assert two is not None
-        if stage == "stage_two":
-            return float(two.stage_two[place]), 2.0 * clip.n_follow_ups
-        scores, count = (two.stage_one, 2) if stage == "stage_one" else (two.final, 1)
-    return float((scores.filtered if human_filter == "filtered" else scores.unfiltered)[place]), float(count)
+
+    def score(clip: ClipResult) -> float:
+        two_stage = None if stage == "one_stage" else clip.two_stage
+        return float(columns_at(clip.one_stage, two_stage, stage, human_filter)[place])
+
+    return Measured(
+        clips=tuple(clip.clip_id for clip in runs[0]),
+        scores=np.array([[score(clip) for clip in run] for run in runs]),
+        weights=np.array([[float(_count(clip, stage)) for clip in run] for run in runs]),
+    )
+
+
+def _count(clip: ClipResult, stage: str) -> int:
+    """Rows of stage one, groups of stage two and follow-up rows: what a clip's score is the mean of."""
+    return {"stage_one": 2, "stage_two": 2, "follow_ups": 2 * clip.n_follow_ups}.get(stage, 1)
 
 
 def check_same_clips(runs: Sequence[Sequence[ClipResult]]) -> None:

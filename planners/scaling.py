@@ -19,11 +19,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 from factory.config import ConfigError, compose, fill
+from planners.aggregation import HumanFilter
 from planners.checkpoint import read_record
 from planners.scaling_figure import Curve, Point, draw_curves
 from planners.scaling_law import FEWEST, fit_scaling
 from planners.scaling_table import bounds, compared, text_of
-from planners.scores import name_of, scores_of, write_csv
+from planners.scores import PAPER, name_of, scores_of, shown, title_of, write_csv
 from planners.sweep import EVALUATIONS, Means, SweepFailed, Training, evaluate_all, folder_of, train_all
 
 BAD_CONFIG, FAILED, INTERRUPTED = 2, 3, 4
@@ -57,8 +58,8 @@ class ScalingSettings:
     steps: int | None = None
     train: dict[str, tuple[str, ...]] = field(default_factory=dict)
     evaluate: tuple[str, ...] = ()
-    stage: Literal["one_stage", "stage_one", "stage_two", "final"] = "final"
-    human_filter: Literal["filtered", "unfiltered"] = "filtered"
+    stage: Literal["one_stage", "stage_one", "stage_two", "follow_ups", "final"] = "final"
+    human_filter: HumanFilter = PAPER
     executor: Literal["process", "ray"] = "process"
     jobs: int | None = None
     minutes: float | None = None
@@ -75,6 +76,11 @@ class ScalingSettings:
             raise ValueError(f"train: {', '.join(unknown)} is none of {EVERYONE}, {', '.join(self.planners)}")
         if min(self.rounds) < 0:
             raise ValueError(f"rounds={list(self.rounds)}: 0 is real samples alone, 1 the first round with them")
+
+    @property
+    def measure(self) -> tuple[str, str]:
+        """The score that is drawn: one of planners.aggregation.MEASURES."""
+        return self.stage, shown(self.human_filter)[self.stage]
 
     @property
     def means(self) -> Means:
@@ -128,7 +134,7 @@ def trainings_of(settings: ScalingSettings) -> list[Training]:
 
 def curves_of(rows: Sequence[dict[str, Any]], settings: ScalingSettings) -> list[Curve]:
     """The rows by planner, expert, ratio, imitation and share of real data; real samples alone stand in each curve."""
-    score = name_of(settings.stage, settings.human_filter)
+    score = name_of(*settings.measure)
     curves = []
     for planner, expert, ratio, imitation, share in itertools.product(
         settings.planners, settings.experts, settings.sim_ratios, settings.imitation, settings.real_shares
@@ -183,8 +189,8 @@ def run(settings: ScalingSettings) -> int:
     for name, table in (tables | {"bounds": bounds(evaluations)}).items():
         if table:
             write_csv(report / f"{name}.csv", table)
-    draw_curves(curves, f"{settings.stage} EPDMS", report / "scaling.png")
-    print(text_of(differences, settings.stage))
+    draw_curves(curves, title_of(*settings.measure), report / "scaling.png")
+    print(text_of(differences, *settings.measure))
     for curve in curves:
         print(curve.text())
     print(f"tables and picture: {report}")

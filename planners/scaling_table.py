@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from planners.aggregation import ClipResult, by_clip
+from planners.aggregation import MEASURES, ClipResult, by_clip
 from planners.compare import CompareSettings, compare
 from planners.score_rows import read_rows
-from planners.scores import BOUNDS, SHOWN, name_of, scores_of
+from planners.scores import BOUNDS, name_of, scores_of
 from planners.sweep import Training
 
 Setup = tuple[tuple[str, Any], ...]  # facts of a training but its seed
@@ -17,7 +17,7 @@ RULES = CompareSettings(a="", b="")  # draws, confidence and seed as `python -m 
 
 
 def compared(trainings: Sequence[Training], evaluations: Path) -> list[dict[str, Any]]:
-    """A row for each setup, which is all facts but the seed, and stage.
+    """A row for each setup, which is all facts but the seed, and each of MEASURES.
 
     In percent: the mean over seeds, the range of single seeds, and the difference from real samples alone with its
     95 % interval (paired bootstrap over clips and seeds), empty for those themselves and where the sweep has none.
@@ -33,7 +33,7 @@ def compared(trainings: Sequence[Training], evaluations: Path) -> list[dict[str,
         differences = {}
         if reference:
             differences = compare(_runs(reference, evaluations), _runs(labels, evaluations), RULES)
-        for stage, human_filter in SHOWN.items():
+        for stage, human_filter in MEASURES:
             each = [score[name_of(stage, human_filter)] for score in scores]
             row = {**dict(setup), "seeds": len(labels), "stage": stage, "human_filter": human_filter}
             row |= {"epdms": float(np.mean(each)), "lowest_seed": min(each), "highest_seed": max(each)}
@@ -50,11 +50,11 @@ def bounds(evaluations: Path) -> list[dict[str, Any]]:
     return [{"planner": name, **scores_of(evaluations / name)} for name in BOUNDS if (evaluations / name).is_dir()]
 
 
-def text_of(rows: Sequence[Mapping[str, Any]], stage: str) -> str:
-    """One stage's rows, to be printed."""
+def text_of(rows: Sequence[Mapping[str, Any]], stage: str, human_filter: str) -> str:
+    """The rows of one of MEASURES, to be printed."""
     lines = [f"{'planner':<22}{'trained on':<26}{'EPDMS':>7}{'difference':>12}   95 % interval"]
     for row in rows:
-        if row["stage"] == stage:
+        if (row["stage"], row["human_filter"]) == (stage, human_filter):
             on = f"{row['expert']}, rounds {row['rounds']}" if row["rounds"] else "real alone"
             line = f"{row['planner']:<22}{on:<26}{row['epdms']:7.2f}"
             if row["difference"] != "":

@@ -15,6 +15,11 @@ Image = NDArray[np.uint8]
 
 HEAD = ("planner", "stage", "human_filter", *COLUMNS, "clips", "frames", "uniform_share", "uniform_share_before")
 ROW_PX, NAME_PX, CELL_PX, MARGIN_PX = 24, 8, 62, 12  # NAME_PX: a letter's width
+# What each line may be held against; said beside every table.
+FILTERS_NOTE = (
+    "unfiltered compares with the paper's tables, filtered with today's leaderboard (human-penalty filter)",
+    "stage_two is weighted as navhard's; follow_ups is the plain mean of its rows, which no published table holds",
+)
 INK, FAINT, STRIPE, PAPER = (30, 30, 30), (140, 140, 140), (238, 241, 244), (252, 252, 250)
 FONT, SIZE = cv2.FONT_HERSHEY_SIMPLEX, 0.42
 
@@ -40,7 +45,7 @@ def table_text(lines: Sequence[SummaryLine]) -> str:
     def padded(row: list[str]) -> str:
         return "  ".join(f"{cell:{'<' if i < 3 else '>'}{width}}" for i, (cell, width) in enumerate(zip(row, widths)))
 
-    return "\n".join(map(padded, rows))
+    return "\n".join([*map(padded, rows), *FILTERS_NOTE])
 
 
 def picture(lines: Sequence[SummaryLine]) -> Image:
@@ -48,7 +53,8 @@ def picture(lines: Sequence[SummaryLine]) -> Image:
     rows = [_head(), *(_cells(line) for line in lines)]
     names = [MARGIN_PX + NAME_PX * max(len(row[i]) for row in rows) for i in range(3)]
     widths = [*names, *[CELL_PX] * (len(rows[0]) - 3)]
-    image = np.full((ROW_PX * len(rows) + 2 * MARGIN_PX, sum(widths) + 2 * MARGIN_PX, 3), PAPER, np.uint8)
+    height = ROW_PX * (len(rows) + len(FILTERS_NOTE)) + 2 * MARGIN_PX
+    image = np.full((height, sum(widths) + 2 * MARGIN_PX, 3), PAPER, np.uint8)
     planners = list(dict.fromkeys(row[0] for row in rows[1:]))
     for r, row in enumerate(rows):
         top = MARGIN_PX + r * ROW_PX
@@ -58,9 +64,11 @@ def picture(lines: Sequence[SummaryLine]) -> Image:
         for i, (cell, width) in enumerate(zip(row, widths)):
             (text_px, _), _ = cv2.getTextSize(cell, FONT, SIZE, 1)
             x = left if i < 3 else left + width - text_px
-            colour = INK if r and (i == 0 or row[2] != "unfiltered") else FAINT
+            colour = INK if r and (i == 0 or row[2] != "filtered") else FAINT
             cv2.putText(image, cell, (x, top + ROW_PX - 8), FONT, SIZE, colour, 1, cv2.LINE_AA)
             left += width
+    for r, note in enumerate(FILTERS_NOTE, start=len(rows) + 1):
+        cv2.putText(image, note, (MARGIN_PX, MARGIN_PX + r * ROW_PX - 8), FONT, SIZE, FAINT, 1, cv2.LINE_AA)
     return image
 
 

@@ -5,12 +5,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from planners.aggregation import lines_of, score_of, summarise
+from planners.aggregation import MEASURES, HumanFilter, lines_of, score_of, summarise
 from planners.score_rows import read_rows
 
-STAGES = ("one_stage", "stage_one", "stage_two", "final")
-SHOWN = {"one_stage": "unfiltered", "stage_one": "filtered", "stage_two": "none", "final": "filtered"}  # as published
+PAPER: HumanFilter = "unfiltered"  # what is held against the paper's tables
 BOUNDS = ("human", "pdm_closed", "constant_velocity")
+
+
+def shown(human_filter: HumanFilter) -> dict[str, str]:
+    """Stage -> the filter under which it stands in a table of so filtered scores."""
+    return {stage: which for stage, which in MEASURES if which in (human_filter, "none")}
 
 
 def scores_of(folder: Path) -> dict[str, float]:
@@ -24,8 +28,20 @@ def scores_of(folder: Path) -> dict[str, float]:
 
 
 def name_of(stage: str, human_filter: str) -> str:
-    """Column of a score; stage two is never filtered."""
-    return stage if stage == "stage_two" else f"{stage}_{human_filter}"
+    """Column of a score."""
+    return stage if human_filter == "none" else f"{stage}_{human_filter}"
+
+
+def title_of(stage: str, human_filter: str) -> str:
+    """A score in words, with what it may be held against."""
+    words = {
+        "one_stage": "EPDMS of one stage",
+        "stage_one": "EPDMS of stage one",
+        "stage_two": "EPDMS of stage two",
+        "follow_ups": "EPDMS of follow-ups (plain mean)",
+        "final": "two-stage EPDMS",
+    }[stage]
+    return f"{words}{'' if human_filter == 'none' else f', {human_filter}'}"
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:

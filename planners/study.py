@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from factory.config import ConfigError, compose, fill
-from planners.aggregation import ClipResult, by_clip
+from planners.aggregation import MEASURES, ClipResult, by_clip
 from planners.checkpoint import read_record
 from planners.clip_table import write_clips
 from planners.compare import CompareSettings, compare
@@ -32,7 +32,8 @@ from planners.index import DataSettings, open_dataset
 from planners.scaling_figure import Curve, Point, draw_curves
 from planners.scaling_law import FEWEST, fit_scaling
 from planners.score_rows import read_rows
-from planners.scores import BOUNDS, SHOWN, name_of, scores_of, write_csv
+from planners.score_table import FILTERS_NOTE
+from planners.scores import BOUNDS, name_of, scores_of, shown, title_of, write_csv
 from planners.study_figures import draw_differences, draw_learning
 from planners.study_plan import (
     Comparison,
@@ -60,7 +61,7 @@ from planners.sweep import (
 )
 
 BAD_CONFIG, FAILED, INTERRUPTED = 2, 3, 4
-CURVES = {"final": ("two-stage EPDMS", "scaling.png"), "stage_two": ("EPDMS of stage two", "scaling_stage_two.png")}
+CURVES = {"final": "scaling.png", "stage_two": "scaling_stage_two.png"}
 
 
 def run(settings: StudySettings) -> int:
@@ -111,18 +112,23 @@ def write_report(standing: Sequence[Comparison], trained: Sequence[Training], se
     write_clips(report / "clips.csv", {training.label: _clips(evaluations / training.label) for training in trained})
     found = compared(standing, evaluations)
     write_csv(report / "comparisons.csv", found)
-    (report / "tables.md").write_text(markdown_of(found))
-    curves = {stage: curves_of(standing, rows, stage) for stage in CURVES}
+    measures = shown(settings.human_filter)
+    (report / "tables.md").write_text(markdown_of(found, settings.human_filter))
+    curves = {(stage, measures[stage]): curves_of(standing, rows, stage, measures[stage]) for stage in CURVES}
     if any(curves.values()):
-        lines = [{"stage": stage, **curve.row()} for stage, drawn in curves.items() for curve in drawn]
+        lines = [
+            {"stage": stage, "human_filter": human_filter, **curve.row()}
+            for (stage, human_filter), drawn in curves.items()
+            for curve in drawn
+        ]
         write_csv(report / "curves.csv", lines)
-        for stage, (title, name) in CURVES.items():
-            draw_curves(curves[stage], title, report / name)
-    differences = [row for row in found if row["reference"]]
+        for measure, drawn in curves.items():
+            draw_curves(drawn, title_of(*measure), report / CURVES[measure[0]])
+    differences = [row for row in found if row["reference"] and row["human_filter"] == measures[row["stage"]]]
     if differences:
         draw_differences(differences, report / "differences.png")
     draw_learning({t.label: folder_of(out, t) for t in trained if t.facts["seed"] == 0}, report / "learning.png")
-    print(text_of(found, evaluations))
+    print(text_of(found, evaluations, measures["final"]))
     print(f"tables and pictures: {report}")
 
 
@@ -156,15 +162,15 @@ def row_of(training: Training, out: Path, evaluations: Path) -> dict[str, Any]:
 
 
 def compared(wanted: Sequence[Comparison], evaluations: Path) -> list[dict[str, Any]]:
-    """A row for each comparison and stage: mean over seeds in percent, difference from the reference, interval."""
+    """A row for each comparison and each of MEASURES: mean over seeds in percent, difference, interval."""
     rows = []
     for one in wanted:
         intervals = {}
         if one.reference is not None:
             a, b = (clips_of(setup, one.seeds, evaluations) for setup in (one.reference, one.setup))
             intervals = compare(a, b, RULES)
-        for stage, human_filter in SHOWN.items():
-            row: dict[str, Any] = {**one.facts, "stage": stage}
+        for stage, human_filter in MEASURES:
+            row: dict[str, Any] = {**one.facts, "stage": stage, "human_filter": human_filter}
             each = scores_of_seeds(one.setup, one.seeds, evaluations, stage, human_filter)
             row |= {"epdms": float(np.mean(each)), "each": " ".join(f"{score:.1f}" for score in each)}
             row |= {"reference": "", "difference": "", "low": "", "high": ""}
@@ -198,9 +204,11 @@ def scores_of_seeds(setup: Setup, seeds: int, evaluations: Path, stage: str, hum
     return [_scores(evaluations / f"{setup.label}-{seed}")[name] for seed in range(seeds)]
 
 
-def curves_of(wanted: Sequence[Comparison], rows: Sequence[Mapping[str, Any]], stage: str) -> list[Curve]:
-    """A stage's EPDMS over the number of samples: one curve for each planner, expert, imitation and budget."""
-    score, points = name_of(stage, SHOWN[stage]), defaultdict[str, list[Point]](list)
+def curves_of(
+    wanted: Sequence[Comparison], rows: Sequence[Mapping[str, Any]], stage: str, human_filter: str
+) -> list[Curve]:
+    """One of MEASURES over the number of samples: a curve for each planner, expert, imitation and budget."""
+    score, points = name_of(stage, human_filter), defaultdict[str, list[Point]](list)
     for row in rows:
         points[row["training"].rpartition("-")[0]].append(Point(row["real"] + row["simulated"], row[score]))
     series = defaultdict[tuple[str, str], dict[Setup, None]](dict)
@@ -217,17 +225,19 @@ def curves_of(wanted: Sequence[Comparison], rows: Sequence[Mapping[str, Any]], s
     return curves
 
 
-def text_of(found: Sequence[Mapping[str, Any]], evaluations: Path) -> str:
+def text_of(found: Sequence[Mapping[str, Any]], evaluations: Path, human_filter: str) -> str:
     """The two-stage scores among the rows of comparisons.csv, to be printed."""
-    lines = [f"{'part':<12}{'trained':<46}{'equal':>8}{'seeds':>7}{'EPDMS':>8}{'difference':>12}   95 % interval"]
+    title = f"{title_of('final', human_filter)}; {FILTERS_NOTE[0]}"
+    lines = [title]
+    lines += [f"{'part':<12}{'trained':<46}{'equal':>8}{'seeds':>7}{'EPDMS':>8}{'difference':>12}   95 % interval"]
     for row in found:
-        if row["stage"] == "final":
+        if (row["stage"], row["human_filter"]) == ("final", human_filter):
             line = f"{row['part']:<12}{row['setup']:<46}{row['budget']:>8}{row['seeds']:7}{row['epdms']:8.2f}"
             if row["reference"]:
                 line += f"{row['difference']:+12.2f}   {row['low']:+.2f} .. {row['high']:+.2f}"
             lines.append(line)
     for name in BOUNDS:
-        score = scores_of(evaluations / name)[name_of("final", SHOWN["final"])]
+        score = scores_of(evaluations / name)[name_of("final", human_filter)]
         lines.append(f"{name:<73}" + (f"{score:8.2f}" if np.isfinite(score) else "       -"))
     return "\n".join(lines)
 

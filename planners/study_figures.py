@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 COLUMNS = 6
 COLOURS = 32
 SMOOTH_STEPS = 20  # of which a loss that is drawn is the mean
-DRAWN = {"stage_two": "stage two", "final": "final"}
+DRAWN = {"stage_two": "stage two", "follow_ups": "follow-ups (plain mean)", "final": "final"}  # those that there are
 CLEAR, OPEN = "#1f6fb4", "#9aa4ad"  # an interval without and with zero
 
 
@@ -59,9 +59,9 @@ def draw_learning(folders: Mapping[str, Path], path: Path) -> None:
 
 
 def draw_differences(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Every comparison's difference in percent points with its interval, in both stages and in the whole score.
+    """Every comparison's difference in percent points with its interval, in stage two and in the final score.
 
-    rows: those of comparisons.csv that have a reference.
+    rows: those of comparisons.csv that have a reference, of one human filter.
     """
     import matplotlib
 
@@ -69,8 +69,10 @@ def draw_differences(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     from matplotlib import pyplot
 
     n = sum(row["stage"] == "final" for row in rows)
-    figure, axes = pyplot.subplots(1, len(DRAWN), figsize=(11.0, 1.0 + 0.2 * n), sharey=True, squeeze=False)
-    for panel, (stage, title) in zip(axes.flat, DRAWN.items()):
+    drawn = {stage: title for stage, title in DRAWN.items() if any(row["stage"] == stage for row in rows)}
+    size = (3.0 + 4.0 * len(drawn), 1.0 + 0.2 * n)
+    figure, axes = pyplot.subplots(1, len(drawn), figsize=size, sharey=True, squeeze=False)
+    for panel, (stage, title) in zip(axes.flat, drawn.items()):
         chosen = [row for row in rows if row["stage"] == stage]
         for y, row in enumerate(chosen):
             color = CLEAR if is_clear(row) else OPEN
@@ -90,9 +92,9 @@ def draw_differences(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 
 def draw_agreement(points: Mapping[str, Sequence[tuple[float, float, bool]]], path: Path) -> None:
-    """Differences of a study made again over those of the first, a panel for each stage, blue where both are clear.
+    """Differences of a study made again over those of the first, a panel for each score, blue where both are clear.
 
-    points: stage -> (first, second, whether both are clear), percent points of EPDMS.
+    points: title of a score -> (first, second, whether both are clear), percent points of EPDMS.
     """
     import matplotlib
 
@@ -100,7 +102,7 @@ def draw_agreement(points: Mapping[str, Sequence[tuple[float, float, bool]]], pa
     from matplotlib import pyplot
 
     figure, axes = pyplot.subplots(1, len(points), figsize=(3.6 * len(points), 3.8), squeeze=False)
-    for panel, (stage, drawn) in zip(axes.flat, points.items()):
+    for panel, (title, drawn) in zip(axes.flat, points.items()):
         for clear, color in ((False, OPEN), (True, CLEAR)):
             chosen = [(one, other) for one, other, is_clear in drawn if is_clear == clear]
             panel.plot(*np.array(chosen).reshape(-1, 2).T, "o", color=color, markersize=4)
@@ -108,7 +110,7 @@ def draw_agreement(points: Mapping[str, Sequence[tuple[float, float, bool]]], pa
         panel.axhline(0.0, color="#d0d5da", linewidth=0.8, zorder=0)
         panel.axvline(0.0, color="#d0d5da", linewidth=0.8, zorder=0)
         panel.set_aspect("equal", adjustable="datalim")
-        panel.set_title(f"{stage.replace('_', ' ')}: difference in EPDMS points", fontsize=8)
+        panel.set_title(f"{title}:\ndifference in points", fontsize=8)
         panel.set_xlabel("first", fontsize=8)
         panel.set_ylabel("again", fontsize=8)
         panel.tick_params(labelsize=7)

@@ -6,6 +6,7 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any, Literal
 
+from planners.aggregation import HumanFilter
 from planners.sweep import TRAININGS, Training
 
 Data = Literal["begin", "real", "recovery", "pdm_closed", "logged"]
@@ -38,6 +39,7 @@ class StudySettings:
     batch_size: int
     psnr_db: float
     parts: tuple[str, ...]
+    human_filter: HumanFilter = "unfiltered"
     jobs: int | None = None
     minutes: float | None = None
 

@@ -4,35 +4,41 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
 from typing import Any
 
-from planners.scores import SHOWN
+from planners.aggregation import HumanFilter
+from planners.score_table import FILTERS_NOTE
+from planners.scores import shown
 
 Row = Mapping[str, Any]  # of comparisons.csv
-HEAD = ("planner", "trained on", "equal", "seeds", *(stage.replace("_", " ") for stage in SHOWN), "final of each seed")
+TITLES = {"follow_ups": "follow-ups (plain mean)"}  # others: the stage's name
 
 
-def markdown_of(rows: Sequence[Row]) -> str:
+def markdown_of(rows: Sequence[Row], human_filter: HumanFilter) -> str:
     """EPDMS in percent; in brackets the difference from the reference with its interval, bold where that excludes 0.
 
-    rows: those of comparisons.csv, a comparison's stages one after the other. A row that is itself a reference stands
-    in front of what is held against it.
+    rows: those of comparisons.csv, a comparison's measures one after the other; of those with and without the human
+    filter one is shown. A row that is itself a reference stands in front of what is held against it.
     """
-    lines = []
-    for part, of_part in groupby(rows, key=lambda row: row["part"]):
-        lines += [f"## {part}", "", _line(HEAD), _line(["---"] * len(HEAD))]
-        lines += [_line(_cells(stages)) for stages in _by_comparison(list(of_part))]
+    mine = [row for row in rows if row["human_filter"] in (human_filter, "none")]
+    stages = [stage for stage in shown(human_filter) if any(row["stage"] == stage for row in mine)]
+    titles = [TITLES.get(stage, stage.replace("_", " ")) for stage in stages]
+    head = ("planner", "trained on", "equal", "seeds", *titles, "final of each seed")
+    lines = [f"Scores are {human_filter}: {FILTERS_NOTE[0]}; {FILTERS_NOTE[1]}.", ""]
+    for part, of_part in groupby(mine, key=lambda row: row["part"]):
+        lines += [f"## {part}", "", _line(head), _line(["---"] * len(head))]
+        lines += [_line(_cells(one)) for one in _by_comparison(list(of_part), len(stages))]
         lines.append("")
     return "\n".join(lines)
 
 
-def _by_comparison(rows: Sequence[Row]) -> Iterator[dict[str, Row]]:
+def _by_comparison(rows: Sequence[Row], n_stages: int) -> Iterator[dict[str, Row]]:
     """The rows of one comparison after the other, by stage."""
-    for first in range(0, len(rows), len(SHOWN)):
-        yield {row["stage"]: row for row in rows[first : first + len(SHOWN)]}
+    for first in range(0, len(rows), n_stages):
+        yield {row["stage"]: row for row in rows[first : first + n_stages]}
 
 
 def _cells(stages: Mapping[str, Row]) -> list[str]:
     final = stages["final"]
-    scores = [_score(stages[stage]) for stage in SHOWN]
+    scores = [_score(row) for row in stages.values()]
     return [f"`{final['planner']}`", words_of(final), final["budget"], str(final["seeds"]), *scores, final["each"]]
 
 

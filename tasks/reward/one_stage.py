@@ -1,7 +1,9 @@
 """A frame's final score, and the means of a one-stage evaluation (docs/reward.md 2k, 2l).
 
-Published one-stage tables hold the UNFILTERED score beside FILTERED sub-scores; two-stage ones are filtered throughout.
-So every number here comes both ways and is named.
+The paper's tables hold the UNFILTERED score beside FILTERED sub-scores, in one stage and in two: its copy of the public
+code filtered the columns after the score's terms were taken (fixed in navsim 359c7f7, September 2025). With the public
+code of today the score is filtered as well. So every number here comes both ways and is named: the unfiltered score is
+held against the paper's tables, the filtered one against today's leaderboard.
 """
 
 from collections.abc import Sequence
@@ -27,7 +29,7 @@ class FrameScores:
 
     @property
     def published(self) -> Array:
-        """Columns (C,) as one-stage tables show them: the filtered sub-scores, the last column's score unfiltered."""
+        """Columns (C,) as the paper's tables show them: the filtered sub-scores, the last column's score unfiltered."""
         return np.append(self.filtered[:-1], self.unfiltered[-1])
 
 
@@ -67,12 +69,13 @@ def means_of(frames: Sequence[FrameScores]) -> FrameScores:
     if not frames:
         raise ValueError("frames must hold at least one frame, got none")
     return FrameScores(
-        unfiltered=_means(np.stack([frame.unfiltered for frame in frames])),
-        filtered=_means(np.stack([frame.filtered for frame in frames])),
+        unfiltered=means_over(np.stack([frame.unfiltered for frame in frames])),
+        filtered=means_over(np.stack([frame.filtered for frame in frames])),
     )
 
 
-def _means(columns: Array) -> Array:
+def means_over(columns: Array) -> Array:
+    """Means (C,) of rows (N, C), each over the rows that have the column; NaN where none does."""
     known = ~np.isnan(columns)
     total = np.where(known, columns, 0.0).sum(axis=0)
     return np.divide(total, known.sum(axis=0), out=np.full(len(total), np.nan), where=known.any(axis=0))

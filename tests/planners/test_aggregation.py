@@ -44,7 +44,9 @@ def test_two_clips_and_three_follow_ups_add_up_as_on_paper() -> None:
     assert summary.two_stage is not None
     assert score_of(summary.one_stage.unfiltered) == pytest.approx(0.8)  # (0.9 + 0.7) / 2
     assert score_of(summary.two_stage.stage_one.filtered) == pytest.approx(0.725)  # (0.8 + 0.6 + 1 + 0.5) / 4
-    assert score_of(summary.two_stage.stage_two) == pytest.approx(3.1 / 6)  # of 1, 0.4, 0.5, 0.2, 0.3, 0.7
+    # groups: a now 0.888650, a before (0.4 + 0.2) / 2, b 0.3 and 0.7
+    assert score_of(summary.two_stage.stage_two) == pytest.approx((0.888650 + 0.3 + 0.3 + 0.7) / 4, abs=1e-6)
+    assert score_of(summary.two_stage.follow_ups) == pytest.approx(3.1 / 6)  # of 1, 0.4, 0.5, 0.2, 0.3, 0.7
     assert score_of(summary.two_stage.final.filtered) == pytest.approx(0.385230, abs=1e-6)
     assert (summary.n_clips, summary.n_two_stage, summary.n_follow_ups) == (2, 2, 3)
     clip_a = by_clip(two_clips())[0].two_stage
@@ -69,6 +71,7 @@ def test_the_share_of_clips_in_the_uniform_fallback_is_counted() -> None:
         ("stage_one", "unfiltered", 4),
         ("stage_one", "filtered", 4),
         ("stage_two", "none", 6),
+        ("follow_ups", "none", 6),
         ("final", "unfiltered", 10),
         ("final", "filtered", 10),
     ]
@@ -110,7 +113,7 @@ def test_a_planner_without_plans_in_stage_two_has_no_final_score() -> None:
     rows = [r if r.stage != "stage_two" else row(r.stage, r.key, np.nan, start=tuple(r.start[:2])) for r in two_clips()]
     two = summarise(rows).two_stage
     assert two is not None
-    assert np.isnan(two.stage_two).all() and np.isnan(two.final.filtered).all()
+    assert np.isnan(two.stage_two).all() and np.isnan(two.follow_ups).all() and np.isnan(two.final.filtered).all()
     assert score_of(two.stage_one.filtered) == pytest.approx(0.725)
 
 

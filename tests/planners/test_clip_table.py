@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from planners.aggregation import MEASURES
 from planners.clip_table import FACTS, read_clips, write_clips
 from planners.compare import BAD_CONFIG, CompareSettings, compare, intervals, main
 from planners.measured import measured
-from planners.scores import SHOWN
 from tests.planners.test_bootstrap import run
 
 SETTINGS = CompareSettings(a="", b="", draws=500)
@@ -24,12 +24,7 @@ def table(tmp_path: Path) -> Path:
 
 def test_what_is_read_is_what_was_scored(table: Path) -> None:
     found, scored = read_clips(table, ["sim-0", "real-1"]), measured([RUNS["sim-0"], RUNS["real-1"]], "score")
-    assert list(found) == [
-        ("one_stage", "unfiltered"),
-        ("stage_one", "filtered"),
-        ("stage_two", "none"),
-        ("final", "filtered"),
-    ]
+    assert tuple(found) == MEASURES
     for name, values in found.items():
         assert values.clips == scored[name].clips
         np.testing.assert_allclose(values.scores, scored[name].scores, atol=1e-6)
@@ -49,7 +44,7 @@ def test_the_command_compares_columns_and_refuses_what_is_none(table: Path, caps
     sides = [f"table={table}", "a=[real-0,real-1]", "b=[sim-0,sim-1]"]
     assert main([*sides, f"out={table.parent / 'out.csv'}"]) == 0
     assert "stage_two" in capsys.readouterr().out
-    assert (table.parent / "out.csv").read_text().count("\n") == 5
+    assert (table.parent / "out.csv").read_text().count("\n") == 1 + len(MEASURES)
     assert main([f"table={table}", "a=real-0", "b=sim-7"]) == BAD_CONFIG
     assert "no run sim-7; it has real-0, real-1, sim-0, sim-1" in capsys.readouterr().err
     assert main([*sides, "column=nc"]) == BAD_CONFIG
@@ -89,7 +84,7 @@ def test_the_studys_comparisons_are_those_of_its_clips(study: Path, least: int) 
         a, b = ([f"{row[side]}-{seed}" for seed in range(int(row["seeds"]))] for side in ("reference", "setup"))
         if not row["reference"] or not there.issuperset([*a, *b]):
             continue
-        name = next(name for name in SHOWN.items() if name[0] == row["stage"])
+        name = row["stage"], row["human_filter"]
         of_a, of_b = (read_clips(study / "clips.csv", side)[name] for side in (a, b))
         mean_a, mean_b = (100.0 * (x.scores * x.weights).sum() / x.weights.sum() for x in (of_a, of_b))
         assert mean_b == pytest.approx(float(row["epdms"]), abs=1e-3)

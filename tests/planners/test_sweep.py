@@ -56,7 +56,7 @@ def test_all_experts_together_are_one_axis_value() -> None:
 def test_curves_hold_their_own_points_and_real_samples_alone() -> None:
     settings = scaling()
     rows = [
-        {**t.facts, "samples": 100 + 50 * t.facts["rounds"], "final_filtered": 30.0 + t.facts["rounds"]}
+        {**t.facts, "samples": 100 + 50 * t.facts["rounds"], "final_unfiltered": 30.0 + t.facts["rounds"]}
         for t in trainings_of(settings)
     ]
     recovery, pdm = curves_of(rows, settings)

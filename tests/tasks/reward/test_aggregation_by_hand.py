@@ -215,8 +215,14 @@ def test_two_stage_scores_average_now_and_previous_then_scenarios() -> None:
     twice = aggregate([(now, previous), (perfect, perfect)])
     assert column(twice.final.filtered, "score") == pytest.approx(0.737421, abs=1e-6)
     assert column(twice.final.unfiltered, "score") == pytest.approx(0.564453, abs=1e-6)
-    # Stage rows are plain means over rows: (0.75 + 0.75 + 1 + 1) / 4 filtered, (0 + 0.75 + 1 + 1) / 4 unfiltered;
-    # six follow-ups: (1 + 0.75 + 0 + 0.6875 + 1 + 1) / 6
+    # Stage one: (0.75 + 0.75 + 1 + 1) / 4 filtered, (0 + 0.75 + 1 + 1) / 4 unfiltered
     assert column(twice.stage_one.filtered, "score") == pytest.approx(0.875)
     assert column(twice.stage_one.unfiltered, "score") == pytest.approx(0.6875)
-    assert column(twice.stage_two, "score") == pytest.approx(0.739583, abs=1e-6)
+    # Stage two, over groups of weighted means: now 0.922494, previous (0 + 0.6875) / 2, perfect 1 and 1:
+    # (0.922494 + 0.34375 + 1 + 1) / 4; EP (0.751979 + 1 + 1 + 1) / 4, DAC (1 + 0.5 + 1 + 1) / 4
+    assert column(once.stage_two, "score") == pytest.approx(0.633122, abs=1e-6)  # (0.922494 + 0.34375) / 2
+    assert column(twice.stage_two, "score") == pytest.approx(0.816561, abs=1e-6)
+    assert column(twice.stage_two, "ep") == pytest.approx(0.937995, abs=1e-6)
+    assert column(twice.stage_two, "dac") == pytest.approx(0.875)
+    # The plain mean of the six follow-up rows is another number: (1 + 0.75 + 0 + 0.6875 + 1 + 1) / 6
+    assert column(twice.follow_ups, "score") == pytest.approx(0.739583, abs=1e-6)

@@ -94,7 +94,8 @@ def test_two_stage_scores_are_those_of_each_number(scenarios: list[tuple[tuple, 
     firsts = [slow.frame(*group[0]) for pair in scenarios for group in pair]
     seconds = [slow.frame(row, None, ec)[0] for pair in scenarios for group in pair for row, ec, _ in group[2]]
     assert_both_same(ours.stage_one, *(slow.means(columns) for columns in zip(*firsts)))
-    assert_same(ours.stage_two, slow.plain_means(seconds))
+    assert_same(ours.stage_two, slow.means([slow_stage_two(*group) for pair in scenarios for group in pair]))
+    assert_same(ours.follow_ups, slow.plain_means(seconds))
     pairs = [[slow_group(*group) for group in pair] for pair in scenarios]
     for both, which in ((ours.final.unfiltered, 0), (ours.final.filtered, 1)):
         assert_same(both, slow.means([slow.means([group[which] for group in pair]) for pair in pairs]))
@@ -107,6 +108,14 @@ def group_of(frame: tuple, end: tuple[float, float], follow_ups: list[tuple]) ->
 
 def slow_group(frame: tuple, end: tuple[float, float], follow_ups: list[tuple]) -> list[slow.Columns]:
     """Unfiltered, filtered."""
+    return [slow.group(columns, *slow_follow_ups(end, follow_ups)) for columns in slow.frame(*frame)]
+
+
+def slow_stage_two(_frame: tuple, end: tuple[float, float], follow_ups: list[tuple]) -> slow.Columns:
+    return slow.weighted(*slow_follow_ups(end, follow_ups))
+
+
+def slow_follow_ups(end: tuple[float, float], follow_ups: list[tuple]) -> tuple[list[float], list[slow.Columns]]:
+    """Weights, columns."""
     weights = slow.follow_up_weights(end, [start for _, _, start in follow_ups])
-    after = [slow.frame(row, None, ec)[0] for row, ec, _ in follow_ups]
-    return [slow.group(columns, weights, after) for columns in slow.frame(*frame)]
+    return weights, [slow.frame(row, None, ec)[0] for row, ec, _ in follow_ups]

@@ -32,9 +32,28 @@ def test_a_scenario_multiplies_its_stages_and_averages_now_and_previous():
     one = aggregate([(now, previous)])
     np.testing.assert_allclose(one.final.filtered, [(1.0 + 0.6) / 2, (0.4 + 0.25) / 2])
     np.testing.assert_allclose(one.stage_one.filtered, [0.9, 0.75])
-    np.testing.assert_allclose(one.stage_two, [2.5 / 4, 1.7 / 4])
+    # now: all the weight on (1, 0.8); previous: uniform, (0.75, 0.25)
+    np.testing.assert_allclose(one.stage_two, [(1.0 + 0.75) / 2, (0.8 + 0.25) / 2])
+    np.testing.assert_allclose(one.follow_ups, [2.5 / 4, 1.7 / 4])
     nothing = group([0.0, 0.0], [[1.0, 1.0]], [0.0])
     np.testing.assert_allclose(aggregate([(now, previous), (nothing, nothing)]).final.filtered, one.final.filtered / 2)
+
+
+def test_in_stage_two_a_group_counts_once_however_many_follow_ups_it_has():
+    row = [1.0]
+    many = group(row, [[0.2]] * 9, [5.0] * 9)
+    one, pair = group(row, [[0.8]], [0.0]), group(row, [[0.4], [1.0]], [0.0, 0.0])
+    both = aggregate([(many, one), (one, pair)])
+    np.testing.assert_allclose(both.stage_two, [(0.2 + 0.8 + 0.8 + 0.7) / 4])
+    np.testing.assert_allclose(both.follow_ups, [(9 * 0.2 + 0.8 + 0.8 + 0.4 + 1.0) / 13])
+
+
+def test_stage_two_is_the_final_score_of_a_planner_that_is_perfect_in_stage_one():
+    rng = np.random.default_rng(3)
+    groups = [group([1.0, 1.0], rng.uniform(size=(4, 2)).tolist(), rng.uniform(0.0, 1.0, 4).tolist()) for _ in range(6)]
+    found = aggregate(list(zip(groups[:3], groups[3:])))
+    np.testing.assert_allclose(found.stage_two, found.final.unfiltered, rtol=1e-12)
+    assert (np.abs(found.stage_two - found.follow_ups) > 1e-3).all()
 
 
 def test_a_group_without_follow_up_frames_is_refused():

@@ -70,9 +70,12 @@ def follow_up_weights(endpoint: tuple[float, float], starts: Sequence[tuple[floa
     return [weight / total for weight in weights]
 
 
+def weighted(weights: Sequence[float], stage_two: Sequence[Columns]) -> Columns:
+    """A group's stage two; a follow-up frame without a column leaves the group without it."""
+    return {name: sum(weight * after[name] for weight, after in zip(weights, stage_two)) for name in stage_two[0]}
+
+
 def group(stage_one: Columns, weights: Sequence[float], stage_two: Sequence[Columns]) -> Columns:
-    """Stage one times the weighted stage two; a follow-up frame without a column leaves the group without it."""
-    return {
-        name: value * sum(weight * after[name] for weight, after in zip(weights, stage_two))
-        for name, value in stage_one.items()
-    }
+    """Stage one times the weighted stage two."""
+    after = weighted(weights, stage_two)
+    return {name: value * after[name] for name, value in stage_one.items()}
