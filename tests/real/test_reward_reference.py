@@ -162,7 +162,10 @@ def test_official_rows_against_pdm_closed_with_the_human_filter(shared_root: Pat
 def test_score_trajectories_equals_the_official_scores_from_the_raw_log(
     shared_root: Path, reader: AV2Reader, name: str
 ) -> None:
-    """Poses and a clip in, PDM-Closed as the reference by default: the public pdm_score() to 1e-9."""
+    """Poses and a clip in, PDM-Closed as the reference by default: the public pdm_score().
+
+    To 1e-6: the public code reads PDM-Closed's plan back at times truncated to microseconds, up to 7e-6 m away.
+    """
     log, frame = name.split("_")
     log_id = next(log_id for log_id in log_folders(reader.root) if log_id.startswith(log))
     clip = reader.read(ClipRef("av2", log_id, (int(frame) - NOW) * 100))
@@ -173,7 +176,7 @@ def test_score_trajectories_equals_the_official_scores_from_the_raw_log(
     ours = score_trajectories(clip, proposals)
     for ours_name, theirs in (("ep", "ego_progress"), ("pdm_score", "pdm_score")):
         expected = [row[theirs] for row in replayed]
-        np.testing.assert_allclose(getattr(ours, ours_name), expected, rtol=0, atol=1e-9, err_msg=theirs)
+        np.testing.assert_allclose(getattr(ours, ours_name), expected, rtol=0, atol=1e-6, err_msg=theirs)
     assert len(set(np.round(ours.pdm_score, 6))) > 2
 
 
