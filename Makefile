@@ -52,10 +52,11 @@ format: install
 bench: install
 	$(PY) -m tests.bench
 
+# PEER=<python of an environment with the packages navsim and nuplan-devkit> runs the public metric in turns with ours.
 bench-reward: install
 	OMP_NUM_THREADS=1 $(PY) -m tests.bench.bench_reward
 
-# SCENE=<file> adds the row of a scene that a reconstruction wrote.
+# SCENE=<file> adds the row of a scene that a reconstruction wrote, PEER=<checkout of OpenSplat> its compiled CPU rasteriser.
 bench-render: install
 	$(PY) -m tests.bench.bench_render $(SCENE)
 

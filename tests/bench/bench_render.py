@@ -2,7 +2,8 @@
 
 Row one is a seeded cloud of 100,000 Gaussians; row two, where a scene file is named, the street of that scene from the
 middle of its block. The clock is the wall's; CPU time stands beside it, for a machine that does other things as well.
-Before them comes the peak memory of a large picture.
+Before them comes the peak memory of a large picture. PEER=<a checkout of OpenSplat> draws the same views with its
+compiled CPU rasteriser in turns with ours; it blurs each Gaussian by 0.3 px^2, ours by 0.1, hence two pictures.
 """
 
 import argparse
@@ -12,23 +13,23 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from factory.scene_file import read_scene
 from tasks.render.gaussians import Gaussians
 from tasks.render.gradient import backward
-from tasks.render.project import TILE
-from tasks.render.raster import Splats, splat, trace
+from tasks.render.raster import splat, trace
+from tests.bench.peer_splat import Draw, compiled, drawing, peer_checkout
 from tests.bench.timing import cpu_milliseconds, memory_mb, milliseconds
-from tests.tasks.render.slow_raster import slow, slow_render
+
+Picture = NDArray[np.float32]
 
 WIDTH, HEIGHT = 480, 270
 INTRINSICS = np.array([[0.6 * WIDTH, 0.0, WIDTH / 2], [0.0, 0.6 * WIDTH, HEIGHT / 2], [0.0, 0.0, 1.0]])
 SIGMA_PX = 2.155  # gives 3.6 tiles per Gaussian
 LARGE = (2048, 1536)
 REPEATS = 15
-TWIN_EVERY = 40  # tiles; the twin is timed on so many and the rest is reckoned
+PEER_TURNS = 7
 BLACK = np.zeros(3, np.float32)
 EYE_M = 1.6
 
@@ -69,40 +70,41 @@ def street_view(scene: Path) -> tuple[Gaussians, NDArray[np.float64]]:
     return street, best
 
 
-def twin_seconds(scene: Gaussians, camera: NDArray[np.float64], splats: Splats, there_and_back: bool) -> float:
-    """What the torch twin would take, given each tile's Gaussians: a sample of the tiles, times their number."""
-    columns, tiles = -(-WIDTH // TILE), range(0, len(splats.tile_start) - 1, TWIN_EVERY)
-    background = torch.zeros((HEIGHT, WIDTH, 3))
-    start = time.perf_counter()
-    for t in tiles:
-        rows = splats.index[splats.tile_splats[splats.tile_start[t] : splats.tile_start[t + 1]]]
-        part = slow(scene.take(rows), torch.float32, grad=there_and_back)
-        x0, y0 = (t % columns) * TILE, (t // columns) * TILE
-        window = (x0, y0, min(x0 + TILE, WIDTH), min(y0 + TILE, HEIGHT))
-        rgb, _, _ = slow_render(part, INTRINSICS, camera, background, window=window)
-        if there_and_back and len(rows):
-            rgb.sum().backward()
-    return (time.perf_counter() - start) * (len(splats.tile_start) - 1) / len(tiles)
-
-
-def row(name: str, scene: Gaussians, camera: NDArray[np.float64], threads: int) -> None:
-    """Prints the scene's two lines of the table, there and there and back."""
+def row(name: str, scene: Gaussians, camera: NDArray[np.float64], threads: int, peer: Draw | None) -> None:
+    """Prints the scene's two lines of the table, there and there and back; the peer's beside the first."""
     view = (scene, INTRINSICS, camera, WIDTH, HEIGHT, BLACK, threads)
     record = trace(*view)
     pairs, seen = len(record.splats.tile_splats), len(record.splats.index)
     upstream = np.random.default_rng(1).normal(size=record.view.rgb.shape).astype(np.float32)
     about = f"{name} | {len(scene):,} | {seen:,} | {pairs / max(seen, 1):.1f}"
-    calls: list[tuple[str, Callable[[], object], bool]] = [
-        ("forward", lambda: trace(*view), False),
-        ("forward + backward", lambda: backward(trace(*view), scene, upstream, threads=threads), True),
+    calls: list[tuple[str, Callable[[], object]]] = [
+        ("forward", lambda: trace(*view)),
+        ("forward + backward", lambda: backward(trace(*view), scene, upstream, threads=threads)),
     ]
-    for what, call, back in calls:
+    for what, call in calls:
         wall_s = milliseconds(call, REPEATS) / 1e3
-        twin_s = twin_seconds(scene, camera, record.splats, back)
-        print(
+        line = (
             f"| {about} | {what} | {1e3 * wall_s:.0f} | {cpu_milliseconds(call, REPEATS):.0f} | {1 / wall_s:.1f} "
-            f"| {WIDTH * HEIGHT / wall_s / 1e6:.1f} | {pairs / wall_s / 1e6:.1f} | {twin_s / wall_s:.0f}x |"
+            f"| {WIDTH * HEIGHT / wall_s / 1e6:.1f} | {pairs / wall_s / 1e6:.1f} |"
         )
+        if peer is not None:
+            theirs = drawing(peer, scene, INTRINSICS, camera, WIDTH, HEIGHT)
+            line += f" {in_turns(call, theirs, record.view.rgb)} |" if what == "forward" else " | | |"
+        print(line, flush=True)
+
+
+def in_turns(ours: Callable[[], object], theirs: Callable[[], NDArray[np.float32]], picture: Picture) -> str:
+    """The peer's CPU time, the ratios to ours of the same turn, and how far the two pictures are apart."""
+    mse = float(np.mean((theirs() - picture) ** 2))
+    times = np.empty((PEER_TURNS, 2))
+    for turn in times:
+        for i, call in enumerate((ours, theirs)):
+            start = time.process_time()
+            call()
+            turn[i] = time.process_time() - start
+    ratio = times[:, 1] / times[:, 0]
+    ratios = " / ".join(f"{value:.1f}" for value in (ratio.min(), np.median(ratio), ratio.max()))
+    return f"{1e3 * np.median(times[:, 1]):.0f} | {ratios} | {-10.0 * np.log10(mse):.1f}"
 
 
 def memory() -> None:
@@ -127,19 +129,20 @@ def memory() -> None:
 
 def main(scene: Path | None = None, threads: int = 2) -> None:
     """Prints the table; the second row only where a scene file is given."""
-    torch.set_num_threads(threads)
+    checkout = peer_checkout()
+    peer = compiled(checkout) if checkout else None
     memory()  # first, for what others leave behind would be used again
     print(
         f"\nrasteriser, {WIDTH}x{HEIGHT}, {threads} threads, load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores\n"
     )
-    print(
-        "| scene | Gaussians | in view | tiles each | what | ms | CPU ms | per s | Mpix/s | M intersections/s "
-        "| torch twin |"
-    )
-    print("|---|---|---|---|---|---|---|---|---|---|---|")
-    row("seeded", cloud(100_000), np.eye(4), threads)
+    columns = ["scene", "Gaussians", "in view", "tiles each", "what", "ms", "CPU ms", "per s", "Mpix/s"]
+    columns += ["M intersections/s"]
+    if peer:
+        columns += ["peer CPU ms", "peer / ours, least / median / most", "PSNR of the two dB"]
+    print("| " + " | ".join(columns) + " |\n" + "|---" * len(columns) + "|")
+    row("seeded", cloud(100_000), np.eye(4), threads, peer)
     if scene is not None:
-        row(scene.stem, *street_view(scene), threads)
+        row(scene.stem, *street_view(scene), threads, peer)
 
 
 if __name__ == "__main__":

@@ -1,94 +1,160 @@
 """Simulate and score K trajectories on one core: `make bench-reward`, `python -m tests.bench.bench_reward`.
 
 The public metric's recorded scenes where they are at hand (proposals for K = 256 on all, 4,096 on four, 16,384 on
-one), else a clip of the synthetic town under the kinematic vocabulary. Every row is a fresh process with one thread;
-times are CPU time, the median of several calls; memory is the peak above what stood before the first such call.
+one), else a clip of the synthetic town under the kinematic vocabulary. K = 2 is what an attempt pays, PDM-Closed and
+the planner. Every row is a fresh process with one thread; times are CPU time, least and median of several calls;
+memory is the peak above what stood before the first such call. What is made ready before is not in `us each`:
+`new place` is paid once per place of the ego, `prepare` whenever the traffic is another.
+
+PEER=<python of an environment with the packages navsim and nuplan-devkit> runs the public metric on the same
+trajectories in turns with ours and says whether the scores are equal; without it nothing is compared.
 """
 
 import multiprocessing
 import sys
-from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factory.clips.synthetic.reader import SyntheticReader
 from tasks.kinematic_vocabulary import kinematic_trajectories
-from tasks.reward.epdms import score
-from tasks.reward.prepare import PreparedScene, prepare_scene
+from tasks.reward.boxes import ego_boxes
+from tasks.reward.epdms import Scores, score
+from tasks.reward.prepare import N_TIMES, PAST_STEPS, PreparedScene, prepare
 from tasks.rollout.lqr import track_local
 from tasks.world.clip import NOW, scene_of_clip
-from tests.bench.timing import cpu_milliseconds, memory_mb
-from tests.real.reference_scenes import RECORDED_K, SCENES, loader, prepared_scene
+from tasks.world.frames import to_world
+from tasks.world.polygons import polygons_near
+from tasks.world.vehicle import PACIFICA
+from tests.bench.peer import BenchScene, Beside, beside, peer_python
+from tests.bench.timing import cpu_milliseconds, least_and_median_cpu_ms, memory_mb
+from tests.real.reference_scenes import RECORDED_K, SCENES, loader, logged_tracks, map_polygons
 
-PUBLIC_MS_PER_TRAJECTORY = 20.0  # the public implementation, one core
-SIZES = (1, 256, 4096, 16384)
+SIZES = (2, 256, 4096, 16384)
+TURNS = {2: 21, 256: 5, 4096: 1, 16384: 1}  # with a peer, which takes minutes for the large ones
 
 
 @dataclass(frozen=True)
 class Row:
     """One line of the table."""
 
-    prepare_ms: float
-    simulate_ms: float
-    score_ms: float
+    place_ms: float  # map, centreline and objects made ready, the map for the first time
+    prepare_ms: float  # the same on a map that was ready already: a further pair of the clip
+    simulate_ms: tuple[float, float]  # least, median
+    score_ms: tuple[float, float]  # least, median
     peak_mb: float
+    beside: Beside | None
 
 
-def measured(prepared: Callable[[], PreparedScene], ego_state: np.ndarray, trajectories: np.ndarray) -> Row:
-    """Times of one scene and K, once everything is compiled."""
-    ready = prepared()
-    states = track_local(ego_state, trajectories[:1])
-    score(ready, states)
-    before = memory_mb("VmRSS")
-    Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew here
-    score(ready, track_local(ego_state, trajectories))
-    peak = memory_mb("VmHWM") - before
-
-    repeats = 5 if len(trajectories) > 1000 else 40
-    states = track_local(ego_state, trajectories)
-    return Row(
-        prepare_ms=cpu_milliseconds(prepared, 10),
-        simulate_ms=cpu_milliseconds(lambda: track_local(ego_state, trajectories), repeats),
-        score_ms=cpu_milliseconds(lambda: score(ready, states), repeats),
-        peak_mb=peak,
+def prepared_scene(scene: BenchScene) -> PreparedScene:
+    """The scene as the reward takes it."""
+    return prepare(
+        past_states=scene.past_states,
+        centerline=scene.centerline,
+        polygons=scene.polygons,
+        route_lane_ids=scene.route_lane_ids,
+        objects=scene.objects,
+        ego_state0=scene.ego_state0,
+        drop_touching=False,
     )
 
 
-def recorded_row(root: Path, scene: str, k: int) -> Row:
+def measured(scene: BenchScene, trajectories: NDArray[np.float64], peer: str | None) -> Row:
+    """Times of one scene and its trajectories (K, 40, 3) in the ego's frame, once everything is compiled."""
+    ready, ego_state = prepared_scene(scene), scene.ego_state0
+
+    def drive_and_score() -> Scores:
+        return score(ready, track_local(ego_state, trajectories))
+
+    score(ready, track_local(ego_state, trajectories[:1]))
+    before = memory_mb("VmRSS")
+    Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew here
+    drive_and_score()
+    peak = memory_mb("VmHWM") - before
+
+    repeats = 5 if len(trajectories) > 1000 else 200
+    states = track_local(ego_state, trajectories)
+    poses = to_world(ego_state[:3], trajectories)
+    return Row(
+        place_ms=cpu_milliseconds(lambda: prepared_scene(elsewhere(scene)), 10),
+        prepare_ms=cpu_milliseconds(lambda: prepared_scene(scene), 10),
+        simulate_ms=least_and_median_cpu_ms(lambda: track_local(ego_state, trajectories), repeats),
+        score_ms=least_and_median_cpu_ms(lambda: score(ready, states), repeats),
+        peak_mb=peak,
+        beside=beside(peer, scene, poses, drive_and_score, TURNS[len(trajectories)]) if peer else None,
+    )
+
+
+def elsewhere(scene: BenchScene) -> BenchScene:
+    """The same scene on a map that nothing has been made of yet."""
+    return replace(scene, polygons=tuple(replace(polygon) for polygon in scene.polygons))
+
+
+def recorded_row(root: Path, name: str, k: int, peer: str | None) -> Row:
     """One of the public metric's scenes with its recorded proposals."""
     module = loader(root)
-    inputs = module.inputs(scene)
-    return measured(lambda: prepared_scene(inputs), inputs["ego_state0"], module.proposals(scene, k))
+    inputs = module.inputs(name)
+    scene = BenchScene(
+        ego_state0=inputs["ego_state0"],
+        past_states=inputs["past_states"],
+        centerline=inputs["centerline"],
+        polygons=tuple(map_polygons(inputs)),
+        route_lane_ids=frozenset(inputs["route_lane_ids"]),
+        objects=logged_tracks(inputs).window(0, N_TIMES),
+    )
+    return measured(scene, module.proposals(name, k), peer)
 
 
-def town_row(k: int) -> Row:
+def town_row(k: int, peer: str | None) -> Row:
     """A clip of the synthetic town."""
     reader = SyntheticReader(n_clips=1)
-    scene = scene_of_clip(reader.read(reader.index().refs[0]))
-    agents = scene.agents.window(NOW, NOW + 41)
-    return measured(lambda: prepare_scene(scene, agents), scene.ego_state, kinematic_trajectories(k, 0))
+    now = scene_of_clip(reader.read(reader.index().refs[0]))
+    scene = BenchScene(
+        ego_state0=now.ego_state,
+        past_states=now.ego_history[list(PAST_STEPS)],
+        centerline=now.centerline,
+        polygons=polygons_near(now.clip.road_map, ego_boxes(now.ego_state, PACIFICA)[:2]),
+        route_lane_ids=now.clip.route.lane_ids,
+        objects=now.agents.window(NOW, NOW + N_TIMES),
+    )
+    return measured(scene, kinematic_trajectories(k, 0), peer)
 
 
 def main(root: Path) -> None:
     """Prints the table, row by row."""
-    print("| scene | K | prepare ms | simulate ms | score ms | total ms | us each | peak MB | public / ours |")
-    print("|---|---|---|---|---|---|---|---|---|")
+    peer = peer_python()
+    columns = [
+        "scene",
+        "K",
+        "new place ms",
+        "prepare ms",
+        "simulate ms",
+        "score ms",
+        "us each, least / median",
+        "peak MB",
+    ]
+    if peer:
+        columns += ["in turns: ours us each", "public us each", "public / ours, least / median / most", "scores"]
+    print("| " + " | ".join(columns) + " |\n" + "|---" * len(columns) + "|")
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=context, max_tasks_per_child=1) as pool:
         if (root / "reference").is_dir():
-            jobs = [(name, k, (recorded_row, root, name, k)) for k in SIZES for name in SCENES if _recorded(name, k)]
+            rows = [
+                (name, k, (recorded_row, root, name, k, peer)) for k in SIZES for name in SCENES if _recorded(name, k)
+            ]
         else:
             print(f"no recorded scenes at {root}: a synthetic one instead", file=sys.stderr)
-            jobs = [("synthetic town", k, (town_row, k)) for k in SIZES]
-        for name, k, job in jobs:
+            rows = [("synthetic town", k, (town_row, k, peer)) for k in SIZES]
+        for name, k, job in rows:
             row: Row = pool.submit(*job).result()
-            total = row.simulate_ms + row.score_ms
+            least, median = (1e3 * (a + b) / k for a, b in zip(row.simulate_ms, row.score_ms))
+            compared = f" {row.beside.row(k)} |" if row.beside else ""
             print(
-                f"| {name} | {k:,} | {row.prepare_ms:.1f} | {row.simulate_ms:.2f} | {row.score_ms:.2f} | {total:.2f} "
-                f"| {1e3 * total / k:.1f} | {row.peak_mb:.0f} | {PUBLIC_MS_PER_TRAJECTORY * k / total:,.0f} |",
+                f"| {name} | {k:,} | {row.place_ms:.1f} | {row.prepare_ms:.2f} | {row.simulate_ms[1]:.3f} "
+                f"| {row.score_ms[1]:.3f} | {least:.1f} / {median:.1f} | {row.peak_mb:.0f} |{compared}",
                 flush=True,
             )
 

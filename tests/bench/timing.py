@@ -9,12 +9,17 @@ import numpy as np
 
 def milliseconds(call: Callable[[], object], repeats: int) -> float:
     """Median wall time of one call, after one that warms up."""
-    return _median_ms(call, repeats, time.perf_counter)
+    return _times_ms(call, repeats, time.perf_counter)[1]
 
 
 def cpu_milliseconds(call: Callable[[], object], repeats: int) -> float:
     """Median CPU time of one call, after one that warms up."""
-    return _median_ms(call, repeats, time.process_time)
+    return _times_ms(call, repeats, time.process_time)[1]
+
+
+def least_and_median_cpu_ms(call: Callable[[], object], repeats: int) -> tuple[float, float]:
+    """CPU time of the quickest and of the median call, after one that warms up."""
+    return _times_ms(call, repeats, time.process_time)
 
 
 def memory_mb(field: str) -> float:
@@ -23,11 +28,11 @@ def memory_mb(field: str) -> float:
     return float(next(line.split()[1] for line in lines if line.startswith(field))) / 1024.0
 
 
-def _median_ms(call: Callable[[], object], repeats: int, clock: Callable[[], float]) -> float:
+def _times_ms(call: Callable[[], object], repeats: int, clock: Callable[[], float]) -> tuple[float, float]:
     call()
     times = []
     for _ in range(repeats):
         start = clock()
         call()
         times.append(clock() - start)
-    return 1e3 * float(np.median(times))
+    return 1e3 * min(times), 1e3 * float(np.median(times))

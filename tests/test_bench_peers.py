@@ -1,0 +1,45 @@
+"""The benchmarks' peers: a ratio needs a peer that is there, and one that is not is refused in one line."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.bench.bench_reward import town_row
+from tests.bench.peer import Beside, peer_python
+from tests.bench.peer_splat import peer_checkout
+
+
+def test_without_a_peer_nothing_is_compared(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("PEER", raising=False)
+    assert peer_python() is None
+    assert peer_checkout() is None
+    row = town_row(2, None)
+    assert row.beside is None
+    assert 0.0 < row.score_ms[0] <= row.score_ms[1]
+
+
+@pytest.mark.parametrize("python", ["/nowhere/python", sys.executable])
+def test_a_python_without_the_public_metric_is_refused_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, python: str
+) -> None:
+    monkeypatch.setenv("PEER", python)
+    with pytest.raises(SystemExit, match="navsim and nuplan-devkit are installed") as refused:
+        peer_python()
+    assert str(refused.value).startswith(f"PEER={python} ")
+    assert "\n" not in str(refused.value)
+
+
+def test_a_checkout_without_the_rasteriser_is_refused_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("PEER", str(tmp_path))
+    with pytest.raises(SystemExit, match="give a checkout of pierotofy/OpenSplat"):
+        peer_checkout()
+
+
+def test_ratios_are_of_turns_and_unequal_scores_are_said() -> None:
+    turns = {"ours_s": np.array([1e-4, 2e-4, 1e-4]), "peer_s": np.array([2e-2, 2e-2, 3e-2])}
+    assert Beside(**turns, worst=1e-12).row(2) == "50.0 | 10,000 | 100 / 200 / 300 | equal"
+    assert Beside(**turns, worst=0.5).row(2).endswith("| differ by 0.5")
