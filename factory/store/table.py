@@ -51,11 +51,6 @@ class TableSpec:
     properties: Mapping[str, str] | None = None
     packed: tuple[str, ...] = ()  # leaves whose values are compressed already, as their paths in a file
 
-    @property
-    def file_schema(self) -> pa.Schema:
-        """The schema of the files: partition columns stand in their paths."""
-        return pa.schema([f for f in self.schema if f.name not in self.partition_by])
-
 
 @dataclass(frozen=True)
 class Shard:
@@ -80,6 +75,8 @@ class LiveFile:
 def write_shard(location: Location, spec: TableSpec, rows: pa.Table) -> Shard:
     """Write rows of ONE partition, sorted by key, as one file under the table's folder. Idempotent.
 
+    The partition's columns stand in the file too, where Delta does not need them: a file alone says what it holds.
+    Tables take them from the log all the same, so that files of versions that left them out are read alike.
     Page checksums are on and row groups hold at most 4 MB, or one row. Arrow's own schema is left out of the file, so
     that every engine reads plain lists as the Delta log says. The table's packed leaves are stored as they are: neither
     zstd nor a dictionary makes a JPEG smaller, and every reader would have to undo them.
@@ -90,12 +87,11 @@ def write_shard(location: Location, spec: TableSpec, rows: pa.Table) -> Shard:
         (value,) = pc.unique(rows[name]).to_pylist()
         partition[name] = str(value)
     keys = tuple(rows[spec.key].to_pylist())
-    body = rows.drop_columns(list(spec.partition_by))
-    group_rows = max(1, int(ROW_GROUP_BYTES // max(1, body.nbytes // max(1, body.num_rows))))
+    group_rows = max(1, int(ROW_GROUP_BYTES // max(1, rows.nbytes // max(1, rows.num_rows))))
     sink = pa.BufferOutputStream()
-    leaves = [path for field in body.schema for path in _leaf_paths(field.name, field.type)]
+    leaves = [path for field in rows.schema for path in _leaf_paths(field.name, field.type)]
     pq.write_table(
-        body,
+        rows,
         sink,
         row_group_size=group_rows,
         compression={path: "none" if path in spec.packed else "zstd" for path in leaves},

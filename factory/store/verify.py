@@ -1,7 +1,7 @@
 """Checks a store from its files alone: `python -m factory.store.verify OUT`.
 
-Damage is what must not be: a file of the log that is missing or fails its checksums, a key twice, a round out of order,
-an episode that is not whole.
+Damage is what must not be: a file of the log that is missing or fails its checksums, or whose own expert and round are
+not those that the log says; a key twice, a round out of order, an episode that is not whole.
 Orphans are harmless: files no commit names, left behind by a run that died, and episodes of rows that were replaced;
 readers ignore them.
 """
@@ -11,9 +11,11 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import pyarrow.compute as pc
+
 from factory.store.episodes import FOLDER, check_episode, episode_name
 from factory.store.samples import Store
-from factory.store.table import KeyedTable
+from factory.store.table import KeyedTable, read_parquet
 
 
 @dataclass(frozen=True)
@@ -48,8 +50,14 @@ def _damaged_files(table: KeyedTable) -> list[str]:
     for path, partition in sorted(table.live_files().items()):
         try:
             table.read_file(path, partition)
+            stated = read_parquet(table.location, path, list(partition))  # nothing in a file of a version before 0.2
         except OSError as error:
             found.append(str(error))
+            continue
+        for name in stated.column_names:
+            values = sorted(map(str, pc.unique(stated[name]).to_pylist()))
+            if values != [partition[name]]:
+                found.append(f"{table.spec.name}/{path}: {name} is {', '.join(values)}, the log says {partition[name]}")
     return found
 
 

@@ -1,0 +1,128 @@
+"""A shard says of itself which expert and round it holds, and every engine reads a table of such shards as before."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import duckdb
+import polars as pl
+import pyarrow as pa
+import pyarrow.dataset as ds
+import pyarrow.parquet as pq
+import pytest
+from deltalake import DeltaTable
+
+from factory.execute import execute
+from factory.store.location import Location
+from factory.store.reader import SampleTable
+from factory.store.samples import Store
+from factory.store.schema import SAMPLES
+from factory.store.table import KeyedTable, Shard
+from factory.store.verify import verify
+from tests.factory.tables import assert_same_rows, assert_same_tables
+from tests.factory.toy import ToyWork, refs
+
+PLACE = ["attempt_id", "expert", "round"]
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("run")
+    execute(ToyWork(), refs(3), ["recovery", "human"], 2, Store(folder), "local", say=lambda line: None)
+    return folder
+
+
+def without_place(out: Path, to: Path) -> Path:
+    """The same run as version 0.1.0 wrote it: expert and round stand in the folders' names and in the log alone."""
+    shutil.copytree(out, to)
+    store, old = Store(to), KeyedTable(Location.parse(to / "old"), SAMPLES)
+    shards = []
+    for path, partition in store.samples.live_files().items():
+        rows = pq.ParquetFile(to / "samples" / path).read()
+        target = to / "old" / path
+        target.parent.mkdir(parents=True)
+        pq.write_table(rows.drop_columns(["expert", "round"]), target, store_schema=False)
+        shards.append(Shard(path, target.stat().st_size, partition, tuple(rows["attempt_id"].to_pylist())))
+    old.commit(shards)
+    shutil.rmtree(to / "samples")
+    (to / "old").rename(to / "samples")
+    return to
+
+
+def places(rows: list[dict[str, object]]) -> list[tuple[object, ...]]:
+    return sorted(tuple(row[name] for name in PLACE) for row in rows)
+
+
+@pytest.mark.parametrize(
+    "read",
+    [
+        lambda file: pq.read_table(file).to_pylist(),
+        lambda file: pq.ParquetFile(file).read(PLACE).to_pylist(),
+        lambda file: duckdb.sql(f"select * from '{file}'").to_arrow_table().to_pylist(),
+        lambda file: pl.read_parquet(file).select(PLACE).to_dicts(),
+    ],
+    ids=["pyarrow", "pyarrow file", "duckdb", "polars"],
+)
+def test_a_shard_that_was_sent_alone_tells_expert_and_round(
+    out: Path, tmp_path: Path, read: Callable[[Path], list[dict[str, object]]]
+) -> None:
+    for path, partition in Store(out).samples.live_files().items():
+        alone = shutil.copy(out / "samples" / path, tmp_path / "alone.parquet")
+        assert {(row["expert"], str(row["round"])) for row in read(Path(alone))} == {
+            (partition["expert"], partition["round"])
+        }
+
+
+ENGINES = {
+    "delta-rs": lambda uri: DeltaTable(uri).to_pyarrow_table(columns=PLACE).to_pylist(),
+    "duckdb on delta-rs": lambda uri: delta_in_duckdb(uri),
+    "polars": lambda uri: pl.scan_delta(uri).select(PLACE).collect().to_dicts(),
+    "duckdb on files": lambda uri: (
+        duckdb.sql(f"select {', '.join(PLACE)} from read_parquet('{uri}/**/*.parquet', hive_partitioning=true)")
+        .to_arrow_table()
+        .to_pylist()
+    ),
+    "pyarrow on files": lambda uri: ds.dataset(uri, partitioning="hive").to_table(columns=PLACE).to_pylist(),
+}
+
+
+def delta_in_duckdb(uri: str) -> list[dict[str, object]]:
+    samples = DeltaTable(uri).to_pyarrow_dataset()  # found by its name
+    assert samples.count_rows()
+    found = duckdb.sql(f"select {', '.join(PLACE)} from samples where expert <> 'nobody' and round >= 0")
+    table: pa.Table = found.to_arrow_table()
+    return table.to_pylist()
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("version", ["0.1.0", "now"])
+def test_every_engine_reads_expert_and_round_of_every_row(out: Path, tmp_path: Path, engine: str, version: str) -> None:
+    folder = out if version == "now" else without_place(out, tmp_path / "old")
+    ours = Store(out).samples.read(PLACE).to_pylist()
+    assert places(ENGINES[engine](str(folder / "samples"))) == places(ours) and len(ours) >= 6
+
+
+def test_a_table_of_version_0_1_0_is_read_verified_and_gone_on_with(out: Path, tmp_path: Path) -> None:
+    old = without_place(out, tmp_path / "old")
+    assert_same_rows(SampleTable(old).table(), SampleTable(out).table())
+    assert [s["expert"] for s in SampleTable(old)] == [s["expert"] for s in SampleTable(out)]
+    assert verify(Store(old)).damage == ()
+    longer = tmp_path / "longer"
+    shutil.copytree(out, longer)
+    for folder in (old, longer):
+        execute(ToyWork(), refs(3), ["recovery", "human"], 3, Store(folder), "local", say=lambda line: None)
+    assert_same_tables(old, longer)
+    assert len(SampleTable(old)) > len(SampleTable(out)), "some shards say it themselves, some do not"
+    assert verify(Store(old)).damage == ()
+    assert places(ENGINES["polars"](str(old / "samples"))) == places(Store(longer).samples.read(PLACE).to_pylist())
+
+
+def test_a_shard_in_another_s_place_is_damage(out: Path, tmp_path: Path) -> None:
+    shutil.copytree(out, tmp_path / "out")
+    store = Store(tmp_path / "out")
+    (path,) = (path for path, part in store.samples.live_files().items() if part == {"round": "0", "expert": "human"})
+    file = tmp_path / "out" / "samples" / path
+    rows = pq.ParquetFile(file).read()
+    at = rows.column_names.index("expert")
+    pq.write_table(rows.set_column(at, "expert", pa.array(["recovery"] * rows.num_rows)), file, store_schema=False)
+    assert f"samples/{path}: expert is recovery, the log says human" in verify(store).damage[0]
