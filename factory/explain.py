@@ -68,13 +68,13 @@ def explain(argv: Sequence[str]) -> int:
     from factory.look.drawing import attempt_picture, candidates_picture, film
     from factory.look.video import write_mp4
     from factory.pipeline import FactoryWork, PerturbedClip
-    from factory.settings import RunConfig, assemble
+    from factory.settings import assemble, run_config
     from factory.work import HUMAN_CANDIDATE, LOGGED
     from tasks.stages import SUBSCORES, Rejected
 
     own, overrides = split_arguments(argv)
     expert, to = own.expert, Path(own.to)
-    config = fill(RunConfig, compose("run", overrides) | {"experts": [expert]}, "run")
+    config = run_config(compose("run", overrides) | {"experts": [expert]})
     run = assemble(config)
     ref = find((*run.index.refs, *run.index.broken), own.clip)
     work: FactoryWork = run.work

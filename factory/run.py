@@ -17,6 +17,7 @@ from itertools import zip_longest
 from typing import TYPE_CHECKING
 
 from factory.config import ConfigError, compose, conf_dir
+from factory.words import Asked, asked_of
 
 if TYPE_CHECKING:
     from factory.clips.reader import ClipRef
@@ -30,10 +31,11 @@ def main(argv: Sequence[str]) -> int:
         print(help_text())
         return 0
     try:
-        if "--cfg" in argv:
-            print(settings_text([argument for argument in argv if argument != "--cfg"]))
+        asked = asked_of(argv)
+        if asked.shows:
+            print(settings_text(asked.words))
             return 0
-        return run(argv)
+        return run(asked)
     except ConfigError as error:
         print(f"error: {error}", file=sys.stderr)
         return BAD_CONFIG
@@ -41,7 +43,7 @@ def main(argv: Sequence[str]) -> int:
 
 def plan(argv: Sequence[str]) -> int:
     """The command `python -m factory plan`: dry_run=true."""
-    return main(argv if {"-h", "--help", "--cfg"} & set(argv) else [*argv, "dry_run=true"])
+    return main(argv if {"-h", "--help"} & set(argv) else [*argv, "dry_run=true"])
 
 
 def dealt(refs: Sequence["ClipRef"], hands: int) -> list["ClipRef"]:
@@ -83,18 +85,23 @@ def seconds_text(seconds: Mapping[str, tuple[int, float]]) -> str:
     return "\n".join([f"{'stage':<12}{'tasks':>8}{'seconds':>10}{'each':>10}", *lines])
 
 
-def run(overrides: Sequence[str]) -> int:
-    """Plan, execute, commit, report."""
+def run(asked: Asked) -> int:
+    """Plan, execute, commit, report. What the command line says is checked before anything heavy is imported."""
+    from factory.run_keys import check
+
+    values = compose("run", asked.words)
+    check(values, asked.overrides)
+
     from factory.benchmark import NEEDED, write_benchmark
     from factory.calibrate import calibrate, plan_text
     from factory.execute import COMPLETE, execute
     from factory.funnel import image_sources_text
     from factory.report import remember, write_report
-    from factory.settings import assemble, load_config
+    from factory.settings import assemble, run_config
     from factory.store.location import BadLocation, Location
     from factory.store.samples import Store
 
-    config = load_config(overrides)
+    config = run_config(values)
     try:
         store = Store(Location.parse(config.out))
     except BadLocation as error:
@@ -120,7 +127,7 @@ def run(overrides: Sequence[str]) -> int:
         shard_seconds=config.shard_seconds,
         minutes=config.minutes,
         episodes=config.one_episode_in,
-        command=overrides,
+        command=asked.words,
     )
     if summary.message:
         print(summary.message, file=sys.stderr)

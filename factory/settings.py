@@ -6,13 +6,15 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from factory.benchmark import BenchmarkSettings
 from factory.clips.reader import ClipIndex, ClipReader
 from factory.config import ConfigError, build, compose, fill, need_run_extra
 from factory.job import in_submitted_job
 from factory.pipeline import FactoryWork
+from factory.reward_settings import RewardSettings
+from factory.run_keys import RunKeys, VocabularyChoice
 from factory.vocabulary import (
     build_recovery_table,
     load_recovery_table,
@@ -21,7 +23,6 @@ from factory.vocabulary import (
     train_windows,
 )
 from factory.work import BENCHMARK, FOLLOW_UP_BEFORE, HUMAN, UNLISTED, RunIdentity, canonical_json
-from tasks.attempt import ExpertGate
 from tasks.caches import user_cache
 from tasks.experts.follow_up import FollowUp
 from tasks.experts.human import Human
@@ -55,21 +56,6 @@ ADDED: dict[str, object] = {"perturb.interleaved": True, "perturb.order": "drawn
 
 
 @dataclass(frozen=True)
-class VocabularyChoice:
-    """Which trajectories perturb the ego."""
-
-    file: str | None = None
-    k: int | None = None
-    human: bool = False  # whether a file must be given
-
-    def __post_init__(self) -> None:
-        if self.k is not None and self.k < 1:
-            raise ValueError(f"k={self.k}: must be positive, or null for the whole file")
-        if self.human and self.file is None:
-            raise ValueError("file is missing: give vocabulary.file=<.npy (K, 40, 3) of human trajectories>")
-
-
-@dataclass(frozen=True)
 class RecoverySources:
     """What the recovery table is made from."""
 
@@ -78,76 +64,20 @@ class RecoverySources:
 
 
 @dataclass(frozen=True)
-class RewardSettings(ExpertGate):
-    """What an expert's drive must reach, and the vocabulary labels that stand in every sample."""
+class RunConfig(RunKeys):
+    """conf/run.yaml, typed."""
 
-    labels: Literal["vocabulary", "none"] = "vocabulary"
-    traffic: Literal["replay", "idm"] = "replay"  # that of the sample's own judged drive, or one that answers to each
-    label_vocabulary: str | None = None  # another .npy file (K, 40, 3); None: the run's vocabulary
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.labels == "none" and self.label_vocabulary is not None:
-            raise ValueError(
-                f"label_vocabulary={self.label_vocabulary} is for labels=vocabulary, but labels=none: leave one out"
-            )
-
-
-@dataclass(frozen=True)
-class RunConfig:
-    """Everything on the command line of `python -m factory.run`; conf/run.yaml says what each key means."""
-
-    clips: dict[str, Any]
     perturb: PerturbSettings
     traffic: TrafficSettings
     pdm: PdmSettings
-    expert: dict[str, dict[str, Any]]
     reward: RewardSettings
     render: RenderSettings
-    vocabulary: VocabularyChoice
     benchmark: BenchmarkSettings
-    rounds: int
-    experts: tuple[str, ...]
-    executor: Literal["ray", "local"]
-    workers: int | None
-    gpu_share: float
-    limit: int | None
-    seed: int
-    out: str
-    on_change: Literal["stop", "keep", "redo"]
-    retry_failed: bool
-    minutes: float | None
-    shard_seconds: float
-    episodes: int | Literal["none", "all"]
-    dry_run: bool
 
     def __post_init__(self) -> None:
-        if self.rounds < 1:
-            raise ValueError(f"rounds={self.rounds}: at least one round is needed")
-        if not self.experts or len(set(self.experts)) != len(self.experts):
-            raise ValueError(f"experts={list(self.experts)}: name each expert once, at least one")
-        if self.minutes is not None and not self.minutes >= 0.0:
-            raise ValueError(f"minutes={self.minutes}: must not be negative, or null for no bound")
-        if not self.shard_seconds > 0.0:
-            raise ValueError(f"shard_seconds={self.shard_seconds}: must be positive")
-        if self.one_episode_in < 0 or self.episodes == 0:
-            raise ValueError(f"episodes={self.episodes}: must be none, all, or n for one sample in n")
-        for name in ("limit", "workers"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ValueError(f"{name}={value}: must be positive, or null for no bound")
-        if not 0.0 <= self.gpu_share <= 1.0:
-            raise ValueError(f"gpu_share={self.gpu_share}: the share of one GPU that an attempt claims, 0 to 1")
-        unknown = [name for name in self.experts if name not in self.expert]
-        if unknown:
-            raise ValueError(f"experts: {unknown} is not among {sorted(self.expert)}; add your own with +expert.<name>")
+        super().__post_init__()
         if self.render.map_rig not in RIGS:
             raise ValueError(f"render.map_rig={self.render.map_rig} is not among {', '.join(RIGS)}")
-
-    @property
-    def one_episode_in(self) -> int:
-        """Samples; 0 for no episode at all."""
-        return {"none": 0, "all": 1}[self.episodes] if isinstance(self.episodes, str) else self.episodes
 
 
 @dataclass(frozen=True)
@@ -162,7 +92,12 @@ class Run:
 
 def load_config(overrides: Sequence[str], name: str = "run") -> RunConfig:
     """The typed settings of a command line. Raises ConfigError."""
-    config = fill(RunConfig, compose(name, overrides), name)
+    return run_config(compose(name, overrides))
+
+
+def run_config(values: Mapping[str, Any]) -> RunConfig:
+    """The typed settings of composed ones. Raises ConfigError."""
+    config = fill(RunConfig, values, "")
     if config.executor == "ray":
         need_run_extra("ray")
     return config

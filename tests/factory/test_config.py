@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 import shutil
 import subprocess
 import sys
@@ -85,15 +86,15 @@ def test_the_run_s_keys_are_those_of_its_dataclass() -> None:
     [
         ("rounds_=2", "rounds_"),
         ("perturb.max_lateral=3", "max_lateral"),
-        ("+perturb.max_lateral=3", "run.perturb.max_lateral"),
-        ("+render.asset.gap=3", "run.render.asset.gap"),
-        ("traffic=fast", "traffic/fast"),
+        ("+perturb.max_lateral=3", "perturb.max_lateral"),
+        ("+render.asset.gap=3", "render.asset.gap"),
+        ("traffic=fast", "traffic=fast: there is idm, replay"),
         ("colour=red", "colour"),
         ("rounds", "rounds"),
     ],
 )
 def test_a_misspelt_override_is_an_error_that_names_it(override: str, named: str) -> None:
-    with pytest.raises(ConfigError, match=named.replace(".", r"\.").replace("/", ".")):
+    with pytest.raises(ConfigError, match=re.escape(named)):
         load_config([override])
 
 
@@ -113,9 +114,9 @@ def test_a_value_that_must_be_given_is_asked_for_by_its_key(clips: str, message:
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("rounds=0", "run: rounds=0: at least one round is needed"),
-        ("perturb.epdms_min=2", "run.perturb: perturb epdms_min must be from 0 to 1, not 2.0"),
-        ("rounds=many", r"run.rounds: Input should be a valid integer, unable to parse string .* \(got 'many'\)"),
+        ("rounds=0", "rounds=0: at least one round is needed"),
+        ("perturb.epdms_min=2", "perturb: perturb epdms_min must be from 0 to 1, not 2.0"),
+        ("rounds=many", r"rounds: must be a whole number \(got 'many'\)"),
     ],
 )
 def test_an_error_says_what_was_given_but_never_prints_a_whole_group(override: str, message: str) -> None:
@@ -147,18 +148,18 @@ def test_render_settings_at_their_bounds_are_taken() -> None:
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("rounds=many", r"run\.rounds: .*'many'"),
+        ("rounds=many", r"rounds: .*'many'"),
         ("rounds=0", "rounds=0"),
         ("limit=0", "limit=0"),
         ("shard_seconds=0", "shard_seconds=0"),
-        ("executor=spark", r"run\.executor: .*'spark'"),
+        ("executor=spark", r"executor: .*'spark'"),
         ("experts=[]", "at least one"),
         ("experts=[human,human]", "each expert once"),
-        ("perturb.epdms_min=high", r"run\.perturb\.epdms_min"),
+        ("perturb.epdms_min=high", r"perturb\.epdms_min"),
         ("perturb.step_lateral_m=0", "step_lateral_m must be positive"),
         ("traffic.headway_s=-1", "headway_s must be positive"),
         ("reward.full=[nc,comfort]", "comfort"),
-        ("render.mode=photo", r"run\.render\.mode"),
+        ("render.mode=photo", r"render\.mode"),
         ("render.map_rig=five_front", r"map_rig=five_front is not among .*three_front"),
         ("vocabulary.k=0", "k=0: must be positive"),
     ],
@@ -259,5 +260,5 @@ def test_a_backend_this_machine_lacks_is_refused_before_anything_is_read(monkeyp
     with pytest.raises(ConfigError, match=r"render\.backend=gsplat needs torch and gsplat"):
         assemble(load_config(["render.backend=gsplat", "clips=av2", "clips.root=/nowhere"]))
     refuse_missing_backend(load_config(["render=none", "render.backend=gsplat"]))  # nothing is drawn with it
-    with pytest.raises(ConfigError, match=r"run\.render\.backend"):
+    with pytest.raises(ConfigError, match=r"render\.backend"):
         load_config(["render.backend=gpu"])
