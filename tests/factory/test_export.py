@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 
 from factory.export import main
 from factory.look.episode_messages import episode_messages, metadata_of, world_from_now
-from factory.look.sample_picture import ego_way
 from factory.store.episodes import episode_bytes
 from factory.store.samples import Store
 from tests.planners.samples import FRONT_YAWS, jpeg, pictures, plain, sample, write_table
@@ -87,17 +86,25 @@ def test_a_flipped_byte_is_found(row: dict[str, Any]) -> None:
 
 
 def test_the_frames_lead_from_the_map_to_every_camera(row: dict[str, Any], topics: dict[str, list[Message]]) -> None:
-    way, now = ego_way(row), world_from_now(row)
-    rig = {camera["name"]: camera["ego_from_camera"].reshape(4, 4) for camera in row["cameras"]}
+    """The 16 poses of the history and the 40 of the label, around the 3-D pose at now; a camera looks along its yaw."""
     assert len(topics["/tf"]) == 56
+    now = np.eye(4)
+    now[:3, :3] = Rotation.from_euler("zyx", [0.7, 0.02, -0.01]).as_matrix()
+    now[:3, 3] = 4100.0, -250.0, 12.0
     for step, (time_ns, message) in enumerate(topics["/tf"]):
+        x, y, heading = row["ego_history_10hz"][step] if step < 16 else row["label_10hz"][step - 16]
         by_child = {transform.child_frame_id: transform for transform in message.transforms}
-        assert time_ns == round(1e9 * (7.5 - 1.5 + 0.1 * step)) == round(1e9 * seconds(by_child["ego"].timestamp))
+        assert time_ns == round(1e9 * (2.0 + 5.5 - 1.5 + 0.1 * step)) == round(1e9 * seconds(by_child["ego"].timestamp))
+        assert (by_child["now"].parent_frame_id, by_child["ego"].parent_frame_id) == ("world", "now")
         np.testing.assert_allclose(matrix(by_child["now"]), now, atol=1e-6)
-        np.testing.assert_allclose(matrix(by_child["ego"])[:2, 3], way[step, :2], atol=1e-6)
-        for name, pose in rig.items():
+        np.testing.assert_allclose(matrix(by_child["ego"])[:3, 3], [x, y, 0.0], atol=1e-6)
+        turned = Rotation.from_euler("z", heading).as_matrix()
+        np.testing.assert_allclose(matrix(by_child["ego"])[:3, :3], turned, atol=1e-6)
+        for name, yaw in FRONT_YAWS.items():
             assert by_child[name].parent_frame_id == "ego"
-            np.testing.assert_allclose(matrix(by_child[name]), pose, atol=1e-9)
+            ahead, right = matrix(by_child[name])[:3, 2], matrix(by_child[name])[:3, 0]
+            np.testing.assert_allclose(ahead, [np.cos(yaw), np.sin(yaw), 0.0], atol=1e-9)
+            np.testing.assert_allclose(right, [np.sin(yaw), -np.cos(yaw), 0.0], atol=1e-9)
 
 
 def test_pictures_are_the_stored_bytes_each_with_its_camera(

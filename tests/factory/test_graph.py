@@ -307,6 +307,25 @@ def test_a_restored_log_goes_on(tmp_path: Path, begun: Callable[..., Path], plai
     assert_same_tables(tmp_path / "out", plain(rounds=3))
 
 
+def test_redo_tries_again_what_a_bug_stopped_under_other_settings_and_nothing_that_it_stopped_under_these(
+    tmp_path: Path,
+) -> None:
+    """Changed settings may be what mends it; the same ones are tried again only when asked to."""
+    out, journal = tmp_path / "out", str(tmp_path / "journal")
+    bug = {"log0:0:recovery:0": "bug"}
+    assert run(out, ToyWork(trouble=bug), n=1).exit_code == COMPLETE_WITH_FAILURES
+    changed = ToyWork(threshold=0.4, prepare_digest="perturb-2", trouble=bug, journal=journal)
+    assert run(out, changed, n=1, on_change="redo").exit_code == COMPLETE_WITH_FAILURES
+    assert ran(journal, "attempt log0:0:recovery:0 ") == 1
+    assert run(out, changed, n=1, on_change="redo").executed.attempts == 0
+    assert ran(journal, "attempt log0:0:recovery:0 ") == 1
+    mended = replace(changed, threshold=0.6, trouble={})
+    assert run(out, mended, n=1, on_change="redo").exit_code == COMPLETE
+    fresh = tmp_path / "fresh"
+    run(fresh, mended, n=1)
+    assert_same_tables(out, fresh)
+
+
 def test_redo_reads_a_changed_log_anew_in_spite_of_the_cache(tmp_path: Path, begun: Callable[..., Path]) -> None:
     begun(rounds=2)
     changed = ToyWork(threshold=0.3, content="other")

@@ -13,7 +13,7 @@ from factory.clips.synthetic.reader import SyntheticReader
 from factory.clips.synthetic.write import TownSettings
 from factory.pipeline import Considered, FactoryWork
 from factory.settings import assemble, identity_of, load_config
-from factory.work import HUMAN, HUMAN_CANDIDATE, UNLISTED, Accepted, Dropped, PreparedClip
+from factory.work import HUMAN, HUMAN_BEFORE, HUMAN_CANDIDATE, UNLISTED, Accepted, Dropped, PreparedClip
 from tasks import stages
 from tasks.kinematic_vocabulary import kinematic_trajectories
 from tasks.perturb import Perturbation
@@ -91,6 +91,29 @@ def test_a_prepared_clip_is_rendered_also_where_its_data_has_moved(town: Path, t
     there = first_sample(work_on(moved, tmp_path / "b"), prepared)
     assert here.row["image_source"] == there.row["image_source"] == "render"
     assert here.row["images"][0]["jpeg"] == there.row["images"][0]["jpeg"]  # type: ignore[index]
+
+
+def test_the_earlier_frame_of_a_pair_shows_its_own_instants_from_where_the_ego_was(town: Path, tmp_path: Path) -> None:
+    """The photo at -0.5 s of the later frame is the one at now of the earlier, with its pose, and so on."""
+    work = work_on(town, tmp_path, "experts=[human,human_before]")
+    ref = work.reader.index().refs[1]
+    prepared = work.prepare(ref)
+    assert isinstance(prepared, PreparedClip)
+    shown = []
+    for expert in (HUMAN, HUMAN_BEFORE):
+        accepted = work.attempt(prepared, HUMAN_CANDIDATE, expert)
+        assert isinstance(accepted, Accepted)
+        shown.append({round(image["time_s"], 3): image for image in accepted.row["images"]})  # type: ignore[attr-defined]
+    later, earlier = shown
+    assert sorted(later) == sorted(earlier) == [-1.5, -1.0, -0.5, 0.0]
+    for time_s in (-1.0, -0.5, 0.0):
+        same = later[time_s - 0.5]
+        assert earlier[time_s]["jpeg"] == same["jpeg"]
+        np.testing.assert_array_equal(earlier[time_s]["ego_pose"], same["ego_pose"])
+    assert earlier[0.0]["jpeg"] != later[0.0]["jpeg"]
+    log = work.reader.read(ref).world_from_ego
+    np.testing.assert_allclose(np.reshape(earlier[0.0]["ego_pose"], (4, 4)), log[NOW - 5], atol=1e-6)
+    np.testing.assert_allclose(np.reshape(later[0.0]["ego_pose"], (4, 4)), log[NOW], atol=1e-6)
 
 
 def test_a_rejected_attempt_is_no_sample(town: Path, tmp_path: Path) -> None:

@@ -16,16 +16,17 @@ from planners.scoring import (
     prepare_clip,
     prepare_frame,
     score_clip,
+    score_pair,
 )
 from tasks.attempt import drive_and_judge
 from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.protocol import Plan
 from tasks.reward.one_stage import COLUMNS
 from tasks.rollout.simulate import TrafficSettings
-from tasks.world.clip import HORIZON_STEPS, NOW, scene_of_clip
+from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, scene_of_clip
 from tasks.world.frames import to_world
 from tasks.world.lanes import MapLayer, MapPolygon
-from tasks.world.vehicle import HEADING
+from tasks.world.vehicle import AX, HEADING, X
 from tests.planners.small_benchmark import clip_scenes, same_plan_everywhere, straight
 from tests.tasks.streets import rectangle, street_clip
 
@@ -112,6 +113,62 @@ def test_what_the_human_fails_is_forgiven_on_logged_frames_only() -> None:
     assert [row.scores.unfiltered[dac] for row in rows] == [0.0] * 7
     assert [row.scores.filtered[dac] for row in rows] == [1.0] * 3 + [0.0] * 4
     assert all(row.scores.filtered[SCORE] > 0.9 and row.scores.unfiltered[SCORE] == 0.0 for row in rows[:3])
+
+
+def test_the_human_is_not_excused_by_what_came_before_the_frame() -> None:
+    """History is the ego's own: a plan that starts in rough motion fails, and nobody's roughness before excuses it."""
+    street = street_clip()
+    rough = street.ego_states.copy()
+    rough[:NOW, AX] = 6.0  # the comfortable limit is 2.4
+    scenes = clip_scenes(replace(street, ego_states=rough))
+    rows = score_clip(prepare_clip(scenes, Rules()), same_plan_everywhere(scenes, straight(8.0)))[:3]
+    hc = COLUMNS.index("hc")
+    assert [row.scores.unfiltered[hc] for row in rows] == [0.0] * 3
+    assert [row.scores.filtered[hc] for row in rows] == [0.0] * 3
+
+
+def slow_start_ahead() -> Clip:
+    """The car ahead is 15 m away at 2 m/s and by its log gone at once: IDM lets it pick up speed at its own pace."""
+    street = street_clip()
+    agents = street.agents
+    boxes, velocities = agents.boxes.copy(), agents.velocities.copy()
+    time = (np.arange(len(boxes)) - NOW) * STEP_S
+    boxes[:, 0, X] = 15.0 + np.where(time > 0.0, 25.0 * time, 2.0 * time)
+    velocities[:, 0] = 2.0, 0.0
+    return replace(street, agents=replace(agents, boxes=boxes, velocities=velocities))
+
+
+def test_what_the_human_fails_is_asked_among_the_traffic_of_the_same_evaluation() -> None:
+    """Among reactive traffic the human runs into the car ahead, which is forgiven there; in the log the way is free,
+    and who races through it into the next car is not."""
+    scenes = clip_scenes(slow_start_ahead())
+    prepared = prepare_clip(scenes, Rules())
+    alone, logged = prepared.alone.now, prepared.logged.now
+    assert alone.human is not None and logged.human is not None
+    assert (alone.human.nc[0], logged.human.nc[0]) == (1.0, 0.0)
+    one_stage, stage_one = score_clip(prepared, same_plan_everywhere(scenes, straight(30.0)))[:2]
+    nc = COLUMNS.index("nc")
+    assert stage_one.scores.unfiltered[nc] == 0.0 and stage_one.scores.filtered[nc] == 1.0
+    assert one_stage.scores.unfiltered[nc] == one_stage.scores.filtered[nc]
+
+
+def waving(after_s: float) -> np.ndarray:
+    """(40, 3) 8 m/s, and from `after_s` on up to 2 m/s2 gained and lost in turn, a second each."""
+    time = np.linspace(0.0, 4.0, 401)
+    speed = 8.0 + np.where(time > after_s, 2.0 / np.pi * (1.0 - np.cos(np.pi * (time - after_s))), 0.0)
+    way = np.concatenate([[0.0], np.cumsum(0.005 * (speed[1:] + speed[:-1]))])
+    return np.column_stack([way[10::10], np.zeros(40), np.zeros(40)])
+
+
+def test_a_plan_is_compared_with_what_the_one_before_wanted_at_the_same_time_of_day(clip: PreparedClip) -> None:
+    """A wave in half a second was a second away half a second ago; the other way round it comes a second late."""
+    now, before = clip.logged.now, clip.logged.before
+    ec = COLUMNS.index("ec")
+    found = {
+        delays: score_pair(now, before, (waving(delays[0]), waving(delays[1])))[0][0].unfiltered[ec]
+        for delays in ((0.5, 1.0), (1.0, 0.5))
+    }
+    assert found == {(0.5, 1.0): 1.0, (1.0, 0.5): 0.0}
 
 
 def test_the_rows_of_a_plan_do_not_depend_on_those_scored_before_it(clip: PreparedClip) -> None:

@@ -103,4 +103,7 @@ def test_a_route_that_has_ended_at_either_frame_drops_both(
 
 def test_the_two_of_a_pair_have_names_and_digests_of_their_own() -> None:
     assert {FollowUp().name, FollowUp(before=True).name} == {"follow_up", "follow_up_before"}
-    assert FollowUp().digest() != FollowUp(before=True).digest() != FollowUp(PdmSettings(headway_s=2.0), True).digest()
+    slow = PdmSettings(headway_s=2.0)
+    four = [FollowUp(), FollowUp(before=True), FollowUp(slow), FollowUp(slow, True)]
+    assert len({expert.digest() for expert in four}) == 4
+    assert FollowUp(PdmSettings(headway_s=2.0)).digest() == FollowUp(slow).digest()

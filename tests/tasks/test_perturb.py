@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from tasks.chance import stream
-from tasks.experts.pdm_closed import PdmSettings
+from tasks.experts.pdm_closed import PdmSettings, plan_for
 from tasks.kinematic_vocabulary import kinematic_trajectories
 from tasks.perturb import (
     Perturbation,
@@ -23,11 +23,13 @@ from tasks.perturb import (
     perturb,
     spread_out,
 )
-from tasks.rollout.simulate import TrafficSettings
+from tasks.reward.epdms import score
+from tasks.reward.prepare import prepare_scene
+from tasks.rollout.simulate import TrafficSettings, simulate
 from tasks.stages import STAGES, Rejected
 from tasks.vocabulary import Vocabulary
-from tasks.world.clip import HORIZON_STEPS, NOW, Clip
-from tasks.world.frames import to_local
+from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, scene_of_clip
+from tasks.world.frames import to_local, to_world
 from tests.tasks.streets import moved, street_clip
 
 SETTINGS = PerturbSettings()
@@ -133,6 +135,39 @@ def test_candidates_pass_the_threshold_twice_and_carry_the_rollout_that_proved_i
         assert candidate.reactive_scores.pdm_score[1] == candidate.reactive_score
         assert candidate.rollout.start_step == NOW
         assert end_speed_mps(candidate) == candidate.rollout.ego_states[-1, 3]
+
+
+def slow_start_ahead() -> Clip:
+    """The car ahead stands 18 m away at T and by its log is gone at once; IDM lets it pick up speed at 1 m/s2."""
+    street = street_clip()
+    boxes, velocities = street.agents.boxes.copy(), street.agents.velocities.copy()
+    time = (np.arange(len(boxes)) - NOW) * STEP_S
+    boxes[:, 0, 0] = 18.0 + np.where(time > 0.0, 25.0 * time, 0.0)
+    velocities[: NOW + 1, 0], velocities[NOW + 1 :, 0] = 0.0, (25.0, 0.0)
+    return replace(street, agents=replace(street.agents, boxes=boxes, velocities=velocities))
+
+
+def test_a_perturbation_that_only_the_log_makes_room_for_is_dropped(trajectories: NDArray[np.float64]) -> None:
+    """What stays and what goes is what the traffic's own answer says, driven and scored once more by hand."""
+    clip = slow_start_ahead()
+    found = perturbed(clip, trajectories)
+    counts = found.counts if isinstance(found, Rejected) else found.gate_counts
+    assert counts["reactive_score"] > 3
+    assert isinstance(found, Perturbation)
+    scene, considered = scene_of_clip(clip), found.considered
+    rival = plan_for(scene, PdmSettings()).driven
+    by_index = {candidate.vocabulary_index: candidate for candidate in found.candidates}
+    for index, fate, replayed in zip(considered.vocabulary_index.tolist(), considered.fate, considered.score):
+        if fate not in ("kept", "reactive"):
+            continue
+        rollout = simulate(scene, to_world(scene.ego_state[:3], trajectories[index]), TrafficSettings())
+        pair = np.stack([rival, rollout.ego_states])
+        reacting = score(prepare_scene(scene, rollout.agents), pair, normalise="pairs").pdm_score[1]
+        assert replayed >= SETTINGS.epdms_min
+        assert (reacting >= SETTINGS.epdms_min) == (fate == "kept")
+        if fate == "kept":
+            assert by_index[index].reactive_score == reacting
+            np.testing.assert_array_equal(by_index[index].rollout.agents.boxes, rollout.agents.boxes)
 
 
 def test_every_gated_trajectory_has_a_fate_and_the_counts_agree_with_it(

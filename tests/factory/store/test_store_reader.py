@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import fields
 from pathlib import Path
 
 import cv2
@@ -61,13 +62,15 @@ def test_a_table_of_another_version_is_named(tmp_path: Path) -> None:
 
 
 def test_vocabulary_labels_come_back_from_the_table(out: Path) -> None:
-    row = row_of(stream("labels"))
-    meant = labels_of(row)
-    for sample in SampleTable(out).iterate((*LABEL_COLUMNS, "attempt_id")):
-        labels = labels_of(sample, vocabulary="vocabulary-1")
-        assert len(labels) == len(meant) and labels.traffic == "replay"
-    assert SampleTable(out)[0].keys() >= {*LABEL_COLUMNS}
-    assert isinstance(meant, VocabularyLabels) and 0.0 <= meant.pdm_score().min() < meant.pdm_score().max() <= 1.0
+    seen = set[tuple[float, ...]]()
+    for sample in SampleTable(out).iterate((*LABEL_COLUMNS, "clip_id", "expert", "candidate_index")):
+        made_by = stream(sample["clip_id"], "attempt", sample["expert"], sample["candidate_index"])
+        made_by.random()  # the attempt's chance to be accepted
+        wrote, labels = labels_of(row_of(made_by)), labels_of(sample, vocabulary="vocabulary-1")
+        for field in fields(VocabularyLabels):
+            assert np.array_equal(getattr(labels, field.name), getattr(wrote, field.name)), field.name
+        seen.add(tuple(labels.pdm_score()))
+    assert len(seen) == 9, "every sample has labels of its own"
 
 
 def test_labels_that_cannot_be_read_say_why() -> None:

@@ -13,7 +13,7 @@ from tasks.kinematic_vocabulary import kinematic_trajectories
 from tasks.stages import Rejected
 from tasks.world.clip import NOW, Scene
 from tasks.world.frames import to_local, to_world
-from tasks.world.vehicle import AX, HEADING, PACIFICA, STEERING, VX
+from tasks.world.vehicle import AX, HEADING, PACIFICA, STEERING, VX, VY
 
 Road = Callable[..., Scene]
 RNG = np.random.default_rng(0)
@@ -45,9 +45,44 @@ def test_start_velocities_are_exact_for_constant_acceleration() -> None:
     np.testing.assert_allclose(start_velocities(straight(8.0, -1.5)[None]), [[8.0, 0.0]], atol=1e-12)
 
 
-def test_a_row_of_the_table_finds_itself() -> None:
-    table = RecoveryTable(kinematic_trajectories(200, 3))
-    assert [table.nearest(row, np.ones(6)) for row in table.features] == list(range(200))
+def drives(velocity: np.ndarray, accel: np.ndarray, yaw_rate: np.ndarray) -> np.ndarray:
+    """(M, 40, 3) constant velocity (M, 2) and acceleration (M, 2) from the origin, headings that turn steadily."""
+    xy = velocity[:, None] * T[:, None] + accel[:, None] * T[:, None] ** 2 / 2.0
+    return np.concatenate([xy, yaw_rate[:, None, None] * T[:, None]], axis=2)
+
+
+def test_a_row_is_matched_by_its_velocity_at_the_start_and_its_pose_at_four_seconds() -> None:
+    """The matching vector by hand: p(t) = v t + a t^2 / 2, and the heading 0 that every row starts with."""
+    rng = np.random.default_rng(0)
+    velocity, accel, yaw_rate = rng.uniform(0, 12, (50, 2)), rng.uniform(-2, 2, (50, 2)), rng.uniform(-0.3, 0.3, 50)
+    expected = np.column_stack([velocity, np.zeros(50), 4.0 * velocity + 8.0 * accel, 4.0 * yaw_rate])
+    table = RecoveryTable(drives(velocity, accel, yaw_rate))
+    np.testing.assert_allclose(table.features, expected, atol=1e-9)
+    assert [table.nearest(vector + 1e-6, np.ones(6)) for vector in expected] == list(range(50))
+
+
+def ending_at(velocity: tuple[float, float], end: np.ndarray) -> np.ndarray:
+    """(40, 3) from a velocity to an end pose (3,), at a constant acceleration."""
+    start = np.array([velocity])
+    return drives(start, (end[None, :2] - 4.0 * start) / 8.0, end[2:] / 4.0)[0]
+
+
+def test_the_ego_s_velocity_is_matched_forward_with_forward_and_sideways_with_sideways(road: Road) -> None:
+    """Rows that end alike: one starts as the ego moves, one as it would with its two components exchanged."""
+    scene = road(speed=10.0)
+    states = scene.ego_history.copy()
+    states[-1, VY] = 1.5
+    scene = replace(scene, ego_history=states)
+    goal = to_local(scene.ego_state[: HEADING + 1], scene.clip.ego_states[NOW + 40, : HEADING + 1])
+    rows = np.stack([ending_at(velocity, goal) for velocity in ((1.5, 10.0), (10.0, 1.5), (10.0, -1.5))])
+    assert Recovery(RecoveryTable(rows)).retrieve(scene) == 1
+
+
+def test_the_goal_is_the_log_s_pose_at_four_seconds_not_a_step_before_or_after(road: Road) -> None:
+    scene = road(speed=10.0)
+    ends = to_local(scene.ego_state[: HEADING + 1], scene.clip.ego_states[NOW + 39 : NOW + 42, : HEADING + 1])
+    rows = np.stack([ending_at((10.0, 0.0), end) for end in ends])
+    assert Recovery(RecoveryTable(rows)).retrieve(scene) == 1
 
 
 def test_end_headings_are_compared_around_the_circle() -> None:

@@ -9,6 +9,7 @@ import street
 from tasks.render.asset import psnr
 from tasks.render.engine import Pinhole, Vehicles, render
 from tasks.render.fit.reconstruct import advance, finish, picture_of, reconstruct
+from tasks.render.fit.schedule import photo_at
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import Problem, prepare
 from tasks.render.fit.state import FitState
@@ -77,6 +78,68 @@ def test_the_number_of_threads_changes_no_bit(prepared: tuple[Problem, FitState]
     advance(prepared[0], two, SETTINGS, 8, threads=2)
     for name, array in one.arrays().items():
         np.testing.assert_array_equal(array, two.arrays()[name], err_msg=name)
+
+
+def test_a_picture_is_shown_with_the_exposure_that_was_learned_for_its_camera(
+    prepared: tuple[Problem, FitState],
+) -> None:
+    """Twice as bright, and a little blue added."""
+    problem, state = prepared[0], fresh(prepared[1])
+    photo = problem.held_out[0].photo
+    plain = picture_of(problem, state, photo)
+    row = np.zeros(12, np.float32)
+    row[[0, 4, 8]], row[11] = 1.0, 0.05
+    state.learned["exposure"].values[:] = row
+    expected = np.clip(2.0 * plain + np.array([0.0, 0.0, 0.05], np.float32), 0.0, 1.0)
+    np.testing.assert_allclose(picture_of(problem, state, photo), expected, atol=1e-5)
+    exposures = finish(problem, state).exposures
+    assert len(exposures) == len(problem.train)
+    for exposure, shot in zip(exposures, problem.train):
+        assert (exposure.camera, exposure.time_s) == (shot.photo.camera, shot.photo.time_s)
+        np.testing.assert_allclose(exposure.affine, [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0.05]], atol=1e-6)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_an_exposure_that_is_off_is_corrected_and_only_the_photo_s_that_was_looked_at(
+    prepared: tuple[Problem, FitState], sign: float
+) -> None:
+    """Too bright: darker, and the other way round; by the rate, as Adam's first step is."""
+    problem, state = prepared[0], fresh(prepared[1])
+    row = photo_at(0, len(problem.train), SETTINGS.seed)
+    offsets = state.learned["exposure"].values[:, 9:]
+    offsets[:] = 0.3 * sign
+    before = offsets.copy()
+    advance(problem, state, SETTINGS, 1)
+    np.testing.assert_allclose(offsets[row] - before[row], -sign * SETTINGS.exposure_rate, rtol=1e-3)
+    others = np.arange(len(offsets)) != row
+    assert np.array_equal(offsets[others], before[others])
+
+
+def test_a_camera_keeps_its_pose_until_pose_from_and_then_shifts_and_turns_at_rates_of_their_own(
+    prepared: tuple[Problem, FitState],
+) -> None:
+    problem, state = prepared[0], fresh(prepared[1])
+    poses = state.learned["poses"].values
+    advance(problem, state, SETTINGS, SETTINGS.pose_from)
+    assert not poses.any()
+    row = photo_at(SETTINGS.pose_from, len(problem.train), SETTINGS.seed)
+    advance(problem, state, SETTINGS, SETTINGS.pose_from + 1)
+    fall = SETTINGS.rate_end ** (SETTINGS.pose_from / SETTINGS.iterations)
+    rates = fall * np.repeat([SETTINGS.shift_rate, SETTINGS.turn_rate], 3)
+    np.testing.assert_allclose(np.abs(poses[row]), rates, rtol=1e-3)
+    assert not np.delete(poses, row, axis=0).any()
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_camera_that_was_turned_away_turns_back(prepared: tuple[Problem, FitState], sign: float) -> None:
+    """By 2 degrees to either side, of a scene that is fitted so far."""
+    problem, state = prepared[0], fresh(prepared[1])
+    advance(problem, state, replace(SETTINGS, pose_from=100), 20)
+    row = photo_at(20, len(problem.train), SETTINGS.seed)
+    poses = state.learned["poses"].values
+    poses[row, 4] = sign * np.radians(2.0)
+    advance(problem, state, replace(SETTINGS, pose_from=20), 21)
+    assert np.sign(poses[row, 4] - sign * np.radians(2.0)) == -sign
 
 
 def test_a_car_is_learned_in_its_own_box_and_can_be_put_elsewhere(prepared: tuple[Problem, FitState]) -> None:
