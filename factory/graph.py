@@ -137,6 +137,8 @@ def _connect(workers: int | None, address: str | None) -> bool:
     environment = WORKER_ENV | {name: os.environ[name] for name in FORWARDED_ENV if name in os.environ}
     where = address or ("auto" if os.environ.get("RAY_ADDRESS") else "local")
     own: dict[str, Any] = {"num_cpus": workers, "include_dashboard": False} if where == "local" else {}
+    if where == "local":  # Ray warns that a cluster of our own asks for a token, as it should
+        logging.getLogger("ray._private.authentication.authentication_token_setup").setLevel(logging.ERROR)
     ray.init(
         address=where,
         runtime_env={"env_vars": environment},

@@ -61,6 +61,8 @@ def _part(settings: dict[str, Any]) -> None:
 def _connect() -> None:
     """To the cluster of RAY_ADDRESS or of the submitted job, else to one of this machine's own, on loopback."""
     there = "RAY_ADDRESS" in os.environ
+    if not there:  # Ray warns that a cluster of our own asks for a token, as it should
+        logging.getLogger("ray._private.authentication.authentication_token_setup").setLevel(logging.ERROR)
     ray.init(
         address=None if there else "local", include_dashboard=None if there else False, logging_level=logging.WARNING
     )

@@ -1,5 +1,8 @@
 """The same graph as Ray tasks: identical rows, dead workers survived, poison contained."""
 
+import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -28,6 +31,15 @@ def two_cpus() -> Iterator[None]:
     ray.init(address="local", num_cpus=2, num_gpus=1, include_dashboard=False, log_to_driver=False)
     yield
     ray.shutdown()
+
+
+@pytest.mark.parametrize("module", ["factory.graph", "planners.on_ray"])
+def test_a_cluster_of_our_own_starts_without_a_warning_and_asks_for_a_token(module: str, tmp_path: Path) -> None:
+    arguments = "1, None" if module == "factory.graph" else ""
+    code = f"import os, {module} as m; m._connect({arguments}); print(os.environ['RAY_AUTH_MODE']); m.ray.shutdown()"
+    env = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")} | {"HOME": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "token\n", "")
 
 
 def test_local_and_ray_with_one_and_two_workers_make_identical_rows(tmp_path: Path, two_cpus: None) -> None:
