@@ -29,7 +29,7 @@ from factory.store.outcomes import Kind
 from factory.store.samples import CURRENT_RUN, ChangedRun, OnChange, Store
 from factory.store.table import AnotherWriter
 from factory.walk import Try, retry_policy
-from factory.work import Work
+from factory.work import NotReady, Work
 
 COMPLETE, BAD_CONFIG, COMPLETE_WITH_FAILURES, INTERRUPTED = 0, 2, 3, 4  # exit codes
 Executor = Literal["local", "ray"]
@@ -105,7 +105,7 @@ def execute(
     try:
         is_due = plan.todo or (pictured is not None and pictured.is_due)
         graph = _graph(work, store, executor, workers, ray_address, gpu_share) if is_due else None
-    except (BadLocation, ClusterLacks) as error:
+    except (BadLocation, ClusterLacks, NotReady) as error:
         return RunSummary(BAD_CONFIG, str(error))
     except KeyboardInterrupt:
         return RunSummary(INTERRUPTED, "stopped before anything was begun")

@@ -27,7 +27,7 @@ from factory.ray_metrics import RayRecorder
 from factory.steps import Failure
 from factory.store.location import BadLocation, Location
 from factory.store.outcomes import ErrorKind
-from factory.work import Work
+from factory.work import NotReady, Work
 
 MAX_RETRIES = 2  # of a task whose worker died
 PROBE_SECONDS = 120.0
@@ -48,7 +48,8 @@ class RayGraph:
 
         More workers than a cluster has CPUs now are what makes one grow that can. gpu_share: of a GPU, claimed by every
         attempt; on a cluster without one, it is asked for one and waited for.
-        Raises BadLocation when some node does not see `out`, ClusterLacks when no GPU comes.
+        Raises BadLocation when some node does not see `out`, ClusterLacks when no GPU comes, NotReady when a node
+        cannot do its part.
         """
         self._connected = not ray.is_initialized()
         self._is_ours = self._connected and _connect(workers, address)
@@ -209,4 +210,4 @@ def _warm_every_node(work: list[Any], with_gpu_only: bool) -> None:
     for report, _ in reports:
         answer, _ = ray.get(report)
         if isinstance(answer, Failure):
-            raise RuntimeError(f"warming up: {answer.error}")
+            raise NotReady(answer.error) if answer.kind is ErrorKind.INPUT else RuntimeError(answer.error)

@@ -23,6 +23,7 @@ from factory.work import (
     Built,
     CandidateRow,
     Dropped,
+    NotReady,
     PreparedClip,
     RunIdentity,
 )
@@ -44,6 +45,7 @@ from tasks.experts.protocol import Expert
 from tasks.hard_scenes import BenchmarkClip
 from tasks.perturb import Candidate, Perturbation, PerturbSettings, end_speed_mps, perturb
 from tasks.render.engine import Backend, check
+from tasks.render.gsplat_backend import BackendMissing
 from tasks.render.settings import RenderMode, RenderSettings, SceneFrom
 from tasks.reward.epdms import Scores
 from tasks.reward.labels import Labelling, vocabulary_labels
@@ -143,14 +145,21 @@ class FactoryWork:
     cache_dir: str  # of reconstructed blocks
 
     def warm(self, draws: bool = True) -> None:
-        """This run's kernels into the on-disk cache. Raises BackendMissing where one that draws lacks the means."""
+        """This run's kernels, and no others, into the on-disk cache. Raises NotReady."""
         from factory.warm import compile_kernels
 
-        parts = ["judge", "drive"]
+        parts = ["judge"]
+        if self.labelling is not None and self.labelling.traffic.mode == "idm":
+            parts.append("answers")
+        elif self._simulates and self.traffic.mode == "idm":
+            parts.append("drive")
         if self.render.mode is RenderMode.AUTO:
             if draws:
-                check(self.render.backend)
-            parts.insert(1, "fit" if self.render.scene is SceneFrom.FIT else "render")
+                try:
+                    check(self.render.backend)
+                except BackendMissing as error:
+                    raise NotReady(str(error)) from error
+            parts.append("fit" if self.render.scene is SceneFrom.FIT else "render")
         compile_kernels(parts)
 
     def expert_digest(self, expert: str) -> str:

@@ -20,7 +20,7 @@ from factory.store.reader import samples_of
 from factory.store.scenes import SceneFiles
 from factory.store.schema import SAMPLES, sample_row_to_table
 from factory.store.table import Shard, write_shard
-from factory.work import Accepted, CandidateRow, PreparedClip, Work
+from factory.work import Accepted, CandidateRow, NotReady, PreparedClip, Work
 from tasks.stages import Rejected
 
 ERROR_LINES = 12  # of a traceback that an outcome keeps
@@ -223,6 +223,8 @@ def warm(work: Work, draws: bool) -> tuple[str | Failure, None]:
     """Kernels into the cache of this machine."""
     try:
         work.warm(draws)
+    except NotReady as error:
+        return Failure(ErrorKind.INPUT, str(error)), None
     except Exception as error:  # the same boundary
         return failure_of(error), None
     return "", None

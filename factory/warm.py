@@ -1,26 +1,31 @@
 """Compiles every kernel once, into the on-disk cache, before workers start: `python -m factory.warm`."""
 
+import fcntl
+import hashlib
 import os
 import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from factory.work import NotReady
 from tasks.attempt import drive_and_judge
 from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.protocol import Plan
-from tasks.kernels import cache_dir, machine
+from tasks.kernels import USED, cache_dir, not_kept, processor, write_whole
 from tasks.kinematic_vocabulary import kinematic_trajectories
 from tasks.render.warm import compile_fit_kernels
 from tasks.render.warm import compile_kernels as compile_render_kernels
 from tasks.reward.labels import Labelling, vocabulary_labels
+from tasks.reward.reactive import reactive_scores
 from tasks.reward.verdicts import INDEX_FROM_ROWS
-from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out_many, simulate
+from tasks.rollout.simulate import TrafficSettings, simulate
 from tasks.vocabulary import Vocabulary
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.clip import CLIP_STEPS, NOW, Clip, Scene, scene_of_clip
@@ -30,29 +35,64 @@ from tasks.world.lanes import Lane, RoadMap, Route
 def compile_kernels(parts: Sequence[str]) -> None:
     """Compiles what is not in the cache yet, each part in a process of its own, as many at once as there are cores.
 
-    Raises RuntimeError with a part's last words where it fails.
+    Of processes that want the same at once, one compiles and the others wait for it.
+    Raises NotReady where the cache cannot be written, and RuntimeError with a part's last words where it fails.
     """
-    missing = [name for name in parts if not _marker(name).exists()]
-    if not missing:
+    if all(map(_is_compiled, parts)):
         return
-    print("compiling kernels, once for this version: a minute or two on two cores", file=sys.stderr, flush=True)
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        list(pool.map(_compile_part, missing))
+    try:
+        cache_dir().mkdir(parents=True, exist_ok=True)
+        with (cache_dir() / f"lock-{_machine()}").open("w") as lock:
+            with suppress(OSError):  # a shared folder without locks: at worst two do the same work
+                fcntl.flock(lock, fcntl.LOCK_EX)
+            missing = [name for name in parts if not _is_compiled(name)]
+            if missing:
+                print("compiling kernels, once for this version: about a minute", file=sys.stderr, flush=True)
+            with ThreadPoolExecutor(os.cpu_count()) as pool:
+                list(pool.map(_compile_part, missing))
+    except OSError as error:
+        raise NotReady(not_kept(error)) from error
+
+
+def _machine() -> str:
+    return hashlib.sha256(processor().encode()).hexdigest()[:8]
 
 
 def _marker(name: str) -> Path:
-    """The file that says that a part is in the cache."""
-    return cache_dir() / f"compiled-{machine()}-{name}"
+    """The file that lists what a part has in the cache."""
+    return cache_dir() / f"compiled-{_machine()}-{name}"
+
+
+def _is_compiled(name: str) -> bool:
+    """The part was compiled, and nobody has taken a file of it away since."""
+    try:
+        listed = _marker(name).read_text()
+    except OSError:  # not there, or in a folder that cannot be: whoever then writes into it says so
+        return False
+    return all((cache_dir() / file).is_file() for file in listed.splitlines())
 
 
 def _compile_part(name: str) -> None:
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     command = [sys.executable, "-m", "factory.warm", name]
     ended = subprocess.run(command, env=environment, capture_output=True, text=True)  # noqa: S603 (our own module)
+    if ended.returncode == NO_ROOM:
+        raise OSError(ended.stderr.strip().splitlines()[-1])
     if ended.returncode != 0:
         raise RuntimeError(f"compiling the kernels of {name} failed: {ended.stderr[-2000:]}")
-    _marker(name).parent.mkdir(parents=True, exist_ok=True)
-    _marker(name).touch()
+
+
+def _warm(name: str) -> int:
+    """One part, in this process; the exit code."""
+    PARTS[name]()
+    listed = "\n".join(sorted(path.relative_to(cache_dir()).as_posix() for path in USED))
+    try:
+        for part in (name, *INCLUDED.get(name, ())):
+            write_whole(_marker(part), listed.encode())
+    except OSError as error:
+        print(error, file=sys.stderr)
+        return NO_ROOM
+    return 0
 
 
 def _judge() -> None:
@@ -65,10 +105,17 @@ def _judge() -> None:
 
 
 def _drive() -> None:
-    """Traffic around one ego and around several."""
+    """Traffic around one ego."""
     scene, ahead = _tiny_scene()
-    ego_states = simulate(scene, ahead, TrafficSettings()).ego_states
-    roll_out_many(prepare_traffic(scene, TrafficSettings()), np.stack([ego_states] * 2))
+    simulate(scene, ahead, TrafficSettings())
+
+
+def _answers() -> None:
+    """The same, and traffic around each of several egos, scored."""
+    _drive()
+    scene, ahead = _tiny_scene()
+    states = simulate(scene, ahead, TrafficSettings(mode="replay")).ego_states
+    reactive_scores(scene, np.stack([states] * 2), TrafficSettings())
 
 
 def _render() -> None:
@@ -82,7 +129,9 @@ def _fit() -> None:
     compile_fit_kernels()
 
 
-PARTS = {"judge": _judge, "drive": _drive, "render": _render, "fit": _fit}
+PARTS = {"judge": _judge, "drive": _drive, "answers": _answers, "render": _render, "fit": _fit}
+INCLUDED = {"answers": ("drive",), "fit": ("render",)}
+NO_ROOM = 5  # exit code of a part whose files could not be kept
 
 
 def _tiny_scene() -> tuple[Scene, NDArray[np.float64]]:
@@ -138,7 +187,6 @@ def tiny_clip() -> Clip:
 
 if __name__ == "__main__":
     if len(sys.argv) > 1:
-        PARTS[sys.argv[1]]()
-    else:
-        compile_kernels(["judge", "fit", "drive"])
-        compile_town_kernels()
+        sys.exit(_warm(sys.argv[1]))
+    compile_kernels(["judge", "answers", "fit"])
+    compile_town_kernels()

@@ -26,6 +26,10 @@ HUMAN_CANDIDATE = -1  # the only candidate index of LOGGED experts
 UNLISTED = "unlisted"  # prepare_digest of clips prepared for the log's own drive alone: no perturb work, no list
 
 
+class NotReady(ValueError):
+    """This machine lacks what the run needs of it; the message says what, and how to give it."""
+
+
 @dataclass(frozen=True)
 class CandidateRow:
     """One perturbation that passed every gate and filter, in the order in which walks try it."""
@@ -128,6 +132,7 @@ class Work(Protocol):
         """Compile the kernels into their cache. Called once per machine before any worker starts.
 
         draws: attempts are made on this machine, so that it must have what they draw with.
+        Raises NotReady.
         """
         ...
 

@@ -5,20 +5,26 @@ None gets the entry for C programs that numba compiles by default: nobody calls 
 Numba's own cache does not notice an edit in a callee or of a constant that lives in another file, and starts anew where
 the same files lie in another folder, as every upload of a Ray job does. So compiled kernels lie in a folder named by a
 digest of all sources that hold kernels or the constants of kernels, and in it by their place in the project: one edit
-anywhere starts a new folder, a copy elsewhere starts none. Numba itself tells apart the processors that share a folder.
-The folder lies in NUMBA_CACHE_DIR where that is set, else in the user's cache.
+anywhere starts a new folder, a copy elsewhere starts none. The folder lies in NUMBA_CACHE_DIR where that is set, else
+in the user's cache. Nothing of numba is changed for other code.
 """
 
 import ast
 import hashlib
 import os
+import pickle
+import secrets
 import sys
+import warnings
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 
-import llvmlite.binding as llvm
 import numba
+from numba.core.compiler import CompileResult
+from numba.core.registry import cpu_target
+from numba.core.serialize import dumps
 
 from tasks.caches import user_cache
 
@@ -61,60 +67,101 @@ def cache_dir() -> Path:
     return Path(os.environ.get("NUMBA_CACHE_DIR") or user_cache()) / f"kernels-{_DIGEST}"
 
 
-def machine() -> str:
-    """What a compiled kernel runs on, beside its sources: 8 hex digits of Python's version and the processor's kind."""
-    processor = llvm.get_host_cpu_name() + llvm.get_host_cpu_features().flatten()
-    return hashlib.sha256(f"{sys.version_info[:2]} {processor}".encode()).hexdigest()[:8]
+@cache
+def processor() -> str:
+    """What machine code is made for: Python's version, the system, the processor and what it can do."""
+    return repr((sys.version_info[:2], cpu_target.target_context.codegen().magic_tuple()))
 
 
 _DIGEST = sources_digest()
+USED: set[Path] = set()  # files of compiled functions that this process has loaded or written
 
 
-class KernelLocator:
-    """Where numba keeps a function of this project, whatever folder the project lies in (NUMBA_CACHE_LOCATOR_CLASSES).
+class KernelCache:
+    """The compiled forms of one function on disk: a file for each, named by the types it takes and the processor.
 
-    The methods are those that numba.core.caching calls.
+    Numba's own cache keeps an index of them, which two processes that compile one function at once write over each
+    other's, so that the index may name machine code for other types. Here a file is written whole and replaced by its
+    like. The methods are those that numba's dispatcher calls.
     """
 
-    def __init__(self, line: int, inside: Path) -> None:
-        self._line = line
-        self._inside = inside
+    def __init__(self, function: Callable[..., Any]) -> None:
+        code = function.__code__
+        self._source = Path(code.co_filename).resolve()
+        self._name = f"{function.__qualname__.replace('<locals>.', '')}-{code.co_firstlineno}"
+        # Of a function inside another one, what it takes from there is compiled in.
+        cells = [cell.cell_contents for cell in function.__closure__ or ()]
+        self._enclosed = hashlib.sha256(code.co_code + (dumps(cells) if cells else b"")).hexdigest()
 
-    @classmethod
-    def from_function(cls, function: Callable[..., Any], file: str) -> Self | None:
-        """The locator of a function; None, so that numba asks its own, where the file is not this project's."""
-        path = Path(file).resolve()
-        if not any(path.is_relative_to(_ROOT / package) for package in _PACKAGES):
+    @property
+    def cache_path(self) -> str:
+        """A folder for each source file; that of a file outside the project has its content in its name."""
+        if any(self._source.is_relative_to(_ROOT / package) for package in _PACKAGES):
+            return str(cache_dir() / self._source.relative_to(_ROOT).with_suffix(""))
+        content = hashlib.sha256(self._source.read_bytes()).hexdigest()[:16]
+        return str(cache_dir() / "elsewhere" / f"{self._source.stem}-{content}")
+
+    def load_overload(self, signature: Any, target: Any) -> Any:
+        """The form compiled for `signature`; None where there is none."""
+        target.refresh()
+        path = self._path(signature)
+        try:
+            kept = path.read_bytes()
+        except OSError:  # not there, or nobody's to read: compiled again, and save_overload says what is wrong
             return None
-        locator = cls(function.__code__.co_firstlineno, path.relative_to(_ROOT).with_suffix(""))
-        locator.ensure_cache_path()
-        return locator
+        USED.add(path)
+        return CompileResult._rebuild(target, *pickle.loads(kept))  # noqa: S301 -- machine code, written below
 
-    def ensure_cache_path(self) -> None:
-        """Raises OSError where the folder cannot be made."""
-        Path(self.get_cache_path()).mkdir(parents=True, exist_ok=True)
+    def save_overload(self, signature: Any, compiled: Any) -> None:
+        """Keep it; warn, once a process, where that cannot be done: then every process compiles for itself."""
+        if compiled.library.has_dynamic_globals:  # addresses of this process
+            return
+        path = self._path(signature)
+        try:
+            write_whole(path, dumps(compiled._reduce()))
+        except OSError as error:
+            warnings.warn(not_kept(error), RuntimeWarning, stacklevel=1)
+            return
+        USED.add(path)
 
-    def get_cache_path(self) -> str:
-        """A folder for each source file."""
-        return str(cache_dir() / self._inside)
+    def _path(self, signature: Any) -> Path:
+        takes = f"{signature} {processor()} {self._enclosed}"
+        return Path(self.cache_path) / f"{self._name}-{hashlib.sha256(takes.encode()).hexdigest()[:16]}.kernel"
 
-    def get_source_stamp(self) -> str:
-        """What must be the same for a cached kernel to be used."""
-        return _DIGEST
-
-    def get_disambiguator(self) -> str:
-        """Tells apart functions of one name in one file."""
-        return str(self._line)
+    def flush(self) -> None:
+        """Forget every form of the function."""
+        for path in Path(self.cache_path).glob(f"{self._name}-*.kernel"):
+            path.unlink(missing_ok=True)
 
 
-_NUMBAS_OWN = "UserProvidedCacheLocator,InTreeCacheLocator,UserWideCacheLocator,IPythonCacheLocator,ZipCacheLocator"
-numba.config.CACHE_LOCATOR_CLASSES = f"{__name__}.{KernelLocator.__name__},{_NUMBAS_OWN}"
+def write_whole(path: Path, data: bytes) -> None:
+    """Under its name at once, or not at all. Raises OSError."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(f".{secrets.token_hex(8)}.tmp")
+    try:
+        draft.write_bytes(data)
+        draft.replace(path)
+    except OSError:
+        draft.unlink(missing_ok=True)
+        raise
+
+
+def not_kept(error: OSError) -> str:
+    """What to say where the cache folder cannot be written."""
+    why = error.strerror or str(error)
+    return f"compiled kernels cannot be kept in {cache_dir()} ({why}): name a folder with room in NUMBA_CACHE_DIR"
+
+
+def _compiled(function: F, **options: Any) -> F:
+    compiled: F = numba.njit(nogil=True, no_cfunc_wrapper=True, **options)(function)
+    if Path(function.__code__.co_filename).is_file():  # else typed at a prompt
+        compiled._cache = KernelCache(function)  # type: ignore[attr-defined]
+    return compiled
 
 
 def kernel(function: F) -> F:
     """Compile `function` with numba on first call."""
-    compiled: F = numba.njit(cache=True, nogil=True, no_cfunc_wrapper=True)(function)
-    return compiled
+    return _compiled(function)
 
 
 def inlined(function: F) -> F:
@@ -123,15 +170,15 @@ def inlined(function: F) -> F:
     A division by zero gives inf or NaN in it, as in numpy: raising would need a branch. Python cannot call it: taking
     tuples of arrays from Python and giving them back would take longer to compile than the function.
     """
-    compiled: F = numba.njit(
-        cache=True,
-        nogil=True,
-        forceinline=True,
-        error_model="numpy",
-        no_cfunc_wrapper=True,
-        no_cpython_wrapper=True,
-    )(function)
-    return compiled
+    return _compiled(function, forceinline=True, error_model="numpy", no_cpython_wrapper=True)
+
+
+def drawing_kernel(function: F) -> F:
+    """As `kernel`, but dividing as numpy does.
+
+    Without Python's ZeroDivisionError behind every division the synthetic town's shading compiles in half the time.
+    """
+    return _compiled(function, error_model="numpy")
 
 
 def inner_kernel(function: F) -> F:
@@ -141,5 +188,4 @@ def inner_kernel(function: F) -> F:
     function allocates nothing (it would not compile) and returns numbers only: an array it returned would be freed
     under its owner's hands.
     """
-    compiled: F = numba.njit(cache=True, nogil=True, no_cfunc_wrapper=True, _nrt=False)(function)
-    return compiled
+    return _compiled(function, _nrt=False)

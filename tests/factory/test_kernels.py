@@ -10,9 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tasks.kernels import KernelLocator, cache_dir, kernel_sources, sources_digest
+from factory.warm import compile_kernels
+from factory.work import NotReady
+from tasks.kernels import cache_dir, kernel_sources, sources_digest
 
 REPOSITORY = Path(__file__).resolve().parents[2]
+DECORATORS = {"njit", "jit", "kernel", "inlined", "inner_kernel", "drawing_kernel"}
 
 
 def test_every_source_that_compiles_something_is_in_the_digest() -> None:
@@ -23,7 +26,8 @@ def test_every_source_that_compiles_something_is_in_the_digest() -> None:
             nodes = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)]
             compiles = any(
                 node.module in ("numba", "tasks.kernels")
-                and {"njit", "jit", "kernel", "inlined"} & {a.name for a in node.names}
+                and {"njit", "jit", "kernel", "inlined", "inner_kernel", "drawing_kernel"}
+                & {a.name for a in node.names}
                 for node in nodes
             )
             assert not compiles or path in listed, path
@@ -83,7 +87,7 @@ def squared(x):
 """
 CALL_IT = """
 from tasks.squares import squared
-assert squared(3.0) == 9.0
+assert squared({argument}) == 9
 print(sum(squared.stats.cache_hits.values()), sum(squared.stats.cache_misses.values()))
 """
 
@@ -98,11 +102,16 @@ def copy_with_one_kernel(folder: Path) -> Path:
     return folder
 
 
-def hits_and_misses(project: Path, **environment: str) -> str:
+def calling(project: Path, argument: str, **environment: str) -> "subprocess.Popen[str]":
     env = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"} | environment
     env |= {"PYTHONPATH": str(project)}
-    done = subprocess.run([sys.executable, "-c", CALL_IT], env=env, cwd=project, capture_output=True, text=True)
-    return done.stdout.strip() or done.stderr
+    command = [sys.executable, "-c", CALL_IT.format(argument=argument)]
+    return subprocess.Popen(command, env=env, cwd=project, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+
+
+def hits_and_misses(project: Path, argument: str = "3.0", **environment: str) -> str:
+    said, error = calling(project, argument, **environment).communicate()
+    return said.strip() + error
 
 
 @pytest.mark.parametrize("named_by", ["NUMBA_CACHE_DIR", "XDG_CACHE_HOME"])
@@ -116,8 +125,43 @@ def test_a_copy_of_the_project_elsewhere_compiles_nothing_again(tmp_path: Path, 
     assert hits_and_misses(second, **where) == "0 1"
 
 
-def test_a_kernel_of_somebody_else_is_left_to_numba() -> None:
-    assert KernelLocator.from_function(test_a_kernel_of_somebody_else_is_left_to_numba, __file__) is None
+def test_processes_that_compile_one_function_for_other_types_at_once_keep_both(tmp_path: Path) -> None:
+    """Numba's own index keeps what was written last, and may name the other's machine code."""
+    project, where = copy_with_one_kernel(tmp_path / "project"), {"XDG_CACHE_HOME": str(tmp_path / "cache")}
+    arguments = ("3", "3.0", "3.0 + 0j")
+    together = [calling(project, argument, **where) for argument in arguments]
+    assert [process.communicate()[0].strip() for process in together] == ["0 1"] * 3
+    assert [hits_and_misses(project, argument, **where) for argument in arguments] == ["1 0"] * 3
+
+
+def test_without_room_for_the_cache_a_kernel_works_and_says_what_helps(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    said = hits_and_misses(copy_with_one_kernel(tmp_path / "project"), XDG_CACHE_HOME=str(tmp_path / "file"))
+    assert said.startswith("0 1")
+    assert said.count("RuntimeWarning: compiled kernels cannot be kept in") == 1
+    assert "name a folder with room in NUMBA_CACHE_DIR" in said
+
+
+def test_without_room_for_the_cache_a_run_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file"))
+    with pytest.raises(NotReady, match=r"cannot be kept in .*file/kernels-\w+ \(Not a directory\): name a folder"):
+        compile_kernels(["judge"])
+
+
+@pytest.mark.slow
+def test_a_part_is_compiled_again_once_a_file_of_it_is_gone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a cleaner of old files would leave the cache."""
+    compile_kernels(["judge"])
+    copy = tmp_path / cache_dir().name
+    shutil.copytree(cache_dir(), copy)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    kept = {path: path.stat().st_mtime_ns for path in copy.rglob("*.kernel")}
+    gone = next(path for path in kept if path.name.startswith("changes_along_rows"))
+    gone.unlink()
+    compile_kernels(["judge"])
+    now = {path: path.stat().st_mtime_ns for path in copy.rglob("*.kernel")}
+    assert {path for path in now if now[path] != kept.get(path)} == {gone}
 
 
 def test_a_kernel_gives_the_bytes_of_its_own_python() -> None:

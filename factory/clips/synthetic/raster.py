@@ -10,13 +10,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from factory.clips.synthetic.compiled import drawing_njit
 from factory.clips.synthetic.textures import LEAVES, SPOKES, TREELINE, opaque_at
+from tasks.kernels import drawing_kernel
 
 NEAR_M = 0.15
 
 
-@drawing_njit
+@drawing_kernel
 def rasterise(
     vertices: NDArray[np.float64],  # (T, 3, 3) world
     uv: NDArray[np.float64],  # (T, 3, 2)

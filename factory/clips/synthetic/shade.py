@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factory.clips.synthetic import textures as tx
-from factory.clips.synthetic.compiled import drawing_njit
 from factory.clips.synthetic.textures import RGB, chance, grain, inside, noise, visible
+from tasks.kernels import drawing_kernel
 
 
-@drawing_njit
+@drawing_kernel
 def road_paint(u: float, d: float, marks: NDArray[np.float64], fu: float, fd: float) -> tuple[float, float]:
     """(coverage, yellowness) of the paint at arc length u and offset d of a road.
 
@@ -40,7 +40,7 @@ def road_paint(u: float, d: float, marks: NDArray[np.float64], fu: float, fd: fl
     return best, yellow
 
 
-@drawing_njit
+@drawing_kernel
 def road_surface(x: float, y: float, u: float, d: float, marks: NDArray[np.float64], fu: float, fd: float) -> RGB:
     """Asphalt with worn lane paint; the gutter beside the kerb is darker."""
     fp = max(fu, fd)
@@ -61,7 +61,7 @@ def road_surface(x: float, y: float, u: float, d: float, marks: NDArray[np.float
     return r, g, b
 
 
-@drawing_njit
+@drawing_kernel
 def sky(dx: float, dy: float, dz: float, sun: NDArray[np.float64], seed: int) -> RGB:
     """The sky in a direction: gradient, clouds on a high plane, a glow around the sun."""
     up = max(0.0, dz)
@@ -82,7 +82,7 @@ def sky(dx: float, dy: float, dz: float, sun: NDArray[np.float64], seed: int) ->
     return min(1.0, r + glow), min(1.0, g + glow), min(1.0, b + glow * 0.8)
 
 
-@drawing_njit
+@drawing_kernel
 def surface_colour(
     kind: int,
     u: float,
@@ -192,7 +192,7 @@ def surface_colour(
     return r, g, b
 
 
-@drawing_njit
+@drawing_kernel
 def lit_by_sun(
     x: float, y: float, z: float, sun_view: NDArray[np.float64], shadow: NDArray[np.float32], bias: float
 ) -> float:
@@ -211,7 +211,7 @@ def lit_by_sun(
     return (1 - b) * top + b * low
 
 
-@drawing_njit
+@drawing_kernel
 def shade(
     ids: NDArray[np.int32],  # (2H, 2W) visible triangle, -1: sky
     planes: NDArray[np.float64],  # (T, 9)

@@ -6,7 +6,7 @@ alias and one place has one colour from near and far. Colours are (r, g, b) in 0
 
 import math
 
-from factory.clips.synthetic.compiled import drawing_njit
+from tasks.kernels import drawing_kernel
 
 # Materials
 (
@@ -39,7 +39,7 @@ from factory.clips.synthetic.compiled import drawing_njit
 RGB = tuple[float, float, float]
 
 
-@drawing_njit
+@drawing_kernel
 def chance(x: int, y: int, seed: int) -> float:
     """A fixed random number in [0, 1) of an integer cell."""
     h = (x * 374761393 + y * 668265263 + seed * 1442695041) & 0xFFFFFFFF
@@ -48,7 +48,7 @@ def chance(x: int, y: int, seed: int) -> float:
     return ((h ^ (h >> 16)) & 0xFFFFFF) / 16777216.0
 
 
-@drawing_njit
+@drawing_kernel
 def noise(u: float, v: float, seed: int) -> float:
     """Value noise in [0, 1) with cells of size 1."""
     iu, iv = math.floor(u), math.floor(v)
@@ -60,13 +60,13 @@ def noise(u: float, v: float, seed: int) -> float:
     return top * (1 - b) + low * b
 
 
-@drawing_njit
+@drawing_kernel
 def visible(size: float, footprint: float) -> float:
     """How much of a pattern of that size survives a pixel of that footprint (1 near, 0 far)."""
     return min(1.0, max(0.0, 1.6 * size / footprint - 0.8))
 
 
-@drawing_njit
+@drawing_kernel
 def inside(x: float, low: float, high: float, footprint: float) -> float:
     """Share of a pixel of that footprint at x that lies in [low, high]."""
     return (
@@ -76,7 +76,7 @@ def inside(x: float, low: float, high: float, footprint: float) -> float:
     )
 
 
-@drawing_njit
+@drawing_kernel
 def grain(u: float, v: float, seed: int, footprint: float) -> float:
     """Three octaves of fine noise around 0: stones of 6, 2 and 0.7 cm."""
     out = 0.0
@@ -90,7 +90,7 @@ def grain(u: float, v: float, seed: int, footprint: float) -> float:
     return out
 
 
-@drawing_njit
+@drawing_kernel
 def asphalt(x: float, y: float, footprint: float) -> RGB:
     """Worn asphalt in world coordinates: broad tones, repairs, cracks, grain."""
     tone = 0.335 + 0.07 * (noise(x / 9.0, y / 9.0, 1) - 0.5) + 0.07 * (noise(x / 1.7, y / 1.7, 2) - 0.5)
@@ -109,7 +109,7 @@ def asphalt(x: float, y: float, footprint: float) -> RGB:
     return tone, tone * 1.005, tone * 1.02
 
 
-@drawing_njit
+@drawing_kernel
 def paving(u: float, v: float, seed: int, footprint: float) -> RGB:
     """Concrete slabs of 60 x 40 cm."""
     row = math.floor(v / 0.4)
@@ -134,7 +134,7 @@ def paving(u: float, v: float, seed: int, footprint: float) -> RGB:
     return tone * 1.01, tone * 0.985, tone * 0.94
 
 
-@drawing_njit
+@drawing_kernel
 def grass(x: float, y: float, footprint: float) -> RGB:
     """A lawn with tufts and bare spots."""
     broad = noise(x / 6.0, y / 6.0, 21)
@@ -146,7 +146,7 @@ def grass(x: float, y: float, footprint: float) -> RGB:
     return (0.27 + 0.12 * bare) * tone, (0.36 - 0.02 * bare) * tone, (0.15 + 0.07 * bare) * tone
 
 
-@drawing_njit
+@drawing_kernel
 def wall(u: float, v: float, style: int, seed: int, footprint: float) -> RGB:
     """Brick (styles 0-2), plaster (3-6) or concrete panels (7), stained from above."""
     stain = 1.0 + 0.16 * (noise(u / 1.3, v / 4.0, seed) - 0.5) + 0.10 * (noise(u / 0.4, v / 0.9, seed + 1) - 0.5)
@@ -178,7 +178,7 @@ def wall(u: float, v: float, style: int, seed: int, footprint: float) -> RGB:
     return 0.60 * rough * joint, 0.59 * rough * joint, 0.57 * rough * joint
 
 
-@drawing_njit
+@drawing_kernel
 def pane(u: float, v: float, cell: int, seed: int) -> RGB:
     """Glass seen from the street: a dark room, a curtain, a bit of sky; u, v in 0..1 over the pane."""
     kind = chance(cell, 3, seed)
@@ -194,7 +194,7 @@ def pane(u: float, v: float, cell: int, seed: int) -> RGB:
     return r, g, b
 
 
-@drawing_njit
+@drawing_kernel
 def facade(u: float, v: float, width: float, height: float, seed: int, fu: float, fv: float) -> RGB:
     """A house front: plinth, shops or doors at street level, floors of windows, cornice. Everything by `seed`."""
     fp = max(fu, fv)
@@ -261,7 +261,7 @@ def facade(u: float, v: float, width: float, height: float, seed: int, fu: float
     return r + (trim - r) * top, g + (trim * 0.97 - g) * top, b + (trim * 0.92 - b) * top
 
 
-@drawing_njit
+@drawing_kernel
 def shopfront(u: float, v: float, ground: float, seed: int, fu: float, fv: float) -> RGB:
     """Shops of 4.6 m: sign with letters, window with goods, door, stall riser."""
     shop = math.floor(u / 4.6)
@@ -295,7 +295,7 @@ def shopfront(u: float, v: float, ground: float, seed: int, fu: float, fv: float
     return fr + (gr - fr) * glass, fg + (gg - fg) * glass, fb + (gb - fb) * glass
 
 
-@drawing_njit
+@drawing_kernel
 def leaf_here(u: float, v: float, seed: int) -> bool:
     """Is there a leaf at this place of a twig's card (in metres)?"""
     for k in range(2):
@@ -310,7 +310,7 @@ def leaf_here(u: float, v: float, seed: int) -> bool:
     return False
 
 
-@drawing_njit
+@drawing_kernel
 def opaque_at(material: int, u: float, v: float, seed: int) -> bool:
     """The cut-out materials' masks."""
     if material == LEAVES:
