@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factory.clips.reader import BadClip, ClipReader, ClipRef
+from factory.clips.validate import read_clip
 from factory.fitting import fits_going_on
 from factory.imaging import Imaging, scene_lookups
 from factory.rows import earlier_lineage, label_columns, sample_row
@@ -211,7 +212,7 @@ class FactoryWork:
         if ref in self.broken:
             raise BrokenLog(ref.log_id, self.broken[ref])
         with watch.of("clip"):
-            clip = self.reader.read(ref)
+            clip = read_clip(self.reader, ref)
         if not has_route(clip.centerline):
             return Rejected("clip", "route_ended", "the log ends at the end of its route")
         return clip
@@ -225,7 +226,7 @@ class FactoryWork:
             return Rejected("clip", "no_earlier_frame", f"the log begins {ref.start_ms} ms before the clip")
         try:
             with watch.of("clip"):
-                return self.reader.read(earlier)
+                return read_clip(self.reader, earlier)
         except BadClip as error:  # the clip itself was read: what lies before it is no drive
             return Rejected("clip", "no_earlier_frame", str(error))
 
@@ -254,7 +255,7 @@ class FactoryWork:
         """The clip's block into this machine's cache. Raises BadClip."""
         watch = Stopwatch()
         with watch.of("reconstruct"):
-            found, psnr_db = self.imaging.build(self.reader.read(ref), threads)
+            found, psnr_db = self.imaging.build(read_clip(self.reader, ref), threads)
         return Built(watch.seconds, found, psnr_db)
 
     def doing(self) -> str:
@@ -348,7 +349,7 @@ class FactoryWork:
         clip = _driven(payload, expert)
         if self.render.mode is not RenderMode.AUTO:
             return clip
-        now = self.reader.read(_earlier_ref(payload.ref) if expert == HUMAN_BEFORE else payload.ref)
+        now = read_clip(self.reader, _earlier_ref(payload.ref) if expert == HUMAN_BEFORE else payload.ref)
         return replace(clip, images=now.images, sweeps=now.sweeps, block=now.block)
 
     @property

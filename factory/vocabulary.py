@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factory.clips.reader import BadClip, ClipReader
+from factory.clips.validate import read_clip
 from factory.config import ConfigError, build, compose, fill, need_run_extra
 from tasks.experts.recovery import RecoveryTable
 from tasks.kinematic_vocabulary import kinematic_trajectories
@@ -80,7 +81,7 @@ def train_windows(reader: ClipReader, every_s: float = 0.5) -> TrainWindows:
     logs: set[str] = set()
     for ref in index.refs:
         try:
-            clip = reader.read(ref)
+            clip = read_clip(reader, ref)
         except BadClip as error:
             broken[ref.clip_id] = str(error)
             continue

@@ -177,6 +177,10 @@ class LogReader(ABC, Generic[Log]):
             raise BadClip(log.file, "start_ms", f"no window of {ref.window} starts at {ref.start_ms} ms")
         recorded = self.recorded(log, start, stop)
         ego_states = log.ego_states[start:stop].copy()  # the log stays with the reader, the clip is the caller's
+        try:
+            centerline = log.finder.centerline_from(ego_states[NOW, :3])
+        except NoRoute as error:
+            raise BadClip(log.file, "route", str(error)) from error
         clip = Clip(
             clip_id=ref.clip_id,
             dataset=self.name,
@@ -188,7 +192,7 @@ class LogReader(ABC, Generic[Log]):
             agents=present(log.agents.window(start, stop)),
             road_map=log.road_map,
             route=log.route,
-            centerline=log.finder.centerline_from(ego_states[NOW, :3]),
+            centerline=centerline,
             lights=TrafficLights(log.lights.lane_ids, log.lights.states[start:stop].copy()),
             cameras=recorded.cameras,
             images=recorded.images,

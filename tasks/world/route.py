@@ -3,7 +3,7 @@
 docs/reward.md 0, "Route and map of a log that has no planner's route". Works for any map with a lane graph.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,7 @@ SAME_DIRECTION_DOT = 0.5
 
 
 class NoRoute(ValueError):
-    """The ego is never on a lane of the map, so the log has no route."""
+    """The log has no route: the ego is never on a lane of the map, or the map does not say what is beside what."""
 
 
 def roadblocks_of(lanes: Mapping[str, Lane]) -> dict[str, str]:
@@ -82,6 +82,7 @@ def driven_lanes(road_map: RoadMap, poses: Array) -> tuple[str, ...]:
     lanes = [lane for lane in road_map.lanes.values() if lane.drives_cars]
     if not lanes:
         raise NoRoute("the map has no lane that cars drive")
+    _refuse_without_roadblock(road_map, [lane.lane_id for lane in lanes])
     rings = Rings([lane.ring for lane in lanes])
     cost: dict[str, float] = {}
     came_from: list[dict[str, str | None]] = []
@@ -119,6 +120,7 @@ class RouteFinder:
         self._lanes = {lane_id: lane for lane_id, lane in road_map.lanes.items() if lane_id in route.lane_ids}
         if not self._lanes:
             raise NoRoute("the route names no lane of the map")
+        _refuse_without_roadblock(road_map, self._lanes)
         self._ids = list(self._lanes)
         self._rings = Rings([lane.ring for lane in self._lanes.values()])
         self._block_of = road_map.roadblock_of
@@ -182,6 +184,15 @@ class RouteFinder:
 def centerline_from(road_map: RoadMap, route: Route, pose: Array) -> Array:
     """(P, 3) centreline of the route ahead of one rear-axle pose (3,); for many poses keep a RouteFinder."""
     return RouteFinder(road_map, route).centerline_from(pose)
+
+
+def _refuse_without_roadblock(road_map: RoadMap, lane_ids: Iterable[str]) -> None:
+    without = [lane_id for lane_id in lane_ids if lane_id not in road_map.roadblock_of]
+    if without:
+        raise NoRoute(
+            f"road_map.roadblock_of has no roadblock of lane {without[0]}: fill it with "
+            "tasks.world.route.roadblocks_of(lanes)"
+        )
 
 
 def _direction(lane: Lane) -> Array:

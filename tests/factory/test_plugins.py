@@ -29,8 +29,8 @@ from tests.tasks.streets import street_clip
 class MyReader:
     name = "mine"
 
-    def __init__(self, root, n=2):
-        self.root, self.n = root, n
+    def __init__(self, root, n=2, blocks=True):
+        self.root, self.n, self.blocks = root, n, blocks
 
     def index(self):
         return ClipIndex(tuple(ClipRef(self.name, "log", 1000 * i) for i in range(self.n)), dropped={"rain": 3})
@@ -38,7 +38,9 @@ class MyReader:
     def read(self, ref):
         if ref.start_ms == 1000:
             raise BadClip(f"{self.root}/log", "x", "holds NaN")
-        return replace(street_clip(), clip_id=ref.clip_id, dataset=self.name, log_id=ref.log_id)
+        street = street_clip()
+        road_map = street.road_map if self.blocks else replace(street.road_map, roadblock_of={})
+        return replace(street, clip_id=ref.clip_id, dataset=self.name, log_id=ref.log_id, road_map=road_map)
 
 
 class RollOn:
@@ -129,6 +131,12 @@ def test_my_reader_s_bad_clip_is_reported_by_file_and_field(package: Path) -> No
     run = assembled(package)
     with pytest.raises(BadClip, match="log: x: holds NaN"):
         run.work.prepare(run.index.refs[1])
+
+
+def test_a_map_without_roadblocks_is_reported_before_anything_is_computed(package: Path) -> None:
+    run = assembled(package, "+clips.blocks=false")
+    with pytest.raises(BadClip, match=r"clip \w{16} \(mine log at 0 s\): road_map.roadblock_of: has no roadblock of"):
+        run.work.prepare(run.index.refs[0])
 
 
 def test_my_expert_s_refusal_is_a_rejection(package: Path) -> None:

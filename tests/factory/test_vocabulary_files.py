@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,9 +26,8 @@ from factory.vocabulary import (
 from tasks.experts.recovery import RecoveryTable
 from tasks.kinematic_vocabulary import kinematic_trajectories
 from tasks.vocabulary import Vocabulary
-from tasks.world.agents import AgentTracks
 from tasks.world.clip import CLIP_STEPS, Clip
-from tasks.world.lanes import RoadMap, Route
+from tests.tasks.streets import street_clip
 
 
 class DriveReader:
@@ -47,26 +47,14 @@ class DriveReader:
         t = ref.start_ms / 1000.0 + 0.1 * np.arange(CLIP_STEPS)
         states = np.zeros((CLIP_STEPS, 11))
         states[:, 0], states[:, 1], states[:, 2] = 6.0 * t + 0.1 * t**2, 0.05 * t**2, 0.02 * t
-        return Clip(
+        return replace(
+            street_clip(),
             clip_id=ref.clip_id,
             dataset="drives",
             log_id=ref.log_id,
             split=self.splits[ref.log_id],
             start_s=ref.start_ms / 1000.0,
             ego_states=states,
-            world_from_ego=np.repeat(np.eye(4)[None], CLIP_STEPS, axis=0),
-            agents=AgentTracks(
-                (),
-                (),
-                np.zeros((CLIP_STEPS, 0, 5)),
-                np.zeros((CLIP_STEPS, 0, 2)),
-                np.zeros((CLIP_STEPS, 0), bool),
-                np.zeros((CLIP_STEPS, 0)),
-                np.zeros(0),
-            ),
-            road_map=RoadMap({}, ()),
-            route=Route((), (), frozenset()),
-            centerline=np.zeros((2, 3)),
         )
 
 

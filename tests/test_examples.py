@@ -1,0 +1,131 @@
+"""examples/ do what they say: each is run through the command that its first lines name."""
+
+import os
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from examples.csv_logs import CsvReader, write_log
+from examples.keep_lane import KeepLane
+from factory.clips.reader import BadClip
+from factory.run import main as run_main
+from factory.store.reader import SampleTable
+from planners.train import main as train_main
+from tasks.experts.protocol import Plan
+from tasks.kernels import cache_dir
+from tasks.stages import Rejected
+from tasks.world.clip import scene_of_clip
+from tests.tasks.streets import street_clip
+
+ROOT = Path(__file__).resolve().parents[1]
+EXAMPLES = sorted(path for path in (ROOT / "examples").glob("*.py"))
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The samples of one log of the CSV reader, driven by the example's expert and the human."""
+    home = tmp_path_factory.mktemp("examples")
+    write_log(home / "logs" / "street")
+    code = run_main(
+        [
+            "clips=custom",
+            "clips._target_=examples.csv_logs.CsvReader",
+            f"+clips.root={home / 'logs'}",
+            "+expert.keep_lane._target_=examples.keep_lane.KeepLane",
+            "+expert.keep_lane.settle_m=12",
+            "experts=[keep_lane,human]",
+            "render=none",
+            "reward.labels=none",
+            "vocabulary.k=256",
+            "executor=local",
+            "limit=1",
+            f"out={home / 'out'}",
+        ]
+    )
+    assert code == 0
+    return home
+
+
+def test_the_reader_and_the_expert_make_samples_of_a_map_of_one_s_own(made: Path) -> None:
+    table = SampleTable(made / "out")
+    rows = [table[i] for i in range(len(table))]
+    assert {row["expert"] for row in rows} == {"keep_lane", "human"}
+    assert {row["dataset"] for row in rows} == {"csv"} and {row["licence"] for row in rows} == {"yours"}
+    kept = next(row for row in rows if row["expert"] == "keep_lane")
+    assert set(kept["route_lane_ids"]) == {"left", "right"}
+
+
+def test_the_planner_trains_on_them(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = [
+        "planner=custom",
+        "planner.name=examples.linear_planner:LinearPlanner",
+        "+planner.settings.history=true",
+        "planner.training.batch_size=2",
+        f"data.real=[{made / 'out'}]",
+        f"data.sim=[{made / 'out'}]",
+        "steps=3",
+        "workers=0",
+        "device=cpu",
+        f"out={made / 'linear'}",
+    ]
+    assert train_main(arguments) == 0, capsys.readouterr().err
+    assert list((made / "linear").rglob("*.safetensors"))
+
+
+def test_the_script_scores_plans_without_ray_or_hydra() -> None:
+    code = "import examples.score_plans, sys\nassert not {'ray', 'hydra', 'torch'} & set(sys.modules)"
+    env = os.environ | {"NUMBA_CACHE_DIR": str(cache_dir().parent)}
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=env, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    told = {line[:20].strip(): line.split()[-6:] for line in done.stdout.splitlines()[1:5]}
+    nc, dac, score = ({name: float(row[i]) for name, row in told.items()} for i in (0, 1, 5))
+    assert nc["rams the car ahead"] == 0.0 and dac["leaves the road"] == 0.0
+    assert max(score, key=lambda name: score[name]) == "goes on" and score["stands"] < 0.7
+    assert "stands, alone in its batch: ep 1.00" in done.stdout
+
+
+def test_keep_lane_is_on_the_centreline_after_some_seconds_and_refuses_what_is_off_the_route() -> None:
+    clip = street_clip()
+    scene = scene_of_clip(clip)
+    beside = scene.ego_history.copy()
+    beside[:, 1] = 1.0
+    plan = KeepLane().plan(replace(scene, ego_history=beside), np.random.default_rng(0))
+    assert isinstance(plan, Plan) and plan.poses.shape == (40, 3)
+    np.testing.assert_allclose(plan.poses[:, 0], 0.8 * np.arange(1, 41), atol=1e-6)
+    np.testing.assert_allclose(plan.poses[:, 1], np.exp(-0.8 * np.arange(1, 41) / 15.0), atol=1e-6)
+    beside[:, 1] = 8.0
+    refused = KeepLane().plan(replace(scene, ego_history=beside), np.random.default_rng(0))
+    assert refused == Rejected("expert", "off_route", "8.0 m beside the centreline")
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "told"),
+    [
+        ("ego.csv", "heading,speed", "heading,pace", r"ego\.csv: speed: expected a column of numbers"),
+        ("ego.csv", ",0,0,8.0", ",north,0,8.0", r"ego\.csv: y: expected a column of numbers: .*north"),
+        ("map.json", '"right": [[', '"rigth": [[', r"map\.json: map: KeyError\('right'\)"),
+    ],
+)
+def test_the_reader_names_file_and_field_of_what_is_wrong(
+    tmp_path: Path, name: str, old: str, new: str, told: str
+) -> None:
+    write_log(tmp_path / "street")
+    reader = CsvReader(tmp_path)
+    (ref, *_) = reader.index().refs
+    file = tmp_path / "street" / name
+    file.write_text(file.read_text().replace(old, new))
+    with pytest.raises(BadClip, match=told):
+        CsvReader(tmp_path).read(ref)
+
+
+def test_every_example_says_how_it_is_run_and_is_short() -> None:
+    assert len(EXAMPLES) == 4
+    for path in EXAMPLES:
+        text = path.read_text()
+        assert re.search(r"python -m (factory|planners|examples)\.", text.split('"""')[1]), path.name
+        assert len(text.splitlines()) < 220, path.name
