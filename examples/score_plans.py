@@ -34,13 +34,9 @@ for k, name in enumerate(plans):
     print(f"{name:<20}{''.join(f'{part:>6.2f}' for part in parts)}{scores.pdm_score[k]:>8.3f}")
 
 # %% When a rule was broken first [s]: inf where it never was.
-print(
-    {
-        rule: np.round(0.1 * index, 1).tolist()
-        for rule, index in scores.first_failures.items()
-        if np.isfinite(index).any()
-    }
-)
+for rule, index in scores.first_failures.items():
+    if np.isfinite(index).any():
+        print(f"{rule:<20}", np.round(0.1 * index, 1))
 
 # %% Held against each other instead: the best row has EP 1, and so has a car that stops, alone in its batch.
 alone = score_trajectories(clip, plans["stands"][None], reference="batch")
