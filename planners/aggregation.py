@@ -36,6 +36,7 @@ class ClipResult:
     clip_id: str
     one_stage: FrameScores  # of the logged frame now, among the one-stage evaluation's traffic
     groups: tuple[Group, Group] | None  # now, before; None: the clip has no follow-ups
+    log_id: str = ""  # empty: unknown
 
     @property
     def n_follow_ups(self) -> int:
@@ -85,7 +86,11 @@ def by_clip(rows: Sequence[FrameRow]) -> list[ClipResult]:
 
 def summarise(rows: Sequence[FrameRow]) -> Summary:
     """Means over the clips of all rows of one planner. Raises ValueError for no rows or a lacking frame."""
-    clips = by_clip(rows)
+    return summary_of(by_clip(rows))
+
+
+def summary_of(clips: Sequence[ClipResult]) -> Summary:
+    """Means over the clips of one planner. Raises ValueError for none."""
     if not clips:
         raise ValueError("no frame was scored")
     groups = [clip.groups for clip in clips if clip.groups is not None]
@@ -152,7 +157,8 @@ def _of_clip(clip_id: str, rows: Sequence[FrameRow]) -> ClipResult:
     if one_stage is None:
         raise ValueError(f"clip {clip_id}: no row of the logged frame in one_stage")
     has_follow_ups = any(stage == "stage_two" for stage, _ in found)
-    return ClipResult(clip_id, one_stage.scores, _groups(clip_id, found) if has_follow_ups else None)
+    groups = _groups(clip_id, found) if has_follow_ups else None
+    return ClipResult(clip_id, one_stage.scores, groups, one_stage.log_id)
 
 
 def _groups(clip_id: str, found: Found) -> tuple[Group, Group]:

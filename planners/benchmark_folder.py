@@ -31,7 +31,7 @@ class BenchmarkFolder:
         """
         self.path, location = path, Location.parse(path)
         self._document = location.read(BENCHMARK_FILE) or b""
-        self._follow_ups = _clips_of(path, self._document)
+        self._follow_ups, self._logs = _clips_of(path, self._document)
         try:
             self.table = SampleTable(path)
         except (FileNotFoundError, ValueError) as error:
@@ -63,6 +63,10 @@ class BenchmarkFolder:
         for clip_id in self._follow_ups:
             found.update(self._scenes.location.read(f"{clip_id}.npz") or b"")
         return found.hexdigest()[:16]
+
+    def log_of(self, clip_id: str) -> str:
+        """The id of the clip's log."""
+        return self._logs[clip_id]
 
     def image_source(self, key: FrameKey) -> str:
         """photo, render, map or none."""
@@ -96,8 +100,13 @@ class BenchmarkFolder:
             raise ConfigError(f"benchmark={self.path}: scenes of clip {clip_id}: {error}: {HOW}") from error
 
 
-def _clips_of(path: str, document: bytes) -> dict[str, list[int]]:
-    """Clip -> candidate indices of its follow-ups."""
+def logs_of(path: str) -> dict[str, str]:
+    """Clip -> log of a benchmark, from its document alone. Raises ConfigError where there is none."""
+    return _clips_of(path, Location.parse(path).read(BENCHMARK_FILE) or b"")[1]
+
+
+def _clips_of(path: str, document: bytes) -> tuple[dict[str, list[int]], dict[str, str]]:
+    """Clip -> candidate indices of its follow-ups, clip -> its log."""
     if not document:
         raise ConfigError(f"benchmark={path}: no {BENCHMARK_FILE} here: {HOW}")
     try:
@@ -105,6 +114,7 @@ def _clips_of(path: str, document: bytes) -> dict[str, list[int]]:
         if stored["format"] != FORMAT:
             raise ConfigError(f"benchmark={path}: format {stored['format']}, this version reads {FORMAT}")
         clips = {str(clip["clip_id"]): [int(i) for i in clip["follow_ups"]] for clip in stored["clips"]}
+        logs = {str(clip["clip_id"]): str(clip["log_id"]) for clip in stored["clips"]}
     except (KeyError, TypeError, ValueError) as error:
         if isinstance(error, ConfigError):
             raise
@@ -112,7 +122,7 @@ def _clips_of(path: str, document: bytes) -> dict[str, list[int]]:
     if not clips:
         why = "; ".join(sorted({str(clip["why"]) for clip in stored["left_out"]})) or "it read none"
         raise ConfigError(f"benchmark={path}: none of its clips counts: {why}")
-    return clips
+    return clips, logs
 
 
 def _frames_of(clip_id: str, follow_ups: Sequence[int]) -> list[FrameKey]:

@@ -1,11 +1,13 @@
 """Paired bootstrap: how far the difference of two planners may lie from the measured one, over clips and seeds.
 
 Both planners were scored on the same clips, so clips are drawn once for both and the differences keep their pairs.
+Clips that share a log or a town are no independent draws: where their clusters are given, whole clusters are drawn.
 Several trainings of each are a second level: with equally many on both sides they are pairs (the same seeds) and are
 drawn as pairs, else on each side by itself. An interval runs between percentiles of the drawn differences
 (Efron & Tibshirani 1993, ch. 13).
 """
 
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +20,7 @@ DRAWS_AT_ONCE = 256  # bounds memory
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean difference, b - a, and where it lies."""
+    """A mean difference, b - a, and where it lies; NaN bounds where one cluster is all there is."""
 
     a: float
     b: float
@@ -28,8 +30,8 @@ class Interval:
 
     @property
     def is_clear(self) -> bool:
-        """Whether zero lies outside."""
-        return not self.low <= 0.0 <= self.high
+        """Whether zero lies outside; not where there is no interval."""
+        return self.low > 0.0 or self.high < 0.0
 
 
 def paired_interval(
@@ -37,6 +39,7 @@ def paired_interval(
     b: Array,
     *,
     weights: tuple[Array, Array] | None = None,
+    clusters: Sequence[Hashable] | None = None,
     confidence: float = 0.95,
     draws: int = 10_000,
     seed: int = 0,
@@ -44,23 +47,35 @@ def paired_interval(
     """The mean of b minus that of a over the same C clips, with its interval.
 
     a, b: (S_a, C), (S_b, C) scores of each training on each clip; weights: of the same shapes, what each score counts
-    in a mean (the number of frames), by default equal. Raises ValueError for other shapes, no clip, scores that are
+    in a mean (the number of frames), by default equal; clusters: of each clip, by default its own. From a single
+    cluster nothing can be drawn, and the interval is NaN. Raises ValueError for other shapes, no clip, scores that are
     not finite, or a confidence that is not between 0 and 1.
     """
     counts = weights if weights is not None else (np.ones_like(a), np.ones_like(b))
     _check(a, b, counts, confidence, draws)
+    cluster_of_clip, n_clusters = _indices(clusters if clusters is not None else range(a.shape[1]), a.shape[1])
+    mean_a, mean_b = (float((x * w).sum() / w.sum()) for x, w in zip((a, b), counts))
+    if n_clusters == 1 and clusters is not None:
+        return Interval(mean_a, mean_b, mean_b - mean_a, np.nan, np.nan)
     rng = np.random.default_rng(seed)
     paired = len(a) == len(b)
     differences = np.empty(draws)
     for start in range(0, draws, DRAWS_AT_ONCE):
         size = min(DRAWS_AT_ONCE, draws - start)
-        clips = _drawn(rng, size, a.shape[1])
+        clips = _drawn(rng, size, n_clusters)[:, cluster_of_clip]
         of_a = _drawn(rng, size, len(a))
         of_b = of_a if paired else _drawn(rng, size, len(b))
         differences[start : start + size] = _means(b, counts[1], of_b, clips) - _means(a, counts[0], of_a, clips)
     low, high = np.quantile(differences, [(1.0 - confidence) / 2.0, (1.0 + confidence) / 2.0])
-    mean_a, mean_b = (float((x * w).sum() / w.sum()) for x, w in zip((a, b), counts))
     return Interval(mean_a, mean_b, mean_b - mean_a, float(low), float(high))
+
+
+def _indices(clusters: Sequence[Hashable], n_clips: int) -> tuple[NDArray[np.intp], int]:
+    """The cluster of each clip as a number, in the order in which they first come, and how many there are."""
+    if len(clusters) != n_clips:
+        raise ValueError(f"clusters must name one for each of {n_clips} clips, got {len(clusters)}")
+    place = {cluster: i for i, cluster in enumerate(dict.fromkeys(clusters))}
+    return np.array([place[cluster] for cluster in clusters]), len(place)
 
 
 def _drawn(rng: np.random.Generator, size: int, n: int) -> Array:

@@ -14,7 +14,7 @@ from planners.aggregation import MEASURES, ClipResult
 from planners.measured import Measured, measured
 from planners.scores import write_csv
 
-FACTS = ("stage", "human_filter", "clip", "frames")  # frames: what the clip counts in a mean
+FACTS = ("stage", "human_filter", "log", "clip", "frames")  # frames: what the clip counts in a mean
 
 
 def write_clips(path: Path, runs: Mapping[str, Sequence[ClipResult]]) -> None:
@@ -23,7 +23,7 @@ def write_clips(path: Path, runs: Mapping[str, Sequence[ClipResult]]) -> None:
     rows = []
     for name in MEASURES:
         for k, clip in enumerate(found[name].clips if name in found else ()):
-            facts = dict(zip(FACTS, (*name, clip, int(found[name].weights[0, k]))))
+            facts = dict(zip(FACTS, (*name, found[name].logs[k], clip, int(found[name].weights[0, k]))))
             rows.append(facts | dict(zip(runs, (100.0 * found[name].scores[:, k]).tolist())))
     write_csv(path, rows)
 
@@ -46,5 +46,6 @@ def read_clips(path: Path, labels: Sequence[str]) -> dict[tuple[str, str], Measu
             frames = np.array([float(row["frames"]) for row in mine])
         except (TypeError, ValueError) as error:
             raise ValueError(f"{path}, {' '.join(name)}: {error}") from error
-        found[name] = Measured(tuple(row["clip"] for row in mine), scores, np.tile(frames, (len(labels), 1)))
+        clips, logs = (tuple(row[what] for row in mine) for what in ("clip", "log"))
+        found[name] = Measured(clips, logs, scores, np.tile(frames, (len(labels), 1)))
     return found

@@ -6,19 +6,23 @@
 
 A run is a folder that `python -m planners.evaluate` made of one planner, or a column of a study's clips.csv. Several
 runs of a side are trainings of one planner with other seeds: clips and seeds are both drawn, pairs of seeds where both
-sides have equally many.
+sides have equally many. Intervals over logs and over towns, where they are known, draw all clips of one together:
+clips of one log share their scene, and an interval over clips alone is too narrow.
 """
 
 import csv
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
 
 from factory.config import ConfigError, compose, fill
 from planners.aggregation import ClipResult, by_clip
 from planners.bootstrap import Interval, paired_interval
 from planners.clip_table import read_clips
+from planners.clusters import LEVELS, clusters_of
 from planners.eval_record import read_record
 from planners.measured import Measured, check_same_clips, measured
 from planners.score_rows import read_rows
@@ -42,51 +46,91 @@ class CompareSettings:
     out: str | None = None  # a CSV file
 
 
+Measure = tuple[str, str]  # stage, human filter
+ByLevel = Mapping[str, Interval]  # of planners.clusters.LEVELS, those that are known
+
+
 def compare(
     a: Sequence[Sequence[ClipResult]], b: Sequence[Sequence[ClipResult]], settings: CompareSettings
-) -> dict[tuple[str, str], Interval]:
-    """(stage, filter) -> difference of the runs b from the runs a. Raises ValueError where their clips differ."""
+) -> dict[Measure, ByLevel]:
+    """Difference of the runs b from the runs a. Raises ValueError where their clips differ."""
     check_same_clips([*a, *b])
     return intervals(measured(a, settings.column), measured(b, settings.column), settings)
 
 
 def intervals(
-    of_a: Mapping[tuple[str, str], Measured], of_b: Mapping[tuple[str, str], Measured], settings: CompareSettings
-) -> dict[tuple[str, str], Interval]:
-    """(stage, filter) -> difference of what runs scored on the same clips, of stages that both sides have."""
+    of_a: Mapping[Measure, Measured], of_b: Mapping[Measure, Measured], settings: CompareSettings
+) -> dict[Measure, ByLevel]:
+    """Difference of what runs scored on the same clips, of measures that both sides have, over clips, logs and towns.
+
+    Raises ValueError where the sides are not over the same clips.
+    """
+    return {name: _by_level(of_a[name], of_b[name], settings) for name in of_a if name in of_b}
+
+
+def _by_level(a: Measured, b: Measured, settings: CompareSettings) -> ByLevel:
+    if a.clips != b.clips:
+        raise ValueError("the runs were not scored on the same clips")
     return {
-        name: paired_interval(
-            of_a[name].scores,
-            of_b[name].scores,
-            weights=(of_a[name].weights, of_b[name].weights),
+        level: paired_interval(
+            a.scores,
+            b.scores,
+            weights=(a.weights, b.weights),
+            clusters=None if level == "clip" else clusters,
             confidence=settings.confidence,
             draws=settings.draws,
             seed=settings.seed,
         )
-        for name in of_a
-        if name in of_b
+        for level, clusters in clusters_of(a.clips, a.logs).items()
     }
 
 
-def text_of(found: Mapping[tuple[str, str], Interval], confidence: float) -> str:
+def is_clear(found: ByLevel) -> bool:
+    """Whether zero lies outside of every interval that there is."""
+    return all(one.is_clear for one in found.values())
+
+
+def row_of(found: ByLevel | None, scale: float = 100.0) -> dict[str, float | str]:
+    """Columns of tables: the difference and its bounds over each of LEVELS, empty where there is none."""
+    row: dict[str, float | str] = {"difference": "" if found is None else scale * found["clip"].difference}
+    for level in LEVELS:
+        one = None if found is None else found.get(level)
+        known = one is not None and np.isfinite(one.low)
+        for name in ("low", "high"):
+            row[name if level == "clip" else f"{name}_{level}"] = scale * getattr(one, name) if known else ""
+    return row
+
+
+def text_of(found: Mapping[Measure, ByLevel], confidence: float) -> str:
     """A table to be printed."""
     percent = f"{100 * confidence:g} %"
-    lines = [f"{'stage':<10} {'filter':<11}{'a':>9}{'b':>9}{'b - a':>9}   {percent} interval"]
-    for (stage, human_filter), one in found.items():
-        lines.append(
-            f"{stage:<10} {human_filter:<11}{one.a:9.4f}{one.b:9.4f}{one.difference:+9.4f}"
-            f"   {one.low:+.4f} .. {one.high:+.4f}{'  *' if one.is_clear else ''}"
-        )
-    return "\n".join([*lines, f"*: zero lies outside the {percent} interval", *FILTERS_NOTE])
+    levels = [level for level in LEVELS if any(level in by_level for by_level in found.values())]
+    over = "".join(f"   {f'{percent} over {level}s':<18}" for level in levels)
+    lines = [f"{'stage':<10} {'filter':<11}{'a':>9}{'b':>9}{'b - a':>9}{over}"]
+    for (stage, human_filter), by_level in found.items():
+        one = by_level["clip"]
+        said = "".join(f"   {_bounds(by_level[level]):<18}" for level in levels)
+        line = f"{stage:<10} {human_filter:<11}{one.a:9.4f}{one.b:9.4f}{one.difference:+9.4f}{said}"
+        lines.append(f"{line}{'  *' if is_clear(by_level) else ''}".rstrip())
+    lines.append(f"*: zero lies outside of each {percent} interval")
+    if "log" not in levels:
+        lines.append("the runs do not say which log a clip is of: evaluate them again for intervals over logs")
+    return "\n".join([*lines, *FILTERS_NOTE])
 
 
-def write_csv(path: Path, found: Mapping[tuple[str, str], Interval]) -> None:
-    """One line a stage and filter."""
+def _bounds(one: Interval) -> str:
+    return f"{one.low:+.4f} .. {one.high:+.4f}" if np.isfinite(one.low) else "only one"
+
+
+def write_csv(path: Path, found: Mapping[Measure, ByLevel]) -> None:
+    """One line a measure."""
     with path.open("w", newline="") as file:
         table = csv.writer(file)
-        table.writerow(["stage", "human_filter", "a", "b", "difference", "low", "high"])
-        for name, one in found.items():
-            table.writerow([*name, *asdict(one).values()])
+        for n, (name, by_level) in enumerate(found.items()):
+            row = row_of(by_level, scale=1.0)
+            if n == 0:
+                table.writerow(["stage", "human_filter", "a", "b", *row])
+            table.writerow([*name, by_level["clip"].a, by_level["clip"].b, *row.values()])
 
 
 def read_runs(folders: str | Sequence[str]) -> list[list[ClipResult]]:

@@ -26,7 +26,7 @@ import os
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -148,7 +148,8 @@ def _scored(
             began = time.perf_counter()
             for one in who:
                 own = plans[one.label] if one.privileged is None else one.privileged(prepared)
-                rows[one.label] += score_clip(prepared, own, tags)
+                scored = score_clip(prepared, own, tags)
+                rows[one.label] += [replace(row, log_id=benchmark.log_of(clip_id)) for row in scored]
             spent += time.perf_counter() - began
             n_rows = sum(map(len, rows.values()))
             progress.show(done, f"{1000.0 * spent / n_rows:.1f} ms a frame and planner")

@@ -72,6 +72,10 @@ class Benchmark(Protocol):
         """Every frame, clip by clip."""
         ...
 
+    def log_of(self, clip_id: str) -> str:
+        """The id of the clip's log."""
+        ...
+
     def image_source(self, key: FrameKey) -> str:
         """photo, render, map or none."""
         ...

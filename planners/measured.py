@@ -17,6 +17,7 @@ class Measured:
     """One column of S runs on C clips."""
 
     clips: tuple[str, ...]
+    logs: tuple[str, ...]  # of each clip; empty: unknown
     scores: Array  # (S, C)
     weights: Array  # (S, C) how much a clip's score counts in a mean: rows or groups that it is the mean of
 
@@ -44,6 +45,7 @@ def _of_stage(runs: Sequence[Sequence[ClipResult]], stage: str, human_filter: st
 
     return Measured(
         clips=tuple(clip.clip_id for clip in runs[0]),
+        logs=tuple(clip.log_id for clip in runs[0]),
         scores=np.array([[score(clip) for clip in run] for run in runs]),
         weights=np.array([[float(_count(clip, stage)) for clip in run] for run in runs]),
     )

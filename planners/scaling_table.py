@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from planners.aggregation import MEASURES, ClipResult, by_clip
-from planners.compare import CompareSettings, compare
+from planners.compare import CompareSettings, compare, row_of
 from planners.score_rows import read_rows
 from planners.scores import BOUNDS, name_of, scores_of
 from planners.sweep import Training
@@ -20,7 +20,8 @@ def compared(trainings: Sequence[Training], evaluations: Path) -> list[dict[str,
     """A row for each setup, which is all facts but the seed, and each of MEASURES.
 
     In percent: the mean over seeds, the range of single seeds, and the difference from real samples alone with its
-    95 % interval (paired bootstrap over clips and seeds), empty for those themselves and where the sweep has none.
+    95 % intervals (paired bootstrap over seeds and clips, logs, towns), empty for those themselves and where the sweep
+    has none.
     uniform_share is the mean share of clips none of whose follow-ups starts near the plan's end.
     """
     setups: dict[Setup, list[str]] = {}
@@ -38,8 +39,7 @@ def compared(trainings: Sequence[Training], evaluations: Path) -> list[dict[str,
             row = {**dict(setup), "seeds": len(labels), "stage": stage, "human_filter": human_filter}
             row |= {"epdms": float(np.mean(each)), "lowest_seed": min(each), "highest_seed": max(each)}
             found = differences.get((stage, human_filter))
-            for name in ("difference", "low", "high"):
-                row[name] = "" if found is None else 100.0 * getattr(found, name)
+            row |= row_of(found)
             row["uniform_share"] = float(np.mean([score["uniform_share"] for score in scores]))
             rows.append(row)
     return rows

@@ -33,6 +33,7 @@ class FrameRow:
     end: Array  # (3,) last pose of the plan as predicted, world; NaN: no plan
     tags: tuple[str, ...] = ()
     weight: float = np.nan  # of a follow-up frame in its group; NaN elsewhere
+    log_id: str = ""  # of the clip; empty: unknown
 
     def __post_init__(self) -> None:
         if self.stage not in STAGES:
@@ -41,7 +42,7 @@ class FrameRow:
 
 SCHEMA = pa.schema(
     [
-        *((name, pa.string()) for name in ("stage", "clip_id", "kind")),
+        *((name, pa.string()) for name in ("stage", "log_id", "clip_id", "kind")),
         ("candidate_index", pa.int32()),
         *((name, pa.float64()) for name in COLUMNS),
         *((name + FILTERED, pa.float64()) for name in COLUMNS),
@@ -62,9 +63,14 @@ def write_rows(folder: Path, rows: Sequence[FrameRow]) -> None:
 
 
 def read_rows(folder: Path) -> list[FrameRow]:
-    """What `write_rows` wrote. Raises FileNotFoundError, or ValueError for a file of other columns."""
+    """What `write_rows` wrote. Raises FileNotFoundError, or ValueError for a file of other columns.
+
+    Files from before log_id was written are read as of unknown logs.
+    """
     path = folder / "frames.parquet"
     table = pq.read_table(path)
+    if "log_id" not in table.column_names:
+        table = table.append_column("log_id", pa.array([""] * len(table)))
     missing = [name for name in SCHEMA.names if name not in table.column_names]
     if missing:
         raise ValueError(f"{path}: no columns {', '.join(missing)}: evaluate the planner again")
@@ -75,6 +81,7 @@ def _flat(row: FrameRow) -> dict[str, object]:
     key = row.key
     return {
         "stage": row.stage,
+        "log_id": row.log_id,
         "clip_id": key.clip_id,
         "kind": key.kind,
         "candidate_index": key.candidate_index,
@@ -101,4 +108,5 @@ def _row(values: dict[str, object]) -> FrameRow:
         end=numbers([f"end_{name}" for name in POSE]),
         tags=tuple(str(values["tags"]).split()),
         weight=float(values["weight"]),  # type: ignore[arg-type]
+        log_id=str(values["log_id"]),
     )

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from planners.aggregation import MEASURES, HumanFilter, lines_of, score_of, summarise
+from planners.aggregation import MEASURES, ClipResult, HumanFilter, by_clip, lines_of, score_of, summary_of
 from planners.score_rows import read_rows
 
 PAPER: HumanFilter = "unfiltered"  # what is held against the paper's tables
@@ -18,9 +18,14 @@ def shown(human_filter: HumanFilter) -> dict[str, str]:
 
 
 def scores_of(folder: Path) -> dict[str, float]:
-    """Of one evaluated planner: name_of(stage, filter) -> EPDMS in percent, and its share of uniform fallbacks."""
+    """`scores_of_clips` of one evaluated planner."""
+    return scores_of_clips(by_clip(read_rows(folder)))
+
+
+def scores_of_clips(clips: Sequence[ClipResult]) -> dict[str, float]:
+    """Of one planner: name_of(stage, filter) -> EPDMS in percent, and its share of uniform fallbacks."""
     found = {}
-    for line in lines_of(folder.name, summarise(read_rows(folder))):
+    for line in lines_of("", summary_of(clips)):
         found[name_of(line.stage, line.human_filter)] = 100.0 * score_of(line.columns)
         if line.stage == "final":
             found["uniform_share"] = line.uniform_share

@@ -3,42 +3,34 @@
     python -m planners.study vocabulary=<K x 40 x 3>.npy           all of it
     python -m planners.study ... minutes=25                          a part of it: what is done stays done
     python -m planners.study ... parts=[main,rounds]                 some comparisons only
+    python -m planners.study ... minutes=0                           the tables of what is done, again
 
 Every comparison is made twice: with equal passes over a planner's own data, as the paper does, and with equal optimiser
 steps, since more data in equal passes is more training as well. Seeds of parts are trained and evaluated one after the
 other, small ones together; when the minutes are out, the tables hold what is done, and say with how many seeds. They
-hold every part that is evaluated in `out`, whichever were asked for now. Tables go to `report`:
-`trainings.csv` (each training), `clips.csv` (its score on each clip), `comparisons.csv` (means over seeds, differences
-with paired bootstrap intervals over clips and seeds), `tables.md` (to be read), `bounds.csv`, `curves.csv`, and
-pictures. Exit codes: 0 complete, 2 bad settings, 3 a training failed, 4 not complete yet, resumable.
+hold every part that is evaluated in `out`, whichever were asked for now. What is written goes to `report`:
+`frames.parquet`, EPDMS of each frame by each planner; the tables and pictures, which are made of it
+(`python -m planners.study_report folder=<report>` makes them again); and the learning curves.
+Exit codes: 0 complete, 2 bad settings, 3 a training failed, 4 not complete yet, resumable.
 """
 
 import sys
-from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from factory.config import ConfigError, compose, fill
-from planners.aggregation import MEASURES, ClipResult, by_clip
+from planners.benchmark_folder import logs_of
 from planners.checkpoint import read_record
-from planners.clip_table import write_clips
-from planners.compare import CompareSettings, compare
 from planners.index import DataSettings, open_dataset
-from planners.scaling_figure import Curve, Point, draw_curves
-from planners.scaling_law import FEWEST, fit_scaling
-from planners.score_rows import read_rows
-from planners.score_table import FILTERS_NOTE
-from planners.scores import BOUNDS, name_of, scores_of, shown, title_of, write_csv
-from planners.study_figures import draw_differences, draw_learning
+from planners.score_rows import FrameRow, read_rows
+from planners.scores import BOUNDS
+from planners.study_figures import draw_learning
+from planners.study_frames import FRAMES, read_frames, write_frames
 from planners.study_plan import (
     Comparison,
     Portion,
-    Setup,
     Sizes,
     StudySettings,
     comparisons,
@@ -47,7 +39,7 @@ from planners.study_plan import (
     so_far,
     with_all_parts,
 )
-from planners.study_tables import markdown_of
+from planners.study_report import write_tables
 from planners.sweep import (
     EVALUATIONS,
     Means,
@@ -61,7 +53,6 @@ from planners.sweep import (
 )
 
 BAD_CONFIG, FAILED, INTERRUPTED = 2, 3, 4
-CURVES = {"final": "scaling.png", "stage_two": "scaling_stage_two.png"}
 
 
 def run(settings: StudySettings) -> int:
@@ -102,34 +93,24 @@ def evaluated(planned: Sequence[Portion], out: Path) -> set[str]:
 
 
 def write_report(standing: Sequence[Comparison], trained: Sequence[Training], settings: StudySettings) -> None:
-    """The tables and pictures of what is evaluated."""
+    """The per-frame rows of what is evaluated, and the tables and pictures, which are made of them alone."""
     out, report = Path(settings.out), Path(settings.report)
-    evaluations = out / EVALUATIONS
     report.mkdir(parents=True, exist_ok=True)
-    rows = [row_of(training, out, evaluations) for training in trained]
-    write_csv(report / "trainings.csv", rows)
-    write_csv(report / "bounds.csv", [{"planner": name, **scores_of(evaluations / name)} for name in BOUNDS])
-    write_clips(report / "clips.csv", {training.label: _clips(evaluations / training.label) for training in trained})
-    found = compared(standing, evaluations)
-    write_csv(report / "comparisons.csv", found)
-    measures = shown(settings.human_filter)
-    (report / "tables.md").write_text(markdown_of(found, settings.human_filter))
-    curves = {(stage, measures[stage]): curves_of(standing, rows, stage, measures[stage]) for stage in CURVES}
-    if any(curves.values()):
-        lines = [
-            {"stage": stage, "human_filter": human_filter, **curve.row()}
-            for (stage, human_filter), drawn in curves.items()
-            for curve in drawn
-        ]
-        write_csv(report / "curves.csv", lines)
-        for measure, drawn in curves.items():
-            draw_curves(drawn, title_of(*measure), report / CURVES[measure[0]])
-    differences = [row for row in found if row["reference"] and row["human_filter"] == measures[row["stage"]]]
-    if differences:
-        draw_differences(differences, report / "differences.png")
+    compared = [one.setup.label_of(seed) for one in standing for seed in range(one.seeds)]
+    labels = dict.fromkeys([*(training.label for training in trained), *compared, *BOUNDS])
+    facts = [facts_of(training, out) for training in trained]
+    write_frames(report / FRAMES, rows_of(labels, out / EVALUATIONS, settings.benchmark), facts, standing)
+    text = write_tables(read_frames(report / FRAMES), report, settings.human_filter)
     draw_learning({t.label: folder_of(out, t) for t in trained if t.facts["seed"] == 0}, report / "learning.png")
-    print(text_of(found, evaluations, measures["final"]))
+    print(text)
     print(f"tables and pictures: {report}")
+
+
+def rows_of(labels: Iterable[str], evaluations: Path, benchmark: str) -> Iterator[tuple[str, list[FrameRow]]]:
+    """The scored frames of each planner, with the logs that their clips are of as the benchmark has them."""
+    logs = logs_of(benchmark)
+    for label in labels:
+        yield label, [replace(row, log_id=logs[row.key.clip_id]) for row in read_rows(evaluations / label)]
 
 
 def sizes_of(settings: StudySettings) -> Sizes:
@@ -147,8 +128,8 @@ def sizes_of(settings: StudySettings) -> Sizes:
     return Sizes(steps, min(len(low), len(high)))
 
 
-def row_of(training: Training, out: Path, evaluations: Path) -> dict[str, Any]:
-    """One training and its scores."""
+def facts_of(training: Training, out: Path) -> dict[str, Any]:
+    """What one training is, as its own record has it."""
     record = read_record(folder_of(out, training))
     return {
         "training": training.label,
@@ -157,89 +138,7 @@ def row_of(training: Training, out: Path, evaluations: Path) -> dict[str, Any]:
         "optimiser_steps": record["trained"]["steps"],
         "real": record["samples"]["real"],
         "simulated": record["samples"]["simulated"],
-        **scores_of(evaluations / training.label),
     }
-
-
-def compared(wanted: Sequence[Comparison], evaluations: Path) -> list[dict[str, Any]]:
-    """A row for each comparison and each of MEASURES: mean over seeds in percent, difference, interval."""
-    rows = []
-    for one in wanted:
-        intervals = {}
-        if one.reference is not None:
-            a, b = (clips_of(setup, one.seeds, evaluations) for setup in (one.reference, one.setup))
-            intervals = compare(a, b, RULES)
-        for stage, human_filter in MEASURES:
-            row: dict[str, Any] = {**one.facts, "stage": stage, "human_filter": human_filter}
-            each = scores_of_seeds(one.setup, one.seeds, evaluations, stage, human_filter)
-            row |= {"epdms": float(np.mean(each)), "each": " ".join(f"{score:.1f}" for score in each)}
-            row |= {"reference": "", "difference": "", "low": "", "high": ""}
-            if one.reference is not None:
-                found = intervals[stage, human_filter]
-                row |= {"reference": one.reference.label, "difference": 100.0 * found.difference}
-                row |= {"low": 100.0 * found.low, "high": 100.0 * found.high}
-            rows.append(row)
-    return rows
-
-
-RULES = CompareSettings(a="", b="")  # draws, confidence and seed as `python -m planners.compare` has them
-
-
-def clips_of(setup: Setup, seeds: int, evaluations: Path) -> list[list[ClipResult]]:
-    """The scored clips of each seed's training."""
-    return [_clips(evaluations / f"{setup.label}-{seed}") for seed in range(seeds)]
-
-
-@cache
-def _clips(folder: Path) -> list[ClipResult]:
-    return by_clip(read_rows(folder))
-
-
-_scores = cache(scores_of)
-
-
-def scores_of_seeds(setup: Setup, seeds: int, evaluations: Path, stage: str, human_filter: str) -> list[float]:
-    """EPDMS of each seed, in percent."""
-    name = name_of(stage, human_filter)
-    return [_scores(evaluations / f"{setup.label}-{seed}")[name] for seed in range(seeds)]
-
-
-def curves_of(
-    wanted: Sequence[Comparison], rows: Sequence[Mapping[str, Any]], stage: str, human_filter: str
-) -> list[Curve]:
-    """One of MEASURES over the number of samples: a curve for each planner, expert, imitation and budget."""
-    score, points = name_of(stage, human_filter), defaultdict[str, list[Point]](list)
-    for row in rows:
-        points[row["training"].rpartition("-")[0]].append(Point(row["real"] + row["simulated"], row[score]))
-    series = defaultdict[tuple[str, str], dict[Setup, None]](dict)
-    for one in wanted:
-        if one.part == "rounds" and one.reference is not None:
-            name = f"{one.setup.data}, rewards only" if one.setup.imitation == "real" else one.setup.data
-            series[f"{one.setup.planner}, equal {one.budget}", name] |= {one.reference: None, one.setup: None}
-    curves = []
-    for (planner, name), setups in series.items():
-        found = tuple(point for setup in setups for point in points[setup.label])
-        enough = len({point.samples for point in found}) >= FEWEST
-        law = fit_scaling([p.samples for p in found], [p.score for p in found]) if enough else None
-        curves.append(Curve(planner, name, found, law))
-    return curves
-
-
-def text_of(found: Sequence[Mapping[str, Any]], evaluations: Path, human_filter: str) -> str:
-    """The two-stage scores among the rows of comparisons.csv, to be printed."""
-    title = f"{title_of('final', human_filter)}; {FILTERS_NOTE[0]}"
-    lines = [title]
-    lines += [f"{'part':<12}{'trained':<46}{'equal':>8}{'seeds':>7}{'EPDMS':>8}{'difference':>12}   95 % interval"]
-    for row in found:
-        if (row["stage"], row["human_filter"]) == ("final", human_filter):
-            line = f"{row['part']:<12}{row['setup']:<46}{row['budget']:>8}{row['seeds']:7}{row['epdms']:8.2f}"
-            if row["reference"]:
-                line += f"{row['difference']:+12.2f}   {row['low']:+.2f} .. {row['high']:+.2f}"
-            lines.append(line)
-    for name in BOUNDS:
-        score = scores_of(evaluations / name)[name_of("final", human_filter)]
-        lines.append(f"{name:<73}" + (f"{score:8.2f}" if np.isfinite(score) else "       -"))
-    return "\n".join(lines)
 
 
 def main(argv: Sequence[str]) -> int:

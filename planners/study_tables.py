@@ -9,20 +9,26 @@ from planners.score_table import FILTERS_NOTE
 from planners.scores import shown
 
 Row = Mapping[str, Any]  # of comparisons.csv
+INTERVALS = (
+    "In brackets: the difference from what the setup is held against, its 95 % interval over clips and, of stage two "
+    "and the final score, over logs and towns (paired bootstrap, with seeds); bold where zero lies outside of each."
+)
+CLAIMED = ("stage_two", "final")  # the stages whose intervals over logs and towns are shown too
 TITLES = {"follow_ups": "follow-ups (plain mean)"}  # others: the stage's name
 
 
 def markdown_of(rows: Sequence[Row], human_filter: HumanFilter) -> str:
-    """EPDMS in percent; in brackets the difference from the reference with its interval, bold where that excludes 0.
+    """EPDMS in percent; in brackets the difference from the reference with its intervals, bold where all exclude 0.
 
-    rows: those of comparisons.csv, a comparison's measures one after the other; of those with and without the human
-    filter one is shown. A row that is itself a reference stands in front of what is held against it.
+    The first interval is over clips. rows: those of comparisons.csv, a comparison's measures one after the other; of
+    those with and without the human filter one is shown. A row that is itself a reference stands in front of what is
+    held against it.
     """
     mine = [row for row in rows if row["human_filter"] in (human_filter, "none")]
     stages = [stage for stage in shown(human_filter) if any(row["stage"] == stage for row in mine)]
     titles = [TITLES.get(stage, stage.replace("_", " ")) for stage in stages]
     head = ("planner", "trained on", "equal", "seeds", *titles, "final of each seed")
-    lines = [f"Scores are {human_filter}: {FILTERS_NOTE[0]}; {FILTERS_NOTE[1]}.", ""]
+    lines = [f"Scores are {human_filter}: {FILTERS_NOTE[0]}; {FILTERS_NOTE[1]}.", "", INTERVALS, ""]
     for part, of_part in groupby(mine, key=lambda row: row["part"]):
         lines += [f"## {part}", "", _line(head), _line(["---"] * len(head))]
         lines += [_line(_cells(one)) for one in _by_comparison(list(of_part), len(stages))]
@@ -47,12 +53,17 @@ def _score(row: Row) -> str:
     if not row["reference"]:
         return text
     bold = "**" if is_clear(row) else ""
-    return f"{text} ({bold}{row['difference']:+.1f}{bold}: {row['low']:+.1f} .. {row['high']:+.1f})"
+    said = [f"{bold}{row['difference']:+.1f}{bold}: {row['low']:+.1f} .. {row['high']:+.1f}"]
+    if row["stage"] in CLAIMED:
+        known = [level for level in ("log", "town") if row.get(f"low_{level}", "") != ""]
+        said += [f"{level}s {row[f'low_{level}']:+.1f} .. {row[f'high_{level}']:+.1f}" for level in known]
+    return f"{text} ({'; '.join(said)})"
 
 
 def is_clear(row: Row) -> bool:
-    """Whether zero lies outside of the interval of a row that has a reference."""
-    return bool(row["low"] > 0.0 or row["high"] < 0.0)
+    """Whether zero lies outside of every interval of a row that has a reference: over clips, logs and towns."""
+    known = [end for end in ("", "_log", "_town") if row.get(f"low{end}", "") != ""]
+    return bool(known) and all(row[f"low{end}"] > 0.0 or row[f"high{end}"] < 0.0 for end in known)
 
 
 def words_of(row: Row) -> str:

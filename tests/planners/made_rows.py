@@ -1,5 +1,7 @@
 """Rows as scoring makes them, with scores chosen by hand."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from planners.frames import FrameKey
@@ -28,6 +30,7 @@ def clip_rows(
     stage_one: tuple[float, float],
     ends: tuple[tuple[float, float], tuple[float, float]],
     follow_ups: list[tuple[tuple[float, float], tuple[float, float], tuple[float, float]]],
+    log_id: str = "",
 ) -> list[FrameRow]:
     """follow_ups: (score now, before), start now, start before."""
     now, before = FrameKey.logged(clip_id)
@@ -39,4 +42,4 @@ def clip_rows(
     for i, (scores, *starts) in enumerate(follow_ups):
         for key, score, start in zip(FrameKey.follow_up(clip_id, i), scores, starts):
             rows.append(row("stage_two", key, score, start=start))
-    return rows
+    return [replace(one, log_id=log_id) for one in rows]

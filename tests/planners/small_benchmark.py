@@ -92,6 +92,9 @@ class StreetBenchmark:
         self.keys = tuple(frames)
         self._rows = {key: sample(key, scene) for key, scene in frames.items()}
 
+    def log_of(self, clip_id: str) -> str:
+        return f"log-{clip_id}"
+
     def image_source(self, key: FrameKey) -> str:
         return self.source
 
@@ -132,7 +135,7 @@ def write_benchmark_folder(out: Path, clip_ids: tuple[str, ...] = ("a", "b")) ->
     for clip_id in clip_ids:
         stored = benchmark_clip(replace(street_clip(), clip_id=clip_id))
         SceneFiles(location.child("scenes")).store(stored)
-        clips.append({"clip_id": clip_id, "follow_ups": [i for i, _ in stored.follow_ups]})
+        clips.append({"clip_id": clip_id, "log_id": f"log-{clip_id}", "follow_ups": [i for i, _ in stored.follow_ups]})
         for key, scene in frames_of(clip_scenes(stored.clip)).items():
             shards.append(write_shard(location.child("samples"), SAMPLES, sample_row_to_table([sample(key, scene)])))
     Store(location).samples.commit(shards)

@@ -51,6 +51,7 @@ def test_the_command_scores_a_benchmark_on_disk(
     for stored, kept in zip(rows, read_rows(tmp_path / "memory" / "pdm_closed")):
         np.testing.assert_allclose(stored.scores.filtered, kept.scores.filtered)
         assert stored.tags == kept.tags
+        assert stored.log_id == kept.log_id == "log-a"
 
 
 def test_its_digest_is_that_of_its_content(folder: Path, tmp_path: Path) -> None:
@@ -71,7 +72,7 @@ def test_what_is_missing_is_named_at_once(tmp_path: Path) -> None:
     def rewritten(**changes: object) -> None:
         (tmp_path / "benchmark.json").write_text(json.dumps(document | changes))
 
-    rewritten(clips=[{"clip_id": "a", "follow_ups": [0, 5]}])
+    rewritten(clips=[{"clip_id": "a", "log_id": "log-a", "follow_ups": [0, 5]}])
     refused("clip a, frame follow_up 5 has no sample")
     rewritten(clips=[], left_out=[{"why": "few_follow_ups"}])
     refused("none of its clips counts: few_follow_ups")

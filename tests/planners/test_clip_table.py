@@ -26,7 +26,7 @@ def test_what_is_read_is_what_was_scored(table: Path) -> None:
     found, scored = read_clips(table, ["sim-0", "real-1"]), measured([RUNS["sim-0"], RUNS["real-1"]], "score")
     assert tuple(found) == MEASURES
     for name, values in found.items():
-        assert values.clips == scored[name].clips
+        assert (values.clips, values.logs) == (scored[name].clips, scored[name].logs)
         np.testing.assert_allclose(values.scores, scored[name].scores, atol=1e-6)
         np.testing.assert_array_equal(values.weights, scored[name].weights)
 
@@ -35,9 +35,11 @@ def test_intervals_of_the_table_are_those_of_the_runs(table: Path) -> None:
     sides = ["real-0", "real-1"], ["sim-0", "sim-1"]
     of_runs = compare(*([RUNS[label] for label in side] for side in sides), SETTINGS)
     of_table = intervals(*(read_clips(table, side) for side in sides), SETTINGS)
-    for name, found in of_table.items():
-        for what in ("a", "b", "difference", "low", "high"):
-            assert getattr(found, what) == pytest.approx(getattr(of_runs[name], what), abs=2e-6)
+    for name, by_level in of_table.items():
+        assert list(by_level) == list(of_runs[name]) == ["clip", "log", "town"]
+        for level, found in by_level.items():
+            for what in ("a", "b", "difference", "low", "high"):
+                assert getattr(found, what) == pytest.approx(getattr(of_runs[name][level], what), abs=2e-6)
 
 
 def test_the_command_compares_columns_and_refuses_what_is_none(table: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -58,7 +60,7 @@ def test_the_command_compares_columns_and_refuses_what_is_none(table: Path, caps
     [
         ("planner,score\na,1\n", "its columns must begin with"),
         ("", "its columns"),
-        ("{head},a\nfinal,filtered,c,1,x\n", "'x'"),
+        ("{head},a\nfinal,filtered,log,c,1,x\n", "'x'"),
     ],
 )
 def test_what_is_no_such_table_is_said(tmp_path: Path, text: str, said: str) -> None:
@@ -91,7 +93,7 @@ def test_the_studys_comparisons_are_those_of_its_clips(study: Path, least: int) 
         assert mean_b - mean_a == pytest.approx(float(row["difference"]), abs=2e-3)
         checked += 1
         if row["stage"] == "final" and drawn < 3:  # with all draws, of which each takes a second
-            found = intervals({name: of_a}, {name: of_b}, CompareSettings(a="", b=""))[name]
+            found = intervals({name: of_a}, {name: of_b}, CompareSettings(a="", b=""))[name]["clip"]
             assert 100.0 * found.low == pytest.approx(float(row["low"]), abs=2e-3)
             assert 100.0 * found.high == pytest.approx(float(row["high"]), abs=2e-3)
             drawn += 1
