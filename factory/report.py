@@ -1,6 +1,7 @@
 """`python -m factory.report out=<folder or URL>`: a run as one HTML file, for sharing.
 
-    python -m factory.report out=runs/demo                  writes runs/demo/report.html, as a run does at its end
+    python -m factory.report out=runs/demo                  writes runs/demo/report.html and the data set's card,
+                                                            runs/demo/README.md, as a run does at its end
     python -m factory.report out=s3://bucket/samples to=run.html
 
 It is the dashboard with its answers and some pictures inside: the same page, the same numbers, nothing fetched.
@@ -40,7 +41,14 @@ class Request:
 
 def main(argv: Sequence[str]) -> int:
     """The command; returns the exit code."""
-    return answer(__doc__ or "", Request, argv, lambda request: [write_report(open_store(request.out), request.to)])
+    return answer(__doc__ or "", Request, argv, _written)
+
+
+def _written(request: Request) -> list[str]:
+    from factory.card import write_card
+
+    store = open_store(request.out)
+    return [write_report(store, request.to), *([write_card(store)] if request.to is None else [])]
 
 
 def write_report(store: "Store", to: str | None = None) -> str:

@@ -94,6 +94,7 @@ def run(asked: Asked) -> int:
 
     from factory.benchmark import NEEDED, write_benchmark
     from factory.calibrate import calibrate, plan_text
+    from factory.card import write_card
     from factory.execute import COMPLETE, execute
     from factory.funnel import image_sources_text
     from factory.report import remember, write_report
@@ -142,6 +143,7 @@ def run(asked: Asked) -> int:
     remember(store, assembled)
     where = store.location.uri
     print(f"report: {write_report(store)}")
+    print(f"card: {write_card(store)}")
     print(f"look at samples: python -m factory.dashboard out={where}")
     return summary.exit_code
 

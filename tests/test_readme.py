@@ -91,6 +91,12 @@ def test_python_runs_as_written_in_the_small_install(demo_home: Path, tmp_path: 
     assert done.stdout.strip()
 
 
+def test_a_run_leaves_the_card_of_its_data_set(demo_home: Path) -> None:
+    text = (demo_home / "runs" / "demo" / "README.md").read_text()
+    assert "license: apache-2.0\n" in text and "The run is complete." in text and "vocabulary.k=64" in text
+    assert "`synthetic` is drawn test data" in text and "pseudo-expert, not" not in text, "one human sample"
+
+
 @pytest.mark.parametrize("command", ALL_COMMANDS, ids=" ".join)
 def test_every_command_is_one_its_program_takes(
     command: list[str], demo_home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
