@@ -9,6 +9,7 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from factory.commands import nearest
 from factory.job import runs_root
+from factory.plugins import offer_choices, with_experts
 from factory.words import Asked, ConfigError, asked_of, no_such_choice, readable, wrong_key
 
 T = TypeVar("T")
@@ -54,6 +55,7 @@ def compose(name: str, words: Sequence[str]) -> dict[str, Any]:
 
     OmegaConf.register_new_resolver("runs", runs_root, replace=True)
     overrides = [readable(word) for word in asked.overrides]
+    offer_choices(overrides, conf_dir(), asked.folders)
     try:
         resolved = OmegaConf.to_container(
             _composed(name, overrides, asked.folders), resolve=True, throw_on_missing=True
@@ -67,7 +69,8 @@ def compose(name: str, words: Sequence[str]) -> dict[str, Any]:
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError(_wrong(name, asked, overrides) or _first_line(error)) from error
     assert isinstance(resolved, dict)
-    return {str(key): value for key, value in resolved.items()}
+    values = {str(key): value for key, value in resolved.items()}
+    return with_experts(values) if "experts" in values and "expert" in values else values
 
 
 def _composed(name: str, overrides: Sequence[str], folders: Sequence[Path]) -> Any:

@@ -44,7 +44,7 @@ def save_checkpoint(
     unfinished = folder.with_name(f".{folder.name}.{os.getpid()}")
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir(parents=True)
-    who = {"planner": {"name": planner.name, "settings": as_record(planner.settings)}, "step": step}
+    who = {"planner": {"name": planner.chosen_as, "settings": as_record(planner.settings)}, "step": step}
     (unfinished / RECORD).write_text(json.dumps({**who, **record}, indent=1))
     save_file({k: v.contiguous() for k, v in planner.state_dict().items()}, unfinished / WEIGHTS)
     np.savez(unfinished / ARRAYS, **planner.arrays)  # type: ignore[arg-type]

@@ -4,6 +4,7 @@
     constant_velocity          needs no training
     runs/my_training           a training's folder or one of its checkpoints
     runs/a+runs/b              the ensemble of several trainings of gtrs_dense
+    mine                       what an installed package offers by that name (docs/extend.md)
     my.module:MyPlanner        a class, or anything called without arguments, of a user's own package
 
 A user's planner has one of two faces:
@@ -26,6 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from factory.config import ConfigError, compose
+from factory.plugins import installed, names
 from planners import checkpoint
 from planners.batch import Needs
 from planners.ensemble import Ensemble
@@ -53,6 +55,11 @@ class Contender:
 def contender(spec: str, label: str | None = None, changed: Mapping[str, Any] | None = None) -> Contender:
     """Who `spec` names; changed: settings of trained planners, see load_planner. Raises ConfigError for nobody."""
     name = label or spec.strip("/").replace("/", "_").replace(":", ".")
+    plugin = installed("planner", spec, [*PRIVILEGED, *BUILT_IN])
+    if plugin is not None:
+        if Path(spec).is_dir():
+            raise ConfigError(f"planner={spec} is a folder here and a planner of {plugin.package}: planner=./{spec}")
+        return _plugged(name, plugin.reference)
     if spec in PRIVILEGED:
         return Contender(name, spec, privileged=PRIVILEGED[spec])
     if spec in UNTRAINED:
@@ -64,12 +71,16 @@ def contender(spec: str, label: str | None = None, changed: Mapping[str, Any] | 
         digest = parts[0] if len(parts) == 1 else hashlib.sha256(" ".join(parts).encode()).hexdigest()[:16]
         return Contender(name, digest, partial(_trained, newest, changed))
     if ":" in spec:
-        made = _imported(spec)
-        return Contender(name, _digest_of(made), lambda: made)
-    known = ", ".join([*PRIVILEGED, *UNTRAINED])
+        return _plugged(name, spec)
+    known = ", ".join([*PRIVILEGED, *UNTRAINED, *names("planner")])
     if spec in BUILT_IN:
         raise ConfigError(f"planner={spec} has to be trained first: name its training's folder; untrained: {known}")
     raise ConfigError(f"planner={spec}: neither a folder nor one of {known}; or name a class, my.module:MyPlanner")
+
+
+def _plugged(label: str, spec: str) -> Contender:
+    made = _imported(spec)
+    return Contender(label, _digest_of(made), lambda: made)
 
 
 def contenders(

@@ -46,6 +46,7 @@ class Planner(nn.Module, ABC):
         """settings: the planner's own frozen dataclass. Raises ValueError where an array has the wrong shape."""
         super().__init__()
         self.settings, self.arrays = settings, dict(arrays)
+        self.chosen_as = self.name  # in configurations and checkpoints: the registry's name, or my.module:MyPlanner
 
     @classmethod
     def fixed_arrays(cls, settings: Any, data: TrainingData) -> dict[str, FloatArray]:

@@ -1,4 +1,4 @@
-"""Planners by name: the built-in ones, or a class of a user's own package."""
+"""Planners by name: the built-in ones, those that installed packages offer, or a class of a user's own package."""
 
 import importlib
 from collections.abc import Mapping
@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from factory.config import ConfigError, fill
+from factory.plugins import installed, names
 from planners.planner import FloatArray, Planner
 
 BUILT_IN = {
@@ -22,16 +23,18 @@ BUILT_IN = {
 class PlannerChoice:
     """A planner and its settings, as conf/planner/*.yaml and checkpoints name it."""
 
-    name: str  # one of BUILT_IN, or my.module:MyPlanner
+    name: str  # one of BUILT_IN, of an installed package's, or my.module:MyPlanner
     settings: dict[str, Any] = field(default_factory=dict)
 
 
 def planner_class(name: str) -> type[Planner]:
     """The class of a planner. Raises ConfigError where there is none of that name."""
-    target = BUILT_IN.get(name, name)
+    plugin = installed("planner", name, BUILT_IN)
+    target = BUILT_IN.get(name, name) if plugin is None else plugin.reference
     module, found, attribute = target.partition(":")
     if not found:
-        raise ConfigError(f"planner.name={name}: none of {', '.join(BUILT_IN)}; or name a class, my.module:MyPlanner")
+        known = ", ".join([*BUILT_IN, *names("planner")])
+        raise ConfigError(f"planner.name={name}: none of {known}; or name a class, my.module:MyPlanner")
     try:
         cls = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError) as error:
@@ -49,6 +52,8 @@ def settings_of(choice: PlannerChoice) -> Any:
 def build_planner(choice: PlannerChoice, arrays: Mapping[str, FloatArray]) -> Planner:
     """The planner around its fixed arrays. Raises ConfigError."""
     try:
-        return planner_class(choice.name)(settings_of(choice), arrays)
+        planner = planner_class(choice.name)(settings_of(choice), arrays)
     except ValueError as error:
         raise ConfigError(f"planner {choice.name}: {error}") from error
+    planner.chosen_as = choice.name
+    return planner

@@ -1,0 +1,186 @@
+"""What an installed package offers by name: a distribution made here, found as any other that pip installed."""
+
+import importlib
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from hydra.core.config_store import ConfigStore
+
+from examples.csv_logs import write_log
+from factory.config import ConfigError, compose
+from factory.plugins import installed, offered
+from factory.run import main as run_main
+from factory.settings import load_config
+from factory.store.reader import SampleTable
+from planners.contenders import contender
+from planners.registry import planner_class
+from planners.train import main as train_main
+from tasks.kernels import cache_dir
+
+ROOT = Path(__file__).resolve().parents[2]
+MODULE = """
+from examples.csv_logs import CsvReader as Reader
+from examples.keep_lane import KeepLane as Expert
+from examples.linear_planner import LinearPlanner as Planner
+"""
+KINDS = {"readers": "Reader", "experts": "Expert", "planners": "Planner"}
+
+
+def install(site: Path, package: str, name: str = "mine", kinds: tuple[str, ...] = tuple(KINDS)) -> None:
+    """What pip would leave in a site folder: a module and its metadata."""
+    (site / package).mkdir(parents=True)
+    (site / package / "__init__.py").write_text(MODULE)
+    metadata = site / f"{package}-1.2.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.2\n")
+    groups = (f"[driving_data_factory.{kind}]\n{name} = {package}:{KINDS[kind]}\n" for kind in kinds)
+    (metadata / "entry_points.txt").write_text("\n".join(groups))
+
+
+@pytest.fixture
+def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder on the path for as long as the test lasts; what it offers is no choice of Hydra's afterwards."""
+    folder = tmp_path / "site"
+    folder.mkdir()
+    monkeypatch.syspath_prepend(str(folder))
+    importlib.invalidate_caches()
+    before = {group: set(ConfigStore.instance().repo.get(group, {})) for group in ("clips", "planner")}
+    yield folder
+    for group, known in before.items():
+        choices = ConfigStore.instance().repo.get(group, {})
+        for name in set(choices) - known:
+            del choices[name]
+    for name in [name for name in sys.modules if name in ("somebody", "somebody_else")]:
+        del sys.modules[name]
+
+
+def run_arguments(home: Path) -> list[str]:
+    write_log(home / "logs" / "street")
+    return [
+        "clips=mine",
+        f"clips.root={home / 'logs'}",
+        "experts=[mine,human]",
+        "render=none",
+        "reward.labels=none",
+        "vocabulary.k=256",
+        "limit=1",
+        f"out={home / 'out'}",
+    ]
+
+
+def test_a_reader_an_expert_and_a_planner_work_by_name(
+    site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    install(site, "somebody")
+    assert run_main([*run_arguments(tmp_path), "executor=local"]) == 0, capsys.readouterr().err
+    assert experts_of(tmp_path) == {"mine", "human"}
+    trained = [
+        "planner=mine",
+        "planner.settings.history=true",
+        "planner.training.batch_size=2",
+        f"data.real=[{tmp_path / 'out'}]",
+        f"data.sim=[{tmp_path / 'out'}]",
+        "steps=1",
+        "workers=0",
+        "device=cpu",
+        f"out={tmp_path / 'linear'}",
+    ]
+    assert train_main(trained) == 0, capsys.readouterr().err
+    loaded = contender(str(tmp_path / "linear")).load
+    assert loaded is not None and type(loaded()) is planner_class("mine")
+    assert contender("mine").label == "mine"
+
+
+def experts_of(home: Path) -> set[str]:
+    table = SampleTable(home / "out")
+    assert len(table)
+    return {table[i]["expert"] for i in range(len(table))}
+
+
+@pytest.mark.ray
+@pytest.mark.slow
+def test_workers_of_ray_import_them_too(site: Path, tmp_path: Path) -> None:
+    install(site, "somebody")
+    env = os.environ | {"PYTHONPATH": f"{site}{os.pathsep}{ROOT}", "NUMBA_CACHE_DIR": str(cache_dir().parent)}
+    command = [sys.executable, "-m", "factory.run", *run_arguments(tmp_path), "executor=ray", "workers=1"]
+    done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=280)
+    assert done.returncode == 0, done.stderr
+    assert experts_of(tmp_path) == {"mine", "human"}
+
+
+def test_settings_of_an_expert_need_no_target_and_a_target_of_one_s_own_comes_first(site: Path) -> None:
+    install(site, "somebody")
+    spec = load_config(["+expert.mine.settle_m=20", "experts=[mine]"]).expert["mine"]
+    assert spec == {"_target_": "somebody.Expert", "settle_m": 20}
+    own = load_config(["+expert.mine._target_=my.Own", "experts=[mine]"]).expert["mine"]
+    assert own == {"_target_": "my.Own"}
+
+
+def test_an_unknown_name_lists_what_is_installed(site: Path) -> None:
+    install(site, "somebody")
+    with pytest.raises(ConfigError, match=r"experts: .*mein.*'mine'"):
+        load_config(["experts=[mein]"])
+    with pytest.raises(ConfigError, match=r"clips=mein: there is .*mine"):
+        load_config(["clips=mein"])
+    with pytest.raises(ConfigError, match=r"planner=mein: there is .*mine"):
+        compose("train", ["planner=mein"])
+    with pytest.raises(ConfigError, match=r"planner.name=mein: none of .*, mine; or name a class"):
+        planner_class("mein")
+    with pytest.raises(ConfigError, match=r"planner=mein: neither a folder nor one of .*, mine; or"):
+        contender("mein")
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda: load_config(["clips=mine"]),
+        lambda: load_config(["experts=[mine]"]),
+        lambda: compose("train", ["planner=mine"]),
+        lambda: contender("mine"),
+    ],
+    ids=("reader", "expert", "planner to train", "planner to evaluate"),
+)
+def test_a_name_that_two_packages_offer_is_refused_with_both(site: Path, ask: object) -> None:
+    install(site, "somebody")
+    install(site, "somebody_else")
+    load_config([])  # nobody asked for it
+    with pytest.raises(ConfigError, match=r"mine is offered by somebody 1\.2 and somebody_else 1\.2: uninstall all"):
+        ask()  # type: ignore[operator]
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "words", "settings"),
+    [
+        ("readers", "av2", ["clips=av2", "clips.root=/logs"], "run"),
+        ("experts", "human", ["experts=[human]"], "run"),
+        ("planners", "ltf", ["planner=ltf"], "train"),
+    ],
+)
+def test_a_name_that_is_built_in_is_refused_with_who_offers_it_too(
+    site: Path, kind: str, name: str, words: list[str], settings: str
+) -> None:
+    compose(settings, words)
+    install(site, "somebody", name, (kind,))
+    importlib.invalidate_caches()
+    with pytest.raises(ConfigError, match=rf"{kind[:-1]} {name} is built in, and somebody 1\.2 offers another"):
+        compose(settings, words)
+
+
+def test_a_folder_of_the_same_name_is_told_apart(site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    install(site, "somebody")
+    (tmp_path / "mine").mkdir()
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match=r"a folder here and a planner of somebody 1\.2: planner=\./mine"):
+        contender("mine")
+
+
+def test_without_plug_ins_nothing_is_offered_and_nothing_is_imported(site: Path) -> None:
+    assert offered("expert") == {} and installed("expert", "mine", ()) is None
+    install(site, "somebody")
+    assert [plugin.target for plugin in offered("expert")["mine"]] == ["somebody.Expert"]
+    load_config([])
+    assert "somebody" not in sys.modules
