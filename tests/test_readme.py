@@ -32,7 +32,7 @@ from tasks.kernels import cache_dir
 from tests.factory.installs import SMALL, as_if_installed
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-PAGES = ("README.md", "docs/configuration.md", "docs/dashboard.md", "docs/training.md")
+PAGES = ("README.md", "CONTRIBUTING.md", "docs/configuration.md", "docs/dashboard.md", "docs/training.md")
 
 
 def blocks(page: str, language: str) -> list[str]:

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import yaml
 from packaging.utils import canonicalize_name
 from packaging.version import Version
 
@@ -136,6 +137,9 @@ def test_the_version_stands_in_one_place() -> None:
     version = Version(tasks.__version__)
     newest = next(Version(section) for section in sections if section != "Unreleased")
     assert (sections[0] == "Unreleased" and version > newest) if version.is_devrelease else version == newest
+    cited = yaml.safe_load((REPOSITORY / "CITATION.cff").read_text())
+    assert f"\n## {cited['version']} - {cited['date-released']}\n" in (REPOSITORY / "CHANGELOG.md").read_text()
+    assert Version(cited["version"]) == newest
     shown = subprocess.run([sys.executable, "-m", "factory", "--version"], cwd=REPOSITORY, capture_output=True)
     assert shown.stdout.decode() == f"driving-data-factory {tasks.__version__}\n"
 
