@@ -15,8 +15,9 @@ from factory.pipeline import Considered, FactoryWork
 from factory.settings import assemble, identity_of, load_config
 from factory.work import HUMAN, HUMAN_BEFORE, HUMAN_CANDIDATE, UNLISTED, Accepted, Dropped, PreparedClip
 from tasks import stages
+from tasks.chance import stream
 from tasks.kinematic_vocabulary import kinematic_trajectories
-from tasks.perturb import Perturbation
+from tasks.perturb import Perturbation, perturb
 from tasks.vocabulary import Vocabulary
 from tasks.world.clip import HORIZON_STEPS, NOW
 from tasks.world.frames import to_local
@@ -99,10 +100,11 @@ def test_the_earlier_frame_of_a_pair_shows_its_own_instants_from_where_the_ego_w
     ref = work.reader.index().refs[1]
     prepared = work.prepare(ref)
     assert isinstance(prepared, PreparedClip)
-    shown = []
-    for expert in (HUMAN, HUMAN_BEFORE):
+    log, shown = work.reader.read(ref), []
+    for expert, step in ((HUMAN, NOW), (HUMAN_BEFORE, NOW - 5)):
         accepted = work.attempt(prepared, HUMAN_CANDIDATE, expert)
         assert isinstance(accepted, Accepted)
+        np.testing.assert_allclose(accepted.row["now_pose"], log.ego_states[step, :3], atol=1e-6)  # type: ignore[arg-type]
         shown.append({round(image["time_s"], 3): image for image in accepted.row["images"]})  # type: ignore[attr-defined]
     later, earlier = shown
     assert sorted(later) == sorted(earlier) == [-1.5, -1.0, -0.5, 0.0]
@@ -111,9 +113,8 @@ def test_the_earlier_frame_of_a_pair_shows_its_own_instants_from_where_the_ego_w
         assert earlier[time_s]["jpeg"] == same["jpeg"]
         np.testing.assert_array_equal(earlier[time_s]["ego_pose"], same["ego_pose"])
     assert earlier[0.0]["jpeg"] != later[0.0]["jpeg"]
-    log = work.reader.read(ref).world_from_ego
-    np.testing.assert_allclose(np.reshape(earlier[0.0]["ego_pose"], (4, 4)), log[NOW - 5], atol=1e-6)
-    np.testing.assert_allclose(np.reshape(later[0.0]["ego_pose"], (4, 4)), log[NOW], atol=1e-6)
+    for image, step in ((later[0.0], NOW), (earlier[0.0], NOW - 5)):
+        np.testing.assert_allclose(np.reshape(image["ego_pose"], (4, 4)), log.world_from_ego[step], atol=1e-6)
 
 
 def test_a_rejected_attempt_is_no_sample(town: Path, tmp_path: Path) -> None:
@@ -157,6 +158,25 @@ def test_what_is_considered_is_what_is_prepared(town: Path, tmp_path: Path) -> N
         candidate.vocabulary_index for candidate in made.candidates
     ]
     assert made.found.considered.fate.count("kept") == len(made.candidates) > 0
+
+
+def test_a_clip_s_candidates_are_drawn_from_a_stream_of_the_run_s_seed_and_its_own_name(
+    town: Path, tmp_path: Path
+) -> None:
+    work = work_on(town, tmp_path, "render=none", "seed=3")
+    ref = work.reader.index().refs[0]
+    clip, made = work.reader.read(ref), work.considered(ref)
+    assert isinstance(made, Considered)
+
+    def drawn(seed: int, clip_id: str) -> list[int]:
+        rng = stream(seed, clip_id, "perturb")
+        found = perturb(clip, work.vocabulary, work.perturb, work.traffic, work.pdm, rng)
+        assert isinstance(found, Perturbation)
+        return [candidate.vocabulary_index for candidate in found.candidates]
+
+    mine = [candidate.vocabulary_index for candidate in made.candidates]
+    assert mine == drawn(3, clip.clip_id)
+    assert mine != drawn(0, clip.clip_id) and mine != drawn(3, "another")
 
 
 @pytest.mark.parametrize(

@@ -104,6 +104,18 @@ def test_a_simulated_label_is_the_driven_states_beside_the_expert_s_proposal(
     assert row["stage2_score"] == judged.scores.pdm_score[1]
 
 
+def test_the_agents_of_a_simulated_row_are_those_of_its_drives_before_and_after_now(
+    row: dict[str, object], candidate_and_judged: tuple[Candidate, Judged]
+) -> None:
+    candidate, judged = candidate_and_judged
+    seen = [judged.scene.agents.track_ids.index(name) for name in row["agent_ids"]]  # type: ignore[attr-defined]
+    boxes = to_world(judged.scene.ego_state[:3], np.asarray(row["agent_boxes"], float)[..., :3]).transpose(1, 0, 2)
+    assert same_poses(boxes[:16], candidate.rollout.agents.boxes[-16:, seen, :3], 1e-6)
+    assert same_poses(boxes[15:], judged.rollout.agents.boxes[:, seen, :3], 1e-6)
+    log = street_clip().agents.boxes[END + 1 : END + 41, seen, :2]
+    assert np.nanmax(np.abs(boxes[16:, :, :2] - log)) > 0.5, "the log would tell of another world"
+
+
 def test_history_agents_and_map_of_the_human_in_closed_form() -> None:
     row = human(street_clip())
     back = np.column_stack([0.1 * SPEED_MPS * np.arange(-15, 1), np.zeros((16, 2))])

@@ -167,6 +167,7 @@ def test_it_chooses_from_fewer_or_other_trajectories_than_it_was_trained_on() ->
     settings = replace(TINY, inference_vocabulary="other.npy")
     model = GtrsDense(settings, {"vocabulary": scenes.vocabulary(K), "inference_vocabulary": other}).eval()
     assert model.scores(batch)["nc"].shape == (2, 5)
+    assert torch.equal(model.plan(batch), torch.tensor(other).float()[model.choose(model.scores(batch))])
     assert model.needs.labels == Vocabulary(scenes.vocabulary(K)).digest
     with pytest.raises(ValueError, match="inference_entries=25: the vocabulary has 24"):
         planner(replace(TINY, inference_entries=K + 1))

@@ -49,6 +49,17 @@ def test_a_drive_scores_as_the_factory_scores_an_experts(mode: str, poses: np.nd
         assert getattr(ours.scores, name)[0] == getattr(judged.scores, name)[1], name
 
 
+def test_who_comes_from_behind_answers_to_the_plan_that_moves_over_in_front() -> None:
+    """PDM-Closed, the rival, keeps its lane: for it nobody would have to brake."""
+    scene, moves_over = clip_scenes().logged.now, straight(3.0, 2.0)
+    answers, goes_on = (
+        drive(prepare_frame(scene, TrafficSettings(mode=mode), PdmSettings(), logged=True), moves_over).scores
+        for mode in ("idm", "replay")
+    )
+    assert (answers.nc[0], answers.ttc[0]) == (1.0, 1.0)
+    assert (goes_on.nc[0], goes_on.ttc[0]) == (0.0, 0.0)
+
+
 def test_the_human_is_known_every_half_second_and_driven_linearly_between() -> None:
     scene = clip_scenes().logged.now
     np.testing.assert_allclose(logged_poses(scene), straight(8.0), atol=1e-9)

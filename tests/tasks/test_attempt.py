@@ -64,6 +64,17 @@ def tried(scene: Scene, expert: Expert) -> tuple[Judged, Rejected | None]:
     return result
 
 
+def test_the_route_of_the_perturbed_scene_begins_with_the_lane_that_the_perturbation_ends_on() -> None:
+    """At x = 70 m that is the junction's, from 60 m on, and not the one before, where the log is."""
+    clip = street_clip()
+    stage_one = first_stage(clip)
+    states = stage_one.ego_states.copy()
+    states[:, 0] += np.linspace(0.0, 70.0 - states[-1, 0], len(states))
+    ahead = perturbed_scene(clip, replace(stage_one, ego_states=states)).centerline
+    assert ahead[0, 0] == 60.0 and ahead[-1, 0] == clip.centerline[-1, 0]
+    assert perturbed_scene(clip, stage_one).centerline[0, 0] < 60.0
+
+
 def test_a_drive_with_every_sub_score_one_and_progress_above_a_half_is_accepted() -> None:
     assert verdict(scores(), GATE) is None
     assert verdict(scores(ep=0.5001), GATE) is None

@@ -94,6 +94,14 @@ def test_a_standing_car_ahead_stops_every_proposal_on_its_path(road: Road, objec
     assert (plan.proposals.progress_velocity[4::5, 50, 1] < 2.0).all(), "the eager ones have braked by then"
 
 
+def test_of_equally_good_proposals_the_first_is_the_plan(road: Road, objects: Objects) -> None:
+    """Behind a car that stands nobody gets 5 m far, so that progress is the same for all who keep the rules."""
+    blocked = road(speed=0.5, agents=objects([[59.0, 0.0, 0.0, CAR[0], 12.0]], [0.0], [AgentKind.VEHICLE]))
+    plan = plan_for(blocked)
+    best = np.flatnonzero(plan.scores.pdm_score == plan.scores.pdm_score.max())
+    assert len(best) > 1 and plan.chosen == best[0]
+
+
 def test_a_leading_car_at_its_speed_is_followed_not_stopped_for(road: Road, objects: Objects) -> None:
     led = road(speed=8.0, agents=objects([[85.0, 0.0, 0.0, *CAR]], [8.0], [AgentKind.VEHICLE]))
     assert plan_for(led).proposals.progress_velocity[4, 50, 1] > 6.5

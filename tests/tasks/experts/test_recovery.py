@@ -102,6 +102,15 @@ def test_weights_decide_between_speed_and_place() -> None:
     assert table.nearest(target, np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])) == 0, "the first of equals"
 
 
+def test_the_nearest_row_is_the_one_with_the_least_sum_of_differences() -> None:
+    """One row is 3 m off along the road, the other 2 m along and 2 m aside: 3 against 4, by squares 9 against 8."""
+    ends = (23.0, 0.0), (22.0, 2.0)
+    table = RecoveryTable(np.stack([ending_at((5.0, 0.0), np.array([x, y, 0.0])) for x, y in ends]))
+    target = np.array([5.0, 0.0, 0.0, 20.0, 0.0, 0.0])
+    assert table.nearest(target, np.ones(6)) == 0
+    assert table.nearest(target, np.array([1.0, 1.0, 1.0, 1.0, 0.1, 1.0])) == 1
+
+
 def test_the_goal_is_the_logged_pose_four_seconds_later_seen_from_the_perturbed_ego(road: Road) -> None:
     wanted = straight(10.0)
     wanted[:, 1] = -1.2 * (T / 4.0) ** 2 * (3.0 - 2.0 * T / 4.0)  # 1.2 m to the right, where the log is
