@@ -1,5 +1,6 @@
 """key=value arguments of the commands that look at a run, as a typed dataclass of theirs."""
 
+import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import MISSING, fields
@@ -15,6 +16,12 @@ Request = TypeVar("Request", bound="DataclassInstance")
 
 class Refused(ValueError):
     """The request cannot be answered; the message says why."""
+
+
+def one_line(error: BaseException) -> str:
+    """What an error says, without a client's colours and line breaks."""
+    plain = re.sub(r"\x1b\[[0-9;]*m", "", str(error)).replace("\u21b3", ":")
+    return " ".join(plain.split())[:300] or type(error).__name__
 
 
 def answer(about: str, shape: type[Request], argv: Sequence[str], lines: Callable[[Request], Iterable[str]]) -> int:

@@ -119,7 +119,7 @@ class Gatherer:
         if batch is None:
             return False
         if isinstance(report, Failure):
-            raise WriteFailed(report.error)
+            raise WriteFailed(f"a file of samples could not be written: {report.error.splitlines()[-1]}")
         batch.shards.append(report)
         batch.writing -= 1
         if not batch.writing:

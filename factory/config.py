@@ -198,7 +198,7 @@ def build(spec: Mapping[str, Any], where: str, labels: Sequence[str] = ("name",)
     try:
         return instantiate({key: value for key, value in spec.items() if key not in labels}, _convert_="all")
     except InstantiationException as error:
-        why = str(error.__cause__ or error).strip().splitlines()
-        raise ConfigError(
-            f"{where}: {spec['_target_']}: {why[-1] if why else type(error.__cause__).__name__}"
-        ) from error
+        cause = error.__cause__ or error
+        why = str(cause).strip().splitlines() or [type(cause).__name__]
+        taken = "does not take these settings: " if isinstance(cause, TypeError) else ""
+        raise ConfigError(f"{where}: {spec['_target_']}: {taken}{why[-1]}") from error

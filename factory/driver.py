@@ -22,6 +22,7 @@ from factory.progress import ProgressLine, Tally
 from factory.steps import Attempted, Failure, Prepared, Reconstructed, Stamp
 from factory.store.candidates import ClipCandidates
 from factory.store.outcomes import QUARANTINE_AFTER, ErrorKind, Kind, Outcome
+from factory.store.room import NoRoom
 from factory.store.samples import Past
 from factory.store.table import Shard
 from factory.walk import Blocked, Complete, Exhausted, Step, Try, tries_before
@@ -102,7 +103,7 @@ class Driver:
         return self._stopping.is_set()
 
     def loop(self, graph: Graph, gatherer: Gatherer, metrics: RunMetrics, episodes: Episodes | None = None) -> None:
-        """Until nothing is left, or until stopped and drained."""
+        """Until nothing is left, or until stopped and drained. Raises NoRoom once a disk is full."""
         self._graph, self._gatherer, self._metrics, self._episodes = graph, gatherer, metrics, episodes
         gatherer.committed = self._committed
         with ProgressLine(len(self._plan.todo), self._forecast.left_s, doing=self._doing) as progress:
@@ -167,6 +168,8 @@ class Driver:
 
     def _take(self, ticket: Ticket, report: Any) -> None:
         self._metrics.task(ticket.step, ticket.queued_s, report)
+        if isinstance(report, Failure) and report.no_room:
+            raise NoRoom(report.no_room)
         if self._gatherer.finished(ticket, report):
             return
         if self._episodes is not None and self._episodes.finished(ticket, report):

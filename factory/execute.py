@@ -16,6 +16,9 @@ from dataclasses import asdict, dataclass, field
 from types import FrameType
 from typing import Literal
 
+from deltalake.exceptions import DeltaError
+
+from factory.arguments import one_line
 from factory.batch import SHARD_BYTES, SHARD_SECONDS, Gatherer, WriteFailed
 from factory.clips.reader import ClipRef
 from factory.driver import Driver, Executed
@@ -26,7 +29,8 @@ from factory.metrics import RunMetrics
 from factory.plan import Plan, make_plan
 from factory.store.location import BadLocation
 from factory.store.outcomes import Kind
-from factory.store.samples import CURRENT_RUN, ChangedRun, OnChange, Store
+from factory.store.room import NoRoom
+from factory.store.samples import CURRENT_RUN, NOTHING, ChangedRun, OnChange, Store
 from factory.store.table import AnotherWriter
 from factory.walk import Try, retry_policy
 from factory.work import NotReady, Work
@@ -86,7 +90,7 @@ def execute(
     identity = work.identity
     try:
         records = store.agree(identity, digests, on_change)
-        history = store.history(identity, digests)
+        history = NOTHING if store.starts_over(records) else store.history(identity, digests)
         if on_change == "stop" and records[-1]["on_change"] == "keep":
             on_change = "keep"
         policy = retry_policy(retry, identity.versions_json)
@@ -107,6 +111,9 @@ def execute(
         graph = _graph(work, store, executor, workers, ray_address, gpu_share) if is_due else None
     except (BadLocation, ClusterLacks, NotReady) as error:
         return RunSummary(BAD_CONFIG, str(error))
+    except ConnectionError as error:
+        where = ray_address or os.environ.get("RAY_ADDRESS")
+        return RunSummary(BAD_CONFIG, f"no Ray cluster answers at RAY_ADDRESS={where}: {one_line(error)}")
     except KeyboardInterrupt:
         return RunSummary(INTERRUPTED, "stopped before anything was begun")
     try:
@@ -126,8 +133,12 @@ def execute(
             code, message = INTERRUPTED, f"{text}; run the same command again to write them"
         if driver.interrupted:
             code, message = INTERRUPTED, "interrupted; run the same command again to go on"
+    except NoRoom as error:
+        code, message = INTERRUPTED, out_of_room(error)
     except (AnotherWriter, WriteFailed) as error:
         code, message = INTERRUPTED, str(error)
+    except (OSError, DeltaError) as error:  # what holds the tables fails: a share that went away, a lost network
+        code, message = INTERRUPTED, f"{one_line(error)}; run the same command again to go on"
     except KeyboardInterrupt:
         code, message = INTERRUPTED, "stopped at once; run the same command again"
     finally:
@@ -137,10 +148,21 @@ def execute(
     counts = _counts(plan)
     summary = RunSummary(code, message, counts, driver.executed, driver.seconds, driver.notes, funnel, began_ms)
     if began_ms or code:
-        _record(store, summary)
+        try:
+            _record(store, summary)
+        except OSError as error:  # the same disk or share
+            summary.exit_code = INTERRUPTED
+            summary.message = summary.message or (
+                out_of_room(error) if isinstance(error, NoRoom) else f"{one_line(error)}; run the same command again"
+            )
     for line in (*summary.notes, str(summary.executed)):
         say(line)
     return summary
+
+
+def out_of_room(error: NoRoom) -> str:
+    """What to do where a disk is full."""
+    return f"{error}; make room and run the same command again: it goes on from what is committed"
 
 
 def _graph(

@@ -12,6 +12,7 @@ import numpy as np
 
 from factory.pace import time_text
 from factory.sensors import SensorData
+from factory.store.room import needs_room
 from tasks.render.asset import RenderAsset
 from tasks.render.fit.reconstruct import advance, finish
 from tasks.render.fit.settings import FitSettings
@@ -77,11 +78,13 @@ def _resumed(begun: Path, start: FitState) -> FitState:
 
 
 def _save(begun: Path, state: FitState) -> None:
-    handle, temporary = tempfile.mkstemp(dir=begun.parent, prefix=".fit-", suffix=".npz")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            np.savez(file, **state.arrays())  # type: ignore[arg-type]
-        os.replace(temporary, begun)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    arrays = state.arrays()
+    with needs_room(begun, sum(array.nbytes for array in arrays.values())):
+        handle, temporary = tempfile.mkstemp(dir=begun.parent, prefix=".fit-", suffix=".npz")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                np.savez(file, **arrays)  # type: ignore[arg-type]
+            os.replace(temporary, begun)
+        except BaseException:
+            Path(temporary).unlink(missing_ok=True)
+            raise

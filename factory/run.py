@@ -17,12 +17,14 @@ from itertools import zip_longest
 from typing import TYPE_CHECKING
 
 from factory.config import ConfigError, compose, conf_dir
+from factory.store.room import NoRoom
+from factory.store.usable import why_unusable
 from factory.words import Asked, asked_of
 
 if TYPE_CHECKING:
     from factory.clips.reader import ClipRef
 
-BAD_CONFIG = 2
+BAD_CONFIG, INTERRUPTED = 2, 4
 
 
 def main(argv: Sequence[str]) -> int:
@@ -36,9 +38,12 @@ def main(argv: Sequence[str]) -> int:
             print(settings_text(asked.words))
             return 0
         return run(asked)
-    except ConfigError as error:
+    except (ConfigError, MemoryError) as error:
         print(f"error: {error}", file=sys.stderr)
         return BAD_CONFIG
+    except NoRoom as error:
+        print(f"error: {error}; make room and run the same command again", file=sys.stderr)
+        return INTERRUPTED
 
 
 def plan(argv: Sequence[str]) -> int:
@@ -91,6 +96,8 @@ def run(asked: Asked) -> int:
 
     values = compose("run", asked.words)
     check(values, asked.overrides)
+    if unusable := why_unusable(values["out"]):
+        raise ConfigError(unusable)
 
     from factory.benchmark import NEEDED, write_benchmark
     from factory.calibrate import calibrate, plan_text

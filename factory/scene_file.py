@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from factory.store.room import needs_room
 from tasks.render.asset import BlockRange, Exposure, RenderAsset, ViewQuality
 from tasks.render.gaussians import Gaussians
 from tasks.render.sky import SkyMap
@@ -46,15 +47,16 @@ def write_scene(path: Path, asset: RenderAsset) -> RenderAsset:
     tensors, described = tensors_of(asset), described_by(asset)
     digest = digest_of(tensors, described)
     data = save(dict(tensors), metadata={KEY: _json(described | {"digest": digest})})
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=".scene-", suffix=SUFFIX)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    with needs_room(path, len(data)):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=".scene-", suffix=SUFFIX)
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(data)
+            os.replace(temporary, path)
+        except BaseException:
+            Path(temporary).unlink(missing_ok=True)
+            raise
     return replace(asset, digest=digest)
 
 

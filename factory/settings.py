@@ -109,7 +109,7 @@ def open_reader(clips: Mapping[str, Any]) -> tuple[ClipReader, ClipIndex]:
     _must_have(reader, ("name", "index", "read"), "clips", "a reader (factory.clips.reader.ClipReader)")
     try:
         index = reader.index()
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         raise ConfigError(f"clips: {error}") from error
     if not index.refs and not index.broken:
         reasons = [f"{reason} x{count}" for reason, count in index.dropped.items()]
@@ -144,10 +144,11 @@ def assemble(config: RunConfig) -> Run:
     """Open the reader, load the vocabulary, prepare the experts. Raises ConfigError with what to mend."""
     refuse_relative_root(config.clips)
     refuse_missing_backend(config)
-    reader, index = open_reader(config.clips)
-    try:
+    try:  # what takes no clips comes first
         vocabulary = choose_vocabulary(config.vocabulary)
         labelling = choose_labelling(config, vocabulary)
+        refuse_wrong_recovery(config)
+        reader, index = open_reader(config.clips)
         experts = {name: build_expert(name, config, reader, index, vocabulary) for name in config.experts}
     except ValueError as error:
         raise error if isinstance(error, ConfigError) else ConfigError(str(error)) from error
@@ -167,6 +168,22 @@ def assemble(config: RunConfig) -> Run:
         cache_dir=cache_folder(config),
     )
     return Run(config, reader, index, work)
+
+
+def refuse_wrong_recovery(config: RunConfig) -> None:
+    """Raises ConfigError for settings that a recovery expert does not take, and for a table that is not there."""
+    for name in config.experts:
+        if config.expert[name].get("kind") == "recovery":
+            sources, _ = recovery_settings(config, name)
+            if sources.table is not None and not Path(sources.table).is_file():
+                raise ConfigError(f"expert.{name}.table={sources.table}: there is no such file")
+
+
+def recovery_settings(config: RunConfig, name: str) -> tuple[RecoverySources, RecoverySettings]:
+    """Typed. Raises ConfigError."""
+    spec = {key: value for key, value in config.expert[name].items() if key != "kind"}
+    of_table: dict[str, Any] = {key: spec.pop(key) for key in ("table", "vocabularies") if key in spec}
+    return fill(RecoverySources, of_table, f"expert.{name}"), fill(RecoverySettings, spec, f"expert.{name}")
 
 
 def choose_vocabulary(choice: VocabularyChoice) -> Vocabulary:
@@ -194,9 +211,7 @@ def build_expert(name: str, config: RunConfig, reader: ClipReader, index: ClipIn
                 raise ConfigError(f"unknown setting {', '.join(f'{where}.{key}' for key in spec)}")
             return _without_settings(kind, config.pdm)
         case "recovery":
-            of_table: dict[str, Any] = {key: spec.pop(key) for key in ("table", "vocabularies") if key in spec}
-            sources = fill(RecoverySources, of_table, where)
-            settings = fill(RecoverySettings, spec, where)
+            sources, settings = recovery_settings(config, name)
             return Recovery(recovery_table(config, reader, index, sources), settings)
         case None:
             expert: Expert = build(spec, where, labels=())

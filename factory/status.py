@@ -8,12 +8,13 @@ Exit codes: 0 shown, 2 bad arguments, or nothing there to show.
 """
 
 import json
+import os
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from factory.arguments import Refused, answer
+from factory.arguments import Refused, answer, one_line
 
 if TYPE_CHECKING:
     from factory.store.samples import Store
@@ -59,6 +60,9 @@ class NothingThere(Refused):
 
 def open_store(out: str) -> "Store":
     """Raises NothingThere where there is no run, Refused where there can be none."""
+    if not out.strip():
+        raise Refused("out= is empty: name the folder or URL of a run (a shell variable that is not set?)")
+    os.environ.setdefault("RUST_LOG", "error")  # what the object store's client warns of, the error says again
     from deltalake.exceptions import DeltaError
 
     from factory.store.location import BadLocation
@@ -67,7 +71,7 @@ def open_store(out: str) -> "Store":
     try:
         store = Store(out)
     except (BadLocation, OSError, DeltaError) as error:
-        raise Refused(f"out={out}: {error}") from error
+        raise Refused(f"out={out}: {one_line(error)}") from error
     if store.samples.version is None and store.outcomes.version is None and store.candidates.version is None:
         raise NothingThere(store.location.uri)
     return store

@@ -17,6 +17,7 @@ from factory.store.cache import BadCacheFile, ClipCache
 from factory.store.location import Location
 from factory.store.outcomes import ErrorKind
 from factory.store.reader import samples_of
+from factory.store.room import no_room
 from factory.store.scenes import SceneFiles
 from factory.store.schema import SAMPLES, sample_row_to_table
 from factory.store.table import Shard, write_shard
@@ -32,6 +33,7 @@ class Failure:
 
     kind: ErrorKind
     error: str
+    no_room: str = ""  # what a full disk said: nothing more can be written, and nothing failed by itself
 
 
 @dataclass(frozen=True)
@@ -236,7 +238,7 @@ def failure_of(error: BaseException) -> Failure:
         return Failure(ErrorKind.INPUT, str(error))
     kind = ErrorKind.SYSTEM if isinstance(error, OSError | MemoryError) else ErrorKind.BUG
     lines = "".join(traceback.format_exception(error)).strip().splitlines()
-    return Failure(kind, "\n".join(lines[-ERROR_LINES:]))
+    return Failure(kind, "\n".join(lines[-ERROR_LINES:]), no_room(error))
 
 
 def _prepared(clip: PreparedClip, from_cache: bool, note: str, seconds: Mapping[str, float]) -> Prepared:

@@ -149,8 +149,11 @@ def _load(path: str | Path) -> np.ndarray | dict[str, np.ndarray]:
     try:
         loaded = np.load(path, allow_pickle=False)
         return loaded if isinstance(loaded, np.ndarray) else {key: loaded[key] for key in loaded.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path}: not readable as a numpy file: {error}") from error
+    except OSError as error:
+        raise ValueError(f"{path}: not readable as a numpy file: {error.strerror or error}") from error
+    except (ValueError, EOFError, zipfile.BadZipFile) as error:  # numpy takes what it does not know for a pickle
+        why = "it holds no plain numbers" if "pickled (object)" in str(error) else str(error)
+        raise ValueError(f"{path}: not readable as a numpy file: {why}") from error
 
 
 def save_vocabulary(path: str | Path, vocabulary: Vocabulary, origin: dict[str, object]) -> None:
@@ -253,7 +256,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(write_kinematic(settings))
             return 0
         lines = run(settings, build(compose("run", of_clips)["clips"], "clips"))
-    except ValueError as error:  # ConfigError is one
+    except (ValueError, OSError, MemoryError) as error:  # ConfigError is one
         print(f"error: {error}", file=sys.stderr)
         return 2
     print("\n".join(lines))

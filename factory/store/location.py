@@ -10,6 +10,7 @@ from pathlib import Path
 from pyarrow import fs
 
 from factory.job import in_submitted_job
+from factory.store.room import needs_room
 
 REMOTE = ("s3", "gs", "abfs", "abfss", "file")  # what both Arrow and Delta write to
 
@@ -65,20 +66,28 @@ class Location:
         return bool(filesystem.get_file_info(f"{base}/{name}").type == fs.FileType.File)
 
     def write(self, name: str, data: bytes) -> None:
-        """Whole file or no file: rename on local disk (flushed first), one put on an object store."""
+        """Whole file or no file: rename on local disk (flushed first), one put on an object store.
+
+        Raises NoRoom where the disk is full.
+        """
         if not self.is_local:
             filesystem, base = self.filesystem()
             with filesystem.open_output_stream(f"{base}/{name}", compression=None) as stream:
                 stream.write(data)
             return
         target = Path(self.uri, name)
-        target.parent.mkdir(parents=True, exist_ok=True)
         draft = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
-        with draft.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        draft.replace(target)
+        with needs_room(target, len(data)):
+            target.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                with draft.open("wb") as file:
+                    file.write(data)
+                    file.flush()
+                    os.fsync(file.fileno())
+                draft.replace(target)
+            except BaseException:
+                draft.unlink(missing_ok=True)
+                raise
 
     def remove(self, name: str) -> None:
         filesystem, base = self.filesystem()

@@ -60,6 +60,9 @@ class History:
     candidates: Mapping[str, Listed]  # clip_id -> what is known of its list
 
 
+NOTHING = History({}, {}, {})
+
+
 class Store:
     """One run's view of everything under `out`. Opening writes nothing."""
 
@@ -82,7 +85,8 @@ class Store:
 
         A record's on_change says whether rows of older records may stand among its own ("keep"). A run that says
         "stop" and changes nothing goes on under the record that it finds. Expert digests are those of all experts so
-        far. Writes nothing. Raises ChangedRun where they differ and on_change is "stop".
+        far. Writes nothing. Raises ChangedRun where they differ, on_change is "stop" and there are samples; without
+        one the run starts over.
         """
         for expert in expert_digests:
             if not re.fullmatch(r"[A-Za-z0-9_-]+", expert):
@@ -104,6 +108,8 @@ class Store:
             )
         if records:
             changes = differences(records[-1], record)
+            if changes and on_change == "stop" and not len(self.samples):
+                return [record]  # nothing stands on the settings that were: they were tried, found wrong and corrected
             if changes and on_change == "stop":
                 raise ChangedRun(f"{self.location.uri} was made with other settings: {'; '.join(changes)}. {WAYS_OUT}")
             record["expert_digests"] = records[-1]["expert_digests"] | record["expert_digests"]
@@ -115,12 +121,23 @@ class Store:
                 records = records[:-1]
         return [*records, record]
 
+    def starts_over(self, records: Sequence[Mapping[str, object]]) -> bool:
+        """Whether `records` of agree() take the place of settings that made no sample."""
+        known = self.runs()
+        return bool(known) and len(records) == 1 and bool(differences(known[-1], records[0]))
+
     def begin(self, records: Sequence[Mapping[str, object]]) -> None:
         """The first writes of a run: record its settings, fence off older runs, tidy up after a crash.
+
+        A run that starts over drops what became of attempts under the settings that were.
 
         A crash between two commits leaves a failed outcome beside the sample that its retry became; it goes. One that
         is newer than the sample of the same attempt, of a redo that failed, stays.
         """
+        if self.starts_over(records):
+            for table in (self.candidates, self.outcomes):
+                table.claim()
+                table.commit([], drop=list(table))
         if list(records) != self.runs():
             document = {"schema_version": SCHEMA_VERSION, "runs": list(records)}
             self.location.write(RUN_FILE, (json.dumps(document, indent=1, sort_keys=True) + "\n").encode())

@@ -26,8 +26,11 @@ from deltalake.exceptions import CommitFailedError
 from deltalake.transaction import AddAction, RemoveAction
 
 from factory.store.location import Location
+from factory.store.room import needs_room
 
 APP_ID = "driving-data-factory"
+ACTION_BYTES = 1024  # of the log, about, that a file added or removed takes
+SCHEMA_BYTES = 16 * 1024  # of the log, about, that a new table takes
 AHEAD = 16  # files of an object store that are read at once
 ROW_GROUP_BYTES = 4 * 2**20  # uncompressed; one sample costs one group, and a group 13 kB of the file's footer
 
@@ -258,7 +261,8 @@ class KeyedTable:
         """One more commit, of metadata. Raises AnotherWriter."""
         table = self._delta if self._delta is not None else self._create()
         version = table.version()
-        table.alter.set_table_properties({name: value}, raise_if_not_exists=False)
+        with needs_room(f"{self.location.uri}/_delta_log", ACTION_BYTES):
+            table.alter.set_table_properties({name: value}, raise_if_not_exists=False)
         table.update_incremental()
         self._check_alone(version)
 
@@ -270,16 +274,16 @@ class KeyedTable:
     def _transact(self, actions: list[AddAction | RemoveAction]) -> None:
         table = self._delta if self._delta is not None else self._create()
         number = (table.transaction_version(APP_ID) or 0) + 1
+        properties = CommitProperties(app_transactions=[Transaction(APP_ID, number)], max_commit_retries=0)
         try:
-            table.create_write_transaction(
-                actions,
-                mode="append",
-                schema=self.spec.schema,
-                partition_by=list(self.spec.partition_by),
-                commit_properties=CommitProperties(
-                    app_transactions=[Transaction(APP_ID, number)], max_commit_retries=0
-                ),
-            )
+            with needs_room(f"{self.location.uri}/_delta_log", ACTION_BYTES * (1 + len(actions))):
+                table.create_write_transaction(
+                    actions,
+                    mode="append",
+                    schema=self.spec.schema,
+                    partition_by=list(self.spec.partition_by),
+                    commit_properties=properties,
+                )
         except CommitFailedError as error:
             raise AnotherWriter(f"{self.spec.name}: another run has taken over {self.location.uri}") from error
         version = table.version()
@@ -292,18 +296,19 @@ class KeyedTable:
             raise AnotherWriter(f"{self.spec.name}: another run has taken over {self.location.uri}")
 
     def _create(self) -> DeltaTable:
-        if self.location.is_local:
-            Path(self.location.uri).mkdir(parents=True, exist_ok=True)
-        self._delta = DeltaTable.create(
-            self.location.uri,
-            self.spec.schema,
-            mode="ignore",
-            partition_by=list(self.spec.partition_by),
-            name=self.spec.name,
-            configuration=self.spec.properties,
-            raise_if_key_not_exists=False,
-            storage_options=dict(self.location.options),
-        )
+        with needs_room(f"{self.location.uri}/_delta_log", SCHEMA_BYTES):
+            if self.location.is_local:
+                Path(self.location.uri).mkdir(parents=True, exist_ok=True)
+            self._delta = DeltaTable.create(
+                self.location.uri,
+                self.spec.schema,
+                mode="ignore",
+                partition_by=list(self.spec.partition_by),
+                name=self.spec.name,
+                configuration=self.spec.properties,
+                raise_if_key_not_exists=False,
+                storage_options=dict(self.location.options),
+            )
         return self._delta
 
 

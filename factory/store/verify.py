@@ -13,6 +13,8 @@ from dataclasses import dataclass
 
 import pyarrow.compute as pc
 
+from factory.arguments import BAD_ARGUMENTS, Refused
+from factory.status import open_store
 from factory.store.episodes import FOLDER, check_episode, episode_name
 from factory.store.samples import Store
 from factory.store.table import KeyedTable, read_parquet
@@ -115,12 +117,13 @@ def main(arguments: Sequence[str]) -> int:
         return 0
     arguments = [argument.removeprefix("out=") for argument in arguments]
     if len(arguments) != 1:
-        print("usage: python -m factory.store.verify OUT", file=sys.stderr)
-        return 2
-    store = Store(arguments[0])
-    if store.samples.version is None and store.outcomes.version is None:
-        print(f"{store.location.uri}: no store here", file=sys.stderr)
-        return 2
+        print("error: expected one folder or URL: python -m factory verify <out>", file=sys.stderr)
+        return BAD_ARGUMENTS
+    try:
+        store = open_store(arguments[0])
+    except Refused as error:
+        print(f"error: {error}", file=sys.stderr)
+        return BAD_ARGUMENTS
     verdict = verify(store)
     for line in verdict.damage:
         print(f"DAMAGED {line}")

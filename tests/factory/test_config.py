@@ -222,7 +222,7 @@ def test_the_installed_package_carries_its_configuration(tmp_path: Path) -> None
     """The wheel's layout: conf inside the package, no checkout around it."""
     packages = ("factory", "tasks")
     for name in packages:
-        shutil.copytree(REPOSITORY / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(REPOSITORY / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__", "conf"))
     shutil.copytree(REPOSITORY / "conf", tmp_path / "factory" / "conf")
     code = (
         "from factory.config import compose, conf_dir; print(conf_dir()); print(compose('run', ['rounds=3'])['rounds'])"

@@ -1,0 +1,106 @@
+"""Whether `out` can be written to, before anything else is done: a folder by a trial file, a URL by a trial object.
+
+A client of an object store tries for minutes where credentials or the network are missing, so the trial of a URL is a
+process of its own that is ended after TRIAL_S: `python -m factory.store.usable URL`.
+"""
+
+import errno
+import os
+import secrets
+import subprocess
+import sys
+from pathlib import Path
+
+from factory.arguments import one_line
+from factory.store.room import existing, needs_room
+
+TRIAL_BYTES = 4 * 2**20  # a row group, the least that samples with pictures are written in
+TRIAL_S = 20.0
+CREDENTIALS = {  # what both clients read
+    "s3": "AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE, and AWS_REGION",
+    "gs": "GOOGLE_APPLICATION_CREDENTIALS",
+    "abfs": "AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY",
+    "abfss": "AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY",
+}
+
+
+def why_unusable(out: str) -> str:
+    """One line on why no run can write to `out`; nothing where it can. Leaves nothing behind."""
+    if not out.strip():
+        return "out= is empty: name a folder or a URL (a shell variable that is not set?)"
+    scheme, is_url, _ = out.partition("://")
+    if is_url and scheme != "file":
+        return _why_not_remote(out, scheme) if scheme in CREDENTIALS else ""  # others are refused by Location
+    path = Path(out.removeprefix("file://")).expanduser().absolute()
+    above = existing(path)
+    if not above.is_dir():
+        return f"out={out}: {above} is not a folder"
+    return _why_not_local(out, path, above)
+
+
+def _why_not_local(out: str, path: Path, above: Path) -> str:
+    created = [place for place in (path, *path.parents) if place != above and above in place.parents]
+    trial = path / f".trial-{secrets.token_hex(8)}"
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with needs_room(path, TRIAL_BYTES):
+            _try(trial)
+    except OSError as error:
+        if error.errno is None:  # NoRoom, which says it all
+            return f"out={out}: {error}"
+        why = "no file can be made there" if error.errno == errno.ENOENT else error.strerror or str(error)
+        return f"out={out}: cannot be written: {why}"
+    finally:
+        for place in created:
+            if place.is_dir():
+                place.rmdir()
+    return ""
+
+
+def _try(trial: Path) -> None:
+    try:
+        with trial.open("wb") as file:
+            file.write(bytes(TRIAL_BYTES))
+            file.flush()
+            os.fsync(file.fileno())
+    finally:
+        trial.unlink(missing_ok=True)
+
+
+def _why_not_remote(out: str, scheme: str) -> str:
+    hint = f"; credentials are read from {CREDENTIALS[scheme]}"
+    command = [sys.executable, "-m", "factory.store.usable", out]
+    try:
+        done = subprocess.run(  # noqa: S603  # our own interpreter; the URL is an argument, not a shell's word
+            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=TRIAL_S
+        )
+    except subprocess.TimeoutExpired:
+        return f"out={out}: no answer in {TRIAL_S:.0f} s{hint}"
+    if done.returncode == 0:
+        return ""
+    said = done.stdout.strip() or (done.stderr.strip().splitlines() or ["the trial ended without a word"])[-1]
+    return f"out={out}: cannot be written: {said}{hint}"
+
+
+def main(arguments: list[str]) -> int:
+    """The trial of a URL: both clients, a small object written and removed; 0, or 1 and why not on standard output."""
+    from deltalake import DeltaTable
+    from deltalake.exceptions import DeltaError
+    from pyarrow import ArrowException
+
+    from factory.store.location import BadLocation, Location
+
+    try:
+        location = Location.parse(arguments[0])
+        name = f".trial-{secrets.token_hex(8)}"
+        DeltaTable.is_deltatable(location.child("samples").uri)
+        location.write(name, b"")
+        location.remove(name)
+    except (OSError, ValueError, ArrowException, DeltaError, BadLocation) as error:
+        print(one_line(error))
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

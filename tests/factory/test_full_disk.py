@@ -1,0 +1,103 @@
+"""A disk that fills up ends a run with exit code 4, loses nothing that was committed, and the same command goes on."""
+
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from factory.execute import COMPLETE, INTERRUPTED, RunSummary, execute
+from factory.steps import failure_of
+from factory.store.room import NoRoom, needs_room, no_room
+from factory.store.samples import Store
+from factory.store.usable import why_unusable
+from factory.store.verify import verify
+from tests.factory.toy import ToyWork, refs
+
+LARGE = "64m"
+
+
+def mount(folder: Path, *options: str) -> bool:
+    command = ["mount", "-t", "tmpfs", *options, "tmpfs", str(folder)]
+    return subprocess.run(command, capture_output=True).returncode == 0
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of its own, of 64 MB until it is made smaller."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    if not mount(folder, "-o", f"size={LARGE}"):
+        pytest.skip("a small disk is a tmpfs, and only root may mount one")
+    yield folder
+    subprocess.run(["umount", str(folder)], check=True)
+
+
+def resize(folder: Path, size: str) -> None:
+    subprocess.run(["mount", "-o", f"remount,size={size}", str(folder)], check=True)
+
+
+def run(out: Path) -> RunSummary:
+    work = ToyWork(threshold=0.4)
+    return execute(
+        work, refs(8), ["recovery", "human"], 2, Store(out), "local", shard_seconds=0.0, say=lambda line: None
+    )
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
+    out = tmp_path_factory.mktemp("undisturbed")
+    assert run(out).exit_code == COMPLETE
+    return set(Store(out).samples)
+
+
+@pytest.mark.parametrize("size", ["16k", "64k", "128k", "192k", "256k", "384k", "512k"])
+def test_wherever_the_disk_is_full_the_same_command_goes_on(disk: Path, undisturbed: set[str], size: str) -> None:
+    out = disk / "out"
+    resize(disk, size)
+    stopped = run(out)
+    assert stopped.exit_code == INTERRUPTED
+    assert str(out) in stopped.message and "bytes are needed" in stopped.message, stopped.message
+    assert "\n" not in stopped.message and "run the same command again" in stopped.message
+    resize(disk, LARGE)
+    committed = set(Store(out).samples)
+    assert committed <= undisturbed
+    assert not list(out.rglob("*.tmp")), "half a file takes room from the next run"
+    if Store(out).samples.version is not None:
+        assert verify(Store(out)).damage == ()
+        assert "failed" not in Store(out).outcomes.read(["kind"])["kind"].to_pylist(), (
+            "a full disk is no failed attempt"
+        )
+    assert run(out).exit_code == COMPLETE
+    assert set(Store(out).samples) == undisturbed
+    assert verify(Store(out)).damage == ()
+
+
+def test_some_of_these_disks_hold_a_part_of_the_samples(disk: Path, undisturbed: set[str]) -> None:
+    resize(disk, "512k")
+    run(disk / "out")
+    assert 0 < len(Store(disk / "out").samples) < len(undisturbed)
+
+
+def test_a_disk_without_room_for_a_row_group_is_refused_at_once(disk: Path) -> None:
+    assert why_unusable(str(disk / "deep" / "out")) == ""
+    resize(disk, "1m")
+    said = why_unusable(str(disk / "deep" / "out"))
+    assert "the disk is full: 4,194,304 bytes are needed, 1,04" in said
+    assert list(disk.iterdir()) == [], "nothing is left behind"
+
+
+def test_what_a_full_disk_said_is_found_behind_other_errors_and_in_delta_s_words(tmp_path: Path) -> None:
+    full = r"x: the disk is full: 1,234 bytes are needed, [\d,]+ are free"
+    with pytest.raises(NoRoom, match=full), needs_room(tmp_path / "x", 1234):
+        raise OSError("Generic LocalFileSystem error: No space left on device (os error 28)")
+    with pytest.raises(PermissionError), needs_room(tmp_path, 1):
+        raise PermissionError(13, "Permission denied")
+    try:
+        try:
+            raise OSError(28, "No space left on device", "/a/file")
+        except OSError as error:
+            raise RuntimeError("a plug-in's own words") from error
+    except RuntimeError as error:
+        assert failure_of(error).no_room == no_room(error) == "/a/file: the disk is full"
+    assert failure_of(ValueError("else")).no_room == ""
