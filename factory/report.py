@@ -1,7 +1,7 @@
 """`python -m factory.report out=<folder or URL>`: a run as one HTML file, for sharing.
 
-    python -m factory.report out=runs/demo                  writes runs/demo/report.html and the data set's card,
-                                                            runs/demo/README.md, as a run does at its end
+    python -m factory.report out=runs/demo                  writes runs/demo/report.html and, beside it, README.md,
+                                                            the data set's card, as a run does at its end
     python -m factory.report out=s3://bucket/samples to=run.html
 
 It is the dashboard with its answers and some pictures inside: the same page, the same numbers, nothing fetched.

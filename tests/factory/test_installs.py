@@ -14,7 +14,11 @@ import yaml
 from packaging.utils import canonicalize_name
 from packaging.version import Version
 
+from factory.execute import execute
+from factory.store.samples import Store
+from tests.factory.filmed import FilmedWork
 from tests.factory.installs import PROJECT, REPOSITORY, SMALL, as_if_installed, closure, declared
+from tests.factory.toy import refs
 
 OURS = {"tasks", "factory", "planners"}
 DISTRIBUTIONS = {  # of modules whose distribution has another name
@@ -125,6 +129,22 @@ def test_a_command_that_needs_an_extra_names_the_line_that_installs_it(
     assert done.returncode == 2, done.stderr
     assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1 and line in done.stderr
     assert list(tmp_path.iterdir()) == [hidden], "nothing is written"
+
+
+def test_the_small_install_looks_at_a_finished_run(tmp_path: Path) -> None:
+    execute(FilmedWork(), refs(2), ["recovery", "human"], 1, Store(tmp_path / "out"), "local", say=lambda line: None)
+    code = (
+        "from factory.__main__ import main\n"
+        "for words in ('status', 'funnel', 'failed', 'lineage sample=0', 'show sample=0 to=.', 'report', 'verify'):\n"
+        "    name, *rest = words.split()\n"
+        "    assert main([name, 'out=out', *rest]) == 0, words\n"
+        "assert main(['export', 'mcap', 'out=out', 'sample=0']) == 0\n"
+        "assert main(['vocabulary', '--help']) == main(['run', '--help']) == 0\n"
+    )
+    env = os.environ | {"PYTHONPATH": f"{as_if_installed(SMALL, tmp_path / 'small')}{os.pathsep}{REPOSITORY}"}
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=env, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert {path.suffix for path in tmp_path.iterdir()} >= {".png", ".mcap"}
 
 
 def test_the_version_stands_in_one_place() -> None:
