@@ -1,10 +1,16 @@
-"""README.md and docs/configuration.md keep their word: python blocks run, commands are ones the programs take."""
+"""Every page keeps its word: python blocks run, and commands are ones that the programs take.
+
+A command that shows what a run holds is run, on a tiny run as `make demo` makes them. One that makes something is read
+by its program's own settings, which refuse what they do not know. What is left out, and why, stands in LEFT_OUT.
+"""
 
 import os
 import re
-import shlex
 import subprocess
 import sys
+import tomllib
+from dataclasses import fields
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -12,43 +18,54 @@ import pytest
 from factory.__main__ import main as door_main
 from factory.arguments import parse
 from factory.clips.synthetic.reader import SyntheticReader
+from factory.commands import COMMANDS
 from factory.config import compose, fill
 from factory.dashboard import Request as DashboardRequest
 from factory.explain import split_arguments
 from factory.export import main as export_main
+from factory.plugins import GROUPS
 from factory.report import main as report_main
 from factory.run import main as run_main
 from factory.settings import load_config
 from factory.show import main as show_main
+from factory.store.verify import main as verify_main
 from planners.agreement import AgreementSettings
 from planners.analysis import AnalysisSettings
 from planners.compare import CompareSettings
 from planners.evaluate import settings_of as evaluate_settings
 from planners.replay import settings_of as replay_settings
 from planners.scaling import ScalingSettings
+from planners.study_plan import StudySettings
+from planners.study_report import ReportSettings
 from planners.train import TrainConfig
 from tasks.caches import user_cache
 from tasks.kernels import cache_dir
+from tasks.render.fit.settings import FitSettings
 from tests.factory.installs import SMALL, as_if_installed
-
-REPOSITORY = Path(__file__).resolve().parents[1]
-PAGES = ("README.md", "CONTRIBUTING.md", "docs/configuration.md", "docs/dashboard.md", "docs/training.md")
-
-
-def blocks(page: str, language: str) -> list[str]:
-    """The fenced blocks of that language ('' where none is named), in order."""
-    text = (REPOSITORY / page).read_text()
-    return [body for named, body in re.findall(r"^```(\w*)\n(.*?)^```$", text, re.M | re.S) if named == language]
-
-
-def commands(page: str) -> list[list[str]]:
-    """The command lines of the unnamed blocks as lists of words: continued lines joined, comments left out."""
-    joined = "\n".join(blocks(page, "")).replace("\\\n", " ")
-    return [words for line in joined.splitlines() if (words := shlex.split(line, comments=True))]
-
+from tests.pages import PAGES, REPOSITORY, Command, blocks, commands, named_in_prose
 
 ALL_COMMANDS = [command for page in PAGES for command in commands(page)]
+IN_PROSE = list(dict.fromkeys(command for page in PAGES for command in named_in_prose(page)))
 PYTHON_BLOCKS = blocks("README.md", "python")
+RUN_ELSEWHERE = {
+    "docs/queries.md": "tests/test_queries.py runs them",
+    "docs/study_notes.md": "needs the evaluations of a whole study; compiled only",
+}
+LEFT_OUT = {  # program, and why its commands are not read here; the files that they name have to be there
+    "kubectl": "needs a cluster; tests/deploy holds its files against their schemas",
+    "prometheus": "needs its server; tests/deploy runs it where it is installed",
+    "rsync": "copies a folder",
+    "export": "sets the shell's variables",
+    "echo": "writes to a file of the kernel",
+    "git": "makes or moves a checkout",
+    "pip": "installs",
+    ".venv/bin/pip": "installs",
+}
+RAY_COMMANDS = {"start", "stop", "status", "up", "dashboard", "get-auth-token"}  # and `ray job`
+JOB_COMMANDS = {"submit", "logs", "stop", "list", "status"}
+JOB_OPTIONS = {"--address", "--submission-id", "--working-dir", "--no-wait", "--follow"}
+MAKE_TARGETS = set(re.findall(r"^([a-z-]+):", (REPOSITORY / "Makefile").read_text(), re.M))
+RUN_HERE = {"runs/demo", "/data/demo", "/archive/demo"}  # what a page calls the folder of its run
 
 
 @pytest.fixture(scope="module")
@@ -97,16 +114,21 @@ def test_a_run_leaves_the_card_of_its_data_set(demo_home: Path) -> None:
     assert "`synthetic` is drawn test data" in text and "pseudo-expert, not" not in text, "one human sample"
 
 
-@pytest.mark.parametrize("command", ALL_COMMANDS, ids=" ".join)
+@pytest.mark.parametrize("command", ALL_COMMANDS, ids=str)
 def test_every_command_is_one_its_program_takes(
-    command: list[str], demo_home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    command: Command, demo_home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    if command[:3] == ["ray", "job", "submit"]:
-        assert command[3:6] == ["--working-dir", ".", "--"]
-        command = command[6:]
-    match command:
-        case ["make", target]:
-            assert re.search(rf"^{target}:", (REPOSITORY / "Makefile").read_text(), re.M)
+    words = list(command.words)
+    assert not (lost := lost_files(words)), f"{lost} are not there"
+    if words[:3] == ["ray", "job", "submit"]:
+        assert set(options_of(words[: words.index("--")])) <= JOB_OPTIONS
+        words = words[words.index("--") + 1 :]
+    monkeypatch.chdir(demo_home)
+    for given_as in RUN_HERE:
+        words = [re.sub(rf"^(out=)?{given_as}$", r"\1runs/demo", word) for word in words]
+    match words:
+        case ["make", target, *_]:
+            assert target in MAKE_TARGETS
         case ["source", *_]:
             assert door_main(["completion", "bash"]) == 0
         case ["python", "-m", "factory"]:
@@ -114,24 +136,22 @@ def test_every_command_is_one_its_program_takes(
         case ["python", "-m", "factory", "plan" | "run", *arguments]:
             load_config(given(arguments))
         case ["python", "-m", "factory", *arguments]:
-            monkeypatch.chdir(demo_home)
             assert door_main(arguments) == 0, capsys.readouterr().err
         case ["python", "-m", "factory.run", "--help"]:
             assert run_main(["--help"]) == 0
-        case ["python", "-m", "factory.run", *arguments]:
+        case ["python", "-m", "factory.run" | "tests.bench.kill_resume", *arguments]:
             load_config(given(arguments))
         case ["python", "-m", "factory.explain", *arguments]:
             load_config(split_arguments(arguments)[1])
         case ["python", "-m", "factory.show", *arguments]:
-            monkeypatch.chdir(demo_home)
             assert show_main(arguments) == 0, capsys.readouterr().err
         case ["python", "-m", "factory.export", *arguments]:
-            monkeypatch.chdir(demo_home)
             assert export_main(arguments) == 0, capsys.readouterr().err
+        case ["python", "-m", "factory.store.verify", *arguments]:
+            assert verify_main(arguments) == 0, capsys.readouterr().err
         case ["python", "-m", "factory.dashboard", *arguments]:
-            parse(DashboardRequest, arguments)
+            parse(DashboardRequest, arguments)  # it would serve until it is stopped
         case ["python", "-m", "factory.report", *arguments]:
-            monkeypatch.chdir(demo_home)
             assert report_main(arguments) == 0, capsys.readouterr().err
         case ["python", "-m", "planners.train", *arguments] | [
             "torchrun",
@@ -147,15 +167,61 @@ def test_every_command_is_one_its_program_takes(
         case ["python", "-m", "planners.compare", *arguments]:
             fill(CompareSettings, compose("compare", arguments), "compare")
         case ["python", "-m", "planners.agreement", *arguments]:
-            fill(AgreementSettings, dict(argument.split("=", 1) for argument in arguments), "agreement")
+            fill(AgreementSettings, pairs(arguments), "agreement")
         case ["python", "-m", "planners.scaling", *arguments]:
             fill(ScalingSettings, compose("scaling", arguments), "scaling")
         case ["python", "-m", "planners.replay", *arguments]:
             replay_settings(arguments)
+        case ["python", "-m", "planners.study", *arguments]:
+            fill(StudySettings, compose("study", arguments), "study")
+        case ["python", "-m", "planners.study_report", *arguments]:
+            fill(ReportSettings, pairs(arguments), "study_report")
         case ["python", "-m", "planners.analysis", *arguments]:
-            fill(AnalysisSettings, dict(argument.split("=", 1) for argument in arguments), "analysis")
-        case _:
-            pytest.fail(f"no program takes {' '.join(command)}")
+            fill(AnalysisSettings, pairs(arguments), "analysis")
+        case ["python", "-m", "tests.bench.bench_kitti", _, *arguments]:
+            known = {field.name for field in fields(FitSettings)} | {"out", "validate", "threads", "first", "last"}
+            assert set(pairs(given(arguments))) <= known
+        case ["ray", "job", action, *rest]:
+            assert action in JOB_COMMANDS and set(options_of(rest)) <= JOB_OPTIONS
+        case ["ray", action, *_]:
+            assert action in RAY_COMMANDS
+        case [program, *_]:
+            assert program in LEFT_OUT, f"no program takes {' '.join(words)}"
+
+
+@pytest.mark.parametrize("command", IN_PROSE, ids=str)
+def test_every_command_named_in_prose_is_there(command: Command) -> None:
+    match list(command.words):
+        case ["make", target, *_]:
+            assert target in MAKE_TARGETS
+        case ["python", "-m", "factory", subcommand, *_]:
+            assert subcommand in COMMANDS or subcommand == "--version"
+        case ["python", "-m", module, *_]:
+            assert find_spec(module) is not None
+        case ["ray", "job", action, *_]:
+            assert action in JOB_COMMANDS
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python") and page != "README.md"])
+def test_python_of_other_pages_is_run_elsewhere_or_compiles(page: str) -> None:
+    assert page in RUN_ELSEWHERE
+    for block in blocks(page, "python"):
+        compile(block, page, "exec")
+
+
+def test_the_groups_of_entry_points_are_those_that_are_looked_for() -> None:
+    (block,) = blocks("docs/extend.md", "toml")
+    assert set(tomllib.loads(block)["project"]["entry-points"]) == set(GROUPS.values())
+
+
+def lost_files(words: list[str]) -> list[str]:
+    """Files of this project that a command reads and that are not there; what a run writes is none of them."""
+    named = (word.rpartition("=")[2] for word in words if not word.startswith(("out=", "report=", "to=")))
+    return [name for name in named if name.startswith(("deploy/", "docs/")) and not (REPOSITORY / name).exists()]
+
+
+def options_of(words: list[str]) -> list[str]:
+    return [word for word in words if word.startswith("--")]
 
 
 def given(arguments: list[str]) -> list[str]:
@@ -163,6 +229,11 @@ def given(arguments: list[str]) -> list[str]:
     return [argument for argument in arguments if argument not in ("...", "--cfg")]
 
 
+def pairs(arguments: list[str]) -> dict[str, str]:
+    return dict(argument.split("=", 1) for argument in arguments)
+
+
 def test_there_is_something_to_check() -> None:
     assert len(PYTHON_BLOCKS) == 2
-    assert len(ALL_COMMANDS) >= 20
+    assert len(ALL_COMMANDS) >= 60 and len(IN_PROSE) >= 40
+    assert {"README.md", "docs/extend.md", "deploy/RUNBOOK.md"} <= {command.page for command in ALL_COMMANDS}
