@@ -15,7 +15,7 @@ from factory.clips.reader import BadClip, ClipRef
 from tasks.world.agents import AgentKind
 from tasks.world.clip import CLIP_STEPS, NOW
 from tasks.world.lanes import LightState
-from tasks.world.vehicle import AX, HEADING, VX, X
+from tasks.world.vehicle import AX, AY, HEADING, VX, X
 
 START_NS = 315_966_253_000_000_000
 YAW = 0.5  # the road's direction in the city frame
@@ -160,6 +160,22 @@ def test_states_of_a_straight_drive_are_its_closed_form(log: Path) -> None:
     assert np.ptp(clip.agents.boxes[:, cone, :2], axis=0).max() < 1e-8
     assert (clip.agents.velocities[:, cone] == 0.0).all()
     assert np.allclose(clip.agents.center_z, 1.5) and clip.agents.heights[car] == 1.6
+
+
+def test_an_ego_that_speeds_up_has_its_acceleration_along_its_heading(log: Path) -> None:
+    """x = 4 t + 0.6 t^2 along the road."""
+
+    def speed_up(columns: dict[str, list]) -> None:
+        time = (np.array(columns["timestamp_ns"]) - START_NS) * 1e-9
+        way = 4.0 * time + 0.6 * time**2
+        columns["tx_m"], columns["ty_m"] = road(way, np.zeros_like(way)).T.tolist()
+
+    edit(log / "city_SE3_egovehicle.feather", speed_up)
+    reader = AV2Reader(log)
+    states = reader.read(reader.index().refs[1]).ego_states
+    np.testing.assert_allclose(states[:, VX], 4.0 + 1.2 * (1.0 + 0.1 * np.arange(CLIP_STEPS)), atol=1e-6)
+    np.testing.assert_allclose(states[:, AX], 1.2, atol=1e-6)
+    np.testing.assert_allclose(states[:, AY], 0.0, atol=1e-6)
 
 
 def test_map_route_and_marks_come_from_the_vector_map(log: Path) -> None:

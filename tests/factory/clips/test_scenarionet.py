@@ -9,7 +9,7 @@ from shapely.geometry import Point, Polygon
 from factory.clips.reader import ClipRef
 from factory.clips.scenarionet import ScenarioNetReader, read_log
 from factory.clips.scenarionet_map import pieces
-from factory.clips.scenarionet_tracks import SLOPE_STEPS, slope_velocities
+from factory.clips.scenarionet_tracks import SLOPE_STEPS, Track, resampled, slope_velocities
 from tasks.world.agents import AgentKind
 from tasks.world.clip import CLIP_STEPS, NOW
 from tasks.world.lanes import LightState
@@ -248,6 +248,17 @@ def test_other_sample_rates_read_as_the_same_drive_at_ten_hertz(tmp_path, step_s
     motion = read_log(town.save(scenario, tmp_path)).motion
     assert len(motion.segment) == 121
     np.testing.assert_allclose(motion.ego_states[:, X], town.ego_xy(121)[:, 0], atol=1e-6)
+
+
+def test_between_two_frames_a_track_turns_the_short_way_round() -> None:
+    """From 0.1 rad before the half turn to 0.1 rad behind it: half way it is the half turn, not straight ahead."""
+    positions = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
+    headings = np.array([np.pi - 0.1, -np.pi + 0.1])
+    track = Track(positions, headings, np.ones(2, bool), np.ones(3))
+    position, heading, valid = resampled(track, np.array([0.0, 0.25, 0.5]))
+    np.testing.assert_allclose(position[:, 0], [0.0, 0.5, 1.0])
+    np.testing.assert_allclose(heading, [np.pi - 0.1, np.pi - 0.05, -np.pi], atol=1e-12)
+    assert valid.all()
 
 
 def test_slope_velocities_ignore_absent_frames_and_far_origins():

@@ -45,6 +45,15 @@ def test_a_perturbed_pose_stands_on_the_plane_of_the_road() -> None:
     assert pose[2, 0] / np.hypot(pose[0, 0], pose[1, 0]) == pytest.approx(0.1 * np.cos(0.4))
 
 
+def test_a_state_stands_at_the_height_of_the_road_next_to_it() -> None:
+    """The log climbs by steps: 2 m at x = 0, 3 m at x = 10, 5 m at x = 20, level at each."""
+    logged = np.tile(np.eye(4), (3, 1, 1))
+    logged[:, 0, 3], logged[:, 2, 3] = (0.0, 10.0, 20.0), (2.0, 3.0, 5.0)
+    states = np.zeros((3, 11))
+    states[:, 0], states[:, 1] = (1.0, 14.0, 16.0), (0.5, -2.0, 3.0)
+    np.testing.assert_allclose(pose_on_ground(logged, states)[:, 2, 3], [2.0, 3.0, 5.0])
+
+
 def test_undistorting_undoes_the_radial_model() -> None:
     camera = Camera(
         "c", 64, 48, np.array([[60.0, 0, 32], [0, 60.0, 24], [0, 0, 1]]), np.array([-0.2, 0.05, 0.0]), np.eye(4)

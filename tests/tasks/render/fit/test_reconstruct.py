@@ -8,7 +8,7 @@ import street
 
 from tasks.render.asset import psnr
 from tasks.render.engine import Pinhole, Vehicles, render
-from tasks.render.fit.reconstruct import advance, finish, picture_of, reconstruct
+from tasks.render.fit.reconstruct import advance, corrections_at, finish, picture_of, reconstruct
 from tasks.render.fit.schedule import photo_at
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import Problem, prepare
@@ -97,6 +97,20 @@ def test_a_picture_is_shown_with_the_exposure_that_was_learned_for_its_camera(
     for exposure, shot in zip(exposures, problem.train):
         assert (exposure.camera, exposure.time_s) == (shot.photo.camera, shot.photo.time_s)
         np.testing.assert_allclose(exposure.affine, [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0.05]], atol=1e-6)
+
+
+def test_a_photo_takes_the_corrections_of_its_own_camera(prepared: tuple[Problem, FitState]) -> None:
+    """Of four photos the second and the third are another camera's; between its own, a correction is their mean."""
+    problem, state = prepared[0], fresh(prepared[1])
+    named = [replace(shot, photo=replace(shot.photo, camera=name)) for shot, name in zip(problem.train, "abba")]
+    times = [shot.photo.time_s for shot in named]
+    for learned in ("poses", "exposure"):
+        state.learned[learned].values[:] = np.array([[1.0], [2.0], [4.0], [8.0]])
+    mixed = replace(problem, train=tuple(named))
+    for camera, time_s, expected in (("a", times[0], 1.0), ("b", times[1], 2.0), ("a", (times[0] + times[3]) / 2, 4.5)):
+        for row in corrections_at(mixed, state, camera, time_s):
+            np.testing.assert_allclose(row, expected, rtol=1e-6)
+    assert not np.concatenate(corrections_at(mixed, state, "nobody's", times[0])).any()
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
