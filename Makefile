@@ -21,9 +21,10 @@ $(VENV)/.run: pyproject.toml constraints.txt
 	$(PY) -m pip install -q -c constraints.txt -e ".[run]"
 	touch $@
 
-# PyTorch comes by itself, so that its index is asked for nothing else; what it needs in turn comes with the rest.
+# PyTorch comes by itself: its index is asked for nothing else and, where it is out of reach, given up within a minute.
+# What PyTorch needs in turn comes with the rest.
 $(VENV)/.installed: $(VENV)/.run
-	$(PY) -m pip install -q -c constraints.txt --no-deps --extra-index-url $(TORCH_INDEX) $(TORCH) || \
+	$(PY) -m pip install -q -c constraints.txt --no-deps --retries 2 --timeout 15 --extra-index-url $(TORCH_INDEX) $(TORCH) || \
 		{ echo "no $(TORCH): give TORCH= and TORCH_INDEX= (see the Makefile)"; exit 1; }
 	$(PY) -m pip install -q -c constraints.txt -e ".[dev]"
 	touch $@
