@@ -123,6 +123,9 @@ def test_a_walk_that_runs_out_of_candidates_is_exhausted_once(tmp_path: Path) ->
     _, outcomes, _ = tables_of(tmp_path / "out")
     exhausted = [o for o in outcomes if o["kind"] == "exhausted"]  # type: ignore[index]
     assert len(exhausted) == 8 and {o["n_tried"] for o in exhausted} == {6}  # type: ignore[index]
+    said = Store(tmp_path / "out").outcomes.live_files()
+    run(tmp_path / "out", ToyWork(threshold=0.99), rounds=3)
+    assert Store(tmp_path / "out").outcomes.live_files() == said, "nothing is said twice"
 
 
 def test_a_clip_without_candidates_still_gives_its_human_sample(tmp_path: Path) -> None:
@@ -268,6 +271,11 @@ def test_a_redo_that_fails_midway_keeps_the_old_walk(tmp_path: Path, begun: Call
     mine = pc.equal(old["expert"], "recovery")
     now = tables_of(tmp_path / "out")[0]
     assert_same_rows(now.filter(pc.equal(now["expert"], "recovery")), old.filter(mine))
+    again = replace(changed, journal=str(tmp_path / "journal"))
+    assert run(tmp_path / "out", again, rounds=3, n=1, on_change="redo").exit_code == COMPLETE_WITH_FAILURES
+    assert ran(again.journal, "attempt log0:0:recovery:1 ") == 0, (
+        "what this redo failed at stands until it is asked for"
+    )
     mended = replace(changed, trouble={})
     assert run(tmp_path / "out", mended, rounds=3, n=1, on_change="redo", retry=True).exit_code == COMPLETE
     run(tmp_path / "fresh", mended, rounds=3, n=1)

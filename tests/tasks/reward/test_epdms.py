@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from straight_street import Thing, drive, past_of, rectangle, street, tracks
 
-from tasks.reward.epdms import Scores, human_filtered, rows, score, score_with_ec
+from tasks.reward.epdms import Scores, human_filtered, relative_progress, rows, score, score_with_ec
 from tasks.reward.map_index import index_map
 from tasks.reward.prepare import prepare
 from tasks.rollout.lqr import track
@@ -44,6 +44,15 @@ def scored(origin: np.ndarray, **settings) -> Scores:
     states = track(start[0, 0], to_world(origin, plans(40)))
     prepared = street(TRAFFIC, EXTRA, ("turn",), past_of(start), origin, start[0, 0])
     return score(prepared, states, **settings)
+
+
+def test_progress_is_held_against_the_best_of_the_batch_or_against_row_0_alone():
+    """Row 0 is 20 m far. The second is 40 m, the third 10 m, the fourth 80 m and breaks a rule."""
+    ep_raw_m, multiplier = np.array([20.0, 40.0, 10.0, 80.0]), np.array([1.0, 1.0, 1.0, 0.0])
+    assert relative_progress(ep_raw_m, multiplier, "batch").tolist() == [0.5, 1.0, 0.25, 1.0]
+    assert relative_progress(ep_raw_m, multiplier, "pairs").tolist() == [1.0, 1.0, 0.5, 1.0]
+    assert relative_progress(np.array([3.0, 5.0]), np.ones(2), "pairs").tolist() == [1.0, 1.0], "nobody beyond 5 m"
+    assert relative_progress(np.array([3.0, 5.1]), np.ones(2), "batch").tolist() == [3.0 / 5.1, 1.0]
 
 
 def test_the_score_is_a_product_times_a_weighted_mean():
