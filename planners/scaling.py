@@ -6,8 +6,9 @@
 Trains one planner for every combination of the axes (planners, experts, rounds, sim_ratios, imitation, real_shares,
 seeds), evaluates all on one benchmark, and fits S(N) = a log^2 N + b log N + c per curve. Writes `scaling.csv` (one row
 a training), `comparisons.csv` (means over seeds, differences from real samples alone with paired bootstrap intervals
-over clips and seeds), `bounds.csv`, `curves.csv` (a, b, c, residuals, saturation) and `scaling.png`. The same command
-goes on where it stopped.
+over seeds and clips, logs, towns), `bounds.csv`, `curves.csv` (a, b, c, residuals, saturation), `scaling.png`, and
+`frames.parquet`, EPDMS of each frame by each planner, of which the tables are made: `python -m planners.scaling_table`
+makes them again. The same command goes on where it stopped.
 Exit codes: 0 complete, 2 bad settings, 3 a training failed, 4 interrupted or out of minutes, and resumable.
 """
 
@@ -23,8 +24,9 @@ from planners.aggregation import HumanFilter
 from planners.checkpoint import read_record
 from planners.scaling_figure import Curve, Point, draw_curves
 from planners.scaling_law import FEWEST, fit_scaling
-from planners.scaling_table import bounds, compared, text_of
-from planners.scores import PAPER, name_of, scores_of, shown, title_of, write_csv
+from planners.scaling_table import text_of, write_tables
+from planners.scores import BOUNDS, PAPER, name_of, shown, title_of, write_csv
+from planners.study_frames import FRAMES, read_frames, rows_of, write_frames
 from planners.sweep import EVALUATIONS, Means, SweepFailed, Training, evaluate_all, folder_of, train_all
 
 BAD_CONFIG, FAILED, INTERRUPTED = 2, 3, 4
@@ -159,6 +161,13 @@ def curves_of(rows: Sequence[dict[str, Any]], settings: ScalingSettings) -> list
     return curves
 
 
+def facts_of(training: Training, out: Path) -> dict[str, Any]:
+    """What one training is, as its own record has it."""
+    samples = read_record(folder_of(out, training))["samples"]
+    counts = {name: samples[name] for name in ("real", "simulated")}
+    return {"training": training.label, **training.facts, **counts, "samples": sum(counts.values())}
+
+
 def run(settings: ScalingSettings) -> int:
     """Train, evaluate, fit, draw; the exit code."""
     out, trainings = Path(settings.out), trainings_of(settings)
@@ -169,26 +178,15 @@ def run(settings: ScalingSettings) -> int:
     ):
         print("not all is trained and evaluated yet: the same command goes on", file=sys.stderr)
         return INTERRUPTED
-    evaluations, rows = out / EVALUATIONS, []
-    for training in trainings:
-        samples = read_record(folder_of(out, training))["samples"]
-        rows.append(
-            {
-                **training.facts,
-                "real": samples["real"],
-                "simulated": samples["simulated"],
-                "samples": samples["real"] + samples["simulated"],
-                **scores_of(evaluations / training.label),
-            }
-        )
     report = Path(settings.report or settings.out)
     report.mkdir(parents=True, exist_ok=True)
-    differences = compared(trainings, evaluations)
+    labels = [training.label for training in trainings]
+    known = [name for name in BOUNDS if (out / EVALUATIONS / name).is_dir()]
+    facts = [facts_of(training, out) for training in trainings]
+    write_frames(report / FRAMES, rows_of([*labels, *known], out / EVALUATIONS, settings.benchmark), facts)
+    rows, differences = write_tables(read_frames(report / FRAMES), report)
     curves = curves_of(rows, settings)
-    tables = {"scaling": rows, "comparisons": differences, "curves": [curve.row() for curve in curves]}
-    for name, table in (tables | {"bounds": bounds(evaluations)}).items():
-        if table:
-            write_csv(report / f"{name}.csv", table)
+    write_csv(report / "curves.csv", [curve.row() for curve in curves])
     draw_curves(curves, title_of(*settings.measure), report / "scaling.png")
     print(text_of(differences, *settings.measure))
     for curve in curves:

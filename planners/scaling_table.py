@@ -1,22 +1,56 @@
-"""The tables of a sweep: what simulated samples add to real ones alone, with intervals, and the bounds beside them."""
+"""`python -m planners.scaling_table folder=<report>`: a sweep's tables again, from its per-frame rows alone.
 
+    python -m planners.scaling_table folder=docs/study/logs/av2_7fab2350/stage_two
+
+`folder` holds the frames.parquet that `python -m planners.scaling` wrote. Made of it: `scaling.csv` (one row a
+training), `comparisons.csv` (what simulated samples add to real ones alone, with intervals) and `bounds.csv`.
+"""
+
+import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from planners.aggregation import MEASURES, ClipResult, by_clip
-from planners.compare import CompareSettings, compare, row_of
-from planners.score_rows import read_rows
-from planners.scores import BOUNDS, name_of, scores_of
-from planners.sweep import Training
+from factory.config import ConfigError, fill
+from planners.aggregation import MEASURES
+from planners.compare import ByLevel, CompareSettings, Measure, compare, row_of
+from planners.scores import BOUNDS, name_of, scores_of_clips, write_csv
+from planners.study_frames import FRAMES, Clips, StudyFrames, read_frames
 
-Setup = tuple[tuple[str, Any], ...]  # facts of a training but its seed
+BAD_CONFIG = 2
+Row = dict[str, Any]
+Setup = tuple[tuple[str, Any], ...]  # facts of a training that are the same for all seeds
+NOT_OF_SETUP = ("training", "seed", "real", "simulated", "samples")
 RULES = CompareSettings(a="", b="")  # draws, confidence and seed as `python -m planners.compare` has them
 
 
-def compared(trainings: Sequence[Training], evaluations: Path) -> list[dict[str, Any]]:
+@dataclass(frozen=True)
+class TableSettings:
+    """The command's keys."""
+
+    folder: str
+    out: str | None = None  # None: the folder
+
+
+def write_tables(frames: StudyFrames, report: Path) -> tuple[list[Row], list[Row]]:
+    """The files of this module's docstring; returns the rows of scaling.csv and of comparisons.csv."""
+    rows = [_scored(facts, frames.clips) for facts in frames.trainings]
+    differences = compared(frames.trainings, frames.clips)
+    for name, table in {"scaling": rows, "comparisons": differences, "bounds": bounds(frames.clips)}.items():
+        if table:
+            write_csv(report / f"{name}.csv", table)
+    return rows, differences
+
+
+def _scored(facts: Mapping[str, Any], clips: Clips) -> Row:
+    told = {name: value for name, value in facts.items() if name != "training"}
+    return told | scores_of_clips(clips[facts["training"]])
+
+
+def compared(trainings: Sequence[Mapping[str, Any]], clips: Clips) -> list[Row]:
     """A row for each setup, which is all facts but the seed, and each of MEASURES.
 
     In percent: the mean over seeds, the range of single seeds, and the difference from real samples alone with its
@@ -25,29 +59,29 @@ def compared(trainings: Sequence[Training], evaluations: Path) -> list[dict[str,
     uniform_share is the mean share of clips none of whose follow-ups starts near the plan's end.
     """
     setups: dict[Setup, list[str]] = {}
-    for training in sorted(trainings, key=lambda training: training.facts["seed"]):
-        setups.setdefault(_setup(training), []).append(training.label)
+    for facts in sorted(trainings, key=lambda facts: facts["seed"]):
+        setups.setdefault(_setup(facts), []).append(facts["training"])
     rows = []
     for setup, labels in setups.items():
-        scores = [scores_of(evaluations / label) for label in labels]
+        scores = [scores_of_clips(clips[label]) for label in labels]
         reference = _real_alone(dict(setup), setups)
-        differences = {}
+        differences: Mapping[Measure, ByLevel] = {}
         if reference:
-            differences = compare(_runs(reference, evaluations), _runs(labels, evaluations), RULES)
+            a, b = ([clips[label] for label in side] for side in (reference, labels))
+            differences = compare(a, b, RULES)
         for stage, human_filter in MEASURES:
             each = [score[name_of(stage, human_filter)] for score in scores]
-            row = {**dict(setup), "seeds": len(labels), "stage": stage, "human_filter": human_filter}
+            row: Row = {**dict(setup), "seeds": len(labels), "stage": stage, "human_filter": human_filter}
             row |= {"epdms": float(np.mean(each)), "lowest_seed": min(each), "highest_seed": max(each)}
-            found = differences.get((stage, human_filter))
-            row |= row_of(found)
+            row |= row_of(differences.get((stage, human_filter)))
             row["uniform_share"] = float(np.mean([score["uniform_share"] for score in scores]))
             rows.append(row)
     return rows
 
 
-def bounds(evaluations: Path) -> list[dict[str, Any]]:
+def bounds(clips: Clips) -> list[Row]:
     """The scores of those bounds that were evaluated."""
-    return [{"planner": name, **scores_of(evaluations / name)} for name in BOUNDS if (evaluations / name).is_dir()]
+    return [{"planner": name, **scores_of_clips(clips[name])} for name in BOUNDS if name in clips]
 
 
 def text_of(rows: Sequence[Mapping[str, Any]], stage: str, human_filter: str) -> str:
@@ -63,8 +97,8 @@ def text_of(rows: Sequence[Mapping[str, Any]], stage: str, human_filter: str) ->
     return "\n".join(lines)
 
 
-def _setup(training: Training) -> Setup:
-    return tuple((name, value) for name, value in training.facts.items() if name != "seed")
+def _setup(facts: Mapping[str, Any]) -> Setup:
+    return tuple((name, value) for name, value in facts.items() if name not in NOT_OF_SETUP)
 
 
 def _real_alone(setup: Mapping[str, Any], setups: Mapping[Setup, list[str]]) -> list[str]:
@@ -76,5 +110,26 @@ def _real_alone(setup: Mapping[str, Any], setups: Mapping[Setup, list[str]]) -> 
     return setups.get(tuple(alone.items()), [])
 
 
-def _runs(labels: Sequence[str], evaluations: Path) -> list[list[ClipResult]]:
-    return [by_clip(read_rows(evaluations / label)) for label in labels]
+def main(argv: Sequence[str]) -> int:
+    """The command; 2 with a message for what is no sweep's folder."""
+    if not argv or {"-h", "--help"} & set(argv):
+        print(__doc__)
+        return 0
+    try:
+        wrong = [word for word in argv if "=" not in word]
+        if wrong:
+            raise ConfigError(f"{wrong[0]}: give key=value: folder=, out=")
+        settings = fill(TableSettings, dict(word.split("=", 1) for word in argv), "scaling_table")
+        frames = read_frames(Path(settings.folder) / FRAMES)
+        out = Path(settings.out or settings.folder)
+        out.mkdir(parents=True, exist_ok=True)
+        write_tables(frames, out)
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return BAD_CONFIG
+    print(f"tables: {out}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -15,19 +15,17 @@ Exit codes: 0 complete, 2 bad settings, 3 a training failed, 4 not complete yet,
 """
 
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from factory.config import ConfigError, compose, fill
-from planners.benchmark_folder import logs_of
 from planners.checkpoint import read_record
 from planners.index import DataSettings, open_dataset
-from planners.score_rows import FrameRow, read_rows
 from planners.scores import BOUNDS
 from planners.study_figures import draw_learning
-from planners.study_frames import FRAMES, read_frames, write_frames
+from planners.study_frames import FRAMES, read_frames, rows_of, write_frames
 from planners.study_plan import (
     Comparison,
     Portion,
@@ -104,13 +102,6 @@ def write_report(standing: Sequence[Comparison], trained: Sequence[Training], se
     draw_learning({t.label: folder_of(out, t) for t in trained if t.facts["seed"] == 0}, report / "learning.png")
     print(text)
     print(f"tables and pictures: {report}")
-
-
-def rows_of(labels: Iterable[str], evaluations: Path, benchmark: str) -> Iterator[tuple[str, list[FrameRow]]]:
-    """The scored frames of each planner, with the logs that their clips are of as the benchmark has them."""
-    logs = logs_of(benchmark)
-    for label in labels:
-        yield label, [replace(row, log_id=logs[row.key.clip_id]) for row in read_rows(evaluations / label)]
 
 
 def sizes_of(settings: StudySettings) -> Sizes:

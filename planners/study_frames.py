@@ -1,4 +1,4 @@
-"""A study's per-frame rows in one file, small enough to be committed: what all of its tables are made of.
+"""A study's or sweep's per-frame rows in one file, small enough to be committed: what all of its tables are made of.
 
 A row for each frame and planner: EPDMS (float32), where the frame starts and where the plan from a logged frame ends,
 which is what follow-ups are weighted by. Frames are the same for all planners, so that their columns take next to
@@ -6,8 +6,8 @@ nothing. What was trained and what is compared with what stands in the file's me
 """
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -18,12 +18,14 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from planners.aggregation import ClipResult, by_clip
+from planners.benchmark_folder import logs_of
 from planners.frames import FrameKey
-from planners.score_rows import FrameRow
+from planners.score_rows import FrameRow, read_rows
 from planners.study_plan import Comparison, Setup
 from tasks.reward.one_stage import COLUMNS, FrameScores
 
 Array = NDArray[np.float64]
+Clips = Mapping[str, Sequence[ClipResult]]  # by label
 
 FRAMES = "frames.parquet"
 META = b"study"
@@ -46,15 +48,22 @@ class StudyFrames:
     """What a file holds."""
 
     trainings: tuple[Mapping[str, Any], ...]  # facts of each, with its label under "training"
-    comparisons: tuple[Comparison, ...]
-    clips: Mapping[str, list[ClipResult]]  # by label, also of ensembles and bounds; scores alone, no sub-scores
+    comparisons: tuple[Comparison, ...]  # of a study; none of a sweep
+    clips: Clips  # by label, also of ensembles and bounds; scores alone, no sub-scores
+
+
+def rows_of(labels: Iterable[str], evaluations: Path, benchmark: str) -> Iterator[tuple[str, list[FrameRow]]]:
+    """The scored frames of each evaluated planner, with the logs of their clips as the benchmark has them."""
+    logs = logs_of(benchmark)
+    for label in labels:
+        yield label, [replace(row, log_id=logs[row.key.clip_id]) for row in read_rows(evaluations / label)]
 
 
 def write_frames(
     path: Path,
     rows: Iterator[tuple[str, Sequence[FrameRow]]],
     trainings: Sequence[Mapping[str, Any]],
-    comparisons: Sequence[Comparison],
+    comparisons: Sequence[Comparison] = (),
 ) -> None:
     """Write the rows of each planner, by its label. Whole or not at all."""
     meta = {"trainings": [dict(one) for one in trainings], "comparisons": [asdict(one) for one in comparisons]}

@@ -27,7 +27,7 @@ from planners.scaling_law import FEWEST, fit_scaling
 from planners.score_table import FILTERS_NOTE
 from planners.scores import BOUNDS, PAPER, name_of, scores_of_clips, shown, title_of, write_csv
 from planners.study_figures import draw_differences
-from planners.study_frames import FRAMES, StudyFrames, read_frames
+from planners.study_frames import FRAMES, Clips, StudyFrames, read_frames
 from planners.study_plan import Comparison, Setup
 from planners.study_tables import markdown_of
 
@@ -35,7 +35,6 @@ BAD_CONFIG = 2
 CURVES = {"final": "scaling.png", "stage_two": "scaling_stage_two.png"}
 RULES = CompareSettings(a="", b="")  # draws, confidence and seed as `python -m planners.compare` has them
 
-Clips = Mapping[str, Sequence[ClipResult]]  # by label
 Row = dict[str, Any]
 
 

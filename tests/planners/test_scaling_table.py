@@ -5,16 +5,17 @@ from pathlib import Path
 import pytest
 
 from planners.scaling import ScalingSettings, SweepData, trainings_of
-from planners.scaling_table import bounds, compared, text_of
-from planners.score_rows import write_rows
-from planners.sweep import Training
+from planners.scaling_table import BAD_CONFIG, bounds, main, text_of, write_tables
+from planners.score_rows import read_rows, write_rows
+from planners.scores import scores_of
+from planners.study_frames import FRAMES, StudyFrames, read_frames, write_frames
 from tests.planners.made_rows import clip_rows
 
 SCORES = {0: 0.5, 1: 0.6, 2: 0.75}  # by rounds
 
 
-def sweep(tmp_path: Path, rounds: tuple[int, ...], end_m: float = 0.0) -> list[Training]:
-    """Two planners and seeds, evaluated on three clips; the second planner and seed are better by 0.01 and 0.02."""
+def sweep(tmp_path: Path, rounds: tuple[int, ...], end_m: float = 0.0) -> StudyFrames:
+    """The rows of two planners and seeds on three clips; the second planner and seed are better by 0.01 and 0.02."""
     settings = ScalingSettings(
         data=SweepData(("real",), ("sim",)),
         benchmark="bench",
@@ -32,7 +33,11 @@ def sweep(tmp_path: Path, rounds: tuple[int, ...], end_m: float = 0.0) -> list[T
         facts = training.facts
         score = SCORES[facts["rounds"]] + 0.01 * (facts["planner"] == "ego_mlp") + 0.02 * facts["seed"]
         evaluated(tmp_path / training.label, score, end_m)
-    return trainings
+    evaluated(tmp_path / "pdm_closed", 0.8)
+    facts = [{"training": training.label, **training.facts, "real": 10} for training in trainings]
+    labels = [*(training.label for training in trainings), "pdm_closed"]
+    write_frames(tmp_path / FRAMES, ((label, read_rows(tmp_path / label)) for label in labels), facts)
+    return read_frames(tmp_path / FRAMES)
 
 
 def evaluated(folder: Path, score: float, end_m: float = 0.0) -> None:
@@ -43,7 +48,7 @@ def evaluated(folder: Path, score: float, end_m: float = 0.0) -> None:
 
 
 def test_every_setup_is_held_against_real_samples_alone_of_its_planner(tmp_path: Path) -> None:
-    rows = compared(sweep(tmp_path, (0, 1, 2)), tmp_path)
+    _, rows = write_tables(sweep(tmp_path, (0, 1, 2)), tmp_path)
     assert len(rows) == 2 * (1 + 2 * 2) * 8
     for row in rows:
         assert (row["seeds"], row["uniform_share"]) == (2, 0.0)
@@ -58,16 +63,33 @@ def test_every_setup_is_held_against_real_samples_alone_of_its_planner(tmp_path:
 
 
 def test_a_sweep_without_real_samples_alone_has_no_differences(tmp_path: Path) -> None:
-    rows = compared(sweep(tmp_path, (1, 2)), tmp_path)
+    _, rows = write_tables(sweep(tmp_path, (1, 2)), tmp_path)
     assert rows and all(row["difference"] == "" for row in rows)
 
 
 def test_plans_that_end_far_from_every_follow_up_are_counted(tmp_path: Path) -> None:
-    assert {row["uniform_share"] for row in compared(sweep(tmp_path, (0,), end_m=50.0), tmp_path)} == {1.0}
+    assert {row["uniform_share"] for row in write_tables(sweep(tmp_path, (0,), end_m=50.0), tmp_path)[1]} == {1.0}
 
 
 def test_bounds_are_those_that_were_evaluated(tmp_path: Path) -> None:
-    assert bounds(tmp_path) == []
-    evaluated(tmp_path / "pdm_closed", 0.8)
-    (row,) = bounds(tmp_path)
+    frames = sweep(tmp_path, (0,))
+    (row,) = bounds(frames.clips)
     assert row["planner"] == "pdm_closed" and row["stage_two"] == pytest.approx(80.0)
+    assert bounds({}) == []
+
+
+def test_the_tables_are_made_again_to_the_byte_of_the_rows_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows, _ = write_tables(sweep(tmp_path, (0, 1)), tmp_path)
+    again = tmp_path / "again"
+    assert main([f"folder={tmp_path}", f"out={again}"]) == 0
+    assert sorted(path.name for path in again.iterdir()) == ["bounds.csv", "comparisons.csv", "scaling.csv"]
+    for path in again.iterdir():
+        assert path.read_bytes() == (tmp_path / path.name).read_bytes()
+    folder = tmp_path / "ltf-recovery-natural-all-1.0-1-0"
+    (mine,) = (row for row in rows if (row["planner"], row["expert"], row["seed"]) == ("ltf", "recovery", 0))
+    for name, score in scores_of(folder).items():
+        assert mine[name] == pytest.approx(score, abs=1e-5)
+    assert main([f"folder={again}"]) == BAD_CONFIG
+    assert "frames.parquet" in capsys.readouterr().err

@@ -11,8 +11,7 @@ from planners.aggregation import MEASURES
 from planners.frames import FrameKey
 from planners.score_rows import FrameRow, read_rows, write_rows
 from planners.scores import BOUNDS, name_of, scores_of, scores_of_clips
-from planners.study import rows_of
-from planners.study_frames import FRAMES, read_frames, write_frames
+from planners.study_frames import FRAMES, read_frames, rows_of, write_frames
 from planners.study_plan import Comparison, Setup
 from planners.study_report import BAD_CONFIG, compared, main, write_tables
 from tests.planners.made_rows import row
