@@ -13,10 +13,11 @@ PAGES = sorted(
 )
 PROGRAMS = {"make", "python", ".venv/bin/python", "source", "ray", "torchrun"}
 PROGRAMS |= {"kubectl", "prometheus", "rsync", "export", "echo", "git", "pip", ".venv/bin/pip"}
-SAMPLE_OUTPUT = {  # first words of lines in unnamed blocks that are no commands
-    "docs/concepts.md": {"reconstruct,", "clip"},  # the graph
-    "docs/study.md": {"stage", "one_stage", "stage_one", "stage_two", "final"},  # what planners.agreement prints
-    "docs/study_notes.md": {"105", "these:", "others:"},  # what the block above prints
+NO_COMMANDS = {  # pages with an unnamed block that is a drawing, or output alone
+    "docs/concepts.md",
+    "docs/study.md",
+    "docs/study_logs.md",
+    "docs/study_notes.md",
 }
 FENCED = re.compile(r"^```(\w*)\n(.*?)^```$", re.M | re.S)
 IN_PROSE = re.compile(r"`((?:python -m|make|ray job|torchrun) [^`]+)`")
@@ -41,24 +42,30 @@ def blocks(page: str, language: str) -> list[str]:
 def commands(page: str) -> list[Command]:
     """Of the unnamed blocks: continued lines joined, comments left out, `NAME="..."` put in where $NAME stands.
 
-    Raises ValueError for a line that begins with no known program and is not listed as a program's output.
+    What a block shows after its commands is their output. Raises ValueError for a command after output, and for a
+    block without a command on a page that is not in NO_COMMANDS.
     """
     found: list[Command] = []
     for block in blocks(page, ""):
         variables: dict[str, str] = {}
-        for line in block.replace("\\\n", " ").splitlines():
+        shown, of_block = "", []
+        for line in filter(None, map(str.strip, block.replace("\\\n", " ").splitlines())):
             for name, value in variables.items():
                 line = line.replace(f"${name}", value)
             assigned = re.match(r'([A-Z_]+)="([^"]*)"', line)
             if assigned:
                 variables[assigned[1]] = assigned[2]
+            elif line.startswith("#"):
                 continue
-            first = line.split(maxsplit=1)[0] if line.strip() else "#"
-            if first in SAMPLE_OUTPUT.get(page, ()) or first.startswith("#"):
-                continue
-            if first not in PROGRAMS:
-                raise ValueError(f"{page}: {line!r} is no command of a program that is known here")
-            found.append(Command(page, tuple(shlex.split(line, comments=True))))
+            elif line.split(maxsplit=1)[0] not in PROGRAMS:
+                shown = line
+            elif shown:
+                raise ValueError(f"{page}: {shown!r} is no command of a program that is known here")
+            else:
+                of_block.append(Command(page, tuple(shlex.split(line, comments=True))))
+        if not of_block and page not in NO_COMMANDS:
+            raise ValueError(f"{page}: no command of a program that is known here: {shown!r}")
+        found += of_block
     return found
 
 

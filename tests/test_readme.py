@@ -12,6 +12,7 @@ import tomllib
 from dataclasses import fields
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -19,7 +20,7 @@ from factory.__main__ import main as door_main
 from factory.arguments import parse
 from factory.clips.synthetic.reader import SyntheticReader
 from factory.commands import COMMANDS
-from factory.config import compose, fill
+from factory.config import compose, conf_dir, fill
 from factory.dashboard import Request as DashboardRequest
 from factory.explain import split_arguments
 from factory.export import main as export_main
@@ -212,6 +213,33 @@ def test_python_of_other_pages_is_run_elsewhere_or_compiles(page: str) -> None:
 def test_the_groups_of_entry_points_are_those_that_are_looked_for() -> None:
     (block,) = blocks("docs/extend.md", "toml")
     assert set(tomllib.loads(block)["project"]["entry-points"]) == set(GROUPS.values())
+
+
+def test_the_table_of_groups_lists_every_choice() -> None:
+    text = (REPOSITORY / "docs/configuration.md").read_text()
+    table = text[text.index("| group | choices |") :].partition("\n\n")[0]
+    told = {row[1].strip(" `"): set(re.findall(r"`(\w+)`", row[2])) for row in split_rows(table)[2:]}
+    there = {name: {path.stem for path in (conf_dir() / name).glob("*.yaml")} for name in told}
+    assert told == there
+    in_run = {path.name for path in conf_dir().iterdir() if path.is_dir()} - {"mix", "planner"}  # those of planners
+    assert set(told) == in_run
+
+
+def split_rows(table: str) -> list[list[str]]:
+    return [re.split(r"(?<!\\)\|", line) for line in table.splitlines()]
+
+
+def test_defaults_in_the_tables_of_settings_are_the_settings_own() -> None:
+    text = (REPOSITORY / "docs/configuration.md").read_text()
+    told = dict(re.findall(r"^\| `([\w.]+)=([\w.]+)` \(default\)", text, re.M))
+    told |= dict(re.findall(r"^\| `([\w.]+)=[^`]*` \|[^|]*`(\w+)` \(default\)", text, re.M))
+    assert len(told) >= 4, told
+    config = load_config([])
+    for key, value in told.items():
+        owner: Any = config
+        for part in key.split("."):
+            owner = getattr(owner, part)
+        assert type(owner)(value) == owner, key
 
 
 def lost_files(words: list[str]) -> list[str]:
