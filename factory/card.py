@@ -63,7 +63,7 @@ def card(store: Store) -> str:
 
 
 def _front_matter(samples: pa.Table, orphans: int) -> Iterator[str]:
-    licences = sorted(set(samples["licence"].to_pylist()))
+    licences = _values(samples, "licence")
     known = {name for text in licences for pattern, name in LICENCES.items() if re.match(pattern, text)}
     yield "---"
     yield MARK
@@ -158,7 +158,7 @@ def _limits(store: Store, samples: pa.Table, orphans: int) -> Iterator[str]:
             f"- The labels of {simulated.num_rows:,} samples are simulated drives of a pseudo-expert, not of a human. "
             f"Other agents follow `traffic.mode={settings.get('traffic.mode', 'none')}` and do not negotiate."
         )
-    if "human" in samples["expert"].to_pylist():
+    if "human" in _values(samples, "expert"):
         yield "- Human samples are scored and never filtered: some break the reward's rules."
     if rendered := sources.get("render", 0):
         psnr = np.array(simulated["psnr"].drop_null().to_pylist())
@@ -179,9 +179,9 @@ def _limits(store: Store, samples: pa.Table, orphans: int) -> Iterator[str]:
     blind = pc.sum(pc.equal(samples["image_source"], "none")).as_py()
     if blind:
         yield f"- {blind:,} samples have no pictures."
-    if any(str(name).startswith("synthetic") for name in samples["dataset"].to_pylist()):
+    if any(name.startswith("synthetic") for name in _values(samples, "dataset")):
         yield "- `synthetic` is drawn test data: no real street, no real traffic."
-    if (lines := len(set(samples["settings_hash"].to_pylist()))) > 1:
+    if (lines := len(_values(samples, "settings_hash"))) > 1:
         yield f"- Rows of {lines} different settings stand side by side (column `settings_hash`, file run.json)."
     if failed := kinds.count(Kind.FAILED):
         yield f"- {failed:,} attempts failed and are not in it (`python -m factory failed out=...`)."
@@ -220,8 +220,13 @@ def _orphans(store: Store) -> int:
     return sum(name.endswith(".parquet") and name not in live for name in store.samples.location.names())
 
 
+def _values(samples: pa.Table, column: str) -> list[str]:
+    """The different texts of a column, sorted."""
+    return sorted(pc.unique(samples[column]).to_pylist())
+
+
 def _datasets(samples: pa.Table) -> str:
-    return _plain(", ".join(sorted(set(samples["dataset"].to_pylist())))) or "no data set yet"
+    return _plain(", ".join(_values(samples, "dataset"))) or "no data set yet"
 
 
 def _plain(text: str) -> str:
