@@ -51,7 +51,7 @@ format: install
 	$(PY) -m ruff check --fix .
 
 # The kept bugs of tests/mutants, each against the tests that should notice; a release has at least 97 % of them noticed.
-# ONLY=planners (or tasks/reward, or one bug's id), J=<how many at a time, a core each>; goes on where it stopped.
+# ONLY=planners (or tasks/reward, or a bug's id; several with commas), J=<how many at a time, a core each>; goes on where it stopped.
 mutants: install
 	$(PY) -m factory.warm
 	$(PY) -m tests.mutants --only "$(ONLY)" -j $(or $(J),2)

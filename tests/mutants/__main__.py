@@ -149,7 +149,7 @@ def summary(results: Sequence[tuple[Mutant, str]]) -> tuple[str, float]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.mutants", description=__doc__.splitlines()[0])
-    parser.add_argument("--only", default="", help="a package, a file or folder of it, or one mutant's id")
+    parser.add_argument("--only", default="", help="a package, a file or folder, an id; several with commas")
     parser.add_argument("-j", "--jobs", type=int, default=1, help="mutants at a time, a core each")
     parser.add_argument("--unchecked", action="store_true", help="do not run the tests without any bug first")
     arguments = parser.parse_args()

@@ -62,16 +62,17 @@ def _mutant(row: dict[str, Any], path: Path) -> Mutant:
 
 
 def chosen(mutants: Sequence[Mutant], only: str) -> list[Mutant]:
-    """Those of a package, of a file or folder, or the one with this id; all for an empty text.
+    """Those of a package, of a file or folder, or the one with this id; several with commas, all for an empty text.
 
-    Raises Stale where there is none.
+    Raises Stale where one of these is nothing.
     """
-    found = [m for m in mutants if only in ("", m.package, m.id) or m.file.startswith(only)]
-    if not found:
-        raise Stale(
-            f"ONLY={only}: no package, no file with mutants, no mutant's id; packages are {', '.join(PACKAGES)}"
-        )
-    return found
+    wanted: set[str] = set()
+    for part in only.split(","):
+        found = {m.id for m in mutants if part in (m.package, m.id) or m.file.startswith(part)}
+        if not found:
+            raise Stale(f"ONLY={part}: neither a package ({', '.join(PACKAGES)}), nor a file with mutants, nor an id")
+        wanted |= found
+    return [m for m in mutants if m.id in wanted]
 
 
 def mutated(mutant: Mutant, root: Path = ROOT) -> str:

@@ -48,8 +48,9 @@ def test_some_can_be_chosen() -> None:
     assert {mutant.package for mutant in chosen(MUTANTS, "planners")} == {"planners"}
     assert [mutant.id for mutant in chosen(MUTANTS, MUTANTS[3].id)] == [MUTANTS[3].id]
     assert len(chosen(MUTANTS, "")) == len(MUTANTS)
+    assert {m.package for m in chosen(MUTANTS, f"planners,tasks/reward,{MUTANTS[3].id}")} >= {"planners", "tasks"}
     with pytest.raises(Stale, match="ONLY=plannrs"):
-        chosen(MUTANTS, "plannrs")
+        chosen(MUTANTS, "factory,plannrs")
 
 
 def test_the_summary_counts_by_package_and_names_what_survived() -> None:
