@@ -8,6 +8,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from tasks.kernels import kernel
@@ -68,6 +69,7 @@ def comfort_history(past_states: Array) -> Array:
     return rows
 
 
+@register_jitable
 def comfort_scratch() -> Array:
     """Scratch (10, 55) for `comfort_along`, one per thread."""
     return np.empty((_SCRATCH_ROWS, HISTORY_ROWS + HORIZON_STEPS + 1))

@@ -99,6 +99,19 @@ def first_time_to_collision(
 
 
 @kernel
+def reach_of(body: Body) -> tuple[float, float, float, float]:
+    """Least x, y, most x, y [m] of the places of a placed body that both rules look at."""
+    ahead = max(TTC_STEPS) * 0.1
+    least_x, least_y, most_x, most_y = math.inf, math.inf, -math.inf, -math.inf
+    for t in range(len(body.x)):
+        x, y, gone = body.x[t], body.y[t], body.speed[t] * ahead
+        ahead_x, ahead_y = x + body.cos[t] * gone, y + body.sin[t] * gone
+        least_x, least_y = min(least_x, x, ahead_x), min(least_y, y, ahead_y)
+        most_x, most_y = max(most_x, x, ahead_x), max(most_y, y, ahead_y)
+    return least_x, least_y, most_x, most_y
+
+
+@kernel
 def _exposed(map_index: MapIndex, states: Array, body: Body, t: int) -> bool:
     """Whether objects beside the ego count at step t: between lanes, off the road or in an intersection."""
     return (body.flags[t] & OFF_LANE) != 0 or in_intersection(map_index, states[t, X], states[t, Y])

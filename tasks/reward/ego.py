@@ -4,6 +4,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from tasks.kernels import kernel
@@ -31,10 +32,17 @@ class Body(NamedTuple):
     flags: NDArray[np.uint8]  # (41,) bits above
 
 
+@register_jitable
 def empty_body(n_times: int) -> Body:
     """Scratch to be filled by `place`."""
-    x, y, cos, sin, speed = np.empty((5, n_times))
-    return Body(x, y, cos, sin, speed, np.zeros(n_times, np.uint8))
+    return Body(
+        np.empty(n_times),
+        np.empty(n_times),
+        np.empty(n_times),
+        np.empty(n_times),
+        np.empty(n_times),
+        np.zeros(n_times, np.uint8),
+    )
 
 
 @kernel

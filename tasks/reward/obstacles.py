@@ -92,6 +92,68 @@ def with_objects(obstacles: Obstacles, boxes: Array, is_stopped: Bools) -> Obsta
 
 
 @kernel
+def spans_of(obstacles: Obstacles) -> Array:
+    """(N, 5) of unindexed objects: least x, y, most x, y of the centre at any time [m], largest diagonal squared [m^2].
+
+    An object that is never there has a least above its most. None (0, 5) for indexed objects.
+    """
+    boxes = obstacles.boxes
+    n_items = boxes.shape[1] if obstacles.cells_per_side == 1 else 0
+    spans = np.empty((n_items, 5))
+    for item in range(n_items):
+        spans[item, 0], spans[item, 1], spans[item, 2] = math.inf, math.inf, -math.inf
+        spans[item, 3], spans[item, 4] = -math.inf, 0.0
+    for t in range(boxes.shape[0]):
+        for item in range(n_items):
+            x, y, length, width = boxes[t, item, 0], boxes[t, item, 1], boxes[t, item, 3], boxes[t, item, 4]
+            diagonal_sq = length * length + width * width
+            # spelled out, for NaN is to move none of them
+            spans[item, 0] = x if x < spans[item, 0] else spans[item, 0]
+            spans[item, 1] = y if y < spans[item, 1] else spans[item, 1]
+            spans[item, 2] = x if x > spans[item, 2] else spans[item, 2]
+            spans[item, 3] = y if y > spans[item, 3] else spans[item, 3]
+            spans[item, 4] = diagonal_sq if diagonal_sq > spans[item, 4] else spans[item, 4]
+    return spans
+
+
+@kernel
+def within_reach(
+    obstacles: Obstacles, spans: Array, path: tuple[float, float, float, float], length: float, width: float
+) -> Obstacles:
+    """Unindexed objects without those that are out of reach all along a path; indexed ones as they are.
+
+    spans: see spans_of; path: least x, y, most x, y of the centres [m] of an ego body of that length and width [m].
+    """
+    if obstacles.cells_per_side > 1:
+        return obstacles
+    items = np.empty(len(spans), np.int32)
+    n = 0
+    for item in range(len(spans)):
+        # as far as out_of_reach ever looks
+        reach = math.sqrt(0.5 * (spans[item, 4] + length * length + width * width) + ROUNDING_M) + ROUNDING_M
+        if (
+            spans[item, 0] - reach <= path[2]
+            and spans[item, 2] + reach >= path[0]
+            and spans[item, 1] - reach <= path[3]
+            and spans[item, 3] + reach >= path[1]
+        ):
+            items[n] = item
+            n += 1
+    starts = np.zeros(2, np.int32)
+    starts[1] = n
+    return Obstacles(
+        obstacles.boxes,
+        obstacles.is_stopped,
+        obstacles.collision_score,
+        obstacles.axes,
+        starts,
+        items[:n],
+        obstacles.cells_per_side,
+        obstacles.cells_per_m,
+    )
+
+
+@kernel
 def cell_of(obstacles: Obstacles, t: int, x: float, y: float) -> int:
     """The cell whose items are all the objects that an ego body centred on (x, y) [m] at step t may touch."""
     n = obstacles.cells_per_side

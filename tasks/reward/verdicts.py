@@ -4,24 +4,28 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from tasks.kernels import kernel
 from tasks.reward.area_flags import areas_along
 from tasks.reward.centerline import Centerline, progress_m
-from tasks.reward.comfort import comfort_along, comfort_scratch
-from tasks.reward.contacts import first_collision, first_time_to_collision
+from tasks.reward.comfort import N_FLAGS, comfort_along, comfort_scratch
+from tasks.reward.contacts import first_collision, first_time_to_collision, reach_of
 from tasks.reward.ego import MULTIPLE_LANES, NON_DRIVABLE, ONCOMING, Body, empty_body, place
 from tasks.reward.lane_discipline import driving_direction, lane_keeping
 from tasks.reward.lights import RedLanes, first_red
 from tasks.reward.map_index import MapIndex
-from tasks.reward.obstacles import Obstacles, unindexed, with_objects
+from tasks.reward.obstacles import Obstacles, spans_of, unindexed, with_objects, within_reach
 from tasks.reward.prepare import N_TIMES, PreparedScene
 from tasks.world.bounds import LARGEST, all_within
 from tasks.world.vehicle import EGO_STATE_SIZE, Vehicle
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
+
+_NO_BOXES, _NO_FLAGS = np.empty((0, N_TIMES, 0, 5)), np.empty((0, 0), np.bool_)
+_NO_DRIVE = f"states must be finite and at most {LARGEST:g}: leave out what is not a drive"
 
 INDEX_FROM_ROWS = 32  # an index of the objects costs about as much as it saves on that many trajectories
 
@@ -76,13 +80,8 @@ class Scratch(NamedTuple):
 
 def judge(prepared: PreparedScene, states: Array, *, with_history: bool = True) -> Verdicts:
     """What the rules say of simulated ego states (K, 41, 11). Raises ValueError for other shapes, non-finite states."""
-    states = checked_states(states)
     obstacles = prepared.indexed_obstacles if len(states) >= INDEX_FROM_ROWS else prepared.obstacles
-    verdicts = no_verdicts(len(states))
-    scratch = scratch_for(obstacles.boxes.shape[1])
-    shared = np.empty((0, N_TIMES, 0, 5)), np.empty((0, 0), np.bool_)
-    _judge_all(world_of(prepared, with_history), obstacles, *shared, states, scratch, verdicts)
-    return verdicts
+    return _verdicts(world_of(prepared, with_history), obstacles, _NO_BOXES, _NO_FLAGS, states)
 
 
 def judge_among(
@@ -93,29 +92,39 @@ def judge_among(
     boxes: (K, 41, N, 5), NaN when absent; is_stopped: (K, N) and collision_score: (N,) as in Obstacles; states:
     (K, 41, 11). Raises ValueError for other shapes, non-finite states.
     """
-    states = checked_states(states)
     n_objects = len(collision_score)
     if boxes.shape != (len(states), N_TIMES, n_objects, 5) or is_stopped.shape != (len(states), n_objects):
         raise ValueError(
             f"boxes must be ({len(states)}, {N_TIMES}, {n_objects}, 5) and is_stopped ({len(states)}, {n_objects}), "
             f"got {boxes.shape} and {is_stopped.shape}"
         )
-    verdicts = no_verdicts(len(states))
     nobody = unindexed(np.full((N_TIMES, n_objects, 5), np.nan), np.zeros(n_objects, np.bool_), collision_score)
     boxes, is_stopped = np.require(boxes, None, ["C", "W"]), np.require(is_stopped, None, ["C", "W"])
-    world, scratch = world_of(prepared, with_history=True), scratch_for(n_objects)
-    _judge_all(world, nobody, boxes, is_stopped, states, scratch, verdicts)
-    return verdicts
+    return _verdicts(world_of(prepared, with_history=True), nobody, boxes, is_stopped, states)
 
 
 def checked_states(states: Array) -> Array:
     """Contiguous float64 states (K >= 1, 41, 11). Raises ValueError where they are not."""
-    states = np.require(states, dtype=np.float64, requirements=["C", "W"])
+    states = _shaped(states)
+    if not all_within(states):
+        raise ValueError(_NO_DRIVE)
+    return states
+
+
+def _shaped(states: Array) -> Array:
+    states = np.ascontiguousarray(states, dtype=np.float64)
     if states.ndim != 3 or states.shape[1:] != (N_TIMES, EGO_STATE_SIZE) or states.shape[0] == 0:
         raise ValueError(f"states must be (K >= 1, {N_TIMES}, {EGO_STATE_SIZE}), got {states.shape}")
-    if not all_within(states):
-        raise ValueError(f"states must be finite and at most {LARGEST:g}: leave out what is not a drive")
-    return states
+    return states if states.flags.writeable else states.copy()
+
+
+def _verdicts(world: World, obstacles: Obstacles, boxes: Array, is_stopped: Bools, states: Array) -> Verdicts:
+    states = _shaped(states)
+    numbers = np.empty((len(Verdicts._fields) - 2, len(states)))
+    areas, comfort = np.empty((len(states), N_TIMES, 3), np.bool_), np.empty((len(states), N_FLAGS), np.bool_)
+    if not _judge_all(world, obstacles, boxes, is_stopped, states, numbers, areas, comfort):
+        raise ValueError(_NO_DRIVE)
+    return Verdicts._make([*numbers, areas, comfort])
 
 
 def world_of(prepared: PreparedScene, with_history: bool) -> World:
@@ -131,13 +140,7 @@ def world_of(prepared: PreparedScene, with_history: bool) -> World:
     )
 
 
-def no_verdicts(count: int) -> Verdicts:
-    """Room for the verdicts on `count` trajectories."""
-    numbers = np.empty((15, count))
-    flags = np.empty((count, N_TIMES, 3), np.bool_), np.empty((count, 6), np.bool_)
-    return Verdicts._make([*numbers, *flags])
-
-
+@register_jitable
 def scratch_for(n_objects: int) -> Scratch:
     """Room for one trajectory among N objects."""
     return Scratch(empty_body(N_TIMES), np.empty(n_objects, np.bool_), comfort_scratch())
@@ -150,21 +153,56 @@ def _judge_all(
     boxes: Array,  # (K, 41, N, 5) of each trajectory's own objects, or none: all meet `obstacles`
     is_stopped: Bools,  # (K, N)
     states: Array,
-    scratch: Scratch,
-    out: Verdicts,
-) -> None:
+    numbers: Array,  # (15, K) out: the columns of Verdicts up to its flags
+    areas: Bools,
+    comfort: Bools,
+) -> bool:
+    """False, and nothing judged, where a state is not finite or above LARGEST."""
+    beyond = 0
+    for value in states.reshape(-1):
+        beyond += not abs(value) <= LARGEST
+    if beyond > 0:
+        return False
+    out = Verdicts(
+        numbers[0],
+        numbers[1],
+        numbers[2],
+        numbers[3],
+        numbers[4],
+        numbers[5],
+        numbers[6],
+        numbers[7],
+        numbers[8],
+        numbers[9],
+        numbers[10],
+        numbers[11],
+        numbers[12],
+        numbers[13],
+        numbers[14],
+        areas,
+        comfort,
+    )
+    scratch = scratch_for(obstacles.boxes.shape[1])
+    spans = spans_of(obstacles)
     for k in range(states.shape[0]):
-        met = obstacles if boxes.shape[0] == 0 else with_objects(obstacles, boxes[k], is_stopped[k])
-        _judge_one(world, met, states[k], scratch, k, out)
+        met = obstacles
+        if boxes.shape[0] > 0:
+            met = with_objects(obstacles, boxes[k], is_stopped[k])
+            spans = spans_of(met)
+        _judge_one(world, met, spans, states[k], scratch, k, out)
+    return True
 
 
 @kernel
-def _judge_one(world: World, obstacles: Obstacles, states: Array, scratch: Scratch, k: int, out: Verdicts) -> None:
-    """All rules on one trajectory (41, 11), written to row k."""
+def _judge_one(
+    world: World, everything: Obstacles, spans: Array, states: Array, scratch: Scratch, k: int, out: Verdicts
+) -> None:
+    """All rules on one trajectory (41, 11), written to row k; spans: of `everything`."""
     body, half_length, half_width = scratch.body, world.ego.half_length, world.ego.half_width
     place(states, world.ego.rear_axle_to_center, body)
     areas_along(world.map_index, body, half_length, half_width)
     _spread_flags(body.flags, out.ego_areas[k])
+    obstacles = within_reach(everything, spans, reach_of(body), 2.0 * half_length, 2.0 * half_width)
     out.nc[k], out.collision_index[k] = first_collision(
         obstacles, states, body, half_length, half_width, scratch.ignored
     )

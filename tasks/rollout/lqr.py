@@ -22,7 +22,7 @@ from tasks.kernels import inlined, kernel
 from tasks.rollout.bicycle import actuate, path_curvature, travel
 from tasks.rollout.profiles import TRACKING_STEPS, Plans, empty_plans, fit_curvatures, fit_speeds
 from tasks.trig import sincos, wrap
-from tasks.world.bounds import LARGEST, all_within
+from tasks.world.bounds import LARGEST
 from tasks.world.clip import HORIZON_STEPS, STEP_S
 from tasks.world.vehicle import (
     AX,
@@ -54,6 +54,7 @@ ACCEL_GAIN = HORIZON_S * Q_VELOCITY / (HORIZON_S * Q_VELOCITY * HORIZON_S + R_AC
 
 BLOCK = 64  # plans simulated side by side; their scratch stays in the second-level cache
 ANY = -1  # length of an axis in a wanted shape
+_NO_STARTS = np.empty((0, 3))  # every plan starts where the ego is
 TILE = 8  # plans written out side by side: one cache line of each row of scratch
 
 # sum_i binomial(i, j) and sum_i i binomial(i, j) over the horizon, j = 0 .. 3
@@ -84,13 +85,9 @@ def track(ego_state0: Array, poses: Array, vehicle: Vehicle = PACIFICA, *, plann
     PDM-Closed start on their path, beside the ego.
     Raises ValueError, with the field's name, on other shapes or values that are not finite.
     """
-    ego = _checked("ego_state0", ego_state0, (EGO_STATE_SIZE,))
-    plans = _checked("poses", poses, (ANY, HORIZON_STEPS, 3))
-    if planned_pose0 is None:
-        starts = ego[None, : HEADING + 1]
-    else:
-        starts = _checked("planned_pose0", planned_pose0, (len(plans), 3))
-    return _followed(ego, np.zeros(3), starts, plans, vehicle)
+    plans = _shaped("poses", poses, (ANY, HORIZON_STEPS, 3))
+    starts = _NO_STARTS if planned_pose0 is None else _shaped("planned_pose0", planned_pose0, (len(plans), 3))
+    return _followed(_shaped("ego_state0", ego_state0, (EGO_STATE_SIZE,)), starts, "poses", plans, False, vehicle)
 
 
 def track_local(ego_state0: Array, trajectories: Array, vehicle: Vehicle = PACIFICA) -> Array:
@@ -100,44 +97,61 @@ def track_local(ego_state0: Array, trajectories: Array, vehicle: Vehicle = PACIF
     `ego_state0`, as a vocabulary holds them. The same as track() of their world poses, without those in memory.
     Raises ValueError, with the field's name, on other shapes or values that are not finite.
     """
-    ego = _checked("ego_state0", ego_state0, (EGO_STATE_SIZE,))
-    plans = _checked("trajectories", trajectories, (ANY, HORIZON_STEPS, 3))
-    return _followed(ego, ego[: HEADING + 1], np.zeros((1, 3)), plans, vehicle)
+    plans = _shaped("trajectories", trajectories, (ANY, HORIZON_STEPS, 3))
+    ego = _shaped("ego_state0", ego_state0, (EGO_STATE_SIZE,))
+    return _followed(ego, _NO_STARTS, "trajectories", plans, True, vehicle)
 
 
-def _checked(name: str, value: Array, shape: tuple[int, ...]) -> Array:
-    """`value` as a finite float64 array of `shape`, where ANY stands for the number of plans."""
-    array = np.asarray(value, dtype=np.float64)
+def _shaped(name: str, value: Array, shape: tuple[int, ...]) -> Array:
+    """`value` as a contiguous float64 array of `shape`, where ANY stands for the number of plans."""
+    array = np.ascontiguousarray(value, dtype=np.float64)
     if array.ndim != len(shape) or any(want not in (ANY, have) for want, have in zip(shape, array.shape)):
         wanted = ", ".join("K" if want == ANY else str(want) for want in shape)
         raise ValueError(f"{name} must have the shape ({wanted}), got {array.shape}")
-    if not all_within(array):
-        worst = np.argwhere(~(np.abs(array) <= LARGEST))[0].tolist()
-        raise ValueError(f"{name} must be finite and at most {LARGEST:g}, element {worst} is not")
     return array
 
 
-def _followed(ego: Array, frame: Array, starts: Array, poses: Array, vehicle: Vehicle) -> Array:
-    states = np.empty((len(poses), HORIZON_STEPS + 1, EGO_STATE_SIZE))
-    ego, frame, starts, poses = (_read_only(array) for array in (ego, frame, starts, poses))
-    _follow(ego, frame, starts, poses, float(vehicle.wheel_base), states)
+def _followed(ego: Array, starts: Array, name: str, plans: Array, local: bool, vehicle: Vehicle) -> Array:
+    """The simulated states; `name` is what the caller calls its plans."""
+    states = np.empty((len(plans), HORIZON_STEPS + 1, EGO_STATE_SIZE))
+    given = _read_only(ego), _read_only(starts), _read_only(plans)
+    if not _follow(*given, local, float(vehicle.wheel_base), states):
+        for what, array in (("ego_state0", ego), (name, plans), ("planned_pose0", starts)):
+            beyond = np.argwhere(~(np.abs(array) <= LARGEST))
+            if len(beyond):
+                at = beyond[0].tolist()
+                raise ValueError(f"{what} must be finite and at most {LARGEST:g}, element {at} is not")
     return states
 
 
 def _read_only(array: Array) -> Array:
-    """A contiguous view that may not be written: one compiled kernel serves arrays of both kinds."""
-    view = np.ascontiguousarray(array).view()
+    """A view that may not be written: one compiled kernel serves arrays of both kinds."""
+    view = array.view()
     view.flags.writeable = False
     return view
 
 
 @kernel
-def _follow(ego: Array, frame: Array, starts: Array, poses: Array, wheel_base: float, states: Array) -> None:
-    """Fill `states` (K, 41, 11); starts (1 or K, 3) and poses (K, 40, 3) are in `frame` (3,)."""
-    plans, motions = empty_plans(BLOCK), _empty_motions(BLOCK)
+def _follow(ego: Array, starts: Array, poses: Array, local: bool, wheel_base: float, states: Array) -> bool:
+    """Fill `states` (K, 41, 11); poses (K, 40, 3), and starts (K, 3) or none, are in the ego's frame if `local`.
+
+    False, and nothing filled, where something given is not finite or above LARGEST.
+    """
+    if not (_within(ego) and _within(starts.reshape(-1)) and _within(poses.reshape(-1))):
+        return False
+    frame, own = np.zeros(3), np.zeros((1, 3))
+    for i in range(3):
+        if local:
+            frame[i] = ego[i]
+        else:
+            own[0, i] = ego[i]
+    if len(starts) > 0:
+        own = starts.copy()
+    size = min(BLOCK, len(poses))
+    plans, motions = empty_plans(size), _empty_motions(size)
     for first in range(0, len(poses), BLOCK):
         n_plans = min(BLOCK, len(poses) - first)
-        _gather(starts, poses, first, n_plans, plans)
+        _gather(own, poses, first, n_plans, plans)
         _place(frame, n_plans, plans)
         fit_speeds(n_plans, plans)
         fit_curvatures(n_plans, plans)
@@ -146,6 +160,16 @@ def _follow(ego: Array, frame: Array, starts: Array, poses: Array, wheel_base: f
             _steer(plans, t, n_plans, wheel_base, motions)
             _move(t, n_plans, wheel_base, motions)
         _write(ego, motions, states[first : first + n_plans])
+    return True
+
+
+@inlined
+def _within(values: Array) -> bool:
+    """Whether all of (N,) are finite and at most LARGEST in size."""
+    beyond = 0
+    for value in values:
+        beyond += not abs(value) <= LARGEST
+    return beyond == 0
 
 
 @inlined

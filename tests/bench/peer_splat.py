@@ -64,6 +64,7 @@ def drawing(
     """A call that draws the scene on black (height, width, 3); camera: to the world, OpenCV axes."""
     import torch  # only where there is a peer
 
+    torch.set_num_threads(1)  # CPU time: more threads would wait for each other in it
     view = np.linalg.inv(camera)
     fx, fy, cx, cy = intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]
     projection = np.array(
