@@ -70,10 +70,13 @@ def index_centerline(points: Array) -> Centerline:
 
 
 def _circles(xy: Array) -> Array:
-    chunks = [xy[i : i + CHUNK + 1] for i in range(0, len(xy) - 1, CHUNK)]
-    centers = np.array([chunk[len(chunk) // 2] for chunk in chunks])
-    radii = [np.hypot(*(chunk - center).T).max() for chunk, center in zip(chunks, centers)]
-    return np.column_stack([centers, np.array(radii) * SLACK + SLACK_M])
+    first = np.arange(0, len(xy) - 1, CHUNK)
+    n_points = np.minimum(len(xy) - first, CHUNK + 1)
+    members = np.minimum(first[:, None] + np.arange(CHUNK + 1), len(xy) - 1)  # a short chunk repeats the line's end
+    centers = xy[first + n_points // 2]
+    away = xy[members] - centers[:, None]
+    radii = np.hypot(away[..., 0], away[..., 1]).max(axis=1)
+    return np.column_stack([centers, radii * SLACK + SLACK_M])
 
 
 def _grid(xy: Array) -> tuple[Array, tuple[int, int]]:

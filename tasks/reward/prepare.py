@@ -168,7 +168,22 @@ def _check_objects(objects: AgentTracks) -> None:
             raise ValueError(f"objects.{name} must be {expected} for {len(objects)} objects, got {found}")
     if len(objects.kinds) != len(objects):
         raise ValueError(f"objects.kinds must name {len(objects)} objects, got {len(objects.kinds)}")
-    absent = ~objects.valid.astype(bool) | np.isnan(objects.boxes).any(axis=-1)
+    there = objects.valid.astype(bool)
+    boxes, velocities = np.abs(objects.boxes) <= LARGEST, np.abs(objects.velocities) <= LARGEST
+    if not ((_every(boxes) & _every(velocities)) | ~there).all() or (objects.boxes[..., 3:] < 0.0).any():
+        _refuse_objects(objects, ~there | np.isnan(objects.boxes).any(axis=-1))
+
+
+def _every(columns: Bools) -> Bools:
+    """(...,) whether all of a few columns (..., C) hold: numpy's `all` is slow on so short an axis."""
+    every: Bools = columns[..., 0].copy()
+    for column in range(1, columns.shape[-1]):
+        every &= columns[..., column]
+    return every
+
+
+def _refuse_objects(objects: AgentTracks, absent: Bools) -> None:
+    """Raises ValueError for the first object that is there and not well, if any is."""
     wrong = {
         "boxes": ~(np.abs(objects.boxes) <= LARGEST).all(axis=-1) | (objects.boxes[..., 3:] < 0.0).any(axis=-1),
         "velocities": ~(np.abs(objects.velocities) <= LARGEST).all(axis=-1),
@@ -183,7 +198,7 @@ def _check_objects(objects: AgentTracks) -> None:
 
 
 def _obstacles(objects: AgentTracks, ego_state0: Array | None, vehicle: Vehicle) -> Obstacles:
-    present = objects.valid & np.isfinite(objects.boxes).all(axis=-1)
+    present = objects.valid & _every(np.isfinite(objects.boxes))
     boxes = np.where(present[..., None], objects.boxes, np.nan)
     keep = present.any(axis=0)
     if ego_state0 is not None:

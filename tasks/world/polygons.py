@@ -14,6 +14,7 @@ from tasks.world.lanes import MapLayer, MapPolygon, RoadMap
 Array = NDArray[np.float64]
 
 CENTERLINE_SPACING_M = 0.75  # docs/reward.md 0
+PLACES_KEPT = 8  # of each map
 MAP_RADIUS_M = 100.0  # docs/reward.md 0
 
 
@@ -106,16 +107,24 @@ def polygons_near(road_map: RoadMap, center_xy: Array, radius_m: float = MAP_RAD
     """
     if road_map not in _DRIVABLE:
         every = _drivable_map(road_map)
-        _DRIVABLE[road_map] = every, Rings([polygon.ring for polygon in every]) if every else None
-    every, rings = _DRIVABLE[road_map]
+        _DRIVABLE[road_map] = every, Rings([polygon.ring for polygon in every]) if every else None, {}
+    every, rings, known = _DRIVABLE[road_map]
     if rings is None:
         return ()
-    near = rings.distances(np.asarray(center_xy)[:2]) <= radius_m
-    return tuple(polygon for polygon, is_near in zip(every, near, strict=True) if is_near)
+    around = float(center_xy[0]), float(center_xy[1]), float(radius_m)
+    found = known.get(around)
+    if found is None:
+        near = rings.distances(np.array(around[:2])) <= radius_m
+        found = tuple(polygon for polygon, is_near in zip(every, near, strict=True) if is_near)
+        if len(known) >= PLACES_KEPT:
+            known.clear()
+        known[around] = found
+    return found
 
 
-# Laid out once per map: an attempt asks several times, and finding what is near costs less than laying it out.
-_DRIVABLE: WeakKeyDictionary[RoadMap, tuple[tuple[MapPolygon, ...], Rings | None]] = WeakKeyDictionary()
+# Laid out once per map; and an attempt asks for the same place several times: its planner and its score.
+_Known = dict[tuple[float, float, float], tuple[MapPolygon, ...]]
+_DRIVABLE: WeakKeyDictionary[RoadMap, tuple[tuple[MapPolygon, ...], Rings | None, _Known]] = WeakKeyDictionary()
 
 
 def _drivable_map(road_map: RoadMap) -> tuple[MapPolygon, ...]:
