@@ -14,7 +14,9 @@ from tasks.reward.obstacles import (
     Obstacles,
     cell_of,
     index_obstacles,
+    spans_of,
     unindexed,
+    within_reach,
 )
 from tests.tasks.reward.slow.boxes import touching
 
@@ -88,6 +90,25 @@ def test_a_world_without_objects_has_an_index_too() -> None:
 def test_unindexed_objects_are_seen_from_everywhere() -> None:
     obstacles = unindexed(np.zeros((41, 5, 5)), np.zeros(5, dtype=bool), np.zeros(5))
     assert seen_from(obstacles, 40, 1e5, -1e5).tolist() == [0, 1, 2, 3, 4]
+
+
+def test_objects_left_out_along_a_path_are_those_that_nothing_on_it_touches() -> None:
+    x = np.array([0.0, 0.0, 43.5, 44.5, 20.0, np.nan, 43.0])  # the path ends at 40 m
+    boxes = np.zeros((41, 7, 5))
+    boxes[..., 0], boxes[..., 3], boxes[..., 4] = x, 2.0, 1.0
+    boxes[:40, 1, 0], boxes[40, 1, 0] = 500.0, 3.0  # gone at all times but the last
+    boxes[:, 4, 1] = 30.0  # aside
+    boxes[:40, 6] = np.nan  # there at the last step alone
+    plain = unindexed(boxes, np.zeros(7, dtype=bool), np.zeros(7))
+    near = within_reach(plain, spans_of(plain), (0.0, 0.0, 40.0, 0.0), *EGO_SIZE)
+    kept = near.items[near.starts[0] : near.starts[1]].tolist()
+    assert kept == [0, 1, 2, 6]
+    touched = [i for i in range(7) if any(touching(np.array([40.0, 0.0, 0.0, *EGO_SIZE]), box) for box in boxes[:, i])]
+    assert touched == [2, 6]  # from the path's end
+    everywhere = indexed(boxes)
+    met = within_reach(everywhere, spans_of(everywhere), (0.0, 0.0, 1.0, 1.0), *EGO_SIZE)
+    assert np.array_equal(met.items, everywhere.items)
+    assert np.array_equal(met.starts, everywhere.starts)
 
 
 def test_arrays_that_do_not_fit_are_refused_by_name() -> None:
