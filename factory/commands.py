@@ -1,9 +1,13 @@
-"""The commands of `python -m factory`, on one screen; nothing heavy is imported until one is called."""
+"""The commands of `python -m factory` and `python -m planners`; nothing heavy is imported until one is called."""
 
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from importlib import import_module
+
+from factory import __version__
+from factory.arguments import BAD_ARGUMENTS
 
 
 @dataclass(frozen=True)
@@ -40,8 +44,45 @@ COMMANDS: Mapping[str, Command] = {
     "completion": Command("completion for bash or zsh", "factory.completion", takes="words"),
 }
 
+# What is built on the factory: names alone, as nothing here imports it. `python -m planners` is their door.
+PLANNERS: Mapping[str, Command] = {
+    "train": Command("fit a planner to logged and simulated samples", "planners.train", takes="words"),
+    "evaluate": Command("EPDMS of planners on held-out clips", "planners.evaluate", takes="words"),
+    "compare": Command("how two evaluated planners differ, with intervals", "planners.compare", takes="words"),
+    "scaling": Command("how scores grow with simulated data, and the law behind it", "planners.scaling", takes="words"),
+    "replay": Command("a planner on one clip as a film", "planners.replay", takes="words"),
+    "ensemble": Command("several GTRS-Dense models evaluated as one", "planners.ensemble", takes="words"),
+    "analysis": Command("EPDMS on real and simulated frames, and by scenario tag", "planners.analysis", takes="words"),
+    "agreement": Command("whether a study that was made again says the same", "planners.agreement", takes="words"),
+    "study_report": Command("a study's tables and pictures from its frames", "planners.study_report", takes="words"),
+    "study": Command("does simulated data make planners better: all of docs/study.md", "planners.study", takes="words"),
+}
+DOORS = {"factory": COMMANDS, "planners": PLANNERS}  # package -> what `python -m <package>` knows
+
 
 def nearest(word: str, known: Sequence[str]) -> str:
     """`; did you mean x?` where one is near, else nothing."""
     found = get_close_matches(word, known, n=1, cutoff=0.6)
     return f"; did you mean {found[0]}?" if found else ""
+
+
+def listed(commands: Mapping[str, Command]) -> str:
+    """Every command in one line."""
+    return "\n".join(f"  {name:<13}{command.about}" for name, command in commands.items())
+
+
+def dispatch(argv: Sequence[str], commands: Mapping[str, Command], about: str) -> int:
+    """Hand the arguments to the command that is named first; its exit code, 2 where there is none."""
+    if not argv or argv[0] in ("-h", "--help", "help"):
+        print(about)
+        return 0 if argv else BAD_ARGUMENTS
+    if argv[0] in ("-V", "--version"):
+        print(f"driving-data-factory {__version__}")
+        return 0
+    name, *rest = argv
+    if name in commands:
+        return commands[name].load()(rest)
+    door = next((door for door, known in DOORS.items() if name in known), None)
+    meant = f"; it is python -m {door} {name}" if door else nearest(name, list(commands))
+    print(f"error: there is no command {name}; see --help{meant}", file=sys.stderr)
+    return BAD_ARGUMENTS

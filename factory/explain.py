@@ -102,7 +102,7 @@ def explain(argv: Sequence[str]) -> int:
         cv2.imwrite(f"{stem}_candidates.png", candidates_picture(clip, found.considered)[..., ::-1])
 
     payload = PerturbedClip(ref, clip, made.candidates, made.before)
-    order = [HUMAN_CANDIDATE] if expert in LOGGED else range(min(own.tries, len(made.candidates)))
+    order: Sequence[int] = [HUMAN_CANDIDATE] if expert in LOGGED else range(min(own.tries, len(made.candidates)))
     shown = None
     for candidate in order:
         trace = work.trace(payload, candidate, expert)
@@ -123,6 +123,11 @@ def explain(argv: Sequence[str]) -> int:
             print(f"    EPDMS {scores.pdm_score[1]:.3f}  " + "  ".join(named))
         if rejected is None:
             break
+    else:
+        left = len(made.candidates) - len(order)
+        if expert not in LOGGED and left > 0:
+            n = len(made.candidates)
+            print(f"none accepted: stopped after {len(order)} of {n} candidates, tries={n} goes on to the last")
     if shown is not None and shown.judged is not None:
         title = f"{expert}: {'accepted' if shown.rejected is None else shown.rejected.detail}"
         picture = attempt_picture(clip, shown.candidate, shown.judged, title, (720, 720))

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from factory.arguments import Refused, answer
+from factory.look.report_words import to_the_side, turned
 from factory.status import open_store
 
 if TYPE_CHECKING:
@@ -137,7 +138,7 @@ def _candidate_facts(row: Row, clip: Row) -> list[tuple[str, object]]:
     return [
         *facts,
         ("vocabulary row", f"{found['vocabulary_index']} of {clip['vocabulary_digest']}"),
-        ("ends", f"{x:+.2f} m along, {y:+.2f} m aside, {57.29578 * heading:+.1f} deg, at {speed:.2f} m/s"),
+        ("ends", f"{x:+.2f} m along, {to_the_side(y)}, {turned(heading)}, at {speed:.2f} m/s"),
         ("grid cell", ", ".join(map(str, found["cell"]))),
         ("EPDMS", f"{found['score']:.3f} against log replay, {found['reactive_score']:.3f} among reacting agents"),
     ]

@@ -11,6 +11,7 @@ written), 3 complete with failed attempts, 4 interrupted and resumable.
 """
 
 import os
+import signal
 import sys
 from collections.abc import Mapping, Sequence
 from itertools import zip_longest
@@ -102,10 +103,11 @@ def run(asked: Asked) -> int:
     from factory.benchmark import NEEDED, write_benchmark
     from factory.calibrate import calibrate, plan_text
     from factory.card import write_card
-    from factory.execute import COMPLETE, execute
+    from factory.execute import COMPLETE, COMPLETE_WITH_FAILURES, execute
     from factory.funnel import image_sources_text
     from factory.report import remember, write_report
     from factory.settings import assemble, run_config
+    from factory.status import failed_line
     from factory.store.location import BadLocation, Location
     from factory.store.samples import Store
 
@@ -152,8 +154,11 @@ def run(asked: Asked) -> int:
     print(f"report: {write_report(store)}")
     print(f"card: {write_card(store)}")
     print(f"look at samples: python -m factory.dashboard out={where}")
+    if summary.exit_code == COMPLETE_WITH_FAILURES:
+        print(failed_line(store))
     return summary.exit_code
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `... | head` ends quietly
     sys.exit(main(sys.argv[1:]))

@@ -197,6 +197,7 @@ def logged_drive(store: "Store", row: dict[str, Any]) -> "NDArray[np.float64] | 
 
 
 def _numbers(row: dict[str, Any]) -> Iterable[str]:
+    from factory.look.report_words import to_the_side, turned
     from tasks.stages import SUBSCORES
 
     yield f"sample        {row['attempt_id']}"
@@ -207,9 +208,9 @@ def _numbers(row: dict[str, Any]) -> Iterable[str]:
     yield f"ego           {vx:.2f}, {vy:.2f} m/s; {ax:.2f}, {ay:.2f} m/s2; command {row['command']}"
     if row["candidate_end"] is not None:
         x, y, heading, speed = row["candidate_end"]
-        yield f"perturbed by  {x:+.2f} m along, {y:+.2f} m aside, {57.29578 * heading:+.1f} deg, at {speed:.2f} m/s"
+        yield f"perturbed by  {x:+.2f} m along, {to_the_side(y)}, {turned(heading)}, at {speed:.2f} m/s"
     x, y, heading = row["label_10hz"][-1]
-    yield f"label         ends {x:+.2f} m ahead, {y:+.2f} m left, turned {57.29578 * heading:+.1f} deg after 4 s"
+    yield f"label         ends {x:+.2f} m ahead, {to_the_side(y)}, turned {turned(heading)} after 4 s"
     images, source = row["images"] or (), row["image_source"]
     cameras = ", ".join(dict.fromkeys(image["camera"] for image in images))
     tags = ", ".join(row["tags"]) or "-"

@@ -9,10 +9,11 @@ Exit codes: 0 shown, 2 bad arguments, or nothing there to show.
 
 import json
 import os
+import shlex
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from factory.arguments import Refused, answer, one_line
 
@@ -121,12 +122,30 @@ def funnel_lines(store: "Store") -> Iterable[str]:
     yield funnel_of(store).text().rstrip()
 
 
+def failed_line(store: "Store") -> str:
+    """What failed, how often, how the first error ends, and what shows all of it; for the end of a run."""
+    rows = [row for row in store.outcomes.read().to_pylist() if row["kind"] == "failed"]
+    kinds = Counter(row["error_kind"] for row in rows)
+    counts = ", ".join(f"{kind} {n}" for kind, n in sorted(kinds.items()))
+    first = min(rows, key=_place)
+    where = f"{first['expert']} on clip {first['clip_id']}" if first["expert"] else f"clip {first['clip_id']}"
+    said = (first["error"].strip().splitlines() or ["no message"])[-1]
+    return (
+        f"{len(rows)} failed ({counts}), the first, {where}: {said}\n"
+        f"all of them: python -m factory failed out={shlex.quote(store.location.uri)}"
+    )
+
+
+def _place(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    return row["log_id"], row["clip_id"], row["expert"], row["candidate_index"]
+
+
 def failed_lines(store: "Store") -> Iterable[str]:
     """Every failed attempt with its message, and how to try it again."""
     rows = [row for row in store.outcomes.read().to_pylist() if row["kind"] == "failed"]
     kinds = Counter(row["error_kind"] for row in rows)
     yield f"{len(rows)} failed" + (": " + ", ".join(f"{kind} {n}" for kind, n in sorted(kinds.items())) if rows else "")
-    for row in sorted(rows, key=lambda row: (row["log_id"], row["clip_id"], row["expert"], row["candidate_index"])):
+    for row in sorted(rows, key=_place):
         what = f"expert {row['expert']}, candidate {row['candidate_index']}" if row["expert"] else "the clip as a whole"
         yield ""
         yield f"{row['attempt_id']}  {row['error_kind']}, tried in {row['tries']} runs"

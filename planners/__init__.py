@@ -3,7 +3,7 @@
 import sys
 from importlib.util import find_spec
 
-from tasks import __version__ as __version__
+from factory import __version__ as __version__  # imported first: it finds tasks beside it, not in the working folder
 
 if find_spec("torch") is None:
     _MISSING = 'planners need PyTorch: pip install -e ".[planners]" in the checkout (make install for its CPU build)'

@@ -8,7 +8,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from factory.board.watch import Snapshot
-from factory.look.report_words import REASON_WORDS
+from factory.look.report_words import REASON_WORDS, to_the_side, turned
 from factory.status import RETRY
 from factory.store.outcomes import Kind
 from factory.store.table import KeyedTable
@@ -213,14 +213,14 @@ def whole(shot: Snapshot, attempt_id: str, row: Mapping[str, Any], candidates: K
 def _facts(row: Mapping[str, Any]) -> dict[str, str]:
     vx, vy, ax, ay = (float(v) for v in row["ego_status"])
     facts = {
-        "ego at now": f"{(vx**2 + vy**2) ** 0.5:.1f} m/s, {ax:+.1f} m/s² along, {ay:+.1f} m/s² aside",
+        "ego at now": f"{(vx**2 + vy**2) ** 0.5:.1f} m/s, {ax:+.1f} m/s² along, {ay:+.1f} m/s² to the left",
         "command": row["command"],
     }
     if row["candidate_end"] is not None:
         x, y, heading, speed = (float(v) for v in row["candidate_end"])
-        facts["perturbed by"] = f"{x:+.2f} m along, {y:+.2f} m aside, {57.29578 * heading:+.1f}°, at {speed:.1f} m/s"
+        facts["perturbed by"] = f"{x:+.2f} m along, {to_the_side(y)}, {turned(heading)}, at {speed:.1f} m/s"
     x, y, heading = (float(v) for v in row["label_10hz"][-1])
-    facts["label after 4 s"] = f"{x:.1f} m ahead, {y:+.1f} m left, turned {57.29578 * heading:+.1f}°"
+    facts["label after 4 s"] = f"{x:.1f} m ahead, {to_the_side(y)}, turned {turned(heading)}"
     facts["around it"] = f"{len(row['agent_ids'])} agents, {len(row['lane_ids'])} lanes"
     facts["images"] = f"{len(row['images'] or ())} from {row['image_source']}"
     if row["psnr"] is not None:

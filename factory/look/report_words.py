@@ -45,3 +45,13 @@ GATE_WORDS = {
     "replay_score": "scored too low against log replay",
     "reactive_score": "scored too low among reacting agents",
 }
+
+
+def to_the_side(y_m: float) -> str:
+    """A distance across, by the word for its side: y of the ego frame points left."""
+    return f"{abs(y_m):.2f} m to the {'left' if y_m >= 0.0 else 'right'}"
+
+
+def turned(heading_rad: float) -> str:
+    """A turn by the word for its side: counter-clockwise is left."""
+    return f"{abs(heading_rad) * 57.29578:.1f} deg to the {'left' if heading_rad >= 0.0 else 'right'}"

@@ -43,7 +43,7 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Row = Mapping[str, Any]
 
-ASIDE_M = (-2.0, -1.0, 0.0, 1.0, 2.0)  # left is positive
+ASIDE_M = (2.0, 1.0, 0.0, -1.0, -2.0)  # left is positive, and on the left of the strip
 STRIP_PX = (320, 180 + CAPTION_PX + 4)
 HOLD_S = 0.5  # how long a stored image stands in a film: they are taken at 2 Hz,
 SLACK_S = 0.06  # give or take this much
@@ -120,10 +120,12 @@ def real_and_rendered(
 ) -> list[tuple[Seen, Seen]]:
     """For each camera the photo nearest to a time since the log's first instant, and the scene from the same pose.
 
+    Cameras that look to the left come first, as they stand side by side.
+
     `photos`: VIEW_COLUMNS of a human sample, whose agents are the log's; `only` these cameras, all for none.
     """
     agents, pairs = agents_of(photos), []
-    for camera in photos["cameras"]:
+    for camera in sorted(photos["cameras"], key=_looks_right):
         mine = [image for image in photos["images"] if image["camera"] == camera["name"]]
         if only and camera["name"] not in only:
             continue
@@ -144,6 +146,12 @@ def real_and_rendered(
     return pairs
 
 
+def _looks_right(camera: Mapping[str, Any]) -> float:
+    """How far to the right a camera looks, clockwise from behind [rad]."""
+    ahead, left = np.reshape(camera["ego_from_camera"], (4, 4))[:2, 2]
+    return float(-np.arctan2(left, ahead))
+
+
 def from_the_side(asset: RenderAsset, row: Row) -> list[Seen]:
     """What the front camera sees at now from ASIDE_M beside the ego; nothing for a row without images."""
     front = front_camera(row)
@@ -154,8 +162,9 @@ def from_the_side(asset: RenderAsset, row: Row) -> list[Seen]:
     for aside_m in ASIDE_M:
         pose = pose_at(row, NOW_INDEX)
         pose[:3, 3] += aside_m * pose[:3, 1]
-        side = f"{aside_m:+g} m, {'left' if aside_m > 0 else 'right'}" if aside_m else f"{front}, rendered at now"
-        out.append(Seen(drawn(asset, rig, pose, agents, 0.0)[0], side))
+        side = f"{abs(aside_m):g} m to the {'left' if aside_m > 0 else 'right'}"
+        caption = side if aside_m else f"{front}, rendered at now"
+        out.append(Seen(drawn(asset, rig, pose, agents, 0.0)[0], caption))
     return out
 
 

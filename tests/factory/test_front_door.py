@@ -14,10 +14,12 @@ from pathlib import Path
 import pytest
 
 from factory.__main__ import main
-from factory.commands import COMMANDS
+from factory.commands import COMMANDS, PLANNERS
 from factory.completion import candidates, settings_of
 from factory.execute import execute
+from factory.status import failed_line
 from factory.store.samples import CURRENT_RUN, Store
+from planners.__main__ import main as planners_main
 from tests.factory.filmed import FilmedWork
 from tests.factory.toy import ToyWork, refs
 
@@ -91,6 +93,35 @@ def test_status_funnel_and_failed_are_what_show_shows(out: Path, capsys: pytest.
     code, failed, _ = ask(capsys, "failed", f"out={out}")
     assert code == 0 and failed == ask(capsys, "show", f"out={out}", "failed=true")[1]
     assert "ZeroDivisionError" in failed and "python -m factory retry" in failed
+
+
+def test_a_run_with_failures_ends_with_what_failed_how_often_and_what_shows_all(out: Path) -> None:
+    clip_id = next(row["clip_id"] for row in Store(out).outcomes.read().to_pylist() if row["kind"] == "failed")
+    assert failed_line(Store(out)).splitlines() == [
+        f"1 failed (bug 1), the first, recovery on clip {clip_id}: ZeroDivisionError: a bug in a stage",
+        f"all of them: python -m factory failed out={out}",
+    ]
+
+
+def test_each_door_lists_its_commands_and_names_those_of_the_other(capsys: pytest.CaptureFixture[str]) -> None:
+    assert planners_main(["--help"]) == 0
+    shown = capsys.readouterr().out
+    code, ours, _ = ask(capsys, "--help")
+    assert code == 0 and "python -m planners <command>" in ours
+    for name, command in PLANNERS.items():
+        assert f"  {name} " in shown and f"  {name} " in ours and command.about in shown
+        assert callable(command.load())
+    modules = {command.module for command in PLANNERS.values()}
+    runnable = {
+        f"planners.{path.stem}"
+        for path in (REPOSITORY / "planners").glob("*.py")
+        if path.stem != "__main__" and 'if __name__ == "__main__"' in path.read_text()
+    }
+    assert modules == runnable, "every command that can be run is listed"
+    assert planners_main(["evalute"]) == 2
+    assert "did you mean evaluate?" in capsys.readouterr().err
+    assert planners_main(["run", "rounds=5"]) == 2
+    assert "python -m factory run" in capsys.readouterr().err
 
 
 def test_lineage_goes_from_the_run_to_the_file(out: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,0 +1,186 @@
+"""What a user can get wrong, row by row: the exit code, one line that says what and how, nothing written."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from factory.__main__ import main
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+HEAVY = ("numpy", "numba", "scipy", "shapely", "pyarrow", "deltalake", "ray", "torch", "cv2")
+NO_HYDRA = ("Hydra", "hydra", "override", "Lexer", "EOF", "struct", "Traceback", "pydantic", "Input should")
+
+
+@dataclass(frozen=True)
+class Wrong:
+    """A command line behind `python -m factory`, and what its one line must say."""
+
+    argv: tuple[str, ...]
+    says: tuple[str, ...]
+    code: int = 2
+
+    @property
+    def name(self) -> str:
+        return " ".join(self.argv)
+
+
+def run(*argv: str, says: Sequence[str]) -> Wrong:
+    return Wrong(("run", *argv), tuple(says))
+
+
+MISTYPED = [  # told before anything heavy is imported
+    run("rounsd=5", says=["rounsd: there is no such setting", "did you mean rounds=?"]),
+    run("render.widht=3", says=["did you mean render.width=?"]),
+    run("preset=dmeo", says=["demo, hard_benchmark", "did you mean preset=demo?"]),
+    run("traffic=fast", says=["traffic=fast: there is idm, replay"]),
+    run("--rounds", "5", says=["settings have no dashes: rounds=5"]),
+    run("--rounds=5", says=["rounds=5"]),
+    run("rounds", "5", says=["'rounds': expected key=value"]),
+    run("rounds=five", says=["rounds: must be a whole number (got 'five')"]),
+    run("rounds=0", says=["rounds=0: at least one round"]),
+    run("rounds=1,2", says=["several runs are several commands"]),
+    run("rounds=[1", says=["rounds=[1", "a list is"]),
+    run("executor=lcoal", says=["must be ray or local; did you mean local?"]),
+    run("retry_failed=maybe", says=["retry_failed: must be true or false"]),
+    run("experts=[recovry]", says=["recovry", "did you mean recovery?"]),
+    run("experts=recovery,human", says=["experts=[recovery,human]"]),
+    run("+rounds=3", says=["rounds is a setting already"]),
+    run("clips.root=/logs", says=["clips.root is a setting of clips=av2 and clips=scenarionet"]),
+    run("clips=av2", says=["clips.root is missing: give clips.root=<folder>"]),
+    run("--multirun", "rounds=1,2", says=["several commands", "out="]),
+    run("--config-dir", "nowhere", says=["nowhere: there is no such folder"]),
+    run("--cfg", "all", says=["--cfg all: the settings of the run alone are shown"]),
+    run("vocabulary.k=99999999", says=["k=99999999", "at most 131,072"]),
+    run("out=", says=["out= is empty", "variable"]),
+    run("out=a_file", says=["a_file is not a folder"]),
+    run("out=a_file/below", says=["a_file is not a folder"]),
+    run("out=/proc/nowhere", says=["out=/proc/nowhere: cannot be written"]),
+]
+WRONG = [
+    *MISTYPED,
+    run("out=ftp://host/x", says=["a URL of s3, gs"]),
+    run("perturb.epdms_min=high", says=["perturb.epdms_min: must be a number (got 'high')"]),
+    run("render.backend=gpu", says=["render.backend: must be cpu or gsplat"]),
+    run("clips=av2", "clips.root=nowhere", says=["nowhere: no such folder"]),
+    run("clips=av2", "clips.root=a_file", says=["a_file: no such folder"]),
+    run("clips=av2", "clips.root=a_folder", says=["a_folder: no Argoverse 2 sensor log here"]),
+    run("clips=scenarionet", "clips.root=a_folder", says=["a_folder: no scenario here"]),
+    run("clips=custom", "clips._target_=nowhere.Reader", says=["nowhere.Reader", "installed?"]),
+    run("vocabulary.file=nowhere.npy", says=["nowhere.npy", "No such file"]),
+    run("vocabulary.file=broken.npy", says=["broken.npy: not readable as a numpy file: it holds no plain numbers"]),
+    run("vocabulary.file=shape.npy", says=["shape.npy: trajectories have shape (3, 4), expected (K >= 1, 40, 3)"]),
+    run("expert.recovery.smooth=maybe", says=["expert.recovery.smooth: must be true or false"]),
+    run("expert.recovery.table=nowhere.npz", says=["nowhere.npz: there is no such file"]),
+    Wrong(("plan", "rounsd=5"), ("did you mean rounds=?",)),
+    Wrong(("rnu",), ("there is no command rnu", "did you mean run?")),
+    Wrong(("train", "planner=ltf"), ("python -m planners train",)),
+    *(Wrong((name, "out=a_folder"), ("a_folder: give the out= of a run",)) for name in ("status", "report", "retry")),
+    Wrong(("show", "out=a_folder", "sample=0"), ("no store at",)),
+    Wrong(("export", "mcap", "out=a_folder", "sample=0"), ("no store at",)),
+    Wrong(("dashboard", "out=a_folder"), ("no store at",)),
+    Wrong(("verify", "a_folder"), ("no store at",)),
+    Wrong(("status", "out=  "), ("out= is empty",)),
+    Wrong(("status", "out=a_file"), ("no store at",)),
+    Wrong(("dashboard", "out=a_folder", "port=99999"), ("port=99999: must be a number below 65536",)),
+    Wrong(("vocabulary", "kinematic=true", "k=4", "out=/proc/x.npy"), ("No such file",)),
+    Wrong(("scene", "info", "broken.npy"), ("broken.npy: cannot be read",)),
+]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    (tmp_path / "a_file").write_text("")
+    (tmp_path / "a_folder").mkdir()
+    (tmp_path / "broken.npy").write_bytes(b"\x00broken")
+    np.save(tmp_path / "shape.npy", np.zeros((3, 4)))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def contents(folder: Path) -> list[tuple[str, int]]:
+    return sorted((str(path.relative_to(folder)), path.stat().st_mtime_ns) for path in folder.rglob("*"))
+
+
+@pytest.mark.parametrize("wrong", WRONG, ids=[wrong.name for wrong in WRONG])
+def test_a_wrong_input_ends_with_its_code_and_one_line_and_writes_nothing(
+    wrong: Wrong, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = contents(folder)
+    argv = wrong.argv
+    if argv[0] == "run" and not any(word.startswith("out=") for word in argv):
+        argv = (*argv, "out=here", "render=none")
+    assert main(argv) == wrong.code
+    said = capsys.readouterr()
+    assert said.err.startswith("error: ") and said.err.count("\n") == 1, said.err
+    for words in wrong.says:
+        assert words in said.err
+    assert not [word for word in NO_HYDRA if word in said.err], said.err
+    assert contents(folder) == before
+
+
+def python(cwd: Path, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    env = os.environ | {"PYTHONPATH": str(REPOSITORY)} | environment
+    return subprocess.run([sys.executable, *arguments], cwd=cwd, env=env, capture_output=True, text=True, timeout=120)
+
+
+def test_a_mistyped_word_imports_nothing_heavy(folder: Path) -> None:
+    code = (
+        "import sys; from factory.__main__ import main\n"
+        f"for argv in {[wrong.argv for wrong in MISTYPED]!r}: assert main(argv) == 2, argv\n"
+        f"print('loaded', [name for name in {HEAVY} if name in sys.modules])"
+    )
+    done = python(folder, "-c", code)
+    assert done.stdout.splitlines()[-1:] == ["loaded []"], done.stderr
+
+
+def test_a_group_s_wrong_value_imports_its_group_alone(folder: Path) -> None:
+    code = (
+        "import sys; from factory.__main__ import main\n"
+        "assert main(['run', 'pdm.shared_lead_memory=maybe']) == 2\n"
+        f"print('loaded', [name for name in {HEAVY[2:]} if name in sys.modules])"
+    )
+    assert python(folder, "-c", code).stdout.splitlines()[-1:] == ["loaded []"]
+
+
+def test_a_bucket_without_credentials_is_refused_before_any_work(folder: Path) -> None:
+    nobody = {name: "" for name in os.environ if name.startswith("AWS_")} | {"AWS_EC2_METADATA_DISABLED": "true"}
+    done = python(folder, "-m", "factory.run", "out=s3://nobody/x", HOME=str(folder), **nobody)
+    assert done.returncode == 2 and not done.stdout
+    assert done.stderr.startswith("error: out=s3://nobody/x: ") and done.stderr.count("\n") == 1, done.stderr
+    assert "AWS_ACCESS_KEY_ID" in done.stderr
+
+
+def test_a_stranger_s_modules_in_the_working_folder_are_not_ours(folder: Path) -> None:
+    (folder / "tasks.py").write_text("raise RuntimeError('this is the wrong tasks')\n")
+    for door in ("factory.run", "planners"):
+        done = python(folder, "-m", door, "--help")
+        assert done.returncode == 0 and "wrong tasks" not in done.stderr, done.stderr
+    done = python(folder, "-m", "factory.run", "rounsd=5")
+    assert done.returncode == 2 and "did you mean rounds=?" in done.stderr
+
+
+def test_one_expert_needs_no_brackets_and_odd_paths_no_quotes(folder: Path) -> None:
+    from factory.config import compose
+    from factory.settings import run_config
+
+    values = compose("run", ["experts=recovery", "render.cameras=front", "out=~/my (first) run=a", "render=none"])
+    config = run_config(values)
+    assert config.experts == ("recovery",) and config.render.cameras == ("front",)
+    assert config.out == "~/my (first) run=a"
+
+
+def test_hydra_s_habits_work(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "a_folder" / "render").mkdir()
+    (folder / "a_folder" / "render" / "mine.yaml").write_text("defaults:\n  - map\n  - _self_\nwidth: 640\n")
+    for show in (["--cfg"], ["--cfg", "job"], ["--cfg=job"], ["-c", "job"]):
+        assert main(["run", *show, "--config-dir", "a_folder", "render=mine", "rounds=7"]) == 0
+        shown = capsys.readouterr().out
+        assert "width: 640" in shown and "mode: map" in shown and "rounds: 7" in shown
+    assert main(["run", "--config-dir=a_folder", "render=mien"]) == 2
+    assert "did you mean render=mine?" in capsys.readouterr().err
