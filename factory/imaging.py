@@ -19,7 +19,8 @@ from factory.sensors import block_of, chosen_cameras, encode_jpeg, load_photos, 
 from tasks.attempt import Judged
 from tasks.experts.follow_up import BEFORE_STEPS
 from tasks.perturb import Candidate
-from tasks.render.gate import unfit
+from tasks.render.gate import looked_at_size, unfit
+from tasks.render.likeness import Album, likeness_to_photo, sightings
 from tasks.render.map_drawing import draw_map_views
 from tasks.render.rigs import RIGS
 from tasks.render.scene import RenderAsset
@@ -99,7 +100,8 @@ class Imaging:
     def unfit(self, clip: Clip, candidate: Candidate, judged: Judged, pair: bool = False) -> Rejected | None:
         """Why a simulated drive cannot be shown: what `tasks.render.gate` finds on its pictures from T to T+2H.
 
-        pair: on those that a benchmark's follow-up and its earlier frame show, the same for both.
+        Vehicles are held against photos on the pictures that are stored.
+        pair: all on those that a benchmark's follow-up and its earlier frame show, the same for both.
 
         None where nothing is rendered from photos: lidar's grey pictures have gaps between its beams, and a reach of
         their own instead. Raises BadClip for a broken sensor file.
@@ -110,9 +112,10 @@ class Imaging:
             return None
         start, now = candidate.rollout.start_step, judged.scene.step
         steps: Sequence[int] = range(start, now + HORIZON_STEPS + 1, GATE_STRIDE)
+        instants = (now - BEFORE_STEPS, now) if pair else (now,)
+        stored = sorted({at + offset for at in instants for offset in STEPS_OF[self.settings.frames]})
         if pair:
-            shown = STEPS_OF[self.settings.frames]
-            steps = sorted({at + offset for at in (now - BEFORE_STEPS, now) for offset in shown})
+            steps = stored
         states = np.concatenate([candidate.rollout.ego_states, judged.rollout.ego_states[1:]])
         return unfit(
             _block(clip, self.settings, self.cache_dir),
@@ -123,6 +126,8 @@ class Imaging:
             (self.settings.width, self.settings.height),
             self.settings.gate,
             self.settings.backend,
+            _kept_album(_Key(clip, self.settings, self.cache_dir)) if self.settings.gate.vehicle_min > 0.0 else None,
+            stored,
         )
 
     def _below(self, asset: RenderAsset) -> bool:
@@ -258,3 +263,28 @@ class _Key:
 @lru_cache(maxsize=2)
 def _kept(key: _Key) -> RenderAsset | None:
     return asset_for(key.clip, key.settings, Path(key.cache_dir))
+
+
+def album_of(clip: Clip, asset: RenderAsset, settings: RenderSettings) -> Album:
+    """The photos of a clip's block; one is opened when a vehicle is first held against it. Raises BadClip then."""
+    block, cameras = block_of(clip), chosen_cameras(clip.cameras, settings.cameras)
+    shown = sightings(block.images, cameras, block.agents)
+    tracks: dict[int, list[str]] = {}
+    for track_id, seen in shown.items():
+        for row in seen.photos:
+            tracks.setdefault(int(row), []).append(track_id)
+    size = looked_at_size((settings.width, settings.height), settings.gate)
+    known: dict[int, dict[str, float]] = {}
+
+    def likeness(track_id: str, row: int) -> float:
+        if row not in known:
+            (photo,) = load_photos([block.images[row]], cameras, *size)
+            known[row] = likeness_to_photo(asset, photo, block.agents, tracks[row], settings.backend)
+        return known[row][track_id]
+
+    return Album(shown, likeness)
+
+
+@lru_cache(maxsize=2)
+def _kept_album(key: _Key) -> Album:
+    return album_of(key.clip, _block(key.clip, key.settings, key.cache_dir), key.settings)

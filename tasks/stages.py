@@ -29,7 +29,7 @@ class Rejected:
 
 
 SUBSCORES = ("nc", "dac", "ddc", "tlc", "ep", "ttc", "lk", "hc", "ec")  # EPDMS, docs/reward.md 2
-PICTURE_FAULTS = ("holes", "lens_covered", "blank", "blurred")  # tasks.render.gate
+PICTURE_FAULTS = ("holes", "lens_covered", "blank", "blurred", "unlike_photos")  # tasks.render.gate
 
 STAGES: tuple[Stage, ...] = (
     Stage("clip", 2, "clip", ("ego_standing", "broken_tracks", "route_ended", "no_earlier_frame")),
@@ -37,7 +37,7 @@ STAGES: tuple[Stage, ...] = (
     Stage("rollout", 2, "attempt", ("route_ended",)),
     Stage("expert", 1, "attempt", ("no_plan",)),
     Stage("reward", 1, "attempt", SUBSCORES),
-    Stage("render", 2, "attempt", ("psnr", *PICTURE_FAULTS)),
+    Stage("render", 3, "attempt", ("psnr", *PICTURE_FAULTS)),
     Stage("write", 2, "attempt", ()),
 )
 

@@ -24,6 +24,7 @@ REASON_WORDS = {
     "lens_covered": "something covers the lens",
     "blank": "nothing to be seen on a picture",
     "blurred": "a picture without detail",
+    "unlike_photos": "a vehicle nearby looks like none of its photos",
     "ego_standing": "ego stands",
     "no_earlier_frame": "the log begins too late for a frame before it",
     "broken_tracks": "broken tracks",

@@ -1,12 +1,13 @@
 """The gate for rendered pictures: what no reward sees.
 
 A sample is fit to learn from when its rig could have seen every instant from T to T+2H, in both stages, whichever of
-the pictures are stored. Pictures are looked at in small and only as far as `reach_m`: what is farther looks from here
-as it did from where the photos were taken, and is most of a block's Gaussians.
+the pictures are stored; vehicles that fill much of a stored picture must also look like their photos
+(tasks/render/likeness.py). Pictures are looked at in small and only as far as `reach_m`: what is farther looks from
+here as it did from where the photos were taken, and is most of a block's Gaussians.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -16,6 +17,7 @@ from scipy.ndimage import uniform_filter
 from tasks.render.asset import RenderAsset, scene_at
 from tasks.render.engine import Backend, Pinhole, Vehicles, render, vehicles_at
 from tasks.render.gaussians import F32, F64, Gaussians, rotations_of
+from tasks.render.likeness import Album, expected, eye_in_box, large_vehicles
 from tasks.render.movers import world_from_boxes
 from tasks.render.raster import View
 from tasks.render.sky import directions
@@ -38,7 +40,8 @@ class GateSettings:
     The limits lie between what was measured on the synthetic town (2 blocks, 3 cameras): 135 pictures of accepted
     drives had at most 6 % holes and 11 % on the lens, contrast 0.15 and detail 0.11 at least; 20 m aside, inside the
     houses or behind them, most had 60 % to 100 % holes. Photos (KITTI, nuScenes, the town) have detail 0.17 to 0.33;
-    blurred by 1.5 pixels of the small picture, 0.06 at most.
+    blurred by 1.5 pixels of the small picture, 0.06 at most. What `vehicle_min` catches and loses is in
+    docs/reconstruction.md.
     """
 
     enabled: bool = True
@@ -50,9 +53,13 @@ class GateSettings:
     lens_max: float = 0.2  # share of the picture that may be covered by it
     contrast_min: float = 0.02  # standard deviation of the grey picture in [0, 1]: five grey levels
     detail_min: float = 0.06  # standard deviation of the grey picture less its 3 x 3 mean, as a share of the contrast
+    vehicle_min: float = (
+        0.7  # likeness to its photos that a large vehicle must be expected to have; 0: none is looked at
+    )
+    vehicle_share: float = 0.05  # of a picture, from which on a vehicle is large
 
     def __post_init__(self) -> None:
-        shares = {"hole_max", "lens_max", "contrast_min", "detail_min"}
+        shares = {"hole_max", "lens_max", "contrast_min", "detail_min", "vehicle_min", "vehicle_share"}
         for name in (field.name for field in fields(self) if field.name != "enabled"):
             value, low = getattr(self, name), 16 if name == "width" else 0.0
             if not (math.isfinite(value) and low <= value <= (1.0 if name in shares else math.inf)):
@@ -79,24 +86,49 @@ def unfit(
     size: tuple[int, int],
     settings: GateSettings,
     backend: Backend = Backend.CPU,
+    album: Album | None = None,
+    stored: Collection[int] = (),
 ) -> Rejected | None:
     """The first picture of a drive that is not fit to be a sample's; None where all are.
 
     `world_from_ego` (F, 4, 4) in 3-D, `steps` (F,) rows of `agents` at these instants, `size` width, height [px] of
-    the pictures to be stored, whose shape the small ones have.
+    the pictures to be stored, whose shape the small ones have. Of the `stored` steps alone vehicles are held against
+    the photos of an `album`: what is torn elsewhere nobody learns from.
     """
-    width = min(settings.width, size[0])
-    height = max(1, round(width * size[1] / size[0]))
+    width, height = looked_at_size(size, settings)
     rig = [camera.resized(width, height) for camera in cameras]
     for pose, step in zip(world_from_ego, steps, strict=True):
         there = vehicles_at(agents, step * STEP_S, pose[:2, 3], settings.reach_m)
         eyes = [Pinhole(c.intrinsics, pose @ c.ego_from_camera, c.width, c.height) for c in rig]
         scene = composed(asset, there, pose[:3, 3], settings.reach_m)
-        for camera, eye, found in zip(rig, eyes, measures(scene, eyes, pose, settings, backend), strict=True):
+        views = render(scene, eyes, backend=backend)
+        for camera, eye, view, found in zip(
+            rig, eyes, views, measures(scene, eyes, views, pose, settings, backend), strict=True
+        ):
             inside = _tracks_around(eye.world_from_camera[:3, 3], there)
             fault = ("lens_covered", f"inside track {inside[0]}") if inside else fault_of(found, settings)
+            if fault is None and album is not None and step in stored:
+                fault = unlike(album, there, eye, view, settings)
             if fault is not None:
                 return Rejected("render", fault[0], f"{camera.name} at step {step}: {fault[1]}")
+    return None
+
+
+def looked_at_size(size: tuple[int, int], settings: GateSettings) -> tuple[int, int]:
+    """Width and height [px] of the pictures that are looked at, for those of `size` to be stored."""
+    width = min(settings.width, size[0])
+    return width, max(1, round(width * size[1] / size[0]))
+
+
+def unlike(album: Album, there: Vehicles, eye: Pinhole, view: View, settings: GateSettings) -> tuple[str, str] | None:
+    """(reason, detail) of the nearest large vehicle that cannot be expected to look like its photos."""
+    if settings.vehicle_min == 0.0:
+        return None
+    for j, share in large_vehicles(there, eye, view, settings.vehicle_share):
+        track_id = there.track_ids[j]
+        alike = expected(album, track_id, eye_in_box(eye.world_from_camera[:3, 3], there.boxes[j]))
+        if alike < settings.vehicle_min:
+            return "unlike_photos", f"track {track_id} on {share:.0%} of the picture, expected likeness {alike:.2f}"
     return None
 
 
@@ -126,13 +158,14 @@ def composed(asset: RenderAsset, there: Vehicles, place: F64, reach_m: float) ->
 def measures(
     scene: RenderAsset,
     eyes: Sequence[Pinhole],
+    views: Sequence[View],
     world_from_ego: F64,
     settings: GateSettings,
     backend: Backend = Backend.CPU,
 ) -> list[Measures]:
-    """Of what each camera sees of a composed scene."""
+    """Of the view that each camera has of a composed scene."""
     out = []
-    for eye, seen in zip(eyes, render(scene, eyes, backend=backend), strict=True):
+    for eye, seen in zip(eyes, views, strict=True):
         rays = directions(eye.intrinsics, eye.world_from_camera, eye.width, eye.height)
         road = meets_road(rays, eye.world_from_camera[:3, 3], world_from_ego, settings.road_m)
         close = _on_the_lens(scene.background, eye.world_from_camera[:3, 3] - scene.origin, settings.lens_m)

@@ -194,7 +194,7 @@ def test_a_pair_falls_together_at_the_pictures(tmp_path: Path) -> None:
     small = ["clips.settings.width=64", "clips.settings.height=36", "clips.settings.lidar_azimuths=300"]
     small += ["clips.settings.steps_per_photo=5"]
     render = ["render=auto", "render.frames=now", "render.width=64", "render.height=36", "render.scene=discs"]
-    lenient = [*small, *render, "render.psnr_min=0", "vocabulary.k=300"]
+    lenient = [*small, *render, "render.psnr_min=0", "render.gate.vehicle_min=0", "vocabulary.k=300"]
     strict = assemble(load_config(overrides(tmp_path, *lenient, "render.gate.contrast_min=1.0", settings=SMALL))).work
     prepared = strict.prepare(strict.reader.index().refs[1])
     assert isinstance(prepared, PreparedClip) and prepared.candidates

@@ -26,7 +26,8 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def arguments(logs: Path, out: Path, *more: str) -> list[str]:
-    size = ["render.width=64", "render.height=36", "render.scene=discs", "render.psnr_min=0", "vocabulary.k=300"]
+    size = ["render.width=64", "render.height=36", "render.scene=discs", "vocabulary.k=300"]
+    size += ["render.psnr_min=0", "render.gate.vehicle_min=0"]
     return ["clips=av2", f"clips.root={logs}", f"out={out}", *size, *more]
 
 

@@ -24,8 +24,8 @@ from tasks.world.frames import to_local
 
 SMALL = TownSettings(cameras=("ring_front_center",), width=64, height=36, lidar_beams=32, lidar_azimuths=300)
 VOCABULARY = Vocabulary(kinematic_trajectories(3, 0))
-SIZE = ["render.width=64", "render.height=36", "render.scene=discs", "render.psnr_min=0", "vocabulary.k=300"]
-SIZE += ["experts=[pdm_closed,human]"]
+SIZE = ["render.width=64", "render.height=36", "render.scene=discs", "vocabulary.k=300"]
+SIZE += ["render.psnr_min=0", "render.gate.vehicle_min=0", "experts=[pdm_closed,human]"]
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +82,19 @@ def test_a_drive_that_cannot_be_shown_is_dropped_and_the_human_s_is_not(town: Pa
     for override in ("render.gate.enabled=false", "render=none", "render=map"):
         lenient = work_on(town, tmp_path, "render.gate.contrast_min=1.0", override)
         assert isinstance(first_sample(lenient, prepared), Accepted)
+
+
+def test_a_drive_past_a_vehicle_unlike_its_photos_is_dropped_and_at_zero_it_is_not(town: Path, tmp_path: Path) -> None:
+    small = "render.gate.vehicle_share=0.001"
+    stored = {f"ring_front_center at step {step}" for step in (40, 45, 50, 55)}  # 1.5 s before T+H to T+H
+    strict = work_on(town, tmp_path, "render.gate.vehicle_min=1.0", small)
+    prepared = prepared_by(strict)
+    found = [strict.attempt(prepared, row.index, "pdm_closed") for row in prepared.candidates]
+    dropped = [result.rejected for result in found if isinstance(result, Dropped)]
+    details = [rejected.detail for rejected in dropped if rejected.reason == "unlike_photos"]
+    assert details and {detail.split(":")[0] for detail in details} <= stored
+    lenient = work_on(town, tmp_path, "render.gate.vehicle_min=0", small)
+    assert isinstance(first_sample(lenient, prepared), Accepted)
 
 
 def test_a_prepared_clip_is_rendered_also_where_its_data_has_moved(town: Path, tmp_path: Path) -> None:

@@ -24,8 +24,9 @@ from tasks.experts.protocol import Plan
 from tasks.experts.recovery import Recovery, RecoveryTable
 from tasks.kinematic_vocabulary import kinematic_trajectories
 from tasks.perturb import Candidate, Perturbation, PerturbSettings, perturb
-from tasks.render.engine import NOBODY, Pinhole
+from tasks.render.engine import NOBODY, Pinhole, render
 from tasks.render.gate import GateSettings, composed, measures
+from tasks.render.likeness import likeness_to_photo
 from tasks.render.map_drawing import draw_map_views
 from tasks.render.rigs import RIGS
 from tasks.render.scene import AssetSettings, build_asset
@@ -181,8 +182,10 @@ def pictures() -> dict[str, object]:
     pose[:, 2, 3] = 0.0
     drawn = draw_map_views(clip.road_map, RIGS["front"], pose, clip.agents, [NOW], 128, 72)
     eye = Pinhole(front.intrinsics, aside[0] @ front.ego_from_camera, street.WIDTH, street.HEIGHT)
-    (found,) = measures(composed(asset, NOBODY, aside[0, :3, 3], 30.0), [eye], aside[0], GateSettings())
-    return {"rendered": blocks(seen), "drawn": blocks(drawn), "gate": astuple(found)}
+    near = composed(asset, NOBODY, aside[0, :3, 3], 30.0)
+    (found,) = measures(near, [eye], render(near, [eye]), aside[0], GateSettings())
+    alike = likeness_to_photo(asset, photos[2], street.tracks(), ["car"])
+    return {"rendered": blocks(seen), "drawn": blocks(drawn), "gate": astuple(found), "likeness": [alike["car"]]}
 
 
 def rows() -> dict[str, object]:
@@ -317,11 +320,12 @@ GOLDEN: dict[str, Golden] = {
         },
     ),
     "render": Golden(
-        2,
+        3,
         {
             "rendered": (714.36471, 34.8568599),
             "drawn": (1001.11158, 15.1497572),
             "gate": (0.198662185, -0.00442765673),
+            "likeness": (0.934323072, 0.934323072),
         },
         tolerance=1e-3,
     ),

@@ -34,8 +34,8 @@ from tasks.render.asset import RenderAsset, psnr
 from tasks.stages import STAGES, SUBSCORES
 
 SMALL = TownSettings(cameras=("ring_front_center",), width=64, height=36, lidar_beams=32, lidar_azimuths=300)
-SIZE = ["render.width=64", "render.height=36", "render.scene=discs", "render.psnr_min=0", "vocabulary.k=300"]
-SIZE += ["experts=[pdm_closed,human]"]
+SIZE = ["render.width=64", "render.height=36", "render.scene=discs", "vocabulary.k=300"]
+SIZE += ["render.psnr_min=0", "render.gate.vehicle_min=0", "experts=[pdm_closed,human]"]
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import street
 from scipy.ndimage import gaussian_filter
 
 from tasks.render.asset import RenderAsset
-from tasks.render.engine import NOBODY, Pinhole
+from tasks.render.engine import NOBODY, Pinhole, render
 from tasks.render.gate import GateSettings, Measures, composed, fault_of, measured, measures, meets_road, unfit
 from tasks.render.gaussians import EMPTY, Gaussians, concatenate
 from tasks.render.raster import View
@@ -36,7 +36,8 @@ def turned(x: float, y: float, degrees: float) -> np.ndarray:
 
 def measured_at(asset: RenderAsset, pose: np.ndarray) -> Measures:
     eye = Pinhole(FRONT.intrinsics, pose @ FRONT.ego_from_camera, *SIZE)
-    return measures(composed(asset, NOBODY, pose[:3, 3], SETTINGS.reach_m), [eye], pose, SETTINGS)[0]
+    scene = composed(asset, NOBODY, pose[:3, 3], SETTINGS.reach_m)
+    return measures(scene, [eye], render(scene, [eye]), pose, SETTINGS)[0]
 
 
 def blob(x: float, y: float, z: float, sigma_m: float) -> Gaussians:
@@ -136,12 +137,13 @@ def test_every_fault_is_a_reason_of_the_render_stage() -> None:
         for name in ("holes", "lens", "contrast", "detail")
         if (fault := fault_of(replace(good, **{name: getattr(bad, name)}), SETTINGS)) is not None
     }
-    assert told == set(PICTURE_FAULTS)
-    assert told <= set(next(stage.reasons for stage in STAGES if stage.name == "render"))
+    assert told | {"unlike_photos"} == set(PICTURE_FAULTS)
+    assert set(PICTURE_FAULTS) <= set(next(stage.reasons for stage in STAGES if stage.name == "render"))
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("hole_max", 1.5), ("width", 8), ("reach_m", float("inf")), ("lens_m", -1.0)]
+    ("name", "value"),
+    [("hole_max", 1.5), ("width", 8), ("reach_m", float("inf")), ("lens_m", -1.0), ("vehicle_min", 1.1)],
 )
 def test_settings_out_of_range_are_refused(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=f"render gate {name} must be"):

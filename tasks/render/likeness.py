@@ -1,0 +1,196 @@
+"""How like its photos a vehicle near the camera looks, judged by the photo that was taken from nearest to here.
+
+A vehicle that passed the cameras in a few photos can be fitted to streaks: they look right from nowhere, also not from
+where its photos were taken. So the scene is drawn as one photo shows it, from the place that is nearest to here as the
+vehicle sees it, and both are compared inside the vehicle's outline. What is found there fades with the way from that
+place to here: a side that no photo shows, or a look from much nearer, is a guess.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tasks.render.asset import RenderAsset
+from tasks.render.engine import Backend, Pinhole, Vehicles, render, vehicles_at
+from tasks.render.gaussians import F32, F64
+from tasks.render.movers import BEYOND_M, behind_boxes, boxes_at, world_from_boxes
+from tasks.render.raster import View
+from tasks.render.sensed import Photo
+from tasks.render.sky import directions
+from tasks.render.stereo import FAR_M
+from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.camera import Camera, SensorFile
+
+FADING = 0.2  # likeness falls by exp(-0.2) where the eye moves by as much as it was away from the vehicle
+TELLING_M = 40.0  # a photo from farther tells nothing of how a vehicle looks from near
+SHOWN = 0.3  # share of a vehicle's points that a photo must have in view
+SIGMA_PX = 1.5  # of the window of SSIM (Wang et al. 2004), on pictures of half the size: blur alone is forgiven
+C1, C2 = 0.01**2, 0.03**2
+HIDDEN_M = 0.5  # what is drawn this much before a vehicle's nearest corner hides it
+CORNERS = np.stack(np.meshgrid((-0.5, 0.5), (-0.5, 0.5), (-0.5, 0.5), indexing="ij"), axis=-1).reshape(8, 3)
+POINTS = 0.9 * np.stack(np.meshgrid(*3 * [(-0.5, 0.0, 0.5)], indexing="ij"), axis=-1).reshape(27, 3)
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """The photos that show one track, and from where."""
+
+    photos: NDArray[np.int64]  # (M,) rows of the block's photos
+    eyes: F64  # (M, 3) of the cameras, in the track's box then: centre, x along the heading [m]
+
+    def nearest(self, eye: F64) -> tuple[int, float]:
+        """The photo taken from nearest to `eye` (3,) in box coordinates, and how far from it, as a share of the eye's
+        distance from the centre."""
+        away = np.linalg.norm(self.eyes - eye, axis=1)
+        k = int(np.argmin(away))
+        return int(self.photos[k]), float(away[k] / max(float(np.linalg.norm(eye)), 1e-6))
+
+
+@dataclass(frozen=True)
+class Album:
+    """A block's photos, for holding vehicles against them."""
+
+    sightings: Mapping[str, Sightings]  # by track id
+    likeness: Callable[[str, int], float]  # of a track as the scene draws it to a photo that shows it, 0 to 1
+
+
+def sightings(files: Sequence[SensorFile], cameras: Sequence[Camera], agents: AgentTracks) -> dict[str, Sightings]:
+    """Which of a block's photos show which vehicle; `agents` are the block's, with the files' times."""
+    rig = {camera.name: camera for camera in cameras}
+    found: dict[str, list[tuple[int, F64]]] = {}
+    for row, file in enumerate(files):
+        if file.sensor not in rig:
+            continue
+        camera = rig[file.sensor]
+        pose = file.world_from_ego @ camera.ego_from_camera
+        boxes, valid = boxes_at(agents, file.time_s)
+        near = valid & (np.linalg.norm(boxes[:, :3] - pose[:3, 3], axis=1) < TELLING_M)
+        rows = [j for j in np.flatnonzero(near) if agents.kinds[j] == AgentKind.VEHICLE]
+        u, v, depth = _projected(boxes[rows], POINTS, camera.intrinsics, pose)
+        with np.errstate(invalid="ignore"):
+            inside = (depth > 0.0) & (u >= 0.0) & (u < camera.width) & (v >= 0.0) & (v < camera.height)
+        for j, share in zip(rows, inside.mean(axis=1), strict=True):
+            if share >= SHOWN:
+                found.setdefault(agents.track_ids[j], []).append((row, eye_in_box(pose[:3, 3], boxes[j])))
+    return {
+        track_id: Sightings(np.array([row for row, _ in seen]), np.stack([eye for _, eye in seen]))
+        for track_id, seen in found.items()
+    }
+
+
+def eye_in_box(eye: F64, box: F64) -> F64:
+    """A place (3,) in the coordinates of a box (7,): from its centre, x along its heading."""
+    return np.asarray((eye - box[:3]) @ world_from_boxes(box[None])[0, :3, :3])
+
+
+def expected(album: Album, track_id: str, eye: F64) -> float:
+    """The likeness, 0 to 1, that a track can be expected to have from `eye` (3,) in its box; 0 where no photo shows
+    it."""
+    seen = album.sightings.get(track_id)
+    if seen is None:
+        return 0.0
+    photo, gap = seen.nearest(eye)
+    return album.likeness(track_id, photo) * float(np.exp(-FADING * gap))
+
+
+def large_vehicles(there: Vehicles, eye: Pinhole, view: View, share: float) -> Iterator[tuple[int, float]]:
+    """Rows of the vehicles that cover at least a share of a picture, each with its share, the nearest first.
+
+    `view` of the scene with them: what is behind a nearer vehicle or behind what the scene has there is not covered.
+    """
+    vehicles = np.array([kind == AgentKind.VEHICLE for kind in there.kinds], bool)
+    grown = there.boxes + np.array([0.0, 0.0, 0.0, 0.0, *3 * [2.0 * BEYOND_M]])
+    u, v, depth = _projected(grown, CORNERS, eye.intrinsics, eye.world_from_camera)
+    nearest = depth.min(axis=1, initial=np.inf)
+    with np.errstate(invalid="ignore"):
+        wide = np.clip(u, 0.0, eye.width), np.clip(v, 0.0, eye.height)
+        room = np.ptp(wide[0], axis=1) * np.ptp(wide[1], axis=1) if len(grown) else np.zeros(0)
+    possible = vehicles & (depth.max(axis=1, initial=-np.inf) > 0.0)
+    possible &= (nearest <= 0.0) | (room >= share * eye.width * eye.height)
+    rays = None
+    free = np.ones((eye.height, eye.width), bool)
+    for j in sorted(np.flatnonzero(possible), key=lambda j: nearest[j]):
+        if rays is None:
+            rays = directions(eye.intrinsics, eye.world_from_camera, eye.width, eye.height).reshape(-1, 3)
+        outline = outline_of(there.boxes[j], eye, rays)
+        hidden = (view.depth < nearest[j] - HIDDEN_M) & (view.alpha > 0.5)
+        covered = float((outline & free & ~hidden).mean())
+        free &= ~outline
+        if covered >= share:
+            yield int(j), covered
+
+
+def outline_of(box: F64, eye: Pinhole, rays: F64 | None = None) -> NDArray[np.bool_]:
+    """(H, W) the pixels that look at a box (7,) in the world; `rays` (H * W, 3) where they are known."""
+    if rays is None:
+        rays = directions(eye.intrinsics, eye.world_from_camera, eye.width, eye.height).reshape(-1, 3)
+    place = np.ascontiguousarray(eye.world_from_camera[:3, 3])
+    met = behind_boxes(place + FAR_M * rays, place, np.ascontiguousarray(box[None]))
+    return np.asarray(met).reshape(eye.height, eye.width)
+
+
+def likeness_to_photo(
+    asset: RenderAsset, photo: Photo, agents: AgentTracks, track_ids: Sequence[str], backend: Backend = Backend.CPU
+) -> dict[str, float]:
+    """How like the photo the scene draws each track, inside its outline; tracks without any pixel have 0.
+
+    `agents` are the block's, with the photo's time. The scene gets the photo's exposure where it has learned one.
+    """
+    height, width = photo.rgb.shape[:2]
+    eye = Pinhole(photo.intrinsics, photo.world_from_camera, width, height)
+    there = vehicles_at(agents, photo.time_s)
+    seen = _exposed(asset, photo, render(asset, [eye], there, backend)[0].rgb)
+    similar = similarity(seen, photo.rgb.astype(np.float32) / np.float32(255.0))
+    out = {}
+    for track_id in track_ids:
+        inside = outline_of(there.boxes[there.track_ids.index(track_id)], eye)
+        out[track_id] = inside_mean(similar, inside)
+    return out
+
+
+def inside_mean(similar: F32, inside: NDArray[np.bool_]) -> float:
+    """Mean of a similarity map over the pixels inside, from 0 to 1; 0 where there are none."""
+    return max(0.0, float(similar[inside].mean())) if inside.any() else 0.0
+
+
+def similarity(a: F32, b: F32) -> F32:
+    """(H, W) SSIM of two pictures (H, W, 3) in [0, 1], mean over the channels, at half their size."""
+    height, width = a.shape[:2]
+    half = (max(1, width // 2), max(1, height // 2))
+    x, y = (np.asarray(cv2.resize(picture, half, interpolation=cv2.INTER_AREA), np.float32) for picture in (a, b))
+    mean_x, mean_y = _blurred(x), _blurred(y)
+    spread_x, spread_y = _blurred(x * x) - mean_x * mean_x, _blurred(y * y) - mean_y * mean_y
+    common = _blurred(x * y) - mean_x * mean_y
+    alike = (2.0 * mean_x * mean_y + C1) * (2.0 * common + C2)
+    alike /= (mean_x * mean_x + mean_y * mean_y + C1) * (spread_x + spread_y + C2)
+    small = alike.mean(axis=-1).astype(np.float32)
+    return np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_NEAREST), np.float32)
+
+
+def _blurred(picture: F32) -> F32:
+    return np.asarray(cv2.GaussianBlur(picture, (0, 0), SIGMA_PX, borderType=cv2.BORDER_REFLECT), np.float32)
+
+
+def _exposed(asset: RenderAsset, photo: Photo, rgb: F32) -> F32:
+    """The picture as the photo's camera exposed then, by the photo of its camera that was aligned nearest in time."""
+    mine = [found for found in asset.exposures if found.camera == photo.camera]
+    if not mine:
+        return rgb
+    affine = min(mine, key=lambda found: abs(found.time_s - photo.time_s)).affine
+    return np.asarray(np.clip(rgb @ affine[:, :3].T + affine[:, 3], 0.0, 1.0), np.float32)
+
+
+def _projected(boxes: F64, points: F64, intrinsics: F64, world_from_camera: F64) -> tuple[F64, F64, F64]:
+    """Pixels u, v and depths (N, P) of points (P, 3) of boxes (N, 7), in shares of their sizes; u, v mean nothing where
+    the depth is not positive."""
+    local = points * boxes[:, None, 4:7]
+    world = np.einsum("nij,npj->npi", world_from_boxes(boxes)[:, :3, :3], local) + boxes[:, None, :3]
+    camera = (world - world_from_camera[:3, 3]) @ world_from_camera[:3, :3]
+    depth = camera[..., 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u = intrinsics[0, 0] * camera[..., 0] / depth + intrinsics[0, 2]
+        v = intrinsics[1, 1] * camera[..., 1] / depth + intrinsics[1, 2]
+    return u, v, depth

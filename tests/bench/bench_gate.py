@@ -1,0 +1,188 @@
+"""What the gate on pictures catches and what it loses: `python -m tests.bench.bench_gate`.
+
+Drives that the reward accepts in runs of preset=demo on synthetic towns, every camera at 1 Hz from T to T+2H, before
+any gate. Each picture is labelled by what the painter of the town shows from the same pose with the same traffic:
+likeness (SSIM at half of 160 pixels' width, tasks/render/likeness.py) inside the outline of each vehicle that covers
+5 % of the picture or more; the worst counts. Limits were chosen on the first seeds and are reported on the others.
+Options: chosen=0,1 held=2 clips=9 out=out/bench_gate, drives=4 of each clip and expert, every=2 of the gate's instants.
+A later call with the same `out` reads <out>/labels-<seed>.csv and only prints. Pictures beside their truths, the worst
+first: <out>/labels-<seed>.png.
+"""
+
+import csv
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from factory.assets import asset_for
+from factory.imaging import album_of
+from factory.pipeline import FactoryWork, PerturbedClip
+from factory.sensors import chosen_cameras
+from factory.settings import assemble, load_config
+from factory.work import PreparedClip
+from tasks.render.asset import RenderAsset
+from tasks.render.gate import GateSettings, looked_at_size, unfit
+from tasks.render.likeness import Album
+from tasks.render.settings import STEPS_OF, Frames
+from tasks.world.clip import HORIZON_STEPS, NOW, Clip
+from tests.bench.gate_truth import Painted, Shown, Simulated, drives, verdicts
+
+BAD, GOOD = 0.7, 0.8  # likeness to the truth: below, something is torn or smeared; from there on, nothing is
+LIMITS = (0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8)
+EXPERTS = ("pdm_closed", "recovery")
+STORED = [NOW + HORIZON_STEPS + offset for offset in STEPS_OF[Frames.HISTORY]]  # steps of a clip
+SHEET = 60  # pictures of a sheet
+
+
+@dataclass(frozen=True)
+class Labelled:
+    """One picture's label, and what the gate goes by."""
+
+    log: str
+    drive: str
+    camera: str
+    step: int
+    likeness: float  # to the truth, of the worst large vehicle; 1 where there is none
+    share: float  # of the picture, of that vehicle; 0 where there is none
+    fault: str  # of the gate's other measures
+    expected: float  # the gate's expectation
+
+
+def labelled(seed: int, clips: int, most: int, every: int, out: Path) -> list[Labelled]:
+    """Runs the seed's towns, writes the labels and the sheet."""
+    overrides = [f"clips.seed={seed}", f"clips.n_clips={clips}", f"out={out}/town{seed}", "render.psnr_gate=mark"]
+    work = assemble(load_config(["preset=demo", *overrides])).work
+    settings, began = work.render.gate, time.perf_counter()
+    rows: list[Labelled] = []
+    worst: list[tuple[float, Shown]] = []
+    costs: list[list[float]] = []
+    for ref in work.reader.index().refs:
+        prepared = work.prepare(ref)
+        if not isinstance(prepared, PreparedClip) or not isinstance(prepared.payload, PerturbedClip):
+            print(f"{ref.log_id} at {ref.start_ms} ms: {prepared}", flush=True)
+            continue
+        clip = work.reader.read(ref)
+        asset = asset_for(clip, work.render, work.cache_dir, threads=2)
+        assert asset is not None, "a town has photos"
+        album, town = album_of(clip, asset, work.render), Painted(seed, ref.log_id)
+        timed_album = album_of(clip, asset, work.render)  # whose photos are opened while the clock runs
+        size = looked_at_size((work.render.width, work.render.height), settings)
+        rig = [camera.resized(*size) for camera in chosen_cameras(clip.cameras, work.render.cameras)]
+        for drive in drives(work, prepared.payload, EXPERTS, most):
+            name = f"{clip.clip_id}/{drive.expert}/{drive.candidate}"
+            costs.append([cpu_ms(drive, asset, clip, work, kept_album) for kept_album in (None, timed_album)])
+            for shown in town.pictures(drive, asset, rig, every):
+                likeness, share = shown.label(settings.vehicle_share)
+                fault, expectation = verdicts(shown, drive, asset, album, settings)
+                rows.append(Labelled(ref.log_id, name, shown.camera, shown.step, likeness, share, fault, expectation))
+                if share > 0.0:
+                    worst = sorted([*worst, (likeness, shown)], key=lambda found: found[0])[:SHEET]
+        print(
+            f"{ref.log_id} at {ref.start_ms} ms: {len(rows)} pictures, {time.perf_counter() - began:.0f} s", flush=True
+        )
+    whole = np.array([pair for pair in costs if np.isfinite(pair).all()])
+    without, held = whole.mean(axis=0)
+    print(f"gate of {len(whole)} drives that pass: {without:.0f} CPU ms a drive without photos, {held:.0f} with")
+    cv2.imwrite(str(out / f"labels-{seed}.png"), cv2.cvtColor(sheet(worst), cv2.COLOR_RGB2BGR))
+    return rows
+
+
+def cpu_ms(drive: Simulated, asset: RenderAsset, clip: Clip, work: FactoryWork, album: Album | None) -> float:
+    """CPU time of the gate on a drive [ms]; NaN where it refuses it, which ends it early."""
+    render, began = work.render, time.process_time()
+    cameras, size = chosen_cameras(clip.cameras, render.cameras), (render.width, render.height)
+    found = unfit(asset, cameras, drive.poses, drive.agents, drive.steps, size, render.gate, album=album, stored=STORED)
+    return 1e3 * (time.process_time() - began) if found is None else float("nan")
+
+
+def sheet(worst: Sequence[tuple[float, Shown]]) -> np.ndarray:
+    """Renderings beside their truths, three pairs a row, each with its label."""
+    tiles = []
+    for likeness, shown in worst:
+        tile = np.rint(255.0 * np.hstack([shown.picture, shown.truth])).astype(np.uint8)
+        cv2.putText(tile, f"{likeness:.2f}", (2, 12), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (255, 0, 0), 1)
+        tiles.append(tile)
+    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % 3)
+    return np.vstack([np.hstack(tiles[k : k + 3]) for k in range(0, len(tiles), 3)])
+
+
+def kept(path: Path, rows: Sequence[Labelled]) -> None:
+    """Writes labels as CSV."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, [field.name for field in fields(Labelled)])
+        writer.writeheader()
+        writer.writerows(asdict(row) for row in rows)
+
+
+def read(path: Path) -> list[Labelled]:
+    """Labels that `kept` wrote."""
+    with path.open(newline="", encoding="utf-8") as file:
+        found = [
+            row | {"step": int(row["step"])} | {name: float(row[name]) for name in ("likeness", "share", "expected")}
+            for row in csv.DictReader(file)
+        ]
+    return [Labelled(**row) for row in found]  # type: ignore[arg-type]
+
+
+def table(rows: Sequence[Labelled], limits: Sequence[float]) -> str:
+    """Per limit what is refused of the pictures with a large vehicle, by label, and of the drives, of which only the
+    stored pictures count."""
+    large = [row for row in rows if row.share > 0.0]
+    of = {
+        "bad": [row for row in large if row.likeness < BAD],
+        "fair": [row for row in large if BAD <= row.likeness < GOOD],
+        "good": [row for row in large if row.likeness >= GOOD],
+    }
+    everyone, poor = {row.drive for row in rows}, {row.drive for row in of["bad"] if row.step in STORED}
+    lines = [
+        f"{len(rows)} pictures of {len(everyone)} drives; with a vehicle of 5 % or more {len(large)}: "
+        + ", ".join(f"{len(found)} {name}" for name, found in of.items())
+        + f"; refused by the other measures: {sum(bool(row.fault) for row in of['bad'])} of the bad, "
+        f"{sum(bool(row.fault) for row in of['good'])} of the good",
+        "",
+        "| `vehicle_min` | bad caught | bad missed | fair lost | good lost | drives refused | with a bad picture "
+        "| drives with a bad picture let through |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for limit in limits:
+        caught, fair, good = (sum(row.expected < limit for row in found) for found in of.values())
+        refused = {row.drive for row in rows if row.expected < limit and row.step in STORED}
+        lines.append(
+            f"| {limit:g} | {caught} ({caught / max(len(of['bad']), 1):.0%}) | {len(of['bad']) - caught} "
+            f"| {fair} ({fair / max(len(of['fair']), 1):.0%}) | {good} ({good / max(len(of['good']), 1):.1%}) "
+            f"| {len(refused)} | {len(refused & poor)} | {len(poor - refused)} |"
+        )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Labels what is not labelled yet and prints the tables."""
+    options = dict(option.split("=", 1) for option in sys.argv[1:])
+    out = Path(options.pop("out", "out/bench_gate"))
+    clips, most, every = (int(options.pop(name, given)) for name, given in (("clips", 9), ("drives", 4), ("every", 2)))
+    towns = {
+        name: [int(s) for s in options.pop(name, given).split(",")]
+        for name, given in (("chosen", "0,1"), ("held", "2"))
+    }
+    if options:
+        raise SystemExit(f"no such option: {', '.join(options)}")
+    out.mkdir(parents=True, exist_ok=True)
+    for name, seeds in towns.items():
+        rows: list[Labelled] = []
+        for seed in seeds:
+            path = out / f"labels-{seed}.csv"
+            if not path.exists():
+                kept(path, labelled(seed, clips, most, every, out))
+            rows += read(path)
+        what = "limits were chosen on" if name == "chosen" else "held out"
+        print(f"\nseeds {', '.join(map(str, seeds))} ({what}): {table(rows, LIMITS)}")
+    print(f"\ndefault: vehicle_min={GateSettings().vehicle_min:g}")
+
+
+if __name__ == "__main__":
+    main()

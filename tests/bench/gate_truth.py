@@ -1,0 +1,146 @@
+"""Pictures of simulated drives through the synthetic town, each beside what the painter of the town shows from there.
+
+The drives are those that a run makes: candidates, experts, traffic that reacts. What a picture should show is painted
+at the same pose with everybody where the simulation has them, so a label says how wrong a picture is, whatever any
+gate thinks of it.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factory.clips.synthetic.draw import Theatre, paint
+from factory.clips.synthetic.drive import Drive
+from factory.clips.synthetic.town import log_name, plan_log
+from factory.imaging import GATE_STRIDE
+from factory.pipeline import FactoryWork, PerturbedClip
+from tasks.render.asset import RenderAsset
+from tasks.render.engine import Pinhole, Vehicles, render, vehicles_at
+from tasks.render.gate import GateSettings, composed, fault_of, measures
+from tasks.render.gaussians import F32, F64
+from tasks.render.likeness import Album, expected, eye_in_box, inside_mean, large_vehicles, outline_of, similarity
+from tasks.render.views import VISIBLE_M, pose_on_ground
+from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.camera import Camera
+from tasks.world.clip import HORIZON_STEPS, STEP_S, Clip
+
+NOTHING_LARGE = 1.0  # the likeness of a picture without any large vehicle
+MOST_LOGS = 10_000
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """One accepted drive at the instants that the gate looks at."""
+
+    clip: Clip
+    expert: str
+    candidate: int
+    poses: F64  # (F, 4, 4) world_from_ego
+    agents: AgentTracks  # of the clip's 96 steps
+    steps: tuple[int, ...]  # (F,)
+
+
+@dataclass(frozen=True)
+class Shown:
+    """One picture."""
+
+    camera: str
+    step: int
+    eye: Pinhole
+    world_from_ego: F64
+    there: Vehicles
+    picture: F32  # (H, W, 3) in [0, 1]
+    truth: F32
+
+    def label(self, share: float) -> tuple[float, float]:
+        """Likeness to the truth of the vehicle that is least like it, of those whose outline covers a share of the
+        picture, hidden or not; and that vehicle's share. (1, 0) where there is none."""
+        similar = similarity(self.picture, self.truth)
+        worst = (NOTHING_LARGE, 0.0)
+        for kind, box in zip(self.there.kinds, self.there.boxes, strict=True):
+            outline = outline_of(box, self.eye) if kind == AgentKind.VEHICLE else np.zeros(1, bool)
+            if outline.mean() >= share:
+                worst = min(worst, (inside_mean(similar, outline), float(outline.mean())))
+        return worst
+
+
+def drives(work: FactoryWork, payload: PerturbedClip, experts: Sequence[str], most: int) -> Iterator[Simulated]:
+    """Drives that the reward accepts, `most` of each expert, before any picture of them is looked at."""
+    for expert in experts:
+        found = 0
+        for index in range(len(payload.candidates)):
+            trace = work.trace(payload, index, expert) if found < most else None
+            if trace is None or trace.judged is None or trace.rejected is not None or trace.candidate is None:
+                continue
+            found += 1
+            start, now = trace.candidate.rollout.start_step, trace.judged.scene.step
+            steps = range(start, now + HORIZON_STEPS + 1, GATE_STRIDE)
+            states = np.concatenate([trace.candidate.rollout.ego_states, trace.judged.rollout.ego_states[1:]])
+            yield Simulated(
+                payload.clip,
+                expert,
+                index,
+                pose_on_ground(payload.clip.world_from_ego, states[[step - start for step in steps]]),
+                trace.judged.scene.agents.overwritten(now, trace.judged.rollout.agents),
+                tuple(steps),
+            )
+
+
+class Painted:
+    """A log of the synthetic town in which others than in the log may drive."""
+
+    def __init__(self, seed: int, log_id: str) -> None:
+        """Raises StopIteration for a log that the seed does not have."""
+        index = next(i for i in range(MOST_LOGS) if log_name(seed, i) == log_id)
+        self.town, self.drive = plan_log(seed, index)
+
+    def pictures(self, drive: Simulated, asset: RenderAsset, rig: Sequence[Camera], every: int) -> Iterator[Shown]:
+        """What the rig, in the size it has, shows at every `every`-th of the drive's instants."""
+        first, town = round(drive.clip.start_s / STEP_S), self.town
+        played = _with(self.drive, drive.agents, first)
+        theatre = Theatre(town.scenery, played, town.sun_azimuth, town.sun_elevation, town.sky_seed)
+        for pose, step in list(zip(drive.poses, drive.steps, strict=True))[::every]:
+            stage = theatre.at(first + step)
+            there = vehicles_at(drive.agents, step * STEP_S, pose[:2, 3], VISIBLE_M)
+            eyes = [Pinhole(c.intrinsics, pose @ c.ego_from_camera, c.width, c.height) for c in rig]
+            for camera, eye, seen in zip(rig, eyes, render(asset, eyes, there), strict=True):
+                truth = _unit(paint(stage, replace(camera, distortion=np.zeros(3)), pose))
+                yield Shown(camera.name, step, eye, pose, there, seen.rgb, truth)
+
+
+def verdicts(
+    shown: Shown, drive: Simulated, asset: RenderAsset, album: Album, settings: GateSettings
+) -> tuple[str, float]:
+    """What the gate says of a picture: the fault without regard to photos, "" for none; the likeness expected of the
+    large vehicle that is to be least like its photos."""
+    pose = shown.world_from_ego
+    there = vehicles_at(drive.agents, shown.step * STEP_S, pose[:2, 3], settings.reach_m)
+    scene = composed(asset, there, pose[:3, 3], settings.reach_m)
+    views = render(scene, [shown.eye])
+    fault = fault_of(measures(scene, [shown.eye], views, pose, settings)[0], settings)
+    least = NOTHING_LARGE
+    for j, _ in large_vehicles(there, shown.eye, views[0], settings.vehicle_share):
+        eye = eye_in_box(shown.eye.world_from_camera[:3, 3], there.boxes[j])
+        least = min(least, expected(album, there.track_ids[j], eye))
+    return "" if fault is None else fault[0], least
+
+
+def _with(drive: Drive, agents: AgentTracks, first: int) -> Drive:
+    """The log's drive with its tracks where `agents` are, from step `first` on."""
+    column = {track_id: j for j, track_id in enumerate(agents.track_ids)}
+    tracks = []
+    for track in drive.tracks:
+        j = column.get(track.track_id)
+        if j is not None:
+            poses = track.poses.copy()
+            known = poses[first : first + agents.n_steps]
+            known[:] = np.where(agents.valid[: len(known), j, None], agents.boxes[: len(known), j, :3], np.nan)
+            track = replace(track, poses=poses)
+        tracks.append(track)
+    return replace(drive, tracks=tuple(tracks))
+
+
+def _unit(rgb: NDArray[np.uint8]) -> F32:
+    return rgb.astype(np.float32) / np.float32(255.0)
