@@ -29,7 +29,7 @@ from tasks.kernels import kernel_sources
 from tests.mutants.records import PACKAGES, ROOT, Mutant, Stale, chosen, load, mutated
 
 GOAL = 0.97
-FAILED, PASSED, TIMED_OUT = 1, 0, -1  # pytest's, and ours
+FAILED, PASSED, TIMED_OUT = 1, 0, 1000  # pytest's, and ours
 NOTICED = {"killed", "timed out"}  # whoever runs the tests sees either
 NO_COPY = shutil.ignore_patterns(".*", "runs", "build", "dist", "__pycache__", "*.egg-info")
 
@@ -120,6 +120,8 @@ def tried(mutant: Mutant, copy: Copy, kernels: set[str]) -> tuple[str, str]:
     """killed, timed out, survived or broken, and what pytest said. Broken: its tests did not even begin."""
     with copy.having(mutant):
         status, said = copy.passes(mutant.tests, mutant.limit_s, mutant.interpreted, mutant.file in kernels)
+    if status < 0:  # died of a signal
+        status = FAILED
     return {FAILED: "killed", TIMED_OUT: "timed out", PASSED: "survived"}.get(status, "broken"), said
 
 

@@ -177,9 +177,9 @@ def test_a_plan_is_compared_with_what_the_one_before_wanted_at_the_same_time_of_
     ec = COLUMNS.index("ec")
     found = {
         delays: score_pair(now, before, (waving(delays[0]), waving(delays[1])))[0][0].unfiltered[ec]
-        for delays in ((0.5, 1.0), (1.0, 0.5))
+        for delays in ((0.5, 1.0), (1.0, 0.5), (0.5, 0.5))
     }
-    assert found == {(0.5, 1.0): 1.0, (1.0, 0.5): 0.0}
+    assert found == {(0.5, 1.0): 1.0, (1.0, 0.5): 0.0, (0.5, 0.5): 0.0}
 
 
 def test_the_rows_of_a_plan_do_not_depend_on_those_scored_before_it(clip: PreparedClip) -> None:

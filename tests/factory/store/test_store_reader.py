@@ -46,6 +46,13 @@ def test_the_tables_metadata_names_version_and_licences(out: Path) -> None:
     assert set(properties["factory.licences"].split("; ")) == licences and len(licences) > 1
 
 
+def test_licences_of_later_commits_are_added_to_those_that_are_named(tmp_path: Path) -> None:
+    for n in (1, 3):
+        execute(ToyWork(), refs(n), ["recovery", "human"], 2, Store(tmp_path), "local", say=lambda line: None)
+    named = set(Store(tmp_path).samples.properties["factory.licences"].split("; "))
+    assert named == set(SampleTable(tmp_path).table(["licence"])["licence"].to_pylist())
+
+
 def test_a_table_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=str(tmp_path)):
         SampleTable(tmp_path)

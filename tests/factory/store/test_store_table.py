@@ -126,6 +126,23 @@ def test_a_flipped_byte_is_found(location: Location) -> None:
         KeyedTable(location, SPEC).read()
 
 
+def test_no_flipped_byte_of_the_data_gives_other_rows(location: Location) -> None:
+    """Also where the page would still be decompressed: its checksum tells."""
+    table = KeyedTable(location, SPEC)
+    table.commit([shard(location, "abcdefgh")])
+    (path,) = Path(location.uri).rglob("*.parquet")
+    whole, rows = path.read_bytes(), KeyedTable(location, SPEC).read()
+    footer = int.from_bytes(whole[-8:-4], "little")
+    found = 0
+    for at in range(4, len(whole) - footer - 8):
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ 0x10]) + whole[at + 1 :])
+        try:
+            assert KeyedTable(location, SPEC).read() == rows, f"byte {at}"
+        except OSError:
+            found += 1
+    assert found > 0
+
+
 def test_row_groups_stay_below_4_mb(location: Location) -> None:
     spec = TableSpec("big", pa.schema([("key", pa.string()), ("blob", pa.binary())]), "key")
     big = pa.table({"key": list("abcde"), "blob": [bytes([i]) * (3 * 2**19) for i in range(5)]}, schema=spec.schema)

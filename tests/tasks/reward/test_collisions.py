@@ -38,6 +38,21 @@ def test_being_hit_from_behind_is_not_at_fault():
     assert scores.nc[0] == 1.0 and scores.ttc[0] == 1.0
 
 
+def test_being_hit_from_behind_is_not_at_fault_between_lanes_either():
+    """Where a contact at the side would be: what lies behind by more than 150 degrees is never the ego's fault."""
+    behind = Thing(-6.0, 1.5, 0.0, (5.0, 0.0))
+    assert score(street([behind]), drive(2.0, y=1.5)).nc[0] == 1.0
+    beside = Thing(0.5, 4.4, 0.0, (2.0, -1.0))
+    assert score(street([beside]), drive(2.0, y=1.5)).nc[0] == 0.0
+
+
+def test_a_car_ahead_that_drives_on_is_no_ttc_violation_and_one_that_stands_is():
+    """3 m behind it at 8 m/s: within 0.9 s the ego is where it was, not where it is then."""
+    ahead = Thing(FRONT + 3.0 + 2.0, 0.0, 0.0, (8.0, 0.0))
+    assert score(street([ahead]), drive(8.0)).ttc[0] == 1.0
+    assert score(street([replace(ahead, velocity=(0.0, 0.0))]), drive(8.0)).ttc_index[0] == 0.0
+
+
 def test_a_chaser_may_count_as_ahead_because_bearings_start_at_the_unprojected_ego():
     scores = score(street([Thing(-15.0, 0.0, 0.0, (12.0, 0.0))]), drive(5.0))
     assert scores.nc[0] == 1.0 and scores.ttc[0] == 0.0  # as the public metric does

@@ -21,6 +21,18 @@ def test_constant_speed_is_comfortable_and_braking_beyond_the_limit_is_not():
     assert 14 <= scores.hc_index[1] <= 20
 
 
+@pytest.mark.parametrize(
+    ("column", "low", "high"), [(AX, -4.05, 2.40), (AY, -4.89, 4.89)], ids=["along the road", "across"]
+)
+def test_a_steady_acceleration_is_comfortable_up_to_its_limit_to_either_side(column, low, high):
+    """As it always was: the filters leave a constant as it is, and its jerk is none."""
+    for value, comfortable in ((0.99 * low, 1.0), (1.01 * low, 0.0), (0.99 * high, 1.0), (1.01 * high, 0.0)):
+        states = drive(8.0)
+        past = past_of(states)
+        states[..., column], past[:, column] = value, value
+        assert score(street(past=past), states).hc[0] == comfortable, value
+
+
 def test_without_a_history_comfort_is_not_judged():
     hard = drive(8.0)
     hard[0, 20:, AX] = -5.0

@@ -50,6 +50,14 @@ def test_inside_an_intersection_no_direction_is_wrong():
     assert score(street(extra=[junction]), drive(6.0, y=4.0)).ddc[0] == 1.0
 
 
+def test_what_is_driven_against_traffic_inside_an_intersection_is_not_added_to_what_is_outside():
+    """0.6 m a step; the centre, 1.461 m before the axle, is outside for the first steps alone: less than 2 m."""
+    junction = rectangle("int_j", MapLayer.INTERSECTION, (3.0, 2), (120, 6))
+    scores = score(street(extra=[junction]), drive(6.0, y=4.0))
+    assert scores.ddc[0] == 1.0 and np.isinf(scores.ddc_index[0])
+    assert score(street(), drive(6.0, y=4.0)).ddc[0] == 0.0
+
+
 def test_lane_keeping_fails_after_twenty_steps_more_than_half_a_metre_off():
     scores = score(street(), np.concatenate([drive(3.0, y=0.6), drive(3.0, y=0.5)]))
     assert scores.lk.tolist() == [0.0, 1.0]
