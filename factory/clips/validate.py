@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 
 from factory.clips.reader import SPLITS, BadClip, ClipReader, ClipRef
-from tasks.world.agents import AgentKind
+from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.camera import Camera
 from tasks.world.clip import CLIP_STEPS, Clip
-from tasks.world.lanes import Lane, LightState, MapLayer, RoadMap
+from tasks.world.lanes import Lane, LightState, MapLayer, RoadMap, Route, TrafficLights
 from tasks.world.vehicle import EGO_STATE_SIZE
 
 Fault = tuple[str, str]  # the field, and what is wrong with it
+KINDS = {"agents": AgentTracks, "road_map": RoadMap, "route": Route, "lights": TrafficLights}
 MAPS_REMEMBERED = 4  # clips of a log share its map, and a reader keeps the last logs only
 
 
@@ -42,6 +43,12 @@ def validate_clip(clip: Clip, file: str) -> Clip:
 
 def _faults(clip: Clip) -> Iterator[Fault]:
     """In an order in which each check may rely on those before it."""
+    for field, kind in KINDS.items():
+        if not isinstance(getattr(clip, field), kind):
+            yield field, f"is a {type(getattr(clip, field)).__name__}, expected {kind.__module__}.{kind.__qualname__}"
+    for field in ("licence", "content_digest"):
+        if not isinstance(getattr(clip, field), str):
+            yield field, f"is a {type(getattr(clip, field)).__name__}, expected text"
     if clip.split not in SPLITS:
         yield "split", f"{clip.split!r} is none of {', '.join(SPLITS)}"
     yield from _array("ego_states", clip.ego_states, (CLIP_STEPS, EGO_STATE_SIZE))
@@ -90,10 +97,10 @@ def map_fault(road_map: RoadMap) -> Fault | None:
 
 def _map_faults(road_map: RoadMap) -> Iterator[Fault]:
     lanes = road_map.lanes
-    if not any(lane.drives_cars for lane in lanes.values()):
-        yield "road_map.lanes", "no lane for cars"
     for lane_id, lane in lanes.items():
         yield from _lane_faults(f"road_map.lanes[{lane_id!r}]", lane_id, lane)
+    if not any(lane.drives_cars for lane in lanes.values()):
+        yield "road_map.lanes", "no lane for cars"
     for i, area in enumerate(road_map.drivable_areas):
         if not isinstance(area.layer, MapLayer):
             yield f"road_map.drivable_areas[{i}].layer", f"{area.layer!r}: expected tasks.world.lanes.MapLayer"
@@ -106,7 +113,9 @@ def _map_faults(road_map: RoadMap) -> Iterator[Fault]:
         yield "road_map.roadblock_of", f"names lanes that are not on the map: {_some(unknown)}"
 
 
-def _lane_faults(field: str, lane_id: str, lane: Lane) -> Iterator[Fault]:
+def _lane_faults(field: str, lane_id: str, lane: Any) -> Iterator[Fault]:
+    if not isinstance(lane, Lane):
+        yield field, f"is a {type(lane).__name__}, expected tasks.world.lanes.Lane"
     if lane.lane_id != lane_id:
         yield field, f"its lane_id is {lane.lane_id!r}"
     yield from _ring(f"{field}.ring", lane.ring)
