@@ -17,6 +17,8 @@ from pathlib import Path
 import pytest
 
 from factory.store.reader import SampleTable
+from factory.warm import compile_kernels
+from tasks.kernels import cache_dir
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow]
 
@@ -32,6 +34,7 @@ LISTENERS = (
     "--ray-client-server-port",
 )
 UPLOADED = ("factory", "tasks", "planners", "conf", "pyproject.toml", ".rayignore", ".gitignore")
+PARTS = ["judge", "drive"]  # of factory.warm
 LEFT_AT_HOME = (  # what lies in a checkout that was worked with
     "runs/demo/samples/shard.parquet",
     ".venv/lib/library.py",
@@ -49,16 +52,14 @@ class Head:
     """A running head node."""
 
     address: str  # of the dashboard
-    folder: Path  # of its sessions
+    folder: Path  # of its sessions, and home of its user
     environment: dict[str, str]
 
     def submit(self, checkout: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
         """`ray job submit` as the README has it; waits for the job's end."""
         command = [*RAY, "job", "submit", "--address", self.address, "--working-dir", ".", "--"]
         command += ["python", "-m", "factory.run", *arguments]
-        return subprocess.run(
-            command, cwd=checkout, env=self.environment, capture_output=True, text=True, timeout=600
-        )  # kernels are compiled again for the uploaded copy
+        return subprocess.run(command, cwd=checkout, env=self.environment, capture_output=True, text=True, timeout=250)
 
 
 def free_ports(count: int) -> list[int]:
@@ -72,7 +73,9 @@ def free_ports(count: int) -> list[int]:
 @pytest.fixture(scope="module")
 def head() -> Iterator[Head]:
     """`ray start --head` on loopback, with a token of its own; ended by its pid (`ray stop` would end every Ray)."""
-    environment = {key: value for key, value in os.environ.items() if not key.startswith(("RAY_", "PYTHONPATH"))}
+    environment = {
+        key: value for key, value in os.environ.items() if not key.startswith(("RAY_", "NUMBA_", "PYTHONPATH"))
+    }
     environment |= {
         "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
         "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
@@ -82,6 +85,7 @@ def head() -> Iterator[Head]:
         "OMP_NUM_THREADS": "1",
     }
     folder = Path(tempfile.mkdtemp(prefix="ray-", dir="/tmp"))  # short: Ray's sockets lie below it
+    environment |= {"HOME": str(folder), "XDG_CACHE_HOME": str(folder / "cache")}
     ports = free_ports(len(LISTENERS))
     listeners = [text for flag, port in zip(LISTENERS, ports) for text in (flag, str(port))]
     command = [*RAY, "start", "--head", "--block", "--node-ip-address=127.0.0.1", "--dashboard-host=127.0.0.1"]
@@ -108,10 +112,8 @@ def _wait_until_it_answers(head: Head, process: "subprocess.Popen[bytes]") -> No
     raise AssertionError((head.folder / "head.log").read_text())
 
 
-@pytest.fixture
-def checkout(tmp_path: Path) -> Path:
+def checkout(root: Path) -> Path:
     """The project as a user has it who has already worked with it: with results, environment and caches beside it."""
-    root = tmp_path / "checkout"
     root.mkdir()
     for name in UPLOADED:
         source = REPOSITORY / name
@@ -125,23 +127,29 @@ def checkout(tmp_path: Path) -> Path:
     return root
 
 
-def test_a_submitted_job_makes_the_table_and_the_same_command_resumes(
-    head: Head, checkout: Path, tmp_path: Path
+def give_compiled_kernels(head: Head) -> Path:
+    """What a run without images needs, as a first job leaves it in the user's cache; compiled once for all tests."""
+    compile_kernels(PARTS)
+    cache = head.folder / "cache" / "driving-data-factory" / cache_dir().name
+    for part in PARTS:
+        (marker,) = cache_dir().glob(f"compiled-*-{part}")
+        for name in (marker.name, *marker.read_text().splitlines()):
+            (cache / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(cache_dir() / name, cache / name)
+    return cache
+
+
+def test_the_command_as_it_stands_makes_the_table_from_one_copy_of_the_project_and_goes_on_from_another(
+    head: Head, tmp_path: Path
 ) -> None:
-    out = tmp_path / "out"
-    command = (
-        "clips.n_clips=1",
-        "clips.settings.cameras=[]",
-        "clips.settings.lidar_beams=0",
-        f"clips.cache_dir={tmp_path / 'towns'}",
-        "vocabulary.k=64",
-        "experts=[human]",
-        "render=none",
-        f"out={out}",
-    )
-    first = head.submit(checkout, *command)
-    assert first.returncode == 0, first.stdout + first.stderr
-    assert "succeeded" in first.stdout
+    first, second = checkout(tmp_path / "first"), checkout(tmp_path / "second")
+    cache = give_compiled_kernels(head)
+    small = ("clips.n_clips=1", "clips.settings.cameras=[]", "clips.settings.lidar_beams=0", "render=none")
+    command = ("rounds=5", *small, "vocabulary.k=64", "experts=[human]")
+    made = head.submit(first, *command)
+    assert made.returncode == 0, made.stdout + made.stderr
+    assert "succeeded" in made.stdout
+    out = head.folder / "driving-data-factory" / "runs" / "synthetic"
     assert len(SampleTable(out)) == 1
 
     packages = list(head.folder.glob("session_*/runtime_resources/working_dir_files/_ray_pkg_*/"))
@@ -150,13 +158,19 @@ def test_a_submitted_job_makes_the_table_and_the_same_command_resumes(
     assert {"factory/run.py", "tasks/perturb.py", "conf/run.yaml"} <= arrived
     assert not set(LEFT_AT_HOME) & arrived
 
-    again = head.submit(checkout, *command)
+    compiled = {path: path.stat().st_mtime_ns for path in cache.glob("**/*.kernel")}
+    (second / "README.md").write_text("another upload")
+    again = head.submit(second, *command, "experts=[human,recovery]")
     assert again.returncode == 0, again.stdout + again.stderr
-    assert "executed 0 perturb tasks" in again.stdout
     assert "found 1 attempts done" in again.stdout
-    assert len(SampleTable(out)) == 1
+    assert len(SampleTable(out)) > 1
+    assert (
+        len({path.name for path in head.folder.glob("session_*/runtime_resources/working_dir_files/_ray_pkg_*/")}) == 2
+    )
+    assert "compiling kernels" not in made.stdout + again.stdout
+    assert {path: path.stat().st_mtime_ns for path in cache.glob("**/*.kernel")} == compiled, "nothing is compiled"
 
-    lost = head.submit(checkout, *command[:-1], "out=runs/here")
+    lost = head.submit(first, *command, "out=runs/here")
     assert lost.returncode != 0
     assert "name an absolute path or a URL" in lost.stdout + lost.stderr
     assert "exit code 2" in lost.stdout + lost.stderr
