@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from factory.benchmark import BenchmarkSettings
-from factory.clips.reader import ClipIndex, ClipReader
+from factory.clips.reader import BadClip, ClipIndex, ClipReader
 from factory.config import ConfigError, build, compose, fill, need_run_extra
 from factory.job import in_submitted_job
 from factory.pipeline import FactoryWork
 from factory.reward_settings import RewardSettings
 from factory.run_keys import RunKeys, VocabularyChoice
+from factory.sensors import chosen_cameras
 from factory.vocabulary import (
     build_recovery_table,
     load_recovery_table,
@@ -41,6 +42,7 @@ from tasks.stages import stage_versions
 from tasks.vocabulary import Vocabulary
 
 KINEMATIC_K = 1024
+RIGS_LOOKED_AT = 3  # clips, for the names of their cameras
 KINDS = (
     "human",
     "pdm_closed",
@@ -149,6 +151,7 @@ def assemble(config: RunConfig) -> Run:
         labelling = choose_labelling(config, vocabulary)
         refuse_wrong_recovery(config)
         reader, index = open_reader(config.clips)
+        refuse_unknown_cameras(config, reader, index)
         experts = {name: build_expert(name, config, reader, index, vocabulary) for name in config.experts}
     except ValueError as error:
         raise error if isinstance(error, ConfigError) else ConfigError(str(error)) from error
@@ -177,6 +180,26 @@ def refuse_wrong_recovery(config: RunConfig) -> None:
             sources, _ = recovery_settings(config, name)
             if sources.table is not None and not Path(sources.table).is_file():
                 raise ConfigError(f"expert.{name}.table={sources.table}: there is no such file")
+
+
+def refuse_unknown_cameras(config: RunConfig, reader: ClipReader, index: ClipIndex) -> None:
+    """Raises ConfigError where render.cameras names one that the rig of the first readable clip with cameras lacks.
+
+    Rigs that differ from log to log are told apart by the attempts themselves.
+    """
+    wanted = config.render.cameras
+    if not wanted or config.render.mode is RenderMode.NONE:
+        return
+    for ref in index.refs[:RIGS_LOOKED_AT]:
+        try:
+            rig = reader.read(ref).cameras
+        except BadClip:
+            continue
+        if not rig and config.render.mode is RenderMode.MAP:
+            rig = RIGS[config.render.map_rig]
+        if rig:
+            chosen_cameras(rig, wanted)
+            return
 
 
 def recovery_settings(config: RunConfig, name: str) -> tuple[RecoverySources, RecoverySettings]:

@@ -241,7 +241,7 @@ def test_every_configuration_file_is_listed_as_package_data() -> None:
     import tomllib
 
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["setuptools"]
-    assert project["package-dir"] == {"factory.conf": "conf"}
+    assert (REPOSITORY / "factory" / "conf").resolve() == REPOSITORY / "conf"
     assert "*.yaml" in project["package-data"]["*"]
     folders = {path.parent.relative_to(REPOSITORY) for path in (REPOSITORY / "conf").rglob("*.yaml")}
     assert {".".join(("factory", *folder.parts)) for folder in folders} <= set(project["packages"])

@@ -34,6 +34,7 @@ def run(*argv: str, says: Sequence[str]) -> Wrong:
     return Wrong(("run", *argv), tuple(says))
 
 
+STREET = ("clips=custom", "clips._target_=tests.factory.street_reader.StreetReader")
 MISTYPED = [  # told before anything heavy is imported
     run("rounsd=5", says=["rounsd: there is no such setting", "did you mean rounds=?"]),
     run("render.widht=3", says=["did you mean render.width=?"]),
@@ -75,6 +76,7 @@ WRONG = [
     run("vocabulary.file=nowhere.npy", says=["nowhere.npy", "No such file"]),
     run("vocabulary.file=broken.npy", says=["broken.npy: not readable as a numpy file: it holds no plain numbers"]),
     run("vocabulary.file=shape.npy", says=["shape.npy: trajectories have shape (3, 4), expected (K >= 1, 40, 3)"]),
+    run(*STREET, "render=map", "render.cameras=[nowhere]", says=["no camera nowhere; this rig has front_left, front"]),
     run("expert.recovery.smooth=maybe", says=["expert.recovery.smooth: must be true or false"]),
     run("expert.recovery.table=nowhere.npz", says=["nowhere.npz: there is no such file"]),
     Wrong(("plan", "rounsd=5"), ("did you mean rounds=?",)),
@@ -114,7 +116,7 @@ def test_a_wrong_input_ends_with_its_code_and_one_line_and_writes_nothing(
     before = contents(folder)
     argv = wrong.argv
     if argv[0] == "run" and not any(word.startswith("out=") for word in argv):
-        argv = (*argv, "out=here", "render=none")
+        argv = ("run", "render=none", *argv[1:], "out=here")
     assert main(argv) == wrong.code
     said = capsys.readouterr()
     assert said.err.startswith("error: ") and said.err.count("\n") == 1, said.err
