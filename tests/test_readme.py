@@ -30,9 +30,10 @@ from factory.run import main as run_main
 from factory.settings import load_config
 from factory.show import main as show_main
 from factory.store.verify import main as verify_main
-from planners.agreement import AgreementSettings
+from planners.agreement import main as agreement_main
 from planners.analysis import AnalysisSettings
 from planners.compare import CompareSettings
+from planners.compare import main as compare_main
 from planners.evaluate import settings_of as evaluate_settings
 from planners.replay import settings_of as replay_settings
 from planners.scaling import ScalingSettings
@@ -165,10 +166,15 @@ def test_every_command_is_one_its_program_takes(
             fill(TrainConfig, compose("train", given(arguments)), "train")
         case ["python", "-m", "planners.evaluate" | "planners.ensemble", *arguments]:
             evaluate_settings([argument for argument in arguments if not argument.startswith("models=")])
+        case ["python", "-m", "planners.compare", *arguments] if any(word.startswith("table=") for word in arguments):
+            monkeypatch.chdir(REPOSITORY)  # the study's tables lie there
+            assert compare_main(arguments) == 0, capsys.readouterr().err
         case ["python", "-m", "planners.compare", *arguments]:
             fill(CompareSettings, compose("compare", arguments), "compare")
         case ["python", "-m", "planners.agreement", *arguments]:
-            fill(AgreementSettings, pairs(arguments), "agreement")
+            monkeypatch.chdir(REPOSITORY)
+            kept = [word for word in arguments if not word.startswith("out=")]
+            assert agreement_main([*kept, f"out={demo_home / 'agreement.png'}"]) == 0, capsys.readouterr().err
         case ["python", "-m", "planners.scaling", *arguments]:
             fill(ScalingSettings, compose("scaling", arguments), "scaling")
         case ["python", "-m", "planners.replay", *arguments]:
