@@ -281,14 +281,14 @@ def test_redo_replaces_the_rows_of_an_expert_whose_inputs_changed_and_no_others(
 def test_a_redo_that_fails_midway_keeps_the_old_walk(tmp_path: Path, begun: Callable[..., Path]) -> None:
     begun(rounds=3, n=1)
     old = tables_of(tmp_path / "out")[0]
-    changed = ToyWork(threshold=0.3, trouble={"log0:0:recovery:1": "bug"})
+    changed = ToyWork(threshold=0.3, trouble={"log0:0:recovery:3": "bug"})  # the first of three is made by then
     assert run(tmp_path / "out", changed, rounds=3, n=1, on_change="redo").exit_code == COMPLETE_WITH_FAILURES
     mine = pc.equal(old["expert"], "recovery")
     now = tables_of(tmp_path / "out")[0]
     assert_same_rows(now.filter(pc.equal(now["expert"], "recovery")), old.filter(mine))
     again = replace(changed, journal=str(tmp_path / "journal"))
     assert run(tmp_path / "out", again, rounds=3, n=1, on_change="redo").exit_code == COMPLETE_WITH_FAILURES
-    assert ran(again.journal, "attempt log0:0:recovery:1 ") == 0, (
+    assert ran(again.journal, "attempt log0:0:recovery:3 ") == 0, (
         "what this redo failed at stands until it is asked for"
     )
     mended = replace(changed, trouble={})
