@@ -11,6 +11,7 @@ from planners.scores import scores_of
 from planners.study_frames import FRAMES, StudyFrames, read_frames, write_frames
 from tests.planners.made_rows import clip_rows
 
+LOGS = Path(__file__).parents[2] / "docs" / "study" / "logs"
 SCORES = {0: 0.5, 1: 0.6, 2: 0.75}  # by rounds
 
 
@@ -76,6 +77,17 @@ def test_bounds_are_those_that_were_evaluated(tmp_path: Path) -> None:
     (row,) = bounds(frames.clips)
     assert row["planner"] == "pdm_closed" and row["stage_two"] == pytest.approx(80.0)
     assert bounds({}) == []
+
+
+@pytest.mark.parametrize("table", ["scaling", "comparisons", "bounds"])
+def test_the_committed_tables_are_those_of_the_committed_rows(tmp_path: Path, table: str) -> None:
+    folder = LOGS / "av2_7fab2350" / "stage_two"
+    write_tables(read_frames(folder / FRAMES), tmp_path)
+    kept, made = ((where / f"{table}.csv").read_text().splitlines() for where in (folder, tmp_path))
+    assert len(kept) == len(made) > 1 and kept[0] == made[0]
+    for line, again in zip(kept[1:], made[1:]):
+        for cell, other in zip(line.split(","), again.split(","), strict=True):
+            assert cell == other or float(cell) == pytest.approx(float(other), abs=2e-3)
 
 
 def test_the_tables_are_made_again_to_the_byte_of_the_rows_alone(

@@ -112,7 +112,11 @@ def test_intervals_stand_over_clips_logs_and_towns_for_both_filters(study: Path)
     assert said.startswith("Scores are filtered") and "; logs " in said and "; towns " in said
 
 
-@pytest.mark.parametrize("frames", sorted(STUDY.glob("**/frames.parquet")), ids=lambda path: path.parent.name)
+@pytest.mark.parametrize(
+    "frames",
+    [path.with_name(FRAMES) for path in sorted(STUDY.glob("**/trainings.csv")) if path.with_name(FRAMES).is_file()],
+    ids=lambda path: path.parent.name,
+)
 def test_the_committed_tables_are_those_of_the_committed_rows(frames: Path) -> None:
     kept = read_frames(frames)
     scores = {label: scores_of_clips(clips) for label, clips in kept.clips.items()}
