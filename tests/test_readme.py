@@ -37,6 +37,7 @@ from planners.compare import main as compare_main
 from planners.evaluate import settings_of as evaluate_settings
 from planners.replay import settings_of as replay_settings
 from planners.scaling import ScalingSettings
+from planners.scaling_table import TableSettings
 from planners.study_plan import StudySettings
 from planners.study_report import ReportSettings
 from planners.train import TrainConfig
@@ -177,6 +178,8 @@ def test_every_command_is_one_its_program_takes(
             assert agreement_main([*kept, f"out={demo_home / 'agreement.png'}"]) == 0, capsys.readouterr().err
         case ["python", "-m", "planners.scaling", *arguments]:
             fill(ScalingSettings, compose("scaling", arguments), "scaling")
+        case ["python", "-m", "planners.scaling_table", *arguments]:
+            fill(TableSettings, pairs(arguments), "scaling_table")
         case ["python", "-m", "planners.replay", *arguments]:
             replay_settings(arguments)
         case ["python", "-m", "planners.study", *arguments]:
