@@ -47,8 +47,8 @@ def test_being_hit_from_behind_is_not_at_fault_between_lanes_either():
 
 
 def test_a_car_ahead_that_drives_on_is_no_ttc_violation_and_one_that_stands_is():
-    """3 m behind it at 8 m/s: within 0.9 s the ego is where it was, not where it is then."""
-    ahead = Thing(FRONT + 3.0 + 2.0, 0.0, 0.0, (8.0, 0.0))
+    """0.2 m behind it at 8 m/s: within 0.9 s the ego is where it was, not where it is then."""
+    ahead = Thing(FRONT + 0.2 + 2.0, 0.0, 0.0, (8.0, 0.0))
     assert score(street([ahead]), drive(8.0)).ttc[0] == 1.0
     assert score(street([replace(ahead, velocity=(0.0, 0.0))]), drive(8.0)).ttc_index[0] == 0.0
 
