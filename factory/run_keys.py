@@ -9,7 +9,8 @@ from importlib import import_module
 from typing import Any, Literal
 
 from factory.commands import nearest
-from factory.config import fill
+from factory.completion import settings_of
+from factory.config import ConfigError, conf_dir, fill
 
 MOST_K = 2**17  # of a kinematic vocabulary: 126 MB of trajectories, eight times the largest in use
 GROUPS = {
@@ -97,7 +98,52 @@ def check(values: Mapping[str, Any], overrides: Sequence[str]) -> None:
     Raises ConfigError. Everything else is held against its type when the run is put together.
     """
     fill(RunKeys, {key: value for key, value in values.items() if key not in GROUPS}, "")
-    named = {word.lstrip("+~").partition("=")[0].partition(".")[0] for word in overrides}
-    for group in sorted(named & set(GROUPS) & set(values)):
+    keys = [word.lstrip("+~").partition("=")[0] for word in overrides]
+    for key in keys:
+        refuse_other_kind(values, key)
+    for group in sorted({key.partition(".")[0] for key in keys} & set(GROUPS) & set(values)):
         module, _, name = GROUPS[group].partition(":")
         fill(getattr(import_module(module), name), values[group], group)
+
+
+def refuse_other_kind(values: Mapping[str, Any], key: str) -> None:
+    """Raises ConfigError where a group's setting is text and its default a number, or none of its choices.
+
+    What conf/ says is enough for that; the types of some groups take a second to import.
+    """
+    group, _, inner = key.partition(".")
+    value = at(values, key)
+    if group not in GROUPS or not inner or not isinstance(value, str):
+        return
+    default = at(default_group(group), inner)
+    choices = settings_of([]).get(key, [])
+    if isinstance(default, bool):
+        wrong = "must be true or false"
+    elif isinstance(default, int | float):
+        wrong = "must be a number"
+    elif choices and value not in choices:
+        wrong = f"must be {' or '.join(filter(None, (', '.join(choices[:-1]), choices[-1])))}{nearest(value, choices)}"
+    else:
+        return
+    raise ConfigError(f"{key}: {wrong} (got {value!r})")
+
+
+def default_group(group: str) -> Mapping[str, Any]:
+    """The file of the choice that conf/run.yaml makes for a group; its own keys for what is no folder of choices."""
+    from omegaconf import OmegaConf
+
+    run: Any = OmegaConf.to_container(OmegaConf.load(conf_dir() / "run.yaml"))
+    choice = next((line[group] for line in run["defaults"] if isinstance(line, dict) and group in line), None)
+    if choice is None:
+        return dict(run[group])
+    chosen: Any = OmegaConf.to_container(OmegaConf.load(conf_dir() / group / f"{choice}.yaml"))
+    return dict(chosen)
+
+
+def at(tree: Any, key: str) -> Any:
+    """The value of a dotted key; None where there is none."""
+    for part in key.split("."):
+        if not isinstance(tree, Mapping) or part not in tree:
+            return None
+        tree = tree[part]
+    return tree

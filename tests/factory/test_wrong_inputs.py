@@ -5,12 +5,17 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from factory.__main__ import main
+from factory.completion import settings_of
+from factory.config import ConfigError, fill
+from factory.run_keys import GROUPS
+from tasks.render.rigs import RIGS
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 HEAVY = ("numpy", "numba", "scipy", "shapely", "pyarrow", "deltalake", "ray", "torch", "cv2")
@@ -58,6 +63,10 @@ MISTYPED = [  # told before anything heavy is imported
     run("--config-dir", "nowhere", says=["nowhere: there is no such folder"]),
     run("--cfg", "all", says=["--cfg all: the settings of the run alone are shown"]),
     run("vocabulary.k=99999999", says=["k=99999999", "at most 131,072"]),
+    run("perturb.epdms_min=high", says=["perturb.epdms_min: must be a number (got 'high')"]),
+    run("render.mode=atuo", says=["render.mode: must be auto, map or none; did you mean auto?"]),
+    run("pdm.shared_lead_memory=maybe", says=["pdm.shared_lead_memory: must be true or false"]),
+    run("benchmark.min_follow_ups=many", says=["benchmark.min_follow_ups: must be a number"]),
     run("out=", says=["out= is empty", "variable"]),
     run("out=a_file", says=["a_file is not a folder"]),
     run("out=a_file/below", says=["a_file is not a folder"]),
@@ -66,8 +75,8 @@ MISTYPED = [  # told before anything heavy is imported
 WRONG = [
     *MISTYPED,
     run("out=ftp://host/x", says=["a URL of s3, gs"]),
-    run("perturb.epdms_min=high", says=["perturb.epdms_min: must be a number (got 'high')"]),
-    run("render.backend=gpu", says=["render.backend: must be cpu or gsplat"]),
+    run("reward.traffic=x", says=["reward.traffic: must be replay or idm"]),
+    run("perturb.epdms_min=1.5", says=["epdms_min must be from 0 to 1"]),
     run("clips=av2", "clips.root=nowhere", says=["nowhere: no such folder"]),
     run("clips=av2", "clips.root=a_file", says=["a_file: no such folder"]),
     run("clips=av2", "clips.root=a_folder", says=["a_folder: no Argoverse 2 sensor log here"]),
@@ -141,13 +150,17 @@ def test_a_mistyped_word_imports_nothing_heavy(folder: Path) -> None:
     assert done.stdout.splitlines()[-1:] == ["loaded []"], done.stderr
 
 
-def test_a_group_s_wrong_value_imports_its_group_alone(folder: Path) -> None:
-    code = (
-        "import sys; from factory.__main__ import main\n"
-        "assert main(['run', 'pdm.shared_lead_memory=maybe']) == 2\n"
-        f"print('loaded', [name for name in {HEAVY[2:]} if name in sys.modules])"
-    )
-    assert python(folder, "-c", code).stdout.splitlines()[-1:] == ["loaded []"]
+def test_the_choices_that_conf_lists_for_a_setting_are_those_of_its_type() -> None:
+    of_groups = {key: choices for key, choices in settings_of([]).items() if "." in key and choices}
+    listed = {key: choices for key, choices in of_groups.items() if key.partition(".")[0] in GROUPS}
+    for key, choices in listed.items():
+        group, _, inner = key.partition(".")
+        if set(choices) == {"true", "false"} or "." in inner or key == "render.map_rig":
+            continue
+        module, _, name = GROUPS[group].partition(":")
+        with pytest.raises(ConfigError, match=rf"must be {'.*'.join(choices)} "):
+            fill(getattr(import_module(module), name), {inner: "nothing"}, group)
+    assert set(settings_of([])["render.map_rig"]) == set(RIGS)
 
 
 def test_a_bucket_without_credentials_is_refused_before_any_work(folder: Path) -> None:
