@@ -12,6 +12,7 @@ from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.clip import CLIP_STEPS, NOW, STEP_S, Rollout, Scene, scene_of_clip
 from tasks.world.frames import box_corners
 from tasks.world.lanes import Lane, LightState, TrafficLights
+from tasks.world.vehicle import PACIFICA
 from tests.tasks.rollout import worlds
 from tests.tasks.rollout.worlds import Track
 
@@ -63,6 +64,23 @@ def test_a_follower_brakes_for_the_ego_where_the_egos_body_is() -> None:
     rollout = run(next_scene(scene, run(scene), scene.centerline))
     nose = rollout.agents.boxes[-1, 0, 0] + worlds.CAR[0] / 2.0
     assert 30.0 - 1.127 - 4.0 < nose < 30.0 - 1.127 - 0.9
+
+
+def test_the_ego_is_for_others_what_a_car_of_its_size_about_its_true_centre_is() -> None:
+    size = (PACIFICA.length, PACIFICA.width)
+    parked = Track(30.0 + PACIFICA.rear_axle_to_center, 0.0, 0.0, 0.0, AgentKind.VEHICLE, size)
+    behind = Track(0.0, speed=8.0)
+    ego = run(worlds.scene(worlds.straight_road(), behind, ego=(30.0, 0.0, 0.0)))
+    car = run(worlds.scene(worlds.straight_road(), behind, parked))
+    np.testing.assert_allclose(ego.agents.boxes[:, 0], car.agents.boxes[:, 0], atol=1e-9)
+
+
+def test_who_was_driven_once_stays_so_also_where_a_later_rollout_drives_others() -> None:
+    scene = worlds.scene(worlds.straight_road(), Track(0.0, speed=8.0), Track(40.0, speed=8.0), Track(80.0, speed=8.0))
+    before = replace(scene, ever_simulated=np.array([True, False, False]))
+    rollout = replace(run(scene), simulated=np.array([False, True, False]))
+    after = next_scene(before, rollout, scene.centerline)
+    assert after.ever_simulated is not None and after.ever_simulated.tolist() == [True, True, False]
 
 
 def test_a_car_leaves_its_first_segment_and_takes_the_fork_its_log_takes() -> None:
