@@ -30,6 +30,7 @@ from factory.run import main as run_main
 from factory.settings import load_config
 from factory.show import main as show_main
 from factory.store.verify import main as verify_main
+from planners.__main__ import main as planners_main
 from planners.agreement import main as agreement_main
 from planners.analysis import AnalysisSettings
 from planners.compare import CompareSettings
@@ -191,6 +192,10 @@ def test_every_command_is_one_its_program_takes(
         case ["python", "-m", "tests.bench.bench_kitti", _, *arguments]:
             known = {field.name for field in fields(FitSettings)} | {"out", "validate", "threads", "first", "last"}
             assert set(pairs(given(arguments))) <= known
+        case ["python", "-m", module] if module.startswith("tests.bench."):
+            assert find_spec(module) is not None  # it measures for minutes
+        case ["python", "-m", "planners"]:
+            assert planners_main(["--help"]) == 0
         case ["ray", "job", action, *rest]:
             assert action in JOB_COMMANDS and set(options_of(rest)) <= JOB_OPTIONS
         case ["ray", action, *_]:
