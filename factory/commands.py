@@ -50,6 +50,7 @@ PLANNERS: Mapping[str, Command] = {
     "evaluate": Command("EPDMS of planners on held-out clips", "planners.evaluate", takes="words"),
     "compare": Command("how two evaluated planners differ, with intervals", "planners.compare", takes="words"),
     "scaling": Command("how scores grow with simulated data, and the law behind it", "planners.scaling", takes="words"),
+    "scaling_table": Command("a sweep's tables from its frames", "planners.scaling_table", takes="words"),
     "replay": Command("a planner on one clip as a film", "planners.replay", takes="words"),
     "ensemble": Command("several GTRS-Dense models evaluated as one", "planners.ensemble", takes="words"),
     "analysis": Command("EPDMS on real and simulated frames, and by scenario tag", "planners.analysis", takes="words"),
@@ -68,7 +69,7 @@ def nearest(word: str, known: Sequence[str]) -> str:
 
 def listed(commands: Mapping[str, Command]) -> str:
     """Every command in one line."""
-    return "\n".join(f"  {name:<13}{command.about}" for name, command in commands.items())
+    return "\n".join(f"  {name:<14}{command.about}" for name, command in commands.items())
 
 
 def dispatch(argv: Sequence[str], commands: Mapping[str, Command], about: str) -> int:

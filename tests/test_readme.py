@@ -137,6 +137,8 @@ def test_every_command_is_one_its_program_takes(
             assert door_main(["completion", "bash"]) == 0
         case ["python", "-m", "factory"]:
             assert door_main(["--help"]) == 0
+        case ["python", "-m", "planners"]:
+            assert planners_main(["--help"]) == 0
         case ["python", "-m", "factory", "plan" | "run", *arguments]:
             load_config(given(arguments))
         case ["python", "-m", "factory", *arguments]:
