@@ -20,8 +20,7 @@ from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.protocol import Plan
 from tasks.kernels import USED, cache_dir, not_kept, processor, write_whole
 from tasks.kinematic_vocabulary import kinematic_trajectories
-from tasks.render.warm import compile_fit_kernels
-from tasks.render.warm import compile_kernels as compile_render_kernels
+from tasks.render import warm as render_warm
 from tasks.reward.labels import Labelling, vocabulary_labels
 from tasks.reward.reactive import reactive_scores
 from tasks.reward.verdicts import INDEX_FROM_ROWS
@@ -42,7 +41,7 @@ def compile_kernels(parts: Sequence[str]) -> None:
         return
     try:
         cache_dir().mkdir(parents=True, exist_ok=True)
-        with (cache_dir() / f"lock-{_machine()}").open("w") as lock:
+        with (cache_dir() / f"lock-{_key()}").open("w") as lock:
             with suppress(OSError):  # a shared folder without locks: at worst two do the same work
                 fcntl.flock(lock, fcntl.LOCK_EX)
             missing = [name for name in parts if not _is_compiled(name)]
@@ -54,19 +53,23 @@ def compile_kernels(parts: Sequence[str]) -> None:
         raise NotReady(not_kept(error)) from error
 
 
-def _machine() -> str:
-    return hashlib.sha256(processor().encode()).hexdigest()[:8]
+def _key() -> str:
+    """8 hex digits of the processor and of what is called here for it to be compiled."""
+    sha = hashlib.sha256(processor().encode())
+    for module in (__file__, render_warm.__file__):
+        sha.update(Path(module).read_bytes())
+    return sha.hexdigest()[:8]
 
 
-def _marker(name: str) -> Path:
+def marker(name: str) -> Path:
     """The file that lists what a part has in the cache."""
-    return cache_dir() / f"compiled-{_machine()}-{name}"
+    return cache_dir() / f"compiled-{_key()}-{name}"
 
 
 def _is_compiled(name: str) -> bool:
     """The part was compiled, and nobody has taken a file of it away since."""
     try:
-        listed = _marker(name).read_text()
+        listed = marker(name).read_text()
     except OSError:  # not there, or in a folder that cannot be: whoever then writes into it says so
         return False
     return all((cache_dir() / file).is_file() for file in listed.splitlines())
@@ -88,7 +91,7 @@ def _warm(name: str) -> int:
     listed = "\n".join(sorted(path.relative_to(cache_dir()).as_posix() for path in USED))
     try:
         for part in (name, *INCLUDED.get(name, ())):
-            write_whole(_marker(part), listed.encode())
+            write_whole(marker(part), listed.encode())
     except OSError as error:
         print(error, file=sys.stderr)
         return NO_ROOM
@@ -120,13 +123,13 @@ def _answers() -> None:
 
 def _render() -> None:
     """Scenes that are built and drawn."""
-    compile_render_kernels()
+    render_warm.compile_kernels()
 
 
 def _fit() -> None:
     """The same, and scenes that are fitted: in one process, for they share kernels."""
-    compile_render_kernels()
-    compile_fit_kernels()
+    render_warm.compile_kernels()
+    render_warm.compile_fit_kernels()
 
 
 PARTS = {"judge": _judge, "drive": _drive, "answers": _answers, "render": _render, "fit": _fit}

@@ -66,7 +66,7 @@ def see(
         directions(photo.intrinsics, photo.world_from_camera, width, height)
         * np.where(depth > 0, depth, FAR_M)[..., None]
     )
-    eye = photo.world_from_camera[:3, 3]
+    eye = np.ascontiguousarray(photo.world_from_camera[:3, 3])
     passing = behind_boxes(seen_to.reshape(-1, 3) + eye, eye, boxes[valid & tracks.driving]).reshape(height, width)
     return Seen(depth, label, sky, passing)
 

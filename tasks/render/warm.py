@@ -6,6 +6,7 @@ from tasks.render.fit.reconstruct import reconstruct
 from tasks.render.fit.settings import FitSettings
 from tasks.render.scene import AssetSettings, RenderAsset, build_asset
 from tasks.render.sensed import Photo, Sweep
+from tasks.render.sh import turned
 from tasks.world.agents import AgentKind, AgentTracks
 
 FRONT = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 1.5], [0.0, 0.0, 0.0, 1.0]])
@@ -13,6 +14,7 @@ FRONT = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 
 
 def compile_kernels() -> RenderAsset:
     """Builds and measures a scene of two 32 x 32 photos, some ground and one box that drives."""
+    turned(np.zeros((1, 3, 3), np.float32), np.diag([1.0, -1.0, 1.0]))
     return build_asset(*_seen(), AssetSettings(refit_sweeps=1, hold_out_every=3))
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from factory.store.reader import SampleTable
-from factory.warm import compile_kernels
+from factory.warm import compile_kernels, marker
 from tasks.kernels import cache_dir
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow]
@@ -132,8 +132,8 @@ def give_compiled_kernels(head: Head) -> Path:
     compile_kernels(PARTS)
     cache = head.folder / "cache" / "driving-data-factory" / cache_dir().name
     for part in PARTS:
-        (marker,) = cache_dir().glob(f"compiled-*-{part}")
-        for name in (marker.name, *marker.read_text().splitlines()):
+        listing = marker(part)
+        for name in (listing.name, *listing.read_text().splitlines()):
             (cache / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(cache_dir() / name, cache / name)
     return cache

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from factory.warm import compile_kernels
+from factory.warm import compile_kernels, marker
 from tasks.kernels import cache_dir
 
 pytestmark = pytest.mark.slow
@@ -33,10 +33,12 @@ def run_with_these(parts: list[str], tmp_path: Path, *arguments: str) -> tuple[s
     compile_kernels(parts)
     cache = tmp_path / "cache" / cache_dir().name
     for part in parts:
-        (marker,) = cache_dir().glob(f"compiled-*-{part}")
-        for name in (marker.name, *marker.read_text().splitlines()):
+        listing = marker(part)
+        for name in (listing.name, *listing.read_text().splitlines()):
             (cache / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(cache_dir() / name, cache / name)
+    if (cache_dir() / "factory").is_dir():  # what paints the town
+        shutil.copytree(cache_dir() / "factory", cache / "factory")
     before = kept(cache)
     done = subprocess.run(
         [sys.executable, "-m", "factory.run", *arguments, f"out={tmp_path / 'out'}"],
@@ -48,6 +50,16 @@ def run_with_these(parts: list[str], tmp_path: Path, *arguments: str) -> tuple[s
     assert done.returncode == 0, done.stderr
     assert "compiling" not in done.stderr
     return before, kept(cache)
+
+
+def test_a_run_on_a_town_with_cameras_compiles_nothing(tmp_path: Path, towns: str) -> None:
+    seen = ("clips.settings.cameras=[ring_front_center]", "clips.settings.photo_steps=36")
+    small = ("clips.settings.width=64", "clips.settings.height=36", "clips.settings.lidar_azimuths=90")
+    fitted = ("render.fit.iterations=20", "render.fit.start_gaussians=2000", "render.psnr_min=0")
+    drawn = (*TOWN, *seen, *small, *fitted, "experts=[recovery]")
+    before, after = run_with_these(["judge", "drive", "fit"], tmp_path, *drawn, towns, "executor=local")
+    assert after == before
+    assert any(name.startswith("tasks/render/") for name in after)
 
 
 def test_a_run_without_images_needs_no_renderer(tmp_path: Path, towns: str) -> None:

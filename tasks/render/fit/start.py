@@ -135,7 +135,7 @@ def _shot(photo: Photo, static: F64, tracks: Tracks, unknown: NDArray[np.bool_],
     boxes, valid = tracks.at(photo.time_s)
     hidden = None
     if (valid & unknown).any():
-        eye = photo.world_from_camera[:3, 3]
+        eye = np.ascontiguousarray(photo.world_from_camera[:3, 3])
         far = rays.reshape(-1, 3) * FAR_M + eye
         hidden = behind_boxes(far, eye, boxes[valid & unknown]).reshape(height, width)
     depth = None
