@@ -113,7 +113,10 @@ def execute(
         return RunSummary(BAD_CONFIG, str(error))
     except ConnectionError as error:
         where = ray_address or os.environ.get("RAY_ADDRESS")
-        return RunSummary(BAD_CONFIG, f"no Ray cluster answers at RAY_ADDRESS={where}: {one_line(error)}")
+        return RunSummary(
+            BAD_CONFIG,
+            f"no Ray cluster answers at RAY_ADDRESS={where} ({one_line(error)}); unset it to run on this machine alone",
+        )
     except KeyboardInterrupt:
         return RunSummary(INTERRUPTED, "stopped before anything was begun")
     try:

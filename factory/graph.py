@@ -7,6 +7,7 @@ fails becomes a steps.Failure. Nothing but loopback is opened for a cluster of o
 import logging
 import os
 import secrets
+import socket
 import time
 from collections import deque
 from typing import Any
@@ -31,6 +32,7 @@ from factory.work import NotReady, Work
 
 MAX_RETRIES = 2  # of a task whose worker died
 PROBE_SECONDS = 120.0
+ANSWER_S = 10.0  # for a cluster's port to be reached
 GPU_WAIT_S = 900.0  # for the first node with one to come
 WORKER_ENV = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 FORWARDED_ENV = ("NUMBA_CACHE_DIR",)
@@ -134,7 +136,11 @@ def _sees(out: Location, name: str, token: bytes) -> bool:
 
 
 def _connect(workers: int | None, address: str | None) -> bool:
-    """Join the cluster of `address` or RAY_ADDRESS, else start one in this machine (then True)."""
+    """Join the cluster of `address` or RAY_ADDRESS, else start one in this machine (then True).
+
+    Raises ConnectionError where nothing listens there: Ray itself tries for minutes.
+    """
+    _must_answer(address or os.environ.get("RAY_ADDRESS", ""))
     environment = WORKER_ENV | {name: os.environ[name] for name in FORWARDED_ENV if name in os.environ}
     where = address or ("auto" if os.environ.get("RAY_ADDRESS") else "local")
     own: dict[str, Any] = {"num_cpus": workers, "include_dashboard": False} if where == "local" else {}
@@ -148,6 +154,17 @@ def _connect(workers: int | None, address: str | None) -> bool:
         **own,
     )
     return where == "local"
+
+
+def _must_answer(address: str) -> None:
+    """Raises ConnectionError for a host:port, or ray://host:port, at which nothing listens."""
+    host, colon, port = address.removeprefix("ray://").rpartition(":")
+    if not (colon and port.isdecimal()):
+        return  # auto, local: Ray knows where
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=ANSWER_S).close()
+    except OSError as error:
+        raise ConnectionError(str(error)) from error
 
 
 def _nodes() -> list[str]:

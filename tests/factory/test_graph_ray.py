@@ -1,6 +1,7 @@
 """The same graph as Ray tasks: identical rows, dead workers survived, poison contained."""
 
 import os
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -40,6 +41,19 @@ def test_a_cluster_of_our_own_starts_without_a_warning_and_asks_for_a_token(modu
     env = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")} | {"HOME": str(tmp_path)}
     done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout, done.stderr) == (0, "token\n", "")
+
+
+def test_a_cluster_that_does_not_answer_is_named_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ray's own client tries for minutes."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"127.0.0.1:{server.getsockname()[1]}"
+        graph._must_answer(address)
+        graph._must_answer(f"ray://{address}")
+    graph._must_answer("auto")
+    monkeypatch.setenv("RAY_ADDRESS", address)
+    ended = run(tmp_path / "out", "ray", ToyWork(), 1, 1)
+    assert ended.exit_code == BAD_CONFIG and f"RAY_ADDRESS={address}" in ended.message and "unset" in ended.message
+    assert not ray.is_initialized()
 
 
 def test_local_and_ray_with_one_and_two_workers_make_identical_rows(tmp_path: Path, two_cpus: None) -> None:
