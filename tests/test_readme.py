@@ -100,6 +100,7 @@ def demo_home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return home
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("block", PYTHON_BLOCKS, ids=range(len(PYTHON_BLOCKS)))
 def test_python_runs_as_written_in_the_small_install(demo_home: Path, tmp_path: Path, block: str) -> None:
     path = f"{as_if_installed(SMALL, tmp_path)}{os.pathsep}{REPOSITORY}"

@@ -114,6 +114,7 @@ def hits_and_misses(project: Path, argument: str = "3.0", **environment: str) ->
     return said.strip() + error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("named_by", ["NUMBA_CACHE_DIR", "XDG_CACHE_HOME"])
 def test_a_copy_of_the_project_elsewhere_compiles_nothing_again(tmp_path: Path, named_by: str) -> None:
     where = {named_by: str(tmp_path / "cache")}
@@ -125,6 +126,7 @@ def test_a_copy_of_the_project_elsewhere_compiles_nothing_again(tmp_path: Path, 
     assert hits_and_misses(second, **where) == "0 1"
 
 
+@pytest.mark.slow
 def test_processes_that_compile_one_function_for_other_types_at_once_keep_both(tmp_path: Path) -> None:
     """Numba's own index keeps what was written last, and may name the other's machine code."""
     project, where = copy_with_one_kernel(tmp_path / "project"), {"XDG_CACHE_HOME": str(tmp_path / "cache")}

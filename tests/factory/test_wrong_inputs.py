@@ -140,6 +140,7 @@ def python(cwd: Path, *arguments: str, **environment: str) -> subprocess.Complet
     return subprocess.run([sys.executable, *arguments], cwd=cwd, env=env, capture_output=True, text=True, timeout=120)
 
 
+@pytest.mark.slow
 def test_a_mistyped_word_imports_nothing_heavy(folder: Path) -> None:
     code = (
         "import sys; from factory.__main__ import main\n"

@@ -73,6 +73,7 @@ def test_what_is_no_such_table_is_said(tmp_path: Path, text: str, said: str) -> 
 STUDY = Path(__file__).parents[2] / "docs" / "study"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("study", "least"), [(STUDY, 64), (STUDY / "again", 300), (STUDY / "long", 12)], ids=["study", "again", "long"]
 )

@@ -43,6 +43,7 @@ def test_towns_painted_side_by_side_have_the_bytes_of_one_painted_here(
     assert not capfd.readouterr().err, "what is there is not written again"
 
 
+@pytest.mark.slow
 def test_a_town_that_cannot_be_written_is_named(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "town-5").write_text("no folder")
     with pytest.raises(RuntimeError, match=r"town 5: its process ended with exit 1"):
