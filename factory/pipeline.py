@@ -47,7 +47,7 @@ from tasks.hard_scenes import BenchmarkClip
 from tasks.perturb import Candidate, Perturbation, PerturbSettings, end_speed_mps, perturb
 from tasks.render.engine import Backend, check
 from tasks.render.gsplat_backend import BackendMissing
-from tasks.render.settings import RenderMode, RenderSettings, SceneFrom
+from tasks.render.settings import RenderMode, RenderSettings
 from tasks.reward.epdms import Scores
 from tasks.reward.labels import Labelling, vocabulary_labels
 from tasks.rollout.simulate import TrafficSettings
@@ -147,21 +147,15 @@ class FactoryWork:
 
     def warm(self, draws: bool = True) -> None:
         """This run's kernels, and no others, into the on-disk cache. Raises NotReady."""
-        from factory.warm import compile_kernels
+        from factory.warm import compile_kernels, parts_of
 
-        parts = ["judge"]
-        if self.labelling is not None and self.labelling.traffic.mode == "idm":
-            parts.append("answers")
-        elif self._simulates and self.traffic.mode == "idm":
-            parts.append("drive")
-        if self.render.mode is RenderMode.AUTO:
-            if draws:
-                try:
-                    check(self.render.backend)
-                except BackendMissing as error:
-                    raise NotReady(str(error)) from error
-            parts.append("fit" if self.render.scene is SceneFrom.FIT else "render")
-        compile_kernels(parts)
+        if draws and self.render.mode is RenderMode.AUTO:
+            try:
+                check(self.render.backend)
+            except BackendMissing as error:
+                raise NotReady(str(error)) from error
+        label_traffic = None if self.labelling is None else self.labelling.traffic.mode
+        compile_kernels(parts_of(self._simulates, self.traffic.mode, label_traffic, self.render))
 
     def expert_digest(self, expert: str) -> str:
         """Of the expert's inputs and settings."""

@@ -14,6 +14,7 @@ import os
 import signal
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from itertools import zip_longest
 from typing import TYPE_CHECKING
 
@@ -24,6 +25,7 @@ from factory.words import Asked, asked_of
 
 if TYPE_CHECKING:
     from factory.clips.reader import ClipRef
+    from factory.settings import RunConfig
 
 BAD_CONFIG, INTERRUPTED = 2, 4
 
@@ -91,6 +93,15 @@ def seconds_text(seconds: Mapping[str, tuple[int, float]]) -> str:
     return "\n".join([f"{'stage':<12}{'tasks':>8}{'seconds':>10}{'each':>10}", *lines])
 
 
+def kernels_of(config: "RunConfig") -> list[str]:
+    """The parts of factory.warm that the run will ask for."""
+    from factory.warm import parts_of
+    from factory.work import HUMAN
+
+    label_traffic = None if config.reward.labels == "none" else config.reward.traffic
+    return parts_of(set(config.experts) != {HUMAN}, config.traffic.mode, label_traffic, config.render)
+
+
 def run(asked: Asked) -> int:
     """Plan, execute, commit, report. What the command line says is checked before anything heavy is imported."""
     from factory.run_keys import check
@@ -110,35 +121,38 @@ def run(asked: Asked) -> int:
     from factory.status import failed_line
     from factory.store.location import BadLocation, Location
     from factory.store.samples import Store
+    from factory.warm import compiling_ahead
 
     config = run_config(values)
     try:
         store = Store(Location.parse(config.out))
     except BadLocation as error:
         raise ConfigError(str(error)) from error
-    assembled = assemble(config)
-    wanted = [*assembled.index.refs, *assembled.index.broken][: config.limit]
-    refs = dealt(wanted, config.workers or os.cpu_count() or 1)
-    print(plan_text(assembled, refs), flush=True)
-    if config.dry_run:
-        print(calibrate(assembled, refs, store))
-        return 0
-    summary = execute(
-        assembled.work,
-        refs,
-        config.experts,
-        config.rounds,
-        store,
-        config.executor,
-        config.workers,
-        gpu_share=config.gpu_share if assembled.work.draws_on_gpu else 0.0,
-        on_change=config.on_change,
-        retry=config.retry_failed,
-        shard_seconds=config.shard_seconds,
-        minutes=config.minutes,
-        episodes=config.one_episode_in,
-        command=asked.words,
-    )
+    elsewhere = config.executor == "ray" and "RAY_ADDRESS" in os.environ  # a cluster's nodes compile for themselves
+    with nullcontext() if elsewhere else compiling_ahead(kernels_of(config)):
+        assembled = assemble(config)
+        wanted = [*assembled.index.refs, *assembled.index.broken][: config.limit]
+        refs = dealt(wanted, config.workers or os.cpu_count() or 1)
+        print(plan_text(assembled, refs), flush=True)
+        if config.dry_run:
+            print(calibrate(assembled, refs, store))
+            return 0
+        summary = execute(
+            assembled.work,
+            refs,
+            config.experts,
+            config.rounds,
+            store,
+            config.executor,
+            config.workers,
+            gpu_share=config.gpu_share if assembled.work.draws_on_gpu else 0.0,
+            on_change=config.on_change,
+            retry=config.retry_failed,
+            shard_seconds=config.shard_seconds,
+            minutes=config.minutes,
+            episodes=config.one_episode_in,
+            command=asked.words,
+        )
     if summary.message:
         print(summary.message, file=sys.stderr)
     if summary.exit_code == BAD_CONFIG or summary.funnel is None:

@@ -6,10 +6,12 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
+from threading import Event, Lock, Thread
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,34 +23,76 @@ from tasks.experts.protocol import Plan
 from tasks.kernels import USED, cache_dir, not_kept, processor, write_whole
 from tasks.kinematic_vocabulary import kinematic_trajectories
 from tasks.render import warm as render_warm
+from tasks.render.settings import RenderMode, RenderSettings, SceneFrom
 from tasks.reward.labels import Labelling, vocabulary_labels
+from tasks.reward.prepare import prepare_scene
 from tasks.reward.reactive import reactive_scores
 from tasks.reward.verdicts import INDEX_FROM_ROWS
 from tasks.rollout.simulate import TrafficSettings, simulate
 from tasks.vocabulary import Vocabulary
 from tasks.world.agents import AgentKind, AgentTracks
-from tasks.world.clip import CLIP_STEPS, NOW, Clip, Scene, scene_of_clip
+from tasks.world.clip import CLIP_STEPS, HORIZON_STEPS, NOW, Clip, Scene, scene_of_clip
 from tasks.world.lanes import Lane, RoadMap, Route
 
+ENOUGH_S = 0.2  # between two looks whether compiling is to be given up
+_one_at_a_time = Lock()
 
-def compile_kernels(parts: Sequence[str]) -> None:
+
+def parts_of(simulates: bool, traffic: str, label_traffic: str | None, render: RenderSettings) -> list[str]:
+    """What a run enters.
+
+    simulates: it has another expert than `human`; traffic, label_traffic: "idm" or "replay", of the drives and of the
+    labels (None: it makes none).
+    """
+    parts = ["judge"]
+    if label_traffic == "idm":
+        parts.append("answers")
+    elif simulates and traffic == "idm":
+        parts.append("drive")
+    if render.mode is RenderMode.AUTO:
+        parts.append("fit" if render.scene is SceneFrom.FIT else "render")
+    return parts
+
+
+@contextmanager
+def compiling_ahead(parts: Sequence[str]) -> Iterator[None]:
+    """Compiles beside what is done inside, and gives up what is not compiled at the end of it.
+
+    Who needs the kernels inside calls `compile_kernels` as ever: it waits for this, and tells what could not be done.
+    """
+    enough = Event()
+
+    def ahead() -> None:
+        with suppress(NotReady, RuntimeError):
+            compile_kernels(parts, enough)
+
+    Thread(target=ahead, daemon=True).start()
+    try:
+        yield
+    finally:
+        enough.set()
+
+
+def compile_kernels(parts: Sequence[str], enough: Event | None = None) -> None:
     """Compiles what is not in the cache yet, each part in a process of its own, as many at once as there are cores.
 
     Of processes that want the same at once, one compiles and the others wait for it.
-    Raises NotReady where the cache cannot be written, and RuntimeError with a part's last words where it fails.
+    Raises NotReady where the cache cannot be written, and RuntimeError with a part's last words where it fails or is
+    given up because there is `enough`.
     """
     if all(map(_is_compiled, parts)):
         return
     try:
         cache_dir().mkdir(parents=True, exist_ok=True)
         with (cache_dir() / f"lock-{_key()}").open("w") as lock:
-            with suppress(OSError):  # a shared folder without locks: at worst two do the same work
-                fcntl.flock(lock, fcntl.LOCK_EX)
-            missing = [name for name in parts if not _is_compiled(name)]
-            if missing:
+            if enough is None:  # somebody waits
                 print("compiling kernels, once for this version: about a minute", file=sys.stderr, flush=True)
-            with ThreadPoolExecutor(os.cpu_count()) as pool:
-                list(pool.map(_compile_part, missing))
+            with _one_at_a_time:
+                with suppress(OSError):  # a shared folder without locks: at worst two do the same work
+                    fcntl.flock(lock, fcntl.LOCK_EX)
+                missing = [name for name in parts if not _is_compiled(name)]
+                with ThreadPoolExecutor(os.cpu_count()) as pool:
+                    list(pool.map(partial(_compile_part, enough=enough or Event()), missing))
     except OSError as error:
         raise NotReady(not_kept(error)) from error
 
@@ -75,14 +119,27 @@ def _is_compiled(name: str) -> bool:
     return all((cache_dir() / file).is_file() for file in listed.splitlines())
 
 
-def _compile_part(name: str) -> None:
+def _compile_part(name: str, enough: Event) -> None:
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     command = [sys.executable, "-m", "factory.warm", name]
-    ended = subprocess.run(command, env=environment, capture_output=True, text=True)  # noqa: S603 (our own module)
-    if ended.returncode == NO_ROOM:
-        raise OSError(ended.stderr.strip().splitlines()[-1])
-    if ended.returncode != 0:
-        raise RuntimeError(f"compiling the kernels of {name} failed: {ended.stderr[-2000:]}")
+    if enough.is_set():
+        raise RuntimeError(f"compiling the kernels of {name} was not begun")
+    with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) as part:  # noqa: S603 (ours)
+        said = _ended(part, enough)
+    if part.returncode == NO_ROOM:
+        raise OSError(said.strip().splitlines()[-1])
+    if part.returncode != 0:
+        raise RuntimeError(f"compiling the kernels of {name} failed: {said[-2000:]}")
+
+
+def _ended(part: "subprocess.Popen[str]", enough: Event) -> str:
+    """What it said once it has ended, by itself or because there is enough."""
+    while True:
+        try:
+            return part.communicate(timeout=ENOUGH_S)[1]
+        except subprocess.TimeoutExpired:
+            if enough.is_set():
+                part.terminate()
 
 
 def _warm(name: str) -> int:
@@ -99,8 +156,12 @@ def _warm(name: str) -> int:
 
 
 def _judge() -> None:
-    """Tracks, plans and scores, a few trajectories and many."""
+    """Tracks, plans and scores, a few trajectories and many.
+
+    The map comes first: `drive` begins with the tracker, which is there when it is needed here.
+    """
     scene, ahead = _tiny_scene()
+    prepare_scene(scene, scene.agents.window(scene.step, scene.step + HORIZON_STEPS + 1))
     replay = TrafficSettings(mode="replay")
     judged = drive_and_judge(scene, Plan(ahead), replay, PdmSettings())
     labelling = Labelling(Vocabulary(kinematic_trajectories(INDEX_FROM_ROWS, 0)), replay)

@@ -189,3 +189,10 @@ def inner_kernel(function: F) -> F:
     under its owner's hands.
     """
     return _compiled(function, _nrt=False)
+
+
+def hidden_kernel(function: F) -> F:
+    """As `inner_kernel`, but Python cannot call it: taking tuples of arrays from Python would take as long to compile
+    as the function.
+    """
+    return _compiled(function, _nrt=False, no_cpython_wrapper=True)

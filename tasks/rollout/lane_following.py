@@ -97,7 +97,8 @@ def _lay_log(track: Array, n_points: int) -> tuple[Array, Array, Array, Array] |
         if n == 0 or (
             math.hypot(track[k, 0] - chosen[n - 1, 0], track[k, 1] - chosen[n - 1, 1]) >= LOGGED_PATH_SPACING_M
         ):
-            chosen[n] = track[k]
+            for c in range(track.shape[1]):
+                chosen[n, c] = track[k, c]
             n += 1
     if n < 2:
         return None

@@ -17,7 +17,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.kernels import inner_kernel, kernel
+from tasks.kernels import hidden_kernel, kernel
 from tasks.rollout.cast import (
     ABSENT,
     DRIVEN,
@@ -129,21 +129,24 @@ def _start_over(rows: Rows, recorded: Rows, strays: Strays) -> None:
 @kernel
 def _set_ego(rows: Rows, strays: Strays, boxes: Array, velocities: Array) -> None:
     ego = len(strays.found) - 1
-    rows.boxes[:, ego], rows.velocities[:, ego], rows.valid[:, ego] = boxes, velocities, True
-    for t in range(boxes.shape[0]):
+    for t in range(boxes.shape[0]):  # element by element: numba takes seconds to compile the copy of a slice
+        for k in range(5):
+            rows.boxes[t, ego, k] = boxes[t, k]
+        rows.velocities[t, ego, 0], rows.velocities[t, ego, 1] = velocities[t, 0], velocities[t, 1]
+        rows.valid[t, ego] = True
         rows.radius[t, ego] = 0.5 * math.hypot(boxes[t, 3], boxes[t, 4])
     strays.mode[ego] = EGO
     _stray(strays, ego)
 
 
-@inner_kernel
+@hidden_kernel
 def _stray(strays: Strays, i: int) -> None:
     strays.found[i] = True
     strays.listed[strays.size[0]] = i
     strays.size[0] += 1
 
 
-@inner_kernel
+@hidden_kernel
 def _leave_record(t: int, i: int, r: int, rows: Rows, strays: Strays, motion: Motion, record: Motion) -> None:
     """Agent i is a stray from step t on: its motion there becomes motion at row r; it is not in row t + 1 yet."""
     _stray(strays, i)
@@ -151,7 +154,7 @@ def _leave_record(t: int, i: int, r: int, rows: Rows, strays: Strays, motion: Mo
     _vanish(rows, t + 1, i)
 
 
-@inner_kernel
+@hidden_kernel
 def _carry(of: Motion, t: int, to: Motion, r: int, i: int) -> None:
     """What agent i was at row t of one rollout it is at row r of another."""
     to.mode[r, i], to.path[r, i], to.clock[r, i] = of.mode[t, i], of.path[t, i], of.clock[t, i]
@@ -160,7 +163,7 @@ def _carry(of: Motion, t: int, to: Motion, r: int, i: int) -> None:
     to.was_driven[r, i] = of.was_driven[t, i]
 
 
-@inner_kernel
+@hidden_kernel
 def _vanish(rows: Rows, t: int, i: int) -> None:
     for k in range(5):
         rows.boxes[t, i, k] = np.nan
@@ -168,7 +171,7 @@ def _vanish(rows: Rows, t: int, i: int) -> None:
     rows.center_z[t, i], rows.radius[t, i], rows.valid[t, i] = np.nan, np.nan, False
 
 
-@inner_kernel
+@hidden_kernel
 def _place(rows: Rows, t: int, world: World, k: int, i: int) -> None:
     """Agent i, in row t, is where it is in step k of a world."""
     for c in range(5):
@@ -178,7 +181,7 @@ def _place(rows: Rows, t: int, world: World, k: int, i: int) -> None:
     rows.radius[t, i] = 0.5 * math.hypot(world.boxes[k, i, 3], world.boxes[k, i, 4])
 
 
-@inner_kernel
+@hidden_kernel
 def _stay(rows: Rows, t: int, i: int) -> None:
     """Agent i, in row t + 1, stands where it is in row t."""
     for k in range(5):
@@ -188,7 +191,7 @@ def _stay(rows: Rows, t: int, i: int) -> None:
     rows.valid[t + 1, i] = True
 
 
-@inner_kernel
+@hidden_kernel
 def _step(
     start: int, log: World, cast: Cast, paths: Paths, driver: Driver, t: int,
     rows: Rows, strays: Strays, motion: Motion, record: Motion,
@@ -203,7 +206,7 @@ def _step(
     _admit(start, log, cast, driver, t, rows, strays, motion, record)
 
 
-@inner_kernel
+@hidden_kernel
 def _take_over(
     cast: Cast, paths: Paths, driver: Driver, t: int, rows: Rows, strays: Strays, motion: Motion, record: Motion
 ) -> None:
@@ -244,7 +247,7 @@ def _take_over(
                 _start_driving(paths, driver, t, i, m, rows, motion)
 
 
-@inner_kernel
+@hidden_kernel
 def _start_driving(paths: Paths, driver: Driver, t: int, i: int, m: int, rows: Rows, motion: Motion) -> None:
     s, offset, turn, speed = start_on(paths, m, rows, t, i, driver)
     motion.mode[t, i], motion.path[t, i], motion.travelled[t, i] = DRIVEN, m, 0.0
@@ -252,7 +255,7 @@ def _start_driving(paths: Paths, driver: Driver, t: int, i: int, m: int, rows: R
     motion.base_z[t, i] = rows.center_z[t, i] - paths.height[m, cell_of(paths, s)]
 
 
-@inner_kernel
+@hidden_kernel
 def _drive_on(
     start: int, cast: Cast, paths: Paths, driver: Driver, t: int,
     rows: Rows, strays: Strays, motion: Motion, record: Motion,
@@ -286,7 +289,7 @@ def _drive_on(
         _advance(paths, driver, t, i, step_m, new_speed, rows, motion)
 
 
-@inner_kernel
+@hidden_kernel
 def _motion_of(
     t: int, i: int, strays: Strays, motion: Motion, record: Motion
 ) -> tuple[int, float, float, float, float, float]:
@@ -302,7 +305,7 @@ def _motion_of(
     )  # fmt: skip
 
 
-@inner_kernel
+@hidden_kernel
 def _advance(
     paths: Paths, driver: Driver, t: int, i: int, step_m: float, new_speed: float, rows: Rows, motion: Motion
 ) -> None:
@@ -320,7 +323,7 @@ def _advance(
     rows.center_z[t + 1, i] = motion.base_z[t + 1, i] + paths.height[m, cell_of(paths, s)]
 
 
-@inner_kernel
+@hidden_kernel
 def _replay(
     log: World, cast: Cast, t: int, rows: Rows, strays: Strays, motion: Motion, record: Motion
 ) -> None:  # fmt: skip
@@ -360,7 +363,7 @@ def _replay(
                 _place(rows, t + 1, log, k, i)
 
 
-@inner_kernel
+@hidden_kernel
 def _admit(
     start: int, log: World, cast: Cast, driver: Driver, t: int,
     rows: Rows, strays: Strays, motion: Motion, record: Motion,

@@ -5,17 +5,20 @@ import os
 import shutil
 import subprocess
 import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from factory.warm import compile_kernels
+from factory.warm import compile_kernels, compiling_ahead
 from factory.work import NotReady
 from tasks.kernels import cache_dir, kernel_sources, sources_digest
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-DECORATORS = {"njit", "jit", "kernel", "inlined", "inner_kernel", "drawing_kernel"}
+DECORATORS = {"njit", "jit", "kernel", "inlined", "inner_kernel", "hidden_kernel", "drawing_kernel"}
 
 
 def test_every_source_that_compiles_something_is_in_the_digest() -> None:
@@ -26,7 +29,7 @@ def test_every_source_that_compiles_something_is_in_the_digest() -> None:
             nodes = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)]
             compiles = any(
                 node.module in ("numba", "tasks.kernels")
-                and {"njit", "jit", "kernel", "inlined", "inner_kernel", "drawing_kernel"}
+                and {"njit", "jit", "kernel", "inlined", "inner_kernel", "hidden_kernel", "drawing_kernel"}
                 & {a.name for a in node.names}
                 for node in nodes
             )
@@ -149,6 +152,41 @@ def test_without_room_for_the_cache_a_run_is_refused(tmp_path: Path, monkeypatch
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file"))
     with pytest.raises(NotReady, match=r"cannot be kept in .*file/kernels-\w+ \(Not a directory\): name a folder"):
         compile_kernels(["judge"])
+
+
+def test_compiling_ahead_leaves_the_refusal_to_whoever_needs_the_kernels(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file"))
+    with compiling_ahead(["judge"]), pytest.raises(NotReady, match="cannot be kept"):
+        compile_kernels(["judge"])
+
+
+def test_compiling_ahead_ends_with_the_run_that_began_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing of a refused run goes on working: its part's process is gone, and the part is not compiled."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    with compiling_ahead(["judge"]):
+        assert within(20.0, lambda: bool(compiling(tmp_path)))
+    assert within(20.0, lambda: not compiling(tmp_path))
+    assert not list(tmp_path.glob("*/compiled-*"))
+
+
+def compiling(cache: Path) -> list[Path]:
+    """The processes that a part into this cache has been given to."""
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):  # another user's, or just ended
+            if f"NUMBA_CACHE_DIR={cache}".encode() in (process / "environ").read_bytes().split(b"\0"):
+                found.append(process)
+    return found
+
+
+def within(seconds: float, holds: Callable[[], bool]) -> bool:
+    ends = time.monotonic() + seconds
+    while not holds() and time.monotonic() < ends:
+        time.sleep(0.05)
+    return holds()
 
 
 @pytest.mark.slow
