@@ -51,6 +51,7 @@ class RunSummary:
     notes: list[str] = field(default_factory=list)
     funnel: Funnel | None = None
     began_ms: int = 0  # since 1970; 0: nothing was left to do
+    disk_full: bool = False  # the message says where; then no page is written
 
 
 def execute(
@@ -105,7 +106,7 @@ def execute(
     driver = Driver(identity, plan, digests, rounds, policy, work.block, work.doing)
     if plan.frozen:
         driver.notes.append(f"{len(plan.frozen)} clips kept as they are: their candidates come from other settings")
-    code, message, began_ms = COMPLETE, "", 0
+    code, message, began_ms, disk_full = COMPLETE, "", 0, False
     try:
         is_due = plan.todo or (pictured is not None and pictured.is_due)
         graph = _graph(work, store, executor, workers, ray_address, gpu_share) if is_due else None
@@ -137,7 +138,7 @@ def execute(
         if driver.interrupted:
             code, message = INTERRUPTED, "interrupted; run the same command again to go on"
     except NoRoom as error:
-        code, message = INTERRUPTED, out_of_room(error)
+        code, message, disk_full = INTERRUPTED, out_of_room(error), True
     except (AnotherWriter, WriteFailed) as error:
         code, message = INTERRUPTED, str(error)
     except (OSError, DeltaError) as error:  # what holds the tables fails: a share that went away, a lost network
@@ -149,12 +150,15 @@ def execute(
             graph.close()
     funnel = funnel_of(store, [ref.clip_id for ref in refs])
     counts = _counts(plan)
-    summary = RunSummary(code, message, counts, driver.executed, driver.seconds, driver.notes, funnel, began_ms)
+    summary = RunSummary(
+        code, message, counts, driver.executed, driver.seconds, driver.notes, funnel, began_ms, disk_full
+    )
     if began_ms or code:
         try:
             _record(store, summary)
         except OSError as error:  # the same disk or share
             summary.exit_code = INTERRUPTED
+            summary.disk_full = summary.disk_full or isinstance(error, NoRoom)
             summary.message = summary.message or (
                 out_of_room(error) if isinstance(error, NoRoom) else f"{one_line(error)}; run the same command again"
             )

@@ -161,6 +161,8 @@ def run(asked: Asked) -> int:
     print(image_sources_text(store, [ref.clip_id for ref in refs]))
     if summary.seconds:
         print(seconds_text(summary.seconds))
+    if summary.disk_full:
+        return summary.exit_code
     if set(config.experts) >= NEEDED and summary.exit_code == COMPLETE:
         print(write_benchmark(store, refs, assembled.work.identity, config.rounds, config.benchmark))
     remember(store, assembled)

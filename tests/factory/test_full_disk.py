@@ -1,20 +1,29 @@
 """A disk that fills up ends a run with exit code 4, loses nothing that was committed, and the same command goes on."""
 
+import re
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
+import pyarrow.compute as pc
 import pytest
 
 from factory.execute import COMPLETE, INTERRUPTED, RunSummary, execute
+from factory.run import main as run_main
 from factory.steps import failure_of
 from factory.store.room import NoRoom, needs_room, no_room
 from factory.store.samples import Store
 from factory.store.usable import why_unusable
 from factory.store.verify import verify
+from tests.factory.tables import assert_same_rows, assert_same_tables, tables_of
 from tests.factory.toy import ToyWork, refs
 
 LARGE = "64m"
+TOWN = ["clips.n_clips=3", "clips.settings.cameras=[]", "clips.settings.lidar_beams=0", "render=none"]
+TOWN += ["vocabulary.k=128", "rounds=2", "executor=local", "shard_seconds=0.001"]  # 6 MB, the pages 0.5 of them
+ONE_LINE = (
+    r"(?:error: )?{out}/\S+: the disk is full: [\d,]+ bytes are needed, [\d,]+ are free; make room and run the same"
+)
 
 
 def mount(folder: Path, *options: str) -> bool:
@@ -30,7 +39,7 @@ def disk(tmp_path: Path) -> Iterator[Path]:
     if not mount(folder, "-o", f"size={LARGE}"):
         pytest.skip("a small disk is a tmpfs, and only root may mount one")
     yield folder
-    subprocess.run(["umount", str(folder)], check=True)
+    subprocess.run(["umount", "--lazy", str(folder)], check=True)  # a failed test may hold a file open
 
 
 def resize(folder: Path, size: str) -> None:
@@ -71,6 +80,34 @@ def test_wherever_the_disk_is_full_the_same_command_goes_on(disk: Path, undistur
     assert run(out).exit_code == COMPLETE
     assert set(Store(out).samples) == undisturbed
     assert verify(Store(out)).damage == ()
+
+
+@pytest.fixture(scope="module")
+def whole_town(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the command makes where nothing disturbs it."""
+    out = tmp_path_factory.mktemp("town") / "out"
+    assert run_main([*TOWN, f"out={out}"]) == COMPLETE
+    return out
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", ["4200k", "4700k", "5500k"])
+def test_a_whole_run_on_a_disk_that_fills_says_so_once_and_goes_on(
+    disk: Path, whole_town: Path, size: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = [*TOWN, f"out={disk / 'out'}"]
+    resize(disk, size)
+    assert run_main(command) == INTERRUPTED
+    told = [line for line in capsys.readouterr().err.splitlines() if "full" in line]
+    assert len(told) == 1 and re.match(ONE_LINE.format(out=re.escape(str(disk / "out"))), told[0]), told
+    resize(disk, LARGE)
+    whole, _, _ = tables_of(whole_town)
+    committed, _, _ = tables_of(disk / "out")
+    assert len(committed) > 0
+    assert_same_rows(committed, whole.filter(pc.is_in(whole["attempt_id"], committed["attempt_id"])))
+    assert verify(Store(disk / "out")).damage == ()
+    assert run_main(command) == COMPLETE
+    assert_same_tables(disk / "out", whole_town)
 
 
 def test_some_of_these_disks_hold_a_part_of_the_samples(disk: Path, undisturbed: set[str]) -> None:
