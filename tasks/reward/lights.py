@@ -18,15 +18,12 @@ Ints = NDArray[np.int64]
 
 
 class RedLanes(NamedTuple):
-    """L lanes that are red at some time, with E edges."""
+    """L lanes that are red at some time, with E edges. Few arrays, as compiled calls pay for each."""
 
     is_red: Bools  # (T, L)
     bounds: Array  # (L, 4) min x, min y, max x, max y [m]
     first: Ints  # (L + 1,) where the edges of a lane begin
-    start_x: Array  # (E,) [m]
-    start_y: Array
-    end_x: Array
-    end_y: Array
+    edges: Array  # (4, E) start x, start y, end x, end y [m]
 
 
 def index_red_lanes(polygons: Sequence[MapPolygon], is_red: Bools) -> RedLanes:
@@ -37,6 +34,8 @@ def index_red_lanes(polygons: Sequence[MapPolygon], is_red: Bools) -> RedLanes:
     if is_red.ndim != 2 or is_red.shape[1] != len(polygons):
         raise ValueError(f"the mask of red lanes must be (T, {len(polygons)}), got {is_red.shape}")
     columns = np.flatnonzero(is_red.any(axis=0)).tolist()
+    if not columns:  # the usual case, and half the cost of preparing a pair's lights
+        return RedLanes(np.empty((len(is_red), 0), np.bool_), np.empty((0, 4)), np.zeros(1, np.int64), np.empty((4, 0)))
     edges, first, owner = outlines([polygons[i] for i in columns])
     lane = np.repeat(owner, np.diff(first))
     bounds = [[*edges[lane == i, :2].min(axis=0), *edges[lane == i, :2].max(axis=0)] for i in range(len(columns))]
@@ -44,7 +43,7 @@ def index_red_lanes(polygons: Sequence[MapPolygon], is_red: Bools) -> RedLanes:
         np.ascontiguousarray(is_red[:, columns]),
         np.array(bounds, dtype=np.float64).reshape(-1, 4),
         np.searchsorted(lane, np.arange(len(columns) + 1)),
-        *np.ascontiguousarray(edges.T),
+        np.ascontiguousarray(edges.T),
     )
 
 
@@ -70,7 +69,7 @@ def _on_lane(
     red: RedLanes, lane: int, x: float, y: float, cos: float, sin: float, half_length: float, half_width: float
 ) -> bool:
     """Whether a box and a lane share a point: an edge touches the box, or else the box's centre is in the lane."""
-    ax, ay, bx, by = red.start_x, red.start_y, red.end_x, red.end_y
+    ax, ay, bx, by = red.edges[0], red.edges[1], red.edges[2], red.edges[3]
     n_touching = 0
     n_right_of_center = 0
     for e in range(red.first[lane], red.first[lane + 1]):

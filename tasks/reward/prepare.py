@@ -34,6 +34,11 @@ LANE_LAYERS = frozenset({MapLayer.LANE, MapLayer.LANE_CONNECTOR})
 _indexed_map = lru_cache(maxsize=4)(index_map)
 
 
+@lru_cache(maxsize=4)
+def _indexed_line(shape: tuple[int, ...], points: bytes) -> Centerline:
+    return index_centerline(np.frombuffer(points).reshape(shape).copy())
+
+
 @dataclass(frozen=True)
 class PreparedScene:
     """A scene ready to score ego trajectories of 4 s at 10 Hz; steps 0..40, 0 is now. Arrays only: it pickles."""
@@ -98,7 +103,7 @@ def prepare(
     return PreparedScene(
         vehicle=vehicle,
         history=None if past_states is None else comfort_history(past_states),
-        centerline=index_centerline(centerline),
+        centerline=_indexed_line(np.shape(centerline), np.ascontiguousarray(centerline, np.float64).tobytes()),
         map_index=_indexed_map(tuple(polygons), route_lane_ids),
         obstacles=_obstacles(objects.window(0, N_TIMES), ego_state0 if drop_touching else None, vehicle),
         red_lanes=_red(red_lanes, polygons),
