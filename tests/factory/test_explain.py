@@ -1,5 +1,6 @@
 """`explain` tells the run's own decisions: what is rejected before the attempts, and logs that cannot be read."""
 
+import re
 import shutil
 from pathlib import Path
 
@@ -56,3 +57,25 @@ def test_a_broken_log_is_found_and_told_in_the_index_s_words(
     ((ref, said),) = assemble(load_config(arguments(logs, tmp_path))).index.broken.items()
     assert main([*arguments(logs, tmp_path), f"clip={ref.clip_id[:8]}"]) == 3
     assert capsys.readouterr().err == f"bad clip: {said}\n"
+
+
+def test_a_walk_that_ends_at_the_limit_says_so_and_how_to_go_on(
+    logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def told(*more: str) -> tuple[list[str], list[str]]:
+        """(lines of candidates, lines on where the walk stopped)."""
+        assert main([*arguments(logs, tmp_path), "render=none", "vocabulary.k=100", f"to={tmp_path}", *more]) == 0
+        lines = capsys.readouterr().out.splitlines()
+        return [line for line in lines if line.startswith("candidate ")], [line for line in lines if "stopped" in line]
+
+    never = "reward.progress_above=2.0"
+    tried, stopped = told(never, "tries=2")
+    assert len(tried) == 2 and all("rejected by reward" in line for line in tried)
+    (said,) = stopped
+    match = re.fullmatch(r"none accepted: stopped after 2 of (\d+) candidates, tries=\1 goes on to the last", said)
+    assert match, said
+    n = int(match[1])
+    tried, stopped = told(never, f"tries={n}")
+    assert len(tried) == n > 2 and not stopped
+    tried, stopped = told("tries=2", "reward.full=[]", "reward.progress_above=-1")
+    assert len(tried) == 1 and tried[0].endswith("accepted") and not stopped, "it stopped because it had what it wanted"
