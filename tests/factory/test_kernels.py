@@ -36,6 +36,16 @@ def test_every_source_that_compiles_something_is_in_the_digest() -> None:
             assert not compiles or path in listed, path
 
 
+def test_every_source_that_a_kernel_s_file_takes_a_constant_from_is_in_the_digest() -> None:
+    """The text is searched for them; here the syntax tree is asked."""
+    listed = set(kernel_sources())
+    for path in listed:
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.ImportFrom) and any(alias.name.isupper() for alias in node.names):
+                source = REPOSITORY.joinpath(*(node.module or "").split(".")).with_suffix(".py")
+                assert not source.is_file() or source in listed, (path, source)
+
+
 def test_no_kernel_may_add_in_another_order_on_another_machine() -> None:
     for path in kernel_sources():
         for node in ast.walk(ast.parse(path.read_text())):
@@ -50,7 +60,7 @@ def small_house(tmp_path: Path) -> Path:
     """A kernel that takes one constant from another file, beside a file that has nothing to do with it."""
     (tmp_path / "tasks").mkdir()
     (tmp_path / "factory").mkdir()
-    (tmp_path / "tasks" / "speed.py").write_text("from tasks.units import STEP_S\nLIMIT = 3.0\n")
+    (tmp_path / "tasks" / "speed.py").write_text("from tasks.units import (\n    metres,\n    STEP_S,\n)\nLIMIT = 3.0\n")
     (tmp_path / "tasks" / "units.py").write_text("STEP_S = 0.1\n")
     (tmp_path / "tasks" / "words.py").write_text("HELLO = 'hello'\n")
     (tmp_path / "factory" / "fast.py").write_text(
