@@ -20,7 +20,7 @@ from factory.work import NotReady
 from tasks.attempt import drive_and_judge
 from tasks.experts.pdm_closed import PdmSettings
 from tasks.experts.protocol import Plan
-from tasks.kernels import USED, cache_dir, not_kept, processor, write_whole
+from tasks.kernels import USED, cache_dir, make_cache_dir, not_kept, processor, write_whole
 from tasks.kinematic_vocabulary import kinematic_trajectories
 from tasks.render import warm as render_warm
 from tasks.render.settings import RenderMode, RenderSettings, SceneFrom
@@ -83,7 +83,7 @@ def compile_kernels(parts: Sequence[str], enough: Event | None = None) -> None:
     if all(map(_is_compiled, parts)):
         return
     try:
-        cache_dir().mkdir(parents=True, exist_ok=True)
+        make_cache_dir()
         with (cache_dir() / f"lock-{_key()}").open("w") as lock:
             if enough is None:  # somebody waits
                 print("compiling kernels, once for this version: about a minute", file=sys.stderr, flush=True)

@@ -6,7 +6,8 @@ Numba's own cache does not notice an edit in a callee or of a constant that live
 the same files lie in another folder, as every upload of a Ray job does. So compiled kernels lie in a folder named by a
 digest of all sources that hold kernels or the constants of kernels, and in it by their place in the project: one edit
 anywhere starts a new folder, a copy elsewhere starts none. The folder lies in NUMBA_CACHE_DIR where that is set, else
-in the user's cache. Nothing of numba is changed for other code.
+in the user's cache. Whoever starts one removes those of other sources that have long been unused. Nothing of numba is
+changed for other code.
 """
 
 import hashlib
@@ -14,9 +15,12 @@ import os
 import pickle
 import re
 import secrets
+import shutil
 import sys
+import time
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -31,6 +35,8 @@ from tasks.caches import user_cache
 F = TypeVar("F", bound=Callable[..., Any])
 _ROOT = Path(__file__).resolve().parent.parent
 _PACKAGES = ("tasks", "factory")
+_FOLDER = re.compile(r"(kernels-[0-9a-f]{16})(-[0-9a-f]{8})?")  # with the second part: being removed
+UNUSED_S = 30 * 86_400.0  # after which a folder of other sources is removed
 _MARKS = (b"tasks.kernels import", b"njit")
 _IMPORT = re.compile(rb"^from ([\w.]+) import (\([^)]*\)|.*)", re.MULTILINE)
 
@@ -69,6 +75,28 @@ def cache_dir() -> Path:
     return Path(os.environ.get("NUMBA_CACHE_DIR") or user_cache()) / f"kernels-{_DIGEST}"
 
 
+def make_cache_dir() -> None:
+    """cache_dir(), which is there then. Whoever makes it removes what is unused beside it. Raises OSError."""
+    folder = cache_dir()
+    try:
+        folder.mkdir(parents=True)
+    except FileExistsError:  # of processes that begin at once one makes it
+        return
+    remove_unused(folder.parent)
+
+
+def remove_unused(caches: Path) -> None:
+    """Remove the folders of kernels that no process has used for UNUSED_S; each process that uses one marks it.
+
+    Renamed first: who begins to use one at this moment finds it whole, or not at all and compiles.
+    """
+    for folder in caches.iterdir():
+        ours = _FOLDER.fullmatch(folder.name)
+        with suppress(OSError):  # another process is about it, or it is another user's
+            if ours and time.time() - folder.stat().st_mtime > UNUSED_S:
+                shutil.rmtree(folder.rename(caches / f"{ours[1]}-{secrets.token_hex(4)}"))
+
+
 @cache
 def processor() -> str:
     """What machine code is made for: Python's version, the system, the processor and what it can do."""
@@ -77,6 +105,14 @@ def processor() -> str:
 
 _DIGEST = sources_digest()
 USED: set[Path] = set()  # files of compiled functions that this process has loaded or written
+
+
+def _use(path: Path) -> None:
+    """Into USED; the process's first marks the folder as used now."""
+    if not USED:
+        with suppress(OSError):  # another user's, to read only
+            os.utime(cache_dir())
+    USED.add(path)
 
 
 class KernelCache:
@@ -111,7 +147,7 @@ class KernelCache:
             kept = path.read_bytes()
         except OSError:  # not there, or nobody's to read: compiled again, and save_overload says what is wrong
             return None
-        USED.add(path)
+        _use(path)
         return CompileResult._rebuild(target, *pickle.loads(kept))  # noqa: S301 -- machine code, written below
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
@@ -120,11 +156,12 @@ class KernelCache:
             return
         path = self._path(signature)
         try:
+            make_cache_dir()
             write_whole(path, dumps(compiled._reduce()))
         except OSError as error:
             warnings.warn(not_kept(error), RuntimeWarning, stacklevel=1)
             return
-        USED.add(path)
+        _use(path)
 
     def _path(self, signature: Any) -> Path:
         takes = f"{signature} {processor()} {self._enclosed}"

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 
@@ -15,7 +16,7 @@ import pytest
 
 from factory.warm import compile_kernels, compiling_ahead
 from factory.work import NotReady
-from tasks.kernels import cache_dir, kernel_sources, sources_digest
+from tasks.kernels import cache_dir, kernel_sources, remove_unused, sources_digest
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DECORATORS = {"njit", "jit", "kernel", "inlined", "inner_kernel", "hidden_kernel", "drawing_kernel"}
@@ -147,6 +148,60 @@ def test_processes_that_compile_one_function_for_other_types_at_once_keep_both(t
     together = [calling(project, argument, **where) for argument in arguments]
     assert [process.communicate()[0].strip() for process in together] == ["0 1"] * 3
     assert [hits_and_misses(project, argument, **where) for argument in arguments] == ["1 0"] * 3
+
+
+def kept_kernels(caches: Path, name: str, days_unused: float) -> Path:
+    folder = caches / name
+    (folder / "tasks").mkdir(parents=True)
+    (folder / "tasks" / "f.kernel").write_bytes(b"code")
+    aged(folder, days_unused)
+    return folder
+
+
+def aged(folder: Path, days_unused: float) -> None:
+    at = time.time() - days_unused * 86_400.0
+    os.utime(folder, (at, at))
+
+
+def test_kernels_that_nobody_has_used_for_a_month_are_removed_and_nothing_else(tmp_path: Path) -> None:
+    unused = [
+        kept_kernels(tmp_path, "kernels-0123456789abcdef", 31.0),
+        kept_kernels(tmp_path, "kernels-fedcba9876543210-01234567", 31.0),  # of a removal that was killed
+    ]
+    kept = [
+        kept_kernels(tmp_path, "kernels-00000000000000aa", 29.0),
+        kept_kernels(tmp_path, "kernels-6.1", 400.0),  # somebody else's
+        kept_kernels(tmp_path, "towns", 400.0),
+    ]
+    remove_unused(tmp_path)
+    assert not [folder for folder in unused if folder.exists()]
+    assert all((folder / "tasks" / "f.kernel").is_file() for folder in kept)
+    assert sorted(tmp_path.iterdir()) == sorted(kept)
+
+
+def test_several_that_remove_at_once_do_not_trip_over_each_other(tmp_path: Path) -> None:
+    for k in range(40):
+        kept_kernels(tmp_path, f"kernels-{k:016x}", 31.0)
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(remove_unused, [tmp_path] * 8))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_kernels_in_use_stay_when_those_of_other_sources_are_begun(tmp_path: Path) -> None:
+    """Used a month ago and again now: the process that loads them says so; what no process loads is gone."""
+    project, cache = copy_with_one_kernel(tmp_path / "project"), tmp_path / "cache"
+    where = {"NUMBA_CACHE_DIR": str(cache)}
+    assert hits_and_misses(project, **where) == "0 1"
+    (used,) = cache.iterdir()
+    unused = kept_kernels(cache, "kernels-0123456789abcdef", 31.0)
+    aged(used, 31.0)
+    assert hits_and_misses(project, **where) == "1 0"
+    assert unused.exists()  # no folder was begun
+    with (project / "tasks" / "squares.py").open("a") as file:
+        file.write("LIMIT = 3.0\n")
+    assert hits_and_misses(project, **where) == "0 1"
+    assert used.exists() and not unused.exists() and len(list(cache.iterdir())) == 2
 
 
 def test_without_room_for_the_cache_a_kernel_works_and_says_what_helps(tmp_path: Path) -> None:
