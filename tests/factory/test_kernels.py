@@ -61,7 +61,7 @@ def small_house(tmp_path: Path) -> Path:
     """A kernel that takes one constant from another file, beside a file that has nothing to do with it."""
     (tmp_path / "tasks").mkdir()
     (tmp_path / "factory").mkdir()
-    (tmp_path / "tasks" / "speed.py").write_text("from tasks.units import (\n    metres,\n    STEP_S,\n)\nLIMIT = 3.0\n")
+    (tmp_path / "tasks" / "speed.py").write_text("from tasks.units import (\n  a,\n  STEP_S,\n)\nLIMIT = 3.0\n")
     (tmp_path / "tasks" / "units.py").write_text("STEP_S = 0.1\n")
     (tmp_path / "tasks" / "words.py").write_text("HELLO = 'hello'\n")
     (tmp_path / "factory" / "fast.py").write_text(
