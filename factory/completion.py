@@ -16,6 +16,7 @@ from typing import get_args, get_type_hints
 from factory.arguments import BAD_ARGUMENTS
 from factory.commands import COMMANDS
 from factory.config import conf_dir
+from factory.plugins import choices
 
 CHOICES = re.compile(r"#\s*([\w-]+(?:\s*\|\s*[\w-]+)+)")  # `ray | local` in the comment behind a setting
 WORDS = {"export": ("mcap", "mp4", "rerun"), "scene": ("info", "export", "import"), "completion": ("bash", "zsh")}
@@ -111,8 +112,8 @@ def settings_of(given: Sequence[str]) -> dict[str, list[str]]:
     text = (folder / "run.yaml").read_text()
     chosen = dict(re.findall(r"^  - (\w+): (\w+)$", text, re.M))
     chosen.update({key: value for key, _, value in (word.partition("=") for word in given) if key in chosen})
-    found = {group: sorted(path.stem for path in (folder / group).glob("*.yaml")) for group in chosen}
-    found |= _keys(text.split("\n\n", 1)[1], "")
+    found = {group: choices(group, [folder]) for group in chosen}
+    found |= _keys(text.split("\n\n", 1)[1], "") | {"experts": choices("expert", [folder])}
     for group, choice in chosen.items():
         path = folder / group / f"{choice}.yaml"
         if path.is_file() and group != "preset":

@@ -70,6 +70,15 @@ def names(kind: str) -> list[str]:
     return list(offered(kind))
 
 
+def choices(group: str, folders: Sequence[Path]) -> list[str]:
+    """What a group of settings offers, sorted: files of its name in the folders, and what packages add to it."""
+    return sorted({*_files(group, folders), *(names(group) if group in GROUPS else ())})
+
+
+def _files(group: str, folders: Sequence[Path]) -> set[str]:
+    return {file.stem for folder in folders for file in (folder / group).glob("*.yaml")}
+
+
 def offer_choices(overrides: Sequence[str], conf: Path, folders: Sequence[Path] = ()) -> None:
     """Make `clips=<name>` and `planner=<name>` choices of Hydra's; their keys may be set without a plus.
 
@@ -80,7 +89,7 @@ def offer_choices(overrides: Sequence[str], conf: Path, folders: Sequence[Path] 
 
     chosen = dict(word.partition("=")[::2] for word in overrides)
     for group in ("clips", "planner"):
-        built_in = {file.stem for root in (conf, *folders) for file in (root / group).glob("*.yaml")}
+        built_in = _files(group, (conf, *folders))
         if group in chosen:
             installed(group, chosen[group], built_in)
         for name, plugins in offered(group).items():

@@ -19,6 +19,7 @@ from itertools import zip_longest
 from typing import TYPE_CHECKING
 
 from factory.config import ConfigError, compose, conf_dir
+from factory.plugins import choices
 from factory.store.room import NoRoom
 from factory.store.usable import why_unusable
 from factory.words import Asked, asked_of
@@ -69,14 +70,15 @@ def dealt(refs: Sequence["ClipRef"], hands: int) -> list["ClipRef"]:
 
 
 def help_text() -> str:
-    """Usage, the keys of conf/run.yaml with their comments, and the choices of every group. Imports nothing heavy."""
+    """Usage, the keys of conf/run.yaml with their comments, and the choices of every group, plug-ins among them.
+
+    Imports nothing heavy.
+    """
     folder = conf_dir()
-    groups = sorted(path for path in folder.iterdir() if path.is_dir())
-    choices = "\n".join(
-        f"  {group.name}: {', '.join(sorted(p.stem for p in group.glob('*.yaml')))}" for group in groups
-    )
+    groups = sorted(path.name for path in folder.iterdir() if path.is_dir())
+    listed = "\n".join(f"  {group}: {', '.join(choices(group, [folder]))}" for group in groups)
     keys = (folder / "run.yaml").read_text().split("_self_", 1)[1].split("\n\n", 1)[1]
-    return f"{__doc__}\nchoices\n{choices}\n\nkeys and defaults\n{keys}"
+    return f"{__doc__}\nchoices\n{listed}\n\nkeys and defaults\n{keys}"
 
 
 def settings_text(overrides: Sequence[str]) -> str:

@@ -26,6 +26,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from factory.commands import nearest
 from factory.config import ConfigError, compose
 from factory.plugins import installed, names
 from planners import checkpoint
@@ -72,10 +73,14 @@ def contender(spec: str, label: str | None = None, changed: Mapping[str, Any] | 
         return Contender(name, digest, partial(_trained, newest, changed))
     if ":" in spec:
         return _plugged(name, spec)
-    known = ", ".join([*PRIVILEGED, *UNTRAINED, *names("planner")])
+    known = [*PRIVILEGED, *UNTRAINED, *names("planner")]
+    listed = ", ".join(known)
     if spec in BUILT_IN:
-        raise ConfigError(f"planner={spec} has to be trained first: name its training's folder; untrained: {known}")
-    raise ConfigError(f"planner={spec}: neither a folder nor one of {known}; or name a class, my.module:MyPlanner")
+        raise ConfigError(f"planner={spec} has to be trained first: name its training's folder; untrained: {listed}")
+    raise ConfigError(
+        f"planner={spec}: neither a folder nor one of {listed}{nearest(spec, known)}; "
+        "or name a class, my.module:MyPlanner"
+    )
 
 
 def _plugged(label: str, spec: str) -> Contender:

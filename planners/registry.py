@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from factory.commands import nearest
 from factory.config import ConfigError, fill
 from factory.plugins import installed, names
 from planners.planner import FloatArray, Planner
@@ -33,8 +34,11 @@ def planner_class(name: str) -> type[Planner]:
     target = BUILT_IN.get(name, name) if plugin is None else plugin.reference
     module, found, attribute = target.partition(":")
     if not found:
-        known = ", ".join([*BUILT_IN, *names("planner")])
-        raise ConfigError(f"planner.name={name}: none of {known}; or name a class, my.module:MyPlanner")
+        known = [*BUILT_IN, *names("planner")]
+        meant = nearest(name, known)
+        raise ConfigError(
+            f"planner.name={name}: none of {', '.join(known)}{meant}; or name a class, my.module:MyPlanner"
+        )
     try:
         cls = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError) as error:

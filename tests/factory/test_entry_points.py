@@ -11,6 +11,7 @@ import pytest
 from hydra.core.config_store import ConfigStore
 
 from examples.csv_logs import write_log
+from factory.completion import candidates
 from factory.config import ConfigError, compose
 from factory.plugins import installed, offered
 from factory.run import main as run_main
@@ -120,18 +121,38 @@ def test_settings_of_an_expert_need_no_target_and_a_target_of_one_s_own_comes_fi
     assert own == {"_target_": "my.Own"}
 
 
-def test_an_unknown_name_lists_what_is_installed(site: Path) -> None:
+def test_an_unknown_name_lists_what_is_installed_and_which_is_meant(site: Path) -> None:
     install(site, "somebody")
-    with pytest.raises(ConfigError, match=r"experts: .*mein.*'mine'"):
+    with pytest.raises(ConfigError, match=r"experts: .*mein.*'mine'.*did you mean mine\?"):
         load_config(["experts=[mein]"])
-    with pytest.raises(ConfigError, match=r"clips=mein: there is .*mine"):
+    with pytest.raises(ConfigError, match=r"clips=mein: there is .*mine.*did you mean clips=mine\?"):
         load_config(["clips=mein"])
-    with pytest.raises(ConfigError, match=r"planner=mein: there is .*mine"):
+    with pytest.raises(ConfigError, match=r"planner=mein: there is .*mine.*did you mean planner=mine\?"):
         compose("train", ["planner=mein"])
-    with pytest.raises(ConfigError, match=r"planner.name=mein: none of .*, mine; or name a class"):
+    with pytest.raises(ConfigError, match=r"planner.name=mein: none of .*, mine; did you mean mine\?; or name a class"):
         planner_class("mein")
-    with pytest.raises(ConfigError, match=r"planner=mein: neither a folder nor one of .*, mine; or"):
+    with pytest.raises(
+        ConfigError, match=r"planner=mein: neither a folder nor one of .*, mine; did you mean mine\?; or"
+    ):
         contender("mein")
+
+
+def test_help_and_completion_list_what_is_installed_and_import_none_of_it(
+    site: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def listed(group: str) -> set[str]:
+        assert run_main(["--help"]) == 0
+        (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith(f"  {group}: "))
+        return set(line.partition(": ")[2].split(", "))
+
+    groups = ("clips", "expert", "planner")
+    without, experts = {group: listed(group) for group in groups}, set(candidates(["run"], "experts="))
+    assert "experts=recovery" in experts and "experts=mine" not in experts
+    install(site, "somebody")
+    assert {group: listed(group) for group in groups} == {group: without[group] | {"mine"} for group in groups}
+    assert set(candidates(["run"], "clips=")) == {f"clips={name}" for name in without["clips"] | {"mine"}}
+    assert set(candidates(["run"], "experts=")) == experts | {"experts=mine"}
+    assert "somebody" not in sys.modules
 
 
 @pytest.mark.parametrize(
