@@ -109,7 +109,7 @@ study-data: install
 	$(PY) -m factory.run $(TRAIN) $(TOWN) $(LABEL) rounds=5 $(OPEN) experts=[logged] out=$(STUDY)/control
 
 study: install
-	OMP_NUM_THREADS=1 $(PY) -m planners.study vocabulary=$(STUDY)/labels.npy $(if $(MINUTES),minutes=$(MINUTES))
+	OMP_NUM_THREADS=1 $(PY) -m planners study vocabulary=$(STUDY)/labels.npy $(if $(MINUTES),minutes=$(MINUTES))
 
 # The part of the study without images (docs/study_logs.md): real logs, split by log. Every command of it goes on where it
 # stopped. SHARED holds data/av2, data/scenarionet and data/vocabulary. FOLDS=av2_7fab2350: some of it.
@@ -156,7 +156,7 @@ $(call sweep,$(1),steps,ego_mlp_bev_small,$($(1)_steps)) $(call learn,$(comma)$(
 $(call sweep,$(1),ego_mlp,ego_mlp_small,$($(1)_steps)) rounds=[0,5] $(call learn)
 
 endef
-sweep = OMP_NUM_THREADS=1 $(PY) -m planners.scaling data.real=[$(LOGS)/$(1)/train] data.sim=[$(LOGS)/$(1)/train] data.val=[$(LOGS)/$(1)/hard] \
+sweep = OMP_NUM_THREADS=1 $(PY) -m planners scaling data.real=[$(LOGS)/$(1)/train] data.sim=[$(LOGS)/$(1)/train] data.val=[$(LOGS)/$(1)/hard] \
 	benchmark=$(LOGS)/$(1)/hard planners=[$(3)] experts=[recovery,pdm_closed] seeds=[0,1,2,3,4] steps=$(4) \
 	out=$(LOGS)/$(1)/$(2) report=$(REPORT)/$(1)/$(2) $(if $(MINUTES),minutes=$(MINUTES))
 learn = "+train={all: ['workers=1','validate_every=50','planner.training.batch_size=8','planner.training.epochs=40'$(1)]}"

@@ -1,10 +1,10 @@
 """A planner: one linear layer from the ego's status to a correction of going straight on.
 
-    python -m planners.train planner=custom planner.name=examples.linear_planner:LinearPlanner \
+    python -m planners train planner=custom planner.name=examples.linear_planner:LinearPlanner \
         data.real=[runs/demo] steps=200 device=cpu out=runs/linear
-    python -m planners.evaluate benchmark=runs/hard planner=runs/linear
+    python -m planners evaluate benchmark=runs/hard planner=runs/linear
 
-Settings are changed with +planner.settings.history=true. What a batch holds: planners/batch.py.
+Settings are changed with +planner.settings.history=true. What a batch holds: planners/data/batch.py.
 """
 
 from collections.abc import Mapping
@@ -14,9 +14,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from planners.batch import Batch, Needs
-from planners.planner import FloatArray, Planner, evaluating
-from planners.regression import imitation_l1, straight_on
+from planners.data.batch import Batch, Needs
+from planners.models.planner import FloatArray, Planner, evaluating
+from planners.models.regression import imitation_l1, straight_on
 
 
 @dataclass(frozen=True)

@@ -46,17 +46,17 @@ COMMANDS: Mapping[str, Command] = {
 
 # What is built on the factory: names alone, as nothing here imports it. `python -m planners` is their door.
 PLANNERS: Mapping[str, Command] = {
-    "train": Command("fit a planner to logged and simulated samples", "planners.train", takes="words"),
-    "evaluate": Command("EPDMS of planners on held-out clips", "planners.evaluate", takes="words"),
-    "compare": Command("how two evaluated planners differ, with intervals", "planners.compare", takes="words"),
-    "scaling": Command("how scores grow with simulated data, and the law behind it", "planners.scaling", takes="words"),
-    "scaling_table": Command("a sweep's tables from its frames", "planners.scaling_table", takes="words"),
-    "replay": Command("a planner on one clip as a film", "planners.replay", takes="words"),
-    "ensemble": Command("several GTRS-Dense models evaluated as one", "planners.ensemble", takes="words"),
-    "analysis": Command("EPDMS on real and simulated frames, and by scenario tag", "planners.analysis", takes="words"),
-    "agreement": Command("whether a study that was made again says the same", "planners.agreement", takes="words"),
-    "study_report": Command("a study's tables and pictures from its frames", "planners.study_report", takes="words"),
-    "study": Command("does simulated data make planners better: all of docs/study.md", "planners.study", takes="words"),
+    "train": Command("fit a planner to logged and simulated samples", "planners.training.train", takes="words"),
+    "evaluate": Command("EPDMS of planners on held-out clips", "planners.evaluation.evaluate", takes="words"),
+    "compare": Command("how two planners differ, with intervals", "planners.evaluation.compare", takes="words"),
+    "scaling": Command("how scores grow with simulated data, by which law", "planners.study.scaling", takes="words"),
+    "scaling_table": Command("a sweep's tables from its frames", "planners.study.scaling_table", takes="words"),
+    "replay": Command("a planner on one clip as a film", "planners.evaluation.replay", takes="words"),
+    "ensemble": Command("several GTRS-Dense models as one", "planners.evaluation.ensemble", takes="words"),
+    "analysis": Command("EPDMS on real and simulated frames, by tag", "planners.evaluation.analysis", takes="words"),
+    "agreement": Command("whether a study made again says the same", "planners.study.agreement", takes="words"),
+    "study_report": Command("a study's tables and pictures from its frames", "planners.study.report", takes="words"),
+    "study": Command("whether simulated data helps: all of docs/study.md", "planners.study.run", takes="words"),
 }
 DOORS = {"factory": COMMANDS, "planners": PLANNERS}  # package -> what `python -m <package>` knows
 

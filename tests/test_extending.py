@@ -16,8 +16,8 @@ from examples.linear_planner import LinearPlanner
 from factory.clips.reader import BadClip
 from factory.run import main as run_main
 from factory.store.reader import SampleTable
-from planners.checkpoint import load_planner
-from planners.train import main as train_main
+from planners.training.checkpoint import load_planner
+from planners.training.train import main as train_main
 from tasks.experts.protocol import Plan
 from tasks.kernels import cache_dir
 from tasks.stages import Rejected
@@ -76,7 +76,7 @@ def test_the_planner_trains_on_them(made: Path, capsys: pytest.CaptureFixture[st
         f"out={made / 'linear'}",
     ]
     assert train_main(arguments) == 0, capsys.readouterr().err
-    assert type(load_planner(made / "linear")) is LinearPlanner  # as planners.evaluate loads it
+    assert type(load_planner(made / "linear")) is LinearPlanner  # as planners.evaluation.evaluate loads it
 
 
 def test_the_script_scores_plans_without_ray_or_hydra() -> None:
@@ -129,5 +129,5 @@ def test_every_example_says_how_it_is_run_and_is_short() -> None:
     assert len(EXAMPLES) == 4
     for path in EXAMPLES:
         text = path.read_text()
-        assert re.search(r"python -m (factory|planners|examples)\.", text.split('"""')[1]), path.name
+        assert re.search(r"python -m (factory\.|planners |examples\.)", text.split('"""')[1]), path.name
         assert len(text.splitlines()) < 220, path.name

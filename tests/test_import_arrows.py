@@ -1,6 +1,7 @@
-"""Imports point one way: tasks <- factory <- planners."""
+"""Imports point one way: tasks <- factory <- planners, and inside a package from its upper rooms to its lower ones."""
 
 import ast
+import graphlib
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +14,9 @@ FORBIDDEN = {
     "factory": {"planners"},
     "planners": set(),
 }
+# Of each package the rooms from the ground up: a module imports from its own room and those below it.
+ROOMS = {"planners": ("data", "models", "training", "evaluation", "study", "__main__")}
+MOST_MODULES = 20  # in a room
 
 
 def imported_modules(path: Path) -> set[str]:
@@ -33,6 +37,48 @@ def test_no_arrow_points_backwards(package: str) -> None:
         assert not wrong, f"{path.relative_to(ROOT)} imports {sorted(wrong)}"
 
 
+def modules() -> dict[str, Path]:
+    """Dotted name -> file of every module of the project; a package goes by the name of its folder."""
+    paths = [path.relative_to(ROOT) for package in FORBIDDEN for path in (ROOT / package).rglob("*.py")]
+    return {".".join(path.with_suffix("").parts).removesuffix(".__init__"): ROOT / path for path in paths}
+
+
+def arrows() -> dict[str, set[str]]:
+    """Module -> modules of the project that it imports, lazily or not."""
+    known = modules()
+    found: dict[str, set[str]] = {}
+    for name, path in known.items():
+        found[name] = set()
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                found[name] |= {alias.name for alias in node.names} & known.keys()
+            elif isinstance(node, ast.ImportFrom) and node.module in known:
+                inside = {f"{node.module}.{alias.name}" for alias in node.names} & known.keys()
+                found[name] |= inside or {node.module}
+    return found
+
+
+def test_no_room_imports_from_one_above_it() -> None:
+    for package, rooms in ROOMS.items():
+        floor = {f"{package}.{room}": number for number, room in enumerate(rooms)}
+        for name, imported in arrows().items():
+            for other in imported:
+                mine, theirs = (floor.get(".".join(module.split(".")[:2])) for module in (name, other))
+                assert mine is None or theirs is None or theirs <= mine, f"{name} imports {other}, which is above it"
+
+
+def test_imports_never_go_round_in_a_circle() -> None:
+    circles = {name: imported for name, imported in arrows().items() if name.startswith(tuple(ROOMS))}
+    list(graphlib.TopologicalSorter(circles).static_order())  # raises CycleError with the circle
+
+
+def test_rooms_are_small_enough_to_be_looked_at() -> None:
+    rooms = {path.parent for name, path in modules().items() if name.startswith(tuple(ROOMS))}
+    for room in rooms:
+        files = [path for path in room.glob("*.py") if path.stem != "__init__"]
+        assert len(files) <= MOST_MODULES, f"{room.relative_to(ROOT)} has {len(files)} modules"
+
+
 def test_only_the_graph_its_metrics_and_trainings_on_a_cluster_import_ray() -> None:
     users = {
         str(path.relative_to(ROOT))
@@ -40,7 +86,7 @@ def test_only_the_graph_its_metrics_and_trainings_on_a_cluster_import_ray() -> N
         for path in (ROOT / package).rglob("*.py")
         if "ray" in imported_modules(path)
     }
-    assert users == {"factory/graph.py", "factory/ray_metrics.py", "planners/on_ray.py"}
+    assert users == {"factory/graph.py", "factory/ray_metrics.py", "planners/training/on_ray.py"}
 
 
 def test_no_module_shadows_the_standard_library() -> None:

@@ -31,17 +31,17 @@ from factory.settings import load_config
 from factory.show import main as show_main
 from factory.store.verify import main as verify_main
 from planners.__main__ import main as planners_main
-from planners.agreement import main as agreement_main
-from planners.analysis import AnalysisSettings
-from planners.compare import CompareSettings
-from planners.compare import main as compare_main
-from planners.evaluate import settings_of as evaluate_settings
-from planners.replay import settings_of as replay_settings
-from planners.scaling import ScalingSettings
-from planners.scaling_table import TableSettings
-from planners.study_plan import StudySettings
-from planners.study_report import ReportSettings
-from planners.train import TrainConfig
+from planners.evaluation.analysis import AnalysisSettings
+from planners.evaluation.compare import CompareSettings
+from planners.evaluation.compare import main as compare_main
+from planners.evaluation.evaluate import settings_of as evaluate_settings
+from planners.evaluation.replay import settings_of as replay_settings
+from planners.study.agreement import main as agreement_main
+from planners.study.plan import StudySettings
+from planners.study.report import ReportSettings
+from planners.study.scaling import ScalingSettings
+from planners.study.scaling_table import TableSettings
+from planners.training.train import TrainConfig
 from tasks.caches import user_cache
 from tasks.kernels import cache_dir
 from tasks.render.fit.settings import FitSettings
@@ -160,37 +160,40 @@ def test_every_command_is_one_its_program_takes(
             parse(DashboardRequest, arguments)  # it would serve until it is stopped
         case ["python", "-m", "factory.report", *arguments]:
             assert report_main(arguments) == 0, capsys.readouterr().err
-        case ["python", "-m", "planners.train", *arguments] | [
+        case ["python", "-m", "planners", "train", *arguments] | [
             "torchrun",
             "--nproc-per-node",
             "8",
             "-m",
-            "planners.train",
+            "planners",
+            "train",
             *arguments,
         ]:
             fill(TrainConfig, compose("train", given(arguments)), "train")
-        case ["python", "-m", "planners.evaluate" | "planners.ensemble", *arguments]:
+        case ["python", "-m", "planners", "evaluate" | "ensemble", *arguments]:
             evaluate_settings([argument for argument in arguments if not argument.startswith("models=")])
-        case ["python", "-m", "planners.compare", *arguments] if any(word.startswith("table=") for word in arguments):
+        case ["python", "-m", "planners", "compare", *arguments] if any(
+            word.startswith("table=") for word in arguments
+        ):
             monkeypatch.chdir(REPOSITORY)  # the study's tables lie there
             assert compare_main(arguments) == 0, capsys.readouterr().err
-        case ["python", "-m", "planners.compare", *arguments]:
+        case ["python", "-m", "planners", "compare", *arguments]:
             fill(CompareSettings, compose("compare", arguments), "compare")
-        case ["python", "-m", "planners.agreement", *arguments]:
+        case ["python", "-m", "planners", "agreement", *arguments]:
             monkeypatch.chdir(REPOSITORY)
             kept = [word for word in arguments if not word.startswith("out=")]
             assert agreement_main([*kept, f"out={demo_home / 'agreement.png'}"]) == 0, capsys.readouterr().err
-        case ["python", "-m", "planners.scaling", *arguments]:
+        case ["python", "-m", "planners", "scaling", *arguments]:
             fill(ScalingSettings, compose("scaling", arguments), "scaling")
-        case ["python", "-m", "planners.scaling_table", *arguments]:
+        case ["python", "-m", "planners", "scaling_table", *arguments]:
             fill(TableSettings, pairs(arguments), "scaling_table")
-        case ["python", "-m", "planners.replay", *arguments]:
+        case ["python", "-m", "planners", "replay", *arguments]:
             replay_settings(arguments)
-        case ["python", "-m", "planners.study", *arguments]:
+        case ["python", "-m", "planners", "study", *arguments]:
             fill(StudySettings, compose("study", arguments), "study")
-        case ["python", "-m", "planners.study_report", *arguments]:
+        case ["python", "-m", "planners", "study_report", *arguments]:
             fill(ReportSettings, pairs(arguments), "study_report")
-        case ["python", "-m", "planners.analysis", *arguments]:
+        case ["python", "-m", "planners", "analysis", *arguments]:
             fill(AnalysisSettings, pairs(arguments), "analysis")
         case ["python", "-m", "tests.bench.bench_kitti", _, *arguments]:
             known = {field.name for field in fields(FitSettings)} | {"out", "validate", "threads", "first", "last"}

@@ -20,10 +20,10 @@ import torch
 from numpy.typing import NDArray
 
 from factory.store.reader import TIME_TOLERANCE_S, SampleTable
-from planners.batch import ImageLayout, Needs
-from planners.data import DataSettings, make_feed, open_data
-from planners.loader import Loader
-from planners.mix import MixSettings
+from planners.data.batch import ImageLayout, Needs
+from planners.data.feed import DataSettings, make_feed, open_data
+from planners.data.loader import Loader
+from planners.data.mix import MixSettings
 from tests.planners.samples import FRONT_YAWS, camera, jpeg, sample, write_table
 
 SHARED = Path("../shared")

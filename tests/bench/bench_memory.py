@@ -66,7 +66,7 @@ def rows_of(numbers: range, k: int, digest: str) -> Iterator[dict[str, Any]]:
 def train(folder: Path, table: Path, shuffle_mb: int, steps: int) -> float:
     """The most memory [MB] that the training's process held. Raises RuntimeError where it fails."""
     command = [
-        *(sys.executable, "-m", "planners.train", "planner=gtrs_dense_small", "mix=rewards_only", f"steps={steps}"),
+        *(sys.executable, "-m", "planners", "train", "planner=gtrs_dense_small", "mix=rewards_only", f"steps={steps}"),
         f"planner.settings.vocabulary={folder / 'vocabulary.npy'}",
         "planner.settings.kept=0.01",
         *(f"data.sim=[{table}]", f"mix.shuffle_mb={shuffle_mb}", f"out={folder / f'trained_{table.name}'}"),

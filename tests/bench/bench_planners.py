@@ -16,12 +16,12 @@ import numpy as np
 import torch
 
 from factory.config import compose, fill
-from planners.batch import Batch, Needs
-from planners.decode import LABELS
-from planners.optim import build_optimiser
-from planners.planner import Planner
-from planners.registry import planner_class, settings_of
-from planners.train import PlannerEntry
+from planners.data.batch import Batch, Needs
+from planners.data.decode import LABELS
+from planners.models.planner import Planner
+from planners.models.registry import planner_class, settings_of
+from planners.training.optim import build_optimiser
+from planners.training.train import PlannerEntry
 from tasks.kinematic_vocabulary import kinematic_trajectories
 from tests.bench.timing import cpu_milliseconds, memory_mb, milliseconds
 

@@ -17,9 +17,9 @@ from factory.plugins import installed, offered
 from factory.run import main as run_main
 from factory.settings import load_config
 from factory.store.reader import SampleTable
-from planners.contenders import contender
-from planners.registry import planner_class
-from planners.train import main as train_main
+from planners.evaluation.contenders import contender
+from planners.models.registry import planner_class
+from planners.training.train import main as train_main
 from tasks.kernels import cache_dir
 
 ROOT = Path(__file__).resolve().parents[2]

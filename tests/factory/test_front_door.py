@@ -113,8 +113,8 @@ def test_each_door_lists_its_commands_and_names_those_of_the_other(capsys: pytes
         assert callable(command.load())
     modules = {command.module for command in PLANNERS.values()}
     runnable = {
-        f"planners.{path.stem}"
-        for path in (REPOSITORY / "planners").glob("*.py")
+        ".".join(path.relative_to(REPOSITORY).with_suffix("").parts)
+        for path in (REPOSITORY / "planners").rglob("*.py")
         if path.stem != "__main__" and 'if __name__ == "__main__"' in path.read_text()
     }
     assert modules == runnable, "every command that can be run is listed"

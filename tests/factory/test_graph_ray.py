@@ -34,7 +34,7 @@ def two_cpus() -> Iterator[None]:
     ray.shutdown()
 
 
-@pytest.mark.parametrize("module", ["factory.graph", "planners.on_ray"])
+@pytest.mark.parametrize("module", ["factory.graph", "planners.training.on_ray"])
 def test_a_cluster_of_our_own_starts_without_a_warning_and_asks_for_a_token(module: str, tmp_path: Path) -> None:
     arguments = "1, None" if module == "factory.graph" else ""
     code = f"import os, {module} as m; m._connect({arguments}); print(os.environ['RAY_AUTH_MODE']); m.ray.shutdown()"

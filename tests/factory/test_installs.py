@@ -113,7 +113,7 @@ COMMANDS = [
     pytest.param(["factory", "run", "preset=demo", "--cfg"], '-e ".[run]"', id="run --cfg"),
     pytest.param(["factory", "explain", "preset=demo", "clip=0"], '-e ".[run]"', id="explain"),
     pytest.param(["factory.vocabulary", "kinematic=true", "k=8", "out=v.npy"], '-e ".[run]"', id="vocabulary"),
-    pytest.param(["planners.train", "planner=ego_mlp_small"], '-e ".[planners]"', id="train"),
+    pytest.param(["planners.training.train", "planner=ego_mlp_small"], '-e ".[planners]"', id="train"),
 ]
 
 

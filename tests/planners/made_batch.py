@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from planners.batch import Batch, Needs
+from planners.data.batch import Batch, Needs
 
 
 def made_batch(needs: Needs, n: int, seed: int = 0) -> Batch:

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from planners.frames import FrameKey
-from planners.score_rows import FrameRow, Stage
+from planners.evaluation.frames import FrameKey
+from planners.evaluation.score_rows import FrameRow, Stage
 from tasks.reward.one_stage import COLUMNS, FrameScores
 
 

@@ -16,7 +16,7 @@ from factory.store.location import Location
 from factory.store.samples import Store
 from factory.store.schema import sample_row_to_table
 from factory.store.table import write_shard
-from planners.batch import COMMANDS
+from planners.data.batch import COMMANDS
 from tests.factory.toy import labels_of_stream, row_of, stream
 
 Pixels = NDArray[np.uint8]

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from planners.backbone import BackboneSettings
-from planners.batch import Batch, BevLayout, ImageLayout
-from planners.transfuser import FusionSettings
+from planners.data.batch import Batch, BevLayout, ImageLayout
+from planners.models.backbones.registry import BackboneSettings
+from planners.models.transfuser import FusionSettings
 from tasks.reward.label_bytes import VocabularyLabels
 
 PICTURE = ImageLayout(width=64, height=32)

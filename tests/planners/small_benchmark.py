@@ -15,7 +15,7 @@ from factory.store.samples import Store
 from factory.store.scenes import SceneFiles
 from factory.store.schema import COLUMNS, SAMPLES, sample_row_to_table
 from factory.store.table import write_shard
-from planners.frames import ClipScenes, FrameKey, FramePair
+from planners.evaluation.frames import ClipScenes, FrameKey, FramePair
 from tasks.attempt import drive_and_judge
 from tasks.experts.follow_up import BEFORE_STEPS
 from tasks.experts.pdm_closed import PdmSettings

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from planners.batch import Batch, Needs
-from planners.planner import FloatArray, Planner, TrainingData
+from planners.data.batch import Batch, Needs
+from planners.models.planner import FloatArray, Planner, TrainingData
 
 
 @dataclass(frozen=True)

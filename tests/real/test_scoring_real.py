@@ -1,6 +1,7 @@
 """What planners are ranked by equals the public scorer on the recorded scenes, from the raw log on.
 
-The frames are prepared, driven and filtered by planners.scoring alone; the plans and numbers are the recorded ones.
+The frames are prepared, driven and filtered by planners.evaluation.scoring alone; plans and numbers are the recorded
+ones.
 """
 
 import json
@@ -15,7 +16,7 @@ from reference_scenes import loader
 
 from factory.clips.av2 import AV2Reader, log_folders
 from factory.clips.reader import ClipRef
-from planners.scoring import PreparedFrame, Rules, drive, prepare_frame, score_pair
+from planners.evaluation.scoring import PreparedFrame, Rules, drive, prepare_frame, score_pair
 from tasks.reward.one_stage import COLUMNS, frame_scores
 from tasks.rollout.simulate import TrafficScene, TrafficSettings
 from tasks.world.clip import NOW, STEP_S, scene_of_clip

@@ -1,0 +1,1 @@
+"""From sample tables to batches: what is read, in which order, and as which tensors."""

@@ -1,0 +1,203 @@
+"""From stored rows to a batch: flat Arrow buffers are cut per sample, without a Python object per value, and decoded.
+
+`StoredRows` is a row group in memory, of the images those at now alone. `BatchBuffer` is a batch that several threads
+fill, sample by sample.
+"""
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from factory.store.columns import Column
+from factory.store.reader import LABEL_COLUMNS, TIME_TOLERANCE_S, labels_of
+from factory.store.schema import COLUMNS
+from planners.data.batch import COMMANDS, Batch, BevLayout, ImageLayout, Needs
+from planners.data.feed import AGENT_COLUMNS, BEV_COLUMNS
+from planners.data.images import Bytes, stitch
+from tasks.reward.label_bytes import CRC_BYTES
+
+LABELS = ("nc", "dac", "ddc", "tlc", "ttc", "lk", "hc", "ep")
+
+
+class StoredRows:
+    """Some rows of one row group."""
+
+    def __init__(self, table: pa.Table, cameras: Sequence[tuple[str, ...]], in_place: bool = False) -> None:
+        """
+        Args:
+            table: each column in one chunk, with the plain lists of a file.
+            cameras: (rows) of each row's picture; none for rows that are not asked for.
+            in_place: pictures stay where they are in the table, which then stays as a whole. Else they are copied, so
+                that the images of other cameras and instants can go.
+        """
+        self._jpegs: list[tuple[Bytes, ...]] = []
+        if "images" in table.column_names:
+            self._jpegs = _jpegs_at_now(_whole(table["images"]), cameras, in_place)
+            table = table.drop_columns(["images"])
+        self._values = {name: _values(COLUMNS[name], _whole(table[name])) for name in table.column_names}
+        self._rasters: dict[tuple[int, BevLayout], NDArray[np.uint8]] = {}
+        self._pictures: dict[tuple[int, ImageLayout], NDArray[np.uint8]] = {}
+
+    def value(self, column: str, row: int) -> Any:
+        """A value as the sample reader gives it: an array, a list of arrays, a text or a number."""
+        return self._values[column](row)
+
+    def values(self, columns: Sequence[str], row: int) -> dict[str, Any]:
+        """Several columns of a row."""
+        return {column: self._values[column](row) for column in columns}
+
+    def raster(self, row: int, layout: BevLayout) -> NDArray[np.uint8]:
+        """The row seen from above (T, rows, columns), drawn once: a raster is smaller than the map it is drawn from."""
+        from planners.data.bev import bev_raster
+
+        if (row, layout) not in self._rasters:
+            self._rasters[row, layout] = bev_raster(self.values(BEV_COLUMNS, row), layout)
+        return self._rasters[row, layout]
+
+    def jpegs(self, row: int) -> tuple[Bytes, ...]:
+        """The images at now of the row's cameras, left to right."""
+        return self._jpegs[row]
+
+    def picture(self, row: int, layout: ImageLayout, out: NDArray[np.uint8], keep: bool = False) -> None:
+        """Write the row's wide picture into `out`; keep: it is decoded once and stays, beside its smaller JPEGs."""
+        kept = self._pictures.get((row, layout))
+        if kept is not None:
+            out[:] = kept
+            return
+        stitch(self.jpegs(row), layout, out)
+        if keep:
+            self._pictures[row, layout] = out.copy()
+
+
+class BatchBuffer:
+    """A batch of `size` samples whose tensors are still to be filled; samples may be filled by several threads."""
+
+    def __init__(
+        self, size: int, needs: Needs, n_labels: int, pinned: bool = False, keep_pictures: bool = False
+    ) -> None:
+        """
+        Args:
+            n_labels: K of the vocabulary.
+            pinned: in memory that a GPU copies from while others compute.
+            keep_pictures: what is decoded stays with its row, for the next pass.
+        """
+
+        def empty(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+            return torch.empty((size, *shape), dtype=dtype, pin_memory=pinned)
+
+        self._needs, self._keep_pictures = needs, keep_pictures
+        self._tensors: dict[str, Tensor] = {
+            "status": empty(len(COMMANDS) + 4),
+            "history": empty(4, 3),
+            "plan_2hz": empty(8, 3),
+            "plan_10hz": empty(40, 3),
+        }
+        if needs.image is not None:
+            self._tensors["image"] = empty(needs.image.height, needs.image.width, 3, dtype=torch.uint8)
+        if needs.bev is not None:
+            self._tensors["bev"] = empty(len(needs.bev.times_s), *needs.bev.shape, dtype=torch.uint8)
+        if needs.n_agents:
+            self._tensors["agents"] = empty(needs.n_agents, 5)
+            self._tensors["agents_valid"] = empty(needs.n_agents, dtype=torch.bool)
+        self._labels = {name: empty(n_labels) for name in LABELS} if needs.labels is not None else {}
+        self._arrays = {name: tensor.numpy() for name, tensor in (self._tensors | self._labels).items()}
+
+    def fill(self, i: int, stored: StoredRows, row: int) -> None:
+        """Decode a row as sample i. Raises ValueError for what cannot be decoded."""
+        arrays, needs = self._arrays, self._needs
+        arrays["status"][i, : len(COMMANDS)] = np.arange(len(COMMANDS)) == COMMANDS.index(stored.value("command", row))
+        arrays["status"][i, len(COMMANDS) :] = stored.value("ego_status", row)
+        arrays["history"][i] = stored.value("ego_history_2hz", row)
+        arrays["plan_2hz"][i] = stored.value("label_2hz", row)
+        arrays["plan_10hz"][i] = stored.value("label_10hz", row)
+        if needs.image is not None:
+            stored.picture(row, needs.image, arrays["image"][i], self._keep_pictures)
+        if needs.bev is not None:
+            arrays["bev"][i] = stored.raster(row, needs.bev)
+            if needs.n_agents:
+                from planners.data.bev import nearest_agents
+
+                seen = stored.values(AGENT_COLUMNS, row)
+                arrays["agents"][i], arrays["agents_valid"][i] = nearest_agents(seen, needs.bev, needs.n_agents)
+        if needs.labels is not None:
+            labels = labels_of(stored.values(LABEL_COLUMNS, row), needs.labels)
+            for name in LABELS:
+                arrays[name][i] = labels.ep(needs.normalise) if name == "ep" else getattr(labels, name)
+
+    def batch(self, attempt_ids: Sequence[str], simulated: NDArray[np.bool_], imitate: NDArray[np.bool_]) -> Batch:
+        """What was filled. The image is channels last in memory, as it was decoded."""
+        tensors: dict[str, Any] = dict(self._tensors)
+        if "image" in tensors:
+            tensors["image"] = tensors["image"].permute(0, 3, 1, 2)
+        return Batch(
+            attempt_ids=tuple(attempt_ids),
+            simulated=torch.from_numpy(simulated.copy()),
+            imitate=torch.from_numpy(imitate.copy()),
+            labels=dict(self._labels) or None,
+            **tensors,
+        )
+
+
+def count_labels(stored: StoredRows, row: int) -> int:
+    """K of a row's vocabulary, from the length of its bytes alone."""
+    return (len(stored.value("label_progress", row)) - CRC_BYTES) // 2
+
+
+def _whole(column: pa.ChunkedArray) -> pa.Array:
+    """In one piece. Of a single chunk `combine_chunks` would make a copy."""
+    return column.chunk(0) if column.num_chunks == 1 else column.combine_chunks()
+
+
+def _jpegs_at_now(images: pa.ListArray, cameras: Sequence[tuple[str, ...]], in_place: bool) -> list[tuple[Bytes, ...]]:
+    starts, entries = images.offsets.to_numpy(), images.values
+    at_now = np.flatnonzero(np.abs(entries.field("time_s").to_numpy()) <= TIME_TOLERANCE_S)
+    names = entries.field("camera").take(pa.array(at_now)).to_pylist()
+    row_of = np.searchsorted(starts, at_now, side="right") - 1
+    found = {(row, name): entry for row, name, entry in zip(row_of.tolist(), names, at_now.tolist())}
+    jpeg = entries.field("jpeg")
+    _, _, data = jpeg.buffers()
+    ends = np.frombuffer(jpeg.buffers()[1], np.int32)[jpeg.offset : jpeg.offset + len(jpeg) + 1]
+    flat = np.frombuffer(data, np.uint8)
+
+    def jpeg_of(entry: int) -> Bytes:
+        stored = flat[ends[entry] : ends[entry + 1]]
+        return stored if in_place else stored.copy()
+
+    return [tuple(jpeg_of(found[row, name]) for name in chosen) for row, chosen in enumerate(cameras)]
+
+
+def _values(column: Column, stored: pa.Array) -> Callable[[int], Any]:
+    """Row -> value, in the declared shape."""
+    if column.dtype in ("string", "binary"):
+        return lambda row: stored[row].as_py()
+    if not column.shape:
+        scalars = stored.to_numpy(zero_copy_only=False)
+        return lambda row: scalars[row].item()
+    offsets, inner = [], stored
+    for _ in column.shape:
+        offsets.append(inner.offsets.to_numpy())
+        inner = inner.values
+    flat = inner.to_numpy(zero_copy_only=False)
+
+    def ends(bounds: Any, level: int) -> Any:
+        """Where lists at a level begin in `flat`."""
+        for deeper in offsets[level:]:
+            bounds = deeper[bounds]
+        return bounds
+
+    if len(column.shape) > 1 and isinstance(column.shape[1], str):
+        item = (-1, *column.shape[2:])
+
+        def ragged(row: int) -> list[NDArray[Any]]:
+            edges = ends(np.arange(offsets[0][row], offsets[0][row + 1] + 1), 1).tolist()
+            return [flat[start:stop].reshape(item) for start, stop in pairwise(edges)]
+
+        return ragged
+    shape = tuple(-1 if isinstance(size, str) else size for size in column.shape)
+    return lambda row: flat[ends(row, 0) : ends(row + 1, 0)].reshape(shape)

@@ -1,0 +1,149 @@
+"""One wide picture of a sample: its front cameras at now, cut, decoded and resized side by side.
+
+A JPEG is decoded at a half, a quarter or an eighth of its size where that is still as large as what is wanted of it.
+At the paper's setting (three 1920 x 1080 pictures, 2048 x 512 wanted) the halves have the wanted size already: 14.4
+instead of 34.8 ms a sample, and 0.15 of 255 away from decoding in full and averaging (rendered pictures).
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from factory.store.reader import TIME_TOLERANCE_S
+from planners.data.batch import ImageLayout
+
+Bytes = NDArray[np.uint8]
+
+SAME_YAW = math.radians(5.0)  # cameras of a stereo pair are no neighbours
+AS_GOOD = math.radians(2.0)  # of cameras that look ahead equally well the first by name is the front one
+REDUCED_BY = {2: cv2.IMREAD_REDUCED_GRAYSCALE_2, 4: cv2.IMREAD_REDUCED_GRAYSCALE_4, 8: cv2.IMREAD_REDUCED_GRAYSCALE_8}
+RGB_AT = {1: cv2.IMREAD_COLOR_RGB} | {f: flag | cv2.IMREAD_COLOR_RGB for f, flag in REDUCED_BY.items()}  # grey is 0
+
+
+def stitched(sample: Mapping[str, Any], layout: ImageLayout) -> NDArray[np.uint8]:
+    """The picture (layout.height, layout.width, 3) uint8 RGB of a sample with the columns cameras and images.
+
+    Raises ValueError where it has no cameras, no image of one of them at now, or a damaged one.
+    """
+    cameras = sample["cameras"] or ()
+    axes = np.array([np.reshape(camera["ego_from_camera"], (4, 4))[:2, 2] for camera in cameras]).reshape(-1, 2)
+    names = chosen_cameras([camera["name"] for camera in cameras], axes, layout)
+    now = {
+        image["camera"]: image["jpeg"] for image in sample["images"] or () if abs(image["time_s"]) <= TIME_TOLERANCE_S
+    }
+    missing = [name for name in names if name not in now]
+    if missing:
+        raise ValueError(f"no image of camera {', '.join(missing)} at now; there are {sorted(now)}")
+    picture = np.empty((layout.height, layout.width, 3), np.uint8)
+    stitch([np.frombuffer(now[name], np.uint8) for name in names], layout, picture)
+    return picture
+
+
+def chosen_cameras(names: Sequence[str], axes: NDArray[np.float64], layout: ImageLayout) -> tuple[str, ...]:
+    """The cameras of the picture, left to right: those of the layout, else the front one and its neighbours.
+
+    The front camera is the one whose optical axis is nearest to ahead; its neighbours are the nearest by yaw, to the
+    left and to the right, that look ahead at all. There may be none.
+
+    Args:
+        names: of the sample's C cameras.
+        axes: (C, 2) x, y of their optical axes in the ego frame.
+
+    Raises ValueError where there is no camera, or none of a name that the layout has.
+    """
+    if layout.cameras:
+        unknown = [name for name in layout.cameras if name not in names]
+        if unknown:
+            raise ValueError(f"no camera {', '.join(unknown)} (image.cameras); there are {sorted(names)}")
+        return layout.cameras
+    yaw = dict(zip(names, np.arctan2(axes[:, 1], axes[:, 0]).tolist()))
+    ahead = {name: angle for name, angle in yaw.items() if abs(angle) < math.pi / 2}
+    if not ahead:
+        raise ValueError(f"no camera looks ahead; there are {sorted(names)}")
+    best = min(map(abs, ahead.values()))
+    front = min(name for name, angle in ahead.items() if abs(angle) <= best + AS_GOOD)
+    left = {name: angle for name, angle in ahead.items() if angle > ahead[front] + SAME_YAW}
+    right = {name: -angle for name, angle in ahead.items() if angle < ahead[front] - SAME_YAW}
+    return (*_nearest(left), front, *_nearest(right))
+
+
+def _nearest(angles: Mapping[str, float]) -> list[str]:
+    return sorted(angles, key=lambda name: (angles[name], name))[:1]
+
+
+def stitch(jpegs: Sequence[Bytes], layout: ImageLayout, out: NDArray[np.uint8]) -> None:
+    """Write the picture of JPEGs, left to right, into `out` (layout.height, layout.width, 3) as RGB.
+
+    Every camera is brought to the same height, and together they are brought to the width.
+    Raises ValueError for what is not a JPEG.
+    """
+    sizes = tuple(jpeg_size(jpeg) for jpeg in jpegs)
+    for jpeg, part in zip(jpegs, _parts(sizes, layout)):
+        pixels = cv2.imdecode(jpeg, RGB_AT[part.factor])
+        if pixels is None or pixels.shape[:2] != part.decoded:
+            raise ValueError("an image is not a JPEG that can be decoded")
+        pixels, into = pixels[part.rows, part.columns], out[:, part.into]
+        if pixels.shape == into.shape:
+            into[:] = pixels
+        else:
+            cv2.resize(pixels, into.shape[1::-1], dst=into, interpolation=part.interpolation)
+
+
+@dataclass(frozen=True)
+class _Part:
+    """One camera's part of the picture."""
+
+    factor: int  # by which it is decoded smaller
+    decoded: tuple[int, int]  # rows, columns that come of it
+    rows: slice  # of them those that are shown
+    columns: slice
+    into: slice  # columns of the picture
+    interpolation: int
+
+
+@lru_cache(maxsize=64)
+def _parts(sizes: tuple[tuple[int, int], ...], layout: ImageLayout) -> tuple[_Part, ...]:
+    """Where images of these sizes (rows, columns) go. Raises ValueError where the layout cuts all of one away."""
+    cuts = [(layout.rows_cut, 0.0 if 2 * i == len(sizes) - 1 else layout.sides_cut) for i in range(len(sizes))]
+    shown = [tuple(_inside(n, share) for n, share in zip(size, cut)) for size, cut in zip(sizes, cuts)]
+    lengths = [tuple(inside.stop - inside.start for inside in one) for one in shown]
+    for size, (rows, columns) in zip(sizes, lengths):
+        if rows < 1 or columns < 1:
+            raise ValueError(f"rows_cut or sides_cut leave nothing of an image of {size[1]} x {size[0]}")
+    widths = np.cumsum([0.0, *(columns / rows for rows, columns in lengths)])
+    edges = np.round(widths / widths[-1] * layout.width).astype(int).tolist()
+    parts = []
+    for size, cut, (rows, columns), start, stop in zip(sizes, cuts, lengths, edges, edges[1:]):
+        factor = max(f for f in RGB_AT if f == 1 or (rows // f >= layout.height and columns // f >= stop - start))
+        decoded = -(-size[0] // factor), -(-size[1] // factor)
+        shrinks = rows > 2 * factor * layout.height or columns > 2 * factor * (stop - start)
+        how = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+        inside = _inside(decoded[0], cut[0]), _inside(decoded[1], cut[1])
+        parts.append(_Part(factor, decoded, *inside, slice(start, stop), how))
+    return tuple(parts)
+
+
+def _inside(n: int, share: float) -> slice:
+    """What is left of n rows or columns that lose a share at either end."""
+    return slice(round(share * n), n - round(share * n))
+
+
+def jpeg_size(jpeg: Bytes) -> tuple[int, int]:
+    """Rows, columns, from the header. Raises ValueError for what is not a JPEG."""
+    at = 2
+    head = jpeg[:2].tobytes()
+    while head == b"\xff\xd8" and at + 9 <= len(jpeg) and jpeg[at] == 0xFF:
+        marker = int(jpeg[at + 1])
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # a start of frame
+            rows, columns = jpeg[at + 5 : at + 9].view(">u2").tolist()
+            if rows and columns:
+                return rows, columns
+            break
+        at += 1 if marker == 0xFF else 2 + 256 * int(jpeg[at + 2]) + int(jpeg[at + 3])
+    raise ValueError(f"an image of {len(jpeg)} bytes is not a JPEG")

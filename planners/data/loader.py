@@ -1,0 +1,249 @@
+"""Batches of samples for a planner: one process's share of every global batch, in an order that nothing disturbs.
+
+    loader = Loader(open_data(settings, needs), needs, MixSettings(), batch_size=64, seed=0)
+    for batch in loader.epoch(0): ...
+    state = loader.state()      # after any batch; `resume(state)` in another process goes on with the next one
+
+Threads read and decode ahead: OpenCV, zlib and Arrow do their work without the interpreter's lock. Of a data set whose
+decoded pictures fit into the memory for shuffling each picture is decoded once.
+"""
+
+import json
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from dataclasses import asdict
+from hashlib import sha256
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planners.data.batch import Batch, Needs
+from planners.data.decode import BatchBuffer, count_labels
+from planners.data.feed import Dataset, make_feed, mixed_samples
+from planners.data.mix import EpochOrder, MixSettings, Side, make_order
+from planners.data.windows import Inline, Memory, Place, Window
+
+STATE_VERSION = 1
+READERS = 4
+TASK = 8  # samples that a thread decodes before it looks for more work
+BATCHES_AHEAD = 2
+
+
+class Loader:
+    """The batches of one process among `world`."""
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        needs: Needs,
+        mix: MixSettings,
+        batch_size: int,
+        rank: int = 0,
+        world: int = 1,
+        seed: int = 0,
+        workers: int = 2,
+        pinned: bool = False,
+    ) -> None:
+        """
+        Args:
+            needs: what the planner reads of a sample.
+            batch_size: samples of a global batch, over all processes.
+            rank, world: which process this is, of how many.
+            workers: threads that decode; 0: everything happens in the caller's, when a batch is asked for.
+            pinned: batches lie in memory that a GPU copies from while others compute.
+
+        Raises ValueError where the data is not what the planner needs or the mix asks for, or a batch does not divide.
+        """
+        if batch_size < 1 or batch_size % world:
+            raise ValueError(f"a global batch of {batch_size} samples does not divide among {world} processes")
+        self.mix, self.batch_size, self.rank, self.world, self.seed = mix, batch_size, rank, world, seed
+        self._needs, self._workers, self._pinned = needs, workers, pinned
+        self._feed = make_feed(dataset, needs)
+        samples = mixed_samples(self._feed, mix)
+        self._order = make_order(samples, mix, batch_size, seed)
+        staying = {side.number: side.rows for side in self._order.sides if side.fits}
+        self._memory = Memory(self._feed, staying)
+        self._pictures_bytes = _kept_pictures(self._order.sides, needs, mix)
+        sha = sha256(dataset.digest.encode())
+        if len(staying) < len(self._order.sides):  # windows depend on where samples stand
+            sha.update(samples.group.tobytes() + samples.size.tobytes())
+        self._digest = sha.hexdigest()[:16]
+        self._position = (0, 0)  # epoch, batch
+        self._resumed = False
+
+    @property
+    def dataset(self) -> Dataset:
+        return self._feed.dataset
+
+    def n_batches(self, epoch: int) -> int:
+        """Batches of an epoch; the rest of its pass, less than a batch, is left out."""
+        return self._order.n_batches
+
+    def epoch(self, epoch: int) -> Iterator[Batch]:
+        """The batches of an epoch; of one that was resumed in, those that are left.
+
+        Raises ValueError for a sample that cannot be decoded and OSError for a damaged file, by name.
+        """
+        first = self._position[1] if self._resumed else 0
+        if self._resumed and epoch != self._position[0]:
+            raise ValueError(f"resumed in epoch {self._position[0]}, not {epoch}")
+        self._resumed = False
+        self._position = (epoch, first)
+        return self._batches(epoch, first)
+
+    def state(self) -> dict[str, Any]:
+        """Where the next batch is, as JSON."""
+        epoch, batch = self._position
+        if batch == self._order.n_batches:
+            epoch, batch = epoch + 1, 0
+        return {
+            "version": STATE_VERSION,
+            "epoch": epoch,
+            "batch": batch,
+            "settings": self._settings(),
+            "data": {"digest": self._digest, "samples": len(self.dataset)},
+        }
+
+    def resume(self, state: Mapping[str, Any]) -> None:
+        """Go on behind the last batch that was handed out before `state`, with any number of workers and processes.
+
+        Raises ValueError, naming what differs, where the order would be another.
+        """
+        if state.get("version") != STATE_VERSION:
+            raise ValueError(f"a loader's state of version {state.get('version')}, this version reads {STATE_VERSION}")
+        now, then = self._settings(), state["settings"]
+        changed = [f"{k}: {then.get(k)} -> {now.get(k)}" for k in sorted({*now, *then}) if now.get(k) != then.get(k)]
+        if changed:
+            raise ValueError(f"the order of samples would change in the middle of a training: {'; '.join(changed)}")
+        if state["data"]["digest"] != self._digest:
+            raise ValueError(
+                f"the samples are not those that the training began with: {state['data']['samples']} then, "
+                f"{len(self.dataset)} now, digest {state['data']['digest']} -> {self._digest}"
+            )
+        self._position = (int(state["epoch"]), int(state["batch"]))
+        self._resumed = True
+
+    def text(self) -> str:
+        """What is seen of what, in a few lines."""
+        order, sides = self._order, self._order.sides
+        batches = f"{order.n_batches} batches of {self.batch_size}"
+        lines = [self.dataset.text()]
+        if order.ratio is None:
+            lines.append(f"an epoch is a pass over all {len(sides[0])} samples: {batches}")
+        else:
+            share = f"{float(order.ratio):g} of every batch are simulated"
+            lines.append(f"an epoch is a pass over the {len(sides[0])} real samples: {batches}, {share}")
+            if order.sim_per_epoch:
+                passes = f"{order.sim_per_epoch / len(sides[1]):.2f} passes over {len(sides[1])} samples"
+                lines.append(f"and {order.sim_per_epoch} times a simulated one, {passes}")
+        lines.append(f"plans to imitate: {self.mix.imitation}")
+        for side in sides:
+            held = "stay in memory" if side.fits else f"are shuffled in windows of {side.window_bytes / 2**20:.0f} MB"
+            lines.append(f"{len(side)} samples of {side.size.sum() / 2**20:.1f} MB {held}")
+        if self._pictures_bytes:
+            lines.append(f"{self._pictures_bytes / 2**20:.1f} MB of pictures stay decoded beside them")
+        if copies := self._memory.copies:
+            there = sum(copy.path.exists() for copy in copies.values())
+            rest = "" if there == len(copies) else ", the others when they are first read"
+            lines.append(f"{there} of {len(copies)} files are copied to {self.dataset.settings.copy}{rest}")
+        return "\n".join(lines)
+
+    def _settings(self) -> dict[str, Any]:
+        """What the order depends on beside the samples, as it is in JSON."""
+        mix = {f"mix.{name}": value for name, value in asdict(self.mix).items()}
+        settings: dict[str, Any] = {**mix, "seed": self.seed, "batch_size": self.batch_size}
+        return dict(json.loads(json.dumps(settings)))
+
+    def _batches(self, epoch: int, first: int) -> Iterator[Batch]:
+        order, n = self._order.epoch(epoch), self._order.n_batches
+        share = self.batch_size // self.world
+        mine = slice(self.rank * share, (self.rank + 1) * share)
+        rows, windows = order.rows[:, mine], order.window[:, mine]
+        threads = self._workers > 0
+        ahead = max(BATCHES_AHEAD, -(-2 * TASK * self._workers // share)) if threads else 1
+        readers: Executor = ThreadPoolExecutor(READERS, "read") if threads else Inline()
+        decoders: Executor = ThreadPoolExecutor(self._workers, "decode") if threads else Inline()
+        coming: deque[_Pending] = deque()
+        try:
+            self._memory.begin(_windows(order, rows, windows, first), readers)
+            batch = first
+            while True:
+                while batch < n and len(coming) < ahead and (not coming or self._ready(order, windows[batch])):
+                    coming.append(self._started(order, rows[batch], windows[batch], decoders))
+                    self._memory.done(batch)
+                    batch += 1
+                if not coming:
+                    return
+                done = coming.popleft().result()
+                self._position = (epoch, batch - len(coming))
+                yield done
+        finally:
+            for executor in (decoders, readers):
+                executor.shutdown(wait=True, cancel_futures=True)
+
+    def _ready(self, order: EpochOrder, windows: NDArray[np.int64]) -> bool:
+        return all(self._memory.ready(order.keys[window]) for window in np.unique(windows))
+
+    def _started(
+        self, order: EpochOrder, samples: NDArray[np.int64], windows: NDArray[np.int64], decoders: Executor
+    ) -> "_Pending":
+        by_window = {window: self._memory.rows(order.keys[window]) for window in np.unique(windows).tolist()}
+        rows = [by_window[window][sample] for sample, window in zip(samples.tolist(), windows.tolist())]
+        n_labels = count_labels(*rows[0]) if self._needs.labels is not None else 0
+        buffer = BatchBuffer(len(rows), self._needs, n_labels, self._pinned, keep_pictures=self._pictures_bytes > 0)
+        return _Pending(self, samples, rows, buffer, decoders)
+
+
+class _Pending:
+    """A batch that threads are filling."""
+
+    def __init__(
+        self,
+        loader: Loader,
+        samples: NDArray[np.int64],
+        rows: Sequence[Place],
+        buffer: BatchBuffer,
+        decoders: Executor,
+    ) -> None:
+        self._loader, self._samples, self._rows, self._buffer = loader, samples, rows, buffer
+        self._tasks: list[Future[None]] = [
+            decoders.submit(self._fill, start, min(start + TASK, len(rows))) for start in range(0, len(rows), TASK)
+        ]
+
+    def result(self) -> Batch:
+        """The batch, once it is filled. Raises ValueError with the name of a sample that cannot be decoded."""
+        for task in self._tasks:
+            task.result()
+        rows, imitation = self._loader.dataset.rows, self._loader.mix.imitation
+        simulated = rows.simulated[self._samples]
+        imitate = {"all": np.ones_like(simulated), "real": ~simulated, "none": np.zeros_like(simulated)}[imitation]
+        return self._buffer.batch(rows.attempt_id[self._samples].tolist(), simulated, imitate)
+
+    def _fill(self, start: int, stop: int) -> None:
+        for i in range(start, stop):
+            try:
+                self._buffer.fill(i, *self._rows[i])
+            except Exception as error:
+                raise ValueError(f"{self._loader.dataset.name(int(self._samples[i]))}: {error}") from error
+
+
+def _kept_pictures(sides: Sequence[Side], needs: Needs, mix: MixSettings) -> int:
+    """Bytes of the decoded pictures of all samples where they fit into mix.shuffle_mb beside the samples, else 0."""
+    if needs.image is None or not all(side.fits for side in sides):
+        return 0
+    pictures = sum(map(len, sides)) * needs.image.height * needs.image.width * 3
+    samples = sum(int(side.size.sum()) for side in sides)
+    return pictures if samples + pictures <= mix.shuffle_mb * 2**20 else 0
+
+
+def _windows(order: EpochOrder, rows: NDArray[np.int64], windows: NDArray[np.int64], first: int) -> list[Window]:
+    """What is wanted of the windows from batch `first` on, in the order in which it is."""
+    found = []
+    batches = np.broadcast_to(np.arange(len(rows))[:, None], rows.shape)[first:]
+    for number in np.unique(windows[first:]).tolist():
+        inside = windows[first:] == number
+        used = batches[inside]
+        found.append((int(used.min()), Window(order.keys[number], np.unique(rows[first:][inside]), int(used.max()))))
+    return [window for _, window in sorted(found, key=lambda item: item[0])]

@@ -1,0 +1,1 @@
+"""EPDMS of planners on a benchmark: frames, plans, scores, tables and comparisons."""

@@ -1,0 +1,183 @@
+"""From the rows of one planner to its scores: one stage, each of two stages, their product (docs/reward.md 2l, 3)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planners.evaluation.frames import FrameKey
+from planners.evaluation.score_rows import FrameRow
+from tasks.reward.one_stage import COLUMNS, FrameScores, means_of
+from tasks.reward.two_stage import Group, TwoStageScores, aggregate, is_uniform
+
+Array = NDArray[np.float64]
+
+HumanFilter = Literal["unfiltered", "filtered"]
+# Every score that tables hold: stage, human filter. No human drove from a follow-up frame, so nothing filters there.
+MEASURES: tuple[tuple[str, str], ...] = (
+    ("one_stage", "unfiltered"),
+    ("one_stage", "filtered"),
+    ("stage_one", "unfiltered"),
+    ("stage_one", "filtered"),
+    ("stage_two", "none"),  # navhard's: the mean over groups of weighted means
+    ("follow_ups", "none"),  # the plain mean of follow-up rows, which no published table holds
+    ("final", "unfiltered"),
+    ("final", "filtered"),
+)
+
+
+@dataclass(frozen=True)
+class ClipResult:
+    """One clip and one planner."""
+
+    clip_id: str
+    one_stage: FrameScores  # of the logged frame now, among the one-stage evaluation's traffic
+    groups: tuple[Group, Group] | None  # now, before; None: the clip has no follow-ups
+    log_id: str = ""  # empty: unknown
+
+    @property
+    def n_follow_ups(self) -> int:
+        """Pairs."""
+        return 0 if self.groups is None else len(self.groups[0].stage_two)
+
+    @cached_property
+    def two_stage(self) -> TwoStageScores | None:
+        """Of this clip alone."""
+        return None if self.groups is None else aggregate([self.groups])
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Means over clips; columns tasks.reward.one_stage.COLUMNS."""
+
+    n_clips: int
+    n_two_stage: int  # clips with follow-ups
+    n_follow_ups: int  # pairs
+    one_stage: FrameScores
+    two_stage: TwoStageScores | None
+    uniform_share: float  # of clips whose follow-ups now all weigh the same, NaN without follow-ups
+    uniform_share_before: float  # the same for those 0.5 s before
+
+
+@dataclass(frozen=True)
+class SummaryLine:
+    """One line of the table of all planners."""
+
+    planner: str
+    stage: str  # of MEASURES
+    human_filter: str  # of MEASURES
+    columns: Array  # (C,) COLUMNS
+    n_clips: int
+    n_frames: int
+    uniform_share: float  # final only, else NaN
+    uniform_share_before: float
+
+
+def by_clip(rows: Sequence[FrameRow]) -> list[ClipResult]:
+    """One result a clip, by clip id, whatever the order of the rows. Raises ValueError naming a lacking frame."""
+    clips: dict[str, list[FrameRow]] = {}
+    for row in rows:
+        clips.setdefault(row.key.clip_id, []).append(row)
+    return [_of_clip(clip_id, clips[clip_id]) for clip_id in sorted(clips)]
+
+
+def summarise(rows: Sequence[FrameRow]) -> Summary:
+    """Means over the clips of all rows of one planner. Raises ValueError for no rows or a lacking frame."""
+    return summary_of(by_clip(rows))
+
+
+def summary_of(clips: Sequence[ClipResult]) -> Summary:
+    """Means over the clips of one planner. Raises ValueError for none."""
+    if not clips:
+        raise ValueError("no frame was scored")
+    groups = [clip.groups for clip in clips if clip.groups is not None]
+    shares = [
+        float(np.mean([is_uniform(pair[side].endpoint_xy, pair[side].starts_xy) for pair in groups]))
+        if groups
+        else np.nan
+        for side in (0, 1)
+    ]
+    return Summary(
+        n_clips=len(clips),
+        n_two_stage=len(groups),
+        n_follow_ups=sum(clip.n_follow_ups for clip in clips),
+        one_stage=means_of([clip.one_stage for clip in clips]),
+        two_stage=aggregate(groups) if groups else None,
+        uniform_share=shares[0],
+        uniform_share_before=shares[1],
+    )
+
+
+def lines_of(planner: str, summary: Summary) -> list[SummaryLine]:
+    """The lines of one planner."""
+    logged, follow_ups = 2 * summary.n_two_stage, 2 * summary.n_follow_ups
+    n_frames = {"one_stage": summary.n_clips, "stage_one": logged, "final": logged + follow_ups}
+    lines = []
+    for stage, human_filter in MEASURES:
+        if stage != "one_stage" and summary.two_stage is None:
+            continue
+        columns = columns_at(summary.one_stage, summary.two_stage, stage, human_filter)
+        n_clips = summary.n_clips if stage == "one_stage" else summary.n_two_stage
+        shares = (summary.uniform_share, summary.uniform_share_before) if stage == "final" else (np.nan, np.nan)
+        frames = n_frames.get(stage, follow_ups)
+        lines.append(SummaryLine(planner, stage, human_filter, columns, n_clips, frames, *shares))
+    return lines
+
+
+def columns_at(one_stage: FrameScores, two_stage: TwoStageScores | None, stage: str, human_filter: str) -> Array:
+    """COLUMNS (C,) of one of MEASURES. two_stage is needed for all but one_stage."""
+    if stage == "one_stage":
+        scores = one_stage
+    else:
+        assert two_stage is not None
+        if stage in ("stage_two", "follow_ups"):
+            return two_stage.stage_two if stage == "stage_two" else two_stage.follow_ups
+        scores = two_stage.stage_one if stage == "stage_one" else two_stage.final
+    return scores.filtered if human_filter == "filtered" else scores.unfiltered
+
+
+def score_of(columns: Array) -> float:
+    """The last of COLUMNS."""
+    return float(columns[COLUMNS.index("score")])
+
+
+Found = dict[tuple[str, FrameKey], FrameRow]
+
+
+def _of_clip(clip_id: str, rows: Sequence[FrameRow]) -> ClipResult:
+    found: Found = {}
+    for row in rows:
+        if (row.stage, row.key) in found:
+            raise ValueError(f"{row.key}: two rows in {row.stage}")
+        found[row.stage, row.key] = row
+    one_stage = found.get(("one_stage", FrameKey.logged(clip_id)[0]))
+    if one_stage is None:
+        raise ValueError(f"clip {clip_id}: no row of the logged frame in one_stage")
+    has_follow_ups = any(stage == "stage_two" for stage, _ in found)
+    groups = _groups(clip_id, found) if has_follow_ups else None
+    return ClipResult(clip_id, one_stage.scores, groups, one_stage.log_id)
+
+
+def _groups(clip_id: str, found: Found) -> tuple[Group, Group]:
+    """The groups now and 0.5 s before of a clip with follow-ups."""
+    candidates = sorted({key.candidate_index for stage, key in found if stage == "stage_two"})
+    groups = []
+    for side, logged in enumerate(FrameKey.logged(clip_id)):
+        wanted = [("stage_one", logged)]
+        wanted += [("stage_two", FrameKey.follow_up(clip_id, i)[side]) for i in candidates]
+        for stage, key in wanted:
+            if (stage, key) not in found:
+                raise ValueError(f"{key}: no row in {stage}")
+        first, *after = [found[place] for place in wanted]
+        groups.append(
+            Group(
+                stage_one=first.scores,
+                endpoint_xy=first.end[:2],
+                stage_two=np.stack([row.scores.unfiltered for row in after]),
+                starts_xy=np.stack([row.start[:2] for row in after]),
+            )
+        )
+    return groups[0], groups[1]

@@ -1,0 +1,186 @@
+"""`python -m planners compare a=<run> b=<run>`: how two evaluated planners differ, with confidence intervals.
+
+    python -m planners compare a=eval/ltf_real b=eval/ltf_sim
+    python -m planners compare a=[eval/real_0,eval/real_1] b=[eval/sim_0,eval/sim_1] out=difference.csv
+    python -m planners compare table=docs/study/clips.csv a=gtrs_dense-real-steps-0 b=gtrs_dense-pdm_closed5-epochs-0
+
+A run is a folder that `python -m planners evaluate` made of one planner, or a column of a study's clips.csv. Several
+runs of a side are trainings of one planner with other seeds: clips and seeds are both drawn, pairs of seeds where both
+sides have equally many. Intervals over logs and over towns, where they are known, draw all clips of one together:
+clips of one log share their scene, and an interval over clips alone is too narrow.
+"""
+
+import csv
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from factory.config import ConfigError, compose, fill
+from planners.evaluation.aggregation import ClipResult, by_clip
+from planners.evaluation.bootstrap import Interval, paired_interval
+from planners.evaluation.clip_scores import Measured, check_same_clips, measured, read_clips
+from planners.evaluation.clusters import LEVELS, clusters_of
+from planners.evaluation.record import read_record
+from planners.evaluation.score_rows import read_rows
+from planners.evaluation.score_table import FILTERS_NOTE
+from tasks.reward.one_stage import COLUMNS
+
+BAD_CONFIG = 2
+
+
+@dataclass(frozen=True)
+class CompareSettings:
+    """The keys of conf/compare.yaml."""
+
+    a: str | list[str]
+    b: str | list[str]
+    table: str | None = None  # clips.csv of a study, of which a and b are columns
+    column: str = "score"  # or a sub-score
+    confidence: float = 0.95
+    draws: int = 10_000
+    seed: int = 0
+    out: str | None = None  # a CSV file
+
+
+Measure = tuple[str, str]  # stage, human filter
+ByLevel = Mapping[str, Interval]  # of planners.evaluation.clusters.LEVELS, those that are known
+
+
+def compare(
+    a: Sequence[Sequence[ClipResult]], b: Sequence[Sequence[ClipResult]], settings: CompareSettings
+) -> dict[Measure, ByLevel]:
+    """Difference of the runs b from the runs a. Raises ValueError where their clips differ."""
+    check_same_clips([*a, *b])
+    return intervals(measured(a, settings.column), measured(b, settings.column), settings)
+
+
+def intervals(
+    of_a: Mapping[Measure, Measured], of_b: Mapping[Measure, Measured], settings: CompareSettings
+) -> dict[Measure, ByLevel]:
+    """Difference of what runs scored on the same clips, of measures that both sides have, over clips, logs and towns.
+
+    Raises ValueError where the sides are not over the same clips.
+    """
+    return {name: _by_level(of_a[name], of_b[name], settings) for name in of_a if name in of_b}
+
+
+def _by_level(a: Measured, b: Measured, settings: CompareSettings) -> ByLevel:
+    if a.clips != b.clips:
+        raise ValueError("the runs were not scored on the same clips")
+    return {
+        level: paired_interval(
+            a.scores,
+            b.scores,
+            weights=(a.weights, b.weights),
+            clusters=None if level == "clip" else clusters,
+            confidence=settings.confidence,
+            draws=settings.draws,
+            seed=settings.seed,
+        )
+        for level, clusters in clusters_of(a.clips, a.logs).items()
+    }
+
+
+def is_clear(found: ByLevel) -> bool:
+    """Whether zero lies outside of every interval that there is."""
+    return all(one.is_clear for one in found.values())
+
+
+def row_of(found: ByLevel | None, scale: float = 100.0) -> dict[str, float | str]:
+    """Columns of tables: the difference and its bounds over each of LEVELS, empty where there is none."""
+    row: dict[str, float | str] = {"difference": "" if found is None else scale * found["clip"].difference}
+    for level in LEVELS:
+        one = None if found is None else found.get(level)
+        known = one is not None and np.isfinite(one.low)
+        for name in ("low", "high"):
+            row[name if level == "clip" else f"{name}_{level}"] = scale * getattr(one, name) if known else ""
+    return row
+
+
+def text_of(found: Mapping[Measure, ByLevel], confidence: float) -> str:
+    """A table to be printed."""
+    percent = f"{100 * confidence:g} %"
+    levels = [level for level in LEVELS if any(level in by_level for by_level in found.values())]
+    over = "".join(f"   {f'{percent} over {level}s':<18}" for level in levels)
+    lines = [f"{'stage':<10} {'filter':<11}{'a':>9}{'b':>9}{'b - a':>9}{over}"]
+    for (stage, human_filter), by_level in found.items():
+        one = by_level["clip"]
+        said = "".join(f"   {_bounds(by_level[level]):<18}" for level in levels)
+        line = f"{stage:<10} {human_filter:<11}{one.a:9.4f}{one.b:9.4f}{one.difference:+9.4f}{said}"
+        lines.append(f"{line}{'  *' if is_clear(by_level) else ''}".rstrip())
+    lines.append(f"*: zero lies outside of each {percent} interval")
+    if "log" not in levels:
+        lines.append("the runs do not say which log a clip is of: evaluate them again for intervals over logs")
+    return "\n".join([*lines, *FILTERS_NOTE])
+
+
+def _bounds(one: Interval) -> str:
+    return f"{one.low:+.4f} .. {one.high:+.4f}" if np.isfinite(one.low) else "only one"
+
+
+def write_csv(path: Path, found: Mapping[Measure, ByLevel]) -> None:
+    """One line a measure."""
+    with path.open("w", newline="") as file:
+        table = csv.writer(file)
+        for n, (name, by_level) in enumerate(found.items()):
+            row = row_of(by_level, scale=1.0)
+            if n == 0:
+                table.writerow(["stage", "human_filter", "a", "b", *row])
+            table.writerow([*name, by_level["clip"].a, by_level["clip"].b, *row.values()])
+
+
+def read_runs(folders: str | Sequence[str]) -> list[list[ClipResult]]:
+    """The clips of each run. Raises ConfigError naming the folder that is none."""
+    runs = []
+    for folder in [folders] if isinstance(folders, str) else folders:
+        try:
+            runs.append(by_clip(read_rows(Path(folder))))
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"{folder}: not an evaluated planner: {error}") from error
+    if not runs:
+        raise ConfigError("compare.a and compare.b must name at least one run each")
+    return runs
+
+
+def check_same_rules(folders: Sequence[str]) -> None:
+    """Raises ConfigError where two runs were made on another benchmark or by other rules."""
+    records = [read_record(Path(folder)) for folder in folders]
+    for folder, record in zip(folders, records):
+        for what in ("benchmark_digest", "rules"):
+            if record[what] != records[0][what]:
+                raise ConfigError(f"{folders[0]} and {folder} differ in their {what}: evaluate both the same way")
+
+
+def main(argv: Sequence[str]) -> int:
+    """The command; 2 with a message for what cannot be compared."""
+    if {"-h", "--help"} & set(argv):
+        print(__doc__)
+        return 0
+    try:
+        settings = fill(CompareSettings, compose("compare", argv), "compare")
+        if settings.column not in COLUMNS:
+            raise ConfigError(f"compare.column={settings.column}: one of {', '.join(COLUMNS)}")
+        sides = [[side] if isinstance(side, str) else side for side in (settings.a, settings.b)]
+        if settings.table is not None:
+            if settings.column != "score":
+                raise ConfigError(f"compare.column={settings.column}: {settings.table} holds scores alone")
+            of_a, of_b = (read_clips(Path(settings.table), side) for side in sides)
+            found = intervals(of_a, of_b, settings)
+        else:
+            a, b = (read_runs(side) for side in sides)
+            check_same_rules([*sides[0], *sides[1]])
+            found = compare(a, b, settings)
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return BAD_CONFIG
+    print(text_of(found, settings.confidence))
+    if settings.out is not None:
+        write_csv(Path(settings.out), found)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,173 @@
+"""Who is evaluated, by what `planner=` says.
+
+    human, pdm_closed          bounds that know the world: the log's own drive, and the privileged planner
+    constant_velocity          needs no training
+    runs/my_training           a training's folder or one of its checkpoints
+    runs/a+runs/b              the ensemble of several trainings of gtrs_dense
+    mine                       what an installed package offers by that name (docs/extend.md)
+    my.module:MyPlanner        a class, or anything called without arguments, of a user's own package
+
+A user's planner has one of two faces:
+
+    def plan(self, sample: Mapping[str, Any]) -> (8, 3) or (40, 3)       one sample, docs/formats.md, as_shown
+    needs: planners.data.batch.Needs; def plan(self, batch: planners.data.batch.Batch) -> (B, 8 or 40, 3)
+
+Poses are x, y [m], heading [rad] of the rear axle in the ego frame at now, at 0.5 .. 4.0 s or 0.1 .. 4.0 s. Where it
+has a text `digest`, that tells its versions apart, else the bytes of its module's file do.
+"""
+
+import hashlib
+import importlib
+import inspect
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from factory.commands import nearest
+from factory.config import ConfigError, compose
+from factory.plugins import installed, names
+from planners.data.batch import Needs
+from planners.evaluation.scoring import Plans, PreparedClip, human_plans, pdm_plans
+from planners.models.gtrs_dense.ensemble import Ensemble
+from planners.models.gtrs_dense.planner import GtrsDense
+from planners.models.planner import Planner
+from planners.models.registry import BUILT_IN, PlannerChoice, build_planner
+from planners.training import checkpoint
+
+Privileged = Callable[[PreparedClip], Plans]
+
+PRIVILEGED: Mapping[str, Privileged] = {"human": human_plans, "pdm_closed": pdm_plans}
+UNTRAINED = ("constant_velocity",)
+
+
+@dataclass(frozen=True)
+class Contender:
+    """Someone to be evaluated."""
+
+    label: str  # names its folder and its rows
+    digest: str  # the same digest plans the same
+    load: Callable[[], Any] | None = None  # with one of the faces above; None: privileged
+    privileged: Privileged | None = None
+
+
+def contender(spec: str, label: str | None = None, changed: Mapping[str, Any] | None = None) -> Contender:
+    """Who `spec` names; changed: settings of trained planners, see load_planner. Raises ConfigError for nobody."""
+    name = label or spec.strip("/").replace("/", "_").replace(":", ".")
+    plugin = installed("planner", spec, [*PRIVILEGED, *BUILT_IN])
+    if plugin is not None:
+        if Path(spec).is_dir():
+            raise ConfigError(f"planner={spec} is a folder here and a planner of {plugin.package}: planner=./{spec}")
+        return _plugged(name, plugin.reference)
+    if spec in PRIVILEGED:
+        return Contender(name, spec, privileged=PRIVILEGED[spec])
+    if spec in UNTRAINED:
+        return Contender(name, spec, partial(_built, spec))
+    members = spec.split("+")
+    if all(Path(member).is_dir() for member in members):
+        newest = [checkpoint.newest(Path(member)) for member in members]  # now: trainings may go on and write others
+        parts = [*map(checkpoint.digest, newest), *([json.dumps(changed, sort_keys=True)] if changed else [])]
+        digest = parts[0] if len(parts) == 1 else hashlib.sha256(" ".join(parts).encode()).hexdigest()[:16]
+        return Contender(name, digest, partial(_trained, newest, changed))
+    if ":" in spec:
+        return _plugged(name, spec)
+    known = [*PRIVILEGED, *UNTRAINED, *names("planner")]
+    listed = ", ".join(known)
+    if spec in BUILT_IN:
+        raise ConfigError(f"planner={spec} has to be trained first: name its training's folder; untrained: {listed}")
+    raise ConfigError(
+        f"planner={spec}: neither a folder nor one of {listed}{nearest(spec, known)}; "
+        "or name a class, my.module:MyPlanner"
+    )
+
+
+def _plugged(label: str, spec: str) -> Contender:
+    made = _imported(spec)
+    return Contender(label, _digest_of(made), lambda: made)
+
+
+def contenders(
+    planner: str | None,
+    planners: Sequence[str] | Mapping[str, str] | None,
+    bounds: bool,
+    changed: Mapping[str, Any] | None = None,
+) -> list[Contender]:
+    """All that are asked for, each once, the bounds first. Raises ConfigError for nobody, or two of one label."""
+    named: list[tuple[str | None, str]] = []
+    if isinstance(planners, Mapping):
+        named += planners.items()
+    else:
+        named += [(None, spec) for spec in planners or ()]
+    named += [(None, planner)] if planner is not None else []
+    if not named:
+        raise ConfigError("planner is missing: give planner=<training folder> or planners=[human,...]")
+    first = [(None, name) for name in (*PRIVILEGED, *UNTRAINED) if bounds]
+    found = [contender(spec, label, changed) for label, spec in dict.fromkeys([*first, *named])]
+    labels = [one.label for one in found]
+    twice = sorted({label for label in labels if labels.count(label) > 1})
+    if twice:
+        raise ConfigError(f"planners: two are called {', '.join(twice)}: give planners={{a: folder, b: folder}}")
+    return found
+
+
+def composed(name: str, argv: Sequence[str]) -> dict[str, Any]:
+    """The values of conf/<name>.yaml and a command line, with `planner=` as text. Raises ConfigError.
+
+    Hydra would take it for a choice among conf/planner, which are planners to be trained.
+    """
+    who = [argument for argument in argv if argument.startswith("planner=")]
+    values = compose(name, [argument for argument in argv if argument not in who])
+    return values | ({"planner": who[-1].split("=", 1)[1]} if who else {})
+
+
+def needs_of(made: Any) -> Needs | None:
+    """What a planner reads of a batch; None: it takes samples."""
+    return getattr(made, "needs", None)
+
+
+def _trained(folders: Sequence[Path], changed: Mapping[str, Any] | None) -> Planner | Ensemble:
+    """One planner, or the ensemble of several. Raises ConfigError where they cannot be one."""
+    models = [(str(folder), checkpoint.load_planner(folder, changed)) for folder in folders]
+    if len(models) == 1:
+        return models[0][1]
+    scoring = [(name, model) for name, model in models if isinstance(model, GtrsDense)]
+    others = [f"{name} ({model.name})" for name, model in models if not isinstance(model, GtrsDense)]
+    if others:
+        raise ConfigError(f"an ensemble averages the scores of gtrs_dense models, not {', '.join(others)}")
+    try:
+        return Ensemble(scoring).eval()
+    except ValueError as error:
+        raise ConfigError(f"ensemble: {error}") from error
+
+
+def _built(name: str) -> Planner:
+    return build_planner(PlannerChoice(name), {}).eval()
+
+
+def _imported(spec: str) -> Any:
+    """The user's planner. Raises ConfigError."""
+    module, _, attribute = spec.partition(":")
+    try:
+        target = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(f"planner={spec}: {error}; is its folder on PYTHONPATH?") from error
+    if isinstance(target, type) and issubclass(target, Planner):
+        return build_planner(PlannerChoice(spec), {}).eval()
+    if not callable(target):
+        raise ConfigError(f"planner={spec} is a {type(target).__name__}: name a class or a function that makes one")
+    try:
+        made = target()
+    except TypeError as error:
+        raise ConfigError(f"planner={spec}: it must be made without arguments: {error}") from error
+    if not callable(getattr(made, "plan", None)):
+        raise ConfigError(f"planner={spec}: a {type(made).__name__} has no method plan(sample) or plan(batch)")
+    return made
+
+
+def _digest_of(made: Any) -> str:
+    own = getattr(made, "digest", None)
+    if isinstance(own, str):
+        return own
+    return hashlib.sha256(Path(inspect.getfile(type(made))).read_bytes()).hexdigest()[:16]

@@ -1,0 +1,202 @@
+"""`python -m planners evaluate benchmark=<out> planner=<who>`: EPDMS of planners on a benchmark, one stage and two.
+
+    python -m planners evaluate benchmark=runs/hard planner=runs/ltf
+    python -m planners evaluate benchmark=runs/hard planners=[runs/ltf,human,my.module:MyPlanner] out=eval
+    python -m planners evaluate benchmark=runs/hard planners={real: runs/a, with_sim: runs/b}
+    python -m planners evaluate benchmark=runs/hard planner=runs/gtrs +settings.inference_entries=8192
+
+The benchmark is the folder that `python -m factory.run preset=hard_benchmark` made. Who may stand under `planner=`, and
+what a planner of one's own looks like, planners/evaluation/contenders.py says. Every planner gets a folder: its plans,
+a row of sub-scores for each frame (frames.parquet, frames.csv), and record.json, written last. A planner that is done
+is not planned or scored again unless it, the benchmark or the rules changed; the same command goes on after a kill.
+All planners of a command share what scoring prepares of a frame, so name several at once.
+
+    summary.csv, summary.png      all planners of this command
+    one_stage                     the logged frames, as navtest
+    stage_one, stage_two, final   as navhard: stage two weighted by how near a follow-up starts to the plan's end,
+                                  final the product of both stages
+    follow_ups                    the plain mean of the follow-up rows; no published table holds it
+    unfiltered, filtered          without and with the human-penalty filter: the former compares with the paper's
+                                  tables, the latter with today's leaderboard
+    uniform                       share of clips none of whose follow-ups starts near the plan's end
+"""
+
+import json
+import os
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from factory.config import ConfigError, conf_dir, fill
+from planners.evaluation.aggregation import SummaryLine, lines_of, summarise
+from planners.evaluation.benchmark_folder import BenchmarkFolder
+from planners.evaluation.contenders import Contender, composed, contenders, needs_of
+from planners.evaluation.frames import Benchmark, FrameKey
+from planners.evaluation.planning import all_plans
+from planners.evaluation.record import forget, is_done, write_record
+from planners.evaluation.score_rows import FrameRow, read_rows, write_rows
+from planners.evaluation.score_table import table_text, write_table
+from planners.evaluation.scoring import Plans, Rules, prepare_clip, score_clip
+from planners.evaluation.tags import TAG_COLUMNS, tags_of
+from planners.training.progress import Counter
+from tasks.experts.pdm_closed import PdmSettings
+from tasks.rollout.simulate import TrafficSettings
+from tasks.stages import stage_versions
+
+BAD_CONFIG = 2
+MOST_UNIFORM = 0.2  # share of clips in the uniform fallback
+
+
+@dataclass(frozen=True)
+class EvaluateSettings:
+    """The keys of conf/evaluate.yaml."""
+
+    benchmark: str
+    out: str
+    planner: str | None = None
+    planners: list[str] | dict[str, str] | None = None
+    settings: dict[str, Any] = field(default_factory=dict)  # of planning, of all trained planners
+    bounds: bool = True  # human, pdm_closed and constant_velocity too
+    one_stage_traffic: TrafficSettings = field(default_factory=lambda: TrafficSettings(mode="replay"))
+    two_stage_traffic: TrafficSettings = field(default_factory=TrafficSettings)
+    pdm: PdmSettings = field(default_factory=PdmSettings)
+    batch_size: int = 16
+    planners_at_once: int = 8  # in memory, planning from one reading of the samples
+    device: str = "cpu"
+    limit: int | None = None  # clips
+    tables: bool = True  # of all planners of the command
+
+    def __post_init__(self) -> None:
+        for name in ("batch_size", "planners_at_once", "limit"):
+            if getattr(self, name) is not None and getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+
+    @property
+    def rules(self) -> Rules:
+        """What the scores depend on beside planner and benchmark."""
+        return Rules(self.one_stage_traffic, self.two_stage_traffic, self.pdm)
+
+
+def evaluate(benchmark: Benchmark, who: Sequence[Contender], settings: EvaluateSettings) -> list[SummaryLine]:
+    """Plan, score, write; the lines of all planners in their order.
+
+    Raises ConfigError where a planner cannot plan from this benchmark, before any is planned.
+    """
+    out = Path(settings.out)
+    keys = _keys(benchmark, settings.limit)
+    n_clips = len({key.clip_id for key in keys})
+    shared = {
+        "benchmark_digest": benchmark.digest,
+        "clips": n_clips,
+        "rules": json.loads(json.dumps(asdict(settings.rules))),  # as it comes back from a file
+        "stage_versions": stage_versions(),
+    }
+    identities = {one.label: {"planner_digest": one.digest, **shared} for one in who}
+    waiting = [one for one in who if not is_done(out / one.label, identities[one.label])]
+    check_needs(benchmark, keys, waiting)
+    for one in waiting:
+        (out / one.label).mkdir(parents=True, exist_ok=True)
+    planning = [
+        (one, out / one.label, {"planner_digest": one.digest, "benchmark_digest": benchmark.digest, "clips": n_clips})
+        for one in waiting
+        if one.load is not None
+    ]
+    plans = all_plans(benchmark, keys, planning, settings.batch_size, settings.planners_at_once, settings.device)
+    if waiting:
+        rows = _scored(benchmark, keys, waiting, plans, settings.rules)
+        for one in waiting:
+            forget(out / one.label)
+            write_rows(out / one.label, rows[one.label])
+            write_record(out / one.label, {**identities[one.label], "planner": one.label, "frames": len(keys)})
+    lines = [line for one in who for line in lines_of(one.label, summarise(read_rows(out / one.label)))]
+    if settings.tables:
+        write_table(out, lines)
+    return lines
+
+
+def check_needs(benchmark: Benchmark, keys: Sequence[FrameKey], who: Sequence[Contender]) -> None:
+    """Raises ConfigError for a planner that needs images of a benchmark that lacks some, naming a frame."""
+    blind = [key for key in keys if benchmark.image_source(key) == "none"]
+    for one in who if blind else ():
+        needs = None if one.load is None else needs_of(one.load())
+        if needs is not None and needs.image is not None:
+            raise ConfigError(
+                f"planner {one.label} needs images, and {len(blind)} of {len(keys)} frames have none, "
+                f"such as {blind[0]}: make the benchmark with cameras (render=..., not render=none)"
+            )
+
+
+def _keys(benchmark: Benchmark, limit: int | None) -> list[FrameKey]:
+    clips = list(dict.fromkeys(key.clip_id for key in benchmark.keys))[:limit]
+    return [key for key in benchmark.keys if key.clip_id in set(clips)]
+
+
+def _scored(
+    benchmark: Benchmark, keys: Sequence[FrameKey], who: Sequence[Contender], plans: Mapping[str, Plans], rules: Rules
+) -> dict[str, list[FrameRow]]:
+    """The rows of every planner, clip by clip: what is prepared of a clip serves all and is let go."""
+    rows: dict[str, list[FrameRow]] = {one.label: [] for one in who}
+    clips = list(dict.fromkeys(key.clip_id for key in keys))
+    tags = {key: tags_of(sample) for key, sample in benchmark.stream(TAG_COLUMNS)}
+    spent = 0.0
+    with Counter("clips scored", len(clips)) as progress:
+        for done, clip_id in enumerate(clips, start=1):
+            prepared = prepare_clip(benchmark.scenes(clip_id), rules)
+            began = time.perf_counter()
+            for one in who:
+                own = plans[one.label] if one.privileged is None else one.privileged(prepared)
+                scored = score_clip(prepared, own, tags)
+                rows[one.label] += [replace(row, log_id=benchmark.log_of(clip_id)) for row in scored]
+            spent += time.perf_counter() - began
+            n_rows = sum(map(len, rows.values()))
+            progress.show(done, f"{1000.0 * spent / n_rows:.1f} ms a frame and planner")
+    return rows
+
+
+def fallback_notes(lines: Sequence[SummaryLine]) -> list[str]:
+    """A line for each planner with more clips in the uniform fallback than a two-stage score should rest on."""
+    return [
+        f"{line.planner}: {100.0 * line.uniform_share:.0f} % of its plans end beyond 1.92 m of every follow-up, "
+        f"whose scores then weigh the same; above {100.0 * MOST_UNIFORM:.0f} % stage two says little of this planner\n"
+        for line in lines
+        if (line.stage, line.human_filter) == ("final", "filtered") and line.uniform_share > MOST_UNIFORM
+    ]
+
+
+def settings_of(argv: Sequence[str]) -> EvaluateSettings:
+    """The settings of a command line. Raises ConfigError."""
+    return fill(EvaluateSettings, composed("evaluate", argv), "evaluate")
+
+
+def help_text() -> str:
+    """Usage and the keys of conf/evaluate.yaml."""
+    return f"{__doc__}\n{(conf_dir() / 'evaluate.yaml').read_text()}"
+
+
+def main(argv: Sequence[str]) -> int:
+    """The command; 2 with a message for what cannot be evaluated."""
+    if {"-h", "--help"} & set(argv):
+        print(help_text())
+        return 0
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    try:
+        settings = settings_of(argv)
+        benchmark = BenchmarkFolder(settings.benchmark)
+        lines = evaluate(
+            benchmark, contenders(settings.planner, settings.planners, settings.bounds, settings.settings), settings
+        )
+    except (ConfigError, FileNotFoundError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return BAD_CONFIG
+    print(table_text(lines))
+    print("".join(fallback_notes(lines)), end="")
+    if settings.tables:
+        print(f"look at {Path(settings.out) / 'summary.png'}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,150 @@
+"""The plans of a benchmark's frames, by planners with either face (planners/evaluation/contenders.py).
+
+Several planners plan from one reading of the samples: what is decoded for one serves all that need the same.
+"""
+
+import json
+import os
+import zipfile
+from collections.abc import Mapping, Sequence
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from factory.config import ConfigError
+from planners.data.batch import Batch, Needs
+from planners.evaluation.contenders import Contender, needs_of
+from planners.evaluation.frames import Benchmark, FrameKey
+from planners.evaluation.scoring import Plans
+from planners.evaluation.shown import as_shown, batch_of, columns_shown
+from planners.training.progress import Counter
+from tasks.trajectories import at_ten_hz
+
+Array = NDArray[np.float64]
+Samples = Sequence[Mapping[str, Any]]
+
+PLANS = "plans.npz"  # kept, so that scoring may begin again without planning
+
+
+def plans_of(made: Any, samples: Samples, device: str = "cpu") -> Array:
+    """(B, 40, 3) plans of one planner. Raises ValueError, naming the sample, for what is no plan."""
+    return _answers(made, _shown_to(needs_of(made), samples, device), samples)
+
+
+def all_plans(
+    benchmark: Benchmark,
+    keys: Sequence[FrameKey],
+    who: Sequence[tuple[Contender, Path, Mapping[str, Any]]],
+    batch_size: int,
+    at_once: int,
+    device: str,
+) -> dict[str, Plans]:
+    """The plans of every planner, by label; read from its folder where they are there.
+
+    who: each with its folder and what identifies its plans there; at_once: planners in memory at a time. Plans are
+    stored as soon as those planners are through. Raises ConfigError naming planner and sample for what is no plan.
+    """
+    plans: dict[str, Plans] = {}
+    waiting = []
+    for one, folder, identity in who:
+        stored = read_plans(folder, identity)
+        if stored is None:
+            waiting.append((one, folder, identity))
+        else:
+            plans[one.label] = stored
+    for first in range(0, len(waiting), at_once):
+        group = waiting[first : first + at_once]
+        found = _planned(benchmark, keys, [one for one, _, _ in group], batch_size, device)
+        for one, folder, identity in group:
+            write_plans(folder, identity, found[one.label])
+        plans.update(found)
+    return plans
+
+
+def _planned(
+    benchmark: Benchmark, keys: Sequence[FrameKey], who: Sequence[Contender], batch_size: int, device: str
+) -> dict[str, dict[FrameKey, Array]]:
+    made = {one.label: _loaded(one, device) for one in who}
+    needs = {label: needs_of(planner) for label, planner in made.items()}
+    kinds = list(dict.fromkeys(needs.values()))
+    columns = dict.fromkeys(name for kind in kinds for name in columns_shown(kind))
+    wanted = set(keys)
+    frames = (frame for frame in benchmark.stream(list(columns)) if frame[0] in wanted)
+    plans: dict[str, dict[FrameKey, Array]] = {label: {} for label in made}
+    name = who[0].label if len(who) == 1 else f"{len(who)} planners"
+    done = 0
+    with Counter(f"{name}: frames planned", len(keys)) as progress:
+        while part := list(islice(frames, batch_size)):
+            samples = [sample for _, sample in part]
+            for kind in kinds:
+                shown = _shown_to(kind, samples, device)
+                for label in (label for label in made if needs[label] == kind):
+                    try:
+                        answers = _answers(made[label], shown, samples)
+                    except ValueError as error:
+                        raise ConfigError(f"planner {label}: {error}") from error
+                    plans[label].update(zip((key for key, _ in part), answers))
+            done += len(part)
+            progress.show(done)
+    return plans
+
+
+def _loaded(one: Contender, device: str) -> Any:
+    assert one.load is not None
+    made = one.load()
+    return made.to(device) if isinstance(made, torch.nn.Module) else made
+
+
+def _shown_to(needs: Needs | None, samples: Samples, device: str) -> Batch | Samples:
+    shown = [as_shown(sample) for sample in samples]
+    return shown if needs is None else batch_of(shown, needs).to(device)
+
+
+def _answers(made: Any, shown: Batch | Samples, samples: Samples) -> Array:
+    if isinstance(shown, Batch):
+        with torch.inference_mode():
+            plans = list(_as_array(made.plan(shown), shown))
+    else:
+        plans = [np.asarray(made.plan(sample), dtype=np.float64) for sample in shown]
+    for sample, plan in zip(samples, plans):
+        if plan.shape not in ((8, 3), (40, 3)) or not np.isfinite(plan).all():
+            name = f"sample {sample['attempt_id']}"
+            raise ValueError(f"{name}: a plan must be (8 or 40, 3) finite numbers, got {plan.shape}")
+    return np.concatenate([at_ten_hz(plan[None]) for plan in plans])
+
+
+def _as_array(plans: Any, batch: Batch) -> Array:
+    array = plans.detach().double().cpu().numpy() if isinstance(plans, torch.Tensor) else np.asarray(plans, np.float64)
+    if array.ndim != 3 or len(array) != len(batch):
+        raise ValueError(f"plan() of a batch of {len(batch)} returned {array.shape}, not ({len(batch)}, 8 or 40, 3)")
+    return array
+
+
+def write_plans(folder: Path, identity: Mapping[str, Any], plans: Mapping[FrameKey, Array]) -> None:
+    """`plans.npz`: who planned (JSON), frame by frame which, and poses (F, 40, 3) in the ego frame."""
+    unfinished = folder / f".{os.getpid()}.{PLANS}"
+    np.savez_compressed(
+        unfinished,
+        identity=np.array(json.dumps(identity, sort_keys=True)),
+        clip_id=np.array([key.clip_id for key in plans]),
+        kind=np.array([key.kind for key in plans]),
+        candidate_index=np.array([key.candidate_index for key in plans]),
+        poses=np.stack(list(plans.values())),
+    )
+    os.replace(unfinished, folder / PLANS)
+
+
+def read_plans(folder: Path, identity: Mapping[str, Any] | None = None) -> dict[FrameKey, Array] | None:
+    """The stored plans; None where there are none, or they are another's than `identity`, or damaged."""
+    try:
+        with np.load(folder / PLANS, allow_pickle=False) as stored:
+            if identity is not None and json.loads(str(stored["identity"])) != dict(identity):
+                return None
+            keys = zip(stored["clip_id"].tolist(), stored["kind"].tolist(), stored["candidate_index"].tolist())
+            return dict(zip((FrameKey(*key) for key in keys), stored["poses"]))
+    except (FileNotFoundError, zipfile.BadZipFile, KeyError, ValueError):
+        return None

@@ -1,0 +1,209 @@
+"""`python -m planners replay benchmark=<out> planner=<who> clip=0`: a clip as a film, from above and the front camera.
+
+First the logged frame at T: 1.5 s of history, then the planner's plan driven for 4 s among traffic that answers to it.
+Then the same from the follow-up that starts nearest to where the plan ended, or follow_up=<candidate>. The camera
+stands still at now: that is the last picture the planner has seen when it plans.
+"""
+
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from factory.config import ConfigError, fill
+from factory.look.bev import EXPERT, LOGGED, PERTURBED, Boxes, draw_bev
+from factory.look.bev import Path as Way
+from factory.look.drawing import map_shapes
+from factory.look.sample_picture import decoded, earlier_images, fitted, front_camera
+from factory.look.video import write_mp4
+from factory.store.reader import Sample
+from planners.evaluation.benchmark_folder import BenchmarkFolder
+from planners.evaluation.contenders import Contender, composed, contender
+from planners.evaluation.evaluate import check_needs
+from planners.evaluation.frames import Benchmark, FrameKey
+from planners.evaluation.planning import plans_of
+from planners.evaluation.scoring import PreparedClip, PreparedPair, Rules, prepare_clip, score_pair
+from tasks.experts.pdm_closed import PdmSettings
+from tasks.reward.one_stage import COLUMNS, FrameScores
+from tasks.rollout.simulate import TrafficSettings, roll_out
+from tasks.world.clip import HISTORY_STEPS, HORIZON_STEPS, STEP_S, Rollout
+from tasks.world.frames import to_world
+from tasks.world.vehicle import HEADING
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+BAD_CONFIG = 2
+BEV_PX, CAMERA_PX = (560, 560), (720, 405)  # width, height
+PAPER, INK = (246, 246, 243), (30, 30, 30)
+HOLD = 10  # pictures that the end of a stage is shown for
+
+
+@dataclass(frozen=True)
+class ReplaySettings:
+    """The keys of conf/replay.yaml."""
+
+    benchmark: str
+    out: str
+    planner: str = "pdm_closed"
+    clip: int | str = 0  # clip id or its beginning, or the clip's place
+    follow_up: int | None = None
+    two_stage_traffic: TrafficSettings = field(default_factory=TrafficSettings)
+    pdm: PdmSettings = field(default_factory=PdmSettings)
+
+
+@dataclass(frozen=True)
+class Shown:
+    """One frame, planned from and driven."""
+
+    title: str
+    sample: Sample
+    pair: PreparedPair
+    plan: Array  # (40, 3) world
+    rollout: Rollout
+    scores: FrameScores
+
+
+def film(shown: Shown, logged: Array | None) -> Iterator[Image]:
+    """Pictures (560, 1280, 3) RGB at 10 Hz, -1.5 .. 4 s; logged: (M, >= 3) what the human drove, world."""
+    frame = shown.pair.now
+    scene, drive = frame.scene, shown.rollout
+    camera = front_camera(shown.sample)
+    pictures = earlier_images(shown.sample, camera) if camera else []
+    ways = [Way(drive.ego_states, PERTURBED, "drive"), Way(shown.plan, EXPERT, "plan", dashed=True)]
+    ways += [] if logged is None else [Way(logged, LOGGED, "logged", dashed=True)]
+    for row in range(-HISTORY_STEPS, HORIZON_STEPS + 1):
+        step = scene.step + row
+        ego = (scene.ego_history[HISTORY_STEPS + row] if row < 0 else drive.ego_states[row])[: HEADING + 1]
+        agents = scene.agents.boxes[step] if row < 0 else drive.agents.boxes[row]
+        shapes = map_shapes(scene.clip, min(step, scene.clip.agents.n_steps - 1))
+        title = f"{shown.title}  t = {row * STEP_S:+.1f} s"
+        bev = draw_bev(
+            ego, shapes, Boxes(agents, drive.agents.kinds), ego, ways if row >= 0 else ways[2:], title, BEV_PX
+        )
+        seen = [image for image in pictures if image["time_s"] <= row * STEP_S + 1e-6] or pictures[:1]
+        yield _sheet(bev, decoded(seen[-1]) if seen else None, camera, shown.scores)
+
+
+def _sheet(bev: Image, picture: Image | None, camera: str | None, scores: FrameScores) -> Image:
+    """The top-down view, the camera beside it, sub-scores below that."""
+    sheet = np.full((BEV_PX[1], BEV_PX[0] + CAMERA_PX[0], 3), PAPER, np.uint8)
+    sheet[:, : BEV_PX[0]] = bev
+    left = BEV_PX[0]
+    if picture is not None:
+        sheet[: CAMERA_PX[1], left:] = fitted(picture, *CAMERA_PX)
+    lines = [f"camera {camera}, up to now" if picture is not None else "no images"]
+    lines += [f"{name.upper()} {_number(value)}" for name, value in zip(COLUMNS, scores.unfiltered)]
+    for i, line in enumerate(lines):
+        at = (
+            (left + 12 + 140 * ((i - 1) % 5), CAMERA_PX[1] + 60 + 28 * ((i - 1) // 5))
+            if i
+            else (left + 12, CAMERA_PX[1] + 24)
+        )
+        cv2.putText(sheet, line, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, INK, 1, cv2.LINE_AA)
+    return sheet
+
+
+def _number(value: float) -> str:
+    return "-" if np.isnan(value) else f"{value:.2f}"
+
+
+def replay(
+    benchmark: Benchmark, one: Contender, clip_id: str, rules: Rules, follow_up: int | None = None
+) -> Iterator[Image]:
+    """Both stages of one clip, picture by picture. Raises ConfigError for a follow-up that the clip does not have."""
+    prepared = prepare_clip(benchmark.scenes(clip_id), rules)
+    plans = _plans(benchmark, one, prepared)
+    stages = [_shown(benchmark, f"{one.label}, stage one", FrameKey.logged(clip_id), prepared.logged, plans)]
+    chosen = _nearest(prepared, stages[0].plan) if follow_up is None else follow_up
+    if chosen is not None and chosen not in prepared.follow_ups:
+        raise ConfigError(f"follow_up={chosen}: clip {clip_id} has {sorted(prepared.follow_ups)}")
+    keys = FrameKey.follow_up(clip_id, -1 if chosen is None else chosen)
+    if chosen is not None and keys[0] in plans:
+        title = f"{one.label}, follow-up {chosen}"
+        stages.append(_shown(benchmark, title, keys, prepared.follow_ups[chosen], plans))
+    clip = prepared.logged.now.scene.clip
+    for shown in stages:
+        last = None
+        for last in film(shown, clip.ego_states[shown.pair.now.scene.step :]):
+            yield last
+        if last is not None:
+            yield from [last] * HOLD
+
+
+def _plans(benchmark: Benchmark, one: Contender, prepared: PreparedClip) -> Mapping[FrameKey, Array]:
+    if one.privileged is not None:
+        return one.privileged(prepared)
+    assert one.load is not None
+    made = one.load()
+    keys = [key for key in benchmark.keys if key.clip_id == prepared.clip_id]
+    return dict(zip(keys, plans_of(made, [benchmark.sample(key) for key in keys])))
+
+
+def _shown(
+    benchmark: Benchmark,
+    title: str,
+    keys: tuple[FrameKey, FrameKey],
+    pair: PreparedPair,
+    plans: Mapping[FrameKey, Array],
+) -> Shown:
+    (scores, drive), _ = score_pair(pair.now, pair.before, (plans[keys[0]], plans[keys[1]]))
+    plan = to_world(pair.now.scene.ego_state[: HEADING + 1], plans[keys[0]])
+    rollout = roll_out(pair.now.traffic, drive.states)
+    return Shown(title, benchmark.sample(keys[0]), pair, plan, rollout, scores)
+
+
+def _nearest(prepared: PreparedClip, plan: Array) -> int | None:
+    """The follow-up that weighs most for a plan (40, 3), world; None: the clip has none."""
+
+    def away(candidate: int) -> float:
+        start = prepared.follow_ups[candidate].now.scene.ego_state
+        return float(np.hypot(*(start[:2] - plan[-1, :2])))
+
+    return min(prepared.follow_ups, key=away, default=None)
+
+
+def find_clip(benchmark: Benchmark, wanted: str) -> str:
+    """The clip of that id, beginning of an id, or place. Raises ConfigError."""
+    clips = list(dict.fromkeys(key.clip_id for key in benchmark.keys))
+    if wanted.isdigit() and int(wanted) < len(clips):
+        return clips[int(wanted)]
+    found = [clip_id for clip_id in clips if clip_id.startswith(wanted)]
+    if len(found) != 1:
+        raise ConfigError(
+            f"clip={wanted}: {len(found)} of {len(clips)} clips fit; give an id or a number below the count"
+        )
+    return found[0]
+
+
+def settings_of(argv: Sequence[str]) -> ReplaySettings:
+    """The settings of a command line. Raises ConfigError."""
+    return fill(ReplaySettings, composed("replay", argv), "replay")
+
+
+def main(argv: Sequence[str]) -> int:
+    """The command; 2 with a message for what cannot be shown."""
+    if {"-h", "--help"} & set(argv):
+        print(__doc__)
+        return 0
+    try:
+        settings = settings_of(argv)
+        benchmark = BenchmarkFolder(settings.benchmark)
+        one = contender(settings.planner)
+        clip_id = find_clip(benchmark, str(settings.clip))
+        check_needs(benchmark, [key for key in benchmark.keys if key.clip_id == clip_id], [one])
+        rules = Rules(two_stage=settings.two_stage_traffic, pdm=settings.pdm)
+        write_mp4(Path(settings.out), replay(benchmark, one, clip_id, rules, settings.follow_up))
+    except (ConfigError, FileNotFoundError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return BAD_CONFIG
+    print(f"look at {settings.out}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,112 @@
+"""What is kept of every scored frame, as Parquet and CSV: all sub-scores without and with the human-penalty filter."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pa_csv
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from planners.evaluation.frames import FrameKey
+from tasks.reward.one_stage import COLUMNS, FrameScores
+
+Array = NDArray[np.float64]
+Stage = Literal["one_stage", "stage_one", "stage_two"]
+STAGES: tuple[Stage, ...] = get_args(Stage)
+FILTERED = "_filtered"  # suffix of a column with the filter
+POSE = ("x", "y", "heading")
+
+
+@dataclass(frozen=True)
+class FrameRow:
+    """One frame and one planner."""
+
+    stage: Stage
+    key: FrameKey
+    scores: FrameScores  # tasks.reward.one_stage.COLUMNS; NaN: not defined
+    progress_m: float  # along the route, of the drive
+    start: Array  # (3,) rear axle of the frame, world
+    end: Array  # (3,) last pose of the plan as predicted, world; NaN: no plan
+    tags: tuple[str, ...] = ()
+    weight: float = np.nan  # of a follow-up frame in its group; NaN elsewhere
+    log_id: str = ""  # of the clip; empty: unknown
+
+    def __post_init__(self) -> None:
+        if self.stage not in STAGES:
+            raise ValueError(f"stage must be one of {', '.join(STAGES)}, not {self.stage!r}")
+
+
+SCHEMA = pa.schema(
+    [
+        *((name, pa.string()) for name in ("stage", "log_id", "clip_id", "kind")),
+        ("candidate_index", pa.int32()),
+        *((name, pa.float64()) for name in COLUMNS),
+        *((name + FILTERED, pa.float64()) for name in COLUMNS),
+        ("progress_m", pa.float64()),
+        *((f"start_{name}", pa.float64()) for name in POSE),
+        *((f"end_{name}", pa.float64()) for name in POSE),
+        ("weight", pa.float64()),
+        ("tags", pa.string()),  # joined by spaces
+    ]
+)
+
+
+def write_rows(folder: Path, rows: Sequence[FrameRow]) -> None:
+    """`frames.parquet` and `frames.csv` in the folder."""
+    table = pa.Table.from_pylist([_flat(row) for row in rows], schema=SCHEMA)
+    pq.write_table(table, folder / "frames.parquet")
+    pa_csv.write_csv(table, folder / "frames.csv")
+
+
+def read_rows(folder: Path) -> list[FrameRow]:
+    """What `write_rows` wrote. Raises FileNotFoundError, or ValueError for a file of other columns.
+
+    Files from before log_id was written are read as of unknown logs.
+    """
+    path = folder / "frames.parquet"
+    table = pq.read_table(path)
+    if "log_id" not in table.column_names:
+        table = table.append_column("log_id", pa.array([""] * len(table)))
+    missing = [name for name in SCHEMA.names if name not in table.column_names]
+    if missing:
+        raise ValueError(f"{path}: no columns {', '.join(missing)}: evaluate the planner again")
+    return [_row(values) for values in table.to_pylist()]
+
+
+def _flat(row: FrameRow) -> dict[str, object]:
+    key = row.key
+    return {
+        "stage": row.stage,
+        "log_id": row.log_id,
+        "clip_id": key.clip_id,
+        "kind": key.kind,
+        "candidate_index": key.candidate_index,
+        **dict(zip(COLUMNS, row.scores.unfiltered.tolist())),
+        **{name + FILTERED: value for name, value in zip(COLUMNS, row.scores.filtered.tolist())},
+        "progress_m": row.progress_m,
+        **{f"start_{name}": value for name, value in zip(POSE, row.start.tolist())},
+        **{f"end_{name}": value for name, value in zip(POSE, row.end.tolist())},
+        "weight": row.weight,
+        "tags": " ".join(row.tags),
+    }
+
+
+def _row(values: dict[str, object]) -> FrameRow:
+    def numbers(names: Sequence[str]) -> Array:
+        return np.array([values[name] for name in names], dtype=np.float64)
+
+    return FrameRow(
+        stage=values["stage"],  # type: ignore[arg-type]  # checked by the class
+        key=FrameKey(values["clip_id"], values["kind"], values["candidate_index"]),  # type: ignore[arg-type]
+        scores=FrameScores(numbers(COLUMNS), numbers([name + FILTERED for name in COLUMNS])),
+        progress_m=float(values["progress_m"]),  # type: ignore[arg-type]
+        start=numbers([f"start_{name}" for name in POSE]),
+        end=numbers([f"end_{name}" for name in POSE]),
+        tags=tuple(str(values["tags"]).split()),
+        weight=float(values["weight"]),  # type: ignore[arg-type]
+        log_id=str(values["log_id"]),
+    )

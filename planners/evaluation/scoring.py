@@ -1,0 +1,245 @@
+"""Plans scored on frames as the public benchmark does it (docs/reward.md 1, 2 and 3).
+
+A frame's plan is driven by the tracker, the traffic answers to it or replays its log, and the drive is scored in the
+two-row batch [PDM-Closed, plan]: progress is relative to PDM-Closed among the traffic that answered to the plan. Where
+the frame is a logged one, what the logged human gets 0 for, driven and scored alone among traffic of its own, is
+forgiven. Extended comfort compares a plan with the one made 0.5 s before and belongs to both.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planners.evaluation.frames import ClipScenes, FrameKey, FramePair
+from planners.evaluation.score_rows import FrameRow, Stage
+from tasks.experts.pdm_closed import PdmSettings, plan_for
+from tasks.reward.comfort import extended_comfort
+from tasks.reward.epdms import Scores, rows, score
+from tasks.reward.one_stage import COLUMNS, FrameScores, frame_scores
+from tasks.reward.prepare import N_TIMES, PreparedScene, among, prepare_scene
+from tasks.reward.two_stage import follow_up_weights
+from tasks.rollout.lqr import track
+from tasks.rollout.simulate import TrafficScene, TrafficSettings, prepare_traffic, roll_out
+from tasks.trajectories import at_ten_hz
+from tasks.world.clip import HORIZON_STEPS, Scene
+from tasks.world.frames import to_local, to_world
+from tasks.world.vehicle import HEADING
+
+Array = NDArray[np.float64]
+
+INTERVAL_S = 0.5  # between the two frames of a pair
+COARSE_STEP = 5  # planners answer at 2 Hz: the human is judged by as much of his drive
+
+
+@dataclass(frozen=True)
+class Rules:
+    """What plans are driven among and measured by."""
+
+    one_stage: TrafficSettings = field(default_factory=lambda: TrafficSettings(mode="replay"))
+    two_stage: TrafficSettings = field(default_factory=TrafficSettings)
+    pdm: PdmSettings = field(default_factory=PdmSettings)
+
+
+@dataclass(frozen=True)
+class PreparedFrame:
+    """All that a frame's score needs and no plan changes."""
+
+    scene: Scene
+    traffic: TrafficScene
+    world: PreparedScene  # map, centreline, lights, history; its objects are set for every drive
+    rival: Array  # (41, 11) PDM-Closed as the tracker drives it
+    pdm_poses: Array  # (40, 3) what PDM-Closed wants, ego frame
+    human_poses: Array | None  # (40, 3) the logged drive from 2 Hz poses, ego frame; None: nobody drove from here
+    human: Scores | None  # one row: the logged drive scored alone; None: nothing is forgiven
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A plan, driven and scored."""
+
+    states: Array  # (41, 11)
+    scores: Scores  # one row
+
+
+def prepare_frame(scene: Scene, traffic: TrafficSettings, pdm: PdmSettings, logged: bool) -> PreparedFrame:
+    """Everything of a frame that does not depend on a plan. logged: whether the scene is the log's own."""
+    plan = plan_for(scene, pdm)
+    now = scene.agents.window(scene.step, scene.step + N_TIMES)
+    frame = PreparedFrame(
+        scene=scene,
+        traffic=prepare_traffic(scene, traffic),
+        world=prepare_scene(scene, now),
+        rival=plan.driven,
+        pdm_poses=to_local(scene.ego_state[: HEADING + 1], plan.poses),
+        human_poses=logged_poses(scene) if logged else None,
+        human=None,
+    )
+    return _with_human(frame)
+
+
+def among_other_traffic(frame: PreparedFrame, traffic: TrafficSettings) -> PreparedFrame:
+    """The same frame with traffic that moves otherwise."""
+    return _with_human(replace(frame, traffic=prepare_traffic(frame.scene, traffic), human=None))
+
+
+def logged_poses(scene: Scene) -> Array:
+    """(40, 3) the logged drive of the next 4 s in the ego frame, known every 0.5 s and linear between."""
+    first = scene.step + COARSE_STEP
+    poses = scene.clip.ego_states[first : first + HORIZON_STEPS : COARSE_STEP, : HEADING + 1]
+    return at_ten_hz(to_local(scene.ego_state[: HEADING + 1], poses)[None])[0]
+
+
+def drive(frame: PreparedFrame, poses: Array) -> Drive:
+    """Drive and score a plan (40, 3) at 0.1 .. 4.0 s in the frame's ego frame. Raises ValueError if not finite."""
+    states, world = _driven(frame, poses)
+    return Drive(states, rows(score(world, np.stack([frame.rival, states]), normalise="pairs"), slice(1, 2)))
+
+
+def _driven(frame: PreparedFrame, poses: Array) -> tuple[Array, PreparedScene]:
+    """States (41, 11), and the world with the traffic that answered to them."""
+    ego = frame.scene.ego_state
+    states = track(ego, to_world(ego[: HEADING + 1], poses)[None])[0]
+    return states, among(frame.world, roll_out(frame.traffic, states).agents, ego)
+
+
+def _with_human(frame: PreparedFrame) -> PreparedFrame:
+    if frame.human_poses is None:
+        return frame
+    states, world = _driven(frame, frame.human_poses)
+    return replace(frame, human=score(world, states[None], with_history=False))
+
+
+def score_pair(
+    now: PreparedFrame, before: PreparedFrame, plans: tuple[Array, Array]
+) -> tuple[tuple[FrameScores, Drive], tuple[FrameScores, Drive]]:
+    """COLUMNS of the plans (40, 3) made now and 0.5 s before, with the extended comfort that they share."""
+    drives = drive(now, plans[0]), drive(before, plans[1])
+    ec = float(extended_comfort(drives[0].states[None], drives[1].states[None], INTERVAL_S).ec[0])
+    of_now, of_before = (frame_scores(d.scores, frame.human, ec) for d, frame in zip(drives, (now, before)))
+    return (of_now, drives[0]), (of_before, drives[1])
+
+
+@dataclass(frozen=True)
+class PreparedPair:
+    """The frame now and the one 0.5 s before."""
+
+    now: PreparedFrame
+    before: PreparedFrame
+
+
+@dataclass(frozen=True)
+class PreparedClip:
+    """All frames of a clip."""
+
+    clip_id: str
+    alone: PreparedPair  # the logged frames among the one-stage evaluation's traffic
+    logged: PreparedPair  # the same among the two-stage evaluation's
+    follow_ups: Mapping[int, PreparedPair]  # candidate index -> frames
+
+
+def prepare_clip(scenes: ClipScenes, rules: Rules) -> PreparedClip:
+    """Everything of a clip's frames that does not depend on a plan. Raises ValueError naming clip and frame."""
+
+    def pair(frames: FramePair, logged: bool, name: str) -> PreparedPair:
+        try:
+            return PreparedPair(
+                *(prepare_frame(s, rules.two_stage, rules.pdm, logged) for s in (frames.now, frames.before))
+            )
+        except ValueError as error:
+            raise ValueError(f"clip {scenes.clip_id}, {name}: {error}") from error
+
+    logged = pair(scenes.logged, True, "the logged frames")
+    alone = logged
+    if rules.one_stage != rules.two_stage:
+        alone = PreparedPair(
+            among_other_traffic(logged.now, rules.one_stage), among_other_traffic(logged.before, rules.one_stage)
+        )
+    follow_ups = {i: pair(frames, False, f"follow-up {i}") for i, frames in scenes.follow_ups.items()}
+    return PreparedClip(scenes.clip_id, alone, logged, follow_ups)
+
+
+Plans = Mapping[FrameKey, Array]  # frame -> (40, 3) in its ego frame
+
+
+def human_plans(clip: PreparedClip) -> dict[FrameKey, Array]:
+    """The log's drive where there is one: nobody drove from a follow-up frame."""
+    poses = clip.logged.now.human_poses, clip.logged.before.human_poses
+    assert poses[0] is not None and poses[1] is not None
+    return dict(zip(FrameKey.logged(clip.clip_id), (poses[0], poses[1])))
+
+
+def pdm_plans(clip: PreparedClip) -> dict[FrameKey, Array]:
+    """PDM-Closed's proposal from every frame."""
+    return {key: frame.pdm_poses for key, frame in _frames(clip)}
+
+
+def _frames(clip: PreparedClip) -> Iterator[tuple[FrameKey, PreparedFrame]]:
+    yield from zip(FrameKey.logged(clip.clip_id), (clip.logged.now, clip.logged.before))
+    for i, pair in clip.follow_ups.items():
+        yield from zip(FrameKey.follow_up(clip.clip_id, i), (pair.now, pair.before))
+
+
+def score_clip(
+    clip: PreparedClip, plans: Plans, tags: Mapping[FrameKey, Sequence[str]] | None = None
+) -> list[FrameRow]:
+    """One row a frame: one stage now, stage one now and before, stage two of every follow-up pair.
+
+    A follow-up frame without a plan gets a row of NaN. Raises ValueError, naming the frame, for a logged frame
+    without a plan and for plans that are not (40, 3) finite numbers.
+    """
+    tags = tags or {}
+    logged = FrameKey.logged(clip.clip_id)
+    one_stage = _pair_rows("one_stage", logged, clip.alone, plans, tags)[:1]
+    stage_one = _pair_rows("stage_one", logged, clip.logged, plans, tags)
+    follow_ups = [
+        _pair_rows("stage_two", FrameKey.follow_up(clip.clip_id, i), pair, plans, tags)
+        for i, pair in clip.follow_ups.items()
+    ]
+    groups = [_weighted(group, row.end) for group, row in zip(zip(*follow_ups), stage_one)]  # now, before
+    return [*one_stage, *stage_one, *(row for pair in zip(*groups) for row in pair)]
+
+
+def _weighted(group: Sequence[FrameRow], end: Array) -> list[FrameRow]:
+    """Follow-up rows with their weights for a plan of stage one that ends at a pose (3,)."""
+    weights = follow_up_weights(end[:2], np.array([row.start[:2] for row in group]))
+    return [replace(row, weight=float(weight)) for row, weight in zip(group, weights)]
+
+
+def _pair_rows(
+    stage: Stage,
+    keys: tuple[FrameKey, FrameKey],
+    pair: PreparedPair,
+    plans: Plans,
+    tags: Mapping[FrameKey, Sequence[str]],
+) -> list[FrameRow]:
+    frames = pair.now, pair.before
+    starts = [frame.scene.ego_state[: HEADING + 1] for frame in frames]
+    if stage == "stage_two" and not any(key in plans for key in keys):
+        nothing = np.full(len(COLUMNS), np.nan)
+        blank = FrameRow(stage, keys[0], FrameScores(nothing, nothing), np.nan, starts[0], np.full(3, np.nan))
+        return [replace(blank, key=key, start=start, tags=tuple(tags.get(key, ()))) for key, start in zip(keys, starts)]
+    made = _checked(keys[0], plans), _checked(keys[1], plans)
+    scored = score_pair(pair.now, pair.before, made)
+    return [
+        FrameRow(
+            stage=stage,
+            key=key,
+            scores=scores,
+            progress_m=float(driven.scores.ep_raw_m[0]),
+            start=start,
+            end=to_world(start, poses[-1]),
+            tags=tuple(tags.get(key, ())),
+        )
+        for key, start, poses, (scores, driven) in zip(keys, starts, made, scored)
+    ]
+
+
+def _checked(key: FrameKey, plans: Plans) -> Array:
+    if key not in plans:
+        raise ValueError(f"{key}: no plan for this frame")
+    poses = np.asarray(plans[key], dtype=np.float64)
+    if poses.shape != (HORIZON_STEPS, 3) or not np.isfinite(poses).all():
+        raise ValueError(f"{key}: a plan must be ({HORIZON_STEPS}, 3) finite numbers, got {poses.shape}")
+    return poses

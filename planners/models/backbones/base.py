@@ -1,0 +1,68 @@
+"""What an image backbone is: four feature maps at strides 4, 8, 16, 32 from a picture."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of red, green, blue in 0 .. 1
+STRIDES = (4, 8, 16, 32)
+
+
+@dataclass(frozen=True)
+class BackboneSettings:
+    """Which network, and where its weights come from."""
+
+    name: Literal["resnet34", "vovnet99", "small"] = "resnet34"
+    pretrained: str | None = None  # .safetensors, .pth or .pt under the published names; null: random weights
+    prefix: str = ""  # before the names in that file, such as "img_backbone."; entries without it are not read
+    widths: tuple[int, ...] = (16, 32, 64, 128)  # of `small`, one residual block each
+
+
+class Backbone(nn.Module, ABC):
+    """`enter`, then `stage` 0 .. 3, between which a planner may change the features; `forward` is all of them."""
+
+    def __init__(self, settings: BackboneSettings, channels: tuple[int, ...]) -> None:
+        super().__init__()
+        self.settings, self.channels = settings, channels
+        self.weights_missing = settings.pretrained is not None
+        mean, std = torch.tensor(IMAGENET_MEAN).view(3, 1, 1), torch.tensor(IMAGENET_STD).view(3, 1, 1)
+        self.register_buffer("shift", -mean / std, persistent=False)
+        self.register_buffer("scale", 1.0 / (255.0 * std), persistent=False)
+        self.register_load_state_dict_post_hook(_weights_came)
+
+    def normalised(self, image: Tensor) -> Tensor:
+        """uint8 RGB (B, 3, h, w) as float with ImageNet's mean 0 and deviation 1; a float input as it is.
+
+        Raises RuntimeError where the settings name weights that nobody loaded.
+        """
+        if self.weights_missing:
+            raise RuntimeError(
+                f"weights {self.settings.pretrained} are named but not loaded: call backbones.registry.load_pretrained"
+            )
+        image = image.contiguous(memory_format=torch.channels_last)  # a third faster in training on a CPU core
+        if image.dtype != torch.uint8:
+            return image
+        return torch.addcmul(self.get_buffer("shift"), image, self.get_buffer("scale"))
+
+    @abstractmethod
+    def enter(self, image: Tensor) -> Tensor:
+        """Picture (B, 3, h, w), see `normalised`, to features at stride 4."""
+
+    @abstractmethod
+    def stage(self, index: int, features: Tensor) -> Tensor:
+        """Features at the stride before to (B, channels[index], h / STRIDES[index], w / STRIDES[index])."""
+
+    def forward(self, image: Tensor) -> list[Tensor]:
+        """Picture (B, 3, h, w), h and w multiples of 32, to (B, channels[i], h / STRIDES[i], w / STRIDES[i]) each."""
+        maps = [self.enter(image)]
+        for i in range(len(STRIDES)):
+            maps.append(self.stage(i, maps[-1]))
+        return maps[1:]
+
+
+def _weights_came(module: nn.Module, _: object) -> None:
+    assert isinstance(module, Backbone)
+    module.weights_missing = False

@@ -1,0 +1,1 @@
+"""DiffusionDrive (Liao et al. 2025)."""

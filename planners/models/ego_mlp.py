@@ -1,0 +1,101 @@
+"""Planners without eyes: one that knows its own speed and command only, and one that is shown the world from above.
+
+The first is the public EgoStatusMLP of NAVSIM, whose defaults these are: what it scores is what a sample's ego status
+gives away. The second sees a raster of the labelled world and is named after it, so that nobody takes it for the first.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from planners.data.batch import Batch, BevLayout, Needs
+from planners.data.bev import BevClass
+from planners.models.planner import FloatArray, Planner, evaluating
+from planners.models.regression import PlanFrom, imitation_l1, planned_from
+
+
+@dataclass(frozen=True)
+class EgoMlpSettings:
+    """Of the one that sees its status alone."""
+
+    hidden: tuple[int, ...] = (512, 512, 512)  # widths of the hidden layers
+    plan_from: PlanFrom = "zero"  # what the regressed poses are added to
+
+
+class EgoMlp(Planner):
+    """Command, velocity and acceleration through a few linear layers to eight poses."""
+
+    name: ClassVar[str] = "ego_mlp"
+    settings_type: ClassVar[type] = EgoMlpSettings
+
+    def __init__(self, settings: EgoMlpSettings, arrays: Mapping[str, FloatArray], seen: int = 0) -> None:
+        """seen: features beside the eight of the ego's status."""
+        super().__init__(settings, arrays)
+        widths = (8 + seen, *settings.hidden)
+        layers = [layer for a, b in pairwise(widths) for layer in (nn.Linear(a, b), nn.ReLU())]
+        self.layers = nn.Sequential(*layers, nn.Linear(widths[-1], 24))
+
+    @property
+    def needs(self) -> Needs:
+        return Needs()
+
+    def features(self, batch: Batch) -> Tensor:
+        """(B, 8 + seen) that the layers take."""
+        return batch.status
+
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
+        return {"trajectory": imitation_l1(self._poses(batch), batch)}
+
+    def plan(self, batch: Batch) -> Tensor:
+        with evaluating(self):
+            return self._poses(batch)
+
+    def _poses(self, batch: Batch) -> Tensor:
+        poses = self.layers(self.features(batch)).float().view(-1, 8, 3)
+        return planned_from(self.settings.plan_from, poses, batch)
+
+
+@dataclass(frozen=True)
+class EgoMlpBevSettings(EgoMlpSettings):
+    """The raster, and the convolutions over it, each of stride 2."""
+
+    bev: BevLayout = field(
+        default_factory=lambda: BevLayout(ahead_m=48.0, behind_m=16.0, cell_m=0.5, times_s=(-1.0, -0.5, 0.0))
+    )
+    classes: int = 4  # numbers that a class of cell is told by
+    channels: tuple[int, ...] = (16, 32, 64, 64)
+    features: int = 256  # that the map is folded into
+
+
+class EgoMlpBev(EgoMlp):
+    """The same, with the map, the route and the agents as a raster beside its status."""
+
+    name: ClassVar[str] = "ego_mlp_bev"
+    settings_type: ClassVar[type] = EgoMlpBevSettings
+
+    def __init__(self, settings: EgoMlpBevSettings, arrays: Mapping[str, FloatArray]) -> None:
+        super().__init__(settings, arrays, settings.features)
+        self.classes = nn.Embedding(len(BevClass), settings.classes)
+        widths = (settings.classes * len(settings.bev.times_s), *settings.channels)
+        self.convolutions = nn.ModuleList(nn.Conv2d(a, b, 3, 2, 1) for a, b in pairwise(widths))
+        rows, columns = settings.bev.shape
+        for _ in settings.channels:
+            rows, columns = (rows + 1) // 2, (columns + 1) // 2
+        self.fold = nn.Linear(widths[-1] * rows * columns, settings.features)
+
+    @property
+    def needs(self) -> Needs:
+        return Needs(bev=self.settings.bev)
+
+    def features(self, batch: Batch) -> Tensor:
+        assert batch.bev is not None
+        told = self.classes(batch.bev.int())  # (B, T, rows, columns, classes)
+        x = told.permute(0, 1, 4, 2, 3).flatten(1, 2)
+        for convolve in self.convolutions:
+            x = F.relu(convolve(x))
+        return torch.cat([batch.status, F.relu(self.fold(x.flatten(1)))], -1)

@@ -1,0 +1,1 @@
+"""GTRS-Dense (Li et al. 2025)."""

@@ -1,0 +1,240 @@
+"""GTRS-Dense (Li et al. 2025): every trajectory of a large vocabulary is scored, the best one is driven.
+
+A trajectory is a query that looks at the picture's tokens; one head for each sub-score of EPDMS learns what that
+trajectory would score if it were driven, another how near it is to the label. A step trains a random half of the
+vocabulary. Constants without another source are those of NVlabs/GTRS and OpenDriveLab/SimScale (04cda10),
+navsim/agents/gtrs_dense: hydra_config.py, hydra_model.py, gtrs_agent.py, with SimScale's gtrs_dense_vov.yaml.
+
+Different here: there is a head for hc as well (weight 1.0 in the published settings, which have no such head), noise on
+the velocity is drawn for each sample instead of once for a batch, and pictures are shifted. The supplement says that
+inputs get "random spatial shifts"; neither code base shifts the pictures of this model, so how far is ours: edge pixels
+are repeated as in DrQ (Kostrikov et al. 2021), few enough of them that the labels stand.
+"""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import ClassVar, Literal
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from planners.data.batch import Batch, ImageLayout, Needs
+from planners.models.anchors import read_array
+from planners.models.attention import Decoder, Layer
+from planners.models.backbones.registry import BackboneSettings
+from planners.models.gtrs_dense.tokens import FusedTokens, PictureTokens
+from planners.models.gtrs_dense.weighting import IMITATION, SUBSCORES, WEIGHTINGS, WeightingName, choose
+from planners.models.planner import FloatArray, Planner, TrainingData, evaluating
+from planners.models.transfuser import FusionSettings
+from tasks.reward.label_bytes import HALVES, Normalise
+from tasks.vocabulary import Vocabulary
+
+STATUS = 8
+VELOCITY = slice(4, 6)  # of the status, after the one-hot command
+AT_2HZ = slice(4, None, 5)  # of 40 poses at 10 Hz
+
+
+@dataclass(frozen=True)
+class RewardWeights:
+    """Of the heads' losses; 0 leaves a head untrained."""
+
+    nc: float = 3.0
+    dac: float = 3.0
+    ddc: float = 1.0
+    tlc: float = 3.0
+    ttc: float = 4.0
+    lk: float = 2.0
+    hc: float = 1.0
+    ep: float = 2.0
+
+
+@dataclass(frozen=True)
+class GtrsDenseSettings:
+    """The defaults are the paper's size."""
+
+    vocabulary: str | None = None  # .npy (K, 40, 3): the one whose labels the samples carry
+    inference_vocabulary: str | None = None  # .npy of another to choose from; published: 8,192 for navhard
+    inference_entries: int | None = None  # or that many of the first, evenly spaced; null for both: all
+    weighting: WeightingName = "release"
+    normalise: Normalise = "masked"  # of the labels' EP
+    image: ImageLayout = field(default_factory=ImageLayout)
+    encoder: Literal["fused", "picture"] = "fused"  # as published with ResNet-34; with V2-99
+    fusion: FusionSettings = field(default_factory=FusionSettings)  # of the fused encoder
+    backbone: BackboneSettings = field(default_factory=lambda: BackboneSettings("vovnet99"))  # of the other
+    width: int = 256
+    heads: int = 8
+    hidden: int = 1024
+    layers: int = 3
+    kept: float = 0.5  # share of the vocabulary in a training step
+    velocity_noise_mps: tuple[float, float] = (1.0, 0.2)  # deviation along and across, in training
+    image_shift: float = 1 / 256  # largest, as a share of the width, in training: 8 of 2048 pixels, half a degree
+    imitation: float = 1.0  # weight of its loss
+    rewards: RewardWeights = field(default_factory=RewardWeights)
+    sigma_m2: float = 0.5  # of the imitated distribution
+
+    def __post_init__(self) -> None:
+        if self.inference_vocabulary is not None and self.inference_entries is not None:
+            raise ValueError("inference_vocabulary and inference_entries: give one of them")
+        if not 0.0 < self.kept <= 1.0:
+            raise ValueError(f"kept={self.kept}: a share of the vocabulary above 0, at most 1")
+
+
+class TrajectoryScorer(nn.Module):
+    """Trajectories that have seen each other, then a scene's tokens, to a logit for each head."""
+
+    def __init__(self, settings: GtrsDenseSettings) -> None:
+        super().__init__()
+        width, hidden = settings.width, settings.hidden
+        self.embed = nn.Sequential(nn.Linear(3 * 40, hidden), nn.ReLU(), nn.Linear(hidden, width))
+        self.among = Layer(width, settings.heads, 4 * width, crosses=False)
+        self.decoder = Decoder(width, settings.heads, hidden, settings.layers)
+        self.status = nn.Linear(STATUS, width)
+        self.heads = nn.ModuleDict(
+            {name: nn.Sequential(nn.Linear(width, hidden), nn.ReLU(), nn.Linear(hidden, 1)) for name in SUBSCORES}
+        )
+        self.heads[IMITATION] = nn.Sequential(
+            nn.Linear(width, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 1)
+        )
+
+    def forward(self, trajectories: Tensor, tokens: Tensor, status: Tensor) -> dict[str, Tensor]:
+        """Trajectories (K, 40, 3), tokens (B, N, width), status (B, 8) to float32 logits (B, K) by name."""
+        queries = self.among(self.embed(trajectories.flatten(1))[None])
+        if self.training:  # else what they have seen of each other is worked out once; gradients would round otherwise
+            queries = queries.expand(len(tokens), -1, -1)
+        seen = self.decoder(queries, tokens) + self.status(status)[:, None]
+        return {name: head(seen).squeeze(-1).float() for name, head in self.heads.items()}
+
+
+class GtrsDense(Planner):
+    """See the module; plans are (B, 40, 3)."""
+
+    name: ClassVar[str] = "gtrs_dense"
+    settings_type: ClassVar[type] = GtrsDenseSettings
+    free_settings = frozenset({"weighting", "inference_entries"})
+    settings: GtrsDenseSettings
+
+    def __init__(self, settings: GtrsDenseSettings, arrays: Mapping[str, FloatArray]) -> None:
+        super().__init__(settings, arrays)
+        vocabulary = Vocabulary(np.asarray(arrays["vocabulary"], np.float64), "vocabulary")
+        choices = _choices(settings, arrays, vocabulary)
+        self.label_digest, self.choice_digest = vocabulary.digest, choices.digest
+        self.register_buffer("trajectories", torch.tensor(vocabulary.trajectories).float(), persistent=False)
+        self.register_buffer("choices", torch.tensor(choices.trajectories).float(), persistent=False)
+        self.tokens: nn.Module
+        if settings.encoder == "fused":
+            self.tokens = FusedTokens(settings.fusion, settings.width)
+        else:
+            self.tokens = PictureTokens(settings.backbone, settings.image, settings.width)
+        self.scorer = TrajectoryScorer(settings)
+
+    @classmethod
+    def fixed_arrays(cls, settings: GtrsDenseSettings, data: TrainingData) -> dict[str, FloatArray]:
+        """`vocabulary`, and `inference_vocabulary` where the settings name one.
+
+        Raises ValueError where a file is missing or the samples are labelled with another vocabulary, or none.
+        """
+        labelled = data.label_vocabulary
+        if labelled is None:
+            raise ValueError("gtrs_dense learns from labels of a vocabulary and these samples carry none")
+        if settings.vocabulary is None:
+            raise ValueError(f"vocabulary: give the .npy file of trajectories with digest {labelled}, the labels' own")
+        vocabulary = Vocabulary(read_array(settings.vocabulary, "vocabulary"), settings.vocabulary)
+        if vocabulary.digest != labelled:
+            raise ValueError(
+                f"vocabulary={settings.vocabulary} has digest {vocabulary.digest}, "
+                f"the samples are labelled with {labelled}"
+            )
+        arrays: dict[str, FloatArray] = {"vocabulary": vocabulary.trajectories}
+        if (file := settings.inference_vocabulary) is not None:
+            arrays["inference_vocabulary"] = Vocabulary(read_array(file, "inference_vocabulary"), file).trajectories
+        return arrays
+
+    @property
+    def needs(self) -> Needs:
+        return Needs(image=self.settings.image, labels=self.label_digest, normalise=self.settings.normalise)
+
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
+        """`imitation`: cross-entropy with softmax(-d^2 / sigma^2) of the poses at 2 Hz; one binary one per sub-score.
+
+        Half points count as none, as published. Raises ValueError where the batch has no image or labels.
+        """
+        if batch.labels is None:
+            raise ValueError("gtrs_dense: a batch without labels cannot be learned from")
+        picked = self._picked()
+        trajectories = self.get_buffer("trajectories")[picked]
+        logits = self._logits(batch, trajectories)
+        target = imitated(trajectories[:, AT_2HZ], batch.plan_2hz, batch.imitate, self.settings.sigma_m2)
+        # masked by a product, also where nothing imitates: a distributed step wants a gradient for every parameter
+        apart = -(target * logits[IMITATION].log_softmax(dim=1)).sum(dim=1)
+        terms = {IMITATION: self.settings.imitation * (apart * batch.imitate).sum() / len(batch)}
+        for name, weight in asdict(self.settings.rewards).items():
+            score = batch.labels[name][:, picked]
+            whole = (score == 1.0).float() if name in HALVES else score
+            terms[name] = weight * F.binary_cross_entropy_with_logits(logits[name], whole)
+        return terms
+
+    def scores(self, batch: Batch) -> dict[str, Tensor]:
+        """Probabilities (B, K) of every trajectory to choose from: the sub-scores, and `imitation` that sums to 1."""
+        with evaluating(self):
+            logits = self._logits(batch, self.get_buffer("choices"))
+        return {name: value.softmax(dim=1) if name == IMITATION else value.sigmoid() for name, value in logits.items()}
+
+    def choose(self, scores: Mapping[str, Tensor]) -> Tensor:
+        """Index (B,) by the weighting of the settings."""
+        return choose(scores, WEIGHTINGS[self.settings.weighting])
+
+    def plan(self, batch: Batch) -> Tensor:
+        return self.get_buffer("choices")[self.choose(self.scores(batch))]
+
+    def _logits(self, batch: Batch, trajectories: Tensor) -> dict[str, Tensor]:
+        if batch.image is None:
+            raise ValueError("gtrs_dense: a batch without images")
+        image, status = batch.image, batch.status
+        if self.training:
+            image = shifted(image, round(self.settings.image_shift * image.shape[-1]))
+            deviation = status.new_zeros(STATUS)
+            deviation[VELOCITY] = status.new_tensor(self.settings.velocity_noise_mps)
+            status = status + deviation * torch.randn_like(status)
+        return self.scorer(trajectories, self.tokens(image), status)
+
+    def _picked(self) -> Tensor:
+        """Sorted indices of the vocabulary for one training step; all of it in evaluation."""
+        trajectories = self.get_buffer("trajectories")
+        size, device = len(trajectories), trajectories.device
+        if not self.training or self.settings.kept == 1.0:
+            return torch.arange(size, device=device)
+        return torch.randperm(size, device=device)[: max(1, round(self.settings.kept * size))].sort().values
+
+
+def _choices(settings: GtrsDenseSettings, arrays: Mapping[str, FloatArray], vocabulary: Vocabulary) -> Vocabulary:
+    if settings.inference_vocabulary is not None:
+        return Vocabulary(np.asarray(arrays["inference_vocabulary"], np.float64), settings.inference_vocabulary)
+    count = settings.inference_entries
+    if count is None:
+        return vocabulary
+    if not 1 <= count <= len(vocabulary):
+        raise ValueError(f"inference_entries={count}: the vocabulary has {len(vocabulary)}")
+    return Vocabulary(vocabulary.trajectories[[i * len(vocabulary) // count for i in range(count)]])
+
+
+def imitated(at_2hz: Tensor, plans: Tensor, imitate: Tensor, sigma_m2: float) -> Tensor:
+    """Distribution (B, K) over trajectories (K, 8, 3): softmax of -sum((x, y, heading apart)^2) / sigma.
+
+    Plans (B, 8, 3) that are not to be imitated may be anything, also NaN; their rows mean nothing.
+    """
+    plans = torch.where(imitate[:, None, None], plans, 0.0)
+    return (-(at_2hz[None] - plans[:, None]).square().sum(dim=(2, 3)) / sigma_m2).softmax(dim=1)
+
+
+def shifted(image: Tensor, most: int) -> Tensor:
+    """Pictures (B, C, h, w), each moved by up to `most` pixels along both axes, edge pixels repeated."""
+    if most == 0:
+        return image
+    n, _, height, width = image.shape
+    moves = torch.randint(-most, most + 1, (2, n, 1), device=image.device)
+    rows = (torch.arange(height, device=image.device) + moves[0]).clamp(0, height - 1)
+    columns = (torch.arange(width, device=image.device) + moves[1]).clamp(0, width - 1)
+    sample = torch.arange(n, device=image.device)[:, None, None]
+    return image[sample, :, rows[:, :, None], columns[:, None, :]].permute(0, 3, 1, 2)

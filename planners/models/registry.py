@@ -1,0 +1,63 @@
+"""Planners by name: the built-in ones, those that installed packages offer, or a class of a user's own package."""
+
+import importlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from factory.commands import nearest
+from factory.config import ConfigError, fill
+from factory.plugins import installed, names
+from planners.models.planner import FloatArray, Planner
+
+BUILT_IN = {
+    "constant_velocity": "planners.models.constant_velocity:ConstantVelocity",
+    "ego_mlp": "planners.models.ego_mlp:EgoMlp",
+    "ego_mlp_bev": "planners.models.ego_mlp:EgoMlpBev",
+    "ltf": "planners.models.ltf:Ltf",
+    "diffusiondrive": "planners.models.diffusiondrive.planner:DiffusionDrive",
+    "gtrs_dense": "planners.models.gtrs_dense.planner:GtrsDense",
+}
+
+
+@dataclass(frozen=True)
+class PlannerChoice:
+    """A planner and its settings, as conf/planner/*.yaml and checkpoints name it."""
+
+    name: str  # one of BUILT_IN, of an installed package's, or my.module:MyPlanner
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
+def planner_class(name: str) -> type[Planner]:
+    """The class of a planner. Raises ConfigError where there is none of that name."""
+    plugin = installed("planner", name, BUILT_IN)
+    target = BUILT_IN.get(name, name) if plugin is None else plugin.reference
+    module, found, attribute = target.partition(":")
+    if not found:
+        known = [*BUILT_IN, *names("planner")]
+        meant = nearest(name, known)
+        raise ConfigError(
+            f"planner.name={name}: none of {', '.join(known)}{meant}; or name a class, my.module:MyPlanner"
+        )
+    try:
+        cls = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise ConfigError(f"planner.name={name}: {error}") from error
+    if not (isinstance(cls, type) and issubclass(cls, Planner)):
+        raise ConfigError(f"planner.name={name} is not a planners.models.planner.Planner")
+    return cls
+
+
+def settings_of(choice: PlannerChoice) -> Any:
+    """The planner's own settings. Raises ConfigError for one that it does not have."""
+    return fill(planner_class(choice.name).settings_type, choice.settings, "planner.settings")
+
+
+def build_planner(choice: PlannerChoice, arrays: Mapping[str, FloatArray]) -> Planner:
+    """The planner around its fixed arrays. Raises ConfigError."""
+    try:
+        planner = planner_class(choice.name)(settings_of(choice), arrays)
+    except ValueError as error:
+        raise ConfigError(f"planner {choice.name}: {error}") from error
+    planner.chosen_as = choice.name
+    return planner

@@ -1,0 +1,155 @@
+"""Checkpoints: a planner that anyone can load, and the state that its training goes on from.
+
+    <out>/checkpoints/<step>/record.json         the planner, its settings, what it was trained on, how far
+                             weights.safetensors
+                             arrays.npz          what the planner is built around: vocabulary, anchors
+                             training.pt         optimiser and loader; only tensors and plain values are read back
+
+A checkpoint is written beside its place and moved there whole. No file of it holds code; a planner of a user's own
+package is imported by the name that the record gives, from what is installed.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+import zipfile
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+
+from factory.config import ConfigError
+from planners.models.planner import FloatArray, Planner
+from planners.models.registry import PlannerChoice, build_planner, planner_class
+
+FOLDER = "checkpoints"
+RECORD, WEIGHTS, ARRAYS, TRAINING = "record.json", "weights.safetensors", "arrays.npz", "training.pt"
+KEPT = 2  # the newest ones of a training
+
+
+def save_checkpoint(
+    out: Path, step: int, planner: Planner, record: Mapping[str, Any], training: Mapping[str, Any]
+) -> Path:
+    """Write checkpoint `step` under `out` and remove all but the newest; returns its folder.
+
+    record: what is to be known of the training, plain values; the planner's name and settings are added.
+    """
+    folder = out / FOLDER / f"{step:08d}"
+    unfinished = folder.with_name(f".{folder.name}.{os.getpid()}")
+    shutil.rmtree(unfinished, ignore_errors=True)
+    unfinished.mkdir(parents=True)
+    who = {"planner": {"name": planner.chosen_as, "settings": as_record(planner.settings)}, "step": step}
+    (unfinished / RECORD).write_text(json.dumps({**who, **record}, indent=1))
+    save_file({k: v.contiguous() for k, v in planner.state_dict().items()}, unfinished / WEIGHTS)
+    np.savez(unfinished / ARRAYS, **planner.arrays)  # type: ignore[arg-type]
+    torch.save(dict(training), unfinished / TRAINING)
+    shutil.rmtree(folder, ignore_errors=True)
+    os.replace(unfinished, folder)
+    for old in checkpoints(out)[:-KEPT]:
+        shutil.rmtree(old)
+    return folder
+
+
+def as_record(settings: Any) -> dict[str, Any]:
+    """A planner's settings as a checkpoint keeps them."""
+    plain: dict[str, Any] = json.loads(json.dumps(asdict(settings)))
+    return plain
+
+
+def checkpoints(out: Path) -> list[Path]:
+    """The whole checkpoints under a training's folder, oldest first."""
+    return sorted(path for path in (out / FOLDER).glob("[0-9]*") if (path / TRAINING).is_file())
+
+
+def newest(path: Path) -> Path:
+    """The checkpoint that `path` is or whose newest it holds. Raises ConfigError where there is none."""
+    if (path / RECORD).is_file():
+        return path
+    found = checkpoints(path)
+    if not found:
+        raise ConfigError(f"{path}: no checkpoint here, nor in its folder {FOLDER}: name the folder of a training")
+    return found[-1]
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """What a checkpoint says of itself. Raises ConfigError."""
+    try:
+        record = json.loads((newest(path) / RECORD).read_text())
+        record["planner"]["name"], record["planner"]["settings"], record["step"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ConfigError(f"{path}: its {RECORD} cannot be read ({error}): restore the checkpoint") from error
+    assert isinstance(record, dict)
+    return record
+
+
+def load_planner(path: str | Path, changed: Mapping[str, Any] | None = None) -> Planner:
+    """The trained planner of a checkpoint or a training's newest one, ready to plan.
+
+    changed: settings of planning alone (`Planner.free_settings`) that are to be others than it was trained with.
+    Raises ConfigError.
+    """
+    folder = newest(Path(path))
+    record = read_record(folder)
+    choice = PlannerChoice(**record["planner"])
+    bound = sorted(set(changed or {}) - planner_class(choice.name).free_settings)
+    if bound:
+        free = ", ".join(sorted(planner_class(choice.name).free_settings)) or "none"
+        raise ConfigError(f"{folder}: {', '.join(bound)} of {choice.name} cannot change after training; free: {free}")
+    choice = replace(choice, settings={**choice.settings, **(changed or {})})
+    planner = build_planner(choice, load_arrays(folder))
+    load_weights(planner, folder)
+    return planner.eval()
+
+
+def load_arrays(folder: Path) -> dict[str, FloatArray]:
+    """What a checkpoint's planner is built around, by name. Raises ConfigError."""
+    try:
+        with np.load(folder / ARRAYS, allow_pickle=False) as stored:
+            return {name: stored[name] for name in stored.files}
+    except (OSError, ValueError, zipfile.BadZipFile) as error:
+        raise ConfigError(f"{folder / ARRAYS}: {error}: restore the checkpoint") from error
+
+
+def load_weights(planner: Planner, folder: Path) -> None:
+    """Raises ConfigError where the weights are damaged or another model's, naming what differs."""
+    try:
+        stored = load_file(folder / WEIGHTS)
+    except (OSError, SafetensorError) as error:
+        raise ConfigError(f"{folder / WEIGHTS}: {error}: restore the checkpoint") from error
+    own = planner.state_dict()
+    wrong = [f"{name} is missing" for name in own if name not in stored]
+    wrong += [f"{name} is unknown" for name in stored if name not in own]
+    wrong += [
+        f"{name} is {tuple(stored[name].shape)}, not {tuple(own[name].shape)}"
+        for name in own.keys() & stored.keys()
+        if stored[name].shape != own[name].shape
+    ]
+    if wrong:
+        more = f" and {len(wrong) - 3} more" if len(wrong) > 3 else ""
+        raise ConfigError(f"{folder}: not a checkpoint of this {planner.name}: {'; '.join(wrong[:3])}{more}")
+    planner.load_state_dict(stored)
+
+
+def load_training(folder: Path) -> dict[str, Any]:
+    """The state that a training goes on from. Raises ConfigError for a file that is damaged or holds anything else."""
+    try:
+        state = torch.load(folder / TRAINING, map_location="cpu", weights_only=True)
+    except Exception as error:  # whatever a damaged zip or a refused object raises
+        raise ConfigError(f"{folder / TRAINING}: {error}: remove {folder} to go on from the one before") from error
+    assert isinstance(state, dict)
+    return state
+
+
+def digest(path: str | Path) -> str:
+    """16 hex digits of a planner's weights, arrays and settings: what it plans depends on nothing else."""
+    folder = newest(Path(path))
+    found = hashlib.sha256(json.dumps(read_record(folder)["planner"], sort_keys=True).encode())
+    for name in (WEIGHTS, ARRAYS):
+        found.update((folder / name).read_bytes())
+    return found.hexdigest()[:16]

@@ -1,0 +1,228 @@
+"""The training loop: batches in, checkpoints and a loss curve out, the same after any number of interruptions.
+
+Everything random in a step comes from a seed made of (run seed, step, rank), so that nothing but weights, optimiser and
+the loader's position needs to be kept.
+"""
+
+import signal
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass
+from itertools import chain, count, islice
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.parallel import DistributedDataParallel
+
+from planners.data.batch import Batch
+from planners.models.planner import Planner
+from planners.training.checkpoint import load_training, load_weights, save_checkpoint
+from planners.training.curves import Curves
+from planners.training.optim import TrainingSettings, build_optimiser, learning_rate
+from planners.training.processes import World
+from planners.training.progress import Counter
+
+STATE_VERSION = 1
+
+
+class Batches(Protocol):
+    """What the loop asks of a loader."""
+
+    def n_batches(self, epoch: int) -> int: ...
+
+    def epoch(self, epoch: int) -> Iterator[Batch]: ...
+
+    def state(self) -> dict[str, Any]: ...
+
+    def resume(self, state: Mapping[str, Any]) -> None: ...
+
+
+@dataclass(frozen=True)
+class Loop:
+    """How a training runs, beside what it computes."""
+
+    seed: int
+    steps: int  # in all
+    accumulate: int = 1  # parts that a batch is computed in, one after the other
+    bf16: bool = False
+    log_every: int = 20  # steps between looks at the losses, which cost a wait for the device
+    checkpoint_every: int = 1000
+    validate_every: int = 0  # 0: only after the last step
+
+
+class Stopped(Exception):
+    """The training was interrupted; what it has done is saved."""
+
+
+def total_steps(batches: Batches, training: TrainingSettings, steps: int | None) -> int:
+    """Optimiser steps of a training: as many as asked for, else those of its epochs."""
+    return steps if steps is not None else sum(batches.n_batches(epoch) for epoch in range(training.epochs))
+
+
+def fit(
+    planner: Planner,
+    batches: Batches,
+    training: TrainingSettings,
+    loop: Loop,
+    world: World,
+    out: Path,
+    record: Mapping[str, Any],
+    resume_from: Path | None = None,
+    validate: Callable[[Planner], dict[str, float]] | None = None,
+) -> None:
+    """Train `planner` in place, from a checkpoint where one is given, to the last step.
+
+    Writes `losses.csv` (every step), `validation.csv`, TensorBoard events and checkpoints under `out`.
+    Raises Stopped after SIGINT or SIGTERM, with a checkpoint written; FloatingPointError, with the step, where the loss
+    is no number.
+    """
+    planner.to(world.device)
+    optimiser = build_optimiser(training, planner)
+    first = 0
+    if resume_from is not None:
+        first = _resume(resume_from, planner, optimiser, batches)
+    model = _wrapped(planner, world)
+    curves = Curves(out, first) if world.writes else None
+    unlogged: list[Tensor] = []
+    names: list[str] = []
+
+    def save(step: int) -> None:
+        if world.writes:
+            state = {
+                "version": STATE_VERSION,
+                "step": step,
+                "optimiser": optimiser.state_dict(),
+                "loader": batches.state(),
+            }
+            save_checkpoint(out, step, planner, record, state)
+        world.wait()
+
+    def log(step: int) -> float:
+        """Losses of the steps since the last look, the mean over all processes; returns the newest."""
+        values = world.mean(torch.stack(unlogged)).tolist()
+        done = range(step - len(values), step)
+        unlogged.clear()
+        for at, row in zip(done, values):
+            if not np.isfinite(row).all():
+                parts = ", ".join(f"{name} {value:g}" for name, value in zip(names, row))
+                raise FloatingPointError(f"the loss of step {at} is no number ({parts}): try a smaller learning_rate")
+            if curves is not None:
+                curves.loss(at, learning_rate(training, at, loop.steps), dict(zip(names, row)))
+        return float(sum(values[-1]))
+
+    def check(step: int) -> None:
+        if validate is not None and curves is not None:
+            curves.validation(step, validate(planner))
+
+    with _stop_asked() as asked, Counter("steps", loop.steps, first, quiet=not world.writes) as counter:
+        step, loss = first, float("nan")
+        for batch in _endless(batches, loop.steps - first):
+            torch.manual_seed(_step_seed(loop.seed, step, world.rank))
+            rate = learning_rate(training, step, loop.steps)
+            terms = _step(model, optimiser, batch, rate, training.gradient_clip, loop, world)
+            names = names or list(terms)
+            unlogged.append(torch.stack(list(terms.values())))
+            step += 1
+            looks = step % loop.log_every == 0 or step == loop.steps
+            # Several processes must agree, and ask each other rarely.
+            stopping = world.anyone(asked.is_set) if world.size == 1 or looks else False
+            saves = step % loop.checkpoint_every == 0 or step == loop.steps or stopping
+            if looks or saves:
+                loss = log(step)
+            counter.show(step, f"loss {loss:.4f}")
+            if (loop.validate_every and step % loop.validate_every == 0) or step == loop.steps:
+                check(step)
+            if saves:
+                save(step)
+            if stopping and step < loop.steps:
+                raise Stopped(f"stopped after step {step} of {loop.steps}; the same command goes on")
+    if curves is not None:
+        curves.close()
+
+
+def _step(
+    model: torch.nn.Module,
+    optimiser: torch.optim.Optimizer,
+    batch: Batch,
+    rate: float,
+    clip: float | None,
+    loop: Loop,
+    world: World,
+) -> dict[str, Tensor]:
+    """One optimiser step; the terms of the loss, detached."""
+    model.train()
+    for group in optimiser.param_groups:
+        group["lr"] = rate
+    optimiser.zero_grad(set_to_none=True)
+    sums: dict[str, Tensor] = {}
+    for i, part in enumerate(batch.parts(loop.accumulate)):
+        last = i == loop.accumulate - 1
+        waits: AbstractContextManager[Any] = (
+            model.no_sync() if isinstance(model, DistributedDataParallel) and not last else nullcontext()
+        )
+        with waits:
+            with torch.autocast(world.device.type, torch.bfloat16, enabled=loop.bf16):
+                terms = {name: term.float() / loop.accumulate for name, term in model(part.to(world.device)).items()}
+            torch.stack(list(terms.values())).sum().backward()
+        sums = {name: sums.get(name, torch.zeros(())).to(term.device) + term.detach() for name, term in terms.items()}
+    if clip is not None:
+        torch.nn.utils.clip_grad_norm_(model.parameters(), clip)
+    optimiser.step()
+    return sums
+
+
+def _endless(batches: Batches, n: int) -> Iterator[Batch]:
+    """The next n batches, epoch after epoch, from the loader's position on."""
+    epochs = (batches.epoch(epoch) for epoch in count(int(batches.state()["epoch"])))
+    return islice(chain.from_iterable(epochs), n)
+
+
+def _resume(folder: Path, planner: Planner, optimiser: torch.optim.Optimizer, batches: Batches) -> int:
+    state = load_training(folder)
+    if state.get("version") != STATE_VERSION:
+        raise ValueError(f"{folder}: training state {state.get('version')}, this version goes on from {STATE_VERSION}")
+    load_weights(planner, folder)
+    optimiser.load_state_dict(state["optimiser"])
+    batches.resume(state["loader"])
+    return int(state["step"])
+
+
+def _wrapped(planner: Planner, world: World) -> torch.nn.Module:
+    if world.size == 1:
+        return planner
+    return DistributedDataParallel(planner, device_ids=[world.device] if world.device.type == "cuda" else None)
+
+
+def _step_seed(seed: int, step: int, rank: int) -> int:
+    """Of all that is random in a step; never from what happened before it."""
+    return int(np.random.SeedSequence([seed, step, rank]).generate_state(1, np.uint64)[0] >> 1)
+
+
+@dataclass
+class _Asked:
+    is_set: bool = False
+
+
+@contextmanager
+def _stop_asked() -> Iterator[_Asked]:
+    """Notes SIGINT and SIGTERM instead of dying of them; a second one has its usual effect."""
+    asked = _Asked()
+    old: dict[int, Any] = {}
+
+    def note(number: int, frame: object) -> None:
+        asked.is_set = True
+        signal.signal(number, old[number])
+
+    try:
+        for what in (signal.SIGINT, signal.SIGTERM):
+            old[what] = signal.signal(what, note)
+    except ValueError:  # not the main thread: a Ray worker, whose signals are Ray's
+        old.clear()
+    try:
+        yield asked
+    finally:
+        for number, handler in old.items():
+            signal.signal(number, handler)

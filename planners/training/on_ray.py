@@ -1,0 +1,86 @@
+"""Trainings on this machine's or a cluster's Ray; the only module of the planners that imports it.
+
+Checkpoints and curves are written by the training itself under `out`, which every node must see.
+"""
+
+import logging
+import os
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")  # keeps every listener on 127.0.0.1
+
+import ray
+from ray.train import RunConfig, ScalingConfig, WorkerGroupError
+from ray.train.torch import TorchConfig, TorchTrainer, get_device
+
+from planners.training.processes import RaySettings, World, joined
+
+T = TypeVar("T")
+
+
+def train_on_ray(train: Callable[[World], None], settings: RaySettings, out: str) -> None:
+    """Call `train` in each of `settings.processes` processes. What one of them raises is raised here."""
+    gpu = settings.gpus > 0
+    started = not ray.is_initialized()
+    if started:
+        _connect()
+    try:
+        TorchTrainer(
+            _part,
+            train_loop_config={"train": train},
+            torch_config=TorchConfig(backend="nccl" if gpu else "gloo"),
+            scaling_config=ScalingConfig(
+                num_workers=settings.processes,
+                use_gpu=gpu,
+                resources_per_worker={"CPU": settings.cpus, **({"GPU": settings.gpus} if gpu else {})},
+            ),
+            run_config=RunConfig(name="ray", storage_path=os.path.abspath(out)),
+        ).fit()
+    except WorkerGroupError as error:
+        cause = next(iter(error.worker_failures.values()))
+        raise getattr(cause, "_base_exc", cause) from error  # Ray wraps what a process raised with its traceback
+    finally:
+        if started:
+            ray.shutdown()
+
+
+def _part(settings: dict[str, Any]) -> None:
+    with joined("auto", get_device()) as world:
+        settings["train"](world)
+
+
+def _connect() -> None:
+    """To the cluster of RAY_ADDRESS or of the submitted job, else to one of this machine's own, on loopback."""
+    there = "RAY_ADDRESS" in os.environ
+    if not there:  # Ray warns that a cluster of our own asks for a token, as it should
+        logging.getLogger("ray._private.authentication.authentication_token_setup").setLevel(logging.ERROR)
+    ray.init(
+        address=None if there else "local", include_dashboard=None if there else False, logging_level=logging.WARNING
+    )
+
+
+def each_on_ray(
+    one: Callable[..., int], items: Sequence[T], out: Path, cpus: float, gpus: float, stop: threading.Event
+) -> Iterator[tuple[T, int]]:
+    """one(item, out) as a task for each item; yields results as they come. After `stop` nothing new begins."""
+    started = not ray.is_initialized()
+    if started:
+        _connect()
+    try:
+        task = ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=0)(one)
+        waiting = {task.remote(item, out.absolute()): item for item in items}
+        while waiting:
+            done, _ = ray.wait(list(waiting), num_returns=1, timeout=1.0)
+            for reference in done:
+                yield waiting.pop(reference), ray.get(reference)
+            if stop.is_set():
+                for reference in waiting:
+                    ray.cancel(reference)
+                return
+    finally:
+        if started:
+            ray.shutdown()

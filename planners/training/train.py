@@ -1,0 +1,236 @@
+"""`python -m planners train`: samples in, a planner out.
+
+    python -m planners train planner=ltf data.real=[runs/town] data.sim=[runs/town] out=runs/ltf
+    python -m planners train planner=gtrs_dense planner.settings.vocabulary=<K x 40 x 3>.npy mix.sim_ratio=0.5 ...
+    python -m planners train planner=ltf init_from=runs/ltf ...  trains a planner further, on other data
+    torchrun --nproc-per-node 8 -m planners train ...          on the GPUs of a node
+    python -m planners train executor=ray ray.processes=8 ray.gpus=1 ...    on a Ray cluster
+    python -m planners train ... --cfg                          the settings, resolved
+
+The same command on the same `out` goes on where it stopped, to the identical curve. Exit codes: 0 complete, 2 bad
+settings or data, 4 interrupted and resumable.
+"""
+
+import dataclasses
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import torch
+
+from factory.config import ConfigError, compose, fill
+from planners.data.feed import Dataset, DataSettings, open_data
+from planners.data.loader import Loader
+from planners.data.mix import MixSettings
+from planners.models.backbones.registry import load_pretrained
+from planners.models.planner import Planner
+from planners.models.registry import PlannerChoice, build_planner, planner_class, settings_of
+from planners.training.checkpoint import as_record, checkpoints, digest, load_arrays, load_weights, newest, read_record
+from planners.training.fit import Loop, Stopped, fit, total_steps
+from planners.training.optim import TrainingSettings
+from planners.training.processes import RaySettings, World, joined
+from planners.training.validate import validation
+
+BAD_CONFIG, INTERRUPTED = 2, 4
+
+
+@dataclass(frozen=True)
+class PlannerEntry(PlannerChoice):
+    """What conf/planner/*.yaml holds."""
+
+    training: TrainingSettings | None = None
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Everything on the command line; conf/train.yaml says what each key means."""
+
+    planner: PlannerEntry
+    mix: MixSettings
+    data: DataSettings
+    steps: int | None
+    seed: int
+    init_from: str | None
+    out: str
+    executor: Literal["process", "ray"]
+    device: Literal["auto", "cpu", "cuda"]
+    precision: Literal["auto", "fp32", "bf16"]
+    accumulate: int
+    workers: int
+    log_every: int
+    checkpoint_every: int
+    validate_every: int
+    ray: RaySettings
+
+    def __post_init__(self) -> None:
+        for name in ("accumulate", "log_every", "checkpoint_every"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}={getattr(self, name)}: must be at least 1")
+        if self.steps is not None and self.steps < 1:
+            raise ValueError(f"steps={self.steps}: must be at least 1, or null for planner.training.epochs")
+
+    @property
+    def training(self) -> TrainingSettings:
+        """Raises ConfigError for a planner that does not learn."""
+        if self.planner.training is None:
+            raise ConfigError(f"planner={self.planner.name} has nothing to learn: evaluate it, there is no training")
+        return self.planner.training
+
+
+def main(argv: Sequence[str]) -> int:
+    """The command; returns the exit code."""
+    if {"-h", "--help"} & set(argv):
+        print(__doc__)
+        return 0
+    try:
+        values = compose("train", [argument for argument in argv if argument != "--cfg"])
+        if "--cfg" in argv:
+            from omegaconf import OmegaConf
+
+            print(OmegaConf.to_yaml(OmegaConf.create(values)))
+            return 0
+        config = fill(TrainConfig, values, "train")
+        if config.executor == "ray":
+            from planners.training.on_ray import train_on_ray
+
+            train_on_ray(partial(train, config), config.ray, config.out)
+        else:
+            with joined(config.device) as world:
+                train(config, world)
+    except (ConfigError, ValueError, FileNotFoundError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return BAD_CONFIG
+    except Stopped as stopped:
+        print(stopped, file=sys.stderr)
+        return INTERRUPTED
+    return 0
+
+
+def train(config: TrainConfig, world: World) -> None:
+    """The part of one process. Raises ConfigError or ValueError for what does not fit, Stopped when interrupted."""
+    training, out = config.training, Path(config.out).absolute()
+    cv2.setNumThreads(1)  # pictures are decoded side by side already
+    settings = settings_of(config.planner)
+    dataset = open_data(config.data, mix=config.mix)
+    torch.manual_seed(config.seed)
+    planner = _planner(config, settings, dataset)
+    loader = Loader(
+        dataset,
+        planner.needs,
+        config.mix,
+        training.batch_size,
+        world.rank,
+        world.size,
+        config.seed,
+        config.workers,
+        pinned=world.device.type == "cuda",
+    )
+    if training.batch_size % (world.size * config.accumulate):
+        raise ConfigError(
+            f"planner.training.batch_size={training.batch_size} does not divide into {world.size} processes times "
+            f"accumulate={config.accumulate} parts"
+        )
+    steps = total_steps(loader, training, config.steps)
+    check = validation(config.data, planner, world, config.workers) if config.data.val else None
+    identity = _identity(config, dataset, steps, world)
+    resume_from = _begun(out, config, identity)
+    backbones = _first_weights(planner, config) if resume_from is None else read_record(resume_from)["backbones"]
+    record = {
+        "trained": identity,
+        "samples": {"real": int((~dataset.rows.simulated).sum()), "simulated": int(dataset.rows.simulated.sum())},
+        "backbones": backbones,
+        "parameters": sum(parameter.numel() for parameter in planner.parameters()),
+    }
+    if world.writes:
+        print(_plan_text(config, record, loader, resume_from), flush=True)
+    loop = Loop(
+        seed=config.seed,
+        steps=steps,
+        accumulate=config.accumulate,
+        bf16=config.precision == "bf16" or (config.precision == "auto" and world.device.type == "cuda"),
+        log_every=config.log_every,
+        checkpoint_every=config.checkpoint_every,
+        validate_every=config.validate_every,
+    )
+    world.wait()  # nobody looks for checkpoints any more
+    fit(planner, loader, training, loop, world, out, record, resume_from, check)
+    if world.writes:
+        print(f"trained: {newest(out)}")
+
+
+def _planner(config: TrainConfig, settings: Any, dataset: Dataset) -> Planner:
+    """The planner, built around what the samples give it; trained further, around what it was trained with."""
+    if config.init_from is not None:
+        before = read_record(Path(config.init_from))["planner"]
+        if before == {"name": config.planner.name, "settings": as_record(settings)}:
+            return build_planner(config.planner, load_arrays(newest(Path(config.init_from))))
+    try:
+        arrays = planner_class(config.planner.name).fixed_arrays(settings, dataset.training_data())
+    except (ValueError, OSError) as error:
+        raise ConfigError(f"planner {config.planner.name}: {error}") from error
+    return build_planner(config.planner, arrays)
+
+
+def _first_weights(planner: Planner, config: TrainConfig) -> dict[str, str]:
+    """Fills in the weights that a training begins with; backbone -> where its weights are from."""
+    if config.init_from is None:
+        return load_pretrained(planner)
+    folder = newest(Path(config.init_from))
+    load_weights(planner, folder)
+    backbones: dict[str, str] = read_record(folder)["backbones"]
+    return backbones
+
+
+def _identity(config: TrainConfig, dataset: Dataset, steps: int, world: World) -> dict[str, Any]:
+    """All that the loss curve depends on beside the planner; a folder is gone on with only where it is the same."""
+    values = {
+        "planner.training": dataclasses.asdict(config.training),
+        "mix": dataclasses.asdict(config.mix),
+        "samples": dataset.digest,
+        "steps": steps,
+        "seed": config.seed,
+        "init_from": None if config.init_from is None else digest(config.init_from),
+        "precision": config.precision,
+        "accumulate": config.accumulate,
+        "processes": world.size,
+    }
+    same: dict[str, Any] = json.loads(json.dumps(values))  # as a checkpoint gives it back
+    return same
+
+
+def _begun(out: Path, config: TrainConfig, identity: Mapping[str, Any]) -> Path | None:
+    """The checkpoint to go on from; None where there is none. Raises ConfigError where it is of another training."""
+    if not checkpoints(out):
+        return None
+    record = read_record(out)
+    now = {**identity, "planner.name": config.planner.name, "planner.settings": as_record(settings_of(config.planner))}
+    then = {**record["trained"], **{f"planner.{key}": value for key, value in record["planner"].items()}}
+    differs = [f"{key} {then.get(key)} -> {value}" for key, value in now.items() if then.get(key) != value]
+    if differs:
+        raise ConfigError(
+            f"out={config.out} holds a training with other settings: {'; '.join(differs)}: choose another out, "
+            "or give the settings it began with"
+        )
+    return newest(out)
+
+
+def _plan_text(config: TrainConfig, record: Mapping[str, Any], loader: Loader, resume_from: Path | None) -> str:
+    begins = f"goes on from {resume_from}" if resume_from is not None else "begins"
+    weights = ", ".join(f"{name}: {source}" for name, source in record["backbones"].items()) or "there are none"
+    return "\n".join(
+        [
+            f"{config.planner.name}: {record['parameters']:,} parameters; pretrained backbones: {weights}",
+            *([] if config.init_from is None else [f"weights to begin with: {newest(Path(config.init_from))}"]),
+            loader.text(),
+            f"{record['trained']['steps']} steps; {begins}; out: {config.out}",
+        ]
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

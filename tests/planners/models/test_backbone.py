@@ -1,0 +1,234 @@
+"""Published names and numbers of the backbones, and weights from files."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from planners.models.backbones.registry import STRIDES, Backbone, BackboneSettings, build_backbone, load_pretrained
+
+SMALL = BackboneSettings(name="small", widths=(4, 8, 12, 16))
+BN = ("weight", "bias", "running_mean", "running_var", "num_batches_tracked")
+
+
+def on_meta(settings: BackboneSettings) -> Backbone:
+    with torch.device("meta"):
+        return build_backbone(settings)
+
+
+def parameters(model: nn.Module) -> int:
+    return sum(p.numel() for p in model.parameters())
+
+
+def published_resnet34() -> dict[str, tuple[int, ...]]:
+    """Names and shapes of torchvision's resnet34, spelt out."""
+    shapes: dict[str, tuple[int, ...]] = {}
+
+    def norm(name: str, width: int) -> None:
+        shapes.update({f"{name}.{part}": () if part == BN[-1] else (width,) for part in BN})
+
+    shapes["conv1.weight"] = (64, 3, 7, 7)
+    norm("bn1", 64)
+    entering = 64
+    for layer, (width, blocks) in enumerate([(64, 3), (128, 4), (256, 6), (512, 3)], start=1):
+        for block in range(blocks):
+            name = f"layer{layer}.{block}"
+            shapes[f"{name}.conv1.weight"] = (width, entering, 3, 3)
+            norm(f"{name}.bn1", width)
+            shapes[f"{name}.conv2.weight"] = (width, width, 3, 3)
+            norm(f"{name}.bn2", width)
+            if entering != width:
+                shapes[f"{name}.downsample.0.weight"] = (width, entering, 1, 1)
+                norm(f"{name}.downsample.1", width)
+            entering = width
+    return shapes
+
+
+def published_vovnet99() -> dict[str, tuple[int, ...]]:
+    """Names and shapes of V2-99 as in published weights, where `img_backbone.` stands before them, spelt out."""
+    shapes: dict[str, tuple[int, ...]] = {}
+
+    def unit(name: str, entering: int, leaving: int, size: int) -> None:
+        shapes[f"{name}/conv.weight"] = (leaving, entering, size, size)
+        shapes.update({f"{name}/norm.{part}": () if part == BN[-1] else (leaving,) for part in BN})
+
+    for i, (entering, leaving) in enumerate([(3, 64), (64, 64), (64, 128)], start=1):
+        unit(f"stem.stem_{i}", entering, leaving, 3)
+    entering = 128
+    for stage, (width, leaving, modules) in enumerate([(128, 256, 1), (160, 512, 3), (192, 768, 9), (224, 1024, 3)], 2):
+        for module in range(1, modules + 1):
+            name, short = f"stage{stage}.OSA{stage}_{module}", f"OSA{stage}_{module}"
+            for layer in range(5):
+                unit(f"{name}.layers.{layer}.{short}_{layer}", entering if layer == 0 else width, width, 3)
+            unit(f"{name}.concat.{short}_concat", entering + 5 * width, leaving, 1)
+            shapes[f"{name}.ese.fc.weight"], shapes[f"{name}.ese.fc.bias"] = (leaving, leaving, 1, 1), (leaving,)
+            entering = leaving
+    return shapes
+
+
+def test_resnet34_has_the_published_names_shapes_and_count() -> None:
+    model = on_meta(BackboneSettings(name="resnet34"))
+    assert {k: tuple(v.shape) for k, v in model.state_dict().items()} == published_resnet34()
+    assert parameters(model) + 512 * 1000 + 1000 == 21_797_672  # with the classifier that a backbone leaves out
+
+
+def test_vovnet99_has_the_published_names_and_shapes() -> None:
+    model = on_meta(BackboneSettings(name="vovnet99"))
+    assert {k: tuple(v.shape) for k, v in model.state_dict().items()} == published_vovnet99()
+
+
+@pytest.mark.parametrize("name", ["resnet34", "vovnet99", "small"])
+def test_four_maps_at_their_strides(name: str) -> None:
+    model = on_meta(BackboneSettings(name=name))  # type: ignore[arg-type]
+    maps = model(torch.zeros(2, 3, 96, 352, dtype=torch.uint8, device="meta"))
+    assert [m.shape for m in maps] == [(2, c, 96 // s, 352 // s) for c, s in zip(model.channels, STRIDES)]
+
+
+def by_hand(weights: dict[str, Tensor], image: Tensor, stem_stride: int) -> list[Tensor]:
+    """A residual network in evaluation, written from its weights' names."""
+
+    def norm(x: Tensor, name: str) -> Tensor:
+        mean, var, scale, shift = (weights[f"{name}.{p}"] for p in ("running_mean", "running_var", "weight", "bias"))
+        return (x - mean[:, None, None]) / (var[:, None, None] + 1e-5).sqrt() * scale[:, None, None] + shift[
+            :, None, None
+        ]
+
+    mean, std = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
+    x = (image / 255 - mean[:, None, None]) / std[:, None, None]
+    x = norm(F.conv2d(x, weights["conv1.weight"], stride=stem_stride, padding=3), "bn1").relu()
+    if stem_stride == 2:
+        x = F.max_pool2d(x, 3, 2, 1)
+    maps = []
+    for layer in range(1, 5):
+        for block in range(100):
+            name, stride = f"layer{layer}.{block}", 2 if layer > 1 and block == 0 else 1
+            if f"{name}.conv1.weight" not in weights:
+                break
+            y = norm(F.conv2d(x, weights[f"{name}.conv1.weight"], stride=stride, padding=1), f"{name}.bn1").relu()
+            y = norm(F.conv2d(y, weights[f"{name}.conv2.weight"], padding=1), f"{name}.bn2")
+            if f"{name}.downsample.0.weight" in weights:
+                x = norm(F.conv2d(x, weights[f"{name}.downsample.0.weight"], stride=stride), f"{name}.downsample.1")
+            x = (x + y).relu()
+        maps.append(x)
+    return maps
+
+
+@pytest.mark.parametrize("name", ["resnet34", "small"])
+def test_a_residual_network_is_what_its_names_say(name: str) -> None:
+    torch.manual_seed(0)
+    model = build_backbone(BackboneSettings(name=name)).eval()  # type: ignore[arg-type]
+    for module in model.modules():
+        if isinstance(module, nn.BatchNorm2d):
+            assert module.running_mean is not None and module.running_var is not None
+            nn.init.uniform_(module.running_mean, -0.1, 0.1)
+            nn.init.uniform_(module.running_var, 0.5, 1.5)
+    image = torch.randint(0, 256, (1, 3, 32, 64), dtype=torch.uint8)
+    with torch.no_grad():
+        for got, expected in zip(
+            model(image), by_hand(dict(model.state_dict()), image, 2 if name == "resnet34" else 4)
+        ):
+            torch.testing.assert_close(got, expected, rtol=1e-4, atol=1e-4)
+
+
+def test_vovnet_takes_blue_first_and_gates_every_channel() -> None:
+    torch.manual_seed(0)
+    model = build_backbone(BackboneSettings(name="vovnet99")).eval()
+    image = torch.randint(0, 256, (1, 3, 32, 32), dtype=torch.uint8)
+    with torch.no_grad():
+        red, stem = model.enter(image), model.state_dict()["stem.stem_1/conv.weight"]
+        stem[:, [0, 2]] = stem[:, [2, 0]]
+        flipped = model.get_submodule("stem")(model.normalised(image))
+        torch.testing.assert_close(red, flipped)
+        gate = model.get_submodule("stage5.OSA5_3.ese")
+        gate.fc.weight.zero_()  # type: ignore[union-attr]
+        gate.fc.bias.fill_(-3.0)  # type: ignore[union-attr, operator]
+        last = model.get_submodule("stage5.OSA5_3")
+        x = torch.randn(1, 1024, 2, 2)
+        torch.testing.assert_close(last(x), x)  # a gate that is shut leaves the shortcut
+
+
+@pytest.mark.parametrize("suffix", ["safetensors", "pth"])
+@pytest.mark.parametrize("prefix", ["", "img_backbone."])
+def test_weights_from_a_file_come_back_without_its_classifier(tmp_path: Path, suffix: str, prefix: str) -> None:
+    torch.manual_seed(0)
+    source = build_backbone(SMALL)
+    named = {prefix + k: v for k, v in source.state_dict().items() if not k.endswith("num_batches_tracked")}
+    named[prefix + "fc.weight"] = torch.zeros(1000, 16)
+    if prefix:
+        named["neck.weight"] = torch.zeros(3)
+    path = tmp_path / f"weights.{suffix}"
+    if suffix == "safetensors":
+        save_file(named, path)
+    else:
+        torch.save({"state_dict": named, "epoch": 3}, path)
+    settings = BackboneSettings(name="small", widths=SMALL.widths, pretrained=str(path), prefix=prefix)
+    model = nn.ModuleDict({"image": build_backbone(settings)})
+    record = load_pretrained(model)
+    assert list(record) == ["image"] and record["image"].startswith(f"weights.{suffix} ")
+    image = torch.randint(0, 256, (2, 3, 32, 32), dtype=torch.uint8)
+    for got, expected in zip(model.eval()["image"](image), source.eval()(image)):
+        assert torch.equal(got, expected)
+
+
+def test_pictures_are_normalised_as_imagenet_and_other_inputs_are_left_alone() -> None:
+    model = build_backbone(SMALL)
+    mean, std = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
+    image = torch.randint(0, 256, (2, 3, 4, 4), dtype=torch.uint8)
+    expected = ((image.permute(0, 2, 3, 1) / 255 - mean) / std).permute(0, 3, 1, 2)
+    torch.testing.assert_close(model.normalised(image), expected, rtol=1e-5, atol=1e-5)
+    assert torch.equal(model.normalised(expected), expected)
+
+
+def test_no_file_is_recorded_as_none() -> None:
+    assert load_pretrained(build_backbone(SMALL)) == {"backbone": "none"}
+
+
+def test_named_weights_that_were_not_loaded_are_refused_and_a_checkpoint_counts_as_loading() -> None:
+    model = build_backbone(BackboneSettings(name="small", widths=SMALL.widths, pretrained="elsewhere.pth"))
+    image = torch.zeros(1, 3, 32, 32, dtype=torch.uint8)
+    with pytest.raises(RuntimeError, match=r"elsewhere\.pth.*load_pretrained"):
+        model(image)
+    outer = nn.ModuleDict({"image": model})
+    outer.load_state_dict({f"image.{k}": v for k, v in build_backbone(SMALL).state_dict().items()})
+    assert len(outer["image"].eval()(image)) == 4
+
+
+def test_a_wrong_weights_file_is_refused_by_name(tmp_path: Path) -> None:
+    def load(content: dict[str, Tensor], prefix: str = "") -> None:
+        save_file(content, tmp_path / "w.safetensors")
+        path = str(tmp_path / "w.safetensors")
+        settings = BackboneSettings(name="small", widths=SMALL.widths, pretrained=path, prefix=prefix)
+        load_pretrained(build_backbone(settings))
+
+    good = dict(build_backbone(SMALL).state_dict())
+    with pytest.raises(ValueError, match=r"lacks layer2\.0\.conv1\.weight of small"):
+        load({k: v for k, v in good.items() if k != "layer2.0.conv1.weight"})
+    with pytest.raises(ValueError, match=r"has layer5\.weight, unknown to small"):
+        load({**good, "layer5.weight": torch.zeros(1)})
+    with pytest.raises(ValueError, match=r"conv1\.weight \(4, 3, 3, 3\), not \(4, 3, 7, 7\)"):
+        load({**good, "conv1.weight": torch.zeros(4, 3, 3, 3)})
+    with pytest.raises(ValueError, match=r"set backbone\.prefix to one of \['model\.image\.'\]"):
+        load({f"model.image.{k}": v for k, v in good.items()})
+    with pytest.raises(ValueError, match="there is no file"):
+        load_pretrained(build_backbone(BackboneSettings(name="small", pretrained=str(tmp_path / "absent.pth"))))
+    with pytest.raises(ValueError, match="give 4"):
+        build_backbone(BackboneSettings(name="small", widths=(8, 16)))
+
+
+class NoTensor:
+    """What no weights file may hold: reading it would have to build it."""
+
+
+@pytest.mark.parametrize("suffix", [".safetensors", ".pth"])
+def test_a_file_that_is_damaged_or_holds_objects_is_refused_by_name(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"weights{suffix}"
+    if suffix == ".pth":
+        torch.save({"conv1.weight": NoTensor()}, path)
+    else:
+        path.write_bytes(b"not weights")
+    model = build_backbone(BackboneSettings("small", pretrained=str(path)))
+    with pytest.raises(ValueError, match=r"weights\..* cannot be read as weights"):
+        load_pretrained(model)

@@ -1,0 +1,217 @@
+"""DiffusionDrive: its size, whom it imitates, and that it learns 32 pictures by heart."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from factory.config import conf_dir, fill
+from planners.data.batch import Batch, BevLayout, ImageLayout
+from planners.models.anchors import cluster_anchors
+from planners.models.diffusiondrive.planner import DiffusionDrive, DiffusionDriveSettings, from_unit, to_unit
+from planners.models.planner import TrainingData
+from planners.training.optim import TrainingSettings
+from tests.planners import scenes
+
+WAYS = 4
+TINY = DiffusionDriveSettings(
+    image=scenes.PICTURE,
+    bev=BevLayout(cell_m=8.0),
+    fusion=scenes.FUSION,
+    width=48,
+    hidden=96,
+    heads=2,
+    layers=1,
+    agents=3,
+)
+
+
+def scene_batch(n: int, image: ImageLayout = TINY.image) -> Batch:
+    plans, colours = scenes.four_ways(n)
+    return scenes.with_surroundings(scenes.batch(n, plans, image, colours), TINY.bev, TINY.agents)
+
+
+def planner(settings: DiffusionDriveSettings = TINY, n_anchors: int = WAYS) -> DiffusionDrive:
+    torch.manual_seed(0)
+    return DiffusionDrive(settings, {"anchors": scenes.four_ways(n_anchors)[0][:, 4::5, :2]})
+
+
+def summed(terms: dict[str, torch.Tensor]) -> torch.Tensor:
+    return torch.stack(list(terms.values())).sum()
+
+
+def test_the_papers_size_is_61_million_parameters() -> None:
+    with torch.device("meta"):
+        model = DiffusionDrive(DiffusionDriveSettings(), {"anchors": np.zeros((20, 8, 2))})
+    assert sum(p.numel() for p in model.parameters()) == pytest.approx(61e6, rel=0.1)
+
+
+def test_a_plan_has_eight_poses_and_is_the_same_every_time_whatever_else_is_in_the_batch() -> None:
+    batch, model = scene_batch(4), planner()
+    first = model.plan(batch)
+    torch.manual_seed(9)
+    assert first.shape == (4, 8, 3) and torch.equal(model.plan(batch), first)
+    torch.testing.assert_close(torch.cat([model.plan(part) for part in batch.parts(4)]), first, atol=1e-4, rtol=1e-4)
+    assert not first.requires_grad and first[..., 2].abs().max() <= torch.pi
+
+
+def test_losses_reach_every_parameter_also_where_nothing_imitates() -> None:
+    batch = scene_batch(4)
+    nothing = replace(
+        batch, imitate=torch.zeros(4, dtype=torch.bool), plan_2hz=torch.full_like(batch.plan_2hz, float("nan"))
+    )
+    for one in (batch, nothing):
+        model = planner()
+        terms = model(one)
+        summed(terms).backward()
+        for name, parameter in model.named_parameters():
+            assert parameter.grad is not None and parameter.grad.isfinite().all(), name
+    assert terms["confidence"].item() == 0.0 and terms["regression"].item() == 0.0 and terms["bev"].item() > 0.0
+    assert all((parameter.grad == 0).all() for parameter in model.decoder.parameters())
+
+
+def test_imitation_is_divided_by_the_whole_batch() -> None:
+    batch, model = scene_batch(4), planner(replace(TINY, dropout=0.0)).eval()
+
+    def terms(imitate: list[bool]) -> dict[str, torch.Tensor]:
+        torch.manual_seed(0)
+        return model.losses(replace(batch, imitate=torch.tensor(imitate)))
+
+    both, one, other = (
+        terms([True, False, True, False]),
+        terms([True] + [False] * 3),
+        terms([False] * 2 + [True, False]),
+    )
+    for name in ("confidence", "regression"):
+        torch.testing.assert_close(both[name], one[name] + other[name])
+
+
+class Told(torch.nn.Module):
+    """A decoder that always answers with the same plans and confidences, and notes what it was asked."""
+
+    def __init__(self, plans: torch.Tensor) -> None:
+        super().__init__()
+        self.plans, self.points, self.steps = plans, list[torch.Tensor](), list[list[int]]()
+
+    def forward(
+        self, points: torch.Tensor, base: torch.Tensor, step: torch.Tensor, *scene: torch.Tensor
+    ) -> list[tuple[torch.Tensor, torch.Tensor]]:
+        self.points.append(points)
+        self.steps.append(step.tolist())
+        n, anchors = points.shape[:2]
+        return [(self.plans.expand(n, -1, -1, -1), torch.arange(float(anchors)).expand(n, -1))]
+
+
+def test_planning_starts_at_noise_step_8_and_goes_by_ddim_from_10_to_9() -> None:
+    """By hand, with the cumulated products of the schedule; the public code's truncated loop."""
+    batch, model = scene_batch(2), planner()
+    model.decoder = told = Told(model.anchors.roll(1, 0)[None] + 0.5)
+    plan = model.plan(batch)
+    betas = np.linspace(1e-4**0.5, 0.02**0.5, 1000) ** 2
+    kept = torch.tensor(np.cumprod(1.0 - betas))
+    clean, noise = to_unit(model.anchors).double(), model.first_noise.double()
+    start = kept[8].sqrt() * clean + (1.0 - kept[8]).sqrt() * noise
+    answer = to_unit(told.plans[0]).double()
+    told_noise = (start - kept[10].sqrt() * answer) / (1.0 - kept[10]).sqrt()
+    second = kept[9].sqrt() * answer.clamp(-1.0, 1.0) + (1.0 - kept[9]).sqrt() * told_noise
+    assert told.steps == [[10, 10], [0, 0]]
+    for found, expected in zip(told.points, (start, second)):
+        torch.testing.assert_close(found[0].double(), from_unit(expected.clamp(-1.0, 1.0)), atol=1e-3, rtol=0.0)
+    torch.testing.assert_close(plan, told.plans[0, -1].expand(2, -1, -1))  # the surest of the last answer
+
+
+def test_an_anchor_is_learned_from_noise_of_the_step_that_the_decoder_is_told() -> None:
+    batch, model = scene_batch(4), planner()
+    model.decoder = told = Told(torch.zeros(1, WAYS, 8, 3))
+    torch.manual_seed(5)
+    model.losses(batch)
+    torch.manual_seed(5)
+    steps = torch.randint(0, 50, (4,))
+    noise = torch.randn(4, *model.anchors.shape)
+    assert told.steps == [steps.tolist()] and len(set(steps.tolist())) > 1
+    kept = torch.tensor(np.cumprod(1.0 - np.linspace(1e-4**0.5, 0.02**0.5, 1000) ** 2)).float()[steps].view(4, 1, 1, 1)
+    noisy = kept.sqrt() * to_unit(model.anchors) + (1.0 - kept).sqrt() * noise
+    torch.testing.assert_close(told.points[0], from_unit(noisy.clamp(-1.0, 1.0)), atol=1e-3, rtol=0.0)
+
+
+@pytest.mark.parametrize("offsets_from", ["noisy", "anchors"])
+def test_before_it_learns_its_plans_are_near_what_they_are_told_from(offsets_from: str) -> None:
+    model = planner(replace(TINY, offsets_from=offsets_from))
+    plans = model.plan(scene_batch(4))[..., :2]
+    off_m = (plans[:, None] - model.anchors).norm(dim=-1).mean(dim=-1).min(dim=1).values
+    assert (off_m < 3.0).all()
+
+
+def test_bf16_gives_finite_losses_and_plans_in_full_precision() -> None:
+    batch, model = scene_batch(2), planner()
+    with torch.autocast("cpu", torch.bfloat16):
+        terms = model(batch)
+        summed(terms).backward()
+        plan = model.plan(batch)
+    assert all(term.isfinite() and term.dtype == torch.float32 for term in terms.values())
+    assert plan.dtype == torch.float32 and plan.isfinite().all()
+
+
+def test_anchors_come_from_a_file_or_from_the_plans_to_be_trained_on(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    data = TrainingData(lambda: scenes.four_ways(40)[0][:, 4::5], None)
+    made = DiffusionDrive.fixed_arrays(replace(TINY, n_anchors=4), data)["anchors"]
+    assert made.shape == (4, 8, 2)
+    assert sorted(made[:, -1, 0].round()) == pytest.approx([12.0, 22.0, 22.0, 40.0], abs=3.0)
+    file = tmp_path / "anchors.npy"
+    np.save(file, made)
+    again = DiffusionDrive.fixed_arrays(replace(TINY, anchors=str(file)), TrainingData(lambda: np.zeros(0), None))
+    assert np.array_equal(again["anchors"], made)
+
+
+@pytest.mark.slow
+def test_it_learns_32_pictures_by_heart() -> None:
+    """Status and command are the same for all: who does not look is metres off."""
+    settings = replace(
+        TINY,
+        image=ImageLayout(width=32, height=32),
+        fusion=replace(scenes.FUSION, image_tokens=(1, 1)),
+        offsets_from="anchors",
+        dropout=0.0,
+        confidence_weight=50.0,
+        agent_class_weight=0.1,
+        agent_box_weight=0.01,
+        bev_weight=0.1,
+    )
+    torch.manual_seed(0)
+    batch = scene_batch(32, settings.image)
+    model = DiffusionDrive(settings, {"anchors": cluster_anchors(batch.plan_2hz.numpy(), WAYS, seed=0)})
+    optimiser = torch.optim.Adam(model.parameters(), betas=(0.9, 0.99))
+    steps, error_m = 400, float("inf")
+    for step in range(steps):
+        optimiser.param_groups[0]["lr"] = 5e-3 * min((step + 1) / 30, 1 - step / steps)
+        optimiser.zero_grad()
+        summed(model(batch)).backward()
+        optimiser.step()
+        if step >= 240 and step % 10 == 0:
+            error_m = (model.plan(batch) - batch.plan_2hz)[..., :2].norm(dim=-1).mean().item()
+            if error_m < 0.1:
+                break
+    assert error_m < 0.1
+    assert batch.image is not None
+    blind = model.plan(replace(batch, image=torch.full_like(batch.image, 128)))
+    assert (blind - batch.plan_2hz)[..., :2].norm(dim=-1).mean() > 1.0
+
+
+def test_a_batch_that_lacks_something_is_refused() -> None:
+    batch, model = scene_batch(2), planner()
+    with pytest.raises(ValueError, match="without view from above or agents"):
+        model.losses(replace(batch, bev=None))
+    with pytest.raises(ValueError, match="without images"):
+        model.plan(replace(batch, image=None))
+
+
+@pytest.mark.parametrize("name", ["diffusiondrive", "diffusiondrive_small"])
+def test_its_configuration_fills_its_settings(name: str) -> None:
+    values = OmegaConf.to_container(OmegaConf.load(conf_dir() / "planner" / f"{name}.yaml"))
+    settings = fill(DiffusionDriveSettings, values["settings"], "settings")
+    fill(TrainingSettings, values["training"], "training")
+    with torch.device("meta"):
+        DiffusionDrive(settings, {"anchors": np.zeros((20, 8, 2))})
+    assert (settings == DiffusionDriveSettings()) != name.endswith("small")

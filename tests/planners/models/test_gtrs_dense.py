@@ -1,0 +1,241 @@
+"""GTRS-Dense: what it learns, from whom, and what it chooses."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from factory.config import conf_dir, fill
+from planners.data.batch import Batch, ImageLayout
+from planners.models.backbones.registry import BackboneSettings
+from planners.models.gtrs_dense.planner import GtrsDense, GtrsDenseSettings, imitated, shifted
+from planners.models.gtrs_dense.weighting import SUBSCORES
+from planners.models.planner import TrainingData
+from planners.training.optim import TrainingSettings
+from tasks.vocabulary import Vocabulary
+from tests.planners import scenes
+
+K = 24
+TINY = GtrsDenseSettings(
+    image=scenes.PICTURE,
+    encoder="picture",
+    backbone=BackboneSettings("small", widths=(8, 16, 16, 32)),
+    width=32,
+    heads=2,
+    hidden=64,
+    layers=1,
+)
+EXACT = replace(TINY, kept=1.0, velocity_noise_mps=(0.0, 0.0), image_shift=0.0)
+
+
+def planner(settings: GtrsDenseSettings = TINY, k: int = K, seed: int = 0) -> GtrsDense:
+    torch.manual_seed(seed)
+    return GtrsDense(settings, {"vocabulary": scenes.vocabulary(k)})
+
+
+def labelled(n: int, k: int = K) -> tuple[Batch, torch.Tensor]:
+    """n scenes whose drivers drive the best trajectory, and the final scores (n, k)."""
+    trajectories = scenes.vocabulary(k)
+    labels, final = scenes.labels(n, trajectories)
+    return scenes.batch(n, trajectories[final.argmax(1)], labels=labels), final
+
+
+@pytest.mark.slow
+def test_it_learns_to_rank_the_best_trajectory_of_32_scenes_first() -> None:
+    batch, final = labelled(32)
+    model = planner(EXACT)
+    optimiser = torch.optim.Adam(model.parameters())
+    best = final.max(dim=1).values - 1e-6
+    right = 0.0
+    for step in range(300):
+        optimiser.param_groups[0]["lr"] = 5e-3 * (1 - step / 300)
+        optimiser.zero_grad()
+        torch.stack(list(model(batch).values())).sum().backward()
+        torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+        optimiser.step()
+        if step >= 100 and step % 20 == 0:
+            chosen = model.eval().choose(model.scores(batch))
+            right = (final.gather(1, chosen[:, None])[:, 0] >= best).float().mean().item()
+            model.train()
+            if right >= 0.9:
+                break
+    assert right >= 0.9
+
+
+def test_scores_are_probabilities_over_the_vocabulary_and_the_plan_is_its_entry() -> None:
+    batch, _ = labelled(3)
+    model = planner().eval()
+    scores = model.scores(batch)
+    assert set(scores) == {*SUBSCORES, "imitation"}
+    assert all(value.shape == (3, K) and value.dtype == torch.float32 for value in scores.values())
+    assert all(((value >= 0) & (value <= 1)).all() for value in scores.values())
+    torch.testing.assert_close(scores["imitation"].sum(dim=1), torch.ones(3))
+    expected = torch.tensor(scenes.vocabulary(K)).float()[model.choose(scores)]
+    assert torch.equal(model.plan(batch), expected) and expected.shape == (3, 40, 3)
+
+
+def test_a_plan_is_the_same_every_time_and_whatever_else_is_in_the_batch() -> None:
+    batch, _ = labelled(4)
+    model = planner().eval()
+    torch.manual_seed(1)
+    first = model.plan(batch)
+    assert torch.equal(model.plan(batch), first)
+    torch.testing.assert_close(torch.cat([model.plan(part) for part in batch.parts(4)]), first)
+
+
+def test_where_nothing_imitates_the_imitation_head_gets_a_gradient_of_zero() -> None:
+    batch, _ = labelled(4)
+    nothing = torch.full_like(batch.plan_2hz, float("nan"))
+    batch = replace(batch, imitate=torch.zeros(4, dtype=torch.bool), plan_2hz=nothing)
+    model = planner()
+    terms = model(batch)
+    torch.stack(list(terms.values())).sum().backward()
+    assert terms["imitation"].item() == 0.0
+    for name, parameter in model.named_parameters():
+        assert parameter.grad is not None and parameter.grad.isfinite().all(), name
+        silent = name.startswith("scorer.heads.imitation")
+        assert bool((parameter.grad == 0).all()) or not silent, name
+    assert model.scorer.heads["nc"][0].weight.grad.abs().sum() > 0
+
+
+def test_imitation_is_divided_by_the_whole_batch_and_rewards_count_every_sample() -> None:
+    batch, _ = labelled(4)
+    model = planner(EXACT).eval()  # without statistics of the batch
+    every = model.losses(batch)
+    half = model.losses(replace(batch, imitate=torch.tensor([True, False, True, False])))
+    pair = [model.losses(part)["imitation"] for part in batch.parts(4)]
+    torch.testing.assert_close(half["imitation"], (pair[0] + pair[2]) / 4)
+    assert all(torch.equal(every[name], half[name]) for name in SUBSCORES)
+
+
+def test_all_parameters_get_a_gradient_with_imitation_and_a_head_switched_off() -> None:
+    batch, _ = labelled(2)
+    model = planner(replace(TINY, imitation=0.0, rewards=replace(TINY.rewards, hc=0.0)))
+    torch.stack(list(model(batch).values())).sum().backward()
+    for name, parameter in model.named_parameters():
+        assert parameter.grad is not None, f"{name}: processes wait for the gradient of every parameter"
+        if name.startswith(("scorer.heads.imitation", "scorer.heads.hc")):
+            assert (parameter.grad == 0.0).all(), f"{name} is switched off"
+    for head in set(SUBSCORES) - {"hc"}:
+        assert model.scorer.heads[head][0].weight.grad.abs().sum() > 0.0, head
+
+
+def test_a_training_step_sees_half_the_vocabulary_by_torchs_own_dice() -> None:
+    model = planner()
+    torch.manual_seed(3)
+    first, second = model._picked(), model._picked()
+    torch.manual_seed(3)
+    assert len(first) == K // 2 and torch.equal(model._picked(), first) and not torch.equal(first, second)
+    assert torch.equal(model.eval()._picked(), torch.arange(K))
+
+
+def test_the_imitated_distribution_is_a_softmax_of_squared_distances() -> None:
+    at_2hz = torch.zeros(3, 8, 3)
+    at_2hz[1, 0, 0], at_2hz[2, 4, 2] = 1.0, 0.5  # squared distances 0, 1, 0.25
+    target = imitated(at_2hz, torch.zeros(1, 8, 3), torch.tensor([True]), sigma_m2=0.5)
+    torch.testing.assert_close(target, torch.tensor([[0.0, -2.0, -0.5]]).softmax(dim=1))
+
+
+def test_half_points_count_as_none() -> None:
+    batch, _ = labelled(2)
+    assert batch.labels is not None
+    model = planner(EXACT).eval()
+    as_half = model.losses(replace(batch, labels=batch.labels | {"nc": torch.full((2, K), 0.5)}))
+    as_none = model.losses(replace(batch, labels=batch.labels | {"nc": torch.zeros(2, K)}))
+    assert torch.equal(as_half["nc"], as_none["nc"])
+
+
+def test_pictures_move_by_whole_pixels_with_their_edges_repeated() -> None:
+    image = torch.arange(12, dtype=torch.uint8).reshape(1, 1, 3, 4)
+    torch.manual_seed(0)
+    seen = {tuple(shifted(image, 1).flatten().tolist()) for _ in range(60)}
+    assert len(seen) == 9  # one step along each axis, or none
+    assert tuple(image.flatten().tolist()) in seen
+    assert (1, 2, 3, 3, 5, 6, 7, 7, 9, 10, 11, 11) in seen  # one column to the left
+    assert shifted(image, 0) is image
+
+
+def test_it_chooses_from_fewer_or_other_trajectories_than_it_was_trained_on() -> None:
+    batch, _ = labelled(2)
+    half = planner(replace(TINY, inference_entries=K // 2)).eval()
+    assert torch.equal(half.choices, planner().trajectories[::2])
+    assert half.scores(batch)["nc"].shape == (2, K // 2)
+    other = scenes.vocabulary(5, seed=9)
+    torch.manual_seed(0)
+    settings = replace(TINY, inference_vocabulary="other.npy")
+    model = GtrsDense(settings, {"vocabulary": scenes.vocabulary(K), "inference_vocabulary": other}).eval()
+    assert model.scores(batch)["nc"].shape == (2, 5)
+    assert torch.equal(model.plan(batch), torch.tensor(other).float()[model.choose(model.scores(batch))])
+    assert model.needs.labels == Vocabulary(scenes.vocabulary(K)).digest
+    with pytest.raises(ValueError, match="inference_entries=25: the vocabulary has 24"):
+        planner(replace(TINY, inference_entries=K + 1))
+
+
+def test_bf16_learns_and_plans() -> None:
+    batch, _ = labelled(2)
+    model = planner()
+    with torch.autocast("cpu", torch.bfloat16):
+        terms = model(batch)
+        torch.stack(list(terms.values())).sum().backward()
+        plan = model.eval().plan(batch)
+    assert all(term.isfinite() and term.dtype == torch.float32 for term in terms.values())
+    assert plan.dtype == torch.float32
+
+
+def test_a_wrong_or_missing_vocabulary_is_refused_with_the_setting(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    file = tmp_path / "vocabulary.npy"
+    np.save(file, scenes.vocabulary(K))
+    digest = Vocabulary(scenes.vocabulary(K)).digest
+
+    def arrays(path: str | None, labelled_with: str | None) -> dict[str, np.ndarray]:
+        data = TrainingData(lambda: np.zeros((0, 8, 3)), labelled_with)
+        return GtrsDense.fixed_arrays(replace(TINY, vocabulary=path), data)
+
+    assert np.array_equal(arrays(str(file), digest)["vocabulary"], scenes.vocabulary(K))
+    with pytest.raises(ValueError, match=f"vocabulary: give the .npy file .* {digest}"):
+        arrays(None, digest)
+    with pytest.raises(ValueError, match=f"has digest {digest}, the samples are labelled with 0123"):
+        arrays(str(file), "0123")
+    with pytest.raises(ValueError, match="these samples carry none"):
+        arrays(str(file), None)
+    with pytest.raises(ValueError, match=r"vocabulary=.*nowhere\.npy: not readable"):
+        arrays(str(tmp_path / "nowhere.npy"), digest)
+
+
+def test_settings_that_contradict_themselves_are_refused() -> None:
+    with pytest.raises(ValueError, match="give one of them"):
+        replace(TINY, inference_vocabulary="a.npy", inference_entries=3)
+    with pytest.raises(ValueError, match=r"kept=0\.0"):
+        replace(TINY, kept=0.0)
+    with pytest.raises(ValueError, match="divisible by 32"):
+        planner(replace(TINY, image=ImageLayout(width=100, height=32)))
+
+
+@pytest.mark.parametrize(("encoder", "millions"), [("fused", 67), ("picture", 83)])
+def test_the_papers_sizes_are_67_million_parameters_with_resnet_34_and_83_with_v2_99(
+    encoder: str, millions: int
+) -> None:
+    with torch.device("meta"):
+        model = GtrsDense(GtrsDenseSettings(encoder=encoder), {"vocabulary": scenes.vocabulary(2)})
+    assert sum(p.numel() for p in model.parameters()) == pytest.approx(millions * 1e6, rel=0.1)
+
+
+def test_the_fused_encoder_learns_too() -> None:
+    batch, _ = labelled(2)
+    model = planner(replace(TINY, encoder="fused", fusion=scenes.FUSION))
+    torch.stack(list(model(batch).values())).sum().backward()
+    assert all(parameter.grad is not None for parameter in model.parameters())
+    assert model.tokens(batch.image).shape == (2, 64, 32)
+
+
+@pytest.mark.parametrize("name", ["gtrs_dense", "gtrs_dense_v2_99", "gtrs_dense_small"])
+def test_its_configuration_fills_its_settings(name: str) -> None:
+    values = OmegaConf.to_container(OmegaConf.load(conf_dir() / "planner" / f"{name}.yaml"))
+    settings = fill(GtrsDenseSettings, values["settings"], "settings")
+    fill(TrainingSettings, values["training"], "training")
+    with torch.device("meta"):
+        GtrsDense(settings, {"vocabulary": scenes.vocabulary(2)})
+    if not name.endswith("small"):
+        assert replace(settings, backbone=GtrsDenseSettings().backbone, encoder="fused") == GtrsDenseSettings()

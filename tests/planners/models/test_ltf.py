@@ -1,0 +1,186 @@
+"""Latent TransFuser: its size, what it minimises, and that it learns 32 pictures by heart."""
+
+import math
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+from torch import nn
+
+from planners.data.batch import Batch, BevLayout, ImageLayout
+from planners.models.backbones.registry import BackboneSettings, load_pretrained
+from planners.models.constant_velocity import ConstantVelocity, ConstantVelocitySettings
+from planners.models.ltf import Ltf, LtfSettings
+from planners.models.transfuser import FusionSettings, LatentFusion
+from tests.planners.made_batch import made_batch
+
+TINY = LtfSettings(
+    image=ImageLayout(width=64, height=32),
+    bev=BevLayout(cell_m=8.0),
+    fusion=FusionSettings(
+        backbone=BackboneSettings(name="small", widths=(16, 32, 64, 64)),
+        latent_size=32,
+        image_tokens=(1, 2),
+        latent_tokens=(1, 1),
+        layers=1,
+        heads=2,
+        expansion=2,
+        bev_channels=8,
+    ),
+    width=64,
+    hidden=256,
+    layers=1,
+    heads=2,
+    agents=3,
+)
+
+
+def planner(settings: LtfSettings = TINY) -> Ltf:
+    torch.manual_seed(0)
+    return Ltf(settings, {})
+
+
+@cache
+def batch(n: int = 4) -> Batch:
+    return made_batch(planner().needs, n)
+
+
+def test_from_constant_velocity_a_head_that_says_nothing_keeps_the_speed() -> None:
+    settings = replace(TINY, plan_from="constant_velocity")
+    from_zero, from_speed = planner(), planner(settings)
+    for one in (from_zero, from_speed):
+        last = one.plan_head[-1]
+        assert isinstance(last, nn.Linear)
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+    straight = ConstantVelocity(ConstantVelocitySettings(), {}).plan(batch())
+    assert torch.equal(from_speed.plan(batch()), straight)
+    assert not from_zero.plan(batch()).any() and straight.any()
+
+
+def test_the_papers_size_is_56_million_parameters() -> None:
+    with torch.device("meta"):
+        model = Ltf(LtfSettings(), {})
+    assert sum(p.numel() for p in model.parameters()) == pytest.approx(56e6, rel=0.1)
+    assert model.needs.image == ImageLayout(width=2048, height=512)
+    assert model.needs.bev is not None and model.needs.bev.shape == (128, 256) and model.needs.n_agents == 30
+
+
+def test_the_papers_picture_goes_through() -> None:
+    settings = FusionSettings()
+    with torch.device("meta"):
+        fused = LatentFusion(settings)(torch.zeros(2, 3, 512, 2048, dtype=torch.uint8))
+    assert fused.image.shape == (2, 512, 16, 64) and fused.latent.shape == (2, 512, 8, 8)
+    assert fused.bev.shape == (2, 64, 64, 64)
+
+
+@pytest.mark.parametrize("size", [(32, 64), (64, 352), (96, 256)])
+def test_a_picture_may_have_any_size_divisible_by_32(size: tuple[int, int]) -> None:
+    settings = replace(TINY, image=ImageLayout(height=size[0], width=size[1]))
+    model = planner(settings)
+    assert model.plan(made_batch(model.needs, 2)).shape == (2, 8, 3)
+
+
+def test_losses_reach_every_parameter() -> None:
+    model = planner().train()
+    torch.stack(list(model(batch()).values())).sum().backward()
+    for name, parameter in model.named_parameters():
+        assert parameter.grad is not None and parameter.grad.isfinite().all(), name
+
+
+def test_a_plan_without_a_label_weighs_nothing_and_the_scene_is_learnt_all_the_same() -> None:
+    model = planner().eval()
+    half = replace(batch(), imitate=torch.tensor([True, False, True, False]))
+    one, two = model.losses(batch()), model.losses(half)
+    parts = [model.losses(replace(batch(), imitate=torch.arange(4) == i))["trajectory"] for i in (0, 2)]
+    torch.testing.assert_close(two["trajectory"], sum(parts))
+    assert all(torch.equal(one[name], two[name]) for name in ("agent_class", "agent_box", "bev"))
+    none = model.losses(replace(batch(), imitate=torch.zeros(4, dtype=torch.bool)))
+    assert none["trajectory"].item() == 0.0
+
+
+def test_a_plan_that_is_its_label_costs_nothing() -> None:
+    model = planner().eval()
+    told = replace(batch(), plan_2hz=model.plan(batch()))
+    assert model.losses(told)["trajectory"].item() == pytest.approx(0.0, abs=1e-6)
+    off = replace(told, plan_2hz=told.plan_2hz + torch.tensor([0.3, 0.0, 0.0]))
+    assert model.losses(off)["trajectory"].item() == pytest.approx(10 * 0.1, rel=1e-4)
+
+
+def test_a_plan_is_the_same_for_the_same_sample_whoever_asks() -> None:
+    model = planner().train()
+    first = model.plan(batch())
+    assert model.training and torch.equal(first, model.plan(batch()))
+    assert not first.requires_grad
+    for i, part in enumerate(batch().parts(4)):
+        torch.testing.assert_close(model.plan(part)[0], first[i], rtol=1e-4, atol=1e-4)
+
+
+def test_half_precision_gives_finite_losses_close_to_the_full_ones() -> None:
+    model = planner().eval()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        half = model.losses(batch())
+    for name, value in model.losses(batch()).items():
+        assert half[name].dtype == torch.float32
+        torch.testing.assert_close(half[name], value, rtol=0.1, atol=0.1)
+
+
+def test_the_latent_counted_once_is_the_latent_of_every_sample() -> None:
+    """Before the first exchange nothing tells samples apart: the mean over copies is the mean over one."""
+    torch.manual_seed(0)
+    fusion = LatentFusion(replace(TINY.fusion, dropout=0.0)).train()
+    alone = fusion.latent.stage(0, fusion.latent.enter(fusion.picture))
+    copies = fusion.latent.stage(0, fusion.latent.enter(fusion.picture.expand(5, -1, -1, -1)))
+    torch.testing.assert_close(copies, alone.expand(5, -1, -1, -1), rtol=1e-4, atol=1e-4)
+
+
+def test_weights_are_for_the_picture_and_the_latent_starts_at_random(tmp_path: Path) -> None:
+    source = planner()
+    save_file(dict(source.fusion.image.state_dict()), tmp_path / "w.safetensors")
+    backbone = replace(TINY.fusion.backbone, pretrained=str(tmp_path / "w.safetensors"))
+    torch.manual_seed(1)
+    model = Ltf(replace(TINY, fusion=replace(TINY.fusion, backbone=backbone)), {})
+    record = load_pretrained(model)
+    assert record["fusion.image"].startswith("w.safetensors") and record["fusion.latent"] == "none"
+    for a, b in zip(model.fusion.image.parameters(), source.fusion.image.parameters()):
+        assert torch.equal(a, b)
+    assert not torch.equal(model.fusion.latent.get_parameter("conv1.weight"), source.fusion.latent.conv1.weight)
+
+
+@pytest.mark.slow
+def test_it_learns_32_pictures_by_heart() -> None:
+    """Status and command are the same for all: without the picture the error stays at 8 m."""
+    settings = replace(
+        TINY,
+        fusion=replace(TINY.fusion, dropout=0.0),
+        agent_class_weight=0.1,
+        agent_box_weight=0.01,
+        bev_weight=0.1,
+    )
+    model = planner(settings).train()
+    samples = made_batch(model.needs, 32)
+    optimiser = torch.optim.Adam(model.parameters(), fused=True)
+    error, steps = float("inf"), 200
+    for step in range(steps):
+        rate = 4e-3 * min((step + 1) / 20, 0.5 + 0.5 * math.cos(math.pi * step / steps))
+        optimiser.param_groups[0]["lr"] = rate
+        torch.stack(list(model(samples).values())).sum().backward()
+        nn.utils.clip_grad_norm_(model.parameters(), 5.0)
+        optimiser.step()
+        optimiser.zero_grad()
+        if step >= 100 and step % 10 == 9:
+            error = (model.plan(samples) - samples.plan_2hz)[..., :2].norm(dim=-1).mean().item()
+            if error < 0.1:
+                break
+    assert error < 0.1
+    blind = replace(samples, image=torch.full_like(samples.image, 128))  # type: ignore[arg-type]
+    assert (model.plan(blind) - samples.plan_2hz)[..., :2].norm(dim=-1).mean().item() > 1.0
+
+
+def test_batch_norm_stays_in_the_published_backbones() -> None:
+    with torch.device("meta"):
+        model = Ltf(LtfSettings(), {})
+    assert sum(isinstance(m, nn.BatchNorm2d) for m in model.modules()) == 2 * 36

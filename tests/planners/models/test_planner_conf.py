@@ -1,0 +1,63 @@
+"""The files of conf/planner that come with the regressing planners say what the code and the paper say."""
+
+from dataclasses import fields
+from typing import Any
+
+import pytest
+import yaml
+
+from factory.config import conf_dir, fill
+from planners.models.backbones.registry import BackboneSettings
+from planners.models.ego_mlp import EgoMlpBevSettings, EgoMlpSettings
+from planners.models.ltf import LtfSettings
+from planners.models.registry import PlannerChoice, build_planner, settings_of
+from planners.training.optim import TrainingSettings
+from tests.planners.made_batch import made_batch
+
+NAMES = ("constant_velocity", "ego_mlp", "ego_mlp_small", "ego_mlp_bev", "ego_mlp_bev_small", "ltf", "ltf_small")
+
+
+def read(name: str) -> dict[str, Any]:
+    content = yaml.safe_load((conf_dir() / "planner" / f"{name}.yaml").read_text())
+    assert isinstance(content, dict)
+    return content
+
+
+def choice(name: str) -> PlannerChoice:
+    content = read(name)
+    return PlannerChoice(content["name"], content["settings"])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_file_fills_its_planner(name: str) -> None:
+    settings_of(choice(name))
+    if name != "constant_velocity":
+        fill(TrainingSettings, read(name)["training"], "training")
+
+
+def test_the_unmarked_files_spell_out_the_defaults() -> None:
+    defaults = {"ltf": LtfSettings(), "ego_mlp": EgoMlpSettings(), "ego_mlp_bev": EgoMlpBevSettings()}
+    for name, expected in defaults.items():
+        assert settings_of(choice(name)) == expected
+        missing = {f.name for f in fields(expected)} - set(read(name)["settings"])
+        assert not missing, name
+
+
+def test_ltf_trains_as_in_the_paper() -> None:
+    training = fill(TrainingSettings, read("ltf")["training"], "training")
+    assert training == TrainingSettings(epochs=100, batch_size=512, learning_rate=2.83e-4)
+
+
+@pytest.mark.parametrize("name", ["ego_mlp_bev_small", "ltf_small"])
+def test_small_planners_take_a_step(name: str) -> None:
+    planner = build_planner(choice(name), {})
+    batch = made_batch(planner.needs, 2)
+    assert planner.plan(batch).shape == (2, 8, 3)
+    assert all(loss.isfinite() for loss in planner(batch).values())
+
+
+def test_ltf_small_is_narrow_and_not_another_planner() -> None:
+    small = settings_of(choice("ltf_small"))
+    assert small.fusion.backbone == BackboneSettings(name="small")
+    assert small.trajectory_weight == LtfSettings().trajectory_weight
+    assert small.layers > 1 and small.agents > 0 and small.bev_weight > 0.0

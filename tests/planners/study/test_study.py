@@ -1,0 +1,89 @@
+"""What the study reports on: all that is trained and evaluated as it is now, whatever was interrupted."""
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from planners.evaluation.contenders import contender
+from planners.evaluation.evaluate import EvaluateSettings, evaluate
+from planners.evaluation.scores import BOUNDS, scores_of
+from planners.study import report as study_report
+from planners.study.plan import Comparison, Portion, Setup, Sizes
+from planners.study.run import evaluated, write_report
+from planners.study.sweep import DONE, EVALUATIONS, Training, folder_of
+from planners.training.checkpoint import save_checkpoint
+from planners.training.curves import LOSSES
+from tests.planners.evaluation.test_evaluate import settings
+from tests.planners.small_benchmark import StreetBenchmark, write_benchmark_folder
+from tests.planners.study.test_study_plan import settings as study_settings
+from tests.planners.toy import Toy, ToySettings
+
+
+def train(out: Path, training: Training, weight: float = 0.0, step: int = 1) -> None:
+    toy = Toy(ToySettings(), {})
+    for parameter in toy.parameters():
+        torch.nn.init.constant_(parameter, weight)
+    record = {"parameters": 2, "trained": {"steps": step}, "samples": {"real": 3, "simulated": 4}}
+    save_checkpoint(folder_of(out, training), step, toy, record, {})
+    (folder_of(out, training) / LOSSES).write_text("step,total\n" + "".join(f"{i},1.0\n" for i in range(40)))
+    (folder_of(out, training) / DONE).write_text(json.dumps(list(training.overrides)))
+
+
+def score(out: Path, rules: EvaluateSettings, *trainings: Training) -> None:
+    trained = [contender(str(folder_of(out, one)), one.label) for one in trainings]
+    evaluate(StreetBenchmark(), [contender("constant_velocity"), *trained], rules)
+
+
+def test_what_is_evaluated_is_reported_and_what_changed_since_is_not(tmp_path: Path) -> None:
+    rules = settings(tmp_path / EVALUATIONS)
+    a, b, c = (Training(label, (f"seed={label}",)) for label in "abc")
+    joined = {"ab": f"{folder_of(tmp_path, a)}+{folder_of(tmp_path, b)}"}
+    planned = [Portion("main", 0, (a, b), {}), Portion("ensemble", 0, (c,), joined)]
+    assert evaluated(planned, tmp_path) == set()
+    train(tmp_path, a)
+    assert evaluated(planned, tmp_path) == set(), "nothing is evaluated yet"
+    score(tmp_path, rules, a)
+    assert evaluated(planned, tmp_path) == {"a"}
+    train(tmp_path, c)
+    score(tmp_path, rules, c)
+    assert evaluated(planned, tmp_path) == {"a", "c"}, "a part behind one that is not done counts"
+
+    other_overrides = [Portion("main", 0, (replace(a, overrides=("seed=9",)), b), {}), planned[1]]
+    assert evaluated(other_overrides, tmp_path) == {"c"}
+    train(tmp_path, a, weight=0.1, step=2)
+    assert evaluated(planned, tmp_path) == {"c"}, "it was trained again since"
+    score(tmp_path, rules, a)
+    assert evaluated(planned, tmp_path) == {"a", "c"}
+    score(tmp_path, replace(rules, one_stage_traffic=rules.two_stage_traffic), c)
+    assert evaluated(planned, tmp_path) == {"c"}, "the other was evaluated by other rules"
+
+
+def test_the_report_is_that_of_the_evaluations_and_can_be_made_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    benchmark = write_benchmark_folder(tmp_path / "benchmark")
+    study = study_settings(out=str(tmp_path), benchmark=str(benchmark), report=str(tmp_path / "report"))
+    real, more = (Setup("ltf", data, rounds, "steps") for data, rounds in (("real", 0), ("pdm_closed", 5)))
+    trainings = [one.training(study, 0, Sizes(steps=1)) for one in (real, more)]
+    for weight, training in zip((0.0, 0.1), trainings):
+        train(tmp_path, training, weight)
+    who = [contender(str(folder_of(tmp_path, one)), one.label) for one in trainings]
+    evaluate(StreetBenchmark(), [*map(contender, BOUNDS), *who], settings(tmp_path / EVALUATIONS))
+    standing = [Comparison("main", real, None, 1, "steps"), Comparison("main", more, real, 1, "steps")]
+    write_report(standing, trainings, study)
+    report = tmp_path / "report"
+    assert "constant_velocity" in capsys.readouterr().out
+    (first, second) = csv.DictReader((report / "trainings.csv").open())
+    assert (first["training"], second["training"]) == (real.label_of(0), more.label_of(0))
+    assert (first["optimiser_steps"], first["real"], second["simulated"]) == ("1", "3", "4")
+    for row in (first, second):
+        for name, score in scores_of(tmp_path / EVALUATIONS / row["training"]).items():
+            assert float(row[name]) == pytest.approx(score, abs=1e-4)
+    made = {path.name: path.read_bytes() for path in report.iterdir()}
+    assert {"frames.parquet", "tables.md", "learning.png"} < set(made)
+    assert study_report.main([f"folder={report}"]) == 0
+    assert {path.name: path.read_bytes() for path in report.iterdir()} == made

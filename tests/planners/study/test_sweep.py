@@ -1,0 +1,119 @@
+"""Sweeps: every combination once, what is done stays done, what fails is named."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from planners.study.scaling import ScalingSettings, SweepData, curves_of, trainings_of
+from planners.study.sweep import (
+    EVALUATED_TOGETHER,
+    INTERRUPTED,
+    LOG,
+    Means,
+    SweepFailed,
+    Training,
+    folder_of,
+    is_done,
+    shares_of,
+    train_all,
+    train_one,
+)
+from planners.training.checkpoint import read_record
+from tests.planners.training.test_train import command, table
+
+__all__ = ["table"]
+
+
+def scaling(**changes: Any) -> ScalingSettings:
+    axes: dict[str, Any] = {
+        "planners": ("ltf",),
+        "experts": ("recovery", "pdm_closed"),
+        "rounds": (0, 1, 2, 3),
+        "sim_ratios": ("natural",),
+        "imitation": ("all",),
+        "real_shares": (1.0,),
+        "seeds": (0, 1),
+    }
+    return ScalingSettings(SweepData(("real",), ("sim",)), "bench", "out", **{**axes, **changes})
+
+
+def test_every_combination_is_trained_once_and_real_samples_alone_not_once_an_expert() -> None:
+    trainings = trainings_of(scaling())
+    assert len(trainings) == len({t.label for t in trainings}) == 2 * (1 + 2 * 3)
+    alone = [t for t in trainings if t.facts["rounds"] == 0]
+    assert [t.facts["seed"] for t in alone] == [0, 1]
+    assert all("data.sim=[]" in t.overrides for t in alone)
+    third = next(t for t in trainings if t.facts["rounds"] == 3 and t.facts["expert"] == "recovery")
+    assert {"data.max_round=2", "data.experts=[recovery]", "data.sim=[sim]"} <= set(third.overrides)
+
+
+def test_all_experts_together_are_one_axis_value() -> None:
+    (one,) = trainings_of(scaling(experts=("all",), rounds=(1,), seeds=(0,)))
+    assert not any(o.startswith("data.experts") for o in one.overrides)
+
+
+def test_curves_hold_their_own_points_and_real_samples_alone() -> None:
+    settings = scaling()
+    rows = [
+        {**t.facts, "samples": 100 + 50 * t.facts["rounds"], "final_unfiltered": 30.0 + t.facts["rounds"]}
+        for t in trainings_of(settings)
+    ]
+    recovery, pdm = curves_of(rows, settings)
+    assert (recovery.label, pdm.label) == ("recovery, imitation", "pdm_closed, imitation")
+    for curve in (recovery, pdm):
+        assert sorted(p.samples for p in curve.points) == [100, 100, 150, 150, 200, 200, 250, 250]
+        assert curve.law is not None
+    (few,) = curves_of([r for r in rows if r["rounds"] < 3], scaling(experts=("recovery",), rounds=(0, 1, 2)))
+    assert few.law is None and "no curve" in few.text() and few.row()["a"] == ""
+
+
+@pytest.mark.parametrize(("name", "value"), [("seeds", ()), ("rounds", (-1,)), ("planners", ("ltf", "ltf"))])
+def test_axes_that_are_none_are_refused(name: str, value: Any) -> None:
+    with pytest.raises(ValueError, match=name):
+        scaling(**{name: value})
+
+
+def small(table: str, label: str, *more: str) -> Training:
+    overrides = [o for o in command(table, Path("unused"), "steps=4", *more) if not o.startswith("out=")]
+    return Training(label, tuple(overrides))
+
+
+@pytest.mark.slow
+def test_a_sweep_trains_what_is_not_done_and_names_what_fails(table: str, tmp_path: Path) -> None:
+    good, bad = small(table, "good"), small(table, "bad", "device=cuda")
+    with pytest.raises(SweepFailed, match=r"bad \(exit 2\): error: device=cuda"):
+        train_all([good, bad], tmp_path, Means(jobs=2))
+    assert is_done(tmp_path, good) and not is_done(tmp_path, bad)
+    assert read_record(folder_of(tmp_path, good))["step"] == 4
+    written = (folder_of(tmp_path, good) / LOG).stat().st_mtime_ns
+    assert train_all([good], tmp_path, Means())
+    assert (folder_of(tmp_path, good) / LOG).stat().st_mtime_ns == written, "it was not to be trained again"
+    assert not is_done(tmp_path, small(table, "good", "seed=1")), "other overrides are another training"
+
+
+@pytest.mark.slow
+def test_what_runs_when_time_is_up_is_saved_and_nothing_new_begins(table: str, tmp_path: Path) -> None:
+    long = small(table, "long", "steps=200000", "checkpoint_every=100000")
+    losses = folder_of(tmp_path, long) / "losses.csv"
+    assert train_one(long, tmp_path, lambda: losses.exists() and losses.stat().st_size > 100) == INTERRUPTED
+    assert 0 < read_record(folder_of(tmp_path, long))["step"] < 200000
+    assert not is_done(tmp_path, long)
+    assert not train_all([small(table, "next")], tmp_path, Means(minutes=0.0))
+    assert not folder_of(tmp_path, small(table, "next")).exists()
+
+
+@pytest.mark.parametrize(("n", "processes"), [(0, 0), (1, 1), (16, 2), (48, 2), (49, 4)])
+def test_processes_evaluate_all_planners_and_as_many_of_each_kind(n: int, processes: int) -> None:
+    who = [(f"{'slow' if i < n / 2 else 'fast'}-{i}", "folder") for i in range(n)]
+    shares = shares_of(who, 2)
+    assert len(shares) == processes
+    assert sorted(one for share in shares for one in share) == sorted(who)
+    assert all(len(share) <= EVALUATED_TOGETHER for share in shares)
+    slow = [sum(label.startswith("slow") for label, _ in share) for share in shares]
+    assert not slow or max(slow) - min(slow) <= 1
+
+
+def test_two_trainings_of_one_label_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="twice"):
+        train_all([Training("twice", ()), Training("twice", ("seed=1",))], tmp_path, Means())

@@ -1,0 +1,255 @@
+"""A training goes on after any interruption as if there had been none, and writes what it did."""
+
+import csv
+import json
+import math
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from factory.config import ConfigError
+from planners.data.batch import Batch
+from planners.models.registry import PlannerChoice, build_planner
+from planners.training.checkpoint import checkpoints, digest, load_planner, newest
+from planners.training.curves import LOSSES, VALIDATION
+from planners.training.fit import Loop, Stopped, fit, total_steps
+from planners.training.optim import TrainingSettings
+from planners.training.processes import World
+from tests.planners.toy import Toy, ToyBatches, ToySettings, toy_batch
+
+ALONE = World(0, 1, torch.device("cpu"))
+TRAINING = TrainingSettings(epochs=3, batch_size=4, learning_rate=0.01, schedule="cosine", optimiser="adamw")
+
+
+def toy() -> Toy:
+    torch.manual_seed(0)
+    return Toy(ToySettings(), {})
+
+
+def train(out: Path, batches: ToyBatches, resume: Path | None = None, **loop: Any) -> Toy:
+    planner = toy()
+    steps = total_steps(batches, TRAINING, None)
+    fit(planner, batches, TRAINING, Loop(**{"seed": 1, "steps": steps, **loop}), ALONE, out, {}, resume, measured)
+    return planner
+
+
+def measured(planner: Any) -> dict[str, float]:
+    return {"weight": float(planner.net[0].weight.detach().sum())}
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+class Interrupted(ToyBatches):
+    """Sends this process a signal while it hands out a batch."""
+
+    def __init__(self, n: int, size: int, after: int) -> None:
+        super().__init__(n, size)
+        self.after = after
+
+    def epoch(self, epoch: int) -> Iterator[Batch]:
+        for batch in super().epoch(epoch):
+            self.after -= 1
+            if self.after == 0:
+                os.kill(os.getpid(), signal.SIGTERM)
+            yield batch
+
+
+def test_the_loss_falls_and_every_step_is_written(tmp_path: Path) -> None:
+    train(tmp_path, ToyBatches(20, 4), log_every=4)
+    curve = rows(tmp_path / LOSSES)
+    assert [int(row["step"]) for row in curve] == list(range(15))
+    total = [float(row["total"]) for row in curve]
+    assert sum(total[-5:]) < sum(total[:5])
+    assert float(curve[0]["learning_rate"]) == 0.01
+    assert float(curve[3]["total"]) == pytest.approx(float(curve[3]["imitation"]) + float(curve[3]["size"]))
+    assert len(rows(tmp_path / VALIDATION)) == 1
+    assert list((tmp_path / "tensorboard").iterdir())
+
+
+@pytest.mark.parametrize("stop_after", [1, 5, 7])  # within an epoch of five batches, at its end, in the next
+def test_an_interrupted_training_resumes_to_the_identical_curve_and_weights(tmp_path: Path, stop_after: int) -> None:
+    whole = train(tmp_path / "whole", ToyBatches(20, 4), validate_every=5)
+    out = tmp_path / "cut"
+    with pytest.raises(Stopped, match=f"after step {stop_after} of 15"):
+        train(out, Interrupted(20, 4, stop_after), validate_every=5)
+    resumed = train(out, ToyBatches(20, 4), newest(out), validate_every=5)
+    assert (out / LOSSES).read_text() == (tmp_path / "whole" / LOSSES).read_text()
+    assert (out / VALIDATION).read_text() == (tmp_path / "whole" / VALIDATION).read_text()
+    for name, value in whole.state_dict().items():
+        assert torch.equal(value, resumed.state_dict()[name]), name
+
+
+def test_a_killed_training_repeats_what_came_after_its_last_checkpoint(tmp_path: Path) -> None:
+    class Killed(Exception):
+        pass
+
+    class Dying(ToyBatches):
+        def epoch(self, epoch: int) -> Iterator[Batch]:
+            for batch in super().epoch(epoch):
+                if self.at == {"epoch": 1, "next": 4}:
+                    raise Killed
+                yield batch
+
+    whole = tmp_path / "whole"
+    train(whole, ToyBatches(20, 4), checkpoint_every=3, log_every=1)
+    out = tmp_path / "cut"
+    with pytest.raises(Killed):
+        train(out, Dying(20, 4), checkpoint_every=3, log_every=1)
+    assert [int(row["step"]) for row in rows(out / LOSSES)] == list(range(8))
+    assert newest(out).name == "00000006"
+    train(out, ToyBatches(20, 4), newest(out), checkpoint_every=3, log_every=1)
+    assert (out / LOSSES).read_text() == (whole / LOSSES).read_text()
+
+
+class Sgd(torch.optim.SGD):
+    """A step is the rate times the gradient, so that a wrong gradient shows: Adam's steps are the same for its double.
+
+    Keeps the rates that it stepped with.
+    """
+
+    def __init__(self, training: TrainingSettings, planner: torch.nn.Module) -> None:
+        super().__init__(planner.parameters(), lr=training.learning_rate)
+        self.rates: list[float] = []
+
+    def step(self, *arguments: Any) -> None:  # type: ignore[override]
+        self.rates += [group["lr"] for group in self.param_groups]
+        super().step(*arguments)
+
+
+@pytest.fixture
+def stepped_by(monkeypatch: pytest.MonkeyPatch) -> list[Sgd]:
+    """The optimisers of the trainings of a test, all of them Sgd."""
+    made: list[Sgd] = []
+
+    def build(training: TrainingSettings, planner: torch.nn.Module) -> Sgd:
+        made.append(Sgd(training, planner))
+        return made[-1]
+
+    monkeypatch.setattr("planners.training.fit.build_optimiser", build)
+    return made
+
+
+def without_chance() -> Toy:
+    torch.manual_seed(0)
+    return Toy(ToySettings(dropout=0.0), {})
+
+
+def gradient_of_the_first_batch(planner: Toy) -> tuple[torch.Tensor, ...]:
+    (batch,) = ToyBatches(4, 4).epoch(0)
+    return torch.autograd.grad(torch.stack(list(planner.losses(batch).values())).sum(), list(planner.parameters()))
+
+
+@pytest.mark.parametrize("parts", [1, 2, 4])
+def test_a_step_goes_against_the_gradient_of_the_whole_batch_whatever_parts_it_is_computed_in(
+    tmp_path: Path, stepped_by: list[Sgd], parts: int
+) -> None:
+    planner, training = without_chance(), TrainingSettings(epochs=1, batch_size=4, learning_rate=0.1)
+    expected = [p.detach() - 0.1 * g for p, g in zip(planner.parameters(), gradient_of_the_first_batch(planner))]
+    fit(planner, ToyBatches(4, 4), training, Loop(1, 1, parts), ALONE, tmp_path, {})
+    for found, wanted in zip(planner.parameters(), expected):
+        torch.testing.assert_close(found.detach(), wanted, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("share", [0.25, 4.0])
+def test_a_gradient_above_the_clip_is_shortened_to_it_and_one_below_is_left_alone(
+    tmp_path: Path, stepped_by: list[Sgd], share: float
+) -> None:
+    planner = without_chance()
+    gradient = gradient_of_the_first_batch(planner)
+    norm = float(torch.cat([g.flatten() for g in gradient]).norm())
+    training = TrainingSettings(epochs=1, batch_size=4, learning_rate=0.1, gradient_clip=share * norm)
+    before = [p.detach().clone() for p in planner.parameters()]
+    fit(planner, ToyBatches(4, 4), training, Loop(1, 1), ALONE, tmp_path, {})
+    for was, found, full in zip(before, planner.parameters(), gradient):
+        torch.testing.assert_close(was - found.detach(), 0.1 * min(share, 1.0) * full, rtol=1e-4, atol=1e-6)
+
+
+def test_the_rate_of_a_step_is_the_schedules_and_the_one_that_is_logged(tmp_path: Path, stepped_by: list[Sgd]) -> None:
+    training = TrainingSettings(epochs=3, batch_size=4, learning_rate=0.01, schedule="cosine", warmup_steps=3)
+    fit(without_chance(), ToyBatches(20, 4), training, Loop(1, 15, log_every=4), ALONE, tmp_path, {})
+    (optimiser,) = stepped_by
+    logged = [float(row["learning_rate"]) for row in rows(tmp_path / LOSSES)]
+    assert optimiser.rates == pytest.approx(logged, rel=1e-5)
+    assert optimiser.rates[:4] == pytest.approx([0.01 / 3, 0.02 / 3, 0.01, 0.01])
+    assert optimiser.rates[-1] == pytest.approx(0.005 * (1.0 + math.cos(math.pi * 11 / 12)))
+
+
+class Dice(Toy):
+    """Notes what a step draws."""
+
+    name = "tests.planners.training.test_fit:Dice"
+
+    def losses(self, batch: Batch) -> dict[str, torch.Tensor]:
+        self.drawn = [*getattr(self, "drawn", []), float(torch.rand(()))]
+        return super().losses(batch)
+
+
+def test_every_step_of_every_rank_draws_its_own_and_the_same_again(tmp_path: Path) -> None:
+    def drawn(rank: int, seed: int = 1) -> list[float]:
+        planner = Dice(ToySettings(), {})  # what was drawn to build it does not matter
+        world = World(rank, 1, torch.device("cpu"))
+        fit(planner, ToyBatches(20, 4), TRAINING, Loop(seed, 5), world, tmp_path / f"{rank}-{seed}", {})
+        return list(planner.drawn)
+
+    first, second = drawn(0), drawn(1)
+    assert len({*first, *second, *drawn(0, seed=2)}) == 15
+    assert drawn(0) == first and drawn(1) == second
+
+
+def test_a_loss_that_is_no_number_stops_the_training_with_its_step(tmp_path: Path) -> None:
+    class Poisoned(ToyBatches):
+        def epoch(self, epoch: int) -> Iterator[Batch]:
+            for i, batch in enumerate(super().epoch(epoch)):
+                if i == 2:
+                    batch.plan_2hz[0] = torch.nan
+                yield batch
+
+    with pytest.raises(FloatingPointError, match=r"loss of step 2 .*imitation nan"):
+        train(tmp_path, Poisoned(20, 4))
+
+
+def test_a_checkpoint_is_the_planner_and_only_the_newest_stay(tmp_path: Path) -> None:
+    trained = train(tmp_path, ToyBatches(20, 4), checkpoint_every=4)
+    assert [path.name for path in checkpoints(tmp_path)] == ["00000012", "00000015"]
+    loaded = load_planner(tmp_path)
+    batch = toy_batch(torch.arange(3).numpy())
+    assert torch.equal(loaded.plan(batch), trained.eval().plan(batch))
+    assert len(digest(tmp_path)) == 16
+    assert digest(tmp_path) != digest(checkpoints(tmp_path)[0])
+
+
+def test_a_checkpoint_of_another_planner_is_refused_by_name(tmp_path: Path) -> None:
+    train(tmp_path, ToyBatches(20, 4))
+    record = newest(tmp_path) / "record.json"
+    changed = json.loads(record.read_text())
+    changed["planner"]["settings"]["hidden"] = 9
+    record.write_text(json.dumps(changed))
+    with pytest.raises(ConfigError, match=r"not a checkpoint of this .*net.0.weight is \(8, 8\), not \(9, 8\)"):
+        load_planner(tmp_path)
+
+
+def test_folders_without_a_checkpoint_and_planners_nobody_knows_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no checkpoint here"):
+        load_planner(tmp_path)
+    with pytest.raises(ConfigError, match=r"planner\.name=nope: none of constant_velocity"):
+        build_planner(PlannerChoice("nope"), {})
+    with pytest.raises(ConfigError, match=r"is not a planners\.models\.planner\.Planner"):
+        build_planner(PlannerChoice("json:JSONDecoder"), {})
+    with pytest.raises(ConfigError, match=r"planner\.settings\.hiden"):
+        build_planner(PlannerChoice("tests.planners.toy:Toy", {"hiden": 3}), {})
+
+
+def test_damaged_weights_are_named(tmp_path: Path) -> None:
+    train(tmp_path, ToyBatches(20, 4))
+    weights = newest(tmp_path) / "weights.safetensors"
+    weights.write_bytes(weights.read_bytes()[:40])
+    with pytest.raises(ConfigError, match=r"weights\.safetensors: .*restore the checkpoint"):
+        load_planner(tmp_path)

@@ -1,0 +1,140 @@
+"""The training command, used as its users do: on a table, killed, gone on with, and asked for what cannot be."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from planners.training.checkpoint import load_planner, newest, read_record
+from planners.training.curves import LOSSES, VALIDATION
+from planners.training.train import main
+from tests.planners.samples import sample, write_table
+
+ROOT = Path(__file__).resolve().parents[3]
+STATUS_PLANNER = ("planner=custom", "planner.name=tests.planners.toy:Toy", "planner.training.batch_size=4")
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory: pytest.TempPathFactory) -> str:
+    path = tmp_path_factory.mktemp("train") / "out"
+    rows: list[dict[str, Any]] = [sample(i) for i in range(8)]
+    rows += [sample(i, "recovery", i % 2) for i in range(8, 24)]
+    write_table(path, rows, shard_rows=10, group_rows=4)
+    return str(path)
+
+
+def command(table: str, out: Path, *more: str, sim: bool = True) -> list[str]:
+    data = [f"data.real=[{table}]", f"data.sim=[{table}]"] if sim else [f"data.real=[{table}]"]
+    return [*STATUS_PLANNER, *data, "planner.training.epochs=3", "log_every=1", f"out={out}", *more]
+
+
+def test_it_trains_and_says_what_with(table: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(command(table, tmp_path, f"data.val=[{table}]", "mix.imitation=real", "validate_every=10")) == 0
+    said = capsys.readouterr().out
+    assert "real: 8 samples" in said and "recovery: 16" in said and "18 steps; begins" in said
+    record = read_record(tmp_path)
+    assert record["step"] == 18
+    assert record["trained"]["mix"]["imitation"] == "real"
+    assert record["backbones"] == {}
+    assert len((tmp_path / LOSSES).read_text().splitlines()) == 1 + 18
+    last = (tmp_path / VALIDATION).read_text().splitlines()
+    assert last[0] == "step,ade_m,fde_m" and [line.split(",")[0] for line in last[1:]] == ["10", "18"]
+
+
+def test_the_same_command_again_has_nothing_left_to_do(table: str, tmp_path: Path) -> None:
+    for _ in range(2):
+        assert main(command(table, tmp_path)) == 0
+    assert len((tmp_path / LOSSES).read_text().splitlines()) == 1 + 18
+
+
+def test_real_samples_alone_are_enough(table: str, tmp_path: Path) -> None:
+    assert main(command(table, tmp_path, sim=False)) == 0
+    assert read_record(tmp_path)["step"] == 6
+
+
+@pytest.mark.slow
+def test_a_killed_training_goes_on_to_the_identical_curve(table: str, tmp_path: Path) -> None:
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    steps = ("steps=600", "checkpoint_every=10", "log_every=10")
+    assert main(command(table, whole, *steps)) == 0
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    arguments = [sys.executable, "-m", "planners", "train", *command(table, cut, *steps)]
+    killed = subprocess.Popen(arguments, cwd=ROOT, env=environment, stderr=subprocess.DEVNULL)
+    while not list((cut / "checkpoints").glob("[0-9]*/training.pt")) and killed.poll() is None:
+        time.sleep(0.02)
+    killed.send_signal(signal.SIGKILL)
+    killed.wait()
+    assert 0 < int(newest(cut).name) < 600, "it was to be killed on its way"
+    assert main(command(table, cut, *steps)) == 0
+    assert (cut / LOSSES).read_text() == (whole / LOSSES).read_text()
+
+
+def test_a_planner_is_trained_further_from_the_weights_of_another_training(
+    table: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    assert main(command(table, first)) == 0
+    further = ("seed=5", "steps=1", f"init_from={first}", "planner.training.learning_rate=1e-9")
+    assert main(command(table, second, *further, sim=False)) == 0
+    assert f"weights to begin with: {newest(first)}" in capsys.readouterr().out
+    begun, learnt = (load_planner(folder).state_dict() for folder in (second, first))
+    for name, weights in learnt.items():
+        torch.testing.assert_close(begun[name], weights, rtol=0.0, atol=1e-8)
+    assert main(command(table, tmp_path / "alone", "steps=1", sim=False)) == 0
+    arrays = {f: load_planner(tmp_path / f).arrays["mean_plan"] for f in ("first", "second", "alone")}
+    np.testing.assert_array_equal(arrays["second"], arrays["first"])  # what it was built around stays, on other data
+    assert not np.array_equal(arrays["alone"], arrays["first"])
+    assert main(command(table, second, *further[:2], further[3], sim=False)) == 2
+    assert "init_from" in capsys.readouterr().err
+    assert main(command(table, tmp_path / "third", f"init_from={first}", "+planner.settings.hidden=9")) == 2
+    assert "(9, " in capsys.readouterr().err
+    assert not (tmp_path / "third").exists()
+
+
+def test_another_planner_or_other_settings_do_not_go_on_in_a_folder(
+    table: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(command(table, tmp_path)) == 0
+    for changed, said in (
+        ("+planner.settings.hidden=9", "planner.settings {'hidden': 8"),
+        ("seed=5", "seed 0 -> 5"),
+        ("mix.sim_ratio=0.5", "'sim_ratio': 'natural'"),
+        ("data.max_round=0", "samples "),
+    ):
+        assert main(command(table, tmp_path, changed)) == 2
+        assert said in capsys.readouterr().err
+    assert json.loads((newest(tmp_path) / "record.json").read_text())["step"] == 18
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (("plannr=ltf",), "plannr"),
+        (("planner.training.epoch=3",), "epoch"),
+        (("data.sim=[]", "mix.sim_ratio=0.5"), "sim_ratio"),
+        (("data.real=[nowhere]", "data.sim=[]"), "nowhere"),
+        (("planner.name=tests.planners.toy:Nobody",), "Nobody"),
+        (("planner.training.batch_size=100",), "lower planner.training.batch_size"),
+        (("accumulate=3",), "accumulate=3"),
+        (("device=cuda",), "device=cuda"),
+        (("init_from=nowhere",), "nowhere: no checkpoint"),
+        (("planner=gtrs_dense_small",), "vocabulary"),
+    ],
+)
+def test_what_cannot_be_trained_is_refused_before_anything_is_written(
+    table: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], more: tuple[str, ...], said: str
+) -> None:
+    arguments = [a for a in command(table, tmp_path / "out") if a.split("=")[0] not in {m.split("=")[0] for m in more}]
+    if any(m.startswith("planner=") for m in more):
+        arguments = [a for a in arguments if not a.startswith("planner.")]
+    assert main([*arguments, *more]) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
