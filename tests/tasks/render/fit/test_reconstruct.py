@@ -5,15 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import street
+from numpy.typing import NDArray
 
+from tasks.render import sh
 from tasks.render.asset import psnr
 from tasks.render.engine import Pinhole, Vehicles, render
+from tasks.render.fit.adam import BETA1, Learned
 from tasks.render.fit.reconstruct import advance, corrections_at, finish, picture_of, reconstruct
 from tasks.render.fit.schedule import photo_at
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import Problem, prepare
-from tasks.render.fit.state import FitState
-from tasks.render.sensed import Photo, Sweep
+from tasks.render.fit.state import SHAPES, FitState
+from tasks.render.gaussians import moved, turned_quats
+from tasks.render.sensed import Photo, Sweep, Tracks
 from tasks.world.agents import AgentKind
 
 SETTINGS = FitSettings(
@@ -172,6 +176,49 @@ def test_a_car_is_learned_in_its_own_box_and_can_be_put_elsewhere(prepared: tupl
     u = int(50 * (1.0 * 2.0 / 12.0) + 32)  # 2 m to the right, 12 m ahead of the camera
     red, green, _ = picture[19:22, u - 1 : u + 2].mean(axis=(0, 1))
     assert red > 2.0 * green
+
+
+def test_a_vehicle_s_gradients_are_turned_into_its_own_frame(prepared: tuple[Problem, FitState]) -> None:
+    """The same car in the same place, held in a box that is turned: its gradients turn against the box.
+
+    With x = R y the chain rule is dL/dy = R^T dL/dx, and for a quaternion likewise. Adam's first moment after one step
+    tells the gradient that the fit went by.
+    """
+    problem, state = prepared[0], fresh(prepared[1])
+    shine = np.random.default_rng(0).normal(0.0, 0.1, (len(state), 9))
+    state.learned["sh_rest"] = Learned.of(shine)
+    angle, mine = np.radians(110.0), np.flatnonzero(state.owner == 0)
+    back = np.eye(4)
+    back[:2, :2] = [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]
+    agents = street.tracks()
+    boxes = agents.boxes.copy()
+    boxes[..., 2] += angle
+    turned_box = replace(problem, tracks=Tracks(replace(agents, boxes=boxes), problem.origin))
+    turned_car = fresh(state)
+    in_box = moved(state.gaussians().take(mine), back)
+    for name, values in (("means", in_box.means), ("quats", in_box.quats), ("sh_rest", in_box.sh_rest)):
+        turned_car.learned[name].values[mine] = values.reshape(len(mine), -1)
+
+    def gradients(problem: Problem, state: FitState) -> dict[str, NDArray[np.float64]]:
+        stepped = fresh(state)
+        for name in SHAPES:
+            stepped.learned[name].forget(np.arange(len(state)))
+        advance(problem, stepped, SETTINGS, state.iteration + 1)
+        return {name: stepped.learned[name].first.astype(float) / (1.0 - BETA1) for name in SHAPES}
+
+    own, turned = gradients(problem, state), gradients(turned_box, turned_car)
+    expected = {
+        "means": own["means"][mine] @ back[:3, :3].T,
+        "quats": turned_quats(np.array([np.cos(angle / 2), 0.0, 0.0, -np.sin(angle / 2)]), own["quats"][mine]),
+        "sh_rest": sh.turned(own["sh_rest"][mine].reshape(len(mine), -1, 3), back[:3, :3]).reshape(len(mine), -1),
+    }
+    for name in SHAPES:
+        wanted = expected.get(name, own[name][mine])
+        size = np.linalg.norm(wanted)
+        assert size > 0.0, f"the photo says nothing of the car's {name}"
+        assert np.linalg.norm(turned[name][mine] - wanted) < 0.01 * size, name  # float32, and discs as thin as paper
+        rest = np.delete(own[name], mine, axis=0)
+        np.testing.assert_allclose(np.delete(turned[name], mine, axis=0), rest, atol=0.01 * abs(rest).max())
 
 
 def test_road_gaussians_stay_on_the_road(prepared: tuple[Problem, FitState]) -> None:
