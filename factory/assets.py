@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from factory.fitting import fitted
 from factory.scene_file import SUFFIX, BadScene, read_scene, write_scene
 from factory.sensors import block_of, chosen_cameras, load_sensors, load_sweeps, taken_by
+from factory.work import Stopped, never
 from tasks.render.asset import BlockRange, RenderAsset
 from tasks.render.lidar_only import lidar_asset
 from tasks.render.scene import build_asset
@@ -67,11 +68,14 @@ def _with_parallax(photos: Sequence[SensorFile]) -> float:
     return found / len(photos)
 
 
-def asset_for(clip: Clip, settings: RenderSettings, cache_dir: str | Path, threads: int = 1) -> RenderAsset | None:
+def asset_for(
+    clip: Clip, settings: RenderSettings, cache_dir: str | Path, threads: int = 1, stopped: Stopped = never
+) -> RenderAsset | None:
     """The scene of the clip's block with its digest; None where the clip has nothing to make one from.
 
     Made of photos and lidar, or of either alone (`sensing`); the same on any number of threads.
-    Raises BadClip where a sensor file is broken, ValueError for a camera the rig does not have.
+    Raises BadClip where a sensor file is broken, ValueError for a camera the rig does not have, and Halted where a fit
+    is `stopped`.
     """
     block, cameras = block_of(clip), chosen_cameras(clip.cameras, settings.cameras)
     made_of = sensing(clip, settings)
@@ -88,7 +92,7 @@ def asset_for(clip: Clip, settings: RenderSettings, cache_dir: str | Path, threa
         if made_of is not Sensing.LIDAR_ONLY:
             data = load_sensors(block, cameras, settings.width, settings.height)
             if settings.scene is SceneFrom.FIT:
-                asset = fitted(path, data, block.agents, settings.fit, threads)
+                asset = fitted(path, data, block.agents, settings.fit, threads, stopped)
             else:
                 asset = build_asset(data.photos, data.sweeps, block.agents, settings.asset)
         else:

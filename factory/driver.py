@@ -19,7 +19,7 @@ from factory.local import Graph, Ticket
 from factory.metrics import RunMetrics
 from factory.plan import CLIP_CANDIDATE, ClipPlan, Plan, WalkState, wants_payload
 from factory.progress import ProgressLine, Tally
-from factory.steps import Attempted, Failure, Prepared, Reconstructed, Stamp
+from factory.steps import Attempted, Failure, HalfBuilt, Prepared, Reconstructed, Stamp
 from factory.store.candidates import ClipCandidates
 from factory.store.outcomes import QUARANTINE_AFTER, ErrorKind, Kind, Outcome
 from factory.store.room import NoRoom
@@ -182,7 +182,10 @@ class Driver:
         else:
             self._take_attempt(*self._trying.pop(ticket), ticket.result, report)
 
-    def _take_block(self, build: Build, report: Reconstructed | Failure) -> None:
+    def _take_block(self, build: Build, report: Reconstructed | HalfBuilt | Failure) -> None:
+        if isinstance(report, HalfBuilt):
+            self.notes.append(f"block {build.block} is not finished; the next run goes on with it")
+            return
         self._forecast.blocks.finish(1)
         if isinstance(report, Reconstructed):
             self._count(report.seconds, self._forecast.blocks)

@@ -33,7 +33,7 @@ from factory.store.room import NoRoom
 from factory.store.samples import CURRENT_RUN, NOTHING, ChangedRun, OnChange, Store
 from factory.store.table import AnotherWriter
 from factory.walk import Try, retry_policy
-from factory.work import NotReady, Work
+from factory.work import NotReady, Stopped, Work
 
 COMPLETE, BAD_CONFIG, COMPLETE_WITH_FAILURES, INTERRUPTED = 0, 2, 3, 4  # exit codes
 Executor = Literal["local", "ray"]
@@ -109,7 +109,11 @@ def execute(
     code, message, began_ms, disk_full = COMPLETE, "", 0, False
     try:
         is_due = plan.todo or (pictured is not None and pictured.is_due)
-        graph = _graph(work, store, executor, workers, ray_address, gpu_share) if is_due else None
+        graph = (
+            _graph(work, store, executor, workers, ray_address, gpu_share, lambda: driver.interrupted)
+            if is_due
+            else None
+        )
     except (BadLocation, ClusterLacks, NotReady) as error:
         return RunSummary(BAD_CONFIG, str(error))
     except ConnectionError as error:
@@ -173,10 +177,16 @@ def out_of_room(error: NoRoom) -> str:
 
 
 def _graph(
-    work: Work, store: Store, executor: Executor, workers: int | None, address: str | None, gpu_share: float
+    work: Work,
+    store: Store,
+    executor: Executor,
+    workers: int | None,
+    address: str | None,
+    gpu_share: float,
+    stopped: Stopped,
 ) -> Graph:
     if executor == "local":
-        return LocalGraph(work, store.location)
+        return LocalGraph(work, store.location, stopped)
     from factory.graph import RayGraph
 
     return RayGraph(work, store.location, workers, address, gpu_share)

@@ -13,6 +13,7 @@ import numpy as np
 from factory.pace import time_text
 from factory.sensors import SensorData
 from factory.store.room import needs_room
+from factory.work import Halted, Stopped, never
 from tasks.render.asset import RenderAsset
 from tasks.render.fit.reconstruct import advance, finish
 from tasks.render.fit.settings import FitSettings
@@ -27,11 +28,17 @@ log = logging.getLogger(__name__)
 
 
 def fitted(
-    path: Path, data: SensorData, agents: AgentTracks | None, settings: FitSettings, threads: int
+    path: Path,
+    data: SensorData,
+    agents: AgentTracks | None,
+    settings: FitSettings,
+    threads: int,
+    stopped: Stopped = never,
 ) -> RenderAsset:
     """The scene of a block's sensors; what is half done lies beside `path`, where the scene will be stored.
 
-    A fit that was killed comes to the same bytes as one that was not. Raises ValueError without photos to learn from.
+    A fit that was killed or halted comes to the same bytes as one that was not. Raises Halted once it is `stopped`,
+    with all of its iterations kept, and ValueError without photos to learn from.
     """
     problem, state = prepare(data.photos, data.sweeps, agents, settings, threads=threads)
     begun, said = path.with_suffix(BEGUN), path.with_suffix(SAID)
@@ -46,8 +53,11 @@ def fitted(
         said.write_text(json.dumps({"block": path.stem, "text": text}))
 
     while state.iteration < settings.iterations:
-        advance(problem, state, settings, state.iteration + STRETCH, say, threads)
+        advance(problem, state, settings, state.iteration + STRETCH, say, threads, stopped)
         _save(begun, state)
+        if state.iteration < settings.iterations and stopped():
+            said.unlink(missing_ok=True)
+            raise Halted(f"{path.stem}: {state.iteration} of {settings.iterations} iterations are done")
     asset = finish(problem, state, threads)
     begun.unlink(missing_ok=True)
     said.unlink(missing_ok=True)

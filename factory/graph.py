@@ -28,7 +28,7 @@ from factory.ray_metrics import RayRecorder
 from factory.steps import Failure
 from factory.store.location import BadLocation, Location
 from factory.store.outcomes import ErrorKind
-from factory.work import NotReady, Work
+from factory.work import NotReady, Work, never
 
 MAX_RETRIES = 2  # of a task whose worker died
 PROBE_SECONDS = 120.0
@@ -60,7 +60,11 @@ class RayGraph:
         self.cores = min(filter(None, _cores_by_node()), default=1)  # none yet where a cluster grows from nothing
         self.cores = min(self.cores, self.parallelism)
         self.recorder: Recorder = RayRecorder()
-        self._supplied: dict[str, Any] = {"work": [ray.put(work)], "out": out}  # in a list: handed over as a reference
+        self._supplied: dict[str, Any] = {
+            "work": [ray.put(work)],
+            "out": out,
+            "stopped": never,
+        }  # in a list: a reference
         self._tickets: dict[Any, Ticket] = {}
         self._ready: deque[Any] = deque()
         self._held_back: deque[tuple[Ticket, str, tuple[Any, ...]]] = deque()

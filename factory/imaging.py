@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from factory.assets import Sensing, asset_for, scene_path, sensing
 from factory.clips.reader import BadClip
 from factory.sensors import block_of, chosen_cameras, encode_jpeg, load_photos, taken_by
+from factory.work import Stopped, never
 from tasks.attempt import Judged
 from tasks.experts.follow_up import BEFORE_STEPS
 from tasks.perturb import Candidate
@@ -49,15 +50,15 @@ class Imaging:
     settings: RenderSettings
     cache_dir: str
 
-    def build(self, clip: Clip, threads: int) -> tuple[bool, float | None]:
+    def build(self, clip: Clip, threads: int, stopped: Stopped = never) -> tuple[bool, float | None]:
         """Make sure of the clip's block in the cache: whether it was there, and its PSNR in dB where it has one.
 
-        Raises BadClip for a broken sensor file.
+        Raises BadClip for a broken sensor file, Halted where a fit is `stopped`.
         """
         found = sensing(clip, self.settings) is not Sensing.NOTHING and (
             scene_path(clip, self.settings, self.cache_dir).exists()
         )
-        asset = asset_for(clip, self.settings, self.cache_dir, threads)
+        asset = asset_for(clip, self.settings, self.cache_dir, threads, stopped)
         return found, asset.psnr_db if asset is not None and np.isfinite(asset.psnr_db) else None
 
     def block_verdict(self, clip: Clip) -> Rejected | None:

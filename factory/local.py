@@ -9,7 +9,7 @@ from typing import Any, Protocol
 from factory import steps
 from factory.metrics import NoRecorder, Recorder
 from factory.store.location import Location
-from factory.work import Work
+from factory.work import Stopped, Work, never
 
 
 class ClusterLacks(ValueError):
@@ -34,7 +34,7 @@ class Graph(Protocol):
     recorder: Recorder  # of metrics
 
     def submit(self, step: str, *args: Any) -> Ticket:
-        """Run `step`; arguments may be results of earlier tickets. `work` and `out` are supplied to it (WANTS)."""
+        """Run `step`; arguments may be results of earlier tickets. What WANTS says is supplied to it."""
         ...
 
     def wait(self, timeout_s: float) -> tuple[Ticket, Any] | None:
@@ -53,7 +53,7 @@ STEPS = {
     "warm": steps.warm,
 }
 WANTS = {
-    "reconstruct": ("work",),
+    "reconstruct": ("work", "stopped"),
     "prepare": ("work", "out"),
     "attempt": ("work",),
     "write": ("out",),
@@ -77,10 +77,11 @@ class LocalGraph:
 
     parallelism = 1
 
-    def __init__(self, work: Work, out: Location) -> None:
+    def __init__(self, work: Work, out: Location, stopped: Stopped = never) -> None:
+        """stopped: asked now and then by tasks that take long, as nobody else can while they are at work."""
         self.cores = os.cpu_count() or 1
         self.recorder: Recorder = NoRecorder()
-        self._supplied = {"work": work, "out": out}
+        self._supplied = {"work": work, "out": out, "stopped": stopped}
         self._waiting: deque[tuple[Ticket, str, tuple[Any, ...]]] = deque()
         work.warm()
 

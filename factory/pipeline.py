@@ -27,6 +27,8 @@ from factory.work import (
     NotReady,
     PreparedClip,
     RunIdentity,
+    Stopped,
+    never,
 )
 from tasks.attempt import (
     ExpertGate,
@@ -245,11 +247,11 @@ class FactoryWork:
         name = named(ref)
         return None if name is None else str(name)
 
-    def reconstruct(self, ref: ClipRef, threads: int) -> Built:
-        """The clip's block into this machine's cache. Raises BadClip."""
+    def reconstruct(self, ref: ClipRef, threads: int, stopped: Stopped = never) -> Built:
+        """The clip's block into this machine's cache. Raises BadClip, and Halted where a fit is `stopped`."""
         watch = Stopwatch()
         with watch.of("reconstruct"):
-            found, psnr_db = self.imaging.build(read_clip(self.reader, ref), threads)
+            found, psnr_db = self.imaging.build(read_clip(self.reader, ref), threads, stopped)
         return Built(watch.seconds, found, psnr_db)
 
     def doing(self) -> str:

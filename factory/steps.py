@@ -21,7 +21,7 @@ from factory.store.room import no_room
 from factory.store.scenes import SceneFiles
 from factory.store.schema import SAMPLES, sample_row_to_table
 from factory.store.table import Shard, write_shard
-from factory.work import Accepted, CandidateRow, NotReady, PreparedClip, Work
+from factory.work import Accepted, CandidateRow, Halted, NotReady, PreparedClip, Stopped, Work
 from tasks.stages import Rejected
 
 ERROR_LINES = 12  # of a traceback that an outcome keeps
@@ -56,6 +56,11 @@ class Reconstructed:
     seconds: Mapping[str, float]
     from_cache: bool
     psnr_db: float | None
+
+
+@dataclass(frozen=True)
+class HalfBuilt:
+    """Report on a block that is not finished because the run stops; the next run goes on with it."""
 
 
 @dataclass(frozen=True)
@@ -212,11 +217,17 @@ def episodes(work: Work, out: Location, wanted: EpisodesOf) -> tuple[EpisodesWri
     return EpisodesWritten(written, tuple(errors)), None
 
 
-def reconstruct(work: Work, ref: ClipRef, threads: int) -> tuple[Reconstructed | Failure, None]:
+def reconstruct(
+    work: Work, stopped: Stopped, ref: ClipRef, threads: int
+) -> tuple[Reconstructed | HalfBuilt | Failure, None]:
     """The block that the clip is rendered from, into the cache of this machine."""
+    if stopped():  # before its sensors are read
+        return HalfBuilt(), None
     try:
-        built = work.reconstruct(ref, threads)
+        built = work.reconstruct(ref, threads, stopped)
         return Reconstructed(built.seconds, built.from_cache, built.psnr_db), None
+    except Halted:
+        return HalfBuilt(), None
     except Exception as error:  # the same boundary
         return failure_of(error), None
 

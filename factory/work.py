@@ -6,7 +6,7 @@ whatever the worker, the order or the retry, the same arguments give the same re
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Protocol
@@ -24,6 +24,18 @@ FOLLOW_UP, FOLLOW_UP_BEFORE = "follow_up", "follow_up_before"
 BENCHMARK = frozenset({HUMAN_BEFORE, FOLLOW_UP, FOLLOW_UP_BEFORE})  # whose clips need an earlier frame and scenes
 HUMAN_CANDIDATE = -1  # the only candidate index of LOGGED experts
 UNLISTED = "unlisted"  # prepare_digest of clips prepared for the log's own drive alone: no perturb work, no list
+
+
+Stopped = Callable[[], bool]  # whether the run was asked to stop: a long task looks now and then
+
+
+def never() -> bool:
+    """For who is not asked to stop."""
+    return False
+
+
+class Halted(Exception):
+    """A long task left off because the run was asked to stop; what it has done is kept, and the next one goes on."""
 
 
 class NotReady(ValueError):
@@ -148,8 +160,8 @@ class Work(Protocol):
         """Name of the block that the clip is rendered from, known without reading it; None: nothing to build ahead."""
         ...
 
-    def reconstruct(self, ref: ClipRef, threads: int) -> Built:
-        """Build the clip's block into this machine's cache. Raises BadClip."""
+    def reconstruct(self, ref: ClipRef, threads: int, stopped: Stopped = never) -> Built:
+        """Build the clip's block into this machine's cache. Raises BadClip, and Halted soon after it is `stopped`."""
         ...
 
     def doing(self) -> str:

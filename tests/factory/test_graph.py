@@ -5,6 +5,7 @@ import re
 import shutil
 import signal
 import threading
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
@@ -13,10 +14,11 @@ from pathlib import Path
 import pyarrow.compute as pc
 import pytest
 
+from factory.clips.reader import ClipRef
 from factory.execute import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, RunSummary, execute
 from factory.store.samples import Store
 from factory.store.verify import verify
-from factory.work import UNLISTED
+from factory.work import UNLISTED, Built, Halted, Stopped, never
 from tests.factory.tables import assert_same_rows, assert_same_tables, tables_of
 from tests.factory.toy import VERSIONS, ToyWork, ran, refs
 
@@ -393,6 +395,28 @@ def test_a_stopped_run_goes_on_where_it_was(tmp_path: Path, plain: Callable[...,
     assert summary.exit_code == INTERRUPTED
     assert run(tmp_path / "out").exit_code == COMPLETE
     assert_same_tables(tmp_path / "out", plain())
+
+
+def test_a_signal_reaches_a_block_that_is_being_built_in_this_process(tmp_path: Path) -> None:
+    class Building(ToyWork):
+        def reconstruct(self, ref: ClipRef, threads: int, stopped: Stopped = never) -> Built:
+            if ref.log_id == "log0":
+                return super().reconstruct(ref, threads)
+            assert not stopped()
+            os.kill(os.getpid(), signal.SIGTERM)
+            end = time.monotonic() + 20.0
+            while not stopped():
+                assert time.monotonic() < end, "nobody told the task"
+            raise Halted("half of it is done")
+
+    stopped = run(tmp_path / "out", Building(blocks=True))
+    assert stopped.exit_code == INTERRUPTED
+    assert [note.split(";")[0] for note in stopped.notes] == ["block log1 is not finished"]
+    committed = set(Store(tmp_path / "out").samples)
+    assert committed, "what was in hand is finished and committed"
+    run(tmp_path / "plain", ToyWork(blocks=True))
+    assert run(tmp_path / "out", ToyWork(blocks=True)).exit_code == COMPLETE
+    assert_same_tables(tmp_path / "out", tmp_path / "plain")
 
 
 def test_a_run_that_is_overtaken_stops_and_loses_nothing(tmp_path: Path, plain: Callable[..., Path]) -> None:

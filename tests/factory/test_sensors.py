@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 
 import cv2
@@ -15,6 +16,7 @@ from factory.assets import Sensing, asset_for, block_id, sensing
 from factory.clips.reader import BadClip
 from factory.scene_file import read_scene
 from factory.sensors import block_of, chosen_cameras, decode_image, encode_jpeg, load_sensors
+from factory.work import Halted, Stopped
 from tasks.render.fit import reconstruct
 from tasks.render.fit.settings import FitSettings
 from tasks.render.scene import AssetSettings, psnr
@@ -274,6 +276,28 @@ def test_a_killed_fit_goes_on_to_the_same_bytes(
     assert starts == [0, 8, 16, 16] and not begun.exists()
     assert len(said) == 1 and said[0].startswith("fit 10/20, "), "how far it is can be asked from outside"
     assert fitting.fits_going_on(tmp_path / "two") == [], "what has ended is not going on"
+
+
+def test_a_fit_that_is_asked_to_stop_keeps_every_iteration_and_goes_on_to_the_same_bytes(
+    clip: Clip, tmp_path: Path
+) -> None:
+    undisturbed = asset_for(clip, FITTED, tmp_path / "one")
+    begun = tmp_path / "two" / f"block-{block_id(clip, FITTED)}.fit.npz"
+
+    def after(n: int) -> Stopped:
+        """Says no so often."""
+        asked = count()
+        return lambda: next(asked) >= n
+
+    for n, done in ((7, 7), (5, 12)):
+        with pytest.raises(Halted, match=f"{done} of 20 iterations are done"):
+            asset_for(clip, FITTED, tmp_path / "two", stopped=after(n))
+        with np.load(begun) as arrays:
+            assert arrays["iteration"] == done
+        assert fitting.fits_going_on(tmp_path / "two") == []
+    again = asset_for(clip, FITTED, tmp_path / "two", stopped=after(8))  # the last iteration is done: nothing to leave
+    assert undisturbed is not None and again is not None and again.digest == undisturbed.digest
+    assert not begun.exists()
 
 
 def test_a_damaged_half_fit_is_said_and_begun_again(

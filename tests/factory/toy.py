@@ -14,7 +14,18 @@ from factory.clips.reader import BadClip, ClipRef
 from factory.rows import label_columns
 from factory.store.columns import Column
 from factory.store.schema import BOOKKEEPING, FIELDS
-from factory.work import UNLISTED, Accepted, AttemptResult, Built, CandidateRow, Dropped, PreparedClip, RunIdentity
+from factory.work import (
+    UNLISTED,
+    Accepted,
+    AttemptResult,
+    Built,
+    CandidateRow,
+    Dropped,
+    PreparedClip,
+    RunIdentity,
+    Stopped,
+    never,
+)
 from tasks.reward.label_bytes import HALVES, WHOLES, VocabularyLabels
 from tasks.stages import Rejected
 
@@ -97,7 +108,7 @@ class ToyWork:
     def block(self, ref: ClipRef) -> str | None:
         return ref.log_id if self.blocks else None
 
-    def reconstruct(self, ref: ClipRef, threads: int) -> Built:
+    def reconstruct(self, ref: ClipRef, threads: int, stopped: Stopped = never) -> Built:
         self._note(f"reconstruct {ref.log_id}")
         time.sleep(self.seconds)
         self._trouble(ref.log_id)

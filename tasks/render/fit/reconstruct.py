@@ -66,10 +66,14 @@ def advance(
     until: int,
     progress: Progress | None = None,
     threads: int = 2,
+    stopped: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Fits on, in place, to iteration `until`. In how many calls the iterations are done makes no difference."""
+    """Fits on, in place, to iteration `until`, or until `stopped`, which is asked before each iteration.
+
+    In how many calls the iterations are done makes no difference.
+    """
     losses, scores = [], []
-    while state.iteration < min(until, settings.iterations):
+    while state.iteration < min(until, settings.iterations) and not stopped():
         loss, score = _iterate(problem, state, settings, threads)
         losses.append(loss)
         scores.append(score)
