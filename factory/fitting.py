@@ -14,7 +14,7 @@ from factory.pace import time_text
 from factory.sensors import SensorData
 from factory.store.room import needs_room
 from factory.work import Halted, Stopped, never
-from tasks.render.asset import RenderAsset
+from tasks.render.scene.asset import RenderAsset
 from tasks.render.fit.reconstruct import advance, finish
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import prepare

@@ -24,7 +24,7 @@ from tasks.render.gate import looked_at_size, unfit
 from tasks.render.likeness import Album, likeness_to_photo, sightings
 from tasks.render.map_drawing import draw_map_views
 from tasks.render.rigs import RIGS
-from tasks.render.scene import RenderAsset
+from tasks.render.scene.build import RenderAsset
 from tasks.render.settings import STEPS_OF, ImageSource, PsnrGate, RenderMode, RenderSettings
 from tasks.render.views import pose_on_ground, render_views
 from tasks.stages import Rejected

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from factory.settings import RunConfig, load_config
-from tasks.vocabulary import Vocabulary
+from tasks.world.vocabulary import Vocabulary
 
 # What the paper says of how samples are made; the rest is this project's own, or how much and where.
 WATCHED = (

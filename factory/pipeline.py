@@ -41,22 +41,22 @@ from tasks.attempt import (
     human_sample,
     perturbed_scene,
 )
-from tasks.chance import stream
 from tasks.experts.follow_up import BEFORE_STEPS, FollowUp
-from tasks.experts.pdm_closed import PdmSettings
+from tasks.experts.pdm_closed.planner import PdmSettings
 from tasks.experts.protocol import Expert
 from tasks.hard_scenes import BenchmarkClip
 from tasks.perturb import Candidate, Perturbation, PerturbSettings, end_speed_mps, perturb
-from tasks.render.engine import Backend, check
-from tasks.render.gsplat_backend import BackendMissing
+from tasks.render.scene.engine import Backend, check
 from tasks.render.settings import RenderMode, RenderSettings
+from tasks.render.splatting.gsplat_backend import BackendMissing
 from tasks.reward.epdms import Scores
 from tasks.reward.labels import Labelling, vocabulary_labels
 from tasks.rollout.simulate import TrafficSettings
 from tasks.stages import SUBSCORES, Rejected
-from tasks.vocabulary import Vocabulary
+from tasks.world.chance import stream
 from tasks.world.clip import NOW, STEP_S, Clip, scene_of_clip
 from tasks.world.vehicle import HEADING
+from tasks.world.vocabulary import Vocabulary
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ MOST_K = 2**17  # of a kinematic vocabulary: 126 MB of trajectories, eight times
 GROUPS = {
     "perturb": "tasks.perturb:PerturbSettings",
     "traffic": "tasks.rollout.simulate:TrafficSettings",
-    "pdm": "tasks.experts.pdm_settings:PdmSettings",
+    "pdm": "tasks.experts.pdm_closed.settings:PdmSettings",
     "reward": "factory.reward_settings:RewardSettings",
     "render": "tasks.render.settings:RenderSettings",
     "benchmark": "factory.benchmark:BenchmarkSettings",

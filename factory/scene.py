@@ -22,11 +22,11 @@ import numpy as np
 
 from factory.config import ConfigError, fill
 from factory.scene_file import BadScene, described_by, read_scene, write_scene
-from tasks.render import sh
-from tasks.render.asset import RenderAsset
-from tasks.render.gaussians import Gaussians
-from tasks.render.lidar_only import plain_sky
-from tasks.render.ply import from_ply, to_ply
+from tasks.render.scene.asset import RenderAsset
+from tasks.render.scene.lidar_only import plain_sky
+from tasks.render.splatting import sh
+from tasks.render.splatting.gaussians import Gaussians
+from tasks.render.splatting.ply import from_ply, to_ply
 
 BAD_INPUT = 2
 

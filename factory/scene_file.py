@@ -28,9 +28,9 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from factory.store.room import needs_room
-from tasks.render.asset import BlockRange, Exposure, RenderAsset, ViewQuality
-from tasks.render.gaussians import Gaussians
-from tasks.render.sky import SkyMap
+from tasks.render.scene.asset import BlockRange, Exposure, RenderAsset, ViewQuality
+from tasks.render.scene.sky import SkyMap
+from tasks.render.splatting.gaussians import Gaussians
 
 FORMAT, VERSION = "driving-data-factory scene", 1
 KEY = "scene"  # one entry: safetensors writes several in no fixed order

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from factory.clips.av2_log import read_feather
 from factory.clips.reader import BadClip
-from tasks.render.sensed import Photo, Sweep, on_ego
+from tasks.render.scene.sensed import Photo, Sweep, on_ego
 from tasks.render.views import undistorted
 from tasks.world.camera import Camera, SensorFile
 from tasks.world.clip import Block, Clip

@@ -27,19 +27,19 @@ from factory.work import BENCHMARK, FOLLOW_UP_BEFORE, HUMAN, UNLISTED, RunIdenti
 from tasks.caches import user_cache
 from tasks.experts.follow_up import FollowUp
 from tasks.experts.human import Human
-from tasks.experts.pdm_closed import PdmClosed, PdmSettings
+from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings
 from tasks.experts.protocol import Expert
-from tasks.experts.recovery import Recovery, RecoverySettings, RecoveryTable
-from tasks.kinematic_vocabulary import kinematic_trajectories
+from tasks.experts.recovery.expert import Recovery, RecoverySettings, RecoveryTable
 from tasks.perturb import PerturbSettings
-from tasks.render import engine
-from tasks.render.gsplat_backend import BackendMissing
 from tasks.render.rigs import RIGS
+from tasks.render.scene import engine
 from tasks.render.settings import RenderMode, RenderSettings
+from tasks.render.splatting.gsplat_backend import BackendMissing
 from tasks.reward.labels import Labelling
 from tasks.rollout.simulate import TrafficSettings
 from tasks.stages import stage_versions
-from tasks.vocabulary import Vocabulary
+from tasks.world.kinematic_vocabulary import kinematic_trajectories
+from tasks.world.vocabulary import Vocabulary
 
 KINEMATIC_K = 1024
 RIGS_LOOKED_AT = 3  # clips, for the names of their cameras

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from factory.look.seen_again import Seen
     from factory.store.samples import Store
-    from tasks.render.asset import RenderAsset
+    from tasks.render.scene.asset import RenderAsset
 
 
 @dataclass(frozen=True)

@@ -26,10 +26,10 @@ from numpy.typing import NDArray
 from factory.clips.reader import BadClip, ClipReader
 from factory.clips.validate import read_clip
 from factory.config import ConfigError, build, compose, fill, need_run_extra
-from tasks.experts.recovery import RecoveryTable
-from tasks.kinematic_vocabulary import kinematic_trajectories
-from tasks.vocabulary import Vocabulary, checked_trajectories, cluster, human_windows
+from tasks.experts.recovery.expert import RecoveryTable
 from tasks.world.clip import CLIP_STEPS, HORIZON_STEPS, STEP_S
+from tasks.world.kinematic_vocabulary import kinematic_trajectories
+from tasks.world.vocabulary import Vocabulary, checked_trajectories, cluster, human_windows
 
 Array = NDArray[np.float64]
 STEP_MS = round(STEP_S * 1000)

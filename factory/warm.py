@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 
 from factory.work import NotReady
 from tasks.attempt import drive_and_judge
-from tasks.experts.pdm_closed import PdmSettings
+from tasks.experts.pdm_closed.planner import PdmSettings
 from tasks.experts.protocol import Plan
-from tasks.kernels import USED, cache_dir, make_cache_dir, not_kept, processor, write_whole
-from tasks.kinematic_vocabulary import kinematic_trajectories
+from tasks.kernels.compiled import USED, cache_dir, make_cache_dir, not_kept, processor, write_whole
 from tasks.render import warm as render_warm
 from tasks.render.settings import RenderMode, RenderSettings, SceneFrom
 from tasks.reward.labels import Labelling, vocabulary_labels
@@ -29,10 +28,11 @@ from tasks.reward.prepare import prepare_scene
 from tasks.reward.reactive import reactive_scores
 from tasks.reward.verdicts import INDEX_FROM_ROWS
 from tasks.rollout.simulate import TrafficSettings, simulate
-from tasks.vocabulary import Vocabulary
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.clip import CLIP_STEPS, HORIZON_STEPS, NOW, Clip, Scene, scene_of_clip
+from tasks.world.kinematic_vocabulary import kinematic_trajectories
 from tasks.world.lanes import Lane, RoadMap, Route
+from tasks.world.vocabulary import Vocabulary
 
 ENOUGH_S = 0.2  # between two looks whether compiling is to be given up
 _one_at_a_time = Lock()

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tasks.experts.follow_up import BEFORE_STEPS, FollowUp
-from tasks.experts.pdm_closed import PdmClosed, PdmPlan, PdmSettings, plan_for
-from tasks.experts.pdm_path import MIN_PROGRESS_M, path_length_m
+from tasks.experts.pdm_closed.path import MIN_PROGRESS_M, path_length_m
+from tasks.experts.pdm_closed.planner import PdmClosed, PdmPlan, PdmSettings, plan_for
 from tasks.experts.protocol import Expert, Plan
 from tasks.reward.epdms import Scores, score
 from tasks.reward.prepare import PreparedScene, prepare_scene

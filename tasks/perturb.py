@@ -17,16 +17,16 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.experts.pdm_closed import PdmSettings, plan_for
+from tasks.experts.pdm_closed.planner import PdmSettings, plan_for
 from tasks.reward.epdms import Scores, score
 from tasks.reward.prepare import among, prepare_scene
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out
 from tasks.stages import Rejected
-from tasks.vocabulary import Vocabulary
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip, Rollout, scene_of_clip
 from tasks.world.frames import to_local, to_world
 from tasks.world.vehicle import HEADING, VX
+from tasks.world.vocabulary import Vocabulary
 
 Array = NDArray[np.float64]
 

@@ -5,7 +5,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.experts.pdm_closed import plan_for
+from tasks.experts.pdm_closed.planner import plan_for
 from tasks.reward.epdms import Scores, rows, score
 from tasks.reward.prepare import N_TIMES, prepare_scene
 from tasks.rollout.lqr import track

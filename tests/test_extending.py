@@ -19,7 +19,7 @@ from factory.store.reader import SampleTable
 from planners.training.checkpoint import load_planner
 from planners.training.train import main as train_main
 from tasks.experts.protocol import Plan
-from tasks.kernels import cache_dir
+from tasks.kernels.compiled import cache_dir
 from tasks.stages import Rejected
 from tasks.world.clip import scene_of_clip
 from tests.tasks.streets import street_clip

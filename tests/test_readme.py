@@ -43,7 +43,7 @@ from planners.study.scaling import ScalingSettings
 from planners.study.scaling_table import TableSettings
 from planners.training.train import TrainConfig
 from tasks.caches import user_cache
-from tasks.kernels import cache_dir
+from tasks.kernels.compiled import cache_dir
 from tasks.render.fit.settings import FitSettings
 from tests.factory.installs import SMALL, as_if_installed
 from tests.pages import PAGES, REPOSITORY, Command, blocks, commands, named_in_prose

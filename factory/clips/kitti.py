@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from factory.clips.reader import BadClip
-from tasks.render.sensed import Photo, Sweep
+from tasks.render.scene.sensed import Photo, Sweep
 
 F64 = NDArray[np.float64]
 EARTH_RADIUS_M = 6378137.0  # of the kit's Mercator projection

@@ -31,11 +31,12 @@ from factory.store.reader import SampleTable
 from factory.store.samples import Store
 from factory.store.schema import AGENT_STEPS, NOW_INDEX
 from tasks.caches import user_cache
-from tasks.render.asset import RenderAsset, psnr
-from tasks.render.engine import Pinhole, render, vehicles_at
+from tasks.render.scene.asset import RenderAsset, psnr
+from tasks.render.scene.engine import render, vehicles_at
 from tasks.render.settings import ImageSource
 from tasks.render.views import VISIBLE_M, pose_on_ground
 from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.camera import Pinhole
 from tasks.world.clip import STEP_S
 from tasks.world.frames import to_world
 

@@ -42,7 +42,7 @@ from planners.evaluation.score_table import table_text, write_table
 from planners.evaluation.scoring import Plans, Rules, prepare_clip, score_clip
 from planners.evaluation.tags import TAG_COLUMNS, tags_of
 from planners.training.progress import Counter
-from tasks.experts.pdm_closed import PdmSettings
+from tasks.experts.pdm_closed.planner import PdmSettings
 from tasks.rollout.simulate import TrafficSettings
 from tasks.stages import stage_versions
 

@@ -27,7 +27,7 @@ from planners.evaluation.evaluate import check_needs
 from planners.evaluation.frames import Benchmark, FrameKey
 from planners.evaluation.planning import plans_of
 from planners.evaluation.scoring import PreparedClip, PreparedPair, Rules, prepare_clip, score_pair
-from tasks.experts.pdm_closed import PdmSettings
+from tasks.experts.pdm_closed.planner import PdmSettings
 from tasks.reward.one_stage import COLUMNS, FrameScores
 from tasks.rollout.simulate import TrafficSettings, roll_out
 from tasks.world.clip import HISTORY_STEPS, HORIZON_STEPS, STEP_S, Rollout

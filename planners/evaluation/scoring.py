@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from planners.evaluation.frames import ClipScenes, FrameKey, FramePair
 from planners.evaluation.score_rows import FrameRow, Stage
-from tasks.experts.pdm_closed import PdmSettings, plan_for
-from tasks.reward.comfort import extended_comfort
+from tasks.experts.pdm_closed.planner import PdmSettings, plan_for
 from tasks.reward.epdms import Scores, rows, score
 from tasks.reward.one_stage import COLUMNS, FrameScores, frame_scores
 from tasks.reward.prepare import N_TIMES, PreparedScene, among, prepare_scene
+from tasks.reward.rules.comfort import extended_comfort
 from tasks.reward.two_stage import follow_up_weights
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficScene, TrafficSettings, prepare_traffic, roll_out

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tasks.experts.pdm_closed import DEFAULTS, PdmClosed, PdmSettings
+from tasks.experts.pdm_closed.planner import DEFAULTS, PdmClosed, PdmSettings
 from tasks.experts.protocol import Plan
 from tasks.stages import Rejected
 from tasks.world.clip import Scene

@@ -14,16 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
-from tasks.render.asset import RenderAsset, scene_at
-from tasks.render.engine import Backend, Pinhole, Vehicles, render, vehicles_at
-from tasks.render.gaussians import F32, F64, Gaussians, rotations_of
 from tasks.render.likeness import Album, expected, eye_in_box, large_vehicles
-from tasks.render.movers import world_from_boxes
-from tasks.render.raster import View
-from tasks.render.sky import directions
+from tasks.render.scene.asset import RenderAsset, scene_at
+from tasks.render.scene.engine import Backend, Vehicles, render, vehicles_at
+from tasks.render.scene.movers import world_from_boxes
+from tasks.render.scene.sky import directions
+from tasks.render.splatting.gaussians import F32, F64, Gaussians, rotations_of
+from tasks.render.splatting.raster import View
 from tasks.stages import Rejected
 from tasks.world.agents import AgentTracks
-from tasks.world.camera import Camera
+from tasks.world.camera import Camera, Pinhole
 from tasks.world.clip import STEP_S
 
 GREY = np.array([0.299, 0.587, 0.114], np.float32)  # luma of ITU-R BT.601

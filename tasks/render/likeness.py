@@ -13,16 +13,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.render.asset import RenderAsset
-from tasks.render.engine import Backend, Pinhole, Vehicles, render, vehicles_at
-from tasks.render.gaussians import F32, F64
-from tasks.render.movers import BEYOND_M, behind_boxes, boxes_at, world_from_boxes
-from tasks.render.raster import View
-from tasks.render.sensed import Photo
-from tasks.render.sky import directions
-from tasks.render.stereo import FAR_M
+from tasks.render.scene.asset import RenderAsset
+from tasks.render.scene.engine import Backend, Vehicles, render, vehicles_at
+from tasks.render.scene.movers import BEYOND_M, behind_boxes, boxes_at, world_from_boxes
+from tasks.render.scene.sensed import Photo
+from tasks.render.scene.sky import directions
+from tasks.render.scene.stereo import FAR_M
+from tasks.render.splatting.gaussians import F32, F64
+from tasks.render.splatting.raster import View
 from tasks.world.agents import AgentKind, AgentTracks
-from tasks.world.camera import Camera, SensorFile
+from tasks.world.camera import Camera, Pinhole, SensorFile
 
 FADING = 0.2  # likeness falls by exp(-0.2) where the eye moves by as much as it was away from the vehicle
 TELLING_M = 40.0  # a photo from farther tells nothing of how a vehicle looks from near

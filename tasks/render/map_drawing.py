@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.render.gaussians import F64
+from tasks.render.splatting.gaussians import F64
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.camera import Camera
 from tasks.world.frames import box_corners

@@ -4,10 +4,10 @@ import math
 from dataclasses import dataclass, field
 from enum import StrEnum
 
-from tasks.render.engine import Backend
 from tasks.render.fit.settings import FitSettings
 from tasks.render.gate import GateSettings
-from tasks.render.scene import AssetSettings
+from tasks.render.scene.build import AssetSettings
+from tasks.render.scene.engine import Backend
 
 
 class RenderMode(StrEnum):

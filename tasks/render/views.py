@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.render.asset import RenderAsset
-from tasks.render.engine import Backend, Pinhole, render, vehicles_at
-from tasks.render.gaussians import F64
+from tasks.render.scene.asset import RenderAsset
+from tasks.render.scene.engine import Backend, render, vehicles_at
+from tasks.render.splatting.gaussians import F64
 from tasks.world.agents import AgentTracks
-from tasks.world.camera import Camera
+from tasks.world.camera import Camera, Pinhole
 from tasks.world.clip import STEP_S
 from tasks.world.vehicle import HEADING, X, Y
 

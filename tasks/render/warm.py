@@ -4,9 +4,9 @@ import numpy as np
 
 from tasks.render.fit.reconstruct import reconstruct
 from tasks.render.fit.settings import FitSettings
-from tasks.render.scene import AssetSettings, RenderAsset, build_asset
-from tasks.render.sensed import Photo, Sweep
-from tasks.render.sh import turned
+from tasks.render.scene.build import AssetSettings, RenderAsset, build_asset
+from tasks.render.scene.sensed import Photo, Sweep
+from tasks.render.splatting.sh import turned
 from tasks.world.agents import AgentKind, AgentTracks
 
 FRONT = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 1.5], [0.0, 0.0, 0.0, 1.0]])

@@ -7,7 +7,7 @@ import numpy as np
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from tasks.kernels import kernel
+from tasks.kernels.compiled import kernel
 from tasks.reward.formula import EC_WEIGHT, MULTIPLIERS, PROGRESS_THRESHOLD_M, WEIGHTS
 from tasks.reward.prepare import PreparedScene
 from tasks.reward.verdicts import Verdicts, judge

@@ -33,7 +33,7 @@ CRC_BYTES = 4
 class VocabularyLabels:
     """What every trajectory of a vocabulary scores when it is driven from one scene; arrays have K rows."""
 
-    vocabulary: str  # digest of the trajectories, tasks.vocabulary.trajectories_digest
+    vocabulary: str  # digest of the trajectories, tasks.world.vocabulary.trajectories_digest
     traffic: str  # replay: one traffic for all; idm: traffic that answers to each trajectory
     reference_progress_m: float  # compliant progress of PDM-Closed [m]
     nc: Array  # (K,) no at-fault collision: 0, 0.5, 1

@@ -12,8 +12,8 @@ from tasks.reward.prepare import PreparedScene
 from tasks.reward.reactive import reactive_scores
 from tasks.rollout.lqr import track_local
 from tasks.rollout.simulate import TrafficSettings
-from tasks.vocabulary import Vocabulary
 from tasks.world.clip import Scene
+from tasks.world.vocabulary import Vocabulary
 
 Array = NDArray[np.float64]
 TRAJECTORIES_AT_ONCE = 4096  # 15 MB of states

@@ -7,17 +7,17 @@ import numpy as np
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from tasks.kernels import kernel
-from tasks.reward.area_flags import areas_along
-from tasks.reward.centerline import Centerline, progress_m
-from tasks.reward.comfort import N_FLAGS, comfort_along, comfort_scratch
-from tasks.reward.contacts import first_collision, first_time_to_collision, reach_of
-from tasks.reward.ego import MULTIPLE_LANES, NON_DRIVABLE, ONCOMING, Body, empty_body, place
-from tasks.reward.lane_discipline import driving_direction, lane_keeping
-from tasks.reward.lights import RedLanes, first_red
-from tasks.reward.map_index import MapIndex
-from tasks.reward.obstacles import Obstacles, spans_of, unindexed, with_objects, within_reach
+from tasks.kernels.compiled import kernel
 from tasks.reward.prepare import N_TIMES, PreparedScene
+from tasks.reward.rules.area_flags import areas_along
+from tasks.reward.rules.centerline import Centerline, progress_m
+from tasks.reward.rules.comfort import N_FLAGS, comfort_along, comfort_scratch
+from tasks.reward.rules.contacts import first_collision, first_time_to_collision, reach_of
+from tasks.reward.rules.ego import MULTIPLE_LANES, NON_DRIVABLE, ONCOMING, Body, empty_body, place
+from tasks.reward.rules.lane_discipline import driving_direction, lane_keeping
+from tasks.reward.rules.lights import RedLanes, first_red
+from tasks.reward.rules.map_index import MapIndex
+from tasks.reward.rules.obstacles import Obstacles, spans_of, unindexed, with_objects, within_reach
 from tasks.world.bounds import LARGEST, all_within
 from tasks.world.vehicle import EGO_STATE_SIZE, Vehicle
 

@@ -9,8 +9,8 @@ One explicit Euler step of 0.1 s. Speed is not clipped at zero, as in the public
 
 import numpy as np
 
-from tasks.kernels import inlined
-from tasks.trig import sincos, wrap
+from tasks.kernels.compiled import inlined
+from tasks.kernels.trig import sincos, wrap
 from tasks.world.clip import STEP_S
 
 MAX_STEERING_RAD = np.pi / 3.0

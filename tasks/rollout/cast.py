@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.kernels import kernel
+from tasks.kernels.compiled import kernel
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]

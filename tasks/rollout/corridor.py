@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.kernels import inner_kernel
+from tasks.kernels.compiled import inner_kernel
 from tasks.rollout.stretches import CELLS, PATH_SPACING_M, SLACK_M, Box, View, view_along
 
 Array = NDArray[np.float64]

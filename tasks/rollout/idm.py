@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.kernels import inner_kernel
+from tasks.kernels.compiled import inner_kernel
 from tasks.rollout.corridor import Paths
 from tasks.world.clip import STEP_S
 

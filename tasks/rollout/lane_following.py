@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.kernels import kernel
+from tasks.kernels.compiled import kernel
 from tasks.rollout.lane_index import (
     COST_CAP_M,
     SNAP_HEADING_RAD,

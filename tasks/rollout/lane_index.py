@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.kernels import kernel
+from tasks.kernels.compiled import kernel
 from tasks.rollout.polylines import interpolated, lengths_along
 from tasks.world.frames import wrap_angle
 from tasks.world.lanes import Lane, RoadMap

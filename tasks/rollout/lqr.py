@@ -18,10 +18,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.kernels import inlined, kernel
+from tasks.kernels.compiled import inlined, kernel
+from tasks.kernels.trig import sincos, wrap
 from tasks.rollout.bicycle import actuate, path_curvature, travel
 from tasks.rollout.profiles import TRACKING_STEPS, Plans, empty_plans, fit_curvatures, fit_speeds
-from tasks.trig import sincos, wrap
 from tasks.world.bounds import LARGEST
 from tasks.world.clip import HORIZON_STEPS, STEP_S
 from tasks.world.vehicle import (

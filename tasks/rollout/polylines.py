@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.kernels import inner_kernel, kernel
+from tasks.kernels.compiled import inner_kernel, kernel
 
 Array = NDArray[np.float64]
 

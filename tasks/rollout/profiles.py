@@ -18,8 +18,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.kernels import inlined
-from tasks.trig import wrap
+from tasks.kernels.compiled import inlined
+from tasks.kernels.trig import wrap
 from tasks.world.clip import HORIZON_STEPS, STEP_S
 
 Array = NDArray[np.float64]

@@ -9,7 +9,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.kernels import inner_kernel
+from tasks.kernels.compiled import inner_kernel
 from tasks.rollout.cast import ABSENT, DRIVEN, NOBODY, Cast, Rows
 from tasks.rollout.corridor import (
     PATH_SPACING_M,

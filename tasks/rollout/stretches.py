@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.kernels import inner_kernel, kernel
+from tasks.kernels.compiled import inner_kernel, kernel
 
 Array = NDArray[np.float64]
 Box = Array | tuple[float, float, float, float, float]  # centre x, y [m], heading [rad], length, width [m]

@@ -17,7 +17,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.kernels import hidden_kernel, kernel
+from tasks.kernels.compiled import hidden_kernel, kernel
 from tasks.rollout.cast import (
     ABSENT,
     DRIVEN,

@@ -52,6 +52,25 @@ class Camera:
 
 
 @dataclass(frozen=True)
+class Pinhole:
+    """A camera without distortion somewhere in the world. Raises ValueError for arrays that are no camera."""
+
+    intrinsics: NDArray[np.float64]  # (3, 3) pixels, without skew, the centre of pixel (0, 0) at (0.5, 0.5)
+    world_from_camera: NDArray[np.float64]  # (4, 4) rigid; camera x right, y down, z forward
+    width: int  # pixels
+    height: int
+
+    def __post_init__(self) -> None:
+        shapes = (self.intrinsics.shape, self.world_from_camera.shape)
+        if shapes != ((3, 3), (4, 4)):
+            raise ValueError(f"Pinhole: intrinsics, pose are {shapes[0]}, {shapes[1]}, expected (3, 3) and (4, 4)")
+        if not (np.isfinite(self.intrinsics).all() and np.isfinite(self.world_from_camera).all()):
+            raise ValueError("Pinhole: intrinsics or pose hold NaN or infinity")
+        if min(self.intrinsics[0, 0], self.intrinsics[1, 1], self.width, self.height) <= 0:
+            raise ValueError("Pinhole: focal lengths, width and height must be positive")
+
+
+@dataclass(frozen=True)
 class SensorFile:
     """One image or lidar sweep of the clip; opened by the factory, never by a task."""
 

@@ -25,9 +25,9 @@ from factory.pipeline import FactoryWork, PerturbedClip
 from factory.sensors import chosen_cameras
 from factory.settings import assemble, load_config
 from factory.work import PreparedClip
-from tasks.render.asset import RenderAsset
 from tasks.render.gate import GateSettings, looked_at_size, unfit
 from tasks.render.likeness import Album
+from tasks.render.scene.asset import RenderAsset
 from tasks.render.settings import STEPS_OF, Frames
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip
 from tests.bench.gate_truth import Painted, Shown, Simulated, drives, verdicts

@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 
 from factory.clips.kitti import read_drive, steadied
 from factory.scene_file import write_scene
-from tasks.render.asset import psnr
-from tasks.render.engine import Pinhole, render
 from tasks.render.fit.exposure import affine_between, exposed
 from tasks.render.fit.losses import ssim, target_of
 from tasks.render.fit.poses import corrected
@@ -27,7 +25,10 @@ from tasks.render.fit.reconstruct import advance, corrections_at, finish, pictur
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import Problem, prepare
 from tasks.render.fit.state import FitState
-from tasks.render.sensed import Photo, shifted
+from tasks.render.scene.asset import psnr
+from tasks.render.scene.engine import render
+from tasks.render.scene.sensed import Photo, shifted
+from tasks.world.camera import Pinhole
 
 F32, F64 = NDArray[np.float32], NDArray[np.float64]
 FITTED_FRAMES = 12  # of image_03's training frames, for its affine colour and rigid correction

@@ -20,8 +20,8 @@ import numpy as np
 from factory.store.samples import Store
 from factory.store.schema import sample_row_to_table
 from factory.store.table import write_shard
-from tasks.kinematic_vocabulary import kinematic_trajectories
-from tasks.vocabulary import Vocabulary
+from tasks.world.kinematic_vocabulary import kinematic_trajectories
+from tasks.world.vocabulary import Vocabulary
 from tests.planners.samples import grey_pictures, labels, sample
 
 FEW = 64

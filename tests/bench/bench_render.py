@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factory.scene_file import read_scene
-from tasks.render.gaussians import Gaussians
-from tasks.render.gradient import backward
-from tasks.render.raster import splat, trace
+from tasks.render.splatting.gaussians import Gaussians
+from tasks.render.splatting.gradient import backward
+from tasks.render.splatting.raster import splat, trace
 from tests.bench.peer_splat import Draw, compiled, drawing, peer_checkout
 from tests.bench.timing import cpu_milliseconds, memory_mb, milliseconds
 

@@ -20,13 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factory.clips.synthetic.reader import SyntheticReader
-from tasks.kinematic_vocabulary import kinematic_trajectories
-from tasks.reward.boxes import ego_boxes
 from tasks.reward.epdms import Scores, score
 from tasks.reward.prepare import N_TIMES, PAST_STEPS, PreparedScene, prepare
+from tasks.reward.rules.boxes import ego_boxes
 from tasks.rollout.lqr import track_local
 from tasks.world.clip import NOW, scene_of_clip
 from tasks.world.frames import to_world
+from tasks.world.kinematic_vocabulary import kinematic_trajectories
 from tasks.world.polygons import polygons_near
 from tasks.world.vehicle import PACIFICA
 from tests.bench.peer import BenchScene, Beside, beside, peer_python

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from factory.clips.av2 import AV2Reader
-from tasks.kinematic_vocabulary import kinematic_trajectories
 from tasks.rollout.lqr import track_local
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out, roll_out_many
 from tasks.world.clip import NOW, Scene, scene_of_clip
+from tasks.world.kinematic_vocabulary import kinematic_trajectories
 from tests.bench.timing import cpu_milliseconds
 
 N_EGOS, NEAREST = 256, 25

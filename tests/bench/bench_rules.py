@@ -16,14 +16,14 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.reward.area_flags import areas_along
-from tasks.reward.centerline import progress_m
-from tasks.reward.comfort import comfort_along
-from tasks.reward.contacts import first_collision, first_time_to_collision
-from tasks.reward.ego import place
 from tasks.reward.epdms import score
-from tasks.reward.lane_discipline import driving_direction, lane_keeping
-from tasks.reward.lights import first_red
+from tasks.reward.rules.area_flags import areas_along
+from tasks.reward.rules.centerline import progress_m
+from tasks.reward.rules.comfort import comfort_along
+from tasks.reward.rules.contacts import first_collision, first_time_to_collision
+from tasks.reward.rules.ego import place
+from tasks.reward.rules.lane_discipline import driving_direction, lane_keeping
+from tasks.reward.rules.lights import first_red
 from tasks.reward.verdicts import scratch_for, world_of
 from tasks.rollout.lqr import track_local
 from tests.real.reference_scenes import RECORDED_K, loader, prepared_scene

@@ -7,14 +7,14 @@ from factory.clips.av2 import AV2Reader
 from factory.clips.reader import ClipReader
 from factory.clips.synthetic.reader import SyntheticReader
 from tasks.attempt import ExpertGate, attempt, perturbed_scene
-from tasks.chance import stream
-from tasks.experts.pdm_closed import PdmClosed, PdmSettings
-from tasks.kinematic_vocabulary import kinematic_trajectories
+from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings
 from tasks.perturb import Perturbation, PerturbSettings, perturb
 from tasks.reward.prepare import prepare_scene
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, simulate
-from tasks.vocabulary import Vocabulary
+from tasks.world.chance import stream
 from tasks.world.clip import scene_of_clip
+from tasks.world.kinematic_vocabulary import kinematic_trajectories
+from tasks.world.vocabulary import Vocabulary
 from tests.bench.timing import milliseconds
 
 

@@ -26,8 +26,8 @@ from factory.sensors import block_of, load_sensors
 from tasks.render.fit.reconstruct import advance, finish
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import prepare
-from tasks.render.scene import held_out_rows
-from tasks.render.sensed import Photo
+from tasks.render.scene.build import held_out_rows
+from tasks.render.scene.sensed import Photo
 from tasks.world.camera import Camera
 from tests.bench.town_truth import MOVED_M, Compared, Painter, Truth, beside, sideways
 

@@ -16,14 +16,14 @@ from factory.clips.synthetic.drive import Drive
 from factory.clips.synthetic.town import log_name, plan_log
 from factory.imaging import GATE_STRIDE
 from factory.pipeline import FactoryWork, PerturbedClip
-from tasks.render.asset import RenderAsset
-from tasks.render.engine import Pinhole, Vehicles, render, vehicles_at
 from tasks.render.gate import GateSettings, composed, fault_of, measures
-from tasks.render.gaussians import F32, F64
 from tasks.render.likeness import Album, expected, eye_in_box, inside_mean, large_vehicles, outline_of, similarity
+from tasks.render.scene.asset import RenderAsset
+from tasks.render.scene.engine import Vehicles, render, vehicles_at
+from tasks.render.splatting.gaussians import F32, F64
 from tasks.render.views import VISIBLE_M, pose_on_ground
 from tasks.world.agents import AgentKind, AgentTracks
-from tasks.world.camera import Camera
+from tasks.world.camera import Camera, Pinhole
 from tasks.world.clip import HORIZON_STEPS, STEP_S, Clip
 
 NOTHING_LARGE = 1.0  # the likeness of a picture without any large vehicle

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.render.gaussians import Gaussians
+from tasks.render.splatting.gaussians import Gaussians
 
 Draw = Callable[..., Any]  # tensors and the camera's numbers -> a picture (height, width, 3)
 

@@ -6,15 +6,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.render.asset import RenderAsset, psnr
-from tasks.render.engine import Pinhole, Vehicles, render, vehicles_at
 from tasks.render.fit.losses import ssim, target_of
-from tasks.render.gaussians import F32, F64
-from tasks.render.movers import behind_boxes
-from tasks.render.sensed import Photo
-from tasks.render.sky import directions
-from tasks.render.stereo import FAR_M
+from tasks.render.scene.asset import RenderAsset, psnr
+from tasks.render.scene.engine import Vehicles, render, vehicles_at
+from tasks.render.scene.movers import behind_boxes
+from tasks.render.scene.sensed import Photo
+from tasks.render.scene.sky import directions
+from tasks.render.scene.stereo import FAR_M
+from tasks.render.splatting.gaussians import F32, F64
 from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.camera import Pinhole
 
 Painter = Callable[[float, Photo], NDArray[np.uint8]]  # time, photo (its camera and pose): the truth there
 MOVED_M = (3.0, 0.8)  # ahead and to the left, of every vehicle

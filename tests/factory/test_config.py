@@ -23,13 +23,13 @@ from factory.settings import (
     open_reader,
     refuse_missing_backend,
 )
-from tasks.experts.pdm_closed import PdmSettings
-from tasks.experts.recovery import RecoverySettings
-from tasks.kinematic_vocabulary import kinematic_trajectories
+from tasks.experts.pdm_closed.planner import PdmSettings
+from tasks.experts.recovery.expert import RecoverySettings
 from tasks.perturb import PerturbSettings
 from tasks.render.settings import RenderMode, RenderSettings
 from tasks.rollout.simulate import TrafficSettings
-from tasks.vocabulary import Vocabulary
+from tasks.world.kinematic_vocabulary import kinematic_trajectories
+from tasks.world.vocabulary import Vocabulary
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DENSE = PerturbSettings(max_longitudinal_m=8.0, step_longitudinal_m=1.0, interleaved=False, order="spread", at_most=32)

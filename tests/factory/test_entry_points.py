@@ -20,7 +20,7 @@ from factory.store.reader import SampleTable
 from planners.evaluation.contenders import contender
 from planners.models.registry import planner_class
 from planners.training.train import main as train_main
-from tasks.kernels import cache_dir
+from tasks.kernels.compiled import cache_dir
 
 ROOT = Path(__file__).resolve().parents[2]
 MODULE = """

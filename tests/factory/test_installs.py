@@ -31,7 +31,7 @@ DISTRIBUTIONS = {  # of modules whose distribution has another name
     "rerun": "rerun-sdk",
 }
 UNSEEN = {  # declared without an import statement of ours
-    "gsplat": "tasks.render.gsplat_backend imports it by name",
+    "gsplat": "tasks.render.splatting.gsplat_backend imports it by name",
     "packaging": "torch.utils.cpp_extension imports it when gsplat compiles",
     "tensorboard": "torch.utils.tensorboard imports it",
 }

@@ -18,7 +18,7 @@ import pytest
 
 from factory.store.reader import SampleTable
 from factory.warm import compile_kernels, marker
-from tasks.kernels import cache_dir
+from tasks.kernels.compiled import cache_dir
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow]
 

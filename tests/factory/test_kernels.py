@@ -16,7 +16,7 @@ import pytest
 
 from factory.warm import compile_kernels, compiling_ahead
 from factory.work import NotReady
-from tasks.kernels import cache_dir, kernel_sources, remove_unused, sources_digest
+from tasks.kernels.compiled import cache_dir, kernel_sources, remove_unused, sources_digest
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DECORATORS = {"njit", "jit", "kernel", "inlined", "inner_kernel", "hidden_kernel", "drawing_kernel"}
@@ -29,7 +29,7 @@ def test_every_source_that_compiles_something_is_in_the_digest() -> None:
         for path in (REPOSITORY / package).rglob("*.py"):
             nodes = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)]
             compiles = any(
-                node.module in ("numba", "tasks.kernels")
+                node.module in ("numba", "tasks.kernels.compiled")
                 and {"njit", "jit", "kernel", "inlined", "inner_kernel", "hidden_kernel", "drawing_kernel"}
                 & {a.name for a in node.names}
                 for node in nodes
@@ -65,7 +65,7 @@ def small_house(tmp_path: Path) -> Path:
     (tmp_path / "tasks" / "units.py").write_text("STEP_S = 0.1\n")
     (tmp_path / "tasks" / "words.py").write_text("HELLO = 'hello'\n")
     (tmp_path / "factory" / "fast.py").write_text(
-        "from tasks.kernels import kernel\nfrom tasks.speed import LIMIT\nfrom tasks.words import greet\n"
+        "from tasks.kernels.compiled import kernel\nfrom tasks.speed import LIMIT\nfrom tasks.words import greet\n"
     )
     return tmp_path
 
@@ -93,7 +93,7 @@ def test_the_cache_lies_in_the_user_s_cache_folder_named_by_the_digest(monkeypat
 
 
 SQUARED = """
-from tasks.kernels import kernel
+from tasks.kernels.compiled import kernel
 
 @kernel
 def squared(x):
@@ -108,7 +108,7 @@ print(sum(squared.stats.cache_hits.values()), sum(squared.stats.cache_misses.val
 
 def copy_with_one_kernel(folder: Path) -> Path:
     """The project's decorator and one kernel, as a job's upload would lie in a folder of its own."""
-    for name in ("__init__", "kernels", "caches"):
+    for name in ("__init__", "caches", "kernels/__init__", "kernels/compiled"):
         target = folder / "tasks" / f"{name}.py"
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(REPOSITORY / "tasks" / f"{name}.py", target)
@@ -271,7 +271,7 @@ def test_a_part_is_compiled_again_once_a_file_of_it_is_gone(tmp_path: Path, monk
 
 def test_a_kernel_gives_the_bytes_of_its_own_python() -> None:
     """No reordered sums: compiled and interpreted addition agree to the last bit."""
-    from tasks.kernels import kernel
+    from tasks.kernels.compiled import kernel
 
     def total(values: np.ndarray) -> float:
         out = 0.0

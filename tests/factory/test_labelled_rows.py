@@ -18,13 +18,13 @@ from factory.store.reader import LABEL_COLUMNS, SampleTable, labels_of
 from factory.vocabulary import save_vocabulary
 from factory.work import HUMAN, HUMAN_CANDIDATE, Accepted, PreparedClip
 from tasks.attempt import Judged
-from tasks.kinematic_vocabulary import kinematic_trajectories
 from tasks.reward.epdms import Scores, score
 from tasks.reward.prepare import prepare_scene
 from tasks.rollout.lqr import track
-from tasks.vocabulary import Vocabulary
 from tasks.world.agents import AgentTracks
 from tasks.world.frames import to_world
+from tasks.world.kinematic_vocabulary import kinematic_trajectories
+from tasks.world.vocabulary import Vocabulary
 
 STREET = [
     "clips=custom",

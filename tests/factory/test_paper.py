@@ -8,8 +8,8 @@ import pytest
 from factory.config import ConfigError
 from factory.paper import differences, setup_text
 from factory.settings import RunConfig, choose_vocabulary, load_config
-from tasks.kinematic_vocabulary import kinematic_trajectories
-from tasks.vocabulary import Vocabulary
+from tasks.world.kinematic_vocabulary import kinematic_trajectories
+from tasks.world.vocabulary import Vocabulary
 
 
 @pytest.fixture(scope="module")

@@ -15,12 +15,12 @@ from factory.pipeline import Considered, FactoryWork
 from factory.settings import assemble, identity_of, load_config
 from factory.work import HUMAN, HUMAN_BEFORE, HUMAN_CANDIDATE, UNLISTED, Accepted, Dropped, PreparedClip
 from tasks import stages
-from tasks.chance import stream
-from tasks.kinematic_vocabulary import kinematic_trajectories
 from tasks.perturb import Perturbation, perturb
-from tasks.vocabulary import Vocabulary
+from tasks.world.chance import stream
 from tasks.world.clip import HORIZON_STEPS, NOW
 from tasks.world.frames import to_local
+from tasks.world.kinematic_vocabulary import kinematic_trajectories
+from tasks.world.vocabulary import Vocabulary
 
 SMALL = TownSettings(cameras=("ring_front_center",), width=64, height=36, lidar_beams=32, lidar_azimuths=300)
 VOCABULARY = Vocabulary(kinematic_trajectories(3, 0))

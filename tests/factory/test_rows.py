@@ -9,16 +9,16 @@ from factory.rows import sample_row
 from factory.store.schema import BOOKKEEPING, COLUMNS, MAP_RADIUS_M, sample_row_to_table
 from tasks.attempt import Judged, human_sample, perturbed_scene
 from tasks.attempt import drive_and_judge as judge
-from tasks.chance import stream
 from tasks.experts.human import Human
-from tasks.experts.pdm_closed import PdmClosed, PdmSettings
-from tasks.kinematic_vocabulary import kinematic_trajectories
+from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings
 from tasks.perturb import Candidate, Perturbation, PerturbSettings, perturb
 from tasks.rollout.simulate import TrafficSettings
-from tasks.vocabulary import Vocabulary
+from tasks.world.chance import stream
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip, scene_of_clip
 from tasks.world.frames import to_world
+from tasks.world.kinematic_vocabulary import kinematic_trajectories
 from tasks.world.lanes import LightState, MapLayer, MapPolygon, TrafficLights
+from tasks.world.vocabulary import Vocabulary
 from tests.tasks.streets import EGO_HEIGHT_M, SPEED_MPS, moved, rectangle, same_poses, street_clip
 
 RNG = np.random.default_rng(0)  # nothing here draws from it

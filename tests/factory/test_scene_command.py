@@ -10,9 +10,10 @@ import pytest
 
 from factory.scene import main
 from factory.scene_file import read_scene, write_scene
-from tasks.render.engine import Pinhole, render
-from tasks.render.gaussians import EMPTY, Gaussians
-from tasks.render.ply import from_ply, to_ply
+from tasks.render.scene.engine import render
+from tasks.render.splatting.gaussians import EMPTY, Gaussians
+from tasks.render.splatting.ply import from_ply, to_ply
+from tasks.world.camera import Pinhole
 from tests.factory.test_scene_file import scene
 
 

@@ -11,9 +11,9 @@ from safetensors import safe_open
 from safetensors.numpy import save_file
 
 from factory.scene_file import KEY, BadScene, described_by, digest_of, read_scene, tensors_of, write_scene
-from tasks.render.asset import BlockRange, Exposure, RenderAsset, ViewQuality
-from tasks.render.gaussians import EMPTY, Gaussians
-from tasks.render.sky import SkyMap
+from tasks.render.scene.asset import BlockRange, Exposure, RenderAsset, ViewQuality
+from tasks.render.scene.sky import SkyMap
+from tasks.render.splatting.gaussians import EMPTY, Gaussians
 
 
 def gaussians(n: int, count: int, seed: int) -> Gaussians:

@@ -19,7 +19,7 @@ from factory.sensors import block_of, chosen_cameras, decode_image, encode_jpeg,
 from factory.work import Halted, Stopped
 from tasks.render.fit import reconstruct
 from tasks.render.fit.settings import FitSettings
-from tasks.render.scene import AssetSettings, psnr
+from tasks.render.scene.build import AssetSettings, psnr
 from tasks.render.settings import RenderSettings, SceneFrom
 from tasks.world.agents import AgentTracks
 from tasks.world.camera import Camera, SensorFile

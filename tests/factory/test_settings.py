@@ -8,8 +8,8 @@ import pytest
 from factory.config import ConfigError
 from factory.settings import assemble, load_config, refuse_relative_root
 from factory.vocabulary import save_recovery_table
-from tasks.experts.recovery import RecoveryTable
-from tasks.kinematic_vocabulary import kinematic_trajectories
+from tasks.experts.recovery.expert import RecoveryTable
+from tasks.world.kinematic_vocabulary import kinematic_trajectories
 
 
 def test_a_relative_root_in_a_submitted_job_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

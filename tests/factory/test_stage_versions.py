@@ -17,30 +17,30 @@ from factory.clips.scenarionet import ScenarioNetReader
 from factory.rows import label_columns, sample_row
 from factory.store.schema import SCHEMA
 from tasks.attempt import Judged, perturbed_scene
-from tasks.chance import stream
 from tasks.experts.human import Human
-from tasks.experts.pdm_closed import PdmClosed, PdmSettings
+from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings
 from tasks.experts.protocol import Plan
-from tasks.experts.recovery import Recovery, RecoveryTable
-from tasks.kinematic_vocabulary import kinematic_trajectories
+from tasks.experts.recovery.expert import Recovery, RecoveryTable
 from tasks.perturb import Candidate, Perturbation, PerturbSettings, perturb
-from tasks.render.engine import NOBODY, Pinhole, render
 from tasks.render.gate import GateSettings, composed, measures
 from tasks.render.likeness import likeness_to_photo
 from tasks.render.map_drawing import draw_map_views
 from tasks.render.rigs import RIGS
-from tasks.render.scene import AssetSettings, build_asset
+from tasks.render.scene.build import AssetSettings, build_asset
+from tasks.render.scene.engine import NOBODY, render
 from tasks.render.views import render_views
 from tasks.reward.epdms import Scores, score
 from tasks.reward.label_bytes import VocabularyLabels
 from tasks.reward.prepare import prepare_scene
 from tasks.rollout.simulate import TrafficSettings, simulate
 from tasks.stages import STAGES, stage_versions
-from tasks.vocabulary import Vocabulary
-from tasks.world.camera import Camera
+from tasks.world.camera import Camera, Pinhole
+from tasks.world.chance import stream
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip, Rollout, Scene, scene_of_clip
 from tasks.world.frames import to_world
+from tasks.world.kinematic_vocabulary import kinematic_trajectories
 from tasks.world.vehicle import EGO_STATE_SIZE, VX, Y
+from tasks.world.vocabulary import Vocabulary
 from tests.factory.clips.scenarionet_scenarios import nuscenes, save
 from tests.factory.clips.test_av2 import write_log
 from tests.tasks.render import street

@@ -23,10 +23,10 @@ from factory.vocabulary import (
     save_recovery_table,
     train_windows,
 )
-from tasks.experts.recovery import RecoveryTable
-from tasks.kinematic_vocabulary import kinematic_trajectories
-from tasks.vocabulary import Vocabulary
+from tasks.experts.recovery.expert import RecoveryTable
 from tasks.world.clip import CLIP_STEPS, Clip
+from tasks.world.kinematic_vocabulary import kinematic_trajectories
+from tasks.world.vocabulary import Vocabulary
 from tests.tasks.streets import street_clip
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from factory.warm import compile_kernels, marker
-from tasks.kernels import cache_dir
+from tasks.kernels.compiled import cache_dir
 
 pytestmark = pytest.mark.slow
 

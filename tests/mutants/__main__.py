@@ -25,7 +25,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from threading import Lock
 
-from tasks.kernels import kernel_sources
+from tasks.kernels.compiled import kernel_sources
 from tests.mutants.records import PACKAGES, ROOT, Mutant, Stale, chosen, load, mutated
 
 GOAL = 0.97

@@ -18,7 +18,7 @@ from factory.store.table import write_shard
 from planners.evaluation.frames import ClipScenes, FrameKey, FramePair
 from tasks.attempt import drive_and_judge
 from tasks.experts.follow_up import BEFORE_STEPS
-from tasks.experts.pdm_closed import PdmSettings
+from tasks.experts.pdm_closed.planner import PdmSettings
 from tasks.experts.protocol import Plan
 from tasks.hard_scenes import BenchmarkClip
 from tasks.rollout.simulate import TrafficSettings, simulate

@@ -8,12 +8,12 @@ import pytest
 from factory.assets import Sensing, asset_for, sensing
 from factory.clips.av2 import AV2Reader
 from factory.sensors import block_of, load_sweeps
-from tasks.render.asset import RenderAsset
-from tasks.render.engine import Pinhole, render, vehicles_at
-from tasks.render.lidar_only import grey_of
-from tasks.render.sensed import Sweep, on_ego
+from tasks.render.scene.asset import RenderAsset
+from tasks.render.scene.engine import render, vehicles_at
+from tasks.render.scene.lidar_only import grey_of
+from tasks.render.scene.sensed import Sweep, on_ego
 from tasks.render.settings import RenderSettings
-from tasks.world.camera import Camera
+from tasks.world.camera import Camera, Pinhole
 from tasks.world.clip import Clip
 
 LOG = "7fab2350-7eaf-3b7e-a39d-6937a4c1bede"

@@ -9,19 +9,19 @@ from numpy.typing import NDArray
 
 from factory.clips.av2 import AV2Reader
 from tasks.attempt import ExpertGate, Judged, attempt, perturbed_scene
-from tasks.chance import stream
-from tasks.experts.pdm_closed import PdmClosed, PdmSettings, plan_for
+from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings, plan_for
 from tasks.experts.protocol import Expert
-from tasks.experts.recovery import Recovery, RecoveryTable
+from tasks.experts.recovery.expert import Recovery, RecoveryTable
 from tasks.perturb import Perturbation, PerturbSettings, gate_failures, grid_cells, perturb
 from tasks.reward.epdms import score
 from tasks.reward.prepare import prepare_scene
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficSettings, simulate
 from tasks.stages import SUBSCORES, Rejected
-from tasks.vocabulary import Vocabulary
+from tasks.world.chance import stream
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip, scene_of_clip
 from tasks.world.frames import to_local, to_world
+from tasks.world.vocabulary import Vocabulary
 
 LOG, START_MS = "adcf7d18-0510-35b0-a2fa-b4cea13a6d76", 6000
 K = 600  # of the 8,192 human trajectories

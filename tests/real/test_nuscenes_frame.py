@@ -9,11 +9,12 @@ import pytest
 from numpy.typing import NDArray
 
 from factory.clips.restricted_pickle import load_plain
-from tasks.render.asset import RenderAsset, psnr
-from tasks.render.engine import NOBODY, Pinhole, render, vehicles_at
-from tasks.render.scene import AssetSettings, build_asset
-from tasks.render.sensed import Photo, Sweep
+from tasks.render.scene.asset import RenderAsset, psnr
+from tasks.render.scene.build import AssetSettings, build_asset
+from tasks.render.scene.engine import NOBODY, render, vehicles_at
+from tasks.render.scene.sensed import Photo, Sweep
 from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.camera import Pinhole
 
 SIZE = (400, 225)  # a quarter of the photos' sides
 LEAST_DB = 20.0

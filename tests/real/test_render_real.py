@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from tasks.render.scene import AssetSettings, build_asset
-from tasks.render.sensed import Photo, Sweep
+from tasks.render.scene.build import AssetSettings, build_asset
+from tasks.render.scene.sensed import Photo, Sweep
 
 EGO_HEIGHT_M = 0.93  # of KITTI's IMU above the ground
 FRAMES = range(20, 52, 2)

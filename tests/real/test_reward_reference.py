@@ -10,9 +10,9 @@ from reference_scenes import RECORDED_K, SCENES, loader, prepared_scene, tracks,
 
 from factory.clips.av2 import AV2Reader, log_folders
 from factory.clips.reader import ClipRef
-from tasks.reward.comfort import extended_comfort
 from tasks.reward.epdms import Scores, human_filtered, rows, score, score_with_ec
 from tasks.reward.prepare import prepare_scene
+from tasks.reward.rules.comfort import extended_comfort
 from tasks.rollout.lqr import track
 from tasks.trajectories import score_trajectories
 from tasks.world.clip import NOW, scene_of_clip

@@ -7,19 +7,19 @@ import pytest
 from numpy.typing import NDArray
 
 from tasks.attempt import ExpertGate, Judged, attempt, human_sample, perturbed_scene, verdict
-from tasks.chance import stream
 from tasks.experts.human import Human
-from tasks.experts.pdm_closed import PdmClosed, PdmSettings
+from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings
 from tasks.experts.protocol import Expert, Plan
-from tasks.experts.recovery import Recovery, RecoveryTable
-from tasks.kinematic_vocabulary import kinematic_trajectories
+from tasks.experts.recovery.expert import Recovery, RecoveryTable
 from tasks.perturb import Perturbation, PerturbSettings, perturb
 from tasks.reward.epdms import Scores
 from tasks.rollout.simulate import TrafficSettings, simulate
 from tasks.stages import STAGES, SUBSCORES, Rejected
-from tasks.vocabulary import Vocabulary
+from tasks.world.chance import stream
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip, Rollout, Scene, scene_of_clip
 from tasks.world.frames import to_world
+from tasks.world.kinematic_vocabulary import kinematic_trajectories
+from tasks.world.vocabulary import Vocabulary
 from tests.tasks.streets import moved, same_poses, street_clip
 
 GATE = ExpertGate()

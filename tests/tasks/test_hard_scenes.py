@@ -8,7 +8,7 @@ import pytest
 
 from tasks.attempt import Judged, follow_up, half_a_second_before, perturbed_scene
 from tasks.experts.follow_up import FollowUp
-from tasks.experts.pdm_closed import PdmSettings
+from tasks.experts.pdm_closed.planner import PdmSettings
 from tasks.hard_scenes import BenchmarkClip
 from tasks.rollout.simulate import TrafficSettings
 from tasks.stages import Rejected

@@ -9,9 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tasks.chance import stream
-from tasks.experts.pdm_closed import PdmSettings, plan_for
-from tasks.kinematic_vocabulary import kinematic_trajectories
+from tasks.experts.pdm_closed.planner import PdmSettings, plan_for
 from tasks.perturb import (
     Perturbation,
     PerturbSettings,
@@ -27,9 +25,11 @@ from tasks.reward.epdms import score
 from tasks.reward.prepare import prepare_scene
 from tasks.rollout.simulate import TrafficSettings, simulate
 from tasks.stages import STAGES, Rejected
-from tasks.vocabulary import Vocabulary
+from tasks.world.chance import stream
 from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, scene_of_clip
 from tasks.world.frames import to_local, to_world
+from tasks.world.kinematic_vocabulary import kinematic_trajectories
+from tasks.world.vocabulary import Vocabulary
 from tests.tasks.streets import moved, street_clip
 
 SETTINGS = PerturbSettings()

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factory.clips.synthetic.textures import LEAVES, SPOKES, TREELINE, opaque_at
-from tasks.kernels import drawing_kernel
+from tasks.kernels.compiled import drawing_kernel
 
 NEAR_M = 0.15
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from factory.clips.synthetic import textures as tx
 from factory.clips.synthetic.textures import RGB, chance, grain, inside, noise, visible
-from tasks.kernels import drawing_kernel
+from tasks.kernels.compiled import drawing_kernel
 
 
 @drawing_kernel

@@ -6,7 +6,7 @@ alias and one place has one colour from near and far. Colours are (r, g, b) in 0
 
 import math
 
-from tasks.kernels import drawing_kernel
+from tasks.kernels.compiled import drawing_kernel
 
 # Materials
 (

@@ -29,7 +29,7 @@ from planners.models.gtrs_dense.weighting import IMITATION, SUBSCORES, WEIGHTING
 from planners.models.planner import FloatArray, Planner, TrainingData, evaluating
 from planners.models.transfuser import FusionSettings
 from tasks.reward.label_bytes import HALVES, Normalise
-from tasks.vocabulary import Vocabulary
+from tasks.world.vocabulary import Vocabulary
 
 STATUS = 8
 VELOCITY = slice(4, 6)  # of the status, after the one-hot command

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.kernels import kernel
-from tasks.render.gaussians import F32
+from tasks.kernels.compiled import kernel
+from tasks.render.splatting.gaussians import F32
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 

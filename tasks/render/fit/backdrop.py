@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.kernels import kernel
-from tasks.render.gaussians import F32, F64
-from tasks.render.sky import COLUMNS, ROWS
-from tasks.render.threads import in_chunks
+from tasks.kernels.compiled import kernel
+from tasks.kernels.threads import in_chunks
+from tasks.render.scene.sky import COLUMNS, ROWS
+from tasks.render.splatting.gaussians import F32, F64
 
 HIDDEN = 0.99
 ROWS_CHUNK = 16  # of the picture, looked up by a thread at a time

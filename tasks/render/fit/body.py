@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from tasks.render.gaussians import F64, Gaussians
+from tasks.render.splatting.gaussians import F64, Gaussians
 
 SPACING_M = 0.3
 SIGMA_M = 0.17  # of a Gaussian along its face

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.kernels import kernel
+from tasks.kernels.compiled import kernel
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.state import SHAPES, FitState, logits_of, opacities_of
-from tasks.render.gaussians import F32, F64, rotations_of
+from tasks.render.splatting.gaussians import F32, F64, rotations_of
 
 MOST_COPIES = 51  # of one Gaussian at once, as in the authors' code
 LEAST_OPACITY = 0.005

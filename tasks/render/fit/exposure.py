@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.render.gaussians import F32, F64
+from tasks.render.splatting.gaussians import F32, F64
 
 SIZE = 12  # a photo's row: 3 x 3 matrix minus identity, then 3 offsets
 

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tasks.render.fit.exposure import SIZE, aligned, exposed, inverse
-from tasks.render.gaussians import F32, F64
-from tasks.render.sensed import Photo
-from tasks.render.sight import Seen
+from tasks.render.scene.sensed import Photo
+from tasks.render.scene.sight import Seen
+from tasks.render.splatting.gaussians import F32, F64
 
 INSTANT_S = 0.05  # photos no further apart were taken at once
 POINTS = 40_000  # of the cloud are looked at, evenly

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.kernels import kernel
-from tasks.render.gaussians import F32
+from tasks.kernels.compiled import kernel
+from tasks.render.splatting.gaussians import F32
 
 WINDOW, SIGMA = 11, 1.5  # pixels, as in the paper
 C1, C2 = 0.01**2, 0.03**2  # for a range of 1

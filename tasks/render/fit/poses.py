@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.render.gaussians import F32, F64
+from tasks.render.splatting.gaussians import F32, F64
 
 SIZE = 6  # a photo's row: shift [m], turn [rad], both in its camera's frame
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.render.asset import Exposure, RenderAsset, ViewQuality, psnr
 from tasks.render.fit.backdrop import SkyCells, backdrop, backdrop_gradient, sky_cells
 from tasks.render.fit.density import refine
 from tasks.render.fit.exposure import exposed, exposed_gradient, matrix_of
@@ -17,13 +16,14 @@ from tasks.render.fit.schedule import decayed, photo_at
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import Problem, Shot, prepare
 from tasks.render.fit.state import BACKGROUND, FitState
-from tasks.render.gaussians import F32, F64, Gaussians, concatenate, moved
-from tasks.render.gradient import Gradients, backward, unmoved
-from tasks.render.movers import world_from_boxes
-from tasks.render.project import DEPTH
-from tasks.render.raster import Trace, trace
-from tasks.render.sensed import Photo, Sweep
-from tasks.render.sky import COLUMNS, ROWS, SkyMap
+from tasks.render.scene.asset import Exposure, RenderAsset, ViewQuality, psnr
+from tasks.render.scene.movers import world_from_boxes
+from tasks.render.scene.sensed import Photo, Sweep
+from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
+from tasks.render.splatting.gaussians import F32, F64, Gaussians, concatenate, moved
+from tasks.render.splatting.gradient import Gradients, backward, unmoved
+from tasks.render.splatting.project import DEPTH
+from tasks.render.splatting.raster import Trace, trace
 from tasks.world.agents import AgentTracks
 
 REPORT_EVERY = 100

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from tasks.kernels import kernel
-from tasks.render.gaussians import F32, F64
+from tasks.kernels.compiled import kernel
+from tasks.render.splatting.gaussians import F32, F64
 
 CELL_M = 0.5
 SMOOTH_CELLS = 1.5

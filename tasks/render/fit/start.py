@@ -6,9 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.render import sh
-from tasks.render.depth import sparse_depth
-from tasks.render.features import triangulated
+from tasks.kernels.threads import in_chunks
 from tasks.render.fit import exposure, poses
 from tasks.render.fit.adam import Learned
 from tasks.render.fit.body import unseen_body
@@ -17,14 +15,16 @@ from tasks.render.fit.losses import Target, target_of
 from tasks.render.fit.road import Road, above_road, find_road, lay_flat
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.state import BACKGROUND, FitState, logits_of
-from tasks.render.gaussians import F32, F64, Gaussians, concatenate, rotations_of
-from tasks.render.movers import behind_boxes
-from tasks.render.scene import held_out_rows, sky_of, surfaces
-from tasks.render.sensed import Photo, Sweep, Tracks, fuse, shifted
-from tasks.render.sight import Seen, see
-from tasks.render.sky import directions
-from tasks.render.stereo import FAR_M
-from tasks.render.threads import in_chunks
+from tasks.render.scene.build import held_out_rows, sky_of, surfaces
+from tasks.render.scene.depth import sparse_depth
+from tasks.render.scene.features import triangulated
+from tasks.render.scene.movers import behind_boxes
+from tasks.render.scene.sensed import Photo, Sweep, Tracks, fuse, shifted
+from tasks.render.scene.sight import Seen, see
+from tasks.render.scene.sky import directions
+from tasks.render.scene.stereo import FAR_M
+from tasks.render.splatting import sh
+from tasks.render.splatting.gaussians import F32, F64, Gaussians, concatenate, rotations_of
 from tasks.world.agents import AgentKind, AgentTracks
 
 ROAD_TOP_M = 0.08  # a Gaussian that starts no further from the road's surface belongs to it

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tasks.render.fit.adam import Learned
-from tasks.render.gaussians import F32, Gaussians
+from tasks.render.splatting.gaussians import F32, Gaussians
 
 BACKGROUND = -1
 SHAPES = ("means", "quats", "log_scales", "logits", "colours", "sh_rest")  # learned, one row per Gaussian

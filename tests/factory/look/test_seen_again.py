@@ -30,7 +30,7 @@ from factory.settings import assemble, load_config
 from factory.show import main
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
-from tasks.render.asset import RenderAsset, psnr
+from tasks.render.scene.asset import RenderAsset, psnr
 from tasks.stages import STAGES, SUBSCORES
 
 SMALL = TownSettings(cameras=("ring_front_center",), width=64, height=36, lidar_beams=32, lidar_azimuths=300)

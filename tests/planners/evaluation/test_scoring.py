@@ -19,7 +19,7 @@ from planners.evaluation.scoring import (
     score_pair,
 )
 from tasks.attempt import drive_and_judge
-from tasks.experts.pdm_closed import PdmSettings
+from tasks.experts.pdm_closed.planner import PdmSettings
 from tasks.experts.protocol import Plan
 from tasks.reward.one_stage import COLUMNS
 from tasks.rollout.simulate import TrafficSettings

@@ -14,7 +14,7 @@ from planners.models.gtrs_dense.planner import GtrsDense, GtrsDenseSettings, imi
 from planners.models.gtrs_dense.weighting import SUBSCORES
 from planners.models.planner import TrainingData
 from planners.training.optim import TrainingSettings
-from tasks.vocabulary import Vocabulary
+from tasks.world.vocabulary import Vocabulary
 from tests.planners import scenes
 
 K = 24

@@ -10,7 +10,7 @@ import shapely
 import shapely.ops
 from numpy.typing import NDArray
 
-from tasks.experts.pdm_settings import DEFAULTS, PdmSettings
+from tasks.experts.pdm_closed.settings import DEFAULTS, PdmSettings
 from tasks.world.agents import MOVING_KINDS, AgentKind, AgentTracks
 from tasks.world.frames import box_corners, wrap_angle
 from tasks.world.vehicle import HEADING, PACIFICA, VX, Vehicle, X, Y

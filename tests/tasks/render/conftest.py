@@ -9,7 +9,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 import street
 
-from tasks.render.scene import AssetSettings, RenderAsset, build_asset
+from tasks.render.scene.build import AssetSettings, RenderAsset, build_asset
 
 
 @pytest.fixture(scope="session")

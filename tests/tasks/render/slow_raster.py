@@ -7,9 +7,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tasks.render.gaussians import Gaussians
-from tasks.render.pixels import MAX_ALPHA
-from tasks.render.project import DILATION_PX2, MAX_TANGENT_RATIO, MIN_ALPHA, NEAR_M
+from tasks.render.splatting.gaussians import Gaussians
+from tasks.render.splatting.pixels import MAX_ALPHA
+from tasks.render.splatting.project import DILATION_PX2, MAX_TANGENT_RATIO, MIN_ALPHA, NEAR_M
 
 
 @dataclass

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.render.sensed import Photo, Sweep
+from tasks.render.scene.sensed import Photo, Sweep
 from tasks.world.agents import AgentKind, AgentTracks
 
 WIDTH, HEIGHT = 128, 72

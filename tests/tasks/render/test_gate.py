@@ -7,14 +7,14 @@ import pytest
 import street
 from scipy.ndimage import gaussian_filter
 
-from tasks.render.asset import RenderAsset
-from tasks.render.engine import NOBODY, Pinhole, render
 from tasks.render.gate import GateSettings, Measures, composed, fault_of, measured, measures, meets_road, unfit
-from tasks.render.gaussians import EMPTY, Gaussians, concatenate
-from tasks.render.raster import View
-from tasks.render.sky import SkyMap
+from tasks.render.scene.asset import RenderAsset
+from tasks.render.scene.engine import NOBODY, render
+from tasks.render.scene.sky import SkyMap
+from tasks.render.splatting.gaussians import EMPTY, Gaussians, concatenate
+from tasks.render.splatting.raster import View
 from tasks.stages import PICTURE_FAULTS, STAGES
-from tasks.world.camera import Camera
+from tasks.world.camera import Camera, Pinhole
 
 SETTINGS = GateSettings(width=128)
 FRONT = Camera("front", street.WIDTH, street.HEIGHT, street.INTRINSICS, np.zeros(3), street.EGO_FROM_CAMERA)

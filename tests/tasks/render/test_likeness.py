@@ -7,10 +7,7 @@ import pytest
 import street
 from numpy.typing import NDArray
 
-from tasks.render.asset import Exposure, RenderAsset
-from tasks.render.engine import Pinhole, Vehicles, render, vehicles_at
 from tasks.render.gate import GateSettings, unfit
-from tasks.render.gaussians import Gaussians
 from tasks.render.likeness import (
     FADING,
     Album,
@@ -23,11 +20,14 @@ from tasks.render.likeness import (
     sightings,
     similarity,
 )
-from tasks.render.movers import BEYOND_M
-from tasks.render.raster import View
+from tasks.render.scene.asset import Exposure, RenderAsset
+from tasks.render.scene.engine import Vehicles, render, vehicles_at
+from tasks.render.scene.movers import BEYOND_M
+from tasks.render.splatting.gaussians import Gaussians
+from tasks.render.splatting.raster import View
 from tasks.stages import Rejected
 from tasks.world.agents import AgentKind
-from tasks.world.camera import Camera, SensorFile
+from tasks.world.camera import Camera, Pinhole, SensorFile
 
 FRONT = Camera("front", street.WIDTH, street.HEIGHT, street.INTRINSICS, np.zeros(3), street.EGO_FROM_CAMERA)
 SIZE = (street.WIDTH, street.HEIGHT)

@@ -8,7 +8,7 @@ import street
 
 from tasks.render.map_drawing import GROUND, ROAD, SKY, WHITE, clip_near, draw_map_views, ground_height
 from tasks.render.rigs import RIGS, pinhole
-from tasks.render.scene import RenderAsset, psnr
+from tasks.render.scene.build import RenderAsset, psnr
 from tasks.render.views import pose_on_ground, render_views, undistorted
 from tasks.world.camera import Camera
 from tasks.world.lanes import Lane, MapLayer, MapPolygon, RoadMap

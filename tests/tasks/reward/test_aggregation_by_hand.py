@@ -5,12 +5,12 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
-from straight_street import drive, street
 
 from tasks.reward.epdms import Scores, human_filtered, relative_progress, score, score_with_ec
 from tasks.reward.formula import MULTIPLIERS, WEIGHTS
 from tasks.reward.one_stage import COLUMNS, columns_of, final_score, frame_scores, means_of
 from tasks.reward.two_stage import Group, aggregate, follow_up_weights, group_scores
+from tests.tasks.reward.straight_street import drive, street
 
 NONE = np.nan  # no frame at most 0.55 s before
 

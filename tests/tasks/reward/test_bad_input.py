@@ -5,12 +5,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from random_worlds import random_drives, random_world
 
 from tasks.reward.epdms import score
 from tasks.reward.prepare import prepare
 from tasks.rollout.lqr import track
 from tasks.world.lanes import MapLayer, MapPolygon
+from tests.tasks.reward.random_worlds import random_drives, random_world
 
 BOW_TIE = np.array([[0.0, 0.0], [4.0, 4.0], [4.0, 0.0], [0.0, 4.0], [0.0, 0.0]])
 SQUARE = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0], [0.0, 0.0]])

@@ -5,15 +5,15 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from straight_street import Thing, drive, past_of, rectangle, street, tracks
 
 from tasks.reward.epdms import Scores, human_filtered, relative_progress, rows, score, score_with_ec
-from tasks.reward.map_index import index_map
 from tasks.reward.prepare import prepare
+from tasks.reward.rules.map_index import index_map
 from tasks.rollout.lqr import track
 from tasks.world.agents import AgentKind
 from tasks.world.frames import to_world
 from tasks.world.lanes import MapLayer
+from tests.tasks.reward.straight_street import Thing, drive, past_of, rectangle, street, tracks
 
 TRAFFIC = (
     Thing(25.3, 0.2, 0.02, (3.0, 0.1)),

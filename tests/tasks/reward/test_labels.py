@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 
 from tasks.attempt import Judged, drive_and_judge, human_sample, perturbed_scene
 from tasks.experts.human import Human
-from tasks.experts.pdm_closed import PdmSettings
+from tasks.experts.pdm_closed.planner import PdmSettings
 from tasks.experts.protocol import Plan
-from tasks.kinematic_vocabulary import kinematic_trajectories
 from tasks.reward.epdms import Scores, score
 from tasks.reward.label_bytes import HALVES, WHOLES, VocabularyLabels
 from tasks.reward.labels import Labelling, vocabulary_labels
@@ -18,9 +17,10 @@ from tasks.reward.prepare import prepare_scene
 from tasks.reward.reactive import reactive_scores
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficSettings, simulate
-from tasks.vocabulary import Vocabulary
 from tasks.world.clip import NOW, Scene, scene_of_clip
 from tasks.world.frames import to_world
+from tasks.world.kinematic_vocabulary import kinematic_trajectories
+from tasks.world.vocabulary import Vocabulary
 from tests.tasks.streets import street_clip
 
 REPLAY, IDM = TrafficSettings(mode="replay"), TrafficSettings()

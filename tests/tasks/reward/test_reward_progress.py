@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from straight_street import drive, rectangle, street
 
 from tasks.reward.epdms import score
 from tasks.world.lanes import MapLayer
 from tasks.world.vehicle import HEADING, X, Y
+from tests.tasks.reward.straight_street import drive, rectangle, street
 
 
 def test_progress_is_the_distance_driven_and_related_to_the_best_of_the_batch():

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_worlds import random_drives, random_world
 
 from tasks.reward.epdms import Scores, score
 from tasks.reward.prepare import among, prepare
+from tests.tasks.reward.random_worlds import random_drives, random_world
 from tests.tasks.reward.slow import epdms as slow
 from tests.tasks.reward.slow.prepare import prepare as slow_prepare
 

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.kernels import kernel
+from tasks.kernels.compiled import kernel
 from tasks.world.clip import STEP_S
 from tests.tasks.rollout.slow_corridor import (
     PATH_SPACING_M,

@@ -5,7 +5,7 @@ from decimal import Decimal, localcontext
 import numpy as np
 import pytest
 
-from tasks.kernels import kernel
+from tasks.kernels.compiled import kernel
 from tasks.rollout.lqr import BLOCK
 from tasks.rollout.profiles import (
     COUPLING,

@@ -15,8 +15,8 @@ from factory.clips.synthetic.mesh import Builder, merged
 from factory.clips.synthetic.rig import build_rig, world_from_ego
 from tasks.render.fit.reconstruct import advance, finish
 from tasks.render.fit.start import prepare
-from tasks.render.scene import held_out_rows
-from tasks.render.sensed import Photo, Sweep
+from tasks.render.scene.build import held_out_rows
+from tasks.render.scene.sensed import Photo, Sweep
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.camera import Camera
 from tests.bench.bench_town import SETTINGS

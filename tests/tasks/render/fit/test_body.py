@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tasks.render.fit.body import FAR_M, unseen_body
-from tasks.render.gaussians import Gaussians
+from tasks.render.splatting.gaussians import Gaussians
 
 
 def rear(size: np.ndarray) -> Gaussians:

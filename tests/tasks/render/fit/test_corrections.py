@@ -7,10 +7,10 @@ from tasks.render.fit.backdrop import backdrop, backdrop_gradient, sky_cells
 from tasks.render.fit.exposure import affine_between, aligned, exposed, exposed_gradient
 from tasks.render.fit.poses import between, corrected, motion
 from tasks.render.fit.schedule import decayed, photo_at
-from tasks.render.gaussians import Gaussians
-from tasks.render.gradient import backward
-from tasks.render.raster import trace
-from tasks.render.sky import COLUMNS, ROWS, SkyMap
+from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
+from tasks.render.splatting.gaussians import Gaussians
+from tasks.render.splatting.gradient import backward
+from tasks.render.splatting.raster import trace
 
 RNG = np.random.default_rng(3)
 K = np.array([[20.0, 0.0, 10.0], [0.0, 20.0, 8.0], [0.0, 0.0, 1.0]])

@@ -7,8 +7,8 @@ from tasks.render.fit.adam import Learned
 from tasks.render.fit.density import refine, shared
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.state import FitState, logits_of, opacities_of
-from tasks.render.gaussians import Gaussians, concatenate
-from tasks.render.raster import rasterize
+from tasks.render.splatting.gaussians import Gaussians, concatenate
+from tasks.render.splatting.raster import rasterize
 
 K = np.array([[40.0, 0.0, 16.0], [0.0, 40.0, 16.0], [0.0, 0.0, 1.0]])
 

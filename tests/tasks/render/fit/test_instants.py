@@ -10,8 +10,8 @@ from tasks.render.fit.exposure import exposed, inverse
 from tasks.render.fit.instants import exposures_of, in_agreement, instants
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import prepare
-from tasks.render.sensed import Photo, Tracks, fuse
-from tasks.render.sight import see
+from tasks.render.scene.sensed import Photo, Tracks, fuse
+from tasks.render.scene.sight import see
 
 DARKER = np.array([-0.3, 0, 0, 0, -0.25, 0, 0, 0, -0.2, 0.02, 0.0, 0.01], np.float32)
 

@@ -7,18 +7,19 @@ import pytest
 import street
 from numpy.typing import NDArray
 
-from tasks.render import sh
-from tasks.render.asset import psnr
-from tasks.render.engine import Pinhole, Vehicles, render
 from tasks.render.fit.adam import BETA1, Learned
 from tasks.render.fit.reconstruct import advance, corrections_at, finish, picture_of, reconstruct
 from tasks.render.fit.schedule import photo_at
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import Problem, prepare
 from tasks.render.fit.state import SHAPES, FitState
-from tasks.render.gaussians import moved, turned_quats
-from tasks.render.sensed import Photo, Sweep, Tracks
+from tasks.render.scene.asset import psnr
+from tasks.render.scene.engine import Vehicles, render
+from tasks.render.scene.sensed import Photo, Sweep, Tracks
+from tasks.render.splatting import sh
+from tasks.render.splatting.gaussians import moved, turned_quats
 from tasks.world.agents import AgentKind
+from tasks.world.camera import Pinhole
 
 SETTINGS = FitSettings(
     iterations=24,

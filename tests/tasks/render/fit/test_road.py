@@ -3,7 +3,7 @@
 import numpy as np
 
 from tasks.render.fit.road import above_road, find_road, lay_flat
-from tasks.render.gaussians import rotations_of
+from tasks.render.splatting.gaussians import rotations_of
 
 RNG = np.random.default_rng(0)
 

@@ -1,0 +1,1 @@
+"""The recovery expert: back to the log along human trajectories."""

@@ -1,0 +1,84 @@
+"""The scene of a block: what a reconstruction gives and every rendering starts from."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tasks.render.scene.boxes import box_gaussians
+from tasks.render.scene.movers import world_from_boxes
+from tasks.render.scene.sky import SkyMap
+from tasks.render.splatting.gaussians import F32, F64, Gaussians, concatenate, moved
+from tasks.world.agents import AgentKind
+
+
+@dataclass(frozen=True)
+class BlockRange:
+    """The stretch of driving that a scene stands for."""
+
+    dataset: str
+    log_id: str
+    start_s: float  # since the log's first instant
+    end_s: float
+    low: F64  # (2,) smallest x, y [m] the sensors were at, world
+    high: F64  # (2,) greatest
+
+
+@dataclass(frozen=True)
+class ViewQuality:
+    """How well one photo comes out."""
+
+    camera: str
+    time_s: float  # since the block's first step
+    psnr_db: float
+    ssim: float  # NaN where it was not measured
+    held_out: bool  # the scene was built without this photo
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """What one camera made of the scene's light at one time: photo = affine[:, :3] @ rgb + affine[:, 3]."""
+
+    camera: str
+    time_s: float  # since the block's first step
+    affine: F32  # (3, 4)
+
+
+@dataclass(frozen=True)
+class RenderAsset:
+    """A block's scene. World coordinates minus `origin` everywhere, so that float32 is exact to less than a mm."""
+
+    origin: F64  # (3,) world [m]
+    background: Gaussians
+    nodes: Mapping[str, Gaussians]  # track id -> Gaussians in box coordinates (centre; x along the heading)
+    sky: SkyMap
+    psnr_db: float  # of the photos held out against their rendering; NaN when none was
+    n_held_out: int = 0
+    digest: str = ""  # of everything else; filled by whoever stores the scene
+    views: tuple[ViewQuality, ...] = ()  # photo by photo, where that was measured
+    exposures: tuple[Exposure, ...] = ()  # of the photos, where they were aligned; images at new poses have none
+    block: BlockRange | None = None  # filled by whoever knows the log
+
+
+def psnr(a: NDArray[np.generic], b: NDArray[np.generic]) -> float:
+    """Peak signal-to-noise ratio [dB] of two images of the same type: uint8 (peak 255) or float (peak 1)."""
+    peak = 255.0 if a.dtype == np.uint8 else 1.0
+    error = float(np.mean((a.astype(np.float64) - b.astype(np.float64)) ** 2))
+    return float("inf") if error == 0.0 else 10.0 * float(np.log10(peak**2 / error))
+
+
+def scene_at(asset: RenderAsset, track_ids: Sequence[str], kinds: Sequence[AgentKind], boxes: F64) -> Gaussians:
+    """Background and the named tracks at `boxes` (N, 7) x, y, z, heading, length, width, height in the world.
+
+    A track without Gaussians of its own is a plain shaded box: nobody is invisible.
+    """
+    local = boxes - np.concatenate([asset.origin, np.zeros(4)])
+    poses = world_from_boxes(local)
+    parts = [asset.background]
+    for j, track_id in enumerate(track_ids):
+        node = asset.nodes.get(track_id)
+        if node is None:
+            node = box_gaussians(boxes[j, 4:7], kinds[j])
+        parts.append(moved(node, poses[j]))
+    return concatenate(parts)

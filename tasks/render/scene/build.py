@@ -1,0 +1,195 @@
+"""The Gaussian scene of a block of driving, built from its coloured points: lidar sweeps and photos with known poses.
+
+Lidar gives each photo a sparse depth image, gaps are closed along surfaces, what lidar does not reach gets its depth
+from neighbouring photos; every pixel becomes a disc, discs that others look through are dropped, the closest look at
+each surface is kept, and the colours are refitted so that the photos come out. What lies in the box of a vehicle,
+pedestrian or bicycle goes to that track's own Gaussians, in box coordinates.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tasks.render.scene.asset import RenderAsset, psnr, scene_at
+from tasks.render.scene.choose import BACKGROUND, Look, choose, count_free_space, with_mirror_image
+from tasks.render.scene.engine import Vehicles, render
+from tasks.render.scene.features import triangulated
+from tasks.render.scene.movers import owners, world_from_boxes
+from tasks.render.scene.refit import FitPhoto, refit_colours
+from tasks.render.scene.sensed import Photo, Sweep, Tracks, fuse, shifted
+from tasks.render.scene.sight import SHALLOW, Seen, see
+from tasks.render.scene.sky import SkyCollector, SkyMap, directions
+from tasks.render.scene.stereo import FAR_M
+from tasks.render.scene.surfels import discs_of_photo, gaussians_of
+from tasks.render.splatting.gaussians import EMPTY, F32, F64, Gaussians
+from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.camera import Pinhole
+
+MIN_NODE_DISCS = 40  # a track seen less is drawn as a plain box
+
+
+@dataclass(frozen=True)
+class AssetSettings:
+    """How a scene is built. Pixels are those of the photos handed in."""
+
+    max_gap_px: tuple[int, int] = (12, 24)  # columns, rows that are interpolated between lidar returns
+    refit_sweeps: int = 1  # a second one gains 0.02 .. 0.08 dB for a third of the time
+    hold_out_every: int = 8  # photo i of a camera with i % n == n // 2 only measures; 0: none is held out
+    stereo_photos: int = 4  # neighbours compared where lidar does not reach
+
+
+def build_asset(
+    photos: Sequence[Photo], sweeps: Sequence[Sweep], agents: AgentTracks | None, settings: AssetSettings
+) -> RenderAsset:
+    """The scene of one block. `agents`: 10 Hz tracks whose first step is time 0 of photos and sweeps.
+
+    Raises ValueError without photos: there is nothing to take colours from.
+    """
+    if not photos:
+        raise ValueError("build_asset: no photos")
+    origin = np.round(photos[0].world_from_camera[:3, 3])
+    photos = [replace(p, world_from_camera=shifted(p.world_from_camera, -origin)) for p in photos]
+    sweeps = [replace(s, world_from_ego=shifted(s.world_from_ego, -origin)) for s in sweeps]
+    held_out = held_out_rows(photos, settings.hold_out_every)
+    train = [p for i, p in enumerate(photos) if i not in held_out]
+    tracks = Tracks(agents, origin)
+    static, per_track = fuse(sweeps, tracks)
+    static = static if sweeps else triangulated(train, tracks)
+    seen = [see(p, train, static, per_track, tracks, settings.max_gap_px, settings.stereo_photos) for p in train]
+    background, nodes = surfaces(train, seen, tracks)
+    sky = sky_of(train, seen)
+    asset = RenderAsset(origin, background, nodes, sky, float("nan"))
+    asset = _refit(asset, train, seen, tracks, settings.refit_sweeps)
+    if not held_out:
+        return asset
+    scores = [
+        psnr(photos[i].rgb.astype(np.float32) / 255.0, _picture(asset, photos[i], tracks)) for i in sorted(held_out)
+    ]
+    return replace(asset, psnr_db=float(np.mean(scores)), n_held_out=len(scores))
+
+
+def held_out_rows(photos: Sequence[Photo], every: int) -> frozenset[int]:
+    """Indices of the photos that only measure: of each camera every `every`-th, from the middle of the first on."""
+    if every == 0:
+        return frozenset()
+    count: dict[str, int] = {}
+    out = set()
+    for i, photo in enumerate(photos):
+        at = count.get(photo.camera, 0)
+        count[photo.camera] = at + 1
+        if at % every == every // 2:
+            out.add(i)
+    return frozenset(out)
+
+
+def surfaces(photos: Sequence[Photo], seen: Sequence[Seen], tracks: Tracks) -> tuple[Gaussians, dict[str, Gaussians]]:
+    """Discs of all photos, carved, dealt to background and tracks, the closest looks kept."""
+    # Only what lidar or the sky says may carve: a guess must not drill holes.
+    carvers = [np.where(s.sky, FAR_M, np.where(s.label == SHALLOW, 0.0, s.depth)).astype(np.float32) for s in seen]
+    looks = []
+    for photo, sight in zip(photos, seen):
+        rgb = photo.rgb.astype(np.float32) / 255.0
+        discs = discs_of_photo(rgb, sight.depth, sight.label, photo.intrinsics, photo.world_from_camera)
+        boxes, valid = tracks.at(photo.time_s)
+        poses = world_from_boxes(boxes)
+        owner = owners(discs.points, boxes, valid)
+        at = (discs.pixels[:, 0], discs.pixels[:, 1])
+        label, guessed = sight.label[at], sight.label[at] == SHALLOW
+        street = (owner < 0) & (label < 0) & ~sight.passing[at]
+        street[street] = _witnessed(discs.points[street], guessed[street], photos, carvers)
+        keep = np.flatnonzero(street | (owner >= 0))
+        looks.append(
+            Look(
+                discs.take(keep),
+                owner[keep],
+                guessed[keep],
+                sight.depth,
+                photo.intrinsics,
+                photo.world_from_camera,
+                {int(j): poses[j] for j in np.flatnonzero(valid)},
+            )
+        )
+    kept = choose(looks)
+    nodes = {}
+    for j, discs in kept.items():
+        if j == BACKGROUND or len(discs.points) < MIN_NODE_DISCS:
+            continue
+        whole = with_mirror_image(discs) if tracks.kinds[j] == AgentKind.VEHICLE else discs
+        nodes[tracks.ids[j]] = gaussians_of(whole, np.zeros(3))
+    return gaussians_of(kept[BACKGROUND], np.zeros(3)) if BACKGROUND in kept else EMPTY, nodes
+
+
+def _witnessed(
+    points: F64, guessed: NDArray[np.bool_], photos: Sequence[Photo], carvers: Sequence[F32]
+) -> NDArray[np.bool_]:
+    """Which points (M, 3) not more photos look through than see; one that lidar saw is lost to two at least."""
+    in_front, agreeing = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
+    for photo, depth in zip(photos, carvers):
+        camera_from_world = np.ascontiguousarray(np.linalg.inv(photo.world_from_camera))
+        count_free_space(points, camera_from_world, photo.intrinsics, depth, in_front, agreeing)
+    return np.asarray((in_front <= agreeing) | ((in_front < 2) & ~guessed))
+
+
+def sky_of(photos: Sequence[Photo], seen: Sequence[Seen]) -> SkyMap:
+    """What the photos show of the sky."""
+    collector = SkyCollector()
+    for photo, sight in zip(photos, seen):
+        height, width = sight.depth.shape
+        rays = directions(photo.intrinsics, photo.world_from_camera, width, height)
+        use = ~sight.passing
+        collector.add(rays[use], photo.rgb[use].astype(np.float32) / 255.0, sight.sky[use])
+    return collector.finish()
+
+
+def _members(asset: RenderAsset, tracks: Tracks, time_s: float) -> tuple[list[int], F64]:
+    """Tracks that are there at a time, and all boxes in the world."""
+    boxes, valid = tracks.at(time_s)
+    boxes = boxes + np.concatenate([asset.origin, np.zeros(4)])
+    return [int(j) for j in np.flatnonzero(valid)], boxes
+
+
+def _picture(asset: RenderAsset, photo: Photo, tracks: Tracks) -> F32:
+    """The rendering of a photo (pose local) as the scene was at its time."""
+    rows, boxes = _members(asset, tracks, photo.time_s)
+    present = Vehicles(tuple(tracks.ids[j] for j in rows), tuple(tracks.kinds[j] for j in rows), boxes[rows])
+    height, width = photo.rgb.shape[:2]
+    camera = Pinhole(photo.intrinsics, shifted(photo.world_from_camera, asset.origin), width, height)
+    return render(asset, [camera], present)[0].rgb
+
+
+def _refit(
+    asset: RenderAsset, photos: Sequence[Photo], seen: Sequence[Seen], tracks: Tracks, sweeps: int
+) -> RenderAsset:
+    """The same scene with refitted colours."""
+    names = list(asset.nodes)
+    parts = [asset.background, *(asset.nodes[name] for name in names)]
+    starts = np.concatenate([[0], np.cumsum([len(p) for p in parts])])
+    place = {name: k + 1 for k, name in enumerate(names)}
+
+    def present(i: int) -> tuple[list[str], F64]:
+        rows, boxes = _members(asset, tracks, photos[i].time_s)
+        rows = [j for j in rows if tracks.ids[j] in place]
+        return [tracks.ids[j] for j in rows], boxes[rows]
+
+    def scene_of(i: int) -> Gaussians:
+        ids, boxes = present(i)
+        return scene_at(asset, ids, [AgentKind.VEHICLE] * len(ids), boxes)
+
+    def rows_of(i: int) -> NDArray[np.intp]:
+        ids, _ = present(i)
+        spans = [0, *(place[name] for name in ids)]
+        return np.concatenate([np.arange(starts[k], starts[k + 1]) for k in spans])
+
+    inputs = []
+    for photo, sight in zip(photos, seen):
+        height, width = photo.rgb.shape[:2]
+        backdrop = asset.sky.seen_by(photo.intrinsics, photo.world_from_camera, width, height)
+        rgb = photo.rgb.astype(np.float32) / 255.0
+        inputs.append(FitPhoto(rgb, photo.intrinsics, photo.world_from_camera, backdrop, sight.passing))
+    colours = refit_colours(
+        scene_of, inputs, np.concatenate([p.colours for p in parts]), rows_of, len(asset.background), sweeps
+    )
+    fitted = [replace(p, colours=colours[starts[k] : starts[k + 1]]) for k, p in enumerate(parts)]
+    return replace(asset, background=fitted[0], nodes=dict(zip(names, fitted[1:])))

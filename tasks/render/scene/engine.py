@@ -1,0 +1,96 @@
+"""The one function that draws a scene: `render(asset, cameras, vehicles, backend) -> rgb, depth, alpha` per camera.
+
+Two backends with one face. `cpu` is the compiled tile rasteriser of this room: the same input gives the same bytes.
+`gsplat` draws the same Gaussians with CUDA, equal up to the last bits of 8-bit colours. Both draw ideal pinholes: a
+camera's distortion is taken out of its photos before they enter a scene (`views.undistorted`), so that images at new
+poses need none.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from types import MappingProxyType
+
+import numpy as np
+
+from tasks.render.scene.asset import RenderAsset, scene_at
+from tasks.render.scene.movers import boxes_at
+from tasks.render.scene.sensed import shifted
+from tasks.render.splatting.gaussians import F32, F64, Gaussians
+from tasks.render.splatting.raster import View, rasterize
+from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.camera import Pinhole
+
+
+class Backend(StrEnum):
+    CPU = "cpu"
+    GSPLAT = "gsplat"
+
+
+@dataclass(frozen=True)
+class Vehicles:
+    """Who is in the scene, and where: vehicles, pedestrians and bicycles."""
+
+    track_ids: tuple[str, ...]
+    kinds: tuple[AgentKind, ...]
+    boxes: F64  # (N, 7) x, y, z of the centre, heading, length, width, height; world [m, rad]
+
+
+NOBODY = Vehicles((), (), np.zeros((0, 7)))
+
+
+def vehicles_at(agents: AgentTracks, time_s: float, around: F64 | None = None, reach_m: float = np.inf) -> Vehicles:
+    """The tracks that are there at a time since their first step; given a place `around` (2,), those within reach."""
+    boxes, valid = boxes_at(agents, time_s)
+    if around is not None:
+        valid = valid & (np.hypot(*(boxes[:, :2] - around).T) < reach_m)
+    rows = np.flatnonzero(valid)
+    return Vehicles(tuple(agents.track_ids[j] for j in rows), tuple(agents.kinds[j] for j in rows), boxes[rows])
+
+
+def render(
+    asset: RenderAsset,
+    cameras: Sequence[Pinhole],
+    vehicles: Vehicles = NOBODY,
+    backend: Backend = Backend.CPU,
+    threads: int = 1,
+) -> list[View]:
+    """What each of the `cameras` sees of the scene with `vehicles` in it: rgb in [0, 1], depth [m], alpha.
+
+    Behind everything is the sky, so that a camera which sees no Gaussian gets a picture of the sky map with alpha 0,
+    never a black one. `threads` are the CPU backend's and change no byte. Raises BackendMissing where the backend
+    cannot work on this machine.
+    """
+    scene = scene_at(asset, vehicles.track_ids, vehicles.kinds, vehicles.boxes)
+    local = [replace(camera, world_from_camera=shifted(camera.world_from_camera, -asset.origin)) for camera in cameras]
+    backdrops = [asset.sky.seen_by(c.intrinsics, c.world_from_camera, c.width, c.height) for c in local]
+    views = RASTERISERS[backend](scene, local, backdrops, threads)
+    return [replace(view, rgb=np.clip(view.rgb, 0.0, 1.0)) for view in views]
+
+
+def check(backend: Backend) -> None:
+    """Raises BackendMissing where the backend cannot work on this machine, with how to mend it."""
+    if backend is Backend.GSPLAT:
+        from tasks.render.splatting.gsplat_backend import require
+
+        require()
+
+
+Rasteriser = Callable[[Gaussians, Sequence[Pinhole], Sequence[F32], int], list[View]]
+"""Gaussians, cameras and (H, W, 3) backdrops in one frame, threads -> views; colours may leave [0, 1]."""
+
+
+def _on_cpu(scene: Gaussians, cameras: Sequence[Pinhole], backdrops: Sequence[F32], threads: int) -> list[View]:
+    return [
+        rasterize(scene, camera.intrinsics, camera.world_from_camera, camera.width, camera.height, backdrop, threads)
+        for camera, backdrop in zip(cameras, backdrops)
+    ]
+
+
+def _with_gsplat(scene: Gaussians, cameras: Sequence[Pinhole], backdrops: Sequence[F32], threads: int) -> list[View]:
+    from tasks.render.splatting.gsplat_backend import rasterize_all  # torch is loaded only where it is asked for
+
+    return rasterize_all(scene, cameras, backdrops)
+
+
+RASTERISERS: Mapping[Backend, Rasteriser] = MappingProxyType({Backend.CPU: _on_cpu, Backend.GSPLAT: _with_gsplat})

@@ -1,0 +1,121 @@
+"""Boxes that move: where they are at an instant, and which points are theirs."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tasks.kernels.compiled import kernel
+from tasks.render.splatting.gaussians import F64
+from tasks.world.agents import AgentTracks
+from tasks.world.clip import STEP_S
+from tasks.world.frames import wrap_angle
+
+MARGIN_M = 0.15  # boxes are drawn tightly; mirrors and noise stick out
+BEYOND_M = 0.12  # around a driving box nothing is trusted to be the street
+DRIVING_M = 1.0
+GROUND_CLEARANCE_M = 0.12  # the road under a car stays behind when it leaves
+
+
+def boxes_at(agents: AgentTracks, time_s: float) -> tuple[F64, NDArray[np.bool_]]:
+    """Boxes (N, 7) x, y, z of the centre, heading, length, width, height at a time since the first step; valid (N,).
+
+    Linear between steps; valid where both neighbouring steps are.
+    """
+    at = np.clip(time_s / STEP_S, 0.0, agents.n_steps - 1.0)
+    before = int(np.floor(at + 1e-6))
+    after = min(before + 1, agents.n_steps - 1)
+    share = float(np.clip(at - before, 0.0, 1.0))
+    if share < 1e-3:
+        after, share = before, 0.0
+    first, second = agents.boxes[before], agents.boxes[after]
+    xy = first[:, :2] * (1 - share) + second[:, :2] * share
+    z = agents.center_z[before] * (1 - share) + agents.center_z[after] * share
+    heading = first[:, 2] + share * wrap_angle(second[:, 2] - first[:, 2])
+    boxes = np.column_stack([xy, z, heading, first[:, 3:5], agents.heights])
+    return boxes, agents.valid[before] & agents.valid[after]
+
+
+def world_from_boxes(boxes: F64) -> F64:
+    """Poses (N, 4, 4) of boxes (N, 7): origin at the centre, x along the heading, z up."""
+    c, s = np.cos(boxes[:, 3]), np.sin(boxes[:, 3])
+    poses = np.tile(np.eye(4), (len(boxes), 1, 1))
+    poses[:, 0, 0], poses[:, 0, 1], poses[:, 1, 0], poses[:, 1, 1] = c, -s, s, c
+    poses[:, :3, 3] = boxes[:, :3]
+    return poses
+
+
+def driving(agents: AgentTracks) -> NDArray[np.bool_]:
+    """(N,) tracks that leave their place at some time; the others may be taken for part of the street."""
+    first = np.argmax(agents.valid, axis=0)
+    start = agents.boxes[first, np.arange(len(agents)), :2]
+    away = np.linalg.norm(agents.boxes[..., :2] - start, axis=-1)
+    return np.asarray((np.where(agents.valid, away, 0.0) > DRIVING_M).any(axis=0))
+
+
+@kernel
+def behind_boxes(points: Any, eye: Any, boxes: Any) -> Any:
+    """Whether the sight line from `eye` (3,) to a point (M, 3), and a little further, meets a moving box (N, 7): (M,).
+
+    Such a pixel shows the mover, its shadow or its edge: nothing that stays.
+    """
+    out = np.zeros(points.shape[0], np.bool_)
+    cosines, sines = np.cos(boxes[:, 3]), np.sin(boxes[:, 3])
+    for i in range(points.shape[0]):
+        dx, dy, dz = points[i, 0] - eye[0], points[i, 1] - eye[1], points[i, 2] - eye[2]
+        length = dx * dx + dy * dy + dz * dz
+        for j in range(boxes.shape[0]):
+            ex, ey, ez = eye[0] - boxes[j, 0], eye[1] - boxes[j, 1], eye[2] - boxes[j, 2]
+            reach = 0.0  # of a ball around the box, squared: most lines miss most balls, which is soon known
+            for k in range(4, 7):
+                half = 0.5 * boxes[j, k] + 2.0 * BEYOND_M
+                reach += half * half
+            along = ex * dx + ey * dy + ez * dz
+            if (ex * ex + ey * ey + ez * ez - reach) * length > along * along:
+                continue
+            enter, leave = 0.0, 1.0 + BEYOND_M / max(np.sqrt(dx * dx + dy * dy + dz * dz), 1e-3)
+            for axis in range(3):
+                if axis == 0:
+                    start, step, half = cosines[j] * ex + sines[j] * ey, cosines[j] * dx + sines[j] * dy, boxes[j, 4]
+                elif axis == 1:
+                    start, step, half = cosines[j] * ey - sines[j] * ex, cosines[j] * dy - sines[j] * dx, boxes[j, 5]
+                else:
+                    start, step, half = ez, dz, boxes[j, 6]
+                half = 0.5 * half + BEYOND_M
+                if abs(step) < 1e-9:
+                    if abs(start) > half:
+                        leave = -1.0
+                    continue
+                a, b = (-half - start) / step, (half - start) / step
+                enter, leave = max(enter, min(a, b)), min(leave, max(a, b))
+            if enter <= leave:
+                out[i] = True
+                break
+    return out
+
+
+@kernel
+def owners(points: Any, boxes: Any, movable: Any) -> Any:
+    """Row of the box each point (M, 3) lies in, -1 for none; the box with the nearest centre wins.
+
+    `boxes` (N, 7), `movable` (N,) False: box is not looked at.
+    """
+    out = np.full(points.shape[0], -1, np.int32)
+    cosines, sines = np.cos(boxes[:, 3]), np.sin(boxes[:, 3])
+    for i in range(points.shape[0]):
+        nearest = np.inf
+        for j in range(boxes.shape[0]):
+            if not movable[j]:
+                continue
+            dx, dy, dz = points[i, 0] - boxes[j, 0], points[i, 1] - boxes[j, 1], points[i, 2] - boxes[j, 2]
+            along = cosines[j] * dx + sines[j] * dy
+            across = cosines[j] * dy - sines[j] * dx
+            half_height = 0.5 * boxes[j, 6]
+            if abs(along) > 0.5 * boxes[j, 4] + MARGIN_M or abs(across) > 0.5 * boxes[j, 5] + MARGIN_M:
+                continue
+            if dz > half_height + MARGIN_M or dz < -half_height + GROUND_CLEARANCE_M:
+                continue
+            distance = dx * dx + dy * dy
+            if distance < nearest:
+                nearest, out[i] = distance, j
+    return out

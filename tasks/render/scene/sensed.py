@@ -1,0 +1,96 @@
+"""What the sensors recorded of a block: photos, sweeps, tracks; and the sweeps as one cloud, what moves apart."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tasks.render.scene.movers import GROUND_CLEARANCE_M, boxes_at, driving, owners, world_from_boxes
+from tasks.render.splatting.gaussians import F32, F64
+from tasks.world.agents import MOVING_KINDS, AgentTracks
+from tasks.world.vehicle import PACIFICA
+
+EGO_MARGIN_M = 0.3
+FUSED_VOXEL_M = 0.07
+
+
+@dataclass(frozen=True)
+class Photo:
+    """An image without distortion and where it was taken."""
+
+    camera: str
+    time_s: float  # since the clip's first step
+    rgb: NDArray[np.uint8]  # (H, W, 3)
+    intrinsics: F64  # (3, 3) pixels, the centre of pixel (0, 0) at (0.5, 0.5)
+    world_from_camera: F64  # (4, 4)
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """One turn of the lidar."""
+
+    time_s: float
+    points: F32  # (M, 3) ego frame [m]
+    world_from_ego: F64  # (4, 4)
+    intensity: NDArray[np.uint8] | None = None  # (M,) strength of the return
+
+
+def shifted(pose: F64, by: F64) -> F64:
+    """A pose (4, 4) moved by (3,)."""
+    out = pose.copy()
+    out[:3, 3] += by
+    return out
+
+
+class Tracks:
+    """The movable tracks of a block, in its local frame."""
+
+    def __init__(self, agents: AgentTracks | None, origin: F64) -> None:
+        self._agents, self._origin = agents, origin
+        self.ids = agents.track_ids if agents is not None else ()
+        self.kinds = agents.kinds if agents is not None else ()
+        self.driving = driving(agents) if agents is not None else np.zeros(0, bool)
+        self._movable = np.array([kind in MOVING_KINDS for kind in self.kinds], bool)
+
+    def at(self, time_s: float) -> tuple[F64, NDArray[np.bool_]]:
+        """Boxes (N, 7) local, and which of them are there and movable (N,)."""
+        if self._agents is None:
+            return np.zeros((0, 7)), np.zeros(0, bool)
+        boxes, valid = boxes_at(self._agents, time_s)
+        boxes[:, :3] -= self._origin
+        return boxes, valid & self._movable
+
+
+def fuse(sweeps: Sequence[Sweep], tracks: Tracks) -> tuple[F64, dict[int, F64]]:
+    """Lidar points that stay (M, 3) local, and those of each track in its box's frame; both thinned by voxels."""
+    static, moving = [np.zeros((0, 3))], dict[int, list[F64]]()
+    for sweep in sweeps:
+        outside = sweep.points[~on_ego(sweep.points)]
+        points = outside.astype(np.float64) @ sweep.world_from_ego[:3, :3].T + sweep.world_from_ego[:3, 3]
+        boxes, valid = tracks.at(sweep.time_s)
+        owner = owners(points, boxes, valid)
+        static.append(_voxels(points[owner < 0]))
+        poses = world_from_boxes(boxes)
+        for j in np.unique(owner[owner >= 0]):
+            mine = points[owner == j]
+            moving.setdefault(int(j), []).append((mine - poses[j, :3, 3]) @ poses[j, :3, :3])
+    return _voxels(np.concatenate(static)), {j: _voxels(np.concatenate(parts)) for j, parts in sorted(moving.items())}
+
+
+def on_ego(points: F32) -> NDArray[np.bool_]:
+    """Returns from the ego's own body (M,): left in, they would hang over the road as a trail."""
+    x, y = points[:, 0], points[:, 1]
+    along = (x > -PACIFICA.rear_length - EGO_MARGIN_M) & (x < PACIFICA.front_length + EGO_MARGIN_M)
+    return np.asarray(along & (np.abs(y) < PACIFICA.half_width + EGO_MARGIN_M) & (points[:, 2] > GROUND_CLEARANCE_M))
+
+
+def voxel_rows(points: F64) -> NDArray[np.intp]:
+    """Rows of the first point (M, 3) of every voxel, ascending."""
+    cells = np.floor((points - points.min(axis=0, initial=np.inf)) / FUSED_VOXEL_M).astype(np.int64)
+    _, first = np.unique((cells[:, 0] << 40) | (cells[:, 1] << 20) | cells[:, 2], return_index=True)
+    return np.sort(first)
+
+
+def _voxels(points: F64) -> F64:
+    return points[voxel_rows(points)]

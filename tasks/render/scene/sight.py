@@ -1,0 +1,108 @@
+"""What one photo shows, pixel by pixel: how far, whose, sky or not.
+
+Lidar gives sparse depth, gaps are closed along surfaces; what lidar does not reach gets its depth from other photos.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tasks.render.scene.depth import dense_depth, sparse_depth
+from tasks.render.scene.movers import behind_boxes, world_from_boxes
+from tasks.render.scene.sensed import Photo, Tracks
+from tasks.render.scene.sky import directions
+from tasks.render.scene.stereo import FAR_M, MAX_BASELINE_M, MIN_BASELINE_M, sweep_depth
+from tasks.render.splatting.gaussians import F32, F64
+
+SHALLOW = -2  # label of a pixel without lidar
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a photo shows, (H, W) each."""
+
+    depth: F32  # [m]; 0: nothing known
+    label: NDArray[np.int32]  # -1 background, row of a track, SHALLOW
+    sky: NDArray[np.bool_]
+    passing: NDArray[np.bool_]  # pixels at or behind something that drives: no witnesses of the street
+
+
+def see(
+    photo: Photo,
+    others: Sequence[Photo],
+    static: F64,
+    per_track: dict[int, F64],
+    tracks: Tracks,
+    max_gap_px: tuple[int, int],
+    stereo_photos: int,
+) -> Seen:
+    """A photo's depth from the fused lidar (`fuse`), completed from the `others` it is compared with."""
+    height, width = photo.rgb.shape[:2]
+    rgb = photo.rgb.astype(np.float32) / 255.0
+    boxes, valid = tracks.at(photo.time_s)
+    poses = world_from_boxes(boxes)
+    points, labels = [static], [np.full(len(static), -1, np.int32)]
+    for j, mine in per_track.items():
+        if valid[j]:
+            points.append(mine @ poses[j, :3, :3].T + poses[j, :3, 3])
+            labels.append(np.full(len(mine), j, np.int32))
+    sparse, label = sparse_depth(
+        np.concatenate(points), np.concatenate(labels), photo.intrinsics, photo.world_from_camera, width, height
+    )
+    depth, label = dense_depth(sparse, label, rgb, max_gap_px)
+    unknown = depth == 0.0
+    bright = _looks_like_sky(rgb)
+    neighbours = _neighbours(photo, others, stereo_photos)
+    hints = _hints(depth)
+    if neighbours:
+        guess, cost, sky_cost = sweep_depth(rgb, hints, neighbours, photo.intrinsics, photo.world_from_camera, unknown)
+        sky = unknown & ((bright & (sky_cost < 1.3 * cost + 0.03)) | (guess >= FAR_M))
+    else:
+        guess, sky = hints[0], unknown & (bright | (hints[0] == 0.0))
+    depth = np.where(unknown & ~sky, guess, depth).astype(np.float32)
+    seen_to = (
+        directions(photo.intrinsics, photo.world_from_camera, width, height)
+        * np.where(depth > 0, depth, FAR_M)[..., None]
+    )
+    eye = np.ascontiguousarray(photo.world_from_camera[:3, 3])
+    passing = behind_boxes(seen_to.reshape(-1, 3) + eye, eye, boxes[valid & tracks.driving]).reshape(height, width)
+    return Seen(depth, label, sky, passing)
+
+
+def _looks_like_sky(rgb: F32) -> NDArray[np.bool_]:
+    brightness = rgb.mean(axis=-1)
+    return np.asarray((brightness > 0.6) | ((rgb[..., 2] > rgb[..., 0] + 0.04) & (brightness > 0.4)))
+
+
+def _hints(depth: F32) -> F32:
+    """(3, H, W) depths of the nearest known pixel below, to the left and to the right; 0 where there is none.
+
+    A facade or a tree goes on above the last lidar return with the depth of that return.
+    """
+    height, width = depth.shape
+    rows, columns = np.arange(height)[:, None], np.arange(width)[None, :]
+    known = depth > 0
+    below = np.minimum.accumulate(np.where(known, rows, height)[::-1], axis=0)[::-1]
+    left = np.maximum.accumulate(np.where(known, columns, -1), axis=1)
+    right = np.minimum.accumulate(np.where(known, columns, width)[:, ::-1], axis=1)[:, ::-1]
+    return np.stack(
+        [
+            np.where(below < height, depth[np.minimum(below, height - 1), columns], 0.0),
+            np.where(left >= 0, depth[rows, np.maximum(left, 0)], 0.0),
+            np.where(right < width, depth[rows, np.minimum(right, width - 1)], 0.0),
+        ]
+    ).astype(np.float32)
+
+
+def _neighbours(photo: Photo, others: Sequence[Photo], n: int) -> list[tuple[F32, F64, F64]]:
+    """The n photos whose baseline is closest to 1 m and that look the same way."""
+    candidates = []
+    for i, other in enumerate(others):
+        baseline = float(np.linalg.norm(other.world_from_camera[:3, 3] - photo.world_from_camera[:3, 3]))
+        same_way = float(other.world_from_camera[:3, 2] @ photo.world_from_camera[:3, 2]) > 0.9
+        if MIN_BASELINE_M <= baseline <= MAX_BASELINE_M and same_way and other.rgb.shape == photo.rgb.shape:
+            candidates.append((abs(np.log(baseline)), i))
+    best = [others[i] for _, i in sorted(candidates)[:n]]
+    return [(o.rgb.astype(np.float32) / 255.0, o.intrinsics, o.world_from_camera) for o in best]

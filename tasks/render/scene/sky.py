@@ -1,0 +1,82 @@
+"""What is behind everything: colour by direction."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+from tasks.render.splatting.gaussians import F32, F64
+
+ROWS, COLUMNS = 256, 1024  # elevation +90 deg .. -90 deg, azimuth -180 deg .. 180 deg
+
+SKY_WEIGHT = 1.0e4  # against one pixel of something else in the same direction
+
+
+@dataclass(frozen=True)
+class SkyMap:
+    """Infinitely far colours. Where no photo saw sky: the mean colour seen in that direction, so that a hole in the
+    scene is no hole to the sky."""
+
+    rgb: F32  # (ROWS, COLUMNS, 3) in [0, 1], world directions
+
+    def seen_by(self, intrinsics: F64, world_from_camera: F64, width: int, height: int) -> F32:
+        """The backdrop (H, W, 3) of a camera."""
+        rows, columns = _cells(directions(intrinsics, world_from_camera, width, height))
+        y0 = np.clip(np.floor(rows).astype(np.intp), 0, ROWS - 2)
+        x0 = np.floor(columns).astype(np.intp)
+        fy = np.clip(rows - y0, 0.0, 1.0)[..., None]
+        fx = (columns - x0)[..., None]
+        left, right = x0 % COLUMNS, (x0 + 1) % COLUMNS
+        top = self.rgb[y0, left] * (1 - fx) + self.rgb[y0, right] * fx
+        bottom = self.rgb[y0 + 1, left] * (1 - fx) + self.rgb[y0 + 1, right] * fx
+        return np.asarray(top * (1 - fy) + bottom * fy, np.float32)
+
+
+def directions(intrinsics: F64, world_from_camera: F64, width: int, height: int) -> F64:
+    """(H, W, 3) viewing directions in the world, not normalised."""
+    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    rays = np.stack(
+        [(u - intrinsics[0, 2]) / intrinsics[0, 0], (v - intrinsics[1, 2]) / intrinsics[1, 1], np.ones_like(u)], axis=-1
+    )
+    return np.asarray(rays @ world_from_camera[:3, :3].T)
+
+
+def _cells(rays: F64) -> tuple[F64, F64]:
+    elevation = np.arctan2(rays[..., 2], np.hypot(rays[..., 0], rays[..., 1]))
+    azimuth = np.arctan2(rays[..., 1], rays[..., 0])
+    return (0.5 - elevation / np.pi) * ROWS - 0.5, (azimuth / (2 * np.pi) + 0.5) * COLUMNS - 0.5
+
+
+class SkyCollector:
+    """Averages what photos show of the sky (and, with next to no weight, of the street)."""
+
+    def __init__(self) -> None:
+        self._sums = np.zeros((ROWS * COLUMNS, 4))
+
+    def add(self, rays: F64, rgb: F32, is_sky: NDArray[np.bool_]) -> None:
+        """Colours (M, 3) in [0, 1] seen in directions (M, 3), and whether it was sky (M,)."""
+        weight = np.where(is_sky, SKY_WEIGHT, 1.0)
+        rows, columns = _cells(rays)
+        cell = np.clip(np.rint(rows), 0, ROWS - 1).astype(np.intp) * COLUMNS
+        cell += np.rint(columns).astype(np.intp) % COLUMNS
+        for channel in range(3):
+            self._sums[:, channel] += np.bincount(cell, weight * rgb[:, channel], ROWS * COLUMNS)
+        self._sums[:, 3] += np.bincount(cell, weight, ROWS * COLUMNS)
+
+    def finish(self) -> SkyMap:
+        """Cells nobody looked at take the colour of the nearest one that was; plain grey without any photo."""
+        sums = self._sums.reshape(ROWS, COLUMNS, 4)
+        seen = sums[..., 3] > 0
+        if not seen.any():
+            return SkyMap(np.full((ROWS, COLUMNS, 3), 0.7, np.float32))
+        colours = sums[..., :3] / np.maximum(sums[..., 3:], 1e-9)
+        out = np.empty((ROWS, COLUMNS, 3), np.float32)
+        for half in (slice(0, ROWS // 2), slice(ROWS // 2, ROWS)):  # sky and street do not fill each other
+            there = seen[half] if seen[half].any() else seen
+            source = colours[half] if seen[half].any() else colours
+            wrapped = np.concatenate([there] * 3, axis=1)
+            nearest = distance_transform_edt(~wrapped, return_distances=False, return_indices=True)
+            rows = nearest[0][: ROWS // 2, COLUMNS : 2 * COLUMNS]
+            out[half] = source[rows, nearest[1][: ROWS // 2, COLUMNS : 2 * COLUMNS] % COLUMNS]
+        return SkyMap(out)

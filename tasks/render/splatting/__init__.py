@@ -1,0 +1,1 @@
+"""3D Gaussians to pixels, and the way back."""

@@ -1,0 +1,188 @@
+"""Anisotropic 3-D Gaussians: what a rendered scene is made of."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tasks.kernels.compiled import kernel
+from tasks.render.splatting import sh
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+_NO_SH = np.zeros((0, 0, 3), np.float32)
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """N Gaussians in one frame (a block's or a vehicle box's).
+
+    Raises ValueError where the arrays' shapes do not agree.
+    """
+
+    means: F32  # (N, 3) [m]
+    quats: F32  # (N, 4) w, x, y, z; unit; columns of the rotation are the axes of the scales
+    log_scales: F32  # (N, 3) natural log of the standard deviations [m]
+    opacities: F32  # (N,) in (0, 1)
+    colours: F32  # (N, 3) rgb, what all sides have in common (SH degree 0); in [0, 1] where there is no more than that
+    sh_rest: F32 = field(
+        default_factory=lambda: _NO_SH
+    )  # (N, M, 3), M in 0, 3, 8, 15: degrees 1 to 3, see splatting.sh
+
+    def __post_init__(self) -> None:
+        n = len(self.means)
+        if self.sh_rest is _NO_SH:
+            object.__setattr__(self, "sh_rest", np.zeros((n, 0, 3), np.float32))
+        if self.sh_rest.shape not in [(n, count, 3) for count in sh.COUNTS]:
+            raise ValueError(f"Gaussians: sh_rest is {self.sh_rest.shape}, expected ({n}, 0 or 3 or 8 or 15, 3)")
+        shapes = (self.means.shape, self.quats.shape, self.log_scales.shape, self.opacities.shape, self.colours.shape)
+        if shapes != ((n, 3), (n, 4), (n, 3), (n,), (n, 3)):
+            raise ValueError(f"Gaussians: shapes do not agree: {shapes}")
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def take(self, rows: NDArray[np.bool_] | NDArray[np.intp] | slice) -> "Gaussians":
+        """The Gaussians at `rows` (indices or mask); a slice copies nothing."""
+        return Gaussians(
+            self.means[rows],
+            self.quats[rows],
+            self.log_scales[rows],
+            self.opacities[rows],
+            self.colours[rows],
+            self.sh_rest[rows],
+        )
+
+
+EMPTY = Gaussians(
+    np.zeros((0, 3), np.float32),
+    np.zeros((0, 4), np.float32),
+    np.zeros((0, 3), np.float32),
+    np.zeros(0, np.float32),
+    np.zeros((0, 3), np.float32),
+)
+
+
+def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
+    """All parts as one, in order, with the most coefficients of any; `EMPTY` for no parts."""
+    if not parts:
+        return EMPTY
+    sh_rest = np.zeros((sum(len(p) for p in parts), max(p.sh_rest.shape[1] for p in parts), 3), np.float32)
+    start = 0
+    for part in parts:
+        sh_rest[start : start + len(part), : part.sh_rest.shape[1]] = part.sh_rest
+        start += len(part)
+    return Gaussians(
+        np.concatenate([p.means for p in parts]),
+        np.concatenate([p.quats for p in parts]),
+        np.concatenate([p.log_scales for p in parts]),
+        np.concatenate([p.opacities for p in parts]),
+        np.concatenate([p.colours for p in parts]),
+        sh_rest,
+    )
+
+
+def moved(gaussians: Gaussians, target_from_source: F64) -> Gaussians:
+    """The same Gaussians in another frame; `target_from_source` (4, 4) is rigid.
+
+    The light turns along: who looks at a moved vehicle sees what its own frame says for that side.
+    """
+    rotation = target_from_source[:3, :3]
+    means = gaussians.means @ rotation.T + target_from_source[:3, 3]
+    quats = turned_quats(quats_of(rotation[None])[0], gaussians.quats)
+    return Gaussians(
+        means.astype(np.float32),
+        quats.astype(np.float32),
+        gaussians.log_scales,
+        gaussians.opacities,
+        gaussians.colours,
+        sh.turned(gaussians.sh_rest, rotation),
+    )
+
+
+def mirrored(gaussians: Gaussians) -> Gaussians:
+    """Reflected at the plane y = 0 (the unseen side of a car from its seen one)."""
+    # A reflection turns R into F R with determinant -1; the covariance is the same for F R F, a rotation,
+    # whose quaternion is (w, -x, y, -z).
+    flip = np.array([1.0, -1.0, 1.0, -1.0], np.float32)
+    return Gaussians(
+        gaussians.means * np.array([1.0, -1.0, 1.0], np.float32),
+        gaussians.quats * flip,
+        gaussians.log_scales,
+        gaussians.opacities,
+        gaussians.colours,
+        sh.turned(gaussians.sh_rest, np.diag([1.0, -1.0, 1.0])),
+    )
+
+
+def turned_quats(turn: F64, quats: NDArray[np.floating]) -> F64:
+    """Hamilton products turn * quats of a quaternion (4,) w, x, y, z and many (N, 4)."""
+    return np.asarray(_turned_quats(turn, quats))
+
+
+@kernel
+def _turned_quats(turn: Any, quats: Any) -> Any:
+    lw, lx, ly, lz = turn
+    out = np.empty((len(quats), 4))
+    for i in range(len(quats)):
+        rw, rx, ry, rz = quats[i]
+        out[i, 0] = lw * rw - lx * rx - ly * ry - lz * rz
+        out[i, 1] = lw * rx + lx * rw + ly * rz - lz * ry
+        out[i, 2] = lw * ry - lx * rz + ly * rw + lz * rx
+        out[i, 3] = lw * rz + lx * ry - ly * rx + lz * rw
+    return out
+
+
+def quats_of(rotations: F64) -> F64:
+    """Unit quaternions (N, 4) of rotation matrices (N, 3, 3)."""
+    return np.asarray(_quats_of(np.ascontiguousarray(rotations, np.float64)))
+
+
+@kernel
+def _quats_of(rotations: Any) -> Any:
+    out = np.empty((len(rotations), 4))
+    for i in range(len(rotations)):
+        m = rotations[i]
+        # Each is 4 * (one component) * q; the one with the largest component is well conditioned.
+        squares = (
+            1 + m[0, 0] + m[1, 1] + m[2, 2],
+            1 + m[0, 0] - m[1, 1] - m[2, 2],
+            1 - m[0, 0] + m[1, 1] - m[2, 2],
+            1 - m[0, 0] - m[1, 1] + m[2, 2],
+        )
+        best = 0
+        for k in range(1, 4):
+            if squares[k] > squares[best]:
+                best = k
+        if best == 0:
+            w, x, y, z = squares[0], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
+        elif best == 1:
+            w, x, y, z = m[2, 1] - m[1, 2], squares[1], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]
+        elif best == 2:
+            w, x, y, z = m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], squares[2], m[1, 2] + m[2, 1]
+        else:
+            w, x, y, z = m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], squares[3]
+        length = np.sqrt(w * w + x * x + y * y + z * z)
+        out[i, 0], out[i, 1], out[i, 2], out[i, 3] = w / length, x / length, y / length, z / length
+    return out
+
+
+def rotations_of(quats: NDArray[np.floating]) -> F64:
+    """Rotation matrices (N, 3, 3) of unit quaternions (N, 4)."""
+    w, x, y, z = np.asarray(quats, np.float64).T
+    return np.stack(
+        [
+            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
+            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
+            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
+        ],
+        axis=-2,
+    )
+
+
+def covariances_of(gaussians: Gaussians) -> F64:
+    """(N, 3, 3) covariance matrices [m^2]."""
+    axes = rotations_of(gaussians.quats) * np.exp(gaussians.log_scales.astype(np.float64))[:, None, :]
+    return np.asarray(axes @ np.swapaxes(axes, 1, 2))

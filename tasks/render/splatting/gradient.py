@@ -1,0 +1,162 @@
+"""The way back from a picture to the Gaussians and the camera it was made with, written out by hand.
+
+Tiles are gone through front to back once more; each leaves one row of sums per Gaussian on it, a Gaussian's rows are
+then added up in a fixed order, so that the result does not depend on the number of threads.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tasks.kernels.threads import in_chunks
+from tasks.render.splatting import sh
+from tasks.render.splatting.gaussians import F32, F64, Gaussians, quats_of, turned_quats
+from tasks.render.splatting.pixels_gradient import SUMS_SIZE, W_BLUE, W_RED, add_pairs, blend_gradient
+from tasks.render.splatting.project_gradient import project_gradient
+from tasks.render.splatting.raster import GAUSSIANS_CHUNK, TILES_CHUNK, Trace, pinhole
+from tasks.render.splatting.tiles import pair_starts
+
+
+@dataclass(frozen=True)
+class Gradients:
+    """Derivatives of a loss by the M Gaussians of a view; those that are not in `index` have none."""
+
+    index: NDArray[np.int64]  # (M,) rows in the scene, ascending
+    means: F32  # (M, 3) [1/m]
+    quats: F32  # (M, 4) by the quaternions as given: rendering normalises them, so this has no part along them
+    log_scales: F32  # (M, 3)
+    logits: F32  # (M,) by log(opacity / (1 - opacity))
+    colours: F32  # (M, 3)
+    sh_rest: F32  # (M, count, 3)
+    screen: F32  # (M, 2) [1/px] by the centre on the picture, u and v: how much density control wants it elsewhere
+    camera: F64  # (6,) by v [1/m], w [1/rad] of a camera motion x' = x + v + w cross x, x in camera coordinates
+
+
+def backward(
+    trace: Trace,
+    gaussians: Gaussians,
+    d_rgb: F32,
+    d_depth: F32 | None = None,
+    d_alpha: F32 | None = None,
+    threads: int = 1,
+) -> Gradients:
+    """Derivatives of a loss, from its derivatives by the view's rgb (H, W, 3), depth and alpha (H, W).
+
+    `gaussians` as traced. By the background it is d_rgb * (1 - alpha). Where the cut-off at 1/255, the cap on alpha or
+    the order in depth changes the picture jumps, and its jumps have no derivative: alpha beyond the cap counts as flat.
+    Raises ValueError where shapes are not the view's.
+    """
+    splats, n, count = trace.splats, len(trace.splats.index), gaussians.sh_rest.shape[1]
+    pair_start = pair_starts(splats.tiles)
+    pairs = _pairs(trace, pair_start, d_rgb, d_depth, d_alpha, threads)
+    center = np.ascontiguousarray(np.linalg.inv(splats.camera_from_scene)[:3, 3])
+    sums = np.empty((n, SUMS_SIZE), np.float32)
+    shapes = ((n, 3), (n, 4), (n, 3), (n,), (n, 2), (n, 3), (n, count, 3))
+    means, quats, log_scales, logits, screen, colours, sh_rest = (np.empty(shape, np.float32) for shape in shapes)
+
+    def run(first: int, last: int) -> F64:
+        camera = np.zeros(6)
+        add_pairs(pair_start, pairs, first, last, sums)
+        project_gradient(
+            gaussians.means,
+            gaussians.quats,
+            gaussians.log_scales,
+            splats.camera_from_scene,
+            *pinhole(splats.intrinsics),
+            splats.width,
+            splats.height,
+            splats.index,
+            splats.projected,
+            sums,
+            first,
+            last,
+            means,
+            quats,
+            log_scales,
+            logits,
+            screen,
+            camera,
+        )
+        by_direction = sh.seen_gradient(
+            gaussians.means,
+            gaussians.colours,
+            gaussians.sh_rest,
+            center,
+            splats.index,
+            sums[:, W_RED : W_BLUE + 1],
+            first,
+            last,
+            means,
+            colours,
+            sh_rest,
+        )
+        # To the directions, a camera moved by v is as a scene moved by v; turning it changes none of them.
+        camera[:3] += splats.camera_from_scene[:3, :3] @ by_direction
+        return camera
+
+    camera = np.sum([np.zeros(6), *in_chunks(run, n, GAUSSIANS_CHUNK, threads)], axis=0)
+    return Gradients(splats.index, means, quats, log_scales, logits, colours, sh_rest, screen, camera)
+
+
+def _pairs(
+    trace: Trace,
+    pair_start: NDArray[np.int64],
+    d_rgb: F32,
+    d_depth: F32 | None,
+    d_alpha: F32 | None,
+    threads: int,
+) -> F32:
+    """(pairs, 11) columns of tasks.render.splatting.pixels_gradient, Gaussian by Gaussian."""
+    splats, view = trace.splats, trace.view
+    by_depth = np.zeros_like(view.alpha) if d_depth is None else np.ascontiguousarray(d_depth, np.float32)
+    by_alpha = np.zeros_like(view.alpha) if d_alpha is None else np.ascontiguousarray(d_alpha, np.float32)
+    shapes = (d_rgb.shape, by_depth.shape, by_alpha.shape)
+    if shapes != (view.rgb.shape, view.alpha.shape, view.alpha.shape):
+        raise ValueError(f"backward: upstream shapes {shapes} do not fit a view of {view.rgb.shape}")
+    by_rgb = np.ascontiguousarray(d_rgb, np.float32)
+    out = np.empty((len(splats.tile_splats), SUMS_SIZE), np.float32)
+
+    def run(first: int, last: int) -> None:
+        blend_gradient(
+            splats.projected,
+            splats.tiles,
+            splats.tile_start,
+            splats.tile_splats,
+            trace.tile_end,
+            pair_start,
+            by_rgb,
+            by_depth,
+            by_alpha,
+            view.rgb,
+            view.depth,
+            view.alpha,
+            first,
+            last,
+            out,
+        )
+
+    in_chunks(run, len(trace.tile_end), TILES_CHUNK, threads)
+    return out
+
+
+def unmoved(gradients: Gradients, target_from_source: F64) -> Gradients:
+    """Derivatives by the Gaussians in the frame that `gaussians.moved` took them from.
+
+    `target_from_source` (4, 4) as given there; what belongs to the picture or the camera stays.
+    """
+    rotation = target_from_source[:3, :3]
+    inverse = quats_of(rotation.T[None])[0]
+    count = gradients.sh_rest.shape[1]
+    turn = sh.turning(rotation, count)
+    return Gradients(
+        gradients.index,
+        (gradients.means @ rotation).astype(np.float32),
+        turned_quats(inverse, gradients.quats).astype(np.float32),
+        gradients.log_scales,
+        gradients.logits,
+        gradients.colours,
+        np.einsum("ba,nbc->nac", turn, gradients.sh_rest).astype(np.float32),
+        gradients.screen,
+        gradients.camera,
+    )

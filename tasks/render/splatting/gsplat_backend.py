@@ -1,0 +1,101 @@
+"""The CUDA backend: the same Gaussians through `gsplat.rasterization` (gsplat >= 1.5.3), all cameras of a size at once.
+
+Its conventions are those of the CPU rasteriser: quaternions w first, world-to-camera matrices with z forward, the
+centre of pixel (0, 0) at (0.5, 0.5), contributions cut off at 1/255 and capped at 0.999. What differs is passed on
+(near plane, screen dilation) or below 8 bits (no more than 1e-4 of the light is dropped instead of 1e-3).
+torch and gsplat are loaded by the first call, nowhere else; gsplat compiles its CUDA sources then, once per machine.
+"""
+
+import importlib
+from collections import defaultdict
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from tasks.render.splatting import sh
+from tasks.render.splatting.gaussians import F32, Gaussians
+from tasks.render.splatting.project import DILATION_PX2, NEAR_M
+from tasks.render.splatting.raster import View
+from tasks.world.camera import Pinhole
+
+HOW_TO_MEND = 'install them (pip install -e ".[gpu]" in the checkout), or draw with render.backend=cpu'
+
+
+class BackendMissing(RuntimeError):
+    """This machine lacks what the backend needs."""
+
+
+def require() -> tuple[Any, Any]:
+    """The modules torch and gsplat. Raises BackendMissing where one is absent or there is no CUDA device."""
+    found = []
+    for name in ("torch", "gsplat"):
+        try:
+            found.append(importlib.import_module(name))
+        except ImportError as error:
+            raise BackendMissing(f"render.backend=gsplat needs torch and gsplat ({error}): {HOW_TO_MEND}") from error
+    torch, gsplat = found
+    if not torch.cuda.is_available():
+        raise BackendMissing(
+            f"render.backend=gsplat needs a CUDA device; torch {torch.__version__} sees none: "
+            "run where there is one, or draw with render.backend=cpu"
+        )
+    return torch, gsplat
+
+
+def arguments(scene: Gaussians, cameras: Sequence[Pinhole]) -> dict[str, Any]:
+    """What `gsplat.rasterization` is called with: arrays float32 by its names, and plain settings.
+
+    means (N, 3), quats (N, 4), scales (N, 3), opacities (N,), colors (N, 3) or, with sh_degree, coefficients (N, K, 3),
+    viewmats (C, 4, 4) camera from scene, Ks (C, 3, 3). All cameras are of one size.
+    """
+    degree = sh.COUNTS.index(scene.sh_rest.shape[1])
+    colours = scene.colours
+    if degree:
+        base = (scene.colours - 0.5) / sh.C0  # gsplat adds the half again
+        colours = np.concatenate([base[:, None], scene.sh_rest], axis=1)
+    arrays = {
+        "means": scene.means,
+        "quats": scene.quats,
+        "scales": np.exp(scene.log_scales),
+        "opacities": scene.opacities,
+        "colors": colours,
+        "viewmats": np.stack([np.linalg.inv(camera.world_from_camera) for camera in cameras]),
+        "Ks": np.stack([camera.intrinsics for camera in cameras]),
+    }
+    return {name: np.ascontiguousarray(array, np.float32) for name, array in arrays.items()} | {
+        "width": cameras[0].width,
+        "height": cameras[0].height,
+        "near_plane": NEAR_M,
+        "eps2d": DILATION_PX2,
+        "sh_degree": degree or None,
+        "render_mode": "RGB+ED",  # the last channel is the depth, a mean by weight
+        "packed": True,  # memory follows what is seen, not cameras x Gaussians
+    }
+
+
+def view_of(colours_and_depth: F32, alpha: F32, backdrop: F32) -> View:
+    """One camera's (H, W, 4) and (H, W, 1) over a backdrop (H, W, 3), which gsplat cannot draw itself."""
+    covered = alpha[..., 0]
+    rgb = colours_and_depth[..., :3] + (1.0 - alpha) * backdrop
+    return View(rgb.astype(np.float32), np.where(covered > 0.0, colours_and_depth[..., 3], 0.0), covered)
+
+
+def rasterize_all(scene: Gaussians, cameras: Sequence[Pinhole], backdrops: Sequence[F32]) -> list[View]:
+    """What `tasks.render.scene.engine.render` draws with on CUDA: one view a camera. Raises BackendMissing."""
+    torch, gsplat = require()
+    by_size: dict[tuple[int, int], list[int]] = defaultdict(list)
+    for i, camera in enumerate(cameras):
+        by_size[camera.width, camera.height].append(i)
+    views: dict[int, View] = {}
+    for (width, height), rows in by_size.items():
+        pictures, alphas = np.zeros((len(rows), height, width, 4)), np.zeros((len(rows), height, width, 1))
+        if len(scene):
+            given = arguments(scene, [cameras[i] for i in rows])
+            on_device = {k: torch.from_numpy(v).cuda() if isinstance(v, np.ndarray) else v for k, v in given.items()}
+            with torch.inference_mode():
+                drawn, covered, _ = gsplat.rasterization(**on_device)
+            pictures, alphas = drawn.cpu().numpy(), covered.cpu().numpy()
+        for i, picture, alpha in zip(rows, pictures, alphas):
+            views[i] = view_of(picture.astype(np.float32), alpha.astype(np.float32), backdrops[i])
+    return [views[i] for i in range(len(cameras))]

@@ -1,0 +1,205 @@
+"""History comfort and two-frame extended comfort (docs/reward.md 2i, 2j).
+
+The six limits hold on a series of 55 rows: 14 of history, then the 41 of the trajectory. It is judged one quantity at a
+time, each a contiguous row of scratch.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba.extending import register_jitable
+from numpy.typing import NDArray
+
+from tasks.kernels.compiled import kernel
+from tasks.reward.rules.smooth import jerk_of, plan_yaw_accel_of, smooth_accel, unwrap, yaw_accel_of, yaw_rate_of
+from tasks.world.bounds import LARGEST, all_within
+from tasks.world.clip import HORIZON_STEPS, STEP_S
+from tasks.world.vehicle import (
+    AX,
+    AY,
+    EGO_STATE_SIZE,
+    HEADING,
+    STEERING,
+    YAW_ACCEL,
+    YAW_RATE,
+)
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+LON_ACCEL_MPS2 = (-4.05, 2.40)
+LAT_ACCEL_MPS2 = 4.89
+JERK_MPS3 = 8.37
+LON_JERK_MPS3 = 4.13
+YAW_ACCEL_RADPS2 = 1.93
+YAW_RATE_RADPS = 0.95
+LIMITS = np.array(
+    [
+        LON_ACCEL_MPS2,
+        (-LAT_ACCEL_MPS2, LAT_ACCEL_MPS2),
+        (-JERK_MPS3, JERK_MPS3),
+        (-LON_JERK_MPS3, LON_JERK_MPS3),
+        (-YAW_ACCEL_RADPS2, YAW_ACCEL_RADPS2),
+        (-YAW_RATE_RADPS, YAW_RATE_RADPS),
+    ]
+)  # (6, 2): longitudinal, lateral acceleration; jerk; longitudinal jerk; yaw acceleration; yaw rate
+EC_LIMITS = (0.7, 0.5, 0.1, 0.1)  # RMS of acceleration, jerk, yaw rate, yaw acceleration (SI)
+EC_MAX_INTERVAL_S = 0.55
+PAST_PERIOD_STEPS = 5  # the history comes at 2 Hz
+HISTORY_ROWS = 14  # -1.5 .. -0.2 s: the row at -0.1 s is missing in the public metric
+HISTORY_START = -15  # step of the first row
+N_FLAGS = 6
+_SCRATCH_ROWS = N_FLAGS + 4
+
+
+def comfort_history(past_states: Array) -> Array:
+    """Ego states (14, 11) at -1.5, -1.4 .. -0.2 s, interpolated linearly between states (4, 11) at 2 Hz.
+
+    Rates of yaw and steering are not part of the public interpolation and are 0.
+    """
+    past = past_states.copy()
+    past[:, HEADING] = np.unwrap(past[:, HEADING])
+    past[:, STEERING + 1 :] = 0.0
+    position = np.arange(HISTORY_ROWS) / PAST_PERIOD_STEPS
+    before = position.astype(np.int64)
+    share = (position - before)[:, None]
+    rows: Array = past[before] + share * (past[np.minimum(before + 1, len(past) - 1)] - past[before])
+    assert rows.shape == (HISTORY_ROWS, EGO_STATE_SIZE)
+    return rows
+
+
+@register_jitable
+def comfort_scratch() -> Array:
+    """Scratch (10, 55) for `comfort_along`, one per thread."""
+    return np.empty((_SCRATCH_ROWS, HISTORY_ROWS + HORIZON_STEPS + 1))
+
+
+@kernel
+def comfort_along(
+    history: Array,  # (14, 11) ego states, see comfort_history
+    states: Array,  # (41, 11) of one trajectory
+    rear_axle_to_center: float,  # [m]
+    scratch: Array,  # (10, 55), see comfort_scratch
+    flags: Bools,  # (6,) out, as in LIMITS
+) -> float:
+    """The first uncomfortable step, inf where there is none; a step of the history is negative (-15 .. -2).
+
+    History comfort is the conjunction of the flags (docs/reward.md 2i).
+    """
+    judged, lon, lat, magnitude, heading = scratch[:N_FLAGS], scratch[6], scratch[7], scratch[8], scratch[9]
+    before = len(history)
+    _load(history, rear_axle_to_center, lon[:before], lat[:before], magnitude[:before], heading[:before])
+    _load(states, rear_axle_to_center, lon[before:], lat[before:], magnitude[before:], heading[before:])
+    unwrap(heading)
+    smooth_accel(lon, judged[0])
+    smooth_accel(lat, judged[1])
+    smooth_accel(magnitude, lat)
+    jerk_of(lat, judged[2])
+    jerk_of(judged[0], judged[3])
+    yaw_accel_of(heading, judged[4])
+    yaw_rate_of(heading, judged[5])
+    comfortable = True
+    for f in range(N_FLAGS):
+        flags[f] = _all_within(judged[f], LIMITS[f, 0], LIMITS[f, 1])
+        comfortable &= flags[f]
+    if comfortable:
+        return math.inf
+    row = _first_beyond(judged)
+    return float(row + HISTORY_START) if row < before else float(row - before)
+
+
+@kernel
+def _load(states: Array, rear_axle_to_center: float, lon: Array, lat: Array, magnitude: Array, heading: Array) -> None:
+    for t in range(len(states)):
+        ax, ay, omega = states[t, AX], states[t, AY], states[t, YAW_RATE]
+        # At the centre, with the public signs: + d omega^2 where geometry says minus, and no lateral term
+        lon[t] = ax + rear_axle_to_center * (omega * omega) + rear_axle_to_center * states[t, YAW_ACCEL]
+        lat[t] = ay
+        magnitude[t] = math.sqrt(ax * ax + ay * ay)
+        heading[t] = states[t, HEADING]
+
+
+@kernel
+def _all_within(values: Array, low: float, high: float) -> bool:
+    beyond = 0
+    for value in values:
+        beyond += not ((low < value) & (value < high))
+    return beyond == 0
+
+
+@kernel
+def _first_beyond(judged: Array) -> int:
+    """First column of (6, T) at which a flag's quantity is not within its limits; there must be one."""
+    t = 0
+    while True:
+        for f in range(N_FLAGS):
+            if not (LIMITS[f, 0] < judged[f, t] and judged[f, t] < LIMITS[f, 1]):
+                return t
+        t += 1
+
+
+@dataclass(frozen=True)
+class ExtendedComfort:
+    """EC of K plans against the plans made a moment before."""
+
+    ec: Array  # (K,) 1 where all four differences are small, else 0
+    rms: Array  # (K, 4) acceleration [m/s^2], jerk [m/s^3], yaw rate [rad/s], yaw acceleration [rad/s^2]
+
+
+def extended_comfort(now_states: Array, previous_states: Array, interval_s: float = 0.5) -> ExtendedComfort:
+    """Compare simulated states (K, 41, 11) with those (K or 1, 41, 11) of the plan made `interval_s` earlier.
+
+    Raises ValueError unless 0 < interval_s < 0.55, and for states of other shapes or not finite.
+    """
+    if not 0.0 < interval_s < EC_MAX_INTERVAL_S:
+        raise ValueError(f"interval_s must lie in (0, {EC_MAX_INTERVAL_S}), got {interval_s}")
+    now, previous = _states("now_states", now_states), _states("previous_states", previous_states)
+    if len(previous) not in (1, len(now)):
+        raise ValueError(
+            f"previous_states must have 1 row or {len(now)}, one for each of now_states; got {len(previous)}"
+        )
+    rms = np.empty((len(now), len(EC_LIMITS)))
+    _motion_rms(now, previous, round(interval_s / STEP_S), rms)
+    return ExtendedComfort(ec=np.where((rms <= EC_LIMITS).all(axis=-1), 1.0, 0.0), rms=rms)
+
+
+def _states(name: str, states: Array) -> Array:
+    states = np.ascontiguousarray(states, dtype=np.float64)
+    if states.ndim != 3 or states.shape[1:] != (HORIZON_STEPS + 1, EGO_STATE_SIZE):
+        raise ValueError(f"{name} must be (K, {HORIZON_STEPS + 1}, {EGO_STATE_SIZE}), got {states.shape}")
+    if not all_within(states):
+        raise ValueError(f"{name} must be finite and at most {LARGEST:g}")
+    return states
+
+
+@kernel
+def _motion_rms(now: Array, previous: Array, shift: int, rms: Array) -> None:
+    """Root mean square (K, 4) over time of what now[k, :-shift] does otherwise than previous[k or 0, shift:]."""
+    # The overlap is cut out first and filtered then, so that the filters' edges fall inside the horizon.
+    n = now.shape[1] - shift
+    ours, theirs, raw = np.empty((4, n)), np.empty((4, n)), np.empty(n)
+    for k in range(len(now)):
+        _motion(now[k, :n], raw, ours)
+        if k < len(previous):
+            _motion(previous[k, shift:], raw, theirs)
+        for f in range(4):
+            total = 0.0
+            for t in range(n):
+                difference = ours[f, t] - theirs[f, t]
+                total += difference * difference
+            rms[k, f] = math.sqrt(total / n)
+
+
+@kernel
+def _motion(states: Array, raw: Array, out: Array) -> None:
+    """Acceleration, jerk, yaw rate, yaw acceleration (4, T) of states (T, 11); raw: scratch (T,)."""
+    for t in range(len(states)):
+        raw[t] = math.sqrt(states[t, AX] * states[t, AX] + states[t, AY] * states[t, AY])
+    smooth_accel(raw, out[0])
+    jerk_of(out[0], out[1])
+    for t in range(len(states)):  # a slice assigned to a slice compiles for 5 s more
+        raw[t] = states[t, HEADING]
+    unwrap(raw)
+    yaw_rate_of(raw, out[2])
+    plan_yaw_accel_of(raw, out[3])

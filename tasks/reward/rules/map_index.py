@@ -1,0 +1,300 @@
+"""The map around the ego, laid out so that the regions that hold a point are found at once (docs/reward.md 2a).
+
+A grid covers every polygon. A cell that no edge touches lies in the same regions everywhere, so it names one set of
+regions. A crossed cell names the set of its middle and lists its edges: on the way from the middle to a point of the
+cell, every edge that is passed leads into or out of the regions it bounds. Polygons share many edges, so that most
+crossed cells know just two sets, one on either side.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tasks.kernels.compiled import kernel
+from tasks.reward.rules.grid import changes_along_rows, grid_over
+from tasks.reward.rules.outlines import Outlines, first_flat, outlines, refused
+from tasks.world.lanes import MapLayer, MapPolygon
+
+Array = NDArray[np.float64]
+Bits = NDArray[np.uint64]
+Bools = NDArray[np.bool_]
+Bytes = NDArray[np.uint8]
+Ints = NDArray[np.int64]
+ShortInts = NDArray[np.int32]
+
+ROUNDING = 1e-15  # above the error of a difference of two products, relative to their sum
+
+# Parts a region plays: rows of MapIndex.playing; 1 << part are the bits of MapIndex.parts
+LANE, ON_ROUTE, DRIVABLE, INTERSECTION = range(4)
+PARTS_OF_LAYER = {  # lane, drivable, intersection; lanes themselves are not drivable
+    MapLayer.LANE: (True, False, False),
+    MapLayer.LANE_CONNECTOR: (True, False, False),
+    MapLayer.INTERSECTION: (False, True, True),
+    MapLayer.DRIVABLE_AREA: (False, True, False),
+    MapLayer.ROADBLOCK: (False, True, False),
+    MapLayer.CARPARK_AREA: (False, True, False),
+}
+
+# Columns of MapIndex.crossed
+NEAR = 0  # set of the cell's middle
+FAR = 1  # set across the edges, when all of them bound the same regions, else -1
+FIRST, LAST = 2, 3  # the cell's entries; the last one is not included
+
+
+class MapIndex(NamedTuple):
+    """R regions, lanes first. A set of regions is W words; region r is bit r % 64 of word r // 64."""
+
+    low_x: float  # corner of the grid [m]
+    low_y: float
+    cell_m: float
+    cells: ShortInts  # (rows, columns) set of a cell without edges; -1 - q for crossed cell q
+    crossed: ShortInts  # (Q, 4) NEAR, FAR, FIRST, LAST
+    entry: ShortInts  # (N,) 2 * edge, plus 1 where the cell's middle is on the left of the edge
+    edges: Array  # (E, 4) x, y of the start, x, y of the end [m]
+    bounded: Bits  # (E, W) the regions an edge bounds
+    sets: Bits  # (S, W); set 0 is empty
+    parts: Bytes  # (S,) bits of the parts that some region of the set plays
+    playing: Bits  # (4, W) the regions that play each part
+    n_lane_words: int  # the first words, which hold all lanes
+
+
+def index_map(polygons: Sequence[MapPolygon], route_lane_ids: frozenset[str]) -> MapIndex:
+    """The index of a map's polygons; those with the same rings are one region that plays all their parts.
+
+    A region holds the points that an odd number of its rings enclose. A ring may touch itself.
+    Raises ValueError naming the polygon when a ring is not finite, has fewer than three distinct points, bounds no
+    area, or crosses itself or another ring of its polygon.
+    """
+    regions, plays = _regions(polygons, route_lane_ids)
+    n_words = max(1, -(-len(regions) // 64))
+    lines = outlines(regions)
+    edges, bounded = _merged(lines.edges.view(np.uint64), lines.first, lines.owner, n_words)
+    grid, touched = grid_over(edges)
+    changes = np.sort(changes_along_rows(edges, grid))
+    cells, crossed, entry, sets = _arranged(changes, touched, bounded, grid.n_rows * grid.n_columns)
+    _check_rings(regions, lines, edges, bounded, crossed, entry)
+    playing = _packed(plays, n_words)
+    is_played = (sets[:, None] & playing).any(axis=-1)
+    return MapIndex(
+        low_x=grid.low_x,
+        low_y=grid.low_y,
+        cell_m=grid.cell_m,
+        cells=cells.reshape(grid.n_rows, grid.n_columns),
+        crossed=crossed,
+        entry=entry,
+        edges=edges,
+        bounded=bounded,
+        sets=sets,
+        parts=np.packbits(is_played, axis=1, bitorder="little")[:, 0].copy(),
+        playing=playing,
+        n_lane_words=-(-int(plays[:, LANE].sum()) // 64),
+    )
+
+
+def _regions(polygons: Sequence[MapPolygon], route_lane_ids: frozenset[str]) -> tuple[list[MapPolygon], Bools]:
+    """The first polygon of every region, lanes first, and the parts (R, 4) that the regions play."""
+    found: dict[tuple[bytes, ...], tuple[MapPolygon, list[bool]]] = {}
+    for polygon in polygons:
+        key = (polygon.ring.tobytes(), *[hole.tobytes() for hole in polygon.holes])
+        plays = found.setdefault(key, (polygon, [False] * 4))[1]
+        is_lane, is_drivable, is_intersection = PARTS_OF_LAYER[polygon.layer]
+        plays[LANE] |= is_lane
+        plays[ON_ROUTE] |= is_lane and polygon.token in route_lane_ids
+        plays[DRIVABLE] |= is_drivable
+        plays[INTERSECTION] |= is_intersection
+    regions = sorted(found.values(), key=lambda region: not region[1][LANE])
+    return [polygon for polygon, _ in regions], np.array([plays for _, plays in regions], bool).reshape(-1, 4)
+
+
+def _packed(plays: Bools, n_words: int) -> Bits:
+    """Columns (R, 4) as sets of regions (4, W)."""
+    padded = np.zeros((4, n_words * 64), dtype=bool)
+    padded[:, : len(plays)] = plays.T
+    return np.packbits(padded, axis=1, bitorder="little").view(np.uint64)
+
+
+def _check_rings(
+    regions: list[MapPolygon], lines: Outlines, edges: Array, bounded: Bits, crossed: ShortInts, entry: ShortInts
+) -> None:
+    """Raises ValueError for rings that cross, else for rings without area: a figure of eight may be both."""
+    edge, region = _first_crossing(edges, bounded, crossed, entry)
+    if edge >= 0:
+        x, y = edges[edge, :2]
+        raise refused(regions[region], f"its outline crosses itself near ({x:.2f}, {y:.2f})")
+    flat = first_flat(lines.edges, lines.first)
+    if flat >= 0:
+        raise refused(regions[lines.owner[flat]], "its ring bounds no area")
+
+
+@kernel
+def _merged(ends: Bits, first: Ints, owner: Ints, n_words: int) -> tuple[Array, Bits]:
+    """The distinct edges (E, 4) of rings, either way round, and the regions they bound (E, W); ends as raw bits."""
+    points = ends.view(np.float64)
+    edges = np.empty(ends.shape, np.uint64)
+    bounded = np.zeros((ends.shape[0], n_words), np.uint64)
+    slots = _no_slots(ends.shape[0])
+    n = 0
+    for i in range(owner.size):
+        for k in range(first[i], first[i + 1]):
+            ax, ay, bx, by = points[k]
+            swap = ax > bx or (ax == bx and ay > by)
+            for c in range(4):
+                edges[n, c] = ends[k, c ^ 2 if swap else c]
+            edge = _row_of(edges, n, slots)
+            n = max(n, edge + 1)
+            bounded[edge, owner[i] >> 6] ^= np.uint64(1) << np.uint64(owner[i] & 63)
+    return edges[:n].copy().view(np.float64), bounded[:n].copy()
+
+
+@kernel
+def _arranged(
+    changes: Ints, touched: Ints, bounded: Bits, n_cells: int
+) -> tuple[ShortInts, ShortInts, ShortInts, Bits]:
+    """`cells` (n_cells,), `crossed`, `entry` and `sets` of the index; changes are sorted."""
+    sides = np.full((bounded.shape[0], 2), -1, np.int32)  # sets last met on the two sides of each edge
+    sets = np.empty((changes.size + touched.size + 2, bounded.shape[1]), np.uint64)
+    sets[0] = 0
+    slots = _no_slots(sets.shape[0])
+    n_sets = 1 + _row_of(sets, 0, slots)
+    cells, n_sets = _cells(changes, n_cells, bounded, sides, sets, slots, n_sets)
+    crossed, entry = _crossed(touched, cells)
+    n_sets = _find_far_sets(crossed, entry, bounded, sides, sets, slots, n_sets)
+    return cells, crossed, entry, sets[:n_sets].copy()
+
+
+@kernel
+def _cells(
+    changes: Ints, n_cells: int, bounded: Bits, sides: ShortInts, sets: Bits, slots: ShortInts, n_sets: int
+) -> tuple[ShortInts, int]:
+    """The set at every cell's middle (n_cells,), and how many sets there are."""
+    cells = np.zeros(n_cells, np.int32)
+    current = 0
+    for k in range(changes.size):
+        edge = changes[k] & 0xFFFFFFFF
+        if current == sides[edge, 0]:
+            current = sides[edge, 1]
+        elif current == sides[edge, 1]:
+            current = sides[edge, 0]
+        else:
+            current = _across(bounded, sides, sets, slots, n_sets, current, edge)
+            n_sets = max(n_sets, current + 1)
+        stop = changes[k + 1] >> 32 if k + 1 < changes.size else n_cells
+        cells[changes[k] >> 32 : stop] = current
+    return cells, n_sets
+
+
+@kernel
+def _crossed(touched: Ints, cells: ShortInts) -> tuple[ShortInts, ShortInts]:
+    """The crossed cells (Q, 4), not yet knowing their far sets, and their entries; `cells` then name them."""
+    crossed = np.empty((touched.size, 4), np.int32)
+    n = 0
+    for pair in touched:
+        cell = pair >> 32
+        if cells[cell] >= 0:
+            crossed[n, NEAR] = cells[cell]
+            crossed[n, LAST] = 0
+            cells[cell] = -1 - n
+            n += 1
+        crossed[-1 - cells[cell], LAST] += 1
+    total = 0
+    for q in range(n):
+        crossed[q, FIRST] = total
+        total += crossed[q, LAST]
+        crossed[q, LAST] = crossed[q, FIRST]
+    entry = np.empty(total, np.int32)
+    for pair in touched:
+        q = -1 - cells[pair >> 32]
+        entry[crossed[q, LAST]] = pair & 0xFFFFFFFF
+        crossed[q, LAST] += 1
+    return crossed[:n].copy(), entry
+
+
+@kernel
+def _find_far_sets(
+    crossed: ShortInts, entry: ShortInts, bounded: Bits, sides: ShortInts, sets: Bits, slots: ShortInts, n_sets: int
+) -> int:
+    """Fill in the far sets of crossed cells; returns how many sets there are."""
+    for q in range(crossed.shape[0]):
+        edge, near = entry[crossed[q, FIRST]] >> 1, crossed[q, NEAR]
+        alike = True
+        for i in range(crossed[q, FIRST] + 1, crossed[q, LAST]):
+            for w in range(bounded.shape[1]):
+                alike &= bounded[entry[i] >> 1, w] == bounded[edge, w]
+        if not alike:
+            crossed[q, FAR] = -1
+        elif near == sides[edge, 0]:
+            crossed[q, FAR] = sides[edge, 1]
+        elif near == sides[edge, 1]:
+            crossed[q, FAR] = sides[edge, 0]
+        else:
+            crossed[q, FAR] = _across(bounded, sides, sets, slots, n_sets, near, edge)
+            n_sets = max(n_sets, crossed[q, FAR] + 1)
+    return n_sets
+
+
+@kernel
+def _across(bounded: Bits, sides: ShortInts, sets: Bits, slots: ShortInts, n_sets: int, start: int, edge: int) -> int:
+    """The number of the set on the other side of an edge, n_sets if it is a new one."""
+    for w in range(sets.shape[1]):
+        sets[n_sets, w] = sets[start, w] ^ bounded[edge, w]
+    found = _row_of(sets, n_sets, slots)
+    sides[edge, 0], sides[edge, 1] = start, found
+    return found
+
+
+@kernel
+def _no_slots(n_rows: int) -> ShortInts:
+    """An empty hash table for that many rows: a power of two, at most half of it in use."""
+    size = 2
+    while size < 2 * n_rows:
+        size *= 2
+    return np.full(size, -1, np.int32)
+
+
+@kernel
+def _row_of(rows: Bits, new: int, slots: ShortInts) -> int:
+    """The earlier row that equals row `new`, else `new`, which the hash table then knows."""
+    key = np.uint64(0)
+    for w in range(rows.shape[1]):
+        key = (key ^ rows[new, w]) * np.uint64(0x9E3779B97F4A7C15)
+        key ^= key >> np.uint64(29)
+    slot = np.int64(key & np.uint64(slots.size - 1))
+    while slots[slot] >= 0:
+        same = True
+        for w in range(rows.shape[1]):
+            same &= rows[slots[slot], w] == rows[new, w]
+        if same:
+            return int(slots[slot])
+        slot = (slot + 1) & (slots.size - 1)
+    slots[slot] = new
+    return new
+
+
+@kernel
+def _first_crossing(edges: Array, bounded: Bits, crossed: ShortInts, entry: ShortInts) -> tuple[int, int]:
+    """An edge that crosses another one of its region beyond doubt, and that region; -1: there is none."""
+    for q in range(crossed.shape[0]):
+        for i in range(crossed[q, FIRST], crossed[q, LAST]):
+            for k in range(crossed[q, FIRST], i):
+                one, other = entry[i] >> 1, entry[k] >> 1
+                for w in range(bounded.shape[1]):
+                    both = bounded[one, w] & bounded[other, w]
+                    if both and _parts(edges, one, other) and _parts(edges, other, one):
+                        return one, 64 * w + int(math.log2(both & (~both + np.uint64(1))))
+    return -1, -1
+
+
+@kernel
+def _parts(edges: Array, line: int, edge: int) -> bool:
+    """Whether a line has the ends of an edge on either side, neither of them within rounding."""
+    ax, ay, bx, by = edges[line]
+    n_left = 0
+    for k in (0, 2):
+        left, right = (bx - ax) * (edges[edge, k + 1] - ay), (by - ay) * (edges[edge, k] - ax)
+        if abs(left - right) <= ROUNDING * (abs(left) + abs(right)):
+            return False
+        n_left += left > right
+    return n_left == 1

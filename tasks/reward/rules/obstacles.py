@@ -1,0 +1,269 @@
+"""Everything the ego may run into, and a map from a place and a time to what can be touched there.
+
+Indexed objects are registered, per time, in every square cell whose centre points an ego body could touch them from,
+whatever its heading; an ego position then reads one cell. The cells repeat after CELLS_PER_SIDE in x and y, so the
+grid has no edges and a fixed size; what stands a whole period away is told apart by the boxes themselves.
+Unindexed objects are the same structure with one cell for everywhere and all times.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tasks.kernels.compiled import kernel
+from tasks.reward.rules.overlap import ROUNDING_M, Box
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.int32]
+
+CELLS_PER_SIDE = 64  # a power of two
+SMALLEST_CELL_M = 2.0
+ENTRIES_PER_BOX = 128  # bounds the index: cells grow until no more are expected on average
+
+
+class Obstacles(NamedTuple):
+    """N objects over T = 41 steps of 0.1 s, world frame, and where they can be touched."""
+
+    boxes: Array  # (T, N, 5) centre x, y [m], heading [rad], length, width [m]; NaN when absent
+    is_stopped: Bools  # (N,) no road user, or at most 0.05 m/s when first seen
+    collision_score: Array  # (N,) what an at-fault collision leaves of NC: 0 for road users, else 0.5
+    axes: Array  # (T, N, 2) cos, sin of the headings; (0, N, 2): worked out where needed
+    starts: Ints  # (T x cells + 1,) items[starts[c]:starts[c + 1]] are the objects of cell c, times outermost
+    items: Ints  # (E,)
+    cells_per_side: int  # 1: one cell for everywhere and all times
+    cells_per_m: float
+
+
+def index_obstacles(boxes: Array, is_stopped: Bools, collision_score: Array, ego_circumradius_m: float) -> Obstacles:
+    """Objects that are the same for all trajectories, ready for egos whose corners are this far from their centre.
+
+    boxes: (T, N, 5); is_stopped, collision_score: (N,), as in Obstacles. Raises ValueError on other shapes.
+    """
+    if not 0.0 < ego_circumradius_m < math.inf:
+        raise ValueError(f"ego_circumradius_m must be a positive length in metres, got {ego_circumradius_m}")
+    plain = unindexed(boxes, is_stopped, collision_score)
+    obstacles = plain._replace(axes=_axes(plain.boxes), cells_per_side=CELLS_PER_SIDE)
+    obstacles = obstacles._replace(cells_per_m=_cells_per_m(obstacles, ego_circumradius_m))
+    starts, items = _index(obstacles, ego_circumradius_m)
+    return obstacles._replace(starts=starts, items=items)
+
+
+def unindexed(boxes: Array, is_stopped: Bools, collision_score: Array) -> Obstacles:
+    """Objects to be looked at one by one: for traffic that few trajectories meet (`with_objects`).
+
+    boxes: (T, N, 5); is_stopped, collision_score: (N,), as in Obstacles. Raises ValueError on other shapes.
+    """
+    n_items = boxes.shape[1] if boxes.ndim == 3 else -1
+    if boxes.ndim != 3 or boxes.shape[2] != 5:
+        raise ValueError(f"boxes must be (T, N, 5), got {boxes.shape}")
+    if is_stopped.shape != (n_items,) or collision_score.shape != (n_items,):
+        raise ValueError(
+            f"is_stopped and collision_score must be ({n_items},) as boxes has {n_items} objects, "
+            f"got {is_stopped.shape} and {collision_score.shape}"
+        )
+    return Obstacles(
+        boxes=np.ascontiguousarray(boxes, dtype=np.float64),
+        is_stopped=np.ascontiguousarray(is_stopped, dtype=np.bool_),
+        collision_score=np.ascontiguousarray(collision_score, dtype=np.float64),
+        axes=np.empty((0, n_items, 2)),
+        starts=np.array([0, n_items], dtype=np.int32),
+        items=np.arange(n_items, dtype=np.int32),
+        cells_per_side=1,
+        cells_per_m=0.0,
+    )
+
+
+@kernel
+def with_objects(obstacles: Obstacles, boxes: Array, is_stopped: Bools) -> Obstacles:
+    """The same unindexed objects, elsewhere: boxes (T, N, 5) that one trajectory meets, is_stopped (N,) of them."""
+    return Obstacles(
+        boxes,
+        is_stopped,
+        obstacles.collision_score,
+        obstacles.axes,
+        obstacles.starts,
+        obstacles.items,
+        obstacles.cells_per_side,
+        obstacles.cells_per_m,
+    )
+
+
+@kernel
+def spans_of(obstacles: Obstacles) -> Array:
+    """(N, 5) of unindexed objects: least x, y, most x, y of the centre at any time [m], largest diagonal squared [m^2].
+
+    An object that is never there has a least above its most. None (0, 5) for indexed objects.
+    """
+    boxes = obstacles.boxes
+    n_items = boxes.shape[1] if obstacles.cells_per_side == 1 else 0
+    spans = np.empty((n_items, 5))
+    for item in range(n_items):
+        spans[item, 0], spans[item, 1], spans[item, 2] = math.inf, math.inf, -math.inf
+        spans[item, 3], spans[item, 4] = -math.inf, 0.0
+    for t in range(boxes.shape[0]):
+        for item in range(n_items):
+            x, y, length, width = boxes[t, item, 0], boxes[t, item, 1], boxes[t, item, 3], boxes[t, item, 4]
+            diagonal_sq = length * length + width * width
+            # spelled out, for NaN is to move none of them
+            spans[item, 0] = x if x < spans[item, 0] else spans[item, 0]
+            spans[item, 1] = y if y < spans[item, 1] else spans[item, 1]
+            spans[item, 2] = x if x > spans[item, 2] else spans[item, 2]
+            spans[item, 3] = y if y > spans[item, 3] else spans[item, 3]
+            spans[item, 4] = diagonal_sq if diagonal_sq > spans[item, 4] else spans[item, 4]
+    return spans
+
+
+@kernel
+def within_reach(
+    obstacles: Obstacles, spans: Array, path: tuple[float, float, float, float], length: float, width: float
+) -> Obstacles:
+    """Unindexed objects without those that are out of reach all along a path; indexed ones as they are.
+
+    spans: see spans_of; path: least x, y, most x, y of the centres [m] of an ego body of that length and width [m].
+    """
+    if obstacles.cells_per_side > 1:
+        return obstacles
+    items = np.empty(len(spans), np.int32)
+    n = 0
+    for item in range(len(spans)):
+        # as far as out_of_reach ever looks
+        reach = math.sqrt(0.5 * (spans[item, 4] + length * length + width * width) + ROUNDING_M) + ROUNDING_M
+        if (
+            spans[item, 0] - reach <= path[2]
+            and spans[item, 2] + reach >= path[0]
+            and spans[item, 1] - reach <= path[3]
+            and spans[item, 3] + reach >= path[1]
+        ):
+            items[n] = item
+            n += 1
+    starts = np.zeros(2, np.int32)
+    starts[1] = n
+    return Obstacles(
+        obstacles.boxes,
+        obstacles.is_stopped,
+        obstacles.collision_score,
+        obstacles.axes,
+        starts,
+        items[:n],
+        obstacles.cells_per_side,
+        obstacles.cells_per_m,
+    )
+
+
+@kernel
+def cell_of(obstacles: Obstacles, t: int, x: float, y: float) -> int:
+    """The cell whose items are all the objects that an ego body centred on (x, y) [m] at step t may touch."""
+    n = obstacles.cells_per_side
+    if n == 1:
+        return 0
+    column = math.floor(x * obstacles.cells_per_m) & (n - 1)
+    row = math.floor(y * obstacles.cells_per_m) & (n - 1)
+    return (t * n + row) * n + column
+
+
+@kernel
+def box_at(obstacles: Obstacles, t: int, item: int) -> Box:
+    """Where an object is at step t; NaN when absent."""
+    x, y, heading = obstacles.boxes[t, item, 0], obstacles.boxes[t, item, 1], obstacles.boxes[t, item, 2]
+    length, width = obstacles.boxes[t, item, 3], obstacles.boxes[t, item, 4]
+    if obstacles.cells_per_side > 1:
+        return Box(x, y, heading, obstacles.axes[t, item, 0], obstacles.axes[t, item, 1], length, width)
+    return Box(x, y, heading, math.cos(heading), math.sin(heading), length, width)
+
+
+@kernel
+def out_of_reach(obstacles: Obstacles, t: int, item: int, ego: Box) -> bool:
+    """Whether an unindexed object is too far away, or absent, to touch the ego at step t: nothing dearer is needed."""
+    if obstacles.cells_per_side > 1:
+        return False
+    boxes = obstacles.boxes
+    dx, dy, length, width = boxes[t, item, 0] - ego.x, boxes[t, item, 1] - ego.y, boxes[t, item, 3], boxes[t, item, 4]
+    # squared sum of the circumradii <= twice the sum of their squares
+    reach_sq = 0.5 * (length * length + width * width + ego.length * ego.length + ego.width * ego.width)
+    return not dx * dx + dy * dy <= reach_sq + ROUNDING_M
+
+
+@kernel
+def _axes(boxes: Array) -> Array:
+    """Cos and sin (T, N, 2) of the headings, by the same library as in `box_at`."""
+    axes = np.empty((boxes.shape[0], boxes.shape[1], 2))
+    for t in range(boxes.shape[0]):
+        for i in range(boxes.shape[1]):
+            axes[t, i, 0], axes[t, i, 1] = math.cos(boxes[t, i, 2]), math.sin(boxes[t, i, 2])
+    return axes
+
+
+@kernel
+def _reach(box: Box, ego_radius: float) -> tuple[float, float]:
+    """How far from a box's centre the centre of an ego that touches it can be, along x and y [m]; NaN when absent."""
+    c, s, margin = abs(box.cos), abs(box.sin), ego_radius + ROUNDING_M
+    return 0.5 * (box.length * c + box.width * s) + margin, 0.5 * (box.length * s + box.width * c) + margin
+
+
+@kernel
+def _cells_per_m(obstacles: Obstacles, ego_radius: float) -> float:
+    """The finest grid that keeps the index small."""
+    n_times, n_items = obstacles.boxes.shape[:2]
+    cell = SMALLEST_CELL_M
+    while True:
+        entries = 0.0
+        for t in range(n_times):
+            for item in range(n_items):
+                reach_x, reach_y = _reach(box_at(obstacles, t, item), ego_radius)
+                area = min(2.0 * reach_x / cell + 1.0, CELLS_PER_SIDE) * min(2.0 * reach_y / cell + 1.0, CELLS_PER_SIDE)
+                if math.isfinite(area):
+                    entries += area
+        if entries <= ENTRIES_PER_BOX * n_times * n_items:
+            return 1.0 / cell
+        cell *= 2.0
+
+
+@kernel
+def _index(obstacles: Obstacles, ego_radius: float) -> tuple[Ints, Ints]:
+    """Starts and items of the cells: counted, summed to the cells' ends, filled from there."""
+    n_times, n_items = obstacles.boxes.shape[:2]
+    starts = np.zeros(n_times * CELLS_PER_SIDE * CELLS_PER_SIDE + 1, dtype=np.int32)
+    items = np.empty(0, dtype=np.int32)
+    for fill in (False, True):
+        for t in range(n_times):
+            for item in range(n_items):
+                _register(obstacles, t, item, ego_radius, fill, starts, items)
+        if not fill:
+            end = 0
+            for cell in range(starts.size):
+                end += starts[cell]
+                starts[cell] = end
+            items = np.empty(end, dtype=np.int32)
+    return starts, items
+
+
+@kernel
+def _register(
+    obstacles: Obstacles, t: int, item: int, ego_radius: float, fill: bool, starts: Ints, items: Ints
+) -> None:
+    """Count an object in, or write it into, the cells that come within the ego's radius of its box at step t."""
+    box, per_m = box_at(obstacles, t, item), obstacles.cells_per_m
+    reach_x, reach_y = _reach(box, ego_radius)
+    if not math.isfinite(box.x + box.y + reach_x + reach_y):
+        return
+    left, right = math.floor((box.x - reach_x) * per_m), math.floor((box.x + reach_x) * per_m)
+    low, high = math.floor((box.y - reach_y) * per_m), math.floor((box.y + reach_y) * per_m)
+    everywhere = right - left >= CELLS_PER_SIDE or high - low >= CELLS_PER_SIDE
+    center_reach = ego_radius + ROUNDING_M + math.sqrt(0.5) / per_m  # from the box to a cell's centre
+    for row in range(low, min(high + 1, low + CELLS_PER_SIDE)):
+        dy = (row + 0.5) / per_m - box.y
+        first = (t * CELLS_PER_SIDE + (row & (CELLS_PER_SIDE - 1))) * CELLS_PER_SIDE
+        for column in range(left, min(right + 1, left + CELLS_PER_SIDE)):
+            dx = (column + 0.5) / per_m - box.x
+            along = max(abs(box.cos * dx + box.sin * dy) - 0.5 * box.length, 0.0)
+            across = max(abs(box.cos * dy - box.sin * dx) - 0.5 * box.width, 0.0)
+            if everywhere or along * along + across * across <= center_reach * center_reach:
+                cell = first + (column & (CELLS_PER_SIDE - 1))
+                if fill:
+                    starts[cell] -= 1
+                    items[starts[cell]] = item
+                else:
+                    starts[cell] += 1

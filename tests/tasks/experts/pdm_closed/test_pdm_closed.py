@@ -1,0 +1,280 @@
+"""PDM-Closed on a straight road, where its proposals are known in closed form (docs/reward.md 4)."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tasks.experts.pdm_closed.forecast import forecast
+from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings, pdm_closed_poses, plan_for
+from tasks.experts.pdm_closed.proposals import driver, idm_step, proposals
+from tasks.experts.protocol import Plan
+from tasks.stages import Rejected
+from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.clip import Scene
+from tasks.world.frames import to_world
+from tasks.world.vehicle import PACIFICA
+
+Road = Callable[..., Scene]
+Objects = Callable[..., AgentTracks]
+RNG = np.random.default_rng(0)
+CAR = (4.5, 1.9)
+
+
+def test_every_proposal_brakes_at_its_hardest_for_the_first_tenth_of_a_second(road: Road) -> None:
+    speed = plan_for(road(speed=8.0)).proposals.progress_velocity[:, :, 1]
+    np.testing.assert_allclose(speed[:, 1], 8.0 - 0.3, atol=1e-12)
+
+
+def test_corrected_the_first_tenth_of_a_second_follows_the_model_on_the_road_it_sees(road: Road) -> None:
+    start, limit, fractions = 8.0, 10.0, np.array(PdmSettings().speed_fractions)
+    settings = PdmSettings(brakes_at_first_step=False)
+    speed = plan_for(road(speed=start, limit=limit), settings).proposals.progress_velocity[:5, :, 1]
+    gap = 400.0 - 50.0 - PACIFICA.half_length  # to the end of the route
+    wanted = 1.0 + start * 1.5 + start * start / (2.0 * np.sqrt(1.5 * 3.0))
+    accel = 1.5 * (1.0 - (start / (fractions * limit)) ** 10 - (wanted / gap) ** 2)
+    np.testing.assert_allclose(speed[:, 1], start + 0.1 * np.clip(accel, -3.0, 1.5), atol=1e-12)
+    assert speed[4, 1] > start > speed[0, 1]
+
+
+def test_a_stop_before_an_oncoming_car_overshoots_as_published_and_corrected_it_stands(
+    road: Road, objects: Objects
+) -> None:
+    near = np.array([1.0, -10.0, 0.0])  # at the least gap: the hardest braking, 0.3 m/s in a step
+    published, corrected = PdmSettings(), PdmSettings(speed_below_zero=False)
+    np.testing.assert_allclose(idm_step(0.0, 0.2, near, 15.0, driver(published)), [0.02, -0.1], atol=1e-12)
+    np.testing.assert_allclose(idm_step(0.0, 0.2, near, 15.0, driver(corrected)), [0.02, 0.0], atol=1e-12)
+
+    scene = road(speed=3.0, agents=objects([[85.0, 0.0, np.pi, *CAR]], [8.0], [AgentKind.VEHICLE]))
+    assert plan_for(scene, published).proposals.progress_velocity[..., 1].min() < 0.0
+    motion = plan_for(scene, corrected).proposals.progress_velocity
+    assert motion[..., 1].min() == 0.0
+    assert (np.diff(motion[..., 0], axis=1) >= 0.0).all()
+
+
+def test_on_a_free_road_speeds_tend_to_their_fraction_of_the_limit(road: Road) -> None:
+    limit = 10.0
+    speed = plan_for(road(speed=6.0, limit=limit)).proposals.progress_velocity[:5, :, 1]
+    wanted = limit * np.array(PdmSettings().speed_fractions)
+    assert (np.diff(speed[:, 40]) > 0).all()
+    assert abs(speed[2, 50] - wanted[2]) < 0.2, "0.6 of the limit is the speed it came with"
+    assert speed[4, 50] > 8.0
+    assert (speed[:3, 50] < 6.5).all()
+
+
+def test_without_a_speed_limit_fifteen_metres_per_second_stand_in(road: Road) -> None:
+    np.testing.assert_array_equal(
+        plan_for(road(limit=None)).proposals.poses, plan_for(road(limit=15.0)).proposals.poses
+    )
+
+
+def test_positive_offsets_lie_to_the_left(road: Road) -> None:
+    poses = plan_for(road()).proposals.poses
+    np.testing.assert_allclose(poses[0:5, :, 1], 0.0, atol=1e-12)
+    np.testing.assert_allclose(poses[5:10, :, 1], -1.0, atol=1e-12)
+    np.testing.assert_allclose(poses[10:15, :, 1], 1.0, atol=1e-12)
+
+
+def test_idm_keeps_the_speed_where_the_closed_form_says_so() -> None:
+    settings = PdmSettings()
+    speed, target = 8.0, 15.0
+    wanted = settings.min_gap_m + speed * settings.headway_s
+    gap = wanted / np.sqrt(1.0 - (speed / target) ** settings.exponent)  # equal speeds: dv/dt = 0 at this gap
+    after = idm_step(3.0, speed, np.array([3.0 + gap, speed, 0.0]), target, driver(settings))
+    np.testing.assert_allclose(after, [3.8, speed], atol=1e-12)
+
+
+def test_a_standing_car_ahead_stops_every_proposal_on_its_path(road: Road, objects: Objects) -> None:
+    blocked = road(speed=8.0, agents=objects([[85.0, 0.0, 0.0, *CAR]], [0.0], [AgentKind.VEHICLE]))
+    plan = plan_for(blocked)
+    front = plan.proposals.poses[:, 50, 0] + PACIFICA.front_length
+    assert (front < 85.0 - CAR[0] / 2.0).all()
+    assert (plan.proposals.progress_velocity[4::5, 50, 1] < 2.0).all(), "the eager ones have braked by then"
+
+
+def test_of_equally_good_proposals_the_first_is_the_plan(road: Road, objects: Objects) -> None:
+    """Behind a car that stands nobody gets 5 m far, so that progress is the same for all who keep the rules."""
+    blocked = road(speed=0.5, agents=objects([[59.0, 0.0, 0.0, CAR[0], 12.0]], [0.0], [AgentKind.VEHICLE]))
+    plan = plan_for(blocked)
+    best = np.flatnonzero(plan.scores.pdm_score == plan.scores.pdm_score.max())
+    assert len(best) > 1 and plan.chosen == best[0]
+
+
+def test_a_leading_car_at_its_speed_is_followed_not_stopped_for(road: Road, objects: Objects) -> None:
+    led = road(speed=8.0, agents=objects([[85.0, 0.0, 0.0, *CAR]], [8.0], [AgentKind.VEHICLE]))
+    assert plan_for(led).proposals.progress_velocity[4, 50, 1] > 6.5
+
+
+def test_a_car_that_drives_backwards_is_forecast_against_its_heading() -> None:
+    backing = AgentTracks(
+        ("a",),
+        (AgentKind.VEHICLE,),
+        np.array([[[30.0, 0.0, 0.0, *CAR]]]),
+        np.array([[[-2.0, 0.1]]]),
+        np.ones((1, 1), bool),
+        np.zeros((1, 1)),
+        np.ones(1),
+    )
+    seen = forecast(np.zeros(11), backing)
+    np.testing.assert_allclose(seen.drift, [[-np.hypot(2.0, 0.1), 0.0]], atol=1e-12)
+
+
+def test_standing_kinds_never_move_in_the_forecast(objects: Objects) -> None:
+    cone = objects([[10.0, 3.0, 0.0, 0.4, 0.4]], [5.0], [AgentKind.TRAFFIC_CONE])
+    assert (forecast(np.zeros(11), cone).drift == 0.0).all()
+
+
+def test_only_the_nearest_fifty_vehicles_within_a_hundred_metres_count(objects: Objects) -> None:
+    boxes = [[5.0 + 2.0 * i, 8.0, 0.0, 1.0, 1.0] for i in range(60)]
+    seen = forecast(np.zeros(11), objects(boxes, [0.0] * 60, [AgentKind.VEHICLE] * 60).window(15, 16))
+    assert len(seen.track) == 49  # the 49th is 99.9 m from the ego's centre, the 50th 101.8 m
+    assert (np.diff(np.hypot(seen.boxes[:, 0] - 1.461, seen.boxes[:, 1])) > 0).all()
+    close = [[5.0 + i, 8.0, 0.0, 0.5, 0.5] for i in range(60)]
+    seen = forecast(np.zeros(11), objects(close, [0.0] * 60, [AgentKind.VEHICLE] * 60).window(15, 16))
+    np.testing.assert_array_equal(np.sort(seen.track), np.arange(50))
+
+
+def test_what_touches_the_ego_at_the_start_is_ignored_for_good(road: Road, objects: Objects) -> None:
+    touching = objects([[50.0 + PACIFICA.front_length + 1.0, 0.0, 0.0, *CAR]], [0.0], [AgentKind.VEHICLE])
+    with_it, without = plan_for(road(agents=touching)), plan_for(road())
+    np.testing.assert_array_equal(with_it.proposals.poses, without.proposals.poses)
+    np.testing.assert_array_equal(with_it.scores.pdm_score, without.scores.pdm_score)
+
+
+def test_a_red_light_is_a_standing_lead_and_running_it_scores_nothing(road: Road) -> None:
+    red, green = plan_for(road(speed=10.0, red=True)), plan_for(road(speed=10.0, red=False))
+    assert (red.proposals.poses[:, 50, 0] + PACIFICA.front_length < 100.0).all()
+    assert (green.proposals.poses[4, 50, 0]) > 90.0
+    fast = plan_for(road(speed=22.0, red=True))  # 46 m at 3 m/s2 is too short: it cannot stop any more
+    assert (fast.scores.tlc == 0.0).all()
+    assert (fast.scores.pdm_score == 0.0).all()
+
+
+def test_an_ego_that_stands_within_the_red_connector_is_not_held_by_it(road: Road) -> None:
+    inside = road(speed=0.0, red=True)
+    history = inside.ego_history.copy()
+    history[:, 0] += 60.0 - PACIFICA.rear_axle_to_center
+    inside = replace(inside, ego_history=history)
+    assert plan_for(inside).proposals.poses[4, 50, 0] > 115.0
+
+
+def test_the_plan_is_the_first_best_proposal_and_sees_nothing_of_the_future(road: Road, objects: Objects) -> None:
+    scene = road(agents=objects([[80.0, 0.0, 0.0, *CAR]], [6.0], [AgentKind.VEHICLE]))
+    plan = plan_for(scene)
+    assert plan.chosen == int(np.argmax(plan.scores.pdm_score))
+    result = PdmClosed().plan(scene, RNG)
+    assert isinstance(result, Plan)
+    np.testing.assert_array_equal(result.poses, plan.proposals.poses[plan.chosen, 1:41])
+
+    boxes = scene.agents.boxes.copy()
+    boxes[scene.step + 1 :] = np.nan
+    valid = scene.agents.valid.copy()
+    valid[scene.step + 1 :] = False
+    blind = replace(scene, agents=replace(scene.agents, boxes=boxes, valid=valid))
+    np.testing.assert_array_equal(pdm_closed_poses(blind), result.poses)
+
+
+def test_a_free_proposal_inherits_the_velocity_of_a_slower_ones_lead_unless_told_not_to() -> None:
+    # A cyclist cuts into the path after 2 s: ahead of the slow proposals, behind the fast ones, which drive freely.
+    ego = np.zeros(11)
+    ego[3] = 12.0
+    line = np.stack([np.linspace(-20, 300, 321), np.zeros(321), np.zeros(321)], axis=1)
+    heading, speed = -1.2, 5.0
+    cyclist = AgentTracks(
+        ("a",),
+        (AgentKind.BICYCLE,),
+        np.array([[[17.0, 12.0, heading, 1.5, 0.6]]]),
+        speed * np.array([[[np.cos(heading), np.sin(heading)]]]),
+        np.ones((1, 1), bool),
+        np.zeros((1, 1)),
+        np.ones(1),
+    )
+    seen = forecast(ego, cyclist)
+    quirk = proposals(ego, line, seen, None, PdmSettings())
+    clean = proposals(ego, line, seen, None, PdmSettings(shared_lead_memory=False))
+    free = clean.leads[:5, :41, 2] > 0.0
+    assert (clean.leads[:5, :41][free][:, 1] == 0.0).all()
+    inherited = quirk.leads[:5, :41, 1][free & (quirk.leads[:5, :41, 2] > 0.0)]
+    np.testing.assert_allclose(inherited[inherited != 0.0], speed * np.cos(heading), atol=1e-12)
+    assert (inherited != 0.0).any()
+    np.testing.assert_array_equal(quirk.leads[::5], clean.leads[::5])  # the slowest of a path inherits nothing
+
+
+def test_moving_the_whole_world_moves_the_plan_with_it(road: Road, objects: Objects) -> None:
+    scene = road(agents=objects([[85.0, 0.5, 0.1, *CAR]], [3.0], [AgentKind.VEHICLE]))
+    ego, line, agents = scene.ego_state, scene.centerline, scene.agents.window(scene.step, scene.step + 1)
+    shift = np.array([300.0, -120.0, 1.1])
+    moved_ego = ego.copy()
+    moved_ego[:3] = to_world(shift, ego[:3])
+    moved_boxes = agents.boxes.copy()
+    moved_boxes[..., :3] = to_world(shift, agents.boxes[..., :3])
+    turn = np.array([[np.cos(1.1), -np.sin(1.1)], [np.sin(1.1), np.cos(1.1)]])
+    moved_agents = replace(agents, boxes=moved_boxes, velocities=agents.velocities @ turn.T)
+    here = proposals(ego, line, forecast(ego, agents), None)
+    there = proposals(moved_ego, to_world(shift, line), forecast(moved_ego, moved_agents), None)
+    np.testing.assert_allclose(there.progress_velocity, here.progress_velocity, atol=1e-8)
+    np.testing.assert_allclose(there.poses, to_world(shift, here.poses), atol=1e-8)
+
+
+def test_a_route_without_length_is_a_rejection(road: Road) -> None:
+    scene = replace(road(), centerline=np.zeros((3, 3)))
+    result = PdmClosed().plan(scene, RNG)
+    assert isinstance(result, Rejected)
+    assert (result.stage, result.reason) == ("expert", "no_plan")
+    with pytest.raises(ValueError, match="length"):
+        pdm_closed_poses(scene)
+
+
+def test_a_speed_limit_of_zero_is_an_error_and_not_a_division(road: Road) -> None:
+    with pytest.raises(ValueError, match=r"speed_limit_mps: 0\.0 m/s cannot be driven"):
+        plan_for(road(limit=0.0))
+
+
+def test_an_ego_state_with_a_nan_is_an_error(road: Road) -> None:
+    scene = road()
+    history = scene.ego_history.copy()
+    history[-1, 3] = np.nan
+    with pytest.raises(ValueError, match=r"ego_state must be \(11,\) finite numbers"):
+        plan_for(replace(scene, ego_history=history))
+    with pytest.raises(ValueError, match=r"ego_state must be \(11,\) finite numbers"):
+        plan_for(replace(scene, ego_history=history[:, :4]))
+
+
+def test_a_centerline_with_a_nan_is_an_error(road: Road) -> None:
+    scene = road()
+    line = scene.centerline.copy()
+    line[3, 1] = np.nan
+    with pytest.raises(ValueError, match="centerline holds NaN"):
+        plan_for(replace(scene, centerline=line))
+
+
+def test_a_valid_object_without_a_box_is_an_error_that_names_it(road: Road, objects: Objects) -> None:
+    agents = objects([[80.0, 0.0, 0.0, *CAR], [90.0, 0.0, 0.0, *CAR]], [0.0, 0.0], [AgentKind.VEHICLE] * 2)
+    agents.boxes[:, 1, 3] = np.nan
+    with pytest.raises(ValueError, match="agents: track track1 is valid"):
+        plan_for(road(agents=agents))
+    with pytest.raises(ValueError, match="agents: 2 tracks need boxes"):
+        plan_for(road(agents=replace(agents, boxes=agents.boxes[..., :4])))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [
+        ({"speed_fractions": ()}, "speed_fractions"),
+        ({"speed_fractions": (0.5, -0.1)}, "speed_fractions"),
+        ({"lateral_offsets_m": (0.0, np.nan)}, "lateral_offsets_m"),
+        ({"min_gap_m": 0.0}, "min_gap_m"),
+        ({"fallback_speed_mps": np.inf}, "fallback_speed_mps"),
+        ({"headway_s": -1.0}, "headway_s"),
+    ],
+)
+def test_settings_that_make_no_sense_are_named(wrong: dict[str, Any], named: str) -> None:
+    with pytest.raises(ValueError, match=f"pdm {named} must be"):
+        PdmSettings(**wrong)
+
+
+def test_the_digest_changes_with_every_setting() -> None:
+    assert PdmClosed().digest() == PdmClosed().digest()
+    assert PdmClosed(PdmSettings(headway_s=2.0)).digest() != PdmClosed().digest()

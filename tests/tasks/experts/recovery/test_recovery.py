@@ -1,0 +1,206 @@
+"""The recovery expert: what it retrieves, and that what it makes of it can be driven."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tasks.experts.protocol import Plan
+from tasks.experts.recovery.expert import Recovery, RecoverySettings, RecoveryTable, start_velocities
+from tasks.experts.recovery.feasible import FeasibleSettings, feasible
+from tasks.stages import Rejected
+from tasks.world.clip import NOW, Scene
+from tasks.world.frames import to_local, to_world
+from tasks.world.kinematic_vocabulary import kinematic_trajectories
+from tasks.world.vehicle import AX, HEADING, PACIFICA, STEERING, VX, VY
+
+Road = Callable[..., Scene]
+RNG = np.random.default_rng(0)
+T = 0.1 * np.arange(1, 41)
+
+
+def straight(speed: float, accel: float = 0.0) -> np.ndarray:
+    return np.stack([speed * T + accel * T**2 / 2.0, np.zeros(40), np.zeros(40)], axis=1)
+
+
+def start_state(speed: float, accel: float = 0.0, steering: float = 0.0) -> np.ndarray:
+    state = np.zeros(11)
+    state[VX], state[AX], state[STEERING] = speed, accel, steering
+    return state
+
+
+def motion(trajectory: np.ndarray, state: np.ndarray) -> dict[str, np.ndarray]:
+    """Speed, acceleration, jerk and curvature of poses that follow `state` at the origin, by differences."""
+    poses = np.concatenate([np.zeros((1, 3)), trajectory])
+    step = np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1)
+    speed = step / 0.1
+    accel = np.diff(np.concatenate([[state[VX]], speed])) / np.concatenate([[0.05], np.full(39, 0.1)])
+    turn = np.diff(np.unwrap(poses[:, 2]))
+    curvature = turn / np.maximum(step, 1e-6)
+    return {"speed": speed, "accel": accel[1:], "jerk": np.diff(accel[1:]) / 0.1, "curvature": curvature, "turn": turn}
+
+
+def test_start_velocities_are_exact_for_constant_acceleration() -> None:
+    np.testing.assert_allclose(start_velocities(straight(8.0, -1.5)[None]), [[8.0, 0.0]], atol=1e-12)
+
+
+def drives(velocity: np.ndarray, accel: np.ndarray, yaw_rate: np.ndarray) -> np.ndarray:
+    """(M, 40, 3) constant velocity (M, 2) and acceleration (M, 2) from the origin, headings that turn steadily."""
+    xy = velocity[:, None] * T[:, None] + accel[:, None] * T[:, None] ** 2 / 2.0
+    return np.concatenate([xy, yaw_rate[:, None, None] * T[:, None]], axis=2)
+
+
+def test_a_row_is_matched_by_its_velocity_at_the_start_and_its_pose_at_four_seconds() -> None:
+    """The matching vector by hand: p(t) = v t + a t^2 / 2, and the heading 0 that every row starts with."""
+    rng = np.random.default_rng(0)
+    velocity, accel, yaw_rate = rng.uniform(0, 12, (50, 2)), rng.uniform(-2, 2, (50, 2)), rng.uniform(-0.3, 0.3, 50)
+    expected = np.column_stack([velocity, np.zeros(50), 4.0 * velocity + 8.0 * accel, 4.0 * yaw_rate])
+    table = RecoveryTable(drives(velocity, accel, yaw_rate))
+    np.testing.assert_allclose(table.features, expected, atol=1e-9)
+    assert [table.nearest(vector + 1e-6, np.ones(6)) for vector in expected] == list(range(50))
+
+
+def ending_at(velocity: tuple[float, float], end: np.ndarray) -> np.ndarray:
+    """(40, 3) from a velocity to an end pose (3,), at a constant acceleration."""
+    start = np.array([velocity])
+    return drives(start, (end[None, :2] - 4.0 * start) / 8.0, end[2:] / 4.0)[0]
+
+
+def test_the_ego_s_velocity_is_matched_forward_with_forward_and_sideways_with_sideways(road: Road) -> None:
+    """Rows that end alike: one starts as the ego moves, one as it would with its two components exchanged."""
+    scene = road(speed=10.0)
+    states = scene.ego_history.copy()
+    states[-1, VY] = 1.5
+    scene = replace(scene, ego_history=states)
+    goal = to_local(scene.ego_state[: HEADING + 1], scene.clip.ego_states[NOW + 40, : HEADING + 1])
+    rows = np.stack([ending_at(velocity, goal) for velocity in ((1.5, 10.0), (10.0, 1.5), (10.0, -1.5))])
+    assert Recovery(RecoveryTable(rows)).retrieve(scene) == 1
+
+
+def test_the_goal_is_the_log_s_pose_at_four_seconds_not_a_step_before_or_after(road: Road) -> None:
+    scene = road(speed=10.0)
+    ends = to_local(scene.ego_state[: HEADING + 1], scene.clip.ego_states[NOW + 39 : NOW + 42, : HEADING + 1])
+    rows = np.stack([ending_at((10.0, 0.0), end) for end in ends])
+    assert Recovery(RecoveryTable(rows)).retrieve(scene) == 1
+
+
+def test_end_headings_are_compared_around_the_circle() -> None:
+    left, right = straight(5.0), straight(5.0)
+    left[:, 2], right[:, 2] = np.pi - 0.05, 2.0
+    table = RecoveryTable(np.stack([right, left]))
+    target = np.array([5.0, 0.0, 0.0, 20.0, 0.0, -np.pi + 0.05])
+    assert table.nearest(target, np.ones(6)) == 1
+
+
+def test_weights_decide_between_speed_and_place() -> None:
+    table = RecoveryTable(
+        np.stack([straight(10.0, -2.0), straight(6.0)])
+    )  # both end at 24 m: 10 - 2 * 2 = 6 on average
+    target = np.array([10.0, 0.0, 0.0, 24.0, 0.0, 0.0])
+    assert table.nearest(target, np.ones(6)) == 0
+    assert table.nearest(target, np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])) == 0, "the first of equals"
+
+
+def test_the_nearest_row_is_the_one_with_the_least_sum_of_differences() -> None:
+    """One row is 3 m off along the road, the other 2 m along and 2 m aside: 3 against 4, by squares 9 against 8."""
+    ends = (23.0, 0.0), (22.0, 2.0)
+    table = RecoveryTable(np.stack([ending_at((5.0, 0.0), np.array([x, y, 0.0])) for x, y in ends]))
+    target = np.array([5.0, 0.0, 0.0, 20.0, 0.0, 0.0])
+    assert table.nearest(target, np.ones(6)) == 0
+    assert table.nearest(target, np.array([1.0, 1.0, 1.0, 1.0, 0.1, 1.0])) == 1
+
+
+def test_the_goal_is_the_logged_pose_four_seconds_later_seen_from_the_perturbed_ego(road: Road) -> None:
+    wanted = straight(10.0)
+    wanted[:, 1] = -1.2 * (T / 4.0) ** 2 * (3.0 - 2.0 * T / 4.0)  # 1.2 m to the right, where the log is
+    table = RecoveryTable(np.stack([straight(10.0), wanted * [1, -1, 1], wanted, straight(4.0)]))
+    scene = road(speed=10.0, y=1.2)
+    raw = Recovery(table, RecoverySettings(smooth=False))
+    assert raw.retrieve(scene) == 2
+    plan = raw.plan(scene, RNG)
+    assert isinstance(plan, Plan)
+    np.testing.assert_allclose(plan.poses, to_world(scene.ego_state[: HEADING + 1], wanted), atol=1e-12)
+    np.testing.assert_allclose(plan.poses[-1], scene.clip.ego_states[NOW + 40, :3], atol=1e-9)
+
+
+def test_the_same_scene_elsewhere_on_earth_retrieves_the_same_row(road: Road) -> None:
+    table = RecoveryTable(kinematic_trajectories(500, 1))
+    scene = road(speed=9.0, y=0.7)
+    origin = np.array([5000.0, -800.0, 2.5])
+    history, states = scene.ego_history.copy(), scene.clip.ego_states.copy()
+    history[:, :3], states[:, :3] = to_world(origin, history[:, :3]), to_world(origin, states[:, :3])
+    moved = replace(scene, ego_history=history, clip=replace(scene.clip, ego_states=states))
+    here, there = Recovery(table).plan(scene, RNG), Recovery(table).plan(moved, RNG)
+    assert isinstance(here, Plan)
+    assert isinstance(there, Plan)
+    np.testing.assert_allclose(to_local(origin, there.poses), here.poses, atol=1e-3)  # the solver's tolerance
+
+
+def test_a_clip_that_ends_before_the_goal_is_refused(road: Road) -> None:
+    with pytest.raises(ValueError, match="needs the log at step 96; the clip has 96"):
+        Recovery(RecoveryTable(straight(5.0)[None])).retrieve(replace(road(), step=56))
+
+
+def test_a_drivable_trajectory_stays_as_it_is() -> None:
+    for speed, accel in ((10.0, 0.0), (6.0, 1.2), (12.0, -2.0), (0.0, 0.0)):
+        wanted = straight(speed, accel)
+        np.testing.assert_allclose(feasible(wanted, start_state(speed, accel)), wanted, atol=0.02)
+
+
+@pytest.mark.parametrize(("speed", "accel", "steering"), [(8.0, 0.0, 0.0), (3.0, 1.0, 0.1), (13.0, -1.5, -0.03)])
+def test_limits_hold_from_the_actual_start_state(speed: float, accel: float, steering: float) -> None:
+    limits = FeasibleSettings()
+    state = start_state(speed, accel, steering)
+    for wanted in kinematic_trajectories(40, 5):
+        result = feasible(wanted, state)
+        assert not isinstance(result, str), result
+        found = motion(result, state)
+        fast = found["speed"] > 1.0
+        assert (found["speed"] > -1e-2).all()
+        assert (found["accel"] > limits.accel_min_mps2 - 0.05).all()
+        assert (found["accel"] < limits.accel_max_mps2 + 0.05).all()
+        assert (np.abs(found["jerk"]) < limits.jerk_max_mps3 + 0.3).all()
+        kappa0 = np.tan(steering) / PACIFICA.wheel_base
+        assert (np.abs(found["curvature"][fast]) < max(limits.curvature_max_1pm, abs(kappa0)) + 0.01).all()
+        assert (np.abs(found["turn"] / 0.1) < max(limits.yaw_rate_max_radps, abs(kappa0) * speed) + 0.05).all()
+        assert abs(found["speed"][0] - speed - 0.05 * accel) < 0.05, "it starts with the speed it has"
+
+
+def test_it_comes_back_to_the_reference_after_a_wrong_start() -> None:
+    result = feasible(straight(8.0), start_state(9.5, 0.0, 0.02))
+    assert not isinstance(result, str)
+    assert np.hypot(*(result[-1, :2] - straight(8.0)[-1, :2])) < 0.5
+    assert abs(result[-1, 2]) < 0.02
+
+
+def test_a_start_that_breaks_a_limit_itself_still_has_a_plan() -> None:
+    for state in (start_state(10.0, -6.0), start_state(0.3, -3.0), start_state(15.0, 3.5), start_state(4.0, 0.0, 0.9)):
+        assert not isinstance(feasible(straight(8.0), state), str)
+
+
+def test_the_same_problem_gives_the_same_bits() -> None:
+    wanted = kinematic_trajectories(3, 9)
+    first = feasible(wanted[0], start_state(7.0))
+    feasible(wanted[1], start_state(2.0))
+    np.testing.assert_array_equal(feasible(wanted[0], start_state(7.0)), first)
+
+
+def test_a_solver_that_does_not_converge_is_a_rejection_and_never_the_raw_trajectory(road: Road) -> None:
+    hurried = RecoverySettings(feasible=FeasibleSettings(max_iterations=1, tolerance=1e-12))
+    result = Recovery(RecoveryTable(kinematic_trajectories(50, 2)), hurried).plan(road(), RNG)
+    assert isinstance(result, Rejected)
+    assert (result.stage, result.reason) == ("expert", "no_plan")
+    assert "longitudinal QP" in result.detail
+
+
+def test_the_digest_knows_the_table_and_the_settings() -> None:
+    table, other = RecoveryTable(kinematic_trajectories(5, 0)), RecoveryTable(kinematic_trajectories(5, 1))
+    digests = {
+        Recovery(table).digest(),
+        Recovery(other).digest(),
+        Recovery(table, RecoverySettings(smooth=False)).digest(),
+        Recovery(table, RecoverySettings(weights=(2.0, 1.0, 1.0, 1.0, 1.0, 1.0))).digest(),
+    }
+    assert len(digests) == 4
+    assert Recovery(table).digest() == Recovery(RecoveryTable(kinematic_trajectories(5, 0))).digest()

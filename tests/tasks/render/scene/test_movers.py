@@ -1,0 +1,49 @@
+"""Which sight lines meet a box: as many points along each say it."""
+
+import numpy as np
+
+from tasks.render.scene.movers import BEYOND_M, behind_boxes
+
+SAMPLES = 4000  # along a line
+
+
+def meets(points: np.ndarray, eye: np.ndarray, boxes: np.ndarray, slack_m: float) -> np.ndarray:
+    """Whether a point of the line from the eye to BEYOND_M behind its end lies in a box grown by BEYOND_M + slack."""
+    lines = points - eye
+    ends = 1.0 + (BEYOND_M + slack_m) / np.linalg.norm(lines, axis=1)
+    shares = np.linspace(0.0, 1.0, SAMPLES)[:, None] * ends
+    along = eye + shares[..., None] * lines  # (SAMPLES, M, 3)
+    met = np.zeros(len(points), bool)
+    for box in boxes:
+        c, s = np.cos(box[3]), np.sin(box[3])
+        local = (along - box[:3]) @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        met |= (np.abs(local) <= 0.5 * box[4:] + BEYOND_M + slack_m).all(axis=-1).any(axis=0)
+    return met
+
+
+def test_a_line_meets_a_box_where_one_of_its_points_lies_in_it() -> None:
+    rng = np.random.default_rng(0)
+    eye = np.array([1.0, -2.0, 1.5])
+    points = eye + rng.normal(size=(600, 3)) * [20.0, 20.0, 4.0]
+    place, heading, size = (
+        rng.normal(size=(12, 3)) * [15.0, 15.0, 2.0],
+        rng.uniform(-np.pi, np.pi, (12, 1)),
+        rng.uniform(0.5, 8.0, (12, 3)),
+    )
+    boxes = np.hstack([place, heading, size])
+    found = np.asarray(behind_boxes(points, eye, boxes))
+    surely, perhaps = meets(points, eye, boxes, -0.03), meets(points, eye, boxes, 0.03)
+    assert 100 < surely.sum() < 500
+    assert found[surely].all()
+    assert not found[~perhaps].any()
+    assert (perhaps & ~surely).sum() < 60, "nearly every line is decided"
+
+
+def test_an_eye_inside_a_box_sees_nothing_else() -> None:
+    points = np.random.default_rng(1).normal(size=(50, 3)) * 10.0
+    box = np.array([[0.0, 0.0, 0.0, 0.3, 4.0, 2.0, 2.0]])
+    assert np.asarray(behind_boxes(points, np.zeros(3), box)).all()
+
+
+def test_without_boxes_every_line_is_free() -> None:
+    assert not np.asarray(behind_boxes(np.ones((3, 3)), np.zeros(3), np.zeros((0, 7)))).any()

@@ -1,0 +1,129 @@
+"""The CUDA backend: what it is called with, what it says where it cannot work, and its image where it can."""
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import street
+
+from tasks.render.scene.asset import RenderAsset
+from tasks.render.scene.engine import Backend, check, render, vehicles_at
+from tasks.render.splatting import sh
+from tasks.render.splatting.gaussians import Gaussians
+from tasks.render.splatting.gsplat_backend import BackendMissing, arguments, require, view_of
+from tasks.render.splatting.project import DILATION_PX2, NEAR_M
+from tasks.render.splatting.raster import colours_seen, splat
+from tasks.world.camera import Pinhole
+
+POSE = street.ego_pose(3.0, 0.4) @ street.EGO_FROM_CAMERA
+FRONT = Pinhole(street.INTRINSICS, POSE, street.WIDTH, street.HEIGHT)
+
+
+def cloud(n: int, count: int) -> Gaussians:
+    rng = np.random.default_rng(3)
+    quats = rng.normal(size=(n, 4))
+    return Gaussians(
+        (rng.uniform(-1.0, 1.0, (n, 3)) * [10.0, 5.0, 2.0] + [16.0, 0.0, 1.5]).astype(np.float32),
+        (quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32),
+        np.log(rng.uniform(0.02, 0.5, (n, 3))).astype(np.float32),
+        rng.uniform(0.05, 0.95, n).astype(np.float32),
+        rng.uniform(0.2, 0.8, (n, 3)).astype(np.float32),
+        rng.normal(0.0, 0.1, (n, count, 3)).astype(np.float32),
+    )
+
+
+@pytest.mark.parametrize(("count", "degree"), [(0, None), (3, 1), (8, 2), (15, 3)])
+def test_it_is_given_the_cameras_the_scales_and_all_coefficients(count: int, degree: int | None) -> None:
+    scene = cloud(20, count)
+    aside = replace(FRONT, world_from_camera=street.ego_pose(0.0, -1.0) @ street.EGO_FROM_CAMERA)
+    given = arguments(scene, [FRONT, aside])
+    assert {name: value.shape for name, value in given.items() if isinstance(value, np.ndarray)} == {
+        "means": (20, 3),
+        "quats": (20, 4),
+        "scales": (20, 3),
+        "opacities": (20,),
+        "colors": (20, 3) if degree is None else (20, count + 1, 3),
+        "viewmats": (2, 4, 4),
+        "Ks": (2, 3, 3),
+    }
+    assert all(value.dtype == np.float32 for value in given.values() if isinstance(value, np.ndarray))
+    np.testing.assert_allclose(given["scales"], np.exp(scene.log_scales), rtol=1e-6)
+    np.testing.assert_allclose(
+        given["viewmats"] @ [FRONT.world_from_camera, aside.world_from_camera], [np.eye(4)] * 2, atol=1e-6
+    )
+    assert (given["width"], given["height"], given["sh_degree"]) == (street.WIDTH, street.HEIGHT, degree)
+    assert (given["near_plane"], given["eps2d"], given["render_mode"]) == (NEAR_M, DILATION_PX2, "RGB+ED")
+    plain = given["colors"] if degree is None else 0.5 + sh.C0 * given["colors"][:, 0]
+    np.testing.assert_allclose(plain, scene.colours, atol=1e-6)
+
+
+def test_its_colours_stand_before_the_sky_and_its_depth_only_where_something_is() -> None:
+    drawn, alpha = np.full((2, 3, 4), 0.25, np.float32), np.zeros((2, 3, 1), np.float32)
+    drawn[..., 3] = 7.0
+    alpha[0] = 0.75
+    view = view_of(drawn, alpha, np.ones((2, 3, 3), np.float32))
+    np.testing.assert_array_equal(view.rgb[0], np.full((3, 3), 0.5))
+    np.testing.assert_array_equal(view.rgb[1], np.full((3, 3), 1.25))
+    np.testing.assert_array_equal(view.depth, [[7.0] * 3, [0.0] * 3])
+    np.testing.assert_array_equal(view.alpha, alpha[..., 0])
+
+
+@pytest.mark.parametrize("name", ["torch", "gsplat"])
+def test_an_absent_package_is_named_with_how_to_get_it(
+    monkeypatch: pytest.MonkeyPatch, name: str, street_asset: RenderAsset
+) -> None:
+    for module in ("torch", "gsplat"):
+        monkeypatch.setitem(sys.modules, module, None if module == name else sys)
+    with pytest.raises(BackendMissing, match=rf"needs torch and gsplat \(import of {name} .*\[gpu\]"):
+        render(street_asset, [FRONT], backend=Backend.GSPLAT)
+
+
+def test_the_cpu_needs_nothing_and_a_machine_without_gpu_is_told_so() -> None:
+    check(Backend.CPU)
+    torch = pytest.importorskip("torch")
+    pytest.importorskip("gsplat", reason="gsplat is not installed")
+    if torch.cuda.is_available():
+        pytest.skip("there is a GPU here")
+    with pytest.raises(BackendMissing, match=r"needs a CUDA device; torch .* sees none"):
+        check(Backend.GSPLAT)
+
+
+def test_gsplat_s_own_reference_in_torch_projects_and_colours_as_the_cpu_does() -> None:
+    torch = pytest.importorskip("torch")
+    twin = pytest.importorskip("gsplat.cuda._torch_impl", reason="gsplat is not installed")
+    scene = cloud(400, 15)
+    given = arguments(scene, [FRONT])
+    tensors = {name: torch.from_numpy(value) for name, value in given.items() if isinstance(value, np.ndarray)}
+    covariances, _ = twin._quat_scale_to_covar_preci(tensors["quats"], tensors["scales"], compute_preci=False)
+    size = (FRONT.width, FRONT.height)
+    limits = {"eps2d": given["eps2d"], "near_plane": given["near_plane"]}
+    _, means2d, depths, conics, _ = twin._fully_fused_projection(
+        tensors["means"], covariances, tensors["viewmats"], tensors["Ks"], *size, **limits
+    )
+    splats = splat(scene, FRONT.intrinsics, POSE, *size)
+    index, projected = splats.index, splats.projected
+    inside = (projected[:, :2] > 0.0).all(axis=1) & (projected[:, :2] < size).all(axis=1)
+    index, projected = index[inside], projected[inside]
+    assert len(index) > 100
+    np.testing.assert_allclose(means2d[0, index].numpy(), projected[:, :2], atol=1e-4)
+    np.testing.assert_allclose(depths[0, index].numpy(), projected[:, 2], rtol=1e-6)
+    np.testing.assert_allclose(conics[0, index].numpy(), projected[:, 3:6], rtol=1e-4, atol=1e-6)
+    directions = tensors["means"] - torch.from_numpy(POSE[:3, 3].astype(np.float32))
+    colours = twin._spherical_harmonics(given["sh_degree"], directions, tensors["colors"]).numpy() + 0.5
+    seen = colours_seen(scene, POSE[:3, 3].copy(), np.arange(len(scene)))
+    np.testing.assert_allclose(np.maximum(colours, 0.0), seen, atol=1e-5)
+
+
+def test_the_gpu_draws_the_cpu_s_image(street_asset: RenderAsset) -> None:
+    try:
+        require()
+    except BackendMissing as error:
+        pytest.skip(str(error))
+    there = vehicles_at(street.tracks(), 0.8)
+    for asset in (street_asset, replace(street_asset, background=cloud(3000, 15))):
+        slow, fast = (render(asset, [FRONT], there, backend)[0] for backend in (Backend.CPU, Backend.GSPLAT))
+        assert np.abs(slow.rgb - fast.rgb).max() <= 2.0 / 255.0
+        np.testing.assert_allclose(fast.alpha, slow.alpha, atol=2.0 / 255.0)
+        solid = slow.alpha > 0.5
+        np.testing.assert_allclose(fast.depth[solid], slow.depth[solid], rtol=0.01)

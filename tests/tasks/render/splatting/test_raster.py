@@ -1,0 +1,165 @@
+"""The tile rasteriser against a slow, obvious twin, and against what can be said in closed form."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tasks.render.splatting.gaussians import (
+    EMPTY,
+    Gaussians,
+    concatenate,
+    covariances_of,
+    mirrored,
+    moved,
+    quats_of,
+    rotations_of,
+)
+from tasks.render.splatting.pixels import MAX_ALPHA
+from tasks.render.splatting.project import DILATION_PX2, MAX_TANGENT_RATIO, MIN_ALPHA, NEAR_M
+from tasks.render.splatting.raster import gather, rasterize, splat
+
+INTRINSICS = np.array([[60.0, 0.0, 37.0], [0.0, 58.0, 22.0], [0.0, 0.0, 1.0]])
+WIDTH, HEIGHT = 75, 45  # no multiple of a tile
+BLACK = np.zeros(3, np.float32)
+
+
+def cloud(n: int, seed: int, sigma: float = 0.15) -> Gaussians:
+    rng = np.random.default_rng(seed)
+    depth = rng.uniform(-1.0, 25.0, n)  # some behind the camera
+    means = np.stack([rng.uniform(-0.8, 0.8, n) * depth, rng.uniform(-0.5, 0.5, n) * depth, depth], 1)
+    quats = rng.normal(size=(n, 4))
+    return Gaussians(
+        means.astype(np.float32),
+        (quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32),
+        np.log(sigma * rng.uniform(0.2, 2.0, (n, 3))).astype(np.float32),
+        rng.uniform(0.05, 0.98, n).astype(np.float32),
+        rng.uniform(0.0, 1.0, (n, 3)).astype(np.float32),
+    )
+
+
+def pose(yaw: float, position: tuple[float, float, float]) -> NDArray[np.float64]:
+    c, s = np.cos(yaw), np.sin(yaw)
+    out = np.eye(4)
+    out[:3, :3] = [[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]
+    out[:3, 3] = position
+    return out
+
+
+def slow_rasterize(
+    gaussians: Gaussians, scene_from_camera: NDArray[np.float64], background: NDArray[np.float32]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Every Gaussian on every pixel, in float64, nearest first."""
+    camera = np.linalg.inv(scene_from_camera)
+    means = gaussians.means.astype(np.float64) @ camera[:3, :3].T + camera[:3, 3]
+    covariances = camera[:3, :3] @ covariances_of(gaussians) @ camera[:3, :3].T
+    fx, fy, cx, cy = INTRINSICS[0, 0], INTRINSICS[1, 1], INTRINSICS[0, 2], INTRINSICS[1, 2]
+    u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    light, rgb, depth = np.ones((HEIGHT, WIDTH)), np.zeros((HEIGHT, WIDTH, 3)), np.zeros((HEIGHT, WIDTH))
+    for i in np.argsort(means[:, 2], kind="stable"):
+        x, y, z = means[i]
+        if z < NEAR_M:
+            continue
+        tx = np.clip(x / z, -MAX_TANGENT_RATIO * cx / fx, MAX_TANGENT_RATIO * (WIDTH - cx) / fx)
+        ty = np.clip(y / z, -MAX_TANGENT_RATIO * cy / fy, MAX_TANGENT_RATIO * (HEIGHT - cy) / fy)
+        jacobian = np.array([[fx / z, 0.0, -fx / z * tx], [0.0, fy / z, -fy / z * ty]])
+        conic = np.linalg.inv(jacobian @ covariances[i] @ jacobian.T + DILATION_PX2 * np.eye(2))
+        du, dv = u - (fx * x / z + cx), v - (fy * y / z + cy)
+        power = -0.5 * (conic[0, 0] * du**2 + 2 * conic[0, 1] * du * dv + conic[1, 1] * dv**2)
+        alpha = np.minimum(gaussians.opacities[i] * np.exp(power), MAX_ALPHA)
+        weight = np.where(alpha >= MIN_ALPHA, alpha, 0.0) * light
+        light = light - weight
+        rgb += weight[..., None] * gaussians.colours[i]
+        depth += weight * z
+    alpha = 1.0 - light
+    mean_depth = np.divide(depth, alpha, out=np.zeros_like(depth), where=alpha > 0)
+    return rgb + light[..., None] * background, mean_depth, alpha
+
+
+@pytest.mark.parametrize(("n", "sigma"), [(40, 0.6), (800, 0.15), (3000, 0.5)])
+def test_the_kernel_equals_its_slow_twin(n: int, sigma: float) -> None:
+    scene, view = cloud(n, seed=n, sigma=sigma), pose(0.2, (0.3, -0.1, -0.5))
+    background = np.random.default_rng(1).uniform(0, 1, (HEIGHT, WIDTH, 3)).astype(np.float32)
+    fast = rasterize(scene, INTRINSICS, view, WIDTH, HEIGHT, background)
+    rgb, depth, alpha = slow_rasterize(scene, view, background)
+    assert np.abs(fast.rgb - rgb).max() <= 2.0 / 255.0
+    assert np.abs(fast.alpha - alpha).max() <= 2.0 / 255.0
+    solid = alpha > 0.05
+    assert np.abs(fast.depth - depth)[solid].max() <= 0.1
+    assert np.median(np.abs(fast.rgb - rgb)) < 1e-4
+
+
+def test_the_same_scene_gives_the_same_bytes() -> None:
+    scene = cloud(2000, seed=3)
+    first = rasterize(scene, INTRINSICS, np.eye(4), WIDTH, HEIGHT, BLACK)
+    second = rasterize(scene, INTRINSICS, np.eye(4), WIDTH, HEIGHT, BLACK)
+    assert first.rgb.tobytes() == second.rgb.tobytes()
+    assert first.depth.tobytes() == second.depth.tobytes()
+
+
+def test_an_empty_scene_is_its_background() -> None:
+    background = np.random.default_rng(2).uniform(0, 1, (HEIGHT, WIDTH, 3)).astype(np.float32)
+    view = rasterize(EMPTY, INTRINSICS, np.eye(4), WIDTH, HEIGHT, background)
+    np.testing.assert_array_equal(view.rgb, background)
+    assert not view.alpha.any() and not view.depth.any()
+
+
+def one(
+    mean: tuple[float, float, float], sigma: float, opacity: float, colour: tuple[float, float, float]
+) -> Gaussians:
+    return Gaussians(
+        np.array([mean], np.float32),
+        np.array([[1, 0, 0, 0]], np.float32),
+        np.full((1, 3), np.log(sigma), np.float32),
+        np.array([opacity], np.float32),
+        np.array([colour], np.float32),
+    )
+
+
+def test_the_nearer_gaussian_hides_the_farther_one_in_whatever_order_they_are_stored() -> None:
+    near, far = one((0, 0, 4), 0.5, 0.99, (1, 0, 0)), one((0, 0, 9), 3.0, 0.99, (0, 0, 1))
+    for scene in (concatenate([near, far]), concatenate([far, near])):
+        view = rasterize(scene, INTRINSICS, np.eye(4), WIDTH, HEIGHT, BLACK)
+        assert view.rgb[22, 37, 0] > 0.95 and view.rgb[22, 37, 2] < 0.05
+        assert view.depth[22, 37] == pytest.approx(4.0, abs=0.1)
+
+
+def test_a_gaussian_lands_where_the_pinhole_equation_says() -> None:
+    view = rasterize(one((1.5, -0.7, 8.0), 0.05, 0.9, (1, 1, 1)), INTRINSICS, np.eye(4), WIDTH, HEIGHT, BLACK)
+    weight = view.alpha.astype(np.float64)
+    u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    assert (weight * u).sum() / weight.sum() == pytest.approx(60.0 * 1.5 / 8.0 + 37.0, abs=0.05)
+    assert (weight * v).sum() / weight.sum() == pytest.approx(58.0 * -0.7 / 8.0 + 22.0, abs=0.05)
+
+
+def test_what_is_behind_or_before_the_near_plane_is_not_drawn() -> None:
+    scene = concatenate([one((0, 0, -5), 1.0, 0.9, (1, 1, 1)), one((0, 0, 0.2), 1.0, 0.9, (1, 1, 1))])
+    assert not rasterize(scene, INTRINSICS, np.eye(4), WIDTH, HEIGHT, BLACK).alpha.any()
+
+
+def test_moving_scene_and_camera_together_changes_nothing() -> None:
+    scene, motion = cloud(300, seed=5), pose(0.7, (12.0, -3.0, 40.0))
+    here = rasterize(scene, INTRINSICS, pose(0.1, (0.1, 0.0, 0.0)), WIDTH, HEIGHT, BLACK)
+    there = rasterize(moved(scene, motion), INTRINSICS, motion @ pose(0.1, (0.1, 0, 0)), WIDTH, HEIGHT, BLACK)
+    assert np.abs(here.rgb - there.rgb).max() <= 2.0 / 255.0
+
+
+def test_mirroring_reflects_covariances_at_the_length_axis() -> None:
+    scene, flip = cloud(50, seed=6), np.diag([1.0, -1.0, 1.0])
+    np.testing.assert_allclose(covariances_of(mirrored(scene)), flip @ covariances_of(scene) @ flip, atol=1e-6)
+    np.testing.assert_allclose(mirrored(mirrored(scene)).means, scene.means)
+
+
+def test_quaternions_and_rotations_are_inverse() -> None:
+    quats = cloud(200, seed=7).quats
+    rotations = rotations_of(quats)
+    np.testing.assert_allclose(rotations_of(quats_of(rotations)), rotations, atol=1e-6)
+
+
+def test_gathering_white_gives_the_blending_weights() -> None:
+    scene = cloud(500, seed=8)
+    splats = splat(scene, INTRINSICS, np.eye(4), WIDTH, HEIGHT)
+    white = np.ones((HEIGHT, WIDTH, 3), np.float32)
+    sums, weights = gather(splats, white)
+    np.testing.assert_allclose(sums, np.repeat(weights[:, None], 3, 1), rtol=1e-5)
+    alpha = rasterize(scene, INTRINSICS, np.eye(4), WIDTH, HEIGHT, BLACK).alpha
+    assert weights.sum() == pytest.approx(alpha.sum(), rel=1e-4)

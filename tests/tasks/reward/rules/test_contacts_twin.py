@@ -1,0 +1,256 @@
+"""Collisions and time to collision: the kernels equal the numpy version in random small worlds, and invariances."""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tasks.kernels.compiled import kernel
+from tasks.reward.rules.contacts import first_collision, first_time_to_collision
+from tasks.reward.rules.ego import MULTIPLE_LANES, NON_DRIVABLE, Body, empty_body, place
+from tasks.reward.rules.map_index import index_map
+from tasks.reward.rules.obstacles import Obstacles, index_obstacles, unindexed, with_objects
+from tasks.world.frames import box_corners, to_world
+from tasks.world.lanes import MapLayer, MapPolygon
+from tasks.world.vehicle import HEADING, PACIFICA, VX, VY, X, Y
+from tests.tasks.reward.slow import collisions as slow
+from tests.tasks.reward.slow.areas import EgoAreas
+from tests.tasks.reward.slow.boxes import ego_boxes
+from tests.tasks.reward.slow.prepare import Obstacles as SlowObstacles
+
+HALF_LENGTH_M, HALF_WIDTH_M = PACIFICA.half_length, PACIFICA.half_width
+
+
+@dataclass(frozen=True)
+class World:
+    """K drives among N objects."""
+
+    states: np.ndarray  # (K, 41, 11)
+    flags: np.ndarray  # (K, 41) bits of tasks.reward.rules.ego
+    crossing: np.ndarray  # (P, 2) ring of an intersection
+    boxes: np.ndarray  # (41, N, 5)
+    is_stopped: np.ndarray  # (N,)
+    collision_score: np.ndarray  # (N,)
+
+
+def contacts(world: World, obstacles: Obstacles) -> np.ndarray:
+    """NC, its index, TTC's index (K, 3) by the kernels."""
+    found = np.empty((len(world.states), 3))
+    ignored = np.ones(obstacles.boxes.shape[1], dtype=bool)
+    map_index = index_map([MapPolygon("crossing", MapLayer.INTERSECTION, world.crossing)], frozenset())
+    half = HALF_LENGTH_M, HALF_WIDTH_M
+    for k, states in enumerate(world.states):
+        body = empty_body(len(states))
+        place(states, PACIFICA.rear_axle_to_center, body)
+        body.flags[:] = world.flags[k]
+        found[k, :2] = first_collision(obstacles, states, body, *half, ignored)
+        found[k, 2] = first_time_to_collision(obstacles, states, body, map_index, *half, ignored)
+    return found
+
+
+def indexed(world: World) -> Obstacles:
+    return index_obstacles(
+        world.boxes, world.is_stopped, world.collision_score, math.hypot(HALF_LENGTH_M, HALF_WIDTH_M)
+    )
+
+
+def slow_contacts(world: World) -> np.ndarray:
+    """The same by the numpy version."""
+    centroids = np.full((*world.boxes.shape[:2], 2), np.nan)
+    present = np.isfinite(world.boxes).all(axis=-1)
+    polygons = shapely.polygons(box_corners(world.boxes[present]))
+    centroids[present] = shapely.get_coordinates(shapely.centroid(polygons))
+    obstacles = SlowObstacles(world.boxes, centroids, world.is_stopped, world.collision_score)
+    nowhere = np.zeros(world.flags.shape, dtype=bool)
+    areas = EgoAreas(
+        multiple_lanes=(world.flags & MULTIPLE_LANES) != 0,
+        non_drivable=(world.flags & NON_DRIVABLE) != 0,
+        oncoming=nowhere,
+        center_in_intersection=nowhere,
+        rear_axle_in_intersection=shapely.contains_xy(
+            shapely.Polygon(world.crossing), world.states[..., X], world.states[..., Y]
+        ),
+    )
+    bodies = ego_boxes(world.states, PACIFICA)
+    nc, collision = slow.no_at_fault_collision(obstacles, world.states, bodies, areas)
+    ttc, violation = slow.time_to_collision(obstacles, world.states, bodies, areas)
+    assert np.array_equal(ttc, np.where(np.isinf(violation), 1.0, 0.0))
+    return np.stack([nc, collision, violation], axis=-1)
+
+
+SPEEDS = (0.0, 0.004, 0.005, 0.05, 0.051, 2.0, 5.0, 9.0, 15.0, -1.0)
+SIZES = ((4.5, 2.0), (0.5, 0.5), (0.0, 2.0), (3.0, 0.0), (0.0, 0.0), (14.0, 2.5), (200.0, 0.3), (5.176, 2.297))
+
+
+def drive(rng: np.random.Generator) -> np.ndarray:
+    """States (41, 11): straight or curved, at a speed that may change at once, standing included."""
+    states = np.zeros((41, 11))
+    speed = np.full(41, rng.choice(SPEEDS))
+    if rng.random() < 0.4:
+        speed[rng.integers(41) :] = rng.choice(SPEEDS)
+    rate = rng.choice([0.0, 0.0, 0.3, -0.5])
+    states[:, HEADING] = rate * 0.1 * np.arange(41)
+    gone = 0.1 * np.cumsum(speed) - 0.1 * speed[0]
+    states[:, X] = gone if rate == 0.0 else 0.1 * np.cumsum(speed * np.cos(states[:, HEADING]))
+    states[:, Y] = 0.0 if rate == 0.0 else 0.1 * np.cumsum(speed * np.sin(states[:, HEADING]))
+    states[:, VX], states[:, VY] = speed, rng.choice([0.0, 0.0, 0.01])
+    return states
+
+
+def item(rng: np.random.Generator, path: np.ndarray) -> np.ndarray:
+    """Boxes (41, 5): beside or on a drive's path, standing or moving, sharing edges with the ego, not always there."""
+    length, width = SIZES[rng.integers(len(SIZES))]
+    at = path[rng.integers(41)]
+    x, y = at[X] + rng.uniform(-8.0, 20.0), at[Y] + rng.choice([0.0, rng.uniform(-5.0, 5.0)])
+    if rng.random() < 0.3:  # bumper to bumper, or side to side, with the ego at that moment
+        x = at[X] + PACIFICA.rear_axle_to_center + rng.choice([-1.0, 0.0, 1.0]) * (PACIFICA.length + length) / 2.0
+        y = at[Y] + rng.choice([-1.0, 0.0, 1.0]) * (PACIFICA.width + width) / 2.0
+    velocity = rng.choice([0.0, 0.0, 5.0, -3.0, 15.0]), rng.choice([0.0, 0.0, 2.0, -2.0])
+    boxes = np.empty((41, 5))
+    boxes[:, :2] = np.array([x, y]) + 0.1 * np.arange(41)[:, None] * np.array(velocity)
+    boxes[:, 2] = rng.choice([0.0, np.pi / 2, np.pi, rng.uniform(-4.0, 4.0)])
+    boxes[:, 3:] = length, width
+    if rng.random() < 0.6:
+        boxes[: rng.integers(41)] = np.nan
+    if rng.random() < 0.3:
+        boxes[rng.integers(41) :] = np.nan
+    if rng.random() < 0.2:
+        boxes[rng.random(41) < 0.5] = np.nan
+    return boxes
+
+
+def square(low_m: float, high_m: float) -> np.ndarray:
+    """Closed ring (5, 2) between low and high in x, and as wide as it is long, around y = 0."""
+    half = (high_m - low_m) / 2.0
+    return np.array([[low_m, -half], [high_m, -half], [high_m, half], [low_m, half], [low_m, -half]])
+
+
+def moved(world: World, origin: np.ndarray) -> World:
+    """The whole world in another frame."""
+    states, boxes = world.states.copy(), world.boxes.copy()
+    crossing = to_world(origin, np.column_stack([world.crossing, np.zeros(len(world.crossing))]))[:, :2]
+    states[..., [X, Y, HEADING]] = to_world(origin, states[..., [X, Y, HEADING]])
+    boxes[..., :3] = to_world(origin, boxes[..., :3])
+    return replace(world, states=states, boxes=boxes, crossing=crossing)
+
+
+@st.composite
+def worlds(draw: st.DrawFn) -> World:
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    n_drives, n_items = draw(st.integers(1, 4)), draw(st.sampled_from([0, 1, 2, 6, 25]))
+    states = np.stack([drive(rng) for _ in range(n_drives)])
+    items = [item(rng, states[rng.integers(n_drives)]) for _ in range(n_items)]
+    if n_items > 2 and draw(st.booleans()):  # many in one place
+        items = [items[i % 2] for i in range(n_items)]
+    off_lane = rng.choice([0, MULTIPLE_LANES, NON_DRIVABLE, 12], (n_drives, 41)).astype(np.uint8)
+    world = World(
+        states=states,
+        flags=off_lane if draw(st.booleans()) else np.zeros_like(off_lane),
+        crossing=square(*draw(st.sampled_from([(-90.0, -80.0), (1.5, 20.0), (-80.0, 80.0)]))),
+        boxes=np.stack(items, axis=1) if items else np.empty((41, 0, 5)),
+        is_stopped=rng.random(n_items) < 0.4,
+        collision_score=rng.choice([0.0, 0.5], n_items),
+    )
+    origin = draw(st.sampled_from([(0.0, 0.0, 0.0), (0.0, 0.0, np.pi / 2), (-63.0, 129.0, 2.2), (3.3e5, 4.7e6, -0.4)]))
+    return moved(world, np.array(origin))
+
+
+@settings(max_examples=400)
+@given(worlds())
+def test_both_rules_equal_the_numpy_version(world: World) -> None:
+    np.testing.assert_array_equal(contacts(world, indexed(world)), slow_contacts(world))
+
+
+@settings(max_examples=60)
+@given(worlds())
+def test_objects_without_an_index_give_the_same(world: World) -> None:
+    plain = unindexed(world.boxes, world.is_stopped, world.collision_score)
+    np.testing.assert_array_equal(contacts(world, plain), contacts(world, indexed(world)))
+
+
+@settings(max_examples=60)
+@given(world=worlds(), seed=st.integers(0, 1000))
+def test_the_order_of_objects_changes_nothing(world: World, seed: int) -> None:
+    order = np.random.default_rng(seed).permutation(len(world.is_stopped))
+    shuffled = replace(
+        world,
+        boxes=world.boxes[:, order],
+        is_stopped=world.is_stopped[order],
+        collision_score=world.collision_score[order],
+    )
+    np.testing.assert_array_equal(contacts(shuffled, indexed(shuffled)), contacts(world, indexed(world)))
+
+
+def crowd(seed: int, n_drives: int = 20, n_items: int = 40) -> World:
+    """A world without ties: nothing is aligned with anything."""
+    rng = np.random.default_rng(seed)
+    states = np.stack([drive(rng) for _ in range(n_drives)])
+    boxes = np.stack([item(rng, states[rng.integers(n_drives)]) for _ in range(n_items)], axis=1)
+    boxes[..., :2] += rng.normal(0.0, 0.1, (n_items, 2))
+    boxes[..., 2] += rng.normal(0.0, 0.1, n_items)
+    return World(
+        states=states,
+        flags=rng.choice([0, MULTIPLE_LANES], (n_drives, 41)).astype(np.uint8),
+        crossing=square(1.3, 17.05),
+        boxes=boxes,
+        is_stopped=rng.random(n_items) < 0.2,
+        collision_score=rng.choice([0.0, 0.5], n_items),
+    )
+
+
+@pytest.mark.parametrize("origin", [(1000.0, -2000.0, 0.0), (0.0, 0.0, 2.0), (-5e5, 3e6, -1.1)])
+def test_moving_the_world_changes_nothing(origin: tuple[float, float, float]) -> None:
+    for seed in range(10):
+        world = crowd(seed)
+        found = contacts(world, indexed(world))
+        assert len(np.unique(found[:, 0])) > 1 and np.isfinite(found).any(axis=0).all()
+        elsewhere = moved(world, np.array(origin))
+        np.testing.assert_array_equal(contacts(elsewhere, indexed(elsewhere)), found)
+
+
+@kernel
+def collisions_with(obstacles: Obstacles, traffic: np.ndarray, states: np.ndarray, body: Body) -> np.ndarray:
+    """Index of the first collision (K,) where trajectory k meets traffic[k] of (K, 41, N, 5)."""
+    first = np.empty(len(states))
+    ignored = np.empty(traffic.shape[2], dtype=np.bool_)
+    for k in range(len(states)):
+        met = with_objects(obstacles, traffic[k], obstacles.is_stopped)
+        first[k] = first_collision(met, states[k], body, HALF_LENGTH_M, HALF_WIDTH_M, ignored)[1]
+    return first
+
+
+def test_every_trajectory_can_meet_traffic_of_its_own() -> None:
+    states = np.zeros((3, 41, 11))
+    states[..., X], states[..., VX] = 0.5 * np.arange(41), 5.0
+    body = empty_body(41)
+    place(states[0], PACIFICA.rear_axle_to_center, body)
+    parked_at = np.array([10.0, 14.0, -50.0])
+    traffic = np.tile([0.0, 0.0, 0.0, 4.0, 2.0], (3, 41, 1, 1))
+    traffic[..., 0] += parked_at[:, None, None]
+    objects = unindexed(np.full((41, 1, 5), np.nan), np.ones(1, dtype=bool), np.zeros(1))
+    reached = np.ceil((parked_at - 2.0 - PACIFICA.front_length) / 0.5)
+    assert collisions_with(objects, traffic, states, body).tolist() == [*reached[:2], np.inf]
+
+
+def test_what_is_exactly_ahead_may_count_as_not_ahead_where_rounding_lifts_the_cosine() -> None:
+    verdicts = set()
+    for heading in np.linspace(0.01, 1.5, 60):
+        states = np.zeros((1, 41, 11))
+        states[..., HEADING], states[..., VX] = heading, 10.0
+        box = [6.0 * np.cos(heading), 6.0 * np.sin(heading), heading, 1.0, 1.0]
+        world = World(
+            states=states,
+            flags=np.zeros((1, 41), dtype=np.uint8),
+            crossing=square(80.0, 90.0),
+            boxes=np.tile(box, (41, 1, 1)),
+            is_stopped=np.ones(1, dtype=bool),
+            collision_score=np.zeros(1),
+        )
+        found = contacts(world, indexed(world))
+        np.testing.assert_array_equal(found, slow_contacts(world))
+        verdicts.add(float(found[0, 2]))
+    assert verdicts == {0.0, np.inf}
