@@ -23,10 +23,10 @@ from factory.scene_file import SUFFIX, BadScene, read_scene, write_scene
 from factory.sensors import block_of, chosen_cameras, load_sensors, load_sweeps, taken_by
 from factory.work import Stopped, never
 from tasks.render.scene.asset import BlockRange, RenderAsset
-from tasks.render.scene.lidar_only import lidar_asset
 from tasks.render.scene.build import build_asset
-from tasks.render.settings import RenderSettings, SceneFrom
+from tasks.render.scene.lidar_only import lidar_asset
 from tasks.render.scene.stereo import MAX_BASELINE_M, MIN_BASELINE_M
+from tasks.render.settings import RenderSettings, SceneFrom
 from tasks.world.camera import SensorFile
 from tasks.world.clip import Block, Clip
 

@@ -14,11 +14,11 @@ from factory.pace import time_text
 from factory.sensors import SensorData
 from factory.store.room import needs_room
 from factory.work import Halted, Stopped, never
-from tasks.render.scene.asset import RenderAsset
 from tasks.render.fit.reconstruct import advance, finish
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import prepare
 from tasks.render.fit.state import FitState
+from tasks.render.scene.asset import RenderAsset
 from tasks.world.agents import AgentTracks
 
 STRETCH = 500  # iterations between two saves

@@ -88,12 +88,14 @@ def make_cache_dir() -> None:
 def remove_unused(caches: Path) -> None:
     """Remove the folders of kernels that no process has used for UNUSED_S; each process that uses one marks it.
 
-    Renamed first: who begins to use one at this moment finds it whole, or not at all and compiles.
+    Marked and renamed first: nobody else removes it too, and who begins to use one at this moment finds it whole, or
+    not at all and compiles.
     """
     for folder in caches.iterdir():
         ours = _FOLDER.fullmatch(folder.name)
         with suppress(OSError):  # another process is about it, or it is another user's
             if ours and time.time() - folder.stat().st_mtime > UNUSED_S:
+                os.utime(folder)
                 shutil.rmtree(folder.rename(caches / f"{ours[1]}-{secrets.token_hex(4)}"))
 
 

@@ -74,7 +74,9 @@ STUDY = Path(__file__).parents[3] / "docs" / "study"
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("study", "least"), [(STUDY, 64), (STUDY / "again", 300), (STUDY / "long", 12)], ids=["study", "again", "long"]
+    ("study", "least"),
+    [(STUDY, 64), (STUDY / "again", 300), (STUDY / "long", 12), (STUDY / "published", 40)],
+    ids=["study", "again", "long", "published"],
 )
 def test_the_studys_comparisons_are_those_of_its_clips(study: Path, least: int) -> None:
     with (study / "comparisons.csv").open(newline="") as file:
