@@ -34,11 +34,11 @@ demo: $(VENV)/.run
 
 # Kernels are compiled once before two test processes would both do it.
 test: install
-	$(PY) -m factory.warm
+	$(PY) -m factory warm
 	$(PY) -m pytest -n 2 --dist loadfile
 
 unit: install
-	$(PY) -m factory.warm
+	$(PY) -m factory warm
 	$(PY) -m pytest -n 2 --dist loadfile --ignore tests/real --ignore tests/chaos -m "not ray and not slow"
 
 lint: install
@@ -53,7 +53,7 @@ format: install
 # The kept bugs of tests/mutants, each against the tests that should notice; a release has at least 97 % of them noticed.
 # ONLY=planners (or tasks/reward, or a bug's id; several with commas), J=<how many at a time, a core each>; goes on where it stopped.
 mutants: install
-	$(PY) -m factory.warm
+	$(PY) -m factory warm
 	$(PY) -m tests.mutants --only "$(ONLY)" -j $(or $(J),2)
 
 bench: install
@@ -101,7 +101,7 @@ study-data: install
 	ln -sfn ../blocks $(STUDY)/train/cache
 	ln -sfn ../blocks $(STUDY)/replay/cache
 	ln -sfn ../blocks $(STUDY)/control/cache
-	test -f $(STUDY)/labels.npy || $(PY) -m factory.vocabulary kinematic=true k=512 out=$(STUDY)/labels.npy
+	test -f $(STUDY)/labels.npy || $(PY) -m factory vocabulary kinematic=true k=512 out=$(STUDY)/labels.npy
 	$(PY) -m factory.run $(BEGIN) $(TOWN) $(LABEL) experts=[human] rounds=1 out=$(STUDY)/begin
 	$(PY) -m factory.run $(TRAIN) $(TOWN) $(LABEL) rounds=5 out=$(STUDY)/train
 	$(PY) -m factory.run preset=hard_benchmark $(HELD) $(TOWN) vocabulary.k=131072 out=$(STUDY)/hard

@@ -21,8 +21,8 @@ from pathlib import Path
 
 import numpy as np
 
-from factory.clips.logs import Drive, LogReader, Recorded, WholeLog, route_of_drive
-from factory.clips.reader import BadClip
+from factory.readers.base import BadClip
+from factory.readers.logs import Drive, LogReader, Recorded, WholeLog, route_of_drive
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.clip import STEP_S
 from tasks.world.lanes import NO_LIGHTS, Lane, MapLayer, MapPolygon, RoadMap

@@ -10,7 +10,7 @@ import signal
 import sys
 from collections.abc import Sequence
 
-from factory.commands import COMMANDS, PLANNERS, dispatch, listed
+from factory.commands.table import COMMANDS, PLANNERS, dispatch, listed
 
 
 def help_text() -> str:
@@ -24,7 +24,7 @@ def help_text() -> str:
 def main(argv: Sequence[str]) -> int:
     """Hand the arguments to the command that is named first; its exit code, 2 where there is none."""
     if argv and argv[0] == "complete":  # what the shell's completion asks
-        from factory.completion import complete
+        from factory.commands.completion import complete
 
         return complete(argv[1:])
     return dispatch(argv, COMMANDS, help_text())

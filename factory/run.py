@@ -18,15 +18,15 @@ from contextlib import nullcontext
 from itertools import zip_longest
 from typing import TYPE_CHECKING
 
-from factory.config import ConfigError, compose, conf_dir
-from factory.plugins import choices
+from factory.config.compose import ConfigError, compose, conf_dir
+from factory.config.plugins import choices
+from factory.config.words import Asked, asked_of
 from factory.store.room import NoRoom
 from factory.store.usable import why_unusable
-from factory.words import Asked, asked_of
 
 if TYPE_CHECKING:
-    from factory.clips.reader import ClipRef
-    from factory.settings import RunConfig
+    from factory.readers.base import ClipRef
+    from factory.setup.settings import RunConfig
 
 BAD_CONFIG, INTERRUPTED = 2, 4
 
@@ -96,9 +96,9 @@ def seconds_text(seconds: Mapping[str, tuple[int, float]]) -> str:
 
 
 def kernels_of(config: "RunConfig") -> list[str]:
-    """The parts of factory.warm that the run will ask for."""
-    from factory.warm import parts_of
-    from factory.work import HUMAN
+    """The parts of factory.stages.warm that the run will ask for."""
+    from factory.graph.work import HUMAN
+    from factory.stages.warm import parts_of
 
     label_traffic = None if config.reward.labels == "none" else config.reward.traffic
     return parts_of(set(config.experts) != {HUMAN}, config.traffic.mode, label_traffic, config.render)
@@ -106,24 +106,26 @@ def kernels_of(config: "RunConfig") -> list[str]:
 
 def run(asked: Asked) -> int:
     """Plan, execute, commit, report. What the command line says is checked before anything heavy is imported."""
-    from factory.run_keys import check
+    from factory.config.run_keys import check
 
     values = compose("run", asked.words)
     check(values, asked.overrides)
     if unusable := why_unusable(values["out"]):
         raise ConfigError(unusable)
 
-    from factory.benchmark import NEEDED, write_benchmark
-    from factory.calibrate import calibrate, plan_text
-    from factory.card import write_card
-    from factory.execute import COMPLETE, COMPLETE_WITH_FAILURES, execute
-    from factory.funnel import image_sources_text
-    from factory.report import remember, write_report
-    from factory.settings import assemble, run_config
-    from factory.status import failed_line
+    from factory.graph.episodes import EpisodesWanted
+    from factory.graph.execute import COMPLETE, COMPLETE_WITH_FAILURES, execute
+    from factory.setup.calibrate import calibrate, plan_text
+    from factory.setup.settings import assemble, run_config
+    from factory.stages.benchmark import NEEDED, write_benchmark
+    from factory.stages.warm import compiling_ahead
+    from factory.store.funnel import image_sources_text
     from factory.store.location import BadLocation, Location
     from factory.store.samples import Store
-    from factory.warm import compiling_ahead
+    from factory.views.board.report import remember, write_report
+    from factory.views.card import write_card
+    from factory.views.logged_drive import prepared_episode
+    from factory.views.status import failed_line
 
     config = run_config(values)
     try:
@@ -152,7 +154,7 @@ def run(asked: Asked) -> int:
             retry=config.retry_failed,
             shard_seconds=config.shard_seconds,
             minutes=config.minutes,
-            episodes=config.one_episode_in,
+            episodes=EpisodesWanted(config.one_episode_in, prepared_episode) if config.one_episode_in else None,
             command=asked.words,
         )
     if summary.message:
@@ -171,7 +173,7 @@ def run(asked: Asked) -> int:
     where = store.location.uri
     print(f"report: {write_report(store)}")
     print(f"card: {write_card(store)}")
-    print(f"look at samples: python -m factory.dashboard out={where}")
+    print(f"look at samples: python -m factory dashboard out={where}")
     if summary.exit_code == COMPLETE_WITH_FAILURES:
         print(failed_line(store))
     return summary.exit_code

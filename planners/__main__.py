@@ -9,7 +9,7 @@ import signal
 import sys
 from collections.abc import Sequence
 
-from factory.commands import PLANNERS, dispatch, listed
+from factory.commands.table import PLANNERS, dispatch, listed
 
 
 def main(argv: Sequence[str]) -> int:

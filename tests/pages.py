@@ -70,7 +70,11 @@ def commands(page: str) -> list[Command]:
 
 
 def named_in_prose(page: str) -> list[Command]:
-    """Commands in backticks outside of blocks, as far as they are shown: words like <file> and ... are left out."""
-    prose = FENCED.sub("", (REPOSITORY / page).read_text())
+    """Commands in backticks outside of blocks, as far as they are shown: words like <file> and ... are left out.
+
+    Of the changelog only what is not released: older versions had the commands that they name.
+    """
+    text = (REPOSITORY / page).read_text()
+    prose = FENCED.sub("", text.split("\n## 0.1.0")[0] if page == "CHANGELOG.md" else text)
     spans = (re.sub(r"\s+", " ", span) for span in IN_PROSE.findall(prose))
     return [Command(page, tuple(re.sub(r"\S*<[^>]*>\S*|\S*\.\.\.\S*", "", span).split())) for span in spans]

@@ -13,7 +13,7 @@ import pytest
 from examples.csv_logs import CsvReader, write_log
 from examples.keep_lane import KeepLane
 from examples.linear_planner import LinearPlanner
-from factory.clips.reader import BadClip
+from factory.readers.base import BadClip
 from factory.run import main as run_main
 from factory.store.reader import SampleTable
 from planners.training.checkpoint import load_planner

@@ -21,6 +21,10 @@ ROOMS = {
         *("perturb", "attempt", "hard_scenes", "trajectories"),
         *("render.splatting", "render.scene", "render.fit", "render"),
     ),
+    "factory": (
+        *("wording", "job", "config", "readers", "store", "graph", "stages", "setup", "views", "views.board"),
+        *("run", "commands", "__main__"),
+    ),
     "planners": ("data", "models", "training", "evaluation", "study", "__main__"),
 }
 MOST_MODULES = 20  # in a room
@@ -99,7 +103,7 @@ def test_only_the_graph_its_metrics_and_trainings_on_a_cluster_import_ray() -> N
         for path in (ROOT / package).rglob("*.py")
         if "ray" in imported_modules(path)
     }
-    assert users == {"factory/graph.py", "factory/ray_metrics.py", "planners/training/on_ray.py"}
+    assert users == {"factory/graph/on_ray.py", "factory/graph/ray_metrics.py", "planners/training/on_ray.py"}
 
 
 def test_no_module_shadows_the_standard_library() -> None:
@@ -115,7 +119,9 @@ def loaded_by(statement: str) -> set[str]:
 
 
 def test_a_run_in_this_process_needs_no_ray() -> None:
-    assert "ray" not in loaded_by("import factory.run, factory.execute, factory.metrics, factory.pipeline")
+    assert "ray" not in loaded_by(
+        "import factory.run, factory.graph.execute, factory.graph.metrics, factory.stages.pipeline"
+    )
 
 
 def test_importing_the_science_needs_numpy_only() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from factory.execute import execute
+from factory.graph.execute import execute
 from factory.store.samples import Store
 from tests.factory.toy import ToyWork, refs
 

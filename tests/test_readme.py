@@ -17,19 +17,16 @@ from typing import Any
 import pytest
 
 from factory.__main__ import main as door_main
-from factory.arguments import parse
-from factory.clips.synthetic.reader import SyntheticReader
-from factory.commands import COMMANDS
-from factory.config import compose, conf_dir, fill
-from factory.dashboard import Request as DashboardRequest
-from factory.explain import split_arguments
-from factory.export import main as export_main
-from factory.plugins import GROUPS
-from factory.report import main as report_main
+from factory.commands.dashboard import Request as DashboardRequest
+from factory.commands.explain import split_arguments
+from factory.commands.table import COMMANDS
+from factory.config.arguments import parse
+from factory.config.compose import compose, conf_dir, fill
+from factory.config.plugins import GROUPS
+from factory.readers.town.reader import SyntheticReader
 from factory.run import main as run_main
-from factory.settings import load_config
-from factory.show import main as show_main
-from factory.store.verify import main as verify_main
+from factory.setup.settings import load_config
+from factory.stages.warm import PARTS
 from planners.__main__ import main as planners_main
 from planners.evaluation.analysis import AnalysisSettings
 from planners.evaluation.compare import CompareSettings
@@ -142,24 +139,20 @@ def test_every_command_is_one_its_program_takes(
             assert planners_main(["--help"]) == 0
         case ["python", "-m", "factory", "plan" | "run", *arguments]:
             load_config(given(arguments))
+        case ["python", "-m", "factory", "explain", *arguments]:
+            load_config(split_arguments(arguments)[1])
+        case ["python", "-m", "factory", "dashboard", *arguments]:
+            parse(DashboardRequest, arguments)  # it would serve until it is stopped
+        case ["python", "-m", "factory", "warm", *arguments]:
+            assert set(arguments) <= PARTS.keys()
+        case ["python", "-m", "factory", "vocabulary", *arguments]:
+            assert door_main(["vocabulary", "--help"]) == 0
         case ["python", "-m", "factory", *arguments]:
             assert door_main(arguments) == 0, capsys.readouterr().err
         case ["python", "-m", "factory.run", "--help"]:
             assert run_main(["--help"]) == 0
         case ["python", "-m", "factory.run" | "tests.bench.kill_resume", *arguments]:
             load_config(given(arguments))
-        case ["python", "-m", "factory.explain", *arguments]:
-            load_config(split_arguments(arguments)[1])
-        case ["python", "-m", "factory.show", *arguments]:
-            assert show_main(arguments) == 0, capsys.readouterr().err
-        case ["python", "-m", "factory.export", *arguments]:
-            assert export_main(arguments) == 0, capsys.readouterr().err
-        case ["python", "-m", "factory.store.verify", *arguments]:
-            assert verify_main(arguments) == 0, capsys.readouterr().err
-        case ["python", "-m", "factory.dashboard", *arguments]:
-            parse(DashboardRequest, arguments)  # it would serve until it is stopped
-        case ["python", "-m", "factory.report", *arguments]:
-            assert report_main(arguments) == 0, capsys.readouterr().err
         case ["python", "-m", "planners", "train", *arguments] | [
             "torchrun",
             "--nproc-per-node",

@@ -21,6 +21,13 @@ from factory.store.location import Location
 
 FORMAT = 1
 PACKAGES = ("tasks.", "factory.")  # whose dataclasses and enums a file may name
+# Names in files of version 0.1.0 whose classes have moved since.
+MOVED = {
+    "factory.pipeline:PerturbedClip": "factory.stages.pipeline:PerturbedClip",
+    "factory.work:PreparedClip": "factory.graph.work:PreparedClip",
+    "factory.work:CandidateRow": "factory.store.candidates:CandidateRow",
+    "factory.clips.reader:ClipRef": "factory.readers.base:ClipRef",
+}
 _PLAIN = (str, int, float, bool, type(None))
 
 
@@ -138,7 +145,7 @@ def _name(kind: type) -> str:
 
 
 def _class(name: str) -> Any:
-    module, _, qualname = name.partition(":")
+    module, _, qualname = MOVED.get(name, name).partition(":")
     if not module.startswith(PACKAGES) or "." in qualname:
         raise BadCacheFile(f"{name} is not a class a cache file may name")
     found = getattr(importlib.import_module(module), qualname)

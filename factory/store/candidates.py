@@ -6,7 +6,21 @@ from dataclasses import asdict, dataclass, fields
 import pyarrow as pa
 
 from factory.store.table import KeyedTable, TableSpec
-from factory.work import CandidateRow
+
+
+@dataclass(frozen=True)
+class CandidateRow:
+    """One perturbation that passed every gate and filter, in the order in which walks try it."""
+
+    index: int  # place in the clip's ordered list, 0 ...
+    vocabulary_index: int
+    end_x: float  # [m] LQR-reached end pose, frame of the logged pose at T+H
+    end_y: float  # [m]
+    end_heading: float  # [rad]
+    end_speed: float  # [m/s]
+    cell: tuple[int, int]  # (longitudinal, lateral) cell of the interleaved grid
+    score: float  # EPDMS (/14) against log replay
+    reactive_score: float  # EPDMS (/14) among reacting agents
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ DATA_END_BYTES = 1 + 8 + 4  # opcode, length, checksum of everything before
 
 
 class Timed(Protocol):
-    """A message: see factory.look.episode_messages.Message."""
+    """A message: see factory.views.episode_messages.Message."""
 
     @property
     def topic(self) -> str: ...

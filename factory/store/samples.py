@@ -15,11 +15,11 @@ from typing import Any, Literal
 
 from factory.store.cache import ClipCache
 from factory.store.candidates import CANDIDATES, ClipCandidates, Listed, candidates_table, listed_of
+from factory.store.identity import UNLISTED, RunIdentity, canonical_json
 from factory.store.location import Location
 from factory.store.outcomes import OUTCOMES, Kind, Outcome, outcomes_table
 from factory.store.schema import LICENCES_PROPERTY, SAMPLES, SCHEMA_VERSION
 from factory.store.table import KeyedTable, Shard, write_shard
-from factory.work import UNLISTED, RunIdentity, canonical_json
 
 OnChange = Literal["stop", "keep", "redo"]
 RUN_FILE = "run.json"

@@ -11,8 +11,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from factory.arguments import one_line
 from factory.store.room import existing, needs_room
+from factory.wording import one_line
 
 TRIAL_BYTES = 4 * 2**20  # a row group, the least that samples with pictures are written in
 TRIAL_S = 20.0

@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from factory.config import ConfigError, fill
+from factory.config.compose import ConfigError, fill
 from planners.evaluation.frames import FOLLOW_UP_KINDS, LOGGED_KINDS
 from planners.evaluation.score_rows import FrameRow, read_rows
 from planners.evaluation.tags import TAGS

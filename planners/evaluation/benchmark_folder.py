@@ -9,8 +9,8 @@ from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import Any
 
-from factory.benchmark import BENCHMARK_FILE, FORMAT
-from factory.config import ConfigError
+from factory.config.compose import ConfigError
+from factory.stages.benchmark import BENCHMARK_FILE, FORMAT
 from factory.store.location import Location
 from factory.store.reader import Sample, SampleTable
 from factory.store.scenes import SceneFiles

@@ -9,7 +9,7 @@ import re
 from collections.abc import Mapping, Sequence
 
 LEVELS = ("clip", "log", "town")
-_SYNTHETIC_LOG = re.compile(r"(town-\d+)-\d{4}-")  # factory.clips.synthetic.town.log_name
+_SYNTHETIC_LOG = re.compile(r"(town-\d+)-\d{4}-")  # factory.readers.town.town.log_name
 
 
 def town_of(log_id: str) -> str:

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from factory.config import ConfigError, compose, fill
+from factory.config.compose import ConfigError, compose, fill
 from planners.evaluation.aggregation import ClipResult, by_clip
 from planners.evaluation.bootstrap import Interval, paired_interval
 from planners.evaluation.clip_scores import Measured, check_same_clips, measured, read_clips

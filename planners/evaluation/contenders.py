@@ -26,9 +26,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from factory.commands import nearest
-from factory.config import ConfigError, compose
-from factory.plugins import installed, names
+from factory.config.compose import ConfigError, compose
+from factory.config.plugins import installed, names
+from factory.config.words import nearest
 from planners.data.batch import Needs
 from planners.evaluation.scoring import Plans, PreparedClip, human_plans, pdm_plans
 from planners.models.gtrs_dense.ensemble import Ensemble

@@ -30,7 +30,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from factory.config import ConfigError, conf_dir, fill
+from factory.config.compose import ConfigError, conf_dir, fill
 from planners.evaluation.aggregation import SummaryLine, lines_of, summarise
 from planners.evaluation.benchmark_folder import BenchmarkFolder
 from planners.evaluation.contenders import Contender, composed, contenders, needs_of

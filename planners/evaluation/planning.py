@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from factory.config import ConfigError
+from factory.config.compose import ConfigError
 from planners.data.batch import Batch, Needs
 from planners.evaluation.contenders import Contender, needs_of
 from planners.evaluation.frames import Benchmark, FrameKey

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from factory.config import ConfigError
+from factory.config.compose import ConfigError
 
 RECORD = "record.json"
 

@@ -14,13 +14,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from factory.config import ConfigError, fill
-from factory.look.bev import EXPERT, LOGGED, PERTURBED, Boxes, draw_bev
-from factory.look.bev import Path as Way
-from factory.look.drawing import map_shapes
-from factory.look.sample_picture import decoded, earlier_images, fitted, front_camera
-from factory.look.video import write_mp4
+from factory.config.compose import ConfigError, fill
 from factory.store.reader import Sample
+from factory.views.bev import EXPERT, LOGGED, PERTURBED, Boxes, draw_bev
+from factory.views.bev import Path as Way
+from factory.views.drawing import map_shapes
+from factory.views.sample_picture import decoded, earlier_images, fitted, front_camera
+from factory.views.video import write_mp4
 from planners.evaluation.benchmark_folder import BenchmarkFolder
 from planners.evaluation.contenders import Contender, composed, contender
 from planners.evaluation.evaluate import check_needs

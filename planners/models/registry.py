@@ -5,9 +5,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from factory.commands import nearest
-from factory.config import ConfigError, fill
-from factory.plugins import installed, names
+from factory.config.compose import ConfigError, fill
+from factory.config.plugins import installed, names
+from factory.config.words import nearest
 from planners.models.planner import FloatArray, Planner
 
 BUILT_IN = {

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from factory.config import ConfigError, fill
+from factory.config.compose import ConfigError, fill
 from planners.evaluation.aggregation import MEASURES
 from planners.evaluation.scores import title_of
 from planners.study.figures import draw_agreement

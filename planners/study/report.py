@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from factory.config import ConfigError, fill
+from factory.config.compose import ConfigError, fill
 from planners.evaluation.aggregation import MEASURES, ClipResult, HumanFilter
 from planners.evaluation.clip_scores import write_clips
 from planners.evaluation.compare import ByLevel, CompareSettings, Measure, compare, row_of

@@ -20,7 +20,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from factory.config import ConfigError, compose, fill
+from factory.config.compose import ConfigError, compose, fill
 from planners.data.index import DataSettings, open_dataset
 from planners.evaluation.scores import BOUNDS
 from planners.study.figures import draw_learning

@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from factory.config import ConfigError, compose, fill
+from factory.config.compose import ConfigError, compose, fill
 from planners.evaluation.aggregation import HumanFilter
 from planners.evaluation.scores import BOUNDS, PAPER, name_of, shown, title_of, write_csv
 from planners.study.frames_file import FRAMES, read_frames, rows_of, write_frames

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from factory.config import ConfigError, fill
+from factory.config.compose import ConfigError, fill
 from planners.evaluation.aggregation import MEASURES
 from planners.evaluation.compare import ByLevel, CompareSettings, Measure, compare, row_of
 from planners.evaluation.scores import BOUNDS, name_of, scores_of_clips, write_csv

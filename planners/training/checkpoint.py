@@ -24,7 +24,7 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
-from factory.config import ConfigError
+from factory.config.compose import ConfigError
 from planners.models.planner import FloatArray, Planner
 from planners.models.registry import PlannerChoice, build_planner, planner_class
 

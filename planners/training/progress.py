@@ -8,7 +8,7 @@ from typing import TextIO
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
-from factory.pace import rate_text, time_text
+from factory.wording import rate_text, time_text
 
 LINE_EVERY_S = 15.0
 

@@ -23,7 +23,7 @@ from typing import Any, Literal
 import cv2
 import torch
 
-from factory.config import ConfigError, compose, fill
+from factory.config.compose import ConfigError, compose, fill
 from planners.data.feed import Dataset, DataSettings, open_data
 from planners.data.loader import Loader
 from planners.data.mix import MixSettings

@@ -19,12 +19,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from factory.assets import asset_for
-from factory.imaging import album_of
-from factory.pipeline import FactoryWork, PerturbedClip
-from factory.sensors import chosen_cameras
-from factory.settings import assemble, load_config
-from factory.work import PreparedClip
+from factory.graph.work import PreparedClip
+from factory.setup.settings import assemble, load_config
+from factory.stages.assets import asset_for
+from factory.stages.imaging import album_of
+from factory.stages.pipeline import FactoryWork, PerturbedClip
+from factory.stages.sensors import chosen_cameras
 from tasks.render.gate import GateSettings, looked_at_size, unfit
 from tasks.render.likeness import Album
 from tasks.render.scene.asset import RenderAsset

@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from factory.clips.kitti import read_drive, steadied
-from factory.scene_file import write_scene
+from factory.readers.kitti import read_drive, steadied
+from factory.stages.scene_file import write_scene
 from tasks.render.fit.exposure import affine_between, exposed
 from tasks.render.fit.losses import ssim, target_of
 from tasks.render.fit.poses import corrected

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from factory.config import compose, fill
+from factory.config.compose import compose, fill
 from planners.data.batch import Batch, Needs
 from planners.data.decode import LABELS
 from planners.models.planner import Planner

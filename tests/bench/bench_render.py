@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from factory.scene_file import read_scene
+from factory.stages.scene_file import read_scene
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.gradient import backward
 from tasks.render.splatting.raster import splat, trace

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from factory.clips.synthetic.reader import SyntheticReader
+from factory.readers.town.reader import SyntheticReader
 from tasks.reward.epdms import Scores, score
 from tasks.reward.prepare import N_TIMES, PAST_STEPS, PreparedScene, prepare
 from tasks.reward.rules.boxes import ego_boxes

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from factory.clips.av2 import AV2Reader
+from factory.readers.av2.reader import AV2Reader
 from tasks.rollout.lqr import track_local
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out, roll_out_many
 from tasks.world.clip import NOW, Scene, scene_of_clip

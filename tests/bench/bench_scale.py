@@ -21,12 +21,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from factory.arguments import answer
-from factory.clips.reader import ClipRef
-from factory.execute import COMPLETE, execute
-from factory.graph import ray  # with the environment that keeps it on loopback
+from factory.config.arguments import answer
+from factory.graph.execute import COMPLETE, execute
+from factory.graph.on_ray import ray  # with the environment that keeps it on loopback
+from factory.graph.work import Accepted, AttemptResult, PreparedClip
+from factory.readers.base import ClipRef
 from factory.store.samples import Store
-from factory.work import Accepted, AttemptResult, PreparedClip
 from tests.factory.toy import ToyWork, stream
 
 EXPERTS = ("pdm_closed", "recovery")
@@ -122,7 +122,7 @@ def _row(request: Request, nodes: int, refs: Sequence[ClipRef], work: WaitingWor
 
 @ray.remote(num_cpus=1)
 def _warm() -> None:
-    import factory.steps  # noqa: F401
+    import factory.graph.steps  # noqa: F401
 
     time.sleep(0.2)
 

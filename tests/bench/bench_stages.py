@@ -3,9 +3,9 @@
 import sys
 from pathlib import Path
 
-from factory.clips.av2 import AV2Reader
-from factory.clips.reader import ClipReader
-from factory.clips.synthetic.reader import SyntheticReader
+from factory.readers.av2.reader import AV2Reader
+from factory.readers.base import ClipReader
+from factory.readers.town.reader import SyntheticReader
 from tasks.attempt import ExpertGate, attempt, perturbed_scene
 from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings
 from tasks.perturb import Perturbation, PerturbSettings, perturb

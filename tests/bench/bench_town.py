@@ -17,12 +17,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from factory.clips.av2 import AV2Reader
-from factory.clips.synthetic.draw import Theatre, paint
-from factory.clips.synthetic.drive import Drive
-from factory.clips.synthetic.town import log_name, plan_log
-from factory.clips.synthetic.write import TownSettings, write_log
-from factory.sensors import block_of, load_sensors
+from factory.readers.av2.reader import AV2Reader
+from factory.readers.town.draw import Theatre, paint
+from factory.readers.town.drive import Drive
+from factory.readers.town.town import log_name, plan_log
+from factory.readers.town.write import TownSettings, write_log
+from factory.stages.sensors import block_of, load_sensors
 from tasks.render.fit.reconstruct import advance, finish
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import prepare

@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from factory.clips.synthetic.draw import Theatre, paint
-from factory.clips.synthetic.drive import Drive
-from factory.clips.synthetic.town import log_name, plan_log
-from factory.imaging import GATE_STRIDE
-from factory.pipeline import FactoryWork, PerturbedClip
+from factory.readers.town.draw import Theatre, paint
+from factory.readers.town.drive import Drive
+from factory.readers.town.town import log_name, plan_log
+from factory.stages.imaging import GATE_STRIDE
+from factory.stages.pipeline import FactoryWork, PerturbedClip
 from tasks.render.gate import GateSettings, composed, fault_of, measures
 from tasks.render.likeness import Album, expected, eye_in_box, inside_mean, large_vehicles, outline_of, similarity
 from tasks.render.scene.asset import RenderAsset

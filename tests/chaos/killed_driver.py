@@ -6,8 +6,8 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-from factory import batch, driver
-from factory.execute import execute
+from factory.graph import batch, driver
+from factory.graph.execute import execute
 from factory.store.samples import Store
 from factory.store.table import KeyedTable
 from tests.factory.toy import ToyWork, refs

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from factory.work import Accepted, AttemptResult, PreparedClip
+from factory.graph.work import Accepted, AttemptResult, PreparedClip
 from tests.factory.toy import ToyWork
 from tests.planners.samples import FRONT_YAWS, jpeg, pictures, plain, sample
 

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from factory.clips.reader import ClipIndex, ClipRef
+from factory.readers.base import ClipIndex, ClipRef
 from tasks.world.clip import Clip
 from tests.tasks.streets import street_clip
 

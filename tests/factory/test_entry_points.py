@@ -11,11 +11,11 @@ import pytest
 from hydra.core.config_store import ConfigStore
 
 from examples.csv_logs import write_log
-from factory.completion import candidates
-from factory.config import ConfigError, compose
-from factory.plugins import installed, offered
+from factory.commands.completion import candidates
+from factory.config.compose import ConfigError, compose
+from factory.config.plugins import installed, offered
 from factory.run import main as run_main
-from factory.settings import load_config
+from factory.setup.settings import load_config
 from factory.store.reader import SampleTable
 from planners.evaluation.contenders import contender
 from planners.models.registry import planner_class

@@ -14,7 +14,7 @@ import yaml
 from packaging.utils import canonicalize_name
 from packaging.version import Version
 
-from factory.execute import execute
+from factory.graph.execute import execute
 from factory.store.samples import Store
 from tests.factory.filmed import FilmedWork
 from tests.factory.installs import PROJECT, REPOSITORY, SMALL, as_if_installed, closure, declared
@@ -35,7 +35,7 @@ UNSEEN = {  # declared without an import statement of ours
     "packaging": "torch.utils.cpp_extension imports it when gsplat compiles",
     "tensorboard": "torch.utils.tensorboard imports it",
 }
-RAY_ONLY = {"factory/graph.py", "factory/ray_metrics.py"}  # loaded by executor=ray alone
+RAY_ONLY = {"factory/graph/on_ray.py", "factory/graph/ray_metrics.py"}  # loaded by executor=ray alone
 GPU = re.compile(r"torch|triton|nvidia|cuda|cudnn|nccl|gsplat")
 
 
@@ -112,7 +112,7 @@ COMMANDS = [
     pytest.param(["factory.run", "preset=demo"], '-e ".[run]"', id="run"),
     pytest.param(["factory", "run", "preset=demo", "--cfg"], '-e ".[run]"', id="run --cfg"),
     pytest.param(["factory", "explain", "preset=demo", "clip=0"], '-e ".[run]"', id="explain"),
-    pytest.param(["factory.vocabulary", "kinematic=true", "k=8", "out=v.npy"], '-e ".[run]"', id="vocabulary"),
+    pytest.param(["factory.setup.vocabulary", "kinematic=true", "k=8", "out=v.npy"], '-e ".[run]"', id="vocabulary"),
     pytest.param(["planners.training.train", "planner=ego_mlp_small"], '-e ".[planners]"', id="train"),
 ]
 

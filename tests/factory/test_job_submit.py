@@ -16,8 +16,8 @@ from pathlib import Path
 
 import pytest
 
+from factory.stages.warm import compile_kernels, marker
 from factory.store.reader import SampleTable
-from factory.warm import compile_kernels, marker
 from tasks.kernels.compiled import cache_dir
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow]
@@ -34,7 +34,7 @@ LISTENERS = (
     "--ray-client-server-port",
 )
 UPLOADED = ("factory", "tasks", "planners", "conf", "pyproject.toml", ".rayignore", ".gitignore")
-PARTS = ["judge", "drive"]  # of factory.warm
+PARTS = ["judge", "drive"]  # of factory.stages.warm
 LEFT_AT_HOME = (  # what lies in a checkout that was worked with
     "runs/demo/samples/shard.parquet",
     ".venv/lib/library.py",

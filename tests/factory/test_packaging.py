@@ -43,7 +43,7 @@ def test_the_wheel_holds_every_module_every_setting_and_no_test(wheel: Path) -> 
         for path in (REPOSITORY / "conf").rglob("*.yaml")
     }
     typed = {f"{package}/py.typed" for package in ("factory", "tasks", "planners")}
-    page = {path.relative_to(REPOSITORY).as_posix() for path in (REPOSITORY / "factory/board/static").iterdir()}
+    page = {path.relative_to(REPOSITORY).as_posix() for path in (REPOSITORY / "factory/views/board/static").iterdir()}
     assert inside == modules | settings | typed | page
 
 
@@ -64,6 +64,8 @@ def test_installed_it_works_beside_a_stranger_s_tasks_py(wheel: Path, tmp_path: 
 
     assert "scenarionet" in python("-m", "factory.run", "--help")
     assert "rounds: 4" in python("-m", "factory.run", "--cfg", "rounds=4", "clips=av2", "clips.root=/logs")
-    found = python("-c", "import factory.pipeline, tasks; print(factory.__file__); print(tasks.__file__)").split()
+    found = python(
+        "-c", "import factory.stages.pipeline, tasks; print(factory.__file__); print(tasks.__file__)"
+    ).split()
     assert found == [str(target / "factory" / "__init__.py"), str(target / "tasks" / "__init__.py")]
     assert list(work.iterdir()) == [work / "tasks.py"], "nothing is written"

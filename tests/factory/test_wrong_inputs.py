@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from factory.__main__ import main
-from factory.completion import settings_of
-from factory.config import ConfigError, fill
-from factory.run_keys import GROUPS
+from factory.commands.completion import settings_of
+from factory.config.compose import ConfigError, fill
+from factory.config.run_keys import GROUPS
 from tasks.render.rigs import RIGS
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -182,8 +182,8 @@ def test_a_stranger_s_modules_in_the_working_folder_are_not_ours(folder: Path) -
 
 
 def test_one_expert_needs_no_brackets_and_odd_paths_no_quotes(folder: Path) -> None:
-    from factory.config import compose
-    from factory.settings import run_config
+    from factory.config.compose import compose
+    from factory.setup.settings import run_config
 
     values = compose("run", ["experts=recovery", "render.cameras=front", "out=~/my (first) run=a", "render=none"])
     config = run_config(values)

@@ -10,22 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
-from factory.clips.reader import BadClip, ClipRef
-from factory.rows import label_columns
+from factory.graph.work import Accepted, AttemptResult, Built, Dropped, PreparedClip, Stopped, never
+from factory.readers.base import BadClip, ClipRef
+from factory.stages.rows import label_columns
+from factory.store.candidates import CandidateRow
 from factory.store.columns import Column
+from factory.store.identity import UNLISTED, RunIdentity
 from factory.store.schema import BOOKKEEPING, FIELDS
-from factory.work import (
-    UNLISTED,
-    Accepted,
-    AttemptResult,
-    Built,
-    CandidateRow,
-    Dropped,
-    PreparedClip,
-    RunIdentity,
-    Stopped,
-    never,
-)
 from tasks.reward.label_bytes import HALVES, WHOLES, VocabularyLabels
 from tasks.stages import Rejected
 

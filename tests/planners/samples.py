@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from factory.rows import label_columns
+from factory.stages.rows import label_columns
 from factory.store import table as store_table
 from factory.store.location import Location
 from factory.store.samples import Store

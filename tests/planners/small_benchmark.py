@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from factory.benchmark import BENCHMARK_FILE
-from factory.rows import sample_row
+from factory.stages.benchmark import BENCHMARK_FILE
+from factory.stages.rows import sample_row
 from factory.store.location import Location
 from factory.store.samples import Store
 from factory.store.scenes import SceneFiles

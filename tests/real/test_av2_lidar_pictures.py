@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factory.assets import Sensing, asset_for, sensing
-from factory.clips.av2 import AV2Reader
-from factory.sensors import block_of, load_sweeps
+from factory.readers.av2.reader import AV2Reader
+from factory.stages.assets import Sensing, asset_for, sensing
+from factory.stages.sensors import block_of, load_sweeps
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.engine import render, vehicles_at
 from tasks.render.scene.lidar_only import grey_of

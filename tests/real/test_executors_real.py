@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from factory.execute import COMPLETE, execute
-from factory.settings import assemble, load_config
+from factory.graph.execute import COMPLETE, execute
+from factory.setup.settings import assemble, load_config
 from factory.store.samples import Store
 from tests.factory.tables import assert_same_tables
 

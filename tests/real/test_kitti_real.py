@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from factory.clips.kitti import read_drive
+from factory.readers.kitti import read_drive
 
 FRAMES = [0, 50, 107]
 

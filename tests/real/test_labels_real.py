@@ -6,8 +6,8 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from factory.rows import label_columns
-from factory.steps import Stamp
+from factory.graph.steps import Stamp
+from factory.stages.rows import label_columns
 from factory.store.reader import LABEL_COLUMNS, SampleTable, labels_of
 from factory.store.samples import Store
 from factory.store.schema import SAMPLES, sample_row_to_table

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from reference_scenes import RECORDED_K, SCENES, loader, prepared_scene, tracks, world_poses
 
-from factory.clips.av2 import AV2Reader, log_folders
-from factory.clips.reader import ClipRef
+from factory.readers.av2.reader import AV2Reader, log_folders
+from factory.readers.base import ClipRef
 from tasks.reward.epdms import Scores, human_filtered, rows, score, score_with_ec
 from tasks.reward.prepare import prepare_scene
 from tasks.reward.rules.comfort import extended_comfort

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from reference_scenes import loader
 
-from factory.clips.av2 import AV2Reader, log_folders
-from factory.clips.reader import ClipRef
+from factory.readers.av2.reader import AV2Reader, log_folders
+from factory.readers.base import ClipRef
 from planners.evaluation.scoring import PreparedFrame, Rules, drive, prepare_frame, score_pair
 from tasks.reward.one_stage import COLUMNS, frame_scores
 from tasks.rollout.simulate import TrafficScene, TrafficSettings

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from factory.clips.synthetic.draw import Theatre, paint
-from factory.clips.synthetic.rig import build_rig, world_from_ego
-from factory.clips.synthetic.town import plan_log
+from factory.readers.town.draw import Theatre, paint
+from factory.readers.town.sensors import build_rig, world_from_ego
+from factory.readers.town.town import plan_log
 
 SIZE = (800, 450)
 QUALITY = 90

@@ -1,8 +1,8 @@
 """Gaussians to pixels on the CPU: small tiles, sorted by depth, blended front to back until nothing shines through.
 
-A pinhole without distortion: photos are undistorted before they come here (factory/sensors.py). The way back, from
-pixels to Gaussians, is gradient.py beside this. Work is dealt to threads in fixed chunks and nothing is summed in an
-order that could change: the same input gives the same bytes, on any number of threads.
+A pinhole without distortion: photos are undistorted before they come here (factory/stages/sensors.py). The backward
+pass, from pixels to Gaussians, is gradient.py beside this. Work is dealt to threads in fixed chunks and nothing is
+summed in an order that could change: the same input gives the same bytes, on any number of threads.
 """
 
 from dataclasses import dataclass, replace

@@ -3,14 +3,15 @@
 import io
 import json
 import sys
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from factory.store.cache import BadCacheFile, ClipCache, decode, encode
+from factory.store.cache import MOVED, BadCacheFile, ClipCache, _class, _name, decode, encode
+from factory.store.candidates import CandidateRow
 from factory.store.location import Location
-from factory.work import CandidateRow
 from tasks.stages import Rejected
 from tasks.world.agents import AgentKind, AgentTracks
 
@@ -51,7 +52,13 @@ def test_an_array_that_stands_twice_is_stored_once() -> None:
 
 @pytest.mark.parametrize(
     "name",
-    ["os:system", "subprocess:Popen", "factory.store.cache:io.BytesIO", "factory.steps:warm", "tasks.stages:nothing"],
+    [
+        "os:system",
+        "subprocess:Popen",
+        "factory.store.cache:io.BytesIO",
+        "factory.graph.steps:warm",
+        "tasks.stages:nothing",
+    ],
 )
 def test_a_file_cannot_name_what_is_not_a_dataclass_of_ours(name: str) -> None:
     with pytest.raises(BadCacheFile):
@@ -86,3 +93,11 @@ def test_damage_is_found_and_absence_is_none(tmp_path: Path) -> None:
         with pytest.raises(BadCacheFile):
             cache.load("x")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["x.npz"]  # no drafts left
+
+
+def test_a_file_written_before_its_classes_moved_is_read() -> None:
+    for then, now in MOVED.items():
+        assert _name(_class(then)) == now
+    row = CandidateRow(0, 7, 1.0, 2.0, 0.1, 5.0, (0, 1), 0.9, 0.8)
+    members = {field.name: getattr(row, field.name) for field in fields(row)} | {"cell": {"tuple": [0, 1]}}
+    assert decode(forged({"format": 1, "root": {"class": "factory.work:CandidateRow", "members": members}})) == row

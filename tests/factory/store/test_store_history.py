@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from factory.execute import execute
+from factory.graph.execute import execute
 from factory.store.candidates import Listed
 from factory.store.outcomes import Kind, Outcome
 from factory.store.samples import OnChange, Store

@@ -10,12 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from factory.board.server import Board
-from factory.execute import execute
+from factory.commands.verify import verify
+from factory.graph.episodes import EpisodesWanted
+from factory.graph.execute import execute
 from factory.store.location import BadLocation, Location
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
-from factory.store.verify import verify
+from factory.views.board.server import Board
+from factory.views.logged_drive import prepared_episode
 from tests.factory.filmed import FilmedWork
 from tests.factory.tables import assert_same_tables
 from tests.factory.toy import ToyWork, refs
@@ -75,13 +77,31 @@ def test_a_bucket_holds_the_same_episodes_as_a_folder_and_makes_up_for_lost_ones
 ) -> None:
     url = f"s3://{BUCKET}/runs/filmed"
     for out in (Store(url, s3), Store(tmp_path)):
-        execute(FilmedWork(), refs(2), ["recovery"], 1, out, "local", episodes=1, say=lambda line: None)
+        execute(
+            FilmedWork(),
+            refs(2),
+            ["recovery"],
+            1,
+            out,
+            "local",
+            episodes=EpisodesWanted(1, prepared_episode),
+            say=lambda line: None,
+        )
     there, here = Location.parse(url, s3).child("episodes"), Location.parse(tmp_path).child("episodes")
     names = here.names()
     assert names and there.names() == names
     assert [there.read(name) for name in names] == [here.read(name) for name in names]
     there.remove(names[0])
-    again = execute(FilmedWork(), refs(2), ["recovery"], 1, Store(url, s3), "local", episodes=1, say=lambda line: None)
+    again = execute(
+        FilmedWork(),
+        refs(2),
+        ["recovery"],
+        1,
+        Store(url, s3),
+        "local",
+        episodes=EpisodesWanted(1, prepared_episode),
+        say=lambda line: None,
+    )
     assert again.executed.episodes == 1 and there.read(names[0]) == here.read(names[0])
 
 

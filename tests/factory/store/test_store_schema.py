@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from factory.steps import Stamp
+from factory.graph.steps import Stamp
 from factory.store.columns import BadRow
 from factory.store.schema import COLUMNS, FIELDS, SCHEMA, formats_table, sample_row_to_table, table_to_rows
 from tests.factory.toy import row_of, stream

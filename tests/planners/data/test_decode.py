@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from factory.rows import label_columns
+from factory.stages.rows import label_columns
 from factory.store.reader import LABEL_COLUMNS, SampleTable, labels_of
 from factory.store.schema import COLUMNS
 from planners.data.batch import COMMANDS, BevLayout, ImageLayout, Needs

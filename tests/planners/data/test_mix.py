@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from factory.config import ConfigError, compose, fill
+from factory.config.compose import ConfigError, compose, fill
 from planners.data.mix import Bins, MixSettings, Order, Samples, Weights, make_order, sample_weights, stream, systematic
 
 N_REAL, N_SIM = 37, 90

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factory.config import ConfigError
+from factory.config.compose import ConfigError
 from planners.evaluation.benchmark_folder import BenchmarkFolder
 from planners.evaluation.contenders import contenders
 from planners.evaluation.evaluate import EvaluateSettings, evaluate, main

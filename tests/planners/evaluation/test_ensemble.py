@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from factory.config import ConfigError
+from factory.config.compose import ConfigError
 from planners.data.batch import ImageLayout
 from planners.evaluation.contenders import contender
 from planners.evaluation.ensemble import main

@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from factory.config import ConfigError
+from factory.config.compose import ConfigError
 from planners.data.batch import Batch, BevLayout, ImageLayout, Needs
 from planners.evaluation.aggregation import SummaryLine
 from planners.evaluation.contenders import Contender, contender, contenders

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from factory.config import ConfigError
+from factory.config.compose import ConfigError
 from planners.evaluation.contenders import contender
 from planners.evaluation.replay import HOLD, ReplaySettings, find_clip, replay, settings_of
 from planners.evaluation.scoring import Rules

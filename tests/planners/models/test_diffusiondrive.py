@@ -7,7 +7,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from factory.config import conf_dir, fill
+from factory.config.compose import conf_dir, fill
 from planners.data.batch import Batch, BevLayout, ImageLayout
 from planners.models.anchors import cluster_anchors
 from planners.models.diffusiondrive.planner import DiffusionDrive, DiffusionDriveSettings, from_unit, to_unit

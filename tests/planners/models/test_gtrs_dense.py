@@ -7,7 +7,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from factory.config import conf_dir, fill
+from factory.config.compose import conf_dir, fill
 from planners.data.batch import Batch, ImageLayout
 from planners.models.backbones.registry import BackboneSettings
 from planners.models.gtrs_dense.planner import GtrsDense, GtrsDenseSettings, imitated, shifted

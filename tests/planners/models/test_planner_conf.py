@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import yaml
 
-from factory.config import conf_dir, fill
+from factory.config.compose import conf_dir, fill
 from planners.models.backbones.registry import BackboneSettings
 from planners.models.ego_mlp import EgoMlpBevSettings, EgoMlpSettings
 from planners.models.ltf import LtfSettings

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from factory.config import compose, fill
+from factory.config.compose import compose, fill
 from planners.study.plan import (
     ENSEMBLE,
     PARTS,

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import torch
 
-from factory.config import ConfigError
+from factory.config.compose import ConfigError
 from planners.data.batch import Batch
 from planners.models.registry import PlannerChoice, build_planner
 from planners.training.checkpoint import checkpoints, digest, load_planner, newest

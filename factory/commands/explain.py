@@ -1,0 +1,143 @@
+"""`python -m factory explain clip=... expert=...`: why one clip gives the samples it gives.
+
+Runs ONE clip in this process: the candidates over the grid and why each fell, every attempt of the walk with its
+sub-scores, and the last attempt's two rollouts as a picture and a film. Takes the settings of `python -m factory.run`.
+"""
+
+import sys
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+from factory.config.compose import ConfigError, compose, fill
+from factory.readers.base import BadClip, ClipRef
+from factory.run import BAD_CONFIG, help_text
+
+
+def main(argv: Sequence[str]) -> int:
+    """The command; 0 when the clip was explained, 2 for bad settings, 3 for a clip that cannot be read."""
+    if {"-h", "--help"} & set(argv):
+        print(f"{__doc__}\nkeys: clip, expert, tries, to, and those of factory.run:\n{help_text()}")
+        return 0
+    try:
+        return explain(argv)
+    except ConfigError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return BAD_CONFIG
+    except BadClip as error:
+        print(f"bad clip: {error}", file=sys.stderr)
+        return 3
+
+
+@dataclass(frozen=True)
+class ExplainSettings:
+    """The keys of this command itself."""
+
+    clip: str = "0"  # clip id or its beginning, or the clip's place in the reader's list
+    expert: str = "pdm_closed"
+    tries: int = 6  # candidates to try before giving up on an accepted one
+    to: str = "explain"  # folder for the pictures
+
+
+def split_arguments(argv: Sequence[str]) -> tuple[ExplainSettings, list[str]]:
+    """This command's keys, and the overrides of the run's settings. Raises ConfigError."""
+    names = {field.name for field in fields(ExplainSettings)}
+    own = dict(argument.split("=", 1) for argument in argv if argument.split("=", 1)[0] in names and "=" in argument)
+    rest = [argument for argument in argv if argument.split("=", 1)[0] not in names]
+    return fill(ExplainSettings, own, "explain"), rest
+
+
+def find(refs: Sequence[ClipRef], wanted: str) -> ClipRef:
+    """The clip of that id, beginning of an id, or place in the list. Raises ConfigError."""
+    if wanted.isdigit() and int(wanted) < len(refs):
+        return refs[int(wanted)]
+    found = [ref for ref in refs if ref.clip_id.startswith(wanted)]
+    if len(found) != 1:
+        raise ConfigError(
+            f"clip={wanted}: {len(found)} of {len(refs)} clips fit; give an id or a number below the count"
+        )
+    return found[0]
+
+
+def explain(argv: Sequence[str]) -> int:
+    """Compose the settings, run the clip, print and draw."""
+    import cv2
+
+    from factory.graph.work import HUMAN_CANDIDATE, LOGGED
+    from factory.setup.settings import assemble, run_config
+    from factory.stages.pipeline import FactoryWork, PerturbedClip
+    from factory.views.drawing import attempt_picture, candidates_picture, film
+    from factory.views.video import write_mp4
+    from tasks.stages import SUBSCORES, Rejected
+
+    own, overrides = split_arguments(argv)
+    expert, to = own.expert, Path(own.to)
+    config = run_config(compose("run", overrides) | {"experts": [expert]})
+    run = assemble(config)
+    ref = find((*run.index.refs, *run.index.broken), own.clip)
+    work: FactoryWork = run.work
+    began = time.perf_counter()
+    made = work.considered(ref)
+    if isinstance(made, Rejected):
+        print(f"clip {ref.clip_id}: log {ref.log_id} at {ref.start_ms / 1000:.1f} s")
+        print(f"rejected by {made.stage}: {made.reason}: {made.detail}")
+        return 0
+    clip, found = made.clip, made.found
+    print(
+        f"clip {ref.clip_id}: log {ref.log_id} at {ref.start_ms / 1000:.1f} s, {clip.split}, {len(clip.agents)} tracks"
+    )
+    to.mkdir(parents=True, exist_ok=True)
+    stem = to / f"{ref.clip_id}_{expert}"
+
+    if isinstance(found, Rejected):
+        print(f"no candidates: rejected by {found.stage}: {found.reason}: {found.detail}")
+        if expert not in LOGGED:
+            return 0
+    else:
+        print("dropped by gate: " + ", ".join(f"{gate} {count}" for gate, count in found.gate_counts.items()))
+        fates = Counter(found.considered.fate)
+        print("gated trajectories: " + ", ".join(f"{fate} {count}" for fate, count in fates.most_common()))
+        cv2.imwrite(f"{stem}_candidates.png", candidates_picture(clip, found.considered)[..., ::-1])
+
+    payload = PerturbedClip(ref, clip, made.candidates, made.before)
+    order: Sequence[int] = [HUMAN_CANDIDATE] if expert in LOGGED else range(min(own.tries, len(made.candidates)))
+    shown = None
+    for candidate in order:
+        trace = work.trace(payload, candidate, expert)
+        end = (
+            ""
+            if trace.candidate is None
+            else "  end x {:+6.2f} y {:+5.2f} m {:+5.1f} deg".format(
+                *trace.candidate.end_pose[:2], trace.candidate.end_pose[2] * 57.29578
+            )
+        )
+        rejected = trace.rejected or work.unfit(clip, trace, expert)
+        verdict = "accepted" if rejected is None else f"rejected by {rejected.stage}: {rejected.detail}"
+        print(f"candidate {candidate:2d}{end}  {verdict}")
+        if trace.judged is not None:
+            shown = trace
+            scores = trace.judged.scores
+            named = [f"{name} {getattr(scores, name)[1]:.2f}" for name in SUBSCORES if name != "ec"]
+            print(f"    EPDMS {scores.pdm_score[1]:.3f}  " + "  ".join(named))
+        if rejected is None:
+            break
+    else:
+        left = len(made.candidates) - len(order)
+        if expert not in LOGGED and left > 0:
+            n = len(made.candidates)
+            print(f"none accepted: stopped after {len(order)} of {n} candidates, tries={n} goes on to the last")
+    if shown is not None and shown.judged is not None:
+        title = f"{expert}: {'accepted' if shown.rejected is None else shown.rejected.detail}"
+        picture = attempt_picture(clip, shown.candidate, shown.judged, title, (720, 720))
+        cv2.imwrite(f"{stem}_rollouts.png", picture[..., ::-1])
+        if shown.candidate is not None:
+            write_mp4(Path(f"{stem}.mp4"), film(clip, shown.candidate, shown.judged))
+    written = ", ".join(str(path) for path in sorted(to.glob(f"{stem.name}*")))
+    print(f"{time.perf_counter() - began:.1f} s; look at {written}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

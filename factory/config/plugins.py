@@ -1,0 +1,123 @@
+"""Readers, experts and planners that installed packages offer by name, through entry points (docs/extend.md).
+
+A package that declares `mine = "my_package:Mine"` in one of these groups makes `clips=mine`, `experts=[mine]` or
+`planner=mine` work wherever it is installed; nothing of it is imported before it is chosen.
+"""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any
+
+from factory.config.words import ConfigError
+
+GROUPS = {
+    "clips": "driving_data_factory.readers",
+    "expert": "driving_data_factory.experts",
+    "planner": "driving_data_factory.planners",
+}
+WHAT = {"clips": "reader", "expert": "expert", "planner": "planner"}
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """What one package offers under a name."""
+
+    name: str
+    module: str
+    attribute: str
+    package: str  # and its version, for messages
+
+    @property
+    def target(self) -> str:
+        """As `_target_` names it."""
+        return f"{self.module}.{self.attribute}"
+
+    @property
+    def reference(self) -> str:
+        """As `planner.name` names it."""
+        return f"{self.module}:{self.attribute}"
+
+
+def offered(kind: str) -> dict[str, list[Plugin]]:
+    """Name -> what installed packages offer under it; kind: a key of GROUPS."""
+    found: dict[str, list[Plugin]] = {}
+    for entry in entry_points(group=GROUPS[kind]):
+        package = "an unnamed package" if entry.dist is None else f"{entry.dist.name} {entry.dist.version}"
+        found.setdefault(entry.name, []).append(Plugin(entry.name, entry.module, entry.attr, package))
+    return {name: sorted(found[name], key=lambda plugin: plugin.package) for name in sorted(found)}
+
+
+def installed(kind: str, name: str, built_in: Collection[str]) -> Plugin | None:
+    """The one plug-in of that name, None where there is none.
+
+    Raises ConfigError naming the packages where two offer it, or one offers what is built in.
+    """
+    plugins = offered(kind).get(name, [])
+    if not plugins:
+        return None
+    by = " and ".join(plugin.package for plugin in plugins)
+    if name in built_in:
+        raise ConfigError(f"{WHAT[kind]} {name} is built in, and {by} offers another of that name: uninstall {by}")
+    if len(plugins) > 1:
+        raise ConfigError(f"{WHAT[kind]} {name} is offered by {by}: uninstall all but one, or name the class")
+    return plugins[0]
+
+
+def names(kind: str) -> list[str]:
+    """What is offered, sorted, for messages."""
+    return list(offered(kind))
+
+
+def choices(group: str, folders: Sequence[Path]) -> list[str]:
+    """What a group of settings offers, sorted: files of its name in the folders, and what packages add to it."""
+    return sorted({*_files(group, folders), *(names(group) if group in GROUPS else ())})
+
+
+def _files(group: str, folders: Sequence[Path]) -> set[str]:
+    return {file.stem for folder in folders for file in (folder / group).glob("*.yaml")}
+
+
+def offer_choices(overrides: Sequence[str], conf: Path, folders: Sequence[Path] = ()) -> None:
+    """Make `clips=<name>` and `planner=<name>` choices of Hydra's; their keys may be set without a plus.
+
+    conf, folders: where the files of the other choices lie. Raises ConfigError where the one that is chosen clashes.
+    """
+    from hydra.core.config_store import ConfigStore
+    from omegaconf import OmegaConf
+
+    chosen = dict(word.partition("=")[::2] for word in overrides)
+    for group in ("clips", "planner"):
+        built_in = _files(group, (conf, *folders))
+        if group in chosen:
+            installed(group, chosen[group], built_in)
+        for name, plugins in offered(group).items():
+            if name in built_in or len(plugins) > 1:
+                continue
+            node = OmegaConf.load(conf / group / "custom.yaml")
+            OmegaConf.set_struct(node, False)
+            node.name = name
+            if group == "clips":
+                node._target_ = plugins[0].target
+            else:
+                OmegaConf.set_struct(node.settings, False)
+            ConfigStore.instance().store(name=name, node=node, group=group, provider=plugins[0].package)
+
+
+def with_experts(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Composed settings with every installed expert as `expert.<name>`; what the command line says of one is kept.
+
+    Raises ConfigError where one that `experts` names clashes.
+    """
+    specs = {name: dict(spec) for name, spec in values["expert"].items()}
+    built_in = {name for name, spec in specs.items() if "kind" in spec}
+    asked = [values["experts"]] if isinstance(values["experts"], str) else values["experts"]
+    for name, plugins in offered("expert").items():
+        if "_target_" in specs.get(name, {}):
+            continue  # the command line names a class
+        if name in asked:
+            installed("expert", name, built_in)
+        if name not in built_in and len(plugins) == 1:
+            specs[name] = {"_target_": plugins[0].target, **specs.get(name, {})}
+    return {**values, "expert": specs}

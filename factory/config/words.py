@@ -1,0 +1,145 @@
+"""The words of a command line as Hydra's overrides, and what is wrong with one in the user's own terms.
+
+A setting is `key=value`. Text that Hydra's grammar does not read, such as a path with brackets, is taken as it stands.
+Of Hydra's options two are kept: `--cfg` shows the settings, `--config-dir` adds a folder of one's own groups.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+SHOW = ("--cfg", "-c")
+FOLDER = ("--config-dir", "-cd")
+SEVERAL = ("--multirun", "-m")
+NEEDS_READING = "[{'\""  # a value that begins so is a list, a mapping or quoted text, never plain text
+
+
+class ConfigError(ValueError):
+    """The command line or a configuration file asks for something that does not exist or does not fit."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What a command line asks for."""
+
+    overrides: tuple[str, ...]
+    folders: tuple[Path, ...] = ()  # of groups beside those of conf/
+    shows: bool = False  # only the settings
+
+    @property
+    def words(self) -> list[str]:
+        """The same command line, without --cfg and every option one word."""
+        return [*(f"--config-dir={folder}" for folder in self.folders), *self.overrides]
+
+
+def asked_of(words: Sequence[str]) -> Asked:
+    """The words sorted into settings and options. Raises ConfigError for a word that is neither."""
+    overrides: list[str] = []
+    folders: list[Path] = []
+    shows = False
+    rest = list(words)
+    while rest:
+        word = rest.pop(0)
+        option, equals, value = word.partition("=")
+        if option in SHOW:
+            shows = True
+            what = value if equals else rest.pop(0) if rest and rest[0] in ("job", "hydra", "all") else "job"
+            if what != "job":
+                raise ConfigError(f"{option} {what}: the settings of the run alone are shown: {option}")
+        elif option in FOLDER:
+            if not equals:
+                value = rest.pop(0) if rest else ""
+            if not value or not Path(value).expanduser().is_dir():
+                raise ConfigError(f"{option} {value}: there is no such folder".replace("  ", " "))
+            folders.append(Path(value).expanduser().resolve())
+        elif option in SEVERAL:
+            raise ConfigError(
+                f"{option}: a run fills one folder, so several runs are several commands: "
+                "for n in 1 2; do python -m factory.run rounds=$n out=runs/rounds$n; done"
+            )
+        elif word.startswith("-"):
+            key = option.lstrip("-")
+            if not equals:
+                value = rest.pop(0) if rest and "=" not in rest[0] and not rest[0].startswith("-") else "..."
+            raise ConfigError(f"{word}: settings have no dashes: {key}={value}; see --help")
+        elif not equals and not word.startswith("~"):
+            raise ConfigError(f"{word!r}: expected key=value; see --help")
+        else:
+            overrides.append(word)
+    return Asked(tuple(overrides), tuple(folders), shows)
+
+
+def readable(word: str) -> str:
+    """An override that Hydra reads. Raises ConfigError for a list without its end, and for several values."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    key, _, value = word.partition("=")
+    try:
+        parsed = OverridesParser.create().parse_override(word)
+    except HydraException as error:
+        if not key or not all(letter.isalnum() or letter in "_.@/+~-" for letter in key):
+            raise ConfigError(f"{word!r}: expected key=value; see --help") from error
+        if value[:1] and value[0] in NEEDS_READING:
+            raise ConfigError(
+                f"{word}: cannot be read; a list is {key}=[a,b], all of it in quotes for the shell"
+            ) from (error)
+        escaped = value.replace("\\", "\\\\").replace("'", "\\'")
+        return f"{key}='{escaped}'"
+    if parsed.is_sweep_override():
+        raise ConfigError(f"{word}: one value, or a list: {key}=[{value}]; several runs are several commands")
+    return word
+
+
+def no_such_choice(missing: str, choices: Sequence[str] | None) -> str:
+    """`missing`: group/choice as Hydra names it."""
+    group, _, choice = missing.rpartition("/")
+    known = sorted(choices or ())
+    meant = nearest(choice, known).replace("mean ", f"mean {group}=")
+    return f"{group}={choice}: there is {', '.join(known) or 'no choice'}{meant}"
+
+
+def wrong_key(word: str, tree: Mapping[str, Any], others: Mapping[str, Mapping[str, Any]]) -> str:
+    """Why an override's key does not fit the composed settings `tree`; nothing where it does.
+
+    others: group=choice -> its settings, for all that are not chosen.
+    """
+    key = word.partition("=")[0]
+    plain = key.lstrip("+~")
+    if "@" in key or key.startswith("++"):
+        return ""
+    if key.startswith("+"):
+        return f"{key}: {plain} is a setting already; without +: {plain}=..." if has(tree, plain) else ""
+    if has(tree, plain):
+        return ""
+    group, _, inner = plain.partition(".")
+    having = [choice for choice, settings in others.items() if choice.startswith(f"{group}=") and has(settings, inner)]
+    if having:
+        return f"{plain} is a setting of {' and '.join(having)}: choose one of them too"
+    meant = nearest(plain, list(dotted(tree)))
+    return f"{plain}: there is no such setting" + (f"{meant.removesuffix('?')}=?" if meant else "; see --help")
+
+
+def has(tree: Any, key: str) -> bool:
+    """There is such a dotted key."""
+    for part in key.split("."):
+        if not isinstance(tree, Mapping) or part not in tree:
+            return False
+        tree = tree[part]
+    return True
+
+
+def dotted(tree: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    """All keys, those of groups with dots."""
+    for key, value in tree.items():
+        yield f"{prefix}{key}"
+        if isinstance(value, Mapping):
+            yield from dotted(value, f"{prefix}{key}.")
+
+
+def nearest(word: str, known: Sequence[str]) -> str:
+    """`; did you mean x?` where one is near, else nothing."""
+    found = get_close_matches(word, known, n=1, cutoff=0.6)
+    return f"; did you mean {found[0]}?" if found else ""

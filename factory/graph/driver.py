@@ -1,0 +1,406 @@
+"""The driver's loop: keeps a bounded number of clips open and walks their candidates, in either executor.
+
+Attempts of one walk are a chain, walks are parallel. Results go to the gatherer, which commits them in groups.
+Everything the driver knows it can know again from the tables, so it can die at any moment.
+"""
+
+import threading
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from factory.graph.batch import Gatherer, PendingRow
+from factory.graph.blocks import BlockOf, BlockQueue, Build
+from factory.graph.episodes import Episodes
+from factory.graph.forecast import Forecast, Work
+from factory.graph.local import Graph, Ticket
+from factory.graph.metrics import RunMetrics
+from factory.graph.plan import CLIP_CANDIDATE, ClipPlan, Plan, WalkState, wants_payload
+from factory.graph.progress import ProgressLine, Tally
+from factory.graph.steps import Attempted, Failure, HalfBuilt, Prepared, Reconstructed, Stamp
+from factory.graph.walk import Blocked, Complete, Exhausted, Step, Try, tries_before
+from factory.graph.work import LOGGED
+from factory.readers.base import ClipRef
+from factory.store.candidates import ClipCandidates
+from factory.store.identity import RunIdentity, attempt_id
+from factory.store.outcomes import QUARANTINE_AFTER, ErrorKind, Kind, Outcome
+from factory.store.room import NoRoom
+from factory.store.samples import Past
+from factory.store.table import Shard
+from tasks.stages import Rejected
+
+CLIPS_PER_WORKER = 2  # open at once: one works while the next is being prepared
+WAIT_S = 0.5
+
+
+@dataclass
+class Executed:
+    """What this run did itself, and what it found done."""
+
+    prepared: int = 0  # clip and perturb stages computed
+    from_cache: int = 0  # prepared clips taken from disk
+    attempts: int = 0
+    found_done: int = 0  # attempts settled by earlier runs
+    episodes: int = 0  # files written
+
+    def __str__(self) -> str:
+        episodes = f"; wrote {self.episodes} episodes" if self.episodes else ""
+        return (
+            f"executed {self.prepared} perturb tasks ({self.from_cache} from cache) and {self.attempts} attempts; "
+            f"found {self.found_done} attempts done{episodes}"
+        )
+
+
+class Driver:
+    """The state of one run, fed by its loop one report at a time."""
+
+    def __init__(
+        self,
+        identity: RunIdentity,
+        plan: Plan,
+        digests: Mapping[str, str],
+        rounds: int,
+        policy: Callable[[Past], bool],
+        block_of: BlockOf = lambda ref: None,
+        doing: Callable[[], str] = str,
+    ) -> None:
+        """block_of: name of the block that is to be built before a clip; doing: how far long tasks are."""
+        self._identity, self._digests, self._rounds, self._policy = identity, digests, rounds, policy
+        self._plan, self._block_of, self._doing = plan, block_of, doing
+        self.executed = Executed(found_done=plan.found_done)
+        self.notes: list[str] = []
+        self._seconds: dict[str, list[float]] = defaultdict(lambda: [0, 0.0])
+        self._fresh: set[str] = set()  # attempt_ids that failed in this run
+        self._building: dict[Ticket, Build] = {}
+        self._preparing: dict[Ticket, ClipPlan] = {}
+        self._trying: dict[Ticket, tuple[ClipPlan, WalkState, Any, Stamp]] = {}
+        self._walks_left: dict[str, int] = {}
+        self._held: dict[tuple[str, str], tuple[list[PendingRow], list[Outcome]]] = {}  # redo: until the walk ends
+        self._stopping = threading.Event()
+        self._tally = Tally()
+        self._wanted = {
+            (clip.ref.clip_id, walk.expert): _wanted(walk, rounds) for clip in plan.todo for walk in clip.walks
+        }
+        self._forecast = Forecast(Work(), Work(left=sum(self._wanted.values())))
+
+    def stop(self) -> None:
+        """Begin nothing more; what is in flight is finished and committed."""
+        self._stopping.set()
+
+    @property
+    def seconds(self) -> dict[str, tuple[int, float]]:
+        """Stage -> (tasks, seconds) of this run."""
+        return {stage: (int(n), total) for stage, (n, total) in sorted(self._seconds.items())}
+
+    @property
+    def has_failures(self) -> bool:
+        """Some planned clip or walk stands at a failed attempt, from this run or an earlier one."""
+        clips = (*self._plan.todo, *self._plan.done)
+        return any(clip.failed or any(isinstance(step, Blocked) for step in clip.steps.values()) for clip in clips)
+
+    @property
+    def interrupted(self) -> bool:
+        return self._stopping.is_set()
+
+    def loop(self, graph: Graph, gatherer: Gatherer, metrics: RunMetrics, episodes: Episodes | None = None) -> None:
+        """Until nothing is left, or until stopped and drained. Raises NoRoom once a disk is full."""
+        self._graph, self._gatherer, self._metrics, self._episodes = graph, gatherer, metrics, episodes
+        gatherer.committed = self._committed
+        with ProgressLine(len(self._plan.todo), self._forecast.left_s, doing=self._doing) as progress:
+            self._work_through(graph, gatherer, progress)
+
+    def _work_through(self, graph: Graph, gatherer: Gatherer, progress: ProgressLine) -> None:
+        self._queue = BlockQueue(self._plan.todo, self._block_of, graph.parallelism)
+        self._forecast.blocks.left = self._queue.n_blocks
+        while True:
+            room = len(self._walks_left) + len(self._preparing) < CLIPS_PER_WORKER * graph.parallelism
+            if gatherer.n_writing < 2 and not self.interrupted:
+                begun = self._queue.next(room)
+                if begun is not None:
+                    self._open(begun)
+                    continue
+            finished = graph.wait(WAIT_S)
+            if finished is not None:
+                self._take(*finished)
+            gatherer.send_if_due()
+            progress.show(self._tally)
+            self._show_state()
+            idle = not self._preparing and not self._trying and not gatherer.n_writing
+            if idle and (
+                self.interrupted or not self._queue
+            ):  # a block half built is left: the next run goes on with it
+                break
+        gatherer.send()
+        while gatherer.n_writing or (self._episodes is not None and self._episodes.is_due):
+            if self.interrupted and self._episodes is not None:
+                self._episodes.stop()
+            finished = graph.wait(WAIT_S)
+            if finished is not None:
+                self._take(*finished)
+            progress.show(self._tally)
+        progress.show(self._tally, last=True)
+        self._show_state(last=True)
+
+    def _committed(self, shards: Sequence[Shard], seconds: float) -> None:
+        self._metrics.committed(shards, seconds)
+        if self._episodes is not None:
+            self._episodes.committed([shard.path for shard in shards])
+
+    def _show_state(self, last: bool = False) -> None:
+        in_flight = {
+            "walks": sum(self._walks_left.values()),
+            "attempts": len(self._trying),
+            "clips": len(self._preparing),
+            "blocks": len(self._building),
+            "batches": self._gatherer.n_writing,
+        }
+        clips = len(self._plan.todo)
+        self._metrics.state(clips, clips - self._tally.clips, in_flight, last)
+
+    def _open(self, what: ClipPlan | Build) -> None:
+        if isinstance(what, Build):
+            threads = max(1, self._graph.cores // self._queue.at_once)
+            self._building[self._graph.submit("reconstruct", what.ref, threads)] = what
+        elif wants_payload(what):
+            self._preparing[self._graph.submit("prepare", what.ref, what.content)] = what
+        else:
+            self._start_walks(what, None)
+
+    def _take(self, ticket: Ticket, report: Any) -> None:
+        self._metrics.task(ticket.step, ticket.queued_s, report)
+        if isinstance(report, Failure) and report.no_room:
+            raise NoRoom(report.no_room)
+        if self._gatherer.finished(ticket, report):
+            return
+        if self._episodes is not None and self._episodes.finished(ticket, report):
+            self.executed.episodes = self._episodes.written
+            return
+        if ticket in self._building:
+            self._take_block(self._building.pop(ticket), report)
+        elif ticket in self._preparing:
+            self._take_prepared(self._preparing.pop(ticket), ticket.result, report)
+        else:
+            self._take_attempt(*self._trying.pop(ticket), ticket.result, report)
+
+    def _take_block(self, build: Build, report: Reconstructed | HalfBuilt | Failure) -> None:
+        if isinstance(report, HalfBuilt):
+            self.notes.append(f"block {build.block} is not finished; the next run goes on with it")
+            return
+        self._forecast.blocks.finish(1)
+        if isinstance(report, Reconstructed):
+            self._count(report.seconds, self._forecast.blocks)
+        else:
+            last = report.error.splitlines()[-1]
+            self.notes.append(f"block {build.block} failed ({last}); it is tried again for each of its clips")
+        self._queue.built(build.block)
+
+    def _take_prepared(self, clip: ClipPlan, result: Any, report: Prepared | Rejected | Failure) -> None:
+        clip_id = clip.ref.clip_id
+        replaced = [*clip.stale, *([clip.past.attempt_id] if clip.past is not None else [])]
+        if isinstance(report, Rejected):
+            replaced += [key for walk in clip.walks for key in walk.stale]
+        if isinstance(report, Prepared):
+            self._count(report.seconds, self._forecast.samples)
+            if report.note:
+                self.notes.append(report.note)
+            elif (
+                clip.listed is not None
+                and clip.listed.prepare_digest == self._identity.prepare_digest
+                and not report.from_cache
+            ):
+                self.notes.append(f"clip {clip_id}: its prepared clip was not in the cache; prepared again")
+            self.executed.prepared += not report.from_cache
+            self.executed.from_cache += report.from_cache
+            clip.n_candidates = len(report.candidates)
+            is_listed = clip.listed is not None and clip.listed.content_digest == report.content_digest
+            rows = [] if is_listed else [self._candidates_row(clip.ref, report)]
+            self._gatherer.add(candidates=rows, replaced=replaced)
+            clip.past = None
+            self._start_walks(clip, result)
+            return
+        key = attempt_id(clip_id, CLIP_CANDIDATE, self._identity.vocabulary_digest, "", "")
+        outcome = self._outcome(clip.ref, key, "", CLIP_CANDIDATE, report, tries_before(clip.past), {}, {})
+        clip.past = _past(outcome)
+        clip.failed = outcome.kind == Kind.FAILED
+        unlisted = [clip_id] if isinstance(report, Rejected) else []
+        self._gatherer.add(outcomes=[outcome], replaced=replaced, unlisted=unlisted)
+        self._metrics.outcome(outcome, None)
+        self._tally.rejected += not clip.failed
+        self._tally.failed += clip.failed
+        self._tally.clips += 1
+        for walk in clip.walks:
+            self._settle(clip, walk)
+
+    def _start_walks(self, clip: ClipPlan, prepared: Any) -> None:
+        self._walks_left[clip.ref.clip_id] = len(clip.walks)
+        for walk in clip.walks:
+            self._advance(clip, walk, prepared)
+
+    def _advance(self, clip: ClipPlan, walk: WalkState, prepared: Any) -> None:
+        step = walk.step(clip.n_candidates, self._rounds, self._may_retry)
+        clip.steps[walk.expert] = step
+        if isinstance(step, Try) and not self.interrupted:
+            stamp = self._stamp(clip.ref, walk.expert, step)
+            self._trying[self._graph.submit("attempt", prepared, stamp)] = (clip, walk, prepared, stamp)
+            return
+        self._finish(clip, walk, step)
+        self._walks_left[clip.ref.clip_id] -= 1
+        if not self._walks_left[clip.ref.clip_id]:
+            del self._walks_left[clip.ref.clip_id]
+            self._tally.clips += not self.interrupted
+
+    def _settle(self, clip: ClipPlan, walk: WalkState, n: int | None = None) -> None:
+        """`n` of the samples that the walk was to make are behind it, None: all, made or not."""
+        key = clip.ref.clip_id, walk.expert
+        n = self._wanted[key] if n is None else min(n, self._wanted[key])
+        self._wanted[key] -= n
+        self._forecast.samples.finish(n)
+
+    def _finish(self, clip: ClipPlan, walk: WalkState, step: Step) -> None:
+        if not isinstance(step, Try):
+            self._settle(clip, walk)
+        if walk.lacks_exhausted(step):
+            assert isinstance(step, Exhausted)
+            stamp = self._stamp(clip.ref, walk.expert, Try(step.n_tried, -1))
+            outcome = self._outcome(clip.ref, stamp.attempt_id, walk.expert, step.n_tried, step, 0, {}, {})
+            walk.known[step.n_tried] = _past(outcome)
+            self._keep(clip, walk, outcomes=[outcome])
+            self._metrics.outcome(outcome, None)
+        rows, outcomes = self._held.pop((clip.ref.clip_id, walk.expert), ([], []))
+        if isinstance(step, Complete | Exhausted):
+            if walk.stale:
+                self._gatherer.add(rows=rows, outcomes=outcomes, replaced=sorted(walk.stale))
+        else:  # rows of an unfinished redo are made again, so that readers see the old walk or the new one
+            self._gatherer.add(outcomes=[o for o in outcomes if o.kind == Kind.FAILED])
+
+    def _take_attempt(
+        self, clip: ClipPlan, walk: WalkState, prepared: Any, stamp: Stamp, result: Any, report: Attempted | Failure
+    ) -> None:
+        self.executed.attempts += 1
+        known = walk.known.get(stamp.candidate_index)
+        replaced = [known.attempt_id] if known is not None else []  # under keep perhaps of other expert inputs
+        if isinstance(report, Attempted):
+            self._count(report.seconds, self._forecast.samples)
+        if isinstance(report, Attempted) and report.rejected is None:
+            walk.known[stamp.candidate_index] = Past(stamp.attempt_id, Kind.ACCEPTED, True, round=stamp.round)
+            row = PendingRow(result, report.n_bytes, (stamp.round, stamp.expert), report.licence)
+            self._keep(clip, walk, rows=[row], replaced=replaced)
+            self._tally.accepted += 1
+            self._settle(clip, walk, 1)
+            self._metrics.accepted(stamp.expert, stamp.round)
+        else:
+            what = report if isinstance(report, Failure) else report.rejected
+            measured = ({}, {}) if isinstance(report, Failure) else (dict(report.subscores), dict(report.seconds))
+            assert what is not None
+            outcome = self._outcome(
+                clip.ref, stamp.attempt_id, stamp.expert, stamp.candidate_index, what, tries_before(known), *measured
+            )
+            walk.known[stamp.candidate_index] = _past(outcome)
+            if outcome.kind == Kind.FAILED:
+                self._fresh.add(stamp.attempt_id)
+            self._keep(clip, walk, outcomes=[outcome], replaced=replaced)
+            self._metrics.outcome(outcome, stamp.round)
+            self._tally.rejected += outcome.kind == Kind.REJECTED
+            self._tally.failed += outcome.kind == Kind.FAILED
+        self._advance(clip, walk, prepared)
+
+    def _keep(
+        self,
+        clip: ClipPlan,
+        walk: WalkState,
+        rows: Sequence[PendingRow] = (),
+        outcomes: Sequence[Outcome] = (),
+        replaced: Sequence[str] = (),
+    ) -> None:
+        """On to the gatherer; a walk that replaces rows is held back until it ends."""
+        if not walk.stale:
+            self._gatherer.add(rows=rows, outcomes=outcomes, replaced=replaced)
+            return
+        held_rows, held_outcomes = self._held.setdefault((clip.ref.clip_id, walk.expert), ([], []))
+        held_rows.extend(rows)
+        held_outcomes.extend(outcomes)
+
+    def _may_retry(self, past: Past) -> bool:
+        return past.attempt_id not in self._fresh and self._policy(past)
+
+    def _stamp(self, ref: ClipRef, expert: str, step: Try) -> Stamp:
+        digest, vocabulary = self._digests[expert], self._identity.vocabulary_digest
+        return Stamp(
+            attempt_id(ref.clip_id, step.candidate, vocabulary, expert, digest),
+            expert,
+            digest,
+            step.round,
+            step.candidate,
+            vocabulary,
+            self._identity.settings_hash,
+            self._identity.versions_json,
+        )
+
+    def _outcome(
+        self,
+        ref: ClipRef,
+        key: str,
+        expert: str,
+        candidate: int,
+        what: Rejected | Failure | Exhausted,
+        tries: int,
+        subscores: dict[str, float],
+        seconds: dict[str, float],
+    ) -> Outcome:
+        base = Outcome(
+            attempt_id=key,
+            clip_id=ref.clip_id,
+            dataset=ref.dataset,
+            log_id=ref.log_id,
+            expert=expert,
+            expert_digest=self._digests.get(expert, ""),
+            candidate_index=candidate,
+            kind=Kind.EXHAUSTED.value,
+            settings_hash=self._identity.settings_hash,
+            stage_versions=self._identity.versions_json,
+            tries=tries + 1,
+            subscores=subscores,
+            seconds=seconds,
+        )
+        facts = asdict(base)
+        if isinstance(what, Rejected):
+            facts |= {"kind": Kind.REJECTED.value, "stage": what.stage, "reason": what.reason, "detail": what.detail}
+        elif isinstance(what, Failure):
+            poison = what.kind is ErrorKind.SYSTEM and tries + 1 >= QUARANTINE_AFTER
+            kind = ErrorKind.POISON if poison else what.kind
+            facts |= {"kind": Kind.FAILED.value, "error_kind": kind.value, "error": what.error}
+        else:
+            facts |= {"n_tried": what.n_tried}
+        return Outcome(**facts)
+
+    def _candidates_row(self, ref: ClipRef, report: Prepared) -> ClipCandidates:
+        return ClipCandidates(
+            ref.clip_id,
+            ref.dataset,
+            ref.log_id,
+            report.content_digest,
+            self._identity.prepare_digest,
+            self._identity.vocabulary_digest,
+            dict(report.gate_counts),
+            report.candidates,
+            report.dropped.stage if report.dropped is not None else "",
+            report.dropped.reason if report.dropped is not None else "",
+        )
+
+    def _count(self, seconds: Mapping[str, float], work: Work) -> None:
+        work.spent_s += sum(seconds.values())
+        for stage, spent in seconds.items():
+            self._seconds[stage][0] += 1
+            self._seconds[stage][1] += spent
+
+
+def _wanted(walk: WalkState, rounds: int) -> int:
+    """Samples that the walk is still to make, as far as its list lasts."""
+    found = sum(past.kind is Kind.ACCEPTED for past in walk.known.values())
+    return max(0, (1 if walk.expert in LOGGED else rounds) - found)
+
+
+def _past(outcome: Outcome) -> Past:
+    kind = Kind(outcome.kind)
+    return Past(outcome.attempt_id, kind, True, -1, outcome.error_kind, outcome.tries, outcome.stage_versions)

@@ -1,0 +1,275 @@
+"""Executes a run: plan against the tables, drive the tasks in one executor or the other, tell how it ended.
+
+The driver can die at any moment: what is committed is done, the rest is tried again by the next run, with the
+same result.
+"""
+
+import json
+import os
+import signal
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from types import FrameType
+from typing import Literal
+
+from deltalake.exceptions import DeltaError
+
+from factory.graph.batch import SHARD_BYTES, SHARD_SECONDS, Gatherer, WriteFailed
+from factory.graph.driver import Driver, Executed
+from factory.graph.episodes import Episodes, EpisodesWanted
+from factory.graph.local import ClusterLacks, Graph, LocalGraph
+from factory.graph.metrics import RunMetrics
+from factory.graph.plan import Plan, make_plan
+from factory.graph.walk import Try, retry_policy
+from factory.graph.work import NotReady, Stopped, Work
+from factory.readers.base import ClipRef
+from factory.store.funnel import Funnel, funnel_of
+from factory.store.location import BadLocation
+from factory.store.outcomes import Kind
+from factory.store.room import NoRoom
+from factory.store.samples import CURRENT_RUN, NOTHING, ChangedRun, OnChange, Store
+from factory.store.table import AnotherWriter
+from factory.wording import one_line
+
+COMPLETE, BAD_CONFIG, COMPLETE_WITH_FAILURES, INTERRUPTED = 0, 2, 3, 4  # exit codes
+Executor = Literal["local", "ray"]
+
+
+@dataclass
+class RunSummary:
+    """How a run ended."""
+
+    exit_code: int
+    message: str = ""
+    counts: dict[str, int] = field(default_factory=dict)  # accepted, rejected, failed, exhausted, of the planned clips
+    executed: Executed = field(default_factory=Executed)
+    seconds: dict[str, tuple[int, float]] = field(default_factory=dict)  # stage -> (tasks, seconds) of this run
+    notes: list[str] = field(default_factory=list)
+    funnel: Funnel | None = None
+    began_ms: int = 0  # since 1970; 0: nothing was left to do
+    disk_full: bool = False  # the message says where; then no page is written
+
+
+def execute(
+    work: Work,
+    refs: Sequence[ClipRef],
+    experts: Sequence[str],
+    rounds: int,
+    store: Store,
+    executor: Executor = "ray",
+    workers: int | None = None,
+    *,
+    on_change: OnChange = "stop",
+    retry: bool = False,
+    ray_address: str | None = None,
+    gpu_share: float = 0.0,
+    shard_bytes: int = SHARD_BYTES,
+    shard_seconds: float = SHARD_SECONDS,
+    minutes: float | None = None,
+    episodes: EpisodesWanted | None = None,
+    command: Sequence[str] | None = None,
+    say: Callable[[str], None] = print,
+) -> RunSummary:
+    """Make the samples of `rounds` rounds for every clip and expert, as far as the store does not hold them already.
+
+    workers: processes of a local Ray cluster, None: one per CPU. retry: try failed(input | bug) attempts again too.
+    gpu_share: of a GPU, that every attempt claims on Ray; 0 where it draws without.
+    minutes: after which nothing new is begun, as after an interruption. episodes: MCAP files to be written
+    beside the samples. command: the settings as they were given, kept for `retry`.
+    Bad wishes come back as exit code 2 with a message and nothing written; see the module's codes for the others.
+    """
+    if not refs or not experts or rounds < 1:
+        return RunSummary(BAD_CONFIG, f"nothing to do: {len(refs)} clips, experts {list(experts)}, rounds={rounds}")
+    twice = [clip_id for clip_id, n in Counter(ref.clip_id for ref in refs).items() if n > 1]
+    if twice or len(set(experts)) < len(experts):
+        return RunSummary(BAD_CONFIG, f"named twice: clips {twice[:3]}, experts {list(experts)}")
+    digests = {expert: work.expert_digest(expert) for expert in experts}
+    identity = work.identity
+    try:
+        records = store.agree(identity, digests, on_change)
+        history = NOTHING if store.starts_over(records) else store.history(identity, digests)
+        if on_change == "stop" and records[-1]["on_change"] == "keep":
+            on_change = "keep"
+        policy = retry_policy(retry, identity.versions_json)
+        plan = make_plan(refs, experts, rounds, history, identity, on_change, policy)
+        pictured = Episodes(store, episodes, refs) if episodes else None
+    except ChangedRun as error:
+        return RunSummary(BAD_CONFIG, str(error))
+    except OSError as error:
+        return RunSummary(BAD_CONFIG, f"{error}; python -m factory verify {store.location.uri} says what is damaged")
+    driver = Driver(identity, plan, digests, rounds, policy, work.block, work.doing)
+    if plan.frozen:
+        driver.notes.append(f"{len(plan.frozen)} clips kept as they are: their candidates come from other settings")
+    code, message, began_ms, disk_full = COMPLETE, "", 0, False
+    try:
+        is_due = plan.todo or (pictured is not None and pictured.is_due)
+        graph = (
+            _graph(work, store, executor, workers, ray_address, gpu_share, lambda: driver.interrupted)
+            if is_due
+            else None
+        )
+    except (BadLocation, ClusterLacks, NotReady) as error:
+        return RunSummary(BAD_CONFIG, str(error))
+    except ConnectionError as error:
+        where = ray_address or os.environ.get("RAY_ADDRESS")
+        return RunSummary(
+            BAD_CONFIG,
+            f"no Ray cluster answers at RAY_ADDRESS={where} ({one_line(error)}); unset it to run on this machine alone",
+        )
+    except KeyboardInterrupt:
+        return RunSummary(INTERRUPTED, "stopped before anything was begun")
+    try:
+        store.begin(records)
+        if graph is not None:
+            began_ms = _announce(store, plan, experts, rounds, command)
+            metrics = RunMetrics(graph.recorder, store.location)
+            with _stop_signals(driver.stop), _alarm(driver.stop, minutes):
+                if pictured is not None:
+                    pictured.begin(graph)
+                driver.loop(graph, Gatherer(graph, store, shard_bytes, shard_seconds), metrics, pictured)
+                if pictured is not None:
+                    pictured.tidy()
+        code = COMPLETE_WITH_FAILURES if driver.has_failures else COMPLETE
+        if pictured is not None and pictured.errors:
+            text = f"{len(pictured.errors)} episodes were not written ({pictured.errors[0]})"
+            code, message = INTERRUPTED, f"{text}; run the same command again to write them"
+        if driver.interrupted:
+            code, message = INTERRUPTED, "interrupted; run the same command again to go on"
+    except NoRoom as error:
+        code, message, disk_full = INTERRUPTED, out_of_room(error), True
+    except (AnotherWriter, WriteFailed) as error:
+        code, message = INTERRUPTED, str(error)
+    except (OSError, DeltaError) as error:  # what holds the tables fails: a share that went away, a lost network
+        code, message = INTERRUPTED, f"{one_line(error)}; run the same command again to go on"
+    except KeyboardInterrupt:
+        code, message = INTERRUPTED, "stopped at once; run the same command again"
+    finally:
+        if graph is not None:
+            graph.close()
+    funnel = funnel_of(store, [ref.clip_id for ref in refs])
+    counts = _counts(plan)
+    summary = RunSummary(
+        code, message, counts, driver.executed, driver.seconds, driver.notes, funnel, began_ms, disk_full
+    )
+    if began_ms or code:
+        try:
+            _record(store, summary)
+        except OSError as error:  # the same disk or share
+            summary.exit_code = INTERRUPTED
+            summary.disk_full = summary.disk_full or isinstance(error, NoRoom)
+            summary.message = summary.message or (
+                out_of_room(error) if isinstance(error, NoRoom) else f"{one_line(error)}; run the same command again"
+            )
+    for line in (*summary.notes, str(summary.executed)):
+        say(line)
+    return summary
+
+
+def out_of_room(error: NoRoom) -> str:
+    """What to do where a disk is full."""
+    return f"{error}; make room and run the same command again: it goes on from what is committed"
+
+
+def _graph(
+    work: Work,
+    store: Store,
+    executor: Executor,
+    workers: int | None,
+    address: str | None,
+    gpu_share: float,
+    stopped: Stopped,
+) -> Graph:
+    if executor == "local":
+        return LocalGraph(work, store.location, stopped)
+    from factory.graph.on_ray import RayGraph
+
+    return RayGraph(work, store.location, workers, address, gpu_share)
+
+
+@contextmanager
+def _stop_signals(stop: Callable[[], None]) -> Iterator[None]:
+    """The first SIGINT or SIGTERM drains the run, a second one ends it at once."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    asked = threading.Event()
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        if asked.is_set():
+            raise KeyboardInterrupt
+        asked.set()
+        stop()
+
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _alarm(stop: Callable[[], None], minutes: float | None) -> Iterator[None]:
+    """Drains the run after so many minutes."""
+    timer = threading.Timer(60.0 * (minutes or 0.0), stop)
+    timer.daemon = True
+    if minutes == 0.0:
+        stop()
+    elif minutes is not None:
+        timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+def _counts(plan: Plan) -> dict[str, int]:
+    """Attempts of the planned clips by what became of them; clip-level rows among them."""
+    counts = dict.fromkeys((kind.value for kind in Kind), 0)
+    for clip in (*plan.todo, *plan.done):
+        pasts = [past for walk in clip.walks for past in walk.known.values()]
+        for past in (*pasts, *([clip.past] if clip.past is not None else [])):
+            counts[past.kind.value] += 1
+    return counts
+
+
+def _announce(store: Store, plan: Plan, experts: Sequence[str], rounds: int, command: Sequence[str] | None) -> int:
+    """current_run.json: when the run began and how many walks it has before it, for who watches; the beginning."""
+    walks = [
+        step
+        for clip in plan.todo
+        for walk in clip.walks
+        if (step := clip.steps.get(walk.expert)) is None or isinstance(step, Try) or walk.lacks_exhausted(step)
+    ]
+    began_ms = int(time.time() * 1000)
+    document = {
+        "began_ms": began_ms,
+        "clips": len(plan.todo) + len(plan.done),
+        "clips_left": len(plan.todo),
+        "walks_left": len(walks),
+        "experts": list(experts),
+        "rounds": rounds,
+        "folder": os.getcwd(),
+        "command": None if command is None else list(command),
+    }
+    store.location.write(CURRENT_RUN, (json.dumps(document, indent=1) + "\n").encode())
+    return began_ms
+
+
+def _record(store: Store, summary: RunSummary) -> None:
+    """last_run.json: what the newest run that did anything did, for people and reports."""
+    document = {
+        "began_ms": summary.began_ms,
+        "ended_ms": int(time.time() * 1000),
+        "exit_code": summary.exit_code,
+        "message": summary.message,
+        "counts": summary.counts,
+        "executed": asdict(summary.executed),
+        "seconds": {stage: {"tasks": n, "seconds": total} for stage, (n, total) in summary.seconds.items()},
+        "notes": summary.notes,
+    }
+    store.location.write("last_run.json", (json.dumps(document, indent=1) + "\n").encode())

@@ -1,0 +1,105 @@
+"""The graph in this process: one task after the other, in the order of submission. For tests, breakpoints, explain."""
+
+import os
+import time
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from factory.graph import steps
+from factory.graph.metrics import NoRecorder, Recorder
+from factory.graph.work import Stopped, Work, never
+from factory.store.location import Location
+
+
+class ClusterLacks(ValueError):
+    """The cluster has no node that the run could use."""
+
+
+@dataclass(eq=False)
+class Ticket:
+    """A submitted task. `result` stands for its large result and may be an argument of later tasks."""
+
+    step: str
+    result: Any
+    submitted: float = field(default_factory=time.monotonic)
+    queued_s: float = 0.0  # once it is finished: from submission to report, less the time at work
+
+
+class Graph(Protocol):
+    """What both executors offer: submit a function of factory.graph.steps, wait for reports."""
+
+    parallelism: int  # tasks at once
+    cores: int  # that one task can have
+    recorder: Recorder  # of metrics
+
+    def submit(self, step: str, *args: Any) -> Ticket:
+        """Run `step`; arguments may be results of earlier tickets. What WANTS says is supplied to it."""
+        ...
+
+    def wait(self, timeout_s: float) -> tuple[Ticket, Any] | None:
+        """A finished task and its report (a steps.Failure where it died); None when the time is up."""
+        ...
+
+    def close(self) -> None: ...
+
+
+STEPS = {
+    "reconstruct": steps.reconstruct,
+    "prepare": steps.prepare,
+    "attempt": steps.attempt,
+    "write": steps.write,
+    "episodes": steps.episodes,
+    "warm": steps.warm,
+}
+WANTS = {
+    "reconstruct": ("work", "stopped"),
+    "prepare": ("work", "out"),
+    "attempt": ("work",),
+    "write": ("out",),
+    "episodes": ("work", "out"),
+    "warm": ("work",),
+}
+
+
+def cores_of(step: str, args: tuple[Any, ...]) -> int:
+    """That a task uses: a reconstruction is told how many threads it has."""
+    return int(args[1]) if step == "reconstruct" else 1
+
+
+@dataclass
+class _Box:
+    value: Any = None
+
+
+class LocalGraph:
+    """Graph in this process."""
+
+    parallelism = 1
+
+    def __init__(self, work: Work, out: Location, stopped: Stopped = never) -> None:
+        """stopped: asked now and then by tasks that take long, as nobody else can while they are at work."""
+        self.cores = os.cpu_count() or 1
+        self.recorder: Recorder = NoRecorder()
+        self._supplied = {"work": work, "out": out, "stopped": stopped}
+        self._waiting: deque[tuple[Ticket, str, tuple[Any, ...]]] = deque()
+        work.warm()
+
+    def submit(self, step: str, *args: Any) -> Ticket:
+        ticket = Ticket(step, _Box())
+        self._waiting.append((ticket, step, args))
+        return ticket
+
+    def wait(self, timeout_s: float) -> tuple[Ticket, Any] | None:
+        if not self._waiting:
+            return None
+        ticket, step, args = self._waiting.popleft()
+        supplied = [self._supplied[name] for name in WANTS[step]]
+        plain = [arg.value if isinstance(arg, _Box) else arg for arg in args]
+        function: Any = STEPS[step]
+        ticket.queued_s = time.monotonic() - ticket.submitted
+        report, ticket.result.value = function(*supplied, *plain)
+        return ticket, report
+
+    def close(self) -> None:
+        self._waiting.clear()

@@ -1,0 +1,234 @@
+"""The graph as Ray tasks, on this machine or on a cluster. With factory.graph.ray_metrics, all that imports ray here.
+
+Large results stay in the object store and travel by reference. A worker that dies is retried by Ray; what then still
+fails becomes a steps.Failure. Nothing but loopback is opened for a cluster of our own, and `ray stop` is never called.
+"""
+
+import logging
+import os
+import secrets
+import socket
+import time
+from collections import deque
+from typing import Any
+
+os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")  # keeps every listener on 127.0.0.1
+os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+os.environ.setdefault("RAY_task_oom_retries", "2")  # Ray's own default retries a task that runs out of memory for ever
+
+import ray
+from ray.autoscaler.sdk import request_resources
+from ray.exceptions import RayError
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+from factory.graph.local import STEPS, WANTS, ClusterLacks, Ticket, cores_of
+from factory.graph.metrics import Recorder
+from factory.graph.ray_metrics import RayRecorder
+from factory.graph.steps import Failure
+from factory.graph.work import NotReady, Work, never
+from factory.store.location import BadLocation, Location
+from factory.store.outcomes import ErrorKind
+
+MAX_RETRIES = 2  # of a task whose worker died
+PROBE_SECONDS = 120.0
+ANSWER_S = 10.0  # for a cluster's port to be reached
+GPU_WAIT_S = 900.0  # for the first node with one to come
+WORKER_ENV = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+FORWARDED_ENV = ("NUMBA_CACHE_DIR",)
+
+_HELD: dict[str, Any] = {}  # per worker process: the run's Work, fetched once
+
+
+class RayGraph:
+    """Graph of Ray tasks. Connects to the cluster of RAY_ADDRESS or `address`, else starts one in this machine."""
+
+    def __init__(
+        self, work: Work, out: Location, workers: int | None = None, address: str | None = None, gpu_share: float = 0.0
+    ) -> None:
+        """workers: CPUs of a cluster started here, tasks at once on one that is there already; None: all its CPUs.
+
+        More workers than a cluster has CPUs now are what makes one grow that can. gpu_share: of a GPU, claimed by every
+        attempt; on a cluster without one, it is asked for one and waited for.
+        Raises BadLocation when some node does not see `out`, ClusterLacks when no GPU comes, NotReady when a node
+        cannot do its part.
+        """
+        self._connected = not ray.is_initialized()
+        self._is_ours = self._connected and _connect(workers, address)
+        available = int(ray.cluster_resources().get("CPU", 1))
+        self.parallelism = max(1, min(workers or available, available) if self._is_ours else workers or available)
+        self.cores = min(filter(None, _cores_by_node()), default=1)  # none yet where a cluster grows from nothing
+        self.cores = min(self.cores, self.parallelism)
+        self.recorder: Recorder = RayRecorder()
+        self._supplied: dict[str, Any] = {
+            "work": [ray.put(work)],
+            "out": out,
+            "stopped": never,
+        }  # in a list: a reference
+        self._tickets: dict[Any, Ticket] = {}
+        self._ready: deque[Any] = deque()
+        self._held_back: deque[tuple[Ticket, str, tuple[Any, ...]]] = deque()
+        try:
+            self._gpu_share = gpu_share if gpu_share and _has_gpu(wait=not self._is_ours) else 0.0
+            _prove_shared(out)
+            _warm_every_node(self._supplied["work"], with_gpu_only=self._gpu_share > 0.0)
+        except BaseException:
+            self.close()
+            raise
+
+    def submit(self, step: str, *args: Any) -> Ticket:
+        ticket = Ticket(step, None)
+        self._held_back.append((ticket, step, args))
+        self._dispatch()
+        return ticket
+
+    def _dispatch(self) -> None:
+        """A cluster of our own queues what its CPUs do not take; on a shared one the rest is held back here."""
+        while self._held_back and (self._is_ours or len(self._tickets) < self.parallelism):
+            ticket, step, args = self._held_back.popleft()
+            supplied = [self._supplied[name] for name in WANTS[step]]
+            task = _run.options(num_cpus=cores_of(step, args), num_gpus=self._gpu_share if step == "attempt" else None)
+            report, ticket.result = task.remote(step, len(supplied), *supplied, *args)
+            self._tickets[report] = ticket
+
+    def wait(self, timeout_s: float) -> tuple[Ticket, Any] | None:
+        if not self._ready and self._tickets:
+            pending = list(self._tickets)
+            some, _ = ray.wait(pending, num_returns=1, timeout=timeout_s, fetch_local=True)
+            if some:
+                some, _ = ray.wait(pending, num_returns=len(pending), timeout=0, fetch_local=True)
+            self._ready.extend(some)
+        if not self._ready:
+            return None
+        reference = self._ready.popleft()
+        ticket = self._tickets.pop(reference)
+        self._dispatch()
+        try:
+            report, worked_s = ray.get(reference)
+        except RayError as error:
+            report, worked_s = Failure(ErrorKind.SYSTEM, f"{type(error).__name__}: {error}"[:2000]), 0.0
+        ticket.queued_s = max(0.0, time.monotonic() - ticket.submitted - worked_s)
+        return ticket, report
+
+    def close(self) -> None:
+        self._tickets.clear()
+        if self._connected:
+            ray.shutdown()
+
+
+@ray.remote(num_cpus=1, num_returns=2, max_retries=MAX_RETRIES)
+def _run(step: str, n_supplied: int, *args: Any) -> tuple[Any, Any]:
+    """A function of factory.graph.steps in a worker: its report with the seconds it took, and its result."""
+    began = time.perf_counter()
+    function: Any = STEPS[step]
+    supplied = [_held(arg) if isinstance(arg, list) else arg for arg in args[:n_supplied]]
+    report, result = function(*supplied, *args[n_supplied:])
+    return (report, time.perf_counter() - began), result
+
+
+def _held(reference: list[Any]) -> Any:
+    key = reference[0].hex()
+    if key not in _HELD:
+        _HELD.clear()
+        _HELD[key] = ray.get(reference[0])
+    return _HELD[key]
+
+
+@ray.remote(num_cpus=0)
+def _sees(out: Location, name: str, token: bytes) -> bool:
+    return out.read(name) == token
+
+
+def _connect(workers: int | None, address: str | None) -> bool:
+    """Join the cluster of `address` or RAY_ADDRESS, else start one in this machine (then True).
+
+    Raises ConnectionError where nothing listens there: Ray itself tries for minutes.
+    """
+    _must_answer(address or os.environ.get("RAY_ADDRESS", ""))
+    environment = WORKER_ENV | {name: os.environ[name] for name in FORWARDED_ENV if name in os.environ}
+    where = address or ("auto" if os.environ.get("RAY_ADDRESS") else "local")
+    own: dict[str, Any] = {"num_cpus": workers, "include_dashboard": False} if where == "local" else {}
+    if where == "local":  # Ray warns that a cluster of our own asks for a token, as it should
+        logging.getLogger("ray._private.authentication.authentication_token_setup").setLevel(logging.ERROR)
+    ray.init(
+        address=where,
+        runtime_env={"env_vars": environment},
+        log_to_driver=False,
+        logging_level=logging.WARNING,
+        **own,
+    )
+    return where == "local"
+
+
+def _must_answer(address: str) -> None:
+    """Raises ConnectionError for a host:port, or ray://host:port, at which nothing listens."""
+    host, colon, port = address.removeprefix("ray://").rpartition(":")
+    if not (colon and port.isdecimal()):
+        return  # auto, local: Ray knows where
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=ANSWER_S).close()
+    except OSError as error:
+        raise ConnectionError(str(error)) from error
+
+
+def _nodes() -> list[str]:
+    return [node["NodeID"] for node in ray.nodes() if node["Alive"]]
+
+
+def _cores_by_node() -> list[int]:
+    return [int(node["Resources"].get("CPU", 0)) for node in ray.nodes() if node["Alive"]]
+
+
+def _has_gpu(wait: bool) -> bool:
+    """Some node has a GPU; where none has, one is asked for and waited for."""
+    if _gpu_nodes() or not wait:
+        return bool(_gpu_nodes())
+    request_resources(bundles=[{"GPU": 1}])
+    began = time.monotonic()
+    while not _gpu_nodes():
+        if time.monotonic() - began > GPU_WAIT_S:
+            raise ClusterLacks(
+                f"no node of the cluster has a GPU, and none came in {GPU_WAIT_S:.0f} s: start one, or draw with "
+                "render.backend=cpu"
+            )
+        time.sleep(min(2.0, GPU_WAIT_S))
+    request_resources(bundles=[])  # the attempts themselves hold it from now on
+    return True
+
+
+def _gpu_nodes() -> set[str]:
+    return {node["NodeID"] for node in ray.nodes() if node["Alive"] and node["Resources"].get("GPU", 0)}
+
+
+def _on(node: str) -> NodeAffinitySchedulingStrategy:
+    return NodeAffinitySchedulingStrategy(node, soft=False)
+
+
+def _prove_shared(out: Location) -> None:
+    """Every node reads what the driver wrote under `out`."""
+    nodes = _nodes()
+    if len(nodes) < 2:
+        return
+    name, token = f"probe-{secrets.token_hex(8)}", secrets.token_bytes(16)
+    out.write(name, token)
+    try:
+        answers = ray.get(
+            [_sees.options(scheduling_strategy=_on(node)).remote(out, name, token) for node in nodes],
+            timeout=PROBE_SECONDS,
+        )
+    finally:
+        out.remove(name)
+    blind = [node for node, sees in zip(nodes, answers) if not sees]
+    if blind:
+        raise BadLocation(f"out={out.uri} is not the same folder on nodes {blind}: name shared storage or a URL")
+
+
+def _warm_every_node(work: list[Any], with_gpu_only: bool) -> None:
+    """Kernels on every node; what attempts draw with where they are made: on all nodes, or on those with a GPU."""
+    nodes = _nodes()
+    draws = _gpu_nodes() if with_gpu_only else set(nodes)
+    reports = [_run.options(scheduling_strategy=_on(n)).remote("warm", 1, work, n in draws) for n in nodes]
+    for report, _ in reports:
+        answer, _ = ray.get(report)
+        if isinstance(answer, Failure):
+            raise NotReady(answer.error) if answer.kind is ErrorKind.INPUT else RuntimeError(answer.error)

@@ -1,0 +1,261 @@
+"""The tasks of the graph as plain functions; the local executor calls them, the Ray executor ships them to workers.
+
+Each returns (report, result): the small report goes to the driver, the large result stays where it was made and is
+handed to other tasks by reference. What a stage raises becomes a Failure here and nowhere else.
+"""
+
+import hashlib
+import time
+import traceback
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import pyarrow as pa
+
+from factory.graph.work import Accepted, Halted, NotReady, PreparedClip, Stopped, Work
+from factory.readers.base import BadClip, ClipRef
+from factory.store.cache import BadCacheFile, ClipCache
+from factory.store.candidates import CandidateRow
+from factory.store.episodes import FOLDER, episode_name
+from factory.store.location import Location
+from factory.store.outcomes import ErrorKind
+from factory.store.reader import samples_of
+from factory.store.room import no_room
+from factory.store.scenes import SceneFiles
+from factory.store.schema import SAMPLES, sample_row_to_table
+from factory.store.table import Shard, write_shard
+from tasks.stages import Rejected
+
+ERROR_LINES = 12  # of a traceback that an outcome keeps
+
+
+@dataclass(frozen=True)
+class Failure:
+    """An incident instead of a report."""
+
+    kind: ErrorKind
+    error: str
+    no_room: str = ""  # what a full disk said: nothing more can be written, and nothing failed by itself
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """Report on a prepared clip."""
+
+    content_digest: str
+    candidates: tuple[CandidateRow, ...]
+    gate_counts: Mapping[str, int]
+    dropped: Rejected | None
+    from_cache: bool
+    note: str = ""  # why the cache was of no use, where a file was there
+    seconds: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Reconstructed:
+    """Report on a block that is in the cache now."""
+
+    seconds: Mapping[str, float]
+    from_cache: bool
+    psnr_db: float | None
+
+
+@dataclass(frozen=True)
+class HalfBuilt:
+    """Report on a block that is not finished because the run stops; the next run goes on with it."""
+
+
+@dataclass(frozen=True)
+class Attempted:
+    """Report on an attempt."""
+
+    rejected: Rejected | None  # None: accepted, and the result is the row
+    n_bytes: int = 0  # of the row
+    licence: str = ""  # of its source
+    subscores: Mapping[str, float] = field(default_factory=dict)
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    scene_at_hand: bool | None = None
+    psnr_db: float | None = None  # of the block that an accepted one is drawn from
+
+
+MakeEpisode = Callable[[Mapping[str, Any], PreparedClip], bytes]  # a sample's row and its prepared clip -> a file
+
+
+@dataclass(frozen=True)
+class EpisodesOf:
+    """Samples of one committed file whose episodes are to be written."""
+
+    path: str  # in the table `samples`
+    partition: Mapping[str, str]
+    refs: Mapping[str, ClipRef]  # attempt_id -> its clip
+    make: MakeEpisode
+
+
+@dataclass(frozen=True)
+class EpisodesWritten:
+    """Report on them: files that stand now, and why others do not."""
+
+    written: int
+    errors: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Stamp:
+    """What the executor writes on a row: names and values of schema.BOOKKEEPING."""
+
+    attempt_id: str
+    expert: str
+    expert_digest: str
+    round: int
+    candidate_index: int
+    vocabulary_digest: str
+    settings_hash: str
+    stage_versions: str
+
+
+def cache_key(clip_id: str, prepare_digest: str) -> str:
+    """File name of a prepared clip."""
+    return f"{clip_id}-{hashlib.sha256(prepare_digest.encode()).hexdigest()[:16]}"
+
+
+def prepare(
+    work: Work, out: Location, ref: ClipRef, wanted_content: str | None = None
+) -> tuple[Prepared | Rejected | Failure, PreparedClip | None]:
+    """The clip from the cache, else prepared and cached; wanted_content: the digest that its stored rows are made of.
+
+    A log that was changed is an input failure where its rows are to be continued, else its cached clip is not used.
+    """
+    cache, key = ClipCache(out.child("cache/prepared")), cache_key(ref.clip_id, work.identity.prepare_digest)
+    note, began = "", time.perf_counter()
+    try:
+        try:
+            stored = cache.load(key)
+        except BadCacheFile as error:
+            stored, note = None, f"cache file {key}: {error}; prepared again"
+        found = work.content_digest(ref) if stored is not None or wanted_content is not None else None
+        _refuse_changed(ref, found, wanted_content)
+        if isinstance(stored, PreparedClip) and found not in (None, stored.content_digest):
+            stored, note = None, f"cache file {key}: log {ref.log_id} was changed since; prepared again"
+        if isinstance(stored, PreparedClip):
+            _refuse_changed(ref, stored.content_digest, wanted_content)
+            _keep_scenes(out, stored)
+            seconds = {"cache": time.perf_counter() - began}
+            return _prepared(stored, True, note, seconds), stored
+        result = work.prepare(ref)
+        if isinstance(result, Rejected):
+            _refuse_changed(ref, f"none ({result.reason})", wanted_content)  # the clip had candidates
+            return result, None
+        if result.clip_id != ref.clip_id:
+            raise ValueError(f"prepare({ref.clip_id}) returned clip {result.clip_id}")
+        _refuse_changed(ref, result.content_digest, wanted_content)
+        cache.store(key, result)
+        _keep_scenes(out, result)
+        return _prepared(result, False, note, result.seconds), result
+    except Exception as error:  # the boundary where whatever a stage or a user's reader raises becomes data
+        return failure_of(error), None
+
+
+def _keep_scenes(out: Location, clip: PreparedClip) -> None:
+    """Before any attempt, so that no row stands without them; written anew each time, they may be of older settings."""
+    if clip.scenes is not None:
+        SceneFiles(out.child("scenes")).store(clip.scenes)
+
+
+def _refuse_changed(ref: ClipRef, found: str | None, wanted: str | None) -> None:
+    if None not in (found, wanted) and found != wanted:
+        problem = f"content digest {found} where the table has {wanted} for clip {ref.clip_id}: the log was changed"
+        raise BadClip(f"log {ref.log_id}", "clip", f"{problem}; restore it or choose another out")
+
+
+def attempt(work: Work, prepared: PreparedClip, stamp: Stamp) -> tuple[Attempted | Failure, pa.Table | None]:
+    """One attempt; an accepted one is checked against the schema here, where its traceback still means something."""
+    began = time.perf_counter()
+    try:
+        result = work.attempt(prepared, stamp.candidate_index, stamp.expert)
+        seconds = result.seconds or {"attempt": time.perf_counter() - began}
+        if not isinstance(result, Accepted):
+            subscores, at_hand = dict(result.subscores), result.scene_at_hand
+            return Attempted(result.rejected, subscores=subscores, seconds=seconds, scene_at_hand=at_hand), None
+        row = sample_row_to_table([{**result.row, **vars(stamp)}])
+        (psnr_db,) = row["psnr"].to_pylist()
+        report = Attempted(
+            None,
+            row.nbytes,
+            str(result.row["licence"]),
+            seconds=seconds,
+            scene_at_hand=result.scene_at_hand,
+            psnr_db=psnr_db,
+        )
+        return report, row
+    except Exception as error:  # the same boundary
+        return failure_of(error), None
+
+
+def write(out: Location, *rows: pa.Table) -> tuple[Shard | Failure, None]:
+    """Rows of one partition as one shard."""
+    try:
+        return write_shard(out.child("samples"), SAMPLES, pa.concat_tables(rows)), None
+    except OSError as error:
+        return failure_of(error), None
+
+
+def episodes(work: Work, out: Location, wanted: EpisodesOf) -> tuple[EpisodesWritten | Failure, None]:
+    """Committed samples as MCAP files beside their table; the log's drive comes from the prepared clip."""
+    written, errors = 0, []
+    try:
+        for row in samples_of(out.child("samples"), wanted.path, wanted.partition, wanted.refs):
+            key = row["attempt_id"]
+            report, clip = prepare(work, out, wanted.refs[key], row["content_digest"])
+            if clip is None:
+                errors.append(f"clip {row['clip_id']}: {report.error if isinstance(report, Failure) else report}")
+                continue
+            try:
+                out.child(FOLDER).write(episode_name(row), wanted.make(row, clip))
+                written += 1
+            except Exception as error:  # one that cannot be made costs no other
+                errors.append(f"sample {key}: {failure_of(error).error.splitlines()[-1]}")
+    except Exception as error:  # the same boundary
+        return failure_of(error), None
+    return EpisodesWritten(written, tuple(errors)), None
+
+
+def reconstruct(
+    work: Work, stopped: Stopped, ref: ClipRef, threads: int
+) -> tuple[Reconstructed | HalfBuilt | Failure, None]:
+    """The block that the clip is rendered from, into the cache of this machine."""
+    if stopped():  # before its sensors are read
+        return HalfBuilt(), None
+    try:
+        built = work.reconstruct(ref, threads, stopped)
+        return Reconstructed(built.seconds, built.from_cache, built.psnr_db), None
+    except Halted:
+        return HalfBuilt(), None
+    except Exception as error:  # the same boundary
+        return failure_of(error), None
+
+
+def warm(work: Work, draws: bool) -> tuple[str | Failure, None]:
+    """Kernels into the cache of this machine."""
+    try:
+        work.warm(draws)
+    except NotReady as error:
+        return Failure(ErrorKind.INPUT, str(error)), None
+    except Exception as error:  # the same boundary
+        return failure_of(error), None
+    return "", None
+
+
+def failure_of(error: BaseException) -> Failure:
+    """Broken input, an ailing machine, or a bug; with the last lines of the traceback."""
+    if isinstance(error, BadClip):
+        return Failure(ErrorKind.INPUT, str(error))
+    kind = ErrorKind.SYSTEM if isinstance(error, OSError | MemoryError) else ErrorKind.BUG
+    lines = "".join(traceback.format_exception(error)).strip().splitlines()
+    return Failure(kind, "\n".join(lines[-ERROR_LINES:]), no_room(error))
+
+
+def _prepared(clip: PreparedClip, from_cache: bool, note: str, seconds: Mapping[str, float]) -> Prepared:
+    return Prepared(
+        clip.content_digest, clip.candidates, dict(clip.gate_counts), clip.dropped, from_cache, note, dict(seconds)
+    )

@@ -1,0 +1,90 @@
+"""The walk of one (clip, expert) down the clip's candidate list: what to try next, given what is known.
+
+A pure function of the list and of what became of its candidates, so that a resumed walk, a longer one (`rounds=5` after
+`rounds=2`) and a fresh one are the same walk. An incident (a failed attempt) stops the walk until it is mended: going
+on would give later samples another round than in a run without the incident, and rows must not depend on incidents.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from factory.graph.work import HUMAN_CANDIDATE, LOGGED
+from factory.store.outcomes import ErrorKind, Kind
+from factory.store.samples import Past
+
+
+@dataclass(frozen=True)
+class Try:
+    """Attempt this candidate; if it is accepted, it is the sample of this round."""
+
+    candidate: int
+    round: int
+
+
+@dataclass(frozen=True)
+class Complete:
+    """The walk has all samples it was asked for (a LOGGED expert: its one attempt is done)."""
+
+
+@dataclass(frozen=True)
+class Exhausted:
+    """The list ended before the walk had all rounds."""
+
+    n_tried: int
+
+
+@dataclass(frozen=True)
+class Blocked:
+    """The walk stands at a failed attempt."""
+
+    candidate: int
+    reason: str
+
+
+Step = Try | Complete | Exhausted | Blocked
+
+
+def candidate_order(expert: str, n_candidates: int) -> Sequence[int]:
+    """Candidate indices in the order in which a walk of this expert tries them."""
+    return (HUMAN_CANDIDATE,) if expert in LOGGED else range(n_candidates)
+
+
+def next_step(
+    expert: str, n_candidates: int, rounds: int, known: Mapping[int, Past], may_retry: Callable[[Past], bool]
+) -> Step:
+    """Where the walk stands. A LOGGED expert has one attempt in round 0 whatever `rounds` is."""
+    wanted = 1 if expert in LOGGED else rounds
+    accepted = 0
+    for candidate in candidate_order(expert, n_candidates):
+        if accepted == wanted:
+            return Complete()
+        past = known.get(candidate)
+        if past is None:
+            return Try(candidate, accepted)
+        if past.kind is Kind.FAILED:
+            return Try(candidate, accepted) if may_retry(past) else Blocked(candidate, "failed")
+        if past.kind is Kind.ACCEPTED:
+            if past.round != accepted:
+                return Blocked(candidate, f"stored as round {past.round}, the walk makes it {accepted}")
+            accepted += 1
+    return Complete() if accepted == wanted or expert in LOGGED else Exhausted(n_candidates)
+
+
+def retry_policy(retry: bool, versions_json: str) -> Callable[[Past], bool]:
+    """Which failures of earlier runs this run tries again: system failures; with `retry`, or under other stage
+    versions than the failure's, all."""
+
+    def may_retry(past: Past) -> bool:
+        return retry or past.error_kind == ErrorKind.SYSTEM or past.stage_versions != versions_json
+
+    return may_retry
+
+
+def never(past: Past) -> bool:
+    """The policy for failures of this run."""
+    return False
+
+
+def tries_before(past: Past | None) -> int:
+    """Runs that already failed at this attempt for the system's sake."""
+    return past.tries if past is not None and past.error_kind == ErrorKind.SYSTEM else 0

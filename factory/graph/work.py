@@ -1,0 +1,131 @@
+"""The seam between the science and the machine: what a run executes, said as one small protocol.
+
+The executors know clips, candidates and attempts only through `Work`. It is picklable and pure given its arguments:
+whatever the worker, the order or the retry, the same arguments give the same result.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Protocol
+
+from factory.readers.base import ClipRef
+from factory.store.candidates import CandidateRow
+from factory.store.identity import RunIdentity
+from tasks.stages import Rejected
+
+if TYPE_CHECKING:
+    from tasks.hard_scenes import BenchmarkClip
+
+HUMAN = "human"  # the expert that is the log itself
+HUMAN_BEFORE = "human_before"  # the same 0.5 s earlier, for benchmarks
+LOGGED = frozenset({HUMAN, HUMAN_BEFORE})  # one attempt each, in round 0
+FOLLOW_UP, FOLLOW_UP_BEFORE = "follow_up", "follow_up_before"
+BENCHMARK = frozenset({HUMAN_BEFORE, FOLLOW_UP, FOLLOW_UP_BEFORE})  # whose clips need an earlier frame and scenes
+HUMAN_CANDIDATE = -1  # the only candidate index of LOGGED experts
+
+
+Stopped = Callable[[], bool]  # whether the run was asked to stop: a long task looks now and then
+
+
+def never() -> bool:
+    """For who is not asked to stop."""
+    return False
+
+
+class Halted(Exception):
+    """A long task left off because the run was asked to stop; what it has done is kept, and the next one goes on."""
+
+
+class NotReady(ValueError):
+    """This machine lacks what the run needs of it; the message says what, and how to give it."""
+
+
+@dataclass(frozen=True)
+class PreparedClip:
+    """The stages `clip` and `perturb` of one clip: everything its attempts need."""
+
+    clip_id: str
+    content_digest: str
+    candidates: tuple[CandidateRow, ...]  # empty: no simulated expert has anything to try
+    gate_counts: Mapping[str, int]  # gate -> vocabulary entries it dropped, in the gates' order
+    payload: object  # tree of frozen dataclasses, dicts, tuples, numpy arrays and scalars (factory.store.cache)
+    dropped: Rejected | None = None  # why there are no candidates; the human row is scored all the same
+    seconds: Mapping[str, float] = field(default_factory=dict)  # stage -> seconds
+    scenes: "BenchmarkClip | None" = None  # to be kept beside the tables before any row of the clip is
+
+
+@dataclass(frozen=True)
+class Accepted:
+    """A sample: columns of factory.store.schema, less the ones in its BOOKKEEPING."""
+
+    row: Mapping[str, object]
+    seconds: Mapping[str, float] = field(default_factory=dict)  # stage -> seconds
+    scene_at_hand: bool | None = None  # the worker had the scene to draw in its memory; None: nothing was drawn
+
+
+@dataclass(frozen=True)
+class Dropped:
+    """An attempt that was turned down."""
+
+    rejected: Rejected
+    subscores: Mapping[str, float] = field(default_factory=dict)  # as far as they were computed
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    scene_at_hand: bool | None = None
+
+
+AttemptResult = Accepted | Dropped
+
+
+@dataclass(frozen=True)
+class Built:
+    """A clip's block is in this machine's cache."""
+
+    seconds: Mapping[str, float]  # by stage
+    from_cache: bool  # it was there
+    psnr_db: float | None = None  # of its held-out photos; None where there are none
+
+
+class Work(Protocol):
+    """What a run does with a clip. Implementations hold reader, settings and tables, and nothing that changes."""
+
+    @property
+    def identity(self) -> RunIdentity: ...
+
+    def warm(self, draws: bool = True) -> None:
+        """Compile the kernels into their cache. Called once per machine before any worker starts.
+
+        draws: attempts are made on this machine, so that it must have what they draw with.
+        Raises NotReady.
+        """
+        ...
+
+    def expert_digest(self, expert: str) -> str:
+        """Of the expert's inputs and settings."""
+        ...
+
+    def content_digest(self, ref: ClipRef) -> str | None:
+        """Of what the clip would be read from now, without preparing it; None where the reader cannot tell."""
+        ...
+
+    def block(self, ref: ClipRef) -> str | None:
+        """Name of the block that the clip is rendered from, known without reading it; None: nothing to build ahead."""
+        ...
+
+    def reconstruct(self, ref: ClipRef, threads: int, stopped: Stopped = never) -> Built:
+        """Build the clip's block into this machine's cache. Raises BadClip, and Halted soon after it is `stopped`."""
+        ...
+
+    def doing(self) -> str:
+        """How far long tasks on this machine are, for a progress line; empty where there are none."""
+        ...
+
+    def prepare(self, ref: ClipRef) -> PreparedClip | Rejected:
+        """Read the clip and list its candidates. Rejected: the clip stage drops it for every expert.
+
+        Raises BadClip for broken input, also for a ref whose log the index called broken.
+        """
+        ...
+
+    def attempt(self, prepared: PreparedClip, candidate: int, expert: str) -> AttemptResult:
+        """Rollout, expert, rollout, reward and render of one candidate; candidate -1 with LOGGED experts."""
+        ...

@@ -1,0 +1,261 @@
+"""Reads Argoverse 2 sensor logs, and everything written in their layout, as clips.
+
+A log may carry one file that Argoverse does not have: `traffic_lights.feather` (timestamp_ns, lane_id, state GREEN |
+YELLOW | RED; a state holds until the lane's next row), which the synthetic town writes.
+"""
+
+import hashlib
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factory.readers.av2.log import (
+    ANNOTATIONS,
+    POSE_COLUMNS,
+    POSES,
+    SAME_FRAME_S,
+    LogMotion,
+    agents_at,
+    ego_states_at,
+    numbers,
+    observed_at,
+    read_feather,
+    read_motion,
+    rotations,
+    stamps,
+    step_times,
+    world_from_ego_at,
+)
+from factory.readers.av2.map import map_file, read_map
+from factory.readers.base import SPLITS, BadClip, ClipRef
+from factory.readers.logs import STEP_MS, Drive, LogReader, Recorded, WholeLog, present, route_of_drive
+from factory.readers.splits import folder_split
+from tasks.world.camera import Camera, SensorFile
+from tasks.world.clip import STEP_S, Block
+from tasks.world.lanes import LightState, RoadMap, TrafficLights
+
+Array = NDArray[np.float64]
+
+LICENCE = "CC BY-NC-SA 4.0 (Argoverse 2)"
+LIGHTS = "traffic_lights.feather"
+INTRINSICS, EXTRINSICS = "calibration/intrinsics.feather", "calibration/egovehicle_SE3_sensor.feather"
+BLOCK_STEPS, BLOCK_STRIDE_STEPS = 200, 100  # of the stretches that are reconstructed
+
+
+@dataclass(frozen=True)
+class AV2Log(WholeLog):
+    """One log, whole, with its rig and where its photos and sweeps lie."""
+
+    motion: LogMotion
+    cameras: tuple[Camera, ...]
+    images: tuple[tuple[str, Path, float], ...]  # camera, file, seconds since the first annotated frame
+    sweeps: tuple[tuple[str, Path, float], ...]
+
+
+class AV2Reader(LogReader[AV2Log]):
+    """Clips of a folder of Argoverse 2 sensor logs, of one of its train/val/test folders, or of one log."""
+
+    data_set = "av2"
+
+    def logs(self) -> dict[str, Path]:
+        """Log id -> folder. Raises ValueError where the root holds no log."""
+        return log_folders(self.root)
+
+    def drive(self, path: Path) -> Drive | str:
+        """Ego and agents of the log in this folder. A log whose frames nobody annotated is skipped. Raises BadClip."""
+        if not (path / ANNOTATIONS).is_file():
+            return f"no {ANNOTATIONS}"
+        map_file(path)
+        motion = read_motion(path)
+        times_s = step_times(0, motion.n_steps)
+        segment = np.where(observed_at(motion, times_s), 0, -1)
+        return Drive(ego_states_at(motion, times_s), agents_at(motion, times_s), segment)
+
+    def load(self, path: Path) -> AV2Log:
+        """The log in this folder. Raises BadClip."""
+        return read_log(path)
+
+    def digest(self, ref: ClipRef) -> str:
+        """The clip's content digest, from the bytes of its log's files alone. Raises BadClip."""
+        return content_digest(self.path_of(ref))
+
+    def block(self, ref: ClipRef) -> str | None:
+        """Log and second at which the block begins that the clip is rendered from; None where the log has no photos."""
+        if ref.log_id not in self._photographed:
+            return None
+        first = ref.start_ms // STEP_MS // BLOCK_STRIDE_STEPS * BLOCK_STRIDE_STEPS
+        return f"{ref.log_id}@{first * STEP_S:g}s"
+
+    @cached_property
+    def _photographed(self) -> frozenset[str]:
+        return frozenset(log_id for log_id, folder in self.logs().items() if (folder / "sensors" / "cameras").is_dir())
+
+    def recorded(self, log: AV2Log, start: int, stop: int) -> Recorded:
+        """Poses, rig, photos and sweeps of a window, and the block that it is rendered from."""
+        return Recorded(
+            world_from_ego=world_from_ego_at(log.motion, step_times(start, stop)),
+            cameras=log.cameras,
+            images=_within(log.motion, log.images, start, stop - start),
+            sweeps=_within(log.motion, log.sweeps, start, stop - start),
+            block=_block(log, start) if log.images else None,
+        )
+
+
+def log_folders(root: Path) -> dict[str, Path]:
+    """Log id -> folder, sorted by id. Raises ValueError where the root is no Argoverse 2 folder."""
+    if _is_log(root):
+        return {root.name: root}
+    if not root.is_dir():
+        raise ValueError(f"{root}: no such folder")
+    parents = [root / split for split in SPLITS if (root / split).is_dir()] or [root]
+    folders = {folder.name: folder for parent in parents for folder in parent.iterdir() if _is_log(folder)}
+    if not folders:
+        raise ValueError(
+            f"{root}: no Argoverse 2 sensor log here; expected .../sensor, its train, val or test folder, or one log"
+        )
+    return dict(sorted(folders.items()))
+
+
+def read_log(folder: Path) -> AV2Log:
+    """The whole log, resampled to 0.1 s. Raises BadClip."""
+    motion = read_motion(folder)
+    times_s = step_times(0, motion.n_steps)
+    ego_states = ego_states_at(motion, times_s)
+    vector_map = map_file(folder)
+    road_map = read_map(vector_map)
+    cameras = read_cameras(folder)
+    return AV2Log(
+        file=str(folder),
+        motion=motion,
+        ego_states=ego_states,
+        agents=agents_at(motion, times_s),
+        road_map=road_map,
+        route=route_of_drive(road_map, ego_states[:, :3], str(vector_map), "lane_segments"),
+        lights=read_lights(folder, road_map, motion, times_s),
+        cameras=cameras,
+        images=tuple(
+            stamped
+            for camera in cameras
+            for stamped in _stamped(motion, camera.name, folder / "sensors" / "cameras" / camera.name, ".jpg")
+        ),
+        sweeps=tuple(_stamped(motion, "lidar", folder / "sensors" / "lidar", ".feather")),
+        licence=_licence(folder),
+        content_digest=content_digest(folder),
+        split=folder_split(folder),
+    )
+
+
+def read_cameras(folder: Path) -> tuple[Camera, ...]:
+    """The calibrated cameras of a log, in file order; none where the log has no calibration. Raises BadClip."""
+    path, pose_path = folder / INTRINSICS, folder / EXTRINSICS
+    if not path.exists() and not pose_path.exists():
+        return ()
+    columns = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "height_px", "width_px")
+    table = read_feather(path, ("sensor_name", *columns))
+    mounts = read_feather(pose_path, ("sensor_name", *POSE_COLUMNS))
+    poses = numbers(pose_path, mounts, POSE_COLUMNS)
+    turned = rotations(pose_path, poses).as_matrix()
+    mount_of = {str(name): i for i, name in enumerate(mounts["sensor_name"])}
+    cameras = []
+    for name, (fx, fy, cx, cy, *distortion, height, width) in zip(
+        table["sensor_name"].astype(str), numbers(path, table, columns)
+    ):
+        if name not in mount_of:
+            raise BadClip(str(pose_path), "sensor_name", f"no pose of camera {name}")
+        ego_from_camera = np.eye(4)
+        ego_from_camera[:3, :3] = turned[mount_of[name]]
+        ego_from_camera[:3, 3] = poses[mount_of[name], 4:]
+        intrinsics = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        try:
+            camera = Camera(str(name), int(width), int(height), intrinsics, np.array(distortion), ego_from_camera)
+        except ValueError as error:
+            raise BadClip(str(path), "calibration", str(error)) from error
+        cameras.append(camera)
+    return tuple(cameras)
+
+
+def read_lights(folder: Path, road_map: RoadMap, motion: LogMotion, times_s: Array) -> TrafficLights:
+    """Light phases at times (S,); no lanes where the log has none. Raises BadClip."""
+    path = folder / LIGHTS
+    if not path.exists():
+        return TrafficLights((), np.zeros((len(times_s), 0), np.int8))
+    table = read_feather(path, ("timestamp_ns", "lane_id", "state"))
+    lanes, names = table["lane_id"].astype(str), table["state"].astype(str)
+    strangers = set(lanes.tolist()) - road_map.lanes.keys()
+    if strangers:
+        raise BadClip(str(path), "lane_id", f"not on the map: {sorted(strangers)}")
+    unknown = set(names.tolist()) - LightState.__members__.keys()
+    if unknown:
+        raise BadClip(str(path), "state", f"unknown state {sorted(unknown)}")
+    changed_at = motion.seconds(stamps(path, table))
+    lane_ids = tuple(sorted(set(lanes.tolist())))
+    states = np.full((len(times_s), len(lane_ids)), LightState.UNKNOWN, np.int8)
+    for column, lane_id in enumerate(lane_ids):
+        rows = np.flatnonzero(lanes == lane_id)
+        rows = rows[np.argsort(changed_at[rows], kind="stable")]
+        phase = np.array([LightState[name] for name in names[rows]], np.int8)
+        latest = np.searchsorted(changed_at[rows], times_s + SAME_FRAME_S) - 1
+        states[latest >= 0, column] = phase[latest[latest >= 0]]
+    return TrafficLights(lane_ids, states)
+
+
+def content_digest(folder: Path) -> str:
+    """sha256 over what a clip is computed from: poses, annotations, map, calibration, lights; not pixels and points."""
+    digest = hashlib.sha256()
+    files = (ANNOTATIONS, POSES, str(map_file(folder).relative_to(folder)), INTRINSICS, EXTRINSICS, LIGHTS)
+    for name in files:
+        path = folder / name
+        if path.exists():
+            content = path.read_bytes()
+            digest.update(f"{name}\x1f{len(content)}\x1f".encode())
+            digest.update(content)
+    return digest.hexdigest()
+
+
+def _is_log(folder: Path) -> bool:
+    return any((folder / name).exists() for name in (ANNOTATIONS, POSES))
+
+
+def _licence(folder: Path) -> str:
+    path = folder / "LICENSE"
+    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    return lines[0].strip() if lines else LICENCE
+
+
+def _stamped(motion: LogMotion, sensor: str, folder: Path, suffix: str) -> list[tuple[str, Path, float]]:
+    """Files named <timestamp_ns><suffix>, in time order. Raises BadClip for any other name."""
+    files = sorted(folder.glob(f"*{suffix}"))
+    for path in files:
+        if not path.stem.isdecimal():
+            raise BadClip(str(path), "name", f"expected <timestamp_ns>{suffix}")
+    times_s = motion.seconds(np.array([int(path.stem) for path in files], dtype=np.int64))
+    return [(sensor, files[i], float(times_s[i])) for i in np.argsort(times_s, kind="stable")]
+
+
+def _block(log: AV2Log, start: int) -> Block:
+    """The block of the clip that starts at step `start`: 20 s that begin at a multiple of 10 s, so that it holds it."""
+    first = start // BLOCK_STRIDE_STEPS * BLOCK_STRIDE_STEPS
+    n_steps = min(BLOCK_STEPS, log.motion.n_steps - first)
+    return Block(
+        start_s=first * STEP_S,
+        agents=present(log.agents.window(first, first + n_steps)),
+        images=_within(log.motion, log.images, first, n_steps),
+        sweeps=_within(log.motion, log.sweeps, first, n_steps),
+    )
+
+
+def _within(
+    motion: LogMotion, files: tuple[tuple[str, Path, float], ...], start: int, n_steps: int
+) -> tuple[SensorFile, ...]:
+    """The sensor files between the first and the last of `n_steps` steps from step `start` on."""
+    first, last = start * STEP_S, (start + n_steps - 1) * STEP_S
+    inside = [entry for entry in files if first - SAME_FRAME_S < entry[2] <= last + SAME_FRAME_S]
+    if not inside:
+        return ()
+    poses = world_from_ego_at(motion, np.array([time_s for _, _, time_s in inside]))
+    return tuple(
+        SensorFile(sensor, str(path), time_s - first, pose) for (sensor, path, time_s), pose in zip(inside, poses)
+    )

@@ -1,0 +1,213 @@
+"""KITTI raw drives for the sensor engine: photos, their poses, lidar. No boxes, no map: not a source of clips.
+
+Layout, calibration and poses are those of Geiger et al. 2013 and of its development kit: `<date>/calib_*.txt`,
+`<date>/<date>_drive_<n>_sync/{image_0k,velodyne_points,oxts}`. World: east, north, up [m] from where the IMU was first.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from factory.readers.base import BadClip
+from tasks.render.scene.sensed import Photo, Sweep
+
+F64 = NDArray[np.float64]
+EARTH_RADIUS_M = 6378137.0  # of the kit's Mercator projection
+IMU_HEIGHT_M = 0.93  # above the road
+
+
+@dataclass(frozen=True)
+class KittiCamera:
+    """A rectified camera of the rig."""
+
+    name: str  # image_00 .. image_03
+    intrinsics: F64  # (3, 3) pixels of `size`, the centre of pixel (0, 0) at (0.5, 0.5)
+    size: tuple[int, int]  # width, height the calibration was made for
+    camera_from_imu: F64  # (4, 4)
+
+    def intrinsics_of(self, width: int, height: int) -> F64:
+        """(3, 3) for images that were scaled to another size."""
+        return np.diag([width / self.size[0], height / self.size[1], 1.0]) @ self.intrinsics
+
+
+@dataclass(frozen=True)
+class KittiDrive:
+    """Where a drive's files are, and where its IMU was at every frame."""
+
+    folder: Path  # <date>_drive_<n>_sync
+    cameras: dict[str, KittiCamera]
+    world_from_imu: F64  # (frames, 4, 4)
+    times_s: F64  # (frames,) since the first
+
+    def photos(self, camera: str, frames: Sequence[int] | None = None) -> list[Photo]:
+        """Photos of one camera at the frames asked for, all by default. Raises BadClip for one that is not there."""
+        if camera not in self.cameras:
+            raise BadClip(str(self.folder), camera, f"no such camera; there are {sorted(self.cameras)}")
+        rig = self.cameras[camera]
+        out = []
+        for frame in range(len(self.times_s)) if frames is None else frames:
+            if not 0 <= frame < len(self.times_s):
+                raise BadClip(str(self.folder), "oxts", f"no pose of frame {frame}; there are {len(self.times_s)}")
+            path = self.folder / camera / "data" / f"{frame:010d}.png"
+            if not path.is_file():
+                raise BadClip(str(path), "image", "is missing; download the drive's synced+rectified data again")
+            image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+            if image is None:
+                raise BadClip(str(path), "image", "cannot be decoded; download the drive again")
+            rgb = np.ascontiguousarray(image[..., ::-1], np.uint8)
+            pose = self.world_from_imu[frame] @ np.linalg.inv(rig.camera_from_imu)
+            intrinsics = rig.intrinsics_of(rgb.shape[1], rgb.shape[0])
+            out.append(Photo(camera, float(self.times_s[frame]), rgb, intrinsics, pose))
+        return out
+
+    def sweeps(self) -> list[Sweep]:
+        """Every lidar sweep there is, in the ego frame (on the road under the IMU, its axes)."""
+        date = self.folder.parent
+        imu_from_velo = np.linalg.inv(_rigid(date / "calib_imu_to_velo.txt"))
+        ego_from_imu = np.eye(4)
+        ego_from_imu[2, 3] = IMU_HEIGHT_M
+        turn = ego_from_imu @ imu_from_velo
+        out = []
+        for path in sorted((self.folder / "velodyne_points" / "data").glob("*.bin")):
+            values = np.fromfile(path, np.float32)
+            if len(values) % 4 or not np.isfinite(values).all():
+                raise BadClip(str(path), "points", f"{len(values)} values are not rows of four finite ones")
+            frame = int(path.stem)
+            if frame >= len(self.times_s):
+                raise BadClip(str(path), "oxts", f"no pose of frame {frame}; there are {len(self.times_s)}")
+            points = values.reshape(-1, 4)[:, :3] @ turn[:3, :3].T + turn[:3, 3]
+            pose = self.world_from_imu[frame] @ np.linalg.inv(ego_from_imu)
+            out.append(Sweep(float(self.times_s[frame]), points.astype(np.float32), pose))
+        return out
+
+    def fused(self) -> list[Sweep]:
+        """The sweeps of all frames as one, positions only, where somebody fused them (`derived/points_fused.npz`)."""
+        path = self.folder.parent / "derived" / "points_fused.npz"
+        if not path.is_file():
+            raise BadClip(str(path), "xyz", "is missing; use the sweeps")
+        with np.load(path, allow_pickle=False) as arrays:
+            return [Sweep(0.0, arrays["xyz"].astype(np.float32), np.eye(4))]
+
+
+def read_drive(root: Path, date: str = "2011_09_26", drive: str = "0001") -> KittiDrive:
+    """Calibration, poses and times. Raises BadClip naming what is missing or of the wrong shape."""
+    folder = root / date / f"{date}_drive_{drive}_sync"
+    if not folder.is_dir():
+        raise BadClip(str(folder), "drive", "no such folder; unpack the synced+rectified data there")
+    poses = _poses(folder / "oxts" / "data")
+    return KittiDrive(folder, _cameras(root / date), poses, _times(folder / "oxts" / "timestamps.txt", len(poses)))
+
+
+def steadied(drive: KittiDrive) -> KittiDrive:
+    """The drive with its poses at the moments when the cameras were triggered.
+
+    The scanner that triggers them turns at a steady rate; stamps and poses are those of the closest tick of 10 ms, up
+    to 8 cm from where a photo of drive 0001 was taken. The rate is the stamps' own, with what it drifts (a cubic).
+    """
+    stamps, frames = drive.times_s, np.arange(len(drive.times_s))
+    if len(frames) < 8:
+        raise ValueError(f"{len(frames)} frames are too few to tell a steady rate from ticks; take 8 or more")
+    times = np.asarray(np.polyval(np.polyfit(frames, stamps, 3), frames), np.float64)
+    before = np.clip(np.searchsorted(stamps, times, side="right") - 1, 0, len(frames) - 2)
+    share = (times - stamps[before]) / (stamps[before + 1] - stamps[before])
+    start, end = drive.world_from_imu[before], drive.world_from_imu[before + 1]
+    turns = Rotation.from_matrix(np.swapaxes(start[:, :3, :3], 1, 2) @ end[:, :3, :3]).as_rotvec()
+    poses = start.copy()
+    poses[:, :3, :3] = start[:, :3, :3] @ Rotation.from_rotvec(share[:, None] * turns).as_matrix()
+    poses[:, :3, 3] += share[:, None] * (end - start)[:, :3, 3]
+    return replace(drive, world_from_imu=poses, times_s=times)
+
+
+def _calibration(path: Path) -> dict[str, F64]:
+    if not path.is_file():
+        raise BadClip(str(path), "calibration", "is missing; unpack the date's calibration there")
+    out = {}
+    for line in path.read_text().splitlines():
+        name, _, text = line.partition(":")
+        if text.strip() and name != "calib_time":
+            try:
+                out[name] = np.array(text.split(), np.float64)
+            except ValueError:
+                raise BadClip(str(path), name, f"is not a row of numbers: {text.strip()[:60]}") from None
+    return out
+
+
+def _matrix(path: Path, values: dict[str, F64], name: str, shape: tuple[int, ...]) -> F64:
+    if name not in values:
+        raise BadClip(str(path), name, "is missing")
+    if values[name].size != np.prod(shape) or not np.isfinite(values[name]).all():
+        raise BadClip(str(path), name, f"holds {values[name].size} values, expected {int(np.prod(shape))} finite ones")
+    return values[name].reshape(shape)
+
+
+def _rigid(path: Path) -> F64:
+    values = _calibration(path)
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = _matrix(path, values, "R", (3, 3)), _matrix(path, values, "T", (3,))
+    return out
+
+
+def _cameras(date: Path) -> dict[str, KittiCamera]:
+    path = date / "calib_cam_to_cam.txt"
+    values = _calibration(path)
+    rectify = np.eye(4)
+    rectify[:3, :3] = _matrix(path, values, "R_rect_00", (3, 3))
+    rectified_from_imu = rectify @ _rigid(date / "calib_velo_to_cam.txt") @ _rigid(date / "calib_imu_to_velo.txt")
+    out = {}
+    for k in range(4):
+        projection = _matrix(path, values, f"P_rect_0{k}", (3, 4))
+        size = _matrix(path, values, f"S_rect_0{k}", (2,))
+        beside = np.eye(4)
+        beside[:3, 3] = np.linalg.solve(projection[:, :3], projection[:, 3])
+        intrinsics = projection[:, :3].copy()
+        intrinsics[:2, 2] += 0.5  # the kit counts from the centre of the first pixel
+        out[f"image_0{k}"] = KittiCamera(
+            f"image_0{k}", intrinsics, (int(size[0]), int(size[1])), beside @ rectified_from_imu
+        )
+    return out
+
+
+def _poses(folder: Path) -> F64:
+    """World from IMU (frames, 4, 4): Mercator at the first latitude, then yaw, pitch, roll."""
+    paths = sorted(folder.glob("*.txt"))
+    if not paths:
+        raise BadClip(str(folder), "oxts", "no poses")
+    rows = []
+    for i, path in enumerate(paths):
+        row = np.array(path.read_text().split(), np.float64)
+        if int(path.stem) != i or len(row) != 30 or not np.isfinite(row[:6]).all():
+            raise BadClip(str(path), "oxts", f"expected frame {i} with 30 values, the first six finite")
+        rows.append(row[:6])
+    latitude, longitude, altitude, roll, pitch, yaw = np.stack(rows, axis=1)
+    scale = np.cos(np.radians(latitude[0])) * EARTH_RADIUS_M
+    out = np.tile(np.eye(4), (len(rows), 1, 1))
+    out[:, 0, 3] = scale * np.radians(longitude)
+    out[:, 1, 3] = scale * np.log(np.tan(np.radians(90.0 + latitude) / 2.0))
+    out[:, 2, 3] = altitude
+    out[:, :3, 3] -= out[0, :3, 3].copy()
+    out[:, :3, :3] = _turn(2, yaw) @ _turn(1, pitch) @ _turn(0, roll)
+    return out
+
+
+def _turn(axis: int, angle: F64) -> F64:
+    out = np.tile(np.eye(3), (len(angle), 1, 1))
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    out[:, i, i] = out[:, j, j] = np.cos(angle)
+    out[:, j, i], out[:, i, j] = np.sin(angle), -np.sin(angle)
+    return out
+
+
+def _times(path: Path, n: int) -> F64:
+    if not path.is_file():
+        raise BadClip(str(path), "timestamps", "is missing")
+    lines = path.read_text().split("\n")
+    stamps = [datetime.fromisoformat(line[:26]) for line in lines if line.strip()]
+    if len(stamps) != n:
+        raise BadClip(str(path), "timestamps", f"{len(stamps)} lines for {n} poses")
+    return np.array([(stamp - stamps[0]).total_seconds() for stamp in stamps])

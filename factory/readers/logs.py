@@ -1,0 +1,254 @@
+"""The base of readers of whole logs: it finds the windows, keeps the last logs, cuts and validates the clips.
+
+To write a reader, subclass `LogReader` and give it four things; AV2Reader has all of them, ScenarioNetReader the least:
+
+* `logs()`: log id -> file or folder of every log under `self.root`;
+* `drive(path)`: ego and agents every 0.1 s, all that the choice of windows needs. It runs over every log of the data
+  set, so open no map and no sensor file;
+* `load(path)`: the same, and the map, the route (`route_of_drive`), the lights: a `WholeLog`, or a subclass that keeps
+  more;
+* `recorded(log, start, stop)`: what else belongs to one window, which is the ego's pose in space, cameras and photos.
+
+A fifth, `digest(ref) -> str`, is optional: the clip's content digest as `read` would give it, found without reading the
+clip. With it a run sees that a log was changed though its clips lie prepared in the cache. A sixth, optional too,
+`block(ref) -> str | None`, names the block that the clip is rendered from, as cheaply; with it the block is built once,
+as a task of its own, before its clips are prepared.
+
+Wherever the input is broken, raise `BadClip(file, field, how to mend it)`. Units: metres, radians, seconds, one world
+frame per log; the columns of ego states are named in tasks.world.vehicle, absent agents hold NaN and valid = False.
+"""
+
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar, Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factory.readers.base import SPLITS, BadClip, ClipIndex, ClipRef, split_of
+from factory.readers.validate import validate_clip
+from factory.readers.windows import WindowSettings, drop_reason, window_starts
+from tasks.world.agents import AgentTracks
+from tasks.world.camera import Camera, SensorFile
+from tasks.world.clip import CLIP_STEPS, NOW, STEP_S, Block, Clip
+from tasks.world.lanes import RoadMap, Route, TrafficLights
+from tasks.world.route import NoRoute, RouteFinder, route_of_log
+
+Array = NDArray[np.float64]
+
+STEP_MS = round(STEP_S * 1000)
+ROUTE_SAMPLE_STEPS = 2  # the route looks at the ego every 0.2 s
+CACHED_LOGS = 2
+
+
+@dataclass(frozen=True)
+class Drive:
+    """What moves in one log, every 0.1 s: step k stands 0.1 k s after the log's first annotated instant."""
+
+    ego_states: Array  # (S, 11), NaN where the log has no continuous drive
+    agents: AgentTracks  # S steps
+    segment: NDArray[np.int64]  # (S,) number of the unbroken stretch a step belongs to, -1: none; no window leaves it
+
+
+@dataclass(frozen=True)
+class WholeLog:
+    """What any clip of one log is cut from. Clips share its map and route, and hold copies of the rest."""
+
+    file: str  # or folder; named in errors
+    ego_states: Array  # (S, 11) every 0.1 s
+    agents: AgentTracks  # S steps
+    road_map: RoadMap
+    route: Route
+    lights: TrafficLights  # S steps
+    licence: str
+    content_digest: str  # sha256 of everything the clips are computed from, but pixels and points
+    split: str | None = field(default=None, kw_only=True)  # the data set's own; None: by the hash of the log's id
+
+    @cached_property
+    def finder(self) -> RouteFinder:
+        """Of the centrelines ahead."""
+        return RouteFinder(self.road_map, self.route)
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """What one window has besides states: the ego's pose in space, and what it is rendered from."""
+
+    world_from_ego: Array  # (96, 4, 4) rear axle
+    cameras: tuple[Camera, ...] = ()
+    images: tuple[SensorFile, ...] = ()
+    sweeps: tuple[SensorFile, ...] = ()
+    block: Block | None = None
+
+
+Log = TypeVar("Log", bound=WholeLog)
+
+
+class LogReader(ABC, Generic[Log]):
+    """Clips of logs of one format: a `factory.readers.base.ClipReader`.
+
+    Keeps the last two logs it read; workers get a reader without them.
+    """
+
+    data_set: ClassVar[str]  # name where none is given
+    length_is: ClassVar[str] = "long"  # "12.3 s ..." of a log that is too short
+
+    def __init__(
+        self,
+        root: str | Path,
+        stride_s: float = 1.0,
+        name: str | None = None,
+        min_top_speed_mps: float = 0.5,
+        first_window: int = 0,
+        only: Sequence[str] = (),
+        split: str | None = None,
+    ) -> None:
+        """name: the data set's name, part of every clip id; first_window: of each log, skips those before it.
+
+        only: ids of the logs to take, of all that are there where none is named; split: of every clip, whatever its
+        data set says. Raises ValueError for an impossible stride, first window or split.
+        """
+        if split is not None and split not in SPLITS:
+            raise ValueError(f"clips.split={split} is none of {', '.join(SPLITS)}; null: the data set's own")
+        self.root = Path(root).expanduser().absolute()
+        self.name = self.data_set if name is None else name
+        self.windows = WindowSettings(stride_s, min_top_speed_mps, first_window)
+        self.only, self.split = tuple(only), split
+        self._logs: dict[str, Log] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_logs": {}}
+
+    @abstractmethod
+    def logs(self) -> Mapping[str, Path]:
+        """Log id -> its file or folder, sorted by id. Raises ValueError where the root is not this data set."""
+
+    @abstractmethod
+    def drive(self, path: Path) -> Drive | str:
+        """What moves in the log; or, as text, why the log is skipped. Raises BadClip."""
+
+    @abstractmethod
+    def load(self, path: Path) -> Log:
+        """The whole log, with the same steps as `drive`. Raises BadClip."""
+
+    @abstractmethod
+    def recorded(self, log: Log, start: int, stop: int) -> Recorded:
+        """What steps start..stop-1 of the log have besides states. Raises BadClip."""
+
+    def index(self) -> ClipIndex:
+        """All windows of all logs, ordered by log id and time. Raises ValueError where the root holds no log."""
+        refs: list[ClipRef] = []
+        dropped: Counter[str] = Counter()
+        skipped: dict[str, str] = {}
+        broken: dict[ClipRef, str] = {}
+        for log_id, path in self._chosen().items():
+            try:
+                drive = self.drive(path)
+            except BadClip as error:
+                broken[ClipRef(self.name, log_id, 0)] = str(error)
+                continue
+            if isinstance(drive, str):
+                skipped[log_id] = drive
+                continue
+            driven = np.flatnonzero(np.isfinite(drive.ego_states).all(axis=1))
+            first, n_steps = (int(driven[0]), int(driven[-1] - driven[0]) + 1) if len(driven) else (0, 0)
+            starts = window_starts(n_steps, self.windows)  # the first window begins where the ego's drive does
+            if not starts:
+                needs_s = (self.windows.first_step + CLIP_STEPS) * STEP_S
+                skipped[log_id] = f"{n_steps * STEP_S:.1f} s {self.length_is}, a clip needs {needs_s:.1f} s"
+            for start in (first + offset for offset in starts):
+                reason = self._drop_reason(drive, start, start + CLIP_STEPS)
+                if reason is None:
+                    refs.append(ClipRef(self.name, log_id, start * STEP_MS))
+                else:
+                    dropped[reason] += 1
+        return ClipIndex(tuple(refs), dict(dropped), skipped, broken)
+
+    def read(self, ref: ClipRef) -> Clip:
+        """The validated clip. Raises BadClip."""
+        log = self._log(ref)
+        start, rest = divmod(ref.start_ms, STEP_MS)
+        stop = start + CLIP_STEPS
+        if rest or start < 0 or stop > len(log.ego_states):
+            raise BadClip(log.file, "start_ms", f"no window of {ref.window} starts at {ref.start_ms} ms")
+        recorded = self.recorded(log, start, stop)
+        ego_states = log.ego_states[start:stop].copy()  # the log stays with the reader, the clip is the caller's
+        try:
+            centerline = log.finder.centerline_from(ego_states[NOW, :3])
+        except NoRoute as error:
+            raise BadClip(log.file, "route", str(error)) from error
+        clip = Clip(
+            clip_id=ref.clip_id,
+            dataset=self.name,
+            log_id=ref.log_id,
+            split=self.split or log.split or split_of(ref.log_id),
+            start_s=start * STEP_S,
+            ego_states=ego_states,
+            world_from_ego=recorded.world_from_ego,
+            agents=present(log.agents.window(start, stop)),
+            road_map=log.road_map,
+            route=log.route,
+            centerline=centerline,
+            lights=TrafficLights(log.lights.lane_ids, log.lights.states[start:stop].copy()),
+            cameras=recorded.cameras,
+            images=recorded.images,
+            sweeps=recorded.sweeps,
+            block=recorded.block,
+            licence=log.licence,
+            content_digest=log.content_digest,
+        )
+        return validate_clip(clip, log.file)
+
+    def _chosen(self) -> Mapping[str, Path]:
+        logs = self.logs()
+        unknown = [log_id for log_id in self.only if log_id not in logs]
+        if unknown:
+            raise ValueError(f"clips.only: no log {', '.join(unknown)} under {self.root}; there are {', '.join(logs)}")
+        return {log_id: logs[log_id] for log_id in logs if not self.only or log_id in self.only}
+
+    def path_of(self, ref: ClipRef) -> Path:
+        """The file or folder of the clip's log. Raises BadClip where there is none."""
+        path = self.logs().get(ref.log_id)
+        if path is None or ref.dataset != self.name:
+            raise BadClip(str(self.root), "log_id", f"no log {ref.log_id} of data set {ref.dataset} here")
+        return path
+
+    def _drop_reason(self, drive: Drive, start: int, stop: int) -> str | None:
+        segment = drive.segment[start:stop]
+        unbroken = (segment >= 0) & (segment == segment[0])
+        return drop_reason(drive.ego_states[start:stop], drive.agents.window(start, stop), unbroken, self.windows)
+
+    def _log(self, ref: ClipRef) -> Log:
+        if ref.log_id not in self._logs:
+            log = self.load(self.path_of(ref))
+            while len(self._logs) >= CACHED_LOGS:
+                del self._logs[next(iter(self._logs))]
+            self._logs[ref.log_id] = log
+        return self._logs[ref.log_id]
+
+
+def route_of_drive(road_map: RoadMap, poses: Array, file: str, field: str) -> Route:
+    """The route that rear-axle poses (S, 3), 0.1 s apart, take. Raises BadClip naming the map's file and field."""
+    try:
+        return route_of_log(road_map, poses[::ROUTE_SAMPLE_STEPS])
+    except NoRoute as error:
+        raise BadClip(file, field, str(error)) from error
+
+
+def present(agents: AgentTracks) -> AgentTracks:
+    """Only the tracks that are present at one of the steps or more."""
+    seen = np.flatnonzero(agents.valid.any(axis=0))
+    return replace(
+        agents,
+        track_ids=tuple(agents.track_ids[i] for i in seen),
+        kinds=tuple(agents.kinds[i] for i in seen),
+        boxes=agents.boxes[:, seen],
+        velocities=agents.velocities[:, seen],
+        valid=agents.valid[:, seen],
+        center_z=agents.center_z[:, seen],
+        heights=agents.heights[seen],
+    )

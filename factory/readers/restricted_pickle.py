@@ -1,0 +1,199 @@
+"""Pickles as data: plain containers and numeric numpy arrays, nothing that runs.
+
+A pickle is a program. Three walls stand before and around it:
+1. the opcodes are read first, without running any: only those that build plain values may occur, every length is
+   checked against the file, and no memo index may exceed the number of opcodes (else 5 bytes could ask for 64 GB);
+2. every global is answered with a function made for this one load; the named object is never imported or called;
+3. arrays and copied containers are paid for from a budget of `BUDGET_PER_BYTE` x file size (+ 16 MB), so that one big
+   value cannot be copied without end. Opcodes themselves cost at most some 100 bytes of memory per byte read.
+"""
+
+import io
+import pickle
+import pickletools
+import re
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+
+from factory.readers.base import BadClip
+
+MAX_FILE_BYTES = 1 << 30
+BUDGET_PER_BYTE = 8
+BUDGET_BASE_BYTES = 1 << 24
+
+_PLAIN_OPCODES = """
+    PROTO FRAME STOP MARK POP POP_MARK DUP NONE NEWTRUE NEWFALSE
+    INT BININT BININT1 BININT2 LONG LONG1 LONG4 FLOAT BINFLOAT
+    STRING BINSTRING SHORT_BINSTRING UNICODE BINUNICODE SHORT_BINUNICODE BINUNICODE8
+    BINBYTES SHORT_BINBYTES BINBYTES8 BYTEARRAY8
+    EMPTY_LIST APPEND APPENDS LIST EMPTY_TUPLE TUPLE TUPLE1 TUPLE2 TUPLE3
+    EMPTY_DICT DICT SETITEM SETITEMS EMPTY_SET ADDITEMS FROZENSET
+    GET BINGET LONG_BINGET PUT BINPUT LONG_BINPUT MEMOIZE
+    GLOBAL STACK_GLOBAL REDUCE BUILD
+"""
+_OPCODES = frozenset(_PLAIN_OPCODES.split())
+_DTYPE = re.compile(r"([biuf])(1|2|4|8)|[SU][1-9]\d{0,4}")
+# What a hostile or truncated stream can make the unpickler raise; BadClip passes through it untouched.
+_LOAD_ERRORS = (
+    pickle.UnpicklingError,
+    EOFError,
+    ValueError,
+    TypeError,
+    KeyError,
+    IndexError,
+    AttributeError,
+    OverflowError,
+    MemoryError,
+    RecursionError,
+)
+
+
+def load_plain(data: bytes, file: str) -> Any:
+    """The value pickled in `data`: dicts (for defaultdict and OrderedDict too), lists, tuples, sets, scalars, arrays.
+
+    `file` names the source in errors. Raises BadClip for a truncated stream, a global that is not one of the plain
+    containers or numpy's own array constructors (named), an array of objects, or a stream that outgrows its budget.
+    """
+    if len(data) > MAX_FILE_BYTES:
+        raise BadClip(file, "pickle", f"{len(data)} bytes; more than {MAX_FILE_BYTES} are refused")
+    _check_opcodes(data, file)
+    try:
+        return _Unpickler(data, file).load()
+    except _LOAD_ERRORS as error:
+        raise BadClip(file, "pickle", f"not a readable pickle ({type(error).__name__}: {error})") from error
+
+
+def _check_opcodes(data: bytes, file: str) -> None:
+    """Raises BadClip where an opcode may do more than build plain values, or the stream is cut off."""
+    try:
+        for count, (opcode, argument, position) in enumerate(pickletools.genops(data)):
+            if opcode.name not in _OPCODES:
+                raise BadClip(file, "pickle", f"opcode {opcode.name} at byte {position} is refused")
+            if opcode.name in ("PUT", "BINPUT", "LONG_BINPUT") and (argument or 0) > count:
+                raise BadClip(file, "pickle", f"memo index {argument} at byte {position} is refused")
+    except (ValueError, EOFError, OverflowError) as error:
+        raise BadClip(file, "pickle", f"truncated or not a pickle ({error})") from error
+
+
+class _Unpickler(pickle.Unpickler):
+    """Answers globals with stand-ins bound to this load's file name and memory budget."""
+
+    def __init__(self, data: bytes, file: str) -> None:
+        super().__init__(io.BytesIO(data))
+        self._file = file
+        self._stand_ins = _stand_ins(file, _Budget(file, BUDGET_BASE_BYTES + BUDGET_PER_BYTE * len(data)))
+
+    def find_class(self, module: str, name: str) -> Any:
+        stand_in = self._stand_ins.get((module, name))
+        if stand_in is None:
+            raise BadClip(
+                self._file, "pickle", f"refused global {module}.{name}; only plain containers and arrays load"
+            )
+        return stand_in
+
+
+class _Budget:
+    """Bytes that arrays and copies of one load may still take."""
+
+    def __init__(self, file: str, left: int) -> None:
+        self.file, self.left = file, left
+
+    def spend(self, n_bytes: int) -> None:
+        self.left -= n_bytes
+        if self.left < 0:
+            raise BadClip(self.file, "pickle", "arrays outgrow the memory that a file of this size may ask for")
+
+
+class _Dtype:
+    """What a pickled numpy dtype says; becomes a real one only after it was checked."""
+
+    def __init__(self, spec: object, file: str) -> None:
+        if not isinstance(spec, str) or not _DTYPE.fullmatch(spec):
+            raise BadClip(file, "pickle", f"refused array type {spec!r}; only numbers, flags and text load")
+        self.dtype = np.dtype(spec)
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        if state[1] in ("<", ">"):
+            self.dtype = self.dtype.newbyteorder(state[1])
+
+
+class _Array(np.ndarray):
+    """An array still without content; numpy's own __setstate__ checks that bytes and shape agree."""
+
+    spend: Callable[[int], None]
+
+    def __setstate__(self, state: Any) -> None:
+        version, shape, dtype, is_fortran, raw = state
+        if not isinstance(dtype, _Dtype) or not isinstance(raw, bytes):
+            raise ValueError("array state without a checked dtype and bytes")
+        self.spend(len(raw))
+        checked: Any = (version, shape, dtype.dtype, bool(is_fortran), raw)
+        super().__setstate__(checked)
+
+
+def _stand_ins(file: str, budget: _Budget) -> dict[tuple[str, str], Callable[..., Any]]:
+    """(module, name) -> what a global stands for. Functions are made anew per load: no stream can alter another's."""
+
+    def array_class(*_: object) -> object:
+        raise BadClip(file, "pickle", "refused a direct call of numpy.ndarray")
+
+    def reconstruct(subtype: object, shape: object, code: object) -> np.ndarray:
+        if subtype is not array_class:
+            raise BadClip(file, "pickle", f"refused array subclass {subtype!r}")
+        empty = np.empty(0, np.uint8).view(_Array)
+        empty.spend = budget.spend
+        return empty
+
+    def from_buffer(raw: object, dtype: object, shape: tuple[int, ...], order: str) -> np.ndarray:
+        if not isinstance(raw, bytes | bytearray) or not isinstance(dtype, _Dtype):
+            raise ValueError("array buffer without a checked dtype and bytes")
+        budget.spend(len(raw))
+        return np.frombuffer(bytes(raw), dtype=dtype.dtype).reshape(shape, order="F" if order == "F" else "C").copy()
+
+    def scalar(dtype: object, raw: object) -> Any:
+        if not isinstance(dtype, _Dtype) or not isinstance(raw, bytes):
+            raise ValueError("scalar without a checked dtype and bytes")
+        budget.spend(len(raw))
+        (value,) = np.frombuffer(raw, dtype=dtype.dtype)
+        return value
+
+    def encode(text: str, encoding: str) -> bytes:
+        """How Python 2's protocols write bytes."""
+        if encoding != "latin1":
+            raise ValueError(f"bytes written as {encoding}")
+        budget.spend(len(text))
+        return text.encode("latin1")
+
+    def make_dtype(spec: object, align: object = False, copy: object = False) -> _Dtype:
+        return _Dtype(spec, file)
+
+    def plain_dict(*arguments: object) -> dict[Any, Any]:
+        """defaultdict(factory) and OrderedDict(); their items follow as opcodes. The factory is dropped."""
+        return {}
+
+    def copied(kind: Callable[[Iterable[object]], Any]) -> Callable[..., Any]:
+        def build(items: list[object] | tuple[object, ...] | str = ()) -> Any:
+            budget.spend(64 * len(items))
+            return kind(items)
+
+        return build
+
+    table: dict[tuple[str, str], Callable[..., Any]] = {
+        ("collections", "defaultdict"): plain_dict,
+        ("collections", "OrderedDict"): plain_dict,
+        ("numpy", "ndarray"): array_class,
+        ("numpy", "dtype"): make_dtype,
+        ("_codecs", "encode"): encode,
+    }
+    for package in ("numpy.core", "numpy._core"):  # numpy 1 and 2
+        table[package + ".multiarray", "_reconstruct"] = reconstruct
+        table[package + ".multiarray", "scalar"] = scalar
+        table[package + ".numeric", "_frombuffer"] = from_buffer
+    for builtins in ("builtins", "__builtin__"):  # Python 3 and 2 names
+        for kind in (set, frozenset, list, tuple):
+            table[builtins, kind.__name__] = copied(kind)
+        for name in ("dict", "int", "float", "bool", "str"):  # only ever factories of a defaultdict
+            table[builtins, name] = plain_dict
+    return table

@@ -1,0 +1,1 @@
+"""ScenarioNet databases: nuScenes, Waymo, nuPlan and others in one format."""

@@ -1,0 +1,222 @@
+"""Reads ScenarioNet's scenario pickles (Li et al. 2023) as clips: nuScenes, Waymo and nuPlan conversions.
+
+A scenario is a dict: `metadata` (dataset, ts, sdc_id, map), `length`, `tracks`, `map_features`, `dynamic_map_states`.
+There are no cameras and no lidar in it. Lanes: scenarionet_lanes.py; map: scenarionet_map.py; motion:
+scenarionet_tracks.py. A database folder lists its scenarios in `dataset_summary.pkl` (file name -> metadata) and
+their folders in `dataset_mapping.pkl` (file name -> folder relative to the database).
+"""
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factory.readers.base import BadClip, ClipRef
+from factory.readers.logs import STEP_MS, Drive, LogReader, Recorded, WholeLog, route_of_drive
+from factory.readers.restricted_pickle import MAX_FILE_BYTES, load_plain
+from factory.readers.scenarionet.map import road_map, traffic_lights
+from factory.readers.scenarionet.tracks import (
+    SOURCES,
+    Source,
+    agent_tracks,
+    ego_segments,
+    frame_positions,
+    ground_height,
+    read_track,
+    sample_times,
+)
+from factory.readers.splits import folder_split, nuscenes_split, waymo_split
+from tasks.world.lanes import TrafficLights
+from tasks.world.vehicle import EGO_STATE_SIZE, HEADING, X, Y
+
+Array = NDArray[np.float64]
+
+SUMMARY, MAPPING = "dataset_summary.pkl", "dataset_mapping.pkl"
+
+
+@dataclass(frozen=True)
+class ScenarioLog(WholeLog):
+    """One log, whole, with the segments of its drive."""
+
+    motion: Drive
+
+
+class ScenarioNetReader(LogReader[ScenarioLog]):
+    """Clips of one scenario pickle, of a folder of them, or of a ScenarioNet database folder.
+
+    A log's id is its file's name without the suffix.
+    """
+
+    data_set = "scenarionet"
+    length_is = "of driving"
+
+    @cached_property
+    def _files(self) -> dict[str, Path]:
+        return scenario_files(self.root)
+
+    def logs(self) -> dict[str, Path]:
+        """Log id -> pickle, listed once. Raises ValueError where the root holds no scenario."""
+        return self._files
+
+    def drive(self, path: Path) -> Drive:
+        """Ego and agents of the scenario in this file. Raises BadClip."""
+        scenario, _ = read_scenario(path)
+        return read_motion(scenario, str(path))
+
+    def load(self, path: Path) -> ScenarioLog:
+        """The scenario in this file. Raises BadClip."""
+        return read_log(path)
+
+    def digest(self, ref: ClipRef) -> str:
+        """The clip's content digest, from the bytes of its log's file alone. Raises BadClip."""
+        return hashlib.sha256(_bytes_of(self.path_of(ref))).hexdigest()
+
+    def recorded(self, log: ScenarioLog, start: int, stop: int) -> Recorded:
+        """The ego's poses, the format has no sensors. Raises BadClip where the ego's drive is broken."""
+        ego_states = log.motion.ego_states[start:stop]
+        if not np.isfinite(ego_states).all():
+            problem = f"the ego's drive is broken within the window at {start * STEP_MS} ms"
+            raise BadClip(log.file, "tracks[sdc]", problem)
+        return Recorded(_flat_poses(ego_states))
+
+
+def scenario_files(root: Path) -> dict[str, Path]:
+    """Log id -> pickle, sorted by id. Raises ValueError where the root is neither a pickle nor a folder with some.
+
+    A database's own list counts, with files that are missing; a plain folder is searched for sd_*.pkl in all depths.
+    """
+    if root.is_file() and root.suffix == ".pkl":
+        return {root.stem: root}
+    if not root.is_dir():
+        raise ValueError(f"{root}: no such folder or .pkl file")
+    if (root / SUMMARY).is_file():
+        paths = _listed(root)
+    else:
+        paths = sorted(root.rglob("sd_*.pkl"))
+    files: dict[str, Path] = {}
+    for path in paths:
+        if path.stem in files:
+            raise ValueError(f"{root}: {path.name} stands in two folders, {files[path.stem].parent} and {path.parent}")
+        files[path.stem] = path
+    if not files:
+        raise ValueError(f"{root}: no scenario here; expected sd_*.pkl files, a database with {SUMMARY}, or one .pkl")
+    return dict(sorted(files.items()))
+
+
+def _listed(root: Path) -> list[Path]:
+    """The database's scenarios by its summary and mapping. Merged databases point to folders beside their own."""
+    try:
+        summary = load_plain((root / SUMMARY).read_bytes(), str(root / SUMMARY))
+        mapped = root / MAPPING
+        mapping = load_plain(mapped.read_bytes(), str(mapped)) if mapped.is_file() else {}
+    except BadClip as error:
+        raise ValueError(str(error)) from error
+    if not isinstance(summary, Mapping) or not isinstance(mapping, Mapping):
+        raise ValueError(f"{root}: {SUMMARY} and {MAPPING} must hold dicts of file names")
+    paths = []
+    for name in summary:
+        folder = mapping.get(name, "")
+        if not _is_pickle_name(name) or not isinstance(folder, str) or PurePosixPath(folder).is_absolute():
+            raise ValueError(f"{root}: {SUMMARY} or {MAPPING} names an impossible file {name!r} in {folder!r}")
+        paths.append(root / folder / name)
+    return paths
+
+
+def _is_pickle_name(name: object) -> bool:
+    return isinstance(name, str) and name.endswith(".pkl") and PurePosixPath(name).name == name
+
+
+def read_scenario(path: Path) -> tuple[dict[str, Any], str]:
+    """The scenario dict and the sha256 of its file. Raises BadClip naming the field that is missing."""
+    file, data = str(path), _bytes_of(path)
+    scenario = load_plain(data, file)
+    if not isinstance(scenario, dict):
+        raise BadClip(file, "scenario", f"holds a {type(scenario).__name__}, not a dict")
+    for name in ("metadata", "tracks", "map_features", "dynamic_map_states"):
+        if not isinstance(scenario.get(name), dict):
+            raise BadClip(file, name, "missing or not a dict")
+    if not isinstance(scenario.get("length"), int | np.integer):
+        raise BadClip(file, "length", "missing or not a number of frames")
+    return scenario, hashlib.sha256(data).hexdigest()
+
+
+def _bytes_of(path: Path) -> bytes:
+    """All of a scenario's file. Raises BadClip."""
+    try:
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise BadClip(str(path), "size", f"more than {MAX_FILE_BYTES} bytes")
+        return path.read_bytes()
+    except OSError as error:
+        raise BadClip(str(path), "file", f"cannot be read: {error}") from error
+
+
+def _source(scenario: Mapping[str, Any], file: str) -> tuple[str, Source]:
+    name = scenario["metadata"].get("dataset")
+    if not isinstance(name, str) or name not in SOURCES:
+        problem = f"{name!r} is not supported; conversions of {', '.join(SOURCES)} are"
+        raise BadClip(file, "metadata.dataset", problem)
+    return name, SOURCES[name]
+
+
+def read_motion(scenario: Mapping[str, Any], file: str) -> Drive:
+    """Ego and agents of a scenario every 0.1 s. Raises BadClip."""
+    n_frames, tracks = int(scenario["length"]), scenario["tracks"]
+    _, source = _source(scenario, file)
+    sdc_id = scenario["metadata"].get("sdc_id")
+    if not isinstance(sdc_id, str | int) or sdc_id not in tracks:
+        raise BadClip(file, "metadata.sdc_id", f"missing, or names no track: {sdc_id!r}")
+    at = frame_positions(sample_times(scenario["metadata"], n_frames, file))
+    ego = read_track(tracks, sdc_id, n_frames, file)
+    states, segments = ego_segments(ego, source, at)
+    segment = np.full(len(at), -1, np.int64)
+    for number, (start, stop) in enumerate(segments):
+        segment[start:stop] = number
+    ground = ground_height(ego, at, file)
+    return Drive(states, agent_tracks(tracks, str(sdc_id), at, n_frames, ground, file), segment)
+
+
+def read_log(path: Path) -> ScenarioLog:
+    """The whole log: motion, map, route, lights. Raises BadClip."""
+    scenario, digest = read_scenario(path)
+    file = str(path)
+    motion = read_motion(scenario, file)
+    name, source = _source(scenario, file)
+    n_frames, metadata = int(scenario["length"]), scenario["metadata"]
+    lights = traffic_lights(scenario["dynamic_map_states"], n_frames, file)
+    lanes = road_map(scenario["map_features"], lights.lane_ids, name, str(metadata.get("map", "")), file)
+    route = route_of_drive(lanes, motion.ego_states[motion.segment >= 0, :3], file, "map_features")
+    frames = np.floor(frame_positions(sample_times(metadata, n_frames, file)) + 1e-9).astype(int)
+    known = [column for column, lane_id in enumerate(lights.lane_ids) if lane_id in lanes.lanes]
+    return ScenarioLog(
+        file=file,
+        motion=motion,
+        ego_states=motion.ego_states,
+        agents=motion.agents,
+        road_map=lanes,
+        route=route,
+        lights=TrafficLights(tuple(lights.lane_ids[c] for c in known), lights.states[frames][:, known]),
+        licence=source.licence,
+        content_digest=digest,
+        split=_own_split(path, metadata),
+    )
+
+
+def _own_split(path: Path, metadata: Mapping[str, Any]) -> str | None:
+    """The folder's, else the list's of the data set that was converted; nuPlan's files do not say theirs."""
+    source = metadata.get("source_file")
+    return folder_split(path) or nuscenes_split(path.stem) or (waymo_split(source) if isinstance(source, str) else None)
+
+
+def _flat_poses(ego_states: Array) -> Array:
+    """(S, 4, 4) rear-axle poses on the plane z = 0, the road: the format's ego has no roll or pitch."""
+    assert ego_states.shape[1] == EGO_STATE_SIZE
+    poses = np.tile(np.eye(4), (len(ego_states), 1, 1))
+    c, s = np.cos(ego_states[:, HEADING]), np.sin(ego_states[:, HEADING])
+    poses[:, 0, 0], poses[:, 0, 1], poses[:, 1, 0], poses[:, 1, 1] = c, -s, s, c
+    poses[:, 0, 3], poses[:, 1, 3] = ego_states[:, X], ego_states[:, Y]
+    return poses

@@ -1,0 +1,296 @@
+"""ScenarioNet's tracks as 10 Hz arrays: a smooth ego at its rear axle, agents with velocities derived again.
+
+What the files hold (public converters, checked on seven nuScenes scenes) and what is done about it:
+* Invalid frames hold zeros and the last frame's velocity is 0, so `valid` masks everything and velocities are not read.
+* nuScenes' ego comes from the CAN bus on a clock of its own (scenarionet_canbus.py), or, without one, is a line between
+  2 Hz keyframes that are in truth 0.4-0.6 s apart. A jump that is left ends a segment; no clip reaches across it.
+* The ego is smoothed: the x(t) that minimises |x - log|^2 + lambda |third difference|^2, whose gain falls to a half
+  at lambda^(-1/6) / 0.1 s = 3.9 rad/s for lambda = 300. On the seven scenes |a| is then at most 3.1 m/s2 and the
+  jerk 3.7 m/s3. Speeds and accelerations are those of a quadratic over +-0.3 s, as in the metric's reference scenes.
+* Agents: nuScenes' are lines between keyframes. Velocity = least-squares slope over +-0.5 s, below 0.1 m/s set to 0.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solveh_banded
+from scipy.signal import savgol_filter
+
+from factory.readers.base import BadClip
+from factory.readers.scenarionet.canbus import jumps, on_log_clock
+from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.clip import STEP_S
+from tasks.world.frames import wrap_angle
+from tasks.world.vehicle import AX, AY, EGO_STATE_SIZE, HEADING, PACIFICA, VX, VY, X, Y
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+KINDS = {
+    "VEHICLE": AgentKind.VEHICLE,
+    "PEDESTRIAN": AgentKind.PEDESTRIAN,
+    "CYCLIST": AgentKind.BICYCLE,  # nuScenes' motorcycles too
+    "TRAFFIC_CONE": AgentKind.TRAFFIC_CONE,
+    "TRAFFIC_BARRIER": AgentKind.BARRIER,
+    "TRAFFIC_OBJECT": AgentKind.GENERIC_OBJECT,
+    "OTHER": AgentKind.GENERIC_OBJECT,
+    "UNSET": AgentKind.GENERIC_OBJECT,
+}
+KEYFRAME_STEPS = 5
+MAX_GAP_S = 0.55  # between two frames; longer ones cannot be filled in
+SLOPE_STEPS = 5  # +-0.55 s holds five steps to each side
+STANDING_MPS = 0.1
+FIT_STEPS = 7  # +-0.3 s
+
+
+@dataclass(frozen=True)
+class Source:
+    """What differs between the data sets that ScenarioNet converts."""
+
+    licence: str
+    origin_to_rear_axle_m: float  # from the stored ego position back along the heading
+    smoothing: float  # lambda of the ego's smoother
+    can_bus: bool  # the ego's frames are thinned 50 Hz messages
+
+
+# nuScenes stores the ego pose, whose origin is the rear axle. Waymo's converter stores the box centre, nuPlan's the
+# EgoState's waypoint, which is the centre too. The Pacifica's own offset keeps its box on the logged box.
+SOURCES = {
+    "nuscenes": Source("CC BY-NC-SA 4.0 (nuScenes via ScenarioNet)", 0.0, 300.0, True),
+    "waymo": Source(
+        "Waymo Open Dataset licence, non-commercial (via ScenarioNet)", PACIFICA.rear_axle_to_center, 10.0, False
+    ),
+    "nuplan": Source("CC BY-NC-SA 4.0 (nuPlan via ScenarioNet)", PACIFICA.rear_axle_to_center, 10.0, False),
+}
+
+
+@dataclass(frozen=True)
+class Track:
+    """One track at the log's own frames."""
+
+    position: Array  # (T, 3)
+    heading: Array  # (T,)
+    valid: Mask  # (T,)
+    size: Array  # (3,) length, width, height, median over the valid frames; NaN where none is stored
+
+
+def sample_times(metadata: Mapping[str, Any], n_frames: int, file: str) -> Array:
+    """(T,) seconds since the first frame. Raises BadClip for missing, non-monotonic or too sparse times."""
+    if "ts" not in metadata:
+        raise BadClip(file, "metadata.ts", "missing")
+    stored = np.asarray(metadata["ts"]).reshape(-1)
+    if len(stored) == n_frames + 1:  # nuScenes' converter counts with arange(0, end, 0.1): rounding may add one
+        stored = stored[:-1]
+    times = _numbers(stored, (n_frames,), file, "metadata.ts")
+    steps = np.diff(times)
+    if not np.isfinite(times).all() or (steps <= 0.0).any():
+        raise BadClip(file, "metadata.ts", "time is not finite and strictly increasing")
+    if n_frames < 2 or steps.max() > MAX_GAP_S:
+        raise BadClip(file, "metadata.ts", f"frames further apart than {MAX_GAP_S} s cannot be resampled to 10 Hz")
+    return times - times[0]
+
+
+def frame_positions(times: Array) -> Array:
+    """(S,) fractional frame index of every 0.1 s step; whole numbers where the log runs at 10 Hz within 1 ms."""
+    if np.abs(times - STEP_S * np.arange(len(times))).max() < 1e-3:
+        return np.arange(len(times), dtype=np.float64)
+    steps = STEP_S * np.arange(int(np.floor(times[-1] / STEP_S + 1e-6)) + 1)
+    return np.interp(steps, times, np.arange(len(times)))
+
+
+def read_track(tracks: Mapping[Any, Any], track_id: str | int, n_frames: int, file: str) -> Track:
+    """One checked track. Raises BadClip naming the field that is missing, misshapen or not finite where valid."""
+    field = f"tracks[{track_id}].state"
+    state = tracks[track_id].get("state") if isinstance(tracks[track_id], dict) else None
+    if not isinstance(state, dict):
+        raise BadClip(file, field, "missing")
+    for name in ("position", "heading", "valid"):
+        if name not in state:
+            raise BadClip(file, f"{field}.{name}", "missing")
+    valid = _numbers(state["valid"], (n_frames,), file, f"{field}.valid") > 0.5
+    position = _floats(state["position"], file, f"{field}.position")
+    if position.ndim != 2 or position.shape[0] != n_frames or position.shape[1] not in (2, 3):
+        raise BadClip(file, f"{field}.position", f"shape {position.shape}, expected ({n_frames}, 3)")
+    if position.shape[1] == 2:
+        position = np.column_stack([position, np.zeros(n_frames)])
+    heading = _numbers(state["heading"], (n_frames,), file, f"{field}.heading")
+    for name, array in (("position", position), ("heading", heading)):
+        if not np.isfinite(array[valid]).all():
+            raise BadClip(file, f"{field}.{name}", "NaN pose at a valid frame")
+    size = np.full(3, np.nan)
+    for column, name in enumerate(("length", "width", "height")):
+        if name in state and valid.any():
+            size[column] = np.median(_numbers(state[name], (n_frames,), file, f"{field}.{name}")[valid])
+    return Track(position, heading, valid, size)
+
+
+def ground_height(ego: Track, at: Array, file: str) -> Array:
+    """(S,) height of the road under the ego: below Waymo's box centre; 0 where the file keeps the ego at z = 0."""
+    if not ego.position[ego.valid, 2].any():
+        return np.zeros(len(at))
+    if not np.isfinite(ego.size[2]):
+        raise BadClip(file, "tracks[sdc].state.height", "missing, and the ego is not at z = 0")
+    return resampled(ego, at)[0][:, 2] - ego.size[2] / 2.0
+
+
+def agent_tracks(
+    tracks: Mapping[Any, Any], sdc_id: str, at: Array, n_frames: int, ground: Array, file: str
+) -> AgentTracks:
+    """All tracks but the ego at the fractional frames `at` (S,), heights above `ground` (S,). Raises BadClip."""
+    ids, kinds, rows = [], [], []
+    for track_id in (key for key in tracks if str(key) != sdc_id):
+        kind = tracks[track_id].get("type") if isinstance(tracks[track_id], dict) else None
+        if not isinstance(kind, str) or kind not in KINDS:
+            raise BadClip(file, f"tracks[{track_id}].type", f"unknown class {kind!r}")
+        track = read_track(tracks, track_id, n_frames, file)
+        if not track.valid.any():
+            continue
+        if not (np.isfinite(track.size).all() and (track.size[:2] > 0.0).all()):
+            raise BadClip(file, f"tracks[{track_id}].state", f"length, width, height are {track.size.tolist()}")
+        ids.append(str(track_id))
+        kinds.append(KINDS[kind])
+        rows.append(track)
+    n = len(rows)
+    boxes, valid, z = np.full((len(at), n, 5), np.nan), np.zeros((len(at), n), bool), np.full((len(at), n), np.nan)
+    for column, track in enumerate(rows):
+        position, heading, seen = resampled(track, at)
+        flat = not track.position[track.valid, 2].any()  # nuPlan stores no height: the box stands on the ground
+        valid[:, column] = seen
+        boxes[seen, column] = np.column_stack(
+            [position[seen, :2], heading[seen], np.broadcast_to(track.size[:2], (seen.sum(), 2))]
+        )
+        z[seen, column] = track.size[2] / 2.0 if flat else (position[:, 2] - ground)[seen]
+    return AgentTracks(
+        track_ids=tuple(ids),
+        kinds=tuple(kinds),
+        boxes=boxes,
+        velocities=slope_velocities(boxes[..., :2], valid),
+        valid=valid,
+        center_z=z,
+        heights=np.array([track.size[2] for track in rows]),
+    )
+
+
+def resampled(track: Track, at: Array) -> tuple[Array, Array, Mask]:
+    """(S, 3) position, (S,) heading in [-pi, pi), (S,) valid: both frames around the fractional one must be."""
+    before = np.floor(at).astype(int)
+    after = np.minimum(before + 1, len(track.valid) - 1)
+    share = at - before
+    after = np.where(share > 0.0, after, before)
+    position = track.position[before] + share[:, None] * (track.position[after] - track.position[before])
+    heading = track.heading[before] + share * wrap_angle(track.heading[after] - track.heading[before])
+    return position, wrap_angle(heading), track.valid[before] & track.valid[after]
+
+
+def slope_velocities(xy: Array, valid: Mask) -> Array:
+    """(S, N, 2) m/s: least-squares slope of the valid positions (S, N, 2) within five steps; NaN where not valid."""
+    n_steps = len(xy)
+    filled = np.where(valid[..., None], xy, 0.0)
+    count, time, square = (np.zeros(valid.shape) for _ in range(3))
+    total, moment = np.zeros(xy.shape), np.zeros(xy.shape)
+    origin = filled  # positions relative to the step's own, so that world coordinates of kilometres cancel nothing
+    for offset in range(-SLOPE_STEPS, SLOPE_STEPS + 1):
+        rows = slice(max(0, -offset), n_steps - max(0, offset))
+        shifted = slice(max(0, offset), n_steps - max(0, -offset))
+        here = valid[shifted] & valid[rows]
+        relative = np.where(here[..., None], filled[shifted] - origin[rows], 0.0)
+        t = offset * STEP_S
+        count[rows] += here
+        time[rows] += t * here
+        square[rows] += t * t * here
+        total[rows] += relative
+        moment[rows] += t * relative
+    spread = count * square - time**2
+    known = valid & (spread > 1e-9)
+    slope = (count[..., None] * moment - time[..., None] * total) / np.where(known, spread, 1.0)[..., None]
+    slope[~known] = 0.0
+    slope[np.hypot(slope[..., 0], slope[..., 1]) < STANDING_MPS] = 0.0
+    slope[~valid] = np.nan
+    return slope
+
+
+def ego_segments(track: Track, source: Source, at: Array) -> tuple[Array, list[tuple[int, int]]]:
+    """Ego states (S, 11) and the segments [start, stop) over which they are one continuous drive.
+
+    Steps outside every segment hold NaN. Columns 7..10 (steering and rates) are 0, as NAVSIM initialises an ego.
+    """
+    position, heading, valid = resampled(track, at)
+    xy = position[:, :2]
+    if source.can_bus and len(xy) > 1 and _keyframe_weights(xy).all():
+        xy, heading, valid = on_log_clock(xy, heading, valid)
+    states = np.full((len(at), EGO_STATE_SIZE), np.nan)
+    segments = _continuous(xy, valid)
+    for start, stop in segments:
+        states[start:stop] = _smooth_drive(xy[start:stop], heading[start:stop], source)
+    return states, segments
+
+
+def _continuous(xy: Array, valid: Mask) -> list[tuple[int, int]]:
+    """Runs of valid steps without a jump, long enough for the quadratic fit."""
+    broken = jumps(xy) | ~valid[1:] | ~valid[:-1]
+    edges = [0, *(np.flatnonzero(broken) + 1).tolist(), len(xy)]
+    return [(a, b) for a, b in pairwise(edges) if b - a >= FIT_STEPS and valid[a:b].all()]
+
+
+def _smooth_drive(xy: Array, heading: Array, source: Source) -> Array:
+    """(S, 11) from logged positions (S, 2) and headings (S,) of one segment."""
+    heading = np.unwrap(heading)
+    xy = xy - source.origin_to_rear_axle_m * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    weight = _keyframe_weights(xy)
+    drive = _least_third_difference(np.column_stack([xy, heading]), weight, source.smoothing)
+    velocity = savgol_filter(drive[:, :2], FIT_STEPS, 2, deriv=1, delta=STEP_S, axis=0)
+    acceleration = savgol_filter(drive[:, :2], FIT_STEPS, 2, deriv=2, delta=STEP_S, axis=0)
+    c, s = np.cos(drive[:, 2]), np.sin(drive[:, 2])
+    states = np.zeros((len(xy), EGO_STATE_SIZE))
+    states[:, X], states[:, Y], states[:, HEADING] = drive[:, 0], drive[:, 1], wrap_angle(drive[:, 2])
+    for (along, across), vector in (((VX, VY), velocity), ((AX, AY), acceleration)):
+        states[:, along] = c * vector[:, 0] + s * vector[:, 1]
+        states[:, across] = -s * vector[:, 0] + c * vector[:, 1]
+    return states
+
+
+def _keyframe_weights(xy: Array) -> Array:
+    """(S,) 1 at every step; only at keyframes where the steps between them are on a straight line at even speed."""
+    bend = np.concatenate([[False], np.hypot(*np.diff(xy, n=2, axis=0).T) > 1e-4, [False]])
+    phase = np.flatnonzero(bend) % KEYFRAME_STEPS
+    if len(phase) == 0 or (phase != phase[0]).any():
+        return np.ones(len(xy))
+    weight = np.zeros(len(xy))
+    weight[phase[0] :: KEYFRAME_STEPS] = 1.0
+    weight[[0, -1]] = 1.0
+    return weight
+
+
+def _least_third_difference(log: Array, weight: Array, smoothing: float) -> Array:
+    """(S, C): argmin of sum w (x - log)^2 + smoothing sum (third difference of x)^2, by a banded Cholesky solve."""
+    n = len(log)
+    kernel = np.array([-1.0, 3.0, -3.0, 1.0])
+    bands = np.zeros((4, n))  # lower form: bands[k, i] = A[i + k, i]
+    for k in range(4):
+        for j in range(4 - k):
+            bands[k, j : n - 3 + j] += smoothing * kernel[j] * kernel[j + k]
+    bands[0] += weight
+    center = log[0]  # solved about the first row: world coordinates of kilometres would cost digits
+    solved: Array = solveh_banded(bands, weight[:, None] * (log - center), lower=True)
+    return solved + center
+
+
+def _numbers(value: object, shape: tuple[int, ...], file: str, field: str) -> Array:
+    """An array of the shape given; a trailing axis of one is dropped."""
+    array = _floats(value, file, field)
+    if array.ndim == len(shape) + 1 and array.shape[-1] == 1:
+        array = array[..., 0]
+    if array.shape != shape:
+        raise BadClip(file, field, f"shape {array.shape}, expected {shape}")
+    return array
+
+
+def _floats(value: object, file: str, field: str) -> Array:
+    try:
+        return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise BadClip(file, field, f"not numbers ({error})") from error

@@ -1,0 +1,119 @@
+"""A z-buffered triangle rasteriser in homogeneous coordinates (Olano and Greer 1997): needs no clipping.
+
+Vertices become rows (x, y, w) of a 3x3 matrix whose inverse gives the edge functions e_i, affine in the image, with
+e_i = barycentric_i / w: inside where all are >= 0, 1/w = sum e_i, attribute/w = sum attribute_i e_i.
+Visible is the largest `key`, interpolated the same way: 1/w for a camera, height above a plane for the sun's view.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factory.readers.town.textures import LEAVES, SPOKES, TREELINE, opaque_at
+from tasks.kernels.compiled import drawing_kernel
+
+NEAR_M = 0.15
+
+
+@drawing_kernel
+def rasterise(
+    vertices: NDArray[np.float64],  # (T, 3, 3) world
+    uv: NDArray[np.float64],  # (T, 3, 2)
+    material: NDArray[np.int64],  # (T,)
+    seed: NDArray[np.int64],  # (T,)
+    view: NDArray[np.float64],  # (4, 4): world point (1) -> x, y, w, key; pixel = (x / w, y / w)
+    first_id: int,
+    keys: NDArray[np.float32],  # (H, W) in and out
+    ids: NDArray[np.int32],  # (H, W) in and out: visible triangle + first_id
+    planes: NDArray[np.float64],  # (T, 9) out: 1/w, u/w, v/w as a x + b y + c; (0, 9) where not wanted
+) -> None:
+    """Draws triangles into `keys` and `ids`; sample (row, column) lies at (column + 0.5, row + 0.5)."""
+    height, width = keys.shape
+    h = np.empty((3, 4))
+    e = np.empty((3, 3))
+    wants_planes = planes.shape[0] > 0
+    for t in range(vertices.shape[0]):
+        n_behind = 0
+        for i in range(3):
+            for k in range(4):
+                h[i, k] = (
+                    view[k, 0] * vertices[t, i, 0]
+                    + view[k, 1] * vertices[t, i, 1]
+                    + view[k, 2] * vertices[t, i, 2]
+                    + view[k, 3]
+                )
+            if h[i, 2] < NEAR_M:
+                n_behind += 1
+        if n_behind == 3:
+            continue
+        x_low, x_high, y_low, y_high = 1e9, -1e9, 1e9, -1e9
+        for i in range(3):
+            if h[i, 2] >= NEAR_M:
+                px, py = h[i, 0] / h[i, 2], h[i, 1] / h[i, 2]
+                x_low, x_high, y_low, y_high = min(x_low, px), max(x_high, px), min(y_low, py), max(y_high, py)
+            j = (i + 1) % 3
+            if (h[i, 2] < NEAR_M) != (h[j, 2] < NEAR_M):
+                along = (NEAR_M - h[i, 2]) / (h[j, 2] - h[i, 2])
+                px = (h[i, 0] + along * (h[j, 0] - h[i, 0])) / NEAR_M
+                py = (h[i, 1] + along * (h[j, 1] - h[i, 1])) / NEAR_M
+                x_low, x_high, y_low, y_high = min(x_low, px), max(x_high, px), min(y_low, py), max(y_high, py)
+        if x_high < 0 or y_high < 0 or x_low > width or y_low > height:
+            continue
+        row_low, row_high = max(0, math.ceil(y_low - 0.5)), min(height - 1, math.floor(y_high - 0.5))
+        left, right = max(0, math.ceil(x_low - 0.5)), min(width - 1, math.floor(x_high - 0.5))
+        if row_low > row_high or left > right:
+            continue
+        det = 0.0
+        for i in range(3):
+            a, b = (i + 1) % 3, (i + 2) % 3
+            e[i, 0] = h[a, 1] * h[b, 2] - h[a, 2] * h[b, 1]
+            e[i, 1] = h[a, 2] * h[b, 0] - h[a, 0] * h[b, 2]
+            e[i, 2] = h[a, 0] * h[b, 1] - h[a, 1] * h[b, 0]
+        det = h[0, 0] * e[0, 0] + h[0, 1] * e[0, 1] + h[0, 2] * e[0, 2]
+        if abs(det) < 1e-12:
+            continue
+        for i in range(3):
+            for k in range(3):
+                e[i, k] /= det
+        kx, ky, kc = 0.0, 0.0, 0.0
+        for i in range(3):
+            kx += e[i, 0] * h[i, 3]
+            ky += e[i, 1] * h[i, 3]
+            kc += e[i, 2] * h[i, 3]
+        kind = material[t]
+        cut_out = kind in (LEAVES, TREELINE, SPOKES)
+        if wants_planes or cut_out:
+            p = np.zeros(9)
+            for i in range(3):
+                for k in range(3):
+                    p[k] += e[i, k]
+                    p[3 + k] += e[i, k] * uv[t, i, 0]
+                    p[6 + k] += e[i, k] * uv[t, i, 1]
+            if wants_planes:
+                planes[t] = p
+        for row in range(row_low, row_high + 1):
+            y = row + 0.5
+            start, stop = float(left), float(right)
+            for i in range(3):
+                value = e[i, 1] * y + e[i, 2]
+                if e[i, 0] > 0:
+                    start = max(start, -value / e[i, 0] - 0.5)
+                elif e[i, 0] < 0:
+                    stop = min(stop, -value / e[i, 0] - 0.5)
+                elif value < 0:
+                    stop = -1.0
+            if stop < start:
+                continue
+            key_row = ky * y + kc
+            for column in range(math.ceil(start), math.floor(stop) + 1):
+                x = column + 0.5
+                key = np.float32(kx * x + key_row)
+                if key > keys[row, column]:
+                    if cut_out:
+                        w = 1.0 / (p[0] * x + p[1] * y + p[2])
+                        u, v = (p[3] * x + p[4] * y + p[5]) * w, (p[6] * x + p[7] * y + p[8]) * w
+                        if not opaque_at(kind, u, v, seed[t]):
+                            continue
+                    keys[row, column] = key
+                    ids[row, column] = t + first_id

@@ -1,0 +1,81 @@
+"""Several towns as one data set: a few logs of each seed's town, for studies that split their clips by town."""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+
+from factory.readers.av2.reader import AV2Reader
+from factory.readers.base import ClipRef
+from factory.readers.town.painters import TownFolder, write_all
+from factory.readers.town.reader import TOWN_VERSION, sensed_digest
+from factory.readers.town.town import LOGS_PER_TOWN
+from factory.readers.town.write import TownSettings
+from tasks.caches import user_cache
+from tasks.world.clip import Clip
+
+
+class SyntheticTownsReader(AV2Reader):
+    """Clips of the towns of several seeds; no seed's clips depend on which other seeds are read.
+
+    A town has eighteen kinds of drives. Of each town the next `logs_per_town` are taken, so that a few towns hold every
+    kind. Each town is written on first use into a folder of its own and moved there whole: indexing writes them all,
+    before a run's workers start, and a reader elsewhere writes those it reads from.
+    """
+
+    data_set = "synthetic"
+
+    def __init__(
+        self,
+        seeds: Sequence[int] | None = None,
+        first_seed: int = 0,
+        n_towns: int = 1,
+        logs_per_town: int = 3,
+        split: str = "train",
+        first_window: int = 0,
+        cache_dir: str | Path | None = None,
+        settings: TownSettings | None = None,
+    ) -> None:
+        """seeds: None: `n_towns` of them from `first_seed` on; split: of every clip, whatever its log's hash says.
+
+        Raises ValueError for repeated or no seeds, an unknown split, or more logs than a town has kinds of drives.
+        """
+        chosen = list(range(first_seed, first_seed + n_towns)) if seeds is None else list(seeds)
+        if not chosen or min(chosen) < 0 or len(set(chosen)) < len(chosen):
+            raise ValueError(f"clips.seeds: each town's seed once, 0 or more, at least one; not {chosen}")
+        if not 1 <= logs_per_town <= LOGS_PER_TOWN:
+            raise ValueError(f"clips.logs_per_town={logs_per_town}: a town has 1 to {LOGS_PER_TOWN} logs")
+        super().__init__(cache_dir or user_cache() / "towns", first_window=first_window, split=split)
+        self.settings = settings or TownSettings()
+        self.towns = tuple(self._town(seed, logs_per_town) for seed in chosen)
+
+    def logs(self) -> dict[str, Path]:
+        """Of all towns, in the order of the seeds; writes the towns that are missing."""
+        write_all(self.towns, self.settings)
+        return {name: folder for town in self.towns for name, folder in town.logs().items()}
+
+    def path_of(self, ref: ClipRef) -> Path:
+        """The folder of the clip's log; writes its town if it is missing. Raises BadClip where there is none."""
+        for town in self.towns:
+            if ref.log_id in town.logs() and ref.dataset == self.name:
+                write_all([town], self.settings)
+                return town.logs()[ref.log_id]
+        return super().path_of(ref)
+
+    def read(self, ref: ClipRef) -> Clip:
+        """The validated clip, of this reader's split. Raises BadClip."""
+        clip = super().read(ref)
+        return replace(clip, content_digest=self._of_here(clip.content_digest))
+
+    def digest(self, ref: ClipRef) -> str:
+        """The clip's content digest, without reading it. Raises BadClip."""
+        return self._of_here(super().digest(ref))
+
+    def _of_here(self, digest: str) -> str:
+        return sensed_digest(f"{digest}{self.split}", self.settings)
+
+    def _town(self, seed: int, n_logs: int) -> TownFolder:
+        indices = tuple((seed * n_logs + i) % LOGS_PER_TOWN for i in range(n_logs))
+        key = json.dumps([TOWN_VERSION, "logs", indices, seed, asdict(self.settings)])
+        return TownFolder(seed, indices, self.root / f"town-{seed}-{hashlib.sha256(key.encode()).hexdigest()[:16]}")

@@ -1,0 +1,221 @@
+"""Agents that drive: lights with phases, lane paths, and a driver that follows its path, its leader and the lights.
+
+Road users are planned one after another; each sees the finished tracks of those before it and yields to them. One
+that would still touch an earlier one is left out, so nobody collides, whatever the seed.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial import cKDTree
+
+from factory.readers.town import curves
+from factory.readers.town.curves import Array
+from factory.readers.town.streets import Streets
+from tasks.world.frames import box_corners
+
+STEP_S = 0.1
+GREEN, YELLOW, RED = 1, 2, 3
+GREEN_S, YELLOW_S, CLEAR_S = 11.0, 3.0, 2.0
+CYCLE_S = 2 * (GREEN_S + YELLOW_S + CLEAR_S)
+
+
+@dataclass(frozen=True)
+class Signals:
+    """Two-phase lights: group 0 and group 1 are green in turn."""
+
+    offset_s: float
+
+    def state(self, group: int, time_s: float) -> int:
+        """GREEN, YELLOW or RED."""
+        phase = (time_s + self.offset_s - group * CYCLE_S / 2) % CYCLE_S
+        return GREEN if phase < GREEN_S else YELLOW if phase < GREEN_S + YELLOW_S else RED
+
+
+@dataclass(frozen=True)
+class Path:
+    """What one road user follows."""
+
+    poses: Array  # (N, 3) every metre
+    s: Array  # (N,) arc length [m]
+    limit: Array  # (N,) speed [m/s] that bends and limits allow, braking ahead of them included
+    stops: tuple[tuple[float, int], ...]  # (arc length of the stop line, signal group); group -1: always stop
+    lane_ids: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Track:
+    """One road user or parked car over the log; absent steps are NaN."""
+
+    track_id: str
+    category: str  # AV2 category
+    size: tuple[float, float, float]  # length, width, height [m]
+    poses: Array  # (S, 3) box centre
+    look: int  # seed of its colour and shape
+
+    def boxes(self) -> Array:
+        """(S, 5) centre x, y, heading, length, width."""
+        return np.column_stack([self.poses, np.broadcast_to(self.size[:2], (len(self.poses), 2))])
+
+
+@dataclass(frozen=True)
+class Driver:
+    """How somebody drives; accelerations in m/s2."""
+
+    speed_factor: float = 1.0
+    accel: float = 1.3
+    brake: float = 1.8
+    jerk: float = 2.5
+    headway_s: float = 1.4
+    gap_m: float = 2.5
+    lateral_accel: float = 2.0
+    yaw_accel: float = 1.2  # rad/s2
+    front_m: float = 2.3  # path point to front bumper
+    half_width_m: float = 0.95
+
+
+def path_of_lanes(streets: Streets, lane_ids: list[int], driver: Driver, smooth_m: float = 2.5) -> Path:
+    """The centre line of consecutive lanes, rounded so that curvature is continuous."""
+    parts, stops, limits, length = [], [], [], 0.0
+    for i, lane_id in enumerate(lane_ids):
+        lane = streets.lanes[lane_id]
+        parts.append(lane.center if i == 0 else lane.center[1:])
+        limits.append(np.full(len(parts[-1]), lane.speed_mps))
+        length += float(curves.arc_length(lane.center)[-1])
+        following = streets.lanes[lane_ids[i + 1]] if i + 1 < len(lane_ids) else None
+        if following is not None and following.light_group >= 0:
+            stops.append((length - lane.stop_before_end, following.light_group))
+        if following is None and lane.kind == "BIKE":
+            stops.append((length - lane.stop_before_end, -1))
+    line = np.vstack(parts)
+    s_raw = curves.arc_length(line)
+    n = int(np.ceil(s_raw[-1])) + 1
+    even = np.linspace(0.0, s_raw[-1], n)
+    xy = curves.at(line, s_raw, even)[:, :2]
+    xy = xy + gaussian_filter1d(xy - _chord(xy), smooth_m / (even[1]), axis=0, mode="nearest") - (xy - _chord(xy))
+    poses = curves.resample(xy, 1.0, float(line[0, 2]))
+    s = curves.arc_length(poses)
+    curvature = gaussian_filter1d(np.gradient(np.unwrap(poses[:, 2]), s), 2.0)
+    winding = np.abs(gaussian_filter1d(np.gradient(curvature, s), 2.0))
+    posted = np.interp(s, s_raw, np.concatenate(limits)) * driver.speed_factor
+    limit = np.minimum(posted, np.sqrt(driver.lateral_accel / np.maximum(np.abs(curvature), 1e-6)))
+    limit = np.minimum(limit, np.sqrt(driver.yaw_accel / np.maximum(winding, 1e-6)))
+    for i in range(len(limit) - 2, -1, -1):
+        limit[i] = min(limit[i], np.sqrt(limit[i + 1] ** 2 + 2 * 0.8 * driver.brake * (s[i + 1] - s[i])))
+    return Path(poses, s, limit, tuple(stops), tuple(lane_ids))
+
+
+def _chord(xy: Array) -> Array:
+    """The straight line between the ends: smoothing the difference to it keeps both ends in place."""
+    t = np.linspace(0.0, 1.0, len(xy))[:, None]
+    return xy[0] * (1 - t) + xy[-1] * t
+
+
+def drive(
+    path: Path,
+    start_s: float,
+    speed: float,
+    driver: Driver,
+    others: Array,
+    signals: Signals,
+    times_s: Array,
+) -> tuple[Array, Array]:
+    """Arc length (S,) [m] and speed (S,) [m/s] of a driver that sees `others` (S, J, 5): IDM with bounded jerk."""
+    rear, along_speed = _on_path(path, driver, others)
+    s_out, v_out = np.empty(len(times_s)), np.empty(len(times_s))
+    s, v, a = start_s, speed, 0.0
+    for i, time in enumerate(times_s):
+        s_out[i], v_out[i] = s, v
+        front = s + driver.front_m
+        wanted = float(np.interp(s + 0.6 * v, path.s, path.limit))
+        command = min(max((wanted - v) / 0.9, -driver.brake), driver.accel)
+        gaps = rear[i] - front
+        ahead = gaps > -1.0
+        if ahead.any():
+            nearest = int(np.argmin(np.where(ahead, gaps, np.inf)))
+            command = min(command, _follow(float(gaps[nearest]), v, float(along_speed[i, nearest]), driver))
+        for line, group in path.stops:
+            state = RED if group < 0 else signals.state(group, float(time))
+            distance = line - front
+            can_stop = v * v / (2 * max(distance, 0.1)) < 2.6
+            if distance > -1.0 and (state == RED or (state == YELLOW and can_stop)) and (distance > 0 or v < 1.0):
+                command = min(command, _follow(distance + driver.gap_m - 0.6, v, 0.0, driver))
+        a += float(np.clip(np.clip(command, -4.5, driver.accel) - a, -driver.jerk * STEP_S, driver.jerk * STEP_S))
+        if command < -2.5:
+            a = min(a, command * 0.6)
+        v_next = max(0.0, v + a * STEP_S)
+        if v_next == 0.0:
+            a = max(a, 0.0)
+        s += (v + v_next) / 2 * STEP_S
+        v = v_next
+    return s_out, v_out
+
+
+def _follow(gap: float, v: float, lead_v: float, driver: Driver) -> float:
+    """IDM's interaction term (Treiber et al. 2000)."""
+    wanted = driver.gap_m + max(
+        0.0, v * driver.headway_s + v * (v - lead_v) / (2 * np.sqrt(driver.accel * driver.brake))
+    )
+    return driver.accel * (1.0 - (wanted / max(gap, 0.3)) ** 2)
+
+
+def _on_path(path: Path, driver: Driver, others: Array) -> tuple[Array, Array]:
+    """Where along the path everybody in the driver's corridor ends (S, J) (inf: not in it), and speeds along it."""
+    steps, n = others.shape[:2]
+    if n == 0:
+        return np.full((steps, 1), np.inf), np.zeros((steps, 1))
+    flat = others.reshape(-1, 5)
+    present = ~np.isnan(flat[:, 0])
+    rear = np.full(len(flat), np.inf)
+    along = np.zeros(len(flat))
+    _, nearest = cKDTree(path.poses[:, :2]).query(flat[present, :2])
+    pose = path.poses[nearest]
+    box = flat[present]
+    dx, dy = box[:, 0] - pose[:, 0], box[:, 1] - pose[:, 1]
+    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    turn = box[:, 2] - pose[:, 2]
+    cos, sin = np.abs(np.cos(turn)), np.abs(np.sin(turn))
+    across = box[:, 3] / 2 * sin + box[:, 4] / 2 * cos
+    position = path.s[nearest] + c * dx + s * dy
+    inside = np.abs(-s * dx + c * dy) < across + driver.half_width_m + 0.25
+    rear[present] = np.where(inside, position - box[:, 3] / 2 * cos - box[:, 4] / 2 * sin, np.inf)
+    along[present] = position
+    speed = np.clip(np.gradient(along.reshape(steps, n), STEP_S, axis=0), 0.0, 30.0)
+    return rear.reshape(steps, n), np.nan_to_num(speed)
+
+
+def overlaps(boxes: Array, others: Array, margin_m: float) -> NDArray[np.bool_]:
+    """(S, J): does `boxes` (S, 5), grown by `margin_m` on every side, touch `others` (S, J, 5)? NaN touches nothing."""
+    hit = np.zeros(others.shape[:2], bool)
+    grown = boxes + np.array([0.0, 0.0, 0.0, 2 * margin_m, 2 * margin_m])
+    reach = (np.hypot(grown[:, 3], grown[:, 4])[:, None] + np.hypot(others[..., 3], others[..., 4])) / 2
+    near = np.hypot(others[..., 0] - boxes[:, None, 0], others[..., 1] - boxes[:, None, 1]) < reach
+    step, index = np.nonzero(near)
+    if len(step):
+        hit[step, index] = _boxes_touch(grown[step], others[step, index])
+    return hit
+
+
+def _boxes_touch(a: Array, b: Array) -> NDArray[np.bool_]:
+    """(M,) separating-axis test of boxes (M, 5)."""
+    corners_a, corners_b = box_corners(a), box_corners(b)
+    touch = np.ones(len(a), bool)
+    for heading in (a[:, 2], a[:, 2] + np.pi / 2, b[:, 2], b[:, 2] + np.pi / 2):
+        axis = np.stack([np.cos(heading), np.sin(heading)], axis=-1)[:, :, None]
+        pa, pb = (corners_a @ axis)[..., 0], (corners_b @ axis)[..., 0]
+        touch &= (pa.max(1) >= pb.min(1)) & (pb.max(1) >= pa.min(1))
+    return touch
+
+
+def endangers(ego: Array, speeds: Array, others: Array, margin_m: float = 0.15) -> NDArray[np.bool_]:
+    """(J,): would the ego (S, 5), straight on for up to 0.9 s, touch that track? Stricter than docs/reward.md 2g."""
+    danger = np.zeros(others.shape[1], bool)
+    for ahead in (0, 3, 6, 9):
+        moved = ego[: len(ego) - ahead].copy()
+        travel = speeds[: len(moved)] * ahead * STEP_S
+        moved[:, 0] += travel * np.cos(moved[:, 2])
+        moved[:, 1] += travel * np.sin(moved[:, 2])
+        danger |= overlaps(moved, others[ahead:], margin_m).any(axis=0)
+    return danger

@@ -1,0 +1,285 @@
+"""Writes drives through the town as Argoverse 2 sensor logs, plus one file for the phases of the lights.
+
+Argoverse 2's layout (Wilson et al. 2021): annotations, ego poses, calibration, vector map, images and sweeps by stamp.
+"""
+
+import json
+import sys
+import time
+from collections.abc import Collection, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pyarrow as pa
+import pyarrow.feather
+import shapely
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from factory.readers.town.curves import Array
+from factory.readers.town.draw import Theatre, paint
+from factory.readers.town.drive import Drive
+from factory.readers.town.sensors import REAR_AXLE_Z_M, build_rig, scan, world_from_ego
+from factory.readers.town.streets import Lane, Streets
+from factory.readers.town.town import LOG_STEPS, STEPS_PER_SWEEP, WINDOWS_PER_LOG, Town, log_name, plan_log
+from factory.readers.town.traffic import GREEN, RED, YELLOW
+from factory.wording import time_text
+from tasks.world.camera import Camera
+
+Stamps = NDArray[np.int64]
+
+LICENCE = "Apache-2.0 (synthetic)"
+ANNOTATION_RANGE_M = 100.0
+MAP_RANGE_M = 260.0  # of the drive
+STEP_NS = 100_000_000
+FIRST_STAMP_NS = 315_970_000_000_000_000
+LOG_SPACING_NS = 60_000_000_000
+STATE_NAMES = {GREEN: "GREEN", YELLOW: "YELLOW", RED: "RED"}
+
+
+@dataclass(frozen=True)
+class TownSettings:
+    """What the sensors of the synthetic ego record."""
+
+    cameras: tuple[str, ...] = ("ring_front_left", "ring_front_center", "ring_front_right")  # any of rig.CAMERA_NAMES
+    width: int = 320  # pixels
+    height: int = 180
+    jpeg_quality: int = 92
+    steps_per_photo: int = 5  # of 0.1 s: 5 is 2 Hz, as fast as samples want them; 1 is 10 Hz, for scenes to learn from
+    photo_steps: int = LOG_STEPS  # of a log, from its first, that are photographed; the three windows' histories are 36
+    lidar_beams: int = 64  # 0: no lidar
+    lidar_azimuths: int = 900
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "cameras", tuple(self.cameras))  # configuration files give lists
+        build_rig(self.cameras, self.width, self.height)
+        if self.width < 16 or self.height < 16 or not 1 <= self.jpeg_quality <= 100:
+            raise ValueError(f"impossible picture: {self.width}x{self.height}, quality {self.jpeg_quality}")
+        if self.steps_per_photo < 1 or STEPS_PER_SWEEP % self.steps_per_photo:
+            raise ValueError(f"steps_per_photo must divide {STEPS_PER_SWEEP}, not {self.steps_per_photo}")
+        if not 1 <= self.photo_steps <= LOG_STEPS:
+            raise ValueError(f"photo_steps must be 1 to {LOG_STEPS}, the steps of a log, not {self.photo_steps}")
+        if self.lidar_beams < 0 or self.lidar_azimuths < 1:
+            raise ValueError(f"impossible lidar: {self.lidar_beams} beams, {self.lidar_azimuths} azimuths")
+
+
+def write_town(out: Path, n_clips: int, seed: int, settings: TownSettings, threads: int = 2) -> list[Path]:
+    """Writes the logs that hold the seed's first `n_clips` clips under `out`; returns their folders.
+
+    Logs are whole, so the last may hold up to two windows more. The same arguments give the same bytes, whatever
+    `threads`; a longer run starts with the logs of a shorter one. Raises ValueError for n_clips < 1.
+    """
+    if n_clips < 1:
+        raise ValueError(f"a town needs at least one clip, not {n_clips}")
+    return write_logs(out, range(-(-n_clips // WINDOWS_PER_LOG)), seed, settings, threads)
+
+
+def write_logs(out: Path, indices: Collection[int], seed: int, settings: TownSettings, threads: int = 2) -> list[Path]:
+    """Writes these logs of the seed under `out`; a log's bytes depend on its index, not on the others.
+
+    Logs with sensors take seconds each, so how far it is goes to stderr.
+    """
+    folders, began = [], time.monotonic()
+    for number, i in enumerate(indices, start=1):
+        folders.append(write_log(out / log_name(seed, i), *plan_log(seed, i), settings, i, threads))
+        if settings.cameras or settings.lidar_beams:
+            left = time_text((time.monotonic() - began) / number * (len(indices) - number))
+            print(f"town {seed}: log {number} of {len(indices)} painted  ETA {left}", file=sys.stderr, flush=True)
+    return folders
+
+
+def write_log(
+    folder: Path, town: Town, drive: Drive, settings: TownSettings, number: int = 0, threads: int = 2
+) -> Path:
+    """Writes one drive as a log folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    stamps = FIRST_STAMP_NS + number * LOG_SPACING_NS + np.arange(LOG_STEPS, dtype=np.int64) * STEP_NS
+    _feather(folder / "city_SE3_egovehicle.feather", _poses(drive, stamps))
+    _feather(folder / "annotations.feather", _annotations(drive, stamps))
+    if lights := _lights(town.streets, drive, stamps):
+        _feather(folder / "traffic_lights.feather", lights)
+    rig = build_rig(settings.cameras, settings.width, settings.height)
+    _calibration(folder, rig)
+    (folder / "map").mkdir(exist_ok=True)
+    content = json.dumps(_vector_map(town.streets, drive), separators=(",", ":"))
+    (folder / "map" / f"log_map_archive_{folder.name}____{town.name}_city_0.json").write_text(content, encoding="utf-8")
+    (folder / "LICENSE").write_text(
+        f"{LICENCE}\nMade by the data factory's synthetic town; test data.\n", encoding="utf-8"
+    )
+    _sensors(folder, town, drive, rig, settings, stamps, threads)
+    return folder
+
+
+def _sensors(
+    folder: Path,
+    town: Town,
+    drive: Drive,
+    rig: tuple[Camera, ...],
+    settings: TownSettings,
+    stamps: Stamps,
+    threads: int,
+) -> None:
+    if not rig and not settings.lidar_beams:
+        return
+    theatre = Theatre(town.scenery, drive, town.sun_azimuth, town.sun_elevation, town.sky_seed)
+    for camera in rig:
+        (folder / "sensors" / "cameras" / camera.name).mkdir(parents=True, exist_ok=True)
+    if settings.lidar_beams:
+        (folder / "sensors" / "lidar").mkdir(parents=True, exist_ok=True)
+
+    photographed = range(0, settings.photo_steps if rig else 0, settings.steps_per_photo)
+    swept = range(0, LOG_STEPS if settings.lidar_beams else 0, STEPS_PER_SWEEP)
+
+    def record(step: int) -> None:
+        stage, pose, stamp = theatre.at(step), world_from_ego(drive.ego[step]), int(stamps[step])
+        for camera in rig if step in photographed else ():
+            picture = cv2.cvtColor(paint(stage, camera, pose), cv2.COLOR_RGB2BGR)
+            _ok, jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, settings.jpeg_quality])
+            (folder / "sensors" / "cameras" / camera.name / f"{stamp}.jpg").write_bytes(jpeg.tobytes())
+        if step in swept:
+            sweep = scan(stage, pose, settings.lidar_beams, settings.lidar_azimuths)
+            columns = {axis: pa.array(sweep.points[:, k]) for k, axis in enumerate("xyz")}
+            columns |= {name: pa.array(getattr(sweep, name)) for name in ("intensity", "laser_number", "offset_ns")}
+            _feather(folder / "sensors" / "lidar" / f"{stamp}.feather", columns)
+
+    with ThreadPoolExecutor(max_workers=threads) as pool:
+        list(pool.map(record, sorted({*photographed, *swept})))
+
+
+def _feather(path: Path, columns: Mapping[str, Any]) -> None:
+    pyarrow.feather.write_feather(pa.table(columns), path)
+
+
+def _yaw_columns(yaw: Array) -> dict[str, Any]:
+    zero = np.zeros(len(yaw))
+    return {"qw": np.cos(yaw / 2), "qx": zero, "qy": zero, "qz": np.sin(yaw / 2)}
+
+
+def _poses(drive: Drive, stamps: Stamps) -> dict[str, Any]:
+    place = {"tx_m": drive.ego[:, 0], "ty_m": drive.ego[:, 1], "tz_m": np.full(len(stamps), REAR_AXLE_Z_M)}
+    return {"timestamp_ns": stamps, **_yaw_columns(drive.ego[:, 2]), **place}
+
+
+def _annotations(drive: Drive, stamps: Stamps) -> dict[str, Any]:
+    """One row per box and frame, box pose in the ego frame of that frame."""
+    rows: list[tuple[int, int]] = []  # (step, track)
+    poses = np.stack([track.poses for track in drive.tracks], axis=1)
+    delta = poses[..., :2] - drive.ego[:, None, :2]
+    rows = [(int(i), int(j)) for i, j in np.argwhere(np.hypot(delta[..., 0], delta[..., 1]) < ANNOTATION_RANGE_M)]
+    step, which = np.array([r[0] for r in rows]), np.array([r[1] for r in rows])
+    heading = drive.ego[step, 2]
+    dx, dy = delta[step, which].T
+    sizes = np.array([track.size for track in drive.tracks])[which]
+    distance = np.hypot(dx, dy)
+    return {
+        "timestamp_ns": stamps[step],
+        "track_uuid": [drive.tracks[k].track_id for k in which],
+        "category": [drive.tracks[k].category for k in which],
+        "length_m": sizes[:, 0],
+        "width_m": sizes[:, 1],
+        "height_m": sizes[:, 2],
+        **_yaw_columns(poses[step, which, 2] - heading),
+        "tx_m": np.cos(heading) * dx + np.sin(heading) * dy,
+        "ty_m": -np.sin(heading) * dx + np.cos(heading) * dy,
+        "tz_m": sizes[:, 2] / 2 - REAR_AXLE_Z_M,
+        "num_interior_pts": np.maximum(1, 40_000 / np.maximum(distance, 4.0) ** 2).astype(np.int64),
+    }
+
+
+def _lights(streets: Streets, drive: Drive, stamps: Stamps) -> dict[str, Any]:
+    """A row per frame and light-governed connector of the map; empty where it has none."""
+    governed = [lane for lane in _near_lanes(streets, drive) if lane.light_group >= 0]
+    if not governed:
+        return {}
+    states = {
+        group: [STATE_NAMES[drive.signals.state(group, float(t))] for t in drive.times_s]
+        for group in sorted({lane.light_group for lane in governed})
+    }
+    return {
+        "timestamp_ns": np.tile(stamps, len(governed)),
+        "lane_id": np.repeat(np.array([lane.lane_id for lane in governed], np.int64), len(stamps)),
+        "state": [state for lane in governed for state in states[lane.light_group]],
+    }
+
+
+def _calibration(folder: Path, rig: tuple[Camera, ...]) -> None:
+    if not rig:
+        return
+    (folder / "calibration").mkdir(exist_ok=True)
+    names = [camera.name for camera in rig]
+    k = np.array([camera.intrinsics for camera in rig])
+    zero = np.zeros(len(rig))
+    intrinsics = {
+        "sensor_name": names,
+        "fx_px": k[:, 0, 0],
+        "fy_px": k[:, 1, 1],
+        "cx_px": k[:, 0, 2],
+        "cy_px": k[:, 1, 2],
+    }
+    intrinsics |= {"k1": zero, "k2": zero, "k3": zero}
+    intrinsics |= {f"{side}_px": np.array([getattr(c, side) for c in rig], np.uint16) for side in ("height", "width")}
+    _feather(folder / "calibration" / "intrinsics.feather", intrinsics)
+    mounts = np.array([camera.ego_from_camera for camera in rig])
+    quaternions = np.array([_quaternion(mount[:3, :3]) for mount in mounts])
+    poses = {"sensor_name": names} | {name: quaternions[:, i] for i, name in enumerate(("qw", "qx", "qy", "qz"))}
+    poses |= {name: mounts[:, i, 3] for i, name in enumerate(("tx_m", "ty_m", "tz_m"))}
+    _feather(folder / "calibration" / "egovehicle_SE3_sensor.feather", poses)
+
+
+def _quaternion(rotation: Array) -> Array:
+    """(4,) w, x, y, z of a rotation matrix (3, 3)."""
+    x, y, z, w = Rotation.from_matrix(rotation).as_quat()
+    return np.array([w, x, y, z])
+
+
+def _near_lanes(streets: Streets, drive: Drive) -> list[Lane]:
+    middle = drive.ego[len(drive.ego) // 2, :2]
+    return [lane for lane in streets.lanes.values() if np.hypot(*(lane.center[:, :2] - middle).T).min() < MAP_RANGE_M]
+
+
+def _vector_map(streets: Streets, drive: Drive) -> dict[str, dict[str, Any]]:
+    """The vector map around the drive; a neighbour's or successor's id may lie outside it, as in Argoverse's crops."""
+    lanes = {
+        str(lane.lane_id): {
+            "id": lane.lane_id,
+            "is_intersection": lane.is_intersection,
+            "lane_type": lane.kind,
+            "left_lane_boundary": _points(_thinned(lane.left)),
+            "left_lane_mark_type": lane.left_mark,
+            "right_lane_boundary": _points(_thinned(lane.right)),
+            "right_lane_mark_type": lane.right_mark,
+            "successors": lane.successors,
+            "predecessors": lane.predecessors,
+            "right_neighbor_id": lane.right_neighbor,
+            "left_neighbor_id": lane.left_neighbor,
+        }
+        for lane in _near_lanes(streets, drive)
+    }
+    areas = {
+        str(1 + k): {"area_boundary": _points(_simplified(ring)), "id": 1 + k} for k, ring in enumerate(streets.areas)
+    }
+    crossings = {
+        str(501 + k): {"edge1": _points(crossing.edge1), "edge2": _points(crossing.edge2), "id": 501 + k}
+        for k, crossing in enumerate(streets.crossings)
+    }
+    return {"lane_segments": lanes, "drivable_areas": areas, "pedestrian_crossings": crossings}
+
+
+def _points(line: Array) -> list[dict[str, float]]:
+    return [{"x": round(float(x), 4), "y": round(float(y), 4), "z": 0.0} for x, y in line[:, :2]]
+
+
+def _simplified(ring: Array) -> Array:
+    """The ring without the points that lie within 1 cm of its other edges."""
+    return np.asarray(shapely.Polygon(ring).simplify(0.01).exterior.coords)[:-1]
+
+
+def _thinned(line: Array) -> Array:
+    """Every other point, both ends kept: 2 m apart."""
+    if len(line) <= 4:
+        return line
+    return line[np.unique(np.append(np.arange(0, len(line) - 1, 2), len(line) - 1))]

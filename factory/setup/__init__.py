@@ -1,0 +1,1 @@
+"""A run put together from its settings: readers, vocabularies, experts, and what it will cost."""

@@ -1,0 +1,267 @@
+"""`python -m factory vocabulary`: vocabularies and recovery tables out of a data set's own TRAIN logs.
+
+    python -m factory vocabulary clips=av2 clips.root=<logs> k=1024 out=vocabulary.npy
+    python -m factory vocabulary kinematic=true k=1024 out=labels.npy
+    python -m factory vocabulary clips=av2 clips.root=<logs> table=recovery.npz vocabularies=[human_8192x40x3.npy]
+
+`clips` and `clips.*` are those of `python -m factory.run`; the other keys are the fields of `VocabularySettings`.
+Both artefacts carry a digest of their trajectories. They are made from ALL train clips of the root, whatever part of
+them a run later reads, so that a run's `limit` never changes what the experts know.
+"""
+
+import dataclasses
+import json
+import os
+import sys
+import zipfile
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factory.config.compose import ConfigError, build, compose, fill, need_run_extra
+from factory.readers.base import BadClip, ClipReader
+from factory.readers.validate import read_clip
+from tasks.experts.recovery.expert import RecoveryTable
+from tasks.world.clip import CLIP_STEPS, HORIZON_STEPS, STEP_S
+from tasks.world.kinematic_vocabulary import kinematic_trajectories
+from tasks.world.vocabulary import Vocabulary, checked_trajectories, cluster, human_windows
+
+Array = NDArray[np.float64]
+STEP_MS = round(STEP_S * 1000)
+TABLE_KEYS = ("trajectories", "digest")
+
+
+@dataclass(frozen=True)
+class VocabularySettings:
+    """What to build from the train clips."""
+
+    out: str | None = None  # a vocabulary: .npy (k, 40, 3), with a .json beside it
+    k: int = 8192
+    seed: int = 0
+    table: str | None = None  # a recovery table: .npz, with a .json beside it
+    vocabularies: tuple[str, ...] = ()  # files whose trajectories go into the table too
+    every_s: float = 0.5  # a window starts this often
+    kinematic: bool = (
+        False  # out: k seeded kinematic trajectories, as a run without vocabulary.file has; reads no clips
+    )
+
+    def __post_init__(self) -> None:
+        if self.kinematic and (self.out is None or self.table is not None):
+            raise ValueError("kinematic=true makes a vocabulary: give out=<file>.npy, and no table")
+
+
+@dataclass(frozen=True)
+class TrainWindows:
+    """What human drivers of the train logs did."""
+
+    trajectories: Array  # (W, 40, 3) ego frame of each window's start, 0.1 .. 4.0 s
+    logs: tuple[str, ...]  # train logs read, sorted
+    clips_of_split: dict[str, int]  # clips read, by split
+    broken: dict[str, str]  # clip id or log -> why it could not be read
+
+
+def train_windows(reader: ClipReader, every_s: float = 0.5) -> TrainWindows:
+    """Every 4 s window of the reader's train clips, each instant of a log once however many clips share it.
+
+    Raises ValueError where `every_s` is no multiple of 0.1 s, or the root holds no data.
+    """
+    every_ms = round(every_s * 1000)
+    if every_ms < STEP_MS or every_ms % STEP_MS:
+        raise ValueError(f"every_s = {every_s} is no multiple of {STEP_S} s")
+    index = reader.index()
+    broken = {ref.log_id: reason for ref, reason in index.broken.items()}
+    windows: list[Array] = []
+    taken: set[tuple[str, int]] = set()
+    splits: Counter[str] = Counter()
+    logs: set[str] = set()
+    for ref in index.refs:
+        try:
+            clip = read_clip(reader, ref)
+        except BadClip as error:
+            broken[ref.clip_id] = str(error)
+            continue
+        splits[clip.split] += 1
+        if clip.split != "train":
+            continue
+        logs.add(ref.log_id)
+        starts = [
+            step
+            for step in range(CLIP_STEPS - HORIZON_STEPS)
+            if (ref.start_ms + step * STEP_MS) % every_ms == 0
+            and (ref.log_id, ref.start_ms + step * STEP_MS) not in taken
+        ]
+        taken |= {(ref.log_id, ref.start_ms + step * STEP_MS) for step in starts}
+        windows.append(human_windows(clip.ego_states, np.array(starts, dtype=np.intp)))
+    trajectories = np.concatenate(windows) if windows else np.zeros((0, HORIZON_STEPS, 3))
+    return TrainWindows(trajectories, tuple(sorted(logs)), dict(splits), broken)
+
+
+def build_vocabulary(windows: TrainWindows, k: int, seed: int) -> Vocabulary:
+    """k human trajectories that stand for all train windows. Raises ValueError where there are too few."""
+    if len(windows.trajectories) == 0:
+        raise ValueError(_no_train_log(windows))
+    return Vocabulary(cluster(windows.trajectories, k, seed), source="train windows")
+
+
+def build_recovery_table(windows: Sequence[TrainWindows], vocabularies: Sequence[Vocabulary]) -> RecoveryTable:
+    """All train windows, then all trajectories of the vocabularies. Raises ValueError where there is none at all."""
+    parts = [part.trajectories for part in windows] + [vocabulary.trajectories for vocabulary in vocabularies]
+    if not sum(map(len, parts)):
+        reasons = "; ".join(_no_train_log(part) for part in windows)
+        raise ValueError(f"a recovery table needs train logs or a vocabulary file: {reasons or 'neither was given'}")
+    return RecoveryTable(np.concatenate(parts))
+
+
+def _no_train_log(windows: TrainWindows) -> str:
+    found = ", ".join(f"{count} {split}" for split, count in sorted(windows.clips_of_split.items()))
+    return f"no train log: the clips read are {found or 'none'}, {len(windows.broken)} could not be read"
+
+
+def load_vocabulary(path: str | Path, first: int | None = None) -> Vocabulary:
+    """The vocabulary in a .npy file (K, 40, 3), or its first entries. Raises ValueError that names the file."""
+    values = _load(path)
+    if not isinstance(values, np.ndarray):
+        raise ValueError(f"{path}: expected one .npy array (K, {HORIZON_STEPS}, 3), found an archive of several")
+    if first is not None and not 1 <= first <= len(values):
+        raise ValueError(f"{path}: the first {first} of {len(values)} trajectories were asked for")
+    return Vocabulary(values[:first], source=str(path))
+
+
+def load_recovery_table(path: str | Path) -> RecoveryTable:
+    """The table in a .npz file. Raises ValueError that names the file, also where it does not match its digest."""
+    archive = _load(path)
+    if isinstance(archive, np.ndarray) or sorted(archive) != sorted(TABLE_KEYS):
+        raise ValueError(f"{path}: expected a .npz archive of {' and '.join(TABLE_KEYS)}")
+    table = RecoveryTable(checked_trajectories(archive["trajectories"], str(path)))
+    if str(archive["digest"]) != table.digest:
+        raise ValueError(
+            f"{path}: digest says {archive['digest']}, the trajectories are {table.digest}: build it again"
+        )
+    return table
+
+
+def _load(path: str | Path) -> np.ndarray | dict[str, np.ndarray]:
+    try:
+        loaded = np.load(path, allow_pickle=False)
+        return loaded if isinstance(loaded, np.ndarray) else {key: loaded[key] for key in loaded.files}
+    except OSError as error:
+        raise ValueError(f"{path}: not readable as a numpy file: {error.strerror or error}") from error
+    except (ValueError, EOFError, zipfile.BadZipFile) as error:  # numpy takes what it does not know for a pickle
+        why = "it holds no plain numbers" if "pickled (object)" in str(error) else str(error)
+        raise ValueError(f"{path}: not readable as a numpy file: {why}") from error
+
+
+def save_vocabulary(path: str | Path, vocabulary: Vocabulary, origin: dict[str, object]) -> None:
+    """Writes the .npy, and a .json beside it with the digest, k and `origin`."""
+    _write(Path(path), lambda file: np.save(file, vocabulary.trajectories, allow_pickle=False))
+    _describe(Path(path), {"digest": vocabulary.digest, "k": len(vocabulary)} | origin)
+
+
+def save_recovery_table(path: str | Path, table: RecoveryTable, origin: dict[str, object]) -> None:
+    """Writes the .npz, and a .json beside it with the digest, the number of trajectories and `origin`."""
+    arrays = {"trajectories": table.trajectories, "digest": np.array(table.digest)}
+    _write(Path(path), lambda file: np.savez(file, allow_pickle=False, **arrays))
+    _describe(Path(path), {"digest": table.digest, "trajectories": len(table)} | origin)
+
+
+def _write(path: Path, fill_in: Callable[[BinaryIO], object]) -> None:
+    """A file that is there whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f"{path.name}.{os.getpid()}.part")
+    with part.open("wb") as file:
+        fill_in(file)
+    part.replace(path)
+
+
+def _describe(path: Path, content: dict[str, object]) -> None:
+    text = json.dumps(content, indent=2, sort_keys=True) + "\n"
+    _write(path.with_suffix(".json"), lambda file: file.write(text.encode()))
+
+
+def run(settings: VocabularySettings, reader: ClipReader) -> list[str]:
+    """Builds and writes what `settings` ask for; one line of report for each artefact.
+
+    Raises ValueError where the root has no data, no train log or too few windows, or a vocabulary file is broken.
+    """
+    vocabularies = [load_vocabulary(file) for file in settings.vocabularies]  # first: broken files fail at once
+    windows = train_windows(reader, settings.every_s)
+    origin: dict[str, object] = {
+        "reader": reader.name,
+        "train_logs": list(windows.logs),
+        "train_windows": len(windows.trajectories),
+        "unreadable": windows.broken,
+    }
+    lines = []
+    if settings.out is not None:
+        vocabulary = build_vocabulary(windows, settings.k, settings.seed)
+        save_vocabulary(settings.out, vocabulary, origin | {"seed": settings.seed})
+        lines.append(f"{settings.out}: {len(vocabulary)} of {len(windows.trajectories)} windows, {vocabulary.digest}")
+    if settings.table is not None:
+        table = build_recovery_table([windows], vocabularies)
+        files = {Path(file).name: vocabulary.digest for file, vocabulary in zip(settings.vocabularies, vocabularies)}
+        save_recovery_table(settings.table, table, origin | {"vocabularies": files})
+        lines.append(
+            f"{settings.table}: {len(table)} trajectories, {len(windows.trajectories)} of them from "
+            f"{len(windows.logs)} train logs, {table.digest}"
+        )
+    lines += [f"unreadable {name}: {reason}" for name, reason in sorted(windows.broken.items())]
+    return lines
+
+
+def write_kinematic(settings: VocabularySettings) -> str:
+    """Writes the kinematic vocabulary of `k` and `seed`; a line of report."""
+    assert settings.out is not None
+    vocabulary = Vocabulary(kinematic_trajectories(settings.k, settings.seed), source="kinematic")
+    save_vocabulary(settings.out, vocabulary, {"source": "kinematic", "seed": settings.seed})
+    return f"{settings.out}: {len(vocabulary)} kinematic trajectories, {vocabulary.digest}"
+
+
+def parsed(arguments: Sequence[str]) -> tuple[VocabularySettings, list[str]]:
+    """The settings, and the overrides that choose the clips. Raises ConfigError."""
+    need_run_extra("omegaconf")
+    from omegaconf import OmegaConf
+
+    of_clips = [argument for argument in arguments if argument.lstrip("+").split("=")[0].split(".")[0] == "clips"]
+    own = [argument for argument in arguments if argument not in of_clips]
+    wrong = [argument for argument in own if "=" not in argument]
+    if wrong:
+        raise ConfigError(f"expected key=value, got {wrong[0]!r}")
+    values = OmegaConf.to_container(OmegaConf.from_dotlist(own))
+    assert isinstance(values, dict)
+    settings = fill(VocabularySettings, {str(key): value for key, value in values.items()}, "vocabulary")
+    if settings.out is None and settings.table is None:
+        raise ConfigError("nothing to build: give out=<file>.npy, table=<file>.npz or both")
+    for name, suffix in (("out", ".npy"), ("table", ".npz")):
+        file = getattr(settings, name)
+        if file is not None and Path(file).suffix != suffix:
+            raise ConfigError(f"{name}={file} must end in {suffix}")
+    return settings, of_clips
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command; 0 when everything was written, 2 on a bad configuration or when there is nothing to build from."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    if not arguments or set(arguments) & {"-h", "--help"}:
+        fields = ", ".join(f"{field.name}={field.default}" for field in dataclasses.fields(VocabularySettings))
+        print(f"{__doc__}\nsettings and their defaults: {fields}")
+        return 0 if arguments else 2
+    try:
+        settings, of_clips = parsed(arguments)
+        if settings.kinematic:
+            print(write_kinematic(settings))
+            return 0
+        lines = run(settings, build(compose("run", of_clips)["clips"], "clips"))
+    except (ValueError, OSError, MemoryError) as error:  # ConfigError is one
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print("\n".join(lines))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,137 @@
+"""The Gaussian scene of a clip's block: built once, kept on disk under the digest of what it is built from.
+
+A block is a stretch of a log that several clips lie in (tasks.world.clip.Block). Whoever comes first on a machine
+builds the scene while the others wait for it; the file appears by an atomic rename, so that a killed builder leaves
+nothing half done.
+"""
+
+import fcntl
+import hashlib
+import json
+import logging
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from enum import Enum
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factory.graph.work import Stopped, never
+from factory.stages.fitting import fitted
+from factory.stages.scene_file import SUFFIX, BadScene, read_scene, write_scene
+from factory.stages.sensors import block_of, chosen_cameras, load_sensors, load_sweeps, taken_by
+from tasks.render.scene.asset import BlockRange, RenderAsset
+from tasks.render.scene.build import build_asset
+from tasks.render.scene.lidar_only import lidar_asset
+from tasks.render.scene.stereo import MAX_BASELINE_M, MIN_BASELINE_M
+from tasks.render.settings import RenderSettings, SceneFrom
+from tasks.world.camera import SensorFile
+from tasks.world.clip import Block, Clip
+
+ASSET_VERSION = 4  # raised by hand when the same sensors give another scene
+PARALLAX_SHARE = 0.9  # without lidar, a photo with no other in stereo reach shows sky alone; so few may be like that
+log = logging.getLogger(__name__)
+
+
+class Sensing(Enum):
+    """What a clip's block was seen by."""
+
+    PHOTOS = "photos"  # and lidar
+    PHOTOS_ONLY = "photos_only"  # depth from parallax alone
+    LIDAR_ONLY = "lidar_only"
+    NOTHING = "nothing"
+
+
+def sensing(clip: Clip, settings: RenderSettings) -> Sensing:
+    """What the block can be made of; nothing without a rig to look through, or without lidar and parallax.
+
+    Raises ValueError for a camera the rig does not have.
+    """
+    block, cameras = block_of(clip), chosen_cameras(clip.cameras, settings.cameras)
+    photos = taken_by(cameras, block.images)
+    if block.sweeps and cameras:
+        return Sensing.PHOTOS if photos else Sensing.LIDAR_ONLY
+    return Sensing.PHOTOS_ONLY if photos and _with_parallax(photos) >= PARALLAX_SHARE else Sensing.NOTHING
+
+
+def _with_parallax(photos: Sequence[SensorFile]) -> float:
+    """Share of the photos that another of the same camera lies at a useful distance from for depth by comparison."""
+    places: dict[str, list[NDArray[np.float64]]] = {}
+    for file in photos:
+        places.setdefault(file.sensor, []).append(file.world_from_ego[:3, 3])
+    found = 0
+    for mine in places.values():
+        apart = np.linalg.norm(np.stack(mine)[:, None] - np.stack(mine), axis=-1)
+        found += int(((apart >= MIN_BASELINE_M) & (apart <= MAX_BASELINE_M)).any(axis=1).sum())
+    return found / len(photos)
+
+
+def asset_for(
+    clip: Clip, settings: RenderSettings, cache_dir: str | Path, threads: int = 1, stopped: Stopped = never
+) -> RenderAsset | None:
+    """The scene of the clip's block with its digest; None where the clip has nothing to make one from.
+
+    Made of photos and lidar, or of either alone (`sensing`); the same on any number of threads.
+    Raises BadClip where a sensor file is broken, ValueError for a camera the rig does not have, and Halted where a fit
+    is `stopped`.
+    """
+    block, cameras = block_of(clip), chosen_cameras(clip.cameras, settings.cameras)
+    made_of = sensing(clip, settings)
+    if made_of is Sensing.NOTHING:
+        return None
+    path = scene_path(clip, settings, cache_dir)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with only_builder(path):
+        if path.exists():
+            try:
+                return read_scene(path)
+            except BadScene as error:
+                log.warning("%s; it is built again", error)
+        if made_of is not Sensing.LIDAR_ONLY:
+            data = load_sensors(block, cameras, settings.width, settings.height)
+            if settings.scene is SceneFrom.FIT:
+                asset = fitted(path, data, block.agents, settings.fit, threads, stopped)
+            else:
+                asset = build_asset(data.photos, data.sweeps, block.agents, settings.asset)
+        else:
+            asset = lidar_asset(load_sweeps(block.sweeps, with_intensity=True), block.agents)
+        return write_scene(path, replace(asset, block=range_of(clip, block)))
+
+
+def scene_path(clip: Clip, settings: RenderSettings, cache_dir: str | Path) -> Path:
+    """Where the scene of the clip's block is kept."""
+    return Path(cache_dir) / f"block-{block_id(clip, settings)}{SUFFIX}"
+
+
+def range_of(clip: Clip, block: Block) -> BlockRange:
+    """When and where the sensors of a clip's block were."""
+    files = (*block.images, *block.sweeps)
+    places = np.stack([file.world_from_ego[:2, 3] for file in files])
+    end_s = block.start_s + max(file.time_s for file in files)
+    return BlockRange(clip.dataset, clip.log_id, block.start_s, end_s, places.min(axis=0), places.max(axis=0))
+
+
+@contextmanager
+def only_builder(path: Path) -> Iterator[None]:
+    """Held by one process of the machine at a time; the kernel frees it when its holder dies."""
+    with path.with_suffix(".lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def block_id(clip: Clip, settings: RenderSettings) -> str:
+    """16 hex digits of everything the scene depends on; of the sensor files, which are not opened, names and sizes."""
+    digest = hashlib.sha256()
+    block = block_of(clip)
+    made_of = (ASSET_VERSION, clip.dataset, clip.log_id, block.start_s, clip.content_digest)
+    made = settings.fit if settings.scene is SceneFrom.FIT else settings.asset
+    how = (settings.width, settings.height, sorted(settings.cameras), asdict(made))
+    digest.update(json.dumps([made_of, how], sort_keys=True).encode())
+    for file in (*block.images, *block.sweeps):
+        path = Path(file.uri)
+        size = path.stat().st_size if path.is_file() else None  # one that is missing is named when it is read
+        digest.update(f"{file.sensor}\x1f{path.name}\x1f{size}\x1f{file.time_s!r}".encode())
+        digest.update(np.ascontiguousarray(file.world_from_ego).tobytes())
+    return digest.hexdigest()[:16]

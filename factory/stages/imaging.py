@@ -1,0 +1,292 @@
+"""The render stage: a sample's images, from the block's scene, the log's own photos, or drawn from the map.
+
+A human sample of a clip with photos keeps them, whatever its block. Every other sample is drawn from the block where
+`factory.stages.assets.sensing` finds something to make it of, else written with image_source=none and no images. Lidar
+without photos gives grey pictures near its sweeps, tagged `lidar_only`; photos without lidar coarse ones, tagged
+`photos_only`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factory.graph.work import Stopped, never
+from factory.readers.base import BadClip
+from factory.stages.assets import Sensing, asset_for, scene_path, sensing
+from factory.stages.sensors import block_of, chosen_cameras, encode_jpeg, load_photos, taken_by
+from tasks.attempt import Judged
+from tasks.experts.follow_up import BEFORE_STEPS
+from tasks.perturb import Candidate
+from tasks.render.gate import looked_at_size, unfit
+from tasks.render.likeness import Album, likeness_to_photo, sightings
+from tasks.render.map_drawing import draw_map_views
+from tasks.render.rigs import RIGS
+from tasks.render.scene.build import RenderAsset
+from tasks.render.settings import STEPS_OF, ImageSource, PsnrGate, RenderMode, RenderSettings
+from tasks.render.views import pose_on_ground, render_views
+from tasks.stages import Rejected
+from tasks.world.agents import AgentTracks
+from tasks.world.camera import Camera, SensorFile
+from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip
+from tasks.world.vehicle import X, Y
+
+NO_IMAGES: dict[str, object] = {"cameras": None, "images": None, "image_source": str(ImageSource.NONE)}
+TAG_OF = {
+    Sensing.LIDAR_ONLY: "lidar_only",  # images show lidar returns in grey, not what a camera would have seen
+    Sensing.PHOTOS_ONLY: "photos_only",  # no lidar: depth is guessed from parallax, markings shear off the photos' path
+}
+LOW_PSNR = "low_psnr"  # tag: held-out photos of the block come out worse than psnr_min
+GATE_STRIDE = 5  # steps of 0.1 s between the pictures that are looked at: 2 Hz
+PHOTO_SLACK_S = 0.06  # a photo belongs to an instant of the 2 Hz grid when it was taken this close to it
+
+
+@dataclass(frozen=True)
+class Imaging:
+    """What a sample's image columns are made from."""
+
+    settings: RenderSettings
+    cache_dir: str
+
+    def build(self, clip: Clip, threads: int, stopped: Stopped = never) -> tuple[bool, float | None]:
+        """Make sure of the clip's block in the cache: whether it was there, and its PSNR in dB where it has one.
+
+        Raises BadClip for a broken sensor file, Halted where a fit is `stopped`.
+        """
+        found = sensing(clip, self.settings) is not Sensing.NOTHING and (
+            scene_path(clip, self.settings, self.cache_dir).exists()
+        )
+        asset = asset_for(clip, self.settings, self.cache_dir, threads, stopped)
+        return found, asset.psnr_db if asset is not None and np.isfinite(asset.psnr_db) else None
+
+    def block_verdict(self, clip: Clip) -> Rejected | None:
+        """Build the clip's block, once, and say whether it is good enough to be rendered from.
+
+        Raises BadClip for a broken sensor file.
+        """
+        if self.settings.mode is not RenderMode.AUTO:
+            return None
+        if sensing(clip, self.settings) not in (Sensing.PHOTOS, Sensing.PHOTOS_ONLY):
+            return None
+        asset = _block(clip, self.settings, self.cache_dir)
+        if self._below(asset) and self.settings.psnr_gate is PsnrGate.REJECT:
+            return Rejected("render", "psnr", f"block at {asset.psnr_db:.2f} dB, below {self.settings.psnr_min:g}")
+        return None
+
+    def pictures(self, clip: Clip, candidate: Candidate | None, judged: Judged) -> dict[str, object]:
+        """The image columns of a sample, and the `tags` they add to its own.
+
+        A human sample of a clip with photos keeps the photos; everything else is drawn at the simulated poses.
+        Raises BadClip for a broken sensor file, and for a human sample that lacks some of its photos.
+        """
+        if self.settings.mode is RenderMode.MAP:
+            rig = clip.cameras or RIGS[self.settings.map_rig]
+            return self._drawn(clip, judged, None, chosen_cameras(rig, self.settings.cameras))
+        if self.settings.mode is RenderMode.NONE:
+            return NO_IMAGES
+        cameras = chosen_cameras(clip.cameras, self.settings.cameras)
+        if candidate is None and taken_by(cameras, (*clip.images, *block_of(clip).images)):
+            return self._photos(clip, judged, cameras)
+        made_of = sensing(clip, self.settings)
+        if made_of is Sensing.NOTHING or (made_of is Sensing.LIDAR_ONLY and not self._near_sweeps(clip, judged)):
+            return NO_IMAGES
+        asset = _block(clip, self.settings, self.cache_dir)
+        tags = [TAG_OF[made_of]] if made_of in TAG_OF else []
+        if self._below(asset):
+            tags.append(LOW_PSNR)
+        return self._drawn(clip, judged, asset, cameras) | {"tags": tags}
+
+    def unfit(self, clip: Clip, candidate: Candidate, judged: Judged, pair: bool = False) -> Rejected | None:
+        """Why a simulated drive cannot be shown: what `tasks.render.gate` finds on its pictures from T to T+2H.
+
+        Vehicles are held against photos on the pictures that are stored.
+        pair: all on those that a benchmark's follow-up and its earlier frame show, the same for both.
+
+        None where nothing is rendered from photos: lidar's grey pictures have gaps between its beams, and a reach of
+        their own instead. Raises BadClip for a broken sensor file.
+        """
+        if self.settings.mode is not RenderMode.AUTO or not self.settings.gate.enabled:
+            return None
+        if sensing(clip, self.settings) not in (Sensing.PHOTOS, Sensing.PHOTOS_ONLY):
+            return None
+        start, now = candidate.rollout.start_step, judged.scene.step
+        steps: Sequence[int] = range(start, now + HORIZON_STEPS + 1, GATE_STRIDE)
+        instants = (now - BEFORE_STEPS, now) if pair else (now,)
+        stored = sorted({at + offset for at in instants for offset in STEPS_OF[self.settings.frames]})
+        if pair:
+            steps = stored
+        states = np.concatenate([candidate.rollout.ego_states, judged.rollout.ego_states[1:]])
+        return unfit(
+            _block(clip, self.settings, self.cache_dir),
+            chosen_cameras(clip.cameras, self.settings.cameras),
+            pose_on_ground(clip.world_from_ego, states[[step - start for step in steps]]),
+            judged.scene.agents.overwritten(now, judged.rollout.agents),
+            steps,
+            (self.settings.width, self.settings.height),
+            self.settings.gate,
+            self.settings.backend,
+            _kept_album(_Key(clip, self.settings, self.cache_dir)) if self.settings.gate.vehicle_min > 0.0 else None,
+            stored,
+        )
+
+    def _below(self, asset: RenderAsset) -> bool:
+        return asset.psnr_db < self.settings.psnr_min  # not so where nothing was held out: NaN
+
+    def _near_sweeps(self, clip: Clip, judged: Judged) -> bool:
+        """Whether every pose to be drawn is within reach of a place that a sweep was taken from."""
+        places = np.stack([file.world_from_ego[:2, 3] for file in block_of(clip).sweeps])
+        offsets = self._ego_states(judged)[:, None, [X, Y]] - places
+        return bool((np.linalg.norm(offsets, axis=-1).min(axis=1) < self.settings.lidar_only_reach_m).all())
+
+    def _ego_states(self, judged: Judged) -> NDArray[np.float64]:
+        """(F, 11) at the instants that are drawn."""
+        driven = np.concatenate([judged.scene.ego_history, judged.rollout.ego_states[1:]])  # rows -15 .. 40 around now
+        return driven[[offset + NOW for offset in STEPS_OF[self.settings.frames]]]
+
+    def _drawn(
+        self, clip: Clip, judged: Judged, asset: RenderAsset | None, cameras: Sequence[Camera]
+    ) -> dict[str, object]:
+        scene, rollout = judged.scene, judged.rollout
+        offsets = STEPS_OF[self.settings.frames]
+        poses = pose_on_ground(clip.world_from_ego, self._ego_states(judged))
+        agents = scene.agents.overwritten(scene.step, rollout.agents)
+        steps = [scene.step + offset for offset in offsets]
+        images = self._draw(clip, asset, cameras, poses, agents, steps)
+        found = [
+            self._image(camera.name, offset * STEP_S, poses[f], images[f, c])
+            for f, offset in enumerate(offsets)
+            for c, camera in enumerate(cameras)
+        ]
+        source = ImageSource.MAP if asset is None else ImageSource.RENDER
+        measured: dict[str, object] = {}
+        if asset is not None:
+            measured = {"asset_digest": asset.digest, "psnr": asset.psnr_db if np.isfinite(asset.psnr_db) else None}
+        return {"cameras": self._rig(cameras), "images": found, "image_source": str(source), **measured}
+
+    def _draw(
+        self,
+        clip: Clip,
+        asset: RenderAsset | None,
+        cameras: Sequence[Camera],
+        poses: NDArray[np.float64],
+        agents: AgentTracks,
+        steps: Sequence[int],
+    ) -> NDArray[np.uint8]:
+        size = (self.settings.width, self.settings.height)
+        if asset is None:
+            return draw_map_views(clip.road_map, cameras, poses, agents, steps, *size)
+        return render_views(asset, cameras, poses, agents, steps, *size, self.settings.backend)
+
+    def _photos(self, clip: Clip, judged: Judged, cameras: Sequence[Camera]) -> dict[str, object]:
+        now_s = judged.scene.step * STEP_S
+        files = [
+            photo_at(clip, camera.name, now_s + offset * STEP_S)
+            for offset in STEPS_OF[self.settings.frames]
+            for camera in cameras
+        ]
+        photos = load_photos(files, cameras, self.settings.width, self.settings.height)
+        poses = {(file.sensor, file.time_s): file.world_from_ego for file in files}
+        found = [
+            self._image(photo.camera, photo.time_s - now_s, poses[photo.camera, photo.time_s], photo.rgb)
+            for photo in photos
+        ]
+        return {"cameras": self._rig(cameras), "images": found, "image_source": str(ImageSource.PHOTO)}
+
+    def _image(
+        self, camera: str, time_s: float, pose: NDArray[np.float64], rgb: NDArray[np.uint8]
+    ) -> dict[str, object]:
+        return {
+            "camera": camera,
+            "time_s": float(time_s),
+            "ego_pose": pose.ravel(),
+            "jpeg": encode_jpeg(rgb, self.settings.jpeg_quality),
+        }
+
+    def _rig(self, cameras: Sequence[Camera]) -> list[dict[str, object]]:
+        """The pinholes the images were drawn with: resized, without distortion."""
+        resized = [camera.resized(self.settings.width, self.settings.height) for camera in cameras]
+        return [
+            {
+                "name": camera.name,
+                "width": camera.width,
+                "height": camera.height,
+                "intrinsics": camera.intrinsics.ravel(),
+                "distortion": np.zeros(3),
+                "ego_from_camera": camera.ego_from_camera.ravel(),
+            }
+            for camera in resized
+        ]
+
+
+def photo_at(clip: Clip, camera: str, time_s: float) -> SensorFile:
+    """The clip's photo of a camera nearest to a time since its first step. Raises BadClip where none is near."""
+    mine = [file for file in clip.images if file.sensor == camera]
+    nearest = min(mine, key=lambda file: abs(file.time_s - time_s), default=None)
+    if nearest is None or abs(nearest.time_s - time_s) > PHOTO_SLACK_S:
+        at_s = clip.start_s + time_s
+        raise BadClip(
+            f"log {clip.log_id}",
+            f"camera {camera}",
+            f"no photo within {PHOTO_SLACK_S:g} s of {at_s:.2f} s of the log ({time_s:.2f} s of the clip): "
+            "restore the missing file, or leave the camera out by render.cameras=[...]",
+        )
+    return nearest
+
+
+def _block(clip: Clip, settings: RenderSettings, cache_dir: str) -> RenderAsset:
+    asset = _kept(_Key(clip, settings, cache_dir))
+    assert asset is not None, "asked for a block only where there are sensors"
+    return asset
+
+
+def scene_lookups() -> tuple[int, int]:
+    """How often a scene was wanted in this process: found in its memory, read or built."""
+    info = _kept.cache_info()
+    return info.hits, info.misses
+
+
+class _Key:
+    """Hashes a clip by its id, so that a worker keeps the last blocks it used."""
+
+    def __init__(self, clip: Clip, settings: RenderSettings, cache_dir: str) -> None:
+        self.clip, self.settings, self.cache_dir = clip, settings, cache_dir
+        self._key = (clip.clip_id, clip.content_digest, repr(settings), cache_dir)
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Key) and self._key == other._key
+
+
+@lru_cache(maxsize=2)
+def _kept(key: _Key) -> RenderAsset | None:
+    return asset_for(key.clip, key.settings, Path(key.cache_dir))
+
+
+def album_of(clip: Clip, asset: RenderAsset, settings: RenderSettings) -> Album:
+    """The photos of a clip's block; one is opened when a vehicle is first held against it. Raises BadClip then."""
+    block, cameras = block_of(clip), chosen_cameras(clip.cameras, settings.cameras)
+    shown = sightings(block.images, cameras, block.agents)
+    tracks: dict[int, list[str]] = {}
+    for track_id, seen in shown.items():
+        for row in seen.photos:
+            tracks.setdefault(int(row), []).append(track_id)
+    size = looked_at_size((settings.width, settings.height), settings.gate)
+    known: dict[int, dict[str, float]] = {}
+
+    def likeness(track_id: str, row: int) -> float:
+        if row not in known:
+            (photo,) = load_photos([block.images[row]], cameras, *size)
+            known[row] = likeness_to_photo(asset, photo, block.agents, tracks[row], settings.backend)
+        return known[row][track_id]
+
+    return Album(shown, likeness)
+
+
+@lru_cache(maxsize=2)
+def _kept_album(key: _Key) -> Album:
+    return album_of(key.clip, _block(key.clip, key.settings, key.cache_dir), key.settings)

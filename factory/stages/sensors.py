@@ -1,0 +1,125 @@
+"""Opens what a clip's sensor files point to: photos and lidar sweeps as arrays."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from factory.readers.av2.log import read_feather
+from factory.readers.base import BadClip
+from tasks.render.scene.sensed import Photo, Sweep, on_ego
+from tasks.render.views import undistorted
+from tasks.world.camera import Camera, SensorFile
+from tasks.world.clip import Block, Clip
+
+XYZ, INTENSITY = ("x", "y", "z"), "intensity"
+NO_PICTURE = 1.0  # standard deviation [grey levels] that a photo has at least, at night too
+
+
+@dataclass(frozen=True)
+class SensorData:
+    """What the sensors saw during a block, in file order."""
+
+    photos: tuple[Photo, ...]  # without distortion, at the size asked for
+    sweeps: tuple[Sweep, ...]
+
+
+def block_of(clip: Clip) -> Block:
+    """What the clip is rendered from: its block, else its own window."""
+    return clip.block or Block(clip.start_s, clip.agents, clip.images, clip.sweeps)
+
+
+def load_sensors(block: Block, cameras: Sequence[Camera], width: int, height: int) -> SensorData:
+    """All sweeps of the block and the photos its `cameras` took, resized to width x height.
+
+    Raises BadClip where a file is missing, broken or not of its camera's size.
+    """
+    photos = load_photos(block.images, cameras, width, height)
+    return SensorData(photos, load_sweeps(block.sweeps))
+
+
+def load_photos(files: Sequence[SensorFile], cameras: Sequence[Camera], width: int, height: int) -> tuple[Photo, ...]:
+    """The files that `cameras` took, without distortion, resized to width x height. Raises BadClip."""
+    took = {camera.name: camera for camera in cameras}
+    return tuple(_photo(file, took[file.sensor], width, height) for file in files if file.sensor in took)
+
+
+def taken_by(cameras: Sequence[Camera], files: Sequence[SensorFile]) -> tuple[SensorFile, ...]:
+    """The files that one of the `cameras` took, in their order."""
+    names = {camera.name for camera in cameras}
+    return tuple(file for file in files if file.sensor in names)
+
+
+def chosen_cameras(rig: Sequence[Camera], names: Sequence[str] | None) -> tuple[Camera, ...]:
+    """The named cameras in the order of `names`; the whole rig for none. Raises ValueError for an unknown name."""
+    if not names:
+        return tuple(rig)
+    by_name = {camera.name: camera for camera in rig}
+    unknown = [name for name in names if name not in by_name]
+    if unknown:
+        raise ValueError(f"render.cameras: no camera {', '.join(unknown)}; this rig has {', '.join(by_name) or 'none'}")
+    return tuple(by_name[name] for name in names)
+
+
+def encode_jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
+    """An rgb image (H, W, 3) as JPEG bytes; quality 1..100."""
+    done, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
+    if not done:
+        raise ValueError(f"no JPEG of an image of shape {image.shape}")
+    return data.tobytes()
+
+
+def decode_image(data: bytes, name: str) -> NDArray[np.uint8]:
+    """Encoded bytes (JPEG or PNG) as rgb (H, W, 3). Raises BadClip that names `name`."""
+    if not data:
+        raise BadClip(name, "image", "the file is empty")
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    if image is None:
+        raise BadClip(name, "image", "not an image that can be decoded")
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def _photo(file: SensorFile, camera: Camera, width: int, height: int) -> Photo:
+    try:
+        data = Path(file.uri).read_bytes()
+    except OSError as error:
+        raise BadClip(file.uri, "image", f"cannot be read: {error.strerror}") from error
+    image = decode_image(data, file.uri)
+    if image.shape[:2] != (camera.height, camera.width):
+        size = f"{image.shape[1]}x{image.shape[0]}"
+        raise BadClip(file.uri, "size", f"{size}, but {camera.name} takes {camera.width}x{camera.height}")
+    left, top, w, h = camera.window(width, height)
+    flat = undistorted(image, camera)[top : top + h, left : left + w]
+    shrinks = width < w
+    small = cv2.resize(flat, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    if small.std() < NO_PICTURE:
+        raise BadClip(
+            file.uri,
+            "image",
+            "one colour all over, no picture of a street: restore it, or leave the camera out by render.cameras=[...]",
+        )
+    pinhole = camera.resized(width, height)
+    return Photo(
+        camera=camera.name,
+        time_s=file.time_s,
+        rgb=np.asarray(small, np.uint8),
+        intrinsics=pinhole.intrinsics,
+        world_from_camera=file.world_from_ego @ pinhole.ego_from_camera,
+    )
+
+
+def load_sweeps(files: Sequence[SensorFile], with_intensity: bool = False) -> tuple[Sweep, ...]:
+    """Sweeps as Argoverse 2 stores them: motion-compensated points in the ego frame. Raises BadClip."""
+    return tuple(_sweep(file, with_intensity) for file in files)
+
+
+def _sweep(file: SensorFile, with_intensity: bool) -> Sweep:
+    table = read_feather(Path(file.uri), (*XYZ, INTENSITY) if with_intensity else XYZ)
+    points = np.stack([table[name] for name in XYZ], axis=1).astype(np.float32)
+    if on_ego(points).all():
+        raise BadClip(file.uri, "x y z", f"none of the {len(points)} returns lies outside of the ego's own body")
+    intensity = table[INTENSITY].astype(np.uint8) if with_intensity else None
+    return Sweep(file.time_s, points, file.world_from_ego, intensity)

@@ -1,0 +1,253 @@
+"""Compiles every kernel once, into the on-disk cache, before workers start."""
+
+import fcntl
+import hashlib
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from functools import partial
+from pathlib import Path
+from threading import Event, Lock, Thread
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factory.graph.work import NotReady
+from tasks.attempt import drive_and_judge
+from tasks.experts.pdm_closed.planner import PdmSettings
+from tasks.experts.protocol import Plan
+from tasks.kernels.compiled import USED, cache_dir, make_cache_dir, not_kept, processor, write_whole
+from tasks.render import warm as render_warm
+from tasks.render.settings import RenderMode, RenderSettings, SceneFrom
+from tasks.reward.labels import Labelling, vocabulary_labels
+from tasks.reward.prepare import prepare_scene
+from tasks.reward.reactive import reactive_scores
+from tasks.reward.verdicts import INDEX_FROM_ROWS
+from tasks.rollout.simulate import TrafficSettings, simulate
+from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.clip import CLIP_STEPS, HORIZON_STEPS, NOW, Clip, Scene, scene_of_clip
+from tasks.world.kinematic_vocabulary import kinematic_trajectories
+from tasks.world.lanes import Lane, RoadMap, Route
+from tasks.world.vocabulary import Vocabulary
+
+ENOUGH_S = 0.2  # between two looks whether compiling is to be given up
+_one_at_a_time = Lock()
+
+
+def parts_of(simulates: bool, traffic: str, label_traffic: str | None, render: RenderSettings) -> list[str]:
+    """What a run enters.
+
+    simulates: it has another expert than `human`; traffic, label_traffic: "idm" or "replay", of the drives and of the
+    labels (None: it makes none).
+    """
+    parts = ["judge"]
+    if label_traffic == "idm":
+        parts.append("answers")
+    elif simulates and traffic == "idm":
+        parts.append("drive")
+    if render.mode is RenderMode.AUTO:
+        parts.append("fit" if render.scene is SceneFrom.FIT else "render")
+    return parts
+
+
+@contextmanager
+def compiling_ahead(parts: Sequence[str]) -> Iterator[None]:
+    """Compiles beside what is done inside, and gives up what is not compiled at the end of it.
+
+    Who needs the kernels inside calls `compile_kernels` as ever: it waits for this, and tells what could not be done.
+    """
+    enough = Event()
+
+    def ahead() -> None:
+        with suppress(NotReady, RuntimeError):
+            compile_kernels(parts, enough)
+
+    Thread(target=ahead, daemon=True).start()
+    try:
+        yield
+    finally:
+        enough.set()
+
+
+def compile_kernels(parts: Sequence[str], enough: Event | None = None) -> None:
+    """Compiles what is not in the cache yet, each part in a process of its own, as many at once as there are cores.
+
+    Of processes that want the same at once, one compiles and the others wait for it.
+    Raises NotReady where the cache cannot be written, and RuntimeError with a part's last words where it fails or is
+    given up because there is `enough`.
+    """
+    if all(map(_is_compiled, parts)):
+        return
+    try:
+        make_cache_dir()
+        with (cache_dir() / f"lock-{_key()}").open("w") as lock:
+            if enough is None:  # somebody waits
+                print("compiling kernels, once for this version: about a minute", file=sys.stderr, flush=True)
+            with _one_at_a_time:
+                with suppress(OSError):  # a shared folder without locks: at worst two do the same work
+                    fcntl.flock(lock, fcntl.LOCK_EX)
+                missing = [name for name in parts if not _is_compiled(name)]
+                with ThreadPoolExecutor(os.cpu_count()) as pool:
+                    list(pool.map(partial(_compile_part, enough=enough or Event()), missing))
+    except OSError as error:
+        raise NotReady(not_kept(error)) from error
+
+
+def _key() -> str:
+    """8 hex digits of the processor and of what is called here for it to be compiled."""
+    sha = hashlib.sha256(processor().encode())
+    for module in (__file__, render_warm.__file__):
+        sha.update(Path(module).read_bytes())
+    return sha.hexdigest()[:8]
+
+
+def marker(name: str) -> Path:
+    """The file that lists what a part has in the cache."""
+    return cache_dir() / f"compiled-{_key()}-{name}"
+
+
+def _is_compiled(name: str) -> bool:
+    """The part was compiled, and nobody has taken a file of it away since."""
+    try:
+        listed = marker(name).read_text()
+    except OSError:  # not there, or in a folder that cannot be: whoever then writes into it says so
+        return False
+    return all((cache_dir() / file).is_file() for file in listed.splitlines())
+
+
+def _compile_part(name: str, enough: Event) -> None:
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    command = [sys.executable, "-m", "factory.stages.warm", name]
+    if enough.is_set():
+        raise RuntimeError(f"compiling the kernels of {name} was not begun")
+    with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) as part:  # noqa: S603 (ours)
+        said = _ended(part, enough)
+    if part.returncode == NO_ROOM:
+        raise OSError(said.strip().splitlines()[-1])
+    if part.returncode != 0:
+        raise RuntimeError(f"compiling the kernels of {name} failed: {said[-2000:]}")
+
+
+def _ended(part: "subprocess.Popen[str]", enough: Event) -> str:
+    """What it said once it has ended, by itself or because there is enough."""
+    while True:
+        try:
+            return part.communicate(timeout=ENOUGH_S)[1]
+        except subprocess.TimeoutExpired:
+            if enough.is_set():
+                part.terminate()
+
+
+def _warm(name: str) -> int:
+    """One part, in this process; the exit code."""
+    PARTS[name]()
+    listed = "\n".join(sorted(path.relative_to(cache_dir()).as_posix() for path in USED))
+    try:
+        for part in (name, *INCLUDED.get(name, ())):
+            write_whole(marker(part), listed.encode())
+    except OSError as error:
+        print(error, file=sys.stderr)
+        return NO_ROOM
+    return 0
+
+
+def _judge() -> None:
+    """Tracks, plans and scores, a few trajectories and many.
+
+    The map comes first: `drive` begins with the tracker, which is there when it is needed here.
+    """
+    scene, ahead = _tiny_scene()
+    prepare_scene(scene, scene.agents.window(scene.step, scene.step + HORIZON_STEPS + 1))
+    replay = TrafficSettings(mode="replay")
+    judged = drive_and_judge(scene, Plan(ahead), replay, PdmSettings())
+    labelling = Labelling(Vocabulary(kinematic_trajectories(INDEX_FROM_ROWS, 0)), replay)
+    vocabulary_labels(labelling, scene, judged.prepared, judged.rival)
+
+
+def _drive() -> None:
+    """Traffic around one ego."""
+    scene, ahead = _tiny_scene()
+    simulate(scene, ahead, TrafficSettings())
+
+
+def _answers() -> None:
+    """The same, and traffic around each of several egos, scored."""
+    _drive()
+    scene, ahead = _tiny_scene()
+    states = simulate(scene, ahead, TrafficSettings(mode="replay")).ego_states
+    reactive_scores(scene, np.stack([states] * 2), TrafficSettings())
+
+
+def _render() -> None:
+    """Scenes that are built and drawn."""
+    render_warm.compile_kernels()
+
+
+def _fit() -> None:
+    """The same, and scenes that are fitted: in one process, for they share kernels."""
+    render_warm.compile_kernels()
+    render_warm.compile_fit_kernels()
+
+
+PARTS = {"judge": _judge, "drive": _drive, "answers": _answers, "render": _render, "fit": _fit}
+INCLUDED = {"answers": ("drive",), "fit": ("render",)}
+NO_ROOM = 5  # exit code of a part whose files could not be kept
+
+
+def _tiny_scene() -> tuple[Scene, NDArray[np.float64]]:
+    ahead = np.stack([np.arange(1, 41) * 0.5, np.zeros(40), np.zeros(40)], axis=1)
+    return scene_of_clip(tiny_clip()), ahead
+
+
+def compile_town_kernels() -> None:
+    """Writes the smallest log of the synthetic town into a folder that is thrown away."""
+    from factory.readers.town.write import TownSettings, write_town
+
+    settings = TownSettings(cameras=("ring_front_center",), width=16, height=16, lidar_beams=1, lidar_azimuths=8)
+    with tempfile.TemporaryDirectory() as folder:
+        write_town(Path(folder), 1, 0, settings, threads=1)
+
+
+def tiny_clip() -> Clip:
+    """A straight road with the ego and a car ahead, and a car that drives beside the road; all at 5 m/s."""
+    steps = np.arange(CLIP_STEPS)
+    way = np.arange(-50.0, 151.0, 1.0)
+    centre = np.stack([way, np.zeros_like(way), np.zeros_like(way)], axis=1)
+    ring = np.array([[-50.0, -2.0], [150.0, -2.0], [150.0, 2.0], [-50.0, 2.0], [-50.0, -2.0]])
+    lane = Lane("lane", ring, centre, is_intersection=False, drives_cars=True)
+    ego = np.zeros((CLIP_STEPS, 11))
+    ego[:, 0], ego[:, 3] = (steps - NOW) * 0.5, 5.0
+    pose = np.tile(np.eye(4), (CLIP_STEPS, 1, 1))
+    pose[:, 0, 3] = ego[:, 0]
+    boxes = np.tile([[0.0, 0.0, 0.0, 4.5, 2.0], [0.0, 30.0, 0.0, 4.5, 2.0]], (CLIP_STEPS, 1, 1))
+    boxes[..., 0] = ego[:, :1] + 20.0
+    cars = AgentTracks(
+        track_ids=("ahead", "beside"),
+        kinds=(AgentKind.VEHICLE, AgentKind.VEHICLE),
+        boxes=boxes,
+        velocities=np.tile([5.0, 0.0], (CLIP_STEPS, 2, 1)),
+        valid=np.ones((CLIP_STEPS, 2), bool),
+        center_z=np.full((CLIP_STEPS, 2), 0.75),
+        heights=np.array([1.5, 1.5]),
+    )
+    return Clip(
+        clip_id="warm",
+        dataset="warm",
+        log_id="warm",
+        split="train",
+        start_s=0.0,
+        ego_states=ego,
+        world_from_ego=pose,
+        agents=cars,
+        road_map=RoadMap({"lane": lane}, (), (), {"lane": "rb_lane"}),
+        route=Route(("lane",), ("rb_lane",), frozenset({"lane"})),
+        centerline=centre,
+    )
+
+
+if __name__ == "__main__":  # what compiling a part starts, in a process of its own
+    sys.exit(_warm(sys.argv[1]))

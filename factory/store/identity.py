@@ -1,0 +1,41 @@
+"""What makes a row this run's: the digests of its settings, stage versions and inputs, and the key of an attempt."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+UNLISTED = "unlisted"  # prepare_digest of clips prepared for the log's own drive alone: no perturb work, no list
+
+
+@dataclass(frozen=True)
+class RunIdentity:
+    """What the rows of a run depend on besides clip, candidate and expert."""
+
+    settings: Mapping[str, object]  # flat, dotted names -> plain values; without rounds, experts, limit, executor, out
+    stage_versions: Mapping[str, int]
+    vocabulary_digest: str
+    prepare_digest: str  # of all that `prepare` depends on besides the clip: perturb, traffic, seed, stage versions;
+    # UNLISTED in a run of `human` alone
+
+    @cached_property
+    def settings_hash(self) -> str:
+        """16 hex digits of the canonical JSON of `settings`."""
+        return hashlib.sha256(canonical_json(self.settings).encode()).hexdigest()[:16]
+
+    @cached_property
+    def versions_json(self) -> str:
+        """`stage_versions` as it stands in the tables."""
+        return canonical_json(self.stage_versions)
+
+
+def canonical_json(value: object) -> str:
+    """JSON with sorted keys and no spaces; the same for equal values, on every machine."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
+
+
+def attempt_id(clip_id: str, candidate: int, vocabulary_digest: str, expert: str, expert_digest: str) -> str:
+    """16 hex digits: the primary key of an attempt, whatever became of it."""
+    key = "\x1f".join((clip_id, str(candidate), vocabulary_digest, expert, expert_digest))
+    return hashlib.sha256(key.encode()).hexdigest()[:16]

@@ -1,0 +1,130 @@
+"""`python -m factory report out=<folder or URL>`: a run as one HTML file, for sharing.
+
+    python -m factory report out=runs/demo                  writes runs/demo/report.html and, beside it, README.md,
+                                                            the data set's card, as a run does at its end
+    python -m factory report out=s3://bucket/samples to=run.html
+
+It is the dashboard with its answers and some pictures inside: the same page, the same numbers, nothing fetched.
+Exit codes: 0 written, 2 bad arguments, or nothing there to show.
+"""
+
+import base64
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from factory.config.arguments import Refused, answer
+from factory.views.status import open_store
+
+if TYPE_CHECKING:
+    from factory.setup.settings import Run
+    from factory.store.samples import Store
+    from factory.views.examples import Picture
+
+STRIP_ROWS = ("now", "earlier", "photos", "aside")
+FILE = "report.html"
+TOLD = (
+    "report.json"  # what the newest run alone could tell: its facts, what its reader left out, rejected attempts drawn
+)
+
+
+@dataclass(frozen=True)
+class Request:
+    """The command line."""
+
+    out: str
+    to: str | None = None
+
+
+def main(argv: Sequence[str]) -> int:
+    """The command; returns the exit code."""
+    return answer(__doc__ or "", Request, argv, _written)
+
+
+def _written(request: Request) -> list[str]:
+    from factory.views.card import write_card
+
+    store = open_store(request.out)
+    return [write_report(store, request.to), *([write_card(store)] if request.to is None else [])]
+
+
+def write_report(store: "Store", to: str | None = None) -> str:
+    """Write the file, into `out` where no other place is named; where it is now. Raises Refused where it cannot be."""
+    from factory.views.board.still import still_page
+    from factory.views.examples import strips_of
+
+    told: dict[str, Any] = json.loads(store.location.read(TOLD) or b"{}")
+    told["strips"] = [
+        {"title": strip.title, "source": strip.source, "rows": rows}
+        for strip in strips_of(store)
+        for rows in [{name: _plain(getattr(strip, name)) for name in STRIP_ROWS}]
+    ]
+    told["settings"] = {
+        name: str(value) for name, value in (store.runs() or [{"settings": {}}])[-1]["settings"].items()
+    }
+    page = still_page(store, told)
+    if to is None:
+        store.location.write(FILE, page)
+        return f"{store.location.uri}/{FILE}"
+    try:
+        Path(to).expanduser().write_bytes(page)
+    except OSError as error:
+        raise Refused(f"to={to}: {error}") from error
+    return str(Path(to).expanduser().resolve())
+
+
+def remember(store: "Store", assembled: "Run") -> None:
+    """Write report.json, for this report and later ones."""
+    from factory.store.outcomes import Kind
+    from factory.views.examples import Again, rejected_examples
+
+    taken = set(store.samples)
+    rejected = [
+        row
+        for row in store.outcomes.read().to_pylist()
+        if row["kind"] == Kind.REJECTED
+        and row["expert"]
+        and row["candidate_index"] >= 0
+        and row["attempt_id"] not in taken
+    ]
+    refs = {ref.clip_id: ref for ref in assembled.index.refs}
+    drawn = rejected_examples(rejected, Again(store, assembled.work, refs).picture)
+    told = {"facts": facts_of(assembled), "left_out": left_out_of(assembled), "rejected": _plain(drawn)}
+    store.location.write(TOLD, json.dumps(told).encode())
+
+
+def facts_of(assembled: "Run") -> dict[str, str]:
+    """Of a configured run."""
+    config, index, vocabulary = assembled.config, assembled.index, assembled.work.vocabulary
+    n_found = len(index.refs) + len(index.broken)
+    planned = n_found if config.limit is None else min(config.limit, n_found)
+    return {
+        "clips of the newest run": f"{planned} of {n_found} found",
+        "rounds": str(config.rounds),
+        "experts": ", ".join(config.experts),
+        "vocabulary": f"{len(vocabulary.trajectories)} trajectories, {Path(vocabulary.source).name}",
+    }
+
+
+def left_out_of(assembled: "Run") -> dict[str, dict[str, str]]:
+    """What the reader did not give, and why."""
+    index = assembled.index
+    return {
+        "Filtered windows": {reason: f"{count} windows" for reason, count in index.dropped.items()},
+        "Skipped logs": dict(index.skipped_logs),
+        "Broken logs": {f"{ref.log_id} at {ref.start_ms} ms": why for ref, why in index.broken.items()},
+    }
+
+
+def _plain(pictures: "Sequence[Picture]") -> list[Mapping[str, Any]]:
+    """As JSON has them."""
+    return [
+        asdict(one) | {"data": None if one.data is None else base64.b64encode(one.data).decode()} for one in pictures
+    ]
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

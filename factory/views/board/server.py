@@ -1,0 +1,208 @@
+"""The HTTP side of the dashboard: GET only, from loopback unless told otherwise.
+
+| path | answer |
+|---|---|
+| `/` and `/static/...` | the page, its style and scripts |
+| `/api/overview` | factory.views.board.overview.Overview |
+| `/api/samples?page=1&size=12&order=newest&expert=...` | factory.views.board.gallery.Page; filters: gallery.FILTERS |
+| `/api/samples/<attempt_id>` | factory.views.board.gallery.Whole |
+| `/api/failed?page=1` | factory.views.board.gallery.Failures |
+| `/picture/<attempt_id>/<name>.jpg` | a JPEG, see factory.views.board.pictures |
+| `/episode/<attempt_id>.mcap` | the sample for Foxglove, Lichtblick or Rerun |
+
+Answers of /api/ are JSON whose fields are those of the named dataclasses; an error is `{"error": why}` with 400 (a
+question put wrongly), 403 (asked under another host name), 404 (not there) or 503 (the tables cannot be read now).
+"""
+
+import json
+import re
+import sys
+import time
+from dataclasses import asdict, dataclass
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qsl, urlsplit
+
+import pyarrow as pa
+from deltalake.exceptions import DeltaError
+
+from factory.store.samples import ChangedRun, Store
+from factory.views.board.gallery import BadRequest, NotThere, failures, gallery, whole
+from factory.views.board.overview import overview
+from factory.views.board.pictures import Pictures
+from factory.views.board.watch import LOOK_EVERY_S, Watch
+from factory.views.report_style import DARK, LIGHT, STYLE
+
+STATIC = Path(__file__).parent / "static"
+KINDS = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
+SERVED = {path.name: path for path in STATIC.iterdir() if path.suffix in KINDS}
+ATTEMPT_ID = re.compile(r"[0-9A-Za-z_-]{1,64}")
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "X-Frame-Options": "DENY",
+}
+FOREVER = "private, max-age=86400, immutable"
+
+
+class Forbidden(ValueError):
+    """Asked under a host name that is not this server's, as a page of another site could through its own DNS."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What goes back."""
+
+    status: int
+    kind: str
+    body: bytes
+    cache: str = "no-store"
+
+
+class Board:
+    """Answers questions about one store."""
+
+    def __init__(self, store: Store, look_every_s: float = LOOK_EVERY_S) -> None:
+        self.watch = Watch(store, look_every_s)
+        self._store = store
+        self._pictures = Pictures(store)
+
+    def answer(self, target: str) -> Answer:
+        """The answer to GET `target`, path and query."""
+        try:
+            return self._answer(target)
+        except BadRequest as error:
+            return _error(400, str(error))
+        except NotThere as error:
+            return _error(404, str(error.args[0]))
+        except (DeltaError, ChangedRun, OSError, pa.ArrowException) as error:
+            return _error(503, f"the tables cannot be read now: {error}")
+
+    def _answer(self, target: str) -> Answer:
+        parts = urlsplit(target)
+        query = dict(parse_qsl(parts.query, keep_blank_values=True))
+        match parts.path.split("/")[1:]:
+            case [""]:
+                return _static("index.html")
+            case ["static", name]:
+                return _static(name)
+            case ["api", "overview"]:
+                return _json(overview(self.watch.now(), self._store.location.uri, time.time()))
+            case ["api", "samples"]:
+                page, size = _number(query, "page", 1), _number(query, "size", 12)
+                order = query.pop("order", "newest")
+                return _json(gallery(self.watch.now(), query, page, size, order))
+            case ["api", "samples", attempt_id]:
+                shot = self.watch.now()
+                row = self._pictures.row(shot, _checked(attempt_id))
+                return _json(whole(shot, attempt_id, row, self._store.candidates))
+            case ["api", "failed"]:
+                return _json(failures(self.watch.now(), _number(query, "page", 1)))
+            case ["picture", attempt_id, name]:
+                return self._picture(_checked(attempt_id), name, query)
+            case ["episode", name]:
+                attempt_id = _checked(name.removesuffix(".mcap"))
+                return Answer(200, "application/octet-stream", self._pictures.episode(self.watch.now(), attempt_id))
+        raise NotThere(f"nothing is at {parts.path}")
+
+    def _picture(self, attempt_id: str, name: str, query: dict[str, str]) -> Answer:
+        shot = self.watch.now()
+        if name == "front.jpg":
+            data = self._pictures.front(shot, attempt_id)
+        elif name == "bev.jpg":
+            data = self._pictures.bev(shot, attempt_id, _number(query, "size", 300), _number(query, "step", 15))
+        elif re.fullmatch(r"[0-9]{1,4}\.jpg", name):
+            small = query.get("small") == "1"
+            data = self._pictures.image(shot, attempt_id, int(name.removesuffix(".jpg")), small)
+        else:
+            raise NotThere(f"no picture {name}: there are front.jpg, bev.jpg and <n>.jpg")
+        return Answer(200, "image/jpeg", data, FOREVER if "v" in query else "no-store")
+
+
+def _checked(attempt_id: str) -> str:
+    if not ATTEMPT_ID.fullmatch(attempt_id):
+        raise NotThere("no sample of that name: an id is letters, digits, _ and -")
+    return attempt_id
+
+
+def _number(query: dict[str, str], name: str, otherwise: int) -> int:
+    """Takes it out of the query."""
+    text = query.pop(name, str(otherwise))
+    if not (text.isascii() and text.isdecimal() and len(text) < 9):
+        raise BadRequest(f"{name}={text}: must be a number")
+    return int(text)
+
+
+def _json(value: Any, status: int = 200) -> Answer:
+    body = json.dumps(value if isinstance(value, dict) else asdict(value), allow_nan=False).encode()
+    return Answer(status, "application/json", body)
+
+
+def _error(status: int, why: str) -> Answer:
+    return _json({"error": why}, status)
+
+
+def _static(name: str) -> Answer:
+    if name not in SERVED:
+        raise NotThere(f"no file {name}")
+    body = SERVED[name].read_bytes()
+    if name == "board.css":
+        body = style().encode()
+    return Answer(200, f"{KINDS[SERVED[name].suffix]}; charset=utf-8", body, "no-cache")
+
+
+def style() -> str:
+    """The page's style sheet."""
+    themes = f':root[data-theme="light"]{{{LIGHT}}}\n:root[data-theme="dark"]{{{DARK}}}\n'
+    return STYLE + themes + (STATIC / "board.css").read_text()
+
+
+class Server(ThreadingHTTPServer):
+    """Serves a board; a thread a connection."""
+
+    daemon_threads = True
+    allow_reuse_address = True
+
+    def __init__(self, board: Board, host: str, port: int) -> None:
+        self.board = board
+        self.host_names = {*LOOPBACK, host} if host in LOOPBACK else None  # None: any
+        super().__init__((host, port), Handler)
+
+
+class Handler(BaseHTTPRequestHandler):
+    """One connection."""
+
+    server: Server
+    protocol_version = "HTTP/1.1"
+    server_version, sys_version = "factory", ""
+    timeout = 60
+    disable_nagle_algorithm = True  # with it, and headers and body sent apart, an answer waits 40 ms for nothing
+    wbufsize = -1
+
+    def do_GET(self) -> None:
+        names = self.server.host_names
+        asked = (urlsplit(f"//{self.headers.get('Host', '')}").hostname or "").lower()
+        if names is not None and asked not in names:
+            self._send(_error(403, f"this server answers to {', '.join(sorted(names))}, not to {asked or 'no name'}"))
+        else:
+            self._send(self.server.board.answer(self.path))
+
+    def _send(self, answer: Answer) -> None:
+        self.send_response(answer.status)
+        self.send_header("Content-Type", answer.kind)
+        self.send_header("Content-Length", str(len(answer.body)))
+        self.send_header("Cache-Control", answer.cache)
+        for name, value in HEADERS.items():
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(answer.body)
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Only what went wrong is said."""
+        if len(args) > 1 and str(args[1]) >= "500":
+            print(f"{self.address_string()} {format % args}", file=sys.stderr)

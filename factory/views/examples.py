@@ -1,0 +1,189 @@
+"""Pictures of a run for its report: what the cameras saw, and attempts that were turned down, made again.
+
+Rejected attempts are attempted again from their prepared clips, which gives the same result. Which examples are shown
+follows from their ids.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from typing import Any, TypeVar
+
+from factory.graph.steps import cache_key
+from factory.graph.work import PreparedClip
+from factory.readers.base import BadClip, ClipRef
+from factory.stages.pipeline import FactoryWork, PerturbedClip
+from factory.store.cache import BadCacheFile
+from factory.store.reader import SampleTable
+from factory.store.samples import Store
+from factory.views.drawing import attempt_picture
+from factory.views.sample_picture import (
+    decoded,
+    earlier_images,
+    encoded,
+    fitted,
+    front_camera,
+    images_at_now,
+    nearer,
+)
+from factory.views.seen_again import VIEW_COLUMNS, Seen, from_the_side, photographed, real_and_rendered, scene_of
+from tasks.render.settings import ImageSource
+
+N_EXAMPLES = 6
+N_STRIPS = 4
+PER_VALUE = 200
+MAX_PREPARED_AGAIN = 2  # clips whose prepared form is gone from the cache: a few seconds each
+BEV_PX = (640, 640)  # 80 m
+CAMERA_PX = 320  # width of a camera frame on the page
+LABELS = ("attempt_id", "clip_id", "log_id", "expert", "round", "image_source")
+Row = Mapping[str, Any]
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A JPEG with its caption; `data` None where there is none, and the caption says why."""
+
+    data: bytes | None
+    caption: str
+    detail: str = ""
+
+
+@dataclass(frozen=True)
+class Strip:
+    """What the cameras of one sample saw."""
+
+    title: str
+    source: str
+    now: tuple[Picture, ...]
+    earlier: tuple[Picture, ...] = ()
+    photos: tuple[Picture, ...] = ()  # the log's, each followed by the scene seen from its pose
+    aside: tuple[Picture, ...] = ()  # the same instant from beside the ego
+
+
+def spread(rows: Iterable[T], keys: Callable[[T], Sequence[Hashable]], order: Callable[[T], str]) -> list[T]:
+    """A few rows, each next one the least like those before it: fewest repeats over its keys, then `order`.
+
+    The same rows in any order give the same list. Of each value of the first key at most PER_VALUE rows are looked at,
+    so that a table of any size costs one pass.
+    """
+    seen: Counter[Hashable] = Counter()
+    left: list[tuple[tuple[tuple[int, Hashable], ...], T]] = []
+    for row in sorted(rows, key=order):
+        slots = tuple(enumerate(keys(row)))
+        seen[slots[0]] += 1
+        if seen[slots[0]] <= PER_VALUE:
+            left.append((slots, row))
+    used: Counter[tuple[int, Hashable]] = Counter()
+    chosen: list[T] = []
+    while left and len(chosen) < 4 * N_EXAMPLES:  # some of them may turn out not to be drawable
+        best = min(range(len(left)), key=lambda i: (sum(used[slot] for slot in left[i][0]), i))
+        slots, row = left.pop(best)
+        chosen.append(row)
+        used.update(slots)
+    return chosen
+
+
+def rejected_examples(rejected: Sequence[Row], picture: Callable[[Row], Picture | None]) -> list[Picture]:
+    """A few of the simulated attempts that were turned down (rows of outcomes).
+
+    picture: of one of them, None where it cannot be made again.
+    """
+    order = spread(rejected, lambda o: (o["reason"], o["expert"], o["clip_id"]), lambda o: str(o["attempt_id"]))
+    made = (found for outcome in order if (found := picture(outcome)) is not None)
+    return list(islice(made, N_EXAMPLES))
+
+
+def strips_of(store: Store) -> list[Strip]:
+    """What the cameras of a few samples saw, each with the log's photos beside renderings where its scene is kept."""
+    labels = store.samples.read(LABELS).to_pylist()
+    pictured = [row for row in labels if row["image_source"] != "none"]
+    if not pictured:
+        return []
+    table = SampleTable(store.location.uri, store.location.options)
+    order = spread(pictured, lambda r: (r["image_source"], r["expert"], r["clip_id"]), lambda r: str(r["attempt_id"]))
+    strips = []
+    for row in order[:N_STRIPS]:
+        sample = table.sample(row["attempt_id"], VIEW_COLUMNS)
+        front = front_camera(sample)
+        earlier = earlier_images(sample, front) if front is not None else []
+        strips.append(
+            Strip(
+                f"{row['expert']}, round {row['round']}, log {row['log_id']}, sample {row['attempt_id']}",
+                row["image_source"],
+                tuple(_frame(image, CAMERA_PX) for image in images_at_now(sample)),
+                tuple(_frame(image, CAMERA_PX // 2) for image in earlier) if len(earlier) > 1 else (),
+                *(_seen_again(store, sample) if row["image_source"] == ImageSource.RENDER else ()),
+            )
+        )
+    return strips
+
+
+def _seen_again(store: Store, sample: Row) -> tuple[tuple[Picture, ...], tuple[Picture, ...]]:
+    """Photos with their renderings, and now from the side; nothing where the scene is not at hand."""
+    scene = scene_of(store, str(sample["asset_digest"]))
+    if scene is None:
+        return (), ()
+    photos = photographed(store, sample, scene)
+    now_s = sample["clip_start_s"] + sample["now_s"]
+    pairs = [] if photos is None else real_and_rendered(scene, photos, now_s, (front_camera(photos) or "",))
+    shown = [seen for pair in pairs for seen in pair]
+    return tuple(_again(seen) for seen in shown), tuple(_again(seen) for seen in from_the_side(scene, sample))
+
+
+def _again(seen: Seen) -> Picture:
+    height = round(CAMERA_PX * seen.pixels.shape[0] / seen.pixels.shape[1])
+    return Picture(encoded(fitted(seen.pixels, CAMERA_PX, height)), seen.caption)
+
+
+def _frame(image: Mapping[str, Any], width: int) -> Picture:
+    caption = f"{image['camera']} {image['time_s']:+.1f} s"
+    try:
+        pixels = decoded(image)
+    except ValueError as error:
+        return Picture(None, str(error))
+    return Picture(encoded(fitted(pixels, width, round(width * pixels.shape[0] / pixels.shape[1]))), caption)
+
+
+class Again:
+    """Prepared clips of a run, from the cache where it holds them, and attempts made again from them."""
+
+    def __init__(self, store: Store, work: FactoryWork, refs: Mapping[str, ClipRef]) -> None:
+        self._store, self._work, self._refs = store, work, refs
+        self._prepared_again = 0
+        self._known: dict[str, PerturbedClip | None] = {}
+
+    def picture(self, outcome: Row) -> Picture | None:
+        """A rejected attempt; None where its clip is not at hand or it was made with other settings."""
+        if outcome["settings_hash"] != self._work.identity.settings_hash or outcome["expert"] not in self._work.experts:
+            return None
+        payload = self._clip(outcome["clip_id"])
+        if payload is None or outcome["candidate_index"] >= len(payload.candidates):
+            return None
+        trace = self._work.trace(payload, outcome["candidate_index"], outcome["expert"])
+        image = attempt_picture(payload.clip, trace.candidate, trace.judged, "", BEV_PX)
+        caption = f"{outcome['expert']}: {outcome['stage']}.{outcome['reason']}"
+        detail = f"{outcome['detail']}; log {outcome['log_id']}; candidate {outcome['candidate_index']}"
+        if trace.rejected is not None and trace.rejected.reason != outcome["reason"]:
+            detail = f"made again it fell to {trace.rejected.reason}: this attempt is not reproducible. {detail}"
+        return Picture(encoded(nearer(image)), caption, detail)
+
+    def _clip(self, clip_id: str) -> PerturbedClip | None:
+        if clip_id not in self._known:
+            self._known[clip_id] = self._load(clip_id)
+        return self._known[clip_id]
+
+    def _load(self, clip_id: str) -> PerturbedClip | None:
+        try:
+            stored = self._store.cache.load(cache_key(clip_id, self._work.identity.prepare_digest))
+        except BadCacheFile:
+            stored = None  # the next run prepares it again and says so
+        if stored is None and clip_id in self._refs and self._prepared_again < MAX_PREPARED_AGAIN:
+            self._prepared_again += 1
+            try:
+                stored = self._work.prepare(self._refs[clip_id])
+            except BadClip:
+                return None
+        payload = stored.payload if isinstance(stored, PreparedClip) else None
+        return payload if isinstance(payload, PerturbedClip) else None

@@ -1,0 +1,194 @@
+"""`python -m factory lineage out=<folder or URL> sample=<id>`: where a sample, or any other attempt, comes from.
+
+    python -m factory lineage 3fa9 out=runs/demo            an id, the beginning of one, or an ordinal
+    python -m factory lineage sample=0 out=s3://bucket/samples
+
+Run -> clip -> candidate -> attempt -> sample, with digests, versions and files.
+Exit codes: 0 shown, 2 bad arguments, or nothing there to show.
+"""
+
+import json
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from factory.config.arguments import Refused, answer
+from factory.views.report_words import to_the_side, turned
+from factory.views.status import open_store
+
+if TYPE_CHECKING:
+    from factory.store.samples import Store
+    from factory.store.table import KeyedTable
+
+Row = Mapping[str, Any]
+Part = tuple[str, list[tuple[str, object]]]
+
+
+@dataclass(frozen=True)
+class Request:
+    """The command line."""
+
+    out: str
+    sample: str
+
+
+def main(argv: Sequence[str]) -> int:
+    """The command; returns the exit code."""
+    named = [argument if "=" in argument or argument.startswith("-") else f"sample={argument}" for argument in argv]
+    return answer(str(__doc__), Request, named, lines_of)
+
+
+def lines_of(request: Request) -> Iterable[str]:
+    """The chain as text. Raises Refused where no attempt, or more than one, is meant."""
+    for title, facts in lineage(open_store(request.out), request.sample):
+        yield title
+        yield from (f"  {name:<18}{value}" for name, value in facts if value not in (None, ""))
+
+
+def lineage(store: "Store", which: str) -> list[Part]:
+    """The chain, part by part. Raises Refused as above."""
+    from factory.store.samples import run_number
+
+    attempt_id = _meant(store, which)
+    is_sample = attempt_id in store.samples
+    path, row = _row(store.samples if is_sample else store.outcomes, attempt_id)
+    records = store.runs()
+    number = run_number(records)(row)
+    record = records[number] if number >= 0 else {}
+    clip = _clip(store, row)
+    parts = [("run", _run_facts(store, record, number, row)), ("clip", _clip_facts(store, row, clip))]
+    if row["candidate_index"] >= 0:
+        parts.append(("candidate", _candidate_facts(row, clip)))
+    parts.append(("attempt", _attempt_facts(store, row)))
+    parts.append(("sample", _sample_facts(store, row, path)) if is_sample else ("no sample", _fate(store, row, path)))
+    return parts
+
+
+def _meant(store: "Store", which: str) -> str:
+    ids = sorted(store.samples)
+    if which.isascii() and which.isdecimal() and int(which) < len(ids):
+        return ids[int(which)]
+    found = sorted({key for table in (store.samples, store.outcomes) for key in table if key.startswith(which)})
+    if len(found) != 1:
+        some = f": {', '.join(found[:8])}" if found else ""
+        raise Refused(f"sample={which} is the beginning of {len(found)} attempts{some}")
+    return found[0]
+
+
+def _row(table: "KeyedTable", attempt_id: str) -> tuple[str, Row]:
+    """The file it stands in, and the row without what is large."""
+    import pyarrow.compute as pc
+
+    large = {"images", "cameras", "label_subscores", "label_progress"}
+    small = [f.name for f in table.spec.schema if f.name not in large and not f.name.startswith(("agent_", "lane_"))]
+    for path, keys in table.files([table.spec.key]):
+        if attempt_id in keys[table.spec.key].to_pylist():
+            rows = table.read_file(path, table.live_files()[path], small)
+            return path, rows.filter(pc.equal(rows[table.spec.key], attempt_id)).to_pylist()[0]
+    raise Refused(f"{attempt_id} is in no file of {table.location.uri}: python -m factory verify says what is damaged")
+
+
+def _clip(store: "Store", row: Row) -> Row:
+    """The clip's row of candidates with its file, empty where it has none."""
+    if row["clip_id"] not in store.candidates:
+        return {}
+    import pyarrow.compute as pc
+
+    for path, rows in store.candidates.files():
+        found = rows.filter(pc.equal(rows["clip_id"], row["clip_id"])).to_pylist()
+        if found:
+            return {**found[0], "file": path}
+    return {}
+
+
+def _run_facts(store: "Store", record: Row, number: int, row: Row) -> list[tuple[str, object]]:
+    versions = ", ".join(f"{stage} {version}" for stage, version in json.loads(row["stage_versions"]).items())
+    return [
+        ("settings", f"{row['settings_hash']}, record {number + 1} of {store.location.uri}/run.json"),
+        ("stage versions", versions),
+        ("vocabulary", record.get("vocabulary_digest")),
+        ("seed", dict(record.get("settings", {})).get("seed")),
+    ]
+
+
+def _clip_facts(store: "Store", row: Row, clip: Row) -> list[tuple[str, object]]:
+    from factory.graph.steps import cache_key
+
+    cached = f"cache/prepared/{cache_key(row['clip_id'], clip['prepare_digest'])}.npz" if clip else ""
+    start = row.get("clip_start_s")
+    return [
+        ("clip", row["clip_id"]),
+        ("data set", row["dataset"]),
+        ("log", row["log_id"] + (f" from {start:.1f} s" if start is not None else "")),
+        ("split, licence", f"{row['split']}, {row['licence']}" if "split" in row else ""),
+        ("content digest", row.get("content_digest") or clip.get("content_digest")),
+        ("candidates", f"{clip['n_candidates']}, in candidates/{clip['file']}" if clip else "none listed"),
+        ("prepared under", clip.get("prepare_digest")),
+        ("prepared clip", cached if cached and store.location.has(cached) else ""),
+    ]
+
+
+def _candidate_facts(row: Row, clip: Row) -> list[tuple[str, object]]:
+    found = next((c for c in clip.get("candidates", ()) if c["index"] == row["candidate_index"]), None)
+    facts: list[tuple[str, object]] = [("place in the list", row["candidate_index"])]
+    if found is None:
+        return facts
+    x, y, heading, speed = (found[name] for name in ("end_x", "end_y", "end_heading", "end_speed"))
+    return [
+        *facts,
+        ("vocabulary row", f"{found['vocabulary_index']} of {clip['vocabulary_digest']}"),
+        ("ends", f"{x:+.2f} m along, {to_the_side(y)}, {turned(heading)}, at {speed:.2f} m/s"),
+        ("grid cell", ", ".join(map(str, found["cell"]))),
+        ("EPDMS", f"{found['score']:.3f} against log replay, {found['reactive_score']:.3f} among reacting agents"),
+    ]
+
+
+def _attempt_facts(store: "Store", row: Row) -> list[tuple[str, object]]:
+    earlier = [
+        f"{o['candidate_index']} {o['kind']} by {o['stage']}.{o['reason']}".removesuffix(" by .")
+        for o in store.outcomes.read(["clip_id", "expert", "candidate_index", "kind", "stage", "reason"]).to_pylist()
+        if (o["clip_id"], o["expert"]) == (row["clip_id"], row["expert"])
+        and 0 <= o["candidate_index"] < row["candidate_index"]
+    ]
+    return [
+        ("attempt", row["attempt_id"]),
+        ("expert", f"{row['expert']}, inputs {row['expert_digest']}" if row["expert"] else "the clip as a whole"),
+        ("tried before it", "; ".join(sorted(earlier, key=lambda text: int(text.split()[0])))),
+    ]
+
+
+def _sample_facts(store: "Store", row: Row, path: str) -> list[tuple[str, object]]:
+    from factory.store.episodes import FOLDER, episode_name
+
+    labels = f"{row['label_vocabulary']}, traffic {row['label_traffic']}" if row["label_vocabulary"] else "none"
+    episode = f"{FOLDER}/{episode_name(row)}"
+    asset, psnr = row["asset_digest"], row["psnr"]
+    return [
+        ("round", row["round"]),
+        ("scores", f"EPDMS {_score(row['stage1_score'])} perturbed, {_score(row['stage2_score'])} driven"),
+        ("images", f"source {row['image_source']}"),
+        ("scene", f"{asset}" + (f", {psnr:.2f} dB on held-out photos" if psnr is not None else "") if asset else ""),
+        ("labels", labels),
+        ("file", f"{store.samples.location.uri}/{path}"),
+        ("table version", store.samples.version),
+        ("episode", episode if store.location.has(episode) else ""),
+    ]
+
+
+def _fate(store: "Store", row: Row, path: str) -> list[tuple[str, object]]:
+    return [
+        ("became", row["kind"]),
+        ("by", f"{row['stage']}.{row['reason']}".strip(".")),
+        ("detail", row["detail"]),
+        ("error", row["error"].strip().splitlines()[-1] if row["error"] else ""),
+        ("file", f"{store.outcomes.location.uri}/{path}"),
+    ]
+
+
+def _score(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,277 @@
+"""A sample's block seen again: its photos beside their renderings, the same instant from the side, a film of it.
+
+Everything comes from the store: rows, and the scenes in its cache. Photos are those of the log's human samples.
+"""
+
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factory.stages.scene_file import BadScene, find_scene
+from factory.store.reader import SampleTable
+from factory.store.samples import Store
+from factory.store.schema import AGENT_STEPS, NOW_INDEX
+from factory.views.bev import BACKGROUND
+from factory.views.sample_picture import (
+    BEV_COLUMNS,
+    CAPTION_PX,
+    beside,
+    decoded,
+    ego_way,
+    front_camera,
+    in_rows,
+    note,
+    padded,
+    sample_bev,
+    tile,
+)
+from tasks.caches import user_cache
+from tasks.render.scene.asset import RenderAsset, psnr
+from tasks.render.scene.engine import render, vehicles_at
+from tasks.render.settings import ImageSource
+from tasks.render.views import VISIBLE_M, pose_on_ground
+from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.camera import Pinhole
+from tasks.world.clip import STEP_S
+from tasks.world.frames import to_world
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+Row = Mapping[str, Any]
+
+ASIDE_M = (2.0, 1.0, 0.0, -1.0, -2.0)  # left is positive, and on the left of the strip
+STRIP_PX = (320, 180 + CAPTION_PX + 4)
+HOLD_S = 0.5  # how long a stored image stands in a film: they are taken at 2 Hz,
+SLACK_S = 0.06  # give or take this much
+AGENT_COLUMNS = (
+    "now_pose",
+    "agent_ids",
+    "agent_kinds",
+    "agent_boxes",
+    "agent_velocities",
+    "agent_valid",
+    "agent_heights",
+    "agent_center_z",
+)
+VIEW_COLUMNS = (
+    *dict.fromkeys((*BEV_COLUMNS, *AGENT_COLUMNS)),
+    "attempt_id",
+    "clip_id",
+    "log_id",
+    "clip_start_s",
+    "now_s",
+    "world_from_ego",
+    "cameras",
+    "images",
+    "image_source",
+    "asset_digest",
+)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A camera's picture with what it shows."""
+
+    pixels: Image
+    caption: str
+
+
+def digest_of(store: Store, row: Row) -> str | None:
+    """Of the scene that a row was rendered from, for a row of photos that of another row of its clip; None: none."""
+    if row["asset_digest"] is not None:
+        return str(row["asset_digest"])
+    others = store.samples.read(("clip_id", "asset_digest")).to_pylist()
+    of_clip = {other["asset_digest"] for other in others if other["clip_id"] == row["clip_id"]}
+    return min(of_clip - {None}, default=None)
+
+
+def scene_of(store: Store, digest: str) -> RenderAsset | None:
+    """The block's scene of a digest; None where the cache has it no more, or has it damaged."""
+    folder = Path(store.location.uri, "cache") if store.location.is_local else user_cache() / "assets"
+    try:
+        return find_scene(folder, digest)
+    except BadScene:
+        return None  # the next run builds it again and says so
+
+
+def photographed(store: Store, row: Row, asset: RenderAsset) -> dict[str, Any] | None:
+    """Of the human samples with photos in the scene's stretch of the row's log, the one nearest in time; None: none."""
+    first, last = (-np.inf, np.inf) if asset.block is None else (asset.block.start_s, asset.block.end_s)
+    wanted = ("attempt_id", "log_id", "image_source", "clip_start_s", "now_s")
+    found = [
+        other
+        for other in store.samples.read(wanted).to_pylist()
+        if other["log_id"] == row["log_id"]
+        and other["image_source"] == ImageSource.PHOTO
+        and first <= _now(other) <= last
+    ]
+    if not found:
+        return None
+    nearest = min(found, key=lambda other: (abs(_now(other) - _now(row)), other["attempt_id"]))
+    return SampleTable(store.location.uri, store.location.options).sample(nearest["attempt_id"], VIEW_COLUMNS)
+
+
+def real_and_rendered(
+    asset: RenderAsset, photos: Row, at_s: float, only: Sequence[str] = ()
+) -> list[tuple[Seen, Seen]]:
+    """For each camera the photo nearest to a time since the log's first instant, and the scene from the same pose.
+
+    Cameras that look to the left come first, as they stand side by side.
+
+    `photos`: VIEW_COLUMNS of a human sample, whose agents are the log's; `only` these cameras, all for none.
+    """
+    agents, pairs = agents_of(photos), []
+    for camera in sorted(photos["cameras"], key=_looks_right):
+        mine = [image for image in photos["images"] if image["camera"] == camera["name"]]
+        if only and camera["name"] not in only:
+            continue
+        nearest = min(mine, key=lambda image: abs(_now(photos) + image["time_s"] - at_s), default=None)
+        if nearest is None:
+            continue
+        photo = decoded(nearest)
+        pose = np.reshape(nearest["ego_pose"], (4, 4))
+        (again,) = drawn(asset, [camera], pose, agents, nearest["time_s"])
+        gap = _now(photos) + nearest["time_s"] - at_s
+        said = "at the sample's now" if abs(gap) < STEP_S / 2 else f"{gap:+.1f} s from the sample's now"
+        pairs.append(
+            (
+                Seen(photo, f"{camera['name']}  photo, {said}"),
+                Seen(again, f"rendered from its pose: {psnr(photo, again):.1f} dB"),
+            )
+        )
+    return pairs
+
+
+def _looks_right(camera: Mapping[str, Any]) -> float:
+    """How far to the right a camera looks, clockwise from behind [rad]."""
+    ahead, left = np.reshape(camera["ego_from_camera"], (4, 4))[:2, 2]
+    return float(-np.arctan2(left, ahead))
+
+
+def from_the_side(asset: RenderAsset, row: Row) -> list[Seen]:
+    """What the front camera sees at now from ASIDE_M beside the ego; nothing for a row without images."""
+    front = front_camera(row)
+    if front is None:
+        return []
+    rig, agents = [camera for camera in row["cameras"] if camera["name"] == front], agents_of(row)
+    out = []
+    for aside_m in ASIDE_M:
+        pose = pose_at(row, NOW_INDEX)
+        pose[:3, 3] += aside_m * pose[:3, 1]
+        side = f"{abs(aside_m):g} m to the {'left' if aside_m > 0 else 'right'}"
+        caption = side if aside_m else f"{front}, rendered at now"
+        out.append(Seen(drawn(asset, rig, pose, agents, 0.0)[0], caption))
+    return out
+
+
+def again_sheet(pairs: Sequence[tuple[Seen, Seen]], strip: Sequence[Seen]) -> Image | None:
+    """Photos over their renderings, and the strip below; None for neither."""
+    parts = []
+    if pairs:
+        shown = [*(photo for photo, _ in pairs), *(again for _, again in pairs)]
+        parts.append(in_rows([tile(s.pixels, s.caption, STRIP_PX) for s in shown], len(pairs)))
+    if strip:
+        parts.append(in_rows([tile(s.pixels, s.caption, STRIP_PX) for s in strip], len(strip)))
+    return stacked(parts) if parts else None
+
+
+def stacked(parts: Sequence[Image]) -> Image:
+    """One below the other, narrower ones with background to their right."""
+    width = max(part.shape[1] for part in parts)
+    return np.concatenate([padded(p.swapaxes(0, 1), width).swapaxes(0, 1) for p in parts])
+
+
+def film(row: Row, asset: RenderAsset | None, logged: Array | None = None) -> Iterator[Image]:
+    """A sample at 10 Hz, from 1.5 s before its now to the label's end: from above, and through its cameras.
+
+    A rendered sample is drawn anew at every step where its scene is at hand; else stored images stand until the next.
+    """
+    agents = agents_of(row)
+    rendered = asset is not None and row["image_source"] == ImageSource.RENDER
+    for step in range(AGENT_STEPS):
+        time_s = (step - NOW_INDEX) * STEP_S
+        if rendered and asset is not None:
+            views = drawn(asset, row["cameras"], pose_at(row, step), agents, time_s)
+            named = zip(row["cameras"], views)
+            tiles = [tile(view, f"{camera['name']}  {time_s:+.1f} s") for camera, view in named]
+        else:
+            tiles = list(_standing(row, time_s)) or [note(f"no images: image_source is {row['image_source']}")]
+        yield _even(beside(sample_bev(row, logged, (720, 720), step=step), tiles))
+
+
+def _standing(row: Row, time_s: float) -> Iterable[Image]:
+    """Tiles of the stored images that were taken last, each camera's for HOLD_S."""
+    for camera in row["cameras"] or ():
+        taken = [
+            image
+            for image in row["images"]
+            if image["camera"] == camera["name"] and -SLACK_S <= time_s - image["time_s"] < HOLD_S - SLACK_S
+        ]
+        if taken:
+            last = max(taken, key=lambda image: float(image["time_s"]))
+            yield tile(decoded(last), f"{last['camera']}  {last['time_s']:+.1f} s")
+        else:
+            yield note(f"{camera['name']}: no image at {time_s:+.1f} s")
+
+
+def drawn(
+    asset: RenderAsset, cameras: Sequence[Mapping[str, Any]], world_from_ego: Array, agents: AgentTracks, time_s: float
+) -> list[Image]:
+    """What cameras of a row see from a pose (4, 4), with the row's agents `time_s` after its now."""
+    there = vehicles_at(agents, time_s + NOW_INDEX * STEP_S, world_from_ego[:2, 3], VISIBLE_M)
+    eyes = [
+        Pinhole(
+            np.reshape(camera["intrinsics"], (3, 3)),
+            world_from_ego @ np.reshape(camera["ego_from_camera"], (4, 4)),
+            camera["width"],
+            camera["height"],
+        )
+        for camera in cameras
+    ]
+    return [
+        np.rint(view.rgb * 255.0).astype(np.uint8) for view in render(asset, eyes, there, threads=os.cpu_count() or 1)
+    ]
+
+
+def pose_at(row: Row, step: int) -> Array:
+    """(4, 4) 3-D pose of the ego at a 10 Hz step, on the ground that the row's own 3-D poses stand on."""
+    known = [np.reshape(image["ego_pose"], (4, 4)) for image in row["images"]]
+    way = to_world(np.asarray(row["now_pose"], dtype=float), ego_way(row)[step : step + 1])
+    return pose_on_ground(np.stack(known), way)[0]
+
+
+def agents_of(row: Row) -> AgentTracks:
+    """The row's agents in the world, step NOW_INDEX being now."""
+    n = len(row["agent_ids"])
+    boxes = np.asarray(row["agent_boxes"], dtype=float).reshape(n, AGENT_STEPS, 5).transpose(1, 0, 2).copy()
+    pose = np.asarray(row["now_pose"], dtype=float)
+    boxes[..., :3] = to_world(pose, boxes[..., :3])
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    velocities = np.asarray(row["agent_velocities"], dtype=float).reshape(n, AGENT_STEPS, 2).transpose(1, 0, 2)
+    return AgentTracks(
+        track_ids=tuple(row["agent_ids"]),
+        kinds=tuple(AgentKind(kind) for kind in row["agent_kinds"]),
+        boxes=boxes,
+        velocities=velocities @ np.array([[c, s], [-s, c]]),
+        valid=np.asarray(row["agent_valid"], dtype=bool).reshape(n, AGENT_STEPS).T,
+        center_z=np.asarray(row["agent_center_z"], dtype=float).reshape(n, AGENT_STEPS).T,
+        heights=np.asarray(row["agent_heights"], dtype=float),
+    )
+
+
+def _now(row: Row) -> float:
+    """Seconds since the log's first instant."""
+    return float(row["clip_start_s"] + row["now_s"])
+
+
+def _even(image: Image) -> Image:
+    """H.264 with 4:2:0 colours takes even sizes."""
+    height, width = image.shape[:2]
+    whole = np.full((height + height % 2, width + width % 2, 3), BACKGROUND, np.uint8)
+    whole[:height, :width] = image
+    return whole

@@ -1,0 +1,240 @@
+"""`python -m factory show out=<folder or URL>`: what a store holds.
+
+    python -m factory show out=runs/demo                  counts, acceptance funnel, the newest run
+    python -m factory show out=runs/demo list=true        sample ids, one a line
+    python -m factory show out=runs/demo sample=0         one sample: numbers, and a picture in the current folder
+    python -m factory show out=runs/demo sample=3fa9      the same by its id, or the beginning of it
+    python -m factory show out=runs/demo sample=0 to=x.png    ... the picture there (a folder, or a file ending in .png)
+    python -m factory show out=runs/demo sample=0 film=true   ... and a film of it beside the picture (.mp4)
+    python -m factory show out=runs/av2 sample=0 vocabulary=human.npy   ... with every labelled trajectory by its score
+    python -m factory show out=runs/demo failed=true      failed attempts: file, field, message, how to retry
+
+Where the block's scene is still in the run's cache, a sample's picture also shows the log's photos, the scene from the
+same poses, and the sample's now as seen from up to 2 m to either side.
+Exit codes: 0 shown, 2 bad arguments, or nothing there to show.
+"""
+
+import signal
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from factory.config.arguments import Refused, answer
+from factory.views.status import failed_lines, open_store, status_lines
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from factory.store.samples import Store
+    from factory.views.seen_again import Seen
+    from tasks.render.scene.asset import RenderAsset
+
+
+@dataclass(frozen=True)
+class Request:
+    """The command line."""
+
+    out: str
+    sample: str | None = None  # attempt_id, its beginning, or an ordinal
+    failed: bool = False
+    list: bool = False
+    to: str | None = None
+    film: bool = False
+    vocabulary: str | None = None  # .npy that the labels are of; without it the kinematic one, where they are of that
+
+    def __post_init__(self) -> None:
+        if sum((self.sample is not None, self.failed, self.list)) > 1:
+            raise ValueError("choose one of sample=, failed=true and list=true")
+        if self.to is not None and self.sample is None:
+            raise ValueError("to= says where the picture of sample= goes; give sample= too")
+        if self.film and self.sample is None:
+            raise ValueError("film=true is of sample=; give sample= too")
+        if self.vocabulary is not None and self.sample is None:
+            raise ValueError("vocabulary= is drawn in the picture of sample=; give sample= too")
+
+
+def main(argv: Sequence[str]) -> int:
+    """The command; returns the exit code."""
+    return answer(str(__doc__), Request, argv, lines_of)
+
+
+def lines_of(request: Request) -> Iterable[str]:
+    """The lines to print. Raises Refused where there is nothing to show."""
+    store = open_store(request.out)
+    if request.failed:
+        return failed_lines(store)
+    if request.list:
+        return sample_ids(store)
+    if request.sample is not None:
+        return sample_lines(store, find(store, request.sample), request)
+    return status_lines(store)
+
+
+def sample_ids(store: "Store") -> list[str]:
+    """In the order of ordinals. Raises Refused where there are none."""
+    ids = sorted(store.samples)
+    if not ids:
+        raise Refused(f"{store.location.uri} holds no sample; without sample= it shows why")
+    return ids
+
+
+def find(store: "Store", which: str) -> str:
+    """The attempt_id meant by an ordinal, an id or the beginning of one. Raises Refused."""
+    ids = sample_ids(store)
+    if which.isascii() and which.isdecimal() and int(which) < len(ids):
+        return ids[int(which)]
+    found = [key for key in ids if key.startswith(which)]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise Refused(f"sample={which} is the beginning of {len(found)} ids: {', '.join(found[:8])}")
+    dropped = [row for row in store.outcomes.read().to_pylist() if row["attempt_id"].startswith(which)]
+    if len(dropped) == 1:
+        row = dropped[0]
+        why = row["error"] or f"{row['stage']}.{row['reason']} {row['detail']}".strip(". ")
+        raise Refused(f"{row['attempt_id']} is no sample but a {row['kind']} attempt of {row['expert']}: {why}")
+    raise Refused(f"no sample {which}: ids begin otherwise, ordinals go from 0 to {len(ids) - 1}; see list=true")
+
+
+def sample_lines(store: "Store", attempt_id: str, request: Request) -> Iterable[str]:
+    """One sample's numbers; writes its picture and says where it is."""
+    from factory.store.reader import SampleTable
+    from factory.views.sample_picture import encoded, sample_sheet
+    from factory.views.seen_again import again_sheet, digest_of, film, scene_of, stacked
+
+    try:
+        row = SampleTable(store.location.uri, store.location.options)[attempt_id]
+    except ValueError as error:  # of another schema version
+        raise Refused(str(error)) from error
+    path = _picture_path(attempt_id, request.to)
+    drawn = labelled_trajectories(row, request.vocabulary)
+    yield from _numbers(row)
+    yield from _label_lines(row, drawn is not None)
+    logged = logged_drive(store, row)
+    sheets = [sample_sheet(row, logged, vocabulary=drawn)]
+    digest = digest_of(store, row)
+    scene = None if digest is None else scene_of(store, digest)
+    if digest is not None and scene is None:
+        yield f"              scene {digest} is not in the run's cache: nothing is rendered anew"
+    if scene is not None and (again := again_sheet(*seen_again(store, row, scene))) is not None:
+        sheets.append(again)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(encoded(stacked(sheets), ".png"))
+        yield f"picture       {path.resolve()}"
+        if request.film:
+            from factory.views.video import write_mp4
+
+            write_mp4(path.with_suffix(".mp4"), film(row, scene, logged))
+            yield f"film          {path.with_suffix('.mp4').resolve()}"
+    except OSError as error:
+        raise Refused(f"to={request.to}: the picture cannot be written: {error}") from error
+
+
+def seen_again(
+    store: "Store", row: dict[str, Any], scene: "RenderAsset"
+) -> "tuple[list[tuple[Seen, Seen]], list[Seen]]":
+    """The log's photos nearest in time with their renderings, and the row's now from the side."""
+    from factory.views.seen_again import from_the_side, photographed, real_and_rendered
+
+    photos = photographed(store, row, scene)
+    pairs = [] if photos is None else real_and_rendered(scene, photos, row["clip_start_s"] + row["now_s"])
+    return pairs, from_the_side(scene, row)
+
+
+def labelled_trajectories(row: dict[str, Any], file: str | None) -> "NDArray[np.float64] | None":
+    """(K, 40, 3) that the row's labels are of; None where they are of a file that was not named.
+
+    Raises Refused where the named file holds others, or the row has no labels.
+    """
+    from factory.setup.settings import VocabularyChoice, choose_vocabulary
+    from factory.store.reader import labels_of
+
+    if row["label_vocabulary"] is None and file is None:
+        return None
+    try:
+        found = choose_vocabulary(VocabularyChoice(file, len(labels_of(row))))
+    except ValueError as error:
+        raise Refused(str(error)) from error
+    if found.digest == row["label_vocabulary"]:
+        return found.trajectories
+    if file is not None:
+        raise Refused(f"vocabulary={file} is {found.digest}, the sample's labels are of {row['label_vocabulary']}")
+    return None
+
+
+def _label_lines(row: dict[str, Any], drawn: bool) -> Iterable[str]:
+    from factory.store.reader import labels_of
+
+    if row["label_vocabulary"] is None:
+        yield "labels        none"
+        return
+    labels = labels_of(row)
+    scores = labels.pdm_score()
+    yield f"labels        {len(labels):,} trajectories of vocabulary {labels.vocabulary}, traffic {labels.traffic}"
+    above = (scores > 0.0).mean()
+    yield f"              EPDMS {scores.max():.3f} at best, {scores.mean():.3f} on average, {above:.0%} above 0"
+    if not drawn:
+        yield "              vocabulary=<its .npy> draws them"
+
+
+def logged_drive(store: "Store", row: dict[str, Any]) -> "NDArray[np.float64] | None":
+    """(81, 3) the log from T to T+2H, world frame, from the prepared clip; None where the cache has it no more."""
+    from factory.graph.steps import cache_key
+    from factory.stages.pipeline import logged_poses
+    from factory.store.cache import BadCacheFile
+
+    digests = {run["settings_hash"]: run["prepare_digest"] for run in store.runs()}
+    if row["settings_hash"] not in digests:
+        return None
+    try:
+        return logged_poses(store.cache.load(cache_key(row["clip_id"], digests[row["settings_hash"]])))
+    except BadCacheFile:
+        return None
+
+
+def _numbers(row: dict[str, Any]) -> Iterable[str]:
+    from factory.views.report_words import to_the_side, turned
+    from tasks.stages import SUBSCORES
+
+    yield f"sample        {row['attempt_id']}"
+    yield f"clip          {row['clip_id']}, {row['dataset']} log {row['log_id']} at {row['clip_start_s']:.1f} s"
+    yield f"              split {row['split']}, licence {row['licence'] or '-'}"
+    yield f"expert        {row['expert']}, round {row['round']}, candidate {row['candidate_index']}"
+    vx, vy, ax, ay = row["ego_status"]
+    yield f"ego           {vx:.2f}, {vy:.2f} m/s; {ax:.2f}, {ay:.2f} m/s2; command {row['command']}"
+    if row["candidate_end"] is not None:
+        x, y, heading, speed = row["candidate_end"]
+        yield f"perturbed by  {x:+.2f} m along, {to_the_side(y)}, {turned(heading)}, at {speed:.2f} m/s"
+    x, y, heading = row["label_10hz"][-1]
+    yield f"label         ends {x:+.2f} m ahead, {to_the_side(y)}, turned {turned(heading)} after 4 s"
+    images, source = row["images"] or (), row["image_source"]
+    cameras = ", ".join(dict.fromkeys(image["camera"] for image in images))
+    tags = ", ".join(row["tags"]) or "-"
+    yield f"world         {len(row['agent_ids'])} agents, {len(row['lane_ids'])} lanes; tags {tags}"
+    yield f"images        {len(images)} from source {source}" + (f": {cameras}" if cameras else "")
+    if row["psnr"] is not None:
+        yield f"block         {row['psnr']:.2f} dB"
+    yield f"scores        {'':11}" + "".join(f"{name:>7}" for name in (*SUBSCORES, "EPDMS"))
+    for prefix, title in (("stage1", "perturbed"), ("stage2", "driven")):
+        values = [row[f"{prefix}_{name}"] for name in (*SUBSCORES, "score")]
+        if any(value is not None for value in values):
+            texts = ("-" if value is None else f"{value:.3f}" for value in values)
+            yield f"              {title:<11}" + "".join(f"{text:>7}" for text in texts)
+
+
+def _picture_path(attempt_id: str, to: str | None) -> Path:
+    target = Path(to or ".").expanduser()
+    if target.suffix.lower() == ".png":
+        return target
+    if target.suffix and not target.is_dir():
+        raise Refused(f"to={to}: the picture is a PNG; name a file ending in .png, or a folder")
+    return target / f"sample_{attempt_id}.png"
+
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `... list=true | head` ends quietly
+    sys.exit(main(sys.argv[1:]))

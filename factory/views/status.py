@@ -1,0 +1,157 @@
+"""`python -m factory status|funnel|failed out=<folder or URL>`: how a run stands, from its tables.
+
+    python -m factory status out=runs/demo        tables, counts, acceptance funnel, the newest run
+    python -m factory funnel out=runs/demo        acceptance by expert and round, and why the rest was not
+    python -m factory failed out=runs/demo        failed attempts: file, field, message, how to retry
+
+Exit codes: 0 shown, 2 bad arguments, or nothing there to show.
+"""
+
+import json
+import os
+import shlex
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from factory.config.arguments import Refused, answer
+from factory.wording import one_line
+
+if TYPE_CHECKING:
+    from factory.store.samples import Store
+
+EXIT_WORDS = {0: "complete", 3: "complete with failed attempts", 4: "interrupted, the same command goes on"}
+RETRY = {
+    "input": "mend or take out the named file, then python -m factory retry out=...",
+    "bug": "python -m factory retry out=..., once the code or the plug-in is mended",
+    "system": "the next run of the same command tries it again by itself",
+    "poison": "it brought workers down in several runs; python -m factory retry out=... tries it once more",
+}
+
+
+@dataclass(frozen=True)
+class Request:
+    """The command line."""
+
+    out: str
+
+
+def status(argv: Sequence[str]) -> int:
+    """The command `status`; the exit code."""
+    return answer(str(__doc__), Request, argv, lambda request: status_lines(open_store(request.out)))
+
+
+def funnel(argv: Sequence[str]) -> int:
+    """The command `funnel`; the exit code."""
+    return answer(str(__doc__), Request, argv, lambda request: funnel_lines(open_store(request.out)))
+
+
+def failed(argv: Sequence[str]) -> int:
+    """The command `failed`; the exit code."""
+    return answer(str(__doc__), Request, argv, lambda request: failed_lines(open_store(request.out)))
+
+
+class NothingThere(Refused):
+    """No run has written here."""
+
+    def __init__(self, uri: str) -> None:
+        super().__init__(f"no store at {uri}: give the out= of a run of python -m factory.run")
+        self.uri = uri
+
+
+def open_store(out: str) -> "Store":
+    """Raises NothingThere where there is no run, Refused where there can be none."""
+    if not out.strip():
+        raise Refused("out= is empty: name the folder or URL of a run (a shell variable that is not set?)")
+    os.environ.setdefault("RUST_LOG", "error")  # what the object store's client warns of, the error says again
+    from deltalake.exceptions import DeltaError
+
+    from factory.store.location import BadLocation
+    from factory.store.samples import Store
+
+    try:
+        store = Store(out)
+    except (BadLocation, OSError, DeltaError) as error:
+        raise Refused(f"out={out}: {one_line(error)}") from error
+    if store.samples.version is None and store.outcomes.version is None and store.candidates.version is None:
+        raise NothingThere(store.location.uri)
+    return store
+
+
+def status_lines(store: "Store") -> Iterable[str]:
+    """Tables, counts, funnel and the newest run."""
+    from factory.store.funnel import funnel_of
+
+    samples = store.samples.read(["expert", "round", "split", "image_source", "dataset"]).to_pylist()
+    outcomes = Counter(store.outcomes.read(["kind"])["kind"].to_pylist())
+    yield f"store       {store.location.uri}"
+    for table in (store.samples, store.candidates, store.outcomes):
+        version = "not there yet" if table.version is None else f"version {table.version}"
+        yield f"{table.spec.name:<12}{len(table):,} rows, {len(table.live_files())} files, {version}"
+    for title in ("dataset", "split", "image_source"):
+        counts = Counter(row[title] for row in samples)
+        yield f"{title:<14}" + (", ".join(f"{name} {n}" for name, n in sorted(counts.items())) or "no samples")
+    yield "not samples   " + (", ".join(f"{kind} {n}" for kind, n in sorted(outcomes.items())) or "none")
+    yield ""
+    yield funnel_of(store).text().rstrip()
+    yield ""
+    yield from _last_run(store)
+
+
+def _last_run(store: "Store") -> Iterable[str]:
+    data = store.location.read("last_run.json")
+    if data is None:
+        yield "newest run    did not finish; run the same command again to go on"
+        return
+    run = json.loads(data)
+    yield f"newest run    exit code {run['exit_code']}: {EXIT_WORDS.get(run['exit_code'], 'see its output')}"
+    executed = ", ".join(f"{name} {count}" for name, count in run["executed"].items())
+    yield f"executed      {executed}"
+    seconds = ", ".join(f"{stage} {s['seconds']:.1f} ({s['tasks']})" for stage, s in run["seconds"].items())
+    yield f"seconds       {seconds or 'nothing was left to do'}  (tasks in brackets)"
+    for note in (*([run["message"]] if run["message"] else []), *run["notes"]):
+        yield f"note          {note}"
+    if store.location.read("report.html") is not None:
+        yield f"report        {store.location.uri}/report.html"
+
+
+def funnel_lines(store: "Store") -> Iterable[str]:
+    """The funnel as a table."""
+    from factory.store.funnel import funnel_of
+
+    yield funnel_of(store).text().rstrip()
+
+
+def failed_line(store: "Store") -> str:
+    """What failed, how often, how the first error ends, and what shows all of it; for the end of a run."""
+    rows = [row for row in store.outcomes.read().to_pylist() if row["kind"] == "failed"]
+    kinds = Counter(row["error_kind"] for row in rows)
+    counts = ", ".join(f"{kind} {n}" for kind, n in sorted(kinds.items()))
+    first = min(rows, key=_place)
+    where = f"{first['expert']} on clip {first['clip_id']}" if first["expert"] else f"clip {first['clip_id']}"
+    said = (first["error"].strip().splitlines() or ["no message"])[-1]
+    return (
+        f"{len(rows)} failed ({counts}), the first, {where}: {said}\n"
+        f"all of them: python -m factory failed out={shlex.quote(store.location.uri)}"
+    )
+
+
+def _place(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    return row["log_id"], row["clip_id"], row["expert"], row["candidate_index"]
+
+
+def failed_lines(store: "Store") -> Iterable[str]:
+    """Every failed attempt with its message, and how to try it again."""
+    rows = [row for row in store.outcomes.read().to_pylist() if row["kind"] == "failed"]
+    kinds = Counter(row["error_kind"] for row in rows)
+    yield f"{len(rows)} failed" + (": " + ", ".join(f"{kind} {n}" for kind, n in sorted(kinds.items())) if rows else "")
+    for row in sorted(rows, key=_place):
+        what = f"expert {row['expert']}, candidate {row['candidate_index']}" if row["expert"] else "the clip as a whole"
+        yield ""
+        yield f"{row['attempt_id']}  {row['error_kind']}, tried in {row['tries']} runs"
+        yield f"  log {row['log_id']}, clip {row['clip_id']}, {what}"
+        yield from (f"  | {line}" for line in row["error"].splitlines())
+    for kind in sorted(kinds):
+        yield ""
+        yield f"to retry {kind}: {RETRY[kind]}"

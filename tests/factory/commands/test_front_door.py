@@ -1,0 +1,294 @@
+"""`python -m factory ...`: one door, suggestions, completion, lineage, retry; exit codes."""
+
+import json
+import os
+import pty
+import select
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from factory.__main__ import main
+from factory.commands.completion import candidates, settings_of
+from factory.commands.table import COMMANDS, PLANNERS
+from factory.graph.episodes import EpisodesWanted
+from factory.graph.execute import execute
+from factory.store.samples import CURRENT_RUN, Store
+from factory.views.logged_drive import prepared_episode
+from factory.views.status import failed_line
+from planners.__main__ import main as planners_main
+from tests.factory.filmed import FilmedWork
+from tests.factory.toy import ToyWork, refs
+
+REPOSITORY = Path(__file__).resolve().parents[3]
+HEAVY = ("numpy", "ray", "torch", "hydra", "omegaconf", "pyarrow", "deltalake", "numba", "cv2", "rich")
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Samples with episodes, rejections, an attempt that raised."""
+    folder = tmp_path_factory.mktemp("out")
+    work = FilmedWork(trouble={"log0:2000:recovery:1": "bug"})
+    given = ["executor=local", "episodes=all", f"out={folder}", "rounds=2"]
+    store = Store(folder)
+    execute(
+        work,
+        refs(4),
+        ["recovery", "human"],
+        2,
+        store,
+        "local",
+        episodes=EpisodesWanted(1, prepared_episode),
+        command=given,
+        say=lambda line: None,
+    )
+    return folder
+
+
+def ask(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
+    code = main(arguments)
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def light(code: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Runs it where nothing heavy may be imported."""
+    script = f"import sys\n{code}\nassert not set({HEAVY}) & set(sys.modules), set({HEAVY}) & set(sys.modules)"
+    env = os.environ | {"PYTHONPATH": str(REPOSITORY)}
+    return subprocess.run([sys.executable, "-c", script, *arguments], env=env, capture_output=True, text=True)
+
+
+def test_every_command_is_listed_and_helps_itself_without_heavy_imports() -> None:
+    listed = light("from factory.__main__ import main; assert main(['--help']) == 0")
+    assert listed.returncode == 0, listed.stderr
+    assert all(f"  {name} " in listed.stdout and command.about in listed.stdout for name, command in COMMANDS.items())
+    needs_more = {"explain", "vocabulary", "scene", "verify"}
+    asked = [name for name in COMMANDS if name not in needs_more]
+    shown = light(f"from factory.__main__ import main\nfor name in {asked}: assert main([name, '--help']) == 0, name")
+    assert shown.returncode == 0, shown.stderr
+    assert shown.stdout.lower().count("exit codes") >= len(asked)
+
+
+@pytest.mark.parametrize("name", ["explain", "vocabulary", "scene", "verify"])
+def test_the_others_help_too(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert ask(capsys, name, "--help")[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "meant"),
+    [
+        (("stauts", "out=x"), "did you mean status?"),
+        (("xyzzy",), "there is no command xyzzy; see --help"),
+        (("status", "outt=x"), "did you mean out=?"),
+        (("show", "smaple=0"), "did you mean sample=?"),
+        (("run", "rounsd=3"), "did you mean rounds=?"),
+        (("run", "render.widht=3"), "did you mean render.width=?"),
+    ],
+)
+def test_a_mistyped_word_gets_a_suggestion_and_ends_with_2(
+    arguments: tuple[str, ...], meant: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, text, error = ask(capsys, *arguments)
+    assert code == 2 and not text and meant in error
+
+
+def test_status_funnel_and_failed_are_what_show_shows(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, status, _ = ask(capsys, "status", f"out={out}")
+    assert code == 0 and status == ask(capsys, "show", f"out={out}")[1]
+    code, funnel, _ = ask(capsys, "funnel", f"out={out}")
+    assert code == 0 and funnel.strip() in status
+    code, failed, _ = ask(capsys, "failed", f"out={out}")
+    assert code == 0 and failed == ask(capsys, "show", f"out={out}", "failed=true")[1]
+    assert "ZeroDivisionError" in failed and "python -m factory retry" in failed
+
+
+def test_a_run_with_failures_ends_with_what_failed_how_often_and_what_shows_all(out: Path) -> None:
+    clip_id = next(row["clip_id"] for row in Store(out).outcomes.read().to_pylist() if row["kind"] == "failed")
+    assert failed_line(Store(out)).splitlines() == [
+        f"1 failed (bug 1), the first, recovery on clip {clip_id}: ZeroDivisionError: a bug in a stage",
+        f"all of them: python -m factory failed out={out}",
+    ]
+
+
+def test_each_door_lists_its_commands_and_names_those_of_the_other(capsys: pytest.CaptureFixture[str]) -> None:
+    assert planners_main(["--help"]) == 0
+    shown = capsys.readouterr().out
+    code, ours, _ = ask(capsys, "--help")
+    assert code == 0 and "python -m planners <command>" in ours
+    for name, command in PLANNERS.items():
+        assert f"  {name} " in shown and f"  {name} " in ours and command.about in shown
+        assert callable(command.load())
+    modules = {command.module for command in PLANNERS.values()}
+    runnable = {
+        ".".join(path.relative_to(REPOSITORY).with_suffix("").parts)
+        for path in (REPOSITORY / "planners").rglob("*.py")
+        if path.stem != "__main__" and 'if __name__ == "__main__"' in path.read_text()
+    }
+    assert modules == runnable, "every command that can be run is listed"
+    assert planners_main(["evalute"]) == 2
+    assert "did you mean evaluate?" in capsys.readouterr().err
+    assert planners_main(["run", "rounds=5"]) == 2
+    assert "python -m factory run" in capsys.readouterr().err
+
+
+def test_lineage_goes_from_the_run_to_the_file(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    store = Store(out)
+    row = next(
+        row
+        for row in store.samples.read(["attempt_id", "clip_id", "expert", "round", "candidate_index"]).to_pylist()
+        if row["expert"] == "recovery" and row["candidate_index"] > row["round"]
+    )
+    code, text, _ = ask(capsys, "lineage", row["attempt_id"][:12], f"out={out}")
+    assert code == 0
+    titles = [line for line in text.splitlines() if not line.startswith(" ")]
+    assert titles == ["run", "clip", "candidate", "attempt", "sample"]
+    facts = dict(line.strip().split(None, 1) for line in text.splitlines() if line.startswith("  "))
+    assert facts["clip"] == row["clip_id"] and facts["attempt"] == row["attempt_id"]
+    assert facts["round"] == str(row["round"]) and "rejected by reward." in facts["tried"]
+    assert Path(facts["file"]).is_file() and (out / facts["episode"]).is_file()
+    assert (out / facts["prepared"].split()[-1]).is_file() or "prepared clip" in text
+
+
+def test_lineage_of_what_is_no_sample_says_what_became_of_it(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rejected = next(o for o in Store(out).outcomes.read().to_pylist() if o["kind"] == "rejected")
+    code, text, _ = ask(capsys, "lineage", f"out={out}", f"sample={rejected['attempt_id']}")
+    assert code == 0 and "no sample" in text and f"reward.{rejected['reason']}" in text
+    assert ask(capsys, "lineage", "zz", f"out={out}")[0] == 2
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """The arguments of every run that a command would begin; none is begun."""
+    found: list[list[str]] = []
+
+    def run(argv: Sequence[str]) -> int:
+        found.append(list(argv))
+        return 0
+
+    monkeypatch.setattr("factory.run.main", run)
+    return found
+
+
+def test_retry_says_what_and_how_and_leaves_the_rest_alone(
+    out: Path, asked: list[list[str]], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(out)
+    code, text, _ = ask(capsys, "retry", f"out={out}", "dry_run=true")
+    assert code == 0 and "1 failed: bug 1" in text and "ZeroDivisionError" in text and not asked
+    assert f"python -m factory run executor=local episodes=all rounds=2 out={out} retry_failed=true" in text
+    assert ask(capsys, "retry", f"out={out}", "workers=1")[0] == 0
+    assert asked == [["executor=local", "episodes=all", "rounds=2", "workers=1", f"out={out}", "retry_failed=true"]]
+
+
+def test_retry_calls_no_code_that_a_table_alone_names(
+    out: Path, asked: list[list[str]], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(out)
+    location, named = Store(out).location, "+expert.mine._target_=my_package.MyExpert"
+    kept = location.read(CURRENT_RUN)
+    document = {"folder": str(out), "command": ["rounds=2", named]}
+    location.write(CURRENT_RUN, json.dumps(document).encode())
+    try:
+        code, _, error = ask(capsys, "retry", f"out={out}")
+        assert code == 2 and named in error and not asked
+        assert ask(capsys, "retry", f"out={out}", named)[0] == 0
+    finally:
+        location.write(CURRENT_RUN, kept or b"{}")
+    assert asked == [["rounds=2", named, f"out={out}", "retry_failed=true"]]
+
+
+def test_retry_of_a_run_without_failures_or_without_a_record_does_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    execute(ToyWork(), refs(1), ["human"], 1, Store(tmp_path / "fine"), "local", say=lambda line: None)
+    assert ask(capsys, "retry", f"out={tmp_path / 'fine'}")[:2] == (0, "0 failed\n")
+    work = ToyWork(trouble={"log0:0:human:-1": "bug"})
+    execute(work, refs(1), ["human"], 1, Store(tmp_path / "old"), "local", say=lambda line: None)
+    code, _, error = ask(capsys, "retry", f"out={tmp_path / 'old'}")
+    assert code == 2 and "records no settings" in error
+
+
+def test_completion_knows_commands_keys_groups_and_choices() -> None:
+    assert set(candidates([], "")) == set(COMMANDS)
+    assert {"clips=", "rounds=", "render.width=", "vocabulary.file="} <= set(candidates(["run"], ""))
+    assert "rounds=" not in candidates(["run", "rounds=5"], "")
+    assert set(candidates(["run"], "clips=")) >= {"clips=av2", "clips=synthetic"}
+    assert set(candidates(["run"], "executor=")) == {"executor=ray", "executor=local"}
+    assert set(candidates(["plan"], "on_change=")) == {"on_change=stop", "on_change=keep", "on_change=redo"}
+    assert "clips.root=" in candidates(["run", "clips=av2"], "") and "clips.root=" not in candidates(["run"], "")
+    assert set(candidates(["show"], "film=")) == {"film=true", "film=false"}
+    assert set(candidates(["export"], "m")) == {"mcap", "mp4", "rerun"}
+    assert {"dry_run=", "workers="} <= set(candidates(["retry"], ""))
+    assert not list(candidates(["nothing"], ""))
+
+
+def test_every_key_that_is_completed_is_one_the_run_takes() -> None:
+    from factory.config.compose import compose
+
+    def has(tree: object, key: str) -> bool:
+        for part in key.split("."):
+            if not isinstance(tree, dict) or part not in tree:
+                return False
+            tree = tree[part]
+        return True
+
+    groups, settings = {"preset"}, compose("run", [])
+    unknown = [key for key in settings_of([]) if key not in groups and not has(settings, key)]
+    assert unknown == []
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")
+def test_bash_completes_the_end_of_the_line(tmp_path: Path) -> None:
+    script = tmp_path / "ask.bash"
+    script.write_text(
+        f'source <("{sys.executable}" -m factory completion bash)\n'
+        'asked() { COMP_LINE=$1 COMP_POINT=${#1}; COMPREPLY=(); $2 2>/dev/null; echo "${COMPREPLY[*]}"; }\n'
+        "asked 'factory sta' _factory_complete\nasked 'python -m factory run executor=l' _factory_python\n"
+        "asked 'factory run clips=sc' _factory_complete\nasked 'python setup.py ' _factory_python\n"
+    )
+    env = os.environ | {"PYTHONPATH": str(REPOSITORY)}
+    done = subprocess.run(["bash", str(script)], env=env, capture_output=True, text=True)
+    assert done.stdout.splitlines() == ["status", "local", "scenarionet", ""], done.stderr
+
+
+@pytest.mark.skipif(shutil.which("zsh") is None, reason="there is no zsh")
+def test_zsh_completes_what_is_typed_before_tab() -> None:
+    env = {"PATH": os.environ["PATH"], "HOME": "/nonexistent", "TERM": "dumb", "PYTHONPATH": str(REPOSITORY)}
+    ours, theirs = pty.openpty()
+    shell = subprocess.Popen(["zsh", "-f", "-i"], stdin=theirs, stdout=theirs, stderr=theirs, env=env)
+    os.close(theirs)
+
+    def heard(typed: str, answer: str) -> bool:
+        os.write(ours, typed.encode())
+        said, end = "", time.monotonic() + 60
+        while answer not in said and time.monotonic() < end:
+            if select.select([ours], [], [], 0.2)[0]:
+                said += os.read(ours, 65536).decode()
+        return answer in said
+
+    try:
+        begin = f"autoload -Uz compinit; compinit -u -D; source <({sys.executable} -m factory completion zsh)"
+        assert heard(f"{begin}; print REA''DY\n", "READY")
+        for typed, answer in (
+            ("python -m factory stat", "factory status "),
+            ("factory run preset=de", "factory run preset=demo "),
+            ("factory export mc", "export mcap "),
+            ("factory run executor=", "executor=local  executor=ray"),
+        ):
+            assert heard(f"\x15{typed}\t", answer), typed  # \x15 clears the line
+    finally:
+        shell.kill()
+        shell.wait()
+        os.close(ours)
+
+
+def test_completion_is_quick_and_another_shell_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    done = light("from factory.commands.completion import complete; complete(['factory run clips='])")
+    assert done.returncode == 0 and "clips=av2" in done.stdout, done.stderr
+    assert ask(capsys, "completion", "fish")[0] == 2
+    assert "compdef _factory_complete factory" in ask(capsys, "completion", "zsh")[1]

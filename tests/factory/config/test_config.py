@@ -1,0 +1,263 @@
+"""Configuration: every choice complete and equal to its dataclass, everything unknown an error that names it."""
+
+import dataclasses
+import math
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from factory.config.compose import ConfigError, build, compose, conf_dir, fill
+from factory.readers.base import ClipIndex
+from factory.setup.settings import (
+    RecoverySources,
+    RewardSettings,
+    RunConfig,
+    assemble,
+    build_expert,
+    load_config,
+    open_reader,
+    refuse_missing_backend,
+)
+from tasks.experts.pdm_closed.planner import PdmSettings
+from tasks.experts.recovery.expert import RecoverySettings
+from tasks.perturb import PerturbSettings
+from tasks.render.settings import RenderMode, RenderSettings
+from tasks.rollout.simulate import TrafficSettings
+from tasks.world.kinematic_vocabulary import kinematic_trajectories
+from tasks.world.vocabulary import Vocabulary
+
+REPOSITORY = Path(__file__).resolve().parents[3]
+DENSE = PerturbSettings(max_longitudinal_m=8.0, step_longitudinal_m=1.0, interleaved=False, order="spread", at_most=32)
+GROUPS = [
+    ("perturb/paper", PerturbSettings()),
+    ("perturb/dense", DENSE),
+    ("traffic/idm", TrafficSettings()),
+    ("traffic/replay", TrafficSettings(mode="replay")),
+    ("pdm/navsim", PdmSettings()),
+    ("pdm/corrected", PdmSettings(shared_lead_memory=False, brakes_at_first_step=False, speed_below_zero=False)),
+    ("reward/epdms", RewardSettings()),
+    ("render/auto", RenderSettings()),
+    ("render/map", RenderSettings(mode=RenderMode.MAP)),
+    ("render/none", RenderSettings(mode=RenderMode.NONE)),
+]
+
+
+def plain(value: object) -> object:
+    """As YAML would hold it."""
+    if isinstance(value, dict):
+        return {key: plain(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(inner) for inner in value]
+    return str(value) if isinstance(value, str) else value
+
+
+def group(name: str) -> dict[str, Any]:
+    folder, choice = name.split("/")
+    chosen: dict[str, Any] = compose("run", [f"{folder}={choice}"])[folder]
+    return chosen
+
+
+@pytest.mark.parametrize(("name", "defaults"), GROUPS, ids=[name for name, _ in GROUPS])
+def test_a_group_holds_exactly_the_fields_of_its_dataclass_with_the_same_defaults(name: str, defaults: Any) -> None:
+    assert group(name) == plain(dataclasses.asdict(defaults))
+    assert fill(type(defaults), group(name), name) == defaults
+
+
+def test_the_recovery_expert_s_file_holds_all_its_settings() -> None:
+    defaults = dataclasses.asdict(RecoverySources()) | dataclasses.asdict(RecoverySettings())
+    assert compose("run", [])["expert"]["recovery"] == {"kind": "recovery"} | plain(defaults)  # type: ignore[operator]
+
+
+def test_the_run_s_keys_are_those_of_its_dataclass() -> None:
+    assert set(compose("run", [])) == {field.name for field in dataclasses.fields(RunConfig)}
+    config = load_config([])
+    assert (config.rounds, config.executor, config.limit) == (1, "ray", None)
+    assert config.perturb == PerturbSettings()
+    assert config.reward == RewardSettings()
+
+
+@pytest.mark.parametrize(
+    ("override", "named"),
+    [
+        ("rounds_=2", "rounds_"),
+        ("perturb.max_lateral=3", "max_lateral"),
+        ("+perturb.max_lateral=3", "perturb.max_lateral"),
+        ("+render.asset.gap=3", "render.asset.gap"),
+        ("traffic=fast", "traffic=fast: there is idm, replay"),
+        ("colour=red", "colour"),
+        ("rounds", "rounds"),
+    ],
+)
+def test_a_misspelt_override_is_an_error_that_names_it(override: str, named: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(named)):
+        load_config([override])
+
+
+@pytest.mark.parametrize(
+    ("clips", "message"),
+    [
+        ("av2", "clips.root is missing: give clips.root=<folder>"),
+        ("custom", "clips._target_ is missing: give clips._target_=<value>"),
+    ],
+)
+def test_a_value_that_must_be_given_is_asked_for_by_its_key(clips: str, message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_config([f"clips={clips}"])
+    assert str(caught.value) == message
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("rounds=0", "rounds=0: at least one round is needed"),
+        ("perturb.epdms_min=2", "perturb: perturb epdms_min must be from 0 to 1, not 2.0"),
+        ("rounds=many", r"rounds: must be a whole number \(got 'many'\)"),
+    ],
+)
+def test_an_error_says_what_was_given_but_never_prints_a_whole_group(override: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=rf"^{message}$"):
+        load_config([override])
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("width", (0, 15, -320)),
+        ("height", (0, 15)),
+        ("jpeg_quality", (0, 101)),
+        ("psnr_min", (-1.0, math.nan, math.inf)),
+        ("lidar_only_reach_m", (-0.1, math.nan, math.inf)),
+    ],
+)
+def test_render_settings_out_of_range_are_refused(name: str, values: tuple[float, ...]) -> None:
+    for value in values:
+        with pytest.raises(ConfigError, match=f"render {name} must be"):
+            fill(RenderSettings, {name: value}, "render")
+
+
+def test_render_settings_at_their_bounds_are_taken() -> None:
+    for quality in (1, 100):
+        RenderSettings(width=16, height=16, jpeg_quality=quality, psnr_min=0.0, lidar_only_reach_m=0.0)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("rounds=many", r"rounds: .*'many'"),
+        ("rounds=0", "rounds=0"),
+        ("limit=0", "limit=0"),
+        ("shard_seconds=0", "shard_seconds=0"),
+        ("executor=spark", r"executor: .*'spark'"),
+        ("experts=[]", "at least one"),
+        ("experts=[human,human]", "each expert once"),
+        ("perturb.epdms_min=high", r"perturb\.epdms_min"),
+        ("perturb.step_lateral_m=0", "step_lateral_m must be positive"),
+        ("traffic.headway_s=-1", "headway_s must be positive"),
+        ("reward.full=[nc,comfort]", "comfort"),
+        ("render.mode=photo", r"render\.mode"),
+        ("render.map_rig=five_front", r"map_rig=five_front is not among .*three_front"),
+        ("vocabulary.k=0", "k=0: must be positive"),
+    ],
+)
+def test_a_value_of_the_wrong_kind_is_an_error_that_names_it(override: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        load_config([override])
+
+
+def test_an_unknown_expert_is_an_error_and_lists_the_known() -> None:
+    known = r"\['follow_up', 'follow_up_before', 'human', 'human_before', 'logged', 'pdm_closed', 'recovery'\]"
+    with pytest.raises(ConfigError, match=rf"\['mine'\] is not among {known}"):
+        load_config(["experts=[human,mine]"])
+
+
+def built(*overrides: str) -> object:
+    config = load_config([*overrides, "experts=[mine]"])
+    no_clips: Any = object()
+    return build_expert("mine", config, no_clips, ClipIndex(()), Vocabulary(kinematic_trajectories(3, 0)))
+
+
+def test_an_expert_is_added_by_its_target_with_all_its_arguments() -> None:
+    expert = built("+expert.mine._target_=tasks.experts.human.Human", "+expert.mine.name=me")
+    assert (type(expert).__name__, expert.name) == ("Human", "me")  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["+expert.mine._target_=nowhere.Expert"], r"expert\.mine: .*nowhere"),
+        (["+expert.mine._target_=tasks.experts.human.Nobody"], r"expert\.mine: .*Nobody"),
+        (["+expert.mine._target_=tasks.experts.human.Human", "+expert.mine.speed=3"], r"(?s)expert\.mine: .*speed"),
+        (["+expert.mine._target_=collections.Counter"], r"Counter is not an expert .* no name, digest, plan"),
+        (["+expert.mine.kind=magic"], r"expert\.mine\.kind=magic"),
+        (["+expert.mine.speed=3"], r"expert\.mine\._target_ is missing"),
+        (["+expert.mine.kind=human", "+expert.mine.speed=3"], r"unknown setting expert\.mine\.speed"),
+        (["+expert.mine.kind=pdm_closed", "+expert.mine.speed=3"], r"unknown setting expert\.mine\.speed"),
+        (["+expert.mine.kind=recovery", "+expert.mine.speed=3"], r"unknown setting expert\.mine\.speed"),
+        (["+expert.mine.kind=recovery", "+expert.mine.table=[1]"], r"expert\.mine\.table"),
+    ],
+)
+def test_an_expert_that_cannot_be_made_is_an_error_that_names_what(overrides: list[str], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        built(*overrides)
+
+
+def test_something_that_is_no_reader_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"Counter is not a reader .* no name, index, read"):
+        open_reader({"name": "custom", "_target_": "collections.Counter"})
+    with pytest.raises(ConfigError, match=r"clips\._target_ is missing"):
+        build({"name": "custom"}, "clips")
+
+
+def test_a_root_without_clips_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="clips"):
+        open_reader(load_config(["clips=av2", f"clips.root={tmp_path}"]).clips)
+
+
+def test_the_installed_package_carries_its_configuration(tmp_path: Path) -> None:
+    """The wheel's layout: conf inside the package, no checkout around it."""
+    packages = ("factory", "tasks")
+    for name in packages:
+        shutil.copytree(REPOSITORY / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__", "conf"))
+    shutil.copytree(REPOSITORY / "conf", tmp_path / "factory" / "conf")
+    shown = "print(conf_dir()); print(compose('run', ['rounds=3'])['rounds'])"
+    code = f"from factory.config.compose import compose, conf_dir; {shown}"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd="/",
+        env={"PYTHONPATH": str(tmp_path), "PATH": ""},
+        capture_output=True,
+        text=True,
+    )
+    assert done.stdout.split() == [str(tmp_path / "factory" / "conf"), "3"], done.stderr
+
+
+def test_every_configuration_file_is_listed_as_package_data() -> None:
+    import tomllib
+
+    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["setuptools"]
+    assert (REPOSITORY / "factory" / "conf").resolve() == REPOSITORY / "conf"
+    assert "*.yaml" in project["package-data"]["*"]
+    folders = {path.parent.relative_to(REPOSITORY) for path in (REPOSITORY / "conf").rglob("*.yaml")}
+    assert {".".join(("factory", *folder.parts)) for folder in folders} <= set(project["packages"])
+    assert {path.suffix for path in (REPOSITORY / "conf").rglob("*") if path.is_file()} == {".yaml"}
+
+
+def test_an_installation_without_configuration_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("factory.config.compose.__file__", str(tmp_path / "factory" / "config.py"))
+    with pytest.raises(ConfigError, match=r"no conf/run\.yaml .* install it again"):
+        conf_dir()
+
+
+def test_a_backend_this_machine_lacks_is_refused_before_anything_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "gsplat", None)
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    with pytest.raises(ConfigError, match=r"render\.backend=gsplat needs torch and gsplat"):
+        assemble(load_config(["render.backend=gsplat", "clips=av2", "clips.root=/nowhere"]))
+    refuse_missing_backend(load_config(["render=none", "render.backend=gsplat"]))  # nothing is drawn with it
+    with pytest.raises(ConfigError, match=r"render\.backend"):
+        load_config(["render.backend=gpu"])

@@ -1,0 +1,45 @@
+"""The time left of a run follows from what its blocks and its samples have cost."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from factory.graph.execute import COMPLETE, COMPLETE_WITH_FAILURES, execute
+from factory.graph.forecast import Forecast, Work
+from factory.store.samples import Store
+from tests.factory.toy import ToyWork, refs
+
+EXPERTS = ["recovery", "human"]
+
+
+def test_what_is_left_costs_what_the_same_has_cost() -> None:
+    # two workers for 100 s: 3 of 4 blocks at 60 s, 10 of 30 samples at 2 s; left are 60 and 40 s of one worker
+    forecast = Forecast(Work(1, 3, 180.0), Work(20, 10, 20.0))
+    assert forecast.left_s(100.0) == pytest.approx(50.0)
+    forecast.blocks.finish(1)
+    assert forecast.left_s(100.0) == pytest.approx(20.0)
+
+
+def test_a_kind_of_work_that_nothing_is_known_of_leaves_the_time_open() -> None:
+    assert Forecast(Work(), Work(5)).left_s(10.0) is None
+    assert Forecast(Work(2, 3, 60.0), Work(5)).left_s(10.0) is None
+    assert Forecast(Work(2), Work(5, 5, 60.0)).left_s(10.0) is None
+    assert Forecast(Work(0, 3), Work(5, 5)).left_s(10.0) is None, "what is done was found in a cache"
+    assert Forecast(Work(0, 3, 60.0), Work(0, 5, 5.0)).left_s(10.0) == 0.0
+    assert Forecast(Work(), Work()).left_s(10.0) == 0.0
+
+
+def last_line(out: Path, work: ToyWork, rounds: int, capsys: pytest.CaptureFixture[str], code: int = COMPLETE) -> str:
+    experts: Sequence[str] = EXPERTS
+    capsys.readouterr()
+    assert execute(work, refs(4), experts, rounds, Store(out), "local", say=lambda line: None).exit_code == code
+    return [line for line in capsys.readouterr().err.splitlines() if line.startswith("clips ")][-1]
+
+
+def test_nothing_is_left_of_a_run_that_is_through(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    names = [f"{ref.log_id}:{ref.start_ms}" for ref in refs(4)]
+    ends = {names[0]: "standing", names[1]: "no_candidates", f"{names[2]}:human:-1": "bad"}
+    work = ToyWork(blocks=True, trouble=ends)
+    for rounds in (2, 3, 9):  # the last is more than any list has
+        assert "  ETA 0 s" in last_line(tmp_path, work, rounds, capsys, COMPLETE_WITH_FAILURES)

@@ -1,0 +1,140 @@
+"""A disk that fills up ends a run with exit code 4, loses nothing that was committed, and the same command goes on."""
+
+import re
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pyarrow.compute as pc
+import pytest
+
+from factory.commands.verify import verify
+from factory.graph.execute import COMPLETE, INTERRUPTED, RunSummary, execute
+from factory.graph.steps import failure_of
+from factory.run import main as run_main
+from factory.store.room import NoRoom, needs_room, no_room
+from factory.store.samples import Store
+from factory.store.usable import why_unusable
+from tests.factory.tables import assert_same_rows, assert_same_tables, tables_of
+from tests.factory.toy import ToyWork, refs
+
+LARGE = "64m"
+TOWN = ["clips.n_clips=3", "clips.settings.cameras=[]", "clips.settings.lidar_beams=0", "render=none"]
+TOWN += ["vocabulary.k=128", "rounds=2", "executor=local", "shard_seconds=0.001"]  # 6 MB, the pages 0.5 of them
+ONE_LINE = (
+    r"(?:error: )?{out}/\S+: the disk is full: [\d,]+ bytes are needed, [\d,]+ are free; make room and run the same"
+)
+
+
+def mount(folder: Path, *options: str) -> bool:
+    command = ["mount", "-t", "tmpfs", *options, "tmpfs", str(folder)]
+    return subprocess.run(command, capture_output=True).returncode == 0
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of its own, of 64 MB until it is made smaller."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    if not mount(folder, "-o", f"size={LARGE}"):
+        pytest.skip("a small disk is a tmpfs, and only root may mount one")
+    yield folder
+    subprocess.run(["umount", "--lazy", str(folder)], check=True)  # a failed test may hold a file open
+
+
+def resize(folder: Path, size: str) -> None:
+    subprocess.run(["mount", "-o", f"remount,size={size}", str(folder)], check=True)
+
+
+def run(out: Path) -> RunSummary:
+    work = ToyWork(threshold=0.4)
+    return execute(
+        work, refs(8), ["recovery", "human"], 2, Store(out), "local", shard_seconds=0.0, say=lambda line: None
+    )
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
+    out = tmp_path_factory.mktemp("undisturbed")
+    assert run(out).exit_code == COMPLETE
+    return set(Store(out).samples)
+
+
+@pytest.mark.parametrize("size", ["16k", "64k", "128k", "192k", "256k", "384k", "512k"])
+def test_wherever_the_disk_is_full_the_same_command_goes_on(disk: Path, undisturbed: set[str], size: str) -> None:
+    out = disk / "out"
+    resize(disk, size)
+    stopped = run(out)
+    assert stopped.exit_code == INTERRUPTED
+    assert str(out) in stopped.message and "bytes are needed" in stopped.message, stopped.message
+    assert "\n" not in stopped.message and "run the same command again" in stopped.message
+    resize(disk, LARGE)
+    committed = set(Store(out).samples)
+    assert committed <= undisturbed
+    assert not list(out.rglob("*.tmp")), "half a file takes room from the next run"
+    if Store(out).samples.version is not None:
+        assert verify(Store(out)).damage == ()
+        assert "failed" not in Store(out).outcomes.read(["kind"])["kind"].to_pylist(), (
+            "a full disk is no failed attempt"
+        )
+    assert run(out).exit_code == COMPLETE
+    assert set(Store(out).samples) == undisturbed
+    assert verify(Store(out)).damage == ()
+
+
+@pytest.fixture(scope="module")
+def whole_town(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the command makes where nothing disturbs it."""
+    out = tmp_path_factory.mktemp("town") / "out"
+    assert run_main([*TOWN, f"out={out}"]) == COMPLETE
+    return out
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", ["4200k", "4700k", "5500k"])
+def test_a_whole_run_on_a_disk_that_fills_says_so_once_and_goes_on(
+    disk: Path, whole_town: Path, size: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = [*TOWN, f"out={disk / 'out'}"]
+    resize(disk, size)
+    assert run_main(command) == INTERRUPTED
+    told = [line for line in capsys.readouterr().err.splitlines() if "full" in line]
+    assert len(told) == 1 and re.match(ONE_LINE.format(out=re.escape(str(disk / "out"))), told[0]), told
+    resize(disk, LARGE)
+    whole, _, _ = tables_of(whole_town)
+    committed, _, _ = tables_of(disk / "out")
+    assert len(committed) > 0
+    assert_same_rows(committed, whole.filter(pc.is_in(whole["attempt_id"], committed["attempt_id"])))
+    assert verify(Store(disk / "out")).damage == ()
+    assert run_main(command) == COMPLETE
+    assert_same_tables(disk / "out", whole_town)
+
+
+def test_some_of_these_disks_hold_a_part_of_the_samples(disk: Path, undisturbed: set[str]) -> None:
+    resize(disk, "512k")
+    run(disk / "out")
+    assert 0 < len(Store(disk / "out").samples) < len(undisturbed)
+
+
+def test_a_disk_without_room_for_a_row_group_is_refused_at_once(disk: Path) -> None:
+    assert why_unusable(str(disk / "deep" / "out")) == ""
+    resize(disk, "1m")
+    said = why_unusable(str(disk / "deep" / "out"))
+    assert "the disk is full: 4,194,304 bytes are needed, 1,04" in said
+    assert list(disk.iterdir()) == [], "nothing is left behind"
+
+
+def test_what_a_full_disk_said_is_found_behind_other_errors_and_in_delta_s_words(tmp_path: Path) -> None:
+    full = r"x: the disk is full: 1,234 bytes are needed, [\d,]+ are free"
+    with pytest.raises(NoRoom, match=full), needs_room(tmp_path / "x", 1234):
+        raise OSError("Generic LocalFileSystem error: No space left on device (os error 28)")
+    with pytest.raises(PermissionError), needs_room(tmp_path, 1):
+        raise PermissionError(13, "Permission denied")
+    try:
+        try:
+            raise OSError(28, "No space left on device", "/a/file")
+        except OSError as error:
+            raise RuntimeError("a plug-in's own words") from error
+    except RuntimeError as error:
+        assert failure_of(error).no_room == no_room(error) == "/a/file: the disk is full"
+    assert failure_of(ValueError("else")).no_room == ""

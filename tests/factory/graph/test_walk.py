@@ -1,0 +1,68 @@
+"""Walks: rounds are nested, incidents stop them, and where one stands follows from the tables alone."""
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from factory.graph.walk import Blocked, Complete, Exhausted, Step, Try, never, next_step, retry_policy
+from factory.store.outcomes import ErrorKind, Kind
+from factory.store.samples import Past
+
+
+def past(kind: Kind, round_: int = -1, error: str = "", versions: str = "v1") -> Past:
+    return Past("id", kind, True, round_, error, 1, versions)
+
+
+def walk(accepts: list[bool], rounds: int, known: dict[int, Past] | None = None) -> tuple[dict[int, Past], Step, int]:
+    """Walk to the end; (known, last step, attempts made)."""
+    known, made = dict(known or {}), 0
+    while isinstance(step := next_step("recovery", len(accepts), rounds, known, never), Try):
+        good = accepts[step.candidate]
+        known[step.candidate] = past(Kind.ACCEPTED, step.round) if good else past(Kind.REJECTED)
+        made += 1
+    return known, step, made
+
+
+LISTS = st.lists(st.booleans(), max_size=12)
+
+
+@given(LISTS, st.integers(1, 4), st.integers(0, 4))
+def test_more_rounds_go_on_where_fewer_stopped(accepts: list[bool], rounds: int, more: int) -> None:
+    first, _, made = walk(accepts, rounds)
+    resumed, step, made_later = walk(accepts, rounds + more, first)
+    direct, direct_step, made_directly = walk(accepts, rounds + more)
+    assert (resumed, step, made + made_later) == (direct, direct_step, made_directly)
+
+
+@given(LISTS, st.integers(1, 4), st.sets(st.integers(0, 11)))
+def test_any_lost_results_are_made_again_the_same(accepts: list[bool], rounds: int, lost: set[int]) -> None:
+    whole, step, _ = walk(accepts, rounds)
+    kept = {candidate: p for candidate, p in whole.items() if candidate not in lost}
+    assert walk(accepts, rounds, kept)[:2] == (whole, step)
+
+
+def test_a_walk_ends_complete_or_exhausted() -> None:
+    assert walk([True, False, True, True], 2)[1] == Complete()
+    assert walk([True, False], 2)[1] == Exhausted(2)
+    assert walk([], 1)[1] == Exhausted(0)
+    assert sorted(walk([True, False, True, True], 2)[0]) == [0, 1, 2]
+
+
+def test_the_human_drives_once_whatever_the_rounds() -> None:
+    assert next_step("human", 9, 5, {}, never) == Try(-1, 0)
+    for kind in (Kind.ACCEPTED, Kind.REJECTED):
+        assert next_step("human", 9, 5, {-1: past(kind, 0)}, never) == Complete()
+
+
+def test_a_failure_stops_the_walk_until_it_is_mended() -> None:
+    for kind in (ErrorKind.BUG, ErrorKind.INPUT, ErrorKind.POISON):
+        known = {0: past(Kind.FAILED, error=kind)}
+        assert next_step("recovery", 3, 2, known, retry_policy(False, "v1")) == Blocked(0, "failed")
+        assert next_step("recovery", 3, 2, known, retry_policy(True, "v1")) == Try(0, 0)
+        assert next_step("recovery", 3, 2, known, retry_policy(False, "v2")) == Try(0, 0)
+    system = {0: past(Kind.FAILED, error=ErrorKind.SYSTEM)}
+    assert next_step("recovery", 3, 2, system, retry_policy(False, "v1")) == Try(0, 0)
+
+
+def test_a_stored_round_that_the_walk_contradicts_is_not_built_upon() -> None:
+    step = next_step("recovery", 3, 3, {0: past(Kind.REJECTED), 1: past(Kind.ACCEPTED, 1)}, never)
+    assert isinstance(step, Blocked) and "round 1" in step.reason

@@ -1,0 +1,39 @@
+"""A reader tells, without reading a clip, whether the clip's log is still what it was."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import scenarionet_scenarios as town
+from test_av2 import write_log
+
+from factory.readers.av2.reader import AV2Reader
+from factory.readers.base import BadClip, ClipRef
+from factory.readers.logs import LogReader
+from factory.readers.scenarionet.reader import ScenarioNetReader
+
+
+def av2(folder: Path) -> tuple[AV2Reader, Path]:
+    """A reader, and a file of its log that clips are computed from."""
+    log = write_log(folder / "log-a")
+    return AV2Reader(log), next((log / "map").glob("log_map_archive_*.json"))
+
+
+def scenarionet(folder: Path) -> tuple[ScenarioNetReader, Path]:
+    """Likewise."""
+    return ScenarioNetReader(folder), town.save(town.nuplan(), folder)
+
+
+@pytest.mark.parametrize("make", [av2, scenarionet])
+def test_the_digest_is_the_clip_s_and_follows_the_log(make: Callable[..., tuple[LogReader, Path]], tmp_path: Path):
+    reader, file = make(tmp_path)
+    ref = reader.index().refs[0]
+    before = reader.digest(ref)
+    assert before == reader.read(ref).content_digest
+    content = file.read_bytes()
+    file.write_bytes(content + b" ")
+    assert reader.digest(ref) != before
+    file.write_bytes(content)
+    assert reader.digest(ref) == before
+    with pytest.raises(BadClip, match="no log gone"):
+        reader.digest(ClipRef(reader.name, "gone", 0))

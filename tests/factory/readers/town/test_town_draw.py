@@ -1,0 +1,157 @@
+"""The renderer and the lidar: true perspective, occlusion, shadows, textures that stay in the world."""
+
+import numpy as np
+import pytest
+
+from factory.readers.town import textures as tx
+from factory.readers.town.draw import SHADOW_SIZE, Stage, camera_view, look, paint, sun_over
+from factory.readers.town.draw import _cast as cast
+from factory.readers.town.mesh import Builder
+from factory.readers.town.scenery import _signal as signal_mast
+from factory.readers.town.scenery import lamps_lit
+from factory.readers.town.sensors import CAMERA_NAMES, MOUNT_M, REAR_AXLE_Z_M, build_rig, scan, world_from_ego
+from factory.readers.town.traffic import GREEN as GREEN_LIGHT
+from factory.readers.town.traffic import RED as RED_LIGHT
+from factory.readers.town.traffic import YELLOW as YELLOW_LIGHT
+
+FRONT = build_rig(("ring_front_center",), 320, 180)[0]
+SIDE = build_rig(("ring_side_left",), 320, 180)[0]
+RED = (1.0, 0.0, 0.0)
+GREEN = (0.0, 1.0, 0.0)
+
+
+def staged(builder: Builder, shadows: bool = False) -> Stage:
+    mesh = builder.mesh()
+    sun = sun_over(np.zeros(2), 0.4, 0.8)
+    shadow = np.full((SHADOW_SIZE, SHADOW_SIZE), -1e9, np.float32)
+    if shadows:
+        cast(shadow, mesh, sun)
+    return Stage(mesh, shadow, sun, np.zeros((1, 1, 9)), 1)
+
+
+def lamp(builder: Builder, at: tuple[float, float, float], size: float, colour: tuple[float, float, float]) -> None:
+    builder.box(at, (size, size, size), tx.GLOW, colour)
+
+
+def lawn(builder: Builder) -> None:
+    corners = np.array([[[-80, -80], [80, -80], [80, 80], [-80, 80]]], float)
+    builder.quads(np.concatenate([corners, np.zeros((1, 4, 1))], axis=-1), corners, tx.GRASS)
+
+
+@pytest.mark.parametrize("camera", build_rig(CAMERA_NAMES, 320, 180), ids=CAMERA_NAMES)
+def test_a_point_is_drawn_where_the_calibration_projects_it(camera) -> None:  # type: ignore[no-untyped-def]
+    ego = world_from_ego(np.array([10.0, -4.0, 0.7]))
+    in_camera = np.array([1.5, -0.6, 14.0, 1.0])  # right, up, ahead
+    world = ego @ camera.ego_from_camera @ in_camera
+    builder = Builder()
+    lamp(builder, tuple(world[:3]), 0.3, RED)
+    picture = paint(staged(builder), camera, ego).astype(int)
+    rows, columns = np.nonzero((picture[..., 0] > 150) & (picture[..., 1] < 120))
+    projected = camera.intrinsics @ in_camera[:3] / in_camera[2]
+    assert abs(columns.mean() + 0.5 - projected[0]) < 0.5
+    assert abs(rows.mean() + 0.5 - projected[1]) < 0.5
+
+
+def test_the_nearer_of_two_things_hides_the_other() -> None:
+    ego = world_from_ego(np.zeros(3))
+    for first, second in (((20.0, RED), (12.0, GREEN)), ((12.0, GREEN), (20.0, RED))):
+        builder = Builder()
+        for distance, colour in (first, second):
+            lamp(builder, (distance, 0.0, 1.65), 1.0, colour)
+        centre = paint(staged(builder), FRONT, ego)[90, 160]
+        assert centre[1] > centre[0]
+
+
+def test_twice_as_far_is_half_as_large() -> None:
+    widths = []
+    for distance in (10.0, 20.0):
+        builder = Builder()
+        builder.face([(distance, 2, 0), (distance, -2, 0), (distance, -2, 3), (distance, 2, 3)], tx.GLOW, RED)
+        picture = paint(staged(builder), FRONT, world_from_ego(np.array([-1.62, 0.0, 0.0]))).astype(int)
+        widths.append(int(((picture[90, :, 0] > 150) & (picture[90, :, 1] < 120)).sum()))
+    assert widths[0] == pytest.approx(2 * widths[1], abs=2)
+
+
+def test_a_surface_that_passes_beside_and_behind_the_camera_is_drawn_to_the_picture_edge() -> None:
+    builder = Builder()
+    lawn(builder)
+    picture = paint(staged(builder), FRONT, world_from_ego(np.zeros(3))).astype(int)
+    assert (picture[-1, :, 1] > picture[-1, :, 2]).all()  # lawn below, all along the lower edge
+    assert (picture[0, :, 2] > picture[0, :, 0] - 8).all()  # sky above
+
+
+def test_a_place_has_one_colour_from_wherever_it_is_seen() -> None:
+    """Big texture cells of a house front, seen from two places at the same pixel size."""
+    builder = Builder()
+    builder.face([(30, 40, 0), (30, -40, 0), (30, -40, 12), (30, 40, 12)], tx.FACADE, seed=4)
+    stage = staged(builder)
+    shifted = 8.0
+    one = paint(stage, FRONT, world_from_ego(np.array([0.0, 0.0, 0.0]))).astype(float)
+    two = paint(stage, FRONT, world_from_ego(np.array([0.0, shifted, 0.0]))).astype(float)
+    pixels = round(shifted * FRONT.intrinsics[0, 0] / (30.0 - 1.62))
+    same = np.abs(one[40:100, : 320 - pixels] - two[40:100, pixels:]).mean()
+    other = np.abs(one[40:100] - two[40:100]).mean()
+    assert same < 0.35 * other
+
+
+def test_what_stands_in_the_sun_casts_a_shadow() -> None:
+    builder = Builder()
+    lawn(builder)
+    ego = world_from_ego(np.zeros(3))
+    bright = paint(staged(builder, shadows=True), FRONT, ego)[120:].astype(float).mean()
+    builder.face([(0, -40, 30.0), (60, -40, 30.0), (60, 40, 30.0), (0, 40, 30.0)], tx.METAL)
+    sun = sun_over(np.zeros(2), 0.4, 0.8).direction
+    assert sun[2] > 0
+    dark = paint(staged(builder, shadows=True), FRONT, ego)
+    shifted = -30.0 * sun[:2] / sun[2]  # where the plate's shadow lies
+    assert np.abs(shifted).max() < 40.0
+    assert dark[170:].astype(float).mean() < 0.75 * bright
+
+
+def test_leaves_leave_gaps() -> None:
+    builder = Builder()
+    corners = np.array([[(8, 0.85, 0.8), (8, -0.85, 0.8), (8, -0.85, 2.5), (8, 0.85, 2.5)]], float)
+    uv = np.array([[(-0.85, -0.85), (0.85, -0.85), (0.85, 0.85), (-0.85, 0.85)]])
+    builder.quads(corners, uv, tx.LEAVES, (0.2, 0.4, 0.1), 3)
+    stage = staged(builder)
+    view, _rays = camera_view(FRONT.intrinsics, world_from_ego(np.zeros(3)) @ FRONT.ego_from_camera)
+    covered = (look(stage, view, 320, 180).ids >= 0).sum()
+    whole = (1.7 / (8 - 1.62) * FRONT.intrinsics[0, 0]) ** 2
+    assert 0.15 * whole < covered < 0.9 * whole
+
+
+def test_the_lidar_measures_the_road_and_a_wall_where_they_are() -> None:
+    builder = Builder()
+    lawn(builder)
+    builder.face([(25, 60, 0), (25, -60, 0), (25, -60, 20), (25, 60, 20)], tx.ISLAND_STONE)
+    sweep = scan(staged(builder), world_from_ego(np.zeros(3)), 24, 360)
+    points = sweep.points
+    wall = np.abs(points[:, 0] - 25.0) < 1e-3
+    ground = np.abs(points[:, 2] + REAR_AXLE_Z_M) < 1e-3
+    assert wall.sum() > 200
+    assert ground.sum() > 1500
+    assert (wall | ground).all()
+    assert not (points[:, 0] > 25.5).any()  # a beam at the foot of the wall may meet the lawn that far behind
+    assert np.hypot(*(points[ground] - MOUNT_M)[:, :2].T).min() > 3.0
+    assert sweep.laser_number.max() < 24
+    assert (np.diff(sweep.offset_ns[sweep.laser_number == 3]) > 0).all()
+
+
+@pytest.mark.parametrize(("state", "height"), [(RED_LIGHT, 3.38), (YELLOW_LIGHT, 3.0), (GREEN_LIGHT, 2.62)])
+def test_a_signal_shows_one_lamp_red_above_yellow_above_green(state: int, height: float) -> None:
+    lamps = lamps_lit(signal_mast(Builder(), np.zeros(3), 3.5), state)
+    bright = lamps.colour.max(axis=1) > 0.5
+    heights = lamps.vertices[bright][..., 2].mean(axis=1)
+    assert bright.sum() == len(lamps) / 3
+    assert np.abs(heights - height).min() < 0.1
+    assert {round(float(h), 1) for h in heights[:10]} <= {round(height + d, 1) for d in (-0.1, 0.0, 0.1)}
+
+
+def test_cameras_look_where_their_names_say() -> None:
+    ahead = {camera.name: camera.ego_from_camera[:3, 2] for camera in build_rig(CAMERA_NAMES, 64, 36)}
+    assert ahead["ring_front_center"] == pytest.approx([1, 0, 0])
+    assert ahead["ring_side_left"][1] > 0.9
+    assert ahead["ring_side_right"][1] < -0.9
+    assert ahead["ring_rear_center"] == pytest.approx([-1, 0, 0], abs=1e-9)
+    with pytest.raises(ValueError, match="unknown cameras"):
+        build_rig(("front",), 64, 36)

@@ -1,0 +1,114 @@
+"""Several towns as one data set: split by seed, each town written once, whole, and by itself."""
+
+from pathlib import Path
+
+import pytest
+
+import factory.readers.town.painters as painters_module
+from factory.readers.base import BadClip, ClipRef
+from factory.readers.town.reader import SyntheticReader
+from factory.readers.town.town import LOGS_PER_TOWN
+from factory.readers.town.towns import SyntheticTownsReader
+from factory.readers.town.write import TownSettings, write_logs, write_town
+
+BLIND = TownSettings(cameras=(), lidar_beams=0)
+
+
+def reader_of(folder: Path, seeds: list[int], n_logs: int = 1, **rest: object) -> SyntheticTownsReader:
+    return SyntheticTownsReader(seeds, logs_per_town=n_logs, cache_dir=folder, settings=BLIND, **rest)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("towns")
+
+
+@pytest.fixture(scope="module")
+def reader(folder: Path) -> SyntheticTownsReader:
+    return reader_of(folder, [18, 9], split="test")
+
+
+def test_every_clip_carries_the_split_and_names_its_town(reader: SyntheticTownsReader) -> None:
+    refs = reader.index().refs
+    assert len(refs) == 2 * 3
+    assert len({ref.clip_id for ref in refs}) == len(refs)
+    assert {ref.log_id.split("-")[1] for ref in refs[:3]} == {"18"}
+    assert {ref.log_id.split("-")[1] for ref in refs[3:]} == {"9"}
+    clip = reader.read(refs[-1])
+    assert (clip.dataset, clip.split, clip.log_id) == ("synthetic", "test", refs[-1].log_id)
+    assert clip.content_digest == reader.digest(refs[-1])
+
+
+def test_a_seeds_clips_are_the_same_whatever_other_seeds_are_read(reader: SyntheticTownsReader, folder: Path) -> None:
+    alone = reader_of(folder, [9], split="test")
+    assert alone.index().refs == reader.index().refs[3:]
+    assert alone.digest(alone.index().refs[0]) == reader.digest(reader.index().refs[3])
+    assert reader_of(folder, [9], split="train").digest(alone.index().refs[0]) != alone.digest(alone.index().refs[0])
+
+
+def test_nine_towns_of_two_logs_have_every_kind_of_drive_once(folder: Path) -> None:
+    indices = [i for town in reader_of(folder, list(range(9)), 2).towns for i in town.indices]
+    assert sorted(indices) == list(range(LOGS_PER_TOWN))
+
+
+@pytest.mark.slow
+def test_a_log_has_the_same_bytes_whatever_logs_are_written_beside_it(tmp_path: Path) -> None:
+    write_town(tmp_path / "all", 4, 3, BLIND)
+    alone = write_logs(tmp_path / "one", [1], 3, BLIND)[0]
+    files = [path for path in sorted(alone.rglob("*")) if path.is_file()]
+    assert files
+    for path in files:
+        assert path.read_bytes() == (tmp_path / "all" / path.relative_to(tmp_path / "one")).read_bytes()
+
+
+@pytest.mark.slow
+def test_a_town_is_written_once_and_only_where_it_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = reader_of(tmp_path, [0, 1])
+    first = next(iter(made.towns[1].logs()))
+    made.read(ClipRef("synthetic", first, 0))
+    assert [town.root.is_dir() for town in made.towns] == [False, True]
+    made.index()
+    assert [town.root.is_dir() for town in made.towns] == [True, True]
+    assert "town 1 of 1: seed 0, 1 logs painted" in capsys.readouterr().err
+
+    def killed(out: Path, *_rest: object) -> None:
+        (out / "half").mkdir()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(painters_module, "write_logs", killed)
+    assert len(reader_of(tmp_path, [0, 1]).index().refs) == 6
+    unfinished = reader_of(tmp_path, [2])
+    with pytest.raises(KeyboardInterrupt):
+        unfinished.index()
+    assert not unfinished.towns[0].root.exists()
+
+
+def test_first_window_skips_the_start_of_every_log(reader: SyntheticTownsReader, folder: Path) -> None:
+    later = reader_of(folder, [18, 9], split="test", first_window=1).index().refs
+    assert later == tuple(ref for ref in reader.index().refs if ref.start_ms >= 1000)
+    none_left = reader_of(folder, [18], first_window=3).index()
+    assert not none_left.refs
+    assert "a clip needs 12.6 s" in next(iter(none_left.skipped_logs.values()))
+
+
+def test_a_town_alone_reads_the_same_clip(reader: SyntheticTownsReader, tmp_path: Path) -> None:
+    ref = reader.index().refs[0]
+    assert reader.towns[0].indices == (0,)
+    single = SyntheticReader(tmp_path, 1, 18, BLIND)
+    assert single.index().refs == (ref,)
+    assert (single.read(ref).ego_states == reader.read(ref).ego_states).all()
+
+
+def test_wrong_wishes_are_refused_by_name(reader: SyntheticTownsReader) -> None:
+    with pytest.raises(ValueError, match=r"clips\.seeds"):
+        SyntheticTownsReader([1, 1])
+    with pytest.raises(ValueError, match=r"clips\.split=held_out"):
+        SyntheticTownsReader([1], split="held_out")
+    with pytest.raises(ValueError, match=r"clips\.logs_per_town=19"):
+        SyntheticTownsReader([1], logs_per_town=19)
+    with pytest.raises(ValueError, match="first_window"):
+        SyntheticTownsReader([1], first_window=-1)
+    with pytest.raises(BadClip, match="no log elsewhere"):
+        reader.read(ClipRef("synthetic", "elsewhere", 0))

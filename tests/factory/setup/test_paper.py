@@ -1,0 +1,74 @@
+"""A run says in what it differs from the paper's set-up; the preset differs in nothing."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from factory.config.compose import ConfigError
+from factory.setup.paper import differences, setup_text
+from factory.setup.settings import RunConfig, choose_vocabulary, load_config
+from tasks.world.kinematic_vocabulary import kinematic_trajectories
+from tasks.world.vocabulary import Vocabulary
+
+
+@pytest.fixture(scope="module")
+def vocabulary() -> Vocabulary:
+    return Vocabulary(kinematic_trajectories(16384, seed=0))
+
+
+def paper(*overrides: str) -> RunConfig:
+    return load_config(["preset=paper", "vocabulary.file=/mine.npy", *overrides])
+
+
+def test_the_preset_is_the_paper_s_set_up(vocabulary: Vocabulary) -> None:
+    config = paper()
+    assert differences(config, vocabulary) == []
+    assert setup_text(config, vocabulary) == "set-up: the paper's (preset=paper)"
+    assert (config.rounds, config.vocabulary.k, config.render.width, config.render.height) == (5, 16384, 1920, 1080)
+    assert (config.render.psnr_min, config.perturb.epdms_min, config.reward.progress_above) == (27.0, 0.8, 0.5)
+
+
+def test_the_defaults_differ_in_vocabulary_pictures_and_gates() -> None:
+    config = load_config([])
+    found = differences(config, choose_vocabulary(config.vocabulary))
+    assert found == [
+        "vocabulary of 1,024 kinematic trajectories (16,384 human ones)",
+        "expert.recovery.smooth=True (False)",
+        "render.width=320 (1920)",
+        "render.height=180 (1080)",
+        "render.gate.enabled=True (False)",
+    ]
+    assert "\n" not in setup_text(config, choose_vocabulary(config.vocabulary))
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("perturb.epdms_min=0.5", "perturb.epdms_min=0.5 (0.8)"),
+        ("perturb=dense", "perturb.max_longitudinal_m=8.0 (20.0)"),
+        ("reward.progress_above=-1", "reward.progress_above=-1.0 (0.5)"),
+        ("traffic=replay", "traffic.mode=replay (idm)"),
+        ("render.psnr_gate=mark", "render.psnr_gate=mark (reject)"),
+        ("render=none", "render.mode=none (auto)"),
+        ("pdm=corrected", "pdm.speed_below_zero=False (True)"),
+    ],
+)
+def test_every_setting_of_the_paper_s_table_is_watched(vocabulary: Vocabulary, override: str, said: str) -> None:
+    assert said in differences(paper(override), vocabulary)
+
+
+def test_without_pictures_nothing_is_said_of_their_size_and_gates(vocabulary: Vocabulary) -> None:
+    assert differences(paper("render=none", "render.width=320"), vocabulary) == ["render.mode=none (auto)"]
+
+
+def test_without_the_recovery_expert_nothing_is_said_of_it(vocabulary: Vocabulary) -> None:
+    assert differences(paper("experts=[pdm_closed]", "expert.recovery.smooth=true"), vocabulary) == []
+
+
+def test_the_preset_asks_for_the_human_vocabulary(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"vocabulary: file is missing: give vocabulary\.file="):
+        load_config(["preset=paper"])
+    np.save(tmp_path / "few.npy", kinematic_trajectories(100, seed=0))
+    with pytest.raises(ValueError, match="first 16384 of 100"):
+        choose_vocabulary(paper(f"vocabulary.file={tmp_path / 'few.npy'}").vocabulary)

@@ -1,0 +1,54 @@
+"""What a command line may not ask for, said before anything is written."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from factory.config.compose import ConfigError
+from factory.setup.settings import assemble, load_config, refuse_relative_root
+from factory.setup.vocabulary import save_recovery_table
+from tasks.experts.recovery.expert import RecoveryTable
+from tasks.world.kinematic_vocabulary import kinematic_trajectories
+
+
+def test_a_relative_root_in_a_submitted_job_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    refuse_relative_root({"root": "logs"})  # on one's own machine it is fine
+    monkeypatch.setenv("RAY_JOB_CONFIG_JSON_ENV_VAR", "{}")
+    refuse_relative_root({"root": "/data/logs"})
+    refuse_relative_root({"n_clips": 3})
+    with pytest.raises(ConfigError, match=r"clips\.root=logs is relative"):
+        refuse_relative_root({"root": "logs"})
+
+
+@pytest.mark.parametrize(
+    ("job", "named", "default"),
+    [
+        (False, None, "runs/synthetic"),
+        (True, None, "/home/someone/driving-data-factory/runs/synthetic"),
+        (False, "/data/runs", "/data/runs/synthetic"),
+        (True, "s3://bucket/runs", "s3://bucket/runs/synthetic"),
+    ],
+)
+def test_results_lie_below_one_root_that_a_submitted_job_can_keep(
+    monkeypatch: pytest.MonkeyPatch, job: bool, named: str | None, default: str
+) -> None:
+    monkeypatch.setenv("HOME", "/home/someone")
+    for variable, value in {"RAY_JOB_CONFIG_JSON_ENV_VAR": "{}" if job else None, "FACTORY_RUNS": named}.items():
+        monkeypatch.delenv(variable, raising=False)
+        if value is not None:
+            monkeypatch.setenv(variable, value)
+    assert load_config([]).out == default
+    assert load_config(["out=elsewhere"]).out == "elsewhere"
+
+
+def test_a_finished_table_takes_no_vocabularies(shared_root: Path, tmp_path: Path) -> None:
+    table = tmp_path / "table.npz"
+    save_recovery_table(table, RecoveryTable(kinematic_trajectories(5, 0)), {})
+    asked = [f"clips.root={shared_root / 'data/av2/sensor/val'}", "clips=av2", f"expert.recovery.table={table}"]
+    run = assemble(load_config([*asked, f"out={tmp_path / 'out'}", "experts=[recovery]"]))
+    assert len(run.work.experts["recovery"].table) == 5  # type: ignore[attr-defined]
+    assert not (tmp_path / "out").exists()
+    np.save(tmp_path / "more.npy", kinematic_trajectories(5, 1))
+    with pytest.raises(ConfigError, match="table or vocabularies"):
+        assemble(load_config([*asked, f"expert.recovery.vocabularies=[{tmp_path / 'more.npy'}]", "experts=[recovery]"]))

@@ -1,0 +1,123 @@
+"""Which pictures a sample gets: a human's photos all there or an error, a simulated drive's from what was sensed."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from factory.graph.work import HUMAN, HUMAN_CANDIDATE, Accepted, PreparedClip
+from factory.readers.base import BadClip
+from factory.readers.town.reader import SyntheticReader
+from factory.readers.town.write import TownSettings
+from factory.setup.settings import assemble, load_config
+from factory.stages.imaging import photo_at
+from factory.stages.pipeline import FactoryWork
+from factory.stages.sensors import block_of
+from tasks.world.clip import Clip
+
+CAMERAS = ("ring_front_left", "ring_front_center")
+SMALL = TownSettings(cameras=CAMERAS, width=64, height=36, lidar_beams=0)
+SIZE = ["render.width=64", "render.height=36", "render.scene=discs", "vocabulary.k=300"]
+SIZE += ["render.psnr_min=0", "render.gate.vehicle_min=0", "experts=[pdm_closed,human]"]
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One clip's log with photos of two cameras, 6.7 m of driving apart, and no lidar."""
+    reader = SyntheticReader(tmp_path_factory.mktemp("town"), 1, 0, SMALL)
+    reader.index()
+    return reader.root
+
+
+def prepared_by(root: Path, out: Path, *overrides: str) -> tuple[FactoryWork, PreparedClip]:
+    work = assemble(load_config(["clips=av2", f"clips.root={root}", f"out={out}", *SIZE, *overrides])).work
+    prepared = work.prepare(work.reader.index().refs[0])
+    assert isinstance(prepared, PreparedClip)
+    return work, prepared
+
+
+def clip_of(root: Path, out: Path) -> Clip:
+    work, _ = prepared_by(root, out)
+    return work.reader.read(work.reader.index().refs[0])
+
+
+def human_row(root: Path, out: Path, *overrides: str) -> dict[str, object]:
+    work, prepared = prepared_by(root, out, *overrides)
+    human = work.attempt(prepared, HUMAN_CANDIDATE, HUMAN)
+    assert isinstance(human, Accepted)
+    return dict(human.row)
+
+
+def test_a_human_sample_has_a_photo_of_every_camera_at_every_instant_also_without_lidar(
+    town: Path, tmp_path: Path
+) -> None:
+    row = human_row(town, tmp_path)
+    assert row["image_source"] == "photo"
+    taken = [(image["camera"], round(image["time_s"], 3)) for image in row["images"]]  # type: ignore[attr-defined]
+    assert sorted(taken) == sorted((camera, at) for camera in CAMERAS for at in (-1.5, -1.0, -0.5, 0.0))
+
+
+def test_photos_too_far_apart_for_parallax_give_a_simulated_drive_no_pictures(town: Path, tmp_path: Path) -> None:
+    work, prepared = prepared_by(town, tmp_path)
+    results = (work.attempt(prepared, row.index, "pdm_closed") for row in prepared.candidates)
+    sample = next(result for result in results if isinstance(result, Accepted))
+    assert sample.row["image_source"] == "none" and sample.row["images"] is None
+
+
+def test_lidar_s_grey_pictures_are_drawn_only_where_every_one_is_near_a_sweep(tmp_path: Path) -> None:
+    """A reach between a drive's nearest and farthest picture gives it none: not a sample with some of its pictures."""
+    settings = replace(SMALL, cameras=CAMERAS[:1], lidar_beams=8, lidar_azimuths=100)
+    reader = SyntheticReader(tmp_path / "town", 1, 0, settings)
+    reader.index()
+    for photos in reader.root.glob("*/sensors/cameras"):
+        shutil.rmtree(photos)
+
+    def sample(reach_m: float) -> Accepted:
+        work, prepared = prepared_by(reader.root, tmp_path, f"render.lidar_only_reach_m={reach_m}")
+        results = (work.attempt(prepared, row.index, "pdm_closed") for row in prepared.candidates)
+        return next(result for result in results if isinstance(result, Accepted))
+
+    everywhere = sample(1000.0)
+    assert everywhere.row["image_source"] == "render" and everywhere.row["tags"][-1] == "lidar_only"  # type: ignore[index]
+    images: Any = everywhere.row["images"]
+    drawn_at = np.array([np.reshape(image["ego_pose"], (4, 4))[:2, 3] for image in images])
+    swept_at = np.array([file.world_from_ego[:2, 3] for file in block_of(clip_of(reader.root, tmp_path)).sweeps])
+    away_m = np.linalg.norm(drawn_at[:, None] - swept_at, axis=-1).min(axis=1)
+    assert away_m.min() + 0.05 < away_m.max()
+    for reach_m, source in (
+        (0.99 * away_m.min(), "none"),
+        ((away_m.min() + away_m.max()) / 2.0, "none"),
+        (1.01 * away_m.max(), "render"),
+    ):
+        assert sample(reach_m).row["image_source"] == source, reach_m
+
+
+def test_a_missing_photo_is_a_bad_clip_that_names_camera_and_time(town: Path, tmp_path: Path) -> None:
+    root = tmp_path / "logs"
+    shutil.copytree(town, root)
+    clip = clip_of(root, tmp_path)
+    Path(photo_at(clip, "ring_front_left", 1.0).uri).unlink()
+    message = (
+        rf"camera ring_front_left: no photo within 0\.06 s of {clip.start_s + 1:.2f} s .* restore the missing file"
+    )
+    with pytest.raises(BadClip, match=message):
+        human_row(root, tmp_path)
+    assert human_row(root, tmp_path, "render.cameras=[ring_front_center]")["image_source"] == "photo"
+
+
+def test_a_camera_without_any_photo_is_named_too(town: Path, tmp_path: Path) -> None:
+    root = tmp_path / "logs"
+    shutil.copytree(town, root)
+    shutil.rmtree(next(root.glob("*/sensors/cameras/ring_front_center")))
+    with pytest.raises(BadClip, match="camera ring_front_center: no photo"):
+        human_row(root, tmp_path)
+
+
+def test_of_many_photos_the_nearest_is_taken(town: Path, tmp_path: Path) -> None:
+    clip = clip_of(town, tmp_path)
+    first = clip.images[0]
+    often = replace(clip, images=tuple(replace(first, time_s=0.05 * k + 0.02) for k in range(100)))
+    assert photo_at(often, first.sensor, 1.0).time_s == pytest.approx(1.02)

@@ -1,0 +1,198 @@
+"""Vocabulary labels from the command line to the row: by default, of which vocabulary, among which traffic."""
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from factory.config.compose import ConfigError
+from factory.graph.work import HUMAN, HUMAN_CANDIDATE, Accepted, PreparedClip
+from factory.run import BAD_CONFIG
+from factory.run import main as run_main
+from factory.setup.calibrate import calibrate, measure
+from factory.setup.settings import Run, assemble, load_config
+from factory.setup.vocabulary import save_vocabulary
+from factory.stages.pipeline import FactoryWork, PerturbedClip
+from factory.store.reader import LABEL_COLUMNS, SampleTable, labels_of
+from factory.views.sample_picture import SCORE_COLOURS, sample_bev
+from factory.views.show import main as show_main
+from tasks.attempt import Judged
+from tasks.reward.epdms import Scores, score
+from tasks.reward.prepare import prepare_scene
+from tasks.rollout.lqr import track
+from tasks.world.agents import AgentTracks
+from tasks.world.frames import to_world
+from tasks.world.kinematic_vocabulary import kinematic_trajectories
+from tasks.world.vocabulary import Vocabulary
+
+STREET = [
+    "clips=custom",
+    "clips._target_=tests.factory.street_reader.StreetReader",
+    "experts=[pdm_closed,human]",
+    "vocabulary.k=150",
+    "render=none",
+    "executor=local",
+]
+KEPT = ("nc", "dac", "ddc", "tlc", "ttc", "lk", "hc")
+
+
+@cache
+def street(*overrides: str) -> Run:
+    return assemble(load_config([*STREET, "out=nowhere", *overrides]))
+
+
+@cache
+def prepared() -> PreparedClip:
+    work = street().work
+    found = work.prepare(work.reader.index().refs[0])
+    assert isinstance(found, PreparedClip) and found.candidates
+    return found
+
+
+def sample(work: FactoryWork, expert: str) -> tuple[Accepted, Judged]:
+    """The first accepted attempt of the street, and what was judged in it."""
+    payload = prepared().payload
+    assert isinstance(payload, PerturbedClip)
+    for candidate in [HUMAN_CANDIDATE] if expert == HUMAN else range(len(prepared().candidates)):
+        result = work.attempt(prepared(), candidate, expert)
+        if isinstance(result, Accepted):
+            judged = work.trace(payload, candidate, expert).judged
+            assert judged is not None
+            return result, judged
+    raise AssertionError("nothing is accepted")
+
+
+def among(judged: Judged, agents: AgentTracks, vocabulary: Vocabulary) -> Scores:
+    """The vocabulary in pairs with PDM-Closed, from the sample's scene."""
+    driven = track(judged.scene.ego_state, to_world(judged.scene.ego_state[:3], vocabulary.trajectories))
+    states = np.concatenate([judged.rival[None], driven])
+    return score(prepare_scene(judged.scene, agents), states, normalise="pairs")
+
+
+def differing(row: dict[str, object], scores: Scores) -> list[str]:
+    labels = labels_of(row)
+    return [name for name in KEPT if (getattr(labels, name) != getattr(scores, name)[1:]).any()]
+
+
+def test_by_default_a_simulated_sample_is_labelled_among_its_simulated_traffic() -> None:
+    work = street().work
+    accepted, judged = sample(work, "pdm_closed")
+    row = dict(accepted.row)
+    assert row["label_vocabulary"] == work.vocabulary.digest and row["label_traffic"] == "replay"
+    assert differing(row, among(judged, judged.rollout.agents, work.vocabulary)) == []
+    log = judged.scene.clip.agents.window(judged.scene.step, judged.scene.step + 41)
+    assert differing(row, among(judged, log, work.vocabulary)), "replaying the log would be seen"
+    assert accepted.seconds["labels"] > 0.0
+
+
+def test_by_default_a_human_sample_is_labelled_among_the_log() -> None:
+    work = street().work
+    accepted, judged = sample(work, HUMAN)
+    log = judged.scene.clip.agents.window(judged.scene.step, judged.scene.step + 41)
+    assert differing(dict(accepted.row), among(judged, log, work.vocabulary)) == []
+
+
+def test_labels_can_be_switched_off() -> None:
+    accepted, _ = sample(street("reward.labels=none").work, HUMAN)
+    assert not set(LABEL_COLUMNS) & set(accepted.row) and "labels" not in accepted.seconds
+
+
+def test_traffic_that_reacts_is_asked_for_by_name() -> None:
+    accepted, _ = sample(street("reward.traffic=idm", "vocabulary.k=6").work, HUMAN)
+    assert accepted.row["label_traffic"] == "idm" and len(labels_of(accepted.row)) == 6
+
+
+def test_another_vocabulary_can_be_labelled_wherever_its_file_lies(tmp_path: Path) -> None:
+    other = Vocabulary(kinematic_trajectories(9, 5))
+    for name in ("a.npy", "b.npy"):
+        save_vocabulary(tmp_path / name, other, {})
+    runs = [street(f"reward.label_vocabulary={tmp_path / name}") for name in ("a.npy", "b.npy")]
+    accepted, _ = sample(runs[0].work, HUMAN)
+    assert accepted.row["label_vocabulary"] == other.digest and len(labels_of(accepted.row)) == 9
+    here, there, default = (run.work.identity for run in (*runs, street()))
+    assert here.settings_hash == there.settings_hash != default.settings_hash
+    assert here.settings["reward.label_vocabulary"] == other.digest
+    assert here.prepare_digest == default.prepare_digest, "perturbing knows nothing of labels"
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "not readable as a numpy file"),
+        (np.zeros((5, 8, 3)), "have shape (5, 8, 3), expected (K >= 1, 40, 3)"),
+        (np.full((5, 40, 3), np.nan), "5 trajectories hold NaN"),
+        (np.zeros((5, 40, 3), int), "expected a floating point type"),
+    ],
+)
+def test_a_label_vocabulary_that_is_none_ends_the_command_before_anything_is_written(
+    content: np.ndarray | None, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, out = tmp_path / "labels.npy", tmp_path / "out"
+    if content is not None:
+        np.save(file, content)
+    assert run_main([*STREET, f"reward.label_vocabulary={file}", f"out={out}"]) == BAD_CONFIG
+    error = capsys.readouterr().err
+    assert str(file) in error and message in error
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (("reward.label=none",), "label"),
+        (("reward.labels=all",), "reward.labels"),
+        (("reward.traffic=log",), "reward.traffic"),
+        (("reward.labels=none", "reward.label_vocabulary=x.npy"), "label_vocabulary=x.npy is for labels=vocabulary"),
+    ],
+)
+def test_a_wish_that_makes_no_sense_is_named(overrides: tuple[str, ...], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        load_config(overrides)
+
+
+def test_a_dry_run_counts_the_labels_time_and_bytes() -> None:
+    refs = street().index.refs
+    with_labels, without = (measure(street(*overrides), refs) for overrides in ((), ("reward.labels=none",)))
+    assert with_labels.seconds["labels"] > 0.0 and without.seconds["labels"] == 0.0
+    bytes_each = 9 * -(-150 // 8) + 4 + 2 * 150 + 4
+    assert with_labels.row_bytes - without.row_bytes >= with_labels.accepted * bytes_each
+    assert "  labels " in calibrate(street(), refs)
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the command leaves behind."""
+    folder = tmp_path_factory.mktemp("street") / "out"
+    assert run_main([*STREET, f"out={folder}"]) == 0
+    return folder
+
+
+def test_a_whole_run_stores_labels_that_a_planner_can_read(out: Path) -> None:
+    table, digest = SampleTable(out), street().work.vocabulary.digest
+    assert len(table) == 2
+    for stored in table.iterate(LABEL_COLUMNS):
+        labels = labels_of(stored, vocabulary=digest)
+        assert len(labels) == 150 and 0.0 < labels.pdm_score().mean() < 1.0
+
+
+def test_a_sample_is_shown_with_its_vocabulary_where_that_is_known(
+    out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = [f"out={out}", "sample=0", f"to={tmp_path}"]
+    assert show_main(asked) == 0, "the kinematic vocabulary needs no file"
+    kinematic = capsys.readouterr().out
+    assert "150 trajectories of vocabulary" in kinematic and "draws them" not in kinematic
+    save_vocabulary(tmp_path / "same.npy", Vocabulary(kinematic_trajectories(150, 0)), {})
+    save_vocabulary(tmp_path / "other.npy", Vocabulary(kinematic_trajectories(150, 1)), {})
+    assert show_main([*asked, f"vocabulary={tmp_path / 'same.npy'}"]) == 0
+    assert capsys.readouterr().out == kinematic
+    assert show_main([*asked, f"vocabulary={tmp_path / 'other.npy'}"]) == 2
+    assert "the sample's labels are of" in capsys.readouterr().err
+
+
+def test_the_picture_draws_each_trajectory_in_the_colour_of_its_score(out: Path) -> None:
+    row, vocabulary = SampleTable(out)[0], street().work.vocabulary
+    drawn = [sample_bev(row, vocabulary=trajectories) for trajectories in (vocabulary.trajectories, None)]
+    green = [(np.abs(image.astype(int) - SCORE_COLOURS[2]).max(axis=-1) < 12).sum() for image in drawn]
+    assert labels_of(row).pdm_score().max() > 0.9 and green[0] > 50 > green[1]

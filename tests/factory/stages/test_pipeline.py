@@ -1,0 +1,246 @@
+"""The work behind the machine: what its digests cover, what a block's verdict drops, and data that moves."""
+
+import dataclasses
+import pickle
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from factory.graph.work import HUMAN, HUMAN_BEFORE, HUMAN_CANDIDATE, Accepted, Dropped, PreparedClip
+from factory.readers.base import BadClip
+from factory.readers.town.reader import SyntheticReader
+from factory.readers.town.write import TownSettings
+from factory.setup.settings import assemble, identity_of, load_config
+from factory.stages.pipeline import Considered, FactoryWork
+from factory.store.identity import UNLISTED
+from tasks import stages
+from tasks.perturb import Perturbation, perturb
+from tasks.world.chance import stream
+from tasks.world.clip import HORIZON_STEPS, NOW
+from tasks.world.frames import to_local
+from tasks.world.kinematic_vocabulary import kinematic_trajectories
+from tasks.world.vocabulary import Vocabulary
+
+SMALL = TownSettings(cameras=("ring_front_center",), width=64, height=36, lidar_beams=32, lidar_azimuths=300)
+VOCABULARY = Vocabulary(kinematic_trajectories(3, 0))
+SIZE = ["render.width=64", "render.height=36", "render.scene=discs", "vocabulary.k=300"]
+SIZE += ["render.psnr_min=0", "render.gate.vehicle_min=0", "experts=[pdm_closed,human]"]
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One clip's log, with one small camera and a lidar."""
+    reader = SyntheticReader(tmp_path_factory.mktemp("town"), 1, 0, SMALL)
+    reader.index()
+    return reader.root
+
+
+def work_on(root: Path, out: Path, *overrides: str) -> FactoryWork:
+    return assemble(load_config(["clips=av2", f"clips.root={root}", f"out={out}", *SIZE, *overrides])).work
+
+
+def prepared_by(work: FactoryWork) -> PreparedClip:
+    prepared = work.prepare(work.reader.index().refs[0])
+    assert isinstance(prepared, PreparedClip)
+    return prepared
+
+
+def first_sample(work: FactoryWork, prepared: PreparedClip) -> Accepted:
+    results = (work.attempt(prepared, row.index, "pdm_closed") for row in prepared.candidates)
+    return next(result for result in results if isinstance(result, Accepted))
+
+
+def test_a_block_below_the_gate_drops_the_experts_and_keeps_the_human(town: Path, tmp_path: Path) -> None:
+    work = work_on(town, tmp_path, "render.psnr_min=60")
+    prepared = prepared_by(work)
+    assert prepared.dropped is not None and (prepared.dropped.stage, prepared.dropped.reason) == ("render", "psnr")
+    assert prepared.candidates == ()
+    human = work.attempt(prepared, HUMAN_CANDIDATE, HUMAN)
+    assert isinstance(human, Accepted) and human.row["image_source"] == "photo"
+
+
+def test_a_marked_block_keeps_its_candidates_and_tags_its_samples(town: Path, tmp_path: Path) -> None:
+    work = work_on(town, tmp_path, "render.psnr_min=60", "render.psnr_gate=mark")
+    prepared = prepared_by(work)
+    assert prepared.dropped is None
+    marked = first_sample(work, prepared)
+    assert marked.row["image_source"] == "render" and "low_psnr" in marked.row["tags"]  # type: ignore[operator]
+    human = work.attempt(prepared, HUMAN_CANDIDATE, HUMAN)
+    assert isinstance(human, Accepted) and "low_psnr" not in human.row["tags"]  # type: ignore[operator]
+
+
+def test_a_drive_that_cannot_be_shown_is_dropped_and_the_human_s_is_not(town: Path, tmp_path: Path) -> None:
+    strict = work_on(town, tmp_path, "render.gate.contrast_min=1.0")
+    prepared = prepared_by(strict)
+    results = [strict.attempt(prepared, row.index, "pdm_closed") for row in prepared.candidates]
+    dropped = [result for result in results if isinstance(result, Dropped) and result.rejected.stage == "render"]
+    assert dropped and {result.rejected.reason for result in dropped} == {"blank"}
+    assert not any(isinstance(result, Accepted) for result in results)
+    assert dropped[0].subscores["nc"] == 1.0  # the reward had accepted it
+    assert isinstance(strict.attempt(prepared, HUMAN_CANDIDATE, HUMAN), Accepted)
+    for override in ("render.gate.enabled=false", "render=none", "render=map"):
+        lenient = work_on(town, tmp_path, "render.gate.contrast_min=1.0", override)
+        assert isinstance(first_sample(lenient, prepared), Accepted)
+
+
+def test_a_drive_past_a_vehicle_unlike_its_photos_is_dropped_and_at_zero_it_is_not(town: Path, tmp_path: Path) -> None:
+    small = "render.gate.vehicle_share=0.001"
+    stored = {f"ring_front_center at step {step}" for step in (40, 45, 50, 55)}  # 1.5 s before T+H to T+H
+    strict = work_on(town, tmp_path, "render.gate.vehicle_min=1.0", small)
+    prepared = prepared_by(strict)
+    found = [strict.attempt(prepared, row.index, "pdm_closed") for row in prepared.candidates]
+    dropped = [result.rejected for result in found if isinstance(result, Dropped)]
+    details = [rejected.detail for rejected in dropped if rejected.reason == "unlike_photos"]
+    assert details and {detail.split(":")[0] for detail in details} <= stored
+    lenient = work_on(town, tmp_path, "render.gate.vehicle_min=0", small)
+    assert isinstance(first_sample(lenient, prepared), Accepted)
+
+
+def test_a_prepared_clip_is_rendered_also_where_its_data_has_moved(town: Path, tmp_path: Path) -> None:
+    prepared = prepared_by(work_on(town, tmp_path / "a"))
+    here = first_sample(work_on(town, tmp_path / "a"), prepared)
+    moved = tmp_path / "elsewhere"
+    shutil.copytree(town, moved)
+    there = first_sample(work_on(moved, tmp_path / "b"), prepared)
+    assert here.row["image_source"] == there.row["image_source"] == "render"
+    assert here.row["images"][0]["jpeg"] == there.row["images"][0]["jpeg"]  # type: ignore[index]
+
+
+def test_the_earlier_frame_of_a_pair_shows_its_own_instants_from_where_the_ego_was(town: Path, tmp_path: Path) -> None:
+    """The photo at -0.5 s of the later frame is the one at now of the earlier, with its pose, and so on."""
+    work = work_on(town, tmp_path, "experts=[human,human_before]")
+    ref = work.reader.index().refs[1]
+    prepared = work.prepare(ref)
+    assert isinstance(prepared, PreparedClip)
+    log, shown = work.reader.read(ref), []
+    for expert, step in ((HUMAN, NOW), (HUMAN_BEFORE, NOW - 5)):
+        accepted = work.attempt(prepared, HUMAN_CANDIDATE, expert)
+        assert isinstance(accepted, Accepted)
+        np.testing.assert_allclose(accepted.row["now_pose"], log.ego_states[step, :3], atol=1e-6)  # type: ignore[arg-type]
+        shown.append({round(image["time_s"], 3): image for image in accepted.row["images"]})  # type: ignore[attr-defined]
+    later, earlier = shown
+    assert sorted(later) == sorted(earlier) == [-1.5, -1.0, -0.5, 0.0]
+    for time_s in (-1.0, -0.5, 0.0):
+        same = later[time_s - 0.5]
+        assert earlier[time_s]["jpeg"] == same["jpeg"]
+        np.testing.assert_array_equal(earlier[time_s]["ego_pose"], same["ego_pose"])
+    assert earlier[0.0]["jpeg"] != later[0.0]["jpeg"]
+    for image, step in ((later[0.0], NOW), (earlier[0.0], NOW - 5)):
+        np.testing.assert_allclose(np.reshape(image["ego_pose"], (4, 4)), log.world_from_ego[step], atol=1e-6)
+
+
+def test_a_rejected_attempt_is_no_sample(town: Path, tmp_path: Path) -> None:
+    work = work_on(town, tmp_path, "reward.progress_above=2.0", "render=none")
+    prepared = prepared_by(work)
+    results = [work.attempt(prepared, row.index, "pdm_closed") for row in prepared.candidates[:2]]
+    assert results and all(isinstance(result, Dropped) for result in results)
+
+
+def test_with_an_open_gate_the_log_s_future_is_the_label_of_every_perturbed_state(town: Path, tmp_path: Path) -> None:
+    work = work_on(town, tmp_path, "reward.full=[]", "reward.progress_above=-1", "render=none", "experts=[logged]")
+    prepared = prepared_by(work)
+    log = work.reader.read(work.reader.index().refs[0]).ego_states
+    results = [work.attempt(prepared, row.index, "logged") for row in prepared.candidates[:4]]
+    assert len(results) == 4
+    for result in results:
+        assert isinstance(result, Accepted)
+        now = np.asarray(result.row["now_pose"])
+        assert np.hypot(*(now - log[NOW + HORIZON_STEPS, :3])[:2]) > 0.3  # perturbed
+        wanted = to_local(now, log[NOW + HORIZON_STEPS + 1 : NOW + 2 * HORIZON_STEPS + 1, :3])
+        np.testing.assert_allclose(result.row["proposal_10hz"], wanted, atol=1e-4)  # type: ignore[arg-type]
+
+
+def test_a_broken_log_fails_with_the_index_s_own_words(town: Path, tmp_path: Path) -> None:
+    root = tmp_path / "logs"
+    shutil.copytree(town, root)
+    (next(root.glob("*/annotations.feather"))).write_bytes(b"no table")
+    work = work_on(root, tmp_path)
+    ((ref, said),) = work.broken.items()
+    assert "annotations.feather: " in said
+    with pytest.raises(BadClip) as raised:
+        work.prepare(ref)
+    assert str(raised.value) == said == str(pickle.loads(pickle.dumps(raised.value)))
+
+
+def test_what_is_considered_is_what_is_prepared(town: Path, tmp_path: Path) -> None:
+    work = work_on(town, tmp_path, "render=none")
+    made = work.considered(work.reader.index().refs[0])
+    assert isinstance(made, Considered) and isinstance(made.found, Perturbation)
+    assert [row.vocabulary_index for row in prepared_by(work).candidates] == [
+        candidate.vocabulary_index for candidate in made.candidates
+    ]
+    assert made.found.considered.fate.count("kept") == len(made.candidates) > 0
+
+
+def test_a_clip_s_candidates_are_drawn_from_a_stream_of_the_run_s_seed_and_its_own_name(
+    town: Path, tmp_path: Path
+) -> None:
+    work = work_on(town, tmp_path, "render=none", "seed=3")
+    ref = work.reader.index().refs[0]
+    clip, made = work.reader.read(ref), work.considered(ref)
+    assert isinstance(made, Considered)
+
+    def drawn(seed: int, clip_id: str) -> list[int]:
+        rng = stream(seed, clip_id, "perturb")
+        found = perturb(clip, work.vocabulary, work.perturb, work.traffic, work.pdm, rng)
+        assert isinstance(found, Perturbation)
+        return [candidate.vocabulary_index for candidate in found.candidates]
+
+    mine = [candidate.vocabulary_index for candidate in made.candidates]
+    assert mine == drawn(3, clip.clip_id)
+    assert mine != drawn(0, clip.clip_id) and mine != drawn(3, "another")
+
+
+@pytest.mark.parametrize(
+    ("override", "prepares_anew"),
+    [
+        ("perturb.epdms_min=0.7", True),
+        ("traffic=replay", True),
+        ("seed=1", True),
+        ("reward.progress_above=0.6", False),  # judges attempts only
+        ("render.width=128", True),  # another block, which may be refused
+        ("render.psnr_min=0", True),
+        ("experts=[pdm_closed]", False),
+        ("rounds=5", False),
+    ],
+)
+def test_what_a_prepared_clip_depends_on(override: str, prepares_anew: bool) -> None:
+    before = identity_of(load_config([]), VOCABULARY, None).prepare_digest
+    after = identity_of(load_config([override]), VOCABULARY, None).prepare_digest
+    assert (before != after) == prepares_anew
+
+
+def test_without_a_gate_the_block_s_settings_are_no_part_of_what_is_prepared() -> None:
+    for free in (["render.psnr_min=0"], ["render=none"]):
+        small, large = (identity_of(load_config([*free, f"render.width={w}"]), VOCABULARY, None) for w in (64, 128))
+        assert small.prepare_digest == large.prepare_digest
+
+
+def test_a_gate_that_only_marks_prepares_nothing_anew() -> None:
+    plain, marking = (
+        identity_of(load_config(overrides), VOCABULARY, None).prepare_digest
+        for overrides in (["render.psnr_min=0"], ["render.psnr_gate=mark"])
+    )
+    assert plain == marking
+
+
+@pytest.mark.parametrize("stage", ["clip", "perturb", "rollout", "expert", "reward"])
+def test_a_raised_stage_before_the_attempts_prepares_anew(stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = identity_of(load_config([]), VOCABULARY, None).prepare_digest
+    raised = [dataclasses.replace(s, version=s.version + (s.name == stage)) for s in stages.STAGES]
+    monkeypatch.setattr(stages, "STAGES", tuple(raised))
+    assert identity_of(load_config([]), VOCABULARY, None).prepare_digest != before
+
+
+def test_the_log_s_own_drive_alone_needs_no_candidates_and_no_block(town: Path, tmp_path: Path) -> None:
+    work = work_on(town, tmp_path, "experts=[human]", "render.psnr_min=60")
+    ref = work.reader.index().refs[0]
+    assert work.block(ref) is None and work_on(town, tmp_path).block(ref) is not None
+    prepared = work.prepare(ref)
+    assert isinstance(prepared, PreparedClip)
+    assert prepared.candidates == () and prepared.dropped is None and work.identity.prepare_digest == UNLISTED
+    accepted = work.attempt(prepared, HUMAN_CANDIDATE, "human")
+    assert isinstance(accepted, Accepted) and accepted.row["image_source"] == "photo"
+    assert not list(tmp_path.rglob("block-*"))

@@ -1,0 +1,95 @@
+"""Warming compiles what a run needs: with the files that it lists and no others, no task compiles anything."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from factory.stages.warm import compile_kernels, marker
+from tasks.kernels.compiled import cache_dir
+
+pytestmark = pytest.mark.slow
+
+REPOSITORY = Path(__file__).resolve().parents[3]
+TOWN = ("clips=synthetic", "clips.n_clips=1", "vocabulary.k=512")
+BLIND = ("clips.settings.cameras=[]", "clips.settings.lidar_beams=0", "render=none")
+
+
+@pytest.fixture
+def towns(tmp_path: Path) -> str:
+    return f"clips.cache_dir={tmp_path / 'towns'}"
+
+
+def kept(cache: Path) -> set[str]:
+    """Compiled functions; less those that paint the town, which is no part of a run on logs."""
+    return {path.relative_to(cache).as_posix() for path in cache.glob("tasks/**/*.kernel")}
+
+
+def run_with_these(parts: list[str], tmp_path: Path, *arguments: str) -> tuple[set[str], set[str]]:
+    """A run whose cache holds what the parts list alone: the files before it and after it."""
+    compile_kernels(parts)
+    cache = tmp_path / "cache" / cache_dir().name
+    for part in parts:
+        listing = marker(part)
+        for name in (listing.name, *listing.read_text().splitlines()):
+            (cache / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(cache_dir() / name, cache / name)
+    if (cache_dir() / "factory").is_dir():  # what paints the town
+        shutil.copytree(cache_dir() / "factory", cache / "factory")
+    before = kept(cache)
+    done = subprocess.run(
+        [sys.executable, "-m", "factory.run", *arguments, f"out={tmp_path / 'out'}"],
+        env=os.environ | {"NUMBA_CACHE_DIR": str(cache.parent)},
+        cwd=REPOSITORY,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "compiling" not in done.stderr
+    return before, kept(cache)
+
+
+def test_a_run_on_a_town_with_cameras_compiles_nothing(tmp_path: Path, towns: str) -> None:
+    seen = ("clips.settings.cameras=[ring_front_center]", "clips.settings.photo_steps=36")
+    small = ("clips.settings.width=64", "clips.settings.height=36", "clips.settings.lidar_azimuths=90")
+    fitted = ("render.fit.iterations=20", "render.fit.start_gaussians=2000", "render.psnr_min=0")
+    drawn = (*TOWN, *seen, *small, *fitted, "experts=[recovery]")
+    before, after = run_with_these(["judge", "drive", "fit"], tmp_path, *drawn, towns, "executor=local")
+    assert after == before
+    assert any(name.startswith("tasks/render/") for name in after)
+
+
+def test_a_run_without_images_needs_no_renderer(tmp_path: Path, towns: str) -> None:
+    before, after = run_with_these(["judge", "drive"], tmp_path, *TOWN, *BLIND, towns, "executor=local")
+    assert after == before
+    assert not any(name.startswith("tasks/render/") for name in after)
+
+
+def test_replayed_traffic_needs_no_idm(tmp_path: Path, towns: str) -> None:
+    replay = ("traffic=replay", "reward.labels=none")
+    before, after = run_with_these(["judge"], tmp_path, *TOWN, *BLIND, *replay, towns, "executor=local")
+    assert after == before
+    assert not any(name.startswith("tasks/rollout/traffic") for name in after)
+
+
+def test_labels_among_traffic_that_answers_compile_nothing(tmp_path: Path, towns: str) -> None:
+    answers = ("reward.traffic=idm", "experts=[human]")
+    before, after = run_with_these(["judge", "answers"], tmp_path, *TOWN, *BLIND, *answers, towns, "executor=local")
+    assert after == before
+
+
+@pytest.mark.ray
+def test_arrays_out_of_ray_s_store_need_no_forms_of_their_own(tmp_path: Path, towns: str) -> None:
+    """They cannot be written, which is another type to numba."""
+    before, after = run_with_these(["judge", "drive"], tmp_path, *TOWN, *BLIND, towns, "workers=1")
+    assert after == before
+
+
+def test_a_run_on_argoverse_logs_compiles_nothing(tmp_path: Path, shared_root: Path) -> None:
+    logs = ("clips=av2", f"clips.root={shared_root / 'data/av2/sensor/val'}", "limit=2", "render=none")
+    human = f"vocabulary.file={shared_root / 'data/vocabulary/human_8192x40x3.npy'}"
+    before, after = run_with_these(["judge", "drive"], tmp_path, *logs, human, "executor=local")
+    assert after == before

@@ -1,0 +1,83 @@
+"""The funnel counts from the tables alone."""
+
+from pathlib import Path
+
+import pytest
+
+from factory.graph.execute import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, execute
+from factory.store.funnel import FunnelRow, _expert_rows, funnel_of, image_sources_text
+from factory.store.samples import Store
+from tests.factory.toy import ToyWork, refs
+
+
+def test_an_attempt_belongs_to_the_round_it_was_tried_for() -> None:
+    clips = {
+        "a": [(0, "reward.nc"), (1, ""), (2, "reward.ep"), (3, "")],
+        "b": [(0, ""), (1, "reward.nc")],
+        "c": [(0, "failed.bug")],
+    }
+    first, second = _expert_rows("recovery", clips)[:2]
+    assert first == FunnelRow("recovery", 0, 2, 1, 1, 3, 2, 3, {"reward.nc": 1, "failed.bug": 1}, 1)
+    assert second == FunnelRow("recovery", 1, 1, 2, 0, 2, 1, 3, {"reward.ep": 1, "reward.nc": 1})
+    assert first.first_try_rate == pytest.approx(1 / 3) and second.first_try_rate == 0.0  # clip b; nobody
+    assert first.attempt_rate == 0.5 and first.clip_rate == pytest.approx(2 / 3)
+    assert second.clip_rate == 0.5 and second.clip_rate_of_all == pytest.approx(1 / 3)
+
+
+def test_the_funnel_adds_up_to_the_tables(tmp_path: Path) -> None:
+    work = ToyWork(trouble={"log0:0": "standing", "log1:1000": "no_candidates", "log0:2000:recovery:1": "bug"})
+    store = Store(tmp_path)
+    summary = execute(work, refs(6), ["recovery", "human"], 3, store, "local", say=lambda line: None)
+    funnel = funnel_of(store)
+    assert funnel == summary.funnel
+    assert sum(row.accepted for row in funnel.rows) == summary.counts["accepted"] == len(store.samples)
+    assert sum(row.rejected for row in funnel.rows) == summary.counts["rejected"] - 1
+    assert sum(row.failed for row in funnel.rows) == summary.counts["failed"] == 1
+    assert funnel.clip_outcomes == {"clip.ego_standing": 1}
+    assert funnel.clips_without_candidates == {"perturb.no_gated_candidate": 1}
+    assert funnel.clips_prepared == 5 and funnel.candidates == 24 and funnel.gates == {"heading": 35, "lateral": 15}
+    (human,) = [row for row in funnel.rows if row.expert == "human"]
+    assert (human.accepted, human.clips_total) == (5, 5)
+    wide = funnel.text(width=200)
+    assert "nc " in wide and "failed.bug 1" in wide
+    assert funnel_of(store, []).rows == ()
+
+
+def test_image_sources_are_counted_over_the_clips_asked_for(tmp_path: Path) -> None:
+    store, clips = Store(tmp_path), refs(4)
+    execute(ToyWork(), clips, ["human"], 1, store, "local", say=lambda line: None)
+    counted = [
+        sum(int(part.rsplit(" ", 1)[1]) for part in image_sources_text(store, ids).removeprefix("images: ").split(", "))
+        for ids in ([ref.clip_id for ref in clips], [clips[0].clip_id])
+    ]
+    assert counted == [4, 1]
+    assert image_sources_text(store, []) == "images: no samples"
+
+
+def test_a_candidate_counts_once_though_its_failure_was_mended_with_other_inputs(tmp_path: Path) -> None:
+    broken = ToyWork(trouble={"log0:0:pdm_closed:0": "bug"})
+    mended = ToyWork(digests={"pdm_closed": "pdm_closed-2"})
+    execute(broken, refs(1), ["pdm_closed"], 2, Store(tmp_path), "local", say=lambda line: None)
+    store = Store(tmp_path)
+    execute(mended, refs(1), ["pdm_closed"], 9, store, "local", on_change="keep", retry=True, say=lambda line: None)
+    tried = sum(row.accepted + row.rejected + row.failed for row in funnel_of(store).rows)
+    assert tried == mended.n_candidates
+    assert "failed" not in store.outcomes.read(["kind"])["kind"].to_pylist()
+
+
+def test_a_redo_that_failed_is_seen_and_not_mended_by_the_next_run(tmp_path: Path) -> None:
+    def run(work: ToyWork, **options: object) -> int:
+        summary = execute(work, refs(1), ["recovery"], 2, Store(tmp_path), "local", say=lambda line: None, **options)  # type: ignore[arg-type]
+        return summary.exit_code
+
+    run(ToyWork(threshold=0.3))
+    first = min(Store(tmp_path).samples.read(["candidate_index"])["candidate_index"].to_pylist())
+    broken = ToyWork(threshold=0.29, trouble={f"log0:0:recovery:{first}": "bug"})
+    for _ in range(2):
+        assert run(broken, on_change="redo") == COMPLETE_WITH_FAILURES
+        assert sum(row.failed for row in funnel_of(Store(tmp_path)).rows) == 1
+    for _ in range(2):
+        assert run(broken) == BAD_CONFIG
+    assert run(broken, on_change="keep") == COMPLETE_WITH_FAILURES
+    assert run(ToyWork(threshold=0.29), on_change="redo", retry=True) == COMPLETE
+    assert sum(row.failed for row in funnel_of(Store(tmp_path)).rows) == 0

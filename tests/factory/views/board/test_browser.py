@@ -1,0 +1,161 @@
+"""In a real browser: the numbers on the page are the tables', pictures load, the console stays empty."""
+
+import re
+import shutil
+import subprocess
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from factory.store.samples import Store
+from factory.views.board.report import main as report_main
+from factory.views.board.server import Board, Server
+from tests.factory.views.board.browser import Tab
+from tests.factory.views.board.runs import EVIL, counted, run
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on the PATH"),
+]
+Dump = Callable[..., str]
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("run")
+    run(folder, 1)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def dump(out: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Dump]:
+    """Address -> the page's elements once it has come to rest; a word on the console fails."""
+    profile = tmp_path_factory.mktemp("profile")
+    with Server(Board(Store(out), look_every_s=0.0), "127.0.0.1", 0) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+
+        def dumped(address: str, width: int = 1440, at: str = "") -> str:
+            base = at or f"http://127.0.0.1:{server.server_address[1]}/"
+            command = [
+                str(CHROMIUM),
+                "--headless=new",
+                "--no-sandbox",
+                "--disable-gpu",
+                "--enable-logging=stderr",
+                f"--user-data-dir={profile}",
+                f"--window-size={width},6000",
+                "--virtual-time-budget=10000",
+                "--dump-dom",
+                f"{base}{address}",
+            ]
+            done = subprocess.run(command, capture_output=True, text=True, timeout=200)
+            assert "CONSOLE" not in done.stderr, done.stderr
+            assert "data-ready" in done.stdout, done.stdout
+            return done.stdout
+
+        yield dumped
+        server.shutdown()
+
+
+def tiles(page: str) -> dict[str, str]:
+    return dict(re.findall(r'data-count="(\w+)"[^>]*><b>([^<]*)</b>', page))
+
+
+def test_the_overview_shows_the_tables_also_after_more_was_committed(out: Path, dump: Dump) -> None:
+    for rounds in (1, 2):
+        run(out, rounds)
+        page, wanted = dump("#/"), counted(out)
+        shown = tiles(page)
+        assert {name: int(shown[name]) for name in ("samples", "attempts", "clips", "failed")} == {
+            name: wanted[name] for name in ("samples", "attempts", "clips", "failed")
+        }
+        totals = re.findall(r'data-reason="([^"]*)".*?</tr>', page)
+        assert set(totals) == set(wanted["reasons"])
+        head = r'<tr><th scope="row">(\w+)(?:<small>[^<]*</small>)?</th>'
+        rows = re.findall(head + 3 * r'<td class="n(?: roomy)?">(\d+)</td>', page)
+        accepted = {(expert, int(number)): int(n) for expert, number, _, n in rows if int(n)}
+        assert accepted == wanted["accepted"]
+        simulated = min(6, wanted["simulated"])
+        assert page.count("data-loaded") == 2 * simulated and "no picture" not in page
+
+
+def test_the_gallery_and_a_sample_show_their_pictures_and_nothing_from_data_is_markup(out: Path, dump: Dump) -> None:
+    run(out, 2)
+    page = dump("#/gallery?expert=recovery")
+    ids = re.findall(r'data-id="(\w+)"', page)
+    rows = Store(out).samples.read(["attempt_id", "clip_id", "expert"]).to_pylist()
+    wanted = [row for row in rows if row["expert"] == "recovery"]
+    assert sorted(ids) == sorted(r["attempt_id"] for r in wanted)
+    assert page.count("data-loaded") == 2 * len(ids)
+    fell = {o["clip_id"] for o in Store(out).outcomes.read().to_pylist() if o["expert"] == "recovery" and o["reason"]}
+    shown = next(r["attempt_id"] for r in wanted if r["clip_id"] in fell)
+    page = dump(f"#/sample/{shown}")
+    assert page.count("data-loaded") == len(Store(out).samples.read(["images"])["images"][0])
+    assert 'data-score="nc"' in page and 'data-kind="rejected"' in page
+    assert EVIL not in dump("#/failed") and "a bug in a stage" in dump("#/failed")
+
+
+def test_an_open_page_follows_the_run_and_the_keys_work(tmp_path: Path) -> None:
+    run(tmp_path / "run", 1)
+    (tmp_path / "run" / "last_run.json").unlink()  # as if it went on
+    with Server(Board(Store(tmp_path / "run"), look_every_s=0.0), "127.0.0.1", 0) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        tab = Tab(str(CHROMIUM), tmp_path / "profile")
+        try:
+            follow(tab, f"http://127.0.0.1:{server.server_address[1]}/", tmp_path / "run")
+            assert not tab.console
+        finally:
+            tab.close()
+            server.shutdown()
+
+
+def follow(tab: Tab, address: str, out: Path) -> None:
+    samples = "document.querySelector('[data-count=samples] b')?.textContent"
+    ready = "document.getElementById('main').dataset.ready"
+    tab.ask("Page.navigate", url=address)
+    tab.wait(f"{samples} === '{counted(out)['samples']}'")
+    assert tab.value("document.getElementById('state').textContent !== 'complete'")
+    run(out, 2)
+    tab.wait(f"{samples} === '{counted(out)['samples']}'")  # without a reload
+    tab.wait("document.getElementById('state').textContent.startsWith('complete')")
+    tab.press("2")
+    tab.wait(f"{ready} === '#/gallery'")
+    tab.press("ArrowDown")
+    first = tab.value("document.activeElement.dataset.id")
+    tab.press("3")
+    tab.wait(f"{ready} === '#/failed'")
+    tab.press("Escape")
+    tab.wait(f"{ready} === '#/gallery'")
+    tab.value(f"location.hash = '#/sample/{first}'")
+    tab.wait(f"{ready} === '#/sample/{first}'")
+    tab.press("ArrowRight")
+    tab.wait(f"{ready}.startsWith('#/sample/') && {ready} !== '#/sample/{first}'")
+    before = tab.value("getComputedStyle(document.body).backgroundColor")
+    tab.press("t")
+    assert tab.value("getComputedStyle(document.body).backgroundColor") != before
+    tab.press("?")
+    assert tab.value("document.getElementById('keys').open")
+
+
+def test_a_report_is_the_same_page_in_one_file(out: Path, dump: Dump) -> None:
+    run(out, 2)
+    assert report_main([f"out={out}"]) == 0
+    at, wanted = f"file://{out / 'report.html'}", counted(out)
+    page = dump("#/", at=at)
+    shown = tiles(page)
+    assert {name: int(shown[name]) for name in ("samples", "attempts", "clips", "failed")} == {
+        name: wanted[name] for name in ("samples", "attempts", "clips", "failed")
+    }
+    assert page.count("data-loaded") == 2 * min(6, wanted["simulated"]) and "no picture" not in page
+    page = dump("#/gallery", at=at)
+    ids = re.findall(r'data-id="(\w+)"', page)
+    assert ids and page.count("data-loaded") == 2 * len(ids)
+    assert 'data-score="nc"' in dump(f"#/sample/{ids[0]}", at=at)
+    assert "a bug in a stage" in dump("#/failed", at=at)
+
+
+def test_a_wrong_address_says_so(dump: Dump) -> None:
+    assert "there is no page nowhere" in dump("#/nowhere")

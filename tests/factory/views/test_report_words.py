@@ -1,0 +1,26 @@
+"""Sides are words: nobody has to know that y points left."""
+
+import numpy as np
+
+from factory.views.report_words import to_the_side, turned
+from factory.views.seen_again import ASIDE_M, _looks_right
+from tasks.world.frames import to_local
+
+
+def test_what_lies_on_the_left_of_a_car_that_drives_north_lies_west_and_is_called_left() -> None:
+    north = np.array([0.0, 0.0, np.pi / 2.0])
+    west, east = to_local(north, np.array([[-1.5, 10.0, np.pi / 2.0 + 0.1], [1.5, 10.0, np.pi / 2.0 - 0.1]]))
+    assert (to_the_side(west[1]), turned(west[2])) == ("1.50 m to the left", "5.7 deg to the left")
+    assert (to_the_side(east[1]), turned(east[2])) == ("1.50 m to the right", "5.7 deg to the right")
+
+
+def test_views_stand_side_by_side_as_their_cameras_do() -> None:
+    def looking(yaw_rad: float) -> dict[str, object]:
+        """A camera whose axis z points `yaw_rad` to the left of ahead."""
+        pose = np.eye(4)
+        pose[:3, 2] = np.cos(yaw_rad), np.sin(yaw_rad), 0.0
+        return {"name": yaw_rad, "ego_from_camera": pose.ravel().tolist()}
+
+    rig = [looking(yaw) for yaw in (0.0, 0.9, -0.9)]
+    assert [camera["name"] for camera in sorted(rig, key=_looks_right)] == [0.9, 0.0, -0.9]
+    assert list(ASIDE_M) == sorted(ASIDE_M, reverse=True), "y points left"
