@@ -15,8 +15,9 @@ import pyarrow.compute as pc
 import pytest
 
 from factory.commands.verify import verify
+from factory.graph import execute as execution
 from factory.graph.execute import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, RunSummary, execute
-from factory.graph.work import Built, Halted, Stopped, never
+from factory.graph.work import AttemptResult, Built, Halted, PreparedClip, Stopped, never
 from factory.readers.base import ClipRef
 from factory.store.identity import UNLISTED
 from factory.store.samples import Store
@@ -396,6 +397,23 @@ def test_a_stopped_run_goes_on_where_it_was(tmp_path: Path, plain: Callable[...,
     assert summary.exit_code == INTERRUPTED
     assert run(tmp_path / "out").exit_code == COMPLETE
     assert_same_tables(tmp_path / "out", plain())
+
+
+def test_nothing_new_begins_once_a_run_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a cluster, where tasks that were handed over end; in this process those that wait are left undone too."""
+    graph = execution._graph
+    monkeypatch.setattr(execution, "_graph", lambda *given: graph(*given[:-1], never))
+
+    class Stopping(ToyWork):
+        def attempt(self, prepared: PreparedClip, candidate: int, expert: str) -> AttemptResult:
+            if not Path(self.journal).read_text().count("attempt"):  # a second signal would end the run at once
+                os.kill(os.getpid(), signal.SIGTERM)
+            return super().attempt(prepared, candidate, expert)
+
+    journal = tmp_path / "journal"
+    assert run(tmp_path / "out", Stopping(journal=str(journal))).exit_code == INTERRUPTED
+    walks = re.findall(r"^attempt (\S+):-?\d+ on", journal.read_text(), re.M)  # log:start:expert
+    assert walks and len(walks) == len(set(walks)), "what was in hand ends, and no walk tries once more"
 
 
 def test_a_signal_reaches_a_block_that_is_being_built_in_this_process(tmp_path: Path) -> None:
