@@ -17,13 +17,11 @@ from tasks.experts.protocol import Expert, Plan
 from tasks.reward.epdms import Scores, score
 from tasks.reward.prepare import PreparedScene, prepare_scene
 from tasks.rollout.simulate import TrafficSettings, next_scene, simulate
-from tasks.stages import SUBSCORES, Rejected
+from tasks.stages import Rejected
+from tasks.subscores import JUDGED
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip, Rollout, Scene, scene_of_clip
 from tasks.world.route import centerline_from
 from tasks.world.vehicle import HEADING
-
-_JUDGED = tuple(name for name in SUBSCORES if name not in ("ep", "ec"))
-
 
 Timed = Callable[[str], AbstractContextManager[object]]
 
@@ -32,13 +30,13 @@ Timed = Callable[[str], AbstractContextManager[object]]
 class ExpertGate:
     """Which sub-scores an expert's rollout must reach (paper, supplement: S_m = 1 for all but EP, EP > 0.5)."""
 
-    full: tuple[str, ...] = ("nc", "dac", "ddc", "tlc", "ttc", "lk", "hc")  # EC needs an earlier plan: there is none
+    full: tuple[str, ...] = JUDGED  # EC needs an earlier plan: there is none
     progress_above: float = 0.5
 
     def __post_init__(self) -> None:
-        unknown = [name for name in self.full if name not in _JUDGED]
+        unknown = [name for name in self.full if name not in JUDGED]
         if unknown:
-            raise ValueError(f"full names {', '.join(unknown)}; an expert's drive is judged by {', '.join(_JUDGED)}")
+            raise ValueError(f"full names {', '.join(unknown)}; an expert's drive is judged by {', '.join(JUDGED)}")
 
 
 @dataclass(frozen=True)

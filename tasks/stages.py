@@ -7,6 +7,8 @@ A stage is a pure function `stage(inputs, settings, rng) -> output | Rejected`.
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from tasks.subscores import SUBSCORES
+
 
 @dataclass(frozen=True)
 class Stage:
@@ -28,7 +30,6 @@ class Rejected:
     counts: Mapping[str, int] = field(default_factory=dict)  # what was counted on the way, such as drops by gate
 
 
-SUBSCORES = ("nc", "dac", "ddc", "tlc", "ep", "ttc", "lk", "hc", "ec")  # EPDMS, docs/reward.md 2
 PICTURE_FAULTS = ("holes", "lens_covered", "blank", "blurred", "unlike_photos")  # tasks.render.gate
 
 STAGES: tuple[Stage, ...] = (

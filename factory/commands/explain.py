@@ -70,7 +70,8 @@ def explain(argv: Sequence[str]) -> int:
     from factory.stages.pipeline import FactoryWork, PerturbedClip
     from factory.views.drawing import attempt_picture, candidates_picture, film
     from factory.views.video import write_mp4
-    from tasks.stages import SUBSCORES, Rejected
+    from tasks.stages import Rejected
+    from tasks.subscores import OF_ONE_PLAN
 
     own, overrides = split_arguments(argv)
     expert, to = own.expert, Path(own.to)
@@ -119,7 +120,7 @@ def explain(argv: Sequence[str]) -> int:
         if trace.judged is not None:
             shown = trace
             scores = trace.judged.scores
-            named = [f"{name} {getattr(scores, name)[1]:.2f}" for name in SUBSCORES if name != "ec"]
+            named = [f"{name} {getattr(scores, name)[1]:.2f}" for name in OF_ONE_PLAN]
             print(f"    EPDMS {scores.pdm_score[1]:.3f}  " + "  ".join(named))
         if rejected is None:
             break

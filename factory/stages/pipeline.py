@@ -52,7 +52,8 @@ from tasks.render.splatting.gsplat_backend import BackendMissing
 from tasks.reward.epdms import Scores
 from tasks.reward.labels import Labelling, vocabulary_labels
 from tasks.rollout.simulate import TrafficSettings
-from tasks.stages import SUBSCORES, Rejected
+from tasks.stages import Rejected
+from tasks.subscores import OF_ONE_PLAN
 from tasks.world.chance import stream
 from tasks.world.clip import NOW, STEP_S, Clip, scene_of_clip
 from tasks.world.vehicle import HEADING
@@ -398,5 +399,5 @@ def _candidate_row(index: int, candidate: Candidate) -> CandidateRow:
 
 
 def _subscores(scores: Scores) -> dict[str, float]:
-    named = {name: float(getattr(scores, name)[1]) for name in SUBSCORES if name != "ec"}
+    named = {name: float(getattr(scores, name)[1]) for name in OF_ONE_PLAN}
     return named | {"score": float(scores.pdm_score[1])} if np.isfinite(scores.pdm_score[1]) else named

@@ -5,14 +5,14 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from factory.store.schema import AGENT_STEPS, FIRST_FAILURES, MAP_RADIUS_M, NOW_INDEX
+from factory.store.schema import AGENT_STEPS, MAP_RADIUS_M, NOW_INDEX
 from tasks.attempt import Judged
 from tasks.experts.follow_up import BEFORE_STEPS
 from tasks.perturb import Candidate, end_speed_mps
 from tasks.render.views import pose_on_ground
 from tasks.reward.epdms import Scores
 from tasks.reward.label_bytes import VocabularyLabels, encode
-from tasks.stages import SUBSCORES
+from tasks.subscores import OF_ONE_PLAN, SUBSCORES
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, Scene
 from tasks.world.command import driving_command
@@ -88,9 +88,9 @@ def score_columns(prefix: str, scores: Scores, row: int = 1) -> dict[str, object
     """Sub-scores, EPDMS (/14: there is no earlier plan to compare comfort with) and first failing times."""
     columns: dict[str, object] = {f"{prefix}_score": float(scores.pdm_score[row])}
     for name in SUBSCORES:
-        columns[f"{prefix}_{name}"] = None if name == "ec" else float(getattr(scores, name)[row])
-    for name in FIRST_FAILURES:
-        index = float(scores.first_failures[name][row])
+        columns[f"{prefix}_{name}"] = float(getattr(scores, name)[row]) if name in OF_ONE_PLAN else None
+    for name, indices in scores.first_failures.items():
+        index = float(indices[row])
         columns[f"{prefix}_{name}_fails_s"] = index * STEP_S if np.isfinite(index) else None
     return columns
 

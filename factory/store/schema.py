@@ -10,13 +10,12 @@ import pyarrow as pa
 
 from factory.store.columns import BadRow, Column
 from factory.store.table import TableSpec
-from tasks.stages import SUBSCORES
+from tasks.subscores import HALVES, JUDGED, SUBSCORES, WHOLES
 
 SCHEMA_VERSION = 2
 MAP_RADIUS_M = 64.0
 AGENT_STEPS = 56  # -1.5 .. 4.0 s at 10 Hz; index 15 is now
 NOW_INDEX = 15
-FIRST_FAILURES = ("nc", "dac", "ddc", "tlc", "ttc", "lk", "hc")  # sub-scores that fail at an instant
 
 EGO, WORLD, LOGGED = "ego at now", "world", "logged pose at T+H"
 STATE = "x [m], y [m], heading [rad], vx, vy [m/s], ax, ay [m/s2], steering [rad], its rate, yaw rate, yaw acceleration"
@@ -106,7 +105,7 @@ def _scores(prefix: str, stage: str) -> tuple[Column, ...]:
             Column(
                 f"{prefix}_{name}_fails_s", "float64", unit="s", about="first failing time; null: never", nullable=True
             )
-            for name in FIRST_FAILURES
+            for name in JUDGED
         ),
     )
 
@@ -138,6 +137,7 @@ def _sensors() -> tuple[Column, ...]:
 
 def _labels() -> tuple[Column, ...]:
     """Scores of a whole vocabulary from now; all null in a run without them (reward.labels=none)."""
+    planes = " ".join((*HALVES, *WHOLES)).upper()
     return (
         Column("label_vocabulary", "string", about="digest of the K trajectories that are labelled", nullable=True),
         Column("label_traffic", "string", about="replay: the row's own; idm: it answers to each", nullable=True),
@@ -148,9 +148,7 @@ def _labels() -> tuple[Column, ...]:
             about="compliant progress of PDM-Closed; EP is relative to it",
             nullable=True,
         ),
-        Column(
-            "label_subscores", "binary", about="NC DDC DAC TLC TTC LK HC of K trajectories, as below", nullable=True
-        ),
+        Column("label_subscores", "binary", about=f"{planes} of K trajectories, as below", nullable=True),
         Column("label_progress", "binary", about="progress of K trajectories along the route, as below", nullable=True),
     )
 

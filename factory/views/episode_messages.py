@@ -28,10 +28,10 @@ from scipy.spatial.transform import Rotation
 
 from factory.store.columns import Column
 from factory.store.episodes import episode_bytes
-from factory.store.schema import FIELDS, FIRST_FAILURES, NOW_INDEX
+from factory.store.schema import FIELDS, NOW_INDEX
 from factory.views.bev import AGENT_COLOURS, EXPERT, LOGGED, OBJECT, PERTURBED, Colour
 from factory.views.sample_picture import ego_way
-from tasks.stages import SUBSCORES
+from tasks.subscores import JUDGED, SUBSCORES
 from tasks.world.frames import to_local
 from tasks.world.vehicle import PACIFICA
 
@@ -83,7 +83,7 @@ def facts_of(row: Row) -> dict[str, Any]:
     facts = {field.name: _plain(row[field.name]) for field in FIELDS if _is_fact(field)}
     for stage in ("stage1", "stage2"):
         facts[stage] = {name: facts.pop(f"{stage}_{name}") for name in (*SUBSCORES, "score")}
-        fails = {name: facts.pop(f"{stage}_{name}_fails_s") for name in FIRST_FAILURES}
+        fails = {name: facts.pop(f"{stage}_{name}_fails_s") for name in JUDGED}
         facts[stage]["first_failures_s"] = {name: time_s for name, time_s in fails.items() if time_s is not None}
     facts["stage_versions"] = json.loads(row["stage_versions"])
     return facts

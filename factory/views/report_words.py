@@ -1,5 +1,7 @@
 """What reasons, gates and ends of a run are called on the pages, and the published rates beside ours."""
 
+from tasks.subscores import RECORDS
+
 # SimScale: clips with a sample of the round, in % of those with one of the round before.
 PAPER_CLIP_PERCENT = {"pdm_closed": (63, 85, 83, 83, 84), "recovery": (43, 80, 78, 78, 78)}
 STATUS = {  # exit code -> words, tone
@@ -9,14 +11,7 @@ STATUS = {  # exit code -> words, tone
 }
 
 REASON_WORDS = {
-    "nc": "collision at fault",
-    "dac": "left the drivable area",
-    "ddc": "against the driving direction",
-    "tlc": "ran a red light",
-    "ep": "too little progress",
-    "ttc": "time to collision",
-    "lk": "lane keeping",
-    "hc": "uncomfortable against the history",
+    **{record.name: record.wrong for record in RECORDS},
     "no_plan": "the expert found no plan",
     "route_ended": "no route is left to drive along",
     "psnr": "block reconstructed too poorly",

@@ -18,9 +18,8 @@ from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
-from factory.store.schema import FIRST_FAILURES
 from factory.views.episode_messages import EGO, NOW, WORLD, Array, Row, episode_messages
-from tasks.stages import SUBSCORES
+from tasks.subscores import JUDGED, SUBSCORES
 
 TIMELINE = "log"  # time since the log's first instant
 INSTALL = "rerun-sdk is not installed: pip install rerun-sdk"
@@ -62,7 +61,7 @@ def score_steps(row: Row) -> list[tuple[str, float, float]]:
     found: list[tuple[str, float, float]] = []
     for name in (*SUBSCORES, "score"):
         value = row[f"stage2_{name}"]
-        fails_s = row[f"stage2_{name}_fails_s"] if name in FIRST_FAILURES else None
+        fails_s = row[f"stage2_{name}_fails_s"] if name in JUDGED else None
         if value is None:
             continue
         if fails_s:

@@ -198,7 +198,7 @@ def logged_drive(store: "Store", row: dict[str, Any]) -> "NDArray[np.float64] | 
 
 def _numbers(row: dict[str, Any]) -> Iterable[str]:
     from factory.views.report_words import to_the_side, turned
-    from tasks.stages import SUBSCORES
+    from tasks.subscores import SUBSCORES
 
     yield f"sample        {row['attempt_id']}"
     yield f"clip          {row['clip_id']}, {row['dataset']} log {row['log_id']} at {row['clip_start_s']:.1f} s"

@@ -71,7 +71,7 @@ class Batch:
     bev: Tensor | None = None  # (B, T, rows, columns) uint8, planners.data.bev.BevClass
     agents: Tensor | None = None  # (B, N, 5) float32: centre x, y, heading, length, width
     agents_valid: Tensor | None = None  # (B, N) bool
-    labels: Mapping[str, Tensor] | None = None  # nc dac ddc tlc ttc lk hc ep -> (B, K) float32
+    labels: Mapping[str, Tensor] | None = None  # tasks.subscores.LABELLED -> (B, K) float32
 
     def __len__(self) -> int:
         return len(self.attempt_ids)

@@ -21,8 +21,7 @@ from planners.data.batch import COMMANDS, Batch, BevLayout, ImageLayout, Needs
 from planners.data.feed import AGENT_COLUMNS, BEV_COLUMNS
 from planners.data.images import Bytes, stitch
 from tasks.reward.label_bytes import CRC_BYTES
-
-LABELS = ("nc", "dac", "ddc", "tlc", "ttc", "lk", "hc", "ep")
+from tasks.subscores import LABELLED
 
 
 class StoredRows:
@@ -105,7 +104,7 @@ class BatchBuffer:
         if needs.n_agents:
             self._tensors["agents"] = empty(needs.n_agents, 5)
             self._tensors["agents_valid"] = empty(needs.n_agents, dtype=torch.bool)
-        self._labels = {name: empty(n_labels) for name in LABELS} if needs.labels is not None else {}
+        self._labels = {name: empty(n_labels) for name in LABELLED} if needs.labels is not None else {}
         self._arrays = {name: tensor.numpy() for name, tensor in (self._tensors | self._labels).items()}
 
     def fill(self, i: int, stored: StoredRows, row: int) -> None:
@@ -127,7 +126,7 @@ class BatchBuffer:
                 arrays["agents"][i], arrays["agents_valid"][i] = nearest_agents(seen, needs.bev, needs.n_agents)
         if needs.labels is not None:
             labels = labels_of(stored.values(LABEL_COLUMNS, row), needs.labels)
-            for name in LABELS:
+            for name in LABELLED:
                 arrays[name][i] = labels.ep(needs.normalise) if name == "ep" else getattr(labels, name)
 
     def batch(self, attempt_ids: Sequence[str], simulated: NDArray[np.bool_], imitate: NDArray[np.bool_]) -> Batch:

@@ -1,65 +1,57 @@
 """EPDMS: the sub-scores of ego trajectories and what they add up to (docs/reward.md 2)."""
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields, make_dataclass, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
-from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from tasks.kernels.compiled import kernel
-from tasks.reward.formula import EC_WEIGHT, MULTIPLIERS, PROGRESS_THRESHOLD_M, WEIGHTS
+from tasks.reward.formula import (
+    EC_WEIGHT,
+    MULTIPLIERS,
+    PROGRESS_THRESHOLD_M,
+    TOTAL_WEIGHT,
+    WEIGHTS,
+    multiplied,
+    weighted,
+)
 from tasks.reward.prepare import PreparedScene
-from tasks.reward.verdicts import Verdicts, judge
+from tasks.reward.verdicts import EP, Verdicts, judge
+from tasks.subscores import INDEX, JUDGED, LABELLED, OF_ONE_PLAN
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Normalise = Literal["batch", "pairs"]
 _NORMALISE = get_args(Normalise)
-EP_WEIGHT, TTC_WEIGHT, LK_WEIGHT, HC_WEIGHT = (WEIGHTS[name] for name in ("ep", "ttc", "lk", "hc"))
-TOTAL_WEIGHT = sum(WEIGHTS.values())
+_FACTORS = tuple(LABELLED.index(name) for name in MULTIPLIERS)  # rows of Verdicts.scores
+_TERMS = tuple((LABELLED.index(name), weight) for name, weight in WEIGHTS.items())
+_RULED, _INSTANTS = (*JUDGED, "ep_raw_m"), tuple(INDEX.values())
+_Columns: Any = make_dataclass("_Columns", [(name, Array) for name in (*OF_ONE_PLAN, *_INSTANTS)], frozen=True)
 
 
 @dataclass(frozen=True)
-class Scores:
-    """Scores of K trajectories; every array has K rows. A `*_index` is a time index (0.1 s), inf: never."""
+class Scores(_Columns):
+    """Scores of K trajectories; every array has K rows.
 
-    nc: Array  # (K,) no at-fault collision: 0, 0.5, 1
-    dac: Array  # (K,) drivable area compliance: 0, 1
-    ddc: Array  # (K,) driving direction compliance: 0, 0.5, 1
-    tlc: Array  # (K,) traffic light compliance: 0, 1
-    ep: Array  # (K,) ego progress, 0 .. 1, relative to the batch
-    ttc: Array  # (K,) time to collision: 0, 1
-    lk: Array  # (K,) lane keeping: 0, 1
-    hc: Array  # (K,) history comfort: 0, 1
+    First the sub-scores of one plan (K,) by their names, 0 .. 1, `ep` relative to the batch; then the time index (K,)
+    (0.1 s) at which each but `ep` first fails, inf: never (tasks.subscores.INDEX). `lk_index` is where 2 s off the
+    centreline are complete; `hc_index` is negative in the history.
+    """
+
     ep_raw_m: Array  # (K,) progress along the centreline [m]
-    multiplier: Array  # (K,) nc dac tlc ddc
-    pdm_score: Array  # (K,) multiplier (5 ep + 5 ttc + 2 lk + 2 hc) / 14
-    collision_index: Array  # (K,) first at-fault collision
-    dac_index: Array  # (K,) first off the drivable area
-    ddc_index: Array  # (K,) first with 2 m against traffic within 1 s
-    tlc_index: Array  # (K,) first on a red lane
-    ttc_index: Array  # (K,) first with a collision ahead
-    lk_index: Array  # (K,) completes 2 s off the centreline
-    hc_index: Array  # (K,) first uncomfortable; negative: in the history
+    multiplier: Array  # (K,) what the weighted mean is multiplied by
+    pdm_score: Array  # (K,) multiplier times weighted mean, without EC
     ego_areas: Bools  # (K, 41, 3) multiple lanes, non-drivable, oncoming
     comfort: Bools  # (K, 6) flags of history comfort, see comfort.history_comfort
 
     def __len__(self) -> int:
-        return len(self.nc)
+        return len(self.pdm_score)
 
     @property
     def first_failures(self) -> dict[str, Array]:
         """Sub-score -> time index (K,) at which it first fails, inf: never."""
-        return {
-            "nc": self.collision_index,
-            "dac": self.dac_index,
-            "ddc": self.ddc_index,
-            "tlc": self.tlc_index,
-            "ttc": self.ttc_index,
-            "lk": self.lk_index,
-            "hc": self.hc_index,
-        }
+        return {name: getattr(self, index) for name, index in INDEX.items()}
 
 
 def score(
@@ -77,11 +69,10 @@ def score(
 
 def combined(verdicts: Verdicts, normalise: Normalise = "batch") -> Scores:
     """What verdicts on K trajectories add up to; `normalise` as in `score`."""
-    v = verdicts
-    ep, multiplier, pdm_score = _combined(
-        v.nc, v.dac, v.tlc, v.ddc, v.ttc, v.lk, v.hc, v.ep_raw_m, _in_pairs(normalise)
-    )
-    return Scores(ep=ep, multiplier=multiplier, pdm_score=pdm_score, **v._asdict())
+    scores, fails, ego_areas, comfort = verdicts
+    ep, multiplier, pdm_score = _combined(scores, _in_pairs(normalise))
+    named = dict(zip(_RULED, scores)) | dict(zip(_INSTANTS, fails))
+    return Scores(ep=ep, multiplier=multiplier, pdm_score=pdm_score, ego_areas=ego_areas, comfort=comfort, **named)
 
 
 def relative_progress(ep_raw_m: Array, multiplier: Array, normalise: Normalise) -> Array:
@@ -96,9 +87,8 @@ def _in_pairs(normalise: Normalise) -> bool:
 
 
 def score_with_ec(scores: Scores, ec: Array) -> Array:
-    """The final per-frame score (K,): multiplier (5 ep + 5 ttc + 2 lk + 2 hc + 2 ec) / 16; ec: (K,)."""
-    weighted = _weighted(scores.ep, scores.ttc, scores.lk, scores.hc) + EC_WEIGHT * ec
-    final: Array = scores.multiplier * weighted / (TOTAL_WEIGHT + EC_WEIGHT)
+    """The final per-frame score (K,): the multiplier times the weighted mean, with extended comfort (K,)."""
+    final: Array = scores.multiplier * (weighted(vars(scores)) + EC_WEIGHT * ec) / (TOTAL_WEIGHT + EC_WEIGHT)
     return final
 
 
@@ -114,8 +104,8 @@ def human_filtered(scores: Scores, human: Scores) -> Scores:
         name: np.ones(len(scores)) for name in (*MULTIPLIERS, *WEIGHTS) if getattr(human, name)[0] == 0.0
     }
     scores = replace(scores, **forgiven)
-    multiplier = _product(scores.nc, scores.dac, scores.tlc, scores.ddc)
-    pdm_score = multiplier * _weighted(scores.ep, scores.ttc, scores.lk, scores.hc) / TOTAL_WEIGHT
+    multiplier = multiplied(vars(scores))
+    pdm_score = multiplier * weighted(vars(scores)) / TOTAL_WEIGHT
     return replace(scores, multiplier=multiplier, pdm_score=pdm_score)
 
 
@@ -125,21 +115,18 @@ def rows(scores: Scores, index: slice | NDArray[np.integer] | NDArray[np.bool_])
 
 
 @kernel
-def _combined(
-    nc: Array,
-    dac: Array,
-    tlc: Array,
-    ddc: Array,
-    ttc: Array,
-    lk: Array,
-    hc: Array,
-    ep_raw_m: Array,
-    in_pairs: bool,
-) -> tuple[Array, Array, Array]:
-    """EP, multiplier and PDM score (K,). One call: on two trajectories, numpy's dozen take longer than the rules."""
-    multiplier = _product(nc, dac, tlc, ddc)
-    ep = _relative(ep_raw_m, multiplier, in_pairs)
-    return ep, multiplier, multiplier * _weighted(ep, ttc, lk, hc) / TOTAL_WEIGHT
+def _combined(scores: Array, in_pairs: bool) -> tuple[Array, Array, Array]:
+    """EP, multiplier and PDM score (K,) of Verdicts.scores.
+
+    One call: on two trajectories, numpy's dozen take longer than the rules.
+    """
+    multiplier, total = np.ones(scores.shape[1]), np.zeros(scores.shape[1])
+    for row in _FACTORS:
+        multiplier *= scores[row]
+    ep = _relative(scores[EP], multiplier, in_pairs)
+    for row, weight in _TERMS:
+        total += weight * (ep if row == EP else scores[row])
+    return ep, multiplier, multiplier * total / TOTAL_WEIGHT
 
 
 @kernel
@@ -155,13 +142,3 @@ def _relative(ep_raw_m: Array, multiplier: Array, in_pairs: bool) -> Array:
         if best_here > PROGRESS_THRESHOLD_M:
             ep[k] = min(max(ep_raw_m[k] / best_here, 0.0), 1.0)
     return ep
-
-
-@register_jitable
-def _product(nc: Array, dac: Array, tlc: Array, ddc: Array) -> Array:
-    return nc * dac * tlc * ddc
-
-
-@register_jitable
-def _weighted(ep: Array, ttc: Array, lk: Array, hc: Array) -> Array:
-    return EP_WEIGHT * ep + TTC_WEIGHT * ttc + LK_WEIGHT * lk + HC_WEIGHT * hc

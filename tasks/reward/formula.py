@@ -1,14 +1,32 @@
 """What sub-scores weigh in a score, and what progress counts as (docs/reward.md 2k). Needs numpy only."""
 
+from collections.abc import Mapping
+from functools import reduce
+from operator import add, mul
+
 import numpy as np
 from numpy.typing import NDArray
 
+from tasks.subscores import RECORDS
+
 Array = NDArray[np.float64]
 
-MULTIPLIERS = ("nc", "dac", "tlc", "ddc")
-WEIGHTS = {"ep": 5.0, "ttc": 5.0, "lk": 2.0, "hc": 2.0}
-EC_WEIGHT = 2.0
+_IN_ORDER = sorted(RECORDS, key=lambda record: record.section)
+MULTIPLIERS = tuple(record.name for record in _IN_ORDER if record.weight is None)
+WEIGHTS = {record.name: record.weight for record in _IN_ORDER if record.weight is not None}
+EC_WEIGHT = WEIGHTS.pop("ec")  # which takes two plans: a score has it or has it not
+TOTAL_WEIGHT = sum(WEIGHTS.values())
 PROGRESS_THRESHOLD_M = 5.0
+
+
+def multiplied(scores: Mapping[str, Array]) -> Array:
+    """What the weighted mean is multiplied by (K,), of sub-scores (K,) by name."""
+    return reduce(mul, (scores[name] for name in MULTIPLIERS))
+
+
+def weighted(scores: Mapping[str, Array]) -> Array:
+    """The weighted sum (K,) of sub-scores (K,) of one plan by name; its mean is over TOTAL_WEIGHT."""
+    return reduce(add, (weight * scores[name] for name, weight in WEIGHTS.items()))
 
 
 def share_of_best(gained_m: Array, best_m: Array) -> Array:

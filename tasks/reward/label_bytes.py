@@ -9,20 +9,20 @@ ends either string. EC is not in it: it compares with an earlier plan, and a voc
 
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
-from typing import Literal
+from dataclasses import dataclass, make_dataclass
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.reward.formula import WEIGHTS, share_of_best
+from tasks.reward.formula import TOTAL_WEIGHT, multiplied, share_of_best, weighted
+from tasks.subscores import HALVES, JUDGED, WHOLES
 
 Array = NDArray[np.float64]
 Bits = NDArray[np.uint8]
 Normalise = Literal["pairs", "batch", "masked"]
 
-HALVES = ("nc", "ddc")  # 0, 0.5 or 1
-WHOLES = ("dac", "tlc", "ttc", "lk", "hc")  # 0 or 1
+ARRAYS = (*JUDGED, "ep_raw_m")  # of VocabularyLabels, and by the same names of Scores
 N_PLANES = 2 * len(HALVES) + len(WHOLES)
 UNITS_PER_M = 128
 MAX_PROGRESS_M = 65535 / UNITS_PER_M
@@ -30,28 +30,31 @@ CRC_BYTES = 4
 
 
 @dataclass(frozen=True, eq=False)
-class VocabularyLabels:
-    """What every trajectory of a vocabulary scores when it is driven from one scene; arrays have K rows."""
-
+class _Header:
     vocabulary: str  # digest of the trajectories, tasks.world.vocabulary.trajectories_digest
     traffic: str  # replay: one traffic for all; idm: traffic that answers to each trajectory
     reference_progress_m: float  # compliant progress of PDM-Closed [m]
-    nc: Array  # (K,) no at-fault collision: 0, 0.5, 1
-    dac: Array  # (K,) drivable area compliance: 0, 1
-    ddc: Array  # (K,) driving direction compliance: 0, 0.5, 1
-    tlc: Array  # (K,) traffic light compliance: 0, 1
-    ttc: Array  # (K,) time to collision: 0, 1
-    lk: Array  # (K,) lane keeping: 0, 1
-    hc: Array  # (K,) history comfort: 0, 1
-    ep_raw_m: Array  # (K,) progress along the route [m]
+
+
+_Labels: Any = make_dataclass(
+    "_Labels", [(name, Array) for name in ARRAYS], bases=(_Header,), frozen=True, eq=False
+)  # their types are known where the record is read
+
+
+@dataclass(frozen=True, eq=False)
+class VocabularyLabels(_Labels):
+    """What every trajectory of a vocabulary scores when it is driven from one scene.
+
+    After the header come ARRAYS (K,): the sub-scores that fail at an instant, and `ep_raw_m`, progress along the route.
+    """
 
     def __len__(self) -> int:
-        return len(self.nc)
+        return len(self.ep_raw_m)
 
     @property
     def multiplier(self) -> Array:
-        """(K,) nc dac tlc ddc."""
-        return self.nc * self.dac * self.tlc * self.ddc
+        """(K,) what the weighted mean is multiplied by."""
+        return multiplied(vars(self))
 
     def ep(self, normalise: Normalise = "pairs") -> Array:
         """(K,) ego progress, 0 .. 1 (docs/reward.md 2k): in pairs with PDM-Closed, or in one batch of it and all K.
@@ -67,11 +70,8 @@ class VocabularyLabels:
         return share_of_best(gained_m, best)
 
     def pdm_score(self, normalise: Normalise = "pairs") -> Array:
-        """(K,) multiplier (5 ep + 5 ttc + 2 lk + 2 hc) / 14."""
-        weighted = WEIGHTS["ep"] * self.ep(normalise)
-        for name in ("ttc", "lk", "hc"):
-            weighted = weighted + WEIGHTS[name] * getattr(self, name)
-        return self.multiplier * weighted / sum(WEIGHTS.values())
+        """(K,) the multiplier times the weighted mean, without EC."""
+        return self.multiplier * weighted(vars(self) | {"ep": self.ep(normalise)}) / TOTAL_WEIGHT
 
 
 def encode(labels: VocabularyLabels) -> tuple[bytes, bytes]:
@@ -79,9 +79,9 @@ def encode(labels: VocabularyLabels) -> tuple[bytes, bytes]:
 
     Raises ValueError naming the field whose length differs, or that holds a value the bytes cannot say.
     """
-    for field in fields(labels)[3:]:
-        if getattr(labels, field.name).shape != labels.nc.shape or labels.nc.ndim != 1:
-            raise ValueError(f"{field.name}: ({len(labels)},) expected, got {getattr(labels, field.name).shape}")
+    for name in ARRAYS:
+        if (shape := getattr(labels, name).shape) != (len(labels),):
+            raise ValueError(f"{name}: ({len(labels)},) expected, got {shape}")
     units = np.ceil(labels.ep_raw_m * UNITS_PER_M)
     if not ((labels.ep_raw_m >= 0.0) & (units <= 65535)).all():  # also for NaN
         raise ValueError(f"ep_raw_m: must lie within 0 .. {MAX_PROGRESS_M:.2f} m, got {_strange(labels.ep_raw_m)}")

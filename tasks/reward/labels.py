@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tasks.reward.epdms import Scores, rows, score
-from tasks.reward.label_bytes import HALVES, WHOLES, VocabularyLabels
+from tasks.reward.label_bytes import ARRAYS, VocabularyLabels
 from tasks.reward.prepare import PreparedScene
 from tasks.reward.reactive import reactive_scores
 from tasks.rollout.lqr import track_local
@@ -50,5 +50,5 @@ def vocabulary_labels(labelling: Labelling, scene: Scene, prepared: PreparedScen
         scores = scored(np.concatenate([rival[None], driven]))
         reference_m = float(scores.ep_raw_m[0] * scores.multiplier[0])
         parts.append(rows(scores, slice(1, None)))
-    kept = {name: np.concatenate([getattr(part, name) for part in parts]) for name in (*HALVES, *WHOLES, "ep_raw_m")}
+    kept = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS}
     return VocabularyLabels(labelling.vocabulary.digest, traffic.mode, reference_m, **kept)

@@ -37,7 +37,7 @@ def reactive_scores(scene: Scene, states: Array, traffic: TrafficSettings) -> Sc
         rollouts = roll_out_many(ready, egos)
         stopped = _stopped_when_first_seen(rollouts) | ~is_agent
         parts.append(judge_among(prepared, rollouts.boxes[:, :, keep], stopped[:, keep], collision_score[keep], egos))
-    every = Verdicts._make([np.concatenate(columns) for columns in zip(*parts)])
+    every = Verdicts._make([np.concatenate(columns, axis) for columns, axis in zip(zip(*parts), (1, 1, 0, 0))])
     return combined(every, "pairs")
 
 

@@ -18,6 +18,7 @@ from tasks.reward.rules.lane_discipline import driving_direction, lane_keeping
 from tasks.reward.rules.lights import RedLanes, first_red
 from tasks.reward.rules.map_index import MapIndex
 from tasks.reward.rules.obstacles import Obstacles, spans_of, unindexed, with_objects, within_reach
+from tasks.subscores import JUDGED, LABELLED, WHOLES
 from tasks.world.bounds import LARGEST, all_within
 from tasks.world.vehicle import EGO_STATE_SIZE, Vehicle
 
@@ -30,24 +31,16 @@ _NO_DRIVE = f"states must be finite and at most {LARGEST:g}: leave out what is n
 INDEX_FROM_ROWS = 32  # an index of the objects costs about as much as it saves on that many trajectories
 
 
-class Verdicts(NamedTuple):
-    """What the rules say of K trajectories, as in Scores; a `*_index` is a time index (0.1 s), inf: never."""
+NC, DAC, DDC, TLC = (LABELLED.index(name) for name in ("nc", "dac", "ddc", "tlc"))
+TTC, LK, HC, EP = (LABELLED.index(name) for name in ("ttc", "lk", "hc", "ep"))
+_WHOLES = tuple(LABELLED.index(name) for name in WHOLES)
 
-    nc: Array  # (K,)
-    dac: Array  # (K,)
-    ddc: Array  # (K,)
-    tlc: Array  # (K,)
-    ttc: Array  # (K,)
-    lk: Array  # (K,)
-    hc: Array  # (K,)
-    ep_raw_m: Array  # (K,)
-    collision_index: Array  # (K,)
-    dac_index: Array  # (K,)
-    ddc_index: Array  # (K,)
-    tlc_index: Array  # (K,)
-    ttc_index: Array  # (K,)
-    lk_index: Array  # (K,)
-    hc_index: Array  # (K,)
+
+class Verdicts(NamedTuple):
+    """What the rules say of K trajectories; a sub-score without a rule is NaN."""
+
+    scores: Array  # (S + 1, K) by LABELLED; of EP the progress [m]
+    fails: Array  # (S, K) by JUDGED: the time index (0.1 s) at which it first fails, inf: never
     ego_areas: Bools  # (K, 41, 3)
     comfort: Bools  # (K, 6)
 
@@ -120,11 +113,11 @@ def _shaped(states: Array) -> Array:
 
 def _verdicts(world: World, obstacles: Obstacles, boxes: Array, is_stopped: Bools, states: Array) -> Verdicts:
     states = _shaped(states)
-    numbers = np.empty((len(Verdicts._fields) - 2, len(states)))
+    scores, fails = np.empty((len(LABELLED), len(states))), np.empty((len(JUDGED), len(states)))
     areas, comfort = np.empty((len(states), N_TIMES, 3), np.bool_), np.empty((len(states), N_FLAGS), np.bool_)
-    if not _judge_all(world, obstacles, boxes, is_stopped, states, numbers, areas, comfort):
+    if not _judge_all(world, obstacles, boxes, is_stopped, states, scores, fails, areas, comfort):
         raise ValueError(_NO_DRIVE)
-    return Verdicts._make([*numbers, areas, comfort])
+    return Verdicts(scores, fails, areas, comfort)
 
 
 def world_of(prepared: PreparedScene, with_history: bool) -> World:
@@ -153,7 +146,8 @@ def _judge_all(
     boxes: Array,  # (K, 41, N, 5) of each trajectory's own objects, or none: all meet `obstacles`
     is_stopped: Bools,  # (K, N)
     states: Array,
-    numbers: Array,  # (15, K) out: the columns of Verdicts up to its flags
+    scores: Array,  # these four out: Verdicts
+    fails: Array,
     areas: Bools,
     comfort: Bools,
 ) -> bool:
@@ -163,25 +157,8 @@ def _judge_all(
         beyond += not abs(value) <= LARGEST
     if beyond > 0:
         return False
-    out = Verdicts(
-        numbers[0],
-        numbers[1],
-        numbers[2],
-        numbers[3],
-        numbers[4],
-        numbers[5],
-        numbers[6],
-        numbers[7],
-        numbers[8],
-        numbers[9],
-        numbers[10],
-        numbers[11],
-        numbers[12],
-        numbers[13],
-        numbers[14],
-        areas,
-        comfort,
-    )
+    out = Verdicts(scores, fails, areas, comfort)
+    out.scores[:], out.fails[:] = math.nan, math.nan
     scratch = scratch_for(obstacles.boxes.shape[1])
     spans = spans_of(obstacles)
     for k in range(states.shape[0]):
@@ -203,30 +180,27 @@ def _judge_one(
     areas_along(world.map_index, body, half_length, half_width)
     _spread_flags(body.flags, out.ego_areas[k])
     obstacles = within_reach(everything, spans, reach_of(body), 2.0 * half_length, 2.0 * half_width)
-    out.nc[k], out.collision_index[k] = first_collision(
+    out.scores[NC, k], out.fails[NC, k] = first_collision(
         obstacles, states, body, half_length, half_width, scratch.ignored
     )
-    out.dac_index[k] = _first_with(body.flags, NON_DRIVABLE)
-    out.ddc[k], out.ddc_index[k] = driving_direction(body)
-    out.tlc_index[k] = first_red(world.red_lanes, body, half_length, half_width)
-    out.ttc_index[k] = first_time_to_collision(
+    out.fails[DAC, k] = _first_with(body.flags, NON_DRIVABLE)
+    out.scores[DDC, k], out.fails[DDC, k] = driving_direction(body)
+    out.fails[TLC, k] = first_red(world.red_lanes, body, half_length, half_width)
+    out.fails[TTC, k] = first_time_to_collision(
         obstacles, states, body, world.map_index, half_length, half_width, scratch.ignored
     )
-    out.lk_index[k] = lane_keeping(world.centerline, body)
+    out.fails[LK, k] = lane_keeping(world.centerline, body)
     last = states.shape[0] - 1
-    out.ep_raw_m[k] = progress_m(world.centerline, body.x[0], body.y[0], body.x[last], body.y[last])
+    out.scores[EP, k] = progress_m(world.centerline, body.x[0], body.y[0], body.x[last], body.y[last])
     if len(world.history) > 0:
-        out.hc_index[k] = comfort_along(
+        out.fails[HC, k] = comfort_along(
             world.history, states, world.ego.rear_axle_to_center, scratch.comfort, out.comfort[k]
         )
     else:
-        out.hc_index[k] = math.inf
+        out.fails[HC, k] = math.inf
         out.comfort[k] = True
-    out.dac[k] = 1.0 if out.dac_index[k] == math.inf else 0.0
-    out.tlc[k] = 1.0 if out.tlc_index[k] == math.inf else 0.0
-    out.ttc[k] = 1.0 if out.ttc_index[k] == math.inf else 0.0
-    out.lk[k] = 1.0 if out.lk_index[k] == math.inf else 0.0
-    out.hc[k] = 1.0 if out.hc_index[k] == math.inf else 0.0
+    for row in _WHOLES:
+        out.scores[row, k] = 1.0 if out.fails[row, k] == math.inf else 0.0
 
 
 @kernel

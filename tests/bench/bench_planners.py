@@ -17,11 +17,11 @@ import torch
 
 from factory.config.compose import compose, fill
 from planners.data.batch import Batch, Needs
-from planners.data.decode import LABELS
 from planners.models.planner import Planner
 from planners.models.registry import planner_class, settings_of
 from planners.training.optim import build_optimiser
 from planners.training.train import PlannerEntry
+from tasks.subscores import LABELLED
 from tasks.world.kinematic_vocabulary import kinematic_trajectories
 from tests.bench.timing import cpu_milliseconds, memory_mb, milliseconds
 
@@ -53,7 +53,7 @@ def random_batch(size: int, needs: Needs, k: int) -> Batch:
         bev=torch.randint(0, 7, (size, *classes), dtype=torch.uint8, generator=rng) if needs.bev is not None else None,
         agents=10.0 * uniform(needs.n_agents, 5) if needs.n_agents else None,
         agents_valid=uniform(needs.n_agents) > 0.5 if needs.n_agents else None,
-        labels={name: (uniform(k) > 0.5).float() for name in LABELS} if needs.labels is not None else None,
+        labels={name: (uniform(k) > 0.5).float() for name in LABELLED} if needs.labels is not None else None,
     )
 
 

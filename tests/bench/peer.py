@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tasks.reward.epdms import Scores
+from tasks.subscores import RECORDS
 from tasks.world.agents import AgentTracks
 from tasks.world.lanes import MapPolygon
 
@@ -24,17 +25,7 @@ Array = NDArray[np.float64]
 
 ADAPTER = Path(__file__).with_name("peer_navsim.py")
 SAME = 1e-9  # scores further apart than this are different
-PEERS = {  # our sub-scores by the public names
-    "no_at_fault_collisions": "nc",
-    "drivable_area_compliance": "dac",
-    "driving_direction_compliance": "ddc",
-    "traffic_light_compliance": "tlc",
-    "ego_progress": "ep",
-    "time_to_collision_within_bound": "ttc",
-    "lane_keeping": "lk",
-    "history_comfort": "hc",
-    "pdm_score": "pdm_score",
-}
+PEERS = {record.long_name: record.name for record in RECORDS if record.plans == 1} | {"pdm_score": "pdm_score"}
 
 
 @dataclass(frozen=True)

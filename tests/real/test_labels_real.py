@@ -13,19 +13,12 @@ from factory.store.samples import Store
 from factory.store.schema import SAMPLES, sample_row_to_table
 from factory.store.table import write_shard
 from tasks.reward.label_bytes import UNITS_PER_M, VocabularyLabels
+from tasks.subscores import JUDGED, RECORDS
 from tests.factory.toy import row_of, stream
 from tests.real.reference_scenes import RECORDED_K, loader
 
-COLUMN = {
-    "nc": "no_at_fault_collisions",
-    "dac": "drivable_area_compliance",
-    "ddc": "driving_direction_compliance",
-    "tlc": "traffic_light_compliance",
-    "ttc": "time_to_collision_within_bound",
-    "lk": "lane_keeping",
-    "hc": "history_comfort",
-    "ep_raw_m": "ego_progress_raw_m",
-}
+COLUMN = {record.name: record.long_name for record in RECORDS if record.name in JUDGED}
+COLUMN["ep_raw_m"] = "ego_progress_raw_m"
 CASES = [(scene, k) for scene, recorded in RECORDED_K.items() for k in recorded]
 BYTES_OF_16384, OVERHEAD_BYTES = 40_000, 1_000
 

@@ -15,19 +15,10 @@ from numpy.typing import NDArray
 
 from tasks.reward.epdms import Scores
 from tasks.reward.one_stage import COLUMNS, FrameScores, columns_of, means_of
+from tasks.subscores import RECORDS
 
 Array = NDArray[np.float64]
-THEIRS = {
-    "nc": "no_at_fault_collisions",
-    "dac": "drivable_area_compliance",
-    "tlc": "traffic_light_compliance",
-    "ddc": "driving_direction_compliance",
-    "ep": "ego_progress",
-    "ttc": "time_to_collision_within_bound",
-    "lk": "lane_keeping",
-    "hc": "history_comfort",
-    "ec": "two_frame_extended_comfort",
-}
+THEIRS = {record.name: record.long_name for record in RECORDS}
 NAVHARD = {"ltf_sim_navhard": 0.44801101737, "gtrs_dense_vov_sim_expert_navhard": 0.65459996490}  # stage two, published
 SCORE, EC = COLUMNS.index("score"), COLUMNS.index("ec")
 

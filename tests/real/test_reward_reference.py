@@ -14,20 +14,13 @@ from tasks.reward.epdms import Scores, human_filtered, rows, score, score_with_e
 from tasks.reward.prepare import prepare_scene
 from tasks.reward.rules.comfort import extended_comfort
 from tasks.rollout.lqr import track
+from tasks.subscores import JUDGED, RECORDS
 from tasks.trajectories import score_trajectories
 from tasks.world.clip import NOW, scene_of_clip
 from tasks.world.frames import to_world, wrap_angle
 from tasks.world.vehicle import HEADING
 
-EXACT = {  # ours: recorded
-    "nc": "no_at_fault_collisions",
-    "dac": "drivable_area_compliance",
-    "ddc": "driving_direction_compliance",
-    "tlc": "traffic_light_compliance",
-    "ttc": "time_to_collision_within_bound",
-    "lk": "lane_keeping",
-    "hc": "history_comfort",
-}
+EXACT = {record.name: record.long_name for record in RECORDS if record.name in JUDGED}  # ours: recorded
 CLOSE = {"ep": "ego_progress", "ep_raw_m": "ego_progress_raw_m", "pdm_score": "pdm_score"}
 
 

@@ -19,21 +19,13 @@ from factory.readers.base import ClipRef
 from planners.evaluation.scoring import PreparedFrame, Rules, drive, prepare_frame, score_pair
 from tasks.reward.one_stage import COLUMNS, frame_scores
 from tasks.rollout.simulate import TrafficScene, TrafficSettings
+from tasks.subscores import RECORDS
 from tasks.world.clip import NOW, STEP_S, scene_of_clip
 from tasks.world.frames import to_local
 
 WHOLE = ("7fab2350_20", "7fab2350_44", "adcf7d18_64")  # the log holds a whole clip there
 REPLAY = TrafficSettings(mode="replay")
-PUBLIC = {
-    "nc": "no_at_fault_collisions",
-    "dac": "drivable_area_compliance",
-    "ddc": "driving_direction_compliance",
-    "tlc": "traffic_light_compliance",
-    "ep": "ego_progress",
-    "ttc": "time_to_collision_within_bound",
-    "lk": "lane_keeping",
-    "hc": "history_comfort",
-}
+PUBLIC = {record.name: record.long_name for record in RECORDS if record.plans == 1}
 
 
 @cache

@@ -14,7 +14,8 @@ from tasks.experts.recovery.expert import Recovery, RecoveryTable
 from tasks.perturb import Perturbation, PerturbSettings, perturb
 from tasks.reward.epdms import Scores
 from tasks.rollout.simulate import TrafficSettings, simulate
-from tasks.stages import STAGES, SUBSCORES, Rejected
+from tasks.stages import STAGES, Rejected
+from tasks.subscores import JUDGED
 from tasks.world.chance import stream
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip, Rollout, Scene, scene_of_clip
 from tasks.world.frames import to_world
@@ -80,7 +81,7 @@ def test_a_drive_with_every_sub_score_one_and_progress_above_a_half_is_accepted(
     assert verdict(scores(ep=0.5001), GATE) is None
 
 
-@pytest.mark.parametrize("name", [name for name in SUBSCORES if name not in ("ep", "ec")])
+@pytest.mark.parametrize("name", JUDGED)
 @pytest.mark.parametrize("value", [0.0, 0.5, float("nan")])
 def test_half_of_a_sub_score_fails_and_is_named(name: str, value: float) -> None:
     rejected = verdict(scores(**{name: value}), GATE)

@@ -13,7 +13,7 @@ from factory.store.table import KeyedTable
 from factory.views.board.watch import Snapshot
 from factory.views.report_words import REASON_WORDS, to_the_side, turned
 from factory.views.status import RETRY
-from tasks.stages import SUBSCORES
+from tasks.subscores import SUBSCORES
 
 FILTERS = ("expert", "round", "image_source", "command", "split", "log_id")
 SIMULATED = "simulated"  # simulated=1: no logged drives

@@ -5,15 +5,15 @@ trajectory would score if it were driven, another how near it is to the label. A
 vocabulary. Constants without another source are those of NVlabs/GTRS and OpenDriveLab/SimScale (04cda10),
 navsim/agents/gtrs_dense: hydra_config.py, hydra_model.py, gtrs_agent.py, with SimScale's gtrs_dense_vov.yaml.
 
-Different here: there is a head for hc as well (weight 1.0 in the published settings, which have no such head), noise on
-the velocity is drawn for each sample instead of once for a batch, and pictures are shifted. The supplement says that
-inputs get "random spatial shifts"; neither code base shifts the pictures of this model, so how far is ours: edge pixels
-are repeated as in DrQ (Kostrikov et al. 2021), few enough of them that the labels stand.
+Different here: there is a head for history comfort as well (weight 1.0 in the published settings, which have no such
+head), noise on the velocity is drawn for each sample instead of once for a batch, and pictures are shifted. The
+supplement says that inputs get "random spatial shifts"; neither code base shifts the pictures of this model, so how far
+is ours: edge pixels are repeated as in DrQ (Kostrikov et al. 2021), few enough of them that the labels stand.
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
-from typing import ClassVar, Literal
+from dataclasses import asdict, dataclass, field, make_dataclass
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -25,29 +25,25 @@ from planners.models.anchors import read_array
 from planners.models.attention import Decoder, Layer
 from planners.models.backbones.registry import BackboneSettings
 from planners.models.gtrs_dense.tokens import FusedTokens, PictureTokens
-from planners.models.gtrs_dense.weighting import IMITATION, SUBSCORES, WEIGHTINGS, WeightingName, choose
+from planners.models.gtrs_dense.weighting import IMITATION, WEIGHTINGS, WeightingName, choose
 from planners.models.planner import FloatArray, Planner, TrainingData, evaluating
 from planners.models.transfuser import FusionSettings
-from tasks.reward.label_bytes import HALVES, Normalise
+from tasks.reward.label_bytes import Normalise
+from tasks.subscores import HALVES, LABELLED
 from tasks.world.vocabulary import Vocabulary
 
 STATUS = 8
 VELOCITY = slice(4, 6)  # of the status, after the one-hot command
 AT_2HZ = slice(4, None, 5)  # of 40 poses at 10 Hz
+LOSS_WEIGHTS = {"nc": 3.0, "dac": 3.0, "tlc": 3.0, "ttc": 4.0, "lk": 2.0, "ep": 2.0}  # of the others 1
+_Weights: Any = make_dataclass(
+    "_Weights", [(name, float, LOSS_WEIGHTS.get(name, 1.0)) for name in LABELLED], frozen=True
+)
 
 
 @dataclass(frozen=True)
-class RewardWeights:
-    """Of the heads' losses; 0 leaves a head untrained."""
-
-    nc: float = 3.0
-    dac: float = 3.0
-    ddc: float = 1.0
-    tlc: float = 3.0
-    ttc: float = 4.0
-    lk: float = 2.0
-    hc: float = 1.0
-    ep: float = 2.0
+class RewardWeights(_Weights):
+    """Of the heads' losses, by sub-score; 0 leaves a head untrained."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +88,7 @@ class TrajectoryScorer(nn.Module):
         self.decoder = Decoder(width, settings.heads, hidden, settings.layers)
         self.status = nn.Linear(STATUS, width)
         self.heads = nn.ModuleDict(
-            {name: nn.Sequential(nn.Linear(width, hidden), nn.ReLU(), nn.Linear(hidden, 1)) for name in SUBSCORES}
+            {name: nn.Sequential(nn.Linear(width, hidden), nn.ReLU(), nn.Linear(hidden, 1)) for name in LABELLED}
         )
         self.heads[IMITATION] = nn.Sequential(
             nn.Linear(width, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 1)

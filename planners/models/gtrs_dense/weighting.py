@@ -2,10 +2,10 @@
 
     total = sum_i w_i log p_i + group log(sum_j v_j p_j)
 
-over probabilities p: what multiplies in EPDMS (nc, dac, ddc, tlc) and imitation in logarithms of their own, what is
-averaged there (ttc, ep, lk, hc) under one. `release` and `proposals` are those of GTRS,
-navsim/agents/gtrs_dense/hydra_model.py (read in OpenDriveLab/SimScale 04cda10 and woxihuanjiangguo/ZTRS 3593a03, which
-agree). Neither weighs hc, for which those models have no head.
+over probabilities p: what multiplies in EPDMS and imitation in logarithms of their own, what is averaged there under
+one. `release` and `proposals` are those of GTRS, navsim/agents/gtrs_dense/hydra_model.py (read in OpenDriveLab/SimScale
+04cda10 and woxihuanjiangguo/ZTRS 3593a03, which agree). Neither weighs history comfort, for which those models have no
+head.
 """
 
 from collections.abc import Mapping
@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 
 IMITATION = "imitation"
-SUBSCORES = ("nc", "dac", "ddc", "tlc", "ttc", "lk", "hc", "ep")  # EPDMS without EC, which compares two plans
 
 WeightingName = Literal["release", "proposals", "close"]
 

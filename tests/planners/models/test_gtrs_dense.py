@@ -11,9 +11,9 @@ from factory.config.compose import conf_dir, fill
 from planners.data.batch import Batch, ImageLayout
 from planners.models.backbones.registry import BackboneSettings
 from planners.models.gtrs_dense.planner import GtrsDense, GtrsDenseSettings, imitated, shifted
-from planners.models.gtrs_dense.weighting import SUBSCORES
 from planners.models.planner import TrainingData
 from planners.training.optim import TrainingSettings
+from tasks.subscores import LABELLED
 from tasks.world.vocabulary import Vocabulary
 from tests.planners import scenes
 
@@ -68,7 +68,7 @@ def test_scores_are_probabilities_over_the_vocabulary_and_the_plan_is_its_entry(
     batch, _ = labelled(3)
     model = planner().eval()
     scores = model.scores(batch)
-    assert set(scores) == {*SUBSCORES, "imitation"}
+    assert set(scores) == {*LABELLED, "imitation"}
     assert all(value.shape == (3, K) and value.dtype == torch.float32 for value in scores.values())
     assert all(((value >= 0) & (value <= 1)).all() for value in scores.values())
     torch.testing.assert_close(scores["imitation"].sum(dim=1), torch.ones(3))
@@ -107,7 +107,7 @@ def test_imitation_is_divided_by_the_whole_batch_and_rewards_count_every_sample(
     half = model.losses(replace(batch, imitate=torch.tensor([True, False, True, False])))
     pair = [model.losses(part)["imitation"] for part in batch.parts(4)]
     torch.testing.assert_close(half["imitation"], (pair[0] + pair[2]) / 4)
-    assert all(torch.equal(every[name], half[name]) for name in SUBSCORES)
+    assert all(torch.equal(every[name], half[name]) for name in LABELLED)
 
 
 def test_all_parameters_get_a_gradient_with_imitation_and_a_head_switched_off() -> None:
@@ -118,7 +118,7 @@ def test_all_parameters_get_a_gradient_with_imitation_and_a_head_switched_off() 
         assert parameter.grad is not None, f"{name}: processes wait for the gradient of every parameter"
         if name.startswith(("scorer.heads.imitation", "scorer.heads.hc")):
             assert (parameter.grad == 0.0).all(), f"{name} is switched off"
-    for head in set(SUBSCORES) - {"hc"}:
+    for head in set(LABELLED) - {"hc"}:
         assert model.scorer.heads[head][0].weight.grad.abs().sum() > 0.0, head
 
 

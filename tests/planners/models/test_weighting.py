@@ -5,13 +5,14 @@ import math
 import pytest
 import torch
 
-from planners.models.gtrs_dense.weighting import SUBSCORES, WEIGHTINGS, choose, total
+from planners.models.gtrs_dense.weighting import WEIGHTINGS, choose, total
+from tasks.subscores import LABELLED
 
 
 def named(**given: list[float]) -> dict[str, torch.Tensor]:
     """Probabilities (1, K): those given, 0.5 for every other."""
     k = len(next(iter(given.values())))
-    every = dict.fromkeys((*SUBSCORES, "imitation"), [0.5] * k) | given
+    every = dict.fromkeys((*LABELLED, "imitation"), [0.5] * k) | given
     return {name: torch.tensor([values]) for name, values in every.items()}
 
 
@@ -42,5 +43,5 @@ def test_of_equals_the_first_is_chosen_and_a_probability_of_zero_stays_finite() 
 
 @pytest.mark.parametrize("name", WEIGHTINGS)
 def test_full_marks_beat_everything(name: str) -> None:
-    best = named(**{score: [1.0, 0.95] for score in SUBSCORES})
+    best = named(**{score: [1.0, 0.95] for score in LABELLED})
     assert choose(best, WEIGHTINGS[name]).tolist() == [0]

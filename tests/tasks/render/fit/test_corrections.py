@@ -57,15 +57,15 @@ def test_a_motion_is_rigid_and_small_ones_add_up() -> None:
 
 
 def test_the_rasterisers_camera_gradient_is_that_of_a_pose_row() -> None:
-    n, rng = 30, np.random.default_rng(3)  # the cut-offs, which no gradient knows, are few in this scene
-    depth = rng.uniform(3.0, 9.0, n)
-    means = np.stack([rng.uniform(-0.3, 0.3, n) * depth, rng.uniform(-0.3, 0.3, n) * depth, depth], 1)
+    n = 30
+    depth = RNG.uniform(3.0, 9.0, n)
+    means = np.stack([RNG.uniform(-0.3, 0.3, n) * depth, RNG.uniform(-0.3, 0.3, n) * depth, depth], 1)
     scene = Gaussians(
         means.astype(np.float32),
         np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
         np.full((n, 3), np.log(0.5), np.float32),
         np.full(n, 0.4, np.float32),
-        rng.uniform(0, 1, (n, 3)).astype(np.float32),
+        RNG.uniform(0, 1, (n, 3)).astype(np.float32),
     )
     upstream = np.ones((SIZE[1], SIZE[0], 3), np.float32) * np.linspace(-1, 1, SIZE[0], dtype=np.float32)[None, :, None]
 
