@@ -3,16 +3,18 @@
 python -m planners train planner=ltf data.real=[runs/town] data.sim=[runs/town] out=runs/ltf
 python -m planners evaluate benchmark=runs/hard planner=runs/ltf
 python -m planners <command> --help
+
+Exit codes of all: 0 complete, 2 settings or files that do not fit, 3 a part of a sweep failed, 4 interrupted or out of
+minutes, and the same command goes on. What is wrong is told in one line.
 """
 
 import signal
 import sys
-from collections.abc import Sequence
 
 from factory.commands.table import PLANNERS, dispatch, listed
 
 
-def main(argv: Sequence[str]) -> int:
+def main(argv: list[str]) -> int:
     """Hand the arguments to the command that is named first; its exit code, 2 where there is none."""
     return dispatch(argv, PLANNERS, f"{__doc__}\ncommands\n{listed(PLANNERS)}\n\nMore: docs/training.md.")
 

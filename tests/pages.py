@@ -15,9 +15,8 @@ PROGRAMS = {"make", "python", ".venv/bin/python", "source", "ray", "torchrun"}
 PROGRAMS |= {"kubectl", "prometheus", "rsync", "export", "echo", "git", "pip", ".venv/bin/pip"}
 NO_COMMANDS = {  # pages with an unnamed block that is a drawing, or output alone
     "docs/concepts.md",
-    "docs/study.md",
-    "docs/study_logs.md",
-    "docs/study_notes.md",
+    "docs/study/details.md",
+    "docs/study/notes.md",
 }
 FENCED = re.compile(r"^```(\w*)\n(.*?)^```$", re.M | re.S)
 IN_PROSE = re.compile(r"`((?:python -m|make|ray job|torchrun) [^`]+)`")

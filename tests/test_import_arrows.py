@@ -25,7 +25,7 @@ ROOMS = {
         *("wording", "job", "config", "readers", "store", "graph", "stages", "setup", "views", "views.board"),
         *("run", "commands", "__main__"),
     ),
-    "planners": ("data", "models", "training", "evaluation", "study", "__main__"),
+    "planners": ("command", "data", "models", "training", "evaluation", "study", "__main__"),
 }
 MOST_MODULES = 20  # in a room
 

@@ -19,7 +19,7 @@ import pytest
 from factory.__main__ import main as door_main
 from factory.commands.dashboard import Request as DashboardRequest
 from factory.commands.explain import split_arguments
-from factory.commands.table import COMMANDS
+from factory.commands.table import COMMANDS, PLANNERS
 from factory.config.arguments import parse
 from factory.config.compose import compose, conf_dir, fill
 from factory.config.plugins import GROUPS
@@ -34,10 +34,10 @@ from planners.evaluation.compare import main as compare_main
 from planners.evaluation.evaluate import settings_of as evaluate_settings
 from planners.evaluation.replay import settings_of as replay_settings
 from planners.study.agreement import main as agreement_main
-from planners.study.plan import StudySettings
-from planners.study.report import ReportSettings
+from planners.study.recipe import Recipe
+from planners.study.report import ReportRequest
 from planners.study.scaling import ScalingSettings
-from planners.study.scaling_table import TableSettings
+from planners.study.setups import StudySettings
 from planners.training.train import TrainConfig
 from tasks.caches import user_cache
 from tasks.kernels.compiled import cache_dir
@@ -50,7 +50,7 @@ IN_PROSE = list(dict.fromkeys(command for page in PAGES for command in named_in_
 PYTHON_BLOCKS = blocks("README.md", "python")
 RUN_ELSEWHERE = {
     "docs/queries.md": "tests/test_queries.py runs them",
-    "docs/study_notes.md": "needs the evaluations of a whole study; compiled only",
+    "docs/study/notes.md": "needs the evaluations of a whole study; compiled only",
 }
 LEFT_OUT = {  # program, and why its commands are not read here; the files that they name have to be there
     "kubectl": "needs a cluster; tests/deploy holds its files against their schemas",
@@ -178,16 +178,16 @@ def test_every_command_is_one_its_program_takes(
             assert agreement_main([*kept, f"out={demo_home / 'agreement.png'}"]) == 0, capsys.readouterr().err
         case ["python", "-m", "planners", "scaling", *arguments]:
             fill(ScalingSettings, compose("scaling", arguments), "scaling")
-        case ["python", "-m", "planners", "scaling_table", *arguments]:
-            fill(TableSettings, pairs(arguments), "scaling_table")
+        case ["python", "-m", "planners", "study_data" | "study_logs" as name, *arguments]:
+            fill(Recipe, compose(name, arguments), name)
         case ["python", "-m", "planners", "replay", *arguments]:
             replay_settings(arguments)
         case ["python", "-m", "planners", "study", *arguments]:
             fill(StudySettings, compose("study", arguments), "study")
-        case ["python", "-m", "planners", "study_report", *arguments]:
-            fill(ReportSettings, pairs(arguments), "study_report")
+        case ["python", "-m", "planners", "report", *arguments]:
+            parse(ReportRequest, arguments)
         case ["python", "-m", "planners", "analysis", *arguments]:
-            fill(AnalysisSettings, pairs(arguments), "analysis")
+            parse(AnalysisSettings, arguments)
         case ["python", "-m", "tests.bench.bench_kitti", _, *arguments]:
             known = {field.name for field in fields(FitSettings)} | {"out", "validate", "threads", "first", "last"}
             assert set(pairs(given(arguments))) <= known
@@ -206,10 +206,15 @@ def test_every_command_is_one_its_program_takes(
 @pytest.mark.parametrize("command", IN_PROSE, ids=str)
 def test_every_command_named_in_prose_is_there(command: Command) -> None:
     match list(command.words):
+        case ["make", "bench", *named]:
+            modules = [word.replace("NAME=", "tests.bench.bench_") for word in named if word.startswith("NAME=")]
+            assert all(find_spec(module) for module in modules)
         case ["make", target, *_]:
             assert target in MAKE_TARGETS
         case ["python", "-m", "factory", subcommand, *_]:
             assert subcommand in COMMANDS or subcommand == "--version"
+        case ["python", "-m", "planners", subcommand, *_]:
+            assert subcommand in PLANNERS
         case ["python", "-m", module, *_]:
             assert find_spec(module) is not None
         case ["ray", "job", action, *_]:

@@ -53,13 +53,14 @@ PLANNERS: Mapping[str, Command] = {
     "evaluate": Command("EPDMS of planners on held-out clips", "planners.evaluation.evaluate", takes="words"),
     "compare": Command("how two planners differ, with intervals", "planners.evaluation.compare", takes="words"),
     "scaling": Command("how scores grow with simulated data, by which law", "planners.study.scaling", takes="words"),
-    "scaling_table": Command("a sweep's tables from its frames", "planners.study.scaling_table", takes="words"),
     "replay": Command("a planner on one clip as a film", "planners.evaluation.replay", takes="words"),
     "ensemble": Command("several GTRS-Dense models as one", "planners.evaluation.ensemble", takes="words"),
     "analysis": Command("EPDMS on real and simulated frames, by tag", "planners.evaluation.analysis", takes="words"),
+    "study": Command("whether simulated data helps: all of docs/study.md", "planners.study.study", takes="words"),
+    "study_data": Command("the study's data, by runs of the factory", "planners.study.recipe", "data", takes="words"),
+    "study_logs": Command("the study's part on real logs", "planners.study.recipe", "logs", takes="words"),
+    "report": Command("a study's tables and pictures from its frames", "planners.study.report", takes="words"),
     "agreement": Command("whether a study made again says the same", "planners.study.agreement", takes="words"),
-    "study_report": Command("a study's tables and pictures from its frames", "planners.study.report", takes="words"),
-    "study": Command("whether simulated data helps: all of docs/study.md", "planners.study.run", takes="words"),
 }
 DOORS = {"factory": COMMANDS, "planners": PLANNERS}  # package -> what `python -m <package>` knows
 

@@ -13,7 +13,6 @@ the map and the log around a sample, but not the scene from which traffic could 
 """
 
 import csv
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +21,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from factory.config.compose import ConfigError, fill
+from factory.config.arguments import parse
+from planners.command import command
 from planners.evaluation.frames import FOLLOW_UP_KINDS, LOGGED_KINDS
 from planners.evaluation.score_rows import FrameRow, read_rows
 from planners.evaluation.tags import TAGS
@@ -31,7 +31,6 @@ from tasks.reward.one_stage import COLUMNS
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-BAD_CONFIG = 2
 EDGES = np.linspace(0.0, 1.0, 11)
 REAL, SIMULATED = (90, 130, 170), (224, 122, 32)  # RGB
 INK, PAPER, FAINT = (30, 30, 30), (252, 252, 250), (200, 200, 200)
@@ -162,27 +161,13 @@ def _plain(value: float) -> float | str:
     return "" if np.isnan(value) else value
 
 
-def main(argv: Sequence[str]) -> int:
-    """The command; 2 with a message for what cannot be analysed."""
-    if not argv or {"-h", "--help"} & set(argv):
-        print(__doc__)
-        return 0
-    try:
-        wrong = [word for word in argv if "=" not in word]
-        if wrong:
-            raise ConfigError(f"{wrong[0]}: give key=value: run=, out=")
-        settings = fill(AnalysisSettings, dict(word.split("=", 1) for word in argv), "analysis")
-        analysis = analyse(read_rows(Path(settings.run)))
-    except (ValueError, FileNotFoundError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return BAD_CONFIG
+@command
+def main(argv: Sequence[str]) -> None:
+    """The command."""
+    settings = parse(AnalysisSettings, argv)
+    analysis = analyse(read_rows(Path(settings.run)))
     out = Path(settings.out or settings.run)
     counts = f"{len(analysis.real)} real, {len(analysis.simulated)} simulated frames"
     write_analysis(out, analysis, f"{Path(settings.run).name}: {counts}")
     print(f"EPDMS {analysis.real.mean():.4f} on real, {analysis.simulated.mean():.4f} on simulated frames")
     print(f"look at {out / 'analysis.png'}")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

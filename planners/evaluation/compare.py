@@ -11,7 +11,6 @@ clips of one log share their scene, and an interval over clips alone is too narr
 """
 
 import csv
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from factory.config.compose import ConfigError, compose, fill
+from planners.command import command
 from planners.evaluation.aggregation import ClipResult, by_clip
 from planners.evaluation.bootstrap import Interval, paired_interval
 from planners.evaluation.clip_scores import Measured, check_same_clips, measured, read_clips
@@ -27,8 +27,6 @@ from planners.evaluation.record import read_record
 from planners.evaluation.score_rows import read_rows
 from planners.evaluation.score_table import FILTERS_NOTE
 from tasks.reward.one_stage import COLUMNS
-
-BAD_CONFIG = 2
 
 
 @dataclass(frozen=True)
@@ -154,33 +152,22 @@ def check_same_rules(folders: Sequence[str]) -> None:
                 raise ConfigError(f"{folders[0]} and {folder} differ in their {what}: evaluate both the same way")
 
 
-def main(argv: Sequence[str]) -> int:
-    """The command; 2 with a message for what cannot be compared."""
-    if {"-h", "--help"} & set(argv):
-        print(__doc__)
-        return 0
-    try:
-        settings = fill(CompareSettings, compose("compare", argv), "compare")
-        if settings.column not in COLUMNS:
-            raise ConfigError(f"compare.column={settings.column}: one of {', '.join(COLUMNS)}")
-        sides = [[side] if isinstance(side, str) else side for side in (settings.a, settings.b)]
-        if settings.table is not None:
-            if settings.column != "score":
-                raise ConfigError(f"compare.column={settings.column}: {settings.table} holds scores alone")
-            of_a, of_b = (read_clips(Path(settings.table), side) for side in sides)
-            found = intervals(of_a, of_b, settings)
-        else:
-            a, b = (read_runs(side) for side in sides)
-            check_same_rules([*sides[0], *sides[1]])
-            found = compare(a, b, settings)
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return BAD_CONFIG
+@command
+def main(argv: Sequence[str]) -> None:
+    """The command."""
+    settings = fill(CompareSettings, compose("compare", argv), "compare")
+    if settings.column not in COLUMNS:
+        raise ConfigError(f"compare.column={settings.column}: one of {', '.join(COLUMNS)}")
+    sides = [[side] if isinstance(side, str) else side for side in (settings.a, settings.b)]
+    if settings.table is not None:
+        if settings.column != "score":
+            raise ConfigError(f"compare.column={settings.column}: {settings.table} holds scores alone")
+        of_a, of_b = (read_clips(Path(settings.table), side) for side in sides)
+        found = intervals(of_a, of_b, settings)
+    else:
+        a, b = (read_runs(side) for side in sides)
+        check_same_rules([*sides[0], *sides[1]])
+        found = compare(a, b, settings)
     print(text_of(found, settings.confidence))
     if settings.out is not None:
         write_csv(Path(settings.out), found)
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

@@ -7,29 +7,22 @@ and backbone; they see one picture and choose from one vocabulary. The members a
 other keys are those of `python -m planners evaluate`, which takes `planner=a+b` for an ensemble as well.
 """
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from planners.evaluation.evaluate import main as evaluate
+from planners.command import command
+from planners.evaluation.evaluate import evaluated
 
 
-def main(argv: Sequence[str]) -> int:
-    """The command: evaluates the members and their ensemble; exit codes as planners.evaluation.evaluate's."""
-    if {"-h", "--help"} & set(argv):
-        print(__doc__)
-        return 0
+@command
+def main(argv: Sequence[str]) -> None:
+    """The command: evaluates the members and their ensemble."""
     named = [argument.removeprefix("models=") for argument in argv if argument.startswith("models=")]
     members = [name.strip() for name in named[-1].strip("[]").split(",")] if named else []
     if len(members) < 2:
-        print("error: models is missing: give models=[<training>,<training>,...], two at least", file=sys.stderr)
-        return 2
+        raise ValueError("models is missing: give models=[<training>,<training>,...], two at least")
     names = [Path(member).name for member in members]
     labels = names if len(set(names)) == len(names) else [str(i) for i in range(len(names))]
     planners = {**dict(zip(labels, members)), "ensemble": "+".join(members)}
     chosen = ",".join(f"{label}: '{spec}'" for label, spec in planners.items())
-    return evaluate([f"planners={{{chosen}}}", *(a for a in argv if not a.startswith("models="))])
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    evaluated([f"planners={{{chosen}}}", *(a for a in argv if not a.startswith("models="))])

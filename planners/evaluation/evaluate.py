@@ -23,14 +23,14 @@ All planners of a command share what scoring prepares of a frame, so name severa
 
 import json
 import os
-import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from factory.config.compose import ConfigError, conf_dir, fill
+from factory.config.compose import ConfigError, fill
+from planners.command import command
 from planners.evaluation.aggregation import SummaryLine, lines_of, summarise
 from planners.evaluation.benchmark_folder import BenchmarkFolder
 from planners.evaluation.contenders import Contender, composed, contenders, needs_of
@@ -46,7 +46,6 @@ from tasks.experts.pdm_closed.planner import PdmSettings
 from tasks.rollout.simulate import TrafficSettings
 from tasks.stages import stage_versions
 
-BAD_CONFIG = 2
 MOST_UNIFORM = 0.2  # share of clips in the uniform fallback
 
 
@@ -171,32 +170,16 @@ def settings_of(argv: Sequence[str]) -> EvaluateSettings:
     return fill(EvaluateSettings, composed("evaluate", argv), "evaluate")
 
 
-def help_text() -> str:
-    """Usage and the keys of conf/evaluate.yaml."""
-    return f"{__doc__}\n{(conf_dir() / 'evaluate.yaml').read_text()}"
-
-
-def main(argv: Sequence[str]) -> int:
-    """The command; 2 with a message for what cannot be evaluated."""
-    if {"-h", "--help"} & set(argv):
-        print(help_text())
-        return 0
+def evaluated(argv: Sequence[str]) -> None:
+    """Evaluate and print what a command line asks for. Raises ConfigError, or OSError for a folder that is none."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    try:
-        settings = settings_of(argv)
-        benchmark = BenchmarkFolder(settings.benchmark)
-        lines = evaluate(
-            benchmark, contenders(settings.planner, settings.planners, settings.bounds, settings.settings), settings
-        )
-    except (ConfigError, FileNotFoundError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return BAD_CONFIG
+    settings = settings_of(argv)
+    who = contenders(settings.planner, settings.planners, settings.bounds, settings.settings)
+    lines = evaluate(BenchmarkFolder(settings.benchmark), who, settings)
     print(table_text(lines))
     print("".join(fallback_notes(lines)), end="")
     if settings.tables:
         print(f"look at {Path(settings.out) / 'summary.png'}")
-    return 0
 
 
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+main = command(evaluated)

@@ -5,7 +5,6 @@ Then the same from the follow-up that starts nearest to where the plan ended, or
 stands still at now: that is the last picture the planner has seen when it plans.
 """
 
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,6 +20,7 @@ from factory.views.bev import Path as Way
 from factory.views.drawing import map_shapes
 from factory.views.sample_picture import decoded, earlier_images, fitted, front_camera
 from factory.views.video import write_mp4
+from planners.command import command
 from planners.evaluation.benchmark_folder import BenchmarkFolder
 from planners.evaluation.contenders import Contender, composed, contender
 from planners.evaluation.evaluate import check_needs
@@ -37,7 +37,6 @@ from tasks.world.vehicle import HEADING
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-BAD_CONFIG = 2
 BEV_PX, CAMERA_PX = (560, 560), (720, 405)  # width, height
 PAPER, INK = (246, 246, 243), (30, 30, 30)
 HOLD = 10  # pictures that the end of a stage is shown for
@@ -185,25 +184,14 @@ def settings_of(argv: Sequence[str]) -> ReplaySettings:
     return fill(ReplaySettings, composed("replay", argv), "replay")
 
 
-def main(argv: Sequence[str]) -> int:
-    """The command; 2 with a message for what cannot be shown."""
-    if {"-h", "--help"} & set(argv):
-        print(__doc__)
-        return 0
-    try:
-        settings = settings_of(argv)
-        benchmark = BenchmarkFolder(settings.benchmark)
-        one = contender(settings.planner)
-        clip_id = find_clip(benchmark, str(settings.clip))
-        check_needs(benchmark, [key for key in benchmark.keys if key.clip_id == clip_id], [one])
-        rules = Rules(two_stage=settings.two_stage_traffic, pdm=settings.pdm)
-        write_mp4(Path(settings.out), replay(benchmark, one, clip_id, rules, settings.follow_up))
-    except (ConfigError, FileNotFoundError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return BAD_CONFIG
+@command
+def main(argv: Sequence[str]) -> None:
+    """The command."""
+    settings = settings_of(argv)
+    benchmark = BenchmarkFolder(settings.benchmark)
+    one = contender(settings.planner)
+    clip_id = find_clip(benchmark, str(settings.clip))
+    check_needs(benchmark, [key for key in benchmark.keys if key.clip_id == clip_id], [one])
+    rules = Rules(two_stage=settings.two_stage_traffic, pdm=settings.pdm)
+    write_mp4(Path(settings.out), replay(benchmark, one, clip_id, rules, settings.follow_up))
     print(f"look at {settings.out}")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

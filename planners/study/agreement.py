@@ -9,24 +9,23 @@ differences of one over those of the other.
 """
 
 import csv
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from factory.config.compose import ConfigError, fill
+from factory.config.arguments import parse
+from planners.command import command
 from planners.evaluation.aggregation import MEASURES
 from planners.evaluation.scores import title_of
 from planners.study.figures import draw_agreement
 
-BAD_CONFIG = 2
 FACTS = ("setup", "reference", "budget", "stage", "human_filter")  # which comparison
 NUMBERS = ("difference", "low", "high")
 Key = tuple[str, ...]  # FACTS
 
 
 @dataclass(frozen=True)
-class AgreementSettings:
+class AgreementRequest:
     """The command's keys."""
 
     first: str
@@ -46,6 +45,9 @@ class Difference:
     def is_clear(self) -> bool:
         """Whether zero lies outside of the interval."""
         return self.low > 0.0 or self.high < 0.0
+
+    def __str__(self) -> str:
+        return f"{self.difference:+.1f} ({self.low:+.1f} .. {self.high:+.1f})"
 
 
 @dataclass(frozen=True)
@@ -71,13 +73,12 @@ def read_differences(folder: Path) -> dict[Key, Difference]:
         raise ValueError(f"{path}: no table of a study's comparisons: it must have {', '.join((*FACTS, *NUMBERS))}")
     found: dict[Key, Difference] = {}
     for line, row in enumerate(rows, start=2):
-        if row["reference"]:
-            try:
-                found.setdefault(
-                    tuple(row[name] for name in FACTS), Difference(*(float(row[name]) for name in NUMBERS))
-                )
-            except (TypeError, ValueError) as error:
-                raise ValueError(f"{path}, line {line}: {error}") from error
+        try:
+            if row["reference"]:
+                one = Difference(*(float(row[name]) for name in NUMBERS))
+                found.setdefault(tuple(row[name] for name in FACTS), one)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{path}, line {line}: {error}") from error
     return found
 
 
@@ -93,13 +94,8 @@ def agreement(pairs: Sequence[Pair]) -> Agreement:
     clear = [pair for pair in pairs if pair[0].is_clear]
     same = [(one, other) for one, other in clear if one.difference * other.difference > 0.0]
     again = sum(other.is_clear for _, other in same)
-    return Agreement(
-        both=len(pairs),
-        clear=len(clear),
-        same_sign=len(same),
-        clear_again=again,
-        clearly_otherwise=sum(other.is_clear for _, other in clear) - again,
-    )
+    otherwise = sum(other.is_clear for _, other in clear) - again
+    return Agreement(len(pairs), len(clear), len(same), again, otherwise)
 
 
 def text_of(found: Mapping[tuple[str, str], Mapping[Key, Pair]]) -> str:
@@ -111,47 +107,28 @@ def text_of(found: Mapping[tuple[str, str], Mapping[Key, Pair]]) -> str:
         n = agreement(list(pairs.values()))
         counts = f"{n.both:>6}{n.clear:>7}{n.same_sign:>11}{n.clear_again:>13}{n.clearly_otherwise:>19}"
         lines.append(f"{stage:<11}{human_filter:<10}{counts}")
-        for (setup, reference, budget, *_), (one, other) in pairs.items():
-            if one.is_clear and one.difference * other.difference <= 0.0:
-                what = f"{setup} against {reference}, equal {budget}, {stage} {human_filter}"
-                otherwise.append(f"{what}: {_words(one)}, then {_words(other)}")
+        otherwise += [
+            f"{setup} against {reference}, equal {budget}, {stage} {human_filter}: {one}, then {other}"
+            for (setup, reference, budget, *_), (one, other) in pairs.items()
+            if one.is_clear and one.difference * other.difference <= 0.0
+        ]
     return "\n".join([*lines, *otherwise])
 
 
-def _words(one: Difference) -> str:
-    return f"{one.difference:+.1f} ({one.low:+.1f} .. {one.high:+.1f})"
-
-
-def main(argv: Sequence[str]) -> int:
-    """The command; 2 with a message for what cannot be compared."""
-    if not argv or {"-h", "--help"} & set(argv):
-        print(__doc__)
-        return 0
-    try:
-        wrong = [word for word in argv if "=" not in word]
-        if wrong:
-            raise ConfigError(f"{wrong[0]}: give key=value: first=, second=, out=")
-        settings = fill(AgreementSettings, dict(word.split("=", 1) for word in argv), "agreement")
-        first, second = (read_differences(Path(folder)) for folder in (settings.first, settings.second))
-        pairs = {measure: pairs_of(first, second, measure) for measure in MEASURES}
-        stages = {measure: both for measure, both in pairs.items() if both}
-        if not stages:
-            raise ConfigError(f"{settings.first} and {settings.second} have no comparison in common")
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return BAD_CONFIG
+@command
+def main(argv: Sequence[str]) -> None:
+    """The command."""
+    request = parse(AgreementRequest, argv)
+    first, second = (read_differences(Path(folder)) for folder in (request.first, request.second))
+    pairs = {measure: pairs_of(first, second, measure) for measure in MEASURES}
+    stages = {measure: both for measure, both in pairs.items() if both}
+    if not stages:
+        raise ValueError(f"{request.first} and {request.second} have no comparison in common")
     print(text_of(stages))
-    if settings.out is not None:
+    if request.out is not None:
         points = {
-            title_of(*measure): [
-                (one.difference, other.difference, one.is_clear and other.is_clear) for one, other in both.values()
-            ]
+            title_of(*measure): [(a.difference, b.difference, a.is_clear and b.is_clear) for a, b in both.values()]
             for measure, both in stages.items()
         }
-        draw_agreement(points, Path(settings.out))
-        print(f"look at {settings.out}")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+        draw_agreement(points, Path(request.out))
+        print(f"look at {request.out}")

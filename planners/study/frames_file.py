@@ -21,7 +21,7 @@ from planners.evaluation.aggregation import ClipResult, by_clip
 from planners.evaluation.benchmark_folder import logs_of
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.score_rows import FrameRow, read_rows
-from planners.study.plan import Comparison, Setup
+from planners.study.setups import Comparison, Setup
 from tasks.reward.one_stage import COLUMNS, FrameScores
 
 Array = NDArray[np.float64]

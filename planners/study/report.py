@@ -1,15 +1,16 @@
-"""`python -m planners study_report folder=docs/study/again`: a study's tables and pictures, from its per-frame rows.
+"""`python -m planners report folder=docs/study/published`: all tables and pictures again, from per-frame rows alone.
 
-    python -m planners study_report folder=docs/study/again                          as the paper's tables
-    python -m planners study_report folder=docs/study/again human_filter=filtered out=/tmp/today
+    python -m planners report folder=docs/study/published                            as the paper's tables
+    python -m planners report folder=docs/study/published human_filter=filtered out=/tmp/today
+    python -m planners report folder=docs/study/logs/nuscenes/stage_two              of `python -m planners scaling`
 
-`folder` holds the frames.parquet that `python -m planners study` wrote; nothing else is read, nothing is trained or
-planned. Made of it: `trainings.csv` (each training), `clips.csv` (its score on each clip), `comparisons.csv` (means
-over seeds, differences with paired bootstrap intervals over seeds and clips, logs, towns), `tables.md` (to be read),
-`bounds.csv`, `curves.csv`, and pictures. Only the learning curves need the trainings' own folders.
+`folder` holds the frames.parquet that the study or a scaling sweep wrote; nothing else is read, nothing is trained or
+planned. Of both: `comparisons.csv` (means over seeds, differences with paired bootstrap intervals over seeds and clips,
+logs, towns), `bounds.csv`, and where there are rounds enough `curves.csv` and pictures of it. Of the study:
+`trainings.csv` (each training), `clips.csv` (its score on each clip), `tables.md` (to be read), `differences.png`. Of a
+sweep: `scaling.csv` (each training). Only the learning curves need the trainings' own folders.
 """
 
-import sys
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,114 +19,185 @@ from typing import Any
 
 import numpy as np
 
-from factory.config.compose import ConfigError, fill
-from planners.evaluation.aggregation import MEASURES, ClipResult, HumanFilter
+from factory.config.arguments import parse
+from planners.command import command
+from planners.evaluation.aggregation import MEASURES, HumanFilter
 from planners.evaluation.clip_scores import write_clips
-from planners.evaluation.compare import ByLevel, CompareSettings, Measure, compare, row_of
+from planners.evaluation.compare import CompareSettings, compare, row_of
 from planners.evaluation.score_table import FILTERS_NOTE
 from planners.evaluation.scores import BOUNDS, PAPER, name_of, scores_of_clips, shown, title_of, write_csv
-from planners.study.figures import draw_differences
-from planners.study.frames_file import FRAMES, Clips, StudyFrames, read_frames
-from planners.study.plan import Comparison, Setup
-from planners.study.scaling_figure import Curve, Point, draw_curves
+from planners.study.figures import Curve, Point, draw_curves, draw_differences
+from planners.study.frames_file import FRAMES, StudyFrames, read_frames
 from planners.study.scaling_law import FEWEST, fit_scaling
+from planners.study.setups import Comparison
 from planners.study.tables import markdown_of
 
-BAD_CONFIG = 2
 CURVES = {"final": "scaling.png", "stage_two": "scaling_stage_two.png"}
 RULES = CompareSettings(a="", b="")  # draws, confidence and seed as `python -m planners compare` has them
+OF_ONE = ("training", "seed", "real", "simulated", "samples", "parameters", "optimiser_steps")  # not of all seeds
 
 Row = dict[str, Any]
+Scores = Mapping[str, Mapping[str, float]]  # by label
 
 
 @dataclass(frozen=True)
-class ReportSettings:
+class ReportRequest:
     """The command's keys."""
 
     folder: str
     out: str | None = None  # None: the folder
     human_filter: HumanFilter = PAPER  # of tables.md and the pictures; the CSVs hold both
 
+    def __post_init__(self) -> None:
+        if self.human_filter not in ("unfiltered", "filtered"):
+            raise ValueError(f"human_filter={self.human_filter}: unfiltered or filtered")
 
-def write_tables(frames: StudyFrames, report: Path, human_filter: HumanFilter) -> str:
-    """The files of this module's docstring; returns the two-stage scores, to be printed."""
+
+@dataclass(frozen=True)
+class Held:
+    """A line of comparisons.csv before it is scored: trainings of one set-up, by seed, and those it is held against."""
+
+    facts: Mapping[str, Any]  # its first columns
+    labels: Sequence[str]
+    against: Sequence[str] = ()
+    reference: str = ""  # the name of these
+
+
+def write_tables(folder: Path, out: Path, human_filter: HumanFilter) -> str:
+    """The files of this module's docstring, of `folder`; returns the two-stage scores, to be printed."""
+    frames, measures = read_frames(folder / FRAMES), shown(human_filter)
+    out.mkdir(parents=True, exist_ok=True)
     scores = {label: scores_of_clips(clips) for label, clips in frames.clips.items()}
     trainings = [{**facts, **scores[facts["training"]]} for facts in frames.trainings]
-    bounds = [{"planner": name, **scores[name]} for name in BOUNDS]
-    found = compared(frames.comparisons, frames.clips)
-    measures = shown(human_filter)
-    write_csv(report / "trainings.csv", trainings)
-    write_csv(report / "bounds.csv", bounds)
-    write_clips(report / "clips.csv", {label: clips for label, clips in frames.clips.items() if label not in BOUNDS})
-    write_csv(report / "comparisons.csv", found)
-    (report / "tables.md").write_text(markdown_of(found, human_filter))
-    curves = {stage: curves_of(frames.comparisons, trainings, stage, measures[stage]) for stage in CURVES}
-    if any(curves.values()):
+    bounds = [{"planner": name, **scores[name]} for name in BOUNDS if name in scores]
+    found = compared(frames)
+    write_csv(out / "comparisons.csv", found)
+    if bounds:
+        write_csv(out / "bounds.csv", bounds)
+    if frames.comparisons:
+        write_csv(out / "trainings.csv", trainings)
+        write_clips(out / "clips.csv", {label: clips for label, clips in frames.clips.items() if label not in BOUNDS})
+        (out / "tables.md").write_text(markdown_of(found, human_filter))
+        drawn = [row for row in found if row["reference"] and row["human_filter"] == measures[row["stage"]]]
+        if drawn:
+            draw_differences(drawn, out / "differences.png")
+    else:
+        write_csv(out / "scaling.csv", [{k: v for k, v in row.items() if k != "training"} for row in trainings])
+    curves = {stage: curves_of(frames, scores, name_of(stage, measures[stage])) for stage in CURVES}
+    if (frames.comparisons and any(curves.values())) or any(one.law for one in curves["final"]):
         lines = [
             {"stage": stage, "human_filter": measures[stage], **curve.row()}
-            for stage, drawn in curves.items()
-            for curve in drawn
+            for stage, drawn_ones in curves.items()
+            for curve in drawn_ones
         ]
-        write_csv(report / "curves.csv", lines)
+        write_csv(out / "curves.csv", lines)
         for stage, name in CURVES.items():
-            draw_curves(curves[stage], title_of(stage, measures[stage]), report / name)
-    differences = [row for row in found if row["reference"] and row["human_filter"] == measures[row["stage"]]]
-    if differences:
-        draw_differences(differences, report / "differences.png")
-    return text_of(found, bounds, measures["final"])
+            draw_curves(curves[stage], title_of(stage, measures[stage]), out / name)
+    return "\n".join([text_of(found, bounds, measures["final"]), f"tables and pictures: {out}"])
 
 
-def compared(wanted: Sequence[Comparison], clips: Clips) -> list[Row]:
-    """A row for each comparison and each of MEASURES: mean over seeds in percent, difference, intervals."""
+def held(frames: StudyFrames) -> list[Held]:
+    """What is compared: a study's comparisons, or each set-up of a sweep with real samples alone."""
+    if frames.comparisons:
+        return [_of_study(one) for one in frames.comparisons]
+    setups = defaultdict[tuple[tuple[str, Any], ...], list[str]](list)
+    for facts in sorted(frames.trainings, key=lambda facts: facts["seed"]):
+        setups[tuple((name, value) for name, value in facts.items() if name not in OF_ONE)].append(facts["training"])
+    found = []
+    for key, labels in setups.items():
+        setup, against = dict(key), list[str]()
+        if setup["rounds"]:
+            imitation = "none" if setup["imitation"] == "none" else "all"
+            alone = {**setup, "expert": "", "rounds": 0, "sim_ratio": "natural", "imitation": imitation}
+            against = setups.get(tuple(alone.items()), [])
+        found.append(Held({**setup, "seeds": len(labels)}, labels, against))
+    return found
+
+
+def _of_study(one: Comparison) -> Held:
+    labels, against = (
+        [setup.label_of(seed) for seed in range(one.seeds)] if setup else [] for setup in (one.setup, one.reference)
+    )
+    return Held(one.facts, labels, against, one.reference.label if one.reference else "")
+
+
+def compared(frames: StudyFrames) -> list[Row]:
+    """A row for each line and each of MEASURES, in percent: mean over seeds, difference, 95 % intervals.
+
+    Of a study the score of each seed and the reference's name stand beside; of a sweep the lowest and highest seed, and
+    uniform_share, the mean share of clips none of whose follow-ups starts near the plan's end.
+    """
     rows = []
-    for one in wanted:
-        intervals: dict[Measure, ByLevel] = {}
-        if one.reference is not None:
-            a, b = (_runs(setup, one.seeds, clips) for setup in (one.reference, one.setup))
-            intervals = compare(a, b, RULES)
-        each = [scores_of_clips(run) for run in _runs(one.setup, one.seeds, clips)]
+    for one in held(frames):
+        a, b = ([frames.clips[label] for label in side] for side in (one.against, one.labels))
+        intervals = compare(a, b, RULES) if a else {}
+        scores = [scores_of_clips(clips) for clips in b]
         for stage, human_filter in MEASURES:
-            mine = [scores[name_of(stage, human_filter)] for scores in each]
-            row: Row = {**one.facts, "stage": stage, "human_filter": human_filter, "epdms": float(np.mean(mine))}
-            row |= {"each": " ".join(f"{score:.1f}" for score in mine)}
-            row |= {"reference": "" if one.reference is None else one.reference.label}
-            rows.append(row | row_of(intervals.get((stage, human_filter))))
+            each = [score[name_of(stage, human_filter)] for score in scores]
+            row = {**one.facts, "stage": stage, "human_filter": human_filter, "epdms": float(np.mean(each))}
+            if frames.comparisons:
+                row |= {"each": " ".join(f"{score:.1f}" for score in each), "reference": one.reference}
+            else:
+                row |= {"lowest_seed": min(each), "highest_seed": max(each)}
+            row |= row_of(intervals.get((stage, human_filter)))
+            if not frames.comparisons:
+                row["uniform_share"] = float(np.mean([score["uniform_share"] for score in scores]))
+            rows.append(row)
     return rows
 
 
-def _runs(setup: Setup, seeds: int, clips: Clips) -> list[Sequence[ClipResult]]:
-    return [clips[setup.label_of(seed)] for seed in range(seeds)]
-
-
-def curves_of(
-    wanted: Sequence[Comparison], rows: Sequence[Mapping[str, Any]], stage: str, human_filter: str
-) -> list[Curve]:
-    """One of MEASURES over the number of samples: a curve for each planner, expert, imitation and budget."""
-    score, points = name_of(stage, human_filter), defaultdict[str, list[Point]](list)
-    for row in rows:
-        points[row["training"].rpartition("-")[0]].append(Point(row["real"] + row["simulated"], row[score]))
-    series = defaultdict[tuple[str, str], dict[Setup, None]](dict)
-    for one in wanted:
-        if one.part == "rounds" and one.reference is not None:
-            name = f"{one.setup.data}, rewards only" if one.setup.imitation == "real" else one.setup.data
-            series[f"{one.setup.planner}, equal {one.budget}", name] |= {one.reference: None, one.setup: None}
+def curves_of(frames: StudyFrames, scores: Scores, score: str) -> list[Curve]:
+    """Scores over the number of samples: a curve for each planner and kind of data, real samples alone in each."""
+    samples = {facts["training"]: facts["real"] + facts["simulated"] for facts in frames.trainings}
     curves = []
-    for (planner, name), setups in series.items():
-        found = tuple(point for setup in setups for point in points[setup.label])
-        enough = len({point.samples for point in found}) >= FEWEST
-        law = fit_scaling([p.samples for p in found], [p.score for p in found]) if enough else None
-        curves.append(Curve(planner, name, found, law))
+    for (planner, name), labels in _series(frames).items():
+        points = tuple(Point(samples[label], scores[label][score]) for label in labels)
+        enough = len({point.samples for point in points}) >= FEWEST
+        law = fit_scaling([p.samples for p in points], [p.score for p in points]) if enough else None
+        curves.append(Curve(planner, name, points, law))
     return curves
 
 
-def text_of(found: Sequence[Mapping[str, Any]], bounds: Sequence[Mapping[str, Any]], human_filter: str) -> str:
+def _series(frames: StudyFrames) -> Mapping[tuple[str, str], list[str]]:
+    """(panel, curve) -> trainings: the study's part `rounds`, or all of a sweep."""
+    found = defaultdict[tuple[str, str], dict[str, None]](dict)
+    of_setup = defaultdict[str, list[str]](list)
+    for facts in frames.trainings:
+        of_setup[facts["training"].rpartition("-")[0]].append(facts["training"])
+    for one in frames.comparisons:
+        if one.part == "rounds" and one.reference is not None:
+            name = f"{one.setup.data}, rewards only" if one.setup.imitation == "real" else one.setup.data
+            both = [*of_setup[one.reference.label], *of_setup[one.setup.label]]
+            found[f"{one.setup.planner}, equal {one.budget}", name] |= dict.fromkeys(both)
+    if not frames.comparisons:
+        axes = ("expert", "sim_ratio", "imitation", "real_share")
+        taught = [facts for facts in frames.trainings if facts["rounds"]]
+        several = {axis for axis in axes if len({facts[axis] for facts in taught}) > 1}
+        for facts in taught:
+            parts = [facts["expert"], *([f"sim_ratio {facts['sim_ratio']}"] if "sim_ratio" in several else [])]
+            parts += [{"all": "imitation", "real": "rewards only", "none": "no imitation"}[facts["imitation"]]]
+            parts += [f"{facts['real_share']:g} of real"] if "real_share" in several else []
+            alone = [other["training"] for other in frames.trainings if _is_alone(other, facts)]
+            found[facts["planner"], ", ".join(parts)] |= dict.fromkeys([*alone, facts["training"]])
+    return {name: list(labels) for name, labels in found.items()}
+
+
+def _is_alone(other: Mapping[str, Any], facts: Mapping[str, Any]) -> bool:
+    """Whether a training is the real samples alone that another of its sweep adds to."""
+    same = all(other[name] == facts[name] for name in ("planner", "real_share"))
+    return same and not other["rounds"] and (other["imitation"] == "none") == (facts["imitation"] == "none")
+
+
+def text_of(found: Sequence[Row], bounds: Sequence[Row], human_filter: str) -> str:
     """The two-stage scores among the rows of comparisons.csv, to be printed."""
     lines = [f"{title_of('final', human_filter)}; {FILTERS_NOTE[0]}"]
     lines += [f"{'part':<12}{'trained':<46}{'equal':>8}{'seeds':>7}{'EPDMS':>8}{'difference':>12}   95 % over clips"]
     for row in found:
         if (row["stage"], row["human_filter"]) == ("final", human_filter):
-            line = f"{row['part']:<12}{row['setup']:<46}{row['budget']:>8}{row['seeds']:7}{row['epdms']:8.2f}"
-            if row["reference"]:
+            on = f"{row['planner']} + {row['expert']}, rounds {row['rounds']}" if row.get("expert") else row["planner"]
+            what = f"{row.get('part', ''):<12}{row.get('setup', on):<46}{row.get('budget', ''):>8}"
+            line = f"{what}{row['seeds']:7}{row['epdms']:8.2f}"
+            if row["difference"] != "":
                 line += f"{row['difference']:+12.2f}   {row['low']:+.2f} .. {row['high']:+.2f}"
             lines.append(line)
     for bound in bounds:
@@ -134,26 +206,8 @@ def text_of(found: Sequence[Mapping[str, Any]], bounds: Sequence[Mapping[str, An
     return "\n".join(lines)
 
 
-def main(argv: Sequence[str]) -> int:
-    """The command; 2 with a message for what is no study's folder."""
-    if not argv or {"-h", "--help"} & set(argv):
-        print(__doc__)
-        return 0
-    try:
-        wrong = [word for word in argv if "=" not in word]
-        if wrong:
-            raise ConfigError(f"{wrong[0]}: give key=value: folder=, out=, human_filter=")
-        settings = fill(ReportSettings, dict(word.split("=", 1) for word in argv), "study_report")
-        frames = read_frames(Path(settings.folder) / FRAMES)
-        out = Path(settings.out or settings.folder)
-        out.mkdir(parents=True, exist_ok=True)
-        print(write_tables(frames, out, settings.human_filter))
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return BAD_CONFIG
-    print(f"tables and pictures: {out}")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+@command
+def main(argv: Sequence[str]) -> None:
+    """The command."""
+    request = parse(ReportRequest, argv)
+    print(write_tables(Path(request.folder), Path(request.out or request.folder), request.human_filter))

@@ -1,7 +1,7 @@
 """Many trainings and their evaluation, resumable: what is done is not done again.
 
 A training is a process of `python -m planners train`; on one machine `jobs` of them run side by side, on a Ray cluster
-each is a task. All are then evaluated on one benchmark by one process, which prepares every frame once.
+each is a task. All are then evaluated on one benchmark, by a few processes.
 """
 
 import contextlib
@@ -16,17 +16,19 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TextIO
 
+from planners.command import INTERRUPTED, Failed, Stopped, until_signal
 from planners.evaluation import record as eval_record
+from planners.evaluation.aggregation import HumanFilter
 from planners.evaluation.contenders import contender
-from planners.evaluation.scores import BOUNDS
+from planners.evaluation.scores import BOUNDS, PAPER
 from planners.training.progress import Counter
 
 TRAININGS, EVALUATIONS, DONE, LOG = "trainings", "evaluations", "sweep.json", "train.log"
-INTERRUPTED = 4
 EVALUATED_TOGETHER = 24  # planners in one process at the most
 LOOK_EVERY_S = 0.5
+ONE_THREAD = {"OMP_NUM_THREADS": "1"}  # of each process, unless the user says otherwise
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,26 @@ class Training:
     label: str  # names its folder; unique in the sweep
     overrides: tuple[str, ...]  # of planners.training.train, but `out`
     facts: Mapping[str, Any] = field(default_factory=dict)  # its columns in the sweep's tables
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepSettings:
+    """The keys that conf/study.yaml and conf/scaling.yaml share."""
+
+    benchmark: str
+    out: str
+    report: str | None = None  # None: out
+    human_filter: HumanFilter = PAPER
+    executor: Literal["process", "ray"] = "process"
+    jobs: int | None = None
+    minutes: float | None = None
+    gpus: float = 0.0
+    cpus: float = 1.0
+    evaluate: tuple[str, ...] = ()
+
+    @property
+    def means(self) -> "Means":
+        return Means(self.executor, self.jobs, self.minutes, self.gpus, self.cpus)
 
 
 @dataclass(frozen=True)
@@ -59,9 +81,10 @@ class Means:
         """Until nothing new begins."""
         return None if self.minutes is None else max(0.0, self.began + 60.0 * self.minutes - time.monotonic())
 
-
-class SweepFailed(Exception):
-    """Trainings that ended with an error; the others are done."""
+    @property
+    def words(self) -> list[str]:
+        """What is left, for another command."""
+        return [] if self.left_s is None else [f"minutes={self.left_s / 60.0:.3f}"]
 
 
 def folder_of(out: Path, training: Training) -> Path:
@@ -75,20 +98,18 @@ def is_done(out: Path, training: Training) -> bool:
     return path.is_file() and json.loads(path.read_text()) == list(training.overrides)
 
 
-def train_all(trainings: Sequence[Training], out: Path, means: Means) -> bool:
-    """Train what is not done; False where time ran out or somebody interrupted before all were.
+def train_all(trainings: Sequence[Training], out: Path, means: Means) -> None:
+    """Train what is not done.
 
-    Raises ValueError for two trainings of one label, SweepFailed with what each failed training said last.
+    Raises ValueError for two trainings of one label, Stopped where time ran out or somebody interrupted before all
+    were, Failed with what each failed training said last.
     """
     labels = [training.label for training in trainings]
-    if len(set(labels)) < len(labels):
-        raise ValueError(f"labels {sorted({x for x in labels if labels.count(x) > 1})} stand for several trainings")
+    if twice := sorted({label for label in labels if labels.count(label) > 1}):
+        raise ValueError(f"labels {twice} stand for several trainings")
     left = [training for training in trainings if not is_done(out, training)]
-    before = len(trainings) - len(left)
-    stop = threading.Event()
-    failed: list[str] = []
-    with Counter("trainings", len(trainings), before) as counter, _stops(stop, means.left_s):
-        done = before
+    done, failed = len(trainings) - len(left), list[str]()
+    with Counter("trainings", len(trainings), done) as counter, _stops(means.left_s) as stop:
         for training, code in _codes(left, out, means, stop):
             if code == 0:
                 done += 1
@@ -96,8 +117,9 @@ def train_all(trainings: Sequence[Training], out: Path, means: Means) -> bool:
                 failed.append(f"{training.label} (exit {code}): {_last_words(folder_of(out, training) / LOG)}")
             counter.show(done, training.label)
     if failed:
-        raise SweepFailed("; ".join(failed))
-    return all(is_done(out, training) for training in trainings)
+        raise Failed("; ".join(failed))
+    if done < len(trainings):
+        raise Stopped(f"{done} of {len(trainings)} are trained: the same command goes on")
 
 
 def train_one(training: Training, out: Path, stop: Callable[[], bool] = lambda: False) -> int:
@@ -108,26 +130,33 @@ def train_one(training: Training, out: Path, stop: Callable[[], bool] = lambda: 
     folder.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, "-m", "planners", "train", *training.overrides, f"out={folder}"]
     with (folder / LOG).open("w") as log:
-        environment = {"OMP_NUM_THREADS": "1", **os.environ}
-        child = subprocess.Popen(command, stdout=log, stderr=log, env=environment)  # noqa: S603 - a list, no shell
-        asked = False
-        while (code := _ended(child, LOOK_EVERY_S)) is None:
-            if stop() and not asked:
-                child.send_signal(signal.SIGTERM)
-                asked = True
-    if asked and code == -signal.SIGTERM:  # it had not begun yet
+        code = exit_code(command, stop, log, ONE_THREAD | os.environ)
+    if stop() and code == -signal.SIGTERM:  # it had not begun yet
         return INTERRUPTED
     if code == 0:
         (folder / DONE).write_text(json.dumps(list(training.overrides)))
     return code
 
 
-def _ended(child: subprocess.Popen[bytes], within_s: float) -> int | None:
-    """Its exit code as soon as there is one; None where it goes on for longer."""
-    try:
-        return child.wait(within_s)
-    except subprocess.TimeoutExpired:
-        return None
+def exit_code(
+    command: Sequence[str],
+    stop: Callable[[], bool],
+    log: TextIO | None = None,
+    environment: Mapping[str, str] | None = None,
+) -> int:
+    """Of a process, which is asked to end as soon as `stop` says so, and then waited for.
+
+    Its session is its own: what a terminal sends reaches it through `stop` alone, and once.
+    """
+    child = subprocess.Popen(command, stdout=log, stderr=log, env=environment, start_new_session=True)  # noqa: S603
+    asked = False
+    while True:
+        try:
+            return child.wait(LOOK_EVERY_S)
+        except subprocess.TimeoutExpired:
+            if stop() and not asked:
+                child.send_signal(signal.SIGTERM)
+                asked = True
 
 
 def _codes(
@@ -146,66 +175,50 @@ def _codes(
 
 
 @contextlib.contextmanager
-def _stops(stop: threading.Event, after_s: float | None) -> Iterator[None]:
-    """Sets the event after so many seconds, or at SIGINT and SIGTERM."""
-    timer = threading.Timer(after_s, stop.set) if after_s is not None else None
-    old: dict[int, Any] = {}
-    if threading.current_thread() is threading.main_thread():
-        for number in (signal.SIGINT, signal.SIGTERM):
-            old[number] = signal.signal(number, lambda *_: stop.set())
-    if timer is not None:
+def _stops(after_s: float | None) -> Iterator[threading.Event]:
+    """Set after so many seconds, or at SIGINT and SIGTERM."""
+    with until_signal() as stop:
+        timer = threading.Timer(after_s or 0.0, stop.set)
         timer.daemon = True
-        timer.start()
-    try:
-        yield
-    finally:
-        if timer is not None:
+        if after_s is not None:
+            timer.start()
+        try:
+            yield stop
+        finally:
             timer.cancel()
-        for what, handler in old.items():
-            signal.signal(what, handler)
 
 
-def evaluate_all(
-    trainings: Sequence[Training],
-    out: Path,
-    benchmark: str,
-    *more: str,
-    others: Mapping[str, str] | None = None,
-    means: Means | None = None,
-) -> bool:
-    """Evaluate all trainings on a benchmark, into `out`/evaluations; those that are evaluated already are not again.
+def evaluate_all(who: Mapping[str, str], out: Path, benchmark: str, means: Means, *more: str) -> None:
+    """Evaluate on a benchmark, into `out`/evaluations; those that are evaluated already are not again.
 
-    Processes of planners.evaluation.evaluate share the planners, a few each at a time, so that a kill costs little.
-    more: overrides of theirs; others: further planners, by label. False where time ran out or somebody interrupted
-    before all were. Raises SweepFailed.
+    Processes of `python -m planners evaluate` share the planners, a few each at a time, so that a kill costs little.
+    who: label -> planner, as that command takes it; more: overrides of it. Raises Stopped where time ran out or
+    somebody interrupted before all were, and Failed.
     """
-    means, stop = means or Means(), threading.Event()
-    who = [(training.label, str(folder_of(out, training))) for training in trainings] + list((others or {}).items())
-    parts = shares_of(who, means.at_once)
     base = [sys.executable, "-m", "planners", "evaluate", f"benchmark={benchmark}", *more, f"out={out / EVALUATIONS}"]
-    environment = {"OMP_NUM_THREADS": "1", **os.environ}
 
-    def evaluate(part: Sequence[tuple[str, str]], *how: str) -> bool:
+    def evaluate(part: Sequence[tuple[str, str]], *how: str) -> int:
         if stop.is_set():
-            return False
+            return 0
         named = ",".join(f"{label}: '{spec}'" for label, spec in part)
         command = [*base, f"planners={{{named}}}", *how]
-        ended = subprocess.run(command, env=environment, capture_output=True, text=True)  # noqa: S603 - a list, no shell
+        ended = subprocess.run(command, env=ONE_THREAD | os.environ, capture_output=True, text=True)  # noqa: S603 - a list, no shell
         if ended.returncode != 0:
-            raise SweepFailed(f"the evaluation ended with exit {ended.returncode}: {ended.stderr.strip()[-500:]}")
-        return True
+            raise Failed(f"the evaluation ended with exit {ended.returncode}: {ended.stderr.strip()[-500:]}")
+        return len(part)
 
+    everyone, done = list(who.items()), 0
     with (
+        _stops(means.left_s) as stop,
         Counter("evaluations", len(who)) as counter,
         ThreadPoolExecutor(means.at_once) as pool,
-        _stops(stop, means.left_s),
     ):
-        done = 0
-        ends = pool.map(lambda part: evaluate(part, "bounds=false", "tables=false"), parts)
-        for part, was_done in zip(parts, ends):
-            done += len(part) * was_done
+        shares = shares_of(everyone, means.at_once)
+        for n in pool.map(lambda part: evaluate(part, "bounds=false", "tables=false"), shares):
+            done += n
             counter.show(done)
-        return done == len(who) and evaluate(who)  # nothing is left but the bounds and the tables of all
+        if done < len(who) or not evaluate(everyone):  # nothing is left but the bounds and the tables of all
+            raise Stopped(f"{done} of {len(who)} are evaluated: the same command goes on")
 
 
 def shares_of(who: Sequence[tuple[str, str]], at_once: int) -> list[Sequence[tuple[str, str]]]:

@@ -4,9 +4,8 @@ Everything random in a step comes from a seed made of (run seed, step, rank), so
 the loader's position needs to be kept.
 """
 
-import signal
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from itertools import chain, count, islice
 from pathlib import Path
@@ -17,6 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
+from planners.command import Stopped, until_signal
 from planners.data.batch import Batch
 from planners.models.planner import Planner
 from planners.training.checkpoint import load_training, load_weights, save_checkpoint
@@ -51,10 +51,6 @@ class Loop:
     log_every: int = 20  # steps between looks at the losses, which cost a wait for the device
     checkpoint_every: int = 1000
     validate_every: int = 0  # 0: only after the last step
-
-
-class Stopped(Exception):
-    """The training was interrupted; what it has done is saved."""
 
 
 def total_steps(batches: Batches, training: TrainingSettings, steps: int | None) -> int:
@@ -117,7 +113,7 @@ def fit(
         if validate is not None and curves is not None:
             curves.validation(step, validate(planner))
 
-    with _stop_asked() as asked, Counter("steps", loop.steps, first, quiet=not world.writes) as counter:
+    with until_signal() as asked, Counter("steps", loop.steps, first, quiet=not world.writes) as counter:
         step, loss = first, float("nan")
         for batch in _endless(batches, loop.steps - first):
             torch.manual_seed(_step_seed(loop.seed, step, world.rank))
@@ -128,7 +124,7 @@ def fit(
             step += 1
             looks = step % loop.log_every == 0 or step == loop.steps
             # Several processes must agree, and ask each other rarely.
-            stopping = world.anyone(asked.is_set) if world.size == 1 or looks else False
+            stopping = world.anyone(asked.is_set()) if world.size == 1 or looks else False
             saves = step % loop.checkpoint_every == 0 or step == loop.steps or stopping
             if looks or saves:
                 loss = log(step)
@@ -199,30 +195,3 @@ def _wrapped(planner: Planner, world: World) -> torch.nn.Module:
 def _step_seed(seed: int, step: int, rank: int) -> int:
     """Of all that is random in a step; never from what happened before it."""
     return int(np.random.SeedSequence([seed, step, rank]).generate_state(1, np.uint64)[0] >> 1)
-
-
-@dataclass
-class _Asked:
-    is_set: bool = False
-
-
-@contextmanager
-def _stop_asked() -> Iterator[_Asked]:
-    """Notes SIGINT and SIGTERM instead of dying of them; a second one has its usual effect."""
-    asked = _Asked()
-    old: dict[int, Any] = {}
-
-    def note(number: int, frame: object) -> None:
-        asked.is_set = True
-        signal.signal(number, old[number])
-
-    try:
-        for what in (signal.SIGINT, signal.SIGTERM):
-            old[what] = signal.signal(what, note)
-    except ValueError:  # not the main thread: a Ray worker, whose signals are Ray's
-        old.clear()
-    try:
-        yield asked
-    finally:
-        for number, handler in old.items():
-            signal.signal(number, handler)

@@ -13,7 +13,6 @@ settings or data, 4 interrupted and resumable.
 
 import dataclasses
 import json
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -24,6 +23,7 @@ import cv2
 import torch
 
 from factory.config.compose import ConfigError, compose, fill
+from planners.command import command
 from planners.data.feed import Dataset, DataSettings, open_data
 from planners.data.loader import Loader
 from planners.data.mix import MixSettings
@@ -31,12 +31,10 @@ from planners.models.backbones.registry import load_pretrained
 from planners.models.planner import Planner
 from planners.models.registry import PlannerChoice, build_planner, planner_class, settings_of
 from planners.training.checkpoint import as_record, checkpoints, digest, load_arrays, load_weights, newest, read_record
-from planners.training.fit import Loop, Stopped, fit, total_steps
+from planners.training.fit import Loop, fit, total_steps
 from planners.training.optim import TrainingSettings
 from planners.training.processes import RaySettings, World, joined
 from planners.training.validate import validation
-
-BAD_CONFIG, INTERRUPTED = 2, 4
 
 
 @dataclass(frozen=True)
@@ -82,33 +80,23 @@ class TrainConfig:
         return self.planner.training
 
 
-def main(argv: Sequence[str]) -> int:
-    """The command; returns the exit code."""
-    if {"-h", "--help"} & set(argv):
-        print(__doc__)
-        return 0
-    try:
-        values = compose("train", [argument for argument in argv if argument != "--cfg"])
-        if "--cfg" in argv:
-            from omegaconf import OmegaConf
+@command
+def main(argv: Sequence[str]) -> None:
+    """The command."""
+    values = compose("train", [argument for argument in argv if argument != "--cfg"])
+    if "--cfg" in argv:
+        from omegaconf import OmegaConf
 
-            print(OmegaConf.to_yaml(OmegaConf.create(values)))
-            return 0
-        config = fill(TrainConfig, values, "train")
-        if config.executor == "ray":
-            from planners.training.on_ray import train_on_ray
+        print(OmegaConf.to_yaml(OmegaConf.create(values)))
+        return
+    config = fill(TrainConfig, values, "train")
+    if config.executor == "ray":
+        from planners.training.on_ray import train_on_ray
 
-            train_on_ray(partial(train, config), config.ray, config.out)
-        else:
-            with joined(config.device) as world:
-                train(config, world)
-    except (ConfigError, ValueError, FileNotFoundError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return BAD_CONFIG
-    except Stopped as stopped:
-        print(stopped, file=sys.stderr)
-        return INTERRUPTED
-    return 0
+        train_on_ray(partial(train, config), config.ray, config.out)
+    else:
+        with joined(config.device) as world:
+            train(config, world)
 
 
 def train(config: TrainConfig, world: World) -> None:
@@ -230,7 +218,3 @@ def _plan_text(config: TrainConfig, record: Mapping[str, Any], loader: Loader, r
             f"{record['trained']['steps']} steps; {begins}; out: {config.out}",
         ]
     )
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

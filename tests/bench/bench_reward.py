@@ -1,4 +1,4 @@
-"""Simulate and score K trajectories on one core: `make bench-reward`, `python -m tests.bench.bench_reward`.
+"""Simulate and score K trajectories on one core: `make bench NAME=reward`, `python -m tests.bench.bench_reward`.
 
 The public metric's recorded scenes where they are at hand (proposals for K = 256 on all, 4,096 on four, 16,384 on
 one), else a clip of the synthetic town under the kinematic vocabulary. K = 2 is what an attempt pays, PDM-Closed and

@@ -16,7 +16,7 @@ from factory.config.compose import ConfigError
 from planners.data.batch import Batch, BevLayout, ImageLayout, Needs
 from planners.evaluation.aggregation import SummaryLine
 from planners.evaluation.contenders import Contender, contender, contenders
-from planners.evaluation.evaluate import EvaluateSettings, evaluate, fallback_notes, help_text, main, settings_of
+from planners.evaluation.evaluate import EvaluateSettings, evaluate, fallback_notes, main, settings_of
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.planning import all_plans, plans_of
 from planners.evaluation.record import read_record
@@ -297,4 +297,4 @@ def test_the_command_line_is_typed_and_complains_by_name(capsys: pytest.CaptureF
     ):
         assert main(argv) == 2
         assert message in capsys.readouterr().err
-    assert "one_stage_traffic" in help_text()
+    assert main(["--help"]) == 0 and "one_stage_traffic" in capsys.readouterr().out

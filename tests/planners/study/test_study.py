@@ -4,22 +4,26 @@ import csv
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
+from planners.command import Stopped
 from planners.evaluation.contenders import contender
 from planners.evaluation.evaluate import EvaluateSettings, evaluate
 from planners.evaluation.scores import BOUNDS, scores_of
 from planners.study import report as study_report
-from planners.study.plan import Comparison, Portion, Setup, Sizes
-from planners.study.run import evaluated, write_report
+from planners.study import study as study_module
+from planners.study.scaling import ScalingSettings, SweepData, trainings_of
+from planners.study.setups import Comparison, Portion, Setup, Sizes
+from planners.study.study import evaluated, run, write_report
 from planners.study.sweep import DONE, EVALUATIONS, Training, folder_of
 from planners.training.checkpoint import save_checkpoint
 from planners.training.curves import LOSSES
 from tests.planners.evaluation.test_evaluate import settings
 from tests.planners.small_benchmark import StreetBenchmark, write_benchmark_folder
-from tests.planners.study.test_study_plan import settings as study_settings
+from tests.planners.study.test_setups import settings as study_settings
 from tests.planners.toy import Toy, ToySettings
 
 
@@ -87,3 +91,38 @@ def test_the_report_is_that_of_the_evaluations_and_can_be_made_again(
     assert {"frames.parquet", "tables.md", "learning.png"} < set(made)
     assert study_report.main([f"folder={report}"]) == 0
     assert {path.name: path.read_bytes() for path in report.iterdir()} == made
+
+
+def test_a_sweep_stops_where_something_is_missing_and_is_reported_when_all_is_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    axes: dict[str, Any] = {"planners": ("ltf",), "experts": ("recovery",), "rounds": (0, 1), "seeds": (3,)}
+    axes |= {"sim_ratios": ("natural",), "imitation": ("all",), "real_shares": (1.0,)}
+    data, benchmark = SweepData(("real",), ("sim",)), write_benchmark_folder(tmp_path / "benchmark")
+    sweep = ScalingSettings(data=data, benchmark=str(benchmark), out=str(tmp_path), **axes)
+    first, second = trainings_of(sweep)
+    asked = [Portion("scaling", 0, (first, second), {})]
+
+    def cut_short(*_: object) -> None:
+        raise Stopped("out of minutes")
+
+    monkeypatch.setattr(study_module, "train_all", cut_short)
+    train(tmp_path, first)
+    score(tmp_path, settings(tmp_path / EVALUATIONS), first)
+    with pytest.raises(Stopped, match="1 of 2 planners are evaluated: the same command goes on"):
+        run(sweep, asked, asked, ())
+    assert not (tmp_path / "scaling.csv").exists()
+
+    monkeypatch.setattr(study_module, "train_all", lambda trainings, out, means: train(out, second, weight=0.1))
+    monkeypatch.setattr(
+        study_module, "evaluate_all", lambda who, out, *_: score(out, settings(out / EVALUATIONS), first, second)
+    )
+    run(sweep, asked, asked, ())
+    alone, more = csv.DictReader((tmp_path / "scaling.csv").open())
+    assert (alone["expert"], more["expert"], more["real"], more["simulated"]) == ("", "recovery", "3", "4")
+    for row, training in ((alone, first), (more, second)):
+        for name, found in scores_of(tmp_path / EVALUATIONS / training.label).items():
+            assert float(row[name]) == pytest.approx(found, abs=1e-4)
+    differences = [row["difference"] for row in csv.DictReader((tmp_path / "comparisons.csv").open())]
+    assert "" in differences[: len(differences) // 2] and "" not in differences[len(differences) // 2 :]
+    assert (tmp_path / "learning.png").is_file()

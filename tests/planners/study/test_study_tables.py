@@ -8,9 +8,9 @@ from PIL import Image
 
 from planners.evaluation.aggregation import MEASURES
 from planners.study.figures import draw_differences
-from planners.study.plan import PARTS, Comparison, Setup, StudySettings, comparisons
+from planners.study.setups import PARTS, Comparison, Setup, StudySettings, comparisons
 from planners.study.tables import markdown_of, words_of
-from tests.planners.study.test_study_plan import settings
+from tests.planners.study.test_setups import settings
 
 
 def rows_of(

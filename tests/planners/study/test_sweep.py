@@ -5,13 +5,15 @@ from typing import Any
 
 import pytest
 
-from planners.study.scaling import ScalingSettings, SweepData, curves_of, trainings_of
+from planners.command import INTERRUPTED, Failed, Stopped
+from planners.study.figures import Curve
+from planners.study.frames_file import StudyFrames
+from planners.study.report import curves_of
+from planners.study.scaling import ScalingSettings, SweepData, trainings_of
 from planners.study.sweep import (
     EVALUATED_TOGETHER,
-    INTERRUPTED,
     LOG,
     Means,
-    SweepFailed,
     Training,
     folder_of,
     is_done,
@@ -35,7 +37,8 @@ def scaling(**changes: Any) -> ScalingSettings:
         "real_shares": (1.0,),
         "seeds": (0, 1),
     }
-    return ScalingSettings(SweepData(("real",), ("sim",)), "bench", "out", **{**axes, **changes})
+    data = SweepData(("real",), ("sim",))
+    return ScalingSettings(data=data, benchmark="bench", out="out", **{**axes, **changes})
 
 
 def test_every_combination_is_trained_once_and_real_samples_alone_not_once_an_expert() -> None:
@@ -53,19 +56,30 @@ def test_all_experts_together_are_one_axis_value() -> None:
     assert not any(o.startswith("data.experts") for o in one.overrides)
 
 
-def test_curves_hold_their_own_points_and_real_samples_alone() -> None:
-    settings = scaling()
-    rows = [
-        {**t.facts, "samples": 100 + 50 * t.facts["rounds"], "final_unfiltered": 30.0 + t.facts["rounds"]}
-        for t in trainings_of(settings)
+def drawn(settings: ScalingSettings) -> list[Curve]:
+    facts = [
+        {"training": one.label, **one.facts, "real": 100, "simulated": 50 * one.facts["rounds"]}
+        for one in trainings_of(settings)
     ]
-    recovery, pdm = curves_of(rows, settings)
+    scores = {one["training"]: {"final_unfiltered": 30.0 + one["rounds"]} for one in facts}
+    return curves_of(StudyFrames(tuple(facts), (), {}), scores, "final_unfiltered")
+
+
+def test_curves_hold_their_own_points_and_real_samples_alone() -> None:
+    recovery, pdm = drawn(scaling())
     assert (recovery.label, pdm.label) == ("recovery, imitation", "pdm_closed, imitation")
     for curve in (recovery, pdm):
         assert sorted(p.samples for p in curve.points) == [100, 100, 150, 150, 200, 200, 250, 250]
         assert curve.law is not None
-    (few,) = curves_of([r for r in rows if r["rounds"] < 3], scaling(experts=("recovery",), rounds=(0, 1, 2)))
-    assert few.law is None and "no curve" in few.text() and few.row()["a"] == ""
+    (few,) = drawn(scaling(experts=("recovery",), rounds=(0, 1, 2)))
+    assert few.law is None and few.row()["a"] == ""
+
+
+def test_a_curve_is_named_after_the_axes_that_have_several_values() -> None:
+    labels = [one.label for one in drawn(scaling(experts=("recovery",), real_shares=(0.5, 1.0), imitation=("real",)))]
+    assert labels == ["recovery, rewards only, 0.5 of real", "recovery, rewards only, 1 of real"]
+    for curve in drawn(scaling(imitation=("all", "none"), seeds=(0,))):
+        assert len(curve.points) == 4, "real samples alone with imitation, or without, as the curve's own"
 
 
 @pytest.mark.parametrize(("name", "value"), [("seeds", ()), ("rounds", (-1,)), ("planners", ("ltf", "ltf"))])
@@ -82,12 +96,12 @@ def small(table: str, label: str, *more: str) -> Training:
 @pytest.mark.slow
 def test_a_sweep_trains_what_is_not_done_and_names_what_fails(table: str, tmp_path: Path) -> None:
     good, bad = small(table, "good"), small(table, "bad", "device=cuda")
-    with pytest.raises(SweepFailed, match=r"bad \(exit 2\): error: device=cuda"):
+    with pytest.raises(Failed, match=r"bad \(exit 2\): error: device=cuda"):
         train_all([good, bad], tmp_path, Means(jobs=2))
     assert is_done(tmp_path, good) and not is_done(tmp_path, bad)
     assert read_record(folder_of(tmp_path, good))["step"] == 4
     written = (folder_of(tmp_path, good) / LOG).stat().st_mtime_ns
-    assert train_all([good], tmp_path, Means())
+    train_all([good], tmp_path, Means())
     assert (folder_of(tmp_path, good) / LOG).stat().st_mtime_ns == written, "it was not to be trained again"
     assert not is_done(tmp_path, small(table, "good", "seed=1")), "other overrides are another training"
 
@@ -99,7 +113,8 @@ def test_what_runs_when_time_is_up_is_saved_and_nothing_new_begins(table: str, t
     assert train_one(long, tmp_path, lambda: losses.exists() and losses.stat().st_size > 100) == INTERRUPTED
     assert 0 < read_record(folder_of(tmp_path, long))["step"] < 200000
     assert not is_done(tmp_path, long)
-    assert not train_all([small(table, "next")], tmp_path, Means(minutes=0.0))
+    with pytest.raises(Stopped, match="0 of 1 are trained"):
+        train_all([small(table, "next")], tmp_path, Means(minutes=0.0))
     assert not folder_of(tmp_path, small(table, "next")).exists()
 
 

@@ -13,11 +13,12 @@ import pytest
 import torch
 
 from factory.config.compose import ConfigError
+from planners.command import Stopped
 from planners.data.batch import Batch
 from planners.models.registry import PlannerChoice, build_planner
 from planners.training.checkpoint import checkpoints, digest, load_planner, newest
 from planners.training.curves import LOSSES, VALIDATION
-from planners.training.fit import Loop, Stopped, fit, total_steps
+from planners.training.fit import Loop, fit, total_steps
 from planners.training.optim import TrainingSettings
 from planners.training.processes import World
 from tests.planners.toy import Toy, ToyBatches, ToySettings, toy_batch

@@ -1,24 +1,33 @@
-"""What the study compares: setups, each trained with several seeds, and which of them is held against which."""
+"""The study's list of set-ups: what is trained on what, which is held against which, and in what order.
 
-from collections.abc import Collection, Iterator, Sequence
+Everything is compared twice: in equal passes over a planner's own data, as the paper does, and in equal optimiser
+steps, since more data in equal passes is more training as well.
+"""
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import takewhile
 from pathlib import Path
 from typing import Any, Literal
 
-from planners.evaluation.aggregation import HumanFilter
-from planners.study.sweep import TRAININGS, Training
+from planners.study.sweep import TRAININGS, SweepSettings, Training
 
-Data = Literal["begin", "real", "recovery", "pdm_closed", "logged"]
 Budget = Literal["epochs", "steps"]
+Imitation = Literal["all", "real", "none"]
+BUDGETS: tuple[Budget, ...] = ("epochs", "steps")
+EXPERTS = ("recovery", "pdm_closed")
+ALL_EXPERTS = "all"
 SHARES = (0.25, 0.5, 1.0)
 RATIOS = (0.25, 0.5, 0.75)
 ENSEMBLE = "ensemble"  # stands for a planner; nothing is trained for it
-MULTI = ("diffusiondrive", "gtrs_dense")  # the planners of everything but the main table
+SCORING = "gtrs_dense"  # the planner that learns from rewards too
+MULTI = ("diffusiondrive", SCORING)  # the planners of everything but the main table
+PARTS = ("main", "rounds", "traffic", "ratio", "psnr", "rewards", "real_share", "control", "ensemble")
+PLANNERS_OF_LEG = 48
 
 
-@dataclass(frozen=True)
-class StudySettings:
+@dataclass(frozen=True, kw_only=True)
+class StudySettings(SweepSettings):
     """The keys of conf/study.yaml."""
 
     data: str
@@ -26,10 +35,7 @@ class StudySettings:
     control: str
     begin: str | None
     begin_epochs: int
-    benchmark: str
     val: str
-    out: str
-    report: str
     planners: dict[str, str]
     vocabulary: str
     rounds: int
@@ -39,9 +45,6 @@ class StudySettings:
     batch_size: int
     psnr_db: float
     parts: tuple[str, ...]
-    human_filter: HumanFilter = "unfiltered"
-    jobs: int | None = None
-    minutes: float | None = None
 
     def __post_init__(self) -> None:
         unknown = sorted(set(self.parts) - set(PARTS))
@@ -65,10 +68,10 @@ class Setup:
     """What one planner is trained on, and how long."""
 
     planner: str
-    data: Data  # real samples, and those of this expert; `begin`: real samples of other towns alone, where all begin
+    data: str  # real samples, and those of this expert; `begin`: real samples of other towns alone, where all begin
     rounds: int  # simulated ones, 0 with real samples alone
     budget: Budget  # equal passes over its own data (the paper), or equal optimiser steps
-    imitation: Literal["all", "real", "none"] = "all"
+    imitation: Imitation = "all"
     traffic: Literal["reactive", "replay"] = "reactive"
     sim_ratio: float | Literal["natural"] = "natural"
     psnr: Literal["any", "low", "high"] = "any"
@@ -85,35 +88,48 @@ class Setup:
         parts += [f"share{self.real_share}"] if self.real_share < 1.0 else []
         return "-".join(parts)
 
+    def label_of(self, seed: int) -> str:
+        """Names one of its trainings."""
+        return f"{self.label}-{seed}"
+
+    def overrides(
+        self, planner: str, real: Iterable[str], sim: Iterable[str], val: Iterable[str], seed: int
+    ) -> list[str]:
+        """Of `python -m planners train`: one of conf/planner, and tables to learn from."""
+        chosen = [f"data.max_round={self.rounds - 1}"] if self.rounds else []
+        chosen += [f"data.experts=[{self.data}]"] if self.rounds and self.data != ALL_EXPERTS else []
+        return [
+            f"planner={planner}",
+            f"data.real=[{','.join(real)}]",
+            f"data.sim=[{','.join(sim) if self.rounds else ''}]",
+            f"data.val=[{','.join(val)}]",
+            f"data.real_share={self.real_share}",
+            f"mix.imitation={self.imitation}",
+            f"mix.sim_ratio={self.sim_ratio}",
+            f"seed={seed}",
+            *chosen,
+        ]
+
     def training(self, settings: StudySettings, seed: int, sizes: Sizes) -> Training:
-        """One of its trainings."""
+        """One of its trainings in the study."""
         simulated = settings.replay if self.traffic == "replay" else settings.data
         if self.data == "logged":
             simulated = settings.control
         begins = self.data == "begin"
-        real = [settings.begin] if begins else [settings.data, *([settings.begin] if settings.begin else [])]
+        real = [str(settings.begin)] if begins else [settings.data, *([settings.begin] if settings.begin else [])]
         overrides = [
-            f"planner={settings.planners[self.planner]}",
-            f"data.real=[{','.join(str(table) for table in real)}]",
-            f"data.sim=[{simulated if self.rounds else ''}]",
-            f"data.val=[{settings.val}]",
-            f"data.real_share={self.real_share}",
-            f"mix.imitation={self.imitation}",
-            f"mix.sim_ratio={self.sim_ratio}",
+            *self.overrides(settings.planners[self.planner], real, [simulated], [settings.val], seed),
             f"planner.training.epochs={settings.begin_epochs if begins else settings.epochs}",
             f"planner.training.batch_size={settings.batch_size}",
-            f"seed={seed}",
             "workers=1",
             "validate_every=100",
         ]
         if settings.begin and not begins:
             overrides.append(f"init_from={Path(settings.out) / TRAININGS / begin(self.planner).label_of(0)}")
-        if self.planner == "gtrs_dense":
+        if self.planner == SCORING:
             overrides.append(f"planner.settings.vocabulary={settings.vocabulary}")
         if self.budget == "steps":
             overrides.append(f"steps={sizes.steps}")
-        if self.rounds:
-            overrides += [f"data.experts=[{self.data}]", f"data.max_round={self.rounds - 1}"]
         if self.psnr == "low":
             overrides += [f"data.psnr_max={settings.psnr_db}"]
         elif self.rounds:
@@ -121,10 +137,6 @@ class Setup:
         if self.psnr != "any":
             overrides += [f"data.limit_sim={sizes.matched}"]
         return Training(self.label_of(seed), tuple(overrides), {**vars(self), "seed": seed})
-
-    def label_of(self, seed: int) -> str:
-        """Names one of its trainings."""
-        return f"{self.label}-{seed}"
 
 
 def begin(planner: str) -> Setup:
@@ -145,25 +157,77 @@ class Comparison:
     @property
     def facts(self) -> dict[str, Any]:
         """Its columns in the tables."""
-        return {
-            "part": self.part,
-            "setup": self.setup.label,
-            **vars(self.setup),
-            "budget": self.budget,
-            "seeds": self.seeds,
-        }
+        of_setup = {"setup": self.setup.label, **vars(self.setup)}
+        return {"part": self.part, **of_setup, "budget": self.budget, "seeds": self.seeds}
+
+
+def taught(planner: str, budget: Budget, rounds: int) -> list[Setup]:
+    """With each expert and, of the planner that can, on rewards alone."""
+    found = [Setup(planner, expert, rounds, budget) for expert in EXPERTS]
+    return [*found, replace(found[-1], imitation="real")] if planner == SCORING else found
+
+
+def groups(settings: StudySettings) -> dict[str, list[tuple[Setup, list[Setup]]]]:
+    """Of each part: setups that others are held against, and these others."""
+    rounds = {
+        "epochs": [*range(1, settings.rounds + 1)],
+        "steps": sorted({1, (settings.rounds + 1) // 2, settings.rounds}),
+    }
+
+    def real(planner: str, budget: Budget, **more: Any) -> Setup:
+        return Setup(planner, "real", 0, budget, **more)
+
+    def sim(
+        planner: str, budget: Budget, data: str = "pdm_closed", rounds: int = settings.rounds, **more: Any
+    ) -> Setup:
+        return Setup(planner, data, rounds, budget, **more)
+
+    both: list[tuple[str, Budget]] = [(planner, budget) for planner in MULTI for budget in BUDGETS]
+    series = [one for planner in MULTI for one in taught(planner, "epochs", settings.rounds)]
+    members = {budget: taught(SCORING, budget, settings.rounds) for budget in BUDGETS}
+    imitation = {SCORING: "real"}
+    return {
+        "main": [(real(p, b), taught(p, b, settings.rounds)) for p in settings.planners for b in BUDGETS],
+        "rounds": [
+            (real(one.planner, b), [replace(one, rounds=n, budget=b) for n in rounds[b]])
+            for one in series
+            for b in BUDGETS
+        ],
+        "traffic": [
+            (sim(p, b, rounds=n), [sim(p, b, rounds=n, traffic="replay")])
+            for p in MULTI
+            for n in rounds["steps"]
+            for b in BUDGETS
+        ],
+        "ratio": [(sim(p, b), [sim(p, b, sim_ratio=ratio) for ratio in RATIOS]) for p, b in both],
+        # As many samples on either side: equal epochs are equal steps.
+        "psnr": [(sim(p, "epochs", psnr="low"), [sim(p, "epochs", psnr="high")]) for p in MULTI],
+        # With real samples alone: is imitation needed there?
+        "rewards": [(real(SCORING, b), [real(SCORING, b, imitation="none")]) for b in BUDGETS],
+        "real_share": [
+            (real(p, b, real_share=s), [sim(p, b, real_share=s, imitation=imitation.get(p, "all"))])
+            for p in MULTI
+            for s in SHARES
+            for b in BUDGETS
+        ],
+        # The same perturbed states with the log's future for a label; in equal steps, as nothing of it is filtered.
+        "control": [(sim(p, "steps"), [sim(p, "steps", "logged")]) for p in settings.planners],
+        # The mean of what three kinds of data taught, held against rewards alone, as in the paper.
+        "ensemble": [(one, [sim(ENSEMBLE, b)] if one is members[b][-1] else []) for b in BUDGETS for one in members[b]],
+    }
 
 
 def comparisons(settings: StudySettings) -> list[Comparison]:
     """All of the chosen parts, each once, behind the trainings that their planners begin with."""
-    chosen = [one for part in settings.parts for one in PARTS[part](settings)]
-    asked = {one.setup.planner for one in chosen}
+    of_part = groups(settings)
+    chosen = [(part, *group) for part in settings.parts for group in of_part[part]]
+    asked = {one.planner for _, base, others in chosen for one in (base, *others)}
     first = [planner for planner in settings.planners if planner in asked] if settings.begin else []
     found = [Comparison("begin", begin(planner), None, 1) for planner in first]
-    for one in chosen:
-        reference = None if one.reference is None else trained(one.reference, settings.rounds)
-        setup = trained(one.setup, settings.rounds)
-        found.append(replace(one, setup=setup, reference=reference, budget=one.setup.budget))
+    for part, base, others in chosen:
+        reference, seeds = trained(base, settings.rounds), settings.seeds if part == "main" else settings.curve_seeds
+        found.append(Comparison(part, reference, None, seeds, base.budget))
+        found += [Comparison(part, trained(one, settings.rounds), reference, seeds, one.budget) for one in others]
     return list(dict.fromkeys(found))
 
 
@@ -178,130 +242,6 @@ def trained(setup: Setup, rounds: int) -> Setup:
     return replace(setup, budget="epochs") if is_whole and setup.planner != ENSEMBLE else setup
 
 
-def _main(settings: StudySettings) -> Iterator[Comparison]:
-    for planner in settings.planners:
-        for budget in BUDGETS:
-            real = Setup(planner, "real", 0, budget)
-            yield Comparison("main", real, None, settings.seeds)
-            for expert in EXPERTS:
-                yield Comparison("main", Setup(planner, expert, settings.rounds, budget), real, settings.seeds)
-            if planner == "gtrs_dense":
-                alone = Setup(planner, "pdm_closed", settings.rounds, budget, imitation="real")
-                yield Comparison("main", alone, real, settings.seeds)
-
-
-def _rounds(settings: StudySettings) -> Iterator[Comparison]:
-    for base in _series():
-        for budget in BUDGETS:
-            real = Setup(base.planner, "real", 0, budget)
-            yield Comparison("rounds", real, None, settings.curve_seeds)
-            every = range(1, settings.rounds + 1)
-            for rounds in every if budget == "epochs" else _few(settings.rounds):
-                setup = replace(base, rounds=rounds, budget=budget)
-                yield Comparison("rounds", setup, real, settings.curve_seeds)
-
-
-def _traffic(settings: StudySettings) -> Iterator[Comparison]:
-    for planner in MULTI:
-        for rounds in _few(settings.rounds):
-            for budget in BUDGETS:
-                reactive = Setup(planner, "pdm_closed", rounds, budget)
-                yield Comparison("traffic", reactive, None, settings.curve_seeds)
-                yield Comparison("traffic", replace(reactive, traffic="replay"), reactive, settings.curve_seeds)
-
-
-def _ratio(settings: StudySettings) -> Iterator[Comparison]:
-    for planner in MULTI:
-        for budget in BUDGETS:
-            natural = Setup(planner, "pdm_closed", settings.rounds, budget)
-            yield Comparison("ratio", natural, None, settings.curve_seeds)
-            for ratio in RATIOS:
-                yield Comparison("ratio", replace(natural, sim_ratio=ratio), natural, settings.curve_seeds)
-
-
-def _psnr(settings: StudySettings) -> Iterator[Comparison]:
-    """As many samples on either side: equal epochs are equal steps."""
-    for planner in MULTI:
-        low = Setup(planner, "pdm_closed", settings.rounds, "epochs", psnr="low")
-        yield Comparison("psnr", low, None, settings.curve_seeds)
-        yield Comparison("psnr", replace(low, psnr="high"), low, settings.curve_seeds)
-
-
-def _rewards(settings: StudySettings) -> Iterator[Comparison]:
-    """With real samples alone: is imitation needed there?"""
-    for budget in BUDGETS:
-        real = Setup("gtrs_dense", "real", 0, budget)
-        yield Comparison("rewards", real, None, settings.curve_seeds)
-        yield Comparison("rewards", replace(real, imitation="none"), real, settings.curve_seeds)
-
-
-def _real_share(settings: StudySettings) -> Iterator[Comparison]:
-    for planner in MULTI:
-        imitation: Literal["all", "real"] = "real" if planner == "gtrs_dense" else "all"
-        for share in SHARES:
-            for budget in BUDGETS:
-                real = Setup(planner, "real", 0, budget, real_share=share)
-                both = Setup(planner, "pdm_closed", settings.rounds, budget, imitation=imitation, real_share=share)
-                yield Comparison("real_share", real, None, settings.curve_seeds)
-                yield Comparison("real_share", both, real, settings.curve_seeds)
-
-
-def _control(settings: StudySettings) -> Iterator[Comparison]:
-    """The same perturbed states with the log's future for a label; in equal steps, as nothing of it is filtered."""
-    for planner in settings.planners:
-        expert = Setup(planner, "pdm_closed", settings.rounds, "steps")
-        yield Comparison("control", expert, None, settings.curve_seeds)
-        yield Comparison("control", replace(expert, data="logged"), expert, settings.curve_seeds)
-
-
-def _ensemble(settings: StudySettings) -> Iterator[Comparison]:
-    """The mean of what three kinds of data taught, held against rewards alone, as in the paper."""
-    for budget in BUDGETS:
-        members = _members(budget, settings.rounds)
-        for member in members:
-            yield Comparison("ensemble", member, None, settings.curve_seeds)
-        together = Setup(ENSEMBLE, "pdm_closed", settings.rounds, budget)
-        yield Comparison("ensemble", together, members[-1], settings.curve_seeds)
-
-
-def members_of(budget: Budget, rounds: int) -> list[Setup]:
-    """The trainings of an ensemble."""
-    return [trained(member, rounds) for member in _members(budget, rounds)]
-
-
-def _members(budget: Budget, rounds: int) -> list[Setup]:
-    """Recovery, planner, rewards only."""
-    imitating = [Setup("gtrs_dense", expert, rounds, budget) for expert in EXPERTS]
-    return [*imitating, replace(imitating[-1], imitation="real")]
-
-
-def _few(rounds: int) -> list[int]:
-    """The first, the middle and the last."""
-    return sorted({1, (rounds + 1) // 2, rounds})
-
-
-def _series() -> Sequence[Setup]:
-    """What is drawn over rounds."""
-    imitating = [Setup(planner, expert, 1, "epochs") for planner in MULTI for expert in EXPERTS]
-    return [*imitating, Setup("gtrs_dense", "pdm_closed", 1, "epochs", imitation="real")]
-
-
-BUDGETS: tuple[Budget, ...] = ("epochs", "steps")
-PLANNERS_OF_LEG = 48
-EXPERTS: tuple[Data, ...] = ("recovery", "pdm_closed")
-PARTS = {
-    "main": _main,
-    "rounds": _rounds,
-    "traffic": _traffic,
-    "ratio": _ratio,
-    "psnr": _psnr,
-    "rewards": _rewards,
-    "real_share": _real_share,
-    "control": _control,
-    "ensemble": _ensemble,
-}
-
-
 @dataclass(frozen=True)
 class Portion:
     """One seed of one part: what is asked for first, and what the tables say of it."""
@@ -309,7 +249,7 @@ class Portion:
     part: str
     seed: int
     trainings: tuple[Training, ...]  # that no portion before it asked for
-    ensembles: dict[str, str]  # label -> trainings joined by plus, as planners.evaluation.evaluate takes them
+    ensembles: Mapping[str, str]  # label -> trainings joined by plus, as `python -m planners evaluate` takes them
 
     @property
     def labels(self) -> list[str]:
@@ -349,7 +289,7 @@ def legs(planned: Sequence[Portion]) -> list[list[Portion]]:
 
 
 def _joined(ensemble: Setup, seed: int, out: Path) -> str:
-    members = members_of(ensemble.budget, ensemble.rounds)
+    members = [trained(member, ensemble.rounds) for member in taught(SCORING, ensemble.budget, ensemble.rounds)]
     return "+".join(str(out / TRAININGS / member.label_of(seed)) for member in members)
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from factory.config.compose import compose, fill
-from planners.study.plan import (
+from planners.study.setups import (
     ENSEMBLE,
     PARTS,
     PLANNERS_OF_LEG,

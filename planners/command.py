@@ -1,0 +1,75 @@
+"""What all commands of `python -m planners` do alike: help, exit codes, one line for what is wrong, signals."""
+
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import wraps
+from typing import Any
+
+from factory.config.compose import conf_dir
+
+COMPLETE, BAD_SETTINGS, FAILED, INTERRUPTED = 0, 2, 3, 4
+
+
+class Failed(Exception):
+    """A part ended with an error; what else was to be done is done."""
+
+
+class Stopped(Exception):
+    """Interrupted or out of minutes; what is done is kept, and the same command goes on."""
+
+
+def command(answer: Callable[[Sequence[str]], None]) -> Callable[[Sequence[str]], int]:
+    """The command that answers its arguments so: --help, and what is raised as one line and an exit code.
+
+    ValueError and OSError are settings or files that do not fit.
+    """
+
+    @wraps(answer)
+    def main(argv: Sequence[str]) -> int:
+        if {"-h", "--help"} & set(argv):
+            print(help_of(answer.__module__))
+            return COMPLETE
+        try:
+            answer(argv)
+        except (ValueError, OSError) as error:
+            print(f"error: {error}", file=sys.stderr)
+            return BAD_SETTINGS
+        except Failed as error:
+            print(f"error: {error}", file=sys.stderr)
+            return FAILED
+        except Stopped as stopped:
+            print(stopped, file=sys.stderr)
+            return INTERRUPTED
+        return COMPLETE
+
+    return main
+
+
+def help_of(module: str) -> str:
+    """What the module says of itself, and the keys of its file in conf/ where it has one."""
+    keys = conf_dir() / f"{module.rpartition('.')[2]}.yaml"
+    return "\n".join([sys.modules[module].__doc__ or "", *([keys.read_text()] if keys.is_file() else [])])
+
+
+@contextmanager
+def until_signal() -> Iterator[threading.Event]:
+    """An event that the first SIGINT or SIGTERM sets; a second one ends the process.
+
+    Only the main thread is told of signals: in another, such as a Ray worker's, the event stays as it is.
+    """
+    event, before = threading.Event(), dict[int, Any]()
+
+    def note(number: int, frame: object) -> None:
+        event.set()
+        signal.signal(number, before[number])
+
+    if threading.current_thread() is threading.main_thread():
+        before |= {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield event
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
