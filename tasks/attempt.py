@@ -8,7 +8,6 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.experts.follow_up import BEFORE_STEPS, FollowUp
 from tasks.experts.pdm_closed.path import MIN_PROGRESS_M, path_length_m
@@ -19,6 +18,7 @@ from tasks.reward.prepare import PreparedScene, prepare_scene
 from tasks.rollout.simulate import TrafficSettings, next_scene, simulate
 from tasks.stages import Rejected
 from tasks.subscores import JUDGED
+from tasks.world.arrays import Array
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip, Rollout, Scene, scene_of_clip
 from tasks.world.route import centerline_from
 from tasks.world.vehicle import HEADING
@@ -48,7 +48,7 @@ class Judged:
     rollout: Rollout
     scores: Scores  # row 1 is this rollout, row 0 PDM-Closed
     prepared: PreparedScene  # the scene among the rollout's agents
-    rival: NDArray[np.float64]  # (41, 11) PDM-Closed as the tracker drives it
+    reference: Array  # (41, 11) PDM-Closed as the tracker drives it
 
 
 def perturbed_scene(clip: Clip, stage_one: Rollout, steps: int = HORIZON_STEPS) -> Scene:
@@ -57,7 +57,7 @@ def perturbed_scene(clip: Clip, stage_one: Rollout, steps: int = HORIZON_STEPS) 
     return next_scene(scene_of_clip(clip), stage_one, centerline_from(clip.road_map, clip.route, pose), steps)
 
 
-def has_route(centerline: NDArray[np.float64]) -> bool:
+def has_route(centerline: Array) -> bool:
     """Whether any route is left to drive along: without it nobody can plan and progress has no meaning."""
     return path_length_m(centerline) > MIN_PROGRESS_M
 
@@ -87,11 +87,11 @@ def judge(scene: Scene, plan: Plan, rollout: Rollout, pdm_plan: PdmPlan) -> Judg
     return Judged(scene, plan, rollout, scores, prepared, pdm_plan.driven)
 
 
-def verdict(scores: Scores, gate: ExpertGate, row: int = 1) -> Rejected | None:
-    """None when the row passes the gate, else the first sub-score that fails, with all of them in the detail."""
-    failed = [f"{name}={getattr(scores, name)[row]:g}" for name in gate.full if getattr(scores, name)[row] != 1.0]
-    if not scores.ep[row] > gate.progress_above:
-        failed.append(f"ep={scores.ep[row]:.3f}")
+def verdict(scores: Scores, gate: ExpertGate) -> Rejected | None:
+    """None when row 1 (see Judged) passes the gate, else the first sub-score that fails, with all in the detail."""
+    failed = [f"{name}={getattr(scores, name)[1]:g}" for name in gate.full if getattr(scores, name)[1] != 1.0]
+    if not scores.ep[1] > gate.progress_above:
+        failed.append(f"ep={scores.ep[1]:.3f}")
     return Rejected("reward", failed[0].split("=")[0], " ".join(failed)) if failed else None
 
 

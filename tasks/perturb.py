@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.experts.pdm_closed.planner import PdmSettings, plan_for
 from tasks.reward.epdms import Scores, score
@@ -23,12 +22,11 @@ from tasks.reward.prepare import among, prepare_scene
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out
 from tasks.stages import Rejected
+from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip, Rollout, scene_of_clip
 from tasks.world.frames import to_local, to_world
 from tasks.world.vehicle import HEADING, VX
 from tasks.world.vocabulary import Vocabulary
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -82,13 +80,13 @@ class Perturbation:
 class Considered:
     """Every vocabulary trajectory that passed the raw gates, and what became of it: for `explain` and pictures."""
 
-    vocabulary_index: NDArray[np.int64]  # (G,)
+    vocabulary_index: Ints  # (G,)
     end_pose: Array  # (G, 3) reached, in the frame of the logged pose at T+H
     fate: tuple[str, ...]  # (G,) "reached_gate", "white_cell", "not_needed", "score", "reactive", "kept"
     score: Array  # (G,) EPDMS under log replay, NaN where it was not needed
 
 
-def gate_failures(end_poses: Array, settings: PerturbSettings) -> dict[str, NDArray[np.bool_]]:
+def gate_failures(end_poses: Array, settings: PerturbSettings) -> dict[str, Bools]:
     """Which end poses (..., 3), in the frame of the logged pose at T+H, each gate drops."""
     return {
         "longitudinal": np.abs(end_poses[..., 0]) > settings.max_longitudinal_m,
@@ -97,15 +95,13 @@ def gate_failures(end_poses: Array, settings: PerturbSettings) -> dict[str, NDAr
     }
 
 
-def grid_cells(end_poses: Array, settings: PerturbSettings) -> NDArray[np.int64]:
+def grid_cells(end_poses: Array, settings: PerturbSettings) -> Ints:
     """Cell (..., 2) of end poses (..., 3): longitudinal and lateral index; cell (0, 0) is centred on the log."""
     steps = np.array([settings.step_longitudinal_m, settings.step_lateral_m])
     return np.floor(end_poses[..., :2] / steps + 0.5).astype(np.int64)
 
 
-def first_good_per_cell(
-    cell_of: NDArray[np.int64], order: NDArray[np.int64], is_good: Callable[[NDArray[np.int64]], NDArray[np.bool_]]
-) -> NDArray[np.int64]:
+def first_good_per_cell(cell_of: Ints, order: Ints, is_good: Callable[[Ints], Bools]) -> Ints:
     """Per cell the first member, in `order`, that is good; cells in the order of their first member.
 
     Args:
@@ -210,7 +206,7 @@ def perturb(
     pdm_states = plan_for(scene, planner).driven[None]
     scores = np.full(len(gated), np.nan)
 
-    def passes_replay(members: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def passes_replay(members: Ints) -> Bools:
         result = score(replay, np.concatenate([pdm_states, states[members]]), normalise="pairs")
         scores[members] = result.pdm_score[1:]
         return scores[members] >= settings.epdms_min

@@ -3,16 +3,15 @@
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.experts.pdm_closed.planner import plan_for
 from tasks.reward.epdms import Scores, rows, score
 from tasks.reward.prepare import N_TIMES, prepare_scene
 from tasks.rollout.lqr import track
+from tasks.world.arrays import Array
 from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, Scene, scene_of_clip
 from tasks.world.frames import to_world
 
-Array = NDArray[np.float64]
 Reference = Literal["pdm_closed", "batch"]
 
 COARSE_STEPS = 8  # 4 s at 2 Hz, the public planners' output

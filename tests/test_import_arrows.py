@@ -17,7 +17,7 @@ FORBIDDEN = {
 # Of each package the rooms from the ground up: a module imports from its own room and those below it.
 ROOMS = {
     "tasks": (
-        *("caches", "subscores", "stages", "world", "kernels", "rollout", "reward.rules", "reward", "experts"),
+        *("caches", "subscores", "stages", "kernels", "world", "rollout", "reward.rules", "reward", "experts"),
         *("perturb", "attempt", "hard_scenes", "trajectories"),
         *("render.splatting", "render.scene", "render.fit", "render"),
     ),

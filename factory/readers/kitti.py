@@ -11,13 +11,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from factory.readers.base import BadClip
 from tasks.render.scene.sensed import Photo, Sweep
+from tasks.world.arrays import Array
 
-F64 = NDArray[np.float64]
 EARTH_RADIUS_M = 6378137.0  # of the kit's Mercator projection
 IMU_HEIGHT_M = 0.93  # above the road
 
@@ -27,11 +26,11 @@ class KittiCamera:
     """A rectified camera of the rig."""
 
     name: str  # image_00 .. image_03
-    intrinsics: F64  # (3, 3) pixels of `size`, the centre of pixel (0, 0) at (0.5, 0.5)
+    intrinsics: Array  # (3, 3) pixels of `size`, the centre of pixel (0, 0) at (0.5, 0.5)
     size: tuple[int, int]  # width, height the calibration was made for
-    camera_from_imu: F64  # (4, 4)
+    camera_from_imu: Array  # (4, 4)
 
-    def intrinsics_of(self, width: int, height: int) -> F64:
+    def intrinsics_of(self, width: int, height: int) -> Array:
         """(3, 3) for images that were scaled to another size."""
         return np.diag([width / self.size[0], height / self.size[1], 1.0]) @ self.intrinsics
 
@@ -42,8 +41,8 @@ class KittiDrive:
 
     folder: Path  # <date>_drive_<n>_sync
     cameras: dict[str, KittiCamera]
-    world_from_imu: F64  # (frames, 4, 4)
-    times_s: F64  # (frames,) since the first
+    world_from_imu: Array  # (frames, 4, 4)
+    times_s: Array  # (frames,) since the first
 
     def photos(self, camera: str, frames: Sequence[int] | None = None) -> list[Photo]:
         """Photos of one camera at the frames asked for, all by default. Raises BadClip for one that is not there."""
@@ -124,7 +123,7 @@ def steadied(drive: KittiDrive) -> KittiDrive:
     return replace(drive, world_from_imu=poses, times_s=times)
 
 
-def _calibration(path: Path) -> dict[str, F64]:
+def _calibration(path: Path) -> dict[str, Array]:
     if not path.is_file():
         raise BadClip(str(path), "calibration", "is missing; unpack the date's calibration there")
     out = {}
@@ -138,7 +137,7 @@ def _calibration(path: Path) -> dict[str, F64]:
     return out
 
 
-def _matrix(path: Path, values: dict[str, F64], name: str, shape: tuple[int, ...]) -> F64:
+def _matrix(path: Path, values: dict[str, Array], name: str, shape: tuple[int, ...]) -> Array:
     if name not in values:
         raise BadClip(str(path), name, "is missing")
     if values[name].size != np.prod(shape) or not np.isfinite(values[name]).all():
@@ -146,7 +145,7 @@ def _matrix(path: Path, values: dict[str, F64], name: str, shape: tuple[int, ...
     return values[name].reshape(shape)
 
 
-def _rigid(path: Path) -> F64:
+def _rigid(path: Path) -> Array:
     values = _calibration(path)
     out = np.eye(4)
     out[:3, :3], out[:3, 3] = _matrix(path, values, "R", (3, 3)), _matrix(path, values, "T", (3,))
@@ -173,7 +172,7 @@ def _cameras(date: Path) -> dict[str, KittiCamera]:
     return out
 
 
-def _poses(folder: Path) -> F64:
+def _poses(folder: Path) -> Array:
     """World from IMU (frames, 4, 4): Mercator at the first latitude, then yaw, pitch, roll."""
     paths = sorted(folder.glob("*.txt"))
     if not paths:
@@ -195,7 +194,7 @@ def _poses(folder: Path) -> F64:
     return out
 
 
-def _turn(axis: int, angle: F64) -> F64:
+def _turn(axis: int, angle: Array) -> Array:
     out = np.tile(np.eye(3), (len(angle), 1, 1))
     i, j = (axis + 1) % 3, (axis + 2) % 3
     out[:, i, i] = out[:, j, j] = np.cos(angle)
@@ -203,7 +202,7 @@ def _turn(axis: int, angle: F64) -> F64:
     return out
 
 
-def _times(path: Path, n: int) -> F64:
+def _times(path: Path, n: int) -> Array:
     if not path.is_file():
         raise BadClip(str(path), "timestamps", "is missing")
     lines = path.read_text().split("\n")

@@ -27,18 +27,16 @@ from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factory.readers.base import SPLITS, BadClip, ClipIndex, ClipRef, split_of
 from factory.readers.validate import validate_clip
 from factory.readers.windows import WindowSettings, drop_reason, window_starts
 from tasks.world.agents import AgentTracks
+from tasks.world.arrays import Array, Ints
 from tasks.world.camera import Camera, SensorFile
 from tasks.world.clip import CLIP_STEPS, NOW, STEP_S, Block, Clip
 from tasks.world.lanes import RoadMap, Route, TrafficLights
 from tasks.world.route import NoRoute, RouteFinder, route_of_log
-
-Array = NDArray[np.float64]
 
 STEP_MS = round(STEP_S * 1000)
 ROUTE_SAMPLE_STEPS = 2  # the route looks at the ego every 0.2 s
@@ -51,7 +49,7 @@ class Drive:
 
     ego_states: Array  # (S, 11), NaN where the log has no continuous drive
     agents: AgentTracks  # S steps
-    segment: NDArray[np.int64]  # (S,) number of the unbroken stretch a step belongs to, -1: none; no window leaves it
+    segment: Ints  # (S,) number of the unbroken stretch a step belongs to, -1: none; no window leaves it
 
 
 @dataclass(frozen=True)

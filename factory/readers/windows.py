@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.world.agents import AgentTracks
+from tasks.world.arrays import Array, Bools
 from tasks.world.clip import CLIP_STEPS, STEP_S
 from tasks.world.vehicle import VX, VY, X, Y
 
@@ -45,9 +45,9 @@ def window_starts(n_steps: int, settings: WindowSettings) -> range:
 
 
 def drop_reason(
-    ego_states: NDArray[np.float64],
+    ego_states: Array,
     agents: AgentTracks,
-    observed: NDArray[np.bool_],
+    observed: Bools,
     settings: WindowSettings,
 ) -> str | None:
     """Why the window with ego_states (96, 11), agents (96 steps) and observed (96,) is dropped; None keeps it.

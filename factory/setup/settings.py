@@ -32,6 +32,7 @@ from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings
 from tasks.experts.protocol import Expert
 from tasks.experts.recovery.expert import Recovery, RecoverySettings, RecoveryTable
 from tasks.perturb import PerturbSettings
+from tasks.render.fit.settings import REMOVED
 from tasks.render.rigs import RIGS
 from tasks.render.scene import engine
 from tasks.render.settings import RenderMode, RenderSettings
@@ -305,6 +306,7 @@ def identity_of(config: RunConfig, vocabulary: Vocabulary, labelling: Labelling 
     settings: dict[str, object] = {"seed": config.seed, "vocabulary": vocabulary.digest}
     for group, value in science.items():
         settings |= {f"{group}.{key}": plain for key, plain in dataclasses.asdict(value).items()}
+    settings["render.fit"] = dataclasses.asdict(config.render.fit) | REMOVED
     settings = {key: plain for key, plain in settings.items() if plain != ADDED.get(key, ABSENT)}
     settings["reward.label_vocabulary"] = None if labelling is None else labelling.vocabulary.digest
     versions = stage_versions()

@@ -21,17 +21,16 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factory.config.compose import ConfigError, build, compose, fill, need_run_extra
 from factory.readers.base import BadClip, ClipReader
 from factory.readers.validate import read_clip
 from tasks.experts.recovery.expert import RecoveryTable
+from tasks.world.arrays import Array
 from tasks.world.clip import CLIP_STEPS, HORIZON_STEPS, STEP_S
 from tasks.world.kinematic_vocabulary import kinematic_trajectories
 from tasks.world.vocabulary import Vocabulary, checked_trajectories, cluster, human_windows
 
-Array = NDArray[np.float64]
 STEP_MS = round(STEP_S * 1000)
 TABLE_KEYS = ("trajectories", "digest")
 

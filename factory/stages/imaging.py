@@ -12,7 +12,6 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factory.graph.work import Stopped, never
 from factory.readers.base import BadClip
@@ -30,6 +29,7 @@ from tasks.render.settings import STEPS_OF, ImageSource, PsnrGate, RenderMode, R
 from tasks.render.views import pose_on_ground, render_views
 from tasks.stages import Rejected
 from tasks.world.agents import AgentTracks
+from tasks.world.arrays import Array, Bytes
 from tasks.world.camera import Camera, SensorFile
 from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip
 from tasks.world.vehicle import X, Y
@@ -141,7 +141,7 @@ class Imaging:
         offsets = self._ego_states(judged)[:, None, [X, Y]] - places
         return bool((np.linalg.norm(offsets, axis=-1).min(axis=1) < self.settings.lidar_only_reach_m).all())
 
-    def _ego_states(self, judged: Judged) -> NDArray[np.float64]:
+    def _ego_states(self, judged: Judged) -> Array:
         """(F, 11) at the instants that are drawn."""
         driven = np.concatenate([judged.scene.ego_history, judged.rollout.ego_states[1:]])  # rows -15 .. 40 around now
         return driven[[offset + NOW for offset in STEPS_OF[self.settings.frames]]]
@@ -171,10 +171,10 @@ class Imaging:
         clip: Clip,
         asset: RenderAsset | None,
         cameras: Sequence[Camera],
-        poses: NDArray[np.float64],
+        poses: Array,
         agents: AgentTracks,
         steps: Sequence[int],
-    ) -> NDArray[np.uint8]:
+    ) -> Bytes:
         size = (self.settings.width, self.settings.height)
         if asset is None:
             return draw_map_views(clip.road_map, cameras, poses, agents, steps, *size)
@@ -195,9 +195,7 @@ class Imaging:
         ]
         return {"cameras": self._rig(cameras), "images": found, "image_source": str(ImageSource.PHOTO)}
 
-    def _image(
-        self, camera: str, time_s: float, pose: NDArray[np.float64], rgb: NDArray[np.uint8]
-    ) -> dict[str, object]:
+    def _image(self, camera: str, time_s: float, pose: Array, rgb: Bytes) -> dict[str, object]:
         return {
             "camera": camera,
             "time_s": float(time_s),

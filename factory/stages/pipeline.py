@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factory.graph.work import (
     BENCHMARK,
@@ -54,6 +53,7 @@ from tasks.reward.labels import Labelling, vocabulary_labels
 from tasks.rollout.simulate import TrafficSettings
 from tasks.stages import Rejected
 from tasks.subscores import OF_ONE_PLAN
+from tasks.world.arrays import Array
 from tasks.world.chance import stream
 from tasks.world.clip import NOW, STEP_S, Clip, scene_of_clip
 from tasks.world.vehicle import HEADING
@@ -70,7 +70,7 @@ class PerturbedClip:
     before: Clip | None = None  # of a benchmark: the same log's window 0.5 s earlier
 
 
-def logged_poses(prepared: object) -> NDArray[np.float64] | None:
+def logged_poses(prepared: object) -> Array | None:
     """(81, 3) the log from T to T+2H, world frame, of a prepared clip; None of what is none, or is another work's."""
     if not isinstance(prepared, PreparedClip) or not isinstance(prepared.payload, PerturbedClip):
         return None
@@ -332,7 +332,7 @@ class FactoryWork:
         if self.labelling is None:
             return {}
         with watch.of("labels"):
-            return label_columns(vocabulary_labels(self.labelling, judged.scene, judged.prepared, judged.rival))
+            return label_columns(vocabulary_labels(self.labelling, judged.scene, judged.prepared, judged.reference))
 
     def _block_verdict(self, clip: Clip) -> Rejected | None:
         """Asked for before perturb work is spent. Without a gate a block is built here only if it will be needed."""

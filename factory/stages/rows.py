@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factory.store.schema import AGENT_STEPS, MAP_RADIUS_M, NOW_INDEX
 from tasks.attempt import Judged
@@ -14,12 +13,12 @@ from tasks.reward.epdms import Scores
 from tasks.reward.label_bytes import VocabularyLabels, encode
 from tasks.subscores import OF_ONE_PLAN, SUBSCORES
 from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.arrays import Array
 from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, Scene
 from tasks.world.command import driving_command
 from tasks.world.frames import points_to_local, to_local
 from tasks.world.vehicle import AX, AY, HEADING, VX, VY
 
-Array = NDArray[np.float64]
 NEAR_M = 30.0  # for the tags
 
 

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from factory.readers.av2.log import read_feather
 from factory.readers.base import BadClip
 from tasks.render.scene.sensed import Photo, Sweep, on_ego
 from tasks.render.views import undistorted
+from tasks.world.arrays import Bytes
 from tasks.world.camera import Camera, SensorFile
 from tasks.world.clip import Block, Clip
 
@@ -64,7 +64,7 @@ def chosen_cameras(rig: Sequence[Camera], names: Sequence[str] | None) -> tuple[
     return tuple(by_name[name] for name in names)
 
 
-def encode_jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
+def encode_jpeg(image: Bytes, quality: int) -> bytes:
     """An rgb image (H, W, 3) as JPEG bytes; quality 1..100."""
     done, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:
@@ -72,7 +72,7 @@ def encode_jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
     return data.tobytes()
 
 
-def decode_image(data: bytes, name: str) -> NDArray[np.uint8]:
+def decode_image(data: bytes, name: str) -> Bytes:
     """Encoded bytes (JPEG or PNG) as rgb (H, W, 3). Raises BadClip that names `name`."""
     if not data:
         raise BadClip(name, "image", "the file is empty")

@@ -14,7 +14,6 @@ from pathlib import Path
 from threading import Event, Lock, Thread
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factory.graph.work import NotReady
 from tasks.attempt import drive_and_judge
@@ -29,6 +28,7 @@ from tasks.reward.reactive import reactive_scores
 from tasks.reward.verdicts import INDEX_FROM_ROWS
 from tasks.rollout.simulate import TrafficSettings, simulate
 from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.arrays import Array
 from tasks.world.clip import CLIP_STEPS, HORIZON_STEPS, NOW, Clip, Scene, scene_of_clip
 from tasks.world.kinematic_vocabulary import kinematic_trajectories
 from tasks.world.lanes import Lane, RoadMap, Route
@@ -165,7 +165,7 @@ def _judge() -> None:
     replay = TrafficSettings(mode="replay")
     judged = drive_and_judge(scene, Plan(ahead), replay, PdmSettings())
     labelling = Labelling(Vocabulary(kinematic_trajectories(INDEX_FROM_ROWS, 0)), replay)
-    vocabulary_labels(labelling, scene, judged.prepared, judged.rival)
+    vocabulary_labels(labelling, scene, judged.prepared, judged.reference)
 
 
 def _drive() -> None:
@@ -198,7 +198,7 @@ INCLUDED = {"answers": ("drive",), "fit": ("render",)}
 NO_ROOM = 5  # exit code of a part whose files could not be kept
 
 
-def _tiny_scene() -> tuple[Scene, NDArray[np.float64]]:
+def _tiny_scene() -> tuple[Scene, Array]:
     ahead = np.stack([np.arange(1, 41) * 0.5, np.zeros(40), np.zeros(40)], axis=1)
     return scene_of_clip(tiny_clip()), ahead
 

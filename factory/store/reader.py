@@ -19,12 +19,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
 from factory.store.location import Location
 from factory.store.schema import SAMPLES, SCHEMA, SCHEMA_VERSION, VERSION_PROPERTY, table_to_rows
 from factory.store.table import KeyedTable
 from tasks.reward.label_bytes import VocabularyLabels, decode
+from tasks.world.arrays import Bytes
 
 if TYPE_CHECKING:
     import torch
@@ -160,7 +160,7 @@ def _read_rows(
     return table_to_rows(pa.table(arrays, schema=pa.schema([SCHEMA.field(n) for n in names])))
 
 
-def image_of(sample: Mapping[str, Any], camera: str, time_s: float) -> NDArray[np.uint8]:
+def image_of(sample: Mapping[str, Any], camera: str, time_s: float) -> Bytes:
     """One image (height, width, 3) uint8 RGB; time_s relative to the sample's now, within 0.05 s.
 
     Raises KeyError where the sample has no such image, ValueError where it cannot be decoded.

@@ -5,13 +5,13 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.world.agents import AgentKind
+from tasks.world.arrays import Array, Bytes, ShortInts
+from tasks.world.boxes import ego_boxes
 from tasks.world.frames import box_corners, points_to_local
 from tasks.world.vehicle import PACIFICA
 
-Array = NDArray[np.float64]
 Colour = tuple[int, int, int]  # RGB
 
 BACKGROUND: Colour = (246, 246, 243)
@@ -72,7 +72,7 @@ def draw_bev(
     title: str = "",
     size_px: tuple[int, int] = (480, 480),
     metres: float = 80.0,
-) -> NDArray[np.uint8]:
+) -> Bytes:
     """An RGB picture (height, width, 3), x of `centre` (3,) pointing up.
 
     `ego` (3,) is the rear-axle pose of the box to draw; `metres` is the extent along the picture's height.
@@ -81,7 +81,7 @@ def draw_bev(
     scale = height / metres
     image = np.full((height, width, 3), BACKGROUND, np.uint8)
 
-    def pixels(points: Array) -> NDArray[np.int32]:
+    def pixels(points: Array) -> ShortInts:
         local = points_to_local(centre, np.asarray(points, dtype=float)[..., :2])
         u = width / 2.0 - local[..., 1] * scale
         v = height * 0.6 - local[..., 0] * scale
@@ -106,23 +106,19 @@ def draw_bev(
             cv2.fillPoly(image, [pixels(corners)], AGENT_COLOURS.get(kind, OBJECT), cv2.LINE_AA, _SHIFT)
             nose = np.stack([(corners[0] + corners[3]) / 2.0, box[:2]])
             cv2.polylines(image, [pixels(nose)], False, BACKGROUND, 1, cv2.LINE_AA, _SHIFT)
-    ahead = PACIFICA.rear_axle_to_center
-    ego_box = np.array(
-        [ego[0] + ahead * np.cos(ego[2]), ego[1] + ahead * np.sin(ego[2]), ego[2], PACIFICA.length, PACIFICA.width]
-    )
-    cv2.fillPoly(image, [pixels(box_corners(ego_box))], EGO, cv2.LINE_AA, _SHIFT)
+    cv2.fillPoly(image, [pixels(box_corners(ego_boxes(ego, PACIFICA)))], EGO, cv2.LINE_AA, _SHIFT)
     _captions(image, title, paths)
     return image
 
 
-def _polyline(image: NDArray[np.uint8], points: NDArray[np.int32], path: Path) -> None:
+def _polyline(image: Bytes, points: ShortInts, path: Path) -> None:
     every, length = (4, 3) if path.dashed else (len(points), len(points))
     for start in range(0, len(points) - 1, every):
         piece = points[start : start + length]
         cv2.polylines(image, [piece], False, path.colour, path.width_px, cv2.LINE_AA, _SHIFT)
 
 
-def _captions(image: NDArray[np.uint8], title: str, paths: Sequence[Path]) -> None:
+def _captions(image: Bytes, title: str, paths: Sequence[Path]) -> None:
     height = image.shape[0]
     if title:
         cv2.putText(image, title, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (20, 20, 20), 1, cv2.LINE_AA)

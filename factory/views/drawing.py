@@ -2,18 +2,13 @@
 
 from collections.abc import Iterator, Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
 from factory.views.bev import EXPERT, LOGGED, PERTURBED, Boxes, MapShapes, Path, draw_bev
 from tasks.attempt import Judged
 from tasks.perturb import Candidate, Considered
+from tasks.world.arrays import Image
 from tasks.world.clip import NOW, Clip
 from tasks.world.lanes import LightState
 from tasks.world.vehicle import HEADING
-
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 FATE_COLOURS = {  # what became of a gated vocabulary trajectory
     "reached_gate": (200, 200, 200),

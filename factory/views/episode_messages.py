@@ -23,7 +23,6 @@ from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletio
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.message import Message as ProtobufMessage
 from google.protobuf.timestamp_pb2 import Timestamp
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from factory.store.columns import Column
@@ -32,10 +31,10 @@ from factory.store.schema import FIELDS, NOW_INDEX
 from factory.views.bev import AGENT_COLOURS, EXPERT, LOGGED, OBJECT, PERTURBED, Colour
 from factory.views.sample_picture import ego_way
 from tasks.subscores import JUDGED, SUBSCORES
+from tasks.world.arrays import Array
 from tasks.world.frames import to_local
 from tasks.world.vehicle import PACIFICA
 
-Array = NDArray[np.float64]
 Row = Mapping[str, Any]
 
 WORLD, NOW, EGO = "world", "now", "ego"

@@ -18,8 +18,9 @@ from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
-from factory.views.episode_messages import EGO, NOW, WORLD, Array, Row, episode_messages
+from factory.views.episode_messages import EGO, NOW, WORLD, Row, episode_messages
 from tasks.subscores import JUDGED, SUBSCORES
+from tasks.world.arrays import Array
 
 TIMELINE = "log"  # time since the log's first instant
 INSTALL = "rerun-sdk is not installed: pip install rerun-sdk"

@@ -6,16 +6,14 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from factory.store.reader import labels_of
 from factory.store.schema import NOW_INDEX
 from factory.views.bev import BACKGROUND, EXPERT, LOGGED, PERTURBED, Boxes, Colour, MapShapes, Path, draw_bev
+from tasks.world.arrays import Array, Image
 from tasks.world.frames import to_local
 from tasks.world.lanes import LightState
 
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
 Row = Mapping[str, Any]
 
 BEV_COLUMNS = (

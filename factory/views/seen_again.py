@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factory.stages.scene_file import BadScene, find_scene
 from factory.store.reader import SampleTable
@@ -36,12 +35,11 @@ from tasks.render.scene.engine import render, vehicles_at
 from tasks.render.settings import ImageSource
 from tasks.render.views import VISIBLE_M, pose_on_ground
 from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.arrays import Array, Image
 from tasks.world.camera import Pinhole
 from tasks.world.clip import STEP_S
 from tasks.world.frames import to_world
 
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
 Row = Mapping[str, Any]
 
 ASIDE_M = (2.0, 1.0, 0.0, -1.0, -2.0)  # left is positive, and on the left of the strip

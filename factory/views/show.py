@@ -23,11 +23,9 @@ from typing import TYPE_CHECKING, Any
 
 from factory.config.arguments import Refused, answer
 from factory.views.status import failed_lines, open_store, status_lines
+from tasks.world.arrays import Array
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from factory.store.samples import Store
     from factory.views.seen_again import Seen
     from tasks.render.scene.asset import RenderAsset
@@ -145,7 +143,7 @@ def seen_again(
     return pairs, from_the_side(scene, row)
 
 
-def labelled_trajectories(row: dict[str, Any], file: str | None) -> "NDArray[np.float64] | None":
+def labelled_trajectories(row: dict[str, Any], file: str | None) -> "Array | None":
     """(K, 40, 3) that the row's labels are of; None where they are of a file that was not named.
 
     Raises Refused where the named file holds others, or the row has no labels.
@@ -181,7 +179,7 @@ def _label_lines(row: dict[str, Any], drawn: bool) -> Iterable[str]:
         yield "              vocabulary=<its .npy> draws them"
 
 
-def logged_drive(store: "Store", row: dict[str, Any]) -> "NDArray[np.float64] | None":
+def logged_drive(store: "Store", row: dict[str, Any]) -> "Array | None":
     """(81, 3) the log from T to T+2H, world frame, from the prepared clip; None where the cache has it no more."""
     from factory.graph.steps import cache_key
     from factory.stages.pipeline import logged_poses

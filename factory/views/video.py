@@ -4,10 +4,11 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+
+from tasks.world.arrays import Bytes
 
 
-def write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], frames_per_s: int = 10) -> None:
+def write_mp4(path: Path, frames: Iterable[Bytes], frames_per_s: int = 10) -> None:
     """RGB frames (height, width, 3), even sizes, as H.264 that browsers play. Raises ValueError without frames."""
     import av
 

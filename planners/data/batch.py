@@ -4,12 +4,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-FloatArray = NDArray[np.floating[Any]]
+from tasks.world.arrays import FloatArray
 
 COMMANDS = ("left", "straight", "right", "unknown")  # order of the one-hot driving command
 

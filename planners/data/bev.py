@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from factory.store.schema import AGENT_STEPS, NOW_INDEX
 from planners.data.batch import BevLayout
 from tasks.world.agents import AgentKind
+from tasks.world.arrays import F32, Bools, Bytes, ShortInts
 from tasks.world.frames import box_corners
-
-Array = NDArray[np.float32]
 
 
 class BevClass(IntEnum):
@@ -47,7 +46,7 @@ _SHIFT = 4  # OpenCV draws at 1/16 cell with this many fractional bits
 _STEPS_PER_S = 10
 
 
-def bev_raster(sample: Mapping[str, Any], layout: BevLayout) -> NDArray[np.uint8]:
+def bev_raster(sample: Mapping[str, Any], layout: BevLayout) -> Bytes:
     """Rasters (T, rows, columns) of BevClass at `layout.times_s`, under one map, in the frame of the ego at now.
 
     A cell whose centre a shape covers shows it; a shape's outline may reach one cell further.
@@ -79,7 +78,7 @@ def bev_raster(sample: Mapping[str, Any], layout: BevLayout) -> NDArray[np.uint8
     return rasters
 
 
-def nearest_agents(sample: Mapping[str, Any], layout: BevLayout, n: int) -> tuple[Array, NDArray[np.bool_]]:
+def nearest_agents(sample: Mapping[str, Any], layout: BevLayout, n: int) -> tuple[F32, Bools]:
     """Vehicles at now whose centre is inside the layout, nearest first: boxes (n, 5) float32 and whether there is one.
 
     Boxes are centre x, y [m], heading [rad], length, width [m] in the frame of the ego at now; zeros where none is.
@@ -95,7 +94,7 @@ def nearest_agents(sample: Mapping[str, Any], layout: BevLayout, n: int) -> tupl
     return nearest, valid
 
 
-def _agents(sample: Mapping[str, Any]) -> tuple[Array, NDArray[np.bool_]]:
+def _agents(sample: Mapping[str, Any]) -> tuple[F32, Bools]:
     """Boxes (N, steps, 5) and whether they are there (N, steps), N = 0 included."""
     n = len(sample["agent_kinds"])
     boxes = np.asarray(sample["agent_boxes"], np.float32).reshape(n, AGENT_STEPS, 5)
@@ -109,14 +108,14 @@ def _step(time_s: float) -> int:
     return step
 
 
-def _cells(points: NDArray[Any], layout: BevLayout) -> NDArray[np.int32]:
+def _cells(points: NDArray[Any], layout: BevLayout) -> ShortInts:
     """Points (..., >= 2) [m] as OpenCV's fixed-point columns and rows, in which whole numbers are centres of cells."""
     ahead = np.array([layout.side_m, layout.ahead_m], np.float64)
     cells = (ahead - points[..., 1::-1]) / layout.cell_m - 0.5
     return np.round(cells * (1 << _SHIFT)).astype(np.int32)
 
 
-def _near(shapes: Sequence[NDArray[Any]], layout: BevLayout) -> list[NDArray[np.int32]]:
+def _near(shapes: Sequence[NDArray[Any]], layout: BevLayout) -> list[ShortInts]:
     """Those of the shapes (P, >= 2) whose bounds meet the raster, in cells."""
     shapes = [shape for shape in shapes if len(shape)]
     if not shapes:

@@ -19,9 +19,10 @@ from factory.store.reader import LABEL_COLUMNS, TIME_TOLERANCE_S, labels_of
 from factory.store.schema import COLUMNS
 from planners.data.batch import COMMANDS, Batch, BevLayout, ImageLayout, Needs
 from planners.data.feed import AGENT_COLUMNS, BEV_COLUMNS
-from planners.data.images import Bytes, stitch
+from planners.data.images import stitch
 from tasks.reward.label_bytes import CRC_BYTES
 from tasks.subscores import LABELLED
+from tasks.world.arrays import Bools, Bytes
 
 
 class StoredRows:
@@ -40,8 +41,8 @@ class StoredRows:
             self._jpegs = _jpegs_at_now(_whole(table["images"]), cameras, in_place)
             table = table.drop_columns(["images"])
         self._values = {name: _values(COLUMNS[name], _whole(table[name])) for name in table.column_names}
-        self._rasters: dict[tuple[int, BevLayout], NDArray[np.uint8]] = {}
-        self._pictures: dict[tuple[int, ImageLayout], NDArray[np.uint8]] = {}
+        self._rasters: dict[tuple[int, BevLayout], Bytes] = {}
+        self._pictures: dict[tuple[int, ImageLayout], Bytes] = {}
 
     def value(self, column: str, row: int) -> Any:
         """A value as the sample reader gives it: an array, a list of arrays, a text or a number."""
@@ -51,7 +52,7 @@ class StoredRows:
         """Several columns of a row."""
         return {column: self._values[column](row) for column in columns}
 
-    def raster(self, row: int, layout: BevLayout) -> NDArray[np.uint8]:
+    def raster(self, row: int, layout: BevLayout) -> Bytes:
         """The row seen from above (T, rows, columns), drawn once: a raster is smaller than the map it is drawn from."""
         from planners.data.bev import bev_raster
 
@@ -63,7 +64,7 @@ class StoredRows:
         """The images at now of the row's cameras, left to right."""
         return self._jpegs[row]
 
-    def picture(self, row: int, layout: ImageLayout, out: NDArray[np.uint8], keep: bool = False) -> None:
+    def picture(self, row: int, layout: ImageLayout, out: Bytes, keep: bool = False) -> None:
         """Write the row's wide picture into `out`; keep: it is decoded once and stays, beside its smaller JPEGs."""
         kept = self._pictures.get((row, layout))
         if kept is not None:
@@ -129,7 +130,7 @@ class BatchBuffer:
             for name in LABELLED:
                 arrays[name][i] = labels.ep(needs.normalise) if name == "ep" else getattr(labels, name)
 
-    def batch(self, attempt_ids: Sequence[str], simulated: NDArray[np.bool_], imitate: NDArray[np.bool_]) -> Batch:
+    def batch(self, attempt_ids: Sequence[str], simulated: Bools, imitate: Bools) -> Batch:
         """What was filled. The image is channels last in memory, as it was decoded."""
         tensors: dict[str, Any] = dict(self._tensors)
         if "image" in tensors:

@@ -10,14 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from factory.store.reader import LABEL_COLUMNS, TIME_TOLERANCE_S
 from planners.data.batch import ImageLayout, Needs
 from planners.data.files import group_bytes, group_rows, leaves
 from planners.data.images import chosen_cameras
-from planners.data.index import OPEN_FILES, Dataset, DataSettings, Index, open_dataset
+from planners.data.index import OPEN_FILES, Dataset, DataSettings, open_dataset
 from planners.data.mix import MixSettings, Samples, check_sides, sample_weights
+from tasks.world.arrays import Array, Ints
 
 __all__ = ["DataSettings", "Dataset", "Feed", "make_feed", "mixed_samples", "open_data"]
 
@@ -42,7 +42,7 @@ class Feed:
     needs: Needs
     columns: tuple[str, ...]
     cameras: tuple[tuple[str, ...], ...]  # (n) of each sample's picture, left to right; empty without images
-    size: Index  # (n,) bytes that a sample takes in memory between its batches, about
+    size: Ints  # (n,) bytes that a sample takes in memory between its batches, about
 
 
 def open_data(settings: DataSettings, needs: Needs | None = None, mix: MixSettings | None = None) -> Dataset:
@@ -90,7 +90,7 @@ def mixed_samples(feed: Feed, mix: MixSettings) -> Samples:
     return Samples(rows.simulated, group, feed.size, _weights(feed.dataset, mix))
 
 
-def _weights(dataset: Dataset, mix: MixSettings) -> NDArray[np.float64]:
+def _weights(dataset: Dataset, mix: MixSettings) -> Array:
     rows = dataset.rows
     return sample_weights(mix.weights, rows.simulated, rows.round, rows.expert, rows.perturbation_m, rows.reward)
 
@@ -116,13 +116,13 @@ def _check_index(dataset: Dataset, needs: Needs) -> None:
         )
 
 
-def _and_more(samples: Index) -> str:
+def _and_more(samples: Ints) -> str:
     return f" and {len(samples) - 1} more are" if len(samples) > 1 else " is"
 
 
 def _file_part(
     dataset: Dataset, needs: Needs, columns: Sequence[str], number: int
-) -> tuple[Index, list[tuple[str, ...]], Index]:
+) -> tuple[Ints, list[tuple[str, ...]], Ints]:
     """Of one file the places in the dataset of its samples, their cameras and their sizes."""
     here = np.flatnonzero(dataset.rows.file == number)
     parquet = dataset.files[number].open()
@@ -145,7 +145,7 @@ def _file_part(
 
 
 def _cameras(
-    dataset: Dataset, samples: Index, seen: pa.Table, places: Index, layout: ImageLayout
+    dataset: Dataset, samples: Ints, seen: pa.Table, places: Ints, layout: ImageLayout
 ) -> list[tuple[str, ...]]:
     """The cameras of each sample's picture. Raises ValueError where it has none, or no image of one at now."""
     rig, images = _list(seen, "cameras"), _list(seen, "images")

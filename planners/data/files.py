@@ -13,10 +13,10 @@ from threading import Lock
 
 import numpy as np
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 from pyarrow import fs
 
 from factory.store.reader import sample_table
+from tasks.world.arrays import Ints
 
 FOOTER_BYTES = 2**25  # as they are stored; parsed they take eight times that
 
@@ -102,13 +102,13 @@ def leaves(file: pq.ParquetFile, columns: Sequence[str]) -> list[str]:
     return [path for path, plain in paths if any(_under(plain, c) for c in columns)]
 
 
-def group_rows(file: pq.ParquetFile) -> NDArray[np.int64]:
+def group_rows(file: pq.ParquetFile) -> Ints:
     """(groups,) rows of each row group."""
     metadata = file.metadata
     return np.array([metadata.row_group(g).num_rows for g in range(metadata.num_row_groups)], np.int64)
 
 
-def group_bytes(file: pq.ParquetFile, columns: Sequence[str]) -> NDArray[np.int64]:
+def group_bytes(file: pq.ParquetFile, columns: Sequence[str]) -> Ints:
     """(groups, columns) uncompressed bytes of columns and members, as the footer says."""
     paths = _paths(file)
     numbers = [[i for i, (_, plain) in enumerate(paths) if _under(plain, column)] for column in columns]

@@ -13,12 +13,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from factory.store.reader import TIME_TOLERANCE_S
 from planners.data.batch import ImageLayout
-
-Bytes = NDArray[np.uint8]
+from tasks.world.arrays import Array, Bytes
 
 SAME_YAW = math.radians(5.0)  # cameras of a stereo pair are no neighbours
 AS_GOOD = math.radians(2.0)  # of cameras that look ahead equally well the first by name is the front one
@@ -26,7 +24,7 @@ REDUCED_BY = {2: cv2.IMREAD_REDUCED_GRAYSCALE_2, 4: cv2.IMREAD_REDUCED_GRAYSCALE
 RGB_AT = {1: cv2.IMREAD_COLOR_RGB} | {f: flag | cv2.IMREAD_COLOR_RGB for f, flag in REDUCED_BY.items()}  # grey is 0
 
 
-def stitched(sample: Mapping[str, Any], layout: ImageLayout) -> NDArray[np.uint8]:
+def stitched(sample: Mapping[str, Any], layout: ImageLayout) -> Bytes:
     """The picture (layout.height, layout.width, 3) uint8 RGB of a sample with the columns cameras and images.
 
     Raises ValueError where it has no cameras, no image of one of them at now, or a damaged one.
@@ -45,7 +43,7 @@ def stitched(sample: Mapping[str, Any], layout: ImageLayout) -> NDArray[np.uint8
     return picture
 
 
-def chosen_cameras(names: Sequence[str], axes: NDArray[np.float64], layout: ImageLayout) -> tuple[str, ...]:
+def chosen_cameras(names: Sequence[str], axes: Array, layout: ImageLayout) -> tuple[str, ...]:
     """The cameras of the picture, left to right: those of the layout, else the front one and its neighbours.
 
     The front camera is the one whose optical axis is nearest to ahead; its neighbours are the nearest by yaw, to the
@@ -77,7 +75,7 @@ def _nearest(angles: Mapping[str, float]) -> list[str]:
     return sorted(angles, key=lambda name: (angles[name], name))[:1]
 
 
-def stitch(jpegs: Sequence[Bytes], layout: ImageLayout, out: NDArray[np.uint8]) -> None:
+def stitch(jpegs: Sequence[Bytes], layout: ImageLayout, out: Bytes) -> None:
     """Write the picture of JPEGs, left to right, into `out` (layout.height, layout.width, 3) as RGB.
 
     Every camera is brought to the same height, and together they are brought to the width.

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from factory.store.location import Location
 from planners.data.batch import TrainingData
 from planners.data.files import SampleFile, files_of, group_rows, leaves
+from tasks.world.arrays import F32, Array, Bools, Ints, ShortInts
 
 HUMAN = "human"
 INDEX_COLUMNS = (
@@ -34,8 +35,6 @@ INDEX_COLUMNS = (
 OPEN_FILES = 8  # at a time, while their columns are read
 
 Tables = str | tuple[str, ...]
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -77,21 +76,21 @@ class Rows:
     clip_id: NDArray[np.str_]
     revision: NDArray[np.str_]  # what they were made under: settings and stage versions
     expert: NDArray[np.str_]
-    round: NDArray[np.int32]
-    simulated: Mask
-    perturbation_m: NDArray[np.float64]  # (n, 2) longitudinal, lateral end in the frame of the log's; NaN human
-    reward: NDArray[np.float64]  # stage2_score, NaN where there is none
-    psnr: NDArray[np.float64]  # [dB] NaN where there is none
+    round: ShortInts
+    simulated: Bools
+    perturbation_m: Array  # (n, 2) longitudinal, lateral end in the frame of the log's; NaN human
+    reward: Array  # stage2_score, NaN where there is none
+    psnr: Array  # [dB] NaN where there is none
     image_source: NDArray[np.str_]
     vocabulary: NDArray[np.str_]  # digest of the labels' trajectories, empty where there are no labels
-    file: Index  # place in Dataset.files
-    group: Index  # row group of the file
-    place: Index  # row of the row group
+    file: Ints  # place in Dataset.files
+    group: Ints  # row group of the file
+    place: Ints  # row of the row group
 
     def __len__(self) -> int:
         return len(self.attempt_id)
 
-    def taken(self, which: Index | Mask) -> "Rows":
+    def taken(self, which: Ints | Bools) -> "Rows":
         """Some of them, in the order of `which`."""
         return Rows(**{f.name: getattr(self, f.name)[which] for f in fields(self)})
 
@@ -132,7 +131,7 @@ class Dataset:
         """What a planner may look at when it is built."""
         return TrainingData(self.labels_2hz, self.label_vocabulary)
 
-    def labels_2hz(self) -> NDArray[np.float32]:
+    def labels_2hz(self) -> F32:
         """(n, 8, 3) label poses at 0.5 .. 4.0 s of all samples, read from the files."""
         labels = np.empty((len(self), 8, 3), np.float32)
         for number in np.unique(self.rows.file):
@@ -205,7 +204,7 @@ def _rows_of(file: SampleFile, number: int) -> Rows:
     def text(name: str) -> NDArray[np.str_]:
         return np.array(pc.fill_null(table[name], "").to_pylist(), dtype=np.str_)
 
-    def number_or_nan(name: str) -> NDArray[np.float64]:
+    def number_or_nan(name: str) -> Array:
         return pc.fill_null(table[name], float("nan")).to_numpy()
 
     end = table["candidate_end"].combine_chunks()
@@ -230,19 +229,19 @@ def _rows_of(file: SampleFile, number: int) -> Rows:
     )
 
 
-def _flat(lists: pa.ListArray | pa.ChunkedArray) -> NDArray[np.float64]:
+def _flat(lists: pa.ListArray | pa.ChunkedArray) -> Array:
     arrays = lists.chunks if isinstance(lists, pa.ChunkedArray) else [lists]
     return np.concatenate([np.zeros(0), *(array.flatten().to_numpy() for array in arrays)])
 
 
-def _kept(settings: DataSettings, rows: Rows) -> Index:
+def _kept(settings: DataSettings, rows: Rows) -> Ints:
     """Places of the rows that the filters leave. Raises ValueError naming the filter that leaves too few."""
     sim = rows.simulated
     if unknown := sorted(set(settings.experts) - set(rows.expert[sim].tolist())):
         have = sorted(set(rows.expert[sim].tolist()))
         raise ValueError(f"data.experts: no simulated samples of {', '.join(unknown)}; there are those of {have}")
     kept = np.ones(len(rows), bool)
-    filters: Mapping[str, Mask | None] = {
+    filters: Mapping[str, Bools | None] = {
         "max_round": None if settings.max_round is None else rows.round <= settings.max_round,
         "experts": np.isin(rows.expert, settings.experts) if settings.experts else None,
         "psnr_min": None if settings.psnr_min is None else rows.psnr >= settings.psnr_min,  # NaN: no
@@ -266,7 +265,7 @@ def _kept(settings: DataSettings, rows: Rows) -> Index:
     return np.flatnonzero(kept)
 
 
-def _of_kept_clips(settings: DataSettings, rows: Rows) -> Mask:
+def _of_kept_clips(settings: DataSettings, rows: Rows) -> Bools:
     """Whether a row's clip is among the share of the real clips. Raises ValueError where there are none."""
     clips = sorted(set(rows.clip_id[~rows.simulated].tolist()))
     if not clips:

@@ -17,13 +17,13 @@ from hashlib import sha256
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from planners.data.batch import Batch, Needs
 from planners.data.decode import BatchBuffer, count_labels
 from planners.data.feed import Dataset, make_feed, mixed_samples
 from planners.data.mix import EpochOrder, MixSettings, Side, make_order
 from planners.data.windows import Inline, Memory, Place, Window
+from tasks.world.arrays import Ints
 
 STATE_VERSION = 1
 READERS = 4
@@ -183,12 +183,10 @@ class Loader:
             for executor in (decoders, readers):
                 executor.shutdown(wait=True, cancel_futures=True)
 
-    def _ready(self, order: EpochOrder, windows: NDArray[np.int64]) -> bool:
+    def _ready(self, order: EpochOrder, windows: Ints) -> bool:
         return all(self._memory.ready(order.keys[window]) for window in np.unique(windows))
 
-    def _started(
-        self, order: EpochOrder, samples: NDArray[np.int64], windows: NDArray[np.int64], decoders: Executor
-    ) -> "_Pending":
+    def _started(self, order: EpochOrder, samples: Ints, windows: Ints, decoders: Executor) -> "_Pending":
         by_window = {window: self._memory.rows(order.keys[window]) for window in np.unique(windows).tolist()}
         rows = [by_window[window][sample] for sample, window in zip(samples.tolist(), windows.tolist())]
         n_labels = count_labels(*rows[0]) if self._needs.labels is not None else 0
@@ -202,7 +200,7 @@ class _Pending:
     def __init__(
         self,
         loader: Loader,
-        samples: NDArray[np.int64],
+        samples: Ints,
         rows: Sequence[Place],
         buffer: BatchBuffer,
         decoders: Executor,
@@ -238,7 +236,7 @@ def _kept_pictures(sides: Sequence[Side], needs: Needs, mix: MixSettings) -> int
     return pictures if samples + pictures <= mix.shuffle_mb * 2**20 else 0
 
 
-def _windows(order: EpochOrder, rows: NDArray[np.int64], windows: NDArray[np.int64], first: int) -> list[Window]:
+def _windows(order: EpochOrder, rows: Ints, windows: Ints, first: int) -> list[Window]:
     """What is wanted of the windows from batch `first` on, in the order in which it is."""
     found = []
     batches = np.broadcast_to(np.arange(len(rows))[:, None], rows.shape)[first:]

@@ -18,8 +18,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-Ints = NDArray[np.int64]
-Floats = NDArray[np.float64]
+from tasks.world.arrays import Array, Bools, Ints, ShortInts
+
 WindowKey = tuple[int, int, int]  # side, pass, window
 
 
@@ -34,7 +34,7 @@ class Bins:
         if len(self.weights) != len(self.edges) + 1 or list(self.edges) != sorted(set(self.edges)):
             raise ValueError(f"edges {self.edges} must rise and have one less than weights {self.weights}")
 
-    def of(self, values: Floats) -> Floats:
+    def of(self, values: Array) -> Array:
         """(n,) weight of each value."""
         return np.asarray(self.weights, np.float64)[np.searchsorted(self.edges, values, side="right")]
 
@@ -88,10 +88,10 @@ class MixSettings:
 class Samples:
     """What the order depends on, of n samples in the order of their ids."""
 
-    simulated: NDArray[np.bool_]  # (n,)
+    simulated: Bools  # (n,)
     group: Ints  # (n,) row group it stands in
     size: Ints  # (n,) bytes in memory
-    weight: Floats  # (n,) not yet normalised
+    weight: Array  # (n,) not yet normalised
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +102,7 @@ class Side:
     rows: Ints  # (m,) places in Samples, rising
     group: Ints  # (m,)
     size: Ints  # (m,)
-    weight: Floats  # (m,) of mean 1 among the real and among the simulated
+    weight: Array  # (m,) of mean 1 among the real and among the simulated
     window_bytes: float
 
     def __len__(self) -> int:
@@ -187,7 +187,7 @@ class Order:
         return np.concatenate(rows), np.concatenate(windows), keys
 
 
-def check_sides(mix: MixSettings, simulated: NDArray[np.bool_]) -> None:
+def check_sides(mix: MixSettings, simulated: Bools) -> None:
     """Raises ValueError where there are none of the samples that a ratio takes."""
     if mix.sim_ratio == "natural":
         return
@@ -256,7 +256,7 @@ def _windows(side: Side, rng: np.random.Generator) -> Ints:
     return window_of[of]
 
 
-def systematic(weight: Floats, rng: np.random.Generator) -> Ints:
+def systematic(weight: Array, rng: np.random.Generator) -> Ints:
     """(m,) visits, floor(w) or ceil(w) and w on average, whose sum is m = sum(weight) always."""
     if (weight == 1.0).all():
         return np.ones(len(weight), np.int64)
@@ -276,12 +276,12 @@ def stream(seed: int, *words: object) -> np.random.Generator:
 
 def sample_weights(
     weights: Weights,
-    simulated: NDArray[np.bool_],
-    round_: NDArray[np.int32],
+    simulated: Bools,
+    round_: ShortInts,
     expert: Sequence[str] | NDArray[np.str_],
-    perturbation_m: Floats,
-    reward: Floats,
-) -> Floats:
+    perturbation_m: Array,
+    reward: Array,
+) -> Array:
     """(n,) products of the weights.
 
     Args:

@@ -17,9 +17,9 @@ import pyarrow as pa
 from planners.data.decode import StoredRows
 from planners.data.feed import Feed
 from planners.data.files import leaves
-from planners.data.index import Index
 from planners.data.local_copy import copies_of
 from planners.data.mix import WindowKey
+from tasks.world.arrays import Ints
 
 AHEAD = 2  # windows of a side that are in memory, the one in use among them
 
@@ -31,7 +31,7 @@ class Window:
     """What is wanted of one window."""
 
     key: WindowKey
-    samples: Index  # places in the data set, rising
+    samples: Ints  # places in the data set, rising
     last: int  # batch after which it can go
 
 
@@ -69,7 +69,7 @@ class _Reading:
 class Memory:
     """The rows of windows that are in use or about to be, and of sides that stay."""
 
-    def __init__(self, feed: Feed, staying: Mapping[int, Index]) -> None:
+    def __init__(self, feed: Feed, staying: Mapping[int, Ints]) -> None:
         """staying: side -> its samples, for those that fit into one window."""
         self._feed, self._staying = feed, staying
         self.copies = copies_of(feed)
@@ -119,12 +119,12 @@ class Memory:
                 waiting.append(window)
         self._to_come = waiting
 
-    def _submit(self, samples: Index, last: int) -> _Reading:
+    def _submit(self, samples: Ints, last: int) -> _Reading:
         files = self._feed.dataset.rows.file[samples]
         tasks = [self._executor.submit(self._load, int(n), samples[files == n]) for n in np.unique(files)]
         return _Reading(tasks, last)
 
-    def _load(self, number: int, samples: Index) -> dict[int, Place]:
+    def _load(self, number: int, samples: Ints) -> dict[int, Place]:
         """Rows of one file."""
         file = self._feed.dataset.files[number]
         groups = self._feed.dataset.rows.group[samples]
@@ -140,7 +140,7 @@ class Memory:
             raise OSError(f"{file.table}: {file.path}: {error}") from error
         return found
 
-    def _reader(self, number: int, groups: Index) -> Callable[[int], pa.Table]:
+    def _reader(self, number: int, groups: Ints) -> Callable[[int], pa.Table]:
         """Row group -> its rows, from the file's copy where there is to be one."""
         if number in self.copies:
             return self.copies[number].open().read_row_group
@@ -149,7 +149,7 @@ class Memory:
         paths = leaves(parquet, self._feed.columns)
         return lambda group: parquet.read_row_group(group, columns=paths, use_threads=False)
 
-    def _rows(self, table: pa.Table, samples: Index, mapped: bool) -> dict[int, Place]:
+    def _rows(self, table: pa.Table, samples: Ints, mapped: bool) -> dict[int, Place]:
         """Those of a row group that are wanted. Of one that is mapped nothing needs to be cut: it takes no memory."""
         places = self._feed.dataset.rows.place[samples]
         if len(samples) < table.num_rows and not mapped:

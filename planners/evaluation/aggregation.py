@@ -6,14 +6,12 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.score_rows import FrameRow
 from tasks.reward.one_stage import COLUMNS, FrameScores, means_of
 from tasks.reward.two_stage import Group, TwoStageScores, aggregate, is_uniform
-
-Array = NDArray[np.float64]
+from tasks.world.arrays import Array
 
 HumanFilter = Literal["unfiltered", "filtered"]
 # Every score that tables hold: stage, human filter. No human drove from a follow-up frame, so nothing filters there.

@@ -19,7 +19,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from factory.config.arguments import parse
 from planners.command import command
@@ -27,9 +26,7 @@ from planners.evaluation.frames import FOLLOW_UP_KINDS, LOGGED_KINDS
 from planners.evaluation.score_rows import FrameRow, read_rows
 from planners.evaluation.tags import TAGS
 from tasks.reward.one_stage import COLUMNS
-
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
+from tasks.world.arrays import Array, Image
 
 EDGES = np.linspace(0.0, 1.0, 11)
 REAL, SIMULATED = (90, 130, 170), (224, 122, 32)  # RGB

@@ -11,9 +11,8 @@ from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from tasks.world.arrays import Array, Indices
 
 DRAWS_AT_ONCE = 256  # bounds memory
 
@@ -70,7 +69,7 @@ def paired_interval(
     return Interval(mean_a, mean_b, mean_b - mean_a, float(low), float(high))
 
 
-def _indices(clusters: Sequence[Hashable], n_clips: int) -> tuple[NDArray[np.intp], int]:
+def _indices(clusters: Sequence[Hashable], n_clips: int) -> tuple[Indices, int]:
     """The cluster of each clip as a number, in the order in which they first come, and how many there are."""
     if len(clusters) != n_clips:
         raise ValueError(f"clusters must name one for each of {n_clips} clips, got {len(clusters)}")

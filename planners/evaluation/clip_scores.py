@@ -11,13 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from planners.evaluation.aggregation import MEASURES, ClipResult, columns_at
 from planners.evaluation.scores import write_csv
 from tasks.reward.one_stage import COLUMNS
-
-Array = NDArray[np.float64]
+from tasks.world.arrays import Array
 
 FACTS = ("stage", "human_filter", "log", "clip", "frames")  # frames: what the clip counts in a mean
 

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from factory.config.compose import ConfigError
 from planners.data.batch import Batch, Needs
@@ -23,8 +22,8 @@ from planners.evaluation.scoring import Plans
 from planners.evaluation.shown import as_shown, batch_of, columns_shown
 from planners.training.progress import Counter
 from tasks.trajectories import at_ten_hz
+from tasks.world.arrays import Array
 
-Array = NDArray[np.float64]
 Samples = Sequence[Mapping[str, Any]]
 
 PLANS = "plans.npz"  # kept, so that scoring may begin again without planning

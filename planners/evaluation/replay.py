@@ -11,7 +11,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from factory.config.compose import ConfigError, fill
 from factory.store.reader import Sample
@@ -30,12 +29,10 @@ from planners.evaluation.scoring import PreparedClip, PreparedPair, Rules, prepa
 from tasks.experts.pdm_closed.planner import PdmSettings
 from tasks.reward.one_stage import COLUMNS, FrameScores
 from tasks.rollout.simulate import TrafficSettings, roll_out
+from tasks.world.arrays import Array, Image
 from tasks.world.clip import HISTORY_STEPS, HORIZON_STEPS, STEP_S, Rollout
 from tasks.world.frames import to_world
 from tasks.world.vehicle import HEADING
-
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 BEV_PX, CAMERA_PX = (560, 560), (720, 405)  # width, height
 PAPER, INK = (246, 246, 243), (30, 30, 30)

@@ -9,12 +9,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
 from planners.evaluation.frames import FrameKey
 from tasks.reward.one_stage import COLUMNS, FrameScores
+from tasks.world.arrays import Array
 
-Array = NDArray[np.float64]
 Stage = Literal["one_stage", "stage_one", "stage_two"]
 STAGES: tuple[Stage, ...] = get_args(Stage)
 FILTERED = "_filtered"  # suffix of a column with the filter

@@ -6,12 +6,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from planners.evaluation.aggregation import SummaryLine
 from tasks.reward.one_stage import COLUMNS
-
-Image = NDArray[np.uint8]
+from tasks.world.arrays import Image
 
 HEAD = ("planner", "stage", "human_filter", *COLUMNS, "clips", "frames", "uniform_share", "uniform_share_before")
 ROW_PX, NAME_PX, CELL_PX, MARGIN_PX = 24, 8, 62, 12  # NAME_PX: a letter's width

@@ -10,7 +10,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from planners.evaluation.frames import ClipScenes, FrameKey, FramePair
 from planners.evaluation.score_rows import FrameRow, Stage
@@ -23,11 +22,10 @@ from tasks.reward.two_stage import follow_up_weights
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficScene, TrafficSettings, prepare_traffic, roll_out
 from tasks.trajectories import at_ten_hz
+from tasks.world.arrays import Array
 from tasks.world.clip import HORIZON_STEPS, Scene
 from tasks.world.frames import to_local, to_world
 from tasks.world.vehicle import HEADING
-
-Array = NDArray[np.float64]
 
 INTERVAL_S = 0.5  # between the two frames of a pair
 COARSE_STEP = 5  # planners answer at 2 Hz: the human is judged by as much of his drive

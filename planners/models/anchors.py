@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.floating[Any]]
+from tasks.world.arrays import FloatArray
+
 WAYPOINTS = 8  # 0.5 .. 4.0 s
 
 
@@ -21,7 +22,7 @@ def read_array(path: str, setting: str) -> NDArray[Any]:
     return loaded
 
 
-def checked_anchors(values: NDArray[Any], source: str) -> Floats:
+def checked_anchors(values: NDArray[Any], source: str) -> FloatArray:
     """`values` as float64 (A, 8, 2). Raises ValueError naming `source`."""
     if values.ndim != 3 or values.shape[1:] != (WAYPOINTS, 2) or len(values) == 0:
         raise ValueError(f"{source}: anchors have shape {values.shape}, expected (A >= 1, {WAYPOINTS}, 2)")
@@ -30,7 +31,7 @@ def checked_anchors(values: NDArray[Any], source: str) -> Floats:
     return values.astype(np.float64)
 
 
-def cluster_anchors(plans: Floats, count: int, seed: int, iterations: int = 100) -> Floats:
+def cluster_anchors(plans: FloatArray, count: int, seed: int, iterations: int = 100) -> FloatArray:
     """Means (count, 8, 2) of k-means over the positions of plans (n, 8, >= 2), from a k-means++ start.
 
     Equal arguments give equal results. Raises ValueError where there are fewer distinct plans than anchors.
@@ -57,6 +58,6 @@ def cluster_anchors(plans: Floats, count: int, seed: int, iterations: int = 100)
     return centers.reshape(count, WAYPOINTS, 2)
 
 
-def _squared(points: Floats, centers: Floats) -> Floats:
+def _squared(points: FloatArray, centers: FloatArray) -> FloatArray:
     """Squared distances (n, k)."""
     return np.stack([((points - center) ** 2).sum(axis=1) for center in centers], axis=1)

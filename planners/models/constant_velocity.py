@@ -7,8 +7,9 @@ from typing import ClassVar
 from torch import Tensor
 
 from planners.data.batch import Batch, Needs
-from planners.models.planner import FloatArray, Planner
+from planners.models.planner import Planner
 from planners.models.regression import straight_on
+from tasks.world.arrays import FloatArray
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,10 @@ from torch import Tensor, nn
 
 from planners.data.batch import Batch, BevLayout, ImageLayout, Needs
 from planners.models.auxiliary import AgentHead, BevHead, agent_losses, bev_loss
-from planners.models.planner import FloatArray, Planner, evaluating
+from planners.models.planner import Planner, evaluating
 from planners.models.regression import PlanFrom, bounded_heading, imitation_l1, planned_from
 from planners.models.transfuser import FusionSettings, LatentFusion
+from tasks.world.arrays import FloatArray
 
 
 @dataclass(frozen=True)

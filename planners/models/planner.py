@@ -19,7 +19,8 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from planners.data.batch import Batch, FloatArray, Needs, TrainingData
+from planners.data.batch import Batch, Needs, TrainingData
+from tasks.world.arrays import FloatArray
 
 
 class Planner(nn.Module, ABC):

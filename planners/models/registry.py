@@ -8,7 +8,8 @@ from typing import Any
 from factory.config.compose import ConfigError, fill
 from factory.config.plugins import installed, names
 from factory.config.words import nearest
-from planners.models.planner import FloatArray, Planner
+from planners.models.planner import Planner
+from tasks.world.arrays import FloatArray
 
 BUILT_IN = {
     "constant_velocity": "planners.models.constant_velocity:ConstantVelocity",

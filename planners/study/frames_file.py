@@ -24,7 +24,6 @@ from planners.evaluation.score_rows import FrameRow, read_rows
 from planners.study.setups import Comparison, Setup
 from tasks.reward.one_stage import COLUMNS, FrameScores
 
-Array = NDArray[np.float64]
 Clips = Mapping[str, Sequence[ClipResult]]  # by label
 
 FRAMES = "frames.parquet"

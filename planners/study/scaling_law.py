@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from tasks.world.arrays import Array
+
 FEWEST = 4  # points: three parameters and one degree of freedom for the residuals
 
 

@@ -25,8 +25,9 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from factory.config.compose import ConfigError
-from planners.models.planner import FloatArray, Planner
+from planners.models.planner import Planner
 from planners.models.registry import PlannerChoice, build_planner, planner_class
+from tasks.world.arrays import FloatArray
 
 FOLDER = "checkpoints"
 RECORD, WEIGHTS, ARRAYS, TRAINING = "record.json", "weights.safetensors", "arrays.npz", "training.pt"

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.stages import Rejected
+from tasks.world.arrays import Array
 from tasks.world.clip import Scene
 
 
@@ -14,7 +14,7 @@ from tasks.world.clip import Scene
 class Plan:
     """What an expert wants to drive."""
 
-    poses: NDArray[np.float64]  # (40, 3) world frame x, y, heading, at 0.1 .. 4.0 s after the scene's step
+    poses: Array  # (40, 3) world frame x, y, heading, at 0.1 .. 4.0 s after the scene's step
 
 
 class Expert(Protocol):

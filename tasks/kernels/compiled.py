@@ -190,7 +190,7 @@ def write_whole(path: Path, data: bytes) -> None:
 def not_kept(error: OSError) -> str:
     """What to say where the cache folder cannot be written."""
     why = error.strerror or str(error)
-    return f"compiled kernels cannot be kept in {cache_dir()} ({why}): name a folder with room in NUMBA_CACHE_DIR"
+    return f"compiled kernels cannot be kept in {cache_dir()} ({why}): name a folder with free space in NUMBA_CACHE_DIR"
 
 
 def _compiled(function: F, **options: Any) -> F:

@@ -105,7 +105,7 @@ def load(typing_context: Any, array: Any, at: Any) -> Any:
 
 @intrinsic
 def store(typing_context: Any, array: Any, at: Any, value: Any) -> Any:
-    """The way back from `load`."""
+    """The inverse of `load`."""
 
     def build(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
         builder.store(arguments[2], _pointer(context, builder, sig.args[0], *arguments[:2]), align=4)

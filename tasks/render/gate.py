@@ -11,7 +11,6 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
 from tasks.render.likeness import Album, expected, eye_in_box, large_vehicles
@@ -19,10 +18,11 @@ from tasks.render.scene.asset import RenderAsset, scene_at
 from tasks.render.scene.engine import Backend, Vehicles, render, vehicles_at
 from tasks.render.scene.movers import world_from_boxes
 from tasks.render.scene.sky import directions
-from tasks.render.splatting.gaussians import F32, F64, Gaussians, rotations_of
+from tasks.render.splatting.gaussians import Gaussians, rotations_of
 from tasks.render.splatting.raster import View
 from tasks.stages import Rejected
 from tasks.world.agents import AgentTracks
+from tasks.world.arrays import F32, Array, Bools
 from tasks.world.camera import Camera, Pinhole
 from tasks.world.clip import STEP_S
 
@@ -80,7 +80,7 @@ class Measures:
 def unfit(
     asset: RenderAsset,
     cameras: Sequence[Camera],
-    world_from_ego: F64,
+    world_from_ego: Array,
     agents: AgentTracks,
     steps: Sequence[int],
     size: tuple[int, int],
@@ -145,7 +145,7 @@ def fault_of(found: Measures, settings: GateSettings) -> tuple[str, str] | None:
     return None
 
 
-def composed(asset: RenderAsset, there: Vehicles, place: F64, reach_m: float) -> RenderAsset:
+def composed(asset: RenderAsset, there: Vehicles, place: Array, reach_m: float) -> RenderAsset:
     """The scene with who is there as its background, without what is farther than reach_m from a place (3,) in the
     world, seen from above."""
     east, north = (asset.background.means[:, k] - np.float32(place[k] - asset.origin[k]) for k in (0, 1))
@@ -159,7 +159,7 @@ def measures(
     scene: RenderAsset,
     eyes: Sequence[Pinhole],
     views: Sequence[View],
-    world_from_ego: F64,
+    world_from_ego: Array,
     settings: GateSettings,
     backend: Backend = Backend.CPU,
 ) -> list[Measures]:
@@ -174,7 +174,7 @@ def measures(
     return out
 
 
-def measured(seen: View, road: NDArray[np.bool_], lens: F32 | None = None) -> Measures:
+def measured(seen: View, road: Bools, lens: F32 | None = None) -> Measures:
     """Of one picture; `road` (H, W) pixels that are not to show sky, `lens` (H, W) alpha of what is on the lens."""
     grey = np.clip(seen.rgb, 0.0, 1.0) @ GREY
     contrast = float(grey.std())
@@ -187,7 +187,7 @@ def measured(seen: View, road: NDArray[np.bool_], lens: F32 | None = None) -> Me
     )
 
 
-def meets_road(rays: F64, eye: F64, world_from_ego: F64, road_m: float) -> NDArray[np.bool_]:
+def meets_road(rays: Array, eye: Array, world_from_ego: Array, road_m: float) -> Bools:
     """Which rays (H, W, 3) from `eye` (3,) meet the plane of the ego frame's x and y nearer than road_m [m].
 
     Where that frame lies at the axle the plane is a wheel's radius above the road: a few rays less are asked for.
@@ -199,11 +199,11 @@ def meets_road(rays: F64, eye: F64, world_from_ego: F64, road_m: float) -> NDArr
     return np.asarray((rise < 0.0) & (height * length < -rise * road_m))
 
 
-def _on_the_lens(scene: Gaussians, eye: F64, lens_m: float) -> Gaussians:
+def _on_the_lens(scene: Gaussians, eye: Array, lens_m: float) -> Gaussians:
     """What is nearer to `eye` than lens_m or has it inside, magnified around it.
 
     That gives the same picture but moves nothing in front of the near plane: a wall nearer than that is not drawn, and
-    the picture would show the room behind it.
+    the picture would show what is behind it.
     """
     x, y, z = (scene.means[:, k] - np.float32(eye[k]) for k in range(3))
     widest = np.exp(np.maximum(np.maximum(*scene.log_scales.T[:2]), scene.log_scales[:, 2]))
@@ -216,7 +216,7 @@ def _on_the_lens(scene: Gaussians, eye: F64, lens_m: float) -> Gaussians:
     return replace(close, means=means, log_scales=close.log_scales + np.float32(math.log(MAGNIFIED)))
 
 
-def _tracks_around(eye: F64, there: Vehicles) -> list[str]:
+def _tracks_around(eye: Array, there: Vehicles) -> list[str]:
     """Tracks whose box has the eye (3,) inside."""
     local = np.einsum("nij,ni->nj", world_from_boxes(there.boxes)[:, :3, :3], eye - there.boxes[:, :3])
     inside = (np.abs(local) < there.boxes[:, 4:7] / 2.0).all(axis=1)

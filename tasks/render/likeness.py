@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.engine import Backend, Vehicles, render, vehicles_at
@@ -19,9 +18,9 @@ from tasks.render.scene.movers import BEYOND_M, behind_boxes, boxes_at, world_fr
 from tasks.render.scene.sensed import Photo
 from tasks.render.scene.sky import directions
 from tasks.render.scene.stereo import FAR_M
-from tasks.render.splatting.gaussians import F32, F64
 from tasks.render.splatting.raster import View
 from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.arrays import F32, Array, Bools, Ints
 from tasks.world.camera import Camera, Pinhole, SensorFile
 
 FADING = 0.2  # likeness falls by exp(-0.2) where the eye moves by as much as it was away from the vehicle
@@ -38,10 +37,10 @@ POINTS = 0.9 * np.stack(np.meshgrid(*3 * [(-0.5, 0.0, 0.5)], indexing="ij"), axi
 class Sightings:
     """The photos that show one track, and from where."""
 
-    photos: NDArray[np.int64]  # (M,) rows of the block's photos
-    eyes: F64  # (M, 3) of the cameras, in the track's box then: centre, x along the heading [m]
+    photos: Ints  # (M,) rows of the block's photos
+    eyes: Array  # (M, 3) of the cameras, in the track's box then: centre, x along the heading [m]
 
-    def nearest(self, eye: F64) -> tuple[int, float]:
+    def nearest(self, eye: Array) -> tuple[int, float]:
         """The photo taken from nearest to `eye` (3,) in box coordinates, and how far from it, as a share of the eye's
         distance from the centre."""
         away = np.linalg.norm(self.eyes - eye, axis=1)
@@ -60,7 +59,7 @@ class Album:
 def sightings(files: Sequence[SensorFile], cameras: Sequence[Camera], agents: AgentTracks) -> dict[str, Sightings]:
     """Which of a block's photos show which vehicle; `agents` are the block's, with the files' times."""
     rig = {camera.name: camera for camera in cameras}
-    found: dict[str, list[tuple[int, F64]]] = {}
+    found: dict[str, list[tuple[int, Array]]] = {}
     for row, file in enumerate(files):
         if file.sensor not in rig:
             continue
@@ -81,12 +80,12 @@ def sightings(files: Sequence[SensorFile], cameras: Sequence[Camera], agents: Ag
     }
 
 
-def eye_in_box(eye: F64, box: F64) -> F64:
+def eye_in_box(eye: Array, box: Array) -> Array:
     """A place (3,) in the coordinates of a box (7,): from its centre, x along its heading."""
     return np.asarray((eye - box[:3]) @ world_from_boxes(box[None])[0, :3, :3])
 
 
-def expected(album: Album, track_id: str, eye: F64) -> float:
+def expected(album: Album, track_id: str, eye: Array) -> float:
     """The likeness, 0 to 1, that a track can be expected to have from `eye` (3,) in its box; 0 where no photo shows
     it."""
     seen = album.sightings.get(track_id)
@@ -107,9 +106,9 @@ def large_vehicles(there: Vehicles, eye: Pinhole, view: View, share: float) -> I
     nearest = depth.min(axis=1, initial=np.inf)
     with np.errstate(invalid="ignore"):
         wide = np.clip(u, 0.0, eye.width), np.clip(v, 0.0, eye.height)
-        room = np.ptp(wide[0], axis=1) * np.ptp(wide[1], axis=1) if len(grown) else np.zeros(0)
+        area = np.ptp(wide[0], axis=1) * np.ptp(wide[1], axis=1) if len(grown) else np.zeros(0)
     possible = vehicles & (depth.max(axis=1, initial=-np.inf) > 0.0)
-    possible &= (nearest <= 0.0) | (room >= share * eye.width * eye.height)
+    possible &= (nearest <= 0.0) | (area >= share * eye.width * eye.height)
     rays = None
     free = np.ones((eye.height, eye.width), bool)
     for j in sorted(np.flatnonzero(possible), key=lambda j: nearest[j]):
@@ -123,7 +122,7 @@ def large_vehicles(there: Vehicles, eye: Pinhole, view: View, share: float) -> I
             yield int(j), covered
 
 
-def outline_of(box: F64, eye: Pinhole, rays: F64 | None = None) -> NDArray[np.bool_]:
+def outline_of(box: Array, eye: Pinhole, rays: Array | None = None) -> Bools:
     """(H, W) the pixels that look at a box (7,) in the world; `rays` (H * W, 3) where they are known."""
     if rays is None:
         rays = directions(eye.intrinsics, eye.world_from_camera, eye.width, eye.height).reshape(-1, 3)
@@ -151,7 +150,7 @@ def likeness_to_photo(
     return out
 
 
-def inside_mean(similar: F32, inside: NDArray[np.bool_]) -> float:
+def inside_mean(similar: F32, inside: Bools) -> float:
     """Mean of a similarity map over the pixels inside, from 0 to 1; 0 where there are none."""
     return max(0.0, float(similar[inside].mean())) if inside.any() else 0.0
 
@@ -183,7 +182,7 @@ def _exposed(asset: RenderAsset, photo: Photo, rgb: F32) -> F32:
     return np.asarray(np.clip(rgb @ affine[:, :3].T + affine[:, 3], 0.0, 1.0), np.float32)
 
 
-def _projected(boxes: F64, points: F64, intrinsics: F64, world_from_camera: F64) -> tuple[F64, F64, F64]:
+def _projected(boxes: Array, points: Array, intrinsics: Array, world_from_camera: Array) -> tuple[Array, Array, Array]:
     """Pixels u, v and depths (N, P) of points (P, 3) of boxes (N, 7), in shares of their sizes; u, v mean nothing where
     the depth is not positive."""
     local = points * boxes[:, None, 4:7]

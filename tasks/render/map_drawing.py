@@ -10,10 +10,9 @@ from itertools import pairwise
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from tasks.render.splatting.gaussians import F64
 from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.arrays import Array, Bytes
 from tasks.world.camera import Camera
 from tasks.world.frames import box_corners
 from tasks.world.lanes import RoadMap
@@ -33,12 +32,12 @@ OTHER_BOX = (150, 110, 150)
 def draw_map_views(
     road_map: RoadMap,
     cameras: Sequence[Camera],
-    world_from_ego: F64,
+    world_from_ego: Array,
     agents: AgentTracks,
     steps: Sequence[int],
     width: int,
     height: int,
-) -> NDArray[np.uint8]:
+) -> Bytes:
     """Images (F, C, height, width, 3) rgb; arguments as `tasks.render.views.render_views`."""
     out = np.empty((len(steps), len(cameras), height, width, 3), np.uint8)
     for f, step in enumerate(steps):
@@ -52,7 +51,7 @@ def draw_map_views(
     return out
 
 
-def ground_height(road_map: RoadMap, world_from_ego: F64) -> float:
+def ground_height(road_map: RoadMap, world_from_ego: Array) -> float:
     """Height [m] of the road over the ego's origin, along the ego's up axis: Argoverse 2 counts from the rear axle.
 
     Median over the lane boundaries within NEAR_GROUND_M; 0 where none has heights (all z are the same 0) or none is
@@ -67,10 +66,10 @@ def ground_height(road_map: RoadMap, world_from_ego: F64) -> float:
     return float(np.median(offsets[near] @ world_from_ego[:3, 2])) if near.any() else 0.0
 
 
-Shape = tuple[F64, tuple[int, int, int]]  # polygon (M, 3) in the ego frame, colour
+Shape = tuple[Array, tuple[int, int, int]]  # polygon (M, 3) in the ego frame, colour
 
 
-def _ground_shapes(road_map: RoadMap, pose: F64) -> list[Shape]:
+def _ground_shapes(road_map: RoadMap, pose: Array) -> list[Shape]:
     """Everything painted on the ground, bottom first."""
     shapes: list[Shape] = []
     for area in road_map.drivable_areas:
@@ -90,11 +89,11 @@ def _ground_shapes(road_map: RoadMap, pose: F64) -> list[Shape]:
     return shapes
 
 
-def _near(points: F64, pose: F64) -> bool:
+def _near(points: Array, pose: Array) -> bool:
     return bool((np.linalg.norm(points[:, :2] - pose[:2, 3], axis=1) < VISIBLE_M).any())
 
 
-def _on_ground(points: F64, pose: F64) -> F64:
+def _on_ground(points: Array, pose: Array) -> Array:
     """World points (M, 2) on the ego's own ground plane, ego frame (M, 3)."""
     up = pose[:3, 2]
     offset = points[:, :2] - pose[:2, 3]
@@ -102,7 +101,7 @@ def _on_ground(points: F64, pose: F64) -> F64:
     return np.asarray(np.column_stack([offset, rise]) @ pose[:3, :3])
 
 
-def _paint(line: F64, dashed: bool) -> list[F64]:
+def _paint(line: Array, dashed: bool) -> list[Array]:
     """Quads (4, 3) along a polyline (M, 3); dashes of 3 m every 9 m."""
     pieces = []
     travelled = 0.0
@@ -128,7 +127,7 @@ def _paint(line: F64, dashed: bool) -> list[F64]:
     return pieces
 
 
-def _box_faces(agents: AgentTracks, step: int, pose: F64) -> list[Shape]:
+def _box_faces(agents: AgentTracks, step: int, pose: Array) -> list[Shape]:
     """Shaded faces of the boxes that are there, ego frame."""
     faces: list[Shape] = []
     valid = agents.valid[step]
@@ -147,10 +146,10 @@ def _box_faces(agents: AgentTracks, step: int, pose: F64) -> list[Shape]:
     return faces
 
 
-def _draw(ground: list[Shape], faces: list[Shape], camera: Camera) -> NDArray[np.uint8]:
+def _draw(ground: list[Shape], faces: list[Shape], camera: Camera) -> Bytes:
     image = np.empty((camera.height, camera.width, 3), np.uint8)
     image[:] = SKY
-    camera_from_ego: F64 = np.linalg.inv(camera.ego_from_camera).astype(np.float64)
+    camera_from_ego: Array = np.linalg.inv(camera.ego_from_camera).astype(np.float64)
     far = 2000.0
     plane = np.array([[far, far, 0.0], [-far, far, 0.0], [-far, -far, 0.0], [far, -far, 0.0]])
     for polygon, colour in [(plane, GROUND), *ground]:
@@ -161,9 +160,7 @@ def _draw(ground: list[Shape], faces: list[Shape], camera: Camera) -> NDArray[np
     return image
 
 
-def _fill(
-    image: NDArray[np.uint8], polygon: F64, colour: tuple[int, int, int], camera: Camera, camera_from_ego: F64
-) -> None:
+def _fill(image: Bytes, polygon: Array, colour: tuple[int, int, int], camera: Camera, camera_from_ego: Array) -> None:
     seen = clip_near(polygon @ camera_from_ego[:3, :3].T + camera_from_ego[:3, 3])
     if len(seen) < 3:
         return
@@ -176,7 +173,7 @@ def _fill(
     cv2.fillPoly(image, [points], colour, lineType=cv2.LINE_AA, shift=SHIFT)
 
 
-def clip_near(polygon: F64) -> F64:
+def clip_near(polygon: Array) -> Array:
     """The part of a polygon (M, 3), camera frame, beyond the near plane (Sutherland and Hodgman 1974)."""
     z = polygon[:, 2]
     if (z >= NEAR_M).all():

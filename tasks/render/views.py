@@ -4,12 +4,11 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.engine import Backend, render, vehicles_at
-from tasks.render.splatting.gaussians import F64
 from tasks.world.agents import AgentTracks
+from tasks.world.arrays import Array, Bytes
 from tasks.world.camera import Camera, Pinhole
 from tasks.world.clip import STEP_S
 from tasks.world.vehicle import HEADING, X, Y
@@ -20,13 +19,13 @@ VISIBLE_M = 150.0  # agents further away are not drawn
 def render_views(
     asset: RenderAsset,
     cameras: Sequence[Camera],
-    world_from_ego: F64,
+    world_from_ego: Array,
     agents: AgentTracks,
     steps: Sequence[int],
     width: int,
     height: int,
     backend: Backend = Backend.CPU,
-) -> NDArray[np.uint8]:
+) -> Bytes:
     """Images (F, C, height, width, 3) rgb.
 
     `world_from_ego` (F, 4, 4) in 3-D (`pose_on_ground`), `steps` (F,) rows of `agents` at these instants. The images
@@ -43,7 +42,7 @@ def render_views(
     return out
 
 
-def undistorted(image: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
+def undistorted(image: Bytes, camera: Camera) -> Bytes:
     """The photo (H, W, 3) an ideal pinhole of the same intrinsics would have taken; outside of the photo: edge colours.
 
     Radial model of `Camera.distortion`: r' = r (1 + k1 r^2 + k2 r^4 + k3 r^6).
@@ -62,7 +61,7 @@ def undistorted(image: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
     return np.asarray(cv2.remap(image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
-def pose_on_ground(logged: F64, ego_states: F64) -> F64:
+def pose_on_ground(logged: Array, ego_states: Array) -> Array:
     """3-D poses (F, 4, 4) of planar ego states (F, 11), standing on the road as the log knows it.
 
     `logged` (S, 4, 4) world_from_ego: each state takes height, roll and pitch from the plane under the nearest logged

@@ -1,4 +1,4 @@
-"""Compiles every kernel of the render room, on the smallest scene that reaches all of them."""
+"""Compiles every kernel of the render package, on the smallest scene that reaches all of them."""
 
 import numpy as np
 

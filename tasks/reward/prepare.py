@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.reward.rules.boxes import ego_boxes, touching
 from tasks.reward.rules.centerline import Centerline, index_centerline
 from tasks.reward.rules.comfort import comfort_history
 from tasks.reward.rules.lights import RedLanes, index_red_lanes
@@ -16,6 +15,7 @@ from tasks.reward.rules.map_index import MapIndex, index_map
 from tasks.reward.rules.obstacles import Obstacles, index_obstacles, unindexed
 from tasks.world.agents import MOVING_KINDS, AgentTracks
 from tasks.world.bounds import LARGEST, all_within
+from tasks.world.boxes import ego_boxes, touching
 from tasks.world.clip import HORIZON_STEPS, Clip, Scene
 from tasks.world.lanes import LightState, MapLayer, MapPolygon
 from tasks.world.polygons import polygons_near

@@ -5,9 +5,9 @@ from numpy.typing import NDArray
 
 from tasks.reward.epdms import Scores, combined
 from tasks.reward.prepare import STOPPED_SPEED_MPS, liability, prepare_scene
-from tasks.reward.rules.boxes import ego_boxes, touching
 from tasks.reward.verdicts import Verdicts, checked_states, judge_among
 from tasks.rollout.simulate import Rollouts, TrafficSettings, prepare_traffic, roll_out_many
+from tasks.world.boxes import ego_boxes, touching
 from tasks.world.clip import HORIZON_STEPS, Scene
 from tasks.world.vehicle import PACIFICA
 

@@ -8,12 +8,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.kernels.compiled import inner_kernel
-from tasks.rollout.stretches import CELLS, PATH_SPACING_M, SLACK_M, Box, View, view_along
-
-Array = NDArray[np.float64]
+from tasks.rollout.stretches import CELLS, PATH_SPACING_M, SLACK_M, Box, CorridorAhead, view_along
+from tasks.world.arrays import Array, Bytes, Ints
+from tasks.world.geometry import to_line
 
 STEEPEST_FADE = 1.876  # no slope of the fade over a unit length is steeper (30 / 16)
 
@@ -26,9 +25,9 @@ class Paths(NamedTuple):
     height: Array  # (M, P) ground relative to anything constant [m]
     target_speed: Array  # (M, P) v0 [m/s]
     stretches: Array  # (M, S, 8) rectangles around them: stretches_of(xy, heading)
-    line_start: NDArray[np.int64]  # (M + 1,) lines of path m: line_start[m]..line_start[m + 1] - 1
+    line_start: Ints  # (M + 1,) lines of path m: line_start[m]..line_start[m + 1] - 1
     line_at: Array  # (Q,) path length of the line [m]
-    line_state: NDArray[np.uint8]  # (41, Q) OPEN, CLOSED_IF_STOPPABLE, CLOSED at every step of the rollout
+    line_state: Bytes  # (41, Q) OPEN, CLOSED_IF_STOPPABLE, CLOSED at every step of the rollout
 
 
 class Way(NamedTuple):
@@ -94,10 +93,7 @@ def project_on_path(paths: Paths, m: int, x: float, y: float) -> tuple[float, fl
             px, py = paths.xy[m, k, 0], paths.xy[m, k, 1]
             ex, ey = paths.xy[m, k + 1, 0] - px, paths.xy[m, k + 1, 1] - py
             dx, dy = x - px, y - py
-            f = (dx * ex + dy * ey) / (ex * ex + ey * ey)
-            f = min(max(f, 0.0), 1.0)
-            rx, ry = dx - f * ex, dy - f * ey
-            square = rx * rx + ry * ry
+            f, square = to_line(dx, dy, ex, ey, (dx * ex + dy * ey) / (ex * ex + ey * ey))
             if square < best:
                 best = square
                 best_s = (k + f) * PATH_SPACING_M
@@ -162,7 +158,7 @@ def _range_in_strip(box: Box, x: float, y: float, heading: float, half_width: fl
 
 
 @inner_kernel
-def look_ahead(paths: Paths, way: Way, blend_length: float, lookahead: float) -> View:
+def look_ahead(paths: Paths, way: Way, blend_length: float, lookahead: float) -> CorridorAhead:
     """Where the corridor ahead of a body is."""
     keep, _ = _fade(way.travelled + way.front, blend_length)
     offset, turn = abs(way.offset) * keep, abs(way.turn) * keep
@@ -187,9 +183,9 @@ def corridor_gap(
     while ahead < lookahead:
         s, travelled = way.s + way.front + ahead, way.travelled + way.front + ahead
         x, y, h = pose_on_path(paths, way.path, s, travelled, way.offset, way.turn, blend_length)
-        room = math.hypot(box[0] - x, box[1] - y) - radius - cell_radius
-        if room > 0.0:
-            ahead += max(0.8 * room, PATH_SPACING_M)  # 0.8: a blended path is a little longer than its own length
+        clearance = math.hypot(box[0] - x, box[1] - y) - radius - cell_radius
+        if clearance > 0.0:
+            ahead += max(0.8 * clearance, PATH_SPACING_M)  # 0.8: a blended path is a little longer than its own length
             continue
         low, high = _range_in_strip(box, x, y, h, way.half_width)
         if low <= PATH_SPACING_M and high >= 0.0:

@@ -11,21 +11,18 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.kernels.compiled import inner_kernel
 from tasks.rollout.corridor import Paths
 from tasks.world.clip import STEP_S
-
-Array = NDArray[np.float64]
 
 STOP_LINE_TOLERANCE_M = 1.0  # a car that stopped with its nose this far over the line still waits
 SMALLEST_GAP_M = 0.1  # keeps s* / gap finite
 OPEN, CLOSED_IF_STOPPABLE, CLOSED = 0, 1, 2  # a stop line's state: green, yellow, red
 
 
-class Driver(NamedTuple):
-    """One driver's habits; SI units."""
+class IdmDriver(NamedTuple):
+    """What all driven vehicles go by: the model's parameters and those of its surroundings; SI units."""
 
     min_gap: float  # s0 [m]
     headway: float  # T [s]
@@ -41,13 +38,13 @@ class Driver(NamedTuple):
 
 
 @inner_kernel
-def free_acceleration(speed: float, target_speed: float, driver: Driver) -> float:
+def free_acceleration(speed: float, target_speed: float, driver: IdmDriver) -> float:
     """Acceleration [m/s2] on a road with nobody in front."""
     return max(driver.accel * (1.0 - (speed / target_speed) ** driver.exponent), -driver.decel)
 
 
 @inner_kernel
-def following_acceleration(free: float, speed: float, gap: float, lead_speed: float, driver: Driver) -> float:
+def following_acceleration(free: float, speed: float, gap: float, lead_speed: float, driver: IdmDriver) -> float:
     """Acceleration [m/s2] `gap` behind a leader, of one whose acceleration on a free road would be `free`."""
     gap = max(gap, SMALLEST_GAP_M)
     closing = speed * (speed - lead_speed) / (2.0 * math.sqrt(driver.accel * driver.decel))
@@ -58,11 +55,11 @@ def following_acceleration(free: float, speed: float, gap: float, lead_speed: fl
 
 
 @inner_kernel
-def needed_deceleration(speed: float, gap: float, lead_speed: float, driver: Driver) -> float:
+def needed_deceleration(speed: float, gap: float, lead_speed: float, driver: IdmDriver) -> float:
     """[m/s2] that stops half the minimum gap behind a leader which makes an emergency stop now."""
     lead_stop = max(lead_speed, 0.0) ** 2 / (2.0 * driver.emergency_decel)
-    room = max(gap - 0.5 * driver.min_gap, SMALLEST_GAP_M) + lead_stop
-    return speed * speed / (2.0 * room)
+    distance = max(gap - 0.5 * driver.min_gap, SMALLEST_GAP_M) + lead_stop
+    return speed * speed / (2.0 * distance)
 
 
 @inner_kernel
@@ -79,10 +76,10 @@ def stop_line_gap(paths: Paths, m: int, step: int, nose: float, speed: float, de
     """Distance [m] from the bumper at path length `nose` to the nearest closed stop line."""
     gap = np.inf
     for q in range(paths.line_start[m], paths.line_start[m + 1]):
-        room = paths.line_at[q] - nose
+        distance = paths.line_at[q] - nose
         state = paths.line_state[step, q]
-        if state == OPEN or (state == CLOSED_IF_STOPPABLE and speed * speed > 2.0 * decel * room):
+        if state == OPEN or (state == CLOSED_IF_STOPPABLE and speed * speed > 2.0 * decel * distance):
             continue
-        if room >= 0.0 or (room > -STOP_LINE_TOLERANCE_M and speed < 1.0):
-            gap = min(gap, max(room, 0.0))
+        if distance >= 0.0 or (distance > -STOP_LINE_TOLERANCE_M and speed < 1.0):
+            gap = min(gap, max(distance, 0.0))
     return gap

@@ -2,7 +2,7 @@
 
 At every fork the log decides: of all ways that start at the vehicle and are long enough, the one nearest to the logged
 track wins, the straightest where the log does not tell. Along it the vehicle keeps the lateral offset its log has there
-(people do not drive on the centreline, and pass parked cars with room), fading to the centre where the log ends; beyond
+(people do not drive on the centreline, and keep clear of parked cars), fading to the centre where the log ends; beyond
 the last lane (the map's crop) the path goes straight on. Off the lanes a vehicle's own log is its path.
 """
 
@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.kernels.compiled import kernel
 from tasks.rollout.lane_index import (
@@ -23,9 +22,8 @@ from tasks.rollout.lane_index import (
 )
 from tasks.rollout.polylines import chord_headings, frenet, interpolated, lengths_along, points_at
 from tasks.rollout.stretches import PATH_SPACING_M
-
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
+from tasks.world.arrays import Array, Ints
+from tasks.world.geometry import wrapped
 
 HEADING_COST_M = 2.0  # metres of distance one radian is worth, as in the route matching (docs/reward.md 0)
 START_COST_WEIGHT = 0.3  # of the distance at the start, against the mean distance of the log
@@ -104,7 +102,7 @@ def _lay_log(track: Array, n_points: int) -> tuple[Array, Array, Array, Array] |
         return None
     for k in range(n - 1):
         edge = math.atan2(chosen[k + 1, 1] - chosen[k, 1], chosen[k + 1, 0] - chosen[k, 0])
-        if abs((edge - chosen[k, 2] + math.pi) % (2.0 * math.pi) - math.pi) > SNAP_HEADING_RAD:
+        if abs(wrapped(edge - chosen[k, 2])) > SNAP_HEADING_RAD:
             return None
     xy, z, v = chosen[:n, :2], np.ascontiguousarray(chosen[:n, 3]), np.ascontiguousarray(chosen[:n, 4])
     length = lengths_along(xy)
@@ -210,7 +208,7 @@ def _path_of(index: LaneIndex, way: list[int], pose: Array, log_poses: Array, ah
 
 @kernel
 def _lay_way(
-    points: Array, first: Integers, heights: Array, limits: Array, way: Integers,
+    points: Array, first: Ints, heights: Array, limits: Array, way: Ints,
     x: float, y: float, log_poses: Array, n_points: int,
 ) -> tuple[Array, Array, Array, Array, Array]:  # fmt: skip
     """Points (P, 2), headings, heights, speed limits (P,) around (x, y) along a way, and where its lanes begin (W,).
@@ -251,7 +249,7 @@ def _lay_way(
 
 
 @kernel
-def _joined(points: Array, first: Integers, way: Integers) -> tuple[Integers, Integers]:
+def _joined(points: Array, first: Ints, way: Ints) -> tuple[Ints, Ints]:
     """(point, place in the way) of the points of a way's lanes (R, 2), and each lane's first of them (W,), or -1."""
     rows, begins, n = np.empty((len(points), 2), np.int64), np.full(len(way), -1), 0
     before = -1
@@ -276,7 +274,7 @@ def _log_offset(center: Array, heading: Array, log_poses: Array) -> Array:
     order = np.argsort(beside[:, 0], kind="mergesort")
     for i in order:
         s, left = beside[i, 0], beside[i, 1]
-        turned = abs((log_poses[i, 2] - interpolated(s, grid, heading) + math.pi) % (2.0 * math.pi) - math.pi)
+        turned = abs(wrapped(log_poses[i, 2] - interpolated(s, grid, heading)))
         usable = abs(left) <= MAX_LOG_OFFSET_M and turned <= SNAP_HEADING_RAD and s > 0.0 and s < grid[-1]
         if usable and (m == 0 or s - at[m - 1] >= LOG_POINT_SPACING_M):
             at[m], offset[m] = s, left

@@ -5,15 +5,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.kernels.compiled import kernel
 from tasks.rollout.polylines import interpolated, lengths_along
+from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.frames import wrap_angle
+from tasks.world.geometry import to_line, wrapped
 from tasks.world.lanes import Lane, RoadMap
-
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 SNAP_HEADING_RAD = math.radians(60.0)
 COST_CAP_M = 6.0  # a logged point farther than this from a way says no more against it
@@ -27,7 +25,7 @@ class LaneIndex:
     lanes: tuple[Lane, ...]
     number: Mapping[str, int]  # lane id -> index
     points: Array  # (Q, 3) all centreline poses
-    first: Integers  # (L + 1,) lane l has points first[l]..first[l + 1] - 1
+    first: Ints  # (L + 1,) lane l has points first[l]..first[l + 1] - 1
     discs: Array  # (L, 3) centre and radius of a disc around each centreline [m]
     heights: Array  # (Q,) of the centrelines' points, from the boundaries [m]; 0 where the map has none
     speed_limits: Array  # (L,) [m/s], NaN where unknown
@@ -74,7 +72,7 @@ def index_lanes(road_map: RoadMap) -> LaneIndex:
     )
 
 
-def _flat(lines: Sequence[Array | None]) -> tuple[Array, Integers]:
+def _flat(lines: Sequence[Array | None]) -> tuple[Array, Ints]:
     """Polylines (P, 3) as one array (Q, 3), and where each begins (L + 1,)."""
     first = np.zeros(len(lines) + 1, dtype=np.int64)
     np.cumsum([0 if line is None else len(line) for line in lines], out=first[1:])
@@ -83,7 +81,7 @@ def _flat(lines: Sequence[Array | None]) -> tuple[Array, Integers]:
 
 
 @kernel
-def _discs_around(points: Array, first: Integers) -> Array:
+def _discs_around(points: Array, first: Ints) -> Array:
     """(L, 3) centre and radius."""
     out = np.zeros((len(first) - 1, 3))
     for lane in range(len(out)):
@@ -95,7 +93,7 @@ def _discs_around(points: Array, first: Integers) -> Array:
 
 
 @kernel
-def _add_heights(first: Integers, boundary: Array, boundary_first: Integers, heights: Array) -> None:
+def _add_heights(first: Ints, boundary: Array, boundary_first: Ints, heights: Array) -> None:
     """Adds half the height a boundary has beside each point of its lane's centreline."""
     for lane in range(len(first) - 1):
         line = boundary[boundary_first[lane] : boundary_first[lane + 1]]
@@ -112,7 +110,7 @@ def _add_heights(first: Integers, boundary: Array, boundary_first: Integers, hei
 
 @kernel
 def _distances(
-    poses: Array, points: Array, first: Integers, discs: Array, lanes: Integers, reach: float
+    poses: Array, points: Array, first: Ints, discs: Array, lanes: Ints, reach: float
 ) -> tuple[Array, Array]:
     """Distance to and heading difference at the nearest point of each lane, (K, L) each; inf beyond `reach`."""
     n_poses, n_lanes = poses.shape[0], lanes.shape[0]
@@ -129,15 +127,12 @@ def _distances(
             for k in range(first[lane], first[lane + 1] - 1):
                 ex, ey = points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1]
                 dx, dy = x - points[k, 0], y - points[k, 1]
-                f = (dx * ex + dy * ey) / max(ex * ex + ey * ey, 1e-12)
-                f = min(max(f, 0.0), 1.0)
-                square = (dx - f * ex) ** 2 + (dy - f * ey) ** 2
+                square = to_line(dx, dy, ex, ey, (dx * ex + dy * ey) / max(ex * ex + ey * ey, 1e-12))[1]
                 if square < best:
                     best, best_k = square, k
             if best <= reach * reach:
                 distance[i, column] = math.sqrt(best)
-                turned = h - points[best_k, 2]
-                difference[i, column] = abs((turned + math.pi) % (2.0 * math.pi) - math.pi)
+                difference[i, column] = abs(wrapped(h - points[best_k, 2]))
     return distance, difference
 
 
@@ -150,7 +145,7 @@ def lane_costs(index: LaneIndex, poses: Array, lanes: Sequence[int] | None = Non
     return _distances(np.ascontiguousarray(poses), index.points, index.first, index.discs, chosen, COST_CAP_M)
 
 
-def on_a_lane(distance: Array, difference: Array, snap_distance_m: float) -> NDArray[np.bool_]:
+def on_a_lane(distance: Array, difference: Array, snap_distance_m: float) -> Bools:
     """(..., L) lanes a vehicle can be said to drive on."""
     return (distance <= snap_distance_m) & (difference <= SNAP_HEADING_RAD)
 

@@ -16,12 +16,12 @@ from math import comb
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.kernels.compiled import inlined, kernel
 from tasks.kernels.trig import sincos, wrap
 from tasks.rollout.bicycle import actuate, path_curvature, travel
 from tasks.rollout.profiles import TRACKING_STEPS, Plans, empty_plans, fit_curvatures, fit_speeds
+from tasks.world.arrays import Array
 from tasks.world.bounds import LARGEST
 from tasks.world.clip import HORIZON_STEPS, STEP_S
 from tasks.world.vehicle import (
@@ -41,7 +41,6 @@ from tasks.world.vehicle import (
     Y,
 )
 
-Array = NDArray[np.float64]
 Sums = tuple[float, float, float, float]
 
 Q_VELOCITY, R_ACCEL = 10.0, 1.0

@@ -3,11 +3,10 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.kernels.compiled import inner_kernel, kernel
-
-Array = NDArray[np.float64]
+from tasks.world.arrays import Array
+from tasks.world.geometry import short_turn, to_line
 
 END_CHORD_M = 5.0  # a line's last few points may be noise
 CHORD_POINTS = 3  # each way, of the chord a heading is taken from
@@ -76,10 +75,7 @@ def chord_headings(points: Array) -> Array:
         a, b = max(k - CHORD_POINTS, 0), min(k + CHORD_POINTS, n - 1)
         h = math.atan2(points[b, 1] - points[a, 1], points[b, 0] - points[a, 0])
         if k > 0 and abs(h - before) >= math.pi:
-            step = (h - before + math.pi) % (2.0 * math.pi) - math.pi
-            if step == -math.pi and h > before:
-                step = math.pi
-            turns += step - (h - before)
+            turns += short_turn(h - before) - (h - before)
         before = h
         out[k] = h + turns
     return out
@@ -94,9 +90,7 @@ def frenet(xy: Array, length: Array, poses: Array) -> Array:
         for k in range(xy.shape[0] - 1):
             ex, ey = xy[k + 1, 0] - xy[k, 0], xy[k + 1, 1] - xy[k, 1]
             dx, dy = poses[i, 0] - xy[k, 0], poses[i, 1] - xy[k, 1]
-            f = (dx * ex + dy * ey) / max(ex * ex + ey * ey, 1e-12)
-            f = min(max(f, 0.0), 1.0)
-            square = (dx - f * ex) ** 2 + (dy - f * ey) ** 2
+            f, square = to_line(dx, dy, ex, ey, (dx * ex + dy * ey) / max(ex * ex + ey * ey, 1e-12))
             if square < best:
                 best = square
                 out[i, 0] = length[k] + f * (length[k + 1] - length[k])

@@ -16,13 +16,11 @@ Curvatures. Written in curvatures instead of their rates, with h_i the heading s
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.kernels.compiled import inlined
 from tasks.kernels.trig import wrap
+from tasks.world.arrays import Array
 from tasks.world.clip import HORIZON_STEPS, STEP_S
-
-Array = NDArray[np.float64]
 
 TRACKING_STEPS = 10  # LQR horizon, 1 s
 ACCEL_PENALTY = 1e-4  # the public "jerk penalty"

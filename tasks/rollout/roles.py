@@ -1,31 +1,28 @@
-"""What a scene's log says about each agent's part: who stands, who joins the lanes when, who starts when."""
+"""The agents' roles, as a scene's log gives them: who stands, who joins the lanes when, who starts when."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.rollout.lane_index import LaneIndex, lane_costs, on_a_lane
 from tasks.world.agents import AgentTracks
+from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.clip import HORIZON_STEPS, STEP_S, Scene
-
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 NEVER = 1_000_000  # a step no clip has
 STANDS_WITHIN_M, STANDS_BELOW_MPS = 1.0, 0.3  # over a whole log: boxes of parked cars jitter by decimetres
 STARTED_AFTER_M = 0.5  # a car that stood has started
 
 
-def stands_always(log: AgentTracks) -> NDArray[np.bool_]:
+def stands_always(log: AgentTracks) -> Bools:
     """(N,) tracks that never leave their place."""
     seen = log.valid.sum(axis=0)
     first = np.take_along_axis(log.boxes[..., :2], log.valid.argmax(axis=0)[None, :, None], axis=0)
     away = np.hypot(*np.moveaxis(log.boxes[..., :2] - first, -1, 0))
     way = np.where(log.valid, away, 0.0).max(axis=0)
-    stands: NDArray[np.bool_] = (way < STANDS_WITHIN_M) & (way < STANDS_BELOW_MPS * STEP_S * (seen - 1) + 0.1)
+    stands: Bools = (way < STANDS_WITHIN_M) & (way < STANDS_BELOW_MPS * STEP_S * (seen - 1) + 0.1)
     return stands & (seen >= 2)
 
 
-def join_steps(index: LaneIndex, scene: Scene, snap_distance_m: float) -> Integers:
+def join_steps(index: LaneIndex, scene: Scene, snap_distance_m: float) -> Ints:
     """(N,) the scene's step for agents that are on a lane now, NEVER for all others."""
     start = scene.step
     out = np.full(len(scene.agents), NEVER)
@@ -52,13 +49,13 @@ def start_step(log: AgentTracks, i: int, step: int) -> int:
     return step + int(np.argmax(started)) if started.any() else NEVER
 
 
-def clocks(scene: Scene) -> Integers:
+def clocks(scene: Scene) -> Ints:
     """(N,) the step of its log each agent is at: the scene's, or earlier for one that an earlier rollout made wait."""
     log, start = scene.clip.agents, scene.step
     here = scene.agents.boxes[start, :, :2]
     away = np.where(log.valid[: start + 1], np.hypot(*np.moveaxis(log.boxes[: start + 1, :, :2] - here, -1, 0)), np.inf)
     backwards = np.where(np.isnan(away), np.inf, away)[::-1]  # the latest of equal ones
-    clock: Integers = start - np.argmin(backwards, axis=0)
+    clock: Ints = start - np.argmin(backwards, axis=0)
     return clock
 
 

@@ -1,4 +1,4 @@
-"""The traffic's rules for one agent: when it takes the wheel, how hard it drives, when it waits, when it enters.
+"""The traffic's rules for one agent: when it switches to IDM, how hard it drives, when it waits, when it enters.
 
 Each rule is an "or" or a "hardest of" over others, and is asked about a list of them: all, or only those who are not
 where an earlier answer saw them. Compiled.
@@ -7,10 +7,8 @@ where an earlier answer saw them. Compiled.
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.kernels.compiled import inner_kernel
-from tasks.rollout.cast import ABSENT, DRIVEN, NOBODY, Cast, Rows
 from tasks.rollout.corridor import (
     PATH_SPACING_M,
     Box,
@@ -24,16 +22,16 @@ from tasks.rollout.corridor import (
 )
 from tasks.rollout.idm import (
     SMALLEST_GAP_M,
-    Driver,
+    IdmDriver,
     following_acceleration,
     free_acceleration,
     needed_deceleration,
     stop_line_gap,
 )
-from tasks.rollout.stretches import View, in_view, may_meet
-
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
+from tasks.rollout.stretches import CorridorAhead, in_view, may_meet
+from tasks.rollout.traffic_state import ABSENT, DRIVEN, NOBODY, Roles, Rows
+from tasks.world.arrays import Array, Ints
+from tasks.world.geometry import wrapped
 
 
 @inner_kernel
@@ -54,19 +52,18 @@ def _forward_speed(rows: Rows, t: int, i: int) -> float:
 
 
 @inner_kernel
-def start_on(paths: Paths, m: int, rows: Rows, t: int, i: int, driver: Driver) -> tuple[float, float, float, float]:
+def start_on(paths: Paths, m: int, rows: Rows, t: int, i: int, driver: IdmDriver) -> tuple[float, float, float, float]:
     """(path length, offset to the left, turn, speed) of agent i if it starts to follow path m from row t."""
     s, left = project_on_path(paths, m, rows.boxes[t, i, 0], rows.boxes[t, i, 1])
-    difference = rows.boxes[t, i, 2] - pose_on_path(paths, m, s, 0.0, left, 0.0, driver.blend_length)[2]
-    turn = (difference + math.pi) % (2.0 * math.pi) - math.pi
+    turn = wrapped(rows.boxes[t, i, 2] - pose_on_path(paths, m, s, 0.0, left, 0.0, driver.blend_length)[2])
     return s, left, turn, _forward_speed(rows, t, i)
 
 
 @inner_kernel
-def due_path(cast: Cast, paths: Paths, driver: Driver, rows: Rows, t: int, i: int, clock: int) -> int:
-    """The path on which agent i, replayed, takes the wheel by itself: its own, once it is due and on it; or -1."""
-    m = cast.path[i]
-    if m < 0 or clock < cast.join_step[i]:
+def due_path(roles: Roles, paths: Paths, driver: IdmDriver, rows: Rows, t: int, i: int, clock: int) -> int:
+    """The path on which agent i, replayed, switches to IDM by itself: its own, once it is due and on it; or -1."""
+    m = roles.path[i]
+    if m < 0 or clock < roles.join_step[i]:
         return -1
     left = project_on_path(paths, m, rows.boxes[t, i, 0], rows.boxes[t, i, 1])[1]
     return m if abs(left) <= driver.largest_offset else -1
@@ -74,7 +71,7 @@ def due_path(cast: Cast, paths: Paths, driver: Driver, rows: Rows, t: int, i: in
 
 @inner_kernel
 def way_of(
-    driver: Driver, rows: Rows, t: int, i: int, m: int, s: float, travelled: float, offset: float, turn: float
+    driver: IdmDriver, rows: Rows, t: int, i: int, m: int, s: float, travelled: float, offset: float, turn: float
 ) -> Way:
     """Agent i, as big as in row t, on its way along path m."""
     front, half_width = 0.5 * rows.boxes[t, i, 3], 0.5 * rows.boxes[t, i, 4] + driver.corridor_margin
@@ -83,7 +80,7 @@ def way_of(
 
 @inner_kernel
 def gap_to(
-    paths: Paths, driver: Driver, rows: Rows, t: int, i: int, way: Way, view: View, j: int
+    paths: Paths, driver: IdmDriver, rows: Rows, t: int, i: int, way: Way, view: CorridorAhead, j: int
 ) -> tuple[float, float]:
     """(gap [m] from the bumper of agent i along its path to j, path heading there); inf: not in the way."""
     box, radius = box_of(rows.boxes, t, j), rows.radius[t, j]
@@ -97,11 +94,11 @@ def gap_to(
 
 @inner_kernel
 def braked_for(
-    cast: Cast, paths: Paths, driver: Driver, rows: Rows, t: int, i: int,
-    mode: Integers, others: Integers, n_others: int,
+    roles: Roles, paths: Paths, driver: IdmDriver, rows: Rows, t: int, i: int,
+    mode: Ints, others: Ints, n_others: int,
 ) -> int:  # fmt: skip
     """The driven one that asks agent i, on its logged path, for more than the comfortable deceleration, or NOBODY."""
-    m = cast.logged_path[i]
+    m = roles.logged_path[i]
     if m < 0:
         return NOBODY
     speed = _forward_speed(rows, t, i)
@@ -128,7 +125,7 @@ def braked_for(
 
 @inner_kernel
 def road_acceleration(
-    paths: Paths, driver: Driver, t: int, m: int, s: float, speed: float, length: float
+    paths: Paths, driver: IdmDriver, t: int, m: int, s: float, speed: float, length: float
 ) -> float:  # fmt: skip
     """[m/s2] of one driven at path length s of path m, for the road alone: its target speed and its stop lines."""
     free = free_acceleration(speed, paths.target_speed[m, cell_of(paths, s)], driver)
@@ -141,8 +138,8 @@ def road_acceleration(
 
 @inner_kernel
 def hardest_acceleration(
-    paths: Paths, driver: Driver, rows: Rows, t: int, i: int, way: Way, speed: float,
-    others: Integers, n_others: int, accel: float, leader: int,
+    paths: Paths, driver: IdmDriver, rows: Rows, t: int, i: int, way: Way, speed: float,
+    others: Ints, n_others: int, accel: float, leader: int,
 ) -> tuple[float, int]:  # fmt: skip
     """(acceleration [m/s2], leader) of agent i, driven, for the others on the list; `accel` without them."""
     view = look_ahead(paths, way, driver.blend_length, driver.lookahead)
@@ -166,7 +163,7 @@ def hardest_acceleration(
 
 @inner_kernel
 def touches_driven(
-    boxes: Array, k: int, i: int, rows: Rows, t: int, mode: Integers, others: Integers, n_others: int
+    boxes: Array, k: int, i: int, rows: Rows, t: int, mode: Ints, others: Ints, n_others: int
 ) -> bool:  # fmt: skip
     """Does agent i at boxes[k, i] share area with a driven one of the list in row t?"""
     box = box_of(boxes, k, i)
@@ -182,13 +179,13 @@ def touches_driven(
 
 
 @inner_kernel
-def has_room(
-    cast: Cast, driver: Driver, log_boxes: Array, k: int, i: int,
-    rows: Rows, t: int, mode: Integers, others: Integers, n_others: int,
+def is_clear(
+    roles: Roles, driver: IdmDriver, log_boxes: Array, k: int, i: int,
+    rows: Rows, t: int, mode: Ints, others: Ints, n_others: int,
 ) -> bool:  # fmt: skip
     """May agent i appear as in step k of its log, as far as those of the list, already there in row t, let it?"""
-    if not cast.enters_clear[i]:
-        return not (cast.moving_kind[i] and touches_driven(log_boxes, k, i, rows, t, mode, others, n_others))
+    if not roles.enters_clear[i]:
+        return not (roles.moving_kind[i] and touches_driven(log_boxes, k, i, rows, t, mode, others, n_others))
     x, y, heading, length, width = box_of(log_boxes, k, i)
     grown = (x, y, heading, length + 2.0 * driver.min_gap, width)
     for a in range(n_others):
@@ -199,8 +196,8 @@ def has_room(
 
 
 @inner_kernel
-def far_from_ego(cast: Cast, driver: Driver, log_boxes: Array, k: int, i: int, rows: Rows, t: int) -> bool:
+def far_from_ego(roles: Roles, driver: IdmDriver, log_boxes: Array, k: int, i: int, rows: Rows, t: int) -> bool:
     """May agent i appear as in step k of its log, as far as its distance to the ego in row t lets it?"""
     ego = rows.boxes.shape[1] - 1
     dx, dy = log_boxes[k, i, 0] - rows.boxes[t, ego, 0], log_boxes[k, i, 1] - rows.boxes[t, ego, 1]
-    return not cast.enters_clear[i] or math.hypot(dx, dy) >= driver.enter_clearance
+    return not roles.enters_clear[i] or math.hypot(dx, dy) >= driver.enter_clearance

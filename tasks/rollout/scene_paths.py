@@ -1,24 +1,23 @@
 """A scene's paths as the traffic's kernels take them: how fast one may drive where, and where one must stop when."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.rollout.corridor import Paths
 from tasks.rollout.idm import CLOSED, CLOSED_IF_STOPPABLE, OPEN
 from tasks.rollout.lane_following import LanePath
 from tasks.rollout.roles import NEVER, STANDS_BELOW_MPS
 from tasks.rollout.stretches import PATH_SPACING_M, stretches_of
+from tasks.world.arrays import Array, Bools, Bytes, Ints
 from tasks.world.clip import HORIZON_STEPS, Scene
 from tasks.world.lanes import LightState
 
-Array = NDArray[np.float64]
-StopLine = tuple[float, NDArray[np.uint8]]  # path length [m], states (41,) at every step of the rollout
+StopLine = tuple[float, Bytes]  # path length [m], states (41,) at every step of the rollout
 
 STOP_STEPS = 5  # a logged stop lasts at least this long
 STOP_BEFORE_ENTRY_M, STOP_BEHIND_ENTRY_M = 12.0, 2.0  # where, around a junction's entry, a stop belongs to it
 
 
-def numbered(found: list[LanePath | None]) -> NDArray[np.int64]:
+def numbered(found: list[LanePath | None]) -> Ints:
     """Index of each path among those there are, -1 where there is none."""
     has = np.array([path is not None for path in found], dtype=bool)
     return np.where(has, np.cumsum(has) - 1, -1)
@@ -86,7 +85,7 @@ def _light_lines(scene: Scene, path: LanePath) -> list[StopLine]:
     return lines
 
 
-def _logged_stops(scene: Scene, path: LanePath, i: int, stopped: NDArray[np.bool_]) -> list[StopLine]:
+def _logged_stops(scene: Scene, path: LanePath, i: int, stopped: Bools) -> list[StopLine]:
     """Stop lines agent i's own log, `stopped` (S,), implies: at a junction's entry, where it stops, until it leaves."""
     entries = _junction_entries(scene, path)
     if not entries or np.count_nonzero(stopped) < STOP_STEPS:

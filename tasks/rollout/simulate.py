@@ -4,7 +4,7 @@ The ego is tracked first, since it follows its plan whatever the traffic does; t
 
 * A vehicle on a lane (within `snap_distance_m` of a centreline, heading within 60 degrees) is driven by IDM along its
   way through the lane graph; one beside the lanes replays its log until it is on one. Where a driven vehicle on its
-  logged way leaves it no room to go on without braking harder than comfort, it is driven by IDM along that way instead.
+  logged way makes it brake harder than comfort, it is driven by IDM along that way instead.
 * A vehicle that its whole log shows standing stays where it is; one that stands now does not start before its log
   does; one that its log stops at a junction stops there as long. The log is all we have of lights and signs that are
   not in the map.
@@ -23,9 +23,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.rollout.cast import Cast, World
 from tasks.rollout.corridor import Paths
-from tasks.rollout.idm import Driver
+from tasks.rollout.idm import IdmDriver
 from tasks.rollout.lane_following import LanePath, find_path, logged_path, straight_path
 from tasks.rollout.lane_index import index_lanes
 from tasks.rollout.lqr import track
@@ -40,12 +39,13 @@ from tasks.rollout.roles import (
 )
 from tasks.rollout.scene_paths import numbered, stack_paths
 from tasks.rollout.traffic import drive, drive_many
+from tasks.rollout.traffic_state import AgentStates, Roles
 from tasks.world.agents import MOVING_KINDS, AgentKind, AgentTracks
+from tasks.world.arrays import Array, Bools
 from tasks.world.bounds import LARGEST, all_within
+from tasks.world.boxes import ego_boxes
 from tasks.world.clip import HORIZON_STEPS, STEP_S, Rollout, Scene
-from tasks.world.vehicle import EGO_STATE_SIZE, HEADING, PACIFICA, VX, VY, Vehicle, X, Y
-
-Array = NDArray[np.float64]
+from tasks.world.vehicle import EGO_STATE_SIZE, HEADING, PACIFICA, VX, VY
 
 MOST = 1000.0  # of any setting, and of speeds [m/s]: the length of paths grows with it
 LOG_STRIDE = 3  # every third logged pose tells a way
@@ -88,9 +88,8 @@ class TrafficScene:
 
     scene: Scene
     settings: TrafficSettings
-    cast: Cast | None  # None: replay
+    roles: Roles | None  # None: replay
     paths: Paths | None
-    lane_paths: tuple[LanePath | None, ...] = ()  # (N,)
 
 
 @dataclass(frozen=True)
@@ -99,8 +98,8 @@ class Rollouts:
 
     boxes: Array  # (B, 41, N, 5) centre x [m], centre y [m], heading [rad], length [m], width [m]; NaN where absent
     velocities: Array  # (B, 41, N, 2) world frame [m/s]
-    valid: NDArray[np.bool_]  # (B, 41, N)
-    simulated: NDArray[np.bool_]  # (B, N) True: moved by IDM at some step, False: replayed or standing
+    valid: Bools  # (B, 41, N)
+    simulated: Bools  # (B, N) True: moved by IDM at some step, False: replayed or standing
 
 
 def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
@@ -139,7 +138,7 @@ def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
         else:
             hold[i] = start_step(log, i, step)
     numbers = numbered(found + logged_ways)
-    cast = Cast(
+    roles = Roles(
         path=numbers[:n],
         logged_path=numbers[n:],
         join_step=np.where(numbers[:n] >= 0, join, NEVER),
@@ -152,34 +151,23 @@ def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
     paths = stack_paths(
         scene, found, logged_ways, settings.target_speed_mps, settings.lateral_accel_max, settings.decel_max
     )
-    return TrafficScene(scene, settings, cast, paths, tuple(found))
+    return TrafficScene(scene, settings, roles, paths)
 
 
-def simulate(
-    scene: Scene,
-    poses: Array,
-    settings: TrafficSettings,
-    traffic: TrafficScene | None = None,
-    vehicle: Vehicle = PACIFICA,
-) -> Rollout:
-    """Ego that tracks `poses` (40, 3) (world, 0.1 .. 4.0 s) and the traffic's answer to it, from the scene's step.
-
-    `traffic` = prepare_traffic(scene, settings) spares the preparation when one scene is rolled out often.
-    """
-    ego_states = track(scene.ego_state, np.asarray(poses)[None], vehicle)[0]
-    return roll_out(traffic if traffic is not None else prepare_traffic(scene, settings), ego_states, vehicle)
+def simulate(scene: Scene, poses: Array, settings: TrafficSettings) -> Rollout:
+    """Ego that tracks `poses` (40, 3) (world, 0.1 .. 4.0 s) and the traffic's answer to it, from the scene's step."""
+    return roll_out(prepare_traffic(scene, settings), track(scene.ego_state, np.asarray(poses)[None])[0])
 
 
-def roll_out(traffic: TrafficScene, ego_states: Array, vehicle: Vehicle = PACIFICA) -> Rollout:
+def roll_out(traffic: TrafficScene, ego_states: Array) -> Rollout:
     """The traffic's answer to an ego whose states (41, 11) are known. ValueError where they are none."""
     _check_states(ego_states[None])
     scene = traffic.scene
     start = scene.step
     window = scene.agents.window(start, start + HORIZON_STEPS + 1)
-    if traffic.cast is None or traffic.paths is None or len(window) == 0:
+    if traffic.roles is None or traffic.paths is None or len(window) == 0:
         return Rollout(start, ego_states, window, np.zeros(len(window), dtype=bool))
-    ego_boxes, ego_velocities = _ego_boxes(ego_states, vehicle)
-    rows, motion = drive(*_script(traffic, window), ego_boxes, ego_velocities)
+    rows, motion = drive(*_script(traffic, window), *_ego_boxes(ego_states))
     n = len(window)
     agents = replace(
         window,
@@ -191,7 +179,7 @@ def roll_out(traffic: TrafficScene, ego_states: Array, vehicle: Vehicle = PACIFI
     return Rollout(start, ego_states, agents, motion.was_driven[-1])
 
 
-def roll_out_many(traffic: TrafficScene, ego_states: Array, vehicle: Vehicle = PACIFICA) -> Rollouts:
+def roll_out_many(traffic: TrafficScene, ego_states: Array) -> Rollouts:
     """The traffic's answers to B egos whose states (B, 41, 11) are known, each to the last bit as `roll_out` gives it.
 
     The result takes 2.3 kB per agent and ego: split B to bound memory. With replayed traffic it is one log, seen B
@@ -201,14 +189,14 @@ def roll_out_many(traffic: TrafficScene, ego_states: Array, vehicle: Vehicle = P
     start = traffic.scene.step
     window = traffic.scene.agents.window(start, start + HORIZON_STEPS + 1)
     many, n = len(ego_states), len(window)
-    if traffic.cast is None or traffic.paths is None or n == 0:
+    if traffic.roles is None or traffic.paths is None or n == 0:
         return Rollouts(
             boxes=np.broadcast_to(window.boxes, (many, *window.boxes.shape)),
             velocities=np.broadcast_to(window.velocities, (many, *window.velocities.shape)),
             valid=np.broadcast_to(window.valid, (many, *window.valid.shape)),
             simulated=np.zeros((many, n), dtype=bool),
         )
-    return Rollouts(*drive_many(*_script(traffic, window), *_ego_boxes(ego_states, vehicle)))
+    return Rollouts(*drive_many(*_script(traffic, window), *_ego_boxes(ego_states)))
 
 
 def _check_states(ego_states: Array) -> None:
@@ -220,35 +208,27 @@ def _check_states(ego_states: Array) -> None:
         raise ValueError(f"ego_states of ego {first} are not finite or above {LARGEST:g}: leave it out")
 
 
-def _script(traffic: TrafficScene, window: AgentTracks) -> tuple[int, World, World, Cast, Paths, Driver]:
+def _script(
+    traffic: TrafficScene, window: AgentTracks
+) -> tuple[int, AgentStates, AgentStates, Roles, Paths, IdmDriver]:
     """All that the kernels need to know but the ego."""
-    assert traffic.cast is not None and traffic.paths is not None
+    assert traffic.roles is not None and traffic.paths is not None
     return (
         traffic.scene.step,
-        _world(traffic.scene.clip.agents),
-        _world(window.window(0, 1)),
-        Cast(*_writable(traffic.cast)),
+        _agent_states(traffic.scene.clip.agents),
+        _agent_states(window.window(0, 1)),
+        Roles(*_writable(traffic.roles)),
         Paths(*_writable(traffic.paths)),
         _driver(traffic.settings),
     )
 
 
-def _ego_boxes(ego_states: Array, vehicle: Vehicle) -> tuple[Array, Array]:
+def _ego_boxes(ego_states: Array) -> tuple[Array, Array]:
     """Boxes (..., 5) about the true centre and world velocities (..., 2) of egos with states (..., 11)."""
     heading = ego_states[..., HEADING]
     cos, sin = np.cos(heading), np.sin(heading)
-    boxes = np.stack(
-        [
-            ego_states[..., X] + vehicle.rear_axle_to_center * cos,
-            ego_states[..., Y] + vehicle.rear_axle_to_center * sin,
-            heading,
-            np.full(heading.shape, vehicle.length),
-            np.full(heading.shape, vehicle.width),
-        ],
-        axis=-1,
-    )
     vx, vy = ego_states[..., VX], ego_states[..., VY]
-    return boxes, np.stack([cos * vx - sin * vy, sin * vx + cos * vy], axis=-1)
+    return ego_boxes(ego_states, PACIFICA), np.stack([cos * vx - sin * vy, sin * vx + cos * vy], axis=-1)
 
 
 def next_scene(scene: Scene, rollout: Rollout, centerline: Array, steps: int = HORIZON_STEPS) -> Scene:
@@ -267,8 +247,8 @@ def next_scene(scene: Scene, rollout: Rollout, centerline: Array, steps: int = H
     )
 
 
-def _world(agents: AgentTracks) -> World:
-    return World(*_writable((agents.boxes, agents.velocities, agents.valid, agents.center_z)))
+def _agent_states(agents: AgentTracks) -> AgentStates:
+    return AgentStates(*_writable((agents.boxes, agents.velocities, agents.valid, agents.center_z)))
 
 
 def _writable(arrays: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
@@ -276,8 +256,8 @@ def _writable(arrays: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
     return (np.require(a, requirements=["C", "W"]) for a in arrays)
 
 
-def _driver(settings: TrafficSettings) -> Driver:
-    return Driver(
+def _driver(settings: TrafficSettings) -> IdmDriver:
+    return IdmDriver(
         min_gap=settings.min_gap_m,
         headway=settings.headway_s,
         accel=settings.accel_max,

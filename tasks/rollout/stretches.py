@@ -10,11 +10,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.kernels.compiled import inner_kernel, kernel
+from tasks.world.arrays import Array
 
-Array = NDArray[np.float64]
 Box = Array | tuple[float, float, float, float, float]  # centre x, y [m], heading [rad], length, width [m]
 
 PATH_SPACING_M = 0.5  # of every path's points
@@ -23,7 +22,7 @@ STRETCH_M = CELLS * PATH_SPACING_M
 SLACK_M = 1e-6  # above what rounding can do to a coordinate of a city
 
 
-class View(NamedTuple):
+class CorridorAhead(NamedTuple):
     """A corridor along a path: a rectangle around all of it, and the stretches it lies along."""
 
     x: float  # [m] the rectangle's centre
@@ -70,13 +69,13 @@ def stretches_of(xy: Array, heading: Array) -> Array:
 @inner_kernel
 def view_along(
     stretches: Array, length: float, m: int, begin: float, end: float, offset: float, turn: float, half_width: float
-) -> View:
+) -> CorridorAhead:
     """The corridor from path length `begin` to `end` of path m, which is `length` long.
 
     offset, turn: the largest lateral offset and turn the body has to its path in there; half_width: of the corridor.
     """
     if begin < 0.0 or end > length:  # beyond the path's ends there are no stretches
-        return View(0.0, 0.0, 1.0, 0.0, np.inf, np.inf, 0, -1, offset, turn, half_width)
+        return CorridorAhead(0.0, 0.0, 1.0, 0.0, np.inf, np.inf, 0, -1, offset, turn, half_width)
     first, last = int(begin / STRETCH_M), min(int(end / STRETCH_M), stretches.shape[1] - 1)
     x, y = stretches[m, first, 0], stretches[m, first, 1]
     dx, dy = stretches[m, last, 0] - x, stretches[m, last, 1] - y
@@ -96,11 +95,11 @@ def view_along(
     x, y = x + u * ux - v * uy, y + u * uy + v * ux
     grown = offset + half_width + PATH_SPACING_M + SLACK_M
     half_u, half_v = 0.5 * (high_u - low_u) + grown, 0.5 * (high_v - low_v) + grown
-    return View(x, y, ux, uy, half_u, half_v, first, last, offset, turn, half_width)
+    return CorridorAhead(x, y, ux, uy, half_u, half_v, first, last, offset, turn, half_width)
 
 
 @inner_kernel
-def in_view(view: View, x: float, y: float, radius: float) -> bool:
+def in_view(view: CorridorAhead, x: float, y: float, radius: float) -> bool:
     """Can something within `radius` of (x, y) be in the corridor? False: surely not."""
     dx, dy = x - view.x, y - view.y
     return (
@@ -110,7 +109,7 @@ def in_view(view: View, x: float, y: float, radius: float) -> bool:
 
 
 @inner_kernel
-def may_meet(stretches: Array, m: int, view: View, box: Box, radius: float) -> bool:
+def may_meet(stretches: Array, m: int, view: CorridorAhead, box: Box, radius: float) -> bool:
     """Can a box, `radius` around it, be in the corridor? False: surely not."""
     if view.last < view.first:
         return True

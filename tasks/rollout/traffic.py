@@ -2,154 +2,139 @@
 
 All agents look at the same instant and then move together, so their order does not matter. A leader is any box, the
 ego included, that reaches into the corridor the driver's own body will sweep along its path. A vehicle that replays
-its log takes the wheel, along its logged way, as soon as a driven vehicle there asks for more than the comfortable
-deceleration; it stays at it for the rest of the rollout.
+its log switches to IDM, along its logged way, as soon as a driven vehicle there asks for more than the comfortable
+deceleration; it stays there for the rest of the rollout.
 
 Against many egos most agents do the same. One rollout without an ego is recorded: what each agent did in each step and
-because of whom. Against an ego an agent keeps to the record until the ego, or one who left the record before (a
-stray), changes its answer; then it is a stray itself and is asked anew at every step. Every rule is an "or" or a
-"hardest of" over others (rules.py), so an answer of the record that no stray gave stands, and only the strays are to
-be asked: the outcome is the very same, to the last bit. Compiled.
+because of whom. Against an ego an agent keeps to the record until the ego, or an agent that has diverged from the
+record before, changes its answer; then it has diverged too and is asked anew at every step. Every rule is an "or" or a
+"hardest of" over others (rules.py), so an answer of the record that no diverged agent gave stands, and only the
+diverged are to be asked: the outcome is the very same, to the last bit. Compiled.
 """
 
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.kernels.compiled import hidden_kernel, kernel
-from tasks.rollout.cast import (
-    ABSENT,
-    DRIVEN,
-    EGO,
-    NOBODY,
-    REPLAYED,
-    STANDING,
-    Cast,
-    Motion,
-    Rows,
-    Strays,
-    World,
-    empty_motion,
-    empty_rows,
-    no_strays,
-)
 from tasks.rollout.corridor import Paths, pose_on_path
-from tasks.rollout.idm import Driver, advance
+from tasks.rollout.idm import IdmDriver, advance
 from tasks.rollout.rules import (
     braked_for,
     cell_of,
     due_path,
     far_from_ego,
     hardest_acceleration,
-    has_room,
+    is_clear,
     road_acceleration,
     start_on,
     touches_driven,
     way_of,
 )
-
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Booleans = NDArray[np.bool_]
+from tasks.rollout.traffic_state import (
+    ABSENT,
+    DRIVEN,
+    EGO,
+    NOBODY,
+    REPLAYED,
+    STANDING,
+    AgentStates,
+    Diverged,
+    Motion,
+    Roles,
+    Rows,
+    empty_motion,
+    empty_rows,
+    nobody_diverged,
+)
+from tasks.world.arrays import Array, Bools
+from tasks.world.geometry import wrapped
 
 
 @kernel
 def drive(
-    start: int,
-    log: World,
-    now: World,
-    cast: Cast,
-    paths: Paths,
-    driver: Driver,
-    ego_boxes: Array,
-    ego_velocities: Array,
+    start: int, log: AgentStates, now: AgentStates, roles: Roles, paths: Paths, driver: IdmDriver,
+    ego_boxes: Array, ego_velocities: Array,
 ) -> tuple[Rows, Motion]:  # fmt: skip
     """The traffic's answer to one ego: boxes (T, 5) (true centre) and world velocities (T, 2), T = 41.
 
     start: the clip's step of row 0; log: the clip's tracks over all its steps; now: the agents (1, N) at `start`.
     """
-    n_rows, n = ego_boxes.shape[0], cast.path.shape[0]
-    rows, motion, strays = empty_rows(n_rows, n), empty_motion(n_rows, n), no_strays(n)
-    _set_ego(rows, strays, ego_boxes, ego_velocities)
+    n_rows, n = ego_boxes.shape[0], roles.path.shape[0]
+    rows, motion, diverged = empty_rows(n_rows, n), empty_motion(n_rows, n), nobody_diverged(n)
+    _set_ego(rows, diverged, ego_boxes, ego_velocities)
     for i in range(n):
-        _stray(strays, i)
-        motion.clock[0, i] = cast.clock[i]
+        _diverge(diverged, i)
+        motion.clock[0, i] = roles.clock[i]
         _place(rows, 0, now, 0, i)
         rows.valid[0, i] = now.valid[0, i]
         if now.valid[0, i]:
-            motion.mode[0, i] = STANDING if cast.standing[i] else REPLAYED
+            motion.mode[0, i] = STANDING if roles.standing[i] else REPLAYED
     for t in range(n_rows - 1):
-        _step(start, log, cast, paths, driver, t, rows, strays, motion, motion)
+        _step(start, log, roles, paths, driver, t, rows, diverged, motion, motion)
     return rows, motion
 
 
 @kernel
 def drive_many(
-    start: int,
-    log: World,
-    now: World,
-    cast: Cast,
-    paths: Paths,
-    driver: Driver,
-    ego_boxes: Array,
-    ego_velocities: Array,
-) -> tuple[Array, Array, Booleans, Booleans]:  # fmt: skip
+    start: int, log: AgentStates, now: AgentStates, roles: Roles, paths: Paths, driver: IdmDriver,
+    ego_boxes: Array, ego_velocities: Array,
+) -> tuple[Array, Array, Bools, Bools]:  # fmt: skip
     """The traffic's answer to each of B egos (B, T, 5), (B, T, 2): as `drive` to it alone, to the last bit.
 
     Boxes (B, T, N, 5), velocities (B, T, N, 2), valid (B, T, N) and who was driven (B, N).
     """
-    n_egos, n_rows, n = ego_boxes.shape[0], ego_boxes.shape[1], cast.path.shape[0]
+    n_egos, n_rows, n = ego_boxes.shape[0], ego_boxes.shape[1], roles.path.shape[0]
     nowhere = np.full((n_rows, 5), np.inf)
-    recorded, record = drive(start, log, now, cast, paths, driver, nowhere, np.zeros((n_rows, 2)))
+    recorded, record = drive(start, log, now, roles, paths, driver, nowhere, np.zeros((n_rows, 2)))
     boxes, velocities = np.empty((n_egos, n_rows, n, 5)), np.empty((n_egos, n_rows, n, 2))
     valid, was_driven = np.empty((n_egos, n_rows, n), np.bool_), np.empty((n_egos, n), np.bool_)
-    rows, motion, strays = empty_rows(n_rows, n), empty_motion(n_rows, n), no_strays(n)
+    rows, motion, diverged = empty_rows(n_rows, n), empty_motion(n_rows, n), nobody_diverged(n)
     for b in range(n_egos):
-        _start_over(rows, recorded, strays)
-        _set_ego(rows, strays, ego_boxes[b], ego_velocities[b])
+        _start_over(rows, recorded, diverged)
+        _set_ego(rows, diverged, ego_boxes[b], ego_velocities[b])
         for t in range(n_rows - 1):
-            _step(start, log, cast, paths, driver, t, rows, strays, motion, record)
+            _step(start, log, roles, paths, driver, t, rows, diverged, motion, record)
         boxes[b], velocities[b], valid[b] = rows.boxes[:, :n], rows.velocities[:, :n], rows.valid[:, :n]
         for i in range(n):
-            moved = motion.was_driven if strays.found[i] else record.was_driven
+            moved = motion.was_driven if diverged.found[i] else record.was_driven
             was_driven[b, i] = moved[n_rows - 1, i]
     return boxes, velocities, valid, was_driven
 
 
 @kernel
-def _start_over(rows: Rows, recorded: Rows, strays: Strays) -> None:
+def _start_over(rows: Rows, recorded: Rows, diverged: Diverged) -> None:
     """Nobody has left the record yet."""
     rows.boxes[:], rows.velocities[:], rows.valid[:] = recorded.boxes, recorded.velocities, recorded.valid
     rows.center_z[:], rows.radius[:] = recorded.center_z, recorded.radius
-    strays.found[:] = False
-    strays.size[0] = 0
+    diverged.found[:] = False
+    diverged.size[0] = 0
 
 
 @kernel
-def _set_ego(rows: Rows, strays: Strays, boxes: Array, velocities: Array) -> None:
-    ego = len(strays.found) - 1
+def _set_ego(rows: Rows, diverged: Diverged, boxes: Array, velocities: Array) -> None:
+    ego = len(diverged.found) - 1
     for t in range(boxes.shape[0]):  # element by element: numba takes seconds to compile the copy of a slice
         for k in range(5):
             rows.boxes[t, ego, k] = boxes[t, k]
         rows.velocities[t, ego, 0], rows.velocities[t, ego, 1] = velocities[t, 0], velocities[t, 1]
         rows.valid[t, ego] = True
         rows.radius[t, ego] = 0.5 * math.hypot(boxes[t, 3], boxes[t, 4])
-    strays.mode[ego] = EGO
-    _stray(strays, ego)
+    diverged.mode[ego] = EGO
+    _diverge(diverged, ego)
 
 
 @hidden_kernel
-def _stray(strays: Strays, i: int) -> None:
-    strays.found[i] = True
-    strays.listed[strays.size[0]] = i
-    strays.size[0] += 1
+def _diverge(diverged: Diverged, i: int) -> None:
+    diverged.found[i] = True
+    diverged.listed[diverged.size[0]] = i
+    diverged.size[0] += 1
 
 
 @hidden_kernel
-def _leave_record(t: int, i: int, r: int, rows: Rows, strays: Strays, motion: Motion, record: Motion) -> None:
-    """Agent i is a stray from step t on: its motion there becomes motion at row r; it is not in row t + 1 yet."""
-    _stray(strays, i)
+def _diverge_at(t: int, i: int, r: int, rows: Rows, diverged: Diverged, motion: Motion, record: Motion) -> None:
+    """Agent i diverges from step t on: its motion there becomes motion at row r; it is not in row t + 1 yet."""
+    _diverge(diverged, i)
     _carry(record, t, motion, r, i)
     _vanish(rows, t + 1, i)
 
@@ -172,13 +157,13 @@ def _vanish(rows: Rows, t: int, i: int) -> None:
 
 
 @hidden_kernel
-def _place(rows: Rows, t: int, world: World, k: int, i: int) -> None:
+def _place(rows: Rows, t: int, source: AgentStates, k: int, i: int) -> None:
     """Agent i, in row t, is where it is in step k of a world."""
     for c in range(5):
-        rows.boxes[t, i, c] = world.boxes[k, i, c]
-    rows.velocities[t, i, 0], rows.velocities[t, i, 1] = world.velocities[k, i, 0], world.velocities[k, i, 1]
-    rows.center_z[t, i], rows.valid[t, i] = world.center_z[k, i], True
-    rows.radius[t, i] = 0.5 * math.hypot(world.boxes[k, i, 3], world.boxes[k, i, 4])
+        rows.boxes[t, i, c] = source.boxes[k, i, c]
+    rows.velocities[t, i, 0], rows.velocities[t, i, 1] = source.velocities[k, i, 0], source.velocities[k, i, 1]
+    rows.center_z[t, i], rows.valid[t, i] = source.center_z[k, i], True
+    rows.radius[t, i] = 0.5 * math.hypot(source.boxes[k, i, 3], source.boxes[k, i, 4])
 
 
 @hidden_kernel
@@ -193,62 +178,63 @@ def _stay(rows: Rows, t: int, i: int) -> None:
 
 @hidden_kernel
 def _step(
-    start: int, log: World, cast: Cast, paths: Paths, driver: Driver, t: int,
-    rows: Rows, strays: Strays, motion: Motion, record: Motion,
+    start: int, log: AgentStates, roles: Roles, paths: Paths, driver: IdmDriver, t: int,
+    rows: Rows, diverged: Diverged, motion: Motion, record: Motion,
 ) -> None:  # fmt: skip
-    """From row t to row t + 1; `record`: the motion of another rollout, for those who are no strays."""
-    _take_over(cast, paths, driver, t, rows, strays, motion, record)
+    """From row t to row t + 1; `record`: the motion of another rollout, for those that have not diverged."""
+    _switch_to_idm(roles, paths, driver, t, rows, diverged, motion, record)
     for i in range(motion.mode.shape[1]):
-        if strays.found[i]:
+        if diverged.found[i]:
             _carry(motion, t, motion, t + 1, i)
-    _drive_on(start, cast, paths, driver, t, rows, strays, motion, record)
-    _replay(log, cast, t, rows, strays, motion, record)
-    _admit(start, log, cast, driver, t, rows, strays, motion, record)
+    _drive_on(start, roles, paths, driver, t, rows, diverged, motion, record)
+    _replay(log, roles, t, rows, diverged, motion, record)
+    _admit(start, log, roles, driver, t, rows, diverged, motion, record)
 
 
 @hidden_kernel
-def _take_over(
-    cast: Cast, paths: Paths, driver: Driver, t: int, rows: Rows, strays: Strays, motion: Motion, record: Motion
-) -> None:
-    """Who is on its path and due takes the wheel, at its own pose and speed; so does who must brake on its log."""
-    n, mode = motion.mode.shape[1], strays.mode
+def _switch_to_idm(
+    roles: Roles, paths: Paths, driver: IdmDriver, t: int,
+    rows: Rows, diverged: Diverged, motion: Motion, record: Motion,
+) -> None:  # fmt: skip
+    """Who is on its path and due switches to IDM, at its own pose and speed; so does who must brake on its log."""
+    n, mode = motion.mode.shape[1], diverged.mode
     for i in range(n):
-        if strays.found[i]:
+        if diverged.found[i]:
             mode[i] = motion.mode[t, i]
             _vanish(rows, t + 1, i)
         else:
-            mode[i] = REPLAYED if record.taken[t, i] >= 0 else record.mode[t, i]
+            mode[i] = REPLAYED if record.switch[t, i] >= 0 else record.mode[t, i]
     for i in range(n):
-        motion.taken[t, i], motion.taken_for[t, i] = -1, NOBODY
+        motion.switch[t, i], motion.switch_for[t, i] = -1, NOBODY
         if mode[i] != REPLAYED or not rows.valid[t, i]:
             continue
-        afresh, taken, taken_for = strays.found[i], -1, NOBODY
+        afresh, switch, switch_for = diverged.found[i], -1, NOBODY
         if not afresh:
-            taken, taken_for = record.taken[t, i], record.taken_for[t, i]
-            afresh = taken_for != NOBODY and strays.found[taken_for]
+            switch, switch_for = record.switch[t, i], record.switch_for[t, i]
+            afresh = switch_for != NOBODY and diverged.found[switch_for]
         if afresh:
-            clock = motion.clock[t, i] if strays.found[i] else record.clock[t, i]
-            taken, taken_for = due_path(cast, paths, driver, rows, t, i, clock), NOBODY
-        if taken < 0:
-            others = strays.everyone if afresh else strays.listed
-            n_others = len(others) if afresh else strays.size[0]
-            taken_for = braked_for(cast, paths, driver, rows, t, i, mode, others, n_others)
-            if taken_for != NOBODY:
-                taken = cast.logged_path[i]
-        if not strays.found[i] and taken != record.taken[t, i]:
-            _leave_record(t, i, t, rows, strays, motion, record)
+            clock = motion.clock[t, i] if diverged.found[i] else record.clock[t, i]
+            switch, switch_for = due_path(roles, paths, driver, rows, t, i, clock), NOBODY
+        if switch < 0:
+            others = diverged.everyone if afresh else diverged.listed
+            n_others = len(others) if afresh else diverged.size[0]
+            switch_for = braked_for(roles, paths, driver, rows, t, i, mode, others, n_others)
+            if switch_for != NOBODY:
+                switch = roles.logged_path[i]
+        if not diverged.found[i] and switch != record.switch[t, i]:
+            _diverge_at(t, i, t, rows, diverged, motion, record)
             motion.mode[t, i] = REPLAYED
-        motion.taken[t, i], motion.taken_for[t, i] = taken, taken_for
+        motion.switch[t, i], motion.switch_for[t, i] = switch, switch_for
     for i in range(n):
-        m = motion.taken[t, i]
+        m = motion.switch[t, i]
         if m >= 0:
             mode[i] = DRIVEN
-            if strays.found[i]:
+            if diverged.found[i]:
                 _start_driving(paths, driver, t, i, m, rows, motion)
 
 
 @hidden_kernel
-def _start_driving(paths: Paths, driver: Driver, t: int, i: int, m: int, rows: Rows, motion: Motion) -> None:
+def _start_driving(paths: Paths, driver: IdmDriver, t: int, i: int, m: int, rows: Rows, motion: Motion) -> None:
     s, offset, turn, speed = start_on(paths, m, rows, t, i, driver)
     motion.mode[t, i], motion.path[t, i], motion.travelled[t, i] = DRIVEN, m, 0.0
     motion.s[t, i], motion.offset[t, i], motion.turn[t, i], motion.speed[t, i] = s, offset, turn, speed
@@ -257,33 +243,33 @@ def _start_driving(paths: Paths, driver: Driver, t: int, i: int, m: int, rows: R
 
 @hidden_kernel
 def _drive_on(
-    start: int, cast: Cast, paths: Paths, driver: Driver, t: int,
-    rows: Rows, strays: Strays, motion: Motion, record: Motion,
+    start: int, roles: Roles, paths: Paths, driver: IdmDriver, t: int,
+    rows: Rows, diverged: Diverged, motion: Motion, record: Motion,
 ) -> None:  # fmt: skip
     """Those who are driven look at row t and move."""
     for i in range(motion.mode.shape[1]):
         motion.leader[t, i] = NOBODY
-        if strays.mode[i] != DRIVEN:
+        if diverged.mode[i] != DRIVEN:
             continue
-        m, s, travelled, speed, offset, turn = _motion_of(t, i, strays, motion, record)
-        if start + t < cast.hold_until[i] and travelled == 0.0 and m == cast.path[i]:
-            if strays.found[i]:
+        m, s, travelled, speed, offset, turn = _motion_of(t, i, diverged, motion, record)
+        if start + t < roles.hold_until[i] and travelled == 0.0 and m == roles.path[i]:
+            if diverged.found[i]:
                 _advance(paths, driver, t, i, 0.0, 0.0, rows, motion)
             continue
-        afresh, accel, leader = strays.found[i], 0.0, NOBODY
+        afresh, accel, leader = diverged.found[i], 0.0, NOBODY
         if not afresh:
             accel, leader = record.accel[t, i], record.leader[t, i]
-            afresh = leader != NOBODY and strays.found[leader]
+            afresh = leader != NOBODY and diverged.found[leader]
         if afresh:
             accel, leader = road_acceleration(paths, driver, t, m, s, speed, rows.boxes[t, i, 3]), NOBODY
-        others = strays.everyone if afresh else strays.listed
-        n_others = len(others) if afresh else strays.size[0]
+        others = diverged.everyone if afresh else diverged.listed
+        n_others = len(others) if afresh else diverged.size[0]
         way = way_of(driver, rows, t, i, m, s, travelled, offset, turn)
         accel, leader = hardest_acceleration(paths, driver, rows, t, i, way, speed, others, n_others, accel, leader)
-        if not strays.found[i]:
+        if not diverged.found[i]:
             if accel == record.accel[t, i]:
                 continue
-            _leave_record(t, i, t + 1, rows, strays, motion, record)
+            _diverge_at(t, i, t + 1, rows, diverged, motion, record)
         motion.accel[t, i], motion.leader[t, i], motion.was_driven[t + 1, i] = accel, leader, True
         step_m, new_speed = advance(speed, accel)
         _advance(paths, driver, t, i, step_m, new_speed, rows, motion)
@@ -291,10 +277,10 @@ def _drive_on(
 
 @hidden_kernel
 def _motion_of(
-    t: int, i: int, strays: Strays, motion: Motion, record: Motion
+    t: int, i: int, diverged: Diverged, motion: Motion, record: Motion
 ) -> tuple[int, float, float, float, float, float]:
-    """Path, path length, distance travelled, speed, offset and turn of agent i at row t, stray or not."""
-    if strays.found[i]:
+    """Path, path length, distance travelled, speed, offset and turn of agent i at row t, diverged or not."""
+    if diverged.found[i]:
         return (
             motion.path[t, i], motion.s[t, i], motion.travelled[t, i],
             motion.speed[t, i], motion.offset[t, i], motion.turn[t, i],
@@ -307,7 +293,7 @@ def _motion_of(
 
 @hidden_kernel
 def _advance(
-    paths: Paths, driver: Driver, t: int, i: int, step_m: float, new_speed: float, rows: Rows, motion: Motion
+    paths: Paths, driver: IdmDriver, t: int, i: int, step_m: float, new_speed: float, rows: Rows, motion: Motion
 ) -> None:
     """Agent i, driven, is `step_m` on along its path in row t + 1."""
     m, s, travelled = motion.path[t + 1, i], motion.s[t + 1, i] + step_m, motion.travelled[t + 1, i] + step_m
@@ -317,7 +303,7 @@ def _advance(
         offset, turn = motion.offset[t + 1, i], motion.turn[t + 1, i]
         x, y, h = pose_on_path(paths, m, s, travelled, offset, turn, driver.blend_length)
         rows.boxes[t + 1, i, 0], rows.boxes[t + 1, i, 1] = x, y
-        rows.boxes[t + 1, i, 2] = (h + math.pi) % (2.0 * math.pi) - math.pi
+        rows.boxes[t + 1, i, 2] = wrapped(h)
     h = rows.boxes[t + 1, i, 2]
     rows.velocities[t + 1, i, 0], rows.velocities[t + 1, i, 1] = new_speed * math.cos(h), new_speed * math.sin(h)
     rows.center_z[t + 1, i] = motion.base_z[t + 1, i] + paths.height[m, cell_of(paths, s)]
@@ -325,39 +311,39 @@ def _advance(
 
 @hidden_kernel
 def _replay(
-    log: World, cast: Cast, t: int, rows: Rows, strays: Strays, motion: Motion, record: Motion
+    log: AgentStates, roles: Roles, t: int, rows: Rows, diverged: Diverged, motion: Motion, record: Motion
 ) -> None:  # fmt: skip
     """The parked stay, the replayed take the next step of their log.
 
     Who cannot brake along its log (who walks or cycles, or reverses) takes none to where a driven car is; one that
     walks goes on once it is touched, a vehicle would drive through.
     """
-    n, mode = motion.mode.shape[1], strays.mode
+    n, mode = motion.mode.shape[1], diverged.mode
     for i in range(n):
         motion.blocked[t, i], motion.waits[t, i] = False, False
-        stray = strays.found[i]
-        if mode[i] == STANDING and stray:
+        has_diverged = diverged.found[i]
+        if mode[i] == STANDING and has_diverged:
             _stay(rows, t, i)
         if mode[i] != REPLAYED:
             continue
-        clock = motion.clock[t, i] if stray else record.clock[t, i]
+        clock = motion.clock[t, i] if has_diverged else record.clock[t, i]
         k = min(clock + 1, log.valid.shape[0] - 1)
-        if cast.moving_kind[i] and cast.logged_path[i] < 0 and rows.valid[t, i] and log.valid[k, i]:
-            afresh = stray or record.blocked[t, i]
-            others = strays.everyone if afresh else strays.listed
-            n_others = len(others) if afresh else strays.size[0]
+        if roles.moving_kind[i] and roles.logged_path[i] < 0 and rows.valid[t, i] and log.valid[k, i]:
+            afresh = has_diverged or record.blocked[t, i]
+            others = diverged.everyone if afresh else diverged.listed
+            n_others = len(others) if afresh else diverged.size[0]
             blocked = touches_driven(log.boxes, k, i, rows, t + 1, mode, others, n_others)
             waits = blocked and (
-                cast.enters_clear[i]
-                or not touches_driven(rows.boxes, t, i, rows, t + 1, mode, strays.everyone, n)
+                roles.enters_clear[i]
+                or not touches_driven(rows.boxes, t, i, rows, t + 1, mode, diverged.everyone, n)
             )  # fmt: skip
-            if not stray and waits != record.waits[t, i]:
-                _leave_record(t, i, t + 1, rows, strays, motion, record)
-                stray = True
+            if not has_diverged and waits != record.waits[t, i]:
+                _diverge_at(t, i, t + 1, rows, diverged, motion, record)
+                has_diverged = True
             motion.blocked[t, i], motion.waits[t, i] = blocked, waits
-        if stray and motion.waits[t, i]:
+        if has_diverged and motion.waits[t, i]:
             _stay(rows, t, i)
-        elif stray:
+        elif has_diverged:
             motion.clock[t + 1, i] = k
             if log.valid[k, i]:
                 _place(rows, t + 1, log, k, i)
@@ -365,28 +351,28 @@ def _replay(
 
 @hidden_kernel
 def _admit(
-    start: int, log: World, cast: Cast, driver: Driver, t: int,
-    rows: Rows, strays: Strays, motion: Motion, record: Motion,
+    start: int, log: AgentStates, roles: Roles, driver: IdmDriver, t: int,
+    rows: Rows, diverged: Diverged, motion: Motion, record: Motion,
 ) -> None:  # fmt: skip
     """Newcomers, judged against everyone who was already there."""
     n = motion.mode.shape[1]
     k = min(start + t + 1, log.valid.shape[0] - 1)
     for i in range(n):
         motion.enters[t, i] = False
-        if strays.mode[i] != ABSENT or not log.valid[k, i]:
+        if diverged.mode[i] != ABSENT or not log.valid[k, i]:
             continue
-        afresh = strays.found[i] or not record.enters[t, i]
-        others = strays.everyone if afresh else strays.listed
-        n_others = len(others) if afresh else strays.size[0]
-        enters = far_from_ego(cast, driver, log.boxes, k, i, rows, t + 1) and has_room(
-            cast, driver, log.boxes, k, i, rows, t + 1, strays.mode, others, n_others
+        afresh = diverged.found[i] or not record.enters[t, i]
+        others = diverged.everyone if afresh else diverged.listed
+        n_others = len(others) if afresh else diverged.size[0]
+        enters = far_from_ego(roles, driver, log.boxes, k, i, rows, t + 1) and is_clear(
+            roles, driver, log.boxes, k, i, rows, t + 1, diverged.mode, others, n_others
         )
-        if not strays.found[i]:
+        if not diverged.found[i]:
             if enters == record.enters[t, i]:
                 continue
-            _leave_record(t, i, t + 1, rows, strays, motion, record)
+            _diverge_at(t, i, t + 1, rows, diverged, motion, record)
         motion.enters[t, i] = enters
     for i in range(n):
         if motion.enters[t, i]:
-            motion.mode[t + 1, i], motion.clock[t + 1, i] = STANDING if cast.standing[i] else REPLAYED, k
+            motion.mode[t + 1, i], motion.clock[t + 1, i] = STANDING if roles.standing[i] else REPLAYED, k
             _place(rows, t + 1, log, k, i)

@@ -3,8 +3,7 @@
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
-import numpy as np
-from numpy.typing import NDArray
+from tasks.world.arrays import Array, Bools
 
 
 class AgentKind(StrEnum):
@@ -28,11 +27,11 @@ class AgentTracks:
 
     track_ids: tuple[str, ...]  # (N,) unique
     kinds: tuple[AgentKind, ...]  # (N,)
-    boxes: NDArray[np.float64]  # (S, N, 5) centre x [m], centre y [m], heading [rad], length [m], width [m]
-    velocities: NDArray[np.float64]  # (S, N, 2) world frame [m/s]
-    valid: NDArray[np.bool_]  # (S, N)
-    center_z: NDArray[np.float64]  # (S, N) height of the box centre, world frame [m]
-    heights: NDArray[np.float64]  # (N,) box height [m]
+    boxes: Array  # (S, N, 5) centre x [m], centre y [m], heading [rad], length [m], width [m]
+    velocities: Array  # (S, N, 2) world frame [m/s]
+    valid: Bools  # (S, N)
+    center_z: Array  # (S, N) height of the box centre, world frame [m]
+    heights: Array  # (N,) box height [m]
 
     @property
     def n_steps(self) -> int:

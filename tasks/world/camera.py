@@ -3,7 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+
+from tasks.world.arrays import Array
 
 ROTATION_SLACK = 1e-3  # of calibrations written with few digits
 
@@ -18,9 +19,9 @@ class Camera:
     name: str
     width: int  # pixels
     height: int
-    intrinsics: NDArray[np.float64]  # (3, 3) pixels
-    distortion: NDArray[np.float64]  # (3,) k1, k2, k3; zeros for an undistorted image
-    ego_from_camera: NDArray[np.float64]  # (4, 4) rigid
+    intrinsics: Array  # (3, 3) pixels
+    distortion: Array  # (3,) k1, k2, k3; zeros for an undistorted image
+    ego_from_camera: Array  # (4, 4) rigid
 
     def __post_init__(self) -> None:
         for name, shape in (("intrinsics", (3, 3)), ("distortion", (3,)), ("ego_from_camera", (4, 4))):
@@ -55,8 +56,8 @@ class Camera:
 class Pinhole:
     """A camera without distortion somewhere in the world. Raises ValueError for arrays that are no camera."""
 
-    intrinsics: NDArray[np.float64]  # (3, 3) pixels, without skew, the centre of pixel (0, 0) at (0.5, 0.5)
-    world_from_camera: NDArray[np.float64]  # (4, 4) rigid; camera x right, y down, z forward
+    intrinsics: Array  # (3, 3) pixels, without skew, the centre of pixel (0, 0) at (0.5, 0.5)
+    world_from_camera: Array  # (4, 4) rigid; camera x right, y down, z forward
     width: int  # pixels
     height: int
 
@@ -77,4 +78,4 @@ class SensorFile:
     sensor: str  # camera name or lidar name
     uri: str
     time_s: float  # relative to the clip's start (its first step)
-    world_from_ego: NDArray[np.float64]  # (4, 4) at this time
+    world_from_ego: Array  # (4, 4) at this time

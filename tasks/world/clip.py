@@ -2,10 +2,8 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from tasks.world.agents import AgentTracks
+from tasks.world.arrays import Array, Bools
 from tasks.world.camera import Camera, SensorFile
 from tasks.world.lanes import NO_LIGHTS, RoadMap, Route, TrafficLights
 from tasks.world.vehicle import EGO_STATE_SIZE
@@ -36,12 +34,12 @@ class Clip:
     log_id: str
     split: str  # train | val | test
     start_s: float  # of the first step, since the log's first annotated instant
-    ego_states: NDArray[np.float64]  # (96, 11), columns tasks.world.vehicle
-    world_from_ego: NDArray[np.float64]  # (96, 4, 4) rear-axle pose in 3-D (z, roll and pitch for rendering)
+    ego_states: Array  # (96, 11), columns tasks.world.vehicle
+    world_from_ego: Array  # (96, 4, 4) rear-axle pose in 3-D (z, roll and pitch for rendering)
     agents: AgentTracks  # 96 steps
     road_map: RoadMap
     route: Route
-    centerline: NDArray[np.float64]  # (P, 3) from the lane of the pose at T along the route
+    centerline: Array  # (P, 3) from the lane of the pose at T along the route
     lights: TrafficLights = NO_LIGHTS  # 96 steps
     cameras: tuple[Camera, ...] = ()
     images: tuple[SensorFile, ...] = ()  # 2 Hz or denser, within the clip
@@ -60,13 +58,13 @@ class Scene:
 
     clip: Clip
     step: int
-    ego_history: NDArray[np.float64]  # (16, 11) the last 1.5 s and now
+    ego_history: Array  # (16, 11) the last 1.5 s and now
     agents: AgentTracks
-    centerline: NDArray[np.float64]  # (P, 3) the route ahead of this ego
-    ever_simulated: NDArray[np.bool_] | None = None  # (N,) agents that a rollout already moved off their log
+    centerline: Array  # (P, 3) the route ahead of this ego
+    ever_simulated: Bools | None = None  # (N,) agents that a rollout already moved off their log
 
     @property
-    def ego_state(self) -> NDArray[np.float64]:
+    def ego_state(self) -> Array:
         """(11,) the ego now."""
         return self.ego_history[-1]
 
@@ -76,9 +74,9 @@ class Rollout:
     """Ego and agents simulated together for H from step `start_step`."""
 
     start_step: int
-    ego_states: NDArray[np.float64]  # (41, 11), row 0 = the scene's ego state
+    ego_states: Array  # (41, 11), row 0 = the scene's ego state
     agents: AgentTracks  # 41 steps, row 0 = the scene's agents
-    simulated: NDArray[np.bool_]  # (N,) True: moved by IDM at some step, False: replayed or standing
+    simulated: Bools  # (N,) True: moved by IDM at some step, False: replayed or standing
 
     def __post_init__(self) -> None:
         assert self.ego_states.shape == (HORIZON_STEPS + 1, EGO_STATE_SIZE)

@@ -1,8 +1,8 @@
 """The driving command a planner is given: which way the route goes next."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tasks.world.arrays import Array
 from tasks.world.frames import to_local, wrap_angle
 
 LOOKAHEAD_M = 20.0  # NAVSIM: the route 20 m ahead decides ...
@@ -10,7 +10,7 @@ LATERAL_M = 2.0  # ... left or right where it lies 2 m or more to a side
 SPACING_M = 0.5  # the route is looked at this densely, however few points it came with
 
 
-def driving_command(centerline: NDArray[np.float64], pose: NDArray[np.float64]) -> str:
+def driving_command(centerline: Array, pose: Array) -> str:
     """left, straight, right, or unknown where less than 20 m of route are left.
 
     Args:
@@ -23,7 +23,7 @@ def driving_command(centerline: NDArray[np.float64], pose: NDArray[np.float64]) 
     arc = np.concatenate([[0.0], np.cumsum(steps)])
     columns = (centerline[:, 0], centerline[:, 1], np.unwrap(centerline[:, 2]))
 
-    def at(lengths: NDArray[np.float64]) -> NDArray[np.float64]:
+    def at(lengths: Array) -> Array:
         return np.stack([np.interp(lengths, arc, column) for column in columns], axis=-1)
 
     along = np.append(np.arange(0.0, arc[-1], SPACING_M), arc[-1])

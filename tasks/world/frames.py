@@ -1,9 +1,8 @@
 """SE(2) poses: arrays whose last axis is x [m], y [m], heading [rad]."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from tasks.world.arrays import Array
 
 
 def wrap_angle(angle: Array) -> Array:
@@ -37,6 +36,15 @@ def points_to_local(origin: Array, points: Array) -> Array:
     c, s = np.cos(origin[2]), np.sin(origin[2])
     dx, dy = points[..., 0] - origin[0], points[..., 1] - origin[1]
     return np.stack([c * dx + s * dy, -s * dx + c * dy], axis=-1)
+
+
+def upright(poses: Array) -> Array:
+    """Poses (N, 3) as matrices (N, 4, 4) on the plane z = 0, z up."""
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    out = np.tile(np.eye(4), (len(poses), 1, 1))
+    out[:, 0, 0], out[:, 0, 1], out[:, 1, 0], out[:, 1, 1] = c, -s, s, c
+    out[:, :2, 3] = poses[:, :2]
+    return out
 
 
 def box_corners(boxes: Array) -> Array:

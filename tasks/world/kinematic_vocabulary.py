@@ -5,8 +5,8 @@ file of human trajectories or build one from their own TRAIN clips.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tasks.world.arrays import Array
 from tasks.world.clip import HORIZON_STEPS, STEP_S
 
 MAX_SPEED_MPS = 18.0
@@ -16,7 +16,7 @@ CURVATURE_MAX_1PM = 0.12  # about the turning circle of a large car
 STRAIGHT_SHARE = 0.4  # most human driving is nearly straight: those draw a tenth of the curvature
 
 
-def kinematic_trajectories(k: int, seed: int) -> NDArray[np.float64]:
+def kinematic_trajectories(k: int, seed: int) -> Array:
     """(k, 40, 3) x [m], y [m], heading [rad] in the ego frame at 0.1 .. 4.0 s; equal (k, seed) give equal numbers.
 
     Speed: uniform start, acceleration constant over each second, never below 0. Curvature: linear between knots at

@@ -7,14 +7,16 @@ from enum import IntEnum, StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from tasks.world.arrays import Array
+
 
 @dataclass(frozen=True)
 class Lane:
     """One lane segment; polylines run in driving direction, world frame, metres."""
 
     lane_id: str
-    ring: NDArray[np.float64]  # (M, 2) closed exterior ring of the lane polygon
-    centerline: NDArray[np.float64]  # (P, 3) x, y, heading [rad]
+    ring: Array  # (M, 2) closed exterior ring of the lane polygon
+    centerline: Array  # (P, 3) x, y, heading [rad]
     is_intersection: bool  # True: a lane connector inside a junction
     drives_cars: bool  # VEHICLE and BUS lanes; bicycle lanes are kept for drawing only
     successors: tuple[str, ...] = ()
@@ -22,8 +24,8 @@ class Lane:
     left_neighbor: str | None = None  # may name a lane outside the map, or one of the opposite direction
     right_neighbor: str | None = None
     speed_limit_mps: float | None = None
-    left_boundary: NDArray[np.float64] | None = None  # (B, 3) x, y, z; None where the source has none
-    right_boundary: NDArray[np.float64] | None = None
+    left_boundary: Array | None = None  # (B, 3) x, y, z; None where the source has none
+    right_boundary: Array | None = None
     left_mark: str = "NONE"  # AV2 lane mark type
     right_mark: str = "NONE"
 
@@ -49,8 +51,8 @@ class MapPolygon:
 
     token: str  # lane id, "int_" + lane id, "da_" + area id
     layer: MapLayer
-    ring: NDArray[np.float64]  # (M, 2) closed exterior ring
-    holes: tuple[NDArray[np.float64], ...] = ()  # closed rings
+    ring: Array  # (M, 2) closed exterior ring
+    holes: tuple[Array, ...] = ()  # closed rings
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +61,7 @@ class RoadMap:
 
     lanes: Mapping[str, Lane]
     drivable_areas: tuple[MapPolygon, ...]
-    crossings: tuple[NDArray[np.float64], ...] = ()  # closed rings (M, 2)
+    crossings: tuple[Array, ...] = ()  # closed rings (M, 2)
     roadblock_of: Mapping[str, str] = field(default_factory=dict)  # lane id -> roadblock (connector) id
     location: str = ""
 

@@ -7,11 +7,9 @@ from collections.abc import Sequence
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tasks.world.arrays import Array, Bools
 from tasks.world.lanes import MapLayer, MapPolygon, RoadMap
-
-Array = NDArray[np.float64]
 
 CENTERLINE_SPACING_M = 0.75  # docs/reward.md 0
 PLACES_KEPT = 8  # of each map
@@ -81,7 +79,7 @@ class Rings:
         self._square = np.maximum((self._step**2).sum(axis=1), 1e-300)  # a repeated point is a segment of length 0
         self._first = np.cumsum([0] + [len(ring) - 1 for ring in rings[:-1]])
 
-    def contains(self, point: Array) -> NDArray[np.bool_]:
+    def contains(self, point: Array) -> Bools:
         """(N,) whether the point (2,) is inside each ring, by the even-odd rule."""
         y0 = self._start[:, 1] - point[1]
         y1 = y0 + self._step[:, 1]

@@ -6,14 +6,12 @@ docs/reward.md 0, "Route and map of a log that has no planner's route". Works fo
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tasks.world.arrays import Array
 from tasks.world.frames import wrap_angle
 from tasks.world.lanes import Lane, RoadMap, Route
 from tasks.world.polygons import Rings
 from tasks.world.vehicle import PACIFICA
-
-Array = NDArray[np.float64]
 
 MAX_LANE_DISTANCE_M = 1.0
 MAX_HEADING_ERROR_RAD = 1.2
@@ -60,14 +58,14 @@ def roadblocks_of(lanes: Mapping[str, Lane]) -> dict[str, str]:
     return blocks
 
 
-def route_of_log(road_map: RoadMap, poses: Array, extension_m: float = EXTENSION_M) -> Route:
+def route_of_log(road_map: RoadMap, poses: Array) -> Route:
     """The route of a whole log from its rear-axle poses (T, 3) every 0.2 s.
 
-    The driven lanes, extended past the log's end by `extension_m` along the straightest successors, and all lanes of
+    The driven lanes, extended past the log's end by EXTENSION_M along the straightest successors, and all lanes of
     the roadblocks they pass. Raises NoRoute.
     """
     path = list(driven_lanes(road_map, poses))
-    path += _straight_on(road_map, path, extension_m)
+    path += _straight_on(road_map, path, EXTENSION_M)
     roadblock_ids = tuple(dict.fromkeys(road_map.roadblock_of[lane_id] for lane_id in path))
     passed = frozenset(roadblock_ids)
     on_route = frozenset(lane_id for lane_id, block in road_map.roadblock_of.items() if block in passed)

@@ -6,11 +6,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from tasks.world.arrays import Array, Indices
 from tasks.world.clip import HORIZON_STEPS
 from tasks.world.frames import to_local
 from tasks.world.vehicle import HEADING
 
-Array = NDArray[np.float64]
+MOST_LLOYD_STEPS = 30  # fewer when no window changes its centre
 CHUNK_ROWS = 4096  # windows whose distances to all centres are held at once: 4096 x 8192 x 8 B = 0.27 GB
 
 
@@ -55,7 +56,7 @@ class Vocabulary:
         return len(self.trajectories)
 
 
-def human_windows(ego_states: Array, starts: NDArray[np.intp]) -> Array:
+def human_windows(ego_states: Array, starts: Indices) -> Array:
     """What the driver of `ego_states` (S, 11) did in the 4 s after each of `starts`, (W, 40, 3) in the ego frame there.
 
     Raises ValueError where a window reaches beyond the last state.
@@ -67,7 +68,7 @@ def human_windows(ego_states: Array, starts: NDArray[np.intp]) -> Array:
     return np.array(windows).reshape(-1, HORIZON_STEPS, 3)
 
 
-def cluster(windows: Array, k: int, seed: int, iterations: int = 30) -> Array:
+def cluster(windows: Array, k: int, seed: int) -> Array:
     """The k windows that stand for all: k-means on the (x, y) courses, each centre replaced by its nearest window.
 
     A real drive is kept instead of a mean of many, because a mean of drives need not be drivable.
@@ -76,7 +77,6 @@ def cluster(windows: Array, k: int, seed: int, iterations: int = 30) -> Array:
         windows: (N, 40, 3) in the ego frame.
         k: how many to keep, at most the number of distinct windows.
         seed: of the k-means++ start (Philox); equal arguments give equal results.
-        iterations: at most this many Lloyd steps; earlier when no window changes its centre.
 
     Returns:
         (k, 40, 3), in the order of the windows.
@@ -91,7 +91,7 @@ def cluster(windows: Array, k: int, seed: int, iterations: int = 30) -> Array:
         raise ValueError(f"k = {k} trajectories cannot be chosen from {distinct} distinct windows")
     centers = points[_spread_start(points, k, seed)]
     owner = np.full(len(points), -1)
-    for _ in range(iterations):
+    for _ in range(MOST_LLOYD_STEPS):
         nearest, _ = _nearest_center(points, centers)
         if np.array_equal(nearest, owner):
             break
@@ -104,7 +104,7 @@ def cluster(windows: Array, k: int, seed: int, iterations: int = 30) -> Array:
     return windows[_one_window_each(points, centers)]
 
 
-def _spread_start(points: Array, k: int, seed: int) -> NDArray[np.intp]:
+def _spread_start(points: Array, k: int, seed: int) -> Indices:
     """k-means++ (Arthur and Vassilvitskii 2007): each next start is drawn with probability ~ squared distance."""
     rng = np.random.Generator(np.random.Philox(key=seed))
     chosen = [int(rng.integers(len(points)))]
@@ -117,7 +117,7 @@ def _spread_start(points: Array, k: int, seed: int) -> NDArray[np.intp]:
     return np.array(chosen)
 
 
-def _nearest_center(points: Array, centers: Array) -> tuple[NDArray[np.intp], Array]:
+def _nearest_center(points: Array, centers: Array) -> tuple[Indices, Array]:
     """Index of each point's nearest centre (the first of equals) and the squared distance to it."""
     owner = np.empty(len(points), dtype=np.intp)
     distance = np.empty(len(points))
@@ -130,7 +130,7 @@ def _nearest_center(points: Array, centers: Array) -> tuple[NDArray[np.intp], Ar
     return owner, distance
 
 
-def _one_window_each(points: Array, centers: Array) -> NDArray[np.intp]:
+def _one_window_each(points: Array, centers: Array) -> Indices:
     """A different window for every centre: the nearest of its own members, for an empty centre the nearest left."""
     owner, distance = _nearest_center(points, centers)
     order = np.lexsort((distance, owner))

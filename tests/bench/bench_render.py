@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from factory.stages.scene_file import read_scene
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.gradient import backward
-from tasks.render.splatting.raster import splat, trace
+from tasks.render.splatting.raster import forward, splat
 from tests.bench.peer_splat import Draw, compiled, drawing, peer_checkout
 from tests.bench.timing import cpu_milliseconds, memory_mb, milliseconds
 
@@ -73,13 +73,13 @@ def street_view(scene: Path) -> tuple[Gaussians, NDArray[np.float64]]:
 def row(name: str, scene: Gaussians, camera: NDArray[np.float64], threads: int, peer: Draw | None) -> None:
     """Prints the scene's two lines of the table, there and there and back; the peer's beside the first."""
     view = (scene, INTRINSICS, camera, WIDTH, HEIGHT, BLACK, threads)
-    record = trace(*view)
+    record = forward(*view)
     pairs, seen = len(record.splats.tile_splats), len(record.splats.index)
     upstream = np.random.default_rng(1).normal(size=record.view.rgb.shape).astype(np.float32)
     about = f"{name} | {len(scene):,} | {seen:,} | {pairs / max(seen, 1):.1f}"
     calls: list[tuple[str, Callable[[], object]]] = [
-        ("forward", lambda: trace(*view)),
-        ("forward + backward", lambda: backward(trace(*view), scene, upstream, threads=threads)),
+        ("forward", lambda: forward(*view)),
+        ("forward + backward", lambda: backward(forward(*view), scene, upstream, threads=threads)),
     ]
     for what, call in calls:
         wall_s = milliseconds(call, REPEATS) / 1e3
@@ -113,12 +113,12 @@ def memory() -> None:
     intrinsics[:2] *= LARGE[0] / WIDTH
     scene, view = cloud(100_000), (intrinsics, np.eye(4), *LARGE, BLACK)
     upstream = np.ones((LARGE[1], LARGE[0], 3), np.float32)
-    warm = trace(scene.take(np.arange(9)), *view)
+    warm = forward(scene.take(np.arange(9)), *view)
     backward(warm, scene, upstream)
     del warm
     before = memory_mb("VmRSS")
     Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew here
-    record = trace(scene, *view)
+    record = forward(scene, *view)
     there = memory_mb("VmHWM") - before
     backward(record, scene, upstream)
     print(

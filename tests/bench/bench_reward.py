@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from factory.readers.town.reader import SyntheticReader
 from tasks.reward.epdms import Scores, score
 from tasks.reward.prepare import N_TIMES, PAST_STEPS, PreparedScene, prepare
-from tasks.reward.rules.boxes import ego_boxes
 from tasks.rollout.lqr import track_local
+from tasks.world.boxes import ego_boxes
 from tasks.world.clip import NOW, scene_of_clip
 from tasks.world.frames import to_world
 from tasks.world.kinematic_vocabulary import kinematic_trajectories

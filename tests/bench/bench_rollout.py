@@ -49,7 +49,7 @@ def main(root: Path) -> None:
         for scene in (among_nearest(whole), whole):
             traffic = prepare_traffic(scene, settings)
             states = track_local(scene.ego_state, trajectories)
-            paths = sum(path is not None for path in traffic.lane_paths)
+            paths = int((traffic.roles.path >= 0).sum()) if traffic.roles else 0
             print(
                 f"| {ref.log_id[:8]} | {ref.start_ms / 1e3:.0f} | {int(scene.agents.valid[NOW].sum())} | {paths} "
                 f"| {cpu_milliseconds(partial(prepare_traffic, scene, settings), 5):.1f} "

@@ -18,11 +18,10 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from factory.readers.base import BadClip
 from tasks.world.agents import MOVING_KINDS, AgentKind, AgentTracks
+from tasks.world.arrays import Array, Bools, Indices, Ints
 from tasks.world.clip import STEP_S
 from tasks.world.frames import wrap_angle
 from tasks.world.vehicle import AX, AY, EGO_STATE_SIZE, HEADING, VX, VY, X, Y
-
-Array = NDArray[np.float64]
 
 POSES, ANNOTATIONS = "city_SE3_egovehicle.feather", "annotations.feather"
 POSE_COLUMNS = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
@@ -105,12 +104,12 @@ class LogMotion:
         last = min(self.frame_times_s[-1] + SAME_FRAME_S, self.pose_times_s[-1] + MIN_POSE_SPACING_S)
         return int(np.floor(last / STEP_S)) + 1
 
-    def seconds(self, stamps_ns: NDArray[np.int64]) -> Array:
+    def seconds(self, stamps_ns: Ints) -> Array:
         """Stamps as seconds since the first annotated frame."""
         return seconds_since(self.start_ns, stamps_ns)
 
 
-def seconds_since(start_ns: int, stamps_ns: NDArray[np.int64]) -> Array:
+def seconds_since(start_ns: int, stamps_ns: Ints) -> Array:
     """Seconds from start_ns to each stamp; the difference is taken in integers."""
     seconds: Array = (stamps_ns - start_ns).astype(np.float64)
     seconds /= 1e9
@@ -155,7 +154,7 @@ def numbers(path: Path, table: Mapping[str, NDArray[np.generic]], columns: tuple
     return np.stack([table[name].astype(np.float64) for name in columns], axis=1)
 
 
-def stamps(path: Path, table: Mapping[str, NDArray[np.generic]]) -> NDArray[np.int64]:
+def stamps(path: Path, table: Mapping[str, NDArray[np.generic]]) -> Ints:
     """The column timestamp_ns. Raises BadClip where it holds no integers."""
     if table["timestamp_ns"].dtype.kind not in "iu":
         raise BadClip(str(path), "timestamp_ns", f"expected integers, found {table['timestamp_ns'].dtype}")
@@ -237,7 +236,7 @@ def world_from_ego_at(motion: LogMotion, times_s: Array) -> Array:
     return poses
 
 
-def observed_at(motion: LogMotion, times_s: Array) -> NDArray[np.bool_]:
+def observed_at(motion: LogMotion, times_s: Array) -> Bools:
     """(S,) whether an annotated frame stands within 50 ms of each time."""
     return _nearest_gap(motion.frame_times_s, times_s) < SAME_FRAME_S
 
@@ -269,7 +268,7 @@ def agents_at(motion: LogMotion, times_s: Array) -> AgentTracks:
     )
 
 
-def _spaced(times_s: Array) -> NDArray[np.intp]:
+def _spaced(times_s: Array) -> Indices:
     """Indices of the times kept when each must stand more than 1 ms after the last one kept."""
     keep = [0]
     for i in range(1, len(times_s)):
@@ -283,7 +282,7 @@ def _yaw(rotation: Rotation) -> Array:
     return np.arctan2(matrix[:, 1, 0], matrix[:, 0, 0])
 
 
-def _nearest(sorted_times: Array, times_s: Array) -> NDArray[np.intp]:
+def _nearest(sorted_times: Array, times_s: Array) -> Indices:
     """(S,) index of the nearest of the sorted times."""
     right = np.clip(np.searchsorted(sorted_times, times_s), 1, max(len(sorted_times) - 1, 1))
     right = np.minimum(right, len(sorted_times) - 1)

@@ -5,14 +5,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factory.readers.base import BadClip
+from tasks.world.arrays import Array
 from tasks.world.lanes import Lane, MapLayer, MapPolygon, RoadMap
 from tasks.world.polygons import centerline_from_boundaries, ring_from_boundaries, valid_ring
 from tasks.world.route import roadblocks_of
-
-Array = NDArray[np.float64]
 
 CAR_LANE_TYPES = {"VEHICLE": True, "BUS": True, "BIKE": False}
 

@@ -10,7 +10,6 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factory.readers.av2.log import (
     ANNOTATIONS,
@@ -33,11 +32,10 @@ from factory.readers.av2.map import map_file, read_map
 from factory.readers.base import SPLITS, BadClip, ClipRef
 from factory.readers.logs import STEP_MS, Drive, LogReader, Recorded, WholeLog, present, route_of_drive
 from factory.readers.splits import folder_split
+from tasks.world.arrays import Array
 from tasks.world.camera import Camera, SensorFile
 from tasks.world.clip import STEP_S, Block
 from tasks.world.lanes import LightState, RoadMap, TrafficLights
-
-Array = NDArray[np.float64]
 
 LICENCE = "CC BY-NC-SA 4.0 (Argoverse 2)"
 LIGHTS = "traffic_lights.feather"

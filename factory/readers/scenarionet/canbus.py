@@ -11,13 +11,10 @@ nothing tells its start, and 0 is assumed (the three scenes that tell: -0.13, 0.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
+from tasks.world.arrays import Array, Bools
 from tasks.world.clip import STEP_S
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 MESSAGE_S = 0.02
 MAX_LOST = 5  # messages in one step
@@ -32,13 +29,13 @@ def usual_steps(xy: Array) -> Array:
     return np.stack([median_filter(column, 11, mode="nearest") for column in np.diff(xy, axis=0).T], axis=1)
 
 
-def jumps(xy: Array) -> Mask:
+def jumps(xy: Array) -> Bools:
     """(S - 1,) True where the step to the next position is not part of the same drive."""
     usual = usual_steps(xy)
     return np.hypot(*(np.diff(xy, axis=0) - usual).T) > JUMP_M + JUMP_S / STEP_S * np.hypot(*usual.T)
 
 
-def on_log_clock(xy: Array, heading: Array, valid: Mask) -> tuple[Array, Array, Mask]:
+def on_log_clock(xy: Array, heading: Array, valid: Bools) -> tuple[Array, Array, Bools]:
     """Positions (S, 2), unwrapped headings (S,) and valid (S,) at the log's steps, from those stored in message order.
 
     Steps before the first message and after the last one are not valid. An ego with gaps is given back as it is.

@@ -20,11 +20,11 @@ from typing import Any
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from shapely.geometry import LineString, Polygon
 
 from factory.readers.base import BadClip
+from tasks.world.arrays import Array
 from tasks.world.polygons import CENTERLINE_SPACING_M, arc_lengths, resample
 
 CAR_LANE_KINDS = frozenset({"LANE_SURFACE_STREET", "LANE_SURFACE_UNSTRUCTURE", "LANE_FREEWAY", "LANE_UNKNOWN"})
@@ -42,8 +42,8 @@ class RawLane:
 
     lane_id: str
     kind: str
-    line: NDArray[np.float64]  # (P, 2) centreline, uniformly resampled, metres
-    ring: NDArray[np.float64]  # (M, 2) closed
+    line: Array  # (P, 2) centreline, uniformly resampled, metres
+    ring: Array  # (M, 2) closed
     has_polygon: bool
     interpolating: bool | None  # Waymo's flag; None where the file has none
     entry: tuple[str, ...] | None  # None where the file has no graph
@@ -88,7 +88,7 @@ def raw_lanes(features: Mapping[str, Any], source: str, file: str) -> dict[str, 
     return lanes
 
 
-def points(feature: Mapping[str, Any], name: str, file: str, field: str) -> NDArray[np.float64]:
+def points(feature: Mapping[str, Any], name: str, file: str, field: str) -> Array:
     """(N, 2) finite points of a polyline or polygon. Raises BadClip."""
     if name not in feature:
         raise BadClip(file, f"{field}.{name}", "missing")
@@ -103,7 +103,7 @@ def points(feature: Mapping[str, Any], name: str, file: str, field: str) -> NDAr
     return array[:, :2]
 
 
-def closed_ring(polygon: NDArray[np.float64]) -> NDArray[np.float64] | None:
+def closed_ring(polygon: Array) -> Array | None:
     """(M, 2) closed exterior of the largest valid part; None where no area is left."""
     if len(polygon) < 3:
         return None
@@ -142,9 +142,7 @@ def _forking_merging_crossing(lanes: Mapping[str, RawLane]) -> set[str]:
     return found | {ids[k] for k in crossing}
 
 
-def _ring(
-    feature: Mapping[str, Any], line: NDArray[np.float64], kind: str, file: str, field: str
-) -> NDArray[np.float64]:
+def _ring(feature: Mapping[str, Any], line: Array, kind: str, file: str, field: str) -> Array:
     if "polygon" in feature:
         ring = closed_ring(points(feature, "polygon", file, field))
         if ring is not None:
@@ -165,7 +163,7 @@ def _half_width(feature: Mapping[str, Any], file: str, field: str) -> float:
     return float(np.median(measured)) if len(measured) else HALF_WIDTH_M
 
 
-def _resampled(line: NDArray[np.float64], file: str, field: str) -> NDArray[np.float64] | None:
+def _resampled(line: Array, file: str, field: str) -> Array | None:
     """The line at uniform arc length, <= 0.75 m apart; None when it has no length."""
     line = line[np.concatenate([[True], np.hypot(*np.diff(line, axis=0).T) > 1e-6])]
     length = arc_lengths(line)[-1]

@@ -20,6 +20,7 @@ from factory.readers.scenarionet.lanes import (
     points,
     raw_lanes,
 )
+from tasks.world.arrays import Array
 from tasks.world.lanes import Lane, LightState, MapLayer, MapPolygon, RoadMap, TrafficLights
 from tasks.world.polygons import with_headings
 from tasks.world.route import roadblocks_of
@@ -208,7 +209,7 @@ def _is_outline(key: object, feature: object) -> bool:
     return str(key).startswith("boundary_") and isinstance(feature, dict) and "polyline" in feature
 
 
-def _crossings(features: Mapping[str, Any], file: str) -> tuple[NDArray[np.float64], ...]:
+def _crossings(features: Mapping[str, Any], file: str) -> tuple[Array, ...]:
     rings = (
         closed_ring(points(feature, "polygon", file, f"map_features[{key}]"))
         for key, feature in features.items()

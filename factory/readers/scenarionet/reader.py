@@ -14,7 +14,6 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factory.readers.base import BadClip, ClipRef
 from factory.readers.logs import STEP_MS, Drive, LogReader, Recorded, WholeLog, route_of_drive
@@ -31,10 +30,8 @@ from factory.readers.scenarionet.tracks import (
     sample_times,
 )
 from factory.readers.splits import folder_split, nuscenes_split, waymo_split
+from tasks.world.frames import upright
 from tasks.world.lanes import TrafficLights
-from tasks.world.vehicle import EGO_STATE_SIZE, HEADING, X, Y
-
-Array = NDArray[np.float64]
 
 SUMMARY, MAPPING = "dataset_summary.pkl", "dataset_mapping.pkl"
 
@@ -82,7 +79,7 @@ class ScenarioNetReader(LogReader[ScenarioLog]):
         if not np.isfinite(ego_states).all():
             problem = f"the ego's drive is broken within the window at {start * STEP_MS} ms"
             raise BadClip(log.file, "tracks[sdc]", problem)
-        return Recorded(_flat_poses(ego_states))
+        return Recorded(upright(ego_states))  # the format's ego has no roll or pitch, its road is at z = 0
 
 
 def scenario_files(root: Path) -> dict[str, Path]:
@@ -210,13 +207,3 @@ def _own_split(path: Path, metadata: Mapping[str, Any]) -> str | None:
     """The folder's, else the list's of the data set that was converted; nuPlan's files do not say theirs."""
     source = metadata.get("source_file")
     return folder_split(path) or nuscenes_split(path.stem) or (waymo_split(source) if isinstance(source, str) else None)
-
-
-def _flat_poses(ego_states: Array) -> Array:
-    """(S, 4, 4) rear-axle poses on the plane z = 0, the road: the format's ego has no roll or pitch."""
-    assert ego_states.shape[1] == EGO_STATE_SIZE
-    poses = np.tile(np.eye(4), (len(ego_states), 1, 1))
-    c, s = np.cos(ego_states[:, HEADING]), np.sin(ego_states[:, HEADING])
-    poses[:, 0, 0], poses[:, 0, 1], poses[:, 1, 0], poses[:, 1, 1] = c, -s, s, c
-    poses[:, 0, 3], poses[:, 1, 3] = ego_states[:, X], ego_states[:, Y]
-    return poses

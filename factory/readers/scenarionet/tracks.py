@@ -16,19 +16,16 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 from scipy.signal import savgol_filter
 
 from factory.readers.base import BadClip
 from factory.readers.scenarionet.canbus import jumps, on_log_clock
 from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.arrays import Array, Bools
 from tasks.world.clip import STEP_S
 from tasks.world.frames import wrap_angle
 from tasks.world.vehicle import AX, AY, EGO_STATE_SIZE, HEADING, PACIFICA, VX, VY, X, Y
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 KINDS = {
     "VEHICLE": AgentKind.VEHICLE,
@@ -74,7 +71,7 @@ class Track:
 
     position: Array  # (T, 3)
     heading: Array  # (T,)
-    valid: Mask  # (T,)
+    valid: Bools  # (T,)
     size: Array  # (3,) length, width, height, median over the valid frames; NaN where none is stored
 
 
@@ -175,7 +172,7 @@ def agent_tracks(
     )
 
 
-def resampled(track: Track, at: Array) -> tuple[Array, Array, Mask]:
+def resampled(track: Track, at: Array) -> tuple[Array, Array, Bools]:
     """(S, 3) position, (S,) heading in [-pi, pi), (S,) valid: both frames around the fractional one must be."""
     before = np.floor(at).astype(int)
     after = np.minimum(before + 1, len(track.valid) - 1)
@@ -186,7 +183,7 @@ def resampled(track: Track, at: Array) -> tuple[Array, Array, Mask]:
     return position, wrap_angle(heading), track.valid[before] & track.valid[after]
 
 
-def slope_velocities(xy: Array, valid: Mask) -> Array:
+def slope_velocities(xy: Array, valid: Bools) -> Array:
     """(S, N, 2) m/s: least-squares slope of the valid positions (S, N, 2) within five steps; NaN where not valid."""
     n_steps = len(xy)
     filled = np.where(valid[..., None], xy, 0.0)
@@ -229,7 +226,7 @@ def ego_segments(track: Track, source: Source, at: Array) -> tuple[Array, list[t
     return states, segments
 
 
-def _continuous(xy: Array, valid: Mask) -> list[tuple[int, int]]:
+def _continuous(xy: Array, valid: Bools) -> list[tuple[int, int]]:
     """Runs of valid steps without a jump, long enough for the quadratic fit."""
     broken = jumps(xy) | ~valid[1:] | ~valid[:-1]
     edges = [0, *(np.flatnonzero(broken) + 1).tolist(), len(xy)]

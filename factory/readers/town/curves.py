@@ -1,9 +1,8 @@
 """Plane curves as arrays of poses (N, 3): x [m], y [m], heading [rad], about one metre apart."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from tasks.world.arrays import Array
 
 
 def from_curvature(start: Array, pieces: list[tuple[float, float]], step_m: float = 1.0, ramp_m: float = 12.0) -> Array:

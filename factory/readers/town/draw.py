@@ -8,9 +8,7 @@ from photos could tell how. One shading per pixel differs by 30 to 36 dB from th
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from factory.readers.town.curves import Array
 from factory.readers.town.drive import Drive
 from factory.readers.town.figures import figure
 from factory.readers.town.mesh import Mesh, merged
@@ -18,6 +16,7 @@ from factory.readers.town.raster import rasterise
 from factory.readers.town.scenery import Scenery, lamps_lit
 from factory.readers.town.shade import shade
 from factory.readers.town.textures import TREELINE
+from tasks.world.arrays import F32, Array, Bytes, ShortInts
 from tasks.world.camera import Camera
 
 CELLS = 2  # shaded places per pixel and axis
@@ -60,7 +59,7 @@ class Stage:
     """One instant of a drive, ready to be seen: all triangles and the sun's depth map."""
 
     mesh: Mesh
-    shadow: NDArray[np.float32]
+    shadow: F32
     sun: Sun
     marks: Array
     sky_seed: int
@@ -70,8 +69,8 @@ class Stage:
 class Visible:
     """What the rasteriser found."""
 
-    keys: NDArray[np.float32]  # (H, W) 1 / depth, 0: nothing
-    ids: NDArray[np.int32]  # (H, W) triangle, -1: nothing
+    keys: F32  # (H, W) 1 / depth, 0: nothing
+    ids: ShortInts  # (H, W) triangle, -1: nothing
     planes: Array  # (T, 9)
 
 
@@ -108,7 +107,7 @@ class Theatre:
         return Stage(merged([self._standing, actors]), shadow, self._sun, self._scenery.marks, self._sky_seed)
 
 
-def _cast(shadow: NDArray[np.float32], mesh: Mesh, sun: Sun) -> None:
+def _cast(shadow: F32, mesh: Mesh, sun: Sun) -> None:
     ids = np.zeros(shadow.shape, np.int32)
     rasterise(mesh.vertices, mesh.uv, mesh.material, mesh.seed, sun.view, 0, shadow, ids, NO_PLANES)
 
@@ -131,7 +130,7 @@ def look(stage: Stage, view: Array, width: int, height: int) -> Visible:
     return Visible(keys, ids, planes)
 
 
-def paint(stage: Stage, camera: Camera, world_from_ego: Array) -> NDArray[np.uint8]:
+def paint(stage: Stage, camera: Camera, world_from_ego: Array) -> Bytes:
     """(H, W, 3) RGB picture of the stage by a camera of the ego at `world_from_ego` (4, 4)."""
     per_pixel, margin = CELLS * SAMPLES, SAMPLES  # of one cell: what the optics reach beyond the picture's edge
     scale = np.array([[per_pixel, 0.0, margin], [0.0, per_pixel, margin], [0.0, 0.0, 1.0]])
@@ -160,7 +159,7 @@ def paint(stage: Stage, camera: Camera, world_from_ego: Array) -> NDArray[np.uin
     return _through_optics(cells)
 
 
-def _through_optics(cells: NDArray[np.float32]) -> NDArray[np.uint8]:
+def _through_optics(cells: F32) -> Bytes:
     """(H, W, 3) of cells (2 H + 2, 2 W + 2, 3) in [0, 255]."""
     n_rows, n_columns = len(cells) - 3, cells.shape[1] - 3
     rows = np.sum([weight * cells[k : n_rows + k : CELLS] for k, weight in enumerate(OPTICS)], axis=0)

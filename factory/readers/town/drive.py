@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from factory.readers.town import curves
-from factory.readers.town.curves import Array
 from factory.readers.town.ego import (
     SLOWEST_MPS,
     Scenario,
@@ -29,6 +28,7 @@ from factory.readers.town.traffic import (
     overlaps,
     path_of_lanes,
 )
+from tasks.world.arrays import Array
 from tasks.world.vehicle import PACIFICA, VX
 
 WARM_STEPS = 40  # simulated before the log starts, so that it starts in the middle of things

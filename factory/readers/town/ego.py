@@ -7,10 +7,10 @@ import numpy as np
 import shapely
 
 from factory.readers.town import curves
-from factory.readers.town.curves import Array
 from factory.readers.town.streets import Lane, Streets
 from factory.readers.town.traffic import RED, STEP_S, Driver, Path, Signals, path_of_lanes
 from tasks.rollout.lqr import track
+from tasks.world.arrays import Array
 from tasks.world.clip import HISTORY_STEPS, HORIZON_STEPS
 from tasks.world.frames import box_corners
 from tasks.world.vehicle import AX, AY, EGO_STATE_SIZE, PACIFICA, VX

@@ -5,9 +5,9 @@ import shapely
 
 from factory.readers.town import curves
 from factory.readers.town import textures as tx
-from factory.readers.town.curves import Array
 from factory.readers.town.mesh import Builder, lifted
 from factory.readers.town.streets import PAVEMENT_M, Streets
+from tasks.world.arrays import Array
 
 KERB_M = 0.12  # height
 PLAIN_Z = -0.06  # the lawn around, below the road

@@ -3,9 +3,8 @@
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
-from factory.readers.town.curves import Array
+from tasks.world.arrays import Array, Ints
 
 
 @dataclass(frozen=True)
@@ -15,10 +14,10 @@ class Mesh:
     vertices: Array  # (T, 3, 3) m
     uv: Array  # (T, 3, 2) surface coordinates, mostly metres
     normals: Array  # (T, 3) unit
-    material: NDArray[np.int64]  # (T,) textures.py
+    material: Ints  # (T,) textures.py
     colour: Array  # (T, 3) 0..1
     extent: Array  # (T, 2) size of the whole face [m]
-    seed: NDArray[np.int64]  # (T,)
+    seed: Ints  # (T,)
 
     def __len__(self) -> int:
         return len(self.material)
@@ -62,7 +61,7 @@ class Builder:
         uv: Array,  # (T, 3, 2)
         material: int,
         colour: Colour = (1.0, 1.0, 1.0),
-        seed: int | NDArray[np.int64] = 0,
+        seed: int | Ints = 0,
         extent: tuple[float, float] = (0.0, 0.0),
         normals: Array | None = None,
     ) -> None:
@@ -88,7 +87,7 @@ class Builder:
         uv: Array,
         material: int,
         colour: Colour = (1.0, 1.0, 1.0),
-        seed: int | NDArray[np.int64] = 0,
+        seed: int | Ints = 0,
         extent: tuple[float, float] = (0.0, 0.0),
         normals: Array | None = None,
     ) -> None:

@@ -8,7 +8,6 @@ import numpy as np
 import shapely
 
 from factory.readers.town import curves
-from factory.readers.town.curves import Array
 from factory.readers.town.streets import (
     CROSSING_GAP_M,
     CROSSING_M,
@@ -19,6 +18,7 @@ from factory.readers.town.streets import (
     _Arm,
     _Builder,
 )
+from tasks.world.arrays import Array
 
 JUNCTION_REACH_M = 17.0  # crossroads: centre to the arms' mouths
 RING_M = 19.0  # roundabout: radius of the ring lane's centre

@@ -8,25 +8,25 @@ Visible is the largest `key`, interpolated the same way: 1/w for a camera, heigh
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factory.readers.town.textures import LEAVES, SPOKES, TREELINE, opaque_at
 from tasks.kernels.compiled import drawing_kernel
+from tasks.world.arrays import F32, Array, Ints, ShortInts
 
 NEAR_M = 0.15
 
 
 @drawing_kernel
 def rasterise(
-    vertices: NDArray[np.float64],  # (T, 3, 3) world
-    uv: NDArray[np.float64],  # (T, 3, 2)
-    material: NDArray[np.int64],  # (T,)
-    seed: NDArray[np.int64],  # (T,)
-    view: NDArray[np.float64],  # (4, 4): world point (1) -> x, y, w, key; pixel = (x / w, y / w)
+    vertices: Array,  # (T, 3, 3) world
+    uv: Array,  # (T, 3, 2)
+    material: Ints,  # (T,)
+    seed: Ints,  # (T,)
+    view: Array,  # (4, 4): world point (1) -> x, y, w, key; pixel = (x / w, y / w)
     first_id: int,
-    keys: NDArray[np.float32],  # (H, W) in and out
-    ids: NDArray[np.int32],  # (H, W) in and out: visible triangle + first_id
-    planes: NDArray[np.float64],  # (T, 9) out: 1/w, u/w, v/w as a x + b y + c; (0, 9) where not wanted
+    keys: F32,  # (H, W) in and out
+    ids: ShortInts,  # (H, W) in and out: visible triangle + first_id
+    planes: Array,  # (T, 9) out: 1/w, u/w, v/w as a x + b y + c; (0, 9) where not wanted
 ) -> None:
     """Draws triangles into `keys` and `ids`; sample (row, column) lies at (column + 0.5, row + 0.5)."""
     height, width = keys.shape

@@ -5,15 +5,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from factory.readers.town import curves
 from factory.readers.town import textures as tx
-from factory.readers.town.curves import Array
 from factory.readers.town.houses import KERB_M, PLAIN_Z, build_houses, plant_tree, plant_trees
 from factory.readers.town.mesh import Builder, Mesh, lifted
 from factory.readers.town.streets import CROSSING_GAP_M, CROSSING_M, PAVEMENT_M, STOP_LINE_M, Road, Streets
 from factory.readers.town.traffic import GREEN, RED, YELLOW
+from tasks.world.arrays import Array, Ints
 
 LAMPS = {RED: (0, (0.95, 0.10, 0.06)), YELLOW: (1, (0.98, 0.75, 0.10)), GREEN: (2, (0.12, 0.90, 0.45))}
 LAMP_OFF = (0.07, 0.07, 0.06)
@@ -26,7 +25,7 @@ class Scenery:
     mesh: Mesh
     marks: Array  # (roads, M, 9) lane paint, shade.road_paint
     lamps: tuple[Mesh, ...]  # per signal post, its lamps: thirds red, yellow, green
-    lamp_groups: NDArray[np.int64]  # (posts,) signal group
+    lamp_groups: Ints  # (posts,) signal group
 
 
 def lamps_lit(lamps: Mesh, state: int) -> Mesh:
@@ -64,7 +63,7 @@ def build_scenery(streets: Streets, rng: np.random.Generator) -> Scenery:
     return Scenery(b.mesh(), marks, lamps, groups)
 
 
-def _stations(line: Array) -> NDArray[np.int64]:
+def _stations(line: Array) -> Ints:
     """Indices of a 1 m curve at which a ribbon is cut: denser in bends."""
     turned = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(line[:, 2])))])
     wanted = np.cumsum(

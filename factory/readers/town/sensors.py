@@ -8,11 +8,10 @@ stamp, so the points need no motion compensation.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factory.readers.town import textures as tx
-from factory.readers.town.curves import Array
 from factory.readers.town.draw import Stage, camera_view, look
+from tasks.world.arrays import F32, Array, Bytes, ShortInts
 from tasks.world.camera import Camera
 
 REAR_AXLE_Z_M = 0.33  # the ego frame's origin above the road
@@ -65,10 +64,10 @@ _REFLECTANCE = {tx.ROAD: 0.22, tx.ASPHALT: 0.20, tx.GLOW: 0.9, tx.SIGN: 0.95, tx
 class Sweep:
     """P returns, ego frame."""
 
-    points: NDArray[np.float32]  # (P, 3) m
-    intensity: NDArray[np.uint8]  # (P,)
-    laser_number: NDArray[np.uint8]  # (P,)
-    offset_ns: NDArray[np.int32]  # (P,) of the beam within its turn of 0.1 s
+    points: F32  # (P, 3) m
+    intensity: Bytes  # (P,)
+    laser_number: Bytes  # (P,)
+    offset_ns: ShortInts  # (P,) of the beam within its turn of 0.1 s
 
 
 def scan(stage: Stage, world_from_ego: Array, beams: int, azimuths: int) -> Sweep:
@@ -113,7 +112,7 @@ def scan(stage: Stage, world_from_ego: Array, beams: int, azimuths: int) -> Swee
     )
 
 
-def _reflectance(stage: Stage, triangle: NDArray[np.int32]) -> Array:
+def _reflectance(stage: Stage, triangle: ShortInts) -> Array:
     out = np.clip(stage.mesh.colour[triangle].mean(axis=1), 0.05, 0.6)
     for material, value in _REFLECTANCE.items():
         out[stage.mesh.material[triangle] == material] = value

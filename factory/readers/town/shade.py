@@ -2,16 +2,14 @@
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
 from factory.readers.town import textures as tx
 from factory.readers.town.textures import RGB, chance, grain, inside, noise, visible
 from tasks.kernels.compiled import drawing_kernel
+from tasks.world.arrays import F32, Array, Ints, ShortInts
 
 
 @drawing_kernel
-def road_paint(u: float, d: float, marks: NDArray[np.float64], fu: float, fd: float) -> tuple[float, float]:
+def road_paint(u: float, d: float, marks: Array, fu: float, fd: float) -> tuple[float, float]:
     """(coverage, yellowness) of the paint at arc length u and offset d of a road.
 
     Marks (M, 9): d from, d to, u from, u to, u period, u dash, d period, d dash (period 0: solid), yellow.
@@ -41,7 +39,7 @@ def road_paint(u: float, d: float, marks: NDArray[np.float64], fu: float, fd: fl
 
 
 @drawing_kernel
-def road_surface(x: float, y: float, u: float, d: float, marks: NDArray[np.float64], fu: float, fd: float) -> RGB:
+def road_surface(x: float, y: float, u: float, d: float, marks: Array, fu: float, fd: float) -> RGB:
     """Asphalt with worn lane paint; the gutter beside the kerb is darker."""
     fp = max(fu, fd)
     r, g, b = tx.asphalt(x, y, fp)
@@ -62,7 +60,7 @@ def road_surface(x: float, y: float, u: float, d: float, marks: NDArray[np.float
 
 
 @drawing_kernel
-def sky(dx: float, dy: float, dz: float, sun: NDArray[np.float64], seed: int) -> RGB:
+def sky(dx: float, dy: float, dz: float, sun: Array, seed: int) -> RGB:
     """The sky in a direction: gradient, clouds on a high plane, a glow around the sun."""
     up = max(0.0, dz)
     blend = math.sqrt(up)
@@ -97,7 +95,7 @@ def surface_colour(
     extent_u: float,
     extent_v: float,
     seed: int,
-    marks: NDArray[np.float64],
+    marks: Array,
 ) -> RGB:
     """Colour before light of a material; (r, g, b) is the triangle's own colour, `extent` the size of its face [m]."""
     fp = max(fu, fv)
@@ -193,9 +191,7 @@ def surface_colour(
 
 
 @drawing_kernel
-def lit_by_sun(
-    x: float, y: float, z: float, sun_view: NDArray[np.float64], shadow: NDArray[np.float32], bias: float
-) -> float:
+def lit_by_sun(x: float, y: float, z: float, sun_view: Array, shadow: F32, bias: float) -> float:
     """0 in shade .. 1 in the sun: four taps of the sun's depth map, blended; outside it: sun."""
     sx = sun_view[0, 0] * x + sun_view[0, 1] * y + sun_view[0, 2] * z + sun_view[0, 3] - 0.5
     sy = sun_view[1, 0] * x + sun_view[1, 1] * y + sun_view[1, 2] * z + sun_view[1, 3] - 0.5
@@ -213,21 +209,21 @@ def lit_by_sun(
 
 @drawing_kernel
 def shade(
-    ids: NDArray[np.int32],  # (2H, 2W) visible triangle, -1: sky
-    planes: NDArray[np.float64],  # (T, 9)
-    normals: NDArray[np.float64],  # (T, 3)
-    material: NDArray[np.int64],
-    colour: NDArray[np.float64],  # (T, 3)
-    extent: NDArray[np.float64],  # (T, 2)
-    seed: NDArray[np.int64],
-    marks: NDArray[np.float64],  # (roads, M, 9)
-    origin: NDArray[np.float64],  # (3,) the camera in the world
-    rays: NDArray[np.float64],  # (3, 3): world direction of sample (x, y), depth 1 = rays @ (x, y, 1)
-    sun: NDArray[np.float64],  # (3,) unit, towards the sun
-    sun_view: NDArray[np.float64],  # (4, 4)
-    shadow: NDArray[np.float32],
+    ids: ShortInts,  # (2H, 2W) visible triangle, -1: sky
+    planes: Array,  # (T, 9)
+    normals: Array,  # (T, 3)
+    material: Ints,
+    colour: Array,  # (T, 3)
+    extent: Array,  # (T, 2)
+    seed: Ints,
+    marks: Array,  # (roads, M, 9)
+    origin: Array,  # (3,) the camera in the world
+    rays: Array,  # (3, 3): world direction of sample (x, y), depth 1 = rays @ (x, y, 1)
+    sun: Array,  # (3,) unit, towards the sun
+    sun_view: Array,  # (4, 4)
+    shadow: F32,
     sky_seed: int,
-    image: NDArray[np.float32],  # (H, W, 3) out, RGB in [0, 255]
+    image: F32,  # (H, W, 3) out, RGB in [0, 255]
 ) -> None:
     """Each cell is the mean of its 2 x 2 samples; a triangle that covers several of them is shaded once."""
     height, width = image.shape[:2]

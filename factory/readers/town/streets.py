@@ -10,7 +10,7 @@ import numpy as np
 import shapely
 
 from factory.readers.town import curves
-from factory.readers.town.curves import Array
+from tasks.world.arrays import Array
 
 CROSSING_M = 3.0  # a crosswalk's width along the road
 CROSSING_GAP_M = 0.8  # from the junction's edge

@@ -7,13 +7,12 @@ that would still touch an earlier one is left out, so nobody collides, whatever 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
 from factory.readers.town import curves
-from factory.readers.town.curves import Array
 from factory.readers.town.streets import Streets
+from tasks.world.arrays import Array, Bools
 from tasks.world.frames import box_corners
 
 STEP_S = 0.1
@@ -186,7 +185,7 @@ def _on_path(path: Path, driver: Driver, others: Array) -> tuple[Array, Array]:
     return rear.reshape(steps, n), np.nan_to_num(speed)
 
 
-def overlaps(boxes: Array, others: Array, margin_m: float) -> NDArray[np.bool_]:
+def overlaps(boxes: Array, others: Array, margin_m: float) -> Bools:
     """(S, J): does `boxes` (S, 5), grown by `margin_m` on every side, touch `others` (S, J, 5)? NaN touches nothing."""
     hit = np.zeros(others.shape[:2], bool)
     grown = boxes + np.array([0.0, 0.0, 0.0, 2 * margin_m, 2 * margin_m])
@@ -198,7 +197,7 @@ def overlaps(boxes: Array, others: Array, margin_m: float) -> NDArray[np.bool_]:
     return hit
 
 
-def _boxes_touch(a: Array, b: Array) -> NDArray[np.bool_]:
+def _boxes_touch(a: Array, b: Array) -> Bools:
     """(M,) separating-axis test of boxes (M, 5)."""
     corners_a, corners_b = box_corners(a), box_corners(b)
     touch = np.ones(len(a), bool)
@@ -209,7 +208,7 @@ def _boxes_touch(a: Array, b: Array) -> NDArray[np.bool_]:
     return touch
 
 
-def endangers(ego: Array, speeds: Array, others: Array, margin_m: float = 0.15) -> NDArray[np.bool_]:
+def endangers(ego: Array, speeds: Array, others: Array, margin_m: float = 0.15) -> Bools:
     """(J,): would the ego (S, 5), straight on for up to 0.9 s, touch that track? Stricter than docs/reward.md 2g."""
     danger = np.zeros(others.shape[1], bool)
     for ahead in (0, 3, 6, 9):

@@ -17,10 +17,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.feather
 import shapely
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from factory.readers.town.curves import Array
 from factory.readers.town.draw import Theatre, paint
 from factory.readers.town.drive import Drive
 from factory.readers.town.sensors import REAR_AXLE_Z_M, build_rig, scan, world_from_ego
@@ -28,9 +26,8 @@ from factory.readers.town.streets import Lane, Streets
 from factory.readers.town.town import LOG_STEPS, STEPS_PER_SWEEP, WINDOWS_PER_LOG, Town, log_name, plan_log
 from factory.readers.town.traffic import GREEN, RED, YELLOW
 from factory.wording import time_text
+from tasks.world.arrays import Array, Ints
 from tasks.world.camera import Camera
-
-Stamps = NDArray[np.int64]
 
 LICENCE = "Apache-2.0 (synthetic)"
 ANNOTATION_RANGE_M = 100.0
@@ -120,7 +117,7 @@ def _sensors(
     drive: Drive,
     rig: tuple[Camera, ...],
     settings: TownSettings,
-    stamps: Stamps,
+    stamps: Ints,
     threads: int,
 ) -> None:
     if not rig and not settings.lidar_beams:
@@ -159,12 +156,12 @@ def _yaw_columns(yaw: Array) -> dict[str, Any]:
     return {"qw": np.cos(yaw / 2), "qx": zero, "qy": zero, "qz": np.sin(yaw / 2)}
 
 
-def _poses(drive: Drive, stamps: Stamps) -> dict[str, Any]:
+def _poses(drive: Drive, stamps: Ints) -> dict[str, Any]:
     place = {"tx_m": drive.ego[:, 0], "ty_m": drive.ego[:, 1], "tz_m": np.full(len(stamps), REAR_AXLE_Z_M)}
     return {"timestamp_ns": stamps, **_yaw_columns(drive.ego[:, 2]), **place}
 
 
-def _annotations(drive: Drive, stamps: Stamps) -> dict[str, Any]:
+def _annotations(drive: Drive, stamps: Ints) -> dict[str, Any]:
     """One row per box and frame, box pose in the ego frame of that frame."""
     rows: list[tuple[int, int]] = []  # (step, track)
     poses = np.stack([track.poses for track in drive.tracks], axis=1)
@@ -190,7 +187,7 @@ def _annotations(drive: Drive, stamps: Stamps) -> dict[str, Any]:
     }
 
 
-def _lights(streets: Streets, drive: Drive, stamps: Stamps) -> dict[str, Any]:
+def _lights(streets: Streets, drive: Drive, stamps: Ints) -> dict[str, Any]:
     """A row per frame and light-governed connector of the map; empty where it has none."""
     governed = [lane for lane in _near_lanes(streets, drive) if lane.light_group >= 0]
     if not governed:

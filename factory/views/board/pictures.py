@@ -19,7 +19,6 @@ import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
 from factory.store.samples import Store
 from factory.store.schema import AGENT_STEPS, SAMPLES, SCHEMA, table_to_rows
@@ -37,6 +36,7 @@ from factory.views.sample_picture import (
     sample_bev,
 )
 from factory.views.show import logged_drive
+from tasks.world.arrays import Array
 
 LARGE_PX = 600
 BEV_SIZES = (300, LARGE_PX)  # divisible by 3 and 4
@@ -48,7 +48,6 @@ KEPT_DRIVES = 4096  # logs' drives of 2 kB, read from prepared clips
 MADE_FROM = ("clip_id", "settings_hash")  # what tells a row's prepared clip
 COLUMNS = tuple(name for name in SCHEMA.names if name not in ("label_subscores", "label_progress"))  # of a row
 Sample = Mapping[str, Any]
-Array = NDArray[np.float64]
 Value = TypeVar("Value")
 
 

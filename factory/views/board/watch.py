@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from numpy.typing import NDArray
 
 from factory.store.samples import CURRENT_RUN, Store
 from factory.store.table import KeyedTable, LiveFile
+from tasks.world.arrays import F32
 
 SAMPLE_COLUMNS = (
     "attempt_id",
@@ -64,7 +64,6 @@ OUTCOME_COLUMNS = (
 )
 CANDIDATE_COLUMNS = ("clip_id", "n_candidates", "gate_counts", "stage", "reason", "candidates")
 LOOK_EVERY_S = 2.0
-Numbers = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -73,7 +72,7 @@ class Part:
 
     rows: pa.Table
     seconds: Mapping[str, tuple[int, float]] = field(default_factory=dict)  # outcomes: stage -> attempts, seconds
-    end_points: Numbers | None = None  # candidates: (N, 2) x, y [m], frame of the logged pose at T+H
+    end_points: F32 | None = None  # candidates: (N, 2) x, y [m], frame of the logged pose at T+H
 
 
 class Watched:
@@ -134,7 +133,7 @@ def seconds_of(column: pa.ChunkedArray) -> dict[str, tuple[int, float]]:
     return totals
 
 
-def end_points_of(column: pa.ChunkedArray) -> Numbers:
+def end_points_of(column: pa.ChunkedArray) -> F32:
     """(N, 2) where the candidates of all rows end."""
     flat = pc.list_flatten(column)
     x, y = (pc.struct_field(flat, name).to_numpy().astype(np.float32) for name in ("end_x", "end_y"))
@@ -154,7 +153,7 @@ class Snapshot:
     candidate_paths: Sequence[str]
     sample_bytes: int
     seconds: Mapping[str, tuple[int, float]]  # stage -> attempts, seconds: of rejected attempts
-    end_points: Numbers  # (N, 2) of all candidates
+    end_points: F32  # (N, 2) of all candidates
     runs: Sequence[Mapping[str, Any]]  # records of run.json, oldest first
     last: Mapping[str, Any]  # last_run.json, empty where there is none
     current: Mapping[str, Any]  # current_run.json, likewise

@@ -26,8 +26,9 @@ from planners.models.attention import Decoder
 from planners.models.auxiliary import AgentHead, BevHead, agent_losses, bev_loss
 from planners.models.diffusiondrive.ddim import kept, noised, stepped
 from planners.models.diffusiondrive.decoder import DiffusionDecoder
-from planners.models.planner import FloatArray, Planner, TrainingData, evaluating
+from planners.models.planner import Planner, TrainingData, evaluating
 from planners.models.transfuser import FusionSettings, LatentFusion
+from tasks.world.arrays import FloatArray
 
 TRUNCATED = 50  # noise steps 0 .. 49 are trained
 NOISED_TO = 8  # where planning starts

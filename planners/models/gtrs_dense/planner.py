@@ -26,10 +26,11 @@ from planners.models.attention import Decoder, Layer
 from planners.models.backbones.registry import BackboneSettings
 from planners.models.gtrs_dense.tokens import FusedTokens, PictureTokens
 from planners.models.gtrs_dense.weighting import IMITATION, WEIGHTINGS, WeightingName, choose
-from planners.models.planner import FloatArray, Planner, TrainingData, evaluating
+from planners.models.planner import Planner, TrainingData, evaluating
 from planners.models.transfuser import FusionSettings
 from tasks.reward.label_bytes import Normalise
 from tasks.subscores import HALVES, LABELLED
+from tasks.world.arrays import FloatArray
 from tasks.world.vocabulary import Vocabulary
 
 STATUS = 8

@@ -11,21 +11,20 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 import shapely.ops
-from numpy.typing import NDArray
 
 from tasks.experts.pdm_closed.forecast import Things
 from tasks.experts.pdm_closed.path import DrivePaths, project
-from tasks.experts.pdm_closed.shapes import ring_contains, segments_touch
 from tasks.kernels.compiled import kernel
+from tasks.world.arrays import Array, Ints
+from tasks.world.geometry import ring_contains, segments_touch, to_line
 
-Array = NDArray[np.float64]
 ROUNDING_M = 1e-9  # what is decided by circles stays this far from the edge
 
 
 class Corridors(NamedTuple):
     """One polygon, with holes where the path closes on itself, around a stretch of each of L paths."""
 
-    first: NDArray[np.int64]  # (L + 1,) polygon l: edges first[l] .. first[l + 1] - 1, of all its rings
+    first: Ints  # (L + 1,) polygon l: edges first[l] .. first[l + 1] - 1, of all its rings
     ax: Array  # (E,) start of each edge [m], world frame
     ay: Array  # (E,)
     bx: Array  # (E,) its end
@@ -71,14 +70,17 @@ def lead_progress(paths: DrivePaths, swept: Corridors, things: Things) -> Array:
     for path in range(n_paths):
         squares = np.empty(swept.first[path + 1] - swept.first[path])
         for m in range(n_things):
-            inside, room = False, -1.0  # room: how far the thing can move before it reaches the corridor's edge [m]
+            inside, clearance = (
+                False,
+                -1.0,
+            )  # [m] it can move before it reaches the corridor's edge
             for sample in range(n_samples):
                 if sample > 0 and things.pace[m] == 0.0:
                     out[path, sample, m] = out[path, 0, m]
                     continue
-                room -= things.pace[m]
-                if room < 0.0:
-                    inside, room = _in_corridor(swept, path, things, m, sample, squares)
+                clearance -= things.pace[m]
+                if clearance < 0.0:
+                    inside, clearance = _in_corridor(swept, path, things, m, sample, squares)
                 if inside:
                     out[path, sample, m] = project(paths, path, things.center_x[sample, m], things.center_y[sample, m])
     return out
@@ -88,10 +90,10 @@ def lead_progress(paths: DrivePaths, swept: Corridors, things: Things) -> Array:
 def _in_corridor(
     swept: Corridors, path: int, things: Things, m: int, sample: int, squares: Array
 ) -> tuple[bool, float]:
-    """Whether thing m has a point in common with a path's corridor, and its room to the corridor's edge [m].
+    """Whether thing m has a point in common with a path's corridor, and its clearance to the corridor's edge [m].
 
-    squares: scratch, one for each edge of the corridor. The room is negative where the edge runs through the thing's
-    circle, and never more than there is.
+    squares: scratch, one for each edge of the corridor. The clearance is negative where the edge runs through the
+    thing's circle, and never more than there is.
     """
     x, y, radius = things.center_x[sample, m], things.center_y[sample, m], things.radius[m]
     low_x, low_y, high_x, high_y = swept.bounds[path]
@@ -99,12 +101,12 @@ def _in_corridor(
     if not outside < 0.0:  # also where the corridor is empty (NaN)
         return False, outside
     inside = _edges_around(swept, path, x, y, squares)
-    room = math.sqrt(squares.min()) - radius - ROUNDING_M
-    if room >= 0.0:
-        return inside, room
+    clearance = math.sqrt(squares.min()) - radius - ROUNDING_M
+    if clearance >= 0.0:
+        return inside, clearance
     ring_x = things.x[sample, things.first[m] : things.first[m + 1]]
     ring_y = things.y[sample, things.first[m] : things.first[m + 1]]
-    return _ring_touches(swept, path, ring_x, ring_y, (radius + ROUNDING_M) ** 2, squares), room
+    return _ring_touches(swept, path, ring_x, ring_y, (radius + ROUNDING_M) ** 2, squares), clearance
 
 
 @kernel
@@ -136,9 +138,7 @@ def _edges_around(swept: Corridors, path: int, x: float, y: float, squares: Arra
     for e in range(squares.shape[0]):
         ex, ey = bx[e] - ax[e], by[e] - ay[e]
         ux, uy = x - ax[e], y - ay[e]
-        t = min(max((ux * ex + uy * ey) * inverse_square[e], 0.0), 1.0)
-        rx, ry = ux - t * ex, uy - t * ey
-        squares[e] = rx * rx + ry * ry
+        squares[e] = to_line(ux, uy, ex, ey, (ux * ex + uy * ey) * inverse_square[e])[1]
         straddles = (ay[e] > y) != (by[e] > y)
         crossings += straddles & ((ux * ey < uy * ex) == (ey > 0.0))
     return crossings % 2 == 1

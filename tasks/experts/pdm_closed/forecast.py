@@ -6,16 +6,15 @@ from typing import NamedTuple
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
-from tasks.experts.pdm_closed.path import HALF_TURN, wrapped
-from tasks.experts.pdm_closed.shapes import rings_touch
 from tasks.kernels.compiled import kernel
 from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.arrays import Array, Bools, Indices, Ints
+from tasks.world.boxes import ego_boxes
 from tasks.world.frames import box_corners
-from tasks.world.vehicle import HEADING, PACIFICA, Vehicle, X, Y
+from tasks.world.geometry import rings_touch, wrapped
+from tasks.world.vehicle import PACIFICA
 
-Array = NDArray[np.float64]
 STEP_S = 0.1
 SAMPLE_STEPS = 2  # one forecast per 0.2 s: step i of the plan sees sample i // 2
 RADIUS_M = 100.0  # from the ego centre
@@ -27,7 +26,7 @@ NEAREST = np.array([50, 50, 25, 10])  # of each group
 class Things(NamedTuple):
     """M closed rings that may stand in the way, at S samples of time; the V vertices of all lie behind one another."""
 
-    first: NDArray[np.int64]  # (M + 1,) ring m: vertices first[m] .. first[m + 1] - 1, the first not repeated
+    first: Ints  # (M + 1,) ring m: vertices first[m] .. first[m + 1] - 1, the first not repeated
     x: Array  # (S, V) [m], world frame
     y: Array  # (S, V)
     center_x: Array  # (S, M) centroid of the area [m]
@@ -36,20 +35,20 @@ class Things(NamedTuple):
     pace: Array  # (M,) what it moves from one sample to the next [m]
     speed: Array  # (M,) as a lead [m/s], 0 for standing things
     heading: Array  # (M,) [rad]
-    is_light: NDArray[np.bool_]  # (M,) a red light
+    is_light: Bools  # (M,) a red light
 
 
 @dataclass(frozen=True)
 class Forecast:
     """M objects as seen now: standing ones first, then vehicles, pedestrians, bicycles, each by distance."""
 
-    track: NDArray[np.intp]  # (M,) column in the agents it was made from
+    track: Indices  # (M,) column in the agents it was made from
     boxes: Array  # (M, 5) now
     corners: Array  # (M, 4, 2) of the boxes
     drift: Array  # (M, 2) velocity used to move the box [m/s]: along its heading or straight against it
     speed: Array  # (M,) [m/s]
-    is_agent: NDArray[np.bool_]  # (M,) vehicles, pedestrians and bicycles
-    touches_ego: NDArray[np.bool_]  # (M,) at the start; such objects are ignored for good
+    is_agent: Bools  # (M,) vehicles, pedestrians and bicycles
+    touches_ego: Bools  # (M,) at the start; such objects are ignored for good
     red_lights: tuple[shapely.Polygon, ...] = ()  # on-route connectors that are red now, kept red
     red_light_holds_ego: tuple[bool, ...] = ()  # the ego's footprint lies within it already: it is no lead
 
@@ -92,25 +91,17 @@ class Forecast:
         )
 
 
-def ego_box(pose: Array, vehicle: Vehicle = PACIFICA) -> Array:
-    """Footprint (5,) of a rear-axle pose (3,)."""
-    x = pose[0] + vehicle.rear_axle_to_center * np.cos(pose[2])
-    y = pose[1] + vehicle.rear_axle_to_center * np.sin(pose[2])
-    return np.array([x, y, pose[2], vehicle.length, vehicle.width])
-
-
 def forecast(
     ego_state: Array,
     agents: AgentTracks,
     red_lights: tuple[shapely.Polygon, ...] = (),
-    vehicle: Vehicle = PACIFICA,
 ) -> Forecast:
     """The objects to reckon with, seen from `ego_state` (11,): `agents` at its first step, none further than 100 m.
 
     The nearest 50 vehicles, 25 pedestrians, 10 bicycles and 50 standing objects, by the distance of their centres to
     the ego's. Source: docs/reward.md 4.
     """
-    ego = ego_box(ego_state[[X, Y, HEADING]], vehicle)
+    ego = ego_boxes(ego_state, PACIFICA)
     distance = np.hypot(agents.boxes[0, :, 0] - ego[0], agents.boxes[0, :, 1] - ego[1])
     group = np.array([GROUP_OF.get(kind, STANDING) for kind in agents.kinds], dtype=np.intp)
     track = _nearest(np.flatnonzero(agents.valid[0] & (distance <= RADIUS_M)), distance, group)
@@ -132,7 +123,7 @@ def forecast(
     )
 
 
-def _nearest(found: NDArray[np.intp], distance: Array, group: NDArray[np.intp]) -> NDArray[np.intp]:
+def _nearest(found: Indices, distance: Array, group: Indices) -> Indices:
     """Those of `found` that are among the nearest of their group: group by group, each by distance."""
     ordered = found[np.lexsort((distance[found], group[found]))]
     of = group[ordered]
@@ -141,9 +132,7 @@ def _nearest(found: NDArray[np.intp], distance: Array, group: NDArray[np.intp]) 
 
 
 @kernel
-def _expected(
-    boxes: Array, velocities: Array, is_agent: NDArray[np.bool_], footprint: Array
-) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+def _expected(boxes: Array, velocities: Array, is_agent: Bools, footprint: Array) -> tuple[Array, Array, Array, Bools]:
     """corners (M, 4, 2), drift (M, 2), speed (M,) and touches_ego (M,) of Forecast. footprint: (4, 2) of the ego."""
     count = boxes.shape[0]
     corners, drift, speed = np.empty((count, 4, 2)), np.zeros((count, 2)), np.empty(count)
@@ -158,8 +147,8 @@ def _expected(
             corners[m, i, 1] = y + s * along + c * across
         speed[m] = math.hypot(velocities[m, 0], velocities[m, 1])
         if is_agent[m]:
-            astray = abs(wrapped(heading - math.atan2(velocities[m, 1], velocities[m, 0])))
-            direction = heading if astray < HALF_TURN / 2.0 else heading + HALF_TURN
+            off_course = abs(wrapped(heading - math.atan2(velocities[m, 1], velocities[m, 0])))
+            direction = heading if off_course < math.pi / 2.0 else heading + math.pi
             drift[m, 0], drift[m, 1] = speed[m] * math.cos(direction), speed[m] * math.sin(direction)
         touches_ego[m] = rings_touch(footprint[:, 0], footprint[:, 1], corners[m, :, 0], corners[m, :, 1])
     return corners, drift, speed, touches_ego
@@ -167,7 +156,7 @@ def _expected(
 
 @kernel
 def _over_time(
-    first: NDArray[np.int64], vertices: Array, centers: Array, drift: Array, samples: int
+    first: Ints, vertices: Array, centers: Array, drift: Array, samples: int
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
     """x, y (S, V), center_x, center_y (S, M), radius, pace (M,) of Things from V vertices now and M drifts."""
     count = centers.shape[0]

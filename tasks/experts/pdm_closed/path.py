@@ -5,13 +5,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tasks.experts.pdm_closed.shapes import to_segment
 from tasks.kernels.compiled import kernel
+from tasks.world.arrays import Array
+from tasks.world.geometry import to_line, to_segment, wrapped
 
-Array = NDArray[np.float64]
-HALF_TURN = math.pi
 MIN_PROGRESS_M = 1e-5  # interpolation never asks for the very first point: joints may repeat it
 _REPEATED_M2 = 1e-300  # below it the inverse of a squared length would overflow
 _TIE_M2 = 1e-6  # segments whose squared distance is this near the least are looked at again, in the exact arithmetic
@@ -56,7 +54,7 @@ def _moved_sideways(centerline: Array, offsets_m: Array) -> DrivePaths:
     for path in range(n_paths):
         unwrap = 0.0
         for k in range(n_points):
-            side = centerline[k, 2] + HALF_TURN / 2.0
+            side = centerline[k, 2] + math.pi / 2.0
             x[path, k] = centerline[k, 0] + math.cos(side) * offsets_m[path]
             y[path, k] = centerline[k, 1] + math.sin(side) * offsets_m[path]
             here = wrapped(centerline[k, 2])
@@ -64,7 +62,7 @@ def _moved_sideways(centerline: Array, offsets_m: Array) -> DrivePaths:
                 heading[path, k], progress[path, k] = here, 0.0
                 continue
             turn = here - wrapped(centerline[k - 1, 2])
-            if abs(turn) >= HALF_TURN:
+            if abs(turn) >= math.pi:
                 unwrap += wrapped(turn) - turn
             heading[path, k] = here + unwrap
             dx, dy = x[path, k] - x[path, k - 1], y[path, k] - y[path, k - 1]
@@ -73,12 +71,6 @@ def _moved_sideways(centerline: Array, offsets_m: Array) -> DrivePaths:
             if square > _REPEATED_M2:
                 inverse_square[path, k - 1] = 1.0 / square
     return DrivePaths(x, y, heading, progress, inverse_square)
-
-
-@kernel
-def wrapped(angle: float) -> float:
-    """An angle [rad] in [-pi, pi)."""
-    return (angle + HALF_TURN) % (2.0 * HALF_TURN) - HALF_TURN
 
 
 @kernel
@@ -112,9 +104,7 @@ def project(paths: DrivePaths, path: int, px: float, py: float) -> float:
     for k in range(inverse.shape[0]):
         ex, ey = next_x[k] - x[k], next_y[k] - y[k]
         ux, uy = px - x[k], py - y[k]
-        t = min(max((ux * ex + uy * ey) * inverse[k], 0.0), 1.0)
-        rx, ry = ux - t * ex, uy - t * ey
-        squares[k] = rx * rx + ry * ry
+        squares[k] = to_line(ux, uy, ex, ey, (ux * ex + uy * ey) * inverse[k])[1]
     bound = squares.min()
     bound += _TIE_M2 * (1.0 + bound)
     nearest, found = np.inf, 0.0

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
-from tasks.experts.pdm_closed.forecast import RADIUS_M, ego_box, forecast
+from tasks.experts.pdm_closed.forecast import RADIUS_M, forecast
 from tasks.experts.pdm_closed.path import MIN_PROGRESS_M, path_length_m
 from tasks.experts.pdm_closed.proposals import SCORED_STEPS, Proposals, proposals
 from tasks.experts.pdm_closed.settings import DEFAULTS, PdmSettings
@@ -24,12 +23,12 @@ from tasks.reward.prepare import prepare
 from tasks.rollout.lqr import track
 from tasks.stages import Rejected
 from tasks.world.agents import AgentTracks
+from tasks.world.arrays import Array
+from tasks.world.boxes import ego_boxes
 from tasks.world.clip import Scene
 from tasks.world.lanes import LightState, MapLayer, MapPolygon
 from tasks.world.polygons import polygons_near
-from tasks.world.vehicle import EGO_STATE_SIZE, HEADING, PACIFICA, Vehicle
-
-Array = NDArray[np.float64]
+from tasks.world.vehicle import EGO_STATE_SIZE, PACIFICA
 
 __all__ = ["PdmClosed", "PdmPlan", "PdmSettings", "pdm_closed_poses", "plan_for", "plan_pdm_closed"]
 
@@ -64,7 +63,6 @@ def plan_pdm_closed(
     red_lane_ids: frozenset[str] = frozenset(),
     speed_limit_mps: float | None = None,
     settings: PdmSettings = DEFAULTS,
-    vehicle: Vehicle = PACIFICA,
 ) -> PdmPlan:
     """Plan from `ego_state` (11,) along `centerline` (N, 3).
 
@@ -79,10 +77,10 @@ def plan_pdm_closed(
         polygon for polygon in polygons if polygon.layer is MapLayer.LANE_CONNECTOR and polygon.token in red_on_route
     ]
     lights = tuple(shapely.Polygon(polygon.ring[:, :2]) for polygon in red)
-    seen = forecast(ego_state, agents, lights, vehicle)
-    candidates = proposals(ego_state, centerline, seen, speed_limit_mps, settings, vehicle)
+    seen = forecast(ego_state, agents, lights)
+    candidates = proposals(ego_state, centerline, seen, speed_limit_mps, settings)
     driven = candidates.poses[:, : SCORED_STEPS + 1]
-    simulated = track(ego_state, driven[:, 1:], vehicle, planned_pose0=driven[:, 0])
+    simulated = track(ego_state, driven[:, 1:], planned_pose0=driven[:, 0])
     prepared = prepare(
         past_states=None,
         centerline=centerline,
@@ -90,7 +88,6 @@ def plan_pdm_closed(
         route_lane_ids=route_lane_ids,
         objects=seen.tracks(agents, SCORED_STEPS + 1),
         red_lanes=tuple(polygon.token for polygon in red),
-        vehicle=vehicle,
         drop_touching=False,  # the forecast's tracks are without them
     )
     scores = score(prepared, simulated)
@@ -110,7 +107,7 @@ def _refuse_nonsense(ego_state: Array, agents: AgentTracks) -> None:
         raise ValueError(f"agents: track {unknown} is valid at the first step but its box or velocity is not finite")
 
 
-def plan_for(scene: Scene, settings: PdmSettings = DEFAULTS, vehicle: Vehicle = PACIFICA) -> PdmPlan:
+def plan_for(scene: Scene, settings: PdmSettings = DEFAULTS) -> PdmPlan:
     """PDM-Closed from a scene, seeing its agents and lights at the scene's step only."""
     clip = scene.clip
     lights = clip.lights
@@ -119,7 +116,7 @@ def plan_for(scene: Scene, settings: PdmSettings = DEFAULTS, vehicle: Vehicle = 
         for lane_id, state in zip(lights.lane_ids, lights.states[scene.step] if lights.lane_ids else ())
         if state == LightState.RED
     }
-    center = ego_box(scene.ego_state[: HEADING + 1], vehicle)[:2]
+    center = ego_boxes(scene.ego_state, PACIFICA)[:2]
     return plan_pdm_closed(
         ego_state=scene.ego_state,
         centerline=scene.centerline,
@@ -129,7 +126,6 @@ def plan_for(scene: Scene, settings: PdmSettings = DEFAULTS, vehicle: Vehicle = 
         red_lane_ids=frozenset(red_now),
         speed_limit_mps=starting_speed_limit(scene),
         settings=settings,
-        vehicle=vehicle,
     )
 
 

@@ -9,20 +9,20 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.experts.pdm_closed.corridor import corridors, lead_progress
 from tasks.experts.pdm_closed.forecast import SAMPLE_STEPS, STEP_S, Forecast, Things
 from tasks.experts.pdm_closed.path import DrivePaths, drive_paths, pose_at, project
 from tasks.experts.pdm_closed.settings import DEFAULTS, PdmSettings
-from tasks.experts.pdm_closed.shapes import rings_distance
 from tasks.kernels.compiled import kernel
-from tasks.world.vehicle import PACIFICA, VX, Vehicle, X, Y
+from tasks.world.arrays import Array
+from tasks.world.geometry import rings_distance
+from tasks.world.vehicle import PACIFICA, VX, X, Y
 
-Array = NDArray[np.float64]
 SCORED_STEPS = 40
 PROPOSAL_STEPS = 50  # the chosen one is driven on to 5 s
 SAMPLES = PROPOSAL_STEPS // SAMPLE_STEPS + 1
+REAR_AXLE_TO_CENTER, HALF_LENGTH, HALF_WIDTH = PACIFICA.rear_axle_to_center, PACIFICA.half_length, PACIFICA.half_width
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Proposals:
     leads: Array  # (P, 51, 3) lead's arc length [m], velocity [m/s], own half length on a free road [m]
 
 
-class Driver(NamedTuple):
+class PdmDriver(NamedTuple):
     """The intelligent driver model's constants, and the faults it keeps (tasks.experts.pdm_closed.settings)."""
 
     min_gap_m: float
@@ -47,21 +47,12 @@ class Driver(NamedTuple):
     speed_below_zero: bool
 
 
-class BodySize(NamedTuple):
-    """The ego's footprint [m]."""
-
-    rear_axle_to_center: float
-    half_length: float
-    half_width: float
-
-
 def proposals(
     ego_state: Array,
     centerline: Array,
     seen: Forecast,
     speed_limit_mps: float | None,
     settings: PdmSettings = DEFAULTS,
-    vehicle: Vehicle = PACIFICA,
 ) -> Proposals:
     """The proposals from `ego_state` (11,) along `centerline` (N, 3) through the forecast traffic.
 
@@ -77,15 +68,14 @@ def proposals(
     targets = np.array(settings.speed_fractions) * limit
     start = np.array([project(paths, i, ego_state[X], ego_state[Y]) for i in range(len(settings.lateral_offsets_m))])
     things = seen.things(SAMPLES)
-    swept = corridors(paths, start, targets.max() * PROPOSAL_STEPS * STEP_S, vehicle.half_width)
+    swept = corridors(paths, start, targets.max() * PROPOSAL_STEPS * STEP_S, HALF_WIDTH)
     progress = lead_progress(paths, swept, things)
-    body = BodySize(vehicle.rear_axle_to_center, vehicle.half_length, vehicle.half_width)
-    return Proposals(*_drive(paths, things, progress, start, ego_state[VX], targets, driver(settings), body))
+    return Proposals(*_drive(paths, things, progress, start, ego_state[VX], targets, driver(settings)))
 
 
-def driver(settings: PdmSettings) -> Driver:
+def driver(settings: PdmSettings) -> PdmDriver:
     """The settings that each step needs."""
-    return Driver(
+    return PdmDriver(
         settings.min_gap_m,
         settings.headway_s,
         settings.accel_max_mps2,
@@ -98,7 +88,7 @@ def driver(settings: PdmSettings) -> Driver:
 
 
 @kernel
-def idm_step(progress: float, speed: float, lead: Array, target_mps: float, idm: Driver) -> tuple[float, float]:
+def idm_step(progress: float, speed: float, lead: Array, target_mps: float, idm: PdmDriver) -> tuple[float, float]:
     """One Euler step of 0.1 s of the intelligent driver model (Treiber et al. 2000): progress [m], speed [m/s].
 
     s* = gap + v T + v (v - v_lead) / (2 sqrt(a b));  dv/dt = a (1 - (v / v0)^n - (s* / s)^2), clipped to [-b, a].
@@ -120,8 +110,7 @@ def _drive(
     start_m: Array,
     speed0_mps: float,
     targets_mps: Array,
-    idm: Driver,
-    body: BodySize,
+    idm: PdmDriver,
 ) -> tuple[Array, Array, Array]:
     """poses (P, 51, 3), motion (P, 51, 2) and leads (P, 51, 3) of Proposals. lead_progress_m: (L, S, M)."""
     n_paths, n_speeds = start_m.shape[0], targets_mps.shape[0]
@@ -143,10 +132,10 @@ def _drive(
                 if looks:
                     if not shared:
                         written[:] = 0.0
-                    _set_footprint(poses[p, step - 1], body, footprint)
+                    _set_footprint(poses[p, step - 1], footprint)
                     sample = step // SAMPLE_STEPS
                     nearest = _nearest_ahead(things, lead_progress_m[path, sample], sample, progress, footprint)
-                    _write_lead(paths, path, things, nearest, progress, poses[p, step - 1, 2], body, written)
+                    _write_lead(paths, path, things, nearest, progress, poses[p, step - 1, 2], written)
                     leads[p, step] = written
                 else:
                     leads[p, step] = leads[p, step - 1]  # before the first search all zeros: no gap, so it brakes hard
@@ -164,7 +153,6 @@ def _write_lead(
     nearest: tuple[float, int],
     progress: float,
     heading: float,
-    body: BodySize,
     lead: Array,
 ) -> None:
     """Write into `lead` (3,) what a search found: arc length, velocity, own half length on a free road.
@@ -173,7 +161,7 @@ def _write_lead(
     """
     distance, thing = nearest
     if thing < 0:
-        lead[0], lead[2] = paths.progress[path, -1], body.half_length
+        lead[0], lead[2] = paths.progress[path, -1], HALF_LENGTH
         return
     lead[0] = progress + distance
     if not things.is_light[thing]:
@@ -202,12 +190,12 @@ def _nearest_ahead(things: Things, ahead_m: Array, sample: int, progress: float,
 
 
 @kernel
-def _set_footprint(pose: Array, body: BodySize, out: Array) -> None:
+def _set_footprint(pose: Array, out: Array) -> None:
     """Corners (2, 4) x, y of the ego's body, its rear axle at `pose` (3,)."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
-    x, y = pose[0] + body.rear_axle_to_center * c, pose[1] + body.rear_axle_to_center * s
+    x, y = pose[0] + REAR_AXLE_TO_CENTER * c, pose[1] + REAR_AXLE_TO_CENTER * s
     for i in range(4):
-        along = body.half_length if i == 0 or i == 3 else -body.half_length
-        across = body.half_width if i < 2 else -body.half_width
+        along = HALF_LENGTH if i == 0 or i == 3 else -HALF_LENGTH
+        across = HALF_WIDTH if i < 2 else -HALF_WIDTH
         out[0, i] = x + c * along - s * across
         out[1, i] = y + s * along + c * across

@@ -10,17 +10,16 @@ import hashlib
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.experts.protocol import Plan
 from tasks.experts.recovery.feasible import DEFAULTS, FeasibleSettings, feasible
 from tasks.stages import Rejected
+from tasks.world.arrays import Array
 from tasks.world.clip import HORIZON_STEPS, STEP_S, Scene
 from tasks.world.frames import to_local, to_world, wrap_angle
 from tasks.world.vehicle import HEADING, VX, VY
 from tasks.world.vocabulary import checked_trajectories, trajectories_digest
 
-Array = NDArray[np.float64]
 FIT_STEPS = 5  # the start velocity is that of a parabola through the origin and the first 0.5 s
 START_HEADING, END_HEADING = 2, 5  # columns of the matching vector that are angles
 

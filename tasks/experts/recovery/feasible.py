@@ -28,13 +28,12 @@ from functools import cache
 
 import numpy as np
 import osqp
-from numpy.typing import NDArray
 from scipy import sparse
 
+from tasks.world.arrays import Array
 from tasks.world.clip import HORIZON_STEPS, STEP_S
-from tasks.world.vehicle import AX, PACIFICA, STEERING, VX, Vehicle
+from tasks.world.vehicle import AX, PACIFICA, STEERING, VX
 
-Array = NDArray[np.float64]
 N = HORIZON_STEPS
 SLOW_MPS = 0.5  # limits that divide by the speed stop growing below it
 
@@ -63,9 +62,7 @@ class FeasibleSettings:
 DEFAULTS = FeasibleSettings()
 
 
-def feasible(
-    trajectory: Array, ego_state: Array, settings: FeasibleSettings = DEFAULTS, vehicle: Vehicle = PACIFICA
-) -> Array | str:
+def feasible(trajectory: Array, ego_state: Array, settings: FeasibleSettings = DEFAULTS) -> Array | str:
     """The nearest drivable trajectory (40, 3) to `trajectory` (40, 3), both in the frame of `ego_state` (11,).
 
     Returns the reason as text where a QP does not reach the tolerance within its iterations.
@@ -81,7 +78,7 @@ def feasible(
     if isinstance(along, str):
         return along
     distance, speed = along
-    kappa0 = float(np.tan(ego_state[STEERING]) / vehicle.wheel_base)
+    kappa0 = float(np.tan(ego_state[STEERING]) / PACIFICA.wheel_base)
     turned = _across(_at(distance, progress, heading), speed, kappa0, settings)
     if isinstance(turned, str):
         return turned

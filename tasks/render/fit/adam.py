@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.kernels.compiled import kernel
-from tasks.render.splatting.gaussians import F32
+from tasks.world.arrays import F32, FloatArray, Ints, ShortInts
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 
@@ -23,15 +22,15 @@ class Learned:
     values: F32  # (N, C)
     first: F32  # (N, C) running mean of the gradient
     second: F32  # (N, C) running mean of its square
-    steps: NDArray[np.int32]  # (N,) how often each row was stepped
+    steps: ShortInts  # (N,) how often each row was stepped
 
     @classmethod
-    def of(cls, values: NDArray[np.floating]) -> "Learned":
+    def of(cls, values: FloatArray) -> "Learned":
         """Never stepped yet; `values` (N, C)."""
         start = np.array(values, np.float32, order="C")
         return cls(start, np.zeros_like(start), np.zeros_like(start), np.zeros(len(start), np.int32))
 
-    def step(self, rows: NDArray[np.int64], gradient: F32, rate: float, scale: F32 | None = None) -> None:
+    def step(self, rows: Ints, gradient: F32, rate: float, scale: F32 | None = None) -> None:
         """Moves `rows` (M,), none twice, against `gradient` (M, C) by `rate`, times `scale` (M,) where given."""
         sizes = np.ones(len(rows), np.float32) if scale is None else scale
         self.steps[rows] += 1
@@ -39,11 +38,11 @@ class Learned:
         unbiased = np.stack([1.0 - BETA1**counts, 1.0 - BETA2**counts], axis=1)
         step_rows(self.values, self.first, self.second, self.steps, rows, gradient, rate, sizes, unbiased)
 
-    def take(self, rows: NDArray[np.int64]) -> "Learned":
+    def take(self, rows: Ints) -> "Learned":
         """The rows (M,), moments and all."""
         return Learned(self.values[rows], self.first[rows], self.second[rows], self.steps[rows])
 
-    def forget(self, rows: NDArray[np.int64]) -> None:
+    def forget(self, rows: Ints) -> None:
         """What `rows` are now has nothing to do with what they were."""
         self.first[rows], self.second[rows], self.steps[rows] = 0.0, 0.0, 0
 

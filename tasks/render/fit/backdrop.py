@@ -1,15 +1,14 @@
-"""The sky as something that is learned: looked up by direction, and the way back."""
+"""The sky as something that is learned: looked up by direction, and the backward pass of that."""
 
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.kernels.compiled import kernel
 from tasks.kernels.threads import in_chunks
 from tasks.render.scene.sky import COLUMNS, ROWS
-from tasks.render.splatting.gaussians import F32, F64
+from tasks.world.arrays import F32, Array, Ints, ShortInts
 
 HIDDEN = 0.99
 ROWS_CHUNK = 16  # of the picture, looked up by a thread at a time
@@ -19,13 +18,11 @@ ROWS_CHUNK = 16  # of the picture, looked up by a thread at a time
 class SkyCells:
     """The four cells of the sky around each pixel's direction; angles are dear, and an iteration needs them twice."""
 
-    corners: NDArray[np.int32]  # (H, W, 3) row of the upper two, columns of the left and of the right two
-    shares: F64  # (H, W, 2) of the right and of the lower ones
+    corners: ShortInts  # (H, W, 3) row of the upper two, columns of the left and of the right two
+    shares: Array  # (H, W, 2) of the right and of the lower ones
 
 
-def sky_cells(
-    intrinsics: NDArray[np.float64], scene_from_camera: NDArray[np.float64], width: int, height: int, threads: int = 1
-) -> SkyCells:
+def sky_cells(intrinsics: Array, scene_from_camera: Array, width: int, height: int, threads: int = 1) -> SkyCells:
     """Where a camera looks when nothing is in the way."""
     found = SkyCells(np.empty((height, width, 3), np.int32), np.empty((height, width, 2)))
 
@@ -94,7 +91,7 @@ def _scatter(d_rgb: Any, alpha: Any, corners: Any, shares: Any, sums: Any, touch
                     sums[cell, c] += share * light * d_rgb[row, column, c]
 
 
-def backdrop_gradient(d_rgb: F32, alpha: F32, where: SkyCells) -> tuple[NDArray[np.int64], F32]:
+def backdrop_gradient(d_rgb: F32, alpha: F32, where: SkyCells) -> tuple[Ints, F32]:
     """The cells (M,) that a photo's background came from, and the gradient by them (M, 3).
 
     `d_rgb` (H, W, 3) by the picture, `alpha` (H, W) of what stands before the background; where it hides more than

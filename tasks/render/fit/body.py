@@ -4,10 +4,10 @@ Where a photo does show the place, the fit takes away what is wrong; what none s
 """
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from tasks.render.splatting.gaussians import F64, Gaussians
+from tasks.render.splatting.gaussians import Gaussians
+from tasks.world.arrays import Array
 
 SPACING_M = 0.3
 SIGMA_M = 0.17  # of a Gaussian along its face
@@ -19,7 +19,7 @@ LOWER, CABIN, TALL = (0.94, 0.92, -0.65, 0.1), (0.5, 0.8, 0.1, 0.88), (0.95, 0.9
 TALL_M = 2.2  # vehicles at least this high have no bonnet
 
 
-def unseen_body(seen: Gaussians, size: F64) -> Gaussians:
+def unseen_body(seen: Gaussians, size: Array) -> Gaussians:
     """Gaussians (M,) in the frame of a vehicle's box of `size` (3,) [m], coloured like the nearest of what was seen."""
     boxes = (TALL,) if size[2] >= TALL_M else (LOWER, CABIN)
     parts = [_faces(np.asarray(size) / 2.0, shares) for shares in boxes]
@@ -36,7 +36,7 @@ def unseen_body(seen: Gaussians, size: F64) -> Gaussians:
     )
 
 
-def _faces(half: F64, shares: tuple[float, float, float, float]) -> tuple[F64, NDArray[np.float64]]:
+def _faces(half: Array, shares: tuple[float, float, float, float]) -> tuple[Array, Array]:
     """Points (M, 3) and scales (M, 3) [m] on four sides and the top."""
     x, y, low, high = half[0] * shares[0], half[1] * shares[1], half[2] * shares[2], half[2] * shares[3]
     along, across, up = _spaced(-x, x), _spaced(-y, y), _spaced(low, high)
@@ -55,5 +55,5 @@ def _faces(half: F64, shares: tuple[float, float, float, float]) -> tuple[F64, N
     return np.concatenate(points), np.concatenate(scales)
 
 
-def _spaced(first: float, last: float) -> NDArray[np.float64]:
+def _spaced(first: float, last: float) -> Array:
     return np.linspace(first, last, max(2, round((last - first) / SPACING_M) + 1))

@@ -8,12 +8,12 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.kernels.compiled import kernel
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.state import SHAPES, FitState, logits_of, opacities_of
-from tasks.render.splatting.gaussians import F32, F64, rotations_of
+from tasks.render.splatting.gaussians import rotations_of
+from tasks.world.arrays import F32, Array, Ints
 
 MOST_COPIES = 51  # of one Gaussian at once, as in the authors' code
 LEAST_OPACITY = 0.005
@@ -36,8 +36,8 @@ def refine(state: FitState, settings: FitSettings) -> None:
 
 def _copy(
     state: FitState,
-    targets: NDArray[np.int64],
-    sources: NDArray[np.int64],
+    targets: Ints,
+    sources: Ints,
     settings: FitSettings,
     rng: np.random.Generator,
 ) -> None:
@@ -59,7 +59,7 @@ def _copy(
     state.rows(np.argsort(state.owner, kind="stable"))
 
 
-def _within(state: FitState, rows: NDArray[np.int64], rng: np.random.Generator) -> F32:
+def _within(state: FitState, rows: Ints, rng: np.random.Generator) -> F32:
     """Random offsets (M, 3) as far as the Gaussians at `rows` reach."""
     quats = state.learned["quats"].values[rows]
     turns = rotations_of(quats / np.linalg.norm(quats, axis=1, keepdims=True))
@@ -88,7 +88,7 @@ def _shared(opacities: Any, counts: Any) -> Any:
     return out, shrink
 
 
-def shared(opacities: F64, counts: NDArray[np.int64]) -> tuple[F64, F64]:
+def shared(opacities: Array, counts: Ints) -> tuple[Array, Array]:
     """Opacity and factor of the scales, (N,) each, of each of `counts` Gaussians that together show what one did."""
-    result: tuple[F64, F64] = _shared(opacities, counts)
+    result: tuple[Array, Array] = _shared(opacities, counts)
     return result

@@ -1,11 +1,11 @@
 """Cameras do not agree about brightness: an affine colour per photo, and between any two that see the same."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tasks.render.splatting.gaussians import F32, F64
+from tasks.world.arrays import F32, Array, Bools, FloatArray
 
 SIZE = 12  # a photo's row: 3 x 3 matrix minus identity, then 3 offsets
+ROUNDS = 20  # of fitting each camera to the mean of all
 
 
 def matrix_of(row: F32) -> tuple[F32, F32]:
@@ -34,7 +34,7 @@ def exposed_gradient(rgb: F32, row: F32, d_exposed: F32) -> tuple[F32, F32]:
     return np.asarray(d_exposed @ matrix, np.float32), d_row.astype(np.float32)
 
 
-def affine_between(source: NDArray[np.floating], target: NDArray[np.floating], ridge: float = 1e-3) -> F32:
+def affine_between(source: FloatArray, target: FloatArray, ridge: float = 1e-3) -> F32:
     """The row (12,) that takes colours `source` (M, 3) closest to `target` (M, 3); identity where they say nothing.
 
     Least squares with a pull of `ridge` per sample towards identity.
@@ -45,7 +45,7 @@ def affine_between(source: NDArray[np.floating], target: NDArray[np.floating], r
     return np.concatenate([off[:3].T.ravel(), off[3]]).astype(np.float32)
 
 
-def aligned(colours: F64, seen: NDArray[np.bool_], sweeps: int = 20) -> F32:
+def aligned(colours: Array, seen: Bools) -> F32:
     """Rows (C, 12) that make cameras of one instant agree on the lidar points that several of them see.
 
     `colours` (C, M, 3) in [0, 1] of M projected points in C cameras, `seen` (C, M). Each camera in turn is fitted to
@@ -53,7 +53,7 @@ def aligned(colours: F64, seen: NDArray[np.bool_], sweeps: int = 20) -> F32:
     """
     rows = np.zeros((len(colours), SIZE), np.float32)
     common = seen.sum(axis=0) > 1
-    for _ in range(sweeps):
+    for _ in range(ROUNDS):
         now = np.stack([exposed(c.astype(np.float32), row) for c, row in zip(colours, rows)])
         mean = (now * seen[..., None]).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)[:, None]
         for c in range(len(colours)):

@@ -7,19 +7,18 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.render.fit.exposure import SIZE, aligned, exposed, inverse
 from tasks.render.scene.sensed import Photo
 from tasks.render.scene.sight import Seen
-from tasks.render.splatting.gaussians import F32, F64
+from tasks.world.arrays import F32, Array, Bools
 
 INSTANT_S = 0.05  # photos no further apart were taken at once
 POINTS = 40_000  # of the cloud are looked at, evenly
 NEAR = 0.05  # of its depth: a point this close to what the photo shows there is seen
 
 
-def exposures_of(photos: Sequence[Photo], seen: Sequence[Seen], points: F64) -> F32:
+def exposures_of(photos: Sequence[Photo], seen: Sequence[Seen], points: Array) -> F32:
     """Rows (N, 12) of the photos: photo colour = row applied to what the cameras of its instant agree on.
 
     `points` (M, 3) lidar that stays, in the photos' frame. Zeros, which is identity, where a photo shares no point.
@@ -59,7 +58,7 @@ def in_agreement(photos: Sequence[Photo], rows: F32) -> list[Photo]:
     return out
 
 
-def _colours(photo: Photo, seen: Seen, points: F64) -> tuple[F64, NDArray[np.bool_]]:
+def _colours(photo: Photo, seen: Seen, points: Array) -> tuple[Array, Bools]:
     """Colours (M, 3) in [0, 1] of the points in a photo, and which of them (M,) it shows."""
     height, width = seen.depth.shape
     camera_from_scene = np.linalg.inv(photo.world_from_camera)

@@ -5,10 +5,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.kernels.compiled import kernel
-from tasks.render.splatting.gaussians import F32
+from tasks.world.arrays import F32, Bools, Bytes
 
 WINDOW, SIGMA = 11, 1.5  # pixels, as in the paper
 C1, C2 = 0.01**2, 0.03**2  # for a range of 1
@@ -25,7 +24,7 @@ class Target:
     weight: F32  # (H, W) 0: the pixel says nothing
 
 
-def target_of(rgb: NDArray[np.uint8], ignored: NDArray[np.bool_] | None = None) -> Target:
+def target_of(rgb: Bytes, ignored: Bools | None = None) -> Target:
     """`rgb` (H, W, 3), `ignored` (H, W) pixels to leave out."""
     image = rgb.astype(np.float32) / np.float32(255.0)
     mean = _blur(image)
@@ -102,16 +101,7 @@ def photo_loss(rgb: F32, target: Target, ssim_weight: float) -> tuple[float, F32
     return loss, gradient
 
 
-def depth_loss(depth: F32, known: F32, weight: float) -> tuple[float, F32]:
-    """`weight` times the mean error of inverse depth [1/m] where `known` (H, W) > 0, and its gradient by `depth`."""
-    use = (known > 0.0) & (depth > 0.0)
-    inverse = np.where(use, 1.0 / np.where(use, depth, 1.0), 0.0)
-    off = np.where(use, inverse - 1.0 / np.where(use, known, 1.0), 0.0)
-    scale = weight / max(int(use.sum()), 1)
-    return scale * float(np.abs(off).sum()), (-scale * np.sign(off) * inverse * inverse).astype(np.float32)
-
-
-def opaque_loss(alpha: F32, ground: NDArray[np.bool_], weight: float) -> tuple[float, F32]:
+def opaque_loss(alpha: F32, ground: Bools, weight: float) -> tuple[float, F32]:
     """`weight` times the light that passes where the picture is `ground` (H, W), as a mean over all of it, and its
     gradient by `alpha`."""
     scale = np.float32(weight / alpha.size)

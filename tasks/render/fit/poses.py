@@ -1,14 +1,13 @@
 """Small corrections of where the cameras were, and what holds between two corrected photos."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tasks.render.splatting.gaussians import F32, F64
+from tasks.world.arrays import F32, Array, FloatArray
 
 SIZE = 6  # a photo's row: shift [m], turn [rad], both in its camera's frame
 
 
-def motion(row: NDArray[np.floating]) -> F64:
+def motion(row: FloatArray) -> Array:
     """(4, 4): x' = R(turn) x + shift of a row (6,)."""
     out = np.eye(4)
     turn = np.asarray(row[3:], np.float64)
@@ -21,12 +20,12 @@ def motion(row: NDArray[np.floating]) -> F64:
     return out
 
 
-def corrected(scene_from_camera: F64, row: NDArray[np.floating]) -> F64:
+def corrected(scene_from_camera: Array, row: FloatArray) -> Array:
     """The pose (4, 4) of a camera whose points move by `row` (6,)."""
     return np.asarray(scene_from_camera @ np.linalg.inv(motion(row)))
 
 
-def between(times: NDArray[np.floating], rows: F32, time_s: float) -> F32:
+def between(times: FloatArray, rows: F32, time_s: float) -> F32:
     """The row (C,) at a time, linear between those (N, C) at `times` (N,) in any order; the nearest one outside."""
     by_time = np.argsort(times, kind="stable")
     return np.array([np.interp(time_s, times[by_time], column[by_time]) for column in rows.T], np.float32)

@@ -4,12 +4,11 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.render.fit.backdrop import SkyCells, backdrop, backdrop_gradient, sky_cells
 from tasks.render.fit.density import refine
 from tasks.render.fit.exposure import exposed, exposed_gradient, matrix_of
-from tasks.render.fit.losses import depth_loss, opaque_loss, photo_loss, ssim
+from tasks.render.fit.losses import opaque_loss, photo_loss, ssim
 from tasks.render.fit.poses import between, corrected
 from tasks.render.fit.road import lay_flat
 from tasks.render.fit.schedule import decayed, photo_at
@@ -20,11 +19,12 @@ from tasks.render.scene.asset import Exposure, RenderAsset, ViewQuality, psnr
 from tasks.render.scene.movers import world_from_boxes
 from tasks.render.scene.sensed import Photo, Sweep
 from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
-from tasks.render.splatting.gaussians import F32, F64, Gaussians, concatenate, moved
+from tasks.render.splatting.gaussians import Gaussians, concatenate, moved
 from tasks.render.splatting.gradient import Gradients, backward, unmoved
 from tasks.render.splatting.project import DEPTH
-from tasks.render.splatting.raster import Trace, trace
+from tasks.render.splatting.raster import ForwardPass, forward
 from tasks.world.agents import AgentTracks
+from tasks.world.arrays import F32, Array, Bools, Ints
 
 REPORT_EVERY = 100
 VIEW_MARGIN_M = 0.5  # how far Gaussians of a track may reach beyond its box
@@ -36,8 +36,8 @@ class Part:
     """Consecutive Gaussians of a composed scene that share an owner."""
 
     first: int
-    rows: NDArray[np.int64]  # (M,) in the state
-    scene_from_owner: F64 | None  # (4, 4); None: the background's, which is the scene's
+    rows: Ints  # (M,) in the state
+    scene_from_owner: Array | None  # (4, 4); None: the background's, which is the scene's
 
 
 def reconstruct(
@@ -97,15 +97,11 @@ def _iterate(problem: Problem, state: FitState, settings: FitSettings, threads: 
     picture = exposed(seen.view.rgb, colours)
     loss, d_picture = photo_loss(picture, shot.target, settings.ssim_weight)
     d_rgb, d_colours = exposed_gradient(seen.view.rgb, colours, d_picture)
-    d_depth = None
-    if shot.lidar_depth is not None:
-        off, d_depth = depth_loss(seen.view.depth, shot.lidar_depth, settings.depth_weight)
-        loss += off
     d_alpha = None
     if settings.opaque_weight > 0.0:
         through, d_alpha = opaque_loss(seen.view.alpha, shot.ground, settings.opaque_weight)
         loss += through
-    back = backward(seen, scene, d_rgb, d_depth, d_alpha, threads)
+    back = backward(seen, scene, d_rgb, d_alpha=d_alpha, threads=threads)
     _step_world(state, settings, row, back, d_colours)
     cells, d_cells = backdrop_gradient(d_rgb, seen.view.alpha, sky)
     progress = state.iteration / settings.iterations
@@ -136,7 +132,7 @@ def compose(problem: Problem, state: FitState, photo: Photo) -> tuple[Gaussians,
     return (scenes[0] if len(scenes) == 1 else concatenate(scenes)), parts
 
 
-def _in_view(boxes: F64, photo: Photo) -> NDArray[np.bool_]:
+def _in_view(boxes: Array, photo: Photo) -> Bools:
     """Whether a ball around each box (N, 7) reaches into the photo's pyramid: (N,)."""
     radius = 0.5 * np.linalg.norm(boxes[:, 4:], axis=1) + VIEW_MARGIN_M
     height, width = photo.rgb.shape[:2]
@@ -150,15 +146,15 @@ def _in_view(boxes: F64, photo: Photo) -> NDArray[np.bool_]:
     return np.asarray(seen)
 
 
-def _sky_behind(photo: Photo, camera: F64, threads: int) -> SkyCells:
+def _sky_behind(photo: Photo, camera: Array, threads: int) -> SkyCells:
     height, width = photo.rgb.shape[:2]
     return sky_cells(photo.intrinsics, camera, width, height, threads)
 
 
-def _look(state: FitState, scene: Gaussians, photo: Photo, camera: F64, sky: SkyCells, threads: int) -> Trace:
+def _look(state: FitState, scene: Gaussians, photo: Photo, camera: Array, sky: SkyCells, threads: int) -> ForwardPass:
     height, width = photo.rgb.shape[:2]
     behind = backdrop(state.learned["sky"].values, sky, threads)
-    return trace(scene, photo.intrinsics, camera, width, height, behind, threads)
+    return forward(scene, photo.intrinsics, camera, width, height, behind, threads)
 
 
 def _step_world(state: FitState, settings: FitSettings, row: int, back: Gradients, d_colours: F32) -> None:
@@ -176,7 +172,7 @@ def _step_world(state: FitState, settings: FitSettings, row: int, back: Gradient
         poses.values[row] = before + rates * (poses.values[row] - before)
 
 
-def _of_owners(back: Gradients, parts: Sequence[Part]) -> tuple[NDArray[np.int64], Gradients]:
+def _of_owners(back: Gradients, parts: Sequence[Part]) -> tuple[Ints, Gradients]:
     """The gradients in the frames that the Gaussians are learned in, and their rows in the state."""
     rows, pieces = [], []
     for part in parts:
@@ -188,23 +184,18 @@ def _of_owners(back: Gradients, parts: Sequence[Part]) -> tuple[NDArray[np.int64
     return np.concatenate(rows), Gradients(**together, camera=back.camera)
 
 
-def _step_gaussians(
-    state: FitState, settings: FitSettings, rows: NDArray[np.int64], mine: Gradients, depths: F32
-) -> None:
+def _step_gaussians(state: FitState, settings: FitSettings, rows: Ints, mine: Gradients, depths: F32) -> None:
     """Steps `rows` (M,), at `depths` (M,) in the photo."""
     learned = state.learned
     state.nearest[rows] = np.minimum(state.nearest[rows], depths)
     state.wanted[rows] += np.hypot(mine.screen[:, 0], mine.screen[:, 1])
     progress = state.iteration / settings.iterations
     fall = decayed(1.0, settings.rate_end, progress)
-    opacity = 1.0 / (1.0 + np.exp(-learned["logits"].values[rows, 0]))
-    d_logits = mine.logits + settings.opacity_weight / len(state) * opacity * (1.0 - opacity)
-    d_scales = mine.log_scales + settings.scale_weight / len(state) * np.exp(learned["log_scales"].values[rows])
     mean_rate = decayed(settings.mean_rate, settings.mean_rate_end, progress)
     learned["means"].step(rows, mine.means, mean_rate, state.nearest[rows])
     learned["quats"].step(rows, mine.quats, fall * settings.quat_rate)
-    learned["log_scales"].step(rows, d_scales.astype(np.float32), fall * settings.scale_rate)
-    learned["logits"].step(rows, d_logits[:, None].astype(np.float32), fall * settings.opacity_rate)
+    learned["log_scales"].step(rows, mine.log_scales, fall * settings.scale_rate)
+    learned["logits"].step(rows, mine.logits[:, None], fall * settings.opacity_rate)
     learned["colours"].step(rows, mine.colours, fall * settings.colour_rate)
     if mine.sh_rest.shape[1]:
         learned["sh_rest"].step(rows, mine.sh_rest.reshape(len(rows), -1), fall * settings.sh_rate)

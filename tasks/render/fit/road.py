@@ -9,11 +9,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from tasks.kernels.compiled import kernel
-from tasks.render.splatting.gaussians import F32, F64
+from tasks.world.arrays import F32, Array, FloatArray, Ints
 
 CELL_M = 0.5
 SMOOTH_CELLS = 1.5
@@ -29,12 +28,12 @@ ALONG_M = 4.0  # a plane is fitted about this often
 class Road:
     """Heights on a grid; NaN where no road is known."""
 
-    corner: F64  # (2,) x, y of the first node [m]
-    heights: F64  # (X, Y) [m], every CELL_M
-    slopes: F64  # (X, Y, 2) d height / d x, d y
+    corner: Array  # (2,) x, y of the first node [m]
+    heights: Array  # (X, Y) [m], every CELL_M
+    slopes: Array  # (X, Y, 2) d height / d x, d y
 
 
-def find_road(points: F64, eyes: F64) -> Road | None:
+def find_road(points: Array, eyes: Array) -> Road | None:
     """The road under the cameras: lidar `points` (M, 3), camera centres `eyes` (V, 3); None where there is none.
 
     Around each few metres of the way a plane is fitted to what lies below the cameras, and fitted again to what is
@@ -56,7 +55,7 @@ def find_road(points: F64, eyes: F64) -> Road | None:
     return _field(points[on_road])
 
 
-def _spaced(eyes: F64) -> Sequence[F64]:
+def _spaced(eyes: Array) -> Sequence[Array]:
     kept = [eyes[0]]
     for eye in eyes:
         if np.linalg.norm(np.array(kept)[:, :2] - eye[:2], axis=1).min() >= ALONG_M:
@@ -64,7 +63,7 @@ def _spaced(eyes: F64) -> Sequence[F64]:
     return kept
 
 
-def _plane(points: F64, eye: F64) -> F64 | None:
+def _plane(points: Array, eye: Array) -> Array | None:
     """z = a (x - eye x) + b (y - eye y) + c, (3,), by trimmed least squares from the median height on."""
     if len(points) < LEAST_POINTS:
         return None
@@ -78,7 +77,7 @@ def _plane(points: F64, eye: F64) -> F64 | None:
     return np.asarray(plane)
 
 
-def _field(points: F64) -> Road:
+def _field(points: Array) -> Road:
     corner = points[:, :2].min(axis=0) - 2.0 * CELL_M
     size = np.ceil((points[:, :2].max(axis=0) - corner) / CELL_M).astype(int) + 3
     cells = np.rint((points[:, :2] - corner) / CELL_M).astype(int)
@@ -121,7 +120,7 @@ def _above(means: Any, heights: Any, slopes: Any, corner: Any) -> Any:
     return out
 
 
-def above_road(means: NDArray[np.floating], road: Road) -> F64:
+def above_road(means: FloatArray, road: Road) -> Array:
     """How far points (N, 3) lie above the road [m]; NaN beyond it."""
     return np.asarray(_above(means, road.heights, road.slopes, road.corner))
 
@@ -164,7 +163,7 @@ def _lay(
 
 
 def lay_flat(
-    means: F32, quats: F32, log_scales: F32, rows: NDArray[np.int64], road: Road, slack_m: float, thickness_m: float
+    means: F32, quats: F32, log_scales: F32, rows: Ints, road: Road, slack_m: float, thickness_m: float
 ) -> None:
     """Puts Gaussians at `rows` onto the road, in place: at most `slack_m` off it, no thicker than `thickness_m`, their
     third axis along its normal. Those beyond the road stay as they are."""

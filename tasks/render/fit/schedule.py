@@ -1,7 +1,8 @@
 """How step sizes fall, and in which order photos are looked at."""
 
 import numpy as np
-from numpy.typing import NDArray
+
+from tasks.world.arrays import Ints
 
 
 def decayed(rate: float, end: float, progress: float) -> float:
@@ -14,6 +15,6 @@ def photo_at(iteration: int, n: int, seed: int) -> int:
     return int(shuffled(n, seed, iteration // n)[iteration % n])
 
 
-def shuffled(n: int, seed: int, epoch: int) -> NDArray[np.int64]:
+def shuffled(n: int, seed: int, epoch: int) -> Ints:
     """0 to n - 1 in the order of one round."""
     return np.random.Generator(np.random.Philox(key=[seed, epoch])).permutation(n)

@@ -2,6 +2,9 @@
 
 from dataclasses import dataclass
 
+# Settings that are gone, as they always were: keys of blocks and tables hold them still, so that older ones go on.
+REMOVED = {"depth_weight": 0.0, "opacity_weight": 0.0, "scale_weight": 0.0}
+
 
 @dataclass(frozen=True)
 class FitSettings:
@@ -25,10 +28,7 @@ class FitSettings:
     sh_degree: int = 0  # 0 to 3
     # Loss.
     ssim_weight: float = 0.1
-    depth_weight: float = 0.0  # of the mean absolute error of inverse depth [1/m] where lidar knows it
-    opacity_weight: float = 0.0
     opaque_weight: float = 0.1  # of the mean light that passes where a photo looks at the ground
-    scale_weight: float = 0.0
     # Step sizes of Adam; each falls exponentially to `rate_end` of itself.
     mean_rate: float = 1.6e-3  # times the nearest viewing depth
     quat_rate: float = 4e-3

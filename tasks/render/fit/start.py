@@ -4,7 +4,6 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.kernels.threads import in_chunks
 from tasks.render.fit import exposure, poses
@@ -16,7 +15,6 @@ from tasks.render.fit.road import Road, above_road, find_road, lay_flat
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.state import BACKGROUND, FitState, logits_of
 from tasks.render.scene.build import held_out_rows, sky_of, surfaces
-from tasks.render.scene.depth import sparse_depth
 from tasks.render.scene.features import triangulated
 from tasks.render.scene.movers import behind_boxes
 from tasks.render.scene.sensed import Photo, Sweep, Tracks, fuse, shifted
@@ -24,8 +22,9 @@ from tasks.render.scene.sight import Seen, see
 from tasks.render.scene.sky import directions
 from tasks.render.scene.stereo import FAR_M
 from tasks.render.splatting import sh
-from tasks.render.splatting.gaussians import F32, F64, Gaussians, concatenate, rotations_of
+from tasks.render.splatting.gaussians import Gaussians, concatenate, rotations_of
 from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.arrays import F32, Array, Bools
 
 ROAD_TOP_M = 0.08  # a Gaussian that starts no further from the road's surface belongs to it
 LOOKS_DOWN = 0.05  # sine of the angle below the horizon from which on a ray meets the ground
@@ -38,15 +37,14 @@ class Shot:
 
     photo: Photo
     target: Target
-    lidar_depth: F32 | None  # (H, W) [m], 0 where no return falls; None: not asked for
-    ground: NDArray[np.bool_]  # (H, W) looks down, so that no sky can be behind
+    ground: Bools  # (H, W) looks down, so that no sky can be behind
 
 
 @dataclass(frozen=True)
 class Problem:
     """What is to be fitted. The same photos, sweeps, agents and settings give the same problem."""
 
-    origin: F64  # (3,) world [m]
+    origin: Array  # (3,) world [m]
     train: tuple[Shot, ...]
     held_out: tuple[Shot, ...]
     tracks: Tracks
@@ -95,7 +93,7 @@ def prepare(
     bodies = _bodies(cars, tracks, [p.time_s for p in train])
     state = _first_state(background, cars, bodies, sky_of(alike, seen).rgb, exposures, road, settings)
     unknown = [track_id not in nodes for track_id in tracks.ids]
-    shots = [_shot(p, static, tracks, np.array(unknown, bool), settings) for p in local]
+    shots = [_shot(p, tracks, np.array(unknown, bool)) for p in local]
     problem = Problem(
         origin,
         tuple(shot for i, shot in enumerate(shots) if i not in out),
@@ -128,7 +126,7 @@ def _bodies(nodes: Sequence[Gaussians | None], tracks: Tracks, times_s: Sequence
     ]
 
 
-def _shot(photo: Photo, static: F64, tracks: Tracks, unknown: NDArray[np.bool_], settings: FitSettings) -> Shot:
+def _shot(photo: Photo, tracks: Tracks, unknown: Bools) -> Shot:
     """A photo, without what moves and has no Gaussians of its own: it would be painted on the street."""
     height, width = photo.rgb.shape[:2]
     rays = directions(photo.intrinsics, photo.world_from_camera, width, height)
@@ -138,12 +136,8 @@ def _shot(photo: Photo, static: F64, tracks: Tracks, unknown: NDArray[np.bool_],
         eye = np.ascontiguousarray(photo.world_from_camera[:3, 3])
         far = rays.reshape(-1, 3) * FAR_M + eye
         hidden = behind_boxes(far, eye, boxes[valid & unknown]).reshape(height, width)
-    depth = None
-    if settings.depth_weight > 0.0:
-        labels = np.full(len(static), BACKGROUND, np.int32)
-        depth, _ = sparse_depth(static, labels, photo.intrinsics, photo.world_from_camera, width, height)
     ground = rays[..., 2] < -LOOKS_DOWN * np.linalg.norm(rays, axis=-1)
-    return Shot(photo, target_of(photo.rgb, hidden), depth, ground)
+    return Shot(photo, target_of(photo.rgb, hidden), ground)
 
 
 def _first_state(
@@ -196,7 +190,7 @@ def _first_state(
     return FitState(0, learned, owners, on_road, nearest, np.zeros(len(start), np.float32))
 
 
-def _lies_on(gaussians: Gaussians, road: Road | None) -> NDArray[np.bool_]:
+def _lies_on(gaussians: Gaussians, road: Road | None) -> Bools:
     if road is None:
         return np.zeros(len(gaussians), bool)
     flat = np.abs(rotations_of(gaussians.quats)[:, 2, 2]) > UPRIGHT
@@ -204,7 +198,7 @@ def _lies_on(gaussians: Gaussians, road: Road | None) -> NDArray[np.bool_]:
         return np.asarray((np.abs(above_road(gaussians.means, road)) < ROAD_TOP_M) & flat)
 
 
-def _thinned(gaussians: Gaussians, n: int, weight: F64, rng: np.random.Generator) -> Gaussians:
+def _thinned(gaussians: Gaussians, n: int, weight: Array, rng: np.random.Generator) -> Gaussians:
     """`n` of them by `weight`, each as much larger as there are fewer of its kind."""
     if len(gaussians) <= n:
         return gaussians

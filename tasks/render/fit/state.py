@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tasks.render.fit.adam import Learned
-from tasks.render.splatting.gaussians import F32, Gaussians
+from tasks.render.splatting.gaussians import Gaussians
+from tasks.world.arrays import F32, Bools, FloatArray, Ints, ShortInts
 
 BACKGROUND = -1
 SHAPES = ("means", "quats", "log_scales", "logits", "colours", "sh_rest")  # learned, one row per Gaussian
@@ -20,8 +21,8 @@ class FitState:
 
     iteration: int
     learned: dict[str, Learned]  # SHAPES: (N, C); sky (cells, 3); exposure (photos, 12); poses (photos, 6)
-    owner: NDArray[np.int32]  # (N,) ascending: BACKGROUND or row of a track
-    road: NDArray[np.bool_]  # (N,) lies on the road
+    owner: ShortInts  # (N,) ascending: BACKGROUND or row of a track
+    road: Bools  # (N,) lies on the road
     nearest: F32  # (N,) [m] depth in the nearest photo so far; inf: not seen yet
     wanted: F32  # (N,) how much more of it was asked for since the density was last looked at
 
@@ -63,7 +64,7 @@ class FitState:
         rest = (np.array(arrays[name]) for name in ("owner", "road", "nearest", "wanted"))
         return cls(int(arrays["iteration"]), learned, *rest)
 
-    def rows(self, rows: NDArray[np.int64]) -> None:
+    def rows(self, rows: Ints) -> None:
         """Keeps these Gaussians, in this order; one may be named again and again."""
         for name in SHAPES:
             self.learned[name] = self.learned[name].take(rows)
@@ -76,6 +77,6 @@ def opacities_of(logits: F32) -> F32:
     return (1.0 / (1.0 + np.exp(-logits))).astype(np.float32)
 
 
-def logits_of(opacities: NDArray[np.floating]) -> F32:
+def logits_of(opacities: FloatArray) -> F32:
     """The inverse of `opacities_of`."""
     return np.log(opacities / (1.0 - opacities)).astype(np.float32)

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from tasks.render.scene.boxes import box_gaussians
 from tasks.render.scene.movers import world_from_boxes
 from tasks.render.scene.sky import SkyMap
-from tasks.render.splatting.gaussians import F32, F64, Gaussians, concatenate, moved
+from tasks.render.splatting.gaussians import Gaussians, concatenate, moved
 from tasks.world.agents import AgentKind
+from tasks.world.arrays import F32, Array
 
 
 @dataclass(frozen=True)
@@ -21,8 +22,8 @@ class BlockRange:
     log_id: str
     start_s: float  # since the log's first instant
     end_s: float
-    low: F64  # (2,) smallest x, y [m] the sensors were at, world
-    high: F64  # (2,) greatest
+    low: Array  # (2,) smallest x, y [m] the sensors were at, world
+    high: Array  # (2,) greatest
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ class Exposure:
 class RenderAsset:
     """A block's scene. World coordinates minus `origin` everywhere, so that float32 is exact to less than a mm."""
 
-    origin: F64  # (3,) world [m]
+    origin: Array  # (3,) world [m]
     background: Gaussians
     nodes: Mapping[str, Gaussians]  # track id -> Gaussians in box coordinates (centre; x along the heading)
     sky: SkyMap
@@ -68,7 +69,7 @@ def psnr(a: NDArray[np.generic], b: NDArray[np.generic]) -> float:
     return float("inf") if error == 0.0 else 10.0 * float(np.log10(peak**2 / error))
 
 
-def scene_at(asset: RenderAsset, track_ids: Sequence[str], kinds: Sequence[AgentKind], boxes: F64) -> Gaussians:
+def scene_at(asset: RenderAsset, track_ids: Sequence[str], kinds: Sequence[AgentKind], boxes: Array) -> Gaussians:
     """Background and the named tracks at `boxes` (N, 7) x, y, z, heading, length, width, height in the world.
 
     A track without Gaussians of its own is a plain shaded box: nobody is invisible.

@@ -5,8 +5,9 @@ from functools import lru_cache
 import numpy as np
 
 from tasks.render.scene.surfels import Discs, gaussians_of
-from tasks.render.splatting.gaussians import F64, Gaussians
+from tasks.render.splatting.gaussians import Gaussians
 from tasks.world.agents import AgentKind
+from tasks.world.arrays import Array
 
 SPACING_M = 0.15
 BODY = {
@@ -20,7 +21,7 @@ OTHER = (0.6, 0.6, 0.6)
 SHADE = {(0, 0, 1): 1.0, (1, 0, 0): 0.8, (-1, 0, 0): 0.7, (0, 1, 0): 0.75, (0, -1, 0): 0.65}
 
 
-def box_gaussians(size: F64, kind: AgentKind) -> Gaussians:
+def box_gaussians(size: Array, kind: AgentKind) -> Gaussians:
     """Five faces (the underside is never seen) of a box (3,) length, width, height [m], in box coordinates.
 
     Neutral colours, lit from above; vehicles get a dark band where windows are, so that they read as cars.

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.render.scene.asset import RenderAsset, psnr, scene_at
 from tasks.render.scene.choose import BACKGROUND, Look, choose, count_free_space, with_mirror_image
@@ -23,8 +22,9 @@ from tasks.render.scene.sight import SHALLOW, Seen, see
 from tasks.render.scene.sky import SkyCollector, SkyMap, directions
 from tasks.render.scene.stereo import FAR_M
 from tasks.render.scene.surfels import discs_of_photo, gaussians_of
-from tasks.render.splatting.gaussians import EMPTY, F32, F64, Gaussians
+from tasks.render.splatting.gaussians import EMPTY, Gaussians
 from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.arrays import F32, Array, Bools, Indices
 from tasks.world.camera import Pinhole
 
 MIN_NODE_DISCS = 40  # a track seen less is drawn as a plain box
@@ -121,9 +121,7 @@ def surfaces(photos: Sequence[Photo], seen: Sequence[Seen], tracks: Tracks) -> t
     return gaussians_of(kept[BACKGROUND], np.zeros(3)) if BACKGROUND in kept else EMPTY, nodes
 
 
-def _witnessed(
-    points: F64, guessed: NDArray[np.bool_], photos: Sequence[Photo], carvers: Sequence[F32]
-) -> NDArray[np.bool_]:
+def _witnessed(points: Array, guessed: Bools, photos: Sequence[Photo], carvers: Sequence[F32]) -> Bools:
     """Which points (M, 3) not more photos look through than see; one that lidar saw is lost to two at least."""
     in_front, agreeing = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
     for photo, depth in zip(photos, carvers):
@@ -143,7 +141,7 @@ def sky_of(photos: Sequence[Photo], seen: Sequence[Seen]) -> SkyMap:
     return collector.finish()
 
 
-def _members(asset: RenderAsset, tracks: Tracks, time_s: float) -> tuple[list[int], F64]:
+def _members(asset: RenderAsset, tracks: Tracks, time_s: float) -> tuple[list[int], Array]:
     """Tracks that are there at a time, and all boxes in the world."""
     boxes, valid = tracks.at(time_s)
     boxes = boxes + np.concatenate([asset.origin, np.zeros(4)])
@@ -168,7 +166,7 @@ def _refit(
     starts = np.concatenate([[0], np.cumsum([len(p) for p in parts])])
     place = {name: k + 1 for k, name in enumerate(names)}
 
-    def present(i: int) -> tuple[list[str], F64]:
+    def present(i: int) -> tuple[list[str], Array]:
         rows, boxes = _members(asset, tracks, photos[i].time_s)
         rows = [j for j in rows if tracks.ids[j] in place]
         return [tracks.ids[j] for j in rows], boxes[rows]
@@ -177,7 +175,7 @@ def _refit(
         ids, boxes = present(i)
         return scene_at(asset, ids, [AgentKind.VEHICLE] * len(ids), boxes)
 
-    def rows_of(i: int) -> NDArray[np.intp]:
+    def rows_of(i: int) -> Indices:
         ids, _ = present(i)
         spans = [0, *(place[name] for name in ids)]
         return np.concatenate([np.arange(starts[k], starts[k + 1]) for k in spans])

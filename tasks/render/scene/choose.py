@@ -9,12 +9,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from tasks.kernels.compiled import kernel
 from tasks.render.scene.surfels import Discs, concatenate_discs
-from tasks.render.splatting.gaussians import F32, F64
+from tasks.world.arrays import F32, Array, Bools, ShortInts
 
 BANDS_M = (8.0, 16.0, 32.0, 64.0)
 COARSER = 1.6  # a kept disc may have been seen with pixels that much larger and still do
@@ -29,12 +28,12 @@ class Look:
     """One photo's discs, before choosing."""
 
     discs: Discs  # in the scene
-    owner: NDArray[np.int32]  # (M,) BACKGROUND or row of a track
-    late: NDArray[np.bool_]  # (M,) depth is a guess: only where nothing better is
+    owner: ShortInts  # (M,) BACKGROUND or row of a track
+    late: Bools  # (M,) depth is a guess: only where nothing better is
     depth: F32  # (H, W)
-    intrinsics: F64
-    scene_from_camera: F64
-    scene_from_box: Mapping[int, F64]  # poses of the tracks that are there
+    intrinsics: Array
+    scene_from_camera: Array
+    scene_from_box: Mapping[int, Array]  # poses of the tracks that are there
 
 
 def choose(looks: Sequence[Look]) -> dict[int, Discs]:

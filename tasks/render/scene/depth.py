@@ -7,10 +7,9 @@ above, below, left and right; across a depth edge only the side that the pixel's
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.kernels.compiled import kernel
-from tasks.render.splatting.gaussians import F32, F64
+from tasks.world.arrays import F32, Array, ShortInts
 
 NEAR_M = 0.5
 SEE_THROUGH_PX = 5  # how far around a pixel its occluders are looked for
@@ -23,8 +22,8 @@ COLOUR_SIGMA = 0.06  # rgb distance that makes a neighbour half as trustworthy
 
 
 def sparse_depth(
-    points: F64, labels: NDArray[np.int32], intrinsics: F64, world_from_camera: F64, width: int, height: int
-) -> tuple[F32, NDArray[np.int32]]:
+    points: Array, labels: ShortInts, intrinsics: Array, world_from_camera: Array, width: int, height: int
+) -> tuple[F32, ShortInts]:
     """Depth [m] of the nearest point per pixel and its label; 0 and -2 where no point falls.
 
     `points` (M, 3) world, `labels` (M,). Points that are seen only through gaps between nearer ones are removed.
@@ -37,9 +36,7 @@ def sparse_depth(
     return depth, label
 
 
-def dense_depth(
-    depth: F32, label: NDArray[np.int32], rgb: F32, max_gap_px: tuple[int, int]
-) -> tuple[F32, NDArray[np.int32]]:
+def dense_depth(depth: F32, label: ShortInts, rgb: F32, max_gap_px: tuple[int, int]) -> tuple[F32, ShortInts]:
     """Closes gaps of a sparse depth image (H, W) up to `max_gap_px` (columns, rows) to the nearest returns.
 
     `rgb` (H, W, 3) in [0, 1]. Where nothing is near enough the depth stays 0 and the label -2.

@@ -1,6 +1,6 @@
 """The one function that draws a scene: `render(asset, cameras, vehicles, backend) -> rgb, depth, alpha` per camera.
 
-Two backends with one face. `cpu` is the compiled tile rasteriser of this room: the same input gives the same bytes.
+Two backends with one face. `cpu` is the compiled tile rasteriser of this package: the same input gives the same bytes.
 `gsplat` draws the same Gaussians with CUDA, equal up to the last bits of 8-bit colours. Both draw ideal pinholes: a
 camera's distortion is taken out of its photos before they enter a scene (`views.undistorted`), so that images at new
 poses need none.
@@ -16,9 +16,10 @@ import numpy as np
 from tasks.render.scene.asset import RenderAsset, scene_at
 from tasks.render.scene.movers import boxes_at
 from tasks.render.scene.sensed import shifted
-from tasks.render.splatting.gaussians import F32, F64, Gaussians
-from tasks.render.splatting.raster import View, rasterize
+from tasks.render.splatting.gaussians import Gaussians
+from tasks.render.splatting.raster import View, forward
 from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.arrays import F32, Array
 from tasks.world.camera import Pinhole
 
 
@@ -33,13 +34,13 @@ class Vehicles:
 
     track_ids: tuple[str, ...]
     kinds: tuple[AgentKind, ...]
-    boxes: F64  # (N, 7) x, y, z of the centre, heading, length, width, height; world [m, rad]
+    boxes: Array  # (N, 7) x, y, z of the centre, heading, length, width, height; world [m, rad]
 
 
 NOBODY = Vehicles((), (), np.zeros((0, 7)))
 
 
-def vehicles_at(agents: AgentTracks, time_s: float, around: F64 | None = None, reach_m: float = np.inf) -> Vehicles:
+def vehicles_at(agents: AgentTracks, time_s: float, around: Array | None = None, reach_m: float = np.inf) -> Vehicles:
     """The tracks that are there at a time since their first step; given a place `around` (2,), those within reach."""
     boxes, valid = boxes_at(agents, time_s)
     if around is not None:
@@ -69,7 +70,7 @@ def render(
 
 
 def check(backend: Backend) -> None:
-    """Raises BackendMissing where the backend cannot work on this machine, with how to mend it."""
+    """Raises BackendMissing where the backend cannot work on this machine, with how to fix it."""
     if backend is Backend.GSPLAT:
         from tasks.render.splatting.gsplat_backend import require
 
@@ -82,7 +83,7 @@ Rasteriser = Callable[[Gaussians, Sequence[Pinhole], Sequence[F32], int], list[V
 
 def _on_cpu(scene: Gaussians, cameras: Sequence[Pinhole], backdrops: Sequence[F32], threads: int) -> list[View]:
     return [
-        rasterize(scene, camera.intrinsics, camera.world_from_camera, camera.width, camera.height, backdrop, threads)
+        forward(scene, camera.intrinsics, camera.world_from_camera, camera.width, camera.height, backdrop, threads).view
         for camera, backdrop in zip(cameras, backdrops)
     ]
 

@@ -4,12 +4,11 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.render.scene.movers import owners
 from tasks.render.scene.sensed import Photo, Tracks, voxel_rows
 from tasks.render.scene.stereo import MAX_BASELINE_M, MIN_BASELINE_M
-from tasks.render.splatting.gaussians import F64
+from tasks.world.arrays import F32, Array, Indices
 
 BEST_M = 1.5  # baseline that partners are chosen near
 PARTNERS = 3  # later photos of the same camera that a photo is matched with
@@ -20,7 +19,7 @@ LEAST_PARALLAX_DEG = 0.7
 FARTHEST_M = 80.0
 
 
-def triangulated(photos: Sequence[Photo], tracks: Tracks) -> F64:
+def triangulated(photos: Sequence[Photo], tracks: Tracks) -> Array:
     """Points (M, 3) that stay, in the photos' frame: SIFT corners matched between photos of one camera.
 
     A match counts where the rays meet: at least LEAST_PARALLAX_DEG apart, in front of both cameras, OFF_PX off at most,
@@ -52,9 +51,7 @@ def _partners(photos: Sequence[Photo], i: int) -> list[int]:
     return [j for _, j in sorted(candidates)[:PARTNERS]]
 
 
-def _matches(
-    first: NDArray[np.float32] | None, second: NDArray[np.float32] | None
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _matches(first: F32 | None, second: F32 | None) -> tuple[Indices, Indices]:
     """Rows of descriptors that are each other's best, clearly better than the second best."""
     if first is None or second is None or min(len(first), len(second)) < 2:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
@@ -66,7 +63,7 @@ def _matches(
     return rows[:, 0], rows[:, 1]
 
 
-def _meeting(a: Photo, b: Photo, at_a: F64, at_b: F64) -> F64:
+def _meeting(a: Photo, b: Photo, at_a: Array, at_b: Array) -> Array:
     """Where the rays of matched pixels (M, 2) meet; only those that do (K, 3)."""
     if len(at_a) == 0:
         return np.zeros((0, 3))

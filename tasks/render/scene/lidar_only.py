@@ -7,7 +7,6 @@ between the rings on the road grow with the square of the distance.
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from tasks.render.scene.asset import RenderAsset
@@ -18,8 +17,9 @@ from tasks.render.scene.movers import owners, world_from_boxes
 from tasks.render.scene.sensed import Sweep, Tracks, on_ego, shifted, voxel_rows
 from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
 from tasks.render.scene.surfels import Discs, concatenate_discs, gaussians_of
-from tasks.render.splatting.gaussians import EMPTY, F32, F64, concatenate
+from tasks.render.splatting.gaussians import EMPTY, concatenate
 from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.arrays import F32, Array, Bools, Bytes
 
 DARKEST, BRIGHTEST, STRONG = 0.12, 0.9, 120.0  # grey of no and of a strong return: lane paint, signs, plates
 SKY_RGB, HAZE_RGB = (0.72, 0.78, 0.85), (0.30, 0.30, 0.31)  # above and below the horizon, where nothing was hit
@@ -42,7 +42,7 @@ def lidar_asset(sweeps: Sequence[Sweep], agents: AgentTracks | None) -> RenderAs
     tracks = Tracks(agents, origin)
     static: list[Discs] = []
     moving: dict[int, list[Discs]] = {}
-    sizes: dict[int, F64] = {}
+    sizes: dict[int, Array] = {}
     for sweep in sweeps:
         pose = shifted(sweep.world_from_ego, -origin)
         discs = _discs(sweep).moved(pose)
@@ -67,7 +67,7 @@ def lidar_asset(sweeps: Sequence[Sweep], agents: AgentTracks | None) -> RenderAs
     return RenderAsset(origin, background, nodes, plain_sky(), float("nan"))
 
 
-def grey_of(intensity: NDArray[np.uint8]) -> F32:
+def grey_of(intensity: Bytes) -> F32:
     """(M, 3) rgb of returns (M,): grey, by the square root, so that dark asphalt is not black."""
     strength = np.sqrt(np.minimum(intensity / STRONG, 1.0))
     return np.repeat((DARKEST + (BRIGHTEST - DARKEST) * strength)[:, None], 3, axis=1).astype(np.float32)
@@ -105,7 +105,7 @@ def _discs(sweep: Sweep) -> Discs:
     )
 
 
-def _is_ground(points: F64) -> NDArray[np.bool_]:
+def _is_ground(points: Array) -> Bools:
     """(M,) returns close above the lowest one of their cell, where that one is about as high as the ego stands."""
     cells = np.floor(points[:, :2] / CELL_M).astype(np.int64)
     _, cell = np.unique(cells, axis=0, return_inverse=True)

@@ -3,13 +3,12 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.kernels.compiled import kernel
-from tasks.render.splatting.gaussians import F64
 from tasks.world.agents import AgentTracks
+from tasks.world.arrays import Array, Bools
 from tasks.world.clip import STEP_S
-from tasks.world.frames import wrap_angle
+from tasks.world.frames import upright, wrap_angle
 
 MARGIN_M = 0.15  # boxes are drawn tightly; mirrors and noise stick out
 BEYOND_M = 0.12  # around a driving box nothing is trusted to be the street
@@ -17,7 +16,7 @@ DRIVING_M = 1.0
 GROUND_CLEARANCE_M = 0.12  # the road under a car stays behind when it leaves
 
 
-def boxes_at(agents: AgentTracks, time_s: float) -> tuple[F64, NDArray[np.bool_]]:
+def boxes_at(agents: AgentTracks, time_s: float) -> tuple[Array, Bools]:
     """Boxes (N, 7) x, y, z of the centre, heading, length, width, height at a time since the first step; valid (N,).
 
     Linear between steps; valid where both neighbouring steps are.
@@ -36,16 +35,14 @@ def boxes_at(agents: AgentTracks, time_s: float) -> tuple[F64, NDArray[np.bool_]
     return boxes, agents.valid[before] & agents.valid[after]
 
 
-def world_from_boxes(boxes: F64) -> F64:
+def world_from_boxes(boxes: Array) -> Array:
     """Poses (N, 4, 4) of boxes (N, 7): origin at the centre, x along the heading, z up."""
-    c, s = np.cos(boxes[:, 3]), np.sin(boxes[:, 3])
-    poses = np.tile(np.eye(4), (len(boxes), 1, 1))
-    poses[:, 0, 0], poses[:, 0, 1], poses[:, 1, 0], poses[:, 1, 1] = c, -s, s, c
-    poses[:, :3, 3] = boxes[:, :3]
+    poses = upright(boxes[:, [0, 1, 3]])
+    poses[:, 2, 3] = boxes[:, 2]
     return poses
 
 
-def driving(agents: AgentTracks) -> NDArray[np.bool_]:
+def driving(agents: AgentTracks) -> Bools:
     """(N,) tracks that leave their place at some time; the others may be taken for part of the street."""
     first = np.argmax(agents.valid, axis=0)
     start = agents.boxes[first, np.arange(len(agents)), :2]

@@ -8,10 +8,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tasks.render.splatting.gaussians import F32, F64, Gaussians
+from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.raster import gather, shade, splat
+from tasks.world.arrays import F32, Array, Bools, Indices
 
 RELAXATION = 0.6
 PRIOR_WEIGHT = 0.3  # weight (in pixels) that keeps barely visible Gaussians near their colour
@@ -22,17 +22,17 @@ class FitPhoto:
     """A photo to be reproduced."""
 
     rgb: F32  # (H, W, 3) in [0, 1]
-    intrinsics: F64  # (3, 3)
-    scene_from_camera: F64  # (4, 4)
+    intrinsics: Array  # (3, 3)
+    scene_from_camera: Array  # (4, 4)
     backdrop: F32  # (H, W, 3)
-    passing: NDArray[np.bool_]  # (H, W) pixels that say nothing about the background
+    passing: Bools  # (H, W) pixels that say nothing about the background
 
 
 def refit_colours(
     scene_of: Callable[[int], Gaussians],
     photos: Sequence[FitPhoto],
     colours: F32,
-    rows_of: Callable[[int], NDArray[np.intp]],
+    rows_of: Callable[[int], Indices],
     n_background: int,
     sweeps: int,
 ) -> F32:

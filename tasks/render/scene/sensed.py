@@ -4,11 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.render.scene.movers import GROUND_CLEARANCE_M, boxes_at, driving, owners, world_from_boxes
-from tasks.render.splatting.gaussians import F32, F64
 from tasks.world.agents import MOVING_KINDS, AgentTracks
+from tasks.world.arrays import F32, Array, Bools, Bytes, Indices
 from tasks.world.vehicle import PACIFICA
 
 EGO_MARGIN_M = 0.3
@@ -21,9 +20,9 @@ class Photo:
 
     camera: str
     time_s: float  # since the clip's first step
-    rgb: NDArray[np.uint8]  # (H, W, 3)
-    intrinsics: F64  # (3, 3) pixels, the centre of pixel (0, 0) at (0.5, 0.5)
-    world_from_camera: F64  # (4, 4)
+    rgb: Bytes  # (H, W, 3)
+    intrinsics: Array  # (3, 3) pixels, the centre of pixel (0, 0) at (0.5, 0.5)
+    world_from_camera: Array  # (4, 4)
 
 
 @dataclass(frozen=True)
@@ -32,11 +31,11 @@ class Sweep:
 
     time_s: float
     points: F32  # (M, 3) ego frame [m]
-    world_from_ego: F64  # (4, 4)
-    intensity: NDArray[np.uint8] | None = None  # (M,) strength of the return
+    world_from_ego: Array  # (4, 4)
+    intensity: Bytes | None = None  # (M,) strength of the return
 
 
-def shifted(pose: F64, by: F64) -> F64:
+def shifted(pose: Array, by: Array) -> Array:
     """A pose (4, 4) moved by (3,)."""
     out = pose.copy()
     out[:3, 3] += by
@@ -46,14 +45,14 @@ def shifted(pose: F64, by: F64) -> F64:
 class Tracks:
     """The movable tracks of a block, in its local frame."""
 
-    def __init__(self, agents: AgentTracks | None, origin: F64) -> None:
+    def __init__(self, agents: AgentTracks | None, origin: Array) -> None:
         self._agents, self._origin = agents, origin
         self.ids = agents.track_ids if agents is not None else ()
         self.kinds = agents.kinds if agents is not None else ()
         self.driving = driving(agents) if agents is not None else np.zeros(0, bool)
         self._movable = np.array([kind in MOVING_KINDS for kind in self.kinds], bool)
 
-    def at(self, time_s: float) -> tuple[F64, NDArray[np.bool_]]:
+    def at(self, time_s: float) -> tuple[Array, Bools]:
         """Boxes (N, 7) local, and which of them are there and movable (N,)."""
         if self._agents is None:
             return np.zeros((0, 7)), np.zeros(0, bool)
@@ -62,9 +61,9 @@ class Tracks:
         return boxes, valid & self._movable
 
 
-def fuse(sweeps: Sequence[Sweep], tracks: Tracks) -> tuple[F64, dict[int, F64]]:
+def fuse(sweeps: Sequence[Sweep], tracks: Tracks) -> tuple[Array, dict[int, Array]]:
     """Lidar points that stay (M, 3) local, and those of each track in its box's frame; both thinned by voxels."""
-    static, moving = [np.zeros((0, 3))], dict[int, list[F64]]()
+    static, moving = [np.zeros((0, 3))], dict[int, list[Array]]()
     for sweep in sweeps:
         outside = sweep.points[~on_ego(sweep.points)]
         points = outside.astype(np.float64) @ sweep.world_from_ego[:3, :3].T + sweep.world_from_ego[:3, 3]
@@ -78,19 +77,19 @@ def fuse(sweeps: Sequence[Sweep], tracks: Tracks) -> tuple[F64, dict[int, F64]]:
     return _voxels(np.concatenate(static)), {j: _voxels(np.concatenate(parts)) for j, parts in sorted(moving.items())}
 
 
-def on_ego(points: F32) -> NDArray[np.bool_]:
+def on_ego(points: F32) -> Bools:
     """Returns from the ego's own body (M,): left in, they would hang over the road as a trail."""
     x, y = points[:, 0], points[:, 1]
     along = (x > -PACIFICA.rear_length - EGO_MARGIN_M) & (x < PACIFICA.front_length + EGO_MARGIN_M)
     return np.asarray(along & (np.abs(y) < PACIFICA.half_width + EGO_MARGIN_M) & (points[:, 2] > GROUND_CLEARANCE_M))
 
 
-def voxel_rows(points: F64) -> NDArray[np.intp]:
+def voxel_rows(points: Array) -> Indices:
     """Rows of the first point (M, 3) of every voxel, ascending."""
     cells = np.floor((points - points.min(axis=0, initial=np.inf)) / FUSED_VOXEL_M).astype(np.int64)
     _, first = np.unique((cells[:, 0] << 40) | (cells[:, 1] << 20) | cells[:, 2], return_index=True)
     return np.sort(first)
 
 
-def _voxels(points: F64) -> F64:
+def _voxels(points: Array) -> Array:
     return points[voxel_rows(points)]

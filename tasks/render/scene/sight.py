@@ -7,14 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.render.scene.depth import dense_depth, sparse_depth
 from tasks.render.scene.movers import behind_boxes, world_from_boxes
 from tasks.render.scene.sensed import Photo, Tracks
 from tasks.render.scene.sky import directions
 from tasks.render.scene.stereo import FAR_M, MAX_BASELINE_M, MIN_BASELINE_M, sweep_depth
-from tasks.render.splatting.gaussians import F32, F64
+from tasks.world.arrays import F32, Array, Bools, ShortInts
 
 SHALLOW = -2  # label of a pixel without lidar
 
@@ -24,16 +23,16 @@ class Seen:
     """What a photo shows, (H, W) each."""
 
     depth: F32  # [m]; 0: nothing known
-    label: NDArray[np.int32]  # -1 background, row of a track, SHALLOW
-    sky: NDArray[np.bool_]
-    passing: NDArray[np.bool_]  # pixels at or behind something that drives: no witnesses of the street
+    label: ShortInts  # -1 background, row of a track, SHALLOW
+    sky: Bools
+    passing: Bools  # pixels at or behind something that drives: no witnesses of the street
 
 
 def see(
     photo: Photo,
     others: Sequence[Photo],
-    static: F64,
-    per_track: dict[int, F64],
+    static: Array,
+    per_track: dict[int, Array],
     tracks: Tracks,
     max_gap_px: tuple[int, int],
     stereo_photos: int,
@@ -71,7 +70,7 @@ def see(
     return Seen(depth, label, sky, passing)
 
 
-def _looks_like_sky(rgb: F32) -> NDArray[np.bool_]:
+def _looks_like_sky(rgb: F32) -> Bools:
     brightness = rgb.mean(axis=-1)
     return np.asarray((brightness > 0.6) | ((rgb[..., 2] > rgb[..., 0] + 0.04) & (brightness > 0.4)))
 
@@ -96,7 +95,7 @@ def _hints(depth: F32) -> F32:
     ).astype(np.float32)
 
 
-def _neighbours(photo: Photo, others: Sequence[Photo], n: int) -> list[tuple[F32, F64, F64]]:
+def _neighbours(photo: Photo, others: Sequence[Photo], n: int) -> list[tuple[F32, Array, Array]]:
     """The n photos whose baseline is closest to 1 m and that look the same way."""
     candidates = []
     for i, other in enumerate(others):

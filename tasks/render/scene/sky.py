@@ -3,10 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from tasks.render.splatting.gaussians import F32, F64
+from tasks.world.arrays import F32, Array, Bools
 
 ROWS, COLUMNS = 256, 1024  # elevation +90 deg .. -90 deg, azimuth -180 deg .. 180 deg
 
@@ -20,7 +19,7 @@ class SkyMap:
 
     rgb: F32  # (ROWS, COLUMNS, 3) in [0, 1], world directions
 
-    def seen_by(self, intrinsics: F64, world_from_camera: F64, width: int, height: int) -> F32:
+    def seen_by(self, intrinsics: Array, world_from_camera: Array, width: int, height: int) -> F32:
         """The backdrop (H, W, 3) of a camera."""
         rows, columns = _cells(directions(intrinsics, world_from_camera, width, height))
         y0 = np.clip(np.floor(rows).astype(np.intp), 0, ROWS - 2)
@@ -33,7 +32,7 @@ class SkyMap:
         return np.asarray(top * (1 - fy) + bottom * fy, np.float32)
 
 
-def directions(intrinsics: F64, world_from_camera: F64, width: int, height: int) -> F64:
+def directions(intrinsics: Array, world_from_camera: Array, width: int, height: int) -> Array:
     """(H, W, 3) viewing directions in the world, not normalised."""
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     rays = np.stack(
@@ -42,7 +41,7 @@ def directions(intrinsics: F64, world_from_camera: F64, width: int, height: int)
     return np.asarray(rays @ world_from_camera[:3, :3].T)
 
 
-def _cells(rays: F64) -> tuple[F64, F64]:
+def _cells(rays: Array) -> tuple[Array, Array]:
     elevation = np.arctan2(rays[..., 2], np.hypot(rays[..., 0], rays[..., 1]))
     azimuth = np.arctan2(rays[..., 1], rays[..., 0])
     return (0.5 - elevation / np.pi) * ROWS - 0.5, (azimuth / (2 * np.pi) + 0.5) * COLUMNS - 0.5
@@ -54,7 +53,7 @@ class SkyCollector:
     def __init__(self) -> None:
         self._sums = np.zeros((ROWS * COLUMNS, 4))
 
-    def add(self, rays: F64, rgb: F32, is_sky: NDArray[np.bool_]) -> None:
+    def add(self, rays: Array, rgb: F32, is_sky: Bools) -> None:
         """Colours (M, 3) in [0, 1] seen in directions (M, 3), and whether it was sky (M,)."""
         weight = np.where(is_sky, SKY_WEIGHT, 1.0)
         rows, columns = _cells(rays)

@@ -8,10 +8,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.kernels.compiled import kernel
-from tasks.render.splatting.gaussians import F32, F64
+from tasks.world.arrays import F32, Array, Bools
 
 FAR_M = 1.0e4  # stands for the sky
 LEVELS_M = (*(float(z) for z in 1.0 / np.linspace(1.0 / 5.0, 1.0 / 160.0, 28)), FAR_M)
@@ -22,11 +21,11 @@ UNSEEN_COST = 0.25  # of a pixel whose hypothesis lies outside the other photo
 
 def sweep_depth(
     rgb: F32,
-    hints: NDArray[np.float32],
-    others: list[tuple[F32, F64, F64]],
-    intrinsics: F64,
-    world_from_camera: F64,
-    wanted: NDArray[np.bool_],
+    hints: F32,
+    others: list[tuple[F32, Array, Array]],
+    intrinsics: Array,
+    world_from_camera: Array,
+    wanted: Bools,
 ) -> tuple[F32, F32, F32]:
     """Best depth (H, W) [m], its cost, and the cost of the sky hypothesis (mean absolute rgb difference).
 

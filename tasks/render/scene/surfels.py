@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.render.splatting.gaussians import F32, F64, Gaussians, quats_of
+from tasks.render.splatting.gaussians import Gaussians, quats_of
+from tasks.world.arrays import F32, Array, Bools, Indices, ShortInts
 
 SIGMA_PER_PIXEL = 0.5  # standard deviation of a disc in units of its spacing on the surface (measured: .45 .. .55)
 FLATNESS = 0.1  # thickness as a share of the short side
@@ -22,14 +23,14 @@ BLOCKS = (4, 2)  # pixels
 class Discs:
     """M discs, all in one frame."""
 
-    points: F64  # (M, 3) [m]
+    points: Array  # (M, 3) [m]
     across: F32  # (M, 3) from one disc to the next along the photo's rows [m]
     down: F32  # (M, 3) the same along its columns
     rgb: F32  # (M, 3) in [0, 1]
     spacing: F32  # (M,) size of the photo's pixel at the disc's depth [m]: how closely it was looked at
-    pixels: NDArray[np.int32]  # (M, 2) row and column in its photo
+    pixels: ShortInts  # (M, 2) row and column in its photo
 
-    def take(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> "Discs":
+    def take(self, rows: Bools | Indices) -> "Discs":
         return Discs(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     def mirrored(self) -> "Discs":
@@ -38,7 +39,7 @@ class Discs:
         across, down = (self.across * flip).astype(np.float32), (self.down * flip).astype(np.float32)
         return Discs(self.points * flip, across, down, self.rgb, self.spacing, self.pixels)
 
-    def moved(self, target_from_source: F64) -> "Discs":
+    def moved(self, target_from_source: Array) -> "Discs":
         """In another frame; (4, 4) rigid."""
         r, t = target_from_source[:3, :3], target_from_source[:3, 3]
         across, down = (self.across @ r.T).astype(np.float32), (self.down @ r.T).astype(np.float32)
@@ -50,7 +51,7 @@ def concatenate_discs(parts: list[Discs]) -> Discs:
     return Discs(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Discs)))
 
 
-def discs_of_photo(rgb: F32, depth: F32, label: NDArray[np.int32], intrinsics: F64, world_from_camera: F64) -> Discs:
+def discs_of_photo(rgb: F32, depth: F32, label: ShortInts, intrinsics: Array, world_from_camera: Array) -> Discs:
     """Discs in the world, for every pixel with depth: blocks where colour, label and depth allow, else single pixels.
 
     `rgb` (H, W, 3) in [0, 1], `depth` (H, W) [m] along the optical axis (0: none), `label` (H, W).
@@ -89,9 +90,7 @@ def discs_of_photo(rgb: F32, depth: F32, label: NDArray[np.int32], intrinsics: F
     return concatenate_discs(parts)
 
 
-def _blocks(
-    rgb: F32, depth: F32, label: NDArray[np.int32], free: NDArray[np.bool_], size: int
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _blocks(rgb: F32, depth: F32, label: ShortInts, free: Bools, size: int) -> tuple[Indices, Indices]:
     """Upper left pixels (rows, columns) of the blocks of size x size that are plain, free and on one surface."""
     if size == 1:
         rows, columns = np.nonzero(free)
@@ -114,7 +113,7 @@ def _blocks(
     return rows * size, columns * size
 
 
-def _tangents(points: F64, depth: F32, axis: int, flat: F64) -> F64:
+def _tangents(points: Array, depth: F32, axis: int, flat: Array) -> Array:
     """Steps on the surface from pixel to pixel along an image axis; facing the camera where there is no plane."""
     inverse = 1.0 / np.maximum(depth, 1e-3).astype(np.float64)
     before, after = np.roll(inverse, 1, axis), np.roll(inverse, -1, axis)
@@ -133,7 +132,7 @@ def _tangents(points: F64, depth: F32, axis: int, flat: F64) -> F64:
     return np.asarray(step * (np.minimum(length, MAX_ELONGATION * shortest) / np.maximum(length, 1e-9))[..., None])
 
 
-def gaussians_of(discs: Discs, origin: F64) -> Gaussians:
+def gaussians_of(discs: Discs, origin: Array) -> Gaussians:
     """Flat Gaussians that spread over each disc; means relative to `origin` (3,)."""
     across, down = discs.across.astype(np.float64), discs.down.astype(np.float64)
     # Principal axes of across across^T + down down^T in its own plane.

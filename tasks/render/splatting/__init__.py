@@ -1,1 +1,1 @@
-"""3D Gaussians to pixels, and the way back."""
+"""3D Gaussians to pixels, and the backward pass."""

@@ -5,13 +5,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.kernels.compiled import kernel
 from tasks.render.splatting import sh
+from tasks.world.arrays import F32, Array, Bools, FloatArray, Indices
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 _NO_SH = np.zeros((0, 0, 3), np.float32)
 
 
@@ -44,7 +42,7 @@ class Gaussians:
     def __len__(self) -> int:
         return len(self.means)
 
-    def take(self, rows: NDArray[np.bool_] | NDArray[np.intp] | slice) -> "Gaussians":
+    def take(self, rows: Bools | Indices | slice) -> "Gaussians":
         """The Gaussians at `rows` (indices or mask); a slice copies nothing."""
         return Gaussians(
             self.means[rows],
@@ -84,7 +82,7 @@ def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
     )
 
 
-def moved(gaussians: Gaussians, target_from_source: F64) -> Gaussians:
+def moved(gaussians: Gaussians, target_from_source: Array) -> Gaussians:
     """The same Gaussians in another frame; `target_from_source` (4, 4) is rigid.
 
     The light turns along: who looks at a moved vehicle sees what its own frame says for that side.
@@ -117,7 +115,7 @@ def mirrored(gaussians: Gaussians) -> Gaussians:
     )
 
 
-def turned_quats(turn: F64, quats: NDArray[np.floating]) -> F64:
+def turned_quats(turn: Array, quats: FloatArray) -> Array:
     """Hamilton products turn * quats of a quaternion (4,) w, x, y, z and many (N, 4)."""
     return np.asarray(_turned_quats(turn, quats))
 
@@ -135,7 +133,7 @@ def _turned_quats(turn: Any, quats: Any) -> Any:
     return out
 
 
-def quats_of(rotations: F64) -> F64:
+def quats_of(rotations: Array) -> Array:
     """Unit quaternions (N, 4) of rotation matrices (N, 3, 3)."""
     return np.asarray(_quats_of(np.ascontiguousarray(rotations, np.float64)))
 
@@ -169,7 +167,7 @@ def _quats_of(rotations: Any) -> Any:
     return out
 
 
-def rotations_of(quats: NDArray[np.floating]) -> F64:
+def rotations_of(quats: FloatArray) -> Array:
     """Rotation matrices (N, 3, 3) of unit quaternions (N, 4)."""
     w, x, y, z = np.asarray(quats, np.float64).T
     return np.stack(
@@ -182,7 +180,7 @@ def rotations_of(quats: NDArray[np.floating]) -> F64:
     )
 
 
-def covariances_of(gaussians: Gaussians) -> F64:
+def covariances_of(gaussians: Gaussians) -> Array:
     """(N, 3, 3) covariance matrices [m^2]."""
     axes = rotations_of(gaussians.quats) * np.exp(gaussians.log_scales.astype(np.float64))[:, None, :]
     return np.asarray(axes @ np.swapaxes(axes, 1, 2))

@@ -1,4 +1,4 @@
-"""The way back from a picture to the Gaussians and the camera it was made with, written out by hand.
+"""The backward pass from a picture to the Gaussians and the camera it was made with, written out by hand.
 
 Tiles are gone through front to back once more; each leaves one row of sums per Gaussian on it, a Gaussian's rows are
 then added up in a fixed order, so that the result does not depend on the number of threads.
@@ -7,22 +7,22 @@ then added up in a fixed order, so that the result does not depend on the number
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.kernels.threads import in_chunks
 from tasks.render.splatting import sh
-from tasks.render.splatting.gaussians import F32, F64, Gaussians, quats_of, turned_quats
+from tasks.render.splatting.gaussians import Gaussians, quats_of, turned_quats
 from tasks.render.splatting.pixels_gradient import SUMS_SIZE, W_BLUE, W_RED, add_pairs, blend_gradient
 from tasks.render.splatting.project_gradient import project_gradient
-from tasks.render.splatting.raster import GAUSSIANS_CHUNK, TILES_CHUNK, Trace, pinhole
+from tasks.render.splatting.raster import GAUSSIANS_CHUNK, TILES_CHUNK, ForwardPass, pinhole
 from tasks.render.splatting.tiles import pair_starts
+from tasks.world.arrays import F32, Array, Ints
 
 
 @dataclass(frozen=True)
 class Gradients:
     """Derivatives of a loss by the M Gaussians of a view; those that are not in `index` have none."""
 
-    index: NDArray[np.int64]  # (M,) rows in the scene, ascending
+    index: Ints  # (M,) rows in the scene, ascending
     means: F32  # (M, 3) [1/m]
     quats: F32  # (M, 4) by the quaternions as given: rendering normalises them, so this has no part along them
     log_scales: F32  # (M, 3)
@@ -30,11 +30,11 @@ class Gradients:
     colours: F32  # (M, 3)
     sh_rest: F32  # (M, count, 3)
     screen: F32  # (M, 2) [1/px] by the centre on the picture, u and v: how much density control wants it elsewhere
-    camera: F64  # (6,) by v [1/m], w [1/rad] of a camera motion x' = x + v + w cross x, x in camera coordinates
+    camera: Array  # (6,) by v [1/m], w [1/rad] of a camera motion x' = x + v + w cross x, x in camera coordinates
 
 
 def backward(
-    trace: Trace,
+    forward: ForwardPass,
     gaussians: Gaussians,
     d_rgb: F32,
     d_depth: F32 | None = None,
@@ -47,15 +47,15 @@ def backward(
     the order in depth changes the picture jumps, and its jumps have no derivative: alpha beyond the cap counts as flat.
     Raises ValueError where shapes are not the view's.
     """
-    splats, n, count = trace.splats, len(trace.splats.index), gaussians.sh_rest.shape[1]
+    splats, n, count = forward.splats, len(forward.splats.index), gaussians.sh_rest.shape[1]
     pair_start = pair_starts(splats.tiles)
-    pairs = _pairs(trace, pair_start, d_rgb, d_depth, d_alpha, threads)
+    pairs = _pairs(forward, pair_start, d_rgb, d_depth, d_alpha, threads)
     center = np.ascontiguousarray(np.linalg.inv(splats.camera_from_scene)[:3, 3])
     sums = np.empty((n, SUMS_SIZE), np.float32)
     shapes = ((n, 3), (n, 4), (n, 3), (n,), (n, 2), (n, 3), (n, count, 3))
     means, quats, log_scales, logits, screen, colours, sh_rest = (np.empty(shape, np.float32) for shape in shapes)
 
-    def run(first: int, last: int) -> F64:
+    def run(first: int, last: int) -> Array:
         camera = np.zeros(6)
         add_pairs(pair_start, pairs, first, last, sums)
         project_gradient(
@@ -100,15 +100,15 @@ def backward(
 
 
 def _pairs(
-    trace: Trace,
-    pair_start: NDArray[np.int64],
+    forward: ForwardPass,
+    pair_start: Ints,
     d_rgb: F32,
     d_depth: F32 | None,
     d_alpha: F32 | None,
     threads: int,
 ) -> F32:
     """(pairs, 11) columns of tasks.render.splatting.pixels_gradient, Gaussian by Gaussian."""
-    splats, view = trace.splats, trace.view
+    splats, view = forward.splats, forward.view
     by_depth = np.zeros_like(view.alpha) if d_depth is None else np.ascontiguousarray(d_depth, np.float32)
     by_alpha = np.zeros_like(view.alpha) if d_alpha is None else np.ascontiguousarray(d_alpha, np.float32)
     shapes = (d_rgb.shape, by_depth.shape, by_alpha.shape)
@@ -123,7 +123,7 @@ def _pairs(
             splats.tiles,
             splats.tile_start,
             splats.tile_splats,
-            trace.tile_end,
+            forward.tile_end,
             pair_start,
             by_rgb,
             by_depth,
@@ -136,11 +136,11 @@ def _pairs(
             out,
         )
 
-    in_chunks(run, len(trace.tile_end), TILES_CHUNK, threads)
+    in_chunks(run, len(forward.tile_end), TILES_CHUNK, threads)
     return out
 
 
-def unmoved(gradients: Gradients, target_from_source: F64) -> Gradients:
+def unmoved(gradients: Gradients, target_from_source: Array) -> Gradients:
     """Derivatives by the Gaussians in the frame that `gaussians.moved` took them from.
 
     `target_from_source` (4, 4) as given there; what belongs to the picture or the camera stays.

@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 
 from tasks.render.splatting import sh
-from tasks.render.splatting.gaussians import F32, Gaussians
+from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.project import DILATION_PX2, NEAR_M
 from tasks.render.splatting.raster import View
+from tasks.world.arrays import F32
 from tasks.world.camera import Pinhole
 
 HOW_TO_MEND = 'install them (pip install -e ".[gpu]" in the checkout), or draw with render.backend=cpu'

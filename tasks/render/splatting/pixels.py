@@ -77,10 +77,10 @@ def alpha_at(x: Any) -> Any:
 
 @kernel
 def aligned(n: int) -> Any:
-    """Room for n float32, at the start of a cache line."""
-    room = np.empty(n + 16, np.float32)
-    first = (-room.ctypes.data % 64) // 4
-    return room[first : first + n]
+    """Memory for n float32, at the start of a cache line."""
+    memory = np.empty(n + 16, np.float32)
+    first = (-memory.ctypes.data % 64) // 4
+    return memory[first : first + n]
 
 
 @inlined

@@ -1,4 +1,4 @@
-"""The way back through `blend`: what a change of the pixels means for each Gaussian on each tile."""
+"""The backward pass of `blend`: what a change of the pixels means for each Gaussian on each tile."""
 
 from typing import Any
 

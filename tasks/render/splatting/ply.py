@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tasks.render.splatting import sh
-from tasks.render.splatting.gaussians import F32, Gaussians
+from tasks.render.splatting.gaussians import Gaussians
+from tasks.world.arrays import F32
 
 FORMAT = "binary_little_endian 1.0"
 MAX_HEADER_BYTES = 1 << 16

@@ -25,7 +25,7 @@ PROJECTED_SIZE = 16
 
 # Rows of a block of 16 Gaussians: mean, quaternion, log-scales, then half the ellipse's box.
 X, Y, Z, QW, QX, QY, QZ, S0, S1, S2, HALF_U, HALF_V = (np.uint64(LANES * row) for row in range(12))
-BLOCK_SIZE = 28 * LANES  # with room for what the way back brings along
+BLOCK_SIZE = 28 * LANES  # with space for what the backward pass adds
 
 # exp(x) = polynomial(x / 64)^64 for x from -30 to 12: its relative error is below 1e-5 there.
 LEAST_LOG, MOST_LOG = np.float32(-30.0), np.float32(12.0)

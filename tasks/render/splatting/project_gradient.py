@@ -1,4 +1,4 @@
-"""The way back through `project`: from a change of the ellipses to a change of the Gaussians and of the camera."""
+"""The backward pass of `project`: from a change of the ellipses to a change of the Gaussians and of the camera."""
 
 from typing import Any
 

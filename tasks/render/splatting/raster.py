@@ -8,14 +8,14 @@ summed in an order that could change: the same input gives the same bytes, on an
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.kernels.threads import in_chunks
 from tasks.render.splatting import sh
-from tasks.render.splatting.gaussians import F32, F64, Gaussians
-from tasks.render.splatting.pixels import blend, carry_back
+from tasks.render.splatting.gaussians import Gaussians
+from tasks.render.splatting.pixels import aligned, blend, carry_back
 from tasks.render.splatting.project import BLUE, DEPTH, PROJECTED_SIZE, RED, project
 from tasks.render.splatting.tiles import deal
+from tasks.world.arrays import F32, Array, Bools, Ints, ShortInts
 
 GAUSSIANS_CHUNK = 8192  # projected by a thread at a time
 TILES_CHUNK = 16  # blended by a thread at a time
@@ -34,33 +34,33 @@ class View:
 class Splats:
     """The Gaussians of one view, projected, sorted and dealt out to tiles."""
 
-    index: NDArray[np.int64]  # (M,) rows in the scene, ascending
+    index: Ints  # (M,) rows in the scene, ascending
     projected: F32  # (M, 16) columns of tasks.render.splatting.project; rows are cache lines
-    tiles: NDArray[np.int32]  # (M, 4) tiles x0 <= x < x1, y0 <= y < y1 that each touches
-    tile_start: NDArray[np.int64]  # (tiles + 1,) into tile_splats
-    tile_splats: NDArray[np.int32]  # (pairs,) rows of `projected`, by tile, nearest first
-    intrinsics: F64  # (3, 3) [px]
-    camera_from_scene: F64  # (4, 4)
+    tiles: ShortInts  # (M, 4) tiles x0 <= x < x1, y0 <= y < y1 that each touches
+    tile_start: Ints  # (tiles + 1,) into tile_splats
+    tile_splats: ShortInts  # (pairs,) rows of `projected`, by tile, nearest first
+    intrinsics: Array  # (3, 3) [px]
+    camera_from_scene: Array  # (4, 4)
     width: int
     height: int
 
 
 @dataclass(frozen=True)
-class Trace:
-    """A view and what the way back from it needs."""
+class ForwardPass:
+    """A view and what its backward pass needs."""
 
     view: View
     splats: Splats  # with the colours they were blended with
-    tile_end: NDArray[np.int64]  # (tiles,) how far into `tile_splats` each tile was blended before it was opaque
+    tile_end: Ints  # (tiles,) how far into `tile_splats` each tile was blended before it was opaque
 
 
 def splat(
-    gaussians: Gaussians, intrinsics: F64, scene_from_camera: F64, width: int, height: int, threads: int = 1
+    gaussians: Gaussians, intrinsics: Array, scene_from_camera: Array, width: int, height: int, threads: int = 1
 ) -> Splats:
     """Projects and sorts. `intrinsics` (3, 3) pixels, without skew; `scene_from_camera` (4, 4) rigid."""
     camera_from_scene = np.ascontiguousarray(np.linalg.inv(scene_from_camera))
 
-    def run(first: int, last: int) -> tuple[NDArray[np.int64], F32, NDArray[np.int32]]:
+    def run(first: int, last: int) -> tuple[Ints, F32, ShortInts]:
         index, projected, tiles = project(
             gaussians.means,
             gaussians.quats,
@@ -91,52 +91,38 @@ def splat(
 
 
 def _cache_lines(n: int) -> F32:
-    """Room for projected rows (n, 16), each of which is one line of the processor's cache (64 bytes)."""
-    room = np.empty((n + 1) * PROJECTED_SIZE, np.float32)
-    first = -room.ctypes.data % 64 // 4
-    return room[first : first + n * PROJECTED_SIZE].reshape(n, PROJECTED_SIZE)
+    """Memory for projected rows (n, 16), each of which is one line of the processor's cache (64 bytes)."""
+    memory: F32 = aligned(n * PROJECTED_SIZE)
+    return memory.reshape(n, PROJECTED_SIZE)
 
 
-def pinhole(intrinsics: F64) -> tuple[float, float, float, float]:
+def pinhole(intrinsics: Array) -> tuple[float, float, float, float]:
     """Focal lengths fx, fy and centre cx, cy [px] of a camera matrix (3, 3)."""
     return float(intrinsics[0, 0]), float(intrinsics[1, 1]), float(intrinsics[0, 2]), float(intrinsics[1, 2])
 
 
-def rasterize(
+def forward(
     gaussians: Gaussians,
-    intrinsics: F64,
-    scene_from_camera: F64,
+    intrinsics: Array,
+    scene_from_camera: Array,
     width: int,
     height: int,
     background: F32,
     threads: int = 1,
-) -> View:
-    """The picture of a pinhole camera.
+) -> ForwardPass:
+    """The picture of a pinhole camera, with what `tasks.render.splatting.gradient.backward` needs.
 
     `intrinsics` (3, 3) pixels, the centre of pixel (0, 0) at (0.5, 0.5); `scene_from_camera` (4, 4), camera x right,
     y down, z forward; `background` (3,) or (H, W, 3) rgb behind everything. Kerbl et al. 2023, with per-Gaussian depth
     order.
     """
-    return trace(gaussians, intrinsics, scene_from_camera, width, height, background, threads).view
-
-
-def trace(
-    gaussians: Gaussians,
-    intrinsics: F64,
-    scene_from_camera: F64,
-    width: int,
-    height: int,
-    background: F32,
-    threads: int = 1,
-) -> Trace:
-    """As `rasterize`, with what `tasks.render.splatting.gradient.backward` needs."""
     splats = splat(gaussians, intrinsics, scene_from_camera, width, height, threads)
     splats.projected[:, RED : BLUE + 1] = colours_seen(gaussians, scene_from_camera[:3, 3], splats.index, threads)
     view, tile_end = _shade(splats, background, threads)
-    return Trace(view, splats, tile_end)
+    return ForwardPass(view, splats, tile_end)
 
 
-def colours_seen(gaussians: Gaussians, camera_center: F64, index: NDArray[np.int64], threads: int = 1) -> F32:
+def colours_seen(gaussians: Gaussians, camera_center: Array, index: Ints, threads: int = 1) -> F32:
     """rgb (M, 3) of the Gaussians at `index` (M,), as seen from `camera_center` (3,) in their frame; never negative."""
     center, out = np.ascontiguousarray(camera_center, np.float64), np.empty((len(index), 3), np.float32)
 
@@ -155,7 +141,7 @@ def shade(splats: Splats, colours: F32, background: F32, threads: int = 1) -> Vi
     return _shade(replace(splats, projected=projected), background, threads)[0]
 
 
-def _shade(splats: Splats, background: F32, threads: int) -> tuple[View, NDArray[np.int64]]:
+def _shade(splats: Splats, background: F32, threads: int) -> tuple[View, Ints]:
     height, width = splats.height, splats.width
     behind = np.ascontiguousarray(np.broadcast_to(background, (height, width, 3)), np.float32)
     view = View(
@@ -183,7 +169,7 @@ def _shade(splats: Splats, background: F32, threads: int) -> tuple[View, NDArray
     return view, ends
 
 
-def gather(splats: Splats, image: F32, masked: NDArray[np.bool_] | None = None, n_masked: int = 0) -> tuple[F32, F32]:
+def gather(splats: Splats, image: F32, masked: Bools | None = None, n_masked: int = 0) -> tuple[F32, F32]:
     """Carries an image back to the Gaussians at `splats.index`: (sum of weight * image (M, 3), sum of weight (M,))
     with the weights that `shade` blends with.
 

@@ -8,12 +8,9 @@ Gaussian's mean, in the frame that the Gaussians are given in.
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.kernels.compiled import kernel
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
+from tasks.world.arrays import F32, Array
 
 C0 = 0.28209479177387814  # sqrt(1 / (4 pi))
 C1 = 0.4886025119029199  # sqrt(3 / (4 pi))
@@ -145,7 +142,7 @@ def seen_gradient(
     return added
 
 
-def turned(sh_rest: F32, matrix: F64) -> F32:
+def turned(sh_rest: F32, matrix: Array) -> F32:
     """Coefficients (N, M, 3) of the same light in a frame turned, or mirrored, by the orthogonal `matrix` (3, 3)."""
     count = sh_rest.shape[1]
     if count == 0 or np.array_equal(matrix, np.eye(3)):
@@ -153,7 +150,7 @@ def turned(sh_rest: F32, matrix: F64) -> F32:
     return np.einsum("ab,nbc->nac", turning(matrix, count), sh_rest).astype(np.float32)
 
 
-def turning(matrix: F64, count: int) -> F64:
+def turning(matrix: Array, count: int) -> Array:
     """The orthogonal (count, count) matrix that takes coefficients to the frame turned by `matrix` (3, 3).
 
     The turned light f(matrix^T d) is again a sum of basis functions, so it is read off exactly from more directions
@@ -162,7 +159,7 @@ def turning(matrix: F64, count: int) -> F64:
     return np.asarray(np.linalg.pinv(basis(_DIRECTIONS, count)) @ basis(_DIRECTIONS @ matrix, count))
 
 
-def _spread(n: int) -> F64:
+def _spread(n: int) -> Array:
     """n directions (n, 3) all over the sphere (a Fibonacci spiral)."""
     z = 1.0 - (2.0 * np.arange(n) + 1.0) / n
     angle = np.arange(n) * np.pi * (3.0 - np.sqrt(5.0))

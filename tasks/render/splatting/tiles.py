@@ -3,19 +3,16 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.kernels.compiled import kernel
 from tasks.kernels.threads import in_chunks
-from tasks.render.splatting.gaussians import F32
 from tasks.render.splatting.project import TILE
+from tasks.world.arrays import F32, Ints, ShortInts
 
 CHUNK = 8192  # ellipses a thread deals out at a time
 
 
-def deal(
-    depths: F32, tiles: NDArray[np.int32], width: int, height: int, threads: int
-) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+def deal(depths: F32, tiles: ShortInts, width: int, height: int, threads: int) -> tuple[Ints, ShortInts]:
     """Start of each tile (tiles + 1,), row by row, in the list (pairs,) of the ellipses that touch it, nearest first.
 
     `depths` (M,) positive, `tiles` (M, 4) as from tasks.render.splatting.project.
@@ -43,7 +40,7 @@ def deal(
     return start, pairs
 
 
-def pair_starts(tiles: NDArray[np.int32]) -> NDArray[np.int64]:
+def pair_starts(tiles: ShortInts) -> Ints:
     """Where each ellipse's pairs start (M + 1,) when they are numbered ellipse by ellipse, its tiles row by row."""
     counts = (tiles[:, 1] - tiles[:, 0]) * (tiles[:, 3] - tiles[:, 2])
     return np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])

@@ -209,7 +209,7 @@ def test_without_room_for_the_cache_a_kernel_works_and_says_what_helps(tmp_path:
     said = hits_and_misses(copy_with_one_kernel(tmp_path / "project"), XDG_CACHE_HOME=str(tmp_path / "file"))
     assert said.startswith("0 1")
     assert said.count("RuntimeWarning: compiled kernels cannot be kept in") == 1
-    assert "name a folder with room in NUMBA_CACHE_DIR" in said
+    assert "name a folder with free space in NUMBA_CACHE_DIR" in said
 
 
 def test_without_room_for_the_cache_a_run_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

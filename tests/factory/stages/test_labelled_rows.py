@@ -66,7 +66,7 @@ def sample(work: FactoryWork, expert: str) -> tuple[Accepted, Judged]:
 def among(judged: Judged, agents: AgentTracks, vocabulary: Vocabulary) -> Scores:
     """The vocabulary in pairs with PDM-Closed, from the sample's scene."""
     driven = track(judged.scene.ego_state, to_world(judged.scene.ego_state[:3], vocabulary.trajectories))
-    states = np.concatenate([judged.rival[None], driven])
+    states = np.concatenate([judged.reference[None], driven])
     return score(prepare_scene(judged.scene, agents), states, normalise="pairs")
 
 

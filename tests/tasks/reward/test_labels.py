@@ -56,7 +56,7 @@ def human() -> Judged:
 def labelled(
     judged: Judged, traffic: TrafficSettings = REPLAY, vocabulary: Vocabulary = VOCABULARY
 ) -> VocabularyLabels:
-    return vocabulary_labels(Labelling(vocabulary, traffic), judged.scene, judged.prepared, judged.rival)
+    return vocabulary_labels(Labelling(vocabulary, traffic), judged.scene, judged.prepared, judged.reference)
 
 
 def in_pairs(judged: Judged, agents_of: str) -> Scores:
@@ -65,7 +65,7 @@ def in_pairs(judged: Judged, agents_of: str) -> Scores:
     log = scene.clip.agents.window(scene.step, scene.step + 41)
     prepared = prepare_scene(scene, judged.rollout.agents if agents_of == "rollout" else log)
     driven = track(scene.ego_state, to_world(scene.ego_state[:3], VOCABULARY.trajectories))
-    return score(prepared, np.concatenate([judged.rival[None], driven]), normalise="pairs")
+    return score(prepared, np.concatenate([judged.reference[None], driven]), normalise="pairs")
 
 
 def assert_labels_are(labels: VocabularyLabels, scores: Scores) -> None:
@@ -84,7 +84,7 @@ def test_labels_are_the_reward_s_scores_in_pairs_with_pdm_closed(simulated: Judg
 
 def test_in_one_batch_they_are_those_of_the_batch(simulated: Judged) -> None:
     driven = track(simulated.scene.ego_state, to_world(simulated.scene.ego_state[:3], VOCABULARY.trajectories))
-    batch = score(simulated.prepared, np.concatenate([simulated.rival[None], driven]))
+    batch = score(simulated.prepared, np.concatenate([simulated.reference[None], driven]))
     np.testing.assert_array_equal(labelled(simulated).ep("batch"), batch.ep[1:])
 
 
@@ -136,7 +136,7 @@ def test_reacting_traffic_answers_to_each_trajectory(human: Judged) -> None:
 def test_reactive_scores_are_in_pairs_with_row_0_and_rows_do_not_see_each_other(human: Judged) -> None:
     scene = human.scene
     poses = to_world(scene.ego_state[:3], VOCABULARY.trajectories[:5])
-    states = np.concatenate([human.rival[None], track(scene.ego_state, poses)])
+    states = np.concatenate([human.reference[None], track(scene.ego_state, poses)])
     scores = reactive_scores(scene, states, IDM)
     labels = labelled(human, IDM, Vocabulary(VOCABULARY.trajectories[:5]))
     assert_labels_are(labels, scores)
@@ -146,8 +146,8 @@ def test_reactive_scores_are_in_pairs_with_row_0_and_rows_do_not_see_each_other(
 
 
 def test_a_reference_at_fault_leaves_no_progress_to_be_held_against(human: Judged) -> None:
-    off_road = human.rival.copy()
+    off_road = human.reference.copy()
     off_road[:, 1] += 30.0
-    labels = labelled(replace(human, rival=off_road))
+    labels = labelled(replace(human, reference=off_road))
     assert labels.reference_progress_m == 0.0
     np.testing.assert_array_equal(labels.ep()[labels.multiplier == 1.0], 1.0)

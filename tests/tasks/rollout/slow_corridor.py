@@ -151,9 +151,9 @@ def corridor_gap(
     cell_radius = math.hypot(half_width, PATH_SPACING_M)
     while ahead < lookahead:
         x, y, h = pose_on_path(paths, m, s + front + ahead, travelled + front + ahead, offset, turn, blend_length)
-        room = math.hypot(center[0] - x, center[1] - y) - radius - cell_radius
-        if room > 0.0:
-            ahead += max(0.8 * room, PATH_SPACING_M)  # 0.8: a blended path is a little longer than its own length
+        clearance = math.hypot(center[0] - x, center[1] - y) - radius - cell_radius
+        if clearance > 0.0:
+            ahead += max(0.8 * clearance, PATH_SPACING_M)  # 0.8: a blended path is a little longer than its own length
             continue
         low, high = _range_in_strip(corners, x, y, h, half_width)
         if low <= PATH_SPACING_M and high >= 0.0:

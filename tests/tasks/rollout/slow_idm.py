@@ -6,8 +6,8 @@ All agents look at the same instant and then move together, so their order does 
 ego included, that reaches into the corridor the driver's own body will sweep along its path; speeds never go below
 zero. The published parameters are kept. Unlike the public traffic a driver brakes harder than `b` only where stopping
 behind the leader's own emergency stop needs it, and never harder than tyres can: logged drivers follow closer than s*
-and would otherwise all stamp on the brake at the first step. A vehicle that replays its log takes the wheel, along its
-logged way, as soon as a driven vehicle there asks for more than `b`; it stays at it for the rest of the rollout.
+and would otherwise all stamp on the brake at the first step. A vehicle that replays its log switches to IDM, along its
+logged way, as soon as a driven vehicle there asks for more than `b`; it stays there for the rest of the rollout.
 Compiled: tens of agents for 4 s take some milliseconds.
 """
 
@@ -37,7 +37,7 @@ OPEN, CLOSED_IF_STOPPABLE, CLOSED = 0, 1, 2  # a stop line's state: green, yello
 ABSENT, REPLAYED, DRIVEN, STANDING = 0, 1, 2, 3  # what moves an agent at the moment
 
 
-class Driver(NamedTuple):
+class IdmDriver(NamedTuple):
     """One driver's habits; SI units."""
 
     min_gap: float  # s0 [m]
@@ -53,7 +53,7 @@ class Driver(NamedTuple):
     enter_clearance: float  # [m] from the ego's centre
 
 
-class Cast(NamedTuple):
+class Roles(NamedTuple):
     """Who does what, N agents; steps are the clip's."""
 
     path: NDArray[np.int64]  # (N,) index of its path, -1: none
@@ -66,7 +66,7 @@ class Cast(NamedTuple):
     enters_clear: NDArray[np.bool_]  # (N,) vehicles that may only enter with clearance to the ego
 
 
-class World(NamedTuple):
+class AgentStates(NamedTuple):
     """Agents' boxes (.., N, 5), velocities (.., N, 2), presence (.., N) and centre heights (.., N)."""
 
     boxes: Array
@@ -76,7 +76,7 @@ class World(NamedTuple):
 
 
 @kernel
-def idm_acceleration(speed: float, target_speed: float, gap: float, lead_speed: float, driver: Driver) -> float:
+def idm_acceleration(speed: float, target_speed: float, gap: float, lead_speed: float, driver: IdmDriver) -> float:
     """Acceleration [m/s2]; gap = inf on a free road."""
     gap = max(gap, SMALLEST_GAP_M)
     free = driver.accel * (1.0 - (speed / target_speed) ** driver.exponent)
@@ -89,11 +89,11 @@ def idm_acceleration(speed: float, target_speed: float, gap: float, lead_speed: 
 
 
 @kernel
-def needed_deceleration(speed: float, gap: float, lead_speed: float, driver: Driver) -> float:
+def needed_deceleration(speed: float, gap: float, lead_speed: float, driver: IdmDriver) -> float:
     """[m/s2] that stops half the minimum gap behind a leader which makes an emergency stop now."""
     lead_stop = max(lead_speed, 0.0) ** 2 / (2.0 * driver.emergency_decel)
-    room = max(gap - 0.5 * driver.min_gap, SMALLEST_GAP_M) + lead_stop
-    return speed * speed / (2.0 * room)
+    distance = max(gap - 0.5 * driver.min_gap, SMALLEST_GAP_M) + lead_stop
+    return speed * speed / (2.0 * distance)
 
 
 @kernel
@@ -110,17 +110,19 @@ def stop_line_gap(paths: Paths, m: int, step: int, nose: float, speed: float, de
     """Distance [m] from the bumper at path length `nose` to the nearest closed stop line."""
     gap = np.inf
     for q in range(paths.line_start[m], paths.line_start[m + 1]):
-        room = paths.line_at[q] - nose
+        distance = paths.line_at[q] - nose
         state = paths.line_state[step, q]
-        if state == OPEN or (state == CLOSED_IF_STOPPABLE and speed * speed > 2.0 * decel * room):
+        if state == OPEN or (state == CLOSED_IF_STOPPABLE and speed * speed > 2.0 * decel * distance):
             continue
-        if room >= 0.0 or (room > -STOP_LINE_TOLERANCE_M and speed < 1.0):
-            gap = min(gap, max(room, 0.0))
+        if distance >= 0.0 or (distance > -STOP_LINE_TOLERANCE_M and speed < 1.0):
+            gap = min(gap, max(distance, 0.0))
     return gap
 
 
 @kernel
-def _start_on(paths: Paths, m: int, box: Array, velocity: Array, driver: Driver) -> tuple[float, float, float, float]:
+def _start_on(
+    paths: Paths, m: int, box: Array, velocity: Array, driver: IdmDriver
+) -> tuple[float, float, float, float]:
     """(path length, offset to the left, turn, speed) of a vehicle that starts to follow path m."""
     s, left = project_on_path(paths, m, box[0], box[1])
     difference = box[2] - pose_on_path(paths, m, s, 0.0, left, 0.0, driver.blend_length)[2]
@@ -131,7 +133,7 @@ def _start_on(paths: Paths, m: int, box: Array, velocity: Array, driver: Driver)
 @kernel
 def _gap_to(
     paths: Paths, m: int, s: float, travelled: float, offset: float, turn: float, box: Array,
-    other: Array, corners: Array, radius: float, driver: Driver,
+    other: Array, corners: Array, radius: float, driver: IdmDriver,
 ) -> tuple[float, float]:  # fmt: skip
     """(gap [m] from the bumper of `box` along its path to an other box, path heading there); inf: not in the way."""
     if not math.hypot(other[0] - box[0], other[1] - box[1]) <= driver.lookahead + box[3] + radius:
@@ -145,7 +147,7 @@ def _gap_to(
 @kernel
 def _must_brake(
     paths: Paths, m: int, i: int, box: Array, velocity: Array,
-    boxes: Array, velocities: Array, mode: NDArray[np.int64], corners: Array, radius: Array, driver: Driver,
+    boxes: Array, velocities: Array, mode: NDArray[np.int64], corners: Array, radius: Array, driver: IdmDriver,
 ) -> bool:  # fmt: skip
     """Does a driven vehicle on path m ask agent i, at `box`, for more than the comfortable deceleration?"""
     s, left, turn, speed = _start_on(paths, m, box, velocity, driver)
@@ -186,13 +188,13 @@ def _is_free(box: Array, row: Array, mode: NDArray[np.int64], ego: Array, margin
 @kernel
 def drive(
     start: int,
-    log: World,
-    now: World,
-    cast: Cast,
+    log: AgentStates,
+    now: AgentStates,
+    roles: Roles,
     paths: Paths,
     ego_boxes: Array,
     ego_velocities: Array,
-    driver: Driver,
+    driver: IdmDriver,
 ) -> tuple[Array, Array, NDArray[np.bool_], Array, NDArray[np.bool_]]:
     """Boxes (T, N, 5), velocities (T, N, 2), valid (T, N), centre z (T, N) and who was driven (N,).
 
@@ -208,7 +210,7 @@ def drive(
     boxes[0], velocities[0], valid[0], center_z[0] = now.boxes, now.velocities, now.valid, now.center_z
 
     mode, path = np.zeros(n, np.int64), np.full(n, -1)
-    clock = cast.clock.copy()
+    clock = roles.clock.copy()
     s, travelled, speed = np.zeros(n), np.zeros(n), np.zeros(n)
     offset, turn, base_z = np.zeros(n), np.zeros(n), np.zeros(n)
     was_driven = np.zeros(n, np.bool_)
@@ -218,7 +220,7 @@ def drive(
 
     for i in range(n):
         if now.valid[i]:
-            mode[i] = STANDING if cast.standing[i] else REPLAYED
+            mode[i] = STANDING if roles.standing[i] else REPLAYED
 
     for t in range(n_rows - 1):
         for j in range(n + 1):
@@ -226,17 +228,17 @@ def drive(
             corners_of(box, corners[j])
             radius[j] = 0.5 * math.hypot(box[3], box[4])
 
-        # Who is on the lane and due takes the wheel, at its own pose and speed; so does who must brake on its log.
+        # Who is on the lane and due switches to IDM, at its own pose and speed; so does who must brake on its log.
         for i in range(n):
             takes[i] = -1
             if mode[i] != REPLAYED or not valid[t, i]:
                 continue
-            m = cast.path[i]
-            if m >= 0 and clock[i] >= cast.join_step[i]:
+            m = roles.path[i]
+            if m >= 0 and clock[i] >= roles.join_step[i]:
                 left = project_on_path(paths, m, boxes[t, i, 0], boxes[t, i, 1])[1]
                 if abs(left) <= driver.largest_offset:
                     takes[i] = m
-            m = cast.logged_path[i]
+            m = roles.logged_path[i]
             if takes[i] < 0 and m >= 0 and _must_brake(
                 paths, m, i, boxes[t, i], velocities[t, i], boxes[t], velocities[t], mode, corners, radius, driver
             ):  # fmt: skip
@@ -255,7 +257,7 @@ def drive(
                 continue
             m = path[i]
             length, width = boxes[t, i, 3], boxes[t, i, 4]
-            held = start + t < cast.hold_until[i] and travelled[i] == 0.0 and m == cast.path[i]
+            held = start + t < roles.hold_until[i] and travelled[i] == 0.0 and m == roles.path[i]
             step_m, new_speed = 0.0, 0.0
             if not held:
                 was_driven[i] = True
@@ -302,10 +304,10 @@ def drive(
                 velocities[t + 1, i] = 0.0
             elif mode[i] == REPLAYED:
                 k = min(clock[i] + 1, n_log - 1)
-                if cast.moving_kind[i] and cast.logged_path[i] < 0 and valid[t, i] and log.valid[k, i]:
+                if roles.moving_kind[i] and roles.logged_path[i] < 0 and valid[t, i] and log.valid[k, i]:
                     blocked = _touches_driven(log.boxes[k, i], boxes[t + 1], mode, i)
                     # One that walks goes on once it is touched; a vehicle would drive through.
-                    if blocked and (cast.enters_clear[i] or not _touches_driven(boxes[t, i], boxes[t + 1], mode, i)):
+                    if blocked and (roles.enters_clear[i] or not _touches_driven(boxes[t, i], boxes[t + 1], mode, i)):
                         boxes[t + 1, i], center_z[t + 1, i], valid[t + 1, i] = boxes[t, i], center_z[t, i], True
                         velocities[t + 1, i] = 0.0
                         continue
@@ -321,13 +323,13 @@ def drive(
             if mode[i] != ABSENT or not log.valid[k, i]:
                 continue
             box, ego = log.boxes[k, i], ego_boxes[t + 1]
-            if cast.enters_clear[i]:
+            if roles.enters_clear[i]:
                 far = math.hypot(box[0] - ego[0], box[1] - ego[1]) >= driver.enter_clearance
                 if not (far and _is_free(box, boxes[t + 1], mode, ego, driver.min_gap)):
                     continue
-            elif cast.moving_kind[i] and _touches_driven(box, boxes[t + 1], mode, i):
+            elif roles.moving_kind[i] and _touches_driven(box, boxes[t + 1], mode, i):
                 continue
-            fresh[i] = STANDING if cast.standing[i] else REPLAYED
+            fresh[i] = STANDING if roles.standing[i] else REPLAYED
         for i in range(n):
             if fresh[i] != ABSENT:
                 mode[i], clock[i] = fresh[i], k

@@ -32,14 +32,14 @@ def slow_roll_out(traffic: TrafficScene, ego_states: Array) -> Rollout:
     """As `roll_out`, by the twin that looks at every pair at every step."""
     scene, of = traffic.scene, traffic.settings
     window = scene.agents.window(scene.step, scene.step + 41)
-    assert traffic.cast is not None and traffic.paths is not None
+    assert traffic.roles is not None and traffic.paths is not None
     paths = traffic.paths._asdict()
     del paths["stretches"]
     heading, speed = ego_states[:, HEADING], ego_states[:, VX]
     cos, sin = np.cos(heading), np.sin(heading)
     size = np.full((41, 2), (PACIFICA.length, PACIFICA.width))
     x, y = (ego_states[:, k] + PACIFICA.rear_axle_to_center * d for k, d in ((X, cos), (Y, sin)))
-    driver = slow_idm.Driver(
+    driver = slow_idm.IdmDriver(
         of.min_gap_m, of.headway_s, of.accel_max, of.decel_max, of.exponent, of.emergency_decel, of.lookahead_m,
         of.corridor_margin_m, of.blend_length_m, of.snap_distance_m + 2.0, of.enter_clearance_m,
     )  # fmt: skip
@@ -47,7 +47,7 @@ def slow_roll_out(traffic: TrafficScene, ego_states: Array) -> Rollout:
         scene.step,
         slow_world(scene.clip.agents, slice(None)),
         slow_world(scene.agents, scene.step),
-        slow_idm.Cast(*traffic.cast),
+        slow_idm.Roles(*traffic.roles),
         slow_corridor.Paths(**paths),
         np.column_stack([x, y, heading, size]),
         np.column_stack([cos * speed, sin * speed]),
@@ -57,8 +57,8 @@ def slow_roll_out(traffic: TrafficScene, ego_states: Array) -> Rollout:
     return Rollout(scene.step, ego_states, agents, driven)
 
 
-def slow_world(agents: AgentTracks, steps: int | slice) -> slow_idm.World:
-    return slow_idm.World(
+def slow_world(agents: AgentTracks, steps: int | slice) -> slow_idm.AgentStates:
+    return slow_idm.AgentStates(
         *(np.ascontiguousarray(a[steps]) for a in (agents.boxes, agents.velocities, agents.valid, agents.center_z))
     )
 
@@ -115,20 +115,20 @@ def test_the_random_worlds_reach_every_rule() -> None:
     braked, waited, kept_out, answers = 0, 0, 0, 0
     for seed in range(30):
         for traffic, egos in stages(seed):
-            assert traffic.cast is not None
+            assert traffic.roles is not None
             start, log = traffic.scene.step, traffic.scene.clip.agents
             logged = log.window(start, start + 41)
             rollouts = [roll_out(traffic, ego) for ego in egos]
             for rollout in rollouts:
                 agents = rollout.agents
-                walks = traffic.cast.moving_kind & (traffic.cast.logged_path < 0) & ~rollout.simulated
+                walks = traffic.roles.moving_kind & (traffic.roles.logged_path < 0) & ~rollout.simulated
                 late = (
                     (agents.boxes != logged.boxes).any(axis=(0, 2))
                     & agents.valid.all(axis=0)
                     & logged.valid.all(axis=0)
                 )
-                braked += int((rollout.simulated & (traffic.cast.path < 0)).sum())
-                waited += int((walks & late & ~traffic.cast.standing).sum())
+                braked += int((rollout.simulated & (traffic.roles.path < 0)).sum())
+                waited += int((walks & late & ~traffic.roles.standing).sum())
                 kept_out += int((logged.valid & ~agents.valid).any(axis=0).sum())
                 answers += agents.boxes.tobytes() != rollouts[0].agents.boxes.tobytes()
     assert min(braked, waited, kept_out, answers) > 20

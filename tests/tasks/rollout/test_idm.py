@@ -7,7 +7,7 @@ import shapely.ops
 
 from tasks.rollout.corridor import Paths, Way, boxes_overlap, corridor_gap, pose_on_path, project_on_path
 from tasks.rollout.idm import (
-    Driver,
+    IdmDriver,
     advance,
     following_acceleration,
     free_acceleration,
@@ -17,7 +17,7 @@ from tasks.rollout.idm import (
 from tasks.rollout.stretches import stretches_of
 from tasks.world.frames import box_corners
 
-DRIVER = Driver(1.0, 1.5, 1.0, 2.0, 4.0, 8.0, 60.0, 0.0, 20.0, 5.0, 30.0)
+DRIVER = IdmDriver(1.0, 1.5, 1.0, 2.0, 4.0, 8.0, 60.0, 0.0, 20.0, 5.0, 30.0)
 
 
 def one_path(xy: np.ndarray, lines: tuple[tuple[float, int], ...] = ()) -> Paths:
@@ -36,7 +36,7 @@ def one_path(xy: np.ndarray, lines: tuple[tuple[float, int], ...] = ()) -> Paths
     )
 
 
-def idm_acceleration(speed: float, target_speed: float, gap: float, lead_speed: float, driver: Driver) -> float:
+def idm_acceleration(speed: float, target_speed: float, gap: float, lead_speed: float, driver: IdmDriver) -> float:
     free = free_acceleration(speed, target_speed, driver)
     return following_acceleration(free, speed, gap, lead_speed, driver)
 

@@ -381,9 +381,17 @@ def test_a_read_only_scene_gives_the_same_rollout() -> None:
     expected = run(busy_scene())
     scene = busy_scene()
     prepared = prepare_traffic(scene, IDM)
-    assert prepared.cast is not None and prepared.paths is not None
+    assert prepared.roles is not None and prepared.paths is not None
     agents, ego = scene.agents, scene.clip.ego_states
-    for array in (*prepared.cast, *prepared.paths, agents.boxes, agents.velocities, agents.valid, agents.center_z, ego):
+    for array in (
+        *prepared.roles,
+        *prepared.paths,
+        agents.boxes,
+        agents.velocities,
+        agents.valid,
+        agents.center_z,
+        ego,
+    ):
         array.flags.writeable = False
     for rollout in (roll_out(prepared, expected.ego_states), run(scene)):
         assert np.array_equal(rollout.agents.boxes, expected.agents.boxes, equal_nan=True)

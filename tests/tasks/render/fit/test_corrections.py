@@ -10,7 +10,7 @@ from tasks.render.fit.schedule import decayed, photo_at
 from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.gradient import backward
-from tasks.render.splatting.raster import trace
+from tasks.render.splatting.raster import forward
 
 RNG = np.random.default_rng(3)
 K = np.array([[20.0, 0.0, 10.0], [0.0, 20.0, 8.0], [0.0, 0.0, 1.0]])
@@ -70,10 +70,10 @@ def test_the_rasterisers_camera_gradient_is_that_of_a_pose_row() -> None:
     upstream = np.ones((SIZE[1], SIZE[0], 3), np.float32) * np.linspace(-1, 1, SIZE[0], dtype=np.float32)[None, :, None]
 
     def value(row: np.ndarray) -> float:
-        view = trace(scene, K, corrected(np.eye(4), row), *SIZE, np.zeros(3, np.float32)).view
+        view = forward(scene, K, corrected(np.eye(4), row), *SIZE, np.zeros(3, np.float32)).view
         return float((view.rgb.astype(np.float64) * upstream).sum())
 
-    slopes = backward(trace(scene, K, np.eye(4), *SIZE, np.zeros(3, np.float32)), scene, upstream).camera
+    slopes = backward(forward(scene, K, np.eye(4), *SIZE, np.zeros(3, np.float32)), scene, upstream).camera
     for axis in (0, 4):  # to the right, and turned about the vertical: what the upstream looks at
         step = np.zeros(6)
         step[axis] = 1e-3

@@ -8,7 +8,7 @@ from tasks.render.fit.density import refine, shared
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.state import FitState, logits_of, opacities_of
 from tasks.render.splatting.gaussians import Gaussians, concatenate
-from tasks.render.splatting.raster import rasterize
+from tasks.render.splatting.raster import forward
 
 K = np.array([[40.0, 0.0, 16.0], [0.0, 40.0, 16.0], [0.0, 0.0, 1.0]])
 
@@ -28,9 +28,9 @@ def one(opacity: float, sigma: float) -> Gaussians:
 def test_copies_in_place_of_one_gaussian_show_the_same(opacity: float, copies: int) -> None:
     opacities, shrink = shared(np.array([opacity]), np.array([copies]))
     assert 1.0 - (1.0 - opacities[0]) ** copies == pytest.approx(opacity)
-    before = rasterize(one(opacity, 0.5), K, np.eye(4), 32, 32, np.zeros(3, np.float32)).rgb
+    before = forward(one(opacity, 0.5), K, np.eye(4), 32, 32, np.zeros(3, np.float32)).view.rgb
     parts = [one(opacities[0], 0.5 * shrink[0])] * copies
-    after = rasterize(concatenate(parts), K, np.eye(4), 32, 32, np.zeros(3, np.float32)).rgb
+    after = forward(concatenate(parts), K, np.eye(4), 32, 32, np.zeros(3, np.float32)).view.rgb
     assert after[16].sum() == pytest.approx(before[16].sum(), rel=0.05)  # the paper's equation: along a line through it
     assert np.abs(after - before).max() < 0.15
     assert after[16, 16] == pytest.approx(before[16, 16], abs=0.01)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tasks.render.fit.losses import depth_loss, opaque_loss, photo_loss, ssim, target_of
+from tasks.render.fit.losses import opaque_loss, photo_loss, ssim, target_of
 
 RNG = np.random.default_rng(0)
 PHOTO = RNG.integers(0, 256, (17, 23, 3)).astype(np.uint8)
@@ -60,14 +60,6 @@ def test_a_picture_that_equals_the_photo_loses_nothing_and_ignored_pixels_do_not
     loss, gradient = photo_loss(painted, target, 0.0)
     assert loss == 0.0
     assert not gradient.any()
-
-
-def test_depth_loss_is_the_mean_error_of_inverse_depth() -> None:
-    known = np.array([[0.0, 4.0], [10.0, 5.0]], np.float32)
-    depth = np.array([[3.0, 5.0], [8.0, 0.0]], np.float32)  # unknown, too far, too near, nothing there
-    loss, gradient = depth_loss(depth, known, 2.0)
-    assert loss == pytest.approx(2.0 * (0.05 + 0.025) / 2)
-    np.testing.assert_allclose(gradient, [[0.0, 1.0 / 25.0], [-1.0 / 64.0, 0.0]], rtol=1e-6)
 
 
 def test_light_that_passes_where_there_is_ground_is_lost() -> None:

@@ -1,4 +1,4 @@
-"""The way back from a picture, against what torch finds by itself in float64."""
+"""The backward pass from a picture, against what torch finds by itself in float64."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from tasks.render.splatting.gaussians import EMPTY, Gaussians, concatenate, moved
 from tasks.render.splatting.gradient import Gradients, backward, unmoved
-from tasks.render.splatting.raster import Trace, trace
+from tasks.render.splatting.raster import ForwardPass, forward
 
 WIDTH, HEIGHT = 37, 29  # no multiple of a tile
 INTRINSICS = np.array([[30.0, 0.0, 18.0], [0.0, 31.0, 15.0], [0.0, 0.0, 1.0]])
@@ -62,8 +62,8 @@ def upstream(seed: int) -> tuple[NDArray[np.float32], ...]:
     return tuple(rng.normal(size=shape).astype(np.float32) for shape in shapes)
 
 
-def traced(scene: Gaussians, threads: int = 1) -> Trace:
-    return trace(scene, INTRINSICS, CAMERA, WIDTH, HEIGHT, BACKGROUND, threads)
+def traced(scene: Gaussians, threads: int = 1) -> ForwardPass:
+    return forward(scene, INTRINSICS, CAMERA, WIDTH, HEIGHT, BACKGROUND, threads)
 
 
 def dense(gradients: Gradients, kind: str, n: int) -> NDArray[np.float32]:
@@ -130,7 +130,7 @@ def test_a_vehicle_gets_its_gradients_in_its_own_frame() -> None:
 
 def test_the_screen_gradient_moves_a_far_gaussian_across_the_view() -> None:
     scene = cloud(60, 11, 30.0, 60.0, 0.2, 0.9)  # so far that a step to the side changes nothing but the place
-    gradients = backward(trace(scene, INTRINSICS, np.eye(4), WIDTH, HEIGHT, BACKGROUND), scene, upstream(11)[0])
+    gradients = backward(forward(scene, INTRINSICS, np.eye(4), WIDTH, HEIGHT, BACKGROUND), scene, upstream(11)[0])
     pixels_per_metre = np.array([30.0, 31.0]) / scene.means[gradients.index, 2:]
     moved_by = gradients.screen * pixels_per_metre
     np.testing.assert_allclose(gradients.means[:, :2], moved_by, atol=0.01 * np.abs(moved_by).max())

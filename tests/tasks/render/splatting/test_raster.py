@@ -16,7 +16,7 @@ from tasks.render.splatting.gaussians import (
 )
 from tasks.render.splatting.pixels import MAX_ALPHA
 from tasks.render.splatting.project import DILATION_PX2, MAX_TANGENT_RATIO, MIN_ALPHA, NEAR_M
-from tasks.render.splatting.raster import gather, rasterize, splat
+from tasks.render.splatting.raster import forward, gather, splat
 
 INTRINSICS = np.array([[60.0, 0.0, 37.0], [0.0, 58.0, 22.0], [0.0, 0.0, 1.0]])
 WIDTH, HEIGHT = 75, 45  # no multiple of a tile
@@ -79,7 +79,7 @@ def slow_rasterize(
 def test_the_kernel_equals_its_slow_twin(n: int, sigma: float) -> None:
     scene, view = cloud(n, seed=n, sigma=sigma), pose(0.2, (0.3, -0.1, -0.5))
     background = np.random.default_rng(1).uniform(0, 1, (HEIGHT, WIDTH, 3)).astype(np.float32)
-    fast = rasterize(scene, INTRINSICS, view, WIDTH, HEIGHT, background)
+    fast = forward(scene, INTRINSICS, view, WIDTH, HEIGHT, background).view
     rgb, depth, alpha = slow_rasterize(scene, view, background)
     assert np.abs(fast.rgb - rgb).max() <= 2.0 / 255.0
     assert np.abs(fast.alpha - alpha).max() <= 2.0 / 255.0
@@ -90,15 +90,15 @@ def test_the_kernel_equals_its_slow_twin(n: int, sigma: float) -> None:
 
 def test_the_same_scene_gives_the_same_bytes() -> None:
     scene = cloud(2000, seed=3)
-    first = rasterize(scene, INTRINSICS, np.eye(4), WIDTH, HEIGHT, BLACK)
-    second = rasterize(scene, INTRINSICS, np.eye(4), WIDTH, HEIGHT, BLACK)
+    first = forward(scene, INTRINSICS, np.eye(4), WIDTH, HEIGHT, BLACK).view
+    second = forward(scene, INTRINSICS, np.eye(4), WIDTH, HEIGHT, BLACK).view
     assert first.rgb.tobytes() == second.rgb.tobytes()
     assert first.depth.tobytes() == second.depth.tobytes()
 
 
 def test_an_empty_scene_is_its_background() -> None:
     background = np.random.default_rng(2).uniform(0, 1, (HEIGHT, WIDTH, 3)).astype(np.float32)
-    view = rasterize(EMPTY, INTRINSICS, np.eye(4), WIDTH, HEIGHT, background)
+    view = forward(EMPTY, INTRINSICS, np.eye(4), WIDTH, HEIGHT, background).view
     np.testing.assert_array_equal(view.rgb, background)
     assert not view.alpha.any() and not view.depth.any()
 
@@ -118,13 +118,13 @@ def one(
 def test_the_nearer_gaussian_hides_the_farther_one_in_whatever_order_they_are_stored() -> None:
     near, far = one((0, 0, 4), 0.5, 0.99, (1, 0, 0)), one((0, 0, 9), 3.0, 0.99, (0, 0, 1))
     for scene in (concatenate([near, far]), concatenate([far, near])):
-        view = rasterize(scene, INTRINSICS, np.eye(4), WIDTH, HEIGHT, BLACK)
+        view = forward(scene, INTRINSICS, np.eye(4), WIDTH, HEIGHT, BLACK).view
         assert view.rgb[22, 37, 0] > 0.95 and view.rgb[22, 37, 2] < 0.05
         assert view.depth[22, 37] == pytest.approx(4.0, abs=0.1)
 
 
 def test_a_gaussian_lands_where_the_pinhole_equation_says() -> None:
-    view = rasterize(one((1.5, -0.7, 8.0), 0.05, 0.9, (1, 1, 1)), INTRINSICS, np.eye(4), WIDTH, HEIGHT, BLACK)
+    view = forward(one((1.5, -0.7, 8.0), 0.05, 0.9, (1, 1, 1)), INTRINSICS, np.eye(4), WIDTH, HEIGHT, BLACK).view
     weight = view.alpha.astype(np.float64)
     u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
     assert (weight * u).sum() / weight.sum() == pytest.approx(60.0 * 1.5 / 8.0 + 37.0, abs=0.05)
@@ -133,13 +133,13 @@ def test_a_gaussian_lands_where_the_pinhole_equation_says() -> None:
 
 def test_what_is_behind_or_before_the_near_plane_is_not_drawn() -> None:
     scene = concatenate([one((0, 0, -5), 1.0, 0.9, (1, 1, 1)), one((0, 0, 0.2), 1.0, 0.9, (1, 1, 1))])
-    assert not rasterize(scene, INTRINSICS, np.eye(4), WIDTH, HEIGHT, BLACK).alpha.any()
+    assert not forward(scene, INTRINSICS, np.eye(4), WIDTH, HEIGHT, BLACK).view.alpha.any()
 
 
 def test_moving_scene_and_camera_together_changes_nothing() -> None:
     scene, motion = cloud(300, seed=5), pose(0.7, (12.0, -3.0, 40.0))
-    here = rasterize(scene, INTRINSICS, pose(0.1, (0.1, 0.0, 0.0)), WIDTH, HEIGHT, BLACK)
-    there = rasterize(moved(scene, motion), INTRINSICS, motion @ pose(0.1, (0.1, 0, 0)), WIDTH, HEIGHT, BLACK)
+    here = forward(scene, INTRINSICS, pose(0.1, (0.1, 0.0, 0.0)), WIDTH, HEIGHT, BLACK).view
+    there = forward(moved(scene, motion), INTRINSICS, motion @ pose(0.1, (0.1, 0, 0)), WIDTH, HEIGHT, BLACK).view
     assert np.abs(here.rgb - there.rgb).max() <= 2.0 / 255.0
 
 
@@ -161,5 +161,5 @@ def test_gathering_white_gives_the_blending_weights() -> None:
     white = np.ones((HEIGHT, WIDTH, 3), np.float32)
     sums, weights = gather(splats, white)
     np.testing.assert_allclose(sums, np.repeat(weights[:, None], 3, 1), rtol=1e-5)
-    alpha = rasterize(scene, INTRINSICS, np.eye(4), WIDTH, HEIGHT, BLACK).alpha
+    alpha = forward(scene, INTRINSICS, np.eye(4), WIDTH, HEIGHT, BLACK).view.alpha
     assert weights.sum() == pytest.approx(alpha.sum(), rel=1e-4)

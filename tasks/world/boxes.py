@@ -4,12 +4,9 @@ Boxes are arrays whose last axis is centre x [m], centre y [m], heading [rad], l
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tasks.world.arrays import Array, Bools
 from tasks.world.vehicle import HEADING, Vehicle, X, Y
-
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 
 def ego_boxes(states: Array, vehicle: Vehicle) -> Array:

@@ -3,7 +3,7 @@
 import numpy as np
 import shapely
 
-from tasks.reward.rules.boxes import ego_boxes, touching
+from tasks.world.boxes import ego_boxes, touching
 from tasks.world.frames import box_corners
 from tasks.world.vehicle import PACIFICA
 

@@ -1,4 +1,4 @@
-"""Closed rings in the plane: which touch, and how far apart they are. Compiled.
+"""Angles, segments and closed rings in the plane, one at a time. Compiled; many at once in numpy: frames.py, boxes.py.
 
 A ring is its vertices x (V,) and y (V,) [m], the first not repeated at the end. Distances are computed in the order of
 operations of GEOS, so that they equal shapely's.
@@ -7,11 +7,33 @@ operations of GEOS, so that they equal shapely's.
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tasks.kernels.compiled import kernel
+from tasks.kernels.compiled import inlined, kernel
+from tasks.world.arrays import Array
 
-Array = NDArray[np.float64]
+
+@inlined
+def wrapped(angle: float) -> float:
+    """An angle [rad] in [-pi, pi)."""
+    return (angle + math.pi) % (2.0 * math.pi) - math.pi
+
+
+@inlined
+def short_turn(turn: float) -> float:
+    """The shorter way round [rad] that stands for a turn in an unwrapped heading; half a turn keeps its sign."""
+    short = wrapped(turn)
+    return math.pi if short == -math.pi and turn > 0.0 else short
+
+
+@inlined
+def to_line(dx: float, dy: float, ex: float, ey: float, along: float) -> tuple[float, float]:
+    """The fraction 0..1 of an edge (ex, ey) nearest to a point (dx, dy) from its start, and the squared distance to it.
+
+    along: the point's projection onto the line, in lengths of the edge.
+    """
+    fraction = min(max(along, 0.0), 1.0)
+    rx, ry = dx - fraction * ex, dy - fraction * ey
+    return fraction, rx * rx + ry * ry
 
 
 @kernel
