@@ -23,12 +23,12 @@ from typing import TYPE_CHECKING, Any
 
 from factory.config.arguments import Refused, answer
 from factory.views.status import failed_lines, open_store, status_lines
-from tasks.world.arrays import Array
 
 if TYPE_CHECKING:
     from factory.store.samples import Store
     from factory.views.seen_again import Seen
     from tasks.render.scene.asset import RenderAsset
+    from tasks.world.arrays import Array
 
 
 @dataclass(frozen=True)

@@ -20,9 +20,9 @@ from tasks.render.gate import GateSettings, composed, fault_of, measures
 from tasks.render.likeness import Album, expected, eye_in_box, inside_mean, large_vehicles, outline_of, similarity
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.engine import Vehicles, render, vehicles_at
-from tasks.render.splatting.gaussians import F32, F64
 from tasks.render.views import VISIBLE_M, pose_on_ground
 from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.arrays import F32, Array
 from tasks.world.camera import Camera, Pinhole
 from tasks.world.clip import HORIZON_STEPS, STEP_S, Clip
 
@@ -37,7 +37,7 @@ class Simulated:
     clip: Clip
     expert: str
     candidate: int
-    poses: F64  # (F, 4, 4) world_from_ego
+    poses: Array  # (F, 4, 4) world_from_ego
     agents: AgentTracks  # of the clip's 96 steps
     steps: tuple[int, ...]  # (F,)
 
@@ -49,7 +49,7 @@ class Shown:
     camera: str
     step: int
     eye: Pinhole
-    world_from_ego: F64
+    world_from_ego: Array
     there: Vehicles
     picture: F32  # (H, W, 3) in [0, 1]
     truth: F32

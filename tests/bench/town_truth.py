@@ -13,8 +13,8 @@ from tasks.render.scene.movers import behind_boxes
 from tasks.render.scene.sensed import Photo
 from tasks.render.scene.sky import directions
 from tasks.render.scene.stereo import FAR_M
-from tasks.render.splatting.gaussians import F32, F64
 from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.arrays import F32, Array
 from tasks.world.camera import Pinhole
 
 Painter = Callable[[float, Photo], NDArray[np.uint8]]  # time, photo (its camera and pose): the truth there
@@ -63,7 +63,7 @@ def sideways(photo: Photo, ego: Photo, left_m: float) -> Photo:
     return replace(photo, world_from_camera=pose)
 
 
-def moved_on(boxes: F64, kinds: Sequence[AgentKind]) -> F64:
+def moved_on(boxes: Array, kinds: Sequence[AgentKind]) -> Array:
     """Boxes (N, 7) of vehicles put MOVED_M from where they are; the others' as they are."""
     out = boxes.copy()
     rows = np.array([kind == AgentKind.VEHICLE for kind in kinds], bool)
@@ -114,7 +114,7 @@ class Truth:
         return np.clip(render(self.asset, [eye], there)[0].rgb, 0.0, 1.0)
 
 
-def _in_the_way(photo: Photo, boxes: F64) -> bool:
+def _in_the_way(photo: Photo, boxes: Array) -> bool:
     off = photo.world_from_camera[:3, 3] - boxes[:, :3]
     along = np.cos(boxes[:, 3]) * off[:, 0] + np.sin(boxes[:, 3]) * off[:, 1]
     across = np.cos(boxes[:, 3]) * off[:, 1] - np.sin(boxes[:, 3]) * off[:, 0]

@@ -49,10 +49,11 @@ def test_help_answers_without_running(capsys: pytest.CaptureFixture[str]) -> Non
 
 
 def test_the_first_signal_is_noted_and_the_second_has_its_usual_effect() -> None:
-    before = signal.getsignal(signal.SIGINT)
+    before = signal.default_int_handler  # a shell starts what runs in the background with the signal ignored
+    inherited = signal.signal(signal.SIGINT, before)
     with until_signal() as asked, pytest.raises(KeyboardInterrupt):
         os.kill(os.getpid(), signal.SIGINT)
         assert asked.wait(5.0)
         os.kill(os.getpid(), signal.SIGINT)
         threading.Event().wait(5.0)
-    assert signal.getsignal(signal.SIGINT) == before
+    assert signal.signal(signal.SIGINT, inherited) == before

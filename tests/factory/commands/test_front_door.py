@@ -3,6 +3,7 @@
 import json
 import os
 import pty
+import re
 import select
 import shutil
 import subprocess
@@ -127,7 +128,7 @@ def test_each_door_lists_its_commands_and_names_those_of_the_other(capsys: pytes
     runnable = {
         ".".join(path.relative_to(REPOSITORY).with_suffix("").parts)
         for path in (REPOSITORY / "planners").rglob("*.py")
-        if path.stem != "__main__" and 'if __name__ == "__main__"' in path.read_text()
+        if re.search(r"^(@|\w+ = )command\b", path.read_text(), re.M)
     }
     assert modules == runnable, "every command that can be run is listed"
     assert planners_main(["evalute"]) == 2
