@@ -10,7 +10,7 @@ DEMO   := runs/demo
 TORCH       ?= torch==2.13.0$(if $(filter Linux,$(shell uname -s)),+cpu)
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 
-.PHONY: install demo test unit lint format mutants bench study clean
+.PHONY: install demo test unit lint format docs mutants bench study clean
 
 install: $(VENV)/.installed
 
@@ -48,6 +48,12 @@ lint: install
 format: install
 	$(PY) -m ruff format .
 	$(PY) -m ruff check --fix .
+
+# The site of the pages, into build/site; whatever MkDocs would warn of ends it. The variable leaves out a notice of the
+# theme's makers about what comes after it.
+docs: install
+	NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build -q
+	@echo "build/site/index.html"
 
 # The kept bugs of tests/mutants, each against the tests that should notice; a release has at least 97 % of them noticed.
 # ONLY=planners (or tasks/reward, or a bug's id; several with commas), J=<how many at a time, a core each>; goes on where it stopped.

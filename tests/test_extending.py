@@ -13,9 +13,12 @@ import pytest
 from examples.csv_logs import CsvReader, write_log
 from examples.keep_lane import KeepLane
 from examples.linear_planner import LinearPlanner
+from factory.config.compose import compose, fill
 from factory.readers.base import BadClip
 from factory.run import main as run_main
+from factory.setup.settings import load_config, open_reader
 from factory.store.reader import SampleTable
+from planners.models.registry import PlannerChoice, build_planner
 from planners.training.checkpoint import load_planner
 from planners.training.train import main as train_main
 from tasks.experts.protocol import Plan
@@ -77,6 +80,27 @@ def test_the_planner_trains_on_them(made: Path, capsys: pytest.CaptureFixture[st
     ]
     assert train_main(arguments) == 0, capsys.readouterr().err
     assert type(load_planner(made / "linear")) is LinearPlanner  # as planners.evaluation.evaluate loads it
+
+
+def test_a_data_set_is_a_reader_and_a_file_of_its_settings(tmp_path: Path) -> None:
+    write_log(tmp_path / "logs" / "street")
+    (tmp_path / "conf" / "clips").mkdir(parents=True)
+    settings = "name: csv\n_target_: examples.csv_logs.CsvReader\nroot: ???\nstride_s: 0.5\n"
+    (tmp_path / "conf" / "clips" / "csv.yaml").write_text(settings)
+    config = load_config([f"--config-dir={tmp_path / 'conf'}", "clips=csv", f"clips.root={tmp_path / 'logs'}"])
+    reader, index = open_reader(config.clips)
+    assert isinstance(reader, CsvReader) and {ref.dataset for ref in index.refs} == {"csv"}
+    assert [ref.start_ms for ref in index.refs] == [0, 500, 1000, 1500, 2000]
+
+
+def test_a_planner_is_its_class_and_a_file_of_its_settings(tmp_path: Path) -> None:
+    (tmp_path / "planner").mkdir()
+    settings = "name: examples.linear_planner:LinearPlanner\nsettings: {history: false}\n"
+    (tmp_path / "planner" / "linear.yaml").write_text(settings + "training: {epochs: 3}\n")
+    composed = compose("train", [f"--config-dir={tmp_path}", "planner=linear"])["planner"]
+    choice = fill(PlannerChoice, {key: composed[key] for key in ("name", "settings")}, "planner")
+    planner = build_planner(choice, {})
+    assert type(planner) is LinearPlanner and planner.settings.history is False
 
 
 def test_the_script_scores_plans_without_ray_or_hydra() -> None:

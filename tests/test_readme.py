@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 
+from examples.csv_logs import write_log
 from factory.__main__ import main as door_main
 from factory.commands.dashboard import Request as DashboardRequest
 from factory.commands.explain import split_arguments
@@ -191,6 +192,8 @@ def test_every_command_is_one_its_program_takes(
         case ["python", "-m", "tests.bench.bench_kitti", _, *arguments]:
             known = {field.name for field in fields(FitSettings)} | {"out", "validate", "threads", "first", "last"}
             assert set(pairs(given(arguments))) <= known
+        case ["python", "-m", "examples.csv_logs", folder]:
+            write_log(Path(folder) / "street")  # what it does, see tests/test_extending.py
         case ["python", "-m", module] if module.startswith("tests.bench."):
             assert find_spec(module) is not None  # it measures for minutes
         case ["python", "-m", "planners"]:

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 import street
 
+from tasks.render.scene import engine
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.engine import NOBODY, render, vehicles_at
 from tasks.render.splatting.gaussians import EMPTY
+from tasks.render.splatting.raster import View
 from tasks.render.views import render_views
 from tasks.world.camera import Camera, Pinhole
 
@@ -33,6 +35,21 @@ def test_the_pipeline_s_frames_are_the_same_function_s(street_asset: RenderAsset
     frames = render_views(street_asset, rig, street.ego_pose(3.0)[None], street.tracks(), [8], *size)
     drawn = render(street_asset, [FRONT], vehicles_at(street.tracks(), 0.8))[0].rgb
     np.testing.assert_array_equal(frames[0, 0], np.rint(drawn * 255.0).astype(np.uint8))
+
+
+def test_a_backend_is_one_function_in_the_table_and_draws_the_pipeline_s_frames(
+    street_asset: RenderAsset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def backdrop_alone(scene, cameras, backdrops, threads):  # type: ignore[no-untyped-def]
+        empty = np.zeros((street.HEIGHT, street.WIDTH), np.float32)
+        return [View(2.0 * backdrop, empty, empty) for backdrop in backdrops]
+
+    monkeypatch.setattr(engine, "RASTERISERS", {**engine.RASTERISERS, "backdrop": backdrop_alone})
+    rig = [Camera("front", street.WIDTH, street.HEIGHT, street.INTRINSICS, np.zeros(3), street.EGO_FROM_CAMERA)]
+    size = (street.WIDTH, street.HEIGHT)
+    frames = render_views(street_asset, rig, street.ego_pose(3.0)[None], street.tracks(), [8], *size, "backdrop")
+    sky = street_asset.sky.seen_by(street.INTRINSICS, FRONT.world_from_camera, *size)
+    np.testing.assert_array_equal(frames[0, 0], np.rint(np.clip(2.0 * sky, 0.0, 1.0) * 255.0).astype(np.uint8))
 
 
 def test_several_cameras_are_drawn_as_each_alone(street_asset: RenderAsset) -> None:
