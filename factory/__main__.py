@@ -6,11 +6,10 @@ python -m factory <command> --help
 python -m factory --version
 """
 
-import signal
-import sys
 from collections.abc import Sequence
 
 from factory.commands.table import COMMANDS, PLANNERS, dispatch, listed
+from factory.exits import as_program
 
 
 def help_text() -> str:
@@ -32,8 +31,7 @@ def main(argv: Sequence[str]) -> int:
 
 def program() -> None:
     """The installed program `factory`."""
-    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `... | head` ends quietly
-    sys.exit(main(sys.argv[1:]))
+    as_program(main)
 
 
 if __name__ == "__main__":

@@ -3,15 +3,13 @@
     python -m factory.run rounds=5                                      the synthetic town
     python -m factory.run clips=av2 clips.root=<logs> vocabulary.file=<human.npy> rounds=5
     python -m factory.run preset=demo out=runs/demo                     small and quick
-    python -m factory.run ... dry_run=true                              what it would take
     python -m factory.run ... --cfg                                     the settings, resolved
 
-The same command again goes on where the last one stopped. Exit codes: 0 complete, 2 bad settings or no clip (nothing is
-written), 3 complete with failed attempts, 4 interrupted and resumable.
+What it would take: python -m factory plan. The same command again goes on where the last one stopped. Exit codes: 0
+complete, 2 bad settings or no clip (nothing is written), 3 complete with failed attempts, 4 interrupted and resumable.
 """
 
 import os
-import signal
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
@@ -21,6 +19,7 @@ from typing import TYPE_CHECKING
 from factory.config.compose import ConfigError, compose, conf_dir
 from factory.config.plugins import choices
 from factory.config.words import Asked, asked_of
+from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, as_program
 from factory.store.room import NoRoom
 from factory.store.usable import why_unusable
 
@@ -28,11 +27,9 @@ if TYPE_CHECKING:
     from factory.readers.base import ClipRef
     from factory.setup.settings import RunConfig
 
-BAD_CONFIG, INTERRUPTED = 2, 4
 
-
-def main(argv: Sequence[str]) -> int:
-    """The command; returns the exit code."""
+def main(argv: Sequence[str], only_plan: bool = False) -> int:
+    """The command, or what it would take; returns the exit code."""
     if {"-h", "--help"} & set(argv):
         print(help_text())
         return 0
@@ -41,18 +38,13 @@ def main(argv: Sequence[str]) -> int:
         if asked.shows:
             print(settings_text(asked.words))
             return 0
-        return run(asked)
+        return run(asked, only_plan)
     except (ConfigError, MemoryError) as error:
         print(f"error: {error}", file=sys.stderr)
         return BAD_CONFIG
     except NoRoom as error:
         print(f"error: {error}; make room and run the same command again", file=sys.stderr)
         return INTERRUPTED
-
-
-def plan(argv: Sequence[str]) -> int:
-    """The command `python -m factory plan`: dry_run=true."""
-    return main(argv if {"-h", "--help"} & set(argv) else [*argv, "dry_run=true"])
 
 
 def dealt(refs: Sequence["ClipRef"], hands: int) -> list["ClipRef"]:
@@ -104,8 +96,8 @@ def kernels_of(config: "RunConfig") -> list[str]:
     return parts_of(set(config.experts) != {HUMAN}, config.traffic.mode, label_traffic, config.render)
 
 
-def run(asked: Asked) -> int:
-    """Plan, execute, commit, report. What the command line says is checked before anything heavy is imported."""
+def run(asked: Asked, only_plan: bool) -> int:
+    """Plan, execute, commit, report; or plan alone. The command line is checked before anything heavy is imported."""
     from factory.config.run_keys import check
 
     values = compose("run", asked.words)
@@ -114,7 +106,7 @@ def run(asked: Asked) -> int:
         raise ConfigError(unusable)
 
     from factory.graph.episodes import EpisodesWanted
-    from factory.graph.execute import COMPLETE, COMPLETE_WITH_FAILURES, execute
+    from factory.graph.execute import execute
     from factory.setup.calibrate import calibrate, plan_text
     from factory.setup.settings import assemble, run_config
     from factory.stages.benchmark import NEEDED, write_benchmark
@@ -138,7 +130,7 @@ def run(asked: Asked) -> int:
         wanted = [*assembled.index.refs, *assembled.index.broken][: config.limit]
         refs = dealt(wanted, config.workers or os.cpu_count() or 1)
         print(plan_text(assembled, refs), flush=True)
-        if config.dry_run:
+        if only_plan:
             print(calibrate(assembled, refs, store))
             return 0
         summary = execute(
@@ -180,5 +172,4 @@ def run(asked: Asked) -> int:
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `... | head` ends quietly
-    sys.exit(main(sys.argv[1:]))
+    as_program(main)

@@ -8,17 +8,16 @@ Exit codes of all: 0 complete, 2 settings or files that do not fit, 3 a part of 
 minutes, and the same command goes on. What is wrong is told in one line.
 """
 
-import signal
-import sys
+from collections.abc import Sequence
 
 from factory.commands.table import PLANNERS, dispatch, listed
+from factory.exits import as_program
 
 
-def main(argv: list[str]) -> int:
+def main(argv: Sequence[str]) -> int:
     """Hand the arguments to the command that is named first; its exit code, 2 where there is none."""
     return dispatch(argv, PLANNERS, f"{__doc__}\ncommands\n{listed(PLANNERS)}\n\nMore: docs/training.md.")
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `... | head` ends quietly
-    sys.exit(main(sys.argv[1:]))
+    as_program(main)

@@ -9,8 +9,7 @@ from functools import wraps
 from typing import Any
 
 from factory.config.compose import conf_dir
-
-COMPLETE, BAD_SETTINGS, FAILED, INTERRUPTED = 0, 2, 3, 4
+from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
 
 
 class Failed(Exception):
@@ -36,10 +35,10 @@ def command(answer: Callable[[Sequence[str]], None]) -> Callable[[Sequence[str]]
             answer(argv)
         except (ValueError, OSError) as error:
             print(f"error: {error}", file=sys.stderr)
-            return BAD_SETTINGS
+            return BAD_CONFIG
         except Failed as error:
             print(f"error: {error}", file=sys.stderr)
-            return FAILED
+            return COMPLETE_WITH_FAILURES
         except Stopped as stopped:
             print(stopped, file=sys.stderr)
             return INTERRUPTED

@@ -22,7 +22,7 @@ ROOMS = {
         *("render.splatting", "render.scene", "render.fit", "render"),
     ),
     "factory": (
-        *("wording", "job", "config", "readers", "store", "graph", "stages", "setup", "views", "views.board"),
+        *("exits", "wording", "job", "config", "readers", "store", "graph", "stages", "setup", "views", "views.board"),
         *("run", "commands", "__main__"),
     ),
     "planners": ("command", "data", "models", "training", "evaluation", "study", "__main__"),

@@ -19,7 +19,7 @@ import pytest
 from examples.csv_logs import write_log
 from factory.__main__ import main as door_main
 from factory.commands.dashboard import Request as DashboardRequest
-from factory.commands.explain import split_arguments
+from factory.commands.explain import Request as ExplainRequest
 from factory.commands.table import COMMANDS, PLANNERS
 from factory.config.arguments import parse
 from factory.config.compose import compose, conf_dir, fill
@@ -141,7 +141,7 @@ def test_every_command_is_one_its_program_takes(
         case ["python", "-m", "factory", "plan" | "run", *arguments]:
             load_config(given(arguments))
         case ["python", "-m", "factory", "explain", *arguments]:
-            load_config(split_arguments(arguments)[1])
+            load_config(parse(ExplainRequest, arguments).settings)
         case ["python", "-m", "factory", "dashboard", *arguments]:
             parse(DashboardRequest, arguments)  # it would serve until it is stopped
         case ["python", "-m", "factory", "warm", *arguments]:

@@ -3,21 +3,18 @@
     source <(python -m factory completion bash)             for this shell; into ~/.bashrc for all
     source <(python -m factory completion zsh)              after compinit
 
-Completes `factory ...` and `python -m factory ...`. Exit codes: 0 printed, 2 another shell.
+Completes `factory ...` and `python -m factory ...`.
 """
 
 import re
 import sys
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields
-from importlib import import_module
-from typing import get_args, get_type_hints
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
 
 from factory.commands.table import COMMANDS
-from factory.config.arguments import BAD_ARGUMENTS
-from factory.config.known import SWITCH, settings_of
-
-WORDS = {"export": ("mcap", "mp4", "rerun"), "scene": ("info", "export", "import"), "completion": ("bash", "zsh")}
+from factory.config.arguments import RUN, WORD, choices_of, given_as, keys_of
+from factory.config.known import settings_of
 
 BASH = r"""_factory_complete() {
   local line="${COMP_LINE:0:COMP_POINT}" word found
@@ -61,17 +58,16 @@ compdef _factory_python python python3
 """
 
 
-def main(argv: Sequence[str]) -> int:
-    """Print the script of a shell; the exit code."""
-    scripts = {"bash": BASH, "zsh": ZSH}
-    if {"-h", "--help"} & set(argv):
-        print(__doc__)
-        return 0
-    if len(argv) != 1 or argv[0] not in scripts:
-        print(f"error: name a shell: {' or '.join(scripts)}; see --help", file=sys.stderr)
-        return BAD_ARGUMENTS
-    print(scripts[argv[0]].replace("PYTHON", sys.executable), end="")
-    return 0
+@dataclass(frozen=True)
+class Request:
+    """The command line."""
+
+    shell: Literal["bash", "zsh"] = field(metadata=WORD)
+
+
+def main(request: Request) -> None:
+    """Print the script of a shell."""
+    print({"bash": BASH, "zsh": ZSH}[request.shell].replace("PYTHON", sys.executable), end="")
 
 
 def complete(argv: Sequence[str]) -> int:
@@ -90,24 +86,16 @@ def candidates(words: Sequence[str], last: str) -> Iterable[str]:
     name, *given = words
     if name not in COMMANDS:
         return ()
-    if name in WORDS and not given:
-        return WORDS[name]
-    command = COMMANDS[name]
-    known = settings_of(given) if command.takes == "run" else {}
-    if command.takes == "request" or name in ("explain", "retry"):
-        known = {**known, **(settings_of([]) if name == "retry" else {}), **request_of(command.module)}
+    shape = getattr(COMMANDS[name].imported(), "Request", None)  # run and plan have none: settings alone
+    known: dict[str, list[str]] = {}
+    if shape is None or given_as(shape, RUN):
+        known |= settings_of(given)
+    if shape is not None:
+        known |= {key: choices_of(kind) for key, kind in keys_of(shape).items()}
+        if (words := given_as(shape, WORD)) and not given and known[words[0]]:
+            return known[words[0]]
     key, equals, _ = last.partition("=")
     if equals:
         return [f"{key}={value}" for value in known.get(key, ())]
     taken = {word.partition("=")[0] for word in given}
     return [f"{key}=" for key in known if key not in taken]
-
-
-def request_of(module: str) -> Mapping[str, list[str]]:
-    """The keys of a command's own dataclass; true and false where it is a switch."""
-    shape = getattr(import_module(module), "ExplainSettings" if module == "factory.commands.explain" else "Request")
-    hints = get_type_hints(shape)
-    return {
-        field.name: sorted(SWITCH) if bool in {hints[field.name], *get_args(hints[field.name])} else []
-        for field in fields(shape)
-    }

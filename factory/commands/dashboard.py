@@ -6,16 +6,13 @@
     python -m factory dashboard out=runs/demo host=0.0.0.0  for others too: everyone who reaches the port sees the data
 
 Works while a run goes on, and after it; it only reads. Ctrl-C ends it.
-Exit codes: 0 ended, 2 bad arguments, nothing there to show, or the port is taken.
 """
 
-import sys
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from factory.config.arguments import BAD_ARGUMENTS, Refused, parse
+from factory.config.arguments import Refused
 from factory.views.status import NothingThere, open_store
 
 if TYPE_CHECKING:
@@ -38,22 +35,15 @@ class Request:
             raise ValueError(f"port={self.port}: must be a number below 65536, 0 for any free one")
 
 
-def main(argv: Sequence[str]) -> int:
-    """The command; returns the exit code."""
-    if {"-h", "--help"} & set(argv):
-        print(__doc__)
-        return 0
+def main(request: Request) -> None:
+    """Serve until Ctrl-C."""
     try:
-        return serve(parse(Request, argv))
-    except Refused as error:
-        print(f"error: {error}", file=sys.stderr)
-        return BAD_ARGUMENTS
+        serve(request)
     except KeyboardInterrupt:
         print()
-        return 0
 
 
-def serve(request: Request) -> int:
+def serve(request: Request) -> None:
     """Until Ctrl-C, which raises. Raises Refused where there is no run or the address cannot be had."""
     store = awaited(request.out) if request.wait else open_store(request.out)
     from factory.views.board.server import LOOPBACK, Board, Server
@@ -71,7 +61,6 @@ def serve(request: Request) -> int:
         print("warning: everyone who reaches this port sees the run's data and pictures; there is no password")
     with server:
         server.serve_forever()
-    return 0
 
 
 def awaited(out: str, look_every_s: float = 2.0) -> "Store":
@@ -85,7 +74,3 @@ def awaited(out: str, look_every_s: float = 2.0) -> "Store":
                 print(f"no store at {nothing.uri} yet: waiting for a run to begin, until Ctrl-C", flush=True)
             is_told = True
             time.sleep(look_every_s)
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

@@ -2,89 +2,85 @@
 
 Runs ONE clip in this process: the candidates over the grid and why each fell, every attempt of the walk with its
 sub-scores, and the last attempt's two rollouts as a picture and a film. Takes the settings of `python -m factory.run`.
+
+    python -m factory explain clips=av2 clips.root=<logs> clip=0 expert=recovery
+    python -m factory explain preset=demo clip=3fa9 tries=20 to=looks     an id or its beginning, or a place in the list
+
+Exit code 3: the clip cannot be read.
 """
 
 import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from factory.config.compose import ConfigError, compose, fill
-from factory.readers.base import BadClip, ClipRef
-from factory.run import BAD_CONFIG, help_text
+from factory.config.arguments import RUN, Refused
+from factory.config.compose import compose
+from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES
 
-
-def main(argv: Sequence[str]) -> int:
-    """The command; 0 when the clip was explained, 2 for bad settings, 3 for a clip that cannot be read."""
-    if {"-h", "--help"} & set(argv):
-        print(f"{__doc__}\nkeys: clip, expert, tries, to, and those of factory.run:\n{help_text()}")
-        return 0
-    try:
-        return explain(argv)
-    except ConfigError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return BAD_CONFIG
-    except BadClip as error:
-        print(f"bad clip: {error}", file=sys.stderr)
-        return 3
+if TYPE_CHECKING:
+    from factory.readers.base import ClipRef
 
 
 @dataclass(frozen=True)
-class ExplainSettings:
-    """The keys of this command itself."""
+class Request:
+    """The command line."""
 
     clip: str = "0"  # clip id or its beginning, or the clip's place in the reader's list
     expert: str = "pdm_closed"
     tries: int = 6  # candidates to try before giving up on an accepted one
     to: str = "explain"  # folder for the pictures
+    settings: tuple[str, ...] = field(default=(), metadata=RUN)
 
 
-def split_arguments(argv: Sequence[str]) -> tuple[ExplainSettings, list[str]]:
-    """This command's keys, and the overrides of the run's settings. Raises ConfigError."""
-    names = {field.name for field in fields(ExplainSettings)}
-    own = dict(argument.split("=", 1) for argument in argv if argument.split("=", 1)[0] in names and "=" in argument)
-    rest = [argument for argument in argv if argument.split("=", 1)[0] not in names]
-    return fill(ExplainSettings, own, "explain"), rest
+def main(request: Request) -> int:
+    """Explain the clip; the exit code."""
+    from factory.readers.base import BadClip
+
+    try:
+        explain(request)
+    except BadClip as error:
+        print(f"bad clip: {error}", file=sys.stderr)
+        return COMPLETE_WITH_FAILURES
+    return COMPLETE
 
 
-def find(refs: Sequence[ClipRef], wanted: str) -> ClipRef:
-    """The clip of that id, beginning of an id, or place in the list. Raises ConfigError."""
+def find(refs: Sequence["ClipRef"], wanted: str) -> "ClipRef":
+    """The clip of that id, beginning of an id, or place in the list. Raises Refused."""
     if wanted.isdigit() and int(wanted) < len(refs):
         return refs[int(wanted)]
     found = [ref for ref in refs if ref.clip_id.startswith(wanted)]
     if len(found) != 1:
-        raise ConfigError(
-            f"clip={wanted}: {len(found)} of {len(refs)} clips fit; give an id or a number below the count"
-        )
+        raise Refused(f"clip={wanted}: {len(found)} of {len(refs)} clips fit; give an id or a number below the count")
     return found[0]
 
 
-def explain(argv: Sequence[str]) -> int:
+def explain(request: Request) -> None:
     """Compose the settings, run the clip, print and draw."""
     import cv2
 
     from factory.graph.work import HUMAN_CANDIDATE, LOGGED
     from factory.setup.settings import assemble, run_config
-    from factory.stages.pipeline import FactoryWork, PerturbedClip
+    from factory.stages.pipeline import PerturbedClip
     from factory.views.drawing import attempt_picture, candidates_picture, film
     from factory.views.video import write_mp4
     from tasks.stages import Rejected
     from tasks.subscores import OF_ONE_PLAN
 
-    own, overrides = split_arguments(argv)
-    expert, to = own.expert, Path(own.to)
-    config = run_config(compose("run", overrides) | {"experts": [expert]})
+    expert, to = request.expert, Path(request.to)
+    config = run_config(compose("run", request.settings) | {"experts": [expert]})
     run = assemble(config)
-    ref = find((*run.index.refs, *run.index.broken), own.clip)
-    work: FactoryWork = run.work
+    ref = find((*run.index.refs, *run.index.broken), request.clip)
+    work = run.work
     began = time.perf_counter()
     made = work.considered(ref)
     if isinstance(made, Rejected):
         print(f"clip {ref.clip_id}: log {ref.log_id} at {ref.start_ms / 1000:.1f} s")
         print(f"rejected by {made.stage}: {made.reason}: {made.detail}")
-        return 0
+        return
     clip, found = made.clip, made.found
     print(
         f"clip {ref.clip_id}: log {ref.log_id} at {ref.start_ms / 1000:.1f} s, {clip.split}, {len(clip.agents)} tracks"
@@ -95,7 +91,7 @@ def explain(argv: Sequence[str]) -> int:
     if isinstance(found, Rejected):
         print(f"no candidates: rejected by {found.stage}: {found.reason}: {found.detail}")
         if expert not in LOGGED:
-            return 0
+            return
     else:
         print("dropped by gate: " + ", ".join(f"{gate} {count}" for gate, count in found.gate_counts.items()))
         fates = Counter(found.considered.fate)
@@ -103,7 +99,7 @@ def explain(argv: Sequence[str]) -> int:
         cv2.imwrite(f"{stem}_candidates.png", candidates_picture(clip, found.considered)[..., ::-1])
 
     payload = PerturbedClip(ref, clip, made.candidates, made.before)
-    order: Sequence[int] = [HUMAN_CANDIDATE] if expert in LOGGED else range(min(own.tries, len(made.candidates)))
+    order: Sequence[int] = [HUMAN_CANDIDATE] if expert in LOGGED else range(min(request.tries, len(made.candidates)))
     shown = None
     for candidate in order:
         trace = work.trace(payload, candidate, expert)
@@ -137,8 +133,3 @@ def explain(argv: Sequence[str]) -> int:
             write_mp4(Path(f"{stem}.mp4"), film(clip, shown.candidate, shown.judged))
     written = ", ".join(str(path) for path in sorted(to.glob(f"{stem.name}*")))
     print(f"{time.perf_counter() - began:.1f} s; look at {written}")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

@@ -6,17 +6,14 @@
     python -m factory export rerun out=runs/demo sample=0            a .rrd, with Rerun's SDK (pip install rerun-sdk)
 
 `sample` is an ordinal, an id or the beginning of one, `to` a folder (the current one) or, for one sample, a file.
-Exit codes: 0 written, 2 bad arguments, or nothing there to export.
 """
 
-import signal
-import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-from factory.config.arguments import BAD_ARGUMENTS, Refused, parse
+from factory.config.arguments import WORD, Refused
 from factory.views.show import find, logged_drive, sample_ids
 from factory.views.status import open_store
 
@@ -28,8 +25,9 @@ Row = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Request:
-    """The command line behind the format."""
+    """The command line."""
 
+    format: Literal["mcap", "mp4", "rerun"] = field(metadata=WORD)
     out: str
     sample: str | None = None
     every: int | None = None
@@ -42,23 +40,13 @@ class Request:
             raise ValueError("every=0: must be 1 or more")
 
 
-def main(argv: Sequence[str]) -> int:
-    """The command; returns the exit code."""
-    if {"-h", "--help"} & set(argv) or not argv:
-        print(__doc__)
-        return 0 if argv else BAD_ARGUMENTS
-    try:
-        if argv[0] not in FORMATS:
-            raise Refused(f"{argv[0]!r}: the first word is one of {', '.join(FORMATS)}; see --help")
-        for path in export(argv[0], parse(Request, argv[1:])):
-            print(path.resolve())
-    except Refused as error:
-        print(f"error: {error}", file=sys.stderr)
-        return BAD_ARGUMENTS
-    return 0
+def main(request: Request) -> None:
+    """Write the files and name them."""
+    for path in export(request):
+        print(path.resolve())
 
 
-def export(kind: str, request: Request) -> Iterator[Path]:
+def export(request: Request) -> Iterator[Path]:
     """Write the files; their paths as they are written. Raises Refused where there is nothing, or no file can be."""
     from factory.store.reader import SampleTable
 
@@ -67,7 +55,7 @@ def export(kind: str, request: Request) -> Iterator[Path]:
         chosen = [find(store, request.sample)]
     else:
         chosen = sample_ids(store)[:: request.every]
-    suffix = SUFFIXES.get(kind, f".{kind}")
+    suffix = SUFFIXES.get(request.format, f".{request.format}")
     is_file = target.suffix == suffix and not target.is_dir()
     if is_file and request.every is not None:
         raise Refused(f"to={request.to}: every=... writes a file for each sample; name a folder")
@@ -76,7 +64,7 @@ def export(kind: str, request: Request) -> Iterator[Path]:
         for attempt_id in chosen:
             path = target if is_file else target / f"sample_{attempt_id}{suffix}"
             path.parent.mkdir(parents=True, exist_ok=True)
-            FORMATS[kind](store, table[attempt_id], path)
+            FORMATS[request.format](store, table[attempt_id], path)
             yield path
     except (OSError, ValueError, ImportError) as error:  # no such folder, another schema version, no SDK
         raise Refused(f"{store.location.uri}: {error}") from error
@@ -112,8 +100,3 @@ FORMATS: Mapping[str, Callable[["Store", Row, Path], None]] = {
     "mp4": write_film,
     "rerun": write_rerun,
 }
-
-
-if __name__ == "__main__":
-    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `... | head` ends quietly
-    sys.exit(main(sys.argv[1:]))

@@ -10,128 +10,46 @@ scene's origin, a node in its box's frame. A block's scene lies in <out>/cache/b
 back under the same name is what the next run draws.
 """
 
-import json
-import re
-import sys
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
-import cv2
-import numpy as np
-
-from factory.config.compose import ConfigError, fill
-from factory.stages.scene_file import BadScene, described_by, read_scene, write_scene
-from tasks.render.scene.asset import RenderAsset
-from tasks.render.scene.lidar_only import plain_sky
-from tasks.render.splatting import sh
-from tasks.render.splatting.gaussians import Gaussians
-from tasks.render.splatting.ply import from_ply, to_ply
-
-BAD_INPUT = 2
+from factory.config.arguments import WORD, Refused
 
 
 @dataclass(frozen=True)
-class SceneOptions:
-    """The keys of this command."""
+class Request:
+    """The command line."""
 
+    action: Literal["info", "export", "import"] = field(metadata=WORD)
+    files: tuple[str, ...] = field(metadata=WORD)
     to: str | None = None
     like: str | None = None
     origin: str | None = None
 
+    def __post_init__(self) -> None:
+        if self.action == "info" and (self.to, self.like, self.origin) != (None, None, None):
+            raise ValueError("scene info takes files alone")
+        if self.action != "info" and (self.to is None or len(self.files) != 1):
+            raise ValueError(f"scene {self.action} takes one file and to=...; see --help")
+        if self.action == "export" and (self.like, self.origin) != (None, None):
+            raise ValueError("like= and origin= are of scene import")
+        if self.like is not None and self.origin is not None:
+            raise ValueError("give origin= or like=: the other scene has an origin of its own")
 
-def main(argv: Sequence[str]) -> int:
-    """The command; 0 when it is done, 2 with a message for what cannot be read or makes no sense."""
-    if not argv or {"-h", "--help"} & set(argv):
-        print(__doc__)
-        return 0
-    names = {field.name for field in fields(SceneOptions)}
-    pairs = [word for word in argv[1:] if word.split("=", 1)[0] in names and "=" in word]
-    files = [word for word in argv[1:] if word not in pairs]
+
+def main(request: Request) -> None:
+    """Do it. Raises Refused for what cannot be read or makes no sense."""
+    from factory.stages.scene_file import read_scene, write_scene
+    from factory.views.scene_parts import export, imported, info_text
+
+    file, to = Path(request.files[0]), Path(request.to or "")
     try:
-        options = fill(SceneOptions, dict(pair.split("=", 1) for pair in pairs), "scene")
-        match argv[0], files, options:
-            case "info", [_, *_], SceneOptions(to=None, like=None, origin=None):
-                print("\n\n".join(info_text(Path(file), read_scene(Path(file))) for file in files))
-            case "export", [file], SceneOptions(to=str(folder), like=None, origin=None):
-                print("\n".join(map(str, export(read_scene(Path(file)), Path(folder)))))
-            case "import", [file], SceneOptions(to=str(to)):
-                print(info_text(Path(to), write_scene(Path(to), imported(Path(file), options))))
-            case _:
-                raise ConfigError(f"cannot be understood: {' '.join(argv)}; see python -m factory scene --help")
-    except (ConfigError, BadScene, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return BAD_INPUT
-    return 0
-
-
-def info_text(path: Path, asset: RenderAsset) -> str:
-    """What a scene holds, a few lines."""
-    lines = [str(path), f"digest      {asset.digest}", f"origin      {', '.join(f'{v:.2f}' for v in asset.origin)} m"]
-    if (block := asset.block) is not None:
-        x, y = (f"{low:.1f} .. {high:.1f}" for low, high in zip(block.low, block.high))
-        lines.append(f"block       {block.dataset} {block.log_id}, {block.start_s:.1f} to {block.end_s:.1f} s")
-        lines.append(f"sensors at  x {x}, y {y} m")
-    lines.append(f"background  {_counted(asset.background)}")
-    lines += [f"node        {name}: {_counted(node)}" for name, node in asset.nodes.items()]
-    held_out = f"{asset.psnr_db:.2f} dB over {asset.n_held_out} held-out photos"
-    lines.append(f"psnr        {held_out if np.isfinite(asset.psnr_db) else 'not measured'}")
-    lines += [
-        f"view        {view.camera} at {view.time_s:.2f} s: {view.psnr_db:.2f} dB, SSIM {view.ssim:.3f}"
-        f"{', held out' if view.held_out else ''}"
-        for view in asset.views
-    ]
-    return "\n".join([*lines, f"exposures   {len(asset.exposures)}"])
-
-
-def export(asset: RenderAsset, folder: Path) -> list[Path]:
-    """Writes the parts into a folder; returns their paths. Raises BadScene where a part holds NaN."""
-    folder.mkdir(parents=True, exist_ok=True)
-    files = {"background.ply": asset.background}
-    files |= {f"node-{re.sub(r'[^A-Za-z0-9._-]', '_', name)}.ply": node for name, node in asset.nodes.items()}
-    if len(files) < 1 + len(asset.nodes):
-        raise BadScene(f"track ids {', '.join(asset.nodes)}: two of them make the same file name")
-    for name, part in files.items():
-        try:
-            (folder / name).write_bytes(to_ply(part))
-        except ValueError as error:
-            raise BadScene(f"{name}: {error}") from error
-    sky = np.rint(np.clip(asset.sky.rgb, 0.0, 1.0) * 255.0).astype(np.uint8)
-    (folder / "sky.png").write_bytes(cv2.imencode(".png", cv2.cvtColor(sky, cv2.COLOR_RGB2BGR))[1].tobytes())
-    described = described_by(asset) | {"origin": asset.origin.tolist(), "digest": asset.digest, "files": list(files)}
-    (folder / "scene.json").write_text(json.dumps(described, indent=1))
-    return [folder / name for name in (*files, "sky.png", "scene.json")]
-
-
-def imported(path: Path, options: SceneOptions) -> RenderAsset:
-    """A .ply as the background of a scene of unknown quality. Raises BadScene, ConfigError or OSError."""
-    try:
-        background = from_ply(path.read_bytes())
-    except ValueError as error:
-        raise BadScene(f"{path}: {error}") from error
-    if not len(background):
-        raise BadScene(f"{path}: ply: vertex: no Gaussian in it")
-    if options.like is not None:
-        if options.origin is not None:
-            raise ConfigError("give origin= or like=: the other scene has an origin of its own")
-        other = read_scene(Path(options.like))
-        return replace(other, background=background, psnr_db=float("nan"), n_held_out=0, views=(), digest="")
-    return RenderAsset(_place(options.origin or "0,0,0"), background, {}, plain_sky(), float("nan"))
-
-
-def _place(text: str) -> np.ndarray:
-    try:
-        place = np.array([float(number) for number in text.split(",")])
-    except ValueError as error:
-        raise ConfigError(f"scene.origin={text}: {error}") from error
-    if place.shape != (3,) or not np.isfinite(place).all():
-        raise ConfigError(f"scene.origin={text}: expected x,y,z in metres")
-    return place
-
-
-def _counted(part: Gaussians) -> str:
-    return f"{len(part)} Gaussians, SH degree {sh.COUNTS.index(part.sh_rest.shape[1])}"
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+        if request.action == "info":
+            print("\n\n".join(info_text(path, read_scene(path)) for path in map(Path, request.files)))
+        elif request.action == "export":
+            print("\n".join(map(str, export(read_scene(file), to))))
+        else:
+            print(info_text(to, write_scene(to, imported(file, request.like, request.origin))))
+    except (ValueError, OSError) as error:
+        raise Refused(str(error)) from error

@@ -3,64 +3,69 @@
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
+from types import ModuleType
 
 from factory import __version__
-from factory.config.arguments import BAD_ARGUMENTS
+from factory.config.arguments import answer
 from factory.config.words import nearest
+from factory.exits import BAD_CONFIG
 
 
 @dataclass(frozen=True)
 class Command:
-    """One word behind `python -m factory`."""
+    """One word behind `python -m factory` or `python -m planners`."""
 
     about: str
-    module: str
-    function: str = "main"
-    takes: str = "request"  # run: settings of conf/run.yaml; request: fields of the module's Request; words: neither
+    module: str  # a Request and what answers it, or `main` for a command that reads its arguments itself, as a run does
+    function: str = "main"  # the latter's name
+
+    def imported(self) -> ModuleType:
+        """The file of the command."""
+        return import_module(self.module)
 
     def load(self) -> Callable[[Sequence[str]], int]:
         """What answers: arguments -> exit code."""
-        found: Callable[[Sequence[str]], int] = getattr(import_module(self.module), self.function)
-        return found
+        module = self.imported()
+        found: Callable[[Sequence[str]], int] = getattr(module, self.function)
+        return partial(answer, module) if hasattr(module, "Request") else found
 
 
 COMMANDS: Mapping[str, Command] = {
-    "run": Command("make samples; the same command again goes on", "factory.run", takes="run"),
-    "plan": Command("what a run would take: attempts, samples, hours, GB", "factory.run", "plan", takes="run"),
-    "status": Command("what a run holds, and how its newest start ended", "factory.views.status", "status"),
-    "funnel": Command("acceptance by expert and round, and why not", "factory.views.status", "funnel"),
-    "failed": Command("failed attempts: file, field, message, how to retry", "factory.views.status", "failed"),
+    "run": Command("make samples; the same command again goes on", "factory.run"),
+    "plan": Command("what a run would take: attempts, samples, hours, GB", "factory.commands.plan"),
+    "status": Command("what a run holds, and how its newest start ended", "factory.commands.status"),
+    "funnel": Command("acceptance by expert and round, and why not", "factory.commands.funnel"),
+    "failed": Command("failed attempts: file, field, message, how to retry", "factory.commands.failed"),
     "retry": Command("try failed attempts again, with the run's own settings", "factory.commands.retry"),
-    "lineage": Command("where a sample comes from: clip, candidate, attempt, files", "factory.views.lineage"),
-    "show": Command("one sample: numbers, a picture, a film", "factory.views.show"),
+    "lineage": Command("where a sample comes from: clip, candidate, attempt, files", "factory.commands.lineage"),
+    "show": Command("one sample: numbers, a picture, a film", "factory.commands.show"),
     "dashboard": Command("a live page of a run in the browser", "factory.commands.dashboard"),
-    "report": Command("the same page as one file", "factory.views.board.report"),
+    "report": Command("the same page as one file", "factory.commands.report"),
     "export": Command("samples as MCAP, Rerun recordings or films", "factory.commands.export"),
-    "explain": Command("one clip: every candidate, why it fell, a film", "factory.commands.explain", takes="run"),
-    "vocabulary": Command(
-        "build a vocabulary or a recovery table from logs", "factory.setup.vocabulary", takes="words"
-    ),
-    "scene": Command("scene files of 3D Gaussians: info, import, export", "factory.commands.scene", takes="words"),
-    "verify": Command("check a run's tables from their files", "factory.commands.verify", takes="words"),
-    "warm": Command("compile the kernels before the first run", "factory.commands.warm", takes="words"),
-    "completion": Command("completion for bash or zsh", "factory.commands.completion", takes="words"),
+    "explain": Command("one clip: every candidate, why it fell, a film", "factory.commands.explain"),
+    "vocabulary": Command("build a vocabulary or a recovery table from logs", "factory.commands.vocabulary"),
+    "scene": Command("scene files of 3D Gaussians: info, import, export", "factory.commands.scene"),
+    "verify": Command("check a run's tables from their files", "factory.commands.verify"),
+    "warm": Command("compile the kernels before the first run", "factory.commands.warm"),
+    "completion": Command("completion for bash or zsh", "factory.commands.completion"),
 }
 
 # What is built on the factory: names alone, as nothing here imports it. `python -m planners` is their door.
 PLANNERS: Mapping[str, Command] = {
-    "train": Command("fit a planner to logged and simulated samples", "planners.training.train", takes="words"),
-    "evaluate": Command("EPDMS of planners on held-out clips", "planners.evaluation.evaluate", takes="words"),
-    "compare": Command("how two planners differ, with intervals", "planners.evaluation.compare", takes="words"),
-    "scaling": Command("how scores grow with simulated data, by which law", "planners.study.scaling", takes="words"),
-    "replay": Command("a planner on one clip as a film", "planners.evaluation.replay", takes="words"),
-    "ensemble": Command("several GTRS-Dense models as one", "planners.evaluation.ensemble", takes="words"),
-    "analysis": Command("EPDMS on real and simulated frames, by tag", "planners.evaluation.analysis", takes="words"),
-    "study": Command("whether simulated data helps: all of docs/study.md", "planners.study.study", takes="words"),
-    "study_data": Command("the study's data, by runs of the factory", "planners.study.recipe", "data", takes="words"),
-    "study_logs": Command("the study's part on real logs", "planners.study.recipe", "logs", takes="words"),
-    "report": Command("a study's tables and pictures from its frames", "planners.study.report", takes="words"),
-    "agreement": Command("whether a study made again says the same", "planners.study.agreement", takes="words"),
+    "train": Command("fit a planner to logged and simulated samples", "planners.training.train"),
+    "evaluate": Command("EPDMS of planners on held-out clips", "planners.evaluation.evaluate"),
+    "compare": Command("how two planners differ, with intervals", "planners.evaluation.compare"),
+    "scaling": Command("how scores grow with simulated data, by which law", "planners.study.scaling"),
+    "replay": Command("a planner on one clip as a film", "planners.evaluation.replay"),
+    "ensemble": Command("several GTRS-Dense models as one", "planners.evaluation.ensemble"),
+    "analysis": Command("EPDMS on real and simulated frames, by tag", "planners.evaluation.analysis"),
+    "study": Command("whether simulated data helps: all of docs/study.md", "planners.study.study"),
+    "study_data": Command("the study's data, by runs of the factory", "planners.study.recipe", "data"),
+    "study_logs": Command("the study's part on real logs", "planners.study.recipe", "logs"),
+    "report": Command("a study's tables and pictures from its frames", "planners.study.report"),
+    "agreement": Command("whether a study made again says the same", "planners.study.agreement"),
 }
 DOORS = {"factory": COMMANDS, "planners": PLANNERS}  # package -> what `python -m <package>` knows
 
@@ -74,7 +79,7 @@ def dispatch(argv: Sequence[str], commands: Mapping[str, Command], about: str) -
     """Hand the arguments to the command that is named first; its exit code, 2 where there is none."""
     if not argv or argv[0] in ("-h", "--help", "help"):
         print(about)
-        return 0 if argv else BAD_ARGUMENTS
+        return 0 if argv else BAD_CONFIG
     if argv[0] in ("-V", "--version"):
         print(f"driving-data-factory {__version__}")
         return 0
@@ -84,4 +89,4 @@ def dispatch(argv: Sequence[str], commands: Mapping[str, Command], about: str) -
     door = next((door for door, known in DOORS.items() if name in known), None)
     meant = f"; it is python -m {door} {name}" if door else nearest(name, list(commands))
     print(f"error: there is no command {name}; see --help{meant}", file=sys.stderr)
-    return BAD_ARGUMENTS
+    return BAD_CONFIG

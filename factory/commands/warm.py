@@ -3,32 +3,31 @@
     python -m factory warm                  all of them, and what the synthetic town is painted with
     python -m factory warm drive judge      parts: what a run that only drives needs, what scores need
 
-Each is compiled once per machine, processor and version; what is there is not compiled again. Exit codes: 0 compiled,
-2 no such part, or no folder to keep them in.
+Each is compiled once per machine, processor and version; what is there is not compiled again.
 """
 
-import sys
-from collections.abc import Sequence
+from dataclasses import dataclass, field
 
-from factory.config.arguments import BAD_ARGUMENTS
+from factory.config.arguments import WORD, Refused
 
 
-def main(argv: Sequence[str]) -> int:
-    """The parts that are named, else all; the exit code."""
-    if {"-h", "--help"} & set(argv):
-        print(__doc__)
-        return 0
+@dataclass(frozen=True)
+class Request:
+    """The command line."""
+
+    parts: tuple[str, ...] = field(default=(), metadata=WORD)
+
+
+def main(request: Request) -> None:
+    """Compile the parts that are named, else all. Raises Refused."""
     from factory.graph.work import NotReady
     from factory.stages.warm import PARTS, compile_kernels, compile_town_kernels
 
-    if unknown := sorted(set(argv) - PARTS.keys()):
-        print(f"error: no part {', '.join(unknown)}; there are {', '.join(PARTS)}", file=sys.stderr)
-        return BAD_ARGUMENTS
+    if unknown := sorted(set(request.parts) - PARTS.keys()):
+        raise Refused(f"no part {', '.join(unknown)}; there are {', '.join(PARTS)}")
     try:
-        compile_kernels(list(argv) or ["judge", "answers", "fit"])
+        compile_kernels(list(request.parts) or ["judge", "answers", "fit"])
     except NotReady as error:
-        print(f"error: {error}", file=sys.stderr)
-        return BAD_ARGUMENTS
-    if not argv:
+        raise Refused(str(error)) from error
+    if not request.parts:
         compile_town_kernels()
-    return 0

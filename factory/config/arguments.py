@@ -1,15 +1,20 @@
-"""key=value arguments of the commands that look at a run, as a typed dataclass of theirs."""
+"""The arguments of a command: one parser, from `key=value` and plain words to a typed dataclass of its own."""
 
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, fields
-from difflib import get_close_matches
-from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_type_hints
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+
+from factory.config.words import ConfigError, nearest
+from factory.exits import BAD_CONFIG
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-BAD_ARGUMENTS = 2  # the exit code
+# Metadata of a field. Of WORD: it may stand without its key; the fields in their order, a tuple for all that is left.
+WORD = {"given": "word"}
+RUN = {"given": "run"}  # it takes every argument that is no field: settings of the run
 Request = TypeVar("Request", bound="DataclassInstance")
 
 
@@ -17,41 +22,52 @@ class Refused(ValueError):
     """The request cannot be answered; the message says why."""
 
 
-def answer(about: str, shape: type[Request], argv: Sequence[str], lines: Callable[[Request], Iterable[str]]) -> int:
-    """A whole command: help, arguments, its lines printed as they come; the exit code."""
+def answer(command: ModuleType, argv: Sequence[str]) -> int:
+    """A whole command: its help, or `main` of its Request; the exit code, 0 where `main` returns none."""
     if {"-h", "--help"} & set(argv):
-        print(about)
+        print(
+            f"{command.__doc__}\nExit codes: 0 done, 2 refused in one line that says why; all: docs/configuration.md."
+        )
         return 0
     try:
-        for line in lines(parse(shape, argv)):
-            print(line, flush=True)
-    except Refused as error:
+        return command.main(parse(command.Request, argv)) or 0
+    except (Refused, ConfigError, MemoryError) as error:
         print(f"error: {error}", file=sys.stderr)
-        return BAD_ARGUMENTS
-    return 0
+        return BAD_CONFIG
 
 
 def parse(shape: type[Request], argv: Sequence[str]) -> Request:
-    """A request out of arguments; its fields are the keys, each a str, an int or a bool, or one of these and None.
+    """A request out of arguments; its fields are the keys: text, a number, a switch, a Literal, a list of texts.
 
     Raises Refused for an unknown key, a value missing or of another kind, a key given twice, and a field without a
     default that is not given.
     """
-    kinds = get_type_hints(shape)
-    given: dict[str, Any] = {}
+    kinds, words, rest = keys_of(shape), given_as(shape, WORD), given_as(shape, RUN)
+    given: dict[str, Any] = dict.fromkeys(rest, ())
     for argument in argv:
         key, equals, value = argument.partition("=")
-        if key not in kinds or not equals or not value:
-            near = "" if key in kinds else "".join(get_close_matches(key, kinds, 1, 0.6))
-            meant = f"; did you mean {near}=?" if near else ""
-            known = ", ".join(f"{name}=..." for name in kinds)
-            raise Refused(f"{argument!r}: expected one of {known}; see --help{meant}")
-        if key in given:
-            raise Refused(f"{key} is given twice")
-        given[key] = _value(key, value, kinds[key])
+        if key in kinds and value:
+            if key in given:
+                raise Refused(f"{key} is given twice")
+            given[key] = _value(key, value, kinds[key])
+        elif words and not equals and not argument.startswith("-"):
+            name = words[0]
+            if get_origin(kinds[name]) is tuple:
+                given[name] = (*given.get(name, ()), argument)
+                continue
+            if name in given:
+                raise Refused(f"{name} is given twice")
+            given[name] = _value("", argument, kinds[words.pop(0)])
+        elif rest:
+            given[rest[0]] += (argument,)
+        else:
+            known = [f"{name}=" for name in kinds]
+            near = "" if key in kinds else nearest(key, known)
+            raise Refused(f"{argument!r}: expected one of {'..., '.join(known)}...; see --help{near}")
     for field in fields(shape):
         if field.default is MISSING and field.name not in given:
-            what = "<folder or URL of a run>" if field.name == "out" else "..."
+            choices = "|".join(map(str, get_args(kinds[field.name])))
+            what = "<folder or URL of a run>" if field.name == "out" else choices or "..."
             raise Refused(f"{field.name}={what} is missing; see --help")
     try:
         return shape(**given)
@@ -59,14 +75,37 @@ def parse(shape: type[Request], argv: Sequence[str]) -> Request:
         raise Refused(str(error)) from error
 
 
-def _value(key: str, text: str, kind: Any) -> str | int | bool:
-    allowed = {kind, *get_args(kind)}
+def keys_of(shape: type["DataclassInstance"]) -> dict[str, Any]:
+    """Key -> type of a request's fields, less the one that takes the settings of the run."""
+    hints, rest = get_type_hints(shape), given_as(shape, RUN)
+    return {field.name: hints[field.name] for field in fields(shape) if field.name not in rest}
+
+
+def given_as(shape: type["DataclassInstance"], how: Mapping[str, str]) -> list[str]:
+    """The fields that are given as words, or that take the settings of the run."""
+    return [field.name for field in fields(shape) if field.metadata == how]
+
+
+def choices_of(kind: Any) -> list[str]:
+    """What a field of few values may be; nothing for any other."""
+    if get_origin(kind) is Literal:
+        return list(get_args(kind))
+    return ["false", "true"] if bool in {kind, *get_args(kind)} else []
+
+
+def _value(key: str, text: str, kind: Any) -> Any:
+    allowed, said = {kind, *get_args(kind)}, f"{key}={text}" if key else repr(text)
+    choices = choices_of(kind)
+    if choices and (text.lower() if bool in allowed else text) not in choices:
+        listed = "true or false" if bool in allowed else f"one of {', '.join(choices)}"
+        raise Refused(f"{said}: must be {listed}{nearest(text, choices)}")
     if bool in allowed:
-        if text.lower() not in ("true", "false"):
-            raise Refused(f"{key}={text}: must be true or false")
         return text.lower() == "true"
-    if int in allowed:
-        if not (text.isascii() and text.isdecimal()):
-            raise Refused(f"{key}={text}: must be a whole number, 0 or more")
-        return int(text)
-    return text
+    if int in allowed and not (text.isascii() and text.isdecimal()):
+        raise Refused(f"{said}: must be a whole number, 0 or more")
+    if get_origin(kind) is tuple:
+        return tuple(part.strip() for part in text.strip("[]").split(","))
+    try:
+        return int(text) if int in allowed else float(text) if float in allowed else text
+    except ValueError as error:
+        raise Refused(f"{said}: must be a number") from error

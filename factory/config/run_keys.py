@@ -60,7 +60,6 @@ class RunKeys:
     minutes: float | None
     shard_seconds: float
     episodes: int | Literal["none", "all"]
-    dry_run: bool
 
     def __post_init__(self) -> None:
         if self.rounds < 1:

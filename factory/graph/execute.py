@@ -6,18 +6,17 @@ same result.
 
 import json
 import os
-import signal
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
-from types import FrameType
 from typing import Literal
 
 from deltalake.exceptions import DeltaError
 
+from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, asked_to_stop
 from factory.graph.batch import SHARD_BYTES, SHARD_SECONDS, Gatherer, WriteFailed
 from factory.graph.driver import Driver, Executed
 from factory.graph.episodes import Episodes, EpisodesWanted
@@ -35,7 +34,6 @@ from factory.store.samples import CURRENT_RUN, NOTHING, ChangedRun, OnChange, St
 from factory.store.table import AnotherWriter
 from factory.wording import one_line
 
-COMPLETE, BAD_CONFIG, COMPLETE_WITH_FAILURES, INTERRUPTED = 0, 2, 3, 4  # exit codes
 Executor = Literal["local", "ray"]
 
 
@@ -127,7 +125,7 @@ def execute(
         if graph is not None:
             began_ms = _announce(store, plan, experts, rounds, command)
             metrics = RunMetrics(graph.recorder, store.location)
-            with _stop_signals(driver.stop), _alarm(driver.stop, minutes):
+            with asked_to_stop(driver.stop), _alarm(driver.stop, minutes):
                 if pictured is not None:
                     pictured.begin(graph)
                 driver.loop(graph, Gatherer(graph, store, shard_bytes, shard_seconds), metrics, pictured)
@@ -188,28 +186,6 @@ def _graph(
     from factory.graph.on_ray import RayGraph
 
     return RayGraph(work, store.location, workers, address, gpu_share)
-
-
-@contextmanager
-def _stop_signals(stop: Callable[[], None]) -> Iterator[None]:
-    """The first SIGINT or SIGTERM drains the run, a second one ends it at once."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    asked = threading.Event()
-
-    def handle(number: int, frame: FrameType | None) -> None:
-        if asked.is_set():
-            raise KeyboardInterrupt
-        asked.set()
-        stop()
-
-    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 @contextmanager

@@ -1,11 +1,11 @@
-"""How far a run is: a bar on a terminal, plain lines elsewhere."""
+"""How far something is: a bar on a terminal, plain lines elsewhere."""
 
 import math
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TextIO
+from typing import Self, TextIO
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
@@ -14,6 +14,62 @@ from factory.wording import rate_text, time_text
 
 LINE_EVERY_S = 15.0
 ASK_EVERY_S = 2.0  # how far long tasks are
+
+
+@dataclass
+class Bar:
+    """Shows `done` of `total` things, and a text; `before` were done when it began."""
+
+    what: str
+    total: int
+    before: int = 0
+    stream: TextIO = field(default_factory=lambda: sys.stderr)
+    quiet: bool = False
+    _began: float = field(default_factory=time.monotonic)
+    _said: float = field(default_factory=time.monotonic)
+    _bar: Progress | None = None
+
+    def __post_init__(self) -> None:
+        if self.stream.isatty() and not self.quiet:
+            columns = (
+                TextColumn(self.what),
+                BarColumn(),
+                TextColumn("{task.completed}/{task.total}  {task.fields[text]}"),
+            )
+            self._bar = Progress(*columns, console=Console(file=self.stream), transient=True)
+            self._bar.add_task("", total=self.total, completed=self.before, text="")
+            self._bar.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def update(self, done: int, text: Callable[[float], str], last: bool) -> None:
+        """Update the bar; without a terminal print a line every 15 s and at the end. text: seconds so far -> words."""
+        now = time.monotonic()
+        if self._bar is not None:
+            self._bar.update(self._bar.task_ids[0], completed=done, text=text(now - self._began))
+        elif not self.quiet and (last or now - self._said >= LINE_EVERY_S):
+            self._said = now
+            print(f"{self.what} {done}/{self.total}  {text(now - self._began)}", file=self.stream, flush=True)
+
+
+@dataclass
+class Counter(Bar):
+    """The rate and the time left by it; those done before this run are not in the rate."""
+
+    def show(self, done: int, note: str = "") -> None:
+        """So many are done."""
+        self.update(done, lambda elapsed_s: self.text(done, elapsed_s, note), done >= self.total)
+
+    def text(self, done: int, elapsed_s: float, note: str) -> str:
+        """Rate, time left, note."""
+        rate = (done - self.before) / elapsed_s if elapsed_s > 0 else 0.0
+        left = time_text((self.total - done) / rate) if rate > 0 else "?"
+        return "  ".join(filter(None, [rate_text(rate), f"ETA {left}", note]))
 
 
 @dataclass
@@ -26,47 +82,23 @@ class Tally:
     failed: int = 0
 
 
-@dataclass
-class ProgressLine:
+class ProgressLine(Bar):
     """Shows a Tally against `total` clips."""
 
-    total: int
-    left_s: Callable[[float], float | None]  # seconds of the run so far -> seconds left, if that is known
-    stream: TextIO = field(default_factory=lambda: sys.stderr)
-    doing: Callable[[], str] = str  # how far long tasks are
-    _began: float = field(default_factory=time.monotonic)
-    _said: float = field(default_factory=time.monotonic)
-    _bar: Progress | None = None
-    _told: str = ""
-    _asked: float = -math.inf
-
-    def __post_init__(self) -> None:
-        if self.stream.isatty():
-            columns = (
-                TextColumn("clips"),
-                BarColumn(),
-                TextColumn("{task.completed}/{task.total}  {task.fields[text]}"),
-            )
-            self._bar = Progress(*columns, console=Console(file=self.stream), transient=True)
-            self._bar.add_task("", total=self.total, text="")
-            self._bar.start()
-
-    def __enter__(self) -> "ProgressLine":
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        if self._bar is not None:
-            self._bar.stop()
+    def __init__(
+        self,
+        total: int,
+        left_s: Callable[[float], float | None],  # seconds of the run so far -> seconds left, if that is known
+        stream: TextIO | None = None,
+        doing: Callable[[], str] = str,  # how far long tasks are
+    ) -> None:
+        super().__init__("clips", total, stream=stream or sys.stderr)
+        self.left_s, self.doing = left_s, doing
+        self._told, self._asked = "", -math.inf
 
     def show(self, tally: Tally, last: bool = False) -> None:
-        """Update the bar; without a terminal print a line every 15 s and at the end."""
-        now = time.monotonic()
-        if self._bar is not None:
-            self._bar.update(self._bar.task_ids[0], completed=tally.clips, text=self.text(tally, now - self._began))
-        elif last or now - self._said >= LINE_EVERY_S:
-            self._said = now
-            text = self.text(tally, now - self._began)
-            print(f"clips {tally.clips}/{self.total}  {text}", file=self.stream, flush=True)
+        """So far is the run."""
+        self.update(tally.clips, lambda elapsed_s: self.text(tally, elapsed_s), last)
 
     def text(self, tally: Tally, elapsed_s: float) -> str:
         rate = tally.clips / elapsed_s if elapsed_s > 0 else 0.0

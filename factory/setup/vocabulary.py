@@ -1,18 +1,11 @@
-"""`python -m factory vocabulary`: vocabularies and recovery tables out of a data set's own TRAIN logs.
+"""Vocabularies and recovery tables out of a data set's own TRAIN logs, and their files.
 
-    python -m factory vocabulary clips=av2 clips.root=<logs> k=1024 out=vocabulary.npy
-    python -m factory vocabulary kinematic=true k=1024 out=labels.npy
-    python -m factory vocabulary clips=av2 clips.root=<logs> table=recovery.npz vocabularies=[human_8192x40x3.npy]
-
-`clips` and `clips.*` are those of `python -m factory.run`; the other keys are the fields of `VocabularySettings`.
 Both artefacts carry a digest of their trajectories. They are made from ALL train clips of the root, whatever part of
 them a run later reads, so that a run's `limit` never changes what the experts know.
 """
 
-import dataclasses
 import json
 import os
-import sys
 import zipfile
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -22,36 +15,15 @@ from typing import BinaryIO
 
 import numpy as np
 
-from factory.config.compose import ConfigError, build, compose, fill, need_run_extra
 from factory.readers.base import BadClip, ClipReader
 from factory.readers.validate import read_clip
 from tasks.experts.recovery.expert import RecoveryTable
 from tasks.world.arrays import Array
 from tasks.world.clip import CLIP_STEPS, HORIZON_STEPS, STEP_S
-from tasks.world.kinematic_vocabulary import kinematic_trajectories
 from tasks.world.vocabulary import Vocabulary, checked_trajectories, cluster, human_windows
 
 STEP_MS = round(STEP_S * 1000)
 TABLE_KEYS = ("trajectories", "digest")
-
-
-@dataclass(frozen=True)
-class VocabularySettings:
-    """What to build from the train clips."""
-
-    out: str | None = None  # a vocabulary: .npy (k, 40, 3), with a .json beside it
-    k: int = 8192
-    seed: int = 0
-    table: str | None = None  # a recovery table: .npz, with a .json beside it
-    vocabularies: tuple[str, ...] = ()  # files whose trajectories go into the table too
-    every_s: float = 0.5  # a window starts this often
-    kinematic: bool = (
-        False  # out: k seeded kinematic trajectories, as a run without vocabulary.file has; reads no clips
-    )
-
-    def __post_init__(self) -> None:
-        if self.kinematic and (self.out is None or self.table is not None):
-            raise ValueError("kinematic=true makes a vocabulary: give out=<file>.npy, and no table")
 
 
 @dataclass(frozen=True)
@@ -180,87 +152,3 @@ def _write(path: Path, fill_in: Callable[[BinaryIO], object]) -> None:
 def _describe(path: Path, content: dict[str, object]) -> None:
     text = json.dumps(content, indent=2, sort_keys=True) + "\n"
     _write(path.with_suffix(".json"), lambda file: file.write(text.encode()))
-
-
-def run(settings: VocabularySettings, reader: ClipReader) -> list[str]:
-    """Builds and writes what `settings` ask for; one line of report for each artefact.
-
-    Raises ValueError where the root has no data, no train log or too few windows, or a vocabulary file is broken.
-    """
-    vocabularies = [load_vocabulary(file) for file in settings.vocabularies]  # first: broken files fail at once
-    windows = train_windows(reader, settings.every_s)
-    origin: dict[str, object] = {
-        "reader": reader.name,
-        "train_logs": list(windows.logs),
-        "train_windows": len(windows.trajectories),
-        "unreadable": windows.broken,
-    }
-    lines = []
-    if settings.out is not None:
-        vocabulary = build_vocabulary(windows, settings.k, settings.seed)
-        save_vocabulary(settings.out, vocabulary, origin | {"seed": settings.seed})
-        lines.append(f"{settings.out}: {len(vocabulary)} of {len(windows.trajectories)} windows, {vocabulary.digest}")
-    if settings.table is not None:
-        table = build_recovery_table([windows], vocabularies)
-        files = {Path(file).name: vocabulary.digest for file, vocabulary in zip(settings.vocabularies, vocabularies)}
-        save_recovery_table(settings.table, table, origin | {"vocabularies": files})
-        lines.append(
-            f"{settings.table}: {len(table)} trajectories, {len(windows.trajectories)} of them from "
-            f"{len(windows.logs)} train logs, {table.digest}"
-        )
-    lines += [f"unreadable {name}: {reason}" for name, reason in sorted(windows.broken.items())]
-    return lines
-
-
-def write_kinematic(settings: VocabularySettings) -> str:
-    """Writes the kinematic vocabulary of `k` and `seed`; a line of report."""
-    assert settings.out is not None
-    vocabulary = Vocabulary(kinematic_trajectories(settings.k, settings.seed), source="kinematic")
-    save_vocabulary(settings.out, vocabulary, {"source": "kinematic", "seed": settings.seed})
-    return f"{settings.out}: {len(vocabulary)} kinematic trajectories, {vocabulary.digest}"
-
-
-def parsed(arguments: Sequence[str]) -> tuple[VocabularySettings, list[str]]:
-    """The settings, and the overrides that choose the clips. Raises ConfigError."""
-    need_run_extra("omegaconf")
-    from omegaconf import OmegaConf
-
-    of_clips = [argument for argument in arguments if argument.lstrip("+").split("=")[0].split(".")[0] == "clips"]
-    own = [argument for argument in arguments if argument not in of_clips]
-    wrong = [argument for argument in own if "=" not in argument]
-    if wrong:
-        raise ConfigError(f"expected key=value, got {wrong[0]!r}")
-    values = OmegaConf.to_container(OmegaConf.from_dotlist(own))
-    assert isinstance(values, dict)
-    settings = fill(VocabularySettings, {str(key): value for key, value in values.items()}, "vocabulary")
-    if settings.out is None and settings.table is None:
-        raise ConfigError("nothing to build: give out=<file>.npy, table=<file>.npz or both")
-    for name, suffix in (("out", ".npy"), ("table", ".npz")):
-        file = getattr(settings, name)
-        if file is not None and Path(file).suffix != suffix:
-            raise ConfigError(f"{name}={file} must end in {suffix}")
-    return settings, of_clips
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """The command; 0 when everything was written, 2 on a bad configuration or when there is nothing to build from."""
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
-    if not arguments or set(arguments) & {"-h", "--help"}:
-        fields = ", ".join(f"{field.name}={field.default}" for field in dataclasses.fields(VocabularySettings))
-        print(f"{__doc__}\nsettings and their defaults: {fields}")
-        return 0 if arguments else 2
-    try:
-        settings, of_clips = parsed(arguments)
-        if settings.kinematic:
-            print(write_kinematic(settings))
-            return 0
-        lines = run(settings, build(compose("run", of_clips)["clips"], "clips"))
-    except (ValueError, OSError, MemoryError) as error:  # ConfigError is one
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    print("\n".join(lines))
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,21 +1,11 @@
-"""`python -m factory lineage out=<folder or URL> sample=<id>`: where a sample, or any other attempt, comes from.
-
-    python -m factory lineage 3fa9 out=runs/demo            an id, the beginning of one, or an ordinal
-    python -m factory lineage sample=0 out=s3://bucket/samples
-
-Run -> clip -> candidate -> attempt -> sample, with digests, versions and files.
-Exit codes: 0 shown, 2 bad arguments, or nothing there to show.
-"""
+"""Where an attempt comes from: run, clip, candidate, attempt, sample, with digests, versions and files."""
 
 import json
-import sys
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from factory.config.arguments import Refused, answer
+from factory.config.arguments import Refused
 from factory.views.report_words import to_the_side, turned
-from factory.views.status import open_store
 
 if TYPE_CHECKING:
     from factory.store.samples import Store
@@ -25,29 +15,8 @@ Row = Mapping[str, Any]
 Part = tuple[str, list[tuple[str, object]]]
 
 
-@dataclass(frozen=True)
-class Request:
-    """The command line."""
-
-    out: str
-    sample: str
-
-
-def main(argv: Sequence[str]) -> int:
-    """The command; returns the exit code."""
-    named = [argument if "=" in argument or argument.startswith("-") else f"sample={argument}" for argument in argv]
-    return answer(str(__doc__), Request, named, lines_of)
-
-
-def lines_of(request: Request) -> Iterable[str]:
-    """The chain as text. Raises Refused where no attempt, or more than one, is meant."""
-    for title, facts in lineage(open_store(request.out), request.sample):
-        yield title
-        yield from (f"  {name:<18}{value}" for name, value in facts if value not in (None, ""))
-
-
 def lineage(store: "Store", which: str) -> list[Part]:
-    """The chain, part by part. Raises Refused as above."""
+    """The chain, part by part. Raises Refused where no attempt, or more than one, is meant."""
     from factory.store.samples import run_number
 
     attempt_id = _meant(store, which)
@@ -188,7 +157,3 @@ def _fate(store: "Store", row: Row, path: str) -> list[tuple[str, object]]:
 
 def _score(value: float | None) -> str:
     return "-" if value is None else f"{value:.3f}"
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

@@ -1,28 +1,9 @@
-"""`python -m factory show out=<folder or URL>`: what a store holds.
+"""One sample in words: which is meant, its numbers, its labels, the log's own drive."""
 
-    python -m factory show out=runs/demo                  counts, acceptance funnel, the newest run
-    python -m factory show out=runs/demo list=true        sample ids, one a line
-    python -m factory show out=runs/demo sample=0         one sample: numbers, and a picture in the current folder
-    python -m factory show out=runs/demo sample=3fa9      the same by its id, or the beginning of it
-    python -m factory show out=runs/demo sample=0 to=x.png    ... the picture there (a folder, or a file ending in .png)
-    python -m factory show out=runs/demo sample=0 film=true   ... and a film of it beside the picture (.mp4)
-    python -m factory show out=runs/av2 sample=0 vocabulary=human.npy   ... with every labelled trajectory by its score
-    python -m factory show out=runs/demo failed=true      failed attempts: file, field, message, how to retry
-
-Where the block's scene is still in the run's cache, a sample's picture also shows the log's photos, the scene from the
-same poses, and the sample's now as seen from up to 2 m to either side.
-Exit codes: 0 shown, 2 bad arguments, or nothing there to show.
-"""
-
-import signal
-import sys
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from factory.config.arguments import Refused, answer
-from factory.views.status import failed_lines, open_store, status_lines
+from factory.config.arguments import Refused
 
 if TYPE_CHECKING:
     from factory.store.samples import Store
@@ -31,51 +12,11 @@ if TYPE_CHECKING:
     from tasks.world.arrays import Array
 
 
-@dataclass(frozen=True)
-class Request:
-    """The command line."""
-
-    out: str
-    sample: str | None = None  # attempt_id, its beginning, or an ordinal
-    failed: bool = False
-    list: bool = False
-    to: str | None = None
-    film: bool = False
-    vocabulary: str | None = None  # .npy that the labels are of; without it the kinematic one, where they are of that
-
-    def __post_init__(self) -> None:
-        if sum((self.sample is not None, self.failed, self.list)) > 1:
-            raise ValueError("choose one of sample=, failed=true and list=true")
-        if self.to is not None and self.sample is None:
-            raise ValueError("to= says where the picture of sample= goes; give sample= too")
-        if self.film and self.sample is None:
-            raise ValueError("film=true is of sample=; give sample= too")
-        if self.vocabulary is not None and self.sample is None:
-            raise ValueError("vocabulary= is drawn in the picture of sample=; give sample= too")
-
-
-def main(argv: Sequence[str]) -> int:
-    """The command; returns the exit code."""
-    return answer(str(__doc__), Request, argv, lines_of)
-
-
-def lines_of(request: Request) -> Iterable[str]:
-    """The lines to print. Raises Refused where there is nothing to show."""
-    store = open_store(request.out)
-    if request.failed:
-        return failed_lines(store)
-    if request.list:
-        return sample_ids(store)
-    if request.sample is not None:
-        return sample_lines(store, find(store, request.sample), request)
-    return status_lines(store)
-
-
 def sample_ids(store: "Store") -> list[str]:
     """In the order of ordinals. Raises Refused where there are none."""
     ids = sorted(store.samples)
     if not ids:
-        raise Refused(f"{store.location.uri} holds no sample; without sample= it shows why")
+        raise Refused(f"{store.location.uri} holds no sample; python -m factory status shows why")
     return ids
 
 
@@ -95,41 +36,6 @@ def find(store: "Store", which: str) -> str:
         why = row["error"] or f"{row['stage']}.{row['reason']} {row['detail']}".strip(". ")
         raise Refused(f"{row['attempt_id']} is no sample but a {row['kind']} attempt of {row['expert']}: {why}")
     raise Refused(f"no sample {which}: ids begin otherwise, ordinals go from 0 to {len(ids) - 1}; see list=true")
-
-
-def sample_lines(store: "Store", attempt_id: str, request: Request) -> Iterable[str]:
-    """One sample's numbers; writes its picture and says where it is."""
-    from factory.store.reader import SampleTable
-    from factory.views.sample_picture import encoded, sample_sheet
-    from factory.views.seen_again import again_sheet, digest_of, film, scene_of, stacked
-
-    try:
-        row = SampleTable(store.location.uri, store.location.options)[attempt_id]
-    except ValueError as error:  # of another schema version
-        raise Refused(str(error)) from error
-    path = _picture_path(attempt_id, request.to)
-    drawn = labelled_trajectories(row, request.vocabulary)
-    yield from _numbers(row)
-    yield from _label_lines(row, drawn is not None)
-    logged = logged_drive(store, row)
-    sheets = [sample_sheet(row, logged, vocabulary=drawn)]
-    digest = digest_of(store, row)
-    scene = None if digest is None else scene_of(store, digest)
-    if digest is not None and scene is None:
-        yield f"              scene {digest} is not in the run's cache: nothing is rendered anew"
-    if scene is not None and (again := again_sheet(*seen_again(store, row, scene))) is not None:
-        sheets.append(again)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(encoded(stacked(sheets), ".png"))
-        yield f"picture       {path.resolve()}"
-        if request.film:
-            from factory.views.video import write_mp4
-
-            write_mp4(path.with_suffix(".mp4"), film(row, scene, logged))
-            yield f"film          {path.with_suffix('.mp4').resolve()}"
-    except OSError as error:
-        raise Refused(f"to={request.to}: the picture cannot be written: {error}") from error
 
 
 def seen_again(
@@ -164,7 +70,8 @@ def labelled_trajectories(row: dict[str, Any], file: str | None) -> "Array | Non
     return None
 
 
-def _label_lines(row: dict[str, Any], drawn: bool) -> Iterable[str]:
+def label_lines(row: dict[str, Any], drawn: bool) -> Iterable[str]:
+    """What its labels say; `drawn`: the picture shows them."""
     from factory.store.reader import labels_of
 
     if row["label_vocabulary"] is None:
@@ -194,7 +101,8 @@ def logged_drive(store: "Store", row: dict[str, Any]) -> "Array | None":
         return None
 
 
-def _numbers(row: dict[str, Any]) -> Iterable[str]:
+def number_lines(row: dict[str, Any]) -> Iterable[str]:
+    """A sample's numbers, without what is large."""
     from factory.views.report_words import to_the_side, turned
     from tasks.subscores import SUBSCORES
 
@@ -222,17 +130,3 @@ def _numbers(row: dict[str, Any]) -> Iterable[str]:
         if any(value is not None for value in values):
             texts = ("-" if value is None else f"{value:.3f}" for value in values)
             yield f"              {title:<11}" + "".join(f"{text:>7}" for text in texts)
-
-
-def _picture_path(attempt_id: str, to: str | None) -> Path:
-    target = Path(to or ".").expanduser()
-    if target.suffix.lower() == ".png":
-        return target
-    if target.suffix and not target.is_dir():
-        raise Refused(f"to={to}: the picture is a PNG; name a file ending in .png, or a folder")
-    return target / f"sample_{attempt_id}.png"
-
-
-if __name__ == "__main__":
-    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `... list=true | head` ends quietly
-    sys.exit(main(sys.argv[1:]))

@@ -1,55 +1,25 @@
-"""`python -m factory status|funnel|failed out=<folder or URL>`: how a run stands, from its tables.
-
-    python -m factory status out=runs/demo        tables, counts, acceptance funnel, the newest run
-    python -m factory funnel out=runs/demo        acceptance by expert and round, and why the rest was not
-    python -m factory failed out=runs/demo        failed attempts: file, field, message, how to retry
-
-Exit codes: 0 shown, 2 bad arguments, or nothing there to show.
-"""
+"""How a run stands, from its tables: its store, what is in it, what failed."""
 
 import json
 import os
 import shlex
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from factory.config.arguments import Refused, answer
+from factory.config.arguments import Refused
+from factory.exits import MEANING
 from factory.wording import one_line
 
 if TYPE_CHECKING:
     from factory.store.samples import Store
 
-EXIT_WORDS = {0: "complete", 3: "complete with failed attempts", 4: "interrupted, the same command goes on"}
 RETRY = {
     "input": "mend or take out the named file, then python -m factory retry out=...",
     "bug": "python -m factory retry out=..., once the code or the plug-in is mended",
     "system": "the next run of the same command tries it again by itself",
     "poison": "it brought workers down in several runs; python -m factory retry out=... tries it once more",
 }
-
-
-@dataclass(frozen=True)
-class Request:
-    """The command line."""
-
-    out: str
-
-
-def status(argv: Sequence[str]) -> int:
-    """The command `status`; the exit code."""
-    return answer(str(__doc__), Request, argv, lambda request: status_lines(open_store(request.out)))
-
-
-def funnel(argv: Sequence[str]) -> int:
-    """The command `funnel`; the exit code."""
-    return answer(str(__doc__), Request, argv, lambda request: funnel_lines(open_store(request.out)))
-
-
-def failed(argv: Sequence[str]) -> int:
-    """The command `failed`; the exit code."""
-    return answer(str(__doc__), Request, argv, lambda request: failed_lines(open_store(request.out)))
 
 
 class NothingThere(Refused):
@@ -81,8 +51,6 @@ def open_store(out: str) -> "Store":
 
 def status_lines(store: "Store") -> Iterable[str]:
     """Tables, counts, funnel and the newest run."""
-    from factory.store.funnel import funnel_of
-
     samples = store.samples.read(["expert", "round", "split", "image_source", "dataset"]).to_pylist()
     outcomes = Counter(store.outcomes.read(["kind"])["kind"].to_pylist())
     yield f"store       {store.location.uri}"
@@ -94,7 +62,7 @@ def status_lines(store: "Store") -> Iterable[str]:
         yield f"{title:<14}" + (", ".join(f"{name} {n}" for name, n in sorted(counts.items())) or "no samples")
     yield "not samples   " + (", ".join(f"{kind} {n}" for kind, n in sorted(outcomes.items())) or "none")
     yield ""
-    yield funnel_of(store).text().rstrip()
+    yield funnel_text(store)
     yield ""
     yield from _last_run(store)
 
@@ -105,7 +73,7 @@ def _last_run(store: "Store") -> Iterable[str]:
         yield "newest run    did not finish; run the same command again to go on"
         return
     run = json.loads(data)
-    yield f"newest run    exit code {run['exit_code']}: {EXIT_WORDS.get(run['exit_code'], 'see its output')}"
+    yield f"newest run    exit code {run['exit_code']}: {MEANING[run['exit_code']]}"
     executed = ", ".join(f"{name} {count}" for name, count in run["executed"].items())
     yield f"executed      {executed}"
     seconds = ", ".join(f"{stage} {s['seconds']:.1f} ({s['tasks']})" for stage, s in run["seconds"].items())
@@ -116,11 +84,11 @@ def _last_run(store: "Store") -> Iterable[str]:
         yield f"report        {store.location.uri}/report.html"
 
 
-def funnel_lines(store: "Store") -> Iterable[str]:
+def funnel_text(store: "Store") -> str:
     """The funnel as a table."""
     from factory.store.funnel import funnel_of
 
-    yield funnel_of(store).text().rstrip()
+    return funnel_of(store).text().rstrip()
 
 
 def failed_line(store: "Store") -> str:

@@ -30,6 +30,7 @@ from pathlib import Path
 from typing import Any
 
 from factory.config.compose import ConfigError, fill
+from factory.graph.progress import Counter
 from planners.command import command
 from planners.evaluation.aggregation import SummaryLine, lines_of, summarise
 from planners.evaluation.benchmark_folder import BenchmarkFolder
@@ -41,7 +42,6 @@ from planners.evaluation.score_rows import FrameRow, read_rows, write_rows
 from planners.evaluation.score_table import table_text, write_table
 from planners.evaluation.scoring import Plans, Rules, prepare_clip, score_clip
 from planners.evaluation.tags import TAG_COLUMNS, tags_of
-from planners.training.progress import Counter
 from tasks.experts.pdm_closed.planner import PdmSettings
 from tasks.rollout.simulate import TrafficSettings
 from tasks.stages import stage_versions

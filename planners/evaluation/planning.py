@@ -15,12 +15,12 @@ import numpy as np
 import torch
 
 from factory.config.compose import ConfigError
+from factory.graph.progress import Counter
 from planners.data.batch import Batch, Needs
 from planners.evaluation.contenders import Contender, needs_of
 from planners.evaluation.frames import Benchmark, FrameKey
 from planners.evaluation.scoring import Plans
 from planners.evaluation.shown import as_shown, batch_of, columns_shown
-from planners.training.progress import Counter
 from tasks.trajectories import at_ten_hz
 from tasks.world.arrays import Array
 

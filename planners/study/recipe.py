@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from factory.config.compose import compose, fill
-from planners.command import INTERRUPTED, Failed, Stopped, command, until_signal
+from factory.exits import INTERRUPTED
+from planners.command import Failed, Stopped, command, until_signal
 from planners.study.scaling import scale
 from planners.study.sweep import Means, exit_code
 

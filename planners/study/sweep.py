@@ -18,12 +18,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TextIO
 
-from planners.command import INTERRUPTED, Failed, Stopped, until_signal
+from factory.exits import INTERRUPTED
+from factory.graph.progress import Counter
+from planners.command import Failed, Stopped, until_signal
 from planners.evaluation import record as eval_record
 from planners.evaluation.aggregation import HumanFilter
 from planners.evaluation.contenders import contender
 from planners.evaluation.scores import BOUNDS, PAPER
-from planners.training.progress import Counter
 
 TRAININGS, EVALUATIONS, DONE, LOG = "trainings", "evaluations", "sweep.json", "train.log"
 EVALUATED_TOGETHER = 24  # planners in one process at the most

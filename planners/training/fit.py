@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
+from factory.graph.progress import Counter
 from planners.command import Stopped, until_signal
 from planners.data.batch import Batch
 from planners.models.planner import Planner
@@ -23,7 +24,6 @@ from planners.training.checkpoint import load_training, load_weights, save_check
 from planners.training.curves import Curves
 from planners.training.optim import TrainingSettings, build_optimiser, learning_rate
 from planners.training.processes import World
-from planners.training.progress import Counter
 
 STATE_VERSION = 1
 

@@ -94,7 +94,7 @@ def measure(out: Path) -> None:
     size = sum(file.n_bytes for file in files) / 1e9
     print(f"{sum(file.n_rows for file in files):,} samples in {len(files)} files, {size:.2f} GB\n")
     print("| what | time | read |\n|---|---|---|")
-    command = [sys.executable, "-m", "factory.commands.dashboard", f"out={out}", "port=0"]
+    command = [sys.executable, "-m", "factory", "dashboard", f"out={out}", "port=0"]
     began = time.perf_counter()
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
         assert server.stdout is not None

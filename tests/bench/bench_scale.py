@@ -16,13 +16,14 @@ import resource
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from factory.config.arguments import answer
-from factory.graph.execute import COMPLETE, execute
+from factory.exits import COMPLETE
+from factory.graph.execute import execute
 from factory.graph.on_ray import ray  # with the environment that keeps it on loopback
 from factory.graph.work import Accepted, AttemptResult, PreparedClip
 from factory.readers.base import ClipRef
@@ -69,13 +70,13 @@ class WaitingWork(ToyWork):
         return replace(result, row={**result.row, "images": [{**image[0], "jpeg": noise}]})
 
 
-def lines(request: Request) -> Iterator[str]:
-    """The table, a row for each number of nodes."""
-    yield f"{request.cpus} CPUs a node, stages of {request.wait_ms} ms, rows of {request.row_kb} kB"
-    yield (f"{'nodes':>5}{'attempts':>10}{'samples':>9}{'seconds':>9}{'ideal':>8}{'efficiency':>12}{'per s':>8}"
+def main(request: Request) -> None:
+    """Print the table, a row for each number of nodes."""
+    print(f"{request.cpus} CPUs a node, stages of {request.wait_ms} ms, rows of {request.row_kb} kB")
+    print(f"{'nodes':>5}{'attempts':>10}{'samples':>9}{'seconds':>9}{'ideal':>8}{'efficiency':>12}{'per s':>8}"
            f"{'driver CPU ms':>15}{'driver MB':>11}{'commits':>9}{'files':>7}{'MB':>8}{'again s':>9}")  # fmt: skip
     for nodes in request.each:
-        yield measured(request, nodes)
+        print(measured(request, nodes), flush=True)
 
 
 def measured(request: Request, nodes: int) -> str:
@@ -139,4 +140,4 @@ def _commits(out: Path) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(answer(__doc__ or "", Request, sys.argv[1:], lines))
+    sys.exit(answer(sys.modules[__name__], sys.argv[1:]))

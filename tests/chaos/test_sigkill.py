@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from factory.commands.verify import verify
 from factory.graph.execute import execute
 from factory.store.samples import Store
+from factory.store.verify import verify
 from tests.chaos.killed_driver import EXPERTS, MOMENTS
 from tests.factory.tables import assert_same_tables
 from tests.factory.toy import ToyWork, ran, refs

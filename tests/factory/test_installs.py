@@ -112,7 +112,7 @@ COMMANDS = [
     pytest.param(["factory.run", "preset=demo"], '-e ".[run]"', id="run"),
     pytest.param(["factory", "run", "preset=demo", "--cfg"], '-e ".[run]"', id="run --cfg"),
     pytest.param(["factory", "explain", "preset=demo", "clip=0"], '-e ".[run]"', id="explain"),
-    pytest.param(["factory.setup.vocabulary", "kinematic=true", "k=8", "out=v.npy"], '-e ".[run]"', id="vocabulary"),
+    pytest.param(["factory", "vocabulary", "clips=synthetic", "k=8", "out=v.npy"], '-e ".[run]"', id="vocabulary"),
     pytest.param(["planners.training.train", "planner=ego_mlp_small"], '-e ".[planners]"', id="train"),
 ]
 

@@ -67,6 +67,7 @@ MISTYPED = [  # told before anything heavy is imported
     run("render.mode=atuo", says=["render.mode: must be auto, map or none; did you mean auto?"]),
     run("pdm.shared_lead_memory=maybe", says=["pdm.shared_lead_memory: must be true or false"]),
     run("benchmark.min_follow_ups=many", says=["benchmark.min_follow_ups: must be a number"]),
+    run("dry_run=true", says=["dry_run: there is no such setting"]),
     run("out=", says=["out= is empty", "variable"]),
     run("out=a_file", says=["a_file is not a folder"]),
     run("out=a_file/below", says=["a_file is not a folder"]),

@@ -7,15 +7,16 @@ from collections.abc import Sequence
 
 import pytest
 
-from planners.command import BAD_SETTINGS, FAILED, INTERRUPTED, Failed, Stopped, command, until_signal
+from factory.exits import BAD_CONFIG, COMPLETE_WITH_FAILURES, INTERRUPTED
+from planners.command import Failed, Stopped, command, until_signal
 
 
 @pytest.mark.parametrize(
     ("raised", "code", "said"),
     [
-        (ValueError("x=1: must be 2"), BAD_SETTINGS, "error: x=1: must be 2\n"),
-        (FileNotFoundError("no runs/a"), BAD_SETTINGS, "error: no runs/a\n"),
-        (Failed("a training"), FAILED, "error: a training\n"),
+        (ValueError("x=1: must be 2"), BAD_CONFIG, "error: x=1: must be 2\n"),
+        (FileNotFoundError("no runs/a"), BAD_CONFIG, "error: no runs/a\n"),
+        (Failed("a training"), COMPLETE_WITH_FAILURES, "error: a training\n"),
         (Stopped("the same command goes on"), INTERRUPTED, "the same command goes on\n"),
     ],
 )

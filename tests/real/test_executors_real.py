@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from factory.graph.execute import COMPLETE, execute
+from factory.exits import COMPLETE
+from factory.graph.execute import execute
 from factory.setup.settings import assemble, load_config
 from factory.store.samples import Store
 from tests.factory.tables import assert_same_tables

@@ -1,23 +1,13 @@
-"""`python -m factory report out=<folder or URL>`: a run as one HTML file, for sharing.
-
-    python -m factory report out=runs/demo                  writes runs/demo/report.html and, beside it, README.md,
-                                                            the data set's card, as a run does at its end
-    python -m factory report out=s3://bucket/samples to=run.html
-
-It is the dashboard with its answers and some pictures inside: the same page, the same numbers, nothing fetched.
-Exit codes: 0 written, 2 bad arguments, or nothing there to show.
-"""
+"""A run as one HTML file: the dashboard with its answers and some pictures inside, nothing fetched."""
 
 import base64
 import json
-import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from factory.config.arguments import Refused, answer
-from factory.views.status import open_store
+from factory.config.arguments import Refused
 
 if TYPE_CHECKING:
     from factory.setup.settings import Run
@@ -29,26 +19,6 @@ FILE = "report.html"
 TOLD = (
     "report.json"  # what the newest run alone could tell: its facts, what its reader left out, rejected attempts drawn
 )
-
-
-@dataclass(frozen=True)
-class Request:
-    """The command line."""
-
-    out: str
-    to: str | None = None
-
-
-def main(argv: Sequence[str]) -> int:
-    """The command; returns the exit code."""
-    return answer(__doc__ or "", Request, argv, _written)
-
-
-def _written(request: Request) -> list[str]:
-    from factory.views.card import write_card
-
-    store = open_store(request.out)
-    return [write_report(store, request.to), *([write_card(store)] if request.to is None else [])]
 
 
 def write_report(store: "Store", to: str | None = None) -> str:
@@ -124,7 +94,3 @@ def _plain(pictures: "Sequence[Picture]") -> list[Mapping[str, Any]]:
     return [
         asdict(one) | {"data": None if one.data is None else base64.b64encode(one.data).decode()} for one in pictures
     ]
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

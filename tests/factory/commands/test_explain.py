@@ -6,11 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from factory.commands.explain import main
+from factory.commands.table import COMMANDS
 from factory.readers.town.reader import SyntheticReader
 from factory.readers.town.write import TownSettings
 from factory.setup.settings import assemble, load_config
 from factory.stages import pipeline
+
+main = COMMANDS["explain"].load()
 
 SMALL = TownSettings(cameras=("ring_front_center",), width=64, height=36, lidar_beams=32, lidar_azimuths=300)
 

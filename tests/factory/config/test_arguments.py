@@ -1,10 +1,11 @@
 """Arguments of the commands that look at a run."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Literal
 
 import pytest
 
-from factory.config.arguments import Refused, parse
+from factory.config.arguments import RUN, WORD, Refused, parse
 
 
 @dataclass(frozen=True)
@@ -45,3 +46,43 @@ def test_what_cannot_be_meant_is_refused(argv: list[str], said: str) -> None:
     with pytest.raises(Refused) as refused:
         parse(Ask, argv)
     assert said in str(refused.value)
+
+
+@dataclass(frozen=True)
+class Told:
+    """Words, a choice, a list and settings of a run."""
+
+    how: Literal["fast", "slow"] = field(metadata=WORD)
+    files: tuple[str, ...] = field(default=(), metadata=WORD)
+    names: tuple[str, ...] = ()
+    every_s: float | None = None
+
+
+@dataclass(frozen=True)
+class Passed:
+    """A key of its own before settings of a run."""
+
+    clip: str = "0"
+    settings: tuple[str, ...] = field(default=(), metadata=RUN)
+
+
+def test_words_stand_without_keys_and_in_their_order() -> None:
+    assert parse(Told, ["slow", "a.npz", "names=[x, y]", "b.npz", "every_s=1e-1"]) == Told(
+        "slow", ("a.npz", "b.npz"), ("x", "y"), 0.1
+    )
+    assert parse(Told, ["how=fast"]) == Told("fast")
+    for argv, said in (
+        ([], "how=fast|slow is missing"),
+        (["fsat"], "'fsat': must be one of fast, slow; did you mean fast?"),
+        (["fast", "every_s=x"], "every_s=x: must be a number"),
+        (["fast", "how=slow"], "how is given twice"),
+        (["fast", "--file"], "'--file': expected one of"),
+    ):
+        with pytest.raises(Refused) as refused:
+            parse(Told, argv)
+        assert said in str(refused.value)
+
+
+def test_what_is_no_key_goes_to_the_run_as_it_stands() -> None:
+    given = ["rounds=2", "clip=7", "--config-dir", "mine", "+expert.mine.x=1", "settings=odd"]
+    assert parse(Passed, given) == Passed("7", (*given[:1], *given[2:]))

@@ -5,8 +5,9 @@ from pathlib import Path
 
 import pytest
 
+from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES
 from factory.graph.blocks import BlockQueue, Build
-from factory.graph.execute import COMPLETE, COMPLETE_WITH_FAILURES, execute
+from factory.graph.execute import execute
 from factory.graph.plan import ClipPlan
 from factory.readers.base import ClipRef
 from factory.store.samples import Store

@@ -7,14 +7,15 @@ from typing import Any
 import pytest
 from mcap.reader import make_reader
 
-from factory.commands.verify import verify
+from factory.exits import COMPLETE, INTERRUPTED
 from factory.graph import episodes
 from factory.graph.episodes import EpisodesWanted
-from factory.graph.execute import COMPLETE, INTERRUPTED, RunSummary, execute
+from factory.graph.execute import RunSummary, execute
 from factory.setup.settings import load_config
 from factory.store.episodes import FOLDER, episode_name, is_chosen
 from factory.store.location import Location
 from factory.store.samples import Store
+from factory.store.verify import verify
 from factory.views.logged_drive import prepared_episode
 from tests.factory.filmed import FilmedWork
 from tests.factory.toy import refs

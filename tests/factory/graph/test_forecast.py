@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from factory.graph.execute import COMPLETE, COMPLETE_WITH_FAILURES, execute
+from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES
+from factory.graph.execute import execute
 from factory.graph.forecast import Forecast, Work
 from factory.store.samples import Store
 from tests.factory.toy import ToyWork, refs

@@ -8,13 +8,14 @@ from pathlib import Path
 import pyarrow.compute as pc
 import pytest
 
-from factory.commands.verify import verify
-from factory.graph.execute import COMPLETE, INTERRUPTED, RunSummary, execute
+from factory.exits import COMPLETE, INTERRUPTED
+from factory.graph.execute import RunSummary, execute
 from factory.graph.steps import failure_of
 from factory.run import main as run_main
 from factory.store.room import NoRoom, needs_room, no_room
 from factory.store.samples import Store
 from factory.store.usable import why_unusable
+from factory.store.verify import verify
 from tests.factory.tables import assert_same_rows, assert_same_tables, tables_of
 from tests.factory.toy import ToyWork, refs
 

@@ -14,13 +14,14 @@ from pathlib import Path
 import pyarrow.compute as pc
 import pytest
 
-from factory.commands.verify import verify
+from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
 from factory.graph import execute as execution
-from factory.graph.execute import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, RunSummary, execute
+from factory.graph.execute import RunSummary, execute
 from factory.graph.work import AttemptResult, Built, Halted, PreparedClip, Stopped, never
 from factory.readers.base import ClipRef
 from factory.store.identity import UNLISTED
 from factory.store.samples import Store
+from factory.store.verify import verify
 from tests.factory.tables import assert_same_rows, assert_same_tables, tables_of
 from tests.factory.toy import VERSIONS, ToyWork, ran, refs
 

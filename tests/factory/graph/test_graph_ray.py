@@ -9,12 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from factory.commands.verify import verify
+from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES
 from factory.graph import on_ray as graph
 from factory.graph.episodes import EpisodesWanted
-from factory.graph.execute import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, execute
+from factory.graph.execute import execute
 from factory.graph.on_ray import ray  # with the environment that keeps it on loopback
 from factory.store.samples import Store
+from factory.store.verify import verify
 from factory.views.logged_drive import prepared_episode
 from tests.factory.filmed import FilmedWork
 from tests.factory.tables import assert_same_tables, tables_of

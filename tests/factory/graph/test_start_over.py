@@ -2,9 +2,10 @@
 
 from pathlib import Path
 
-from factory.commands.verify import verify
-from factory.graph.execute import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, RunSummary, execute
+from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES
+from factory.graph.execute import RunSummary, execute
 from factory.store.samples import Store
+from factory.store.verify import verify
 from tests.factory.tables import assert_same_tables
 from tests.factory.toy import ToyWork, refs
 

@@ -8,18 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factory.config.compose import ConfigError
+from factory.commands.table import COMMANDS
+from factory.commands.vocabulary import Request, run
+from factory.config.arguments import Refused, parse
 from factory.readers.base import BadClip, ClipIndex, ClipRef
 from factory.setup.settings import VocabularyChoice, choose_vocabulary
 from factory.setup.vocabulary import (
-    VocabularySettings,
     build_recovery_table,
     build_vocabulary,
     load_recovery_table,
     load_vocabulary,
-    main,
-    parsed,
-    run,
     save_recovery_table,
     train_windows,
 )
@@ -28,6 +26,8 @@ from tasks.world.clip import CLIP_STEPS, Clip
 from tasks.world.kinematic_vocabulary import kinematic_trajectories
 from tasks.world.vocabulary import Vocabulary
 from tests.tasks.streets import street_clip
+
+main = COMMANDS["vocabulary"].load()
 
 
 class DriveReader:
@@ -77,7 +77,7 @@ def test_without_a_train_log_there_is_no_vocabulary_and_it_says_so() -> None:
 
 
 def test_a_broken_log_is_named_and_the_others_are_used(tmp_path: Path) -> None:
-    settings = VocabularySettings(table=str(tmp_path / "t.npz"))
+    settings = Request(table=str(tmp_path / "t.npz"))
     lines = run(settings, DriveReader({"a": "train", "x": "train"}, broken=["x"]))
     assert len(load_recovery_table(tmp_path / "t.npz")) == 30
     assert sum("poses.feather: tx_m: NaN" in line for line in lines) == 10
@@ -85,7 +85,7 @@ def test_a_broken_log_is_named_and_the_others_are_used(tmp_path: Path) -> None:
 
 def test_both_artefacts_come_back_with_their_digests(tmp_path: Path) -> None:
     np.save(tmp_path / "human.npy", kinematic_trajectories(20, 0).astype(np.float32))
-    settings = VocabularySettings(
+    settings = Request(
         out=str(tmp_path / "deep/voc.npy"),
         k=8,
         table=str(tmp_path / "table.npz"),
@@ -141,18 +141,19 @@ def test_the_first_entries_of_a_vocabulary_can_be_asked_for(tmp_path: Path) -> N
 
 
 def test_the_command_line_separates_clips_from_its_own_settings() -> None:
-    settings, clips = parsed(["clips=av2", "clips.root=/logs", "k=16", "out=v.npy", "vocabularies=[a.npy,b.npy]"])
-    assert clips == ["clips=av2", "clips.root=/logs"]
-    assert settings == VocabularySettings(out="v.npy", k=16, vocabularies=("a.npy", "b.npy"))
+    clips = ("clips=av2", "clips.root=/logs")
+    found = parse(Request, [*clips, "k=16", "out=v.npy", "vocabularies=[a.npy,b.npy]", "every_s=0.2"])
+    assert found == Request(out="v.npy", k=16, vocabularies=("a.npy", "b.npy"), every_s=0.2, settings=clips)
     for wrong, message in (
         (["k=3"], "nothing to build"),
         (["out=v.npz"], r"must end in \.npy"),
-        (["out=v.npy", "kk=3"], r"vocabulary\.kk"),
-        (["out=v.npy", "k=many"], "got 'many'"),
+        (["out=v.npy", "tabel=3"], "did you mean table"),
+        (["out=v.npy", "kk=3"], "kk: there is no such setting"),
+        (["out=v.npy", "k=many"], "k=many: must be a whole number"),
         (["out"], "expected key=value"),
     ):
-        with pytest.raises(ConfigError, match=message):
-            parsed(wrong)
+        with pytest.raises(Refused, match=message):
+            parse(Request, wrong)
 
 
 def test_a_bad_command_ends_with_two(capsys: pytest.CaptureFixture[str]) -> None:

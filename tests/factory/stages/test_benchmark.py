@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from factory.graph.execute import COMPLETE, execute
+from factory.exits import COMPLETE
+from factory.graph.execute import execute
 from factory.graph.work import Accepted, Dropped, PreparedClip
 from factory.readers.base import ClipRef
 from factory.readers.town.write import TownSettings

@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from factory.commands.table import COMMANDS
 from factory.config.compose import ConfigError
+from factory.exits import BAD_CONFIG
 from factory.graph.work import HUMAN, HUMAN_CANDIDATE, Accepted, PreparedClip
-from factory.run import BAD_CONFIG
 from factory.run import main as run_main
 from factory.setup.calibrate import calibrate, measure
 from factory.setup.settings import Run, assemble, load_config
@@ -16,7 +17,6 @@ from factory.setup.vocabulary import save_vocabulary
 from factory.stages.pipeline import FactoryWork, PerturbedClip
 from factory.store.reader import LABEL_COLUMNS, SampleTable, labels_of
 from factory.views.sample_picture import SCORE_COLOURS, sample_bev
-from factory.views.show import main as show_main
 from tasks.attempt import Judged
 from tasks.reward.epdms import Scores, score
 from tasks.reward.prepare import prepare_scene
@@ -180,6 +180,7 @@ def test_a_sample_is_shown_with_its_vocabulary_where_that_is_known(
     out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     asked = [f"out={out}", "sample=0", f"to={tmp_path}"]
+    show_main = COMMANDS["show"].load()
     assert show_main(asked) == 0, "the kinematic vocabulary needs no file"
     kinematic = capsys.readouterr().out
     assert "150 trajectories of vocabulary" in kinematic and "draws them" not in kinematic

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from factory.graph.execute import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, execute
+from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES
+from factory.graph.execute import execute
 from factory.store.funnel import FunnelRow, _expert_rows, funnel_of, image_sources_text
 from factory.store.samples import Store
 from tests.factory.toy import ToyWork, refs

@@ -12,13 +12,13 @@ import pyarrow.parquet as pq
 import pytest
 from deltalake import DeltaTable
 
-from factory.commands.verify import verify
 from factory.graph.execute import execute
 from factory.store.location import Location
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
 from factory.store.schema import SAMPLES
 from factory.store.table import KeyedTable, Shard
+from factory.store.verify import verify
 from tests.factory.tables import assert_same_rows, assert_same_tables
 from tests.factory.toy import ToyWork, refs
 

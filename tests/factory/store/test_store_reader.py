@@ -10,12 +10,15 @@ import cv2
 import numpy as np
 import pytest
 
-from factory.commands.verify import main, verify
+from factory.commands.table import COMMANDS
 from factory.graph.execute import execute
 from factory.store.reader import LABEL_COLUMNS, SampleTable, image_of, labels_of, to_torch
 from factory.store.samples import Store
+from factory.store.verify import verify
 from tasks.reward.label_bytes import VocabularyLabels
 from tests.factory.toy import ToyWork, refs, row_of, stream
+
+main = COMMANDS["verify"].load()
 
 
 @pytest.fixture(scope="module")

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from factory.commands.verify import verify
 from factory.graph.episodes import EpisodesWanted
 from factory.graph.execute import execute
 from factory.store.location import BadLocation, Location
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
+from factory.store.verify import verify
 from factory.views.board.server import Board
 from factory.views.logged_drive import prepared_episode
 from tests.factory.filmed import FilmedWork

@@ -7,12 +7,15 @@ from typing import Any
 import pytest
 import yaml
 
-from factory.graph.execute import COMPLETE, INTERRUPTED, execute
+from factory.commands.table import COMMANDS
+from factory.exits import COMPLETE, INTERRUPTED
+from factory.graph.execute import execute
 from factory.store.funnel import funnel_of
 from factory.store.samples import Store
-from factory.views.board.report import main as report_main
 from factory.views.card import FILE, card, write_card
 from tests.factory.toy import ToyWork, refs
+
+report_main = COMMANDS["report"].load()
 
 
 def front_matter(text: str) -> dict[str, Any]:

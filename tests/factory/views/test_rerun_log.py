@@ -6,10 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from factory.commands.export import main
+from factory.commands.table import COMMANDS
 from factory.views import rerun_log
 from factory.views.rerun_log import RerunMissing, score_steps, write_recording
 from tests.planners.samples import FRONT_YAWS, jpeg, pictures, plain, sample, write_table
+
+main = COMMANDS["export"].load()
 
 
 def row() -> dict[str, Any]:

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from factory.commands.table import COMMANDS
 from factory.graph.execute import execute
 from factory.readers.town.reader import SyntheticReader
 from factory.readers.town.write import TownSettings
@@ -29,9 +30,10 @@ from factory.views.seen_again import (
     real_and_rendered,
     scene_of,
 )
-from factory.views.show import main
 from tasks.render.scene.asset import RenderAsset, psnr
 from tasks.stages import STAGES
+
+main = COMMANDS["show"].load()
 
 SMALL = TownSettings(cameras=("ring_front_center",), width=64, height=36, lidar_beams=32, lidar_azimuths=300)
 SIZE = ["render.width=64", "render.height=36", "render.scene=discs", "vocabulary.k=300"]

@@ -7,11 +7,14 @@ from pathlib import Path
 import cv2
 import pytest
 
+from factory.commands.table import COMMANDS
 from factory.graph.execute import execute
 from factory.readers.base import ClipRef
 from factory.store.samples import Store
-from factory.views.show import main
 from tests.factory.toy import ToyWork, refs
+
+main = COMMANDS["show"].load()
+status, failed = COMMANDS["status"].load(), COMMANDS["failed"].load()
 
 
 @pytest.fixture(scope="module")
@@ -30,9 +33,8 @@ def ask(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, 
 
 
 def test_status_counts_the_tables(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code, text, _ = ask(capsys, f"out={out}")
-    store = Store(out)
-    assert code == 0
+    assert status([f"out={out}"]) == 0
+    text, store = capsys.readouterr().out, Store(out)
     assert f"samples     {len(store.samples)} rows" in text
     assert f"outcomes    {len(store.outcomes)} rows" in text
     assert "failed 2" in text and "exit code 3: complete with failed attempts" in text
@@ -45,7 +47,7 @@ def test_list_gives_the_ids_that_sample_takes(out: Path, tmp_path: Path, capsys:
     assert code == 0 and ids == sorted(Store(out).samples)
     by_ordinal = ask(capsys, f"out={out}", "sample=1", f"to={tmp_path}")
     by_id = ask(capsys, f"out={out}", f"sample={ids[1]}", f"to={tmp_path}")
-    by_prefix = ask(capsys, f"out={out}", f"sample={ids[1][:12]}", f"to={tmp_path}")
+    by_prefix = ask(capsys, ids[1][:12], f"out={out}", f"to={tmp_path}")
     assert by_ordinal == by_id == by_prefix and by_id[0] == 0 and ids[1] in by_id[1]
 
 
@@ -63,8 +65,8 @@ def test_the_picture_lies_where_it_was_asked_for(
 
 
 def test_failed_names_file_field_and_how_to_retry(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code, text, _ = ask(capsys, f"out={out}", "failed=true")
-    assert code == 0
+    assert failed([f"out={out}"]) == 0
+    text = capsys.readouterr().out
     assert "2 failed: bug 1, input 1" in text
     assert "toy.feather: tx_m: holds NaN" in text and "ZeroDivisionError" in text
     assert text.count("factory retry out=") == 2
@@ -75,15 +77,17 @@ def test_failed_names_file_field_and_how_to_retry(out: Path, capsys: pytest.Capt
     [
         ((), "out=<folder or URL of a run> is missing"),
         (("outt=x",), "expected one of out="),
-        (("out",), "expected one of out="),
+        (("out",), "out=<folder or URL of a run> is missing"),
+        (("out={out}",), "python -m factory status shows the run"),
+        (("out={out}", "0", "sample=0"), "sample is given twice"),
         (("out=",), "expected one of out="),
         (("out={out}", "out={out}"), "given twice"),
-        (("out={out}", "failed=maybe"), "must be true or false"),
-        (("out={out}", "failed=true", "list=true"), "choose one"),
-        (("out={out}", "to=x.png"), "give sample= too"),
+        (("out={out}", "film=maybe"), "must be true or false"),
+        (("out={out}", "sample=0", "list=true"), "choose one"),
+        (("out={out}", "to=x.png", "list=true"), "give sample= too"),
         (("out={out}", "sample=zz"), "no sample zz"),
         (("out={out}", "sample=-1"), "no sample -1"),
-        (("out={out}/nothing",), "no store at"),
+        (("out={out}/nothing", "sample=0"), "no store at"),
     ],
 )
 def test_a_request_that_cannot_be_answered_ends_with_2_and_says_why(
@@ -103,7 +107,7 @@ def test_an_attempt_that_is_no_sample_says_what_became_of_it(out: Path, capsys: 
 def test_a_store_without_samples_shows_its_status_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     work = ToyWork(trouble={"log0:0": "standing"})
     execute(work, [ClipRef("toy", "log0", 0)], ["human"], 1, Store(tmp_path), "local", say=lambda line: None)
-    assert ask(capsys, f"out={tmp_path}")[0] == 0
+    assert status([f"out={tmp_path}"]) == 0 and capsys.readouterr().out
     for request in ("sample=0", "list=true"):
         code, _, error = ask(capsys, f"out={tmp_path}", request)
         assert code == 2 and "holds no sample" in error
@@ -112,18 +116,18 @@ def test_a_store_without_samples_shows_its_status_only(tmp_path: Path, capsys: p
 def test_a_run_that_died_is_told_from_one_that_ended(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     execute(ToyWork(), refs(1), ["human"], 1, Store(tmp_path), "local", say=lambda line: None)
     (tmp_path / "last_run.json").unlink()
-    assert "did not finish" in ask(capsys, f"out={tmp_path}")[1]
+    assert status([f"out={tmp_path}"]) == 0 and "did not finish" in capsys.readouterr().out
 
 
 def test_show_imports_neither_ray_nor_torch_and_helps_without_heavy_imports(out: Path, tmp_path: Path) -> None:
     script = (
-        "import sys; from factory.views.show import main; code = main(sys.argv[2:]); "
+        "import sys; from factory.__main__ import main; code = main(sys.argv[2:]); "
         "bad = set(sys.argv[1].split(',')) & set(sys.modules); sys.exit(f'{code} {bad}' if code or bad else 0)"
     )
     for heavy, arguments in (
-        ("ray,torch", [f"out={out}", "sample=0", f"to={tmp_path}"]),
-        ("ray,torch", [f"out={out}"]),
-        ("ray,torch,numpy,cv2,pyarrow,deltalake,rich,hydra", ["--help"]),
+        ("ray,torch", ["show", f"out={out}", "sample=0", f"to={tmp_path}"]),
+        ("ray,torch", ["status", f"out={out}"]),
+        ("ray,torch,numpy,cv2,pyarrow,deltalake,rich,hydra", ["show", "--help"]),
     ):
         done = subprocess.run([sys.executable, "-c", script, heavy, *arguments], capture_output=True, text=True)
         assert done.returncode == 0, done.stderr

@@ -17,15 +17,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from factory.commands.table import COMMANDS
 from factory.graph.work import HUMAN
 from factory.readers.av2.reader import AV2Reader
 from factory.readers.town.write import TownSettings, write_logs
 from factory.run import main as run_main
 from factory.store.reader import SampleTable
 from factory.views.bev import EXPERT, LOGGED
-from factory.views.show import main as show_main
 from tasks.world.clip import NOW
 from tasks.world.vehicle import HEADING, X, Y
+
+show_main = COMMANDS["show"].load()
 
 pytestmark = pytest.mark.slow
 

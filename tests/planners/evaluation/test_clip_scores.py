@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from planners.command import BAD_SETTINGS
+from factory.exits import BAD_CONFIG
 from planners.evaluation.aggregation import MEASURES
 from planners.evaluation.clip_scores import FACTS, measured, read_clips, write_clips
 from planners.evaluation.compare import CompareSettings, compare, intervals, main
@@ -47,11 +47,11 @@ def test_the_command_compares_columns_and_refuses_what_is_none(table: Path, caps
     assert main([*sides, f"out={table.parent / 'out.csv'}"]) == 0
     assert "stage_two" in capsys.readouterr().out
     assert (table.parent / "out.csv").read_text().count("\n") == 1 + len(MEASURES)
-    assert main([f"table={table}", "a=real-0", "b=sim-7"]) == BAD_SETTINGS
+    assert main([f"table={table}", "a=real-0", "b=sim-7"]) == BAD_CONFIG
     assert "no run sim-7; it has real-0, real-1, sim-0, sim-1" in capsys.readouterr().err
-    assert main([*sides, "column=nc"]) == BAD_SETTINGS
+    assert main([*sides, "column=nc"]) == BAD_CONFIG
     assert "holds scores alone" in capsys.readouterr().err
-    assert main([f"table={table.parent / 'none.csv'}", "a=real-0", "b=sim-0"]) == BAD_SETTINGS
+    assert main([f"table={table.parent / 'none.csv'}", "a=real-0", "b=sim-0"]) == BAD_CONFIG
     assert "none.csv" in capsys.readouterr().err
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from planners.command import BAD_SETTINGS
+from factory.exits import BAD_CONFIG
 from planners.evaluation.aggregation import MEASURES
 from planners.study.agreement import Agreement, Difference, agreement, main, pairs_of, read_differences
 
@@ -83,11 +83,11 @@ def test_what_is_no_such_table_is_said(tmp_path: Path, text: str, said: str) -> 
 def test_wrong_words_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     first = study(tmp_path / "a", "main,sim,real,steps,final,filtered,5,1,9")
     other = study(tmp_path / "b", "main,sim,real,epochs,final,filtered,5,1,9")
-    assert main([f"first={first}", f"second={other}"]) == BAD_SETTINGS
+    assert main([f"first={first}", f"second={other}"]) == BAD_CONFIG
     assert "no comparison in common" in capsys.readouterr().err
-    assert main([f"first={first}", f"second={tmp_path / 'none'}"]) == BAD_SETTINGS
+    assert main([f"first={first}", f"second={tmp_path / 'none'}"]) == BAD_CONFIG
     assert "none" in capsys.readouterr().err
-    assert main([f"first={first}", f"sceond={first}"]) == BAD_SETTINGS
+    assert main([f"first={first}", f"sceond={first}"]) == BAD_CONFIG
     assert "sceond" in capsys.readouterr().err
-    assert main([f"first={first}", str(first)]) == BAD_SETTINGS
+    assert main([f"first={first}", str(first)]) == BAD_CONFIG
     assert "expected one of first=" in capsys.readouterr().err

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from planners.command import BAD_SETTINGS
+from factory.exits import BAD_CONFIG
 from planners.evaluation.score_rows import read_rows, write_rows
 from planners.evaluation.scores import scores_of
 from planners.study.frames_file import FRAMES, StudyFrames, read_frames, write_frames
@@ -109,5 +109,5 @@ def test_the_tables_are_made_again_to_the_byte_of_the_rows_alone(
     (mine,) = (row for row in rows if (row["planner"], row["expert"], row["seed"]) == ("ltf", "recovery", "0"))
     for name, score in scores_of(folder).items():
         assert float(mine[name]) == pytest.approx(score, abs=1e-4)
-    assert main([f"folder={again}"]) == BAD_SETTINGS
+    assert main([f"folder={again}"]) == BAD_CONFIG
     assert "frames.parquet" in capsys.readouterr().err

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from planners.command import BAD_SETTINGS
+from factory.exits import BAD_CONFIG
 from planners.evaluation.aggregation import MEASURES
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.score_rows import FrameRow, read_rows, write_rows
@@ -142,12 +142,12 @@ def test_the_committed_tables_are_those_of_the_committed_rows(frames: Path) -> N
 
 
 def test_what_is_no_study_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([f"folder={tmp_path}"]) == BAD_SETTINGS
+    assert main([f"folder={tmp_path}"]) == BAD_CONFIG
     assert "frames.parquet" in capsys.readouterr().err
     write_rows(tmp_path, scored(0))
-    assert main([f"folder={tmp_path}"]) == BAD_SETTINGS
+    assert main([f"folder={tmp_path}"]) == BAD_CONFIG
     assert "no rows of a study" in capsys.readouterr().err
-    assert main([f"folder={tmp_path}", "human_filter=none"]) == BAD_SETTINGS
+    assert main([f"folder={tmp_path}", "human_filter=none"]) == BAD_CONFIG
     assert "human_filter" in capsys.readouterr().err
-    assert main([str(tmp_path)]) == BAD_SETTINGS
+    assert main([str(tmp_path)]) == BAD_CONFIG
     assert "expected one of folder=" in capsys.readouterr().err

@@ -5,7 +5,8 @@ from typing import Any
 
 import pytest
 
-from planners.command import INTERRUPTED, Failed, Stopped
+from factory.exits import INTERRUPTED
+from planners.command import Failed, Stopped
 from planners.study.figures import Curve
 from planners.study.frames_file import StudyFrames
 from planners.study.report import curves_of

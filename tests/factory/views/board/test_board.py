@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
-from factory.commands.dashboard import Request, awaited, main
-from factory.commands.export import main as export_main
+from factory.commands.dashboard import Request, awaited
+from factory.commands.table import COMMANDS
 from factory.config.arguments import Refused, parse
 from factory.graph.execute import execute
 from factory.setup.settings import assemble, load_config
@@ -26,6 +26,9 @@ from factory.views.board.watch import Watch
 from factory.views.sample_picture import encoded, nearer, sample_bev
 from factory.views.show import logged_drive
 from tests.factory.views.board.runs import EVIL, REFS, VIEW, counted, run, told
+
+main = COMMANDS["dashboard"].load()
+export_main = COMMANDS["export"].load()
 
 
 @pytest.fixture(scope="module")

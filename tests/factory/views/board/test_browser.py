@@ -9,11 +9,13 @@ from pathlib import Path
 
 import pytest
 
+from factory.commands.table import COMMANDS
 from factory.store.samples import Store
-from factory.views.board.report import main as report_main
 from factory.views.board.server import Board, Server
 from tests.factory.views.board.browser import Tab
 from tests.factory.views.board.runs import EVIL, counted, run
+
+report_main = COMMANDS["report"].load()
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 pytestmark = [

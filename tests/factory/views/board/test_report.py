@@ -8,10 +8,13 @@ from typing import Any
 
 import pytest
 
+from factory.commands.table import COMMANDS
 from factory.store.samples import Store
-from factory.views.board.report import FILE, TOLD, main
+from factory.views.board.report import FILE, TOLD
 from factory.views.board.still import N_LOOKS, N_SAMPLES
 from tests.factory.views.board.runs import EVIL, counted, run, told
+
+main = COMMANDS["report"].load()
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,110 @@
+"""`python -m factory vocabulary`: vocabularies and recovery tables out of a data set's own TRAIN logs.
+
+    python -m factory vocabulary clips=av2 clips.root=<logs> k=1024 out=vocabulary.npy
+    python -m factory vocabulary kinematic=true k=1024 out=labels.npy
+    python -m factory vocabulary clips=av2 clips.root=<logs> table=recovery.npz vocabularies=[human_8192x40x3.npy]
+
+`clips` and `clips.*` are those of `python -m factory.run`. Other keys: k=8192 and seed=0 of the vocabulary, every_s=0.5
+between the starts of windows. Each artefact has a .json with its digest and origin beside it.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from factory.config.arguments import RUN, Refused, keys_of
+from factory.config.words import nearest
+
+if TYPE_CHECKING:
+    from factory.readers.base import ClipReader
+
+
+@dataclass(frozen=True)
+class Request:
+    """What to build from the train clips."""
+
+    out: str | None = None  # a vocabulary: .npy (k, 40, 3)
+    k: int = 8192
+    seed: int = 0
+    table: str | None = None  # a recovery table: .npz
+    vocabularies: tuple[str, ...] = ()  # files whose trajectories go into the table too
+    every_s: float = 0.5  # a window starts this often
+    kinematic: bool = False  # out: k seeded trajectories, as a run without vocabulary.file has; reads no clips
+    settings: tuple[str, ...] = field(default=(), metadata=RUN)
+
+    def __post_init__(self) -> None:
+        for key, equals, _ in (word.lstrip("+").partition("=") for word in self.settings):
+            if not equals:
+                raise ValueError(f"{key!r}: expected key=value; see --help")
+            if key.partition(".")[0] != "clips":
+                raise ValueError(f"{key}: there is no such setting; see --help{nearest(key, list(keys_of(Request)))}")
+        if self.kinematic and (self.out is None or self.table is not None):
+            raise ValueError("kinematic=true makes a vocabulary: give out=<file>.npy, and no table")
+        if self.out is None and self.table is None:
+            raise ValueError("nothing to build: give out=<file>.npy, table=<file>.npz or both")
+        for name, file, suffix in (("out", self.out, ".npy"), ("table", self.table, ".npz")):
+            if file is not None and Path(file).suffix != suffix:
+                raise ValueError(f"{name}={file} must end in {suffix}")
+
+
+def main(request: Request) -> None:
+    """Write what is asked for and name it. Raises Refused, ConfigError."""
+    from factory.config.compose import build, compose
+
+    try:
+        if request.kinematic:
+            print(write_kinematic(request))
+        else:
+            print("\n".join(run(request, build(compose("run", request.settings)["clips"], "clips"))))
+    except (ValueError, OSError) as error:
+        raise Refused(str(error)) from error
+
+
+def run(request: Request, reader: "ClipReader") -> list[str]:
+    """Builds and writes what is asked for; one line of report for each artefact.
+
+    Raises ValueError where the root has no data, no train log or too few windows, or a vocabulary file is broken.
+    """
+    from factory.setup.vocabulary import (
+        build_recovery_table,
+        build_vocabulary,
+        load_vocabulary,
+        save_recovery_table,
+        save_vocabulary,
+        train_windows,
+    )
+
+    vocabularies = [load_vocabulary(file) for file in request.vocabularies]  # first: broken files fail at once
+    windows = train_windows(reader, request.every_s)
+    origin: dict[str, object] = {
+        "reader": reader.name,
+        "train_logs": list(windows.logs),
+        "train_windows": len(windows.trajectories),
+        "unreadable": windows.broken,
+    }
+    lines = []
+    if request.out is not None:
+        vocabulary = build_vocabulary(windows, request.k, request.seed)
+        save_vocabulary(request.out, vocabulary, origin | {"seed": request.seed})
+        lines.append(f"{request.out}: {len(vocabulary)} of {len(windows.trajectories)} windows, {vocabulary.digest}")
+    if request.table is not None:
+        table = build_recovery_table([windows], vocabularies)
+        files = {Path(file).name: vocabulary.digest for file, vocabulary in zip(request.vocabularies, vocabularies)}
+        save_recovery_table(request.table, table, origin | {"vocabularies": files})
+        lines.append(
+            f"{request.table}: {len(table)} trajectories, {len(windows.trajectories)} of them from "
+            f"{len(windows.logs)} train logs, {table.digest}"
+        )
+    lines += [f"unreadable {name}: {reason}" for name, reason in sorted(windows.broken.items())]
+    return lines
+
+
+def write_kinematic(request: Request) -> str:
+    """Writes the kinematic vocabulary of `k` and `seed`; a line of report."""
+    from factory.setup.vocabulary import save_vocabulary
+    from tasks.world.kinematic_vocabulary import kinematic_trajectories
+    from tasks.world.vocabulary import Vocabulary
+
+    vocabulary = Vocabulary(kinematic_trajectories(request.k, request.seed), source="kinematic")
+    save_vocabulary(str(request.out), vocabulary, {"source": "kinematic", "seed": request.seed})
+    return f"{request.out}: {len(vocabulary)} kinematic trajectories, {vocabulary.digest}"

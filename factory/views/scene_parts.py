@@ -1,0 +1,82 @@
+"""A block's scene in words, and its parts as the files of other programs."""
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from factory.stages.scene_file import BadScene, described_by, read_scene
+from tasks.render.scene.asset import RenderAsset
+from tasks.render.scene.lidar_only import plain_sky
+from tasks.render.splatting import sh
+from tasks.render.splatting.gaussians import Gaussians
+from tasks.render.splatting.ply import from_ply, to_ply
+
+
+def info_text(path: Path, asset: RenderAsset) -> str:
+    """What a scene holds, a few lines."""
+    lines = [str(path), f"digest      {asset.digest}", f"origin      {', '.join(f'{v:.2f}' for v in asset.origin)} m"]
+    if (block := asset.block) is not None:
+        x, y = (f"{low:.1f} .. {high:.1f}" for low, high in zip(block.low, block.high))
+        lines.append(f"block       {block.dataset} {block.log_id}, {block.start_s:.1f} to {block.end_s:.1f} s")
+        lines.append(f"sensors at  x {x}, y {y} m")
+    lines.append(f"background  {_counted(asset.background)}")
+    lines += [f"node        {name}: {_counted(node)}" for name, node in asset.nodes.items()]
+    held_out = f"{asset.psnr_db:.2f} dB over {asset.n_held_out} held-out photos"
+    lines.append(f"psnr        {held_out if np.isfinite(asset.psnr_db) else 'not measured'}")
+    lines += [
+        f"view        {view.camera} at {view.time_s:.2f} s: {view.psnr_db:.2f} dB, SSIM {view.ssim:.3f}"
+        f"{', held out' if view.held_out else ''}"
+        for view in asset.views
+    ]
+    return "\n".join([*lines, f"exposures   {len(asset.exposures)}"])
+
+
+def export(asset: RenderAsset, folder: Path) -> list[Path]:
+    """Writes the parts into a folder; returns their paths. Raises BadScene where a part holds NaN."""
+    folder.mkdir(parents=True, exist_ok=True)
+    files = {"background.ply": asset.background}
+    files |= {f"node-{re.sub(r'[^A-Za-z0-9._-]', '_', name)}.ply": node for name, node in asset.nodes.items()}
+    if len(files) < 1 + len(asset.nodes):
+        raise BadScene(f"track ids {', '.join(asset.nodes)}: two of them make the same file name")
+    for name, part in files.items():
+        try:
+            (folder / name).write_bytes(to_ply(part))
+        except ValueError as error:
+            raise BadScene(f"{name}: {error}") from error
+    sky = np.rint(np.clip(asset.sky.rgb, 0.0, 1.0) * 255.0).astype(np.uint8)
+    (folder / "sky.png").write_bytes(cv2.imencode(".png", cv2.cvtColor(sky, cv2.COLOR_RGB2BGR))[1].tobytes())
+    described = described_by(asset) | {"origin": asset.origin.tolist(), "digest": asset.digest, "files": list(files)}
+    (folder / "scene.json").write_text(json.dumps(described, indent=1))
+    return [folder / name for name in (*files, "sky.png", "scene.json")]
+
+
+def imported(path: Path, like: str | None = None, origin: str | None = None) -> RenderAsset:
+    """A .ply as the background of a scene of unknown quality. Raises BadScene, ValueError or OSError."""
+    try:
+        background = from_ply(path.read_bytes())
+    except ValueError as error:
+        raise BadScene(f"{path}: {error}") from error
+    if not len(background):
+        raise BadScene(f"{path}: ply: vertex: no Gaussian in it")
+    if like is not None:
+        other = read_scene(Path(like))
+        return replace(other, background=background, psnr_db=float("nan"), n_held_out=0, views=(), digest="")
+    return RenderAsset(_place(origin or "0,0,0"), background, {}, plain_sky(), float("nan"))
+
+
+def _place(text: str) -> np.ndarray:
+    try:
+        place = np.array([float(number) for number in text.split(",")])
+    except ValueError as error:
+        raise ValueError(f"origin={text}: {error}") from error
+    if place.shape != (3,) or not np.isfinite(place).all():
+        raise ValueError(f"origin={text}: expected x,y,z in metres")
+    return place
+
+
+def _counted(part: Gaussians) -> str:
+    return f"{len(part)} Gaussians, SH degree {sh.COUNTS.index(part.sh_rest.shape[1])}"
