@@ -83,7 +83,7 @@ def drive_and_judge(
 def judge(scene: Scene, plan: Plan, rollout: Rollout, pdm_plan: PdmPlan) -> Judged:
     """Score a rollout from the scene in the two-row batch [PDM-Closed, rollout]."""
     prepared = prepare_scene(scene, rollout.agents)
-    scores = score(prepared, np.stack([pdm_plan.driven, rollout.ego_states]), normalise="pairs")
+    scores = score(prepared, np.array([pdm_plan.driven, rollout.ego_states]), normalise="pairs")
     return Judged(scene, plan, rollout, scores, prepared, pdm_plan.driven)
 
 

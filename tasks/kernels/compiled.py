@@ -26,9 +26,11 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
+import numpy as np
 from numba.core.compiler import CompileResult
 from numba.core.registry import cpu_target
 from numba.core.serialize import dumps
+from numpy.typing import NDArray
 
 from tasks.caches import user_cache
 
@@ -191,6 +193,13 @@ def not_kept(error: OSError) -> str:
     """What to say where the cache folder cannot be written."""
     why = error.strerror or str(error)
     return f"compiled kernels cannot be kept in {cache_dir()} ({why}): name a folder with free space in NUMBA_CACHE_DIR"
+
+
+def read_only(array: NDArray[Any], dtype: type = np.float64) -> NDArray[Any]:
+    """A contiguous array that may not be written: one compiled kernel serves those of a shared store and others."""
+    view: NDArray[Any] = np.ascontiguousarray(array, dtype).view()
+    view.flags.writeable = False
+    return view
 
 
 def _compiled(function: F, **options: Any) -> F:

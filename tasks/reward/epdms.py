@@ -1,5 +1,7 @@
 """EPDMS: the sub-scores of ego trajectories and what they add up to (docs/reward.md 2)."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, make_dataclass, replace
 from typing import Any, Literal, get_args
 
@@ -17,17 +19,25 @@ from tasks.reward.formula import (
     weighted,
 )
 from tasks.reward.prepare import PreparedScene
-from tasks.reward.verdicts import EP, Verdicts, judge
-from tasks.subscores import INDEX, JUDGED, LABELLED, OF_ONE_PLAN
+from tasks.reward.rules.comfort import N_FLAGS
+from tasks.reward.rules.obstacles import N_TIMES, Obstacles, unindexed
+from tasks.reward.verdicts import INDEX_FROM_ROWS, NO_DRIVE, Verdicts, World, judge_all, shaped, world_of
+from tasks.subscores import INDEX, LABELLED
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Normalise = Literal["batch", "pairs"]
 _NORMALISE = get_args(Normalise)
-_FACTORS = tuple(LABELLED.index(name) for name in MULTIPLIERS)  # rows of Verdicts.scores
+_NO_BOXES, _NO_FLAGS = np.empty((0, N_TIMES, 0, 5)), np.empty((0, 0), np.bool_)
+_COLUMNS = (*LABELLED, *INDEX.values())
+_Columns: Any = make_dataclass("_Columns", [(name, Array) for name in _COLUMNS], frozen=True)
+
+# Rows of a table of scores (N_ROWS, K): the fields of Scores in their order, up to its flags
+N_ROWS = len(_COLUMNS) + 3
+_EP, _N_SCORES = LABELLED.index("ep"), len(LABELLED)
+_EP_RAW_M, _MULTIPLIER, _PDM_SCORE = range(len(_COLUMNS), N_ROWS)
+_FACTORS = tuple(LABELLED.index(name) for name in MULTIPLIERS)
 _TERMS = tuple((LABELLED.index(name), weight) for name, weight in WEIGHTS.items())
-_RULED, _INSTANTS = (*JUDGED, "ep_raw_m"), tuple(INDEX.values())
-_Columns: Any = make_dataclass("_Columns", [(name, Array) for name in (*OF_ONE_PLAN, *_INSTANTS)], frozen=True)
 
 
 @dataclass(frozen=True)
@@ -64,15 +74,46 @@ def score(
     as if alone. with_history=False leaves history comfort at 1, as the public passes over the human and PDM-Closed do.
     Raises ValueError for other shapes or non-finite states.
     """
-    return combined(judge(prepared, states, with_history=with_history), normalise)
+    obstacles = prepared.indexed_obstacles if len(states) >= INDEX_FROM_ROWS else prepared.obstacles
+    return _scored(world_of(prepared, with_history), obstacles, _NO_BOXES, _NO_FLAGS, states, _in_pairs(normalise))
 
 
-def combined(verdicts: Verdicts, normalise: Normalise = "batch") -> Scores:
-    """What verdicts on K trajectories add up to; `normalise` as in `score`."""
-    scores, fails, ego_areas, comfort = verdicts
-    ep, multiplier, pdm_score = _combined(scores, _in_pairs(normalise))
-    named = dict(zip(_RULED, scores)) | dict(zip(_INSTANTS, fails))
-    return Scores(ep=ep, multiplier=multiplier, pdm_score=pdm_score, ego_areas=ego_areas, comfort=comfort, **named)
+def score_among(
+    prepared: PreparedScene, boxes: Array, is_stopped: Bools, collision_score: Array, states: Array
+) -> Scores:
+    """The same in pairs where every trajectory meets its own objects, those of the scene set aside.
+
+    boxes: (K, 41, N, 5), NaN when absent; is_stopped: (K, N) and collision_score: (N,) as in Obstacles; states:
+    (K, 41, 11). Raises ValueError for other shapes, non-finite states.
+    """
+    n_objects = len(collision_score)
+    if boxes.shape != (len(states), N_TIMES, n_objects, 5) or is_stopped.shape != (len(states), n_objects):
+        raise ValueError(
+            f"boxes must be ({len(states)}, {N_TIMES}, {n_objects}, 5) and is_stopped ({len(states)}, {n_objects}), "
+            f"got {boxes.shape} and {is_stopped.shape}"
+        )
+    nobody = unindexed(np.full((N_TIMES, n_objects, 5), np.nan), np.zeros(n_objects, np.bool_), collision_score)
+    boxes, is_stopped = np.require(boxes, None, ["C", "W"]), np.require(is_stopped, None, ["C", "W"])
+    return _scored(world_of(prepared, with_history=True), nobody, boxes, is_stopped, states, True)
+
+
+def joined(parts: Sequence[Scores], normalise: Normalise) -> Scores:
+    """The rows of all parts, their progress related anew; `normalise` as in `score`."""
+    *numbers, areas, comfort = (np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Scores))
+    table = np.stack(numbers)
+    _add_up(table, _in_pairs(normalise))
+    return Scores(*[*table, areas, comfort])
+
+
+def _scored(
+    world: World, obstacles: Obstacles, boxes: Array, is_stopped: Bools, states: Array, in_pairs: bool
+) -> Scores:
+    states = shaped(states)
+    table = np.empty((N_ROWS, len(states)))
+    areas, comfort = np.empty((len(states), N_TIMES, 3), np.bool_), np.empty((len(states), N_FLAGS), np.bool_)
+    if not _score_all(world, obstacles, boxes, is_stopped, states, in_pairs, table, areas, comfort):
+        raise ValueError(NO_DRIVE)
+    return Scores(*[*table, areas, comfort])
 
 
 def relative_progress(ep_raw_m: Array, multiplier: Array, normalise: Normalise) -> Array:
@@ -115,18 +156,40 @@ def rows(scores: Scores, index: slice | NDArray[np.integer] | NDArray[np.bool_])
 
 
 @kernel
-def _combined(scores: Array, in_pairs: bool) -> tuple[Array, Array, Array]:
-    """EP, multiplier and PDM score (K,) of Verdicts.scores.
+def _score_all(
+    world: World,
+    obstacles: Obstacles,
+    boxes: Array,
+    is_stopped: Bools,
+    states: Array,
+    in_pairs: bool,
+    table: Array,
+    areas: Bools,
+    comfort: Bools,
+) -> bool:
+    """As `judge_all`, and the sums. One call: on two trajectories entering it takes as long as the rules."""
+    table[:] = math.nan  # what no rule says
+    out = Verdicts(table[:_N_SCORES], table[_N_SCORES:_EP_RAW_M], table[_EP_RAW_M], areas, comfort)
+    well = judge_all(world, obstacles, boxes, is_stopped, states, out)
+    if well:
+        _add_up(table, in_pairs)
+    return well
 
-    One call: on two trajectories, numpy's dozen take longer than the rules.
-    """
-    multiplier, total = np.ones(scores.shape[1]), np.zeros(scores.shape[1])
-    for row in _FACTORS:
-        multiplier *= scores[row]
-    ep = _relative(scores[EP], multiplier, in_pairs)
-    for row, weight in _TERMS:
-        total += weight * (ep if row == EP else scores[row])
-    return ep, multiplier, multiplier * total / TOTAL_WEIGHT
+
+@kernel
+def _add_up(table: Array, in_pairs: bool) -> None:
+    """EP, multiplier and PDM score of a table (N_ROWS, K) from its other rows."""
+    for k in range(table.shape[1]):
+        multiplier = 1.0
+        for row in _FACTORS:
+            multiplier *= table[row, k]
+        table[_MULTIPLIER, k] = multiplier
+    table[_EP] = _relative(table[_EP_RAW_M], table[_MULTIPLIER], in_pairs)
+    for k in range(table.shape[1]):
+        total = 0.0
+        for row, weight in _TERMS:
+            total += weight * table[row, k]
+        table[_PDM_SCORE, k] = table[_MULTIPLIER, k] * total / TOTAL_WEIGHT
 
 
 @kernel

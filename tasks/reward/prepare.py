@@ -8,15 +8,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tasks.kernels.compiled import read_only
 from tasks.reward.rules.centerline import Centerline, index_centerline
 from tasks.reward.rules.comfort import comfort_history
-from tasks.reward.rules.lights import RedLanes, index_red_lanes
+from tasks.reward.rules.lights import NEVER_RED, RedLanes, index_red_lanes
 from tasks.reward.rules.map_index import MapIndex, index_map
-from tasks.reward.rules.obstacles import Obstacles, index_obstacles, unindexed
-from tasks.world.agents import MOVING_KINDS, AgentTracks
+from tasks.reward.rules.obstacles import N_TIMES, Obstacles, index_obstacles, lay_out
+from tasks.world.agents import MOVING_KINDS, AgentKind, AgentTracks
 from tasks.world.bounds import LARGEST, all_within
-from tasks.world.boxes import ego_boxes, touching
-from tasks.world.clip import HORIZON_STEPS, Clip, Scene
+from tasks.world.boxes import ego_boxes
+from tasks.world.clip import Clip, Scene
 from tasks.world.lanes import LightState, MapLayer, MapPolygon
 from tasks.world.polygons import polygons_near
 from tasks.world.vehicle import EGO_STATE_SIZE, PACIFICA, Vehicle
@@ -24,9 +25,8 @@ from tasks.world.vehicle import EGO_STATE_SIZE, PACIFICA, Vehicle
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-N_TIMES = HORIZON_STEPS + 1
 PAST_STEPS = (0, 5, 10, 15)  # of the 1.5 s history at 10 Hz: -1.5, -1.0, -0.5, 0 s
-STOPPED_SPEED_MPS = 0.05
+_NOBODY = read_only(np.full(5, np.nan))
 LANE_LAYERS = frozenset({MapLayer.LANE, MapLayer.LANE_CONNECTOR})
 
 
@@ -95,17 +95,16 @@ def prepare(
         _check_states("past_states", past_states, (len(PAST_STEPS), EGO_STATE_SIZE))
     if ego_state0 is not None:
         _check_states("ego_state0", ego_state0, (EGO_STATE_SIZE,))
-    _check_objects(objects)
     if ego_state0 is None and past_states is not None:
         ego_state0 = past_states[-1]
     if ego_state0 is None and drop_touching:
         raise ValueError("drop_touching needs ego_state0 or past_states")
     return PreparedScene(
         vehicle=vehicle,
-        history=None if past_states is None else comfort_history(past_states),
+        history=None if past_states is None else comfort_history(read_only(past_states)),
         centerline=_indexed_line(np.shape(centerline), np.ascontiguousarray(centerline, np.float64).tobytes()),
         map_index=_indexed_map(tuple(polygons), route_lane_ids),
-        obstacles=_obstacles(objects.window(0, N_TIMES), ego_state0 if drop_touching else None, vehicle),
+        obstacles=_obstacles(objects, ego_state0 if drop_touching else None, vehicle),
         red_lanes=_red(red_lanes, polygons),
     )
 
@@ -126,7 +125,6 @@ def prepare_scene(
         objects=agents,
         red_lanes=_red_connectors(clip, scene.step),
         vehicle=vehicle,
-        ego_state0=scene.ego_state,
         drop_touching=drop_touching,
     )
 
@@ -137,8 +135,7 @@ def among(prepared: PreparedScene, objects: AgentTracks, ego_state0: Array | Non
     Those that touch the ego at `ego_state0` (11,) are left out for good; None: nobody is. Raises ValueError for tracks
     of other shapes.
     """
-    _check_objects(objects)
-    return replace(prepared, obstacles=_obstacles(objects.window(0, N_TIMES), ego_state0, prepared.vehicle))
+    return replace(prepared, obstacles=_obstacles(objects, ego_state0, prepared.vehicle))
 
 
 def _red_connectors(clip: Clip, step: int) -> tuple[tuple[str, ...], Bools]:
@@ -162,66 +159,48 @@ def _check_states(name: str, states: Array, shape: tuple[int, ...]) -> None:
         raise ValueError(f"{name} must be finite and at most {LARGEST:g}, it holds NaN, infinity or more")
 
 
-def _check_objects(objects: AgentTracks) -> None:
+def _obstacles(objects: AgentTracks, ego_state0: Array | None, vehicle: Vehicle) -> Obstacles:
+    """The objects but those that touch an ego at `ego_state0`. Raises ValueError where they are none."""
     if objects.n_steps < N_TIMES:
         raise ValueError(f"objects must span at least {N_TIMES} steps, got {objects.n_steps}")
     shape = (objects.n_steps, len(objects))
-    wanted = {"valid": shape, "boxes": (*shape, 5), "velocities": (*shape, 2)}
-    for name, expected in wanted.items():
+    for name, wanted in (("valid", shape), ("boxes", (*shape, 5)), ("velocities", (*shape, 2))):
         found = getattr(objects, name).shape
-        if found != expected:
-            raise ValueError(f"objects.{name} must be {expected} for {len(objects)} objects, got {found}")
+        if found != wanted:
+            raise ValueError(f"objects.{name} must be {wanted} for {len(objects)} objects, got {found}")
     if len(objects.kinds) != len(objects):
         raise ValueError(f"objects.kinds must name {len(objects)} objects, got {len(objects.kinds)}")
-    there = objects.valid.astype(bool)
-    boxes, velocities = np.abs(objects.boxes) <= LARGEST, np.abs(objects.velocities) <= LARGEST
-    if not ((_every(boxes) & _every(velocities)) | ~there).all() or (objects.boxes[..., 3:] < 0.0).any():
-        _refuse_objects(objects, ~there | np.isnan(objects.boxes).any(axis=-1))
+    all_well, obstacles = lay_out(
+        read_only(objects.boxes),
+        read_only(objects.velocities),
+        read_only(objects.valid, np.bool_),
+        collision_scores(objects.kinds),
+        _NOBODY if ego_state0 is None else read_only(ego_boxes(ego_state0, vehicle)),
+    )
+    if not all_well:
+        raise _refused(objects)
+    return obstacles
 
 
-def _every(columns: Bools) -> Bools:
-    """(...,) whether all of a few columns (..., C) hold: numpy's `all` is slow on so short an axis."""
-    every: Bools = columns[..., 0].copy()
-    for column in range(1, columns.shape[-1]):
-        every &= columns[..., column]
-    return every
-
-
-def _refuse_objects(objects: AgentTracks, absent: Bools) -> None:
-    """Raises ValueError for the first object that is there and not well, if any is."""
+def _refused(objects: AgentTracks) -> ValueError:
+    """The error that names the first object that is there and not well."""
+    there = objects.valid.astype(bool) & ~np.isnan(objects.boxes).any(axis=-1)
     wrong = {
         "boxes": ~(np.abs(objects.boxes) <= LARGEST).all(axis=-1) | (objects.boxes[..., 3:] < 0.0).any(axis=-1),
         "velocities": ~(np.abs(objects.velocities) <= LARGEST).all(axis=-1),
     }
-    for name, where in wrong.items():
-        if (where & ~absent).any():
-            step, i = np.argwhere(where & ~absent)[0]
-            raise ValueError(
-                f"objects.{name} of {objects.track_ids[i]} at step {step} are {getattr(objects, name)[step, i]}: they "
-                f"must be finite, at most {LARGEST:g}, sizes not negative; where it is absent its box is NaN"
-            )
+    name = next(name for name, where in wrong.items() if (where & there).any())
+    step, i = np.argwhere(wrong[name] & there)[0]
+    return ValueError(
+        f"objects.{name} of {objects.track_ids[i]} at step {step} are {getattr(objects, name)[step, i]}: they "
+        f"must be finite, at most {LARGEST:g}, sizes not negative; where it is absent its box is NaN"
+    )
 
 
-def _obstacles(objects: AgentTracks, ego_state0: Array | None, vehicle: Vehicle) -> Obstacles:
-    present = objects.valid & _every(np.isfinite(objects.boxes))
-    boxes = np.where(present[..., None], objects.boxes, np.nan)
-    keep = present.any(axis=0)
-    if ego_state0 is not None:
-        keep &= ~touching(ego_boxes(ego_state0, vehicle), boxes[0])
-    is_stopped, collision_score = liability(objects)
-    return unindexed(boxes[:, keep], is_stopped[keep], collision_score[keep])
-
-
-def liability(objects: AgentTracks) -> tuple[Bools, Array]:
-    """Whether each object counts as stopped (N,), and what an at-fault collision with it leaves of NC (N,).
-
-    Velocity and class are those of the first appearance, as in the public observation (docs/reward.md 2).
-    """
-    first_seen = objects.valid.argmax(axis=0)
-    velocity = objects.velocities[first_seen, np.arange(len(objects))]
-    is_agent = np.array([kind in MOVING_KINDS for kind in objects.kinds], dtype=bool)
-    is_stopped = ~is_agent | (np.hypot(velocity[:, 0], velocity[:, 1]) <= STOPPED_SPEED_MPS)
-    return is_stopped, np.where(is_agent, 0.0, 0.5)
+@lru_cache(maxsize=4)
+def collision_scores(kinds: tuple[AgentKind, ...]) -> Array:
+    """What an at-fault collision with each of N objects leaves of NC (N,): 0 for road users. Not to be written to."""
+    return read_only(np.array([0.0 if kind in MOVING_KINDS else 0.5 for kind in kinds]))
 
 
 def _red(red_lanes: tuple[str, ...] | tuple[tuple[str, ...], Bools], polygons: Sequence[MapPolygon]) -> RedLanes:
@@ -233,6 +212,8 @@ def _red(red_lanes: tuple[str, ...] | tuple[tuple[str, ...], Bools], polygons: S
         raise ValueError(f"the mask of red lanes must be ({N_TIMES}, {len(lane_ids)}), got {is_red.shape}")
     if is_red.dtype != np.bool_:
         raise ValueError(f"the mask of red lanes must be bool, got {is_red.dtype}")
+    if not lane_ids:  # the usual case, and half the cost of preparing a pair's lights
+        return NEVER_RED
     lanes = {polygon.token: polygon for polygon in polygons if polygon.layer in LANE_LAYERS}
     columns = [i for i, lane_id in enumerate(lane_ids) if lane_id in lanes and is_red[:, i].any()]
     return index_red_lanes([lanes[lane_ids[i]] for i in columns], is_red[:, columns])

@@ -3,9 +3,10 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.reward.epdms import Scores, combined
-from tasks.reward.prepare import STOPPED_SPEED_MPS, liability, prepare_scene
-from tasks.reward.verdicts import Verdicts, checked_states, judge_among
+from tasks.reward.epdms import Scores, joined, score_among
+from tasks.reward.prepare import collision_scores, prepare_scene
+from tasks.reward.rules.obstacles import STOPPED_SPEED_MPS
+from tasks.reward.verdicts import checked_states
 from tasks.rollout.simulate import Rollouts, TrafficSettings, prepare_traffic, roll_out_many
 from tasks.world.boxes import ego_boxes, touching
 from tasks.world.clip import HORIZON_STEPS, Scene
@@ -28,7 +29,7 @@ def reactive_scores(scene: Scene, states: Array, traffic: TrafficSettings) -> Sc
     ready = prepare_traffic(scene, traffic)
     now = scene.agents.window(scene.step, scene.step + HORIZON_STEPS + 1)
     prepared = prepare_scene(scene, now)
-    _, collision_score = liability(now)
+    collision_score = collision_scores(now.kinds)
     is_agent = collision_score == 0.0
     keep = ~(now.valid[0] & touching(ego_boxes(scene.ego_state, PACIFICA), now.boxes[0]))
     parts = []
@@ -36,9 +37,8 @@ def reactive_scores(scene: Scene, states: Array, traffic: TrafficSettings) -> Sc
         egos = states[start : start + EGOS_AT_ONCE]
         rollouts = roll_out_many(ready, egos)
         stopped = _stopped_when_first_seen(rollouts) | ~is_agent
-        parts.append(judge_among(prepared, rollouts.boxes[:, :, keep], stopped[:, keep], collision_score[keep], egos))
-    every = Verdicts._make([np.concatenate(columns, axis) for columns, axis in zip(zip(*parts), (1, 1, 0, 0))])
-    return combined(every, "pairs")
+        parts.append(score_among(prepared, rollouts.boxes[:, :, keep], stopped[:, keep], collision_score[keep], egos))
+    return joined(parts, "pairs")
 
 
 def _stopped_when_first_seen(rollouts: Rollouts) -> Bools:

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tasks.kernels.compiled import inlined, kernel
+from tasks.kernels.compiled import inlined, kernel, read_only
 from tasks.kernels.trig import sincos, wrap
 from tasks.rollout.bicycle import actuate, path_curvature, travel
 from tasks.rollout.profiles import TRACKING_STEPS, Plans, empty_plans, fit_curvatures, fit_speeds
@@ -113,7 +113,7 @@ def _shaped(name: str, value: Array, shape: tuple[int, ...]) -> Array:
 def _followed(ego: Array, starts: Array, name: str, plans: Array, local: bool, vehicle: Vehicle) -> Array:
     """The simulated states; `name` is what the caller calls its plans."""
     states = np.empty((len(plans), HORIZON_STEPS + 1, EGO_STATE_SIZE))
-    given = _read_only(ego), _read_only(starts), _read_only(plans)
+    given = read_only(ego), read_only(starts), read_only(plans)
     if not _follow(*given, local, float(vehicle.wheel_base), states):
         for what, array in (("ego_state0", ego), (name, plans), ("planned_pose0", starts)):
             beyond = np.argwhere(~(np.abs(array) <= LARGEST))
@@ -121,13 +121,6 @@ def _followed(ego: Array, starts: Array, name: str, plans: Array, local: bool, v
                 at = beyond[0].tolist()
                 raise ValueError(f"{what} must be finite and at most {LARGEST:g}, element {at} is not")
     return states
-
-
-def _read_only(array: Array) -> Array:
-    """A view that may not be written: one compiled kernel serves arrays of both kinds."""
-    view = array.view()
-    view.flags.writeable = False
-    return view
 
 
 @kernel

@@ -11,18 +11,12 @@ from tasks.world.vehicle import HEADING, Vehicle, X, Y
 
 def ego_boxes(states: Array, vehicle: Vehicle) -> Array:
     """The ego's body (..., 5) at states (..., 11); the state's pose is the rear axle."""
-    heading = states[..., HEADING]
-    shift = vehicle.rear_axle_to_center
-    return np.stack(
-        [
-            states[..., X] + shift * np.cos(heading),
-            states[..., Y] + shift * np.sin(heading),
-            heading,
-            np.full(heading.shape, vehicle.length),
-            np.full(heading.shape, vehicle.width),
-        ],
-        axis=-1,
-    )
+    heading, shift = states[..., HEADING], vehicle.rear_axle_to_center
+    boxes = np.empty((*heading.shape, 5))
+    boxes[..., 0] = states[..., X] + shift * np.cos(heading)
+    boxes[..., 1] = states[..., Y] + shift * np.sin(heading)
+    boxes[..., 2], boxes[..., 3], boxes[..., 4] = heading, vehicle.length, vehicle.width
+    return boxes
 
 
 def touching(first: Array, second: Array) -> Bools:

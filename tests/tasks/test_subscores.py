@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tasks.reward import verdicts
-from tasks.reward.epdms import score
+from tasks.reward import epdms
+from tasks.reward.epdms import N_ROWS, score
 from tasks.reward.formula import MULTIPLIERS, WEIGHTS
 from tasks.subscores import HALVES, LABELLED, RECORDS, SUBSCORES, WHOLES
 from tests.tasks.reward.straight_street import drive, street
@@ -65,10 +65,10 @@ def test_orders_and_bits_are_those_that_were_written() -> None:
 
 
 def test_a_record_without_a_rule_is_no_score(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(verdicts, "LABELLED", (*LABELLED, "new"))
-    found = verdicts.judge(street(), drive(8.0))
-    assert np.isnan(found.scores[-1]).all() and np.isfinite(found.scores[:-1]).all()
-    assert score(street(), drive(8.0)).pdm_score[0] == 1.0
+    monkeypatch.setattr(epdms, "N_ROWS", N_ROWS + 1)
+    monkeypatch.setattr(epdms, "Scores", lambda *columns: columns)
+    *known, new, _, _ = score(street(), drive(8.0))  # type: ignore[misc]
+    assert np.isnan(new).all() and not np.isnan(known).any()
 
 
 @pytest.mark.slow

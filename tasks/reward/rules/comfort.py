@@ -53,19 +53,23 @@ N_FLAGS = 6
 _SCRATCH_ROWS = N_FLAGS + 4
 
 
+@kernel
 def comfort_history(past_states: Array) -> Array:
     """Ego states (14, 11) at -1.5, -1.4 .. -0.2 s, interpolated linearly between states (4, 11) at 2 Hz.
 
     Rates of yaw and steering are not part of the public interpolation and are 0.
     """
     past = past_states.copy()
-    past[:, HEADING] = np.unwrap(past[:, HEADING])
+    heading = past[:, HEADING].copy()
+    unwrap(heading)
+    past[:, HEADING] = heading
     past[:, STEERING + 1 :] = 0.0
-    position = np.arange(HISTORY_ROWS) / PAST_PERIOD_STEPS
-    before = position.astype(np.int64)
-    share = (position - before)[:, None]
-    rows: Array = past[before] + share * (past[np.minimum(before + 1, len(past) - 1)] - past[before])
-    assert rows.shape == (HISTORY_ROWS, EGO_STATE_SIZE)
+    rows = np.empty((HISTORY_ROWS, EGO_STATE_SIZE))
+    for row in range(HISTORY_ROWS):
+        before = row // PAST_PERIOD_STEPS
+        share, after = row / PAST_PERIOD_STEPS - before, min(before + 1, len(past) - 1)
+        for column in range(EGO_STATE_SIZE):
+            rows[row, column] = past[before, column] + share * (past[after, column] - past[before, column])
     return rows
 
 

@@ -26,6 +26,9 @@ class RedLanes(NamedTuple):
     edges: Array  # (4, E) start x, start y, end x, end y [m]
 
 
+NEVER_RED = RedLanes(np.empty((0, 0), np.bool_), np.empty((0, 4)), np.zeros(1, np.int64), np.empty((4, 0)))
+
+
 def index_red_lanes(polygons: Sequence[MapPolygon], is_red: Bools) -> RedLanes:
     """Lanes laid out for `first_red`; is_red: (T, L) whether each of the L polygons is red at each instant.
 
@@ -34,8 +37,8 @@ def index_red_lanes(polygons: Sequence[MapPolygon], is_red: Bools) -> RedLanes:
     if is_red.ndim != 2 or is_red.shape[1] != len(polygons):
         raise ValueError(f"the mask of red lanes must be (T, {len(polygons)}), got {is_red.shape}")
     columns = np.flatnonzero(is_red.any(axis=0)).tolist()
-    if not columns:  # the usual case, and half the cost of preparing a pair's lights
-        return RedLanes(np.empty((len(is_red), 0), np.bool_), np.empty((0, 4)), np.zeros(1, np.int64), np.empty((4, 0)))
+    if not columns:
+        return NEVER_RED
     edges, first, owner = outlines([polygons[i] for i in columns])
     lane = np.repeat(owner, np.diff(first))
     bounds = [[*edges[lane == i, :2].min(axis=0), *edges[lane == i, :2].max(axis=0)] for i in range(len(columns))]

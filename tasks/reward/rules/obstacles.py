@@ -12,13 +12,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.kernels.compiled import kernel
-from tasks.reward.rules.overlap import ROUNDING_M, Box
+from tasks.kernels.compiled import inlined, kernel
+from tasks.reward.rules.overlap import ROUNDING_M, Box, touching
+from tasks.world.bounds import LARGEST
+from tasks.world.clip import HORIZON_STEPS
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int32]
 
+N_TIMES = HORIZON_STEPS + 1
+STOPPED_SPEED_MPS = 0.05
 CELLS_PER_SIDE = 64  # a power of two
 SMALLEST_CELL_M = 2.0
 ENTRIES_PER_BOX = 128  # bounds the index: cells grow until no more are expected on average
@@ -30,6 +34,7 @@ class Obstacles(NamedTuple):
     boxes: Array  # (T, N, 5) centre x, y [m], heading [rad], length, width [m]; NaN when absent
     is_stopped: Bools  # (N,) no road user, or at most 0.05 m/s when first seen
     collision_score: Array  # (N,) what an at-fault collision leaves of NC: 0 for road users, else 0.5
+    spans: Array  # (N, 5) of unindexed objects, see spans_of; (0, 5) of indexed ones
     axes: Array  # (T, N, 2) cos, sin of the headings; (0, N, 2): worked out where needed
     starts: Ints  # (T x cells + 1,) items[starts[c]:starts[c + 1]] are the objects of cell c, times outermost
     items: Ints  # (E,)
@@ -45,7 +50,7 @@ def index_obstacles(boxes: Array, is_stopped: Bools, collision_score: Array, ego
     if not 0.0 < ego_circumradius_m < math.inf:
         raise ValueError(f"ego_circumradius_m must be a positive length in metres, got {ego_circumradius_m}")
     plain = unindexed(boxes, is_stopped, collision_score)
-    obstacles = plain._replace(axes=_axes(plain.boxes), cells_per_side=CELLS_PER_SIDE)
+    obstacles = plain._replace(spans=plain.spans[:0], axes=_axes(plain.boxes), cells_per_side=CELLS_PER_SIDE)
     obstacles = obstacles._replace(cells_per_m=_cells_per_m(obstacles, ego_circumradius_m))
     starts, items = _index(obstacles, ego_circumradius_m)
     return obstacles._replace(starts=starts, items=items)
@@ -64,16 +69,78 @@ def unindexed(boxes: Array, is_stopped: Bools, collision_score: Array) -> Obstac
             f"is_stopped and collision_score must be ({n_items},) as boxes has {n_items} objects, "
             f"got {is_stopped.shape} and {collision_score.shape}"
         )
-    return Obstacles(
-        boxes=np.ascontiguousarray(boxes, dtype=np.float64),
-        is_stopped=np.ascontiguousarray(is_stopped, dtype=np.bool_),
-        collision_score=np.ascontiguousarray(collision_score, dtype=np.float64),
-        axes=np.empty((0, n_items, 2)),
-        starts=np.array([0, n_items], dtype=np.int32),
-        items=np.arange(n_items, dtype=np.int32),
-        cells_per_side=1,
-        cells_per_m=0.0,
+    return _plain(
+        np.ascontiguousarray(boxes, dtype=np.float64),
+        np.ascontiguousarray(is_stopped, dtype=np.bool_),
+        np.ascontiguousarray(collision_score, dtype=np.float64),
     )
+
+
+@kernel
+def _plain(boxes: Array, is_stopped: Bools, collision_score: Array) -> Obstacles:
+    starts = np.zeros(2, np.int32)
+    starts[1] = len(is_stopped)
+    axes, items = np.empty((0, len(is_stopped), 2)), np.arange(len(is_stopped)).astype(np.int32)
+    return Obstacles(boxes, is_stopped, collision_score, spans_of(boxes), axes, starts, items, 1, 0.0)
+
+
+@kernel
+def lay_out(
+    boxes: Array, velocities: Array, valid: Bools, collision_score: Array, ego_box: Array
+) -> tuple[bool, Obstacles]:
+    """The unindexed obstacles that tracks of N objects are over their first 41 steps; False where one is not well.
+
+    boxes (S >= 41, N, 5), velocities (S, N, 2) and valid (S, N) as in AgentTracks; collision_score: (N,). Left out for
+    good is who is never there, and who touches the ego's box (5,) at first (one of NaN: nobody). Not well is who is
+    there with a size below zero or a number that is infinite or above LARGEST; with a NaN in the box it is not there.
+    Whether it stands its velocity at its first appearance says (docs/reward.md 2).
+    """
+    first_seen, column, n_kept = np.full(valid.shape[1], -1), np.full(valid.shape[1], -1), 0
+    for t in range(N_TIMES - 1, -1, -1):
+        for i in range(valid.shape[1]):
+            first_seen[i] = t if valid[t, i] else first_seen[i]
+    ego = _box(ego_box)
+    for i in range(valid.shape[1]):
+        if first_seen[i] > 0 or (first_seen[i] == 0 and not touching(ego, _box(boxes[0, i]))):
+            column[i] = n_kept
+            n_kept += 1
+    met, n_wrong = np.full((N_TIMES, n_kept, 5), np.nan), 0
+    for t in range(valid.shape[0]):
+        for i in range(valid.shape[1]):
+            if valid[t, i] and _is_known(boxes, t, i):
+                n_wrong += not _is_well(boxes, velocities, t, i)
+                if t < N_TIMES and column[i] >= 0:
+                    for c in range(5):
+                        met[t, column[i], c] = boxes[t, i, c]
+    kept = np.flatnonzero(column >= 0)
+    is_stopped, score = np.empty(n_kept, np.bool_), collision_score[kept]
+    for k in range(n_kept):
+        vx, vy = velocities[first_seen[kept[k]], kept[k]]
+        is_stopped[k] = score[k] > 0.0 or np.hypot(vx, vy) <= STOPPED_SPEED_MPS
+    return n_wrong == 0, _plain(met, is_stopped, score)
+
+
+@inlined
+def _is_known(boxes: Array, t: int, i: int) -> bool:
+    """Whether no number of a box is NaN."""
+    return not math.isnan(
+        abs(boxes[t, i, 0]) + abs(boxes[t, i, 1]) + abs(boxes[t, i, 2]) + abs(boxes[t, i, 3]) + abs(boxes[t, i, 4])
+    )
+
+
+@inlined
+def _is_well(boxes: Array, velocities: Array, t: int, i: int) -> bool:
+    """Whether an object's numbers are finite and at most LARGEST, and its sizes not negative."""
+    well = (boxes[t, i, 3] >= 0.0) & (boxes[t, i, 4] >= 0.0)
+    for c in range(5):
+        well &= abs(boxes[t, i, c]) <= LARGEST
+    return well & (abs(velocities[t, i, 0]) <= LARGEST) & (abs(velocities[t, i, 1]) <= LARGEST)
+
+
+@kernel
+def _box(box: Array) -> Box:
+    x, y, heading, length, width = box
+    return Box(x, y, heading, math.cos(heading), math.sin(heading), length, width)
 
 
 @kernel
@@ -83,6 +150,7 @@ def with_objects(obstacles: Obstacles, boxes: Array, is_stopped: Bools) -> Obsta
         boxes,
         is_stopped,
         obstacles.collision_score,
+        spans_of(boxes),
         obstacles.axes,
         obstacles.starts,
         obstacles.items,
@@ -92,13 +160,12 @@ def with_objects(obstacles: Obstacles, boxes: Array, is_stopped: Bools) -> Obsta
 
 
 @kernel
-def spans_of(obstacles: Obstacles) -> Array:
-    """(N, 5) of unindexed objects: least x, y, most x, y of the centre at any time [m], largest diagonal squared [m^2].
+def spans_of(boxes: Array) -> Array:
+    """(N, 5) of boxes (T, N, 5): least x, y, most x, y of the centre at any time [m], largest diagonal squared [m^2].
 
-    An object that is never there has a least above its most. None (0, 5) for indexed objects.
+    An object that is never there has a least above its most.
     """
-    boxes = obstacles.boxes
-    n_items = boxes.shape[1] if obstacles.cells_per_side == 1 else 0
+    n_items = boxes.shape[1]
     spans = np.empty((n_items, 5))
     for item in range(n_items):
         spans[item, 0], spans[item, 1], spans[item, 2] = math.inf, math.inf, -math.inf
@@ -118,14 +185,15 @@ def spans_of(obstacles: Obstacles) -> Array:
 
 @kernel
 def within_reach(
-    obstacles: Obstacles, spans: Array, path: tuple[float, float, float, float], length: float, width: float
+    obstacles: Obstacles, path: tuple[float, float, float, float], length: float, width: float
 ) -> Obstacles:
     """Unindexed objects without those that are out of reach all along a path; indexed ones as they are.
 
-    spans: see spans_of; path: least x, y, most x, y of the centres [m] of an ego body of that length and width [m].
+    path: least x, y, most x, y of the centres [m] of an ego body of that length and width [m].
     """
     if obstacles.cells_per_side > 1:
         return obstacles
+    spans = obstacles.spans
     items = np.empty(len(spans), np.int32)
     n = 0
     for item in range(len(spans)):
@@ -145,6 +213,7 @@ def within_reach(
         obstacles.boxes,
         obstacles.is_stopped,
         obstacles.collision_score,
+        spans,
         obstacles.axes,
         starts,
         items[:n],

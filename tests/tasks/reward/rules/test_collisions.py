@@ -53,6 +53,20 @@ def test_a_car_ahead_that_drives_on_is_no_ttc_violation_and_one_that_stands_is()
     assert score(street([replace(ahead, velocity=(0.0, 0.0))]), drive(8.0)).ttc_index[0] == 0.0
 
 
+def test_who_touches_the_ego_at_first_is_left_out_for_good_and_nobody_else() -> None:
+    """Driving on into a thing is the ego's fault, unless they touched before the drive began."""
+    contact = FRONT + 2.0
+    for ahead_m, nc in ((contact - 0.1, 1.0), (contact + 0.1, 0.0)):
+        assert score(street([Thing(ahead_m, 0.0)]), drive(8.0)).nc[0] == nc
+
+
+def test_what_stands_when_it_is_first_seen_counts_as_standing() -> None:
+    """Half a second in, something is behind the ego and touches it: only what stands is the ego's fault there."""
+    for speed_mps, nc in ((0.0, 0.0), (1.0, 1.0)):
+        behind = Thing(-1.9 - 0.5 * speed_mps, 0.0, velocity=(speed_mps, 0.0), first=5)
+        assert score(street([behind]), drive(2.0)).nc[0] == nc
+
+
 def test_a_chaser_may_count_as_ahead_because_bearings_start_at_the_unprojected_ego():
     scores = score(street([Thing(-15.0, 0.0, 0.0, (12.0, 0.0))]), drive(5.0))
     assert scores.nc[0] == 1.0 and scores.ttc[0] == 0.0  # as the public metric does

@@ -14,7 +14,6 @@ from tasks.reward.rules.obstacles import (
     Obstacles,
     cell_of,
     index_obstacles,
-    spans_of,
     unindexed,
     within_reach,
 )
@@ -100,13 +99,13 @@ def test_objects_left_out_along_a_path_are_those_that_nothing_on_it_touches() ->
     boxes[:, 4, 1] = 30.0  # aside
     boxes[:40, 6] = np.nan  # there at the last step alone
     plain = unindexed(boxes, np.zeros(7, dtype=bool), np.zeros(7))
-    near = within_reach(plain, spans_of(plain), (0.0, 0.0, 40.0, 0.0), *EGO_SIZE)
+    near = within_reach(plain, (0.0, 0.0, 40.0, 0.0), *EGO_SIZE)
     kept = near.items[near.starts[0] : near.starts[1]].tolist()
     assert kept == [0, 1, 2, 6]
     touched = [i for i in range(7) if any(touching(np.array([40.0, 0.0, 0.0, *EGO_SIZE]), box) for box in boxes[:, i])]
     assert touched == [2, 6]  # from the path's end
     everywhere = indexed(boxes)
-    met = within_reach(everywhere, spans_of(everywhere), (0.0, 0.0, 1.0, 1.0), *EGO_SIZE)
+    met = within_reach(everywhere, (0.0, 0.0, 1.0, 1.0), *EGO_SIZE)
     assert np.array_equal(met.items, everywhere.items)
     assert np.array_equal(met.starts, everywhere.starts)
 
