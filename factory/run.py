@@ -16,8 +16,10 @@ from contextlib import nullcontext
 from itertools import zip_longest
 from typing import TYPE_CHECKING
 
-from factory.config.compose import ConfigError, compose, conf_dir
+from factory.config.compose import ConfigError, conf_dir
 from factory.config.plugins import choices
+from factory.config.run import RunConfig, composed_run, load_config, refuse_missing_root, shapes_in
+from factory.config.shapes import defaults_of, described
 from factory.config.words import Asked, asked_of
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, as_program
 from factory.store.room import NoRoom
@@ -25,7 +27,6 @@ from factory.store.usable import why_unusable
 
 if TYPE_CHECKING:
     from factory.readers.base import ClipRef
-    from factory.setup.settings import RunConfig
 
 
 def main(argv: Sequence[str], only_plan: bool = False) -> int:
@@ -62,23 +63,22 @@ def dealt(refs: Sequence["ClipRef"], hands: int) -> list["ClipRef"]:
 
 
 def help_text() -> str:
-    """Usage, the keys of conf/run.yaml with their comments, and the choices of every group, plug-ins among them.
+    """Usage, the run's keys with their defaults and meanings, and the choices of every group, plug-ins among them.
 
     Imports nothing heavy.
     """
     folder = conf_dir()
     groups = sorted(path.name for path in folder.iterdir() if path.is_dir())
     listed = "\n".join(f"  {group}: {', '.join(choices(group, [folder]))}" for group in groups)
-    keys = (folder / "run.yaml").read_text().split("_self_", 1)[1].split("\n\n", 1)[1]
-    return f"{__doc__}\nchoices\n{listed}\n\nkeys and defaults\n{keys}"
+    keys = {key: value for key, value in defaults_of(RunConfig).items() if key not in groups}
+    told = "\n".join(described(keys, RunConfig, {}))
+    return f"{__doc__}\nchoices\n{listed}\n\nkeys and defaults\n{told}"
 
 
-def settings_text(overrides: Sequence[str]) -> str:
-    """The composed settings as YAML."""
-    config = compose("run", overrides)
-    from omegaconf import OmegaConf
-
-    return OmegaConf.to_yaml(OmegaConf.create(config))
+def settings_text(words: Sequence[str]) -> str:
+    """The settings of a command line as YAML, each with its meaning behind it."""
+    values = composed_run(words)
+    return "\n".join(described(values, RunConfig, shapes_in(values)))
 
 
 def seconds_text(seconds: Mapping[str, tuple[int, float]]) -> str:
@@ -87,7 +87,7 @@ def seconds_text(seconds: Mapping[str, tuple[int, float]]) -> str:
     return "\n".join([f"{'stage':<12}{'tasks':>8}{'seconds':>10}{'each':>10}", *lines])
 
 
-def kernels_of(config: "RunConfig") -> list[str]:
+def kernels_of(config: RunConfig) -> list[str]:
     """The parts of factory.stages.warm that the run will ask for."""
     from factory.graph.work import HUMAN
     from factory.stages.warm import parts_of
@@ -98,17 +98,15 @@ def kernels_of(config: "RunConfig") -> list[str]:
 
 def run(asked: Asked, only_plan: bool) -> int:
     """Plan, execute, commit, report; or plan alone. The command line is checked before anything heavy is imported."""
-    from factory.config.run_keys import check
-
-    values = compose("run", asked.words)
-    check(values, asked.overrides)
-    if unusable := why_unusable(values["out"]):
+    config = load_config(asked.words)
+    if unusable := why_unusable(config.out):
         raise ConfigError(unusable)
+    refuse_missing_root(config.clips)
 
     from factory.graph.episodes import EpisodesWanted
     from factory.graph.execute import execute
     from factory.setup.calibrate import calibrate, plan_text
-    from factory.setup.settings import assemble, run_config
+    from factory.setup.settings import assemble
     from factory.stages.benchmark import NEEDED, write_benchmark
     from factory.stages.warm import compiling_ahead
     from factory.store.funnel import image_sources_text
@@ -119,7 +117,6 @@ def run(asked: Asked, only_plan: bool) -> int:
     from factory.views.logged_drive import prepared_episode
     from factory.views.status import failed_line
 
-    config = run_config(values)
     try:
         store = Store(Location.parse(config.out))
     except BadLocation as error:

@@ -16,27 +16,14 @@ from tasks.experts.protocol import Expert, Plan
 from tasks.reward.epdms import Scores, score
 from tasks.reward.prepare import PreparedScene, prepare_scene
 from tasks.rollout.simulate import TrafficSettings, next_scene, simulate
+from tasks.settings import ExpertGate
 from tasks.stages import Rejected
-from tasks.subscores import JUDGED
 from tasks.world.arrays import Array
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip, Rollout, Scene, scene_of_clip
 from tasks.world.route import centerline_from
 from tasks.world.vehicle import HEADING
 
 Timed = Callable[[str], AbstractContextManager[object]]
-
-
-@dataclass(frozen=True)
-class ExpertGate:
-    """Which sub-scores an expert's rollout must reach (paper, supplement: S_m = 1 for all but EP, EP > 0.5)."""
-
-    full: tuple[str, ...] = JUDGED  # EC needs an earlier plan: there is none
-    progress_above: float = 0.5
-
-    def __post_init__(self) -> None:
-        unknown = [name for name in self.full if name not in JUDGED]
-        if unknown:
-            raise ValueError(f"full names {', '.join(unknown)}; an expert's drive is judged by {', '.join(JUDGED)}")
 
 
 @dataclass(frozen=True)

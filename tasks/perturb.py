@@ -9,10 +9,8 @@ walked abreast: the same result as filter-then-pick at a fraction of the scores.
 For benchmarks the grid may be dense, and the candidates in an order in which the first few already lie all over it.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
@@ -21,37 +19,13 @@ from tasks.reward.epdms import Scores, score
 from tasks.reward.prepare import among, prepare_scene
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out
+from tasks.settings import PerturbSettings
 from tasks.stages import Rejected
 from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip, Rollout, scene_of_clip
 from tasks.world.frames import to_local, to_world
 from tasks.world.vehicle import HEADING, VX
 from tasks.world.vocabulary import Vocabulary
-
-
-@dataclass(frozen=True)
-class PerturbSettings:
-    """Paper, supplement, table of the curation pipeline."""
-
-    max_heading_deg: float = 20.0
-    max_longitudinal_m: float = 20.0
-    max_lateral_m: float = 2.0
-    step_longitudinal_m: float = 5.0
-    step_lateral_m: float = 0.5
-    epdms_min: float = 0.8  # /14 score, without EC
-    interleaved: bool = True  # every second cell of the grid, as on a chessboard; False: every cell
-    order: Literal["drawn", "spread"] = "drawn"  # of the candidates: as drawn, or see spread_out
-    at_most: int | None = None  # candidates a clip; None: all there are
-
-    def __post_init__(self) -> None:
-        gates = ("max_heading_deg", "max_longitudinal_m", "max_lateral_m")
-        for name in (*gates, "step_longitudinal_m", "step_lateral_m"):
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise ValueError(f"perturb {name} must be positive and finite, not {getattr(self, name)}")
-        if not 0.0 <= self.epdms_min <= 1.0:
-            raise ValueError(f"perturb epdms_min must be from 0 to 1, not {self.epdms_min}")
-        if self.at_most is not None and self.at_most < 1:
-            raise ValueError(f"perturb at_most must be positive, or null for no bound, not {self.at_most}")
 
 
 @dataclass(frozen=True)

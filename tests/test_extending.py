@@ -14,9 +14,10 @@ from examples.csv_logs import CsvReader, write_log
 from examples.keep_lane import KeepLane
 from examples.linear_planner import LinearPlanner
 from factory.config.compose import compose, fill
+from factory.config.run import load_config
 from factory.readers.base import BadClip
 from factory.run import main as run_main
-from factory.setup.settings import load_config, open_reader
+from factory.setup.settings import open_reader
 from factory.store.reader import SampleTable
 from planners.models.registry import PlannerChoice, build_planner
 from planners.training.checkpoint import load_planner

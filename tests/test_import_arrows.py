@@ -17,12 +17,13 @@ FORBIDDEN = {
 # Of each package the rooms from the ground up: a module imports from its own room and those below it.
 ROOMS = {
     "tasks": (
-        *("caches", "subscores", "stages", "kernels", "world", "rollout", "reward.rules", "reward", "experts"),
-        *("perturb", "attempt", "hard_scenes", "trajectories"),
+        *("caches", "subscores", "stages", "settings", "kernels", "world", "rollout", "reward.rules", "reward"),
+        *("experts", "perturb", "attempt", "hard_scenes", "trajectories"),
         *("render.splatting", "render.scene", "render.fit", "render"),
     ),
     "factory": (
-        *("exits", "wording", "job", "config", "readers", "store", "graph", "stages", "setup", "views", "views.board"),
+        *("exits", "wording", "job", "readers.settings", "readers.town.settings", "config", "readers", "store"),
+        *("graph", "stages", "setup", "views", "views.board"),
         *("run", "commands", "__main__"),
     ),
     "planners": ("command", "data", "models", "training", "evaluation", "study", "__main__"),

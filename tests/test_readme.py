@@ -24,9 +24,9 @@ from factory.commands.table import COMMANDS, PLANNERS
 from factory.config.arguments import parse
 from factory.config.compose import compose, conf_dir, fill
 from factory.config.plugins import GROUPS
+from factory.config.run import load_config
 from factory.readers.town.reader import SyntheticReader
 from factory.run import main as run_main
-from factory.setup.settings import load_config
 from factory.stages.warm import PARTS
 from planners.__main__ import main as planners_main
 from planners.evaluation.analysis import AnalysisSettings

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from factory.config.arguments import RUN, Refused
-from factory.config.compose import compose
+from factory.config.run import composed_run, run_config
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def explain(request: Request) -> None:
     import cv2
 
     from factory.graph.work import HUMAN_CANDIDATE, LOGGED
-    from factory.setup.settings import assemble, run_config
+    from factory.setup.settings import assemble
     from factory.stages.pipeline import PerturbedClip
     from factory.views.drawing import attempt_picture, candidates_picture, film
     from factory.views.video import write_mp4
@@ -71,7 +71,7 @@ def explain(request: Request) -> None:
     from tasks.subscores import OF_ONE_PLAN
 
     expert, to = request.expert, Path(request.to)
-    config = run_config(compose("run", request.settings) | {"experts": [expert]})
+    config = run_config(composed_run(request.settings) | {"experts": [expert]})
     run = assemble(config)
     ref = find((*run.index.refs, *run.index.broken), request.clip)
     work = run.work

@@ -1,14 +1,14 @@
 """Configuration: Hydra composes conf/, typed dataclasses take the result, and anything unknown is an error."""
 
-import dataclasses
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, get_type_hints
 
-from factory.config.plugins import offer_choices, with_experts
-from factory.config.words import Asked, ConfigError, asked_of, nearest, no_such_choice, readable, wrong_key
+from factory.config.plugins import offer_choices
+from factory.config.shapes import dataclass_in, defaults_of, keys_of, merged
+from factory.config.words import ConfigError, asked_of, nearest, no_such_choice, readable
 from factory.job import runs_root
 
 T = TypeVar("T")
@@ -41,9 +41,11 @@ def conf_dir() -> Path:
     raise ConfigError(f"no conf/run.yaml in {here} or {here.parent}: the installation is incomplete, install it again")
 
 
-def compose(name: str, words: Sequence[str]) -> dict[str, Any]:
+def compose(name: str, words: Sequence[str], shape: type[Any] | None = None) -> dict[str, Any]:
     """The resolved configuration `name` with the settings and options of a command line.
 
+    shape: the dataclass of its keys, whose defaults hold for what neither conf/ nor the words say; None: conf/ says
+    all, and what is unknown is told when the values are filled in.
     Raises ConfigError for a misspelt key, an unknown choice, bad syntax or a value that must be given and is not.
     """
     asked = asked_of(words)
@@ -53,7 +55,8 @@ def compose(name: str, words: Sequence[str]) -> dict[str, Any]:
     from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
     OmegaConf.register_new_resolver("runs", runs_root, replace=True)
-    overrides = [readable(word) for word in asked.overrides]
+    groups = {path.name for root in (conf_dir(), *asked.folders) for path in root.iterdir() if path.is_dir()}
+    overrides = [_as_override(readable(word), groups) for word in asked.overrides]
     offer_choices(overrides, conf_dir(), asked.folders)
     try:
         resolved = OmegaConf.to_container(
@@ -66,10 +69,19 @@ def compose(name: str, words: Sequence[str]) -> dict[str, Any]:
     except MissingConfigException as error:
         raise ConfigError(no_such_choice(error.missing_cfg_file or "", error.options)) from error
     except (HydraException, OmegaConfBaseException) as error:
-        raise ConfigError(_wrong(name, asked, overrides) or _first_line(error)) from error
+        raise ConfigError(_first_line(error)) from error
     assert isinstance(resolved, dict)
     values = {str(key): value for key, value in resolved.items()}
-    return with_experts(values) if "experts" in values and "expert" in values else values
+    if shape is None:
+        return values
+    refuse_unknown(shape, values, "")
+    return merged(defaults_of(shape), values)
+
+
+def _as_override(word: str, groups: Collection[str]) -> str:
+    """Keys are held against the dataclasses and not against conf/, which says few of them: Hydra takes any."""
+    plain = word.lstrip("+")
+    return word if plain.partition("=")[0].partition("@")[0] in groups else f"++{plain}"
 
 
 def _composed(name: str, overrides: Sequence[str], folders: Sequence[Path]) -> Any:
@@ -78,25 +90,6 @@ def _composed(name: str, overrides: Sequence[str], folders: Sequence[Path]) -> A
     quoted = ",".join(f"'file://{folder!s}'" for folder in folders)
     with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
         return hydra.compose(name, [*overrides, *([f"hydra.searchpath=[{quoted}]"] if folders else [])])
-
-
-def _wrong(name: str, asked: Asked, overrides: Sequence[str]) -> str:
-    """What is wrong with the first key that does not fit the chosen groups."""
-    from omegaconf import OmegaConf
-
-    roots = [conf_dir(), *asked.folders]
-    groups = {folder.name for root in roots for folder in root.iterdir() if folder.is_dir()}
-    chosen = [word for word in overrides if word.partition("=")[0].partition("@")[0].lstrip("+~") in groups]
-    tree = OmegaConf.to_container(_composed(name, chosen, asked.folders))
-    assert isinstance(tree, dict)
-    others = {
-        f"{group}={path.stem}": OmegaConf.to_container(OmegaConf.load(path))
-        for root in roots
-        for group in sorted(groups)
-        for path in sorted((root / group).glob("*.yaml"))
-    }
-    faults = (wrong_key(word, tree, others) for word in asked.overrides if word not in chosen)  # type: ignore[arg-type]
-    return next((fault for fault in faults if fault), "")
 
 
 def _first_line(error: Exception) -> str:
@@ -113,9 +106,7 @@ def fill(cls: type[T], values: Mapping[str, Any], where: str) -> T:
     need_run_extra("pydantic")
     from pydantic import TypeAdapter, ValidationError
 
-    unknown = list(_unknown_keys(cls, values, where))
-    if unknown:
-        raise ConfigError(f"unknown setting {', '.join(unknown)}")
+    refuse_unknown(cls, values, where)
     try:
         return TypeAdapter(cls).validate_python(_with_lists(cls, values))
     except ValidationError as error:
@@ -126,7 +117,7 @@ def _with_lists(cls: type[Any], values: Mapping[str, Any]) -> dict[str, Any]:
     hints = get_type_hints(cls)
     found = dict(values)
     for name, value in values.items():
-        inner = _dataclass_in(hints[name])
+        inner = dataclass_in(hints[name])
         if inner is not None and isinstance(value, Mapping):
             found[name] = _with_lists(inner, value)
         elif hints[name] == tuple[str, ...] and isinstance(value, str) and value:
@@ -156,7 +147,7 @@ def _path(cls: type[Any] | None, loc: Sequence[str | int]) -> list[str]:
         return [str(head), *_path(None, rest)]
     if cls is None or head not in (hints := get_type_hints(cls)):
         return []
-    return [head, *_path(_dataclass_in(hints[head]), rest)]
+    return [head, *_path(dataclass_in(hints[head]), rest)]
 
 
 def _message(error: Any) -> str:
@@ -168,20 +159,30 @@ def _message(error: Any) -> str:
     return known_kind or str(error["msg"]).removeprefix("Value error, ")
 
 
-def _unknown_keys(cls: type[Any], values: Mapping[str, Any], where: str) -> list[str]:
+def refuse_unknown(
+    cls: type[Any], values: Mapping[str, Any], where: str, said: Callable[[str], str] = lambda key: ""
+) -> None:
+    """Raises ConfigError naming the first key, below `where`, that `cls` does not have, and the nearest that it has.
+
+    said: what else is known of such a key.
+    """
+    prefix = f"{where}." if where else ""
+    known = [key for key, _ in keys_of(cls, prefix)]
+    for key in _dotted(cls, values, prefix):
+        if key not in known:
+            meant = nearest(key, known)
+            more = f"{meant.removesuffix('?')}=?" if meant else "; see --help"
+            raise ConfigError(said(key) or f"{key}: there is no such setting{more}")
+
+
+def _dotted(cls: type[Any], values: Mapping[str, Any], prefix: str) -> Iterator[str]:
+    """The keys of `values`, into groups that are dataclasses."""
     hints = get_type_hints(cls)
-    names = {field.name for field in dataclasses.fields(cls)}
-    found = [".".join(filter(None, (where, key))) for key in values if key not in names]
-    for name in names & set(values):
-        inner = _dataclass_in(hints[name])
-        if inner is not None and isinstance(values[name], Mapping):
-            found += _unknown_keys(inner, values[name], ".".join(filter(None, (where, name))))
-    return found
-
-
-def _dataclass_in(hint: Any) -> type[Any] | None:
-    options = get_args(hint) if get_origin(hint) is not None else (hint,)
-    return next((option for option in options if isinstance(option, type) and dataclasses.is_dataclass(option)), None)
+    for key, value in values.items():
+        yield f"{prefix}{key}"
+        inner = dataclass_in(hints.get(key))
+        if inner is not None and isinstance(value, Mapping):
+            yield from _dotted(inner, value, f"{prefix}{key}.")
 
 
 def build(spec: Mapping[str, Any], where: str, labels: Sequence[str] = ("name",)) -> Any:

@@ -1,48 +1,21 @@
-"""The settings that conf/ holds with the choices in its comments, read as text: no configuration library, no engine."""
+"""What may stand on a run's command line, for the shell's completion: no configuration library, no engine."""
 
 import re
 from collections.abc import Sequence
 
 from factory.config.compose import conf_dir
 from factory.config.plugins import choices
-
-CHOICES = re.compile(r"#\s*([\w-]+(?:\s*\|\s*[\w-]+)+)")  # `ray | local` in the comment behind a setting
-SWITCH = {"true", "false"}
+from factory.config.run import RecoverySources, RunConfig, reader_of
+from factory.config.shapes import choices_of, dataclass_in, keys_of
 
 
 def settings_of(given: Sequence[str]) -> dict[str, list[str]]:
-    """Setting -> its choices where they are few: groups, keys of conf/run.yaml, keys of the chosen groups."""
+    """Setting -> its choices where they are few: groups, the run's keys, those of the chosen reader and of recovery."""
     folder = conf_dir()
-    text = (folder / "run.yaml").read_text()
-    chosen = dict(re.findall(r"^  - (\w+): (\w+)$", text, re.M))
+    chosen = dict(re.findall(r"^  - (\w+): (\w+)$", (folder / "run.yaml").read_text(), re.M))
     chosen.update({key: value for key, _, value in (word.partition("=") for word in given) if key in chosen})
-    found = {group: choices(group, [folder]) for group in chosen}
-    found |= _keys(text.split("\n\n", 1)[1], "") | {"experts": choices("expert", [folder])}
-    for group, choice in chosen.items():
-        path = folder / group / f"{choice}.yaml"
-        if path.is_file() and group != "preset":
-            found |= _keys(path.read_text(), f"{group}.")
-    for expert, file in re.findall(r"^  - expert@expert\.(\w+): (\w+)$", text, re.M):
-        found |= _keys((folder / "expert" / f"{file}.yaml").read_text(), f"expert.{expert}.")
-    return found
-
-
-def _keys(text: str, prefix: str) -> dict[str, list[str]]:
-    """Of a YAML file of ours, nested keys with dots."""
-    found: dict[str, list[str]] = {}
-    above: list[tuple[int, str]] = []
-    for indent, key, rest in re.findall(r"^( *)(\w+):(.*)$", text, re.M):
-        while above and above[-1][0] >= len(indent):
-            above.pop()
-        name = prefix + ".".join([*(parent for _, parent in above), key])
-        value, _, comment = rest.partition("#")
-        if not value.strip():
-            above.append((len(indent), key))
-            continue
-        choices = CHOICES.search(f"#{comment}")
-        if value.strip() in SWITCH:
-            found[name] = sorted(SWITCH)
-        else:
-            words = re.split(r"\s*\|\s*", choices[1]) if choices else []
-            found[name] = [word for word in words if len(word) > 1]  # `n` stands for a number
-    return found
+    typed = dict(keys_of(RunConfig)) | dict(keys_of(RecoverySources, "expert.recovery."))
+    reader = reader_of(chosen["clips"])
+    typed |= {} if reader is None else dict(keys_of(reader, "clips."))
+    found = {key: choices_of(hint) for key, hint in typed.items() if key != "expert" and dataclass_in(hint) is None}
+    return found | {group: choices(group, [folder]) for group in chosen} | {"experts": choices("expert", [folder])}

@@ -80,7 +80,7 @@ def _files(group: str, folders: Sequence[Path]) -> set[str]:
 
 
 def offer_choices(overrides: Sequence[str], conf: Path, folders: Sequence[Path] = ()) -> None:
-    """Make `clips=<name>` and `planner=<name>` choices of Hydra's; their keys may be set without a plus.
+    """Make `clips=<name>` and `planner=<name>` choices of Hydra's.
 
     conf, folders: where the files of the other choices lie. Raises ConfigError where the one that is chosen clashes.
     """
@@ -96,12 +96,9 @@ def offer_choices(overrides: Sequence[str], conf: Path, folders: Sequence[Path] 
             if name in built_in or len(plugins) > 1:
                 continue
             node = OmegaConf.load(conf / group / "custom.yaml")
-            OmegaConf.set_struct(node, False)
             node.name = name
             if group == "clips":
                 node._target_ = plugins[0].target
-            else:
-                OmegaConf.set_struct(node.settings, False)
             ConfigStore.instance().store(name=name, node=node, group=group, provider=plugins[0].package)
 
 

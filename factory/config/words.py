@@ -4,11 +4,10 @@ A setting is `key=value`. Text that Hydra's grammar does not read, such as a pat
 Of Hydra's options two are kept: `--cfg` shows the settings, `--config-dir` adds a folder of one's own groups.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any
 
 SHOW = ("--cfg", "-c")
 FOLDER = ("--config-dir", "-cd")
@@ -64,7 +63,7 @@ def asked_of(words: Sequence[str]) -> Asked:
             if not equals:
                 value = rest.pop(0) if rest and "=" not in rest[0] and not rest[0].startswith("-") else "..."
             raise ConfigError(f"{word}: settings have no dashes: {key}={value}; see --help")
-        elif not equals and not word.startswith("~"):
+        elif not equals or word.startswith("~"):
             raise ConfigError(f"{word!r}: expected key=value; see --help")
         else:
             overrides.append(word)
@@ -99,44 +98,6 @@ def no_such_choice(missing: str, choices: Sequence[str] | None) -> str:
     known = sorted(choices or ())
     meant = nearest(choice, known).replace("mean ", f"mean {group}=")
     return f"{group}={choice}: there is {', '.join(known) or 'no choice'}{meant}"
-
-
-def wrong_key(word: str, tree: Mapping[str, Any], others: Mapping[str, Mapping[str, Any]]) -> str:
-    """Why an override's key does not fit the composed settings `tree`; nothing where it does.
-
-    others: group=choice -> its settings, for all that are not chosen.
-    """
-    key = word.partition("=")[0]
-    plain = key.lstrip("+~")
-    if "@" in key or key.startswith("++"):
-        return ""
-    if key.startswith("+"):
-        return f"{key}: {plain} is a setting already; without +: {plain}=..." if has(tree, plain) else ""
-    if has(tree, plain):
-        return ""
-    group, _, inner = plain.partition(".")
-    having = [choice for choice, settings in others.items() if choice.startswith(f"{group}=") and has(settings, inner)]
-    if having:
-        return f"{plain} is a setting of {' and '.join(having)}: choose one of them too"
-    meant = nearest(plain, list(dotted(tree)))
-    return f"{plain}: there is no such setting" + (f"{meant.removesuffix('?')}=?" if meant else "; see --help")
-
-
-def has(tree: Any, key: str) -> bool:
-    """There is such a dotted key."""
-    for part in key.split("."):
-        if not isinstance(tree, Mapping) or part not in tree:
-            return False
-        tree = tree[part]
-    return True
-
-
-def dotted(tree: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
-    """All keys, those of groups with dots."""
-    for key, value in tree.items():
-        yield f"{prefix}{key}"
-        if isinstance(value, Mapping):
-            yield from dotted(value, f"{prefix}{key}.")
 
 
 def nearest(word: str, known: Sequence[str]) -> str:

@@ -29,8 +29,9 @@ from typing import Any, ClassVar, Generic, TypeVar
 import numpy as np
 
 from factory.readers.base import SPLITS, BadClip, ClipIndex, ClipRef, split_of
+from factory.readers.settings import LogClips, WindowSettings
 from factory.readers.validate import validate_clip
-from factory.readers.windows import WindowSettings, drop_reason, window_starts
+from factory.readers.windows import drop_reason, window_starts
 from tasks.world.agents import AgentTracks
 from tasks.world.arrays import Array, Ints
 from tasks.world.camera import Camera, SensorFile
@@ -98,12 +99,12 @@ class LogReader(ABC, Generic[Log]):
     def __init__(
         self,
         root: str | Path,
-        stride_s: float = 1.0,
+        stride_s: float = LogClips.stride_s,
         name: str | None = None,
-        min_top_speed_mps: float = 0.5,
-        first_window: int = 0,
-        only: Sequence[str] = (),
-        split: str | None = None,
+        min_top_speed_mps: float = LogClips.min_top_speed_mps,
+        first_window: int = LogClips.first_window,
+        only: Sequence[str] = LogClips.only,
+        split: str | None = LogClips.split,
     ) -> None:
         """name: the data set's name, part of every clip id; first_window: of each log, skips those before it.
 

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from factory.setup.settings import RunConfig, load_config
+from factory.config.run import RunConfig, load_config
 from tasks.world.vocabulary import Vocabulary
 
 # What the paper says of how samples are made; the rest is this project's own, or how much and where.

@@ -8,11 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from factory.config.compose import ConfigError, build, compose, fill, need_run_extra
-from factory.config.reward import RewardSettings
-from factory.config.run_keys import RunKeys, VocabularyChoice
+from factory.config.compose import ConfigError, build
+from factory.config.run import RecoverySources, RunConfig, VocabularyChoice, recovery_settings, refuse_relative_root
 from factory.graph.work import BENCHMARK, FOLLOW_UP_BEFORE, HUMAN
-from factory.job import in_submitted_job
 from factory.readers.base import BadClip, ClipIndex, ClipReader
 from factory.setup.vocabulary import (
     build_recovery_table,
@@ -21,7 +19,6 @@ from factory.setup.vocabulary import (
     save_recovery_table,
     train_windows,
 )
-from factory.stages.benchmark import BenchmarkSettings
 from factory.stages.pipeline import FactoryWork
 from factory.stages.sensors import chosen_cameras
 from factory.store.identity import UNLISTED, RunIdentity, canonical_json
@@ -30,15 +27,13 @@ from tasks.experts.follow_up import FollowUp
 from tasks.experts.human import Human
 from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings
 from tasks.experts.protocol import Expert
-from tasks.experts.recovery.expert import Recovery, RecoverySettings, RecoveryTable
-from tasks.perturb import PerturbSettings
+from tasks.experts.recovery.expert import Recovery, RecoveryTable
 from tasks.render.fit.settings import REMOVED
 from tasks.render.rigs import RIGS
 from tasks.render.scene import engine
-from tasks.render.settings import RenderMode, RenderSettings
+from tasks.render.settings import RenderMode
 from tasks.render.splatting.gsplat_backend import BackendMissing
 from tasks.reward.labels import Labelling
-from tasks.rollout.simulate import TrafficSettings
 from tasks.stages import stage_versions
 from tasks.world.kinematic_vocabulary import kinematic_trajectories
 from tasks.world.vocabulary import Vocabulary
@@ -60,31 +55,6 @@ ADDED: dict[str, object] = {"perturb.interleaved": True, "perturb.order": "drawn
 
 
 @dataclass(frozen=True)
-class RecoverySources:
-    """What the recovery table is made from."""
-
-    table: str | None = None  # an artefact; None: the TRAIN windows of the run's clips and `vocabularies`
-    vocabularies: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class RunConfig(RunKeys):
-    """conf/run.yaml, typed."""
-
-    perturb: PerturbSettings
-    traffic: TrafficSettings
-    pdm: PdmSettings
-    reward: RewardSettings
-    render: RenderSettings
-    benchmark: BenchmarkSettings
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.render.map_rig not in RIGS:
-            raise ValueError(f"render.map_rig={self.render.map_rig} is not among {', '.join(RIGS)}")
-
-
-@dataclass(frozen=True)
 class Run:
     """A configured run: what to read and what to do with it."""
 
@@ -92,19 +62,6 @@ class Run:
     reader: ClipReader
     index: ClipIndex
     work: FactoryWork
-
-
-def load_config(overrides: Sequence[str], name: str = "run") -> RunConfig:
-    """The typed settings of a command line. Raises ConfigError."""
-    return run_config(compose(name, overrides))
-
-
-def run_config(values: Mapping[str, Any]) -> RunConfig:
-    """The typed settings of composed ones. Raises ConfigError."""
-    config = fill(RunConfig, values, "")
-    if config.executor == "ray":
-        need_run_extra("ray")
-    return config
 
 
 def open_reader(clips: Mapping[str, Any]) -> tuple[ClipReader, ClipIndex]:
@@ -122,16 +79,6 @@ def open_reader(clips: Mapping[str, Any]) -> tuple[ClipReader, ClipIndex]:
             f"clips: no clip found under {clips.get('root', 'its root')} ({'; '.join(reasons) or 'empty'})"
         )
     return reader, index
-
-
-def refuse_relative_root(clips: Mapping[str, Any]) -> None:
-    """Raises ConfigError for a relative clips.root inside a submitted Ray job, whose folder is a temporary copy."""
-    root = clips.get("root")
-    if in_submitted_job() and isinstance(root, str) and not Path(root).expanduser().is_absolute():
-        raise ConfigError(
-            f"clips.root={root} is relative, and a submitted job runs in a copy of the working directory: "
-            "name an absolute path that every node sees"
-        )
 
 
 def refuse_missing_backend(config: RunConfig) -> None:
@@ -202,13 +149,6 @@ def refuse_unknown_cameras(config: RunConfig, reader: ClipReader, index: ClipInd
         if rig:
             chosen_cameras(rig, wanted)
             return
-
-
-def recovery_settings(config: RunConfig, name: str) -> tuple[RecoverySources, RecoverySettings]:
-    """Typed. Raises ConfigError."""
-    spec = {key: value for key, value in config.expert[name].items() if key != "kind"}
-    of_table: dict[str, Any] = {key: spec.pop(key) for key in ("table", "vocabularies") if key in spec}
-    return fill(RecoverySources, of_table, f"expert.{name}"), fill(RecoverySettings, spec, f"expert.{name}")
 
 
 def choose_vocabulary(choice: VocabularyChoice) -> Vocabulary:

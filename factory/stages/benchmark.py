@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from factory.config.run import BenchmarkSettings
 from factory.graph.work import FOLLOW_UP, FOLLOW_UP_BEFORE, HUMAN, HUMAN_BEFORE, HUMAN_CANDIDATE
 from factory.readers.base import ClipRef
 from factory.store.identity import RunIdentity
@@ -19,17 +20,6 @@ from tasks.world.clip import STEP_S
 BENCHMARK_FILE = "benchmark.json"
 NEEDED = frozenset({HUMAN, HUMAN_BEFORE, FOLLOW_UP, FOLLOW_UP_BEFORE})  # experts
 FORMAT = 1
-
-
-@dataclass(frozen=True)
-class BenchmarkSettings:
-    """What makes a clip count."""
-
-    min_follow_ups: int = 8  # complete pairs; clips with fewer are named and do not count
-
-    def __post_init__(self) -> None:
-        if self.min_follow_ups < 1:
-            raise ValueError(f"min_follow_ups={self.min_follow_ups}: at least one is needed")
 
 
 def write_benchmark(

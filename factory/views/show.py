@@ -54,7 +54,8 @@ def labelled_trajectories(row: dict[str, Any], file: str | None) -> "Array | Non
 
     Raises Refused where the named file holds others, or the row has no labels.
     """
-    from factory.setup.settings import VocabularyChoice, choose_vocabulary
+    from factory.config.run import VocabularyChoice
+    from factory.setup.settings import choose_vocabulary
     from factory.store.reader import labels_of
 
     if row["label_vocabulary"] is None and file is None:

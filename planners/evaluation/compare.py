@@ -31,12 +31,12 @@ from tasks.reward.one_stage import COLUMNS
 
 @dataclass(frozen=True)
 class CompareSettings:
-    """The keys of conf/compare.yaml."""
+    """Everything on the command line of `planners compare`."""
 
-    a: str | list[str]
+    a: str | list[str]  # folder of an evaluated planner, or a list of them
     b: str | list[str]
     table: str | None = None  # clips.csv of a study, of which a and b are columns
-    column: str = "score"  # or a sub-score
+    column: str = "score"  # or a sub-score: nc dac tlc ddc ep ttc lk hc ec
     confidence: float = 0.95
     draws: int = 10_000
     seed: int = 0
@@ -155,7 +155,7 @@ def check_same_rules(folders: Sequence[str]) -> None:
 @command
 def main(argv: Sequence[str]) -> None:
     """The command."""
-    settings = fill(CompareSettings, compose("compare", argv), "compare")
+    settings = fill(CompareSettings, compose("compare", argv, CompareSettings), "compare")
     if settings.column not in COLUMNS:
         raise ConfigError(f"compare.column={settings.column}: one of {', '.join(COLUMNS)}")
     sides = [[side] if isinstance(side, str) else side for side in (settings.a, settings.b)]

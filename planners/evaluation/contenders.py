@@ -112,13 +112,13 @@ def contenders(
     return found
 
 
-def composed(name: str, argv: Sequence[str]) -> dict[str, Any]:
-    """The values of conf/<name>.yaml and a command line, with `planner=` as text. Raises ConfigError.
+def composed(name: str, argv: Sequence[str], shape: type[Any]) -> dict[str, Any]:
+    """The values of a command line and conf/<name>.yaml, typed by `shape`, with `planner=` as text. Raises ConfigError.
 
     Hydra would take it for a choice among conf/planner, which are planners to be trained.
     """
     who = [argument for argument in argv if argument.startswith("planner=")]
-    values = compose(name, [argument for argument in argv if argument not in who])
+    values = compose(name, [argument for argument in argv if argument not in who], shape)
     return values | ({"planner": who[-1].split("=", 1)[1]} if who else {})
 
 

@@ -51,22 +51,22 @@ MOST_UNIFORM = 0.2  # share of clips in the uniform fallback
 
 @dataclass(frozen=True)
 class EvaluateSettings:
-    """The keys of conf/evaluate.yaml."""
+    """Everything on the command line of `planners evaluate`."""
 
-    benchmark: str
-    out: str
-    planner: str | None = None
-    planners: list[str] | dict[str, str] | None = None
-    settings: dict[str, Any] = field(default_factory=dict)  # of planning, of all trained planners
+    benchmark: str  # the folder that factory.run preset=hard_benchmark made
+    planner: str | None = None  # a training's folder, human, pdm_closed, constant_velocity, or my.module:MyPlanner
+    planners: list[str] | dict[str, str] | None = None  # several: a list, or {label: planner, ...}
+    out: str = "evaluations"  # a folder for each planner, and the table of all
+    settings: dict[str, Any] = field(default_factory=dict)  # of planning, changed in all trained planners
     bounds: bool = True  # human, pdm_closed and constant_velocity too
-    one_stage_traffic: TrafficSettings = field(default_factory=lambda: TrafficSettings(mode="replay"))
-    two_stage_traffic: TrafficSettings = field(default_factory=TrafficSettings)
-    pdm: PdmSettings = field(default_factory=PdmSettings)
+    one_stage_traffic: TrafficSettings = field(default_factory=lambda: TrafficSettings(mode="replay"))  # as NAVSIM's
+    two_stage_traffic: TrafficSettings = field(default_factory=TrafficSettings)  # both of navhard's stages are reactive
+    pdm: PdmSettings = field(default_factory=PdmSettings)  # row 0 of the batch that progress is held against
     batch_size: int = 16
     planners_at_once: int = 8  # in memory, planning from one reading of the samples
-    device: str = "cpu"
-    limit: int | None = None  # clips
-    tables: bool = True  # of all planners of the command
+    device: str = "cpu"  # or cuda
+    limit: int | None = None  # the first so many clips only
+    tables: bool = True  # summary.csv and summary.png of all planners; false where others follow into the same out
 
     def __post_init__(self) -> None:
         for name in ("batch_size", "planners_at_once", "limit"):
@@ -167,7 +167,7 @@ def fallback_notes(lines: Sequence[SummaryLine]) -> list[str]:
 
 def settings_of(argv: Sequence[str]) -> EvaluateSettings:
     """The settings of a command line. Raises ConfigError."""
-    return fill(EvaluateSettings, composed("evaluate", argv), "evaluate")
+    return fill(EvaluateSettings, composed("evaluate", argv, EvaluateSettings), "evaluate")
 
 
 def evaluated(argv: Sequence[str]) -> None:

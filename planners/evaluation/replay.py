@@ -41,13 +41,13 @@ HOLD = 10  # pictures that the end of a stage is shown for
 
 @dataclass(frozen=True)
 class ReplaySettings:
-    """The keys of conf/replay.yaml."""
+    """Everything on the command line of `planners replay`."""
 
-    benchmark: str
-    out: str
-    planner: str = "pdm_closed"
+    benchmark: str  # the folder that factory.run preset=hard_benchmark made
+    out: str = "replay.mp4"
+    planner: str = "pdm_closed"  # a training's folder, human, pdm_closed, constant_velocity, or my.module:MyPlanner
     clip: int | str = 0  # clip id or its beginning, or the clip's place
-    follow_up: int | None = None
+    follow_up: int | None = None  # a candidate; null: the one that starts nearest to where the plan ends
     two_stage_traffic: TrafficSettings = field(default_factory=TrafficSettings)
     pdm: PdmSettings = field(default_factory=PdmSettings)
 
@@ -178,7 +178,7 @@ def find_clip(benchmark: Benchmark, wanted: str) -> str:
 
 def settings_of(argv: Sequence[str]) -> ReplaySettings:
     """The settings of a command line. Raises ConfigError."""
-    return fill(ReplaySettings, composed("replay", argv), "replay")
+    return fill(ReplaySettings, composed("replay", argv, ReplaySettings), "replay")
 
 
 @command

@@ -7,6 +7,7 @@ from typing import Any
 
 from factory.config.compose import ConfigError, fill
 from factory.config.plugins import installed, names
+from factory.config.shapes import defaults_of, merged
 from factory.config.words import nearest
 from planners.models.planner import Planner
 from tasks.world.arrays import FloatArray
@@ -50,8 +51,9 @@ def planner_class(name: str) -> type[Planner]:
 
 
 def settings_of(choice: PlannerChoice) -> Any:
-    """The planner's own settings. Raises ConfigError for one that it does not have."""
-    return fill(planner_class(choice.name).settings_type, choice.settings, "planner.settings")
+    """The planner's own settings, its defaults for what is not named. Raises ConfigError for one it does not have."""
+    shape = planner_class(choice.name).settings_type
+    return fill(shape, merged(defaults_of(shape), choice.settings), "planner.settings")
 
 
 def build_planner(choice: PlannerChoice, arrays: Mapping[str, FloatArray]) -> Planner:

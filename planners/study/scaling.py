@@ -78,7 +78,7 @@ def trainings_of(s: ScalingSettings) -> list[Training]:
 
 def scale(words: Sequence[str]) -> None:
     """Train, score and report what settings ask for. Raises ConfigError, Stopped, Failed."""
-    s = fill(ScalingSettings, compose("scaling", words), "scaling")
+    s = fill(ScalingSettings, compose("scaling", words, ScalingSettings), "scaling")
     everything = [Portion("scaling", 0, tuple(trainings_of(s)), {})]
     run(s, everything, everything, ())
 

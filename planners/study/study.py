@@ -125,7 +125,7 @@ def sizes_of(settings: StudySettings) -> Sizes:
 @command
 def main(argv: Sequence[str]) -> None:
     """The command."""
-    settings = fill(StudySettings, compose("study", argv), "study")
+    settings = fill(StudySettings, compose("study", argv, StudySettings), "study")
     sizes, whole = sizes_of(settings), with_all_parts(settings)
     wanted = comparisons(whole)
     asked = portions(comparisons(settings), settings, sizes)

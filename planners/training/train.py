@@ -14,7 +14,7 @@ settings or data, 4 interrupted and resumable.
 import dataclasses
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -23,6 +23,7 @@ import cv2
 import torch
 
 from factory.config.compose import ConfigError, compose, fill
+from factory.config.shapes import described, merged, plain
 from planners.command import command
 from planners.data.feed import Dataset, DataSettings, open_data
 from planners.data.loader import Loader
@@ -46,24 +47,24 @@ class PlannerEntry(PlannerChoice):
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Everything on the command line; conf/train.yaml says what each key means."""
+    """Everything on the command line."""
 
     planner: PlannerEntry
-    mix: MixSettings
-    data: DataSettings
-    steps: int | None
-    seed: int
-    init_from: str | None
-    out: str
-    executor: Literal["process", "ray"]
-    device: Literal["auto", "cpu", "cuda"]
-    precision: Literal["auto", "fp32", "bf16"]
-    accumulate: int
-    workers: int
-    log_every: int
-    checkpoint_every: int
-    validate_every: int
-    ray: RaySettings
+    out: str  # the same command on the same folder resumes
+    mix: MixSettings = field(default_factory=MixSettings)
+    data: DataSettings = field(default_factory=DataSettings)
+    steps: int | None = None  # optimiser steps in all; null: planner.training.epochs
+    seed: int = 0  # of the weights at the start, the order and everything random in a step
+    init_from: str | None = None  # folder of a training of the same planner, or a checkpoint: whose weights go on
+    executor: Literal["process", "ray"] = "process"  # process: alone, or as torchrun starts it; ray: Ray Train
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    precision: Literal["auto", "fp32", "bf16"] = "auto"  # auto: bf16 on a GPU, fp32 elsewhere
+    accumulate: int = 1  # parts that a batch is computed in
+    workers: int = 2  # threads that decode
+    log_every: int = 20  # steps
+    checkpoint_every: int = 1000  # steps
+    validate_every: int = 0  # steps; 0: after the last one
+    ray: RaySettings = field(default_factory=RaySettings)
 
     def __post_init__(self) -> None:
         for name in ("accumulate", "log_every", "checkpoint_every"):
@@ -83,11 +84,9 @@ class TrainConfig:
 @command
 def main(argv: Sequence[str]) -> None:
     """The command."""
-    values = compose("train", [argument for argument in argv if argument != "--cfg"])
+    values = compose("train", [argument for argument in argv if argument != "--cfg"], TrainConfig)
     if "--cfg" in argv:
-        from omegaconf import OmegaConf
-
-        print(OmegaConf.to_yaml(OmegaConf.create(values)))
+        print(settings_text(values))
         return
     config = fill(TrainConfig, values, "train")
     if config.executor == "ray":
@@ -97,6 +96,14 @@ def main(argv: Sequence[str]) -> None:
     else:
         with joined(config.device) as world:
             train(config, world)
+
+
+def settings_text(values: Mapping[str, Any]) -> str:
+    """Composed settings as YAML, the planner's own with their defaults, each with its meaning behind it."""
+    entry = values["planner"]
+    own = settings_of(PlannerChoice(entry["name"], entry.get("settings", {})))
+    full = merged(values, {"planner": {"settings": plain(own)}})
+    return "\n".join(described(full, TrainConfig, {"planner.settings": type(own)}))
 
 
 def train(config: TrainConfig, world: World) -> None:

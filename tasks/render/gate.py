@@ -8,7 +8,7 @@ here as it did from where the photos were taken, and is most of a block's Gaussi
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import uniform_filter
@@ -18,6 +18,7 @@ from tasks.render.scene.asset import RenderAsset, scene_at
 from tasks.render.scene.engine import Backend, Vehicles, render, vehicles_at
 from tasks.render.scene.movers import world_from_boxes
 from tasks.render.scene.sky import directions
+from tasks.render.settings import GateSettings
 from tasks.render.splatting.gaussians import Gaussians, rotations_of
 from tasks.render.splatting.raster import View
 from tasks.stages import Rejected
@@ -31,40 +32,6 @@ SOLID = 0.5  # alpha from which a pixel counts as covered
 INSIDE_SIGMAS = 2.0  # a lens this close to a Gaussian's mean, in its standard deviations, is inside of it
 MAGNIFIED = 30.0  # takes what is 1 cm from the lens out to the rasteriser's near plane at 0.3 m
 NO_CONTRAST = 1.0e-6
-
-
-@dataclass(frozen=True)
-class GateSettings:
-    """What every picture must come up to.
-
-    The limits lie between what was measured on the synthetic town (2 blocks, 3 cameras): 135 pictures of accepted
-    drives had at most 6 % holes and 11 % on the lens, contrast 0.15 and detail 0.11 at least; 20 m aside, inside the
-    houses or behind them, most had 60 % to 100 % holes. Photos (KITTI, nuScenes, the town) have detail 0.17 to 0.33;
-    blurred by 1.5 pixels of the small picture, 0.06 at most. What `vehicle_min` catches and loses is in
-    docs/reconstruction.md.
-    """
-
-    enabled: bool = True
-    width: int = 160  # pixels of the pictures that are looked at, where those to be stored are no smaller
-    reach_m: float = 30.0  # of the scene that is looked at
-    road_m: float = 20.0  # a ray that meets the road's plane nearer than this is not one at the sky
-    hole_max: float = 0.2  # share of those rays that meet nothing
-    lens_m: float = 0.8  # what is nearer than this is on the lens
-    lens_max: float = 0.2  # share of the picture that may be covered by it
-    contrast_min: float = 0.02  # standard deviation of the grey picture in [0, 1]: five grey levels
-    detail_min: float = 0.06  # standard deviation of the grey picture less its 3 x 3 mean, as a share of the contrast
-    vehicle_min: float = (
-        0.7  # likeness to its photos that a large vehicle must be expected to have; 0: none is looked at
-    )
-    vehicle_share: float = 0.05  # of a picture, from which on a vehicle is large
-
-    def __post_init__(self) -> None:
-        shares = {"hole_max", "lens_max", "contrast_min", "detail_min", "vehicle_min", "vehicle_share"}
-        for name in (field.name for field in fields(self) if field.name != "enabled"):
-            value, low = getattr(self, name), 16 if name == "width" else 0.0
-            if not (math.isfinite(value) and low <= value <= (1.0 if name in shares else math.inf)):
-                wanted = "from 0 to 1" if name in shares else f"finite and at least {low:g}"
-                raise ValueError(f"render gate {name} must be {wanted}, not {value}")
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from factory.config.run import load_config
 from factory.graph.work import PreparedClip
-from factory.setup.settings import assemble, load_config
+from factory.setup.settings import assemble
 from factory.stages.assets import asset_for
 from factory.stages.imaging import album_of
 from factory.stages.pipeline import FactoryWork, PerturbedClip

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 
+from factory.config.run import load_config
 from factory.graph.execute import execute
-from factory.setup.settings import assemble, load_config
+from factory.setup.settings import assemble
 from factory.store.reader import LABEL_COLUMNS, SampleTable, labels_of
 from factory.store.samples import Store
 from tests.bench.timing import milliseconds

@@ -18,10 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factory.readers.av2.reader import AV2Reader
+from factory.readers.settings import TownSettings
 from factory.readers.town.draw import Theatre, paint
 from factory.readers.town.drive import Drive
 from factory.readers.town.town import log_name, plan_log
-from factory.readers.town.write import TownSettings, write_log
+from factory.readers.town.write import write_log
 from factory.stages.sensors import block_of, load_sensors
 from tasks.render.fit.reconstruct import advance, finish
 from tasks.render.fit.settings import FitSettings

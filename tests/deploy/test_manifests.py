@@ -184,7 +184,7 @@ def test_gpus_are_asked_for_by_one_group_and_the_head_runs_no_tasks() -> None:
 
 
 def test_the_command_of_the_job_is_one_that_the_factory_takes() -> None:
-    from factory.setup.settings import load_config
+    from factory.config.run import load_config
 
     python, _, module, *overrides = loaded("kuberay/ray_job.yaml")["spec"]["entrypoint"].split()
     assert (python, module) == ("python", "factory.run")

@@ -5,7 +5,9 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hydra.core.config_store import ConfigStore
@@ -14,8 +16,8 @@ from examples.csv_logs import write_log
 from factory.commands.completion import candidates
 from factory.config.compose import ConfigError, compose
 from factory.config.plugins import installed, offered
+from factory.config.run import composed_run, load_config
 from factory.run import main as run_main
-from factory.setup.settings import load_config
 from factory.store.reader import SampleTable
 from planners.evaluation.contenders import contender
 from planners.models.registry import planner_class
@@ -174,21 +176,21 @@ def test_a_name_that_two_packages_offer_is_refused_with_both(site: Path, ask: ob
 
 
 @pytest.mark.parametrize(
-    ("kind", "name", "words", "settings"),
+    ("kind", "name", "words", "asked"),
     [
-        ("readers", "av2", ["clips=av2", "clips.root=/logs"], "run"),
-        ("experts", "human", ["experts=[human]"], "run"),
-        ("planners", "ltf", ["planner=ltf"], "train"),
+        ("readers", "av2", ["clips=av2", "clips.root=/logs"], composed_run),
+        ("experts", "human", ["experts=[human]"], composed_run),
+        ("planners", "ltf", ["planner=ltf"], partial(compose, "train")),
     ],
 )
 def test_a_name_that_is_built_in_is_refused_with_who_offers_it_too(
-    site: Path, kind: str, name: str, words: list[str], settings: str
+    site: Path, kind: str, name: str, words: list[str], asked: Any
 ) -> None:
-    compose(settings, words)
+    asked(words)
     install(site, "somebody", name, (kind,))
     importlib.invalidate_caches()
     with pytest.raises(ConfigError, match=rf"{kind[:-1]} {name} is built in, and somebody 1\.2 offers another"):
-        compose(settings, words)
+        asked(words)
 
 
 def test_a_folder_of_the_same_name_is_told_apart(site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,9 +4,10 @@ from pathlib import Path
 
 import pytest
 
+from factory.config.run import load_config
 from factory.exits import COMPLETE
 from factory.graph.execute import execute
-from factory.setup.settings import assemble, load_config
+from factory.setup.settings import assemble
 from factory.store.samples import Store
 from tests.factory.tables import assert_same_tables
 

@@ -21,9 +21,10 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from factory.readers.settings import TownSettings
 from factory.readers.town.reader import finish_whole, make_whole, unfinished_folder
 from factory.readers.town.town import log_name
-from factory.readers.town.write import TownSettings, write_logs
+from factory.readers.town.write import write_logs
 from factory.wording import time_text
 
 THREADS = 2  # of a town that is painted alone; a log's bytes do not depend on them

@@ -11,7 +11,8 @@ from pathlib import Path
 
 from factory.readers.av2.reader import AV2Reader
 from factory.readers.base import ClipIndex, ClipRef
-from factory.readers.town.write import TownSettings, write_town
+from factory.readers.settings import TownClips, TownSettings
+from factory.readers.town.write import write_town
 from tasks.caches import user_cache
 from tasks.world.clip import Clip
 
@@ -30,15 +31,14 @@ class SyntheticReader:
     def __init__(
         self,
         cache_dir: str | Path | None = None,
-        n_clips: int = 12,
-        seed: int = 0,
+        n_clips: int = TownClips.n_clips,
+        seed: int = TownClips.seed,
         settings: TownSettings | None = None,
     ) -> None:
         """cache_dir: where towns are kept; None: in the user's cache. Raises ValueError for n_clips < 1."""
-        if n_clips < 1:
-            raise ValueError(f"clips.n_clips: a town needs at least one clip, not {n_clips}")
+        clips = TownClips(n_clips=n_clips, seed=seed, settings=settings or TownSettings())
         self.cache_dir = Path(cache_dir or user_cache() / "towns").expanduser().absolute()
-        self.n_clips, self.seed, self.settings = n_clips, seed, settings or TownSettings()
+        self.n_clips, self.seed, self.settings = clips.n_clips, clips.seed, clips.settings
         self._logs: AV2Reader | None = None
 
     @property

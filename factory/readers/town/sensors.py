@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from factory.readers.settings import MOUNTS, check_cameras
 from factory.readers.town import textures as tx
 from factory.readers.town.draw import Stage, camera_view, look
 from tasks.world.arrays import F32, Array, Bytes, ShortInts
@@ -16,27 +17,14 @@ from tasks.world.camera import Camera
 
 REAR_AXLE_Z_M = 0.33  # the ego frame's origin above the road
 FIELD_OF_VIEW_RAD = np.deg2rad(70.0)  # horizontal
-_MOUNTS = {  # name: yaw [deg], x, y, z in the ego frame [m]; names as in AV2, but for the eighth
-    "ring_front_center": (0.0, 1.62, 0.0, 1.32),
-    "ring_front_left": (50.0, 1.52, 0.35, 1.32),
-    "ring_front_right": (-50.0, 1.52, -0.35, 1.32),
-    "ring_side_left": (100.0, 1.20, 0.45, 1.32),
-    "ring_side_right": (-100.0, 1.20, -0.45, 1.32),
-    "ring_rear_left": (150.0, 0.80, 0.35, 1.32),
-    "ring_rear_right": (-150.0, 0.80, -0.35, 1.32),
-    "ring_rear_center": (180.0, 0.70, 0.0, 1.32),
-}
-CAMERA_NAMES = tuple(_MOUNTS)
 
 
 def build_rig(names: tuple[str, ...], width: int, height: int) -> tuple[Camera, ...]:
     """The named cameras at width x height pixels; pixel (0, 0) covers image coordinates 0..1. Raises ValueError."""
-    unknown = [name for name in names if name not in _MOUNTS]
-    if unknown:
-        raise ValueError(f"unknown cameras {unknown}; known: {', '.join(CAMERA_NAMES)}")
+    check_cameras(names)
     focal = width / 2 / np.tan(FIELD_OF_VIEW_RAD / 2)
     intrinsics = np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
-    return tuple(Camera(name, width, height, intrinsics, np.zeros(3), _pose(*_MOUNTS[name])) for name in names)
+    return tuple(Camera(name, width, height, intrinsics, np.zeros(3), _pose(*MOUNTS[name])) for name in names)
 
 
 def _pose(yaw_deg: float, x: float, y: float, z: float) -> Array:

@@ -5,6 +5,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from factory.readers.settings import LOG_STEPS, LOGS_PER_TOWN
 from factory.readers.town.drive import Drive, parked_cars, plan_drive
 from factory.readers.town.ego import SCENARIOS
 from factory.readers.town.plan import build_streets
@@ -12,10 +13,7 @@ from factory.readers.town.scenery import Scenery, build_scenery
 from factory.readers.town.streets import Streets
 from factory.readers.town.traffic import Track
 
-LOGS_PER_TOWN = len(SCENARIOS)  # then another town of the same plan, with other lengths, bends, houses
-LOG_STEPS = 116  # annotated frames of a log, 11.5 s
 WINDOWS_PER_LOG = 3  # of 9.5 s at stride 1 s
-STEPS_PER_SWEEP = 5  # 2 Hz
 
 
 @dataclass(frozen=True)

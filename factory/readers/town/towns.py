@@ -8,10 +8,9 @@ from pathlib import Path
 
 from factory.readers.av2.reader import AV2Reader
 from factory.readers.base import ClipRef
+from factory.readers.settings import LOGS_PER_TOWN, TownsClips, TownSettings
 from factory.readers.town.painters import TownFolder, write_all
 from factory.readers.town.reader import TOWN_VERSION, sensed_digest
-from factory.readers.town.town import LOGS_PER_TOWN
-from factory.readers.town.write import TownSettings
 from tasks.caches import user_cache
 from tasks.world.clip import Clip
 
@@ -29,11 +28,11 @@ class SyntheticTownsReader(AV2Reader):
     def __init__(
         self,
         seeds: Sequence[int] | None = None,
-        first_seed: int = 0,
-        n_towns: int = 1,
-        logs_per_town: int = 3,
-        split: str = "train",
-        first_window: int = 0,
+        first_seed: int = TownsClips.first_seed,
+        n_towns: int = TownsClips.n_towns,
+        logs_per_town: int = TownsClips.logs_per_town,
+        split: str = TownsClips.split,
+        first_window: int = TownsClips.first_window,
         cache_dir: str | Path | None = None,
         settings: TownSettings | None = None,
     ) -> None:
@@ -41,11 +40,7 @@ class SyntheticTownsReader(AV2Reader):
 
         Raises ValueError for repeated or no seeds, an unknown split, or more logs than a town has kinds of drives.
         """
-        chosen = list(range(first_seed, first_seed + n_towns)) if seeds is None else list(seeds)
-        if not chosen or min(chosen) < 0 or len(set(chosen)) < len(chosen):
-            raise ValueError(f"clips.seeds: each town's seed once, 0 or more, at least one; not {chosen}")
-        if not 1 <= logs_per_town <= LOGS_PER_TOWN:
-            raise ValueError(f"clips.logs_per_town={logs_per_town}: a town has 1 to {LOGS_PER_TOWN} logs")
+        chosen = TownsClips(None if seeds is None else tuple(seeds), first_seed, n_towns, logs_per_town).chosen
         super().__init__(cache_dir or user_cache() / "towns", first_window=first_window, split=split)
         self.settings = settings or TownSettings()
         self.towns = tuple(self._town(seed, logs_per_town) for seed in chosen)

@@ -8,7 +8,6 @@ import sys
 import time
 from collections.abc import Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +18,12 @@ import pyarrow.feather
 import shapely
 from scipy.spatial.transform import Rotation
 
+from factory.readers.settings import LOG_STEPS, STEPS_PER_SWEEP, TownSettings
 from factory.readers.town.draw import Theatre, paint
 from factory.readers.town.drive import Drive
 from factory.readers.town.sensors import REAR_AXLE_Z_M, build_rig, scan, world_from_ego
 from factory.readers.town.streets import Lane, Streets
-from factory.readers.town.town import LOG_STEPS, STEPS_PER_SWEEP, WINDOWS_PER_LOG, Town, log_name, plan_log
+from factory.readers.town.town import WINDOWS_PER_LOG, Town, log_name, plan_log
 from factory.readers.town.traffic import GREEN, RED, YELLOW
 from factory.wording import time_text
 from tasks.world.arrays import Array, Ints
@@ -36,32 +36,6 @@ STEP_NS = 100_000_000
 FIRST_STAMP_NS = 315_970_000_000_000_000
 LOG_SPACING_NS = 60_000_000_000
 STATE_NAMES = {GREEN: "GREEN", YELLOW: "YELLOW", RED: "RED"}
-
-
-@dataclass(frozen=True)
-class TownSettings:
-    """What the sensors of the synthetic ego record."""
-
-    cameras: tuple[str, ...] = ("ring_front_left", "ring_front_center", "ring_front_right")  # any of rig.CAMERA_NAMES
-    width: int = 320  # pixels
-    height: int = 180
-    jpeg_quality: int = 92
-    steps_per_photo: int = 5  # of 0.1 s: 5 is 2 Hz, as fast as samples want them; 1 is 10 Hz, for scenes to learn from
-    photo_steps: int = LOG_STEPS  # of a log, from its first, that are photographed; the three windows' histories are 36
-    lidar_beams: int = 64  # 0: no lidar
-    lidar_azimuths: int = 900
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "cameras", tuple(self.cameras))  # configuration files give lists
-        build_rig(self.cameras, self.width, self.height)
-        if self.width < 16 or self.height < 16 or not 1 <= self.jpeg_quality <= 100:
-            raise ValueError(f"impossible picture: {self.width}x{self.height}, quality {self.jpeg_quality}")
-        if self.steps_per_photo < 1 or STEPS_PER_SWEEP % self.steps_per_photo:
-            raise ValueError(f"steps_per_photo must divide {STEPS_PER_SWEEP}, not {self.steps_per_photo}")
-        if not 1 <= self.photo_steps <= LOG_STEPS:
-            raise ValueError(f"photo_steps must be 1 to {LOG_STEPS}, the steps of a log, not {self.photo_steps}")
-        if self.lidar_beams < 0 or self.lidar_azimuths < 1:
-            raise ValueError(f"impossible lidar: {self.lidar_beams} beams, {self.lidar_azimuths} azimuths")
 
 
 def write_town(out: Path, n_clips: int, seed: int, settings: TownSettings, threads: int = 2) -> list[Path]:

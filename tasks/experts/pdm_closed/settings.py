@@ -19,7 +19,7 @@ class PdmSettings:
     headway_s: float = 1.5
     accel_max_mps2: float = 1.5
     decel_max_mps2: float = 3.0
-    exponent: int = 10
+    exponent: int = 10  # of IDM's free-road term
     shared_lead_memory: bool = True  # within one path, a speed inherits lead fields its own search did not write
     brakes_at_first_step: bool = True  # no lead is looked for before 0.2 s: until then one seems to stand at the bumper
     speed_below_zero: bool = True  # a stop before an oncoming car overshoots into creeping backwards

@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from tasks.experts.protocol import Plan
-from tasks.experts.recovery.feasible import DEFAULTS, FeasibleSettings, feasible
+from tasks.experts.recovery.feasible import feasible
+from tasks.experts.recovery.settings import RecoverySettings
 from tasks.stages import Rejected
 from tasks.world.arrays import Array
 from tasks.world.clip import HORIZON_STEPS, STEP_S, Scene
@@ -61,20 +62,11 @@ class RecoveryTable:
 
 
 @dataclass(frozen=True)
-class RecoverySettings:
-    """How to retrieve and what to do with what was found."""
-
-    smooth: bool = True  # False: the retrieved trajectory as it is, as published
-    weights: tuple[float, float, float, float, float, float] = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)  # of the matching vector
-    feasible: FeasibleSettings = DEFAULTS
-
-
-@dataclass(frozen=True)
 class Recovery:
     """Drives back to the log the way some human once did."""
 
     table: RecoveryTable
-    settings: RecoverySettings = RecoverySettings()
+    settings: RecoverySettings = field(default_factory=RecoverySettings)
     name: str = "recovery"
 
     def digest(self) -> str:

@@ -23,43 +23,19 @@ both problems always have a solution. Limits are those of the reward's comfort r
 because the tracker adds its own.
 """
 
-from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 import osqp
 from scipy import sparse
 
+from tasks.experts.recovery.settings import DEFAULTS, FeasibleSettings
 from tasks.world.arrays import Array
 from tasks.world.clip import HORIZON_STEPS, STEP_S
 from tasks.world.vehicle import AX, PACIFICA, STEERING, VX
 
 N = HORIZON_STEPS
 SLOW_MPS = 0.5  # limits that divide by the speed stop growing below it
-
-
-@dataclass(frozen=True)
-class FeasibleSettings:
-    """Limits and weights of the two QPs."""
-
-    accel_min_mps2: float = -3.6  # comfort: -4.05
-    accel_max_mps2: float = 2.1  # comfort: 2.40
-    jerk_max_mps3: float = 3.5  # comfort: 4.13
-    lateral_accel_max_mps2: float = 4.0  # comfort: 4.89
-    yaw_rate_max_radps: float = 0.8  # comfort: 0.95
-    yaw_accel_max_radps2: float = 1.5  # comfort: 1.93
-    curvature_max_1pm: float = 0.2  # turning circle of a car of this size, 10 m across
-    curvature_rate_max_1pms: float = 0.2  # steering wheel speed at standstill
-    weight_progress: float = 1.0
-    weight_jerk: float = 0.3
-    weight_lateral: float = 1.0
-    weight_heading: float = 10.0
-    weight_yaw_accel: float = 0.1
-    max_iterations: int = 4000
-    tolerance: float = 1e-4
-
-
-DEFAULTS = FeasibleSettings()
 
 
 def feasible(trajectory: Array, ego_state: Array, settings: FeasibleSettings = DEFAULTS) -> Array | str:

@@ -7,7 +7,7 @@ pedestrian or bicycle goes to that track's own Gaussians, in box coordinates.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from tasks.render.scene.features import triangulated
 from tasks.render.scene.movers import owners, world_from_boxes
 from tasks.render.scene.refit import FitPhoto, refit_colours
 from tasks.render.scene.sensed import Photo, Sweep, Tracks, fuse, shifted
+from tasks.render.scene.settings import AssetSettings
 from tasks.render.scene.sight import SHALLOW, Seen, see
 from tasks.render.scene.sky import SkyCollector, SkyMap, directions
 from tasks.render.scene.stereo import FAR_M
@@ -28,16 +29,6 @@ from tasks.world.arrays import F32, Array, Bools, Indices
 from tasks.world.camera import Pinhole
 
 MIN_NODE_DISCS = 40  # a track seen less is drawn as a plain box
-
-
-@dataclass(frozen=True)
-class AssetSettings:
-    """How a scene is built. Pixels are those of the photos handed in."""
-
-    max_gap_px: tuple[int, int] = (12, 24)  # columns, rows that are interpolated between lidar returns
-    refit_sweeps: int = 1  # a second one gains 0.02 .. 0.08 dB for a third of the time
-    hold_out_every: int = 8  # photo i of a camera with i % n == n // 2 only measures; 0: none is held out
-    stereo_photos: int = 4  # neighbours compared where lidar does not reach
 
 
 def build_asset(

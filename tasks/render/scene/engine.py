@@ -8,7 +8,6 @@ poses need none.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from types import MappingProxyType
 
 import numpy as np
@@ -16,16 +15,12 @@ import numpy as np
 from tasks.render.scene.asset import RenderAsset, scene_at
 from tasks.render.scene.movers import boxes_at
 from tasks.render.scene.sensed import shifted
+from tasks.render.scene.settings import Backend
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.raster import View, forward
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import F32, Array
 from tasks.world.camera import Pinhole
-
-
-class Backend(StrEnum):
-    CPU = "cpu"
-    GSPLAT = "gsplat"
 
 
 @dataclass(frozen=True)

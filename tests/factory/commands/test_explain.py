@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 
 from factory.commands.table import COMMANDS
+from factory.config.run import load_config
+from factory.readers.settings import TownSettings
 from factory.readers.town.reader import SyntheticReader
-from factory.readers.town.write import TownSettings
-from factory.setup.settings import assemble, load_config
+from factory.setup.settings import assemble
 from factory.stages import pipeline
 
 main = COMMANDS["explain"].load()

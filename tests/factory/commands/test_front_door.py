@@ -245,7 +245,7 @@ def test_completion_knows_commands_keys_groups_and_choices() -> None:
 
 
 def test_every_key_that_is_completed_is_one_the_run_takes() -> None:
-    from factory.config.compose import compose
+    from factory.config.run import composed_run
 
     def has(tree: object, key: str) -> bool:
         for part in key.split("."):
@@ -254,7 +254,7 @@ def test_every_key_that_is_completed_is_one_the_run_takes() -> None:
             tree = tree[part]
         return True
 
-    groups, settings = {"preset"}, compose("run", [])
+    groups, settings = {"preset"}, composed_run([])
     unknown = [key for key in settings_of([]) if key not in groups and not has(settings, key)]
     assert unknown == []
 

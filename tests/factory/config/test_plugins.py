@@ -12,10 +12,11 @@ import pytest
 
 from factory.__main__ import main as factory_main
 from factory.config.compose import ConfigError
+from factory.config.run import load_config
 from factory.graph.work import Accepted, Dropped, PreparedClip
 from factory.readers.base import BadClip
 from factory.run import main as run_main
-from factory.setup.settings import Run, assemble, load_config
+from factory.setup.settings import Run, assemble
 from factory.store.schema import BOOKKEEPING, sample_row_to_table
 from tasks.stages import Rejected
 

@@ -7,11 +7,11 @@ from typing import Any
 import pytest
 from mcap.reader import make_reader
 
+from factory.config.run import load_config
 from factory.exits import COMPLETE, INTERRUPTED
 from factory.graph import episodes
 from factory.graph.episodes import EpisodesWanted
 from factory.graph.execute import RunSummary, execute
-from factory.setup.settings import load_config
 from factory.store.episodes import FOLDER, episode_name, is_chosen
 from factory.store.location import Location
 from factory.store.samples import Store

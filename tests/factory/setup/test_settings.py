@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from factory.config.compose import ConfigError
-from factory.setup.settings import assemble, load_config, refuse_relative_root
+from factory.config.run import load_config, refuse_relative_root
+from factory.setup.settings import assemble
 from factory.setup.vocabulary import save_recovery_table
 from tasks.experts.recovery.expert import RecoveryTable
 from tasks.world.kinematic_vocabulary import kinematic_trajectories

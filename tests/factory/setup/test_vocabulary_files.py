@@ -11,8 +11,9 @@ import pytest
 from factory.commands.table import COMMANDS
 from factory.commands.vocabulary import Request, run
 from factory.config.arguments import Refused, parse
+from factory.config.run import VocabularyChoice
 from factory.readers.base import BadClip, ClipIndex, ClipRef
-from factory.setup.settings import VocabularyChoice, choose_vocabulary
+from factory.setup.settings import choose_vocabulary
 from factory.setup.vocabulary import (
     build_recovery_table,
     build_vocabulary,

@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from factory.config.run import BenchmarkSettings, load_config
 from factory.exits import COMPLETE
 from factory.graph.execute import execute
 from factory.graph.work import Accepted, Dropped, PreparedClip
 from factory.readers.base import ClipRef
-from factory.readers.town.write import TownSettings
-from factory.setup.settings import assemble, identity_of, load_config
-from factory.stages.benchmark import BenchmarkSettings, benchmark_of, write_benchmark
+from factory.readers.settings import TownSettings
+from factory.setup.settings import assemble, identity_of
+from factory.stages.benchmark import benchmark_of, write_benchmark
 from factory.stages.pipeline import FactoryWork, PerturbedClip
 from factory.store.cache import BadCacheFile
 from factory.store.location import Location

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from factory.config.run import load_config
 from factory.graph.work import HUMAN, HUMAN_CANDIDATE, Accepted, PreparedClip
 from factory.readers.base import BadClip
+from factory.readers.settings import TownSettings
 from factory.readers.town.reader import SyntheticReader
-from factory.readers.town.write import TownSettings
-from factory.setup.settings import assemble, load_config
+from factory.setup.settings import assemble
 from factory.stages.imaging import photo_at
 from factory.stages.pipeline import FactoryWork
 from factory.stages.sensors import block_of

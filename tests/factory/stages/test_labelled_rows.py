@@ -8,11 +8,12 @@ import pytest
 
 from factory.commands.table import COMMANDS
 from factory.config.compose import ConfigError
+from factory.config.run import load_config
 from factory.exits import BAD_CONFIG
 from factory.graph.work import HUMAN, HUMAN_CANDIDATE, Accepted, PreparedClip
 from factory.run import main as run_main
 from factory.setup.calibrate import calibrate, measure
-from factory.setup.settings import Run, assemble, load_config
+from factory.setup.settings import Run, assemble
 from factory.setup.vocabulary import save_vocabulary
 from factory.stages.pipeline import FactoryWork, PerturbedClip
 from factory.store.reader import LABEL_COLUMNS, SampleTable, labels_of

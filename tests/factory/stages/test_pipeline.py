@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from factory.config.run import load_config
 from factory.graph.work import HUMAN, HUMAN_BEFORE, HUMAN_CANDIDATE, Accepted, Dropped, PreparedClip
 from factory.readers.base import BadClip
+from factory.readers.settings import TownSettings
 from factory.readers.town.reader import SyntheticReader
-from factory.readers.town.write import TownSettings
-from factory.setup.settings import assemble, identity_of, load_config
+from factory.setup.settings import assemble, identity_of
 from factory.stages.pipeline import Considered, FactoryWork
 from factory.store.identity import UNLISTED
 from tasks import stages

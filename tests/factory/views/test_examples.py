@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from factory.config.run import load_config
 from factory.graph.execute import execute
-from factory.setup.settings import Run, assemble, load_config
+from factory.setup.settings import Run, assemble
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
 from factory.views.examples import Again, Row, rejected_examples, spread, strips_of

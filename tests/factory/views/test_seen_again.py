@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from factory.commands.table import COMMANDS
+from factory.config.run import load_config
 from factory.graph.execute import execute
+from factory.readers.settings import TownSettings
 from factory.readers.town.reader import SyntheticReader
-from factory.readers.town.write import TownSettings
-from factory.setup.settings import assemble, load_config
+from factory.setup.settings import assemble
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
 from factory.views.examples import strips_of

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from factory.commands.table import COMMANDS
 from factory.graph.work import HUMAN
 from factory.readers.av2.reader import AV2Reader
-from factory.readers.town.write import TownSettings, write_logs
+from factory.readers.settings import TownSettings
+from factory.readers.town.write import write_logs
 from factory.run import main as run_main
 from factory.store.reader import SampleTable
 from factory.views.bev import EXPERT, LOGGED

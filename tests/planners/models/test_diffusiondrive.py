@@ -210,7 +210,7 @@ def test_a_batch_that_lacks_something_is_refused() -> None:
 @pytest.mark.parametrize("name", ["diffusiondrive", "diffusiondrive_small"])
 def test_its_configuration_fills_its_settings(name: str) -> None:
     values = OmegaConf.to_container(OmegaConf.load(conf_dir() / "planner" / f"{name}.yaml"))
-    settings = fill(DiffusionDriveSettings, values["settings"], "settings")
+    settings = fill(DiffusionDriveSettings, values.get("settings", {}), "settings")
     fill(TrainingSettings, values["training"], "training")
     with torch.device("meta"):
         DiffusionDrive(settings, {"anchors": np.zeros((20, 8, 2))})

@@ -233,7 +233,7 @@ def test_the_fused_encoder_learns_too() -> None:
 @pytest.mark.parametrize("name", ["gtrs_dense", "gtrs_dense_v2_99", "gtrs_dense_small"])
 def test_its_configuration_fills_its_settings(name: str) -> None:
     values = OmegaConf.to_container(OmegaConf.load(conf_dir() / "planner" / f"{name}.yaml"))
-    settings = fill(GtrsDenseSettings, values["settings"], "settings")
+    settings = fill(GtrsDenseSettings, values.get("settings", {}), "settings")
     fill(TrainingSettings, values["training"], "training")
     with torch.device("meta"):
         GtrsDense(settings, {"vocabulary": scenes.vocabulary(2)})

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from factory.config.compose import compose, fill
-from factory.setup.settings import load_config
+from factory.config.run import load_config
 from planners.command import Failed
 from planners.study import recipe as module
 from planners.study.recipe import Recipe, factory, make

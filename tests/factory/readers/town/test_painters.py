@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from factory.readers.settings import TownSettings
 from factory.readers.town.painters import TownFolder, write_all, write_one
-from factory.readers.town.write import TownSettings
 
 SMALL = TownSettings(cameras=("ring_front_center",), width=32, height=18, lidar_beams=0)
 PATIENCE_S = 60.0
@@ -56,7 +56,7 @@ INTERRUPTED = """
 import os, signal, sys
 from pathlib import Path
 from factory.readers.town.painters import TownFolder, write_all
-from factory.readers.town.write import TownSettings
+from factory.readers.settings import TownSettings
 signal.signal(signal.SIGTERM, signal.default_int_handler)
 signal.signal(signal.SIGINT, signal.SIG_IGN)  # of the processes it starts, too
 os.cpu_count = lambda: 2

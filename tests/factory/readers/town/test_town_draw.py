@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 
+from factory.readers.settings import CAMERA_NAMES
 from factory.readers.town import textures as tx
 from factory.readers.town.draw import SHADOW_SIZE, Stage, camera_view, look, paint, sun_over
 from factory.readers.town.draw import _cast as cast
 from factory.readers.town.mesh import Builder
 from factory.readers.town.scenery import _signal as signal_mast
 from factory.readers.town.scenery import lamps_lit
-from factory.readers.town.sensors import CAMERA_NAMES, MOUNT_M, REAR_AXLE_Z_M, build_rig, scan, world_from_ego
+from factory.readers.town.sensors import MOUNT_M, REAR_AXLE_Z_M, build_rig, scan, world_from_ego
 from factory.readers.town.traffic import GREEN as GREEN_LIGHT
 from factory.readers.town.traffic import RED as RED_LIGHT
 from factory.readers.town.traffic import YELLOW as YELLOW_LIGHT

@@ -7,15 +7,16 @@ import pytest
 import shapely
 
 from factory.readers.av2.reader import AV2Reader
+from factory.readers.settings import LOG_STEPS, TownSettings
 from factory.readers.town import curves
 from factory.readers.town.drive import plan_drive
 from factory.readers.town.ego import SCENARIOS, centre_boxes
 from factory.readers.town.plan import build_streets
 from factory.readers.town.streets import Streets
-from factory.readers.town.town import LOG_STEPS, WINDOWS_PER_LOG, plan_log
+from factory.readers.town.town import WINDOWS_PER_LOG, plan_log
 from factory.readers.town.traffic import GREEN, RED, YELLOW, Driver, Signals, drive, overlaps
 from factory.readers.town.traffic import Path as LanePath
-from factory.readers.town.write import TownSettings, write_town
+from factory.readers.town.write import write_town
 from tasks.trajectories import score_trajectories
 from tasks.world.clip import NOW
 from tasks.world.frames import box_corners, to_local

@@ -10,9 +10,10 @@ import pyarrow.feather
 import pytest
 
 import factory.readers.town.reader as reader_module
+from factory.readers.settings import LOG_STEPS, STEPS_PER_SWEEP, TownSettings
 from factory.readers.town.reader import SyntheticReader
-from factory.readers.town.town import LOG_STEPS, STEPS_PER_SWEEP, WINDOWS_PER_LOG
-from factory.readers.town.write import LICENCE, TownSettings, write_town
+from factory.readers.town.town import WINDOWS_PER_LOG
+from factory.readers.town.write import LICENCE, write_town
 from tasks.world.clip import Clip
 from tasks.world.lanes import LightState
 

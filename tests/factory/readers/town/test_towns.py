@@ -6,10 +6,11 @@ import pytest
 
 import factory.readers.town.painters as painters_module
 from factory.readers.base import BadClip, ClipRef
+from factory.readers.settings import LOGS_PER_TOWN, TownSettings
+from factory.readers.town.ego import SCENARIOS
 from factory.readers.town.reader import SyntheticReader
-from factory.readers.town.town import LOGS_PER_TOWN
 from factory.readers.town.towns import SyntheticTownsReader
-from factory.readers.town.write import TownSettings, write_logs, write_town
+from factory.readers.town.write import write_logs, write_town
 
 BLIND = TownSettings(cameras=(), lidar_beams=0)
 
@@ -48,7 +49,7 @@ def test_a_seeds_clips_are_the_same_whatever_other_seeds_are_read(reader: Synthe
 
 def test_nine_towns_of_two_logs_have_every_kind_of_drive_once(folder: Path) -> None:
     indices = [i for town in reader_of(folder, list(range(9)), 2).towns for i in town.indices]
-    assert sorted(indices) == list(range(LOGS_PER_TOWN))
+    assert sorted(indices) == list(range(LOGS_PER_TOWN)) and len(SCENARIOS) == LOGS_PER_TOWN
 
 
 @pytest.mark.slow

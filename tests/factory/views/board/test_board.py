@@ -15,8 +15,9 @@ import pytest
 from factory.commands.dashboard import Request, awaited
 from factory.commands.table import COMMANDS
 from factory.config.arguments import Refused, parse
+from factory.config.run import load_config
 from factory.graph.execute import execute
-from factory.setup.settings import assemble, load_config
+from factory.setup.settings import assemble
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
 from factory.views.board.overview import QUIET_S, overview

@@ -1,0 +1,237 @@
+"""The settings of `python -m factory.run`, typed, and their defaults.
+
+Importing them is cheap, and all are held against their types here, so that a mistyped word is told at once.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from factory.config.compose import compose, conf_dir, fill, need_run_extra, refuse_unknown
+from factory.config.plugins import with_experts
+from factory.config.shapes import defaults_of, keys_of, merged
+from factory.config.words import ConfigError, nearest
+from factory.job import in_submitted_job
+from factory.readers.settings import LogClips, TownClips, TownsClips
+from tasks.experts.pdm_closed.settings import PdmSettings
+from tasks.experts.recovery.settings import RecoverySettings
+from tasks.render.settings import RenderMode, RenderSettings
+from tasks.rollout.settings import TrafficSettings
+from tasks.settings import ExpertGate, PerturbSettings
+
+MOST_K = 2**17  # of a kinematic vocabulary: 126 MB of trajectories, eight times the largest in use
+READERS: Mapping[str, type[Any]] = {  # `_target_` of a built-in reader -> its settings
+    "factory.readers.av2.reader.AV2Reader": LogClips,
+    "factory.readers.scenarionet.reader.ScenarioNetReader": LogClips,
+    "factory.readers.town.reader.SyntheticReader": TownClips,
+    "factory.readers.town.towns.SyntheticTownsReader": TownsClips,
+}
+
+
+@dataclass(frozen=True)
+class VocabularyChoice:
+    """Which trajectories perturb the ego."""
+
+    file: str | None = None  # .npy (K, 40, 3) of human ones; null: the kinematic vocabulary, for first looks
+    k: int | None = None  # the first k of the file alone, null: all; size of the kinematic vocabulary, null: 1024
+    human: bool = False  # true: refuse to run without a file
+
+    def __post_init__(self) -> None:
+        if self.k is not None and self.k < 1:
+            raise ValueError(f"k={self.k}: must be positive, or null for the whole file")
+        if self.human and self.file is None:
+            raise ValueError("file is missing: give vocabulary.file=<.npy (K, 40, 3) of human trajectories>")
+        if self.file is None and self.k is not None and self.k > MOST_K:
+            raise ValueError(f"k={self.k}: a kinematic vocabulary has at most {MOST_K:,} trajectories")
+
+
+@dataclass(frozen=True)
+class RewardSettings(ExpertGate):
+    """What an expert's drive must reach, and the vocabulary labels that stand in every sample."""
+
+    labels: Literal["vocabulary", "none"] = "vocabulary"  # of a whole vocabulary, for planners that learn to score
+    traffic: Literal["replay", "idm"] = "replay"  # that of the sample's own judged drive, or one that answers to each
+    label_vocabulary: str | None = None  # another .npy file (K, 40, 3); null: the run's vocabulary
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.labels == "none" and self.label_vocabulary is not None:
+            raise ValueError(
+                f"label_vocabulary={self.label_vocabulary} is for labels=vocabulary, but labels=none: leave one out"
+            )
+
+
+@dataclass(frozen=True)
+class BenchmarkSettings:
+    """What makes a clip of preset=hard_benchmark count."""
+
+    min_follow_ups: int = 8  # complete pairs; clips with fewer are named and do not count
+
+    def __post_init__(self) -> None:
+        if self.min_follow_ups < 1:
+            raise ValueError(f"min_follow_ups={self.min_follow_ups}: at least one is needed")
+
+
+@dataclass(frozen=True)
+class RecoverySources(RecoverySettings):
+    """A recovery expert, and what its table is made from."""
+
+    table: str | None = None  # .npz of `factory vocabulary table=...`; null: the clips' TRAIN windows and vocabularies
+    vocabularies: tuple[str, ...] = ()  # further .npy files of human trajectories, beside the run's vocabulary.file
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Everything on the command line of `python -m factory.run`."""
+
+    clips: dict[str, Any]  # the reader, and which clips of its data
+    expert: dict[str, dict[str, Any]]  # all there are; `experts` picks
+    out: str  # folder or URL; the same command on it resumes; default $FACTORY_RUNS or runs/, and the name of the clips
+    rounds: int = 1  # accepted attempts wanted per clip and expert
+    experts: tuple[str, ...] = ("pdm_closed", "recovery", "human")  # who drives
+    executor: Literal["ray", "local"] = "ray"  # local: in this process, for a debugger
+    workers: int | None = None  # processes; null: every core; on a cluster that grows: tasks at once
+    gpu_share: float = 0.1  # of a GPU that an attempt claims on Ray with render.backend=gsplat; 1/share share one
+    limit: int | None = None  # read this many clips only
+    seed: int = 0  # of every random draw
+    on_change: Literal["stop", "keep", "redo"] = "stop"  # when settings or stage versions differ from the table's
+    retry_failed: bool = False  # run attempts again that failed on their input or by a bug
+    minutes: float | None = None  # after which nothing new is begun (exit code 4); the same command goes on
+    shard_seconds: float = 30.0  # between commits, if no partition reaches 128 MB before; longer: larger files
+    episodes: int | Literal["none", "all"] = "none"  # or n for one sample in n: MCAP files under out/episodes
+    vocabulary: VocabularyChoice = field(default_factory=VocabularyChoice)
+    perturb: PerturbSettings = field(default_factory=PerturbSettings)
+    traffic: TrafficSettings = field(default_factory=TrafficSettings)
+    pdm: PdmSettings = field(default_factory=PdmSettings)
+    reward: RewardSettings = field(default_factory=RewardSettings)
+    render: RenderSettings = field(default_factory=RenderSettings)
+    benchmark: BenchmarkSettings = field(default_factory=BenchmarkSettings)
+
+    def __post_init__(self) -> None:
+        if self.rounds < 1:
+            raise ValueError(f"rounds={self.rounds}: at least one round is needed")
+        if not self.experts or len(set(self.experts)) != len(self.experts):
+            raise ValueError(f"experts={list(self.experts)}: name each expert once, at least one")
+        if self.minutes is not None and not self.minutes >= 0.0:
+            raise ValueError(f"minutes={self.minutes}: must not be negative, or null for no bound")
+        if not self.shard_seconds > 0.0:
+            raise ValueError(f"shard_seconds={self.shard_seconds}: must be positive")
+        if self.one_episode_in < 0 or self.episodes == 0:
+            raise ValueError(f"episodes={self.episodes}: must be none, all, or n for one sample in n")
+        for name in ("limit", "workers"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"{name}={value}: must be positive, or null for no bound")
+        if not 0.0 <= self.gpu_share <= 1.0:
+            raise ValueError(f"gpu_share={self.gpu_share}: the share of one GPU that an attempt claims, 0 to 1")
+        unknown = [name for name in self.experts if name not in self.expert]
+        if unknown:
+            raise ValueError(
+                f"experts: {unknown} is not among {sorted(self.expert)}{nearest(unknown[0], list(self.expert))}; "
+                "add your own with expert.<name>._target_=<class>"
+            )
+
+    @property
+    def one_episode_in(self) -> int:
+        """Samples; 0 for no episode at all."""
+        return {"none": 0, "all": 1}[self.episodes] if isinstance(self.episodes, str) else self.episodes
+
+
+def composed_run(words: Sequence[str]) -> dict[str, Any]:
+    """The settings of a command line with all defaults, not yet typed. Raises ConfigError."""
+    values = with_experts(compose("run", words, RunConfig))
+    for key, shape in shapes_in(values).items():
+        group, _, name = key.partition(".")
+        given = values[group][name] if name else values[group]
+        refuse_unknown(shape, without_labels(given), key, said=_elsewhere)
+        full = {**given, **merged(defaults_of(shape), given)}
+        values = {**values, group: {**values[group], name: full} if name else full}
+    return values
+
+
+def run_config(values: Mapping[str, Any]) -> RunConfig:
+    """The typed settings of composed ones, those of the reader and of the experts held against their types too.
+
+    Raises ConfigError.
+    """
+    config = fill(RunConfig, values, "")
+    for key, shape in shapes_in(values).items():
+        group, _, name = key.partition(".")
+        filled = fill(shape, without_labels(values[group][name] if name else values[group]), key)
+        if isinstance(filled, TownClips | TownsClips):
+            _refuse_cameras_without(config.render, filled.settings.cameras)
+    if config.executor == "ray":
+        need_run_extra("ray")
+    return config
+
+
+def _refuse_cameras_without(render: RenderSettings, rig: Sequence[str]) -> None:
+    """Raises ConfigError for a camera that the town's rig has not; other rigs are known when clips are read."""
+    missing = [name for name in render.cameras if name not in rig] if rig and render.mode is not RenderMode.NONE else []
+    if missing:
+        raise ConfigError(f"render.cameras: no camera {', '.join(missing)}; this rig has {', '.join(rig)}")
+
+
+def refuse_relative_root(clips: Mapping[str, Any]) -> None:
+    """Raises ConfigError for a relative clips.root inside a submitted Ray job, whose folder is a temporary copy."""
+    root = clips.get("root")
+    if in_submitted_job() and isinstance(root, str) and not Path(root).expanduser().is_absolute():
+        raise ConfigError(
+            f"clips.root={root} is relative, and a submitted job runs in a copy of the working directory: "
+            "name an absolute path that every node sees"
+        )
+
+
+def refuse_missing_root(clips: Mapping[str, Any]) -> None:
+    """Raises ConfigError where a built-in reader's clips.root is not there, before the reader is imported."""
+    refuse_relative_root(clips)
+    root = clips.get("root")
+    if clips.get("_target_") in READERS and isinstance(root, str) and not Path(root).expanduser().exists():
+        raise ConfigError(f"clips: {root}: no such folder")
+
+
+def load_config(words: Sequence[str]) -> RunConfig:
+    """The typed settings of a command line. Raises ConfigError."""
+    return run_config(composed_run(words))
+
+
+def shapes_in(values: Mapping[str, Any]) -> dict[str, type[Any]]:
+    """Key -> dataclass of the built-in reader and experts that a run's settings name."""
+    reader = READERS.get(values["clips"].get("_target_", ""))
+    recovery = {
+        f"expert.{name}": RecoverySources for name, spec in values["expert"].items() if spec.get("kind") == "recovery"
+    }
+    return {**({} if reader is None else {"clips": reader}), **recovery}
+
+
+def without_labels(spec: Mapping[str, Any]) -> dict[str, Any]:
+    """What is a setting of the reader or expert itself."""
+    return {
+        key: without_labels(value) if isinstance(value, Mapping) else value
+        for key, value in spec.items()
+        if key not in ("name", "kind", "_target_")
+    }
+
+
+def reader_of(choice: str) -> type[Any] | None:
+    """The settings of the built-in reader `clips=<choice>`; None where there is none of that name."""
+    file = conf_dir() / "clips" / f"{choice}.yaml"
+    target = re.search(r"^_target_: (\S+)", file.read_text(), re.M) if file.is_file() else None
+    return None if target is None else READERS.get(target[1])
+
+
+def _elsewhere(key: str) -> str:
+    """Which other choices have this key of `clips`."""
+    group, _, inner = key.partition(".")
+    names = sorted(file.stem for file in (conf_dir() / "clips").glob("*.yaml")) if group == "clips" else []
+    shapes = {name: shape for name in names if (shape := reader_of(name)) is not None}
+    having = [f"clips={name}" for name, shape in shapes.items() if inner in dict(keys_of(shape))]
+    return f"{key} is a setting of {' and '.join(having)}: choose one of them too" if having else ""
+
+
+def recovery_settings(config: RunConfig, name: str) -> tuple[RecoverySources, RecoverySettings]:
+    """Typed. Raises ConfigError."""
+    sources = fill(RecoverySources, without_labels(config.expert[name]), f"expert.{name}")
+    return sources, RecoverySettings(sources.smooth, sources.weights, sources.feasible)

@@ -1,0 +1,133 @@
+"""What a dataclass of settings says of itself: its keys, their defaults, their choices, and what each means.
+
+A field means what the comment behind it says; a group of fields, what its dataclass' docstring begins with.
+"""
+
+import inspect
+import io
+import json
+import re
+import tokenize
+from collections.abc import Iterator, Mapping
+from dataclasses import MISSING, Field, asdict, fields, is_dataclass
+from enum import Enum
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+SWITCH = ("false", "true")
+PLAIN = re.compile(r"[A-Za-z_/.~]([\w./:~-]*[\w./~-])?")  # text that YAML reads as text without quotes,
+OTHERWISE = {"null", "~", "true", "false", "yes", "no", "on", "off", "y", "n"}  # but for these
+
+
+def dataclass_in(hint: Any) -> type[Any] | None:
+    """The dataclass that a field's type is, or allows beside None."""
+    options = get_args(hint) if get_origin(hint) is not None else (hint,)
+    return next((option for option in options if isinstance(option, type) and is_dataclass(option)), None)
+
+
+def keys_of(shape: type[Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Every key with dots, groups before what is in them, and its type."""
+    hints = get_type_hints(shape)
+    for field in fields(shape):
+        yield f"{prefix}{field.name}", hints[field.name]
+        inner = dataclass_in(hints[field.name])
+        if inner is not None:
+            yield from keys_of(inner, f"{prefix}{field.name}.")
+
+
+def choices_of(hint: Any) -> list[str]:
+    """The words that a key may have, where they are few."""
+    if hint is bool:
+        return list(SWITCH)
+    if isinstance(hint, type) and issubclass(hint, Enum):
+        return [str(member.value) for member in hint]
+    if get_origin(hint) is Literal:
+        return [str(value) for value in get_args(hint)]
+    return [choice for option in get_args(hint) if get_origin(option) is Literal for choice in choices_of(option)]
+
+
+def defaults_of(shape: type[Any]) -> dict[str, Any]:
+    """Key -> default of every field that has one, as YAML would hold it."""
+    return {field.name: plain(_default(field)) for field in fields(shape) if _default(field) is not MISSING}
+
+
+def _default(field: Field[Any]) -> Any:
+    return field.default if field.default_factory is MISSING else field.default_factory()
+
+
+def plain(value: Any) -> Any:
+    """Dataclasses as mappings, tuples as lists, enums as text."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return plain(asdict(value))
+    if isinstance(value, Mapping):
+        return {key: plain(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(inner) for inner in value]
+    return value.value if isinstance(value, Enum) else value
+
+
+def merged(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """`under` with what `over` says, group by group."""
+    both = {
+        key: merged(under[key], value) if isinstance(value, Mapping) and isinstance(under.get(key), Mapping) else value
+        for key, value in over.items()
+    }
+    return {**under, **both}
+
+
+def meanings(shape: type[Any]) -> Mapping[str, str]:
+    """Field -> its comment; of a group without one, the first sentence of its docstring."""
+    found: dict[str, str] = {}
+    for cls in reversed(shape.__mro__):
+        if is_dataclass(cls):
+            found |= _comments(cls)
+    for name, hint in get_type_hints(shape).items():
+        inner = dataclass_in(hint)
+        if inner is not None and name not in found:
+            found[name] = (inspect.getdoc(inner) or "").partition("\n")[0].rstrip(".")
+    return found
+
+
+def _comments(cls: type[Any]) -> dict[str, str]:
+    """Field -> the comments on the lines of its statement."""
+    names, found, words = inspect.get_annotations(cls), {}, []
+    statement: list[str] = []
+    for token in tokenize.generate_tokens(io.StringIO(inspect.cleandoc("\n" + inspect.getsource(cls))).readline):
+        if token.type == tokenize.COMMENT and statement:
+            words.append(token.string.lstrip("# "))
+        elif token.type == tokenize.NEWLINE:
+            if words and len(statement) > 1 and statement[0] in names and statement[1] == ":":
+                found[statement[0]] = " ".join(words)
+            statement, words = [], []
+        elif token.type in (tokenize.NAME, tokenize.OP, tokenize.NUMBER, tokenize.STRING):
+            statement.append(token.string)
+    return found
+
+
+def described(
+    values: Mapping[str, Any], shape: type[Any] | None, others: Mapping[str, type[Any]], key: str = ""
+) -> Iterator[str]:
+    """The values as lines of YAML, each with its meaning behind it.
+
+    others: key with dots -> the dataclass of a group that `shape` leaves open.
+    """
+    hints = {} if shape is None else get_type_hints(shape)
+    about = {} if shape is None else meanings(shape)
+    for name, value in values.items():
+        path = f"{key}.{name}" if key else name
+        words = choices_of(hints.get(name))
+        said = "; ".join(filter(None, (" | ".join(words) if words != list(SWITCH) else "", about.get(name))))
+        comment = f"  # {said}" if said else ""
+        pad = "  " * path.count(".")
+        if isinstance(value, Mapping) and value:
+            yield f"{pad}{name}:{comment}"
+            yield from described(value, others.get(path, dataclass_in(hints.get(name))), others, path)
+        else:
+            yield f"{pad}{name}: {_scalar(value)}{comment}"
+
+
+def _scalar(value: Any) -> str:
+    if isinstance(value, list):
+        return f"[{', '.join(map(_scalar, value))}]"
+    if isinstance(value, str) and PLAIN.fullmatch(value) and value.lower() not in OTHERWISE:
+        return value
+    return json.dumps(value)
