@@ -23,9 +23,8 @@ from tasks.reward.rules.comfort import N_FLAGS
 from tasks.reward.rules.obstacles import N_TIMES, Obstacles, unindexed
 from tasks.reward.verdicts import INDEX_FROM_ROWS, NO_DRIVE, Verdicts, World, judge_all, shaped, world_of
 from tasks.subscores import INDEX, LABELLED
+from tasks.world.arrays import Array, Bools
 
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 Normalise = Literal["batch", "pairs"]
 _NORMALISE = get_args(Normalise)
 _NO_BOXES, _NO_FLAGS = np.empty((0, N_TIMES, 0, 5)), np.empty((0, 0), np.bool_)
@@ -150,7 +149,7 @@ def human_filtered(scores: Scores, human: Scores) -> Scores:
     return replace(scores, multiplier=multiplier, pdm_score=pdm_score)
 
 
-def rows(scores: Scores, index: slice | NDArray[np.integer] | NDArray[np.bool_]) -> Scores:
+def rows(scores: Scores, index: slice | NDArray[np.integer] | Bools) -> Scores:
     """The chosen rows of the scores; progress stays relative to the batch it was scored in."""
     return Scores(**{field.name: getattr(scores, field.name)[index] for field in fields(Scores)})
 

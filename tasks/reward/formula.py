@@ -5,11 +5,9 @@ from functools import reduce
 from operator import add, mul
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.subscores import RECORDS
-
-Array = NDArray[np.float64]
+from tasks.world.arrays import Array
 
 _IN_ORDER = sorted(RECORDS, key=lambda record: record.section)
 MULTIPLIERS = tuple(record.name for record in _IN_ORDER if record.weight is None)

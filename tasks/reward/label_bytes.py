@@ -13,13 +13,11 @@ from dataclasses import dataclass, make_dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.reward.formula import TOTAL_WEIGHT, multiplied, share_of_best, weighted
 from tasks.subscores import HALVES, JUDGED, WHOLES
+from tasks.world.arrays import Array, Bools, Bytes
 
-Array = NDArray[np.float64]
-Bits = NDArray[np.uint8]
 Normalise = Literal["pairs", "batch", "masked"]
 
 ARRAYS = (*JUDGED, "ep_raw_m")  # of VocabularyLabels, and by the same names of Scores
@@ -113,7 +111,7 @@ def decode(
     return VocabularyLabels(vocabulary, traffic, reference_progress_m, ep_raw_m=ep_raw_m, **scores)
 
 
-def _planes(labels: VocabularyLabels) -> Iterator[NDArray[np.bool_]]:
+def _planes(labels: VocabularyLabels) -> Iterator[Bools]:
     """Each (K,), in their order. Raises ValueError."""
     for name in HALVES:
         score = getattr(labels, name)
@@ -137,7 +135,7 @@ def _sealed(body: bytes) -> bytes:
     return body + zlib.crc32(body).to_bytes(CRC_BYTES, "little")
 
 
-def _opened(name: str, sealed: bytes) -> Bits:
+def _opened(name: str, sealed: bytes) -> Bytes:
     """The bytes before their checksum. Raises ValueError."""
     body, crc = sealed[:-CRC_BYTES], sealed[-CRC_BYTES:]
     if len(sealed) < CRC_BYTES or zlib.crc32(body).to_bytes(CRC_BYTES, "little") != crc:

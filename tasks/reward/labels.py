@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.reward.epdms import Scores, rows, score
 from tasks.reward.label_bytes import ARRAYS, VocabularyLabels
@@ -12,10 +11,10 @@ from tasks.reward.prepare import PreparedScene
 from tasks.reward.reactive import reactive_scores
 from tasks.rollout.lqr import track_local
 from tasks.rollout.simulate import TrafficSettings
+from tasks.world.arrays import Array
 from tasks.world.clip import Scene
 from tasks.world.vocabulary import Vocabulary
 
-Array = NDArray[np.float64]
 TRAJECTORIES_AT_ONCE = 4096  # 15 MB of states
 
 

@@ -10,12 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.reward.epdms import Scores, human_filtered, score_with_ec
 from tasks.reward.formula import MULTIPLIERS, WEIGHTS
-
-Array = NDArray[np.float64]
+from tasks.world.arrays import Array
 
 COLUMNS = (*MULTIPLIERS, *WEIGHTS, "ec", "score")
 

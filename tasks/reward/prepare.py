@@ -6,7 +6,6 @@ from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.kernels.compiled import read_only
 from tasks.reward.rules.centerline import Centerline, index_centerline
@@ -15,15 +14,13 @@ from tasks.reward.rules.lights import NEVER_RED, RedLanes, index_red_lanes
 from tasks.reward.rules.map_index import MapIndex, index_map
 from tasks.reward.rules.obstacles import N_TIMES, Obstacles, index_obstacles, lay_out
 from tasks.world.agents import MOVING_KINDS, AgentKind, AgentTracks
+from tasks.world.arrays import Array, Bools
 from tasks.world.bounds import LARGEST, all_within
 from tasks.world.boxes import ego_boxes
 from tasks.world.clip import Clip, Scene
 from tasks.world.lanes import LightState, MapLayer, MapPolygon
 from tasks.world.polygons import polygons_near
 from tasks.world.vehicle import EGO_STATE_SIZE, PACIFICA, Vehicle
-
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 PAST_STEPS = (0, 5, 10, 15)  # of the 1.5 s history at 10 Hz: -1.5, -1.0, -0.5, 0 s
 _NOBODY = read_only(np.full(5, np.nan))

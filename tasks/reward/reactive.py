@@ -1,19 +1,16 @@
 """Scores of many ego trajectories, each among the traffic that answers to it."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.reward.epdms import Scores, joined, score_among
 from tasks.reward.prepare import collision_scores, prepare_scene
 from tasks.reward.rules.obstacles import STOPPED_SPEED_MPS
 from tasks.reward.verdicts import checked_states
 from tasks.rollout.simulate import Rollouts, TrafficSettings, prepare_traffic, roll_out_many
+from tasks.world.arrays import Array, Bools
 from tasks.world.boxes import ego_boxes, touching
 from tasks.world.clip import HORIZON_STEPS, Scene
 from tasks.world.vehicle import PACIFICA
-
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 EGOS_AT_ONCE = 256  # 0.6 MB per agent of traffic
 

@@ -16,11 +16,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.reward.one_stage import FrameScores, means_of, means_over
-
-Array = NDArray[np.float64]
+from tasks.world.arrays import Array
 
 WEIGHT_VARIANCE_M2 = 0.1
 

@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numba.extending import register_jitable
-from numpy.typing import NDArray
 
 from tasks.kernels.compiled import kernel
 from tasks.reward.prepare import N_TIMES, PreparedScene
@@ -19,11 +18,9 @@ from tasks.reward.rules.lights import RedLanes, first_red
 from tasks.reward.rules.map_index import MapIndex
 from tasks.reward.rules.obstacles import Obstacles, with_objects, within_reach
 from tasks.subscores import LABELLED, WHOLES
+from tasks.world.arrays import Array, Bools, Bytes
 from tasks.world.bounds import LARGEST, all_within
 from tasks.world.vehicle import EGO_STATE_SIZE, Vehicle
-
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 NO_DRIVE = f"states must be finite and at most {LARGEST:g}: leave out what is not a drive"
 
@@ -162,7 +159,7 @@ def _judge_one(world: World, everything: Obstacles, states: Array, scratch: Scra
 
 
 @kernel
-def _spread_flags(flags: NDArray[np.uint8], out: Bools) -> None:
+def _spread_flags(flags: Bytes, out: Bools) -> None:
     for t in range(len(flags)):
         out[t, 0] = flags[t] & MULTIPLE_LANES != 0
         out[t, 1] = flags[t] & NON_DRIVABLE != 0
@@ -170,7 +167,7 @@ def _spread_flags(flags: NDArray[np.uint8], out: Bools) -> None:
 
 
 @kernel
-def _first_with(flags: NDArray[np.uint8], bit: int) -> float:
+def _first_with(flags: Bytes, bit: int) -> float:
     for t in range(len(flags)):
         if flags[t] & bit:
             return float(t)

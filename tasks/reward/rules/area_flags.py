@@ -23,12 +23,9 @@ from tasks.reward.rules.map_index import (
     ON_ROUTE,
     MapIndex,
 )
+from tasks.world.arrays import Array, Bytes, ShortInts
 
-Array = NDArray[np.float64]
 Bits = NDArray[np.uint64]
-Bools = NDArray[np.bool_]
-Bytes = NDArray[np.uint8]
-ShortInts = NDArray[np.int32]
 
 
 class Held(NamedTuple):

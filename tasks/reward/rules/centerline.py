@@ -8,13 +8,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.kernels.compiled import kernel
+from tasks.world.arrays import Array, ShortInts
 from tasks.world.bounds import LARGEST
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int32]
 
 DEVIATION_M = 0.5  # farther than this is off the centreline
 CHUNK = 8  # segments within one circle
@@ -33,8 +30,8 @@ class Centerline(NamedTuple):
     segments: Array  # (S, 6) [m] start x, y; end x, y; length, 0 where a point repeats; arc length at the start
     circles: Array  # (C, 3) [m] a point of the chunk, x and y, about its middle; radius that holds the chunk
     grid: Array  # (3,) [m] lower left corner x, y; size of a cell
-    cell_start: Ints  # (rows, columns + 1): cell (r, c) has near[cell_start[r, c] : cell_start[r, c + 1]]
-    near: Ints  # the segments within DEVIATION_M of any point of the cell
+    cell_start: ShortInts  # (rows, columns + 1): cell (r, c) has near[cell_start[r, c] : cell_start[r, c + 1]]
+    near: ShortInts  # the segments within DEVIATION_M of any point of the cell
 
 
 def index_centerline(points: Array) -> Centerline:
@@ -91,7 +88,7 @@ def _grid(xy: Array) -> tuple[Array, tuple[int, int]]:
 
 
 @kernel
-def _enter_cells(segments: Array, grid: Array, cursor: Ints, near: Ints) -> None:
+def _enter_cells(segments: Array, grid: Array, cursor: ShortInts, near: ShortInts) -> None:
     """Where `near` is empty, count into cursor (rows, columns) the segments near each cell; else write them at the
     cursors, which move on."""
     cell_m = grid[2]

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba.extending import register_jitable
-from numpy.typing import NDArray
 
 from tasks.kernels.compiled import kernel
 from tasks.reward.rules.smooth import jerk_of, plan_yaw_accel_of, smooth_accel, unwrap, yaw_accel_of, yaw_rate_of
+from tasks.world.arrays import Array, Bools
 from tasks.world.bounds import LARGEST, all_within
 from tasks.world.clip import HORIZON_STEPS, STEP_S
 from tasks.world.vehicle import (
@@ -24,9 +24,6 @@ from tasks.world.vehicle import (
     YAW_ACCEL,
     YAW_RATE,
 )
-
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 LON_ACCEL_MPS2 = (-4.05, 2.40)
 LAT_ACCEL_MPS2 = 4.89

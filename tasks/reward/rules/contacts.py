@@ -7,7 +7,6 @@ harmless.
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.kernels.compiled import kernel
 from tasks.reward.rules.area_flags import in_intersection
@@ -15,10 +14,8 @@ from tasks.reward.rules.ego import OFF_LANE, Body
 from tasks.reward.rules.map_index import MapIndex
 from tasks.reward.rules.obstacles import Obstacles, box_at, cell_of, out_of_reach
 from tasks.reward.rules.overlap import Box, apart, centroid, touching
+from tasks.world.arrays import Array, Bools
 from tasks.world.vehicle import HEADING, X, Y
-
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 STOPPED_EGO_MPS = 0.05
 STOPPED_EGO_TTC_MPS = 5e-3

@@ -5,13 +5,11 @@ from typing import NamedTuple
 
 import numpy as np
 from numba.extending import register_jitable
-from numpy.typing import NDArray
 
 from tasks.kernels.compiled import kernel
 from tasks.kernels.trig import sincos
+from tasks.world.arrays import Array, Bytes
 from tasks.world.vehicle import HEADING, VX, VY, X, Y
-
-Array = NDArray[np.float64]
 
 # Bits of an instant's flags (docs/reward.md 2a)
 MULTIPLE_LANES = 1  # corners in more than one lane, and no lane holds all four
@@ -29,7 +27,7 @@ class Body(NamedTuple):
     cos: Array  # (41,) of the heading
     sin: Array  # (41,)
     speed: Array  # (41,) hypot(vx, vy) [m/s]
-    flags: NDArray[np.uint8]  # (41,) bits above
+    flags: Bytes  # (41,) bits above
 
 
 @register_jitable

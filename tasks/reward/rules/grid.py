@@ -4,12 +4,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.kernels.compiled import kernel
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from tasks.world.arrays import Array, Ints
 
 CELL_M = 0.5
 MAX_CELLS = 1_000_000  # larger maps get larger cells

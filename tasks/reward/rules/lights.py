@@ -5,16 +5,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.kernels.compiled import kernel
 from tasks.reward.rules.ego import Body
 from tasks.reward.rules.outlines import outlines
+from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.lanes import MapPolygon
-
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
 
 
 class RedLanes(NamedTuple):

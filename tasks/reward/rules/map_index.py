@@ -16,14 +16,10 @@ from numpy.typing import NDArray
 from tasks.kernels.compiled import kernel
 from tasks.reward.rules.grid import changes_along_rows, grid_over
 from tasks.reward.rules.outlines import Outlines, first_flat, outlines, refused
+from tasks.world.arrays import Array, Bools, Bytes, Ints, ShortInts
 from tasks.world.lanes import MapLayer, MapPolygon
 
-Array = NDArray[np.float64]
 Bits = NDArray[np.uint64]
-Bools = NDArray[np.bool_]
-Bytes = NDArray[np.uint8]
-Ints = NDArray[np.int64]
-ShortInts = NDArray[np.int32]
 
 ROUNDING = 1e-15  # above the error of a difference of two products, relative to their sum
 

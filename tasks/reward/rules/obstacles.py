@@ -10,16 +10,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.kernels.compiled import inlined, kernel
 from tasks.reward.rules.overlap import ROUNDING_M, Box, touching
+from tasks.world.arrays import Array, Bools, ShortInts
 from tasks.world.bounds import LARGEST
 from tasks.world.clip import HORIZON_STEPS
-
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int32]
 
 N_TIMES = HORIZON_STEPS + 1
 STOPPED_SPEED_MPS = 0.05
@@ -36,8 +32,8 @@ class Obstacles(NamedTuple):
     collision_score: Array  # (N,) what an at-fault collision leaves of NC: 0 for road users, else 0.5
     spans: Array  # (N, 5) of unindexed objects, see spans_of; (0, 5) of indexed ones
     axes: Array  # (T, N, 2) cos, sin of the headings; (0, N, 2): worked out where needed
-    starts: Ints  # (T x cells + 1,) items[starts[c]:starts[c + 1]] are the objects of cell c, times outermost
-    items: Ints  # (E,)
+    starts: ShortInts  # (T x cells + 1,) items[starts[c]:starts[c + 1]] are the objects of cell c, times outermost
+    items: ShortInts  # (E,)
     cells_per_side: int  # 1: one cell for everywhere and all times
     cells_per_m: float
 
@@ -291,7 +287,7 @@ def _cells_per_m(obstacles: Obstacles, ego_radius: float) -> float:
 
 
 @kernel
-def _index(obstacles: Obstacles, ego_radius: float) -> tuple[Ints, Ints]:
+def _index(obstacles: Obstacles, ego_radius: float) -> tuple[ShortInts, ShortInts]:
     """Starts and items of the cells: counted, summed to the cells' ends, filled from there."""
     n_times, n_items = obstacles.boxes.shape[:2]
     starts = np.zeros(n_times * CELLS_PER_SIDE * CELLS_PER_SIDE + 1, dtype=np.int32)
@@ -311,7 +307,7 @@ def _index(obstacles: Obstacles, ego_radius: float) -> tuple[Ints, Ints]:
 
 @kernel
 def _register(
-    obstacles: Obstacles, t: int, item: int, ego_radius: float, fill: bool, starts: Ints, items: Ints
+    obstacles: Obstacles, t: int, item: int, ego_radius: float, fill: bool, starts: ShortInts, items: ShortInts
 ) -> None:
     """Count an object in, or write it into, the cells that come within the ego's radius of its box at step t."""
     box, per_m = box_at(obstacles, t, item), obstacles.cells_per_m

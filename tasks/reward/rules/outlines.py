@@ -4,14 +4,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.kernels.compiled import kernel
+from tasks.world.arrays import Array, Ints
 from tasks.world.bounds import LARGEST, all_within
 from tasks.world.lanes import MapPolygon
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 MIN_WIDTH = 1e-12  # area of a ring over its squared perimeter; what is below is rounding
 

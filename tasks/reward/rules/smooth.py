@@ -9,12 +9,11 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tasks.kernels.compiled import kernel
+from tasks.world.arrays import Array
 from tasks.world.clip import STEP_S
 
-Array = NDArray[np.float64]
 Filter = Callable[[Array, Array], None]  # samples (T,) at 10 Hz, output (T,); T is at least the window
 
 # Weights of the oldest to the newest sample, in scipy.signal.savgol_coeffs' own rounding. Exact fractions (-3 / 32,
