@@ -47,7 +47,7 @@ def test_the_command_scores_a_benchmark_on_disk(
     rows = read_rows(tmp_path / "pdm_closed")
     assert {row.key.clip_id for row in rows} == {"a"} and len(rows) == 7
     memory = StreetBenchmark(("a",))
-    evaluate(memory, contenders("pdm_closed", None, bounds=False), EvaluateSettings("", str(tmp_path / "memory")))
+    evaluate(memory, contenders("pdm_closed", None, bounds=False), EvaluateSettings("", out=str(tmp_path / "memory")))
     for stored, kept in zip(rows, read_rows(tmp_path / "memory" / "pdm_closed")):
         np.testing.assert_allclose(stored.scores.filtered, kept.scores.filtered)
         assert stored.tags == kept.tags
