@@ -89,11 +89,11 @@ def seconds_text(seconds: Mapping[str, tuple[int, float]]) -> str:
 
 def kernels_of(config: RunConfig) -> list[str]:
     """The parts of factory.stages.warm that the run will ask for."""
-    from factory.graph.work import HUMAN
+    from factory.setup.settings import simulates
     from factory.stages.warm import parts_of
 
     label_traffic = None if config.reward.labels == "none" else config.reward.traffic
-    return parts_of(set(config.experts) != {HUMAN}, config.traffic.mode, label_traffic, config.render)
+    return parts_of(simulates(config), config.traffic.mode, label_traffic, config.render)
 
 
 def run(asked: Asked, only_plan: bool) -> int:
@@ -139,6 +139,7 @@ def run(asked: Asked, only_plan: bool) -> int:
             config.executor,
             config.workers,
             gpu_share=config.gpu_share if assembled.work.draws_on_gpu else 0.0,
+            fuse=config.graph.fuse,
             on_change=config.on_change,
             retry=config.retry_failed,
             shard_seconds=config.shard_seconds,

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tasks.experts.follow_up import BEFORE_STEPS, FollowUp
 from tasks.experts.pdm_closed.path import MIN_PROGRESS_M, path_length_m
 from tasks.experts.pdm_closed.planner import PdmClosed, PdmPlan, PdmSettings, plan_for
 from tasks.experts.protocol import Expert, Plan
@@ -19,7 +18,7 @@ from tasks.rollout.simulate import TrafficSettings, next_scene, simulate
 from tasks.settings import ExpertGate
 from tasks.stages import Rejected
 from tasks.world.arrays import Array
-from tasks.world.clip import HORIZON_STEPS, NOW, Clip, Rollout, Scene, scene_of_clip
+from tasks.world.clip import HORIZON_STEPS, Clip, Rollout, Scene, scene_of_clip
 from tasks.world.route import centerline_from
 from tasks.world.vehicle import HEADING
 
@@ -112,35 +111,7 @@ def attempt(
 def human_sample(
     scene: Scene, expert: Expert, planner: PdmSettings, rng: np.random.Generator, timed: Timed = nullcontext
 ) -> Judged:
-    """The logged drive from T, scored under log replay and never filtered."""
+    """The drive from the log at T, scored under log replay and never filtered."""
     plan = expert.plan(scene, rng)
-    assert isinstance(plan, Plan), "the log always has a plan"
+    assert isinstance(plan, Plan), "who is tried once always has a plan"
     return drive_and_judge(scene, plan, TrafficSettings(mode="replay"), planner, timed)
-
-
-def follow_up(
-    clip: Clip, stage_one: Rollout, expert: FollowUp, traffic: TrafficSettings, timed: Timed = nullcontext
-) -> Judged | Rejected:
-    """PDM-Closed from T+H of a candidate's rollout, scored and never filtered.
-
-    The same for both frames of a pair, also where it is Rejected: a route that has ended at either has no follow-up.
-    """
-    with timed("rollout"):
-        scene = perturbed_scene(clip, stage_one)
-        before = perturbed_scene(clip, stage_one, HORIZON_STEPS - BEFORE_STEPS)
-    if not (has_route(scene.centerline) and has_route(before.centerline)):
-        return Rejected("rollout", "route_ended", "the perturbed ego stands at the end of its route")
-    with timed("expert"):
-        pdm_plan = plan_for(scene, expert.settings)
-    return drive_and_judge(scene, Plan(pdm_plan.poses), traffic, expert.settings, timed, pdm_plan)
-
-
-def half_a_second_before(judged: Judged, stage_one: Rollout, planner: PdmSettings) -> Judged:
-    """A follow-up's drive seen from its earlier frame: the last 0.5 s of the perturbation, then what came of it."""
-    kept = HORIZON_STEPS - BEFORE_STEPS
-    scene = perturbed_scene(judged.scene.clip, stage_one, kept)
-    states = np.concatenate([stage_one.ego_states[kept:], judged.rollout.ego_states[1 : kept + 1]])
-    world = judged.scene.agents.overwritten(judged.scene.step, judged.rollout.agents)
-    agents = world.window(NOW + kept, NOW + kept + HORIZON_STEPS + 1)
-    rollout = Rollout(scene.step, states, agents, stage_one.simulated | judged.rollout.simulated)
-    return judge(scene, Plan(states[1:, : HEADING + 1]), rollout, plan_for(scene, planner))

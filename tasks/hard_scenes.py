@@ -1,14 +1,24 @@
-"""The scenes of a two-stage benchmark: what a planner is driven and scored from, apart from any sample.
+"""A two-stage benchmark: the scenes that a planner is driven and scored from, and the frames it is shown of them.
 
 Stage one is the log at T, stage two where candidates' rollouts lead at T+H (docs/reward.md 3). Each has a frame
 0.5 s earlier, so that extended comfort is defined.
 """
 
+import hashlib
+from contextlib import nullcontext
 from dataclasses import dataclass
 
-from tasks.attempt import perturbed_scene
-from tasks.experts.follow_up import BEFORE_STEPS
-from tasks.world.clip import HORIZON_STEPS, Clip, Rollout, Scene, scene_of_clip
+import numpy as np
+
+from tasks.attempt import Judged, Timed, drive_and_judge, has_route, judge, perturbed_scene
+from tasks.experts.pdm_closed.planner import PdmSettings, plan_for
+from tasks.experts.protocol import Plan
+from tasks.rollout.simulate import TrafficSettings
+from tasks.stages import FOLLOW_UP_BEFORE, HUMAN_BEFORE, Rejected
+from tasks.world.clip import HORIZON_STEPS, NOW, Clip, Rollout, Scene, scene_of_clip
+from tasks.world.vehicle import HEADING
+
+BEFORE_STEPS = 5  # the earlier frame of a pair: 0.5 s, over which extended comfort compares two plans
 
 
 @dataclass(frozen=True)
@@ -29,3 +39,39 @@ class BenchmarkClip:
         Agents that the rollout moved are marked as such: they go on by their driver model, not by the log.
         """
         return perturbed_scene(self.clip, dict(self.follow_ups)[candidate], HORIZON_STEPS - BEFORE_STEPS * before)
+
+
+def frame_digest(frame: str, planner: PdmSettings) -> str:
+    """Of what a frame (one of tasks.stages.FRAMES) is made by, as an expert's."""
+    if frame == HUMAN_BEFORE:
+        return "human"
+    return hashlib.sha256(repr((planner, frame == FOLLOW_UP_BEFORE)).encode()).hexdigest()[:16]
+
+
+def follow_up(
+    clip: Clip, stage_one: Rollout, traffic: TrafficSettings, planner: PdmSettings, timed: Timed = nullcontext
+) -> Judged | Rejected:
+    """PDM-Closed from T+H of a candidate's rollout, scored and never filtered.
+
+    A hard scene is allowed to be hard: its drive is a label to look at, not one that must have been good.
+    The same for both frames of a pair, also where it is Rejected: a route that has ended at either has no follow-up.
+    """
+    with timed("rollout"):
+        scene = perturbed_scene(clip, stage_one)
+        before = perturbed_scene(clip, stage_one, HORIZON_STEPS - BEFORE_STEPS)
+    if not (has_route(scene.centerline) and has_route(before.centerline)):
+        return Rejected("rollout", "route_ended", "the perturbed ego stands at the end of its route")
+    with timed("expert"):
+        pdm_plan = plan_for(scene, planner)
+    return drive_and_judge(scene, Plan(pdm_plan.poses), traffic, planner, timed, pdm_plan)
+
+
+def half_a_second_before(judged: Judged, stage_one: Rollout, planner: PdmSettings) -> Judged:
+    """A follow-up's drive seen from its earlier frame: the last 0.5 s of the perturbation, then what came of it."""
+    kept = HORIZON_STEPS - BEFORE_STEPS
+    scene = perturbed_scene(judged.scene.clip, stage_one, kept)
+    states = np.concatenate([stage_one.ego_states[kept:], judged.rollout.ego_states[1 : kept + 1]])
+    world = judged.scene.agents.overwritten(judged.scene.step, judged.rollout.agents)
+    agents = world.window(NOW + kept, NOW + kept + HORIZON_STEPS + 1)
+    rollout = Rollout(scene.step, states, agents, stage_one.simulated | judged.rollout.simulated)
+    return judge(scene, Plan(states[1:, : HEADING + 1]), rollout, plan_for(scene, planner))

@@ -30,6 +30,9 @@ class Rejected:
     counts: Mapping[str, int] = field(default_factory=dict)  # what was counted on the way, such as drops by gate
 
 
+HUMAN = "human"  # the expert that is the log itself
+# The frames of a benchmark (tasks.hard_scenes): they stand where an expert's name does, in settings and tables.
+HUMAN_BEFORE, FOLLOW_UP, FOLLOW_UP_BEFORE = FRAMES = ("human_before", "follow_up", "follow_up_before")
 PICTURE_FAULTS = ("holes", "lens_covered", "blank", "blurred", "unlike_photos")  # tasks.render.gate
 
 STAGES: tuple[Stage, ...] = (
@@ -41,6 +44,29 @@ STAGES: tuple[Stage, ...] = (
     Stage("render", 3, "attempt", ("psnr", *PICTURE_FAULTS)),
     Stage("write", 2, "attempt", ()),
 )
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a machine is asked to do at once; Ray, the metrics and docs/concepts.md know it by this name."""
+
+    name: str
+    stages: tuple[str, ...]  # as their seconds are told
+    per: str  # block, clip, attempt, batch
+    may_draw: bool = False  # claims its share of a GPU where pictures are drawn on one; a core of a CPU in any case
+
+
+TASKS: tuple[Task, ...] = (
+    Task("reconstruct", ("reconstruct",), "block"),  # on as many cores as it is told
+    Task("perturb", ("clip", "render", "perturb"), "clip"),
+    Task("drive", ("rollout", "expert", "reward"), "attempt"),
+    Task("render", ("render",), "attempt", may_draw=True),  # only of drives that the reward accepts
+    Task("label", ("labels",), "attempt"),
+    Task("write", (), "batch"),
+)
+# Fused into one task, `drive+render+label`, unless drawing claims a GPU: a task costs Ray some 40 ms, and what a drive
+# hands on is up to 5 MB. With a GPU they are tasks of their own, so that nothing but pictures holds it.
+ATTEMPT = tuple(task.name for task in TASKS if task.per == "attempt")
 
 
 def stage_versions() -> dict[str, int]:

@@ -62,9 +62,8 @@ def explain(request: Request) -> None:
     """Compose the settings, run the clip, print and draw."""
     import cv2
 
-    from factory.graph.work import HUMAN_CANDIDATE, LOGGED
+    from factory.graph.walk import candidate_order
     from factory.setup.settings import assemble
-    from factory.stages.pipeline import PerturbedClip
     from factory.views.drawing import attempt_picture, candidates_picture, film
     from factory.views.video import write_mp4
     from tasks.stages import Rejected
@@ -90,7 +89,7 @@ def explain(request: Request) -> None:
 
     if isinstance(found, Rejected):
         print(f"no candidates: rejected by {found.stage}: {found.reason}: {found.detail}")
-        if expert not in LOGGED:
+        if not work.once(expert):
             return
     else:
         print("dropped by gate: " + ", ".join(f"{gate} {count}" for gate, count in found.gate_counts.items()))
@@ -98,11 +97,11 @@ def explain(request: Request) -> None:
         print("gated trajectories: " + ", ".join(f"{fate} {count}" for fate, count in fates.most_common()))
         cv2.imwrite(f"{stem}_candidates.png", candidates_picture(clip, found.considered)[..., ::-1])
 
-    payload = PerturbedClip(ref, clip, made.candidates, made.before)
-    order: Sequence[int] = [HUMAN_CANDIDATE] if expert in LOGGED else range(min(request.tries, len(made.candidates)))
+    prepared = work.listed(ref, made)
+    order = candidate_order(work.once(expert), min(request.tries, len(made.candidates)))
     shown = None
     for candidate in order:
-        trace = work.trace(payload, candidate, expert)
+        trace = work.trace(prepared, candidate, expert)
         end = (
             ""
             if trace.candidate is None
@@ -110,7 +109,7 @@ def explain(request: Request) -> None:
                 *trace.candidate.end_pose[:2], trace.candidate.end_pose[2] * 57.29578
             )
         )
-        rejected = trace.rejected or work.unfit(clip, trace, expert)
+        rejected = trace.rejected or work.unfit(clip, trace)
         verdict = "accepted" if rejected is None else f"rejected by {rejected.stage}: {rejected.detail}"
         print(f"candidate {candidate:2d}{end}  {verdict}")
         if trace.judged is not None:
@@ -122,7 +121,7 @@ def explain(request: Request) -> None:
             break
     else:
         left = len(made.candidates) - len(order)
-        if expert not in LOGGED and left > 0:
+        if not work.once(expert) and left > 0:
             n = len(made.candidates)
             print(f"none accepted: stopped after {len(order)} of {n} candidates, tries={n} goes on to the last")
     if shown is not None and shown.judged is not None:

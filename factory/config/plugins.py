@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from factory.config.words import ConfigError
+from tasks.stages import FRAMES
 
 GROUPS = {
     "clips": "driving_data_factory.readers",
@@ -102,16 +103,16 @@ def offer_choices(overrides: Sequence[str], conf: Path, folders: Sequence[Path] 
             ConfigStore.instance().store(name=name, node=node, group=group, provider=plugins[0].package)
 
 
-def with_experts(values: Mapping[str, Any]) -> dict[str, Any]:
+def with_experts(values: Mapping[str, Any], conf: Path) -> dict[str, Any]:
     """Composed settings with every installed expert as `expert.<name>`; what the command line says of one is kept.
 
-    Raises ConfigError where one that `experts` names clashes.
+    conf: where the files of the built-in ones lie. Raises ConfigError where one that `experts` names clashes.
     """
     specs = {name: dict(spec) for name, spec in values["expert"].items()}
-    built_in = {name for name, spec in specs.items() if "kind" in spec}
+    built_in = {*_files("expert", (conf,)), *FRAMES}
     asked = [values["experts"]] if isinstance(values["experts"], str) else values["experts"]
     for name, plugins in offered("expert").items():
-        if "_target_" in specs.get(name, {}):
+        if "_target_" in specs.get(name, {}) and name not in built_in:
             continue  # the command line names a class
         if name in asked:
             installed("expert", name, built_in)

@@ -20,6 +20,7 @@ from tasks.experts.recovery.settings import RecoverySettings
 from tasks.render.settings import RenderMode, RenderSettings
 from tasks.rollout.settings import TrafficSettings
 from tasks.settings import ExpertGate, PerturbSettings
+from tasks.stages import FRAMES
 
 MOST_K = 2**17  # of a kinematic vocabulary: 126 MB of trajectories, eight times the largest in use
 READERS: Mapping[str, type[Any]] = {  # `_target_` of a built-in reader -> its settings
@@ -28,6 +29,9 @@ READERS: Mapping[str, type[Any]] = {  # `_target_` of a built-in reader -> its s
     "factory.readers.town.reader.SyntheticReader": TownClips,
     "factory.readers.town.towns.SyntheticTownsReader": TownsClips,
 }
+
+
+RECOVERY = "factory.setup.recovery.recovery"  # `_target_` of the built-in expert that has settings of its own
 
 
 @dataclass(frozen=True)
@@ -83,6 +87,13 @@ class RecoverySources(RecoverySettings):
 
 
 @dataclass(frozen=True)
+class GraphChoice:
+    """How the work is cut into tasks; rows do not depend on it."""
+
+    fuse: Literal["auto", "all", "none"] = "auto"  # drive, render, label in one task; auto: unless drawing claims a GPU
+
+
+@dataclass(frozen=True)
 class RunConfig:
     """Everything on the command line of `python -m factory.run`."""
 
@@ -93,7 +104,8 @@ class RunConfig:
     experts: tuple[str, ...] = ("pdm_closed", "recovery", "human")  # who drives
     executor: Literal["ray", "local"] = "ray"  # local: in this process, for a debugger
     workers: int | None = None  # processes; null: every core; on a cluster that grows: tasks at once
-    gpu_share: float = 0.1  # of a GPU that an attempt claims on Ray with render.backend=gsplat; 1/share share one
+    gpu_share: float = 0.1  # of a GPU that a task which draws claims with render.backend=gsplat; 1/share share one
+    graph: GraphChoice = field(default_factory=GraphChoice)
     limit: int | None = None  # read this many clips only
     seed: int = 0  # of every random draw
     on_change: Literal["stop", "keep", "redo"] = "stop"  # when settings or stage versions differ from the table's
@@ -125,11 +137,12 @@ class RunConfig:
             if value is not None and value < 1:
                 raise ValueError(f"{name}={value}: must be positive, or null for no bound")
         if not 0.0 <= self.gpu_share <= 1.0:
-            raise ValueError(f"gpu_share={self.gpu_share}: the share of one GPU that an attempt claims, 0 to 1")
-        unknown = [name for name in self.experts if name not in self.expert]
+            raise ValueError(f"gpu_share={self.gpu_share}: the share of one GPU that a task which draws claims, 0 to 1")
+        known = sorted({*self.expert, *FRAMES})
+        unknown = [name for name in self.experts if name not in known]
         if unknown:
             raise ValueError(
-                f"experts: {unknown} is not among {sorted(self.expert)}{nearest(unknown[0], list(self.expert))}; "
+                f"experts: {unknown} is not among {known}{nearest(unknown[0], known)}; "
                 "add your own with expert.<name>._target_=<class>"
             )
 
@@ -141,7 +154,7 @@ class RunConfig:
 
 def composed_run(words: Sequence[str]) -> dict[str, Any]:
     """The settings of a command line with all defaults, not yet typed. Raises ConfigError."""
-    values = with_experts(compose("run", words, RunConfig))
+    values = with_experts(compose("run", words, RunConfig), conf_dir())
     for key, shape in shapes_in(values).items():
         group, _, name = key.partition(".")
         given = values[group][name] if name else values[group]
@@ -201,7 +214,7 @@ def shapes_in(values: Mapping[str, Any]) -> dict[str, type[Any]]:
     """Key -> dataclass of the built-in reader and experts that a run's settings name."""
     reader = READERS.get(values["clips"].get("_target_", ""))
     recovery = {
-        f"expert.{name}": RecoverySources for name, spec in values["expert"].items() if spec.get("kind") == "recovery"
+        f"expert.{name}": RecoverySources for name, spec in values["expert"].items() if spec.get("_target_") == RECOVERY
     }
     return {**({} if reader is None else {"clips": reader}), **recovery}
 
@@ -211,7 +224,7 @@ def without_labels(spec: Mapping[str, Any]) -> dict[str, Any]:
     return {
         key: without_labels(value) if isinstance(value, Mapping) else value
         for key, value in spec.items()
-        if key not in ("name", "kind", "_target_")
+        if key not in ("name", "_target_")
     }
 
 
@@ -229,9 +242,3 @@ def _elsewhere(key: str) -> str:
     shapes = {name: shape for name in names if (shape := reader_of(name)) is not None}
     having = [f"clips={name}" for name, shape in shapes.items() if inner in dict(keys_of(shape))]
     return f"{key} is a setting of {' and '.join(having)}: choose one of them too" if having else ""
-
-
-def recovery_settings(config: RunConfig, name: str) -> tuple[RecoverySources, RecoverySettings]:
-    """Typed. Raises ConfigError."""
-    sources = fill(RecoverySources, without_labels(config.expert[name]), f"expert.{name}")
-    return sources, RecoverySettings(sources.smooth, sources.weights, sources.feasible)

@@ -7,7 +7,7 @@ Everything the driver knows it can know again from the tables, so it can die at 
 import threading
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from factory.graph.batch import Gatherer, PendingRow
@@ -18,9 +18,8 @@ from factory.graph.local import Graph, Ticket
 from factory.graph.metrics import RunMetrics
 from factory.graph.plan import CLIP_CANDIDATE, ClipPlan, Plan, WalkState, wants_payload
 from factory.graph.progress import ProgressLine, Tally
-from factory.graph.steps import Attempted, Failure, HalfBuilt, Prepared, Reconstructed, Stamp
+from factory.graph.steps import Attempted, Failure, HalfBuilt, HandedOn, Prepared, Reconstructed, Stamp
 from factory.graph.walk import Blocked, Complete, Exhausted, Step, Try, tries_before
-from factory.graph.work import LOGGED
 from factory.readers.base import ClipRef
 from factory.store.candidates import ClipCandidates
 from factory.store.identity import RunIdentity, attempt_id
@@ -52,6 +51,17 @@ class Executed:
         )
 
 
+@dataclass(frozen=True)
+class Trial:
+    """An attempt in flight."""
+
+    clip: ClipPlan
+    walk: WalkState
+    prepared: Any  # stands for the prepared clip
+    stamp: Stamp
+    tasks_done: int = 0  # of the graph's `attempt_tasks`
+
+
 class Driver:
     """The state of one run, fed by its loop one report at a time."""
 
@@ -74,7 +84,7 @@ class Driver:
         self._fresh: set[str] = set()  # attempt_ids that failed in this run
         self._building: dict[Ticket, Build] = {}
         self._preparing: dict[Ticket, ClipPlan] = {}
-        self._trying: dict[Ticket, tuple[ClipPlan, WalkState, Any, Stamp]] = {}
+        self._trying: dict[Ticket, Trial] = {}
         self._walks_left: dict[str, int] = {}
         self._held: dict[tuple[str, str], tuple[list[PendingRow], list[Outcome]]] = {}  # redo: until the walk ends
         self._stopping = threading.Event()
@@ -163,7 +173,7 @@ class Driver:
             threads = max(1, self._graph.cores // self._queue.at_once)
             self._building[self._graph.submit("reconstruct", what.ref, threads)] = what
         elif wants_payload(what):
-            self._preparing[self._graph.submit("prepare", what.ref, what.content)] = what
+            self._preparing[self._graph.submit("perturb", what.ref, what.content)] = what
         else:
             self._start_walks(what, None)
 
@@ -181,7 +191,7 @@ class Driver:
         elif ticket in self._preparing:
             self._take_prepared(self._preparing.pop(ticket), ticket.result, report)
         else:
-            self._take_attempt(*self._trying.pop(ticket), ticket.result, report)
+            self._take_attempt(self._trying.pop(ticket), ticket.result, report)
 
     def _take_block(self, build: Build, report: Reconstructed | HalfBuilt | Failure) -> None:
         if isinstance(report, HalfBuilt):
@@ -242,13 +252,18 @@ class Driver:
         clip.steps[walk.expert] = step
         if isinstance(step, Try) and not self.interrupted:
             stamp = self._stamp(clip.ref, walk.expert, step)
-            self._trying[self._graph.submit("attempt", prepared, stamp)] = (clip, walk, prepared, stamp)
+            self._try(Trial(clip, walk, prepared, stamp), prepared)
             return
         self._finish(clip, walk, step)
         self._walks_left[clip.ref.clip_id] -= 1
         if not self._walks_left[clip.ref.clip_id]:
             del self._walks_left[clip.ref.clip_id]
             self._tally.clips += not self.interrupted
+
+    def _try(self, trial: Trial, so_far: Any) -> None:
+        """The next task of an attempt, from the result of the one before."""
+        stages = self._graph.attempt_tasks[trial.tasks_done]
+        self._trying[self._graph.submit("attempt", stages, so_far, trial.stamp)] = trial
 
     def _settle(self, clip: ClipPlan, walk: WalkState, n: int | None = None) -> None:
         """`n` of the samples that the walk was to make are behind it, None: all, made or not."""
@@ -274,9 +289,11 @@ class Driver:
         else:  # rows of an unfinished redo are made again, so that readers see the old walk or the new one
             self._gatherer.add(outcomes=[o for o in outcomes if o.kind == Kind.FAILED])
 
-    def _take_attempt(
-        self, clip: ClipPlan, walk: WalkState, prepared: Any, stamp: Stamp, result: Any, report: Attempted | Failure
-    ) -> None:
+    def _take_attempt(self, trial: Trial, result: Any, report: Attempted | HandedOn | Failure) -> None:
+        if isinstance(report, HandedOn):
+            self._try(replace(trial, tasks_done=trial.tasks_done + 1), result)
+            return
+        clip, walk, stamp = trial.clip, trial.walk, trial.stamp
         self.executed.attempts += 1
         known = walk.known.get(stamp.candidate_index)
         replaced = [known.attempt_id] if known is not None else []  # under keep perhaps of other expert inputs
@@ -303,7 +320,7 @@ class Driver:
             self._metrics.outcome(outcome, stamp.round)
             self._tally.rejected += outcome.kind == Kind.REJECTED
             self._tally.failed += outcome.kind == Kind.FAILED
-        self._advance(clip, walk, prepared)
+        self._advance(clip, walk, trial.prepared)
 
     def _keep(
         self,
@@ -398,7 +415,7 @@ class Driver:
 def _wanted(walk: WalkState, rounds: int) -> int:
     """Samples that the walk is still to make, as far as its list lasts."""
     found = sum(past.kind is Kind.ACCEPTED for past in walk.known.values())
-    return max(0, (1 if walk.expert in LOGGED else rounds) - found)
+    return max(0, (1 if walk.once else rounds) - found)
 
 
 def _past(outcome: Outcome) -> Past:

@@ -3,13 +3,17 @@
 import os
 import time
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 from factory.graph import steps
 from factory.graph.metrics import NoRecorder, Recorder
 from factory.graph.work import Stopped, Work, never
 from factory.store.location import Location
+from tasks.stages import ATTEMPT
+
+Fuse = Literal["auto", "all", "none"]
 
 
 class ClusterLacks(ValueError):
@@ -31,6 +35,7 @@ class Graph(Protocol):
 
     parallelism: int  # tasks at once
     cores: int  # that one task can have
+    attempt_tasks: Sequence[Sequence[str]]  # the stages of an attempt, by the tasks that they are fused into
     recorder: Recorder  # of metrics
 
     def submit(self, step: str, *args: Any) -> Ticket:
@@ -46,7 +51,7 @@ class Graph(Protocol):
 
 STEPS = {
     "reconstruct": steps.reconstruct,
-    "prepare": steps.prepare,
+    "perturb": steps.prepare,
     "attempt": steps.attempt,
     "write": steps.write,
     "episodes": steps.episodes,
@@ -54,12 +59,22 @@ STEPS = {
 }
 WANTS = {
     "reconstruct": ("work", "stopped"),
-    "prepare": ("work", "out"),
+    "perturb": ("work", "out"),
     "attempt": ("work",),
     "write": ("out",),
     "episodes": ("work", "out"),
     "warm": ("work",),
 }
+
+
+def attempt_tasks(fuse: Fuse, apart: bool) -> tuple[tuple[str, ...], ...]:
+    """The stages of an attempt by task; apart: whether `auto` makes a task of each, as where `render` claims a GPU."""
+    return tuple((stage,) for stage in ATTEMPT) if fuse == "none" or (fuse == "auto" and apart) else (ATTEMPT,)
+
+
+def name_of(step: str, args: tuple[Any, ...]) -> str:
+    """What metrics and Ray call a task: an attempt's by the stages in it."""
+    return "+".join(args[0]) if step == "attempt" else step
 
 
 def cores_of(step: str, args: tuple[Any, ...]) -> int:
@@ -77,8 +92,9 @@ class LocalGraph:
 
     parallelism = 1
 
-    def __init__(self, work: Work, out: Location, stopped: Stopped = never) -> None:
+    def __init__(self, work: Work, out: Location, stopped: Stopped = never, fuse: Fuse = "auto") -> None:
         """stopped: asked now and then by tasks that take long, as nobody else can while they are at work."""
+        self.attempt_tasks: Sequence[Sequence[str]] = attempt_tasks(fuse, apart=False)
         self.cores = os.cpu_count() or 1
         self.recorder: Recorder = NoRecorder()
         self._supplied = {"work": work, "out": out, "stopped": stopped}
@@ -86,7 +102,7 @@ class LocalGraph:
         work.warm()
 
     def submit(self, step: str, *args: Any) -> Ticket:
-        ticket = Ticket(step, _Box())
+        ticket = Ticket(name_of(step, args), _Box())
         self._waiting.append((ticket, step, args))
         return ticket
 

@@ -10,6 +10,7 @@ import secrets
 import socket
 import time
 from collections import deque
+from collections.abc import Sequence
 from typing import Any
 
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
@@ -22,13 +23,14 @@ from ray.autoscaler.sdk import request_resources
 from ray.exceptions import RayError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from factory.graph.local import STEPS, WANTS, ClusterLacks, Ticket, cores_of
+from factory.graph.local import STEPS, WANTS, ClusterLacks, Fuse, Ticket, attempt_tasks, cores_of, name_of
 from factory.graph.metrics import Recorder
 from factory.graph.ray_metrics import RayRecorder
 from factory.graph.steps import Failure
 from factory.graph.work import NotReady, Work, never
 from factory.store.location import BadLocation, Location
 from factory.store.outcomes import ErrorKind
+from tasks.stages import TASKS
 
 MAX_RETRIES = 2  # of a task whose worker died
 PROBE_SECONDS = 120.0
@@ -44,12 +46,18 @@ class RayGraph:
     """Graph of Ray tasks. Connects to the cluster of RAY_ADDRESS or `address`, else starts one in this machine."""
 
     def __init__(
-        self, work: Work, out: Location, workers: int | None = None, address: str | None = None, gpu_share: float = 0.0
+        self,
+        work: Work,
+        out: Location,
+        workers: int | None = None,
+        address: str | None = None,
+        gpu_share: float = 0.0,
+        fuse: Fuse = "auto",
     ) -> None:
         """workers: CPUs of a cluster started here, tasks at once on one that is there already; None: all its CPUs.
 
         More workers than a cluster has CPUs now are what makes one grow that can. gpu_share: of a GPU, claimed by every
-        attempt; on a cluster without one, it is asked for one and waited for.
+        task that draws; on a cluster without one, it is asked for one and waited for.
         Raises BadLocation when some node does not see `out`, ClusterLacks when no GPU comes, NotReady when a node
         cannot do its part.
         """
@@ -67,9 +75,11 @@ class RayGraph:
         }  # in a list: a reference
         self._tickets: dict[Any, Ticket] = {}
         self._ready: deque[Any] = deque()
-        self._held_back: deque[tuple[Ticket, str, tuple[Any, ...]]] = deque()
+        self._held_back: dict[bool, deque[tuple[Ticket, str, tuple[Any, ...]]]] = {False: deque(), True: deque()}
+        self._flying = {False: 0, True: 0}  # both by whether a task claims a GPU
         try:
             self._gpu_share = gpu_share if gpu_share and _has_gpu(wait=not self._is_ours) else 0.0
+            self.attempt_tasks: Sequence[Sequence[str]] = attempt_tasks(fuse, apart=self._gpu_share > 0.0)
             _prove_shared(out)
             _warm_every_node(self._supplied["work"], with_gpu_only=self._gpu_share > 0.0)
         except BaseException:
@@ -77,19 +87,28 @@ class RayGraph:
             raise
 
     def submit(self, step: str, *args: Any) -> Ticket:
-        ticket = Ticket(step, None)
-        self._held_back.append((ticket, step, args))
+        ticket = Ticket(name_of(step, args), None)
+        self._held_back[self._draws(ticket)].append((ticket, step, args))
         self._dispatch()
         return ticket
 
+    def _draws(self, ticket: Ticket) -> bool:
+        return self._gpu_share > 0.0 and any(task.may_draw for task in TASKS if task.name in ticket.step.split("+"))
+
     def _dispatch(self) -> None:
-        """A cluster of our own queues what its CPUs do not take; on a shared one the rest is held back here."""
-        while self._held_back and (self._is_ours or len(self._tickets) < self.parallelism):
-            ticket, step, args = self._held_back.popleft()
-            supplied = [self._supplied[name] for name in WANTS[step]]
-            task = _run.options(num_cpus=cores_of(step, args), num_gpus=self._gpu_share if step == "attempt" else None)
-            report, ticket.result = task.remote(step, len(supplied), *supplied, *args)
-            self._tickets[report] = ticket
+        """A cluster of our own queues what its CPUs do not take; on a shared one the rest is held back here.
+
+        What draws has a queue of its own, so that neither the GPUs nor the CPUs wait for the other's tasks.
+        """
+        for draws, waiting in self._held_back.items():
+            while waiting and (self._is_ours or self._flying[draws] < self.parallelism):
+                ticket, step, args = waiting.popleft()
+                supplied = [self._supplied[name] for name in WANTS[step]]
+                gpu = self._gpu_share if draws else None
+                task = _run.options(name=ticket.step, num_cpus=cores_of(step, args), num_gpus=gpu)
+                report, ticket.result = task.remote(step, len(supplied), *supplied, *args)
+                self._tickets[report] = ticket
+                self._flying[draws] += 1
 
     def wait(self, timeout_s: float) -> tuple[Ticket, Any] | None:
         if not self._ready and self._tickets:
@@ -102,6 +121,7 @@ class RayGraph:
             return None
         reference = self._ready.popleft()
         ticket = self._tickets.pop(reference)
+        self._flying[self._draws(ticket)] -= 1
         self._dispatch()
         try:
             report, worked_s = ray.get(reference)
@@ -227,7 +247,7 @@ def _warm_every_node(work: list[Any], with_gpu_only: bool) -> None:
     """Kernels on every node; what attempts draw with where they are made: on all nodes, or on those with a GPU."""
     nodes = _nodes()
     draws = _gpu_nodes() if with_gpu_only else set(nodes)
-    reports = [_run.options(scheduling_strategy=_on(n)).remote("warm", 1, work, n in draws) for n in nodes]
+    reports = [_run.options(name="warm", scheduling_strategy=_on(n)).remote("warm", 1, work, n in draws) for n in nodes]
     for report, _ in reports:
         answer, _ = ray.get(report)
         if isinstance(answer, Failure):

@@ -20,11 +20,12 @@ class WalkState:
     """One (clip, expert) on its way."""
 
     expert: str
+    once: bool  # tried once, on the log itself
     known: dict[int, Past]
     stale: frozenset[str] = frozenset()  # redo: attempt_ids whose rows this walk replaces as a whole
 
     def step(self, n_candidates: int, rounds: int, may_retry: Policy) -> Step:
-        return next_step(self.expert, n_candidates, rounds, self.known, may_retry)
+        return next_step(self.once, n_candidates, rounds, self.known, may_retry)
 
     def lacks_exhausted(self, step: Step) -> bool:
         """The walk stands at the end of its list and no outcome says so yet."""
@@ -64,8 +65,9 @@ def make_plan(
     identity: RunIdentity,
     on_change: OnChange,
     may_retry: Policy,
+    once: Callable[[str], bool],
 ) -> Plan:
-    """Hold the wishes against the tables.
+    """Hold the wishes against the tables; once: whether an expert is tried once.
 
     Rows of other settings: under `redo` they count as absent and are replaced, under `keep` they count as done. Raises
     ChangedRun where there are some under `stop`, and where `redo` would replace the candidate list of other rows.
@@ -85,8 +87,8 @@ def make_plan(
             stored = listed = None
         if stored is not None and UNLISTED == stored.prepare_digest != identity.prepare_digest:
             listed = None  # its drive is stored, its candidates are to be found
-        walks = tuple(_walk(history, ref.clip_id, expert, on_change) for expert in experts)
-        whole = _walk(history, ref.clip_id, "", on_change)
+        walks = tuple(_walk(history, ref.clip_id, expert, on_change, once(expert)) for expert in experts)
+        whole = _walk(history, ref.clip_id, "", on_change, True)
         stays = on_change != "redo" or any(walk.known and not walk.stale for walk in walks) or ref.clip_id in others
         clip = ClipPlan(
             ref,
@@ -126,13 +128,13 @@ def _of_other_settings(stored: Listed, identity: RunIdentity) -> bool:
     return stored.prepare_digest not in (identity.prepare_digest, UNLISTED) and identity.prepare_digest != UNLISTED
 
 
-def _walk(history: History, clip_id: str, expert: str, on_change: OnChange) -> WalkState:
+def _walk(history: History, clip_id: str, expert: str, on_change: OnChange, once: bool) -> WalkState:
     known = dict(history.walks.get((clip_id, expert), {}))
     stale = history.stale.get((clip_id, expert), frozenset()) if on_change == "redo" else frozenset()
     if stale:  # the walk is made anew from its first candidate; what an earlier redo failed at stands
         stale |= {past.attempt_id for past in known.values()}
         known = {i: past for i, past in known.items() if past.current and past.kind is Kind.FAILED}
-    return WalkState(expert, known, stale)
+    return WalkState(expert, once, known, stale)
 
 
 def _has_work(clip: ClipPlan, rounds: int, may_retry: Policy) -> bool:

@@ -7,13 +7,13 @@ handed to other tasks by reference. What a stage raises becomes a Failure here a
 import hashlib
 import time
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import pyarrow as pa
 
-from factory.graph.work import Accepted, Halted, NotReady, PreparedClip, Stopped, Work
+from factory.graph.work import Dropped, Halted, NotReady, PreparedClip, Stopped, Underway, Work, go_on
 from factory.readers.base import BadClip, ClipRef
 from factory.store.cache import BadCacheFile, ClipCache
 from factory.store.candidates import CandidateRow
@@ -64,6 +64,11 @@ class Reconstructed:
 @dataclass(frozen=True)
 class HalfBuilt:
     """Report on a block that is not finished because the run stops; the next run goes on with it."""
+
+
+@dataclass(frozen=True)
+class HandedOn:
+    """Report on an attempt whose further stages are another task; the result is what that starts from."""
 
 
 @dataclass(frozen=True)
@@ -168,13 +173,18 @@ def _refuse_changed(ref: ClipRef, found: str | None, wanted: str | None) -> None
         raise BadClip(f"log {ref.log_id}", "clip", f"{problem}; restore it or choose another out")
 
 
-def attempt(work: Work, prepared: PreparedClip, stamp: Stamp) -> tuple[Attempted | Failure, pa.Table | None]:
-    """One attempt; an accepted one is checked against the schema here, where its traceback still means something."""
+def attempt(
+    work: Work, stages: Sequence[str], so_far: PreparedClip | Underway, stamp: Stamp
+) -> tuple[Attempted | HandedOn | Failure, pa.Table | Underway | None]:
+    """Some stages of one attempt, from where it stands; an accepted one is checked against the schema here, where its
+    traceback still means something."""
     began = time.perf_counter()
     try:
-        result = work.attempt(prepared, stamp.candidate_index, stamp.expert)
+        result = go_on(work, stages, so_far, stamp.candidate_index, stamp.expert)
+        if isinstance(result, Underway):
+            return HandedOn(), result
         seconds = result.seconds or {"attempt": time.perf_counter() - began}
-        if not isinstance(result, Accepted):
+        if isinstance(result, Dropped):
             subscores, at_hand = dict(result.subscores), result.scene_at_hand
             return Attempted(result.rejected, subscores=subscores, seconds=seconds, scene_at_hand=at_hand), None
         row = sample_row_to_table([{**result.row, **vars(stamp)}])

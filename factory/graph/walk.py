@@ -8,7 +8,7 @@ on would give later samples another round than in a run without the incident, an
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from factory.graph.work import HUMAN_CANDIDATE, LOGGED
+from factory.graph.work import HUMAN_CANDIDATE
 from factory.store.outcomes import ErrorKind, Kind
 from factory.store.samples import Past
 
@@ -23,7 +23,7 @@ class Try:
 
 @dataclass(frozen=True)
 class Complete:
-    """The walk has all samples it was asked for (a LOGGED expert: its one attempt is done)."""
+    """The walk has all samples it was asked for (an expert that is tried once: its one attempt is done)."""
 
 
 @dataclass(frozen=True)
@@ -44,18 +44,18 @@ class Blocked:
 Step = Try | Complete | Exhausted | Blocked
 
 
-def candidate_order(expert: str, n_candidates: int) -> Sequence[int]:
-    """Candidate indices in the order in which a walk of this expert tries them."""
-    return (HUMAN_CANDIDATE,) if expert in LOGGED else range(n_candidates)
+def candidate_order(once: bool, n_candidates: int) -> Sequence[int]:
+    """Candidate indices in the order in which a walk tries them; once: of an expert that is tried once."""
+    return (HUMAN_CANDIDATE,) if once else range(n_candidates)
 
 
 def next_step(
-    expert: str, n_candidates: int, rounds: int, known: Mapping[int, Past], may_retry: Callable[[Past], bool]
+    once: bool, n_candidates: int, rounds: int, known: Mapping[int, Past], may_retry: Callable[[Past], bool]
 ) -> Step:
-    """Where the walk stands. A LOGGED expert has one attempt in round 0 whatever `rounds` is."""
-    wanted = 1 if expert in LOGGED else rounds
+    """Where the walk stands. An expert that is tried `once` has one attempt in round 0 whatever `rounds` is."""
+    wanted = 1 if once else rounds
     accepted = 0
-    for candidate in candidate_order(expert, n_candidates):
+    for candidate in candidate_order(once, n_candidates):
         if accepted == wanted:
             return Complete()
         past = known.get(candidate)
@@ -67,7 +67,7 @@ def next_step(
             if past.round != accepted:
                 return Blocked(candidate, f"stored as round {past.round}, the walk makes it {accepted}")
             accepted += 1
-    return Complete() if accepted == wanted or expert in LOGGED else Exhausted(n_candidates)
+    return Complete() if accepted == wanted or once else Exhausted(n_candidates)
 
 
 def retry_policy(retry: bool, versions_json: str) -> Callable[[Past], bool]:

@@ -4,25 +4,19 @@ The executors know clips, candidates and attempts only through `Work`. It is pic
 whatever the worker, the order or the retry, the same arguments give the same result.
 """
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Protocol
 
 from factory.readers.base import ClipRef
 from factory.store.candidates import CandidateRow
 from factory.store.identity import RunIdentity
-from tasks.stages import Rejected
+from tasks.stages import ATTEMPT, Rejected
 
 if TYPE_CHECKING:
     from tasks.hard_scenes import BenchmarkClip
 
-HUMAN = "human"  # the expert that is the log itself
-HUMAN_BEFORE = "human_before"  # the same 0.5 s earlier, for benchmarks
-LOGGED = frozenset({HUMAN, HUMAN_BEFORE})  # one attempt each, in round 0
-FOLLOW_UP, FOLLOW_UP_BEFORE = "follow_up", "follow_up_before"
-BENCHMARK = frozenset({HUMAN_BEFORE, FOLLOW_UP, FOLLOW_UP_BEFORE})  # whose clips need an earlier frame and scenes
-HUMAN_CANDIDATE = -1  # the only candidate index of LOGGED experts
-
+HUMAN_CANDIDATE = -1  # the only candidate index of experts that are tried once: the log itself
 
 Stopped = Callable[[], bool]  # whether the run was asked to stop: a long task looks now and then
 
@@ -55,8 +49,16 @@ class PreparedClip:
 
 
 @dataclass(frozen=True)
-class Accepted:
-    """A sample: columns of factory.store.schema, less the ones in its BOOKKEEPING."""
+class Driven:
+    """A drive that the reward accepts, on its way to a sample: all that it takes to draw and to label it."""
+
+    payload: object  # the work's own; it can be pickled
+    seconds: Mapping[str, float] = field(default_factory=dict)  # stage -> seconds
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Some columns of a sample, of factory.store.schema less the ones in its BOOKKEEPING."""
 
     row: Mapping[str, object]
     seconds: Mapping[str, float] = field(default_factory=dict)  # stage -> seconds
@@ -71,9 +73,6 @@ class Dropped:
     subscores: Mapping[str, float] = field(default_factory=dict)  # as far as they were computed
     seconds: Mapping[str, float] = field(default_factory=dict)
     scene_at_hand: bool | None = None
-
-
-AttemptResult = Accepted | Dropped
 
 
 @dataclass(frozen=True)
@@ -97,6 +96,10 @@ class Work(Protocol):
         draws: attempts are made on this machine, so that it must have what they draw with.
         Raises NotReady.
         """
+        ...
+
+    def once(self, expert: str) -> bool:
+        """Whether the expert has one attempt, candidate -1 in round 0, whatever the candidates and rounds."""
         ...
 
     def expert_digest(self, expert: str) -> str:
@@ -126,6 +129,61 @@ class Work(Protocol):
         """
         ...
 
-    def attempt(self, prepared: PreparedClip, candidate: int, expert: str) -> AttemptResult:
-        """Rollout, expert, rollout, reward and render of one candidate; candidate -1 with LOGGED experts."""
+    def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> Driven | Dropped:
+        """Rollout, expert, rollout and reward of one candidate."""
         ...
+
+    def draw(self, driven: Driven) -> Columns | Dropped:
+        """The columns of its pictures and the `tags` they add; Dropped where the pictures are no sample's."""
+        ...
+
+    def label(self, driven: Driven) -> Columns:
+        """All other columns."""
+        ...
+
+
+@dataclass(frozen=True)
+class Underway:
+    """An attempt that some stages are done of."""
+
+    driven: Driven
+    drawn: Columns | None = None
+
+
+def go_on(
+    work: Work, stages: Sequence[str], so_far: PreparedClip | Underway, candidate: int, expert: str
+) -> Underway | Columns | Dropped:
+    """Some stages of an attempt (tasks.stages.ATTEMPT), one after the other, from where it stands.
+
+    Columns: the sample's. Seconds are those of all stages so far.
+    """
+    for stage in stages:
+        if stage == "drive":
+            assert isinstance(so_far, PreparedClip)
+            driven = work.drive(so_far, candidate, expert)
+            if isinstance(driven, Dropped):
+                return driven
+            so_far = Underway(driven)
+            continue
+        assert isinstance(so_far, Underway)
+        driven, drawn = so_far.driven, so_far.drawn
+        if stage == "render":
+            found = work.draw(driven)
+            if isinstance(found, Dropped):
+                return replace(found, seconds={**driven.seconds, **found.seconds})
+            so_far = Underway(driven, found)
+        else:
+            assert stage == "label" and drawn is not None
+            labelled = work.label(driven)
+            tags = [*labelled.row["tags"], *drawn.row.get("tags", ())]  # type: ignore[misc]
+            seconds = {**driven.seconds, **drawn.seconds, **labelled.seconds}
+            return Columns({**labelled.row, **drawn.row, "tags": tags}, seconds, drawn.scene_at_hand)
+    assert isinstance(so_far, Underway)
+    return so_far
+
+
+def attempted(work: Work, prepared: PreparedClip, candidate: int, expert: str) -> Columns | Dropped:
+    """One attempt, whole."""
+    result = go_on(work, ATTEMPT, prepared, candidate, expert)
+    assert not isinstance(result, Underway)
+    return result

@@ -5,17 +5,17 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from factory.graph.work import HUMAN_CANDIDATE, LOGGED, Accepted
+from factory.graph.walk import candidate_order
+from factory.graph.work import Columns, attempted
 from factory.readers.base import ClipRef
 from factory.setup.paper import setup_text
 from factory.setup.settings import Run
 from factory.store.funnel import funnel_of
 from factory.store.samples import Store
 from factory.store.schema import BOOKKEEPING, sample_row_to_table
-from tasks.stages import Rejected
+from tasks.stages import TASKS, Rejected
 
 CALIBRATION_CLIPS = 3
-PER_CLIP = ("clip", "perturb", "reconstruct")  # stages that are no part of an attempt
 
 
 def plan_text(run: Run, refs: Sequence[ClipRef]) -> str:
@@ -66,13 +66,13 @@ def measure(run: Run, refs: Sequence[ClipRef]) -> Calibration:
         sums.candidates += len(prepared.candidates)
         sums.seconds.update(prepared.seconds)
         for expert in run.config.experts:
-            wanted = 1 if expert in LOGGED else run.config.rounds
-            tries = [HUMAN_CANDIDATE] if expert in LOGGED else range(len(prepared.candidates))
-            for candidate in tries:
-                result = run.work.attempt(prepared, candidate, expert)
+            once = run.work.once(expert)
+            wanted = 1 if once else run.config.rounds
+            for candidate in candidate_order(once, len(prepared.candidates)):
+                result = attempted(run.work, prepared, candidate, expert)
                 sums.attempts += 1
                 sums.seconds.update(result.seconds)
-                if isinstance(result, Accepted):
+                if isinstance(result, Columns):
                     sums.accepted += 1
                     sums.row_bytes += _bytes_of(result)
                     wanted -= 1
@@ -81,7 +81,7 @@ def measure(run: Run, refs: Sequence[ClipRef]) -> Calibration:
     return sums
 
 
-def _bytes_of(result: Accepted) -> int:
+def _bytes_of(result: Columns) -> int:
     blank: dict[str, object] = dict.fromkeys(BOOKKEEPING, "") | {"round": 0, "candidate_index": 0}
     return int(sample_row_to_table([{**blank, **result.row}]).nbytes)
 
@@ -95,8 +95,9 @@ def calibrate(run: Run, refs: Sequence[ClipRef], store: Store | None = None) -> 
     core_hours = sum(sums.seconds.values()) * factor / 3600.0
     cores = run.config.workers or os.cpu_count() or 1
     total = f"{core_hours:.2f} core-hours ({core_hours / cores:.2f} h on {cores} cores)"
-    if run.work.draws_on_gpu:  # a drawing attempt holds its share of a GPU from its first stage to its last
-        spent = sum(seconds for stage, seconds in sums.seconds.items() if stage not in PER_CLIP)
+    if run.work.draws_on_gpu:  # a task that draws holds its share of a GPU; where all is fused, the whole attempt does
+        tasks = [task for task in TASKS if task.per == "attempt" and (task.may_draw or run.config.graph.fuse == "all")]
+        spent = sum(sums.seconds[stage] for task in tasks for stage in task.stages)
         total += f", {spent * run.config.gpu_share * factor / 3600.0:.2f} GPU-hours"
     lines = [
         f"measured on {sums.clips} clips: {sums.candidates / sums.clips:.1f} candidates a clip, "
@@ -124,7 +125,7 @@ def by_the_tables(store: Store, experts: Sequence[str], rounds: int, n_clips: in
         rows = [row for row in funnel_of(store).rows if row.expert == expert and row.clips_before]
         if not rows:
             continue
-        wanted = 1 if expert in LOGGED else rounds
+        wanted = rounds if rows[0].simulated else 1
         left, attempts, samples = float(n_clips), 0.0, 0.0
         for number in range(wanted):
             row = rows[min(number, len(rows) - 1)]

@@ -3,52 +3,37 @@
 import dataclasses
 import hashlib
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache, partial
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
 from factory.config.compose import ConfigError, build
-from factory.config.run import RecoverySources, RunConfig, VocabularyChoice, recovery_settings, refuse_relative_root
-from factory.graph.work import BENCHMARK, FOLLOW_UP_BEFORE, HUMAN
+from factory.config.run import RunConfig, VocabularyChoice, refuse_relative_root
 from factory.readers.base import BadClip, ClipIndex, ClipReader
-from factory.setup.vocabulary import (
-    build_recovery_table,
-    load_recovery_table,
-    load_vocabulary,
-    save_recovery_table,
-    train_windows,
-)
+from factory.setup.vocabulary import load_vocabulary
+from factory.stages.frames import BenchmarkWork
 from factory.stages.pipeline import FactoryWork
 from factory.stages.sensors import chosen_cameras
 from factory.store.identity import UNLISTED, RunIdentity, canonical_json
+from factory.wording import one_line
 from tasks.caches import user_cache
-from tasks.experts.follow_up import FollowUp
-from tasks.experts.human import Human
-from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings
-from tasks.experts.protocol import Expert
-from tasks.experts.recovery.expert import Recovery, RecoveryTable
+from tasks.experts.pdm_closed.settings import PdmSettings
+from tasks.experts.protocol import Expert, tried_once
 from tasks.render.fit.settings import REMOVED
 from tasks.render.rigs import RIGS
 from tasks.render.scene import engine
 from tasks.render.settings import RenderMode
 from tasks.render.splatting.gsplat_backend import BackendMissing
 from tasks.reward.labels import Labelling
-from tasks.stages import stage_versions
+from tasks.stages import FRAMES, stage_versions
 from tasks.world.kinematic_vocabulary import kinematic_trajectories
 from tasks.world.vocabulary import Vocabulary
 
 KINEMATIC_K = 1024
 RIGS_LOOKED_AT = 3  # clips, for the names of their cameras
-KINDS = (
-    "human",
-    "pdm_closed",
-    "recovery",
-    "logged",
-    "human_before",
-    "follow_up",
-    "follow_up_before",
-)  # of built-in experts
 ABSENT = object()
 # Settings that came later: at what held before there was a choice they are left out, so that older tables go on.
 ADDED: dict[str, object] = {"perturb.interleaved": True, "perturb.order": "drawn", "perturb.at_most": None}
@@ -62,6 +47,20 @@ class Run:
     reader: ClipReader
     index: ClipIndex
     work: FactoryWork
+
+
+@dataclass(frozen=True)
+class RunContext:
+    """What an expert is told of its run, where its class, or the function that makes it, takes an argument `run`."""
+
+    config: RunConfig
+    name: str  # of the expert
+    clips: Callable[[], tuple[ClipReader, ClipIndex]]  # opens them when it is first called
+
+    @property
+    def pdm(self) -> PdmSettings:
+        """Constants of PDM-Closed."""
+        return self.config.pdm
 
 
 def open_reader(clips: Mapping[str, Any]) -> tuple[ClipReader, ClipIndex]:
@@ -78,6 +77,13 @@ def open_reader(clips: Mapping[str, Any]) -> tuple[ClipReader, ClipIndex]:
         raise ConfigError(
             f"clips: no clip found under {clips.get('root', 'its root')} ({'; '.join(reasons) or 'empty'})"
         )
+    return reader, index
+
+
+def open_for(config: RunConfig) -> tuple[ClipReader, ClipIndex]:
+    """The run's clips, fit for what it draws. Raises ConfigError."""
+    reader, index = open_reader(config.clips)
+    refuse_unknown_cameras(config, reader, index)
     return reader, index
 
 
@@ -98,13 +104,16 @@ def assemble(config: RunConfig) -> Run:
     try:  # what takes no clips comes first
         vocabulary = choose_vocabulary(config.vocabulary)
         labelling = choose_labelling(config, vocabulary)
-        refuse_wrong_recovery(config)
-        reader, index = open_reader(config.clips)
-        refuse_unknown_cameras(config, reader, index)
-        experts = {name: build_expert(name, config, reader, index, vocabulary) for name in config.experts}
+        opened = cache(lambda: open_for(config))
+        experts = {
+            name: build_expert(RunContext(config, name, opened)) for name in config.experts if name not in FRAMES
+        }
+        reader, index = opened()
     except ValueError as error:
         raise error if isinstance(error, ConfigError) else ConfigError(str(error)) from error
-    work = FactoryWork(
+    frames = tuple(name for name in config.experts if name in FRAMES)
+    kind = partial(BenchmarkWork, frames=frames) if frames else FactoryWork
+    work = kind(
         reader=reader,
         broken=index.broken,
         vocabulary=vocabulary,
@@ -120,15 +129,6 @@ def assemble(config: RunConfig) -> Run:
         cache_dir=cache_folder(config),
     )
     return Run(config, reader, index, work)
-
-
-def refuse_wrong_recovery(config: RunConfig) -> None:
-    """Raises ConfigError for settings that a recovery expert does not take, and for a table that is not there."""
-    for name in config.experts:
-        if config.expert[name].get("kind") == "recovery":
-            sources, _ = recovery_settings(config, name)
-            if sources.table is not None and not Path(sources.table).is_file():
-                raise ConfigError(f"expert.{name}.table={sources.table}: there is no such file")
 
 
 def refuse_unknown_cameras(config: RunConfig, reader: ClipReader, index: ClipIndex) -> None:
@@ -167,71 +167,53 @@ def choose_labelling(config: RunConfig, vocabulary: Vocabulary) -> Labelling | N
     return Labelling(chosen, dataclasses.replace(config.traffic, mode=config.reward.traffic))
 
 
-def build_expert(name: str, config: RunConfig, reader: ClipReader, index: ClipIndex, vocabulary: Vocabulary) -> Expert:
-    """One of the built-in kinds, or a user's `_target_`. Raises ConfigError for what the expert does not take."""
-    spec, where = dict(config.expert[name]), f"expert.{name}"
-    match spec.pop("kind", None):
-        case "human" | "human_before" | "logged" | "pdm_closed" | "follow_up" | "follow_up_before" as kind:
-            if spec:
-                raise ConfigError(f"unknown setting {', '.join(f'{where}.{key}' for key in spec)}")
-            return _without_settings(kind, config.pdm)
-        case "recovery":
-            sources, settings = recovery_settings(config, name)
-            return Recovery(recovery_table(config, reader, index, sources), settings)
-        case None:
-            expert: Expert = build(spec, where, labels=())
-            _must_have(expert, ("name", "digest", "plan"), where, "an expert (tasks.experts.protocol.Expert)")
-            return expert
-        case other:
-            raise ConfigError(f"{where}.kind={other} is none of {', '.join(KINDS)}; or give _target_")
+def build_expert(run: RunContext) -> Expert:
+    """What the expert's `_target_` makes of its settings and, where it asks for it, of `run`. Raises ConfigError."""
+    where = f"expert.{run.name}"
+    target, spec = _target(run.config, run.name), run.config.expert[run.name]
+    if not _asks_for_run(target):
+        made = build(spec, where, labels=())
+    else:
+        try:
+            signature(target).bind(run=run, **{key: value for key, value in spec.items() if key != "_target_"})
+        except TypeError as error:
+            raise ConfigError(f"{where}: {spec['_target_']}: does not take these settings: {error}") from error
+        made = build({**spec, "_partial_": True}, where, labels=())(run=run)
+    _must_have(made, ("name", "digest", "plan"), where, "an expert (tasks.experts.protocol.Expert)")
+    expert: Expert = made
+    return expert
 
 
-def _without_settings(kind: str, pdm: PdmSettings) -> Expert:
-    match kind:
-        case "human" | "human_before" | "logged":
-            return Human(kind)
-        case "pdm_closed":
-            return PdmClosed(pdm)
-        case _:
-            return FollowUp(pdm, before=kind == FOLLOW_UP_BEFORE)
+def _target(config: RunConfig, name: str) -> Callable[..., Any]:
+    """What `expert.<name>._target_` names. Raises ConfigError."""
+    from hydra.utils import get_object
+
+    where, spec = f"expert.{name}", config.expert[name]
+    if "_target_" not in spec:
+        raise ConfigError(f"{where}._target_ is missing: name the class to use, such as my_package.MyExpert")
+    try:
+        found: Callable[..., Any] = get_object(spec["_target_"])
+    except (ImportError, ValueError, AttributeError) as error:
+        raise ConfigError(f"{where}: {spec['_target_']}: {one_line(error)}") from error
+    return found
+
+
+def _asks_for_run(target: Callable[..., Any]) -> bool:
+    try:
+        return "run" in signature(target).parameters
+    except (TypeError, ValueError):  # nothing to call, or written in C
+        return False
+
+
+def simulates(config: RunConfig) -> bool:
+    """Whether the run drives from candidates: not where all its experts are tried once, on the log itself."""
+    return any(name in FRAMES or not tried_once(_target(config, name)) for name in config.experts)
 
 
 def _must_have(plugged: object, members: Sequence[str], where: str, what: str) -> None:
     missing = [member for member in members if not hasattr(plugged, member)]
     if missing:
         raise ConfigError(f"{where}: {type(plugged).__name__} is not {what}: it has no {', '.join(missing)}")
-
-
-def recovery_table(config: RunConfig, reader: ClipReader, index: ClipIndex, sources: RecoverySources) -> RecoveryTable:
-    """The named table, else one of all TRAIN windows and the vocabulary files, kept in the user's cache."""
-    if sources.table is not None:
-        if sources.vocabularies:
-            raise ConfigError(
-                "expert.recovery: give table or vocabularies; a finished table takes no more trajectories"
-            )
-        return load_recovery_table(sources.table)
-    files = [*sources.vocabularies, *([config.vocabulary.file] if config.vocabulary.file else [])]
-    loaded = [load_vocabulary(file) for file in dict.fromkeys(files)]
-    digests = log_digests(reader, index)
-    if digests is None:
-        return build_recovery_table([train_windows(reader)], loaded)
-    made_of = [stage_versions()["clip"], digests, sorted(ref.clip_id for ref in index.refs), [v.digest for v in loaded]]
-    key = hashlib.sha256(canonical_json(made_of).encode()).hexdigest()[:16]
-    cached = user_cache() / "tables" / f"recovery-{key}.npz"
-    if cached.is_file():
-        return load_recovery_table(cached)
-    built = build_recovery_table([train_windows(reader)], loaded)
-    save_recovery_table(cached, built, {"clips": len(index.refs), "vocabularies": files})
-    return built
-
-
-def log_digests(reader: ClipReader, index: ClipIndex) -> list[str] | None:
-    """Content digest of every log; None where the reader cannot tell them without reading the clips."""
-    digest = getattr(reader, "digest", None)
-    if digest is None:
-        return None
-    first_of_log = {ref.log_id: ref for ref in reversed(index.refs)}
-    return [str(digest(first_of_log[log_id])) for log_id in sorted(first_of_log)]
 
 
 def identity_of(config: RunConfig, vocabulary: Vocabulary, labelling: Labelling | None) -> RunIdentity:
@@ -258,11 +240,11 @@ def identity_of(config: RunConfig, vocabulary: Vocabulary, labelling: Labelling 
         early |= {key: value for key, value in settings.items() if key.startswith("render.")}
         stages.append("render")
     made_of: list[object] = [early, {stage: versions[stage] for stage in stages}]
-    if set(config.experts) & BENCHMARK:  # then a prepared clip has its earlier frame
+    if set(config.experts) & set(FRAMES):  # then a prepared clip has its earlier frame
         made_of.append("earlier frame")
     prepared = canonical_json(made_of)
     digest = hashlib.sha256(prepared.encode()).hexdigest()[:16]
-    return RunIdentity(settings, versions, vocabulary.digest, UNLISTED if set(config.experts) == {HUMAN} else digest)
+    return RunIdentity(settings, versions, vocabulary.digest, digest if simulates(config) else UNLISTED)
 
 
 def cache_folder(config: RunConfig) -> str:

@@ -10,15 +10,16 @@ from dataclasses import dataclass
 from typing import Any
 
 from factory.config.run import BenchmarkSettings
-from factory.graph.work import FOLLOW_UP, FOLLOW_UP_BEFORE, HUMAN, HUMAN_BEFORE, HUMAN_CANDIDATE
+from factory.graph.work import HUMAN_CANDIDATE
 from factory.readers.base import ClipRef
 from factory.store.identity import RunIdentity
 from factory.store.samples import MADE_UNDER, Store
-from tasks.experts.follow_up import BEFORE_STEPS
+from tasks.hard_scenes import BEFORE_STEPS
+from tasks.stages import FOLLOW_UP, FOLLOW_UP_BEFORE, FRAMES, HUMAN, HUMAN_BEFORE
 from tasks.world.clip import STEP_S
 
 BENCHMARK_FILE = "benchmark.json"
-NEEDED = frozenset({HUMAN, HUMAN_BEFORE, FOLLOW_UP, FOLLOW_UP_BEFORE})  # experts
+NEEDED = frozenset({HUMAN, *FRAMES})  # samples of each clip
 FORMAT = 1
 
 

@@ -18,7 +18,6 @@ from factory.readers.base import BadClip
 from factory.stages.assets import Sensing, asset_for, scene_path, sensing
 from factory.stages.sensors import block_of, chosen_cameras, encode_jpeg, load_photos, taken_by
 from tasks.attempt import Judged
-from tasks.experts.follow_up import BEFORE_STEPS
 from tasks.perturb import Candidate
 from tasks.render.gate import looked_at_size, unfit
 from tasks.render.likeness import Album, likeness_to_photo, sightings
@@ -99,11 +98,11 @@ class Imaging:
             tags.append(LOW_PSNR)
         return self._drawn(clip, judged, asset, cameras) | {"tags": tags}
 
-    def unfit(self, clip: Clip, candidate: Candidate, judged: Judged, pair: bool = False) -> Rejected | None:
+    def unfit(self, clip: Clip, candidate: Candidate, judged: Judged, shared: Sequence[int] = ()) -> Rejected | None:
         """Why a simulated drive cannot be shown: what `tasks.render.gate` finds on its pictures from T to T+2H.
 
         Vehicles are held against photos on the pictures that are stored.
-        pair: all on those that a benchmark's follow-up and its earlier frame show, the same for both.
+        shared: steps of several samples of the drive, which fall together: then all is held against what they store.
 
         None where nothing is rendered from photos: lidar's grey pictures have gaps between its beams, and a reach of
         their own instead. Raises BadClip for a broken sensor file.
@@ -114,9 +113,8 @@ class Imaging:
             return None
         start, now = candidate.rollout.start_step, judged.scene.step
         steps: Sequence[int] = range(start, now + HORIZON_STEPS + 1, GATE_STRIDE)
-        instants = (now - BEFORE_STEPS, now) if pair else (now,)
-        stored = sorted({at + offset for at in instants for offset in STEPS_OF[self.settings.frames]})
-        if pair:
+        stored = sorted({at + offset for at in shared or (now,) for offset in STEPS_OF[self.settings.frames]})
+        if shared:
             steps = stored
         states = np.concatenate([candidate.rollout.ego_states, judged.rollout.ego_states[1:]])
         return unfit(

@@ -3,59 +3,33 @@
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from factory.graph.work import (
-    BENCHMARK,
-    HUMAN,
-    HUMAN_BEFORE,
-    LOGGED,
-    Accepted,
-    AttemptResult,
-    Built,
-    Dropped,
-    NotReady,
-    PreparedClip,
-    Stopped,
-    never,
-)
+from factory.graph.work import Built, Columns, Driven, Dropped, NotReady, PreparedClip, Stopped, never
 from factory.readers.base import BadClip, ClipReader, ClipRef
 from factory.readers.validate import read_clip
 from factory.stages.fitting import fits_going_on
 from factory.stages.imaging import Imaging, scene_lookups
-from factory.stages.rows import earlier_lineage, label_columns, sample_row
+from factory.stages.rows import label_columns, sample_row
 from factory.store.candidates import CandidateRow
-from factory.store.identity import RunIdentity
-from tasks.attempt import (
-    ExpertGate,
-    Judged,
-    Timed,
-    attempt,
-    follow_up,
-    half_a_second_before,
-    has_route,
-    human_sample,
-    perturbed_scene,
-)
-from tasks.experts.follow_up import BEFORE_STEPS, FollowUp
+from factory.store.identity import UNLISTED, RunIdentity
+from tasks.attempt import ExpertGate, Judged, Timed, attempt, has_route, human_sample, perturbed_scene
 from tasks.experts.pdm_closed.planner import PdmSettings
-from tasks.experts.protocol import Expert
-from tasks.hard_scenes import BenchmarkClip
+from tasks.experts.protocol import Expert, tried_once
 from tasks.perturb import Candidate, Perturbation, PerturbSettings, end_speed_mps, perturb
 from tasks.render.scene.engine import Backend, check
 from tasks.render.settings import RenderMode, RenderSettings
 from tasks.render.splatting.gsplat_backend import BackendMissing
-from tasks.reward.epdms import Scores
 from tasks.reward.labels import Labelling, vocabulary_labels
 from tasks.rollout.simulate import TrafficSettings
 from tasks.stages import Rejected
 from tasks.subscores import OF_ONE_PLAN
 from tasks.world.arrays import Array
 from tasks.world.chance import stream
-from tasks.world.clip import NOW, STEP_S, Clip, scene_of_clip
+from tasks.world.clip import NOW, Clip, scene_of_clip
 from tasks.world.vehicle import HEADING
 from tasks.world.vocabulary import Vocabulary
 
@@ -67,7 +41,6 @@ class PerturbedClip:
     ref: ClipRef
     clip: Clip
     candidates: tuple[Candidate, ...]
-    before: Clip | None = None  # of a benchmark: the same log's window 0.5 s earlier
 
 
 def logged_poses(prepared: object) -> Array | None:
@@ -84,7 +57,6 @@ class Considered:
     clip: Clip
     found: Perturbation | Rejected  # Rejected by render or perturb: no simulated expert has anything to try
     seconds: Mapping[str, float]  # by stage
-    before: Clip | None = None  # of a benchmark: the same log's window 0.5 s earlier
 
     @property
     def candidates(self) -> tuple[Candidate, ...]:
@@ -106,12 +78,22 @@ class BrokenLog(BadClip):
 
 
 @dataclass(frozen=True)
-class Trace:
-    """One attempt with everything it went through, for pictures and explanations."""
+class Drive:
+    """One attempt up to the reward's verdict with everything it went through: to be drawn, labelled or explained."""
 
-    candidate: Candidate | None
+    ref: ClipRef  # the window that its sensor files are of
+    candidate: Candidate | None  # None: the log's own drive
     judged: Judged | None  # None where the expert had no plan
     rejected: Rejected | None  # None: the reward accepts it
+    shared: tuple[int, ...] = ()  # steps at which samples of this drive have their now, where there are several
+    told: Mapping[str, object] = field(default_factory=dict)  # columns that the row has in place of its own
+    shown: Judged | None = None  # as the sample tells it, where that is not `judged`
+
+    @property
+    def sampled(self) -> Judged:
+        """What the sample is made of."""
+        assert self.judged is not None, "a drive that was accepted"
+        return self.shown or self.judged
 
 
 class Stopwatch:
@@ -160,6 +142,15 @@ class FactoryWork:
         label_traffic = None if self.labelling is None else self.labelling.traffic.mode
         compile_kernels(parts_of(self._simulates, self.traffic.mode, label_traffic, self.render))
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Whose samples this run makes."""
+        return tuple(self.experts)
+
+    def once(self, expert: str) -> bool:
+        """Whether the expert says so itself."""
+        return tried_once(self.experts[expert])
+
     def expert_digest(self, expert: str) -> str:
         """Of the expert's inputs and settings."""
         return self.experts[expert].digest()
@@ -167,43 +158,40 @@ class FactoryWork:
     def prepare(self, ref: ClipRef) -> PreparedClip | Rejected:
         """Read the clip, check that its block can be rendered, list its candidates.
 
-        In a run of `human` alone the clip is read and nothing more: its drive needs no block and no candidates.
+        In a run of experts that are tried once, on the log itself, the clip is read and nothing more: their drives need
+        no block and no candidates.
         """
-        if not self._simulates:
-            return self._unlisted(ref)
-        made = self.considered(ref)
-        if isinstance(made, Rejected):
-            return made
-        clip, found = _bare(made.clip), made.found
-        before = None if made.before is None else _bare(made.before)
-        rollouts = tuple((i, candidate.rollout) for i, candidate in enumerate(made.candidates))
+        made = self.considered(ref) if self._simulates else self._unlisted(ref)
+        return made if isinstance(made, Rejected | PreparedClip) else self.listed(ref, made)
+
+    def listed(self, ref: ClipRef, made: Considered) -> PreparedClip:
+        """What attempts start from."""
+        clip, found = bare(made.clip), made.found
         return PreparedClip(
             clip_id=clip.clip_id,
             content_digest=clip.content_digest,
             candidates=tuple(_candidate_row(index, candidate) for index, candidate in enumerate(made.candidates)),
             gate_counts=found.counts if isinstance(found, Rejected) else found.gate_counts,
-            payload=PerturbedClip(ref, clip, made.candidates, before),
+            payload=PerturbedClip(ref, clip, made.candidates),
             dropped=found if isinstance(found, Rejected) else None,
             seconds=made.seconds,
-            scenes=None if before is None else BenchmarkClip(clip, before, rollouts),
         )
 
     def considered(self, ref: ClipRef) -> Considered | Rejected:
         """All that `prepare` decides, and every gated trajectory's fate. Rejected: for every expert. Raises BadClip."""
         watch = Stopwatch()
         clip = self._read(ref, watch)
-        if isinstance(clip, Rejected):
-            return clip
-        before = self._earlier(ref, watch)
-        if isinstance(before, Rejected):
-            return before
-        with watch.of("render"):
-            blocked = self._block_verdict(clip)
+        return clip if isinstance(clip, Rejected) else self._perturbed(clip, watch)
+
+    def _perturbed(self, clip: Clip, watch: Stopwatch) -> Considered:
+        with watch.of("render"):  # before perturb work is spent; without a gate only a block that will be needed
+            asked = self.render.refuses_blocks or self._simulates
+            blocked = self.imaging.block_verdict(clip) if asked else None
         with watch.of("perturb"):
             found = blocked or perturb(
                 clip, self.vocabulary, self.perturb, self.traffic, self.pdm, stream(self.seed, clip.clip_id, "perturb")
             )
-        return Considered(clip, found, watch.seconds, before)
+        return Considered(clip, found, watch.seconds)
 
     def _read(self, ref: ClipRef, watch: Stopwatch) -> Clip | Rejected:
         if ref in self.broken:
@@ -214,25 +202,12 @@ class FactoryWork:
             return Rejected("clip", "route_ended", "the log ends at the end of its route")
         return clip
 
-    def _earlier(self, ref: ClipRef, watch: Stopwatch) -> Clip | Rejected | None:
-        """The window 0.5 s before a clip that was read; None where nobody asks for it."""
-        if not set(self.experts) & BENCHMARK:
-            return None
-        earlier = _earlier_ref(ref)
-        if earlier.start_ms < 0:
-            return Rejected("clip", "no_earlier_frame", f"the log begins {ref.start_ms} ms before the clip")
-        try:
-            with watch.of("clip"):
-                return read_clip(self.reader, earlier)
-        except BadClip as error:  # the clip itself was read: what lies before it is no drive
-            return Rejected("clip", "no_earlier_frame", str(error))
-
     def _unlisted(self, ref: ClipRef) -> PreparedClip | Rejected:
         watch = Stopwatch()
         clip = self._read(ref, watch)
         if isinstance(clip, Rejected):
             return clip
-        payload = PerturbedClip(ref, _bare(clip), ())
+        payload = PerturbedClip(ref, bare(clip), ())
         return PreparedClip(clip.clip_id, clip.content_digest, (), {}, payload, seconds=watch.seconds)
 
     def content_digest(self, ref: ClipRef) -> str | None:
@@ -259,94 +234,68 @@ class FactoryWork:
         """The fits that are going on here."""
         return "; ".join(fits_going_on(Path(self.cache_dir)))
 
-    def attempt(self, prepared: PreparedClip, candidate: int, expert: str) -> AttemptResult:
-        """Rollout, expert, rollout, reward, render and labels of one candidate; candidate -1 is the human drive."""
+    def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> Driven | Dropped:
+        """Rollout, expert, rollout and reward; candidate -1 with experts that are tried once."""
         watch = Stopwatch()
-        payload = prepared.payload
-        assert isinstance(payload, PerturbedClip)
-        trace = self.trace(payload, candidate, expert, watch.of)
-        if trace.judged is None or trace.rejected is not None:
-            assert trace.rejected is not None
-            return Dropped(trace.rejected, _subscores(trace.judged.scores) if trace.judged else {}, watch.seconds)
-        before = scene_lookups()
-        with watch.of("render"):
-            sensed = self._with_sensors(payload, expert)
-            unfit = self.unfit(sensed, trace, expert)
-            if unfit is not None:
-                return Dropped(unfit, _subscores(trace.judged.scores), watch.seconds, _at_hand(before))
-        judged = self._sampled(trace, expert)
-        with watch.of("render"):
-            pictures = self.imaging.pictures(sensed, trace.candidate, judged)
-        labels = self._labels(judged, watch)
-        row = sample_row(judged.scene.clip, trace.candidate, judged)
-        if expert == HUMAN_BEFORE:
-            row |= earlier_lineage(payload.clip)
-        tags = [*row["tags"], *pictures.get("tags", ())]  # type: ignore[misc]
-        return Accepted(row | labels | pictures | {"tags": tags}, watch.seconds, _at_hand(before))
+        drive = self.trace(prepared, candidate, expert, watch.of)
+        if drive.rejected is not None:
+            return Dropped(drive.rejected, _subscores(drive), watch.seconds)
+        return Driven(drive, watch.seconds)
 
-    def trace(
-        self,
-        payload: PerturbedClip,
-        candidate: int,
-        expert: str,
-        timed: Timed = nullcontext,
-    ) -> Trace:
-        """The same attempt up to the reward's verdict, nothing left out."""
-        clip, driver = payload.clip, self.experts[expert]
-        rng = stream(self.seed, clip.clip_id, f"expert.{expert}", candidate)
-        if expert in LOGGED:
-            logged = scene_of_clip(_driven(payload, expert))
-            return Trace(None, human_sample(logged, driver, self.pdm, rng, timed), None)
+    def trace(self, prepared: PreparedClip, candidate: int, expert: str, timed: Timed = nullcontext) -> Drive:
+        """The same with nothing left out."""
+        payload, driver = payload_of(prepared), self.experts[expert]
+        rng = stream(self.seed, prepared.clip_id, f"expert.{expert}", candidate)
+        if tried_once(driver):
+            judged = human_sample(scene_of_clip(payload.clip), driver, self.pdm, rng, timed)
+            return Drive(payload.ref, None, judged, None)
         chosen = payload.candidates[candidate]
-        if isinstance(driver, FollowUp):
-            led_to = follow_up(clip, chosen.rollout, driver, self.traffic, timed)
-            return Trace(chosen, None, led_to) if isinstance(led_to, Rejected) else Trace(chosen, led_to, None)
         with timed("rollout"):
-            scene = perturbed_scene(clip, chosen.rollout)
+            scene = perturbed_scene(payload.clip, chosen.rollout)
         result = attempt(scene, driver, self.gate, self.traffic, self.pdm, rng, timed)
-        if isinstance(result, Rejected):
-            return Trace(chosen, None, result)
-        return Trace(chosen, *result)
+        return Drive(payload.ref, chosen, *((None, result) if isinstance(result, Rejected) else result))
 
-    def unfit(self, clip: Clip, trace: Trace, expert: str) -> Rejected | None:
+    def draw(self, driven: Driven) -> Columns | Dropped:
+        """The pictures; Dropped where they are no sample's. Raises BadClip."""
+        watch, drive, before = Stopwatch(), drive_of(driven), scene_lookups()
+        with watch.of("render"):
+            sensed = self._with_sensors(drive)
+            unfit = self.unfit(sensed, drive)
+            pictures = {} if unfit is not None else self.imaging.pictures(sensed, drive.candidate, drive.sampled)
+        if unfit is not None:
+            return Dropped(unfit, _subscores(drive), watch.seconds, _at_hand(before))
+        return Columns(pictures, watch.seconds, _at_hand(before))
+
+    def unfit(self, clip: Clip, drive: Drive) -> Rejected | None:
         """Why the pictures of an accepted drive are no sample's; `clip` with its sensor files. Raises BadClip.
 
-        The human drive is never filtered.
+        The log's own drive is never filtered.
         """
-        if trace.candidate is None or trace.judged is None:
+        if drive.candidate is None or drive.judged is None:
             return None
-        pair = isinstance(self.experts[expert], FollowUp)
-        return self.imaging.unfit(clip, trace.candidate, trace.judged, pair)
+        return self.imaging.unfit(clip, drive.candidate, drive.judged, drive.shared)
 
-    def _sampled(self, trace: Trace, expert: str) -> Judged:
-        """The drive as the sample tells it; of the earlier frame of a pair, only after all that the pair shares."""
-        assert trace.judged is not None
-        driver = self.experts[expert]
-        if not (isinstance(driver, FollowUp) and driver.before):
-            return trace.judged
-        assert trace.candidate is not None
-        return half_a_second_before(trace.judged, trace.candidate.rollout, driver.settings)
-
-    def _labels(self, judged: Judged, watch: Stopwatch) -> dict[str, object]:
-        """Columns of the vocabulary labels; none in a run without them."""
-        if self.labelling is None:
-            return {}
-        with watch.of("labels"):
-            return label_columns(vocabulary_labels(self.labelling, judged.scene, judged.prepared, judged.reference))
-
-    def _block_verdict(self, clip: Clip) -> Rejected | None:
-        """Asked for before perturb work is spent. Without a gate a block is built here only if it will be needed."""
-        return self.imaging.block_verdict(clip) if self.render.refuses_blocks or self._simulates else None
+    def label(self, driven: Driven) -> Columns:
+        """All but the pictures, the vocabulary labels among it."""
+        watch, drive = Stopwatch(), drive_of(driven)
+        judged = drive.sampled
+        labels: dict[str, object] = {}
+        if self.labelling is not None:
+            with watch.of("labels"):
+                labelled = vocabulary_labels(self.labelling, judged.scene, judged.prepared, judged.reference)
+                labels = label_columns(labelled)
+        row = sample_row(judged.scene.clip, drive.candidate, judged)
+        return Columns({**row, **drive.told, **labels}, watch.seconds)
 
     @property
     def _simulates(self) -> bool:
-        return bool(set(self.experts) - {HUMAN})
+        return self.identity.prepare_digest != UNLISTED
 
-    def _with_sensors(self, payload: PerturbedClip, expert: str) -> Clip:
-        clip = _driven(payload, expert)
+    def _with_sensors(self, drive: Drive) -> Clip:
+        clip = drive.sampled.scene.clip
         if self.render.mode is not RenderMode.AUTO:
             return clip
-        now = read_clip(self.reader, _earlier_ref(payload.ref) if expert == HUMAN_BEFORE else payload.ref)
+        now = read_clip(self.reader, drive.ref)
         return replace(clip, images=now.images, sweeps=now.sweeps, block=now.block)
 
     @property
@@ -366,21 +315,21 @@ def _at_hand(before: tuple[int, int]) -> bool | None:
     return None if (hits, misses) == before else misses == before[1]
 
 
-def _bare(clip: Clip) -> Clip:
+def bare(clip: Clip) -> Clip:
     """Without its sensor files: where data lies may change."""
     return replace(clip, images=(), sweeps=(), block=None)
 
 
-def _earlier_ref(ref: ClipRef) -> ClipRef:
-    return replace(ref, start_ms=ref.start_ms - round(1000 * BEFORE_STEPS * STEP_S))
+def payload_of(prepared: PreparedClip) -> PerturbedClip:
+    """What FactoryWork prepared."""
+    assert isinstance(prepared.payload, PerturbedClip)
+    return prepared.payload
 
 
-def _driven(payload: PerturbedClip, expert: str) -> Clip:
-    """The window at whose T the expert's sample has its now, or begins its perturbation."""
-    if expert != HUMAN_BEFORE:
-        return payload.clip
-    assert payload.before is not None, "prepared by a run without benchmark experts"
-    return payload.before
+def drive_of(driven: Driven) -> Drive:
+    """What FactoryWork drove."""
+    assert isinstance(driven.payload, Drive)
+    return driven.payload
 
 
 def _candidate_row(index: int, candidate: Candidate) -> CandidateRow:
@@ -398,6 +347,9 @@ def _candidate_row(index: int, candidate: Candidate) -> CandidateRow:
     )
 
 
-def _subscores(scores: Scores) -> dict[str, float]:
+def _subscores(drive: Drive) -> dict[str, float]:
+    if drive.judged is None:
+        return {}
+    scores = drive.judged.scores
     named = {name: float(getattr(scores, name)[1]) for name in OF_ONE_PLAN}
     return named | {"score": float(scores.pdm_score[1])} if np.isfinite(scores.pdm_score[1]) else named

@@ -6,7 +6,6 @@ import numpy as np
 
 from factory.store.schema import AGENT_STEPS, MAP_RADIUS_M, NOW_INDEX
 from tasks.attempt import Judged
-from tasks.experts.follow_up import BEFORE_STEPS
 from tasks.perturb import Candidate, end_speed_mps
 from tasks.render.views import pose_on_ground
 from tasks.reward.epdms import Scores
@@ -58,16 +57,6 @@ def sample_row(clip: Clip, candidate: Candidate | None, judged: Judged) -> dict[
         **({} if candidate is None else score_columns("stage1", candidate.reactive_scores)),
         **score_columns("stage2", judged.scores),
         "tags": _tags(scene, command),
-    }
-
-
-def earlier_lineage(clip: Clip) -> dict[str, object]:
-    """What the row of the log 0.5 s before T says about its clip, instead of the earlier window it was read from."""
-    return {
-        "clip_id": clip.clip_id,
-        "clip_start_s": clip.start_s,
-        "now_s": (NOW - BEFORE_STEPS) * STEP_S,
-        "parent_states": clip.ego_states[[NOW, NOW + HORIZON_STEPS]],
     }
 
 

@@ -28,6 +28,7 @@ MOVED = {
     "factory.work:CandidateRow": "factory.store.candidates:CandidateRow",
     "factory.clips.reader:ClipRef": "factory.readers.base:ClipRef",
 }
+DROPPED = {"factory.stages.pipeline:PerturbedClip": {"before"}}  # members that older files have and nobody reads
 _PLAIN = (str, int, float, bool, type(None))
 
 
@@ -125,7 +126,9 @@ def _decode(node: Any, arrays: Mapping[str, NDArray[np.generic]]) -> Any:
         if not dataclasses.is_dataclass(kind):
             raise BadCacheFile(f"{node['class']} is no dataclass")
         build: Any = kind
-        return build(**{name: _decode(child, arrays) for name, child in node["members"].items()})
+        dropped = DROPPED.get(MOVED.get(name := str(node["class"]), name), ())
+        members = {name: child for name, child in node["members"].items() if name not in dropped}
+        return build(**{name: _decode(child, arrays) for name, child in members.items()})
     if "enum" in node:
         kind = _class(node["enum"])
         if not issubclass(kind, enum.Enum):

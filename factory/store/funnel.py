@@ -38,6 +38,7 @@ class FunnelRow:
     clips_total: int  # in which this expert was to drive
     reasons: Mapping[str, int] = field(default_factory=dict)  # "stage.reason" or "failed.kind" -> attempts
     first_tries: int = 0  # clips whose first attempt of this round was accepted
+    simulated: bool = True  # from candidates; False: the log's own drive, tried once a clip
 
     @property
     def attempt_rate(self) -> float:
@@ -167,6 +168,7 @@ def _expert_rows(expert: str, clips: Mapping[str, list[tuple[int, str]]]) -> lis
                 at, fresh = at + 1, True
     rounds = max([*accepted, *reasons], default=-1) + 1
     before = len(clips)
+    simulated = any(candidate >= 0 for attempts in clips.values() for candidate, _ in attempts)
     rows = []
     for number in range(rounds):
         whys = reasons[number]
@@ -183,6 +185,7 @@ def _expert_rows(expert: str, clips: Mapping[str, list[tuple[int, str]]]) -> lis
                 len(clips),
                 dict(whys.most_common()),
                 first_tries[number],
+                simulated,
             )
         )
         before = accepted[number]

@@ -14,7 +14,6 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from factory import __version__
-from factory.graph.work import LOGGED
 from factory.store.funnel import Funnel, funnel_of
 from factory.store.outcomes import Kind
 from factory.store.samples import CURRENT_RUN, Store
@@ -23,7 +22,8 @@ from factory.store.schema import SCHEMA_VERSION
 FILE = "README.md"
 MARK = "# written by python -m factory, and again by its next run"  # a README without it is the user's own
 SOURCE = ["dataset", "licence", "split"]
-COLUMNS = [*SOURCE, "log_id", "clip_id", "expert", "round", "image_source", "psnr", "tags", "settings_hash"]
+COLUMNS = [*SOURCE, "log_id", "clip_id", "expert", "round", "candidate_index"]
+COLUMNS += ["image_source", "psnr", "tags", "settings_hash"]
 SIZES = ((10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"), (10**7, "1M<n<10M"))
 LICENCES = {  # as a row's licence begins -> the identifier of the convention
     r"Apache-2\.0\b": "apache-2.0",
@@ -149,7 +149,7 @@ def _funnel(funnel: Funnel) -> Iterator[str]:
 def _limits(store: Store, samples: pa.Table, orphans: int) -> Iterator[str]:
     """What a user must know; each line only where it is so."""
     yield "\n## Known limits\n"
-    simulated = samples.filter(pc.invert(pc.is_in(samples["expert"], value_set=pa.array(sorted(LOGGED)))))
+    simulated = samples.filter(pc.greater_equal(samples["candidate_index"], 0))
     sources = dict(zip(*(simulated["image_source"].value_counts().field(i).to_pylist() for i in (0, 1))))
     settings = _record(store)["settings"]
     kinds = store.outcomes.read(["kind"])["kind"].to_pylist()

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 from factory.graph.steps import cache_key
 from factory.graph.work import PreparedClip
 from factory.readers.base import BadClip, ClipRef
-from factory.stages.pipeline import FactoryWork, PerturbedClip
+from factory.stages.pipeline import FactoryWork, PerturbedClip, payload_of
 from factory.store.cache import BadCacheFile
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
@@ -152,29 +152,29 @@ class Again:
     def __init__(self, store: Store, work: FactoryWork, refs: Mapping[str, ClipRef]) -> None:
         self._store, self._work, self._refs = store, work, refs
         self._prepared_again = 0
-        self._known: dict[str, PerturbedClip | None] = {}
+        self._known: dict[str, PreparedClip | None] = {}
 
     def picture(self, outcome: Row) -> Picture | None:
         """A rejected attempt; None where its clip is not at hand or it was made with other settings."""
-        if outcome["settings_hash"] != self._work.identity.settings_hash or outcome["expert"] not in self._work.experts:
+        if outcome["settings_hash"] != self._work.identity.settings_hash or outcome["expert"] not in self._work.names:
             return None
-        payload = self._clip(outcome["clip_id"])
-        if payload is None or outcome["candidate_index"] >= len(payload.candidates):
+        prepared = self._clip(outcome["clip_id"])
+        if prepared is None or outcome["candidate_index"] >= len(prepared.candidates):
             return None
-        trace = self._work.trace(payload, outcome["candidate_index"], outcome["expert"])
-        image = attempt_picture(payload.clip, trace.candidate, trace.judged, "", BEV_PX)
+        trace = self._work.trace(prepared, outcome["candidate_index"], outcome["expert"])
+        image = attempt_picture(payload_of(prepared).clip, trace.candidate, trace.judged, "", BEV_PX)
         caption = f"{outcome['expert']}: {outcome['stage']}.{outcome['reason']}"
         detail = f"{outcome['detail']}; log {outcome['log_id']}; candidate {outcome['candidate_index']}"
         if trace.rejected is not None and trace.rejected.reason != outcome["reason"]:
             detail = f"made again it fell to {trace.rejected.reason}: this attempt is not reproducible. {detail}"
         return Picture(encoded(nearer(image)), caption, detail)
 
-    def _clip(self, clip_id: str) -> PerturbedClip | None:
+    def _clip(self, clip_id: str) -> PreparedClip | None:
         if clip_id not in self._known:
             self._known[clip_id] = self._load(clip_id)
         return self._known[clip_id]
 
-    def _load(self, clip_id: str) -> PerturbedClip | None:
+    def _load(self, clip_id: str) -> PreparedClip | None:
         try:
             stored = self._store.cache.load(cache_key(clip_id, self._work.identity.prepare_digest))
         except BadCacheFile:
@@ -185,5 +185,4 @@ class Again:
                 stored = self._work.prepare(self._refs[clip_id])
             except BadClip:
                 return None
-        payload = stored.payload if isinstance(stored, PreparedClip) else None
-        return payload if isinstance(payload, PerturbedClip) else None
+        return stored if isinstance(stored, PreparedClip) and isinstance(stored.payload, PerturbedClip) else None

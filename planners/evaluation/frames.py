@@ -9,10 +9,11 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from factory.store.reader import Sample
+from tasks.stages import FOLLOW_UP, FOLLOW_UP_BEFORE, HUMAN, HUMAN_BEFORE
 from tasks.world.clip import Scene
 
-LOGGED_KINDS = ("human", "human_before")
-FOLLOW_UP_KINDS = ("follow_up", "follow_up_before")
+LOGGED_KINDS = (HUMAN, HUMAN_BEFORE)
+FOLLOW_UP_KINDS = (FOLLOW_UP, FOLLOW_UP_BEFORE)
 KINDS = (*LOGGED_KINDS, *FOLLOW_UP_KINDS)  # as the samples' column `expert` has them
 NO_CANDIDATE = -1
 

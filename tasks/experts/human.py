@@ -1,6 +1,7 @@
-"""The human expert: what the log's driver did."""
+"""The log's own drive as an expert: from T, and from perturbed states."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -11,13 +12,10 @@ from tasks.world.vehicle import HEADING
 
 @dataclass(frozen=True)
 class Human:
-    """Replays the log from the scene's step. At T, `human`, it makes the real samples.
-
-    From a perturbed state, `logged`, it goes to where the log's driver was at each moment, however far that is: what
-    a planner would be taught without a pseudo-expert.
-    """
+    """What the log's driver did from T: it makes the real samples, one a clip."""
 
     name: str = "human"
+    once: ClassVar[bool] = True
 
     def digest(self) -> str:
         """The log is the clip itself: nothing else goes in."""
@@ -29,3 +27,14 @@ class Human:
         if len(after) < HORIZON_STEPS:
             raise ValueError(f"the clip ends {len(after)} steps after step {scene.step}; a plan needs {HORIZON_STEPS}")
         return Plan(after.copy())
+
+
+@dataclass(frozen=True)
+class Logged(Human):
+    """From a perturbed state to where the log's driver was at each moment, however far that is.
+
+    What a planner would be taught without a pseudo-expert.
+    """
+
+    name: str = "logged"
+    once: ClassVar[bool] = False

@@ -1,10 +1,14 @@
-"""What an expert is; experts from a user's own package satisfy it too."""
+"""What an expert is; experts from a user's own package satisfy it too.
+
+A class, or a function that makes an expert, is told of the run where it takes an argument `run`.
+"""
 
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
+from tasks.experts.pdm_closed.settings import PdmSettings
 from tasks.stages import Rejected
 from tasks.world.arrays import Array
 from tasks.world.clip import Scene
@@ -32,3 +36,19 @@ class Expert(Protocol):
     def plan(self, scene: Scene, rng: np.random.Generator) -> Plan | Rejected:
         """The plan, or why there is none."""
         ...
+
+
+def tried_once(expert: object) -> bool:
+    """Whether an expert, or the class of one, says `once = True`.
+
+    It then drives once a clip, from the log at T, always has a plan, and is kept whatever the reward says, as `human`.
+    Any other is tried from where candidates lead, until it has a sample for every round.
+    """
+    return bool(getattr(expert, "once", False))
+
+
+class RunContext(Protocol):
+    """What an expert is told of its run; factory.setup.settings has more of it."""
+
+    @property
+    def pdm(self) -> PdmSettings: ...

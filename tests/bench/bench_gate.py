@@ -24,7 +24,7 @@ from factory.graph.work import PreparedClip
 from factory.setup.settings import assemble
 from factory.stages.assets import asset_for
 from factory.stages.imaging import album_of
-from factory.stages.pipeline import FactoryWork, PerturbedClip
+from factory.stages.pipeline import FactoryWork
 from factory.stages.sensors import chosen_cameras
 from tasks.render.gate import GateSettings, looked_at_size, unfit
 from tasks.render.likeness import Album
@@ -64,7 +64,7 @@ def labelled(seed: int, clips: int, most: int, every: int, out: Path) -> list[La
     costs: list[list[float]] = []
     for ref in work.reader.index().refs:
         prepared = work.prepare(ref)
-        if not isinstance(prepared, PreparedClip) or not isinstance(prepared.payload, PerturbedClip):
+        if not isinstance(prepared, PreparedClip):
             print(f"{ref.log_id} at {ref.start_ms} ms: {prepared}", flush=True)
             continue
         clip = work.reader.read(ref)
@@ -74,7 +74,7 @@ def labelled(seed: int, clips: int, most: int, every: int, out: Path) -> list[La
         timed_album = album_of(clip, asset, work.render)  # whose photos are opened while the clock runs
         size = looked_at_size((work.render.width, work.render.height), settings)
         rig = [camera.resized(*size) for camera in chosen_cameras(clip.cameras, work.render.cameras)]
-        for drive in drives(work, prepared.payload, EXPERTS, most):
+        for drive in drives(work, prepared, EXPERTS, most):
             name = f"{clip.clip_id}/{drive.expert}/{drive.candidate}"
             costs.append([cpu_ms(drive, asset, clip, work, kept_album) for kept_album in (None, timed_album)])
             for shown in town.pictures(drive, asset, rig, every):

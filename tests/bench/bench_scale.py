@@ -25,7 +25,7 @@ from factory.config.arguments import answer
 from factory.exits import COMPLETE
 from factory.graph.execute import execute
 from factory.graph.on_ray import ray  # with the environment that keeps it on loopback
-from factory.graph.work import Accepted, AttemptResult, PreparedClip
+from factory.graph.work import Columns, Driven
 from factory.readers.base import ClipRef
 from factory.store.samples import Store
 from tests.factory.toy import ToyWork, stream
@@ -61,13 +61,13 @@ class WaitingWork(ToyWork):
 
     row_kb: int = 20
 
-    def attempt(self, prepared: PreparedClip, candidate: int, expert: str) -> AttemptResult:
-        result = super().attempt(prepared, candidate, expert)
-        if not isinstance(result, Accepted):
-            return result
-        noise = stream(prepared.clip_id, "picture", candidate).bytes(self.row_kb * 1024)
-        image: Any = result.row["images"]
-        return replace(result, row={**result.row, "images": [{**image[0], "jpeg": noise}]})
+    def draw(self, driven: Driven) -> Columns:
+        drawn = super().draw(driven)
+        assert isinstance(drawn, Columns)
+        name, _ = driven.payload  # type: ignore[misc]
+        image: Any = drawn.row["images"]
+        noise = stream(name, "picture").bytes(self.row_kb * 1024)
+        return replace(drawn, row={**drawn.row, "images": [{**image[0], "jpeg": noise}]})
 
 
 def main(request: Request) -> None:

@@ -11,11 +11,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from factory.graph.work import PreparedClip
 from factory.readers.town.draw import Theatre, paint
 from factory.readers.town.drive import Drive
 from factory.readers.town.town import log_name, plan_log
 from factory.stages.imaging import GATE_STRIDE
-from factory.stages.pipeline import FactoryWork, PerturbedClip
+from factory.stages.pipeline import FactoryWork, payload_of
 from tasks.render.gate import GateSettings, composed, fault_of, measures
 from tasks.render.likeness import Album, expected, eye_in_box, inside_mean, large_vehicles, outline_of, similarity
 from tasks.render.scene.asset import RenderAsset
@@ -66,12 +67,13 @@ class Shown:
         return worst
 
 
-def drives(work: FactoryWork, payload: PerturbedClip, experts: Sequence[str], most: int) -> Iterator[Simulated]:
+def drives(work: FactoryWork, prepared: PreparedClip, experts: Sequence[str], most: int) -> Iterator[Simulated]:
     """Drives that the reward accepts, `most` of each expert, before any picture of them is looked at."""
+    payload = payload_of(prepared)
     for expert in experts:
         found = 0
         for index in range(len(payload.candidates)):
-            trace = work.trace(payload, index, expert) if found < most else None
+            trace = work.trace(prepared, index, expert) if found < most else None
             if trace is None or trace.judged is None or trace.rejected is not None or trace.candidate is None:
                 continue
             found += 1

@@ -1,10 +1,10 @@
 """A Work whose rows are fit to be made into episodes and pictures: a world of the right size, times of a log."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
-from factory.graph.work import Accepted, AttemptResult, PreparedClip
+from factory.graph.work import Columns, Driven
 from tests.factory.toy import ToyWork
 from tests.planners.samples import FRONT_YAWS, jpeg, pictures, plain, sample
 
@@ -20,6 +20,7 @@ class FilmedWork(ToyWork):
 
     shown: Mapping[str, Any] = field(default_factory=lambda: {**WORLD, **VIEW, **TIMES})
 
-    def attempt(self, prepared: PreparedClip, candidate: int, expert: str) -> AttemptResult:
-        result = super().attempt(prepared, candidate, expert)
-        return replace(result, row={**result.row, **self.shown}) if isinstance(result, Accepted) else result
+    def draw(self, driven: Driven) -> Columns:
+        drawn = super().draw(driven)
+        assert isinstance(drawn, Columns)
+        return Columns({**drawn.row, **self.shown})

@@ -3,6 +3,7 @@
 import hashlib
 import os
 import signal
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -10,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from factory.graph.work import Accepted, AttemptResult, Built, Dropped, PreparedClip, Stopped, never
+from factory.graph.work import Built, Columns, Driven, Dropped, PreparedClip, Stopped, never
 from factory.readers.base import BadClip, ClipRef
 from factory.stages.rows import label_columns
 from factory.store.candidates import CandidateRow
@@ -21,12 +22,20 @@ from tasks.reward.label_bytes import HALVES, WHOLES, VocabularyLabels
 from tasks.stages import Rejected
 
 VERSIONS = {"clip": 1, "perturb": 1, "rollout": 1, "expert": 1, "reward": 1, "render": 1, "write": 1}
+PICTURES = ("cameras", "images", "image_source")
 RAGGED = {"N": 3, "L": 4, "P": 5, "D": 2, "X": 1, "S": 1, "R": 2, "C": 1, "I": 2, "T": 1}
 
 
 def refs(n: int) -> list[ClipRef]:
     """n clips of two logs."""
     return [ClipRef("toy", f"log{i % 2}", 1000 * i) for i in range(n)]
+
+
+def where() -> str:
+    """The node of a cluster and the GPUs that this process sees, for a journal."""
+    ray = sys.modules.get("ray")
+    node = ray.get_runtime_context().get_node_id() if ray is not None and ray.is_initialized() else "here"
+    return f"node {node} gpu {os.environ.get('CUDA_VISIBLE_DEVICES', '')}"
 
 
 def stream(*words: object) -> np.random.Generator:
@@ -90,6 +99,9 @@ class ToyWork:
     def warm(self, draws: bool = True) -> None:
         self._note("warm")
 
+    def once(self, expert: str) -> bool:
+        return expert == "human"
+
     def expert_digest(self, expert: str) -> str:
         return self.digests.get(expert, f"{expert}-1")
 
@@ -128,11 +140,11 @@ class ToyWork:
         counts = {"heading": 7, "lateral": 3}
         return PreparedClip(ref.clip_id, self.content, candidates, counts, payload, dropped, {"perturb": 0.1})
 
-    def attempt(self, prepared: PreparedClip, candidate: int, expert: str) -> AttemptResult:
+    def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> Driven | Dropped:
         payload = prepared.payload
         assert isinstance(payload, dict)
         name = f"{payload['name']}:{expert}:{candidate}"
-        self._note(f"attempt {name} on gpu {os.environ.get('CUDA_VISIBLE_DEVICES', '')}")
+        self._note(f"attempt {name} on {where()}")
         time.sleep(self.seconds)
         self._trouble(name)
         rng = stream(prepared.clip_id, "attempt", expert, candidate)
@@ -142,7 +154,19 @@ class ToyWork:
         row = row_of(rng)
         row["clip_id"], row["content_digest"] = prepared.clip_id, prepared.content_digest
         row["label_10hz"] = payload["states"][candidate % 6, 1:].astype(np.float32)
-        return Accepted(row, {"reward": 0.01})
+        return Driven((name, row), {"reward": 0.01})
+
+    def draw(self, driven: Driven) -> Columns | Dropped:
+        name, row = driven.payload  # type: ignore[misc]
+        self._note(f"render {name} on {where()}")
+        if self._trouble(f"{name}:render") == "unfit":
+            return Dropped(Rejected("render", "blank"), {"nc": 1.0}, {"render": 0.02})
+        return Columns({key: row[key] for key in PICTURES} | {"tags": ["drawn"]}, {"render": 0.02}, True)
+
+    def label(self, driven: Driven) -> Columns:
+        name, row = driven.payload  # type: ignore[misc]
+        self._note(f"label {name} on {where()}")
+        return Columns({key: value for key, value in row.items() if key not in PICTURES}, {"labels": 0.03})
 
     def _note(self, line: str) -> None:
         if self.journal:

@@ -17,10 +17,9 @@ from factory.store.schema import COLUMNS, SAMPLES, sample_row_to_table
 from factory.store.table import write_shard
 from planners.evaluation.frames import ClipScenes, FrameKey, FramePair
 from tasks.attempt import drive_and_judge
-from tasks.experts.follow_up import BEFORE_STEPS
 from tasks.experts.pdm_closed.planner import PdmSettings
 from tasks.experts.protocol import Plan
-from tasks.hard_scenes import BenchmarkClip
+from tasks.hard_scenes import BEFORE_STEPS, BenchmarkClip
 from tasks.rollout.simulate import TrafficSettings, simulate
 from tasks.world.clip import NOW, STEP_S, Clip, Scene, scene_of_clip
 from tasks.world.frames import to_world

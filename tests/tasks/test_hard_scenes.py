@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tasks.attempt import Judged, follow_up, half_a_second_before, perturbed_scene
-from tasks.experts.follow_up import FollowUp
+from tasks.attempt import Judged, perturbed_scene
+from tasks.experts.human import Human
 from tasks.experts.pdm_closed.planner import PdmSettings
-from tasks.hard_scenes import BenchmarkClip
+from tasks.hard_scenes import BenchmarkClip, follow_up, frame_digest, half_a_second_before
 from tasks.rollout.simulate import TrafficSettings
-from tasks.stages import Rejected
+from tasks.stages import FRAMES, Rejected
 from tasks.world.clip import HISTORY_STEPS, HORIZON_STEPS, NOW, Clip, Rollout, Scene
 from tests.tasks.streets import street_clip
 from tests.tasks.test_attempt import first_stage
@@ -36,7 +36,7 @@ def scenes(clip: Clip, stage_one: Rollout) -> BenchmarkClip:
 
 @pytest.fixture(scope="module")
 def judged(clip: Clip, stage_one: Rollout) -> Judged:
-    result = follow_up(clip, stage_one, FollowUp(), TrafficSettings())
+    result = follow_up(clip, stage_one, TrafficSettings(), PdmSettings())
     assert isinstance(result, Judged)
     return result
 
@@ -82,7 +82,7 @@ def test_the_earlier_frame_drives_the_end_of_the_perturbation_and_then_the_same_
 
 def test_a_bad_drive_is_a_follow_up_too(clip: Clip, stage_one: Rollout) -> None:
     nowhere = replace(clip, road_map=replace(clip.road_map, drivable_areas=()))
-    judged = follow_up(nowhere, stage_one, FollowUp(), TrafficSettings())
+    judged = follow_up(nowhere, stage_one, TrafficSettings(), PdmSettings())
     assert isinstance(judged, Judged) and judged.scores.dac[1] == 0.0
 
 
@@ -94,16 +94,16 @@ def test_a_route_that_has_ended_at_either_frame_drops_both(
         scene = perturbed_scene(*arguments)
         return replace(scene, centerline=scene.centerline[[-1, -1]]) if scene.step == ended_at else scene
 
-    monkeypatch.setattr("tasks.attempt.perturbed_scene", perturbed)
-    for expert in (FollowUp(), FollowUp(before=True)):
-        lost = follow_up(clip, stage_one, expert, TrafficSettings())
-        assert isinstance(lost, Rejected)
-        assert (lost.stage, lost.reason) == ("rollout", "route_ended")
+    monkeypatch.setattr("tasks.hard_scenes.perturbed_scene", perturbed)
+    lost = follow_up(clip, stage_one, TrafficSettings(), PdmSettings())
+    assert isinstance(lost, Rejected)
+    assert (lost.stage, lost.reason) == ("rollout", "route_ended")
 
 
-def test_the_two_of_a_pair_have_names_and_digests_of_their_own() -> None:
-    assert {FollowUp().name, FollowUp(before=True).name} == {"follow_up", "follow_up_before"}
-    slow = PdmSettings(headway_s=2.0)
-    four = [FollowUp(), FollowUp(before=True), FollowUp(slow), FollowUp(slow, True)]
-    assert len({expert.digest() for expert in four}) == 4
-    assert FollowUp(PdmSettings(headway_s=2.0)).digest() == FollowUp(slow).digest()
+def test_the_two_of_a_pair_have_digests_of_their_own() -> None:
+    plain, slow = PdmSettings(), PdmSettings(headway_s=2.0)
+    four = [frame_digest(frame, settings) for frame in FRAMES[1:] for settings in (plain, slow)]
+    assert len(set(four)) == 4
+    assert four[::2] == ["ec60687d0de515e2", "bc2dc65fb6c61aaa"]  # attempt ids hold them, and tables go on
+    assert frame_digest("follow_up", PdmSettings(headway_s=2.0)) == frame_digest("follow_up", slow)
+    assert frame_digest("human_before", plain) == frame_digest("human_before", slow) == Human().digest()

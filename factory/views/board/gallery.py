@@ -7,7 +7,6 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from factory.graph.work import LOGGED
 from factory.store.outcomes import Kind
 from factory.store.table import KeyedTable
 from factory.views.board.watch import Snapshot
@@ -145,7 +144,7 @@ def chosen(shot: Snapshot, wanted: Mapping[str, str], order: str = "newest") -> 
     rows = shot.newest_first
     for name, value in wanted.items():
         if name == SIMULATED:
-            rows = rows.filter(pc.invert(pc.is_in(rows["expert"], pa.array(sorted(LOGGED)))))
+            rows = rows.filter(pc.greater_equal(rows["candidate_index"], 0))
             continue
         if name not in FILTERS:
             raise BadRequest(f"{name}: samples can be filtered by {', '.join((*FILTERS, SIMULATED))}")

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from factory.graph.work import LOGGED
 from factory.store.funnel import Funnel, funnel_of_rows
 from factory.store.outcomes import Kind
 from factory.views.board.watch import Snapshot
@@ -153,7 +152,7 @@ def overview(shot: Snapshot, where: str, now_s: float) -> Overview:
     """All of it; `now_s` since 1970."""
     funnel = _funnel(shot)
     rows = funnel.rows
-    simulated = [row for row in rows if row.expert not in LOGGED]
+    simulated = [row for row in rows if row.simulated]
     failed = [row for row in shot.outcome_rows if row["kind"] == Kind.FAILED]
     stage_times, of = _stage_times(shot)
     return Overview(
@@ -163,7 +162,7 @@ def overview(shot: Snapshot, where: str, now_s: float) -> Overview:
         state=_state(shot, now_s),
         counts=Counts(
             samples=shot.samples.num_rows,
-            simulated=sum(row["expert"] not in LOGGED for row in shot.sample_rows),
+            simulated=sum(row["candidate_index"] >= 0 for row in shot.sample_rows),
             simulated_attempts=sum(r.accepted + r.rejected + r.failed for r in simulated),
             attempts=sum(r.accepted + r.rejected + r.failed for r in rows),
             rejected=sum(r.rejected for r in rows),
@@ -248,7 +247,7 @@ def _facts(shot: Snapshot) -> dict[str, str]:
 
 def steps_of(funnel: Funnel) -> list[Step]:
     """Simulated attempts after each stage that turns some down, in the order of the stages."""
-    rows = [row for row in funnel.rows if row.expert not in LOGGED]
+    rows = [row for row in funnel.rows if row.simulated]
     dropped: Counter[str] = Counter()
     for row in rows:
         for name, count in row.reasons.items():
@@ -346,12 +345,12 @@ def _walks(shot: Snapshot, began_ms: int, elapsed_s: float) -> tuple[int, int, f
     ended = {
         (row["clip_id"], row["expert"])
         for row in shot.sample_rows
-        if row["_written_ms"] >= began_ms and (row["expert"] in LOGGED or row["round"] >= rounds - 1)
+        if row["_written_ms"] >= began_ms and (row["candidate_index"] < 0 or row["round"] >= rounds - 1)
     }
     for row in shot.outcome_rows:
         if row["_written_ms"] >= began_ms and (row["kind"] in (Kind.EXHAUSTED, Kind.FAILED) or not row["expert"]):
             ended |= {(row["clip_id"], expert) for expert in ([row["expert"]] if row["expert"] else experts)}
-        elif row["_written_ms"] >= began_ms and row["expert"] in LOGGED:
+        elif row["_written_ms"] >= began_ms and row["candidate_index"] < 0:
             ended.add((row["clip_id"], row["expert"]))
     walks = max(int(shot.current["walks_left"]), len(ended))
     return len(ended), walks, (walks - len(ended)) * elapsed_s / len(ended) if ended else None

@@ -17,7 +17,7 @@ from tasks.experts.pdm_closed.forecast import RADIUS_M, forecast
 from tasks.experts.pdm_closed.path import MIN_PROGRESS_M, path_length_m
 from tasks.experts.pdm_closed.proposals import SCORED_STEPS, Proposals, proposals
 from tasks.experts.pdm_closed.settings import DEFAULTS, PdmSettings
-from tasks.experts.protocol import Plan
+from tasks.experts.protocol import Plan, RunContext
 from tasks.reward.epdms import Scores, score
 from tasks.reward.prepare import prepare
 from tasks.rollout.lqr import track
@@ -150,6 +150,11 @@ class PdmClosed:
 
     settings: PdmSettings = DEFAULTS
     name: str = "pdm_closed"
+
+    @classmethod
+    def of_run(cls, run: RunContext) -> "PdmClosed":
+        """With the constants of the run."""
+        return cls(run.pdm)
 
     def digest(self) -> str:
         """Of every setting."""

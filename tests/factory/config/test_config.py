@@ -14,15 +14,19 @@ import yaml
 
 from factory.config.compose import ConfigError, build, conf_dir, fill
 from factory.config.run import RewardSettings, RunConfig, composed_run, load_config
-from factory.readers.base import ClipIndex
 from factory.run import settings_text
-from factory.setup.settings import assemble, build_expert, open_reader, refuse_missing_backend
-from tasks.experts.pdm_closed.planner import PdmSettings
+from factory.setup.settings import (
+    RunContext,
+    assemble,
+    build_expert,
+    open_reader,
+    refuse_missing_backend,
+    simulates,
+)
+from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings
 from tasks.perturb import PerturbSettings
 from tasks.render.settings import RenderMode, RenderSettings
 from tasks.rollout.simulate import TrafficSettings
-from tasks.world.kinematic_vocabulary import kinematic_trajectories
-from tasks.world.vocabulary import Vocabulary
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 DENSE = PerturbSettings(max_longitudinal_m=8.0, step_longitudinal_m=1.0, interleaved=False, order="spread", at_most=32)
@@ -159,10 +163,14 @@ def test_an_unknown_expert_is_an_error_and_lists_the_known() -> None:
         load_config(["experts=[human,mine]"])
 
 
+PDM = "+expert.mine._target_=tasks.experts.pdm_closed.planner.PdmClosed.of_run"
+RECOVERY = "+expert.mine._target_=factory.setup.recovery.recovery"
+
+
 def built(*overrides: str) -> object:
     config = load_config([*overrides, "experts=[mine]"])
-    no_clips: Any = object()
-    return build_expert("mine", config, no_clips, ClipIndex(()), Vocabulary(kinematic_trajectories(3, 0)))
+    no_clips: Any = None
+    return build_expert(RunContext(config, "mine", no_clips))
 
 
 def test_an_expert_is_added_by_its_target_with_all_its_arguments() -> None:
@@ -177,17 +185,32 @@ def test_an_expert_is_added_by_its_target_with_all_its_arguments() -> None:
         (["+expert.mine._target_=tasks.experts.human.Nobody"], r"expert\.mine: .*Nobody"),
         (["+expert.mine._target_=tasks.experts.human.Human", "+expert.mine.speed=3"], r"(?s)expert\.mine: .*speed"),
         (["+expert.mine._target_=collections.Counter"], r"Counter is not an expert .* no name, digest, plan"),
-        (["+expert.mine.kind=magic"], r"expert\.mine\.kind=magic"),
         (["+expert.mine.speed=3"], r"expert\.mine\._target_ is missing"),
-        (["+expert.mine.kind=human", "+expert.mine.speed=3"], r"unknown setting expert\.mine\.speed"),
-        (["+expert.mine.kind=pdm_closed", "+expert.mine.speed=3"], r"unknown setting expert\.mine\.speed"),
-        (["+expert.mine.kind=recovery", "+expert.mine.speed=3"], r"expert\.mine\.speed: there is no such setting"),
-        (["+expert.mine.kind=recovery", "+expert.mine.table=[1]"], r"expert\.mine\.table"),
+        ([PDM, "+expert.mine.speed=3"], r"(?s)expert\.mine: .*speed"),
+        ([RECOVERY, "+expert.mine.speed=3"], r"expert\.mine\.speed: there is no such setting"),
+        ([RECOVERY, "+expert.mine.table=[1]"], r"expert\.mine\.table"),
+        ([RECOVERY, "+expert.mine.table=nowhere.npz"], r"expert\.mine\.table=nowhere.npz: there is no such file"),
     ],
 )
 def test_an_expert_that_cannot_be_made_is_an_error_that_names_what(overrides: list[str], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         built(*overrides)
+
+
+def test_an_expert_that_asks_for_the_run_is_told_of_it() -> None:
+    expert = built(PDM, "pdm.headway_s=2.5")
+    assert isinstance(expert, PdmClosed) and expert.settings == PdmSettings(headway_s=2.5)
+
+
+def test_experts_that_are_tried_once_say_so_themselves() -> None:
+    mine = "+expert.mine._target_=tasks.experts.human."
+    for target, experts, simulated in (
+        ("Human", "[mine,human]", False),
+        ("Logged", "[mine,human]", True),
+        ("Human", "[mine,pdm_closed]", True),
+        ("Human", "[mine,human_before]", True),  # a benchmark's clips are listed
+    ):
+        assert simulates(load_config([mine + target, f"experts={experts}"])) == simulated
 
 
 def test_something_that_is_no_reader_is_refused() -> None:

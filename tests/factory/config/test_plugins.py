@@ -13,7 +13,7 @@ import pytest
 from factory.__main__ import main as factory_main
 from factory.config.compose import ConfigError
 from factory.config.run import load_config
-from factory.graph.work import Accepted, Dropped, PreparedClip
+from factory.graph.work import Columns, Dropped, PreparedClip, attempted
 from factory.readers.base import BadClip
 from factory.run import main as run_main
 from factory.setup.settings import Run, assemble
@@ -105,10 +105,10 @@ def test_my_reader_and_my_expert_make_samples(package: Path) -> None:
     prepared = run.work.prepare(run.index.refs[0])
     assert isinstance(prepared, PreparedClip)
     assert prepared.clip_id == run.index.refs[0].clip_id
-    results = [run.work.attempt(prepared, candidate.index, "mine") for candidate in prepared.candidates]
-    rows = [result.row for result in results if isinstance(result, Accepted)]
+    results = [attempted(run.work, prepared, candidate.index, "mine") for candidate in prepared.candidates]
+    rows = [result.row for result in results if isinstance(result, Columns)]
     assert rows, [result.rejected for result in results if isinstance(result, Dropped)]
-    rows.append(run.work.attempt(prepared, -1, "human").row)  # type: ignore[union-attr]
+    rows.append(attempted(run.work, prepared, -1, "human").row)  # type: ignore[union-attr]
     books = {"round": 0, "candidate_index": 0} | {
         name: "x" for name in BOOKKEEPING if name not in ("round", "candidate_index")
     }
@@ -128,9 +128,9 @@ def test_every_attempt_gives_the_same_result_again(package: Path) -> None:
     assert isinstance(second, PreparedClip)
     assert first.candidates == second.candidates
     for index in range(3):
-        a, b = run.work.attempt(first, index, "mine"), again.work.attempt(second, index, "mine")
+        a, b = attempted(run.work, first, index, "mine"), attempted(again.work, second, index, "mine")
         assert isinstance(a, Dropped) == isinstance(b, Dropped)
-        if isinstance(a, Accepted) and isinstance(b, Accepted):
+        if isinstance(a, Columns) and isinstance(b, Columns):
             np.testing.assert_array_equal(a.row["label_10hz"], b.row["label_10hz"])  # type: ignore[arg-type]
         elif isinstance(a, Dropped) and isinstance(b, Dropped):
             assert (a.rejected, a.subscores) == (b.rejected, b.subscores)
@@ -152,7 +152,7 @@ def test_my_expert_s_refusal_is_a_rejection(package: Path) -> None:
     run = assembled(package, "+expert.mine.stubborn=true")
     prepared = run.work.prepare(run.index.refs[0])
     assert isinstance(prepared, PreparedClip)
-    result = run.work.attempt(prepared, 0, "mine")
+    result = attempted(run.work, prepared, 0, "mine")
     assert isinstance(result, Dropped)
     assert result.rejected == Rejected("expert", "no_plan", "will not")
     assert result.subscores == {}

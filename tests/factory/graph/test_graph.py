@@ -17,7 +17,7 @@ import pytest
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
 from factory.graph import execute as execution
 from factory.graph.execute import RunSummary, execute
-from factory.graph.work import AttemptResult, Built, Halted, PreparedClip, Stopped, never
+from factory.graph.work import Built, Driven, Dropped, Halted, PreparedClip, Stopped, never
 from factory.readers.base import ClipRef
 from factory.store.identity import UNLISTED
 from factory.store.samples import Store
@@ -406,10 +406,10 @@ def test_nothing_new_begins_once_a_run_is_stopped(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(execution, "_graph", lambda *given: graph(*given[:-1], never))
 
     class Stopping(ToyWork):
-        def attempt(self, prepared: PreparedClip, candidate: int, expert: str) -> AttemptResult:
+        def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> Driven | Dropped:
             if not Path(self.journal).read_text().count("attempt"):  # a second signal would end the run at once
                 os.kill(os.getpid(), signal.SIGTERM)
-            return super().attempt(prepared, candidate, expert)
+            return super().drive(prepared, candidate, expert)
 
     journal = tmp_path / "journal"
     assert run(tmp_path / "out", Stopping(journal=str(journal))).exit_code == INTERRUPTED
@@ -446,10 +446,10 @@ def test_a_run_that_is_overtaken_stops_and_loses_nothing(tmp_path: Path, plain: 
         def warm(self) -> None:
             pass
 
-        def attempt(self, prepared, candidate, expert):  # type: ignore[no-untyped-def]
+        def drive(self, prepared, candidate, expert):  # type: ignore[no-untyped-def]
             if expert == "human" and prepared.payload["name"] == "log1:1000":
                 run(tmp_path / "out")  # the same command, started a second time meanwhile
-            return super().attempt(prepared, candidate, expert)
+            return super().drive(prepared, candidate, expert)
 
     summary = execute(Overtaking(), refs(4), EXPERTS, 2, overtaken, "local", shard_seconds=0.0, say=lambda line: None)
     assert summary.exit_code == INTERRUPTED and "another run has taken over" in summary.message

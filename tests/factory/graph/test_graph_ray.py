@@ -90,7 +90,7 @@ def test_workers_write_the_same_episodes_as_one_process(tmp_path: Path, two_cpus
     assert local == ray_s and len(local) == len(Store(tmp_path / "ray").samples)
 
 
-def test_attempts_claim_their_share_of_a_gpu(tmp_path: Path, two_cpus: None) -> None:
+def test_only_what_draws_claims_its_share_of_a_gpu(tmp_path: Path, two_cpus: None) -> None:
     journal = str(tmp_path / "journal")
     summary = execute(
         ToyWork(journal=journal),
@@ -102,9 +102,11 @@ def test_attempts_claim_their_share_of_a_gpu(tmp_path: Path, two_cpus: None) -> 
         say=lambda line: None,
     )
     assert summary.exit_code == COMPLETE
-    tries = [line for line in Path(journal).read_text().splitlines() if line.startswith("attempt")]
-    assert len(tries) == summary.executed.attempts > 0
-    assert all(line.endswith("on gpu 0") for line in tries)
+    lines = Path(journal).read_text().splitlines()
+    drawn, driven = ([line for line in lines if line.startswith(word)] for word in ("render", "attempt"))
+    assert len(driven) == summary.executed.attempts > len(drawn) == summary.counts["accepted"] > 0
+    assert all(line.endswith(" gpu 0") for line in drawn)
+    assert ran(journal, "label") == len(drawn)
 
 
 def test_a_cluster_without_a_gpu_is_waited_for_and_then_named(

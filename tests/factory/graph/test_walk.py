@@ -15,7 +15,7 @@ def past(kind: Kind, round_: int = -1, error: str = "", versions: str = "v1") ->
 def walk(accepts: list[bool], rounds: int, known: dict[int, Past] | None = None) -> tuple[dict[int, Past], Step, int]:
     """Walk to the end; (known, last step, attempts made)."""
     known, made = dict(known or {}), 0
-    while isinstance(step := next_step("recovery", len(accepts), rounds, known, never), Try):
+    while isinstance(step := next_step(False, len(accepts), rounds, known, never), Try):
         good = accepts[step.candidate]
         known[step.candidate] = past(Kind.ACCEPTED, step.round) if good else past(Kind.REJECTED)
         made += 1
@@ -47,22 +47,22 @@ def test_a_walk_ends_complete_or_exhausted() -> None:
     assert sorted(walk([True, False, True, True], 2)[0]) == [0, 1, 2]
 
 
-def test_the_human_drives_once_whatever_the_rounds() -> None:
-    assert next_step("human", 9, 5, {}, never) == Try(-1, 0)
+def test_who_is_tried_once_drives_once_whatever_the_rounds() -> None:
+    assert next_step(True, 9, 5, {}, never) == Try(-1, 0)
     for kind in (Kind.ACCEPTED, Kind.REJECTED):
-        assert next_step("human", 9, 5, {-1: past(kind, 0)}, never) == Complete()
+        assert next_step(True, 9, 5, {-1: past(kind, 0)}, never) == Complete()
 
 
 def test_a_failure_stops_the_walk_until_it_is_mended() -> None:
     for kind in (ErrorKind.BUG, ErrorKind.INPUT, ErrorKind.POISON):
         known = {0: past(Kind.FAILED, error=kind)}
-        assert next_step("recovery", 3, 2, known, retry_policy(False, "v1")) == Blocked(0, "failed")
-        assert next_step("recovery", 3, 2, known, retry_policy(True, "v1")) == Try(0, 0)
-        assert next_step("recovery", 3, 2, known, retry_policy(False, "v2")) == Try(0, 0)
+        assert next_step(False, 3, 2, known, retry_policy(False, "v1")) == Blocked(0, "failed")
+        assert next_step(False, 3, 2, known, retry_policy(True, "v1")) == Try(0, 0)
+        assert next_step(False, 3, 2, known, retry_policy(False, "v2")) == Try(0, 0)
     system = {0: past(Kind.FAILED, error=ErrorKind.SYSTEM)}
-    assert next_step("recovery", 3, 2, system, retry_policy(False, "v1")) == Try(0, 0)
+    assert next_step(False, 3, 2, system, retry_policy(False, "v1")) == Try(0, 0)
 
 
 def test_a_stored_round_that_the_walk_contradicts_is_not_built_upon() -> None:
-    step = next_step("recovery", 3, 3, {0: past(Kind.REJECTED), 1: past(Kind.ACCEPTED, 1)}, never)
+    step = next_step(False, 3, 3, {0: past(Kind.REJECTED), 1: past(Kind.ACCEPTED, 1)}, never)
     assert isinstance(step, Blocked) and "round 1" in step.reason

@@ -13,12 +13,13 @@ import pytest
 from factory.config.run import BenchmarkSettings, load_config
 from factory.exits import COMPLETE
 from factory.graph.execute import execute
-from factory.graph.work import Accepted, Dropped, PreparedClip
+from factory.graph.work import Columns, Dropped, PreparedClip, attempted
 from factory.readers.base import ClipRef
 from factory.readers.settings import TownSettings
 from factory.setup.settings import assemble, identity_of
 from factory.stages.benchmark import benchmark_of, write_benchmark
-from factory.stages.pipeline import FactoryWork, PerturbedClip
+from factory.stages.frames import BenchmarkWork
+from factory.stages.pipeline import FactoryWork
 from factory.store.cache import BadCacheFile
 from factory.store.location import Location
 from factory.store.samples import Store
@@ -170,7 +171,7 @@ def test_scenes_are_there_before_any_row_is(
     def killed(*_arguments: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(FactoryWork, "attempt", killed)
+    monkeypatch.setattr(BenchmarkWork, "drive", killed)
     execute(work, refs[1:2], EXPERTS, 1, Store(str(tmp_path)), "local", say=lambda line: None)
     assert SceneFiles(Location(str(tmp_path / "scenes"))).clip_ids() == [refs[1].clip_id]
     assert not len(Store(str(tmp_path)).samples)
@@ -200,17 +201,16 @@ def test_a_pair_falls_together_at_the_pictures(tmp_path: Path) -> None:
     strict = assemble(load_config(overrides(tmp_path, *lenient, "render.gate.contrast_min=1.0", settings=SMALL))).work
     prepared = strict.prepare(strict.reader.index().refs[1])
     assert isinstance(prepared, PreparedClip) and prepared.candidates
-    pair = [strict.attempt(prepared, 0, expert) for expert in ("follow_up", "follow_up_before")]
+    pair = [attempted(strict, prepared, 0, expert) for expert in ("follow_up", "follow_up_before")]
     assert all(isinstance(result, Dropped) and result.rejected.reason == "blank" for result in pair)
     assert pair[0].rejected == pair[1].rejected  # type: ignore[union-attr]
     assert "at step 50" in pair[0].rejected.detail  # type: ignore[union-attr]
     drawn = assemble(load_config(overrides(tmp_path, *lenient, settings=SMALL))).work
     for expert, at in (("human_before", -1), ("follow_up", 0), ("follow_up_before", 0)):
-        result = drawn.attempt(prepared, at, expert)
-        assert isinstance(result, Accepted)
+        result = attempted(drawn, prepared, at, expert)
+        assert isinstance(result, Columns)
         assert result.row["image_source"] == ("photo" if at < 0 else "render")
         assert [image["time_s"] for image in result.row["images"]] == [pytest.approx(0.0, abs=1e-6)]  # type: ignore[attr-defined]
-    assert isinstance(prepared.payload, PerturbedClip) and prepared.payload.before is not None
 
 
 def test_settings_that_came_later_leave_older_tables_alone() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from factory.config.run import load_config
-from factory.graph.work import HUMAN, HUMAN_CANDIDATE, Accepted, PreparedClip
+from factory.graph.work import HUMAN_CANDIDATE, Columns, PreparedClip, attempted
 from factory.readers.base import BadClip
 from factory.readers.settings import TownSettings
 from factory.readers.town.reader import SyntheticReader
@@ -17,6 +17,7 @@ from factory.setup.settings import assemble
 from factory.stages.imaging import photo_at
 from factory.stages.pipeline import FactoryWork
 from factory.stages.sensors import block_of
+from tasks.stages import HUMAN
 from tasks.world.clip import Clip
 
 CAMERAS = ("ring_front_left", "ring_front_center")
@@ -47,8 +48,8 @@ def clip_of(root: Path, out: Path) -> Clip:
 
 def human_row(root: Path, out: Path, *overrides: str) -> dict[str, object]:
     work, prepared = prepared_by(root, out, *overrides)
-    human = work.attempt(prepared, HUMAN_CANDIDATE, HUMAN)
-    assert isinstance(human, Accepted)
+    human = attempted(work, prepared, HUMAN_CANDIDATE, HUMAN)
+    assert isinstance(human, Columns)
     return dict(human.row)
 
 
@@ -63,8 +64,8 @@ def test_a_human_sample_has_a_photo_of_every_camera_at_every_instant_also_withou
 
 def test_photos_too_far_apart_for_parallax_give_a_simulated_drive_no_pictures(town: Path, tmp_path: Path) -> None:
     work, prepared = prepared_by(town, tmp_path)
-    results = (work.attempt(prepared, row.index, "pdm_closed") for row in prepared.candidates)
-    sample = next(result for result in results if isinstance(result, Accepted))
+    results = (attempted(work, prepared, row.index, "pdm_closed") for row in prepared.candidates)
+    sample = next(result for result in results if isinstance(result, Columns))
     assert sample.row["image_source"] == "none" and sample.row["images"] is None
 
 
@@ -76,10 +77,10 @@ def test_lidar_s_grey_pictures_are_drawn_only_where_every_one_is_near_a_sweep(tm
     for photos in reader.root.glob("*/sensors/cameras"):
         shutil.rmtree(photos)
 
-    def sample(reach_m: float) -> Accepted:
+    def sample(reach_m: float) -> Columns:
         work, prepared = prepared_by(reader.root, tmp_path, f"render.lidar_only_reach_m={reach_m}")
-        results = (work.attempt(prepared, row.index, "pdm_closed") for row in prepared.candidates)
-        return next(result for result in results if isinstance(result, Accepted))
+        results = (attempted(work, prepared, row.index, "pdm_closed") for row in prepared.candidates)
+        return next(result for result in results if isinstance(result, Columns))
 
     everywhere = sample(1000.0)
     assert everywhere.row["image_source"] == "render" and everywhere.row["tags"][-1] == "lidar_only"  # type: ignore[index]

@@ -10,18 +10,19 @@ from factory.commands.table import COMMANDS
 from factory.config.compose import ConfigError
 from factory.config.run import load_config
 from factory.exits import BAD_CONFIG
-from factory.graph.work import HUMAN, HUMAN_CANDIDATE, Accepted, PreparedClip
+from factory.graph.work import HUMAN_CANDIDATE, Columns, PreparedClip, attempted
 from factory.run import main as run_main
 from factory.setup.calibrate import calibrate, measure
 from factory.setup.settings import Run, assemble
 from factory.setup.vocabulary import save_vocabulary
-from factory.stages.pipeline import FactoryWork, PerturbedClip
+from factory.stages.pipeline import FactoryWork
 from factory.store.reader import LABEL_COLUMNS, SampleTable, labels_of
 from factory.views.sample_picture import SCORE_COLOURS, sample_bev
 from tasks.attempt import Judged
 from tasks.reward.epdms import Scores, score
 from tasks.reward.prepare import prepare_scene
 from tasks.rollout.lqr import track
+from tasks.stages import HUMAN
 from tasks.world.agents import AgentTracks
 from tasks.world.frames import to_world
 from tasks.world.kinematic_vocabulary import kinematic_trajectories
@@ -51,14 +52,12 @@ def prepared() -> PreparedClip:
     return found
 
 
-def sample(work: FactoryWork, expert: str) -> tuple[Accepted, Judged]:
+def sample(work: FactoryWork, expert: str) -> tuple[Columns, Judged]:
     """The first accepted attempt of the street, and what was judged in it."""
-    payload = prepared().payload
-    assert isinstance(payload, PerturbedClip)
     for candidate in [HUMAN_CANDIDATE] if expert == HUMAN else range(len(prepared().candidates)):
-        result = work.attempt(prepared(), candidate, expert)
-        if isinstance(result, Accepted):
-            judged = work.trace(payload, candidate, expert).judged
+        result = attempted(work, prepared(), candidate, expert)
+        if isinstance(result, Columns):
+            judged = work.trace(prepared(), candidate, expert).judged
             assert judged is not None
             return result, judged
     raise AssertionError("nothing is accepted")

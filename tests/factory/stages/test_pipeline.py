@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from factory.config.run import load_config
-from factory.graph.work import HUMAN, HUMAN_BEFORE, HUMAN_CANDIDATE, Accepted, Dropped, PreparedClip
+from factory.graph.work import HUMAN_CANDIDATE, Columns, Dropped, PreparedClip, attempted
 from factory.readers.base import BadClip
 from factory.readers.settings import TownSettings
 from factory.readers.town.reader import SyntheticReader
@@ -18,6 +18,7 @@ from factory.stages.pipeline import Considered, FactoryWork
 from factory.store.identity import UNLISTED
 from tasks import stages
 from tasks.perturb import Perturbation, perturb
+from tasks.stages import HUMAN, HUMAN_BEFORE
 from tasks.world.chance import stream
 from tasks.world.clip import HORIZON_STEPS, NOW
 from tasks.world.frames import to_local
@@ -48,9 +49,9 @@ def prepared_by(work: FactoryWork) -> PreparedClip:
     return prepared
 
 
-def first_sample(work: FactoryWork, prepared: PreparedClip) -> Accepted:
-    results = (work.attempt(prepared, row.index, "pdm_closed") for row in prepared.candidates)
-    return next(result for result in results if isinstance(result, Accepted))
+def first_sample(work: FactoryWork, prepared: PreparedClip) -> Columns:
+    results = (attempted(work, prepared, row.index, "pdm_closed") for row in prepared.candidates)
+    return next(result for result in results if isinstance(result, Columns))
 
 
 def test_a_block_below_the_gate_drops_the_experts_and_keeps_the_human(town: Path, tmp_path: Path) -> None:
@@ -58,8 +59,8 @@ def test_a_block_below_the_gate_drops_the_experts_and_keeps_the_human(town: Path
     prepared = prepared_by(work)
     assert prepared.dropped is not None and (prepared.dropped.stage, prepared.dropped.reason) == ("render", "psnr")
     assert prepared.candidates == ()
-    human = work.attempt(prepared, HUMAN_CANDIDATE, HUMAN)
-    assert isinstance(human, Accepted) and human.row["image_source"] == "photo"
+    human = attempted(work, prepared, HUMAN_CANDIDATE, HUMAN)
+    assert isinstance(human, Columns) and human.row["image_source"] == "photo"
 
 
 def test_a_marked_block_keeps_its_candidates_and_tags_its_samples(town: Path, tmp_path: Path) -> None:
@@ -68,22 +69,22 @@ def test_a_marked_block_keeps_its_candidates_and_tags_its_samples(town: Path, tm
     assert prepared.dropped is None
     marked = first_sample(work, prepared)
     assert marked.row["image_source"] == "render" and "low_psnr" in marked.row["tags"]  # type: ignore[operator]
-    human = work.attempt(prepared, HUMAN_CANDIDATE, HUMAN)
-    assert isinstance(human, Accepted) and "low_psnr" not in human.row["tags"]  # type: ignore[operator]
+    human = attempted(work, prepared, HUMAN_CANDIDATE, HUMAN)
+    assert isinstance(human, Columns) and "low_psnr" not in human.row["tags"]  # type: ignore[operator]
 
 
 def test_a_drive_that_cannot_be_shown_is_dropped_and_the_human_s_is_not(town: Path, tmp_path: Path) -> None:
     strict = work_on(town, tmp_path, "render.gate.contrast_min=1.0")
     prepared = prepared_by(strict)
-    results = [strict.attempt(prepared, row.index, "pdm_closed") for row in prepared.candidates]
+    results = [attempted(strict, prepared, row.index, "pdm_closed") for row in prepared.candidates]
     dropped = [result for result in results if isinstance(result, Dropped) and result.rejected.stage == "render"]
     assert dropped and {result.rejected.reason for result in dropped} == {"blank"}
-    assert not any(isinstance(result, Accepted) for result in results)
+    assert not any(isinstance(result, Columns) for result in results)
     assert dropped[0].subscores["nc"] == 1.0  # the reward had accepted it
-    assert isinstance(strict.attempt(prepared, HUMAN_CANDIDATE, HUMAN), Accepted)
+    assert isinstance(attempted(strict, prepared, HUMAN_CANDIDATE, HUMAN), Columns)
     for override in ("render.gate.enabled=false", "render=none", "render=map"):
         lenient = work_on(town, tmp_path, "render.gate.contrast_min=1.0", override)
-        assert isinstance(first_sample(lenient, prepared), Accepted)
+        assert isinstance(first_sample(lenient, prepared), Columns)
 
 
 def test_a_drive_past_a_vehicle_unlike_its_photos_is_dropped_and_at_zero_it_is_not(town: Path, tmp_path: Path) -> None:
@@ -91,12 +92,12 @@ def test_a_drive_past_a_vehicle_unlike_its_photos_is_dropped_and_at_zero_it_is_n
     stored = {f"ring_front_center at step {step}" for step in (40, 45, 50, 55)}  # 1.5 s before T+H to T+H
     strict = work_on(town, tmp_path, "render.gate.vehicle_min=1.0", small)
     prepared = prepared_by(strict)
-    found = [strict.attempt(prepared, row.index, "pdm_closed") for row in prepared.candidates]
+    found = [attempted(strict, prepared, row.index, "pdm_closed") for row in prepared.candidates]
     dropped = [result.rejected for result in found if isinstance(result, Dropped)]
     details = [rejected.detail for rejected in dropped if rejected.reason == "unlike_photos"]
     assert details and {detail.split(":")[0] for detail in details} <= stored
     lenient = work_on(town, tmp_path, "render.gate.vehicle_min=0", small)
-    assert isinstance(first_sample(lenient, prepared), Accepted)
+    assert isinstance(first_sample(lenient, prepared), Columns)
 
 
 def test_a_prepared_clip_is_rendered_also_where_its_data_has_moved(town: Path, tmp_path: Path) -> None:
@@ -117,8 +118,8 @@ def test_the_earlier_frame_of_a_pair_shows_its_own_instants_from_where_the_ego_w
     assert isinstance(prepared, PreparedClip)
     log, shown = work.reader.read(ref), []
     for expert, step in ((HUMAN, NOW), (HUMAN_BEFORE, NOW - 5)):
-        accepted = work.attempt(prepared, HUMAN_CANDIDATE, expert)
-        assert isinstance(accepted, Accepted)
+        accepted = attempted(work, prepared, HUMAN_CANDIDATE, expert)
+        assert isinstance(accepted, Columns)
         np.testing.assert_allclose(accepted.row["now_pose"], log.ego_states[step, :3], atol=1e-6)  # type: ignore[arg-type]
         shown.append({round(image["time_s"], 3): image for image in accepted.row["images"]})  # type: ignore[attr-defined]
     later, earlier = shown
@@ -135,7 +136,7 @@ def test_the_earlier_frame_of_a_pair_shows_its_own_instants_from_where_the_ego_w
 def test_a_rejected_attempt_is_no_sample(town: Path, tmp_path: Path) -> None:
     work = work_on(town, tmp_path, "reward.progress_above=2.0", "render=none")
     prepared = prepared_by(work)
-    results = [work.attempt(prepared, row.index, "pdm_closed") for row in prepared.candidates[:2]]
+    results = [attempted(work, prepared, row.index, "pdm_closed") for row in prepared.candidates[:2]]
     assert results and all(isinstance(result, Dropped) for result in results)
 
 
@@ -143,10 +144,10 @@ def test_with_an_open_gate_the_log_s_future_is_the_label_of_every_perturbed_stat
     work = work_on(town, tmp_path, "reward.full=[]", "reward.progress_above=-1", "render=none", "experts=[logged]")
     prepared = prepared_by(work)
     log = work.reader.read(work.reader.index().refs[0]).ego_states
-    results = [work.attempt(prepared, row.index, "logged") for row in prepared.candidates[:4]]
+    results = [attempted(work, prepared, row.index, "logged") for row in prepared.candidates[:4]]
     assert len(results) == 4
     for result in results:
-        assert isinstance(result, Accepted)
+        assert isinstance(result, Columns)
         now = np.asarray(result.row["now_pose"])
         assert np.hypot(*(now - log[NOW + HORIZON_STEPS, :3])[:2]) > 0.3  # perturbed
         wanted = to_local(now, log[NOW + HORIZON_STEPS + 1 : NOW + 2 * HORIZON_STEPS + 1, :3])
@@ -242,6 +243,6 @@ def test_the_log_s_own_drive_alone_needs_no_candidates_and_no_block(town: Path, 
     prepared = work.prepare(ref)
     assert isinstance(prepared, PreparedClip)
     assert prepared.candidates == () and prepared.dropped is None and work.identity.prepare_digest == UNLISTED
-    accepted = work.attempt(prepared, HUMAN_CANDIDATE, "human")
-    assert isinstance(accepted, Accepted) and accepted.row["image_source"] == "photo"
+    accepted = attempted(work, prepared, HUMAN_CANDIDATE, "human")
+    assert isinstance(accepted, Columns) and accepted.row["image_source"] == "photo"
     assert not list(tmp_path.rglob("block-*"))

@@ -18,13 +18,13 @@ import pytest
 from numpy.typing import NDArray
 
 from factory.commands.table import COMMANDS
-from factory.graph.work import HUMAN
 from factory.readers.av2.reader import AV2Reader
 from factory.readers.settings import TownSettings
 from factory.readers.town.write import write_logs
 from factory.run import main as run_main
 from factory.store.reader import SampleTable
 from factory.views.bev import EXPERT, LOGGED
+from tasks.stages import HUMAN
 from tasks.world.clip import NOW
 from tasks.world.vehicle import HEADING, X, Y
 

@@ -2,12 +2,12 @@
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from factory.graph.execute import RunSummary, execute
-from factory.graph.work import Accepted, AttemptResult, PreparedClip
+from factory.graph.work import Columns, Driven, Dropped, PreparedClip
 from factory.readers.base import ClipRef
 from factory.store.funnel import funnel_of
 from factory.store.samples import Store
@@ -32,12 +32,12 @@ class PicturedWork(ToyWork):
 
     watching: Callable[[], None] = lambda: None
 
-    def attempt(self, prepared: PreparedClip, candidate: int, expert: str) -> AttemptResult:
+    def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> Driven | Dropped:
         self.watching()
-        result = super().attempt(prepared, candidate, expert)
-        if isinstance(result, Accepted):
-            return replace(result, row={**result.row, **pictures(dict.fromkeys(FRONT_YAWS, VIEW))})
-        return result
+        return super().drive(prepared, candidate, expert)
+
+    def draw(self, driven: Driven) -> Columns:
+        return Columns(pictures(dict.fromkeys(FRONT_YAWS, VIEW)))
 
 
 def run(out: Path, rounds: int = 2, watching: Callable[[], None] = lambda: None, n: int = len(REFS)) -> RunSummary:

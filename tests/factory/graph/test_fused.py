@@ -1,0 +1,140 @@
+"""However the stages of an attempt are cut into tasks, the rows are the same, to the byte."""
+
+import pickle
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from factory.graph.execute import COMPLETE, COMPLETE_WITH_FAILURES, execute
+from factory.graph.local import attempt_tasks
+from factory.graph.on_ray import ray  # with the environment that keeps it on loopback
+from factory.graph.work import Columns, PreparedClip, Underway, attempted, go_on
+from factory.readers.town.reader import SyntheticReader
+from factory.stages.pipeline import FactoryWork
+from factory.store.samples import Store
+from tasks.stages import ATTEMPT, TASKS
+from tests.factory.stages.test_pipeline import SMALL, work_on
+from tests.factory.tables import assert_same_tables, tables_of
+from tests.factory.toy import ToyWork, ran, refs
+
+EXPERTS = ["recovery", "pdm_closed", "human"]
+UNFIT = {f"log0:{start}:pdm_closed:{i}:render": "unfit" for start in (0, 2000) for i in range(3)}
+
+
+def run(out: Path, work: ToyWork, **options: object):  # type: ignore[no-untyped-def]
+    return execute(work, refs(4), EXPERTS, 2, Store(out), say=lambda line: None, **options)  # type: ignore[arg-type]
+
+
+def test_the_tasks_of_an_attempt() -> None:
+    assert attempt_tasks("all", apart=True) == attempt_tasks("auto", apart=False) == (ATTEMPT,)
+    assert (
+        attempt_tasks("none", apart=False) == attempt_tasks("auto", apart=True) == (("drive",), ("render",), ("label",))
+    )
+    assert [task.name for task in TASKS if task.may_draw] == ["render"]
+
+
+def test_the_page_of_concepts_names_every_task() -> None:
+    page = (Path(__file__).resolve().parents[3] / "docs/concepts.md").read_text()
+    assert re.findall(r"^\| `(\w+)` \|", page, re.M) == [task.name for task in TASKS]
+
+
+def test_stages_as_tasks_of_their_own_make_the_same_rows_in_this_process(tmp_path: Path) -> None:
+    journal = str(tmp_path / "journal")
+    work = ToyWork(trouble={**UNFIT, "log1:1000:recovery:1": "bug"}, journal=journal)
+    apart = run(tmp_path / "apart", work, executor="local", fuse="none")
+    fused = run(tmp_path / "fused", ToyWork(trouble=work.trouble), executor="local", fuse="all")
+    assert apart.exit_code == fused.exit_code == COMPLETE_WITH_FAILURES
+    assert apart.counts == fused.counts and apart.executed == fused.executed
+    assert_same_tables(tmp_path / "apart", tmp_path / "fused")
+    rejected = [row for row in tables_of(tmp_path / "apart")[1] if row["stage"] == "render"]  # type: ignore[index]
+    assert rejected and {row["reason"] for row in rejected} == {"blank"}  # type: ignore[index]
+    assert ran(journal, "label") == apart.counts["accepted"] == ran(journal, "render") - len(rejected)
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory: pytest.TempPathFactory) -> FactoryWork:
+    """A run that draws from a small town's block."""
+    folder = tmp_path_factory.mktemp("town")
+    reader = SyntheticReader(folder / "town", 1, 0, SMALL)
+    reader.index()
+    return work_on(reader.root, folder / "out")
+
+
+@pytest.mark.slow
+def test_a_real_drive_travels_between_tasks_and_makes_the_same_row(town: FactoryWork) -> None:
+    prepared = town.prepare(town.reader.index().refs[0])
+    assert isinstance(prepared, PreparedClip)
+    drawn = []
+    for expert, candidates in (("human", [-1]), ("pdm_closed", [row.index for row in prepared.candidates[:4]])):
+        for candidate in candidates:
+            whole = attempted(town, prepared, candidate, expert)
+            result: object = prepared
+            for stage in ATTEMPT:
+                travelled = pickle.loads(pickle.dumps(result))
+                result = go_on(town, [stage], travelled, candidate, expert)
+                if not isinstance(result, Underway):
+                    break
+            assert type(result) is type(whole)
+            if isinstance(result, Columns) and isinstance(whole, Columns):
+                drawn.append(whole.row["image_source"])
+                assert repr(result.row) == repr(whole.row)
+    assert set(drawn) == {"photo", "render"}
+
+
+@pytest.fixture(scope="module")
+def two_nodes() -> Iterator[dict[str, str]]:
+    """A cluster of a node with CPUs and one with a GPU, in name: their kinds by id."""
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster()
+    cluster.add_node(num_cpus=2, num_gpus=0, include_dashboard=False)
+    cluster.add_node(num_cpus=1, num_gpus=1)
+    ray.init(address=cluster.address, log_to_driver=False)
+    cluster.wait_for_nodes()
+    kinds = {node["NodeID"]: "gpu" if node["Resources"].get("GPU") else "cpu" for node in ray.nodes()}
+    yield kinds
+    ray.shutdown()
+    cluster.shutdown()
+
+
+@pytest.mark.ray
+@pytest.mark.slow
+def test_a_real_run_makes_the_same_rows_in_one_task_here_and_in_three_on_ray(town: FactoryWork, tmp_path: Path) -> None:
+    stores = {}
+    for executor, fuse in (("local", "all"), ("ray", "none")):
+        stores[executor] = Store(tmp_path / executor)
+        made = execute(
+            *(town, town.reader.index().refs[:1], ["pdm_closed", "human"], 1, stores[executor], executor),  # type: ignore[arg-type]
+            workers=2,
+            fuse=fuse,  # type: ignore[arg-type]
+            say=lambda line: None,
+        )
+        assert made.exit_code == COMPLETE and made.counts["accepted"] == 2
+    assert_same_tables(tmp_path / "local", tmp_path / "ray")
+
+
+@pytest.mark.ray
+@pytest.mark.slow
+def test_gpu_nodes_draw_and_cpu_nodes_drive(tmp_path: Path, two_nodes: dict[str, str]) -> None:
+    journal = str(tmp_path / "journal")
+    work = ToyWork(trouble=UNFIT, journal=journal, seconds=0.05)
+    assert run(tmp_path / "out", work, workers=2, gpu_share=0.5).exit_code == COMPLETE
+    at = {"render": set(), "attempt": set(), "label": set()}  # type: dict[str, set[str]]
+    for line in Path(journal).read_text().splitlines():
+        word = line.split()[0]
+        if word in at:
+            at[word].add(two_nodes[line.split(" node ")[1].split()[0]])
+    assert at["render"] == {"gpu"}
+    assert at["attempt"] == at["label"] == {"cpu"}
+    run(tmp_path / "local", ToyWork(trouble=UNFIT), executor="local")
+    assert_same_tables(tmp_path / "out", tmp_path / "local")
+
+
+@pytest.mark.ray
+@pytest.mark.slow
+def test_stages_as_tasks_of_their_own_make_the_same_rows_on_ray(tmp_path: Path, two_nodes: dict[str, str]) -> None:
+    assert run(tmp_path / "apart", ToyWork(trouble=UNFIT), workers=2, fuse="none").exit_code == COMPLETE
+    run(tmp_path / "local", ToyWork(trouble=UNFIT), executor="local")
+    assert_same_tables(tmp_path / "apart", tmp_path / "local")
