@@ -7,7 +7,7 @@ without photos gives grey pictures near its sweeps, tagged `lidar_only`; photos 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -126,7 +126,9 @@ class Imaging:
             (self.settings.width, self.settings.height),
             self.settings.gate,
             self.settings.backend,
-            _kept_album(_Key(clip, self.settings, self.cache_dir)) if self.settings.gate.vehicle_min > 0.0 else None,
+            _kept_album(_of_block(clip, self.settings, self.cache_dir))
+            if self.settings.gate.vehicle_min > 0.0
+            else None,
             stored,
         )
 
@@ -233,7 +235,7 @@ def photo_at(clip: Clip, camera: str, time_s: float) -> SensorFile:
 
 
 def _block(clip: Clip, settings: RenderSettings, cache_dir: str) -> RenderAsset:
-    asset = _kept(_Key(clip, settings, cache_dir))
+    asset = _kept(_of_block(clip, settings, cache_dir))
     assert asset is not None, "asked for a block only where there are sensors"
     return asset
 
@@ -244,23 +246,31 @@ def scene_lookups() -> tuple[int, int]:
     return info.hits, info.misses
 
 
-class _Key:
-    """Hashes a clip by its id, so that a worker keeps the last blocks it used."""
+@dataclass(frozen=True)
+class _Block:
+    """A clip and how its block is drawn; in the caches of a worker, `key` stands for it."""
 
-    def __init__(self, clip: Clip, settings: RenderSettings, cache_dir: str) -> None:
-        self.clip, self.settings, self.cache_dir = clip, settings, cache_dir
-        self._key = (clip.clip_id, clip.content_digest, repr(settings), cache_dir)
+    key: tuple[object, ...]
+    clip: Clip = field(compare=False)
+    settings: RenderSettings = field(compare=False)
+    cache_dir: str = field(compare=False)
 
-    def __hash__(self) -> int:
-        return hash(self._key)
 
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Key) and self._key == other._key
+def _of_block(clip: Clip, settings: RenderSettings, cache_dir: str) -> _Block:
+    """Equal for all clips of a block, so that a worker that goes from clip to clip reads its scene once."""
+    how = repr(settings)
+    of_clip = _Block((clip.clip_id, clip.content_digest, how, cache_dir), clip, settings, cache_dir)
+    return replace(of_clip, key=(_place(of_clip), how))
+
+
+@lru_cache(maxsize=16)
+def _place(of_clip: _Block) -> Path:
+    return scene_path(of_clip.clip, of_clip.settings, of_clip.cache_dir)
 
 
 @lru_cache(maxsize=2)
-def _kept(key: _Key) -> RenderAsset | None:
-    return asset_for(key.clip, key.settings, Path(key.cache_dir))
+def _kept(block: _Block) -> RenderAsset | None:
+    return asset_for(block.clip, block.settings, Path(block.cache_dir))
 
 
 def album_of(clip: Clip, asset: RenderAsset, settings: RenderSettings) -> Album:
@@ -284,5 +294,5 @@ def album_of(clip: Clip, asset: RenderAsset, settings: RenderSettings) -> Album:
 
 
 @lru_cache(maxsize=2)
-def _kept_album(key: _Key) -> Album:
-    return album_of(key.clip, _block(key.clip, key.settings, key.cache_dir), key.settings)
+def _kept_album(block: _Block) -> Album:
+    return album_of(block.clip, _block(block.clip, block.settings, block.cache_dir), block.settings)

@@ -53,3 +53,14 @@ def test_a_finished_table_takes_no_vocabularies(shared_root: Path, tmp_path: Pat
     np.save(tmp_path / "more.npy", kinematic_trajectories(5, 1))
     with pytest.raises(ConfigError, match="table or vocabularies"):
         assemble(load_config([*asked, f"expert.recovery.vocabularies=[{tmp_path / 'more.npy'}]", "experts=[recovery]"]))
+
+
+def test_a_recovery_table_kept_of_train_logs_is_not_given_where_they_are_test(
+    shared_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    asked = ["clips=av2", f"clips.root={shared_root / 'data/av2/sensor/val'}", f"out={tmp_path}", "experts=[recovery]"]
+    run = assemble(load_config([*asked, "clips.split=train", "limit=1"]))
+    assert len(run.work.experts["recovery"].table)  # type: ignore[attr-defined]
+    with pytest.raises(ConfigError, match="no train log"):
+        assemble(load_config([*asked, "clips.split=test", "limit=1"]))

@@ -14,7 +14,7 @@ from factory.readers.base import BadClip
 from factory.readers.settings import TownSettings
 from factory.readers.town.reader import SyntheticReader
 from factory.setup.settings import assemble
-from factory.stages.imaging import photo_at
+from factory.stages.imaging import photo_at, scene_lookups
 from factory.stages.pipeline import FactoryWork
 from factory.stages.sensors import block_of
 from tasks.stages import HUMAN
@@ -123,3 +123,17 @@ def test_of_many_photos_the_nearest_is_taken(town: Path, tmp_path: Path) -> None
     first = clip.images[0]
     often = replace(clip, images=tuple(replace(first, time_s=0.05 * k + 0.02) for k in range(100)))
     assert photo_at(often, first.sensor, 1.0).time_s == pytest.approx(1.02)
+
+
+def test_a_worker_reads_a_block_s_scene_once_for_all_its_clips(tmp_path: Path) -> None:
+    town = SyntheticReader(tmp_path / "town", 1, 0, replace(SMALL, lidar_beams=8))
+    town.index()
+    overrides = ["clips=av2", f"clips.root={town.root}", f"out={tmp_path / 'out'}", *SIZE]
+    work = assemble(load_config(overrides)).work
+    before = scene_lookups()
+    refs = work.reader.index().refs
+    for ref in refs:
+        assert work.imaging.block_verdict(work.reader.read(ref)) is None
+    hits, misses = scene_lookups()
+    assert len(refs) == 3
+    assert (hits - before[0], misses - before[1]) == (2, 1)
