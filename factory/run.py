@@ -105,6 +105,7 @@ def run(asked: Asked, only_plan: bool) -> int:
 
     from factory.graph.episodes import EpisodesWanted
     from factory.graph.execute import execute
+    from factory.graph.local import Claims
     from factory.setup.calibrate import calibrate, plan_text
     from factory.setup.settings import assemble
     from factory.stages.benchmark import NEEDED, write_benchmark
@@ -138,7 +139,7 @@ def run(asked: Asked, only_plan: bool) -> int:
             store,
             config.executor,
             config.workers,
-            gpu_share=config.gpu_share if assembled.work.draws_on_gpu else 0.0,
+            claims=Claims(config.gpu_share if assembled.work.draws_on_gpu else 0.0, config.graph.memory_gb),
             fuse=config.graph.fuse,
             on_change=config.on_change,
             retry=config.retry_failed,

@@ -53,16 +53,17 @@ class Task:
     name: str
     stages: tuple[str, ...]  # as their seconds are told
     per: str  # block, clip, attempt, batch
-    may_draw: bool = False  # claims its share of a GPU where pictures are drawn on one; a core of a CPU in any case
+    memory_gb: float  # that its worker holds meanwhile; claimed of its node, as is a core
+    may_draw: bool = False  # claims its share of a GPU where pictures are drawn on one
 
 
 TASKS: tuple[Task, ...] = (
-    Task("reconstruct", ("reconstruct",), "block"),  # on as many cores as it is told
-    Task("perturb", ("clip", "render", "perturb"), "clip"),
-    Task("drive", ("rollout", "expert", "reward"), "attempt"),
-    Task("render", ("render",), "attempt", may_draw=True),  # only of drives that the reward accepts
-    Task("label", ("labels",), "attempt"),
-    Task("write", (), "batch"),
+    Task("reconstruct", ("reconstruct",), "block", 2.0),  # on as many cores as it is told
+    Task("perturb", ("clip", "render", "perturb"), "clip", 1.0),
+    Task("drive", ("rollout", "expert", "reward"), "attempt", 1.0),
+    Task("render", ("render",), "attempt", 1.0, may_draw=True),  # only of drives that the reward accepts
+    Task("label", ("labels",), "attempt", 1.0),
+    Task("write", (), "batch", 1.0),
 )
 # Fused into one task, `drive+render+label`, unless drawing claims a GPU: a task costs Ray some 40 ms, and what a drive
 # hands on is up to 5 MB. With a GPU they are tasks of their own, so that nothing but pictures holds it.

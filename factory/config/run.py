@@ -20,7 +20,7 @@ from tasks.experts.recovery.settings import RecoverySettings
 from tasks.render.settings import RenderMode, RenderSettings
 from tasks.rollout.settings import TrafficSettings
 from tasks.settings import ExpertGate, PerturbSettings
-from tasks.stages import FRAMES
+from tasks.stages import FRAMES, TASKS
 
 MOST_K = 2**17  # of a kinematic vocabulary: 126 MB of trajectories, eight times the largest in use
 READERS: Mapping[str, type[Any]] = {  # `_target_` of a built-in reader -> its settings
@@ -88,9 +88,18 @@ class RecoverySources(RecoverySettings):
 
 @dataclass(frozen=True)
 class GraphChoice:
-    """How the work is cut into tasks; rows do not depend on it."""
+    """How the work is cut into tasks, and what they claim on Ray; rows do not depend on it."""
 
     fuse: Literal["auto", "all", "none"] = "auto"  # drive, render, label in one task; auto: unless drawing claims a GPU
+    memory_gb: dict[str, float] = field(default_factory=dict)  # by task, where it is not the 1 GB (reconstruct: 2)
+
+    def __post_init__(self) -> None:
+        known = [task.name for task in TASKS]
+        for name, claimed in self.memory_gb.items():
+            if name not in known:
+                raise ValueError(f"memory_gb.{name}: there is no such task{nearest(name, known)}; there are {known}")
+            if not claimed >= 0.0:
+                raise ValueError(f"memory_gb.{name}={claimed}: must not be negative")
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUP
 from factory.graph.batch import SHARD_BYTES, SHARD_SECONDS, Gatherer, WriteFailed
 from factory.graph.driver import Driver, Executed
 from factory.graph.episodes import Episodes, EpisodesWanted
-from factory.graph.local import ClusterLacks, Fuse, Graph, LocalGraph
+from factory.graph.local import NO_CLAIMS, Claims, ClusterLacks, Fuse, Graph, LocalGraph
 from factory.graph.metrics import RunMetrics
 from factory.graph.plan import Plan, make_plan
 from factory.graph.walk import Try, retry_policy
@@ -64,7 +64,7 @@ def execute(
     on_change: OnChange = "stop",
     retry: bool = False,
     ray_address: str | None = None,
-    gpu_share: float = 0.0,
+    claims: Claims = NO_CLAIMS,
     fuse: Fuse = "auto",
     shard_bytes: int = SHARD_BYTES,
     shard_seconds: float = SHARD_SECONDS,
@@ -76,8 +76,7 @@ def execute(
     """Make the samples of `rounds` rounds for every clip and expert, as far as the store does not hold them already.
 
     workers: processes of a local Ray cluster, None: one per CPU. retry: try failed(input | bug) attempts again too.
-    gpu_share: of a GPU, that every task that draws claims on Ray; 0 where it draws without. fuse: whether the stages of
-    an attempt are one task; auto: not where drawing claims a GPU.
+    claims: on Ray. fuse: whether the stages of an attempt are one task; auto: not where drawing claims a GPU.
     minutes: after which nothing new is begun, as after an interruption. episodes: MCAP files to be written
     beside the samples. command: the settings as they were given, kept for `retry`.
     Bad wishes come back as exit code 2 with a message and nothing written; see the module's codes for the others.
@@ -108,7 +107,7 @@ def execute(
     try:
         is_due = plan.todo or (pictured is not None and pictured.is_due)
         graph = (
-            _graph(work, store, executor, workers, ray_address, gpu_share, fuse, lambda: driver.interrupted)
+            _graph(work, store, executor, workers, ray_address, claims, fuse, lambda: driver.interrupted)
             if is_due
             else None
         )
@@ -180,7 +179,7 @@ def _graph(
     executor: Executor,
     workers: int | None,
     address: str | None,
-    gpu_share: float,
+    claims: Claims,
     fuse: Fuse,
     stopped: Stopped,
 ) -> Graph:
@@ -188,7 +187,7 @@ def _graph(
         return LocalGraph(work, store.location, stopped, fuse)
     from factory.graph.on_ray import RayGraph
 
-    return RayGraph(work, store.location, workers, address, gpu_share, fuse)
+    return RayGraph(work, store.location, workers, address, claims, fuse)
 
 
 @contextmanager

@@ -3,7 +3,7 @@
 import os
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
@@ -11,13 +11,30 @@ from factory.graph import steps
 from factory.graph.metrics import NoRecorder, Recorder
 from factory.graph.work import Stopped, Work, never
 from factory.store.location import Location
-from tasks.stages import ATTEMPT
+from tasks.stages import ATTEMPT, TASKS
 
 Fuse = Literal["auto", "all", "none"]
 
 
+@dataclass(frozen=True)
+class Claims:
+    """What tasks claim of a Ray node, beside cores."""
+
+    gpu_share: float = 0.0  # of a GPU, every task that draws; 0: drawn without
+    memory_gb: Mapping[str, float] = field(default_factory=dict)  # by task, where it is not what tasks.stages says
+
+    def memory_bytes(self, name: str) -> int:
+        """Of a task by its name; of stages fused into one, the most that any of them wants."""
+        parts = set(name.split("+"))
+        wanted = (self.memory_gb.get(task.name, task.memory_gb) for task in TASKS if task.name in parts)
+        return int(1e9 * max(wanted, default=0.0))
+
+
 class ClusterLacks(ValueError):
     """The cluster has no node that the run could use."""
+
+
+NO_CLAIMS = Claims()
 
 
 @dataclass(eq=False)

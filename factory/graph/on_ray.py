@@ -23,7 +23,18 @@ from ray.autoscaler.sdk import request_resources
 from ray.exceptions import RayError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from factory.graph.local import STEPS, WANTS, ClusterLacks, Fuse, Ticket, attempt_tasks, cores_of, name_of
+from factory.graph.local import (
+    NO_CLAIMS,
+    STEPS,
+    WANTS,
+    Claims,
+    ClusterLacks,
+    Fuse,
+    Ticket,
+    attempt_tasks,
+    cores_of,
+    name_of,
+)
 from factory.graph.metrics import Recorder
 from factory.graph.ray_metrics import RayRecorder
 from factory.graph.steps import Failure
@@ -51,13 +62,13 @@ class RayGraph:
         out: Location,
         workers: int | None = None,
         address: str | None = None,
-        gpu_share: float = 0.0,
+        claims: Claims = NO_CLAIMS,
         fuse: Fuse = "auto",
     ) -> None:
         """workers: CPUs of a cluster started here, tasks at once on one that is there already; None: all its CPUs.
 
-        More workers than a cluster has CPUs now are what makes one grow that can. gpu_share: of a GPU, claimed by every
-        task that draws; on a cluster without one, it is asked for one and waited for.
+        More workers than a cluster has CPUs now are what makes one grow that can. A cluster without a GPU is asked for
+        one where tasks claim it, and waited for; memory is claimed up to what the largest node has.
         Raises BadLocation when some node does not see `out`, ClusterLacks when no GPU comes, NotReady when a node
         cannot do its part.
         """
@@ -65,7 +76,7 @@ class RayGraph:
         self._is_ours = self._connected and _connect(workers, address)
         available = int(ray.cluster_resources().get("CPU", 1))
         self.parallelism = max(1, min(workers or available, available) if self._is_ours else workers or available)
-        self.cores = min(filter(None, _cores_by_node()), default=1)  # none yet where a cluster grows from nothing
+        self.cores = min(_of_nodes("CPU"), default=1)  # none yet where a cluster grows from nothing
         self.cores = min(self.cores, self.parallelism)
         self.recorder: Recorder = RayRecorder()
         self._supplied: dict[str, Any] = {
@@ -78,7 +89,8 @@ class RayGraph:
         self._held_back: dict[bool, deque[tuple[Ticket, str, tuple[Any, ...]]]] = {False: deque(), True: deque()}
         self._flying = {False: 0, True: 0}  # both by whether a task claims a GPU
         try:
-            self._gpu_share = gpu_share if gpu_share and _has_gpu(wait=not self._is_ours) else 0.0
+            self._gpu_share = claims.gpu_share if claims.gpu_share and _has_gpu(wait=not self._is_ours) else 0.0
+            self._claims, self._most_memory = claims, max(_of_nodes("memory"), default=None)
             self.attempt_tasks: Sequence[Sequence[str]] = attempt_tasks(fuse, apart=self._gpu_share > 0.0)
             _prove_shared(out)
             _warm_every_node(self._supplied["work"], with_gpu_only=self._gpu_share > 0.0)
@@ -105,7 +117,10 @@ class RayGraph:
                 ticket, step, args = waiting.popleft()
                 supplied = [self._supplied[name] for name in WANTS[step]]
                 gpu = self._gpu_share if draws else None
-                task = _run.options(name=ticket.step, num_cpus=cores_of(step, args), num_gpus=gpu)
+                memory = self._claims.memory_bytes(ticket.step)
+                memory = memory if self._most_memory is None else min(memory, self._most_memory)
+                cores = cores_of(step, args)
+                task = _run.options(name=ticket.step, num_cpus=cores, num_gpus=gpu, memory=memory or None)
                 report, ticket.result = task.remote(step, len(supplied), *supplied, *args)
                 self._tickets[report] = ticket
                 self._flying[draws] += 1
@@ -195,8 +210,10 @@ def _nodes() -> list[str]:
     return [node["NodeID"] for node in ray.nodes() if node["Alive"]]
 
 
-def _cores_by_node() -> list[int]:
-    return [int(node["Resources"].get("CPU", 0)) for node in ray.nodes() if node["Alive"]]
+def _of_nodes(resource: str) -> list[int]:
+    """Of each node that works: a head without cores does not."""
+    working = [node["Resources"] for node in ray.nodes() if node["Alive"] and node["Resources"].get("CPU")]
+    return [int(resources[resource]) for resources in working if resources.get(resource)]
 
 
 def _has_gpu(wait: bool) -> bool:

@@ -150,6 +150,8 @@ def test_render_settings_at_their_bounds_are_taken() -> None:
         ("render.mode=photo", r"render\.mode"),
         ("render.map_rig=five_front", r"render\.map_rig: must be .*three_front"),
         ("vocabulary.k=0", "k=0: must be positive"),
+        ("graph.memory_gb.rendr=3", "there is no such task; did you mean render"),
+        ("graph.memory_gb.render=-1", r"memory_gb\.render=-1"),
     ],
 )
 def test_a_value_of_the_wrong_kind_is_an_error_that_names_it(override: str, message: str) -> None:

@@ -2,15 +2,16 @@
 
 import pickle
 import re
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from factory.graph.execute import COMPLETE, COMPLETE_WITH_FAILURES, execute
-from factory.graph.local import attempt_tasks
+from factory.graph.local import Claims, attempt_tasks
 from factory.graph.on_ray import ray  # with the environment that keeps it on loopback
-from factory.graph.work import Columns, PreparedClip, Underway, attempted, go_on
+from factory.graph.work import Columns, Driven, Dropped, PreparedClip, Underway, attempted, go_on
 from factory.readers.town.reader import SyntheticReader
 from factory.stages.pipeline import FactoryWork
 from factory.store.samples import Store
@@ -83,20 +84,44 @@ def test_a_real_drive_travels_between_tasks_and_makes_the_same_row(town: Factory
     assert set(drawn) == {"photo", "render"}
 
 
-@pytest.fixture(scope="module")
-def two_nodes() -> Iterator[dict[str, str]]:
-    """A cluster of a node with CPUs and one with a GPU, in name: their kinds by id."""
-    from ray.cluster_utils import Cluster
-
-    cluster = Cluster()
-    cluster.add_node(num_cpus=2, num_gpus=0, include_dashboard=False)
-    cluster.add_node(num_cpus=1, num_gpus=1)
-    ray.init(address=cluster.address, log_to_driver=False)
-    cluster.wait_for_nodes()
-    kinds = {node["NodeID"]: "gpu" if node["Resources"].get("GPU") else "cpu" for node in ray.nodes()}
-    yield kinds
+@pytest.fixture
+def memory_of_two() -> Iterator[None]:
+    """A cluster of four cores, with memory for two tasks of 1 GB."""
+    ray.init(address="local", num_cpus=4, _memory=2_500_000_000, include_dashboard=False, log_to_driver=False)
+    yield
     ray.shutdown()
-    cluster.shutdown()
+
+
+def test_fused_stages_claim_what_the_hungriest_of_them_wants() -> None:
+    claims = Claims(memory_gb={"label": 1.5, "reconstruct": 8.0})
+    assert claims.memory_bytes("drive+render+label") == 1_500_000_000
+    assert claims.memory_bytes("drive") == 1_000_000_000
+    assert claims.memory_bytes("reconstruct") == 8_000_000_000
+    assert claims.memory_bytes("episodes") == 0
+
+
+@pytest.mark.ray
+@pytest.mark.slow
+@pytest.mark.parametrize(("claimed_gb", "at_once"), [(1.0, 2), (9.0, 1)])
+def test_memory_bounds_what_a_node_does_at_once(
+    tmp_path: Path, memory_of_two: None, claimed_gb: float, at_once: int
+) -> None:
+    """Of four cores, memory fills two; a task that claims more than any node has is alone on one."""
+
+    class Timed(ToyWork):
+        def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> Driven | Dropped:
+            began, result = time.time(), super().drive(prepared, candidate, expert)
+            with open(self.journal, "a") as file:
+                file.write(f"at {began} {time.time()}\n")
+            return result
+
+    journal = tmp_path / "journal"
+    work = Timed(journal=str(journal), seconds=0.2)
+    claims = Claims(memory_gb={task.name: claimed_gb for task in TASKS})
+    assert run(tmp_path / "out", work, workers=4, claims=claims).exit_code == COMPLETE
+    spans = [[float(t) for t in line.split()[1:]] for line in journal.read_text().splitlines() if line[:3] == "at "]
+    together = [sum(began <= start < ended for began, ended in spans) for start, _ in spans]
+    assert max(together) == at_once
 
 
 @pytest.mark.ray
@@ -115,12 +140,28 @@ def test_a_real_run_makes_the_same_rows_in_one_task_here_and_in_three_on_ray(tow
     assert_same_tables(tmp_path / "local", tmp_path / "ray")
 
 
+@pytest.fixture(scope="module")
+def two_nodes() -> Iterator[dict[str, str]]:
+    """A cluster of a node with CPUs and one with a GPU, in name: their kinds by id."""
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster()
+    cluster.add_node(num_cpus=2, num_gpus=0, include_dashboard=False)
+    cluster.add_node(num_cpus=1, num_gpus=1)
+    ray.init(address=cluster.address, log_to_driver=False)
+    cluster.wait_for_nodes()
+    kinds = {node["NodeID"]: "gpu" if node["Resources"].get("GPU") else "cpu" for node in ray.nodes()}
+    yield kinds
+    ray.shutdown()
+    cluster.shutdown()
+
+
 @pytest.mark.ray
 @pytest.mark.slow
 def test_gpu_nodes_draw_and_cpu_nodes_drive(tmp_path: Path, two_nodes: dict[str, str]) -> None:
     journal = str(tmp_path / "journal")
     work = ToyWork(trouble=UNFIT, journal=journal, seconds=0.05)
-    assert run(tmp_path / "out", work, workers=2, gpu_share=0.5).exit_code == COMPLETE
+    assert run(tmp_path / "out", work, workers=2, claims=Claims(gpu_share=0.5)).exit_code == COMPLETE
     at = {"render": set(), "attempt": set(), "label": set()}  # type: dict[str, set[str]]
     for line in Path(journal).read_text().splitlines():
         word = line.split()[0]

@@ -13,6 +13,7 @@ from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES
 from factory.graph import on_ray as graph
 from factory.graph.episodes import EpisodesWanted
 from factory.graph.execute import execute
+from factory.graph.local import Claims
 from factory.graph.on_ray import ray  # with the environment that keeps it on loopback
 from factory.store.samples import Store
 from factory.store.verify import verify
@@ -98,7 +99,7 @@ def test_only_what_draws_claims_its_share_of_a_gpu(tmp_path: Path, two_cpus: Non
         ["recovery"],
         1,
         Store(tmp_path / "out"),
-        gpu_share=0.5,
+        claims=Claims(gpu_share=0.5),
         say=lambda line: None,
     )
     assert summary.exit_code == COMPLETE
@@ -115,7 +116,7 @@ def test_a_cluster_without_a_gpu_is_waited_for_and_then_named(
     monkeypatch.setattr(graph, "_gpu_nodes", set)
     monkeypatch.setattr(graph, "GPU_WAIT_S", 0.1)
     store = Store(tmp_path / "out")
-    summary = execute(ToyWork(), refs(1), ["human"], 1, store, gpu_share=0.5, say=lambda line: None)
+    summary = execute(ToyWork(), refs(1), ["human"], 1, store, claims=Claims(gpu_share=0.5), say=lambda line: None)
     assert summary.exit_code == BAD_CONFIG and "render.backend=cpu" in summary.message
     assert not (tmp_path / "out").exists()
 
