@@ -79,7 +79,7 @@ def execute(
     claims: on Ray. fuse: whether the stages of an attempt are one task; auto: not where drawing claims a GPU.
     minutes: after which nothing new is begun, as after an interruption. episodes: MCAP files to be written
     beside the samples. command: the settings as they were given, kept for `retry`.
-    Bad wishes come back as exit code 2 with a message and nothing written; see the module's codes for the others.
+    Wrong settings come back as exit code 2 with a message and nothing written; see the module's codes for the others.
     """
     if not refs or not experts or rounds < 1:
         return RunSummary(BAD_CONFIG, f"nothing to do: {len(refs)} clips, experts {list(experts)}, rounds={rounds}")

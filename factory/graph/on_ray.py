@@ -41,6 +41,7 @@ from factory.graph.steps import Failure
 from factory.graph.work import NotReady, Work, never
 from factory.store.location import BadLocation, Location
 from factory.store.outcomes import ErrorKind
+from factory.wording import one_line
 from tasks.stages import TASKS
 
 MAX_RETRIES = 2  # of a task whose worker died
@@ -265,7 +266,12 @@ def _warm_every_node(work: list[Any], with_gpu_only: bool) -> None:
     nodes = _nodes()
     draws = _gpu_nodes() if with_gpu_only else set(nodes)
     reports = [_run.options(name="warm", scheduling_strategy=_on(n)).remote("warm", 1, work, n in draws) for n in nodes]
-    for report, _ in reports:
-        answer, _ = ray.get(report)
+    for node, (report, _) in zip(nodes, reports):
+        try:
+            answer, _ = ray.get(report)
+        except RayError as error:
+            if node not in _nodes():
+                continue  # it has left the cluster: no task goes there
+            raise NotReady(f"node {node} could not get its kernels ready: {one_line(error)}") from error
         if isinstance(answer, Failure):
             raise NotReady(answer.error) if answer.kind is ErrorKind.INPUT else RuntimeError(answer.error)

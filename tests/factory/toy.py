@@ -190,3 +190,17 @@ def ran(journal: str, word: str) -> int:
     """Tasks of a kind that really ran; a journal that nobody began holds none."""
     path = Path(journal)
     return sum(line.startswith(word) for line in path.read_text().splitlines()) if path.exists() else 0
+
+
+@dataclass(frozen=True)
+class TakesItsNodeAway(ToyWork):
+    """Where its kernels are to be compiled on one node of a Ray cluster, that node dies."""
+
+    doomed: str = ""
+
+    def warm(self, draws: bool = True) -> None:
+        import ray
+
+        if ray.get_runtime_context().get_node_id() == self.doomed:
+            os.kill(os.getppid(), signal.SIGKILL)  # the node's own process, which started this one
+            os.kill(os.getpid(), signal.SIGKILL)

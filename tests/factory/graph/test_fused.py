@@ -5,6 +5,7 @@ import re
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -18,7 +19,7 @@ from factory.store.samples import Store
 from tasks.stages import ATTEMPT, TASKS
 from tests.factory.stages.test_pipeline import SMALL, work_on
 from tests.factory.tables import assert_same_tables, tables_of
-from tests.factory.toy import ToyWork, ran, refs
+from tests.factory.toy import TakesItsNodeAway, ToyWork, ran, refs
 
 EXPERTS = ["recovery", "pdm_closed", "human"]
 UNFIT = {f"log0:{start}:pdm_closed:{i}:render": "unfit" for start in (0, 2000) for i in range(3)}
@@ -141,8 +142,8 @@ def test_a_real_run_makes_the_same_rows_in_one_task_here_and_in_three_on_ray(tow
 
 
 @pytest.fixture(scope="module")
-def two_nodes() -> Iterator[dict[str, str]]:
-    """A cluster of a node with CPUs and one with a GPU, in name: their kinds by id."""
+def cluster() -> Iterator[Any]:
+    """A node with CPUs and one with a GPU, in name."""
     from ray.cluster_utils import Cluster
 
     cluster = Cluster()
@@ -150,10 +151,15 @@ def two_nodes() -> Iterator[dict[str, str]]:
     cluster.add_node(num_cpus=1, num_gpus=1)
     ray.init(address=cluster.address, log_to_driver=False)
     cluster.wait_for_nodes()
-    kinds = {node["NodeID"]: "gpu" if node["Resources"].get("GPU") else "cpu" for node in ray.nodes()}
-    yield kinds
+    yield cluster
     ray.shutdown()
     cluster.shutdown()
+
+
+@pytest.fixture(scope="module")
+def two_nodes(cluster: Any) -> dict[str, str]:
+    """Their kinds by id."""
+    return {node["NodeID"]: "gpu" if node["Resources"].get("GPU") else "cpu" for node in ray.nodes()}
 
 
 @pytest.mark.ray
@@ -179,3 +185,15 @@ def test_stages_as_tasks_of_their_own_make_the_same_rows_on_ray(tmp_path: Path, 
     assert run(tmp_path / "apart", ToyWork(trouble=UNFIT), workers=2, fuse="none").exit_code == COMPLETE
     run(tmp_path / "local", ToyWork(trouble=UNFIT), executor="local")
     assert_same_tables(tmp_path / "apart", tmp_path / "local")
+
+
+@pytest.mark.ray
+@pytest.mark.slow
+def test_a_node_that_leaves_before_the_first_task_is_done_without(tmp_path: Path, cluster: Any) -> None:
+    doomed = cluster.add_node(num_cpus=1, num_gpus=0).node_id
+    cluster.wait_for_nodes()
+    work = TakesItsNodeAway(doomed=doomed)
+    assert run(tmp_path / "out", work, workers=2).exit_code == COMPLETE
+    assert doomed not in {node["NodeID"] for node in ray.nodes() if node["Alive"]}
+    run(tmp_path / "local", ToyWork(), executor="local")
+    assert_same_tables(tmp_path / "out", tmp_path / "local")
