@@ -92,10 +92,8 @@ def attempt(
 ) -> tuple[Judged, Rejected | None] | Rejected:
     """Let `expert` plan from the perturbed scene, drive its plan and judge it.
 
+    Returns the judged drive and the verdict (None: accepted); Rejected where the route ends or the expert has no plan.
     `timed(stage)` is entered around the work of each stage, for whoever wants to know where the time goes.
-
-    Returns:
-        The judged drive and the verdict (None: accepted); Rejected where the route ends or the expert has no plan.
     """
     if not has_route(scene.centerline):
         return Rejected("rollout", "route_ended", "the perturbed ego stands at the end of its route")

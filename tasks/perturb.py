@@ -1,16 +1,14 @@
 """Perturbation: which vocabulary trajectories take the ego somewhere new, near the log, and lawfully.
 
-Paper, section "Trajectory Perturbation" and the configuration table of its supplement. The order of the filters:
-gates on the raw end pose, LQR, gates on the reached end pose, an interleaved grid over the reached end poses, per
-cell the first trajectory in seeded order with a non-reactive EPDMS at the threshold (log replay), then the same
-threshold under reactive traffic on the kept ones only. Scores are needed only until a cell is filled, so cells are
-walked abreast: the same result as filter-then-pick at a fraction of the scores.
-
-For benchmarks the grid may be dense, and the candidates in an order in which the first few already lie all over it.
+Paper, section "Trajectory Perturbation" and the configuration table of its supplement: gates on the raw end pose, LQR,
+gates on the reached end pose, an interleaved grid over those, per cell the first trajectory in seeded order with a
+non-reactive EPDMS at the threshold (log replay), then the same threshold under reactive traffic on the kept ones only.
+Scores are needed only until a cell is filled, so cells are walked abreast: the same result at a fraction of the scores.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 
@@ -76,15 +74,9 @@ def grid_cells(end_poses: Array, settings: PerturbSettings) -> Ints:
 
 
 def first_good_per_cell(cell_of: Ints, order: Ints, is_good: Callable[[Ints], Bools]) -> Ints:
-    """Per cell the first member, in `order`, that is good; cells in the order of their first member.
+    """Per cell the first of `order`, (G',) in seeded order, that is good (C,); cells in the order of their first.
 
-    Args:
-        cell_of: (G, 2) cell of each trajectory.
-        order: (G',) the trajectories to walk, in seeded order.
-        is_good: asked for a batch of trajectories at a time, at most once for each.
-
-    Returns:
-        (C,) the chosen trajectories.
+    cell_of: (G, 2) cell of each trajectory; is_good: asked for a batch at a time, at most once for each.
     """
     queues: dict[tuple[int, int], list[int]] = {}
     for member in order:
@@ -98,17 +90,6 @@ def first_good_per_cell(cell_of: Ints, order: Ints, is_good: Callable[[Ints], Bo
         good = is_good(np.array([member for _, member in asked], dtype=np.int64))
         chosen.update({cell: member for (cell, member), ok in zip(asked, good) if ok})
         rank += 1
-
-
-def in_turn(n: int, is_good: Callable[[int], bool], at_most: int) -> list[int]:
-    """The first `at_most` good ones of 0 .. n-1."""
-    taken: list[int] = []
-    for member in range(n):
-        if len(taken) == at_most:
-            break
-        if is_good(member):
-            taken.append(member)
-    return taken
 
 
 def spread_out(points: Array, is_good: Callable[[int], bool], at_most: int) -> list[int]:
@@ -139,18 +120,10 @@ def perturb(
     planner: PdmSettings,
     rng: np.random.Generator,
 ) -> Perturbation | Rejected:
-    """The ordered candidates of a clip.
+    """The ordered candidates of a clip, or Rejected "no_gated_candidate" or "no_good_candidate".
 
-    Args:
-        clip: the recording.
-        vocabulary: trajectories (K, 40, 3) in the ego frame.
-        settings: gates, grid and threshold.
-        traffic: of the reactive check.
-        planner: PDM-Closed, the first row of every two-row batch that normalises progress.
-        rng: the clip's `perturb` stream; draws one permutation of the vocabulary.
-
-    Returns:
-        Perturbation, or Rejected "no_gated_candidate" / "no_good_candidate".
+    traffic: of the reactive check; planner: PDM-Closed, the first row of every two-row batch that normalises progress;
+    rng: the clip's `perturb` stream, which draws one permutation of the vocabulary.
     """
     scene = scene_of_clip(clip)
     start = scene.ego_state
@@ -163,9 +136,8 @@ def perturb(
     gated = np.flatnonzero(~np.logical_or.reduce(list(raw_fails.values())))
     counts = {f"raw_{name}": int(fails.sum()) for name, fails in raw_fails.items()}
     if len(gated) == 0:
-        return Rejected(
-            "perturb", "no_gated_candidate", f"none of {len(raw_ends)} trajectories ends near the log", counts
-        )
+        detail = f"none of {len(raw_ends)} trajectories ends near the log"
+        return Rejected("perturb", "no_gated_candidate", detail, counts)
 
     states = track(start, to_world(start[: HEADING + 1], vocabulary.trajectories[gated]))
     ends = to_local(target, states[:, -1, : HEADING + 1])
@@ -199,11 +171,8 @@ def perturb(
     def passes_reactive(place: int) -> bool:
         member = int(kept[place])
         rollout = roll_out(traffic_scene, states[member].copy())
-        reactive = score(
-            among(replay, rollout.agents, start),
-            np.concatenate([pdm_states, rollout.ego_states[None]]),
-            normalise="pairs",
-        )
+        pair = np.concatenate([pdm_states, rollout.ego_states[None]])
+        reactive = score(among(replay, rollout.agents, start), pair, normalise="pairs")
         good = bool(reactive.pdm_score[1] >= settings.epdms_min)
         fate[member] = "kept" if good else "reactive"
         if good:
@@ -223,7 +192,7 @@ def perturb(
     if settings.order == "spread":
         places = spread_out(ends[kept, :2], passes_reactive, at_most)
     else:
-        places = in_turn(len(kept), passes_reactive, at_most)
+        places = list(islice(filter(passes_reactive, range(len(kept))), at_most))
     candidates = [proven[place] for place in places]
     counts["reactive_score"] = int((fate == "reactive").sum())
     if not candidates:

@@ -22,12 +22,12 @@ from factory.wording import one_line
 from tasks.caches import user_cache
 from tasks.experts.pdm_closed.settings import PdmSettings
 from tasks.experts.protocol import Expert, tried_once
-from tasks.render.fit.settings import REMOVED
 from tasks.render.rigs import RIGS
 from tasks.render.scene import engine
-from tasks.render.settings import RenderMode
+from tasks.render.settings import REMOVED, RenderMode
 from tasks.render.splatting.gsplat_backend import BackendMissing
 from tasks.reward.labels import Labelling
+from tasks.rollout import settings as traffic
 from tasks.stages import FRAMES, stage_versions
 from tasks.world.kinematic_vocabulary import kinematic_trajectories
 from tasks.world.vocabulary import Vocabulary
@@ -228,7 +228,9 @@ def identity_of(config: RunConfig, vocabulary: Vocabulary, labelling: Labelling 
     settings: dict[str, object] = {"seed": config.seed, "vocabulary": vocabulary.digest}
     for group, value in science.items():
         settings |= {f"{group}.{key}": plain for key, plain in dataclasses.asdict(value).items()}
-    settings["render.fit"] = dataclasses.asdict(config.render.fit) | REMOVED
+    settings |= {f"traffic.{key}": value for key, value in traffic.REMOVED.items()}
+    for part, gone in REMOVED.items():
+        settings[f"render.{part}"] = dataclasses.asdict(getattr(config.render, part)) | gone
     settings = {key: plain for key, plain in settings.items() if plain != ADDED.get(key, ABSENT)}
     settings["reward.label_vocabulary"] = None if labelling is None else labelling.vocabulary.digest
     versions = stage_versions()

@@ -21,12 +21,11 @@ from factory.graph.work import Stopped, never
 from factory.stages.fitting import fitted
 from factory.stages.scene_file import SUFFIX, BadScene, read_scene, write_scene
 from factory.stages.sensors import block_of, chosen_cameras, load_sensors, load_sweeps, taken_by
-from tasks.render.fit.settings import REMOVED
 from tasks.render.scene.asset import BlockRange, RenderAsset
 from tasks.render.scene.build import build_asset
 from tasks.render.scene.lidar_only import lidar_asset
 from tasks.render.scene.stereo import MAX_BASELINE_M, MIN_BASELINE_M
-from tasks.render.settings import RenderSettings, SceneFrom
+from tasks.render.settings import REMOVED, RenderSettings, SceneFrom
 from tasks.world.arrays import Array
 from tasks.world.camera import SensorFile
 from tasks.world.clip import Block, Clip
@@ -127,7 +126,8 @@ def block_id(clip: Clip, settings: RenderSettings) -> str:
     digest = hashlib.sha256()
     block = block_of(clip)
     made_of = (ASSET_VERSION, clip.dataset, clip.log_id, block.start_s, clip.content_digest)
-    made = asdict(settings.fit) | REMOVED if settings.scene is SceneFrom.FIT else asdict(settings.asset)
+    part = "fit" if settings.scene is SceneFrom.FIT else "asset"
+    made = asdict(settings)[part] | REMOVED[part]
     how = (settings.width, settings.height, sorted(settings.cameras), made)
     digest.update(json.dumps([made_of, how], sort_keys=True).encode())
     for file in (*block.images, *block.sweeps):

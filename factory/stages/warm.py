@@ -22,9 +22,8 @@ from tasks.experts.protocol import Plan
 from tasks.kernels.compiled import USED, cache_dir, make_cache_dir, not_kept, processor, write_whole
 from tasks.render import warm as render_warm
 from tasks.render.settings import RenderMode, RenderSettings, SceneFrom
-from tasks.reward.labels import Labelling, vocabulary_labels
+from tasks.reward.labels import Labelling, reactive_scores, vocabulary_labels
 from tasks.reward.prepare import prepare_scene
-from tasks.reward.reactive import reactive_scores
 from tasks.reward.verdicts import INDEX_FROM_ROWS
 from tasks.rollout.simulate import TrafficSettings, simulate
 from tasks.world.agents import AgentKind, AgentTracks

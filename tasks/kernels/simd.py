@@ -49,14 +49,8 @@ def _operator(function: Callable[..., Any], instruction: str) -> None:
         return getattr(builder, instruction)(*arguments)
 
 
-for _function, _instruction in (
-    (operator.add, "fadd"),
-    (operator.sub, "fsub"),
-    (operator.mul, "fmul"),
-    (operator.truediv, "fdiv"),
-):
-    _operator(_function, _instruction)
-_operator(operator.iadd, "fadd")
+for _name, _instruction in (("add", "fadd"), ("sub", "fsub"), ("mul", "fmul"), ("truediv", "fdiv"), ("iadd", "fadd")):
+    _operator(getattr(operator, _name), _instruction)
 
 
 def _constant(values: Any) -> Any:
@@ -67,17 +61,14 @@ def _order(places: list[int]) -> Any:
     return ir.Constant(ir.VectorType(ir.IntType(32), LANES), places)
 
 
-def _broadcast(builder: Any, number: Any) -> Any:
-    one = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), number, ir.Constant(ir.IntType(32), 0))
-    return builder.shuffle_vector(one, ir.Constant(_VECTOR, ir.Undefined), _order([0] * LANES))
-
-
 @intrinsic
 def fill(typing_context: Any, number: Any) -> Any:
     """The same float32 in every lane."""
 
     def build(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        return _broadcast(builder, arguments[0])
+        nothing = ir.Constant(_VECTOR, ir.Undefined)
+        one = builder.insert_element(nothing, arguments[0], ir.Constant(ir.IntType(32), 0))
+        return builder.shuffle_vector(one, nothing, _order([0] * LANES))
 
     return lanes(types.float32), build
 
@@ -130,14 +121,18 @@ def prefetch(typing_context: Any, array: Any, at: Any) -> Any:
     return types.none(array, types.uint64), build
 
 
+def _called(builder: Any, name: str, arguments: Any) -> Any:
+    """What one of LLVM's own functions makes of values of this type."""
+    kind = ir.FunctionType(_VECTOR, [_VECTOR] * len(arguments))
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), arguments)
+
+
 @intrinsic
 def fused(typing_context: Any, a: Any, b: Any, c: Any) -> Any:
     """a * b + c in one rounding."""
 
     def build(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        kind = ir.FunctionType(_VECTOR, [_VECTOR] * 3)
-        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.fma.v16f32")
-        return builder.call(function, arguments)
+        return _called(builder, "llvm.fma.v16f32", arguments)
 
     return lanes(lanes, lanes, lanes), build
 
@@ -145,56 +140,40 @@ def fused(typing_context: Any, a: Any, b: Any, c: Any) -> Any:
 @intrinsic
 def root(typing_context: Any, values: Any) -> Any:
     """Square roots; NaN of what is negative."""
-
-    def build(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        kind = ir.FunctionType(_VECTOR, [_VECTOR])
-        return builder.call(cgutils.get_or_insert_function(builder.module, kind, "llvm.sqrt.v16f32"), arguments)
-
-    return lanes(lanes), build
+    return lanes(lanes), lambda context, builder, sig, arguments: _called(builder, "llvm.sqrt.v16f32", arguments)
 
 
-@intrinsic
-def smaller(typing_context: Any, a: Any, b: Any) -> Any:
-    """The smaller of each lane; b where a is NaN."""
+def _first_where(comparison: str) -> Any:
+    """An intrinsic of a and b: a in the lanes where the comparison of them holds, b in the others."""
 
-    def build(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        a, b = arguments
-        return builder.select(builder.fcmp_ordered("<", a, b), a, b)
+    @intrinsic
+    def chosen(typing_context: Any, a: Any, b: Any) -> Any:
+        def build(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+            return builder.select(builder.fcmp_ordered(comparison, *arguments), *arguments)
 
-    return lanes(lanes, lanes), build
+        return lanes(lanes, lanes), build
 
-
-@intrinsic
-def larger(typing_context: Any, a: Any, b: Any) -> Any:
-    """The larger of each lane; b where a is NaN."""
-
-    def build(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        a, b = arguments
-        return builder.select(builder.fcmp_ordered(">", a, b), a, b)
-
-    return lanes(lanes, lanes), build
+    return chosen
 
 
-@intrinsic
-def where_at_least(typing_context: Any, a: Any, b: Any, value: Any) -> Any:
-    """`value` in the lanes where a >= b, 0 in the others."""
-
-    def build(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        a, b, value = arguments
-        return builder.select(builder.fcmp_ordered(">=", a, b), value, _constant([0.0] * LANES))
-
-    return lanes(lanes, lanes, lanes), build
+smaller, larger = _first_where("<"), _first_where(">")  # b where a is NaN
 
 
-@intrinsic
-def where_below(typing_context: Any, a: Any, b: Any, value: Any) -> Any:
-    """`value` in the lanes where a < b, 0 in the others."""
+def _value_where(comparison: str) -> Any:
+    """An intrinsic of a, b and a value: the value in the lanes where the comparison of a and b holds, 0 elsewhere."""
 
-    def build(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        a, b, value = arguments
-        return builder.select(builder.fcmp_ordered("<", a, b), value, _constant([0.0] * LANES))
+    @intrinsic
+    def chosen(typing_context: Any, a: Any, b: Any, value: Any) -> Any:
+        def build(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+            a, b, value = arguments
+            return builder.select(builder.fcmp_ordered(comparison, a, b), value, _constant([0.0] * LANES))
 
-    return lanes(lanes, lanes, lanes), build
+        return lanes(lanes, lanes, lanes), build
+
+    return chosen
+
+
+where_at_least, where_below = _value_where(">="), _value_where("<")
 
 
 @intrinsic

@@ -15,7 +15,7 @@ FRONT = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 
 def compile_kernels() -> RenderAsset:
     """Builds and measures a scene of two 32 x 32 photos, some ground and one box that drives."""
     turned(np.zeros((1, 3, 3), np.float32), np.diag([1.0, -1.0, 1.0]))
-    return build_asset(*_seen(), AssetSettings(refit_sweeps=1, hold_out_every=3))
+    return build_asset(*_seen(), AssetSettings(hold_out_every=3))
 
 
 def compile_fit_kernels() -> RenderAsset:
@@ -38,13 +38,5 @@ def _seen() -> tuple[list[Photo], list[Sweep], AgentTracks]:
         photos.append(Photo("front", 0.1 * k, rgb, intrinsics, world_from_ego @ FRONT))
         sweeps.append(Sweep(0.1 * k, ground, world_from_ego))
     boxes = np.array([[[8.0 + 2.0 * k, 0.0, 0.0, 4.0, 2.0]] for k in range(3)])
-    agents = AgentTracks(
-        ("a",),
-        (AgentKind.VEHICLE,),
-        boxes,
-        np.zeros((3, 1, 2)),
-        np.ones((3, 1), bool),
-        np.full((3, 1), 0.8),
-        np.array([1.6]),
-    )
-    return photos, sweeps, agents
+    there, heights = np.ones((3, 1), bool), (np.full((3, 1), 0.8), np.array([1.6]))
+    return photos, sweeps, AgentTracks(("a",), (AgentKind.VEHICLE,), boxes, np.zeros((3, 1, 2)), there, *heights)

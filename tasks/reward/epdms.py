@@ -20,10 +20,12 @@ from tasks.reward.formula import (
 )
 from tasks.reward.prepare import PreparedScene
 from tasks.reward.rules.comfort import N_FLAGS
-from tasks.reward.rules.obstacles import N_TIMES, Obstacles, unindexed
-from tasks.reward.verdicts import INDEX_FROM_ROWS, NO_DRIVE, Verdicts, World, judge_all, shaped, world_of
+from tasks.reward.rules.ego import no_drive, shaped
+from tasks.reward.rules.obstacles import N_TIMES, Obstacles, unindexed, with_objects
+from tasks.reward.verdicts import INDEX_FROM_ROWS, Verdicts, World, judge_one, scratch_for, world_of
 from tasks.subscores import INDEX, LABELLED
 from tasks.world.arrays import Array, Bools
+from tasks.world.bounds import LARGEST
 
 Normalise = Literal["batch", "pairs"]
 _NORMALISE = get_args(Normalise)
@@ -107,17 +109,12 @@ def joined(parts: Sequence[Scores], normalise: Normalise) -> Scores:
 def _scored(
     world: World, obstacles: Obstacles, boxes: Array, is_stopped: Bools, states: Array, in_pairs: bool
 ) -> Scores:
-    states = shaped(states)
+    states = shaped("states", states)
     table = np.empty((N_ROWS, len(states)))
     areas, comfort = np.empty((len(states), N_TIMES, 3), np.bool_), np.empty((len(states), N_FLAGS), np.bool_)
     if not _score_all(world, obstacles, boxes, is_stopped, states, in_pairs, table, areas, comfort):
-        raise ValueError(NO_DRIVE)
+        raise no_drive("states")
     return Scores(*[*table, areas, comfort])
-
-
-def relative_progress(ep_raw_m: Array, multiplier: Array, normalise: Normalise) -> Array:
-    """EP (K,): raw progress over the best compliant one, clipped to 0 .. 1; 1 where that best is at most 5 m."""
-    return _relative(ep_raw_m, multiplier, _in_pairs(normalise))
 
 
 def _in_pairs(normalise: Normalise) -> bool:
@@ -158,21 +155,33 @@ def rows(scores: Scores, index: slice | NDArray[np.integer] | Bools) -> Scores:
 def _score_all(
     world: World,
     obstacles: Obstacles,
-    boxes: Array,
-    is_stopped: Bools,
-    states: Array,
+    boxes: Array,  # (K, 41, N, 5) of each trajectory's own objects, or none: all meet `obstacles`
+    is_stopped: Bools,  # (K, N)
+    states: Array,  # (K, 41, 11)
     in_pairs: bool,
     table: Array,
     areas: Bools,
     comfort: Bools,
 ) -> bool:
-    """As `judge_all`, and the sums. One call: on two trajectories entering it takes as long as the rules."""
+    """All rules and sums. One call: on two trajectories entering it takes as long as the rules.
+
+    False, and nothing judged, where a state is not finite or above LARGEST.
+    """
+    beyond = 0
+    for value in states.reshape(-1):
+        beyond += not abs(value) <= LARGEST
+    if beyond > 0:
+        return False
     table[:] = math.nan  # what no rule says
     out = Verdicts(table[:_N_SCORES], table[_N_SCORES:_EP_RAW_M], table[_EP_RAW_M], areas, comfort)
-    well = judge_all(world, obstacles, boxes, is_stopped, states, out)
-    if well:
-        _add_up(table, in_pairs)
-    return well
+    scratch = scratch_for(obstacles.boxes.shape[1])
+    for k in range(states.shape[0]):
+        met = obstacles
+        if boxes.shape[0] > 0:
+            met = with_objects(obstacles, boxes[k], is_stopped[k])
+        judge_one(world, met, states[k], scratch, k, out)
+    _add_up(table, in_pairs)
+    return True
 
 
 @kernel
@@ -183,7 +192,7 @@ def _add_up(table: Array, in_pairs: bool) -> None:
         for row in _FACTORS:
             multiplier *= table[row, k]
         table[_MULTIPLIER, k] = multiplier
-    table[_EP] = _relative(table[_EP_RAW_M], table[_MULTIPLIER], in_pairs)
+    table[_EP] = relative_progress(table[_EP_RAW_M], table[_MULTIPLIER], in_pairs)
     for k in range(table.shape[1]):
         total = 0.0
         for row, weight in _TERMS:
@@ -192,8 +201,8 @@ def _add_up(table: Array, in_pairs: bool) -> None:
 
 
 @kernel
-def _relative(ep_raw_m: Array, multiplier: Array, in_pairs: bool) -> Array:
-    """EP (K,) as `relative_progress`."""
+def relative_progress(ep_raw_m: Array, multiplier: Array, in_pairs: bool) -> Array:
+    """EP (K,): raw progress over the best compliant one, clipped to 0 .. 1; 1 where that best is at most 5 m."""
     best = ep_raw_m[0] * multiplier[0]
     if not in_pairs:
         for k in range(len(ep_raw_m)):

@@ -1,10 +1,8 @@
-"""What sub-scores weigh in a score, and what progress counts as (docs/reward.md 2k). Needs numpy only."""
+"""What sub-scores weigh in a score, and what progress counts as (docs/reward.md 2k)."""
 
 from collections.abc import Mapping
 from functools import reduce
 from operator import add, mul
-
-import numpy as np
 
 from tasks.subscores import RECORDS
 from tasks.world.arrays import Array
@@ -25,9 +23,3 @@ def multiplied(scores: Mapping[str, Array]) -> Array:
 def weighted(scores: Mapping[str, Array]) -> Array:
     """The weighted sum (K,) of sub-scores (K,) of one plan by name; its mean is over TOTAL_WEIGHT."""
     return reduce(add, (weight * scores[name] for name, weight in WEIGHTS.items()))
-
-
-def share_of_best(gained_m: Array, best_m: Array) -> Array:
-    """EP (K,): metres gained over the best metres (K,), clipped to 0 .. 1; 1 where that best is at most 5 m."""
-    far_enough = best_m > PROGRESS_THRESHOLD_M
-    return np.where(far_enough, np.clip(gained_m / np.where(far_enough, best_m, 1.0), 0.0, 1.0), 1.0)

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from tasks.reward.formula import TOTAL_WEIGHT, multiplied, share_of_best, weighted
+from tasks.reward.formula import PROGRESS_THRESHOLD_M, TOTAL_WEIGHT, multiplied, weighted
 from tasks.subscores import HALVES, JUDGED, WHOLES
 from tasks.world.arrays import Array, Bools, Bytes
 
@@ -27,23 +27,18 @@ MAX_PROGRESS_M = 65535 / UNITS_PER_M
 CRC_BYTES = 4
 
 
-@dataclass(frozen=True, eq=False)
-class _Header:
-    vocabulary: str  # digest of the trajectories, tasks.world.vocabulary.trajectories_digest
-    traffic: str  # replay: one traffic for all; idm: traffic that answers to each trajectory
-    reference_progress_m: float  # compliant progress of PDM-Closed [m]
-
-
-_Labels: Any = make_dataclass(
-    "_Labels", [(name, Array) for name in ARRAYS], bases=(_Header,), frozen=True, eq=False
-)  # their types are known where the record is read
+_HEADER = (("vocabulary", str), ("traffic", str), ("reference_progress_m", float))
+_FIELDS = [*_HEADER, *((name, Array) for name in ARRAYS)]
+_Labels: Any = make_dataclass("_Labels", _FIELDS, frozen=True, eq=False)  # types are known where the record is read
 
 
 @dataclass(frozen=True, eq=False)
 class VocabularyLabels(_Labels):
     """What every trajectory of a vocabulary scores when it is driven from one scene.
 
-    After the header come ARRAYS (K,): the sub-scores that fail at an instant, and `ep_raw_m`, progress along the route.
+    First the vocabulary's digest (tasks.world.vocabulary.trajectories_digest), the traffic (replay: one for all; idm:
+    it answers to each) and the compliant progress of PDM-Closed [m]; then ARRAYS (K,): the sub-scores that fail at an
+    instant, and `ep_raw_m`, progress along the route.
     """
 
     def __len__(self) -> int:
@@ -65,7 +60,8 @@ class VocabularyLabels(_Labels):
         if normalise == "batch":
             best = np.full_like(best, best.max())
         gained_m = compliant_m if normalise == "masked" else self.ep_raw_m
-        return share_of_best(gained_m, best)
+        far_enough = best > PROGRESS_THRESHOLD_M
+        return np.where(far_enough, np.clip(gained_m / np.where(far_enough, best, 1.0), 0.0, 1.0), 1.0)
 
     def pdm_score(self, normalise: Normalise = "pairs") -> Array:
         """(K,) the multiplier times the weighted mean, without EC."""

@@ -5,17 +5,21 @@ from functools import partial
 
 import numpy as np
 
-from tasks.reward.epdms import Scores, rows, score
+from tasks.reward.epdms import Scores, joined, rows, score, score_among
 from tasks.reward.label_bytes import ARRAYS, VocabularyLabels
-from tasks.reward.prepare import PreparedScene
-from tasks.reward.reactive import reactive_scores
-from tasks.rollout.lqr import track_local
-from tasks.rollout.simulate import TrafficSettings
-from tasks.world.arrays import Array
-from tasks.world.clip import Scene
+from tasks.reward.prepare import PreparedScene, collision_scores, prepare_scene
+from tasks.reward.rules.ego import checked
+from tasks.reward.rules.obstacles import STOPPED_SPEED_MPS
+from tasks.rollout.lqr import track
+from tasks.rollout.simulate import Rollouts, TrafficSettings, prepare_traffic, roll_out_many
+from tasks.world.arrays import Array, Bools
+from tasks.world.boxes import ego_boxes, touching
+from tasks.world.clip import HORIZON_STEPS, Scene
+from tasks.world.vehicle import PACIFICA
 from tasks.world.vocabulary import Vocabulary
 
 TRAJECTORIES_AT_ONCE = 4096  # 15 MB of states
+EGOS_AT_ONCE = 256  # 0.6 MB per agent of traffic
 
 
 @dataclass(frozen=True)
@@ -26,15 +30,14 @@ class Labelling:
     traffic: TrafficSettings  # replay: the traffic that the sample was judged in; idm: traffic that answers to each
 
 
-def vocabulary_labels(labelling: Labelling, scene: Scene, prepared: PreparedScene, rival: Array) -> VocabularyLabels:
-    """The scores of the whole vocabulary, driven by the tracker from the scene's ego state.
+def vocabulary_labels(
+    labelling: Labelling, scene: Scene, prepared: PreparedScene, reference: Array
+) -> VocabularyLabels:
+    """The scores of the whole vocabulary, driven by the tracker from the scene's ego state at the sample's now.
 
-    Args:
-        labelling: vocabulary of K trajectories, and the traffic.
-        scene: where the sample's now is.
-        prepared: the scene with the objects that the sample was judged among; asked only where traffic is replayed.
-        rival: (41, 11) PDM-Closed as the tracker drives it, the reference of every trajectory's progress. Where traffic
-            reacts it is scored among the traffic that answers to it.
+    prepared: the scene with the objects that the sample was judged among; asked only where traffic is replayed.
+    reference: (41, 11) PDM-Closed as the tracker drives it, to which every trajectory's progress is related. Where
+    traffic reacts it is scored among the traffic that answers to it.
     """
     trajectories, traffic = labelling.vocabulary.trajectories, labelling.traffic
     scored = (
@@ -45,9 +48,39 @@ def vocabulary_labels(labelling: Labelling, scene: Scene, prepared: PreparedScen
     parts: list[Scores] = []
     reference_m = 0.0
     for start in range(0, len(trajectories), TRAJECTORIES_AT_ONCE):
-        driven = track_local(scene.ego_state, trajectories[start : start + TRAJECTORIES_AT_ONCE])
-        scores = scored(np.concatenate([rival[None], driven]))
+        driven = track(scene.ego_state, trajectories[start : start + TRAJECTORIES_AT_ONCE], local=True)
+        scores = scored(np.concatenate([reference[None], driven]))
         reference_m = float(scores.ep_raw_m[0] * scores.multiplier[0])
         parts.append(rows(scores, slice(1, None)))
     kept = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS}
     return VocabularyLabels(labelling.vocabulary.digest, traffic.mode, reference_m, **kept)
+
+
+def reactive_scores(scene: Scene, states: Array, traffic: TrafficSettings) -> Scores:
+    """Score simulated ego states (K, 41, 11); progress is related in pairs with row 0, as `score` does.
+
+    A row does not depend on the others but for that: row 0, too, drives among the traffic that answers to it. As in
+    every prepared scene, an agent that touches the ego at the start is left out for good.
+    Raises ValueError for other shapes or non-finite states.
+    """
+    states = checked("states", states)
+    ready = prepare_traffic(scene, traffic)
+    now = scene.agents.window(scene.step, scene.step + HORIZON_STEPS + 1)
+    prepared = prepare_scene(scene, now)
+    collision_score = collision_scores(now.kinds)
+    is_agent = collision_score == 0.0
+    keep = ~(now.valid[0] & touching(ego_boxes(scene.ego_state, PACIFICA), now.boxes[0]))
+    parts = []
+    for start in range(0, len(states), EGOS_AT_ONCE):
+        egos = states[start : start + EGOS_AT_ONCE]
+        rollouts = roll_out_many(ready, egos)
+        stopped = _stopped_when_first_seen(rollouts) | ~is_agent
+        parts.append(score_among(prepared, rollouts.boxes[:, :, keep], stopped[:, keep], collision_score[keep], egos))
+    return joined(parts, "pairs")
+
+
+def _stopped_when_first_seen(rollouts: Rollouts) -> Bools:
+    """(B, N) whether each agent's speed is next to nothing at its first appearance (docs/reward.md 2)."""
+    first = rollouts.valid.argmax(axis=1)[:, None, :, None]
+    velocity = np.take_along_axis(rollouts.velocities, first, axis=1)[:, 0]
+    return np.hypot(velocity[..., 0], velocity[..., 1]) <= STOPPED_SPEED_MPS

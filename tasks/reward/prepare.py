@@ -20,7 +20,7 @@ from tasks.world.boxes import ego_boxes
 from tasks.world.clip import Clip, Scene
 from tasks.world.lanes import LightState, MapLayer, MapPolygon
 from tasks.world.polygons import polygons_near
-from tasks.world.vehicle import EGO_STATE_SIZE, PACIFICA, Vehicle
+from tasks.world.vehicle import EGO_STATE_SIZE, PACIFICA
 
 PAST_STEPS = (0, 5, 10, 15)  # of the 1.5 s history at 10 Hz: -1.5, -1.0, -0.5, 0 s
 _NOBODY = read_only(np.full(5, np.nan))
@@ -40,7 +40,6 @@ def _indexed_line(shape: tuple[int, ...], points: bytes) -> Centerline:
 class PreparedScene:
     """A scene ready to score ego trajectories of 4 s at 10 Hz; steps 0..40, 0 is now. Arrays only: it pickles."""
 
-    vehicle: Vehicle
     history: Array | None  # (14, 11) ego states at -1.5 .. -0.2 s; None: history comfort is not judged
     centerline: Centerline
     map_index: MapIndex
@@ -50,7 +49,7 @@ class PreparedScene:
     @cached_property
     def indexed_obstacles(self) -> Obstacles:
         """The same objects, quicker to look up; made when first asked for, since only many trajectories repay it."""
-        radius_m = float(np.hypot(self.vehicle.half_length, self.vehicle.half_width))
+        radius_m = float(np.hypot(PACIFICA.half_length, PACIFICA.half_width))
         plain = self.obstacles
         return index_obstacles(plain.boxes, plain.is_stopped, plain.collision_score, radius_m)
 
@@ -73,7 +72,6 @@ def prepare(
     route_lane_ids: frozenset[str],
     objects: AgentTracks,
     red_lanes: tuple[str, ...] | tuple[tuple[str, ...], Bools] = (),
-    vehicle: Vehicle = PACIFICA,
     ego_state0: Array | None = None,
     drop_touching: bool = True,
 ) -> PreparedScene:
@@ -97,18 +95,15 @@ def prepare(
     if ego_state0 is None and drop_touching:
         raise ValueError("drop_touching needs ego_state0 or past_states")
     return PreparedScene(
-        vehicle=vehicle,
         history=None if past_states is None else comfort_history(read_only(past_states)),
         centerline=_indexed_line(np.shape(centerline), np.ascontiguousarray(centerline, np.float64).tobytes()),
         map_index=_indexed_map(tuple(polygons), route_lane_ids),
-        obstacles=_obstacles(objects, ego_state0 if drop_touching else None, vehicle),
+        obstacles=_obstacles(objects, ego_state0 if drop_touching else None),
         red_lanes=_red(red_lanes, polygons),
     )
 
 
-def prepare_scene(
-    scene: Scene, agents: AgentTracks, vehicle: Vehicle = PACIFICA, drop_touching: bool = True
-) -> PreparedScene:
+def prepare_scene(scene: Scene, agents: AgentTracks) -> PreparedScene:
     """Prepare step `scene.step` of a clip against `agents` (41 steps, row 0 is that step): a rollout's or the log's.
 
     Lights are red for on-route lane connectors over steps scene.step .. scene.step + 40.
@@ -117,12 +112,10 @@ def prepare_scene(
     return prepare(
         past_states=scene.ego_history[list(PAST_STEPS)],
         centerline=scene.centerline,
-        polygons=polygons_near(clip.road_map, ego_boxes(scene.ego_state, vehicle)[:2]),
+        polygons=polygons_near(clip.road_map, ego_boxes(scene.ego_state, PACIFICA)[:2]),
         route_lane_ids=clip.route.lane_ids,
         objects=agents,
         red_lanes=_red_connectors(clip, scene.step),
-        vehicle=vehicle,
-        drop_touching=drop_touching,
     )
 
 
@@ -132,7 +125,7 @@ def among(prepared: PreparedScene, objects: AgentTracks, ego_state0: Array | Non
     Those that touch the ego at `ego_state0` (11,) are left out for good; None: nobody is. Raises ValueError for tracks
     of other shapes.
     """
-    return replace(prepared, obstacles=_obstacles(objects, ego_state0, prepared.vehicle))
+    return replace(prepared, obstacles=_obstacles(objects, ego_state0))
 
 
 def _red_connectors(clip: Clip, step: int) -> tuple[tuple[str, ...], Bools]:
@@ -156,7 +149,7 @@ def _check_states(name: str, states: Array, shape: tuple[int, ...]) -> None:
         raise ValueError(f"{name} must be finite and at most {LARGEST:g}, it holds NaN, infinity or more")
 
 
-def _obstacles(objects: AgentTracks, ego_state0: Array | None, vehicle: Vehicle) -> Obstacles:
+def _obstacles(objects: AgentTracks, ego_state0: Array | None) -> Obstacles:
     """The objects but those that touch an ego at `ego_state0`. Raises ValueError where they are none."""
     if objects.n_steps < N_TIMES:
         raise ValueError(f"objects must span at least {N_TIMES} steps, got {objects.n_steps}")
@@ -172,7 +165,7 @@ def _obstacles(objects: AgentTracks, ego_state0: Array | None, vehicle: Vehicle)
         read_only(objects.velocities),
         read_only(objects.valid, np.bool_),
         collision_scores(objects.kinds),
-        _NOBODY if ego_state0 is None else read_only(ego_boxes(ego_state0, vehicle)),
+        _NOBODY if ego_state0 is None else read_only(ego_boxes(ego_state0, PACIFICA)),
     )
     if not all_well:
         raise _refused(objects)

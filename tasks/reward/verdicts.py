@@ -16,16 +16,12 @@ from tasks.reward.rules.ego import MULTIPLE_LANES, NON_DRIVABLE, ONCOMING, Body,
 from tasks.reward.rules.lane_discipline import driving_direction, lane_keeping
 from tasks.reward.rules.lights import RedLanes, first_red
 from tasks.reward.rules.map_index import MapIndex
-from tasks.reward.rules.obstacles import Obstacles, with_objects, within_reach
+from tasks.reward.rules.obstacles import Obstacles, within_reach
 from tasks.subscores import LABELLED, WHOLES
 from tasks.world.arrays import Array, Bools, Bytes
-from tasks.world.bounds import LARGEST, all_within
-from tasks.world.vehicle import EGO_STATE_SIZE, Vehicle
-
-NO_DRIVE = f"states must be finite and at most {LARGEST:g}: leave out what is not a drive"
+from tasks.world.vehicle import EGO_STATE_SIZE, PACIFICA
 
 INDEX_FROM_ROWS = 32  # an index of the objects costs about as much as it saves on that many trajectories
-
 
 NC, DAC, DDC, TLC = (LABELLED.index(name) for name in ("nc", "dac", "ddc", "tlc"))
 TTC, LK, HC = (LABELLED.index(name) for name in ("ttc", "lk", "hc"))
@@ -68,28 +64,11 @@ class Scratch(NamedTuple):
     comfort: Array
 
 
-def checked_states(states: Array) -> Array:
-    """Contiguous float64 states (K >= 1, 41, 11). Raises ValueError where they are not."""
-    states = shaped(states)
-    if not all_within(states):
-        raise ValueError(NO_DRIVE)
-    return states
-
-
-def shaped(states: Array) -> Array:
-    """Contiguous float64 states (K >= 1, 41, 11) of any values. Raises ValueError where they are of another shape."""
-    states = np.ascontiguousarray(states, dtype=np.float64)
-    if states.ndim != 3 or states.shape[1:] != (N_TIMES, EGO_STATE_SIZE) or states.shape[0] == 0:
-        raise ValueError(f"states must be (K >= 1, {N_TIMES}, {EGO_STATE_SIZE}), got {states.shape}")
-    return states if states.flags.writeable else states.copy()
-
-
 def world_of(prepared: PreparedScene, with_history: bool) -> World:
     """A prepared scene as the kernels take it."""
-    vehicle: Vehicle = prepared.vehicle
     history = prepared.history if with_history and prepared.history is not None else np.empty((0, EGO_STATE_SIZE))
     return World(
-        Ego(vehicle.half_length, vehicle.half_width, vehicle.rear_axle_to_center),
+        Ego(PACIFICA.half_length, PACIFICA.half_width, PACIFICA.rear_axle_to_center),
         prepared.centerline,
         prepared.map_index,
         prepared.red_lanes,
@@ -103,32 +82,8 @@ def scratch_for(n_objects: int) -> Scratch:
     return Scratch(empty_body(N_TIMES), np.empty(n_objects, np.bool_), comfort_scratch())
 
 
-@register_jitable
-def judge_all(
-    world: World,
-    obstacles: Obstacles,
-    boxes: Array,  # (K, 41, N, 5) of each trajectory's own objects, or none: all meet `obstacles`
-    is_stopped: Bools,  # (K, N)
-    states: Array,  # (K, 41, 11)
-    out: Verdicts,
-) -> bool:
-    """False, and nothing judged, where a state is not finite or above LARGEST."""
-    beyond = 0
-    for value in states.reshape(-1):
-        beyond += not abs(value) <= LARGEST
-    if beyond > 0:
-        return False
-    scratch = scratch_for(obstacles.boxes.shape[1])
-    for k in range(states.shape[0]):
-        met = obstacles
-        if boxes.shape[0] > 0:
-            met = with_objects(obstacles, boxes[k], is_stopped[k])
-        _judge_one(world, met, states[k], scratch, k, out)
-    return True
-
-
 @kernel
-def _judge_one(world: World, everything: Obstacles, states: Array, scratch: Scratch, k: int, out: Verdicts) -> None:
+def judge_one(world: World, everything: Obstacles, states: Array, scratch: Scratch, k: int, out: Verdicts) -> None:
     """All rules on one trajectory (41, 11), written to row k."""
     body, half_length, half_width = scratch.body, world.ego.half_length, world.ego.half_width
     place(states, world.ego.rear_axle_to_center, body)

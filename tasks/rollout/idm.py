@@ -22,43 +22,40 @@ OPEN, CLOSED_IF_STOPPABLE, CLOSED = 0, 1, 2  # a stop line's state: green, yello
 
 
 class IdmDriver(NamedTuple):
-    """What all driven vehicles go by: the model's parameters and those of its surroundings; SI units."""
+    """What all driven vehicles go by, of TrafficSettings."""
 
-    min_gap: float  # s0 [m]
-    headway: float  # T [s]
-    accel: float  # a [m/s2]
-    decel: float  # b [m/s2], comfortable
+    min_gap_m: float  # s0
+    headway_s: float  # T
+    accel_max: float  # a [m/s2]
+    decel_max: float  # b [m/s2], comfortable
     exponent: float  # delta
     emergency_decel: float  # [m/s2]
-    lookahead: float  # [m] of path in front of the bumper
-    corridor_margin: float  # [m] each side
-    blend_length: float  # [m] over which a start off the path fades
-    largest_offset: float  # [m] a start farther from the path stays on its log
-    enter_clearance: float  # [m] from the ego's centre
+    lookahead_m: float  # of path in front of the bumper
+    blend_length_m: float  # over which a start off the path fades
 
 
 @inner_kernel
 def free_acceleration(speed: float, target_speed: float, driver: IdmDriver) -> float:
     """Acceleration [m/s2] on a road with nobody in front."""
-    return max(driver.accel * (1.0 - (speed / target_speed) ** driver.exponent), -driver.decel)
+    return max(driver.accel_max * (1.0 - (speed / target_speed) ** driver.exponent), -driver.decel_max)
 
 
 @inner_kernel
 def following_acceleration(free: float, speed: float, gap: float, lead_speed: float, driver: IdmDriver) -> float:
     """Acceleration [m/s2] `gap` behind a leader, of one whose acceleration on a free road would be `free`."""
     gap = max(gap, SMALLEST_GAP_M)
-    closing = speed * (speed - lead_speed) / (2.0 * math.sqrt(driver.accel * driver.decel))
-    desired = driver.min_gap + max(0.0, speed * driver.headway + closing)
+    closing = speed * (speed - lead_speed) / (2.0 * math.sqrt(driver.accel_max * driver.decel_max))
+    desired = driver.min_gap_m + max(0.0, speed * driver.headway_s + closing)
     ratio = desired / gap
-    hardest = min(max(driver.decel, needed_deceleration(speed, gap, lead_speed, driver)), driver.emergency_decel)
-    return max(free - driver.accel * ratio * ratio, -hardest)
+    hardest = min(max(driver.decel_max, needed_deceleration(speed, gap, lead_speed, driver)), driver.emergency_decel)
+    return max(free - driver.accel_max * ratio * ratio, -hardest)
 
 
 @inner_kernel
 def needed_deceleration(speed: float, gap: float, lead_speed: float, driver: IdmDriver) -> float:
     """[m/s2] that stops half the minimum gap behind a leader which makes an emergency stop now."""
     lead_stop = max(lead_speed, 0.0) ** 2 / (2.0 * driver.emergency_decel)
-    distance = max(gap - 0.5 * driver.min_gap, SMALLEST_GAP_M) + lead_stop
+    distance = max(gap - 0.5 * driver.min_gap_m, SMALLEST_GAP_M) + lead_stop
     return speed * speed / (2.0 * distance)
 
 

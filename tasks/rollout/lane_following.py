@@ -13,13 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tasks.kernels.compiled import kernel
-from tasks.rollout.lane_index import (
-    COST_CAP_M,
-    SNAP_HEADING_RAD,
-    LaneIndex,
-    lane_costs,
-    on_a_lane,
-)
+from tasks.rollout.lane_index import COST_CAP_M, SNAP_HEADING_RAD, LaneIndex, lane_costs, on_a_lane
 from tasks.rollout.polylines import chord_headings, frenet, interpolated, lengths_along, points_at
 from tasks.rollout.stretches import PATH_SPACING_M
 from tasks.world.arrays import Array, Ints
@@ -45,25 +39,23 @@ class LanePath:
     heading: Array  # (P,) [rad], unwrapped
     height: Array  # (P,) of the lane's boundaries [m], 0 where the map has none
     speed_limit_mps: Array  # (P,) NaN where unknown
-    lane_entries: tuple[
-        tuple[str, float], ...
-    ]  # (lane id, path length of its start, negative behind the path), in driving order
+    lane_entries: tuple[tuple[str, float], ...]  # (lane id, path length of its start, < 0 behind it), as driven
 
 
-def find_path(
-    index: LaneIndex, pose: Array, log_poses: Array, snap_distance_m: float, ahead_m: float
-) -> LanePath | None:
+def find_path(index: LaneIndex, pose: Array, log_poses: Array, ahead_m: float) -> LanePath | None:
     """The path of the vehicle at `pose` (3,), `ahead_m` long ahead of it; None where it is on no lane.
 
     log_poses (K, 3): where its log is over the whole clip, before and after.
     """
     distance, difference = lane_costs(index, pose[None])
-    starts: list[int] = np.flatnonzero(on_a_lane(distance[0], difference[0], snap_distance_m)).tolist()
+    starts: list[int] = np.flatnonzero(on_a_lane(distance[0], difference[0])).tolist()
     if not starts:
         return None
     starts = _with_neighbors(index, starts, distance[0], difference[0])
     ahead = {k: _left_of_lane(index, k, pose) for k in starts}
-    ways = _ways(index, ahead, _log_reach(pose, log_poses))
+    # To be told apart ways must go as far as the log gets from here.
+    reach = float(np.hypot(*(log_poses[:, :2] - pose[:2]).T).max(initial=0.0)) * 1.2 + 10.0
+    ways = _ways(index, ahead, reach)
     way = ways[0]
     if len(ways) > 1:
         start_costs = _point_costs(distance, difference)[0]
@@ -116,7 +108,7 @@ def _lay_log(track: Array, n_points: int) -> tuple[Array, Array, Array, Array] |
 
 def straight_path(pose: Array, ahead_m: float) -> LanePath:
     """A path straight on, for a car that has left the map and its log."""
-    along = np.arange(math.ceil((BEHIND_M + ahead_m) / PATH_SPACING_M) + 1) * PATH_SPACING_M - BEHIND_M
+    along = np.arange(n_points(ahead_m)) * PATH_SPACING_M - BEHIND_M
     direction = np.array([np.cos(pose[2]), np.sin(pose[2])])
     return LanePath(
         xy=pose[:2] + along[:, None] * direction,
@@ -141,11 +133,6 @@ def _with_neighbors(index: LaneIndex, starts: list[int], distance: Array, differ
             if other is not None and other not in starts and difference[other] <= SNAP_HEADING_RAD:
                 beside.append(other)
     return list(dict.fromkeys(starts + beside))
-
-
-def _log_reach(pose: Array, log_poses: Array) -> float:
-    """How far ways must go to be told apart: as far as the log gets from here."""
-    return float(np.hypot(*(log_poses[:, :2] - pose[:2]).T).max(initial=0.0)) * 1.2 + 10.0
 
 
 def _left_of_lane(index: LaneIndex, lane: int, pose: Array) -> float:

@@ -13,7 +13,7 @@ from tasks.world.frames import wrap_angle
 from tasks.world.geometry import to_line, wrapped
 from tasks.world.lanes import Lane, RoadMap
 
-SNAP_HEADING_RAD = math.radians(60.0)
+SNAP_M, SNAP_HEADING_RAD = 3.0, math.radians(60.0)  # of a lane that a vehicle can be said to drive on
 COST_CAP_M = 6.0  # a logged point farther than this from a way says no more against it
 ABOVE_ROUNDING = 1.0 + 1e-9
 
@@ -55,11 +55,9 @@ def index_lanes(road_map: RoadMap) -> LaneIndex:
     lanes = tuple(lane for lane in road_map.lanes.values() if lane.drives_cars and len(lane.centerline) >= 2)
     points, first = _flat([lane.centerline for lane in lanes])
     known = [lane.left_boundary is not None and lane.right_boundary is not None for lane in lanes]
-    left, left_first = _flat([lane.left_boundary if k else None for lane, k in zip(lanes, known)])
-    right, right_first = _flat([lane.right_boundary if k else None for lane, k in zip(lanes, known)])
     heights = np.zeros(len(points))
-    _add_heights(first, left, left_first, heights)
-    _add_heights(first, right, right_first, heights)
+    for side in ("left_boundary", "right_boundary"):
+        _add_heights(first, *_flat([getattr(lane, side) if k else None for lane, k in zip(lanes, known)]), heights)
     return LaneIndex(
         lanes=lanes,
         number={lane.lane_id: k for k, lane in enumerate(lanes)},
@@ -109,10 +107,8 @@ def _add_heights(first: Ints, boundary: Array, boundary_first: Ints, heights: Ar
 
 
 @kernel
-def _distances(
-    poses: Array, points: Array, first: Ints, discs: Array, lanes: Ints, reach: float
-) -> tuple[Array, Array]:
-    """Distance to and heading difference at the nearest point of each lane, (K, L) each; inf beyond `reach`."""
+def _distances(poses: Array, points: Array, first: Ints, discs: Array, lanes: Ints) -> tuple[Array, Array]:
+    """Distance to and heading difference at the nearest point of each lane, (K, L) each; inf beyond COST_CAP_M."""
     n_poses, n_lanes = poses.shape[0], lanes.shape[0]
     distance = np.full((n_poses, n_lanes), np.inf)
     difference = np.full((n_poses, n_lanes), np.inf)
@@ -120,7 +116,7 @@ def _distances(
         x, y, h = poses[i, 0], poses[i, 1], poses[i, 2]
         for column in range(n_lanes):
             lane = lanes[column]
-            dx, dy, far = x - discs[lane, 0], y - discs[lane, 1], discs[lane, 2] + reach
+            dx, dy, far = x - discs[lane, 0], y - discs[lane, 1], discs[lane, 2] + COST_CAP_M
             if dx * dx + dy * dy > far * far * ABOVE_ROUNDING:
                 continue
             best, best_k = np.inf, 0
@@ -130,7 +126,7 @@ def _distances(
                 square = to_line(dx, dy, ex, ey, (dx * ex + dy * ey) / max(ex * ex + ey * ey, 1e-12))[1]
                 if square < best:
                     best, best_k = square, k
-            if best <= reach * reach:
+            if best <= COST_CAP_M * COST_CAP_M:
                 distance[i, column] = math.sqrt(best)
                 difference[i, column] = abs(wrapped(h - points[best_k, 2]))
     return distance, difference
@@ -142,12 +138,12 @@ def lane_costs(index: LaneIndex, poses: Array, lanes: Sequence[int] | None = Non
     lanes: which; None: all.
     """
     chosen = np.arange(len(index.lanes)) if lanes is None else np.array(lanes)
-    return _distances(np.ascontiguousarray(poses), index.points, index.first, index.discs, chosen, COST_CAP_M)
+    return _distances(np.ascontiguousarray(poses), index.points, index.first, index.discs, chosen)
 
 
-def on_a_lane(distance: Array, difference: Array, snap_distance_m: float) -> Bools:
+def on_a_lane(distance: Array, difference: Array) -> Bools:
     """(..., L) lanes a vehicle can be said to drive on."""
-    return (distance <= snap_distance_m) & (difference <= SNAP_HEADING_RAD)
+    return (distance <= SNAP_M) & (difference <= SNAP_HEADING_RAD)
 
 
 def _straightest_first(index: LaneIndex, lane: int) -> list[int]:

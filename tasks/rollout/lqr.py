@@ -76,42 +76,26 @@ class Motions(NamedTuple):
     curvature: Array  # (41, B) tan(steering) / wheel base [1/m]
 
 
-def track(ego_state0: Array, poses: Array, vehicle: Vehicle = PACIFICA, *, planned_pose0: Array | None = None) -> Array:
-    """Simulated ego states (K, 41, 11) that follow each plan; row 0 is `ego_state0`.
+def track(
+    ego_state0: Array,
+    poses: Array,
+    vehicle: Vehicle = PACIFICA,
+    *,
+    planned_pose0: Array | None = None,
+    local: bool = False,
+) -> Array:
+    """Simulated ego states (K, 41, 11), world frame, that follow each plan; row 0 is `ego_state0`.
 
-    ego_state0: (11,) columns tasks.world.vehicle; poses: (K, 40, 3) world x, y, heading at 0.1 .. 4.0 s.
+    ego_state0: (11,) columns tasks.world.vehicle; poses: (K, 40, 3) x, y, heading at 0.1 .. 4.0 s, in the world or, if
+    `local`, in the frame of `ego_state0`, as a vocabulary holds them.
     planned_pose0: (K, 3) where each plan says the ego is now, when that is not the ego's own pose: the proposals of
     PDM-Closed start on their path, beside the ego.
     Raises ValueError, with the field's name, on other shapes or values that are not finite.
     """
-    plans = _shaped("poses", poses, (ANY, HORIZON_STEPS, 3))
+    name = "trajectories" if local else "poses"
+    plans = _shaped(name, poses, (ANY, HORIZON_STEPS, 3))
     starts = _NO_STARTS if planned_pose0 is None else _shaped("planned_pose0", planned_pose0, (len(plans), 3))
-    return _followed(_shaped("ego_state0", ego_state0, (EGO_STATE_SIZE,)), starts, "poses", plans, False, vehicle)
-
-
-def track_local(ego_state0: Array, trajectories: Array, vehicle: Vehicle = PACIFICA) -> Array:
-    """Simulated ego states (K, 41, 11), world frame, that follow each trajectory given in the ego's frame.
-
-    ego_state0: (11,) as for `track`; trajectories: (K, 40, 3) x, y, heading at 0.1 .. 4.0 s in the frame of
-    `ego_state0`, as a vocabulary holds them. The same as track() of their world poses, without those in memory.
-    Raises ValueError, with the field's name, on other shapes or values that are not finite.
-    """
-    plans = _shaped("trajectories", trajectories, (ANY, HORIZON_STEPS, 3))
     ego = _shaped("ego_state0", ego_state0, (EGO_STATE_SIZE,))
-    return _followed(ego, _NO_STARTS, "trajectories", plans, True, vehicle)
-
-
-def _shaped(name: str, value: Array, shape: tuple[int, ...]) -> Array:
-    """`value` as a contiguous float64 array of `shape`, where ANY stands for the number of plans."""
-    array = np.ascontiguousarray(value, dtype=np.float64)
-    if array.ndim != len(shape) or any(want not in (ANY, have) for want, have in zip(shape, array.shape)):
-        wanted = ", ".join("K" if want == ANY else str(want) for want in shape)
-        raise ValueError(f"{name} must have the shape ({wanted}), got {array.shape}")
-    return array
-
-
-def _followed(ego: Array, starts: Array, name: str, plans: Array, local: bool, vehicle: Vehicle) -> Array:
-    """The simulated states; `name` is what the caller calls its plans."""
     states = np.empty((len(plans), HORIZON_STEPS + 1, EGO_STATE_SIZE))
     given = read_only(ego), read_only(starts), read_only(plans)
     if not _follow(*given, local, float(vehicle.wheel_base), states):
@@ -121,6 +105,15 @@ def _followed(ego: Array, starts: Array, name: str, plans: Array, local: bool, v
                 at = beyond[0].tolist()
                 raise ValueError(f"{what} must be finite and at most {LARGEST:g}, element {at} is not")
     return states
+
+
+def _shaped(name: str, value: Array, shape: tuple[int, ...]) -> Array:
+    """`value` as a contiguous float64 array of `shape`, where ANY stands for the number of plans."""
+    array = np.ascontiguousarray(value, dtype=np.float64)
+    if array.ndim != len(shape) or any(want not in (ANY, have) for want, have in zip(shape, array.shape)):
+        wanted = ", ".join("K" if want == ANY else str(want) for want in shape)
+        raise ValueError(f"{name} must have the shape ({wanted}), got {array.shape}")
+    return array
 
 
 @kernel

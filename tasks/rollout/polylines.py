@@ -6,7 +6,7 @@ import numpy as np
 
 from tasks.kernels.compiled import inner_kernel, kernel
 from tasks.world.arrays import Array
-from tasks.world.geometry import short_turn, to_line
+from tasks.world.geometry import to_line, wrapped
 
 END_CHORD_M = 5.0  # a line's last few points may be noise
 CHORD_POINTS = 3  # each way, of the chord a heading is taken from
@@ -74,8 +74,10 @@ def chord_headings(points: Array) -> Array:
     for k in range(n):
         a, b = max(k - CHORD_POINTS, 0), min(k + CHORD_POINTS, n - 1)
         h = math.atan2(points[b, 1] - points[a, 1], points[b, 0] - points[a, 0])
-        if k > 0 and abs(h - before) >= math.pi:
-            turns += short_turn(h - before) - (h - before)
+        turn = h - before
+        if k > 0 and abs(turn) >= math.pi:
+            short = wrapped(turn)  # the shorter way round; half a turn keeps its sign
+            turns += (math.pi if short == -math.pi and turn > 0.0 else short) - turn
         before = h
         out[k] = h + turns
     return out

@@ -22,21 +22,21 @@ def stands_always(log: AgentTracks) -> Bools:
     return stands & (seen >= 2)
 
 
-def join_steps(index: LaneIndex, scene: Scene, snap_distance_m: float) -> Ints:
+def join_steps(index: LaneIndex, scene: Scene) -> Ints:
     """(N,) the scene's step for agents that are on a lane now, NEVER for all others."""
     start = scene.step
     out = np.full(len(scene.agents), NEVER)
     here = np.flatnonzero(scene.agents.valid[start])
-    on = on_a_lane(*lane_costs(index, scene.agents.boxes[start, here, :3]), snap_distance_m).any(axis=1)
+    on = on_a_lane(*lane_costs(index, scene.agents.boxes[start, here, :3])).any(axis=1)
     out[here[on]] = start
     return out
 
 
-def later_join_step(index: LaneIndex, scene: Scene, i: int, snap_distance_m: float) -> int:
+def later_join_step(index: LaneIndex, scene: Scene, i: int) -> int:
     """First later step at which agent i is on a lane; NEVER if it never is."""
     log, start = scene.clip.agents, scene.step
     steps = start + 1 + np.flatnonzero(log.valid[start + 1 : start + HORIZON_STEPS + 1, i])
-    on = on_a_lane(*lane_costs(index, log.boxes[steps, i, :3]), snap_distance_m).any(axis=1)
+    on = on_a_lane(*lane_costs(index, log.boxes[steps, i, :3])).any(axis=1)
     return int(steps[on.argmax()]) if on.any() else NEVER
 
 

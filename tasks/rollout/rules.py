@@ -28,10 +28,15 @@ from tasks.rollout.idm import (
     needed_deceleration,
     stop_line_gap,
 )
+from tasks.rollout.lane_index import SNAP_M
 from tasks.rollout.stretches import CorridorAhead, in_view, may_meet
 from tasks.rollout.traffic_state import ABSENT, DRIVEN, NOBODY, Roles, Rows
 from tasks.world.arrays import Array, Ints
 from tasks.world.geometry import wrapped
+
+LARGEST_OFFSET_M = SNAP_M + 2.0  # a start farther from the path stays on its log
+CORRIDOR_MARGIN_M = 0.1  # beside the body, each side
+ENTER_CLEARANCE_M = 30.0  # of the ego's centre from where a vehicle enters
 
 
 @inner_kernel
@@ -55,26 +60,24 @@ def _forward_speed(rows: Rows, t: int, i: int) -> float:
 def start_on(paths: Paths, m: int, rows: Rows, t: int, i: int, driver: IdmDriver) -> tuple[float, float, float, float]:
     """(path length, offset to the left, turn, speed) of agent i if it starts to follow path m from row t."""
     s, left = project_on_path(paths, m, rows.boxes[t, i, 0], rows.boxes[t, i, 1])
-    turn = wrapped(rows.boxes[t, i, 2] - pose_on_path(paths, m, s, 0.0, left, 0.0, driver.blend_length)[2])
+    turn = wrapped(rows.boxes[t, i, 2] - pose_on_path(paths, m, s, 0.0, left, 0.0, driver.blend_length_m)[2])
     return s, left, turn, _forward_speed(rows, t, i)
 
 
 @inner_kernel
-def due_path(roles: Roles, paths: Paths, driver: IdmDriver, rows: Rows, t: int, i: int, clock: int) -> int:
+def due_path(roles: Roles, paths: Paths, rows: Rows, t: int, i: int, clock: int) -> int:
     """The path on which agent i, replayed, switches to IDM by itself: its own, once it is due and on it; or -1."""
     m = roles.path[i]
     if m < 0 or clock < roles.join_step[i]:
         return -1
     left = project_on_path(paths, m, rows.boxes[t, i, 0], rows.boxes[t, i, 1])[1]
-    return m if abs(left) <= driver.largest_offset else -1
+    return m if abs(left) <= LARGEST_OFFSET_M else -1
 
 
 @inner_kernel
-def way_of(
-    driver: IdmDriver, rows: Rows, t: int, i: int, m: int, s: float, travelled: float, offset: float, turn: float
-) -> Way:
+def way_of(rows: Rows, t: int, i: int, m: int, s: float, travelled: float, offset: float, turn: float) -> Way:
     """Agent i, as big as in row t, on its way along path m."""
-    front, half_width = 0.5 * rows.boxes[t, i, 3], 0.5 * rows.boxes[t, i, 4] + driver.corridor_margin
+    front, half_width = 0.5 * rows.boxes[t, i, 3], 0.5 * rows.boxes[t, i, 4] + CORRIDOR_MARGIN_M
     return Way(m, s, travelled, offset, turn, front, half_width)
 
 
@@ -85,10 +88,10 @@ def gap_to(
     """(gap [m] from the bumper of agent i along its path to j, path heading there); inf: not in the way."""
     box, radius = box_of(rows.boxes, t, j), rows.radius[t, j]
     away = math.hypot(box[0] - rows.boxes[t, i, 0], box[1] - rows.boxes[t, i, 1])
-    if away <= driver.lookahead + rows.boxes[t, i, 3] + radius and may_meet(
+    if away <= driver.lookahead_m + rows.boxes[t, i, 3] + radius and may_meet(
         paths.stretches, way.path, view, box, radius
     ):
-        return corridor_gap(paths, way, box, radius, driver.blend_length, driver.lookahead)
+        return corridor_gap(paths, way, box, radius, driver.blend_length_m, driver.lookahead_m)
     return np.inf, 0.0
 
 
@@ -102,11 +105,11 @@ def braked_for(
     if m < 0:
         return NOBODY
     speed = _forward_speed(rows, t, i)
-    if 0.5 * speed * speed <= driver.decel * SMALLEST_GAP_M:
+    if 0.5 * speed * speed <= driver.decel_max * SMALLEST_GAP_M:
         return NOBODY  # too slow to need it at any gap
     s, left, turn, _ = start_on(paths, m, rows, t, i, driver)
-    way = way_of(driver, rows, t, i, m, s, 0.0, left, turn)
-    view = look_ahead(paths, way, driver.blend_length, driver.lookahead)
+    way = way_of(rows, t, i, m, s, 0.0, left, turn)
+    view = look_ahead(paths, way, driver.blend_length_m, driver.lookahead_m)
     for a in range(n_others):
         j = others[a]
         if (
@@ -118,19 +121,17 @@ def braked_for(
         gap, h = gap_to(paths, driver, rows, t, i, way, view, j)
         if gap < np.inf:
             lead_speed = rows.velocities[t, j, 0] * math.cos(h) + rows.velocities[t, j, 1] * math.sin(h)
-            if needed_deceleration(speed, gap, lead_speed, driver) > driver.decel:
+            if needed_deceleration(speed, gap, lead_speed, driver) > driver.decel_max:
                 return j
     return NOBODY
 
 
 @inner_kernel
-def road_acceleration(
-    paths: Paths, driver: IdmDriver, t: int, m: int, s: float, speed: float, length: float
-) -> float:  # fmt: skip
+def road_acceleration(paths: Paths, driver: IdmDriver, t: int, m: int, s: float, speed: float, length: float) -> float:
     """[m/s2] of one driven at path length s of path m, for the road alone: its target speed and its stop lines."""
     free = free_acceleration(speed, paths.target_speed[m, cell_of(paths, s)], driver)
     accel = following_acceleration(free, speed, np.inf, 0.0, driver)
-    line = stop_line_gap(paths, m, t, s + 0.5 * length, speed, driver.decel)
+    line = stop_line_gap(paths, m, t, s + 0.5 * length, speed, driver.decel_max)
     if line < np.inf:
         accel = min(accel, following_acceleration(free, speed, line, 0.0, driver))
     return accel
@@ -142,7 +143,7 @@ def hardest_acceleration(
     others: Ints, n_others: int, accel: float, leader: int,
 ) -> tuple[float, int]:  # fmt: skip
     """(acceleration [m/s2], leader) of agent i, driven, for the others on the list; `accel` without them."""
-    view = look_ahead(paths, way, driver.blend_length, driver.lookahead)
+    view = look_ahead(paths, way, driver.blend_length_m, driver.lookahead_m)
     for a in range(n_others):
         j = others[a]
         if (
@@ -162,9 +163,7 @@ def hardest_acceleration(
 
 
 @inner_kernel
-def touches_driven(
-    boxes: Array, k: int, i: int, rows: Rows, t: int, mode: Ints, others: Ints, n_others: int
-) -> bool:  # fmt: skip
+def touches_driven(boxes: Array, k: int, i: int, rows: Rows, t: int, mode: Ints, others: Ints, n_others: int) -> bool:
     """Does agent i at boxes[k, i] share area with a driven one of the list in row t?"""
     box = box_of(boxes, k, i)
     radius = 0.5 * math.hypot(box[3], box[4])
@@ -187,7 +186,7 @@ def is_clear(
     if not roles.enters_clear[i]:
         return not (roles.moving_kind[i] and touches_driven(log_boxes, k, i, rows, t, mode, others, n_others))
     x, y, heading, length, width = box_of(log_boxes, k, i)
-    grown = (x, y, heading, length + 2.0 * driver.min_gap, width)
+    grown = (x, y, heading, length + 2.0 * driver.min_gap_m, width)
     for a in range(n_others):
         j = others[a]
         if mode[j] != ABSENT and boxes_overlap(grown, box_of(rows.boxes, t, j)):
@@ -196,8 +195,8 @@ def is_clear(
 
 
 @inner_kernel
-def far_from_ego(roles: Roles, driver: IdmDriver, log_boxes: Array, k: int, i: int, rows: Rows, t: int) -> bool:
+def far_from_ego(roles: Roles, log_boxes: Array, k: int, i: int, rows: Rows, t: int) -> bool:
     """May agent i appear as in step k of its log, as far as its distance to the ego in row t lets it?"""
     ego = rows.boxes.shape[1] - 1
     dx, dy = log_boxes[k, i, 0] - rows.boxes[t, ego, 0], log_boxes[k, i, 1] - rows.boxes[t, ego, 1]
-    return not roles.enters_clear[i] or math.hypot(dx, dy) >= driver.enter_clearance
+    return not roles.enters_clear[i] or math.hypot(dx, dy) >= ENTER_CLEARANCE_M

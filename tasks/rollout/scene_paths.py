@@ -13,6 +13,7 @@ from tasks.world.lanes import LightState
 
 StopLine = tuple[float, Bytes]  # path length [m], states (41,) at every step of the rollout
 
+LATERAL_ACCEL_MAX = 3.0  # m/s2, slows down in curves
 STOP_STEPS = 5  # a logged stop lasts at least this long
 STOP_BEFORE_ENTRY_M, STOP_BEHIND_ENTRY_M = 12.0, 2.0  # where, around a junction's entry, a stop belongs to it
 
@@ -24,9 +25,12 @@ def numbered(found: list[LanePath | None]) -> Ints:
 
 
 def stack_paths(
-    scene: Scene, found: list[LanePath | None], logged_ways: list[LanePath | None],
-    target_speed_mps: float, lateral_accel_max: float, decel_max: float,
-) -> Paths:  # fmt: skip
+    scene: Scene,
+    found: list[LanePath | None],
+    logged_ways: list[LanePath | None],
+    target_speed_mps: float,
+    decel_max: float,
+) -> Paths:
     """The agents' paths and logged ways (N,), as `numbered` counts them; a logged way's own speeds tell it to stop."""
     chosen = [path for path in found + logged_ways if path is not None]
     n_points = len(chosen[0].xy) if chosen else 2
@@ -40,7 +44,7 @@ def stack_paths(
         xy=xy,
         heading=heading,
         height=np.array([path.height for path in chosen]).reshape(-1, n_points),
-        target_speed=_target_speeds(limit, heading, target_speed_mps, lateral_accel_max, decel_max),
+        target_speed=_target_speeds(limit, heading, target_speed_mps, decel_max),
         stretches=stretches_of(xy, heading),
         line_start=np.concatenate([[0], np.cumsum(counts, dtype=np.int64)]),
         line_at=np.array([at for of_path in lines for at, _ in of_path], dtype=np.float64),
@@ -48,11 +52,11 @@ def stack_paths(
     )
 
 
-def _target_speeds(limit: Array, heading: Array, default: float, lateral_accel_max: float, decel_max: float) -> Array:
+def _target_speeds(limit: Array, heading: Array, default: float, decel_max: float) -> Array:
     """(M, P) [m/s] the limit or the default, less in curves, and in time before them at comfortable deceleration."""
     target = np.where(np.isnan(limit), default, limit)
     curvature = np.abs(np.gradient(heading, PATH_SPACING_M, axis=1))
-    square = np.minimum(target**2, lateral_accel_max / np.maximum(curvature, 1e-6))
+    square = np.minimum(target**2, LATERAL_ACCEL_MAX / np.maximum(curvature, 1e-6))
     # v^2 falls by at most 2 b per metre towards a slower place: a running minimum from the far end.
     fall = 2.0 * decel_max * PATH_SPACING_M * np.arange(limit.shape[1])
     square = np.minimum.accumulate((square + fall)[:, ::-1], axis=1)[:, ::-1] - fall

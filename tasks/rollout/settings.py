@@ -3,6 +3,8 @@
 from dataclasses import dataclass, fields
 from typing import Literal
 
+# Settings that are gone, as they always were: keys of tables hold them still, so that older ones go on.
+REMOVED = {"lateral_accel_max": 3.0, "snap_distance_m": 3.0, "enter_clearance_m": 30.0, "corridor_margin_m": 0.1}
 MOST = 1000.0  # of any setting, and of speeds [m/s]: the length of paths grows with it
 
 
@@ -18,17 +20,13 @@ class TrafficSettings:
     decel_max: float = 2.0  # m/s2, comfortable
     exponent: float = 4.0  # of the free-road term
     emergency_decel: float = 8.0  # m/s2, what tyres can; the public traffic knows no limit
-    lateral_accel_max: float = 3.0  # m/s2, slows down in curves
-    snap_distance_m: float = 3.0
-    enter_clearance_m: float = 30.0
     lookahead_m: float = 60.0
-    corridor_margin_m: float = 0.1  # beside the body, each side
     blend_length_m: float = 20.0  # over which a start beside the path fades onto it
 
     def __post_init__(self) -> None:
         if self.mode not in ("idm", "replay"):
             raise ValueError(f"traffic mode must be idm or replay, not {self.mode!r}")
-        for name in ("target_speed_mps", "headway_s", "accel_max", "decel_max", "lateral_accel_max", "blend_length_m"):
+        for name in ("target_speed_mps", "headway_s", "accel_max", "decel_max", "blend_length_m"):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"traffic {name} must be positive, not {getattr(self, name)}")
         for field in fields(self):

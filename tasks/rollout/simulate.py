@@ -2,7 +2,7 @@
 
 The ego is tracked first, since it follows its plan whatever the traffic does; then the traffic answers to it.
 
-* A vehicle on a lane (within `snap_distance_m` of a centreline, heading within 60 degrees) is driven by IDM along its
+* A vehicle on a lane (within SNAP_M of a centreline, heading within 60 degrees) is driven by IDM along its
   way through the lane graph; one beside the lanes replays its log until it is on one. Where a driven vehicle on its
   logged way makes it brake harder than comfort, it is driven by IDM along that way instead.
 * A vehicle that its whole log shows standing stays where it is; one that stands now does not start before its log
@@ -10,7 +10,7 @@ The ego is tracked first, since it follows its plan whatever the traffic does; t
   not in the map.
 * A driven vehicle goes on when its log ends; a replayed one leaves with its log.
 * A vehicle first seen later enters at the first logged step where its box is free, with the minimum gap at both ends,
-  and the ego's centre is `enter_clearance_m` away, and is driven from then on; else never. Parked cars, pedestrians and
+  and the ego's centre is ENTER_CLEARANCE_M away, and is driven from then on; else never. Parked cars, pedestrians and
   things appear by their log.
 * Pedestrians and cyclists walk their log; before a step into a driven vehicle they wait, then go on late along the
   same log. Neither they nor replayed vehicles wait for the ego: its reward must not profit from their care.
@@ -28,20 +28,12 @@ from tasks.rollout.idm import IdmDriver
 from tasks.rollout.lane_following import LanePath, find_path, logged_path, straight_path
 from tasks.rollout.lane_index import index_lanes
 from tasks.rollout.lqr import track
-from tasks.rollout.roles import (
-    NEVER,
-    clocks,
-    join_steps,
-    later_join_step,
-    logged_track,
-    stands_always,
-    start_step,
-)
+from tasks.rollout.roles import NEVER, clocks, join_steps, later_join_step, logged_track, stands_always, start_step
 from tasks.rollout.scene_paths import numbered, stack_paths
 from tasks.rollout.settings import MOST, TrafficSettings
 from tasks.rollout.traffic import drive, drive_many
 from tasks.rollout.traffic_state import AgentStates, Roles
-from tasks.world.agents import MOVING_KINDS, AgentKind, AgentTracks
+from tasks.world.agents import MOVING_KINDS, PER_STEP, AgentKind, AgentTracks
 from tasks.world.arrays import Array, Bools
 from tasks.world.bounds import LARGEST, all_within
 from tasks.world.boxes import ego_boxes
@@ -84,14 +76,14 @@ def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
     index = index_lanes(scene.clip.road_map)
     ahead_m = _path_length(scene, settings)
 
-    join, hold = join_steps(index, scene, settings.snap_distance_m), np.zeros(n, dtype=np.int64)
+    join, hold = join_steps(index, scene), np.zeros(n, dtype=np.int64)
     clock = clocks(scene)
     found: list[LanePath | None] = [None] * n
     logged_ways: list[LanePath | None] = [None] * n
     for i in np.flatnonzero(is_vehicle & ~standing).tolist():
         driven_before = bool(moved[i] and now.valid[start, i])
         if join[i] == NEVER and not driven_before:
-            join[i] = later_join_step(index, scene, i, settings.snap_distance_m)
+            join[i] = later_join_step(index, scene, i)
         step = start if driven_before else int(join[i])
         if step != start:
             logged_ways[i] = logged_path(logged_track(scene, i, int(clock[i])), ahead_m)
@@ -99,7 +91,7 @@ def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
             continue
         pose = (now.boxes[start, i, :3] if step == start else log.boxes[step, i, :3]).copy()
         logged = log.boxes[np.flatnonzero(log.valid[:, i])[::LOG_STRIDE], i, :3]
-        found[i] = find_path(index, pose, logged, settings.snap_distance_m, ahead_m)
+        found[i] = find_path(index, pose, logged, ahead_m)
         if found[i] is None:  # a driven car that left the map
             found[i] = logged_path(logged_track(scene, i, int(clock[i])), ahead_m) or straight_path(pose, ahead_m)
         if driven_before:
@@ -117,9 +109,7 @@ def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
         moving_kind=moving_kind,
         enters_clear=is_vehicle & ~standing,
     )
-    paths = stack_paths(
-        scene, found, logged_ways, settings.target_speed_mps, settings.lateral_accel_max, settings.decel_max
-    )
+    paths = stack_paths(scene, found, logged_ways, settings.target_speed_mps, settings.decel_max)
     return TrafficScene(scene, settings, roles, paths)
 
 
@@ -138,13 +128,7 @@ def roll_out(traffic: TrafficScene, ego_states: Array) -> Rollout:
         return Rollout(start, ego_states, window, np.zeros(len(window), dtype=bool))
     rows, motion = drive(*_script(traffic, window), *_ego_boxes(ego_states))
     n = len(window)
-    agents = replace(
-        window,
-        boxes=rows.boxes[:, :n].copy(),
-        velocities=rows.velocities[:, :n].copy(),
-        valid=rows.valid[:, :n].copy(),
-        center_z=rows.center_z[:, :n].copy(),
-    )
+    agents = replace(window, **{name: getattr(rows, name)[:, :n].copy() for name in PER_STEP})
     return Rollout(start, ego_states, agents, motion.was_driven[-1])
 
 
@@ -159,12 +143,8 @@ def roll_out_many(traffic: TrafficScene, ego_states: Array) -> Rollouts:
     window = traffic.scene.agents.window(start, start + HORIZON_STEPS + 1)
     many, n = len(ego_states), len(window)
     if traffic.roles is None or traffic.paths is None or n == 0:
-        return Rollouts(
-            boxes=np.broadcast_to(window.boxes, (many, *window.boxes.shape)),
-            velocities=np.broadcast_to(window.velocities, (many, *window.velocities.shape)),
-            valid=np.broadcast_to(window.valid, (many, *window.valid.shape)),
-            simulated=np.zeros((many, n), dtype=bool),
-        )
+        alike: Any = [np.broadcast_to(a, (many, *a.shape)) for a in (window.boxes, window.velocities, window.valid)]
+        return Rollouts(alike[0], alike[1], alike[2], np.zeros((many, n), dtype=bool))
     return Rollouts(*drive_many(*_script(traffic, window), *_ego_boxes(ego_states)))
 
 
@@ -188,7 +168,7 @@ def _script(
         _agent_states(window.window(0, 1)),
         Roles(*_writable(traffic.roles)),
         Paths(*_writable(traffic.paths)),
-        _driver(traffic.settings),
+        IdmDriver(*(getattr(traffic.settings, name) for name in IdmDriver._fields)),
     )
 
 
@@ -217,28 +197,12 @@ def next_scene(scene: Scene, rollout: Rollout, centerline: Array, steps: int = H
 
 
 def _agent_states(agents: AgentTracks) -> AgentStates:
-    return AgentStates(*_writable((agents.boxes, agents.velocities, agents.valid, agents.center_z)))
+    return AgentStates(*_writable(getattr(agents, name) for name in AgentStates._fields))
 
 
 def _writable(arrays: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
     """Arrays as the kernel was compiled for; a shared object store hands out read-only ones."""
     return (np.require(a, requirements=["C", "W"]) for a in arrays)
-
-
-def _driver(settings: TrafficSettings) -> IdmDriver:
-    return IdmDriver(
-        min_gap=settings.min_gap_m,
-        headway=settings.headway_s,
-        accel=settings.accel_max,
-        decel=settings.decel_max,
-        exponent=settings.exponent,
-        emergency_decel=settings.emergency_decel,
-        lookahead=settings.lookahead_m,
-        corridor_margin=settings.corridor_margin_m,
-        blend_length=settings.blend_length_m,
-        largest_offset=settings.snap_distance_m + 2.0,
-        enter_clearance=settings.enter_clearance_m,
-    )
 
 
 def _path_length(scene: Scene, settings: TrafficSettings) -> float:

@@ -91,7 +91,9 @@ def drive_many(
     valid, was_driven = np.empty((n_egos, n_rows, n), np.bool_), np.empty((n_egos, n), np.bool_)
     rows, motion, diverged = empty_rows(n_rows, n), empty_motion(n_rows, n), nobody_diverged(n)
     for b in range(n_egos):
-        _start_over(rows, recorded, diverged)
+        rows.boxes[:], rows.velocities[:], rows.valid[:] = recorded.boxes, recorded.velocities, recorded.valid
+        rows.center_z[:], rows.radius[:] = recorded.center_z, recorded.radius
+        diverged.found[:], diverged.size[0] = False, 0
         _set_ego(rows, diverged, ego_boxes[b], ego_velocities[b])
         for t in range(n_rows - 1):
             _step(start, log, roles, paths, driver, t, rows, diverged, motion, record)
@@ -100,15 +102,6 @@ def drive_many(
             moved = motion.was_driven if diverged.found[i] else record.was_driven
             was_driven[b, i] = moved[n_rows - 1, i]
     return boxes, velocities, valid, was_driven
-
-
-@kernel
-def _start_over(rows: Rows, recorded: Rows, diverged: Diverged) -> None:
-    """Nobody has left the record yet."""
-    rows.boxes[:], rows.velocities[:], rows.valid[:] = recorded.boxes, recorded.velocities, recorded.valid
-    rows.center_z[:], rows.radius[:] = recorded.center_z, recorded.radius
-    diverged.found[:] = False
-    diverged.size[0] = 0
 
 
 @kernel
@@ -214,7 +207,7 @@ def _switch_to_idm(
             afresh = switch_for != NOBODY and diverged.found[switch_for]
         if afresh:
             clock = motion.clock[t, i] if diverged.found[i] else record.clock[t, i]
-            switch, switch_for = due_path(roles, paths, driver, rows, t, i, clock), NOBODY
+            switch, switch_for = due_path(roles, paths, rows, t, i, clock), NOBODY
         if switch < 0:
             others = diverged.everyone if afresh else diverged.listed
             n_others = len(others) if afresh else diverged.size[0]
@@ -230,15 +223,10 @@ def _switch_to_idm(
         if m >= 0:
             mode[i] = DRIVEN
             if diverged.found[i]:
-                _start_driving(paths, driver, t, i, m, rows, motion)
-
-
-@hidden_kernel
-def _start_driving(paths: Paths, driver: IdmDriver, t: int, i: int, m: int, rows: Rows, motion: Motion) -> None:
-    s, offset, turn, speed = start_on(paths, m, rows, t, i, driver)
-    motion.mode[t, i], motion.path[t, i], motion.travelled[t, i] = DRIVEN, m, 0.0
-    motion.s[t, i], motion.offset[t, i], motion.turn[t, i], motion.speed[t, i] = s, offset, turn, speed
-    motion.base_z[t, i] = rows.center_z[t, i] - paths.height[m, cell_of(paths, s)]
+                s, offset, turn, speed = start_on(paths, m, rows, t, i, driver)
+                motion.mode[t, i], motion.path[t, i], motion.travelled[t, i] = DRIVEN, m, 0.0
+                motion.s[t, i], motion.offset[t, i], motion.turn[t, i], motion.speed[t, i] = s, offset, turn, speed
+                motion.base_z[t, i] = rows.center_z[t, i] - paths.height[m, cell_of(paths, s)]
 
 
 @hidden_kernel
@@ -264,7 +252,7 @@ def _drive_on(
             accel, leader = road_acceleration(paths, driver, t, m, s, speed, rows.boxes[t, i, 3]), NOBODY
         others = diverged.everyone if afresh else diverged.listed
         n_others = len(others) if afresh else diverged.size[0]
-        way = way_of(driver, rows, t, i, m, s, travelled, offset, turn)
+        way = way_of(rows, t, i, m, s, travelled, offset, turn)
         accel, leader = hardest_acceleration(paths, driver, rows, t, i, way, speed, others, n_others, accel, leader)
         if not diverged.found[i]:
             if accel == record.accel[t, i]:
@@ -301,7 +289,7 @@ def _advance(
     _stay(rows, t, i)  # a standing car keeps its box to the last bit
     if step_m != 0.0:
         offset, turn = motion.offset[t + 1, i], motion.turn[t + 1, i]
-        x, y, h = pose_on_path(paths, m, s, travelled, offset, turn, driver.blend_length)
+        x, y, h = pose_on_path(paths, m, s, travelled, offset, turn, driver.blend_length_m)
         rows.boxes[t + 1, i, 0], rows.boxes[t + 1, i, 1] = x, y
         rows.boxes[t + 1, i, 2] = wrapped(h)
     h = rows.boxes[t + 1, i, 2]
@@ -364,7 +352,7 @@ def _admit(
         afresh = diverged.found[i] or not record.enters[t, i]
         others = diverged.everyone if afresh else diverged.listed
         n_others = len(others) if afresh else diverged.size[0]
-        enters = far_from_ego(roles, driver, log.boxes, k, i, rows, t + 1) and is_clear(
+        enters = far_from_ego(roles, log.boxes, k, i, rows, t + 1) and is_clear(
             roles, driver, log.boxes, k, i, rows, t + 1, diverged.mode, others, n_others
         )
         if not diverged.found[i]:

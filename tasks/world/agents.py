@@ -21,6 +21,9 @@ class AgentKind(StrEnum):
 MOVING_KINDS = frozenset({AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.BICYCLE})  # "Agent" in docs/reward.md 2b
 
 
+PER_STEP = ("boxes", "velocities", "valid", "center_z")  # fields of AgentTracks
+
+
 @dataclass(frozen=True)
 class AgentTracks:
     """N tracks over S steps of 0.1 s, world frame. Absent entries hold NaN and valid = False."""
@@ -42,13 +45,7 @@ class AgentTracks:
 
     def window(self, start: int, stop: int) -> "AgentTracks":
         """The same tracks over steps start..stop-1 (views, not copies)."""
-        return replace(
-            self,
-            boxes=self.boxes[start:stop],
-            velocities=self.velocities[start:stop],
-            valid=self.valid[start:stop],
-            center_z=self.center_z[start:stop],
-        )
+        return replace(self, **{name: getattr(self, name)[start:stop] for name in PER_STEP})
 
     def overwritten(self, start: int, part: "AgentTracks") -> "AgentTracks":
         """A copy whose steps start..start+part.n_steps-1 come from `part` (same tracks, same order)."""
@@ -56,7 +53,7 @@ class AgentTracks:
             raise ValueError("overwritten() needs the same tracks in the same order")
         stop = start + part.n_steps
         out = {}
-        for name in ("boxes", "velocities", "valid", "center_z"):
+        for name in PER_STEP:
             whole = getattr(self, name).copy()
             whole[start:stop] = getattr(part, name)
             out[name] = whole

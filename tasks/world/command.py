@@ -11,13 +11,10 @@ SPACING_M = 0.5  # the route is looked at this densely, however few points it ca
 
 
 def driving_command(centerline: Array, pose: Array) -> str:
-    """left, straight, right, or unknown where less than 20 m of route are left.
+    """left, straight, right, or unknown where less than 20 m of route are left ahead of the rear axle's `pose` (3,).
 
-    Args:
-        centerline: (P, 3) the route ahead, x, y [m], heading [rad].
-        pose: (3,) the ego's rear axle.
-
-    Rule: the side offset of the route's point 20 m ahead, in the frame of the route at the ego (NAVSIM's command).
+    NAVSIM's command: the side offset of the route's point 20 m ahead, in the frame of the route at the ego.
+    centerline: (P, 3) the route ahead, x, y [m], heading [rad].
     """
     steps = np.hypot(*np.diff(centerline[:, :2], axis=0).T)
     arc = np.concatenate([[0.0], np.cumsum(steps)])

@@ -19,13 +19,6 @@ def wrapped(angle: float) -> float:
 
 
 @inlined
-def short_turn(turn: float) -> float:
-    """The shorter way round [rad] that stands for a turn in an unwrapped heading; half a turn keeps its sign."""
-    short = wrapped(turn)
-    return math.pi if short == -math.pi and turn > 0.0 else short
-
-
-@inlined
 def to_line(dx: float, dy: float, ex: float, ey: float, along: float) -> tuple[float, float]:
     """The fraction 0..1 of an edge (ex, ey) nearest to a point (dx, dy) from its start, and the squared distance to it.
 

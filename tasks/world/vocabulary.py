@@ -69,20 +69,10 @@ def human_windows(ego_states: Array, starts: Indices) -> Array:
 
 
 def cluster(windows: Array, k: int, seed: int) -> Array:
-    """The k windows that stand for all: k-means on the (x, y) courses, each centre replaced by its nearest window.
+    """The k windows (k, 40, 3) that stand for all (N, 40, 3), in their order: k-means on the (x, y) courses.
 
-    A real drive is kept instead of a mean of many, because a mean of drives need not be drivable.
-
-    Args:
-        windows: (N, 40, 3) in the ego frame.
-        k: how many to keep, at most the number of distinct windows.
-        seed: of the k-means++ start (Philox); equal arguments give equal results.
-
-    Returns:
-        (k, 40, 3), in the order of the windows.
-
-    Raises:
-        ValueError: fewer than k distinct windows.
+    Each centre is replaced by its nearest window, because a mean of drives need not be drivable. seed: of the k-means++
+    start (Philox). Raises ValueError for fewer than k distinct windows.
     """
     windows = checked_trajectories(windows, "windows to cluster")
     points = windows[:, :, :2].reshape(len(windows), -1)

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 
 from factory.readers.kitti import read_drive, steadied
 from factory.stages.scene_file import write_scene
-from tasks.render.fit.exposure import affine_between, exposed
+from tasks.render.fit.corrections import affine_between, corrected, exposed
 from tasks.render.fit.losses import ssim, target_of
-from tasks.render.fit.poses import corrected
 from tasks.render.fit.reconstruct import advance, corrections_at, finish, picture_of
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import Problem, prepare

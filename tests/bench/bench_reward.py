@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from factory.readers.town.reader import SyntheticReader
 from tasks.reward.epdms import Scores, score
 from tasks.reward.prepare import N_TIMES, PAST_STEPS, PreparedScene, prepare
-from tasks.rollout.lqr import track_local
+from tasks.rollout.lqr import track
 from tasks.world.boxes import ego_boxes
 from tasks.world.clip import NOW, scene_of_clip
 from tasks.world.frames import to_world
@@ -67,21 +67,21 @@ def measured(scene: BenchScene, trajectories: NDArray[np.float64], peer: str | N
     ready, ego_state = prepared_scene(scene), scene.ego_state0
 
     def drive_and_score() -> Scores:
-        return score(ready, track_local(ego_state, trajectories))
+        return score(ready, track(ego_state, trajectories, local=True))
 
-    score(ready, track_local(ego_state, trajectories[:1]))
+    score(ready, track(ego_state, trajectories[:1], local=True))
     before = memory_mb("VmRSS")
     Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew here
     drive_and_score()
     peak = memory_mb("VmHWM") - before
 
     repeats = 5 if len(trajectories) > 1000 else 200
-    states = track_local(ego_state, trajectories)
+    states = track(ego_state, trajectories, local=True)
     poses = to_world(ego_state[:3], trajectories)
     return Row(
         place_ms=cpu_milliseconds(lambda: prepared_scene(elsewhere(scene)), 10),
         prepare_ms=cpu_milliseconds(lambda: prepared_scene(scene), 10),
-        simulate_ms=least_and_median_cpu_ms(lambda: track_local(ego_state, trajectories), repeats),
+        simulate_ms=least_and_median_cpu_ms(lambda: track(ego_state, trajectories, local=True), repeats),
         score_ms=least_and_median_cpu_ms(lambda: score(ready, states), repeats),
         peak_mb=peak,
         beside=beside(peer, scene, poses, drive_and_score, TURNS[len(trajectories)]) if peer else None,

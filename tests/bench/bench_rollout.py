@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from factory.readers.av2.reader import AV2Reader
-from tasks.rollout.lqr import track_local
+from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out, roll_out_many
 from tasks.world.clip import NOW, Scene, scene_of_clip
 from tasks.world.kinematic_vocabulary import kinematic_trajectories
@@ -48,7 +48,7 @@ def main(root: Path) -> None:
         whole = scene_of_clip(reader.read(ref))
         for scene in (among_nearest(whole), whole):
             traffic = prepare_traffic(scene, settings)
-            states = track_local(scene.ego_state, trajectories)
+            states = track(scene.ego_state, trajectories, local=True)
             paths = int((traffic.roles.path >= 0).sum()) if traffic.roles else 0
             print(
                 f"| {ref.log_id[:8]} | {ref.start_ms / 1e3:.0f} | {int(scene.agents.valid[NOW].sum())} | {paths} "

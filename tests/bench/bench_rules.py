@@ -25,7 +25,7 @@ from tasks.reward.rules.ego import place
 from tasks.reward.rules.lane_discipline import driving_direction, lane_keeping
 from tasks.reward.rules.lights import first_red
 from tasks.reward.verdicts import scratch_for, world_of
-from tasks.rollout.lqr import track_local
+from tasks.rollout.lqr import track
 from tests.real.reference_scenes import RECORDED_K, loader, prepared_scene
 
 RECORDED, K, RUNS = 4096, 1024, 40
@@ -81,7 +81,7 @@ def main(root: Path) -> None:
         module = loader(root)
         inputs = module.inputs(name)
         prepared = prepared_scene(inputs)
-        states = track_local(inputs["ego_state0"], module.proposals(name, RECORDED)[:K])
+        states = track(inputs["ego_state0"], module.proposals(name, RECORDED)[:K], local=True)
         obstacles, world = prepared.indexed_obstacles, world_of(prepared, with_history=True)
         scratch, comfort = scratch_for(obstacles.boxes.shape[1]), np.empty(6, np.bool_)
         given = (world, obstacles, states, scratch, comfort)

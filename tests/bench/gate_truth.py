@@ -121,7 +121,7 @@ def verdicts(
     there = vehicles_at(drive.agents, shown.step * STEP_S, pose[:2, 3], settings.reach_m)
     scene = composed(asset, there, pose[:3, 3], settings.reach_m)
     views = render(scene, [shown.eye])
-    fault = fault_of(measures(scene, [shown.eye], views, pose, settings)[0], settings)
+    fault = fault_of(measures(scene, [shown.eye], views, pose)[0], settings)
     least = NOTHING_LARGE
     for j, _ in large_vehicles(there, shown.eye, views[0], settings.vehicle_share):
         eye = eye_in_box(shown.eye.world_from_camera[:3, 3], there.boxes[j])

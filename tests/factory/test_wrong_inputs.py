@@ -71,7 +71,7 @@ MISTYPED = [  # told before anything heavy is imported
     run("perturb.epdms_min=1.5", says=["epdms_min must be from 0 to 1"]),
     run("traffic.headway_s=-1", says=["headway_s must be positive"]),
     run("render.width=0", says=["render width must be finite and at least 16, not 0"]),
-    run("render.gate.hole_max=2", says=["render gate hole_max must be from 0 to 1"]),
+    run("render.gate.vehicle_min=2", says=["render gate vehicle_min must be from 0 to 1"]),
     run("render.map_rig=five_front", says=["render.map_rig: must be front, three_front or ring_six; did you mean"]),
     run("expert.recovery.smooth=maybe", says=["expert.recovery.smooth: must be true or false"]),
     run("expert.recovery.weihgts=[1]", says=["did you mean expert.recovery.weights=?"]),

@@ -17,7 +17,6 @@ from tasks.perturb import (
     first_good_per_cell,
     gate_failures,
     grid_cells,
-    in_turn,
     perturb,
     spread_out,
 )
@@ -272,7 +271,6 @@ def test_a_bad_point_leaves_no_mark_on_the_spread(data: st.DataObject) -> None:
     assert taken == only_good[spread_out(points[good], lambda _: True, at_most)].tolist()
     assert len(set(asked)) == len(asked)
     assert len(taken) == min(at_most, good.sum())
-    assert in_turn(n, is_good, at_most) == only_good[:at_most].tolist()
 
 
 def test_a_dense_grid_takes_every_cell_and_the_first_of_its_spread_are_those_of_a_longer_one(

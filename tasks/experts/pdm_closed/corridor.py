@@ -70,10 +70,7 @@ def lead_progress(paths: DrivePaths, swept: Corridors, things: Things) -> Array:
     for path in range(n_paths):
         squares = np.empty(swept.first[path + 1] - swept.first[path])
         for m in range(n_things):
-            inside, clearance = (
-                False,
-                -1.0,
-            )  # [m] it can move before it reaches the corridor's edge
+            inside, clearance = False, -1.0  # [m] it can move before it reaches the corridor's edge
             for sample in range(n_samples):
                 if sample > 0 and things.pace[m] == 0.0:
                     out[path, sample, m] = out[path, 0, m]

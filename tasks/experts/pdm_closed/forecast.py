@@ -91,11 +91,7 @@ class Forecast:
         )
 
 
-def forecast(
-    ego_state: Array,
-    agents: AgentTracks,
-    red_lights: tuple[shapely.Polygon, ...] = (),
-) -> Forecast:
+def forecast(ego_state: Array, agents: AgentTracks, red_lights: tuple[shapely.Polygon, ...] = ()) -> Forecast:
     """The objects to reckon with, seen from `ego_state` (11,): `agents` at its first step, none further than 100 m.
 
     The nearest 50 vehicles, 25 pedestrians, 10 bicycles and 50 standing objects, by the distance of their centres to

@@ -30,7 +30,7 @@ from tasks.world.lanes import LightState, MapLayer, MapPolygon
 from tasks.world.polygons import polygons_near
 from tasks.world.vehicle import EGO_STATE_SIZE, PACIFICA
 
-__all__ = ["PdmClosed", "PdmPlan", "PdmSettings", "pdm_closed_poses", "plan_for", "plan_pdm_closed"]
+__all__ = ["PdmClosed", "PdmPlan", "PdmSettings", "plan_for", "plan_pdm_closed"]
 
 
 @dataclass(frozen=True)
@@ -116,6 +116,11 @@ def plan_for(scene: Scene, settings: PdmSettings = DEFAULTS) -> PdmPlan:
         for lane_id, state in zip(lights.lane_ids, lights.states[scene.step] if lights.lane_ids else ())
         if state == LightState.RED
     }
+    on_route = (clip.road_map.lanes.get(lane_id) for lane_id in sorted(clip.route.lane_ids))
+    starts = (
+        lane for lane in on_route if lane is not None and np.array_equal(lane.centerline[:2], scene.centerline[:2])
+    )
+    first = next(starts, None)
     center = ego_boxes(scene.ego_state, PACIFICA)[:2]
     return plan_pdm_closed(
         ego_state=scene.ego_state,
@@ -124,24 +129,9 @@ def plan_for(scene: Scene, settings: PdmSettings = DEFAULTS) -> PdmPlan:
         polygons=polygons_near(clip.road_map, center, RADIUS_M),
         route_lane_ids=clip.route.lane_ids,
         red_lane_ids=frozenset(red_now),
-        speed_limit_mps=starting_speed_limit(scene),
+        speed_limit_mps=None if first is None else first.speed_limit_mps,
         settings=settings,
     )
-
-
-def starting_speed_limit(scene: Scene) -> float | None:
-    """Speed limit [m/s] of the on-route lane that the scene's centreline starts with; None where it has none."""
-    start = scene.centerline[:2]
-    for lane_id in sorted(scene.clip.route.lane_ids):
-        lane = scene.clip.road_map.lanes.get(lane_id)
-        if lane is not None and np.array_equal(lane.centerline[:2], start):
-            return lane.speed_limit_mps
-    return None
-
-
-def pdm_closed_poses(scene: Scene, settings: PdmSettings = DEFAULTS) -> Array:
-    """(40, 3) world poses of PDM-Closed's plan."""
-    return plan_for(scene, settings).poses
 
 
 @dataclass(frozen=True)
@@ -165,4 +155,4 @@ class PdmClosed:
         length_m = path_length_m(scene.centerline)
         if length_m <= MIN_PROGRESS_M:
             return Rejected("expert", "no_plan", f"the route ahead is {length_m:g} m long")
-        return Plan(pdm_closed_poses(scene, self.settings))
+        return Plan(plan_for(scene, self.settings).poses)

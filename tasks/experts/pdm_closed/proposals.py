@@ -48,11 +48,7 @@ class PdmDriver(NamedTuple):
 
 
 def proposals(
-    ego_state: Array,
-    centerline: Array,
-    seen: Forecast,
-    speed_limit_mps: float | None,
-    settings: PdmSettings = DEFAULTS,
+    ego_state: Array, centerline: Array, seen: Forecast, speed_limit_mps: float | None, settings: PdmSettings = DEFAULTS
 ) -> Proposals:
     """The proposals from `ego_state` (11,) along `centerline` (N, 3) through the forecast traffic.
 
@@ -75,16 +71,8 @@ def proposals(
 
 def driver(settings: PdmSettings) -> PdmDriver:
     """The settings that each step needs."""
-    return PdmDriver(
-        settings.min_gap_m,
-        settings.headway_s,
-        settings.accel_max_mps2,
-        settings.decel_max_mps2,
-        float(settings.exponent),
-        settings.shared_lead_memory,
-        settings.brakes_at_first_step,
-        settings.speed_below_zero,
-    )
+    each = {name: getattr(settings, name) for name in PdmDriver._fields}
+    return PdmDriver(**(each | {"exponent": float(settings.exponent)}))
 
 
 @kernel

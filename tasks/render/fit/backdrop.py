@@ -1,6 +1,7 @@
 """The sky as something that is learned: looked up by direction, and the backward pass of that."""
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,16 +26,12 @@ class SkyCells:
 def sky_cells(intrinsics: Array, scene_from_camera: Array, width: int, height: int, threads: int = 1) -> SkyCells:
     """Where a camera looks when nothing is in the way."""
     found = SkyCells(np.empty((height, width, 3), np.int32), np.empty((height, width, 2)))
-
-    def run(first: int, last: int) -> None:
-        _find(intrinsics, scene_from_camera, first, last, found.corners, found.shares)
-
-    in_chunks(run, height, ROWS_CHUNK, threads)
+    in_chunks(partial(_find, intrinsics, scene_from_camera, found.corners, found.shares), height, ROWS_CHUNK, threads)
     return found
 
 
 @kernel
-def _find(k: Any, turn: Any, first: int, last: int, corners: Any, shares: Any) -> None:
+def _find(k: Any, turn: Any, corners: Any, shares: Any, first: int, last: int) -> None:
     for row in range(first, last):
         for column in range(corners.shape[1]):
             a, b = (column + 0.5 - k[0, 2]) / k[0, 0], (row + 0.5 - k[1, 2]) / k[1, 1]
@@ -54,16 +51,12 @@ def _find(k: Any, turn: Any, first: int, last: int, corners: Any, shares: Any) -
 def backdrop(cells: F32, where: SkyCells, threads: int = 1) -> F32:
     """What `SkyMap.seen_by` shows (H, W, 3); `cells` (ROWS * COLUMNS, 3)."""
     out = np.empty(where.corners.shape, np.float32)
-
-    def run(first: int, last: int) -> None:
-        _look_up(cells, where.corners, where.shares, first, last, out)
-
-    in_chunks(run, len(out), ROWS_CHUNK, threads)
+    in_chunks(partial(_look_up, cells, where.corners, where.shares, out), len(out), ROWS_CHUNK, threads)
     return out
 
 
 @kernel
-def _look_up(cells: Any, corners: Any, shares: Any, first: int, last: int, out: Any) -> None:
+def _look_up(cells: Any, corners: Any, shares: Any, out: Any, first: int, last: int) -> None:
     for row in range(first, last):
         for column in range(out.shape[1]):
             v, left, right = corners[row, column, 0], corners[row, column, 1], corners[row, column, 2]

@@ -5,7 +5,6 @@ Both of a pair are made weaker and narrower so that the picture stays the same (
 """
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -17,30 +16,26 @@ from tasks.world.arrays import F32, Array, Ints
 
 MOST_COPIES = 51  # of one Gaussian at once, as in the authors' code
 LEAST_OPACITY = 0.005
+DEAD_OPACITY = 0.01  # below which a Gaussian is moved elsewhere
+JITTER = 0.5  # how far from its source a copy is put, in standard deviations of it
 
 
 def refine(state: FitState, settings: FitSettings) -> None:
     """Relocates and grows, in place; a function of seed and iteration alone."""
     rng = np.random.Generator(np.random.Philox(key=[settings.seed, 2**32 + state.iteration]))
     opacities = opacities_of(state.learned["logits"].values[:, 0]).astype(np.float64)
-    dead = opacities < settings.dead_opacity
+    dead = opacities < DEAD_OPACITY
     weight = np.where(dead, 0.0, opacities * state.wanted)
     if weight.sum() > 0.0:
         free = np.flatnonzero(dead)
         target = min(settings.most_gaussians, int(len(state) * (1.0 + settings.growth)))
         n_new = max(target - len(state), 0)
         sources = rng.choice(len(state), len(free) + n_new, p=weight / weight.sum())
-        _copy(state, np.concatenate([free, np.arange(len(state), len(state) + n_new)]), sources, settings, rng)
+        _copy(state, np.concatenate([free, np.arange(len(state), len(state) + n_new)]), sources, rng)
     state.wanted = np.zeros(len(state), np.float32)
 
 
-def _copy(
-    state: FitState,
-    targets: Ints,
-    sources: Ints,
-    settings: FitSettings,
-    rng: np.random.Generator,
-) -> None:
+def _copy(state: FitState, targets: Ints, sources: Ints, rng: np.random.Generator) -> None:
     """Puts copies of `sources` at the rows `targets` (M,), where rows beyond the last are new."""
     if len(targets) == 0:
         return
@@ -53,7 +48,7 @@ def _copy(
     rows[targets] = sources
     state.rows(rows)
     means = state.learned["means"].values
-    means[targets] += settings.jitter * _within(state, targets, rng)
+    means[targets] += JITTER * _within(state, targets, rng)
     for name in SHAPES:
         state.learned[name].forget(np.concatenate([named, targets]))
     state.rows(np.argsort(state.owner, kind="stable"))
@@ -79,16 +74,11 @@ def _shrink(opacity: float, shared_opacity: float, n: int) -> float:
 
 
 @kernel
-def _shared(opacities: Any, counts: Any) -> Any:
+def shared(opacities: Array, counts: Ints) -> tuple[Array, Array]:
+    """Opacity and factor of the scales, (N,) each, of each of `counts` Gaussians that together show what one did."""
     out, shrink = np.empty(len(opacities)), np.empty(len(opacities))
     for i in range(len(opacities)):
         n = min(counts[i], MOST_COPIES)
         out[i] = 1.0 - (1.0 - opacities[i]) ** (1.0 / n)
         shrink[i] = _shrink(opacities[i], out[i], n)
     return out, shrink
-
-
-def shared(opacities: Array, counts: Ints) -> tuple[Array, Array]:
-    """Opacity and factor of the scales, (N,) each, of each of `counts` Gaussians that together show what one did."""
-    result: tuple[Array, Array] = _shared(opacities, counts)
-    return result

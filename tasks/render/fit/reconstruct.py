@@ -1,19 +1,17 @@
 """A block's scene fitted to its photos: one photo an iteration, all of it a function of the inputs and the seed."""
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from tasks.render.fit.backdrop import SkyCells, backdrop, backdrop_gradient, sky_cells
+from tasks.render.fit.corrections import between, corrected, exposed, exposed_gradient, matrix_of
 from tasks.render.fit.density import refine
-from tasks.render.fit.exposure import exposed, exposed_gradient, matrix_of
 from tasks.render.fit.losses import opaque_loss, photo_loss, ssim
-from tasks.render.fit.poses import between, corrected
 from tasks.render.fit.road import lay_flat
-from tasks.render.fit.schedule import decayed, photo_at
 from tasks.render.fit.settings import FitSettings
-from tasks.render.fit.start import Problem, Shot, prepare
+from tasks.render.fit.start import Problem, prepare
 from tasks.render.fit.state import BACKGROUND, FitState
 from tasks.render.scene.asset import Exposure, RenderAsset, ViewQuality, psnr
 from tasks.render.scene.movers import world_from_boxes
@@ -27,6 +25,9 @@ from tasks.world.agents import AgentTracks
 from tasks.world.arrays import F32, Array, Bools, Ints
 
 REPORT_EVERY = 100
+RATE_END = 0.1  # what every rate but that of the means falls to, as a share of itself
+SH_RATE = 6e-4  # step size of what depends on the direction
+REFINE_UNTIL = 0.8  # share of the iterations
 VIEW_MARGIN_M = 0.5  # how far Gaussians of a track may reach beyond its box
 Progress = Callable[[int, float, float], None]  # iteration, mean loss and mean PSNR [dB] of the last REPORT_EVERY
 
@@ -78,7 +79,7 @@ def advance(
         losses.append(loss)
         scores.append(score)
         state.iteration += 1
-        at, last = state.iteration, settings.refine_until * settings.iterations
+        at, last = state.iteration, REFINE_UNTIL * settings.iterations
         if at % settings.refine_every == 0 and settings.refine_from <= at <= last:
             refine(state, settings)
         if progress is not None and at % REPORT_EVERY == 0:
@@ -86,13 +87,23 @@ def advance(
             losses, scores = [], []
 
 
+def decayed(end: float, progress: float) -> float:
+    """What is left of a step size: 1 at progress 0, falling exponentially to `end` at 1 (Kerbl et al. 2023)."""
+    return float(end**progress)
+
+
+def photo_at(iteration: int, n: int, seed: int) -> int:
+    """Which of n photos an iteration looks at: each once per round, shuffled by seed and round alone."""
+    order = np.random.Generator(np.random.Philox(key=[seed, iteration // n])).permutation(n)
+    return int(order[iteration % n])
+
+
 def _iterate(problem: Problem, state: FitState, settings: FitSettings, threads: int) -> tuple[float, float]:
     row = photo_at(state.iteration, len(problem.train), settings.seed)
     shot = problem.train[row]
     camera = corrected(shot.photo.world_from_camera, state.learned["poses"].values[row])
     scene, parts = compose(problem, state, shot.photo)
-    sky = _sky_behind(shot.photo, camera, threads)
-    seen = _look(state, scene, shot.photo, camera, sky, threads)
+    seen, sky = _look(state, scene, shot.photo, camera, threads)
     colours = state.learned["exposure"].values[row]
     picture = exposed(seen.view.rgb, colours)
     loss, d_picture = photo_loss(picture, shot.target, settings.ssim_weight)
@@ -104,15 +115,14 @@ def _iterate(problem: Problem, state: FitState, settings: FitSettings, threads: 
     back = backward(seen, scene, d_rgb, d_alpha=d_alpha, threads=threads)
     _step_world(state, settings, row, back, d_colours)
     cells, d_cells = backdrop_gradient(d_rgb, seen.view.alpha, sky)
-    progress = state.iteration / settings.iterations
-    state.learned["sky"].step(cells, d_cells, decayed(settings.sky_rate, settings.rate_end, progress))
+    fall = decayed(RATE_END, state.iteration / settings.iterations)
+    state.learned["sky"].step(cells, d_cells, fall * settings.sky_rate)
     depths = seen.splats.projected[:, DEPTH]
     _step_gaussians(state, settings, *_of_owners(back, parts), depths)
     if problem.road is not None:
         rows = back.index[: np.searchsorted(back.index, len(parts[0].rows))]  # the background's are their own rows
         means, quats, log_scales = (state.learned[name].values for name in ("means", "quats", "log_scales"))
-        flat = rows[state.road[rows]]
-        lay_flat(means, quats, log_scales, flat, problem.road, settings.road_slack, settings.road_thickness)
+        lay_flat(means, quats, log_scales, rows[state.road[rows]], problem.road)
     return loss, psnr(np.clip(picture, 0.0, 1.0), shot.target.rgb)
 
 
@@ -146,24 +156,19 @@ def _in_view(boxes: Array, photo: Photo) -> Bools:
     return np.asarray(seen)
 
 
-def _sky_behind(photo: Photo, camera: Array, threads: int) -> SkyCells:
+def _look(state: FitState, scene: Gaussians, photo: Photo, camera: Array, threads: int) -> tuple[ForwardPass, SkyCells]:
+    """The photo's picture from `camera` (4, 4), and where its sky comes from."""
     height, width = photo.rgb.shape[:2]
-    return sky_cells(photo.intrinsics, camera, width, height, threads)
-
-
-def _look(state: FitState, scene: Gaussians, photo: Photo, camera: Array, sky: SkyCells, threads: int) -> ForwardPass:
-    height, width = photo.rgb.shape[:2]
+    sky = sky_cells(photo.intrinsics, camera, width, height, threads)
     behind = backdrop(state.learned["sky"].values, sky, threads)
-    return forward(scene, photo.intrinsics, camera, width, height, behind, threads)
+    return forward(scene, photo.intrinsics, camera, width, height, behind, threads), sky
 
 
 def _step_world(state: FitState, settings: FitSettings, row: int, back: Gradients, d_colours: F32) -> None:
     """Exposure and pose of the photo."""
-    progress, at = state.iteration / settings.iterations, np.array([row])
-    rate = decayed(settings.exposure_rate, settings.rate_end, progress)
-    state.learned["exposure"].step(at, d_colours[None], rate)
+    at, fall = np.array([row]), decayed(RATE_END, state.iteration / settings.iterations)
+    state.learned["exposure"].step(at, d_colours[None], fall * settings.exposure_rate)
     if state.iteration >= settings.pose_from:
-        fall = decayed(1.0, settings.rate_end, progress)
         poses = state.learned["poses"]
         # Shift and turn step by different rates: the gradient's own size does not matter to Adam.
         before = poses.values[row].copy()
@@ -189,16 +194,15 @@ def _step_gaussians(state: FitState, settings: FitSettings, rows: Ints, mine: Gr
     learned = state.learned
     state.nearest[rows] = np.minimum(state.nearest[rows], depths)
     state.wanted[rows] += np.hypot(mine.screen[:, 0], mine.screen[:, 1])
-    progress = state.iteration / settings.iterations
-    fall = decayed(1.0, settings.rate_end, progress)
-    mean_rate = decayed(settings.mean_rate, settings.mean_rate_end, progress)
+    fall = decayed(RATE_END, state.iteration / settings.iterations)
+    mean_rate = settings.mean_rate * decayed(settings.mean_rate_end, state.iteration / settings.iterations)
     learned["means"].step(rows, mine.means, mean_rate, state.nearest[rows])
     learned["quats"].step(rows, mine.quats, fall * settings.quat_rate)
     learned["log_scales"].step(rows, mine.log_scales, fall * settings.scale_rate)
     learned["logits"].step(rows, mine.logits[:, None], fall * settings.opacity_rate)
     learned["colours"].step(rows, mine.colours, fall * settings.colour_rate)
     if mine.sh_rest.shape[1]:
-        learned["sh_rest"].step(rows, mine.sh_rest.reshape(len(rows), -1), fall * settings.sh_rate)
+        learned["sh_rest"].step(rows, mine.sh_rest.reshape(len(rows), -1), fall * SH_RATE)
 
 
 _PER_GAUSSIAN = ("index", "means", "quats", "log_scales", "logits", "colours", "sh_rest", "screen")
@@ -213,7 +217,7 @@ def picture_of(problem: Problem, state: FitState, photo: Photo, threads: int = 1
     row_pose, row_colour = corrections_at(problem, state, photo.camera, photo.time_s)
     camera = corrected(photo.world_from_camera, row_pose)
     scene, _ = compose(problem, state, photo)
-    seen = _look(state, scene, photo, camera, _sky_behind(photo, camera, threads), threads)
+    seen, _ = _look(state, scene, photo, camera, threads)
     return np.clip(exposed(seen.view.rgb, row_colour), 0.0, 1.0)
 
 
@@ -230,10 +234,13 @@ def corrections_at(problem: Problem, state: FitState, camera: str, time_s: float
 def finish(problem: Problem, state: FitState, threads: int = 2) -> RenderAsset:
     """The scene as it is rendered, with the PSNR of the photos held out."""
     every = state.gaussians()
-    quats = every.quats / np.linalg.norm(every.quats, axis=1, keepdims=True)
-    every = Gaussians(every.means, quats, every.log_scales, every.opacities, every.colours, every.sh_rest)
+    every = replace(every, quats=every.quats / np.linalg.norm(every.quats, axis=1, keepdims=True))
     nodes = {problem.tracks.ids[j]: every.take(state.owner == j) for j in np.unique(state.owner[state.owner >= 0])}
-    views = tuple(_quality(problem, state, shot, threads) for shot in problem.held_out)
+    views = []
+    for shot in problem.held_out:
+        picture, photo = picture_of(problem, state, shot.photo, threads), shot.photo
+        quality = psnr(picture, shot.target.rgb), ssim(picture, shot.target)[0]
+        views.append(ViewQuality(photo.camera, photo.time_s, *quality, held_out=True))
     return RenderAsset(
         problem.origin,
         every.take(state.owner == BACKGROUND),
@@ -241,15 +248,9 @@ def finish(problem: Problem, state: FitState, threads: int = 2) -> RenderAsset:
         SkyMap(np.clip(state.learned["sky"].values, 0.0, 1.0).reshape(ROWS, COLUMNS, 3)),
         float(np.mean([view.psnr_db for view in views])) if views else float("nan"),
         len(views),
-        views=views,
+        views=tuple(views),
         exposures=tuple(
             Exposure(shot.photo.camera, shot.photo.time_s, np.column_stack(matrix_of(row)))
             for shot, row in zip(problem.train, state.learned["exposure"].values)
         ),
     )
-
-
-def _quality(problem: Problem, state: FitState, shot: Shot, threads: int) -> ViewQuality:
-    picture = picture_of(problem, state, shot.photo, threads)
-    photo = shot.photo
-    return ViewQuality(photo.camera, photo.time_s, psnr(picture, shot.target.rgb), ssim(picture, shot.target)[0], True)

@@ -22,6 +22,8 @@ NEAR_PLANE_M = 0.12  # what is further from the local plane is no road
 PLANE_REACH_M = 15.0
 LEAST_POINTS = 30
 ALONG_M = 4.0  # a plane is fitted about this often
+SLACK_M = 0.02  # how far a road Gaussian may leave the lidar's surface
+THICKNESS_M = 0.005  # of a road Gaussian
 
 
 @dataclass(frozen=True)
@@ -127,22 +129,14 @@ def above_road(means: FloatArray, road: Road) -> Array:
 
 @kernel
 def _lay(
-    means: Any,
-    quats: Any,
-    log_scales: Any,
-    rows: Any,
-    heights: Any,
-    slopes: Any,
-    corner: Any,
-    slack: float,
-    thick: float,
+    means: Any, quats: Any, log_scales: Any, rows: Any, heights: Any, slopes: Any, corner: Any, thick: float
 ) -> None:
     for k in range(rows.shape[0]):
         i = rows[k]
         z, sx, sy = _height(heights, slopes, corner, means[i, 0], means[i, 1])
         if z != z:
             continue
-        means[i, 2] = min(max(means[i, 2], z - slack), z + slack)
+        means[i, 2] = min(max(means[i, 2], z - SLACK_M), z + SLACK_M)
         log_scales[i, 2] = min(log_scales[i, 2], thick)
         # Turn the third axis onto the normal the shortest way: q' = (1 + a.n, a x n) q.
         w, x, y, s = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
@@ -162,9 +156,7 @@ def _lay(
         quats[i, 3] = tw * s + tx * y - ty * x + tz * w
 
 
-def lay_flat(
-    means: F32, quats: F32, log_scales: F32, rows: Ints, road: Road, slack_m: float, thickness_m: float
-) -> None:
-    """Puts Gaussians at `rows` onto the road, in place: at most `slack_m` off it, no thicker than `thickness_m`, their
+def lay_flat(means: F32, quats: F32, log_scales: F32, rows: Ints, road: Road) -> None:
+    """Puts Gaussians at `rows` onto the road, in place: at most SLACK_M off it, no thicker than THICKNESS_M, their
     third axis along its normal. Those beyond the road stay as they are."""
-    _lay(means, quats, log_scales, rows, road.heights, road.slopes, road.corner, slack_m, float(np.log(thickness_m)))
+    _lay(means, quats, log_scales, rows, road.heights, road.slopes, road.corner, float(np.log(THICKNESS_M)))

@@ -2,9 +2,6 @@
 
 from dataclasses import dataclass
 
-# Settings that are gone, as they always were: keys of blocks and tables hold them still, so that older ones go on.
-REMOVED = {"depth_weight": 0.0, "opacity_weight": 0.0, "scale_weight": 0.0}
-
 
 @dataclass(frozen=True)
 class FitSettings:
@@ -23,37 +20,29 @@ class FitSettings:
     start_node_gaussians: int = 3_000  # of each track, at most
     most_gaussians: int = 250_000  # of a scene
     start_opacity: float = 0.5  # of every Gaussian
-    max_gap_px: tuple[int, int] = (12, 24)  # columns, rows that are interpolated between lidar returns
     stereo_photos: int = 4  # neighbours compared where lidar does not reach
     sh_degree: int = 0  # 0 to 3
     # Loss.
     ssim_weight: float = 0.1  # loss = (1 - w) L1 + w (1 - SSIM)
     opaque_weight: float = 0.1  # of the mean light that passes where a photo looks at the ground
-    # Step sizes of Adam; each falls exponentially to `rate_end` of itself.
+    # Step sizes of Adam; each falls exponentially to a tenth of itself.
     mean_rate: float = 1.6e-3  # times the nearest viewing depth
     quat_rate: float = 4e-3  # of rotations
     scale_rate: float = 2e-2  # of sizes
     opacity_rate: float = 8e-2  # of opacities
     colour_rate: float = 1.2e-2  # of colours
-    sh_rate: float = 6e-4  # of what depends on the direction
     sky_rate: float = 4e-3  # of the sky map
     exposure_rate: float = 1e-3  # 0: the cameras agree, nothing is aligned
     turn_rate: float = 3e-4  # [rad] of the pose corrections
     shift_rate: float = 1e-3  # [m]
     pose_from: int = 100  # iteration at which poses start to move
-    rate_end: float = 0.1  # what every rate falls to, as a share of itself
-    mean_rate_end: float = 0.04  # the same of mean_rate
+    mean_rate_end: float = 0.04  # what mean_rate falls to instead, as a share of itself
     # Density: relocation and growth of 3DGS as Markov chain Monte Carlo (Kheradmand et al. 2024).
     refine_every: int = 100  # iterations
     refine_from: int = 300  # iteration
-    refine_until: float = 0.8  # share of the iterations
     growth: float = 0.03  # share of Gaussians added each time
-    dead_opacity: float = 0.01  # below which a Gaussian is moved elsewhere
-    jitter: float = 0.5  # how far from its source a copy is put, in standard deviations of it
     # Road.
     road: bool = True  # Gaussians of the road lie flat on what lidar knows of it
-    road_slack: float = 0.02  # how far a road Gaussian may leave the lidar's surface
-    road_thickness: float = 0.005  # of a road Gaussian
 
     def __post_init__(self) -> None:
         for name in (
@@ -70,6 +59,6 @@ class FitSettings:
             raise ValueError(f"fit road_share must be above 0, not {self.road_share}")
         if self.sh_degree not in range(4):
             raise ValueError(f"fit sh_degree must be 0 to 3, not {self.sh_degree}")
-        for name in ("ssim_weight", "refine_until", "rate_end", "mean_rate_end"):
+        for name in ("ssim_weight", "mean_rate_end"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"fit {name} must be from 0 to 1, not {getattr(self, name)}")

@@ -6,10 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tasks.kernels.threads import in_chunks
-from tasks.render.fit import exposure, poses
 from tasks.render.fit.adam import Learned
 from tasks.render.fit.body import unseen_body
-from tasks.render.fit.instants import exposures_of, in_agreement, instants
+from tasks.render.fit.corrections import EXPOSURE_SIZE, POSE_SIZE, between, exposures_of, in_agreement, instants
 from tasks.render.fit.losses import Target, target_of
 from tasks.render.fit.road import Road, above_road, find_road, lay_flat
 from tasks.render.fit.settings import FitSettings
@@ -78,11 +77,11 @@ def prepare(
     looked_at = [train[i] for i in sorted(first_seen)]
 
     def look(first: int, last: int) -> list[Seen]:
-        gap, n = settings.max_gap_px, settings.stereo_photos
-        return [see(p, train, static, per_track, tracks, gap, n) for p in looked_at[first:last]]
+        n = settings.stereo_photos
+        return [see(p, train, static, per_track, tracks, n) for p in looked_at[first:last]]
 
     seen = [s for part in in_chunks(look, len(looked_at), 1, threads) for s in part]
-    exposures = np.zeros((len(train), exposure.SIZE), np.float32)
+    exposures = np.zeros((len(train), EXPOSURE_SIZE), np.float32)
     if settings.exposure_rate > 0.0:
         exposures = _exposures(train, looked_at, exposures_of(looked_at, seen, static))
     alike = in_agreement(looked_at, exposures[sorted(first_seen)])
@@ -106,11 +105,11 @@ def prepare(
 
 def _exposures(photos: Sequence[Photo], known: Sequence[Photo], rows: F32) -> F32:
     """Rows (N, 12) of all photos from those (M, 12) of some: of the same camera, between the times before and after."""
-    out = np.zeros((len(photos), exposure.SIZE), np.float32)
+    out = np.zeros((len(photos), EXPOSURE_SIZE), np.float32)
     for i, photo in enumerate(photos):
         mine = [k for k, other in enumerate(known) if other.camera == photo.camera]
         if mine:
-            out[i] = poses.between(np.array([known[k].time_s for k in mine]), rows[mine], photo.time_s)
+            out[i] = between(np.array([known[k].time_s for k in mine]), rows[mine], photo.time_s)
     return out
 
 
@@ -164,15 +163,7 @@ def _first_state(
     owners = np.repeat(owner, [len(part) for part in parts]).astype(np.int32)
     on_road = _lies_on(start, road) & (owners == BACKGROUND)
     if road is not None:
-        lay_flat(
-            start.means,
-            start.quats,
-            start.log_scales,
-            np.flatnonzero(on_road),
-            road,
-            settings.road_slack,
-            settings.road_thickness,
-        )
+        lay_flat(start.means, start.quats, start.log_scales, np.flatnonzero(on_road), road)
     bodily = np.repeat([any(part is body for body in bodies) for part in parts], [len(part) for part in parts])
     opacities = np.where(bodily, start.opacities, np.float32(settings.start_opacity))[:, None]
     learned = {
@@ -184,7 +175,7 @@ def _first_state(
         "sh_rest": Learned.of(np.zeros((len(start), 3 * sh.COUNTS[settings.sh_degree]))),
         "sky": Learned.of(sky.reshape(-1, 3)),
         "exposure": Learned.of(exposures),
-        "poses": Learned.of(np.zeros((len(exposures), poses.SIZE))),
+        "poses": Learned.of(np.zeros((len(exposures), POSE_SIZE))),
     }
     nearest = np.full(len(start), np.inf, np.float32)
     return FitState(0, learned, owners, on_road, nearest, np.zeros(len(start), np.float32))

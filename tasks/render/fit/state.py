@@ -13,6 +13,7 @@ from tasks.world.arrays import F32, Bools, FloatArray, Ints, ShortInts
 BACKGROUND = -1
 SHAPES = ("means", "quats", "log_scales", "logits", "colours", "sh_rest")  # learned, one row per Gaussian
 WORLD = ("sky", "exposure", "poses")
+PER_GAUSSIAN = ("owner", "road", "nearest", "wanted")  # fields of FitState
 
 
 @dataclass
@@ -31,16 +32,9 @@ class FitState:
 
     def gaussians(self) -> Gaussians:
         """All of them, in the frames of their owners."""
-        values = {name: self.learned[name].values for name in SHAPES}
-        n = len(self)
-        return Gaussians(
-            values["means"],
-            values["quats"],
-            values["log_scales"],
-            opacities_of(values["logits"][:, 0]),
-            values["colours"],
-            values["sh_rest"].reshape(n, -1, 3),
-        )
+        means, quats, log_scales, logits, colours, rest = (self.learned[name].values for name in SHAPES)
+        rest = rest.reshape(len(self), -1, 3)
+        return Gaussians(means, quats, log_scales, opacities_of(logits[:, 0]), colours, rest)
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:
         """By name, for whoever stores them."""
@@ -50,9 +44,7 @@ class FitState:
             for field in fields(Learned)
         }
         out["iteration"] = np.array(self.iteration)
-        for name in ("owner", "road", "nearest", "wanted"):
-            out[name] = getattr(self, name)
-        return out
+        return out | {name: getattr(self, name) for name in PER_GAUSSIAN}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[np.generic]]) -> "FitState":
@@ -61,15 +53,14 @@ class FitState:
             name: Learned(*(np.array(arrays[f"{name}.{field.name}"]) for field in fields(Learned)))
             for name in SHAPES + WORLD
         }
-        rest = (np.array(arrays[name]) for name in ("owner", "road", "nearest", "wanted"))
-        return cls(int(arrays["iteration"]), learned, *rest)
+        return cls(int(arrays["iteration"]), learned, *(np.array(arrays[name]) for name in PER_GAUSSIAN))
 
     def rows(self, rows: Ints) -> None:
         """Keeps these Gaussians, in this order; one may be named again and again."""
         for name in SHAPES:
             self.learned[name] = self.learned[name].take(rows)
-        self.owner, self.road = self.owner[rows], self.road[rows]
-        self.nearest, self.wanted = self.nearest[rows], self.wanted[rows]
+        for name in PER_GAUSSIAN:
+            setattr(self, name, getattr(self, name)[rows])
 
 
 def opacities_of(logits: F32) -> F32:

@@ -61,6 +61,5 @@ def _box(size: tuple[float, float, float], kind: AgentKind) -> Gaussians:
             np.concatenate(colours).astype(np.float32),
             np.full(len(stacked), SPACING_M, np.float32),
             np.zeros((len(stacked), 2), np.int32),
-        ),
-        np.zeros(3),
+        )
     )

@@ -50,11 +50,9 @@ def choose(looks: Sequence[Look]) -> dict[int, Discs]:
                 pose = np.eye(4) if owner == BACKGROUND else look.scene_from_box.get(owner)
                 if pose is None:
                     continue
-                camera = np.ascontiguousarray(np.linalg.inv(look.scene_from_camera) @ pose)
+                photo = np.ascontiguousarray(np.linalg.inv(look.scene_from_camera) @ pose), look.intrinsics, look.depth
                 for part in parts:
-                    _cover(
-                        part.points, part.across, part.down, part.spacing, camera, look.intrinsics, look.depth, covered
-                    )
+                    _cover(part.points, part.across, part.down, part.spacing, *photo, covered)
             rows, columns = look.discs.pixels.T
             new = np.flatnonzero(mine & ~covered[rows, columns])
             for owner in np.unique(look.owner[new]):
@@ -81,14 +79,7 @@ def with_mirror_image(discs: Discs) -> Discs:
 
 @kernel
 def _cover(
-    points: Any,
-    across: Any,
-    down: Any,
-    spacing: Any,
-    camera_from_scene: Any,
-    k: Any,
-    depth: Any,
-    covered: Any,
+    points: Any, across: Any, down: Any, spacing: Any, camera_from_scene: Any, k: Any, depth: Any, covered: Any
 ) -> None:
     """Marks the pixels (H, W) whose surface a disc shows about as finely as the photo does."""
     height, width = depth.shape

@@ -12,6 +12,7 @@ from tasks.kernels.compiled import kernel
 from tasks.world.arrays import F32, Array, ShortInts
 
 NEAR_M = 0.5
+MAX_GAP_PX = (12, 24)  # columns, rows that are interpolated between returns
 SEE_THROUGH_PX = 5  # how far around a pixel its occluders are looked for
 OCCLUDED_RATIO = 0.85  # a return is hidden when returns on both sides are nearer than this share of its depth
 EDGE_RATIO = 1.25  # depths further apart than this belong to two surfaces
@@ -36,15 +37,15 @@ def sparse_depth(
     return depth, label
 
 
-def dense_depth(depth: F32, label: ShortInts, rgb: F32, max_gap_px: tuple[int, int]) -> tuple[F32, ShortInts]:
-    """Closes gaps of a sparse depth image (H, W) up to `max_gap_px` (columns, rows) to the nearest returns.
+def dense_depth(depth: F32, label: ShortInts, rgb: F32) -> tuple[F32, ShortInts]:
+    """Closes gaps of a sparse depth image (H, W) up to MAX_GAP_PX to the nearest returns.
 
     `rgb` (H, W, 3) in [0, 1]. Where nothing is near enough the depth stays 0 and the label -2.
     """
     colours = np.ascontiguousarray(rgb, np.float32)
     filled, labels = depth, label
     for _ in range(2):  # the first pass fills rows and columns that hold returns, the second what lies between them
-        filled, labels = _fill(filled, labels, colours, max_gap_px[0], max_gap_px[1])
+        filled, labels = _fill(filled, labels, colours, *MAX_GAP_PX)
     return _smooth(filled, labels), labels
 
 

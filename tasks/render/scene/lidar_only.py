@@ -52,18 +52,17 @@ def lidar_asset(sweeps: Sequence[Sweep], agents: AgentTracks | None) -> RenderAs
         poses = world_from_boxes(boxes)
         for j in np.unique(owner[owner >= 0]):
             sizes[int(j)] = boxes[j, 4:7]
-            moving.setdefault(int(j), []).append(
-                discs.take(owner == j).moved(np.linalg.inv(poses[j]).astype(np.float64))
-            )
+            mine = discs.take(owner == j).moved(np.linalg.inv(poses[j]).astype(np.float64))
+            moving.setdefault(int(j), []).append(mine)
     nodes = {}
     for j, parts in sorted(moving.items()):
         whole = _thinned(parts)
         if len(whole.points) >= MIN_NODE_DISCS:
             whole = with_mirror_image(whole) if tracks.kinds[j] == AgentKind.VEHICLE else whole
             inner = box_gaussians(sizes[j] * INNER_SHARE, tracks.kinds[j])
-            nodes[tracks.ids[j]] = concatenate([gaussians_of(whole, np.zeros(3)), inner])
+            nodes[tracks.ids[j]] = concatenate([gaussians_of(whole), inner])
     street = _thinned(static)
-    background = gaussians_of(street, np.zeros(3)) if len(street.points) else EMPTY
+    background = gaussians_of(street) if len(street.points) else EMPTY
     return RenderAsset(origin, background, nodes, plain_sky(), float("nan"))
 
 

@@ -34,7 +34,6 @@ def see(
     static: Array,
     per_track: dict[int, Array],
     tracks: Tracks,
-    max_gap_px: tuple[int, int],
     stereo_photos: int,
 ) -> Seen:
     """A photo's depth from the fused lidar (`fuse`), completed from the `others` it is compared with."""
@@ -50,9 +49,10 @@ def see(
     sparse, label = sparse_depth(
         np.concatenate(points), np.concatenate(labels), photo.intrinsics, photo.world_from_camera, width, height
     )
-    depth, label = dense_depth(sparse, label, rgb, max_gap_px)
+    depth, label = dense_depth(sparse, label, rgb)
     unknown = depth == 0.0
-    bright = _looks_like_sky(rgb)
+    brightness = rgb.mean(axis=-1)
+    bright = (brightness > 0.6) | ((rgb[..., 2] > rgb[..., 0] + 0.04) & (brightness > 0.4))
     neighbours = _neighbours(photo, others, stereo_photos)
     hints = _hints(depth)
     if neighbours:
@@ -68,11 +68,6 @@ def see(
     eye = np.ascontiguousarray(photo.world_from_camera[:3, 3])
     passing = behind_boxes(seen_to.reshape(-1, 3) + eye, eye, boxes[valid & tracks.driving]).reshape(height, width)
     return Seen(depth, label, sky, passing)
-
-
-def _looks_like_sky(rgb: F32) -> Bools:
-    brightness = rgb.mean(axis=-1)
-    return np.asarray((brightness > 0.6) | ((rgb[..., 2] > rgb[..., 0] + 0.04) & (brightness > 0.4)))
 
 
 def _hints(depth: F32) -> F32:

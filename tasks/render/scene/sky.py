@@ -1,5 +1,6 @@
 """What is behind everything: colour by direction."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,11 +35,14 @@ class SkyMap:
 
 def directions(intrinsics: Array, world_from_camera: Array, width: int, height: int) -> Array:
     """(H, W, 3) viewing directions in the world, not normalised."""
+    return np.asarray(camera_rays(intrinsics, width, height) @ world_from_camera[:3, :3].T)
+
+
+def camera_rays(intrinsics: Array, width: int, height: int) -> Array:
+    """(H, W, 3) viewing directions in camera coordinates, z = 1."""
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    rays = np.stack(
-        [(u - intrinsics[0, 2]) / intrinsics[0, 0], (v - intrinsics[1, 2]) / intrinsics[1, 1], np.ones_like(u)], axis=-1
-    )
-    return np.asarray(rays @ world_from_camera[:3, :3].T)
+    x, y = (u - intrinsics[0, 2]) / intrinsics[0, 0], (v - intrinsics[1, 2]) / intrinsics[1, 1]
+    return np.stack([x, y, np.ones_like(u)], axis=-1)
 
 
 def _cells(rays: Array) -> tuple[Array, Array]:
@@ -47,35 +51,32 @@ def _cells(rays: Array) -> tuple[Array, Array]:
     return (0.5 - elevation / np.pi) * ROWS - 0.5, (azimuth / (2 * np.pi) + 0.5) * COLUMNS - 0.5
 
 
-class SkyCollector:
-    """Averages what photos show of the sky (and, with next to no weight, of the street)."""
+def sky_of_views(views: Iterable[tuple[Array, F32, Bools]]) -> SkyMap:
+    """The mean of what views show of the sky (and, with next to no weight, of the street).
 
-    def __init__(self) -> None:
-        self._sums = np.zeros((ROWS * COLUMNS, 4))
-
-    def add(self, rays: Array, rgb: F32, is_sky: Bools) -> None:
-        """Colours (M, 3) in [0, 1] seen in directions (M, 3), and whether it was sky (M,)."""
+    Each is directions (M, 3), their colours (M, 3) in [0, 1], and whether it was sky (M,). Cells nobody looked at take
+    the colour of the nearest one that was; plain grey without any view.
+    """
+    sums = np.zeros((ROWS * COLUMNS, 4))
+    for rays, rgb, is_sky in views:
         weight = np.where(is_sky, SKY_WEIGHT, 1.0)
         rows, columns = _cells(rays)
         cell = np.clip(np.rint(rows), 0, ROWS - 1).astype(np.intp) * COLUMNS
         cell += np.rint(columns).astype(np.intp) % COLUMNS
         for channel in range(3):
-            self._sums[:, channel] += np.bincount(cell, weight * rgb[:, channel], ROWS * COLUMNS)
-        self._sums[:, 3] += np.bincount(cell, weight, ROWS * COLUMNS)
-
-    def finish(self) -> SkyMap:
-        """Cells nobody looked at take the colour of the nearest one that was; plain grey without any photo."""
-        sums = self._sums.reshape(ROWS, COLUMNS, 4)
-        seen = sums[..., 3] > 0
-        if not seen.any():
-            return SkyMap(np.full((ROWS, COLUMNS, 3), 0.7, np.float32))
-        colours = sums[..., :3] / np.maximum(sums[..., 3:], 1e-9)
-        out = np.empty((ROWS, COLUMNS, 3), np.float32)
-        for half in (slice(0, ROWS // 2), slice(ROWS // 2, ROWS)):  # sky and street do not fill each other
-            there = seen[half] if seen[half].any() else seen
-            source = colours[half] if seen[half].any() else colours
-            wrapped = np.concatenate([there] * 3, axis=1)
-            nearest = distance_transform_edt(~wrapped, return_distances=False, return_indices=True)
-            rows = nearest[0][: ROWS // 2, COLUMNS : 2 * COLUMNS]
-            out[half] = source[rows, nearest[1][: ROWS // 2, COLUMNS : 2 * COLUMNS] % COLUMNS]
-        return SkyMap(out)
+            sums[:, channel] += np.bincount(cell, weight * rgb[:, channel], ROWS * COLUMNS)
+        sums[:, 3] += np.bincount(cell, weight, ROWS * COLUMNS)
+    cells = sums.reshape(ROWS, COLUMNS, 4)
+    seen = cells[..., 3] > 0
+    if not seen.any():
+        return SkyMap(np.full((ROWS, COLUMNS, 3), 0.7, np.float32))
+    colours = cells[..., :3] / np.maximum(cells[..., 3:], 1e-9)
+    out = np.empty((ROWS, COLUMNS, 3), np.float32)
+    for half in (slice(0, ROWS // 2), slice(ROWS // 2, ROWS)):  # sky and street do not fill each other
+        there = seen[half] if seen[half].any() else seen
+        source = colours[half] if seen[half].any() else colours
+        wrapped = np.concatenate([there] * 3, axis=1)
+        nearest = distance_transform_edt(~wrapped, return_distances=False, return_indices=True)
+        rows = nearest[0][: ROWS // 2, COLUMNS : 2 * COLUMNS]
+        out[half] = source[rows, nearest[1][: ROWS // 2, COLUMNS : 2 * COLUMNS] % COLUMNS]
+    return SkyMap(out)

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tasks.render.scene.sky import camera_rays
 from tasks.render.splatting.gaussians import Gaussians, quats_of
 from tasks.world.arrays import F32, Array, Bools, Indices, ShortInts
 
@@ -57,11 +58,7 @@ def discs_of_photo(rgb: F32, depth: F32, label: ShortInts, intrinsics: Array, wo
     `rgb` (H, W, 3) in [0, 1], `depth` (H, W) [m] along the optical axis (0: none), `label` (H, W).
     """
     height, width = depth.shape
-    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    rays = np.stack(
-        [(u - intrinsics[0, 2]) / intrinsics[0, 0], (v - intrinsics[1, 2]) / intrinsics[1, 1], np.ones_like(u)], axis=-1
-    )
-    points = rays * depth[..., None].astype(np.float64)
+    points = camera_rays(intrinsics, width, height) * depth[..., None].astype(np.float64)
     across = _tangents(points, depth, 1, np.array([1.0 / intrinsics[0, 0], 0.0, 0.0]))
     down = _tangents(points, depth, 0, np.array([0.0, 1.0 / intrinsics[1, 1], 0.0]))
     free = depth > 0
@@ -132,8 +129,8 @@ def _tangents(points: Array, depth: F32, axis: int, flat: Array) -> Array:
     return np.asarray(step * (np.minimum(length, MAX_ELONGATION * shortest) / np.maximum(length, 1e-9))[..., None])
 
 
-def gaussians_of(discs: Discs, origin: Array) -> Gaussians:
-    """Flat Gaussians that spread over each disc; means relative to `origin` (3,)."""
+def gaussians_of(discs: Discs) -> Gaussians:
+    """Flat Gaussians that spread over each disc."""
     across, down = discs.across.astype(np.float64), discs.down.astype(np.float64)
     # Principal axes of across across^T + down down^T in its own plane.
     e1 = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
@@ -155,7 +152,7 @@ def gaussians_of(discs: Discs, origin: Array) -> Gaussians:
     axes = np.stack([first, second, np.cross(first, second)], axis=-1)
     scales = SIGMA_PER_PIXEL * np.stack([major, minor, FLATNESS * minor], axis=1)
     return Gaussians(
-        (discs.points - origin).astype(np.float32),
+        discs.points.astype(np.float32),
         quats_of(axes).astype(np.float32),
         np.log(scales).astype(np.float32),
         np.full(len(discs.points), OPACITY, np.float32),

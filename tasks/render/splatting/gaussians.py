@@ -1,7 +1,7 @@
 """Anisotropic 3-D Gaussians: what a rendered scene is made of."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -25,9 +25,7 @@ class Gaussians:
     log_scales: F32  # (N, 3) natural log of the standard deviations [m]
     opacities: F32  # (N,) in (0, 1)
     colours: F32  # (N, 3) rgb, what all sides have in common (SH degree 0); in [0, 1] where there is no more than that
-    sh_rest: F32 = field(
-        default_factory=lambda: _NO_SH
-    )  # (N, M, 3), M in 0, 3, 8, 15: degrees 1 to 3, see splatting.sh
+    sh_rest: F32 = field(default_factory=lambda: _NO_SH)  # (N, M, 3), M 0, 3, 8 or 15: degrees 1 to 3, splatting.sh
 
     def __post_init__(self) -> None:
         n = len(self.means)
@@ -44,23 +42,10 @@ class Gaussians:
 
     def take(self, rows: Bools | Indices | slice) -> "Gaussians":
         """The Gaussians at `rows` (indices or mask); a slice copies nothing."""
-        return Gaussians(
-            self.means[rows],
-            self.quats[rows],
-            self.log_scales[rows],
-            self.opacities[rows],
-            self.colours[rows],
-            self.sh_rest[rows],
-        )
+        return Gaussians(*(getattr(self, each.name)[rows] for each in fields(self)))
 
 
-EMPTY = Gaussians(
-    np.zeros((0, 3), np.float32),
-    np.zeros((0, 4), np.float32),
-    np.zeros((0, 3), np.float32),
-    np.zeros(0, np.float32),
-    np.zeros((0, 3), np.float32),
-)
+EMPTY = Gaussians(*(np.zeros((0, *row), np.float32) for row in ((3,), (4,), (3,), (), (3,))))
 
 
 def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
@@ -72,14 +57,9 @@ def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
     for part in parts:
         sh_rest[start : start + len(part), : part.sh_rest.shape[1]] = part.sh_rest
         start += len(part)
-    return Gaussians(
-        np.concatenate([p.means for p in parts]),
-        np.concatenate([p.quats for p in parts]),
-        np.concatenate([p.log_scales for p in parts]),
-        np.concatenate([p.opacities for p in parts]),
-        np.concatenate([p.colours for p in parts]),
-        sh_rest,
-    )
+    names = (each.name for each in fields(Gaussians) if each.name != "sh_rest")
+    whole = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    return Gaussians(**(whole | {"sh_rest": sh_rest}))
 
 
 def moved(gaussians: Gaussians, target_from_source: Array) -> Gaussians:
@@ -90,38 +70,13 @@ def moved(gaussians: Gaussians, target_from_source: Array) -> Gaussians:
     rotation = target_from_source[:3, :3]
     means = gaussians.means @ rotation.T + target_from_source[:3, 3]
     quats = turned_quats(quats_of(rotation[None])[0], gaussians.quats)
-    return Gaussians(
-        means.astype(np.float32),
-        quats.astype(np.float32),
-        gaussians.log_scales,
-        gaussians.opacities,
-        gaussians.colours,
-        sh.turned(gaussians.sh_rest, rotation),
-    )
-
-
-def mirrored(gaussians: Gaussians) -> Gaussians:
-    """Reflected at the plane y = 0 (the unseen side of a car from its seen one)."""
-    # A reflection turns R into F R with determinant -1; the covariance is the same for F R F, a rotation,
-    # whose quaternion is (w, -x, y, -z).
-    flip = np.array([1.0, -1.0, 1.0, -1.0], np.float32)
-    return Gaussians(
-        gaussians.means * np.array([1.0, -1.0, 1.0], np.float32),
-        gaussians.quats * flip,
-        gaussians.log_scales,
-        gaussians.opacities,
-        gaussians.colours,
-        sh.turned(gaussians.sh_rest, np.diag([1.0, -1.0, 1.0])),
-    )
-
-
-def turned_quats(turn: Array, quats: FloatArray) -> Array:
-    """Hamilton products turn * quats of a quaternion (4,) w, x, y, z and many (N, 4)."""
-    return np.asarray(_turned_quats(turn, quats))
+    sh_rest = sh.turned(gaussians.sh_rest, rotation)
+    return replace(gaussians, means=means.astype(np.float32), quats=quats.astype(np.float32), sh_rest=sh_rest)
 
 
 @kernel
-def _turned_quats(turn: Any, quats: Any) -> Any:
+def turned_quats(turn: Array, quats: FloatArray) -> Array:
+    """Hamilton products turn * quats of a quaternion (4,) w, x, y, z and many (N, 4)."""
     lw, lx, ly, lz = turn
     out = np.empty((len(quats), 4))
     for i in range(len(quats)):
@@ -178,9 +133,3 @@ def rotations_of(quats: FloatArray) -> Array:
         ],
         axis=-2,
     )
-
-
-def covariances_of(gaussians: Gaussians) -> Array:
-    """(N, 3, 3) covariance matrices [m^2]."""
-    axes = rotations_of(gaussians.quats) * np.exp(gaussians.log_scales.astype(np.float64))[:, None, :]
-    return np.asarray(axes @ np.swapaxes(axes, 1, 2))

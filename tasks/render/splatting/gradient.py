@@ -4,7 +4,8 @@ Tiles are gone through front to back once more; each leaves one row of sums per 
 then added up in a fixed order, so that the result does not depend on the number of threads.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from tasks.render.splatting import sh
 from tasks.render.splatting.gaussians import Gaussians, quats_of, turned_quats
 from tasks.render.splatting.pixels_gradient import SUMS_SIZE, W_BLUE, W_RED, add_pairs, blend_gradient
 from tasks.render.splatting.project_gradient import project_gradient
-from tasks.render.splatting.raster import GAUSSIANS_CHUNK, TILES_CHUNK, ForwardPass, pinhole
+from tasks.render.splatting.raster import GAUSSIANS_CHUNK, TILES_CHUNK, ForwardPass
 from tasks.render.splatting.tiles import pair_starts
 from tasks.world.arrays import F32, Array, Ints
 
@@ -52,45 +53,18 @@ def backward(
     pairs = _pairs(forward, pair_start, d_rgb, d_depth, d_alpha, threads)
     center = np.ascontiguousarray(np.linalg.inv(splats.camera_from_scene)[:3, 3])
     sums = np.empty((n, SUMS_SIZE), np.float32)
-    shapes = ((n, 3), (n, 4), (n, 3), (n,), (n, 2), (n, 3), (n, count, 3))
-    means, quats, log_scales, logits, screen, colours, sh_rest = (np.empty(shape, np.float32) for shape in shapes)
+    sizes = ((n, 3), (n, 4), (n, 3), (n,), (n, 2), (n, 3), (n, count, 3))
+    means, quats, log_scales, logits, screen, colours, sh_rest = (np.empty(size, np.float32) for size in sizes)
+    shapes, light = (means, quats, log_scales, logits, screen), (gaussians.means, gaussians.colours, gaussians.sh_rest)
+    camera_from_scene, size = splats.camera_from_scene, (splats.width, splats.height)
+    scene = (gaussians.means, gaussians.quats, gaussians.log_scales, camera_from_scene, splats.intrinsics, *size)
 
     def run(first: int, last: int) -> Array:
         camera = np.zeros(6)
         add_pairs(pair_start, pairs, first, last, sums)
-        project_gradient(
-            gaussians.means,
-            gaussians.quats,
-            gaussians.log_scales,
-            splats.camera_from_scene,
-            *pinhole(splats.intrinsics),
-            splats.width,
-            splats.height,
-            splats.index,
-            splats.projected,
-            sums,
-            first,
-            last,
-            means,
-            quats,
-            log_scales,
-            logits,
-            screen,
-            camera,
-        )
-        by_direction = sh.seen_gradient(
-            gaussians.means,
-            gaussians.colours,
-            gaussians.sh_rest,
-            center,
-            splats.index,
-            sums[:, W_RED : W_BLUE + 1],
-            first,
-            last,
-            means,
-            colours,
-            sh_rest,
-        )
+        project_gradient(*scene, splats.index, splats.projected, sums, first, last, *shapes, camera)
+        upstream = sums[:, W_RED : W_BLUE + 1]
+        by_direction = sh.seen_gradient(*light, center, splats.index, upstream, first, last, means, colours, sh_rest)
         # To the directions, a camera moved by v is as a scene moved by v; turning it changes none of them.
         camera[:3] += splats.camera_from_scene[:3, :3] @ by_direction
         return camera
@@ -100,12 +74,7 @@ def backward(
 
 
 def _pairs(
-    forward: ForwardPass,
-    pair_start: Ints,
-    d_rgb: F32,
-    d_depth: F32 | None,
-    d_alpha: F32 | None,
-    threads: int,
+    forward: ForwardPass, pair_start: Ints, d_rgb: F32, d_depth: F32 | None, d_alpha: F32 | None, threads: int
 ) -> F32:
     """(pairs, 11) columns of tasks.render.splatting.pixels_gradient, Gaussian by Gaussian."""
     splats, view = forward.splats, forward.view
@@ -114,28 +83,10 @@ def _pairs(
     shapes = (d_rgb.shape, by_depth.shape, by_alpha.shape)
     if shapes != (view.rgb.shape, view.alpha.shape, view.alpha.shape):
         raise ValueError(f"backward: upstream shapes {shapes} do not fit a view of {view.rgb.shape}")
-    by_rgb = np.ascontiguousarray(d_rgb, np.float32)
+    upstream, seen = (np.ascontiguousarray(d_rgb, np.float32), by_depth, by_alpha), (view.rgb, view.depth, view.alpha)
+    dealt = (splats.projected, splats.tiles, splats.tile_start, splats.tile_splats)
     out = np.empty((len(splats.tile_splats), SUMS_SIZE), np.float32)
-
-    def run(first: int, last: int) -> None:
-        blend_gradient(
-            splats.projected,
-            splats.tiles,
-            splats.tile_start,
-            splats.tile_splats,
-            forward.tile_end,
-            pair_start,
-            by_rgb,
-            by_depth,
-            by_alpha,
-            view.rgb,
-            view.depth,
-            view.alpha,
-            first,
-            last,
-            out,
-        )
-
+    run = partial(blend_gradient, *dealt, forward.tile_end, pair_start, *upstream, *seen, out)
     in_chunks(run, len(forward.tile_end), TILES_CHUNK, threads)
     return out
 
@@ -146,17 +97,11 @@ def unmoved(gradients: Gradients, target_from_source: Array) -> Gradients:
     `target_from_source` (4, 4) as given there; what belongs to the picture or the camera stays.
     """
     rotation = target_from_source[:3, :3]
-    inverse = quats_of(rotation.T[None])[0]
-    count = gradients.sh_rest.shape[1]
-    turn = sh.turning(rotation, count)
-    return Gradients(
-        gradients.index,
-        (gradients.means @ rotation).astype(np.float32),
-        turned_quats(inverse, gradients.quats).astype(np.float32),
-        gradients.log_scales,
-        gradients.logits,
-        gradients.colours,
-        np.einsum("ba,nbc->nac", turn, gradients.sh_rest).astype(np.float32),
-        gradients.screen,
-        gradients.camera,
+    quats = turned_quats(quats_of(rotation.T[None])[0], gradients.quats)
+    turn = sh.turning(rotation, gradients.sh_rest.shape[1])
+    return replace(
+        gradients,
+        means=(gradients.means @ rotation).astype(np.float32),
+        quats=quats.astype(np.float32),
+        sh_rest=np.einsum("ba,nbc->nac", turn, gradients.sh_rest).astype(np.float32),
     )

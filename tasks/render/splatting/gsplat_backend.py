@@ -20,7 +20,7 @@ from tasks.render.splatting.raster import View
 from tasks.world.arrays import F32
 from tasks.world.camera import Pinhole
 
-HOW_TO_MEND = 'install them (pip install -e ".[gpu]" in the checkout), or draw with render.backend=cpu'
+HOW_TO_FIX = 'install them (pip install -e ".[gpu]" in the checkout), or draw with render.backend=cpu'
 
 
 class BackendMissing(RuntimeError):
@@ -34,7 +34,7 @@ def require() -> tuple[Any, Any]:
         try:
             found.append(importlib.import_module(name))
         except ImportError as error:
-            raise BackendMissing(f"render.backend=gsplat needs torch and gsplat ({error}): {HOW_TO_MEND}") from error
+            raise BackendMissing(f"render.backend=gsplat needs torch and gsplat ({error}): {HOW_TO_FIX}") from error
     torch, gsplat = found
     if not torch.cuda.is_available():
         raise BackendMissing(

@@ -105,12 +105,12 @@ def blend(
     tile_start: Any,
     tile_splats: Any,
     behind: Any,
-    first_tile: int,
-    last_tile: int,
     rgb: Any,
     depth: Any,
     alpha: Any,
     ends: Any,
+    first_tile: int,
+    last_tile: int,
 ) -> None:
     """Fills rgb (H, W, 3), depth and alpha (H, W) on some tiles, and where in `tile_splats` each was opaque."""
     height, width = alpha.shape

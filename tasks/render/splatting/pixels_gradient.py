@@ -21,15 +21,7 @@ ROW = np.uint64(CHANNELS * TILE)
 
 @kernel
 def _load(
-    buffer: Any,
-    x0: int,
-    y0: int,
-    d_rgb: Any,
-    d_depth: Any,
-    d_alpha: Any,
-    rgb: Any,
-    depth: Any,
-    alpha: Any,
+    buffer: Any, x0: int, y0: int, d_rgb: Any, d_depth: Any, d_alpha: Any, rgb: Any, depth: Any, alpha: Any
 ) -> None:
     """A tile's upstream derivatives by rgb, sum of weight * depth and sum of weight; and in channel 1 those times the
     sums themselves, added up, background included. Pixels outside the picture carry no light."""
@@ -72,9 +64,9 @@ def blend_gradient(
     rgb: Any,
     depth: Any,
     alpha: Any,
+    out: Any,
     first_tile: int,
     last_tile: int,
-    out: Any,
 ) -> None:
     """Fills a row of `out` (pairs, 16) for each Gaussian on each of some tiles; zero where it was not blended.
 

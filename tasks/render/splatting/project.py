@@ -160,10 +160,7 @@ def project(
     log_scales: Any,
     opacities: Any,
     camera_from_scene: Any,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
+    intrinsics: Any,
     width: int,
     height: int,
     first: int,
@@ -171,9 +168,10 @@ def project(
 ) -> Any:
     """Which of the Gaussians `first` to `last` can be seen, and their ellipses.
 
-    Arrays as in `Gaussians`, quaternions of any length; `camera_from_scene` (4, 4) float64; focal lengths and centre in
-    pixels, the centre of pixel (0, 0) being at (0.5, 0.5). Returns index (M,) int64; projected (M, 16) float32, rows of
-    pixels TOP <= y < BOTTOM being all that it shows on; tiles (M, 4) int32, x0 <= x < x1, y0 <= y < y1 that it touches.
+    Arrays as in `Gaussians`, quaternions of any length; `camera_from_scene` (4, 4) and `intrinsics` (3, 3) [px]
+    float64, the centre of pixel (0, 0) being at (0.5, 0.5). Returns index (M,) int64; projected (M, 16) float32, rows
+    of pixels TOP <= y < BOTTOM being all that it shows on; tiles (M, 4) int32, x0 <= x < x1, y0 <= y < y1 that it
+    touches.
     """
     index = np.empty(last - first, np.int64)
     out = np.empty((last - first, PROJECTED_SIZE), np.float32)
@@ -181,6 +179,7 @@ def project(
     count = 0
     block = np.zeros(BLOCK_SIZE, np.float32)
     rows, centre = turned_by(camera_from_scene)
+    fx, fy, cx, cy = intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]
     limits = tangent_limits(fx, fy, cx, cy, width, height)
     middle_u, middle_v = width / 2.0, height / 2.0
     for start in range(first, last, LANES):

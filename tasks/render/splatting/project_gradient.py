@@ -150,10 +150,7 @@ def project_gradient(
     quats: Any,
     log_scales: Any,
     camera_from_scene: Any,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
+    intrinsics: Any,
     width: int,
     height: int,
     index: Any,
@@ -177,6 +174,7 @@ def project_gradient(
     """
     block, motion = np.zeros(BLOCK_SIZE, np.float32), np.empty(LANES, np.float32)
     rows, centre = turned_by(camera_from_scene)
+    fx, fy, cx, cy = intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]
     limits = tangent_limits(fx, fy, cx, cy, width, height)
     for start in range(first, last, LANES):
         n = min(LANES, last - start)

@@ -6,6 +6,7 @@ summed in an order that could change: the same input gives the same bytes, on an
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -59,23 +60,11 @@ def splat(
 ) -> Splats:
     """Projects and sorts. `intrinsics` (3, 3) pixels, without skew; `scene_from_camera` (4, 4) rigid."""
     camera_from_scene = np.ascontiguousarray(np.linalg.inv(scene_from_camera))
+    scene = (gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.opacities)
+    intrinsics = np.array(intrinsics, np.float64)  # a copy: kernels compile once more for read-only arrays
 
-    def run(first: int, last: int) -> tuple[Ints, F32, ShortInts]:
-        index, projected, tiles = project(
-            gaussians.means,
-            gaussians.quats,
-            gaussians.log_scales,
-            gaussians.opacities,
-            camera_from_scene,
-            *pinhole(intrinsics),
-            width,
-            height,
-            first,
-            last,
-        )
-        return index, projected, tiles
-
-    parts = in_chunks(run, len(gaussians), GAUSSIANS_CHUNK, threads)
+    project_some = partial(project, *scene, camera_from_scene, intrinsics, width, height)
+    parts = in_chunks(project_some, len(gaussians), GAUSSIANS_CHUNK, threads)
     start = np.cumsum([0, *(len(part[0]) for part in parts)])
     index, projected = np.empty(start[-1], np.int64), _cache_lines(start[-1])
     tiles = np.empty((start[-1], 4), np.int32)
@@ -94,11 +83,6 @@ def _cache_lines(n: int) -> F32:
     """Memory for projected rows (n, 16), each of which is one line of the processor's cache (64 bytes)."""
     memory: F32 = aligned(n * PROJECTED_SIZE)
     return memory.reshape(n, PROJECTED_SIZE)
-
-
-def pinhole(intrinsics: Array) -> tuple[float, float, float, float]:
-    """Focal lengths fx, fy and centre cx, cy [px] of a camera matrix (3, 3)."""
-    return float(intrinsics[0, 0]), float(intrinsics[1, 1]), float(intrinsics[0, 2]), float(intrinsics[1, 2])
 
 
 def forward(
@@ -125,11 +109,8 @@ def forward(
 def colours_seen(gaussians: Gaussians, camera_center: Array, index: Ints, threads: int = 1) -> F32:
     """rgb (M, 3) of the Gaussians at `index` (M,), as seen from `camera_center` (3,) in their frame; never negative."""
     center, out = np.ascontiguousarray(camera_center, np.float64), np.empty((len(index), 3), np.float32)
-
-    def run(first: int, last: int) -> None:
-        sh.seen(gaussians.means, gaussians.colours, gaussians.sh_rest, center, index, first, last, out)
-
-    in_chunks(run, len(index), GAUSSIANS_CHUNK, threads)
+    see = partial(sh.seen, gaussians.means, gaussians.colours, gaussians.sh_rest, center, index, out)
+    in_chunks(see, len(index), GAUSSIANS_CHUNK, threads)
     return out
 
 
@@ -144,28 +125,12 @@ def shade(splats: Splats, colours: F32, background: F32, threads: int = 1) -> Vi
 def _shade(splats: Splats, background: F32, threads: int) -> tuple[View, Ints]:
     height, width = splats.height, splats.width
     behind = np.ascontiguousarray(np.broadcast_to(background, (height, width, 3)), np.float32)
-    view = View(
-        np.empty((height, width, 3), np.float32),
-        np.empty((height, width), np.float32),
-        np.empty((height, width), np.float32),
-    )
+    view = View(*(np.empty((height, width, *more), np.float32) for more in ((3,), (), ())))
+    dealt = (splats.projected, splats.tile_start, splats.tile_splats)
     ends = np.empty(len(splats.tile_start) - 1, np.int64)
 
-    def run(first: int, last: int) -> None:
-        blend(
-            splats.projected,
-            splats.tile_start,
-            splats.tile_splats,
-            behind,
-            first,
-            last,
-            view.rgb,
-            view.depth,
-            view.alpha,
-            ends,
-        )
-
-    in_chunks(run, len(ends), TILES_CHUNK, threads)
+    blend_some = partial(blend, *dealt, behind, view.rgb, view.depth, view.alpha, ends)
+    in_chunks(blend_some, len(ends), TILES_CHUNK, threads)
     return view, ends
 
 

@@ -71,7 +71,7 @@ def basis(directions: Any, count: int) -> Any:
 
 
 @kernel
-def seen(means: Any, colours: Any, sh_rest: Any, center: Any, index: Any, first: int, last: int, out: Any) -> None:
+def seen(means: Any, colours: Any, sh_rest: Any, center: Any, index: Any, out: Any, first: int, last: int) -> None:
     """Fills rgb (M, 3), never negative, of the Gaussians at `index` (M,) as seen from `center` (3,) float64, for rows
     `first` to `last`."""
     count = sh_rest.shape[1]

@@ -20,23 +20,21 @@ def deal(depths: F32, tiles: ShortInts, width: int, height: int, threads: int) -
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
     order = _nearest_first(np.ascontiguousarray(depths))
     corners = np.zeros((-(-len(order) // CHUNK), tiles_y + 1, tiles_x + 1), np.int64)
-    in_chunks(
-        lambda first, last: _mark_corners(tiles, order, first, last, corners[first // CHUNK]),
-        len(order),
-        CHUNK,
-        threads,
-    )
+
+    def mark(first: int, last: int) -> None:
+        _mark_corners(tiles, order, first, last, corners[first // CHUNK])
+
+    in_chunks(mark, len(order), CHUNK, threads)
     counts = corners.cumsum(axis=1).cumsum(axis=2)[:, :-1, :-1].reshape(len(corners), tiles_x * tiles_y)
     start = np.concatenate([[0], np.cumsum(counts.sum(axis=0))])
     before = np.cumsum(counts, axis=0) - counts  # a tile's ellipses of the nearer chunks come first
     places = start[:-1] + before
     pairs = np.empty(start[-1], np.int32)
-    in_chunks(
-        lambda first, last: _fill(tiles, order, tiles_x, first, last, places[first // CHUNK], pairs),
-        len(order),
-        CHUNK,
-        threads,
-    )
+
+    def fill(first: int, last: int) -> None:
+        _fill(tiles, order, tiles_x, first, last, places[first // CHUNK], pairs)
+
+    in_chunks(fill, len(order), CHUNK, threads)
     return start, pairs
 
 

@@ -12,17 +12,7 @@ from numpy.typing import NDArray
 from tasks.kernels.compiled import kernel
 from tasks.reward.rules.ego import CENTER_IN_INTERSECTION, MULTIPLE_LANES, NON_DRIVABLE, ONCOMING, Body
 from tasks.reward.rules.grid import beside, middle, passes_between
-from tasks.reward.rules.map_index import (
-    DRIVABLE,
-    FAR,
-    FIRST,
-    INTERSECTION,
-    LANE,
-    LAST,
-    NEAR,
-    ON_ROUTE,
-    MapIndex,
-)
+from tasks.reward.rules.map_index import DRIVABLE, FAR, FIRST, INTERSECTION, LANE, LAST, NEAR, ON_ROUTE, MapIndex
 from tasks.world.arrays import Array, Bytes, ShortInts
 
 Bits = NDArray[np.uint64]
@@ -101,14 +91,8 @@ def _look_up(index: MapIndex, x: Array, y: Array, found: ShortInts) -> None:
 @kernel
 def _pass_edges(index: MapIndex, x: Array, y: Array, found: ShortInts) -> None:
     """Turn crossed cells that know their far set into the set around the point, unless an edge's line is on it."""
-    low_x, low_y, cell_m, crossed, entry, edges = (
-        index.low_x,
-        index.low_y,
-        index.cell_m,
-        index.crossed,
-        index.entry,
-        index.edges,
-    )
+    low_x, low_y, cell_m = index.low_x, index.low_y, index.cell_m
+    crossed, entry, edges = index.crossed, index.entry, index.edges
     for p in range(x.size):
         q = -1 - found[p]
         if q >= 0 and crossed[q, FAR] >= 0:
@@ -128,14 +112,8 @@ def _pass_edges(index: MapIndex, x: Array, y: Array, found: ShortInts) -> None:
 @kernel
 def _collect_others(index: MapIndex, x: Array, y: Array, held: Held) -> None:
     """Fill in the other sets, and all parts."""
-    low_x, low_y, cell_m, crossed, entry, edges = (
-        index.low_x,
-        index.low_y,
-        index.cell_m,
-        index.crossed,
-        index.entry,
-        index.edges,
-    )
+    low_x, low_y, cell_m = index.low_x, index.low_y, index.cell_m
+    crossed, entry, edges = index.crossed, index.entry, index.edges
     sets, bounded, parts_of_set, playing = index.sets, index.bounded, index.parts, index.playing
     found, others, parts = held
     n = 0

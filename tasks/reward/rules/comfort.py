@@ -11,36 +11,14 @@ import numpy as np
 from numba.extending import register_jitable
 
 from tasks.kernels.compiled import kernel
+from tasks.reward.rules.ego import checked
 from tasks.reward.rules.smooth import jerk_of, plan_yaw_accel_of, smooth_accel, unwrap, yaw_accel_of, yaw_rate_of
 from tasks.world.arrays import Array, Bools
-from tasks.world.bounds import LARGEST, all_within
 from tasks.world.clip import HORIZON_STEPS, STEP_S
-from tasks.world.vehicle import (
-    AX,
-    AY,
-    EGO_STATE_SIZE,
-    HEADING,
-    STEERING,
-    YAW_ACCEL,
-    YAW_RATE,
-)
+from tasks.world.vehicle import AX, AY, EGO_STATE_SIZE, HEADING, STEERING, YAW_ACCEL, YAW_RATE
 
-LON_ACCEL_MPS2 = (-4.05, 2.40)
-LAT_ACCEL_MPS2 = 4.89
-JERK_MPS3 = 8.37
-LON_JERK_MPS3 = 4.13
-YAW_ACCEL_RADPS2 = 1.93
-YAW_RATE_RADPS = 0.95
-LIMITS = np.array(
-    [
-        LON_ACCEL_MPS2,
-        (-LAT_ACCEL_MPS2, LAT_ACCEL_MPS2),
-        (-JERK_MPS3, JERK_MPS3),
-        (-LON_JERK_MPS3, LON_JERK_MPS3),
-        (-YAW_ACCEL_RADPS2, YAW_ACCEL_RADPS2),
-        (-YAW_RATE_RADPS, YAW_RATE_RADPS),
-    ]
-)  # (6, 2): longitudinal, lateral acceleration; jerk; longitudinal jerk; yaw acceleration; yaw rate
+# (6, 2): longitudinal, lateral acceleration [m/s2]; jerk; longitudinal jerk [m/s3]; yaw acceleration; yaw rate
+LIMITS = np.array([(-4.05, 2.40), *((-most, most) for most in (4.89, 8.37, 4.13, 1.93, 0.95))])
 EC_LIMITS = (0.7, 0.5, 0.1, 0.1)  # RMS of acceleration, jerk, yaw rate, yaw acceleration (SI)
 EC_MAX_INTERVAL_S = 0.55
 PAST_PERIOD_STEPS = 5  # the history comes at 2 Hz
@@ -155,23 +133,12 @@ def extended_comfort(now_states: Array, previous_states: Array, interval_s: floa
     """
     if not 0.0 < interval_s < EC_MAX_INTERVAL_S:
         raise ValueError(f"interval_s must lie in (0, {EC_MAX_INTERVAL_S}), got {interval_s}")
-    now, previous = _states("now_states", now_states), _states("previous_states", previous_states)
+    now, previous = checked("now_states", now_states), checked("previous_states", previous_states)
     if len(previous) not in (1, len(now)):
-        raise ValueError(
-            f"previous_states must have 1 row or {len(now)}, one for each of now_states; got {len(previous)}"
-        )
+        raise ValueError(f"previous_states must be 1 row or {len(now)}, as now_states; got {len(previous)}")
     rms = np.empty((len(now), len(EC_LIMITS)))
     _motion_rms(now, previous, round(interval_s / STEP_S), rms)
     return ExtendedComfort(ec=np.where((rms <= EC_LIMITS).all(axis=-1), 1.0, 0.0), rms=rms)
-
-
-def _states(name: str, states: Array) -> Array:
-    states = np.ascontiguousarray(states, dtype=np.float64)
-    if states.ndim != 3 or states.shape[1:] != (HORIZON_STEPS + 1, EGO_STATE_SIZE):
-        raise ValueError(f"{name} must be (K, {HORIZON_STEPS + 1}, {EGO_STATE_SIZE}), got {states.shape}")
-    if not all_within(states):
-        raise ValueError(f"{name} must be finite and at most {LARGEST:g}")
-    return states
 
 
 @kernel

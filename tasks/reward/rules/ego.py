@@ -9,7 +9,9 @@ from numba.extending import register_jitable
 from tasks.kernels.compiled import kernel
 from tasks.kernels.trig import sincos
 from tasks.world.arrays import Array, Bytes
-from tasks.world.vehicle import HEADING, VX, VY, X, Y
+from tasks.world.bounds import LARGEST, all_within
+from tasks.world.clip import HORIZON_STEPS
+from tasks.world.vehicle import EGO_STATE_SIZE, HEADING, VX, VY, X, Y
 
 # Bits of an instant's flags (docs/reward.md 2a)
 MULTIPLE_LANES = 1  # corners in more than one lane, and no lane holds all four
@@ -28,6 +30,27 @@ class Body(NamedTuple):
     sin: Array  # (41,)
     speed: Array  # (41,) hypot(vx, vy) [m/s]
     flags: Bytes  # (41,) bits above
+
+
+def shaped(name: str, states: Array) -> Array:
+    """Contiguous float64 states (K >= 1, 41, 11) of any values. Raises ValueError where they are of another shape."""
+    states = np.ascontiguousarray(states, dtype=np.float64)
+    if states.ndim != 3 or states.shape[1:] != (HORIZON_STEPS + 1, EGO_STATE_SIZE) or len(states) == 0:
+        raise ValueError(f"{name} must be (K >= 1, {HORIZON_STEPS + 1}, {EGO_STATE_SIZE}), got {states.shape}")
+    return states if states.flags.writeable else states.copy()
+
+
+def checked(name: str, states: Array) -> Array:
+    """As `shaped`, and of drives. Raises ValueError."""
+    states = shaped(name, states)
+    if not all_within(states):
+        raise no_drive(name)
+    return states
+
+
+def no_drive(name: str) -> ValueError:
+    """The error that states are refused with."""
+    return ValueError(f"{name} must be finite and at most {LARGEST:g}: leave out what is not a drive")
 
 
 @register_jitable

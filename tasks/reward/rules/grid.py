@@ -31,13 +31,12 @@ def grid_over(edges: Array) -> tuple[Grid, Ints]:
     An entry is 2 * edge, plus 1 where the cell's middle is on the left of the edge. No middle is on the line of an
     edge of its cell. Pairs are in the order of the edges.
     """
-    attempt = 1
-    while True:  # nearly always once
+    is_clear, attempt = False, 0
+    while not is_clear:  # nearly always once
+        attempt += 1
         grid = _grid(edges, attempt)
         touched, is_clear = _touched_cells(edges, grid)
-        if is_clear:
-            return grid, touched
-        attempt += 1
+    return grid, touched
 
 
 def _grid(edges: Array, attempt: int) -> Grid:

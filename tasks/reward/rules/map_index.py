@@ -74,20 +74,10 @@ def index_map(polygons: Sequence[MapPolygon], route_lane_ids: frozenset[str]) ->
     _check_rings(regions, lines, edges, bounded, crossed, entry)
     playing = _packed(plays, n_words)
     is_played = (sets[:, None] & playing).any(axis=-1)
-    return MapIndex(
-        low_x=grid.low_x,
-        low_y=grid.low_y,
-        cell_m=grid.cell_m,
-        cells=cells.reshape(grid.n_rows, grid.n_columns),
-        crossed=crossed,
-        entry=entry,
-        edges=edges,
-        bounded=bounded,
-        sets=sets,
-        parts=np.packbits(is_played, axis=1, bitorder="little")[:, 0].copy(),
-        playing=playing,
-        n_lane_words=-(-int(plays[:, LANE].sum()) // 64),
-    )
+    parts = np.packbits(is_played, axis=1, bitorder="little")[:, 0].copy()
+    corner_and_cells = (grid.low_x, grid.low_y, grid.cell_m, cells.reshape(grid.n_rows, grid.n_columns))
+    n_lane_words = -(-int(plays[:, LANE].sum()) // 64)
+    return MapIndex(*corner_and_cells, crossed, entry, edges, bounded, sets, parts, playing, n_lane_words)
 
 
 def _regions(polygons: Sequence[MapPolygon], route_lane_ids: frozenset[str]) -> tuple[list[MapPolygon], Bools]:

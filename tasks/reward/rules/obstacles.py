@@ -41,10 +41,8 @@ class Obstacles(NamedTuple):
 def index_obstacles(boxes: Array, is_stopped: Bools, collision_score: Array, ego_circumradius_m: float) -> Obstacles:
     """Objects that are the same for all trajectories, ready for egos whose corners are this far from their centre.
 
-    boxes: (T, N, 5); is_stopped, collision_score: (N,), as in Obstacles. Raises ValueError on other shapes.
+    boxes: (T, N, 5); is_stopped, collision_score: (N,), as in Obstacles.
     """
-    if not 0.0 < ego_circumradius_m < math.inf:
-        raise ValueError(f"ego_circumradius_m must be a positive length in metres, got {ego_circumradius_m}")
     plain = unindexed(boxes, is_stopped, collision_score)
     obstacles = plain._replace(spans=plain.spans[:0], axes=_axes(plain.boxes), cells_per_side=CELLS_PER_SIDE)
     obstacles = obstacles._replace(cells_per_m=_cells_per_m(obstacles, ego_circumradius_m))
@@ -52,28 +50,12 @@ def index_obstacles(boxes: Array, is_stopped: Bools, collision_score: Array, ego
     return obstacles._replace(starts=starts, items=items)
 
 
+@kernel
 def unindexed(boxes: Array, is_stopped: Bools, collision_score: Array) -> Obstacles:
     """Objects to be looked at one by one: for traffic that few trajectories meet (`with_objects`).
 
-    boxes: (T, N, 5); is_stopped, collision_score: (N,), as in Obstacles. Raises ValueError on other shapes.
+    boxes: (T, N, 5); is_stopped, collision_score: (N,), as in Obstacles.
     """
-    n_items = boxes.shape[1] if boxes.ndim == 3 else -1
-    if boxes.ndim != 3 or boxes.shape[2] != 5:
-        raise ValueError(f"boxes must be (T, N, 5), got {boxes.shape}")
-    if is_stopped.shape != (n_items,) or collision_score.shape != (n_items,):
-        raise ValueError(
-            f"is_stopped and collision_score must be ({n_items},) as boxes has {n_items} objects, "
-            f"got {is_stopped.shape} and {collision_score.shape}"
-        )
-    return _plain(
-        np.ascontiguousarray(boxes, dtype=np.float64),
-        np.ascontiguousarray(is_stopped, dtype=np.bool_),
-        np.ascontiguousarray(collision_score, dtype=np.float64),
-    )
-
-
-@kernel
-def _plain(boxes: Array, is_stopped: Bools, collision_score: Array) -> Obstacles:
     starts = np.zeros(2, np.int32)
     starts[1] = len(is_stopped)
     axes, items = np.empty((0, len(is_stopped), 2)), np.arange(len(is_stopped)).astype(np.int32)
@@ -113,7 +95,7 @@ def lay_out(
     for k in range(n_kept):
         vx, vy = velocities[first_seen[kept[k]], kept[k]]
         is_stopped[k] = score[k] > 0.0 or np.hypot(vx, vy) <= STOPPED_SPEED_MPS
-    return n_wrong == 0, _plain(met, is_stopped, score)
+    return n_wrong == 0, unindexed(met, is_stopped, score)
 
 
 @inlined

@@ -46,8 +46,10 @@ def outlines(polygons: Sequence[MapPolygon]) -> Outlines:
 
 
 def refused(polygon: MapPolygon, problem: str) -> ValueError:
-    """The error that names a polygon, what is wrong with it and how to mend it."""
-    return ValueError(f"polygons: {polygon.layer} {polygon.token!r}: {problem} (tasks.world.polygons.valid_ring mends)")
+    """The error that names a polygon, what is wrong with it and how to fix it."""
+    return ValueError(
+        f"polygons: {polygon.layer} {polygon.token!r}: {problem} (tasks.world.polygons.valid_ring repairs)"
+    )
 
 
 @kernel

@@ -27,9 +27,7 @@ from tasks.world.clip import CLIP_STEPS, Clip
 from tasks.world.lanes import RoadMap, Route
 from tasks.world.vehicle import EGO_STATE_SIZE
 
-SETTINGS = RenderSettings(
-    width=48, height=32, scene=SceneFrom.DISCS, asset=AssetSettings(hold_out_every=0, refit_sweeps=1)
-)
+SETTINGS = RenderSettings(width=48, height=32, scene=SceneFrom.DISCS, asset=AssetSettings(hold_out_every=0))
 FRONT = np.array([[0.0, 0.0, 1.0, 1.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 1.5], [0.0, 0.0, 0.0, 1.0]])
 
 

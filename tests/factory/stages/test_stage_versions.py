@@ -22,7 +22,7 @@ from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings
 from tasks.experts.protocol import Plan
 from tasks.experts.recovery.expert import Recovery, RecoveryTable
 from tasks.perturb import Candidate, Perturbation, PerturbSettings, perturb
-from tasks.render.gate import GateSettings, composed, measures
+from tasks.render.gate import composed, measures
 from tasks.render.likeness import likeness_to_photo
 from tasks.render.map_drawing import draw_map_views
 from tasks.render.rigs import RIGS
@@ -183,7 +183,7 @@ def pictures() -> dict[str, object]:
     drawn = draw_map_views(clip.road_map, RIGS["front"], pose, clip.agents, [NOW], 128, 72)
     eye = Pinhole(front.intrinsics, aside[0] @ front.ego_from_camera, street.WIDTH, street.HEIGHT)
     near = composed(asset, NOBODY, aside[0, :3, 3], 30.0)
-    (found,) = measures(near, [eye], render(near, [eye]), aside[0], GateSettings())
+    (found,) = measures(near, [eye], render(near, [eye]), aside[0])
     alike = likeness_to_photo(asset, photos[2], street.tracks(), ["car"])
     return {"rendered": blocks(seen), "drawn": blocks(drawn), "gate": astuple(found), "likeness": [alike["car"]]}
 

@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tasks.render.splatting.gaussians import Gaussians
+from tasks.render.splatting.gaussians import Gaussians, rotations_of
 from tasks.render.splatting.pixels import MAX_ALPHA
 from tasks.render.splatting.project import DILATION_PX2, MAX_TANGENT_RATIO, MIN_ALPHA, NEAR_M
 
@@ -158,3 +158,9 @@ def slow_render(
     rgb = torch.einsum("nhw,nc->hwc", weight, colours) + (1 - covered)[..., None] * background[y0:y1, x0:x1]
     depth = torch.einsum("nhw,n->hw", weight, z) / torch.where(covered > 0, covered, torch.ones_like(covered))
     return rgb, depth, covered
+
+
+def covariances_of(gaussians: Gaussians) -> NDArray[np.float64]:
+    """(N, 3, 3) covariance matrices [m^2]."""
+    axes = rotations_of(gaussians.quats) * np.exp(gaussians.log_scales.astype(np.float64))[:, None, :]
+    return np.asarray(axes @ np.swapaxes(axes, 1, 2))

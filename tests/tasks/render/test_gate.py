@@ -7,7 +7,17 @@ import pytest
 import street
 from scipy.ndimage import gaussian_filter
 
-from tasks.render.gate import GateSettings, Measures, composed, fault_of, measured, measures, meets_road, unfit
+from tasks.render.gate import (
+    DETAIL_MIN,
+    GateSettings,
+    Measures,
+    composed,
+    fault_of,
+    measured,
+    measures,
+    meets_road,
+    unfit,
+)
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.engine import NOBODY, render
 from tasks.render.scene.sky import SkyMap
@@ -37,7 +47,7 @@ def turned(x: float, y: float, degrees: float) -> np.ndarray:
 def measured_at(asset: RenderAsset, pose: np.ndarray) -> Measures:
     eye = Pinhole(FRONT.intrinsics, pose @ FRONT.ego_from_camera, *SIZE)
     scene = composed(asset, NOBODY, pose[:3, 3], SETTINGS.reach_m)
-    return measures(scene, [eye], render(scene, [eye]), pose, SETTINGS)[0]
+    return measures(scene, [eye], render(scene, [eye]), pose)[0]
 
 
 def blob(x: float, y: float, z: float, sigma_m: float) -> Gaussians:
@@ -115,12 +125,12 @@ def test_a_scene_of_large_gaussians_is_blurred(street_asset: RenderAsset) -> Non
     wide = np.maximum(background.log_scales, np.float32(np.log(0.8)))
     blurred = replace(street_asset, background=replace(background, log_scales=wide), nodes={})
     found = measured_at(blurred, street.ego_pose(3.0))
-    assert found.detail < SETTINGS.detail_min < measured_at(street_asset, street.ego_pose(3.0)).detail
+    assert found.detail < DETAIL_MIN < measured_at(street_asset, street.ego_pose(3.0)).detail
 
 
 def test_only_rays_that_come_down_on_the_road_in_reach_are_asked_for() -> None:
     rays = np.array([[[10.0, 0.0, -1.5], [30.0, 0.0, -1.5], [10.0, 0.0, 0.5]]])
-    assert meets_road(rays, np.array([0.0, 0.0, 1.5]), np.eye(4), 20.0).tolist() == [[True, False, False]]
+    assert meets_road(rays, np.array([0.0, 0.0, 1.5]), np.eye(4)).tolist() == [[True, False, False]]
 
 
 def test_the_first_fault_in_time_is_told(street_asset: RenderAsset) -> None:
@@ -143,7 +153,7 @@ def test_every_fault_is_a_reason_of_the_render_stage() -> None:
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("hole_max", 1.5), ("width", 8), ("reach_m", float("inf")), ("lens_m", -1.0), ("vehicle_min", 1.1)],
+    [("contrast_min", 1.5), ("width", 8), ("reach_m", float("inf")), ("reach_m", -1.0), ("vehicle_min", 1.1)],
 )
 def test_settings_out_of_range_are_refused(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=f"render gate {name} must be"):

@@ -51,7 +51,7 @@ def test_a_perfect_frame_is_1_either_way_and_one_zero_multiplier_makes_it_0() ->
 
 def test_progress_is_relative_only_where_the_best_compliant_is_more_than_5_m() -> None:
     def ep(raw: list[float], multiplier: list[float]) -> list[float]:
-        return relative_progress(np.array(raw), np.array(multiplier), "batch").tolist()
+        return relative_progress(np.array(raw), np.array(multiplier), False).tolist()
 
     assert ep([5.0, 2.0], [1, 1]) == [1.0, 1.0]  # 5.0 is not more than 5
     assert ep([5.0625, 2.53125], [1, 1]) == [1.0, 0.5]
@@ -64,10 +64,10 @@ def test_progress_is_relative_only_where_the_best_compliant_is_more_than_5_m() -
 def test_pairs_relate_each_row_to_row_0_and_itself_only() -> None:
     raw = np.array([10.0, 20.0, 4.0])
     good, first_offends = np.ones(3), np.array([0.0, 1.0, 1.0])
-    assert relative_progress(raw, good, "batch").tolist() == [0.5, 1.0, 0.2]  # of 20
-    assert relative_progress(raw, good, "pairs").tolist() == [1.0, 1.0, 0.4]  # of 10, 20, 10
-    assert relative_progress(raw, first_offends, "batch").tolist() == [0.5, 1.0, 0.2]
-    assert relative_progress(raw, first_offends, "pairs").tolist() == [1.0, 1.0, 1.0]  # of 0, 20, 4: only 20 exceeds 5
+    assert relative_progress(raw, good, False).tolist() == [0.5, 1.0, 0.2]  # of 20
+    assert relative_progress(raw, good, True).tolist() == [1.0, 1.0, 0.4]  # of 10, 20, 10
+    assert relative_progress(raw, first_offends, False).tolist() == [0.5, 1.0, 0.2]
+    assert relative_progress(raw, first_offends, True).tolist() == [1.0, 1.0, 1.0]  # of 0, 20, 4: only 20 exceeds 5
 
 
 def test_a_scored_batch_on_a_street_adds_up_as_on_paper() -> None:

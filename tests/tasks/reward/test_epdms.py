@@ -49,10 +49,10 @@ def scored(origin: np.ndarray, **settings) -> Scores:
 def test_progress_is_held_against_the_best_of_the_batch_or_against_row_0_alone():
     """Row 0 is 20 m far. The second is 40 m, the third 10 m, the fourth 80 m and breaks a rule."""
     ep_raw_m, multiplier = np.array([20.0, 40.0, 10.0, 80.0]), np.array([1.0, 1.0, 1.0, 0.0])
-    assert relative_progress(ep_raw_m, multiplier, "batch").tolist() == [0.5, 1.0, 0.25, 1.0]
-    assert relative_progress(ep_raw_m, multiplier, "pairs").tolist() == [1.0, 1.0, 0.5, 1.0]
-    assert relative_progress(np.array([3.0, 5.0]), np.ones(2), "pairs").tolist() == [1.0, 1.0], "nobody beyond 5 m"
-    assert relative_progress(np.array([3.0, 5.1]), np.ones(2), "batch").tolist() == [3.0 / 5.1, 1.0]
+    assert relative_progress(ep_raw_m, multiplier, False).tolist() == [0.5, 1.0, 0.25, 1.0]
+    assert relative_progress(ep_raw_m, multiplier, True).tolist() == [1.0, 1.0, 0.5, 1.0]
+    assert relative_progress(np.array([3.0, 5.0]), np.ones(2), True).tolist() == [1.0, 1.0], "nobody beyond 5 m"
+    assert relative_progress(np.array([3.0, 5.1]), np.ones(2), False).tolist() == [3.0 / 5.1, 1.0]
 
 
 def test_the_score_is_a_product_times_a_weighted_mean():

@@ -78,7 +78,7 @@ def test_progress_and_score_are_those_of_the_reward(labels: VocabularyLabels) ->
     metres = np.append(labels.reference_progress_m, labels.ep_raw_m)
     multiplier = np.append(1.0, labels.multiplier)
     for normalise in ("pairs", "batch"):
-        ep = relative_progress(metres, multiplier, normalise)[1:]  # type: ignore[arg-type]
+        ep = relative_progress(metres, multiplier, normalise == "pairs")[1:]  # type: ignore[arg-type]
         np.testing.assert_array_equal(labels.ep(normalise), ep)  # type: ignore[arg-type]
         weighted = 5.0 * ep + 5.0 * labels.ttc + 2.0 * labels.lk + 2.0 * labels.hc
         np.testing.assert_allclose(labels.pdm_score(normalise), labels.multiplier * weighted / 14.0, atol=1e-15)  # type: ignore[arg-type]

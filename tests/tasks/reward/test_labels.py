@@ -12,9 +12,8 @@ from tasks.experts.pdm_closed.planner import PdmSettings
 from tasks.experts.protocol import Plan
 from tasks.reward.epdms import Scores, score
 from tasks.reward.label_bytes import HALVES, WHOLES, VocabularyLabels
-from tasks.reward.labels import Labelling, vocabulary_labels
+from tasks.reward.labels import Labelling, reactive_scores, vocabulary_labels
 from tasks.reward.prepare import prepare_scene
-from tasks.reward.reactive import reactive_scores
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficSettings, simulate
 from tasks.world.clip import NOW, Scene, scene_of_clip

@@ -5,10 +5,10 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from tasks.reward import reactive
+from tasks.reward import labels
 from tasks.reward.epdms import Scores, score
+from tasks.reward.labels import reactive_scores
 from tasks.reward.prepare import prepare_scene
-from tasks.reward.reactive import reactive_scores
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out
 from tests.tasks.rollout.worlds import random_egos, random_scene
 
@@ -22,7 +22,7 @@ def test_the_batch_equals_one_rollout_and_score_after_the_other(seed: int, monke
     scene = replace(scene, centerline=next(iter(scene.clip.road_map.lanes.values())).centerline)
     states = random_egos(scene, seed, 13)
     states[:, 0] = scene.ego_state
-    monkeypatch.setattr(reactive, "EGOS_AT_ONCE", 5)
+    monkeypatch.setattr(labels, "EGOS_AT_ONCE", 5)
     every = reactive_scores(scene, states, IDM)
     ready = prepare_traffic(scene, IDM)
     for k, one in enumerate(states):

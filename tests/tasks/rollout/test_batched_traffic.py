@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from tasks.rollout.rules import CORRIDOR_MARGIN_M, ENTER_CLEARANCE_M, LARGEST_OFFSET_M
 from tasks.rollout.simulate import (
     Rollouts,
     TrafficScene,
@@ -41,7 +42,7 @@ def slow_roll_out(traffic: TrafficScene, ego_states: Array) -> Rollout:
     x, y = (ego_states[:, k] + PACIFICA.rear_axle_to_center * d for k, d in ((X, cos), (Y, sin)))
     driver = slow_idm.IdmDriver(
         of.min_gap_m, of.headway_s, of.accel_max, of.decel_max, of.exponent, of.emergency_decel, of.lookahead_m,
-        of.corridor_margin_m, of.blend_length_m, of.snap_distance_m + 2.0, of.enter_clearance_m,
+        CORRIDOR_MARGIN_M, of.blend_length_m, LARGEST_OFFSET_M, ENTER_CLEARANCE_M,
     )  # fmt: skip
     boxes, velocities, valid, center_z, driven = slow_idm.drive(
         scene.step,

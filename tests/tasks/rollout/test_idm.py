@@ -17,7 +17,7 @@ from tasks.rollout.idm import (
 from tasks.rollout.stretches import stretches_of
 from tasks.world.frames import box_corners
 
-DRIVER = IdmDriver(1.0, 1.5, 1.0, 2.0, 4.0, 8.0, 60.0, 0.0, 20.0, 5.0, 30.0)
+DRIVER = IdmDriver(1.0, 1.5, 1.0, 2.0, 4.0, 8.0, 60.0, 20.0)
 
 
 def one_path(xy: np.ndarray, lines: tuple[tuple[float, int], ...] = ()) -> Paths:
@@ -74,7 +74,7 @@ def test_the_needed_deceleration_stops_half_the_minimum_gap_behind_the_leaders_e
     for speed, gap, lead in ((10.0, 20.0, 0.0), (12.0, 6.0, 8.0)):
         needed = needed_deceleration(speed, gap, lead, DRIVER)
         left = gap + lead**2 / (2.0 * DRIVER.emergency_decel) - speed**2 / (2.0 * needed)
-        assert left == pytest.approx(0.5 * DRIVER.min_gap)
+        assert left == pytest.approx(0.5 * DRIVER.min_gap_m)
 
 
 def test_a_braking_car_stops_where_it_stops_and_never_reverses() -> None:

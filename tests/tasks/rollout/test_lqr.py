@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tasks.rollout.lqr import track, track_local
+from tasks.rollout.lqr import track
 from tasks.world.frames import to_world, wrap_angle
 from tasks.world.vehicle import AX, HEADING, STEERING, VX, YAW_RATE, X, Y
 
@@ -81,11 +81,11 @@ def test_no_plans_give_no_states():
 def test_read_only_and_strided_plans_are_driven_as_they_are():
     plans = np.repeat(arc(9.0, -0.04)[None], 6, axis=0)
     plans[:, :, 1] += 0.1 * np.arange(6)[:, None]
-    expected = track_local(ego_at(0.0, 0.0, 0.0, 9.0), plans)
+    expected = track(ego_at(0.0, 0.0, 0.0, 9.0), plans, local=True)
     strided = np.asfortranarray(plans)[::2]
     plans.flags.writeable = False
-    assert np.array_equal(track_local(ego_at(0.0, 0.0, 0.0, 9.0), plans), expected)
-    assert np.array_equal(track_local(ego_at(0.0, 0.0, 0.0, 9.0), strided), expected[::2])
+    assert np.array_equal(track(ego_at(0.0, 0.0, 0.0, 9.0), plans, local=True), expected)
+    assert np.array_equal(track(ego_at(0.0, 0.0, 0.0, 9.0), strided, local=True), expected[::2])
 
 
 @pytest.mark.parametrize(
@@ -111,4 +111,4 @@ def test_a_bad_value_is_named_with_its_place():
     trajectories = np.zeros((5, 40, 3))
     trajectories[3, 7, 1] = np.nan
     with pytest.raises(ValueError, match=r"trajectories must be finite and at most 1e\+08, element \[3, 7, 1\] is not"):
-        track_local(np.zeros(11), trajectories)
+        track(np.zeros(11), trajectories, local=True)

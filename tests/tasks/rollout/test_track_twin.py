@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from tasks.rollout.lqr import STOPPING_SPEED_MPS, track, track_local
+from tasks.rollout.lqr import STOPPING_SPEED_MPS, track
 from tasks.world.frames import to_world, wrap_angle
 from tasks.world.vehicle import AX, AY, HEADING, STEERING, VX, VY, YAW_RATE, Vehicle, X, Y
 from tests.tasks.rollout import slow_lqr
@@ -105,7 +105,7 @@ def test_ego_frame_trajectories_drive_as_their_world_poses_do(drive: tuple[np.nd
     ego, local = drive
     poses = to_world(ego[:3], local)
     twin(ego, poses, Vehicle())  # leaves out what is not well posed
-    difference = apart(track_local(ego, local), track(ego, poses))
+    difference = apart(track(ego, local, local=True), track(ego, poses))
     assert difference[: HEADING + 1].max() < 1e-11
     assert difference.max() < 1e-9
 
@@ -120,9 +120,9 @@ def test_shifting_and_rotating_the_world_moves_the_states_with_it(
     frame = np.array([*shift, turn])
     moved_ego = ego.copy()
     moved_ego[:3] = to_world(frame, ego[:3])
-    expected = track_local(ego, local)
+    expected = track(ego, local, local=True)
     expected[..., :3] = to_world(frame, expected[..., :3])
-    assert apart(track_local(moved_ego, local), expected).max() < 1e-8
+    assert apart(track(moved_ego, local, local=True), expected).max() < 1e-8
 
 
 @DRIVEN
@@ -131,9 +131,9 @@ def test_neither_order_nor_chunks_change_a_bit(drive: tuple[np.ndarray, np.ndarr
     ego, few = drive
     rng = np.random.default_rng(seed)
     local = few[rng.integers(len(few), size=n_plans)] + rng.normal(0.0, 0.05, (n_plans, 40, 3))
-    together = track_local(ego, local)
+    together = track(ego, local, local=True)
     order = rng.permutation(n_plans)
-    assert np.array_equal(track_local(ego, local[order]), together[order])
+    assert np.array_equal(track(ego, local[order], local=True), together[order])
     cuts = np.sort(rng.integers(0, n_plans + 1, size=3))
-    chunks = [track_local(ego, chunk) for chunk in np.split(local, cuts)]
+    chunks = [track(ego, chunk, local=True) for chunk in np.split(local, cuts)]
     assert np.array_equal(np.concatenate(chunks), together)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tasks.experts.pdm_closed.forecast import forecast
-from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings, pdm_closed_poses, plan_for
+from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings, plan_for
 from tasks.experts.pdm_closed.proposals import driver, idm_step, proposals
 from tasks.experts.protocol import Plan
 from tasks.stages import Rejected
@@ -173,7 +173,7 @@ def test_the_plan_is_the_first_best_proposal_and_sees_nothing_of_the_future(road
     valid = scene.agents.valid.copy()
     valid[scene.step + 1 :] = False
     blind = replace(scene, agents=replace(scene.agents, boxes=boxes, valid=valid))
-    np.testing.assert_array_equal(pdm_closed_poses(blind), result.poses)
+    np.testing.assert_array_equal(plan_for(blind).poses, result.poses)
 
 
 def test_a_free_proposal_inherits_the_velocity_of_a_slower_ones_lead_unless_told_not_to() -> None:
@@ -224,7 +224,7 @@ def test_a_route_without_length_is_a_rejection(road: Road) -> None:
     assert isinstance(result, Rejected)
     assert (result.stage, result.reason) == ("expert", "no_plan")
     with pytest.raises(ValueError, match="length"):
-        pdm_closed_poses(scene)
+        plan_for(scene)
 
 
 def test_a_speed_limit_of_zero_is_an_error_and_not_a_division(road: Road) -> None:

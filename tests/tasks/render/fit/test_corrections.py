@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from tasks.render.fit.backdrop import backdrop, backdrop_gradient, sky_cells
-from tasks.render.fit.exposure import affine_between, aligned, exposed, exposed_gradient
-from tasks.render.fit.poses import between, corrected, motion
-from tasks.render.fit.schedule import decayed, photo_at
+from tasks.render.fit.corrections import affine_between, aligned, between, corrected, exposed, exposed_gradient, motion
+from tasks.render.fit.reconstruct import decayed, photo_at
 from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.gradient import backward
@@ -108,4 +107,4 @@ def test_every_photo_is_looked_at_once_a_round() -> None:
 
 
 def test_rates_fall_exponentially() -> None:
-    assert [decayed(2.0, 0.01, p) for p in (0.0, 0.5, 1.0)] == pytest.approx([2.0, 0.2, 0.02])
+    assert [decayed(0.01, p) for p in (0.0, 0.5, 1.0)] == pytest.approx([1.0, 0.1, 0.01])

@@ -8,8 +8,8 @@ import street
 from numpy.typing import NDArray
 
 from tasks.render.fit.adam import BETA1, Learned
-from tasks.render.fit.reconstruct import advance, corrections_at, finish, picture_of, reconstruct
-from tasks.render.fit.schedule import photo_at
+from tasks.render.fit.reconstruct import RATE_END, advance, corrections_at, finish, photo_at, picture_of, reconstruct
+from tasks.render.fit.road import SLACK_M
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import Problem, prepare
 from tasks.render.fit.state import SHAPES, FitState
@@ -143,7 +143,7 @@ def test_a_camera_keeps_its_pose_until_pose_from_and_then_shifts_and_turns_at_ra
     assert not poses.any()
     row = photo_at(SETTINGS.pose_from, len(problem.train), SETTINGS.seed)
     advance(problem, state, SETTINGS, SETTINGS.pose_from + 1)
-    fall = SETTINGS.rate_end ** (SETTINGS.pose_from / SETTINGS.iterations)
+    fall = RATE_END ** (SETTINGS.pose_from / SETTINGS.iterations)
     rates = fall * np.repeat([SETTINGS.shift_rate, SETTINGS.turn_rate], 3)
     np.testing.assert_allclose(np.abs(poses[row]), rates, rtol=1e-3)
     assert not np.delete(poses, row, axis=0).any()
@@ -227,7 +227,7 @@ def test_road_gaussians_stay_on_the_road(prepared: tuple[Problem, FitState]) -> 
     advance(problem, state, SETTINGS, 12)
     heights = state.learned["means"].values[state.road, 2]
     assert state.road.sum() > 100
-    assert np.abs(heights + problem.origin[2]).max() < SETTINGS.road_slack + 0.01
+    assert np.abs(heights + problem.origin[2]).max() < SLACK_M + 0.01
 
 
 def test_progress_is_told_and_photos_are_needed() -> None:

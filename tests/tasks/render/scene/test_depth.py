@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from slow_raster import covariances_of
 
 from tasks.render.scene.choose import BACKGROUND, Look, choose
 from tasks.render.scene.depth import dense_depth, sparse_depth
-from tasks.render.scene.sky import SkyCollector, directions
+from tasks.render.scene.sky import directions, sky_of_views
 from tasks.render.scene.surfels import discs_of_photo, gaussians_of
-from tasks.render.splatting.gaussians import covariances_of
 
 INTRINSICS = np.array([[80.0, 0.0, 40.0], [0.0, 80.0, 30.0], [0.0, 0.0, 1.0]])
 WIDTH, HEIGHT = 80, 60
@@ -26,7 +26,7 @@ def test_gaps_on_a_plane_are_closed_exactly() -> None:
     sparse[rows, 1::3] = truth[rows, 1::3]
     label = np.where(sparse > 0, -1, -2).astype(np.int32)
     grey = np.full((HEIGHT, WIDTH, 3), 0.4, np.float32)
-    dense, labels = dense_depth(sparse, label, grey, (12, 24))
+    dense, labels = dense_depth(sparse, label, grey)
     inside = np.zeros_like(truth, bool)
     inside[43:60, 4:75] = True  # above, noise would be smoothed one-sidedly
     assert (dense[inside] > 0).all() and (labels[inside] == -1).all()
@@ -38,7 +38,7 @@ def test_a_gap_takes_the_depth_of_the_surface_its_colour_belongs_to() -> None:
     sparse[:, 20], sparse[:, 30] = 5.0, 25.0
     rgb = np.zeros((HEIGHT, WIDTH, 3), np.float32)
     rgb[:, 28:] = 0.8  # the edge of the near, dark surface is at column 28
-    dense, _ = dense_depth(sparse, np.where(sparse > 0, -1, -2).astype(np.int32), rgb, (12, 24))
+    dense, _ = dense_depth(sparse, np.where(sparse > 0, -1, -2).astype(np.int32), rgb)
     assert np.allclose(dense[:, 21:28], 5.0) and np.allclose(dense[:, 28:30], 25.0)
 
 
@@ -46,7 +46,7 @@ def test_nothing_is_invented_beyond_the_last_return() -> None:
     sparse = np.zeros((HEIGHT, WIDTH), np.float32)
     sparse[40:50, 30:50] = 8.0
     label = np.where(sparse > 0, -1, -2).astype(np.int32)
-    dense, _ = dense_depth(sparse, label, np.zeros((HEIGHT, WIDTH, 3), np.float32), (12, 24))
+    dense, _ = dense_depth(sparse, label, np.zeros((HEIGHT, WIDTH, 3), np.float32))
     assert not dense[:35].any() and not dense[:, :25].any()
 
 
@@ -87,7 +87,7 @@ def test_a_second_photo_from_the_same_place_adds_nothing() -> None:
 
 
 def test_discs_become_flat_gaussians_that_lie_in_their_surface() -> None:
-    gaussians = gaussians_of(look((1, 1, 1), 4.0, 0.0).discs, np.zeros(3))
+    gaussians = gaussians_of(look((1, 1, 1), 4.0, 0.0).discs)
     covariances = covariances_of(gaussians)
     assert np.sqrt(covariances[:, 2, 2]).max() < 0.2 * np.sqrt(covariances[:, 0, 0]).min()
     assert np.abs(np.linalg.norm(gaussians.quats, axis=1) - 1.0).max() < 1e-5
@@ -107,9 +107,7 @@ def test_the_sky_is_the_colour_that_was_seen_in_its_direction() -> None:
     up = rays[..., 2] > 0.02
     colours = np.zeros((60, 80, 3), np.float32)
     colours[..., 0] = np.linspace(0, 1, 80)[None, :]
-    collector = SkyCollector()
-    collector.add(rays[up], colours[up], np.ones(up.sum(), bool))
-    sky = collector.finish()
+    sky = sky_of_views([(rays[up], colours[up], np.ones(up.sum(), bool))])
     pose = np.array([[0, 0, 1.0, 50.0], [-1, 0, 0, -9.0], [0, -1, 0, 3.0], [0, 0, 0, 1]])  # elsewhere, same heading
     seen = sky.seen_by(INTRINSICS, pose, 80, 60)
     inside = np.zeros((60, 80), bool)

@@ -76,7 +76,7 @@ def test_a_track_nobody_photographed_is_a_visible_box(street_asset: RenderAsset)
 
 def test_held_out_photos_do_not_enter_the_scene() -> None:
     photos, sweeps = street.drive(6, with_car=False)
-    settings = AssetSettings(hold_out_every=6, refit_sweeps=1)
+    settings = AssetSettings(hold_out_every=6)
     honest = build_asset(photos, sweeps, None, settings)
     spoiled = [*photos[:3], Photo("front", 0.75, 255 - photos[3].rgb, street.INTRINSICS, photos[3].world_from_camera)]
     other = build_asset([*spoiled, *photos[4:]], sweeps, None, settings)
@@ -87,7 +87,7 @@ def test_held_out_photos_do_not_enter_the_scene() -> None:
 
 def test_the_same_input_gives_the_same_scene_and_the_world_may_lie_anywhere(street_asset: RenderAsset) -> None:
     photos, sweeps = street.drive(4, with_car=False)
-    settings = AssetSettings(hold_out_every=0, refit_sweeps=1)
+    settings = AssetSettings(hold_out_every=0)
     here = build_asset(photos, sweeps, None, settings)
     again = build_asset(photos, sweeps, None, settings)
     assert here.background.means.tobytes() == again.background.means.tobytes()

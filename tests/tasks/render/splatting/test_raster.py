@@ -3,13 +3,12 @@
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from slow_raster import covariances_of
 
 from tasks.render.splatting.gaussians import (
     EMPTY,
     Gaussians,
     concatenate,
-    covariances_of,
-    mirrored,
     moved,
     quats_of,
     rotations_of,
@@ -141,12 +140,6 @@ def test_moving_scene_and_camera_together_changes_nothing() -> None:
     here = forward(scene, INTRINSICS, pose(0.1, (0.1, 0.0, 0.0)), WIDTH, HEIGHT, BLACK).view
     there = forward(moved(scene, motion), INTRINSICS, motion @ pose(0.1, (0.1, 0, 0)), WIDTH, HEIGHT, BLACK).view
     assert np.abs(here.rgb - there.rgb).max() <= 2.0 / 255.0
-
-
-def test_mirroring_reflects_covariances_at_the_length_axis() -> None:
-    scene, flip = cloud(50, seed=6), np.diag([1.0, -1.0, 1.0])
-    np.testing.assert_allclose(covariances_of(mirrored(scene)), flip @ covariances_of(scene) @ flip, atol=1e-6)
-    np.testing.assert_allclose(mirrored(mirrored(scene)).means, scene.means)
 
 
 def test_quaternions_and_rotations_are_inverse() -> None:

@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -108,13 +107,3 @@ def test_objects_left_out_along_a_path_are_those_that_nothing_on_it_touches() ->
     met = within_reach(everywhere, (0.0, 0.0, 1.0, 1.0), *EGO_SIZE)
     assert np.array_equal(met.items, everywhere.items)
     assert np.array_equal(met.starts, everywhere.starts)
-
-
-def test_arrays_that_do_not_fit_are_refused_by_name() -> None:
-    boxes = np.zeros((41, 3, 5))
-    with pytest.raises(ValueError, match=r"boxes must be \(T, N, 5\), got \(41, 3, 4\)"):
-        unindexed(boxes[..., :4], np.zeros(3, dtype=bool), np.zeros(3))
-    with pytest.raises(ValueError, match=r"is_stopped and collision_score must be \(3,\)"):
-        index_obstacles(boxes, np.zeros(2, dtype=bool), np.zeros(3), RADIUS_M)
-    with pytest.raises(ValueError, match="ego_circumradius_m must be a positive length"):
-        index_obstacles(boxes, np.zeros(3, dtype=bool), np.zeros(3), math.nan)

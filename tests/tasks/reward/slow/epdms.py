@@ -38,7 +38,7 @@ def score(
     ]
     raw = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     multiplier = np.prod([raw[name] for name in ("nc", "dac", "tlc", "ddc")], axis=0)
-    ep = relative_progress(raw["ep_raw_m"], multiplier, normalise)
+    ep = relative_progress(raw["ep_raw_m"], multiplier, normalise == "pairs")
     weighted = (5.0 * ep + 5.0 * raw["ttc"] + 2.0 * raw["lk"] + 2.0 * raw["hc"]) / 14.0
     return Scores(ep=ep, multiplier=multiplier, pdm_score=multiplier * weighted, **raw)
 
