@@ -11,7 +11,7 @@ SPLITS = ("train", "val", "test")
 
 
 class BadClip(Exception):
-    """The input is broken: says which file, which field, and how to mend it."""
+    """The input is broken: says which file, which field, and how to fix it."""
 
     def __init__(self, file: str, field: str, problem: str) -> None:
         super().__init__(f"{file}: {field}: {problem}")

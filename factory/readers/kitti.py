@@ -185,11 +185,10 @@ def _poses(folder: Path) -> Array:
         rows.append(row[:6])
     latitude, longitude, altitude, roll, pitch, yaw = np.stack(rows, axis=1)
     scale = np.cos(np.radians(latitude[0])) * EARTH_RADIUS_M
+    north = scale * np.log(np.tan(np.radians(90.0 + latitude) / 2.0))
+    place = np.column_stack([scale * np.radians(longitude), north, altitude])
     out = np.tile(np.eye(4), (len(rows), 1, 1))
-    out[:, 0, 3] = scale * np.radians(longitude)
-    out[:, 1, 3] = scale * np.log(np.tan(np.radians(90.0 + latitude) / 2.0))
-    out[:, 2, 3] = altitude
-    out[:, :3, 3] -= out[0, :3, 3].copy()
+    out[:, :3, 3] = place - place[0]
     out[:, :3, :3] = _turn(2, yaw) @ _turn(1, pitch) @ _turn(0, roll)
     return out
 

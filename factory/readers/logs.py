@@ -14,7 +14,7 @@ clip. With it a run sees that a log was changed though its clips lie prepared in
 `block(ref) -> str | None`, names the block that the clip is rendered from, as cheaply; with it the block is built once,
 as a task of its own, before its clips are prepared.
 
-Wherever the input is broken, raise `BadClip(file, field, how to mend it)`. Units: metres, radians, seconds, one world
+Wherever the input is broken, raise `BadClip(file, field, how to fix it)`. Units: metres, radians, seconds, one world
 frame per log; the columns of ego states are named in tasks.world.vehicle, absent agents hold NaN and valid = False.
 """
 
@@ -31,17 +31,18 @@ import numpy as np
 from factory.readers.base import SPLITS, BadClip, ClipIndex, ClipRef, split_of
 from factory.readers.settings import LogClips, WindowSettings
 from factory.readers.validate import validate_clip
-from factory.readers.windows import drop_reason, window_starts
 from tasks.world.agents import AgentTracks
 from tasks.world.arrays import Array, Ints
 from tasks.world.camera import Camera, SensorFile
 from tasks.world.clip import CLIP_STEPS, NOW, STEP_S, Block, Clip
 from tasks.world.lanes import RoadMap, Route, TrafficLights
 from tasks.world.route import NoRoute, RouteFinder, route_of_log
+from tasks.world.vehicle import VX, VY, X, Y
 
 STEP_MS = round(STEP_S * 1000)
 ROUTE_SAMPLE_STEPS = 2  # the route looks at the ego every 0.2 s
 CACHED_LOGS = 2
+EGO_STANDING, BROKEN_TRACKS = "ego_standing", "broken_tracks"  # reasons of the stage "clip"
 
 
 @dataclass(frozen=True)
@@ -155,16 +156,16 @@ class LogReader(ABC, Generic[Log]):
                 continue
             driven = np.flatnonzero(np.isfinite(drive.ego_states).all(axis=1))
             first, n_steps = (int(driven[0]), int(driven[-1] - driven[0]) + 1) if len(driven) else (0, 0)
-            starts = window_starts(n_steps, self.windows)  # the first window begins where the ego's drive does
+            # The first window begins where the ego's drive does.
+            starts = range(self.windows.first_step, n_steps - CLIP_STEPS + 1, self.windows.stride_steps)
             if not starts:
                 needs_s = (self.windows.first_step + CLIP_STEPS) * STEP_S
                 skipped[log_id] = f"{n_steps * STEP_S:.1f} s {self.length_is}, a clip needs {needs_s:.1f} s"
             for start in (first + offset for offset in starts):
-                reason = self._drop_reason(drive, start, start + CLIP_STEPS)
-                if reason is None:
-                    refs.append(ClipRef(self.name, log_id, start * STEP_MS))
-                else:
+                if reason := self._drop_reason(drive, start, start + CLIP_STEPS):
                     dropped[reason] += 1
+                else:
+                    refs.append(ClipRef(self.name, log_id, start * STEP_MS))
         return ClipIndex(tuple(refs), dict(dropped), skipped, broken)
 
     def read(self, ref: ClipRef) -> Clip:
@@ -217,16 +218,21 @@ class LogReader(ABC, Generic[Log]):
         return path
 
     def _drop_reason(self, drive: Drive, start: int, stop: int) -> str | None:
-        segment = drive.segment[start:stop]
+        """Why the window is dropped; None keeps it."""
+        ego, segment = drive.ego_states[start:stop], drive.segment[start:stop]
+        if np.hypot(ego[:, VX], ego[:, VY]).max() < self.windows.min_top_speed_mps:
+            return EGO_STANDING
+        moved = np.diff(np.concatenate([ego[:, None, [X, Y]], drive.agents.boxes[start:stop, :, :2]], axis=1), axis=0)
+        jumped = (
+            np.hypot(*np.moveaxis(moved, -1, 0)) > self.windows.max_speed_mps * STEP_S
+        )  # false next to absent steps
         unbroken = (segment >= 0) & (segment == segment[0])
-        return drop_reason(drive.ego_states[start:stop], drive.agents.window(start, stop), unbroken, self.windows)
+        return None if unbroken.all() and not jumped.any() else BROKEN_TRACKS
 
     def _log(self, ref: ClipRef) -> Log:
         if ref.log_id not in self._logs:
             log = self.load(self.path_of(ref))
-            while len(self._logs) >= CACHED_LOGS:
-                del self._logs[next(iter(self._logs))]
-            self._logs[ref.log_id] = log
+            self._logs = dict([*self._logs.items(), (ref.log_id, log)][-CACHED_LOGS:])
         return self._logs[ref.log_id]
 
 

@@ -37,16 +37,8 @@ _OPCODES = frozenset(_PLAIN_OPCODES.split())
 _DTYPE = re.compile(r"([biuf])(1|2|4|8)|[SU][1-9]\d{0,4}")
 # What a hostile or truncated stream can make the unpickler raise; BadClip passes through it untouched.
 _LOAD_ERRORS = (
-    pickle.UnpicklingError,
-    EOFError,
-    ValueError,
-    TypeError,
-    KeyError,
-    IndexError,
-    AttributeError,
-    OverflowError,
-    MemoryError,
-    RecursionError,
+    *(pickle.UnpicklingError, EOFError, ValueError, TypeError, LookupError, AttributeError),
+    *(OverflowError, MemoryError, RecursionError),
 )
 
 
@@ -83,27 +75,13 @@ class _Unpickler(pickle.Unpickler):
     def __init__(self, data: bytes, file: str) -> None:
         super().__init__(io.BytesIO(data))
         self._file = file
-        self._stand_ins = _stand_ins(file, _Budget(file, BUDGET_BASE_BYTES + BUDGET_PER_BYTE * len(data)))
+        self._stand_ins = _stand_ins(file, BUDGET_BASE_BYTES + BUDGET_PER_BYTE * len(data))
 
     def find_class(self, module: str, name: str) -> Any:
-        stand_in = self._stand_ins.get((module, name))
-        if stand_in is None:
-            raise BadClip(
-                self._file, "pickle", f"refused global {module}.{name}; only plain containers and arrays load"
-            )
-        return stand_in
-
-
-class _Budget:
-    """Bytes that arrays and copies of one load may still take."""
-
-    def __init__(self, file: str, left: int) -> None:
-        self.file, self.left = file, left
-
-    def spend(self, n_bytes: int) -> None:
-        self.left -= n_bytes
-        if self.left < 0:
-            raise BadClip(self.file, "pickle", "arrays outgrow the memory that a file of this size may ask for")
+        if (module, name) not in self._stand_ins:
+            problem = f"refused global {module}.{name}; only plain containers and arrays load"
+            raise BadClip(self._file, "pickle", problem)
+        return self._stand_ins[module, name]
 
 
 class _Dtype:
@@ -133,8 +111,24 @@ class _Array(np.ndarray):
         super().__setstate__(checked)
 
 
-def _stand_ins(file: str, budget: _Budget) -> dict[tuple[str, str], Callable[..., Any]]:
-    """(module, name) -> what a global stands for. Functions are made anew per load: no stream can alter another's."""
+def _stand_ins(file: str, budget: int) -> dict[tuple[str, str], Callable[..., Any]]:
+    """(module, name) -> what a global stands for. Functions are made anew per load: no stream can alter another's.
+
+    budget: bytes that arrays and copies may take.
+    """
+    left = budget
+
+    def spend(n_bytes: int) -> None:
+        nonlocal left
+        left -= n_bytes
+        if left < 0:
+            raise BadClip(file, "pickle", "arrays outgrow the memory that a file of this size may ask for")
+
+    def content(raw: object, dtype: object) -> np.ndarray:
+        if not isinstance(raw, bytes | bytearray) or not isinstance(dtype, _Dtype):
+            raise ValueError("values without a checked dtype and bytes")
+        spend(len(raw))
+        return np.frombuffer(bytes(raw), dtype=dtype.dtype)
 
     def array_class(*_: object) -> object:
         raise BadClip(file, "pickle", "refused a direct call of numpy.ndarray")
@@ -143,31 +137,22 @@ def _stand_ins(file: str, budget: _Budget) -> dict[tuple[str, str], Callable[...
         if subtype is not array_class:
             raise BadClip(file, "pickle", f"refused array subclass {subtype!r}")
         empty = np.empty(0, np.uint8).view(_Array)
-        empty.spend = budget.spend
+        empty.spend = spend
         return empty
 
     def from_buffer(raw: object, dtype: object, shape: tuple[int, ...], order: str) -> np.ndarray:
-        if not isinstance(raw, bytes | bytearray) or not isinstance(dtype, _Dtype):
-            raise ValueError("array buffer without a checked dtype and bytes")
-        budget.spend(len(raw))
-        return np.frombuffer(bytes(raw), dtype=dtype.dtype).reshape(shape, order="F" if order == "F" else "C").copy()
+        return content(raw, dtype).reshape(shape, order="F" if order == "F" else "C").copy()
 
     def scalar(dtype: object, raw: object) -> Any:
-        if not isinstance(dtype, _Dtype) or not isinstance(raw, bytes):
-            raise ValueError("scalar without a checked dtype and bytes")
-        budget.spend(len(raw))
-        (value,) = np.frombuffer(raw, dtype=dtype.dtype)
+        (value,) = content(raw, dtype)
         return value
 
     def encode(text: str, encoding: str) -> bytes:
         """How Python 2's protocols write bytes."""
         if encoding != "latin1":
             raise ValueError(f"bytes written as {encoding}")
-        budget.spend(len(text))
+        spend(len(text))
         return text.encode("latin1")
-
-    def make_dtype(spec: object, align: object = False, copy: object = False) -> _Dtype:
-        return _Dtype(spec, file)
 
     def plain_dict(*arguments: object) -> dict[Any, Any]:
         """defaultdict(factory) and OrderedDict(); their items follow as opcodes. The factory is dropped."""
@@ -175,7 +160,7 @@ def _stand_ins(file: str, budget: _Budget) -> dict[tuple[str, str], Callable[...
 
     def copied(kind: Callable[[Iterable[object]], Any]) -> Callable[..., Any]:
         def build(items: list[object] | tuple[object, ...] | str = ()) -> Any:
-            budget.spend(64 * len(items))
+            spend(64 * len(items))
             return kind(items)
 
         return build
@@ -184,7 +169,7 @@ def _stand_ins(file: str, budget: _Budget) -> dict[tuple[str, str], Callable[...
         ("collections", "defaultdict"): plain_dict,
         ("collections", "OrderedDict"): plain_dict,
         ("numpy", "ndarray"): array_class,
-        ("numpy", "dtype"): make_dtype,
+        ("numpy", "dtype"): lambda spec, align=False, copy=False: _Dtype(spec, file),
         ("_codecs", "encode"): encode,
     }
     for package in ("numpy.core", "numpy._core"):  # numpy 1 and 2

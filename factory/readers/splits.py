@@ -7,14 +7,8 @@ wins over what is known of single logs: whoever sorted the logs said so.
 import re
 from pathlib import Path, PurePosixPath
 
-FOLDERS = {
-    "train": "train",
-    "val": "val",
-    "test": "test",
-    "training": "train",  # Waymo's names
-    "validation": "val",
-    "testing": "test",
-}
+WAYMO = {"training": "train", "validation": "val", "testing": "test"}
+FOLDERS = {"train": "train", "val": "val", "test": "test", **WAYMO}
 # nuscenes-devkit @ d9de17a, python-sdk/nuscenes/utils/splits.py: the 150 scenes `val` of v1.0-trainval, whose other 700
 # are `train`; `mini_val` of v1.0-mini; all of v1.0-test is `test`. The train scenes of the mini version are partly the
 # whole data set's val scenes, so the version in a file's name decides.
@@ -50,7 +44,7 @@ def nuscenes_split(scenario: str) -> str | None:
     return None if held_out is None else "val" if scene in held_out else "train"
 
 
-def waymo_split(source_file: str) -> str | None:
+def waymo_split(source_file: object) -> str | None:
     """The split of the record that a scenario was converted from: training*, validation*, testing*.tfrecord-*."""
-    name = PurePosixPath(source_file).name
-    return next((FOLDERS[word] for word in ("training", "validation", "testing") if name.startswith(word)), None)
+    name = PurePosixPath(source_file).name if isinstance(source_file, str) else ""
+    return next((split for word, split in WAYMO.items() if name.startswith(word)), None)

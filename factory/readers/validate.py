@@ -54,31 +54,25 @@ def _faults(clip: Clip) -> Iterator[Fault]:
     yield from _array("ego_states", clip.ego_states, (CLIP_STEPS, EGO_STATE_SIZE))
     yield from _array("world_from_ego", clip.world_from_ego, (CLIP_STEPS, 4, 4))
     yield from _agent_faults(clip)
-    fault = map_fault(clip.road_map)
-    if fault is not None:
+    if fault := map_fault(clip.road_map):
         yield fault
     yield from _route_faults(clip)
-    yield from _polyline("centerline", clip.centerline, 3)
+    yield from _polyline("centerline", clip.centerline)
     yield from _light_faults(clip)
     yield from _sensor_faults(clip)
 
 
 def _agent_faults(clip: Clip) -> Iterator[Fault]:
     agents, n = clip.agents, len(clip.agents)
-    for name, array, shape in (
-        ("boxes", agents.boxes, (CLIP_STEPS, n, 5)),
-        ("velocities", agents.velocities, (CLIP_STEPS, n, 2)),
-        ("valid", agents.valid, (CLIP_STEPS, n)),
-        ("center_z", agents.center_z, (CLIP_STEPS, n)),
-        ("heights", agents.heights, (n,)),
-    ):
-        yield from _shape(f"agents.{name}", array, shape)
+    columns: dict[str, tuple[int, ...]] = {"boxes": (5,), "velocities": (2,), "valid": (), "center_z": ()}
+    for name, last in columns.items():
+        yield from _shape(f"agents.{name}", getattr(agents, name), (CLIP_STEPS, n, *last))
+    yield from _shape("agents.heights", agents.heights, (n,))
     if agents.valid.dtype != np.bool_:
         yield "agents.valid", f"dtype {agents.valid.dtype}, expected bool"
     if len(agents.kinds) != n:
         yield "agents.kinds", "not one kind per track"
-    strange = sorted({repr(kind) for kind in agents.kinds if not isinstance(kind, AgentKind)})
-    if strange:
+    if strange := sorted({repr(kind) for kind in agents.kinds if not isinstance(kind, AgentKind)}):
         yield "agents.kinds", f"{', '.join(strange)}: expected tasks.world.agents.AgentKind"
     if len(set(agents.track_ids)) != n:
         yield "agents.track_ids", "a track id stands twice"
@@ -108,8 +102,7 @@ def _map_faults(road_map: RoadMap) -> Iterator[Fault]:
             yield from _ring(f"road_map.drivable_areas[{i}]", ring)
     for i, ring in enumerate(road_map.crossings):
         yield from _ring(f"road_map.crossings[{i}]", ring)
-    unknown = sorted(set(road_map.roadblock_of) - set(lanes))
-    if unknown:
+    if unknown := sorted(set(road_map.roadblock_of) - set(lanes)):
         yield "road_map.roadblock_of", f"names lanes that are not on the map: {_some(unknown)}"
 
 
@@ -119,10 +112,9 @@ def _lane_faults(field: str, lane_id: str, lane: Any) -> Iterator[Fault]:
     if lane.lane_id != lane_id:
         yield field, f"its lane_id is {lane.lane_id!r}"
     yield from _ring(f"{field}.ring", lane.ring)
-    yield from _polyline(f"{field}.centerline", lane.centerline, 3)
+    yield from _polyline(f"{field}.centerline", lane.centerline)
     for side in ("left_boundary", "right_boundary"):
-        line = getattr(lane, side)
-        if line is not None:
+        if (line := getattr(lane, side)) is not None:
             yield from _array(f"{field}.{side}", line, (None, 3))
 
 
@@ -131,18 +123,12 @@ def _route_faults(clip: Clip) -> Iterator[Fault]:
     if not route.lane_ids:
         yield "route.lane_ids", "empty"
     for name in ("lane_ids", "lane_path"):
-        unknown = sorted(set(getattr(route, name)) - set(clip.road_map.lanes))
-        if unknown:
+        if unknown := sorted(set(getattr(route, name)) - set(clip.road_map.lanes)):
             yield f"route.{name}", f"not on the map: {_some(unknown)}"
-    without = sorted(set(route.lane_ids) - set(blocks))
-    if without:
-        yield (
-            "road_map.roadblock_of",
-            f"has no roadblock of on-route {_some(without)}: fill it with tasks.world.route.roadblocks_of(lanes)",
-        )
-    passed = set(route.roadblock_ids)
-    beside = sorted({blocks[lane_id] for lane_id in route.lane_ids} - passed)
-    if beside:
+    if without := sorted(set(route.lane_ids) - set(blocks)):
+        how = "fill it with tasks.world.route.roadblocks_of(lanes)"
+        yield "road_map.roadblock_of", f"has no roadblock of on-route {_some(without)}: {how}"
+    if beside := sorted({blocks[lane_id] for lane_id in route.lane_ids} - set(route.roadblock_ids)):
         yield "route.roadblock_ids", f"lacks the roadblocks of on-route lanes: {_some(beside)}"
 
 
@@ -151,8 +137,7 @@ def _light_faults(clip: Clip) -> Iterator[Fault]:
     if not lights.lane_ids:
         return
     yield from _shape("lights.states", lights.states, (CLIP_STEPS, len(lights.lane_ids)))
-    strange = sorted(set(np.unique(lights.states).tolist()) - {int(state) for state in LightState})
-    if strange:
+    if strange := sorted(set(np.unique(lights.states).tolist()) - {int(state) for state in LightState}):
         yield "lights.states", f"{_some(strange)}: expected tasks.world.lanes.LightState"
 
 
@@ -162,8 +147,7 @@ def _sensor_faults(clip: Clip) -> Iterator[Fault]:
     names = [camera.name for camera in clip.cameras]
     if len(set(names)) != len(names):
         yield "cameras", "a name stands twice"
-    uncalibrated = sorted({image.sensor for image in clip.images} - set(names))
-    if uncalibrated:
+    if uncalibrated := sorted({image.sensor for image in clip.images} - set(names)):
         yield "images", f"no calibration of camera {uncalibrated}"
     for kind in ("images", "sweeps"):
         for i, file in enumerate(getattr(clip, kind)):
@@ -191,8 +175,8 @@ def _ring(field: str, ring: Any) -> Iterator[Fault]:
         yield field, f"{len(ring)} points: a closed ring has four or more"
 
 
-def _polyline(field: str, line: Any, columns: int) -> Iterator[Fault]:
-    yield from _array(field, line, (None, columns))
+def _polyline(field: str, line: Any) -> Iterator[Fault]:
+    yield from _array(field, line, (None, 3))
     if len(line) < 2:
         yield field, f"{len(line)} points: a line has two or more"
 

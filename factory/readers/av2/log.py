@@ -8,7 +8,6 @@ velocities by least squares. File format: that of argoverse/av2-api.
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 import pyarrow as pa
@@ -36,41 +35,17 @@ STANDING_SPEED_MPS = 0.1  # slower is standing: velocity (and the ego's accelera
 SAME_FRAME_S = STEP_S / 2  # a step sees the annotated frame that is at most this far away
 ROUNDING_S = 1e-9
 
-KIND_OF_CATEGORY: Mapping[str, AgentKind] = MappingProxyType(
-    {
-        "REGULAR_VEHICLE": AgentKind.VEHICLE,
-        "LARGE_VEHICLE": AgentKind.VEHICLE,
-        "BUS": AgentKind.VEHICLE,
-        "ARTICULATED_BUS": AgentKind.VEHICLE,
-        "SCHOOL_BUS": AgentKind.VEHICLE,
-        "BOX_TRUCK": AgentKind.VEHICLE,
-        "TRUCK": AgentKind.VEHICLE,
-        "TRUCK_CAB": AgentKind.VEHICLE,
-        "VEHICULAR_TRAILER": AgentKind.VEHICLE,
-        "MESSAGE_BOARD_TRAILER": AgentKind.VEHICLE,
-        "TRAFFIC_LIGHT_TRAILER": AgentKind.VEHICLE,
-        "RAILED_VEHICLE": AgentKind.VEHICLE,
-        "PEDESTRIAN": AgentKind.PEDESTRIAN,
-        "OFFICIAL_SIGNALER": AgentKind.PEDESTRIAN,
-        "STROLLER": AgentKind.PEDESTRIAN,
-        "WHEELCHAIR": AgentKind.PEDESTRIAN,
-        "BICYCLE": AgentKind.BICYCLE,
-        "BICYCLIST": AgentKind.BICYCLE,
-        "MOTORCYCLE": AgentKind.BICYCLE,
-        "MOTORCYCLIST": AgentKind.BICYCLE,
-        "WHEELED_DEVICE": AgentKind.BICYCLE,
-        "WHEELED_RIDER": AgentKind.BICYCLE,
-        "BOLLARD": AgentKind.BARRIER,
-        "CONSTRUCTION_BARREL": AgentKind.TRAFFIC_CONE,
-        "CONSTRUCTION_CONE": AgentKind.TRAFFIC_CONE,
-        "SIGN": AgentKind.CZONE_SIGN,
-        "STOP_SIGN": AgentKind.CZONE_SIGN,
-        "MOBILE_PEDESTRIAN_SIGN": AgentKind.CZONE_SIGN,
-        "MOBILE_PEDESTRIAN_CROSSING_SIGN": AgentKind.CZONE_SIGN,
-        "DOG": AgentKind.GENERIC_OBJECT,
-        "ANIMAL": AgentKind.GENERIC_OBJECT,
-    }
-)
+_CATEGORIES = {
+    AgentKind.VEHICLE: "REGULAR_VEHICLE LARGE_VEHICLE BUS ARTICULATED_BUS SCHOOL_BUS BOX_TRUCK TRUCK TRUCK_CAB "
+    "VEHICULAR_TRAILER MESSAGE_BOARD_TRAILER TRAFFIC_LIGHT_TRAILER RAILED_VEHICLE",
+    AgentKind.PEDESTRIAN: "PEDESTRIAN OFFICIAL_SIGNALER STROLLER WHEELCHAIR",
+    AgentKind.BICYCLE: "BICYCLE BICYCLIST MOTORCYCLE MOTORCYCLIST WHEELED_DEVICE WHEELED_RIDER",
+    AgentKind.BARRIER: "BOLLARD",
+    AgentKind.TRAFFIC_CONE: "CONSTRUCTION_BARREL CONSTRUCTION_CONE",
+    AgentKind.CZONE_SIGN: "SIGN STOP_SIGN MOBILE_PEDESTRIAN_SIGN MOBILE_PEDESTRIAN_CROSSING_SIGN",
+    AgentKind.GENERIC_OBJECT: "DOG ANIMAL",
+}
+KIND_OF_CATEGORY = {name: kind for kind, names in _CATEGORIES.items() for name in names.split()}
 
 
 @dataclass(frozen=True)
@@ -111,16 +86,12 @@ class LogMotion:
 
 def seconds_since(start_ns: int, stamps_ns: Ints) -> Array:
     """Seconds from start_ns to each stamp; the difference is taken in integers."""
-    seconds: Array = (stamps_ns - start_ns).astype(np.float64)
-    seconds /= 1e9
-    return seconds
+    return np.asarray((stamps_ns - start_ns) / 1e9, np.float64)
 
 
 def step_times(start: int, stop: int) -> Array:
     """Seconds since the log's first annotated frame at steps start..stop-1."""
-    times: Array = np.arange(start, stop, dtype=np.float64)
-    times *= STEP_S
-    return times
+    return np.asarray(np.arange(start, stop) * STEP_S, np.float64)
 
 
 def read_feather(path: Path, columns: tuple[str, ...]) -> dict[str, NDArray[np.generic]]:
@@ -170,13 +141,10 @@ def rotations(path: Path, poses: Array) -> Rotation:
 
 def read_motion(folder: Path) -> LogMotion:
     """Poses and annotations of the log in `folder`. Raises BadClip."""
-    path = folder / ANNOTATIONS
+    path, pose_path = folder / ANNOTATIONS, folder / POSES
     boxes = read_feather(path, ("timestamp_ns", "track_uuid", "category", *SIZE_COLUMNS, *POSE_COLUMNS))
     box_stamps = stamps(path, boxes)
     start_ns = int(box_stamps.min())
-    frame_stamps = np.unique(box_stamps)
-
-    pose_path = folder / POSES
     poses = read_feather(pose_path, ("timestamp_ns", *POSE_COLUMNS))
     pose_stamps = stamps(pose_path, poses)
     if (np.diff(pose_stamps) < 0).any():
@@ -184,7 +152,7 @@ def read_motion(folder: Path) -> LogMotion:
     keep = _spaced(seconds_since(start_ns, pose_stamps))
     pose_values = numbers(pose_path, poses, POSE_COLUMNS)[keep]
     pose_times = seconds_since(start_ns, pose_stamps[keep])
-    frame_times = seconds_since(start_ns, frame_stamps)
+    frame_times = seconds_since(start_ns, np.unique(box_stamps))
     if pose_times[0] > MIN_POSE_SPACING_S or pose_times[-1] < frame_times[-1] - SAME_FRAME_S:
         raise BadClip(str(pose_path), "timestamp_ns", "the poses do not span the annotated frames")
     city_from_ego = rotations(pose_path, pose_values)
@@ -207,9 +175,9 @@ def ego_states_at(motion: LogMotion, times_s: Array) -> Array:
     where the poses are too sparse to fit.
     """
     states = np.zeros((len(times_s), EGO_STATE_SIZE))
-    states[:, X] = np.interp(times_s, motion.pose_times_s, motion.positions[:, 0])
-    states[:, Y] = np.interp(times_s, motion.pose_times_s, motion.positions[:, 1])
-    states[:, HEADING] = wrap_angle(np.interp(times_s, motion.pose_times_s, motion.yaws))
+    for column, known in ((X, motion.positions[:, 0]), (Y, motion.positions[:, 1]), (HEADING, motion.yaws)):
+        states[:, column] = np.interp(times_s, motion.pose_times_s, known)
+    states[:, HEADING] = wrap_angle(states[:, HEADING])
     for state, time in zip(states, times_s):
         offset = motion.pose_times_s - time
         near = np.abs(offset) <= EGO_FIT_HALF_WINDOW_S + ROUNDING_S
@@ -218,12 +186,11 @@ def ego_states_at(motion: LogMotion, times_s: Array) -> Array:
         basis = np.vander(offset[near], 3, increasing=True)
         fit = np.linalg.lstsq(basis, motion.positions[near, :2] - state[[X, Y]], rcond=None)[0]
         velocity, acceleration = fit[1], 2.0 * fit[2]
-        if np.hypot(*velocity) < STANDING_SPEED_MPS:
-            continue
-        c, s = np.cos(state[HEADING]), np.sin(state[HEADING])
-        ego_from_city = np.array([[c, s], [-s, c]])
-        state[[VX, VY]] = ego_from_city @ velocity
-        state[[AX, AY]] = ego_from_city @ acceleration
+        if np.hypot(*velocity) >= STANDING_SPEED_MPS:
+            c, s = np.cos(state[HEADING]), np.sin(state[HEADING])
+            ego_from_city = np.array([[c, s], [-s, c]])
+            state[[VX, VY]] = ego_from_city @ velocity
+            state[[AX, AY]] = ego_from_city @ acceleration
     return states
 
 
@@ -243,11 +210,8 @@ def observed_at(motion: LogMotion, times_s: Array) -> Bools:
 
 def agents_at(motion: LogMotion, times_s: Array) -> AgentTracks:
     """All tracks of the log at times (S,): present where their nearest frame is within 50 ms, linear in between."""
-    n_steps, n_tracks = len(times_s), len(motion.tracks)
-    boxes = np.full((n_steps, n_tracks, 5), np.nan)
-    velocities = np.full((n_steps, n_tracks, 2), np.nan)
-    center_z = np.full((n_steps, n_tracks), np.nan)
-    valid = np.zeros((n_steps, n_tracks), dtype=bool)
+    valid = np.zeros((len(times_s), len(motion.tracks)), dtype=bool)
+    boxes, velocities, center_z = (np.full((*valid.shape, *columns), np.nan) for columns in ((5,), (2,), ()))
     for i, track in enumerate(motion.tracks):
         here = valid[:, i] = _nearest_gap(track.times_s, times_s) < SAME_FRAME_S
         known = np.column_stack([track.centers[:, :2], track.headings, track.sizes[:, :2]])

@@ -55,7 +55,7 @@ def _section(path: Path, content: Any, name: str) -> dict[str, Any]:
 def _lane(path: Path, key: str, raw: Any) -> Lane:
     field = f"lane_segments[{key}]"
     try:
-        lane_type = raw["lane_type"]
+        beside = [None if lane is None else str(lane) for lane in (raw["left_neighbor_id"], raw["right_neighbor_id"])]
         left = _points(path, f"{field}.left_lane_boundary", raw["left_lane_boundary"])
         right = _points(path, f"{field}.right_lane_boundary", raw["right_lane_boundary"])
         return Lane(
@@ -63,11 +63,11 @@ def _lane(path: Path, key: str, raw: Any) -> Lane:
             ring=ring_from_boundaries(left, right),
             centerline=centerline_from_boundaries(left, right),
             is_intersection=bool(raw["is_intersection"]),
-            drives_cars=CAR_LANE_TYPES[lane_type],
+            drives_cars=CAR_LANE_TYPES[raw["lane_type"]],
             successors=tuple(str(lane) for lane in raw["successors"]),
             predecessors=tuple(str(lane) for lane in raw["predecessors"]),
-            left_neighbor=_optional_id(raw["left_neighbor_id"]),
-            right_neighbor=_optional_id(raw["right_neighbor_id"]),
+            left_neighbor=beside[0],
+            right_neighbor=beside[1],
             left_boundary=left,
             right_boundary=right,
             left_mark=str(raw["left_lane_mark_type"]),
@@ -77,10 +77,6 @@ def _lane(path: Path, key: str, raw: Any) -> Lane:
         raise BadClip(str(path), field, f"missing key or unknown lane type {error}") from error
     except (TypeError, ValueError) as error:
         raise BadClip(str(path), field, str(error)) from error
-
-
-def _optional_id(value: Any) -> str | None:
-    return None if value is None else str(value)
 
 
 def _points(path: Path, field: str, raw: Any) -> Array:

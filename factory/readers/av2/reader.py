@@ -7,6 +7,7 @@ YELLOW | RED; a state holds until the lane's next row), which the synthetic town
 import hashlib
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -93,13 +94,8 @@ class AV2Reader(LogReader[AV2Log]):
 
     def recorded(self, log: AV2Log, start: int, stop: int) -> Recorded:
         """Poses, rig, photos and sweeps of a window, and the block that it is rendered from."""
-        return Recorded(
-            world_from_ego=world_from_ego_at(log.motion, step_times(start, stop)),
-            cameras=log.cameras,
-            images=_within(log.motion, log.images, start, stop - start),
-            sweeps=_within(log.motion, log.sweeps, start, stop - start),
-            block=_block(log, start) if log.images else None,
-        )
+        poses = world_from_ego_at(log.motion, step_times(start, stop))
+        return Recorded(poses, log.cameras, *_sensed(log, start, stop), _block(log, start) if log.images else None)
 
 
 def log_folders(root: Path) -> dict[str, Path]:
@@ -124,7 +120,7 @@ def read_log(folder: Path) -> AV2Log:
     ego_states = ego_states_at(motion, times_s)
     vector_map = map_file(folder)
     road_map = read_map(vector_map)
-    cameras = read_cameras(folder)
+    cameras, sensors = read_cameras(folder), folder / "sensors"
     return AV2Log(
         file=str(folder),
         motion=motion,
@@ -134,12 +130,8 @@ def read_log(folder: Path) -> AV2Log:
         route=route_of_drive(road_map, ego_states[:, :3], str(vector_map), "lane_segments"),
         lights=read_lights(folder, road_map, motion, times_s),
         cameras=cameras,
-        images=tuple(
-            stamped
-            for camera in cameras
-            for stamped in _stamped(motion, camera.name, folder / "sensors" / "cameras" / camera.name, ".jpg")
-        ),
-        sweeps=tuple(_stamped(motion, "lidar", folder / "sensors" / "lidar", ".feather")),
+        images=tuple(chain(*(_stamped(motion, c.name, sensors / "cameras" / c.name, ".jpg") for c in cameras))),
+        sweeps=tuple(_stamped(motion, "lidar", sensors / "lidar", ".feather")),
         licence=_licence(folder),
         content_digest=content_digest(folder),
         split=folder_split(folder),
@@ -163,15 +155,13 @@ def read_cameras(folder: Path) -> tuple[Camera, ...]:
     ):
         if name not in mount_of:
             raise BadClip(str(pose_path), "sensor_name", f"no pose of camera {name}")
-        ego_from_camera = np.eye(4)
-        ego_from_camera[:3, :3] = turned[mount_of[name]]
-        ego_from_camera[:3, 3] = poses[mount_of[name], 4:]
+        mount, row = np.eye(4), mount_of[name]
+        mount[:3, :3], mount[:3, 3] = turned[row], poses[row, 4:]
         intrinsics = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         try:
-            camera = Camera(str(name), int(width), int(height), intrinsics, np.array(distortion), ego_from_camera)
+            cameras.append(Camera(str(name), int(width), int(height), intrinsics, np.array(distortion), mount))
         except ValueError as error:
             raise BadClip(str(path), "calibration", str(error)) from error
-        cameras.append(camera)
     return tuple(cameras)
 
 
@@ -203,13 +193,10 @@ def read_lights(folder: Path, road_map: RoadMap, motion: LogMotion, times_s: Arr
 def content_digest(folder: Path) -> str:
     """sha256 over what a clip is computed from: poses, annotations, map, calibration, lights; not pixels and points."""
     digest = hashlib.sha256()
-    files = (ANNOTATIONS, POSES, str(map_file(folder).relative_to(folder)), INTRINSICS, EXTRINSICS, LIGHTS)
-    for name in files:
-        path = folder / name
-        if path.exists():
-            content = path.read_bytes()
-            digest.update(f"{name}\x1f{len(content)}\x1f".encode())
-            digest.update(content)
+    for name in (ANNOTATIONS, POSES, str(map_file(folder).relative_to(folder)), INTRINSICS, EXTRINSICS, LIGHTS):
+        if (folder / name).exists():
+            content = (folder / name).read_bytes()
+            digest.update(f"{name}\x1f{len(content)}\x1f".encode() + content)
     return digest.hexdigest()
 
 
@@ -236,20 +223,19 @@ def _stamped(motion: LogMotion, sensor: str, folder: Path, suffix: str) -> list[
 def _block(log: AV2Log, start: int) -> Block:
     """The block of the clip that starts at step `start`: 20 s that begin at a multiple of 10 s, so that it holds it."""
     first = start // BLOCK_STRIDE_STEPS * BLOCK_STRIDE_STEPS
-    n_steps = min(BLOCK_STEPS, log.motion.n_steps - first)
-    return Block(
-        start_s=first * STEP_S,
-        agents=present(log.agents.window(first, first + n_steps)),
-        images=_within(log.motion, log.images, first, n_steps),
-        sweeps=_within(log.motion, log.sweeps, first, n_steps),
-    )
+    stop = min(first + BLOCK_STEPS, log.motion.n_steps)
+    return Block(first * STEP_S, present(log.agents.window(first, stop)), *_sensed(log, first, stop))
+
+
+def _sensed(log: AV2Log, start: int, stop: int) -> tuple[tuple[SensorFile, ...], tuple[SensorFile, ...]]:
+    """Photos and sweeps of the steps start..stop-1."""
+    return _within(log.motion, log.images, start, stop), _within(log.motion, log.sweeps, start, stop)
 
 
 def _within(
-    motion: LogMotion, files: tuple[tuple[str, Path, float], ...], start: int, n_steps: int
+    motion: LogMotion, files: tuple[tuple[str, Path, float], ...], start: int, stop: int
 ) -> tuple[SensorFile, ...]:
-    """The sensor files between the first and the last of `n_steps` steps from step `start` on."""
-    first, last = start * STEP_S, (start + n_steps - 1) * STEP_S
+    first, last = start * STEP_S, (stop - 1) * STEP_S
     inside = [entry for entry in files if first - SAME_FRAME_S < entry[2] <= last + SAME_FRAME_S]
     if not inside:
         return ()

@@ -24,6 +24,7 @@ from scipy.spatial import cKDTree
 from shapely.geometry import LineString, Polygon
 
 from factory.readers.base import BadClip
+from factory.readers.scenarionet.tracks import floats
 from tasks.world.arrays import Array
 from tasks.world.polygons import CENTERLINE_SPACING_M, arc_lengths, resample
 
@@ -155,10 +156,7 @@ def _half_width(feature: Mapping[str, Any], file: str, field: str) -> float:
     """Half of the lane's median width where Waymo's converter measured it to the painted lines, else the default."""
     if "width" not in feature:
         return HALF_WIDTH_M
-    try:
-        widths = np.asarray(feature["width"], dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise BadClip(file, f"{field}.width", f"not numbers ({error})") from error
+    widths = floats(feature["width"], file, f"{field}.width")
     measured = widths[(widths > 1.0) & (widths < 3.0)]  # zeros: no line on that side; more: not this lane's line
     return float(np.median(measured)) if len(measured) else HALF_WIDTH_M
 
@@ -175,9 +173,7 @@ def _resampled(line: Array, file: str, field: str) -> Array | None:
 
 
 def _ids(value: object) -> tuple[str, ...] | None:
-    if not isinstance(value, list | tuple | set | np.ndarray):
-        return None
-    return tuple(str(item) for item in value)
+    return tuple(map(str, value)) if isinstance(value, list | tuple | set | np.ndarray) else None
 
 
 def _flag(feature: Mapping[str, Any], name: str, file: str, field: str) -> bool | None:
@@ -205,8 +201,8 @@ def _speed_limit(feature: Mapping[str, Any], source: str) -> float | None:
     """m/s. nuScenes has none: its converter writes a constant 100 km/h on connectors."""
     if source == "nuscenes":
         return None
-    mph, kmh = feature.get("speed_limit_mph"), feature.get("speed_limit_kmh")
-    for value, unit in ((mph, MPH), (kmh, 1.0 / 3.6)):
+    for name, unit in (("speed_limit_mph", MPH), ("speed_limit_kmh", 1.0 / 3.6)):
+        value = feature.get(name)
         if isinstance(value, int | float | np.number) and np.isfinite(value) and value > 0:
             return float(value) * unit
     return None

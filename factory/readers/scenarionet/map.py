@@ -38,9 +38,7 @@ NEIGHBOUR_VOTES = 2  # of the five probes
 _LIGHTS = {
     LightState.GREEN: ("LANE_STATE_GO", "LANE_STATE_ARROW_GO", "TRAFFIC_LIGHT_GREEN"),
     LightState.YELLOW: (
-        "LANE_STATE_CAUTION",
-        "LANE_STATE_ARROW_CAUTION",
-        "LANE_STATE_FLASHING_CAUTION",
+        *(f"LANE_STATE_{kind}CAUTION" for kind in ("", "ARROW_", "FLASHING_")),
         "TRAFFIC_LIGHT_YELLOW",
     ),
     LightState.RED: ("LANE_STATE_STOP", "LANE_STATE_ARROW_STOP", "TRAFFIC_LIGHT_RED"),
@@ -108,11 +106,10 @@ def neighbours(raw: Mapping[str, RawLane], connectors: frozenset[str]) -> tuple[
     polygon begins where its own ends, seen by at least two of the rays. Connectors have none (docs/reward.md 0 joins
     them by what they connect).
     """
-    if any(lane.left or lane.right for lane in raw.values()):
-        return (
-            {lane_id: lane.left for lane_id, lane in raw.items() if lane.left},
-            {lane_id: lane.right for lane_id, lane in raw.items() if lane.right},
-        )
+    left = {lane_id: lane.left for lane_id, lane in raw.items() if lane.left}
+    right = {lane_id: lane.right for lane_id, lane in raw.items() if lane.right}
+    if left or right:
+        return left, right
     lanes = [lane for lane in raw.values() if lane.kind in CAR_LANE_KINDS and lane.lane_id not in connectors]
     return _beside(lanes, side=1.0), _beside(lanes, side=-1.0)
 
@@ -123,8 +120,10 @@ def _beside(lanes: list[RawLane], side: float) -> dict[str, str]:
         return {}
     shapes = np.array([Polygon(lane.ring) for lane in lanes])
     rows = np.array([np.rint(NEIGHBOUR_PROBES * (len(lane.line) - 2)).astype(int) for lane in lanes])
-    origin = np.array([lane.line[row] for lane, row in zip(lanes, rows, strict=True)]).reshape(-1, 2)
-    ahead = np.array([lane.line[row + 1] for lane, row in zip(lanes, rows, strict=True)]).reshape(-1, 2) - origin
+    origin, after = (
+        np.concatenate([lane.line[row + step] for lane, row in zip(lanes, rows, strict=True)]) for step in (0, 1)
+    )
+    ahead = after - origin
     across = side * np.stack([-ahead[:, 1], ahead[:, 0]], axis=1) / np.hypot(*ahead.T)[:, None]
     rays = shapely.linestrings(np.stack([origin, origin + NEIGHBOUR_REACH_M * across], axis=1))
     starts = shapely.points(origin)

@@ -1,9 +1,8 @@
 """Reads ScenarioNet's scenario pickles (Li et al. 2023) as clips: nuScenes, Waymo and nuPlan conversions.
 
 A scenario is a dict: `metadata` (dataset, ts, sdc_id, map), `length`, `tracks`, `map_features`, `dynamic_map_states`.
-There are no cameras and no lidar in it. Lanes: scenarionet_lanes.py; map: scenarionet_map.py; motion:
-scenarionet_tracks.py. A database folder lists its scenarios in `dataset_summary.pkl` (file name -> metadata) and
-their folders in `dataset_mapping.pkl` (file name -> folder relative to the database).
+There are no cameras and no lidar in it. A database folder lists its scenarios in `dataset_summary.pkl` (file name ->
+metadata) and their folders in `dataset_mapping.pkl` (file name -> folder relative to the database).
 """
 
 import hashlib
@@ -77,8 +76,7 @@ class ScenarioNetReader(LogReader[ScenarioLog]):
         """The ego's poses, the format has no sensors. Raises BadClip where the ego's drive is broken."""
         ego_states = log.motion.ego_states[start:stop]
         if not np.isfinite(ego_states).all():
-            problem = f"the ego's drive is broken within the window at {start * STEP_MS} ms"
-            raise BadClip(log.file, "tracks[sdc]", problem)
+            raise BadClip(log.file, "tracks[sdc]", f"the ego's drive is broken in the window at {start * STEP_MS} ms")
         return Recorded(upright(ego_states))  # the format's ego has no roll or pitch, its road is at z = 0
 
 
@@ -91,12 +89,8 @@ def scenario_files(root: Path) -> dict[str, Path]:
         return {root.stem: root}
     if not root.is_dir():
         raise ValueError(f"{root}: no such folder or .pkl file")
-    if (root / SUMMARY).is_file():
-        paths = _listed(root)
-    else:
-        paths = sorted(root.rglob("sd_*.pkl"))
     files: dict[str, Path] = {}
-    for path in paths:
+    for path in _listed(root) if (root / SUMMARY).is_file() else sorted(root.rglob("sd_*.pkl")):
         if path.stem in files:
             raise ValueError(f"{root}: {path.name} stands in two folders, {files[path.stem].parent} and {path.parent}")
         files[path.stem] = path
@@ -118,14 +112,11 @@ def _listed(root: Path) -> list[Path]:
     paths = []
     for name in summary:
         folder = mapping.get(name, "")
-        if not _is_pickle_name(name) or not isinstance(folder, str) or PurePosixPath(folder).is_absolute():
+        named = isinstance(name, str) and name.endswith(".pkl") and PurePosixPath(name).name == name
+        if not named or not isinstance(folder, str) or PurePosixPath(folder).is_absolute():
             raise ValueError(f"{root}: {SUMMARY} or {MAPPING} names an impossible file {name!r} in {folder!r}")
         paths.append(root / folder / name)
     return paths
-
-
-def _is_pickle_name(name: object) -> bool:
-    return isinstance(name, str) and name.endswith(".pkl") and PurePosixPath(name).name == name
 
 
 def read_scenario(path: Path) -> tuple[dict[str, Any], str]:
@@ -155,8 +146,7 @@ def _bytes_of(path: Path) -> bytes:
 def _source(scenario: Mapping[str, Any], file: str) -> tuple[str, Source]:
     name = scenario["metadata"].get("dataset")
     if not isinstance(name, str) or name not in SOURCES:
-        problem = f"{name!r} is not supported; conversions of {', '.join(SOURCES)} are"
-        raise BadClip(file, "metadata.dataset", problem)
+        raise BadClip(file, "metadata.dataset", f"{name!r} is not supported; conversions of {', '.join(SOURCES)} are")
     return name, SOURCES[name]
 
 
@@ -169,10 +159,7 @@ def read_motion(scenario: Mapping[str, Any], file: str) -> Drive:
         raise BadClip(file, "metadata.sdc_id", f"missing, or names no track: {sdc_id!r}")
     at = frame_positions(sample_times(scenario["metadata"], n_frames, file))
     ego = read_track(tracks, sdc_id, n_frames, file)
-    states, segments = ego_segments(ego, source, at)
-    segment = np.full(len(at), -1, np.int64)
-    for number, (start, stop) in enumerate(segments):
-        segment[start:stop] = number
+    states, segment = ego_segments(ego, source, at)
     ground = ground_height(ego, at, file)
     return Drive(states, agent_tracks(tracks, str(sdc_id), at, n_frames, ground, file), segment)
 
@@ -199,11 +186,5 @@ def read_log(path: Path) -> ScenarioLog:
         lights=TrafficLights(tuple(lights.lane_ids[c] for c in known), lights.states[frames][:, known]),
         licence=source.licence,
         content_digest=digest,
-        split=_own_split(path, metadata),
+        split=folder_split(path) or nuscenes_split(path.stem) or waymo_split(metadata.get("source_file")),
     )
-
-
-def _own_split(path: Path, metadata: Mapping[str, Any]) -> str | None:
-    """The folder's, else the list's of the data set that was converted; nuPlan's files do not say theirs."""
-    source = metadata.get("source_file")
-    return folder_split(path) or nuscenes_split(path.stem) or (waymo_split(source) if isinstance(source, str) else None)

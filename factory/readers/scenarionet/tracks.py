@@ -2,7 +2,7 @@
 
 What the files hold (public converters, checked on seven nuScenes scenes) and what is done about it:
 * Invalid frames hold zeros and the last frame's velocity is 0, so `valid` masks everything and velocities are not read.
-* nuScenes' ego comes from the CAN bus on a clock of its own (scenarionet_canbus.py), or, without one, is a line between
+* nuScenes' ego comes from the CAN bus on a clock of its own (canbus.py), or, without one, is a line between
   2 Hz keyframes that are in truth 0.4-0.6 s apart. A jump that is left ends a segment; no clip reaches across it.
 * The ego is smoothed: the x(t) that minimises |x - log|^2 + lambda |third difference|^2, whose gain falls to a half
   at lambda^(-1/6) / 0.1 s = 3.9 rad/s for lambda = 300. On the seven scenes |a| is then at most 3.1 m/s2 and the
@@ -22,7 +22,7 @@ from scipy.signal import savgol_filter
 from factory.readers.base import BadClip
 from factory.readers.scenarionet.canbus import jumps, on_log_clock
 from tasks.world.agents import AgentKind, AgentTracks
-from tasks.world.arrays import Array, Bools
+from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.clip import STEP_S
 from tasks.world.frames import wrap_angle
 from tasks.world.vehicle import AX, AY, EGO_STATE_SIZE, HEADING, PACIFICA, VX, VY, X, Y
@@ -33,9 +33,7 @@ KINDS = {
     "CYCLIST": AgentKind.BICYCLE,  # nuScenes' motorcycles too
     "TRAFFIC_CONE": AgentKind.TRAFFIC_CONE,
     "TRAFFIC_BARRIER": AgentKind.BARRIER,
-    "TRAFFIC_OBJECT": AgentKind.GENERIC_OBJECT,
-    "OTHER": AgentKind.GENERIC_OBJECT,
-    "UNSET": AgentKind.GENERIC_OBJECT,
+    **dict.fromkeys(("TRAFFIC_OBJECT", "OTHER", "UNSET"), AgentKind.GENERIC_OBJECT),
 }
 KEYFRAME_STEPS = 5
 MAX_GAP_S = 0.55  # between two frames; longer ones cannot be filled in
@@ -109,7 +107,7 @@ def read_track(tracks: Mapping[Any, Any], track_id: str | int, n_frames: int, fi
         if name not in state:
             raise BadClip(file, f"{field}.{name}", "missing")
     valid = _numbers(state["valid"], (n_frames,), file, f"{field}.valid") > 0.5
-    position = _floats(state["position"], file, f"{field}.position")
+    position = floats(state["position"], file, f"{field}.position")
     if position.ndim != 2 or position.shape[0] != n_frames or position.shape[1] not in (2, 3):
         raise BadClip(file, f"{field}.position", f"shape {position.shape}, expected ({n_frames}, 3)")
     if position.shape[1] == 2:
@@ -151,15 +149,14 @@ def agent_tracks(
         ids.append(str(track_id))
         kinds.append(KINDS[kind])
         rows.append(track)
-    n = len(rows)
-    boxes, valid, z = np.full((len(at), n, 5), np.nan), np.zeros((len(at), n), bool), np.full((len(at), n), np.nan)
+    valid = np.zeros((len(at), len(rows)), bool)
+    boxes, z = np.full((*valid.shape, 5), np.nan), np.full(valid.shape, np.nan)
     for column, track in enumerate(rows):
         position, heading, seen = resampled(track, at)
         flat = not track.position[track.valid, 2].any()  # nuPlan stores no height: the box stands on the ground
         valid[:, column] = seen
-        boxes[seen, column] = np.column_stack(
-            [position[seen, :2], heading[seen], np.broadcast_to(track.size[:2], (seen.sum(), 2))]
-        )
+        boxes[seen, column, :2], boxes[seen, column, 2] = position[seen, :2], heading[seen]
+        boxes[seen, column, 3:] = track.size[:2]
         z[seen, column] = track.size[2] / 2.0 if flat else (position[:, 2] - ground)[seen]
     return AgentTracks(
         track_ids=tuple(ids),
@@ -189,12 +186,12 @@ def slope_velocities(xy: Array, valid: Bools) -> Array:
     filled = np.where(valid[..., None], xy, 0.0)
     count, time, square = (np.zeros(valid.shape) for _ in range(3))
     total, moment = np.zeros(xy.shape), np.zeros(xy.shape)
-    origin = filled  # positions relative to the step's own, so that world coordinates of kilometres cancel nothing
     for offset in range(-SLOPE_STEPS, SLOPE_STEPS + 1):
         rows = slice(max(0, -offset), n_steps - max(0, offset))
         shifted = slice(max(0, offset), n_steps - max(0, -offset))
         here = valid[shifted] & valid[rows]
-        relative = np.where(here[..., None], filled[shifted] - origin[rows], 0.0)
+        # Relative to the step's own position, so that world coordinates of kilometres cancel nothing.
+        relative = np.where(here[..., None], filled[shifted] - filled[rows], 0.0)
         t = offset * STEP_S
         count[rows] += here
         time[rows] += t * here
@@ -210,27 +207,23 @@ def slope_velocities(xy: Array, valid: Bools) -> Array:
     return slope
 
 
-def ego_segments(track: Track, source: Source, at: Array) -> tuple[Array, list[tuple[int, int]]]:
-    """Ego states (S, 11) and the segments [start, stop) over which they are one continuous drive.
+def ego_segments(track: Track, source: Source, at: Array) -> tuple[Array, Ints]:
+    """Ego states (S, 11), and (S,) the number of the continuous drive that a step belongs to; NaN and -1: none.
 
-    Steps outside every segment hold NaN. Columns 7..10 (steering and rates) are 0, as NAVSIM initialises an ego.
+    Columns 7..10 (steering and rates) are 0, as NAVSIM initialises an ego.
     """
     position, heading, valid = resampled(track, at)
     xy = position[:, :2]
     if source.can_bus and len(xy) > 1 and _keyframe_weights(xy).all():
         xy, heading, valid = on_log_clock(xy, heading, valid)
-    states = np.full((len(at), EGO_STATE_SIZE), np.nan)
-    segments = _continuous(xy, valid)
-    for start, stop in segments:
-        states[start:stop] = _smooth_drive(xy[start:stop], heading[start:stop], source)
-    return states, segments
-
-
-def _continuous(xy: Array, valid: Bools) -> list[tuple[int, int]]:
-    """Runs of valid steps without a jump, long enough for the quadratic fit."""
+    states, segment = np.full((len(at), EGO_STATE_SIZE), np.nan), np.full(len(at), -1, np.int64)
     broken = jumps(xy) | ~valid[1:] | ~valid[:-1]
-    edges = [0, *(np.flatnonzero(broken) + 1).tolist(), len(xy)]
-    return [(a, b) for a, b in pairwise(edges) if b - a >= FIT_STEPS and valid[a:b].all()]
+    runs = pairwise([0, *(np.flatnonzero(broken) + 1).tolist(), len(xy)])
+    long_enough = [(a, b) for a, b in runs if b - a >= FIT_STEPS and valid[a:b].all()]
+    for number, (start, stop) in enumerate(long_enough):
+        states[start:stop] = _smooth_drive(xy[start:stop], heading[start:stop], source)
+        segment[start:stop] = number
+    return states, segment
 
 
 def _smooth_drive(xy: Array, heading: Array, source: Source) -> Array:
@@ -278,7 +271,7 @@ def _least_third_difference(log: Array, weight: Array, smoothing: float) -> Arra
 
 def _numbers(value: object, shape: tuple[int, ...], file: str, field: str) -> Array:
     """An array of the shape given; a trailing axis of one is dropped."""
-    array = _floats(value, file, field)
+    array = floats(value, file, field)
     if array.ndim == len(shape) + 1 and array.shape[-1] == 1:
         array = array[..., 0]
     if array.shape != shape:
@@ -286,7 +279,8 @@ def _numbers(value: object, shape: tuple[int, ...], file: str, field: str) -> Ar
     return array
 
 
-def _floats(value: object, file: str, field: str) -> Array:
+def floats(value: object, file: str, field: str) -> Array:
+    """The value as an array. Raises BadClip where it is none of numbers."""
     try:
         return np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:

@@ -3,29 +3,29 @@
 import numpy as np
 
 from tasks.world.arrays import Array
+from tasks.world.polygons import arc_lengths
+
+RAMP_M = 12.0  # curvature is averaged over it, so that a car can follow without a jump of the steering wheel
 
 
-def from_curvature(start: Array, pieces: list[tuple[float, float]], step_m: float = 1.0, ramp_m: float = 12.0) -> Array:
-    """Poses (N, 3) that start at pose `start` and follow (length [m], curvature [1/m]) pieces.
-
-    Curvature is averaged over `ramp_m`, so that a car can follow it without a jump of the steering wheel.
-    """
+def from_curvature(start: Array, pieces: list[tuple[float, float]]) -> Array:
+    """Poses (N, 3) that start at pose `start` and follow (length [m], curvature [1/m]) pieces."""
     length = sum(p[0] for p in pieces)
-    n = max(2, round(length / step_m))
+    n = max(2, round(length))
     step = length / n
     at = (np.arange(n) + 0.5) * step
     edges = np.cumsum([0.0] + [p[0] for p in pieces])
     area = np.concatenate([[0.0], np.cumsum([p[0] * p[1] for p in pieces])])
-    ahead = np.interp(np.clip(at + ramp_m / 2, 0, length), edges, area)
-    behind = np.interp(np.clip(at - ramp_m / 2, 0, length), edges, area)
-    heading = start[2] + np.concatenate([[0.0], np.cumsum((ahead - behind) / ramp_m * step)])
+    ahead = np.interp(np.clip(at + RAMP_M / 2, 0, length), edges, area)
+    behind = np.interp(np.clip(at - RAMP_M / 2, 0, length), edges, area)
+    heading = start[2] + np.concatenate([[0.0], np.cumsum((ahead - behind) / RAMP_M * step)])
     middle = (heading[:-1] + heading[1:]) / 2
     x = start[0] + np.concatenate([[0.0], np.cumsum(np.cos(middle) * step)])
     y = start[1] + np.concatenate([[0.0], np.cumsum(np.sin(middle) * step)])
     return np.column_stack([x, y, heading])
 
 
-def bezier(start: Array, end: Array, reach: float = 0.39, step_m: float = 1.0) -> Array:
+def bezier(start: Array, end: Array, reach: float = 0.39) -> Array:
     """Cubic from pose `start` to pose `end`, tangent to both; `reach` = handle length / (chord + lateral detour)."""
     chord = float(np.hypot(end[0] - start[0], end[1] - start[1]))
     turn = abs(float(np.angle(np.exp(1j * (end[2] - start[2])))))
@@ -35,29 +35,19 @@ def bezier(start: Array, end: Array, reach: float = 0.39, step_m: float = 1.0) -
     p2 = p3 - handle * np.array([np.cos(end[2]), np.sin(end[2])])
     t = np.linspace(0.0, 1.0, 200)[:, None]
     points = (1 - t) ** 3 * p0 + 3 * (1 - t) ** 2 * t * p1 + 3 * (1 - t) * t**2 * p2 + t**3 * p3
-    return resample(points, step_m, start[2], end[2])
+    return resample(points, start[2], end[2])
 
 
-def resample(
-    points: Array, step_m: float, first_heading: float | None = None, last_heading: float | None = None
-) -> Array:
-    """Poses every ~step_m along a polyline (N, >=2); headings are those of the chords, ends may be given."""
-    xy = points[:, :2]
-    s = arc_length(xy)
-    n = max(2, int(np.ceil(s[-1] / step_m)) + 1)
-    at = np.linspace(0.0, s[-1], n)
-    x, y = np.interp(at, s, xy[:, 0]), np.interp(at, s, xy[:, 1])
+def resample(points: Array, first_heading: float, last_heading: float | None = None) -> Array:
+    """Poses about a metre apart along a polyline (N, 2); headings are those of the chords, but for given ends."""
+    s = arc_lengths(points)
+    even = np.linspace(0.0, s[-1], max(2, int(np.ceil(s[-1])) + 1))
+    x, y = np.interp(even, s, points[:, 0]), np.interp(even, s, points[:, 1])
     heading = np.unwrap(np.arctan2(np.gradient(y), np.gradient(x)))
-    if first_heading is not None:
-        heading[0] = first_heading
+    heading[0] = first_heading
     if last_heading is not None:
         heading[-1] = last_heading
     return np.column_stack([x, y, np.unwrap(heading)])
-
-
-def arc_length(xy: Array) -> Array:
-    """(N,) metres along a polyline (N, >=2)."""
-    return np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(xy[:, 0]), np.diff(xy[:, 1])))])
 
 
 def offset(poses: Array, left_m: Array | float) -> Array:
@@ -75,15 +65,18 @@ def reverse(poses: Array) -> Array:
     return out
 
 
-def at(poses: Array, s: Array, query: Array | float) -> Array:
-    """Poses at arc lengths `query` (scalar or (Q,)), linear in x, y and unwrapped heading; `s` = arc_length(poses)."""
-    heading = np.unwrap(poses[:, 2])
-    return np.stack(
-        [np.interp(query, s, poses[:, 0]), np.interp(query, s, poses[:, 1]), np.interp(query, s, heading)], axis=-1
-    )
+def at(poses: Array, query: Array | float) -> Array:
+    """Poses at arc lengths `query` (scalar or (Q,)), linear in x, y and unwrapped heading."""
+    s = arc_lengths(poses)
+    return np.stack([np.interp(query, s, column) for column in (*poses[:, :2].T, np.unwrap(poses[:, 2]))], axis=-1)
 
 
 def advance(pose: Array, ahead_m: float, left_m: float = 0.0, turn: float = 0.0) -> Array:
     """The pose `ahead_m` further and `left_m` to the left, turned by `turn` [rad]."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
     return np.array([pose[0] + ahead_m * c - left_m * s, pose[1] + ahead_m * s + left_m * c, pose[2] + turn])
+
+
+def beside(poses: Array, s: float, right_m: float, turn: float = 0.0) -> Array:
+    """The pose `right_m` to the right of the curve at arc length `s`, turned by `turn` [rad]."""
+    return advance(at(poses, s), 0.0, -right_m, turn)

@@ -1,19 +1,12 @@
 """One drive through the town: the ego, everybody around it and the lights, as tracks that never touch."""
 
+import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from factory.readers.town import curves
-from factory.readers.town.ego import (
-    SLOWEST_MPS,
-    Scenario,
-    centre_boxes,
-    ego_path,
-    is_lawful,
-    on_at_random,
-    tracked,
-)
+from factory.readers.town.ego import SLOWEST_MPS, Scenario, ego_path, is_lawful, on_at_random, tracked
 from factory.readers.town.streets import Road, Streets
 from factory.readers.town.traffic import (
     CYCLE_S,
@@ -29,6 +22,8 @@ from factory.readers.town.traffic import (
     path_of_lanes,
 )
 from tasks.world.arrays import Array
+from tasks.world.boxes import ego_boxes
+from tasks.world.polygons import arc_lengths
 from tasks.world.vehicle import PACIFICA, VX
 
 WARM_STEPS = 40  # simulated before the log starts, so that it starts in the middle of things
@@ -36,7 +31,6 @@ SPAWN_RADIUS_M = 130.0
 TRIES = 200
 JUNCTION_CLEAR_M = 28.0  # no parked car this near to the ends of a street
 EGO = Driver(
-    1.0,
     accel=1.2,
     brake=1.5,
     jerk=2.0,
@@ -59,7 +53,6 @@ FLEET = (  # AV2 category, length, width, height, share
 class Drive:
     """A log's worth of behaviour, S steps of 0.1 s."""
 
-    kind: str
     ego: Array  # (S, 3) rear axle
     ego_speed: Array  # (S,) m/s
     tracks: tuple[Track, ...]
@@ -68,24 +61,20 @@ class Drive:
 
 
 class _World:
-    """Tracks planned so far."""
+    """The streets, their lights, and the tracks planned so far."""
 
-    def __init__(self, steps: int) -> None:
-        self.steps = steps
+    def __init__(self, streets: Streets, signals: Signals, times: Array, rng: np.random.Generator) -> None:
+        self.streets, self.signals, self.times, self.rng = streets, signals, times, rng
         self.tracks: list[Track] = []
-        self.boxes = np.full((steps, 0, 5), np.nan)
+        self.boxes = np.full((len(times), 0, 5), np.nan)
         self.egos: list[tuple[int, Array, Array]] = []  # first step, boxes, speeds: the ego, and the ego as tracked
 
-    def add(self, track: Track, margin_m: float) -> bool:
+    def add(self, track: Track, margin_m: float) -> None:
         """Adds the track unless it comes closer than the margin to an earlier one or endangers the ego."""
-        boxes = track.boxes()
-        if overlaps(boxes, self.boxes, margin_m).any():
-            return False
-        if self.threatened_by(boxes[:, None]):
-            return False
-        self.tracks.append(track)
-        self.boxes = np.concatenate([self.boxes, boxes[:, None]], axis=1)
-        return True
+        boxes = track.boxes()[:, None]
+        if not overlaps(boxes[:, 0], self.boxes, margin_m).any() and not self.threatened_by(boxes):
+            self.tracks.append(track)
+            self.boxes = np.concatenate([self.boxes, boxes], axis=1)
 
     def threatened_by(self, others: Array) -> bool:
         """Does anybody of `others` (S, J, 5) endanger the ego?"""
@@ -93,106 +82,79 @@ class _World:
             bool(endangers(boxes, speed, others[start : start + len(boxes)]).any()) for start, boxes, speed in self.egos
         )
 
-    def seen(self) -> Array:
-        """(S, J, 5) everybody, the ego too."""
-        return np.concatenate([self.boxes, self.egos[0][1][:, None]], axis=1) if self.egos else self.boxes
+    def driven(self, path: Path, start: float, speed: float, driver: Driver) -> tuple[Array, Array]:
+        """Arc length and speed (S,) of somebody who sees everybody planned so far, the ego too."""
+        seen = np.concatenate([self.boxes, self.egos[0][1][:, None]], axis=1) if self.egos else self.boxes
+        return drive(path, start, speed, driver, seen, self.signals, self.times)
+
+    def look(self) -> int:
+        """Of the next track."""
+        return int(self.rng.integers(1 << 30))
 
 
 def parked_cars(streets: Streets, rng: np.random.Generator) -> tuple[Track, ...]:
     """Cars in the parking strips: part of the town, the same in all its logs (poses of one step)."""
     cars: list[Track] = []
-    for road in streets.roads:
-        if road.strip != "park":
-            continue
-        for forward in (True, False):
-            line = road.line if forward else curves.reverse(road.line)
-            s_line = curves.arc_length(line)
+    for road in (road for road in streets.roads if road.strip == "park"):
+        for line in road.both_ways:
             s = JUNCTION_CLEAR_M
-            while s < s_line[-1] - JUNCTION_CLEAR_M:
+            while s < arc_lengths(line)[-1] - JUNCTION_CLEAR_M:
                 if rng.random() < 0.8:
-                    length, width, height = (
-                        4.4 + rng.uniform(-0.4, 0.5),
-                        1.8 + rng.uniform(-0.06, 0.06),
-                        rng.uniform(1.42, 1.8),
-                    )
-                    d = -(road.half_width - 0.18 - width / 2 + rng.uniform(-0.04, 0.04))
-                    pose = curves.advance(curves.at(line, s_line, s), 0.0, d, rng.uniform(-0.012, 0.012))
-                    cars.append(
-                        Track(
-                            f"parked-{len(cars):03d}",
-                            "REGULAR_VEHICLE",
-                            (length, width, height),
-                            pose[None],
-                            int(rng.integers(1 << 30)),
-                        )
-                    )
+                    size = 4.4 + rng.uniform(-0.4, 0.5), 1.8 + rng.uniform(-0.06, 0.06), rng.uniform(1.42, 1.8)
+                    right = road.half_width - 0.18 - size[1] / 2 + rng.uniform(-0.04, 0.04)
+                    pose = curves.beside(line, s, right, rng.uniform(-0.012, 0.012))
+                    look = int(rng.integers(1 << 30))
+                    cars.append(Track(f"parked-{len(cars):03d}", "REGULAR_VEHICLE", size, pose[None], look))
                 s += rng.uniform(6.0, 7.2)
     return tuple(cars)
 
 
-def plan_drive(
-    streets: Streets, parked: tuple[Track, ...], scenario: Scenario, steps: int, seed: list[int], density: float = 1.0
-) -> Drive:
+def plan_drive(streets: Streets, parked: tuple[Track, ...], scenario: Scenario, steps: int, seed: list[int]) -> Drive:
     """A drive of `steps` steps of 0.1 s; drawn again until the ego keeps moving, keeps the law and is in no danger.
 
     Raises RuntimeError after 200 draws (not seen).
     """
     for attempt in range(TRIES):
-        rng = np.random.default_rng([*seed, attempt])
-        drive_or_none = _attempt(streets, parked, scenario, steps, rng, density)
-        if drive_or_none is not None:
-            return drive_or_none
+        if found := _attempt(streets, parked, scenario, steps, np.random.default_rng([*seed, attempt])):
+            return found
     raise RuntimeError(f"no lawful drive for scenario {scenario.kind!r} with seed {seed}")
 
 
 def _attempt(
-    streets: Streets,
-    parked: tuple[Track, ...],
-    scenario: Scenario,
-    steps: int,
-    rng: np.random.Generator,
-    density: float,
+    streets: Streets, parked: tuple[Track, ...], scenario: Scenario, steps: int, rng: np.random.Generator
 ) -> Drive | None:
-    total = steps + WARM_STEPS
-    times: Array = (np.arange(total, dtype=np.float64) - WARM_STEPS) * STEP_S
-    ego_driver = replace(EGO, speed_factor=float(rng.uniform(0.86, 1.0)))
-    path, start = ego_path(streets, scenario, ego_driver, rng)
+    times: Array = (np.arange(steps + WARM_STEPS, dtype=np.float64) - WARM_STEPS) * STEP_S
+    driver = replace(EGO, speed_factor=float(rng.uniform(0.86, 1.0)))
+    path, start = ego_path(streets, scenario, driver, rng)
     if start + WARM_STEPS * STEP_S * 9.0 + 60.0 > path.s[-1]:
         return None
-    signals = _signals(path, start, float(times[0]), rng)
-    world = _World(total)
-    near = curves.at(path.poses, path.s, start + 70.0)[:2]
+    world = _World(streets, _signals(path, start, float(times[0]), rng), times, rng)
+    near = curves.at(path.poses, start + 70.0)[:2]
     for car in parked:
         if np.hypot(*(car.poses[0, :2] - near)) < 220.0:
-            world.add(Track(car.track_id, car.category, car.size, np.repeat(car.poses, total, axis=0), car.look), 0.0)
+            world.add(replace(car, poses=np.repeat(car.poses, len(times), axis=0)), 0.0)
     ego_v = float(np.interp(start, path.s, path.limit)) * rng.uniform(0.8, 0.95)
     if rng.random() < 0.7:
-        _lead(streets, world, path, start + 4.6 + ego_v * rng.uniform(1.9, 3.2), ego_v, signals, times, rng)
-    s, v = drive(path, start, ego_v, ego_driver, world.boxes, signals, times)
+        _lead(world, path, start + 4.6 + ego_v * rng.uniform(1.9, 3.2), ego_v)
+    s, v = world.driven(path, start, ego_v, driver)
     if v.min() < SLOWEST_MPS or v[WARM_STEPS:].mean() < 4.5 or s[-1] > path.s[-1] - 40.0:
         return None
-    rear = curves.at(path.poses, path.s, s)
     wander = 0.07 * np.sin(s / 13.0 + rng.uniform(0, 6.28))
-    rear = curves.offset(rear, wander)
+    rear = curves.offset(curves.at(path.poses, s), wander)
     rear[:, 2] += np.gradient(wander, s)
-    boxes = centre_boxes(rear)
+    boxes = ego_boxes(rear, PACIFICA)
     world.egos = [(0, boxes, v)]
     for start_step, states in tracked(rear[WARM_STEPS:], v[WARM_STEPS:]):
-        world.egos.append((WARM_STEPS + start_step, centre_boxes(states[:, :3]), states[:, VX]))
-    if not all(is_lawful(streets, path, b, signals, times[a : a + len(b)]) for a, b, _ in world.egos):
+        world.egos.append((WARM_STEPS + start_step, ego_boxes(states, PACIFICA), states[:, VX]))
+    if not all(is_lawful(streets, path, b, world.signals, times[a : a + len(b)]) for a, b, _ in world.egos):
         return None
     if world.threatened_by(world.boxes):
         return None
-    centre = boxes[WARM_STEPS + steps // 2, :2]
-    _cyclists(streets, world, centre, signals, times, rng, density)
-    _cars(streets, world, centre, signals, times, rng, density)
-    _walkers(streets, world, centre, signals, times, rng, density)
-    tracks = tuple(
-        Track(t.track_id, t.category, t.size, t.poses[WARM_STEPS:], t.look)
-        for t in world.tracks
-        if not np.isnan(t.poses[WARM_STEPS:, 0]).all()
-    )
-    return Drive(scenario.kind, rear[WARM_STEPS:], v[WARM_STEPS:], tracks, signals, times[WARM_STEPS:])
+    for add in (_cyclists, _cars, _walkers):
+        add(world, boxes[WARM_STEPS + steps // 2, :2])
+    logged = [replace(track, poses=track.poses[WARM_STEPS:]) for track in world.tracks]
+    tracks = tuple(track for track in logged if not np.isnan(track.poses[:, 0]).all())
+    return Drive(rear[WARM_STEPS:], v[WARM_STEPS:], tracks, world.signals, times[WARM_STEPS:])
 
 
 def _signals(path: Path, start: float, start_time_s: float, rng: np.random.Generator) -> Signals:
@@ -204,127 +166,80 @@ def _signals(path: Path, start: float, start_time_s: float, rng: np.random.Gener
     return Signals(float(rng.uniform(0.0, CYCLE_S)))
 
 
-def _vehicle(
-    world: _World,
-    name: str,
-    path: Path,
-    start: float,
-    speed: float,
-    fleet: int,
-    signals: Signals,
-    times: Array,
-    rng: np.random.Generator,
-) -> bool:
+def _vehicle(world: _World, name: str, path: Path, start: float, speed: float, fleet: int) -> None:
     category, length, width, height, _ = FLEET[fleet]
-    stretch = float(rng.uniform(0.96, 1.04))
-    driver = Driver(front_m=length * stretch / 2, half_width_m=width / 2)
-    s, _v = drive(path, start, speed, driver, world.seen(), signals, times)
-    poses = curves.at(path.poses, path.s, s)
+    length *= float(world.rng.uniform(0.96, 1.04))
+    s, _v = world.driven(path, start, speed, Driver(front_m=length / 2, half_width_m=width / 2))
+    poses = curves.at(path.poses, s)
     poses[s > path.s[-1] - 1.0] = np.nan
-    return world.add(Track(name, category, (length * stretch, width, height), poses, int(rng.integers(1 << 30))), 0.35)
+    world.add(Track(name, category, (length, width, height), poses, world.look()), 0.35)
 
 
-def _lead(
-    streets: Streets,
-    world: _World,
-    path: Path,
-    start: float,
-    speed: float,
-    signals: Signals,
-    times: Array,
-    rng: np.random.Generator,
-) -> None:
+def _lead(world: _World, path: Path, start: float, speed: float) -> None:
     """A vehicle in front of the ego, on the ego's own way."""
-    own = path_of_lanes(streets, list(path.lane_ids), Driver(float(rng.uniform(0.88, 1.02))))
-    _vehicle(world, "lead", own, start, speed, int(rng.choice(3, p=[0.7, 0.2, 0.1])), signals, times, rng)
+    own = path_of_lanes(world.streets, list(path.lane_ids), Driver(float(world.rng.uniform(0.88, 1.02))))
+    _vehicle(world, "lead", own, start, speed, int(world.rng.choice(3, p=[0.7, 0.2, 0.1])))
 
 
-def _cars(
-    streets: Streets,
-    world: _World,
-    centre: Array,
-    signals: Signals,
-    times: Array,
-    rng: np.random.Generator,
-    density: float,
-) -> None:
+def _cars(world: _World, centre: Array) -> None:
+    streets, rng = world.streets, world.rng
     spawns = []
     for lane in streets.lanes.values():
         if lane.kind != "VEHICLE" or lane.is_intersection or lane.road == "ring":
             continue
-        s = curves.arc_length(lane.center)
+        length = float(arc_lengths(lane.center)[-1])
         at = float(rng.uniform(0.0, 25.0))
-        while at < s[-1] - 8.0:
-            if np.hypot(*(curves.at(lane.center, s, at)[:2] - centre)) < SPAWN_RADIUS_M:
-                spawns.append((float(s[-1] - at), lane.lane_id, at))
-            at += float(rng.uniform(16.0, 55.0)) / density
-    shares = np.array([f[-1] for f in FLEET])
+        while at < length - 8.0:
+            if np.hypot(*(curves.at(lane.center, at)[:2] - centre)) < SPAWN_RADIUS_M:
+                spawns.append((length - at, lane.lane_id, at))
+            at += float(rng.uniform(16.0, 55.0))
+    shares = [share for *_, share in FLEET]
     for k, (_to_end, lane_id, at) in enumerate(sorted(spawns)):
         driver = Driver(float(rng.uniform(0.82, 1.02)))
         path = path_of_lanes(streets, on_at_random(streets, [lane_id], rng), driver)
         narrow = streets.lanes[lane_id].speed_mps < 10.0
         fleet = 0 if narrow else int(rng.choice(len(FLEET), p=shares))
         speed = float(np.interp(at, path.s, path.limit)) * float(rng.uniform(0.5, 0.95))
-        _vehicle(world, f"vehicle-{k:03d}", path, at, speed, fleet, signals, times, rng)
+        _vehicle(world, f"vehicle-{k:03d}", path, at, speed, fleet)
 
 
-def _cyclists(
-    streets: Streets,
-    world: _World,
-    centre: Array,
-    signals: Signals,
-    times: Array,
-    rng: np.random.Generator,
-    density: float,
-) -> None:
+def _cyclists(world: _World, centre: Array) -> None:
+    streets, rng = world.streets, world.rng
     lanes = [lane for lane in streets.lanes.values() if lane.kind == "BIKE"]
     lanes = [lane for lane in lanes if np.hypot(*(lane.center[len(lane.center) // 2, :2] - centre)) < SPAWN_RADIUS_M]
     for k, lane in enumerate(lanes):
-        if rng.random() > 0.45 * density:
+        if rng.random() > 0.45:
             continue
-        driver = Driver(
-            speed_factor=float(rng.uniform(3.6, 5.6)) / lane.speed_mps, front_m=0.9, half_width_m=0.3, gap_m=1.0
-        )
+        driver = Driver(float(rng.uniform(3.6, 5.6)) / lane.speed_mps, front_m=0.9, half_width_m=0.3, gap_m=1.0)
         path = path_of_lanes(streets, on_at_random(streets, [lane.lane_id], rng), driver)
-        start = float(rng.uniform(0.0, 50.0))
-        s, _v = drive(path, start, 4.0, driver, world.seen(), signals, times)
-        poses = curves.offset(curves.at(path.poses, path.s, s), -0.15)
+        s, _v = world.driven(path, float(rng.uniform(0.0, 50.0)), 4.0, driver)
+        poses = curves.offset(curves.at(path.poses, s), -0.15)
         poses[s > path.s[-1] - 0.5] = np.nan
-        world.add(Track(f"cyclist-{k:02d}", "BICYCLIST", (1.75, 0.62, 1.72), poses, int(rng.integers(1 << 30))), 0.3)
+        world.add(Track(f"cyclist-{k:02d}", "BICYCLIST", (1.75, 0.62, 1.72), poses, world.look()), 0.3)
 
 
-def _walkers(
-    streets: Streets,
-    world: _World,
-    centre: Array,
-    signals: Signals,
-    times: Array,
-    rng: np.random.Generator,
-    density: float,
-) -> None:
+def _walkers(world: _World, centre: Array) -> None:
     """Pedestrians on the pavements, and on the crosswalks while the cars they cross have red."""
-    size = (0.55, 0.6, 1.75)
-    for road in streets.roads:
-        for side in (-1.0, 1.0):
-            for k in range(int(rng.poisson(9 * density))):
-                poses = _stroll(road, side, times, rng)
-                if np.nanmin(np.hypot(*(poses[:, :2] - centre).T)) < 110.0:
-                    name = f"pedestrian-{road.name.replace(' ', '-')}-{int(side > 0)}-{k}"
-                    world.add(Track(name, "PEDESTRIAN", size, poses, int(rng.integers(1 << 30))), 0.2)
-    for c, crossing in enumerate(streets.crossings):
+    times, rng, size = world.times, world.rng, (0.55, 0.6, 1.75)
+    for road, side in itertools.product(world.streets.roads, (-1.0, 1.0)):
+        for k in range(int(rng.poisson(9))):
+            poses = _stroll(road, side, times, rng)
+            if np.nanmin(np.hypot(*(poses[:, :2] - centre).T)) < 110.0:
+                name = f"pedestrian-{road.name.replace(' ', '-')}-{int(side > 0)}-{k}"
+                world.add(Track(name, "PEDESTRIAN", size, poses, world.look()), 0.2)
+    for c, crossing in enumerate(world.streets.crossings):
         if np.hypot(*(crossing.edge1.mean(0) - centre)) > 110.0:
             continue
-        for k in range(int(rng.poisson(3 * density))):
+        for k in range(int(rng.poisson(3))):
             speed, begin, share = rng.uniform(1.2, 1.6), rng.uniform(times[0], times[-1]), rng.uniform(0.25, 0.75)
             a, b = (crossing.edge1 * share + crossing.edge2 * (1 - share))[:: int(rng.choice([-1, 1]))]
             length = float(np.hypot(*(b - a)))
-            if any(signals.state(crossing.light_group, float(t)) != RED for t in (begin, begin + length / speed)):
+            if any(world.signals.state(crossing.light_group, float(t)) != RED for t in (begin, begin + length / speed)):
                 continue
             along = np.clip((times - begin) * speed, -1.2, length + 1.2)  # waits and ends on the pavement
-            heading = np.arctan2(b[1] - a[1], b[0] - a[0])
             xy = a + along[:, None] / length * (b - a)
-            poses = np.column_stack([xy, np.full(len(xy), heading)])
-            world.add(Track(f"crossing-{c}-{k}", "PEDESTRIAN", size, poses, int(rng.integers(1 << 30))), 0.3)
+            poses = np.column_stack([xy, np.full(len(xy), np.arctan2(b[1] - a[1], b[0] - a[0]))])
+            world.add(Track(f"crossing-{c}-{k}", "PEDESTRIAN", size, poses, world.look()), 0.3)
 
 
 def _stroll(road: Road, side: float, times: Array, rng: np.random.Generator) -> Array:
@@ -332,8 +247,8 @@ def _stroll(road: Road, side: float, times: Array, rng: np.random.Generator) -> 
     edge = curves.offset(road.line, side * (road.half_width + float(rng.uniform(1.3, 2.7))))
     if rng.random() < 0.5:
         edge = curves.reverse(edge)
-    s = curves.arc_length(edge)
-    along = float(rng.uniform(6.0, s[-1] - 30.0)) + float(rng.uniform(1.0, 1.6)) * (times - times[0])
-    poses = curves.at(edge, s, np.minimum(along, s[-1]))
-    poses[along > s[-1] - 1.0] = np.nan
+    length = arc_lengths(edge)[-1]
+    along = float(rng.uniform(6.0, length - 30.0)) + float(rng.uniform(1.0, 1.6)) * (times - times[0])
+    poses = curves.at(edge, np.minimum(along, length))
+    poses[along > length - 1.0] = np.nan
     return poses

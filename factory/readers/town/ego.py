@@ -6,14 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 
-from factory.readers.town import curves
-from factory.readers.town.streets import Lane, Streets
+from factory.readers.town.streets import Streets
 from factory.readers.town.traffic import RED, STEP_S, Driver, Path, Signals, path_of_lanes
 from tasks.rollout.lqr import track
 from tasks.world.arrays import Array
 from tasks.world.clip import HISTORY_STEPS, HORIZON_STEPS
 from tasks.world.frames import box_corners
-from tasks.world.vehicle import AX, AY, EGO_STATE_SIZE, PACIFICA, VX
+from tasks.world.polygons import arc_lengths
+from tasks.world.vehicle import AX, AY, EGO_STATE_SIZE, VX
 
 EGO_SMOOTH_M = 3.2  # rounds the lanes' joints: steering that a person would do
 SLOWEST_MPS = 1.2  # a log whose ego is ever slower is drawn again: a standing ego makes no clip
@@ -55,30 +55,17 @@ SCENARIOS = (  # in turn, log by log; every run of seven holds every kind once
 
 def chains(streets: Streets, road: str, forward: bool) -> list[list[int]]:
     """Lane ids of a road's VEHICLE lanes, one list per lane, inner lane first, in driving direction."""
-    line = next(r.line for r in streets.roads if r.name == road)
-    first = [
-        lane
-        for lane in streets.lanes.values()
-        if lane.road == road and lane.kind == "VEHICLE" and _starts(streets, lane)
-    ]
-    along = [lane for lane in first if (np.cos(lane.center[0, 2] - _near_heading(line, lane)) > 0) == forward]
+    lanes, line = streets.lanes, next(r.line for r in streets.roads if r.name == road)
     out = []
-    for lane in along:
-        chain = [lane.lane_id]
-        while (
-            after := next((n for n in streets.lanes[chain[-1]].successors if streets.lanes[n].road == road), None)
-        ) is not None:
-            chain.append(after)
-        out.append(chain)
+    for lane in lanes.values():
+        if lane.road != road or lane.kind != "VEHICLE" or any(lanes[p].road == road for p in lane.predecessors):
+            continue
+        beside = line[np.argmin(np.hypot(*(line[:, :2] - lane.center[0, :2]).T)), 2]
+        if (np.cos(lane.center[0, 2] - beside) > 0) == forward:
+            out.append([lane.lane_id])
+            while after := [n for n in lanes[out[-1][-1]].successors if lanes[n].road == road]:
+                out[-1].append(after[0])
     return out
-
-
-def _starts(streets: Streets, lane: Lane) -> bool:
-    return all(streets.lanes[p].road != lane.road for p in lane.predecessors)
-
-
-def _near_heading(line: Array, lane: Lane) -> float:
-    return float(line[np.argmin(np.hypot(*(line[:, :2] - lane.center[0, :2]).T)), 2])
 
 
 def way_to(streets: Streets, lane_id: int, road: str) -> list[int] | None:
@@ -115,7 +102,7 @@ def ego_path(streets: Streets, scenario: Scenario, driver: Driver, rng: np.rando
         chain = starts[k]
         way = [] if scenario.target is None else way_to(streets, chain[-1], scenario.target)
         if way is not None:
-            length = sum(float(curves.arc_length(streets.lanes[lane].center)[-1]) for lane in chain)
+            length = sum(float(arc_lengths(streets.lanes[lane].center)[-1]) for lane in chain)
             start = float(rng.uniform(25.0, 55.0)) if near is None else length - float(rng.uniform(*near))
             return path_of_lanes(streets, on_at_random(streets, chain + way, rng), driver, EGO_SMOOTH_M), start
     raise ValueError(f"no way from {scenario.road!r} to {scenario.target!r}")
@@ -136,24 +123,13 @@ def tracked(rear_axle: Array, speed: Array) -> list[tuple[int, Array]]:
     return [(a, track(states[a], states[None, a + 1 : a + 1 + HORIZON_STEPS, :3])[0]) for a in starts]
 
 
-def centre_boxes(rear_axle: Array) -> Array:
-    """(S, 5) boxes of the ego from its rear-axle poses (S, 3)."""
-    ahead = PACIFICA.rear_axle_to_center
-    size = np.broadcast_to([PACIFICA.length, PACIFICA.width], (len(rear_axle), 2))
-    x = rear_axle[:, 0] + ahead * np.cos(rear_axle[:, 2])
-    y = rear_axle[:, 1] + ahead * np.sin(rear_axle[:, 2])
-    return np.column_stack([x, y, rear_axle[:, 2], size])
-
-
 def is_lawful(streets: Streets, path: Path, boxes: Array, signals: Signals, times_s: Array) -> bool:
     """All corners on drivable surface at every step, and never on a connector of its way while that is red."""
-    surface = streets.surface()
-    corners = box_corners(boxes).reshape(-1, 2)
-    if not shapely.contains_xy(surface, corners[:, 0], corners[:, 1]).all():
+    corners = box_corners(boxes)
+    if not shapely.contains_xy(streets.surface(), *corners.reshape(-1, 2).T).all():
         return False
-    body = shapely.polygons(box_corners(boxes))
-    for lane_id in path.lane_ids:
-        lane = streets.lanes[lane_id]
+    body = shapely.polygons(corners)
+    for lane in (streets.lanes[lane_id] for lane_id in path.lane_ids):
         if lane.light_group >= 0:
             ring = shapely.Polygon(np.vstack([lane.left, lane.right[::-1]])).buffer(0.3)
             red = np.array([signals.state(lane.light_group, float(t)) == RED for t in times_s])

@@ -27,7 +27,6 @@ from factory.readers.town.town import log_name
 from factory.readers.town.write import write_logs
 from factory.wording import time_text
 
-THREADS = 2  # of a town that is painted alone; a log's bytes do not depend on them
 MOST_PAINTERS = 8  # processes; each takes half a gigabyte
 LOOK_EVERY_S = 0.1
 
@@ -47,7 +46,7 @@ class TownFolder:
 
 def write_one(town: TownFolder, settings: TownSettings) -> None:
     """Writes the town whole, unless it is there."""
-    make_whole(town.root, lambda folder: write_logs(folder, town.indices, town.seed, settings, THREADS))
+    make_whole(town.root, lambda folder: write_logs(folder, town.indices, town.seed, settings))
 
 
 def write_all(towns: Sequence[TownFolder], settings: TownSettings) -> None:
@@ -58,11 +57,19 @@ def write_all(towns: Sequence[TownFolder], settings: TownSettings) -> None:
     """
     missing = [town for town in towns if not town.root.is_dir()]
     at_once = min(len(missing), os.cpu_count() or 1, MOST_PAINTERS) if settings.cameras or settings.lidar_beams else 1
-    progress = _Progress(len(missing))
+    done, began = 0, time.monotonic()
+
+    def show(town: TownFolder) -> None:
+        nonlocal done
+        done += 1
+        left = (time.monotonic() - began) / done * (len(missing) - done)
+        told = f"town {done} of {len(missing)}: seed {town.seed}, {len(town.indices)} logs painted"
+        print(f"{told}  ETA {time_text(left)}", file=sys.stderr, flush=True)
+
     if at_once <= 1:
         for town in missing:
             write_one(town, settings)
-            progress.show(town)
+            show(town)
         return
     waiting, painting, begun = deque(missing), dict[subprocess.Popen[bytes], TownFolder](), list[Path]()
     lifeline, held = os.pipe()
@@ -79,7 +86,7 @@ def write_all(towns: Sequence[TownFolder], settings: TownSettings) -> None:
                     raise RuntimeError(
                         f"town {town.seed}: {ended}; towns that are written stay, the same command goes on"
                     )
-                progress.show(town)
+                show(town)
             time.sleep(LOOK_EVERY_S)
     finally:
         os.close(held)
@@ -92,17 +99,6 @@ def write_all(towns: Sequence[TownFolder], settings: TownSettings) -> None:
             shutil.rmtree(folder, ignore_errors=True)  # where its town is whole, it is gone
 
 
-class _Progress:
-    def __init__(self, total: int) -> None:
-        self._total, self._done, self._began = total, 0, time.monotonic()
-
-    def show(self, town: TownFolder) -> None:
-        self._done += 1
-        left = (time.monotonic() - self._began) / self._done * (self._total - self._done)
-        told = f"town {self._done} of {self._total}: seed {town.seed}, {len(town.indices)} logs painted"
-        print(f"{told}  ETA {time_text(left)}", file=sys.stderr, flush=True)
-
-
 def _painter(town: TownFolder, unfinished: Path, settings: TownSettings, lifeline: int) -> "subprocess.Popen[bytes]":
     told = {"seed": town.seed, "indices": town.indices, "root": str(town.root), "settings": asdict(settings)}
     command = [sys.executable, "-m", __name__, json.dumps(told | {"unfinished": str(unfinished)})]
@@ -113,12 +109,8 @@ def main(told: str) -> None:
     """A painter's process: one town, on one core."""
     threading.Thread(target=_end_with_input, daemon=True).start()
     town = json.loads(told)
-    settings = TownSettings(**town["settings"])
-
-    def write(folder: Path) -> None:
-        write_logs(folder, town["indices"], town["seed"], settings, threads=1)
-
-    finish_whole(Path(town["unfinished"]), Path(town["root"]), write)
+    arguments = town["indices"], town["seed"], TownSettings(**town["settings"])
+    finish_whole(Path(town["unfinished"]), Path(town["root"]), lambda folder: write_logs(folder, *arguments, threads=1))
 
 
 def _end_with_input() -> None:

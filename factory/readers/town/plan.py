@@ -81,7 +81,7 @@ def _crossroads(b: _Builder, arms: list[_Arm]) -> None:
             np.array([curves.advance(arm.pose, ahead, d)[:2] for d in (-h, h)])
             for ahead in (CROSSING_GAP_M, CROSSING_GAP_M + CROSSING_M)
         ]
-        b.crossings.append(Crossing(edges[0], edges[1], arm.road.name, group))
+        b.crossings.append(Crossing(edges[0], edges[1], group))
 
 
 def _y_branch(b: _Builder, stem: _Arm, rng: np.random.Generator) -> None:

@@ -6,6 +6,7 @@ Visible is the largest `key`, interpolated the same way: 1/w for a camera, heigh
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,33 +17,42 @@ from tasks.world.arrays import F32, Array, Ints, ShortInts
 NEAR_M = 0.15
 
 
+class Mesh(NamedTuple):
+    """T triangles; z is height above the road, x and y world or object coordinates. Kernels take it whole."""
+
+    vertices: Array  # (T, 3, 3) m
+    uv: Array  # (T, 3, 2) surface coordinates, mostly metres
+    normals: Array  # (T, 3) unit
+    material: Ints  # (T,) textures.py
+    colour: Array  # (T, 3) 0..1
+    extent: Array  # (T, 2) size of the whole face [m]
+    seed: Ints  # (T,)
+
+    def placed(self, pose: Array) -> "Mesh":
+        """The object mesh standing on the road at pose (x, y, heading)."""
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        return self._replace(vertices=self.vertices @ turn + [pose[0], pose[1], 0.0], normals=self.normals @ turn)
+
+
 @drawing_kernel
-def rasterise(
-    vertices: Array,  # (T, 3, 3) world
-    uv: Array,  # (T, 3, 2)
-    material: Ints,  # (T,)
-    seed: Ints,  # (T,)
-    view: Array,  # (4, 4): world point (1) -> x, y, w, key; pixel = (x / w, y / w)
-    first_id: int,
-    keys: F32,  # (H, W) in and out
-    ids: ShortInts,  # (H, W) in and out: visible triangle + first_id
-    planes: Array,  # (T, 9) out: 1/w, u/w, v/w as a x + b y + c; (0, 9) where not wanted
-) -> None:
-    """Draws triangles into `keys` and `ids`; sample (row, column) lies at (column + 0.5, row + 0.5)."""
+def rasterise(mesh: Mesh, view: Array, keys: F32, ids: ShortInts) -> Array:
+    """Draws triangles into `keys` and `ids` (H, W), the visible one's number.
+
+    Sample (row, column) lies at (column + 0.5, row + 0.5). The view (4, 4) takes a world point (1) to x, y, w, key; it
+    is seen at (x / w, y / w). Returns each triangle's 1/w, u/w, v/w as a x + b y + c, (T, 9); 0 out of the view.
+    """
+    vertices, uv, material, seed = mesh.vertices, mesh.uv, mesh.material, mesh.seed
+    planes = np.zeros((vertices.shape[0], 9))
     height, width = keys.shape
     h = np.empty((3, 4))
     e = np.empty((3, 3))
-    wants_planes = planes.shape[0] > 0
     for t in range(vertices.shape[0]):
         n_behind = 0
         for i in range(3):
+            x, y, z = vertices[t, i, 0], vertices[t, i, 1], vertices[t, i, 2]
             for k in range(4):
-                h[i, k] = (
-                    view[k, 0] * vertices[t, i, 0]
-                    + view[k, 1] * vertices[t, i, 1]
-                    + view[k, 2] * vertices[t, i, 2]
-                    + view[k, 3]
-                )
+                h[i, k] = view[k, 0] * x + view[k, 1] * y + view[k, 2] * z + view[k, 3]
             if h[i, 2] < NEAR_M:
                 n_behind += 1
         if n_behind == 3:
@@ -64,7 +74,6 @@ def rasterise(
         left, right = max(0, math.ceil(x_low - 0.5)), min(width - 1, math.floor(x_high - 0.5))
         if row_low > row_high or left > right:
             continue
-        det = 0.0
         for i in range(3):
             a, b = (i + 1) % 3, (i + 2) % 3
             e[i, 0] = h[a, 1] * h[b, 2] - h[a, 2] * h[b, 1]
@@ -73,9 +82,7 @@ def rasterise(
         det = h[0, 0] * e[0, 0] + h[0, 1] * e[0, 1] + h[0, 2] * e[0, 2]
         if abs(det) < 1e-12:
             continue
-        for i in range(3):
-            for k in range(3):
-                e[i, k] /= det
+        e /= det
         kx, ky, kc = 0.0, 0.0, 0.0
         for i in range(3):
             kx += e[i, 0] * h[i, 3]
@@ -83,15 +90,12 @@ def rasterise(
             kc += e[i, 2] * h[i, 3]
         kind = material[t]
         cut_out = kind in (LEAVES, TREELINE, SPOKES)
-        if wants_planes or cut_out:
-            p = np.zeros(9)
-            for i in range(3):
-                for k in range(3):
-                    p[k] += e[i, k]
-                    p[3 + k] += e[i, k] * uv[t, i, 0]
-                    p[6 + k] += e[i, k] * uv[t, i, 1]
-            if wants_planes:
-                planes[t] = p
+        p = planes[t]
+        for i in range(3):
+            for k in range(3):
+                p[k] += e[i, k]
+                p[3 + k] += e[i, k] * uv[t, i, 0]
+                p[6 + k] += e[i, k] * uv[t, i, 1]
         for row in range(row_low, row_high + 1):
             y = row + 0.5
             start, stop = float(left), float(right)
@@ -116,4 +120,5 @@ def rasterise(
                         if not opaque_at(kind, u, v, seed[t]):
                             continue
                     keys[row, column] = key
-                    ids[row, column] = t + first_id
+                    ids[row, column] = t
+    return planes

@@ -19,14 +19,31 @@ from tasks.world.clip import Clip
 TOWN_VERSION = 2  # raise by hand whenever the same seed gives other bytes
 
 
-class SyntheticReader:
+class SensedReader(AV2Reader):
+    """Towns' logs: a digest tells what the sensors record, too, pixels and points, which Argoverse's leaves out."""
+
+    data_set = "synthetic"
+    settings: TownSettings
+
+    def read(self, ref: ClipRef) -> Clip:
+        """The validated clip. Raises BadClip."""
+        clip = super().read(ref)
+        return replace(clip, content_digest=self._sensed(clip.content_digest))
+
+    def digest(self, ref: ClipRef) -> str:
+        """The clip's content digest, without reading it. Raises BadClip."""
+        return self._sensed(super().digest(ref))
+
+    def _sensed(self, digest: str) -> str:
+        return hashlib.sha256(f"{digest}{self.split or ''}{json.dumps(asdict(self.settings))}".encode()).hexdigest()
+
+
+class SyntheticReader(SensedReader):
     """Clips of a seed's town. It is test data and a first look, no replacement for real logs.
 
     The town is written on first use, into a folder named by everything that its bytes depend on, and moved there
     whole: parallel workers and killed processes never leave or see half a town.
     """
-
-    name = "synthetic"
 
     def __init__(
         self,
@@ -37,47 +54,25 @@ class SyntheticReader:
     ) -> None:
         """cache_dir: where towns are kept; None: in the user's cache. Raises ValueError for n_clips < 1."""
         clips = TownClips(n_clips=n_clips, seed=seed, settings=settings or TownSettings())
-        self.cache_dir = Path(cache_dir or user_cache() / "towns").expanduser().absolute()
         self.n_clips, self.seed, self.settings = clips.n_clips, clips.seed, clips.settings
-        self._logs: AV2Reader | None = None
+        super().__init__(town_folder(cache_dir, seed, [n_clips], self.settings))
 
-    @property
-    def root(self) -> Path:
-        """Where this town's logs lie, or will."""
-        key = json.dumps([TOWN_VERSION, self.n_clips, self.seed, asdict(self.settings)])
-        return self.cache_dir / f"town-{self.seed}-{hashlib.sha256(key.encode()).hexdigest()[:16]}"
+    def logs(self) -> dict[str, Path]:
+        """Log id -> folder; writes the town if it is missing."""
+        make_whole(self.root, lambda folder: write_town(folder, self.n_clips, self.seed, self.settings))
+        return super().logs()
 
     def index(self) -> ClipIndex:
         """The first n_clips windows, in the order of the logs."""
-        index = self._reader().index()
+        index = super().index()
         return replace(index, refs=index.refs[: self.n_clips])
 
-    def read(self, ref: ClipRef) -> Clip:
-        """The validated clip. Raises BadClip."""
-        clip = self._reader().read(ref)
-        return replace(clip, content_digest=self._with_sensors(clip.content_digest))
 
-    def digest(self, ref: ClipRef) -> str:
-        """The clip's content digest, without reading it. Raises BadClip."""
-        return self._with_sensors(self._reader().digest(ref))
-
-    def block(self, ref: ClipRef) -> str | None:
-        """Of the clip, as an Argoverse 2 log's."""
-        return self._reader().block(ref)
-
-    def _with_sensors(self, digest: str) -> str:
-        return sensed_digest(digest, self.settings)
-
-    def _reader(self) -> AV2Reader:
-        if self._logs is None:
-            make_whole(self.root, lambda folder: write_town(folder, self.n_clips, self.seed, self.settings))
-            self._logs = AV2Reader(self.root, name=self.name)
-        return self._logs
-
-
-def sensed_digest(digest: str, settings: TownSettings) -> str:
-    """A log's digest with what the sensors record: pixels and points, which Argoverse's digest leaves out."""
-    return hashlib.sha256(f"{digest}{json.dumps(asdict(settings))}".encode()).hexdigest()
+def town_folder(cache_dir: str | Path | None, seed: int, logs: list[object], settings: TownSettings) -> Path:
+    """Where these logs of a seed's town lie, or will."""
+    key = json.dumps([TOWN_VERSION, *logs, seed, asdict(settings)])
+    name = f"town-{seed}-{hashlib.sha256(key.encode()).hexdigest()[:16]}"
+    return Path(cache_dir or user_cache() / "towns").expanduser().absolute() / name
 
 
 def make_whole(root: Path, write: Callable[[Path], object]) -> None:

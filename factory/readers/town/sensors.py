@@ -80,16 +80,14 @@ def scan(stage: Stage, world_from_ego: Array, beams: int, azimuths: int) -> Swee
         local = direction[mine] @ ego_from_view[:3, :3]  # x right, y down, z forward
         x = local[:, 0] / local[:, 2] * width / 2 + width / 2
         y = local[:, 1] / local[:, 2] * width / 2 + height / 2
-        seen = look(stage, view, width, height)
-        column = np.clip(x.astype(int), 0, width - 1)
-        hit = seen.ids[np.clip(y.astype(int), 0, height - 1), column]
-        plane = seen.planes[np.maximum(hit, 0)]
+        ids, planes = look(stage, view, width, height)
+        hit = ids[np.clip(y.astype(int), 0, height - 1), np.clip(x.astype(int), 0, width - 1)]
+        plane = planes[np.maximum(hit, 0)]
         inverse_depth = plane[:, 0] * x + plane[:, 1] * y + plane[:, 2]
         met = (hit >= 0) & (inverse_depth > 1.0 / (2 * RANGE_M[1]))
         distance[mine[met]] = 1.0 / (inverse_depth[met] * local[met, 2])
-        facing = np.abs(
-            np.einsum("ij,ij->i", stage.mesh.normals[hit[met]] @ world_from_ego[:3, :3], direction[mine[met]])
-        )
+        normals = stage.mesh.normals[hit[met]] @ world_from_ego[:3, :3]
+        facing = np.abs(np.einsum("ij,ij->i", normals, direction[mine[met]]))
         intensity[mine[met]] = _reflectance(stage, hit[met]) * (0.35 + 0.65 * facing)
     keep = np.flatnonzero((distance > RANGE_M[0]) & (distance < RANGE_M[1]))  # false for NaN
     return Sweep(

@@ -11,6 +11,7 @@ import shapely
 
 from factory.readers.town import curves
 from tasks.world.arrays import Array
+from tasks.world.polygons import arc_lengths
 
 CROSSING_M = 3.0  # a crosswalk's width along the road
 CROSSING_GAP_M = 0.8  # from the junction's edge
@@ -30,12 +31,16 @@ class Road:
     strip_width: float
     speed_mps: float
     crossing_at_start: bool = False
-    crossing_at_end: bool = False
 
     @property
     def half_width(self) -> float:
         """Reference line to kerb [m]."""
         return self.lanes * self.lane_width + self.strip_width
+
+    @property
+    def both_ways(self) -> tuple[Array, Array]:
+        """The line as driven in either direction."""
+        return self.line, curves.reverse(self.line)
 
 
 @dataclass
@@ -77,7 +82,6 @@ class Crossing:
 
     edge1: Array  # (2, 2)
     edge2: Array
-    arm: str  # road name
     light_group: int  # of the cars that it crosses
 
 
@@ -137,7 +141,7 @@ class _Builder:
     def road(self, road: Road) -> tuple[_Arm, _Arm]:
         """Lanes of a road in segments of ~80 m; returns the arms at its first and second end."""
         self.roads.append(road)
-        n_cuts = max(1, round(curves.arc_length(road.line)[-1] / 80.0))
+        n_cuts = max(1, round(arc_lengths(road.line)[-1] / 80.0))
         bounds = np.linspace(0, len(road.line) - 1, n_cuts + 1).astype(int)
         chains: dict[tuple[bool, int], list[int]] = {}
         for a, b in itertools.pairwise(bounds):
@@ -148,21 +152,13 @@ class _Builder:
             ordered = chain if forward else chain[::-1]
             for before, after in itertools.pairwise(ordered):
                 self.join(before, after)
-            crossing = road.crossing_at_end if forward else road.crossing_at_start
-            self.lanes[ordered[-1]].stop_before_end = STOP_LINE_M if crossing else 0.5
+            self.lanes[ordered[-1]].stop_before_end = STOP_LINE_M if road.crossing_at_start and not forward else 0.5
         h = road.half_width
         self.areas.append(np.vstack([curves.offset(road.line, -h)[:, :2], curves.offset(road.line, h)[::-1, :2]]))
-        first = _Arm(
-            road,
-            road.line[0],
-            [chains[False, k][0] for k in range(road.lanes)],
-            [chains[True, k][0] for k in range(road.lanes)],
-        )
-        second = _Arm(
-            road,
-            curves.advance(road.line[-1], 0.0, turn=np.pi),
-            [chains[True, k][-1] for k in range(road.lanes)],
-            [chains[False, k][-1] for k in range(road.lanes)],
+        outwards = (road.line[0], 0, False), (curves.advance(road.line[-1], 0.0, turn=np.pi), -1, True)
+        first, second = (
+            _Arm(road, pose, *([chains[way, k][end] for k in range(road.lanes)] for way in (comes, not comes)))
+            for pose, end, comes in outwards
         )
         return first, second
 

@@ -9,34 +9,29 @@ import math
 from tasks.kernels.compiled import drawing_kernel
 
 # Materials
-(
-    ASPHALT,
-    ROAD,
-    PAVING,
-    KERB,
-    GRASS,
-    FACADE,
-    ROOF_TILES,
-    FLAT_ROOF,
-    BARK,
-    LEAVES,
-    PAINTED,
-    CABIN,
-    WHEEL,
-    GLOW,
-    METAL,
-    CLOTH,
-    SIGN,
-    TREELINE,
-    CARGO,
-    BUS_SIDE,
-    SPOKES,
-    ISLAND_STONE,
-    DARK,
-) = range(23)
-
+ASPHALT, ROAD, PAVING, KERB, GRASS, FACADE, ROOF_TILES, FLAT_ROOF, BARK, LEAVES, PAINTED, CABIN = range(12)
+WHEEL, GLOW, METAL, CLOTH, SIGN, TREELINE, CARGO, BUS_SIDE, SPOKES, ISLAND_STONE, DARK = range(12, 23)
 
 RGB = tuple[float, float, float]
+WALLS = (  # colours: three of brick, four of plaster, concrete panels
+    *((0.55, 0.30, 0.23), (0.46, 0.33, 0.26), (0.66, 0.54, 0.40)),
+    *((0.80, 0.74, 0.62), (0.72, 0.60, 0.42), (0.62, 0.66, 0.68), (0.74, 0.55, 0.47)),
+    (0.60, 0.59, 0.57),
+)
+MORTAR, TRIM, SHUTTER = (0.62, 0.59, 0.55), (1.0, 0.97, 0.92), (0.85, 0.85, 0.82)
+
+
+@drawing_kernel
+def toned(colour: RGB, tone: float) -> RGB:
+    """The colour, lighter or darker by a factor."""
+    return colour[0] * tone, colour[1] * tone, colour[2] * tone
+
+
+@drawing_kernel
+def mixed(colour: RGB, other: RGB, share: float) -> RGB:
+    """The colour with that share of the other."""
+    r, g, b = colour
+    return r + (other[0] - r) * share, g + (other[1] - g) * share, b + (other[2] - b) * share
 
 
 @drawing_kernel
@@ -148,7 +143,7 @@ def grass(x: float, y: float, footprint: float) -> RGB:
 
 @drawing_kernel
 def wall(u: float, v: float, style: int, seed: int, footprint: float) -> RGB:
-    """Brick (styles 0-2), plaster (3-6) or concrete panels (7), stained from above."""
+    """Brick, plaster or concrete panels, as in WALLS, stained from above."""
     stain = 1.0 + 0.16 * (noise(u / 1.3, v / 4.0, seed) - 0.5) + 0.10 * (noise(u / 0.4, v / 0.9, seed + 1) - 0.5)
     if style <= 2:
         row = math.floor(v / 0.085)
@@ -158,56 +153,36 @@ def wall(u: float, v: float, style: int, seed: int, footprint: float) -> RGB:
         tone = stain * (1 + 0.2 * seen * (chance(int(column), int(row), seed) - 0.5))
         du, dv = shifted - column * 0.24, v - row * 0.085
         mortar = max(inside(du, 0.0, 0.014, footprint), inside(dv, 0.0, 0.014, footprint)) * visible(0.06, footprint)
-        if style == 0:
-            r, g, b = 0.55 * tone, 0.30 * tone, 0.23 * tone
-        elif style == 1:
-            r, g, b = 0.46 * tone, 0.33 * tone, 0.26 * tone
-        else:
-            r, g, b = 0.66 * tone, 0.54 * tone, 0.40 * tone
-        return r + (0.62 - r) * mortar, g + (0.59 - g) * mortar, b + (0.55 - b) * mortar
-    rough = stain + 0.1 * grain(u, v, seed + 3, footprint)
-    if style == 3:
-        return 0.80 * rough, 0.74 * rough, 0.62 * rough
-    if style == 4:
-        return 0.72 * rough, 0.60 * rough, 0.42 * rough
-    if style == 5:
-        return 0.62 * rough, 0.66 * rough, 0.68 * rough
-    if style == 6:
-        return 0.74 * rough, 0.55 * rough, 0.47 * rough
-    joint = 0.75 if (u % 3.0 < 0.03 or v % 1.6 < 0.03) and footprint < 0.3 else 1.0
-    return 0.60 * rough * joint, 0.59 * rough * joint, 0.57 * rough * joint
+        return mixed(toned(WALLS[style], tone), MORTAR, mortar)
+    rough = toned(WALLS[style], stain + 0.1 * grain(u, v, seed + 3, footprint))
+    return toned(rough, 0.75) if style == 7 and (u % 3.0 < 0.03 or v % 1.6 < 0.03) and footprint < 0.3 else rough
 
 
 @drawing_kernel
 def pane(u: float, v: float, cell: int, seed: int) -> RGB:
     """Glass seen from the street: a dark room, a curtain, a bit of sky; u, v in 0..1 over the pane."""
     kind = chance(cell, 3, seed)
-    sky = 0.16 + 0.30 * max(0.0, v - 0.35 + 0.25 * (u - 0.5)) * chance(cell, 4, seed)
-    r, g, b = 0.10 + sky * 0.8, 0.12 + sky * 0.95, 0.15 + sky * 1.1
     if kind < 0.35 and abs(u - 0.5) > 0.17 + 0.2 * chance(cell, 5, seed):
-        fold = 0.85 + 0.15 * math.sin(u * 60.0)
-        r, g, b = 0.74 * fold, 0.70 * fold, 0.62 * fold
-    elif kind > 0.7 and v > 0.3 + 0.6 * chance(cell, 6, seed):
-        r, g, b = 0.62, 0.60, 0.55
-    elif kind > 0.62 and kind < 0.66:
-        r, g, b = 0.85, 0.74, 0.48
-    return r, g, b
+        return toned((0.74, 0.70, 0.62), 0.85 + 0.15 * math.sin(u * 60.0))
+    if kind > 0.7 and v > 0.3 + 0.6 * chance(cell, 6, seed):
+        return 0.62, 0.60, 0.55
+    if kind > 0.62 and kind < 0.66:
+        return 0.85, 0.74, 0.48
+    sky = 0.16 + 0.30 * max(0.0, v - 0.35 + 0.25 * (u - 0.5)) * chance(cell, 4, seed)
+    return 0.10 + sky * 0.8, 0.12 + sky * 0.95, 0.15 + sky * 1.1
 
 
 @drawing_kernel
 def facade(u: float, v: float, width: float, height: float, seed: int, fu: float, fv: float) -> RGB:
     """A house front: plinth, shops or doors at street level, floors of windows, cornice. Everything by `seed`."""
-    fp = max(fu, fv)
-    style = int(chance(seed, 1, 77) * 8)
     ground = 3.3 + chance(seed, 2, 77) * 0.9
     floor_height = 2.9 + chance(seed, 3, 77) * 0.5
-    bays = max(1.0, math.floor(width / (2.1 + 1.2 * chance(seed, 4, 77))))
-    spacing = width / bays
+    spacing = width / max(1.0, math.floor(width / (2.1 + 1.2 * chance(seed, 4, 77))))
     trim = 0.55 + 0.35 * chance(seed, 5, 77)
-    r, g, b = wall(u, v, style, seed, fp)
+    cornice = toned(TRIM, trim)
+    colour = wall(u, v, int(chance(seed, 1, 77) * 8), seed, max(fu, fv))
     bay = math.floor(u / spacing)
     x = u - bay * spacing
-    shops = chance(seed, 6, 77) < 0.55
     if v > ground:
         floor = math.floor((v - ground) / floor_height)
         y = v - ground - floor * floor_height
@@ -216,29 +191,20 @@ def facade(u: float, v: float, width: float, height: float, seed: int, fu: float
             low, high = 0.75 + 0.2 * chance(seed, 8, 77), floor_height - 0.42
             left, right = spacing / 2 - half, spacing / 2 + half
             surround = inside(x, left - 0.14, right + 0.14, fu) * inside(y, low - 0.16, high + 0.16, fv)
-            r, g, b = r + (trim - r) * surround, g + (trim * 0.97 - g) * surround, b + (trim * 0.92 - b) * surround
             sill = inside(y, low - 0.42, low - 0.16, fv) * inside(x, left - 0.1, right + 0.1, fu)
-            r, g, b = r * (1 - 0.28 * sill), g * (1 - 0.28 * sill), b * (1 - 0.28 * sill)
+            colour = toned(mixed(colour, cornice, surround), 1 - 0.28 * sill)
             opening = inside(x, left, right, fu) * inside(y, low, high, fv)
             if opening > 0.0:
                 pu, pv = (x - left) / (right - left), (y - low) / (high - low)
-                pr, pg, pb = pane(pu, pv, int(bay) * 31 + int(floor), seed)
+                glass = pane(pu, pv, int(bay) * 31 + int(floor), seed)
                 frame = 1.0 - inside(x, left + 0.07, right - 0.07, fu) * inside(y, low + 0.07, high - 0.07, fv)
-                frame = max(
-                    frame, inside(pu, 0.46, 0.54, fu / (right - left)), inside(pv, 0.66, 0.71, fv / (high - low))
-                )
+                bars = inside(pu, 0.46, 0.54, fu / (right - left)), inside(pv, 0.66, 0.71, fv / (high - low))
                 tone = 0.88 if chance(seed, 9, 77) < 0.7 else 0.22
-                shade = 1.0 - 0.55 * inside(y, high - 0.16, high, fv)
-                pr, pg, pb = (
-                    (pr + (tone - pr) * frame) * shade,
-                    (pg + (tone - pg) * frame) * shade,
-                    (pb + (tone - pb) * frame) * shade,
-                )
-                r, g, b = r + (pr - r) * opening, g + (pg - g) * opening, b + (pb - b) * opening
-        band = inside(y, 0.0, 0.16, fv)
-        r, g, b = r + (trim * 0.9 - r) * band, g + (trim * 0.88 - g) * band, b + (trim * 0.84 - b) * band
-    elif shops:
-        r, g, b = shopfront(u, v, ground, seed, fu, fv)
+                glass = mixed(glass, (tone, tone, tone), max(frame, bars[0], bars[1]))
+                colour = mixed(colour, toned(glass, 1.0 - 0.55 * inside(y, high - 0.16, high, fv)), opening)
+        colour = mixed(colour, (trim * 0.9, trim * 0.88, trim * 0.84), inside(y, 0.0, 0.16, fv))
+    elif chance(seed, 6, 77) < 0.55:
+        colour = shopfront(u, v, ground, seed, fu, fv)
     else:
         left, right = spacing * 0.25, spacing * 0.75
         is_door = chance(int(bay), 12, seed) < 0.3
@@ -246,19 +212,17 @@ def facade(u: float, v: float, width: float, height: float, seed: int, fu: float
         opening = inside(x, left, right, fu) * inside(v, low, high, fv)
         if is_door:
             hue = chance(int(bay), 13, seed)
-            panel = 0.75 + 0.25 * inside((v * 1.4) % 1.0, 0.12, 0.88, fv * 1.4) * inside(
-                (x - left) / (right - left) * 2 % 1.0, 0.15, 0.85, fu
-            )
-            pr, pg, pb = (0.16 + 0.34 * hue) * panel, (0.20 + 0.10 * hue) * panel, (0.30 - 0.2 * hue) * panel
+            across = inside((x - left) / (right - left) * 2 % 1.0, 0.15, 0.85, fu)
+            panel = 0.75 + 0.25 * inside((v * 1.4) % 1.0, 0.12, 0.88, fv * 1.4) * across
+            filling = toned((0.16 + 0.34 * hue, 0.20 + 0.10 * hue, 0.30 - 0.2 * hue), panel)
         else:
-            pr, pg, pb = pane((x - left) / (right - left), (v - low) / (high - low), int(bay), seed + 1)
+            filling = pane((x - left) / (right - left), (v - low) / (high - low), int(bay), seed + 1)
             frame = 1.0 - inside(x, left + 0.08, right - 0.08, fu) * inside(v, low + 0.08, high - 0.08, fv)
-            pr, pg, pb = pr + (0.85 - pr) * frame, pg + (0.85 - pg) * frame, pb + (0.82 - pb) * frame
-        r, g, b = r + (pr - r) * opening, g + (pg - g) * opening, b + (pb - b) * opening
+            filling = mixed(filling, SHUTTER, frame)
+        r, g, b = mixed(colour, filling, opening)
         plinth = inside(v, -1.0, 0.5, fv) * (1 - opening)
-        r, g, b = r * (1 - 0.4 * plinth), g * (1 - 0.4 * plinth), b * (1 - 0.38 * plinth)
-    top = inside(v, height - 0.45, height + 1.0, fv)
-    return r + (trim - r) * top, g + (trim * 0.97 - g) * top, b + (trim * 0.92 - b) * top
+        colour = r * (1 - 0.4 * plinth), g * (1 - 0.4 * plinth), b * (1 - 0.38 * plinth)
+    return mixed(colour, cornice, inside(v, height - 0.45, height + 1.0, fv))
 
 
 @drawing_kernel
@@ -267,7 +231,7 @@ def shopfront(u: float, v: float, ground: float, seed: int, fu: float, fv: float
     shop = math.floor(u / 4.6)
     x = u - shop * 4.6
     hue = chance(shop, 21, seed)
-    sr, sg, sb = 0.15 + 0.65 * chance(shop, 22, seed), 0.15 + 0.4 * hue, 0.15 + 0.5 * chance(shop, 23, seed)
+    sign = 0.15 + 0.65 * chance(shop, 22, seed), 0.15 + 0.4 * hue, 0.15 + 0.5 * chance(shop, 23, seed)
     if v > ground - 0.85:
         letter = 0.0
         y = (v - ground + 0.68) / 0.42
@@ -276,23 +240,22 @@ def shopfront(u: float, v: float, ground: float, seed: int, fu: float, fv: float
             letter = visible(0.12, max(fu, fv)) * 0.85 if stroke and (x / 0.34) % 1.0 < 0.78 else 0.0
         edge = 1.0 - inside(x, 0.1, 4.5, fu) * inside(v, ground - 0.8, ground - 0.12, fv)
         tone = 0.92 if hue < 0.7 else 0.1
-        sr, sg, sb = sr + (tone - sr) * letter, sg + (tone - sg) * letter, sb + (tone * 0.95 - sb) * letter
-        return sr * (1 - 0.5 * edge), sg * (1 - 0.5 * edge), sb * (1 - 0.5 * edge)
+        return toned(mixed(sign, (tone, tone, tone * 0.95), letter), 1 - 0.5 * edge)
     door = x > 3.35
     low = 0.1 if door else 0.55
     left, right = (3.5, 4.4) if door else (0.25, 3.3)
-    glass = inside(x, left, right, fu) * inside(v, low, ground - 1.0, fv)
     bar = 0.0 if door else inside(x, 1.72, 1.82, fu)
+    glass = inside(x, left, right, fu) * inside(v, low, ground - 1.0, fv) * (1 - bar)
     goods = noise(x / 0.35, v / 0.45, seed + shop) * visible(0.35, max(fu, fv)) if v < 1.9 else 0.3
     column, row = math.floor(x / 0.35), math.floor(v / 0.45)
     goods *= 0.2 + 0.8 * chance(column, row, seed + 1)
     warm = chance(column, row, seed + 2) - 0.5
-    gr = 0.12 + goods * (0.52 + 0.25 * warm) + 0.10 * v / ground
-    gg = 0.13 + goods * 0.46 + 0.11 * v / ground
-    gb = 0.15 + goods * (0.38 - 0.25 * warm) + 0.13 * v / ground
-    glass *= 1 - bar
-    fr, fg, fb = sr * 0.6 + 0.1, sg * 0.6 + 0.1, sb * 0.6 + 0.1
-    return fr + (gr - fr) * glass, fg + (gg - fg) * glass, fb + (gb - fb) * glass
+    window = (
+        0.12 + goods * (0.52 + 0.25 * warm) + 0.10 * v / ground,
+        0.13 + goods * 0.46 + 0.11 * v / ground,
+        0.15 + goods * (0.38 - 0.25 * warm) + 0.13 * v / ground,
+    )
+    return mixed((sign[0] * 0.6 + 0.1, sign[1] * 0.6 + 0.1, sign[2] * 0.6 + 0.1), window, glass)
 
 
 @drawing_kernel

@@ -1,29 +1,22 @@
 """Several towns as one data set: a few logs of each seed's town, for studies that split their clips by town."""
 
-import hashlib
-import json
 from collections.abc import Sequence
-from dataclasses import asdict, replace
 from pathlib import Path
 
-from factory.readers.av2.reader import AV2Reader
 from factory.readers.base import ClipRef
 from factory.readers.settings import LOGS_PER_TOWN, TownsClips, TownSettings
 from factory.readers.town.painters import TownFolder, write_all
-from factory.readers.town.reader import TOWN_VERSION, sensed_digest
+from factory.readers.town.reader import SensedReader, town_folder
 from tasks.caches import user_cache
-from tasks.world.clip import Clip
 
 
-class SyntheticTownsReader(AV2Reader):
+class SyntheticTownsReader(SensedReader):
     """Clips of the towns of several seeds; no seed's clips depend on which other seeds are read.
 
     A town has eighteen kinds of drives. Of each town the next `logs_per_town` are taken, so that a few towns hold every
     kind. Each town is written on first use into a folder of its own and moved there whole: indexing writes them all,
     before a run's workers start, and a reader elsewhere writes those it reads from.
     """
-
-    data_set = "synthetic"
 
     def __init__(
         self,
@@ -58,19 +51,6 @@ class SyntheticTownsReader(AV2Reader):
                 return town.logs()[ref.log_id]
         return super().path_of(ref)
 
-    def read(self, ref: ClipRef) -> Clip:
-        """The validated clip, of this reader's split. Raises BadClip."""
-        clip = super().read(ref)
-        return replace(clip, content_digest=self._of_here(clip.content_digest))
-
-    def digest(self, ref: ClipRef) -> str:
-        """The clip's content digest, without reading it. Raises BadClip."""
-        return self._of_here(super().digest(ref))
-
-    def _of_here(self, digest: str) -> str:
-        return sensed_digest(f"{digest}{self.split}", self.settings)
-
     def _town(self, seed: int, n_logs: int) -> TownFolder:
         indices = tuple((seed * n_logs + i) % LOGS_PER_TOWN for i in range(n_logs))
-        key = json.dumps([TOWN_VERSION, "logs", indices, seed, asdict(self.settings)])
-        return TownFolder(seed, indices, self.root / f"town-{seed}-{hashlib.sha256(key.encode()).hexdigest()[:16]}")
+        return TownFolder(seed, indices, town_folder(self.root, seed, ["logs", indices], self.settings))

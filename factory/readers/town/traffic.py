@@ -13,7 +13,8 @@ from scipy.spatial import cKDTree
 from factory.readers.town import curves
 from factory.readers.town.streets import Streets
 from tasks.world.arrays import Array, Bools
-from tasks.world.frames import box_corners
+from tasks.world.boxes import touching
+from tasks.world.polygons import arc_lengths
 
 STEP_S = 0.1
 GREEN, YELLOW, RED = 1, 2, 3
@@ -82,20 +83,19 @@ def path_of_lanes(streets: Streets, lane_ids: list[int], driver: Driver, smooth_
         lane = streets.lanes[lane_id]
         parts.append(lane.center if i == 0 else lane.center[1:])
         limits.append(np.full(len(parts[-1]), lane.speed_mps))
-        length += float(curves.arc_length(lane.center)[-1])
+        length += float(arc_lengths(lane.center)[-1])
         following = streets.lanes[lane_ids[i + 1]] if i + 1 < len(lane_ids) else None
         if following is not None and following.light_group >= 0:
             stops.append((length - lane.stop_before_end, following.light_group))
         if following is None and lane.kind == "BIKE":
             stops.append((length - lane.stop_before_end, -1))
     line = np.vstack(parts)
-    s_raw = curves.arc_length(line)
-    n = int(np.ceil(s_raw[-1])) + 1
-    even = np.linspace(0.0, s_raw[-1], n)
-    xy = curves.at(line, s_raw, even)[:, :2]
+    s_raw = arc_lengths(line)
+    even = np.linspace(0.0, s_raw[-1], int(np.ceil(s_raw[-1])) + 1)
+    xy = curves.at(line, even)[:, :2]
     xy = xy + gaussian_filter1d(xy - _chord(xy), smooth_m / (even[1]), axis=0, mode="nearest") - (xy - _chord(xy))
-    poses = curves.resample(xy, 1.0, float(line[0, 2]))
-    s = curves.arc_length(poses)
+    poses = curves.resample(xy, float(line[0, 2]))
+    s = arc_lengths(poses)
     curvature = gaussian_filter1d(np.gradient(np.unwrap(poses[:, 2]), s), 2.0)
     winding = np.abs(gaussian_filter1d(np.gradient(curvature, s), 2.0))
     posted = np.interp(s, s_raw, np.concatenate(limits)) * driver.speed_factor
@@ -113,13 +113,7 @@ def _chord(xy: Array) -> Array:
 
 
 def drive(
-    path: Path,
-    start_s: float,
-    speed: float,
-    driver: Driver,
-    others: Array,
-    signals: Signals,
-    times_s: Array,
+    path: Path, start_s: float, speed: float, driver: Driver, others: Array, signals: Signals, times_s: Array
 ) -> tuple[Array, Array]:
     """Arc length (S,) [m] and speed (S,) [m/s] of a driver that sees `others` (S, J, 5): IDM with bounded jerk."""
     rear, along_speed = _on_path(path, driver, others)
@@ -154,58 +148,34 @@ def drive(
 
 def _follow(gap: float, v: float, lead_v: float, driver: Driver) -> float:
     """IDM's interaction term (Treiber et al. 2000)."""
-    wanted = driver.gap_m + max(
-        0.0, v * driver.headway_s + v * (v - lead_v) / (2 * np.sqrt(driver.accel * driver.brake))
-    )
+    closing = v * (v - lead_v) / (2 * np.sqrt(driver.accel * driver.brake))
+    wanted = driver.gap_m + max(0.0, v * driver.headway_s + closing)
     return driver.accel * (1.0 - (wanted / max(gap, 0.3)) ** 2)
 
 
 def _on_path(path: Path, driver: Driver, others: Array) -> tuple[Array, Array]:
     """Where along the path everybody in the driver's corridor ends (S, J) (inf: not in it), and speeds along it."""
-    steps, n = others.shape[:2]
-    if n == 0:
-        return np.full((steps, 1), np.inf), np.zeros((steps, 1))
-    flat = others.reshape(-1, 5)
-    present = ~np.isnan(flat[:, 0])
-    rear = np.full(len(flat), np.inf)
-    along = np.zeros(len(flat))
-    _, nearest = cKDTree(path.poses[:, :2]).query(flat[present, :2])
+    if others.shape[1] == 0:
+        return np.full((len(others), 1), np.inf), np.zeros((len(others), 1))
+    rear, along = np.full(others.shape[:2], np.inf), np.zeros(others.shape[:2])
+    present = ~np.isnan(others[..., 0])
+    box = others[present]
+    _, nearest = cKDTree(path.poses[:, :2]).query(box[:, :2])
     pose = path.poses[nearest]
-    box = flat[present]
-    dx, dy = box[:, 0] - pose[:, 0], box[:, 1] - pose[:, 1]
+    dx, dy = (box[:, :2] - pose[:, :2]).T
     c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
     turn = box[:, 2] - pose[:, 2]
     cos, sin = np.abs(np.cos(turn)), np.abs(np.sin(turn))
     across = box[:, 3] / 2 * sin + box[:, 4] / 2 * cos
-    position = path.s[nearest] + c * dx + s * dy
+    along[present] = position = path.s[nearest] + c * dx + s * dy
     inside = np.abs(-s * dx + c * dy) < across + driver.half_width_m + 0.25
     rear[present] = np.where(inside, position - box[:, 3] / 2 * cos - box[:, 4] / 2 * sin, np.inf)
-    along[present] = position
-    speed = np.clip(np.gradient(along.reshape(steps, n), STEP_S, axis=0), 0.0, 30.0)
-    return rear.reshape(steps, n), np.nan_to_num(speed)
+    return rear, np.nan_to_num(np.clip(np.gradient(along, STEP_S, axis=0), 0.0, 30.0))
 
 
 def overlaps(boxes: Array, others: Array, margin_m: float) -> Bools:
     """(S, J): does `boxes` (S, 5), grown by `margin_m` on every side, touch `others` (S, J, 5)? NaN touches nothing."""
-    hit = np.zeros(others.shape[:2], bool)
-    grown = boxes + np.array([0.0, 0.0, 0.0, 2 * margin_m, 2 * margin_m])
-    reach = (np.hypot(grown[:, 3], grown[:, 4])[:, None] + np.hypot(others[..., 3], others[..., 4])) / 2
-    near = np.hypot(others[..., 0] - boxes[:, None, 0], others[..., 1] - boxes[:, None, 1]) < reach
-    step, index = np.nonzero(near)
-    if len(step):
-        hit[step, index] = _boxes_touch(grown[step], others[step, index])
-    return hit
-
-
-def _boxes_touch(a: Array, b: Array) -> Bools:
-    """(M,) separating-axis test of boxes (M, 5)."""
-    corners_a, corners_b = box_corners(a), box_corners(b)
-    touch = np.ones(len(a), bool)
-    for heading in (a[:, 2], a[:, 2] + np.pi / 2, b[:, 2], b[:, 2] + np.pi / 2):
-        axis = np.stack([np.cos(heading), np.sin(heading)], axis=-1)[:, :, None]
-        pa, pb = (corners_a @ axis)[..., 0], (corners_b @ axis)[..., 0]
-        touch &= (pa.max(1) >= pb.min(1)) & (pb.max(1) >= pa.min(1))
-    return touch
+    return touching((boxes + 2 * margin_m * np.array([0.0, 0.0, 0.0, 1.0, 1.0]))[:, None], others)
 
 
 def endangers(ego: Array, speeds: Array, others: Array, margin_m: float = 0.15) -> Bools:

@@ -18,6 +18,7 @@ import pyarrow.feather
 import shapely
 from scipy.spatial.transform import Rotation
 
+from factory.readers.av2.log import POSE_COLUMNS, SIZE_COLUMNS
 from factory.readers.settings import LOG_STEPS, STEPS_PER_SWEEP, TownSettings
 from factory.readers.town.draw import Theatre, paint
 from factory.readers.town.drive import Drive
@@ -86,22 +87,14 @@ def write_log(
 
 
 def _sensors(
-    folder: Path,
-    town: Town,
-    drive: Drive,
-    rig: tuple[Camera, ...],
-    settings: TownSettings,
-    stamps: Ints,
-    threads: int,
+    folder: Path, town: Town, drive: Drive, rig: tuple[Camera, ...], settings: TownSettings, stamps: Ints, threads: int
 ) -> None:
-    if not rig and not settings.lidar_beams:
+    kinds = [f"cameras/{camera.name}" for camera in rig] + ["lidar"] * bool(settings.lidar_beams)
+    if not kinds:
         return
     theatre = Theatre(town.scenery, drive, town.sun_azimuth, town.sun_elevation, town.sky_seed)
-    for camera in rig:
-        (folder / "sensors" / "cameras" / camera.name).mkdir(parents=True, exist_ok=True)
-    if settings.lidar_beams:
-        (folder / "sensors" / "lidar").mkdir(parents=True, exist_ok=True)
-
+    for kind in kinds:
+        (folder / "sensors" / kind).mkdir(parents=True, exist_ok=True)
     photographed = range(0, settings.photo_steps if rig else 0, settings.steps_per_photo)
     swept = range(0, LOG_STEPS if settings.lidar_beams else 0, STEPS_PER_SWEEP)
 
@@ -137,11 +130,9 @@ def _poses(drive: Drive, stamps: Ints) -> dict[str, Any]:
 
 def _annotations(drive: Drive, stamps: Ints) -> dict[str, Any]:
     """One row per box and frame, box pose in the ego frame of that frame."""
-    rows: list[tuple[int, int]] = []  # (step, track)
     poses = np.stack([track.poses for track in drive.tracks], axis=1)
     delta = poses[..., :2] - drive.ego[:, None, :2]
-    rows = [(int(i), int(j)) for i, j in np.argwhere(np.hypot(delta[..., 0], delta[..., 1]) < ANNOTATION_RANGE_M)]
-    step, which = np.array([r[0] for r in rows]), np.array([r[1] for r in rows])
+    step, which = np.nonzero(np.hypot(delta[..., 0], delta[..., 1]) < ANNOTATION_RANGE_M)
     heading = drive.ego[step, 2]
     dx, dy = delta[step, which].T
     sizes = np.array([track.size for track in drive.tracks])[which]
@@ -150,9 +141,7 @@ def _annotations(drive: Drive, stamps: Ints) -> dict[str, Any]:
         "timestamp_ns": stamps[step],
         "track_uuid": [drive.tracks[k].track_id for k in which],
         "category": [drive.tracks[k].category for k in which],
-        "length_m": sizes[:, 0],
-        "width_m": sizes[:, 1],
-        "height_m": sizes[:, 2],
+        **dict(zip(SIZE_COLUMNS, sizes.T)),
         **_yaw_columns(poses[step, which, 2] - heading),
         "tx_m": np.cos(heading) * dx + np.sin(heading) * dy,
         "ty_m": -np.sin(heading) * dx + np.cos(heading) * dy,
@@ -181,30 +170,15 @@ def _calibration(folder: Path, rig: tuple[Camera, ...]) -> None:
     if not rig:
         return
     (folder / "calibration").mkdir(exist_ok=True)
-    names = [camera.name for camera in rig]
-    k = np.array([camera.intrinsics for camera in rig])
-    zero = np.zeros(len(rig))
-    intrinsics = {
-        "sensor_name": names,
-        "fx_px": k[:, 0, 0],
-        "fy_px": k[:, 1, 1],
-        "cx_px": k[:, 0, 2],
-        "cy_px": k[:, 1, 2],
-    }
-    intrinsics |= {"k1": zero, "k2": zero, "k3": zero}
-    intrinsics |= {f"{side}_px": np.array([getattr(c, side) for c in rig], np.uint16) for side in ("height", "width")}
-    _feather(folder / "calibration" / "intrinsics.feather", intrinsics)
+    names, k = {"sensor_name": [camera.name for camera in rig]}, np.array([camera.intrinsics for camera in rig])
+    intrinsics = {"fx_px": k[:, 0, 0], "fy_px": k[:, 1, 1], "cx_px": k[:, 0, 2], "cy_px": k[:, 1, 2]}
+    intrinsics |= dict.fromkeys(("k1", "k2", "k3"), np.zeros(len(rig)))
+    sides = {f"{side}_px": np.array([getattr(c, side) for c in rig], np.uint16) for side in ("height", "width")}
+    _feather(folder / "calibration" / "intrinsics.feather", names | intrinsics | sides)
     mounts = np.array([camera.ego_from_camera for camera in rig])
-    quaternions = np.array([_quaternion(mount[:3, :3]) for mount in mounts])
-    poses = {"sensor_name": names} | {name: quaternions[:, i] for i, name in enumerate(("qw", "qx", "qy", "qz"))}
-    poses |= {name: mounts[:, i, 3] for i, name in enumerate(("tx_m", "ty_m", "tz_m"))}
+    columns = np.column_stack([Rotation.from_matrix(mounts[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]], mounts[:, :3, 3]])
+    poses = names | dict(zip(POSE_COLUMNS, columns.T))
     _feather(folder / "calibration" / "egovehicle_SE3_sensor.feather", poses)
-
-
-def _quaternion(rotation: Array) -> Array:
-    """(4,) w, x, y, z of a rotation matrix (3, 3)."""
-    x, y, z, w = Rotation.from_matrix(rotation).as_quat()
-    return np.array([w, x, y, z])
 
 
 def _near_lanes(streets: Streets, drive: Drive) -> list[Lane]:
@@ -250,7 +224,5 @@ def _simplified(ring: Array) -> Array:
 
 
 def _thinned(line: Array) -> Array:
-    """Every other point, both ends kept: 2 m apart."""
-    if len(line) <= 4:
-        return line
-    return line[np.unique(np.append(np.arange(0, len(line) - 1, 2), len(line) - 1))]
+    """Every other point of more than four, both ends kept: 2 m apart."""
+    return line if len(line) <= 4 else line[np.unique(np.append(np.arange(0, len(line) - 1, 2), len(line) - 1))]

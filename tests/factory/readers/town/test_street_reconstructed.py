@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from factory.readers.town import textures as tx
-from factory.readers.town.draw import SHADOW_SIZE, Stage, paint, sun_over
+from factory.readers.town.draw import SHADOW_SIZE, paint, sun_over
 from factory.readers.town.figures import _car as car
 from factory.readers.town.houses import plant_tree
 from factory.readers.town.mesh import Builder, merged
 from factory.readers.town.sensors import build_rig, scan, world_from_ego
+from factory.readers.town.shade import Stage
 from tasks.render.fit.reconstruct import advance, finish
 from tasks.render.fit.start import prepare
 from tasks.render.scene.build import held_out_rows

@@ -5,12 +5,12 @@ import pytest
 
 from factory.readers.settings import CAMERA_NAMES
 from factory.readers.town import textures as tx
-from factory.readers.town.draw import SHADOW_SIZE, Stage, camera_view, look, paint, sun_over
-from factory.readers.town.draw import _cast as cast
+from factory.readers.town.draw import SHADOW_SIZE, camera_view, cast, look, paint, sun_over
 from factory.readers.town.mesh import Builder
 from factory.readers.town.scenery import _signal as signal_mast
 from factory.readers.town.scenery import lamps_lit
 from factory.readers.town.sensors import MOUNT_M, REAR_AXLE_Z_M, build_rig, scan, world_from_ego
+from factory.readers.town.shade import Stage
 from factory.readers.town.traffic import GREEN as GREEN_LIGHT
 from factory.readers.town.traffic import RED as RED_LIGHT
 from factory.readers.town.traffic import YELLOW as YELLOW_LIGHT
@@ -116,7 +116,7 @@ def test_leaves_leave_gaps() -> None:
     builder.quads(corners, uv, tx.LEAVES, (0.2, 0.4, 0.1), 3)
     stage = staged(builder)
     view, _rays = camera_view(FRONT.intrinsics, world_from_ego(np.zeros(3)) @ FRONT.ego_from_camera)
-    covered = (look(stage, view, 320, 180).ids >= 0).sum()
+    covered = (look(stage, view, 320, 180)[0] >= 0).sum()
     whole = (1.7 / (8 - 1.62) * FRONT.intrinsics[0, 0]) ** 2
     assert 0.15 * whole < covered < 0.9 * whole
 
@@ -143,7 +143,7 @@ def test_a_signal_shows_one_lamp_red_above_yellow_above_green(state: int, height
     lamps = lamps_lit(signal_mast(Builder(), np.zeros(3), 3.5), state)
     bright = lamps.colour.max(axis=1) > 0.5
     heights = lamps.vertices[bright][..., 2].mean(axis=1)
-    assert bright.sum() == len(lamps) / 3
+    assert bright.sum() == len(lamps.material) / 3
     assert np.abs(heights - height).min() < 0.1
     assert {round(float(h), 1) for h in heights[:10]} <= {round(height + d, 1) for d in (-0.1, 0.0, 0.1)}
 

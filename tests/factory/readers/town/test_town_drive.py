@@ -10,7 +10,7 @@ from factory.readers.av2.reader import AV2Reader
 from factory.readers.settings import LOG_STEPS, TownSettings
 from factory.readers.town import curves
 from factory.readers.town.drive import plan_drive
-from factory.readers.town.ego import SCENARIOS, centre_boxes
+from factory.readers.town.ego import SCENARIOS
 from factory.readers.town.plan import build_streets
 from factory.readers.town.streets import Streets
 from factory.readers.town.town import WINDOWS_PER_LOG, plan_log
@@ -18,8 +18,11 @@ from factory.readers.town.traffic import GREEN, RED, YELLOW, Driver, Signals, dr
 from factory.readers.town.traffic import Path as LanePath
 from factory.readers.town.write import write_town
 from tasks.trajectories import score_trajectories
+from tasks.world.boxes import ego_boxes
 from tasks.world.clip import NOW
 from tasks.world.frames import box_corners, to_local
+from tasks.world.polygons import arc_lengths
+from tasks.world.vehicle import PACIFICA
 
 BLIND = TownSettings(cameras=(), lidar_beams=0)
 
@@ -75,7 +78,7 @@ def test_crossing_directions_are_never_green_together() -> None:
 
 def test_a_driver_stops_at_a_red_light_before_the_line() -> None:
     line = curves.from_curvature(np.zeros(3), [(200.0, 0.0)])
-    s = curves.arc_length(line)
+    s = arc_lengths(line)
     path = LanePath(line, s, np.full(len(s), 12.0), ((100.0, 0),), ())
     times = np.arange(0.0, 15.0, 0.1)
     red_for_15_s = Signals(16.0)
@@ -86,7 +89,7 @@ def test_a_driver_stops_at_a_red_light_before_the_line() -> None:
 
 def test_a_driver_keeps_its_distance_from_a_standing_car() -> None:
     line = curves.from_curvature(np.zeros(3), [(200.0, 0.0)])
-    s = curves.arc_length(line)
+    s = arc_lengths(line)
     path = LanePath(line, s, np.full(len(s), 12.0), (), ())
     times = np.arange(0.0, 20.0, 0.1)
     standing = np.broadcast_to([120.0, 0.0, 0.0, 4.0, 2.0], (len(times), 1, 5))
@@ -100,7 +103,7 @@ def test_nobody_touches_anybody_and_the_ego_stays_on_the_road(index: int) -> Non
     town, log = plan_log(0, index)
     assert len(log.ego) == LOG_STEPS
     assert len(log.tracks) > 15
-    ego = centre_boxes(log.ego)
+    ego = ego_boxes(log.ego, PACIFICA)
     everyone = np.stack([ego, *(track.boxes() for track in log.tracks)], axis=1)
     for k in range(everyone.shape[1] - 1):
         assert not overlaps(everyone[:, k], everyone[:, k + 1 :], 0.0).any()
