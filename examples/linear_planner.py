@@ -15,8 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from planners.data.batch import Batch, Needs
-from planners.models.planner import FloatArray, Planner, evaluating
-from planners.models.regression import imitation_l1, straight_on
+from planners.models.planner import FloatArray, Planner, evaluating, imitation_l1, straight_on
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,8 @@
-"""What all commands of `python -m planners` do alike: help, exit codes, one line for what is wrong, signals."""
+"""What all commands of `python -m planners` do alike: help, exit codes, one line for what is wrong."""
 
-import signal
 import sys
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from functools import wraps
-from typing import Any
 
 from factory.config.compose import conf_dir
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
@@ -51,24 +47,3 @@ def help_of(module: str) -> str:
     """What the module says of itself, and the keys of its file in conf/ where it has one."""
     keys = conf_dir() / f"{module.rpartition('.')[2]}.yaml"
     return "\n".join([sys.modules[module].__doc__ or "", *([keys.read_text()] if keys.is_file() else [])])
-
-
-@contextmanager
-def until_signal() -> Iterator[threading.Event]:
-    """An event that the first SIGINT or SIGTERM sets; a second one ends the process.
-
-    Only the main thread is told of signals: in another, such as a Ray worker's, the event stays as it is.
-    """
-    event, before = threading.Event(), dict[int, Any]()
-
-    def note(number: int, frame: object) -> None:
-        event.set()
-        signal.signal(number, before[number])
-
-    if threading.current_thread() is threading.main_thread():
-        before |= {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield event
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

@@ -29,12 +29,9 @@ class StoredRows:
     """Some rows of one row group."""
 
     def __init__(self, table: pa.Table, cameras: Sequence[tuple[str, ...]], in_place: bool = False) -> None:
-        """
-        Args:
-            table: each column in one chunk, with the plain lists of a file.
-            cameras: (rows) of each row's picture; none for rows that are not asked for.
-            in_place: pictures stay where they are in the table, which then stays as a whole. Else they are copied, so
-                that the images of other cameras and instants can go.
+        """cameras: (rows) of each row's picture; none for rows that are not asked for.
+
+        in_place: pictures stay in the table, which stays as a whole; else they are copied, and other images can go.
         """
         self._jpegs: list[tuple[Bytes, ...]] = []
         if "images" in table.column_names:
@@ -81,12 +78,7 @@ class BatchBuffer:
     def __init__(
         self, size: int, needs: Needs, n_labels: int, pinned: bool = False, keep_pictures: bool = False
     ) -> None:
-        """
-        Args:
-            n_labels: K of the vocabulary.
-            pinned: in memory that a GPU copies from while others compute.
-            keep_pictures: what is decoded stays with its row, for the next pass.
-        """
+        """n_labels: K of the vocabulary; keep_pictures: what is decoded stays with its row, for the next pass."""
 
         def empty(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
             return torch.empty((size, *shape), dtype=dtype, pin_memory=pinned)

@@ -19,8 +19,6 @@ from planners.data.index import OPEN_FILES, Dataset, DataSettings, open_dataset
 from planners.data.mix import MixSettings, Samples, check_sides, sample_weights
 from tasks.world.arrays import Array, Ints
 
-__all__ = ["DataSettings", "Dataset", "Feed", "make_feed", "mixed_samples", "open_data"]
-
 PLAN_COLUMNS = ("command", "ego_status", "ego_history_2hz", "label_2hz", "label_10hz")
 IMAGE_COLUMNS = ("images.camera", "images.time_s", "images.jpeg")
 AGENT_COLUMNS = ("agent_kinds", "agent_boxes", "agent_valid")
@@ -45,14 +43,12 @@ class Feed:
     size: Ints  # (n,) bytes that a sample takes in memory between its batches, about
 
 
-def open_data(settings: DataSettings, needs: Needs | None = None, mix: MixSettings | None = None) -> Dataset:
-    """The samples that the settings ask for; with `needs` and `mix` also checked for what an index shows.
+def open_data(settings: DataSettings, mix: MixSettings | None = None) -> Dataset:
+    """The samples that the settings ask for; with `mix` also checked for what an index shows.
 
-    Raises ValueError with table, sample or setting and how to mend it, FileNotFoundError where there is no table.
+    Raises ValueError with table, sample or setting and how to fix it, FileNotFoundError where there is no table.
     """
     dataset = open_dataset(settings)
-    if needs is not None:
-        _check_index(dataset, needs)
     if mix is not None:
         check_sides(mix, dataset.rows.simulated)
         _weights(dataset, mix)

@@ -47,12 +47,7 @@ def chosen_cameras(names: Sequence[str], axes: Array, layout: ImageLayout) -> tu
     """The cameras of the picture, left to right: those of the layout, else the front one and its neighbours.
 
     The front camera is the one whose optical axis is nearest to ahead; its neighbours are the nearest by yaw, to the
-    left and to the right, that look ahead at all. There may be none.
-
-    Args:
-        names: of the sample's C cameras.
-        axes: (C, 2) x, y of their optical axes in the ego frame.
-
+    left and to the right, that look ahead at all. There may be none. axes: (C, 2) x, y of optical axes, ego frame.
     Raises ValueError where there is no camera, or none of a name that the layout has.
     """
     if layout.cameras:

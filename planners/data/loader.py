@@ -1,6 +1,6 @@
 """Batches of samples for a planner: one process's share of every global batch, in an order that nothing disturbs.
 
-    loader = Loader(open_data(settings, needs), needs, MixSettings(), batch_size=64, seed=0)
+    loader = Loader(open_data(settings), needs, MixSettings(), batch_size=64, seed=0)
     for batch in loader.epoch(0): ...
     state = loader.state()      # after any batch; `resume(state)` in another process goes on with the next one
 
@@ -20,9 +20,10 @@ import numpy as np
 
 from planners.data.batch import Batch, Needs
 from planners.data.decode import BatchBuffer, count_labels
-from planners.data.feed import Dataset, make_feed, mixed_samples
+from planners.data.feed import make_feed, mixed_samples
+from planners.data.index import Dataset
 from planners.data.mix import EpochOrder, MixSettings, Side, make_order
-from planners.data.windows import Inline, Memory, Place, Window
+from planners.data.windows import Inline, Memory, Window
 from tasks.world.arrays import Ints
 
 STATE_VERSION = 1
@@ -46,14 +47,9 @@ class Loader:
         workers: int = 2,
         pinned: bool = False,
     ) -> None:
-        """
-        Args:
-            needs: what the planner reads of a sample.
-            batch_size: samples of a global batch, over all processes.
-            rank, world: which process this is, of how many.
-            workers: threads that decode; 0: everything happens in the caller's, when a batch is asked for.
-            pinned: batches lie in memory that a GPU copies from while others compute.
+        """batch_size: of a global batch, over all `world` processes; workers: threads that decode, 0: the caller's.
 
+        pinned: batches lie in memory that a GPU copies from while others compute.
         Raises ValueError where the data is not what the planner needs or the mix asks for, or a batch does not divide.
         """
         if batch_size < 1 or batch_size % world:
@@ -165,7 +161,7 @@ class Loader:
         ahead = max(BATCHES_AHEAD, -(-2 * TASK * self._workers // share)) if threads else 1
         readers: Executor = ThreadPoolExecutor(READERS, "read") if threads else Inline()
         decoders: Executor = ThreadPoolExecutor(self._workers, "decode") if threads else Inline()
-        coming: deque[_Pending] = deque()
+        coming: deque[tuple[Ints, BatchBuffer, list[Future[None]]]] = deque()
         try:
             self._memory.begin(_windows(order, rows, windows, first), readers)
             batch = first
@@ -176,7 +172,7 @@ class Loader:
                     batch += 1
                 if not coming:
                     return
-                done = coming.popleft().result()
+                done = self._finished(*coming.popleft())
                 self._position = (epoch, batch - len(coming))
                 yield done
         finally:
@@ -186,45 +182,32 @@ class Loader:
     def _ready(self, order: EpochOrder, windows: Ints) -> bool:
         return all(self._memory.ready(order.keys[window]) for window in np.unique(windows))
 
-    def _started(self, order: EpochOrder, samples: Ints, windows: Ints, decoders: Executor) -> "_Pending":
+    def _started(
+        self, order: EpochOrder, samples: Ints, windows: Ints, decoders: Executor
+    ) -> tuple[Ints, BatchBuffer, list[Future[None]]]:
+        """A batch that threads are filling."""
         by_window = {window: self._memory.rows(order.keys[window]) for window in np.unique(windows).tolist()}
         rows = [by_window[window][sample] for sample, window in zip(samples.tolist(), windows.tolist())]
         n_labels = count_labels(*rows[0]) if self._needs.labels is not None else 0
         buffer = BatchBuffer(len(rows), self._needs, n_labels, self._pinned, keep_pictures=self._pictures_bytes > 0)
-        return _Pending(self, samples, rows, buffer, decoders)
 
+        def fill(start: int) -> None:
+            for i in range(start, min(start + TASK, len(rows))):
+                try:
+                    buffer.fill(i, *rows[i])
+                except Exception as error:
+                    raise ValueError(f"{self.dataset.name(int(samples[i]))}: {error}") from error
 
-class _Pending:
-    """A batch that threads are filling."""
+        return samples, buffer, [decoders.submit(fill, start) for start in range(0, len(rows), TASK)]
 
-    def __init__(
-        self,
-        loader: Loader,
-        samples: Ints,
-        rows: Sequence[Place],
-        buffer: BatchBuffer,
-        decoders: Executor,
-    ) -> None:
-        self._loader, self._samples, self._rows, self._buffer = loader, samples, rows, buffer
-        self._tasks: list[Future[None]] = [
-            decoders.submit(self._fill, start, min(start + TASK, len(rows))) for start in range(0, len(rows), TASK)
-        ]
-
-    def result(self) -> Batch:
+    def _finished(self, samples: Ints, buffer: BatchBuffer, tasks: Sequence[Future[None]]) -> Batch:
         """The batch, once it is filled. Raises ValueError with the name of a sample that cannot be decoded."""
-        for task in self._tasks:
+        for task in tasks:
             task.result()
-        rows, imitation = self._loader.dataset.rows, self._loader.mix.imitation
-        simulated = rows.simulated[self._samples]
-        imitate = {"all": np.ones_like(simulated), "real": ~simulated, "none": np.zeros_like(simulated)}[imitation]
-        return self._buffer.batch(rows.attempt_id[self._samples].tolist(), simulated, imitate)
-
-    def _fill(self, start: int, stop: int) -> None:
-        for i in range(start, stop):
-            try:
-                self._buffer.fill(i, *self._rows[i])
-            except Exception as error:
-                raise ValueError(f"{self._loader.dataset.name(int(self._samples[i]))}: {error}") from error
+        rows = self.dataset.rows
+        simulated = rows.simulated[samples]
+        imitate = {"all": np.ones_like(simulated), "real": ~simulated, "none": np.zeros_like(simulated)}
+        return buffer.batch(rows.attempt_id[samples].tolist(), simulated, imitate[self.mix.imitation])
 
 
 def _kept_pictures(sides: Sequence[Side], needs: Needs, mix: MixSettings) -> int:

@@ -282,11 +282,7 @@ def sample_weights(
     perturbation_m: Array,
     reward: Array,
 ) -> Array:
-    """(n,) products of the weights.
-
-    Args:
-        perturbation_m: (n, 2) longitudinal, lateral end of the perturbation in the frame of the log's; NaN human.
-        reward: (n,) NaN where there is none.
+    """(n,) products of the weights, of what index.Rows holds.
 
     Raises ValueError for an expert that made none of the samples, and where a weight needs what a sample has not.
     """

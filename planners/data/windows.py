@@ -110,7 +110,7 @@ class Memory:
         return self._read[key]
 
     def _advance(self) -> None:
-        """Submit the next windows of every side that has room."""
+        """Submit the next windows of every side that has fewer than AHEAD."""
         waiting = []
         for window in self._to_come:
             if sum(key[0] == window.key[0] for key in self._read) < AHEAD:

@@ -24,7 +24,6 @@ from factory.config.arguments import parse
 from planners.command import command
 from planners.evaluation.frames import FOLLOW_UP_KINDS, LOGGED_KINDS
 from planners.evaluation.score_rows import FrameRow, read_rows
-from planners.evaluation.tags import TAGS
 from tasks.reward.one_stage import COLUMNS
 from tasks.world.arrays import Array, Image
 
@@ -80,14 +79,12 @@ def analyse(rows: Sequence[FrameRow]) -> Analysis:
             raise ValueError(f"no scores of {name} frames: evaluate a planner that plans from them")
 
     def of_tag(tag: str) -> TagScore:
-        numbers: list[float] = []
-        for side, found in zip((real, simulated), scores):
-            own = found[[tag in row.tags for row in side]]
-            numbers += [len(own), float(own.mean()) if len(own) else float("nan")]
-        return TagScore(tag, int(numbers[0]), numbers[1], int(numbers[2]), numbers[3])
+        own = [found[[tag in row.tags for row in side]] for side, found in zip((real, simulated), scores)]
+        n_real, n_simulated = map(len, own)
+        means = [float(found.mean()) if len(found) else float("nan") for found in own]
+        return TagScore(tag, n_real, means[0], n_simulated, means[1])
 
-    found_tags = [of_tag(tag) for tag in TAGS]
-    known = [tag for tag in found_tags if tag.n_real + tag.n_simulated]
+    known = [of_tag(tag) for tag in {tag for row in (*real, *simulated) for tag in row.tags}]
     ranked = sorted(known, key=lambda tag: (np.isnan(tag.simulated), tag.simulated, tag.tag))
     return Analysis(scores[0], scores[1], tuple(ranked))
 

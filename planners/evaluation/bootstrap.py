@@ -1,31 +1,50 @@
 """Paired bootstrap: how far the difference of two planners may lie from the measured one, over clips and seeds.
 
 Both planners were scored on the same clips, so clips are drawn once for both and the differences keep their pairs.
-Clips that share a log or a town are no independent draws: where their clusters are given, whole clusters are drawn.
+Clips that share a log or a town are no independent draws: where their clusters are given, whole clusters are drawn
+(Cameron, Gelbach & Miller 2008). From few clusters, as six towns are, an interval is rather too narrow than too wide.
 Several trainings of each are a second level: with equally many on both sides they are pairs (the same seeds) and are
 drawn as pairs, else on each side by itself. An interval runs between percentiles of the drawn differences
 (Efron & Tibshirani 1993, ch. 13).
 """
 
-from collections.abc import Hashable, Sequence
+import re
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from tasks.world.arrays import Array, Indices
 
+LEVELS = ("clip", "log", "town")
+_SYNTHETIC_LOG = re.compile(r"(town-\d+)-\d{4}-")  # factory.readers.town.town.log_name
+
+
+def town_of(log_id: str) -> str:
+    """The town of a synthetic log; empty for logs of other data sets, whose ids name no place."""
+    found = _SYNTHETIC_LOG.match(log_id)
+    return found[1] if found else ""
+
+
+def clusters_of(clips: Sequence[str], logs: Sequence[str]) -> Mapping[str, tuple[str, ...]]:
+    """Level -> cluster of each clip, for those of LEVELS that are known of every clip; logs: empty where unknown."""
+    towns = [town_of(log) for log in logs]
+    known = {"clip": clips, "log": logs, "town": towns}
+    return {level: tuple(names) for level, names in known.items() if all(names)}
+
+
 DRAWS_AT_ONCE = 256  # bounds memory
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean difference, b - a, and where it lies; NaN bounds where one cluster is all there is."""
+    """A mean difference and where it lies; NaN bounds where one cluster is all there is."""
 
-    a: float
-    b: float
-    difference: float
+    difference: float  # b - a
     low: float
     high: float
+    a: float = np.nan
+    b: float = np.nan
 
     @property
     def is_clear(self) -> bool:
@@ -55,7 +74,7 @@ def paired_interval(
     cluster_of_clip, n_clusters = _indices(clusters if clusters is not None else range(a.shape[1]), a.shape[1])
     mean_a, mean_b = (float((x * w).sum() / w.sum()) for x, w in zip((a, b), counts))
     if n_clusters == 1 and clusters is not None:
-        return Interval(mean_a, mean_b, mean_b - mean_a, np.nan, np.nan)
+        return Interval(mean_b - mean_a, np.nan, np.nan, mean_a, mean_b)
     rng = np.random.default_rng(seed)
     paired = len(a) == len(b)
     differences = np.empty(draws)
@@ -66,7 +85,7 @@ def paired_interval(
         of_b = of_a if paired else _drawn(rng, size, len(b))
         differences[start : start + size] = _means(b, counts[1], of_b, clips) - _means(a, counts[0], of_a, clips)
     low, high = np.quantile(differences, [(1.0 - confidence) / 2.0, (1.0 + confidence) / 2.0])
-    return Interval(mean_a, mean_b, mean_b - mean_a, float(low), float(high))
+    return Interval(mean_b - mean_a, float(low), float(high), mean_a, mean_b)
 
 
 def _indices(clusters: Sequence[Hashable], n_clips: int) -> tuple[Indices, int]:

@@ -12,8 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from planners.evaluation.aggregation import MEASURES, ClipResult, columns_at
-from planners.evaluation.scores import write_csv
+from planners.evaluation.aggregation import MEASURES, ClipResult, columns_at, write_csv
 from tasks.reward.one_stage import COLUMNS
 from tasks.world.arrays import Array
 

@@ -20,11 +20,9 @@ import numpy as np
 from factory.config.compose import ConfigError, compose, fill
 from planners.command import command
 from planners.evaluation.aggregation import ClipResult, by_clip
-from planners.evaluation.bootstrap import Interval, paired_interval
+from planners.evaluation.bootstrap import LEVELS, Interval, clusters_of, paired_interval
 from planners.evaluation.clip_scores import Measured, check_same_clips, measured, read_clips
-from planners.evaluation.clusters import LEVELS, clusters_of
-from planners.evaluation.record import read_record
-from planners.evaluation.score_rows import read_rows
+from planners.evaluation.score_rows import read_record, read_rows
 from planners.evaluation.score_table import FILTERS_NOTE
 from tasks.reward.one_stage import COLUMNS
 
@@ -44,7 +42,7 @@ class CompareSettings:
 
 
 Measure = tuple[str, str]  # stage, human filter
-ByLevel = Mapping[str, Interval]  # of planners.evaluation.clusters.LEVELS, those that are known
+ByLevel = Mapping[str, Interval]  # of planners.evaluation.bootstrap.LEVELS, those that are known
 
 
 def compare(

@@ -6,8 +6,8 @@
     python -m planners evaluate benchmark=runs/hard planner=runs/gtrs +settings.inference_entries=8192
 
 The benchmark is the folder that `python -m factory.run preset=hard_benchmark` made. Who may stand under `planner=`, and
-what a planner of one's own looks like, planners/evaluation/contenders.py says. Every planner gets a folder: its plans,
-a row of sub-scores for each frame (frames.parquet, frames.csv), and record.json, written last. A planner that is done
+what a planner of one's own looks like, planners/evaluation/planner_names.py says. Every planner gets a folder: its
+plans, a row of sub-scores for each frame (frames.parquet, frames.csv), and record.json, written last. What is done
 is not planned or scored again unless it, the benchmark or the rules changed; the same command goes on after a kill.
 All planners of a command share what scoring prepares of a frame, so name several at once.
 
@@ -34,11 +34,10 @@ from factory.graph.progress import Counter
 from planners.command import command
 from planners.evaluation.aggregation import SummaryLine, lines_of, summarise
 from planners.evaluation.benchmark_folder import BenchmarkFolder
-from planners.evaluation.contenders import Contender, composed, contenders, needs_of
 from planners.evaluation.frames import Benchmark, FrameKey
+from planners.evaluation.planner_names import EvaluatedPlanner, composed, needs_of, planners_of
 from planners.evaluation.planning import all_plans
-from planners.evaluation.record import forget, is_done, write_record
-from planners.evaluation.score_rows import FrameRow, read_rows, write_rows
+from planners.evaluation.score_rows import RECORD, FrameRow, is_done, read_rows, write_record, write_rows
 from planners.evaluation.score_table import table_text, write_table
 from planners.evaluation.scoring import Plans, Rules, prepare_clip, score_clip
 from planners.evaluation.tags import TAG_COLUMNS, tags_of
@@ -79,7 +78,7 @@ class EvaluateSettings:
         return Rules(self.one_stage_traffic, self.two_stage_traffic, self.pdm)
 
 
-def evaluate(benchmark: Benchmark, who: Sequence[Contender], settings: EvaluateSettings) -> list[SummaryLine]:
+def evaluate(benchmark: Benchmark, who: Sequence[EvaluatedPlanner], settings: EvaluateSettings) -> list[SummaryLine]:
     """Plan, score, write; the lines of all planners in their order.
 
     Raises ConfigError where a planner cannot plan from this benchmark, before any is planned.
@@ -107,7 +106,7 @@ def evaluate(benchmark: Benchmark, who: Sequence[Contender], settings: EvaluateS
     if waiting:
         rows = _scored(benchmark, keys, waiting, plans, settings.rules)
         for one in waiting:
-            forget(out / one.label)
+            (out / one.label / RECORD).unlink(missing_ok=True)  # what the folder holds is about to be replaced
             write_rows(out / one.label, rows[one.label])
             write_record(out / one.label, {**identities[one.label], "planner": one.label, "frames": len(keys)})
     lines = [line for one in who for line in lines_of(one.label, summarise(read_rows(out / one.label)))]
@@ -116,7 +115,7 @@ def evaluate(benchmark: Benchmark, who: Sequence[Contender], settings: EvaluateS
     return lines
 
 
-def check_needs(benchmark: Benchmark, keys: Sequence[FrameKey], who: Sequence[Contender]) -> None:
+def check_needs(benchmark: Benchmark, keys: Sequence[FrameKey], who: Sequence[EvaluatedPlanner]) -> None:
     """Raises ConfigError for a planner that needs images of a benchmark that lacks some, naming a frame."""
     blind = [key for key in keys if benchmark.image_source(key) == "none"]
     for one in who if blind else ():
@@ -134,7 +133,11 @@ def _keys(benchmark: Benchmark, limit: int | None) -> list[FrameKey]:
 
 
 def _scored(
-    benchmark: Benchmark, keys: Sequence[FrameKey], who: Sequence[Contender], plans: Mapping[str, Plans], rules: Rules
+    benchmark: Benchmark,
+    keys: Sequence[FrameKey],
+    who: Sequence[EvaluatedPlanner],
+    plans: Mapping[str, Plans],
+    rules: Rules,
 ) -> dict[str, list[FrameRow]]:
     """The rows of every planner, clip by clip: what is prepared of a clip serves all and is let go."""
     rows: dict[str, list[FrameRow]] = {one.label: [] for one in who}
@@ -174,7 +177,7 @@ def evaluated(argv: Sequence[str]) -> None:
     """Evaluate and print what a command line asks for. Raises ConfigError, or OSError for a folder that is none."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     settings = settings_of(argv)
-    who = contenders(settings.planner, settings.planners, settings.bounds, settings.settings)
+    who = planners_of(settings.planner, settings.planners, settings.bounds, settings.settings)
     lines = evaluate(BenchmarkFolder(settings.benchmark), who, settings)
     print(table_text(lines))
     print("".join(fallback_notes(lines)), end="")

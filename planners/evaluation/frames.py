@@ -6,7 +6,7 @@ A clip has a logged frame now (at T) and one 0.5 s before; and for each follow-u
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 from factory.store.reader import Sample
 from tasks.stages import FOLLOW_UP, FOLLOW_UP_BEFORE, HUMAN, HUMAN_BEFORE
@@ -16,6 +16,14 @@ LOGGED_KINDS = (HUMAN, HUMAN_BEFORE)
 FOLLOW_UP_KINDS = (FOLLOW_UP, FOLLOW_UP_BEFORE)
 KINDS = (*LOGGED_KINDS, *FOLLOW_UP_KINDS)  # as the samples' column `expert` has them
 NO_CANDIDATE = -1
+T = TypeVar("T")
+
+
+class Pair(NamedTuple, Generic[T]):
+    """Something of a frame now, and of the one 0.5 s before."""
+
+    now: T
+    before: T
 
 
 @dataclass(frozen=True, order=True)
@@ -31,24 +39,17 @@ class FrameKey:
         return f"clip {self.clip_id}, frame {self.kind}{follow_up}"
 
     @staticmethod
-    def logged(clip_id: str) -> "tuple[FrameKey, FrameKey]":
-        """Now, before."""
-        now, before = LOGGED_KINDS
-        return FrameKey(clip_id, now), FrameKey(clip_id, before)
+    def logged(clip_id: str) -> "Pair[FrameKey]":
+        """Of the log."""
+        return Pair(*(FrameKey(clip_id, kind) for kind in LOGGED_KINDS))
 
     @staticmethod
-    def follow_up(clip_id: str, candidate_index: int) -> "tuple[FrameKey, FrameKey]":
-        """Now, before."""
-        now, before = FOLLOW_UP_KINDS
-        return FrameKey(clip_id, now, candidate_index), FrameKey(clip_id, before, candidate_index)
+    def follow_up(clip_id: str, candidate_index: int) -> "Pair[FrameKey]":
+        """Of one follow-up."""
+        return Pair(*(FrameKey(clip_id, kind, candidate_index) for kind in FOLLOW_UP_KINDS))
 
 
-@dataclass(frozen=True)
-class FramePair:
-    """The scene now and the one 0.5 s before."""
-
-    now: Scene
-    before: Scene
+FramePair = Pair[Scene]
 
 
 @dataclass(frozen=True)
@@ -61,34 +62,20 @@ class ClipScenes:
 
 
 class Benchmark(Protocol):
-    """Frames to plan from and to drive in, fixed before any planner is scored."""
+    """Frames to plan from and to drive in, fixed before any planner is scored: what a BenchmarkFolder is."""
 
     @property
-    def digest(self) -> str:
-        """Of everything that scores depend on."""
-        ...
+    def digest(self) -> str: ...
 
     @property
-    def keys(self) -> Sequence[FrameKey]:
-        """Every frame, clip by clip."""
-        ...
+    def keys(self) -> Sequence[FrameKey]: ...
 
-    def log_of(self, clip_id: str) -> str:
-        """The id of the clip's log."""
-        ...
+    def log_of(self, clip_id: str) -> str: ...
 
-    def image_source(self, key: FrameKey) -> str:
-        """photo, render, map or none."""
-        ...
+    def image_source(self, key: FrameKey) -> str: ...
 
-    def stream(self, columns: Sequence[str]) -> Iterator[tuple[FrameKey, Sample]]:
-        """Every frame once, in whatever order is quick, with some columns of its sample (docs/formats.md)."""
-        ...
+    def stream(self, columns: Sequence[str]) -> Iterator[tuple[FrameKey, Sample]]: ...
 
-    def sample(self, key: FrameKey) -> Sample:
-        """A whole row."""
-        ...
+    def sample(self, key: FrameKey) -> Sample: ...
 
-    def scenes(self, clip_id: str) -> ClipScenes:
-        """The worlds of a clip's frames."""
-        ...
+    def scenes(self, clip_id: str) -> ClipScenes: ...

@@ -1,4 +1,4 @@
-"""The plans of a benchmark's frames, by planners with either face (planners/evaluation/contenders.py).
+"""The plans of a benchmark's frames, by planners with either face (planners/evaluation/planner_names.py).
 
 Several planners plan from one reading of the samples: what is decoded for one serves all that need the same.
 """
@@ -17,8 +17,8 @@ import torch
 from factory.config.compose import ConfigError
 from factory.graph.progress import Counter
 from planners.data.batch import Batch, Needs
-from planners.evaluation.contenders import Contender, needs_of
 from planners.evaluation.frames import Benchmark, FrameKey
+from planners.evaluation.planner_names import EvaluatedPlanner, needs_of
 from planners.evaluation.scoring import Plans
 from planners.evaluation.shown import as_shown, batch_of, columns_shown
 from tasks.trajectories import at_ten_hz
@@ -37,7 +37,7 @@ def plans_of(made: Any, samples: Samples, device: str = "cpu") -> Array:
 def all_plans(
     benchmark: Benchmark,
     keys: Sequence[FrameKey],
-    who: Sequence[tuple[Contender, Path, Mapping[str, Any]]],
+    who: Sequence[tuple[EvaluatedPlanner, Path, Mapping[str, Any]]],
     batch_size: int,
     at_once: int,
     device: str,
@@ -65,7 +65,7 @@ def all_plans(
 
 
 def _planned(
-    benchmark: Benchmark, keys: Sequence[FrameKey], who: Sequence[Contender], batch_size: int, device: str
+    benchmark: Benchmark, keys: Sequence[FrameKey], who: Sequence[EvaluatedPlanner], batch_size: int, device: str
 ) -> dict[str, dict[FrameKey, Array]]:
     made = {one.label: _loaded(one, device) for one in who}
     needs = {label: needs_of(planner) for label, planner in made.items()}
@@ -92,7 +92,7 @@ def _planned(
     return plans
 
 
-def _loaded(one: Contender, device: str) -> Any:
+def _loaded(one: EvaluatedPlanner, device: str) -> Any:
     assert one.load is not None
     made = one.load()
     return made.to(device) if isinstance(made, torch.nn.Module) else made

@@ -21,9 +21,9 @@ from factory.views.sample_picture import decoded, earlier_images, fitted, front_
 from factory.views.video import write_mp4
 from planners.command import command
 from planners.evaluation.benchmark_folder import BenchmarkFolder
-from planners.evaluation.contenders import Contender, composed, contender
 from planners.evaluation.evaluate import check_needs
-from planners.evaluation.frames import Benchmark, FrameKey
+from planners.evaluation.frames import Benchmark, FrameKey, Pair
+from planners.evaluation.planner_names import EvaluatedPlanner, composed, planner_of
 from planners.evaluation.planning import plans_of
 from planners.evaluation.scoring import PreparedClip, PreparedPair, Rules, prepare_clip, score_pair
 from tasks.experts.pdm_closed.planner import PdmSettings
@@ -109,7 +109,7 @@ def _number(value: float) -> str:
 
 
 def replay(
-    benchmark: Benchmark, one: Contender, clip_id: str, rules: Rules, follow_up: int | None = None
+    benchmark: Benchmark, one: EvaluatedPlanner, clip_id: str, rules: Rules, follow_up: int | None = None
 ) -> Iterator[Image]:
     """Both stages of one clip, picture by picture. Raises ConfigError for a follow-up that the clip does not have."""
     prepared = prepare_clip(benchmark.scenes(clip_id), rules)
@@ -131,7 +131,7 @@ def replay(
             yield from [last] * HOLD
 
 
-def _plans(benchmark: Benchmark, one: Contender, prepared: PreparedClip) -> Mapping[FrameKey, Array]:
+def _plans(benchmark: Benchmark, one: EvaluatedPlanner, prepared: PreparedClip) -> Mapping[FrameKey, Array]:
     if one.privileged is not None:
         return one.privileged(prepared)
     assert one.load is not None
@@ -143,11 +143,11 @@ def _plans(benchmark: Benchmark, one: Contender, prepared: PreparedClip) -> Mapp
 def _shown(
     benchmark: Benchmark,
     title: str,
-    keys: tuple[FrameKey, FrameKey],
+    keys: Pair[FrameKey],
     pair: PreparedPair,
     plans: Mapping[FrameKey, Array],
 ) -> Shown:
-    (scores, drive), _ = score_pair(pair.now, pair.before, (plans[keys[0]], plans[keys[1]]))
+    (scores, drive), _ = score_pair(pair, [plans[key] for key in keys])
     plan = to_world(pair.now.scene.ego_state[: HEADING + 1], plans[keys[0]])
     rollout = roll_out(pair.now.traffic, drive.states)
     return Shown(title, benchmark.sample(keys[0]), pair, plan, rollout, scores)
@@ -186,7 +186,7 @@ def main(argv: Sequence[str]) -> None:
     """The command."""
     settings = settings_of(argv)
     benchmark = BenchmarkFolder(settings.benchmark)
-    one = contender(settings.planner)
+    one = planner_of(settings.planner)
     clip_id = find_clip(benchmark, str(settings.clip))
     check_needs(benchmark, [key for key in benchmark.keys if key.clip_id == clip_id], [one])
     rules = Rules(two_stage=settings.two_stage_traffic, pdm=settings.pdm)

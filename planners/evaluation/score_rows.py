@@ -1,15 +1,21 @@
-"""What is kept of every scored frame, as Parquet and CSV: all sub-scores without and with the human-penalty filter."""
+"""What is kept of an evaluated planner: all sub-scores of every frame, as Parquet and CSV, and what the folder is.
 
-from collections.abc import Sequence
+record.json is written last, so that a folder without it is not done.
+"""
+
+import json
+import os
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 
+from factory.config.compose import ConfigError
 from planners.evaluation.frames import FrameKey
 from tasks.reward.one_stage import COLUMNS, FrameScores
 from tasks.world.arrays import Array
@@ -77,35 +83,54 @@ def read_rows(folder: Path) -> list[FrameRow]:
 
 
 def _flat(row: FrameRow) -> dict[str, object]:
-    key = row.key
-    return {
-        "stage": row.stage,
-        "log_id": row.log_id,
-        "clip_id": key.clip_id,
-        "kind": key.kind,
-        "candidate_index": key.candidate_index,
-        **dict(zip(COLUMNS, row.scores.unfiltered.tolist())),
-        **{name + FILTERED: value for name, value in zip(COLUMNS, row.scores.filtered.tolist())},
-        "progress_m": row.progress_m,
-        **{f"start_{name}": value for name, value in zip(POSE, row.start.tolist())},
-        **{f"end_{name}": value for name, value in zip(POSE, row.end.tolist())},
-        "weight": row.weight,
-        "tags": " ".join(row.tags),
-    }
+    key, scores = row.key, [*row.scores.unfiltered.tolist(), *row.scores.filtered.tolist()]
+    facts = (row.stage, row.log_id, key.clip_id, key.kind, key.candidate_index)
+    values = (*facts, *scores, row.progress_m, *row.start.tolist(), *row.end.tolist(), row.weight, " ".join(row.tags))
+    return dict(zip(SCHEMA.names, values, strict=True))
 
 
-def _row(values: dict[str, object]) -> FrameRow:
-    def numbers(names: Sequence[str]) -> Array:
+def _row(values: dict[str, Any]) -> FrameRow:
+    def numbers(names: Iterable[str]) -> Array:
         return np.array([values[name] for name in names], dtype=np.float64)
 
     return FrameRow(
-        stage=values["stage"],  # type: ignore[arg-type]  # checked by the class
-        key=FrameKey(values["clip_id"], values["kind"], values["candidate_index"]),  # type: ignore[arg-type]
-        scores=FrameScores(numbers(COLUMNS), numbers([name + FILTERED for name in COLUMNS])),
-        progress_m=float(values["progress_m"]),  # type: ignore[arg-type]
-        start=numbers([f"start_{name}" for name in POSE]),
-        end=numbers([f"end_{name}" for name in POSE]),
-        tags=tuple(str(values["tags"]).split()),
-        weight=float(values["weight"]),  # type: ignore[arg-type]
-        log_id=str(values["log_id"]),
+        stage=values["stage"],
+        key=FrameKey(values["clip_id"], values["kind"], values["candidate_index"]),
+        scores=FrameScores(numbers(COLUMNS), numbers(name + FILTERED for name in COLUMNS)),
+        progress_m=float(values["progress_m"]),
+        start=numbers(f"start_{name}" for name in POSE),
+        end=numbers(f"end_{name}" for name in POSE),
+        tags=tuple(values["tags"].split()),
+        weight=float(values["weight"]),
+        log_id=values["log_id"],
     )
+
+
+RECORD = "record.json"
+
+
+def write_record(folder: Path, record: Mapping[str, Any]) -> None:
+    """Whole or not at all."""
+    unfinished = folder / f".{RECORD}.{os.getpid()}"
+    unfinished.write_text(json.dumps(record, indent=1, sort_keys=True))
+    os.replace(unfinished, folder / RECORD)
+
+
+def read_record(folder: Path) -> dict[str, Any]:
+    """Raises ConfigError where there is none or it is damaged."""
+    try:
+        record = json.loads((folder / RECORD).read_text())
+    except FileNotFoundError as error:
+        raise ConfigError(f"{folder}: no {RECORD}: no planner was evaluated here, or not to the end") from error
+    except ValueError as error:
+        raise ConfigError(f"{folder / RECORD}: {error}: remove it and evaluate again") from error
+    assert isinstance(record, dict)
+    return record
+
+
+def is_done(folder: Path, identity: Mapping[str, Any]) -> bool:
+    """Whether the folder holds what `identity` (planner, benchmark, rules) describes, whole."""
+    if not (folder / RECORD).is_file():
+        return False
+    record = read_record(folder)
+    return all(record.get(name) == value for name, value in identity.items())

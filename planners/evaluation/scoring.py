@@ -6,12 +6,12 @@ the frame is a logged one, what the logged human gets 0 for, driven and scored a
 forgiven. Extended comfort compares a plan with the one made 0.5 s before and belongs to both.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from planners.evaluation.frames import ClipScenes, FrameKey, FramePair
+from planners.evaluation.frames import ClipScenes, FrameKey, FramePair, Pair
 from planners.evaluation.score_rows import FrameRow, Stage
 from tasks.experts.pdm_closed.planner import PdmSettings, plan_for
 from tasks.reward.epdms import Scores, rows, score
@@ -47,10 +47,13 @@ class PreparedFrame:
     scene: Scene
     traffic: TrafficScene
     world: PreparedScene  # map, centreline, lights, history; its objects are set for every drive
-    rival: Array  # (41, 11) PDM-Closed as the tracker drives it
+    reference: Array  # (41, 11) PDM-Closed as the tracker drives it
     pdm_poses: Array  # (40, 3) what PDM-Closed wants, ego frame
     human_poses: Array | None  # (40, 3) the logged drive from 2 Hz poses, ego frame; None: nobody drove from here
     human: Scores | None  # one row: the logged drive scored alone; None: nothing is forgiven
+
+
+PreparedPair = Pair[PreparedFrame]
 
 
 @dataclass(frozen=True)
@@ -69,7 +72,7 @@ def prepare_frame(scene: Scene, traffic: TrafficSettings, pdm: PdmSettings, logg
         scene=scene,
         traffic=prepare_traffic(scene, traffic),
         world=prepare_scene(scene, now),
-        rival=plan.driven,
+        reference=plan.driven,
         pdm_poses=to_local(scene.ego_state[: HEADING + 1], plan.poses),
         human_poses=logged_poses(scene) if logged else None,
         human=None,
@@ -92,7 +95,7 @@ def logged_poses(scene: Scene) -> Array:
 def drive(frame: PreparedFrame, poses: Array) -> Drive:
     """Drive and score a plan (40, 3) at 0.1 .. 4.0 s in the frame's ego frame. Raises ValueError if not finite."""
     states, world = _driven(frame, poses)
-    return Drive(states, rows(score(world, np.stack([frame.rival, states]), normalise="pairs"), slice(1, 2)))
+    return Drive(states, rows(score(world, np.stack([frame.reference, states]), normalise="pairs"), slice(1, 2)))
 
 
 def _driven(frame: PreparedFrame, poses: Array) -> tuple[Array, PreparedScene]:
@@ -109,22 +112,11 @@ def _with_human(frame: PreparedFrame) -> PreparedFrame:
     return replace(frame, human=score(world, states[None], with_history=False))
 
 
-def score_pair(
-    now: PreparedFrame, before: PreparedFrame, plans: tuple[Array, Array]
-) -> tuple[tuple[FrameScores, Drive], tuple[FrameScores, Drive]]:
+def score_pair(pair: PreparedPair, plans: Sequence[Array]) -> list[tuple[FrameScores, Drive]]:
     """COLUMNS of the plans (40, 3) made now and 0.5 s before, with the extended comfort that they share."""
-    drives = drive(now, plans[0]), drive(before, plans[1])
+    drives = [drive(frame, plan) for frame, plan in zip(pair, plans)]
     ec = float(extended_comfort(drives[0].states[None], drives[1].states[None], INTERVAL_S).ec[0])
-    of_now, of_before = (frame_scores(d.scores, frame.human, ec) for d, frame in zip(drives, (now, before)))
-    return (of_now, drives[0]), (of_before, drives[1])
-
-
-@dataclass(frozen=True)
-class PreparedPair:
-    """The frame now and the one 0.5 s before."""
-
-    now: PreparedFrame
-    before: PreparedFrame
+    return [(frame_scores(d.scores, frame.human, ec), d) for d, frame in zip(drives, pair)]
 
 
 @dataclass(frozen=True)
@@ -142,18 +134,14 @@ def prepare_clip(scenes: ClipScenes, rules: Rules) -> PreparedClip:
 
     def pair(frames: FramePair, logged: bool, name: str) -> PreparedPair:
         try:
-            return PreparedPair(
-                *(prepare_frame(s, rules.two_stage, rules.pdm, logged) for s in (frames.now, frames.before))
-            )
+            return PreparedPair(*(prepare_frame(scene, rules.two_stage, rules.pdm, logged) for scene in frames))
         except ValueError as error:
             raise ValueError(f"clip {scenes.clip_id}, {name}: {error}") from error
 
     logged = pair(scenes.logged, True, "the logged frames")
     alone = logged
     if rules.one_stage != rules.two_stage:
-        alone = PreparedPair(
-            among_other_traffic(logged.now, rules.one_stage), among_other_traffic(logged.before, rules.one_stage)
-        )
+        alone = PreparedPair(*(among_other_traffic(frame, rules.one_stage) for frame in logged))
     follow_ups = {i: pair(frames, False, f"follow-up {i}") for i, frames in scenes.follow_ups.items()}
     return PreparedClip(scenes.clip_id, alone, logged, follow_ups)
 
@@ -163,20 +151,15 @@ Plans = Mapping[FrameKey, Array]  # frame -> (40, 3) in its ego frame
 
 def human_plans(clip: PreparedClip) -> dict[FrameKey, Array]:
     """The log's drive where there is one: nobody drove from a follow-up frame."""
-    poses = clip.logged.now.human_poses, clip.logged.before.human_poses
-    assert poses[0] is not None and poses[1] is not None
-    return dict(zip(FrameKey.logged(clip.clip_id), (poses[0], poses[1])))
+    poses = [frame.human_poses for frame in clip.logged if frame.human_poses is not None]
+    return dict(zip(FrameKey.logged(clip.clip_id), poses, strict=True))
 
 
 def pdm_plans(clip: PreparedClip) -> dict[FrameKey, Array]:
     """PDM-Closed's proposal from every frame."""
-    return {key: frame.pdm_poses for key, frame in _frames(clip)}
-
-
-def _frames(clip: PreparedClip) -> Iterator[tuple[FrameKey, PreparedFrame]]:
-    yield from zip(FrameKey.logged(clip.clip_id), (clip.logged.now, clip.logged.before))
-    for i, pair in clip.follow_ups.items():
-        yield from zip(FrameKey.follow_up(clip.clip_id, i), (pair.now, pair.before))
+    pairs = [(FrameKey.logged(clip.clip_id), clip.logged)]
+    pairs += [(FrameKey.follow_up(clip.clip_id, i), pair) for i, pair in clip.follow_ups.items()]
+    return {key: frame.pdm_poses for keys, pair in pairs for key, frame in zip(keys, pair)}
 
 
 def score_clip(
@@ -207,19 +190,18 @@ def _weighted(group: Sequence[FrameRow], end: Array) -> list[FrameRow]:
 
 def _pair_rows(
     stage: Stage,
-    keys: tuple[FrameKey, FrameKey],
+    keys: Pair[FrameKey],
     pair: PreparedPair,
     plans: Plans,
     tags: Mapping[FrameKey, Sequence[str]],
 ) -> list[FrameRow]:
-    frames = pair.now, pair.before
-    starts = [frame.scene.ego_state[: HEADING + 1] for frame in frames]
+    starts = [frame.scene.ego_state[: HEADING + 1] for frame in pair]
     if stage == "stage_two" and not any(key in plans for key in keys):
         nothing = np.full(len(COLUMNS), np.nan)
         blank = FrameRow(stage, keys[0], FrameScores(nothing, nothing), np.nan, starts[0], np.full(3, np.nan))
         return [replace(blank, key=key, start=start, tags=tuple(tags.get(key, ()))) for key, start in zip(keys, starts)]
-    made = _checked(keys[0], plans), _checked(keys[1], plans)
-    scored = score_pair(pair.now, pair.before, made)
+    made = [_checked(key, plans) for key in keys]
+    scored = score_pair(pair, made)
     return [
         FrameRow(
             stage=stage,

@@ -8,18 +8,20 @@ parent_states                               the logged state at T+H is NaN in fr
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import torch
 
 from factory.store.reader import LABEL_COLUMNS, Sample
 from factory.store.schema import NOW_INDEX, SCHEMA
-from planners.data.batch import COMMANDS, Batch, Needs
-from planners.data.bev import bev_raster, nearest_agents
+from planners.data.batch import Batch, BevLayout, ImageLayout, Needs
+from planners.data.bev import bev_raster
+from planners.data.decode import BatchBuffer, StoredRows
 from planners.data.feed import BEV_COLUMNS
 from planners.data.images import stitched
 from planners.evaluation.frames import LOGGED_KINDS
+from tasks.world.arrays import Bytes
 
 SCORES = ("stage1_", "stage2_", *LABEL_COLUMNS)
 LATER_NAN = ("agent_boxes", "agent_velocities", "agent_center_z")
@@ -52,37 +54,32 @@ def columns_shown(needs: Needs | None) -> list[str]:
     return [*EGO_COLUMNS, *bev, *(("cameras", "images") if needs.image is not None else ())]
 
 
+class _StoredSample(StoredRows):
+    """A sample as the loader's rows are read; zeros for the plans, which are not shown."""
+
+    def __init__(self, sample: Mapping[str, Any]) -> None:
+        self._sample = sample
+
+    def value(self, column: str, row: int) -> Any:
+        return 0.0 if column.startswith("label_") else self._sample[column]
+
+    def values(self, columns: Sequence[str], row: int) -> Any:
+        return self._sample
+
+    def raster(self, row: int, layout: BevLayout) -> Bytes:
+        return bev_raster(self._sample, layout)
+
+    def picture(self, row: int, layout: ImageLayout, out: Bytes, keep: bool = False) -> None:
+        out[:] = stitched(self._sample, layout)
+
+
 def batch_of(samples: Sequence[Mapping[str, Any]], needs: Needs) -> Batch:
     """The batch that a planner plans for. Raises ValueError, naming the sample, where it lacks what `needs` asks."""
-    rasters, boxes, valid, pictures = [], [], [], []
-    for sample in samples:
+    buffer = BatchBuffer(len(samples), replace(needs, labels=None), 0)
+    for i, sample in enumerate(samples):
         try:
-            if needs.image is not None:
-                pictures.append(stitched(sample, needs.image).transpose(2, 0, 1))
-            if needs.bev is not None:
-                rasters.append(bev_raster(sample, needs.bev))
-                nearest = nearest_agents(sample, needs.bev, needs.n_agents)
-                boxes.append(nearest[0])
-                valid.append(nearest[1])
+            buffer.fill(i, _StoredSample(sample), 0)
         except ValueError as error:
             raise ValueError(f"sample {sample['attempt_id']}: {error}") from error
-    n = len(samples)
-    return Batch(
-        attempt_ids=tuple(str(sample["attempt_id"]) for sample in samples),
-        status=torch.from_numpy(np.stack([_status(sample) for sample in samples])),
-        history=torch.from_numpy(np.stack([np.asarray(s["ego_history_2hz"], np.float32) for s in samples])),
-        plan_2hz=torch.zeros(n, 8, 3),
-        plan_10hz=torch.zeros(n, 40, 3),
-        simulated=torch.tensor([sample["expert"] not in LOGGED_KINDS for sample in samples]),
-        imitate=torch.zeros(n, dtype=torch.bool),
-        image=torch.from_numpy(np.ascontiguousarray(np.stack(pictures))) if pictures else None,
-        bev=torch.from_numpy(np.stack(rasters)) if rasters else None,
-        agents=torch.from_numpy(np.stack(boxes)) if needs.n_agents else None,
-        agents_valid=torch.from_numpy(np.stack(valid)) if needs.n_agents else None,
-    )
-
-
-def _status(sample: Mapping[str, Any]) -> np.ndarray:
-    """(8,) float32: the command one-hot, then the ego's velocity and acceleration."""
-    command = [float(sample["command"] == name) for name in COMMANDS]
-    return np.array([*command, *sample["ego_status"]], dtype=np.float32)
+    simulated = np.array([sample["expert"] not in LOGGED_KINDS for sample in samples])
+    return buffer.batch([str(sample["attempt_id"]) for sample in samples], simulated, np.zeros_like(simulated))

@@ -22,24 +22,6 @@ NEAR_VEHICLE_M, NEAR_PERSON_M = 8.0, 10.0  # between the centres
 LEAD_AHEAD_M, LEAD_ASIDE_M = 25.0, 1.5
 DENSE_COUNT, DENSE_M = 10, 30.0
 
-TAGS = (
-    "turning_left",
-    "turning_right",
-    "standing",
-    "starting",
-    "stopping",
-    "high_speed",
-    "lane_change",
-    "off_center",
-    "near_vehicle",
-    "near_pedestrian",
-    "near_cyclist",
-    "following",
-    "dense_traffic",
-    "intersection",
-    "red_light",
-)
-
 TAG_COLUMNS = (
     "label_10hz",
     "ego_status",
@@ -56,12 +38,12 @@ TAG_COLUMNS = (
 
 
 def tags_of(row: Mapping[str, Any]) -> tuple[str, ...]:
-    """Which of TAGS a sample's row (TAG_COLUMNS) has, in that order.
+    """The tags that a sample's row (TAG_COLUMNS) has.
 
     Movement is that of the label, the drive that follows; agents, lights and places are those at now.
     """
-    found = _movement(row) | _agents(row) | _places(row)
-    return tuple(name for name in TAGS if found[name])
+    found = _movement(row) | _aside(row) | _agents(row) | _places(row)
+    return tuple(name for name, has in found.items() if has)
 
 
 def _movement(row: Mapping[str, Any]) -> dict[str, bool]:
@@ -99,10 +81,14 @@ def _agents(row: Mapping[str, Any]) -> dict[str, bool]:
     }
 
 
+def _aside(row: Mapping[str, Any]) -> dict[str, bool]:
+    line = np.asarray(row["route_centerline"], dtype=np.float64)
+    now, then = _aside_m(line, np.zeros(3)), _aside_m(line, np.asarray(row["label_10hz"], dtype=np.float64)[-1])
+    return {"lane_change": abs(then - now) > LANE_CHANGE_M, "off_center": abs(now) > OFF_ROUTE_LINE_M}
+
+
 def _places(row: Mapping[str, Any]) -> dict[str, bool]:
     label = np.asarray(row["label_10hz"], dtype=np.float64)
-    line = np.asarray(row["route_centerline"], dtype=np.float64)
-    aside_now, aside_then = _aside_m(line, np.zeros(3)), _aside_m(line, label[-1])
     junctions = [ring for ring, is_one in zip(row["lane_polygons"], row["lane_is_intersection"], strict=True) if is_one]
     places = np.concatenate([np.zeros((1, 2)), label[4::5, :2]])
     rings = Rings(junctions) if junctions else None
@@ -113,8 +99,6 @@ def _places(row: Mapping[str, Any]) -> dict[str, bool]:
         if lane_id in on_route and states[NOW_INDEX] == LightState.RED
     ]
     return {
-        "lane_change": abs(aside_then - aside_now) > LANE_CHANGE_M,
-        "off_center": abs(aside_now) > OFF_ROUTE_LINE_M,
         "intersection": rings is not None and any(rings.contains(place).any() for place in places),
         "red_light": bool(reds),
     }

@@ -4,12 +4,14 @@ Heads and losses of the public TransFuser for NAVSIM (TransfuserModel, transfuse
 """
 
 import math
+from typing import Any
 
 import torch
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from planners.data.batch import Batch
 from planners.data.bev import BevClass
 
 N_CLASSES = 7  # background .. pedestrian, as published: a cell of the route counts as centre line
@@ -80,3 +82,16 @@ def _matching(
     cost = (class_weight * unsure + box_weight * apart).cpu().numpy()
     columns = [torch.from_numpy(linear_sum_assignment(c)[1]) for c in cost]
     return torch.stack(columns).to(boxes.device)
+
+
+def auxiliary_losses(settings: Any, batch: Batch, bev: Tensor, boxes: Tensor, logits: Tensor) -> dict[str, Tensor]:
+    """The weighted terms of a planner whose settings name their weights, of the outputs of both heads."""
+    if batch.bev is None or batch.agents is None or batch.agents_valid is None:
+        raise ValueError("a batch without view from above or agents cannot be learned from")
+    weights = settings.agent_class_weight, settings.agent_box_weight
+    there, box = agent_losses(boxes, logits, batch.agents, batch.agents_valid, *weights)
+    return {
+        "agent_class": weights[0] * there,
+        "agent_box": weights[1] * box,
+        "bev": settings.bev_weight * bev_loss(bev, batch.bev),
+    }

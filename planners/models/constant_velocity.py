@@ -7,8 +7,7 @@ from typing import ClassVar
 from torch import Tensor
 
 from planners.data.batch import Batch, Needs
-from planners.models.planner import Planner
-from planners.models.regression import straight_on
+from planners.models.planner import Planner, straight_on
 from tasks.world.arrays import FloatArray
 
 

@@ -15,8 +15,7 @@ from torch.nn import functional as F
 
 from planners.data.batch import Batch, BevLayout, Needs
 from planners.data.bev import BevClass
-from planners.models.planner import Planner, evaluating
-from planners.models.regression import PlanFrom, imitation_l1, planned_from
+from planners.models.planner import PlanFrom, Planner, evaluating, imitation_l1, planned_from
 from tasks.world.arrays import FloatArray
 
 

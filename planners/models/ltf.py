@@ -12,9 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from planners.data.batch import Batch, BevLayout, ImageLayout, Needs
-from planners.models.auxiliary import AgentHead, BevHead, agent_losses, bev_loss
-from planners.models.planner import Planner, evaluating
-from planners.models.regression import PlanFrom, bounded_heading, imitation_l1, planned_from
+from planners.models.auxiliary import AgentHead, BevHead, auxiliary_losses
+from planners.models.planner import PlanFrom, Planner, bounded_heading, evaluating, imitation_l1, planned_from
 from planners.models.transfuser import FusionSettings, LatentFusion
 from tasks.world.arrays import FloatArray
 
@@ -75,19 +74,10 @@ class Ltf(Planner):
         return planned_from(self.settings.plan_from, plan, batch), queries[:, 1:], fused.bev
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
-        assert batch.bev is not None and batch.agents is not None and batch.agents_valid is not None
         s = self.settings
         plan, queries, above = self._decode(batch)
-        boxes, logits = self.agent_head(queries)
-        there, box = agent_losses(
-            boxes, logits, batch.agents, batch.agents_valid, s.agent_class_weight, s.agent_box_weight
-        )
-        return {
-            "trajectory": s.trajectory_weight * imitation_l1(plan, batch),
-            "agent_class": s.agent_class_weight * there,
-            "agent_box": s.agent_box_weight * box,
-            "bev": s.bev_weight * bev_loss(self.bev_head(above), batch.bev),
-        }
+        auxiliary = auxiliary_losses(s, batch, self.bev_head(above), *self.agent_head(queries))
+        return {"trajectory": s.trajectory_weight * imitation_l1(plan, batch), **auxiliary}
 
     def plan(self, batch: Batch) -> Tensor:
         with evaluating(self):

@@ -17,8 +17,8 @@ BUILT_IN = {
     "ego_mlp": "planners.models.ego_mlp:EgoMlp",
     "ego_mlp_bev": "planners.models.ego_mlp:EgoMlpBev",
     "ltf": "planners.models.ltf:Ltf",
-    "diffusiondrive": "planners.models.diffusiondrive.planner:DiffusionDrive",
-    "gtrs_dense": "planners.models.gtrs_dense.planner:GtrsDense",
+    "diffusiondrive": "planners.models.diffusiondrive:DiffusionDrive",
+    "gtrs_dense": "planners.models.gtrs_dense:GtrsDense",
 }
 
 

@@ -12,7 +12,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from planners.models.backbones.registry import STRIDES, BackboneSettings, build_backbone
+from planners.models.backbones.base import STRIDES, BackboneSettings
+from planners.models.backbones.registry import build_backbone
 
 
 @dataclass(frozen=True)

@@ -9,18 +9,21 @@ differences of one over those of the other.
 """
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from factory.config.arguments import parse
 from planners.command import command
-from planners.evaluation.aggregation import MEASURES
-from planners.evaluation.scores import title_of
+from planners.evaluation.aggregation import MEASURES, title_of
+from planners.evaluation.bootstrap import Interval
 from planners.study.figures import draw_agreement
 
 FACTS = ("setup", "reference", "budget", "stage", "human_filter")  # which comparison
-NUMBERS = ("difference", "low", "high")
+NUMBERS = ("difference", "low", "high")  # percent points of EPDMS
+# Comparisons that both studies made; clear in the first; of these, with the same sign in the second; of these, clear
+# there too; clear in both with other signs.
+COUNTS = ("both", "clear", "same sign", "clear again", "clearly otherwise")
 Key = tuple[str, ...]  # FACTS
 
 
@@ -33,49 +36,21 @@ class AgreementRequest:
     out: str | None = None  # a picture
 
 
-@dataclass(frozen=True)
-class Difference:
-    """Of a setup from what it is held against, with its interval; percent points of EPDMS."""
-
-    difference: float
-    low: float
-    high: float
-
-    @property
-    def is_clear(self) -> bool:
-        """Whether zero lies outside of the interval."""
-        return self.low > 0.0 or self.high < 0.0
-
-    def __str__(self) -> str:
-        return f"{self.difference:+.1f} ({self.low:+.1f} .. {self.high:+.1f})"
+Pair = tuple[Interval, Interval]
 
 
-@dataclass(frozen=True)
-class Agreement:
-    """Of one score."""
-
-    both: int  # comparisons that both studies made
-    clear: int  # in the first
-    same_sign: int  # of these, in the second
-    clear_again: int  # of these, with the same sign
-    clearly_otherwise: int  # of those clear in the first
-
-
-Pair = tuple[Difference, Difference]
-
-
-def read_differences(folder: Path) -> dict[Key, Difference]:
+def read_differences(folder: Path) -> dict[Key, Interval]:
     """FACTS -> difference, of each comparison in the first part that makes it. ValueError for no such table."""
     path = folder / "comparisons.csv"
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
     if not rows or not {*FACTS, *NUMBERS} <= set(rows[0]):
         raise ValueError(f"{path}: no table of a study's comparisons: it must have {', '.join((*FACTS, *NUMBERS))}")
-    found: dict[Key, Difference] = {}
+    found: dict[Key, Interval] = {}
     for line, row in enumerate(rows, start=2):
         try:
             if row["reference"]:
-                one = Difference(*(float(row[name]) for name in NUMBERS))
+                one = Interval(*(float(row[name]) for name in NUMBERS))
                 found.setdefault(tuple(row[name] for name in FACTS), one)
         except (TypeError, ValueError) as error:
             raise ValueError(f"{path}, line {line}: {error}") from error
@@ -83,35 +58,35 @@ def read_differences(folder: Path) -> dict[Key, Difference]:
 
 
 def pairs_of(
-    first: Mapping[Key, Difference], second: Mapping[Key, Difference], measure: tuple[str, str]
+    first: Mapping[Key, Interval], second: Mapping[Key, Interval], measure: tuple[str, str]
 ) -> dict[Key, Pair]:
     """What both compared in one of MEASURES."""
     return {key: (one, second[key]) for key, one in first.items() if key[-2:] == measure and key in second}
 
 
-def agreement(pairs: Sequence[Pair]) -> Agreement:
-    """Counts of one score."""
-    clear = [pair for pair in pairs if pair[0].is_clear]
-    same = [(one, other) for one, other in clear if one.difference * other.difference > 0.0]
+def agreement(pairs: Iterable[Pair]) -> tuple[int, ...]:
+    """COUNTS of one score."""
+    both = list(pairs)
+    clear = [pair for pair in both if pair[0].is_clear]
+    same = [pair for pair in clear if not _is_otherwise(*pair)]
     again = sum(other.is_clear for _, other in same)
-    otherwise = sum(other.is_clear for _, other in clear) - again
-    return Agreement(len(pairs), len(clear), len(same), again, otherwise)
+    return len(both), len(clear), len(same), again, sum(other.is_clear for _, other in clear) - again
+
+
+def _is_otherwise(one: Interval, other: Interval) -> bool:
+    return one.difference * other.difference <= 0.0
 
 
 def text_of(found: Mapping[tuple[str, str], Mapping[Key, Pair]]) -> str:
     """A table to be printed, then each clear difference of the first that has not its sign in the second."""
-    counts = f"{'both':>6}{'clear':>7}{'same sign':>11}{'clear again':>13}{'clearly otherwise':>19}"
-    lines = [f"{'stage':<11}{'filter':<10}{counts}"]
-    otherwise = []
+    lines, otherwise = [f"{'stage':<11}{'filter':<10}  {'  '.join(COUNTS)}"], []
     for (stage, human_filter), pairs in found.items():
-        n = agreement(list(pairs.values()))
-        counts = f"{n.both:>6}{n.clear:>7}{n.same_sign:>11}{n.clear_again:>13}{n.clearly_otherwise:>19}"
-        lines.append(f"{stage:<11}{human_filter:<10}{counts}")
-        otherwise += [
-            f"{setup} against {reference}, equal {budget}, {stage} {human_filter}: {one}, then {other}"
-            for (setup, reference, budget, *_), (one, other) in pairs.items()
-            if one.is_clear and one.difference * other.difference <= 0.0
-        ]
+        counts = (f"{n:>{len(name) + 2}}" for n, name in zip(agreement(pairs.values()), COUNTS))
+        lines.append(f"{stage:<11}{human_filter:<10}{''.join(counts)}")
+        for (setup, reference, budget, *_), pair in pairs.items():
+            if pair[0].is_clear and _is_otherwise(*pair):
+                said = ", then ".join(f"{one.difference:+.1f} ({one.low:+.1f} .. {one.high:+.1f})" for one in pair)
+                otherwise.append(f"{setup} against {reference}, equal {budget}, {stage} {human_filter}: {said}")
     return "\n".join([*lines, *otherwise])
 
 

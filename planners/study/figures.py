@@ -24,27 +24,20 @@ CLEAR, OPEN = "#1f6fb4", "#9aa4ad"  # an interval without and with zero
 
 
 @dataclass(frozen=True)
-class Point:
-    """One training."""
-
-    samples: int  # real and simulated
-    score: float  # percent
-
-
-@dataclass(frozen=True)
 class Curve:
     """The trainings of one planner with one kind of data."""
 
     planner: str
     label: str
-    points: tuple[Point, ...]
+    samples: tuple[int, ...]  # of each training, real and simulated
+    scores: tuple[float, ...]  # percent
     law: ScalingLaw | None  # None: fewer than 4 data sizes
 
     def row(self) -> dict[str, Any]:
         """Of the table of curves; empty where there is no fit."""
         top = None if self.law is None else self.law.saturation
         fit = {name: getattr(self.law, name, "") for name in ("a", "b", "c", "residual_std")}
-        head = {"planner": self.planner, "curve": self.label, "trainings": len(self.points)}
+        head = {"planner": self.planner, "curve": self.label, "trainings": len(self.samples)}
         return {**head, **fit, "saturation_samples": "" if top is None else f"{top:.0f}"}
 
 
@@ -73,38 +66,31 @@ def draw_curves(curves: Sequence[Curve], score: str, path: Path) -> None:
     planners = list(dict.fromkeys(curve.planner for curve in curves))
     with _sheet(path, 1, len(planners), (1.0 + 4.4 * len(planners), 4.2), dpi=130, few=False) as (figure, axes):
         for panel, planner in zip(axes[0], planners):
-            for colour, curve in zip(CURVES * len(curves), (c for c in curves if c.planner == planner)):
-                sizes = [point.samples for point in curve.points]
-                panel.plot(sizes, [p.score for p in curve.points], "o", color=colour, markersize=4, alpha=0.8)
+            mine = [curve for curve in curves if curve.planner == planner]
+            for colour, curve in zip(CURVES * len(mine), mine):
+                panel.plot(curve.samples, curve.scores, "o", color=colour, markersize=4, alpha=0.8)
                 if curve.law is None:
                     panel.plot([], [], "o", color=colour, label=curve.label)
                     continue
-                along = np.geomspace(min(sizes), max(sizes), 100)
+                first, last = min(curve.samples), max(curve.samples)
+                along = np.geomspace(first, last, 100)
                 middle, half = curve.law.score(along), curve.law.residual_std
                 panel.plot(along, middle, color=colour, label=curve.label)
                 panel.fill_between(along, middle - half, middle + half, color=colour, alpha=0.15, linewidth=0)
                 top = curve.law.saturation
-                if top is not None and min(sizes) <= top <= max(sizes):
+                if top is not None and first <= top <= last:
                     panel.plot([top], [float(curve.law.score(top))], "*", color=colour, markersize=13)
             panel.set(xscale="log", title=planner, xlabel="samples, real and simulated")
             panel.grid(alpha=0.3)
-            ticks = _apart(
-                sorted({point.samples for curve in curves if curve.planner == planner for point in curve.points})
-            )
+            ticks: list[int] = []  # far enough from each other to be written side by side
+            for size in sorted({size for curve in mine for size in curve.samples}):
+                if not ticks or math.log(size / ticks[-1]) > 0.2:
+                    ticks.append(size)
             panel.set_xticks(ticks, [str(tick) for tick in ticks])
             panel.minorticks_off()
             panel.legend(fontsize=8)
         axes[0][0].set_ylabel(f"{score} [%]")
         figure.tight_layout()
-
-
-def _apart(sizes: Sequence[int]) -> list[int]:
-    """Those of the rising sizes that are far enough from each other to be written side by side on the axis."""
-    shown: list[int] = []
-    for size in sizes:
-        if not shown or math.log(size / shown[-1]) > 0.2:
-            shown.append(size)
-    return shown
 
 
 def draw_learning(folders: Mapping[str, Path], path: Path) -> None:
@@ -117,11 +103,9 @@ def draw_learning(folders: Mapping[str, Path], path: Path) -> None:
         for panel in axes.flat[len(folders) :]:
             panel.axis("off")
         for panel, (label, folder) in zip(axes.flat, folders.items()):
-            steps, losses = (
-                values[: len(values) // SMOOTH_STEPS * SMOOTH_STEPS] for values in column(folder / LOSSES, "total")
-            )
-            smooth = [values.reshape(-1, SMOOTH_STEPS).mean(axis=1) for values in (steps, losses)]
-            panel.plot(*smooth, color="#1f6fb4", linewidth=1)
+            curve = column(folder / LOSSES, "total")
+            whole = curve[:, : curve.shape[1] // SMOOTH_STEPS * SMOOTH_STEPS]
+            panel.plot(*whole.reshape(2, -1, SMOOTH_STEPS).mean(axis=2), color="#1f6fb4", linewidth=1)
             if (folder / VALIDATION).is_file():
                 other = panel.twinx()
                 other.plot(*column(folder / VALIDATION, "ade_m"), color="#d1561c", linewidth=1)
@@ -185,8 +169,7 @@ def difference_label(row: Mapping[str, Any]) -> str:
     return f"{row['part']}: {row['planner']} {words_of(row)} (equal {row['budget']}, {seeds})"
 
 
-def column(path: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Steps and values of one column of a curve."""
+def column(path: Path, name: str) -> np.ndarray:
+    """(2, n) steps and values of one column of a curve."""
     with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    return np.array([int(row["step"]) for row in rows]), np.array([float(row[name]) for row in rows])
+        return np.array([(float(row["step"]), float(row[name])) for row in csv.DictReader(file)]).T

@@ -8,14 +8,14 @@ nothing. What was trained and what is compared with what stands in the file's me
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from itertools import pairwise
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
 from planners.evaluation.aggregation import ClipResult, by_clip
 from planners.evaluation.benchmark_folder import logs_of
@@ -67,7 +67,7 @@ def write_frames(
     """Write the rows of each planner, by its label. Whole or not at all."""
     meta = {"trainings": [dict(one) for one in trainings], "comparisons": [asdict(one) for one in comparisons]}
     schema = SCHEMA.with_metadata({META: json.dumps(meta).encode()})
-    table = pa.concat_tables([_table(label, of_one) for label, of_one in rows]).cast(schema)
+    table = pa.concat_tables(_table(label, of_one) for label, of_one in rows).cast(schema)
     unfinished = path.with_name(f".{path.name}.unfinished")
     pq.write_table(
         table,
@@ -87,48 +87,38 @@ def read_frames(path: Path) -> StudyFrames:
     if meta is None or table.column_names != SCHEMA.names:
         raise ValueError(f"{path}: no rows of a study: it must have the columns {', '.join(SCHEMA.names)}")
     told = json.loads(meta)
-    columns = {name: table[name].to_numpy(zero_copy_only=False) for name in SCHEMA.names}
-    labels = columns["training"]
-    begins = [0, *(np.flatnonzero(labels[1:] != labels[:-1]) + 1).tolist(), len(labels)]
-    clips = {}
-    for first, last in pairwise(begins):
-        clips[str(labels[first])] = by_clip([_row(columns, i) for i in range(first, last)])
+    columns = (table[name].to_numpy(zero_copy_only=False) for name in SCHEMA.names)
+    clips = {
+        str(label): by_clip([_row(*values) for _, *values in rows])
+        for label, rows in groupby(zip(*columns), key=itemgetter(0))
+    }
     return StudyFrames(tuple(told["trainings"]), tuple(map(_comparison, told["comparisons"])), clips)
 
 
 def _table(label: str, rows: Sequence[FrameRow]) -> pa.Table:
     ordered = sorted(rows, key=lambda row: (row.key.clip_id, row.stage, row.key.candidate_index, row.key.kind))
-    scores = np.array([(row.scores.unfiltered[SCORE], row.scores.filtered[SCORE]) for row in ordered], np.float32)
-    starts = np.array([row.start[:2] for row in ordered])
-    ends = np.array([row.end[:2] for row in ordered])
-    same = (scores[:, 0] == scores[:, 1]) | np.isnan(scores[:, 1])
-    follow_up = np.array([row.stage == "stage_two" for row in ordered])
-    columns = [
-        pa.array([label] * len(ordered)),
-        *(pa.array([getattr(row, name) for row in ordered]) for name in ("stage", "log_id")),
-        *(pa.array([getattr(row.key, name) for row in ordered]) for name in ("clip_id", "kind", "candidate_index")),
-        pa.array(scores[:, 0]),
-        pa.array(scores[:, 1], mask=same),
-        *(pa.array(np.ascontiguousarray(column)) for column in starts.T),
-        *(pa.array(np.ascontiguousarray(column), mask=follow_up) for column in ends.T),
-    ]
-    return pa.table(columns, names=SCHEMA.names).cast(SCHEMA)
+    return pa.Table.from_pylist([_flat(label, row) for row in ordered], SCHEMA)
 
 
-def _row(columns: Mapping[str, NDArray[Any]], i: int) -> FrameRow:
-    """As it was scored, with NaN for what the file does not hold."""
-    score, filtered = float(columns["score"][i]), float(columns["score_filtered"][i])
-    unfiltered, forgiven = np.full((2, len(COLUMNS)), np.nan)
-    unfiltered[SCORE], forgiven[SCORE] = score, score if np.isnan(filtered) else filtered
-    return FrameRow(
-        stage=columns["stage"][i],
-        key=FrameKey(columns["clip_id"][i], columns["kind"][i], int(columns["candidate_index"][i])),
-        scores=FrameScores(unfiltered, forgiven),
-        progress_m=np.nan,
-        start=np.array([columns["start_x"][i], columns["start_y"][i], np.nan]),
-        end=np.array([columns["end_x"][i], columns["end_y"][i], np.nan]),
-        log_id=columns["log_id"][i],
+def _flat(label: str, row: FrameRow) -> dict[str, Any]:
+    score, filtered = (np.float32(values[SCORE]) for values in (row.scores.unfiltered, row.scores.filtered))
+    same = score == filtered or np.isnan(filtered)
+    ends = (None, None) if row.stage == "stage_two" else row.end
+    facts = (row.log_id, row.key.clip_id, row.key.kind, row.key.candidate_index)
+    return dict(
+        zip(SCHEMA.names, (label, row.stage, *facts, score, None if same else filtered, *row.start[:2], *ends[:2]))
     )
+
+
+def _row(
+    stage: Any, log_id: str, clip_id: str, kind: str, candidate: int, score: float, filtered: float, *places: float
+) -> FrameRow:
+    """As it was scored, with NaN for what the file does not hold."""
+    scores = np.full((2, len(COLUMNS)), np.nan)
+    scores[:, SCORE] = score, score if np.isnan(filtered) else filtered
+    start, end = (np.array([*places[i : i + 2], np.nan]) for i in (0, 2))
+    key = FrameKey(clip_id, kind, int(candidate))
+    return FrameRow(stage, key, FrameScores(*scores), np.nan, start, end, log_id=log_id)
 
 
 def _comparison(told: Mapping[str, Any]) -> Comparison:

@@ -12,10 +12,11 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Event
 
 from factory.config.compose import compose, fill
-from factory.exits import INTERRUPTED
-from planners.command import Failed, Stopped, command, until_signal
+from factory.exits import INTERRUPTED, asked_to_stop
+from planners.command import Failed, Stopped, command
 from planners.study.scaling import scale
 from planners.study.sweep import Means, exit_code
 
@@ -67,7 +68,8 @@ def make(recipe: Recipe) -> None:
 def factory(*words: str) -> None:
     """One command of the factory. Raises Stopped where it was interrupted, Failed where it ended with an error."""
     print("python -m factory", *words, file=sys.stderr)
-    with until_signal() as stop:
+    stop = Event()
+    with asked_to_stop(stop.set):
         code = exit_code([sys.executable, "-m", "factory", *words], stop.is_set)
     if code == INTERRUPTED or stop.is_set():
         raise Stopped("the same command goes on")

@@ -12,7 +12,7 @@ sweep: `scaling.csv` (each training). Only the learning curves need the training
 """
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,15 +21,23 @@ import numpy as np
 
 from factory.config.arguments import parse
 from planners.command import command
-from planners.evaluation.aggregation import MEASURES, HumanFilter
+from planners.evaluation.aggregation import (
+    BOUNDS,
+    MEASURES,
+    PAPER,
+    HumanFilter,
+    name_of,
+    scores_of_clips,
+    shown,
+    title_of,
+    write_csv,
+)
 from planners.evaluation.clip_scores import write_clips
 from planners.evaluation.compare import CompareSettings, compare, row_of
 from planners.evaluation.score_table import FILTERS_NOTE
-from planners.evaluation.scores import BOUNDS, PAPER, name_of, scores_of_clips, shown, title_of, write_csv
-from planners.study.figures import Curve, Point, draw_curves, draw_differences
+from planners.study.figures import Curve, draw_curves, draw_differences
 from planners.study.frames_file import FRAMES, StudyFrames, read_frames
 from planners.study.scaling_law import FEWEST, fit_scaling
-from planners.study.setups import Comparison
 from planners.study.tables import markdown_of
 
 CURVES = {"final": "scaling.png", "stage_two": "scaling_stage_two.png"}
@@ -53,16 +61,6 @@ class ReportRequest:
             raise ValueError(f"human_filter={self.human_filter}: unfiltered or filtered")
 
 
-@dataclass(frozen=True)
-class Held:
-    """A line of comparisons.csv before it is scored: trainings of one set-up, by seed, and those it is held against."""
-
-    facts: Mapping[str, Any]  # its first columns
-    labels: Sequence[str]
-    against: Sequence[str] = ()
-    reference: str = ""  # the name of these
-
-
 def write_tables(folder: Path, out: Path, human_filter: HumanFilter) -> str:
     """The files of this module's docstring, of `folder`; returns the two-stage scores, to be printed."""
     frames, measures = read_frames(folder / FRAMES), shown(human_filter)
@@ -70,55 +68,44 @@ def write_tables(folder: Path, out: Path, human_filter: HumanFilter) -> str:
     scores = {label: scores_of_clips(clips) for label, clips in frames.clips.items()}
     trainings = [{**facts, **scores[facts["training"]]} for facts in frames.trainings]
     bounds = [{"planner": name, **scores[name]} for name in BOUNDS if name in scores]
-    found = compared(frames)
-    write_csv(out / "comparisons.csv", found)
+    rows = compared(frames)
+    write_csv(out / "comparisons.csv", rows)
     if bounds:
         write_csv(out / "bounds.csv", bounds)
     if frames.comparisons:
         write_csv(out / "trainings.csv", trainings)
         write_clips(out / "clips.csv", {label: clips for label, clips in frames.clips.items() if label not in BOUNDS})
-        (out / "tables.md").write_text(markdown_of(found, human_filter))
-        drawn = [row for row in found if row["reference"] and row["human_filter"] == measures[row["stage"]]]
+        (out / "tables.md").write_text(markdown_of(rows, human_filter))
+        drawn = [row for row in rows if row["reference"] and row["human_filter"] == measures[row["stage"]]]
         if drawn:
             draw_differences(drawn, out / "differences.png")
     else:
         write_csv(out / "scaling.csv", [{k: v for k, v in row.items() if k != "training"} for row in trainings])
     curves = {stage: curves_of(frames, scores, name_of(stage, measures[stage])) for stage in CURVES}
     if (frames.comparisons and any(curves.values())) or any(one.law for one in curves["final"]):
-        lines = [
-            {"stage": stage, "human_filter": measures[stage], **curve.row()}
-            for stage, drawn_ones in curves.items()
-            for curve in drawn_ones
-        ]
-        write_csv(out / "curves.csv", lines)
+        heads = {stage: {"stage": stage, "human_filter": measures[stage]} for stage in curves}
+        write_csv(out / "curves.csv", [heads[stage] | one.row() for stage, found in curves.items() for one in found])
         for stage, name in CURVES.items():
             draw_curves(curves[stage], title_of(stage, measures[stage]), out / name)
-    return "\n".join([text_of(found, bounds, measures["final"]), f"tables and pictures: {out}"])
+    return "\n".join([text_of(rows, bounds, measures["final"]), f"tables and pictures: {out}"])
 
 
-def held(frames: StudyFrames) -> list[Held]:
-    """What is compared: a study's comparisons, or each set-up of a sweep with real samples alone."""
-    if frames.comparisons:
-        return [_of_study(one) for one in frames.comparisons]
+def held(frames: StudyFrames) -> Iterator[tuple[Mapping[str, Any], Sequence[str], Sequence[str]]]:
+    """Facts and trainings of what is compared, and those it is held against, of the same seeds.
+
+    A study's comparisons, or each set-up of a sweep with real samples alone.
+    """
+    for one in frames.comparisons:
+        labels, *against = ([setup.label_of(seed) for seed in range(one.seeds)] for setup in one.setups)
+        yield one.facts, labels, against[0] if against else ()
     setups = defaultdict[tuple[tuple[str, Any], ...], list[str]](list)
-    for facts in sorted(frames.trainings, key=lambda facts: facts["seed"]):
+    for facts in sorted(frames.trainings, key=lambda facts: facts["seed"]) if not frames.comparisons else ():
         setups[tuple((name, value) for name, value in facts.items() if name not in OF_ONE)].append(facts["training"])
-    found = []
     for key, labels in setups.items():
-        setup, against = dict(key), list[str]()
-        if setup["rounds"]:
-            imitation = "none" if setup["imitation"] == "none" else "all"
-            alone = {**setup, "expert": "", "rounds": 0, "sim_ratio": "natural", "imitation": imitation}
-            against = setups.get(tuple(alone.items()), [])
-        found.append(Held({**setup, "seeds": len(labels)}, labels, against))
-    return found
-
-
-def _of_study(one: Comparison) -> Held:
-    labels, against = (
-        [setup.label_of(seed) for seed in range(one.seeds)] if setup else [] for setup in (one.setup, one.reference)
-    )
-    return Held(one.facts, labels, against, one.reference.label if one.reference else "")
+        setup = dict(key)
+        imitation = "none" if setup["imitation"] == "none" else "all"
+        alone = {**setup, "expert": "", "rounds": 0, "sim_ratio": "natural", "imitation": imitation}
+        yield setup | {"seeds": len(labels)}, labels, setups.get(tuple(alone.items()), ()) if setup["rounds"] else ()
 
 
 def compared(frames: StudyFrames) -> list[Row]:
@@ -128,15 +115,16 @@ def compared(frames: StudyFrames) -> list[Row]:
     uniform_share, the mean share of clips none of whose follow-ups starts near the plan's end.
     """
     rows = []
-    for one in held(frames):
-        a, b = ([frames.clips[label] for label in side] for side in (one.against, one.labels))
+    for facts, labels, against in held(frames):
+        a, b = ([frames.clips[label] for label in side] for side in (against, labels))
         intervals = compare(a, b, RULES) if a else {}
         scores = [scores_of_clips(clips) for clips in b]
         for stage, human_filter in MEASURES:
             each = [score[name_of(stage, human_filter)] for score in scores]
-            row = {**one.facts, "stage": stage, "human_filter": human_filter, "epdms": float(np.mean(each))}
+            row = {**facts, "stage": stage, "human_filter": human_filter, "epdms": float(np.mean(each))}
             if frames.comparisons:
-                row |= {"each": " ".join(f"{score:.1f}" for score in each), "reference": one.reference}
+                row["each"] = " ".join(f"{score:.1f}" for score in each)
+                row["reference"] = against[0].rpartition("-")[0] if against else ""
             else:
                 row |= {"lowest_seed": min(each), "highest_seed": max(each)}
             row |= row_of(intervals.get((stage, human_filter)))
@@ -151,10 +139,9 @@ def curves_of(frames: StudyFrames, scores: Scores, score: str) -> list[Curve]:
     samples = {facts["training"]: facts["real"] + facts["simulated"] for facts in frames.trainings}
     curves = []
     for (planner, name), labels in _series(frames).items():
-        points = tuple(Point(samples[label], scores[label][score]) for label in labels)
-        enough = len({point.samples for point in points}) >= FEWEST
-        law = fit_scaling([p.samples for p in points], [p.score for p in points]) if enough else None
-        curves.append(Curve(planner, name, points, law))
+        sizes, values = tuple(samples[label] for label in labels), tuple(scores[label][score] for label in labels)
+        law = fit_scaling(sizes, values) if len(set(sizes)) >= FEWEST else None
+        curves.append(Curve(planner, name, sizes, values, law))
     return curves
 
 

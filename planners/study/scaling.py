@@ -15,7 +15,7 @@ from typing import Literal
 
 from factory.config.compose import compose, fill
 from planners.command import command
-from planners.study.setups import Imitation, Portion, Setup
+from planners.study.setups import Imitation, Setup
 from planners.study.study import run
 from planners.study.sweep import SweepSettings, Training
 
@@ -47,6 +47,7 @@ class ScalingSettings(SweepSettings):
     train: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name in ("planners", "experts", "rounds", "sim_ratios", "imitation", "real_shares", "seeds"):
             values = getattr(self, name)
             if not values or len(set(values)) < len(values):
@@ -72,14 +73,15 @@ def trainings_of(s: ScalingSettings) -> list[Training]:
         label = "-".join(str(value) for value in facts.values() if value != "")
         overrides = setup.overrides(planner, s.data.real, s.data.sim, s.data.val, seed)
         overrides += [f"steps={s.steps}"] if s.steps is not None else []
-        found[label] = Training(label, (*overrides, *s.train.get(EVERYONE, ()), *s.train.get(planner, ())), facts)
+        overrides += [*s.train.get(EVERYONE, ()), *s.train.get(planner, ())]
+        found[label] = Training(label, tuple(overrides), facts, ("scaling", 0))
     return list(found.values())
 
 
 def scale(words: Sequence[str]) -> None:
     """Train, score and report what settings ask for. Raises ConfigError, Stopped, Failed."""
     s = fill(ScalingSettings, compose("scaling", words, ScalingSettings), "scaling")
-    everything = [Portion("scaling", 0, tuple(trainings_of(s)), {})]
+    everything = trainings_of(s)
     run(s, everything, everything, ())
 
 

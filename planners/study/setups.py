@@ -4,7 +4,7 @@ Everything is compared twice: in equal passes over a planner's own data, as the 
 steps, since more data in equal passes is more training as well.
 """
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import takewhile
 from pathlib import Path
@@ -23,7 +23,6 @@ ENSEMBLE = "ensemble"  # stands for a planner; nothing is trained for it
 SCORING = "gtrs_dense"  # the planner that learns from rewards too
 MULTI = ("diffusiondrive", SCORING)  # the planners of everything but the main table
 PARTS = ("main", "rounds", "traffic", "ratio", "psnr", "rewards", "real_share", "control", "ensemble")
-PLANNERS_OF_LEG = 48
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +46,7 @@ class StudySettings(SweepSettings):
     parts: tuple[str, ...]
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         unknown = sorted(set(self.parts) - set(PARTS))
         if unknown or not self.parts:
             raise ValueError(f"parts={list(self.parts)}: some of {', '.join(PARTS)}")
@@ -110,8 +110,12 @@ class Setup:
             *chosen,
         ]
 
-    def training(self, settings: StudySettings, seed: int, sizes: Sizes) -> Training:
+    def training(self, settings: StudySettings, seed: int, sizes: Sizes, part: str = "") -> Training:
         """One of its trainings in the study."""
+        label, facts, unit = self.label_of(seed), {**vars(self), "seed": seed}, (part, seed)
+        if self.planner == ENSEMBLE:
+            members = (trained(one, self.rounds) for one in taught(SCORING, self.budget, self.rounds))
+            return Training(label, (), facts, unit, tuple(one.label_of(seed) for one in members))
         simulated = settings.replay if self.traffic == "replay" else settings.data
         if self.data == "logged":
             simulated = settings.control
@@ -136,7 +140,7 @@ class Setup:
             overrides += [f"data.psnr_min={settings.psnr_db}"]
         if self.psnr != "any":
             overrides += [f"data.limit_sim={sizes.matched}"]
-        return Training(self.label_of(seed), tuple(overrides), {**vars(self), "seed": seed})
+        return Training(label, tuple(overrides), facts, unit)
 
 
 def begin(planner: str) -> Setup:
@@ -153,6 +157,11 @@ class Comparison:
     reference: Setup | None
     seeds: int
     budget: Budget = "epochs"  # that of the comparison
+
+    @property
+    def setups(self) -> tuple[Setup, ...]:
+        """Both, or the only one."""
+        return (self.setup,) if self.reference is None else (self.setup, self.reference)
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -242,55 +251,17 @@ def trained(setup: Setup, rounds: int) -> Setup:
     return replace(setup, budget="epochs") if is_whole and setup.planner != ENSEMBLE else setup
 
 
-@dataclass(frozen=True)
-class Portion:
-    """One seed of one part: what is asked for first, and what the tables say of it."""
-
-    part: str
-    seed: int
-    trainings: tuple[Training, ...]  # that no portion before it asked for
-    ensembles: Mapping[str, str]  # label -> trainings joined by plus, as `python -m planners evaluate` takes them
-
-    @property
-    def labels(self) -> list[str]:
-        """What is evaluated."""
-        return [*(training.label for training in self.trainings), *self.ensembles]
-
-
-def portions(found: Sequence[Comparison], settings: StudySettings, sizes: Sizes) -> list[Portion]:
+def planned(found: Sequence[Comparison], settings: StudySettings, sizes: Sizes) -> list[Training]:
     """Every setup with every seed that some comparison asks for, each once: part by part, in each seed by seed."""
-    planned, seen = [], set[tuple[Setup, int]]()
+    trainings: dict[str, Training] = {}
     for part in dict.fromkeys(one.part for one in found):
         mine = [one for one in found if one.part == part]
         for seed in range(max(one.seeds for one in mine)):
-            asked = [one for one in mine if seed < one.seeds]
-            setups = dict.fromkeys(s for one in asked for s in (one.setup, one.reference) if s is not None)
-            new = [s for s in setups if (s, seed) not in seen]
-            seen |= {(s, seed) for s in new}
-            new_trainings = tuple(s.training(settings, seed, sizes) for s in new if s.planner != ENSEMBLE)
-            joined = {s.label_of(seed): _joined(s, seed, Path(settings.out)) for s in new if s.planner == ENSEMBLE}
-            planned.append(Portion(part, seed, new_trainings, joined))
-    return planned
-
-
-def legs(planned: Sequence[Portion]) -> list[list[Portion]]:
-    """Portions that are trained at once and then evaluated at once: cores idle at the end of either.
-
-    What all begin with is done before; else as many portions, one after the other, as make PLANNERS_OF_LEG.
-    """
-    found: list[list[Portion]] = []
-    for portion in planned:
-        last = found[-1] if found else []
-        if not last or last[-1].part == "begin" or sum(len(p.labels) for p in last) >= PLANNERS_OF_LEG:
-            found.append([portion])
-        else:
-            last.append(portion)
-    return found
-
-
-def _joined(ensemble: Setup, seed: int, out: Path) -> str:
-    members = [trained(member, ensemble.rounds) for member in taught(SCORING, ensemble.budget, ensemble.rounds)]
-    return "+".join(str(out / TRAININGS / member.label_of(seed)) for member in members)
+            for one in mine:
+                for setup in one.setups if seed < one.seeds else ():
+                    if setup.label_of(seed) not in trainings:
+                        trainings[setup.label_of(seed)] = setup.training(settings, seed, sizes, part)
+    return list(trainings.values())
 
 
 def so_far(found: Sequence[Comparison], evaluated: Collection[str]) -> list[Comparison]:
@@ -298,15 +269,11 @@ def so_far(found: Sequence[Comparison], evaluated: Collection[str]) -> list[Comp
 
     A part is left out as long as nothing of it is held against anything: other parts share what it would begin with.
     """
-    standing = [(one, seeds) for one in found if (seeds := _seeds_of(one, evaluated))]
-    of_part: dict[str, int] = {}
-    for one, seeds in standing:
-        of_part[one.part] = min(seeds, of_part.get(one.part, seeds))
-    open_parts = {one.part for one in found if one.reference} - {one.part for one, _ in standing if one.reference}
-    return [replace(one, seeds=of_part[one.part]) for one, _ in standing if one.part not in open_parts]
-
-
-def _seeds_of(one: Comparison, evaluated: Collection[str]) -> int:
-    sides = [setup for setup in (one.setup, one.reference) if setup is not None]
-    done = (all(setup.label_of(seed) in evaluated for setup in sides) for seed in range(one.seeds))
-    return sum(takewhile(bool, done))
+    standing: list[tuple[Comparison, int]] = []
+    for one in found:
+        done = (all(setup.label_of(seed) in evaluated for setup in one.setups) for seed in range(one.seeds))
+        if seeds := sum(takewhile(bool, done)):
+            standing.append((one, seeds))
+    closed = {one.part for one in found if one.reference} - {one.part for one, _ in standing if one.reference}
+    fewest = {part: min(n for one, n in standing if one.part == part) for part in {one.part for one, _ in standing}}
+    return [replace(one, seeds=fewest[one.part]) for one, _ in standing if one.part not in closed]

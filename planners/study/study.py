@@ -20,25 +20,16 @@ from typing import Any
 from factory.config.compose import ConfigError, compose, fill
 from planners.command import Stopped, command
 from planners.data.index import DataSettings, open_dataset
-from planners.evaluation.scores import BOUNDS
+from planners.evaluation.aggregation import BOUNDS
 from planners.study.figures import draw_learning
 from planners.study.frames_file import FRAMES, rows_of, write_frames
 from planners.study.report import write_tables
-from planners.study.setups import (
-    Comparison,
-    Portion,
-    Sizes,
-    StudySettings,
-    comparisons,
-    legs,
-    portions,
-    so_far,
-    with_all_parts,
-)
+from planners.study.setups import Comparison, Sizes, StudySettings, comparisons, planned, so_far, with_all_parts
 from planners.study.sweep import (
     EVALUATIONS,
     SweepSettings,
     Training,
+    batches,
     evaluate_all,
     folder_of,
     is_done,
@@ -49,40 +40,34 @@ from planners.training.checkpoint import read_record
 
 
 def run(
-    settings: SweepSettings, asked: Sequence[Portion], known: Sequence[Portion], wanted: Sequence[Comparison]
+    settings: SweepSettings, asked: Sequence[Training], known: Sequence[Training], wanted: Sequence[Comparison]
 ) -> None:
-    """Train and score what is missing of `asked`, one leg after the other, and report on what there is.
+    """Train and score what is missing of `asked`, one batch after the other, and report on what there is.
 
     known: of which what is done is reported, whoever asked for it; wanted: of these, what is compared; none: every
     set-up is held against real samples alone, when all is done. Raises Stopped, Failed.
     """
-    out, labels, means = Path(settings.out), {label for portion in asked for label in portion.labels}, settings.means
+    out, labels = Path(settings.out), {one.label for one in asked}
     try:
-        for leg in legs(asked):
-            print("; ".join(f"{portion.part}, seed {portion.seed}" for portion in leg), file=sys.stderr)
-            trainings = [training for portion in leg for training in portion.trainings]
-            who = {training.label: str(folder_of(out, training)) for training in trainings}
-            who |= {label: spec for portion in leg for label, spec in portion.ensembles.items()}
-            train_all(trainings, out, means)
-            evaluate_all(who, out, settings.benchmark, means, *settings.evaluate)
+        for batch in batches(asked):
+            print("; ".join(dict.fromkeys("{}, seed {}".format(*one.unit) for one in batch)), file=sys.stderr)
+            train_all(batch, out, settings)
+            evaluate_all(batch, out, settings.benchmark, settings, *settings.evaluate)
     except Stopped as stopped:
         print(stopped, file=sys.stderr)
     done = evaluated(known, out)
     if done and (wanted or done >= labels):
-        trained = [training for portion in known for training in portion.trainings if training.label in done]
+        trained = [one for one in known if one.label in done and not one.members]
         write_report(so_far(wanted, done), trained, settings)
     if not done >= labels:
         raise Stopped(f"{len(labels & done)} of {len(labels)} planners are evaluated: the same command goes on")
 
 
-def evaluated(planned: Sequence[Portion], out: Path) -> set[str]:
+def evaluated(planned: Sequence[Training], out: Path) -> set[str]:
     """Labels of all that is trained to its end and evaluated as it is now, by this command or one before it."""
-    trainings = [training for portion in planned for training in portion.trainings if is_done(out, training)]
-    trained = {training.label: str(folder_of(out, training)) for training in trainings}
-    folders = set(trained.values())
-    joined = [(label, spec) for portion in planned for label, spec in portion.ensembles.items()]
-    whole = {label: spec for label, spec in joined if folders.issuperset(spec.split("+"))}
-    return {label for label, spec in (trained | whole).items() if is_evaluated(out, label, spec)}
+    trained = {one.label for one in planned if not one.members and is_done(out, one)}
+    whole = [one for one in planned if trained.issuperset(one.members or (one.label,))]
+    return {one.label for one in whole if is_evaluated(out, one)}
 
 
 def write_report(standing: Sequence[Comparison], trained: Sequence[Training], settings: SweepSettings) -> None:
@@ -128,5 +113,4 @@ def main(argv: Sequence[str]) -> None:
     settings = fill(StudySettings, compose("study", argv, StudySettings), "study")
     sizes, whole = sizes_of(settings), with_all_parts(settings)
     wanted = comparisons(whole)
-    asked = portions(comparisons(settings), settings, sizes)
-    run(settings, asked, portions(wanted, whole, sizes), wanted)
+    run(settings, planned(comparisons(settings), settings, sizes), planned(wanted, whole, sizes), wanted)

@@ -15,18 +15,20 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field
+from itertools import groupby
 from pathlib import Path
-from typing import Any, Literal, TextIO
+from typing import Any, ClassVar, Literal, TextIO
 
-from factory.exits import INTERRUPTED
+from factory.exits import INTERRUPTED, asked_to_stop
 from factory.graph.progress import Counter
-from planners.command import Failed, Stopped, until_signal
-from planners.evaluation import record as eval_record
-from planners.evaluation.aggregation import HumanFilter
-from planners.evaluation.contenders import contender
-from planners.evaluation.scores import BOUNDS, PAPER
+from planners.command import Failed, Stopped
+from planners.evaluation.aggregation import BOUNDS, PAPER, HumanFilter
+from planners.evaluation.planner_names import planner_of
+from planners.evaluation.score_rows import RECORD, read_record
+from planners.evaluation.score_rows import is_done as evaluation_is_done
 
 TRAININGS, EVALUATIONS, DONE, LOG = "trainings", "evaluations", "sweep.json", "train.log"
+BATCH = 48  # planners that are trained and evaluated together: cores idle at the end of either
 EVALUATED_TOGETHER = 24  # planners in one process at the most
 LOOK_EVERY_S = 0.5
 ONE_THREAD = {"OMP_NUM_THREADS": "1"}  # of each process, unless the user says otherwise
@@ -34,31 +36,17 @@ ONE_THREAD = {"OMP_NUM_THREADS": "1"}  # of each process, unless the user says o
 
 @dataclass(frozen=True)
 class Training:
-    """One training of a sweep."""
+    """One planner of a sweep: a training, or the ensemble of several."""
 
     label: str  # names its folder; unique in the sweep
-    overrides: tuple[str, ...]  # of planners.training.train, but `out`
+    overrides: tuple[str, ...] = ()  # of planners.training.train, but `out`
     facts: Mapping[str, Any] = field(default_factory=dict)  # its columns in the sweep's tables
+    unit: tuple[str, int] = ("", 0)  # part and seed, which are done one after the other
+    members: tuple[str, ...] = ()  # of an ensemble: the labels of its trainings
 
-
-@dataclass(frozen=True, kw_only=True)
-class SweepSettings:
-    """The keys that conf/study.yaml and conf/scaling.yaml share."""
-
-    benchmark: str
-    out: str
-    report: str | None = None  # None: out
-    human_filter: HumanFilter = PAPER
-    executor: Literal["process", "ray"] = "process"
-    jobs: int | None = None
-    minutes: float | None = None
-    gpus: float = 0.0
-    cpus: float = 1.0
-    evaluate: tuple[str, ...] = ()
-
-    @property
-    def means(self) -> "Means":
-        return Means(self.executor, self.jobs, self.minutes, self.gpus, self.cpus)
+    def spec(self, out: Path) -> str:
+        """As `python -m planners evaluate` takes it."""
+        return "+".join(str(out / TRAININGS / label) for label in self.members or (self.label,))
 
 
 @dataclass(frozen=True)
@@ -70,7 +58,10 @@ class Means:
     minutes: float | None = None  # after which nothing new begins, and what runs is saved and stopped
     gpus: float = 0.0  # of each training on Ray
     cpus: float = 1.0
-    began: float = field(default_factory=time.monotonic)  # what the minutes are counted from
+    began: ClassVar[float]  # what the minutes are counted from; of each, but no setting
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "began", time.monotonic())
 
     @property
     def at_once(self) -> int:
@@ -88,6 +79,17 @@ class Means:
         return [] if self.left_s is None else [f"minutes={self.left_s / 60.0:.3f}"]
 
 
+@dataclass(frozen=True, kw_only=True)
+class SweepSettings(Means):
+    """The keys that conf/study.yaml and conf/scaling.yaml share."""
+
+    benchmark: str
+    out: str
+    report: str | None = None  # None: out
+    human_filter: HumanFilter = PAPER
+    evaluate: tuple[str, ...] = ()
+
+
 def folder_of(out: Path, training: Training) -> Path:
     """Where a training lies under the sweep's folder."""
     return out / TRAININGS / training.label
@@ -99,12 +101,23 @@ def is_done(out: Path, training: Training) -> bool:
     return path.is_file() and json.loads(path.read_text()) == list(training.overrides)
 
 
+def batches(planned: Sequence[Training]) -> list[list[Training]]:
+    """Units one after the other, as many as make BATCH; what all begin with is done before."""
+    found: list[list[Training]] = []
+    for _, unit in groupby(planned, key=lambda one: one.unit):
+        if not found or found[-1][-1].unit[0] == "begin" or len(found[-1]) >= BATCH:
+            found.append([])
+        found[-1] += unit
+    return found
+
+
 def train_all(trainings: Sequence[Training], out: Path, means: Means) -> None:
-    """Train what is not done.
+    """Train what is not done; ensembles need not be.
 
     Raises ValueError for two trainings of one label, Stopped where time ran out or somebody interrupted before all
     were, Failed with what each failed training said last.
     """
+    trainings = [training for training in trainings if not training.members]
     labels = [training.label for training in trainings]
     if twice := sorted({label for label in labels if labels.count(label) > 1}):
         raise ValueError(f"labels {twice} stand for several trainings")
@@ -178,9 +191,10 @@ def _codes(
 @contextlib.contextmanager
 def _stops(after_s: float | None) -> Iterator[threading.Event]:
     """Set after so many seconds, or at SIGINT and SIGTERM."""
-    with until_signal() as stop:
-        timer = threading.Timer(after_s or 0.0, stop.set)
-        timer.daemon = True
+    stop = threading.Event()
+    timer = threading.Timer(after_s or 0.0, stop.set)
+    timer.daemon = True
+    with asked_to_stop(stop.set):
         if after_s is not None:
             timer.start()
         try:
@@ -189,52 +203,52 @@ def _stops(after_s: float | None) -> Iterator[threading.Event]:
             timer.cancel()
 
 
-def evaluate_all(who: Mapping[str, str], out: Path, benchmark: str, means: Means, *more: str) -> None:
+def evaluate_all(everyone: Sequence[Training], out: Path, benchmark: str, means: Means, *more: str) -> None:
     """Evaluate on a benchmark, into `out`/evaluations; those that are evaluated already are not again.
 
     Processes of `python -m planners evaluate` share the planners, a few each at a time, so that a kill costs little.
-    who: label -> planner, as that command takes it; more: overrides of it. Raises Stopped where time ran out or
-    somebody interrupted before all were, and Failed.
+    more: overrides of that command. Raises Stopped where time ran out or somebody interrupted before all were, and
+    Failed.
     """
     base = [sys.executable, "-m", "planners", "evaluate", f"benchmark={benchmark}", *more, f"out={out / EVALUATIONS}"]
 
-    def evaluate(part: Sequence[tuple[str, str]], *how: str) -> int:
+    def evaluate(share: Sequence[Training], *how: str) -> int:
         if stop.is_set():
             return 0
-        named = ",".join(f"{label}: '{spec}'" for label, spec in part)
+        named = ",".join(f"{one.label}: '{one.spec(out)}'" for one in share)
         command = [*base, f"planners={{{named}}}", *how]
         ended = subprocess.run(command, env=ONE_THREAD | os.environ, capture_output=True, text=True)  # noqa: S603 - a list, no shell
         if ended.returncode != 0:
             raise Failed(f"the evaluation ended with exit {ended.returncode}: {ended.stderr.strip()[-500:]}")
-        return len(part)
+        return len(share)
 
-    everyone, done = list(who.items()), 0
+    done = 0
     with (
         _stops(means.left_s) as stop,
-        Counter("evaluations", len(who)) as counter,
+        Counter("evaluations", len(everyone)) as counter,
         ThreadPoolExecutor(means.at_once) as pool,
     ):
         shares = shares_of(everyone, means.at_once)
-        for n in pool.map(lambda part: evaluate(part, "bounds=false", "tables=false"), shares):
+        for n in pool.map(lambda share: evaluate(share, "bounds=false", "tables=false"), shares):
             done += n
             counter.show(done)
-        if done < len(who) or not evaluate(everyone):  # nothing is left but the bounds and the tables of all
-            raise Stopped(f"{done} of {len(who)} are evaluated: the same command goes on")
+        if done < len(everyone) or not evaluate(everyone):  # nothing is left but the bounds and the tables of all
+            raise Stopped(f"{done} of {len(everyone)} are evaluated: the same command goes on")
 
 
-def shares_of(who: Sequence[tuple[str, str]], at_once: int) -> list[Sequence[tuple[str, str]]]:
+def shares_of(everyone: Sequence[Training], at_once: int) -> list[Sequence[Training]]:
     """What each process evaluates, taken in turn: neighbours are of one kind, and kinds take different times."""
-    n = min(at_once * -(-len(who) // (at_once * EVALUATED_TOGETHER)), len(who))
-    return [who[i::n] for i in range(n)]
+    n = min(at_once * -(-len(everyone) // (at_once * EVALUATED_TOGETHER)), len(everyone))
+    return [everyone[i::n] for i in range(n)]
 
 
-def is_evaluated(out: Path, label: str, spec: str) -> bool:
-    """Whether who `spec` names stands under `label` as it is now, evaluated as the bounds were last."""
-    bound, mine = (out / EVALUATIONS / name for name in (BOUNDS[-1], label))
-    if not (bound / eval_record.RECORD).is_file():
+def is_evaluated(out: Path, one: Training) -> bool:
+    """Whether it stands under its label as it is now, evaluated as the bounds were last."""
+    bound, mine = (out / EVALUATIONS / name for name in (BOUNDS[-1], one.label))
+    if not (bound / RECORD).is_file():
         return False
-    shared = {k: v for k, v in eval_record.read_record(bound).items() if k not in ("planner", "planner_digest")}
-    return eval_record.is_done(mine, {"planner_digest": contender(spec).digest, **shared})
+    shared = {k: v for k, v in read_record(bound).items() if k not in ("planner", "planner_digest")}
+    return evaluation_is_done(mine, {"planner_digest": planner_of(one.spec(out)).digest, **shared})
 
 
 def _last_words(log: Path) -> str:

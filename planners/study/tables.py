@@ -1,12 +1,11 @@
 """The study's comparisons as Markdown: a table for each part, to be read, or copied into a document."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import groupby
 from typing import Any
 
-from planners.evaluation.aggregation import HumanFilter
+from planners.evaluation.aggregation import HumanFilter, shown
 from planners.evaluation.score_table import FILTERS_NOTE
-from planners.evaluation.scores import shown
 
 Row = Mapping[str, Any]  # of comparisons.csv
 INTERVALS = (
@@ -30,22 +29,18 @@ def markdown_of(rows: Sequence[Row], human_filter: HumanFilter) -> str:
     head = ("planner", "trained on", "equal", "seeds", *titles, "final of each seed")
     lines = [f"Scores are {human_filter}: {FILTERS_NOTE[0]}; {FILTERS_NOTE[1]}.", "", INTERVALS, ""]
     for part, of_part in groupby(mine, key=lambda row: row["part"]):
+        rows = list(of_part)
         lines += [f"## {part}", "", _line(head), _line(["---"] * len(head))]
-        lines += [_line(_cells(one)) for one in _by_comparison(list(of_part), len(stages))]
+        lines += [_line(_cells(rows[i : i + len(stages)])) for i in range(0, len(rows), len(stages))]
         lines.append("")
     return "\n".join(lines)
 
 
-def _by_comparison(rows: Sequence[Row], n_stages: int) -> Iterator[dict[str, Row]]:
-    """The rows of one comparison after the other, by stage."""
-    for first in range(0, len(rows), n_stages):
-        yield {row["stage"]: row for row in rows[first : first + n_stages]}
-
-
-def _cells(stages: Mapping[str, Row]) -> list[str]:
-    final = stages["final"]
-    scores = [_score(row) for row in stages.values()]
-    return [f"`{final['planner']}`", words_of(final), final["budget"], str(final["seeds"]), *scores, final["each"]]
+def _cells(stages: Sequence[Row]) -> list[str]:
+    """Of the rows of one comparison."""
+    one = stages[-1]
+    facts = [f"`{one['planner']}`", words_of(one), one["budget"], str(one["seeds"])]
+    return [*facts, *map(_score, stages), one["each"]]
 
 
 def _score(row: Row) -> str:
@@ -70,17 +65,14 @@ def words_of(row: Row) -> str:
     """What a planner was trained on, in words; what is as usual is left out."""
     if row["data"] == "begin":
         return "other towns"
-    said = ["real"] if row["rounds"] == 0 else [f"+ {row['data']}", *_rounds(row["rounds"])]
+    rounds = "1 round" if row["rounds"] == 1 else f"{row['rounds']} rounds"
+    said = ["real"] if row["rounds"] == 0 else [f"+ {row['data']}", rounds]
     said += {"all": [], "real": ["rewards only"], "none": ["no imitation"]}[row["imitation"]]
     said += ["replayed traffic"] if row["traffic"] == "replay" else []
     said += [f"sim ratio {row['sim_ratio']}"] if row["sim_ratio"] != "natural" else []
     said += {"any": [], "low": ["low PSNR"], "high": ["high PSNR"]}[row["psnr"]]
     said += [f"{100.0 * row['real_share']:.0f} % of the real"] if row["real_share"] < 1.0 else []
     return ", ".join(said)
-
-
-def _rounds(rounds: int) -> list[str]:
-    return ["1 round"] if rounds == 1 else [f"{rounds} rounds"]
 
 
 def _line(cells: Sequence[str]) -> str:

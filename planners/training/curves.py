@@ -34,7 +34,7 @@ class Curves:
     def close(self) -> None:
         """Flush everything."""
         for rows in self._files.values():
-            rows.close()
+            rows.file.close()
         self._board.close()
         if self._wandb is not None:
             self._wandb.finish()
@@ -55,23 +55,17 @@ class _Rows:
         if path.exists():
             with path.open(newline="") as old:
                 kept = [row for row in csv.DictReader(old) if int(row["step"]) < first_step]
-        self._file = path.open("w", newline="")
+        self.file = path.open("w", newline="")
         self._writer: csv.DictWriter[str] | None = None
         for row in kept:
-            self._row(row)
+            self.write(row)
 
     def write(self, row: Mapping[str, Any]) -> None:
-        self._row({key: repr(value) if isinstance(value, float) else value for key, value in row.items()})
-        self._file.flush()
-
-    def close(self) -> None:
-        self._file.close()
-
-    def _row(self, row: Mapping[str, Any]) -> None:
         if self._writer is None:
-            self._writer = csv.DictWriter(self._file, list(row))
+            self._writer = csv.DictWriter(self.file, list(row))
             self._writer.writeheader()
-        self._writer.writerow(row)
+        self._writer.writerow({key: repr(value) if isinstance(value, float) else value for key, value in row.items()})
+        self.file.flush()
 
 
 def _wandb_run(out: Path) -> Any:

@@ -7,6 +7,7 @@ import logging
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -25,11 +26,8 @@ T = TypeVar("T")
 def train_on_ray(train: Callable[[World], None], settings: RaySettings, out: str) -> None:
     """Call `train` in each of `settings.processes` processes. What one of them raises is raised here."""
     gpu = settings.gpus > 0
-    started = not ray.is_initialized()
-    if started:
-        _connect()
-    try:
-        TorchTrainer(
+    with _connected():
+        trainer = TorchTrainer(
             _part,
             train_loop_config={"train": train},
             torch_config=TorchConfig(backend="nccl" if gpu else "gloo"),
@@ -39,13 +37,12 @@ def train_on_ray(train: Callable[[World], None], settings: RaySettings, out: str
                 resources_per_worker={"CPU": settings.cpus, **({"GPU": settings.gpus} if gpu else {})},
             ),
             run_config=RunConfig(name="ray", storage_path=os.path.abspath(out)),
-        ).fit()
-    except WorkerGroupError as error:
-        cause = next(iter(error.worker_failures.values()))
-        raise getattr(cause, "_base_exc", cause) from error  # Ray wraps what a process raised with its traceback
-    finally:
-        if started:
-            ray.shutdown()
+        )
+        try:
+            trainer.fit()
+        except WorkerGroupError as error:
+            cause = next(iter(error.worker_failures.values()))
+            raise getattr(cause, "_base_exc", cause) from error  # Ray wraps what a process raised with its traceback
 
 
 def _part(settings: dict[str, Any]) -> None:
@@ -53,24 +50,34 @@ def _part(settings: dict[str, Any]) -> None:
         settings["train"](world)
 
 
-def _connect() -> None:
-    """To the cluster of RAY_ADDRESS or of the submitted job, else to one of this machine's own, on loopback."""
+@contextmanager
+def _connected() -> Iterator[None]:
+    """To the cluster of RAY_ADDRESS or of the submitted job, else to one of this machine's own, on loopback.
+
+    Where a connection stands already it is used and stays.
+    """
+    if ray.is_initialized():
+        yield
+        return
     there = "RAY_ADDRESS" in os.environ
     if not there:  # Ray warns that a cluster of our own asks for a token, as it should
         logging.getLogger("ray._private.authentication.authentication_token_setup").setLevel(logging.ERROR)
-    ray.init(
-        address=None if there else "local", include_dashboard=None if there else False, logging_level=logging.WARNING
-    )
+    try:
+        ray.init(
+            address=None if there else "local",
+            include_dashboard=None if there else False,
+            logging_level=logging.WARNING,
+        )
+        yield
+    finally:
+        ray.shutdown()
 
 
 def each_on_ray(
     one: Callable[..., int], items: Sequence[T], out: Path, cpus: float, gpus: float, stop: threading.Event
 ) -> Iterator[tuple[T, int]]:
     """one(item, out) as a task for each item; yields results as they come. After `stop` nothing new begins."""
-    started = not ray.is_initialized()
-    if started:
-        _connect()
-    try:
+    with _connected():
         task = ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=0)(one)
         waiting = {task.remote(item, out.absolute()): item for item in items}
         while waiting:
@@ -81,6 +88,3 @@ def each_on_ray(
                 for reference in waiting:
                     ray.cancel(reference)
                 return
-    finally:
-        if started:
-            ray.shutdown()

@@ -13,8 +13,8 @@ settings or data, 4 interrupted and resumable.
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -25,17 +25,45 @@ import torch
 from factory.config.compose import ConfigError, compose, fill
 from factory.config.shapes import described, merged, plain
 from planners.command import command
-from planners.data.feed import Dataset, DataSettings, open_data
+from planners.data.feed import open_data
+from planners.data.index import Dataset, DataSettings
 from planners.data.loader import Loader
 from planners.data.mix import MixSettings
 from planners.models.backbones.registry import load_pretrained
 from planners.models.planner import Planner
 from planners.models.registry import PlannerChoice, build_planner, planner_class, settings_of
 from planners.training.checkpoint import as_record, checkpoints, digest, load_arrays, load_weights, newest, read_record
-from planners.training.fit import Loop, fit, total_steps
-from planners.training.optim import TrainingSettings
+from planners.training.fit import Loop, TrainingSettings, fit, total_steps
 from planners.training.processes import RaySettings, World, joined
-from planners.training.validate import validation
+
+LARGEST_BATCH = 32
+
+
+def validation(
+    data: DataSettings, planner: Planner, world: World, workers: int
+) -> Callable[[Planner], dict[str, float]]:
+    """A function that plans for all human samples of the tables `data.val`: ade_m and fde_m, mean and final distance.
+
+    Raises ValueError where the tables are not what the planner needs.
+    """
+    dataset = open_data(DataSettings(real=data.tables("val"), storage_options=data.storage_options, copy=data.copy))
+    needs = replace(planner.needs, labels=None)
+    size = max(n for n in range(1, LARGEST_BATCH + 1) if len(dataset) % n == 0)  # no sample is left out
+    loader = Loader(dataset, needs, MixSettings(), size, workers=workers)
+
+    def measure(trained: Planner) -> dict[str, float]:
+        trained.eval()
+        distances = []
+        with torch.no_grad():
+            for batch in loader.epoch(0):
+                here = batch.to(world.device)
+                plans = trained.plan(here)
+                labels = here.plan_2hz if plans.shape[1] == here.plan_2hz.shape[1] else here.plan_10hz
+                distances.append((plans[..., :2].float() - labels[..., :2]).norm(dim=-1).cpu())
+        off = torch.cat(distances)
+        return {"ade_m": float(off.mean()), "fde_m": float(off[:, -1].mean())}
+
+    return measure
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from factory.store.reader import TIME_TOLERANCE_S, SampleTable
 from planners.data.batch import ImageLayout, Needs
-from planners.data.feed import DataSettings, make_feed, open_data
+from planners.data.feed import make_feed, open_data
+from planners.data.index import DataSettings
 from planners.data.loader import Loader
 from planners.data.mix import MixSettings
 from tests.planners.samples import FRONT_YAWS, camera, jpeg, sample, write_table
@@ -75,7 +76,7 @@ def compare(table: str, layout: ImageLayout, threads: int, name: str, copy: str)
     needs = Needs(image=layout)
     experts = set(SampleTable(table).table(["expert"])["expert"].to_pylist())
     settings = DataSettings(real=table if "human" in experts else (), sim=table if experts != {"human"} else ())
-    dataset = open_data(settings, needs)
+    dataset = open_data(settings)
     feed = make_feed(dataset, needs)
     wanted = dict(zip(dataset.rows.attempt_id.tolist(), feed.cameras))
     jpegs = [

@@ -19,7 +19,7 @@ from factory.config.plugins import installed, offered
 from factory.config.run import composed_run, load_config
 from factory.run import main as run_main
 from factory.store.reader import SampleTable
-from planners.evaluation.contenders import contender
+from planners.evaluation.planner_names import planner_of
 from planners.models.registry import planner_class
 from planners.training.train import main as train_main
 from tasks.kernels.compiled import cache_dir
@@ -93,9 +93,9 @@ def test_a_reader_an_expert_and_a_planner_work_by_name(
         f"out={tmp_path / 'linear'}",
     ]
     assert train_main(trained) == 0, capsys.readouterr().err
-    loaded = contender(str(tmp_path / "linear")).load
+    loaded = planner_of(str(tmp_path / "linear")).load
     assert loaded is not None and type(loaded()) is planner_class("mine")
-    assert contender("mine").label == "mine"
+    assert planner_of("mine").label == "mine"
 
 
 def experts_of(home: Path) -> set[str]:
@@ -136,7 +136,7 @@ def test_an_unknown_name_lists_what_is_installed_and_which_is_meant(site: Path) 
     with pytest.raises(
         ConfigError, match=r"planner=mein: neither a folder nor one of .*, mine; did you mean mine\?; or"
     ):
-        contender("mein")
+        planner_of("mein")
 
 
 def test_help_and_completion_list_what_is_installed_and_import_none_of_it(
@@ -163,7 +163,7 @@ def test_help_and_completion_list_what_is_installed_and_import_none_of_it(
         lambda: load_config(["clips=mine"]),
         lambda: load_config(["experts=[mine]"]),
         lambda: compose("train", ["planner=mine"]),
-        lambda: contender("mine"),
+        lambda: planner_of("mine"),
     ],
     ids=("reader", "expert", "planner to train", "planner to evaluate"),
 )
@@ -198,7 +198,7 @@ def test_a_folder_of_the_same_name_is_told_apart(site: Path, tmp_path: Path, mon
     (tmp_path / "mine").mkdir()
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ConfigError, match=r"a folder here and a planner of somebody 1\.2: planner=\./mine"):
-        contender("mine")
+        planner_of("mine")
 
 
 def test_without_plug_ins_nothing_is_offered_and_nothing_is_imported(site: Path) -> None:

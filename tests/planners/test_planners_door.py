@@ -1,14 +1,11 @@
-"""What all commands do alike: help, exit codes, one line for what is wrong, signals."""
+"""What all commands do alike: help, exit codes, one line for what is wrong."""
 
-import os
-import signal
-import threading
 from collections.abc import Sequence
 
 import pytest
 
 from factory.exits import BAD_CONFIG, COMPLETE_WITH_FAILURES, INTERRUPTED
-from planners.command import Failed, Stopped, command, until_signal
+from planners.command import Failed, Stopped, command
 
 
 @pytest.mark.parametrize(
@@ -47,14 +44,3 @@ def test_help_answers_without_running(capsys: pytest.CaptureFixture[str]) -> Non
 
     assert main(["--help", "x=1"]) == 0
     assert capsys.readouterr().out.startswith("What all commands do alike")
-
-
-def test_the_first_signal_is_noted_and_the_second_has_its_usual_effect() -> None:
-    before = signal.default_int_handler  # a shell starts what runs in the background with the signal ignored
-    inherited = signal.signal(signal.SIGINT, before)
-    with until_signal() as asked, pytest.raises(KeyboardInterrupt):
-        os.kill(os.getpid(), signal.SIGINT)
-        assert asked.wait(5.0)
-        os.kill(os.getpid(), signal.SIGINT)
-        threading.Event().wait(5.0)
-    assert signal.signal(signal.SIGINT, inherited) == before

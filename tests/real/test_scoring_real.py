@@ -16,6 +16,7 @@ from reference_scenes import loader
 
 from factory.readers.av2.reader import AV2Reader, log_folders
 from factory.readers.base import ClipRef
+from planners.evaluation.frames import Pair
 from planners.evaluation.scoring import PreparedFrame, Rules, drive, prepare_frame, score_pair
 from tasks.reward.one_stage import COLUMNS, frame_scores
 from tasks.rollout.simulate import TrafficScene, TrafficSettings
@@ -81,6 +82,6 @@ def test_extended_comfort_of_a_plan_and_the_humans_before_is_the_recorded_one(sh
     some = np.concatenate([np.flatnonzero(expected == value)[:4] for value in (0.0, 1.0)])
     assert set(expected[some]) == {0.0, 1.0}
     for k in some:
-        (of_now, _), (of_before, driven) = score_pair(now, before, (plans[k], human))
+        (of_now, _), (of_before, driven) = score_pair(Pair(now, before), (plans[k], human))
         np.testing.assert_allclose(driven.states, recorded["prev_human_simulated_states"], rtol=0, atol=1e-6)
         assert of_now.unfiltered[COLUMNS.index("ec")] == of_before.unfiltered[COLUMNS.index("ec")] == expected[k]

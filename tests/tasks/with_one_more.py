@@ -15,7 +15,7 @@ from factory.views.board.overview import _reasons
 from factory.views.report_words import REASON_WORDS
 from planners.data.batch import Needs
 from planners.data.decode import BatchBuffer
-from planners.models.gtrs_dense.planner import GtrsDenseSettings, TrajectoryScorer
+from planners.models.gtrs_dense import GtrsDenseSettings, TrajectoryScorer
 from tasks import subscores
 from tasks.attempt import ExpertGate, verdict
 from tasks.reward.epdms import Scores, human_filtered, rows, score, score_with_ec

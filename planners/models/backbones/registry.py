@@ -17,8 +17,6 @@ from planners.models.backbones.base import STRIDES, Backbone, BackboneSettings
 from planners.models.backbones.resnet import ResNet
 from planners.models.backbones.vovnet import VoVNet99
 
-__all__ = ["STRIDES", "Backbone", "BackboneSettings", "build_backbone", "load_pretrained"]
-
 CLASSIFIERS = ("fc.", "classifier.", "head.")  # of the published networks; not part of a backbone
 
 

@@ -9,7 +9,8 @@ import pytest
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
 from planners.data.batch import BevLayout, ImageLayout, Needs
-from planners.data.feed import Dataset, DataSettings, make_feed, mixed_samples, open_data
+from planners.data.feed import make_feed, mixed_samples, open_data
+from planners.data.index import Dataset, DataSettings
 from planners.data.mix import MixSettings, Weights
 from tests.planners.samples import FRONT_YAWS, grey_pictures, jpeg, pictures, plain, sample, write_table
 
@@ -169,17 +170,17 @@ def test_a_table_of_another_version_is_named(tmp_path: Path) -> None:
 
 def test_an_image_planner_refuses_samples_without_images_by_name(out: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=rf"{out}: sample attempt00000 and 69 more are without images.*render=auto"):
-        open_data(DataSettings(real=out, sim=out), PICTURE)
+        make_feed(open_data(DataSettings(real=out, sim=out)), PICTURE)
     write_table(tmp_path, [sample(0, **grey_pictures(9)), sample(1)])
     with pytest.raises(ValueError, match="sample attempt00001 is without images"):
-        open_data(DataSettings(real=str(tmp_path)), PICTURE)
+        make_feed(open_data(DataSettings(real=str(tmp_path))), PICTURE)
 
 
 def test_cameras_that_are_missing_are_refused_by_name(tmp_path: Path) -> None:
     views = dict.fromkeys(FRONT_YAWS, jpeg(plain((1, 2, 3))))
     two = {name: views[name] for name in ("front", "left")}
     write_table(tmp_path / "a", [sample(0, **pictures(views)), sample(1, **pictures(two))])
-    data = open_data(DataSettings(real=str(tmp_path / "a")), PICTURE)
+    data = open_data(DataSettings(real=str(tmp_path / "a")))
     with pytest.raises(ValueError, match=rf"{tmp_path}/a: sample attempt00001: no image of camera right at now"):
         make_feed(data, PICTURE)
     with pytest.raises(ValueError, match=r"attempt00000: no camera rear \(image\.cameras\); there are"):
@@ -197,7 +198,7 @@ def test_labels_that_are_missing_or_of_another_vocabulary_are_refused_by_name(tm
         write_table(tmp_path / str(number), [rows[0], rows[number]])
         table = str(tmp_path / str(number))
         with pytest.raises(ValueError, match=rf"{table}: sample attempt0000{number} is {message}.* vocabulary-1"):
-            open_data(DataSettings(real=table, sim=table), needs)
+            make_feed(open_data(DataSettings(real=table, sim=table)), needs)
     write_table(tmp_path / "all", rows)
     mixed = open_data(DataSettings(real=str(tmp_path / "all"), sim=str(tmp_path / "all")))
     assert mixed.label_vocabulary == "vocabulary-1 and vocabulary-2 (1 of 3 samples without)"
@@ -212,7 +213,7 @@ def test_a_mix_that_the_samples_do_not_allow_is_refused(out: str) -> None:
     with pytest.raises(ValueError, match="no simulated samples of recovry"):
         open_data(DataSettings(real=out, sim=out), mix=MixSettings(weights=Weights(expert={"recovry": 2.0})))
     with pytest.raises(ValueError, match="n_agents=3"):
-        open_data(DataSettings(real=out), Needs(n_agents=3))
+        make_feed(open_data(DataSettings(real=out)), Needs(n_agents=3))
 
 
 def test_a_sample_takes_what_stays_in_memory_of_it(tmp_path: Path) -> None:

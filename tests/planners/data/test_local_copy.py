@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from planners.data.batch import BevLayout, Needs
-from planners.data.feed import DataSettings, make_feed, open_data
+from planners.data.feed import make_feed, open_data
+from planners.data.index import DataSettings
 from planners.data.loader import Loader
 from planners.data.local_copy import LocalCopy, copies_of
 from planners.data.mix import MixSettings

@@ -1,7 +1,7 @@
 """Which clips share a log, and which a town."""
 
 from factory.readers.town.town import log_name
-from planners.evaluation.clusters import clusters_of, town_of
+from planners.evaluation.bootstrap import clusters_of, town_of
 
 
 def test_a_synthetic_log_names_its_town() -> None:

@@ -8,9 +8,9 @@ import torch
 
 from factory.config.compose import ConfigError
 from planners.data.batch import ImageLayout
-from planners.evaluation.contenders import contender
 from planners.evaluation.ensemble import main
-from planners.models.gtrs_dense.ensemble import Ensemble, mean_scores
+from planners.evaluation.planner_names import planner_of
+from planners.models.gtrs_dense import Ensemble, mean_scores
 from planners.training.checkpoint import load_planner, save_checkpoint
 from tests.planners.models.test_gtrs_dense import TINY, labelled, planner
 from tests.planners.toy import Toy, ToySettings
@@ -61,16 +61,16 @@ def saved(out: Path, seed: int) -> str:
 def test_trainings_joined_by_plus_are_evaluated_as_their_ensemble(tmp_path: Path) -> None:
     batch, _ = labelled(4)
     a, b = saved(tmp_path / "a", 0), saved(tmp_path / "b", 1)
-    both = contender(f"{a}+{b}", "both")
-    assert len({both.digest, contender(a).digest, contender(b).digest}) == 3
+    both = planner_of(f"{a}+{b}", "both")
+    assert len({both.digest, planner_of(a).digest, planner_of(b).digest}) == 3
     made = both.load()
     assert torch.equal(made.plan(batch), Ensemble([("a", load_planner(a)), ("b", load_planner(b))]).plan(batch))
 
 
 def test_only_settings_of_planning_change_after_training(tmp_path: Path) -> None:
     a = saved(tmp_path / "a", 0)
-    few = contender(a, "few", {"inference_entries": 3})
-    assert few.digest != contender(a).digest
+    few = planner_of(a, "few", {"inference_entries": 3})
+    assert few.digest != planner_of(a).digest
     assert len(few.load().choices) == 3
     with pytest.raises(ConfigError, match="layers of gtrs_dense cannot change after training; free: inference_entries"):
         load_planner(a, {"layers": 9})
@@ -80,7 +80,7 @@ def test_an_ensemble_of_planners_without_scores_is_refused(tmp_path: Path) -> No
     torch.manual_seed(0)
     save_checkpoint(tmp_path / "toy", 1, Toy(ToySettings(), {}), {}, {"version": 1})
     with pytest.raises(ConfigError, match=r"averages the scores of gtrs_dense models, not .*toy"):
-        contender(f"{saved(tmp_path / 'a', 0)}+{tmp_path / 'toy'}").load()
+        planner_of(f"{saved(tmp_path / 'a', 0)}+{tmp_path / 'toy'}").load()
 
 
 def test_the_command_needs_two_models(capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,12 +15,11 @@ from torch import Tensor
 from factory.config.compose import ConfigError
 from planners.data.batch import Batch, BevLayout, ImageLayout, Needs
 from planners.evaluation.aggregation import SummaryLine
-from planners.evaluation.contenders import Contender, contender, contenders
 from planners.evaluation.evaluate import EvaluateSettings, evaluate, fallback_notes, main, settings_of
 from planners.evaluation.frames import FrameKey
+from planners.evaluation.planner_names import EvaluatedPlanner, planner_of, planners_of
 from planners.evaluation.planning import all_plans, plans_of
-from planners.evaluation.record import read_record
-from planners.evaluation.score_rows import read_rows
+from planners.evaluation.score_rows import read_record, read_rows
 from planners.evaluation.shown import as_shown
 from planners.training.checkpoint import save_checkpoint
 from tasks.reward.one_stage import COLUMNS
@@ -93,8 +92,8 @@ def benchmark() -> StreetBenchmark:
     return StreetBenchmark()
 
 
-def named(*specs: str) -> list[Contender]:
-    return contenders(None, specs, bounds=False)
+def named(*specs: str) -> list[EvaluatedPlanner]:
+    return planners_of(None, specs, bounds=False)
 
 
 def test_both_faces_of_a_planner_and_the_bounds_are_scored_in_one_table(
@@ -144,7 +143,7 @@ def test_a_checkpoint_is_scored_again_when_its_weights_changed(benchmark: Street
         for parameter in toy.parameters():
             torch.nn.init.constant_(parameter, weight)
         save_checkpoint(training, step, toy, {}, {})
-        lines = evaluate(benchmark, [contender(str(training), "toy")], settings(out))
+        lines = evaluate(benchmark, [planner_of(str(training), "toy")], settings(out))
         return lines, read_record(out / "toy")["planner_digest"]
 
     first, digest = scored(1, 0.0)  # it stands where it is
@@ -267,22 +266,22 @@ def test_a_batch_planner_must_answer_for_every_sample(benchmark: StreetBenchmark
 )
 def test_nobody_is_evaluated_under_a_name_that_means_nobody(spec: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        contender(spec)
+        planner_of(spec)
 
 
 def test_a_folder_without_a_checkpoint_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no checkpoint"):
-        contender(str(tmp_path))
+        planner_of(str(tmp_path))
 
 
 def test_labels_are_unique_and_bounds_come_once() -> None:
     with pytest.raises(ConfigError, match="planner is missing"):
-        contenders(None, [], bounds=True)
-    found = contenders(None, {"mine": "test_evaluate:Steady", "yours": "test_evaluate:Steady"}, bounds=False)
+        planners_of(None, [], bounds=True)
+    found = planners_of(None, {"mine": "test_evaluate:Steady", "yours": "test_evaluate:Steady"}, bounds=False)
     assert [one.label for one in found] == ["mine", "yours"]
     with pytest.raises(ConfigError, match="two are called"):
-        contenders("test_evaluate:Steady", {"test_evaluate.Steady": "human"}, bounds=False)
-    assert [one.label for one in contenders("human", ["human"], bounds=False)] == ["human"]
+        planners_of("test_evaluate:Steady", {"test_evaluate.Steady": "human"}, bounds=False)
+    assert [one.label for one in planners_of("human", ["human"], bounds=False)] == ["human"]
 
 
 def test_the_command_line_is_typed_and_complains_by_name(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from planners.evaluation.frames import FrameKey
+from planners.evaluation.frames import FrameKey, Pair
 from planners.evaluation.scoring import (
     PreparedClip,
     Rules,
@@ -50,7 +50,7 @@ def test_a_drive_scores_as_the_factory_scores_an_experts(mode: str, poses: np.nd
 
 
 def test_who_comes_from_behind_answers_to_the_plan_that_moves_over_in_front() -> None:
-    """PDM-Closed, the rival, keeps its lane: for it nobody would have to brake."""
+    """PDM-Closed, the reference, keeps its lane: for it nobody would have to brake."""
     scene, moves_over = clip_scenes().logged.now, straight(3.0, 2.0)
     answers, goes_on = (
         drive(prepare_frame(scene, TrafficSettings(mode=mode), PdmSettings(), logged=True), moves_over).scores
@@ -176,7 +176,7 @@ def test_a_plan_is_compared_with_what_the_one_before_wanted_at_the_same_time_of_
     now, before = clip.logged.now, clip.logged.before
     ec = COLUMNS.index("ec")
     found = {
-        delays: score_pair(now, before, (waving(delays[0]), waving(delays[1])))[0][0].unfiltered[ec]
+        delays: score_pair(Pair(now, before), (waving(delays[0]), waving(delays[1])))[0][0].unfiltered[ec]
         for delays in ((0.5, 1.0), (1.0, 0.5), (0.5, 0.5))
     }
     assert found == {(0.5, 1.0): 1.0, (1.0, 0.5): 0.0, (0.5, 0.5): 0.0}

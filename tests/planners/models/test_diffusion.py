@@ -6,9 +6,18 @@ import torch
 
 from planners.data.batch import BevLayout
 from planners.models.anchors import checked_anchors, cluster_anchors, read_array
-from planners.models.diffusiondrive.ddim import kept, noised, stepped
-from planners.models.diffusiondrive.decoder import DiffusionDecoder, on_map, waves
-from planners.models.diffusiondrive.planner import FOCAL_ALPHA, focal, from_unit, to_unit
+from planners.models.diffusiondrive import (
+    FOCAL_ALPHA,
+    DiffusionDecoder,
+    focal,
+    from_unit,
+    kept,
+    noised,
+    on_map,
+    stepped,
+    to_unit,
+    waves,
+)
 
 
 def test_anchors_are_the_means_of_well_separated_clusters() -> None:

@@ -9,10 +9,10 @@ from omegaconf import OmegaConf
 
 from factory.config.compose import conf_dir, fill
 from planners.data.batch import Batch, ImageLayout
-from planners.models.backbones.registry import BackboneSettings
-from planners.models.gtrs_dense.planner import GtrsDense, GtrsDenseSettings, imitated, shifted
+from planners.models.backbones.base import BackboneSettings
+from planners.models.gtrs_dense import GtrsDense, GtrsDenseSettings, imitated, shifted
 from planners.models.planner import TrainingData
-from planners.training.optim import TrainingSettings
+from planners.training.fit import TrainingSettings
 from tasks.subscores import LABELLED
 from tasks.world.vocabulary import Vocabulary
 from tests.planners import scenes

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from planners.models.gtrs_dense.weighting import WEIGHTINGS, choose, total
+from planners.models.gtrs_dense import WEIGHTINGS, choose, total
 from tasks.subscores import LABELLED
 
 

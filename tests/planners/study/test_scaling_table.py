@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from factory.exits import BAD_CONFIG
+from planners.evaluation.aggregation import scores_of
 from planners.evaluation.score_rows import read_rows, write_rows
-from planners.evaluation.scores import scores_of
 from planners.study.frames_file import FRAMES, StudyFrames, read_frames, write_frames
 from planners.study.report import compared, main, write_tables
 from planners.study.scaling import ScalingSettings, SweepData, trainings_of

@@ -1,6 +1,8 @@
 """The study's plan: what is compared with what, and that nothing is trained twice."""
 
 import re
+from itertools import groupby
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -9,16 +11,14 @@ from factory.config.compose import compose, fill
 from planners.study.setups import (
     ENSEMBLE,
     PARTS,
-    PLANNERS_OF_LEG,
     Sizes,
     StudySettings,
     comparisons,
-    legs,
-    portions,
+    planned,
     so_far,
     with_all_parts,
 )
-from planners.study.sweep import Training
+from planners.study.sweep import BATCH, Training, batches
 
 SIZES = Sizes(steps=600, matched=7)
 
@@ -29,7 +29,11 @@ def settings(**changes: Any) -> StudySettings:
 
 
 def trainings(chosen: StudySettings) -> list[Training]:
-    return [t for portion in portions(comparisons(chosen), chosen, SIZES) for t in portion.trainings]
+    return [one for one in planned(comparisons(chosen), chosen, SIZES) if not one.members]
+
+
+def labels(found: list[Training], *units: tuple[str, int]) -> list[str]:
+    return [one.label for one in found if one.unit in units]
 
 
 def test_every_family_is_trained_with_and_without_simulation_in_equal_epochs_and_in_equal_steps() -> None:
@@ -50,10 +54,10 @@ def test_every_family_is_trained_with_and_without_simulation_in_equal_epochs_and
 
 def test_every_training_begins_with_what_the_same_planner_learnt_in_other_towns() -> None:
     everything = settings(out="here", data="made", begin="elsewhere")
-    planned = trainings(everything)
-    first = {t.label: t for t in planned if t.facts["data"] == "begin"}
+    everyone = trainings(everything)
+    first = {t.label: t for t in everyone if t.facts["data"] == "begin"}
     assert set(first) == {f"{planner}-begin-epochs-0" for planner in everything.planners}
-    for training in planned:
+    for training in everyone:
         mine = f"init_from=here/trainings/{training.facts['planner']}-begin-epochs-0"
         assert (mine in training.overrides) == (training.label not in first)
         real = "elsewhere" if training.label in first else "made,elsewhere"
@@ -61,8 +65,8 @@ def test_every_training_begins_with_what_the_same_planner_learnt_in_other_towns(
     two = trainings(settings(begin="elsewhere", parts=("ratio",)))
     assert {t.facts["planner"] for t in two} == {"diffusiondrive", "gtrs_dense"}, "nothing else is trained for a part"
     alone = settings(begin=None)
-    planned = trainings(alone)
-    assert not any("begin" in t.label or any(o.startswith("init_from") for o in t.overrides) for t in planned)
+    begun = ["begin" in t.label or any(o.startswith("init_from") for o in t.overrides) for t in trainings(alone)]
+    assert not any(begun)
 
 
 def test_tables_hold_all_parts_whichever_are_trained_now() -> None:
@@ -76,10 +80,9 @@ def test_tables_hold_all_parts_whichever_are_trained_now() -> None:
 
 def test_a_training_is_planned_once_with_as_many_seeds_as_anyone_asks_for() -> None:
     everything = settings()
-    planned = trainings(everything)
-    labels = [training.label for training in planned]
-    assert len(set(labels)) == len(labels) == len({training.overrides for training in planned})
-    assert {t.facts["seed"] for t in planned if t.label.startswith("gtrs_dense-pdm_closed5-epochs-")} >= {0, 1, 2}
+    everyone = trainings(everything)
+    assert len({one.label for one in everyone}) == len(everyone) == len({one.overrides for one in everyone})
+    assert {t.facts["seed"] for t in everyone if t.label.startswith("gtrs_dense-pdm_closed5-epochs-")} >= {0, 1, 2}
 
 
 def test_a_setup_differs_from_its_reference_in_what_its_part_is_about() -> None:
@@ -123,62 +126,59 @@ def test_a_label_names_how_many_rounds_are_learned_from_and_rounds_count_from_0(
 
 def test_ensembles_are_made_of_trainings_that_are_planned_before_them() -> None:
     chosen = settings(parts=("ensemble",), out="here")
-    trained = set[str]()
-    made = 0
-    for portion in portions(comparisons(chosen), chosen, SIZES):
-        trained |= {f"here/trainings/{t.label}" for t in portion.trainings}
-        made += len(portion.ensembles)
-        for label, spec in portion.ensembles.items():
-            assert label.startswith(ENSEMBLE)
-            assert set(spec.split("+")) <= trained
-    assert made == 2 * chosen.curve_seeds
+    everyone = planned(comparisons(chosen), chosen, SIZES)
+    made = [one for one in everyone if one.members]
+    for ensemble in made:
+        trained = [one.label for one in everyone if one.unit <= ensemble.unit and not one.members]
+        assert ensemble.label.startswith(ENSEMBLE) and set(ensemble.members) <= set(trained)
+        assert ensemble.spec(Path("here")) == "+".join(f"here/trainings/{label}" for label in ensemble.members)
+    assert len(made) == 2 * chosen.curve_seeds
 
 
 def test_one_seed_of_one_part_is_done_after_the_other() -> None:
     chosen = settings(parts=("main", "control"))
-    planned = portions(comparisons(chosen), chosen, SIZES)
-    assert [(p.part, p.seed) for p in planned] == [
+    everyone = planned(comparisons(chosen), chosen, SIZES)
+    assert [unit for unit, _ in groupby(everyone, key=lambda one: one.unit)] == [
         ("begin", 0),
         *(("main", seed) for seed in range(3)),
         *(("control", seed) for seed in range(2)),
     ]
-    for portion in planned:
-        assert {t.facts["seed"] for t in portion.trainings} == {portion.seed}
-    assert {t.facts["data"] for p in planned if p.part == "control" for t in p.trainings} == {"logged"}
+    assert all(one.facts["seed"] == one.unit[1] for one in everyone)
+    assert {one.facts["data"] for one in everyone if one.unit[0] == "control"} == {"logged"}
 
 
-def test_small_portions_are_trained_at_once_but_never_with_what_they_begin_with() -> None:
+def test_small_units_are_trained_at_once_but_never_with_what_they_begin_with() -> None:
     chosen = settings(parts=("main", "control", "rewards"))
-    planned = portions(comparisons(chosen), chosen, SIZES)
-    found = legs(planned)
-    assert [portion for leg in found for portion in leg] == planned
-    assert [portion.part for portion in found[0]] == ["begin"]
-    for leg in found[1:]:
-        sizes = [len(portion.labels) for portion in leg]
-        assert sum(sizes[:-1]) < PLANNERS_OF_LEG
-        assert sum(sizes) >= PLANNERS_OF_LEG or leg is found[-1]
-    assert len(found) < len(planned) - 2
+    everyone = planned(comparisons(chosen), chosen, SIZES)
+    found = batches(everyone)
+    assert [one for batch in found for one in batch] == everyone
+    assert {one.unit[0] for one in found[0]} == {"begin"}
+    for batch in found[1:]:
+        assert len(batch) - len(labels(batch, batch[-1].unit)) < BATCH
+        assert len(batch) >= BATCH or batch is found[-1]
+    assert len(found) < len({one.unit for one in everyone}) - 2
 
 
 def test_comparisons_so_far_have_the_seeds_that_both_sides_have() -> None:
     chosen = settings(parts=("main",))
     found = comparisons(chosen)
-    begun, first, second, _ = portions(found, chosen, SIZES)
-    assert {c.part for c in so_far(found, begun.labels)} == {"begin"}
-    whole = so_far(found, [*begun.labels, *first.labels])
+    everyone = planned(found, chosen, SIZES)
+    begun, first, second = (labels(everyone, unit) for unit in (("begin", 0), ("main", 0), ("main", 1)))
+    assert {c.part for c in so_far(found, begun)} == {"begin"}
+    whole = so_far(found, [*begun, *first])
     assert [c.setup for c in whole] == [c.setup for c in found]
     assert {c.seeds for c in whole} == {1}
-    both = so_far(found, [*begun.labels, *first.labels, *second.labels])
+    both = so_far(found, [*begun, *first, *second])
     assert {c.seeds for c in both if c.part == "main"} == {2}
-    without = [label for label in second.labels if label != "ltf-real-steps-1"]
-    assert so_far(found, [*begun.labels, *first.labels, *without]) == whole, "means of other seeds would stand beside"
-    assert so_far(found, second.labels) == []
+    without = [label for label in second if label != "ltf-real-steps-1"]
+    assert so_far(found, [*begun, *first, *without]) == whole, "means of other seeds would stand beside"
+    assert so_far(found, second) == []
 
 
 def test_a_part_of_which_only_others_trainings_are_there_is_left_out() -> None:
     asked, whole = settings(parts=("rewards",)), settings()
-    labels = [label for portion in portions(comparisons(asked), asked, SIZES) for label in portion.labels]
-    assert {c.part for c in so_far(comparisons(whole), labels)} == {"begin", "rewards"}
+    done = [one.label for one in planned(comparisons(asked), asked, SIZES)]
+    assert {c.part for c in so_far(comparisons(whole), done)} == {"begin", "rewards"}
 
 
 @pytest.mark.parametrize(

@@ -10,13 +10,13 @@ import pytest
 import torch
 
 from planners.command import Stopped
-from planners.evaluation.contenders import contender
+from planners.evaluation.aggregation import BOUNDS, scores_of
 from planners.evaluation.evaluate import EvaluateSettings, evaluate
-from planners.evaluation.scores import BOUNDS, scores_of
+from planners.evaluation.planner_names import planner_of
 from planners.study import report as study_report
 from planners.study import study as study_module
 from planners.study.scaling import ScalingSettings, SweepData, trainings_of
-from planners.study.setups import Comparison, Portion, Setup, Sizes
+from planners.study.setups import Comparison, Setup, Sizes
 from planners.study.study import evaluated, run, write_report
 from planners.study.sweep import DONE, EVALUATIONS, Training, folder_of
 from planners.training.checkpoint import save_checkpoint
@@ -38,15 +38,14 @@ def train(out: Path, training: Training, weight: float = 0.0, step: int = 1) -> 
 
 
 def score(out: Path, rules: EvaluateSettings, *trainings: Training) -> None:
-    trained = [contender(str(folder_of(out, one)), one.label) for one in trainings]
-    evaluate(StreetBenchmark(), [contender("constant_velocity"), *trained], rules)
+    trained = [planner_of(str(folder_of(out, one)), one.label) for one in trainings]
+    evaluate(StreetBenchmark(), [planner_of("constant_velocity"), *trained], rules)
 
 
 def test_what_is_evaluated_is_reported_and_what_changed_since_is_not(tmp_path: Path) -> None:
     rules = settings(tmp_path / EVALUATIONS)
     a, b, c = (Training(label, (f"seed={label}",)) for label in "abc")
-    joined = {"ab": f"{folder_of(tmp_path, a)}+{folder_of(tmp_path, b)}"}
-    planned = [Portion("main", 0, (a, b), {}), Portion("ensemble", 0, (c,), joined)]
+    planned = [a, b, c, Training("ab", members=("a", "b"))]
     assert evaluated(planned, tmp_path) == set()
     train(tmp_path, a)
     assert evaluated(planned, tmp_path) == set(), "nothing is evaluated yet"
@@ -56,7 +55,7 @@ def test_what_is_evaluated_is_reported_and_what_changed_since_is_not(tmp_path: P
     score(tmp_path, rules, c)
     assert evaluated(planned, tmp_path) == {"a", "c"}, "a part behind one that is not done counts"
 
-    other_overrides = [Portion("main", 0, (replace(a, overrides=("seed=9",)), b), {}), planned[1]]
+    other_overrides = [replace(a, overrides=("seed=9",)), *planned[1:]]
     assert evaluated(other_overrides, tmp_path) == {"c"}
     train(tmp_path, a, weight=0.1, step=2)
     assert evaluated(planned, tmp_path) == {"c"}, "it was trained again since"
@@ -75,8 +74,8 @@ def test_the_report_is_that_of_the_evaluations_and_can_be_made_again(
     trainings = [one.training(study, 0, Sizes(steps=1)) for one in (real, more)]
     for weight, training in zip((0.0, 0.1), trainings):
         train(tmp_path, training, weight)
-    who = [contender(str(folder_of(tmp_path, one)), one.label) for one in trainings]
-    evaluate(StreetBenchmark(), [*map(contender, BOUNDS), *who], settings(tmp_path / EVALUATIONS))
+    who = [planner_of(str(folder_of(tmp_path, one)), one.label) for one in trainings]
+    evaluate(StreetBenchmark(), [*map(planner_of, BOUNDS), *who], settings(tmp_path / EVALUATIONS))
     standing = [Comparison("main", real, None, 1, "steps"), Comparison("main", more, real, 1, "steps")]
     write_report(standing, trainings, study)
     report = tmp_path / "report"
@@ -100,8 +99,7 @@ def test_a_sweep_stops_where_something_is_missing_and_is_reported_when_all_is_do
     axes |= {"sim_ratios": ("natural",), "imitation": ("all",), "real_shares": (1.0,)}
     data, benchmark = SweepData(("real",), ("sim",)), write_benchmark_folder(tmp_path / "benchmark")
     sweep = ScalingSettings(data=data, benchmark=str(benchmark), out=str(tmp_path), **axes)
-    first, second = trainings_of(sweep)
-    asked = [Portion("scaling", 0, (first, second), {})]
+    asked = first, second = trainings_of(sweep)
 
     def cut_short(*_: object) -> None:
         raise Stopped("out of minutes")

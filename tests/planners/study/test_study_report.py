@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from factory.exits import BAD_CONFIG
-from planners.evaluation.aggregation import MEASURES
+from planners.evaluation.aggregation import BOUNDS, MEASURES, name_of, scores_of, scores_of_clips
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.score_rows import FrameRow, read_rows, write_rows
-from planners.evaluation.scores import BOUNDS, name_of, scores_of, scores_of_clips
 from planners.study.frames_file import FRAMES, read_frames, rows_of, write_frames
 from planners.study.report import compared, main, write_tables
 from planners.study.setups import Comparison, Setup

@@ -70,7 +70,7 @@ def test_curves_hold_their_own_points_and_real_samples_alone() -> None:
     recovery, pdm = drawn(scaling())
     assert (recovery.label, pdm.label) == ("recovery, imitation", "pdm_closed, imitation")
     for curve in (recovery, pdm):
-        assert sorted(p.samples for p in curve.points) == [100, 100, 150, 150, 200, 200, 250, 250]
+        assert sorted(curve.samples) == [100, 100, 150, 150, 200, 200, 250, 250]
         assert curve.law is not None
     (few,) = drawn(scaling(experts=("recovery",), rounds=(0, 1, 2)))
     assert few.law is None and few.row()["a"] == ""
@@ -80,7 +80,7 @@ def test_a_curve_is_named_after_the_axes_that_have_several_values() -> None:
     labels = [one.label for one in drawn(scaling(experts=("recovery",), real_shares=(0.5, 1.0), imitation=("real",)))]
     assert labels == ["recovery, rewards only, 0.5 of real", "recovery, rewards only, 1 of real"]
     for curve in drawn(scaling(imitation=("all", "none"), seeds=(0,))):
-        assert len(curve.points) == 4, "real samples alone with imitation, or without, as the curve's own"
+        assert len(curve.samples) == 4, "real samples alone with imitation, or without, as the curve's own"
 
 
 @pytest.mark.parametrize(("name", "value"), [("seeds", ()), ("rounds", (-1,)), ("planners", ("ltf", "ltf"))])
@@ -121,12 +121,12 @@ def test_what_runs_when_time_is_up_is_saved_and_nothing_new_begins(table: str, t
 
 @pytest.mark.parametrize(("n", "processes"), [(0, 0), (1, 1), (16, 2), (48, 2), (49, 4)])
 def test_processes_evaluate_all_planners_and_as_many_of_each_kind(n: int, processes: int) -> None:
-    who = [(f"{'slow' if i < n / 2 else 'fast'}-{i}", "folder") for i in range(n)]
+    who = [Training(f"{'slow' if i < n / 2 else 'fast'}-{i}") for i in range(n)]
     shares = shares_of(who, 2)
     assert len(shares) == processes
-    assert sorted(one for share in shares for one in share) == sorted(who)
+    assert sorted(one.label for share in shares for one in share) == sorted(one.label for one in who)
     assert all(len(share) <= EVALUATED_TOGETHER for share in shares)
-    slow = [sum(label.startswith("slow") for label, _ in share) for share in shares]
+    slow = [sum(one.label.startswith("slow") for one in share) for share in shares]
     assert not slow or max(slow) - min(slow) <= 1
 
 

@@ -18,8 +18,7 @@ from planners.data.batch import Batch
 from planners.models.registry import PlannerChoice, build_planner
 from planners.training.checkpoint import checkpoints, digest, load_planner, newest
 from planners.training.curves import LOSSES, VALIDATION
-from planners.training.fit import Loop, fit, total_steps
-from planners.training.optim import TrainingSettings
+from planners.training.fit import Loop, TrainingSettings, fit, total_steps
 from planners.training.processes import World
 from tests.planners.toy import Toy, ToyBatches, ToySettings, toy_batch
 

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from planners.training.optim import TrainingSettings, build_optimiser, learning_rate
+from planners.training.fit import TrainingSettings, build_optimiser, learning_rate
 
 
 def settings(**changes: object) -> TrainingSettings:

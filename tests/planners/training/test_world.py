@@ -11,8 +11,7 @@ import torch.multiprocessing as mp
 
 from planners.training.checkpoint import newest
 from planners.training.curves import LOSSES
-from planners.training.fit import Loop, fit
-from planners.training.optim import TrainingSettings
+from planners.training.fit import Loop, TrainingSettings, fit
 from planners.training.processes import joined
 from tests.planners.toy import Toy, ToyBatches, ToySettings
 

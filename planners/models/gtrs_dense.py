@@ -11,7 +11,7 @@ supplement says that inputs get "random spatial shifts"; neither code base shift
 is ours: edge pixels are repeated as in DrQ (Kostrikov et al. 2021), few enough of them that the labels stand.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, make_dataclass
 from typing import Any, ClassVar, Literal
 
@@ -23,15 +23,104 @@ from torch import Tensor, nn
 from planners.data.batch import Batch, ImageLayout, Needs
 from planners.models.anchors import read_array
 from planners.models.attention import Decoder, Layer
-from planners.models.backbones.registry import BackboneSettings
-from planners.models.gtrs_dense.tokens import FusedTokens, PictureTokens
-from planners.models.gtrs_dense.weighting import IMITATION, WEIGHTINGS, WeightingName, choose
+from planners.models.backbones.base import STRIDES, BackboneSettings
+from planners.models.backbones.registry import build_backbone
 from planners.models.planner import Planner, TrainingData, evaluating
-from planners.models.transfuser import FusionSettings
+from planners.models.transfuser import FusionSettings, LatentFusion
 from tasks.reward.label_bytes import Normalise
 from tasks.subscores import HALVES, LABELLED
 from tasks.world.arrays import FloatArray
 from tasks.world.vocabulary import Vocabulary
+
+IMITATION = "imitation"
+
+WeightingName = Literal["release", "proposals", "close"]
+
+
+@dataclass(frozen=True)
+class Weighting:
+    """How a trajectory's predicted sub-scores p become the one number that it is chosen by.
+
+        total = sum_i w_i log p_i + group log(sum_j v_j p_j)
+
+    What multiplies in EPDMS and imitation in logarithms of their own, what is averaged there under one. `release` and
+    `proposals` are those of hydra_model.py (also in woxihuanjiangguo/ZTRS 3593a03). Neither weighs history comfort, for
+    which those models have no head. What is not named weighs nothing.
+    """
+
+    alone: Mapping[str, float]  # w
+    group: float
+    inside: Mapping[str, float]  # v
+
+
+WEIGHTINGS: dict[WeightingName, Weighting] = {
+    # HydraTrajHead.forward: what GTRS-Dense plans with; SimScale's scripts use it for navhard and navtest alike
+    "release": Weighting(
+        {IMITATION: 0.03, "tlc": 0.1, "nc": 0.1, "dac": 0.9, "ddc": 0.2}, 6.0, {"ttc": 7.0, "ep": 7.0, "lk": 3.0}
+    ),
+    # HydraTrajHead.eval_dp_proposals: trajectories of a diffusion policy ranked beside the vocabulary; the scores of
+    # 87.0 and 86.6 in its comment are of navtest's range
+    "proposals": Weighting(
+        {IMITATION: 0.01, "tlc": 0.1, "nc": 0.5, "dac": 0.5, "ddc": 0.5}, 3.0, {"ttc": 5.0, "ep": 5.0, "lk": 2.0}
+    ),
+    # ours: `release` with ten times its imitation, for small planners over hundreds of trajectories
+    "close": Weighting(
+        {IMITATION: 0.3, "tlc": 0.1, "nc": 0.1, "dac": 0.9, "ddc": 0.2}, 6.0, {"ttc": 7.0, "ep": 7.0, "lk": 3.0}
+    ),
+}
+
+
+def total(scores: Mapping[str, Tensor], weighting: Weighting) -> Tensor:
+    """One number (B, K) from probabilities (B, K) by name, comparable within a row only."""
+    inside = sum(weight * scores[name].float() for name, weight in weighting.inside.items())
+    assert isinstance(inside, Tensor)
+    result = weighting.group * _log(inside)
+    for name, weight in weighting.alone.items():
+        result = result + weight * _log(scores[name].float())
+    return result
+
+
+def choose(scores: Mapping[str, Tensor], weighting: Weighting) -> Tensor:
+    """Index (B,) of the best of K; of equals the first."""
+    return total(scores, weighting).argmax(dim=1)
+
+
+def _log(x: Tensor) -> Tensor:
+    return x.clamp_min(torch.finfo(torch.float32).tiny).log()  # a probability that underflowed must not be -inf
+
+
+class PictureTokens(nn.Module):
+    """The backbone's last map: what GTRS-Dense reads with V2-99."""
+
+    def __init__(self, backbone: BackboneSettings, image: ImageLayout, width: int) -> None:
+        super().__init__()
+        stride = STRIDES[-1]
+        if image.width % stride or image.height % stride:
+            raise ValueError(f"image is {image.width} x {image.height}: both sides must be divisible by {stride}")
+        self.backbone = build_backbone(backbone)
+        self.narrow = nn.Conv2d(self.backbone.channels[-1], width, 1)
+        self.places = nn.Parameter(torch.randn(image.height // stride * (image.width // stride), width))
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Picture (B, 3, h, w) uint8 to (B, h / 32 x w / 32, width)."""
+        return self.narrow(self.backbone(image)[-1]).flatten(2).transpose(1, 2) + self.places
+
+
+class FusedTokens(nn.Module):
+    """LTF's view from above, coarse and fine side by side: what GTRS-Dense reads with ResNet-34."""
+
+    def __init__(self, fusion: FusionSettings, width: int) -> None:
+        super().__init__()
+        self.fusion = LatentFusion(fusion)
+        self.narrow = nn.Conv2d(self.fusion.channels[-1] + fusion.bev_channels, width, 1)
+        self.places = nn.Parameter(torch.randn((fusion.latent_size // STRIDES[0]) ** 2, width))
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Picture (B, 3, h, w) uint8 to (B, (latent_size / 4)^2, width)."""
+        fused = self.fusion(image)
+        coarse = F.interpolate(fused.latent, fused.bev.shape[2:], mode="bilinear")
+        return self.narrow(torch.cat([coarse, fused.bev], dim=1)).flatten(2).transpose(1, 2) + self.places
+
 
 STATUS = 8
 VELOCITY = slice(4, 6)  # of the status, after the one-hot command
@@ -235,3 +324,45 @@ def shifted(image: Tensor, most: int) -> Tensor:
     columns = (torch.arange(width, device=image.device) + moves[1]).clamp(0, width - 1)
     sample = torch.arange(n, device=image.device)[:, None, None]
     return image[sample, :, rows[:, :, None], columns[:, None, :]].permute(0, 3, 1, 2)
+
+
+def mean_scores(scores: Sequence[dict[str, Tensor]]) -> dict[str, Tensor]:
+    """Mean probabilities (B, K) by name of several models' over the same trajectories (paper, supplement)."""
+    return {name: torch.stack([one[name] for one in scores]).mean(dim=0) for name in scores[0]}
+
+
+class Ensemble(nn.Module):
+    """Plans (B, 40, 3) from the mean of its members' scores, by the first member's weighting.
+
+    members: by the name they are spoken of in errors, such as a file's.
+    Raises ValueError for no member, or members of different vocabularies or pictures.
+    """
+
+    def __init__(self, members: Sequence[tuple[str, GtrsDense]]) -> None:
+        super().__init__()
+        if not members:
+            raise ValueError("an ensemble needs one model at least")
+        first_name, first = members[0]
+        for name, member in members[1:]:
+            if member.choice_digest != first.choice_digest:
+                raise ValueError(
+                    f"{name} chooses from vocabulary {member.choice_digest} and {first_name} from "
+                    f"{first.choice_digest}: scores of different trajectories have no mean"
+                )
+            if member.needs.image != first.needs.image:
+                raise ValueError(f"{name} sees {member.needs.image} and {first_name} sees {first.needs.image}")
+        self.models = [member for _, member in members]
+        self.members = nn.ModuleList(self.models)  # for .to() and .eval()
+
+    @property
+    def needs(self) -> Needs:
+        """The members' picture; an ensemble is not trained and reads no labels."""
+        return Needs(image=self.models[0].needs.image)
+
+    def scores(self, batch: Batch) -> dict[str, Tensor]:
+        """Mean probabilities (B, K) by name."""
+        return mean_scores([member.scores(batch) for member in self.models])
+
+    def plan(self, batch: Batch) -> Tensor:
+        first = self.models[0]
+        return first.get_buffer("choices")[first.choose(self.scores(batch))]

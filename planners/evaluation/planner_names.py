@@ -31,8 +31,7 @@ from factory.config.plugins import installed, names
 from factory.config.words import nearest
 from planners.data.batch import Needs
 from planners.evaluation.scoring import Plans, PreparedClip, human_plans, pdm_plans
-from planners.models.gtrs_dense.ensemble import Ensemble
-from planners.models.gtrs_dense.planner import GtrsDense
+from planners.models.gtrs_dense import Ensemble, GtrsDense
 from planners.models.planner import Planner
 from planners.models.registry import BUILT_IN, PlannerChoice, build_planner
 from planners.training import checkpoint
@@ -44,7 +43,7 @@ UNTRAINED = ("constant_velocity",)
 
 
 @dataclass(frozen=True)
-class Contender:
+class EvaluatedPlanner:
     """Someone to be evaluated."""
 
     label: str  # names its folder and its rows
@@ -53,7 +52,7 @@ class Contender:
     privileged: Privileged | None = None
 
 
-def contender(spec: str, label: str | None = None, changed: Mapping[str, Any] | None = None) -> Contender:
+def planner_of(spec: str, label: str | None = None, changed: Mapping[str, Any] | None = None) -> EvaluatedPlanner:
     """Who `spec` names; changed: settings of trained planners, see load_planner. Raises ConfigError for nobody."""
     name = label or spec.strip("/").replace("/", "_").replace(":", ".")
     plugin = installed("planner", spec, [*PRIVILEGED, *BUILT_IN])
@@ -62,15 +61,15 @@ def contender(spec: str, label: str | None = None, changed: Mapping[str, Any] | 
             raise ConfigError(f"planner={spec} is a folder here and a planner of {plugin.package}: planner=./{spec}")
         return _plugged(name, plugin.reference)
     if spec in PRIVILEGED:
-        return Contender(name, spec, privileged=PRIVILEGED[spec])
+        return EvaluatedPlanner(name, spec, privileged=PRIVILEGED[spec])
     if spec in UNTRAINED:
-        return Contender(name, spec, partial(_built, spec))
+        return EvaluatedPlanner(name, spec, partial(_built, spec))
     members = spec.split("+")
     if all(Path(member).is_dir() for member in members):
         newest = [checkpoint.newest(Path(member)) for member in members]  # now: trainings may go on and write others
         parts = [*map(checkpoint.digest, newest), *([json.dumps(changed, sort_keys=True)] if changed else [])]
         digest = parts[0] if len(parts) == 1 else hashlib.sha256(" ".join(parts).encode()).hexdigest()[:16]
-        return Contender(name, digest, partial(_trained, newest, changed))
+        return EvaluatedPlanner(name, digest, partial(_trained, newest, changed))
     if ":" in spec:
         return _plugged(name, spec)
     known = [*PRIVILEGED, *UNTRAINED, *names("planner")]
@@ -83,17 +82,17 @@ def contender(spec: str, label: str | None = None, changed: Mapping[str, Any] | 
     )
 
 
-def _plugged(label: str, spec: str) -> Contender:
+def _plugged(label: str, spec: str) -> EvaluatedPlanner:
     made = _imported(spec)
-    return Contender(label, _digest_of(made), lambda: made)
+    return EvaluatedPlanner(label, _digest_of(made), lambda: made)
 
 
-def contenders(
+def planners_of(
     planner: str | None,
     planners: Sequence[str] | Mapping[str, str] | None,
     bounds: bool,
     changed: Mapping[str, Any] | None = None,
-) -> list[Contender]:
+) -> list[EvaluatedPlanner]:
     """All that are asked for, each once, the bounds first. Raises ConfigError for nobody, or two of one label."""
     named: list[tuple[str | None, str]] = []
     if isinstance(planners, Mapping):
@@ -104,7 +103,7 @@ def contenders(
     if not named:
         raise ConfigError("planner is missing: give planner=<training folder> or planners=[human,...]")
     first = [(None, name) for name in (*PRIVILEGED, *UNTRAINED) if bounds]
-    found = [contender(spec, label, changed) for label, spec in dict.fromkeys([*first, *named])]
+    found = [planner_of(spec, label, changed) for label, spec in dict.fromkeys([*first, *named])]
     labels = [one.label for one in found]
     twice = sorted({label for label in labels if labels.count(label) > 1})
     if twice:

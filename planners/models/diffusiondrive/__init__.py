@@ -1,1 +1,0 @@
-"""DiffusionDrive (Liao et al. 2025)."""

@@ -1,1 +1,0 @@
-"""GTRS-Dense (Li et al. 2025)."""
