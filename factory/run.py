@@ -22,7 +22,7 @@ from factory.config.run import RunConfig, composed_run, load_config, refuse_miss
 from factory.config.shapes import defaults_of, described
 from factory.config.words import Asked, asked_of
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, as_program
-from factory.store.room import NoRoom
+from factory.store.disk import DiskFull
 from factory.store.usable import why_unusable
 
 if TYPE_CHECKING:
@@ -43,8 +43,8 @@ def main(argv: Sequence[str], only_plan: bool = False) -> int:
     except (ConfigError, MemoryError) as error:
         print(f"error: {error}", file=sys.stderr)
         return BAD_CONFIG
-    except NoRoom as error:
-        print(f"error: {error}; make room and run the same command again", file=sys.stderr)
+    except DiskFull as error:
+        print(f"error: {error}; free disk space and run the same command again", file=sys.stderr)
         return INTERRUPTED
 
 
@@ -115,7 +115,7 @@ def run(asked: Asked, only_plan: bool) -> int:
     from factory.store.samples import Store
     from factory.views.board.report import remember, write_report
     from factory.views.card import write_card
-    from factory.views.logged_drive import prepared_episode
+    from factory.views.show import prepared_episode
     from factory.views.status import failed_line
 
     try:

@@ -13,8 +13,12 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from factory.commands.table import COMMANDS
-from factory.config.arguments import RUN, WORD, choices_of, given_as, keys_of
-from factory.config.known import settings_of
+from factory.config.arguments import RUN, WORD, given_as, keys_of
+from factory.config.compose import conf_dir
+from factory.config.plugins import choices
+from factory.config.run import RecoverySources, RunConfig, reader_of
+from factory.config.shapes import choices_of, dataclass_in
+from factory.config.shapes import keys_of as settings_in
 
 BASH = r"""_factory_complete() {
   local line="${COMP_LINE:0:COMP_POINT}" word found
@@ -99,3 +103,15 @@ def candidates(words: Sequence[str], last: str) -> Iterable[str]:
         return [f"{key}={value}" for value in known.get(key, ())]
     taken = {word.partition("=")[0] for word in given}
     return [f"{key}=" for key in known if key not in taken]
+
+
+def settings_of(given: Sequence[str]) -> dict[str, list[str]]:
+    """Setting -> its choices where they are few: groups, the run's keys, those of the chosen reader and of recovery."""
+    folder = conf_dir()
+    chosen = dict(re.findall(r"^  - (\w+): (\w+)$", (folder / "run.yaml").read_text(), re.M))
+    chosen.update({key: value for key, _, value in (word.partition("=") for word in given) if key in chosen})
+    typed = dict(settings_in(RunConfig)) | dict(settings_in(RecoverySources, "expert.recovery."))
+    reader = reader_of(chosen["clips"])
+    typed |= {} if reader is None else dict(settings_in(reader, "clips."))
+    found = {key: choices_of(hint) for key, hint in typed.items() if key != "expert" and dataclass_in(hint) is None}
+    return found | {group: choices(group, [folder]) for group in chosen} | {"experts": choices("expert", [folder])}

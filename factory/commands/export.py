@@ -8,7 +8,7 @@
 `sample` is an ordinal, an id or the beginning of one, `to` a folder (the current one) or, for one sample, a file.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -55,7 +55,7 @@ def export(request: Request) -> Iterator[Path]:
         chosen = [find(store, request.sample)]
     else:
         chosen = sample_ids(store)[:: request.every]
-    suffix = SUFFIXES.get(request.format, f".{request.format}")
+    suffix = ".rrd" if request.format == "rerun" else f".{request.format}"
     is_file = target.suffix == suffix and not target.is_dir()
     if is_file and request.every is not None:
         raise Refused(f"to={request.to}: every=... writes a file for each sample; name a folder")
@@ -64,39 +64,26 @@ def export(request: Request) -> Iterator[Path]:
         for attempt_id in chosen:
             path = target if is_file else target / f"sample_{attempt_id}{suffix}"
             path.parent.mkdir(parents=True, exist_ok=True)
-            FORMATS[request.format](store, table[attempt_id], path)
+            write(request.format, store, table[attempt_id], path)
             yield path
     except (OSError, ValueError, ImportError) as error:  # no such folder, another schema version, no SDK
         raise Refused(f"{store.location.uri}: {error}") from error
 
 
-def write_mcap(store: "Store", row: Row, path: Path) -> None:
-    """The sample as an MCAP episode."""
-    from factory.views.episode_messages import episode_of
+def write(format: str, store: "Store", row: Row, path: Path) -> None:
+    """One sample as one file."""
+    logged = logged_drive(store, dict(row))
+    if format == "mcap":
+        from factory.views.episode_messages import episode_of
 
-    path.write_bytes(episode_of(row, logged_drive(store, dict(row))))
+        path.write_bytes(episode_of(row, logged))
+    elif format == "rerun":
+        from factory.views.rerun_log import write_recording
 
+        write_recording(path, row, logged)
+    else:
+        from factory.views.bev import write_mp4
+        from factory.views.seen_again import digest_of, film, scene_of
 
-def write_film(store: "Store", row: Row, path: Path) -> None:
-    """The sample's drive at 10 Hz."""
-    from factory.views.seen_again import digest_of, film, scene_of
-    from factory.views.video import write_mp4
-
-    digest = digest_of(store, row)
-    scene = None if digest is None else scene_of(store, digest)
-    write_mp4(path, film(row, scene, logged_drive(store, dict(row))))
-
-
-def write_rerun(store: "Store", row: Row, path: Path) -> None:
-    """The sample as a Rerun recording."""
-    from factory.views.rerun_log import write_recording
-
-    write_recording(path, row, logged_drive(store, dict(row)))
-
-
-SUFFIXES = {"rerun": ".rrd"}  # where they are not the format's name
-FORMATS: Mapping[str, Callable[["Store", Row, Path], None]] = {
-    "mcap": write_mcap,
-    "mp4": write_film,
-    "rerun": write_rerun,
-}
+        digest = digest_of(store, row)
+        write_mp4(path, film(row, None if digest is None else scene_of(store, digest), logged))

@@ -24,7 +24,6 @@ from factory.views.show import (
     logged_drive,
     number_lines,
     sample_ids,
-    seen_again,
 )
 from factory.views.status import open_store
 
@@ -78,14 +77,14 @@ def sample_lines(store: "Store", attempt_id: str, request: Request) -> Iterator[
     scene = None if digest is None else scene_of(store, digest)
     if digest is not None and scene is None:
         yield f"              scene {digest} is not in the run's cache: nothing is rendered anew"
-    if scene is not None and (again := again_sheet(*seen_again(store, row, scene))) is not None:
+    if scene is not None and (again := again_sheet(store, row, scene)) is not None:
         sheets.append(again)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(encoded(stacked(sheets), ".png"))
         yield f"picture       {path.resolve()}"
         if request.film:
-            from factory.views.video import write_mp4
+            from factory.views.bev import write_mp4
 
             write_mp4(path.with_suffix(".mp4"), film(row, scene, logged))
             yield f"film          {path.with_suffix('.mp4').resolve()}"

@@ -35,8 +35,7 @@ class Command:
 COMMANDS: Mapping[str, Command] = {
     "run": Command("make samples; the same command again goes on", "factory.run"),
     "plan": Command("what a run would take: attempts, samples, hours, GB", "factory.commands.plan"),
-    "status": Command("what a run holds, and how its newest start ended", "factory.commands.status"),
-    "funnel": Command("acceptance by expert and round, and why not", "factory.commands.funnel"),
+    "status": Command("what a run holds, its acceptance funnel, how it ended", "factory.commands.status"),
     "failed": Command("failed attempts: file, field, message, how to retry", "factory.commands.failed"),
     "retry": Command("try failed attempts again, with the run's own settings", "factory.commands.retry"),
     "lineage": Command("where a sample comes from: clip, candidate, attempt, files", "factory.commands.lineage"),

@@ -4,8 +4,9 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, fields
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin, get_type_hints
 
+from factory.config.shapes import choices_of
 from factory.config.words import ConfigError, nearest
 from factory.exits import BAD_CONFIG
 
@@ -84,13 +85,6 @@ def keys_of(shape: type["DataclassInstance"]) -> dict[str, Any]:
 def given_as(shape: type["DataclassInstance"], how: Mapping[str, str]) -> list[str]:
     """The fields that are given as words, or that take the settings of the run."""
     return [field.name for field in fields(shape) if field.metadata == how]
-
-
-def choices_of(kind: Any) -> list[str]:
-    """What a field of few values may be; nothing for any other."""
-    if get_origin(kind) is Literal:
-        return list(get_args(kind))
-    return ["false", "true"] if bool in {kind, *get_args(kind)} else []
 
 
 def _value(key: str, text: str, kind: Any) -> Any:

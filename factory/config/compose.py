@@ -1,7 +1,8 @@
 """Configuration: Hydra composes conf/, typed dataclasses take the result, and anything unknown is an error."""
 
+import re
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
@@ -50,18 +51,24 @@ def compose(name: str, words: Sequence[str], shape: type[Any] | None = None) -> 
     """
     asked = asked_of(words)
     need_run_extra("hydra", "omegaconf")
+    import hydra
     from hydra.errors import HydraException, MissingConfigException
     from omegaconf import OmegaConf
     from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
     OmegaConf.register_new_resolver("runs", runs_root, replace=True)
     groups = {path.name for root in (conf_dir(), *asked.folders) for path in root.iterdir() if path.is_dir()}
-    overrides = [_as_override(readable(word), groups) for word in asked.overrides]
+    overrides = []  # held against the dataclasses and not against conf/, which says few keys: Hydra takes any
+    for word in map(readable, asked.overrides):
+        plain = word.lstrip("+")
+        overrides.append(word if re.split("[=@]", plain)[0] in groups else f"++{plain}")
     offer_choices(overrides, conf_dir(), asked.folders)
+    if asked.folders:
+        quoted = ",".join(f"'file://{folder!s}'" for folder in asked.folders)
+        overrides.append(f"hydra.searchpath=[{quoted}]")
     try:
-        resolved = OmegaConf.to_container(
-            _composed(name, overrides, asked.folders), resolve=True, throw_on_missing=True
-        )
+        with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+            resolved = OmegaConf.to_container(hydra.compose(name, overrides), resolve=True, throw_on_missing=True)
     except MissingMandatoryValue as error:
         key = str(error.full_key)
         what = "<folder>" if key.endswith("root") else "<value>"
@@ -69,33 +76,14 @@ def compose(name: str, words: Sequence[str], shape: type[Any] | None = None) -> 
     except MissingConfigException as error:
         raise ConfigError(no_such_choice(error.missing_cfg_file or "", error.options)) from error
     except (HydraException, OmegaConfBaseException) as error:
-        raise ConfigError(_first_line(error)) from error
+        cause = f" ({error.__cause__})" if error.__cause__ is not None else ""
+        raise ConfigError(f"{str(error).strip()}{cause}".splitlines()[0]) from error
     assert isinstance(resolved, dict)
     values = {str(key): value for key, value in resolved.items()}
     if shape is None:
         return values
     refuse_unknown(shape, values, "")
     return merged(defaults_of(shape), values)
-
-
-def _as_override(word: str, groups: Collection[str]) -> str:
-    """Keys are held against the dataclasses and not against conf/, which says few of them: Hydra takes any."""
-    plain = word.lstrip("+")
-    return word if plain.partition("=")[0].partition("@")[0] in groups else f"++{plain}"
-
-
-def _composed(name: str, overrides: Sequence[str], folders: Sequence[Path]) -> Any:
-    import hydra
-
-    quoted = ",".join(f"'file://{folder!s}'" for folder in folders)
-    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return hydra.compose(name, [*overrides, *([f"hydra.searchpath=[{quoted}]"] if folders else [])])
-
-
-def _first_line(error: Exception) -> str:
-    """Hydra's own words, where none of ours fit."""
-    cause = f" ({error.__cause__})" if error.__cause__ is not None else ""
-    return f"{str(error).strip()}{cause}".splitlines()[0]
 
 
 def fill(cls: type[T], values: Mapping[str, Any], where: str) -> T:

@@ -29,8 +29,6 @@ READERS: Mapping[str, type[Any]] = {  # `_target_` of a built-in reader -> its s
     "factory.readers.town.reader.SyntheticReader": TownClips,
     "factory.readers.town.towns.SyntheticTownsReader": TownsClips,
 }
-
-
 RECOVERY = "factory.setup.recovery.recovery"  # `_target_` of the built-in expert that has settings of its own
 
 
@@ -183,17 +181,13 @@ def run_config(values: Mapping[str, Any]) -> RunConfig:
         group, _, name = key.partition(".")
         filled = fill(shape, without_labels(values[group][name] if name else values[group]), key)
         if isinstance(filled, TownClips | TownsClips):
-            _refuse_cameras_without(config.render, filled.settings.cameras)
+            rig = filled.settings.cameras  # other rigs are known when clips are read
+            asked = config.render.cameras if rig and config.render.mode is not RenderMode.NONE else ()
+            if missing := [name for name in asked if name not in rig]:
+                raise ConfigError(f"render.cameras: no camera {', '.join(missing)}; this rig has {', '.join(rig)}")
     if config.executor == "ray":
         need_run_extra("ray")
     return config
-
-
-def _refuse_cameras_without(render: RenderSettings, rig: Sequence[str]) -> None:
-    """Raises ConfigError for a camera that the town's rig has not; other rigs are known when clips are read."""
-    missing = [name for name in render.cameras if name not in rig] if rig and render.mode is not RenderMode.NONE else []
-    if missing:
-        raise ConfigError(f"render.cameras: no camera {', '.join(missing)}; this rig has {', '.join(rig)}")
 
 
 def refuse_relative_root(clips: Mapping[str, Any]) -> None:

@@ -38,15 +38,15 @@ class BlockQueue:
         """Some clip has not been handed out."""
         return bool(self._ahead or self._ready or self._waiting)
 
-    def next(self, room: bool) -> ClipPlan | Build | None:
-        """A clip to begin with, if there is `room` for one, or a block to build; None: nothing for now."""
-        if room and self._ready:
+    def next(self, wanted: bool) -> ClipPlan | Build | None:
+        """A clip to begin with, if one is `wanted`, or a block to build; None: nothing for now."""
+        if wanted and self._ready:
             return self._ready.popleft()
         while self._ahead:
             clip = self._ahead[0]
             block = self._block_of(clip.ref) if wants_payload(clip) else None
             if block is None or block in self._built:
-                return self._ahead.popleft() if room else None
+                return self._ahead.popleft() if wanted else None
             if block in self._waiting:
                 self._waiting[block].append(self._ahead.popleft())
             elif len(self._waiting) < self.at_once:

@@ -7,24 +7,24 @@ Everything the driver knows it can know again from the tables, so it can die at 
 import threading
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from factory.graph.batch import Gatherer, PendingRow
 from factory.graph.blocks import BlockOf, BlockQueue, Build
 from factory.graph.episodes import Episodes
-from factory.graph.forecast import Forecast, Work
 from factory.graph.local import Graph, Ticket
 from factory.graph.metrics import RunMetrics
-from factory.graph.plan import CLIP_CANDIDATE, ClipPlan, Plan, WalkState, wants_payload
-from factory.graph.progress import ProgressLine, Tally
-from factory.graph.steps import Attempted, Failure, HalfBuilt, HandedOn, Prepared, Reconstructed, Stamp
+from factory.graph.plan import CLIP_CANDIDATE, ClipPlan, RunPlan, WalkState, wants_payload
+from factory.graph.progress import Forecast, ProgressLine, Tally, Workload
+from factory.graph.steps import Attempted, Failure, HalfBuilt, HandedOn, Prepared, Reconstructed
 from factory.graph.walk import Blocked, Complete, Exhausted, Step, Try, tries_before
+from factory.graph.work import PreparedClip
 from factory.readers.base import ClipRef
 from factory.store.candidates import ClipCandidates
-from factory.store.identity import RunIdentity, attempt_id
+from factory.store.disk import DiskFull
+from factory.store.identity import RunIdentity, Stamp, attempt_id
 from factory.store.outcomes import QUARANTINE_AFTER, ErrorKind, Kind, Outcome
-from factory.store.room import NoRoom
 from factory.store.samples import Past
 from factory.store.table import Shard
 from tasks.stages import Rejected
@@ -68,7 +68,7 @@ class Driver:
     def __init__(
         self,
         identity: RunIdentity,
-        plan: Plan,
+        plan: RunPlan,
         digests: Mapping[str, str],
         rounds: int,
         policy: Callable[[Past], bool],
@@ -92,7 +92,7 @@ class Driver:
         self._wanted = {
             (clip.ref.clip_id, walk.expert): _wanted(walk, rounds) for clip in plan.todo for walk in clip.walks
         }
-        self._forecast = Forecast(Work(), Work(left=sum(self._wanted.values())))
+        self._forecast = Forecast(Workload(), Workload(left=sum(self._wanted.values())))
 
     def stop(self) -> None:
         """Begin nothing more; what is in flight is finished and committed."""
@@ -114,7 +114,7 @@ class Driver:
         return self._stopping.is_set()
 
     def loop(self, graph: Graph, gatherer: Gatherer, metrics: RunMetrics, episodes: Episodes | None = None) -> None:
-        """Until nothing is left, or until stopped and drained. Raises NoRoom once a disk is full."""
+        """Until nothing is left, or until stopped and drained. Raises DiskFull once a disk is full."""
         self._graph, self._gatherer, self._metrics, self._episodes = graph, gatherer, metrics, episodes
         gatherer.committed = self._committed
         with ProgressLine(len(self._plan.todo), self._forecast.left_s, doing=self._doing) as progress:
@@ -124,9 +124,9 @@ class Driver:
         self._queue = BlockQueue(self._plan.todo, self._block_of, graph.parallelism)
         self._forecast.blocks.left = self._queue.n_blocks
         while True:
-            room = len(self._walks_left) + len(self._preparing) < CLIPS_PER_WORKER * graph.parallelism
+            wanted = len(self._walks_left) + len(self._preparing) < CLIPS_PER_WORKER * graph.parallelism
             if gatherer.n_writing < 2 and not self.interrupted:
-                begun = self._queue.next(room)
+                begun = self._queue.next(wanted)
                 if begun is not None:
                     self._open(begun)
                     continue
@@ -137,9 +137,7 @@ class Driver:
             progress.show(self._tally)
             self._show_state()
             idle = not self._preparing and not self._trying and not gatherer.n_writing
-            if idle and (
-                self.interrupted or not self._queue
-            ):  # a block half built is left: the next run goes on with it
+            if idle and (self.interrupted or not self._queue):  # half a block is left: the next run goes on with it
                 break
         gatherer.send()
         while gatherer.n_writing or (self._episodes is not None and self._episodes.is_due):
@@ -179,8 +177,8 @@ class Driver:
 
     def _take(self, ticket: Ticket, report: Any) -> None:
         self._metrics.task(ticket.step, ticket.queued_s, report)
-        if isinstance(report, Failure) and report.no_room:
-            raise NoRoom(report.no_room)
+        if isinstance(report, Failure) and report.disk_full:
+            raise DiskFull(report.disk_full)
         if self._gatherer.finished(ticket, report):
             return
         if self._episodes is not None and self._episodes.finished(ticket, report):
@@ -222,9 +220,9 @@ class Driver:
                 self.notes.append(f"clip {clip_id}: its prepared clip was not in the cache; prepared again")
             self.executed.prepared += not report.from_cache
             self.executed.from_cache += report.from_cache
-            clip.n_candidates = len(report.candidates)
-            is_listed = clip.listed is not None and clip.listed.content_digest == report.content_digest
-            rows = [] if is_listed else [self._candidates_row(clip.ref, report)]
+            clip.n_candidates = len(report.clip.candidates)
+            is_listed = clip.listed is not None and clip.listed.content_digest == report.clip.content_digest
+            rows = [] if is_listed else [self._candidates_row(clip.ref, report.clip)]
             self._gatherer.add(candidates=rows, replaced=replaced)
             clip.past = None
             self._start_walks(clip, result)
@@ -365,7 +363,15 @@ class Driver:
         subscores: dict[str, float],
         seconds: dict[str, float],
     ) -> Outcome:
-        base = Outcome(
+        if isinstance(what, Rejected):
+            became = {"kind": Kind.REJECTED.value, "stage": what.stage, "reason": what.reason, "detail": what.detail}
+        elif isinstance(what, Failure):
+            poison = what.kind is ErrorKind.SYSTEM and tries + 1 >= QUARANTINE_AFTER
+            kind = ErrorKind.POISON if poison else what.kind
+            became = {"kind": Kind.FAILED.value, "error_kind": kind.value, "error": what.error}
+        else:
+            became = {"kind": Kind.EXHAUSTED.value}
+        return Outcome(
             attempt_id=key,
             clip_id=ref.clip_id,
             dataset=ref.dataset,
@@ -373,39 +379,23 @@ class Driver:
             expert=expert,
             expert_digest=self._digests.get(expert, ""),
             candidate_index=candidate,
-            kind=Kind.EXHAUSTED.value,
             settings_hash=self._identity.settings_hash,
             stage_versions=self._identity.versions_json,
             tries=tries + 1,
+            n_tried=what.n_tried if isinstance(what, Exhausted) else 0,
             subscores=subscores,
             seconds=seconds,
-        )
-        facts = asdict(base)
-        if isinstance(what, Rejected):
-            facts |= {"kind": Kind.REJECTED.value, "stage": what.stage, "reason": what.reason, "detail": what.detail}
-        elif isinstance(what, Failure):
-            poison = what.kind is ErrorKind.SYSTEM and tries + 1 >= QUARANTINE_AFTER
-            kind = ErrorKind.POISON if poison else what.kind
-            facts |= {"kind": Kind.FAILED.value, "error_kind": kind.value, "error": what.error}
-        else:
-            facts |= {"n_tried": what.n_tried}
-        return Outcome(**facts)
-
-    def _candidates_row(self, ref: ClipRef, report: Prepared) -> ClipCandidates:
-        return ClipCandidates(
-            ref.clip_id,
-            ref.dataset,
-            ref.log_id,
-            report.content_digest,
-            self._identity.prepare_digest,
-            self._identity.vocabulary_digest,
-            dict(report.gate_counts),
-            report.candidates,
-            report.dropped.stage if report.dropped is not None else "",
-            report.dropped.reason if report.dropped is not None else "",
+            **became,
         )
 
-    def _count(self, seconds: Mapping[str, float], work: Work) -> None:
+    def _candidates_row(self, ref: ClipRef, clip: PreparedClip) -> ClipCandidates:
+        identity, dropped = self._identity, clip.dropped or Rejected("", "")
+        read = (ref.clip_id, ref.dataset, ref.log_id, clip.content_digest)
+        under = (identity.prepare_digest, identity.vocabulary_digest)
+        gates = dict(clip.gate_counts)
+        return ClipCandidates(*read, *under, gates, clip.candidates, dropped.stage, dropped.reason)
+
+    def _count(self, seconds: Mapping[str, float], work: Workload) -> None:
         work.spent_s += sum(seconds.values())
         for stage, spent in seconds.items():
             self._seconds[stage][0] += 1

@@ -22,14 +22,14 @@ from factory.graph.driver import Driver, Executed
 from factory.graph.episodes import Episodes, EpisodesWanted
 from factory.graph.local import NO_CLAIMS, Claims, ClusterLacks, Fuse, Graph, LocalGraph
 from factory.graph.metrics import RunMetrics
-from factory.graph.plan import Plan, make_plan
+from factory.graph.plan import RunPlan, make_plan
 from factory.graph.walk import Try, retry_policy
-from factory.graph.work import NotReady, Stopped, Work
+from factory.graph.work import NotReady, Work
 from factory.readers.base import ClipRef
+from factory.store.disk import DiskFull
 from factory.store.funnel import Funnel, funnel_of
 from factory.store.location import BadLocation
 from factory.store.outcomes import Kind
-from factory.store.room import NoRoom
 from factory.store.samples import CURRENT_RUN, NOTHING, ChangedRun, OnChange, Store
 from factory.store.table import AnotherWriter
 from factory.wording import one_line
@@ -79,7 +79,7 @@ def execute(
     claims: on Ray. fuse: whether the stages of an attempt are one task; auto: not where drawing claims a GPU.
     minutes: after which nothing new is begun, as after an interruption. episodes: MCAP files to be written
     beside the samples. command: the settings as they were given, kept for `retry`.
-    Wrong settings come back as exit code 2 with a message and nothing written; see the module's codes for the others.
+    Invalid arguments come back as exit code 2 with a message and nothing written.
     """
     if not refs or not experts or rounds < 1:
         return RunSummary(BAD_CONFIG, f"nothing to do: {len(refs)} clips, experts {list(experts)}, rounds={rounds}")
@@ -106,11 +106,13 @@ def execute(
     code, message, began_ms, disk_full = COMPLETE, "", 0, False
     try:
         is_due = plan.todo or (pictured is not None and pictured.is_due)
-        graph = (
-            _graph(work, store, executor, workers, ray_address, claims, fuse, lambda: driver.interrupted)
-            if is_due
-            else None
-        )
+        graph: Graph | None = None
+        if is_due and executor == "local":
+            graph = LocalGraph(work, store.location, lambda: driver.interrupted, fuse)
+        elif is_due:
+            from factory.graph.on_ray import RayGraph
+
+            graph = RayGraph(work, store.location, workers, ray_address, claims, fuse)
     except (BadLocation, ClusterLacks, NotReady) as error:
         return RunSummary(BAD_CONFIG, str(error))
     except ConnectionError as error:
@@ -138,8 +140,8 @@ def execute(
             code, message = INTERRUPTED, f"{text}; run the same command again to write them"
         if driver.interrupted:
             code, message = INTERRUPTED, "interrupted; run the same command again to go on"
-    except NoRoom as error:
-        code, message, disk_full = INTERRUPTED, out_of_room(error), True
+    except DiskFull as error:
+        code, message, disk_full = INTERRUPTED, out_of_disk(error), True
     except (AnotherWriter, WriteFailed) as error:
         code, message = INTERRUPTED, str(error)
     except (OSError, DeltaError) as error:  # what holds the tables fails: a share that went away, a lost network
@@ -159,35 +161,18 @@ def execute(
             _record(store, summary)
         except OSError as error:  # the same disk or share
             summary.exit_code = INTERRUPTED
-            summary.disk_full = summary.disk_full or isinstance(error, NoRoom)
+            summary.disk_full = summary.disk_full or isinstance(error, DiskFull)
             summary.message = summary.message or (
-                out_of_room(error) if isinstance(error, NoRoom) else f"{one_line(error)}; run the same command again"
+                out_of_disk(error) if isinstance(error, DiskFull) else f"{one_line(error)}; run the same command again"
             )
     for line in (*summary.notes, str(summary.executed)):
         say(line)
     return summary
 
 
-def out_of_room(error: NoRoom) -> str:
+def out_of_disk(error: DiskFull) -> str:
     """What to do where a disk is full."""
-    return f"{error}; make room and run the same command again: it goes on from what is committed"
-
-
-def _graph(
-    work: Work,
-    store: Store,
-    executor: Executor,
-    workers: int | None,
-    address: str | None,
-    claims: Claims,
-    fuse: Fuse,
-    stopped: Stopped,
-) -> Graph:
-    if executor == "local":
-        return LocalGraph(work, store.location, stopped, fuse)
-    from factory.graph.on_ray import RayGraph
-
-    return RayGraph(work, store.location, workers, address, claims, fuse)
+    return f"{error}; free disk space and run the same command again: it goes on from what is committed"
 
 
 @contextmanager
@@ -205,7 +190,7 @@ def _alarm(stop: Callable[[], None], minutes: float | None) -> Iterator[None]:
         timer.cancel()
 
 
-def _counts(plan: Plan) -> dict[str, int]:
+def _counts(plan: RunPlan) -> dict[str, int]:
     """Attempts of the planned clips by what became of them; clip-level rows among them."""
     counts = dict.fromkeys((kind.value for kind in Kind), 0)
     for clip in (*plan.todo, *plan.done):
@@ -215,7 +200,7 @@ def _counts(plan: Plan) -> dict[str, int]:
     return counts
 
 
-def _announce(store: Store, plan: Plan, experts: Sequence[str], rounds: int, command: Sequence[str] | None) -> int:
+def _announce(store: Store, plan: RunPlan, experts: Sequence[str], rounds: int, command: Sequence[str] | None) -> int:
     """current_run.json: when the run began and how many walks it has before it, for who watches; the beginning."""
     walks = [
         step

@@ -56,7 +56,7 @@ class Graph(Protocol):
     recorder: Recorder  # of metrics
 
     def submit(self, step: str, *args: Any) -> Ticket:
-        """Run `step`; arguments may be results of earlier tickets. What WANTS says is supplied to it."""
+        """Run `step`; arguments may be results of earlier tickets. What STEPS says is supplied to it."""
         ...
 
     def wait(self, timeout_s: float) -> tuple[Ticket, Any] | None:
@@ -66,21 +66,13 @@ class Graph(Protocol):
     def close(self) -> None: ...
 
 
-STEPS = {
-    "reconstruct": steps.reconstruct,
-    "perturb": steps.prepare,
-    "attempt": steps.attempt,
-    "write": steps.write,
-    "episodes": steps.episodes,
-    "warm": steps.warm,
-}
-WANTS = {
-    "reconstruct": ("work", "stopped"),
-    "perturb": ("work", "out"),
-    "attempt": ("work",),
-    "write": ("out",),
-    "episodes": ("work", "out"),
-    "warm": ("work",),
+STEPS: Mapping[str, tuple[Any, tuple[str, ...]]] = {  # its function, and what it is supplied with
+    "reconstruct": (steps.reconstruct, ("work", "stopped")),
+    "perturb": (steps.prepare, ("work", "out")),
+    "attempt": (steps.attempt, ("work",)),
+    "write": (steps.write, ("out",)),
+    "episodes": (steps.episodes, ("work", "out")),
+    "warm": (steps.warm, ("work",)),
 }
 
 
@@ -127,11 +119,10 @@ class LocalGraph:
         if not self._waiting:
             return None
         ticket, step, args = self._waiting.popleft()
-        supplied = [self._supplied[name] for name in WANTS[step]]
+        function, wants = STEPS[step]
         plain = [arg.value if isinstance(arg, _Box) else arg for arg in args]
-        function: Any = STEPS[step]
         ticket.queued_s = time.monotonic() - ticket.submitted
-        report, ticket.result.value = function(*supplied, *plain)
+        report, ticket.result.value = function(*(self._supplied[name] for name in wants), *plain)
         return ticket, report
 
     def close(self) -> None:

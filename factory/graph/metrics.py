@@ -102,23 +102,7 @@ IN_FLIGHT = Metric(
 DISK = Metric("factory_disk_bytes", Type.GAUGE, "B", (), "Size of the file system of a local `out`.")
 DISK_FREE = Metric("factory_disk_free_bytes", Type.GAUGE, "B", (), "Free space there.")
 
-METRICS = (
-    OUTCOMES,
-    TASKS,
-    STAGE_SECONDS,
-    STAGE_SPENT,
-    QUEUE_WAIT,
-    SAMPLES,
-    BYTES,
-    COMMIT_SECONDS,
-    LOOKUPS,
-    PSNR,
-    CLIPS,
-    CLIPS_LEFT,
-    IN_FLIGHT,
-    DISK,
-    DISK_FREE,
-)
+METRICS = tuple(metric for metric in list(globals().values()) if isinstance(metric, Metric))
 
 
 class Recorder(Protocol):

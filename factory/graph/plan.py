@@ -48,7 +48,7 @@ class ClipPlan:
 
 
 @dataclass(frozen=True)
-class Plan:
+class RunPlan:
     """All clips of a run: those with something left to do, in order, and the others."""
 
     todo: tuple[ClipPlan, ...]
@@ -66,8 +66,8 @@ def make_plan(
     on_change: OnChange,
     may_retry: Policy,
     once: Callable[[str], bool],
-) -> Plan:
-    """Hold the wishes against the tables; once: whether an expert is tried once.
+) -> RunPlan:
+    """Hold what is asked for against the tables; once: whether an expert is tried once.
 
     Rows of other settings: under `redo` they count as absent and are replaced, under `keep` they count as done. Raises
     ChangedRun where there are some under `stop`, and where `redo` would replace the candidate list of other rows.
@@ -101,7 +101,7 @@ def make_plan(
         )
         found += sum(past.kind in (Kind.ACCEPTED, Kind.REJECTED) for walk in clip.walks for past in walk.known.values())
         (todo if _has_work(clip, rounds, may_retry) else done).append(clip)
-    return Plan(tuple(todo), tuple(done), tuple(frozen), found)
+    return RunPlan(tuple(todo), tuple(done), tuple(frozen), found)
 
 
 def _refuse_mixing(

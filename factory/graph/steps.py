@@ -8,21 +8,20 @@ import hashlib
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import pyarrow as pa
 
 from factory.graph.work import Dropped, Halted, NotReady, PreparedClip, Stopped, Underway, Work, go_on
 from factory.readers.base import BadClip, ClipRef
-from factory.store.cache import BadCacheFile, ClipCache
-from factory.store.candidates import CandidateRow
+from factory.store.cache import BadCacheFile, ClipCache, SceneFiles
+from factory.store.disk import why_disk_full
 from factory.store.episodes import FOLDER, episode_name
+from factory.store.identity import Stamp
 from factory.store.location import Location
 from factory.store.outcomes import ErrorKind
 from factory.store.reader import samples_of
-from factory.store.room import no_room
-from factory.store.scenes import SceneFiles
 from factory.store.schema import SAMPLES, sample_row_to_table
 from factory.store.table import Shard, write_shard
 from tasks.stages import Rejected
@@ -36,17 +35,14 @@ class Failure:
 
     kind: ErrorKind
     error: str
-    no_room: str = ""  # what a full disk said: nothing more can be written, and nothing failed by itself
+    disk_full: str = ""  # what a full disk said: nothing more can be written, and nothing failed by itself
 
 
 @dataclass(frozen=True)
 class Prepared:
     """Report on a prepared clip."""
 
-    content_digest: str
-    candidates: tuple[CandidateRow, ...]
-    gate_counts: Mapping[str, int]
-    dropped: Rejected | None
+    clip: PreparedClip  # without what its attempts alone need
     from_cache: bool
     note: str = ""  # why the cache was of no use, where a file was there
     seconds: Mapping[str, float] = field(default_factory=dict)
@@ -105,20 +101,6 @@ class EpisodesWritten:
     errors: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
-class Stamp:
-    """What the executor writes on a row: names and values of schema.BOOKKEEPING."""
-
-    attempt_id: str
-    expert: str
-    expert_digest: str
-    round: int
-    candidate_index: int
-    vocabulary_digest: str
-    settings_hash: str
-    stage_versions: str
-
-
 def cache_key(clip_id: str, prepare_digest: str) -> str:
     """File name of a prepared clip."""
     return f"{clip_id}-{hashlib.sha256(prepare_digest.encode()).hexdigest()[:16]}"
@@ -146,7 +128,7 @@ def prepare(
             _refuse_changed(ref, stored.content_digest, wanted_content)
             _keep_scenes(out, stored)
             seconds = {"cache": time.perf_counter() - began}
-            return _prepared(stored, True, note, seconds), stored
+            return Prepared(replace(stored, payload=None, scenes=None), True, note, seconds), stored
         result = work.prepare(ref)
         if isinstance(result, Rejected):
             _refuse_changed(ref, f"none ({result.reason})", wanted_content)  # the clip had candidates
@@ -156,7 +138,7 @@ def prepare(
         _refuse_changed(ref, result.content_digest, wanted_content)
         cache.store(key, result)
         _keep_scenes(out, result)
-        return _prepared(result, False, note, result.seconds), result
+        return Prepared(replace(result, payload=None, scenes=None), False, note, result.seconds), result
     except Exception as error:  # the boundary where whatever a stage or a user's reader raises becomes data
         return failure_of(error), None
 
@@ -262,10 +244,4 @@ def failure_of(error: BaseException) -> Failure:
         return Failure(ErrorKind.INPUT, str(error))
     kind = ErrorKind.SYSTEM if isinstance(error, OSError | MemoryError) else ErrorKind.BUG
     lines = "".join(traceback.format_exception(error)).strip().splitlines()
-    return Failure(kind, "\n".join(lines[-ERROR_LINES:]), no_room(error))
-
-
-def _prepared(clip: PreparedClip, from_cache: bool, note: str, seconds: Mapping[str, float]) -> Prepared:
-    return Prepared(
-        clip.content_digest, clip.candidates, dict(clip.gate_counts), clip.dropped, from_cache, note, dict(seconds)
-    )
+    return Failure(kind, "\n".join(lines[-ERROR_LINES:]), why_disk_full(error))

@@ -1,7 +1,7 @@
 """The walk of one (clip, expert) down the clip's candidate list: what to try next, given what is known.
 
 A pure function of the list and of what became of its candidates, so that a resumed walk, a longer one (`rounds=5` after
-`rounds=2`) and a fresh one are the same walk. An incident (a failed attempt) stops the walk until it is mended: going
+`rounds=2`) and a fresh one are the same walk. An incident (a failed attempt) stops the walk until it is fixed: going
 on would give later samples another round than in a run without the incident, and rows must not depend on incidents.
 """
 
@@ -78,11 +78,6 @@ def retry_policy(retry: bool, versions_json: str) -> Callable[[Past], bool]:
         return retry or past.error_kind == ErrorKind.SYSTEM or past.stage_versions != versions_json
 
     return may_retry
-
-
-def never(past: Past) -> bool:
-    """The policy for failures of this run."""
-    return False
 
 
 def tries_before(past: Past | None) -> int:

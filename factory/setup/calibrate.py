@@ -1,21 +1,41 @@
-"""What a run would take: the clips it would read, and attempts, hours and GB extrapolated from three clips."""
+"""What a run would take: the clips it would read, and attempts, hours and GB extrapolated from three clips.
+
+And in what its set-up differs from the paper's, which conf/preset/paper.yaml holds: one line at its start.
+"""
 
 import os
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
 
+from factory.config.run import RunConfig, load_config
 from factory.graph.walk import candidate_order
 from factory.graph.work import Columns, attempted
 from factory.readers.base import ClipRef
-from factory.setup.paper import setup_text
 from factory.setup.settings import Run
 from factory.store.funnel import funnel_of
 from factory.store.samples import Store
 from factory.store.schema import BOOKKEEPING, sample_row_to_table
 from tasks.stages import TASKS, Rejected
+from tasks.world.vocabulary import Vocabulary
 
 CALIBRATION_CLIPS = 3
+# What the paper says of how samples are made; the rest is this project's own, or how much and where.
+WATCHED = (
+    "perturb",
+    "traffic",
+    "pdm",
+    "reward.full",
+    "reward.progress_above",
+    "expert.recovery.smooth",
+    "render.mode",
+    "render.width",
+    "render.height",
+    "render.psnr_min",
+    "render.psnr_gate",
+    "render.gate.enabled",
+)
 
 
 def plan_text(run: Run, refs: Sequence[ClipRef]) -> str:
@@ -50,9 +70,8 @@ class Calibration:
 def measure(run: Run, refs: Sequence[ClipRef]) -> Calibration:
     """Walk a few clips, evenly spread over the run's, in this process; nothing is written but the block cache."""
     sums = Calibration()
-    chosen = [
-        refs[i * len(refs) // min(CALIBRATION_CLIPS, len(refs))] for i in range(min(CALIBRATION_CLIPS, len(refs)))
-    ]
+    n = min(CALIBRATION_CLIPS, len(refs))
+    chosen = [refs[i * len(refs) // n] for i in range(n)]
     run.work.warm()
     for ref in chosen:
         if ref in run.index.broken:
@@ -74,16 +93,12 @@ def measure(run: Run, refs: Sequence[ClipRef]) -> Calibration:
                 sums.seconds.update(result.seconds)
                 if isinstance(result, Columns):
                     sums.accepted += 1
-                    sums.row_bytes += _bytes_of(result)
+                    blank: dict[str, object] = dict.fromkeys(BOOKKEEPING, "") | {"round": 0, "candidate_index": 0}
+                    sums.row_bytes += int(sample_row_to_table([{**blank, **result.row}]).nbytes)
                     wanted -= 1
                 if wanted == 0:
                     break
     return sums
-
-
-def _bytes_of(result: Columns) -> int:
-    blank: dict[str, object] = dict.fromkeys(BOOKKEEPING, "") | {"round": 0, "candidate_index": 0}
-    return int(sample_row_to_table([{**blank, **result.row}]).nbytes)
 
 
 def calibrate(run: Run, refs: Sequence[ClipRef], store: Store | None = None) -> str:
@@ -129,13 +144,55 @@ def by_the_tables(store: Store, experts: Sequence[str], rounds: int, n_clips: in
         left, attempts, samples = float(n_clips), 0.0, 0.0
         for number in range(wanted):
             row = rows[min(number, len(rows) - 1)]
-            attempts += left * (row.accepted + row.rejected + row.failed) / row.clips_before
+            attempts += left * row.tried / row.clips_before
             left *= row.clip_rate
             samples += left
-        tried = sum(row.accepted + row.rejected + row.failed for row in rows)
+        tried = sum(row.tried for row in rows)
         rate = 100.0 * sum(row.accepted for row in rows) / tried if tried else 0.0
         found.append(
             f"  {expert}: {rate:.1f} % of {tried} attempts on {rows[0].clips_total} clips were accepted; "
             f"{attempts:.0f} attempts, {samples:.0f} samples"
         )
     return [f"by the acceptance measured in {store.location.uri}:", *found] if found else []
+
+
+def setup_text(config: RunConfig, vocabulary: Vocabulary) -> str:
+    """One line: that the set-up is the paper's, or every setting that is another, with the paper's in brackets."""
+    found = differences(config, vocabulary)
+    if not found:
+        return "set-up: the paper's (preset=paper)"
+    return f"set-up: not the paper's (in brackets; preset=paper): {', '.join(found)}"
+
+
+def differences(config: RunConfig, vocabulary: Vocabulary) -> list[str]:
+    """`key=value (the paper's)` for each watched setting that is another.
+
+    Nothing is said of pictures where none are rendered, nor of experts that do not drive.
+    """
+    paper = load_config(["preset=paper", "vocabulary.file=given"])
+    given, wanted = _dotted(asdict(config)), dict(_dotted(asdict(paper)))
+    found, size = [], paper.vocabulary.k
+    if len(vocabulary) != size or config.vocabulary.file is None:
+        kind = "kinematic" if config.vocabulary.file is None else "given"
+        found.append(f"vocabulary of {len(vocabulary):,} {kind} trajectories ({size:,} human ones)")
+    unseen = [f"expert.{name}" for name in paper.expert if name not in config.experts]
+    if config.render.mode is not paper.render.mode:
+        unseen += [key for key in WATCHED if key.startswith("render.") and key != "render.mode"]
+    return found + [
+        f"{key}={value} ({wanted[key]})"
+        for key, value in given
+        if _within(key, WATCHED) and not _within(key, unseen) and value != wanted[key]
+    ]
+
+
+def _within(key: str, groups: Sequence[str]) -> bool:
+    return any(key == group or key.startswith(f"{group}.") for group in groups)
+
+
+def _dotted(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Keys with dots -> values."""
+    for key, value in tree.items():
+        if isinstance(value, Mapping):
+            yield from _dotted(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value

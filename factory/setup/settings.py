@@ -80,13 +80,6 @@ def open_reader(clips: Mapping[str, Any]) -> tuple[ClipReader, ClipIndex]:
     return reader, index
 
 
-def open_for(config: RunConfig) -> tuple[ClipReader, ClipIndex]:
-    """The run's clips, fit for what it draws. Raises ConfigError."""
-    reader, index = open_reader(config.clips)
-    refuse_unknown_cameras(config, reader, index)
-    return reader, index
-
-
 def refuse_missing_backend(config: RunConfig) -> None:
     """Raises ConfigError where images are to be drawn with what this machine lacks; a cluster's nodes say so later."""
     if config.render.mode is not RenderMode.AUTO or (config.executor == "ray" and "RAY_ADDRESS" in os.environ):
@@ -98,13 +91,19 @@ def refuse_missing_backend(config: RunConfig) -> None:
 
 
 def assemble(config: RunConfig) -> Run:
-    """Open the reader, load the vocabulary, prepare the experts. Raises ConfigError with what to mend."""
+    """Open the reader, load the vocabulary, prepare the experts. Raises ConfigError with what to fix."""
     refuse_relative_root(config.clips)
     refuse_missing_backend(config)
+
+    @cache
+    def opened() -> tuple[ClipReader, ClipIndex]:
+        found = open_reader(config.clips)
+        refuse_unknown_cameras(config, *found)
+        return found
+
     try:  # what takes no clips comes first
         vocabulary = choose_vocabulary(config.vocabulary)
         labelling = choose_labelling(config, vocabulary)
-        opened = cache(lambda: open_for(config))
         experts = {
             name: build_expert(RunContext(config, name, opened)) for name in config.experts if name not in FRAMES
         }

@@ -5,18 +5,17 @@ them a run later reads, so that a run's `limit` never changes what the experts k
 """
 
 import json
-import os
 import zipfile
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 
 from factory.readers.base import BadClip, ClipReader
 from factory.readers.validate import read_clip
+from factory.store.disk import whole_file
 from tasks.experts.recovery.expert import RecoveryTable
 from tasks.world.arrays import Array
 from tasks.world.clip import CLIP_STEPS, HORIZON_STEPS, STEP_S
@@ -129,26 +128,19 @@ def _load(path: str | Path) -> np.ndarray | dict[str, np.ndarray]:
 
 def save_vocabulary(path: str | Path, vocabulary: Vocabulary, origin: dict[str, object]) -> None:
     """Writes the .npy, and a .json beside it with the digest, k and `origin`."""
-    _write(Path(path), lambda file: np.save(file, vocabulary.trajectories, allow_pickle=False))
+    with whole_file(Path(path), vocabulary.trajectories.nbytes) as draft, draft.open("wb") as file:
+        np.save(file, vocabulary.trajectories, allow_pickle=False)
     _describe(Path(path), {"digest": vocabulary.digest, "k": len(vocabulary)} | origin)
 
 
 def save_recovery_table(path: str | Path, table: RecoveryTable, origin: dict[str, object]) -> None:
     """Writes the .npz, and a .json beside it with the digest, the number of trajectories and `origin`."""
-    arrays = {"trajectories": table.trajectories, "digest": np.array(table.digest)}
-    _write(Path(path), lambda file: np.savez(file, allow_pickle=False, **arrays))
+    with whole_file(Path(path), table.trajectories.nbytes) as draft, draft.open("wb") as file:
+        np.savez(file, allow_pickle=False, trajectories=table.trajectories, digest=np.array(table.digest))
     _describe(Path(path), {"digest": table.digest, "trajectories": len(table)} | origin)
-
-
-def _write(path: Path, fill_in: Callable[[BinaryIO], object]) -> None:
-    """A file that is there whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f"{path.name}.{os.getpid()}.part")
-    with part.open("wb") as file:
-        fill_in(file)
-    part.replace(path)
 
 
 def _describe(path: Path, content: dict[str, object]) -> None:
     text = json.dumps(content, indent=2, sort_keys=True) + "\n"
-    _write(path.with_suffix(".json"), lambda file: file.write(text.encode()))
+    with whole_file(path.with_suffix(".json"), len(text)) as draft:
+        draft.write_text(text)

@@ -2,8 +2,6 @@
 
 import json
 import logging
-import os
-import tempfile
 import time
 import zipfile
 from pathlib import Path
@@ -12,7 +10,7 @@ import numpy as np
 
 from factory.graph.work import Halted, Stopped, never
 from factory.stages.sensors import SensorData
-from factory.store.room import needs_room
+from factory.store.disk import whole_file
 from factory.wording import time_text
 from tasks.render.fit.reconstruct import advance, finish
 from tasks.render.fit.settings import FitSettings
@@ -54,7 +52,9 @@ def fitted(
 
     while state.iteration < settings.iterations:
         advance(problem, state, settings, state.iteration + STRETCH, say, threads, stopped)
-        _save(begun, state)
+        arrays = state.arrays()
+        with whole_file(begun, sum(array.nbytes for array in arrays.values())) as draft, draft.open("wb") as file:
+            np.savez(file, **arrays)  # type: ignore[arg-type]
         if state.iteration < settings.iterations and stopped():
             said.unlink(missing_ok=True)
             raise Halted(f"{path.stem}: {state.iteration} of {settings.iterations} iterations are done")
@@ -85,16 +85,3 @@ def _resumed(begun: Path, start: FitState) -> FitState:
     except (ValueError, KeyError, OSError, zipfile.BadZipFile) as error:
         log.warning("%s is damaged (%s); the fit begins again", begun, error)
         return start
-
-
-def _save(begun: Path, state: FitState) -> None:
-    arrays = state.arrays()
-    with needs_room(begun, sum(array.nbytes for array in arrays.values())):
-        handle, temporary = tempfile.mkstemp(dir=begun.parent, prefix=".fit-", suffix=".npz")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                np.savez(file, **arrays)  # type: ignore[arg-type]
-            os.replace(temporary, begun)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise

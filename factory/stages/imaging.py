@@ -27,7 +27,6 @@ from tasks.render.scene.build import RenderAsset
 from tasks.render.settings import STEPS_OF, ImageSource, PsnrGate, RenderMode, RenderSettings
 from tasks.render.views import pose_on_ground, render_views
 from tasks.stages import Rejected
-from tasks.world.agents import AgentTracks
 from tasks.world.arrays import Array, Bytes
 from tasks.world.camera import Camera, SensorFile
 from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip
@@ -101,11 +100,9 @@ class Imaging:
     def unfit(self, clip: Clip, candidate: Candidate, judged: Judged, shared: Sequence[int] = ()) -> Rejected | None:
         """Why a simulated drive cannot be shown: what `tasks.render.gate` finds on its pictures from T to T+2H.
 
-        Vehicles are held against photos on the pictures that are stored.
-        shared: steps of several samples of the drive, which fall together: then all is held against what they store.
-
-        None where nothing is rendered from photos: lidar's grey pictures have gaps between its beams, and a reach of
-        their own instead. Raises BadClip for a broken sensor file.
+        Vehicles are held against photos on the pictures that are stored, all else too where there are `shared` steps
+        of several samples of the drive, which fall together. None where nothing is rendered from photos: lidar's grey
+        pictures have gaps between its beams, and a reach instead. Raises BadClip for a broken sensor file.
         """
         if self.settings.mode is not RenderMode.AUTO or not self.settings.gate.enabled:
             return None
@@ -116,6 +113,8 @@ class Imaging:
         stored = sorted({at + offset for at in shared or (now,) for offset in STEPS_OF[self.settings.frames]})
         if shared:
             steps = stored
+        looks = self.settings.gate.vehicle_min > 0.0  # at vehicles
+        album = _kept_album(_of_block(clip, self.settings, self.cache_dir)) if looks else None
         states = np.concatenate([candidate.rollout.ego_states, judged.rollout.ego_states[1:]])
         return unfit(
             _block(clip, self.settings, self.cache_dir),
@@ -126,9 +125,7 @@ class Imaging:
             (self.settings.width, self.settings.height),
             self.settings.gate,
             self.settings.backend,
-            _kept_album(_of_block(clip, self.settings, self.cache_dir))
-            if self.settings.gate.vehicle_min > 0.0
-            else None,
+            album,
             stored,
         )
 
@@ -154,7 +151,11 @@ class Imaging:
         poses = pose_on_ground(clip.world_from_ego, self._ego_states(judged))
         agents = scene.agents.overwritten(scene.step, rollout.agents)
         steps = [scene.step + offset for offset in offsets]
-        images = self._draw(clip, asset, cameras, poses, agents, steps)
+        seen = (cameras, poses, agents, steps, self.settings.width, self.settings.height)
+        if asset is None:
+            images = draw_map_views(clip.road_map, *seen)
+        else:
+            images = render_views(asset, *seen, self.settings.backend)
         found = [
             self._image(camera.name, offset * STEP_S, poses[f], images[f, c])
             for f, offset in enumerate(offsets)
@@ -165,20 +166,6 @@ class Imaging:
         if asset is not None:
             measured = {"asset_digest": asset.digest, "psnr": asset.psnr_db if np.isfinite(asset.psnr_db) else None}
         return {"cameras": self._rig(cameras), "images": found, "image_source": str(source), **measured}
-
-    def _draw(
-        self,
-        clip: Clip,
-        asset: RenderAsset | None,
-        cameras: Sequence[Camera],
-        poses: Array,
-        agents: AgentTracks,
-        steps: Sequence[int],
-    ) -> Bytes:
-        size = (self.settings.width, self.settings.height)
-        if asset is None:
-            return draw_map_views(clip.road_map, cameras, poses, agents, steps, *size)
-        return render_views(asset, cameras, poses, agents, steps, *size, self.settings.backend)
 
     def _photos(self, clip: Clip, judged: Judged, cameras: Sequence[Camera]) -> dict[str, object]:
         now_s = judged.scene.step * STEP_S

@@ -15,8 +15,6 @@ exposures, the block's range, and the digest over all of it. No code runs when a
 import hashlib
 import json
 import math
-import os
-import tempfile
 from collections.abc import Mapping
 from dataclasses import asdict, fields, replace
 from pathlib import Path
@@ -27,7 +25,8 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from factory.store.room import needs_room
+from factory.store.disk import whole_file
+from factory.store.identity import canonical_json
 from tasks.render.scene.asset import BlockRange, Exposure, RenderAsset, ViewQuality
 from tasks.render.scene.sky import SkyMap
 from tasks.render.splatting.gaussians import Gaussians
@@ -46,17 +45,9 @@ def write_scene(path: Path, asset: RenderAsset) -> RenderAsset:
     """Writes beside the path and renames; returns the scene with its digest."""
     tensors, described = tensors_of(asset), described_by(asset)
     digest = digest_of(tensors, described)
-    data = save(dict(tensors), metadata={KEY: _json(described | {"digest": digest})})
-    with needs_room(path, len(data)):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=".scene-", suffix=SUFFIX)
-        try:
-            with os.fdopen(handle, "wb") as file:
-                file.write(data)
-            os.replace(temporary, path)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
+    data = save(dict(tensors), metadata={KEY: canonical_json(described | {"digest": digest})})
+    with whole_file(path, len(data)) as draft:
+        draft.write_bytes(data)
     return replace(asset, digest=digest)
 
 
@@ -158,15 +149,11 @@ def scene_of(tensors: Tensors, described: Mapping[str, Any], digest: str) -> Ren
 
 def digest_of(tensors: Tensors, described: Mapping[str, Any]) -> str:
     """16 hex digits of the scene's content."""
-    digest = hashlib.sha256(_json(described).encode())
+    digest = hashlib.sha256(canonical_json(described).encode())
     for name, array in sorted(tensors.items()):
         digest.update(f"\x1f{name}\x1f{array.dtype.str}\x1f{array.shape}\x1f".encode())
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()[:16]
-
-
-def _json(value: Mapping[str, Any]) -> str:
-    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
 
 
 def _number(value: float) -> float | str | None:

@@ -125,7 +125,7 @@ def _compile_part(name: str, enough: Event) -> None:
         raise RuntimeError(f"compiling the kernels of {name} was not begun")
     with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) as part:  # noqa: S603 (ours)
         said = _ended(part, enough)
-    if part.returncode == NO_ROOM:
+    if part.returncode == DISK_FULL:
         raise OSError(said.strip().splitlines()[-1])
     if part.returncode != 0:
         raise RuntimeError(f"compiling the kernels of {name} failed: {said[-2000:]}")
@@ -150,7 +150,7 @@ def _warm(name: str) -> int:
             write_whole(marker(part), listed.encode())
     except OSError as error:
         print(error, file=sys.stderr)
-        return NO_ROOM
+        return DISK_FULL
     return 0
 
 
@@ -181,20 +181,15 @@ def _answers() -> None:
     reactive_scores(scene, np.stack([states] * 2), TrafficSettings())
 
 
-def _render() -> None:
-    """Scenes that are built and drawn."""
-    render_warm.compile_kernels()
-
-
 def _fit() -> None:
-    """The same, and scenes that are fitted: in one process, for they share kernels."""
+    """Scenes that are built and drawn, and fitted: in one process, for they share kernels."""
     render_warm.compile_kernels()
     render_warm.compile_fit_kernels()
 
 
-PARTS = {"judge": _judge, "drive": _drive, "answers": _answers, "render": _render, "fit": _fit}
+PARTS = {"judge": _judge, "drive": _drive, "answers": _answers, "render": render_warm.compile_kernels, "fit": _fit}
 INCLUDED = {"answers": ("drive",), "fit": ("render",)}
-NO_ROOM = 5  # exit code of a part whose files could not be kept
+DISK_FULL = 5  # exit code of a part whose files could not be kept
 
 
 def _tiny_scene() -> tuple[Scene, Array]:

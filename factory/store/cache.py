@@ -1,4 +1,4 @@
-"""Prepared clips on disk, so that a later run goes on without a perturb task.
+"""Prepared clips on disk, so that a later run goes on without a perturb task, and the scenes of a benchmark.
 
 A file is a plain zip of arrays (npz, no pickle) plus one JSON tree that says how frozen dataclasses, tuples, dicts and
 arrays nest. Reading it builds only dataclasses and enums of this distribution, by their fields, and nothing else.
@@ -12,12 +12,15 @@ import io
 import json
 import zipfile
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from factory.store.location import Location
+
+if TYPE_CHECKING:
+    from tasks.hard_scenes import BenchmarkClip
 
 FORMAT = 1
 PACKAGES = ("tasks.", "factory.")  # whose dataclasses and enums a file may name
@@ -74,6 +77,33 @@ class ClipCache:
     def store(self, key: str, value: object) -> None:
         """Whole or not at all."""
         self.location.write(f"{key}.npz", encode(value))
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneFiles:
+    """The folder `scenes` of a store: one file a clip, from which planners are driven without the raw logs."""
+
+    location: Location
+
+    def store(self, scenes: "BenchmarkClip") -> None:
+        """Whole or not at all; in place of an older one."""
+        self.location.write(f"{scenes.clip.clip_id}.npz", encode(scenes))
+
+    def load(self, clip_id: str) -> "BenchmarkClip":
+        """Raises FileNotFoundError where the clip has none, BadCacheFile for a damaged or foreign file."""
+        from tasks.hard_scenes import BenchmarkClip
+
+        data = self.location.read(f"{clip_id}.npz")
+        if data is None:
+            raise FileNotFoundError(f"{self.location.uri}/{clip_id}.npz: no scenes of this clip; run the factory again")
+        scenes = decode(data)
+        if not isinstance(scenes, BenchmarkClip):
+            raise BadCacheFile(f"{self.location.uri}/{clip_id}.npz holds {type(scenes).__name__}, not a clip's scenes")
+        return scenes
+
+    def clip_ids(self) -> list[str]:
+        """Of all clips that have scenes, sorted."""
+        return [name.removesuffix(".npz") for name in self.location.names() if name.endswith(".npz")]
 
 
 class _Arrays:

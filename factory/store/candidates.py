@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass, fields
 
 import pyarrow as pa
 
-from factory.store.table import KeyedTable, TableSpec
+from factory.store.table import KeyedTable, TableSpec, schema_of
 
 
 @dataclass(frozen=True)
@@ -48,43 +48,13 @@ class Listed:
     n_candidates: int
 
 
-CANDIDATE = pa.struct(
-    [
-        ("index", pa.int32()),
-        ("vocabulary_index", pa.int32()),
-        ("end_x", pa.float64()),
-        ("end_y", pa.float64()),
-        ("end_heading", pa.float64()),
-        ("end_speed", pa.float64()),
-        ("cell", pa.list_(pa.int32())),
-        ("score", pa.float64()),
-        ("reactive_score", pa.float64()),
-    ]
-)
-SCHEMA = pa.schema(
-    [
-        *(
-            pa.field(name, pa.string())
-            for name in ("clip_id", "dataset", "log_id", "content_digest", "prepare_digest", "vocabulary_digest")
-        ),
-        pa.field("gate_counts", pa.map_(pa.string(), pa.int64())),
-        pa.field("n_candidates", pa.int32()),
-        pa.field("candidates", pa.list_(CANDIDATE)),
-        pa.field("stage", pa.string()),
-        pa.field("reason", pa.string()),
-    ]
-)
+SCHEMA = schema_of(ClipCandidates)
+SCHEMA = SCHEMA.insert(SCHEMA.get_field_index("candidates"), pa.field("n_candidates", pa.int32()))
 CANDIDATES = TableSpec("candidates", SCHEMA, "clip_id")
 
 
 def candidates_table(rows: Sequence[ClipCandidates]) -> pa.Table:
-    return pa.Table.from_pylist(
-        [
-            asdict(row) | {"gate_counts": list(row.gate_counts.items()), "n_candidates": len(row.candidates)}
-            for row in rows
-        ],
-        schema=SCHEMA,
-    )
+    return pa.Table.from_pylist([asdict(row) | {"n_candidates": len(row.candidates)} for row in rows], schema=SCHEMA)
 
 
 def listed_of(table: KeyedTable) -> dict[str, Listed]:

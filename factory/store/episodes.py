@@ -9,7 +9,8 @@ import json
 import zlib
 from collections import deque
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from dataclasses import dataclass
+from typing import Any
 
 from mcap.records import Footer
 from mcap.stream_reader import MAGIC_SIZE, StreamReader
@@ -23,15 +24,13 @@ CHUNK_BYTES = 1 << 20
 DATA_END_BYTES = 1 + 8 + 4  # opcode, length, checksum of everything before
 
 
-class Timed(Protocol):
-    """A message: see factory.views.episode_messages.Message."""
+@dataclass(frozen=True)
+class Message:
+    """What stands under a topic at a time; a mapping is to be written as JSON."""
 
-    @property
-    def topic(self) -> str: ...
-    @property
-    def time_ns(self) -> int: ...
-    @property
-    def content(self) -> Any: ...
+    topic: str
+    time_ns: int
+    content: Any  # a message of protobuf, or a mapping
 
 
 def is_chosen(attempt_id: str, every: int) -> bool:
@@ -45,7 +44,7 @@ def episode_name(row: Mapping[str, Any]) -> str:
     return f"{row['attempt_id']}-{made_under}.mcap"
 
 
-def episode_bytes(messages: Sequence[Timed], metadata: Mapping[str, str]) -> bytes:
+def episode_bytes(messages: Sequence[Message], metadata: Mapping[str, str]) -> bytes:
     """An MCAP file of messages, in their order; metadata stands under the name `sample`."""
     stream = io.BytesIO()
     writer = Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD, enable_data_crcs=True)
@@ -79,7 +78,7 @@ def check_episode(data: bytes) -> None:
         raise ValueError("its checksum is another")
 
 
-def _channel(writer: Writer, message: Timed) -> int:
+def _channel(writer: Writer, message: Message) -> int:
     if isinstance(message.content, Mapping):
         name = message.topic.strip("/").capitalize()
         schema = writer.register_schema(name, SchemaEncoding.JSONSchema, json.dumps({"type": "object"}).encode())

@@ -41,9 +41,12 @@ class FunnelRow:
     simulated: bool = True  # from candidates; False: the log's own drive, tried once a clip
 
     @property
+    def tried(self) -> int:
+        return self.accepted + self.rejected + self.failed
+
+    @property
     def attempt_rate(self) -> float:
-        tried = self.accepted + self.rejected + self.failed
-        return self.accepted / tried if tried else float("nan")
+        return self.accepted / self.tried if self.tried else float("nan")
 
     @property
     def clip_rate(self) -> float:
@@ -87,14 +90,11 @@ class Funnel:
             "expert", "round", "tried", "accepted", "attempts %", "1st try %", "clips", "clips %", "of all %", "why not"
         )
         for r in self.rows:
-            tried = r.accepted + r.rejected + r.failed
             why = ", ".join(f"{name.removeprefix('reward.')} {n}" for name, n in r.reasons.items())
-            rates = (_percent(r.attempt_rate), _percent(r.clip_rate), _percent(r.clip_rate_of_all))
-            first = _percent(r.first_try_rate)
-            clips = f"{r.clips}/{r.clips_before}"
-            table.add_row(
-                r.expert, str(r.round), str(tried), str(r.accepted), rates[0], first, clips, rates[1], rates[2], why
-            )
+            numbers = map(str, (r.round, r.tried, r.accepted))
+            tries = map(_percent, (r.attempt_rate, r.first_try_rate))
+            clips = map(_percent, (r.clip_rate, r.clip_rate_of_all))
+            table.add_row(r.expert, *numbers, *tries, f"{r.clips}/{r.clips_before}", *clips, why)
         sink = io.StringIO()
         Console(file=sink, width=width, no_color=True).print(table)
         return f"{head}\n{sink.getvalue()}"

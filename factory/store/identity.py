@@ -30,6 +30,20 @@ class RunIdentity:
         return canonical_json(self.stage_versions)
 
 
+@dataclass(frozen=True)
+class Stamp:
+    """What the executor writes on a row: columns that Work.label does not give."""
+
+    attempt_id: str
+    expert: str
+    expert_digest: str
+    round: int
+    candidate_index: int
+    vocabulary_digest: str
+    settings_hash: str
+    stage_versions: str
+
+
 def canonical_json(value: object) -> str:
     """JSON with sorted keys and no spaces; the same for equal values, on every machine."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)

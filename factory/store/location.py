@@ -1,7 +1,6 @@
 """Where a store lives: a folder or an object-store URL, with the few file operations the store needs."""
 
 import os
-import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -10,7 +9,7 @@ from pathlib import Path
 from pyarrow import fs
 
 from factory.job import in_submitted_job
-from factory.store.room import needs_room
+from factory.store.disk import whole_file
 
 REMOTE = ("s3", "gs", "abfs", "abfss", "file")  # what both Arrow and Delta write to
 
@@ -68,26 +67,17 @@ class Location:
     def write(self, name: str, data: bytes) -> None:
         """Whole file or no file: rename on local disk (flushed first), one put on an object store.
 
-        Raises NoRoom where the disk is full.
+        Raises DiskFull where the disk is full.
         """
         if not self.is_local:
             filesystem, base = self.filesystem()
             with filesystem.open_output_stream(f"{base}/{name}", compression=None) as stream:
                 stream.write(data)
             return
-        target = Path(self.uri, name)
-        draft = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
-        with needs_room(target, len(data)):
-            target.parent.mkdir(parents=True, exist_ok=True)
-            try:
-                with draft.open("wb") as file:
-                    file.write(data)
-                    file.flush()
-                    os.fsync(file.fileno())
-                draft.replace(target)
-            except BaseException:
-                draft.unlink(missing_ok=True)
-                raise
+        with whole_file(Path(self.uri, name), len(data)) as draft, draft.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
 
     def remove(self, name: str) -> None:
         filesystem, base = self.filesystem()

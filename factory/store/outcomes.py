@@ -11,7 +11,7 @@ from enum import StrEnum
 
 import pyarrow as pa
 
-from factory.store.table import TableSpec
+from factory.store.table import TableSpec, schema_of
 
 
 class Kind(StrEnum):
@@ -57,35 +57,9 @@ class Outcome:
     seconds: dict[str, float] = field(default_factory=dict)  # stage -> seconds
 
 
-SCHEMA = pa.schema(
-    [
-        *(
-            pa.field(name, pa.string())
-            for name in ("attempt_id", "clip_id", "dataset", "log_id", "expert", "expert_digest")
-        ),
-        pa.field("candidate_index", pa.int32()),
-        *(
-            pa.field(name, pa.string())
-            for name in (
-                "kind",
-                "settings_hash",
-                "stage_versions",
-                "stage",
-                "reason",
-                "detail",
-                "error_kind",
-                "error",
-            )
-        ),
-        pa.field("tries", pa.int32()),
-        pa.field("n_tried", pa.int32()),
-        pa.field("subscores", pa.map_(pa.string(), pa.float64())),
-        pa.field("seconds", pa.map_(pa.string(), pa.float64())),
-    ]
-)
+SCHEMA = schema_of(Outcome)
 OUTCOMES = TableSpec("outcomes", SCHEMA, "attempt_id")
 
 
 def outcomes_table(outcomes: Sequence[Outcome]) -> pa.Table:
-    rows = [asdict(o) | {"subscores": list(o.subscores.items()), "seconds": list(o.seconds.items())} for o in outcomes]
-    return pa.Table.from_pylist(rows, schema=SCHEMA)
+    return pa.Table.from_pylist([asdict(outcome) for outcome in outcomes], schema=SCHEMA)

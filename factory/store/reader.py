@@ -13,7 +13,7 @@ files they stand in; `iterate` goes file by file instead, which is what a pass o
 
 import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 
 from factory.store.location import Location
 from factory.store.schema import SAMPLES, SCHEMA, SCHEMA_VERSION, VERSION_PROPERTY, table_to_rows
-from factory.store.table import KeyedTable
+from factory.store.table import KeyedTable, open_parquet, with_partition
 from tasks.reward.label_bytes import VocabularyLabels, decode
 from tasks.world.arrays import Bytes
 
@@ -31,13 +31,6 @@ if TYPE_CHECKING:
 
 Sample = dict[str, Any]
 TIME_TOLERANCE_S = 0.05
-LABEL_COLUMNS = (
-    "label_vocabulary",
-    "label_traffic",
-    "label_reference_progress_m",
-    "label_subscores",
-    "label_progress",
-)
 
 
 def sample_table(path: str | os.PathLike[str], storage_options: Mapping[str, str] | None = None) -> KeyedTable:
@@ -73,7 +66,7 @@ class SampleTable:
         ]
         self._places = sorted(places)
         self._index = {key: i for i, (key, _, _) in enumerate(self._places)}
-        self._file = lru_cache(maxsize=32)(self._open)
+        self._file = lru_cache(maxsize=32)(partial(open_parquet, self._table.location))
 
     def __len__(self) -> int:
         return len(self._places)
@@ -101,12 +94,8 @@ class SampleTable:
     def sample(self, which: int | str, columns: Sequence[str] | None = None) -> Sample:
         """One sample, or some of its columns; reads the row group it stands in."""
         _, path, row = self._places[self._index[which] if isinstance(which, str) else which]
-        file = self._file(path)
-        group = 0
-        while row >= file.metadata.row_group(group).num_rows:
-            row -= file.metadata.row_group(group).num_rows
-            group += 1
-        (sample,) = self._rows(path, [group], columns, slice(row, row + 1))
+        group, row = group_of(self._file(path), row)
+        (sample,) = _read_rows(self._file(path), group, self._partitions[path], columns, slice(row, row + 1))
         return sample
 
     def __iter__(self) -> Iterator[Sample]:
@@ -116,48 +105,42 @@ class SampleTable:
         """Every sample once, file by file, one row group in memory."""
         for path in sorted(self._partitions):
             for group in range(self._file(path).metadata.num_row_groups):
-                yield from self._rows(path, [group], columns, slice(None))
-
-    def _rows(self, path: str, groups: list[int], columns: Sequence[str] | None, rows: slice) -> list[Sample]:
-        return _read_rows(self._file(path), groups, self._partitions[path], columns, rows)
-
-    def _open(self, path: str) -> pq.ParquetFile:
-        return _opened(self._table.location, path)
+                yield from _read_rows(self._file(path), group, self._partitions[path], columns)
 
 
 def samples_of(
     table: Location, path: str, partition: Mapping[str, str], attempt_ids: Collection[str]
 ) -> Iterator[Sample]:
     """Some whole rows of one file of a table of samples; reads the row groups they stand in, one at a time."""
-    file = _opened(table, path)
+    file = open_parquet(table, path)
     for group in range(file.metadata.num_row_groups):
         keys = file.read_row_group(group, columns=["attempt_id"])["attempt_id"].to_pylist()
         for i in (i for i, key in enumerate(keys) if key in attempt_ids):
-            yield from _read_rows(file, [group], partition, None, slice(i, i + 1))
+            yield from _read_rows(file, group, partition, None, slice(i, i + 1))
 
 
-def _opened(table: Location, path: str) -> pq.ParquetFile:
-    filesystem, base = table.filesystem()
-    return pq.ParquetFile(f"{base}/{path}", filesystem=filesystem, page_checksum_verification=True)
+def group_of(file: pq.ParquetFile, row: int) -> tuple[int, int]:
+    """The row group that a file's row stands in, and its place there."""
+    group = 0
+    while row >= file.metadata.row_group(group).num_rows:
+        row -= file.metadata.row_group(group).num_rows
+        group += 1
+    return group, row
 
 
 def _read_rows(
-    file: pq.ParquetFile, groups: list[int], partition: Mapping[str, str], columns: Sequence[str] | None, rows: slice
+    file: pq.ParquetFile,
+    group: int,
+    partition: Mapping[str, str],
+    columns: Sequence[str] | None,
+    rows: slice = slice(None),
 ) -> list[Sample]:
     names = list(SCHEMA.names if columns is None else columns)
     unknown = sorted(set(names) - set(SCHEMA.names))
     if unknown:
         raise KeyError(f"no columns {unknown}")
-    stored = file.read_row_groups(groups, columns=[n for n in names if n not in partition])
-    start, stop, _ = rows.indices(stored.num_rows)
-    stored = stored.slice(start, stop - start)
-    arrays = [
-        pa.repeat(pa.scalar(partition[n]).cast(SCHEMA.field(n).type), stored.num_rows)
-        if n in partition
-        else stored[n].cast(SCHEMA.field(n).type)
-        for n in names
-    ]
-    return table_to_rows(pa.table(arrays, schema=pa.schema([SCHEMA.field(n) for n in names])))
+    stored = file.read_row_group(group, columns=[n for n in names if n not in partition])[rows]
+    return table_to_rows(with_partition(stored, pa.schema([SCHEMA.field(n) for n in names]), partition))
 
 
 def image_of(sample: Mapping[str, Any], camera: str, time_s: float) -> Bytes:
@@ -165,16 +148,22 @@ def image_of(sample: Mapping[str, Any], camera: str, time_s: float) -> Bytes:
 
     Raises KeyError where the sample has no such image, ValueError where it cannot be decoded.
     """
-    import cv2
-
     for image in sample["images"] or ():
         if image["camera"] == camera and abs(image["time_s"] - time_s) <= TIME_TOLERANCE_S:
-            pixels = cv2.imdecode(np.frombuffer(image["jpeg"], np.uint8), cv2.IMREAD_COLOR)
-            if pixels is None:
-                raise ValueError(f"{sample.get('attempt_id', 'sample')}: image {camera} at {time_s} s is not a JPEG")
-            return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+            return decoded(image)
     have = sorted({(i["camera"], round(float(i["time_s"]), 3)) for i in sample["images"] or ()})
     raise KeyError(f"no image of camera {camera!r} at {time_s} s; there are {have}, source {sample['image_source']}")
+
+
+def decoded(image: Mapping[str, Any]) -> Bytes:
+    """The pixels of one of a row's images (height, width, 3) uint8 RGB. Raises ValueError where it is no picture."""
+    import cv2
+
+    data = np.frombuffer(image["jpeg"], np.uint8)
+    pixels = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
+    if pixels is None:
+        raise ValueError(f"image of camera {image['camera']} at {image['time_s']:.1f} s cannot be decoded")
+    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
 def labels_of(sample: Mapping[str, Any], vocabulary: str | None = None) -> VocabularyLabels:

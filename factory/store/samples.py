@@ -11,6 +11,7 @@ import sys
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any, Literal
 
 from factory.store.cache import ClipCache
@@ -48,7 +49,7 @@ class Past:
     round: int = -1  # accepted: its round
     error_kind: str = ""  # failed: ErrorKind
     tries: int = 0  # failed: runs that tried it
-    stage_versions: str = ""  # failed: under which
+    stage_versions: str = ""  # under which
 
 
 @dataclass(frozen=True)
@@ -83,10 +84,9 @@ class Store:
     ) -> list[dict[str, Any]]:
         """Hold the run against the newest record of run.json; the records as they are to be, with this run's as newest.
 
-        A record's on_change says whether rows of older records may stand among its own ("keep"). A run that says
-        "stop" and changes nothing goes on under the record that it finds. Expert digests are those of all experts so
-        far. Writes nothing. Raises ChangedRun where they differ, on_change is "stop" and there are samples; without
-        one the run starts over.
+        A record's on_change says whether rows of older records may stand among its own ("keep"); its expert digests
+        are those of all experts so far. Writes nothing. Raises ChangedRun where they differ, on_change is "stop" and
+        there are samples; without one the run starts over.
         """
         for expert in expert_digests:
             if not re.fullmatch(r"[A-Za-z0-9_-]+", expert):
@@ -129,10 +129,9 @@ class Store:
     def begin(self, records: Sequence[Mapping[str, object]]) -> None:
         """The first writes of a run: record its settings, fence off older runs, tidy up after a crash.
 
-        A run that starts over drops what became of attempts under the settings that were.
-
-        A crash between two commits leaves a failed outcome beside the sample that its retry became; it goes. One that
-        is newer than the sample of the same attempt, of a redo that failed, stays.
+        A run that starts over drops what became of attempts under the settings that were. A crash between two commits
+        leaves a failed outcome beside the sample that its retry became; it goes. One that is newer than the sample of
+        the same attempt, of a redo that failed, stays.
         """
         if self.starts_over(records):
             for table in (self.candidates, self.outcomes):
@@ -173,32 +172,26 @@ class Store:
     def history(self, identity: RunIdentity, expert_digests: Mapping[str, str]) -> History:
         """Everything the tables know, samples winning over outcomes of the same attempt."""
 
-        def current(settings_hash: str, versions: str, expert: str, digest: str) -> bool:
-            return (
-                settings_hash == identity.settings_hash
-                and versions == identity.versions_json
-                and digest == expert_digests.get(expert, digest)
-            )
-
         walks: dict[Place, dict[int, Past]] = defaultdict(dict)
         stale: dict[Place, set[str]] = defaultdict(set)
-
-        def enter(place: Place, candidate: int, past: Past) -> None:
+        made_by = identity.settings_hash, identity.versions_json
+        for row in chain(_rows(self.outcomes, OUTCOME_STATE), _rows(self.samples, SAMPLE_STATE)):
+            place, candidate, digest = (row["clip_id"], row["expert"]), row["candidate_index"], row["expert_digest"]
+            past = Past(
+                row["attempt_id"],
+                Kind(row.get("kind", Kind.ACCEPTED)),
+                (row["settings_hash"], row["stage_versions"]) == made_by
+                and digest == expert_digests.get(row["expert"], digest),
+                row.get("round", -1),
+                row.get("error_kind", ""),
+                row.get("tries", 0),
+                sys.intern(row["stage_versions"]),
+            )
             known = walks[place].get(candidate)
             if known is None or past.current or not known.current:
                 walks[place][candidate] = past
             if not past.current:
                 stale[place].add(past.attempt_id)
-
-        for row in _rows(self.outcomes, OUTCOME_STATE):
-            is_current = current(row["settings_hash"], row["stage_versions"], row["expert"], row["expert_digest"])
-            error_kind, tries, versions = row["error_kind"], row["tries"], sys.intern(row["stage_versions"])
-            past = Past(row["attempt_id"], Kind(row["kind"]), is_current, -1, error_kind, tries, versions)
-            enter((row["clip_id"], row["expert"]), row["candidate_index"], past)
-        for row in _rows(self.samples, SAMPLE_STATE):
-            is_current = current(row["settings_hash"], row["stage_versions"], row["expert"], row["expert_digest"])
-            past = Past(row["attempt_id"], Kind.ACCEPTED, is_current, round=row["round"])
-            enter((row["clip_id"], row["expert"]), row["candidate_index"], past)
         return History(walks, {place: frozenset(ids) for place, ids in stale.items()}, listed_of(self.candidates))
 
     def commit(

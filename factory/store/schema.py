@@ -5,10 +5,12 @@ not depend on when or where it was made.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 
 import pyarrow as pa
 
 from factory.store.columns import BadRow, Column
+from factory.store.identity import Stamp
 from factory.store.table import TableSpec
 from tasks.subscores import HALVES, JUDGED, SUBSCORES, WHOLES
 
@@ -163,20 +165,11 @@ FIELDS: tuple[Column, ...] = (
     *_labels(),
 )
 SCHEMA = pa.schema([field.arrow_field for field in FIELDS], metadata={"schema_version": str(SCHEMA_VERSION)})
+LABEL_COLUMNS = tuple(field.name for field in _labels())
 COLUMNS: Mapping[str, Column] = {field.name: field for field in FIELDS}
 
 # What the executor fills in; everything else is the row that `Work.attempt` returns.
-BOOKKEEPING = (
-    "attempt_id",
-    "expert",
-    "expert_digest",
-    "round",
-    "candidate_index",
-    "vocabulary_digest",
-    "settings_hash",
-    "stage_versions",
-)
-
+BOOKKEEPING = tuple(field.name for field in fields(Stamp))
 
 LICENCES_PROPERTY = "factory.licences"  # of the table `samples`: the licences of its rows' sources, "; " between
 VERSION_PROPERTY = "factory.schema_version"  # of the table `samples`
@@ -208,16 +201,3 @@ def table_to_rows(table: pa.Table) -> list[dict[str, object]]:
     """The opposite: one dict per row with arrays in the declared shapes; only the columns the table has."""
     fields = [COLUMNS[name] for name in table.column_names]
     return [{field.name: field.to_python(table[field.name][i]) for field in fields} for i in range(table.num_rows)]
-
-
-def formats_table(fields: Sequence[Column] = FIELDS, prefix: str = "") -> str:
-    """The Markdown table of docs/formats.md."""
-    head = "" if prefix else "| name | dtype | shape | unit | frame | null | what |\n|---|---|---|---|---|---|---|\n"
-    lines = []
-    for f in fields:
-        shape = "x".join(map(str, f.shape)) or "-"
-        null = "yes" if f.nullable else ("NaN" if f.nan else "")
-        lines.append(f"| `{prefix}{f.name}` | {f.dtype} | {shape} | {f.unit} | {f.frame} | {null} | {f.about} |\n")
-        if f.members:
-            lines.append(formats_table(f.members, prefix=f"{f.name}."))
-    return head + "".join(lines)

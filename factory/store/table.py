@@ -14,9 +14,10 @@ import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any, get_args, get_origin, get_type_hints
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -25,9 +26,16 @@ from deltalake import CommitProperties, DeltaTable, Transaction
 from deltalake.exceptions import CommitFailedError
 from deltalake.transaction import AddAction, RemoveAction
 
+from factory.store.disk import needs_disk
 from factory.store.location import Location
-from factory.store.room import needs_room
 
+ARROW = {  # type of a dataclass' field -> of its column
+    str: pa.string(),
+    int: pa.int32(),
+    float: pa.float64(),
+    dict[str, int]: pa.map_(pa.string(), pa.int64()),
+    dict[str, float]: pa.map_(pa.string(), pa.float64()),
+}
 APP_ID = "driving-data-factory"
 ACTION_BYTES = 1024  # of the log, about, that a file added or removed takes
 SCHEMA_BYTES = 16 * 1024  # of the log, about, that a new table takes
@@ -55,6 +63,19 @@ class TableSpec:
     packed: tuple[str, ...] = ()  # leaves whose values are compressed already, as their paths in a file
 
 
+def schema_of(row: type) -> pa.Schema:
+    """The columns of a dataclass: its fields in their order."""
+
+    def arrow(hint: Any) -> pa.DataType:
+        if is_dataclass(hint):
+            return pa.struct(list(schema_of(hint)))  # type: ignore[arg-type]
+        if get_origin(hint) is tuple:
+            return pa.list_(arrow(get_args(hint)[0]))
+        return ARROW[hint]
+
+    return pa.schema([pa.field(name, arrow(hint)) for name, hint in get_type_hints(row).items()])
+
+
 @dataclass(frozen=True)
 class Shard:
     """One written, not yet committed file."""
@@ -79,10 +100,8 @@ def write_shard(location: Location, spec: TableSpec, rows: pa.Table) -> Shard:
     """Write rows of ONE partition, sorted by key, as one file under the table's folder. Idempotent.
 
     The partition's columns stand in the file too, where Delta does not need them: a file alone says what it holds.
-    Tables take them from the log all the same, so that files of versions that left them out are read alike.
-    Page checksums are on and row groups hold at most 4 MB, or one row. Arrow's own schema is left out of the file, so
-    that every engine reads plain lists as the Delta log says. The table's packed leaves are stored as they are: neither
-    zstd nor a dictionary makes a JPEG smaller, and every reader would have to undo them.
+    Row groups hold at most 4 MB, or one row. Without Arrow's own schema every engine reads plain lists as the Delta log
+    says. Packed leaves are stored as they are: neither zstd nor a dictionary makes a JPEG smaller.
     """
     rows = rows.select(spec.schema.names).cast(spec.schema).sort_by(spec.key)
     partition = {}
@@ -198,14 +217,7 @@ class KeyedTable:
         """One file's rows in the table's schema, page checksums verified."""
         schema = self.spec.schema if columns is None else pa.schema([self.spec.schema.field(c) for c in columns])
         stored = [name for name in schema.names if name not in partition]
-        rows = read_parquet(self.location, path, stored)
-        arrays = [
-            pa.repeat(pa.scalar(partition[f.name]).cast(f.type), rows.num_rows)
-            if f.name in partition
-            else rows[f.name].cast(f.type)
-            for f in schema
-        ]
-        return pa.table(arrays, schema=schema)
+        return with_partition(read_parquet(self.location, path, stored), schema, partition)
 
     def read(self, columns: Sequence[str] | None = None) -> pa.Table:
         """All rows."""
@@ -261,7 +273,7 @@ class KeyedTable:
         """One more commit, of metadata. Raises AnotherWriter."""
         table = self._delta if self._delta is not None else self._create()
         version = table.version()
-        with needs_room(f"{self.location.uri}/_delta_log", ACTION_BYTES):
+        with needs_disk(f"{self.location.uri}/_delta_log", ACTION_BYTES):
             table.alter.set_table_properties({name: value}, raise_if_not_exists=False)
         table.update_incremental()
         self._check_alone(version)
@@ -276,7 +288,7 @@ class KeyedTable:
         number = (table.transaction_version(APP_ID) or 0) + 1
         properties = CommitProperties(app_transactions=[Transaction(APP_ID, number)], max_commit_retries=0)
         try:
-            with needs_room(f"{self.location.uri}/_delta_log", ACTION_BYTES * (1 + len(actions))):
+            with needs_disk(f"{self.location.uri}/_delta_log", ACTION_BYTES * (1 + len(actions))):
                 table.create_write_transaction(
                     actions,
                     mode="append",
@@ -296,7 +308,7 @@ class KeyedTable:
             raise AnotherWriter(f"{self.spec.name}: another run has taken over {self.location.uri}")
 
     def _create(self) -> DeltaTable:
-        with needs_room(f"{self.location.uri}/_delta_log", SCHEMA_BYTES):
+        with needs_disk(f"{self.location.uri}/_delta_log", SCHEMA_BYTES):
             if self.location.is_local:
                 Path(self.location.uri).mkdir(parents=True, exist_ok=True)
             self._delta = DeltaTable.create(
@@ -312,12 +324,24 @@ class KeyedTable:
         return self._delta
 
 
+def with_partition(stored: pa.Table, schema: pa.Schema, partition: Mapping[str, object]) -> pa.Table:
+    """The columns of `schema` from what a file holds and what the log says of it."""
+    n = stored.num_rows
+    arrays = [
+        pa.repeat(pa.scalar(partition[f.name]).cast(f.type), n) if f.name in partition else stored[f.name].cast(f.type)
+        for f in schema
+    ]
+    return pa.table(arrays, schema=schema)
+
+
+def open_parquet(location: Location, path: str) -> pq.ParquetFile:
+    filesystem, base = location.filesystem()
+    return pq.ParquetFile(f"{base}/{path}", filesystem=filesystem, page_checksum_verification=True)
+
+
 def read_parquet(location: Location, path: str, columns: Sequence[str] | None) -> pa.Table:
     """Some columns of one Parquet file. Raises OSError naming the file for a damaged page."""
-    filesystem, base = location.filesystem()
     try:
-        return pq.ParquetFile(f"{base}/{path}", filesystem=filesystem, page_checksum_verification=True).read(
-            columns=list(columns) if columns is not None else None
-        )
+        return open_parquet(location, path).read(columns=list(columns) if columns is not None else None)
     except (OSError, pa.ArrowException) as error:
         raise OSError(f"{location.uri}/{path}: {error}") from error

@@ -11,7 +11,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from factory.store.room import existing, needs_room
+from factory.store.disk import existing, needs_disk
 from factory.wording import one_line
 
 TRIAL_BYTES = 4 * 2**20  # a row group, the least that samples with pictures are written in
@@ -43,10 +43,16 @@ def _why_not_local(out: str, path: Path, above: Path) -> str:
     trial = path / f".trial-{secrets.token_hex(8)}"
     try:
         path.mkdir(parents=True, exist_ok=True)
-        with needs_room(path, TRIAL_BYTES):
-            _try(trial)
+        with needs_disk(path, TRIAL_BYTES):
+            try:
+                with trial.open("wb") as file:
+                    file.write(bytes(TRIAL_BYTES))
+                    file.flush()
+                    os.fsync(file.fileno())
+            finally:  # before the free space is told
+                trial.unlink(missing_ok=True)
     except OSError as error:
-        if error.errno is None:  # NoRoom, which says it all
+        if error.errno is None:  # DiskFull, which says it all
             return f"out={out}: {error}"
         why = "no file can be made there" if error.errno == errno.ENOENT else error.strerror or str(error)
         return f"out={out}: cannot be written: {why}"
@@ -55,16 +61,6 @@ def _why_not_local(out: str, path: Path, above: Path) -> str:
             if place.is_dir():
                 place.rmdir()
     return ""
-
-
-def _try(trial: Path) -> None:
-    try:
-        with trial.open("wb") as file:
-            file.write(bytes(TRIAL_BYTES))
-            file.flush()
-            os.fsync(file.fileno())
-    finally:
-        trial.unlink(missing_ok=True)
 
 
 def _why_not_remote(out: str, scheme: str) -> str:

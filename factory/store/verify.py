@@ -31,9 +31,11 @@ def verify(store: Store) -> Verdict:
     orphans: list[str] = []
     for table in (store.samples, store.candidates, store.outcomes):
         damage += _damaged_files(table)
-        orphans += _orphans(table)
+        live, name = table.live_files(), table.spec.name
+        files = [file for file in table.location.names() if not file.startswith("_delta_log/")]
+        orphans += [f"{name}/{file}" for file in files if file not in live]
     if damage:
-        return Verdict(0, (*damage, "keys and rounds were not checked: mend the files first"), tuple(orphans))
+        return Verdict(0, (*damage, "keys and rounds were not checked: fix the files first"), tuple(orphans))
     damage += _twice(store) + _broken_rounds(store)
     broken, outdated = _episodes(store)
     damage, orphans = damage + broken, orphans + outdated
@@ -57,12 +59,6 @@ def _damaged_files(table: KeyedTable) -> list[str]:
             if values != [partition[name]]:
                 found.append(f"{table.spec.name}/{path}: {name} is {', '.join(values)}, the log says {partition[name]}")
     return found
-
-
-def _orphans(table: KeyedTable) -> list[str]:
-    live = set(table.live_files())
-    names = [name for name in table.location.names() if not name.startswith("_delta_log/")]
-    return [f"{table.spec.name}/{name}" for name in names if name not in live]
 
 
 def _twice(store: Store) -> list[str]:

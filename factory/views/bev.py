@@ -1,6 +1,7 @@
-"""Top-down pictures: map, agents and trajectories, drawn with OpenCV in a couple of milliseconds."""
+"""Top-down pictures: map, agents and trajectories, drawn with OpenCV in a couple of milliseconds; films of pictures."""
 
-from collections.abc import Sequence
+import os
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -120,9 +121,31 @@ def _polyline(image: Bytes, points: ShortInts, path: Path) -> None:
 
 def _captions(image: Bytes, title: str, paths: Sequence[Path]) -> None:
     height = image.shape[0]
-    if title:
-        cv2.putText(image, title, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (20, 20, 20), 1, cv2.LINE_AA)
+    write(image, title, (8, 18), 0.42)
     for row, path in enumerate(path for path in paths if path.label):
         y = height - 10 - 16 * row
         cv2.line(image, (8, y - 4), (26, y - 4), path.colour, 3, cv2.LINE_AA)
-        cv2.putText(image, path.label, (32, y), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (20, 20, 20), 1, cv2.LINE_AA)
+        write(image, path.label, (32, y))
+
+
+def write(image: Bytes, text: str, at: tuple[int, int], size: float = 0.4, colour: Colour = (20, 20, 20)) -> None:
+    """A line of text into the picture."""
+    cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)
+
+
+def write_mp4(path: "os.PathLike[str]", frames: Iterable[Bytes], frames_per_s: int = 10) -> None:
+    """RGB frames (height, width, 3), even sizes, as H.264 that browsers play. Raises ValueError without frames."""
+    import av
+
+    with av.open(str(path), "w") as container:
+        stream = None
+        for frame in frames:
+            if stream is None:
+                stream = container.add_stream("libx264", rate=frames_per_s)
+                stream.height, stream.width = frame.shape[:2]
+                stream.pix_fmt = "yuv420p"
+                stream.options = {"crf": "20", "movflags": "+faststart"}
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")))
+        if stream is None:
+            raise ValueError(f"{path}: a film needs at least one frame")
+        container.mux(stream.encode())

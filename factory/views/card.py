@@ -67,12 +67,12 @@ def _front_matter(samples: pa.Table, orphans: int) -> Iterator[str]:
     known = {name for text in licences for pattern, name in LICENCES.items() if re.match(pattern, text)}
     yield "---"
     yield MARK
-    yield f"pretty_name: {_quoted('Driving samples of ' + _datasets(samples))}"
+    yield f"pretty_name: {json.dumps('Driving samples of ' + _datasets(samples), ensure_ascii=False)}"
     if len(licences) == 1 and len(known) == 1:
         yield f"license: {known.pop()}"
     elif licences:
         yield "license: other"
-        yield f"license_name: {_quoted('; '.join(licences))}"
+        yield f"license_name: {json.dumps('; '.join(licences), ensure_ascii=False)}"
     yield "task_categories:\n- robotics"
     yield "tags:\n- autonomous-driving\n- end-to-end-driving\n- motion-planning\n- synthetic"
     yield "size_categories:"
@@ -139,10 +139,9 @@ def _funnel(funnel: Funnel) -> Iterator[str]:
     head = ("expert", "round", "tried", "accepted", "of attempts", "clips", "why not")
     rows = []
     for r in funnel.rows:
-        tried = r.accepted + r.rejected + r.failed
         why = ", ".join(f"{name} {n}" for name, n in r.reasons.items())
-        share = f"{100.0 * r.attempt_rate:.1f} %" if tried else "-"
-        rows.append((r.expert, r.round, tried, r.accepted, share, f"{r.clips} of {r.clips_before}", why))
+        share = f"{100.0 * r.attempt_rate:.1f} %" if r.tried else "-"
+        rows.append((r.expert, r.round, r.tried, r.accepted, share, f"{r.clips} of {r.clips_before}", why))
     yield from _table(head, rows)
 
 
@@ -232,10 +231,6 @@ def _datasets(samples: pa.Table) -> str:
 def _plain(text: str) -> str:
     """One line without markup: names come from data."""
     return " ".join(text.split()).replace("<", "&lt;")
-
-
-def _quoted(text: str) -> str:
-    return json.dumps(text, ensure_ascii=False)  # a YAML string too
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[object]] | Sequence[tuple[str, str]]) -> Iterator[str]:

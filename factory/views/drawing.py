@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 
-from factory.views.bev import EXPERT, LOGGED, PERTURBED, Boxes, MapShapes, Path, draw_bev
+from factory.views.bev import EXPERT, LOGGED, PERTURBED, Boxes, MapShapes, Path, draw_bev, write
 from tasks.attempt import Judged
 from tasks.perturb import Candidate, Considered
 from tasks.world.arrays import Image
@@ -41,25 +41,26 @@ def attempt_picture(
     clip: Clip, candidate: Candidate | None, judged: Judged | None, title: str, size_px: tuple[int, int] = (480, 480)
 ) -> Image:
     """Logged, perturbed, planned and driven way of one attempt, with the agents at the scene's instant."""
-    paths = [Path(clip.ego_states[NOW:, : HEADING + 1], LOGGED, "logged", dashed=True)]
-    if candidate is not None:
-        paths.append(Path(candidate.rollout.ego_states, PERTURBED, "perturbed"))
     if judged is not None:
-        paths.append(Path(judged.rollout.ego_states, EXPERT, "expert (simulated)"))
         step, ego, boxes = judged.scene.step, judged.scene.ego_state, judged.rollout.agents.boxes[0]
         kinds: Sequence[str] = judged.rollout.agents.kinds
     elif candidate is not None:
-        rollout = candidate.rollout
-        step, ego, boxes, kinds = (
-            rollout.start_step + 40,
-            rollout.ego_states[-1],
-            rollout.agents.boxes[-1],
-            clip.agents.kinds,
-        )
+        rollout, kinds = candidate.rollout, clip.agents.kinds
+        step, ego, boxes = rollout.start_step + 40, rollout.ego_states[-1], rollout.agents.boxes[-1]
     else:
         step, ego, boxes, kinds = NOW, clip.ego_states[NOW], clip.agents.boxes[NOW], clip.agents.kinds
     pose = ego[: HEADING + 1]
-    return draw_bev(pose, map_shapes(clip, step), Boxes(boxes, kinds), pose, paths, title, size_px)
+    ways = _ways(clip, candidate, judged, "expert (simulated)")
+    return draw_bev(pose, map_shapes(clip, step), Boxes(boxes, kinds), pose, ways, title, size_px)
+
+
+def _ways(clip: Clip, candidate: Candidate | None, judged: Judged | None, expert: str) -> list[Path]:
+    ways = [Path(clip.ego_states[NOW:, : HEADING + 1], LOGGED, "logged", dashed=True)]
+    if candidate is not None:
+        ways.append(Path(candidate.rollout.ego_states, PERTURBED, "perturbed"))
+    if judged is not None:
+        ways.append(Path(judged.rollout.ego_states, EXPERT, expert))
+    return ways
 
 
 def candidates_picture(clip: Clip, considered: Considered, size_px: tuple[int, int] = (720, 720)) -> Image:
@@ -87,27 +88,13 @@ def candidates_picture(clip: Clip, considered: Considered, size_px: tuple[int, i
     for row, (fate, colour) in enumerate(FATE_COLOURS.items()):
         count = sum(f == fate for f in considered.fate)
         cv2.circle(image, (14, height - 14 - 16 * row), 4, colour, -1, cv2.LINE_AA)
-        cv2.putText(
-            image,
-            f"{fate} {count}",
-            (24, height - 10 - 16 * row),
-            cv2.FONT_HERSHEY_SIMPLEX,
-            0.4,
-            (20, 20, 20),
-            1,
-            cv2.LINE_AA,
-        )
+        write(image, f"{fate} {count}", (24, height - 10 - 16 * row))
     return image
 
 
 def film(clip: Clip, candidate: Candidate, judged: Judged, size_px: tuple[int, int] = (480, 480)) -> Iterator[Image]:
     """Both rollouts at 10 Hz, T .. T+2H, one picture a step."""
-    logged = Path(clip.ego_states[NOW:, : HEADING + 1], LOGGED, "logged", dashed=True)
-    ways = [
-        logged,
-        Path(candidate.rollout.ego_states, PERTURBED, "perturbed"),
-        Path(judged.rollout.ego_states, EXPERT, "expert"),
-    ]
+    ways = _ways(clip, candidate, judged, "expert")
     for stage, rollout in enumerate((candidate.rollout, judged.rollout)):
         for row in range(stage, len(rollout.ego_states)):
             step = rollout.start_step + row

@@ -7,7 +7,6 @@ float32 of a screen; `ego` moves; each camera's frame hangs on `ego`.
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,12 +20,11 @@ from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
-from google.protobuf.message import Message as ProtobufMessage
 from google.protobuf.timestamp_pb2 import Timestamp
 from scipy.spatial.transform import Rotation
 
 from factory.store.columns import Column
-from factory.store.episodes import episode_bytes
+from factory.store.episodes import Message, episode_bytes
 from factory.store.schema import FIELDS, NOW_INDEX
 from factory.views.bev import AGENT_COLOURS, EXPERT, LOGGED, OBJECT, PERTURBED, Colour
 from factory.views.sample_picture import ego_way
@@ -44,15 +42,6 @@ EGO_HEIGHT_M = 1.777  # of the body that PACIFICA is; nothing is scored by it
 LINE_M, TRAJECTORY_M = 0.08, 0.25
 ROAD, LANE, CENTRE, CROSSING, ROUTE = (120, 120, 120), (170, 170, 170), (90, 120, 150), (200, 180, 90), (90, 170, 110)
 OURS: Colour = (60, 120, 220)
-
-
-@dataclass(frozen=True)
-class Message:
-    """What stands under a topic at a time; a mapping is to be written as JSON."""
-
-    topic: str
-    time_ns: int
-    content: ProtobufMessage | Mapping[str, Any]
 
 
 def episode_messages(row: Row, logged: Array | None = None) -> list[Message]:
@@ -79,7 +68,12 @@ def episode_of(row: Row, logged: Array | None = None) -> bytes:
 
 def facts_of(row: Row) -> dict[str, Any]:
     """Lineage, licence, scores and tags of a row, as JSON has them."""
-    facts = {field.name: _plain(row[field.name]) for field in FIELDS if _is_fact(field)}
+
+    def is_small(field: Column) -> bool:
+        small = not field.shape and field.dtype != "binary"
+        return small or field.name in ("ego_status", "candidate_end", "tags", "now_pose")
+
+    facts = {field.name: _plain(row[field.name]) for field in FIELDS if is_small(field)}
     for stage in ("stage1", "stage2"):
         facts[stage] = {name: facts.pop(f"{stage}_{name}") for name in (*SUBSCORES, "score")}
         fails = {name: facts.pop(f"{stage}_{name}_fails_s") for name in JUDGED}
@@ -91,11 +85,6 @@ def facts_of(row: Row) -> dict[str, Any]:
 def metadata_of(row: Row) -> dict[str, str]:
     """What tells a sample from others, and who may use it."""
     return {name: str(row[name]) for name in IDENTITY}
-
-
-def _is_fact(field: Column) -> bool:
-    small = not field.shape and field.dtype != "binary"
-    return small or field.name in ("ego_status", "candidate_end", "tags", "now_pose")
 
 
 def _plain(value: Any) -> Any:

@@ -7,6 +7,7 @@ follows from their ids.
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import islice
 from typing import Any, TypeVar
 
@@ -15,17 +16,16 @@ from factory.graph.work import PreparedClip
 from factory.readers.base import BadClip, ClipRef
 from factory.stages.pipeline import FactoryWork, PerturbedClip, payload_of
 from factory.store.cache import BadCacheFile
-from factory.store.reader import SampleTable
+from factory.store.reader import SampleTable, decoded
 from factory.store.samples import Store
 from factory.views.drawing import attempt_picture
 from factory.views.sample_picture import (
-    decoded,
     earlier_images,
     encoded,
-    fitted,
     front_camera,
     images_at_now,
     nearer,
+    small_jpeg,
 )
 from factory.views.seen_again import VIEW_COLUMNS, Seen, from_the_side, photographed, real_and_rendered, scene_of
 from tasks.render.settings import ImageSource
@@ -48,18 +48,6 @@ class Picture:
     data: bytes | None
     caption: str
     detail: str = ""
-
-
-@dataclass(frozen=True)
-class Strip:
-    """What the cameras of one sample saw."""
-
-    title: str
-    source: str
-    now: tuple[Picture, ...]
-    earlier: tuple[Picture, ...] = ()
-    photos: tuple[Picture, ...] = ()  # the log's, each followed by the scene seen from its pose
-    aside: tuple[Picture, ...] = ()  # the same instant from beside the ego
 
 
 def spread(rows: Iterable[T], keys: Callable[[T], Sequence[Hashable]], order: Callable[[T], str]) -> list[T]:
@@ -95,8 +83,11 @@ def rejected_examples(rejected: Sequence[Row], picture: Callable[[Row], Picture 
     return list(islice(made, N_EXAMPLES))
 
 
-def strips_of(store: Store) -> list[Strip]:
-    """What the cameras of a few samples saw, each with the log's photos beside renderings where its scene is kept."""
+def strips_of(store: Store) -> list[dict[str, Any]]:
+    """What the cameras of a few samples saw, each a title, a source and rows of pictures.
+
+    photos: the log's, each followed by the scene seen from its pose, where that is kept; aside: from beside the ego.
+    """
     labels = store.samples.read(LABELS).to_pylist()
     pictured = [row for row in labels if row["image_source"] != "none"]
     if not pictured:
@@ -108,15 +99,15 @@ def strips_of(store: Store) -> list[Strip]:
         sample = table.sample(row["attempt_id"], VIEW_COLUMNS)
         front = front_camera(sample)
         earlier = earlier_images(sample, front) if front is not None else []
-        strips.append(
-            Strip(
-                f"{row['expert']}, round {row['round']}, log {row['log_id']}, sample {row['attempt_id']}",
-                row["image_source"],
-                tuple(_frame(image, CAMERA_PX) for image in images_at_now(sample)),
-                tuple(_frame(image, CAMERA_PX // 2) for image in earlier) if len(earlier) > 1 else (),
-                *(_seen_again(store, sample) if row["image_source"] == ImageSource.RENDER else ()),
-            )
-        )
+        photos, aside = _seen_again(store, sample) if row["image_source"] == ImageSource.RENDER else ((), ())
+        rows: dict[str, Sequence[Picture]] = {
+            "now": [_frame(image, CAMERA_PX) for image in images_at_now(sample)],
+            "earlier": [_frame(image, CAMERA_PX // 2) for image in earlier] if len(earlier) > 1 else [],
+            "photos": photos,
+            "aside": aside,
+        }
+        title = f"{row['expert']}, round {row['round']}, log {row['log_id']}, sample {row['attempt_id']}"
+        strips.append({"title": title, "source": row["image_source"], "rows": rows})
     return strips
 
 
@@ -129,21 +120,19 @@ def _seen_again(store: Store, sample: Row) -> tuple[tuple[Picture, ...], tuple[P
     now_s = sample["clip_start_s"] + sample["now_s"]
     pairs = [] if photos is None else real_and_rendered(scene, photos, now_s, (front_camera(photos) or "",))
     shown = [seen for pair in pairs for seen in pair]
-    return tuple(_again(seen) for seen in shown), tuple(_again(seen) for seen in from_the_side(scene, sample))
+    return tuple(map(_again, shown)), tuple(map(_again, from_the_side(scene, sample)))
 
 
 def _again(seen: Seen) -> Picture:
-    height = round(CAMERA_PX * seen.pixels.shape[0] / seen.pixels.shape[1])
-    return Picture(encoded(fitted(seen.pixels, CAMERA_PX, height)), seen.caption)
+    return Picture(small_jpeg(seen.pixels, CAMERA_PX), seen.caption)
 
 
 def _frame(image: Mapping[str, Any], width: int) -> Picture:
     caption = f"{image['camera']} {image['time_s']:+.1f} s"
     try:
-        pixels = decoded(image)
+        return Picture(small_jpeg(decoded(image), width), caption)
     except ValueError as error:
         return Picture(None, str(error))
-    return Picture(encoded(fitted(pixels, width, round(width * pixels.shape[0] / pixels.shape[1]))), caption)
 
 
 class Again:
@@ -152,7 +141,7 @@ class Again:
     def __init__(self, store: Store, work: FactoryWork, refs: Mapping[str, ClipRef]) -> None:
         self._store, self._work, self._refs = store, work, refs
         self._prepared_again = 0
-        self._known: dict[str, PreparedClip | None] = {}
+        self._clip = cache(self._load)
 
     def picture(self, outcome: Row) -> Picture | None:
         """A rejected attempt; None where its clip is not at hand or it was made with other settings."""
@@ -168,11 +157,6 @@ class Again:
         if trace.rejected is not None and trace.rejected.reason != outcome["reason"]:
             detail = f"made again it fell to {trace.rejected.reason}: this attempt is not reproducible. {detail}"
         return Picture(encoded(nearer(image)), caption, detail)
-
-    def _clip(self, clip_id: str) -> PreparedClip | None:
-        if clip_id not in self._known:
-            self._known[clip_id] = self._load(clip_id)
-        return self._known[clip_id]
 
     def _load(self, clip_id: str) -> PreparedClip | None:
         try:

@@ -7,9 +7,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from factory.store.reader import labels_of
+from factory.store.reader import decoded, labels_of
 from factory.store.schema import NOW_INDEX
-from factory.views.bev import BACKGROUND, EXPERT, LOGGED, PERTURBED, Boxes, Colour, MapShapes, Path, draw_bev
+from factory.views.bev import BACKGROUND, EXPERT, LOGGED, PERTURBED, Boxes, Colour, MapShapes, Path, draw_bev, write
 from tasks.world.arrays import Array, Image
 from tasks.world.frames import to_local
 from tasks.world.lanes import LightState
@@ -47,15 +47,10 @@ def sample_bev(
     step: int = NOW_INDEX,
     legend: bool = True,
 ) -> Image:
-    """A sample from above, at its now or another step, the ego pointing up.
+    """A sample (BEV_COLUMNS) from above, at its now or another 10 Hz step -1.5 .. 4.0 s around it, the ego pointing up.
 
-    Args:
-        row: at least BEV_COLUMNS of a sample.
-        logged: (M, >=3) the log's drive from T on, world frame; None: the row's own two logged poses are joined.
-        size_px: width, height.
-        vocabulary: (K, 40, 3) the trajectories that the row's labels are of, to be drawn in the colour of their score.
-        step: index of the row's 10 Hz steps, -1.5 .. 4.0 s around now.
-        legend: whether the paths' names are written below.
+    logged: (M, >=3) the log's drive from T on, world frame; None: the row's own two logged poses are joined.
+    vocabulary: (K, 40, 3) that the row's labels are of, to be drawn in the colour of their score.
     """
     lanes = dict(zip(row["lane_ids"], row["lane_polygons"]))
     red = {
@@ -144,15 +139,6 @@ def front_camera(row: Row) -> str | None:
     )
 
 
-def decoded(image: Mapping[str, Any]) -> Image:
-    """RGB (height, width, 3). Raises ValueError where the bytes are no picture."""
-    data = np.frombuffer(image["jpeg"], np.uint8)
-    pixels = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
-    if pixels is None:
-        raise ValueError(f"image of camera {image['camera']} at {image['time_s']:.1f} s cannot be decoded")
-    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), dtype=np.uint8)
-
-
 def fitted(image: Image, width: int, height: int) -> Image:
     """The image scaled into width x height pixels, its aspect kept, padded with the background."""
     scale = min(width / image.shape[1], height / image.shape[0])
@@ -170,6 +156,11 @@ def encoded(image: Image, suffix: str = ".jpg") -> bytes:
     done, data = cv2.imencode(suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR), options)
     assert done, f"OpenCV cannot write {suffix}"
     return bytes(data)
+
+
+def small_jpeg(image: Image, width: int) -> bytes:
+    """RGB scaled to a width, as the bytes of a JPEG."""
+    return encoded(fitted(image, width, max(1, round(width * image.shape[0] / image.shape[1]))))
 
 
 def sample_sheet(row: Row, logged: Array | None = None, bev_px: int = 720, vocabulary: Array | None = None) -> Image:
@@ -213,7 +204,7 @@ def note(text: str) -> Image:
 
 
 def _written(tile: Image, text: str, baseline: int) -> Image:
-    cv2.putText(tile, text, (8, baseline), cv2.FONT_HERSHEY_SIMPLEX, 0.42, INK, 1, cv2.LINE_AA)
+    write(tile, text, (8, baseline), 0.42, INK)
     return tile
 
 

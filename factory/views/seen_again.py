@@ -12,15 +12,14 @@ from typing import Any
 import numpy as np
 
 from factory.stages.scene_file import BadScene, find_scene
-from factory.store.reader import SampleTable
+from factory.store.reader import SampleTable, decoded
 from factory.store.samples import Store
-from factory.store.schema import AGENT_STEPS, NOW_INDEX
+from factory.store.schema import AGENT_STEPS, NOW_INDEX, SCHEMA
 from factory.views.bev import BACKGROUND
 from factory.views.sample_picture import (
     BEV_COLUMNS,
     CAPTION_PX,
     beside,
-    decoded,
     ego_way,
     front_camera,
     in_rows,
@@ -46,18 +45,9 @@ ASIDE_M = (2.0, 1.0, 0.0, -1.0, -2.0)  # left is positive, and on the left of th
 STRIP_PX = (320, 180 + CAPTION_PX + 4)
 HOLD_S = 0.5  # how long a stored image stands in a film: they are taken at 2 Hz,
 SLACK_S = 0.06  # give or take this much
-AGENT_COLUMNS = (
-    "now_pose",
-    "agent_ids",
-    "agent_kinds",
-    "agent_boxes",
-    "agent_velocities",
-    "agent_valid",
-    "agent_heights",
-    "agent_center_z",
-)
 VIEW_COLUMNS = (
-    *dict.fromkeys((*BEV_COLUMNS, *AGENT_COLUMNS)),
+    *BEV_COLUMNS,
+    *(name for name in SCHEMA.names if name.startswith("agent_") and name not in BEV_COLUMNS),
     "attempt_id",
     "clip_id",
     "log_id",
@@ -117,9 +107,7 @@ def photographed(store: Store, row: Row, asset: RenderAsset) -> dict[str, Any] |
 def real_and_rendered(
     asset: RenderAsset, photos: Row, at_s: float, only: Sequence[str] = ()
 ) -> list[tuple[Seen, Seen]]:
-    """For each camera the photo nearest to a time since the log's first instant, and the scene from the same pose.
-
-    Cameras that look to the left come first, as they stand side by side.
+    """For each camera, left ones first, the photo nearest to a time of the log, and the scene from the same pose.
 
     `photos`: VIEW_COLUMNS of a human sample, whose agents are the log's; `only` these cameras, all for none.
     """
@@ -167,14 +155,16 @@ def from_the_side(asset: RenderAsset, row: Row) -> list[Seen]:
     return out
 
 
-def again_sheet(pairs: Sequence[tuple[Seen, Seen]], strip: Sequence[Seen]) -> Image | None:
-    """Photos over their renderings, and the strip below; None for neither."""
-    parts = []
-    if pairs:
-        shown = [*(photo for photo, _ in pairs), *(again for _, again in pairs)]
-        parts.append(in_rows([tile(s.pixels, s.caption, STRIP_PX) for s in shown], len(pairs)))
-    if strip:
-        parts.append(in_rows([tile(s.pixels, s.caption, STRIP_PX) for s in strip], len(strip)))
+def again_sheet(store: Store, row: Row, scene: RenderAsset) -> Image | None:
+    """The log's photos nearest in time over their renderings, and below the row's now from the side; None: neither."""
+    photos, strip = photographed(store, row, scene), from_the_side(scene, row)
+    pairs = [] if photos is None else real_and_rendered(scene, photos, _now(row))
+    shown = [*(photo for photo, _ in pairs), *(again for _, again in pairs)]
+    parts = [
+        in_rows([tile(s.pixels, s.caption, STRIP_PX) for s in seen], columns)
+        for seen, columns in ((shown, len(pairs)), (strip, len(strip)))
+        if seen
+    ]
     return stacked(parts) if parts else None
 
 

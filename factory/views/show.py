@@ -1,14 +1,14 @@
 """One sample in words: which is meant, its numbers, its labels, the log's own drive."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from factory.config.arguments import Refused
+from factory.views.status import fate
 
 if TYPE_CHECKING:
+    from factory.graph.work import PreparedClip
     from factory.store.samples import Store
-    from factory.views.seen_again import Seen
-    from tasks.render.scene.asset import RenderAsset
     from tasks.world.arrays import Array
 
 
@@ -32,21 +32,8 @@ def find(store: "Store", which: str) -> str:
         raise Refused(f"sample={which} is the beginning of {len(found)} ids: {', '.join(found[:8])}")
     dropped = [row for row in store.outcomes.read().to_pylist() if row["attempt_id"].startswith(which)]
     if len(dropped) == 1:
-        row = dropped[0]
-        why = row["error"] or f"{row['stage']}.{row['reason']} {row['detail']}".strip(". ")
-        raise Refused(f"{row['attempt_id']} is no sample but a {row['kind']} attempt of {row['expert']}: {why}")
+        raise Refused(fate(dropped[0]))
     raise Refused(f"no sample {which}: ids begin otherwise, ordinals go from 0 to {len(ids) - 1}; see list=true")
-
-
-def seen_again(
-    store: "Store", row: dict[str, Any], scene: "RenderAsset"
-) -> "tuple[list[tuple[Seen, Seen]], list[Seen]]":
-    """The log's photos nearest in time with their renderings, and the row's now from the side."""
-    from factory.views.seen_again import from_the_side, photographed, real_and_rendered
-
-    photos = photographed(store, row, scene)
-    pairs = [] if photos is None else real_and_rendered(scene, photos, row["clip_start_s"] + row["now_s"])
-    return pairs, from_the_side(scene, row)
 
 
 def labelled_trajectories(row: dict[str, Any], file: str | None) -> "Array | None":
@@ -100,6 +87,14 @@ def logged_drive(store: "Store", row: dict[str, Any]) -> "Array | None":
         return logged_poses(store.cache.load(cache_key(row["clip_id"], digests[row["settings_hash"]])))
     except BadCacheFile:
         return None
+
+
+def prepared_episode(row: Mapping[str, Any], prepared: "PreparedClip") -> bytes:
+    """The sample as one MCAP file, with the log's drive from its prepared clip; for workers of a run."""
+    from factory.stages.pipeline import logged_poses
+    from factory.views.episode_messages import episode_of
+
+    return episode_of(row, logged_poses(prepared))
 
 
 def number_lines(row: dict[str, Any]) -> Iterable[str]:

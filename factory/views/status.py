@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from factory.store.samples import Store
 
 RETRY = {
-    "input": "mend or take out the named file, then python -m factory retry out=...",
-    "bug": "python -m factory retry out=..., once the code or the plug-in is mended",
+    "input": "fix or take out the named file, then python -m factory retry out=...",
+    "bug": "python -m factory retry out=..., once the code or the plug-in is fixed",
     "system": "the next run of the same command tries it again by itself",
     "poison": "it brought workers down in several runs; python -m factory retry out=... tries it once more",
 }
@@ -51,6 +51,8 @@ def open_store(out: str) -> "Store":
 
 def status_lines(store: "Store") -> Iterable[str]:
     """Tables, counts, funnel and the newest run."""
+    from factory.store.funnel import funnel_of
+
     samples = store.samples.read(["expert", "round", "split", "image_source", "dataset"]).to_pylist()
     outcomes = Counter(store.outcomes.read(["kind"])["kind"].to_pylist())
     yield f"store       {store.location.uri}"
@@ -62,7 +64,7 @@ def status_lines(store: "Store") -> Iterable[str]:
         yield f"{title:<14}" + (", ".join(f"{name} {n}" for name, n in sorted(counts.items())) or "no samples")
     yield "not samples   " + (", ".join(f"{kind} {n}" for kind, n in sorted(outcomes.items())) or "none")
     yield ""
-    yield funnel_text(store)
+    yield funnel_of(store).text().rstrip()
     yield ""
     yield from _last_run(store)
 
@@ -84,19 +86,10 @@ def _last_run(store: "Store") -> Iterable[str]:
         yield f"report        {store.location.uri}/report.html"
 
 
-def funnel_text(store: "Store") -> str:
-    """The funnel as a table."""
-    from factory.store.funnel import funnel_of
-
-    return funnel_of(store).text().rstrip()
-
-
 def failed_line(store: "Store") -> str:
     """What failed, how often, how the first error ends, and what shows all of it; for the end of a run."""
-    rows = [row for row in store.outcomes.read().to_pylist() if row["kind"] == "failed"]
-    kinds = Counter(row["error_kind"] for row in rows)
-    counts = ", ".join(f"{kind} {n}" for kind, n in sorted(kinds.items()))
-    first = min(rows, key=_place)
+    rows, kinds = _failed(store)
+    counts, first = ", ".join(f"{kind} {n}" for kind, n in kinds.items()), rows[0]
     where = f"{first['expert']} on clip {first['clip_id']}" if first["expert"] else f"clip {first['clip_id']}"
     said = (first["error"].strip().splitlines() or ["no message"])[-1]
     return (
@@ -105,21 +98,29 @@ def failed_line(store: "Store") -> str:
     )
 
 
-def _place(row: Mapping[str, Any]) -> tuple[Any, ...]:
-    return row["log_id"], row["clip_id"], row["expert"], row["candidate_index"]
+def fate(row: Mapping[str, Any]) -> str:
+    """What became of an attempt that is no sample, from its row of outcomes."""
+    why = row["error"] or f"{row['stage']}.{row['reason']} {row['detail']}".strip(". ")
+    return f"{row['attempt_id']} is no sample but a {row['kind']} attempt of {row['expert'] or 'a clip'}: {why}"
+
+
+def _failed(store: "Store") -> tuple[list[dict[str, Any]], dict[str, int]]:
+    """By log, clip and walk; how many of each kind of error."""
+    rows = [row for row in store.outcomes.read().to_pylist() if row["kind"] == "failed"]
+    rows.sort(key=lambda row: (row["log_id"], row["clip_id"], row["expert"], row["candidate_index"]))
+    return rows, dict(sorted(Counter(row["error_kind"] for row in rows).items()))
 
 
 def failed_lines(store: "Store") -> Iterable[str]:
     """Every failed attempt with its message, and how to try it again."""
-    rows = [row for row in store.outcomes.read().to_pylist() if row["kind"] == "failed"]
-    kinds = Counter(row["error_kind"] for row in rows)
-    yield f"{len(rows)} failed" + (": " + ", ".join(f"{kind} {n}" for kind, n in sorted(kinds.items())) if rows else "")
-    for row in sorted(rows, key=_place):
+    rows, kinds = _failed(store)
+    yield f"{len(rows)} failed" + (": " + ", ".join(f"{kind} {n}" for kind, n in kinds.items()) if rows else "")
+    for row in rows:
         what = f"expert {row['expert']}, candidate {row['candidate_index']}" if row["expert"] else "the clip as a whole"
         yield ""
         yield f"{row['attempt_id']}  {row['error_kind']}, tried in {row['tries']} runs"
         yield f"  log {row['log_id']}, clip {row['clip_id']}, {what}"
         yield from (f"  | {line}" for line in row["error"].splitlines())
-    for kind in sorted(kinds):
+    for kind in kinds:
         yield ""
         yield f"to retry {kind}: {RETRY[kind]}"

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from factory.store.columns import Column
-from factory.store.reader import LABEL_COLUMNS, TIME_TOLERANCE_S, labels_of
-from factory.store.schema import COLUMNS
+from factory.store.reader import TIME_TOLERANCE_S, labels_of
+from factory.store.schema import COLUMNS, LABEL_COLUMNS
 from planners.data.batch import COMMANDS, Batch, BevLayout, ImageLayout, Needs
 from planners.data.feed import AGENT_COLUMNS, BEV_COLUMNS
 from planners.data.images import stitch

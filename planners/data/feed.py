@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import pyarrow as pa
 
-from factory.store.reader import LABEL_COLUMNS, TIME_TOLERANCE_S
+from factory.store.reader import TIME_TOLERANCE_S
+from factory.store.schema import LABEL_COLUMNS
 from planners.data.batch import ImageLayout, Needs
 from planners.data.files import group_bytes, group_rows, leaves
 from planners.data.images import chosen_cameras

@@ -11,9 +11,9 @@ from typing import Any
 
 from factory.config.compose import ConfigError
 from factory.stages.benchmark import BENCHMARK_FILE, FORMAT
+from factory.store.cache import SceneFiles
 from factory.store.location import Location
 from factory.store.reader import Sample, SampleTable
-from factory.store.scenes import SceneFiles
 from planners.evaluation.frames import ClipScenes, FrameKey, FramePair
 
 IDENTITY = ("attempt_id", "clip_id", "expert", "candidate_index", "image_source", "settings_hash", "stage_versions")

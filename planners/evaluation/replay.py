@@ -13,12 +13,11 @@ import cv2
 import numpy as np
 
 from factory.config.compose import ConfigError, fill
-from factory.store.reader import Sample
-from factory.views.bev import EXPERT, LOGGED, PERTURBED, Boxes, draw_bev
+from factory.store.reader import Sample, decoded
+from factory.views.bev import EXPERT, LOGGED, PERTURBED, Boxes, draw_bev, write_mp4
 from factory.views.bev import Path as Way
 from factory.views.drawing import map_shapes
-from factory.views.sample_picture import decoded, earlier_images, fitted, front_camera
-from factory.views.video import write_mp4
+from factory.views.sample_picture import earlier_images, fitted, front_camera
 from planners.command import command
 from planners.evaluation.benchmark_folder import BenchmarkFolder
 from planners.evaluation.evaluate import check_needs

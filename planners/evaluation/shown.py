@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from factory.store.reader import LABEL_COLUMNS, Sample
-from factory.store.schema import NOW_INDEX, SCHEMA
+from factory.store.reader import Sample
+from factory.store.schema import LABEL_COLUMNS, NOW_INDEX, SCHEMA
 from planners.data.batch import Batch, BevLayout, ImageLayout, Needs
 from planners.data.bev import bev_raster
 from planners.data.decode import BatchBuffer, StoredRows

@@ -10,8 +10,9 @@ import pyarrow.parquet as pq
 from factory.config.run import load_config
 from factory.graph.execute import execute
 from factory.setup.settings import assemble
-from factory.store.reader import LABEL_COLUMNS, SampleTable, labels_of
+from factory.store.reader import SampleTable, labels_of
 from factory.store.samples import Store
+from factory.store.schema import LABEL_COLUMNS
 from tests.bench.timing import milliseconds
 from tests.real.reference_scenes import loader
 

@@ -35,7 +35,7 @@ UNSEEN = {  # declared without an import statement of ours
     "packaging": "torch.utils.cpp_extension imports it when gsplat compiles",
     "tensorboard": "torch.utils.tensorboard imports it",
 }
-RAY_ONLY = {"factory/graph/on_ray.py", "factory/graph/ray_metrics.py"}  # loaded by executor=ray alone
+RAY_ONLY = {"factory/graph/on_ray.py"}  # loaded by executor=ray alone
 GPU = re.compile(r"torch|triton|nvidia|cuda|cudnn|nccl|gsplat")
 
 
@@ -135,7 +135,7 @@ def test_the_small_install_looks_at_a_finished_run(tmp_path: Path) -> None:
     execute(FilmedWork(), refs(2), ["recovery", "human"], 1, Store(tmp_path / "out"), "local", say=lambda line: None)
     code = (
         "from factory.__main__ import main\n"
-        "for words in ('status', 'funnel', 'failed', 'lineage sample=0', 'show sample=0 to=.', 'report', 'verify'):\n"
+        "for words in ('status', 'failed', 'lineage sample=0', 'show sample=0 to=.', 'report', 'verify'):\n"
         "    name, *rest = words.split()\n"
         "    assert main([name, 'out=out', *rest]) == 0, words\n"
         "assert main(['export', 'mcap', 'out=out', 'sample=0']) == 0\n"

@@ -10,9 +10,9 @@ import numpy as np
 
 from factory.stages.benchmark import BENCHMARK_FILE
 from factory.stages.rows import sample_row
+from factory.store.cache import SceneFiles
 from factory.store.location import Location
 from factory.store.samples import Store
-from factory.store.scenes import SceneFiles
 from factory.store.schema import COLUMNS, SAMPLES, sample_row_to_table
 from factory.store.table import write_shard
 from planners.evaluation.frames import ClipScenes, FrameKey, FramePair

@@ -6,11 +6,11 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from factory.graph.steps import Stamp
 from factory.stages.rows import label_columns
-from factory.store.reader import LABEL_COLUMNS, SampleTable, labels_of
+from factory.store.identity import Stamp
+from factory.store.reader import SampleTable, labels_of
 from factory.store.samples import Store
-from factory.store.schema import SAMPLES, sample_row_to_table
+from factory.store.schema import LABEL_COLUMNS, SAMPLES, sample_row_to_table
 from factory.store.table import write_shard
 from tasks.reward.label_bytes import UNITS_PER_M, VocabularyLabels
 from tasks.subscores import JUDGED, RECORDS

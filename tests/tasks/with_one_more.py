@@ -10,7 +10,6 @@ from factory.store.funnel import funnel_of_rows
 from factory.store.outcomes import Kind
 from factory.store.reader import labels_of
 from factory.store.schema import COLUMNS as STORED
-from factory.store.schema import formats_table
 from factory.views.board.overview import _reasons
 from factory.views.report_words import REASON_WORDS
 from planners.data.batch import Needs
@@ -22,6 +21,7 @@ from tasks.reward.epdms import Scores, human_filtered, rows, score, score_with_e
 from tasks.reward.label_bytes import ARRAYS, N_PLANES, VocabularyLabels
 from tasks.reward.one_stage import COLUMNS, columns_of
 from tasks.stages import STAGES
+from tests.factory.store.formats import formats_table
 from tests.tasks.reward.straight_street import drive, street
 from tests.tasks.test_subscores import docs_table
 
@@ -74,7 +74,7 @@ def told(scores: Scores) -> None:
     outcome |= {"expert_digest": "d", "settings_hash": "s", "stage_versions": "{}"}
     funnel = funnel_of_rows([], [outcome], [], [])
     assert funnel.rows[0].reasons == {"reward.sl": 1} and "sl 1" in funnel.text()
-    assert _reasons(funnel)[0].words == REASON_WORDS["sl"] == "drove too fast"
+    assert _reasons(funnel)[0]["words"] == REASON_WORDS["sl"] == "drove too fast"
     assert "| SL | `speed_limit_compliance` | 0, 1 | weighs 3 | 2m | drove too fast |" in docs_table()
 
 

@@ -1,232 +1,87 @@
 """The numbers of the overview, from one snapshot: what GET /api/overview answers.
 
-Every type is a frozen dataclass whose fields are the JSON's. A share that is not defined is null.
+A share or a time that is not defined is null; names end in their unit, `_ms` is since 1970.
 """
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from factory.store.funnel import Funnel, funnel_of_rows
+from factory.store.funnel import Funnel
 from factory.store.outcomes import Kind
+from factory.views.board.gallery import FILTERS
 from factory.views.board.watch import Snapshot
 from factory.views.report_words import GATE_WORDS, PAPER_CLIP_PERCENT, REASON_WORDS, STATUS
+from tasks.stages import STAGES
 
-STAGES = ("clip", "perturb", "rollout", "expert", "reward", "render", "write")  # in the order of an attempt
 QUIET_S = 900.0  # a run that commits nothing for so long is said to be quiet
 N_BUCKETS = 60
-N_FAILED = 50
 BINS = (40, 24)  # along, aside
 REACH_M = (20.0, 2.0)  # where run.json does not say: the paper's
+STEPS = {
+    "clip": "the clip was read",
+    "perturb": "the perturbation held",
+    "rollout": "the traffic's answer was simulated",
+    "expert": "the expert found a plan",
+    "reward": "the reward accepted the drive",
+    "render": "the cameras could be rendered",
+    "write": "the sample was written",
+    "failed": "nothing broke",
+}
+Json = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class State:
-    """How the newest run goes."""
-
-    word: str
-    tone: str  # good | warn | bad | live
-    live: bool
-    detail: str
-    last_commit_ms: int  # since 1970; 0: nothing yet
-
-
-@dataclass(frozen=True)
-class Counts:
-    """Of the whole store."""
-
-    samples: int
-    simulated: int  # samples that are not a logged drive
-    simulated_attempts: int
-    attempts: int
-    rejected: int
-    failed: int  # attempts and clips
-    clips: int  # with a row of candidates
-    candidates: int
-    sample_bytes: int
-
-
-@dataclass(frozen=True)
-class Step:
-    """One bar of the funnel by stage: what is left after it."""
-
-    name: str
-    what: str
-    left: int
-    dropped: int
-
-
-@dataclass(frozen=True)
-class Acceptance:
-    """One round of one expert."""
-
-    expert: str
-    round: int
-    tried: int
-    accepted: int
-    rejected: int
-    failed: int
-    clips: int
-    clips_before: int
-    attempt_rate: float | None
-    first_try_rate: float | None
-    clip_rate: float | None
-    paper: float | None  # published share of clips, to hold against clip_rate and first_try_rate
-
-
-@dataclass(frozen=True)
-class Reason:
-    """Why attempts, or clips, fell."""
-
-    reason: str  # stage.reason or failed.kind
-    words: str
-    total: int
-    by_expert: Mapping[str, int]
-
-
-@dataclass(frozen=True)
-class Throughput:
-    """Rows by the time of their commit."""
-
-    began_ms: int
-    ended_ms: int
-    bucket_s: float
-    samples: Sequence[int]  # per bucket
-    attempts: Sequence[int]
-    samples_per_hour: float | None
-    walks_done: int | None  # of a live run: (clip, expert) walks that ended since it began
-    walks: int | None
-    eta_s: float | None  # null too where the run is quiet
-
-
-@dataclass(frozen=True)
-class StageTime:
-    """Worker seconds of one stage."""
-
-    stage: str
-    tasks: int
-    seconds: float
-
-
-@dataclass(frozen=True)
-class Coverage:
-    """Counts over end points in the frame of the logged pose at T+H; [aside][along], from the right and from behind."""
-
-    reach_along_m: float
-    reach_aside_m: float
-    candidates: Sequence[Sequence[int]]
-    accepted: Sequence[Sequence[int]]
-    beyond: int  # end points outside
-
-
-@dataclass(frozen=True)
-class Overview:
-    """Everything on the first page."""
-
-    version: str
-    taken_ms: int
-    where: str
-    state: State
-    counts: Counts
-    facts: Mapping[str, str]
-    notes: Sequence[str]
-    steps: Sequence[Step]
-    acceptance: Sequence[Acceptance]
-    exhausted: Mapping[str, int]  # expert -> walks at the end of their candidates
-    reasons: Sequence[Reason]
-    clip_reasons: Sequence[Reason]
-    gates: Sequence[Reason]
-    throughput: Throughput
-    stage_times: Sequence[StageTime]
-    stage_times_of: str  # what they are measured on
-    coverage: Coverage
-    failed_kinds: Mapping[str, int]
-    facets: Mapping[str, Sequence[str]]  # what the gallery can be filtered by
-
-
-def overview(shot: Snapshot, where: str, now_s: float) -> Overview:
+def overview(shot: Snapshot, where: str, now_s: float) -> Json:
     """All of it; `now_s` since 1970."""
-    funnel = _funnel(shot)
-    rows = funnel.rows
-    simulated = [row for row in rows if row.simulated]
+    funnel = shot.funnel
+    simulated = [row for row in funnel.rows if row.simulated]
     failed = [row for row in shot.outcome_rows if row["kind"] == Kind.FAILED]
     stage_times, of = _stage_times(shot)
-    return Overview(
-        version=shot.version,
-        taken_ms=int(shot.taken_s * 1000),
-        where=where,
-        state=_state(shot, now_s),
-        counts=Counts(
-            samples=shot.samples.num_rows,
-            simulated=sum(row["candidate_index"] >= 0 for row in shot.sample_rows),
-            simulated_attempts=sum(r.accepted + r.rejected + r.failed for r in simulated),
-            attempts=sum(r.accepted + r.rejected + r.failed for r in rows),
-            rejected=sum(r.rejected for r in rows),
-            failed=len(failed),
-            clips=funnel.clips_prepared,
-            candidates=funnel.candidates,
-            sample_bytes=shot.sample_bytes,
-        ),
-        facts=_facts(shot),
-        notes=[*([shot.last["message"]] if shot.last.get("message") else []), *shot.last.get("notes", [])],
-        steps=steps_of(funnel),
-        acceptance=_acceptance(funnel),
-        exhausted=funnel.exhausted,
-        reasons=_reasons(funnel),
-        clip_reasons=[
-            _reason(name, count)
-            for name, count in (Counter(funnel.clip_outcomes) + Counter(funnel.clips_without_candidates)).most_common()
-        ],
-        gates=[Reason(gate, GATE_WORDS.get(gate, ""), count, {}) for gate, count in funnel.gates.items()],
-        throughput=_throughput(shot, now_s),
-        stage_times=stage_times,
-        stage_times_of=of,
-        coverage=_coverage(shot),
-        failed_kinds=dict(Counter(row["error_kind"] for row in failed).most_common()),
-        facets={
-            name: sorted({str(row[name]) for row in shot.sample_rows})
-            for name in ("expert", "round", "image_source", "command", "split", "log_id")
+    before = Counter(funnel.clip_outcomes) + Counter(funnel.clips_without_candidates)
+    return {
+        "version": shot.version,
+        "taken_ms": int(shot.taken_s * 1000),
+        "where": where,
+        "state": _state(shot, now_s),
+        "counts": {
+            "samples": shot.samples.num_rows,
+            "simulated": sum(row["candidate_index"] >= 0 for row in shot.sample_rows),  # not a logged drive
+            "simulated_attempts": sum(row.tried for row in simulated),
+            "attempts": sum(row.tried for row in funnel.rows),
+            "rejected": sum(row.rejected for row in funnel.rows),
+            "failed": len(failed),  # attempts and clips
+            "clips": funnel.clips_prepared,
+            "candidates": funnel.candidates,
+            "sample_bytes": shot.sample_bytes,
         },
-    )
+        "facts": _facts(shot),
+        "notes": [*([shot.last["message"]] if shot.last.get("message") else []), *shot.last.get("notes", [])],
+        "steps": _steps(funnel),
+        "acceptance": _acceptance(funnel),
+        "exhausted": funnel.exhausted,  # expert -> walks at the end of their candidates
+        "reasons": _reasons(funnel),
+        "clip_reasons": [_reason(name, count) for name, count in before.most_common()],
+        "gates": [_reason(gate, count, words=GATE_WORDS) for gate, count in funnel.gates.items()],
+        "throughput": _throughput(shot, now_s),
+        "stage_times": stage_times,  # worker seconds
+        "stage_times_of": of,  # what they are measured on
+        "coverage": _coverage(shot),
+        "failed_kinds": dict(Counter(row["error_kind"] for row in failed).most_common()),
+        "facets": {name: sorted({str(row[name]) for row in shot.sample_rows}) for name in FILTERS},
+    }
 
 
-@lru_cache(maxsize=2)
-def _cached_funnel(held: "_Held") -> Funnel:
-    shot = held.shot
-    lists = shot.candidates.select(["clip_id", "n_candidates", "gate_counts", "stage", "reason"]).to_pylist()
-    return funnel_of_rows(shot.sample_rows, shot.outcome_rows, lists, shot.runs)
-
-
-class _Held:
-    """A snapshot that is itself and no other: equal by identity."""
-
-    def __init__(self, shot: Snapshot) -> None:
-        self.shot = shot
-
-    def __hash__(self) -> int:
-        return id(self.shot)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Held) and other.shot is self.shot
-
-
-def _funnel(shot: Snapshot) -> Funnel:
-    return _cached_funnel(_Held(shot))
-
-
-def _state(shot: Snapshot, now_s: float) -> State:
-    last_ms = shot.last_commit_ms
+def _state(shot: Snapshot, now_s: float) -> Json:
+    """How the newest run goes; tone: good, warn, bad or live."""
+    word, tone, detail = *STATUS.get(shot.last.get("exit_code", -1), ("run status unknown", "warn")), ""
     if shot.live:
+        word, tone = "running", "live"
         if _quiet(shot, now_s):
-            text = "nothing was committed for a while: a long reconstruction, or the run is gone; then run it again"
-            return State("quiet", "warn", True, text, last_ms)
-        return State("running", "live", True, "", last_ms)
-    word, tone = STATUS.get(shot.last.get("exit_code", -1), ("no run has told how it ended", "warn"))
-    return State(word, tone, False, "", last_ms)
+            word, tone = "quiet", "warn"
+            detail = "nothing was committed for a while: a long reconstruction, or the run is gone; then run it again"
+    return {"word": word, "tone": tone, "live": shot.live, "detail": detail, "last_commit_ms": shot.last_commit_ms}
 
 
 def _quiet(shot: Snapshot, now_s: float) -> bool:
@@ -245,7 +100,7 @@ def _facts(shot: Snapshot) -> dict[str, str]:
     }
 
 
-def steps_of(funnel: Funnel) -> list[Step]:
+def _steps(funnel: Funnel) -> list[Json]:
     """Simulated attempts after each stage that turns some down, in the order of the stages."""
     rows = [row for row in funnel.rows if row.simulated]
     dropped: Counter[str] = Counter()
@@ -253,57 +108,43 @@ def steps_of(funnel: Funnel) -> list[Step]:
         for name, count in row.reasons.items():
             dropped[name.partition(".")[0]] += count
     left = sum(row.accepted for row in rows) + dropped.total()
-    steps = [Step("tried", "perturbations tried", left, 0)]
-    words = {
-        "clip": "the clip was read",
-        "perturb": "the perturbation held",
-        "rollout": "the traffic's answer was simulated",
-        "expert": "the expert found a plan",
-        "reward": "the reward accepted the drive",
-        "render": "the cameras could be rendered",
-        "write": "the sample was written",
-        "failed": "nothing broke",
-    }
-    order = [*STAGES, *sorted(set(dropped) - {*STAGES, "failed"}), "failed"]
-    for stage in order:
+    steps = [{"name": "tried", "what": "perturbations tried", "left": left, "dropped": 0}]
+    known = [stage.name for stage in STAGES]
+    for stage in (*known, *sorted(set(dropped) - {*known, "failed"}), "failed"):
         if dropped[stage] or stage in ("expert", "reward", "render"):
             left -= dropped[stage]
-            steps.append(Step(stage, words.get(stage, ""), left, dropped[stage]))
+            steps.append({"name": stage, "what": STEPS.get(stage, ""), "left": left, "dropped": dropped[stage]})
     return steps
 
 
-def _acceptance(funnel: Funnel) -> list[Acceptance]:
+def _acceptance(funnel: Funnel) -> list[Json]:
+    """Of each round of each expert; paper: the published share of clips, to hold against the shares of clips."""
     found = []
     for row in funnel.rows:
         published = PAPER_CLIP_PERCENT.get(row.expert, ())
+        named = ("expert", "round", "tried", "accepted", "rejected", "failed", "clips", "clips_before")
+        rates = {name: getattr(row, name) for name in ("attempt_rate", "first_try_rate", "clip_rate")}
         found.append(
-            Acceptance(
-                row.expert,
-                row.round,
-                row.accepted + row.rejected + row.failed,
-                row.accepted,
-                row.rejected,
-                row.failed,
-                row.clips,
-                row.clips_before,
-                _share(row.attempt_rate),
-                _share(row.first_try_rate),
-                _share(row.clip_rate),
-                published[row.round] / 100.0 if row.round < len(published) else None,
-            )
+            {name: getattr(row, name) for name in named}
+            | {name: None if np.isnan(rate) else rate for name, rate in rates.items()}
+            | {"paper": published[row.round] / 100.0 if row.round < len(published) else None}
         )
     return found
 
 
-def _share(rate: float) -> float | None:
-    return None if rate != rate else rate
+def _reason(
+    name: str, total: int, by_expert: Mapping[str, int] | None = None, words: Mapping[str, str] = REASON_WORDS
+) -> Json:
+    """Why attempts, or clips, fell; name: stage.reason, failed.kind or a gate."""
+    return {
+        "reason": name,
+        "words": words.get(name.rpartition(".")[2], ""),
+        "total": total,
+        "by_expert": dict(by_expert or {}),
+    }
 
 
-def _reason(name: str, total: int, by_expert: Mapping[str, int] | None = None) -> Reason:
-    return Reason(name, REASON_WORDS.get(name.rpartition(".")[2], ""), total, dict(by_expert or {}))
-
-
-def _reasons(funnel: Funnel) -> list[Reason]:
+def _reasons(funnel: Funnel) -> list[Json]:
     counts: dict[str, Counter[str]] = {}
     for row in funnel.rows:
         for name, count in row.reasons.items():
@@ -312,7 +153,8 @@ def _reasons(funnel: Funnel) -> list[Reason]:
     return [_reason(name, counts[name].total(), counts[name]) for name in order]
 
 
-def _throughput(shot: Snapshot, now_s: float) -> Throughput:
+def _throughput(shot: Snapshot, now_s: float) -> Json:
+    """Rows by the time of their commit, in buckets; of a live run also the walks that ended since it began."""
     samples = shot.samples["_written_ms"].to_numpy()
     others = shot.outcomes["_written_ms"].to_numpy()
     began = shot.current.get("began_ms", 0)
@@ -326,17 +168,17 @@ def _throughput(shot: Snapshot, now_s: float) -> Throughput:
     made = int((samples >= start).sum())
     hours = (end - start) / 3.6e6
     done, walks, eta = _walks(shot, began, (end - start) / 1000.0) if shot.live else (None, None, None)
-    return Throughput(
-        start,
-        end,
-        width,
-        np.histogram(samples, edges)[0].tolist(),
-        np.histogram(times, edges)[0].tolist(),
-        made / hours if hours > 0 else None,
-        done,
-        walks,
-        None if _quiet(shot, now_s) else eta,
-    )
+    return {
+        "began_ms": start,
+        "ended_ms": end,
+        "bucket_s": width,
+        "samples": np.histogram(samples, edges)[0].tolist(),
+        "attempts": np.histogram(times, edges)[0].tolist(),
+        "samples_per_hour": made / hours if hours > 0 else None,
+        "walks_done": done,  # (clip, expert)
+        "walks": walks,
+        "eta_s": None if _quiet(shot, now_s) else eta,
+    }
 
 
 def _walks(shot: Snapshot, began_ms: int, elapsed_s: float) -> tuple[int, int, float | None]:
@@ -356,15 +198,15 @@ def _walks(shot: Snapshot, began_ms: int, elapsed_s: float) -> tuple[int, int, f
     return len(ended), walks, (walks - len(ended)) * elapsed_s / len(ended) if ended else None
 
 
-def _stage_times(shot: Snapshot) -> tuple[list[StageTime], str]:
+def _stage_times(shot: Snapshot) -> tuple[list[Json], str]:
     if shot.live or not shot.last.get("seconds"):
-        times = [StageTime(stage, n, seconds) for stage, (n, seconds) in shot.seconds.items()]
+        times = [{"stage": stage, "tasks": n, "seconds": seconds} for stage, (n, seconds) in shot.seconds.items()]
         return times, "the attempts that were turned down so far (accepted ones are timed when the run ends)"
-    spent = shot.last["seconds"].items()
-    return [StageTime(stage, int(s["tasks"]), float(s["seconds"])) for stage, s in spent], "the newest run, all workers"
+    return [{"stage": stage, **spent} for stage, spent in shot.last["seconds"].items()], "the newest run, all workers"
 
 
-def _coverage(shot: Snapshot) -> Coverage:
+def _coverage(shot: Snapshot) -> Json:
+    """Counts over end points in the frame of the logged pose at T+H; [aside][along], from the right and from behind."""
     settings: Mapping[str, Any] = shot.runs[-1]["settings"] if shot.runs else {}
     along = float(settings.get("perturb.max_longitudinal_m", REACH_M[0]))
     aside = float(settings.get("perturb.max_lateral_m", REACH_M[1]))
@@ -376,4 +218,10 @@ def _coverage(shot: Snapshot) -> Coverage:
         return np.histogram2d(points[:, 1], points[:, 0], edges)[0].astype(int).tolist()
 
     inside = (np.abs(shot.end_points[:, 0]) <= along) & (np.abs(shot.end_points[:, 1]) <= aside)
-    return Coverage(along, aside, counted(shot.end_points), counted(accepted), int((~inside).sum()))
+    return {
+        "reach_along_m": along,
+        "reach_aside_m": aside,
+        "candidates": counted(shot.end_points),
+        "accepted": counted(accepted),
+        "beyond": int((~inside).sum()),  # end points outside
+    }

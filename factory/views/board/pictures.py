@@ -12,28 +12,28 @@ go out as they are, unless they are wider than WIDE_PX and small=1 asks for less
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, Generic, TypeVar
 
 import cv2
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
+from factory.store.reader import decoded, group_of
 from factory.store.samples import Store
 from factory.store.schema import AGENT_STEPS, SAMPLES, SCHEMA, table_to_rows
+from factory.store.table import open_parquet, with_partition
 from factory.views.board.gallery import BadRequest, NotThere, place_of
 from factory.views.board.watch import Snapshot
 from factory.views.episode_messages import episode_of
 from factory.views.sample_picture import (
     BEV_COLUMNS,
-    decoded,
     encoded,
-    fitted,
     front_camera,
     images_at_now,
     nearer,
     sample_bev,
+    small_jpeg,
 )
 from factory.views.show import logged_drive
 from tasks.world.arrays import Array
@@ -80,26 +80,22 @@ class Pictures:
 
     def __init__(self, store: Store) -> None:
         self._store = store
-        self._location = store.samples.location
         self._logged: Kept[Array | None] = Kept(KEPT_DRIVES, lambda drive: 1)
         self._kept: Kept[bytes] = Kept(KEPT_BYTES, len)
         self._groups: Kept[pa.Table] = Kept(KEPT_GROUP_BYTES, lambda group: int(group.nbytes))
         self._lock = threading.Lock()
-        self._file = lru_cache(maxsize=KEPT_FILES)(self._open)
+        self._file = lru_cache(maxsize=KEPT_FILES)(partial(open_parquet, store.samples.location))
 
     def row(self, shot: Snapshot, attempt_id: str, columns: Sequence[str] = COLUMNS) -> Sample:
         """Some columns of one sample. Raises NotThere."""
         path, row, partition = self._place(shot, attempt_id)
         with self._lock:  # the pictures of a page ask at once; one of them reads for all
             file = self._file(path)
-            group = 0
-            while row >= file.metadata.row_group(group).num_rows:
-                row -= file.metadata.row_group(group).num_rows
-                group += 1
-            stored = self._groups.get((path, group), lambda: self._read(file, group, partition))
-        fields = [SCHEMA.field(name) for name in columns]
-        arrays = [stored[f.name].slice(row, 1).cast(f.type) for f in fields]
-        return table_to_rows(pa.table(arrays, schema=pa.schema(fields)))[0]
+            group, row = group_of(file, row)
+            kept = [name for name in COLUMNS if name not in partition]
+            stored = self._groups.get((path, group), lambda: file.read_row_group(group, columns=kept))
+        schema = pa.schema([SCHEMA.field(name) for name in columns])
+        return table_to_rows(with_partition(stored.slice(row, 1), schema, partition))[0]
 
     def front(self, shot: Snapshot, attempt_id: str) -> bytes:
         """JPEG, small. Raises NotThere where the sample has no image."""
@@ -158,16 +154,6 @@ class Pictures:
         )
         return shot.sample_paths[file], row, dict(zip(SAMPLES.partition_by, partition))
 
-    def _read(self, file: pq.ParquetFile, group: int, partition: Mapping[str, object]) -> pa.Table:
-        rows = file.read_row_groups([group], columns=[name for name in COLUMNS if name not in partition])
-        for name, value in partition.items():
-            rows = rows.append_column(name, pa.repeat(pa.scalar(value, SCHEMA.field(name).type), rows.num_rows))
-        return rows
-
-    def _open(self, path: str) -> pq.ParquetFile:
-        filesystem, base = self._location.filesystem()
-        return pq.ParquetFile(f"{base}/{path}", filesystem=filesystem, page_checksum_verification=True)
-
 
 def _jpeg(image: Mapping[str, Any], small: bool) -> bytes:
     """As it is stored, or not wider than WIDE_PX. Raises NotThere where it cannot be decoded to be made smaller."""
@@ -179,7 +165,7 @@ def _jpeg(image: Mapping[str, Any], small: bool) -> bytes:
         raise NotThere(str(error)) from error
     if pixels is None:
         return bytes(image["jpeg"])
-    return encoded(fitted(pixels, WIDE_PX, round(WIDE_PX * pixels.shape[0] / pixels.shape[1])))
+    return small_jpeg(pixels, WIDE_PX)
 
 
 def _width(jpeg: bytes) -> int:

@@ -14,11 +14,8 @@ if TYPE_CHECKING:
     from factory.store.samples import Store
     from factory.views.examples import Picture
 
-STRIP_ROWS = ("now", "earlier", "photos", "aside")
 FILE = "report.html"
-TOLD = (
-    "report.json"  # what the newest run alone could tell: its facts, what its reader left out, rejected attempts drawn
-)
+TOLD = "report.json"  # what only the newest run knows: its facts, what its reader left out, rejected attempts drawn
 
 
 def write_report(store: "Store", to: str | None = None) -> str:
@@ -28,13 +25,10 @@ def write_report(store: "Store", to: str | None = None) -> str:
 
     told: dict[str, Any] = json.loads(store.location.read(TOLD) or b"{}")
     told["strips"] = [
-        {"title": strip.title, "source": strip.source, "rows": rows}
-        for strip in strips_of(store)
-        for rows in [{name: _plain(getattr(strip, name)) for name in STRIP_ROWS}]
+        strip | {"rows": {name: _plain(row) for name, row in strip["rows"].items()}} for strip in strips_of(store)
     ]
-    told["settings"] = {
-        name: str(value) for name, value in (store.runs() or [{"settings": {}}])[-1]["settings"].items()
-    }
+    settings = store.runs()[-1]["settings"] if store.runs() else {}
+    told["settings"] = {name: str(value) for name, value in settings.items()}
     page = still_page(store, told)
     if to is None:
         store.location.write(FILE, page)
@@ -60,33 +54,25 @@ def remember(store: "Store", assembled: "Run") -> None:
         and row["candidate_index"] >= 0
         and row["attempt_id"] not in taken
     ]
-    refs = {ref.clip_id: ref for ref in assembled.index.refs}
-    drawn = rejected_examples(rejected, Again(store, assembled.work, refs).picture)
-    told = {"facts": facts_of(assembled), "left_out": left_out_of(assembled), "rejected": _plain(drawn)}
-    store.location.write(TOLD, json.dumps(told).encode())
-
-
-def facts_of(assembled: "Run") -> dict[str, str]:
-    """Of a configured run."""
     config, index, vocabulary = assembled.config, assembled.index, assembled.work.vocabulary
+    drawn = rejected_examples(rejected, Again(store, assembled.work, {ref.clip_id: ref for ref in index.refs}).picture)
     n_found = len(index.refs) + len(index.broken)
     planned = n_found if config.limit is None else min(config.limit, n_found)
-    return {
-        "clips of the newest run": f"{planned} of {n_found} found",
-        "rounds": str(config.rounds),
-        "experts": ", ".join(config.experts),
-        "vocabulary": f"{len(vocabulary.trajectories)} trajectories, {Path(vocabulary.source).name}",
+    told = {
+        "facts": {
+            "clips of the newest run": f"{planned} of {n_found} found",
+            "rounds": str(config.rounds),
+            "experts": ", ".join(config.experts),
+            "vocabulary": f"{len(vocabulary.trajectories)} trajectories, {Path(vocabulary.source).name}",
+        },
+        "left_out": {  # what the reader did not give, and why
+            "Filtered windows": {reason: f"{count} windows" for reason, count in index.dropped.items()},
+            "Skipped logs": dict(index.skipped_logs),
+            "Broken logs": {f"{ref.log_id} at {ref.start_ms} ms": why for ref, why in index.broken.items()},
+        },
+        "rejected": _plain(drawn),
     }
-
-
-def left_out_of(assembled: "Run") -> dict[str, dict[str, str]]:
-    """What the reader did not give, and why."""
-    index = assembled.index
-    return {
-        "Filtered windows": {reason: f"{count} windows" for reason, count in index.dropped.items()},
-        "Skipped logs": dict(index.skipped_logs),
-        "Broken logs": {f"{ref.log_id} at {ref.start_ms} ms": why for ref, why in index.broken.items()},
-    }
+    store.location.write(TOLD, json.dumps(told).encode())
 
 
 def _plain(pictures: "Sequence[Picture]") -> list[Mapping[str, Any]]:

@@ -3,14 +3,14 @@
 | path | answer |
 |---|---|
 | `/` and `/static/...` | the page, its style and scripts |
-| `/api/overview` | factory.views.board.overview.Overview |
-| `/api/samples?page=1&size=12&order=newest&expert=...` | factory.views.board.gallery.Page; filters: gallery.FILTERS |
-| `/api/samples/<attempt_id>` | factory.views.board.gallery.Whole |
-| `/api/failed?page=1` | factory.views.board.gallery.Failures |
+| `/api/overview` | factory.views.board.overview.overview |
+| `/api/samples?page=1&size=12&order=newest&expert=...` | factory.views.board.gallery.gallery; filters: FILTERS there |
+| `/api/samples/<attempt_id>` | factory.views.board.gallery.whole |
+| `/api/failed?page=1` | factory.views.board.gallery.failures |
 | `/picture/<attempt_id>/<name>.jpg` | a JPEG, see factory.views.board.pictures |
 | `/episode/<attempt_id>.mcap` | the sample for Foxglove, Lichtblick or Rerun |
 
-Answers of /api/ are JSON whose fields are those of the named dataclasses; an error is `{"error": why}` with 400 (a
+Answers of /api/ are the JSON that the named functions return; an error is `{"error": why}` with 400 (a
 question put wrongly), 403 (asked under another host name), 404 (not there) or 503 (the tables cannot be read now).
 """
 
@@ -18,7 +18,7 @@ import json
 import re
 import sys
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,6 @@ from factory.views.board.gallery import BadRequest, NotThere, failures, gallery,
 from factory.views.board.overview import overview
 from factory.views.board.pictures import Pictures
 from factory.views.board.watch import LOOK_EVERY_S, Watch
-from factory.views.report_style import DARK, LIGHT, STYLE
 
 STATIC = Path(__file__).parent / "static"
 KINDS = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
@@ -48,10 +47,6 @@ HEADERS = {
     "X-Frame-Options": "DENY",
 }
 FOREVER = "private, max-age=86400, immutable"
-
-
-class Forbidden(ValueError):
-    """Asked under a host name that is not this server's, as a page of another site could through its own DNS."""
 
 
 @dataclass(frozen=True)
@@ -77,11 +72,11 @@ class Board:
         try:
             return self._answer(target)
         except BadRequest as error:
-            return _error(400, str(error))
+            return _json({"error": str(error)}, 400)
         except NotThere as error:
-            return _error(404, str(error.args[0]))
+            return _json({"error": str(error.args[0])}, 404)
         except (DeltaError, ChangedRun, OSError, pa.ArrowException) as error:
-            return _error(503, f"the tables cannot be read now: {error}")
+            return _json({"error": f"the tables cannot be read now: {error}"}, 503)
 
     def _answer(self, target: str) -> Answer:
         parts = urlsplit(target)
@@ -139,27 +134,13 @@ def _number(query: dict[str, str], name: str, otherwise: int) -> int:
 
 
 def _json(value: Any, status: int = 200) -> Answer:
-    body = json.dumps(value if isinstance(value, dict) else asdict(value), allow_nan=False).encode()
-    return Answer(status, "application/json", body)
-
-
-def _error(status: int, why: str) -> Answer:
-    return _json({"error": why}, status)
+    return Answer(status, "application/json", json.dumps(value, allow_nan=False).encode())
 
 
 def _static(name: str) -> Answer:
     if name not in SERVED:
         raise NotThere(f"no file {name}")
-    body = SERVED[name].read_bytes()
-    if name == "board.css":
-        body = style().encode()
-    return Answer(200, f"{KINDS[SERVED[name].suffix]}; charset=utf-8", body, "no-cache")
-
-
-def style() -> str:
-    """The page's style sheet."""
-    themes = f':root[data-theme="light"]{{{LIGHT}}}\n:root[data-theme="dark"]{{{DARK}}}\n'
-    return STYLE + themes + (STATIC / "board.css").read_text()
+    return Answer(200, f"{KINDS[SERVED[name].suffix]}; charset=utf-8", SERVED[name].read_bytes(), "no-cache")
 
 
 class Server(ThreadingHTTPServer):
@@ -188,7 +169,9 @@ class Handler(BaseHTTPRequestHandler):
         names = self.server.host_names
         asked = (urlsplit(f"//{self.headers.get('Host', '')}").hostname or "").lower()
         if names is not None and asked not in names:
-            self._send(_error(403, f"this server answers to {', '.join(sorted(names))}, not to {asked or 'no name'}"))
+            self._send(
+                _json({"error": f"this server answers to {', '.join(sorted(names))}, not to {asked or 'no name'}"}, 403)
+            )
         else:
             self._send(self.server.board.answer(self.path))
 

@@ -8,18 +8,18 @@ import json
 import re
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
 from typing import Any
 
+from factory.store.reader import decoded
 from factory.store.samples import Store
 from factory.store.schema import NOW_INDEX
-from factory.views.board.gallery import Page, Whole, failures, gallery, item_of, whole
+from factory.views.board.gallery import card_of, failures, gallery, whole
 from factory.views.board.overview import overview
 from factory.views.board.pictures import Pictures
-from factory.views.board.server import STATIC, style
+from factory.views.board.server import STATIC
 from factory.views.board.watch import Snapshot, Watch
 from factory.views.examples import CAMERA_PX, spread
-from factory.views.sample_picture import decoded, encoded, fitted, front_camera, images_at_now
+from factory.views.sample_picture import front_camera, images_at_now, small_jpeg
 
 N_SAMPLES = 18  # in the gallery, each with a page and some 150 kB of pictures
 N_LOOKS = 6  # the newest simulated ones, as the overview asks for them
@@ -37,22 +37,20 @@ def still_page(store: Store, extra: Mapping[str, Any]) -> bytes:
     """
     shot, pictures = Watch(store).now(), Pictures(store)
     looks = gallery(shot, {"simulated": "1"}, 1, N_LOOKS)
-    shown = _shown(shot, [item.attempt_id for item in looks.items])
-    items = [item_of(shot, row) for row in shown]
+    items = [card_of(shot, row) for row in _shown(shot, [item["attempt_id"] for item in looks["items"]])]
     kept: dict[str, str] = {}
     answers: dict[str, Any] = {
-        "/api/overview": asdict(overview(shot, store.location.uri, time.time())),
-        f"/api/samples?size={N_LOOKS}&simulated=1": asdict(looks),
-        "/api/samples": asdict(Page(shot.version, shot.samples.num_rows, 1, 1, len(items), items)),
-        "/api/failed?page=1": asdict(replace(failures(shot, 1, N_FAILED), pages=1)),
+        "/api/overview": overview(shot, store.location.uri, time.time()),
+        f"/api/samples?size={N_LOOKS}&simulated=1": looks,
+        "/api/samples": {"total": shot.samples.num_rows, "page": 1, "pages": 1, "items": items},
+        "/api/failed?page=1": failures(shot, 1, N_FAILED) | {"pages": 1},
     }
-    ids = [item.attempt_id for item in items]
+    ids = [item["attempt_id"] for item in items]
     for i, attempt_id in enumerate(ids):
         found = whole(shot, attempt_id, row := pictures.row(shot, attempt_id), store.candidates)
         newer, older = ids[i - 1] if i else None, ids[i + 1] if i + 1 < len(ids) else None
-        answers[f"/api/samples/{attempt_id}"] = asdict(
-            replace(_with_pictures(found, row, kept), newer=newer, older=older)
-        )
+        images = _with_pictures(found, row, kept)
+        answers[f"/api/samples/{attempt_id}"] = found | {"images": images, "newer": newer, "older": older}
         kept[f"{attempt_id}/bev.jpg"] = _text(pictures.bev(shot, attempt_id, 600, NOW_INDEX))
     return _document({"answers": answers, "pictures": kept, "extra": extra})
 
@@ -65,28 +63,23 @@ def _shown(shot: Snapshot, always: Sequence[str]) -> list[Mapping[str, Any]]:
     return [row for row in rows if row["attempt_id"] in set(ids)]
 
 
-def _with_pictures(found: Whole, row: Mapping[str, Any], kept: dict[str, str]) -> Whole:
-    """The sample with its images at now alone, which are kept, small."""
+def _with_pictures(found: Mapping[str, Any], row: Mapping[str, Any], kept: dict[str, str]) -> list[dict[str, Any]]:
+    """A sample's images at now alone, which are kept, small."""
     at_now = {(image["camera"], float(image["time_s"])): image for image in images_at_now(row)}
     images = []
-    for image in found.images:
-        stored = at_now.get((image.camera, image.time_s))
-        small = None if stored is None else _small(stored)
+    for image in found["images"]:
+        stored = at_now.get((image["camera"], image["time_s"]))
+        try:
+            small = None if stored is None else _text(small_jpeg(decoded(stored), CAMERA_PX))
+        except ValueError:  # the page says that there is no picture
+            continue
         if small is None:
             continue
         images.append(image)
-        kept[f"{found.item.attempt_id}/{image.index}.jpg"] = small
-        if image.camera == front_camera(row):
-            kept[f"{found.item.attempt_id}/front.jpg"] = small
-    return replace(found, images=images)
-
-
-def _small(image: Mapping[str, Any]) -> str | None:
-    try:
-        pixels = decoded(image)
-    except ValueError:  # the page says that there is no picture
-        return None
-    return _text(encoded(fitted(pixels, CAMERA_PX, max(1, round(CAMERA_PX * pixels.shape[0] / pixels.shape[1])))))
+        kept[f"{row['attempt_id']}/{image['index']}.jpg"] = small
+        if image["camera"] == front_camera(row):
+            kept[f"{row['attempt_id']}/front.jpg"] = small
+    return images
 
 
 def _text(data: bytes) -> str:
@@ -103,8 +96,9 @@ def _document(kept: Mapping[str, Any]) -> bytes:
     page = (STATIC / "index.html").read_text()
     page, links = re.subn(r"<link [^>]*>\n|<script [^>]*></script>\n", "", page)
     assert links == 3, "index.html names an icon, a style and a script"
+    style = (STATIC / "board.css").read_text()
     inside = (
-        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n<style>{style()}</style>\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n<style>{style}</style>\n'
         f'<script type="importmap">{json.dumps({"imports": scripts})}</script>\n'
         f'<script type="application/json" id="kept">{data}</script>\n'
         '<script type="module">import "app";</script>\n</head>'

@@ -20,49 +20,15 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from factory.store import funnel
 from factory.store.samples import CURRENT_RUN, Store
 from factory.store.table import KeyedTable, LiveFile
 from tasks.world.arrays import F32
 
-SAMPLE_COLUMNS = (
-    "attempt_id",
-    "clip_id",
-    "dataset",
-    "log_id",
-    "split",
-    "licence",
-    "expert",
-    "expert_digest",
-    "round",
-    "candidate_index",
-    "settings_hash",
-    "stage_versions",
-    "command",
-    "image_source",
-    "psnr",
-    "stage1_score",
-    "stage2_score",
-    "candidate_end",
-)
-OUTCOME_COLUMNS = (
-    "attempt_id",
-    "clip_id",
-    "log_id",
-    "expert",
-    "expert_digest",
-    "candidate_index",
-    "kind",
-    "settings_hash",
-    "stage_versions",
-    "stage",
-    "reason",
-    "detail",
-    "error_kind",
-    "error",
-    "tries",
-    "seconds",
-)
-CANDIDATE_COLUMNS = ("clip_id", "n_candidates", "gate_counts", "stage", "reason", "candidates")
+SAMPLE_COLUMNS = (*funnel.SAMPLE_COLUMNS, "dataset", "log_id", "split", "licence", "round", "command", "image_source")
+SAMPLE_COLUMNS += ("stage1_score", "stage2_score", "candidate_end")
+OUTCOME_COLUMNS = (*funnel.OUTCOME_COLUMNS, "log_id", "detail", "error", "tries", "seconds")
+CANDIDATE_COLUMNS = (*funnel.LIST_COLUMNS, "candidates")
 LOOK_EVERY_S = 2.0
 
 
@@ -99,11 +65,9 @@ class Watched:
 
     def rows(self) -> pa.Table:
         """All of them."""
-        if not self.parts:
-            names = [name for name in self._columns if name not in ("seconds", "candidates")]
-            schema = pa.schema([self.table.spec.schema.field(name) for name in names])
-            return _placed(schema.empty_table(), 0, 0)
-        return pa.concat_tables([part.rows for part in self.parts.values()])
+        names = [name for name in self._columns if name not in ("seconds", "candidates")]
+        schema = pa.schema([self.table.spec.schema.field(name) for name in names])
+        return pa.concat_tables([_placed(schema.empty_table(), 0, 0), *(part.rows for part in self.parts.values())])
 
     def _read(self, path: str, file: LiveFile) -> Part:
         rows = self.table.read_file(path, file.partition, self._columns)
@@ -177,6 +141,11 @@ class Snapshot:
     @cached_property
     def outcome_rows(self) -> list[dict[str, Any]]:
         return self.outcomes.to_pylist()
+
+    @cached_property
+    def funnel(self) -> funnel.Funnel:
+        lists = self.candidates.select(funnel.LIST_COLUMNS).to_pylist()
+        return funnel.funnel_of_rows(self.sample_rows, self.outcome_rows, lists, self.runs)
 
     @cached_property
     def newest_first(self) -> pa.Table:

@@ -20,8 +20,9 @@ from factory.commands.table import COMMANDS, PLANNERS
 from factory.exits import MEANING
 from factory.graph.episodes import EpisodesWanted
 from factory.graph.execute import execute
+from factory.store.funnel import funnel_of
 from factory.store.samples import CURRENT_RUN, Store
-from factory.views.logged_drive import prepared_episode
+from factory.views.show import prepared_episode
 from factory.views.status import failed_line
 from planners.__main__ import main as planners_main
 from tests.factory.filmed import FilmedWork
@@ -96,9 +97,7 @@ def test_a_mistyped_word_gets_a_suggestion_and_ends_with_2(
 
 def test_status_holds_the_funnel_and_failed_names_every_failure(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code, status, _ = ask(capsys, "status", f"out={out}")
-    assert code == 0
-    code, funnel, _ = ask(capsys, "funnel", f"out={out}")
-    assert code == 0 and funnel.strip() and funnel.strip() in status
+    assert code == 0 and funnel_of(Store(out)).text().strip() in status
     code, failed, _ = ask(capsys, "failed", f"out={out}")
     assert code == 0 and "ZeroDivisionError" in failed and "python -m factory retry" in failed
 

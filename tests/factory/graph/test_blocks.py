@@ -20,10 +20,10 @@ def plans(logs: str) -> list[ClipPlan]:
     return [ClipPlan(ClipRef("toy", log, 1000 * i), (), None, None, frozenset(), 0, None) for i, log in enumerate(logs)]
 
 
-def handed_out(queue: BlockQueue, room: bool = True) -> list[str]:
+def handed_out(queue: BlockQueue, wanted: bool = True) -> list[str]:
     """What the queue gives until it has nothing for now: clips as log and second, blocks in brackets."""
     out = []
-    while (what := queue.next(room)) is not None:
+    while (what := queue.next(wanted)) is not None:
         out.append(f"[{what.block}]" if isinstance(what, Build) else f"{what.ref.log_id}{what.ref.start_ms // 1000}")
     return out
 
@@ -35,7 +35,7 @@ def test_clips_wait_for_their_block_while_those_of_built_ones_go_on() -> None:
     assert handed_out(queue) == ["b1", "b4", "[c]"]
     queue.built("a")
     queue.built("c")
-    assert handed_out(queue, room=False) == [] and queue
+    assert handed_out(queue, wanted=False) == [] and queue
     assert handed_out(queue) == ["a0", "a2", "a3", "c5"] and not queue
 
 

@@ -16,7 +16,7 @@ from factory.store.episodes import FOLDER, episode_name, is_chosen
 from factory.store.location import Location
 from factory.store.samples import Store
 from factory.store.verify import verify
-from factory.views.logged_drive import prepared_episode
+from factory.views.show import prepared_episode
 from tests.factory.filmed import FilmedWork
 from tests.factory.toy import refs
 

@@ -12,7 +12,7 @@ from factory.exits import COMPLETE, INTERRUPTED
 from factory.graph.execute import RunSummary, execute
 from factory.graph.steps import failure_of
 from factory.run import main as run_main
-from factory.store.room import NoRoom, needs_room, no_room
+from factory.store.disk import DiskFull, needs_disk, why_disk_full
 from factory.store.samples import Store
 from factory.store.usable import why_unusable
 from factory.store.verify import verify
@@ -22,9 +22,8 @@ from tests.factory.toy import ToyWork, refs
 LARGE = "64m"
 TOWN = ["clips.n_clips=3", "clips.settings.cameras=[]", "clips.settings.lidar_beams=0", "render=none"]
 TOWN += ["vocabulary.k=128", "rounds=2", "executor=local", "shard_seconds=0.001"]  # 6 MB, the pages 0.5 of them
-ONE_LINE = (
-    r"(?:error: )?{out}/\S+: the disk is full: [\d,]+ bytes are needed, [\d,]+ are free; make room and run the same"
-)
+FULL = r"the disk is full: [\d,]+ bytes are needed, [\d,]+ are free; free disk space and run the same"
+ONE_LINE = rf"(?:error: )?{{out}}/\S+: {FULL}"
 
 
 def mount(folder: Path, *options: str) -> bool:
@@ -72,7 +71,7 @@ def test_wherever_the_disk_is_full_the_same_command_goes_on(disk: Path, undistur
     resize(disk, LARGE)
     committed = set(Store(out).samples)
     assert committed <= undisturbed
-    assert not list(out.rglob("*.tmp")), "half a file takes room from the next run"
+    assert not list(out.rglob("*.tmp")), "half a file takes space from the next run"
     if Store(out).samples.version is not None:
         assert verify(Store(out)).damage == ()
         assert "failed" not in Store(out).outcomes.read(["kind"])["kind"].to_pylist(), (
@@ -127,9 +126,9 @@ def test_a_disk_without_room_for_a_row_group_is_refused_at_once(disk: Path) -> N
 
 def test_what_a_full_disk_said_is_found_behind_other_errors_and_in_delta_s_words(tmp_path: Path) -> None:
     full = r"x: the disk is full: 1,234 bytes are needed, [\d,]+ are free"
-    with pytest.raises(NoRoom, match=full), needs_room(tmp_path / "x", 1234):
+    with pytest.raises(DiskFull, match=full), needs_disk(tmp_path / "x", 1234):
         raise OSError("Generic LocalFileSystem error: No space left on device (os error 28)")
-    with pytest.raises(PermissionError), needs_room(tmp_path, 1):
+    with pytest.raises(PermissionError), needs_disk(tmp_path, 1):
         raise PermissionError(13, "Permission denied")
     try:
         try:
@@ -137,5 +136,5 @@ def test_what_a_full_disk_said_is_found_behind_other_errors_and_in_delta_s_words
         except OSError as error:
             raise RuntimeError("a plug-in's own words") from error
     except RuntimeError as error:
-        assert failure_of(error).no_room == no_room(error) == "/a/file: the disk is full"
-    assert failure_of(ValueError("else")).no_room == ""
+        assert failure_of(error).disk_full == why_disk_full(error) == "/a/file: the disk is full"
+    assert failure_of(ValueError("else")).disk_full == ""

@@ -158,8 +158,8 @@ def test_broken_input_and_bugs_are_rows_with_a_reason_and_hurt_nobody_else(
     assert "toy.feather: tx_m" in failed["input"] and "ZeroDivisionError: a bug in a stage" in failed["bug"]
     again = run(tmp_path / "out", work)
     assert again.exit_code == COMPLETE_WITH_FAILURES and again.executed.attempts == 0
-    mended = run(tmp_path / "out", ToyWork(), retry=True)
-    assert mended.exit_code == COMPLETE
+    fixed = run(tmp_path / "out", ToyWork(), retry=True)
+    assert fixed.exit_code == COMPLETE
     assert_same_tables(tmp_path / "out", plain())
 
 
@@ -296,9 +296,9 @@ def test_a_redo_that_fails_midway_keeps_the_old_walk(tmp_path: Path, begun: Call
     assert ran(again.journal, "attempt log0:0:recovery:3 ") == 0, (
         "what this redo failed at stands until it is asked for"
     )
-    mended = replace(changed, trouble={})
-    assert run(tmp_path / "out", mended, rounds=3, n=1, on_change="redo", retry=True).exit_code == COMPLETE
-    run(tmp_path / "fresh", mended, rounds=3, n=1)
+    fixed = replace(changed, trouble={})
+    assert run(tmp_path / "out", fixed, rounds=3, n=1, on_change="redo", retry=True).exit_code == COMPLETE
+    run(tmp_path / "fresh", fixed, rounds=3, n=1)
     assert_same_tables(tmp_path / "out", tmp_path / "fresh")
 
 
@@ -338,7 +338,7 @@ def test_a_restored_log_goes_on(tmp_path: Path, begun: Callable[..., Path], plai
 def test_redo_tries_again_what_a_bug_stopped_under_other_settings_and_nothing_that_it_stopped_under_these(
     tmp_path: Path,
 ) -> None:
-    """Changed settings may be what mends it; the same ones are tried again only when asked to."""
+    """Changed settings may be what fixes it; the same ones are tried again only when asked to."""
     out, journal = tmp_path / "out", str(tmp_path / "journal")
     bug = {"log0:0:recovery:0": "bug"}
     assert run(out, ToyWork(trouble=bug), n=1).exit_code == COMPLETE_WITH_FAILURES
@@ -347,10 +347,10 @@ def test_redo_tries_again_what_a_bug_stopped_under_other_settings_and_nothing_th
     assert ran(journal, "attempt log0:0:recovery:0 ") == 1
     assert run(out, changed, n=1, on_change="redo").executed.attempts == 0
     assert ran(journal, "attempt log0:0:recovery:0 ") == 1
-    mended = replace(changed, threshold=0.6, trouble={})
-    assert run(out, mended, n=1, on_change="redo").exit_code == COMPLETE
+    fixed = replace(changed, threshold=0.6, trouble={})
+    assert run(out, fixed, n=1, on_change="redo").exit_code == COMPLETE
     fresh = tmp_path / "fresh"
-    run(fresh, mended, n=1)
+    run(fresh, fixed, n=1)
     assert_same_tables(out, fresh)
 
 
@@ -402,8 +402,8 @@ def test_a_stopped_run_goes_on_where_it_was(tmp_path: Path, plain: Callable[...,
 
 def test_nothing_new_begins_once_a_run_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As on a cluster, where tasks that were handed over end; in this process those that wait are left undone too."""
-    graph = execution._graph
-    monkeypatch.setattr(execution, "_graph", lambda *given: graph(*given[:-1], never))
+    local = execution.LocalGraph
+    monkeypatch.setattr(execution, "LocalGraph", lambda work, out, stopped, fuse: local(work, out, never, fuse))
 
     class Stopping(ToyWork):
         def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> Driven | Dropped:

@@ -17,7 +17,7 @@ from factory.graph.local import Claims
 from factory.graph.on_ray import ray  # with the environment that keeps it on loopback
 from factory.store.samples import Store
 from factory.store.verify import verify
-from factory.views.logged_drive import prepared_episode
+from factory.views.show import prepared_episode
 from tests.factory.filmed import FilmedWork
 from tests.factory.tables import assert_same_tables, tables_of
 from tests.factory.toy import ToyWork, ran, refs
@@ -113,7 +113,8 @@ def test_only_what_draws_claims_its_share_of_a_gpu(tmp_path: Path, two_cpus: Non
 def test_a_cluster_without_a_gpu_is_waited_for_and_then_named(
     tmp_path: Path, two_cpus: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(graph, "_gpu_nodes", set)
+    nodes = graph._nodes
+    monkeypatch.setattr(graph, "_nodes", lambda having="": [] if having == "GPU" else nodes(having))
     monkeypatch.setattr(graph, "GPU_WAIT_S", 0.1)
     store = Store(tmp_path / "out")
     summary = execute(ToyWork(), refs(1), ["human"], 1, store, claims=Claims(gpu_share=0.5), say=lambda line: None)

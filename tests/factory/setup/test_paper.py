@@ -7,7 +7,7 @@ import pytest
 
 from factory.config.compose import ConfigError
 from factory.config.run import RunConfig, load_config
-from factory.setup.paper import differences, setup_text
+from factory.setup.calibrate import differences, setup_text
 from factory.setup.settings import choose_vocabulary
 from tasks.world.kinematic_vocabulary import kinematic_trajectories
 from tasks.world.vocabulary import Vocabulary

@@ -20,10 +20,9 @@ from factory.setup.settings import assemble, identity_of
 from factory.stages.benchmark import benchmark_of, write_benchmark
 from factory.stages.frames import BenchmarkWork
 from factory.stages.pipeline import FactoryWork
-from factory.store.cache import BadCacheFile
+from factory.store.cache import BadCacheFile, SceneFiles
 from factory.store.location import Location
 from factory.store.samples import Store
-from factory.store.scenes import SceneFiles
 from tasks.stages import Rejected
 from tasks.world.clip import HORIZON_STEPS, NOW
 from tests.factory.stages.test_pipeline import SMALL, VOCABULARY

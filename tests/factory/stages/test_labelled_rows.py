@@ -16,7 +16,8 @@ from factory.setup.calibrate import calibrate, measure
 from factory.setup.settings import Run, assemble
 from factory.setup.vocabulary import save_vocabulary
 from factory.stages.pipeline import FactoryWork
-from factory.store.reader import LABEL_COLUMNS, SampleTable, labels_of
+from factory.store.reader import SampleTable, labels_of
+from factory.store.schema import LABEL_COLUMNS
 from factory.views.sample_picture import SCORE_COLOURS, sample_bev
 from tasks.attempt import Judged
 from tasks.reward.epdms import Scores, score

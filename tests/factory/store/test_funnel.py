@@ -57,12 +57,12 @@ def test_image_sources_are_counted_over_the_clips_asked_for(tmp_path: Path) -> N
 
 def test_a_candidate_counts_once_though_its_failure_was_mended_with_other_inputs(tmp_path: Path) -> None:
     broken = ToyWork(trouble={"log0:0:pdm_closed:0": "bug"})
-    mended = ToyWork(digests={"pdm_closed": "pdm_closed-2"})
+    fixed = ToyWork(digests={"pdm_closed": "pdm_closed-2"})
     execute(broken, refs(1), ["pdm_closed"], 2, Store(tmp_path), "local", say=lambda line: None)
     store = Store(tmp_path)
-    execute(mended, refs(1), ["pdm_closed"], 9, store, "local", on_change="keep", retry=True, say=lambda line: None)
+    execute(fixed, refs(1), ["pdm_closed"], 9, store, "local", on_change="keep", retry=True, say=lambda line: None)
     tried = sum(row.accepted + row.rejected + row.failed for row in funnel_of(store).rows)
-    assert tried == mended.n_candidates
+    assert tried == fixed.n_candidates
     assert "failed" not in store.outcomes.read(["kind"])["kind"].to_pylist()
 
 

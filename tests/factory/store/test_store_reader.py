@@ -12,8 +12,9 @@ import pytest
 
 from factory.commands.table import COMMANDS
 from factory.graph.execute import execute
-from factory.store.reader import LABEL_COLUMNS, SampleTable, image_of, labels_of, to_torch
+from factory.store.reader import SampleTable, image_of, labels_of, to_torch
 from factory.store.samples import Store
+from factory.store.schema import LABEL_COLUMNS
 from factory.store.verify import verify
 from tasks.reward.label_bytes import VocabularyLabels
 from tests.factory.toy import ToyWork, refs, row_of, stream

@@ -17,7 +17,7 @@ from factory.store.reader import SampleTable
 from factory.store.samples import Store
 from factory.store.verify import verify
 from factory.views.board.server import Board
-from factory.views.logged_drive import prepared_episode
+from factory.views.show import prepared_episode
 from tests.factory.filmed import FilmedWork
 from tests.factory.tables import assert_same_tables
 from tests.factory.toy import ToyWork, refs

@@ -6,9 +6,10 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from factory.graph.steps import Stamp
 from factory.store.columns import BadRow
-from factory.store.schema import COLUMNS, FIELDS, SCHEMA, formats_table, sample_row_to_table, table_to_rows
+from factory.store.identity import Stamp
+from factory.store.schema import COLUMNS, FIELDS, SCHEMA, sample_row_to_table, table_to_rows
+from tests.factory.store.formats import formats_table
 from tests.factory.toy import row_of, stream
 
 DOCS = Path(__file__).parents[3] / "docs" / "formats.md"

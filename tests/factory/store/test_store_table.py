@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import factory.store.table as table_module
-from factory.graph.steps import Stamp
+from factory.store.identity import Stamp
 from factory.store.location import Location
 from factory.store.schema import SAMPLES, sample_row_to_table
 from factory.store.table import AnotherWriter, DuplicateKey, KeyedTable, Shard, TableSpec, write_shard

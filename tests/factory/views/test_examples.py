@@ -10,10 +10,10 @@ import pytest
 from factory.config.run import load_config
 from factory.graph.execute import execute
 from factory.setup.settings import Run, assemble
-from factory.store.reader import SampleTable
+from factory.store.reader import SampleTable, decoded
 from factory.store.samples import Store
 from factory.views.examples import Again, Row, rejected_examples, spread, strips_of
-from factory.views.sample_picture import decoded, encoded, fitted, sample_sheet
+from factory.views.sample_picture import encoded, fitted, sample_sheet
 from tests.factory.toy import ToyWork, refs
 
 
@@ -37,7 +37,7 @@ def test_examples_are_spread_and_do_not_depend_on_the_order_of_rows() -> None:
 
 
 def test_an_image_that_is_none_says_so(store: Store) -> None:
-    captions = [picture.caption for strip in strips_of(store) for picture in strip.now]
+    captions = [picture.caption for strip in strips_of(store) for picture in strip["rows"]["now"]]
     assert captions and all("cannot be decoded" in caption for caption in captions)  # the toy's are random bytes
 
 

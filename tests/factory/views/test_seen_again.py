@@ -14,11 +14,11 @@ from factory.graph.execute import execute
 from factory.readers.settings import TownSettings
 from factory.readers.town.reader import SyntheticReader
 from factory.setup.settings import assemble
-from factory.store.reader import SampleTable
+from factory.store.reader import SampleTable, decoded
 from factory.store.samples import Store
 from factory.views.examples import strips_of
 from factory.views.report_words import REASON_WORDS
-from factory.views.sample_picture import decoded, sample_bev
+from factory.views.sample_picture import sample_bev
 from factory.views.seen_again import (
     ASIDE_M,
     agents_of,
@@ -142,9 +142,9 @@ def test_show_writes_the_picture_and_the_film(
 
 
 def test_the_report_shows_photos_with_their_renderings_and_the_view_from_the_side(store: Store) -> None:
-    strips = {strip.source: strip for strip in strips_of(store)}
-    assert len(strips["render"].photos) == 2 and len(strips["render"].aside) == len(ASIDE_M)
-    assert strips["photo"].photos == strips["photo"].aside == ()
+    strips = {strip["source"]: strip["rows"] for strip in strips_of(store)}
+    assert len(strips["render"]["photos"]) == 2 and len(strips["render"]["aside"]) == len(ASIDE_M)
+    assert strips["photo"]["photos"] == strips["photo"]["aside"] == ()
 
 
 def test_every_reason_of_every_stage_has_its_words() -> None:

@@ -7,8 +7,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from factory.stages.rows import label_columns
-from factory.store.reader import LABEL_COLUMNS, SampleTable, labels_of
-from factory.store.schema import COLUMNS
+from factory.store.reader import SampleTable, labels_of
+from factory.store.schema import COLUMNS, LABEL_COLUMNS
 from planners.data.batch import COMMANDS, BevLayout, ImageLayout, Needs
 from planners.data.bev import bev_raster, nearest_agents
 from planners.data.decode import BatchBuffer, StoredRows, count_labels

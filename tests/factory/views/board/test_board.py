@@ -121,9 +121,10 @@ def test_a_run_that_went_silent_is_said_to_be_quiet_and_to_have_no_end_in_sight(
     shot = Watch(Store(tmp_path)).now()
     last_s = shot.last_commit_ms / 1000.0
     soon, late = (overview(shot, "", last_s + waited) for waited in (1.0, QUIET_S + 1.0))
-    assert (soon.state.word, late.state.word) == ("running", "quiet")
-    assert soon.throughput.walks_done == soon.throughput.walks == 6 and soon.throughput.eta_s == 0.0
-    assert late.throughput.eta_s is None
+    assert (soon["state"]["word"], late["state"]["word"]) == ("running", "quiet")
+    ahead = soon["throughput"]
+    assert ahead["walks_done"] == ahead["walks"] == 6 and ahead["eta_s"] == 0.0
+    assert late["throughput"]["eta_s"] is None
 
 
 def test_only_new_files_are_read(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
