@@ -38,10 +38,15 @@ def two_cpus() -> Iterator[None]:
     ray.shutdown()
 
 
-@pytest.mark.parametrize("module", ["factory.graph.on_ray", "planners.training.on_ray"])
-def test_a_cluster_of_our_own_starts_without_a_warning_and_asks_for_a_token(module: str, tmp_path: Path) -> None:
-    arguments = "1, None" if module == "factory.graph.on_ray" else ""
-    code = f"import os, {module} as m; m._connect({arguments}); print(os.environ['RAY_AUTH_MODE']); m.ray.shutdown()"
+@pytest.mark.parametrize(
+    "begun",
+    [
+        "import factory.graph.on_ray as m; m._connect(1, None)",
+        "import planners.training.on_ray as m; held = m._connected(); held.__enter__()",
+    ],
+)
+def test_a_cluster_of_our_own_starts_without_a_warning_and_asks_for_a_token(begun: str, tmp_path: Path) -> None:
+    code = f"import os; {begun}; print(os.environ['RAY_AUTH_MODE']); m.ray.shutdown()"
     env = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")} | {"HOME": str(tmp_path)}
     done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout, done.stderr) == (0, "token\n", "")
