@@ -42,7 +42,7 @@ STAGES: tuple[Stage, ...] = (
     Stage("expert", 1, "attempt", ("no_plan",)),
     Stage("reward", 1, "attempt", SUBSCORES),
     Stage("render", 3, "attempt", ("psnr", *PICTURE_FAULTS)),
-    Stage("write", 2, "attempt", ()),
+    Stage("write", 3, "attempt", ()),
 )
 
 

@@ -95,11 +95,12 @@ def _map_faults(road_map: RoadMap) -> Iterator[Fault]:
         yield from _lane_faults(f"road_map.lanes[{lane_id!r}]", lane_id, lane)
     if not any(lane.drives_cars for lane in lanes.values()):
         yield "road_map.lanes", "no lane for cars"
-    for i, area in enumerate(road_map.drivable_areas):
-        if not isinstance(area.layer, MapLayer):
-            yield f"road_map.drivable_areas[{i}].layer", f"{area.layer!r}: expected tasks.world.lanes.MapLayer"
-        for ring in (area.ring, *area.holes):
-            yield from _ring(f"road_map.drivable_areas[{i}]", ring)
+    for name in ("drivable_areas", "intersections"):
+        for i, area in enumerate(getattr(road_map, name) or ()):
+            if not isinstance(area.layer, MapLayer):
+                yield f"road_map.{name}[{i}].layer", f"{area.layer!r}: expected tasks.world.lanes.MapLayer"
+            for ring in (area.ring, *area.holes):
+                yield from _ring(f"road_map.{name}[{i}]", ring)
     for i, ring in enumerate(road_map.crossings):
         yield from _ring(f"road_map.crossings[{i}]", ring)
     if unknown := sorted(set(road_map.roadblock_of) - set(lanes)):

@@ -199,7 +199,7 @@ class Imaging:
                 "width": camera.width,
                 "height": camera.height,
                 "intrinsics": camera.intrinsics.ravel(),
-                "distortion": np.zeros(3),
+                "distortion": np.zeros(5),
                 "ego_from_camera": camera.ego_from_camera.ravel(),
             }
             for camera in resized

@@ -40,6 +40,7 @@ def sample_row(clip: Clip, candidate: Candidate | None, judged: Judged) -> dict[
         "vocabulary_index": None if candidate is None else candidate.vocabulary_index,
         "content_digest": clip.content_digest,
         "licence": clip.licence,
+        "frame_tokens": None if clip.frame_tokens is None else list(clip.frame_tokens),
         "parent_states": clip.ego_states[[NOW, NOW + HORIZON_STEPS]],
         "now_pose": pose,
         "world_from_ego": pose_on_ground(clip.world_from_ego, scene.ego_state[None])[0],
@@ -116,7 +117,7 @@ def _map(scene: Scene, pose: Array) -> Mapping[str, object]:
         return points_to_local(pose, ring[:, :2])
 
     lanes = [lane for lane in road_map.lanes.values() if lane.drives_cars and near(lane.centerline)]
-    areas = [area.ring for area in road_map.drivable_areas if near(area.ring) or _encloses(area.ring, pose)]
+    areas = [ring for ring in road_map.road_rings if near(ring) or _encloses(ring, pose)]
     shown = {lane.lane_id for lane in lanes}
     lights = [i for i, lane_id in enumerate(clip.lights.lane_ids) if lane_id in shown]
     steps = slice(scene.step - NOW_INDEX, scene.step - NOW_INDEX + AGENT_STEPS)
@@ -129,6 +130,8 @@ def _map(scene: Scene, pose: Array) -> Mapping[str, object]:
         "crossing_rings": [local_ring(ring) for ring in road_map.crossings if near(ring)],
         "light_lane_ids": [clip.lights.lane_ids[i] for i in lights],
         "light_states": clip.lights.states[steps, lights].T if lights else np.zeros((0, AGENT_STEPS), np.int8),
+        "map_location": road_map.location,
+        "route_roadblock_ids": list(clip.route.roadblock_ids),
         "route_lane_ids": sorted(clip.route.lane_ids),
         "route_centerline": to_local(pose, scene.centerline),
     }

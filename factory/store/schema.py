@@ -14,7 +14,7 @@ from factory.store.identity import Stamp
 from factory.store.table import TableSpec
 from tasks.subscores import HALVES, JUDGED, SUBSCORES, WHOLES
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 MAP_RADIUS_M = 64.0
 AGENT_STEPS = 56  # -1.5 .. 4.0 s at 10 Hz; index 15 is now
 NOW_INDEX = 15
@@ -42,6 +42,7 @@ def _lineage() -> tuple[Column, ...]:
         Column("stage_versions", "string", about="canonical JSON, stage -> version"),
         Column("content_digest", "string", about="of what the clip was read from, but pixels and points"),
         Column("licence", "string", about="of the source log"),
+        Column("frame_tokens", "string", (2,), about="the log's own names of its frames at T and T+H", nullable=True),
         Column("parent_states", "float64", (2, 11), STATE, WORLD, "logged ego at T and at T+H"),
     )
 
@@ -90,6 +91,8 @@ def _world() -> tuple[Column, ...]:
         Column("crossing_rings", "float32", ("X", "P", 2), "m", EGO, "closed rings"),
         Column("light_lane_ids", "string", ("S",), about="lane connectors with a traffic light"),
         Column("light_states", "int8", ("S", AGENT_STEPS), about="0 unknown, 1 green, 2 yellow, 3 red; " + steps),
+        Column("map_location", "string", about="the map's name of the place; empty: it has none"),
+        Column("route_roadblock_ids", "string", ("B",), about="roadblocks and connectors of the route, in order"),
         Column("route_lane_ids", "string", ("R",), about="lanes of the roadblocks on the route"),
         Column("route_centerline", "float32", ("P", 3), "x, y [m], heading [rad]", EGO, "ahead of the ego"),
     )
@@ -118,7 +121,7 @@ def _sensors() -> tuple[Column, ...]:
         Column("width", "int32", unit="pixel"),
         Column("height", "int32", unit="pixel"),
         Column("intrinsics", "float64", (9,), "pixel", "image", "3x3, row by row"),
-        Column("distortion", "float64", (3,), about="radial k1, k2, k3"),
+        Column("distortion", "float64", (5,), about="k1, k2, p1, p2, k3 as OpenCV has them; zeros: none"),
         Column("ego_from_camera", "float64", (16,), "m", "ego", "4x4, row by row"),
     )
     image = (

@@ -29,7 +29,7 @@ def map_shapes(clip: Clip, step: int) -> MapShapes:
         if state == LightState.RED
     }
     return MapShapes(
-        roads=[area.ring for area in clip.road_map.drivable_areas],
+        roads=clip.road_map.road_rings,
         route=[lanes[i].ring for i in sorted(clip.route.lane_ids) if i in lanes],
         crossings=clip.road_map.crossings,
         lanes=[lane.ring for lane in lanes.values() if lane.drives_cars],

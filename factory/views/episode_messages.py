@@ -149,14 +149,13 @@ def _cameras(row: Row) -> Iterator[Message]:
         yield Message(f"/camera/{name}/image", time_ns, picture)
         camera = rig[name]
         intrinsics = np.asarray(camera["intrinsics"], float).reshape(3, 3)
-        k1, k2, k3 = camera["distortion"]
         calibration = CameraCalibration(
             timestamp=_stamp(time_ns),
             frame_id=name,
             width=camera["width"],
             height=camera["height"],
             distortion_model="plumb_bob",
-            D=[k1, k2, 0.0, 0.0, k3],
+            D=list(camera["distortion"]),
             K=intrinsics.reshape(-1).tolist(),
             R=np.eye(3).reshape(-1).tolist(),
             P=np.hstack([intrinsics, np.zeros((3, 1))]).reshape(-1).tolist(),

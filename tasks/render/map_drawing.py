@@ -72,8 +72,8 @@ Shape = tuple[Array, tuple[int, int, int]]  # polygon (M, 3) in the ego frame, c
 def _ground_shapes(road_map: RoadMap, pose: Array) -> list[Shape]:
     """Everything painted on the ground, bottom first."""
     shapes: list[Shape] = []
-    for area in road_map.drivable_areas:
-        shapes.append((_on_ground(area.ring, pose), ROAD))
+    for ring in road_map.road_rings:
+        shapes.append((_on_ground(ring, pose), ROAD))
     lanes = [lane for lane in road_map.lanes.values() if _near(lane.centerline[:, :2], pose)]
     shapes.extend((_on_ground(lane.ring, pose), ROAD) for lane in lanes)
     shapes.extend((_on_ground(ring, pose), CROSSING) for ring in road_map.crossings if _near(ring, pose))

@@ -17,7 +17,7 @@ def pinhole(name: str, yaw_deg: float, field_of_view_deg: float, width: int = 64
     ego_from_camera[:3, :3] = np.stack([np.cross(down, forward), down, forward], axis=1)
     ego_from_camera[:3, 3] = [1.5, 0.0, HEIGHT_M]
     intrinsics = np.array([[focal, 0.0, width / 2.0], [0.0, focal, height / 2.0], [0.0, 0.0, 1.0]])
-    return Camera(name, width, height, intrinsics, np.zeros(3), ego_from_camera)
+    return Camera(name, width, height, intrinsics, np.zeros(5), ego_from_camera)
 
 
 _SIX = {"front": 0.0, "front_left": 60.0, "rear_left": 120.0, "rear": 180.0, "rear_right": -120.0, "front_right": -60.0}

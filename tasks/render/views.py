@@ -45,7 +45,8 @@ def render_views(
 def undistorted(image: Bytes, camera: Camera) -> Bytes:
     """The photo (H, W, 3) an ideal pinhole of the same intrinsics would have taken; outside of the photo: edge colours.
 
-    Radial model of `Camera.distortion`: r' = r (1 + k1 r^2 + k2 r^4 + k3 r^6).
+    `Camera.distortion` is Brown's model as OpenCV has it. Where an ideal pinhole sees x, y over depth, the lens shows
+    x s + 2 p1 x y + p2 (r2 + 2 x^2), y s + p1 (r2 + 2 y^2) + 2 p2 x y with s = 1 + k1 r2 + k2 r2^2 + k3 r2^3.
     """
     if not np.any(camera.distortion):
         return image
@@ -54,10 +55,11 @@ def undistorted(image: Bytes, camera: Camera) -> Bytes:
     fx, fy, cx, cy = (camera.intrinsics[i, j] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     x, y = (u - cx) / fx, (v - cy) / fy
     r2 = x * x + y * y
-    k1, k2, k3 = camera.distortion
+    k1, k2, p1, p2, k3 = camera.distortion
     stretch = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    map_x = (fx * x * stretch + cx - 0.5).astype(np.float32)
-    map_y = (fy * y * stretch + cy - 0.5).astype(np.float32)
+    seen_x = x * stretch + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+    seen_y = y * stretch + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+    map_x, map_y = (fx * seen_x + cx - 0.5).astype(np.float32), (fy * seen_y + cy - 0.5).astype(np.float32)
     return np.asarray(cv2.remap(image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 

@@ -11,8 +11,9 @@ ROTATION_SLACK = 1e-3  # of calibrations written with few digits
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera with radial distortion, mounted on the ego. Camera frame: x right, y down, z forward.
+    """A pinhole camera with lens distortion, mounted on the ego. Camera frame: x right, y down, z forward.
 
+    Distortion is OpenCV's and nuPlan's: radial k1, k2, k3 and tangential p1, p2 (`tasks.render.views.undistorted`).
     Raises ValueError that names camera and field for what is no calibration.
     """
 
@@ -20,11 +21,11 @@ class Camera:
     width: int  # pixels
     height: int
     intrinsics: Array  # (3, 3) pixels
-    distortion: Array  # (3,) k1, k2, k3; zeros for an undistorted image
+    distortion: Array  # (5,) k1, k2, p1, p2, k3; zeros for an undistorted image
     ego_from_camera: Array  # (4, 4) rigid
 
     def __post_init__(self) -> None:
-        for name, shape in (("intrinsics", (3, 3)), ("distortion", (3,)), ("ego_from_camera", (4, 4))):
+        for name, shape in (("intrinsics", (3, 3)), ("distortion", (5,)), ("ego_from_camera", (4, 4))):
             array = getattr(self, name)
             if np.shape(array) != shape:
                 raise ValueError(f"camera {self.name}: {name}: shape {np.shape(array)}, expected {shape}")

@@ -46,6 +46,7 @@ class Clip:
     sweeps: tuple[SensorFile, ...] = ()  # lidar, within the clip
     block: Block | None = None  # what the clip is rendered from; None: it has no photos
     licence: str = ""
+    frame_tokens: tuple[str, str] | None = None  # the log's own names of its frames at T and T+H
     content_digest: str = ""  # of everything the clip was read from, but pixels and points
 
 

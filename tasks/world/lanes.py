@@ -60,10 +60,16 @@ class RoadMap:
     """The map a log carries, in file order; its identity is the object's, so that what is made of it can be kept."""
 
     lanes: Mapping[str, Lane]
-    drivable_areas: tuple[MapPolygon, ...]
+    drivable_areas: tuple[MapPolygon, ...]  # of layers DRIVABLE_AREA, ROADBLOCK, CARPARK_AREA
     crossings: tuple[Array, ...] = ()  # closed rings (M, 2)
     roadblock_of: Mapping[str, str] = field(default_factory=dict)  # lane id -> roadblock (connector) id
     location: str = ""
+    intersections: tuple[MapPolygon, ...] | None = None  # None: every intersection lane's own polygon is one
+
+    @property
+    def road_rings(self) -> tuple[Array, ...]:
+        """Closed exterior rings of all that may be driven on, lanes not named again."""
+        return tuple(area.ring for area in (*self.drivable_areas, *(self.intersections or ())))
 
 
 @dataclass(frozen=True)

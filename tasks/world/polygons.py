@@ -100,8 +100,8 @@ class Rings:
 def polygons_near(road_map: RoadMap, center_xy: Array, radius_m: float = MAP_RADIUS_M) -> tuple[MapPolygon, ...]:
     """Every polygon of the drivable map within `radius_m` of a point (2,), in the reference's order.
 
-    LANE, LANE_CONNECTOR, INTERSECTION (one per intersection lane), DRIVABLE_AREA, each in file order; only lanes
-    that cars drive (docs/reward.md 0). The same map gives the same objects again.
+    LANE, LANE_CONNECTOR, INTERSECTION (the map's own, else one per intersection lane), drivable areas, each in file
+    order; only lanes that cars drive (docs/reward.md 0). The same map gives the same objects again.
     """
     if road_map not in _DRIVABLE:
         every = _drivable_map(road_map)
@@ -128,9 +128,11 @@ _DRIVABLE: WeakKeyDictionary[RoadMap, tuple[tuple[MapPolygon, ...], Rings | None
 def _drivable_map(road_map: RoadMap) -> tuple[MapPolygon, ...]:
     lanes = [lane for lane in road_map.lanes.values() if lane.drives_cars]
     connectors = [lane for lane in lanes if lane.is_intersection]
+    own = road_map.intersections
+    each = (MapPolygon(f"int_{lane.lane_id}", MapLayer.INTERSECTION, lane.ring) for lane in connectors)
     return (
         *(MapPolygon(lane.lane_id, MapLayer.LANE, lane.ring) for lane in lanes if not lane.is_intersection),
         *(MapPolygon(lane.lane_id, MapLayer.LANE_CONNECTOR, lane.ring) for lane in connectors),
-        *(MapPolygon(f"int_{lane.lane_id}", MapLayer.INTERSECTION, lane.ring) for lane in connectors),
+        *(each if own is None else own),
         *road_map.drivable_areas,
     )

@@ -61,7 +61,7 @@ def painter(theatre: Theatre) -> Painter:
 
     def painted(time_s: float, photo: Photo) -> NDArray[np.uint8]:
         height, width = photo.rgb.shape[:2]
-        camera = Camera(photo.camera, width, height, photo.intrinsics, np.zeros(3), np.eye(4))
+        camera = Camera(photo.camera, width, height, photo.intrinsics, np.zeros(5), np.eye(4))
         return paint(theatre.at(round(10.0 * time_s)), camera, photo.world_from_camera)
 
     return painted

@@ -108,7 +108,7 @@ class Painted:
             there = vehicles_at(drive.agents, step * STEP_S, pose[:2, 3], VISIBLE_M)
             eyes = [Pinhole(c.intrinsics, pose @ c.ego_from_camera, c.width, c.height) for c in rig]
             for camera, eye, seen in zip(rig, eyes, render(asset, eyes, there), strict=True):
-                truth = _unit(paint(stage, replace(camera, distortion=np.zeros(3)), pose))
+                truth = _unit(paint(stage, replace(camera, distortion=np.zeros(5)), pose))
                 yield Shown(camera.name, step, eye, pose, there, seen.rgb, truth)
 
 

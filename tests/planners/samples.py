@@ -49,7 +49,7 @@ def camera(name: str, yaw: float, width: int = 32, height: int = 18) -> dict[str
         "width": width,
         "height": height,
         "intrinsics": np.array(focal, float),
-        "distortion": np.zeros(3),
+        "distortion": np.zeros(5),
         "ego_from_camera": pose.reshape(16),
     }
 

@@ -150,7 +150,7 @@ def read_cameras(folder: Path) -> tuple[Camera, ...]:
     turned = rotations(pose_path, poses).as_matrix()
     mount_of = {str(name): i for i, name in enumerate(mounts["sensor_name"])}
     cameras = []
-    for name, (fx, fy, cx, cy, *distortion, height, width) in zip(
+    for name, (fx, fy, cx, cy, k1, k2, k3, height, width) in zip(
         table["sensor_name"].astype(str), numbers(path, table, columns)
     ):
         if name not in mount_of:
@@ -158,8 +158,9 @@ def read_cameras(folder: Path) -> tuple[Camera, ...]:
         mount, row = np.eye(4), mount_of[name]
         mount[:3, :3], mount[:3, 3] = turned[row], poses[row, 4:]
         intrinsics = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        distortion = np.array([k1, k2, 0.0, 0.0, k3])  # Argoverse has radial terms only
         try:
-            cameras.append(Camera(str(name), int(width), int(height), intrinsics, np.array(distortion), mount))
+            cameras.append(Camera(str(name), int(width), int(height), intrinsics, distortion, mount))
         except ValueError as error:
             raise BadClip(str(path), "calibration", str(error)) from error
     return tuple(cameras)

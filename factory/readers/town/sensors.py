@@ -24,7 +24,7 @@ def build_rig(names: tuple[str, ...], width: int, height: int) -> tuple[Camera, 
     check_cameras(names)
     focal = width / 2 / np.tan(FIELD_OF_VIEW_RAD / 2)
     intrinsics = np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
-    return tuple(Camera(name, width, height, intrinsics, np.zeros(3), _pose(*MOUNTS[name])) for name in names)
+    return tuple(Camera(name, width, height, intrinsics, np.zeros(5), _pose(*MOUNTS[name])) for name in names)
 
 
 def _pose(yaw_deg: float, x: float, y: float, z: float) -> Array:

@@ -68,7 +68,7 @@ def clip(tmp_path: Path) -> Clip:
         road_map=RoadMap({}, ()),
         route=Route((), (), frozenset()),
         centerline=np.zeros((2, 3)),
-        cameras=(Camera("front", 96, 64, intrinsics, np.zeros(3), FRONT),),
+        cameras=(Camera("front", 96, 64, intrinsics, np.zeros(5), FRONT),),
         images=tuple(images),
         sweeps=tuple(sweeps),
     )

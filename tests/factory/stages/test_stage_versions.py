@@ -174,7 +174,7 @@ def pictures() -> dict[str, object]:
     """The stage `render`: a scene made of four photos seen from beside them, and the map drawn."""
     photos, sweeps = street.drive(4)
     asset = build_asset(photos, sweeps, street.tracks(), AssetSettings(hold_out_every=0))
-    front = Camera("front", street.WIDTH, street.HEIGHT, street.INTRINSICS, np.zeros(3), street.EGO_FROM_CAMERA)
+    front = Camera("front", street.WIDTH, street.HEIGHT, street.INTRINSICS, np.zeros(5), street.EGO_FROM_CAMERA)
     aside = np.stack([street.ego_pose(1.5, 0.6)])
     seen = render_views(asset, [front], aside, street.tracks(), [4], street.WIDTH, street.HEIGHT)
     clip = street_clip()
@@ -330,16 +330,16 @@ GOLDEN: dict[str, Golden] = {
         tolerance=1e-3,
     ),
     "write": Golden(
-        2,
+        3,
         {
             "simulated": (492.175951, 17.1899041),
-            "simulated text": (2952.74832, 8.00567927),
+            "simulated text": (3008.15481, -2.11722917),
             "human": (652.576569, -14.5853737),
-            "human text": (2473.67526, 5.81133534),
+            "human text": (2539.58184, -1.48495039),
             "label_subscores": (549.77183, 63.7185064),
             "label_progress": (478.196993, -18.9944372),
             "labels text": (947.357383, -11.9462762),
-            "schema": (5374.357, 10.1952164),
+            "schema": (5466.55809, -12.7329856),
         },
     ),
 }

@@ -46,7 +46,7 @@ def test_samples_are_the_same_by_place_key_iteration_and_table(out: Path) -> Non
 def test_the_tables_metadata_names_version_and_licences(out: Path) -> None:
     properties = Store(out).samples.properties
     licences = set(SampleTable(out).table(["licence"])["licence"].to_pylist())
-    assert properties["factory.schema_version"] == "2"
+    assert properties["factory.schema_version"] == "3"
     assert set(properties["factory.licences"].split("; ")) == licences and len(licences) > 1
 
 
@@ -68,7 +68,7 @@ def test_a_table_of_another_version_is_named(tmp_path: Path) -> None:
     store = Store(tmp_path)
     execute(ToyWork(), refs(1), ["human"], 1, store, "local", say=lambda line: None)
     store.samples.set_property("factory.schema_version", "1")
-    with pytest.raises(ValueError, match=f"{tmp_path}.*schema_version 1, this version reads 2"):
+    with pytest.raises(ValueError, match=f"{tmp_path}.*schema_version 1, this version reads 3"):
         SampleTable(tmp_path)
 
 

@@ -27,7 +27,7 @@ from tasks.stages import PICTURE_FAULTS, STAGES
 from tasks.world.camera import Camera, Pinhole
 
 SETTINGS = GateSettings(width=128)
-FRONT = Camera("front", street.WIDTH, street.HEIGHT, street.INTRINSICS, np.zeros(3), street.EGO_FROM_CAMERA)
+FRONT = Camera("front", street.WIDTH, street.HEIGHT, street.INTRINSICS, np.zeros(5), street.EGO_FROM_CAMERA)
 SIZE = (street.WIDTH, street.HEIGHT)
 
 

@@ -29,7 +29,7 @@ from tasks.stages import Rejected
 from tasks.world.agents import AgentKind
 from tasks.world.camera import Camera, Pinhole, SensorFile
 
-FRONT = Camera("front", street.WIDTH, street.HEIGHT, street.INTRINSICS, np.zeros(3), street.EGO_FROM_CAMERA)
+FRONT = Camera("front", street.WIDTH, street.HEIGHT, street.INTRINSICS, np.zeros(5), street.EGO_FROM_CAMERA)
 SIZE = (street.WIDTH, street.HEIGHT)
 SETTINGS = GateSettings(width=street.WIDTH, vehicle_share=0.03)
 FILES = [SensorFile("front", "", 0.25 * k, street.ego_pose(1.0 * k)) for k in range(10)]

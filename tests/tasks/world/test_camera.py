@@ -8,7 +8,12 @@ import pytest
 from tasks.world.camera import Camera
 
 CAMERA = Camera(
-    "front", 640, 480, np.array([[500.0, 0, 320], [0, 510.0, 240], [0, 0, 1]]), np.array([-0.1, 0.01, 0.0]), np.eye(4)
+    "front",
+    640,
+    480,
+    np.array([[500.0, 0, 320], [0, 510.0, 240], [0, 0, 1]]),
+    np.array([-0.1, 0.01, 0.0, 0.0, 0.0]),
+    np.eye(4),
 )
 
 
@@ -25,9 +30,9 @@ def test_the_centred_part_of_an_image_keeps_its_rays() -> None:
     [
         ({"intrinsics": np.eye(4)}, r"camera front: intrinsics: shape \(4, 4\), expected \(3, 3\)"),
         ({"intrinsics": np.array([500.0, 510.0, 320.0, 240.0])}, r"intrinsics: shape \(4,\)"),
-        ({"distortion": np.zeros(5)}, r"distortion: shape \(5,\), expected \(3,\)"),
+        ({"distortion": np.zeros(3)}, r"distortion: shape \(3,\), expected \(5,\)"),
         ({"ego_from_camera": np.eye(4)[:3]}, r"ego_from_camera: shape \(3, 4\), expected \(4, 4\)"),
-        ({"distortion": np.array([0.0, np.nan, 0.0])}, "distortion: NaN"),
+        ({"distortion": np.array([0.0, np.nan, 0.0, 0.0, 0.0])}, "distortion: NaN"),
         ({"intrinsics": np.diag([0.0, 500.0, 1.0])}, "focal lengths must be positive"),
         ({"width": 0}, "size: 0x480"),
         ({"ego_from_camera": np.diag([1.0, 1.0, -1.0, 1.0])}, "not a rotation"),

@@ -42,7 +42,7 @@ def street(car_at: np.ndarray) -> Stage:
 
 
 def painted(stage: Stage, photo: Photo) -> np.ndarray:
-    camera = Camera(photo.camera, CAMERA.width, CAMERA.height, photo.intrinsics, np.zeros(3), np.eye(4))
+    camera = Camera(photo.camera, CAMERA.width, CAMERA.height, photo.intrinsics, np.zeros(5), np.eye(4))
     return paint(stage, camera, photo.world_from_camera)
 
 

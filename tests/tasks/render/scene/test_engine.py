@@ -30,7 +30,7 @@ def test_depth_is_metres_along_the_axis_and_alpha_says_where_the_street_is(stree
 
 
 def test_the_pipeline_s_frames_are_the_same_function_s(street_asset: RenderAsset) -> None:
-    rig = [Camera("front", street.WIDTH, street.HEIGHT, street.INTRINSICS, np.zeros(3), street.EGO_FROM_CAMERA)]
+    rig = [Camera("front", street.WIDTH, street.HEIGHT, street.INTRINSICS, np.zeros(5), street.EGO_FROM_CAMERA)]
     size = (street.WIDTH, street.HEIGHT)
     frames = render_views(street_asset, rig, street.ego_pose(3.0)[None], street.tracks(), [8], *size)
     drawn = render(street_asset, [FRONT], vehicles_at(street.tracks(), 0.8))[0].rgb
@@ -45,7 +45,7 @@ def test_a_backend_is_one_function_in_the_table_and_draws_the_pipeline_s_frames(
         return [View(2.0 * backdrop, empty, empty) for backdrop in backdrops]
 
     monkeypatch.setattr(engine, "RASTERISERS", {**engine.RASTERISERS, "backdrop": backdrop_alone})
-    rig = [Camera("front", street.WIDTH, street.HEIGHT, street.INTRINSICS, np.zeros(3), street.EGO_FROM_CAMERA)]
+    rig = [Camera("front", street.WIDTH, street.HEIGHT, street.INTRINSICS, np.zeros(5), street.EGO_FROM_CAMERA)]
     size = (street.WIDTH, street.HEIGHT)
     frames = render_views(street_asset, rig, street.ego_pose(3.0)[None], street.tracks(), [8], *size, "backdrop")
     sky = street_asset.sky.seen_by(street.INTRINSICS, FRONT.world_from_camera, *size)
