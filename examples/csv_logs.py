@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from factory.readers.base import BadClip
-from factory.readers.logs import Drive, LogReader, Recorded, WholeLog, route_of_drive
+from factory.readers.logs import LoggedDrive, LogReader, Recorded, WholeLog, route_of_drive
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.clip import STEP_S
 from tasks.world.lanes import NO_LIGHTS, Lane, MapLayer, MapPolygon, RoadMap
@@ -42,14 +42,14 @@ class CsvReader(LogReader[WholeLog]):
         """Every folder that holds an ego.csv."""
         return {path.parent.name: path.parent for path in sorted(self.root.glob("*/ego.csv"))}
 
-    def drive(self, path: Path) -> Drive:
+    def drive(self, path: Path) -> LoggedDrive:
         """Raises BadClip."""
         ego = numbers(path / "ego.csv", ("t", "x", "y", "heading", "speed"))
         states = np.zeros((len(ego), EGO_STATE_SIZE))
         states[:, [X, Y, HEADING, VX]] = ego[:, 1:]
         states[:, AX] = np.gradient(ego[:, 4], STEP_S)
         states[:, YAW_RATE] = np.gradient(np.unwrap(ego[:, 3]), STEP_S)
-        return Drive(states, agents_of(path / "agents.csv", ego[:, 0]), np.zeros(len(ego), dtype=np.int64))
+        return LoggedDrive(states, agents_of(path / "agents.csv", ego[:, 0]), np.zeros(len(ego), dtype=np.int64))
 
     def load(self, path: Path) -> WholeLog:
         """Raises BadClip."""

@@ -97,6 +97,19 @@ def test_rooms_are_small_enough_to_be_looked_at() -> None:
         assert len(files) <= MOST_MODULES, f"{room.relative_to(ROOT)} has {len(files)} modules"
 
 
+def test_a_class_s_name_means_one_thing() -> None:
+    """Each command has its own Request; a Protocol may bear the name of the class that it describes."""
+    where: dict[str, list[str]] = {}
+    for module, path in modules().items():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ClassDef) and "Protocol" not in map(ast.unparse, node.bases):
+                where.setdefault(node.name, []).append(module)
+    commands = [module for module in where.pop("Request") if not module.startswith("factory.commands.")]
+    assert not commands, f"{commands} take a command's word for what it was asked"
+    twice = {name: found for name, found in where.items() if len(found) > 1}
+    assert not twice, f"one word for one thing, docs/glossary.md: {twice}"
+
+
 def test_only_the_graph_its_metrics_and_trainings_on_a_cluster_import_ray() -> None:
     users = {
         str(path.relative_to(ROOT))

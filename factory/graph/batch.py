@@ -36,7 +36,7 @@ class PendingRow:
 
 
 @dataclass
-class Batch:
+class PendingCommit:
     """What one commit holds."""
 
     rows: dict[tuple[int, str], list[PendingRow]] = field(default_factory=lambda: defaultdict(list))
@@ -72,8 +72,8 @@ class Gatherer:
         self._graph, self._store, self._clock = graph, store, clock
         self.committed: Callable[[Sequence[Shard], float], None] = lambda shards, seconds: None  # told of every commit
         self._shard_bytes, self._shard_seconds = shard_bytes, shard_seconds
-        self._open = Batch()
-        self._written_by: dict[Ticket, Batch] = {}
+        self._open = PendingCommit()
+        self._written_by: dict[Ticket, PendingCommit] = {}
 
     @property
     def n_writing(self) -> int:
@@ -105,7 +105,7 @@ class Gatherer:
 
     def send(self) -> None:
         """Close the open batch and have its shards written."""
-        batch, self._open = self._open, Batch()
+        batch, self._open = self._open, PendingCommit()
         for partition in sorted(batch.rows):
             ticket = self._graph.submit("write", *(row.result for row in batch.rows[partition]))
             self._written_by[ticket] = batch
@@ -126,7 +126,7 @@ class Gatherer:
             self._commit(batch)
         return True
 
-    def _commit(self, batch: Batch) -> None:
+    def _commit(self, batch: PendingCommit) -> None:
         licences = {row.licence for rows in batch.rows.values() for row in rows}
         began = time.perf_counter()
         self._store.commit(batch.candidates, batch.shards, batch.outcomes, batch.replaced, batch.unlisted, licences)

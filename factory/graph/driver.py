@@ -16,7 +16,7 @@ from factory.graph.episodes import Episodes
 from factory.graph.local import Graph, Ticket
 from factory.graph.metrics import RunMetrics
 from factory.graph.plan import CLIP_CANDIDATE, ClipPlan, RunPlan, WalkState, wants_payload
-from factory.graph.progress import Forecast, ProgressLine, Tally, Workload
+from factory.graph.progress import ProgressLine, RunForecast, Tally, Workload
 from factory.graph.steps import Attempted, Failure, HalfBuilt, HandedOn, Prepared, Reconstructed
 from factory.graph.walk import Blocked, Complete, Exhausted, Step, Try, tries_before
 from factory.graph.work import PreparedClip
@@ -92,7 +92,7 @@ class Driver:
         self._wanted = {
             (clip.ref.clip_id, walk.expert): _wanted(walk, rounds) for clip in plan.todo for walk in clip.walks
         }
-        self._forecast = Forecast(Workload(), Workload(left=sum(self._wanted.values())))
+        self._forecast = RunForecast(Workload(), Workload(left=sum(self._wanted.values())))
 
     def stop(self) -> None:
         """Begin nothing more; what is in flight is finished and committed."""

@@ -87,7 +87,7 @@ class Workload:
 
 
 @dataclass
-class Forecast:
+class RunForecast:
     """All work of a run; the driver keeps it.
 
     A run builds blocks and settles samples: makes each that a walk was asked for, or finds that it cannot be made.

@@ -46,7 +46,7 @@ EGO_STANDING, BROKEN_TRACKS = "ego_standing", "broken_tracks"  # reasons of the 
 
 
 @dataclass(frozen=True)
-class Drive:
+class LoggedDrive:
     """What moves in one log, every 0.1 s: step k stands 0.1 k s after the log's first annotated instant."""
 
     ego_states: Array  # (S, 11), NaN where the log has no continuous drive
@@ -128,7 +128,7 @@ class LogReader(ABC, Generic[Log]):
         """Log id -> its file or folder, sorted by id. Raises ValueError where the root is not this data set."""
 
     @abstractmethod
-    def drive(self, path: Path) -> Drive | str:
+    def drive(self, path: Path) -> LoggedDrive | str:
         """What moves in the log; or, as text, why the log is skipped. Raises BadClip."""
 
     @abstractmethod
@@ -217,7 +217,7 @@ class LogReader(ABC, Generic[Log]):
             raise BadClip(str(self.root), "log_id", f"no log {ref.log_id} of data set {ref.dataset} here")
         return path
 
-    def _drop_reason(self, drive: Drive, start: int, stop: int) -> str | None:
+    def _drop_reason(self, drive: LoggedDrive, start: int, stop: int) -> str | None:
         """Why the window is dropped; None keeps it."""
         ego, segment = drive.ego_states[start:stop], drive.segment[start:stop]
         if np.hypot(ego[:, VX], ego[:, VY]).max() < self.windows.min_top_speed_mps:

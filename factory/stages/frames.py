@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from factory.graph.work import PreparedClip
 from factory.readers.base import BadClip, ClipRef
 from factory.readers.validate import read_clip
-from factory.stages.pipeline import Considered, Drive, FactoryWork, Stopwatch, bare, payload_of
+from factory.stages.pipeline import Drive, FactoryWork, Stopwatch, WholeClip, bare, payload_of
 from tasks.attempt import Timed, human_sample
 from tasks.experts.human import Human
 from tasks.hard_scenes import BEFORE_STEPS, BenchmarkClip, follow_up, frame_digest, half_a_second_before
@@ -20,7 +20,7 @@ from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, scene_of_clip
 
 
 @dataclass(frozen=True)
-class ConsideredPair(Considered):
+class WholeClipPair(WholeClip):
     """With the window 0.5 s earlier."""
 
     before: Clip
@@ -45,7 +45,7 @@ class BenchmarkWork(FactoryWork):
         """Of the expert's or frame's inputs and settings."""
         return frame_digest(expert, self.pdm) if expert in self.frames else super().expert_digest(expert)
 
-    def considered(self, ref: ClipRef) -> ConsideredPair | Rejected:
+    def considered(self, ref: ClipRef) -> WholeClipPair | Rejected:
         """With the earlier window; Rejected also where there is none."""
         watch = Stopwatch()
         clip = self._read(ref, watch)
@@ -55,7 +55,7 @@ class BenchmarkWork(FactoryWork):
         if isinstance(before, Rejected):
             return before
         made = self._perturbed(clip, watch)
-        return ConsideredPair(made.clip, made.found, made.seconds, before)
+        return WholeClipPair(made.clip, made.found, made.seconds, before)
 
     def _earlier(self, ref: ClipRef, watch: Stopwatch) -> Clip | Rejected:
         earlier = _earlier_ref(ref)
@@ -67,9 +67,9 @@ class BenchmarkWork(FactoryWork):
         except BadClip as error:  # the clip itself was read: what lies before it is no drive
             return Rejected("clip", "no_earlier_frame", str(error))
 
-    def listed(self, ref: ClipRef, made: Considered) -> PreparedClip:
+    def listed(self, ref: ClipRef, made: WholeClip) -> PreparedClip:
         """With the clip's scenes."""
-        assert isinstance(made, ConsideredPair)
+        assert isinstance(made, WholeClipPair)
         prepared = super().listed(ref, made)
         rollouts = tuple((i, candidate.rollout) for i, candidate in enumerate(made.candidates))
         return replace(prepared, scenes=BenchmarkClip(payload_of(prepared).clip, bare(made.before), rollouts))

@@ -51,7 +51,7 @@ def logged_poses(prepared: object) -> Array | None:
 
 
 @dataclass(frozen=True)
-class Considered:
+class WholeClip:
     """A clip that attempts can start from, whole, and what became of its candidates."""
 
     clip: Clip
@@ -164,7 +164,7 @@ class FactoryWork:
         made = self.considered(ref) if self._simulates else self._unlisted(ref)
         return made if isinstance(made, Rejected | PreparedClip) else self.listed(ref, made)
 
-    def listed(self, ref: ClipRef, made: Considered) -> PreparedClip:
+    def listed(self, ref: ClipRef, made: WholeClip) -> PreparedClip:
         """What attempts start from."""
         clip, found = bare(made.clip), made.found
         return PreparedClip(
@@ -177,13 +177,13 @@ class FactoryWork:
             seconds=made.seconds,
         )
 
-    def considered(self, ref: ClipRef) -> Considered | Rejected:
+    def considered(self, ref: ClipRef) -> WholeClip | Rejected:
         """All that `prepare` decides, and every gated trajectory's fate. Rejected: for every expert. Raises BadClip."""
         watch = Stopwatch()
         clip = self._read(ref, watch)
         return clip if isinstance(clip, Rejected) else self._perturbed(clip, watch)
 
-    def _perturbed(self, clip: Clip, watch: Stopwatch) -> Considered:
+    def _perturbed(self, clip: Clip, watch: Stopwatch) -> WholeClip:
         with watch.of("render"):  # before perturb work is spent; without a gate only a block that will be needed
             asked = self.render.refuses_blocks or self._simulates
             blocked = self.imaging.block_verdict(clip) if asked else None
@@ -191,7 +191,7 @@ class FactoryWork:
             found = blocked or perturb(
                 clip, self.vocabulary, self.perturb, self.traffic, self.pdm, stream(self.seed, clip.clip_id, "perturb")
             )
-        return Considered(clip, found, watch.seconds)
+        return WholeClip(clip, found, watch.seconds)
 
     def _read(self, ref: ClipRef, watch: Stopwatch) -> Clip | Rejected:
         if ref in self.broken:

@@ -35,7 +35,7 @@ _SHIFT = 4  # OpenCV draws at 1/16 pixel with this many fractional bits
 
 
 @dataclass(frozen=True)
-class Path:
+class DrawnPath:
     """One trajectory to draw, world frame."""
 
     poses: Array  # (M, >=2)
@@ -69,7 +69,7 @@ def draw_bev(
     shapes: MapShapes,
     agents: Boxes,
     ego: Array,
-    paths: Sequence[Path] = (),
+    paths: Sequence[DrawnPath] = (),
     title: str = "",
     size_px: tuple[int, int] = (480, 480),
     metres: float = 80.0,
@@ -112,14 +112,14 @@ def draw_bev(
     return image
 
 
-def _polyline(image: Bytes, points: ShortInts, path: Path) -> None:
+def _polyline(image: Bytes, points: ShortInts, path: DrawnPath) -> None:
     every, length = (4, 3) if path.dashed else (len(points), len(points))
     for start in range(0, len(points) - 1, every):
         piece = points[start : start + length]
         cv2.polylines(image, [piece], False, path.colour, path.width_px, cv2.LINE_AA, _SHIFT)
 
 
-def _captions(image: Bytes, title: str, paths: Sequence[Path]) -> None:
+def _captions(image: Bytes, title: str, paths: Sequence[DrawnPath]) -> None:
     height = image.shape[0]
     write(image, title, (8, 18), 0.42)
     for row, path in enumerate(path for path in paths if path.label):

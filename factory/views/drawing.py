@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 
-from factory.views.bev import EXPERT, LOGGED, PERTURBED, Boxes, MapShapes, Path, draw_bev, write
+from factory.views.bev import EXPERT, LOGGED, PERTURBED, Boxes, DrawnPath, MapShapes, draw_bev, write
 from tasks.attempt import Judged
 from tasks.perturb import Candidate, Considered
 from tasks.world.arrays import Image
@@ -54,12 +54,12 @@ def attempt_picture(
     return draw_bev(pose, map_shapes(clip, step), Boxes(boxes, kinds), pose, ways, title, size_px)
 
 
-def _ways(clip: Clip, candidate: Candidate | None, judged: Judged | None, expert: str) -> list[Path]:
-    ways = [Path(clip.ego_states[NOW:, : HEADING + 1], LOGGED, "logged", dashed=True)]
+def _ways(clip: Clip, candidate: Candidate | None, judged: Judged | None, expert: str) -> list[DrawnPath]:
+    ways = [DrawnPath(clip.ego_states[NOW:, : HEADING + 1], LOGGED, "logged", dashed=True)]
     if candidate is not None:
-        ways.append(Path(candidate.rollout.ego_states, PERTURBED, "perturbed"))
+        ways.append(DrawnPath(candidate.rollout.ego_states, PERTURBED, "perturbed"))
     if judged is not None:
-        ways.append(Path(judged.rollout.ego_states, EXPERT, expert))
+        ways.append(DrawnPath(judged.rollout.ego_states, EXPERT, expert))
     return ways
 
 
@@ -74,7 +74,7 @@ def candidates_picture(clip: Clip, considered: Considered, size_px: tuple[int, i
         map_shapes(clip, step),
         Boxes(clip.agents.boxes[step], clip.agents.kinds),
         target,
-        [Path(clip.ego_states[NOW:, : HEADING + 1], LOGGED, "", dashed=True)],
+        [DrawnPath(clip.ego_states[NOW:, : HEADING + 1], LOGGED, "", dashed=True)],
         f"{len(considered.fate)} gated end poses at T+H",
         size_px,
         metres=60.0,

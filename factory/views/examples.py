@@ -27,7 +27,14 @@ from factory.views.sample_picture import (
     nearer,
     small_jpeg,
 )
-from factory.views.seen_again import VIEW_COLUMNS, Seen, from_the_side, photographed, real_and_rendered, scene_of
+from factory.views.seen_again import (
+    VIEW_COLUMNS,
+    CaptionedPicture,
+    from_the_side,
+    photographed,
+    real_and_rendered,
+    scene_of,
+)
 from tasks.render.settings import ImageSource
 
 N_EXAMPLES = 6
@@ -123,7 +130,7 @@ def _seen_again(store: Store, sample: Row) -> tuple[tuple[Picture, ...], tuple[P
     return tuple(map(_again, shown)), tuple(map(_again, from_the_side(scene, sample)))
 
 
-def _again(seen: Seen) -> Picture:
+def _again(seen: CaptionedPicture) -> Picture:
     return Picture(small_jpeg(seen.pixels, CAMERA_PX), seen.caption)
 
 

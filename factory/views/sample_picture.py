@@ -9,7 +9,18 @@ import numpy as np
 
 from factory.store.reader import decoded, labels_of
 from factory.store.schema import NOW_INDEX
-from factory.views.bev import BACKGROUND, EXPERT, LOGGED, PERTURBED, Boxes, Colour, MapShapes, Path, draw_bev, write
+from factory.views.bev import (
+    BACKGROUND,
+    EXPERT,
+    LOGGED,
+    PERTURBED,
+    Boxes,
+    Colour,
+    DrawnPath,
+    MapShapes,
+    draw_bev,
+    write,
+)
 from tasks.world.arrays import Array, Image
 from tasks.world.frames import to_local
 from tasks.world.lanes import LightState
@@ -83,14 +94,14 @@ def ego_way(row: Row) -> Array:
     return np.concatenate([row["ego_history_10hz"], row["label_10hz"]]).astype(np.float64)
 
 
-def _scored_paths(row: Row, vocabulary: Array) -> list[Path]:
+def _scored_paths(row: Row, vocabulary: Array) -> list[DrawnPath]:
     """Thin lines from the ego for every n-th trajectory, the best on top; the worst and the best have a caption."""
     shown = slice(None, None, -(-len(vocabulary) // MOST_LINES))
     scores = labels_of(row).pdm_score()[shown]
     lines = np.concatenate([np.zeros((len(scores), 1, 3)), vocabulary[shown]], axis=1)
     order = np.argsort(scores, kind="stable")
     captions = {i: f"vocabulary: EPDMS {scores[i]:.2f}" for i in (order[0], order[-1])}
-    return [Path(lines[i], _score_colour(scores[i]), captions.get(i, ""), width_px=1) for i in order]
+    return [DrawnPath(lines[i], _score_colour(scores[i]), captions.get(i, ""), width_px=1) for i in order]
 
 
 def _score_colour(score: float) -> Colour:
@@ -99,16 +110,16 @@ def _score_colour(score: float) -> Colour:
     return round(red), round(green), round(blue)
 
 
-def _paths(row: Row, logged: Array | None) -> list[Path]:
+def _paths(row: Row, logged: Array | None) -> list[DrawnPath]:
     pose = np.asarray(row["now_pose"], dtype=float)
     label = np.concatenate([np.zeros((1, 3)), row["label_10hz"]])
     if row["perturbed_states"] is None:
-        return [Path(label, LOGGED, "logged drive = label")]
+        return [DrawnPath(label, LOGGED, "logged drive = label")]
     known, name = (logged, "logged") if logged is not None else (row["parent_states"], "logged at T and T+H, joined")
     return [
-        Path(to_local(pose, np.asarray(known, dtype=float)[:, :3]), LOGGED, name, dashed=logged is not None),
-        Path(to_local(pose, np.asarray(row["perturbed_states"])[:, :3]), PERTURBED, "perturbed"),
-        Path(label, EXPERT, "expert (simulated) = label"),
+        DrawnPath(to_local(pose, np.asarray(known, dtype=float)[:, :3]), LOGGED, name, dashed=logged is not None),
+        DrawnPath(to_local(pose, np.asarray(row["perturbed_states"])[:, :3]), PERTURBED, "perturbed"),
+        DrawnPath(label, EXPERT, "expert (simulated) = label"),
     ]
 
 

@@ -62,7 +62,7 @@ VIEW_COLUMNS = (
 
 
 @dataclass(frozen=True)
-class Seen:
+class CaptionedPicture:
     """A camera's picture with what it shows."""
 
     pixels: Image
@@ -106,7 +106,7 @@ def photographed(store: Store, row: Row, asset: RenderAsset) -> dict[str, Any] |
 
 def real_and_rendered(
     asset: RenderAsset, photos: Row, at_s: float, only: Sequence[str] = ()
-) -> list[tuple[Seen, Seen]]:
+) -> list[tuple[CaptionedPicture, CaptionedPicture]]:
     """For each camera, left ones first, the photo nearest to a time of the log, and the scene from the same pose.
 
     `photos`: VIEW_COLUMNS of a human sample, whose agents are the log's; `only` these cameras, all for none.
@@ -126,8 +126,8 @@ def real_and_rendered(
         said = "at the sample's now" if abs(gap) < STEP_S / 2 else f"{gap:+.1f} s from the sample's now"
         pairs.append(
             (
-                Seen(photo, f"{camera['name']}  photo, {said}"),
-                Seen(again, f"rendered from its pose: {psnr(photo, again):.1f} dB"),
+                CaptionedPicture(photo, f"{camera['name']}  photo, {said}"),
+                CaptionedPicture(again, f"rendered from its pose: {psnr(photo, again):.1f} dB"),
             )
         )
     return pairs
@@ -139,7 +139,7 @@ def _looks_right(camera: Mapping[str, Any]) -> float:
     return float(-np.arctan2(left, ahead))
 
 
-def from_the_side(asset: RenderAsset, row: Row) -> list[Seen]:
+def from_the_side(asset: RenderAsset, row: Row) -> list[CaptionedPicture]:
     """What the front camera sees at now from ASIDE_M beside the ego; nothing for a row without images."""
     front = front_camera(row)
     if front is None:
@@ -151,7 +151,7 @@ def from_the_side(asset: RenderAsset, row: Row) -> list[Seen]:
         pose[:3, 3] += aside_m * pose[:3, 1]
         side = f"{abs(aside_m):g} m to the {'left' if aside_m > 0 else 'right'}"
         caption = side if aside_m else f"{front}, rendered at now"
-        out.append(Seen(drawn(asset, rig, pose, agents, 0.0)[0], caption))
+        out.append(CaptionedPicture(drawn(asset, rig, pose, agents, 0.0)[0], caption))
     return out
 
 

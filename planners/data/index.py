@@ -69,7 +69,7 @@ class DataSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class SampleRows:
     """Columns of n samples."""
 
     attempt_id: NDArray[np.str_]  # (n,)
@@ -90,9 +90,9 @@ class Rows:
     def __len__(self) -> int:
         return len(self.attempt_id)
 
-    def taken(self, which: Ints | Bools) -> "Rows":
+    def taken(self, which: Ints | Bools) -> "SampleRows":
         """Some of them, in the order of `which`."""
-        return Rows(**{f.name: getattr(self, f.name)[which] for f in fields(self)})
+        return SampleRows(**{f.name: getattr(self, f.name)[which] for f in fields(self)})
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +101,7 @@ class Dataset:
 
     settings: DataSettings
     files: tuple[SampleFile, ...]
-    rows: Rows
+    rows: SampleRows
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -182,7 +182,7 @@ def open_dataset(settings: DataSettings) -> Dataset:
             raise ValueError(f"{name} in {uri}")
     with ThreadPoolExecutor(OPEN_FILES) as pool:
         parts = list(pool.map(_rows_of, files, range(len(files))))
-    rows = Rows(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Rows)})
+    rows = SampleRows(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(SampleRows)})
     rows = rows.taken(np.argsort(rows.attempt_id, kind="stable"))
     dataset = Dataset(settings, tuple(files), rows)
     twice = np.flatnonzero(rows.attempt_id[1:] == rows.attempt_id[:-1])
@@ -192,7 +192,7 @@ def open_dataset(settings: DataSettings) -> Dataset:
     return replace(dataset, rows=rows.taken(_kept(settings, rows)))
 
 
-def _rows_of(file: SampleFile, number: int) -> Rows:
+def _rows_of(file: SampleFile, number: int) -> SampleRows:
     """The index columns of one file. Raises ValueError naming missing ones."""
     parquet = file.open()
     try:
@@ -211,7 +211,7 @@ def _rows_of(file: SampleFile, number: int) -> Rows:
     perturbation_m = np.full((n, 2), np.nan)
     perturbation_m[end.is_valid().to_numpy(zero_copy_only=False)] = _flat(end).reshape(-1, 4)[:, :2]
     starts = np.cumsum(counts) - counts
-    return Rows(
+    return SampleRows(
         attempt_id=text("attempt_id"),
         clip_id=text("clip_id"),
         revision=np.char.add(np.char.add(text("settings_hash"), " "), text("stage_versions")),
@@ -234,7 +234,7 @@ def _flat(lists: pa.ListArray | pa.ChunkedArray) -> Array:
     return np.concatenate([np.zeros(0), *(array.flatten().to_numpy() for array in arrays)])
 
 
-def _kept(settings: DataSettings, rows: Rows) -> Ints:
+def _kept(settings: DataSettings, rows: SampleRows) -> Ints:
     """Places of the rows that the filters leave. Raises ValueError naming the filter that leaves too few."""
     sim = rows.simulated
     if unknown := sorted(set(settings.experts) - set(rows.expert[sim].tolist())):
@@ -265,7 +265,7 @@ def _kept(settings: DataSettings, rows: Rows) -> Ints:
     return np.flatnonzero(kept)
 
 
-def _of_kept_clips(settings: DataSettings, rows: Rows) -> Bools:
+def _of_kept_clips(settings: DataSettings, rows: SampleRows) -> Bools:
     """Whether a row's clip is among the share of the real clips. Raises ValueError where there are none."""
     clips = sorted(set(rows.clip_id[~rows.simulated].tolist()))
     if not clips:

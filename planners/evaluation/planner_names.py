@@ -30,13 +30,13 @@ from factory.config.compose import ConfigError, compose
 from factory.config.plugins import installed, names
 from factory.config.words import nearest
 from planners.data.batch import Needs
-from planners.evaluation.scoring import Plans, PreparedClip, human_plans, pdm_plans
+from planners.evaluation.scoring import ClipFrames, Plans, human_plans, pdm_plans
 from planners.models.gtrs_dense import Ensemble, GtrsDense
 from planners.models.planner import Planner
 from planners.models.registry import BUILT_IN, PlannerChoice, build_planner
 from planners.training import checkpoint
 
-Privileged = Callable[[PreparedClip], Plans]
+Privileged = Callable[[ClipFrames], Plans]
 
 PRIVILEGED: Mapping[str, Privileged] = {"human": human_plans, "pdm_closed": pdm_plans}
 UNTRAINED = ("constant_velocity",)

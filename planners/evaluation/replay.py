@@ -14,8 +14,7 @@ import numpy as np
 
 from factory.config.compose import ConfigError, fill
 from factory.store.reader import Sample, decoded
-from factory.views.bev import EXPERT, LOGGED, PERTURBED, Boxes, draw_bev, write_mp4
-from factory.views.bev import Path as Way
+from factory.views.bev import EXPERT, LOGGED, PERTURBED, Boxes, DrawnPath, draw_bev, write_mp4
 from factory.views.drawing import map_shapes
 from factory.views.sample_picture import earlier_images, fitted, front_camera
 from planners.command import command
@@ -24,7 +23,7 @@ from planners.evaluation.evaluate import check_needs
 from planners.evaluation.frames import Benchmark, FrameKey, Pair
 from planners.evaluation.planner_names import EvaluatedPlanner, composed, planner_of
 from planners.evaluation.planning import plans_of
-from planners.evaluation.scoring import PreparedClip, PreparedPair, Rules, prepare_clip, score_pair
+from planners.evaluation.scoring import ClipFrames, PreparedPair, Rules, prepare_clip, score_pair
 from tasks.experts.pdm_closed.planner import PdmSettings
 from tasks.reward.one_stage import COLUMNS, FrameScores
 from tasks.rollout.simulate import TrafficSettings, roll_out
@@ -69,8 +68,8 @@ def film(shown: Shown, logged: Array | None) -> Iterator[Image]:
     scene, drive = frame.scene, shown.rollout
     camera = front_camera(shown.sample)
     pictures = earlier_images(shown.sample, camera) if camera else []
-    ways = [Way(drive.ego_states, PERTURBED, "drive"), Way(shown.plan, EXPERT, "plan", dashed=True)]
-    ways += [] if logged is None else [Way(logged, LOGGED, "logged", dashed=True)]
+    ways = [DrawnPath(drive.ego_states, PERTURBED, "drive"), DrawnPath(shown.plan, EXPERT, "plan", dashed=True)]
+    ways += [] if logged is None else [DrawnPath(logged, LOGGED, "logged", dashed=True)]
     for row in range(-HISTORY_STEPS, HORIZON_STEPS + 1):
         step = scene.step + row
         ego = (scene.ego_history[HISTORY_STEPS + row] if row < 0 else drive.ego_states[row])[: HEADING + 1]
@@ -130,7 +129,7 @@ def replay(
             yield from [last] * HOLD
 
 
-def _plans(benchmark: Benchmark, one: EvaluatedPlanner, prepared: PreparedClip) -> Mapping[FrameKey, Array]:
+def _plans(benchmark: Benchmark, one: EvaluatedPlanner, prepared: ClipFrames) -> Mapping[FrameKey, Array]:
     if one.privileged is not None:
         return one.privileged(prepared)
     assert one.load is not None
@@ -152,7 +151,7 @@ def _shown(
     return Shown(title, benchmark.sample(keys[0]), pair, plan, rollout, scores)
 
 
-def _nearest(prepared: PreparedClip, plan: Array) -> int | None:
+def _nearest(prepared: ClipFrames, plan: Array) -> int | None:
     """The follow-up that weighs most for a plan (40, 3), world; None: the clip has none."""
 
     def away(candidate: int) -> float:

@@ -20,8 +20,8 @@ from planners.evaluation.frames import FrameKey
 from tasks.reward.one_stage import COLUMNS, FrameScores
 from tasks.world.arrays import Array
 
-Stage = Literal["one_stage", "stage_one", "stage_two"]
-STAGES: tuple[Stage, ...] = get_args(Stage)
+ScoreStage = Literal["one_stage", "stage_one", "stage_two"]
+STAGES: tuple[ScoreStage, ...] = get_args(ScoreStage)
 FILTERED = "_filtered"  # suffix of a column with the filter
 POSE = ("x", "y", "heading")
 
@@ -30,7 +30,7 @@ POSE = ("x", "y", "heading")
 class FrameRow:
     """One frame and one planner."""
 
-    stage: Stage
+    stage: ScoreStage
     key: FrameKey
     scores: FrameScores  # tasks.reward.one_stage.COLUMNS; NaN: not defined
     progress_m: float  # along the route, of the drive

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from planners.evaluation.frames import ClipScenes, FrameKey, FramePair, Pair
-from planners.evaluation.score_rows import FrameRow, Stage
+from planners.evaluation.score_rows import FrameRow, ScoreStage
 from tasks.experts.pdm_closed.planner import PdmSettings, plan_for
 from tasks.reward.epdms import Scores, rows, score
 from tasks.reward.one_stage import COLUMNS, FrameScores, frame_scores
@@ -57,7 +57,7 @@ PreparedPair = Pair[PreparedFrame]
 
 
 @dataclass(frozen=True)
-class Drive:
+class ScoredDrive:
     """A plan, driven and scored."""
 
     states: Array  # (41, 11)
@@ -92,10 +92,10 @@ def logged_poses(scene: Scene) -> Array:
     return at_ten_hz(to_local(scene.ego_state[: HEADING + 1], poses)[None])[0]
 
 
-def drive(frame: PreparedFrame, poses: Array) -> Drive:
+def drive(frame: PreparedFrame, poses: Array) -> ScoredDrive:
     """Drive and score a plan (40, 3) at 0.1 .. 4.0 s in the frame's ego frame. Raises ValueError if not finite."""
     states, world = _driven(frame, poses)
-    return Drive(states, rows(score(world, np.stack([frame.reference, states]), normalise="pairs"), slice(1, 2)))
+    return ScoredDrive(states, rows(score(world, np.stack([frame.reference, states]), normalise="pairs"), slice(1, 2)))
 
 
 def _driven(frame: PreparedFrame, poses: Array) -> tuple[Array, PreparedScene]:
@@ -112,7 +112,7 @@ def _with_human(frame: PreparedFrame) -> PreparedFrame:
     return replace(frame, human=score(world, states[None], with_history=False))
 
 
-def score_pair(pair: PreparedPair, plans: Sequence[Array]) -> list[tuple[FrameScores, Drive]]:
+def score_pair(pair: PreparedPair, plans: Sequence[Array]) -> list[tuple[FrameScores, ScoredDrive]]:
     """COLUMNS of the plans (40, 3) made now and 0.5 s before, with the extended comfort that they share."""
     drives = [drive(frame, plan) for frame, plan in zip(pair, plans)]
     ec = float(extended_comfort(drives[0].states[None], drives[1].states[None], INTERVAL_S).ec[0])
@@ -120,7 +120,7 @@ def score_pair(pair: PreparedPair, plans: Sequence[Array]) -> list[tuple[FrameSc
 
 
 @dataclass(frozen=True)
-class PreparedClip:
+class ClipFrames:
     """All frames of a clip."""
 
     clip_id: str
@@ -129,7 +129,7 @@ class PreparedClip:
     follow_ups: Mapping[int, PreparedPair]  # candidate index -> frames
 
 
-def prepare_clip(scenes: ClipScenes, rules: Rules) -> PreparedClip:
+def prepare_clip(scenes: ClipScenes, rules: Rules) -> ClipFrames:
     """Everything of a clip's frames that does not depend on a plan. Raises ValueError naming clip and frame."""
 
     def pair(frames: FramePair, logged: bool, name: str) -> PreparedPair:
@@ -143,28 +143,26 @@ def prepare_clip(scenes: ClipScenes, rules: Rules) -> PreparedClip:
     if rules.one_stage != rules.two_stage:
         alone = PreparedPair(*(among_other_traffic(frame, rules.one_stage) for frame in logged))
     follow_ups = {i: pair(frames, False, f"follow-up {i}") for i, frames in scenes.follow_ups.items()}
-    return PreparedClip(scenes.clip_id, alone, logged, follow_ups)
+    return ClipFrames(scenes.clip_id, alone, logged, follow_ups)
 
 
 Plans = Mapping[FrameKey, Array]  # frame -> (40, 3) in its ego frame
 
 
-def human_plans(clip: PreparedClip) -> dict[FrameKey, Array]:
+def human_plans(clip: ClipFrames) -> dict[FrameKey, Array]:
     """The log's drive where there is one: nobody drove from a follow-up frame."""
     poses = [frame.human_poses for frame in clip.logged if frame.human_poses is not None]
     return dict(zip(FrameKey.logged(clip.clip_id), poses, strict=True))
 
 
-def pdm_plans(clip: PreparedClip) -> dict[FrameKey, Array]:
+def pdm_plans(clip: ClipFrames) -> dict[FrameKey, Array]:
     """PDM-Closed's proposal from every frame."""
     pairs = [(FrameKey.logged(clip.clip_id), clip.logged)]
     pairs += [(FrameKey.follow_up(clip.clip_id, i), pair) for i, pair in clip.follow_ups.items()]
     return {key: frame.pdm_poses for keys, pair in pairs for key, frame in zip(keys, pair)}
 
 
-def score_clip(
-    clip: PreparedClip, plans: Plans, tags: Mapping[FrameKey, Sequence[str]] | None = None
-) -> list[FrameRow]:
+def score_clip(clip: ClipFrames, plans: Plans, tags: Mapping[FrameKey, Sequence[str]] | None = None) -> list[FrameRow]:
     """One row a frame: one stage now, stage one now and before, stage two of every follow-up pair.
 
     A follow-up frame without a plan gets a row of NaN. Raises ValueError, naming the frame, for a logged frame
@@ -189,7 +187,7 @@ def _weighted(group: Sequence[FrameRow], end: Array) -> list[FrameRow]:
 
 
 def _pair_rows(
-    stage: Stage,
+    stage: ScoreStage,
     keys: Pair[FrameKey],
     pair: PreparedPair,
     plans: Plans,

@@ -230,7 +230,7 @@ class DiffusionDriveSettings:
     bev_weight: float = 14.0
 
 
-class Scene(NamedTuple):
+class EncodedScene(NamedTuple):
     """What the decoder of plans reads of a sample."""
 
     ego: Tensor  # (B, 1, width)
@@ -256,7 +256,7 @@ class SceneEncoder(nn.Module):
             nn.Linear(width + settings.fusion.bev_channels, width), nn.ReLU(), nn.LayerNorm(width)
         )
 
-    def forward(self, image: Tensor, status: Tensor) -> Scene:
+    def forward(self, image: Tensor, status: Tensor) -> EncodedScene:
         """Picture (B, 3, h, w) uint8 and status (B, 8)."""
         fused = self.fusion(image)
         coarse = self.narrow(fused.latent)
@@ -265,7 +265,7 @@ class SceneEncoder(nn.Module):
         placed = tokens[:, :-1].transpose(1, 2).unflatten(2, coarse.shape[2:])
         wide = F.interpolate(placed, fused.bev.shape[2:], mode="bilinear")
         joined = self.join(torch.cat([wide, fused.bev], dim=1).movedim(1, -1)).movedim(-1, 1)
-        return Scene(queries[:, :1], queries[:, 1:], joined, fused.bev)
+        return EncodedScene(queries[:, :1], queries[:, 1:], joined, fused.bev)
 
 
 class DiffusionDrive(Planner):
@@ -329,18 +329,18 @@ class DiffusionDrive(Planner):
         with evaluating(self):
             return self._denoised(self._scene(batch))
 
-    def _scene(self, batch: Batch) -> Scene:
+    def _scene(self, batch: Batch) -> EncodedScene:
         if batch.image is None:
             raise ValueError("diffusiondrive: a batch without images")
         return self.encoder(batch.image, batch.status)
 
-    def _decoded(self, at: Tensor, step: Tensor, scene: Scene) -> list[tuple[Tensor, Tensor]]:
+    def _decoded(self, at: Tensor, step: Tensor, scene: EncodedScene) -> list[tuple[Tensor, Tensor]]:
         """Plans and logits of every refinement from positions (B, A, 8, 2) in -1 .. 1 at noise step (B,)."""
         points = from_unit(at.clamp(-1.0, 1.0))
         base = points if self.settings.offsets_from == "noisy" else self.get_buffer("anchors").expand_as(points)
         return self.decoder(points, base, step, scene.above, scene.agents, scene.ego)
 
-    def _denoised(self, scene: Scene) -> Tensor:
+    def _denoised(self, scene: EncodedScene) -> Tensor:
         n, levels = len(scene.ego), self.get_buffer("kept")
         start = noised(to_unit(self.get_buffer("anchors")), self.get_buffer("first_noise"), levels[NOISED_TO])
         at = start.expand(n, -1, -1, -1)

@@ -102,7 +102,7 @@ class _Exchange(nn.Module):
         n = rows * columns + settings.latent_tokens[0] * settings.latent_tokens[1]
         self.position = nn.Parameter(torch.zeros(1, n, width))
         self.dropout = nn.Dropout(settings.dropout)
-        self.blocks = nn.Sequential(*(_Block(width, settings) for _ in range(settings.layers)))
+        self.blocks = nn.Sequential(*(_AttentionBlock(width, settings) for _ in range(settings.layers)))
         self.norm = nn.LayerNorm(width)
 
     def forward(self, image: Tensor, latent: Tensor) -> tuple[Tensor, Tensor]:
@@ -113,7 +113,7 @@ class _Exchange(nn.Module):
         return mixed[..., :n].reshape(image.shape), mixed[..., n:].reshape(latent.shape)
 
 
-class _Block(nn.Module):
+class _AttentionBlock(nn.Module):
     """Self-attention and a feed-forward part, both behind a normalisation and beside a shortcut."""
 
     def __init__(self, width: int, settings: FusionSettings) -> None:

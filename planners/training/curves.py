@@ -18,7 +18,10 @@ class Curves:
         from torch.utils.tensorboard import SummaryWriter
 
         out.mkdir(parents=True, exist_ok=True)
-        self._files = {LOSSES: _Rows(out / LOSSES, first_step), VALIDATION: _Rows(out / VALIDATION, first_step + 1)}
+        self._files = {
+            LOSSES: _CsvRows(out / LOSSES, first_step),
+            VALIDATION: _CsvRows(out / VALIDATION, first_step + 1),
+        }
         self._board = SummaryWriter(str(out / "tensorboard"), purge_step=first_step)
         self._wandb = _wandb_run(out)
 
@@ -47,7 +50,7 @@ class Curves:
             self._wandb.log({f"{prefix}/{key}": value for key, value in row.items()}, step=step)
 
 
-class _Rows:
+class _CsvRows:
     """A CSV file whose first column is the step; numbers are written so that they read back the same."""
 
     def __init__(self, path: Path, first_step: int) -> None:

@@ -25,7 +25,7 @@ from planners.data.batch import Batch
 from planners.models.planner import Planner
 from planners.training.checkpoint import load_training, load_weights, save_checkpoint
 from planners.training.curves import Curves
-from planners.training.processes import World
+from planners.training.processes import TrainingProcess
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ def fit(
     batches: Batches,
     training: TrainingSettings,
     loop: Loop,
-    world: World,
+    process: TrainingProcess,
     out: Path,
     record: Mapping[str, Any],
     resume_from: Path | None = None,
@@ -119,18 +119,18 @@ def fit(
     Raises Stopped after SIGINT or SIGTERM, with a checkpoint written; FloatingPointError, with the step, where the loss
     is no number.
     """
-    planner.to(world.device)
+    planner.to(process.device)
     optimiser = build_optimiser(training, planner)
     first = 0
     if resume_from is not None:
         first = _resume(resume_from, planner, optimiser, batches)
-    model = _wrapped(planner, world)
-    curves = Curves(out, first) if world.writes else None
+    model = _wrapped(planner, process)
+    curves = Curves(out, first) if process.writes else None
     unlogged: list[Tensor] = []
     names: list[str] = []
 
     def save(step: int) -> None:
-        if world.writes:
+        if process.writes:
             state = {
                 "version": STATE_VERSION,
                 "step": step,
@@ -138,11 +138,11 @@ def fit(
                 "loader": batches.state(),
             }
             save_checkpoint(out, step, planner, record, state)
-        world.wait()
+        process.wait()
 
     def log(step: int) -> float:
         """Losses of the steps since the last look, the mean over all processes; returns the newest."""
-        values = world.mean(torch.stack(unlogged)).tolist()
+        values = process.mean(torch.stack(unlogged)).tolist()
         done = range(step - len(values), step)
         unlogged.clear()
         for at, row in zip(done, values):
@@ -158,18 +158,18 @@ def fit(
             curves.validation(step, validate(planner))
 
     asked = Event()
-    with asked_to_stop(asked.set), Counter("steps", loop.steps, first, quiet=not world.writes) as counter:
+    with asked_to_stop(asked.set), Counter("steps", loop.steps, first, quiet=not process.writes) as counter:
         step, loss = first, float("nan")
         for batch in _endless(batches, loop.steps - first):
-            torch.manual_seed(_step_seed(loop.seed, step, world.rank))
+            torch.manual_seed(_step_seed(loop.seed, step, process.rank))
             rate = learning_rate(training, step, loop.steps)
-            terms = _step(model, optimiser, batch, rate, training.gradient_clip, loop, world)
+            terms = _step(model, optimiser, batch, rate, training.gradient_clip, loop, process)
             names = names or list(terms)
             unlogged.append(torch.stack(list(terms.values())))
             step += 1
             looks = step % loop.log_every == 0 or step == loop.steps
             # Several processes must agree, and ask each other rarely.
-            stopping = world.anyone(asked.is_set()) if world.size == 1 or looks else False
+            stopping = process.anyone(asked.is_set()) if process.size == 1 or looks else False
             saves = step % loop.checkpoint_every == 0 or step == loop.steps or stopping
             if looks or saves:
                 loss = log(step)
@@ -191,7 +191,7 @@ def _step(
     rate: float,
     clip: float | None,
     loop: Loop,
-    world: World,
+    process: TrainingProcess,
 ) -> dict[str, Tensor]:
     """One optimiser step; the terms of the loss, detached."""
     model.train()
@@ -205,8 +205,8 @@ def _step(
             model.no_sync() if isinstance(model, DistributedDataParallel) and not last else nullcontext()
         )
         with waits:
-            with torch.autocast(world.device.type, torch.bfloat16, enabled=loop.bf16):
-                terms = {name: term.float() / loop.accumulate for name, term in model(part.to(world.device)).items()}
+            with torch.autocast(process.device.type, torch.bfloat16, enabled=loop.bf16):
+                terms = {name: term.float() / loop.accumulate for name, term in model(part.to(process.device)).items()}
             torch.stack(list(terms.values())).sum().backward()
         sums = {name: sums.get(name, torch.zeros(())).to(term.device) + term.detach() for name, term in terms.items()}
     if clip is not None:
@@ -231,10 +231,10 @@ def _resume(folder: Path, planner: Planner, optimiser: torch.optim.Optimizer, ba
     return int(state["step"])
 
 
-def _wrapped(planner: Planner, world: World) -> torch.nn.Module:
-    if world.size == 1:
+def _wrapped(planner: Planner, process: TrainingProcess) -> torch.nn.Module:
+    if process.size == 1:
         return planner
-    return DistributedDataParallel(planner, device_ids=[world.device] if world.device.type == "cuda" else None)
+    return DistributedDataParallel(planner, device_ids=[process.device] if process.device.type == "cuda" else None)
 
 
 def _step_seed(seed: int, step: int, rank: int) -> int:

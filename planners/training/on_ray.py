@@ -18,12 +18,12 @@ import ray
 from ray.train import RunConfig, ScalingConfig, WorkerGroupError
 from ray.train.torch import TorchConfig, TorchTrainer, get_device
 
-from planners.training.processes import RaySettings, World, joined
+from planners.training.processes import RaySettings, TrainingProcess, joined
 
 T = TypeVar("T")
 
 
-def train_on_ray(train: Callable[[World], None], settings: RaySettings, out: str) -> None:
+def train_on_ray(train: Callable[[TrainingProcess], None], settings: RaySettings, out: str) -> None:
     """Call `train` in each of `settings.processes` processes. What one of them raises is raised here."""
     gpu = settings.gpus > 0
     with _connected():
@@ -46,8 +46,8 @@ def train_on_ray(train: Callable[[World], None], settings: RaySettings, out: str
 
 
 def _part(settings: dict[str, Any]) -> None:
-    with joined("auto", get_device()) as world:
-        settings["train"](world)
+    with joined("auto", get_device()) as process:
+        settings["train"](process)
 
 
 @contextmanager

@@ -21,7 +21,7 @@ class RaySettings:
 
 
 @dataclass(frozen=True)
-class World:
+class TrainingProcess:
     """One of `size` processes; rank 0 writes."""
 
     rank: int
@@ -55,8 +55,8 @@ class World:
 
 
 @contextmanager
-def joined(device: str, place: torch.device | None = None) -> Iterator[World]:
-    """The world this process was started into: alone, by torchrun, or a group that stands already (Ray Train).
+def joined(device: str, place: torch.device | None = None) -> Iterator[TrainingProcess]:
+    """What this process was started as: alone, by torchrun, or in a group that stands already (Ray Train).
 
     device: auto | cpu | cuda; place: the device itself, where that is known. Raises ValueError for cuda where there is
     none.
@@ -75,7 +75,7 @@ def joined(device: str, place: torch.device | None = None) -> Iterator[World]:
         dist.init_process_group("nccl" if place.type == "cuda" else "gloo")
     try:
         group = dist.is_initialized()
-        yield World(dist.get_rank() if group else 0, dist.get_world_size() if group else 1, place)
+        yield TrainingProcess(dist.get_rank() if group else 0, dist.get_world_size() if group else 1, place)
         if started:
             dist.barrier()  # a process that leaves first takes the connections of the others down
     finally:

@@ -34,13 +34,13 @@ from planners.models.planner import Planner
 from planners.models.registry import PlannerChoice, build_planner, planner_class, settings_of
 from planners.training.checkpoint import as_record, checkpoints, digest, load_arrays, load_weights, newest, read_record
 from planners.training.fit import Loop, TrainingSettings, fit, total_steps
-from planners.training.processes import RaySettings, World, joined
+from planners.training.processes import RaySettings, TrainingProcess, joined
 
 LARGEST_BATCH = 32
 
 
 def validation(
-    data: DataSettings, planner: Planner, world: World, workers: int
+    data: DataSettings, planner: Planner, process: TrainingProcess, workers: int
 ) -> Callable[[Planner], dict[str, float]]:
     """A function that plans for all human samples of the tables `data.val`: ade_m and fde_m, mean and final distance.
 
@@ -56,7 +56,7 @@ def validation(
         distances = []
         with torch.no_grad():
             for batch in loader.epoch(0):
-                here = batch.to(world.device)
+                here = batch.to(process.device)
                 plans = trained.plan(here)
                 labels = here.plan_2hz if plans.shape[1] == here.plan_2hz.shape[1] else here.plan_10hz
                 distances.append((plans[..., :2].float() - labels[..., :2]).norm(dim=-1).cpu())
@@ -122,8 +122,8 @@ def main(argv: Sequence[str]) -> None:
 
         train_on_ray(partial(train, config), config.ray, config.out)
     else:
-        with joined(config.device) as world:
-            train(config, world)
+        with joined(config.device) as process:
+            train(config, process)
 
 
 def settings_text(values: Mapping[str, Any]) -> str:
@@ -134,7 +134,7 @@ def settings_text(values: Mapping[str, Any]) -> str:
     return "\n".join(described(full, TrainConfig, {"planner.settings": type(own)}))
 
 
-def train(config: TrainConfig, world: World) -> None:
+def train(config: TrainConfig, process: TrainingProcess) -> None:
     """The part of one process. Raises ConfigError or ValueError for what does not fit, Stopped when interrupted."""
     training, out = config.training, Path(config.out).absolute()
     cv2.setNumThreads(1)  # pictures are decoded side by side already
@@ -147,20 +147,20 @@ def train(config: TrainConfig, world: World) -> None:
         planner.needs,
         config.mix,
         training.batch_size,
-        world.rank,
-        world.size,
+        process.rank,
+        process.size,
         config.seed,
         config.workers,
-        pinned=world.device.type == "cuda",
+        pinned=process.device.type == "cuda",
     )
-    if training.batch_size % (world.size * config.accumulate):
+    if training.batch_size % (process.size * config.accumulate):
         raise ConfigError(
-            f"planner.training.batch_size={training.batch_size} does not divide into {world.size} processes times "
+            f"planner.training.batch_size={training.batch_size} does not divide into {process.size} processes times "
             f"accumulate={config.accumulate} parts"
         )
     steps = total_steps(loader, training, config.steps)
-    check = validation(config.data, planner, world, config.workers) if config.data.val else None
-    identity = _identity(config, dataset, steps, world)
+    check = validation(config.data, planner, process, config.workers) if config.data.val else None
+    identity = _identity(config, dataset, steps, process)
     resume_from = _begun(out, config, identity)
     backbones = _first_weights(planner, config) if resume_from is None else read_record(resume_from)["backbones"]
     record = {
@@ -169,20 +169,20 @@ def train(config: TrainConfig, world: World) -> None:
         "backbones": backbones,
         "parameters": sum(parameter.numel() for parameter in planner.parameters()),
     }
-    if world.writes:
+    if process.writes:
         print(_plan_text(config, record, loader, resume_from), flush=True)
     loop = Loop(
         seed=config.seed,
         steps=steps,
         accumulate=config.accumulate,
-        bf16=config.precision == "bf16" or (config.precision == "auto" and world.device.type == "cuda"),
+        bf16=config.precision == "bf16" or (config.precision == "auto" and process.device.type == "cuda"),
         log_every=config.log_every,
         checkpoint_every=config.checkpoint_every,
         validate_every=config.validate_every,
     )
-    world.wait()  # nobody looks for checkpoints any more
-    fit(planner, loader, training, loop, world, out, record, resume_from, check)
-    if world.writes:
+    process.wait()  # nobody looks for checkpoints any more
+    fit(planner, loader, training, loop, process, out, record, resume_from, check)
+    if process.writes:
         print(f"trained: {newest(out)}")
 
 
@@ -209,7 +209,7 @@ def _first_weights(planner: Planner, config: TrainConfig) -> dict[str, str]:
     return backbones
 
 
-def _identity(config: TrainConfig, dataset: Dataset, steps: int, world: World) -> dict[str, Any]:
+def _identity(config: TrainConfig, dataset: Dataset, steps: int, process: TrainingProcess) -> dict[str, Any]:
     """All that the loss curve depends on beside the planner; a folder is gone on with only where it is the same."""
     values = {
         "planner.training": dataclasses.asdict(config.training),
@@ -220,7 +220,7 @@ def _identity(config: TrainConfig, dataset: Dataset, steps: int, world: World) -
         "init_from": None if config.init_from is None else digest(config.init_from),
         "precision": config.precision,
         "accumulate": config.accumulate,
-        "processes": world.size,
+        "processes": process.size,
     }
     same: dict[str, Any] = json.loads(json.dumps(values))  # as a checkpoint gives it back
     return same

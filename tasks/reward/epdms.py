@@ -22,7 +22,7 @@ from tasks.reward.prepare import PreparedScene
 from tasks.reward.rules.comfort import N_FLAGS
 from tasks.reward.rules.ego import no_drive, shaped
 from tasks.reward.rules.obstacles import N_TIMES, Obstacles, unindexed, with_objects
-from tasks.reward.verdicts import INDEX_FROM_ROWS, Verdicts, World, judge_one, scratch_for, world_of
+from tasks.reward.verdicts import INDEX_FROM_ROWS, RuleContext, Verdicts, context_of, judge_one, scratch_for
 from tasks.subscores import INDEX, LABELLED
 from tasks.world.arrays import Array, Bools
 from tasks.world.bounds import LARGEST
@@ -76,7 +76,7 @@ def score(
     Raises ValueError for other shapes or non-finite states.
     """
     obstacles = prepared.indexed_obstacles if len(states) >= INDEX_FROM_ROWS else prepared.obstacles
-    return _scored(world_of(prepared, with_history), obstacles, _NO_BOXES, _NO_FLAGS, states, _in_pairs(normalise))
+    return _scored(context_of(prepared, with_history), obstacles, _NO_BOXES, _NO_FLAGS, states, _in_pairs(normalise))
 
 
 def score_among(
@@ -95,7 +95,7 @@ def score_among(
         )
     nobody = unindexed(np.full((N_TIMES, n_objects, 5), np.nan), np.zeros(n_objects, np.bool_), collision_score)
     boxes, is_stopped = np.require(boxes, None, ["C", "W"]), np.require(is_stopped, None, ["C", "W"])
-    return _scored(world_of(prepared, with_history=True), nobody, boxes, is_stopped, states, True)
+    return _scored(context_of(prepared, with_history=True), nobody, boxes, is_stopped, states, True)
 
 
 def joined(parts: Sequence[Scores], normalise: Normalise) -> Scores:
@@ -107,12 +107,12 @@ def joined(parts: Sequence[Scores], normalise: Normalise) -> Scores:
 
 
 def _scored(
-    world: World, obstacles: Obstacles, boxes: Array, is_stopped: Bools, states: Array, in_pairs: bool
+    context: RuleContext, obstacles: Obstacles, boxes: Array, is_stopped: Bools, states: Array, in_pairs: bool
 ) -> Scores:
     states = shaped("states", states)
     table = np.empty((N_ROWS, len(states)))
     areas, comfort = np.empty((len(states), N_TIMES, 3), np.bool_), np.empty((len(states), N_FLAGS), np.bool_)
-    if not _score_all(world, obstacles, boxes, is_stopped, states, in_pairs, table, areas, comfort):
+    if not _score_all(context, obstacles, boxes, is_stopped, states, in_pairs, table, areas, comfort):
         raise no_drive("states")
     return Scores(*[*table, areas, comfort])
 
@@ -153,7 +153,7 @@ def rows(scores: Scores, index: slice | NDArray[np.integer] | Bools) -> Scores:
 
 @kernel
 def _score_all(
-    world: World,
+    context: RuleContext,
     obstacles: Obstacles,
     boxes: Array,  # (K, 41, N, 5) of each trajectory's own objects, or none: all meet `obstacles`
     is_stopped: Bools,  # (K, N)
@@ -179,7 +179,7 @@ def _score_all(
         met = obstacles
         if boxes.shape[0] > 0:
             met = with_objects(obstacles, boxes[k], is_stopped[k])
-        judge_one(world, met, states[k], scratch, k, out)
+        judge_one(context, met, states[k], scratch, k, out)
     _add_up(table, in_pairs)
     return True
 

@@ -46,7 +46,7 @@ class Ego(NamedTuple):
     rear_axle_to_center: float
 
 
-class World(NamedTuple):
+class RuleContext(NamedTuple):
     """What a trajectory is judged against, but for the objects."""
 
     ego: Ego
@@ -64,10 +64,10 @@ class Scratch(NamedTuple):
     comfort: Array
 
 
-def world_of(prepared: PreparedScene, with_history: bool) -> World:
+def context_of(prepared: PreparedScene, with_history: bool) -> RuleContext:
     """A prepared scene as the kernels take it."""
     history = prepared.history if with_history and prepared.history is not None else np.empty((0, EGO_STATE_SIZE))
-    return World(
+    return RuleContext(
         Ego(PACIFICA.half_length, PACIFICA.half_width, PACIFICA.rear_axle_to_center),
         prepared.centerline,
         prepared.map_index,
@@ -83,11 +83,13 @@ def scratch_for(n_objects: int) -> Scratch:
 
 
 @kernel
-def judge_one(world: World, everything: Obstacles, states: Array, scratch: Scratch, k: int, out: Verdicts) -> None:
+def judge_one(
+    context: RuleContext, everything: Obstacles, states: Array, scratch: Scratch, k: int, out: Verdicts
+) -> None:
     """All rules on one trajectory (41, 11), written to row k."""
-    body, half_length, half_width = scratch.body, world.ego.half_length, world.ego.half_width
-    place(states, world.ego.rear_axle_to_center, body)
-    areas_along(world.map_index, body, half_length, half_width)
+    body, half_length, half_width = scratch.body, context.ego.half_length, context.ego.half_width
+    place(states, context.ego.rear_axle_to_center, body)
+    areas_along(context.map_index, body, half_length, half_width)
     _spread_flags(body.flags, out.ego_areas[k])
     obstacles = within_reach(everything, reach_of(body), 2.0 * half_length, 2.0 * half_width)
     out.scores[NC, k], out.fails[NC, k] = first_collision(
@@ -95,16 +97,16 @@ def judge_one(world: World, everything: Obstacles, states: Array, scratch: Scrat
     )
     out.fails[DAC, k] = _first_with(body.flags, NON_DRIVABLE)
     out.scores[DDC, k], out.fails[DDC, k] = driving_direction(body)
-    out.fails[TLC, k] = first_red(world.red_lanes, body, half_length, half_width)
+    out.fails[TLC, k] = first_red(context.red_lanes, body, half_length, half_width)
     out.fails[TTC, k] = first_time_to_collision(
-        obstacles, states, body, world.map_index, half_length, half_width, scratch.ignored
+        obstacles, states, body, context.map_index, half_length, half_width, scratch.ignored
     )
-    out.fails[LK, k] = lane_keeping(world.centerline, body)
+    out.fails[LK, k] = lane_keeping(context.centerline, body)
     last = states.shape[0] - 1
-    out.ep_raw_m[k] = progress_m(world.centerline, body.x[0], body.y[0], body.x[last], body.y[last])
-    if len(world.history) > 0:
+    out.ep_raw_m[k] = progress_m(context.centerline, body.x[0], body.y[0], body.x[last], body.y[last])
+    if len(context.history) > 0:
         out.fails[HC, k] = comfort_along(
-            world.history, states, world.ego.rear_axle_to_center, scratch.comfort, out.comfort[k]
+            context.history, states, context.ego.rear_axle_to_center, scratch.comfort, out.comfort[k]
         )
     else:
         out.fails[HC, k] = math.inf

@@ -30,7 +30,7 @@ from tasks.rollout.idm import (
 )
 from tasks.rollout.lane_index import SNAP_M
 from tasks.rollout.stretches import CorridorAhead, in_view, may_meet
-from tasks.rollout.traffic_state import ABSENT, DRIVEN, NOBODY, Roles, Rows
+from tasks.rollout.traffic_state import ABSENT, DRIVEN, NOBODY, Roles, RolloutRows
 from tasks.world.arrays import Array, Ints
 from tasks.world.geometry import wrapped
 
@@ -51,13 +51,15 @@ def box_of(boxes: Array, t: int, i: int) -> Box:
 
 
 @inner_kernel
-def _forward_speed(rows: Rows, t: int, i: int) -> float:
+def _forward_speed(rows: RolloutRows, t: int, i: int) -> float:
     h = rows.boxes[t, i, 2]
     return max(0.0, rows.velocities[t, i, 0] * math.cos(h) + rows.velocities[t, i, 1] * math.sin(h))
 
 
 @inner_kernel
-def start_on(paths: Paths, m: int, rows: Rows, t: int, i: int, driver: IdmDriver) -> tuple[float, float, float, float]:
+def start_on(
+    paths: Paths, m: int, rows: RolloutRows, t: int, i: int, driver: IdmDriver
+) -> tuple[float, float, float, float]:
     """(path length, offset to the left, turn, speed) of agent i if it starts to follow path m from row t."""
     s, left = project_on_path(paths, m, rows.boxes[t, i, 0], rows.boxes[t, i, 1])
     turn = wrapped(rows.boxes[t, i, 2] - pose_on_path(paths, m, s, 0.0, left, 0.0, driver.blend_length_m)[2])
@@ -65,7 +67,7 @@ def start_on(paths: Paths, m: int, rows: Rows, t: int, i: int, driver: IdmDriver
 
 
 @inner_kernel
-def due_path(roles: Roles, paths: Paths, rows: Rows, t: int, i: int, clock: int) -> int:
+def due_path(roles: Roles, paths: Paths, rows: RolloutRows, t: int, i: int, clock: int) -> int:
     """The path on which agent i, replayed, switches to IDM by itself: its own, once it is due and on it; or -1."""
     m = roles.path[i]
     if m < 0 or clock < roles.join_step[i]:
@@ -75,7 +77,7 @@ def due_path(roles: Roles, paths: Paths, rows: Rows, t: int, i: int, clock: int)
 
 
 @inner_kernel
-def way_of(rows: Rows, t: int, i: int, m: int, s: float, travelled: float, offset: float, turn: float) -> Way:
+def way_of(rows: RolloutRows, t: int, i: int, m: int, s: float, travelled: float, offset: float, turn: float) -> Way:
     """Agent i, as big as in row t, on its way along path m."""
     front, half_width = 0.5 * rows.boxes[t, i, 3], 0.5 * rows.boxes[t, i, 4] + CORRIDOR_MARGIN_M
     return Way(m, s, travelled, offset, turn, front, half_width)
@@ -83,7 +85,7 @@ def way_of(rows: Rows, t: int, i: int, m: int, s: float, travelled: float, offse
 
 @inner_kernel
 def gap_to(
-    paths: Paths, driver: IdmDriver, rows: Rows, t: int, i: int, way: Way, view: CorridorAhead, j: int
+    paths: Paths, driver: IdmDriver, rows: RolloutRows, t: int, i: int, way: Way, view: CorridorAhead, j: int
 ) -> tuple[float, float]:
     """(gap [m] from the bumper of agent i along its path to j, path heading there); inf: not in the way."""
     box, radius = box_of(rows.boxes, t, j), rows.radius[t, j]
@@ -97,7 +99,7 @@ def gap_to(
 
 @inner_kernel
 def braked_for(
-    roles: Roles, paths: Paths, driver: IdmDriver, rows: Rows, t: int, i: int,
+    roles: Roles, paths: Paths, driver: IdmDriver, rows: RolloutRows, t: int, i: int,
     mode: Ints, others: Ints, n_others: int,
 ) -> int:  # fmt: skip
     """The driven one that asks agent i, on its logged path, for more than the comfortable deceleration, or NOBODY."""
@@ -139,7 +141,7 @@ def road_acceleration(paths: Paths, driver: IdmDriver, t: int, m: int, s: float,
 
 @inner_kernel
 def hardest_acceleration(
-    paths: Paths, driver: IdmDriver, rows: Rows, t: int, i: int, way: Way, speed: float,
+    paths: Paths, driver: IdmDriver, rows: RolloutRows, t: int, i: int, way: Way, speed: float,
     others: Ints, n_others: int, accel: float, leader: int,
 ) -> tuple[float, int]:  # fmt: skip
     """(acceleration [m/s2], leader) of agent i, driven, for the others on the list; `accel` without them."""
@@ -163,7 +165,9 @@ def hardest_acceleration(
 
 
 @inner_kernel
-def touches_driven(boxes: Array, k: int, i: int, rows: Rows, t: int, mode: Ints, others: Ints, n_others: int) -> bool:
+def touches_driven(
+    boxes: Array, k: int, i: int, rows: RolloutRows, t: int, mode: Ints, others: Ints, n_others: int
+) -> bool:
     """Does agent i at boxes[k, i] share area with a driven one of the list in row t?"""
     box = box_of(boxes, k, i)
     radius = 0.5 * math.hypot(box[3], box[4])
@@ -180,7 +184,7 @@ def touches_driven(boxes: Array, k: int, i: int, rows: Rows, t: int, mode: Ints,
 @inner_kernel
 def is_clear(
     roles: Roles, driver: IdmDriver, log_boxes: Array, k: int, i: int,
-    rows: Rows, t: int, mode: Ints, others: Ints, n_others: int,
+    rows: RolloutRows, t: int, mode: Ints, others: Ints, n_others: int,
 ) -> bool:  # fmt: skip
     """May agent i appear as in step k of its log, as far as those of the list, already there in row t, let it?"""
     if not roles.enters_clear[i]:
@@ -195,7 +199,7 @@ def is_clear(
 
 
 @inner_kernel
-def far_from_ego(roles: Roles, log_boxes: Array, k: int, i: int, rows: Rows, t: int) -> bool:
+def far_from_ego(roles: Roles, log_boxes: Array, k: int, i: int, rows: RolloutRows, t: int) -> bool:
     """May agent i appear as in step k of its log, as far as its distance to the ego in row t lets it?"""
     ego = rows.boxes.shape[1] - 1
     dx, dy = log_boxes[k, i, 0] - rows.boxes[t, ego, 0], log_boxes[k, i, 1] - rows.boxes[t, ego, 1]

@@ -42,7 +42,7 @@ from tasks.rollout.traffic_state import (
     Diverged,
     Motion,
     Roles,
-    Rows,
+    RolloutRows,
     empty_motion,
     empty_rows,
     nobody_diverged,
@@ -55,7 +55,7 @@ from tasks.world.geometry import wrapped
 def drive(
     start: int, log: AgentStates, now: AgentStates, roles: Roles, paths: Paths, driver: IdmDriver,
     ego_boxes: Array, ego_velocities: Array,
-) -> tuple[Rows, Motion]:  # fmt: skip
+) -> tuple[RolloutRows, Motion]:  # fmt: skip
     """The traffic's answer to one ego: boxes (T, 5) (true centre) and world velocities (T, 2), T = 41.
 
     start: the clip's step of row 0; log: the clip's tracks over all its steps; now: the agents (1, N) at `start`.
@@ -105,7 +105,7 @@ def drive_many(
 
 
 @kernel
-def _set_ego(rows: Rows, diverged: Diverged, boxes: Array, velocities: Array) -> None:
+def _set_ego(rows: RolloutRows, diverged: Diverged, boxes: Array, velocities: Array) -> None:
     ego = len(diverged.found) - 1
     for t in range(boxes.shape[0]):  # element by element: numba takes seconds to compile the copy of a slice
         for k in range(5):
@@ -125,7 +125,7 @@ def _diverge(diverged: Diverged, i: int) -> None:
 
 
 @hidden_kernel
-def _diverge_at(t: int, i: int, r: int, rows: Rows, diverged: Diverged, motion: Motion, record: Motion) -> None:
+def _diverge_at(t: int, i: int, r: int, rows: RolloutRows, diverged: Diverged, motion: Motion, record: Motion) -> None:
     """Agent i diverges from step t on: its motion there becomes motion at row r; it is not in row t + 1 yet."""
     _diverge(diverged, i)
     _carry(record, t, motion, r, i)
@@ -142,7 +142,7 @@ def _carry(of: Motion, t: int, to: Motion, r: int, i: int) -> None:
 
 
 @hidden_kernel
-def _vanish(rows: Rows, t: int, i: int) -> None:
+def _vanish(rows: RolloutRows, t: int, i: int) -> None:
     for k in range(5):
         rows.boxes[t, i, k] = np.nan
     rows.velocities[t, i, 0], rows.velocities[t, i, 1] = np.nan, np.nan
@@ -150,7 +150,7 @@ def _vanish(rows: Rows, t: int, i: int) -> None:
 
 
 @hidden_kernel
-def _place(rows: Rows, t: int, source: AgentStates, k: int, i: int) -> None:
+def _place(rows: RolloutRows, t: int, source: AgentStates, k: int, i: int) -> None:
     """Agent i, in row t, is where it is in step k of a world."""
     for c in range(5):
         rows.boxes[t, i, c] = source.boxes[k, i, c]
@@ -160,7 +160,7 @@ def _place(rows: Rows, t: int, source: AgentStates, k: int, i: int) -> None:
 
 
 @hidden_kernel
-def _stay(rows: Rows, t: int, i: int) -> None:
+def _stay(rows: RolloutRows, t: int, i: int) -> None:
     """Agent i, in row t + 1, stands where it is in row t."""
     for k in range(5):
         rows.boxes[t + 1, i, k] = rows.boxes[t, i, k]
@@ -172,7 +172,7 @@ def _stay(rows: Rows, t: int, i: int) -> None:
 @hidden_kernel
 def _step(
     start: int, log: AgentStates, roles: Roles, paths: Paths, driver: IdmDriver, t: int,
-    rows: Rows, diverged: Diverged, motion: Motion, record: Motion,
+    rows: RolloutRows, diverged: Diverged, motion: Motion, record: Motion,
 ) -> None:  # fmt: skip
     """From row t to row t + 1; `record`: the motion of another rollout, for those that have not diverged."""
     _switch_to_idm(roles, paths, driver, t, rows, diverged, motion, record)
@@ -187,7 +187,7 @@ def _step(
 @hidden_kernel
 def _switch_to_idm(
     roles: Roles, paths: Paths, driver: IdmDriver, t: int,
-    rows: Rows, diverged: Diverged, motion: Motion, record: Motion,
+    rows: RolloutRows, diverged: Diverged, motion: Motion, record: Motion,
 ) -> None:  # fmt: skip
     """Who is on its path and due switches to IDM, at its own pose and speed; so does who must brake on its log."""
     n, mode = motion.mode.shape[1], diverged.mode
@@ -232,7 +232,7 @@ def _switch_to_idm(
 @hidden_kernel
 def _drive_on(
     start: int, roles: Roles, paths: Paths, driver: IdmDriver, t: int,
-    rows: Rows, diverged: Diverged, motion: Motion, record: Motion,
+    rows: RolloutRows, diverged: Diverged, motion: Motion, record: Motion,
 ) -> None:  # fmt: skip
     """Those who are driven look at row t and move."""
     for i in range(motion.mode.shape[1]):
@@ -281,7 +281,7 @@ def _motion_of(
 
 @hidden_kernel
 def _advance(
-    paths: Paths, driver: IdmDriver, t: int, i: int, step_m: float, new_speed: float, rows: Rows, motion: Motion
+    paths: Paths, driver: IdmDriver, t: int, i: int, step_m: float, new_speed: float, rows: RolloutRows, motion: Motion
 ) -> None:
     """Agent i, driven, is `step_m` on along its path in row t + 1."""
     m, s, travelled = motion.path[t + 1, i], motion.s[t + 1, i] + step_m, motion.travelled[t + 1, i] + step_m
@@ -299,7 +299,7 @@ def _advance(
 
 @hidden_kernel
 def _replay(
-    log: AgentStates, roles: Roles, t: int, rows: Rows, diverged: Diverged, motion: Motion, record: Motion
+    log: AgentStates, roles: Roles, t: int, rows: RolloutRows, diverged: Diverged, motion: Motion, record: Motion
 ) -> None:  # fmt: skip
     """The parked stay, the replayed take the next step of their log.
 
@@ -340,7 +340,7 @@ def _replay(
 @hidden_kernel
 def _admit(
     start: int, log: AgentStates, roles: Roles, driver: IdmDriver, t: int,
-    rows: Rows, diverged: Diverged, motion: Motion, record: Motion,
+    rows: RolloutRows, diverged: Diverged, motion: Motion, record: Motion,
 ) -> None:  # fmt: skip
     """Newcomers, judged against everyone who was already there."""
     n = motion.mode.shape[1]

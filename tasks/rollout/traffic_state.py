@@ -36,10 +36,10 @@ class AgentStates(NamedTuple):
     center_z: Array  # (S, N) [m]
 
 
-class Rows(NamedTuple):
+class RolloutRows(NamedTuple):
     """A rollout's T rows of N agents and, in the last place, the ego; the absent hold NaN and False."""
 
-    boxes: Array  # (T, N + 1, 5) as World
+    boxes: Array  # (T, N + 1, 5) as in AgentStates
     velocities: Array  # (T, N + 1, 2) [m/s]
     valid: Bools  # (T, N + 1)
     center_z: Array  # (T, N + 1) [m]
@@ -79,9 +79,9 @@ class Diverged(NamedTuple):
 
 
 @kernel
-def empty_rows(n_rows: int, n: int) -> Rows:
+def empty_rows(n_rows: int, n: int) -> RolloutRows:
     """Nobody there yet."""
-    return Rows(
+    return RolloutRows(
         np.full((n_rows, n + 1, 5), np.nan),
         np.full((n_rows, n + 1, 2), np.nan),
         np.zeros((n_rows, n + 1), np.bool_),

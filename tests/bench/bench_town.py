@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from factory.readers.av2.reader import AV2Reader
 from factory.readers.settings import TownSettings
 from factory.readers.town.draw import Theatre, paint
-from factory.readers.town.drive import Drive
+from factory.readers.town.drive import TownDrive
 from factory.readers.town.town import log_name, plan_log
 from factory.readers.town.write import write_log
 from factory.stages.sensors import block_of, load_sensors
@@ -67,7 +67,7 @@ def painter(theatre: Theatre) -> Painter:
     return painted
 
 
-def with_moved_vehicles(drive: Drive) -> Drive:
+def with_moved_vehicles(drive: TownDrive) -> TownDrive:
     """The drive with its vehicles put MOVED_M from where they are."""
     tracks = []
     for track in drive.tracks:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from factory.graph.work import PreparedClip
 from factory.readers.town.draw import Theatre, paint
-from factory.readers.town.drive import Drive
+from factory.readers.town.drive import TownDrive
 from factory.readers.town.town import log_name, plan_log
 from factory.stages.imaging import GATE_STRIDE
 from factory.stages.pipeline import FactoryWork, payload_of
@@ -104,11 +104,11 @@ class Painted:
         played = _with(self.drive, drive.agents, first)
         theatre = Theatre(town.scenery, played, town.sun_azimuth, town.sun_elevation, town.sky_seed)
         for pose, step in list(zip(drive.poses, drive.steps, strict=True))[::every]:
-            stage = theatre.at(first + step)
+            scene = theatre.at(first + step)
             there = vehicles_at(drive.agents, step * STEP_S, pose[:2, 3], VISIBLE_M)
             eyes = [Pinhole(c.intrinsics, pose @ c.ego_from_camera, c.width, c.height) for c in rig]
             for camera, eye, seen in zip(rig, eyes, render(asset, eyes, there), strict=True):
-                truth = _unit(paint(stage, replace(camera, distortion=np.zeros(5)), pose))
+                truth = _unit(paint(scene, replace(camera, distortion=np.zeros(5)), pose))
                 yield Shown(camera.name, step, eye, pose, there, seen.rgb, truth)
 
 
@@ -129,7 +129,7 @@ def verdicts(
     return "" if fault is None else fault[0], least
 
 
-def _with(drive: Drive, agents: AgentTracks, first: int) -> Drive:
+def _with(drive: TownDrive, agents: AgentTracks, first: int) -> TownDrive:
     """The log's drive with its tracks where `agents` are, from step `first` on."""
     column = {track_id: j for j, track_id in enumerate(agents.track_ids)}
     tracks = []

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 
 from planners.evaluation.frames import FrameKey
-from planners.evaluation.score_rows import FrameRow, Stage
+from planners.evaluation.score_rows import FrameRow, ScoreStage
 from tasks.reward.one_stage import COLUMNS, FrameScores
 
 
 def row(
-    stage: Stage,
+    stage: ScoreStage,
     key: FrameKey,
     score: float,
     filtered: float | None = None,

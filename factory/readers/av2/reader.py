@@ -31,7 +31,7 @@ from factory.readers.av2.log import (
 )
 from factory.readers.av2.map import map_file, read_map
 from factory.readers.base import SPLITS, BadClip, ClipRef
-from factory.readers.logs import STEP_MS, Drive, LogReader, Recorded, WholeLog, present, route_of_drive
+from factory.readers.logs import STEP_MS, LoggedDrive, LogReader, Recorded, WholeLog, present, route_of_drive
 from factory.readers.splits import folder_split
 from tasks.world.arrays import Array
 from tasks.world.camera import Camera, SensorFile
@@ -63,7 +63,7 @@ class AV2Reader(LogReader[AV2Log]):
         """Log id -> folder. Raises ValueError where the root holds no log."""
         return log_folders(self.root)
 
-    def drive(self, path: Path) -> Drive | str:
+    def drive(self, path: Path) -> LoggedDrive | str:
         """Ego and agents of the log in this folder. A log whose frames nobody annotated is skipped. Raises BadClip."""
         if not (path / ANNOTATIONS).is_file():
             return f"no {ANNOTATIONS}"
@@ -71,7 +71,7 @@ class AV2Reader(LogReader[AV2Log]):
         motion = read_motion(path)
         times_s = step_times(0, motion.n_steps)
         segment = np.where(observed_at(motion, times_s), 0, -1)
-        return Drive(ego_states_at(motion, times_s), agents_at(motion, times_s), segment)
+        return LoggedDrive(ego_states_at(motion, times_s), agents_at(motion, times_s), segment)
 
     def load(self, path: Path) -> AV2Log:
         """The log in this folder. Raises BadClip."""

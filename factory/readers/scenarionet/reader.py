@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from factory.readers.base import BadClip, ClipRef
-from factory.readers.logs import STEP_MS, Drive, LogReader, Recorded, WholeLog, route_of_drive
+from factory.readers.logs import STEP_MS, LoggedDrive, LogReader, Recorded, WholeLog, route_of_drive
 from factory.readers.restricted_pickle import MAX_FILE_BYTES, load_plain
 from factory.readers.scenarionet.map import road_map, traffic_lights
 from factory.readers.scenarionet.tracks import (
@@ -39,7 +39,7 @@ SUMMARY, MAPPING = "dataset_summary.pkl", "dataset_mapping.pkl"
 class ScenarioLog(WholeLog):
     """One log, whole, with the segments of its drive."""
 
-    motion: Drive
+    motion: LoggedDrive
 
 
 class ScenarioNetReader(LogReader[ScenarioLog]):
@@ -59,7 +59,7 @@ class ScenarioNetReader(LogReader[ScenarioLog]):
         """Log id -> pickle, listed once. Raises ValueError where the root holds no scenario."""
         return self._files
 
-    def drive(self, path: Path) -> Drive:
+    def drive(self, path: Path) -> LoggedDrive:
         """Ego and agents of the scenario in this file. Raises BadClip."""
         scenario, _ = read_scenario(path)
         return read_motion(scenario, str(path))
@@ -150,7 +150,7 @@ def _source(scenario: Mapping[str, Any], file: str) -> tuple[str, Source]:
     return name, SOURCES[name]
 
 
-def read_motion(scenario: Mapping[str, Any], file: str) -> Drive:
+def read_motion(scenario: Mapping[str, Any], file: str) -> LoggedDrive:
     """Ego and agents of a scenario every 0.1 s. Raises BadClip."""
     n_frames, tracks = int(scenario["length"]), scenario["tracks"]
     _, source = _source(scenario, file)
@@ -161,7 +161,7 @@ def read_motion(scenario: Mapping[str, Any], file: str) -> Drive:
     ego = read_track(tracks, sdc_id, n_frames, file)
     states, segment = ego_segments(ego, source, at)
     ground = ground_height(ego, at, file)
-    return Drive(states, agent_tracks(tracks, str(sdc_id), at, n_frames, ground, file), segment)
+    return LoggedDrive(states, agent_tracks(tracks, str(sdc_id), at, n_frames, ground, file), segment)
 
 
 def read_log(path: Path) -> ScenarioLog:

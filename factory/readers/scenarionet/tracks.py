@@ -64,7 +64,7 @@ SOURCES = {
 
 
 @dataclass(frozen=True)
-class Track:
+class LoggedTrack:
     """One track at the log's own frames."""
 
     position: Array  # (T, 3)
@@ -97,7 +97,7 @@ def frame_positions(times: Array) -> Array:
     return np.interp(steps, times, np.arange(len(times)))
 
 
-def read_track(tracks: Mapping[Any, Any], track_id: str | int, n_frames: int, file: str) -> Track:
+def read_track(tracks: Mapping[Any, Any], track_id: str | int, n_frames: int, file: str) -> LoggedTrack:
     """One checked track. Raises BadClip naming the field that is missing, misshapen or not finite where valid."""
     field = f"tracks[{track_id}].state"
     state = tracks[track_id].get("state") if isinstance(tracks[track_id], dict) else None
@@ -120,10 +120,10 @@ def read_track(tracks: Mapping[Any, Any], track_id: str | int, n_frames: int, fi
     for column, name in enumerate(("length", "width", "height")):
         if name in state and valid.any():
             size[column] = np.median(_numbers(state[name], (n_frames,), file, f"{field}.{name}")[valid])
-    return Track(position, heading, valid, size)
+    return LoggedTrack(position, heading, valid, size)
 
 
-def ground_height(ego: Track, at: Array, file: str) -> Array:
+def ground_height(ego: LoggedTrack, at: Array, file: str) -> Array:
     """(S,) height of the road under the ego: below Waymo's box centre; 0 where the file keeps the ego at z = 0."""
     if not ego.position[ego.valid, 2].any():
         return np.zeros(len(at))
@@ -169,7 +169,7 @@ def agent_tracks(
     )
 
 
-def resampled(track: Track, at: Array) -> tuple[Array, Array, Bools]:
+def resampled(track: LoggedTrack, at: Array) -> tuple[Array, Array, Bools]:
     """(S, 3) position, (S,) heading in [-pi, pi), (S,) valid: both frames around the fractional one must be."""
     before = np.floor(at).astype(int)
     after = np.minimum(before + 1, len(track.valid) - 1)
@@ -207,7 +207,7 @@ def slope_velocities(xy: Array, valid: Bools) -> Array:
     return slope
 
 
-def ego_segments(track: Track, source: Source, at: Array) -> tuple[Array, Ints]:
+def ego_segments(track: LoggedTrack, source: Source, at: Array) -> tuple[Array, Ints]:
     """Ego states (S, 11), and (S,) the number of the continuous drive that a step belongs to; NaN and -1: none.
 
     Columns 7..10 (steering and rates) are 0, as NAVSIM initialises an ego.

@@ -7,12 +7,12 @@ from photos could tell how. One shading per pixel differs by 30 to 36 dB from th
 
 import numpy as np
 
-from factory.readers.town.drive import Drive
+from factory.readers.town.drive import TownDrive
 from factory.readers.town.figures import figure
 from factory.readers.town.mesh import merged
 from factory.readers.town.raster import Mesh, rasterise
 from factory.readers.town.scenery import Scenery, lamps_lit
-from factory.readers.town.shade import Stage, Sun, shade
+from factory.readers.town.shade import LitScene, Sun, shade
 from factory.readers.town.textures import TREELINE
 from tasks.world.arrays import F32, Array, Bytes, ShortInts
 from tasks.world.camera import Camera
@@ -43,7 +43,9 @@ def sun_over(middle: Array, azimuth: float, elevation: float) -> Sun:
 class Theatre:
     """The town around one drive: standing triangles and their shadows once, what moves per instant."""
 
-    def __init__(self, scenery: Scenery, drive: Drive, sun_azimuth: float, sun_elevation: float, sky_seed: int) -> None:
+    def __init__(
+        self, scenery: Scenery, drive: TownDrive, sun_azimuth: float, sun_elevation: float, sky_seed: int
+    ) -> None:
         middle = drive.ego[len(drive.ego) // 2, :2]
         mesh = scenery.mesh
         centre = mesh.vertices[..., :2].mean(axis=1)
@@ -53,10 +55,10 @@ class Theatre:
         self._scenery, self._drive = scenery, drive
         shadow = np.full((SHADOW_SIZE, SHADOW_SIZE), -1e9, np.float32)
         standing, sun = Mesh(*(field[near] for field in mesh)), sun_over(middle, sun_azimuth, sun_elevation)
-        self._standing = Stage(standing, shadow, sun, scenery.marks, sky_seed)
+        self._standing = LitScene(standing, shadow, sun, scenery.marks, sky_seed)
         cast(shadow, standing, sun)
 
-    def at(self, step: int) -> Stage:
+    def at(self, step: int) -> LitScene:
         """The scene at a step of the drive."""
         drive = self._drive
         moving = [
@@ -85,21 +87,21 @@ def camera_view(intrinsics: Array, world_from_camera: Array) -> tuple[Array, Arr
     return view, world_from_camera[:3, :3] @ np.linalg.inv(intrinsics)
 
 
-def look(stage: Stage, view: Array, width: int, height: int) -> tuple[ShortInts, Array]:
+def look(scene: LitScene, view: Array, width: int, height: int) -> tuple[ShortInts, Array]:
     """Which triangle is visible in each of height x width samples, -1: none; the triangles' planes (T, 9)."""
     ids = np.full((height, width), -1, np.int32)
-    return ids, rasterise(stage.mesh, view, np.zeros((height, width), np.float32), ids)
+    return ids, rasterise(scene.mesh, view, np.zeros((height, width), np.float32), ids)
 
 
-def paint(stage: Stage, camera: Camera, world_from_ego: Array) -> Bytes:
-    """(H, W, 3) RGB picture of the stage by a camera of the ego at `world_from_ego` (4, 4)."""
+def paint(scene: LitScene, camera: Camera, world_from_ego: Array) -> Bytes:
+    """(H, W, 3) RGB picture of the scene by a camera of the ego at `world_from_ego` (4, 4)."""
     per_pixel, margin = CELLS * SAMPLES, SAMPLES  # of one cell: what the optics reach beyond the picture's edge
     scale = np.array([[per_pixel, 0.0, margin], [0.0, per_pixel, margin], [0.0, 0.0, 1.0]])
     world_from_camera = world_from_ego @ camera.ego_from_camera
     view, rays = camera_view(scale @ camera.intrinsics, world_from_camera)
     height, width = CELLS * camera.height + 2, CELLS * camera.width + 2
-    ids, planes = look(stage, view, SAMPLES * width, SAMPLES * height)
-    return _through_optics(shade(stage, ids, planes, np.ascontiguousarray(world_from_camera[:3, 3]), rays))
+    ids, planes = look(scene, view, SAMPLES * width, SAMPLES * height)
+    return _through_optics(shade(scene, ids, planes, np.ascontiguousarray(world_from_camera[:3, 3]), rays))
 
 
 def _through_optics(cells: F32) -> Bytes:

@@ -7,7 +7,7 @@ import numpy as np
 import shapely
 
 from factory.readers.town.streets import Streets
-from factory.readers.town.traffic import RED, STEP_S, Driver, Path, Signals, path_of_lanes
+from factory.readers.town.traffic import RED, STEP_S, DrivingStyle, Signals, TownPath, path_of_lanes
 from tasks.rollout.lqr import track
 from tasks.world.arrays import Array
 from tasks.world.clip import HISTORY_STEPS, HORIZON_STEPS
@@ -94,7 +94,9 @@ def on_at_random(streets: Streets, lane_ids: list[int], rng: np.random.Generator
     return out
 
 
-def ego_path(streets: Streets, scenario: Scenario, driver: Driver, rng: np.random.Generator) -> tuple[Path, float]:
+def ego_path(
+    streets: Streets, scenario: Scenario, style: DrivingStyle, rng: np.random.Generator
+) -> tuple[TownPath, float]:
     """The ego's path and its start on it [m]."""
     near = scenario.to_junction_m
     starts = chains(streets, scenario.road, scenario.forward)
@@ -104,7 +106,7 @@ def ego_path(streets: Streets, scenario: Scenario, driver: Driver, rng: np.rando
         if way is not None:
             length = sum(float(arc_lengths(streets.lanes[lane].center)[-1]) for lane in chain)
             start = float(rng.uniform(25.0, 55.0)) if near is None else length - float(rng.uniform(*near))
-            return path_of_lanes(streets, on_at_random(streets, chain + way, rng), driver, EGO_SMOOTH_M), start
+            return path_of_lanes(streets, on_at_random(streets, chain + way, rng), style, EGO_SMOOTH_M), start
     raise ValueError(f"no way from {scenario.road!r} to {scenario.target!r}")
 
 
@@ -123,7 +125,7 @@ def tracked(rear_axle: Array, speed: Array) -> list[tuple[int, Array]]:
     return [(a, track(states[a], states[None, a + 1 : a + 1 + HORIZON_STEPS, :3])[0]) for a in starts]
 
 
-def is_lawful(streets: Streets, path: Path, boxes: Array, signals: Signals, times_s: Array) -> bool:
+def is_lawful(streets: Streets, path: TownPath, boxes: Array, signals: Signals, times_s: Array) -> bool:
     """All corners on drivable surface at every step, and never on a connector of its way while that is red."""
     corners = box_corners(boxes)
     if not shapely.contains_xy(streets.surface(), *corners.reshape(-1, 2).T).all():

@@ -8,7 +8,7 @@ import numpy as np
 from factory.readers.town import textures as tx
 from factory.readers.town.mesh import Builder, shades
 from factory.readers.town.raster import Mesh
-from factory.readers.town.traffic import Track
+from factory.readers.town.traffic import TownTrack
 from tasks.world.arrays import Array
 
 CAR_PAINT = shades("62 64 66, 12 12 13, 85 85 84, 36 38 40, 50 8 9, 11 20 42, 18 30 24, 70 62 50, 74 72 70, 60 30 10")
@@ -25,7 +25,7 @@ STRIDE_M = 1.4  # a pedestrian's two steps
 Corners = list[tuple[float, float, float]]
 
 
-def figure(track: Track, step: int) -> Mesh:
+def figure(track: TownTrack, step: int) -> Mesh:
     """The track's mesh at one step, in the world."""
     look = track.look % 64
     if walker := WALKERS.get(track.category):

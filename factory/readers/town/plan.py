@@ -12,9 +12,9 @@ from factory.readers.town.streets import (
     CROSSING_GAP_M,
     CROSSING_M,
     Crossing,
-    Road,
     SignalPost,
     Streets,
+    TownRoad,
     _Arm,
     _Builder,
 )
@@ -51,10 +51,10 @@ def build_streets(rng: np.random.Generator) -> Streets:
     west_line = curves.from_curvature(
         mouth(np.pi), [(40.0, 0.0), (35.0, sway), (70.0, -sway), (35.0, sway), (40.0, 0.0)]
     )
-    avenue = Road("avenue", avenue_line, 2, 3.5, "bike", 1.8, 13.5, crossing_at_start=True)
-    south = Road("south avenue", south_line, 2, 3.5, "bike", 1.8, 12.5, crossing_at_start=True)
-    north = Road("narrow street", north_line, 1, 3.3, "park", 2.3, 8.8, crossing_at_start=True)
-    west = Road("west street", west_line, 1, 3.5, "bike", 1.8, 11.5, crossing_at_start=True)
+    avenue = TownRoad("avenue", avenue_line, 2, 3.5, "bike", 1.8, 13.5, crossing_at_start=True)
+    south = TownRoad("south avenue", south_line, 2, 3.5, "bike", 1.8, 12.5, crossing_at_start=True)
+    north = TownRoad("narrow street", north_line, 1, 3.3, "park", 2.3, 8.8, crossing_at_start=True)
+    west = TownRoad("west street", west_line, 1, 3.5, "bike", 1.8, 11.5, crossing_at_start=True)
     arms, far = zip(*(b.road(road) for road in (avenue, north, west, south)), strict=True)
     _crossroads(b, list(arms))
     _y_branch(b, far[0], rng)
@@ -93,7 +93,7 @@ def _y_branch(b: _Builder, stem: _Arm, rng: np.random.Generator) -> None:
         start = curves.advance(inward, 27.0, sign * 8.8, angle)
         bend = -sign * float(rng.uniform(0.0, 0.004))
         line = curves.from_curvature(start, [(50.0, 0.0), (90.0, bend), (120.0, 0.0)])
-        branches.append(b.road(Road(name, line, 1, 3.5, "bike", 1.8, 11.5))[0])
+        branches.append(b.road(TownRoad(name, line, 1, 3.5, "bike", 1.8, 11.5))[0])
     junction = b.mouth("branch", [stem, *branches])
     b.areas.append(_ring(shapely.Polygon(junction.ring).buffer(0.4)))
     right, left = branches
@@ -114,7 +114,7 @@ def _roundabout(b: _Builder, stem: _Arm, rng: np.random.Generator) -> None:
         start = curves.advance(np.array([center[0], center[1], angle]), ROUNDABOUT_REACH_M)
         bend = float(rng.uniform(-0.004, 0.004))
         line = curves.from_curvature(start, [(60.0, 0.0), (80.0, bend), (90.0, 0.0)])
-        arms.append(b.road(Road(f"ring road {k}", line, 1, 3.5, "bike", 1.8, 11.5))[0])
+        arms.append(b.road(TownRoad(f"ring road {k}", line, 1, 3.5, "bike", 1.8, 11.5))[0])
     inner = RING_M - RING_WIDTH_M / 2
     junction = b.mouth("roundabout", arms, inner - 0.6, RING_M + RING_WIDTH_M / 2 + 0.8)
     angles = np.unwrap([float(arm.pose[2]) for arm in arms])

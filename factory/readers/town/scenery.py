@@ -11,7 +11,7 @@ from factory.readers.town import textures as tx
 from factory.readers.town.houses import KERB_M, PLAIN_Z, build_houses, plant_tree, plant_trees
 from factory.readers.town.mesh import WHITE, Builder, lifted
 from factory.readers.town.raster import Mesh
-from factory.readers.town.streets import CROSSING_GAP_M, CROSSING_M, PAVEMENT_M, STOP_LINE_M, Road, Streets
+from factory.readers.town.streets import CROSSING_GAP_M, CROSSING_M, PAVEMENT_M, STOP_LINE_M, Streets, TownRoad
 from factory.readers.town.traffic import GREEN, RED, YELLOW
 from tasks.world.arrays import Array, Ints
 from tasks.world.polygons import arc_lengths
@@ -77,7 +77,7 @@ def _stations(line: Array) -> Ints:
     return np.unique(np.append(picks, len(line) - 1))
 
 
-def _road_marks(roads: tuple[Road, ...]) -> Array:
+def _road_marks(roads: tuple[TownRoad, ...]) -> Array:
     """(roads, M, 9) paint rectangles in road coordinates (u along the line, d to its left), see shade.road_paint."""
     tables = [_marks_of(road) for road in roads]
     out = np.full((len(tables), max(map(len, tables)), 9), 1e9)
@@ -86,7 +86,7 @@ def _road_marks(roads: tuple[Road, ...]) -> Array:
     return out
 
 
-def _marks_of(road: Road) -> list[list[float]]:
+def _marks_of(road: TownRoad) -> list[list[float]]:
     length, h, parks = float(arc_lengths(road.line)[-1]), road.half_width, road.strip == "park"
     outer = road.lanes * road.lane_width
     rows: list[list[float]] = []
@@ -113,7 +113,7 @@ def _marks_of(road: Road) -> list[list[float]]:
     return rows
 
 
-def _road(b: Builder, road: Road, index: int) -> None:
+def _road(b: Builder, road: TownRoad, index: int) -> None:
     cuts = _stations(road.line)
     s, h = arc_lengths(road.line)[cuts], road.half_width
     for left, right in itertools.pairwise(np.linspace(h, -h, 5)):

@@ -11,7 +11,7 @@ import numpy as np
 
 from factory.readers.settings import MOUNTS, check_cameras
 from factory.readers.town import textures as tx
-from factory.readers.town.draw import Stage, camera_view, look
+from factory.readers.town.draw import LitScene, camera_view, look
 from tasks.world.arrays import F32, Array, Bytes, ShortInts
 from tasks.world.camera import Camera
 
@@ -49,7 +49,7 @@ _REFLECTANCE = {tx.ROAD: 0.22, tx.ASPHALT: 0.20, tx.GLOW: 0.9, tx.SIGN: 0.95, tx
 
 
 @dataclass(frozen=True)
-class Sweep:
+class LidarReturns:
     """P returns, ego frame."""
 
     points: F32  # (P, 3) m
@@ -58,7 +58,7 @@ class Sweep:
     offset_ns: ShortInts  # (P,) of the beam within its turn of 0.1 s
 
 
-def scan(stage: Stage, world_from_ego: Array, beams: int, azimuths: int) -> Sweep:
+def scan(scene: LitScene, world_from_ego: Array, beams: int, azimuths: int) -> LidarReturns:
     """One sweep of `beams` x `azimuths` shots from the ego at `world_from_ego` (4, 4)."""
     elevation = np.deg2rad(np.linspace(*ELEVATIONS_DEG, beams))
     turn = np.arange(azimuths) * 2 * np.pi / azimuths
@@ -80,17 +80,17 @@ def scan(stage: Stage, world_from_ego: Array, beams: int, azimuths: int) -> Swee
         local = direction[mine] @ ego_from_view[:3, :3]  # x right, y down, z forward
         x = local[:, 0] / local[:, 2] * width / 2 + width / 2
         y = local[:, 1] / local[:, 2] * width / 2 + height / 2
-        ids, planes = look(stage, view, width, height)
+        ids, planes = look(scene, view, width, height)
         hit = ids[np.clip(y.astype(int), 0, height - 1), np.clip(x.astype(int), 0, width - 1)]
         plane = planes[np.maximum(hit, 0)]
         inverse_depth = plane[:, 0] * x + plane[:, 1] * y + plane[:, 2]
         met = (hit >= 0) & (inverse_depth > 1.0 / (2 * RANGE_M[1]))
         distance[mine[met]] = 1.0 / (inverse_depth[met] * local[met, 2])
-        normals = stage.mesh.normals[hit[met]] @ world_from_ego[:3, :3]
+        normals = scene.mesh.normals[hit[met]] @ world_from_ego[:3, :3]
         facing = np.abs(np.einsum("ij,ij->i", normals, direction[mine[met]]))
-        intensity[mine[met]] = _reflectance(stage, hit[met]) * (0.35 + 0.65 * facing)
+        intensity[mine[met]] = _reflectance(scene, hit[met]) * (0.35 + 0.65 * facing)
     keep = np.flatnonzero((distance > RANGE_M[0]) & (distance < RANGE_M[1]))  # false for NaN
-    return Sweep(
+    return LidarReturns(
         (MOUNT_M + direction[keep] * distance[keep, None]).astype(np.float32),
         np.clip(intensity[keep] * 255, 0, 255).astype(np.uint8),
         laser[keep].astype(np.uint8),
@@ -98,8 +98,8 @@ def scan(stage: Stage, world_from_ego: Array, beams: int, azimuths: int) -> Swee
     )
 
 
-def _reflectance(stage: Stage, triangle: ShortInts) -> Array:
-    out = np.clip(stage.mesh.colour[triangle].mean(axis=1), 0.05, 0.6)
+def _reflectance(scene: LitScene, triangle: ShortInts) -> Array:
+    out = np.clip(scene.mesh.colour[triangle].mean(axis=1), 0.05, 0.6)
     for material, value in _REFLECTANCE.items():
-        out[stage.mesh.material[triangle] == material] = value
+        out[scene.mesh.material[triangle] == material] = value
     return out

@@ -19,7 +19,7 @@ class Sun(NamedTuple):
     projection: Array  # (4, 4)
 
 
-class Stage(NamedTuple):
+class LitScene(NamedTuple):
     """One instant of a drive, ready to be seen: all triangles and the sun's depth map. Kernels take it whole."""
 
     mesh: Mesh
@@ -93,14 +93,14 @@ def sky(dx: float, dy: float, dz: float, sun: Array, seed: int) -> RGB:
 
 
 @drawing_kernel
-def surface_colour(stage: Stage, t: int, u: float, v: float, x: float, y: float, fu: float, fv: float) -> RGB:
+def surface_colour(scene: LitScene, t: int, u: float, v: float, x: float, y: float, fu: float, fv: float) -> RGB:
     """Colour before light of triangle t at (u, v), world (x, y), in a pixel with the footprint (fu, fv)."""
-    mesh = stage.mesh
+    mesh = scene.mesh
     kind, seed, width, height = mesh.material[t], mesh.seed[t], mesh.extent[t, 0], mesh.extent[t, 1]
     colour = mesh.colour[t, 0], mesh.colour[t, 1], mesh.colour[t, 2]
     fp, tone = max(fu, fv), 1.0
     if kind == tx.ROAD:
-        return road_surface(x, y, u, v, stage.marks[seed], fu, fv)
+        return road_surface(x, y, u, v, scene.marks[seed], fu, fv)
     if kind == tx.ASPHALT:
         return tx.asphalt(x, y, fp)
     if kind == tx.PAVING:
@@ -166,9 +166,9 @@ def surface_colour(stage: Stage, t: int, u: float, v: float, x: float, y: float,
 
 
 @drawing_kernel
-def lit_by_sun(x: float, y: float, z: float, stage: Stage) -> float:
+def lit_by_sun(x: float, y: float, z: float, scene: LitScene) -> float:
     """0 in shade .. 1 in the sun: four taps of the sun's depth map, blended; outside it: sun."""
-    view, shadow = stage.sun.projection, stage.shadow
+    view, shadow = scene.sun.projection, scene.shadow
     sx = view[0, 0] * x + view[0, 1] * y + view[0, 2] * z + view[0, 3] - 0.5
     sy = view[1, 0] * x + view[1, 1] * y + view[1, 2] * z + view[1, 3] - 0.5
     key = view[3, 0] * x + view[3, 1] * y + view[3, 2] * z + view[3, 3] + 0.25
@@ -182,12 +182,12 @@ def lit_by_sun(x: float, y: float, z: float, stage: Stage) -> float:
 
 
 @drawing_kernel
-def lit(stage: Stage, t: int, colour: RGB, x: float, y: float, z: float, dx: float, dy: float, dz: float) -> RGB:
+def lit(scene: LitScene, t: int, colour: RGB, x: float, y: float, z: float, dx: float, dy: float, dz: float) -> RGB:
     """The colour of triangle t at world (x, y, z) in the light there, seen along (dx, dy, dz)."""
-    kind, sun = stage.mesh.material[t], stage.sun.direction
+    kind, sun = scene.mesh.material[t], scene.sun.direction
     if kind == tx.GLOW:
         return colour
-    nx, ny, nz = stage.mesh.normals[t, 0], stage.mesh.normals[t, 1], stage.mesh.normals[t, 2]
+    nx, ny, nz = scene.mesh.normals[t, 0], scene.mesh.normals[t, 1], scene.mesh.normals[t, 2]
     if kind != tx.LEAVES and nx * dx + ny * dy + nz * dz > 0:
         nx, ny, nz = -nx, -ny, -nz
     facing = nx * sun[0] + ny * sun[1] + nz * sun[2]
@@ -195,13 +195,13 @@ def lit(stage: Stage, t: int, colour: RGB, x: float, y: float, z: float, dx: flo
         facing = 0.35 + 0.5 * facing
     direct = 0.0
     if facing > 0 and kind != tx.TREELINE:
-        direct = facing * lit_by_sun(x + 0.1 * nx, y + 0.1 * ny, z + 0.1 * nz, stage)
+        direct = facing * lit_by_sun(x + 0.1 * nx, y + 0.1 * ny, z + 0.1 * nz, scene)
     ambient, (r, g, b) = 0.56 + 0.16 * nz, colour
     return r * (ambient * 0.93 + 0.86 * direct), g * (ambient + 0.80 * direct), b * (ambient * 1.10 + 0.70 * direct)
 
 
 @drawing_kernel
-def shade(stage: Stage, ids: ShortInts, planes: Array, origin: Array, rays: Array) -> F32:
+def shade(scene: LitScene, ids: ShortInts, planes: Array, origin: Array, rays: Array) -> F32:
     """(H, W, 3) RGB in [0, 255] of the triangles (2H, 2W) that a camera at `origin` (3,) in the world sees.
 
     Each cell is the mean of its 2 x 2 samples; a triangle that covers several of them is shaded once. The world's
@@ -230,7 +230,7 @@ def shade(stage: Stage, ids: ShortInts, planes: Array, origin: Array, rays: Arra
                 dz = rays[2, 0] * x + rays[2, 1] * y + rays[2, 2]
                 length = math.sqrt(dx * dx + dy * dy + dz * dz)
                 if t < 0:
-                    r, g, b = sky(dx / length, dy / length, dz / length, stage.sun.direction, stage.sky_seed)
+                    r, g, b = sky(dx / length, dy / length, dz / length, scene.sun.direction, scene.sky_seed)
                 else:
                     p = planes[t]
                     depth = 1.0 / (p[0] * x + p[1] * y + p[2])
@@ -238,7 +238,7 @@ def shade(stage: Stage, ids: ShortInts, planes: Array, origin: Array, rays: Arra
                     fu = 2 * depth * (abs(p[3] - u * p[0]) + abs(p[4] - u * p[1])) + 1e-6
                     fv = 2 * depth * (abs(p[6] - v * p[0]) + abs(p[7] - v * p[1])) + 1e-6
                     wx, wy, wz = origin[0] + dx * depth, origin[1] + dy * depth, origin[2] + dz * depth
-                    colour = lit(stage, t, surface_colour(stage, t, u, v, wx, wy, fu, fv), wx, wy, wz, dx, dy, dz)
+                    colour = lit(scene, t, surface_colour(scene, t, u, v, wx, wy, fu, fv), wx, wy, wz, dx, dy, dz)
                     r, g, b = mixed(colour, (0.84, 0.88, 0.93), 1.0 - math.exp(-depth / 2200.0))  # haze
                 red += count * r
                 green += count * g

@@ -20,7 +20,7 @@ PAVEMENT_M = 3.4  # pavement's width behind the kerb
 
 
 @dataclass(frozen=True)
-class Road:
+class TownRoad:
     """A street between two junctions (or the town's edge); `line` runs from its first to its second end."""
 
     name: str
@@ -44,7 +44,7 @@ class Road:
 
 
 @dataclass
-class Lane:
+class TownLane:
     """One lane segment under construction, then read only. Boundaries run in driving direction."""
 
     lane_id: int
@@ -98,9 +98,9 @@ class SignalPost:
 class Streets:
     """The whole network."""
 
-    roads: tuple[Road, ...]
+    roads: tuple[TownRoad, ...]
     junctions: tuple[Junction, ...]
-    lanes: dict[int, Lane]
+    lanes: dict[int, TownLane]
     areas: tuple[Array, ...]  # rings (M, 2) of drivable surface
     crossings: tuple[Crossing, ...]
     posts: tuple[SignalPost, ...]
@@ -114,7 +114,7 @@ class Streets:
 class _Arm:
     """A road's end at a junction; `pose` looks out of the junction along the road's reference line."""
 
-    road: Road
+    road: TownRoad
     pose: Array
     incoming: list[int]  # lane ids that end here, inner lane first
     outgoing: list[int]
@@ -122,15 +122,15 @@ class _Arm:
 
 class _Builder:
     def __init__(self) -> None:
-        self.lanes: dict[int, Lane] = {}
-        self.roads: list[Road] = []
+        self.lanes: dict[int, TownLane] = {}
+        self.roads: list[TownRoad] = []
         self.junctions: list[Junction] = []
         self.areas: list[Array] = []
         self.crossings: list[Crossing] = []
         self.posts: list[SignalPost] = []
 
-    def lane(self, center: Array, left: Array, right: Array, road: str, speed: float, **more: object) -> Lane:
-        lane = Lane(1000 + 7 * len(self.lanes), center, left[:, :2], right[:, :2], road, speed, **more)  # type: ignore[arg-type]
+    def lane(self, center: Array, left: Array, right: Array, road: str, speed: float, **more: object) -> TownLane:
+        lane = TownLane(1000 + 7 * len(self.lanes), center, left[:, :2], right[:, :2], road, speed, **more)  # type: ignore[arg-type]
         self.lanes[lane.lane_id] = lane
         return lane
 
@@ -138,7 +138,7 @@ class _Builder:
         self.lanes[before].successors.append(after)
         self.lanes[after].predecessors.append(before)
 
-    def road(self, road: Road) -> tuple[_Arm, _Arm]:
+    def road(self, road: TownRoad) -> tuple[_Arm, _Arm]:
         """Lanes of a road in segments of ~80 m; returns the arms at its first and second end."""
         self.roads.append(road)
         n_cuts = max(1, round(arc_lengths(road.line)[-1] / 80.0))
@@ -162,10 +162,10 @@ class _Builder:
         )
         return first, second
 
-    def _segment(self, road: Road, line: Array, forward: bool, chains: dict[tuple[bool, int], list[int]]) -> int:
+    def _segment(self, road: TownRoad, line: Array, forward: bool, chains: dict[tuple[bool, int], list[int]]) -> int:
         """Lanes of one direction over one segment; returns the innermost lane's id."""
         base = line if forward else curves.reverse(line)
-        previous: Lane | None = None
+        previous: TownLane | None = None
         innermost = -1
         for k in range(road.lanes + 1):
             is_strip = k == road.lanes

@@ -6,12 +6,12 @@ from functools import lru_cache
 import numpy as np
 
 from factory.readers.settings import LOG_STEPS, LOGS_PER_TOWN
-from factory.readers.town.drive import Drive, parked_cars, plan_drive
+from factory.readers.town.drive import TownDrive, parked_cars, plan_drive
 from factory.readers.town.ego import SCENARIOS
 from factory.readers.town.plan import build_streets
 from factory.readers.town.scenery import Scenery, build_scenery
 from factory.readers.town.streets import Streets
-from factory.readers.town.traffic import Track
+from factory.readers.town.traffic import TownTrack
 
 WINDOWS_PER_LOG = 3  # of 9.5 s at stride 1 s
 
@@ -22,7 +22,7 @@ class Town:
 
     name: str
     streets: Streets
-    parked: tuple[Track, ...]
+    parked: tuple[TownTrack, ...]
     scenery: Scenery
     sun_azimuth: float
     sun_elevation: float
@@ -53,7 +53,7 @@ def log_name(seed: int, index: int) -> str:
     return f"town-{seed}-{index:04d}-{kind}"
 
 
-def plan_log(seed: int, index: int) -> tuple[Town, Drive]:
+def plan_log(seed: int, index: int) -> tuple[Town, TownDrive]:
     """The drive of log `index`, and the town it leads through."""
     town = build_town(seed, index // LOGS_PER_TOWN)
     return town, plan_drive(town.streets, town.parked, SCENARIOS[index % LOGS_PER_TOWN], LOG_STEPS, [seed, index, 4])

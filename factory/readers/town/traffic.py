@@ -35,7 +35,7 @@ class Signals:
 
 
 @dataclass(frozen=True)
-class Path:
+class TownPath:
     """What one road user follows."""
 
     poses: Array  # (N, 3) every metre
@@ -46,7 +46,7 @@ class Path:
 
 
 @dataclass(frozen=True)
-class Track:
+class TownTrack:
     """One road user or parked car over the log; absent steps are NaN."""
 
     track_id: str
@@ -61,7 +61,7 @@ class Track:
 
 
 @dataclass(frozen=True)
-class Driver:
+class DrivingStyle:
     """How somebody drives; accelerations in m/s2."""
 
     speed_factor: float = 1.0
@@ -76,7 +76,7 @@ class Driver:
     half_width_m: float = 0.95
 
 
-def path_of_lanes(streets: Streets, lane_ids: list[int], driver: Driver, smooth_m: float = 2.5) -> Path:
+def path_of_lanes(streets: Streets, lane_ids: list[int], style: DrivingStyle, smooth_m: float = 2.5) -> TownPath:
     """The centre line of consecutive lanes, rounded so that curvature is continuous."""
     parts, stops, limits, length = [], [], [], 0.0
     for i, lane_id in enumerate(lane_ids):
@@ -98,12 +98,12 @@ def path_of_lanes(streets: Streets, lane_ids: list[int], driver: Driver, smooth_
     s = arc_lengths(poses)
     curvature = gaussian_filter1d(np.gradient(np.unwrap(poses[:, 2]), s), 2.0)
     winding = np.abs(gaussian_filter1d(np.gradient(curvature, s), 2.0))
-    posted = np.interp(s, s_raw, np.concatenate(limits)) * driver.speed_factor
-    limit = np.minimum(posted, np.sqrt(driver.lateral_accel / np.maximum(np.abs(curvature), 1e-6)))
-    limit = np.minimum(limit, np.sqrt(driver.yaw_accel / np.maximum(winding, 1e-6)))
+    posted = np.interp(s, s_raw, np.concatenate(limits)) * style.speed_factor
+    limit = np.minimum(posted, np.sqrt(style.lateral_accel / np.maximum(np.abs(curvature), 1e-6)))
+    limit = np.minimum(limit, np.sqrt(style.yaw_accel / np.maximum(winding, 1e-6)))
     for i in range(len(limit) - 2, -1, -1):
-        limit[i] = min(limit[i], np.sqrt(limit[i + 1] ** 2 + 2 * 0.8 * driver.brake * (s[i + 1] - s[i])))
-    return Path(poses, s, limit, tuple(stops), tuple(lane_ids))
+        limit[i] = min(limit[i], np.sqrt(limit[i + 1] ** 2 + 2 * 0.8 * style.brake * (s[i + 1] - s[i])))
+    return TownPath(poses, s, limit, tuple(stops), tuple(lane_ids))
 
 
 def _chord(xy: Array) -> Array:
@@ -113,29 +113,29 @@ def _chord(xy: Array) -> Array:
 
 
 def drive(
-    path: Path, start_s: float, speed: float, driver: Driver, others: Array, signals: Signals, times_s: Array
+    path: TownPath, start_s: float, speed: float, style: DrivingStyle, others: Array, signals: Signals, times_s: Array
 ) -> tuple[Array, Array]:
     """Arc length (S,) [m] and speed (S,) [m/s] of a driver that sees `others` (S, J, 5): IDM with bounded jerk."""
-    rear, along_speed = _on_path(path, driver, others)
+    rear, along_speed = _on_path(path, style, others)
     s_out, v_out = np.empty(len(times_s)), np.empty(len(times_s))
     s, v, a = start_s, speed, 0.0
     for i, time in enumerate(times_s):
         s_out[i], v_out[i] = s, v
-        front = s + driver.front_m
+        front = s + style.front_m
         wanted = float(np.interp(s + 0.6 * v, path.s, path.limit))
-        command = min(max((wanted - v) / 0.9, -driver.brake), driver.accel)
+        command = min(max((wanted - v) / 0.9, -style.brake), style.accel)
         gaps = rear[i] - front
         ahead = gaps > -1.0
         if ahead.any():
             nearest = int(np.argmin(np.where(ahead, gaps, np.inf)))
-            command = min(command, _follow(float(gaps[nearest]), v, float(along_speed[i, nearest]), driver))
+            command = min(command, _follow(float(gaps[nearest]), v, float(along_speed[i, nearest]), style))
         for line, group in path.stops:
             state = RED if group < 0 else signals.state(group, float(time))
             distance = line - front
             can_stop = v * v / (2 * max(distance, 0.1)) < 2.6
             if distance > -1.0 and (state == RED or (state == YELLOW and can_stop)) and (distance > 0 or v < 1.0):
-                command = min(command, _follow(distance + driver.gap_m - 0.6, v, 0.0, driver))
-        a += float(np.clip(np.clip(command, -4.5, driver.accel) - a, -driver.jerk * STEP_S, driver.jerk * STEP_S))
+                command = min(command, _follow(distance + style.gap_m - 0.6, v, 0.0, style))
+        a += float(np.clip(np.clip(command, -4.5, style.accel) - a, -style.jerk * STEP_S, style.jerk * STEP_S))
         if command < -2.5:
             a = min(a, command * 0.6)
         v_next = max(0.0, v + a * STEP_S)
@@ -146,14 +146,14 @@ def drive(
     return s_out, v_out
 
 
-def _follow(gap: float, v: float, lead_v: float, driver: Driver) -> float:
+def _follow(gap: float, v: float, lead_v: float, style: DrivingStyle) -> float:
     """IDM's interaction term (Treiber et al. 2000)."""
-    closing = v * (v - lead_v) / (2 * np.sqrt(driver.accel * driver.brake))
-    wanted = driver.gap_m + max(0.0, v * driver.headway_s + closing)
-    return driver.accel * (1.0 - (wanted / max(gap, 0.3)) ** 2)
+    closing = v * (v - lead_v) / (2 * np.sqrt(style.accel * style.brake))
+    wanted = style.gap_m + max(0.0, v * style.headway_s + closing)
+    return style.accel * (1.0 - (wanted / max(gap, 0.3)) ** 2)
 
 
-def _on_path(path: Path, driver: Driver, others: Array) -> tuple[Array, Array]:
+def _on_path(path: TownPath, style: DrivingStyle, others: Array) -> tuple[Array, Array]:
     """Where along the path everybody in the driver's corridor ends (S, J) (inf: not in it), and speeds along it."""
     if others.shape[1] == 0:
         return np.full((len(others), 1), np.inf), np.zeros((len(others), 1))
@@ -168,7 +168,7 @@ def _on_path(path: Path, driver: Driver, others: Array) -> tuple[Array, Array]:
     cos, sin = np.abs(np.cos(turn)), np.abs(np.sin(turn))
     across = box[:, 3] / 2 * sin + box[:, 4] / 2 * cos
     along[present] = position = path.s[nearest] + c * dx + s * dy
-    inside = np.abs(-s * dx + c * dy) < across + driver.half_width_m + 0.25
+    inside = np.abs(-s * dx + c * dy) < across + style.half_width_m + 0.25
     rear[present] = np.where(inside, position - box[:, 3] / 2 * cos - box[:, 4] / 2 * sin, np.inf)
     return rear, np.nan_to_num(np.clip(np.gradient(along, STEP_S, axis=0), 0.0, 30.0))
 

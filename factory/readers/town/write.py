@@ -21,9 +21,9 @@ from scipy.spatial.transform import Rotation
 from factory.readers.av2.log import POSE_COLUMNS, SIZE_COLUMNS
 from factory.readers.settings import LOG_STEPS, STEPS_PER_SWEEP, TownSettings
 from factory.readers.town.draw import Theatre, paint
-from factory.readers.town.drive import Drive
+from factory.readers.town.drive import TownDrive
 from factory.readers.town.sensors import REAR_AXLE_Z_M, build_rig, scan, world_from_ego
-from factory.readers.town.streets import Lane, Streets
+from factory.readers.town.streets import Streets, TownLane
 from factory.readers.town.town import WINDOWS_PER_LOG, Town, log_name, plan_log
 from factory.readers.town.traffic import GREEN, RED, YELLOW
 from factory.wording import time_text
@@ -65,7 +65,7 @@ def write_logs(out: Path, indices: Collection[int], seed: int, settings: TownSet
 
 
 def write_log(
-    folder: Path, town: Town, drive: Drive, settings: TownSettings, number: int = 0, threads: int = 2
+    folder: Path, town: Town, drive: TownDrive, settings: TownSettings, number: int = 0, threads: int = 2
 ) -> Path:
     """Writes one drive as a log folder."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -87,7 +87,13 @@ def write_log(
 
 
 def _sensors(
-    folder: Path, town: Town, drive: Drive, rig: tuple[Camera, ...], settings: TownSettings, stamps: Ints, threads: int
+    folder: Path,
+    town: Town,
+    drive: TownDrive,
+    rig: tuple[Camera, ...],
+    settings: TownSettings,
+    stamps: Ints,
+    threads: int,
 ) -> None:
     kinds = [f"cameras/{camera.name}" for camera in rig] + ["lidar"] * bool(settings.lidar_beams)
     if not kinds:
@@ -99,13 +105,13 @@ def _sensors(
     swept = range(0, LOG_STEPS if settings.lidar_beams else 0, STEPS_PER_SWEEP)
 
     def record(step: int) -> None:
-        stage, pose, stamp = theatre.at(step), world_from_ego(drive.ego[step]), int(stamps[step])
+        scene, pose, stamp = theatre.at(step), world_from_ego(drive.ego[step]), int(stamps[step])
         for camera in rig if step in photographed else ():
-            picture = cv2.cvtColor(paint(stage, camera, pose), cv2.COLOR_RGB2BGR)
+            picture = cv2.cvtColor(paint(scene, camera, pose), cv2.COLOR_RGB2BGR)
             _ok, jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, settings.jpeg_quality])
             (folder / "sensors" / "cameras" / camera.name / f"{stamp}.jpg").write_bytes(jpeg.tobytes())
         if step in swept:
-            sweep = scan(stage, pose, settings.lidar_beams, settings.lidar_azimuths)
+            sweep = scan(scene, pose, settings.lidar_beams, settings.lidar_azimuths)
             columns = {axis: pa.array(sweep.points[:, k]) for k, axis in enumerate("xyz")}
             columns |= {name: pa.array(getattr(sweep, name)) for name in ("intensity", "laser_number", "offset_ns")}
             _feather(folder / "sensors" / "lidar" / f"{stamp}.feather", columns)
@@ -123,12 +129,12 @@ def _yaw_columns(yaw: Array) -> dict[str, Any]:
     return {"qw": np.cos(yaw / 2), "qx": zero, "qy": zero, "qz": np.sin(yaw / 2)}
 
 
-def _poses(drive: Drive, stamps: Ints) -> dict[str, Any]:
+def _poses(drive: TownDrive, stamps: Ints) -> dict[str, Any]:
     place = {"tx_m": drive.ego[:, 0], "ty_m": drive.ego[:, 1], "tz_m": np.full(len(stamps), REAR_AXLE_Z_M)}
     return {"timestamp_ns": stamps, **_yaw_columns(drive.ego[:, 2]), **place}
 
 
-def _annotations(drive: Drive, stamps: Ints) -> dict[str, Any]:
+def _annotations(drive: TownDrive, stamps: Ints) -> dict[str, Any]:
     """One row per box and frame, box pose in the ego frame of that frame."""
     poses = np.stack([track.poses for track in drive.tracks], axis=1)
     delta = poses[..., :2] - drive.ego[:, None, :2]
@@ -150,7 +156,7 @@ def _annotations(drive: Drive, stamps: Ints) -> dict[str, Any]:
     }
 
 
-def _lights(streets: Streets, drive: Drive, stamps: Ints) -> dict[str, Any]:
+def _lights(streets: Streets, drive: TownDrive, stamps: Ints) -> dict[str, Any]:
     """A row per frame and light-governed connector of the map; empty where it has none."""
     governed = [lane for lane in _near_lanes(streets, drive) if lane.light_group >= 0]
     if not governed:
@@ -181,12 +187,12 @@ def _calibration(folder: Path, rig: tuple[Camera, ...]) -> None:
     _feather(folder / "calibration" / "egovehicle_SE3_sensor.feather", poses)
 
 
-def _near_lanes(streets: Streets, drive: Drive) -> list[Lane]:
+def _near_lanes(streets: Streets, drive: TownDrive) -> list[TownLane]:
     middle = drive.ego[len(drive.ego) // 2, :2]
     return [lane for lane in streets.lanes.values() if np.hypot(*(lane.center[:, :2] - middle).T).min() < MAP_RANGE_M]
 
 
-def _vector_map(streets: Streets, drive: Drive) -> dict[str, dict[str, Any]]:
+def _vector_map(streets: Streets, drive: TownDrive) -> dict[str, dict[str, Any]]:
     """The vector map around the drive; a neighbour's or successor's id may lie outside it, as in Argoverse's crops."""
     lanes = {
         str(lane.lane_id): {

@@ -33,7 +33,7 @@ LOOK_EVERY_S = 2.0
 
 
 @dataclass(frozen=True)
-class Part:
+class WatchedFile:
     """What is kept of one file; `rows` has the columns _file, _row and _written_ms beside those of the table."""
 
     rows: pa.Table
@@ -47,7 +47,7 @@ class Watched:
     def __init__(self, table: KeyedTable, columns: Sequence[str]) -> None:
         self.table, self._columns = table, list(columns)
         self.files: Mapping[str, LiveFile] = {}
-        self.parts: dict[str, Part] = {}
+        self.parts: dict[str, WatchedFile] = {}
         self.paths: list[str] = []  # by the number in _file
         self._seen: int | None = None
 
@@ -69,7 +69,7 @@ class Watched:
         schema = pa.schema([self.table.spec.schema.field(name) for name in names])
         return pa.concat_tables([_placed(schema.empty_table(), 0, 0), *(part.rows for part in self.parts.values())])
 
-    def _read(self, path: str, file: LiveFile) -> Part:
+    def _read(self, path: str, file: LiveFile) -> WatchedFile:
         rows = self.table.read_file(path, file.partition, self._columns)
         self.paths.append(path)
         seconds, ends = {}, None
@@ -77,7 +77,7 @@ class Watched:
             seconds, rows = seconds_of(rows["seconds"]), rows.drop_columns(["seconds"])
         if "candidates" in self._columns:
             ends, rows = end_points_of(rows["candidates"]), rows.drop_columns(["candidates"])
-        return Part(_placed(rows, len(self.paths) - 1, file.written_ms), seconds, ends)
+        return WatchedFile(_placed(rows, len(self.paths) - 1, file.written_ms), seconds, ends)
 
 
 def _placed(rows: pa.Table, file: int, written_ms: int) -> pa.Table:

@@ -33,7 +33,7 @@ Progress = Callable[[int, float, float], None]  # iteration, mean loss and mean 
 
 
 @dataclass(frozen=True)
-class Part:
+class OwnedGaussians:
     """Consecutive Gaussians of a composed scene that share an owner."""
 
     first: int
@@ -126,17 +126,17 @@ def _iterate(problem: Problem, state: FitState, settings: FitSettings, threads: 
     return loss, psnr(np.clip(picture, 0.0, 1.0), shot.target.rgb)
 
 
-def compose(problem: Problem, state: FitState, photo: Photo) -> tuple[Gaussians, list[Part]]:
+def compose(problem: Problem, state: FitState, photo: Photo) -> tuple[Gaussians, list[OwnedGaussians]]:
     """All Gaussians that a photo (pose local) may show, in the scene, and whose they are; the background's first."""
     every = state.gaussians()
     n = int(np.searchsorted(state.owner, 0))
-    scenes, parts = [every.take(slice(n))], [Part(0, np.arange(n), None)]
+    scenes, parts = [every.take(slice(n))], [OwnedGaussians(0, np.arange(n), None)]
     boxes, valid = problem.tracks.at(photo.time_s)
     frames = world_from_boxes(boxes)
     for j in np.flatnonzero(valid & _in_view(boxes, photo)):
         mine = slice(*np.searchsorted(state.owner, [j, j + 1]))
         if mine.start < mine.stop:
-            parts.append(Part(n, np.arange(mine.start, mine.stop), frames[j]))
+            parts.append(OwnedGaussians(n, np.arange(mine.start, mine.stop), frames[j]))
             scenes.append(moved(every.take(mine), frames[j]))
             n += mine.stop - mine.start
     return (scenes[0] if len(scenes) == 1 else concatenate(scenes)), parts
@@ -177,7 +177,7 @@ def _step_world(state: FitState, settings: FitSettings, row: int, back: Gradient
         poses.values[row] = before + rates * (poses.values[row] - before)
 
 
-def _of_owners(back: Gradients, parts: Sequence[Part]) -> tuple[Ints, Gradients]:
+def _of_owners(back: Gradients, parts: Sequence[OwnedGaussians]) -> tuple[Ints, Gradients]:
     """The gradients in the frames that the Gaussians are learned in, and their rows in the state."""
     rows, pieces = [], []
     for part in parts:

@@ -7,7 +7,7 @@ import pytest
 
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES
 from factory.graph.execute import execute
-from factory.graph.progress import Forecast, Workload
+from factory.graph.progress import RunForecast, Workload
 from factory.store.samples import Store
 from tests.factory.toy import ToyWork, refs
 
@@ -16,19 +16,19 @@ EXPERTS = ["recovery", "human"]
 
 def test_what_is_left_costs_what_the_same_has_cost() -> None:
     # two workers for 100 s: 3 of 4 blocks at 60 s, 10 of 30 samples at 2 s; left are 60 and 40 s of one worker
-    forecast = Forecast(Workload(1, 3, 180.0), Workload(20, 10, 20.0))
+    forecast = RunForecast(Workload(1, 3, 180.0), Workload(20, 10, 20.0))
     assert forecast.left_s(100.0) == pytest.approx(50.0)
     forecast.blocks.finish(1)
     assert forecast.left_s(100.0) == pytest.approx(20.0)
 
 
 def test_a_kind_of_work_that_nothing_is_known_of_leaves_the_time_open() -> None:
-    assert Forecast(Workload(), Workload(5)).left_s(10.0) is None
-    assert Forecast(Workload(2, 3, 60.0), Workload(5)).left_s(10.0) is None
-    assert Forecast(Workload(2), Workload(5, 5, 60.0)).left_s(10.0) is None
-    assert Forecast(Workload(0, 3), Workload(5, 5)).left_s(10.0) is None, "what is done was found in a cache"
-    assert Forecast(Workload(0, 3, 60.0), Workload(0, 5, 5.0)).left_s(10.0) == 0.0
-    assert Forecast(Workload(), Workload()).left_s(10.0) == 0.0
+    assert RunForecast(Workload(), Workload(5)).left_s(10.0) is None
+    assert RunForecast(Workload(2, 3, 60.0), Workload(5)).left_s(10.0) is None
+    assert RunForecast(Workload(2), Workload(5, 5, 60.0)).left_s(10.0) is None
+    assert RunForecast(Workload(0, 3), Workload(5, 5)).left_s(10.0) is None, "what is done was found in a cache"
+    assert RunForecast(Workload(0, 3, 60.0), Workload(0, 5, 5.0)).left_s(10.0) == 0.0
+    assert RunForecast(Workload(), Workload()).left_s(10.0) == 0.0
 
 
 def last_line(out: Path, work: ToyWork, rounds: int, capsys: pytest.CaptureFixture[str], code: int = COMPLETE) -> str:

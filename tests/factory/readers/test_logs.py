@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from factory.readers.base import BadClip, ClipRef
-from factory.readers.logs import Drive, LogReader, Recorded, WholeLog, route_of_drive
+from factory.readers.logs import LoggedDrive, LogReader, Recorded, WholeLog, route_of_drive
 from tasks.world.agents import AgentTracks
 from tasks.world.clip import CLIP_STEPS, STEP_S
 from tasks.world.lanes import TrafficLights
@@ -34,7 +34,7 @@ class StreetReader(LogReader[WholeLog]):
     def logs(self) -> dict[str, Path]:
         return {path.stem: path for path in sorted(self.root.glob("*.txt"))}
 
-    def drive(self, path: Path) -> Drive | str:
+    def drive(self, path: Path) -> LoggedDrive | str:
         text = path.read_text()
         if text == "unlabelled":
             return "nobody labelled it"
@@ -47,11 +47,11 @@ class StreetReader(LogReader[WholeLog]):
         states[:first] = np.nan
         segment = np.where(np.arange(n_steps) < gap, 0, 1)
         segment[:first] = -1
-        return Drive(states, NOBODY.window(0, n_steps), segment)
+        return LoggedDrive(states, NOBODY.window(0, n_steps), segment)
 
     def load(self, path: Path) -> WholeLog:
         drive, street = self.drive(path), street_clip()
-        assert isinstance(drive, Drive)
+        assert isinstance(drive, LoggedDrive)
         driven = drive.ego_states[drive.segment >= 0, :3]
         return WholeLog(
             file=str(path),

@@ -9,7 +9,7 @@ from shapely.geometry import Point, Polygon
 from factory.readers.base import ClipRef
 from factory.readers.scenarionet.map import pieces
 from factory.readers.scenarionet.reader import ScenarioNetReader, read_log
-from factory.readers.scenarionet.tracks import SLOPE_STEPS, Track, resampled, slope_velocities
+from factory.readers.scenarionet.tracks import SLOPE_STEPS, LoggedTrack, resampled, slope_velocities
 from tasks.world.agents import AgentKind
 from tasks.world.clip import CLIP_STEPS, NOW
 from tasks.world.lanes import LightState
@@ -254,7 +254,7 @@ def test_between_two_frames_a_track_turns_the_short_way_round() -> None:
     """From 0.1 rad before the half turn to 0.1 rad behind it: half way it is the half turn, not straight ahead."""
     positions = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
     headings = np.array([np.pi - 0.1, -np.pi + 0.1])
-    track = Track(positions, headings, np.ones(2, bool), np.ones(3))
+    track = LoggedTrack(positions, headings, np.ones(2, bool), np.ones(3))
     position, heading, valid = resampled(track, np.array([0.0, 0.25, 0.5]))
     np.testing.assert_allclose(position[:, 0], [0.0, 0.5, 1.0])
     np.testing.assert_allclose(heading, [np.pi - 0.1, np.pi - 0.05, -np.pi], atol=1e-12)

@@ -14,7 +14,7 @@ from factory.readers.base import BadClip
 from factory.readers.settings import TownSettings
 from factory.readers.town.reader import SyntheticReader
 from factory.setup.settings import assemble, identity_of
-from factory.stages.pipeline import Considered, FactoryWork
+from factory.stages.pipeline import FactoryWork, WholeClip
 from factory.store.identity import UNLISTED
 from tasks import stages
 from tasks.perturb import Perturbation, perturb
@@ -169,7 +169,7 @@ def test_a_broken_log_fails_with_the_index_s_own_words(town: Path, tmp_path: Pat
 def test_what_is_considered_is_what_is_prepared(town: Path, tmp_path: Path) -> None:
     work = work_on(town, tmp_path, "render=none")
     made = work.considered(work.reader.index().refs[0])
-    assert isinstance(made, Considered) and isinstance(made.found, Perturbation)
+    assert isinstance(made, WholeClip) and isinstance(made.found, Perturbation)
     assert [row.vocabulary_index for row in prepared_by(work).candidates] == [
         candidate.vocabulary_index for candidate in made.candidates
     ]
@@ -182,7 +182,7 @@ def test_a_clip_s_candidates_are_drawn_from_a_stream_of_the_run_s_seed_and_its_o
     work = work_on(town, tmp_path, "render=none", "seed=3")
     ref = work.reader.index().refs[0]
     clip, made = work.reader.read(ref), work.considered(ref)
-    assert isinstance(made, Considered)
+    assert isinstance(made, WholeClip)
 
     def drawn(seed: int, clip_id: str) -> list[int]:
         rng = stream(seed, clip_id, "perturb")

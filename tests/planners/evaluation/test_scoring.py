@@ -7,7 +7,7 @@ import pytest
 
 from planners.evaluation.frames import FrameKey, Pair
 from planners.evaluation.scoring import (
-    PreparedClip,
+    ClipFrames,
     Rules,
     drive,
     human_plans,
@@ -34,7 +34,7 @@ SCORE = COLUMNS.index("score")
 
 
 @pytest.fixture(scope="module")
-def clip() -> PreparedClip:
+def clip() -> ClipFrames:
     return prepare_clip(clip_scenes(), Rules())
 
 
@@ -69,7 +69,7 @@ def test_the_human_is_known_every_half_second_and_driven_linearly_between() -> N
     np.testing.assert_allclose(logged_poses(moved), straight(8.0), atol=1e-9)
 
 
-def test_rows_are_one_of_one_stage_two_of_stage_one_and_a_pair_a_follow_up(clip: PreparedClip) -> None:
+def test_rows_are_one_of_one_stage_two_of_stage_one_and_a_pair_a_follow_up(clip: ClipFrames) -> None:
     scenes = clip_scenes()
     rows = score_clip(clip, same_plan_everywhere(scenes, straight(8.0)))
     assert [(row.stage, row.key.kind, row.key.candidate_index) for row in rows] == [
@@ -90,7 +90,7 @@ def test_rows_are_one_of_one_stage_two_of_stage_one_and_a_pair_a_follow_up(clip:
     assert all(np.isnan(row.weight) for row in rows[:3])
 
 
-def test_the_pair_shares_its_extended_comfort(clip: PreparedClip) -> None:
+def test_the_pair_shares_its_extended_comfort(clip: ClipFrames) -> None:
     scenes = clip_scenes()
     steady = score_clip(clip, same_plan_everywhere(scenes, straight(8.0)))
     plans = same_plan_everywhere(scenes, straight(8.0))
@@ -103,7 +103,7 @@ def test_the_pair_shares_its_extended_comfort(clip: PreparedClip) -> None:
         np.testing.assert_array_equal(a.scores.unfiltered, b.scores.unfiltered)
 
 
-def test_human_and_pdm_closed_bound_a_plan_that_stands_or_races(clip: PreparedClip) -> None:
+def test_human_and_pdm_closed_bound_a_plan_that_stands_or_races(clip: ClipFrames) -> None:
     scenes = clip_scenes()
     human, pdm = score_clip(clip, human_plans(clip)), score_clip(clip, pdm_plans(clip))
     bad = [score_clip(clip, same_plan_everywhere(scenes, straight(v))) for v in (0.0, 25.0)]
@@ -171,7 +171,7 @@ def waving(after_s: float) -> np.ndarray:
     return np.column_stack([way[10::10], np.zeros(40), np.zeros(40)])
 
 
-def test_a_plan_is_compared_with_what_the_one_before_wanted_at_the_same_time_of_day(clip: PreparedClip) -> None:
+def test_a_plan_is_compared_with_what_the_one_before_wanted_at_the_same_time_of_day(clip: ClipFrames) -> None:
     """A wave in half a second was a second away half a second ago; the other way round it comes a second late."""
     now, before = clip.logged.now, clip.logged.before
     ec = COLUMNS.index("ec")
@@ -182,7 +182,7 @@ def test_a_plan_is_compared_with_what_the_one_before_wanted_at_the_same_time_of_
     assert found == {(0.5, 1.0): 1.0, (1.0, 0.5): 0.0, (0.5, 0.5): 0.0}
 
 
-def test_the_rows_of_a_plan_do_not_depend_on_those_scored_before_it(clip: PreparedClip) -> None:
+def test_the_rows_of_a_plan_do_not_depend_on_those_scored_before_it(clip: ClipFrames) -> None:
     plans = same_plan_everywhere(clip_scenes(), straight(8.0))
     first = score_clip(clip, plans)
     score_clip(clip, same_plan_everywhere(clip_scenes(), straight(20.0)))
@@ -192,7 +192,7 @@ def test_the_rows_of_a_plan_do_not_depend_on_those_scored_before_it(clip: Prepar
         assert (a.key, a.weight) == (b.key, b.weight) or np.isnan(a.weight)
 
 
-def test_a_missing_or_broken_plan_is_named(clip: PreparedClip) -> None:
+def test_a_missing_or_broken_plan_is_named(clip: ClipFrames) -> None:
     plans = same_plan_everywhere(clip_scenes(), straight(8.0))
     key = FrameKey.follow_up(clip.clip_id, 1)[1]
     with pytest.raises(ValueError, match="clip street, frame follow_up_before 1: no plan"):

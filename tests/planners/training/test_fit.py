@@ -19,10 +19,10 @@ from planners.models.registry import PlannerChoice, build_planner
 from planners.training.checkpoint import checkpoints, digest, load_planner, newest
 from planners.training.curves import LOSSES, VALIDATION
 from planners.training.fit import Loop, TrainingSettings, fit, total_steps
-from planners.training.processes import World
+from planners.training.processes import TrainingProcess
 from tests.planners.toy import Toy, ToyBatches, ToySettings, toy_batch
 
-ALONE = World(0, 1, torch.device("cpu"))
+ALONE = TrainingProcess(0, 1, torch.device("cpu"))
 TRAINING = TrainingSettings(epochs=3, batch_size=4, learning_rate=0.01, schedule="cosine", optimiser="adamw")
 
 
@@ -195,8 +195,8 @@ class Dice(Toy):
 def test_every_step_of_every_rank_draws_its_own_and_the_same_again(tmp_path: Path) -> None:
     def drawn(rank: int, seed: int = 1) -> list[float]:
         planner = Dice(ToySettings(), {})  # what was drawn to build it does not matter
-        world = World(rank, 1, torch.device("cpu"))
-        fit(planner, ToyBatches(20, 4), TRAINING, Loop(seed, 5), world, tmp_path / f"{rank}-{seed}", {})
+        process = TrainingProcess(rank, 1, torch.device("cpu"))
+        fit(planner, ToyBatches(20, 4), TRAINING, Loop(seed, 5), process, tmp_path / f"{rank}-{seed}", {})
         return list(planner.drawn)
 
     first, second = drawn(0), drawn(1)

@@ -12,7 +12,7 @@ from factory.readers.town.figures import _car as car
 from factory.readers.town.houses import plant_tree
 from factory.readers.town.mesh import Builder, merged
 from factory.readers.town.sensors import build_rig, scan, world_from_ego
-from factory.readers.town.shade import Stage
+from factory.readers.town.shade import LitScene
 from tasks.render.fit.reconstruct import advance, finish
 from tasks.render.fit.start import prepare
 from tasks.render.scene.build import held_out_rows
@@ -28,7 +28,7 @@ CAMERA = build_rig(("ring_front_center",), 96, 54)[0]
 CAR, SIZE = np.array([16.0, 3.0, 0.0]), (4.4, 1.8, 1.5)
 
 
-def street(car_at: np.ndarray) -> Stage:
+def street(car_at: np.ndarray) -> LitScene:
     b = Builder()
     ground = np.array([[(-20, -9, 0), (60, -9, 0), (60, 9, 0), (-20, 9, 0)]], float)
     b.quads(ground, ground[..., :2], tx.ASPHALT)
@@ -38,24 +38,24 @@ def street(car_at: np.ndarray) -> Stage:
     plant_tree(b, np.array([24.0, -5.0]), 0.0, np.random.default_rng(0), 0.8)
     shadow = np.full((SHADOW_SIZE, SHADOW_SIZE), -1e9, np.float32)
     mesh = merged([b.mesh(), car(*SIZE, 5).placed(car_at)])
-    return Stage(mesh, shadow, sun_over(np.zeros(2), 0.4, 0.8), np.zeros((1, 1, 9)), 1)
+    return LitScene(mesh, shadow, sun_over(np.zeros(2), 0.4, 0.8), np.zeros((1, 1, 9)), 1)
 
 
-def painted(stage: Stage, photo: Photo) -> np.ndarray:
+def painted(scene: LitScene, photo: Photo) -> np.ndarray:
     camera = Camera(photo.camera, CAMERA.width, CAMERA.height, photo.intrinsics, np.zeros(5), np.eye(4))
-    return paint(stage, camera, photo.world_from_camera)
+    return paint(scene, camera, photo.world_from_camera)
 
 
 @pytest.fixture(scope="module")
 def views() -> dict[str, list[Compared]]:
-    stage = street(CAR)
+    scene = street(CAR)
     photos, sweeps = [], []
     for i in range(N):
         ego = world_from_ego(np.array([0.5 * i, 0.0, 0.0]))
-        rgb = paint(stage, CAMERA, ego)
+        rgb = paint(scene, CAMERA, ego)
         photos.append(Photo(CAMERA.name, 0.1 * i, rgb, CAMERA.intrinsics, ego @ CAMERA.ego_from_camera))
         if i % 5 == 0:
-            sweeps.append(Sweep(0.1 * i, scan(stage, ego, 64, 450).points, ego))
+            sweeps.append(Sweep(0.1 * i, scan(scene, ego, 64, 450).points, ego))
     agents = AgentTracks(
         ("parked",),
         (AgentKind.VEHICLE,),
@@ -69,7 +69,7 @@ def views() -> dict[str, list[Compared]]:
     advance(problem, state, TINY, TINY.iterations, threads=1)
     asset = finish(problem, state, threads=1)
     moved = street(CAR + np.array([*MOVED_M, 0.0]))
-    truth = Truth(asset, agents, lambda _t, p: painted(stage, p), lambda _t, p: painted(moved, p))
+    truth = Truth(asset, agents, lambda _t, p: painted(scene, p), lambda _t, p: painted(moved, p))
     held_out = [photos[i] for i in sorted(held_out_rows(photos, TINY.hold_out_every))]
     return {
         "held out": truth.compared(held_out),

@@ -10,7 +10,7 @@ from factory.readers.town.mesh import Builder
 from factory.readers.town.scenery import _signal as signal_mast
 from factory.readers.town.scenery import lamps_lit
 from factory.readers.town.sensors import MOUNT_M, REAR_AXLE_Z_M, build_rig, scan, world_from_ego
-from factory.readers.town.shade import Stage
+from factory.readers.town.shade import LitScene
 from factory.readers.town.traffic import GREEN as GREEN_LIGHT
 from factory.readers.town.traffic import RED as RED_LIGHT
 from factory.readers.town.traffic import YELLOW as YELLOW_LIGHT
@@ -21,13 +21,13 @@ RED = (1.0, 0.0, 0.0)
 GREEN = (0.0, 1.0, 0.0)
 
 
-def staged(builder: Builder, shadows: bool = False) -> Stage:
+def staged(builder: Builder, shadows: bool = False) -> LitScene:
     mesh = builder.mesh()
     sun = sun_over(np.zeros(2), 0.4, 0.8)
     shadow = np.full((SHADOW_SIZE, SHADOW_SIZE), -1e9, np.float32)
     if shadows:
         cast(shadow, mesh, sun)
-    return Stage(mesh, shadow, sun, np.zeros((1, 1, 9)), 1)
+    return LitScene(mesh, shadow, sun, np.zeros((1, 1, 9)), 1)
 
 
 def lamp(builder: Builder, at: tuple[float, float, float], size: float, colour: tuple[float, float, float]) -> None:
@@ -85,10 +85,10 @@ def test_a_place_has_one_colour_from_wherever_it_is_seen() -> None:
     """Big texture cells of a house front, seen from two places at the same pixel size."""
     builder = Builder()
     builder.face([(30, 40, 0), (30, -40, 0), (30, -40, 12), (30, 40, 12)], tx.FACADE, seed=4)
-    stage = staged(builder)
+    scene = staged(builder)
     shifted = 8.0
-    one = paint(stage, FRONT, world_from_ego(np.array([0.0, 0.0, 0.0]))).astype(float)
-    two = paint(stage, FRONT, world_from_ego(np.array([0.0, shifted, 0.0]))).astype(float)
+    one = paint(scene, FRONT, world_from_ego(np.array([0.0, 0.0, 0.0]))).astype(float)
+    two = paint(scene, FRONT, world_from_ego(np.array([0.0, shifted, 0.0]))).astype(float)
     pixels = round(shifted * FRONT.intrinsics[0, 0] / (30.0 - 1.62))
     same = np.abs(one[40:100, : 320 - pixels] - two[40:100, pixels:]).mean()
     other = np.abs(one[40:100] - two[40:100]).mean()
@@ -114,9 +114,9 @@ def test_leaves_leave_gaps() -> None:
     corners = np.array([[(8, 0.85, 0.8), (8, -0.85, 0.8), (8, -0.85, 2.5), (8, 0.85, 2.5)]], float)
     uv = np.array([[(-0.85, -0.85), (0.85, -0.85), (0.85, 0.85), (-0.85, 0.85)]])
     builder.quads(corners, uv, tx.LEAVES, (0.2, 0.4, 0.1), 3)
-    stage = staged(builder)
+    scene = staged(builder)
     view, _rays = camera_view(FRONT.intrinsics, world_from_ego(np.zeros(3)) @ FRONT.ego_from_camera)
-    covered = (look(stage, view, 320, 180)[0] >= 0).sum()
+    covered = (look(scene, view, 320, 180)[0] >= 0).sum()
     whole = (1.7 / (8 - 1.62) * FRONT.intrinsics[0, 0]) ** 2
     assert 0.15 * whole < covered < 0.9 * whole
 

@@ -14,8 +14,7 @@ from factory.readers.town.ego import SCENARIOS
 from factory.readers.town.plan import build_streets
 from factory.readers.town.streets import Streets
 from factory.readers.town.town import WINDOWS_PER_LOG, plan_log
-from factory.readers.town.traffic import GREEN, RED, YELLOW, Driver, Signals, drive, overlaps
-from factory.readers.town.traffic import Path as LanePath
+from factory.readers.town.traffic import GREEN, RED, YELLOW, DrivingStyle, Signals, TownPath, drive, overlaps
 from factory.readers.town.write import write_town
 from tasks.trajectories import score_trajectories
 from tasks.world.boxes import ego_boxes
@@ -79,23 +78,23 @@ def test_crossing_directions_are_never_green_together() -> None:
 def test_a_driver_stops_at_a_red_light_before_the_line() -> None:
     line = curves.from_curvature(np.zeros(3), [(200.0, 0.0)])
     s = arc_lengths(line)
-    path = LanePath(line, s, np.full(len(s), 12.0), ((100.0, 0),), ())
+    path = TownPath(line, s, np.full(len(s), 12.0), ((100.0, 0),), ())
     times = np.arange(0.0, 15.0, 0.1)
     red_for_15_s = Signals(16.0)
-    position, speed = drive(path, 10.0, 12.0, Driver(), np.zeros((len(times), 0, 5)), red_for_15_s, times)
+    position, speed = drive(path, 10.0, 12.0, DrivingStyle(), np.zeros((len(times), 0, 5)), red_for_15_s, times)
     assert speed[-1] < 0.3
-    assert 94.0 < position[-1] + Driver().front_m <= 100.0
+    assert 94.0 < position[-1] + DrivingStyle().front_m <= 100.0
 
 
 def test_a_driver_keeps_its_distance_from_a_standing_car() -> None:
     line = curves.from_curvature(np.zeros(3), [(200.0, 0.0)])
     s = arc_lengths(line)
-    path = LanePath(line, s, np.full(len(s), 12.0), (), ())
+    path = TownPath(line, s, np.full(len(s), 12.0), (), ())
     times = np.arange(0.0, 20.0, 0.1)
     standing = np.broadcast_to([120.0, 0.0, 0.0, 4.0, 2.0], (len(times), 1, 5))
-    position, speed = drive(path, 10.0, 12.0, Driver(), standing, Signals(0.0), times)
+    position, speed = drive(path, 10.0, 12.0, DrivingStyle(), standing, Signals(0.0), times)
     assert speed[-1] < 0.3
-    assert 1.0 < 118.0 - (position[-1] + Driver().front_m) < 5.0
+    assert 1.0 < 118.0 - (position[-1] + DrivingStyle().front_m) < 5.0
 
 
 @pytest.mark.parametrize("index", [2, 3, 6])
