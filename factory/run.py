@@ -18,10 +18,11 @@ from typing import TYPE_CHECKING
 
 from factory.config.compose import ConfigError, conf_dir
 from factory.config.plugins import choices
-from factory.config.run import RunConfig, composed_run, load_config, refuse_missing_root, shapes_in
+from factory.config.run import RunConfig, composed_run, load_config, shapes_in
 from factory.config.shapes import defaults_of, described
 from factory.config.words import Asked, asked_of
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, as_program
+from factory.setup.early import refuse_what_is_not_there
 from factory.store.disk import DiskFull
 from factory.store.usable import why_unusable
 
@@ -101,7 +102,7 @@ def run(asked: Asked, only_plan: bool) -> int:
     config = load_config(asked.words)
     if unusable := why_unusable(config.out):
         raise ConfigError(unusable)
-    refuse_missing_root(config.clips)
+    refuse_what_is_not_there(config)
 
     from factory.graph.episodes import EpisodesWanted
     from factory.graph.execute import execute

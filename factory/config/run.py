@@ -23,8 +23,9 @@ from tasks.settings import ExpertGate, PerturbSettings
 from tasks.stages import FRAMES, TASKS
 
 MOST_K = 2**17  # of a kinematic vocabulary: 126 MB of trajectories, eight times the largest in use
+AV2 = "factory.readers.av2.reader.AV2Reader"
 READERS: Mapping[str, type[Any]] = {  # `_target_` of a built-in reader -> its settings
-    "factory.readers.av2.reader.AV2Reader": LogClips,
+    AV2: LogClips,
     "factory.readers.scenarionet.reader.ScenarioNetReader": LogClips,
     "factory.readers.town.reader.SyntheticReader": TownClips,
     "factory.readers.town.towns.SyntheticTownsReader": TownsClips,
@@ -231,11 +232,17 @@ def without_labels(spec: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
+def built_in_classes(group: str) -> dict[str, str]:
+    """Choice -> `_target_` of the files in conf/<group>."""
+    found = {
+        file.stem: re.search(r"^_target_: (\S+)", file.read_text(), re.M) for file in (conf_dir() / group).iterdir()
+    }
+    return {name: target[1] for name, target in sorted(found.items()) if target}
+
+
 def reader_of(choice: str) -> type[Any] | None:
     """The settings of the built-in reader `clips=<choice>`; None where there is none of that name."""
-    file = conf_dir() / "clips" / f"{choice}.yaml"
-    target = re.search(r"^_target_: (\S+)", file.read_text(), re.M) if file.is_file() else None
-    return None if target is None else READERS.get(target[1])
+    return READERS.get(built_in_classes("clips").get(choice, ""))
 
 
 def _elsewhere(key: str) -> str:

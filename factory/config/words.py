@@ -100,7 +100,7 @@ def no_such_choice(missing: str, choices: Sequence[str] | None) -> str:
     return f"{group}={choice}: there is {', '.join(known) or 'no choice'}{meant}"
 
 
-def nearest(word: str, known: Sequence[str]) -> str:
-    """`; did you mean x?` where one is near, else nothing."""
-    found = get_close_matches(word, known, n=1, cutoff=0.6)
+def nearest(word: str, known: Sequence[str], cutoff: float = 0.6) -> str:
+    """`; did you mean x?` where one is near, else nothing. cutoff: 0..1, the likeness that counts as near."""
+    found = get_close_matches(word, known, n=1, cutoff=cutoff)
     return f"; did you mean {found[0]}?" if found else ""

@@ -10,6 +10,7 @@ from inspect import signature
 from pathlib import Path
 from typing import Any
 
+from factory.config.classes import class_of
 from factory.config.compose import ConfigError, build
 from factory.config.run import RunConfig, VocabularyChoice, refuse_relative_root
 from factory.readers.base import BadClip, ClipIndex, ClipReader
@@ -18,7 +19,6 @@ from factory.stages.frames import BenchmarkWork
 from factory.stages.pipeline import FactoryWork
 from factory.stages.sensors import chosen_cameras
 from factory.store.identity import UNLISTED, RunIdentity, canonical_json
-from factory.wording import one_line
 from tasks.caches import user_cache
 from tasks.experts.pdm_closed.settings import PdmSettings
 from tasks.experts.protocol import Expert, tried_once
@@ -185,15 +185,7 @@ def build_expert(run: RunContext) -> Expert:
 
 def _target(config: RunConfig, name: str) -> Callable[..., Any]:
     """What `expert.<name>._target_` names. Raises ConfigError."""
-    from hydra.utils import get_object
-
-    where, spec = f"expert.{name}", config.expert[name]
-    if "_target_" not in spec:
-        raise ConfigError(f"{where}._target_ is missing: name the class to use, such as my_package.MyExpert")
-    try:
-        found: Callable[..., Any] = get_object(spec["_target_"])
-    except (ImportError, ValueError, AttributeError) as error:
-        raise ConfigError(f"{where}: {spec['_target_']}: {one_line(error)}") from error
+    found: Callable[..., Any] = class_of(config.expert[name], f"expert.{name}", "my_package.MyExpert")
     return found
 
 

@@ -17,7 +17,6 @@ has a text `digest`, that tells its versions apart, else the bytes of its module
 """
 
 import hashlib
-import importlib
 import inspect
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -26,6 +25,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from factory.config.classes import object_named
 from factory.config.compose import ConfigError, compose
 from factory.config.plugins import installed, names
 from factory.config.words import nearest
@@ -33,7 +33,7 @@ from planners.data.batch import Needs
 from planners.evaluation.scoring import ClipFrames, Plans, human_plans, pdm_plans
 from planners.models.gtrs_dense import Ensemble, GtrsDense
 from planners.models.planner import Planner
-from planners.models.registry import BUILT_IN, PlannerChoice, build_planner
+from planners.models.registry import BUILT_IN, OWN, PlannerChoice, build_planner
 from planners.training import checkpoint
 
 Privileged = Callable[[ClipFrames], Plans]
@@ -147,11 +147,7 @@ def _built(name: str) -> Planner:
 
 def _imported(spec: str) -> Any:
     """The user's planner. Raises ConfigError."""
-    module, _, attribute = spec.partition(":")
-    try:
-        target = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ConfigError(f"planner={spec}: {error}; is its folder on PYTHONPATH?") from error
+    target = object_named(spec, "planner", OWN)
     if isinstance(target, type) and issubclass(target, Planner):
         return build_planner(PlannerChoice(spec), {}).eval()
     if not callable(target):

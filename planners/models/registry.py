@@ -1,10 +1,10 @@
 """Planners by name: the built-in ones, those that installed packages offer, or a class of a user's own package."""
 
-import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from factory.config.classes import object_named
 from factory.config.compose import ConfigError, fill
 from factory.config.plugins import installed, names
 from factory.config.shapes import defaults_of, merged
@@ -20,6 +20,7 @@ BUILT_IN = {
     "diffusiondrive": "planners.models.diffusiondrive:DiffusionDrive",
     "gtrs_dense": "planners.models.gtrs_dense:GtrsDense",
 }
+OWN = "my.module:MyPlanner"  # how a class of the user's own is named
 
 
 @dataclass(frozen=True)
@@ -34,17 +35,11 @@ def planner_class(name: str) -> type[Planner]:
     """The class of a planner. Raises ConfigError where there is none of that name."""
     plugin = installed("planner", name, BUILT_IN)
     target = BUILT_IN.get(name, name) if plugin is None else plugin.reference
-    module, found, attribute = target.partition(":")
-    if not found:
+    if ":" not in target:
         known = [*BUILT_IN, *names("planner")]
         meant = nearest(name, known)
-        raise ConfigError(
-            f"planner.name={name}: none of {', '.join(known)}{meant}; or name a class, my.module:MyPlanner"
-        )
-    try:
-        cls = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
-        raise ConfigError(f"planner.name={name}: {error}") from error
+        raise ConfigError(f"planner.name={name}: none of {', '.join(known)}{meant}; or name a class, {OWN}")
+    cls: Any = object_named(target, "planner.name", OWN)
     if not (isinstance(cls, type) and issubclass(cls, Planner)):
         raise ConfigError(f"planner.name={name} is not a planners.models.planner.Planner")
     return cls

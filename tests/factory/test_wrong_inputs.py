@@ -8,10 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pytest
+from pyarrow.feather import write_feather
 
 from factory.__main__ import main
 from factory.commands.completion import settings_of
+from factory.readers.av2.folders import INTRINSICS, POSES
 from tasks.render.rigs import RIGS
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -82,6 +85,16 @@ MISTYPED = [  # told before anything heavy is imported
     run("render=map", "render.cameras=[nope]", says=["no camera nope; this rig has ring_front_left, ring_front_"]),
     run("clips=synthetic_towns", "clips.logs_per_town=19", says=["a town has 1 to 18 logs"]),
     run("clips=av2", "clips.root=x", "clips.split=tset", says=["must be train, val or test; did you mean test?"]),
+    run(
+        "clips=custom", "clips._target_=nowhere.Reader", says=["clips: nowhere.Reader: there is no module", "installed"]
+    ),
+    run("clips=custom", "clips._target_=facotry.Reader", says=["no module facotry; did you mean factory?"]),
+    run("clips=custom", "clips._target_=Reader", says=["clips: Reader: name a class with its module"]),
+    run("+expert.x._target_=nowhere.Expert", "experts=[x]", says=["expert.x: nowhere.Expert: there is no module"]),
+    run("+expert.x._target_=nowhere.Expert", says=["expert.x: nowhere.Expert: there is no module nowhere"]),
+    run("+expert.x.speed=3", "experts=[x]", says=["expert.x._target_ is missing: name the class"]),
+    run("clips=av2", "clips.root=a_file", says=["a_file: no such folder"]),
+    run("clips=av2", "clips.root=a_folder", says=["a_folder: no Argoverse 2 sensor log here"]),
     run("out=", says=["out= is empty", "variable"]),
     run("out=a_file", says=["a_file is not a folder"]),
     run("out=a_file/below", says=["a_file is not a folder"]),
@@ -90,10 +103,25 @@ MISTYPED = [  # told before anything heavy is imported
 WRONG = [
     *MISTYPED,
     run("out=ftp://host/x", says=["a URL of s3, gs"]),
-    run("clips=av2", "clips.root=a_file", says=["a_file: no such folder"]),
-    run("clips=av2", "clips.root=a_folder", says=["a_folder: no Argoverse 2 sensor log here"]),
     run("clips=scenarionet", "clips.root=a_folder", says=["a_folder: no scenario here"]),
-    run("clips=custom", "clips._target_=nowhere.Reader", says=["nowhere.Reader", "installed?"]),
+    run("clips=custom", "clips._target_=factory.readers.av2.reader.AV2Raeder", says=["did you mean AV2Reader?"]),
+    run("clips=custom", "clips._target_=factory.readers.av3.Reader", says=["factory.readers has no av3", "mean av2?"]),
+    run("clips=custom", "clips._target_=a_module.Reader", says=["a_module cannot be imported: KeyError: 'x'"]),
+    run("+expert.x._target_=tasks.experts.human.Humann", "experts=[x]", says=["has no Humann; did you mean Human?"]),
+    run(
+        "clips=av2", "clips.root=a_log", "render=auto", "render.cameras=[nope]", says=["this rig has ring_front_center"]
+    ),
+    run(
+        "clips=av2", "clips.root=a_rigless_log", "render=auto", "render.cameras=[nope]", says=["no log under a_rigless"]
+    ),
+    run("clips=scenarionet", "clips.root=a_folder", "render=map", "render.cameras=[nope]", says=["rig has front_left"]),
+    run(
+        "clips=scenarionet",
+        "clips.root=a_folder",
+        "render=auto",
+        "render.cameras=[front]",
+        says=["no log under a_folder"],
+    ),
     run("vocabulary.file=nowhere.npy", says=["nowhere.npy", "No such file"]),
     run("vocabulary.file=broken.npy", says=["broken.npy: not readable as a numpy file: it holds no plain numbers"]),
     run("vocabulary.file=shape.npy", says=["shape.npy: trajectories have shape (3, 4), expected (K >= 1, 40, 3)"]),
@@ -120,7 +148,17 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "a_file").write_text("")
     (tmp_path / "a_folder").mkdir()
     (tmp_path / "broken.npy").write_bytes(b"\x00broken")
+    (tmp_path / "a_module.py").write_text("{}['x']")
     np.save(tmp_path / "shape.npy", np.zeros((3, 4)))
+    for name in ("a_log", "a_rigless_log"):  # broken from the poses on: they are not looked at
+        (tmp_path / name).mkdir()
+        (tmp_path / name / POSES).write_bytes(b"broken")
+    (tmp_path / "a_log" / "calibration").mkdir()
+    write_feather(
+        pa.table({"sensor_name": ["ring_front_center", "stereo_front_left"]}), tmp_path / "a_log" / INTRINSICS
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # of a_module: that is no work of the command
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

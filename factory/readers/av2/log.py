@@ -15,6 +15,7 @@ import pyarrow.feather
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from factory.readers.av2.folders import ANNOTATIONS, POSES
 from factory.readers.base import BadClip
 from tasks.world.agents import MOVING_KINDS, AgentKind, AgentTracks
 from tasks.world.arrays import Array, Bools, Indices, Ints
@@ -22,7 +23,6 @@ from tasks.world.clip import STEP_S
 from tasks.world.frames import wrap_angle
 from tasks.world.vehicle import AX, AY, EGO_STATE_SIZE, HEADING, VX, VY, X, Y
 
-POSES, ANNOTATIONS = "city_SE3_egovehicle.feather", "annotations.feather"
 POSE_COLUMNS = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 SIZE_COLUMNS = ("length_m", "width_m", "height_m")
 

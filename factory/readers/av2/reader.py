@@ -12,10 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
+from factory.readers.av2.folders import ANNOTATIONS, EXTRINSICS, INTRINSICS, POSES, log_folders
 from factory.readers.av2.log import (
-    ANNOTATIONS,
     POSE_COLUMNS,
-    POSES,
     SAME_FRAME_S,
     LogMotion,
     agents_at,
@@ -30,7 +29,7 @@ from factory.readers.av2.log import (
     world_from_ego_at,
 )
 from factory.readers.av2.map import map_file, read_map
-from factory.readers.base import SPLITS, BadClip, ClipRef
+from factory.readers.base import BadClip, ClipRef
 from factory.readers.logs import STEP_MS, LoggedDrive, LogReader, Recorded, WholeLog, present, route_of_drive
 from factory.readers.splits import folder_split
 from tasks.world.arrays import Array
@@ -40,7 +39,6 @@ from tasks.world.lanes import LightState, RoadMap, TrafficLights
 
 LICENCE = "CC BY-NC-SA 4.0 (Argoverse 2)"
 LIGHTS = "traffic_lights.feather"
-INTRINSICS, EXTRINSICS = "calibration/intrinsics.feather", "calibration/egovehicle_SE3_sensor.feather"
 BLOCK_STEPS, BLOCK_STRIDE_STEPS = 200, 100  # of the stretches that are reconstructed
 
 
@@ -96,21 +94,6 @@ class AV2Reader(LogReader[AV2Log]):
         """Poses, rig, photos and sweeps of a window, and the block that it is rendered from."""
         poses = world_from_ego_at(log.motion, step_times(start, stop))
         return Recorded(poses, log.cameras, *_sensed(log, start, stop), _block(log, start) if log.images else None)
-
-
-def log_folders(root: Path) -> dict[str, Path]:
-    """Log id -> folder, sorted by id. Raises ValueError where the root is no Argoverse 2 folder."""
-    if _is_log(root):
-        return {root.name: root}
-    if not root.is_dir():
-        raise ValueError(f"{root}: no such folder")
-    parents = [root / split for split in SPLITS if (root / split).is_dir()] or [root]
-    folders = {folder.name: folder for parent in parents for folder in parent.iterdir() if _is_log(folder)}
-    if not folders:
-        raise ValueError(
-            f"{root}: no Argoverse 2 sensor log here; expected .../sensor, its train, val or test folder, or one log"
-        )
-    return dict(sorted(folders.items()))
 
 
 def read_log(folder: Path) -> AV2Log:
@@ -199,10 +182,6 @@ def content_digest(folder: Path) -> str:
             content = (folder / name).read_bytes()
             digest.update(f"{name}\x1f{len(content)}\x1f".encode() + content)
     return digest.hexdigest()
-
-
-def _is_log(folder: Path) -> bool:
-    return any((folder / name).exists() for name in (ANNOTATIONS, POSES))
 
 
 def _licence(folder: Path) -> str:
