@@ -8,6 +8,7 @@ from factory.readers.town.raster import Mesh
 from tasks.world.arrays import Array
 
 WHITE = (1.0, 1.0, 1.0)
+UP, AHEAD = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
 
 
 def merged(parts: list[Mesh]) -> Mesh:
@@ -18,6 +19,16 @@ def merged(parts: list[Mesh]) -> Mesh:
 def lifted(xy: Array, z: float) -> Array:
     """Points (..., >= 2) at height z, (..., 3)."""
     return np.concatenate([xy[..., :2], np.full((*xy.shape[:-1], 1), z)], axis=-1)
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Vector product of (..., 3) and (..., 3): bit for bit that of np.cross, which takes ten times as long for one."""
+    (ax, ay, az), (bx, by, bz) = (a[..., 0], a[..., 1], a[..., 2]), (b[..., 0], b[..., 1], b[..., 2])
+    product = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    product[..., 0] = ay * bz - az * by
+    product[..., 1] = az * bx - ax * bz
+    product[..., 2] = ax * by - ay * bx
+    return product
 
 
 def shades(percentages: str) -> Array:
@@ -47,8 +58,8 @@ class Builder:
     ) -> None:
         points, n = np.asarray(points, np.float64), len(points)
         if normals is None:
-            cross = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
-            normals = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-12)
+            across = cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
+            normals = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
         colours, extents = np.full((n, 3), colour, np.float64), np.full((n, 2), extent, np.float64)
         materials, seeds = np.full(n, material, np.int64), np.full(n, seed, np.int64)
         self._parts.append(Mesh(points, np.asarray(uv, np.float64), normals, materials, colours, extents, seeds))
@@ -97,10 +108,10 @@ class Builder:
         a, b = np.asarray(foot, np.float64), np.asarray(head, np.float64)
         length = float(np.linalg.norm(b - a))
         axis = (b - a) / length
-        one = np.cross(axis, [0.0, 0.0, 1.0] if abs(axis[2]) < 0.9 else [1.0, 0.0, 0.0])
+        one = cross(axis, UP if abs(axis[2]) < 0.9 else AHEAD)
         one /= np.linalg.norm(one)
         angle = np.arange(sides + 1) * 2 * np.pi / sides
-        ring, u = np.cos(angle)[:, None] * one + np.sin(angle)[:, None] * np.cross(axis, one), angle * radius
+        ring, u = np.cos(angle)[:, None] * one + np.sin(angle)[:, None] * cross(axis, one), angle * radius
         low = np.column_stack([a + radius * ring, u, np.zeros(sides + 1)])
         top = np.column_stack([b + radius * taper * ring, u, np.full(sides + 1, length)])
         cells = np.stack([low[:-1], low[1:], top[1:], top[:-1]], axis=1)
@@ -115,11 +126,11 @@ class Builder:
     ) -> None:
         """A disc facing along `axis`; u to its right, v up, offsets from the centre times `uv_scale`."""
         axis = np.asarray(axis, np.float64) / np.linalg.norm(axis)
-        one = np.cross([0.0, 0.0, 1.0], axis)
+        one = cross(UP, axis)
         one = one / np.linalg.norm(one) if np.linalg.norm(one) > 1e-6 else np.array([1.0, 0.0, 0.0])
         angle = np.arange(sides + 1) * 2 * np.pi / sides
         flat = radius * np.column_stack([np.cos(angle), np.sin(angle)])
-        rim = centre + flat[:, :1] * one + flat[:, 1:] * np.cross(axis, one)
+        rim = centre + flat[:, :1] * one + flat[:, 1:] * cross(axis, one)
         points = np.stack([np.broadcast_to(centre, (sides, 3)), rim[:-1], rim[1:]], axis=1)
         uv = np.stack([np.zeros((sides, 2)), flat[:-1], flat[1:]], axis=1) * uv_scale
         self.triangles(points, uv, *surface, normals=np.broadcast_to(axis, (sides, 3)).copy())

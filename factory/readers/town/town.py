@@ -1,7 +1,7 @@
 """The town as one object, and its logs' plans: pure functions of the seed, nothing is written here."""
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -20,13 +20,23 @@ WINDOWS_PER_LOG = 3  # of 9.5 s at stride 1 s
 class Town:
     """Streets, what is parked there, what it looks like, and its weather."""
 
-    name: str
+    seed: int
+    number: int
     streets: Streets
     parked: tuple[TownTrack, ...]
-    scenery: Scenery
     sun_azimuth: float
     sun_elevation: float
     sky_seed: int
+
+    @property
+    def name(self) -> str:
+        """As the files of its map say it."""
+        return f"SYN{self.number:02d}"
+
+    @cached_property
+    def scenery(self) -> Scenery:
+        """Houses, trees, road marks: seconds to build, so logs that nobody sees go without."""
+        return build_scenery(self.streets, np.random.default_rng([self.seed, self.number, 2]))
 
 
 @lru_cache(maxsize=1)
@@ -34,13 +44,12 @@ def build_town(seed: int, number: int) -> Town:
     """Town `number` of a seed."""
     streets = build_streets(np.random.default_rng([seed, number, 0]))
     parked = parked_cars(streets, np.random.default_rng([seed, number, 1]))
-    scenery = build_scenery(streets, np.random.default_rng([seed, number, 2]))
     rng = np.random.default_rng([seed, number, 3])
     return Town(
-        f"SYN{number:02d}",
+        seed,
+        number,
         streets,
         parked,
-        scenery,
         float(rng.uniform(-np.pi, np.pi)),
         float(np.deg2rad(rng.uniform(35.0, 55.0))),
         int(rng.integers(1 << 20)),
