@@ -48,7 +48,7 @@ def commands(page: str) -> list[Command]:
     for block in blocks(page, ""):
         variables: dict[str, str] = {}
         shown, of_block = "", []
-        for line in filter(None, map(str.strip, block.replace("\\\n", " ").splitlines())):
+        for line in filter(None, map(str.strip, block.replace("\\\n", "").splitlines())):
             for name, value in variables.items():
                 line = line.replace(f"${name}", value)
             assigned = re.match(r'([A-Z_]+)="([^"]*)"', line)
