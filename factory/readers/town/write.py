@@ -22,7 +22,7 @@ from factory.readers.av2.log import POSE_COLUMNS, SIZE_COLUMNS
 from factory.readers.settings import LOG_STEPS, STEPS_PER_SWEEP, TownSettings
 from factory.readers.town.draw import Theatre, paint
 from factory.readers.town.drive import TownDrive
-from factory.readers.town.sensors import REAR_AXLE_Z_M, build_rig, scan, world_from_ego
+from factory.readers.town.sensors import MOUNT_M, REAR_AXLE_Z_M, build_rig, scan, world_from_ego
 from factory.readers.town.streets import Streets, TownLane
 from factory.readers.town.town import WINDOWS_PER_LOG, Town, log_name, plan_log
 from factory.readers.town.traffic import GREEN, RED, YELLOW
@@ -33,6 +33,7 @@ from tasks.world.camera import Camera
 LICENCE = "Apache-2.0 (synthetic)"
 ANNOTATION_RANGE_M = 100.0
 MAP_RANGE_M = 260.0  # of the drive
+LIDARS = ("up_lidar", "down_lidar")  # Argoverse's two names, which converters look up; here they are one and the same
 STEP_NS = 100_000_000
 FIRST_STAMP_NS = 315_970_000_000_000_000
 LOG_SPACING_NS = 60_000_000_000
@@ -75,7 +76,7 @@ def write_log(
     if lights := _lights(town.streets, drive, stamps):
         _feather(folder / "traffic_lights.feather", lights)
     rig = build_rig(settings.cameras, settings.width, settings.height)
-    _calibration(folder, rig)
+    _calibration(folder, rig, LIDARS if settings.lidar_beams else ())
     (folder / "map").mkdir(exist_ok=True)
     content = json.dumps(_vector_map(town.streets, drive), separators=(",", ":"))
     (folder / "map" / f"log_map_archive_{folder.name}____{town.name}_city_0.json").write_text(content, encoding="utf-8")
@@ -172,7 +173,8 @@ def _lights(streets: Streets, drive: TownDrive, stamps: Ints) -> dict[str, Any]:
     }
 
 
-def _calibration(folder: Path, rig: tuple[Camera, ...]) -> None:
+def _calibration(folder: Path, rig: tuple[Camera, ...], lidars: tuple[str, ...]) -> None:
+    """Intrinsics of the cameras, and how cameras and lidars are mounted; nothing for a town without cameras."""
     if not rig:
         return
     (folder / "calibration").mkdir(exist_ok=True)
@@ -183,7 +185,9 @@ def _calibration(folder: Path, rig: tuple[Camera, ...]) -> None:
     _feather(folder / "calibration" / "intrinsics.feather", names | intrinsics | sides)
     mounts = np.array([camera.ego_from_camera for camera in rig])
     columns = np.column_stack([Rotation.from_matrix(mounts[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]], mounts[:, :3, 3]])
-    poses = names | dict(zip(POSE_COLUMNS, columns.T))
+    level = np.array([[1.0, 0.0, 0.0, 0.0, *MOUNT_M]] * len(lidars)).reshape(-1, len(POSE_COLUMNS))
+    poses = {"sensor_name": [*names["sensor_name"], *lidars]}
+    poses |= dict(zip(POSE_COLUMNS, np.concatenate([columns, level]).T))
     _feather(folder / "calibration" / "egovehicle_SE3_sensor.feather", poses)
 
 

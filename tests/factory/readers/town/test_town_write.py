@@ -66,6 +66,9 @@ def test_a_log_has_argoverse_2s_files(town: Path) -> None:
     assert picture.shape == (36, 64, 3)
     sweep = pyarrow.feather.read_table(sorted((log / "sensors" / "lidar").glob("*.feather"))[0])
     assert sweep.column_names == ["x", "y", "z", "intensity", "laser_number", "offset_ns"]
+    mounts = pyarrow.feather.read_table(log / "calibration" / "egovehicle_SE3_sensor.feather").to_pylist()
+    assert [row["sensor_name"] for row in mounts] == [*SMALL.cameras, "up_lidar", "down_lidar"]
+    assert [mounts[-1][axis] for axis in ("tx_m", "ty_m", "tz_m")] == [1.2, 0.0, 1.62]
     assert len(list((log / "map").glob("log_map_archive_*.json"))) == 1
 
 
