@@ -5,7 +5,7 @@ reproduce its recorded states: linear interpolation between poses, boxes placed 
 velocities by least squares. File format: that of argoverse/av2-api.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -72,6 +72,7 @@ class LogMotion:
     rotations: Rotation  # P rotations, city from ego
     yaws: Array  # (P,) unwrapped [rad]
     tracks: tuple[BoxTrack, ...]  # ordered by track id
+    fill_s: float = 0.0  # two frames of a track at most this far apart hold the steps between them too
 
     @property
     def n_steps(self) -> int:
@@ -149,7 +150,7 @@ def read_motion(folder: Path) -> LogMotion:
     pose_stamps = stamps(pose_path, poses)
     if (np.diff(pose_stamps) < 0).any():
         raise BadClip(str(pose_path), "timestamp_ns", "time runs backwards")
-    keep = _spaced(seconds_since(start_ns, pose_stamps))
+    keep = spaced(seconds_since(start_ns, pose_stamps))
     pose_values = numbers(pose_path, poses, POSE_COLUMNS)[keep]
     pose_times = seconds_since(start_ns, pose_stamps[keep])
     frame_times = seconds_since(start_ns, np.unique(box_stamps))
@@ -163,7 +164,7 @@ def read_motion(folder: Path) -> LogMotion:
         pose_times_s=pose_times,
         positions=pose_values[:, 4:],
         rotations=city_from_ego,
-        yaws=np.unwrap(_yaw(city_from_ego)),
+        yaws=np.unwrap(yaw_of(city_from_ego)),
         tracks=_tracks(path, boxes, seconds_since(start_ns, box_stamps), pose_times, pose_values[:, 4:], city_from_ego),
     )
 
@@ -204,22 +205,22 @@ def world_from_ego_at(motion: LogMotion, times_s: Array) -> Array:
 
 
 def observed_at(motion: LogMotion, times_s: Array) -> Bools:
-    """(S,) whether an annotated frame stands within 50 ms of each time."""
-    return _nearest_gap(motion.frame_times_s, times_s) < SAME_FRAME_S
+    """(S,) whether an annotated frame stands within 50 ms of each time, or two enclose it that are filled in."""
+    return _seen(motion.frame_times_s, times_s, motion.fill_s)
 
 
 def agents_at(motion: LogMotion, times_s: Array) -> AgentTracks:
-    """All tracks of the log at times (S,): present where their nearest frame is within 50 ms, linear in between."""
+    """All tracks of the log at times (S,): present where `observed_at` holds for their frames, linear in between."""
     valid = np.zeros((len(times_s), len(motion.tracks)), dtype=bool)
     boxes, velocities, center_z = (np.full((*valid.shape, *columns), np.nan) for columns in ((5,), (2,), ()))
     for i, track in enumerate(motion.tracks):
-        here = valid[:, i] = _nearest_gap(track.times_s, times_s) < SAME_FRAME_S
+        here = valid[:, i] = _seen(track.times_s, times_s, motion.fill_s)
         known = np.column_stack([track.centers[:, :2], track.headings, track.sizes[:, :2]])
         for column in range(5):
             boxes[here, i, column] = np.interp(times_s[here], track.times_s, known[:, column])
         boxes[here, i, 2] = wrap_angle(boxes[here, i, 2])
         center_z[here, i] = np.interp(times_s[here], track.times_s, track.centers[:, 2])
-        for column, speeds in enumerate(_track_velocities(track).T):
+        for column, speeds in enumerate(_track_velocities(track, max(VELOCITY_HALF_WINDOW_S, motion.fill_s)).T):
             velocities[here, i, column] = np.interp(times_s[here], track.times_s, speeds)
     return AgentTracks(
         track_ids=tuple(track.track_id for track in motion.tracks),
@@ -232,7 +233,7 @@ def agents_at(motion: LogMotion, times_s: Array) -> AgentTracks:
     )
 
 
-def _spaced(times_s: Array) -> Indices:
+def spaced(times_s: Array) -> Indices:
     """Indices of the times kept when each must stand more than 1 ms after the last one kept."""
     keep = [0]
     for i in range(1, len(times_s)):
@@ -241,7 +242,8 @@ def _spaced(times_s: Array) -> Indices:
     return np.array(keep)
 
 
-def _yaw(rotation: Rotation) -> Array:
+def yaw_of(rotation: Rotation) -> Array:
+    """(n,) heading [rad] of n rotations: of their x axis, seen from above."""
     matrix = rotation.as_matrix()
     return np.arctan2(matrix[:, 1, 0], matrix[:, 0, 0])
 
@@ -254,8 +256,11 @@ def _nearest(sorted_times: Array, times_s: Array) -> Indices:
     return np.where(np.abs(times_s - sorted_times[left]) <= np.abs(sorted_times[right] - times_s), left, right)
 
 
-def _nearest_gap(sorted_times: Array, times_s: Array) -> Array:
-    return np.abs(sorted_times[_nearest(sorted_times, times_s)] - times_s)
+def _seen(sorted_times: Array, times_s: Array, fill_s: float) -> Bools:
+    """(S,) whether one of the sorted times is less than 50 ms away, or two enclose it that are at most fill_s apart."""
+    near = np.abs(sorted_times[_nearest(sorted_times, times_s)] - times_s) < SAME_FRAME_S
+    gaps = np.concatenate([[np.inf], np.diff(sorted_times), [np.inf]])  # before each of them, and after the last
+    return np.asarray(near | (gaps[np.searchsorted(sorted_times, times_s)] <= fill_s + ROUNDING_S))
 
 
 def _tracks(
@@ -276,28 +281,47 @@ def _tracks(
     poses = numbers(path, table, POSE_COLUMNS)
     ego = _nearest(pose_times_s, times_s)
     centers = city_from_ego[ego].apply(poses[:, 4:]) + positions[ego]
-    headings = _yaw(city_from_ego[ego] * rotations(path, poses))
+    headings = yaw_of(city_from_ego[ego] * rotations(path, poses))
 
-    ids = table["track_uuid"].astype(str)
+    kinds = [KIND_OF_CATEGORY[str(name)] for name in table["category"]]
+    return tracks_of(path, "track_uuid", table["track_uuid"].astype(str), kinds, times_s, centers, headings, sizes)
+
+
+def tracks_of(
+    path: Path,
+    field: str,
+    ids: NDArray[np.str_],
+    kinds: Sequence[AgentKind],
+    times_s: Array,
+    centers: Array,
+    headings: Array,
+    sizes: Array,
+) -> tuple[BoxTrack, ...]:
+    """n boxes, in any order, as tracks ordered by id; a track is of its first box's kind.
+
+    ids: (n,), named `field` in errors; centers, sizes: (n, 3). Raises BadClip where a track stands twice in one frame.
+    """
+    if len(ids) == 0:
+        return ()
     order = np.lexsort((times_s, ids))
     groups = np.split(order, np.flatnonzero(ids[order][1:] != ids[order][:-1]) + 1)
     tracks = []
     for rows in groups:
         track_id = str(ids[rows[0]])
         if (np.diff(times_s[rows]) <= 0.0).any():
-            raise BadClip(str(path), "track_uuid", f"track {track_id} stands twice in one frame")
-        kind = KIND_OF_CATEGORY[str(table["category"][rows[0]])]
+            raise BadClip(str(path), field, f"track {track_id} stands twice in one frame")
+        kind = kinds[rows[0]]
         tracks.append(BoxTrack(track_id, kind, times_s[rows], centers[rows], np.unwrap(headings[rows]), sizes[rows]))
     return tuple(tracks)
 
 
-def _track_velocities(track: BoxTrack) -> Array:
-    """(n, 2) velocity at each frame: least-squares slope over +-0.55 s; 0 below 0.1 m/s and for things that stand."""
+def _track_velocities(track: BoxTrack, half_window_s: float) -> Array:
+    """(n, 2) velocity at each frame: least-squares slope over the window; 0 below 0.1 m/s and for things that stand."""
     n = len(track.times_s)
     if track.kind not in MOVING_KINDS or n < 2:
         return np.zeros((n, 2))
     offset = track.times_s[None, :] - track.times_s[:, None]  # (n, n)
-    near = np.abs(offset) <= VELOCITY_HALF_WINDOW_S + ROUNDING_S
+    near = np.abs(offset) <= half_window_s + ROUNDING_S
     count = near.sum(axis=1)
     centered = np.where(near, offset - (np.where(near, offset, 0.0).sum(axis=1) / count)[:, None], 0.0)
     moved = track.centers[None, :, :2] - track.centers[:, None, :2]  # (n, n, 2)

@@ -67,7 +67,7 @@ def raw_lanes(features: Mapping[str, Any], source: str, file: str) -> dict[str, 
             continue
         if kind not in LANE_KINDS:
             raise BadClip(file, f"{field}.type", f"unknown lane class {kind!r}")
-        line = _resampled(points(feature, "polyline", file, field), file, field)
+        line = resampled_line(points(feature, "polyline", file, field), file, f"{field}.polyline")
         if line is None:  # a lane shorter than a centimetre leads nowhere
             continue
         ring = _ring(feature, line, kind, file, field)
@@ -161,14 +161,14 @@ def _half_width(feature: Mapping[str, Any], file: str, field: str) -> float:
     return float(np.median(measured)) if len(measured) else HALF_WIDTH_M
 
 
-def _resampled(line: Array, file: str, field: str) -> Array | None:
-    """The line at uniform arc length, <= 0.75 m apart; None when it has no length."""
+def resampled_line(line: Array, file: str, field: str) -> Array | None:
+    """The line (P, 2) at uniform arc length, <= 0.75 m apart; None when it has no length. Raises BadClip over 20 km."""
     line = line[np.concatenate([[True], np.hypot(*np.diff(line, axis=0).T) > 1e-6])]
     length = arc_lengths(line)[-1]
     if length < 0.01:
         return None
     if length > MAX_LANE_M:
-        raise BadClip(file, f"{field}.polyline", f"a lane of {length:.0f} m")
+        raise BadClip(file, field, f"a lane of {length:.0f} m")
     return resample(line, max(2, int(np.ceil(length / CENTERLINE_SPACING_M)) + 1))
 
 

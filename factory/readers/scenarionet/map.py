@@ -1,6 +1,6 @@
 """From ScenarioNet's map features to a RoadMap: lane graph, neighbours, drivable area, crossings, lights."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import reduce
 from typing import Any
 
@@ -175,6 +175,11 @@ def _drivable_areas(features: Mapping[str, Any], raw: Mapping[str, RawLane], fil
         surface = reduce(shapely.symmetric_difference, [Polygon(ring) for ring in rings], Polygon())
         near = shapely.convex_hull(shapely.MultiPolygon(shapes)).buffer(SURFACE_MARGIN_M)
         shapes.append(shapely.intersection(surface, near))
+    return paved_areas(shapes)
+
+
+def paved_areas(shapes: Sequence[Polygon]) -> tuple[MapPolygon, ...]:
+    """The union of polygons, gaps of up to 0.6 m between them closed, in pieces, largest first."""
     merged = shapely.union_all(shapes).buffer(SEAM_M, join_style="mitre").buffer(-SEAM_M, join_style="mitre")
     whole = sorted(shapely.get_parts(merged.simplify(SIMPLIFY_M)), key=lambda part: -part.area)
     parts = [piece for part in whole for piece in pieces(part)]

@@ -230,8 +230,16 @@ def _smooth_drive(xy: Array, heading: Array, source: Source) -> Array:
     """(S, 11) from logged positions (S, 2) and headings (S,) of one segment."""
     heading = np.unwrap(heading)
     xy = xy - source.origin_to_rear_axle_m * np.stack([np.cos(heading), np.sin(heading)], axis=1)
-    weight = _keyframe_weights(xy)
-    drive = _least_third_difference(np.column_stack([xy, heading]), weight, source.smoothing)
+    return smooth_drive(xy, heading, _keyframe_weights(xy), source.smoothing)
+
+
+def smooth_drive(xy: Array, heading: Array, weight: Array, smoothing: float) -> Array:
+    """Ego states (S, 11) of the smooth drive nearest to rear-axle positions (S, 2) and headings (S,), unwrapped.
+
+    weight: (S,) 1 where a step was observed, 0 where it only lies between two that were, three or more of them 1;
+    S >= 7. Steering and rates are 0.
+    """
+    drive = _least_third_difference(np.column_stack([xy, heading]), weight, smoothing)
     velocity = savgol_filter(drive[:, :2], FIT_STEPS, 2, deriv=1, delta=STEP_S, axis=0)
     acceleration = savgol_filter(drive[:, :2], FIT_STEPS, 2, deriv=2, delta=STEP_S, axis=0)
     c, s = np.cos(drive[:, 2]), np.sin(drive[:, 2])
