@@ -58,6 +58,14 @@ class LogClips:
         return WindowSettings(self.stride_s, self.min_top_speed_mps, self.first_window)
 
 
+@dataclass(frozen=True)
+class Py123dClips(LogClips):
+    """Clips of logs that 123D converted."""
+
+    maps_root: str | None = None  # of the maps that logs share; null: `maps` beside `logs`
+    sensor_root: str | None = None  # of the data set that was converted, for its photos; null: clips without
+
+
 LOG_STEPS = 116  # annotated frames of a log, 11.5 s
 STEPS_PER_SWEEP = 5  # 2 Hz
 MOUNTS = {  # name: yaw [deg], x, y, z in the ego frame [m]; names as in AV2, but for the eighth

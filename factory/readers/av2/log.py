@@ -206,7 +206,7 @@ def world_from_ego_at(motion: LogMotion, times_s: Array) -> Array:
 
 def observed_at(motion: LogMotion, times_s: Array) -> Bools:
     """(S,) whether an annotated frame stands within 50 ms of each time, or two enclose it that are filled in."""
-    return _seen(motion.frame_times_s, times_s, motion.fill_s)
+    return seen_at(motion.frame_times_s, times_s, motion.fill_s)
 
 
 def agents_at(motion: LogMotion, times_s: Array) -> AgentTracks:
@@ -214,7 +214,7 @@ def agents_at(motion: LogMotion, times_s: Array) -> AgentTracks:
     valid = np.zeros((len(times_s), len(motion.tracks)), dtype=bool)
     boxes, velocities, center_z = (np.full((*valid.shape, *columns), np.nan) for columns in ((5,), (2,), ()))
     for i, track in enumerate(motion.tracks):
-        here = valid[:, i] = _seen(track.times_s, times_s, motion.fill_s)
+        here = valid[:, i] = seen_at(track.times_s, times_s, motion.fill_s)
         known = np.column_stack([track.centers[:, :2], track.headings, track.sizes[:, :2]])
         for column in range(5):
             boxes[here, i, column] = np.interp(times_s[here], track.times_s, known[:, column])
@@ -256,7 +256,7 @@ def _nearest(sorted_times: Array, times_s: Array) -> Indices:
     return np.where(np.abs(times_s - sorted_times[left]) <= np.abs(sorted_times[right] - times_s), left, right)
 
 
-def _seen(sorted_times: Array, times_s: Array, fill_s: float) -> Bools:
+def seen_at(sorted_times: Array, times_s: Array, fill_s: float) -> Bools:
     """(S,) whether one of the sorted times is less than 50 ms away, or two enclose it that are at most fill_s apart."""
     near = np.abs(sorted_times[_nearest(sorted_times, times_s)] - times_s) < SAME_FRAME_S
     gaps = np.concatenate([[np.inf], np.diff(sorted_times), [np.inf]])  # before each of them, and after the last
