@@ -26,7 +26,7 @@ ROOMS = {
         *("graph", "stages", "setup", "views", "views.board"),
         *("run", "commands", "__main__"),
     ),
-    "planners": ("command", "data", "models", "training", "evaluation", "study", "__main__"),
+    "planners": ("command", "data", "models", "training", "evaluation", "navsim", "study", "__main__"),
 }
 MOST_MODULES = 20  # in a room
 

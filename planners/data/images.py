@@ -81,11 +81,26 @@ def stitch(jpegs: Sequence[Bytes], layout: ImageLayout, out: Bytes) -> None:
         pixels = cv2.imdecode(jpeg, RGB_AT[part.factor])
         if pixels is None or pixels.shape[:2] != part.decoded:
             raise ValueError("an image is not a JPEG that can be decoded")
-        pixels, into = pixels[part.rows, part.columns], out[:, part.into]
-        if pixels.shape == into.shape:
-            into[:] = pixels
-        else:
-            cv2.resize(pixels, into.shape[1::-1], dst=into, interpolation=part.interpolation)
+        _place(pixels, part, out)
+
+
+def stitch_pixels(images: Sequence[Bytes], layout: ImageLayout, out: Bytes) -> None:
+    """The same of images (rows, columns, 3) uint8 RGB that someone else has decoded.
+
+    What would have been decoded smaller is averaged to that size; the rest is equal to the last bit.
+    """
+    sizes = tuple((image.shape[0], image.shape[1]) for image in images)
+    for image, part in zip(images, _parts(sizes, layout)):
+        whole = image if part.factor == 1 else cv2.resize(image, part.decoded[::-1], interpolation=cv2.INTER_AREA)
+        _place(np.asarray(whole, np.uint8), part, out)
+
+
+def _place(pixels: Bytes, part: "_Part", out: Bytes) -> None:
+    pixels, into = pixels[part.rows, part.columns], out[:, part.into]
+    if pixels.shape == into.shape:
+        into[:] = pixels
+    else:
+        cv2.resize(pixels, into.shape[1::-1], dst=into, interpolation=part.interpolation)
 
 
 @dataclass(frozen=True)

@@ -105,18 +105,24 @@ def _shown_to(needs: Needs | None, samples: Samples, device: str) -> Batch | Sam
 
 def _answers(made: Any, shown: Batch | Samples, samples: Samples) -> Array:
     if isinstance(shown, Batch):
-        with torch.inference_mode():
-            plans = list(_as_array(made.plan(shown), shown))
+        plans = list(plans_for(made, shown))
     else:
         plans = [np.asarray(made.plan(sample), dtype=np.float64) for sample in shown]
     for sample, plan in zip(samples, plans):
-        if plan.shape not in ((8, 3), (40, 3)) or not np.isfinite(plan).all():
-            name = f"sample {sample['attempt_id']}"
-            raise ValueError(f"{name}: a plan must be (8 or 40, 3) finite numbers, got {plan.shape}")
+        check_plan(plan, f"sample {sample['attempt_id']}")
     return np.concatenate([at_ten_hz(plan[None]) for plan in plans])
 
 
-def _as_array(plans: Any, batch: Batch) -> Array:
+def check_plan(plan: Array, name: str) -> None:
+    """Raises ValueError, naming whose it is, for what is no plan."""
+    if plan.shape not in ((8, 3), (40, 3)) or not np.isfinite(plan).all():
+        raise ValueError(f"{name}: a plan must be (8 or 40, 3) finite numbers, got {plan.shape}")
+
+
+def plans_for(made: Any, batch: Batch) -> Array:
+    """What a planner answers to a batch, (B, 8 or 40, 3). Raises ValueError for anything else."""
+    with torch.inference_mode():
+        plans = made.plan(batch)
     array = plans.detach().double().cpu().numpy() if isinstance(plans, torch.Tensor) else np.asarray(plans, np.float64)
     if array.ndim != 3 or len(array) != len(batch):
         raise ValueError(f"plan() of a batch of {len(batch)} returned {array.shape}, not ({len(batch)}, 8 or 40, 3)")

@@ -301,6 +301,10 @@ class DiffusionDrive(Planner):
     def needs(self) -> Needs:
         return Needs(image=self.settings.image, bev=self.settings.bev, n_agents=self.settings.agents)
 
+    @property
+    def needs_to_plan(self) -> Needs:
+        return Needs(image=self.settings.image)
+
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """`confidence` and `regression` of all refinements, `agent_class`, `agent_box`, `bev`.
 

@@ -63,6 +63,10 @@ class Ltf(Planner):
     def needs(self) -> Needs:
         return Needs(image=self.settings.image, bev=self.settings.bev, n_agents=self.settings.agents)
 
+    @property
+    def needs_to_plan(self) -> Needs:
+        return Needs(image=self.settings.image)
+
     def _decode(self, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
         """Plans (B, 8, 3), queries of agents (B, N, width), features from above."""
         assert batch.image is not None

@@ -15,6 +15,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -49,6 +50,11 @@ class Planner(nn.Module, ABC):
     @abstractmethod
     def needs(self) -> Needs:
         """What it reads of a sample."""
+
+    @property
+    def needs_to_plan(self) -> Needs:
+        """What of it `plan` looks at; less where auxiliary losses want more than planning does."""
+        return replace(self.needs, labels=None)
 
     @abstractmethod
     def losses(self, batch: Batch) -> dict[str, Tensor]:

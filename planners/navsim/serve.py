@@ -1,0 +1,49 @@
+"""`python -m planners serve planner=<training>`: plans for NAVSIM's own evaluation, whose agent starts this.
+
+planners.navsim.agent.FactoryAgent asks on standard input and reads the plans on standard output (planners.navsim.wire).
+Nobody starts it by hand; what it prints goes to standard error.
+
+planner=     a training's folder, a+b, constant_velocity, or my.module:MyPlanner; it looks at pictures and status alone
+device=      cpu or cuda
+cameras=     NAVSIM's cameras in the places of those it was trained on, left to right: [cam_l0,cam_f0,cam_r0]
+undistort=   true for a planner that was trained on pinhole pictures
+"""
+
+import os
+import sys
+from dataclasses import dataclass
+
+import numpy as np
+
+from factory.config.arguments import Refused
+from planners.navsim.pilot import Pilot, seen_of
+from planners.navsim.wire import receive, send
+
+
+@dataclass(frozen=True)
+class Request:
+    """The command line."""
+
+    planner: str
+    device: str = "cpu"
+    cameras: tuple[str, ...] = ()
+    undistort: bool = False
+
+
+def main(request: Request) -> None:
+    """Answer until nobody asks any more. Raises Refused for a planner that cannot plan there."""
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # whatever prints must not come between the answers
+    try:
+        pilot = Pilot(request.planner, request.cameras, request.undistort, request.device)
+    except (ValueError, OSError, RuntimeError) as error:  # RuntimeError: a device that is not there
+        send(answers, {"error": str(error)})
+        raise Refused(str(error)) from error
+    send(answers, {"cameras": np.array(pilot.cameras, dtype=str)})
+    while (question := receive(sys.stdin.buffer)) is not None:
+        try:
+            poses = pilot.plan(seen_of(question, pilot.cameras), int(question["n_poses"]))
+        except ValueError as error:
+            send(answers, {"error": str(error)})
+        else:
+            send(answers, {"poses": poses})

@@ -1,0 +1,140 @@
+"""The agent's process: it starts, plans, says what is wrong, and ends; NAVSIM itself where it is at hand."""
+
+import ast
+import io
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from planners.navsim import agent
+from planners.navsim.agent import RemotePlanner, shown
+from planners.navsim.pilot import FRONT, Pilot, seen_of
+from planners.navsim.wire import LENGTH, receive, send
+from tests.planners.navsim.agent_inputs import agent_input
+from tests.planners.navsim.trained import made, saved
+
+REPOSITORY = Path(__file__).resolve().parents[3]
+IN_NAVSIM_S_PYTHON = ("tasks", "factory", "planners", "planners/navsim")  # and of the last what follows
+ITS_OWN = ("planners/navsim/agent.py", "planners/navsim/wire.py")
+
+
+def test_messages_come_back_as_they_were_sent() -> None:
+    pipe = io.BytesIO()
+    sent = {"image": np.arange(24, dtype=np.uint8).reshape(2, 4, 3), "n_poses": 8, "error": "none", "cameras": FRONT}
+    send(pipe, sent)
+    send(pipe, {"second": np.eye(2)})
+    pipe.seek(0)
+    first = receive(pipe)
+    assert first is not None and first.keys() == sent.keys()
+    np.testing.assert_array_equal(first["image"], sent["image"])
+    assert str(first["error"]) == "none" and int(first["n_poses"]) == 8 and tuple(first["cameras"]) == FRONT
+    np.testing.assert_array_equal((receive(pipe) or {})["second"], np.eye(2))
+    assert receive(pipe) is None
+
+
+@pytest.mark.parametrize("data", [b"warning", LENGTH.pack(100) + b"short", LENGTH.pack(1 << 40)])
+def test_what_is_no_message_is_told(data: bytes) -> None:
+    with pytest.raises(ValueError, match="cut off, or something else"):
+        receive(io.BytesIO(data))
+
+
+@pytest.mark.slow
+def test_a_process_of_its_own_plans_the_same_and_ends_with_its_owner(tmp_path: Path) -> None:
+    folder, given = saved(made("ltf_small"), tmp_path), agent_input(FRONT)
+    remote = RemotePlanner(folder, sys.executable)
+    assert remote.cameras == FRONT
+    here = Pilot(folder)
+    for n_poses in (8, 40):
+        expected = here.plan(seen_of(shown(given, FRONT), FRONT), n_poses)
+        plan = remote.plan(given, n_poses)
+        np.testing.assert_allclose(plan, expected, atol=1e-5)  # it has other threads than this process
+        assert plan.shape == (n_poses, 3) and plan.dtype == np.float32
+    given.cameras[-1].cam_f0.image = np.zeros((90, 160, 3), np.float32)
+    with pytest.raises(RuntimeError, match="cam_f0: a picture is"):
+        remote.plan(given, 8)
+    assert remote.plan(agent_input(FRONT), 8).shape == (8, 3), "a question that is refused ends nothing"
+    process = remote._process
+    remote.close()
+    assert process.wait(timeout=20) == 0
+    with pytest.raises(RuntimeError, match="was closed"):
+        remote.plan(agent_input(FRONT), 8)
+
+
+@pytest.mark.slow
+def test_why_it_cannot_plan_is_said_before_the_first_scene(tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError, match="neither a folder nor one of"):
+        RemotePlanner(str(tmp_path / "gone"), sys.executable)
+    with pytest.raises(RuntimeError, match="no camera cam_x0"):
+        RemotePlanner(saved(made("ltf_small"), tmp_path), sys.executable, cameras=("cam_l0", "cam_x0", "cam_r0"))
+
+
+def test_a_python_without_the_planners_is_told() -> None:
+    with pytest.raises(RuntimeError, match="ended with code"):
+        RemotePlanner("constant_velocity", "/bin/false")
+
+
+def test_what_runs_in_navsim_s_python_is_of_its_version_and_needs_numpy_alone() -> None:
+    files = [f"{package}/__init__.py" for package in IN_NAVSIM_S_PYTHON] + list(ITS_OWN)
+    for file in files:
+        text = (REPOSITORY / file).read_text()
+        tree = ast.parse(text, feature_version=(3, 9))
+        if file in ITS_OWN:
+            assert "from __future__ import annotations" in text, f"{file}: 3.9 has no X | None"
+            named = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+            ours = {name for name in named if name and name.startswith(("planners", "factory", "tasks"))}
+            assert ours <= {"planners.navsim.wire"}
+
+
+def test_without_navsim_only_the_agent_itself_is_missing() -> None:
+    with pytest.raises(AttributeError, match="no attribute Agent"):
+        agent.Agent  # noqa: B018
+    if "NAVSIM_PYTHON" not in os.environ:
+        with pytest.raises(ModuleNotFoundError, match="navsim"):
+            agent.FactoryAgent  # noqa: B018
+
+
+IN_NAVSIM = """
+import pickle, sys
+import numpy as np
+from hydra.utils import instantiate
+from navsim.agents.abstract_agent import AbstractAgent
+from navsim.common.dataclasses import AgentInput, Camera, Cameras, EgoStatus, Trajectory
+stored = np.load(sys.argv[1])
+checkpoint, python = sys.argv[2:]
+config = {"_target_": "planners.navsim.agent.FactoryAgent", "_convert_": "all", "checkpoint": checkpoint}
+agent = instantiate({**config, "python": python})
+assert isinstance(agent, AbstractAgent) and not agent.requires_scene
+sensors = agent.get_sensor_config()
+assert sensors.get_sensors_at_iteration(3) == ["cam_f0", "cam_l0", "cam_r0"]
+assert not any(sensors.get_sensors_at_iteration(i) for i in (0, 1, 2, 4, 11))
+agent.initialize()
+names = ["cam_f0", "cam_l0", "cam_l1", "cam_l2", "cam_r0", "cam_r1", "cam_r2", "cam_b0"]
+keys = ["image", "rotation", "translation", "intrinsics", "distortion"]
+cameras = {n: Camera(*(stored[f"{n}.{k}"] for k in keys)) if f"{n}.image" in stored else Camera() for n in names}
+status = stored["status"]
+egos = [EgoStatus(pose, status[4:6], status[6:], status[:4].astype(int)) for pose in stored["history"]]
+plan = agent.compute_trajectory(AgentInput(egos, [Cameras(**cameras)] * 4, []))
+assert isinstance(plan, Trajectory) and plan.trajectory_sampling.num_poses == 8
+again = pickle.loads(pickle.dumps({"first_stage_predictions": [{"token": plan}]}))
+np.save(sys.stdout.buffer, again["first_stage_predictions"][0]["token"].poses)
+"""
+
+
+@pytest.mark.slow
+def test_navsim_s_own_code_takes_the_agent(tmp_path: Path) -> None:
+    """NAVSIM_PYTHON=<python of an environment with NAVSIM> pytest ...; skipped where there is none."""
+    if "NAVSIM_PYTHON" not in os.environ:
+        pytest.skip("NAVSIM_PYTHON names no interpreter that has NAVSIM")
+    folder, given = saved(made("ltf_small"), tmp_path / "training"), agent_input(FRONT)
+    arrays = shown(given, FRONT)
+    np.savez(tmp_path / "seen.npz", **arrays)
+    path = os.pathsep.join([str(REPOSITORY), *filter(None, [os.environ.get("NAVSIM_PATH")])])
+    command = [os.environ["NAVSIM_PYTHON"], "-c", IN_NAVSIM, str(tmp_path / "seen.npz"), folder, sys.executable]
+    done = subprocess.run(command, env=os.environ | {"PYTHONPATH": path}, capture_output=True, timeout=200)
+    assert done.returncode == 0, done.stderr.decode()
+    expected = Pilot(folder).plan(seen_of(arrays, FRONT), 8)
+    np.testing.assert_allclose(np.load(io.BytesIO(done.stdout)), expected, atol=1e-5)
