@@ -23,7 +23,7 @@ ROOMS = {
     ),
     "factory": (
         *("exits", "wording", "job", "readers.settings", "readers.town.settings", "config", "readers", "store"),
-        *("graph", "stages", "setup", "views", "views.board"),
+        *("exports", "graph", "stages", "setup", "views", "views.board"),
         *("run", "commands", "__main__"),
     ),
     "planners": ("command", "data", "models", "training", "evaluation", "navsim", "study", "__main__"),

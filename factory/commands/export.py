@@ -1,24 +1,36 @@
-"""`python -m factory export mcap|mp4|rerun out=<folder or URL> sample=<id>`: samples as files for other tools.
+"""`python -m factory export mcap|mp4|rerun|navsim out=<folder or URL> ...`: samples as files for other tools.
 
     python -m factory export mcap out=runs/demo sample=0             one sample for Foxglove, Lichtblick or Rerun
     python -m factory export mcap out=runs/demo every=10 to=looks    every tenth sample, a file each
     python -m factory export mp4 out=runs/demo sample=3fa9           a drive as H.264, from above and from the cameras
     python -m factory export rerun out=runs/demo sample=0            a .rrd, with Rerun's SDK (pip install rerun-sdk)
+    python -m factory export navsim out=runs/demo to=openscene       all samples in SimScale's layout, for its training
 
 `sample` is an ordinal, an id or the beginning of one, `to` a folder (the current one) or, for one sample, a file.
+`navsim` takes all samples, or those of expert=a,b round=0,1 split=train,val, and goes on where it was stopped:
+    tag=<word>          behind the experts' names, so that splits of ours stand beside the released ones
+    layout=released     as SimScale's archives unpack; moved (the default): as after its tools/move.sh
+    resize=true         pictures of other sizes to 1920x1080, which the released agents take for granted
+    missing=black|none  for pictures that a sample has not: a black one, or none; refuse is the default
+    map_location=<one>  of NAVSIM's four, for logs whose map has another name
+    vocabulary=<.npy>   the trajectories that the labels are of, to be written beside the rewards
+    workers=<n>         processes
+What is written: docs/navsim_format.md.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from factory.config.arguments import WORD, Refused
+from factory.exports.navsim.settings import Layout, Missing
 from factory.views.show import find, logged_drive, sample_ids
 from factory.views.status import open_store
 
 if TYPE_CHECKING:
     from factory.store.samples import Store
+    from tasks.world.arrays import Array
 
 Row = Mapping[str, Any]
 
@@ -27,21 +39,53 @@ Row = Mapping[str, Any]
 class Request:
     """The command line."""
 
-    format: Literal["mcap", "mp4", "rerun"] = field(metadata=WORD)
+    format: Literal["mcap", "mp4", "rerun", "navsim"] = field(metadata=WORD)
     out: str
     sample: str | None = None
     every: int | None = None
     to: str = "."
+    expert: tuple[str, ...] = ()
+    round: tuple[str, ...] = ()
+    split: tuple[str, ...] = ()
+    tag: str = ""
+    layout: Layout = "moved"
+    resize: bool = False
+    missing: Missing = "refuse"
+    map_location: str = ""
+    vocabulary: str | None = None
+    workers: int = 1
 
     def __post_init__(self) -> None:
+        if self.format == "navsim":
+            self._check_all()
+            return
+        for name in [f.name for f in fields(self) if f.name not in EVERYWHERE]:
+            if getattr(self, name) != getattr(type(self), name):
+                raise ValueError(f"{name}=...: of export navsim alone; {self.format} takes sample= or every=, and to=")
         if (self.sample is None) == (self.every is None):
             raise ValueError("give either sample=<id> or every=<n>; see --help")
         if self.every == 0:
             raise ValueError("every=0: must be 1 or more")
 
+    def _check_all(self) -> None:
+        if self.sample is not None or self.every is not None:
+            raise ValueError("sample= and every= are of single files; navsim takes expert=, round= and split=")
+        if self.to == ".":
+            raise ValueError("to=<folder> is missing: where logs, pictures, splits and rewards are written")
+        if self.workers == 0:
+            raise ValueError("workers=0: must be 1 or more")
+        if odd := [word for word in self.round if not (word.isascii() and word.isdecimal())]:
+            raise ValueError(f"round={odd[0]}: must be a whole number, 0 or more")
+
+
+EVERYWHERE = ("format", "out", "sample", "every", "to")
+
 
 def main(request: Request) -> None:
     """Write the files and name them."""
+    if request.format == "navsim":
+        _export_all(request)
+        return
     for path in export(request):
         print(path.resolve())
 
@@ -68,6 +112,48 @@ def export(request: Request) -> Iterator[Path]:
             yield path
     except (OSError, ValueError, ImportError) as error:  # no such folder, another schema version, no SDK
         raise Refused(f"{store.location.uri}: {error}") from error
+
+
+def _export_all(request: Request) -> None:
+    """All samples in SimScale's layout. Raises Refused."""
+    from factory.exports.navsim.export import export as export_all
+    from factory.exports.navsim.settings import ExportSettings
+    from factory.store.reader import sample_table
+
+    store, target = open_store(request.out), Path(request.to).expanduser()
+    try:
+        settings = ExportSettings(
+            request.expert,
+            tuple(int(word) for word in request.round),
+            request.split,
+            request.tag,
+            request.layout,
+            request.resize,
+            request.missing,
+            request.map_location,
+        )
+        table = sample_table(store.location.uri, store.location.options)
+        trajectories = _label_trajectories(store, request.vocabulary)
+        done = export_all(table, target, settings, trajectories, request.workers)
+    except (OSError, ValueError) as error:  # no folder, a full disk, a sample that cannot be written as asked
+        raise Refused(str(error)) from error
+    for note in done.notes:
+        print(f"note: {note}")
+    print(f"{done.written:,} logs written, {done.logs:,} in all, {done.n_bytes / 1e9:,.3f} GB: {target.resolve()}")
+
+
+def _label_trajectories(store: "Store", file: str | None) -> "Array | None":
+    """(K, 40, 3) that the samples' labels are of; None where there are none, or of a file that was not named."""
+    from factory.store.reader import SampleTable
+    from factory.store.schema import LABEL_COLUMNS
+    from factory.views.show import labelled_trajectories
+
+    samples = SampleTable(store.location.uri, store.location.options)
+    digests = samples.table(["label_vocabulary"])["label_vocabulary"].to_pylist()
+    labelled = next((i for i, digest in enumerate(digests) if digest is not None), None)
+    if labelled is None:
+        return None
+    return labelled_trajectories(samples.sample(labelled, ["attempt_id", *LABEL_COLUMNS]), file)
 
 
 def write(format: str, store: "Store", row: Row, path: Path) -> None:

@@ -95,7 +95,7 @@ class SampleTable:
         """One sample, or some of its columns; reads the row group it stands in."""
         _, path, row = self._places[self._index[which] if isinstance(which, str) else which]
         group, row = group_of(self._file(path), row)
-        (sample,) = _read_rows(self._file(path), group, self._partitions[path], columns, slice(row, row + 1))
+        (sample,) = read_rows(self._file(path), group, self._partitions[path], columns, slice(row, row + 1))
         return sample
 
     def __iter__(self) -> Iterator[Sample]:
@@ -105,7 +105,7 @@ class SampleTable:
         """Every sample once, file by file, one row group in memory."""
         for path in sorted(self._partitions):
             for group in range(self._file(path).metadata.num_row_groups):
-                yield from _read_rows(self._file(path), group, self._partitions[path], columns)
+                yield from read_rows(self._file(path), group, self._partitions[path], columns)
 
 
 def samples_of(
@@ -116,7 +116,7 @@ def samples_of(
     for group in range(file.metadata.num_row_groups):
         keys = file.read_row_group(group, columns=["attempt_id"])["attempt_id"].to_pylist()
         for i in (i for i, key in enumerate(keys) if key in attempt_ids):
-            yield from _read_rows(file, group, partition, None, slice(i, i + 1))
+            yield from read_rows(file, group, partition, None, slice(i, i + 1))
 
 
 def group_of(file: pq.ParquetFile, row: int) -> tuple[int, int]:
@@ -128,13 +128,14 @@ def group_of(file: pq.ParquetFile, row: int) -> tuple[int, int]:
     return group, row
 
 
-def _read_rows(
+def read_rows(
     file: pq.ParquetFile,
     group: int,
     partition: Mapping[str, str],
     columns: Sequence[str] | None,
     rows: slice = slice(None),
 ) -> list[Sample]:
+    """Rows of one row group of a file of a table of samples; columns None: all. Raises KeyError for unknown ones."""
     names = list(SCHEMA.names if columns is None else columns)
     unknown = sorted(set(names) - set(SCHEMA.names))
     if unknown:

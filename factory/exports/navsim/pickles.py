@@ -1,0 +1,38 @@
+"""Pickles that the public code's own, older numpy opens, and a large dictionary pickled entry by entry."""
+
+import pickle
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+from typing import BinaryIO
+
+PROTOCOL = 3  # the newest whose globals stand as text, and whose values may follow each other in one stream
+HEAD, TAIL = b"\x80\x03", b"."
+EMPTY_DICT, MARK, SETITEMS = b"}", b"(", b"u"
+NUMPY_2, NUMPY_1 = b"cnumpy._core.multiarray\n", b"cnumpy.core.multiarray\n"  # numpy < 1.26 knows the second alone
+
+
+def dumps(value: object) -> bytes:
+    """A pickle of plain values and numpy arrays, the same bytes whatever numpy writes it."""
+    return pickle.dumps(value, PROTOCOL).replace(NUMPY_2, NUMPY_1)
+
+
+def write_dict(file: BinaryIO, entries: Iterable[tuple[str, object]], after: Path | None = None) -> None:
+    """Pickle a dictionary of any size into `file`, one entry in memory.
+
+    after: a file written by this function, whose entries come first.
+    """
+    file.write(HEAD + EMPTY_DICT)
+    if after is not None:
+        with after.open("rb") as earlier:
+            earlier.seek(len(HEAD + EMPTY_DICT))
+            shutil.copyfileobj(earlier, file, 1 << 20)
+        file.seek(-len(TAIL), 2)
+    for key, value in entries:
+        file.write(MARK + _bare(key) + _bare(value) + SETITEMS)
+    file.write(TAIL)
+
+
+def _bare(value: object) -> bytes:
+    """A value's opcodes without head and tail. Its memo begins at 0 again, over what an earlier value left there."""
+    return dumps(value)[len(HEAD) : -len(TAIL)]
