@@ -1,9 +1,11 @@
 """However the stages of an attempt are cut into tasks, the rows are the same, to the byte."""
 
+import json
 import pickle
 import re
 import time
 from collections.abc import Iterator
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ from factory.readers.town.reader import SyntheticReader
 from factory.stages.pipeline import FactoryWork
 from factory.store.samples import Store
 from tasks.stages import ATTEMPT, TASKS
+from tests.factory.noted import NotedWork
 from tests.factory.stages.test_pipeline import SMALL, work_on
 from tests.factory.tables import assert_same_tables, tables_of
 from tests.factory.toy import TakesItsNodeAway, ToyWork, ran, refs
@@ -59,7 +62,7 @@ def test_stages_as_tasks_of_their_own_make_the_same_rows_in_this_process(tmp_pat
 def town(tmp_path_factory: pytest.TempPathFactory) -> FactoryWork:
     """A run that draws from a small town's block."""
     folder = tmp_path_factory.mktemp("town")
-    reader = SyntheticReader(folder / "town", 1, 0, SMALL)
+    reader = SyntheticReader(folder / "town", 2, 0, SMALL)
     reader.index()
     return work_on(reader.root, folder / "out")
 
@@ -177,6 +180,30 @@ def test_gpu_nodes_draw_and_cpu_nodes_drive(tmp_path: Path, two_nodes: dict[str,
     assert at["attempt"] == at["label"] == {"cpu"}
     run(tmp_path / "local", ToyWork(trouble=UNFIT), executor="local")
     assert_same_tables(tmp_path / "out", tmp_path / "local")
+
+
+@pytest.mark.ray
+@pytest.mark.slow
+def test_the_town_s_pictures_are_drawn_on_the_gpu_node_and_its_drives_made_on_the_cpu_node(
+    town: FactoryWork, tmp_path: Path, two_nodes: dict[str, str]
+) -> None:
+    """Drives go on between the first picture and the last, and the rows are those of one process."""
+    root, journal = town.reader.root, tmp_path / "journal"  # type: ignore[attr-defined]
+    work = work_on(root, tmp_path / "blocks", "render.gate.enabled=false")  # the block is built by this run
+    noted = NotedWork(**{f.name: getattr(work, f.name) for f in fields(work)}, journal=str(journal))
+    what = (work.reader.index().refs, ["pdm_closed", "human"], 3)
+    on_two = Store(tmp_path / "ray")
+    made = execute(noted, *what, on_two, workers=2, claims=Claims(gpu_share=0.5), say=lambda line: None)
+    assert made.exit_code == COMPLETE and made.counts["rejected"] > 0
+    tasks = [json.loads(line) for line in journal.read_text().splitlines()]
+    places = {name: {two_nodes[node] for task, node, *_ in tasks if task == name} for name, *_ in tasks}
+    labelled = places.pop("label")  # where it is drawn, if a core is free there: its pictures are what weighs most
+    assert places == {"reconstruct": {"cpu"}, "perturb": {"cpu"}, "drive": {"cpu"}, "render": {"gpu"}} and labelled
+    drives, pictures = ([span for task, _, *span in tasks if task == name] for name in ("drive", "render"))
+    assert len(pictures) == made.counts["accepted"], "only what the reward accepts is drawn"
+    assert any(min(pictures)[0] < began < max(pictures)[0] for began, _ in drives)
+    execute(work, *what, Store(tmp_path / "local"), "local", say=lambda line: None)
+    assert_same_tables(tmp_path / "ray", tmp_path / "local")
 
 
 @pytest.mark.ray
