@@ -47,7 +47,7 @@ class StudyFrames:
     """What a file holds."""
 
     trainings: tuple[Mapping[str, Any], ...]  # facts of each, with its label under "training"
-    comparisons: tuple[Comparison, ...]  # of a study; none of a sweep
+    comparisons: tuple[Comparison, ...]
     clips: Clips  # by label, also of ensembles and bounds; scores alone, no sub-scores
 
 
@@ -62,7 +62,7 @@ def write_frames(
     path: Path,
     rows: Iterator[tuple[str, Sequence[FrameRow]]],
     trainings: Sequence[Mapping[str, Any]],
-    comparisons: Sequence[Comparison] = (),
+    comparisons: Sequence[Comparison],
 ) -> None:
     """Write the rows of each planner, by its label. Whole or not at all."""
     meta = {"trainings": [dict(one) for one in trainings], "comparisons": [asdict(one) for one in comparisons]}

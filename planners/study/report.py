@@ -5,14 +5,14 @@
     python -m planners report folder=docs/study/logs/nuscenes/stage_two              of `python -m planners scaling`
 
 `folder` holds the frames.parquet that the study or a scaling sweep wrote; nothing else is read, nothing is trained or
-planned. Of both: `comparisons.csv` (means over seeds, differences with paired bootstrap intervals over seeds and clips,
-logs, towns), `bounds.csv`, and where there are rounds enough `curves.csv` and pictures of it. Of the study:
-`trainings.csv` (each training), `clips.csv` (its score on each clip), `tables.md` (to be read), `differences.png`. Of a
-sweep: `scaling.csv` (each training). Only the learning curves need the trainings' own folders.
+planned. `comparisons.csv` (means over seeds, differences with paired bootstrap intervals over seeds and clips, logs,
+towns), `trainings.csv` (each training), `clips.csv` (its score on each clip), `bounds.csv`, `tables.md` (to be read),
+`differences.png`, and where there are rounds enough `curves.csv` and pictures of it. Only the learning curves need the
+trainings' own folders.
 """
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,11 +38,12 @@ from planners.evaluation.score_table import FILTERS_NOTE
 from planners.study.figures import Curve, draw_curves, draw_differences
 from planners.study.frames_file import FRAMES, StudyFrames, read_frames
 from planners.study.scaling_law import FEWEST, fit_scaling
-from planners.study.tables import markdown_of
+from planners.study.setups import SWEEP
+from planners.study.tables import markdown_of, words_of
 
 CURVES = {"final": "scaling.png", "stage_two": "scaling_stage_two.png"}
 RULES = CompareSettings(a="", b="")  # draws, confidence and seed as `python -m planners compare` has them
-OF_ONE = ("training", "seed", "real", "simulated", "samples", "parameters", "optimiser_steps")  # not of all seeds
+CURVED = ("rounds", SWEEP)  # the parts that are scores over data
 
 Row = dict[str, Any]
 Scores = Mapping[str, Mapping[str, float]]  # by label
@@ -72,17 +73,14 @@ def write_tables(folder: Path, out: Path, human_filter: HumanFilter) -> str:
     write_csv(out / "comparisons.csv", rows)
     if bounds:
         write_csv(out / "bounds.csv", bounds)
-    if frames.comparisons:
-        write_csv(out / "trainings.csv", trainings)
-        write_clips(out / "clips.csv", {label: clips for label, clips in frames.clips.items() if label not in BOUNDS})
-        (out / "tables.md").write_text(markdown_of(rows, human_filter))
-        drawn = [row for row in rows if row["reference"] and row["human_filter"] == measures[row["stage"]]]
-        if drawn:
-            draw_differences(drawn, out / "differences.png")
-    else:
-        write_csv(out / "scaling.csv", [{k: v for k, v in row.items() if k != "training"} for row in trainings])
+    write_csv(out / "trainings.csv", trainings)
+    write_clips(out / "clips.csv", {label: clips for label, clips in frames.clips.items() if label not in BOUNDS})
+    (out / "tables.md").write_text(markdown_of(rows, human_filter))
+    drawn = [row for row in rows if row["reference"] and row["human_filter"] == measures[row["stage"]]]
+    if drawn:
+        draw_differences(drawn, out / "differences.png")
     curves = {stage: curves_of(frames, scores, name_of(stage, measures[stage])) for stage in CURVES}
-    if (frames.comparisons and any(curves.values())) or any(one.law for one in curves["final"]):
+    if any(one.law for one in curves["final"]):
         heads = {stage: {"stage": stage, "human_filter": measures[stage]} for stage in curves}
         write_csv(out / "curves.csv", [heads[stage] | one.row() for stage, found in curves.items() for one in found])
         for stage, name in CURVES.items():
@@ -90,47 +88,19 @@ def write_tables(folder: Path, out: Path, human_filter: HumanFilter) -> str:
     return "\n".join([text_of(rows, bounds, measures["final"]), f"tables and pictures: {out}"])
 
 
-def held(frames: StudyFrames) -> Iterator[tuple[Mapping[str, Any], Sequence[str], Sequence[str]]]:
-    """Facts and trainings of what is compared, and those it is held against, of the same seeds.
-
-    A study's comparisons, or each set-up of a sweep with real samples alone.
-    """
-    for one in frames.comparisons:
-        labels, *against = ([setup.label_of(seed) for seed in range(one.seeds)] for setup in one.setups)
-        yield one.facts, labels, against[0] if against else ()
-    setups = defaultdict[tuple[tuple[str, Any], ...], list[str]](list)
-    for facts in sorted(frames.trainings, key=lambda facts: facts["seed"]) if not frames.comparisons else ():
-        setups[tuple((name, value) for name, value in facts.items() if name not in OF_ONE)].append(facts["training"])
-    for key, labels in setups.items():
-        setup = dict(key)
-        imitation = "none" if setup["imitation"] == "none" else "all"
-        alone = {**setup, "expert": "", "rounds": 0, "sim_ratio": "natural", "imitation": imitation}
-        yield setup | {"seeds": len(labels)}, labels, setups.get(tuple(alone.items()), ()) if setup["rounds"] else ()
-
-
 def compared(frames: StudyFrames) -> list[Row]:
-    """A row for each line and each of MEASURES, in percent: mean over seeds, difference, 95 % intervals.
-
-    Of a study the score of each seed and the reference's name stand beside; of a sweep the lowest and highest seed, and
-    uniform_share, the mean share of clips none of whose follow-ups starts near the plan's end.
-    """
+    """A row for each comparison and each of MEASURES, in percent: mean over seeds, difference, 95 % intervals."""
     rows = []
-    for facts, labels, against in held(frames):
-        a, b = ([frames.clips[label] for label in side] for side in (against, labels))
-        intervals = compare(a, b, RULES) if a else {}
-        scores = [scores_of_clips(clips) for clips in b]
+    for one in frames.comparisons:
+        sides = [[frames.clips[setup.label_of(seed)] for seed in range(one.seeds)] for setup in one.setups]
+        intervals = compare(sides[1], sides[0], RULES) if one.reference else {}
+        scores = [scores_of_clips(clips) for clips in sides[0]]
         for stage, human_filter in MEASURES:
             each = [score[name_of(stage, human_filter)] for score in scores]
-            row = {**facts, "stage": stage, "human_filter": human_filter, "epdms": float(np.mean(each))}
-            if frames.comparisons:
-                row["each"] = " ".join(f"{score:.1f}" for score in each)
-                row["reference"] = against[0].rpartition("-")[0] if against else ""
-            else:
-                row |= {"lowest_seed": min(each), "highest_seed": max(each)}
-            row |= row_of(intervals.get((stage, human_filter)))
-            if not frames.comparisons:
-                row["uniform_share"] = float(np.mean([score["uniform_share"] for score in scores]))
-            rows.append(row)
+            row = {**one.facts, "stage": stage, "human_filter": human_filter, "epdms": float(np.mean(each))}
+            row["each"] = " ".join(f"{score:.1f}" for score in each)
+            row["reference"] = one.reference.label if one.reference else ""
+            rows.append(row | row_of(intervals.get((stage, human_filter))))
     return rows
 
 
@@ -146,33 +116,17 @@ def curves_of(frames: StudyFrames, scores: Scores, score: str) -> list[Curve]:
 
 
 def _series(frames: StudyFrames) -> Mapping[tuple[str, str], list[str]]:
-    """(panel, curve) -> trainings: the study's part `rounds`, or all of a sweep."""
+    """(panel, curve) -> trainings, of the parts that are CURVED."""
     found = defaultdict[tuple[str, str], dict[str, None]](dict)
     of_setup = defaultdict[str, list[str]](list)
     for facts in frames.trainings:
         of_setup[facts["training"].rpartition("-")[0]].append(facts["training"])
     for one in frames.comparisons:
-        if one.part == "rounds" and one.reference is not None:
-            name = f"{one.setup.data}, rewards only" if one.setup.imitation == "real" else one.setup.data
-            both = [*of_setup[one.reference.label], *of_setup[one.setup.label]]
-            found[f"{one.setup.planner}, equal {one.budget}", name] |= dict.fromkeys(both)
-    if not frames.comparisons:
-        axes = ("expert", "sim_ratio", "imitation", "real_share")
-        taught = [facts for facts in frames.trainings if facts["rounds"]]
-        several = {axis for axis in axes if len({facts[axis] for facts in taught}) > 1}
-        for facts in taught:
-            parts = [facts["expert"], *([f"sim_ratio {facts['sim_ratio']}"] if "sim_ratio" in several else [])]
-            parts += [{"all": "imitation", "real": "rewards only", "none": "no imitation"}[facts["imitation"]]]
-            parts += [f"{facts['real_share']:g} of real"] if "real_share" in several else []
-            alone = [other["training"] for other in frames.trainings if _is_alone(other, facts)]
-            found[facts["planner"], ", ".join(parts)] |= dict.fromkeys([*alone, facts["training"]])
+        if one.part in CURVED and one.setup.rounds:
+            labels = [label for setup in reversed(one.setups) for label in of_setup[setup.label]]
+            curve = f"{one.setup.planner}, equal {one.budget}", words_of(one.facts, counted=False)
+            found[curve] |= dict.fromkeys(labels)
     return {name: list(labels) for name, labels in found.items()}
-
-
-def _is_alone(other: Mapping[str, Any], facts: Mapping[str, Any]) -> bool:
-    """Whether a training is the real samples alone that another of its sweep adds to."""
-    same = all(other[name] == facts[name] for name in ("planner", "real_share"))
-    return same and not other["rounds"] and (other["imitation"] == "none") == (facts["imitation"] == "none")
 
 
 def text_of(found: Sequence[Row], bounds: Sequence[Row], human_filter: str) -> str:
@@ -181,9 +135,7 @@ def text_of(found: Sequence[Row], bounds: Sequence[Row], human_filter: str) -> s
     lines += [f"{'part':<12}{'trained':<46}{'equal':>8}{'seeds':>7}{'EPDMS':>8}{'difference':>12}   95 % over clips"]
     for row in found:
         if (row["stage"], row["human_filter"]) == ("final", human_filter):
-            on = f"{row['planner']} + {row['expert']}, rounds {row['rounds']}" if row.get("expert") else row["planner"]
-            what = f"{row.get('part', ''):<12}{row.get('setup', on):<46}{row.get('budget', ''):>8}"
-            line = f"{what}{row['seeds']:7}{row['epdms']:8.2f}"
+            line = f"{row['part']:<12}{row['setup']:<46}{row['budget']:>8}{row['seeds']:7}{row['epdms']:8.2f}"
             if row["difference"] != "":
                 line += f"{row['difference']:+12.2f}   {row['low']:+.2f} .. {row['high']:+.2f}"
             lines.append(line)

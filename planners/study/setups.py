@@ -22,6 +22,7 @@ RATIOS = (0.25, 0.5, 0.75)
 ENSEMBLE = "ensemble"  # stands for a planner; nothing is trained for it
 SCORING = "gtrs_dense"  # the planner that learns from rewards too
 MULTI = ("diffusiondrive", SCORING)  # the planners of everything but the main table
+SWEEP = "sweep"  # the one part of `python -m planners scaling`
 PARTS = ("main", "rounds", "traffic", "ratio", "psnr", "rewards", "real_share", "control", "ensemble")
 
 

@@ -44,8 +44,8 @@ def run(
 ) -> None:
     """Train and score what is missing of `asked`, one batch after the other, and report on what there is.
 
-    known: of which what is done is reported, whoever asked for it; wanted: of these, what is compared; none: every
-    set-up is held against real samples alone, when all is done. Raises Stopped, Failed.
+    known: of which what is done is reported, whoever asked for it; wanted: of these, what is compared. Raises Stopped,
+    Failed.
     """
     out, labels = Path(settings.out), {one.label for one in asked}
     try:
@@ -56,9 +56,8 @@ def run(
     except Stopped as stopped:
         print(stopped, file=sys.stderr)
     done = evaluated(known, out)
-    if done and (wanted or done >= labels):
-        trained = [one for one in known if one.label in done and not one.members]
-        write_report(so_far(wanted, done), trained, settings)
+    if standing := so_far(wanted, done):
+        write_report(standing, [one for one in known if one.label in done and not one.members], settings)
     if not done >= labels:
         raise Stopped(f"{len(labels & done)} of {len(labels)} planners are evaluated: the same command goes on")
 

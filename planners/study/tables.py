@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from itertools import groupby
+from textwrap import wrap
 from typing import Any
 
 from planners.evaluation.aggregation import HumanFilter, shown
@@ -27,7 +28,8 @@ def markdown_of(rows: Sequence[Row], human_filter: HumanFilter) -> str:
     stages = [stage for stage in shown(human_filter) if any(row["stage"] == stage for row in mine)]
     titles = [TITLES.get(stage, stage.replace("_", " ")) for stage in stages]
     head = ("planner", "trained on", "equal", "seeds", *titles, "final of each seed")
-    lines = [f"Scores are {human_filter}: {FILTERS_NOTE[0]}; {FILTERS_NOTE[1]}.", "", INTERVALS, ""]
+    lines = [*wrap(f"Scores are {human_filter}: {FILTERS_NOTE[0]}; {FILTERS_NOTE[1]}.", 120), ""]
+    lines += [*wrap(INTERVALS, 120), ""]
     for part, of_part in groupby(mine, key=lambda row: row["part"]):
         rows = list(of_part)
         lines += [f"## {part}", "", _line(head), _line(["---"] * len(head))]
@@ -61,12 +63,12 @@ def is_clear(row: Row) -> bool:
     return bool(known) and all(row[f"low{end}"] > 0.0 or row[f"high{end}"] < 0.0 for end in known)
 
 
-def words_of(row: Row) -> str:
-    """What a planner was trained on, in words; what is as usual is left out."""
+def words_of(row: Row, counted: bool = True) -> str:
+    """What a planner was trained on, in words; what is as usual is left out, and the rounds where not `counted`."""
     if row["data"] == "begin":
         return "other towns"
     rounds = "1 round" if row["rounds"] == 1 else f"{row['rounds']} rounds"
-    said = ["real"] if row["rounds"] == 0 else [f"+ {row['data']}", rounds]
+    said = ["real"] if row["rounds"] == 0 else [f"+ {row['data']}", rounds] if counted else [row["data"]]
     said += {"all": [], "real": ["rewards only"], "none": ["no imitation"]}[row["imitation"]]
     said += ["replayed traffic"] if row["traffic"] == "replay" else []
     said += [f"sim ratio {row['sim_ratio']}"] if row["sim_ratio"] != "natural" else []

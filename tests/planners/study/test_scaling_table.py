@@ -11,7 +11,7 @@ from planners.evaluation.aggregation import scores_of
 from planners.evaluation.score_rows import read_rows, write_rows
 from planners.study.frames_file import FRAMES, StudyFrames, read_frames, write_frames
 from planners.study.report import compared, main, write_tables
-from planners.study.scaling import ScalingSettings, SweepData, trainings_of
+from planners.study.scaling import ScalingSettings, SweepData, comparisons_of, trainings_of
 from tests.planners.made_rows import clip_rows
 
 LOGS = Path(__file__).parents[3] / "docs" / "study" / "logs"
@@ -30,7 +30,7 @@ def sweep(tmp_path: Path, rounds: tuple[int, ...], end_m: float = 0.0) -> StudyF
         sim_ratios=("natural",),
         imitation=("all",),
         real_shares=(1.0,),
-        seeds=(1, 0),
+        seeds=2,
     )
     trainings = trainings_of(settings)
     for training in trainings:
@@ -40,7 +40,9 @@ def sweep(tmp_path: Path, rounds: tuple[int, ...], end_m: float = 0.0) -> StudyF
     evaluated(tmp_path / "pdm_closed", 0.8)
     facts = [{"training": training.label, **training.facts, "real": 10, "simulated": 5} for training in trainings]
     labels = [*(training.label for training in trainings), "pdm_closed"]
-    write_frames(tmp_path / FRAMES, ((label, read_rows(tmp_path / label)) for label in labels), facts)
+    write_frames(
+        tmp_path / FRAMES, ((label, read_rows(tmp_path / label)) for label in labels), facts, comparisons_of(settings)
+    )
     return read_frames(tmp_path / FRAMES)
 
 
@@ -55,16 +57,16 @@ def test_every_setup_is_held_against_real_samples_alone_of_its_planner(tmp_path:
     rows = compared(sweep(tmp_path, (0, 1, 2)))
     assert len(rows) == 2 * (1 + 2 * 2) * 8
     for row in rows:
-        assert (row["seeds"], row["uniform_share"]) == (2, 0.0)
+        assert row["seeds"] == 2
         if row["rounds"] == 0:
             assert row["difference"] == row["low"] == row["high"] == ""
         elif row["stage"] != "final":  # the product of both stages
             expected = 100.0 * (SCORES[row["rounds"]] - SCORES[0])
             assert [row["difference"], row["low"], row["high"]] == pytest.approx([expected] * 3)
     (one, _) = [r for r in rows if (r["planner"], r["rounds"], r["stage"]) == ("ego_mlp", 0, "one_stage")]
-    assert [one["lowest_seed"], one["epdms"], one["highest_seed"]] == pytest.approx([51.0, 52.0, 53.0])
+    assert (one["epdms"], one["each"]) == (pytest.approx(52.0), "51.0 53.0")
     said = write_tables(tmp_path, tmp_path, "unfiltered")
-    assert re.search(r"ltf \+ recovery, rounds 2 +2 +57\.77 +\+31\.75 ", said) and "pdm_closed" in said
+    assert re.search(r"ltf-recovery2-epochs +epochs +2 +57\.77 +\+31\.75 ", said) and "pdm_closed" in said
 
 
 def test_a_sweep_without_real_samples_alone_has_no_differences(tmp_path: Path) -> None:
@@ -73,7 +75,12 @@ def test_a_sweep_without_real_samples_alone_has_no_differences(tmp_path: Path) -
 
 
 def test_plans_that_end_far_from_every_follow_up_are_counted(tmp_path: Path) -> None:
-    assert {row["uniform_share"] for row in compared(sweep(tmp_path, (0,), end_m=50.0))} == {1.0}
+    for end_m, share in ((0.0, 0.0), (50.0, 1.0)):
+        folder = tmp_path / str(end_m)
+        folder.mkdir()
+        sweep(folder, (0,), end_m)
+        write_tables(folder, folder, "unfiltered")
+        assert {float(row["uniform_share"]) for row in csv.DictReader((folder / "trainings.csv").open())} == {share}
 
 
 def test_bounds_are_those_that_were_evaluated(tmp_path: Path) -> None:
@@ -83,7 +90,7 @@ def test_bounds_are_those_that_were_evaluated(tmp_path: Path) -> None:
     assert row["planner"] == "pdm_closed" and float(row["stage_two"]) == pytest.approx(80.0)
 
 
-@pytest.mark.parametrize("table", ["scaling", "comparisons", "bounds"])
+@pytest.mark.parametrize("table", ["trainings", "comparisons", "bounds"])
 def test_the_committed_tables_are_those_of_the_committed_rows(tmp_path: Path, table: str) -> None:
     folder = LOGS / "av2_7fab2350" / "stage_two"
     write_tables(folder, tmp_path, "unfiltered")
@@ -99,14 +106,14 @@ def test_the_tables_are_made_again_to_the_byte_of_the_rows_alone(
 ) -> None:
     sweep(tmp_path, (0, 1))
     write_tables(tmp_path, tmp_path, "unfiltered")
-    rows = list(csv.DictReader((tmp_path / "scaling.csv").open()))
+    rows = list(csv.DictReader((tmp_path / "trainings.csv").open()))
     again = tmp_path / "again"
     assert main([f"folder={tmp_path}", f"out={again}"]) == 0
-    assert sorted(path.name for path in again.iterdir()) == ["bounds.csv", "comparisons.csv", "scaling.csv"]
+    assert {"bounds.csv", "comparisons.csv", "trainings.csv", "clips.csv"} < {path.name for path in again.iterdir()}
     for path in again.iterdir():
         assert path.read_bytes() == (tmp_path / path.name).read_bytes()
-    folder = tmp_path / "ltf-recovery-natural-all-1.0-1-0"
-    (mine,) = (row for row in rows if (row["planner"], row["expert"], row["seed"]) == ("ltf", "recovery", "0"))
+    folder = tmp_path / "ltf-recovery1-epochs-0"
+    (mine,) = (row for row in rows if (row["planner"], row["data"], row["seed"]) == ("ltf", "recovery", "0"))
     for name, score in scores_of(folder).items():
         assert float(mine[name]) == pytest.approx(score, abs=1e-4)
     assert main([f"folder={again}"]) == BAD_CONFIG

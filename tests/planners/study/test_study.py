@@ -15,7 +15,7 @@ from planners.evaluation.evaluate import EvaluateSettings, evaluate
 from planners.evaluation.planner_names import planner_of
 from planners.study import report as study_report
 from planners.study import study as study_module
-from planners.study.scaling import ScalingSettings, SweepData, trainings_of
+from planners.study.scaling import ScalingSettings, SweepData, comparisons_of, trainings_of
 from planners.study.setups import Comparison, Setup, Sizes
 from planners.study.study import evaluated, run, write_report
 from planners.study.sweep import DONE, EVALUATIONS, Training, folder_of
@@ -95,11 +95,12 @@ def test_the_report_is_that_of_the_evaluations_and_can_be_made_again(
 def test_a_sweep_stops_where_something_is_missing_and_is_reported_when_all_is_done(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    axes: dict[str, Any] = {"planners": ("ltf",), "experts": ("recovery",), "rounds": (0, 1), "seeds": (3,)}
+    axes: dict[str, Any] = {"planners": ("ltf",), "experts": ("recovery",), "rounds": (0, 1), "seeds": 1}
     axes |= {"sim_ratios": ("natural",), "imitation": ("all",), "real_shares": (1.0,)}
     data, benchmark = SweepData(("real",), ("sim",)), write_benchmark_folder(tmp_path / "benchmark")
     sweep = ScalingSettings(data=data, benchmark=str(benchmark), out=str(tmp_path), **axes)
     asked = first, second = trainings_of(sweep)
+    wanted = comparisons_of(sweep)
 
     def cut_short(*_: object) -> None:
         raise Stopped("out of minutes")
@@ -108,16 +109,16 @@ def test_a_sweep_stops_where_something_is_missing_and_is_reported_when_all_is_do
     train(tmp_path, first)
     score(tmp_path, settings(tmp_path / EVALUATIONS), first)
     with pytest.raises(Stopped, match="1 of 2 planners are evaluated: the same command goes on"):
-        run(sweep, asked, asked, ())
-    assert not (tmp_path / "scaling.csv").exists()
+        run(sweep, asked, asked, wanted)
+    assert not (tmp_path / "trainings.csv").exists()
 
     monkeypatch.setattr(study_module, "train_all", lambda trainings, out, means: train(out, second, weight=0.1))
     monkeypatch.setattr(
         study_module, "evaluate_all", lambda who, out, *_: score(out, settings(out / EVALUATIONS), first, second)
     )
-    run(sweep, asked, asked, ())
-    alone, more = csv.DictReader((tmp_path / "scaling.csv").open())
-    assert (alone["expert"], more["expert"], more["real"], more["simulated"]) == ("", "recovery", "3", "4")
+    run(sweep, asked, asked, wanted)
+    alone, more = csv.DictReader((tmp_path / "trainings.csv").open())
+    assert (alone["data"], more["data"], more["real"], more["simulated"]) == ("real", "recovery", "3", "4")
     for row, training in ((alone, first), (more, second)):
         for name, found in scores_of(tmp_path / EVALUATIONS / training.label).items():
             assert float(row[name]) == pytest.approx(found, abs=1e-4)

@@ -32,8 +32,10 @@ def test_a_difference_is_bold_where_its_interval_leaves_out_zero() -> None:
     real, more = (Comparison("main", setup, None, 2, "steps") for setup in (REAL, MORE))
     clear, open_, worse = (5.04, 0.96, 10.0), (5.0, -1.0, 10.0), (-5.0, -9.0, -1.0)
     found = [*rows_of(real, 30.0), *rows_of(more, 35.04, clear), *rows_of(more, 35.0, open_), *rows_of(more, 25, worse)]
-    note, _, _, _, *lines = markdown_of(found, "unfiltered").splitlines()
-    assert note.startswith("Scores are unfiltered: unfiltered compares with the paper's tables")
+    text = markdown_of(found, "unfiltered")
+    assert text.startswith("Scores are unfiltered: unfiltered compares with the paper's tables")
+    assert max(map(len, text.partition("##")[0].splitlines())) <= 120
+    lines = text[text.index("##") :].splitlines()
     assert lines[0] == "## main"
     assert lines[2].split(" | ")[4:-1] == ["one stage", "stage one", "stage two", "follow-ups (plain mean)", "final"]
     assert lines[4] == "| `ltf` | real | steps | 2 | 30.0 | 30.0 | 30.0 | 30.0 | 30.0 | 1.0 2.0 |"

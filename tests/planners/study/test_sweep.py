@@ -10,7 +10,7 @@ from planners.command import Failed, Stopped
 from planners.study.figures import Curve
 from planners.study.frames_file import StudyFrames
 from planners.study.report import curves_of
-from planners.study.scaling import ScalingSettings, SweepData, trainings_of
+from planners.study.scaling import ScalingSettings, SweepData, comparisons_of, trainings_of
 from planners.study.sweep import (
     EVALUATED_TOGETHER,
     LOG,
@@ -36,7 +36,7 @@ def scaling(**changes: Any) -> ScalingSettings:
         "sim_ratios": ("natural",),
         "imitation": ("all",),
         "real_shares": (1.0,),
-        "seeds": (0, 1),
+        "seeds": 2,
     }
     data = SweepData(("real",), ("sim",))
     return ScalingSettings(data=data, benchmark="bench", out="out", **{**axes, **changes})
@@ -48,12 +48,12 @@ def test_every_combination_is_trained_once_and_real_samples_alone_not_once_an_ex
     alone = [t for t in trainings if t.facts["rounds"] == 0]
     assert [t.facts["seed"] for t in alone] == [0, 1]
     assert all("data.sim=[]" in t.overrides for t in alone)
-    third = next(t for t in trainings if t.facts["rounds"] == 3 and t.facts["expert"] == "recovery")
+    third = next(t for t in trainings if t.facts["rounds"] == 3 and t.facts["data"] == "recovery")
     assert {"data.max_round=2", "data.experts=[recovery]", "data.sim=[sim]"} <= set(third.overrides)
 
 
 def test_all_experts_together_are_one_axis_value() -> None:
-    (one,) = trainings_of(scaling(experts=("all",), rounds=(1,), seeds=(0,)))
+    (one,) = trainings_of(scaling(experts=("all",), rounds=(1,), seeds=1))
     assert not any(o.startswith("data.experts") for o in one.overrides)
 
 
@@ -63,12 +63,12 @@ def drawn(settings: ScalingSettings) -> list[Curve]:
         for one in trainings_of(settings)
     ]
     scores = {one["training"]: {"final_unfiltered": 30.0 + one["rounds"]} for one in facts}
-    return curves_of(StudyFrames(tuple(facts), (), {}), scores, "final_unfiltered")
+    return curves_of(StudyFrames(tuple(facts), tuple(comparisons_of(settings)), {}), scores, "final_unfiltered")
 
 
 def test_curves_hold_their_own_points_and_real_samples_alone() -> None:
     recovery, pdm = drawn(scaling())
-    assert (recovery.label, pdm.label) == ("recovery, imitation", "pdm_closed, imitation")
+    assert (recovery.label, pdm.label) == ("recovery", "pdm_closed")
     for curve in (recovery, pdm):
         assert sorted(curve.samples) == [100, 100, 150, 150, 200, 200, 250, 250]
         assert curve.law is not None
@@ -76,14 +76,14 @@ def test_curves_hold_their_own_points_and_real_samples_alone() -> None:
     assert few.law is None and few.row()["a"] == ""
 
 
-def test_a_curve_is_named_after_the_axes_that_have_several_values() -> None:
+def test_a_curve_is_named_after_what_is_not_as_usual() -> None:
     labels = [one.label for one in drawn(scaling(experts=("recovery",), real_shares=(0.5, 1.0), imitation=("real",)))]
-    assert labels == ["recovery, rewards only, 0.5 of real", "recovery, rewards only, 1 of real"]
-    for curve in drawn(scaling(imitation=("all", "none"), seeds=(0,))):
+    assert labels == ["recovery, rewards only, 50 % of the real", "recovery, rewards only"]
+    for curve in drawn(scaling(imitation=("all", "none"), seeds=1)):
         assert len(curve.samples) == 4, "real samples alone with imitation, or without, as the curve's own"
 
 
-@pytest.mark.parametrize(("name", "value"), [("seeds", ()), ("rounds", (-1,)), ("planners", ("ltf", "ltf"))])
+@pytest.mark.parametrize(("name", "value"), [("seeds", 0), ("rounds", (-1,)), ("planners", ("ltf", "ltf"))])
 def test_axes_that_are_none_are_refused(name: str, value: Any) -> None:
     with pytest.raises(ValueError, match=name):
         scaling(**{name: value})
