@@ -11,6 +11,7 @@ from tests.bench.peer import Beside, peer_python
 from tests.bench.peer_splat import peer_checkout
 
 
+@pytest.mark.slow
 def test_without_a_peer_nothing_is_compared(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("PEER", raising=False)
     assert peer_python() is None

@@ -104,6 +104,7 @@ def test_a_planner_is_its_class_and_a_file_of_its_settings(tmp_path: Path) -> No
     assert type(planner) is LinearPlanner and planner.settings.history is False
 
 
+@pytest.mark.slow
 def test_the_script_scores_plans_without_ray_or_hydra() -> None:
     code = "import examples.score_plans, sys\nassert not {'ray', 'hydra', 'torch'} & set(sys.modules)"
     env = os.environ | {"NUMBA_CACHE_DIR": str(cache_dir().parent)}

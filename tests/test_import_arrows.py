@@ -135,6 +135,7 @@ def loaded_by(statement: str) -> set[str]:
     return set(out.stdout.split())
 
 
+@pytest.mark.slow
 def test_a_run_in_this_process_needs_no_ray() -> None:
     assert "ray" not in loaded_by(
         "import factory.run, factory.graph.execute, factory.graph.metrics, factory.stages.pipeline"

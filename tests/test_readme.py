@@ -83,6 +83,9 @@ def demo_home(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "clips.settings.width=64",
         "clips.settings.height=36",
         "clips.settings.cameras=[ring_front_center]",
+        "clips.settings.steps_per_photo=5",
+        "clips.settings.lidar_beams=16",
+        "clips.settings.lidar_azimuths=200",
         "vocabulary.k=64",
         "experts=[human]",
         "render.frames=now",
@@ -111,6 +114,7 @@ def test_python_runs_as_written_in_the_small_install(demo_home: Path, tmp_path: 
     assert done.stdout.strip()
 
 
+@pytest.mark.slow
 def test_a_run_leaves_the_card_of_its_data_set(demo_home: Path) -> None:
     text = (demo_home / "runs" / "demo" / "README.md").read_text()
     assert "license: apache-2.0\n" in text and "The run is complete." in text and "vocabulary.k=64" in text

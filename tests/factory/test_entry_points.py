@@ -75,6 +75,7 @@ def run_arguments(home: Path) -> list[str]:
     ]
 
 
+@pytest.mark.slow
 def test_a_reader_an_expert_and_a_planner_work_by_name(
     site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

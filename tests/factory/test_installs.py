@@ -131,6 +131,7 @@ def test_a_command_that_needs_an_extra_names_the_line_that_installs_it(
     assert list(tmp_path.iterdir()) == [hidden], "nothing is written"
 
 
+@pytest.mark.slow
 def test_the_small_install_looks_at_a_finished_run(tmp_path: Path) -> None:
     execute(FilmedWork(), refs(2), ["recovery", "human"], 1, Store(tmp_path / "out"), "local", say=lambda line: None)
     code = (

@@ -31,6 +31,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return next(dist.glob("*.whl"))
 
 
+@pytest.mark.slow
 def test_the_wheel_holds_every_module_every_setting_and_no_test(wheel: Path) -> None:
     inside = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
     modules = {
@@ -47,6 +48,7 @@ def test_the_wheel_holds_every_module_every_setting_and_no_test(wheel: Path) -> 
     assert inside == modules | settings | typed | page
 
 
+@pytest.mark.slow
 def test_installed_it_works_beside_a_stranger_s_tasks_py(wheel: Path, tmp_path: Path) -> None:
     target, work = tmp_path / "site", tmp_path / "work"
     with zipfile.ZipFile(wheel) as archive:

@@ -8,25 +8,21 @@ import pytest
 
 from factory.commands.table import COMMANDS
 from factory.config.run import load_config
-from factory.readers.settings import TownSettings
-from factory.readers.town.reader import SyntheticReader
 from factory.setup.settings import assemble
 from factory.stages import pipeline
 
 main = COMMANDS["explain"].load()
 
-SMALL = TownSettings(cameras=("ring_front_center",), width=64, height=36, lidar_beams=32, lidar_azimuths=300)
-
 
 @pytest.fixture(scope="module")
-def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def logs(small_town: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A clip's log and a copy of it with broken annotations."""
-    reader = SyntheticReader(tmp_path_factory.mktemp("town"), 1, 0, SMALL)
-    reader.index()
-    (log,) = (path for path in reader.root.iterdir() if path.is_dir())
-    shutil.copytree(log, reader.root / "broken")
-    (reader.root / "broken" / "annotations.feather").write_bytes(b"no table")
-    return reader.root
+    folder = tmp_path_factory.mktemp("logs")
+    (log,) = (path for path in small_town.iterdir() if path.is_dir())
+    for name in (log.name, "broken"):
+        shutil.copytree(log, folder / name)
+    (folder / "broken" / "annotations.feather").write_bytes(b"no table")
+    return folder
 
 
 def arguments(logs: Path, out: Path, *more: str) -> list[str]:
@@ -35,6 +31,7 @@ def arguments(logs: Path, out: Path, *more: str) -> list[str]:
     return ["clips=av2", f"clips.root={logs}", f"out={out}", *size, *more]
 
 
+@pytest.mark.slow
 def test_a_block_below_the_gate_is_why_there_are_no_candidates(
     logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -62,6 +59,7 @@ def test_a_broken_log_is_found_and_told_in_the_index_s_words(
     assert capsys.readouterr().err == f"bad clip: {said}\n"
 
 
+@pytest.mark.slow
 def test_a_walk_that_ends_at_the_limit_says_so_and_how_to_go_on(
     logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

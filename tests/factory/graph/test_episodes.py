@@ -130,6 +130,7 @@ def test_an_episode_that_cannot_be_written_costs_no_other_and_the_same_command_w
     assert there(tmp_path) == there(whole)
 
 
+@pytest.mark.slow
 def test_a_redo_leaves_the_episodes_of_the_rows_that_are_there(tmp_path: Path) -> None:
     run(tmp_path)
     before = there(tmp_path)

@@ -15,12 +15,11 @@ from factory.graph.execute import COMPLETE, COMPLETE_WITH_FAILURES, execute
 from factory.graph.local import Claims, attempt_tasks
 from factory.graph.on_ray import ray  # with the environment that keeps it on loopback
 from factory.graph.work import Columns, Driven, Dropped, PreparedClip, Underway, attempted, go_on
-from factory.readers.town.reader import SyntheticReader
 from factory.stages.pipeline import FactoryWork
 from factory.store.samples import Store
 from tasks.stages import ATTEMPT, TASKS
 from tests.factory.noted import NotedWork
-from tests.factory.stages.test_pipeline import SMALL, work_on
+from tests.factory.stages.test_pipeline import work_on
 from tests.factory.tables import assert_same_tables, tables_of
 from tests.factory.toy import TakesItsNodeAway, ToyWork, ran, refs
 
@@ -59,12 +58,9 @@ def test_stages_as_tasks_of_their_own_make_the_same_rows_in_this_process(tmp_pat
 
 
 @pytest.fixture(scope="module")
-def town(tmp_path_factory: pytest.TempPathFactory) -> FactoryWork:
+def town(small_town: Path, tmp_path_factory: pytest.TempPathFactory) -> FactoryWork:
     """A run that draws from a small town's block."""
-    folder = tmp_path_factory.mktemp("town")
-    reader = SyntheticReader(folder / "town", 2, 0, SMALL)
-    reader.index()
-    return work_on(reader.root, folder / "out")
+    return work_on(small_town, tmp_path_factory.mktemp("drawn") / "out")
 
 
 @pytest.mark.slow

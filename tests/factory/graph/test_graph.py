@@ -91,6 +91,7 @@ def test_the_same_command_again_executes_nothing(tmp_path: Path) -> None:
     assert second.counts == first.counts
 
 
+@pytest.mark.slow
 def test_five_rounds_after_two_are_five_rounds_and_perturb_nothing_again(tmp_path: Path) -> None:
     journal = str(tmp_path / "journal")
     run(tmp_path / "nested", ToyWork(journal=journal), rounds=2)
@@ -207,6 +208,7 @@ def test_keep_goes_on_and_records_both(tmp_path: Path, begun: Callable[..., Path
     assert run(tmp_path / "out", changed, n=4).exit_code == COMPLETE
 
 
+@pytest.mark.slow
 def test_a_redo_of_some_clips_leaves_the_others_to_be_decided(tmp_path: Path, begun: Callable[..., Path]) -> None:
     changed = ToyWork(threshold=0.3)
     begun(n=4)

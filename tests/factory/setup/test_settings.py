@@ -55,6 +55,7 @@ def test_a_finished_table_takes_no_vocabularies(shared_root: Path, tmp_path: Pat
         assemble(load_config([*asked, f"expert.recovery.vocabularies=[{tmp_path / 'more.npy'}]", "experts=[recovery]"]))
 
 
+@pytest.mark.slow
 def test_a_recovery_table_kept_of_train_logs_is_not_given_where_they_are_test(
     shared_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -25,8 +25,9 @@ from factory.store.location import Location
 from factory.store.samples import Store
 from tasks.stages import Rejected
 from tasks.world.clip import HORIZON_STEPS, NOW
-from tests.factory.stages.test_pipeline import SMALL, VOCABULARY
+from tests.factory.stages.test_pipeline import VOCABULARY
 
+SMALL = TownSettings(cameras=("ring_front_center",), lidar_beams=32)
 EXPERTS = ("human", "human_before", "follow_up", "follow_up_before")
 Rows = dict[tuple[str, str], dict[int, dict[str, Any]]]
 
@@ -148,6 +149,7 @@ def test_the_document_names_what_counts_and_what_does_not(
     }
 
 
+@pytest.mark.slow
 def test_a_resumed_benchmark_is_the_same_and_its_scenes_come_back(
     store: Store, work: FactoryWork, refs: Sequence[ClipRef], tmp_path: Path
 ) -> None:

@@ -69,6 +69,7 @@ def test_photos_too_far_apart_for_parallax_give_a_simulated_drive_no_pictures(to
     assert sample.row["image_source"] == "none" and sample.row["images"] is None
 
 
+@pytest.mark.slow
 def test_lidar_s_grey_pictures_are_drawn_only_where_every_one_is_near_a_sweep(tmp_path: Path) -> None:
     """A reach between a drive's nearest and farthest picture gives it none: not a sample with some of its pictures."""
     settings = replace(SMALL, cameras=CAMERAS[:1], lidar_beams=8, lidar_azimuths=100)
@@ -97,6 +98,7 @@ def test_lidar_s_grey_pictures_are_drawn_only_where_every_one_is_near_a_sweep(tm
         assert sample(reach_m).row["image_source"] == source, reach_m
 
 
+@pytest.mark.slow
 def test_a_missing_photo_is_a_bad_clip_that_names_camera_and_time(town: Path, tmp_path: Path) -> None:
     root = tmp_path / "logs"
     shutil.copytree(town, root)
@@ -125,6 +127,7 @@ def test_of_many_photos_the_nearest_is_taken(town: Path, tmp_path: Path) -> None
     assert photo_at(often, first.sensor, 1.0).time_s == pytest.approx(1.02)
 
 
+@pytest.mark.slow
 def test_a_worker_reads_a_block_s_scene_once_for_all_its_clips(tmp_path: Path) -> None:
     town = SyntheticReader(tmp_path / "town", 1, 0, replace(SMALL, lidar_beams=8))
     town.index()

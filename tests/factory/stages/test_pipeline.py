@@ -11,8 +11,6 @@ import pytest
 from factory.config.run import load_config
 from factory.graph.work import HUMAN_CANDIDATE, Columns, Dropped, PreparedClip, attempted
 from factory.readers.base import BadClip
-from factory.readers.settings import TownSettings
-from factory.readers.town.reader import SyntheticReader
 from factory.setup.settings import assemble, identity_of
 from factory.stages.pipeline import FactoryWork, WholeClip
 from factory.store.identity import UNLISTED
@@ -25,18 +23,9 @@ from tasks.world.frames import to_local
 from tasks.world.kinematic_vocabulary import kinematic_trajectories
 from tasks.world.vocabulary import Vocabulary
 
-SMALL = TownSettings(cameras=("ring_front_center",), width=64, height=36, lidar_beams=32, lidar_azimuths=300)
 VOCABULARY = Vocabulary(kinematic_trajectories(3, 0))
 SIZE = ["render.width=64", "render.height=36", "render.scene=discs", "vocabulary.k=300"]
 SIZE += ["render.psnr_min=0", "render.gate.vehicle_min=0", "experts=[pdm_closed,human]"]
-
-
-@pytest.fixture(scope="module")
-def town(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One clip's log, with one small camera and a lidar."""
-    reader = SyntheticReader(tmp_path_factory.mktemp("town"), 1, 0, SMALL)
-    reader.index()
-    return reader.root
 
 
 def work_on(root: Path, out: Path, *overrides: str) -> FactoryWork:
@@ -54,8 +43,8 @@ def first_sample(work: FactoryWork, prepared: PreparedClip) -> Columns:
     return next(result for result in results if isinstance(result, Columns))
 
 
-def test_a_block_below_the_gate_drops_the_experts_and_keeps_the_human(town: Path, tmp_path: Path) -> None:
-    work = work_on(town, tmp_path, "render.psnr_min=60")
+def test_a_block_below_the_gate_drops_the_experts_and_keeps_the_human(small_town: Path, tmp_path: Path) -> None:
+    work = work_on(small_town, tmp_path, "render.psnr_min=60")
     prepared = prepared_by(work)
     assert prepared.dropped is not None and (prepared.dropped.stage, prepared.dropped.reason) == ("render", "psnr")
     assert prepared.candidates == ()
@@ -63,8 +52,8 @@ def test_a_block_below_the_gate_drops_the_experts_and_keeps_the_human(town: Path
     assert isinstance(human, Columns) and human.row["image_source"] == "photo"
 
 
-def test_a_marked_block_keeps_its_candidates_and_tags_its_samples(town: Path, tmp_path: Path) -> None:
-    work = work_on(town, tmp_path, "render.psnr_min=60", "render.psnr_gate=mark")
+def test_a_marked_block_keeps_its_candidates_and_tags_its_samples(small_town: Path, tmp_path: Path) -> None:
+    work = work_on(small_town, tmp_path, "render.psnr_min=60", "render.psnr_gate=mark")
     prepared = prepared_by(work)
     assert prepared.dropped is None
     marked = first_sample(work, prepared)
@@ -73,8 +62,9 @@ def test_a_marked_block_keeps_its_candidates_and_tags_its_samples(town: Path, tm
     assert isinstance(human, Columns) and "low_psnr" not in human.row["tags"]  # type: ignore[operator]
 
 
-def test_a_drive_that_cannot_be_shown_is_dropped_and_the_human_s_is_not(town: Path, tmp_path: Path) -> None:
-    strict = work_on(town, tmp_path, "render.gate.contrast_min=1.0")
+@pytest.mark.slow
+def test_a_drive_that_cannot_be_shown_is_dropped_and_the_human_s_is_not(small_town: Path, tmp_path: Path) -> None:
+    strict = work_on(small_town, tmp_path, "render.gate.contrast_min=1.0")
     prepared = prepared_by(strict)
     results = [attempted(strict, prepared, row.index, "pdm_closed") for row in prepared.candidates]
     dropped = [result for result in results if isinstance(result, Dropped) and result.rejected.stage == "render"]
@@ -83,36 +73,42 @@ def test_a_drive_that_cannot_be_shown_is_dropped_and_the_human_s_is_not(town: Pa
     assert dropped[0].subscores["nc"] == 1.0  # the reward had accepted it
     assert isinstance(attempted(strict, prepared, HUMAN_CANDIDATE, HUMAN), Columns)
     for override in ("render.gate.enabled=false", "render=none", "render=map"):
-        lenient = work_on(town, tmp_path, "render.gate.contrast_min=1.0", override)
+        lenient = work_on(small_town, tmp_path, "render.gate.contrast_min=1.0", override)
         assert isinstance(first_sample(lenient, prepared), Columns)
 
 
-def test_a_drive_past_a_vehicle_unlike_its_photos_is_dropped_and_at_zero_it_is_not(town: Path, tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_a_drive_past_a_vehicle_unlike_its_photos_is_dropped_and_at_zero_it_is_not(
+    small_town: Path, tmp_path: Path
+) -> None:
     small = "render.gate.vehicle_share=0.001"
     stored = {f"ring_front_center at step {step}" for step in (40, 45, 50, 55)}  # 1.5 s before T+H to T+H
-    strict = work_on(town, tmp_path, "render.gate.vehicle_min=1.0", small)
+    strict = work_on(small_town, tmp_path, "render.gate.vehicle_min=1.0", small)
     prepared = prepared_by(strict)
     found = [attempted(strict, prepared, row.index, "pdm_closed") for row in prepared.candidates]
     dropped = [result.rejected for result in found if isinstance(result, Dropped)]
     details = [rejected.detail for rejected in dropped if rejected.reason == "unlike_photos"]
     assert details and {detail.split(":")[0] for detail in details} <= stored
-    lenient = work_on(town, tmp_path, "render.gate.vehicle_min=0", small)
+    lenient = work_on(small_town, tmp_path, "render.gate.vehicle_min=0", small)
     assert isinstance(first_sample(lenient, prepared), Columns)
 
 
-def test_a_prepared_clip_is_rendered_also_where_its_data_has_moved(town: Path, tmp_path: Path) -> None:
-    prepared = prepared_by(work_on(town, tmp_path / "a"))
-    here = first_sample(work_on(town, tmp_path / "a"), prepared)
+@pytest.mark.slow
+def test_a_prepared_clip_is_rendered_also_where_its_data_has_moved(small_town: Path, tmp_path: Path) -> None:
+    prepared = prepared_by(work_on(small_town, tmp_path / "a"))
+    here = first_sample(work_on(small_town, tmp_path / "a"), prepared)
     moved = tmp_path / "elsewhere"
-    shutil.copytree(town, moved)
+    shutil.copytree(small_town, moved)
     there = first_sample(work_on(moved, tmp_path / "b"), prepared)
     assert here.row["image_source"] == there.row["image_source"] == "render"
     assert here.row["images"][0]["jpeg"] == there.row["images"][0]["jpeg"]  # type: ignore[index]
 
 
-def test_the_earlier_frame_of_a_pair_shows_its_own_instants_from_where_the_ego_was(town: Path, tmp_path: Path) -> None:
+def test_the_earlier_frame_of_a_pair_shows_its_own_instants_from_where_the_ego_was(
+    small_town: Path, tmp_path: Path
+) -> None:
     """The photo at -0.5 s of the later frame is the one at now of the earlier, with its pose, and so on."""
-    work = work_on(town, tmp_path, "experts=[human,human_before]")
+    work = work_on(small_town, tmp_path, "experts=[human,human_before]")
     ref = work.reader.index().refs[1]
     prepared = work.prepare(ref)
     assert isinstance(prepared, PreparedClip)
@@ -133,15 +129,19 @@ def test_the_earlier_frame_of_a_pair_shows_its_own_instants_from_where_the_ego_w
         np.testing.assert_allclose(np.reshape(image["ego_pose"], (4, 4)), log.world_from_ego[step], atol=1e-6)
 
 
-def test_a_rejected_attempt_is_no_sample(town: Path, tmp_path: Path) -> None:
-    work = work_on(town, tmp_path, "reward.progress_above=2.0", "render=none")
+def test_a_rejected_attempt_is_no_sample(small_town: Path, tmp_path: Path) -> None:
+    work = work_on(small_town, tmp_path, "reward.progress_above=2.0", "render=none")
     prepared = prepared_by(work)
     results = [attempted(work, prepared, row.index, "pdm_closed") for row in prepared.candidates[:2]]
     assert results and all(isinstance(result, Dropped) for result in results)
 
 
-def test_with_an_open_gate_the_log_s_future_is_the_label_of_every_perturbed_state(town: Path, tmp_path: Path) -> None:
-    work = work_on(town, tmp_path, "reward.full=[]", "reward.progress_above=-1", "render=none", "experts=[logged]")
+def test_with_an_open_gate_the_log_s_future_is_the_label_of_every_perturbed_state(
+    small_town: Path, tmp_path: Path
+) -> None:
+    work = work_on(
+        small_town, tmp_path, "reward.full=[]", "reward.progress_above=-1", "render=none", "experts=[logged]"
+    )
     prepared = prepared_by(work)
     log = work.reader.read(work.reader.index().refs[0]).ego_states
     results = [attempted(work, prepared, row.index, "logged") for row in prepared.candidates[:4]]
@@ -154,9 +154,9 @@ def test_with_an_open_gate_the_log_s_future_is_the_label_of_every_perturbed_stat
         np.testing.assert_allclose(result.row["proposal_10hz"], wanted, atol=1e-4)  # type: ignore[arg-type]
 
 
-def test_a_broken_log_fails_with_the_index_s_own_words(town: Path, tmp_path: Path) -> None:
+def test_a_broken_log_fails_with_the_index_s_own_words(small_town: Path, tmp_path: Path) -> None:
     root = tmp_path / "logs"
-    shutil.copytree(town, root)
+    shutil.copytree(small_town, root)
     (next(root.glob("*/annotations.feather"))).write_bytes(b"no table")
     work = work_on(root, tmp_path)
     ((ref, said),) = work.broken.items()
@@ -166,8 +166,8 @@ def test_a_broken_log_fails_with_the_index_s_own_words(town: Path, tmp_path: Pat
     assert str(raised.value) == said == str(pickle.loads(pickle.dumps(raised.value)))
 
 
-def test_what_is_considered_is_what_is_prepared(town: Path, tmp_path: Path) -> None:
-    work = work_on(town, tmp_path, "render=none")
+def test_what_is_considered_is_what_is_prepared(small_town: Path, tmp_path: Path) -> None:
+    work = work_on(small_town, tmp_path, "render=none")
     made = work.considered(work.reader.index().refs[0])
     assert isinstance(made, WholeClip) and isinstance(made.found, Perturbation)
     assert [row.vocabulary_index for row in prepared_by(work).candidates] == [
@@ -177,9 +177,9 @@ def test_what_is_considered_is_what_is_prepared(town: Path, tmp_path: Path) -> N
 
 
 def test_a_clip_s_candidates_are_drawn_from_a_stream_of_the_run_s_seed_and_its_own_name(
-    town: Path, tmp_path: Path
+    small_town: Path, tmp_path: Path
 ) -> None:
-    work = work_on(town, tmp_path, "render=none", "seed=3")
+    work = work_on(small_town, tmp_path, "render=none", "seed=3")
     ref = work.reader.index().refs[0]
     clip, made = work.reader.read(ref), work.considered(ref)
     assert isinstance(made, WholeClip)
@@ -236,10 +236,10 @@ def test_a_raised_stage_before_the_attempts_prepares_anew(stage: str, monkeypatc
     assert identity_of(load_config([]), VOCABULARY, None).prepare_digest != before
 
 
-def test_the_log_s_own_drive_alone_needs_no_candidates_and_no_block(town: Path, tmp_path: Path) -> None:
-    work = work_on(town, tmp_path, "experts=[human]", "render.psnr_min=60")
+def test_the_log_s_own_drive_alone_needs_no_candidates_and_no_block(small_town: Path, tmp_path: Path) -> None:
+    work = work_on(small_town, tmp_path, "experts=[human]", "render.psnr_min=60")
     ref = work.reader.index().refs[0]
-    assert work.block(ref) is None and work_on(town, tmp_path).block(ref) is not None
+    assert work.block(ref) is None and work_on(small_town, tmp_path).block(ref) is not None
     prepared = work.prepare(ref)
     assert isinstance(prepared, PreparedClip)
     assert prepared.candidates == () and prepared.dropped is None and work.identity.prepare_digest == UNLISTED

@@ -126,6 +126,7 @@ def test_a_flipped_byte_is_found(location: Location) -> None:
         KeyedTable(location, SPEC).read()
 
 
+@pytest.mark.slow
 def test_no_flipped_byte_of_the_data_gives_other_rows(location: Location) -> None:
     """Also where the page would still be decompressed: its checksum tells."""
     table = KeyedTable(location, SPEC)

@@ -11,8 +11,6 @@ import pytest
 from factory.commands.table import COMMANDS
 from factory.config.run import load_config
 from factory.graph.execute import execute
-from factory.readers.settings import TownSettings
-from factory.readers.town.reader import SyntheticReader
 from factory.setup.settings import assemble
 from factory.store.reader import SampleTable, decoded
 from factory.store.samples import Store
@@ -36,18 +34,15 @@ from tasks.stages import STAGES
 
 main = COMMANDS["show"].load()
 
-SMALL = TownSettings(cameras=("ring_front_center",), width=64, height=36, lidar_beams=32, lidar_azimuths=300)
 SIZE = ["render.width=64", "render.height=36", "render.scene=discs", "vocabulary.k=300"]
 SIZE += ["render.psnr_min=0", "render.gate.vehicle_min=0", "experts=[pdm_closed,human]"]
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
+def store(small_town: Path, tmp_path_factory: pytest.TempPathFactory) -> Store:
     """One clip of the town: a rendered sample and the human one with photos."""
     folder = tmp_path_factory.mktemp("seen")
-    reader = SyntheticReader(folder / "town", 1, 0, SMALL)
-    reader.index()
-    run = assemble(load_config(["clips=av2", f"clips.root={reader.root}", f"out={folder / 'out'}", *SIZE]))
+    run = assemble(load_config(["clips=av2", f"clips.root={small_town}", f"out={folder / 'out'}", *SIZE]))
     store = Store(folder / "out")
     execute(run.work, run.index.refs[:1], run.config.experts, 1, store, "local", say=lambda line: None)
     return store
@@ -105,6 +100,7 @@ def test_a_row_of_photos_is_compared_with_the_scene_of_its_clip(store: Store) ->
     assert human["asset_digest"] is None and digest_of(store, human) == rendered["asset_digest"]
 
 
+@pytest.mark.slow
 def test_a_film_shows_the_sample_from_its_history_to_the_label_s_end(store: Store) -> None:
     rendered, human = rows(store)
     for row, asset in ((rendered, scene(store)), (human, None), ({**rendered, "images": [], "cameras": None}, None)):
@@ -117,6 +113,7 @@ def test_a_film_shows_the_sample_from_its_history_to_the_label_s_end(store: Stor
     assert (sample_bev(rendered, step=0) != sample_bev(rendered, step=55)).any()
 
 
+@pytest.mark.slow
 def test_show_writes_the_picture_and_the_film(
     store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -119,6 +119,7 @@ def test_a_run_that_died_is_told_from_one_that_ended(tmp_path: Path, capsys: pyt
     assert status([f"out={tmp_path}"]) == 0 and "did not finish" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_show_imports_neither_ray_nor_torch_and_helps_without_heavy_imports(out: Path, tmp_path: Path) -> None:
     script = (
         "import sys; from factory.__main__ import main; code = main(sys.argv[2:]); "

@@ -50,6 +50,7 @@ def test_one_table_serves_both_sides(out: str) -> None:
     assert real.label_vocabulary == "vocabulary-1" and len({real.digest, sim.digest, both.digest}) == 3
 
 
+@pytest.mark.slow
 def test_the_index_is_what_the_rows_say(out: str) -> None:
     data = opened(out)
     for i, one in enumerate(SampleTable(out)[key] for key in data.rows.attempt_id.tolist()):

@@ -55,6 +55,7 @@ def test_only_what_both_compared_in_the_stage_is_paired() -> None:
     assert not pairs_of(first, second, ("final", "unfiltered"))
 
 
+@pytest.mark.slow
 def test_the_command_prints_and_draws(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     first = study(tmp_path / "a", *(f"main,sim,real,steps,{','.join(measure)},5,1,9" for measure in MEASURES))
     second = study(tmp_path / "b", *(f"main,sim,real,steps,{','.join(measure)},-1,-3,1" for measure in MEASURES))

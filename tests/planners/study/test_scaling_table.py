@@ -53,6 +53,7 @@ def evaluated(folder: Path, score: float, end_m: float = 0.0) -> None:
     write_rows(folder, [row for clip in "abc" for row in clip_rows(clip, score, (score, score), ends, follow_ups)])
 
 
+@pytest.mark.slow
 def test_every_setup_is_held_against_real_samples_alone_of_its_planner(tmp_path: Path) -> None:
     rows = compared(sweep(tmp_path, (0, 1, 2)))
     assert len(rows) == 2 * (1 + 2 * 2) * 8
@@ -101,6 +102,7 @@ def test_the_committed_tables_are_those_of_the_committed_rows(tmp_path: Path, ta
             assert cell == other or float(cell) == pytest.approx(float(other), abs=2e-3)
 
 
+@pytest.mark.slow
 def test_the_tables_are_made_again_to_the_byte_of_the_rows_alone(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

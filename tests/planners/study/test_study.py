@@ -65,6 +65,7 @@ def test_what_is_evaluated_is_reported_and_what_changed_since_is_not(tmp_path: P
     assert evaluated(planned, tmp_path) == {"c"}, "the other was evaluated by other rules"
 
 
+@pytest.mark.slow
 def test_the_report_is_that_of_the_evaluations_and_can_be_made_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

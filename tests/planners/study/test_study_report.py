@@ -113,6 +113,7 @@ def test_intervals_stand_over_clips_logs_and_towns_for_both_filters(study: Path)
     assert said.startswith("Scores are filtered") and "; logs " in said and "; towns " in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "frames",
     [path.with_name(FRAMES) for path in sorted(STUDY.glob("**/trainings.csv")) if path.with_name(FRAMES).is_file()],

@@ -99,6 +99,7 @@ def test_a_planner_is_trained_further_from_the_weights_of_another_training(
     assert not (tmp_path / "third").exists()
 
 
+@pytest.mark.slow
 def test_another_planner_or_other_settings_do_not_go_on_in_a_folder(
     table: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -71,6 +71,7 @@ def test_rounding_moves_progress_by_at_most_its_unit_over_five_metres(labels: Vo
         assert np.abs(back.ep(normalise) - labels.ep(normalise)).max() <= 2.0 / UNITS_PER_M / 5.0  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 @given(any_labels())
 def test_progress_and_score_are_those_of_the_reward(labels: VocabularyLabels) -> None:
     """Row 0 of the reward's batch is PDM-Closed, here with all it was stored of it: its compliant progress."""

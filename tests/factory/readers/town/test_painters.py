@@ -74,6 +74,7 @@ def begun_in(folder: Path) -> "subprocess.Popen[str]":
     return command
 
 
+@pytest.mark.slow
 def test_an_interrupted_command_leaves_nothing_unfinished_whatever_its_processes_hear(tmp_path: Path) -> None:
     with begun_in(tmp_path) as command:
         command.send_signal(signal.SIGTERM)

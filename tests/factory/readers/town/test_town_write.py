@@ -112,6 +112,7 @@ def _until_now(clip: Clip) -> dict[tuple[str, str], bytes]:
     return {(file.sensor, Path(file.uri).name): Path(file.uri).read_bytes() for file in shown}
 
 
+@pytest.mark.slow
 def test_36_photo_steps_are_what_the_histories_of_a_logs_windows_show(reader: SyntheticReader, tmp_path: Path) -> None:
     short = SyntheticReader(tmp_path, WINDOWS_PER_LOG, 0, replace(SMALL, photo_steps=36))
     for ref, whole in zip(short.index().refs, reader.index().refs):

@@ -112,6 +112,7 @@ def assert_equals_its_slow_twin(world: World, limit: float | None, chosen: PdmSe
     np.testing.assert_allclose(fast.poses, slow.poses, rtol=0.0, atol=1e-9)
 
 
+@pytest.mark.slow
 @settings(max_examples=80)
 @given(
     shape=st.sampled_from(SHAPES),

@@ -1,6 +1,7 @@
 """Which sight lines meet a box: as many points along each say it."""
 
 import numpy as np
+import pytest
 
 from tasks.render.scene.movers import BEYOND_M, behind_boxes
 
@@ -21,6 +22,7 @@ def meets(points: np.ndarray, eye: np.ndarray, boxes: np.ndarray, slack_m: float
     return met
 
 
+@pytest.mark.slow
 def test_a_line_meets_a_box_where_one_of_its_points_lies_in_it() -> None:
     rng = np.random.default_rng(0)
     eye = np.array([1.0, -2.0, 1.5])

@@ -89,6 +89,7 @@ def walks(draw: st.DrawFn, points: np.ndarray) -> Body:
     return body_at(xy[:, 0], xy[:, 1])._replace(flags=flags)
 
 
+@pytest.mark.slow
 @settings(max_examples=300)
 @given(data=st.data(), points=lines())
 def test_the_three_rules_equal_their_slow_twins(data: st.DataObject, points: np.ndarray) -> None:

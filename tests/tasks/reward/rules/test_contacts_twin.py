@@ -159,6 +159,7 @@ def worlds(draw: st.DrawFn) -> World:
     return moved(world, np.array(origin))
 
 
+@pytest.mark.slow
 @settings(max_examples=400)
 @given(worlds())
 def test_both_rules_equal_the_numpy_version(world: World) -> None:

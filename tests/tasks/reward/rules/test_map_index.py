@@ -48,6 +48,7 @@ def telling_points(polygons: list[MapPolygon], seed: int, step: float) -> np.nda
     return np.concatenate([*anywhere, snapped, corners, crossings, between])
 
 
+@pytest.mark.slow
 @settings(max_examples=150)
 @given(st.data(), st.sampled_from([0.0, 0.25, 1.0]), st.integers(0, 1000))
 def test_every_point_is_in_the_regions_that_shapely_says(data: st.DataObject, step: float, seed: int) -> None:
