@@ -29,6 +29,7 @@ DISTRIBUTIONS = {  # of modules whose distribution has another name
     "hydra": "hydra-core",
     "mcap_protobuf": "mcap-protobuf-support",
     "rerun": "rerun-sdk",
+    "yaml": "pyyaml",
 }
 UNSEEN = {  # declared without an import statement of ours
     "gsplat": "tasks.render.splatting.gsplat_backend imports it by name",
