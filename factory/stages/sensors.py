@@ -9,6 +9,7 @@ import numpy as np
 
 from factory.readers.av2.log import read_feather
 from factory.readers.base import BadClip
+from factory.readers.pcd import read_pcd
 from tasks.render.scene.sensed import Photo, Sweep, on_ego
 from tasks.render.views import undistorted
 from tasks.world.arrays import Bytes
@@ -112,14 +113,15 @@ def _photo(file: SensorFile, camera: Camera, width: int, height: int) -> Photo:
 
 
 def load_sweeps(files: Sequence[SensorFile], with_intensity: bool = False) -> tuple[Sweep, ...]:
-    """Sweeps as Argoverse 2 stores them: motion-compensated points in the ego frame. Raises BadClip."""
+    """Sweeps as Argoverse 2 (.feather) and OpenScene (.pcd) store them: points in the ego frame. Raises BadClip."""
     return tuple(_sweep(file, with_intensity) for file in files)
 
 
 def _sweep(file: SensorFile, with_intensity: bool) -> Sweep:
-    table = read_feather(Path(file.uri), (*XYZ, INTENSITY) if with_intensity else XYZ)
+    path, columns = Path(file.uri), (*XYZ, INTENSITY) if with_intensity else XYZ
+    table = read_pcd(path, columns) if path.suffix == ".pcd" else read_feather(path, columns)
     points = np.stack([table[name] for name in XYZ], axis=1).astype(np.float32)
     if on_ego(points).all():
         raise BadClip(file.uri, "x y z", f"none of the {len(points)} returns lies outside of the ego's own body")
-    intensity = table[INTENSITY].astype(np.uint8) if with_intensity else None
+    intensity = np.clip(table[INTENSITY], 0, 255).astype(np.uint8) if with_intensity else None
     return Sweep(file.time_s, points, file.world_from_ego, intensity)

@@ -131,7 +131,7 @@ def frame_of(item: Any, file: str, place: str) -> Frame:
         roadblock_ids=values.texts("roadblock_ids"),
         pose=pose,
         world_from_ego=world_from_ego,
-        dynamic_state=values.numbers("ego_dynamic_state", (4,)),
+        dynamic_state=values.numbers("ego_dynamic_state", (4,)).astype(np.float32).astype(np.float64),  # as NAVSIM does
         lights=lights_of(values),
         command=command_of(values),
         cameras=cameras_of(values.inner("cams")),

@@ -1,0 +1,94 @@
+"""The eight cameras of a frame as a clip's rig, and the blobs of frames as sensor files.
+
+NAVSIM's pictures are distorted and its K is that of the distorted picture. The factory keeps both in `Camera`, and
+whoever opens a photo takes the distortion out (`tasks.render.views.undistorted`), so scenes are built of pinholes.
+
+A download may hold the pictures of a few frames only: navtrain's current and history archives have none of the future.
+So a frame none of whose blobs is there has no pictures. A frame that has some and lacks others was damaged.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from factory.readers.base import BadClip
+from factory.readers.navsim.log import Frame
+from tasks.world.camera import Camera, SensorFile
+
+LIDAR = "lidar"
+FRAME_S = 0.5
+_FRAME_HEADERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # JPEG's segments that hold the picture's size
+_ALONE = frozenset((0x01, *range(0xD0, 0xD8)))  # markers without a segment
+
+
+@dataclass(frozen=True)
+class Blobs:
+    """What the sensors of a run of frames recorded and is on disk."""
+
+    images: tuple[SensorFile, ...]
+    sweeps: tuple[SensorFile, ...]
+
+
+def blobs_of(frames: Sequence[Frame], folder: Path) -> Blobs:
+    """The pictures and sweeps below `folder` of frames 0.5 s apart, times from the first. Raises BadClip."""
+    images: list[SensorFile] = []
+    sweeps: list[SensorFile] = []
+    for k, frame in enumerate(frames):
+        files = {camera.name: _below(folder, camera.path) for camera in frame.cameras}
+        there = {name: path for name, path in files.items() if path.is_file()}
+        if there and (missing := [path for name, path in files.items() if name not in there]):
+            problem = f"missing, though {len(there)} of the frame's {len(files)} pictures are there"
+            raise BadClip(str(missing[0]), "image", f"{problem}: restore it, or remove them all")
+        images += [SensorFile(name, str(path), FRAME_S * k, frame.world_from_ego) for name, path in there.items()]
+        if frame.lidar_path is not None and (sweep := _below(folder, frame.lidar_path)).is_file():
+            sweeps.append(SensorFile(LIDAR, str(sweep), FRAME_S * k, frame.world_from_ego))
+    return Blobs(tuple(images), tuple(sweeps))
+
+
+def rig_of(frame: Frame, images: Sequence[SensorFile], file: str) -> tuple[Camera, ...]:
+    """The cameras of a frame that took any of the `images`, whose first tells their size. Raises BadClip."""
+    first: dict[str, str] = {}
+    for image in images:
+        first.setdefault(image.sensor, image.uri)
+    cameras = []
+    for camera in frame.cameras:
+        if camera.name in first:
+            width, height = jpeg_size(Path(first[camera.name]))
+            try:
+                cameras.append(
+                    Camera(camera.name, width, height, camera.intrinsics, camera.distortion, camera.ego_from_camera)
+                )
+            except ValueError as error:
+                raise BadClip(file, f"cams.{camera.name}", str(error)) from error
+    return tuple(cameras)
+
+
+def jpeg_size(path: Path) -> tuple[int, int]:
+    """Width and height [px] from a JPEG's header, without decoding it. Raises BadClip."""
+    try:
+        with path.open("rb") as file:
+            if file.read(2) != b"\xff\xd8":
+                raise BadClip(str(path), "image", "no JPEG")
+            while True:
+                start = file.read(2)
+                if len(start) < 2 or start[0] != 0xFF:
+                    raise BadClip(str(path), "image", "a JPEG that is cut off")
+                while start[1] == 0xFF:  # padding
+                    start = start[1:] + file.read(1)
+                if start[1] in _ALONE:
+                    continue
+                segment = file.read(2)
+                content = file.read(int.from_bytes(segment) - 2) if len(segment) == 2 else b""
+                if len(content) < int.from_bytes(segment) - 2 or len(segment) < 2 or start[1] == 0xDA:
+                    raise BadClip(str(path), "image", "a JPEG that is cut off")
+                if start[1] in _FRAME_HEADERS and len(content) >= 5:
+                    return int.from_bytes(content[3:5]), int.from_bytes(content[1:3])
+    except OSError as error:
+        raise BadClip(str(path), "image", f"cannot be read: {error.strerror}") from error
+
+
+def _below(folder: Path, path: str) -> Path:
+    """A path of the log, which may not lead out of the folder of blobs. Raises BadClip."""
+    if Path(path).is_absolute() or ".." in Path(path).parts:
+        raise BadClip(str(folder), path, "a log's sensor paths lie below the folder of sensor blobs")
+    return folder / path
