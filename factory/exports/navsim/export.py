@@ -98,6 +98,7 @@ def export(
     say(f"{len(planned):,} samples chosen, {len(planned) - len(todo):,} of them are there already")
     if not (todo or stale or journal.interrupted) and _is_done(journal, trajectories):
         return _summary(journal, 0, journal.facts, journal.files)
+    journal.begin()
     _write_logs(table, journal, settings, todo, workers, say)
     logs = [journal.logs[key] for key in sorted(planned)]
     say("splits, rewards, checksums")

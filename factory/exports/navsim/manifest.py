@@ -73,7 +73,10 @@ class Journal:
         self.interrupted = (root / JOURNAL).exists()
         for name in (MANIFEST, JOURNAL):
             self._read(root / name)
-        if not (root / JOURNAL).exists():
+
+    def begin(self) -> None:
+        """From here on what is written is noted. Raises DiskFull."""
+        if not (self.root / JOURNAL).exists():
             self._append({"format": FORMAT, "settings": self.settings})
 
     def add(self, logs: Iterable[Written]) -> None:
