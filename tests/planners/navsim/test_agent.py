@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from planners.navsim import agent
 from planners.navsim.agent import RemotePlanner, shown
@@ -87,6 +88,17 @@ def test_what_runs_in_navsim_s_python_is_of_its_version_and_needs_numpy_alone() 
             named = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
             ours = {name for name in named if name and name.startswith(("planners", "factory", "tasks"))}
             assert ours <= {"planners.navsim.wire"}
+
+
+def test_the_agent_s_file_names_every_setting_of_it() -> None:
+    tree = ast.parse((REPOSITORY / "planners/navsim/agent.py").read_text())
+    (made,) = [node for node in ast.walk(tree) if isinstance(node, ast.ClassDef) and node.name == "FactoryAgent"]
+    (begin,) = [node for node in made.body if isinstance(node, ast.FunctionDef) and node.name == "__init__"]
+    content = yaml.safe_load((REPOSITORY / "deploy/navsim/agent/factory_agent.yaml").read_text())
+    assert content["_target_"] == f"{agent.__name__}.FactoryAgent"
+    assert [key for key in content if not key.startswith("_")] == [arg.arg for arg in begin.args.args[1:]]
+    sampling = content["trajectory_sampling"]
+    assert (sampling["time_horizon"] / sampling["interval_length"], sampling["interval_length"]) in agent.SAMPLINGS
 
 
 def test_without_navsim_only_the_agent_itself_is_missing() -> None:
