@@ -65,6 +65,8 @@ def read_map(path: Path, source: Source, drive: Array) -> RoadMap:
         in_junction = _name(contents[lane_id].get("lane_group_id")) in junction if junction else None
         if (lane := _raw_lane(objects, row, contents[lane_id], in_junction)) is not None:
             raw[lane_id] = lane
+    if all(lane.kind == BIKE for lane in raw.values()):
+        raise BadClip(str(path), "map_layer", "no lane for cars, or none within 250 m of the drive")
     connectors = connector_ids(raw, frozenset())
     left, right = neighbours(raw, connectors)
     lanes = {
@@ -84,13 +86,13 @@ def read_map(path: Path, source: Source, drive: Array) -> RoadMap:
         )
         for lane_id, lane in raw.items()
     }
-    if not any(lane.drives_cars for lane in lanes.values()):
-        raise BadClip(str(path), "map_layer", "no lane for cars, or none within 250 m of the drive")
     own = tuple(_polygons(objects, INTERSECTION, "int", MapLayer.INTERSECTION)) if source.own_intersections else None
     return RoadMap(
         lanes=lanes,
         drivable_areas=_drivable_areas(objects, source, lanes),
-        crossings=tuple(area.ring for area in _polygons(objects, CROSSWALK, "cw", MapLayer.DRIVABLE_AREA)),
+        crossings=tuple(
+            _exterior(objects, row, part) for row in objects.rows(CROSSWALK) for part in _parts(objects, row)
+        ),
         roadblock_of=_roadblocks(path, contents, lanes) if source.own_roadblocks else roadblocks_of(lanes),
         location=str(objects.file.metadata.get("location") or ""),
         intersections=own,
@@ -122,7 +124,7 @@ def _raw_lane(objects: MapObjects, row: int, content: Mapping[str, Any], in_junc
     line = resampled_line(center[:, :2], file, f"centerline of lane {lane_id}")
     if line is None:
         return None
-    parts = list(_rings(objects, row))
+    parts = _rings(objects, row)
     speed = content.get("speed_limit_mps")
     return RawLane(
         lane_id=lane_id,
@@ -173,21 +175,29 @@ def _polygons(objects: MapObjects, layer: int, prefix: str, as_layer: MapLayer) 
             yield MapPolygon(f"{prefix}_{objects.ids[row]}" + f"_{part}" * bool(part), as_layer, ring, holes)
 
 
+def _parts(objects: MapObjects, row: int) -> list[Polygon]:
+    """The polygons of the row's shape. Raises BadClip where there is none."""
+    parts = [part for part in shapely.get_parts(objects.shapes[row]) if part.geom_type == "Polygon"]
+    if not parts or any(part.is_empty for part in parts):
+        raise BadClip(str(objects.file.path), f"wkb of {objects.where(row)}", "no polygon")
+    return parts
+
+
+def _exterior(objects: MapObjects, row: int, part: Polygon) -> Array:
+    points = np.asarray(part.exterior.coords, np.float64)[:, :2]
+    if not np.isfinite(points).all():
+        raise BadClip(str(objects.file.path), f"wkb of {objects.where(row)}", "holds NaN or infinity")
+    return points
+
+
 def _rings(objects: MapObjects, row: int) -> list[tuple[Array, tuple[Array, ...]]]:
-    """Exterior and holes of each polygon of the row's shape, valid ones. Raises BadClip where there is none."""
-    shape, file = objects.shapes[row], str(objects.file.path)
-    parts = [part for part in shapely.get_parts(shape) if part.geom_type == "Polygon" and not part.is_empty]
-    if not parts:
-        raise BadClip(file, f"wkb of {objects.where(row)}", "no polygon")
+    """Exterior and holes of each polygon of the row's shape, made valid. Raises BadClip where one bounds no area."""
     out = []
-    for part in parts:
-        points = np.asarray(part.exterior.coords, np.float64)[:, :2]
-        if not np.isfinite(points).all():
-            raise BadClip(file, f"wkb of {objects.where(row)}", "holds NaN or infinity")
+    for part in _parts(objects, row):
         try:
-            ring = valid_ring(points)
+            ring = valid_ring(_exterior(objects, row, part))
         except ValueError as error:
-            raise BadClip(file, f"wkb of {objects.where(row)}", str(error)) from error
+            raise BadClip(str(objects.file.path), f"wkb of {objects.where(row)}", str(error)) from error
         holes = (closed_ring(np.asarray(hole.coords, np.float64)[:, :2]) for hole in part.interiors)
         out.append((ring, tuple(hole for hole in holes if hole is not None)))
     return out

@@ -10,7 +10,9 @@ from test_av2 import write_log
 from factory.readers.av2.reader import AV2Reader
 from factory.readers.base import BadClip, ClipRef
 from factory.readers.logs import LogReader
+from factory.readers.py123d.reader import Py123dReader
 from factory.readers.scenarionet.reader import ScenarioNetReader
+from tests.factory.readers.py123d_logs import convert
 
 
 def av2(folder: Path) -> tuple[AV2Reader, Path]:
@@ -24,7 +26,13 @@ def scenarionet(folder: Path) -> tuple[ScenarioNetReader, Path]:
     return ScenarioNetReader(folder), town.save(town.nuplan(), folder)
 
 
-@pytest.mark.parametrize("make", [av2, scenarionet])
+def py123d(folder: Path) -> tuple[Py123dReader, Path]:
+    """Likewise."""
+    log = convert(write_log(folder / "source" / "log-a"), folder / "out")
+    return Py123dReader(log), log / "map.arrow"
+
+
+@pytest.mark.parametrize("make", [av2, py123d, scenarionet])
 def test_the_digest_is_the_clip_s_and_follows_the_log(make: Callable[..., tuple[LogReader, Path]], tmp_path: Path):
     reader, file = make(tmp_path)
     ref = reader.index().refs[0]
