@@ -257,7 +257,7 @@ def test_a_batch_planner_must_answer_for_every_sample(benchmark: StreetBenchmark
     [
         ("runs/nowhere", "neither a folder nor one of human, pdm_closed"),
         ("ltf", "has to be trained first"),
-        ("no_such_module:Planner", "No module named 'no_such_module'"),
+        ("no_such_module:Planner", "there is no module no_such_module"),
         ("test_evaluate:NoSuchClass", "NoSuchClass"),
         ("test_evaluate:SCORE", "is a int: name a class"),
         ("test_evaluate:settings", "without arguments"),
