@@ -35,6 +35,8 @@ LISTENERS = (
 )
 UPLOADED = ("factory", "tasks", "planners", "conf", "pyproject.toml", ".rayignore", ".gitignore")
 PARTS = ["judge", "drive"]  # of factory.stages.warm
+SMALL = ("clips.n_clips=1", "clips.settings.cameras=[]", "clips.settings.lidar_beams=0", "render=none")
+SMALL_JOB = ("rounds=5", *SMALL, "vocabulary.k=64", "experts=[human]")
 LEFT_AT_HOME = (  # what lies in a checkout that was worked with
     "runs/demo/samples/shard.parquet",
     ".venv/lib/library.py",
@@ -70,8 +72,7 @@ def free_ports(count: int) -> list[int]:
         return [each.getsockname()[1] for each in sockets]
 
 
-@pytest.fixture(scope="module")
-def head() -> Iterator[Head]:
+def running_head() -> Iterator[Head]:
     """`ray start --head` on loopback, with a token of its own; ended by its pid (`ray stop` would end every Ray)."""
     environment = {
         key: value for key, value in os.environ.items() if not key.startswith(("RAY_", "NUMBA_", "PYTHONPATH"))
@@ -100,6 +101,9 @@ def head() -> Iterator[Head]:
         process.send_signal(signal.SIGTERM)
         process.wait(60)
         shutil.rmtree(folder, ignore_errors=True)
+
+
+head = pytest.fixture(running_head, scope="module", name="head")
 
 
 def _wait_until_it_answers(head: Head, process: "subprocess.Popen[bytes]") -> None:
@@ -144,9 +148,7 @@ def test_the_command_as_it_stands_makes_the_table_from_one_copy_of_the_project_a
 ) -> None:
     first, second = checkout(tmp_path / "first"), checkout(tmp_path / "second")
     cache = give_compiled_kernels(head)
-    small = ("clips.n_clips=1", "clips.settings.cameras=[]", "clips.settings.lidar_beams=0", "render=none")
-    command = ("rounds=5", *small, "vocabulary.k=64", "experts=[human]")
-    made = head.submit(first, *command)
+    made = head.submit(first, *SMALL_JOB)
     assert made.returncode == 0, made.stdout + made.stderr
     assert "succeeded" in made.stdout
     out = head.folder / "driving-data-factory" / "runs" / "synthetic"
@@ -160,7 +162,7 @@ def test_the_command_as_it_stands_makes_the_table_from_one_copy_of_the_project_a
 
     compiled = {path: path.stat().st_mtime_ns for path in cache.glob("**/*.kernel")}
     (second / "README.md").write_text("another upload")
-    again = head.submit(second, *command, "experts=[human,recovery]")
+    again = head.submit(second, *SMALL_JOB, "experts=[human,recovery]")
     assert again.returncode == 0, again.stdout + again.stderr
     assert "found 1 attempts done" in again.stdout
     assert len(SampleTable(out)) > 1
@@ -170,7 +172,7 @@ def test_the_command_as_it_stands_makes_the_table_from_one_copy_of_the_project_a
     assert "compiling kernels" not in made.stdout + again.stdout
     assert {path: path.stat().st_mtime_ns for path in cache.glob("**/*.kernel")} == compiled, "nothing is compiled"
 
-    lost = head.submit(first, *command, "out=runs/here")
+    lost = head.submit(first, *SMALL_JOB, "out=runs/here")
     assert lost.returncode != 0
     assert "name an absolute path or a URL" in lost.stdout + lost.stderr
     assert "exit code 2" in lost.stdout + lost.stderr
