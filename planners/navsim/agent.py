@@ -120,7 +120,7 @@ def _agent_class() -> Any:
         "nuplan.planning.simulation.trajectory.trajectory_sampling"
     ).TrajectorySampling
 
-    class FactoryAgent(abstract):  # type: ignore[misc]
+    class FactoryAgent(abstract):
         """See the module. One JPEG a camera and frame is loaded: those that the planner looks at, at now."""
 
         requires_scene = False

@@ -24,7 +24,7 @@ FRONT = ("cam_l0", "cam_f0", "cam_r0")  # the front camera and its neighbours, l
 
 
 @dataclass(frozen=True)
-class View:
+class CameraShot:
     """What one camera shows at now."""
 
     camera: Camera
@@ -37,12 +37,12 @@ class View:
 
 
 @dataclass(frozen=True)
-class Seen:
+class Sighting:
     """What NAVSIM shows an agent at one moment."""
 
     history: Array  # (4, 3) x, y [m], heading [rad] at -1.5 .. 0 s in the ego frame at now
     status: Array  # (8,) command one-hot (COMMANDS), vx, vy [m/s], ax, ay [m/s2]
-    views: tuple[View, ...] = ()  # left to right
+    views: tuple[CameraShot, ...] = ()  # left to right
 
     def __post_init__(self) -> None:
         for name, shape in (("history", (HISTORY, 3)), ("status", (len(COMMANDS) + 4,))):
@@ -76,7 +76,7 @@ class Pilot:
         self._by_direction = needs.image is not None and not (cameras or needs.image.cameras)
         self.cameras = cameras_for(needs.image, cameras)
 
-    def plan(self, seen: Seen, n_poses: int) -> Array:
+    def plan(self, seen: Sighting, n_poses: int) -> Array:
         """(8 or 40, 3) float32 poses, 4 s. Raises ValueError where a plan is none, or the cameras look elsewhere."""
         batch = self.batch_of(seen).to(self._device)
         plan = plans_for(self._made, batch)[0]
@@ -85,7 +85,7 @@ class Pilot:
             plan = at_ten_hz(plan[None])[0] if n_poses == HORIZON_STEPS else plan[4::5]
         return plan.astype(np.float32)
 
-    def batch_of(self, seen: Seen) -> Batch:
+    def batch_of(self, seen: Sighting) -> Batch:
         """The batch of one that a row of the same content makes."""
         views = seen.views
         if self._by_direction:
@@ -121,7 +121,7 @@ def cameras_for(layout: ImageLayout | None, given: Sequence[str] = ()) -> tuple[
     return names
 
 
-def seen_of(arrays: Mapping[str, Any], cameras: Sequence[str]) -> Seen:
+def seen_of(arrays: Mapping[str, Any], cameras: Sequence[str]) -> Sighting:
     """What `planners.navsim.agent.shown` wrote. NAVSIM's lidar frame is the ego's. Raises ValueError."""
     views = []
     for name in cameras:
@@ -131,14 +131,14 @@ def seen_of(arrays: Mapping[str, Any], cameras: Sequence[str]) -> Seen:
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = arrays[f"{name}.rotation"], arrays[f"{name}.translation"]
         calibration = [np.asarray(arrays[f"{name}.{what}"], np.float64) for what in ("intrinsics", "distortion")]
-        views.append(View(Camera(name, image.shape[1], image.shape[0], *calibration, pose), image))
-    return Seen(arrays["history"], arrays["status"], tuple(views))
+        views.append(CameraShot(Camera(name, image.shape[1], image.shape[0], *calibration, pose), image))
+    return Sighting(arrays["history"], arrays["status"], tuple(views))
 
 
 class _SeenRow(StoredRows):
     """What was seen, as the loader's rows are read; zeros for the plans, which nobody knows."""
 
-    def __init__(self, seen: Seen, images: Sequence[Bytes]) -> None:
+    def __init__(self, seen: Sighting, images: Sequence[Bytes]) -> None:
         status = seen.status
         self._images = images
         self._seen = {
