@@ -130,8 +130,9 @@ def seen_of(arrays: Mapping[str, Any], cameras: Sequence[str]) -> Sighting:
             raise ValueError(f"{name}: a picture of shape {image.shape}")
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = arrays[f"{name}.rotation"], arrays[f"{name}.translation"]
-        calibration = [np.asarray(arrays[f"{name}.{what}"], np.float64) for what in ("intrinsics", "distortion")]
-        views.append(CameraShot(Camera(name, image.shape[1], image.shape[0], *calibration, pose), image))
+        intrinsics, distortion = (np.asarray(arrays[f"{name}.{k}"], np.float64) for k in ("intrinsics", "distortion"))
+        camera = Camera(name, image.shape[1], image.shape[0], intrinsics, distortion, pose)
+        views.append(CameraShot(camera, image))
     return Sighting(arrays["history"], arrays["status"], tuple(views))
 
 
