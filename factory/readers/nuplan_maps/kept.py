@@ -1,0 +1,89 @@
+"""A city's tables on disk, in the user's cache: read from the GeoPackage once, then within a fraction of a second."""
+
+import hashlib
+import logging
+import secrets
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from factory.readers.nuplan_maps.geopackage import KEYS, LINES, NUMBERS, Table, read_geopackage
+from tasks.caches import user_cache
+
+log = logging.getLogger(__name__)
+
+FORMAT = 1  # raise by hand whenever a GeoPackage gives other tables
+
+
+class BadMapCache(ValueError):
+    """A kept map is damaged or of another make."""
+
+
+def kept_tables(path: Path) -> dict[str, Table]:
+    """The tables of a GeoPackage, from the cache where it is in order. Raises BadClip, ImportError."""
+    kept = cache_file(path)
+    if kept.is_file():
+        try:
+            return load_tables(kept)
+        except BadMapCache as error:
+            log.warning("%s: %s; %s is read again", kept, error, path)
+    tables = read_geopackage(path)
+    save_tables(kept, tables)
+    return tables
+
+
+def cache_file(path: Path) -> Path:
+    """Named by the GeoPackage's place, size and time of change, and by this format."""
+    told = path.stat()
+    name = f"{path.resolve()}|{told.st_size}|{told.st_mtime_ns}|{FORMAT}"
+    return user_cache() / "maps" / f"{path.parent.parent.name}-{hashlib.sha256(name.encode()).hexdigest()[:16]}.npz"
+
+
+def save_tables(path: Path, tables: dict[str, Table]) -> None:
+    """Whole or not at all."""
+    arrays: dict[str, NDArray[np.generic]] = {"format": np.array(FORMAT)}
+    for layer, table in tables.items():
+        arrays[f"{layer}.fid"] = table.fid
+        arrays |= {f"{layer}.{name}": column for name, column in table.columns.items()}
+        if len(table.fid):
+            _, xy, offsets = shapely.to_ragged_array(table.shapes)
+            arrays[f"{layer}.xy"] = xy
+            arrays |= {f"{layer}.offsets{i}": offset for i, offset in enumerate(offsets)}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        with draft.open("wb") as file:
+            np.savez(file, allow_pickle=False, **arrays)
+        draft.replace(path)
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+def load_tables(path: Path) -> dict[str, Table]:
+    """Raises BadMapCache."""
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            if int(stored["format"]) != FORMAT:
+                raise BadMapCache(f"format {int(stored['format'])}, this version reads {FORMAT}")
+            return {layer: _table(stored, layer) for layer in KEYS}
+    except BadMapCache:
+        raise
+    except (OSError, zipfile.BadZipFile, KeyError, ValueError, EOFError, shapely.errors.ShapelyError) as error:
+        raise BadMapCache(f"damaged ({error})") from error
+
+
+def _table(stored: np.lib.npyio.NpzFile, layer: str) -> Table:
+    fid = stored[f"{layer}.fid"]
+    columns = {name: stored[f"{layer}.{name}"] for name in (*KEYS[layer], *NUMBERS.get(layer, ()))}
+    if not len(fid):
+        return Table(fid, columns, np.empty(0, dtype=object))
+    is_line = layer in LINES
+    kind = shapely.GeometryType.LINESTRING if is_line else shapely.GeometryType.POLYGON
+    offsets = tuple(stored[f"{layer}.offsets{i}"] for i in range(1 if is_line else 2))
+    shapes = np.asarray(shapely.from_ragged_array(kind, stored[f"{layer}.xy"], offsets), dtype=object)
+    if any(len(array) != len(fid) for array in (shapes, *columns.values())):
+        raise BadMapCache(f"layer {layer}: arrays of unequal length")
+    return Table(fid, columns, shapes)
