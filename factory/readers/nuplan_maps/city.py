@@ -1,6 +1,7 @@
 """A nuPlan city, and the part of it around a drive as a RoadMap."""
 
 from collections import defaultdict
+from collections.abc import Collection
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -76,15 +77,18 @@ class City:
         self._lanes: dict[int, Lane] = {}
         self._areas: dict[tuple[str, int], MapPolygon] = {}
 
-    def road_map(self, along_xy: Array, radius_m: float) -> RoadMap:
+    def road_map(self, along_xy: Array, radius_m: float, lane_ids: Collection[str] = ()) -> RoadMap:
         """All within `radius_m` [m] of any of the points (S, 2), in file order: lanes, then connectors.
+
+        lane_ids: further lanes, wherever they are, as those of a route. Raises KeyError for one that is none.
 
         Lane ids are nuPlan's fids; neighbours and successors may name lanes outside the map. Centrelines are the
         baselines' own points, as nuPlan's `discrete_path`. Drivable are lane groups and car parks, and intersections:
         generic drivable areas are what the public metric never loads.
         """
         around = shapely.multipoints(np.asarray(along_xy, dtype=np.float64).reshape(-1, 2))
-        lanes = {lane.lane_id: lane for lane in map(self._lane, _near(self._tree, around, radius_m))}
+        rows = {*_near(self._tree, around, radius_m), *(self._index_of[lane_id] for lane_id in lane_ids)}
+        lanes = {lane.lane_id: lane for lane in map(self._lane, sorted(rows))}
         areas: dict[str, list[MapPolygon]] = {
             layer: [self._area(layer, row) for row in _near(self._area_trees[layer], around, radius_m)]
             for layer in AREAS
