@@ -60,11 +60,10 @@ class City:
             raise BadClip(str(path), f"layers {LANES} and {CONNECTORS}, fid {values[counts > 1][0]}", "stands twice")
         self._ids = list(self._index_of)
         self._n_lanes = len(lanes.fid)
-        self._shapes = np.concatenate([lanes.shapes, polygons.shapes[row_of]])
-        baselines = tables["baseline_paths"].shapes
+        self._polygon_rows = row_of
         of_lane = self._rows_of("baseline_paths", "lane_fid", lanes)
         of_connector = self._rows_of("baseline_paths", "lane_connector_fid", connectors)
-        self._baselines = np.concatenate([baselines[of_lane], baselines[of_connector]])
+        self._baselines = np.concatenate([of_lane, of_connector])
         sides = [f"{side}_boundary_fid" for side in ("left", "right")]
         self._sides = [np.concatenate([lanes.columns[s], polygons.columns[s][row_of]]) for s in sides]
         self._blocks = np.concatenate([lanes.columns["lane_group_fid"], connectors.columns["lane_group_connector_fid"]])
@@ -72,7 +71,7 @@ class City:
         self._boundary_row = {fid: i for i, fid in enumerate(tables["boundaries"].fid.tolist())}
         self._before, self._after = self._graph()
         self._beside = self._neighbours()
-        self._tree = shapely.STRtree(self._shapes)
+        self._tree = shapely.STRtree(np.concatenate([lanes.shapes, polygons.shapes[row_of]]))
         self._area_trees = {layer: shapely.STRtree(tables[layer].shapes) for layer in (*AREAS, "crosswalks")}
         self._lanes: dict[int, Lane] = {}
         self._areas: dict[tuple[str, int], MapPolygon] = {}
@@ -93,11 +92,11 @@ class City:
             layer: [self._area(layer, row) for row in _near(self._area_trees[layer], around, radius_m)]
             for layer in AREAS
         }
-        crossings = self.tables["crosswalks"].shapes
+        crossings = self.tables["crosswalks"]
         return RoadMap(
             lanes=lanes,
             drivable_areas=(*areas[GROUPS], *areas["carpark_areas"]),
-            crossings=tuple(_ring(crossings[i]) for i in _near(self._area_trees["crosswalks"], around, radius_m)),
+            crossings=tuple(crossings.outline(i) for i in _near(self._area_trees["crosswalks"], around, radius_m)),
             roadblock_of={lane_id: str(self._blocks[self._index_of[lane_id]]) for lane_id in lanes},
             location=self.location,
             intersections=tuple(areas["intersections"]),
@@ -169,11 +168,11 @@ class City:
 
     def _lane(self, i: int) -> Lane:
         if i not in self._lanes:
-            centerline = with_headings(shapely.get_coordinates(self._baselines[i]))
+            centerline = with_headings(self.tables["baseline_paths"].outline(int(self._baselines[i])))
             speed = float(self._speeds[i])
             self._lanes[i] = Lane(
                 lane_id=self._ids[i],
-                ring=_ring(self._shapes[i]),
+                ring=self._ring(i),
                 centerline=centerline,
                 is_intersection=i >= self._n_lanes,
                 drives_cars=True,  # the public metric makes no difference between lanes
@@ -187,11 +186,16 @@ class City:
             )
         return self._lanes[i]
 
+    def _ring(self, i: int) -> Array:
+        if i < self._n_lanes:
+            return self.tables[LANES].outline(i)
+        return self.tables[CONNECTOR_POLYGONS].outline(int(self._polygon_rows[i - self._n_lanes]))
+
     def _boundary(self, fid: int, centerline: Array) -> Array | None:
         """(B, 3) in the lane's direction; heights are not in the map. None where no row has that fid."""
         if fid not in self._boundary_row:
             return None
-        points = shapely.get_coordinates(self.tables["boundaries"].shapes[self._boundary_row[fid]])
+        points = self.tables["boundaries"].outline(self._boundary_row[fid])
         ends, lane_ends = points[[0, -1]], centerline[[0, -1], :2]
         if np.hypot(*(ends - lane_ends).T).sum() > np.hypot(*(ends[::-1] - lane_ends).T).sum():
             points = points[::-1]
@@ -206,16 +210,11 @@ class City:
             while part < row and fids[row - part - 1] == fids[row]:
                 part += 1
             token = f"{fids[row]}_{part}" if part else str(fids[row])
-            shape = self.tables[layer].shapes[row]
-            holes = tuple(shapely.get_coordinates(hole) for hole in shape.interiors)
-            self._areas[key] = MapPolygon(token, AREAS[layer], _ring(shape), holes)
+            table = self.tables[layer]
+            self._areas[key] = MapPolygon(token, AREAS[layer], table.outline(row), table.holes(row))
         return self._areas[key]
 
 
 def _near(tree: shapely.STRtree, around: Any, radius_m: float) -> list[int]:
     """Rows within a distance, in file order."""
     return sorted(tree.query(around, predicate="dwithin", distance=radius_m).tolist())
-
-
-def _ring(polygon: Any) -> Array:
-    return np.asarray(shapely.get_coordinates(shapely.get_exterior_ring(polygon)), dtype=np.float64)

@@ -8,6 +8,7 @@ import json
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ import shapely
 from numpy.typing import NDArray
 
 from factory.readers.base import BadClip
-from tasks.world.arrays import Ints
+from tasks.world.arrays import Array, Ints
 
 log = logging.getLogger(__name__)
 
@@ -52,7 +53,27 @@ class Table:
 
     fid: Ints  # (N,)
     columns: Mapping[str, NDArray[np.generic]]  # (N,) each
-    shapes: NDArray[np.object_]  # (N,) shapely polygons or lines [m]
+    xy: Array  # (T, 2) points of all shapes [m]
+    offsets: tuple[Ints, ...]  # shapely's: where lines or rings begin in xy; then where polygons begin in rings
+
+    @cached_property
+    def shapes(self) -> NDArray[np.object_]:
+        """(N,) shapely polygons or lines."""
+        if not len(self.fid):
+            return np.empty(0, dtype=object)
+        kind = shapely.GeometryType.LINESTRING if len(self.offsets) == 1 else shapely.GeometryType.POLYGON
+        return np.asarray(shapely.from_ragged_array(kind, self.xy, self.offsets), dtype=object)
+
+    def outline(self, row: int) -> Array:
+        """(P, 2) a line, or a polygon's closed exterior ring."""
+        first = row if len(self.offsets) == 1 else int(self.offsets[1][row])
+        points = self.offsets[0]
+        return self.xy[points[first] : points[first + 1]]
+
+    def holes(self, row: int) -> tuple[Array, ...]:
+        """The closed rings of a polygon's holes."""
+        rings, points = self.offsets[1], self.offsets[0]
+        return tuple(self.xy[points[i] : points[i + 1]] for i in range(rings[row] + 1, rings[row + 1]))
 
 
 def map_file(maps_root: Path, location: str) -> Path:
@@ -137,7 +158,12 @@ def _table(path: Path, layer: str, target: str) -> Table:
             columns[name] = numbers
     shapes = _projected(path, layer, meta["crs"], target, fids, wkb)
     rows, parts = _parts(path, layer, fids, shapes)
-    return Table(fids[rows], {name: column[rows] for name, column in columns.items()}, parts)
+    kept = {name: column[rows] for name, column in columns.items()}
+    if not len(rows):
+        nothing = np.zeros(1, dtype=np.int64)
+        return Table(fids[rows], kept, np.empty((0, 2)), (nothing,) if layer in LINES else (nothing, nothing))
+    _, xy, offsets = shapely.to_ragged_array(parts)
+    return Table(fids[rows], kept, xy, tuple(offsets))
 
 
 def _projected(path: Path, layer: str, source: str | None, target: str, fids: Ints, wkb: Any) -> NDArray[np.object_]:

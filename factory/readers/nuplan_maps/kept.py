@@ -7,7 +7,6 @@ import zipfile
 from pathlib import Path
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 
 from factory.readers.nuplan_maps.geopackage import KEYS, LINES, NUMBERS, Table, read_geopackage
@@ -48,10 +47,8 @@ def save_tables(path: Path, tables: dict[str, Table]) -> None:
     for layer, table in tables.items():
         arrays[f"{layer}.fid"] = table.fid
         arrays |= {f"{layer}.{name}": column for name, column in table.columns.items()}
-        if len(table.fid):
-            _, xy, offsets = shapely.to_ragged_array(table.shapes)
-            arrays[f"{layer}.xy"] = xy
-            arrays |= {f"{layer}.offsets{i}": offset for i, offset in enumerate(offsets)}
+        arrays[f"{layer}.xy"] = table.xy
+        arrays |= {f"{layer}.offsets{i}": offset for i, offset in enumerate(table.offsets)}
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
@@ -71,19 +68,17 @@ def load_tables(path: Path) -> dict[str, Table]:
             return {layer: _table(stored, layer) for layer in KEYS}
     except BadMapCache:
         raise
-    except (OSError, zipfile.BadZipFile, KeyError, ValueError, EOFError, shapely.errors.ShapelyError) as error:
+    except (OSError, zipfile.BadZipFile, KeyError, ValueError, IndexError, EOFError) as error:
         raise BadMapCache(f"damaged ({error})") from error
 
 
 def _table(stored: np.lib.npyio.NpzFile, layer: str) -> Table:
     fid = stored[f"{layer}.fid"]
     columns = {name: stored[f"{layer}.{name}"] for name in (*KEYS[layer], *NUMBERS.get(layer, ()))}
-    if not len(fid):
-        return Table(fid, columns, np.empty(0, dtype=object))
-    is_line = layer in LINES
-    kind = shapely.GeometryType.LINESTRING if is_line else shapely.GeometryType.POLYGON
-    offsets = tuple(stored[f"{layer}.offsets{i}"] for i in range(1 if is_line else 2))
-    shapes = np.asarray(shapely.from_ragged_array(kind, stored[f"{layer}.xy"], offsets), dtype=object)
-    if any(len(array) != len(fid) for array in (shapes, *columns.values())):
+    xy = stored[f"{layer}.xy"]
+    offsets = tuple(stored[f"{layer}.offsets{i}"] for i in range(1 if layer in LINES else 2))
+    sizes = [len(xy), *(len(offset) - 1 for offset in offsets)]
+    ends = [int(offset[-1]) for offset in offsets]
+    if sizes != [*ends, len(fid)] or any(len(column) != len(fid) for column in columns.values()):
         raise BadMapCache(f"layer {layer}: arrays of unequal length")
-    return Table(fid, columns, shapes)
+    return Table(fid, columns, xy, offsets)
