@@ -129,12 +129,13 @@ def among(prepared: PreparedScene, objects: AgentTracks, ego_state0: Array | Non
 
 
 def _red_connectors(clip: Clip, step: int) -> tuple[tuple[str, ...], Bools]:
-    """On-route lane connectors with a light, and where it is red over steps step .. step + 40: ids (L,), (41, L)."""
-    lights, lanes = clip.lights, clip.road_map.lanes
+    """Lane connectors whose light counts on the route, ids (L,), and where it is red in steps step .. step + 40, (41, L)."""
+    lights, lanes, route = clip.lights, clip.road_map.lanes, clip.route
+    lit = route.lane_ids if route.lit_lane_ids is None else route.lit_lane_ids
     governed = [
         i
         for i, lane_id in enumerate(lights.lane_ids)
-        if lane_id in clip.route.lane_ids and lane_id in lanes and lanes[lane_id].is_intersection
+        if lane_id in lit and lane_id in lanes and lanes[lane_id].is_intersection
     ]
     if not governed:
         return (), np.zeros((N_TIMES, 0), dtype=bool)

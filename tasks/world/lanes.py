@@ -79,6 +79,7 @@ class Route:
     lane_path: tuple[str, ...]  # lanes driven, in order
     roadblock_ids: tuple[str, ...]  # roadblocks passed, in order
     lane_ids: frozenset[str]  # all lanes of the roadblocks passed ("on route")
+    lit_lane_ids: frozenset[str] | None = None  # lanes whose red lights the reward sees; None: those on route
 
 
 class LightState(IntEnum):

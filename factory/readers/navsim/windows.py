@@ -96,6 +96,12 @@ def kept_table(path: Path, cache_dir: Path) -> FrameTable | None:
 def make_table(path: Path, cache_dir: Path) -> FrameTable:
     """The table of the log at `path`, read and kept. Raises BadClip."""
     table = table_of(read_frames(path))
+    keep_table(table, path, cache_dir)
+    return table
+
+
+def keep_table(table: FrameTable, path: Path, cache_dir: Path) -> None:
+    """Keeps the table of the log at `path`, for as long as that file is as it is. Raises BadClip, OSError."""
     columns: dict[str, NDArray[Any]] = {**vars(table)}
     rows = np.zeros(len(table), [(name, column.dtype) for name, column in columns.items()])
     for name, column in columns.items():
@@ -104,7 +110,6 @@ def make_table(path: Path, cache_dir: Path) -> FrameTable:
     np.save(data, rows, allow_pickle=False)
     cache_dir.mkdir(parents=True, exist_ok=True)
     write_whole(_kept(path, cache_dir), data.getvalue())
-    return table
 
 
 def _kept(path: Path, cache_dir: Path) -> Path:

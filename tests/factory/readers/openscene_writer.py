@@ -6,6 +6,7 @@ Keys, shapes, types and frames of OpenDriveLab/OpenScene @ 7286074, create_opens
 
 import hashlib
 import pickle
+import pickletools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -94,9 +95,23 @@ def write_frames(root: Path, split: str, name: str, frames: Sequence[Mapping[str
     """The pickle as OpenScene's: a plain list, highest protocol."""
     path = root / "navsim_logs" / split / f"{name}.pkl"
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("wb") as file:
-        pickle.dump(list(frames), file, pickle.HIGHEST_PROTOCOL)
+    path.write_bytes(numpy_1_pickle(list(frames)))
     return path
+
+
+def numpy_1_pickle(value: Any) -> bytes:
+    """As NumPy 1 writes it, which OpenScene and NAVSIM run: NumPy 2 has moved what its pickles name."""
+    data = pickle.dumps(value, pickle.HIGHEST_PROTOCOL)
+    opcodes = list(pickletools.genops(data))
+    ends = [position for _, _, position in opcodes[1:]] + [len(data)]
+    out = bytearray()
+    for (opcode, argument, position), end in zip(opcodes, ends):
+        if isinstance(argument, str) and argument.startswith("numpy._core."):
+            moved = argument.replace("numpy._core.", "numpy.core.").encode()
+            out += b"\x8c" + bytes([len(moved)]) + moved
+        elif opcode.name != "FRAME":  # frames say their length, which is another now, and are optional
+            out += data[position:end]
+    return bytes(out)
 
 
 def log_frames(

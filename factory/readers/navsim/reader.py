@@ -1,0 +1,345 @@
+"""Reads NAVSIM's logs (OpenScene: nuPlan at 2 Hz) with nuPlan's maps as clips.
+
+A clip is 20 frames of a log, of which the fourth is T: 1.5 s before it and 8 s after. NAVSIM's scenes are named by T's
+token too, but end 4 or 5 s after it. A scene filter only names windows of a log, so a clip takes the frames after its
+scene's end from the log; where the log ends earlier, or has a gap, there is no clip, and the plan counts it.
+"""
+
+import hashlib
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from factory.readers.base import SPLITS, BadClip, ClipIndex, ClipRef, split_of
+from factory.readers.logs import CACHED_LOGS
+from factory.readers.navsim.filters import Selection, read_selection
+from factory.readers.navsim.log import LogFrames, bytes_of, frames_of
+from factory.readers.navsim.rig import blobs_of, rig_of
+from factory.readers.navsim.tracks import (
+    FRAMES_BEFORE,
+    HORIZON_FRAMES,
+    WINDOW_FRAMES,
+    ego_states,
+    lights,
+    stretch_agents,
+    window_agents,
+    world_from_ego,
+)
+from factory.readers.navsim.windows import (
+    ABSENT,
+    Choice,
+    FrameTable,
+    kept_table,
+    make_table,
+    table_of,
+    usable,
+    wanted_windows,
+)
+from factory.readers.nuplan_maps.city import open_city
+from factory.readers.restricted_pickle import load_plain
+from factory.readers.settings import NavsimClips
+from factory.readers.validate import validate_clip
+from factory.wording import time_text
+from tasks.caches import user_cache
+from tasks.world.arrays import Array
+from tasks.world.clip import NOW, Block, Clip
+from tasks.world.lanes import RoadMap, Route
+from tasks.world.roadblocks import corrected_roadblocks, route_of_roadblocks
+from tasks.world.route import NoRoute, RouteFinder
+
+LICENCE = "CC BY-NC-SA 4.0 (nuPlan via OpenScene)"
+MAP_RADIUS_M = 150.0  # around the window's drive: the reward's 100 m, and room for one that strays
+BLOCK_FRAMES, BLOCK_STRIDE_FRAMES = 40, 20  # of the stretches that are reconstructed
+SPLIT_OF = {  # by how the name of the filter, or of the logs' folder, begins; others: by the hash of the log's id
+    "navtrain": "train",
+    "synthetic_reaction": "train",  # SimScale's, made of navtrain
+    "navtest": "test",
+    "navhard": "test",
+    "navsafe": "test",
+    "warmup": "test",
+    "private_test": "test",
+    "test": "test",
+}
+TELL_AFTER_S = 2.0  # how long opening logs may take before it is told
+
+
+@dataclass(frozen=True)
+class OpenLog:
+    """One log, and what its clips share."""
+
+    log: LogFrames
+    table: FrameTable
+    content_digest: str
+
+
+class NavsimReader:
+    """Clips of a folder of OpenScene logs: a `factory.readers.base.ClipReader`."""
+
+    def __init__(
+        self,
+        root: str | Path,
+        maps: str | Path,
+        sensors: str | Path | None = NavsimClips.sensors,
+        scene_filter: str | None = NavsimClips.scene_filter,
+        scene_filters: str | Path | None = NavsimClips.scene_filters,
+        stride_s: float = NavsimClips.stride_s,
+        name: str = "navsim",
+        min_top_speed_mps: float = NavsimClips.min_top_speed_mps,
+        first_window: int = NavsimClips.first_window,
+        only: Sequence[str] = NavsimClips.only,
+        split: str | None = NavsimClips.split,
+        cache_dir: str | Path | None = NavsimClips.cache_dir,
+    ) -> None:
+        """Arguments: see NavsimClips. Raises ValueError for what is no filter, stride or split."""
+        if split is not None and split not in SPLITS:
+            raise ValueError(f"clips.split={split} is none of {', '.join(SPLITS)}; null: by the filter and the folder")
+        settings = NavsimClips(str(root), str(maps), stride_s=stride_s, first_window=first_window)
+        self.root, self.maps = (Path(folder).expanduser().absolute() for folder in (root, maps))
+        self.sensors = None if sensors is None else Path(sensors).expanduser().absolute()
+        self.name, self.only, self.split = name, tuple(only), split
+        self.selection: Selection | None = read_selection(scene_filter, scene_filters) if scene_filter else None
+        self.choice = Choice(
+            stride_frames=settings.stride_frames,
+            first_frame=first_window * settings.stride_frames,
+            min_top_speed_mps=min_top_speed_mps,
+            scene_filter=self.selection.scene_filter if self.selection else None,
+        )
+        self.cache_dir = Path(cache_dir or user_cache() / "navsim").expanduser().absolute()
+        self._logs: dict[str, OpenLog] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        held = {**self.__dict__, "_logs": {}}
+        held.pop("_paths", None)
+        return held
+
+    @cached_property
+    def _paths(self) -> dict[str, Path]:
+        return log_files(self.root)
+
+    def logs(self) -> dict[str, Path]:
+        """Log id -> pickle, of all under the root. Raises ValueError where there is none."""
+        return self._paths
+
+    def index(self) -> ClipIndex:
+        """All windows that are clips, by log and time. Raises ValueError where the folders are not what they should."""
+        if not self.maps.is_dir():
+            raise ValueError(f"{self.maps}: no such folder; clips.maps is nuPlan's, with one folder a city")
+        if self.sensors is not None and not self.sensors.is_dir():
+            raise ValueError(f"{self.sensors}: no such folder; clips.sensors=null reads clips without pictures")
+        scenes = self.choice.scene_filter
+        tokens = None if scenes is None or scenes.tokens is None else frozenset(scenes.tokens)
+        refs: list[ClipRef] = []
+        dropped: Counter[str] = Counter()
+        skipped: dict[str, str] = {}
+        broken: dict[ClipRef, str] = {}
+        found, found_tokens = 0, set[str]()
+        for log_id, table in self._tables(self._chosen()):
+            if isinstance(table, BadClip):
+                broken[ClipRef(self.name, log_id, 0)] = str(table)
+                continue
+            wanted = wanted_windows(table, self.choice, tokens)
+            if scenes is not None and scenes.max_scenes is not None:
+                wanted = wanted[: max(scenes.max_scenes - found, 0)]
+            if scenes is None and not wanted:
+                skipped[log_id] = f"{len(table) * 0.5:.1f} s long, a clip needs {WINDOW_FRAMES * 0.5:.1f} s"
+            found += len(wanted)
+            found_tokens.update(table.tokens[wanted].tolist())
+            kept, reasons = usable(table, wanted, self.choice)
+            dropped += reasons
+            start_ms = table.start_ms
+            refs += [ClipRef(self.name, log_id, int(start_ms[now - FRAMES_BEFORE])) for now in kept]
+        if tokens is not None and (absent := len(tokens - found_tokens)):
+            if not found and not broken:
+                raise ValueError(f"{self.root}: none of the scene filter's {len(tokens)} tokens is in the logs here")
+            dropped[ABSENT] += absent
+        return ClipIndex(tuple(refs), dict(dropped), skipped, broken)
+
+    def read(self, ref: ClipRef) -> Clip:
+        """The validated clip. Raises BadClip."""
+        opened = self._open(ref)
+        frames, table = opened.log.frames, opened.table
+        start = _frame_at(ref, table, opened.log.file)
+        window, now = frames[start : start + WINDOW_FRAMES], start + FRAMES_BEFORE
+        if any(frame.boxes is None for frame in window):
+            raise BadClip(opened.log.file, f"frames[{start}].anns", "missing: nobody annotated the window")
+        states = ego_states(window)
+        road_map, route = self._road(opened.log, now, states[:, :2], states[NOW, :3])
+        try:
+            centerline = RouteFinder(road_map, route).centerline_from(states[NOW, :3])
+        except NoRoute as error:
+            raise BadClip(opened.log.file, f"frames[{now}].roadblock_ids", str(error)) from error
+        images, sweeps, cameras, block = (), (), (), None
+        if self.sensors is not None:
+            blobs = blobs_of(window, self.sensors)
+            if not blobs.images and not blobs.sweeps:
+                problem = f"no picture of the frames {start} to {start + WINDOW_FRAMES - 1} of {ref.log_id} is here"
+                raise BadClip(str(self.sensors), "blobs", f"{problem}; clips.sensors=null reads clips without pictures")
+            images, sweeps = blobs.images, blobs.sweeps
+            block = self._block(opened, start)
+            cameras = rig_of(frames[now], block.images, opened.log.file)
+        clip = Clip(
+            clip_id=ref.clip_id,
+            dataset=self.name,
+            log_id=ref.log_id,
+            split=self.split_of(ref.log_id),
+            start_s=ref.start_ms / 1000,
+            ego_states=states,
+            world_from_ego=world_from_ego(window),
+            agents=window_agents(window),
+            road_map=road_map,
+            route=route,
+            centerline=centerline,
+            lights=lights(window, tuple(road_map.lanes)),
+            cameras=cameras,
+            images=images,
+            sweeps=sweeps,
+            block=block,
+            licence=LICENCE,
+            frame_tokens=(frames[now].token, frames[now + HORIZON_FRAMES].token),
+            content_digest=opened.content_digest,
+        )
+        return validate_clip(clip, opened.log.file)
+
+    def digest(self, ref: ClipRef) -> str:
+        """The clip's content digest, from the bytes of its log's file and the name of its map. Raises BadClip."""
+        return _digest(bytes_of(self._path_of(ref)))
+
+    def block(self, ref: ClipRef) -> str | None:
+        """Log and second at which the block begins that the clip is rendered from; None without sensors."""
+        if self.sensors is None:
+            return None
+        path = self._path_of(ref)
+        table = kept_table(path, self.cache_dir) or make_table(path, self.cache_dir)
+        first, _ = _block_frames(table, _frame_at(ref, table, str(path)))
+        return f"{ref.log_id}@{table.start_ms[first] / 1000:g}s"
+
+    def split_of(self, log_id: str) -> str:
+        """train, val or test: as the settings say, else by the filter's name, the folder's, the log's hash."""
+        if self.split is not None:
+            return self.split
+        folder = self.root.parent if self.root.suffix == ".pkl" else self.root
+        names = [self.selection.name] if self.selection else []
+        for name in (*names, folder.name):
+            for begins, split in SPLIT_OF.items():
+                if name.startswith(begins):
+                    return split
+        return split_of(log_id)
+
+    def _chosen(self) -> dict[str, Path]:
+        """The logs that the settings and the scene filter name. Raises ValueError where none of them is here."""
+        logs = self.logs()
+        if unknown := [log_id for log_id in self.only if log_id not in logs]:
+            raise ValueError(f"clips.only: no log {', '.join(unknown)} under {self.root}; there are {', '.join(logs)}")
+        chosen = {log_id: logs[log_id] for log_id in logs if not self.only or log_id in self.only}
+        named = self.choice.scene_filter.log_names if self.choice.scene_filter else None
+        if named is None:
+            return chosen
+        wanted = frozenset(named)
+        chosen = {log_id: path for log_id, path in chosen.items() if log_id in wanted}
+        if not chosen:
+            raise ValueError(f"{self.root}: none of the {len(wanted)} logs that the scene filter names is here")
+        return chosen
+
+    def _tables(self, logs: Mapping[str, Path]) -> Iterable[tuple[str, FrameTable | BadClip]]:
+        """The table of each log, or what is wrong with it; what takes long is told on stderr."""
+        began, made, told = time.monotonic(), 0, 0.0
+        for i, (log_id, path) in enumerate(logs.items(), start=1):
+            try:
+                table = kept_table(path, self.cache_dir)
+                if table is None:
+                    table = make_table(path, self.cache_dir)
+                    made += 1
+            except BadClip as error:
+                yield log_id, error
+                continue
+            took = time.monotonic() - began
+            if made and took - told > TELL_AFTER_S:
+                left = time_text(took / made * (len(logs) - i))
+                print(f"navsim: log {i} of {len(logs)} listed, once for all runs  ETA {left}", file=sys.stderr)
+                told = took
+            yield log_id, table
+
+    def _path_of(self, ref: ClipRef) -> Path:
+        path = self.logs().get(ref.log_id)
+        if path is None or ref.dataset != self.name:
+            raise BadClip(str(self.root), "log_id", f"no log {ref.log_id} of data set {ref.dataset} here")
+        return path
+
+    def _open(self, ref: ClipRef) -> OpenLog:
+        if ref.log_id not in self._logs:
+            path = self._path_of(ref)
+            data = bytes_of(path)
+            log = frames_of(load_plain(data, str(path)), path)
+            opened = OpenLog(log, table_of(log), _digest(data))
+            self._logs = dict([*self._logs.items(), (ref.log_id, opened)][-CACHED_LOGS:])
+        return self._logs[ref.log_id]
+
+    def _road(self, log: LogFrames, now: int, along_xy: Array, pose: Array) -> tuple[RoadMap, Route]:
+        """The map around the window's drive and along its route, and the route at frame `now`. Raises BadClip.
+
+        Lights count on the lanes of the log's own roadblocks, before the route is mended: the public metric cache
+        gathers the one and the other so (metric_cache_processor.py, `_load_route_dicts` and `_build_pdm_observation`).
+        """
+        frame = log.frames[now]
+        city = open_city(self.maps, frame.map_location)
+        blocks = city.roadblocks
+        try:
+            passed = corrected_roadblocks(blocks, frame.roadblock_ids, pose)
+            own = [block for block in frame.roadblock_ids if block in blocks.lanes_of]
+            lit = frozenset(lane_id for block in own for lane_id in blocks.lanes_of[block])
+            along = [lane_id for block in passed for lane_id in blocks.lanes_of.get(block, ())]
+            road_map = city.road_map(along_xy, MAP_RADIUS_M, along)
+            return road_map, replace(route_of_roadblocks(road_map, frame.roadblock_ids, pose, blocks), lit_lane_ids=lit)
+        except NoRoute as error:
+            raise BadClip(log.file, f"frames[{now}].roadblock_ids", str(error)) from error
+
+    def _block(self, opened: OpenLog, start: int) -> Block:
+        """Up to 20 s that begin at a multiple of 10 s of the stretch and hold the window."""
+        assert self.sensors is not None
+        first, stop = _block_frames(opened.table, start)
+        frames = opened.log.frames[first:stop]
+        blobs = blobs_of(frames, self.sensors)
+        start_s = float(opened.table.start_ms[first]) / 1000
+        return Block(start_s, stretch_agents(frames), blobs.images, blobs.sweeps)
+
+
+def log_files(root: Path) -> dict[str, Path]:
+    """Log id -> pickle, sorted by id: of one log, or of a folder of them. Raises ValueError where there is none."""
+    if root.is_file() and root.suffix == ".pkl":
+        return {root.stem: root}
+    if not root.is_dir():
+        raise ValueError(f"{root}: no such folder or .pkl file; clips.root is navsim_logs/<split>, or one log of it")
+    files = {path.stem: path for path in sorted(root.glob("*.pkl"))}
+    if not files:
+        splits = sorted(path.parent.name for path in root.glob("*/*.pkl"))
+        hint = f"; its folders {', '.join(dict.fromkeys(splits))} have some" if splits else ""
+        raise ValueError(f"{root}: no log here; expected <log>.pkl files, as in navsim_logs/<split>{hint}")
+    return files
+
+
+def _digest(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+def _frame_at(ref: ClipRef, table: FrameTable, file: str) -> int:
+    """The frame at which the clip begins. Raises BadClip where none begins there, or it would leave its stretch."""
+    (found,) = np.nonzero(table.start_ms == ref.start_ms)
+    start = int(found[0]) if len(found) else -1
+    stretch = table.stretch
+    if start < 0 or start + WINDOW_FRAMES > len(table) or stretch[start] != stretch[start + WINDOW_FRAMES - 1]:
+        raise BadClip(file, "start_ms", f"no window of {ref.window} starts at {ref.start_ms} ms")
+    return start
+
+
+def _block_frames(table: FrameTable, start: int) -> tuple[int, int]:
+    """The frames first..stop-1 of the block of the window that begins at frame `start`."""
+    (stretch,) = np.nonzero(table.stretch == table.stretch[start])
+    first = int(stretch[0]) + (start - int(stretch[0])) // BLOCK_STRIDE_FRAMES * BLOCK_STRIDE_FRAMES
+    return first, min(first + BLOCK_FRAMES, int(stretch[-1]) + 1)
