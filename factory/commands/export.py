@@ -72,6 +72,8 @@ class Request:
             raise ValueError("sample= and every= are of single files; navsim takes expert=, round= and split=")
         if self.to == ".":
             raise ValueError("to=<folder> is missing: where logs, pictures, splits and rewards are written")
+        if "://" in self.to:
+            raise ValueError(f"to={self.to}: is written to a local folder; copy that")
         if self.workers == 0:
             raise ValueError("workers=0: must be 1 or more")
         if odd := [word for word in self.round if not (word.isascii() and word.isdecimal())]:

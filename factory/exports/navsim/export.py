@@ -5,7 +5,7 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from io import BytesIO
 from pathlib import Path
@@ -32,10 +32,15 @@ from factory.store.table import KeyedTable, open_parquet
 from factory.wording import rate_text, time_text
 from tasks.world.arrays import Array
 
-PLANNED = (*NAMING, "attempt_id", "settings_hash", "stage_versions", "split", "map_location", "label_vocabulary")
-PLANNED += ("licence", "label_traffic")
-DRAWN = ("command", "image_source", "cameras", "light_lane_ids", "light_states", "route_roadblock_ids", "agent_ids")
-DRAWN += ("agent_kinds", "agent_boxes", "agent_velocities", "agent_valid", "agent_heights", "agent_center_z")
+PLANNED = (
+    *(*NAMING, "attempt_id", "settings_hash", "stage_versions", "split", "map_location"),
+    *("licence", "label_vocabulary", "label_traffic"),
+)
+KEPT = ("attempt_id", "candidate_index", "expert", "round", "licence", "label_vocabulary", "label_traffic")
+DRAWN = (
+    *("command", "image_source", "cameras", "light_lane_ids", "light_states", "route_roadblock_ids", "agent_ids"),
+    *("agent_kinds", "agent_boxes", "agent_velocities", "agent_valid", "agent_heights", "agent_center_z"),
+)
 SAY_EVERY_S = 10.0
 Say = Callable[[str], None]
 
@@ -58,10 +63,10 @@ class Planned:
     log: str
     token: str
     made_of: str
-    row: Sample = field(repr=False)  # its columns PLANNED
-    path: str = ""
-    group: int = 0
-    number: int = 0
+    row: Sample = field(repr=False)  # its columns PLANNED, then KEPT alone
+    path: str  # of its file,
+    group: int  # its row group there,
+    number: int  # and its place in that
 
     @property
     def key(self) -> tuple[str, str]:
@@ -129,7 +134,8 @@ def plan(table: KeyedTable, settings: ExportSettings) -> dict[tuple[str, str], P
                 f"samples {other} and {row['attempt_id']} would both be {sample.token} of {sample.split.folder}: two "
                 "clips of one log at one time"
             )
-        found[sample.key], tokens[here] = sample, row["attempt_id"]
+        kept = replace(sample, row={name: row[name] for name in KEPT})
+        found[sample.key], tokens[here] = kept, row["attempt_id"]
     if not found:
         chosen = {"expert": settings.experts, "round": settings.rounds, "split": settings.splits}
         asked = ", ".join(f"{name}={','.join(map(str, values))}" for name, values in chosen.items() if values)

@@ -18,8 +18,10 @@ from tasks.world.vehicle import AX, AY, EGO_STATE_SIZE, HEADING, VX, VY, YAW_RAT
 STEPS_PER_FRAME = 5
 INSTANTS = np.arange(0, AGENT_STEPS, STEPS_PER_FRAME)  # of a row's 56 steps
 DRIVEN = slice(HORIZON_STEPS - NOW_INDEX, HORIZON_STEPS, STEPS_PER_FRAME)  # of perturbed_states, before now
-MOTION = ("ego_history_10hz", "label_10hz", "now_pose", "world_from_ego", "perturbed_states", "ego_status")
-MOTION += ("parent_states", "images")
+MOTION = (
+    *("ego_history_10hz", "label_10hz", "now_pose", "world_from_ego", "perturbed_states", "ego_status"),
+    *("parent_states", "images"),
+)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import hashlib
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 from tasks.world.clip import HORIZON_STEPS, STEP_S
@@ -100,13 +101,17 @@ class SplitNames:
 
 
 def split_names(row: Mapping[str, Any], tag: str = "") -> SplitNames:
-    """Of a row with the columns NAMING. The rewards' file is always named 16384, whatever K is (gtrs_agent.py:231)."""
-    expert = RELEASED.get(row["expert"], str(row["expert"]))
-    who = f"{expert}_{tag}" if tag else expert
-    if not is_simulated(row):
+    """Of a row with the columns NAMING. The rewards' file is always named 16384, whatever K is (gtrs_agent.py:232)."""
+    return _split_names(str(row["expert"]), int(row["round"]), is_simulated(row), tag)
+
+
+@cache
+def _split_names(expert: str, round_: int, simulated: bool, tag: str) -> SplitNames:
+    who = RELEASED.get(expert, expert) + (f"_{tag}" if tag else "")
+    if not simulated:
         name = f"navtrain_{who}"
         return SplitNames(name, name, f"default_log_split_{name}", f"ori/{name}_16384.pkl")
-    name = f"{who}_v1.0-{int(row['round'])}"
+    name = f"{who}_v1.0-{round_}"
     return SplitNames(
         f"synthetic_reaction_{name}",
         f"navtrain_reaction_{name}",

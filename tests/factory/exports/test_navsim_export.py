@@ -306,6 +306,7 @@ def test_two_samples_of_one_name_are_refused(tmp_path: Path) -> None:
         (["split=night"], "split: train, val"),
         (["sample=0"], "navsim takes expert="),
         (["to=."], "to=<folder> is missing"),
+        (["to=s3://bucket/folder"], "to a local folder"),
         (["workers=0"], "must be 1 or more"),
         (["tag=a-b"], "letters, digits and _"),
         (["missing=white"], "one of refuse, black, none"),
