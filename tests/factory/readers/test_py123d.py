@@ -254,7 +254,7 @@ def test_a_phase_lasts_until_the_next_frame_and_the_stricter_of_two_counts(tmp_p
     green, yellow, red, off = 0, 1, 2, 3
     stamps = START_NS // 1000 + np.array([0, 500_000, 1_000_000])
     rows = np.array([0, 0, 0, 1, 2, 2])
-    write_lights(folder, stamps, rows, [2, 2, 77, 2, 2, 2], [green, red, red, yellow, off, green])
+    write_lights(folder, stamps, rows, [2, 2, 77, 2, 2, 2], [red, green, red, yellow, off, green])
     reader = Py123dReader(folder)
     lights = reader.read(reader.index().refs[0]).lights
     assert lights.lane_ids == ("2",), "77 is on no map"
