@@ -86,10 +86,10 @@ def read_map(path: Path, source: Source, drive: Array) -> RoadMap:
         )
         for lane_id, lane in raw.items()
     }
-    own = tuple(_polygons(objects, INTERSECTION, "int", MapLayer.INTERSECTION)) if source.own_intersections else None
+    own = tuple(_layer(objects, INTERSECTION, "int", MapLayer.INTERSECTION)) if source.own_intersections else None
     return RoadMap(
         lanes=lanes,
-        drivable_areas=_drivable_areas(objects, source, lanes),
+        drivable_areas=_drivable_areas(objects, source, junction, lanes),
         crossings=tuple(
             _exterior(objects, row, part) for row in objects.rows(CROSSWALK) for part in _parts(objects, row)
         ),
@@ -148,14 +148,20 @@ def _centerline(objects: MapObjects, lane: RawLane, content: Mapping[str, Any], 
     return centerline_from_boundaries(*sides)
 
 
-def _drivable_areas(objects: MapObjects, source: Source, lanes: Mapping[str, Lane]) -> tuple[MapPolygon, ...]:
-    """The data set's own surfaces; the union of its lanes where it has none (Waymo's driveways lead off the road)."""
-    areas = list(_polygons(objects, GENERIC_DRIVABLE, "da", MapLayer.DRIVABLE_AREA))
+def _drivable_areas(
+    objects: MapObjects, source: Source, junction: set[str], lanes: Mapping[str, Lane]
+) -> tuple[MapPolygon, ...]:
+    """The data set's own surfaces; the union of its lanes where it has none (Waymo's driveways lead off the road).
+
+    Groups within a junction are no surface: its intersection is (docs/reward.md 2a).
+    """
+    areas = list(_layer(objects, GENERIC_DRIVABLE, "da", MapLayer.DRIVABLE_AREA))
+    roadblocks = [row for row in objects.rows(LANE_GROUP) if objects.ids[row] not in junction]
     if source.own_roadblocks:
-        areas += _polygons(objects, LANE_GROUP, "rb", MapLayer.ROADBLOCK)
+        areas += [area for row in roadblocks for area in _polygons(objects, row, "rb", MapLayer.ROADBLOCK)]
     if not areas:
         areas += paved_areas([Polygon(lane.ring) for lane in lanes.values() if lane.drives_cars])
-    return (*areas, *_polygons(objects, CARPARK, "cp", MapLayer.CARPARK_AREA))
+    return (*areas, *_layer(objects, CARPARK, "cp", MapLayer.CARPARK_AREA))
 
 
 def _roadblocks(path: Path, contents: Mapping[str, Mapping[str, Any]], lanes: Mapping[str, Lane]) -> dict[str, str]:
@@ -169,10 +175,14 @@ def _roadblocks(path: Path, contents: Mapping[str, Mapping[str, Any]], lanes: Ma
     return blocks
 
 
-def _polygons(objects: MapObjects, layer: int, prefix: str, as_layer: MapLayer) -> Iterator[MapPolygon]:
+def _layer(objects: MapObjects, layer: int, prefix: str, as_layer: MapLayer) -> Iterator[MapPolygon]:
     for row in objects.rows(layer):
-        for part, (ring, holes) in enumerate(_rings(objects, row)):
-            yield MapPolygon(f"{prefix}_{objects.ids[row]}" + f"_{part}" * bool(part), as_layer, ring, holes)
+        yield from _polygons(objects, row, prefix, as_layer)
+
+
+def _polygons(objects: MapObjects, row: int, prefix: str, as_layer: MapLayer) -> Iterator[MapPolygon]:
+    for part, (ring, holes) in enumerate(_rings(objects, row)):
+        yield MapPolygon(f"{prefix}_{objects.ids[row]}" + f"_{part}" * bool(part), as_layer, ring, holes)
 
 
 def _parts(objects: MapObjects, row: int) -> list[Polygon]:

@@ -38,8 +38,9 @@ _AV2 = (
 # Kind by label number, of the classes in py123d/parser/registry.py.
 KINDS_OF_LABELS: dict[str, tuple[AgentKind, ...]] = {
     "AV2SensorBoxDetectionLabel": tuple(KIND_OF_CATEGORY[name] for name in _AV2.split()),
-    "NuPlanBoxDetectionLabel": (
-        *(_CAR, _BICYCLE, _WALKER, AgentKind.TRAFFIC_CONE, AgentKind.BARRIER, AgentKind.CZONE_SIGN, _THING),
+    "NuPlanBoxDetectionLabel": tuple(
+        AgentKind[name]
+        for name in ["VEHICLE", "BICYCLE", "PEDESTRIAN", "TRAFFIC_CONE", "BARRIER", "CZONE_SIGN", "GENERIC_OBJECT"]
     ),
     "NuScenesBoxDetectionLabel": (
         *(_CAR,) * 8,  # car, truck, two buses, construction, ambulance, police, trailer
