@@ -143,7 +143,7 @@ def starting_lane(road_map: RoadMap, lane_ids: Sequence[str], pose: Array) -> st
     polygons = np.array([shapely.Polygon(road_map.lanes[lane_id].ring) for lane_id in lane_ids])
     inside = np.flatnonzero(shapely.intersects(polygons, shapely.Point(pose[:2])))
     if inside.size:
-        lines = [road_map.lanes[lane_ids[i]].centerline for i in inside]
+        lines = [road_map.lanes[lane_ids[i]].centerline for i in inside.tolist()]
         return lane_ids[int(inside[np.argmin([_nearest(line, pose)[1] for line in lines])])]
     forward, left = np.array([np.cos(pose[2]), np.sin(pose[2])]), np.array([-np.sin(pose[2]), np.cos(pose[2])])
     center = pose[:2] + PACIFICA.rear_axle_to_center * forward
