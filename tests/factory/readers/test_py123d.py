@@ -13,8 +13,6 @@ import shapely
 from factory.readers.av2.reader import AV2Reader
 from factory.readers.py123d.reader import Py123dReader
 from factory.readers.py123d.sources import KINDS_OF_LABELS
-from factory.readers.settings import TownSettings
-from factory.readers.town.write import write_logs
 from tasks.trajectories import score_trajectories
 from tasks.world.agents import AgentKind
 from tasks.world.clip import NOW, Clip
@@ -37,7 +35,6 @@ from tests.factory.readers.py123d_logs import (
 )
 from tests.factory.readers.test_av2 import SPEED, START_NS, road, write_log, write_table
 
-BLIND = TownSettings(cameras=(), lidar_beams=0)
 NUPLAN = Made("nuplan", "nuplan_val", location="us-ma-boston", map_is_per_log=False, labels="NuPlanBoxDetectionLabel")
 NUPLAN = replace(NUPLAN, label_of={"REGULAR_VEHICLE": 0, "CONSTRUCTION_CONE": 3})
 WAYMO = Made("wod-perception", "wod-perception_train", location=None, labels="WODPerceptionBoxDetectionLabel")
@@ -45,15 +42,15 @@ WAYMO = replace(WAYMO, label_of={"REGULAR_VEHICLE": 1, "CONSTRUCTION_CONE": 3})
 
 
 @pytest.fixture(scope="module")
-def crossroads(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The town's signalised crossroads as an Argoverse 2 log."""
-    return write_logs(tmp_path_factory.mktemp("town") / "train", [1], 0, BLIND)[0]
+def street(small_town: Path) -> Path:
+    """A signalised street of the town as an Argoverse 2 log."""
+    return next(folder for folder in sorted(small_town.iterdir()) if folder.is_dir())
 
 
 @pytest.fixture(scope="module")
-def pair(crossroads: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Clip, Clip]:
+def pair(street: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Clip, Clip]:
     """A clip of it as its own reader and as the reader of 123D's files has it."""
-    return clips(crossroads, tmp_path_factory.mktemp("123d"))
+    return clips(street, tmp_path_factory.mktemp("123d"))
 
 
 def clips(log: Path, root: Path, made: Made | None = None) -> tuple[Clip, Clip]:
@@ -130,8 +127,8 @@ def test_plans_score_the_same_through_123d(pair: tuple[Clip, Clip]) -> None:
         assert np.array_equal(getattr(native, name), getattr(through, name)), name
 
 
-def test_keyframes_of_2_hz_become_10_hz(crossroads: Path, tmp_path: Path) -> None:
-    native, through = clips(crossroads, tmp_path, Made(every=5))
+def test_keyframes_of_2_hz_become_10_hz(street: Path, tmp_path: Path) -> None:
+    native, through = clips(street, tmp_path, Made(every=5))
     moved = np.hypot(*(native.ego_states - through.ego_states)[:, :2].T)
     assert moved.max() < 0.05
     assert np.abs(native.ego_states - through.ego_states)[:, 3:5].max() < 0.15  # m/s
