@@ -129,7 +129,7 @@ def among(prepared: PreparedScene, objects: AgentTracks, ego_state0: Array | Non
 
 
 def _red_connectors(clip: Clip, step: int) -> tuple[tuple[str, ...], Bools]:
-    """Lane connectors whose light counts on the route, ids (L,), and where it is red in steps step .. step + 40, (41, L)."""
+    """Lane connectors whose light counts on the route, ids (L,), and where it is red from `step` on, (41, L)."""
     lights, lanes, route = clip.lights, clip.road_map.lanes, clip.route
     lit = route.lane_ids if route.lit_lane_ids is None else route.lit_lane_ids
     governed = [
