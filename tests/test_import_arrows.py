@@ -25,7 +25,7 @@ ROOMS = {
     ),
     "factory": (
         *("exits", "wording", "job", "readers.settings", "readers.town.settings", "config", "readers", "store"),
-        *("exports", "graph", "stages", "setup", "views", "views.board"),
+        *("exports", "graph", "stages", "setup", "imports", "views", "views.board"),
         *("run", "commands", "__main__"),
     ),
     "planners": ("command", "data", "models", "training", "evaluation", "navsim", "study", "__main__"),

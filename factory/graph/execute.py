@@ -158,7 +158,7 @@ def execute(
     )
     if began_ms or code:
         try:
-            _record(store, summary)
+            record_summary(store, summary)
         except OSError as error:  # the same disk or share
             summary.exit_code = INTERRUPTED
             summary.disk_full = summary.disk_full or isinstance(error, DiskFull)
@@ -223,7 +223,7 @@ def _announce(store: Store, plan: RunPlan, experts: Sequence[str], rounds: int, 
     return began_ms
 
 
-def _record(store: Store, summary: RunSummary) -> None:
+def record_summary(store: Store, summary: RunSummary) -> None:
     """last_run.json: what the newest run that did anything did, for people and reports."""
     document = {
         "began_ms": summary.began_ms,

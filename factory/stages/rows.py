@@ -53,11 +53,11 @@ def sample_row(clip: Clip, candidate: Candidate | None, judged: Judged) -> dict[
         "proposal_10hz": None if human else to_local(pose, judged.plan.poses),
         "perturbed_states": None if candidate is None else candidate.rollout.ego_states,
         "candidate_end": None if candidate is None else np.append(candidate.end_pose, end_speed_mps(candidate)),
-        **_agents(scene.agents.overwritten(scene.step, judged.rollout.agents), scene.step, pose),
-        **_map(scene, pose),
+        **agent_columns(scene.agents.overwritten(scene.step, judged.rollout.agents), scene.step, pose),
+        **map_columns(scene, pose),
         **({} if candidate is None else score_columns("stage1", candidate.reactive_scores)),
         **score_columns("stage2", judged.scores),
-        "tags": _tags(scene, command),
+        "tags": scene_tags(scene, command),
     }
 
 
@@ -84,7 +84,8 @@ def score_columns(prefix: str, scores: Scores, row: int = 1) -> dict[str, object
     return columns
 
 
-def _agents(tracks: AgentTracks, now: int, pose: Array) -> Mapping[str, object]:
+def agent_columns(tracks: AgentTracks, now: int, pose: Array) -> Mapping[str, object]:
+    """Tracks from 1.5 s before step `now` to 4 s after it in the frame of `pose`, without those that never are there."""
     window = tracks.window(now - NOW_INDEX, now - NOW_INDEX + AGENT_STEPS)
     seen = np.flatnonzero(window.valid.any(axis=0))
     boxes = window.boxes[:, seen].copy()
@@ -107,7 +108,8 @@ def _agents(tracks: AgentTracks, now: int, pose: Array) -> Mapping[str, object]:
     }
 
 
-def _map(scene: Scene, pose: Array) -> Mapping[str, object]:
+def map_columns(scene: Scene, pose: Array) -> Mapping[str, object]:
+    """What of the map is near, the lights of its lanes and the route, in the frame of `pose`."""
     road_map, clip = scene.clip.road_map, scene.clip
 
     def near(line: Array) -> bool:
@@ -154,7 +156,7 @@ def _encloses(ring: Array, pose: Array) -> bool:
     return bool((at_x > 0).sum() % 2)
 
 
-def _tags(scene: Scene, command: str) -> list[str]:
+def scene_tags(scene: Scene, command: str) -> list[str]:
     """What is in the scene, for filters and weights."""
     pose, now = scene.ego_state[: HEADING + 1], scene.agents.window(scene.step, scene.step + 1)
     distance = np.where(now.valid[0], np.hypot(*(now.boxes[0, :, :2] - pose[:2]).T), np.inf)

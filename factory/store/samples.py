@@ -25,6 +25,7 @@ from factory.store.table import KeyedTable, Shard, write_shard
 OnChange = Literal["stop", "keep", "redo"]
 RUN_FILE = "run.json"
 CURRENT_RUN = "current_run.json"  # what the newest run set out to do; over once last_run.json has its began_ms
+IMPORTED = "import.source"  # a setting that tables of others' rows have, and no run
 WAYS_OUT = "Go on with on_change=keep, replace with on_change=redo, or choose another out"
 STATE = ["attempt_id", "clip_id", "expert", "expert_digest", "candidate_index", "settings_hash", "stage_versions"]
 MADE_UNDER = ["attempt_id", "expert", "expert_digest", "settings_hash", "stage_versions"]

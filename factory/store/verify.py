@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import pyarrow.compute as pc
 
 from factory.store.episodes import FOLDER, check_episode, episode_name
-from factory.store.samples import Store
+from factory.store.samples import IMPORTED, Store
 from factory.store.table import KeyedTable, read_parquet
 
 
@@ -74,10 +74,12 @@ def _twice(store: Store) -> list[str]:
 
 
 def _broken_rounds(store: Store) -> list[str]:
-    """Rounds of a walk count 0, 1, 2 ... in the order of its candidates."""
+    """Rounds of a walk count 0, 1, 2 ... in the order of its candidates. Of imported rows they are their source's."""
+    imported = {run["settings_hash"] for run in store.runs() if IMPORTED in run["settings"]}
     walks: dict[tuple[str, str], list[tuple[int, int]]] = defaultdict(list)
-    for row in store.samples.read(["clip_id", "expert", "candidate_index", "round"]).to_pylist():
-        walks[row["clip_id"], row["expert"]].append((row["candidate_index"], row["round"]))
+    for row in store.samples.read(["clip_id", "expert", "candidate_index", "round", "settings_hash"]).to_pylist():
+        if row["settings_hash"] not in imported:
+            walks[row["clip_id"], row["expert"]].append((row["candidate_index"], row["round"]))
     return [
         f"samples: clip {clip_id}, expert {expert}: candidates and rounds {sorted(rows)}"
         for (clip_id, expert), rows in sorted(walks.items())

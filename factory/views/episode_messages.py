@@ -250,7 +250,7 @@ def _lines(
 ) -> SceneEntity:
     """x, y of lines at the ground, in the frame `now`."""
     entity = SceneEntity(timestamp=_stamp(time_ns), frame_id=NOW, id=name)
-    for points in lines:
+    for points in (line for line in lines if len(line)):  # a sample without a map has an empty route
         line = entity.lines.add(type=LinePrimitive.Type.LINE_LOOP if closed else LinePrimitive.Type.LINE_STRIP)
         line.pose.orientation.w = 1.0
         line.thickness = thickness_m

@@ -1,0 +1,1 @@
+"""Other people's samples and benchmarks as tables of ours."""

@@ -1,0 +1,190 @@
+"""NAVSIM's frames as a scene and as columns of a sample: a drive that others made, looked at as a log of its own.
+
+The fourth frame is T, and now. What lies beyond the last frame is unknown: the ego's states are NaN there, and nobody
+else is there. Between two frames everything is as `factory.readers.navsim.tracks` says, what the public code makes of
+it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from factory.readers.base import BadClip
+from factory.readers.navsim.log import Frame
+from factory.readers.navsim.rig import blobs_of, rig_of
+from factory.readers.navsim.tracks import (
+    FRAMES_BEFORE,
+    WINDOW_FRAMES,
+    ego_states,
+    lights,
+    window_agents,
+    world_from_ego,
+)
+from factory.stages.rows import agent_columns, map_columns, scene_tags
+from tasks.render.settings import ImageSource
+from tasks.world.agents import PER_STEP, AgentTracks
+from tasks.world.arrays import Array
+from tasks.world.clip import CLIP_STEPS, HISTORY_STEPS, HORIZON_STEPS, NOW, STEP_S, Clip, Scene, scene_of_clip
+from tasks.world.frames import to_local
+from tasks.world.lanes import LightState, RoadMap, Route, TrafficLights
+from tasks.world.vehicle import AX, AY, EGO_STATE_SIZE, HEADING, VX, VY
+
+HISTORY_FRAMES = FRAMES_BEFORE + 1  # now among them
+SCENE_FRAMES = HISTORY_FRAMES + 8  # with the 4 s that are driven
+COARSE_STEPS = 5  # between two frames
+
+
+@dataclass(frozen=True)
+class RoadAhead:
+    """The map around a scene and the way through it."""
+
+    road_map: RoadMap
+    route: Route
+    centerline: Array  # (P, 3) from the lane of the pose at T along the route
+
+
+@dataclass(frozen=True)
+class Origin:
+    """What a scene is called, and what it was read from."""
+
+    file: str  # named in errors
+    clip_id: str
+    dataset: str
+    log_id: str
+    split: str
+    licence: str
+    content_digest: str
+    frame_tokens: tuple[str, str] | None
+
+
+def no_road(frame: Frame) -> RoadAhead:
+    """Where there are no maps: the route is known by its roadblocks alone."""
+    route = Route((), frame.roadblock_ids, frozenset())
+    return RoadAhead(RoadMap({}, (), location=frame.map_location), route, np.zeros((0, 3)))
+
+
+def scene_of(frames: Sequence[Frame], road: RoadAhead, origin: Origin) -> Scene:
+    """The scene at T of 4 to 12 frames that are 0.5 s apart."""
+    assert HISTORY_FRAMES <= len(frames) <= SCENE_FRAMES
+    states, space = ego_states(frames), world_from_ego(frames)
+    known = len(states)
+    after = ((0, CLIP_STEPS - known), (0, 0))
+    clip = Clip(
+        clip_id=origin.clip_id,
+        dataset=origin.dataset,
+        log_id=origin.log_id,
+        split=origin.split,
+        start_s=0.0,
+        ego_states=np.pad(states, after, constant_values=np.nan).reshape(CLIP_STEPS, EGO_STATE_SIZE),
+        world_from_ego=np.concatenate([space, np.repeat(space[-1:], CLIP_STEPS - known, axis=0)]),
+        agents=_agents(frames, known),
+        road_map=road.road_map,
+        route=road.route,
+        centerline=road.centerline,
+        lights=_lights(frames, tuple(road.road_map.lanes)),
+        licence=origin.licence,
+        frame_tokens=origin.frame_tokens,
+        content_digest=origin.content_digest,
+    )
+    return scene_of_clip(clip)
+
+
+def _agents(frames: Sequence[Frame], known: int) -> AgentTracks:
+    """96 steps, of which the first `known` are of frames: later ones stand in for a window that nobody annotated."""
+    unseen = replace(frames[-1], boxes=None)
+    agents = window_agents([*frames, *[unseen] * (WINDOW_FRAMES - len(frames))])
+    parts = {name: getattr(agents, name).copy() for name in PER_STEP}
+    for name, part in parts.items():
+        part[known:] = False if name == "valid" else np.nan
+    return replace(agents, **parts)
+
+
+def _lights(frames: Sequence[Frame], lane_ids: Sequence[str]) -> TrafficLights:
+    """96 steps, unknown after the last frame."""
+    found = lights(frames, lane_ids)
+    after = ((0, CLIP_STEPS - len(found.states)), (0, 0))
+    return replace(found, states=np.pad(found.states, after, constant_values=LightState.UNKNOWN))
+
+
+def world_columns(scene: Scene, command: str) -> dict[str, object]:
+    """A row's columns but label, scores, pictures, vocabulary labels and bookkeeping; command: as the log says it."""
+    clip, pose = scene.clip, scene.ego_state[: HEADING + 1]
+    history = scene.ego_history[:, : HEADING + 1]
+    return {
+        "clip_id": clip.clip_id,
+        "dataset": clip.dataset,
+        "log_id": clip.log_id,
+        "split": clip.split,
+        "clip_start_s": clip.start_s,
+        "now_s": HISTORY_STEPS * STEP_S,
+        "content_digest": clip.content_digest,
+        "licence": clip.licence,
+        "frame_tokens": None if clip.frame_tokens is None else list(clip.frame_tokens),
+        "now_pose": pose,
+        "world_from_ego": clip.world_from_ego[NOW],
+        "ego_history_10hz": to_local(pose, history),
+        "ego_history_2hz": to_local(pose, history[::COARSE_STEPS]),
+        "ego_status": scene.ego_state[[VX, VY, AX, AY]],
+        "command": command,
+        **agent_columns(scene.agents, scene.step, pose),
+        **map_columns(scene, pose),
+        "tags": scene_tags(scene, command),
+    }
+
+
+def logged_label(scene: Scene) -> dict[str, object]:
+    """The columns that hold the drive from T on, of a scene whose 12 frames hold it."""
+    pose, states = scene.ego_state[: HEADING + 1], scene.clip.ego_states[NOW : NOW + HORIZON_STEPS + 1]
+    label = to_local(pose, states[1:, : HEADING + 1])
+    return {
+        "label_10hz": label,
+        "label_2hz": label[COARSE_STEPS - 1 :: COARSE_STEPS],
+        "parent_states": states[[0, HORIZON_STEPS]],
+    }
+
+
+def pictures(frames: Sequence[Frame], folder: Path, source: ImageSource, file: str) -> dict[str, object]:
+    """The columns of the pictures of frames that end now: the files' own bytes, with the rig of now. Raises BadClip.
+
+    file: whose frames they are, named where they have none.
+    """
+    images = blobs_of(frames, folder).images
+    if not images:
+        raise BadClip(file, "cams", f"none of its pictures is in {folder}; pictures=false imports it without")
+    now_s = (len(frames) - 1) * COARSE_STEPS * STEP_S
+    return {
+        "cameras": [
+            {
+                "name": camera.name,
+                "width": camera.width,
+                "height": camera.height,
+                "intrinsics": camera.intrinsics.ravel(),
+                "distortion": camera.distortion,
+                "ego_from_camera": camera.ego_from_camera.ravel(),
+            }
+            for camera in rig_of(frames[-1], images, file)
+        ],
+        "images": [
+            {
+                "camera": image.sensor,
+                "time_s": image.time_s - now_s,
+                "ego_pose": image.world_from_ego.ravel(),
+                "jpeg": _jpeg(Path(image.uri)),
+            }
+            for image in images
+        ],
+        "image_source": str(source),
+    }
+
+
+def _jpeg(path: Path) -> bytes:
+    """A whole file. Raises BadClip where it is no JPEG or is cut off."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise BadClip(str(path), "image", f"cannot be read: {error.strerror}") from error
+    if not data.startswith(b"\xff\xd8") or b"\xff\xd9" not in data[-64:]:
+        raise BadClip(str(path), "image", f"{len(data)} bytes that are no whole JPEG")
+    return data

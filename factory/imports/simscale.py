@@ -1,0 +1,177 @@
+"""SimScale's released layout as samples: a row for each log of 12 frames, as the public code reads it.
+
+What a row is. `now` is the log's fourth frame, and the row's own log is the simulated one: `parent_states` are its ego
+at T and T+H, `now_s` is 1.5. Label and history at 2 Hz are the frames', at 10 Hz linear between them. Pictures are the
+files' own bytes. What the release does not hold stays null: scores, perturbation, what the expert asked for.
+"""
+
+import re
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from hashlib import sha256
+from itertools import pairwise
+from pathlib import Path
+
+from factory.imports.labels import vocabulary_labels
+from factory.imports.scenes import (
+    HISTORY_FRAMES,
+    SCENE_FRAMES,
+    Origin,
+    RoadAhead,
+    logged_label,
+    pictures,
+    scene_of,
+    world_columns,
+)
+from factory.imports.table import Entry
+from factory.readers.base import BadClip
+from factory.readers.navsim.log import Frame, bytes_of, frames_of
+from factory.readers.navsim.rewards import RewardFile
+from factory.readers.restricted_pickle import load_plain
+from factory.stages.imaging import NO_IMAGES
+from factory.stages.rows import label_columns
+from tasks.render.settings import ImageSource
+from tasks.world.vocabulary import Vocabulary
+
+DATASET = "simscale"
+LICENCE = "CC BY-NC-SA 4.0 (SimScale, of nuPlan)"
+FOLDER = re.compile(r"[a-z]+_reaction_(?P<who>[A-Za-z0-9_-]+)_v1\.0-(?P<round>\d+)")
+LOG = re.compile(r"(?P<log>.+)-(?P<seed>[0-9a-f]{16})-(?P<round>\d{3})")
+TOKEN = re.compile(r"(?P<frame>[0-9a-f]{16})-(?P<round>\d{3})")
+REWARDS = re.compile(r"sim[a-z]+_\d+_(?P<who>[A-Za-z0-9_-]+)_v1\.0-(?P<round>\d+)\.pkl")
+EXPERTS = {"pdm": "pdm_closed"}  # SimScale's name of an expert -> ours, where they differ
+FRAME_US, SLACK_US = 500_000, 50_000
+RoadOf = Callable[[Sequence[Frame], int, str], RoadAhead]  # frames, index of T, file
+
+
+@dataclass(frozen=True, order=True)
+class Part:
+    """The samples of one expert and round."""
+
+    name: str
+    logs: Path
+    blobs: Path
+    who: str  # as SimScale names the expert
+    round: int
+
+    @property
+    def expert(self) -> str:
+        return EXPERTS.get(self.who, self.who)
+
+
+def parts_of(root: Path, only: Collection[str] = ()) -> list[Part]:
+    """What lies under the root: as moved into NAVSIM's folders (tools/move.sh), or as unpacked.
+
+    Raises ValueError where there is none, or none of that name.
+    """
+    found = []
+    for name, logs, blobs in _folders(root):
+        named = FOLDER.fullmatch(name)
+        if named is not None:
+            found.append(Part(name, logs, blobs, named["who"], int(named["round"])))
+    if not found:
+        expected = "navsim_logs/synthetic_reaction_<expert>_v1.0-<k> with sensor_blobs/, or <name>/meta_datas"
+        raise ValueError(f"root={root}: nothing of SimScale's here; expected {expected}")
+    names = {part.name for part in found}
+    if unknown := sorted(set(only) - names):
+        raise ValueError(f"only={unknown[0]}: not under {root}; there are {', '.join(sorted(names))}")
+    return sorted(part for part in found if not only or part.name in only)
+
+
+def _folders(root: Path) -> Iterator[tuple[str, Path, Path]]:
+    for logs in sorted(root.glob("navsim_logs/*/")):
+        yield logs.name, logs, root / "sensor_blobs" / logs.name
+    for top in (root, root / "SimScale"):
+        for logs in sorted(top.glob("*/meta_datas/")):
+            yield logs.parent.name, logs, logs.parent / "sensor_blobs_hist"
+
+
+class Rewards:
+    """The reward files of a folder, or one of them, by expert; each is opened when the first token of it is wanted."""
+
+    def __init__(self, path: Path, vocabulary: Vocabulary) -> None:
+        """Raises ValueError where there is none."""
+        self.vocabulary = vocabulary
+        self._paths: dict[str, list[tuple[int, Path]]] = {}
+        for file in [path] if path.is_file() else sorted(path.rglob("*.pkl")):
+            named = REWARDS.fullmatch(file.name)
+            if named is not None:
+                self._paths.setdefault(named["who"], []).append((int(named["round"]), file))
+        if not self._paths:
+            raise ValueError(f"rewards={path}: no file simcale_<K>_<expert>_v1.0-<k>.pkl here")
+        self._open: dict[Path, RewardFile] = {}
+
+    def columns(self, part: Part, token: str) -> dict[str, object]:
+        """The label columns of a token; none where no file of its expert has it. Raises BadClip.
+
+        The file of the part's own round is asked first, then later ones: the release's may be of one round or of all.
+        """
+        later = sorted(entry for entry in self._paths.get(part.who, ()) if entry[0] >= part.round)
+        for _, path in later:
+            if path not in self._open:
+                self._open[path] = RewardFile(path)
+            if token in self._open[path]:
+                found, vocabulary = self._open[path][token], self.vocabulary
+                try:
+                    return label_columns(vocabulary_labels(found, vocabulary.digest, len(vocabulary)))
+                except ValueError as error:
+                    raise BadClip(str(path), f"[{token!r}]", str(error)) from error
+        return {}
+
+
+@dataclass(frozen=True)
+class Import:
+    """What is made of every log."""
+
+    road_of: RoadOf
+    pictures: bool = True
+    rewards: Rewards | None = None
+
+    def entries(self, parts: Sequence[Part]) -> list[Entry]:
+        """Every log of the parts, by the names of their files alone."""
+        return [self._entry(part, path) for part in parts for path in sorted(part.logs.glob("*.pkl"))]
+
+    def _entry(self, part: Part, path: Path) -> Entry:
+        named = LOG.fullmatch(path.stem)
+        log, seed = (named["log"], named["seed"]) if named else (path.stem, "")
+        clip_id = sha256("\x1f".join((DATASET, log, seed)).encode()).hexdigest()[:16]
+        make = partial(self.row, part, path, clip_id)
+        return Entry(clip_id, DATASET, log, part.expert, part.round, part.round, make)
+
+    def row(self, part: Part, path: Path, clip_id: str) -> dict[str, object]:
+        """The columns of one log's row. Raises BadClip."""
+        named = LOG.fullmatch(path.stem)
+        if named is None or int(named["round"]) != part.round:
+            expected = f"<log>-<token>-{part.round:03d}.pkl"
+            raise BadClip(str(path), "name", f"expected {expected}, as SimScale names the logs of {part.name}")
+        data = bytes_of(path)
+        frames = frames_of(load_plain(data, str(path)), path).frames
+        if len(frames) != SCENE_FRAMES:
+            raise BadClip(str(path), "frames", f"{len(frames)}, expected {SCENE_FRAMES}: 4 of history and 8 to come")
+        for i, (before, frame) in enumerate(pairwise(frames), 1):
+            if abs(frame.timestamp_us - before.timestamp_us - FRAME_US) > SLACK_US:
+                raise BadClip(str(path), f"frames[{i}].timestamp", "not 0.5 s after the frame before")
+            if frame.boxes is None:
+                raise BadClip(str(path), f"frames[{i}].anns", "missing")
+        at = HISTORY_FRAMES - 1
+        now = frames[at]
+        token = TOKEN.fullmatch(now.token)
+        if token is None:
+            raise BadClip(str(path), f"frames[{at}].token", f"is {now.token!r}, expected <16 hex digits>-00k")
+        origin = Origin(
+            file=str(path),
+            clip_id=clip_id,
+            dataset=DATASET,
+            log_id=named["log"],
+            split="train",
+            licence=LICENCE,
+            content_digest=sha256(data).hexdigest(),
+            frame_tokens=(named["seed"], token["frame"]),
+        )
+        scene = scene_of(frames, self.road_of(frames, at, str(path)), origin)
+        seen: dict[str, object] = dict(NO_IMAGES)
+        if self.pictures:
+            seen = pictures(frames[:HISTORY_FRAMES], part.blobs, ImageSource.RENDER, str(path))
+        labels = {} if self.rewards is None else self.rewards.columns(part, now.token)
+        return {**world_columns(scene, now.command), **logged_label(scene), **seen, **labels}
