@@ -85,7 +85,7 @@ def score_columns(prefix: str, scores: Scores, row: int = 1) -> dict[str, object
 
 
 def agent_columns(tracks: AgentTracks, now: int, pose: Array) -> Mapping[str, object]:
-    """Tracks from 1.5 s before step `now` to 4 s after it in the frame of `pose`, without those that never are there."""
+    """Tracks from 1.5 s before step `now` to 4 s after it, in the frame of `pose`; only those that are there."""
     window = tracks.window(now - NOW_INDEX, now - NOW_INDEX + AGENT_STEPS)
     seen = np.flatnonzero(window.valid.any(axis=0))
     boxes = window.boxes[:, seen].copy()

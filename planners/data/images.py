@@ -81,7 +81,7 @@ def stitch(jpegs: Sequence[Bytes], layout: ImageLayout, out: Bytes) -> None:
         pixels = cv2.imdecode(jpeg, RGB_AT[part.factor])
         if pixels is None or pixels.shape[:2] != part.decoded:
             raise ValueError("an image is not a JPEG that can be decoded")
-        _place(pixels, part, out)
+        _place(np.asarray(pixels, np.uint8), part, out)
 
 
 def stitch_pixels(images: Sequence[Bytes], layout: ImageLayout, out: Bytes) -> None:

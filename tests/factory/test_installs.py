@@ -68,7 +68,7 @@ def _modules(node: ast.AST, at_import: bool) -> Iterator[str]:
 
 @pytest.mark.parametrize(
     ("package", "extras"),
-    [("tasks", ("run",)), ("factory", ("run", "rerun", "gpu")), ("planners", ("planners", "wandb"))],
+    [("tasks", ("run",)), ("factory", ("run", "rerun", "gpu", "navsim")), ("planners", ("planners", "wandb"))],
 )
 def test_every_import_is_declared_where_it_belongs(package: str, extras: tuple[str, ...]) -> None:
     allowed = set().union(*map(declared, extras))

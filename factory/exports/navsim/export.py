@@ -46,7 +46,7 @@ Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
-class Group:
+class RowGroup:
     """One row group of the table, and which of its rows are wanted."""
 
     path: str
@@ -74,7 +74,7 @@ class Planned:
 
 
 @dataclass(frozen=True)
-class Summary:
+class ExportSummary:
     """What an export did."""
 
     written: int  # logs, by this call
@@ -90,7 +90,7 @@ def export(
     trajectories: Array | None = None,
     workers: int = 1,
     say: Say = print,
-) -> Summary:
+) -> ExportSummary:
     """Write all samples that `settings` choose below `to`; what a call before has written stays.
 
     trajectories (K, 40, 3): of the labels' vocabulary, where they are known. Raises CannotExport for samples that
@@ -147,7 +147,7 @@ def plan(table: KeyedTable, settings: ExportSettings) -> dict[tuple[str, str], P
     return found
 
 
-def write_group(table: Location, root: Path, settings: ExportSettings, group: Group) -> list[Written]:
+def write_group(table: Location, root: Path, settings: ExportSettings, group: RowGroup) -> list[Written]:
     """Write the logs and pictures of one row group's wanted rows; each pickle last. For worker processes."""
     columns = tuple(dict.fromkeys((*PLANNED, *MOTION, *DRAWN)))
     rows = read_rows(open_parquet(table, group.path), group.number, group.partition, columns)
@@ -185,7 +185,7 @@ def _write_logs(
     for sample in todo:
         wanted[sample.path, sample.group].append(sample.number)
     groups = [
-        Group(path, dict(live[path]), number, tuple(sorted(rows))) for (path, number), rows in sorted(wanted.items())
+        RowGroup(path, dict(live[path]), number, tuple(sorted(rows))) for (path, number), rows in sorted(wanted.items())
     ]
     work = partial(write_group, table.location, journal.root, settings)
     began = said = time.monotonic()
@@ -199,7 +199,9 @@ def _write_logs(
             say(f"{done:,} of {len(todo):,} logs, {rate_text(rate, ' logs')}, {left} left")
 
 
-def _each(work: Callable[[Group], list[Written]], groups: Sequence[Group], workers: int) -> Iterator[list[Written]]:
+def _each(
+    work: Callable[[RowGroup], list[Written]], groups: Sequence[RowGroup], workers: int
+) -> Iterator[list[Written]]:
     """Of each group as it is done, in this process or in others."""
     if workers == 1 or len(groups) < 2:
         yield from map(work, groups)
@@ -238,9 +240,9 @@ def _is_done(journal: Journal, trajectories: Array | None) -> bool:
     return bool(there) and asked <= there and all(journal.whole(file) for file in journal.files)
 
 
-def _summary(journal: Journal, written: int, facts: Mapping[str, Any], files: Sequence[File]) -> Summary:
+def _summary(journal: Journal, written: int, facts: Mapping[str, Any], files: Sequence[File]) -> ExportSummary:
     n_bytes = sum(file.bytes for file in (*files, *(file for log in journal.logs.values() for file in log.files)))
-    return Summary(written, len(journal.logs), n_bytes, tuple(_notes(facts, [file.path for file in files])))
+    return ExportSummary(written, len(journal.logs), n_bytes, tuple(_notes(facts, [file.path for file in files])))
 
 
 def _is_whole(journal: Journal, sample: Planned) -> bool:

@@ -20,7 +20,7 @@ BLACK = "black.jpg"  # beside the folders of pictures
 
 
 @dataclass(frozen=True)
-class Picture:
+class BlobPicture:
     """One file: where it lies below the pictures' folder, of which frame, its bytes."""
 
     data_path: str
@@ -29,17 +29,17 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Shown:
+class RowPictures:
     """A sample's pictures."""
 
-    pictures: tuple[Picture, ...]
+    pictures: tuple[BlobPicture, ...]
     cams: tuple[Mapping[str, Mapping[str, Any]], ...]  # (N_FRAMES,) the frames' `cams`
     absent: int  # of the history's 8 x 4
     left_out: tuple[str, ...]  # cameras of the rig that stand for none of the eight
     sizes: tuple[str, ...]  # width x height [px], as written
 
 
-def shown(row: Mapping[str, Any], names: SampleNames, settings: ExportSettings) -> Shown:
+def shown(row: Mapping[str, Any], names: SampleNames, settings: ExportSettings) -> RowPictures:
     """The pictures of a row (columns cameras, images) under its names.
 
     Raises CannotExport where one of the history's is absent and settings.missing is "refuse".
@@ -62,13 +62,13 @@ def shown(row: Mapping[str, Any], names: SampleNames, settings: ExportSettings) 
             image = stored.get(name, {}).get(i)
             if image is not None:
                 assert camera is not None
-                pictures.append(Picture(path, i, _jpeg(image, camera, size)))
+                pictures.append(BlobPicture(path, i, _jpeg(image, camera, size)))
             elif settings.missing == "black" and i < N_HISTORY:
                 path = BLACK
             cams[i][name] = _entry(path, calibration)
     left_out = tuple(sorted({camera.name for camera in rig} - {camera.name for camera in chosen.values()}))
     sizes = tuple(sorted({f"{width}x{height}" for width, height in written.values()}))
-    return Shown(tuple(pictures), tuple(cams), len(absent), left_out, sizes)
+    return RowPictures(tuple(pictures), tuple(cams), len(absent), left_out, sizes)
 
 
 @cache

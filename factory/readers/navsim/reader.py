@@ -49,6 +49,7 @@ from factory.readers.validate import validate_clip
 from factory.wording import time_text
 from tasks.caches import user_cache
 from tasks.world.arrays import Array
+from tasks.world.camera import Camera, SensorFile
 from tasks.world.clip import NOW, Block, Clip
 from tasks.world.lanes import RoadMap, Route
 from tasks.world.roadblocks import corrected_roadblocks, route_of_roadblocks
@@ -175,7 +176,10 @@ class NavsimReader:
             centerline = RouteFinder(road_map, route).centerline_from(states[NOW, :3])
         except NoRoute as error:
             raise BadClip(opened.log.file, f"frames[{now}].roadblock_ids", str(error)) from error
-        images, sweeps, cameras, block = (), (), (), None
+        images: tuple[SensorFile, ...] = ()
+        sweeps: tuple[SensorFile, ...] = ()
+        cameras: tuple[Camera, ...] = ()
+        block = None
         if self.sensors is not None:
             blobs = blobs_of(window, self.sensors)
             if not blobs.images and not blobs.sweeps:

@@ -126,6 +126,7 @@ def _follow(file: BinaryIO, add: Any) -> None:
         del stack[len(stack) - n :]
         return taken
 
+    argument: Any  # of the type that its opcode says
     for opcode, argument, position in pickletools.genops(file):
         name = opcode.name
         if name in HEAD_BYTES:

@@ -34,7 +34,7 @@ BOX, VELOCITY, HEIGHT_AT = slice(0, 3), slice(3, 5), 5  # columns of what is lin
 
 
 @dataclass(frozen=True)
-class Seen:
+class SeenBoxes:
     """What F frames show of N objects, world frame; NaN where a frame does not show one."""
 
     track_ids: tuple[str, ...]  # (N,)
@@ -116,7 +116,7 @@ def _between(known: Array) -> Array:
     return np.asarray(known[before] + share * (known[after] - known[before]))
 
 
-def _seen(frames: Sequence[Frame], order: Sequence[int]) -> Seen:
+def _seen(frames: Sequence[Frame], order: Sequence[int]) -> SeenBoxes:
     """The objects of frames; order: in which the frames say what an object is. A frame without boxes shows none."""
     kind_of: dict[str, AgentKind] = {}
     for boxes in (frames[i].boxes for i in order):
@@ -133,11 +133,11 @@ def _seen(frames: Sequence[Frame], order: Sequence[int]) -> Seen:
             sizes[row, at] = frame.boxes.boxes[:, 3:6]
     stands = np.array([kind not in MOVING_KINDS for kind in kind_of.values()], bool)
     linear[:, stands, VELOCITY] = 0.0  # a thing that stands has no velocity in the public code, whatever the log says
-    return Seen(tuple(kind_of), tuple(kind_of.values()), linear, sizes)
+    return SeenBoxes(tuple(kind_of), tuple(kind_of.values()), linear, sizes)
 
 
 def _in_world(frame: Frame) -> Array:
-    """(N, 6) as in `Seen.linear`: turned by the ego's heading alone, the height by its whole pose."""
+    """(N, 6) as in `SeenBoxes.linear`: turned by the ego's heading alone, the height by its whole pose."""
     assert frame.boxes is not None
     boxes, velocities = frame.boxes.boxes, frame.boxes.velocities
     (x, y, heading), space = frame.pose, frame.world_from_ego
@@ -154,7 +154,7 @@ def _in_world(frame: Frame) -> Array:
     )
 
 
-def _nowhere(seen: Seen, steps: int) -> AgentTracks:
+def _nowhere(seen: SeenBoxes, steps: int) -> AgentTracks:
     """Tracks that are absent at all steps."""
     n = len(seen.track_ids)
     known = seen.valid
@@ -170,7 +170,7 @@ def _nowhere(seen: Seen, steps: int) -> AgentTracks:
     )
 
 
-def _write(agents: AgentTracks, seen: Seen, frames: Sequence[Frame], first: int, last: int, judged: bool) -> None:
+def _write(agents: AgentTracks, seen: SeenBoxes, frames: Sequence[Frame], first: int, last: int, judged: bool) -> None:
     """Frames first..last into the steps from the one to the other, whatever stood there."""
     steps = slice(FRAME_STEPS * first, FRAME_STEPS * last + 1)
     at = np.arange(n_steps(last - first + 1))

@@ -17,7 +17,7 @@ from shapely.geometry import LineString, Polygon
 
 from factory.readers.base import BadClip
 from factory.readers.py123d.arrow import ArrowFile, check_version, open_file, unpacked, whole
-from factory.readers.py123d.sources import Source
+from factory.readers.py123d.sources import ConvertedSet
 from factory.readers.scenarionet.lanes import RawLane, closed_ring, connector_ids, resampled_line
 from factory.readers.scenarionet.map import neighbours, paved_areas
 from tasks.world.arrays import Array, Indices
@@ -53,7 +53,7 @@ class MapObjects:
         return f"object {self.ids[row]} of layer {self.layers[row]}"
 
 
-def read_map(path: Path, source: Source, drive: Array) -> RoadMap:
+def read_map(path: Path, source: ConvertedSet, drive: Array) -> RoadMap:
     """The map in this file. drive: (S, 2) where the ego was. Raises BadClip naming the object that is broken."""
     objects = _objects(path, drive)
     groups = {objects.ids[row]: objects.content(row) for row in objects.rows(LANE_GROUP)}
@@ -141,7 +141,7 @@ def _raw_lane(objects: MapObjects, row: int, content: Mapping[str, Any], in_junc
     )
 
 
-def _centerline(objects: MapObjects, lane: RawLane, content: Mapping[str, Any], source: Source) -> Array:
+def _centerline(objects: MapObjects, lane: RawLane, content: Mapping[str, Any], source: ConvertedSet) -> Array:
     if source.own_centerlines:
         return with_headings(lane.line)
     sides = (_line(objects, lane.lane_id, content, f"{side}_boundary") for side in ("left", "right"))
@@ -149,7 +149,7 @@ def _centerline(objects: MapObjects, lane: RawLane, content: Mapping[str, Any], 
 
 
 def _drivable_areas(
-    objects: MapObjects, source: Source, junction: set[str], lanes: Mapping[str, Lane]
+    objects: MapObjects, source: ConvertedSet, junction: set[str], lanes: Mapping[str, Lane]
 ) -> tuple[MapPolygon, ...]:
     """The data set's own surfaces; the union of its lanes where it has none (Waymo's driveways lead off the road).
 

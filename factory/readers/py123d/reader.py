@@ -14,7 +14,7 @@ from factory.readers.py123d.arrow import ArrowFile, check_version, open_metadata
 from factory.readers.py123d.log import BOXES, EGO, LIGHTS, drive_of, lights_of, read_motion
 from factory.readers.py123d.map import read_map
 from factory.readers.py123d.sensors import camera_files, has_photos, read_rig, recorded_photos, recorded_sweeps, within
-from factory.readers.py123d.sources import SOURCES, Source
+from factory.readers.py123d.sources import SOURCES, ConvertedSet
 from factory.readers.settings import Py123dClips
 from tasks.world.camera import Camera, SensorFile
 from tasks.world.clip import STEP_S, Block
@@ -128,7 +128,7 @@ def open_header(folder: Path) -> ArrowFile:
     return header
 
 
-def source_of(header: ArrowFile) -> Source:
+def source_of(header: ArrowFile) -> ConvertedSet:
     """The data set that was converted. Raises BadClip for one that is not read."""
     name = header.value("dataset", str)
     if name not in SOURCES:

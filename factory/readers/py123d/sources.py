@@ -7,7 +7,7 @@ from tasks.world.agents import AgentKind
 
 
 @dataclass(frozen=True)
-class Source:
+class ConvertedSet:
     """What differs between the data sets."""
 
     licence: str
@@ -20,12 +20,12 @@ class Source:
 AV2 = "CC BY-NC-SA 4.0 (Argoverse 2 via 123D)"
 WAYMO = "Waymo Open Dataset licence, non-commercial (via 123D)"
 SOURCES = {  # by the data set's name in a log's metadata
-    "av2-sensor": Source(AV2, own_centerlines=False),
-    "nuplan": Source("CC BY-NC-SA 4.0 (nuPlan via 123D)", own_roadblocks=True, own_intersections=True),
-    "nuscenes": Source("CC BY-NC-SA 4.0 (nuScenes via 123D)", own_intersections=True),
-    "wod-perception": Source(WAYMO),
-    "wod-motion": Source(WAYMO),
-    "kitti360": Source("CC BY-NC-SA 3.0 (KITTI-360 via 123D)", has_lanes=False),
+    "av2-sensor": ConvertedSet(AV2, own_centerlines=False),
+    "nuplan": ConvertedSet("CC BY-NC-SA 4.0 (nuPlan via 123D)", own_roadblocks=True, own_intersections=True),
+    "nuscenes": ConvertedSet("CC BY-NC-SA 4.0 (nuScenes via 123D)", own_intersections=True),
+    "wod-perception": ConvertedSet(WAYMO),
+    "wod-motion": ConvertedSet(WAYMO),
+    "kitti360": ConvertedSet("CC BY-NC-SA 3.0 (KITTI-360 via 123D)", has_lanes=False),
 }
 
 _CAR, _WALKER, _BICYCLE, _THING = AgentKind.VEHICLE, AgentKind.PEDESTRIAN, AgentKind.BICYCLE, AgentKind.GENERIC_OBJECT

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from factory.exports.navsim.export import Summary, export
+from factory.exports.navsim.export import ExportSummary, export
 from factory.exports.navsim.settings import ExportSettings
 from factory.store.samples import Store
 from tests.factory.exports.navsim_samples import exported
@@ -21,7 +21,7 @@ def street_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def openscene(street_run: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Summary]:
+def openscene(street_run: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ExportSummary]:
     """All of it, exported."""
     to = tmp_path_factory.mktemp("openscene")
     return to, export(Store(street_run).samples, to, ExportSettings(), say=lambda line: None)

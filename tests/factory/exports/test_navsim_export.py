@@ -20,7 +20,7 @@ import pytest
 import yaml
 
 from factory.commands.table import COMMANDS
-from factory.exports.navsim.export import Summary, export
+from factory.exports.navsim.export import ExportSummary, export
 from factory.exports.navsim.names import hex16, source_log
 from factory.exports.navsim.pickles import dumps, write_dict
 from factory.exports.navsim.rewards import METRICS
@@ -39,7 +39,7 @@ SOURCE = "2021.05.12_veh-35_00005_00204"
 main = COMMANDS["export"].load()
 
 
-def quiet(run: Path, to: Path, settings: ExportSettings = ExportSettings(), **more: Any) -> Summary:  # noqa: B008
+def quiet(run: Path, to: Path, settings: ExportSettings = ExportSettings(), **more: Any) -> ExportSummary:  # noqa: B008
     return export(Store(run).samples, to, settings, say=lambda line: None, **more)
 
 
@@ -53,7 +53,7 @@ def read(path: Path) -> Any:
     return yaml.safe_load(path.read_text())
 
 
-def test_the_recipe_of_the_public_training_holds(openscene: tuple[Path, Summary]) -> None:
+def test_the_recipe_of_the_public_training_holds(openscene: tuple[Path, ExportSummary]) -> None:
     """Stem and log_name agree, have a round and two dashes before it; the token has a dash and not 17 characters."""
     to, summary = openscene
     logs = sorted((to / "navsim_logs").rglob("*.pkl"))
@@ -75,7 +75,7 @@ def test_the_recipe_of_the_public_training_holds(openscene: tuple[Path, Summary]
 
 
 @pytest.mark.parametrize("split", SPLITS)
-def test_filters_and_splits_name_the_logs_that_are_there(openscene: tuple[Path, Summary], split: str) -> None:
+def test_filters_and_splits_name_the_logs_that_are_there(openscene: tuple[Path, ExportSummary], split: str) -> None:
     to, _ = openscene
     name = f"navtrain_reaction_{split}"
     chosen = read(to / CONFIG / "common/train_test_split" / f"{name}.yaml")
@@ -92,7 +92,7 @@ def test_filters_and_splits_name_the_logs_that_are_there(openscene: tuple[Path, 
 
 
 def test_rewards_are_the_labels_under_the_public_names_and_add_up_over_rounds(
-    openscene: tuple[Path, Summary], street_run: Path
+    openscene: tuple[Path, ExportSummary], street_run: Path
 ) -> None:
     to, _ = openscene
     files = {path.name: pickle.loads(path.read_bytes()) for path in (to / "traj_pdm_v2").rglob("*.pkl")}
@@ -111,7 +111,7 @@ def test_rewards_are_the_labels_under_the_public_names_and_add_up_over_rounds(
     np.testing.assert_allclose(found["pdm_score"], labels.pdm_score("masked"), atol=1e-3)
 
 
-def test_the_manifest_names_every_other_file_with_its_checksum(openscene: tuple[Path, Summary]) -> None:
+def test_the_manifest_names_every_other_file_with_its_checksum(openscene: tuple[Path, ExportSummary]) -> None:
     to, summary = openscene
     header, *lines = map(json.loads, (to / "manifest.jsonl").read_text().splitlines())
     files = [file for line in lines for file in (line["log"]["files"] if "log" in line else [line["file"]])]
@@ -125,13 +125,13 @@ def test_the_manifest_names_every_other_file_with_its_checksum(openscene: tuple[
 
 @pytest.mark.slow
 def test_its_bytes_do_not_depend_on_processes_or_time(
-    openscene: tuple[Path, Summary], street_run: Path, tmp_path: Path
+    openscene: tuple[Path, ExportSummary], street_run: Path, tmp_path: Path
 ) -> None:
     quiet(street_run, tmp_path / "again", workers=2)
     assert tree(tmp_path / "again") == tree(openscene[0])
 
 
-def test_what_is_there_is_not_written_again(openscene: tuple[Path, Summary], street_run: Path) -> None:
+def test_what_is_there_is_not_written_again(openscene: tuple[Path, ExportSummary], street_run: Path) -> None:
     to, before = openscene
     stamps = {path: path.stat().st_mtime_ns for path in to.rglob("*")}
     again = quiet(street_run, to)
@@ -140,7 +140,7 @@ def test_what_is_there_is_not_written_again(openscene: tuple[Path, Summary], str
 
 
 def test_a_run_that_has_grown_adds_its_logs_alone(
-    openscene: tuple[Path, Summary], street_run: Path, tmp_path: Path
+    openscene: tuple[Path, ExportSummary], street_run: Path, tmp_path: Path
 ) -> None:
     """And rows that are no more take their logs with them."""
     small, to = tmp_path / "run", tmp_path / "to"
@@ -161,7 +161,7 @@ def test_another_export_does_not_go_into_the_same_folder(street_run: Path, tmp_p
 
 
 @pytest.mark.slow
-def test_a_killed_export_goes_on_to_the_same_bytes(openscene: tuple[Path, Summary], tmp_path: Path) -> None:
+def test_a_killed_export_goes_on_to_the_same_bytes(openscene: tuple[Path, ExportSummary], tmp_path: Path) -> None:
     """Killed between logs and amid them, with half a line in the journal and half a picture beside the others."""
     run, to = tmp_path / "run", tmp_path / "to"
     rows = [exported(0, "human"), exported(1, "pdm_closed", 0), exported(2, "pdm_closed", 1, split="val")]
@@ -183,7 +183,7 @@ def test_a_killed_export_goes_on_to_the_same_bytes(openscene: tuple[Path, Summar
 
 
 def test_a_log_that_was_lost_is_written_again(
-    openscene: tuple[Path, Summary], street_run: Path, tmp_path: Path
+    openscene: tuple[Path, ExportSummary], street_run: Path, tmp_path: Path
 ) -> None:
     to = tmp_path / "to"
     shutil.copytree(openscene[0], to)
@@ -356,7 +356,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 
 def test_a_full_disk_is_said_in_one_line_and_the_same_command_goes_on(
-    small_disk: Path, openscene: tuple[Path, Summary], street_run: Path, capsys: pytest.CaptureFixture[str]
+    small_disk: Path, openscene: tuple[Path, ExportSummary], street_run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     command = ["navsim", f"out={street_run}", f"to={small_disk / 'to'}"]
     assert main(command) == 2

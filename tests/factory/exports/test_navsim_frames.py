@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from factory.exports.navsim.export import Summary
+from factory.exports.navsim.export import ExportSummary
 from factory.exports.navsim.frames import connector_number, log_frames
 from factory.exports.navsim.motion import derivatives, in_space
 from factory.exports.navsim.names import sample_names
@@ -164,7 +164,7 @@ def test_tokens_are_the_log_s_own_where_it_has_names_and_chained() -> None:
             assert frame["token"] == one_time[frame["timestamp"]] + "-002", "the two logs name an instant alike"
 
 
-def test_every_camera_s_picture_is_that_of_the_one_that_looks_its_way(openscene: tuple[Path, Summary]) -> None:
+def test_every_camera_s_picture_is_that_of_the_one_that_looks_its_way(openscene: tuple[Path, ExportSummary]) -> None:
     to, _ = openscene
     (log,) = (to / "navsim_logs/synthetic_reaction_pdm_v1.0-0").iterdir()
     ours = {
