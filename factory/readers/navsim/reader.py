@@ -179,7 +179,7 @@ class NavsimReader:
         images: tuple[SensorFile, ...] = ()
         sweeps: tuple[SensorFile, ...] = ()
         cameras: tuple[Camera, ...] = ()
-        block = None
+        block: Block | None = None
         if self.sensors is not None:
             blobs = blobs_of(window, self.sensors)
             if not blobs.images and not blobs.sweeps:
