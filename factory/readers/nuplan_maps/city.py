@@ -15,7 +15,6 @@ from factory.readers.nuplan_maps.geopackage import Table, map_file
 from factory.readers.nuplan_maps.kept import kept_tables
 from tasks.world.arrays import Array
 from tasks.world.lanes import Lane, MapLayer, MapPolygon, RoadMap
-from tasks.world.polygons import with_headings
 from tasks.world.roadblocks import Roadblocks
 
 LANES, CONNECTORS = "lanes_polygons", "lane_connectors"
@@ -63,12 +62,13 @@ class City:
         self._polygon_rows = row_of
         of_lane = self._rows_of("baseline_paths", "lane_fid", lanes)
         of_connector = self._rows_of("baseline_paths", "lane_connector_fid", connectors)
-        self._baselines = np.concatenate([of_lane, of_connector])
+        self._baselines, self._centerlines = np.concatenate([of_lane, of_connector]), _headed(tables["baseline_paths"])
         sides = [f"{side}_boundary_fid" for side in ("left", "right")]
-        self._sides = [np.concatenate([lanes.columns[s], polygons.columns[s][row_of]]) for s in sides]
+        self._sides = [self._side(np.concatenate([lanes.columns[s], polygons.columns[s][row_of]])) for s in sides]
+        edges = tables["boundaries"].xy
+        self._edges = np.column_stack([edges, np.zeros(len(edges))])  # heights are not in the map
         self._blocks = np.concatenate([lanes.columns["lane_group_fid"], connectors.columns["lane_group_connector_fid"]])
         self._speeds = np.concatenate([t.columns["speed_limit_mps"] for t in (lanes, connectors)])
-        self._boundary_row = {fid: i for i, fid in enumerate(tables["boundaries"].fid.tolist())}
         self._before, self._after = self._graph()
         self._beside = self._neighbours()
         self._tree = shapely.STRtree(np.concatenate([lanes.shapes, polygons.shapes[row_of]]))
@@ -168,12 +168,12 @@ class City:
 
     def _lane(self, i: int) -> Lane:
         if i not in self._lanes:
-            centerline = with_headings(self.tables["baseline_paths"].outline(int(self._baselines[i])))
+            lines, row = self.tables["baseline_paths"].offsets[0], int(self._baselines[i])
             speed = float(self._speeds[i])
             self._lanes[i] = Lane(
                 lane_id=self._ids[i],
                 ring=self._ring(i),
-                centerline=centerline,
+                centerline=self._centerlines[lines[row] : lines[row + 1]],
                 is_intersection=i >= self._n_lanes,
                 drives_cars=True,  # the public metric makes no difference between lanes
                 successors=self._after[i],
@@ -181,8 +181,8 @@ class City:
                 left_neighbor=self._beside[i][0],
                 right_neighbor=self._beside[i][1],
                 speed_limit_mps=None if np.isnan(speed) else speed,
-                left_boundary=self._boundary(int(self._sides[0][i]), centerline),
-                right_boundary=self._boundary(int(self._sides[1][i]), centerline),
+                left_boundary=self._boundary(0, i),
+                right_boundary=self._boundary(1, i),
             )
         return self._lanes[i]
 
@@ -191,15 +191,26 @@ class City:
             return self.tables[LANES].outline(i)
         return self.tables[CONNECTOR_POLYGONS].outline(int(self._polygon_rows[i - self._n_lanes]))
 
-    def _boundary(self, fid: int, centerline: Array) -> Array | None:
-        """(B, 3) in the lane's direction; heights are not in the map. None where no row has that fid."""
-        if fid not in self._boundary_row:
+    def _side(self, fids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Of each lane the row of its boundary, -1 where no row has that fid, and whether that runs against it."""
+        table, lines = self.tables["boundaries"], self.tables["baseline_paths"]
+        if not len(table.fid):
+            return np.full(len(fids), -1), np.zeros(len(fids), np.bool_)
+        order = np.argsort(table.fid, kind="stable")
+        at = np.minimum(np.searchsorted(table.fid[order], fids), len(order) - 1)
+        rows = np.where(table.fid[order][at] == fids, order[at], -1)
+        ends, own = _ends(table, np.maximum(rows, 0)), _ends(lines, self._baselines)
+        along = np.hypot(*(ends - own).T).sum(axis=0)
+        return rows, (rows >= 0) & (along > np.hypot(*(ends[:, ::-1] - own).T).sum(axis=0))
+
+    def _boundary(self, side: int, i: int) -> Array | None:
+        """(B, 3) in the lane's direction; None where the map has none."""
+        rows, against = self._sides[side]
+        if rows[i] < 0:
             return None
-        points = self.tables["boundaries"].outline(self._boundary_row[fid])
-        ends, lane_ends = points[[0, -1]], centerline[[0, -1], :2]
-        if np.hypot(*(ends - lane_ends).T).sum() > np.hypot(*(ends[::-1] - lane_ends).T).sum():
-            points = points[::-1]
-        return np.column_stack([points, np.zeros(len(points))])
+        first, last = self.tables["boundaries"].offsets[0][rows[i] : rows[i] + 2]
+        points = self._edges[first:last]
+        return points[::-1] if against[i] else points
 
     def _area(self, layer: str, row: int) -> MapPolygon:
         """An area; parts of one fid after the largest are named <fid>_1, <fid>_2 and so on."""
@@ -218,3 +229,17 @@ class City:
 def _near(tree: shapely.STRtree, around: Any, radius_m: float) -> list[int]:
     """Rows within a distance, in file order."""
     return sorted(tree.query(around, predicate="dwithin", distance=radius_m).tolist())
+
+
+def _headed(table: Table) -> Array:
+    """(T, 3) the points of a layer of lines with the direction of the segment that starts there; a last one repeats."""
+    steps = np.diff(table.xy, axis=0, append=0.0)
+    heading, last = np.arctan2(steps[:, 1], steps[:, 0]), table.offsets[0][1:] - 1
+    heading[last] = heading[last - 1]
+    return np.column_stack([table.xy, heading])
+
+
+def _ends(table: Table, rows: NDArray[np.int64]) -> Array:
+    """(N, 2, 2) first and last point of lines."""
+    points = table.offsets[0]
+    return np.stack([table.xy[points[rows]], table.xy[points[rows + 1] - 1]], axis=1)
