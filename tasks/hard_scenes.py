@@ -41,6 +41,23 @@ class BenchmarkClip:
         return perturbed_scene(self.clip, dict(self.follow_ups)[candidate], HORIZON_STEPS - BEFORE_STEPS * before)
 
 
+@dataclass(frozen=True)
+class GivenScenes:
+    """One clip of a benchmark that others made: each frame's world as it was given, a clip whose T is the frame."""
+
+    clip: Clip
+    before: Clip  # 0.5 s earlier
+    follow_ups: tuple[tuple[int, tuple[Clip, Clip]], ...]  # number, the frame now and the one 0.5 s earlier
+
+    def stage_one(self, before: bool = False) -> Scene:
+        """As of a BenchmarkClip."""
+        return scene_of_clip(self.before if before else self.clip)
+
+    def stage_two(self, candidate: int, before: bool = False) -> Scene:
+        """As of a BenchmarkClip. Raises KeyError for no follow-up of the clip."""
+        return scene_of_clip(dict(self.follow_ups)[candidate][before])
+
+
 def frame_digest(frame: str, planner: PdmSettings) -> str:
     """Of what a frame (one of tasks.stages.FRAMES) is made by, as an expert's."""
     if frame == HUMAN_BEFORE:

@@ -1,4 +1,4 @@
-"""`python -m factory import simscale root=<folder> out=<folder or URL>`: others' samples as a table of ours.
+"""`python -m factory import simscale|navhard root=<folder> out=<folder or URL>`: others' samples as a table of ours.
 
     python -m factory import simscale root=SimScale_data out=runs/simscale maps=nuplan/maps
     python -m factory import simscale root=exported out=runs/back only=[synthetic_reaction_pdm_v1.0-0]
@@ -10,22 +10,32 @@ simscale: the released layout, moved into NAVSIM's folders or as unpacked. One r
     rewards=<folder>     reward pickles, or one of them; with vocabulary=<.npy> they become the rows' labels
     pictures=false       rows without pictures
     only=[a,b]           these of the folders alone
+navhard: NAVSIM's two-stage benchmark, which `python -m planners evaluate benchmark=<out>` takes.
+    python -m factory import navhard root=navhard_two_stage logs=navsim_logs/test sensors=sensor_blobs/test \\
+        maps=maps split=.../train_test_split/navhard_two_stage.yaml out=runs/navhard
+    root=<folder>        synthetic_scene_pickles and sensor_blobs of the second stage
+    logs=, sensors=      of the first stage; pictures=false needs no sensors
+    split=<.yaml>        whose reactive_all_mapping says which scenes belong together
 The same command again goes on, and tries what failed once more. What is kept and what is lost: docs/navsim.md.
 """
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from factory.config.arguments import WORD, Refused
 from factory.wording import one_line
+
+if TYPE_CHECKING:
+    from factory.graph.execute import RunSummary
+    from factory.store.samples import Store
 
 
 @dataclass(frozen=True)
 class Request:
     """The command line."""
 
-    source: Literal["simscale"] = field(metadata=WORD)
+    source: Literal["simscale", "navhard"] = field(metadata=WORD)
     root: str
     out: str
     maps: str | None = None
@@ -33,20 +43,25 @@ class Request:
     vocabulary: str | None = None
     pictures: bool = True
     only: tuple[str, ...] = ()
+    logs: str | None = None
+    sensors: str | None = None
+    split: str | None = None
 
     def __post_init__(self) -> None:
         if (self.rewards is None) != (self.vocabulary is None):
             raise ValueError("rewards= and vocabulary= go together: scores mean nothing without their trajectories")
+        if self.source == "navhard":
+            if missing := [name for name in ("logs", "maps", "split") if getattr(self, name) is None]:
+                raise ValueError(f"{missing[0]}=... is missing: import navhard takes logs=, maps= and split=")
+            if (self.sensors is None) == self.pictures:
+                raise ValueError("sensors= and pictures=: give the folder of pictures, or pictures=false")
 
 
 def main(request: Request) -> int:
     """Write the rows and say how it ended. Raises Refused."""
     from deltalake.exceptions import DeltaError
 
-    from factory.imports.scenes import no_road
-    from factory.imports.simscale import Import, Rewards, parts_of
-    from factory.imports.table import identity_of, import_rows
-    from factory.setup.vocabulary import load_vocabulary
+    from factory.readers.base import BadClip
     from factory.store.location import Location
     from factory.store.samples import ChangedRun, Store
     from factory.store.table import AnotherWriter
@@ -55,26 +70,52 @@ def main(request: Request) -> int:
 
     if unusable := why_unusable(request.out):
         raise Refused(unusable)
-    root = Path(request.root).expanduser()
     try:
-        parts = parts_of(root, request.only)
-        rewards = None
-        if request.rewards is not None and request.vocabulary is not None:
-            rewards = Rewards(Path(request.rewards).expanduser(), load_vocabulary(request.vocabulary))
-        settings = {
-            "maps": request.maps is not None,
-            "pictures": request.pictures,
-            "labels": None if rewards is None else rewards.vocabulary.digest,
-        }
-        wanted = Import(lambda frames, now, file: no_road(frames[now]), request.pictures, rewards)
         store = Store(Location.parse(request.out))
-        summary = import_rows(store, identity_of(request.source, settings), wanted.entries(parts))
-    except (ChangedRun, AnotherWriter, ValueError, OSError, DeltaError) as error:
+        summary, told = _navhard(request, store) if request.source == "navhard" else _simscale(request, store)
+    except (BadClip, ChangedRun, AnotherWriter, ValueError, OSError, DeltaError) as error:
         raise Refused(one_line(error)) from error
     counts = summary.counts
     print(f"{counts['accepted']:,} samples imported, {summary.executed.found_done:,} were there: {store.location.uri}")
-    if summary.message:
-        print(summary.message)
-    if counts["failed"]:
-        print(failed_line(store))
+    for line in filter(None, (summary.message, told, failed_line(store) if counts["failed"] else "")):
+        print(line)
     return summary.exit_code
+
+
+def _simscale(request: Request, store: "Store") -> tuple["RunSummary", str]:
+    from factory.imports.simscale import Import, Rewards, parts_of
+    from factory.imports.table import identity_of, import_rows
+    from factory.setup.vocabulary import load_vocabulary
+
+    parts = parts_of(Path(request.root).expanduser(), request.only)
+    rewards = None
+    if request.rewards is not None and request.vocabulary is not None:
+        rewards = Rewards(Path(request.rewards).expanduser(), load_vocabulary(request.vocabulary))
+    settings = {
+        "maps": request.maps is not None,
+        "pictures": request.pictures,
+        "labels": None if rewards is None else rewards.vocabulary.digest,
+    }
+    wanted = Import(_folder(request.maps), request.pictures, rewards)
+    return import_rows(store, identity_of(request.source, settings), wanted.entries(parts)), ""
+
+
+def _navhard(request: Request, store: "Store") -> tuple["RunSummary", str]:
+    from factory.imports.navhard import GroupReader, Places, entries_of, groups_of, logs_of_tokens, write_benchmark
+    from factory.imports.table import identity_of, import_rows
+    from factory.readers.navsim.filters import read_selection
+
+    logs, maps = _folder(request.logs), _folder(request.maps)
+    assert logs is not None and maps is not None and request.split is not None
+    selection = read_selection(request.split)
+    groups = groups_of(selection)
+    tokens = frozenset(token for group in groups for token in (group.now, group.before))
+    places = Places(logs, _folder(request.sensors), Path(request.root).expanduser(), maps)
+    reader = GroupReader(places, logs_of_tokens(logs, tokens, selection.scene_filter.log_names), store)
+    identity = identity_of(request.source, {"pictures": request.pictures, "split": selection.name})
+    summary = import_rows(store, identity, entries_of(groups, reader))
+    return summary, write_benchmark(store, groups, reader, identity)
+
+
+def _folder(path: str | None) -> Path | None:
+    return None if path is None else Path(path).expanduser()

@@ -19,6 +19,7 @@ from factory.readers.navsim.tracks import (
     WINDOW_FRAMES,
     ego_states,
     lights,
+    n_steps,
     window_agents,
     world_from_ego,
 )
@@ -65,10 +66,10 @@ def no_road(frame: Frame) -> RoadAhead:
     return RoadAhead(RoadMap({}, (), location=frame.map_location), route, np.zeros((0, 3)))
 
 
-def scene_of(frames: Sequence[Frame], road: RoadAhead, origin: Origin) -> Scene:
-    """The scene at T of 4 to 12 frames that are 0.5 s apart."""
+def scene_of(frames: Sequence[Frame], road: RoadAhead, origin: Origin, driven: int | None = None) -> Scene:
+    """The scene at T of 4 to 12 frames that are 0.5 s apart; the ego is known in the first `driven`, None: in all."""
     assert HISTORY_FRAMES <= len(frames) <= SCENE_FRAMES
-    states, space = ego_states(frames), world_from_ego(frames)
+    states, space = ego_states(frames[:driven]), world_from_ego(frames[:driven])
     known = len(states)
     after = ((0, CLIP_STEPS - known), (0, 0))
     clip = Clip(
@@ -79,7 +80,7 @@ def scene_of(frames: Sequence[Frame], road: RoadAhead, origin: Origin) -> Scene:
         start_s=0.0,
         ego_states=np.pad(states, after, constant_values=np.nan).reshape(CLIP_STEPS, EGO_STATE_SIZE),
         world_from_ego=np.concatenate([space, np.repeat(space[-1:], CLIP_STEPS - known, axis=0)]),
-        agents=_agents(frames, known),
+        agents=_agents(frames),
         road_map=road.road_map,
         route=road.route,
         centerline=road.centerline,
@@ -91,13 +92,13 @@ def scene_of(frames: Sequence[Frame], road: RoadAhead, origin: Origin) -> Scene:
     return scene_of_clip(clip)
 
 
-def _agents(frames: Sequence[Frame], known: int) -> AgentTracks:
-    """96 steps, of which the first `known` are of frames: later ones stand in for a window that nobody annotated."""
+def _agents(frames: Sequence[Frame]) -> AgentTracks:
+    """96 steps; those after the last frame are of a window that nobody annotated, and nobody is there."""
     unseen = replace(frames[-1], boxes=None)
     agents = window_agents([*frames, *[unseen] * (WINDOW_FRAMES - len(frames))])
     parts = {name: getattr(agents, name).copy() for name in PER_STEP}
     for name, part in parts.items():
-        part[known:] = False if name == "valid" else np.nan
+        part[n_steps(len(frames)) :] = False if name == "valid" else np.nan
     return replace(agents, **parts)
 
 
@@ -136,13 +137,14 @@ def world_columns(scene: Scene, command: str) -> dict[str, object]:
 
 def logged_label(scene: Scene) -> dict[str, object]:
     """The columns that hold the drive from T on, of a scene whose 12 frames hold it."""
-    pose, states = scene.ego_state[: HEADING + 1], scene.clip.ego_states[NOW : NOW + HORIZON_STEPS + 1]
-    label = to_local(pose, states[1:, : HEADING + 1])
-    return {
-        "label_10hz": label,
-        "label_2hz": label[COARSE_STEPS - 1 :: COARSE_STEPS],
-        "parent_states": states[[0, HORIZON_STEPS]],
-    }
+    states = scene.clip.ego_states[NOW : NOW + HORIZON_STEPS + 1]
+    return {**label_columns_of(scene, states[1:, : HEADING + 1]), "parent_states": states[[0, HORIZON_STEPS]]}
+
+
+def label_columns_of(scene: Scene, poses: Array) -> dict[str, object]:
+    """The columns of a drive (40, 3) from T on, world frame."""
+    label = to_local(scene.ego_state[: HEADING + 1], poses)
+    return {"label_10hz": label, "label_2hz": label[COARSE_STEPS - 1 :: COARSE_STEPS]}
 
 
 def pictures(frames: Sequence[Frame], folder: Path, source: ImageSource, file: str) -> dict[str, object]:

@@ -6,7 +6,7 @@ files' own bytes. What the release does not hold stays null: scores, perturbatio
 """
 
 import re
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
@@ -14,19 +14,20 @@ from itertools import pairwise
 from pathlib import Path
 
 from factory.imports.labels import vocabulary_labels
+from factory.imports.roads import road_around
 from factory.imports.scenes import (
     HISTORY_FRAMES,
     SCENE_FRAMES,
     Origin,
-    RoadAhead,
     logged_label,
+    no_road,
     pictures,
     scene_of,
     world_columns,
 )
 from factory.imports.table import Entry
 from factory.readers.base import BadClip
-from factory.readers.navsim.log import Frame, bytes_of, frames_of
+from factory.readers.navsim.log import bytes_of, frames_of
 from factory.readers.navsim.rewards import RewardFile
 from factory.readers.restricted_pickle import load_plain
 from factory.stages.imaging import NO_IMAGES
@@ -42,7 +43,6 @@ TOKEN = re.compile(r"(?P<frame>[0-9a-f]{16})-(?P<round>\d{3})")
 REWARDS = re.compile(r"sim[a-z]+_\d+_(?P<who>[A-Za-z0-9_-]+)_v1\.0-(?P<round>\d+)\.pkl")
 EXPERTS = {"pdm": "pdm_closed"}  # SimScale's name of an expert -> ours, where they differ
 FRAME_US, SLACK_US = 500_000, 50_000
-RoadOf = Callable[[Sequence[Frame], int, str], RoadAhead]  # frames, index of T, file
 
 
 @dataclass(frozen=True, order=True)
@@ -124,7 +124,7 @@ class Rewards:
 class Import:
     """What is made of every log."""
 
-    road_of: RoadOf
+    maps: Path | None = None  # nuPlan's; None: rows without a map
     pictures: bool = True
     rewards: Rewards | None = None
 
@@ -169,7 +169,8 @@ class Import:
             content_digest=sha256(data).hexdigest(),
             frame_tokens=(named["seed"], token["frame"]),
         )
-        scene = scene_of(frames, self.road_of(frames, at, str(path)), origin)
+        road = no_road(now) if self.maps is None else road_around(self.maps, frames, at, str(path))
+        scene = scene_of(frames, road, origin)
         seen: dict[str, object] = dict(NO_IMAGES)
         if self.pictures:
             seen = pictures(frames[:HISTORY_FRAMES], part.blobs, ImageSource.RENDER, str(path))
