@@ -12,8 +12,8 @@ import io
 import pickle
 import pickletools
 import re
-from collections.abc import Callable, Iterable
-from typing import Any
+from collections.abc import Callable, Collection, Iterable, Mapping
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from factory.readers.base import BadClip
 MAX_FILE_BYTES = 1 << 30
 BUDGET_PER_BYTE = 8
 BUDGET_BASE_BYTES = 1 << 24
+RECORD_BYTES = 512  # what a record is paid for with
 
 _PLAIN_OPCODES = """
     PROTO FRAME STOP MARK POP POP_MARK DUP NONE NEWTRUE NEWFALSE
@@ -48,20 +49,55 @@ def load_plain(data: bytes, file: str) -> Any:
     `file` names the source in errors. Raises BadClip for a truncated stream, a global that is not one of the plain
     containers or numpy's own array constructors (named), an array of objects, or a stream that outgrows its budget.
     """
+    return _load(data, file, _OPCODES, frozenset())
+
+
+def load_records(data: bytes, file: str, classes: Collection[str]) -> Any:
+    """As `load_plain`, where objects of these `classes` ("module name" each) are records of what the pickle says.
+
+    Nothing of them is imported, called or looked up. Raises BadClip as `load_plain` does.
+    """
+    return _load(data, file, _OPCODES | {"NEWOBJ"}, frozenset(classes))
+
+
+class Record:
+    """An object that a pickle describes: its class, what it was made with, and its state. Inert."""
+
+    module: ClassVar[str]
+    name: ClassVar[str]
+    arguments: tuple[Any, ...]
+    state: Mapping[str, Any]  # field -> value
+    spend: ClassVar[Callable[[int], None]]
+
+    def __new__(cls, *arguments: Any) -> "Record":
+        """Called by the unpickler alone, for a class of one load."""
+        cls.spend(RECORD_BYTES)
+        made = super().__new__(cls)
+        made.arguments, made.state = arguments, {}
+        return made
+
+    def __setstate__(self, state: Any) -> None:
+        parts = state if isinstance(state, tuple) else (state,)  # with __slots__: (dict or None, dict of the slots)
+        if len(parts) > 2 or not all(isinstance(part, dict | None) for part in parts):
+            raise ValueError(f"state of a {self.name} that is no dict of its fields")
+        self.state = {name: value for part in parts for name, value in (part or {}).items()}
+
+
+def _load(data: bytes, file: str, opcodes: frozenset[str], classes: frozenset[str]) -> Any:
     if len(data) > MAX_FILE_BYTES:
         raise BadClip(file, "pickle", f"{len(data)} bytes; more than {MAX_FILE_BYTES} are refused")
-    _check_opcodes(data, file)
+    _check_opcodes(data, file, opcodes)
     try:
-        return _Unpickler(data, file).load()
+        return _Unpickler(data, file, classes).load()
     except _LOAD_ERRORS as error:
         raise BadClip(file, "pickle", f"not a readable pickle ({type(error).__name__}: {error})") from error
 
 
-def _check_opcodes(data: bytes, file: str) -> None:
+def _check_opcodes(data: bytes, file: str, allowed: frozenset[str]) -> None:
     """Raises BadClip where an opcode may do more than build plain values, or the stream is cut off."""
     try:
         for count, (opcode, argument, position) in enumerate(pickletools.genops(data)):
-            if opcode.name not in _OPCODES:
+            if opcode.name not in allowed:
                 raise BadClip(file, "pickle", f"opcode {opcode.name} at byte {position} is refused")
             if opcode.name in ("PUT", "BINPUT", "LONG_BINPUT") and (argument or 0) > count:
                 raise BadClip(file, "pickle", f"memo index {argument} at byte {position} is refused")
@@ -72,10 +108,10 @@ def _check_opcodes(data: bytes, file: str) -> None:
 class _Unpickler(pickle.Unpickler):
     """Answers globals with stand-ins bound to this load's file name and memory budget."""
 
-    def __init__(self, data: bytes, file: str) -> None:
+    def __init__(self, data: bytes, file: str, classes: frozenset[str]) -> None:
         super().__init__(io.BytesIO(data))
         self._file = file
-        self._stand_ins = _stand_ins(file, BUDGET_BASE_BYTES + BUDGET_PER_BYTE * len(data))
+        self._stand_ins = _stand_ins(file, BUDGET_BASE_BYTES + BUDGET_PER_BYTE * len(data), classes)
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in self._stand_ins:
@@ -111,7 +147,7 @@ class _Array(np.ndarray):
         super().__setstate__(checked)
 
 
-def _stand_ins(file: str, budget: int) -> dict[tuple[str, str], Callable[..., Any]]:
+def _stand_ins(file: str, budget: int, classes: frozenset[str]) -> dict[tuple[str, str], Callable[..., Any]]:
     """(module, name) -> what a global stands for. Functions are made anew per load: no stream can alter another's.
 
     budget: bytes that arrays and copies may take.
@@ -181,4 +217,7 @@ def _stand_ins(file: str, budget: int) -> dict[tuple[str, str], Callable[..., An
             table[builtins, kind.__name__] = copied(kind)
         for name in ("dict", "int", "float", "bool", "str"):  # only ever factories of a defaultdict
             table[builtins, name] = plain_dict
+    for module, name in (words.split(" ") for words in classes):
+        inert = {"module": module, "name": name, "spend": staticmethod(spend)}
+        table[module, name] = type("Record", (Record,), inert)
     return table
