@@ -164,39 +164,118 @@ def _frame(i: int) -> dict[str, Any]:
 
 
 def _lights(i: int) -> Any:
-    stamp = TimePoint(1_620_000_000_000_000 + 500_000 * i)
     status = [TrafficLightStatusType.GREEN, TrafficLightStatusType.YELLOW, TrafficLightStatusType.RED]
+    return _statuses([(21 + k, s) for k, s in enumerate(status)], 1_620_000_000_000_000 + 500_000 * i)
+
+
+def _statuses(lights: list[tuple[int, TrafficLightStatusType]], stamp_us: int) -> Any:
+    stamp = TimePoint(stamp_us)
     return _new(
         "TrafficLightStatuses",
         traffic_lights=[
-            _new("TrafficLightStatusData", status=s, lane_connector_id=21 + k, timestamp=stamp)
-            for k, s in enumerate(status)
+            _new("TrafficLightStatusData", status=s, lane_connector_id=lane_id, timestamp=stamp)
+            for lane_id, s in lights
         ],
     )
 
 
 def _tracks(i: int) -> Any:
-    things = []
-    for k, number in enumerate((0, 1, 3)):
-        x, y, heading = map(np.float64, world_box(i, k))
+    """A vehicle, a pedestrian and a cone."""
+    things = [
+        (number, f"{0xC000 + k:016x}", world_box(i, k), (4.0, 2.0, 1.5), (0.5 * k, 3.0))
+        for k, number in enumerate((0, 1, 3))
+    ]
+    return _detections(things, f"{0xB000 + i:016x}")
+
+
+def _detections(things: list[tuple[int, str, np.ndarray, Any, Any]], token: str) -> Any:
+    """Of kind, track token, x y heading, length width height, velocity each."""
+    found = []
+    for number, track, pose, sizes, velocity in things:
+        x, y, heading = map(np.float64, pose)
+        names = {"token": token, "track_id": None, "track_token": track, "category_name": None}
+        center = _new("StateSE2", x=x, y=y, heading=heading)
         fields = {
-            "_metadata": _new(
-                "SceneObjectMetadata",
-                timestamp_us=0,
-                token=f"{0xB000 + i:016x}",
-                track_id=None,
-                track_token=f"{0xC000 + k:016x}",
-                category_name=None,
-            ),
+            "_metadata": _new("SceneObjectMetadata", timestamp_us=0, **names),
             "instance_token": None,
             "_tracked_object_type": _kind(number),
-            "_box": _new(
-                "OrientedBox", _center=_new("StateSE2", x=x, y=y, heading=heading), _length=4.0, _width=2.0, _height=1.5
-            ),
+            "_box": _new("OrientedBox", _center=center, **dict(zip(("_length", "_width", "_height"), sizes))),
         }
-        moving = {"_velocity": _new("StateVector2D", _x=0.5 * k, _y=np.float64(3.0), _array=np.array([0.5 * k, 3.0]))}
-        things.append(_new("StaticObject", **fields) if number == 3 else _new("Agent", **fields, **moving))
-    return _new("DetectionsTracks", tracked_objects=_new("TrackedObjects", tracked_objects=things))
+        moving = {"_velocity": _new("StateVector2D", _x=velocity[0], _y=velocity[1], _array=np.array(velocity))}
+        found.append(_new("StaticObject", **fields) if number >= 3 else _new("Agent", **fields, **moving))
+    return _new("DetectionsTracks", tracked_objects=_new("TrackedObjects", tracked_objects=found))
+
+
+def scene_of_log(frames: list[dict[str, Any]], at: int, token: str) -> dict[str, Any]:
+    """A log's own frames (as OpenScene's dicts) around frame `at`, as if somebody had simulated them."""
+    now = frames[at]
+    about = {
+        "log_name": now["log_name"],
+        "scene_token": token,
+        "map_name": now["map_location"],
+        "initial_token": token,
+        "num_history_frames": 4,
+        "num_future_frames": 0,
+        "corresponding_original_scene": now["token"],
+        "corresponding_original_initial_token": frames[at - 8]["token"] if at >= 8 else None,
+    }
+    return {
+        "scene_metadata": about,
+        "frames": [_log_frame(frame, token if frame is now else frame["token"]) for frame in frames[at - 3 : at + 1]],
+        "extended_traffic_light_data": [
+            _statuses(
+                [(lane, TrafficLightStatusType.RED if red else TrafficLightStatusType.GREEN) for lane, red in lights],
+                0,
+            )
+            for lights in (frame["traffic_lights"] for frame in frames[at + 1 : at + 9])
+        ],
+        "extended_detections_tracks": [_log_tracks(frame) for frame in frames[at + 1 : at + 9]],
+    }
+
+
+def _heading(frame: dict[str, Any]) -> float:
+    w, x, y, z = frame["ego2global_rotation"]
+    return float(np.arctan2(2.0 * (w * z - x * y), 1.0 - 2.0 * (y**2 + z**2)))
+
+
+def _log_frame(frame: dict[str, Any], token: str) -> dict[str, Any]:
+    anns, motion = frame["anns"], np.array(frame["ego_dynamic_state"], np.float32)
+    return {
+        "token": token,
+        "timestamp": frame["timestamp"],
+        "roadblock_ids": frame["roadblock_ids"],
+        "traffic_lights": frame["traffic_lights"],
+        "annotations": {
+            "boxes": anns["gt_boxes"],
+            "names": anns["gt_names"],
+            "velocity_3d": anns["gt_velocity_3d"],
+            "instance_tokens": anns["instance_tokens"],
+            "track_tokens": anns["track_tokens"],
+        },
+        "ego_status": {
+            "ego_pose": np.array([*frame["ego2global_translation"][:2], _heading(frame)]),
+            "ego_velocity": motion[:2],
+            "ego_acceleration": motion[2:],
+            "driving_command": frame["driving_command"],
+            "in_global_frame": True,
+        },
+        "lidar_path": None,
+        "camera_dict": {name: {} for name in CAMERAS},
+    }
+
+
+def _log_tracks(frame: dict[str, Any]) -> Any:
+    anns, heading = frame["anns"], _heading(frame)
+    c, s = np.cos(heading), np.sin(heading)
+    numbers = {kind.name.lower(): kind.value for kind in TrackedObjectType}
+    things = []
+    for box, name, velocity, track in zip(
+        anns["gt_boxes"], anns["gt_names"], anns["gt_velocity_3d"], anns["track_tokens"]
+    ):
+        x, y = np.array([[c, -s], [s, c]]) @ box[:2] + frame["ego2global_translation"][:2]
+        vx, vy = np.array([[c, -s], [s, c]]) @ velocity[:2]
+        things.append((numbers[str(name)], track, np.array([x, y, box[6] + heading]), box[3:6], (vx, vy)))
+    return _detections(things, frame["token"])
 
 
 def write_scene(folder: Path, value: dict[str, Any]) -> Path:
