@@ -101,7 +101,14 @@ def _simscale(request: Request, store: "Store") -> tuple["RunSummary", str]:
 
 
 def _navhard(request: Request, store: "Store") -> tuple["RunSummary", str]:
-    from factory.imports.navhard import GroupReader, Places, entries_of, groups_of, logs_of_tokens, write_benchmark
+    from factory.imports.navhard import (
+        GroupReader,
+        NavsimFolders,
+        entries_of,
+        groups_of,
+        logs_of_tokens,
+        write_benchmark,
+    )
     from factory.imports.table import identity_of, import_rows
     from factory.readers.navsim.filters import read_selection
 
@@ -110,7 +117,7 @@ def _navhard(request: Request, store: "Store") -> tuple["RunSummary", str]:
     selection = read_selection(request.split)
     groups = groups_of(selection)
     tokens = frozenset(token for group in groups for token in (group.now, group.before))
-    places = Places(logs, _folder(request.sensors), Path(request.root).expanduser(), maps)
+    places = NavsimFolders(logs, _folder(request.sensors), Path(request.root).expanduser(), maps)
     reader = GroupReader(places, logs_of_tokens(logs, tokens, selection.scene_filter.log_names), store)
     identity = identity_of(request.source, {"pictures": request.pictures, "split": selection.name})
     summary = import_rows(store, identity, entries_of(groups, reader))

@@ -47,7 +47,7 @@ FRAME_MS = 500
 
 
 @dataclass(frozen=True)
-class Places:
+class NavsimFolders:
     """Where NAVSIM's files lie."""
 
     logs: Path  # navsim_logs/<split>
@@ -90,7 +90,7 @@ def groups_of(selection: Selection) -> list[SceneGroup]:
 class GroupReader:
     """Reads a group when its first row is wanted, keeps it until the next group's, and the log of the last."""
 
-    places: Places
+    places: NavsimFolders
     log_of: dict[str, Path]  # token of a stage-one frame -> its log
     store: Store
     _log: LogFrames | None = None
