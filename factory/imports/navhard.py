@@ -193,7 +193,7 @@ def logs_of_tokens(logs: Path, tokens: frozenset[str], names: Sequence[str] | No
     A log that is named and not here is left out: what needs it fails by name.
     """
     paths = sorted(logs.glob("*.pkl")) if names is None else [logs / f"{name}.pkl" for name in sorted(names)]
-    found = {}
+    found: dict[str, Path] = {}
     for path in (path for path in paths if path.is_file()):
         found |= {frame.token: path for frame in read_frames(path).frames if frame.token in tokens}
     if not found:

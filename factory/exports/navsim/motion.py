@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from factory.exports.navsim.names import N_FRAMES, NOW_FRAME, is_simulated
+from factory.exports.navsim.names import N_FRAMES, NOW_FRAME
 from factory.store.schema import AGENT_STEPS, NOW_INDEX
 from tasks.render.views import pose_on_ground
 from tasks.world.arrays import Array
@@ -43,12 +43,12 @@ def frame_motion(row: Mapping[str, Any]) -> FrameMotion:
     poses = to_world(np.asarray(row["now_pose"]), local[INSTANTS])
     poses[NOW_FRAME] = row["now_pose"]
     dynamics[NOW_FRAME] = row["ego_status"]
-    driven = row["perturbed_states"]
-    if is_simulated(row):
+    driven = row["perturbed_states"]  # null of human rows and of imported ones, whose own log is the drive
+    if driven is not None:
         before = np.asarray(driven)[DRIVEN]  # float64, of the very drive
         poses[:NOW_FRAME], dynamics[:NOW_FRAME] = before[:, : HEADING + 1], before[:, [VX, VY, AX, AY]]
         yaw_rates[: NOW_FRAME + 1] = np.append(before[:, YAW_RATE], driven[-1, YAW_RATE])
-    else:  # the log at T is now, and at T+H the last frame
+    else:  # that log at T is now, and at T+H the last frame
         logged = np.asarray(row["parent_states"])[:, [VX, VY, AX, AY]]
         dynamics[[NOW_FRAME, N_FRAMES - 1]] = logged
     matrices, quaternions = in_space(poses, known_poses(row))

@@ -119,6 +119,19 @@ def test_what_reads_samples_reads_them(released: Path, tmp_path: Path, capsys: p
     assert all(set(np.unique(raster)) > {0, int(BevClass.VEHICLE)} for raster in rasters)
 
 
+def test_exported_again_and_imported_again_rows_are_the_same(released: Path, tmp_path: Path) -> None:
+    imported(released, tmp_path / "out")
+    assert factory(["export", "navsim", f"out={tmp_path / 'out'}", f"to={tmp_path / 'again'}"]) == 0
+    assert imported(tmp_path / "again", tmp_path / "twice") == COMPLETE
+    once, twice = rows_of(tmp_path / "out"), rows_of(tmp_path / "twice")
+    assert sorted(once) == sorted(twice)
+    for key, row in once.items():
+        for name in ("now_pose", "ego_history_2hz", "label_2hz", "ego_status", "frame_tokens", "command"):
+            np.testing.assert_array_equal(row[name], twice[key][name], err_msg=name)
+        assert [image["jpeg"] for image in row["images"]] == [image["jpeg"] for image in twice[key]["images"]]
+        np.testing.assert_allclose(row["label_10hz"], twice[key]["label_10hz"], atol=1e-5)
+
+
 def test_the_unpacked_layout_gives_the_same_rows(released: Path, tmp_path: Path) -> None:
     unpacked = tmp_path / "unpacked" / "SimScale"
     for name in (PDM, RECOVERY):
