@@ -70,18 +70,18 @@ def jpeg_size(path: Path) -> tuple[int, int]:
             if file.read(2) != b"\xff\xd8":
                 raise BadClip(str(path), "image", "no JPEG")
             while True:
-                start = file.read(2)
-                if len(start) < 2 or start[0] != 0xFF:
+                start, marker = file.read(1), file.read(1)
+                while marker == b"\xff":  # padding
+                    marker = file.read(1)
+                if start != b"\xff" or not marker:
                     raise BadClip(str(path), "image", "a JPEG that is cut off")
-                while start[1] == 0xFF:  # padding
-                    start = start[1:] + file.read(1)
-                if start[1] in _ALONE:
+                if marker[0] in _ALONE:
                     continue
-                segment = file.read(2)
-                content = file.read(int.from_bytes(segment) - 2) if len(segment) == 2 else b""
-                if len(content) < int.from_bytes(segment) - 2 or len(segment) < 2 or start[1] == 0xDA:
+                length = int.from_bytes(file.read(2)) - 2
+                content = file.read(max(length, 0))
+                if len(content) != length or marker[0] == 0xDA:
                     raise BadClip(str(path), "image", "a JPEG that is cut off")
-                if start[1] in _FRAME_HEADERS and len(content) >= 5:
+                if marker[0] in _FRAME_HEADERS and length >= 5:
                     return int.from_bytes(content[3:5]), int.from_bytes(content[1:3])
     except OSError as error:
         raise BadClip(str(path), "image", f"cannot be read: {error.strerror}") from error
