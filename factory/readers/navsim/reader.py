@@ -43,6 +43,8 @@ from factory.readers.navsim.windows import (
     wanted_windows,
 )
 from factory.readers.nuplan_maps.city import open_city
+from factory.readers.nuplan_maps.geopackage import DOWNLOAD, map_file
+from factory.readers.nuplan_maps.kept import file_digest
 from factory.readers.restricted_pickle import load_plain
 from factory.readers.settings import NavsimClips
 from factory.readers.validate import validate_clip
@@ -131,7 +133,7 @@ class NavsimReader:
     def index(self) -> ClipIndex:
         """All windows that are clips, by log and time. Raises ValueError where the folders are not what they should."""
         if not self.maps.is_dir():
-            raise ValueError(f"{self.maps}: no such folder; clips.maps is nuPlan's, with one folder a city")
+            raise ValueError(f"{self.maps}: no such folder; clips.maps has one folder a city: {DOWNLOAD}")
         if self.sensors is not None and not self.sensors.is_dir():
             raise ValueError(f"{self.sensors}: no such folder; clips.sensors=null reads clips without pictures")
         scenes = self.choice.scene_filter
@@ -141,6 +143,7 @@ class NavsimReader:
         skipped: dict[str, str] = {}
         broken: dict[ClipRef, str] = {}
         found, found_tokens = 0, set[str]()
+        cities: dict[str, BadClip | None] = {}  # what is wrong with the map of each
         for log_id, table in self._tables(self._chosen()):
             if isinstance(table, BadClip):
                 broken[ClipRef(self.name, log_id, 0)] = str(table)
@@ -152,10 +155,15 @@ class NavsimReader:
                 skipped[log_id] = f"{len(table) * 0.5:.1f} s long, a clip needs {WINDOW_FRAMES * 0.5:.1f} s"
             found += len(wanted)
             found_tokens.update(table.tokens[wanted].tolist())
+            if wanted and (no_map := self._no_map(table.location, cities)):
+                broken[ClipRef(self.name, log_id, 0)] = str(no_map)
+                continue
             kept, reasons = usable(table, wanted, self.choice)
             dropped += reasons
             start_ms = table.start_ms
             refs += [ClipRef(self.name, log_id, int(start_ms[now - FRAMES_BEFORE])) for now in kept]
+        if cities and None not in cities.values():
+            raise ValueError(" ".join(map(str, cities.values())))
         if tokens is not None and (absent := len(tokens - found_tokens)):
             if not found and not broken:
                 raise ValueError(f"{self.root}: none of the scene filter's {len(tokens)} tokens is in the logs here")
@@ -212,8 +220,10 @@ class NavsimReader:
         return validate_clip(clip, opened.log.file)
 
     def digest(self, ref: ClipRef) -> str:
-        """The clip's content digest, from the bytes of its log's file and the name of its map. Raises BadClip."""
-        return _digest(bytes_of(self._path_of(ref)))
+        """The clip's content digest, from the bytes of its log's file and of its city's map. Raises BadClip."""
+        path = self._path_of(ref)
+        table = kept_table(path, self.cache_dir) or make_table(path, self.cache_dir)
+        return _digest(bytes_of(path), map_file(self.maps, table.location))
 
     def block(self, ref: ClipRef) -> str | None:
         """Log and second at which the block begins that the clip is rendered from; None without sensors."""
@@ -270,6 +280,16 @@ class NavsimReader:
                 told = took
             yield log_id, table
 
+    def _no_map(self, location: str, cities: dict[str, BadClip | None]) -> BadClip | None:
+        """What is wrong with the place of a city's map, looked up once a plan; None: it is there."""
+        if location not in cities:
+            try:
+                map_file(self.maps, location)
+                cities[location] = None
+            except BadClip as error:
+                cities[location] = error
+        return cities[location]
+
     def _path_of(self, ref: ClipRef) -> Path:
         path = self.logs().get(ref.log_id)
         if path is None or ref.dataset != self.name:
@@ -281,7 +301,8 @@ class NavsimReader:
             path = self._path_of(ref)
             data = bytes_of(path)
             log = frames_of(load_plain(data, str(path)), path)
-            opened = OpenLog(log, table_of(log), _digest(data))
+            table = table_of(log)
+            opened = OpenLog(log, table, _digest(data, map_file(self.maps, table.location)))
             self._logs = dict([*self._logs.items(), (ref.log_id, opened)][-CACHED_LOGS:])
         return self._logs[ref.log_id]
 
@@ -328,8 +349,8 @@ def log_files(root: Path) -> dict[str, Path]:
     return files
 
 
-def _digest(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()
+def _digest(log: bytes, city: Path) -> str:
+    return hashlib.sha256(hashlib.sha256(log).digest() + bytes.fromhex(file_digest(city))).hexdigest()
 
 
 def _frame_at(ref: ClipRef, table: FrameTable, file: str) -> int:

@@ -8,7 +8,7 @@ import hashlib
 import io
 from collections import Counter
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from factory.readers.navsim.tracks import FRAMES_BEFORE, WINDOW_FRAMES
 from tasks.kernels.compiled import write_whole
 from tasks.world.arrays import Bools, Ints
 
-TABLE_VERSION = 1  # of the tables kept
+TABLE_VERSION = 2  # of the tables kept
 FRAME_S, SLACK_S = 0.5, 0.05  # between two frames; more or less is a gap
 GAP, SHORT_HISTORY, SHORT_FUTURE = "gap_in_frames", "short_history", "short_future"
 NO_ROUTE, NO_BOXES, STANDING, ABSENT = "no_route", "not_annotated", "ego_standing", "absent_token"
@@ -37,6 +37,12 @@ class FrameTable:
     has_route: Bools  # (F,)
     annotated: Bools  # (F,)
     speeds: NDArray[np.float32]  # (F,) of the ego [m/s]
+    locations: NDArray[np.str_]  # (F,) the city, the same in all frames
+
+    @property
+    def location(self) -> str:
+        """The city that the log drives in."""
+        return str(self.locations[0])
 
     def __len__(self) -> int:
         return len(self.tokens)
@@ -78,6 +84,7 @@ def table_of(log: LogFrames) -> FrameTable:
         has_route=np.array([bool(frame.roadblock_ids) for frame in frames]),
         annotated=np.array([frame.boxes is not None for frame in frames]),
         speeds=np.array([np.hypot(*frame.dynamic_state[:2]) for frame in frames], np.float32),
+        locations=np.array([frame.map_location for frame in frames]),
     )
 
 
@@ -86,7 +93,7 @@ def kept_table(path: Path, cache_dir: Path) -> FrameTable | None:
     try:
         data = _kept(path, cache_dir).read_bytes()
         rows = np.load(io.BytesIO(data), allow_pickle=False)
-        return FrameTable(*(rows[name] for name in ("tokens", "timestamps_us", "has_route", "annotated", "speeds")))
+        return FrameTable(*(rows[column.name] for column in fields(FrameTable)))
     except FileNotFoundError:
         return None
     except (ValueError, OSError, EOFError, IndexError):

@@ -22,6 +22,7 @@ from tasks.world.arrays import Array, Ints
 log = logging.getLogger(__name__)
 
 INDEX = "nuplan-maps-v1.0.json"  # the name is part of nuPlan's code; the maps of release 1.1 come with it, too
+DOWNLOAD = "download nuPlan's nuplan-maps-v1.1.zip, whose folder nuplan-maps-v1.0 is the root"
 INSTALL = "nuPlan's maps are read by pyogrio and pyproj: pip install 'driving-data-factory[navsim]'"
 KEYS: Mapping[str, tuple[str, ...]] = {  # layer -> columns of integers that must not be NULL
     "lanes_polygons": ("lane_group_fid", "lane_index", "left_boundary_fid", "right_boundary_fid"),
@@ -80,7 +81,8 @@ def map_file(maps_root: Path, location: str) -> Path:
     """<maps_root>/<location>/<version>/map.gpkg. Raises BadClip."""
     folder, index = maps_root / location, maps_root / INDEX
     if not folder.is_dir():
-        raise BadClip(str(folder), "location", "no such folder; the maps' root holds one folder for each city")
+        problem = "no such folder; the maps' root holds one for each city"
+        raise BadClip(str(folder), "location", f"{problem}: {DOWNLOAD}")
     if index.is_file():
         try:
             version = str(json.loads(index.read_text(encoding="utf-8"))[location]["version"])
@@ -93,7 +95,7 @@ def map_file(maps_root: Path, location: str) -> Path:
         version = versions[0]
     path = folder / version / "map.gpkg"
     if not path.is_file():
-        raise BadClip(str(path), "map.gpkg", "no such file")
+        raise BadClip(str(path), "map.gpkg", f"no such file; {DOWNLOAD}")
     return path
 
 

@@ -4,6 +4,7 @@ import hashlib
 import logging
 import secrets
 import zipfile
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +40,18 @@ def cache_file(path: Path) -> Path:
     told = path.stat()
     name = f"{path.resolve()}|{told.st_size}|{told.st_mtime_ns}|{FORMAT}"
     return user_cache() / "maps" / f"{path.parent.parent.name}-{hashlib.sha256(name.encode()).hexdigest()[:16]}.npz"
+
+
+def file_digest(path: Path) -> str:
+    """sha256 of a GeoPackage, read once in a process and again where its size or time of change is another."""
+    told = path.stat()
+    return _digest_of(path.resolve(), told.st_size, told.st_mtime_ns)
+
+
+@lru_cache(maxsize=8)
+def _digest_of(path: Path, _size: int, _changed_ns: int) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def save_tables(path: Path, tables: dict[str, Table]) -> None:

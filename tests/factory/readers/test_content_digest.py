@@ -10,8 +10,11 @@ from test_av2 import write_log
 from factory.readers.av2.reader import AV2Reader
 from factory.readers.base import BadClip, ClipRef
 from factory.readers.logs import LogReader
+from factory.readers.navsim.reader import NavsimReader
 from factory.readers.py123d.reader import Py123dReader
 from factory.readers.scenarionet.reader import ScenarioNetReader
+from tests.factory.readers.navsim.small import reader_of, road_frames, write_city
+from tests.factory.readers.navsim.small import write_log as write_navsim_log
 from tests.factory.readers.py123d_logs import convert
 
 
@@ -32,8 +35,24 @@ def py123d(folder: Path) -> tuple[Py123dReader, Path]:
     return Py123dReader(log), log / "map.arrow"
 
 
-@pytest.mark.parametrize("make", [av2, py123d, scenarionet])
-def test_the_digest_is_the_clip_s_and_follows_the_log(make: Callable[..., tuple[LogReader, Path]], tmp_path: Path):
+def navsim(folder: Path) -> tuple[NavsimReader, Path]:
+    """Likewise."""
+    write_city(folder)
+    log = write_navsim_log(folder, road_frames())
+    return reader_of(folder, sensors=None), log
+
+
+def navsim_map(folder: Path) -> tuple[NavsimReader, Path]:
+    """Likewise; the city's map is no part of the log."""
+    reader, _ = navsim(folder)
+    return reader, next(folder.glob("maps/*/*/map.gpkg"))
+
+
+Reader = LogReader | NavsimReader
+
+
+@pytest.mark.parametrize("make", [av2, navsim, navsim_map, py123d, scenarionet])
+def test_the_digest_is_the_clip_s_and_follows_the_log(make: Callable[..., tuple[Reader, Path]], tmp_path: Path):
     reader, file = make(tmp_path)
     ref = reader.index().refs[0]
     before = reader.digest(ref)

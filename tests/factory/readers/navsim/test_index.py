@@ -8,7 +8,7 @@ import pytest
 
 from factory.config.run import load_config
 from factory.config.words import ConfigError
-from factory.readers.base import ClipRef
+from factory.readers.base import BadClip, ClipRef
 from factory.readers.navsim.reader import NavsimReader
 from factory.readers.settings import NavsimClips
 from tests.factory.readers.navsim.logs import NAME, frame
@@ -19,11 +19,17 @@ OTHER = "2021.06.14.18.00.00_veh-51_00100_00200"
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """Two logs of 24 frames, and an empty folder of maps, which planning does not open."""
+    """Two logs of 24 frames, and a map that planning does not open."""
     for name in (NAME, OTHER):
         write_frames(tmp_path, "mini", name, [frame(k, name) for k in range(24)])
-    (tmp_path / "maps").mkdir()
+    write_no_map(tmp_path, "us-ma-boston")
     return tmp_path
+
+
+def write_no_map(root: Path, city: str) -> None:
+    """A file where the city's map should be."""
+    (root / "maps" / city / "9").mkdir(parents=True)
+    (root / "maps" / city / "9" / "map.gpkg").touch()
 
 
 def reader(root: Path, folder: str = "mini", **other: Any) -> NavsimReader:
@@ -94,7 +100,7 @@ def test_folders_that_are_wrong_are_told(root: Path) -> None:
         NavsimReader(root / "navsim_logs", root / "maps").index()
     with pytest.raises(ValueError, match=r"nowhere: no such folder or \.pkl file"):
         NavsimReader(root / "nowhere", root / "maps").index()
-    with pytest.raises(ValueError, match=r"nowhere: no such folder; clips\.maps is nuPlan's"):
+    with pytest.raises(ValueError, match=r"nowhere: no such folder; clips\.maps .* nuplan-maps-v1\.1\.zip"):
         reader(root, maps=root / "nowhere").index()
     with pytest.raises(ValueError, match=r"nowhere: no such folder; clips\.sensors=null"):
         reader(root, sensors=root / "nowhere").index()
@@ -104,6 +110,25 @@ def test_folders_that_are_wrong_are_told(root: Path) -> None:
         reader(root, scene_filter=write_filter(root, tokens=("0" * 16,))).index()
     with pytest.raises(ValueError, match="none of the 1 logs that the scene filter names is here"):
         reader(root, scene_filter=write_filter(root, log_names=("gone",))).index()
+
+
+def test_a_city_without_a_map_is_told_before_any_clip_is_read_and_hurts_no_other(root: Path) -> None:
+    here = "sg-one-north"
+    write_frames(root, "mini", OTHER, [frame(k, OTHER, map_location=here) for k in range(24)])
+    index = reader(root).index()
+    assert [ref.log_id for ref in index.refs] == [NAME] * 3
+    ((ref, problem),) = index.broken.items()
+    assert ref.log_id == OTHER and problem.startswith(str(root / "maps" / here)) and "nuplan-maps-v1.1.zip" in problem
+    with pytest.raises(BadClip, match=rf"{here}: location: no such folder"):
+        reader(root).read(ref)
+    chosen = write_filter(root, tokens=(hex16(NAME, 4), hex16(OTHER, 4), hex16(OTHER, 5)))
+    assert reader(root, scene_filter=chosen).index().dropped == {}, "its tokens are not absent"
+    assert not reader(root, scene_filter=write_filter(root, tokens=(hex16(NAME, 4),))).index().broken
+    with pytest.raises(ValueError, match=rf"{here}: location: no such folder; .* nuplan-maps-v1\.1\.zip"):
+        reader(root, only=[OTHER]).index()
+    (root / "maps" / here / "9").mkdir(parents=True)
+    with pytest.raises(ValueError, match=r"sg-one-north: version: .* it must hold one version, it holds \[\]"):
+        reader(root, only=[OTHER]).index()
 
 
 def test_settings_that_cannot_be_are_refused_before_anything_is_read() -> None:

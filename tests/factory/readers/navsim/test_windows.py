@@ -40,6 +40,7 @@ def table(n: int, **other: np.ndarray) -> FrameTable:
             has_route=np.ones(n, bool),
             annotated=np.ones(n, bool),
             speeds=np.full(n, 8.0, np.float32),
+            locations=np.full(n, "us-ma-boston"),
         ),
         **other,
     )
@@ -126,6 +127,8 @@ def test_navtrain_s_token_list_plans_in_seconds(tmp_path: Path) -> None:
     rng, wanted, names = np.random.default_rng(0), [], []
     (tmp_path / "logs").mkdir()
     (tmp_path / "kept").mkdir()
+    (tmp_path / "us-ma-boston" / "9").mkdir(parents=True)
+    (tmp_path / "us-ma-boston" / "9" / "map.gpkg").touch()
     for i in range(1192):
         name = f"2021.06.14.18.00.00_veh-51_{i:05d}_{i + 1:05d}"
         (tmp_path / "logs" / f"{name}.pkl").write_bytes(b"never opened")
