@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow.feather
+import shapely
 from scipy.spatial.transform import Rotation
 
 from factory.readers.av2.log import step_times, world_from_ego_at
@@ -23,7 +24,6 @@ from factory.readers.navsim.log import CAMERA_NAMES
 from tasks.world.agents import AgentKind
 from tasks.world.camera import Camera
 from tasks.world.clip import STEP_S
-from tasks.world.command import driving_command
 from tasks.world.frames import points_to_local
 from tasks.world.lanes import LightState
 from tasks.world.vehicle import AX, HEADING, VX
@@ -228,8 +228,19 @@ def _lights(log: WholeLog, step: int, place: Place) -> list[tuple[int | str, boo
 
 
 def _command(log: WholeLog, step: int) -> np.ndarray:
+    """By OpenScene's rule (helpers/driving_command.py), without our `driving_command`: the side of the route's point
+    20 m ahead, seen along the route at the ego; 2 m or more are a turn, a route that ends before it is unknown.
+    """
     pose = log.ego_states[step, :3]
-    word = driving_command(log.finder.centerline_from(pose), pose)
+    line = shapely.LineString(log.finder.centerline_from(pose)[:, :2])
+    here = line.project(shapely.Point(pose[:2]))
+    word = "unknown"
+    if here + 20.0 <= line.length:
+        points = [line.interpolate(here + ahead) for ahead in (0.0, 0.2, 20.0)]
+        (x, y), (near_x, near_y), (far_x, far_y) = ((point.x, point.y) for point in points)
+        length = np.hypot(near_x - x, near_y - y)
+        side = ((near_x - x) * (far_y - y) - (near_y - y) * (far_x - x)) / length
+        word = "left" if side >= 2.0 else "right" if side <= -2.0 else "straight"
     return np.array([int(word == known) for known in ("left", "straight", "right", "unknown")])
 
 

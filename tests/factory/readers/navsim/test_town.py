@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from factory.readers.av2.reader import AV2Reader, read_log
+from factory.readers.navsim.log import read_frames
 from factory.readers.navsim.reader import LICENCE, NavsimReader
 from factory.readers.settings import TownSettings
 from factory.readers.town.write import write_logs
@@ -165,10 +166,18 @@ def test_thinning_moves_what_turns_and_brakes_by_centimetres(towns: Towns) -> No
 
 
 @pytest.mark.slow
-def test_the_log_s_command_is_the_one_computed_from_the_route(towns: Towns) -> None:
-    for native, read in towns.pairs():
-        there = driving_command(native.centerline, native.ego_states[NOW, :3])
-        assert driving_command(read.centerline, read.ego_states[NOW, :3]) == there
+def test_the_command_computed_from_the_route_is_the_log_s_own(towns: Towns) -> None:
+    """But where the route ends at a lane that follows a lane directly, which a GeoPackage cannot hold."""
+    seen, compared = set(), 0
+    for _, read in towns.pairs():
+        frames = {frame.token: frame for frame in read_frames(towns.navsim.logs()[read.log_id]).frames}
+        command = frames[read.frame_tokens[0]].command
+        computed = driving_command(read.centerline, read.ego_states[NOW, :3])
+        if computed != "unknown":
+            assert computed == command
+            seen.add(command)
+            compared += 1
+    assert len(seen) > 1 and compared >= 6, (seen, compared)
 
 
 def _by_place(clip: Clip) -> list[np.ndarray]:
