@@ -17,6 +17,8 @@ from factory.readers.town.write import _vector_map
 from tasks.world.lanes import MapLayer, RoadMap
 from tests.factory.readers.geopackage_writer import ORIGIN, Row, town_rows, write_geopackage, write_root
 
+pytestmark = pytest.mark.slow  # the first test builds a town
+
 CITY, ZONE = "us-nv-las-vegas-strip", 32611
 PROJECTION_M = 1e-6  # what going to degrees and back may cost; measured: 4e-9
 
