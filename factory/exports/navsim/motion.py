@@ -58,15 +58,20 @@ def frame_motion(row: Mapping[str, Any]) -> FrameMotion:
 def derivatives(poses: Array) -> tuple[Array, Array]:
     """Of poses (S, 3) at 10 Hz: (S, 4) vx, vy, ax, ay in the axes of each pose, and (S,) yaw rates.
 
-    First and second differences of the positions over one step to either side; at both ends, the nearest of them.
+    Velocities are differences over one step to either side, at both ends the slope of the parabola through three
+    frames. Accelerations are second differences over a frame to either side, nearer to an end those of the nearest
+    step: a log at 2 Hz is straight between its frames, and over single steps its speed would change in one of them.
     """
     xy, heading = poses[:, :2], np.unwrap(poses[:, 2])
     velocity, yaw_rate = np.gradient(xy, STEP_S, axis=0), np.gradient(heading, STEP_S)
+    n, frame_s = STEPS_PER_FRAME, STEPS_PER_FRAME * STEP_S
+    velocity[0] = (4.0 * xy[n] - 3.0 * xy[0] - xy[2 * n]) / (2.0 * frame_s)
+    velocity[-1] = (3.0 * xy[-1] - 4.0 * xy[-1 - n] + xy[-1 - 2 * n]) / (2.0 * frame_s)
     acceleration = np.zeros_like(xy)
-    acceleration[1:-1] = (xy[2:] - 2.0 * xy[1:-1] + xy[:-2]) / STEP_S**2
-    acceleration[[0, -1]] = acceleration[[1, -2]]
+    acceleration[n:-n] = (xy[2 * n :] - 2.0 * xy[n:-n] + xy[: -2 * n]) / frame_s**2
     c, s = np.cos(heading)[:, None], np.sin(heading)[:, None]
     turned = [np.hstack([c * v[:, :1] + s * v[:, 1:], c * v[:, 1:] - s * v[:, :1]]) for v in (velocity, acceleration)]
+    turned[1][:n], turned[1][-n:] = turned[1][n], turned[1][-n - 1]
     return np.hstack(turned), yaw_rate
 
 

@@ -209,8 +209,22 @@ def test_differences_of_a_circle_are_its_speed_and_centripetal_acceleration() ->
     turned = speed / radius * 0.1 * np.arange(56)
     poses = np.column_stack([radius * np.sin(turned), radius * (1 - np.cos(turned)), turned])
     dynamics, yaw_rates = derivatives(poses)
-    np.testing.assert_allclose(dynamics[1:-1], np.tile([speed, 0, 0, speed**2 / radius], (54, 1)), atol=2e-3)
+    np.testing.assert_allclose(dynamics[1:-1, :2], np.tile([speed, 0], (54, 1)), atol=2e-3)
+    np.testing.assert_allclose(dynamics[[0, -1], :2], np.tile([speed, 0], (2, 1)), atol=0.05)
+    np.testing.assert_allclose(dynamics[:, 2:], np.tile([0, speed**2 / radius], (56, 1)), atol=4e-3)
     np.testing.assert_allclose(yaw_rates, speed / radius, atol=1e-12)
+
+
+def test_a_log_at_2_hz_has_the_accelerations_of_its_frames() -> None:
+    """Between frames it is straight: over single steps a steady braking would come in jerks, five times as hard."""
+    speed, braking, heading = 8.0, -1.4, 0.7
+    frames_s, steps_s = 0.5 * np.arange(12), 0.1 * np.arange(56)
+    way = np.interp(steps_s, frames_s, speed * frames_s + braking / 2 * frames_s**2)
+    poses = np.column_stack([np.cos(heading) * way, np.sin(heading) * way, np.full(56, heading)])
+    dynamics, _ = derivatives(poses)
+    still = np.zeros(12)
+    expected = np.column_stack([speed + braking * frames_s, still, still + braking, still])
+    np.testing.assert_allclose(dynamics[::5], expected, atol=1e-9)
 
 
 def test_lights_are_red_or_not_and_keyed_by_numbers() -> None:
