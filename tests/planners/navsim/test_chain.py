@@ -1,0 +1,342 @@
+"""From NAVSIM's folders to a planner that is scored in them, by the commands: every link held against the one before.
+
+A town's log as OpenScene with a GeoPackage and JPEGs -> a run -> its export, read by the independent reader -> a
+training step -> the agent before the exported logs -> our scorer; and the export brought back as samples.
+"""
+
+import json
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from factory.__main__ import main as factory
+from factory.exports.navsim.names import sample_names, split_names
+from factory.imports.labels import METRICS
+from factory.readers.av2.reader import read_log
+from factory.readers.navsim.log import CAMERA_NAMES
+from factory.readers.navsim.reader import NavsimReader
+from factory.readers.restricted_pickle import load_plain
+from factory.readers.settings import TownSettings
+from factory.readers.town.write import write_logs
+from factory.run import main as run
+from factory.store.reader import SampleTable, labels_of
+from planners.evaluation.planning import plans_of
+from planners.navsim.agent import RemotePlanner, shown
+from planners.navsim.pilot import FRONT, Pilot, seen_of
+from planners.training.checkpoint import load_planner, newest
+from planners.training.train import main as train
+from tasks.trajectories import score_trajectories
+from tasks.world.camera import Camera
+from tasks.world.clip import Clip
+from tasks.world.frames import to_world
+from tasks.world.lanes import LightState
+from tests.factory.exports.openscene_reader import Scene, read_rewards, read_scenes, read_split
+from tests.factory.readers.geopackage_writer import ORIGIN, town_rows, write_root
+from tests.factory.readers.openscene_writer import Place, Sensed, write_openscene
+from tests.planners.navsim import agent_inputs
+from tests.planners.navsim.agent_inputs import DISTORTION, YAWS, AgentInput, Cameras, EgoStatus, looking, photo, pinhole
+
+SIZE = (160, 90)  # of the log's JPEGs; the run's are of its half
+K = 48
+TOWN = "us-ma-boston"
+MAP = ("render=map", "render.frames=history", "render.width=80", "render.height=45")
+
+
+@dataclass(frozen=True)
+class Chain:
+    """NAVSIM's folders, the run made of them, and its export."""
+
+    root: Path
+
+    @property
+    def logs(self) -> Path:
+        return self.root / "navsim_logs/mini"
+
+    @property
+    def run(self) -> Path:
+        return self.root / "run"
+
+    @property
+    def to(self) -> Path:
+        return self.root / "to"
+
+    def reader(self) -> NavsimReader:
+        return NavsimReader(self.logs, self.root / "maps", cache_dir=self.root / "kept", stride_s=4.0)
+
+    def rows(self, out: str = "run") -> list[dict[str, Any]]:
+        return sorted(SampleTable(self.root / out), key=lambda row: (row["expert"], row["round"]))
+
+    def scenes(self) -> dict[tuple[str, int], Scene]:
+        """By expert and round, found as a training finds them: by the splits' files."""
+        found = {}
+        for row in self.rows():
+            who = "navtrain_human" if row["expert"] == "human" else f"navtrain_reaction_pdm_v1.0-{row['round']}"
+            devkit = self.to / "devkit/navsim/planning/script/config/common/train_test_split"
+            folder, chosen = read_split(devkit / f"{who}.yaml")
+            scenes = read_scenes(self.to / "navsim_logs" / folder, self.to / "sensor_blobs" / folder, chosen)
+            (found[row["expert"], row["round"]],) = scenes.values()
+        return found
+
+
+@pytest.fixture(scope="module")
+def chain(tmp_path_factory: pytest.TempPathFactory) -> Chain:
+    made = Chain(tmp_path_factory.mktemp("chain"))
+    write_navsim(made.root)
+    clips = ("clips=navsim", f"clips.root={made.logs}", f"clips.maps={made.root / 'maps'}", "+clips.stride_s=4.0")
+    clips += (f"clips.sensors={made.root / 'sensor_blobs/mini'}", f"clips.cache_dir={made.root / 'kept'}")
+    drawn = (*MAP, "rounds=2", "experts=[pdm_closed,human]", f"vocabulary.k={K}", "executor=local")
+    assert run([*clips, *drawn, f"out={made.run}"]) == 0
+    assert factory(["export", "navsim", f"out={made.run}", f"to={made.to}", "resize=true", "workers=1"]) == 0
+    return made
+
+
+def write_navsim(root: Path) -> None:
+    """A log of the town in nuPlan's Boston, with a photo of each of eight cameras at 2 Hz."""
+    (folder,) = write_logs(root / "av2", (1,), 0, TownSettings(cameras=(), lidar_beams=0))
+    log = read_log(folder)
+    rows = town_rows(log.road_map)
+    write_root(root / "maps", TOWN, rows)
+    blocks = log.road_map.roadblock_of
+    number = {blocks[str(row["fid"])]: str(row["lane_group_fid"]) for row in rows["lanes_polygons"]}
+    number |= {blocks[str(row["fid"])]: str(row["lane_group_connector_fid"]) for row in rows["lane_connectors"]}
+    place = Place(TOWN, np.append(ORIGIN, 0.0), roadblock_number=number.__getitem__)
+    frames = range(len(log.ego_states[::5]))
+    images = {(name, k): photo(name.lower(), *SIZE) for name in CAMERA_NAMES for k in frames}
+    rig = tuple(Camera(name, *SIZE, pinhole(*SIZE), DISTORTION, _mounted(name)) for name in CAMERA_NAMES)
+    write_openscene(root, "mini", folder.name, log, place, Sensed(rig, images))
+
+
+def _mounted(name: str) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = looking(YAWS[name.lower()]), (1.2, 0.0, 1.6)
+    return pose
+
+
+@pytest.mark.slow
+def test_the_run_is_of_the_log_s_frames_and_has_two_rounds(chain: Chain) -> None:
+    frames = _logged(chain)
+    tokens = [frame["token"] for frame in frames]
+    rows = chain.rows()
+    assert [(row["expert"], row["round"]) for row in rows] == [("human", 0), ("pdm_closed", 0), ("pdm_closed", 1)]
+    for row in rows:
+        at = tokens.index(row["frame_tokens"][0])
+        assert row["frame_tokens"][1] == tokens[at + 8]
+        poses = np.stack([frame["ego2global_translation"][:2] for frame in (frames[at], frames[at + 8])])
+        np.testing.assert_allclose(row["parent_states"][:, :2], poses, atol=1e-6)
+        assert len(row["images"]) == 32 and row["image_source"] == "map" and row["map_location"] == TOWN
+        assert not any(np.any(camera["distortion"]) for camera in row["cameras"]), "drawn as pinholes see"
+    human = rows[0]
+    logged = np.stack([frame["ego2global_translation"][:2] for frame in frames[at + 1 : at + 9]])
+    np.testing.assert_allclose(to_world(human["now_pose"], human["label_2hz"])[:, :2], logged, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_the_independent_reader_finds_in_the_export_what_the_rows_say(chain: Chain) -> None:
+    road_map, scenes = _clip(chain).road_map, chain.scenes()
+    connectors = {int(name) for name, lane in road_map.lanes.items() if lane.is_intersection}
+    lit: set[int] = set()
+    for row in chain.rows():
+        scene = scenes[row["expert"], row["round"]]
+        first, second = row["frame_tokens"]
+        assert scene.token == (first if row["expert"] == "human" else f"{second}-{row['round']:03d}")
+        assert scene.simulated == (row["expert"] != "human") and not scene.second_stage
+        assert len(scene.frames) == 12 and scene.n_history == 4 and scene.map_name == TOWN
+        np.testing.assert_allclose(scene.history(), row["ego_history_2hz"], atol=1e-5)
+        np.testing.assert_allclose(scene.future(), row["label_2hz"], atol=1e-5)
+        np.testing.assert_allclose(scene.status()[4:], row["ego_status"], atol=1e-6)
+        assert ("left", "straight", "right", "unknown")[int(np.argmax(scene.status()[:4]))] == row["command"]
+        assert scene.now.roadblock_ids == tuple(row["route_roadblock_ids"])
+        assert set(map(int, scene.now.roadblock_ids)) & set(map(int, road_map.roadblock_of.values()))
+        lit |= {number for number, _ in scene.now.traffic_lights}
+        there = np.asarray(row["agent_valid"])[:, 15]
+        assert sorted(scene.now.track_tokens) == sorted(np.asarray(row["agent_ids"])[there])
+        _same_pictures(row, scene)
+    assert lit and lit <= connectors
+
+
+@pytest.mark.slow
+def test_the_human_s_history_has_the_log_s_own_velocities_and_accelerations(chain: Chain) -> None:
+    """Samples do not hold them; the public metric's history comfort looks at them."""
+    logged = {frame["token"]: frame["ego_dynamic_state"] for frame in _logged(chain)}
+    tokens, scene = list(logged), chain.scenes()["human", 0]
+    at = tokens.index(scene.token)
+    for i, frame in enumerate(scene.frames):
+        own = logged[tokens[at - 3 + i]]
+        np.testing.assert_allclose(frame.velocity, own[:2], atol=0.1)
+        np.testing.assert_allclose(frame.acceleration, own[2:], atol=0.25)
+
+
+def _logged(chain: Chain) -> list[dict[str, Any]]:
+    """The frames of NAVSIM's log, written as NumPy 1 names its parts."""
+    (file,) = chain.logs.glob("*.pkl")
+    frames = load_plain(file.read_bytes(), str(file))
+    assert isinstance(frames, list)
+    return frames
+
+
+def _same_pictures(row: Mapping[str, Any], scene: Scene) -> None:
+    """Each is the row's, larger: made small again it looks alike, and the camera sees the same rays."""
+    rig = {camera["name"].lower(): camera for camera in row["cameras"]}
+    for image in row["images"]:
+        name = image["camera"].lower()
+        shot = scene.frames[round(2.0 * image["time_s"]) + 3].cameras[name]
+        small = cv2.resize(shot.image(), (80, 45), interpolation=cv2.INTER_AREA).astype(float)
+        stored = cv2.imdecode(np.frombuffer(image["jpeg"], np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+        assert np.abs(small - stored).mean() < 3.0
+        scale = np.diag([1920 / 80, 1080 / 45, 1.0])
+        np.testing.assert_allclose(shot.intrinsics, scale @ rig[name]["intrinsics"].reshape(3, 3))
+        pose = rig[name]["ego_from_camera"].reshape(4, 4)
+        np.testing.assert_allclose(shot.rotation, pose[:3, :3], atol=1e-9)
+        np.testing.assert_allclose(shot.translation, pose[:3, 3], atol=1e-9)
+
+
+@pytest.mark.slow
+def test_the_rewards_are_the_rows_labels_and_those_the_scores_of_their_trajectories(chain: Chain) -> None:
+    vocabulary = np.load(chain.to / f"devkit/traj_final/{K}.npy")
+    for row in chain.rows():
+        names, split = sample_names(row), split_names(row)
+        rewards = read_rewards(chain.to / "traj_pdm_v2" / split.rewards, [names.token], K)[names.token]
+        labels = labels_of(row)
+        for public, ours in METRICS.items():
+            np.testing.assert_array_equal(rewards[public], np.float16(getattr(labels, ours)))
+        np.testing.assert_array_equal(rewards["ego_progress"], np.float16(labels.ep("masked")))
+    scores = score_trajectories(_clip(chain), vocabulary)
+    human = labels_of(chain.rows()[0])
+    for ours in METRICS.values():
+        np.testing.assert_array_equal(getattr(scores, ours), getattr(human, ours))
+
+
+@pytest.mark.slow
+def test_a_planner_of_one_step_drives_as_an_agent_in_the_exported_logs_and_is_scored(chain: Chain) -> None:
+    data = [f"data.real=[{chain.run}]", f"data.sim=[{chain.run}]", "planner.training.batch_size=3"]
+    cameras = f"planner.settings.image.cameras=[{','.join(name.upper() for name in FRONT)}]"
+    out = chain.root / "trained"
+    assert train(["planner=ltf_small", cameras, *data, "steps=1", f"out={out}"]) == 0
+    assert json.loads((newest(out) / "record.json").read_text())["step"] == 1
+    scenes, rows, clip = chain.scenes(), chain.rows(), _clip(chain)
+    expected = plans_of(load_planner(out), rows)
+    remote = RemotePlanner(str(out), sys.executable)
+    plans = {key: remote.plan(agent_input(scene), 40) for key, scene in scenes.items()}
+    remote.close()
+    for row, of_row in zip(rows, expected):  # pictures are other JPEGs, decoded smaller
+        np.testing.assert_allclose(plans[row["expert"], row["round"]], of_row, atol=0.3)
+    still = Pilot("constant_velocity")
+    steady = still.plan(seen_of(shown(agent_input(scenes["human", 0]), ()), ()), 8)
+    speed = rows[0]["ego_status"][0]
+    straight = np.array([[0.5 * speed * k, 0.0, 0.0] for k in range(1, 9)])
+    np.testing.assert_allclose(steady, straight, atol=0.1)
+    driven = [scenes["human", 0].future(), rows[0]["label_2hz"], steady, straight, plans["human", 0][4::5]]
+    scores = score_trajectories(clip, np.stack(driven)).pdm_score
+    assert scores[0] == pytest.approx(scores[1], abs=1e-5) and scores[2] == pytest.approx(scores[3], abs=0.01)
+    assert ((scores >= 0.0) & (scores <= 1.0)).all() and scores[0] > 0.8
+
+
+def _clip(chain: Chain) -> Clip:
+    """The human sample's."""
+    reader = chain.reader()
+    (ref,) = reader.index().refs
+    return reader.read(ref)
+
+
+def agent_input(scene: Scene) -> AgentInput:
+    """What NAVSIM would show an agent of a scene, decoded by PIL, with the front cameras at now alone."""
+    status = scene.status()
+    egos = [EgoStatus(pose, status[4:6], status[6:], status[:4].astype(int)) for pose in scene.history()]
+    shot = {}
+    for name in FRONT:
+        camera = scene.now.cameras[name]
+        calibration = camera.rotation, camera.translation, camera.intrinsics, camera.distortion
+        shot[name] = agent_inputs.Camera(camera.image(), *calibration)
+    return AgentInput(egos, [Cameras(), Cameras(), Cameras(), Cameras(**shot)])
+
+
+@pytest.mark.slow
+def test_the_export_brought_back_is_the_run(chain: Chain) -> None:
+    """States, labels, rewards and pictures, to float32.
+
+    Not carried: what lies between two frames (label, history, tracks and lights at 10 Hz), perturbation, proposal and
+    scores, metres of progress, the logged drive before (parent_states), the vocabulary's digest (NAVSIM's are float32),
+    human samples, which are no SimScale's.
+    """
+    words = [
+        f"maps={chain.root / 'maps'}",
+        f"rewards={chain.to / 'traj_pdm_v2'}",
+        f"vocabulary={chain.to / f'devkit/traj_final/{K}.npy'}",
+    ]
+    assert factory(["import", "simscale", f"root={chain.to}", f"out={chain.root / 'back'}", *words]) == 0
+    rows = [row for row in chain.rows() if row["expert"] != "human"]
+    scenes = chain.scenes()
+    back = chain.rows("back")
+    assert [(row["expert"], row["round"]) for row in back] == [(row["expert"], row["round"]) for row in rows]
+    for row, again in zip(rows, back):
+        for name in ("ego_history_2hz", "label_2hz", "ego_status", "label_subscores", "now_pose", "world_from_ego"):
+            _equal(again[name], row[name])
+        for name in ("command", "frame_tokens", "map_location", "route_roadblock_ids", "route_lane_ids", "lane_ids"):
+            assert again[name] == row[name], name
+        np.testing.assert_allclose(again["route_centerline"], row["route_centerline"], atol=1e-4)
+        assert again["light_lane_ids"] == row["light_lane_ids"]
+        lights = [np.asarray(one["light_states"])[:, ::5] == LightState.RED for one in (row, again)]
+        np.testing.assert_array_equal(*lights)
+        np.testing.assert_array_equal(again["label_10hz"][4::5], again["label_2hz"])
+        np.testing.assert_allclose(again["label_10hz"], row["label_10hz"], atol=0.1)
+        labels, kept = labels_of(row), labels_of(again)
+        for ours in METRICS.values():
+            np.testing.assert_array_equal(getattr(kept, ours), getattr(labels, ours))
+        np.testing.assert_array_equal(np.float16(kept.ep("masked")), np.float16(labels.ep("masked")))
+        _same_agents(row, again)
+        shots = scenes[row["expert"], row["round"]].frames
+        for image in again["images"]:
+            shot = shots[round(2.0 * image["time_s"]) + 3].cameras[image["camera"].lower()]
+            assert image["jpeg"] == shot.file.read_bytes()
+
+
+def _equal(mine: Any, theirs: Any) -> None:
+    if isinstance(theirs, bytes):
+        assert mine == theirs
+    else:
+        np.testing.assert_allclose(np.asarray(mine, np.float64), theirs, rtol=0, atol=1e-5)
+
+
+def _same_agents(row: Mapping[str, Any], again: Mapping[str, Any]) -> None:
+    """At every frame everybody, where they were, as fast as they were."""
+    for step in range(0, 56, 5):
+        found = [_agents(one, step) for one in (row, again)]
+        assert found[0].keys() == found[1].keys()
+        for name, there in found[0].items():
+            np.testing.assert_allclose(found[1][name], there, atol=1e-4)
+
+
+def _agents(row: Mapping[str, Any], step: int) -> dict[str, np.ndarray]:
+    boxes, velocities, z = (np.asarray(row[f"agent_{part}"]) for part in ("boxes", "velocities", "center_z"))
+    return {
+        str(row["agent_ids"][i]): np.concatenate([boxes[i, step], velocities[i, step], [z[i, step]]])
+        for i in np.flatnonzero(np.asarray(row["agent_valid"])[:, step])
+    }
+
+
+@pytest.mark.slow
+def test_pictures_that_are_not_resized_keep_their_bytes(chain: Chain, tmp_path: Path) -> None:
+    only = ["expert=pdm_closed", "round=1"]
+    assert factory(["export", "navsim", f"out={chain.run}", f"to={tmp_path / 'to'}", *only, "workers=1"]) == 0
+    assert factory(["import", "simscale", f"root={tmp_path / 'to'}", f"out={tmp_path / 'back'}"]) == 0
+    (back,) = SampleTable(tmp_path / "back")
+    row = chain.rows()[-1]
+    stored, kept = ({(i["camera"], round(i["time_s"], 3)): i["jpeg"] for i in one["images"]} for one in (row, back))
+    assert len(stored) == 32 and kept == stored
+    by_name = {camera["name"]: camera for camera in row["cameras"]}
+    for camera in back["cameras"]:
+        for part in ("width", "height", "intrinsics", "ego_from_camera"):
+            np.testing.assert_allclose(camera[part], by_name[camera["name"]][part], atol=1e-9)
+
+
+@pytest.mark.slow
+def test_an_exported_log_ends_too_early_to_be_a_clip_and_that_is_said(chain: Chain) -> None:
+    for folder in (chain.to / "navsim_logs").iterdir():
+        plan = NavsimReader(folder, chain.root / "maps", cache_dir=chain.root / "kept").index()
+        assert not plan.refs and list(plan.skipped_logs.values()) == ["6.0 s long, a clip needs 10.0 s"]
