@@ -25,7 +25,7 @@ from factory.readers.restricted_pickle import load_plain
 from factory.readers.settings import TownSettings
 from factory.readers.town.write import write_logs
 from factory.run import main as run
-from factory.store.reader import SampleTable, labels_of
+from factory.store.reader import SampleTable, decoded, labels_of
 from planners.evaluation.planning import plans_of
 from planners.navsim.agent import RemotePlanner, shown
 from planners.navsim.pilot import FRONT, Pilot, seen_of
@@ -88,8 +88,8 @@ class Chain:
 def chain(tmp_path_factory: pytest.TempPathFactory) -> Chain:
     made = Chain(tmp_path_factory.mktemp("chain"))
     write_navsim(made.root)
-    clips = ("clips=navsim", f"clips.root={made.logs}", f"clips.maps={made.root / 'maps'}", "+clips.stride_s=4.0")
-    clips += (f"clips.sensors={made.root / 'sensor_blobs/mini'}", f"clips.cache_dir={made.root / 'kept'}")
+    clips = ["clips=navsim", f"clips.root={made.logs}", f"clips.maps={made.root / 'maps'}", "+clips.stride_s=4.0"]
+    clips += [f"clips.sensors={made.root / 'sensor_blobs/mini'}", f"clips.cache_dir={made.root / 'kept'}"]
     drawn = (*MAP, "rounds=2", "experts=[pdm_closed,human]", f"vocabulary.k={K}", "executor=local")
     assert run([*clips, *drawn, f"out={made.run}"]) == 0
     assert factory(["export", "navsim", f"out={made.run}", f"to={made.to}", "resize=true", "workers=1"]) == 0
@@ -187,7 +187,7 @@ def _same_pictures(row: Mapping[str, Any], scene: Scene) -> None:
         name = image["camera"].lower()
         shot = scene.frames[round(2.0 * image["time_s"]) + 3].cameras[name]
         small = cv2.resize(shot.image(), (80, 45), interpolation=cv2.INTER_AREA).astype(float)
-        stored = cv2.imdecode(np.frombuffer(image["jpeg"], np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+        stored = decoded(image).astype(float)
         assert np.abs(small - stored).mean() < 3.0
         scale = np.diag([1920 / 80, 1080 / 45, 1.0])
         np.testing.assert_allclose(shot.intrinsics, scale @ rig[name]["intrinsics"].reshape(3, 3))
