@@ -253,4 +253,4 @@ def _elsewhere(key: str) -> str:
     names = sorted(file.stem for file in (conf_dir() / "clips").glob("*.yaml")) if group == "clips" else []
     shapes = {name: shape for name in names if (shape := reader_of(name)) is not None}
     having = [f"clips={name}" for name, shape in shapes.items() if inner in dict(keys_of(shape))]
-    return f"{key} is a setting of {' and '.join(having)}: choose one of them too" if having else ""
+    return f"{key} is a setting of {', '.join(having)}: choose one of them too" if having else ""

@@ -58,7 +58,10 @@ MISTYPED = [  # told before anything heavy is imported
     run("experts=recovery,human", says=["experts=[recovery,human]"]),
     run("+rounsd=3", says=["rounsd: there is no such setting", "did you mean rounds=?"]),
     run("~rounds", says=["'~rounds': expected key=value"]),
-    run("clips.root=/logs", says=["clips.root is a setting of clips=av2 and clips=scenarionet"]),
+    run(
+        "clips.root=/logs",
+        says=["clips.root is a setting of clips=av2, clips=navsim, clips=py123d, clips=scenarionet: choose one"],
+    ),
     run("clips=av2", says=["clips.root is missing: give clips.root=<folder>"]),
     run("--multirun", "rounds=1,2", says=["several commands", "out="]),
     run("--config-dir", "nowhere", says=["nowhere: there is no such folder"]),

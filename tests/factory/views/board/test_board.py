@@ -195,7 +195,13 @@ def test_pictures_are_those_of_the_row(out: Path, board: Board) -> None:
     get(board, f"/picture/{attempt_id}/{len(images)}.jpg", 404)
     get(board, f"/picture/{attempt_id}/bev.jpg?size=9999", 400)
     get(board, f"/picture/{attempt_id}/bev.jpg?step=56", 400)
-    assert "no episode" in get(board, f"/episode/{attempt_id}.mcap", 404)["error"], "its poses are made up"
+
+
+def test_a_sample_whose_poses_are_none_has_no_episode(out: Path, board: Board) -> None:
+    """Toy samples' poses are made up; half of the matrices are mirrors, which no ego drives in."""
+    samples = SampleTable(out)
+    mirrored = next(row for row in samples if np.linalg.det(np.reshape(row["world_from_ego"], (4, 4))[:3, :3]) < 0.0)
+    assert "no episode" in get(board, f"/episode/{mirrored['attempt_id']}.mcap", 404)["error"]
 
 
 @pytest.mark.slow
