@@ -20,6 +20,7 @@ from examples.csv_logs import write_log
 from factory.__main__ import main as door_main
 from factory.commands.dashboard import Request as DashboardRequest
 from factory.commands.explain import Request as ExplainRequest
+from factory.commands.export import Request as ExportRequest
 from factory.commands.import_ import Request as ImportRequest
 from factory.commands.table import COMMANDS, PLANNERS
 from factory.config.arguments import parse
@@ -153,6 +154,8 @@ def test_every_command_is_one_its_program_takes(
             assert set(arguments) <= PARTS.keys()
         case ["python", "-m", "factory", "vocabulary", *arguments]:
             assert door_main(["vocabulary", "--help"]) == 0
+        case ["python", "-m", "factory", "export", *arguments] if "out=/data/samples" in arguments:
+            parse(ExportRequest, arguments)  # a run of NAVSIM's logs
         case ["python", "-m", "factory", "import", *arguments]:
             parse(ImportRequest, arguments)  # its folders are a user's
         case ["python", "-m", "factory", *arguments]:
