@@ -82,7 +82,7 @@ def _record(header: dict[str, list[str]], file: str) -> tuple[np.dtype[Any], int
     for name, size, kind in zip(names, sizes, kinds):
         letter, known = _KINDS.get(kind, ("", ()))
         if not size.isdecimal() or int(size) not in known:
-            raise BadClip(file, "TYPE", f"field {name} is of type {kind} and {size} bytes, which is no number")
+            raise BadClip(file, "TYPE", f"field {name} is of type {kind} and {size} bytes, which is not numeric")
         fields.append((name, f"<{letter}{size}"))
     (points, *more) = header["POINTS"] or [""]
     if more or not points.isdecimal():

@@ -31,6 +31,6 @@ def log_split(logs: Sequence[Written]) -> str:
 
 
 def _list(key: str, values: Iterable[str]) -> str:
-    """In double quotes: a token of digits alone, or one with an e among them, is no number."""
+    """In double quotes: a token of digits alone, or one with an e among them, would be read as a number."""
     listed = list(values)
     return f"{key}:\n" + "".join(f'- "{value}"\n' for value in listed) if listed else f"{key}: []\n"
