@@ -4,6 +4,7 @@ import ast
 import graphlib
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -33,10 +34,17 @@ ROOMS = {
 MOST_MODULES = 20  # in a room
 
 
+@cache
+def nodes(path: Path) -> list[ast.stmt]:
+    """Imports and classes of a file, wherever they stand in it."""
+    wanted = ast.Import, ast.ImportFrom, ast.ClassDef
+    return [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, wanted)]
+
+
 def imported_modules(path: Path) -> set[str]:
     """First words of all absolute imports of a file, lazy ones included."""
     names = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in nodes(path):
         if isinstance(node, ast.Import):
             names |= {alias.name.split(".")[0] for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
@@ -63,7 +71,7 @@ def arrows() -> dict[str, set[str]]:
     found: dict[str, set[str]] = {}
     for name, path in known.items():
         found[name] = set()
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in nodes(path):
             if isinstance(node, ast.Import):
                 found[name] |= {alias.name for alias in node.names} & known.keys()
             elif isinstance(node, ast.ImportFrom) and node.module in known:
@@ -103,7 +111,7 @@ def test_a_class_s_name_means_one_thing() -> None:
     """Each command has its own Request; a Protocol may bear the name of the class that it describes."""
     where: dict[str, list[str]] = {}
     for module, path in modules().items():
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in nodes(path):
             if isinstance(node, ast.ClassDef) and "Protocol" not in map(ast.unparse, node.bases):
                 where.setdefault(node.name, []).append(module)
     asked = {command.module for command in (*COMMANDS.values(), *PLANNERS.values())}

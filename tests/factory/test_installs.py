@@ -66,6 +66,7 @@ def _modules(node: ast.AST, at_import: bool) -> Iterator[str]:
             yield from _modules(child, at_import)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("package", "extras"),
     [("tasks", ("run",)), ("factory", ("run", "rerun", "gpu", "navsim")), ("planners", ("planners", "wandb"))],
@@ -86,6 +87,7 @@ def test_what_the_small_install_lacks_is_imported_within_functions(package: str)
     assert not lacking
 
 
+@pytest.mark.slow
 def test_every_declared_package_is_imported() -> None:
     imported = {name for package in OURS for name in imports(package)}
     extras = [extra for extra in PROJECT["optional-dependencies"] if extra not in ("dev", "docs")]
@@ -118,6 +120,7 @@ COMMANDS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("command", "line"), COMMANDS)
 def test_a_command_that_needs_an_extra_names_the_line_that_installs_it(
     command: list[str], line: str, tmp_path: Path
@@ -195,6 +198,7 @@ def test_pip_asks_for_neither_pytorch_nor_cuda_for_the_demo(tmp_path: Path) -> N
     assert {"ray", "hydra-core"} <= names and not [name for name in names if GPU.search(name)]
 
 
+@pytest.mark.slow
 def test_no_cuda_build_on_pypi_satisfies_what_the_tests_install(tmp_path: Path) -> None:
     made = subprocess.run(
         ["make", "-n", "-B", "install"], cwd=REPOSITORY, capture_output=True, text=True, check=True

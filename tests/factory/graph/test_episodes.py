@@ -80,6 +80,7 @@ def test_one_in_n_is_a_choice_of_the_ids_alone(whole: Path, tmp_path: Path) -> N
     assert set(filter(lambda key: is_chosen(key, 6), many)) < set(filter(lambda key: is_chosen(key, 3), many))
 
 
+@pytest.mark.slow
 def test_what_is_missing_is_made_up_for_and_nothing_is_written_twice(whole: Path, tmp_path: Path) -> None:
     run(tmp_path, every=0)
     made_up = run(tmp_path)
@@ -91,6 +92,7 @@ def test_what_is_missing_is_made_up_for_and_nothing_is_written_twice(whole: Path
     assert there(tmp_path) == there(whole)
 
 
+@pytest.mark.slow
 def test_a_run_killed_between_commit_and_episodes_ends_in_the_same_files(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -112,6 +114,7 @@ def test_a_run_killed_between_commit_and_episodes_ends_in_the_same_files(
     assert there(tmp_path) == there(whole)
 
 
+@pytest.mark.slow
 def test_an_episode_that_cannot_be_written_costs_no_other_and_the_same_command_writes_it(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -141,6 +144,7 @@ def test_a_redo_leaves_the_episodes_of_the_rows_that_are_there(tmp_path: Path) -
     assert set(after) == asked_for(tmp_path) and not set(after) & set(before)
 
 
+@pytest.mark.slow
 def test_episodes_of_clips_that_are_not_in_the_run_are_left_alone(whole: Path, tmp_path: Path) -> None:
     run(tmp_path)
     assert run(tmp_path, every=2, n=1).executed.episodes == 0

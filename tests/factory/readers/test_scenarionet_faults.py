@@ -104,6 +104,7 @@ def test_a_broken_map_or_light_is_named_when_the_clip_is_read(tmp_path, message)
 JUNK = [None, 3, float("nan"), "x", [], {}, [{}], np.zeros((2, 2)), np.full(121, np.nan), b"x", [None] * 121]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dialect", ["nuscenes", "waymo", "nuplan"])
 def test_junk_in_any_field_is_a_bad_clip_or_harmless(tmp_path, dialect):
     def fields(part, path=()):

@@ -52,6 +52,7 @@ def test_a_block_below_the_gate_drops_the_experts_and_keeps_the_human(small_town
     assert isinstance(human, Columns) and human.row["image_source"] == "photo"
 
 
+@pytest.mark.slow
 def test_a_marked_block_keeps_its_candidates_and_tags_its_samples(small_town: Path, tmp_path: Path) -> None:
     work = work_on(small_town, tmp_path, "render.psnr_min=60", "render.psnr_gate=mark")
     prepared = prepared_by(work)

@@ -72,6 +72,7 @@ def test_a_bucket_holds_the_same_rows_as_a_folder(s3: dict[str, str], tmp_path: 
     assert samples[0]["label_10hz"].shape == (40, 3) and len(samples) == len(SampleTable(tmp_path))
 
 
+@pytest.mark.slow
 def test_a_bucket_holds_the_same_episodes_as_a_folder_and_makes_up_for_lost_ones(
     s3: dict[str, str], tmp_path: Path
 ) -> None:
@@ -105,6 +106,7 @@ def test_a_bucket_holds_the_same_episodes_as_a_folder_and_makes_up_for_lost_ones
     assert again.executed.episodes == 1 and there.read(names[0]) == here.read(names[0])
 
 
+@pytest.mark.slow
 def test_the_dashboard_follows_a_run_in_a_bucket(s3: dict[str, str]) -> None:
     url = f"s3://{BUCKET}/runs/two"
     board = None

@@ -164,6 +164,7 @@ class Counting(io.FileIO):
         return data
 
 
+@pytest.mark.slow
 def test_a_query_on_scores_reads_kilobytes_of_a_shard(location: Location) -> None:
     rng = stream("images")
     made = []

@@ -178,6 +178,7 @@ def test_what_is_copied_is_said(out: str, folder: Path) -> None:
     assert "copied" not in loader(out, None).text()
 
 
+@pytest.mark.slow
 def test_a_bucket_is_read_once_for_all_trainings(
     s3: Iterator[dict[str, str]], folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -18,6 +18,7 @@ def benchmark() -> StreetBenchmark:
     return StreetBenchmark(("a", "bc", "bd"))
 
 
+@pytest.mark.slow
 def test_both_stages_are_shown_from_history_to_the_end(benchmark: StreetBenchmark) -> None:
     pictures = list(replay(benchmark, planner_of("pdm_closed"), "a", Rules()))
     assert len(pictures) == 2 * (INSTANTS + HOLD)

@@ -134,6 +134,7 @@ def test_a_residual_network_is_what_its_names_say(name: str) -> None:
             torch.testing.assert_close(got, expected, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_vovnet_takes_blue_first_and_gates_every_channel() -> None:
     torch.manual_seed(0)
     model = build_backbone(BackboneSettings(name="vovnet99")).eval()

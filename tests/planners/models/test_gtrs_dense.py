@@ -64,6 +64,7 @@ def test_it_learns_to_rank_the_best_trajectory_of_32_scenes_first() -> None:
     assert right >= 0.9
 
 
+@pytest.mark.slow
 def test_scores_are_probabilities_over_the_vocabulary_and_the_plan_is_its_entry() -> None:
     batch, _ = labelled(3)
     model = planner().eval()
@@ -213,6 +214,7 @@ def test_settings_that_contradict_themselves_are_refused() -> None:
         planner(replace(TINY, image=ImageLayout(width=100, height=32)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("encoder", "millions"), [("fused", 67), ("picture", 83)])
 def test_the_papers_sizes_are_67_million_parameters_with_resnet_34_and_83_with_v2_99(
     encoder: str, millions: int

@@ -62,6 +62,7 @@ class Interrupted(ToyBatches):
             yield batch
 
 
+@pytest.mark.slow
 def test_the_loss_falls_and_every_step_is_written(tmp_path: Path) -> None:
     train(tmp_path, ToyBatches(20, 4), log_every=4)
     curve = rows(tmp_path / LOSSES)

@@ -84,6 +84,7 @@ def test_an_interrupted_command_leaves_nothing_unfinished_whatever_its_processes
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_processes_end_with_a_command_that_is_killed(tmp_path: Path) -> None:
     with begun_in(tmp_path) as command:
         command.kill()

@@ -97,6 +97,7 @@ def test_a_driver_keeps_its_distance_from_a_standing_car() -> None:
     assert 1.0 < 118.0 - (position[-1] + DrivingStyle().front_m) < 5.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("index", [2, 3, 6])
 def test_nobody_touches_anybody_and_the_ego_stays_on_the_road(index: int) -> None:
     town, log = plan_log(0, index)

@@ -42,6 +42,7 @@ def town(reader: SyntheticReader) -> Path:
     return reader.root
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bytes_with_any_number_of_threads(
     town: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -29,6 +29,7 @@ def reader(folder: Path) -> SyntheticTownsReader:
     return reader_of(folder, [18, 9], split="test")
 
 
+@pytest.mark.slow
 def test_every_clip_carries_the_split_and_names_its_town(reader: SyntheticTownsReader) -> None:
     refs = reader.index().refs
     assert len(refs) == 2 * 3
@@ -94,6 +95,7 @@ def test_first_window_skips_the_start_of_every_log(reader: SyntheticTownsReader,
     assert "a clip needs 12.6 s" in next(iter(none_left.skipped_logs.values()))
 
 
+@pytest.mark.slow
 def test_a_town_alone_reads_the_same_clip(reader: SyntheticTownsReader, tmp_path: Path) -> None:
     ref = reader.index().refs[0]
     assert reader.towns[0].indices == (0,)

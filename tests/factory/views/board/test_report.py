@@ -86,6 +86,7 @@ def test_it_fetches_nothing_and_data_is_no_markup(text: str) -> None:
     assert EVIL not in text and text.count("<script") == 3
 
 
+@pytest.mark.slow
 def test_it_goes_where_it_is_asked_to_and_says_what_is_missing(
     out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,10 +1,12 @@
 """A scene whose depth comes from parallax alone."""
 
+import pytest
 import street
 
 from tasks.render.scene.build import AssetSettings, build_asset
 
 
+@pytest.mark.slow
 def test_without_lidar_the_street_is_recognised_though_less_well() -> None:
     photos, sweeps = street.drive()
     settings = AssetSettings(hold_out_every=6)
