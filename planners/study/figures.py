@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from planners.study.scaling_law import ScalingLaw
+from planners.evaluation.scaling_law import ScalingLaw
 from planners.study.tables import is_clear, words_of
 from planners.training.curves import LOSSES, VALIDATION
 

@@ -12,8 +12,8 @@ trainings' own folders.
 """
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -34,11 +34,12 @@ from planners.evaluation.aggregation import (
 )
 from planners.evaluation.clip_scores import write_clips
 from planners.evaluation.compare import CompareSettings, compare, row_of
+from planners.evaluation.frames_file import FRAMES, Clips, read_frames, write_frames
+from planners.evaluation.scaling_law import FEWEST, fit_scaling
+from planners.evaluation.score_rows import FrameRow
 from planners.evaluation.score_table import FILTERS_NOTE
 from planners.study.figures import Curve, draw_curves, draw_differences
-from planners.study.frames_file import FRAMES, StudyFrames, read_frames
-from planners.study.scaling_law import FEWEST, fit_scaling
-from planners.study.setups import SWEEP
+from planners.study.setups import SWEEP, Comparison, Setup
 from planners.study.tables import markdown_of, words_of
 
 CURVES = {"final": "scaling.png", "stage_two": "scaling_stage_two.png"}
@@ -62,9 +63,40 @@ class ReportRequest:
             raise ValueError(f"human_filter={self.human_filter}: unfiltered or filtered")
 
 
+@dataclass(frozen=True)
+class StudyFrames:
+    """What a study's frames.parquet holds."""
+
+    trainings: tuple[Mapping[str, Any], ...]  # facts of each, with its label under "training"
+    comparisons: tuple[Comparison, ...]
+    clips: Clips  # also of ensembles and bounds
+
+
+def write_study(
+    path: Path,
+    rows: Iterator[tuple[str, Sequence[FrameRow]]],
+    trainings: Sequence[Mapping[str, Any]],
+    comparisons: Sequence[Comparison],
+) -> None:
+    """Write a StudyFrames of the rows of each planner, by its label. Whole or not at all."""
+    meta = {"trainings": [dict(one) for one in trainings], "comparisons": [asdict(one) for one in comparisons]}
+    write_frames(path, rows, meta)
+
+
+def read_study(path: Path) -> StudyFrames:
+    """What `write_study` wrote. Raises FileNotFoundError, or ValueError for a file that is none."""
+    meta, clips = read_frames(path)
+    return StudyFrames(tuple(meta["trainings"]), tuple(map(_comparison, meta["comparisons"])), clips)
+
+
+def _comparison(told: Mapping[str, Any]) -> Comparison:
+    setups = {side: told[side] and Setup(**told[side]) for side in ("setup", "reference")}
+    return Comparison(**{**told, **setups})
+
+
 def write_tables(folder: Path, out: Path, human_filter: HumanFilter) -> str:
     """The files of this module's docstring, of `folder`; returns the two-stage scores, to be printed."""
-    frames, measures = read_frames(folder / FRAMES), shown(human_filter)
+    frames, measures = read_study(folder / FRAMES), shown(human_filter)
     out.mkdir(parents=True, exist_ok=True)
     scores = {label: scores_of_clips(clips) for label, clips in frames.clips.items()}
     trainings = [{**facts, **scores[facts["training"]]} for facts in frames.trainings]

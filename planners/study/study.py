@@ -21,9 +21,9 @@ from factory.config.compose import ConfigError, compose, fill
 from planners.command import Stopped, command
 from planners.data.index import DataSettings, open_dataset
 from planners.evaluation.aggregation import BOUNDS
+from planners.evaluation.frames_file import FRAMES, rows_of
 from planners.study.figures import draw_learning
-from planners.study.frames_file import FRAMES, rows_of, write_frames
-from planners.study.report import write_tables
+from planners.study.report import write_study, write_tables
 from planners.study.setups import Comparison, Sizes, StudySettings, comparisons, planned, so_far, with_all_parts
 from planners.study.sweep import (
     EVALUATIONS,
@@ -77,7 +77,7 @@ def write_report(standing: Sequence[Comparison], trained: Sequence[Training], se
     bounds = [name for name in BOUNDS if (out / EVALUATIONS / name).is_dir()]
     labels = dict.fromkeys([*(training.label for training in trained), *compared, *bounds])
     facts = [facts_of(training, out) for training in trained]
-    write_frames(report / FRAMES, rows_of(labels, out / EVALUATIONS, settings.benchmark), facts, standing)
+    write_study(report / FRAMES, rows_of(labels, out / EVALUATIONS, settings.benchmark), facts, standing)
     first = min(training.facts["seed"] for training in trained)
     drawn = {one.label: folder_of(out, one) for one in trained if one.facts["seed"] == first}
     draw_learning(drawn, report / "learning.png")

@@ -8,9 +8,9 @@ import pytest
 
 from factory.exits import BAD_CONFIG
 from planners.evaluation.aggregation import scores_of
+from planners.evaluation.frames_file import FRAMES
 from planners.evaluation.score_rows import read_rows, write_rows
-from planners.study.frames_file import FRAMES, StudyFrames, read_frames, write_frames
-from planners.study.report import compared, main, write_tables
+from planners.study.report import StudyFrames, compared, main, read_study, write_study, write_tables
 from planners.study.scaling import ScalingSettings, SweepData, comparisons_of, trainings_of
 from tests.planners.made_rows import clip_rows
 
@@ -40,10 +40,10 @@ def sweep(tmp_path: Path, rounds: tuple[int, ...], end_m: float = 0.0) -> StudyF
     evaluated(tmp_path / "pdm_closed", 0.8)
     facts = [{"training": training.label, **training.facts, "real": 10, "simulated": 5} for training in trainings]
     labels = [*(training.label for training in trainings), "pdm_closed"]
-    write_frames(
+    write_study(
         tmp_path / FRAMES, ((label, read_rows(tmp_path / label)) for label in labels), facts, comparisons_of(settings)
     )
-    return read_frames(tmp_path / FRAMES)
+    return read_study(tmp_path / FRAMES)
 
 
 def evaluated(folder: Path, score: float, end_m: float = 0.0) -> None:

@@ -11,9 +11,9 @@ import pytest
 from factory.exits import BAD_CONFIG
 from planners.evaluation.aggregation import BOUNDS, MEASURES, name_of, scores_of, scores_of_clips
 from planners.evaluation.frames import FrameKey
+from planners.evaluation.frames_file import FRAMES, rows_of
 from planners.evaluation.score_rows import FrameRow, read_rows, write_rows
-from planners.study.frames_file import FRAMES, read_frames, rows_of, write_frames
-from planners.study.report import compared, main, write_tables
+from planners.study.report import compared, main, read_study, write_study, write_tables
 from planners.study.setups import Comparison, Setup
 from tests.planners.made_rows import row
 
@@ -55,7 +55,7 @@ def study(tmp_path: Path) -> Path:
     (tmp_path / "report").mkdir()
     facts = [{"training": label, "real": 10, "simulated": 5 * n} for n, label in enumerate(LABELS[:4])]
     rows = rows_of(LABELS, tmp_path / "evaluations", str(tmp_path))
-    write_frames(tmp_path / "report" / FRAMES, rows, facts, COMPARISONS)
+    write_study(tmp_path / "report" / FRAMES, rows, facts, COMPARISONS)
     return tmp_path
 
 
@@ -77,7 +77,7 @@ def test_scores_of_the_file_are_those_of_the_folders(study: Path) -> None:
 
 
 def test_plans_ends_and_logs_come_back_to_the_last_digit(study: Path) -> None:
-    clips = read_frames(study / "report" / FRAMES).clips
+    clips = read_study(study / "report" / FRAMES).clips
     for label in LABELS:
         groups = {clip.clip_id: clip for clip in clips[label]}
         for kept in read_rows(study / "evaluations" / label):
@@ -120,7 +120,7 @@ def test_intervals_stand_over_clips_logs_and_towns_for_both_filters(study: Path)
     ids=lambda path: path.parent.name,
 )
 def test_the_committed_tables_are_those_of_the_committed_rows(frames: Path) -> None:
-    kept = read_frames(frames)
+    kept = read_study(frames)
     scores = {label: scores_of_clips(clips) for label, clips in kept.clips.items()}
     trainings, comparisons = (table(frames.parent / f"{name}.csv") for name in ("trainings", "comparisons"))
     assert [row["training"] for row in trainings] == [facts["training"] for facts in kept.trainings]

@@ -8,8 +8,7 @@ import pytest
 from factory.exits import INTERRUPTED
 from planners.command import Failed, Stopped
 from planners.study.figures import Curve
-from planners.study.frames_file import StudyFrames
-from planners.study.report import curves_of
+from planners.study.report import StudyFrames, curves_of
 from planners.study.scaling import ScalingSettings, SweepData, comparisons_of, trainings_of
 from planners.study.sweep import (
     EVALUATED_TOGETHER,

@@ -1,13 +1,13 @@
-"""A study's or sweep's per-frame rows in one file, small enough to be committed: what all of its tables are made of.
+"""Per-frame rows of many planners in one file, small enough to be committed: what all tables of them are made of.
 
 A row for each frame and planner: EPDMS (float32), where the frame starts and where the plan from a logged frame ends,
 which is what follow-ups are weighted by. Frames are the same for all planners, so that their columns take next to
-nothing. What was trained and what is compared with what stands in the file's metadata.
+nothing. Whatever else is to be known of the planners stands in the file's metadata.
 """
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
@@ -21,10 +21,9 @@ from planners.evaluation.aggregation import ClipResult, by_clip
 from planners.evaluation.benchmark_folder import logs_of
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.score_rows import FrameRow, read_rows
-from planners.study.setups import Comparison, Setup
 from tasks.reward.one_stage import COLUMNS, FrameScores
 
-Clips = Mapping[str, Sequence[ClipResult]]  # by label
+Clips = Mapping[str, Sequence[ClipResult]]  # by label of the planner; scores alone, no sub-scores
 
 FRAMES = "frames.parquet"
 META = b"study"
@@ -42,15 +41,6 @@ SCHEMA = pa.schema(
 )
 
 
-@dataclass(frozen=True)
-class StudyFrames:
-    """What a file holds."""
-
-    trainings: tuple[Mapping[str, Any], ...]  # facts of each, with its label under "training"
-    comparisons: tuple[Comparison, ...]
-    clips: Clips  # by label, also of ensembles and bounds; scores alone, no sub-scores
-
-
 def rows_of(labels: Iterable[str], evaluations: Path, benchmark: str) -> Iterator[tuple[str, list[FrameRow]]]:
     """The scored frames of each evaluated planner, with the logs of their clips as the benchmark has them."""
     logs = logs_of(benchmark)
@@ -58,14 +48,8 @@ def rows_of(labels: Iterable[str], evaluations: Path, benchmark: str) -> Iterato
         yield label, [replace(row, log_id=logs[row.key.clip_id]) for row in read_rows(evaluations / label)]
 
 
-def write_frames(
-    path: Path,
-    rows: Iterator[tuple[str, Sequence[FrameRow]]],
-    trainings: Sequence[Mapping[str, Any]],
-    comparisons: Sequence[Comparison],
-) -> None:
-    """Write the rows of each planner, by its label. Whole or not at all."""
-    meta = {"trainings": [dict(one) for one in trainings], "comparisons": [asdict(one) for one in comparisons]}
+def write_frames(path: Path, rows: Iterator[tuple[str, Sequence[FrameRow]]], meta: Mapping[str, Any]) -> None:
+    """Write the rows of each planner, by its label, and what else is to be known. Whole or not at all."""
     schema = SCHEMA.with_metadata({META: json.dumps(meta).encode()})
     table = pa.concat_tables(_table(label, of_one) for label, of_one in rows).cast(schema)
     unfinished = path.with_name(f".{path.name}.unfinished")
@@ -80,19 +64,18 @@ def write_frames(
     unfinished.replace(path)
 
 
-def read_frames(path: Path) -> StudyFrames:
-    """What `write_frames` wrote. Raises FileNotFoundError, or ValueError for a file that is none."""
+def read_frames(path: Path) -> tuple[Mapping[str, Any], Clips]:
+    """`meta` and rows of `write_frames`. Raises FileNotFoundError, or ValueError for a file that is none."""
     table = pq.read_table(path)
     meta = (table.schema.metadata or {}).get(META)
     if meta is None or table.column_names != SCHEMA.names:
         raise ValueError(f"{path}: no rows of a study: it must have the columns {', '.join(SCHEMA.names)}")
-    told = json.loads(meta)
     columns = (table[name].to_numpy(zero_copy_only=False) for name in SCHEMA.names)
     clips = {
         str(label): by_clip([_row(*values) for _, *values in rows])
         for label, rows in groupby(zip(*columns), key=itemgetter(0))
     }
-    return StudyFrames(tuple(told["trainings"]), tuple(map(_comparison, told["comparisons"])), clips)
+    return json.loads(meta), clips
 
 
 def _table(label: str, rows: Sequence[FrameRow]) -> pa.Table:
@@ -119,8 +102,3 @@ def _row(
     start, end = (np.array([*places[i : i + 2], np.nan]) for i in (0, 2))
     key = FrameKey(clip_id, kind, int(candidate))
     return FrameRow(stage, key, FrameScores(*scores), np.nan, start, end, log_id=log_id)
-
-
-def _comparison(told: Mapping[str, Any]) -> Comparison:
-    reference = None if told["reference"] is None else Setup(**told["reference"])
-    return Comparison(**{**told, "setup": Setup(**told["setup"]), "reference": reference})

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from planners.study.scaling_law import fit_scaling
+from planners.evaluation.scaling_law import fit_scaling
 
 SIZES = [150, 300, 450, 600, 750, 900]
 
