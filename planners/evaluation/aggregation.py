@@ -212,15 +212,14 @@ def name_of(stage: str, human_filter: str) -> str:
     return stage if human_filter == "none" else f"{stage}_{human_filter}"
 
 
+def words_of_stage(stage: str) -> str:
+    """A stage as tables call it."""
+    return "follow-ups (plain mean)" if stage == "follow_ups" else stage.replace("_", " ")
+
+
 def title_of(stage: str, human_filter: str) -> str:
     """A score in words, with what it may be held against."""
-    words = {
-        "one_stage": "EPDMS of one stage",
-        "stage_one": "EPDMS of stage one",
-        "stage_two": "EPDMS of stage two",
-        "follow_ups": "EPDMS of follow-ups (plain mean)",
-        "final": "two-stage EPDMS",
-    }[stage]
+    words = "two-stage EPDMS" if stage == "final" else f"EPDMS of {words_of_stage(stage)}"
     return f"{words}{'' if human_filter == 'none' else f', {human_filter}'}"
 
 

@@ -14,6 +14,7 @@ import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -94,6 +95,12 @@ def row_of(found: ByLevel | None, scale: float = 100.0) -> dict[str, float | str
         for name in ("low", "high"):
             row[name if level == "clip" else f"{name}_{level}"] = scale * getattr(one, name) if known else ""
     return row
+
+
+def is_clear_row(row: Mapping[str, Any]) -> bool:
+    """The same of a row of `row_of`; not where it has no interval."""
+    known = [end for end in ("", "_log", "_town") if row.get(f"low{end}", "") != ""]
+    return bool(known) and all(row[f"low{end}"] > 0.0 or row[f"high{end}"] < 0.0 for end in known)
 
 
 def text_of(found: Mapping[Measure, ByLevel], confidence: float) -> str:

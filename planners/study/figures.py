@@ -11,15 +11,17 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from planners.evaluation.aggregation import words_of_stage
+from planners.evaluation.compare import is_clear_row
 from planners.evaluation.scaling_law import ScalingLaw
-from planners.study.tables import is_clear, words_of
+from planners.study.setups import words_of
 from planners.training.curves import LOSSES, VALIDATION
 
 COLUMNS = 6
 COLOURS = 32  # of a picture: a sheet of eighty panels has 1.5 MB in full colour, a quarter of it in a few
 CURVES = ("#1f6fb4", "#d1561c", "#2a8a4a", "#8a4fb0", "#b03a5b", "#6b6b6b")
 SMOOTH_STEPS = 20  # of which a loss that is drawn is the mean
-DRAWN = {"stage_two": "stage two", "follow_ups": "follow-ups (plain mean)", "final": "final"}  # those that there are
+DRAWN = ("stage_two", "follow_ups", "final")  # those that there are
 CLEAR, OPEN = "#1f6fb4", "#9aa4ad"  # an interval without and with zero
 
 
@@ -123,12 +125,12 @@ def draw_differences(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     rows: those of comparisons.csv that have a reference, of one human filter.
     """
     n = sum(row["stage"] == "final" for row in rows)
-    drawn = {stage: title for stage, title in DRAWN.items() if any(row["stage"] == stage for row in rows)}
+    drawn = [stage for stage in DRAWN if any(row["stage"] == stage for row in rows)]
     with _sheet(path, 1, len(drawn), (3.0 + 4.0 * len(drawn), 1.0 + 0.2 * n), sharey=True) as (figure, axes):
-        for panel, (stage, title) in zip(axes.flat, drawn.items()):
+        for panel, stage in zip(axes.flat, drawn):
             chosen = [row for row in rows if row["stage"] == stage]
             for y, row in enumerate(chosen):
-                color = CLEAR if is_clear(row) else OPEN
+                color = CLEAR if is_clear_row(row) else OPEN
                 panel.plot([row["low"], row["high"]], [y, y], color=color, linewidth=2)
                 panel.plot(row["difference"], y, "o", color=color, markersize=4)
             for y in range(1, n):
@@ -136,7 +138,7 @@ def draw_differences(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
                     panel.axhline(y - 0.5, color="#d0d5da", linewidth=0.8)
             panel.axvline(0.0, color="black", linewidth=0.8)
             panel.set_yticks(range(n), [difference_label(row) for row in chosen], fontsize=7)
-            panel.set_title(f"{title}: difference in EPDMS points", fontsize=9)
+            panel.set_title(f"{words_of_stage(stage)}: difference in EPDMS points", fontsize=9)
             panel.tick_params(axis="x", labelsize=7)
         axes.flat[0].set_ylim(n - 0.5, -0.5)
         figure.tight_layout()

@@ -14,7 +14,9 @@ trainings' own folders.
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import groupby
 from pathlib import Path
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
@@ -30,23 +32,28 @@ from planners.evaluation.aggregation import (
     scores_of_clips,
     shown,
     title_of,
+    words_of_stage,
     write_csv,
 )
 from planners.evaluation.clip_scores import write_clips
-from planners.evaluation.compare import CompareSettings, compare, row_of
+from planners.evaluation.compare import CompareSettings, compare, is_clear_row, row_of
 from planners.evaluation.frames_file import FRAMES, Clips, read_frames, write_frames
 from planners.evaluation.scaling_law import FEWEST, fit_scaling
 from planners.evaluation.score_rows import FrameRow
 from planners.evaluation.score_table import FILTERS_NOTE
 from planners.study.figures import Curve, draw_curves, draw_differences
-from planners.study.setups import SWEEP, Comparison, Setup
-from planners.study.tables import markdown_of, words_of
+from planners.study.setups import SWEEP, Comparison, Setup, words_of
 
 CURVES = {"final": "scaling.png", "stage_two": "scaling_stage_two.png"}
 RULES = CompareSettings(a="", b="")  # draws, confidence and seed as `python -m planners compare` has them
 CURVED = ("rounds", SWEEP)  # the parts that are scores over data
+INTERVALS = (
+    "In brackets: the difference from what the setup is held against, its 95 % interval over clips and, of stage two "
+    "and the final score, over logs and towns (paired bootstrap, with seeds); bold where zero lies outside of each."
+)
+CLAIMED = ("stage_two", "final")  # the stages whose intervals over logs and towns are shown too
 
-Row = dict[str, Any]
+Row = dict[str, Any]  # of comparisons.csv
 Scores = Mapping[str, Mapping[str, float]]  # by label
 
 
@@ -159,6 +166,49 @@ def _series(frames: StudyFrames) -> Mapping[tuple[str, str], list[str]]:
             curve = f"{one.setup.planner}, equal {one.budget}", words_of(one.facts, counted=False)
             found[curve] |= dict.fromkeys(labels)
     return {name: list(labels) for name, labels in found.items()}
+
+
+def markdown_of(rows: Sequence[Mapping[str, Any]], human_filter: HumanFilter) -> str:
+    """EPDMS in percent; in brackets the difference from the reference with its intervals, bold where all exclude 0.
+
+    The first interval is over clips. rows: those of comparisons.csv, a comparison's measures one after the other; of
+    those with and without the human filter one is shown. A row that is itself a reference stands in front of what is
+    held against it.
+    """
+    mine = [row for row in rows if row["human_filter"] in (human_filter, "none")]
+    stages = [stage for stage in shown(human_filter) if any(row["stage"] == stage for row in mine)]
+    head = ("planner", "trained on", "equal", "seeds", *map(words_of_stage, stages), "final of each seed")
+    lines = [*wrap(f"Scores are {human_filter}: {FILTERS_NOTE[0]}; {FILTERS_NOTE[1]}.", 120), ""]
+    lines += [*wrap(INTERVALS, 120), ""]
+    for part, of_part in groupby(mine, key=lambda row: row["part"]):
+        rows = list(of_part)
+        lines += [f"## {part}", "", _line(head), _line(["---"] * len(head))]
+        lines += [_line(_cells(rows[i : i + len(stages)])) for i in range(0, len(rows), len(stages))]
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _cells(stages: Sequence[Row]) -> list[str]:
+    """Of the rows of one comparison."""
+    one = stages[-1]
+    facts = [f"`{one['planner']}`", words_of(one), one["budget"], str(one["seeds"])]
+    return [*facts, *map(_score, stages), one["each"]]
+
+
+def _score(row: Row) -> str:
+    text = f"{row['epdms']:.1f}"
+    if not row["reference"]:
+        return text
+    bold = "**" if is_clear_row(row) else ""
+    said = [f"{bold}{row['difference']:+.1f}{bold}: {row['low']:+.1f} .. {row['high']:+.1f}"]
+    if row["stage"] in CLAIMED:
+        known = [level for level in ("log", "town") if row.get(f"low_{level}", "") != ""]
+        said += [f"{level}s {row[f'low_{level}']:+.1f} .. {row[f'high_{level}']:+.1f}" for level in known]
+    return f"{text} ({'; '.join(said)})"
+
+
+def _line(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
 
 
 def text_of(found: Sequence[Row], bounds: Sequence[Row], human_filter: str) -> str:

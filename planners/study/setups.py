@@ -4,7 +4,7 @@ Everything is compared twice: in equal passes over a planner's own data, as the 
 steps, since more data in equal passes is more training as well.
 """
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import takewhile
 from pathlib import Path
@@ -169,6 +169,20 @@ class Comparison:
         """Its columns in the tables."""
         of_setup = {"setup": self.setup.label, **vars(self.setup)}
         return {"part": self.part, **of_setup, "budget": self.budget, "seeds": self.seeds}
+
+
+def words_of(row: Mapping[str, Any], counted: bool = True) -> str:
+    """What a planner was trained on, in words; what is as usual is left out, and the rounds where not `counted`."""
+    if row["data"] == "begin":
+        return "other towns"
+    rounds = "1 round" if row["rounds"] == 1 else f"{row['rounds']} rounds"
+    said = ["real"] if row["rounds"] == 0 else [f"+ {row['data']}", rounds] if counted else [row["data"]]
+    said += {"all": [], "real": ["rewards only"], "none": ["no imitation"]}[row["imitation"]]
+    said += ["replayed traffic"] if row["traffic"] == "replay" else []
+    said += [f"sim ratio {row['sim_ratio']}"] if row["sim_ratio"] != "natural" else []
+    said += {"any": [], "low": ["low PSNR"], "high": ["high PSNR"]}[row["psnr"]]
+    said += [f"{100.0 * row['real_share']:.0f} % of the real"] if row["real_share"] < 1.0 else []
+    return ", ".join(said)
 
 
 def taught(planner: str, budget: Budget, rounds: int) -> list[Setup]:

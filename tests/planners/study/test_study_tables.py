@@ -8,8 +8,8 @@ from PIL import Image
 
 from planners.evaluation.aggregation import MEASURES
 from planners.study.figures import draw_differences
-from planners.study.setups import PARTS, Comparison, Setup, StudySettings, comparisons
-from planners.study.tables import markdown_of, words_of
+from planners.study.report import markdown_of
+from planners.study.setups import PARTS, Comparison, Setup, StudySettings, comparisons, words_of
 from tests.planners.study.test_setups import settings
 
 
