@@ -40,7 +40,7 @@ from planners.study.agreement import main as agreement_main
 from planners.study.recipe import Recipe
 from planners.study.report import ReportRequest
 from planners.study.scaling import ScalingSettings
-from planners.study.setups import StudySettings
+from planners.study.study import StudySettings
 from planners.training.train import TrainConfig
 from tasks.caches import user_cache
 from tasks.kernels.compiled import cache_dir

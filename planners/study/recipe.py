@@ -18,7 +18,7 @@ from factory.config.compose import compose, fill
 from factory.exits import INTERRUPTED, asked_to_stop
 from planners.command import Failed, Stopped, command
 from planners.study.scaling import scale
-from planners.study.sweep import Means, exit_code
+from planners.training.many import Means, exit_code
 
 
 @dataclass(frozen=True)

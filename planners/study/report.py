@@ -168,7 +168,7 @@ def _series(frames: StudyFrames) -> Mapping[tuple[str, str], list[str]]:
     return {name: list(labels) for name, labels in found.items()}
 
 
-def markdown_of(rows: Sequence[Mapping[str, Any]], human_filter: HumanFilter) -> str:
+def markdown_of(rows: Sequence[Row], human_filter: HumanFilter) -> str:
     """EPDMS in percent; in brackets the difference from the reference with its intervals, bold where all exclude 0.
 
     The first interval is over clips. rows: those of comparisons.csv, a comparison's measures one after the other; of

@@ -17,8 +17,8 @@ from typing import Literal
 from factory.config.compose import compose, fill
 from planners.command import command
 from planners.study.setups import SWEEP, Budget, Comparison, Imitation, Setup
-from planners.study.study import run
-from planners.study.sweep import SweepSettings, Training
+from planners.study.sweep import SweepSettings, run
+from planners.training.many import Training
 
 EVERYONE = "all"
 

@@ -1,82 +1,35 @@
-"""Many trainings and their evaluation, resumable: what is done is not done again.
+"""Many trainings and their evaluation on one benchmark, by a few processes, and the report on what is done of it.
 
-A training is a process of `python -m planners train`; on one machine `jobs` of them run side by side, on a Ray cluster
-each is a task. All are then evaluated on one benchmark, by a few processes.
+Resumable: what is trained or evaluated already is not again.
 """
 
-import contextlib
-import json
 import os
-import signal
 import subprocess
 import sys
-import threading
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import Any, ClassVar, Literal, TextIO
+from typing import Any
 
-from factory.exits import INTERRUPTED, asked_to_stop
 from factory.graph.progress import Counter
 from planners.command import Failed, Stopped
 from planners.evaluation.aggregation import BOUNDS, PAPER, HumanFilter
+from planners.evaluation.frames_file import FRAMES, rows_of
 from planners.evaluation.planner_names import planner_of
-from planners.evaluation.score_rows import RECORD, read_record
+from planners.evaluation.score_rows import RECORD
 from planners.evaluation.score_rows import is_done as evaluation_is_done
+from planners.evaluation.score_rows import read_record as read_evaluation
+from planners.study.figures import draw_learning
+from planners.study.report import write_study, write_tables
+from planners.study.setups import Comparison, so_far
+from planners.training.checkpoint import read_record
+from planners.training.many import ONE_THREAD, Means, Training, folder_of, is_done, stops_after, train_all
 
-TRAININGS, EVALUATIONS, DONE, LOG = "trainings", "evaluations", "sweep.json", "train.log"
+EVALUATIONS = "evaluations"
 BATCH = 48  # planners that are trained and evaluated together: cores idle at the end of either
 EVALUATED_TOGETHER = 24  # planners in one process at the most
-LOOK_EVERY_S = 0.5
-ONE_THREAD = {"OMP_NUM_THREADS": "1"}  # of each process, unless the user says otherwise
-
-
-@dataclass(frozen=True)
-class Training:
-    """One planner of a sweep: a training, or the ensemble of several."""
-
-    label: str  # names its folder; unique in the sweep
-    overrides: tuple[str, ...] = ()  # of planners.training.train, but `out`
-    facts: Mapping[str, Any] = field(default_factory=dict)  # its columns in the sweep's tables
-    unit: tuple[str, int] = ("", 0)  # part and seed, which are done one after the other
-    members: tuple[str, ...] = ()  # of an ensemble: the labels of its trainings
-
-    def spec(self, out: Path) -> str:
-        """As `python -m planners evaluate` takes it."""
-        return "+".join(str(out / TRAININGS / label) for label in self.members or (self.label,))
-
-
-@dataclass(frozen=True)
-class Means:
-    """How a sweep runs."""
-
-    executor: Literal["process", "ray"] = "process"
-    jobs: int | None = None  # at a time; None: one a core
-    minutes: float | None = None  # after which nothing new begins, and what runs is saved and stopped
-    gpus: float = 0.0  # of each training on Ray
-    cpus: float = 1.0
-    began: ClassVar[float]  # what the minutes are counted from; of each, but no setting
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "began", time.monotonic())
-
-    @property
-    def at_once(self) -> int:
-        """Processes."""
-        return self.jobs or os.cpu_count() or 1
-
-    @property
-    def left_s(self) -> float | None:
-        """Until nothing new begins."""
-        return None if self.minutes is None else max(0.0, self.began + 60.0 * self.minutes - time.monotonic())
-
-    @property
-    def words(self) -> list[str]:
-        """What is left, for another command."""
-        return [] if self.left_s is None else [f"minutes={self.left_s / 60.0:.3f}"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,15 +43,56 @@ class SweepSettings(Means):
     evaluate: tuple[str, ...] = ()
 
 
-def folder_of(out: Path, training: Training) -> Path:
-    """Where a training lies under the sweep's folder."""
-    return out / TRAININGS / training.label
+def run(
+    settings: SweepSettings, asked: Sequence[Training], known: Sequence[Training], wanted: Sequence[Comparison]
+) -> None:
+    """Train and score what is missing of `asked`, one batch after the other, and report on what there is.
+
+    known: of which what is done is reported, whoever asked for it; wanted: of these, what is compared. Raises Stopped,
+    Failed.
+    """
+    out, labels = Path(settings.out), {one.label for one in asked}
+    try:
+        for batch in batches(asked):
+            print("; ".join(dict.fromkeys("{}, seed {}".format(*one.unit) for one in batch)), file=sys.stderr)
+            train_all(batch, out, settings)
+            evaluate_all(batch, out, settings.benchmark, settings, *settings.evaluate)
+    except Stopped as stopped:
+        print(stopped, file=sys.stderr)
+    done = evaluated(known, out)
+    if standing := so_far(wanted, done):
+        write_report(standing, [one for one in known if one.label in done and not one.members], settings)
+    if not done >= labels:
+        raise Stopped(f"{len(labels & done)} of {len(labels)} planners are evaluated: the same command goes on")
 
 
-def is_done(out: Path, training: Training) -> bool:
-    """Whether it was trained to its end with these overrides."""
-    path = folder_of(out, training) / DONE
-    return path.is_file() and json.loads(path.read_text()) == list(training.overrides)
+def evaluated(planned: Sequence[Training], out: Path) -> set[str]:
+    """Labels of all that is trained to its end and evaluated as it is now, by this command or one before it."""
+    trained = {one.label for one in planned if not one.members and is_done(out, one)}
+    whole = [one for one in planned if trained.issuperset(one.members or (one.label,))]
+    return {one.label for one in whole if is_evaluated(out, one)}
+
+
+def write_report(standing: Sequence[Comparison], trained: Sequence[Training], settings: SweepSettings) -> None:
+    """The per-frame rows of what is evaluated, and the tables and pictures, which are made of them alone."""
+    out, report = Path(settings.out), Path(settings.report or settings.out)
+    report.mkdir(parents=True, exist_ok=True)
+    compared = [one.setup.label_of(seed) for one in standing for seed in range(one.seeds)]
+    bounds = [name for name in BOUNDS if (out / EVALUATIONS / name).is_dir()]
+    labels = dict.fromkeys([*(training.label for training in trained), *compared, *bounds])
+    facts = [facts_of(training, out) for training in trained]
+    write_study(report / FRAMES, rows_of(labels, out / EVALUATIONS, settings.benchmark), facts, standing)
+    first = min(training.facts["seed"] for training in trained)
+    drawn = {one.label: folder_of(out, one) for one in trained if one.facts["seed"] == first}
+    draw_learning(drawn, report / "learning.png")
+    print(write_tables(report, report, settings.human_filter))
+
+
+def facts_of(training: Training, out: Path) -> Mapping[str, Any]:
+    """What one training is, as its own record has it."""
+    record = read_record(folder_of(out, training))
+    counts = {"parameters": record["parameters"], "optimiser_steps": record["trained"]["steps"], **record["samples"]}
+    return {"training": training.label, **training.facts, **counts}
 
 
 def batches(planned: Sequence[Training]) -> list[list[Training]]:
@@ -109,98 +103,6 @@ def batches(planned: Sequence[Training]) -> list[list[Training]]:
             found.append([])
         found[-1] += unit
     return found
-
-
-def train_all(trainings: Sequence[Training], out: Path, means: Means) -> None:
-    """Train what is not done; ensembles need not be.
-
-    Raises ValueError for two trainings of one label, Stopped where time ran out or somebody interrupted before all
-    were, Failed with what each failed training said last.
-    """
-    trainings = [training for training in trainings if not training.members]
-    labels = [training.label for training in trainings]
-    if twice := sorted({label for label in labels if labels.count(label) > 1}):
-        raise ValueError(f"labels {twice} stand for several trainings")
-    left = [training for training in trainings if not is_done(out, training)]
-    done, failed = len(trainings) - len(left), list[str]()
-    with Counter("trainings", len(trainings), done) as counter, _stops(means.left_s) as stop:
-        for training, code in _codes(left, out, means, stop):
-            if code == 0:
-                done += 1
-            elif code != INTERRUPTED:
-                failed.append(f"{training.label} (exit {code}): {_last_words(folder_of(out, training) / LOG)}")
-            counter.show(done, training.label)
-    if failed:
-        raise Failed("; ".join(failed))
-    if done < len(trainings):
-        raise Stopped(f"{done} of {len(trainings)} are trained: the same command goes on")
-
-
-def train_one(training: Training, out: Path, stop: Callable[[], bool] = lambda: False) -> int:
-    """Train one in a process of its own and note that it is done; returns its exit code."""
-    if stop():
-        return INTERRUPTED
-    folder = folder_of(out, training)
-    folder.mkdir(parents=True, exist_ok=True)
-    command = [sys.executable, "-m", "planners", "train", *training.overrides, f"out={folder}"]
-    with (folder / LOG).open("w") as log:
-        code = exit_code(command, stop, log, ONE_THREAD | os.environ)
-    if stop() and code == -signal.SIGTERM:  # it had not begun yet
-        return INTERRUPTED
-    if code == 0:
-        (folder / DONE).write_text(json.dumps(list(training.overrides)))
-    return code
-
-
-def exit_code(
-    command: Sequence[str],
-    stop: Callable[[], bool],
-    log: TextIO | None = None,
-    environment: Mapping[str, str] | None = None,
-) -> int:
-    """Of a process, which is asked to end as soon as `stop` says so, and then waited for.
-
-    Its session is its own: what a terminal sends reaches it through `stop` alone, and once.
-    """
-    child = subprocess.Popen(command, stdout=log, stderr=log, env=environment, start_new_session=True)  # noqa: S603
-    asked = False
-    while True:
-        try:
-            return child.wait(LOOK_EVERY_S)
-        except subprocess.TimeoutExpired:
-            if stop() and not asked:
-                child.send_signal(signal.SIGTERM)
-                asked = True
-
-
-def _codes(
-    trainings: Sequence[Training], out: Path, means: Means, stop: threading.Event
-) -> Iterator[tuple[Training, int]]:
-    """Exit codes as trainings end."""
-    if means.executor == "ray":
-        from planners.training.on_ray import each_on_ray
-
-        yield from each_on_ray(train_one, trainings, out, means.cpus, means.gpus, stop)
-        return
-    with ThreadPoolExecutor(means.at_once) as pool:
-        futures = {pool.submit(train_one, training, out, stop.is_set): training for training in trainings}
-        for future in as_completed(futures):
-            yield futures[future], future.result()
-
-
-@contextlib.contextmanager
-def _stops(after_s: float | None) -> Iterator[threading.Event]:
-    """Set after so many seconds, or at SIGINT and SIGTERM."""
-    stop = threading.Event()
-    timer = threading.Timer(after_s or 0.0, stop.set)
-    timer.daemon = True
-    with asked_to_stop(stop.set):
-        if after_s is not None:
-            timer.start()
-        try:
-            yield stop
-        finally:
-            timer.cancel()
 
 
 def evaluate_all(everyone: Sequence[Training], out: Path, benchmark: str, means: Means, *more: str) -> None:
@@ -224,7 +126,7 @@ def evaluate_all(everyone: Sequence[Training], out: Path, benchmark: str, means:
 
     done = 0
     with (
-        _stops(means.left_s) as stop,
+        stops_after(means.left_s) as stop,
         Counter("evaluations", len(everyone)) as counter,
         ThreadPoolExecutor(means.at_once) as pool,
     ):
@@ -247,10 +149,5 @@ def is_evaluated(out: Path, one: Training) -> bool:
     bound, mine = (out / EVALUATIONS / name for name in (BOUNDS[-1], one.label))
     if not (bound / RECORD).is_file():
         return False
-    shared = {k: v for k, v in read_record(bound).items() if k not in ("planner", "planner_digest")}
+    shared = {k: v for k, v in read_evaluation(bound).items() if k not in ("planner", "planner_digest")}
     return evaluation_is_done(mine, {"planner_digest": planner_of(one.spec(out)).digest, **shared})
-
-
-def _last_words(log: Path) -> str:
-    lines = log.read_text().strip().splitlines() if log.is_file() else []
-    return lines[-1] if lines else "it said nothing"

@@ -8,17 +8,10 @@ from typing import Any
 import pytest
 
 from factory.config.compose import compose, fill
-from planners.study.setups import (
-    ENSEMBLE,
-    PARTS,
-    Sizes,
-    StudySettings,
-    comparisons,
-    planned,
-    so_far,
-    with_all_parts,
-)
-from planners.study.sweep import BATCH, Training, batches
+from planners.study.setups import so_far
+from planners.study.study import ENSEMBLE, PARTS, Sizes, StudySettings, comparisons, planned, with_all_parts
+from planners.study.sweep import BATCH, batches
+from planners.training.many import Training
 
 SIZES = Sizes(steps=600, matched=7)
 

@@ -14,13 +14,14 @@ from planners.evaluation.aggregation import BOUNDS, scores_of
 from planners.evaluation.evaluate import EvaluateSettings, evaluate
 from planners.evaluation.planner_names import planner_of
 from planners.study import report as study_report
-from planners.study import study as study_module
+from planners.study import sweep as sweep_module
 from planners.study.scaling import ScalingSettings, SweepData, comparisons_of, trainings_of
-from planners.study.setups import Comparison, Setup, Sizes
-from planners.study.study import evaluated, run, write_report
-from planners.study.sweep import DONE, EVALUATIONS, Training, folder_of
+from planners.study.setups import Comparison, Setup
+from planners.study.study import Sizes, training_of
+from planners.study.sweep import EVALUATIONS, evaluated, run, write_report
 from planners.training.checkpoint import save_checkpoint
 from planners.training.curves import LOSSES
+from planners.training.many import DONE, Training, folder_of
 from tests.planners.evaluation.test_evaluate import settings
 from tests.planners.small_benchmark import StreetBenchmark, write_benchmark_folder
 from tests.planners.study.test_setups import settings as study_settings
@@ -72,7 +73,7 @@ def test_the_report_is_that_of_the_evaluations_and_can_be_made_again(
     benchmark = write_benchmark_folder(tmp_path / "benchmark")
     study = study_settings(out=str(tmp_path), benchmark=str(benchmark), report=str(tmp_path / "report"))
     real, more = (Setup("ltf", data, rounds, "steps") for data, rounds in (("real", 0), ("pdm_closed", 5)))
-    trainings = [one.training(study, 0, Sizes(steps=1)) for one in (real, more)]
+    trainings = [training_of(one, study, 0, Sizes(steps=1)) for one in (real, more)]
     for weight, training in zip((0.0, 0.1), trainings):
         train(tmp_path, training, weight)
     who = [planner_of(str(folder_of(tmp_path, one)), one.label) for one in trainings]
@@ -106,16 +107,16 @@ def test_a_sweep_stops_where_something_is_missing_and_is_reported_when_all_is_do
     def cut_short(*_: object) -> None:
         raise Stopped("out of minutes")
 
-    monkeypatch.setattr(study_module, "train_all", cut_short)
+    monkeypatch.setattr(sweep_module, "train_all", cut_short)
     train(tmp_path, first)
     score(tmp_path, settings(tmp_path / EVALUATIONS), first)
     with pytest.raises(Stopped, match="1 of 2 planners are evaluated: the same command goes on"):
         run(sweep, asked, asked, wanted)
     assert not (tmp_path / "trainings.csv").exists()
 
-    monkeypatch.setattr(study_module, "train_all", lambda trainings, out, means: train(out, second, weight=0.1))
+    monkeypatch.setattr(sweep_module, "train_all", lambda trainings, out, means: train(out, second, weight=0.1))
     monkeypatch.setattr(
-        study_module, "evaluate_all", lambda who, out, *_: score(out, settings(out / EVALUATIONS), first, second)
+        sweep_module, "evaluate_all", lambda who, out, *_: score(out, settings(out / EVALUATIONS), first, second)
     )
     run(sweep, asked, asked, wanted)
     alone, more = csv.DictReader((tmp_path / "trainings.csv").open())

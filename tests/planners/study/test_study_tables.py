@@ -9,7 +9,8 @@ from PIL import Image
 from planners.evaluation.aggregation import MEASURES
 from planners.study.figures import draw_differences
 from planners.study.report import markdown_of
-from planners.study.setups import PARTS, Comparison, Setup, StudySettings, comparisons, words_of
+from planners.study.setups import Comparison, Setup, words_of
+from planners.study.study import PARTS, StudySettings, comparisons
 from tests.planners.study.test_setups import settings
 
 

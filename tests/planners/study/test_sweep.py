@@ -1,30 +1,17 @@
-"""Sweeps: every combination once, what is done stays done, what fails is named."""
+"""Sweeps: every combination once, its curves, and who evaluates what."""
 
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-from factory.exits import INTERRUPTED
-from planners.command import Failed, Stopped
 from planners.study.figures import Curve
 from planners.study.report import StudyFrames, curves_of
 from planners.study.scaling import ScalingSettings, SweepData, comparisons_of, trainings_of
 from planners.study.sweep import (
     EVALUATED_TOGETHER,
-    LOG,
-    Means,
-    Training,
-    folder_of,
-    is_done,
     shares_of,
-    train_all,
-    train_one,
 )
-from planners.training.checkpoint import read_record
-from tests.planners.training.test_train import command, table
-
-__all__ = ["table"]
+from planners.training.many import Training
 
 
 def scaling(**changes: Any) -> ScalingSettings:
@@ -88,36 +75,6 @@ def test_axes_that_are_none_are_refused(name: str, value: Any) -> None:
         scaling(**{name: value})
 
 
-def small(table: str, label: str, *more: str) -> Training:
-    overrides = [o for o in command(table, Path("unused"), "steps=4", *more) if not o.startswith("out=")]
-    return Training(label, tuple(overrides))
-
-
-@pytest.mark.slow
-def test_a_sweep_trains_what_is_not_done_and_names_what_fails(table: str, tmp_path: Path) -> None:
-    good, bad = small(table, "good"), small(table, "bad", "device=cuda")
-    with pytest.raises(Failed, match=r"bad \(exit 2\): error: device=cuda"):
-        train_all([good, bad], tmp_path, Means(jobs=2))
-    assert is_done(tmp_path, good) and not is_done(tmp_path, bad)
-    assert read_record(folder_of(tmp_path, good))["step"] == 4
-    written = (folder_of(tmp_path, good) / LOG).stat().st_mtime_ns
-    train_all([good], tmp_path, Means())
-    assert (folder_of(tmp_path, good) / LOG).stat().st_mtime_ns == written, "it was not to be trained again"
-    assert not is_done(tmp_path, small(table, "good", "seed=1")), "other overrides are another training"
-
-
-@pytest.mark.slow
-def test_what_runs_when_time_is_up_is_saved_and_nothing_new_begins(table: str, tmp_path: Path) -> None:
-    long = small(table, "long", "steps=200000", "checkpoint_every=100000")
-    losses = folder_of(tmp_path, long) / "losses.csv"
-    assert train_one(long, tmp_path, lambda: losses.exists() and losses.stat().st_size > 100) == INTERRUPTED
-    assert 0 < read_record(folder_of(tmp_path, long))["step"] < 200000
-    assert not is_done(tmp_path, long)
-    with pytest.raises(Stopped, match="0 of 1 are trained"):
-        train_all([small(table, "next")], tmp_path, Means(minutes=0.0))
-    assert not folder_of(tmp_path, small(table, "next")).exists()
-
-
 @pytest.mark.parametrize(("n", "processes"), [(0, 0), (1, 1), (16, 2), (48, 2), (49, 4)])
 def test_processes_evaluate_all_planners_and_as_many_of_each_kind(n: int, processes: int) -> None:
     who = [Training(f"{'slow' if i < n / 2 else 'fast'}-{i}") for i in range(n)]
@@ -127,8 +84,3 @@ def test_processes_evaluate_all_planners_and_as_many_of_each_kind(n: int, proces
     assert all(len(share) <= EVALUATED_TOGETHER for share in shares)
     slow = [sum(one.label.startswith("slow") for one in share) for share in shares]
     assert not slow or max(slow) - min(slow) <= 1
-
-
-def test_two_trainings_of_one_label_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="twice"):
-        train_all([Training("twice", ()), Training("twice", ("seed=1",))], tmp_path, Means())
