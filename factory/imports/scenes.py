@@ -23,14 +23,14 @@ from factory.readers.navsim.tracks import (
     window_agents,
     world_from_ego,
 )
-from factory.stages.rows import agent_columns, map_columns, scene_tags
+from factory.stages.rows import scene_columns
 from tasks.render.settings import ImageSource
 from tasks.world.agents import PER_STEP, AgentTracks
 from tasks.world.arrays import Array
-from tasks.world.clip import CLIP_STEPS, HISTORY_STEPS, HORIZON_STEPS, NOW, STEP_S, Clip, Scene, scene_of_clip
+from tasks.world.clip import CLIP_STEPS, HORIZON_STEPS, NOW, STEP_S, Clip, Scene, scene_of_clip
 from tasks.world.frames import to_local
 from tasks.world.lanes import LightState, RoadMap, Route, TrafficLights
-from tasks.world.vehicle import AX, AY, EGO_STATE_SIZE, HEADING, VX, VY
+from tasks.world.vehicle import EGO_STATE_SIZE, HEADING
 
 HISTORY_FRAMES = FRAMES_BEFORE + 1  # now among them
 SCENE_FRAMES = HISTORY_FRAMES + 8  # with the 4 s that are driven
@@ -111,28 +111,7 @@ def _lights(frames: Sequence[Frame], lane_ids: Sequence[str]) -> TrafficLights:
 
 def world_columns(scene: Scene, command: str) -> dict[str, object]:
     """A row's columns but label, scores, pictures, vocabulary labels and bookkeeping; command: as the log says it."""
-    clip, pose = scene.clip, scene.ego_state[: HEADING + 1]
-    history = scene.ego_history[:, : HEADING + 1]
-    return {
-        "clip_id": clip.clip_id,
-        "dataset": clip.dataset,
-        "log_id": clip.log_id,
-        "split": clip.split,
-        "clip_start_s": clip.start_s,
-        "now_s": HISTORY_STEPS * STEP_S,
-        "content_digest": clip.content_digest,
-        "licence": clip.licence,
-        "frame_tokens": None if clip.frame_tokens is None else list(clip.frame_tokens),
-        "now_pose": pose,
-        "world_from_ego": clip.world_from_ego[NOW],
-        "ego_history_10hz": to_local(pose, history),
-        "ego_history_2hz": to_local(pose, history[::COARSE_STEPS]),
-        "ego_status": scene.ego_state[[VX, VY, AX, AY]],
-        "command": command,
-        **agent_columns(scene.agents, scene.step, pose),
-        **map_columns(scene, pose),
-        "tags": scene_tags(scene, command),
-    }
+    return scene_columns(scene, scene.agents, scene.clip.world_from_ego[NOW], command)
 
 
 def logged_label(scene: Scene) -> dict[str, object]:

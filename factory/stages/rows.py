@@ -30,6 +30,27 @@ def sample_row(clip: Clip, candidate: Candidate | None, judged: Judged) -> dict[
     human = candidate is None
     label = judged.plan.poses if human else judged.rollout.ego_states[1:, : HEADING + 1]
     command = driving_command(scene.centerline, pose)
+    place = pose_on_ground(clip.world_from_ego, scene.ego_state[None])[0]
+    return {
+        **scene_columns(scene, scene.agents.overwritten(scene.step, judged.rollout.agents), place, command),
+        "vocabulary_index": None if candidate is None else candidate.vocabulary_index,
+        "parent_states": clip.ego_states[[NOW, NOW + HORIZON_STEPS]],
+        "label_10hz": to_local(pose, label),
+        "label_2hz": to_local(pose, label[4::5]),
+        "proposal_10hz": None if human else to_local(pose, judged.plan.poses),
+        "perturbed_states": None if candidate is None else candidate.rollout.ego_states,
+        "candidate_end": None if candidate is None else np.append(candidate.end_pose, end_speed_mps(candidate)),
+        **({} if candidate is None else score_columns("stage1", candidate.reactive_scores)),
+        **score_columns("stage2", judged.scores),
+    }
+
+
+def scene_columns(scene: Scene, agents: AgentTracks, world_from_ego: Array, command: str) -> dict[str, object]:
+    """What a row says of its scene, whoever drives on from it.
+
+    agents: with those that drive by other tracks than the clip's; world_from_ego: (4, 4), of now.
+    """
+    clip, pose, history = scene.clip, scene.ego_state[: HEADING + 1], scene.ego_history[:, : HEADING + 1]
     return {
         "clip_id": clip.clip_id,
         "dataset": clip.dataset,
@@ -37,26 +58,17 @@ def sample_row(clip: Clip, candidate: Candidate | None, judged: Judged) -> dict[
         "split": clip.split,
         "clip_start_s": clip.start_s,
         "now_s": scene.step * STEP_S,
-        "vocabulary_index": None if candidate is None else candidate.vocabulary_index,
         "content_digest": clip.content_digest,
         "licence": clip.licence,
         "frame_tokens": None if clip.frame_tokens is None else list(clip.frame_tokens),
-        "parent_states": clip.ego_states[[NOW, NOW + HORIZON_STEPS]],
         "now_pose": pose,
-        "world_from_ego": pose_on_ground(clip.world_from_ego, scene.ego_state[None])[0],
-        "ego_history_10hz": to_local(pose, scene.ego_history[:, : HEADING + 1]),
-        "ego_history_2hz": to_local(pose, scene.ego_history[::5, : HEADING + 1]),
+        "world_from_ego": world_from_ego,
+        "ego_history_10hz": to_local(pose, history),
+        "ego_history_2hz": to_local(pose, history[::5]),
         "ego_status": scene.ego_state[[VX, VY, AX, AY]],
         "command": command,
-        "label_10hz": to_local(pose, label),
-        "label_2hz": to_local(pose, label[4::5]),
-        "proposal_10hz": None if human else to_local(pose, judged.plan.poses),
-        "perturbed_states": None if candidate is None else candidate.rollout.ego_states,
-        "candidate_end": None if candidate is None else np.append(candidate.end_pose, end_speed_mps(candidate)),
-        **agent_columns(scene.agents.overwritten(scene.step, judged.rollout.agents), scene.step, pose),
+        **agent_columns(agents, scene.step, pose),
         **map_columns(scene, pose),
-        **({} if candidate is None else score_columns("stage1", candidate.reactive_scores)),
-        **score_columns("stage2", judged.scores),
         "tags": scene_tags(scene, command),
     }
 

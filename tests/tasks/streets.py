@@ -5,11 +5,17 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tasks.experts.pdm_closed.planner import PdmSettings
+from tasks.perturb import Perturbation, PerturbSettings, perturb
+from tasks.rollout.simulate import TrafficSettings
 from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.chance import stream
 from tasks.world.clip import CLIP_STEPS, NOW, STEP_S, Clip
 from tasks.world.frames import to_world
+from tasks.world.kinematic_vocabulary import kinematic_trajectories
 from tasks.world.lanes import Lane, LightState, MapLayer, MapPolygon, RoadMap, Route, TrafficLights
 from tasks.world.vehicle import EGO_STATE_SIZE, VX, X
+from tasks.world.vocabulary import Vocabulary
 
 Array = NDArray[np.float64]
 SPEED_MPS = 8.0
@@ -135,3 +141,13 @@ def same_poses(a: Array, b: Array, tolerance: float = 1e-6) -> bool:
     difference = np.asarray(a, float) - np.asarray(b, float)
     difference[..., 2] = (difference[..., 2] + np.pi) % (2.0 * np.pi) - np.pi
     return bool(np.nanmax(np.abs(difference), initial=0.0) <= tolerance)
+
+
+def perturbed(clip: Clip, size: int = 150) -> Perturbation:
+    """The clip's list of candidates, from so many trajectories."""
+    listed = perturb(
+        clip, Vocabulary(kinematic_trajectories(size, 0)), PerturbSettings(), TrafficSettings(), PdmSettings(),
+        stream(0, clip.clip_id, "perturb"),
+    )  # fmt: skip
+    assert isinstance(listed, Perturbation)
+    return listed

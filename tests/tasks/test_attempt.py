@@ -11,17 +11,14 @@ from tasks.experts.human import Human
 from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings
 from tasks.experts.protocol import Expert, Plan
 from tasks.experts.recovery.expert import Recovery, RecoveryTable
-from tasks.perturb import Perturbation, PerturbSettings, perturb
 from tasks.reward.epdms import Scores
 from tasks.rollout.simulate import TrafficSettings, simulate
 from tasks.stages import STAGES, Rejected
 from tasks.subscores import JUDGED
-from tasks.world.chance import stream
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip, Rollout, Scene, scene_of_clip
 from tasks.world.frames import to_world
 from tasks.world.kinematic_vocabulary import kinematic_trajectories
-from tasks.world.vocabulary import Vocabulary
-from tests.tasks.streets import moved, same_poses, street_clip
+from tests.tasks.streets import moved, perturbed, same_poses, street_clip
 
 GATE = ExpertGate()
 RNG = np.random.default_rng(0)  # no expert here draws from it
@@ -148,13 +145,8 @@ def test_both_experts_recover_from_beside_the_lane_s_middle(scene: Scene, table:
 
 def test_the_verdict_over_a_clip_s_list_agrees_with_its_scores(table: RecoveryTable) -> None:
     clip = street_clip()
-    listed = perturb(
-        clip, Vocabulary(kinematic_trajectories(250, 0)), PerturbSettings(), TrafficSettings(), PdmSettings(),
-        stream(0, clip.clip_id, "perturb"),
-    )  # fmt: skip
-    assert isinstance(listed, Perturbation)
     accepted, rejected = 0, 0
-    for candidate in listed.candidates[:12]:
+    for candidate in perturbed(clip, 250).candidates[:12]:
         judged, verdict_ = tried(perturbed_scene(clip, candidate.rollout), Recovery(table))
         passes = all(getattr(judged.scores, n)[1] == 1.0 for n in GATE.full) and judged.scores.ep[1] > 0.5
         assert (verdict_ is None) == passes

@@ -12,14 +12,10 @@ from factory.stages.rows import sample_row
 from tasks.attempt import drive_and_judge, human_sample, perturbed_scene
 from tasks.experts.human import Human
 from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings
-from tasks.perturb import Perturbation, PerturbSettings, perturb
 from tasks.rollout.simulate import TrafficSettings
-from tasks.world.chance import stream
 from tasks.world.clip import Clip, scene_of_clip
-from tasks.world.kinematic_vocabulary import kinematic_trajectories
-from tasks.world.vocabulary import Vocabulary
 from tests.planners.samples import camera, jpeg, labels, plain, sample
-from tests.tasks.streets import moved, street_clip
+from tests.tasks.streets import moved, perturbed, street_clip
 
 RNG = np.random.default_rng(0)  # nothing here draws from it
 ORIGIN = np.array([664_400.25, 3_997_000.5, 0.7])  # where the street begins: far out, and turned
@@ -40,12 +36,7 @@ def street() -> Clip:
 def driven() -> tuple[dict[str, Any], dict[str, Any]]:
     """The human's row, and the row of PDM-Closed after a perturbation, without pictures and bookkeeping."""
     clip = street()
-    listed = perturb(
-        clip, Vocabulary(kinematic_trajectories(150, 0)), PerturbSettings(), TrafficSettings(), PdmSettings(),
-        stream(0, clip.clip_id, "perturb"),
-    )  # fmt: skip
-    assert isinstance(listed, Perturbation)
-    candidate = listed.candidates[0]
+    candidate = perturbed(clip).candidates[0]
     scene = perturbed_scene(clip, candidate.rollout)
     judged = drive_and_judge(scene, PdmClosed().plan(scene, RNG), TrafficSettings(), PdmSettings())
     human = human_sample(scene_of_clip(clip), Human(), PdmSettings(), RNG)

@@ -11,15 +11,12 @@ from tasks.attempt import Judged, human_sample, perturbed_scene
 from tasks.attempt import drive_and_judge as judge
 from tasks.experts.human import Human
 from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings
-from tasks.perturb import Candidate, Perturbation, PerturbSettings, perturb
+from tasks.perturb import Candidate
 from tasks.rollout.simulate import TrafficSettings
-from tasks.world.chance import stream
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip, scene_of_clip
 from tasks.world.frames import to_world
-from tasks.world.kinematic_vocabulary import kinematic_trajectories
 from tasks.world.lanes import LightState, MapLayer, MapPolygon, TrafficLights
-from tasks.world.vocabulary import Vocabulary
-from tests.tasks.streets import EGO_HEIGHT_M, SPEED_MPS, moved, rectangle, same_poses, street_clip
+from tests.tasks.streets import EGO_HEIGHT_M, SPEED_MPS, moved, perturbed, rectangle, same_poses, street_clip
 
 RNG = np.random.default_rng(0)  # nothing here draws from it
 END = NOW + HORIZON_STEPS
@@ -32,12 +29,7 @@ def human(clip: Clip) -> dict[str, object]:
 
 
 def simulated(clip: Clip) -> tuple[Candidate, Judged]:
-    listed = perturb(
-        clip, Vocabulary(kinematic_trajectories(150, 0)), PerturbSettings(), TrafficSettings(), PdmSettings(),
-        stream(0, clip.clip_id, "perturb"),
-    )  # fmt: skip
-    assert isinstance(listed, Perturbation)
-    candidate = listed.candidates[0]
+    candidate = perturbed(clip).candidates[0]
     scene = perturbed_scene(clip, candidate.rollout)
     plan = PdmClosed().plan(scene, RNG)
     return candidate, judge(scene, plan, TrafficSettings(), PdmSettings())  # type: ignore[arg-type]
