@@ -17,14 +17,12 @@ from factory.graph.local import Graph, Ticket
 from factory.graph.metrics import RunMetrics
 from factory.graph.plan import CLIP_CANDIDATE, ClipPlan, RunPlan, WalkState, wants_payload
 from factory.graph.progress import ProgressLine, RunForecast, Tally, Workload
+from factory.graph.records import Records, past_of
 from factory.graph.steps import Attempted, Failure, HalfBuilt, HandedOn, Prepared, Reconstructed
 from factory.graph.walk import Blocked, Complete, Exhausted, Step, Try, tries_before
-from factory.graph.work import PreparedClip
-from factory.readers.base import ClipRef
-from factory.store.candidates import ClipCandidates
 from factory.store.disk import DiskFull
 from factory.store.identity import RunIdentity, Stamp, attempt_id
-from factory.store.outcomes import QUARANTINE_AFTER, ErrorKind, Kind, Outcome
+from factory.store.outcomes import Kind, Outcome
 from factory.store.samples import Past
 from factory.store.table import Shard
 from tasks.stages import Rejected
@@ -76,8 +74,9 @@ class Driver:
         doing: Callable[[], str] = str,
     ) -> None:
         """block_of: name of the block that is to be built before a clip; doing: how far long tasks are."""
-        self._identity, self._digests, self._rounds, self._policy = identity, digests, rounds, policy
+        self._identity, self._rounds, self._policy = identity, rounds, policy
         self._plan, self._block_of, self._doing = plan, block_of, doing
+        self._records = Records(identity, digests)
         self.executed = Executed(found_done=plan.found_done)
         self.notes: list[str] = []
         self._seconds: dict[str, list[float]] = defaultdict(lambda: [0, 0.0])
@@ -222,14 +221,14 @@ class Driver:
             self.executed.from_cache += report.from_cache
             clip.n_candidates = len(report.clip.candidates)
             is_listed = clip.listed is not None and clip.listed.content_digest == report.clip.content_digest
-            rows = [] if is_listed else [self._candidates_row(clip.ref, report.clip)]
+            rows = [] if is_listed else [self._records.candidates(clip.ref, report.clip)]
             self._gatherer.add(candidates=rows, replaced=replaced)
             clip.past = None
             self._start_walks(clip, result)
             return
         key = attempt_id(clip_id, CLIP_CANDIDATE, self._identity.vocabulary_digest, "", "")
-        outcome = self._outcome(clip.ref, key, "", CLIP_CANDIDATE, report, tries_before(clip.past), {}, {})
-        clip.past = _past(outcome)
+        outcome = self._records.outcome(clip.ref, key, "", CLIP_CANDIDATE, report, tries_before(clip.past), {}, {})
+        clip.past = past_of(outcome)
         clip.failed = outcome.kind == Kind.FAILED
         unlisted = [clip_id] if isinstance(report, Rejected) else []
         self._gatherer.add(outcomes=[outcome], replaced=replaced, unlisted=unlisted)
@@ -249,7 +248,7 @@ class Driver:
         step = walk.step(clip.n_candidates, self._rounds, self._may_retry)
         clip.steps[walk.expert] = step
         if isinstance(step, Try) and not self.interrupted:
-            stamp = self._stamp(clip.ref, walk.expert, step)
+            stamp = self._records.stamp(clip.ref, walk.expert, step)
             self._try(Trial(clip, walk, prepared, stamp), prepared)
             return
         self._finish(clip, walk, step)
@@ -275,9 +274,9 @@ class Driver:
             self._settle(clip, walk)
         if walk.lacks_exhausted(step):
             assert isinstance(step, Exhausted)
-            stamp = self._stamp(clip.ref, walk.expert, Try(step.n_tried, -1))
-            outcome = self._outcome(clip.ref, stamp.attempt_id, walk.expert, step.n_tried, step, 0, {}, {})
-            walk.known[step.n_tried] = _past(outcome)
+            stamp = self._records.stamp(clip.ref, walk.expert, Try(step.n_tried, -1))
+            outcome = self._records.outcome(clip.ref, stamp.attempt_id, walk.expert, step.n_tried, step, 0, {}, {})
+            walk.known[step.n_tried] = past_of(outcome)
             self._keep(clip, walk, outcomes=[outcome])
             self._metrics.outcome(outcome, None)
         rows, outcomes = self._held.pop((clip.ref.clip_id, walk.expert), ([], []))
@@ -308,10 +307,10 @@ class Driver:
             what = report if isinstance(report, Failure) else report.rejected
             measured = ({}, {}) if isinstance(report, Failure) else (dict(report.subscores), dict(report.seconds))
             assert what is not None
-            outcome = self._outcome(
+            outcome = self._records.outcome(
                 clip.ref, stamp.attempt_id, stamp.expert, stamp.candidate_index, what, tries_before(known), *measured
             )
-            walk.known[stamp.candidate_index] = _past(outcome)
+            walk.known[stamp.candidate_index] = past_of(outcome)
             if outcome.kind == Kind.FAILED:
                 self._fresh.add(stamp.attempt_id)
             self._keep(clip, walk, outcomes=[outcome], replaced=replaced)
@@ -339,62 +338,6 @@ class Driver:
     def _may_retry(self, past: Past) -> bool:
         return past.attempt_id not in self._fresh and self._policy(past)
 
-    def _stamp(self, ref: ClipRef, expert: str, step: Try) -> Stamp:
-        digest, vocabulary = self._digests[expert], self._identity.vocabulary_digest
-        return Stamp(
-            attempt_id(ref.clip_id, step.candidate, vocabulary, expert, digest),
-            expert,
-            digest,
-            step.round,
-            step.candidate,
-            vocabulary,
-            self._identity.settings_hash,
-            self._identity.versions_json,
-        )
-
-    def _outcome(
-        self,
-        ref: ClipRef,
-        key: str,
-        expert: str,
-        candidate: int,
-        what: Rejected | Failure | Exhausted,
-        tries: int,
-        subscores: dict[str, float],
-        seconds: dict[str, float],
-    ) -> Outcome:
-        if isinstance(what, Rejected):
-            became = {"kind": Kind.REJECTED.value, "stage": what.stage, "reason": what.reason, "detail": what.detail}
-        elif isinstance(what, Failure):
-            poison = what.kind is ErrorKind.SYSTEM and tries + 1 >= QUARANTINE_AFTER
-            kind = ErrorKind.POISON if poison else what.kind
-            became = {"kind": Kind.FAILED.value, "error_kind": kind.value, "error": what.error}
-        else:
-            became = {"kind": Kind.EXHAUSTED.value}
-        return Outcome(
-            attempt_id=key,
-            clip_id=ref.clip_id,
-            dataset=ref.dataset,
-            log_id=ref.log_id,
-            expert=expert,
-            expert_digest=self._digests.get(expert, ""),
-            candidate_index=candidate,
-            settings_hash=self._identity.settings_hash,
-            stage_versions=self._identity.versions_json,
-            tries=tries + 1,
-            n_tried=what.n_tried if isinstance(what, Exhausted) else 0,
-            subscores=subscores,
-            seconds=seconds,
-            **became,
-        )
-
-    def _candidates_row(self, ref: ClipRef, clip: PreparedClip) -> ClipCandidates:
-        identity, dropped = self._identity, clip.dropped or Rejected("", "")
-        read = (ref.clip_id, ref.dataset, ref.log_id, clip.content_digest)
-        under = (identity.prepare_digest, identity.vocabulary_digest)
-        gates = dict(clip.gate_counts)
-        return ClipCandidates(*read, *under, gates, clip.candidates, dropped.stage, dropped.reason)
-
     def _count(self, seconds: Mapping[str, float], work: Workload) -> None:
         work.spent_s += sum(seconds.values())
         for stage, spent in seconds.items():
@@ -406,8 +349,3 @@ def _wanted(walk: WalkState, rounds: int) -> int:
     """Samples that the walk is still to make, as far as its list lasts."""
     found = sum(past.kind is Kind.ACCEPTED for past in walk.known.values())
     return max(0, (1 if walk.once else rounds) - found)
-
-
-def _past(outcome: Outcome) -> Past:
-    kind = Kind(outcome.kind)
-    return Past(outcome.attempt_id, kind, True, -1, outcome.error_kind, outcome.tries, outcome.stage_versions)

@@ -1,0 +1,30 @@
+"""A toy's run in this process, and what the tests of runs take it to be."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from factory.graph.execute import RunSummary, execute
+from factory.store.samples import Store
+from tests.factory.toy import ToyWork, refs
+
+EXPERTS = ["recovery", "pdm_closed", "human"]
+
+
+def run(
+    out: Path,
+    work: ToyWork | None = None,
+    rounds: int = 2,
+    n: int = 4,
+    experts: Sequence[str] = EXPERTS,
+    **options: object,
+) -> RunSummary:
+    return execute(
+        work or ToyWork(),
+        refs(n),
+        experts,
+        rounds,
+        Store(out),
+        "local",
+        say=lambda line: None,
+        **options,  # type: ignore[arg-type]
+    )
