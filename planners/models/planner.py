@@ -108,7 +108,12 @@ def planned_from(base: PlanFrom, regressed: Tensor, batch: Batch) -> Tensor:
 
 
 def straight_on(batch: Batch) -> Tensor:
-    """(B, 8, 3) poses at 0.5 .. 4.0 s of an ego that keeps the speed of now and does not turn."""
+    """(B, 8, 3) poses at 0.5 .. 4.0 s of an ego that keeps the speed of now and does not turn.
+
+    Speed is the length of the velocity, as in navsim/agents/constant_velocity_agent.py (autonomousvision/navsim
+    @ 0a380a9).
+    """
     times_s = torch.arange(1, 9, device=batch.status.device) * 0.5
-    ahead = batch.status[:, len(COMMANDS), None].float() * times_s
+    velocity = batch.status[:, len(COMMANDS) : len(COMMANDS) + 2].float()
+    ahead = (velocity**2).sum(-1, keepdim=True).sqrt() * times_s
     return torch.stack([ahead, torch.zeros_like(ahead), torch.zeros_like(ahead)], -1)

@@ -43,6 +43,9 @@ def test_constant_velocity_goes_straight_on() -> None:
     plan = ConstantVelocity(ConstantVelocitySettings(), {}).plan(batch)  # at 5 m/s
     assert plan.shape == (2, 8, 3) and not plan[..., 1:].any()
     torch.testing.assert_close(plan[0, :, 0], torch.arange(1, 9) * 2.5)
+    slipping = replace(batch, status=batch.status.clone())
+    slipping.status[:, 4:6] = torch.tensor([-3.0, 4.0])  # NAVSIM's agent takes the length of the velocity
+    torch.testing.assert_close(ConstantVelocity(ConstantVelocitySettings(), {}).plan(slipping), plan)
 
 
 def test_constant_velocity_cannot_be_trained() -> None:
