@@ -2,7 +2,7 @@
 
 import pickle
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import BinaryIO
 
@@ -12,9 +12,15 @@ EMPTY_DICT, MARK, SETITEMS = b"}", b"(", b"u"
 NUMPY_2, NUMPY_1 = b"cnumpy._core.multiarray\n", b"cnumpy.core.multiarray\n"  # numpy < 1.26 knows the second alone
 
 
-def dumps(value: object) -> bytes:
-    """A pickle of plain values and numpy arrays, the same bytes whatever numpy writes it."""
-    return pickle.dumps(value, PROTOCOL).replace(NUMPY_2, NUMPY_1)
+def dumps(value: object, known_as: Mapping[type, str] | None = None) -> bytes:
+    """A pickle of plain values and numpy arrays, the same bytes whatever numpy writes it.
+
+    known_as: classes of ours whose objects come back as those of another's, "module name", which need not be here.
+    """
+    data = pickle.dumps(value, PROTOCOL).replace(NUMPY_2, NUMPY_1)
+    for kind, name in (known_as or {}).items():
+        data = data.replace(_global(f"{kind.__module__} {kind.__qualname__}"), _global(name))
+    return data
 
 
 def write_dict(file: BinaryIO, entries: Iterable[tuple[str, object]], after: Path | None = None) -> None:
@@ -31,6 +37,11 @@ def write_dict(file: BinaryIO, entries: Iterable[tuple[str, object]], after: Pat
     for key, value in entries:
         file.write(MARK + _bare(key) + _bare(value) + SETITEMS)
     file.write(TAIL)
+
+
+def _global(name: str) -> bytes:
+    module, _, qualified = name.partition(" ")
+    return f"c{module}\n{qualified}\n".encode()
 
 
 def _bare(value: object) -> bytes:

@@ -74,13 +74,16 @@ class SyntheticScene:
     frames: tuple[Frame, ...]  # HISTORY_FRAMES and what follows
 
 
-def read_scene_pickle(path: Path) -> SyntheticScene:
-    """The scene in this pickle. Raises BadClip, naming frame and key."""
-    return scene_of_pickle(load_records(bytes_of(path), str(path), CLASSES), str(path))
+def read_scene_pickle(path: Path, *, as_shown: bool = False) -> SyntheticScene:
+    """The scene in this pickle; as_shown: what an agent is shown of it. Raises BadClip, naming frame and key."""
+    return scene_of_pickle(load_records(bytes_of(path), str(path), CLASSES), str(path), as_shown=as_shown)
 
 
-def scene_of_pickle(value: Any, file: str) -> SyntheticScene:
-    """What a scene's pickle holds, checked. Raises BadClip."""
+def scene_of_pickle(value: Any, file: str, *, as_shown: bool = False) -> SyntheticScene:
+    """What a scene's pickle holds, checked; as_shown: four frames without boxes, whatever else is there or not.
+
+    Raises BadClip.
+    """
     if not isinstance(value, Mapping):
         raise BadClip(file, "scene", f"holds a {type(value).__name__}, expected a dict")
     values = Values(value, file)
@@ -90,7 +93,10 @@ def scene_of_pickle(value: Any, file: str) -> SyntheticScene:
         raise values.bad("frames", f"{len(items)}, the scene's metadata say otherwise")
     if about.integer("num_history_frames") != HISTORY_FRAMES:
         raise about.bad("num_history_frames", f"expected {HISTORY_FRAMES}")
-    history = [_frame(Values(item, file, f"frames[{i}]."), about) for i, item in enumerate(items[:HISTORY_FRAMES])]
+    history = [
+        _frame(Values(item, file, f"frames[{i}]."), about, as_shown=as_shown)
+        for i, item in enumerate(items[:HISTORY_FRAMES])
+    ]
     if history[-1].token != about.text("initial_token"):
         raise about.bad("initial_token", f"is not {history[-1].token}, the token of frames[{HISTORY_FRAMES - 1}]")
     return SyntheticScene(
@@ -100,11 +106,11 @@ def scene_of_pickle(value: Any, file: str) -> SyntheticScene:
         log_name=about.text("log_name"),
         original_scene=_token(about, "corresponding_original_scene", "corresponding_orignal_scene"),  # v2.0's spelling
         original_token=_token(about, "corresponding_original_initial_token"),
-        frames=(*history, *_later(values, history[-1])),
+        frames=(*history, *(() if as_shown else _later(values, history[-1]))),
     )
 
 
-def _frame(values: Values, about: Values) -> Frame:
+def _frame(values: Values, about: Values, *, as_shown: bool) -> Frame:
     """One frame's dict. Raises BadClip."""
     if not isinstance(values.items, Mapping):
         raise BadClip(values.file, values.place.rstrip("."), f"is a {type(values.items).__name__}, expected a dict")
@@ -130,7 +136,7 @@ def _frame(values: Values, about: Values) -> Frame:
             Values(_without_paths(values.get("camera_dict")), values.file, f"{values.place}camera_dict.")
         ),
         lidar_path=None,
-        boxes=boxes_of(values.inner("annotations"), ANNOTATIONS),
+        boxes=None if as_shown else boxes_of(values.inner("annotations"), ANNOTATIONS),
     )
 
 

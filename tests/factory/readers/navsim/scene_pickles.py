@@ -1,11 +1,10 @@
 """Writes second-stage scenes as NAVSIM's `Scene.save_to_disk` does, without nuPlan: classes of the same names, pickled.
 
-Field by field as the real ones: TimePoint has slots, TrackedObjectType carries a second value, a StaticObject has
-no velocity.
+Field by field as the real ones: points in space and time have slots, TrackedObjectType carries a second value, a
+StaticObject has no velocity.
 """
 
 import enum
-import pickle
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,6 +13,8 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+
+from tests.factory.readers.openscene_writer import numpy_1_pickle
 
 STATE = "nuplan.common.actor_state.state_representation"
 TOKEN, ORIGINAL, BEFORE = "0000000000005a00c", "000000000000a00c", "000000000000a004"
@@ -52,13 +53,18 @@ class TrackedObjectType(enum.Enum):
         return member
 
 
-class TimePoint:
-    __slots__ = ("time_us",)
+def _slotted(name: str, *slots: str) -> Any:
+    """A class without a dictionary of its fields."""
 
-    def __init__(self, time_us: int) -> None:
-        self.time_us = time_us
+    def begin(self: Any, *values: Any, **fields: Any) -> None:
+        for key, value in (*zip(slots, values), *fields.items()):
+            setattr(self, key, value)
+
+    return type(name, (), {"__slots__": slots, "__init__": begin})
 
 
+TimePoint = _slotted("TimePoint", "time_us")
+SLOTTED = (_slotted("StateSE2", "x", "y", "heading"), _slotted("StateVector2D", "_x", "_y", "_array"), TimePoint)
 TYPES: dict[str, Any] = {
     f"{module} {name}": type(name, (_Thing,), {})
     for module, names in {
@@ -69,13 +75,12 @@ TYPES: dict[str, Any] = {
         "nuplan.common.actor_state.static_object": ("StaticObject",),
         "nuplan.common.actor_state.scene_object": ("SceneObjectMetadata",),
         "nuplan.common.actor_state.oriented_box": ("OrientedBox",),
-        STATE: ("StateSE2", "StateVector2D"),
     }.items()
     for name in names
 }
 TYPES["nuplan.common.maps.maps_datatypes TrafficLightStatusType"] = TrafficLightStatusType
 TYPES["nuplan.common.actor_state.tracked_objects_types TrackedObjectType"] = TrackedObjectType
-TYPES[f"{STATE} TimePoint"] = TimePoint
+TYPES |= {f"{STATE} {kind.__name__}": kind for kind in SLOTTED}
 
 
 @contextmanager
@@ -206,8 +211,11 @@ def _detections(things: list[tuple[int, str, np.ndarray, Any, Any]], token: str)
     return _new("DetectionsTracks", tracked_objects=_new("TrackedObjects", tracked_objects=found))
 
 
-def scene_of_log(frames: list[dict[str, Any]], at: int, token: str) -> dict[str, Any]:
-    """A log's own frames (as OpenScene's dicts) around frame `at`, as if somebody had simulated them."""
+def scene_of_log(frames: list[dict[str, Any]], at: int, token: str, cameras: bool = False) -> dict[str, Any]:
+    """A log's own frames (as OpenScene's dicts) around frame `at`, as if somebody had simulated them.
+
+    cameras: with the log's pictures, by their paths.
+    """
     now = frames[at]
     about = {
         "log_name": now["log_name"],
@@ -221,7 +229,9 @@ def scene_of_log(frames: list[dict[str, Any]], at: int, token: str) -> dict[str,
     }
     return {
         "scene_metadata": about,
-        "frames": [_log_frame(frame, token if frame is now else frame["token"]) for frame in frames[at - 3 : at + 1]],
+        "frames": [
+            _log_frame(frame, token if frame is now else frame["token"], cameras) for frame in frames[at - 3 : at + 1]
+        ],
         "extended_traffic_light_data": [
             _statuses(
                 [(lane, TrafficLightStatusType.RED if red else TrafficLightStatusType.GREEN) for lane, red in lights],
@@ -238,7 +248,7 @@ def _heading(frame: dict[str, Any]) -> float:
     return float(np.arctan2(2.0 * (w * z - x * y), 1.0 - 2.0 * (y**2 + z**2)))
 
 
-def _log_frame(frame: dict[str, Any], token: str) -> dict[str, Any]:
+def _log_frame(frame: dict[str, Any], token: str, cameras: bool) -> dict[str, Any]:
     anns, motion = frame["anns"], np.array(frame["ego_dynamic_state"], np.float32)
     return {
         "token": token,
@@ -260,7 +270,12 @@ def _log_frame(frame: dict[str, Any], token: str) -> dict[str, Any]:
             "in_global_frame": True,
         },
         "lidar_path": None,
-        "camera_dict": {name: {} for name in CAMERAS},
+        "camera_dict": {
+            name: {**frame["cams"][name.upper()], "data_path": Path(frame["cams"][name.upper()]["data_path"])}
+            if cameras
+            else {}
+            for name in CAMERAS
+        },
     }
 
 
@@ -282,5 +297,5 @@ def write_scene(folder: Path, value: dict[str, Any]) -> Path:
     """The pickle, named by its scene."""
     path = folder / f"{value['scene_metadata']['scene_token']}.pkl"
     with importable():
-        path.write_bytes(pickle.dumps(value, pickle.HIGHEST_PROTOCOL))
+        path.write_bytes(numpy_1_pickle(value))
     return path
