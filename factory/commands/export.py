@@ -14,16 +14,21 @@
     missing=black|none  for pictures that a sample has not: a black one, or none; refuse is the default
     map_location=<one>  of NAVSIM's four, for logs whose map has another name
     vocabulary=<.npy>   the trajectories that the labels are of, to be written beside the rewards
-    workers=<n>         processes
+    executor=ray        workers on Ray: the cluster of RAY_ADDRESS, whose nodes see `out` and `to` by the same paths, or
+                        one of this machine's own; local (the default): processes
+    workers=<n>         at once; else 1, on Ray every core
 What is written: docs/navsim_format.md.
 """
 
+import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from factory.config.arguments import WORD, Refused
+from factory.exits import COMPLETE, INTERRUPTED
 from factory.exports.navsim.settings import Layout, Missing
 from factory.views.show import find, logged_drive, sample_ids
 from factory.views.status import open_store
@@ -53,7 +58,8 @@ class Request:
     missing: Missing = "refuse"
     map_location: str = ""
     vocabulary: str | None = None
-    workers: int = 1
+    executor: Literal["local", "ray"] = "local"
+    workers: int | None = None
 
     def __post_init__(self) -> None:
         if self.format == "navsim":
@@ -83,13 +89,13 @@ class Request:
 EVERYWHERE = ("format", "out", "sample", "every", "to")
 
 
-def main(request: Request) -> None:
+def main(request: Request) -> int:
     """Write the files and name them."""
     if request.format == "navsim":
-        _export_all(request)
-        return
+        return _export_all(request)
     for path in export(request):
         print(path.resolve())
+    return COMPLETE
 
 
 def export(request: Request) -> Iterator[Path]:
@@ -116,13 +122,19 @@ def export(request: Request) -> Iterator[Path]:
         raise Refused(f"{store.location.uri}: {error}") from error
 
 
-def _export_all(request: Request) -> None:
-    """All samples in SimScale's layout. Raises Refused."""
+def _export_all(request: Request) -> int:
+    """All samples in SimScale's layout; the exit code. Raises Refused."""
+    from factory.config.compose import need_run_extra
     from factory.exports.navsim.export import export as export_all
     from factory.exports.navsim.settings import ExportSettings
+    from factory.graph.each import WorkerDied, each
+    from factory.graph.work import Halted
+    from factory.store.location import Location
     from factory.store.reader import sample_table
 
-    store, target = open_store(request.out), Path(request.to).expanduser()
+    if request.executor == "ray":
+        need_run_extra("ray")
+    store = open_store(request.out)
     try:
         settings = ExportSettings(
             request.expert,
@@ -134,14 +146,21 @@ def _export_all(request: Request) -> None:
             request.missing,
             request.map_location,
         )
+        target = Location.parse(request.to, setting="to")
+        dealt = partial(each, executor=request.executor, workers=request.workers, to=target)
         table = sample_table(store.location.uri, store.location.options)
         trajectories = _label_trajectories(store, request.vocabulary)
-        done = export_all(table, target, settings, trajectories, request.workers)
-    except (OSError, ValueError) as error:  # no folder, a full disk, a sample that cannot be written as asked
+        done = export_all(table, Path(target.uri), settings, trajectories, dealt)
+    except (OSError, ValueError, WorkerDied) as error:  # no folder, a full disk, what cannot be written as asked
         raise Refused(str(error)) from error
+    except (Halted, KeyboardInterrupt) as error:
+        at_once = "" if isinstance(error, Halted) else " at once"
+        print(f"interrupted{at_once}; run the same command again to go on", file=sys.stderr)
+        return INTERRUPTED
     for note in done.notes:
         print(f"note: {note}")
-    print(f"{done.written:,} logs written, {done.logs:,} in all, {done.n_bytes / 1e9:,.3f} GB: {target.resolve()}")
+    print(f"{done.written:,} logs written, {done.logs:,} in all, {done.n_bytes / 1e9:,.3f} GB: {target.uri}")
+    return COMPLETE
 
 
 def _label_trajectories(store: "Store", file: str | None) -> "Array | None":

@@ -113,14 +113,8 @@ def execute(
             from factory.graph.on_ray import RayGraph
 
             graph = RayGraph(work, store.location, workers, ray_address, claims, fuse)
-    except (BadLocation, ClusterLacks, NotReady) as error:
+    except (BadLocation, ClusterLacks, NotReady, ConnectionError) as error:
         return RunSummary(BAD_CONFIG, str(error))
-    except ConnectionError as error:
-        where = ray_address or os.environ.get("RAY_ADDRESS")
-        return RunSummary(
-            BAD_CONFIG,
-            f"no Ray cluster answers at RAY_ADDRESS={where} ({one_line(error)}); unset it to run on this machine alone",
-        )
     except KeyboardInterrupt:
         return RunSummary(INTERRUPTED, "stopped before anything was begun")
     try:

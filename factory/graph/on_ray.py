@@ -11,7 +11,8 @@ import socket
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from concurrent.futures import BrokenExecutor, Executor, Future
+from typing import Any, ParamSpec, TypeVar
 
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")  # keeps every listener on 127.0.0.1
@@ -20,7 +21,7 @@ os.environ.setdefault("RAY_task_oom_retries", "2")  # Ray's own default retries 
 
 import ray
 from ray.autoscaler.sdk import request_resources
-from ray.exceptions import RayError
+from ray.exceptions import RayError, RayTaskError
 from ray.util.metrics import Counter, Gauge, Histogram
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
@@ -49,6 +50,9 @@ ANSWER_S = 10.0  # for a cluster's port to be reached
 GPU_WAIT_S = 900.0  # for the first node with one to come
 WORKER_ENV = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 FORWARDED_ENV = ("NUMBA_CACHE_DIR",)
+
+R = TypeVar("R")
+P = ParamSpec("P")
 
 _HELD: dict[str, Any] = {}  # per worker process: the run's Work, fetched once
 
@@ -98,8 +102,7 @@ class RayGraph:
         """
         self._connected = not ray.is_initialized()
         self._is_ours = self._connected and _connect(workers, address)
-        available = int(ray.cluster_resources().get("CPU", 1))
-        self.parallelism = max(1, min(workers or available, available) if self._is_ours else workers or available)
+        self.parallelism = _at_once(workers, self._is_ours)
         self.cores = min(self.parallelism, *(_of_nodes("CPU") or [1]))  # none yet where a cluster grows from nothing
         self.recorder: Recorder = RayRecorder()
         self._supplied: dict[str, Any] = {"work": [ray.put(work)], "out": out, "stopped": never}  # list: a reference
@@ -111,7 +114,7 @@ class RayGraph:
             self._gpu_share = claims.gpu_share if claims.gpu_share and _has_gpu(wait=not self._is_ours) else 0.0
             self._claims, self._most_memory = claims, max(_of_nodes("memory"), default=None)
             self.attempt_tasks: Sequence[Sequence[str]] = attempt_tasks(fuse, apart=self._gpu_share > 0.0)
-            _prove_shared(out)
+            _prove_shared(out, "out", "shared storage or a URL")
             _warm_every_node(self._supplied["work"], with_gpu_only=self._gpu_share > 0.0)
         except BaseException:
             self.close()
@@ -170,6 +173,59 @@ class RayGraph:
             ray.shutdown()
 
 
+class RayPool(Executor):
+    """Tasks of a core each as futures, of any function. What a task raises is its future's own exception."""
+
+    def __init__(self, workers: int | None, to: Location | None) -> None:
+        """Workers as of RayGraph; to: the folder that tasks write to.
+
+        Raises BadLocation where some node does not see it, ConnectionError where no cluster answers.
+        """
+        self._connected = not ray.is_initialized()
+        is_ours = self._connected and _connect(workers, None)
+        self.parallelism = _at_once(workers, is_ours)
+        self._references: dict[Future[Any], Any] = {}
+        try:
+            if to is not None:
+                _prove_shared(to, "to", "storage that all of them share")
+        except BaseException:
+            self.shutdown()
+            raise
+
+    def submit(self, function: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
+        """BrokenExecutor is raised by a future whose worker died, with all of its retries."""
+        reference = _call.remote(function, args, kwargs)
+        future: Future[R] = Future()
+        future.set_running_or_notify_cancel()
+        self._references[future] = reference  # by which it could be ended
+        reference.future().add_done_callback(lambda done: self._hand_on(done, future))
+        return future
+
+    def _hand_on(self, done: Future[R], future: Future[R]) -> None:
+        self._references.pop(future, None)
+        error = done.exception()
+        if error is None:
+            future.set_result(done.result())
+        elif isinstance(error, RayTaskError):  # Ray wraps what a task raised with its traceback
+            future.set_exception(error.cause)
+        else:
+            future.set_exception(BrokenExecutor(f"{type(error).__name__}: {one_line(error)}"))
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Leave the cluster; cancel_futures: end what is not done. What is done is in its future already."""
+        if cancel_futures:
+            for reference in list(self._references.values()):
+                ray.cancel(reference)
+        self._references.clear()
+        if self._connected:
+            ray.shutdown()
+
+
+@ray.remote(num_cpus=1, max_retries=MAX_RETRIES)
+def _call(function: Callable[..., Any], args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
+    return function(*args, **kwargs)
+
+
 @ray.remote(num_cpus=1, num_returns=2, max_retries=MAX_RETRIES)
 def _run(step: str, n_supplied: int, *args: Any) -> tuple[Any, Any]:
     """A function of factory.graph.steps in a worker: its report with the seconds it took, and its result."""
@@ -195,22 +251,33 @@ def _sees(out: Location, name: str, token: bytes) -> bool:
 def _connect(workers: int | None, address: str | None) -> bool:
     """Join the cluster of `address` or RAY_ADDRESS, else start one in this machine (then True).
 
-    Raises ConnectionError where nothing listens there: Ray itself tries for minutes.
+    Raises ConnectionError where nothing answers there; where nothing listens at once: Ray itself tries for minutes.
     """
-    _must_answer(address or os.environ.get("RAY_ADDRESS", ""))
+    named = address or os.environ.get("RAY_ADDRESS", "")
     environment = WORKER_ENV | {name: os.environ[name] for name in FORWARDED_ENV if name in os.environ}
     where = address or ("auto" if os.environ.get("RAY_ADDRESS") else "local")
     own: dict[str, Any] = {"num_cpus": workers, "include_dashboard": False} if where == "local" else {}
     if where == "local":  # Ray warns that a cluster of our own asks for a token, as it should
         logging.getLogger("ray._private.authentication.authentication_token_setup").setLevel(logging.ERROR)
-    ray.init(
-        address=where,
-        runtime_env={"env_vars": environment},
-        log_to_driver=False,
-        logging_level=logging.WARNING,
-        **own,
-    )
+    try:
+        _must_answer(named)
+        ray.init(
+            address=where,
+            runtime_env={"env_vars": environment},
+            log_to_driver=False,
+            logging_level=logging.WARNING,
+            **own,
+        )
+    except ConnectionError as error:
+        said = f"no Ray cluster answers at RAY_ADDRESS={named} ({one_line(error)})"
+        raise ConnectionError(f"{said}; unset it to run on this machine alone") from error
     return where == "local"
+
+
+def _at_once(workers: int | None, is_ours: bool) -> int:
+    """Tasks: of a cluster of our own no more than it has cores, of another what was asked for, as it may grow."""
+    available = int(ray.cluster_resources().get("CPU", 1))
+    return max(1, min(workers or available, available) if is_ours else workers or available)
 
 
 def _must_answer(address: str) -> None:
@@ -255,8 +322,8 @@ def _on(node: str) -> NodeAffinitySchedulingStrategy:
     return NodeAffinitySchedulingStrategy(node, soft=False)
 
 
-def _prove_shared(out: Location) -> None:
-    """Every node reads what the driver wrote under `out`."""
+def _prove_shared(out: Location, setting: str, wanted: str) -> None:
+    """Every node reads what the driver wrote under `out`. Raises BadLocation with what is `wanted` of the setting."""
     nodes = _nodes()
     if len(nodes) < 2:
         return
@@ -271,7 +338,7 @@ def _prove_shared(out: Location) -> None:
         out.remove(name)
     blind = [node for node, sees in zip(nodes, answers) if not sees]
     if blind:
-        raise BadLocation(f"out={out.uri} is not the same folder on nodes {blind}: name shared storage or a URL")
+        raise BadLocation(f"{setting}={out.uri} is not the same folder on nodes {blind}: name {wanted}")
 
 
 def _warm_every_node(work: list[Any], with_gpu_only: bool) -> None:

@@ -29,17 +29,22 @@ class Location:
     options: Mapping[str, str] = field(default_factory=dict)
 
     @staticmethod
-    def parse(out: str | os.PathLike[str], options: Mapping[str, str] | None = None) -> "Location":
-        """Raises BadLocation for an unknown kind of URL, and for a relative path in a submitted Ray job's own copy."""
+    def parse(
+        out: str | os.PathLike[str], options: Mapping[str, str] | None = None, setting: str = "out"
+    ) -> "Location":
+        """Raises BadLocation for an unknown kind of URL, and for a relative path in a submitted Ray job's own copy.
+
+        setting: what errors call it.
+        """
         text = os.fspath(out)
         if "://" in text:
             if text.partition("://")[0] not in REMOTE:
-                raise BadLocation(f"out={text}: name a folder, or a URL of {', '.join(REMOTE)}://")
+                raise BadLocation(f"{setting}={text}: name a folder, or a URL of {', '.join(REMOTE)}://")
             return Location(text.rstrip("/"), dict(options or {}))
         path = Path(text).expanduser()
         if not path.is_absolute() and in_submitted_job():
             raise BadLocation(
-                f"out={text} is relative, and a submitted job runs in a copy: name an absolute path or a URL"
+                f"{setting}={text} is relative, and a submitted job runs in a copy: name an absolute path or a URL"
             )
         return Location(str(path.resolve()), dict(options or {}))
 

@@ -1,10 +1,10 @@
-"""A run's samples into SimScale's layout: streamed, in processes, gone on with where it was stopped."""
+"""A run's samples into SimScale's layout: streamed, by workers, gone on with where it was stopped."""
 
-import multiprocessing
+import socket
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from io import BytesIO
@@ -43,6 +43,8 @@ DRAWN = (
 )
 SAY_EVERY_S = 10.0
 Say = Callable[[str], None]
+WriteGroup = Callable[["RowGroup"], list["Written"]]
+Each = Callable[[WriteGroup, Iterable["RowGroup"]], Generator[list["Written"], None, None]]  # in any order
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,9 @@ class RowGroup:
     partition: Mapping[str, str]
     number: int
     rows: tuple[int, ...]
+
+    def __str__(self) -> str:
+        return f"{self.path}, row group {self.number}"
 
 
 @dataclass(frozen=True)
@@ -83,18 +88,24 @@ class ExportSummary:
     notes: tuple[str, ...]  # what its user should know
 
 
+def one_after_the_other(write: WriteGroup, groups: Iterable[RowGroup]) -> Generator[list[Written], None, None]:
+    """In this process."""
+    yield from map(write, groups)
+
+
 def export(
     table: KeyedTable,
     to: Path,
     settings: ExportSettings,
     trajectories: Array | None = None,
-    workers: int = 1,
+    each: Each = one_after_the_other,
     say: Say = print,
 ) -> ExportSummary:
     """Write all samples that `settings` choose below `to`; what a call before has written stays.
 
-    trajectories (K, 40, 3): of the labels' vocabulary, where they are known. Raises CannotExport for samples that
-    cannot be written, ValueError where `to` holds another export, OSError where the disk cannot be written or is full.
+    trajectories (K, 40, 3): of the labels' vocabulary, where they are known. each: how row groups are dealt to workers,
+    which must see `to` by the same path. Raises CannotExport for samples that cannot be written, ValueError where `to`
+    holds another export, OSError where the disk cannot be written or is full, and what `each` does.
     """
     planned = plan(table, settings)
     journal = Journal(to, asdict(settings))
@@ -104,7 +115,7 @@ def export(
     if not (todo or stale or journal.interrupted) and _is_done(journal, trajectories):
         return _summary(journal, 0, journal.facts, journal.files)
     journal.begin()
-    _write_logs(table, journal, settings, todo, workers, say)
+    _write_logs(table, journal, settings, todo, each, say)
     logs = [journal.logs[key] for key in sorted(planned)]
     say("splits, rewards, checksums")
     files = [*_split_files(to, settings, logs, planned)]
@@ -148,9 +159,17 @@ def plan(table: KeyedTable, settings: ExportSettings) -> dict[tuple[str, str], P
 
 
 def write_group(table: Location, root: Path, settings: ExportSettings, group: RowGroup) -> list[Written]:
-    """Write the logs and pictures of one row group's wanted rows; each pickle last. For worker processes."""
+    """Write the logs and pictures of one row group's wanted rows; each pickle last. For workers anywhere.
+
+    Raises CannotExport, DiskFull.
+    """
     columns = tuple(dict.fromkeys((*PLANNED, *MOTION, *DRAWN)))
-    rows = read_rows(open_parquet(table, group.path), group.number, group.partition, columns)
+    try:
+        file = open_parquet(table, group.path)
+    except FileNotFoundError as error:
+        here = socket.gethostname()
+        raise CannotExport(f"{table.uri}/{group.path}: not there for {here}: every worker must see the run") from error
+    rows = read_rows(file, group.number, group.partition, columns)
     return [_write_log(root, settings, rows[i]) for i in group.rows]
 
 
@@ -178,7 +197,7 @@ def _write_log(root: Path, settings: ExportSettings, row: Sample) -> Written:
 
 
 def _write_logs(
-    table: KeyedTable, journal: Journal, settings: ExportSettings, todo: Sequence[Planned], workers: int, say: Say
+    table: KeyedTable, journal: Journal, settings: ExportSettings, todo: Sequence[Planned], each: Each, say: Say
 ) -> None:
     live = table.live_files()
     wanted: dict[tuple[str, int], list[int]] = defaultdict(list)
@@ -190,29 +209,14 @@ def _write_logs(
     work = partial(write_group, table.location, journal.root, settings)
     began = said = time.monotonic()
     done = 0
-    for written in _each(work, groups, workers):
-        journal.add(written)
-        done, now = done + len(written), time.monotonic()
-        if now - said > SAY_EVERY_S:
-            said, rate = now, done / (now - began)
-            left = time_text((len(todo) - done) / rate)
-            say(f"{done:,} of {len(todo):,} logs, {rate_text(rate, ' logs')}, {left} left")
-
-
-def _each(
-    work: Callable[[RowGroup], list[Written]], groups: Sequence[RowGroup], workers: int
-) -> Iterator[list[Written]]:
-    """Of each group as it is done, in this process or in others."""
-    if workers == 1 or len(groups) < 2:
-        yield from map(work, groups)
-        return
-    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
-        pending = [pool.submit(work, group) for group in groups]
-        try:
-            for future in as_completed(pending):
-                yield future.result()
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+    with closing(each(work, groups)) as results:
+        for written in results:
+            journal.add(written)
+            done, now = done + len(written), time.monotonic()
+            if now - said > SAY_EVERY_S:
+                said, rate = now, done / (now - began)
+                left = time_text((len(todo) - done) / rate)
+                say(f"{done:,} of {len(todo):,} logs, {rate_text(rate, ' logs')}, {left} left")
 
 
 def _all_rows(table: KeyedTable, tag: str) -> Iterator[Planned]:

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ import pytest
 import yaml
 
 from factory.commands.table import COMMANDS
-from factory.exports.navsim.export import ExportSummary, export
+from factory.exports.navsim.export import ExportSummary, RowGroup, export, write_group
 from factory.exports.navsim.names import hex16, source_log
 from factory.exports.navsim.pickles import dumps, write_dict
 from factory.exports.navsim.rewards import METRICS
@@ -123,14 +124,6 @@ def test_the_manifest_names_every_other_file_with_its_checksum(openscene: tuple[
     assert header["picture_sizes"] == ["32x18"] and header["distortion"].startswith("none")
 
 
-@pytest.mark.slow
-def test_its_bytes_do_not_depend_on_processes_or_time(
-    openscene: tuple[Path, ExportSummary], street_run: Path, tmp_path: Path
-) -> None:
-    quiet(street_run, tmp_path / "again", workers=2)
-    assert tree(tmp_path / "again") == tree(openscene[0])
-
-
 def test_what_is_there_is_not_written_again(openscene: tuple[Path, ExportSummary], street_run: Path) -> None:
     to, before = openscene
     stamps = {path: path.stat().st_mtime_ns for path in to.rglob("*")}
@@ -160,18 +153,39 @@ def test_another_export_does_not_go_into_the_same_folder(street_run: Path, tmp_p
         quiet(street_run, tmp_path, ExportSettings(experts=("recovery",)))
 
 
+EXECUTORS = [
+    pytest.param(["executor=local", "workers=2"], id="local"),
+    pytest.param(["executor=ray", "workers=2"], id="ray", marks=pytest.mark.ray),
+]
+
+
+@pytest.fixture(scope="module")
+def long_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A run of twelve rounds, a row group each, and its export without a disturbance."""
+    run, to = (tmp_path_factory.mktemp("long") / name for name in ("run", "to"))
+    write_table(run, [exported(i, "pdm_closed", i) for i in range(12)], group_rows=1)
+    quiet(run, to)
+    return run, to
+
+
 @pytest.mark.slow
-def test_a_killed_export_goes_on_to_the_same_bytes(openscene: tuple[Path, ExportSummary], tmp_path: Path) -> None:
+@pytest.mark.parametrize("how", EXECUTORS)
+def test_processes_and_ray_write_what_one_process_writes(
+    long_run: tuple[Path, Path], tmp_path: Path, how: list[str]
+) -> None:
+    assert main(["navsim", f"out={long_run[0]}", f"to={tmp_path / 'to'}", *how]) == 0
+    assert tree(tmp_path / "to") == tree(long_run[1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", EXECUTORS)
+def test_a_killed_export_goes_on_to_the_same_bytes(long_run: tuple[Path, Path], tmp_path: Path, how: list[str]) -> None:
     """Killed between logs and amid them, with half a line in the journal and half a picture beside the others."""
-    run, to = tmp_path / "run", tmp_path / "to"
-    rows = [exported(0, "human"), exported(1, "pdm_closed", 0), exported(2, "pdm_closed", 1, split="val")]
-    write_table(run, [*rows, exported(3, "recovery", 0)], group_rows=1)
-    command = [sys.executable, "-m", "factory", "export", "navsim", f"out={run}", f"to={to}"]
-    killed = subprocess.Popen(command, cwd=ROOT, env=os.environ | {"PYTHONPATH": str(ROOT)}, stdout=subprocess.DEVNULL)
-    while not list(to.glob("navsim_logs/*/*.pkl")) and killed.poll() is None:
-        time.sleep(0.001)
+    (run, undisturbed), to = long_run, tmp_path / "to"
+    killed = begun(run, to, how)
     killed.send_signal(signal.SIGKILL)
-    killed.wait()
+    killed.communicate()
+    settled(to)
     journal = to / ".journal.jsonl"
     assert journal.exists() and not (to / "manifest.jsonl").exists(), "it was to be killed on its way"
     with journal.open("a") as file:
@@ -179,7 +193,67 @@ def test_a_killed_export_goes_on_to_the_same_bytes(openscene: tuple[Path, Export
     half = next(to.rglob("*.jpg")).with_name(".half.jpg.1234.tmp")
     half.write_bytes(b"half")
     quiet(run, to)
-    assert tree(to) == tree(openscene[0])
+    assert tree(to) == tree(undisturbed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", EXECUTORS)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "SIGTERM"])
+def test_an_interrupted_export_ends_what_is_in_hand_and_says_how_it_goes_on(
+    long_run: tuple[Path, Path], tmp_path: Path, how: list[str], number: int
+) -> None:
+    """Ctrl-C goes to all of its processes, SIGTERM to the one that was started."""
+    (run, undisturbed), to = long_run, tmp_path / "to"
+    stopped = begun(run, to, how)
+    (os.killpg if number == signal.SIGINT else os.kill)(stopped.pid, number)
+    _, said = stopped.communicate(timeout=120)
+    assert (stopped.returncode, said) == (4, "interrupted; run the same command again to go on\n")
+    n_written = len((to / ".journal.jsonl").read_text().splitlines()) - 1
+    assert n_written == len(list(to.glob("navsim_logs/*/*.pkl"))) < 12, "every log that was begun is whole and noted"
+    assert quiet(run, to).written == 12 - n_written
+    assert tree(to) == tree(undisturbed)
+
+
+def begun(run: Path, to: Path, how: list[str]) -> "subprocess.Popen[str]":
+    """An export that has written its first log, in a session of its own."""
+    command = [sys.executable, "-m", "factory", "export", "navsim", f"out={run}", f"to={to}", *how]
+    env = os.environ | {"PYTHONPATH": str(ROOT)}
+    export = subprocess.Popen(
+        command, cwd=ROOT, env=env, text=True, start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+    )
+    while not list(to.glob("navsim_logs/*/*.pkl")):
+        assert export.poll() is None, export.communicate()
+        time.sleep(0.001)
+    return export
+
+
+def settled(to: Path) -> None:
+    """Workers of a killed driver may still finish what they have in hand."""
+    before = None
+    while before != (now := tree(to)):
+        before = now
+        time.sleep(1.0)
+
+
+@pytest.mark.slow
+@pytest.mark.ray
+def test_a_sample_that_cannot_be_written_is_named_on_ray_as_here(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = [exported(0, "human"), exported(1, "pdm_closed", 0, **pictures(times_s=(0.0,)))]
+    write_table(tmp_path / "run", rows, group_rows=1)
+    said = []
+    for executor in ("local", "ray"):
+        assert main(["navsim", f"out={tmp_path / 'run'}", f"to={tmp_path / executor}", f"executor={executor}"]) == 2
+        said.append(capsys.readouterr().err)
+    assert said[0].startswith("error: sample attempt00001: ") and said[0] == said[1]
+
+
+def test_a_worker_that_does_not_see_the_run_says_so(street_run: Path, tmp_path: Path) -> None:
+    elsewhere = replace(Store(street_run).samples.location, uri=str(tmp_path / "not_mounted"))
+    group = RowGroup("round=0/part.parquet", {}, 0, (0,))
+    with pytest.raises(CannotExport, match=r"not_mounted/round=0/part.parquet: not there for .*: every worker"):
+        write_group(elsewhere, tmp_path, ExportSettings(), group)
 
 
 def test_a_log_that_was_lost_is_written_again(
@@ -308,6 +382,7 @@ def test_two_samples_of_one_name_are_refused(tmp_path: Path) -> None:
         (["to=."], "to=<folder> is missing"),
         (["to=s3://bucket/folder"], "to a local folder"),
         (["workers=0"], "must be 1 or more"),
+        (["executor=slurm"], "one of local, ray"),
         (["tag=a-b"], "letters, digits and _"),
         (["missing=white"], "one of refuse, black, none"),
         (["map_location=PIT"], "the public code knows"),

@@ -1,0 +1,104 @@
+"""One function of many items, here, in processes or on Ray: a few at once, results as they come, until a signal."""
+
+import multiprocessing
+import os
+import threading
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
+from contextlib import contextmanager
+from itertools import islice
+from typing import Literal, ParamSpec, TypeVar
+
+from factory.exits import asked_to_stop
+from factory.graph.work import Halted
+from factory.store.location import Location
+
+T = TypeVar("T")
+R = TypeVar("R")
+P = ParamSpec("P")
+IN_HAND = 2  # items for every worker, so that none waits until the driver has taken a result
+
+
+class WorkerDied(RuntimeError):
+    """A worker died at an item: killed, or out of memory."""
+
+
+def each(
+    function: Callable[[T], R],
+    items: Iterable[T],
+    executor: Literal["local", "ray"] = "local",
+    workers: int | None = None,
+    to: Location | None = None,
+) -> Generator[R, None, None]:
+    """function(item) of each item, in whatever order they are done. What one raises is raised here and ends it.
+
+    workers: at once; None: 1 here, every core on Ray, which is the cluster of RAY_ADDRESS or one of this machine's own.
+    to: the folder that the function writes to, called `to=` where a node of a cluster does not see it. At the first
+    SIGINT or SIGTERM nothing new is begun; what is in hand still comes. Close the iterator to have the signals back.
+    Raises Halted where items are left then, WorkerDied, BadLocation, ConnectionError where no cluster answers.
+    """
+    stopped: list[bool] = []
+    waiting = iter(items)
+    with _pool(executor, workers, to) as (pool, most), asked_to_stop(lambda: stopped.append(True)):
+        in_hand: dict[Future[R], T] = {}
+        while True:
+            if not stopped:
+                for item in islice(waiting, most - len(in_hand)):
+                    in_hand[pool.submit(function, item)] = item
+            if not in_hand:
+                break
+            done, _ = wait(in_hand, return_when=FIRST_COMPLETED)
+            for future in done:
+                item = in_hand.pop(future)
+                try:
+                    result = future.result()
+                except BrokenExecutor as error:
+                    raise WorkerDied(f"{item}: its worker died ({error}); run the same command again") from error
+                yield result
+        if stopped and any(True for _ in waiting):
+            raise Halted
+
+
+@contextmanager
+def _pool(executor: str, workers: int | None, to: Location | None) -> Iterator[tuple[Executor, int]]:
+    """What runs the function, and how many items it is to hold. What has not begun when it is left is dropped."""
+    pool: Executor
+    if executor == "ray":
+        from factory.graph.on_ray import RayPool
+
+        pool = RayPool(workers, to)
+        most = IN_HAND * pool.parallelism
+    elif workers is None or workers == 1:
+        pool, most = _Here(), 1
+    else:
+        pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _apart)
+        most = IN_HAND * workers
+    try:
+        yield pool, most
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+class _Here(Executor):
+    """In this process, at once."""
+
+    def submit(self, function: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
+        future: Future[R] = Future()
+        try:
+            future.set_result(function(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+def _apart() -> None:
+    """A worker process out of reach of what a terminal sends to all, that ends when its driver was killed."""
+    os.setpgrp()
+    driver = multiprocessing.parent_process()
+    assert driver is not None
+
+    def watch() -> None:
+        driver.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

@@ -1,0 +1,143 @@
+"""One function of many items: the same results in every executor, few in hand, ended by signals and errors alike."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from factory.graph.each import IN_HAND, WorkerDied, each
+from factory.graph.work import Halted
+from factory.store.location import BadLocation, Location
+from tests.factory.items import Elsewhere, OddItem, squared
+
+ROOT = Path(__file__).resolve().parents[3]
+HERE: dict[str, Any] = {}
+TWO: dict[str, Any] = {"workers": 2}
+RAY: dict[str, Any] = {"executor": "ray", "workers": 2}
+EXECUTORS = [
+    pytest.param(HERE, id="here"),
+    pytest.param(TWO, id="processes", marks=pytest.mark.slow),
+    pytest.param(RAY, id="ray", marks=[pytest.mark.ray, pytest.mark.slow]),
+]
+WORKERS = EXECUTORS[1:]
+
+
+def counted(n: int, begun: list[int]) -> Iterator[int]:
+    for i in range(n):
+        begun.append(i)
+        yield i
+
+
+@pytest.fixture(scope="module", autouse=True)
+def two_cpus(request: pytest.FixtureRequest) -> Iterator[None]:
+    """One cluster for those of this module's tests that need one: starting it takes seven seconds."""
+    if not any(item.get_closest_marker("ray") for item in request.session.items if item.path == request.path):
+        yield
+        return
+    from factory.graph.on_ray import ray
+
+    ray.init(address="local", num_cpus=2, include_dashboard=False, log_to_driver=False)
+    yield
+    ray.shutdown()
+
+
+@pytest.mark.parametrize("how", EXECUTORS)
+def test_every_item_has_its_result(how: dict[str, Any]) -> None:
+    assert sorted(each(squared, range(20), **how)) == [i * i for i in range(20)]
+    assert list(each(squared, [], **how)) == []
+
+
+@pytest.mark.parametrize("how", EXECUTORS)
+def test_few_items_are_in_hand_however_many_there_are(how: dict[str, Any]) -> None:
+    begun: list[int] = []
+    with closing(each(squared, counted(1000, begun), **how)) as results:
+        for done in range(1, 6):
+            next(results)
+            assert done <= len(begun) <= done + IN_HAND * how.get("workers", 1)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize("how", EXECUTORS)
+def test_after_a_signal_what_is_in_hand_still_comes_and_nothing_new_begins(how: dict[str, Any], number: int) -> None:
+    before = signal.getsignal(number)
+    begun: list[int] = []
+    results = each(squared, counted(100, begun), **how)
+    came = [next(results)]
+    os.kill(os.getpid(), number)
+    with pytest.raises(Halted):
+        came.extend(results)
+    assert 0 < len(came) < 20 and len(begun) - len(came) == 1, "one was looked at to see whether any was left"
+    assert signal.getsignal(number) == before
+
+
+@pytest.mark.parametrize("how", EXECUTORS)
+def test_a_signal_behind_the_last_item_halts_nothing(how: dict[str, Any]) -> None:
+    results = each(squared, [3], **how)
+    assert next(results) == 9
+    os.kill(os.getpid(), signal.SIGTERM)
+    assert list(results) == []
+
+
+@pytest.mark.parametrize("how", EXECUTORS)
+def test_what_an_item_raises_is_raised_as_it_is(how: dict[str, Any]) -> None:
+    with pytest.raises(OddItem) as raised:
+        list(each(partial(squared, odd=3), range(6), **how))
+    assert str(raised.value) == "3 is odd" and type(raised.value) is OddItem
+
+
+@pytest.mark.parametrize("how", WORKERS)
+def test_a_worker_that_dies_is_told_with_its_item(how: dict[str, Any]) -> None:
+    with pytest.raises(WorkerDied, match=r"^3: its worker died \(.*\); run the same command again"):
+        list(each(partial(squared, deadly=3), [3], **how))
+
+
+@pytest.mark.slow
+@pytest.mark.ray
+def test_a_folder_that_a_node_does_not_see_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second node is this one again; what it reads is another machine's folder, where nothing is."""
+    from factory.graph import on_ray
+
+    node = on_ray._nodes()
+    monkeypatch.setattr(on_ray, "_nodes", lambda having="": node * 2)
+    assert list(each(squared, [3], **RAY, to=Location(str(tmp_path)))) == [9]
+    with pytest.raises(BadLocation, match=rf"^to={tmp_path} is not the same folder on nodes .*storage that all"):
+        list(each(squared, [3], **RAY, to=Elsewhere(str(tmp_path))))
+    assert not list(tmp_path.iterdir()), "the trial file is taken away"
+    assert on_ray.ray.is_initialized(), "a cluster that was there stays"
+
+
+@pytest.mark.slow
+def test_workers_end_with_a_driver_that_is_killed(tmp_path: Path) -> None:
+    code = (
+        "import sys; from pathlib import Path; from factory.graph.each import each; "
+        "from tests.factory.items import noted; "
+        f"list(each(noted, [Path({str(tmp_path)!r}, str(i)) for i in range(2)], workers=2))"
+    )
+    driver = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, env=os.environ | {"PYTHONPATH": str(ROOT)})
+    until(lambda: len(list(tmp_path.glob("[01]"))) == 2, 60.0)
+    workers = [int(path.read_text()) for path in tmp_path.glob("[01]")]
+    driver.kill()
+    driver.wait()
+    until(lambda: not any(map(alive, workers)), 20.0)
+
+
+def alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def until(is_so: Any, seconds: float) -> None:
+    end = time.monotonic() + seconds
+    while not is_so():
+        assert time.monotonic() < end, "in vain"
+        time.sleep(0.05)
