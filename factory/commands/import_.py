@@ -4,8 +4,9 @@
     python -m factory import simscale root=exported out=runs/back only=[synthetic_reaction_pdm_v1.0-0]
     python -m factory import simscale root=SimScale_data out=runs/simscale rewards=traj_pdm vocabulary=16384.npy
 
-simscale: the released layout, moved into NAVSIM's folders or as unpacked. One row for each log, which `train`, `show`,
-`dashboard`, `report` and `export` take as any other (`data.sim=[runs/simscale]`).
+simscale: the released layout, moved into NAVSIM's folders or as unpacked, and what `export navsim` wrote, human samples
+too. One row for each log, which `train`, `show`, `dashboard`, `report` and `export` take as any other
+(`data.sim=[runs/simscale]`).
     maps=<folder>        nuPlan's, for lanes, route and lights of each row; without it these columns are empty
     rewards=<folder>     reward pickles, or one of them; with vocabulary=<.npy> they become the rows' labels
     pictures=false       rows without pictures

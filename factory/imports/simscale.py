@@ -3,6 +3,8 @@
 What a row is. `now` is the log's fourth frame, and the row's own log is the simulated one: `parent_states` are its ego
 at T and T+H, `now_s` is 1.5. Label and history at 2 Hz are the frames', at 10 Hz linear between them. Pictures are the
 files' own bytes. What the release does not hold stays null: scores, perturbation, what the expert asked for.
+SimScale has released simulated samples alone; the human ones are those of our own export (factory.exports.navsim),
+which writes them beside. Their log is the source log itself.
 """
 
 import re
@@ -13,6 +15,7 @@ from hashlib import sha256
 from itertools import pairwise
 from pathlib import Path
 
+from factory.graph.work import HUMAN_CANDIDATE
 from factory.imports.labels import vocabulary_labels
 from factory.imports.roads import road_around
 from factory.imports.scenes import (
@@ -33,50 +36,80 @@ from factory.readers.restricted_pickle import load_plain
 from factory.stages.imaging import NO_IMAGES
 from factory.stages.rows import label_columns
 from tasks.render.settings import ImageSource
+from tasks.stages import HUMAN
 from tasks.world.vocabulary import Vocabulary
 
 DATASET = "simscale"
 LICENCE = "CC BY-NC-SA 4.0 (SimScale, of nuPlan)"
 FOLDER = re.compile(r"[a-z]+_reaction_(?P<who>[A-Za-z0-9_-]+)_v1\.0-(?P<round>\d+)")
-LOG = re.compile(r"(?P<log>.+)-(?P<seed>[0-9a-f]{16})-(?P<round>\d{3})")
-TOKEN = re.compile(r"(?P<frame>[0-9a-f]{16})-(?P<round>\d{3})")
+HUMAN_FOLDER = re.compile(r"navtrain_(?P<who>human(_[A-Za-z0-9_]+)?)")
+LOG, TOKEN = r"(?P<log>.+)-(?P<seed>[0-9a-f]{16})", r"(?P<frame>[0-9a-f]{16})"  # -00k behind, of simulated ones
 REWARDS = re.compile(r"sim[a-z]+_\d+_(?P<who>[A-Za-z0-9_-]+)_v1\.0-(?P<round>\d+)\.pkl")
+HUMAN_REWARDS = re.compile(HUMAN_FOLDER.pattern + r"_\d+\.pkl")
 EXPERTS = {"pdm": "pdm_closed"}  # SimScale's name of an expert -> ours, where they differ
 FRAME_US, SLACK_US = 500_000, 50_000
 
 
-@dataclass(frozen=True, order=True)
+@dataclass(frozen=True)
 class Part:
-    """The samples of one expert and round."""
+    """The samples of one expert and round, or human ones."""
 
     name: str
     logs: Path
     blobs: Path
     who: str  # as SimScale names the expert
-    round: int
+    number: int | None  # the round; None: human samples
 
     @property
     def expert(self) -> str:
-        return EXPERTS.get(self.who, self.who)
+        return HUMAN if self.number is None else EXPERTS.get(self.who, self.who)
+
+    @property
+    def round(self) -> int:
+        return self.number or 0
+
+    @property
+    def candidate(self) -> int:
+        return HUMAN_CANDIDATE if self.number is None else self.number
+
+    @property
+    def suffix(self) -> str:
+        """Of its logs' and tokens' names."""
+        return "" if self.number is None else f"-{self.number:03d}"
+
+    @property
+    def source(self) -> ImageSource:
+        """Of its pictures; NAVSIM's human ones are photos."""
+        return ImageSource.PHOTO if self.number is None else ImageSource.RENDER
 
 
 def parts_of(root: Path, only: Collection[str] = ()) -> list[Part]:
     """What lies under the root: as moved into NAVSIM's folders (tools/move.sh), or as unpacked.
 
-    Raises ValueError where there is none, or none of that name.
+    Raises ValueError where there is none, none of that name, or two of one expert and round.
     """
     found = []
     for name, logs, blobs in _folders(root):
-        named = FOLDER.fullmatch(name)
-        if named is not None:
+        if (named := FOLDER.fullmatch(name)) is not None:
             found.append(Part(name, logs, blobs, named["who"], int(named["round"])))
+        elif (named := HUMAN_FOLDER.fullmatch(name)) is not None:
+            found.append(Part(name, logs, blobs, named["who"], None))
     if not found:
-        expected = "navsim_logs/synthetic_reaction_<expert>_v1.0-<k> with sensor_blobs/, or <name>/meta_datas"
+        names = "synthetic_reaction_<expert>_v1.0-<k> or navtrain_human"
+        expected = f"navsim_logs/<name> with sensor_blobs/<name>, or <name>/meta_datas, <name> being {names}"
         raise ValueError(f"root={root}: nothing of SimScale's here; expected {expected}")
-    names = {part.name for part in found}
-    if unknown := sorted(set(only) - names):
-        raise ValueError(f"only={unknown[0]}: not under {root}; there are {', '.join(sorted(names))}")
-    return sorted(part for part in found if not only or part.name in only)
+    there = {part.name for part in found}
+    if unknown := sorted(set(only) - there):
+        raise ValueError(f"only={unknown[0]}: not under {root}; there are {', '.join(sorted(there))}")
+    chosen: dict[tuple[str, int], Part] = {}
+    for part in sorted(found, key=lambda part: (part.name, part.logs)):
+        if not only or part.name in only:
+            twin = chosen.setdefault((part.expert, part.round), part)
+            if twin is not part:
+                both = " and ".join(str(one.logs.relative_to(root)) for one in (twin, part))
+                whose = f"of {part.expert} in round {part.round}"
+                raise ValueError(f"root={root}: {both} are both {whose}: name one with only=")
+    return list(chosen.values())
 
 
 def _folders(root: Path) -> Iterator[tuple[str, Path, Path]]:
@@ -95,11 +128,14 @@ class Rewards:
         self.vocabulary = vocabulary
         self._paths: dict[str, list[tuple[int, Path]]] = {}
         for file in [path] if path.is_file() else sorted(path.rglob("*.pkl")):
-            named = REWARDS.fullmatch(file.name)
-            if named is not None:
+            if (named := REWARDS.fullmatch(file.name)) is not None:
                 self._paths.setdefault(named["who"], []).append((int(named["round"]), file))
+            elif (named := HUMAN_REWARDS.fullmatch(file.name)) is not None:
+                self._paths.setdefault(named["who"], []).append((0, file))
         if not self._paths:
-            raise ValueError(f"rewards={path}: no file simcale_<K>_<expert>_v1.0-<k>.pkl here")
+            raise ValueError(
+                f"rewards={path}: no file simcale_<K>_<expert>_v1.0-<k>.pkl or navtrain_human_<K>.pkl here"
+            )
         self._open: dict[Path, RewardFile] = {}
 
     def columns(self, part: Part, token: str) -> dict[str, object]:
@@ -133,18 +169,17 @@ class Import:
         return [self._entry(part, path) for part in parts for path in sorted(part.logs.glob("*.pkl"))]
 
     def _entry(self, part: Part, path: Path) -> Entry:
-        named = LOG.fullmatch(path.stem)
+        named = re.fullmatch(LOG + part.suffix, path.stem)
         log, seed = (named["log"], named["seed"]) if named else (path.stem, "")
         clip_id = sha256("\x1f".join((DATASET, log, seed)).encode()).hexdigest()[:16]
         make = partial(self.row, part, path, clip_id)
-        return Entry(clip_id, DATASET, log, part.expert, part.round, part.round, make)
+        return Entry(clip_id, DATASET, log, part.expert, part.round, part.candidate, make)
 
     def row(self, part: Part, path: Path, clip_id: str) -> dict[str, object]:
         """The columns of one log's row. Raises BadClip."""
-        named = LOG.fullmatch(path.stem)
-        if named is None or int(named["round"]) != part.round:
-            expected = f"<log>-<token>-{part.round:03d}.pkl"
-            raise BadClip(str(path), "name", f"expected {expected}, as SimScale names the logs of {part.name}")
+        named = re.fullmatch(LOG + part.suffix, path.stem)
+        if named is None:
+            raise BadClip(str(path), "name", f"expected <log>-<token>{part.suffix}.pkl, as the logs of {part.name} are")
         data = bytes_of(path)
         frames = frames_of(load_plain(data, str(path)), path).frames
         if len(frames) != SCENE_FRAMES:
@@ -155,10 +190,12 @@ class Import:
             if frame.boxes is None:
                 raise BadClip(str(path), f"frames[{i}].anns", "missing")
         at = HISTORY_FRAMES - 1
-        now = frames[at]
-        token = TOKEN.fullmatch(now.token)
+        now, end = frames[at], frames[-1]
+        token = re.fullmatch(TOKEN + part.suffix, now.token)
         if token is None:
-            raise BadClip(str(path), f"frames[{at}].token", f"is {now.token!r}, expected <16 hex digits>-00k")
+            raise BadClip(str(path), f"frames[{at}].token", f"is {now.token!r}, expected <16 hex digits>{part.suffix}")
+        # A and B: a simulated log begins at B and is named after A; a human one begins at A, and its last frame is B
+        tokens = (named["seed"], token["frame"]) if part.suffix else (token["frame"], end.token)
         origin = Origin(
             file=str(path),
             clip_id=clip_id,
@@ -167,12 +204,12 @@ class Import:
             split="train",
             licence=LICENCE,
             content_digest=sha256(data).hexdigest(),
-            frame_tokens=(named["seed"], token["frame"]),
+            frame_tokens=tokens,
         )
         road = no_road(now) if self.maps is None else road_around(self.maps, frames, at, str(path))
         scene = scene_of(frames, road, origin)
         seen: dict[str, object] = dict(NO_IMAGES)
         if self.pictures:
-            seen = pictures(frames[:HISTORY_FRAMES], part.blobs, ImageSource.RENDER, str(path))
+            seen = pictures(frames[:HISTORY_FRAMES], part.blobs, part.source, str(path))
         labels = {} if self.rewards is None else self.rewards.columns(part, now.token)
         return {**world_columns(scene, now.command), **logged_label(scene), **seen, **labels}

@@ -20,8 +20,10 @@ DISTORTION = np.array([-0.356123, 0.172545, -0.00213, 0.000464, -0.05231])
 SIZE = (96, 54)  # of a picture, width and height
 
 
-def names(seed: int, round: int) -> tuple[str, str, str]:
-    """Log, scene token and the token of frame 3."""
+def names(seed: int, round: int | None) -> tuple[str, str, str]:
+    """Log, scene token and the token of frame 3; round: None of a human log, which begins at the frame of its name."""
+    if round is None:
+        return f"{SOURCE}-{seed:016x}", f"{seed:016x}", f"{seed:016x}"
     scene = f"{seed:016x}-{round:03d}"
     return f"{SOURCE}-{scene}", scene, f"{seed + 0xB0000:016x}-{round:03d}"
 
@@ -34,10 +36,11 @@ def poses(seed: int) -> np.ndarray:
     return np.column_stack([ORIGIN + forward, (heading + np.pi) % (2 * np.pi) - np.pi])
 
 
-def frames(seed: int, round: int) -> list[dict[str, Any]]:
+def frames(seed: int, round: int | None) -> list[dict[str, Any]]:
     """The 12 frames of one log."""
     log, scene, token = names(seed, round)
-    tokens = [f"{seed + 0xA0000 + i:016x}-{round:03d}" for i in range(N_FRAMES)]
+    suffix = "" if round is None else f"-{round:03d}"
+    tokens = [f"{seed + 0xA0000 + i:016x}{suffix}" for i in range(N_FRAMES)]
     tokens[NOW] = token
     return [_frame(i, log, scene, tokens, poses(seed)) for i in range(N_FRAMES)]
 
@@ -92,7 +95,9 @@ def _camera(k: int, name: str, path: str) -> dict[str, Any]:
     }
 
 
-def write_log(root: Path, folder: str, seed: int, round: int, log: Sequence[dict[str, Any]] | None = None) -> Path:
+def write_log(
+    root: Path, folder: str, seed: int, round: int | None, log: Sequence[dict[str, Any]] | None = None
+) -> Path:
     """A log and the pictures of its history below navsim_logs/<folder> and sensor_blobs/<folder>."""
     log = frames(seed, round) if log is None else log
     path = root / "navsim_logs" / folder / f"{names(seed, round)[0]}.pkl"

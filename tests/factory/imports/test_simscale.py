@@ -19,6 +19,7 @@ from tasks.world.frames import to_local, to_world
 from tests.factory.imports import simscale_writer as simscale
 
 PDM, RECOVERY = "synthetic_reaction_pdm_v1.0-0", "synthetic_reaction_recovery_v1.0-2"
+HUMAN = "navtrain_human"  # of our own export
 
 
 def imported(root: Path, out: Path, *words: str) -> int:
@@ -119,14 +120,29 @@ def test_what_reads_samples_reads_them(released: Path, tmp_path: Path, capsys: p
     assert all(set(np.unique(raster)) > {0, int(BevClass.VEHICLE)} for raster in rasters)
 
 
+def test_a_human_log_is_a_row_of_the_human_that_begins_at_the_frame_of_its_name(released: Path, tmp_path: Path) -> None:
+    """Its clip is that of the simulated rows that began in the same frame."""
+    simscale.write_log(released, HUMAN, 1, None)
+    assert imported(released, tmp_path / "out") == COMPLETE
+    rows = rows_of(tmp_path / "out")
+    row, frames = rows["human", 1], simscale.frames(1, None)
+    assert row["clip_id"] == rows["pdm_closed", 1]["clip_id"] and row["log_id"] == simscale.SOURCE
+    assert row["frame_tokens"] == [frames[3]["token"], frames[11]["token"]] == [f"{1:016x}", f"{0xA000C:016x}"]
+    assert (row["candidate_index"], row["round"], row["image_source"]) == (-1, 0, "photo")
+    poses = simscale.poses(1)
+    np.testing.assert_allclose(row["parent_states"][:, :3], poses[[3, 11]], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(row["label_2hz"], to_local(poses[3], poses)[4:], atol=1e-5)
+
+
 def test_exported_again_and_imported_again_rows_are_the_same(released: Path, tmp_path: Path) -> None:
+    simscale.write_log(released, HUMAN, 1, None)
     imported(released, tmp_path / "out")
     assert factory(["export", "navsim", f"out={tmp_path / 'out'}", f"to={tmp_path / 'again'}"]) == 0
     assert imported(tmp_path / "again", tmp_path / "twice") == COMPLETE
     once, twice = rows_of(tmp_path / "out"), rows_of(tmp_path / "twice")
-    assert sorted(once) == sorted(twice)
+    assert sorted(once) == sorted(twice) and len(once) == 4
     for key, row in once.items():
-        for name in ("now_pose", "ego_history_2hz", "label_2hz", "ego_status", "frame_tokens", "command"):
+        for name in ("clip_id", "now_pose", "ego_history_2hz", "label_2hz", "ego_status", "frame_tokens", "command"):
             np.testing.assert_array_equal(row[name], twice[key][name], err_msg=name)
         assert [image["jpeg"] for image in row["images"]] == [image["jpeg"] for image in twice[key]["images"]]
         np.testing.assert_allclose(row["label_10hz"], twice[key]["label_10hz"], atol=1e-5)
@@ -159,8 +175,8 @@ def _not_annotated(log: list[dict[str, Any]]) -> None:
     log[9]["anns"] = None
 
 
-def _real_token(log: list[dict[str, Any]]) -> None:
-    log[3]["token"] = f"{7:016x}"
+def _token(log: list[dict[str, Any]]) -> None:
+    log[3]["token"] += "-000" if len(log[3]["token"]) == 16 else "0"
 
 
 @pytest.mark.parametrize(
@@ -170,17 +186,44 @@ def _real_token(log: list[dict[str, Any]]) -> None:
         (_gap, "frames[5].timestamp: not 0.5 s"),
         (_short, "frames: 11, expected 12"),
         (_not_annotated, "frames[9].anns: missing"),
-        (_real_token, "frames[3].token"),
+        (_token, "frames[3].token: is "),
     ],
 )
-def test_a_bad_log_is_counted_and_hurts_no_other(harm: Any, said: str, released: Path, tmp_path: Path) -> None:
-    log = simscale.frames(2, 0)
+@pytest.mark.parametrize(("folder", "round"), [(PDM, 0), (HUMAN, None)])
+def test_a_bad_log_is_counted_and_hurts_no_other(
+    folder: str, round: int | None, harm: Any, said: str, released: Path, tmp_path: Path
+) -> None:
+    log = simscale.frames(2, round)
     harm(log)
-    path = simscale.write_log(released, PDM, 2, 0, log)
+    path = simscale.write_log(released, folder, 2, round, log)
+    if folder != PDM:
+        (released / "navsim_logs" / PDM / f"{simscale.names(2, 0)[0]}.pkl").unlink()
     assert imported(released, tmp_path / "out") == COMPLETE_WITH_FAILURES
     (failed,) = Store(tmp_path / "out").outcomes.read().to_pylist()
     assert failed["error"].startswith(f"{path}: {said}") and failed["error_kind"] == "input"
     assert sorted(rows_of(tmp_path / "out")) == [("pdm_closed", 1), ("recovery", 1)]
+
+
+@pytest.mark.parametrize(("folder", "other"), [(PDM, None), (HUMAN, 0)])
+def test_a_log_of_the_other_kind_s_name_is_counted(
+    folder: str, other: int | None, released: Path, tmp_path: Path
+) -> None:
+    path = simscale.write_log(released, folder, 5, other)
+    assert imported(released, tmp_path / "out") == COMPLETE_WITH_FAILURES
+    (failed,) = Store(tmp_path / "out").outcomes.read().to_pylist()
+    assert failed["error"].startswith(f"{path}: name: expected <log>-<token>{'' if folder == HUMAN else '-000'}.pkl")
+    assert len(rows_of(tmp_path / "out")) == 3
+
+
+def test_two_folders_of_one_expert_and_round_are_one_too_many(
+    released: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They hold the same samples under two names, as where the split's name is a link to the folder's."""
+    (released / "navsim_logs" / "navtrain_reaction_pdm_v1.0-0").symlink_to(released / "navsim_logs" / PDM)
+    assert imported(released, tmp_path / "out") == 2
+    assert "are both of pdm_closed in round 0: name one with only=" in capsys.readouterr().err
+    assert imported(released, tmp_path / "out", f"only={PDM}") == COMPLETE
+    assert len(rows_of(tmp_path / "out")) == 2
 
 
 def test_missing_and_damaged_pictures_are_counted(released: Path, tmp_path: Path) -> None:

@@ -258,11 +258,11 @@ def agent_input(scene: Scene) -> AgentInput:
 
 @pytest.mark.slow
 def test_the_export_brought_back_is_the_run(chain: Chain) -> None:
-    """States, labels, rewards and pictures, to float32.
+    """States, labels, rewards and pictures of human and simulated samples, to float32.
 
     Not carried: what lies between two frames (label, history, tracks and lights at 10 Hz), perturbation, proposal and
-    scores, metres of progress, the logged drive before (parent_states), the vocabulary's digest (NAVSIM's are float32),
-    human samples, which are no SimScale's.
+    scores, metres of progress, of simulated samples the logged drive before (parent_states), the vocabulary's digest
+    (NAVSIM's are float32).
     """
     words = [
         f"maps={chain.root / 'maps'}",
@@ -270,11 +270,13 @@ def test_the_export_brought_back_is_the_run(chain: Chain) -> None:
         f"vocabulary={chain.to / f'devkit/traj_final/{K}.npy'}",
     ]
     assert factory(["import", "simscale", f"root={chain.to}", f"out={chain.root / 'back'}", *words]) == 0
-    rows = [row for row in chain.rows() if row["expert"] != "human"]
-    scenes = chain.scenes()
-    back = chain.rows("back")
+    rows, back, scenes = chain.rows(), chain.rows("back"), chain.scenes()
     assert [(row["expert"], row["round"]) for row in back] == [(row["expert"], row["round"]) for row in rows]
+    assert len({row["clip_id"] for row in back}) == 1, "all are of one clip, whose human sample is among them"
     for row, again in zip(rows, back):
+        if row["expert"] == "human":
+            np.testing.assert_allclose(again["parent_states"], row["parent_states"], rtol=0, atol=1e-4)
+            assert again["candidate_index"] == row["candidate_index"] == -1
         for name in ("ego_history_2hz", "label_2hz", "ego_status", "label_subscores", "now_pose", "world_from_ego"):
             _equal(again[name], row[name])
         for name in ("command", "frame_tokens", "map_location", "route_roadblock_ids", "route_lane_ids", "lane_ids"):
