@@ -6,6 +6,7 @@
 What it would try: python -m factory failed. The settings are those of the newest start of the run (current_run.json);
 attempts that are settled are not touched.
 Code that they name (`_target_`) is not called on the word of a table: give those settings again.
+A table that `import` wrote is no run: the same import again tries what failed.
 Exit codes: those of the run; 0 where nothing failed.
 """
 
@@ -19,7 +20,7 @@ from typing import TYPE_CHECKING
 
 from factory.config.arguments import RUN, Refused
 from factory.exits import COMPLETE
-from factory.views.status import failed_lines, open_store
+from factory.views.status import IMPORT_AGAIN, failed_lines, open_store
 
 if TYPE_CHECKING:
     from factory.store.samples import Store
@@ -36,11 +37,14 @@ class Request:
 def main(request: Request) -> int:
     """Say what is to be tried again and how; try it. Raises Refused."""
     from factory.run import main as run
+    from factory.store.samples import imported_from
 
     store = open_store(request.out)
     print("\n".join(failed_lines(store)))
     if "failed" not in store.outcomes.read(["kind"])["kind"].to_pylist():
         return COMPLETE
+    if source := imported_from(store.runs()):
+        raise Refused(f"{store.location.uri} is no run, its rows were imported: {IMPORT_AGAIN.format(source)}")
     folder, recorded = recorded_command(store, request.settings)
     command = [*recorded, *request.settings, f"out={store.location.uri}", "retry_failed=true"]
     print(f"\nin {folder}: python -m factory run {shlex.join(command)}", flush=True)

@@ -33,6 +33,11 @@ SAMPLE_STATE = [*STATE, "round"]
 OUTCOME_STATE = [*STATE, "kind", "error_kind", "tries"]
 
 
+def imported_from(runs: Sequence[Mapping[str, Any]]) -> str | None:
+    """Whose rows a table's are, by its records (Store.runs); None for those of a run."""
+    return runs[-1]["settings"].get(IMPORTED) if runs else None
+
+
 class ChangedRun(ValueError):
     """The run's settings, versions or expert inputs differ from the table's; the message says where."""
 

@@ -4,7 +4,7 @@ import json
 import os
 import shlex
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from factory.config.arguments import Refused
@@ -20,6 +20,17 @@ RETRY = {
     "system": "the next run of the same command tries it again by itself",
     "poison": "it brought workers down in several runs; python -m factory retry out=... tries it once more",
 }
+IMPORT_AGAIN = "give the same command again, python -m factory import {} ..."  # of what it was imported from
+
+
+def how_to_retry(error_kind: str, runs: Sequence[Mapping[str, Any]]) -> str:
+    """A failed attempt of a table with these records (Store.runs)."""
+    from factory.store.samples import imported_from
+
+    source = imported_from(runs)
+    if source is None:
+        return RETRY[error_kind]
+    return f"fix or take out the named file, then {IMPORT_AGAIN.format(source)}"
 
 
 class NothingThere(Refused):
@@ -113,7 +124,7 @@ def _failed(store: "Store") -> tuple[list[dict[str, Any]], dict[str, int]]:
 
 def failed_lines(store: "Store") -> Iterable[str]:
     """Every failed attempt with its message, and how to try it again."""
-    rows, kinds = _failed(store)
+    (rows, kinds), runs = _failed(store), store.runs()
     yield f"{len(rows)} failed" + (": " + ", ".join(f"{kind} {n}" for kind, n in kinds.items()) if rows else "")
     for row in rows:
         what = f"expert {row['expert']}, candidate {row['candidate_index']}" if row["expert"] else "the clip as a whole"
@@ -123,4 +134,4 @@ def failed_lines(store: "Store") -> Iterable[str]:
         yield from (f"  | {line}" for line in row["error"].splitlines())
     for kind in kinds:
         yield ""
-        yield f"to retry {kind}: {RETRY[kind]}"
+        yield f"to retry {kind}: {how_to_retry(kind, runs)}"

@@ -10,7 +10,7 @@ from factory.store.outcomes import Kind
 from factory.store.table import KeyedTable
 from factory.views.board.watch import Snapshot
 from factory.views.report_words import REASON_WORDS, to_the_side, turned
-from factory.views.status import RETRY, fate
+from factory.views.status import fate, how_to_retry
 from tasks.subscores import SUBSCORES
 
 FILTERS = ("expert", "round", "image_source", "command", "split", "log_id")
@@ -74,7 +74,7 @@ def failures(shot: Snapshot, page: int = 1, size: int = 50) -> Json:
 
     def failure(row: Row) -> Json:
         kind = row["error_kind"]
-        known = {"kind": kind, "words": REASON_WORDS.get(kind, ""), "retry": RETRY[kind]}
+        known = {"kind": kind, "words": REASON_WORDS.get(kind, ""), "retry": how_to_retry(kind, shot.runs)}
         return {name: row[name] for name in FAILED} | known
 
     return _page(rows, page, size, failure, most=size)

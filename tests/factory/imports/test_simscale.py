@@ -13,6 +13,8 @@ from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES
 from factory.store.reader import SampleTable, labels_of
 from factory.store.samples import Store
 from factory.store.verify import verify
+from factory.views.board.gallery import failures
+from factory.views.board.watch import Watch
 from planners.data.batch import BevLayout
 from planners.data.bev import BevClass, bev_raster
 from tasks.world.frames import to_local, to_world
@@ -248,6 +250,25 @@ def test_the_same_command_goes_on_and_tries_what_failed_again(released: Path, tm
     assert len(store.samples) == 3 and len(store.outcomes) == 0
     assert before is not None and store.samples.version is not None and store.samples.version > before
     assert not verify(store).damage
+
+
+def test_what_failed_is_tried_again_by_the_import_and_every_place_says_so(
+    released: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`retry` has settings of runs alone."""
+    path, out = released / "navsim_logs" / PDM / f"{simscale.names(2, 0)[0]}.pkl", tmp_path / "out"
+    path.write_bytes(path.read_bytes()[:-50])
+    imported(released, out)
+    capsys.readouterr()
+    again = "give the same command again, python -m factory import simscale ..."
+    assert factory(["failed", f"out={out}"]) == 0
+    told = capsys.readouterr().out
+    assert f"to retry input: fix or take out the named file, then {again}" in told and "factory retry" not in told
+    assert factory(["retry", f"out={out}"]) == 2
+    told = capsys.readouterr()
+    assert again in told.err and "retry_failed" not in told.err + told.out and "factory retry" not in told.out
+    (shown,) = failures(Watch(Store(out)).now())["items"]
+    assert again in shown["retry"] and shown["error"].startswith(str(path))
 
 
 def test_a_pickle_with_code_runs_none_of_it(released: Path, tmp_path: Path) -> None:
