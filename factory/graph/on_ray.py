@@ -12,6 +12,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future
+from dataclasses import dataclass
 from typing import Any, ParamSpec, TypeVar
 
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
@@ -114,6 +115,7 @@ class RayGraph:
             self._gpu_share = claims.gpu_share if claims.gpu_share and _has_gpu(wait=not self._is_ours) else 0.0
             self._claims, self._most_memory = claims, max(_of_nodes("memory"), default=None)
             self.attempt_tasks: Sequence[Sequence[str]] = attempt_tasks(fuse, apart=self._gpu_share > 0.0)
+            self._after_drawing = _after_drawing(self.attempt_tasks) if self._gpu_share else frozenset()
             _prove_shared(out, "out", "shared storage or a URL")
             _warm_every_node(self._supplied["work"], with_gpu_only=self._gpu_share > 0.0)
         except BaseException:
@@ -138,6 +140,8 @@ class RayGraph:
             while waiting and (self._is_ours or self._flying[draws] < self.parallelism):
                 ticket, step, args = waiting.popleft()
                 supplied = [self._supplied[name] for name in STEPS[step][1]]
+                if ticket.step in self._after_drawing:
+                    args = tuple(Fetched(arg) if isinstance(arg, ray.ObjectRef) else arg for arg in args)
                 gpu = self._gpu_share if draws else None
                 memory = self._claims.memory_bytes(ticket.step)
                 memory = memory if self._most_memory is None else min(memory, self._most_memory)
@@ -224,6 +228,20 @@ class RayPool(Executor):
 @ray.remote(num_cpus=1, max_retries=MAX_RETRIES)
 def _call(function: Callable[..., Any], args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
     return function(*args, **kwargs)
+@dataclass(frozen=True)
+class Fetched:
+    """A result that a task fetches itself: Ray sends a task to the node where most of what it is given lies.
+
+    What follows a picture would go to the node that drew it, and take the cores that the next pictures wait for.
+    """
+
+    reference: Any
+
+
+def _after_drawing(tasks: Sequence[Sequence[str]]) -> frozenset[str]:
+    """Names of an attempt's tasks behind the one that may draw."""
+    draws = [any(task.may_draw for task in TASKS if task.name in stages) for stages in tasks]
+    return frozenset("+".join(stages) for stages in tasks[draws.index(True) + 1 :])
 
 
 @ray.remote(num_cpus=1, num_returns=2, max_retries=MAX_RETRIES)
@@ -231,7 +249,8 @@ def _run(step: str, n_supplied: int, *args: Any) -> tuple[Any, Any]:
     """A function of factory.graph.steps in a worker: its report with the seconds it took, and its result."""
     began = time.perf_counter()
     supplied = [_held(arg) if isinstance(arg, list) else arg for arg in args[:n_supplied]]
-    report, result = STEPS[step][0](*supplied, *args[n_supplied:])
+    given = [ray.get(arg.reference) if isinstance(arg, Fetched) else arg for arg in args[n_supplied:]]
+    report, result = STEPS[step][0](*supplied, *given)
     return (report, time.perf_counter() - began), result
 
 
