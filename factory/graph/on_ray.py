@@ -228,6 +228,8 @@ class RayPool(Executor):
 @ray.remote(num_cpus=1, max_retries=MAX_RETRIES)
 def _call(function: Callable[..., Any], args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
     return function(*args, **kwargs)
+
+
 @dataclass(frozen=True)
 class Fetched:
     """A result that a task fetches itself: Ray sends a task to the node where most of what it is given lies.

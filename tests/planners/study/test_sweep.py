@@ -7,10 +7,7 @@ import pytest
 from planners.study.figures import Curve
 from planners.study.report import StudyFrames, curves_of
 from planners.study.scaling import ScalingSettings, SweepData, comparisons_of, trainings_of
-from planners.study.sweep import (
-    EVALUATED_TOGETHER,
-    shares_of,
-)
+from planners.study.sweep import EVALUATED_TOGETHER, shares_of
 from planners.training.many import Training
 
 
