@@ -3,11 +3,13 @@
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Protocol
 
 from tasks.world.clip import Clip
 
 SPLITS = ("train", "val", "test")
+MAX_FILE_BYTES = 1 << 30  # of a file that is read whole
 
 
 class BadClip(Exception):
@@ -19,6 +21,16 @@ class BadClip(Exception):
 
     def __reduce__(self) -> tuple[type["BadClip"], tuple[str, str, str]]:
         return BadClip, (self.file, self.field, self.problem)
+
+
+def bytes_of(path: Path) -> bytes:
+    """All of a file. Raises BadClip where it cannot be read or is larger than MAX_FILE_BYTES."""
+    try:
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise BadClip(str(path), "size", f"more than {MAX_FILE_BYTES} bytes")
+        return path.read_bytes()
+    except OSError as error:
+        raise BadClip(str(path), "file", f"cannot be read: {error.strerror}") from error
 
 
 @dataclass(frozen=True, order=True)

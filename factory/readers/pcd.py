@@ -11,23 +11,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from factory.readers.base import BadClip
+from factory.readers.base import BadClip, bytes_of
 
 KEYS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
 MAX_HEADER_BYTES = 1 << 14
-MAX_FILE_BYTES = 1 << 30
 _KINDS = {"F": ("f", (4, 8)), "I": ("i", (1, 2, 4, 8)), "U": ("u", (1, 2, 4, 8))}
 
 
 def read_pcd(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
     """The named fields (N,), N >= 1, in the types they have in the file. Raises BadClip."""
-    file = str(path)
-    try:
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise BadClip(file, "size", f"more than {MAX_FILE_BYTES} bytes")
-        data = path.read_bytes()
-    except OSError as error:
-        raise BadClip(file, "file", f"cannot be read: {error.strerror}") from error
+    file, data = str(path), bytes_of(path)
     header, start = _header(data, file)
     record, n_points = _record(header, file)
     if record.names is None or (missing := [name for name in columns if name not in record.names]):

@@ -17,9 +17,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from factory.readers.base import BadClip
+from factory.readers.base import MAX_FILE_BYTES, BadClip
 
-MAX_FILE_BYTES = 1 << 30
 BUDGET_PER_BYTE = 8
 BUDGET_BASE_BYTES = 1 << 24
 RECORD_BYTES = 512  # what a record is paid for with

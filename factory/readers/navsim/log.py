@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from factory.readers.base import BadClip
+from factory.readers.base import BadClip, bytes_of
 from factory.readers.navsim.values import Values
-from factory.readers.restricted_pickle import MAX_FILE_BYTES, load_plain
+from factory.readers.restricted_pickle import load_plain
 from tasks.world.agents import AgentKind
 from tasks.world.arrays import Array
 
@@ -81,16 +81,6 @@ class LogFrames:
 def read_frames(path: Path) -> LogFrames:
     """The log in this pickle. Raises BadClip, naming frame and key."""
     return frames_of(load_plain(bytes_of(path), str(path)), path)
-
-
-def bytes_of(path: Path) -> bytes:
-    """All of a log's file. Raises BadClip."""
-    try:
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise BadClip(str(path), "size", f"more than {MAX_FILE_BYTES} bytes")
-        return path.read_bytes()
-    except OSError as error:
-        raise BadClip(str(path), "file", f"cannot be read: {error.strerror}") from error
 
 
 def frames_of(value: Any, path: Path) -> LogFrames:

@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from factory.readers.base import SPLITS, BadClip, ClipIndex, ClipRef, split_of
+from factory.readers.base import SPLITS, BadClip, ClipIndex, ClipRef, bytes_of, split_of
 from factory.readers.logs import CACHED_LOGS
 from factory.readers.navsim.filters import Selection, read_selection
-from factory.readers.navsim.log import LogFrames, bytes_of, frames_of
+from factory.readers.navsim.log import LogFrames, frames_of
 from factory.readers.navsim.rig import blobs_of, rig_of
 from factory.readers.navsim.tracks import (
     FRAMES_BEFORE,

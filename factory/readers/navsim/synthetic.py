@@ -12,13 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from factory.readers.base import BadClip
+from factory.readers.base import BadClip, bytes_of
 from factory.readers.navsim.log import (
     LOCATION_OF_ALIAS,
     Frame,
     FrameBoxes,
     boxes_of,
-    bytes_of,
     cameras_of,
     command_of,
     lights_of,

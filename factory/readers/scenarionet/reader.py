@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from factory.readers.base import BadClip, ClipRef
+from factory.readers.base import BadClip, ClipRef, bytes_of
 from factory.readers.logs import STEP_MS, LoggedDrive, LogReader, Recorded, WholeLog, route_of_drive
-from factory.readers.restricted_pickle import MAX_FILE_BYTES, load_plain
+from factory.readers.restricted_pickle import load_plain
 from factory.readers.scenarionet.map import road_map, traffic_lights
 from factory.readers.scenarionet.tracks import (
     SOURCES,
@@ -70,7 +70,7 @@ class ScenarioNetReader(LogReader[ScenarioLog]):
 
     def digest(self, ref: ClipRef) -> str:
         """The clip's content digest, from the bytes of its log's file alone. Raises BadClip."""
-        return hashlib.sha256(_bytes_of(self.path_of(ref))).hexdigest()
+        return hashlib.sha256(bytes_of(self.path_of(ref))).hexdigest()
 
     def recorded(self, log: ScenarioLog, start: int, stop: int) -> Recorded:
         """The ego's poses, the format has no sensors. Raises BadClip where the ego's drive is broken."""
@@ -121,7 +121,7 @@ def _listed(root: Path) -> list[Path]:
 
 def read_scenario(path: Path) -> tuple[dict[str, Any], str]:
     """The scenario dict and the sha256 of its file. Raises BadClip naming the field that is missing."""
-    file, data = str(path), _bytes_of(path)
+    file, data = str(path), bytes_of(path)
     scenario = load_plain(data, file)
     if not isinstance(scenario, dict):
         raise BadClip(file, "scenario", f"holds a {type(scenario).__name__}, not a dict")
@@ -131,16 +131,6 @@ def read_scenario(path: Path) -> tuple[dict[str, Any], str]:
     if not isinstance(scenario.get("length"), int | np.integer):
         raise BadClip(file, "length", "missing or not a number of frames")
     return scenario, hashlib.sha256(data).hexdigest()
-
-
-def _bytes_of(path: Path) -> bytes:
-    """All of a scenario's file. Raises BadClip."""
-    try:
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise BadClip(str(path), "size", f"more than {MAX_FILE_BYTES} bytes")
-        return path.read_bytes()
-    except OSError as error:
-        raise BadClip(str(path), "file", f"cannot be read: {error}") from error
 
 
 def _source(scenario: Mapping[str, Any], file: str) -> tuple[str, Source]:
