@@ -170,13 +170,17 @@ def _add_groups(
             rows[layer].append(row)
 
 
-def stub_rows(origin: Array = ORIGIN) -> dict[str, list[Row]]:
-    """One straight road of two lanes and the connector between them: enough for nuPlan's code to open the city."""
+def stub_rows(origin: Array = ORIGIN, scale: float = 1.0) -> dict[str, list[Row]]:
+    """One straight road of two lanes and the connector between them: enough for nuPlan's code to open the city.
+
+    scale: of its 110 m. Above 1 its lines have a point every 5 m or so, as nuPlan's traffic needs to drive on it.
+    """
     rows: dict[str, list[Row]] = {layer: [] for layer in LAYERS}
     spans = {1: (0.0, 50.0), 2: (60.0, 110.0), 3: (50.0, 60.0)}
-    for k, (x0, x1) in spans.items():
+    for k, (x0, x1) in ((k, (scale * x0, scale * x1)) for k, (x0, x1) in spans.items()):
         box = shapely.box(origin[0] + x0, origin[1] - 2.0, origin[0] + x1, origin[1] + 2.0)
-        line = shapely.LineString(np.array([[x0, 0.0], [x1, 0.0]]) + origin)
+        along = np.linspace(x0, x1, 2 if scale == 1.0 else int((x1 - x0) / 5.0) + 1)
+        line = shapely.LineString(np.column_stack([along, np.zeros(len(along))]) + origin)
         rows["boundaries"].append({"fid": 10 + k, "shape": line})
         owner = {"lane_fid": k if k < 3 else None, "lane_connector_fid": k if k == 3 else None}
         rows["baseline_paths"].append({"fid": 20 + k, "shape": line, **owner})
