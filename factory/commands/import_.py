@@ -74,7 +74,7 @@ def main(request: Request) -> int:
     try:
         store = Store(Location.parse(request.out))
         summary, told = _navhard(request, store) if request.source == "navhard" else _simscale(request, store)
-    except (BadClip, ChangedRun, AnotherWriter, ValueError, OSError, DeltaError) as error:
+    except (BadClip, ChangedRun, AnotherWriter, ValueError, OSError, ImportError, DeltaError) as error:
         raise Refused(one_line(error)) from error
     counts = summary.counts
     print(f"{counts['accepted']:,} samples imported, {summary.executed.found_done:,} were there: {store.location.uri}")
@@ -97,7 +97,10 @@ def _simscale(request: Request, store: "Store") -> tuple["RunSummary", str]:
         "pictures": request.pictures,
         "labels": None if rewards is None else rewards.vocabulary.digest,
     }
-    wanted = Import(_folder(request.maps), request.pictures, rewards)
+    maps = _folder(request.maps)
+    if maps is not None and not maps.is_dir():
+        raise Refused(f"maps={request.maps}: no such folder")
+    wanted = Import(maps, request.pictures, rewards)
     return import_rows(store, identity_of(request.source, settings), wanted.entries(parts)), ""
 
 

@@ -13,7 +13,6 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from factory.imports.roads import road_around
 from factory.imports.scenes import (
     HISTORY_FRAMES,
     SCENE_FRAMES,
@@ -28,7 +27,9 @@ from factory.imports.table import Entry
 from factory.readers.base import BadClip
 from factory.readers.navsim.filters import Selection
 from factory.readers.navsim.log import Frame, LogFrames, read_frames
+from factory.readers.navsim.road import RoadAhead, road_around
 from factory.readers.navsim.synthetic import SyntheticScene, read_scene_pickle
+from factory.readers.navsim.tracks import ego_states
 from factory.stages.benchmark import BENCHMARK_FILE, FORMAT
 from factory.stages.imaging import NO_IMAGES
 from factory.store.cache import SceneFiles
@@ -144,7 +145,7 @@ class GroupReader:
         if at < 0 or first < 0 or first + SCENE_FRAMES > len(log.frames):
             raise BadClip(log.file, f"token {token}", "not here with 1.5 s before and 4 s after it")
         frames = log.frames[first : first + SCENE_FRAMES]
-        road = road_around(self.places.maps, frames, HISTORY_FRAMES - 1, log.file)
+        road = self._road(frames, log.file, at)
         scene = scene_of(frames, road, self._origin(log.file, log.name, group, token))
         seen = self._seen(frames[:HISTORY_FRAMES], self.places.sensors, ImageSource.PHOTO, log.file)
         return scene, {**world_columns(scene, frames[HISTORY_FRAMES - 1].command), **logged_label(scene), **seen}
@@ -155,13 +156,18 @@ class GroupReader:
         if found.token != token:
             raise BadClip(str(path), "scene_metadata.initial_token", f"is {found.token}, the file's name says {token}")
         history = found.frames[:HISTORY_FRAMES]
-        road = road_around(self.places.maps, history, HISTORY_FRAMES - 1, str(path))
+        road = self._road(history, str(path), HISTORY_FRAMES - 1)
         scene = scene_of(found.frames, road, self._origin(str(path), log, group, token), HISTORY_FRAMES)
         blobs = None if self.places.sensors is None else self.places.scenes / "sensor_blobs"
         plan = plan_for(scene, PdmSettings())
         label = label_columns_of(scene, plan.driven[1:, : HEADING + 1])
         seen = self._seen(history, blobs, ImageSource.RENDER, str(path))
         return scene, {**world_columns(scene, history[-1].command), **label, **seen}
+
+    def _road(self, driven: Sequence[Frame], file: str, number: int) -> RoadAhead:
+        """At the fourth of these frames, which has this number in its file."""
+        now = driven[HISTORY_FRAMES - 1]
+        return road_around(self.places.maps, now, ego_states(driven)[:, :2], now.pose, file, number)
 
     def _seen(self, frames: Sequence[Frame], folder: Path | None, source: ImageSource, file: str) -> dict[str, object]:
         return dict(NO_IMAGES) if folder is None else pictures(frames, folder, source, file)

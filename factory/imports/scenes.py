@@ -14,6 +14,7 @@ import numpy as np
 from factory.readers.base import BadClip
 from factory.readers.navsim.log import Frame
 from factory.readers.navsim.rig import blobs_of, rig_of
+from factory.readers.navsim.road import RoadAhead
 from factory.readers.navsim.tracks import (
     FRAMES_BEFORE,
     WINDOW_FRAMES,
@@ -35,15 +36,6 @@ from tasks.world.vehicle import EGO_STATE_SIZE, HEADING
 HISTORY_FRAMES = FRAMES_BEFORE + 1  # now among them
 SCENE_FRAMES = HISTORY_FRAMES + 8  # with the 4 s that are driven
 COARSE_STEPS = 5  # between two frames
-
-
-@dataclass(frozen=True)
-class RoadAhead:
-    """The map around a scene and the way through it."""
-
-    road_map: RoadMap
-    route: Route
-    centerline: Array  # (P, 3) from the lane of the pose at T along the route
 
 
 @dataclass(frozen=True)

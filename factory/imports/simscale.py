@@ -17,7 +17,6 @@ from pathlib import Path
 
 from factory.graph.work import HUMAN_CANDIDATE
 from factory.imports.labels import vocabulary_labels
-from factory.imports.roads import road_around
 from factory.imports.scenes import (
     HISTORY_FRAMES,
     SCENE_FRAMES,
@@ -32,6 +31,8 @@ from factory.imports.table import Entry
 from factory.readers.base import BadClip
 from factory.readers.navsim.log import bytes_of, frames_of
 from factory.readers.navsim.rewards import RewardFile
+from factory.readers.navsim.road import road_around
+from factory.readers.navsim.tracks import ego_states
 from factory.readers.restricted_pickle import load_plain
 from factory.stages.imaging import NO_IMAGES
 from factory.stages.rows import label_columns
@@ -206,7 +207,9 @@ class Import:
             content_digest=sha256(data).hexdigest(),
             frame_tokens=tokens,
         )
-        road = no_road(now) if self.maps is None else road_around(self.maps, frames, at, str(path))
+        road = no_road(now)
+        if self.maps is not None:
+            road = road_around(self.maps, now, ego_states(frames)[:, :2], now.pose, str(path), at)
         scene = scene_of(frames, road, origin)
         seen: dict[str, object] = dict(NO_IMAGES)
         if self.pictures:

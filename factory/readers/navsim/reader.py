@@ -10,7 +10,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from factory.readers.logs import CACHED_LOGS
 from factory.readers.navsim.filters import Selection, read_selection
 from factory.readers.navsim.log import LogFrames, frames_of
 from factory.readers.navsim.rig import blobs_of, rig_of
+from factory.readers.navsim.road import road_around
 from factory.readers.navsim.tracks import (
     FRAMES_BEFORE,
     HORIZON_FRAMES,
@@ -42,7 +43,6 @@ from factory.readers.navsim.windows import (
     usable,
     wanted_windows,
 )
-from factory.readers.nuplan_maps.city import open_city
 from factory.readers.nuplan_maps.geopackage import DOWNLOAD, map_file
 from factory.readers.nuplan_maps.kept import file_digest
 from factory.readers.restricted_pickle import load_plain
@@ -50,15 +50,10 @@ from factory.readers.settings import NavsimClips
 from factory.readers.validate import validate_clip
 from factory.wording import time_text
 from tasks.caches import user_cache
-from tasks.world.arrays import Array
 from tasks.world.camera import Camera, SensorFile
 from tasks.world.clip import NOW, Block, Clip
-from tasks.world.lanes import RoadMap, Route
-from tasks.world.roadblocks import corrected_roadblocks, route_of_roadblocks
-from tasks.world.route import NoRoute, RouteFinder
 
 LICENCE = "CC BY-NC-SA 4.0 (nuPlan via OpenScene)"
-MAP_RADIUS_M = 150.0  # around the window's drive: the reward's 100 m, and room for one that strays
 BLOCK_FRAMES, BLOCK_STRIDE_FRAMES = 40, 20  # of the stretches that are reconstructed
 SPLIT_OF = {  # by how the name of the filter, or of the logs' folder, begins; others: by the hash of the log's id
     "navtrain": "train",
@@ -179,11 +174,7 @@ class NavsimReader:
         if any(frame.boxes is None for frame in window):
             raise BadClip(opened.log.file, f"frames[{start}].anns", "missing: nobody annotated the window")
         states = ego_states(window)
-        road_map, route = self._road(opened.log, now, states[:, :2], states[NOW, :3])
-        try:
-            centerline = RouteFinder(road_map, route).centerline_from(states[NOW, :3])
-        except NoRoute as error:
-            raise BadClip(opened.log.file, f"frames[{now}].roadblock_ids", str(error)) from error
+        road = road_around(self.maps, frames[now], states[:, :2], states[NOW, :3], opened.log.file, now)
         images: tuple[SensorFile, ...] = ()
         sweeps: tuple[SensorFile, ...] = ()
         cameras: tuple[Camera, ...] = ()
@@ -205,10 +196,10 @@ class NavsimReader:
             ego_states=states,
             world_from_ego=world_from_ego(window),
             agents=window_agents(window),
-            road_map=road_map,
-            route=route,
-            centerline=centerline,
-            lights=lights(window, tuple(road_map.lanes)),
+            road_map=road.road_map,
+            route=road.route,
+            centerline=road.centerline,
+            lights=lights(window, tuple(road.road_map.lanes)),
             cameras=cameras,
             images=images,
             sweeps=sweeps,
@@ -305,25 +296,6 @@ class NavsimReader:
             opened = OpenLog(log, table, _digest(data, map_file(self.maps, table.location)))
             self._logs = dict([*self._logs.items(), (ref.log_id, opened)][-CACHED_LOGS:])
         return self._logs[ref.log_id]
-
-    def _road(self, log: LogFrames, now: int, along_xy: Array, pose: Array) -> tuple[RoadMap, Route]:
-        """The map around the window's drive and along its route, and the route at frame `now`. Raises BadClip.
-
-        Lights count on the lanes of the log's own roadblocks, before the route is mended: the public metric cache
-        gathers the one and the other so (metric_cache_processor.py, `_load_route_dicts` and `_build_pdm_observation`).
-        """
-        frame = log.frames[now]
-        city = open_city(self.maps, frame.map_location)
-        blocks = city.roadblocks
-        try:
-            passed = corrected_roadblocks(blocks, frame.roadblock_ids, pose)
-            own = [block for block in frame.roadblock_ids if block in blocks.lanes_of]
-            lit = frozenset(lane_id for block in own for lane_id in blocks.lanes_of[block])
-            along = [lane_id for block in passed for lane_id in blocks.lanes_of.get(block, ())]
-            road_map = city.road_map(along_xy, MAP_RADIUS_M, along)
-            return road_map, replace(route_of_roadblocks(road_map, frame.roadblock_ids, pose, blocks), lit_lane_ids=lit)
-        except NoRoute as error:
-            raise BadClip(log.file, f"frames[{now}].roadblock_ids", str(error)) from error
 
     def _block(self, opened: OpenLog, start: int) -> Block:
         """Up to 20 s that begin at a multiple of 10 s of the stretch and hold the window."""

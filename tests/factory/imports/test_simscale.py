@@ -18,10 +18,13 @@ from factory.views.board.watch import Watch
 from planners.data.batch import BevLayout
 from planners.data.bev import BevClass, bev_raster
 from tasks.world.frames import to_local, to_world
+from tasks.world.lanes import LightState
 from tests.factory.imports import simscale_writer as simscale
+from tests.factory.readers.geopackage_writer import CITIES, ORIGIN, stub_rows, write_geopackage
 
 PDM, RECOVERY = "synthetic_reaction_pdm_v1.0-0", "synthetic_reaction_recovery_v1.0-2"
 HUMAN = "navtrain_human"  # of our own export
+CITY = "us-nv-las-vegas-strip"  # of the writer's logs
 
 
 def imported(root: Path, out: Path, *words: str) -> int:
@@ -107,6 +110,52 @@ def test_pictures_are_the_files_bytes_with_their_cameras(released: Path, tmp_pat
         np.testing.assert_array_equal(camera["distortion"], simscale.DISTORTION)
         np.testing.assert_array_equal(camera["ego_from_camera"].reshape(4, 4)[:3, :3], given["sensor2lidar_rotation"])
         assert (camera["width"], camera["height"]) == simscale.SIZE
+
+
+def on_the_road(seed: int, **changed: Any) -> list[dict[str, Any]]:
+    """A log along the one road of a small city, lanes 1 and 2 and between them connector 3, red for six frames."""
+    log = simscale.frames(seed, 0)
+    for i, frame in enumerate(log):
+        frame["ego2global_translation"] = np.append(ORIGIN + np.array([10.0 + 4.0 * i, 0.5]), 608.1)
+        frame["ego2global_rotation"] = np.array([1.0, 0.0, 0.0, 0.0])
+        frame |= {"roadblock_ids": ["31", "33", "32"], "traffic_lights": [(3, i < 6)]} | changed
+    return log
+
+
+@pytest.fixture
+def city(tmp_path: Path) -> Path:
+    """nuPlan's maps with the city of the logs alone."""
+    version, zone = CITIES[CITY]
+    write_geopackage(tmp_path / "maps" / CITY / version / "map.gpkg", stub_rows(), zone)
+    return tmp_path / "maps"
+
+
+@pytest.mark.slow
+def test_with_maps_a_row_has_the_lanes_the_route_and_the_lights_around_it(city: Path, tmp_path: Path) -> None:
+    root, out = tmp_path / "SimScale_data", tmp_path / "out"
+    simscale.write_log(root, PDM, 1, 0, on_the_road(1))
+    strayed = simscale.write_log(root, PDM, 2, 0, on_the_road(2, roadblock_ids=["77"]))
+    elsewhere = simscale.write_log(root, PDM, 3, 0, on_the_road(3, map_location="us-ma-boston"))
+    assert imported(root, out, f"maps={city}") == COMPLETE_WITH_FAILURES
+    (row,) = SampleTable(out)
+    assert sorted(row["lane_ids"]) == ["1", "2", "3"] and row["map_location"] == CITY
+    polygons = dict(zip(row["lane_ids"], row["lane_polygons"]))
+    ahead = {"1": (0.0, 50.0), "3": (50.0, 60.0), "2": (60.0, 110.0)}  # along the road, of which now is at 22 m, 0.5 m
+    for lane_id, (begin, end) in ahead.items():
+        ring = np.asarray(polygons[lane_id])
+        corners = [[begin - 22.0, -2.5], [end - 22.0, 1.5]]
+        np.testing.assert_allclose([ring.min(axis=0), ring.max(axis=0)], corners, atol=1e-3)
+    assert row["route_roadblock_ids"] == ["31", "33", "32"] and sorted(row["route_lane_ids"]) == ["1", "2", "3"]
+    line = np.asarray(row["route_centerline"])
+    np.testing.assert_allclose(line[:, 1], -0.5, atol=1e-3)
+    assert line[-1, 0] == pytest.approx(110.0 - 22.0, abs=1e-3)
+    assert row["light_lane_ids"] == ["3"]
+    red = np.asarray(row["light_states"])[0, ::5] == LightState.RED
+    np.testing.assert_array_equal(red, np.arange(12) < 6)
+    failed = {one["error"].partition(": ")[0]: one["error"] for one in Store(out).outcomes.read().to_pylist()}
+    assert len(failed) == 2 and "frames[3].roadblock_ids" in failed[str(strayed)], "off its route, said where"
+    (lacking,) = (said for path, said in failed.items() if path != str(strayed))
+    assert "us-ma-boston" in lacking and elsewhere.exists()
 
 
 def test_what_reads_samples_reads_them(released: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -289,6 +338,7 @@ def test_a_pickle_with_code_runs_none_of_it(released: Path, tmp_path: Path) -> N
         (["rewards=x"], "go together"),
         (["only=synthetic_reaction_pdm_v1.0-4"], "only=synthetic_reaction_pdm_v1.0-4: not under"),
         (["rewards=.", "vocabulary=none.npy"], "none.npy"),
+        (["maps=nowhere"], "maps=nowhere: no such folder"),
     ],
 )
 def test_what_cannot_be_is_refused(
