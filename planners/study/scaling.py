@@ -2,6 +2,7 @@
 
     python -m planners scaling data.real=[runs/town] data.sim=[runs/town] benchmark=runs/hard \
         planners=[ltf_small,diffusiondrive_small] experts=[recovery,pdm_closed] seeds=2
+    ... "+train={all: ['workers=1'], gtrs_dense: ['planner.settings.vocabulary=<file>']}"      settings of the trainings
 
 Trains one planner for every combination of the axes (planners, experts, rounds, sim_ratios, imitation, real_shares)
 and seed, evaluates all on one benchmark, holds each against real samples alone, and fits S(N) = a log^2 N + b log N + c
@@ -27,25 +28,25 @@ EVERYONE = "all"
 class SweepData:
     """Tables."""
 
-    real: tuple[str, ...]
-    sim: tuple[str, ...]
-    val: tuple[str, ...] = ()
+    real: tuple[str, ...]  # of the factory
+    sim: tuple[str, ...]  # with at least as many rounds as are asked for
+    val: tuple[str, ...] = ()  # for each training's validation curve
 
 
 @dataclass(frozen=True, kw_only=True)
 class ScalingSettings(SweepSettings):
-    """The keys of conf/scaling.yaml."""
+    """The command's keys."""
 
     data: SweepData
-    planners: tuple[str, ...]
-    experts: tuple[str, ...]
-    rounds: tuple[int, ...]
-    sim_ratios: tuple[float | Literal["natural"], ...]
-    imitation: tuple[Imitation, ...]
-    real_shares: tuple[float, ...]
-    seeds: int
-    steps: int | None = None
-    train: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    planners: tuple[str, ...] = ("ltf",)  # names of conf/planner
+    experts: tuple[str, ...] = ("pdm_closed",)  # one curve each; all: samples of every expert together
+    rounds: tuple[int, ...] = (0, 1, 2, 3, 4, 5)  # simulated rounds trained on; 0: real samples alone
+    sim_ratios: tuple[float | Literal["natural"], ...] = ("natural",)
+    imitation: tuple[Imitation, ...] = ("all",)  # real: rewards only on simulated samples
+    real_shares: tuple[float, ...] = (1.0,)
+    seeds: int = 1
+    steps: int | None = None  # optimiser steps of every training; null: the planner's epochs of what it is trained on
+    train: dict[str, tuple[str, ...]] = field(default_factory=dict)  # planner, or all -> overrides of `planners train`
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -96,4 +97,4 @@ def scale(words: Sequence[str]) -> None:
     run(s, everything, everything, comparisons_of(s))
 
 
-main = command(scale)
+main = command(scale, ScalingSettings)

@@ -38,21 +38,21 @@ PARTS = ("main", "rounds", "traffic", "ratio", "psnr", "rewards", "real_share", 
 class StudySettings(SweepSettings):
     """The keys of conf/study.yaml."""
 
-    data: str
-    replay: str
-    control: str
-    begin: str | None
+    data: str  # the training clips' run: real, recovery and pdm_closed samples
+    replay: str  # the same clips with traffic=replay, pdm_closed
+    control: str  # their perturbed states with the log's own future, whatever its reward
+    begin: str | None  # human samples of other towns: every planner is trained on them first, and goes on; null: none
     begin_epochs: int
-    val: str
-    planners: dict[str, str]
-    vocabulary: str
+    val: str  # the held-out clips' human rows, for learning curves
+    planners: dict[str, str]  # of conf/planner
+    vocabulary: str  # .npy that the samples are labelled with
     rounds: int
-    seeds: int
-    curve_seeds: int
-    epochs: int
+    seeds: int  # of the main table
+    curve_seeds: int  # of everything else
+    epochs: int  # passes over a planner's own data; in equal steps those over all real and pdm_closed samples
     batch_size: int
-    psnr_db: float
-    parts: tuple[str, ...]
+    psnr_db: float  # the paper's bound
+    parts: tuple[str, ...]  # which comparisons
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -215,10 +215,12 @@ def sizes_of(settings: StudySettings) -> Sizes:
     return Sizes(steps, min(len(low), len(high)))
 
 
-@command
-def main(argv: Sequence[str]) -> None:
-    """The command."""
+def study(argv: Sequence[str]) -> None:
+    """Train, score and report what settings ask for. Raises ConfigError, Stopped, Failed."""
     settings = fill(StudySettings, compose("study", argv, StudySettings), "study")
     sizes, whole = sizes_of(settings), with_all_parts(settings)
     wanted = comparisons(whole)
     run(settings, planned(comparisons(settings), settings, sizes), planned(wanted, whole, sizes), wanted)
+
+
+main = command(study, StudySettings)

@@ -34,13 +34,13 @@ EVALUATED_TOGETHER = 24  # planners in one process at the most
 
 @dataclass(frozen=True, kw_only=True)
 class SweepSettings(Means):
-    """The keys that conf/study.yaml and conf/scaling.yaml share."""
+    """The keys that study and scaling share."""
 
-    benchmark: str
-    out: str
-    report: str | None = None  # None: out
-    human_filter: HumanFilter = PAPER
-    evaluate: tuple[str, ...] = ()
+    benchmark: str  # the folder that factory.run preset=hard_benchmark made of held-out clips
+    out: str  # the same command on the same folder goes on
+    report: str | None = None  # folder of the tables and pictures; null: out
+    human_filter: HumanFilter = PAPER  # of tables.md and the pictures, the paper's or today's; CSVs hold both
+    evaluate: tuple[str, ...] = ()  # further overrides of `planners evaluate`
 
 
 def run(

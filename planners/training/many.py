@@ -47,8 +47,8 @@ class Means:
     """How a sweep runs."""
 
     executor: Literal["process", "ray"] = "process"
-    jobs: int | None = None  # at a time; None: one a core
-    minutes: float | None = None  # after which nothing new begins, and what runs is saved and stopped
+    jobs: int | None = None  # trainings at a time; null: one a core
+    minutes: float | None = None  # after which nothing new begins and what runs is saved; the same command goes on
     gpus: float = 0.0  # of each training on Ray
     cpus: float = 1.0
     began: ClassVar[float]  # what the minutes are counted from; of each, but no setting

@@ -6,6 +6,7 @@ import pytest
 
 from factory.exits import BAD_CONFIG, COMPLETE_WITH_FAILURES, INTERRUPTED
 from planners.command import Failed, Stopped, command
+from planners.study.scaling import main as scaling
 
 
 @pytest.mark.parametrize(
@@ -44,3 +45,15 @@ def test_help_answers_without_running(capsys: pytest.CaptureFixture[str]) -> Non
 
     assert main(["--help", "x=1"]) == 0
     assert capsys.readouterr().out.startswith("What all commands do alike")
+
+
+def test_help_tells_every_key_with_its_value_and_its_meaning(capsys: pytest.CaptureFixture[str]) -> None:
+    """Of the file of choices, of the dataclass, and of the dataclass that it builds on."""
+    assert scaling(["--help"]) == 0
+    told = capsys.readouterr().out
+    for line in (
+        "out: runs/scaling  # the same command on the same folder goes on",
+        "rounds: [0, 1, 2, 3, 4, 5]  # simulated rounds trained on; 0: real samples alone",
+        "executor: process  # process | ray",
+    ):
+        assert f"\n{line}\n" in told
