@@ -104,14 +104,16 @@ class _Batch:
     def __init__(self, store: Store) -> None:
         self._store = store
         self._rows: dict[tuple[int, str], list[pa.Table]] = defaultdict(list)
+        self._bytes: dict[tuple[int, str], int] = defaultdict(int)  # of them; Arrow counts anew whenever it is asked
         self._failed: list[Outcome] = []
         self._licences: set[str] = set()
 
     def add(self, rows: pa.Table, partition: tuple[int, str], licence: str) -> None:
         """Commits where the partition is large enough for a file."""
         self._rows[partition].append(rows)
+        self._bytes[partition] += rows.nbytes
         self._licences.add(licence)
-        if sum(table.nbytes for table in self._rows[partition]) >= SHARD_BYTES:
+        if self._bytes[partition] >= SHARD_BYTES:
             self.commit()
 
     def fail(self, outcome: Outcome) -> None:
@@ -125,6 +127,7 @@ class _Batch:
         ]
         self._store.commit([], shards, self._failed, licences=self._licences)
         self._rows.clear()
+        self._bytes.clear()
         self._failed, self._licences = [], set()
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from factory.__main__ import main as factory
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES
+from factory.imports import table
 from factory.store.reader import SampleTable, labels_of
 from factory.store.samples import Store
 from factory.store.verify import verify
@@ -318,6 +319,18 @@ def test_what_failed_is_tried_again_by_the_import_and_every_place_says_so(
     assert again in told.err and "retry_failed" not in told.err + told.out and "factory retry" not in told.out
     (shown,) = failures(Watch(Store(out)).now())["items"]
     assert again in shown["retry"] and shown["error"].startswith(str(path))
+
+
+def test_files_are_cut_by_the_bytes_of_the_rows_since_the_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    root, out = tmp_path / "SimScale_data", tmp_path / "out"
+    for seed in range(5):
+        simscale.write_log(root, PDM, seed, 0)
+    assert imported(root, tmp_path / "whole") == COMPLETE
+    whole = Store(tmp_path / "whole").samples
+    assert [len(rows) for _, rows in whole.files(["attempt_id"])] == [5]
+    monkeypatch.setattr(table, "SHARD_BYTES", int(1.5 * whole.read().nbytes / 5))
+    assert imported(root, out) == COMPLETE
+    assert sorted(len(rows) for _, rows in Store(out).samples.files(["attempt_id"])) == [1, 2, 2]
 
 
 def test_a_pickle_with_code_runs_none_of_it(released: Path, tmp_path: Path) -> None:
