@@ -1,14 +1,19 @@
 """Samples of the hand-made street with pictures of eight cameras, whose colours say camera and instant."""
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from factory.exports.navsim.export import ExportSummary, export
+from factory.exports.navsim.settings import ExportSettings
 from factory.readers.settings import MOUNTS
 from factory.stages.rows import sample_row
+from factory.store.samples import Store
 from tasks.attempt import drive_and_judge, human_sample, perturbed_scene
 from tasks.experts.human import Human
 from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings
@@ -74,3 +79,14 @@ def exported(number: int, expert: str, round_: int = 0, **columns: Any) -> Mappi
     human, simulated = driven()
     row = sample(number, expert, round_) | (human if expert == "human" else simulated) | pictures()
     return row | labels(number, K) | {"split": "train"} | columns
+
+
+def quiet(run: Path, to: Path, settings: ExportSettings = ExportSettings(), **more: Any) -> ExportSummary:  # noqa: B008
+    """The export of a run in this process, without a word."""
+    return export(Store(run).samples, to, settings, say=lambda line: None, **more)
+
+
+def tree(folder: Path) -> dict[str, str]:
+    """Path -> SHA-256 of every file."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
