@@ -41,6 +41,7 @@ class Written:
     has_route: bool  # else the public loader leaves it out
     image_source: str
     sizes: tuple[str, ...]  # of the pictures as written
+    distorted: bool  # these are as a lens makes them
     absent_pictures: int  # of the history's 32
     left_out_cameras: tuple[str, ...]
     files: tuple[File, ...]  # the pickle last

@@ -37,6 +37,7 @@ class RowPictures:
     absent: int  # of the history's 8 x 4
     left_out: tuple[str, ...]  # cameras of the rig that stand for none of the eight
     sizes: tuple[str, ...]  # width x height [px], as written
+    distorted: bool  # as a lens makes them; else of pinholes
 
 
 def shown(row: Mapping[str, Any], names: SampleNames, settings: ExportSettings) -> RowPictures:
@@ -68,7 +69,8 @@ def shown(row: Mapping[str, Any], names: SampleNames, settings: ExportSettings) 
             cams[i][name] = _entry(path, calibration)
     left_out = tuple(sorted({camera.name for camera in rig} - {camera.name for camera in chosen.values()}))
     sizes = tuple(sorted({f"{width}x{height}" for width, height in written.values()}))
-    return RowPictures(tuple(pictures), tuple(cams), len(absent), left_out, sizes)
+    distorted = any(camera.distortion.any() for camera in chosen.values())
+    return RowPictures(tuple(pictures), tuple(cams), len(absent), left_out, sizes, distorted)
 
 
 @cache

@@ -102,7 +102,7 @@ def test_the_manifest_names_every_other_file_with_its_checksum(openscene: tuple[
     assert {file["path"]: file["sha256"] for file in files} == there
     assert sum(file["bytes"] for file in files) == summary.n_bytes == sum((to / path).stat().st_size for path in there)
     assert header["logs"] == {"navtrain_human": 1} | {f"synthetic_reaction_{split}": 1 for split in SPLITS}
-    assert header["picture_sizes"] == ["32x18"] and header["distortion"].startswith("none")
+    assert header["picture_sizes"] == ["32x18"] and header["distorted_logs"] == 0
 
 
 def test_what_is_there_is_not_written_again(openscene: tuple[Path, ExportSummary], street_run: Path) -> None:
@@ -175,6 +175,18 @@ def test_pictures_of_another_size_are_told_of_and_resized_on_demand(tmp_path: Pa
         assert cv2.imread(str(picture)).shape == ((1080, 1920, 3) if resize else (18, 32, 3))
     scale = np.diag([1920 / SIZE[0], 1080 / SIZE[1], 1.0])
     np.testing.assert_allclose(found[True]["cam_intrinsic"], scale @ found[False]["cam_intrinsic"])
+
+
+def test_a_lens_keeps_its_terms_and_its_logs_are_counted(tmp_path: Path) -> None:
+    """Rows that were imported from SimScale's release have the pictures and the rig of NAVSIM's logs."""
+    lens, columns = [-0.356, 0.172, -0.002, 0.0, -0.052], pictures()
+    columns["cameras"] = [camera | {"distortion": np.array(lens)} for camera in columns["cameras"]]
+    write_table(tmp_path / "run", [exported(0, "human"), exported(1, "pdm_closed", 0, **columns)])
+    quiet(tmp_path / "run", tmp_path / "to")
+    (log,) = (tmp_path / "to").glob("navsim_logs/synthetic_reaction_pdm_*/*.pkl")
+    assert list(pickle.loads(log.read_bytes())[3]["cams"]["CAM_F0"]["distortion"]) == lens
+    header = json.loads((tmp_path / "to" / "manifest.jsonl").read_text().splitlines()[0])
+    assert header["distorted_logs"] == 1
 
 
 @pytest.mark.parametrize(
