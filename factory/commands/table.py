@@ -55,6 +55,8 @@ COMMANDS: Mapping[str, Command] = {
 # What is built on the factory: names alone, as nothing here imports it. `python -m planners` is their door.
 PLANNERS: Mapping[str, Command] = {
     "train": Command("fit a planner to logged and simulated samples", "planners.training.train"),
+    "import": Command("a released checkpoint of the public code as ours", "planners.published.import_planner"),
+    "parity": Command("our planners against the public code, number by number", "planners.published.parity"),
     "evaluate": Command("EPDMS of planners on held-out clips", "planners.evaluation.evaluate"),
     "compare": Command("how two planners differ, with intervals", "planners.evaluation.compare"),
     "scaling": Command("how scores grow with simulated data, by which law", "planners.study.scaling"),

@@ -29,13 +29,18 @@ class ImageLayout:
 
 @dataclass(frozen=True)
 class BevLayout:
-    """A raster from above in the ego frame: row 0 is farthest ahead, column 0 farthest left; one class a cell."""
+    """A raster from above in the ego frame: row 0 is farthest ahead, column 0 farthest left; one class a cell.
+
+    `first="near_right"` turns it by half a turn, as the public code's targets lie: row 0 is nearest, column 0 farthest
+    right.
+    """
 
     ahead_m: float = 32.0
     behind_m: float = 0.0
     side_m: float = 32.0  # to either side
     cell_m: float = 0.25
     times_s: tuple[float, ...] = (0.0,)  # one raster each, with the agents as they were then; now or before
+    first: Literal["far_left", "near_right"] = "far_left"  # the cell that comes first
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -75,7 +75,7 @@ def bev_raster(sample: Mapping[str, Any], layout: BevLayout) -> Bytes:
         there = there[np.argsort(classes[there], kind="stable")]
         for box, what in zip(_cells(box_corners(boxes[there, step]), layout), classes[there]):
             cv2.fillConvexPoly(raster, box, int(what), cv2.LINE_8, _SHIFT)
-    return rasters
+    return np.ascontiguousarray(rasters[:, ::-1, ::-1]) if layout.first == "near_right" else rasters
 
 
 def nearest_agents(sample: Mapping[str, Any], layout: BevLayout, n: int) -> tuple[F32, Bools]:

@@ -9,15 +9,18 @@ from torch import Tensor, nn
 
 
 class Attention(nn.Module):
-    """Queries (B, Q, width) over values (B, N, width); dropout on what is attended to, in training."""
+    """Queries (B, Q, width) over values (B, N, width); dropout on what is attended to, in training.
 
-    def __init__(self, width: int, heads: int, dropout: float = 0.0) -> None:
+    `bias`: whether its four linear maps have one.
+    """
+
+    def __init__(self, width: int, heads: int, dropout: float = 0.0, bias: bool = True) -> None:
         super().__init__()
         if width % heads:
             raise ValueError(f"width {width} is not divisible by heads {heads}")
         self.heads, self.dropout = heads, dropout
-        self.query, self.key = nn.Linear(width, width), nn.Linear(width, width)
-        self.value, self.out = nn.Linear(width, width), nn.Linear(width, width)
+        self.query, self.key = nn.Linear(width, width, bias), nn.Linear(width, width, bias)
+        self.value, self.out = nn.Linear(width, width, bias), nn.Linear(width, width, bias)
         for projection in (self.query, self.key, self.value):
             nn.init.xavier_uniform_(projection.weight)
 
@@ -35,11 +38,16 @@ class Attention(nn.Module):
 
 
 class Layer(nn.Module):
-    """Self-attention, attention to a memory where `crosses`, feed-forward; each added and normalised."""
+    """Self-attention, attention to a memory where `crosses`, feed-forward; each added and normalised.
 
-    def __init__(self, width: int, heads: int, feedforward: int, crosses: bool, dropout: float = 0.0) -> None:
+    `bias`: whether the linear maps of self-attention have one.
+    """
+
+    def __init__(
+        self, width: int, heads: int, feedforward: int, crosses: bool, dropout: float = 0.0, bias: bool = True
+    ) -> None:
         super().__init__()
-        self.own = Attention(width, heads, dropout)
+        self.own = Attention(width, heads, dropout, bias)
         self.own_norm = nn.LayerNorm(width)
         self.cross = Attention(width, heads, dropout) if crosses else None
         self.cross_norm = nn.LayerNorm(width) if crosses else None

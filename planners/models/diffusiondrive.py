@@ -11,8 +11,9 @@ plans may be offsets from the anchors (`offsets_from`) instead of the noisy poin
 to labels, it says nothing about the label, and all that offsets from noisy points do with it is take it out again:
 that a wide network learns in 100 epochs, a narrow one does not in 30. And a point reads the cell of the raster from
 above that it lies in (`BevLayout`); the public code reads a raster supervised for 0 .. 32 m ahead as if it reached from
--32 to 32 m. As there, the feed-forward has no shortcut, every layer starts from the same feature of the noisy plan, and
-a layer's plans lie where the layer before put them.
+-32 to 32 m (`points_on="centred"`), and the slowest wave of its noise step is the last of a closed range
+(`step_waves="closed"`). As there, the feed-forward has no shortcut, every layer starts from the same feature of
+the noisy plan, and a layer's plans lie where the layer before put them.
 """
 
 import math
@@ -66,10 +67,14 @@ POINT_FEATURES = 64  # of a point: sines and cosines of its two coordinates
 RARE = 0.01  # confidence that the classifiers start from
 
 
-def waves(x: Tensor, count: int, per_unit: float = 1.0) -> Tensor:
-    """`count` sines and cosines of (...,), their frequencies from per_unit to 1e-4 per_unit rad: (..., count)."""
+def waves(x: Tensor, count: int, per_unit: float = 1.0, closed: bool = False) -> Tensor:
+    """`count` sines and cosines of (...,), their frequencies from per_unit to 1e-4 per_unit rad: (..., count).
+
+    The last frequency is that of the end where the range is `closed`, else one step before it.
+    """
     half = count // 2
-    rates = per_unit * 10000.0 ** (-torch.arange(half, device=x.device, dtype=torch.float32) / half)
+    steps = half - 1 if closed else half
+    rates = per_unit * 10000.0 ** (-torch.arange(half, device=x.device, dtype=torch.float32) / steps)
     angles = x[..., None].float() * rates
     return torch.cat([angles.sin(), angles.cos()], dim=-1)
 
@@ -86,9 +91,9 @@ def mlp(*widths: int, normalise: bool = False) -> nn.Sequential:
 class AlongTrajectory(nn.Module):
     """Attention to a map from above at a plan's own points; the plan's feature says how much each point counts."""
 
-    def __init__(self, width: int, dropout: float, layout: BevLayout) -> None:
+    def __init__(self, width: int, dropout: float, layout: BevLayout, points_on: "PointsOn") -> None:
         super().__init__()
-        self.layout = layout
+        self.layout, self.points_on = layout, points_on
         self.weights = nn.Linear(width, WAYPOINTS)
         self.value = nn.Sequential(nn.Conv2d(width, width, 3, padding=1), nn.ReLU())
         self.out = nn.Linear(width, width)
@@ -100,25 +105,30 @@ class AlongTrajectory(nn.Module):
 
     def forward(self, feature: Tensor, points: Tensor, above: Tensor) -> Tensor:
         """Features (B, A, width), points (B, A, 8, 2) in m, map (B, width, rows, columns); outside of it is zero."""
-        grid = on_map(points, self.layout)
+        grid = on_map(points, self.layout, self.points_on)
         seen = F.grid_sample(self.value(above).float(), grid, align_corners=False)  # (B, width, A, 8)
         seen = torch.einsum("bcap,bap->bac", seen, self.weights(feature).float().softmax(dim=-1))
         return feature + self.drop(self.out(seen))
 
 
-def on_map(points: Tensor, layout: BevLayout) -> Tensor:
+PointsOn = Literal["cell", "centred"]  # the raster's own cells; as if it reached behind as far as ahead
+
+
+def on_map(points: Tensor, layout: BevLayout, points_on: PointsOn = "cell") -> Tensor:
     """Points (..., 2), x ahead and y left in m, as column and row in -1 .. 1 over a raster from above."""
     x, y = points.float().unbind(dim=-1)
-    reach = layout.ahead_m + layout.behind_m
-    return torch.stack([-y / layout.side_m, 2.0 * (layout.ahead_m - x) / reach - 1.0], dim=-1)
+    reach = layout.ahead_m + (layout.ahead_m if points_on == "centred" else layout.behind_m)
+    places = torch.stack([-y / layout.side_m, 2.0 * (layout.ahead_m - x) / reach - 1.0], dim=-1)
+    return -places if layout.first == "near_right" else places
 
 
 class DiffusionLayer(nn.Module):
     """One refinement: the map under the plan, agents, ego, feed-forward, scaled and shifted by the noise step."""
 
-    def __init__(self, width: int, heads: int, hidden: int, dropout: float, layout: BevLayout) -> None:
+    def __init__(self, settings: "DiffusionDriveSettings") -> None:
         super().__init__()
-        self.along = AlongTrajectory(width, dropout, layout)
+        width, heads, hidden, dropout = settings.width, settings.heads, settings.hidden, settings.dropout
+        self.along = AlongTrajectory(width, dropout, settings.bev, settings.points_on)
         self.agents, self.ego = Attention(width, heads), Attention(width, heads)
         self.agents_norm, self.ego_norm, self.norm = (nn.LayerNorm(width) for _ in range(3))
         self.feedforward = mlp(width, hidden, width)
@@ -151,14 +161,14 @@ class DiffusionLayer(nn.Module):
 class DiffusionDecoder(nn.Module):
     """Noisy positions of every anchor to plans, in a cascade of layers."""
 
-    def __init__(self, width: int, heads: int, hidden: int, layers: int, dropout: float, layout: BevLayout) -> None:
+    def __init__(self, settings: "DiffusionDriveSettings") -> None:
         super().__init__()
-        self.width = width
+        self.width, self.closed = (width := settings.width), settings.step_waves == "closed"
         self.feature = nn.Sequential(
             nn.Linear(WAYPOINTS * POINT_FEATURES, width), nn.ReLU(), nn.LayerNorm(width), nn.Linear(width, width)
         )
         self.step = nn.Sequential(nn.Linear(width, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
-        self.layers = nn.ModuleList(DiffusionLayer(width, heads, hidden, dropout, layout) for _ in range(layers))
+        self.layers = nn.ModuleList(DiffusionLayer(settings) for _ in range(settings.refinements))
 
     def forward(
         self, points: Tensor, base: Tensor, step: Tensor, above: Tensor, agents: Tensor, ego: Tensor
@@ -168,7 +178,7 @@ class DiffusionDecoder(nn.Module):
         The first layer's plans are offsets from `base`, which is the points themselves or what the noise was added to.
         """
         feature = self.feature(waves(points, POINT_FEATURES // 2, 2.0 * math.pi).flatten(2))
-        noise = self.step(waves(step, self.width))
+        noise = self.step(waves(step, self.width, closed=self.closed))
         results = []
         for layer in self.layers:
             plans, logits = layer(feature, points, base, above, agents, ego, noise)
@@ -221,6 +231,8 @@ class DiffusionDriveSettings:
     refinements: int = 2  # layers of the cascade
     dropout: float = 0.1  # in the cascade
     offsets_from: Literal["noisy", "anchors"] = "noisy"  # what the first refinement's plans are told from
+    points_on: PointsOn = "cell"  # where on the map from above a plan's points look
+    step_waves: Literal["half_open", "closed"] = "half_open"  # frequencies of the noise step, see `waves`
     agents: int = 30
     trajectory_weight: float = 12.0  # of all refinements together
     confidence_weight: float = 10.0  # within it
@@ -283,9 +295,7 @@ class DiffusionDrive(Planner):
         self.register_buffer("first_noise", torch.randn(anchors.shape, generator=fixed), persistent=False)
         self.register_buffer("kept", kept(), persistent=False)
         self.encoder = SceneEncoder(settings)
-        self.decoder = DiffusionDecoder(
-            settings.width, settings.heads, settings.hidden, settings.refinements, settings.dropout, settings.bev
-        )
+        self.decoder = DiffusionDecoder(settings)
         reach_m = max(settings.bev.ahead_m, settings.bev.side_m)
         self.agent_head = AgentHead(settings.width, settings.hidden, reach_m)
         self.bev_head = BevHead(settings.fusion.bev_channels, settings.bev.shape)
@@ -310,7 +320,7 @@ class DiffusionDrive(Planner):
 
         Raises ValueError where the batch lacks its picture, view from above or agents.
         """
-        s, scene = self.settings, self._scene(batch)
+        s, scene = self.settings, self.scene(batch)
         anchors = self.get_buffer("anchors")
         step = torch.randint(0, TRUNCATED, (len(batch),), device=anchors.device)
         noise = torch.randn((len(batch), *anchors.shape), device=anchors.device)
@@ -331,9 +341,10 @@ class DiffusionDrive(Planner):
 
     def plan(self, batch: Batch) -> Tensor:
         with evaluating(self):
-            return self._denoised(self._scene(batch))
+            return self.denoised(self.scene(batch))
 
-    def _scene(self, batch: Batch) -> EncodedScene:
+    def scene(self, batch: Batch) -> EncodedScene:
+        """What plans are decoded from. Raises ValueError for a batch without pictures."""
         if batch.image is None:
             raise ValueError("diffusiondrive: a batch without images")
         return self.encoder(batch.image, batch.status)
@@ -344,7 +355,8 @@ class DiffusionDrive(Planner):
         base = points if self.settings.offsets_from == "noisy" else self.get_buffer("anchors").expand_as(points)
         return self.decoder(points, base, step, scene.above, scene.agents, scene.ego)
 
-    def _denoised(self, scene: EncodedScene) -> Tensor:
+    def denoised(self, scene: EncodedScene) -> Tensor:
+        """Plans (B, 8, 3) from the noise that stays the same."""
         n, levels = len(scene.ego), self.get_buffer("kept")
         start = noised(to_unit(self.get_buffer("anchors")), self.get_buffer("first_noise"), levels[NOISED_TO])
         at = start.expand(n, -1, -1, -1)

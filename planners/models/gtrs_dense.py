@@ -5,8 +5,9 @@ trajectory would score if it were driven, another how near it is to the label. A
 vocabulary. Constants without another source are those of NVlabs/GTRS and OpenDriveLab/SimScale (04cda10),
 navsim/agents/gtrs_dense: hydra_config.py, hydra_model.py, gtrs_agent.py, with SimScale's gtrs_dense_vov.yaml.
 
-Different here: there is a head for history comfort as well (weight 1.0 in the published settings, which have no such
-head), noise on the velocity is drawn for each sample instead of once for a batch, and pictures are shifted. The
+Different here, unless settings say otherwise (conf/planner/gtrs_dense_public.yaml): there is a head for history comfort
+as well (weight 1.0 in the published settings, which have no such head), noise on the velocity is drawn for each sample
+instead of once for a batch, the trajectories' attention to each other has biases, and pictures are shifted. The
 supplement says that inputs get "random spatial shifts"; neither code base shifts the pictures of this model, so how far
 is ours: edge pixels are repeated as in DrQ (Kostrikov et al. 2021), few enough of them that the labels stand.
 """
@@ -155,12 +156,21 @@ class GtrsDenseSettings:
     layers: int = 3
     kept: float = 0.5  # share of the vocabulary in a training step
     velocity_noise_mps: tuple[float, float] = (1.0, 0.2)  # deviation along and across, in training
+    noise_of: Literal["sample", "batch"] = "sample"  # whom one draw of it is for
     image_shift: float = 1 / 256  # largest, as a share of the width, in training: 8 of 2048 pixels, half a degree
     imitation: float = 1.0  # weight of its loss
     rewards: RewardWeights = field(default_factory=RewardWeights)
     sigma_m2: float = 0.5  # of the imitated distribution
+    without: tuple[str, ...] = ()  # sub-scores that no head learns
+    among_bias: bool = True  # of the attention in which the vocabulary's trajectories see each other
 
     def __post_init__(self) -> None:
+        weighting = WEIGHTINGS[self.weighting]
+        for name in self.without:
+            if name not in LABELLED:
+                raise ValueError(f"without={name}: not one of {', '.join(LABELLED)}")
+            if name in weighting.alone or name in weighting.inside:
+                raise ValueError(f"without={name}: weighting={self.weighting} needs it")
         if self.inference_vocabulary is not None and self.inference_entries is not None:
             raise ValueError("inference_vocabulary and inference_entries: give one of them")
         if not 0.0 < self.kept <= 1.0:
@@ -174,11 +184,15 @@ class TrajectoryScorer(nn.Module):
         super().__init__()
         width, hidden = settings.width, settings.hidden
         self.embed = nn.Sequential(nn.Linear(3 * 40, hidden), nn.ReLU(), nn.Linear(hidden, width))
-        self.among = Layer(width, settings.heads, 4 * width, crosses=False)
+        self.among = Layer(width, settings.heads, 4 * width, crosses=False, bias=settings.among_bias)
         self.decoder = Decoder(width, settings.heads, hidden, settings.layers)
         self.status = nn.Linear(STATUS, width)
         self.heads = nn.ModuleDict(
-            {name: nn.Sequential(nn.Linear(width, hidden), nn.ReLU(), nn.Linear(hidden, 1)) for name in LABELLED}
+            {
+                name: nn.Sequential(nn.Linear(width, hidden), nn.ReLU(), nn.Linear(hidden, 1))
+                for name in LABELLED
+                if name not in settings.without
+            }
         )
         self.heads[IMITATION] = nn.Sequential(
             nn.Linear(width, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 1)
@@ -232,10 +246,7 @@ class GtrsDense(Planner):
                 f"vocabulary={settings.vocabulary} has digest {vocabulary.digest}, "
                 f"the samples are labelled with {labelled}"
             )
-        arrays: dict[str, FloatArray] = {"vocabulary": vocabulary.trajectories}
-        if (file := settings.inference_vocabulary) is not None:
-            arrays["inference_vocabulary"] = Vocabulary(read_array(file, "inference_vocabulary"), file).trajectories
-        return arrays
+        return {"vocabulary": vocabulary.trajectories, **inference_arrays(settings)}
 
     @property
     def needs(self) -> Needs:
@@ -248,14 +259,16 @@ class GtrsDense(Planner):
         """
         if batch.labels is None:
             raise ValueError("gtrs_dense: a batch without labels cannot be learned from")
+        status = self._noisy(batch.status) if self.training else batch.status
         picked = self._picked()
         trajectories = self.get_buffer("trajectories")[picked]
-        logits = self._logits(batch, trajectories)
+        logits = self.logits(batch, status, trajectories)
         target = imitated(trajectories[:, AT_2HZ], batch.plan_2hz, batch.imitate, self.settings.sigma_m2)
         # masked by a product, also where nothing imitates: a distributed step wants a gradient for every parameter
         apart = -(target * logits[IMITATION].log_softmax(dim=1)).sum(dim=1)
         terms = {IMITATION: self.settings.imitation * (apart * batch.imitate).sum() / len(batch)}
-        for name, weight in asdict(self.settings.rewards).items():
+        told = {name: weight for name, weight in asdict(self.settings.rewards).items() if name in logits}
+        for name, weight in told.items():
             score = batch.labels[name][:, picked]
             whole = (score == 1.0).float() if name in HALVES else score
             terms[name] = weight * F.binary_cross_entropy_with_logits(logits[name], whole)
@@ -264,7 +277,7 @@ class GtrsDense(Planner):
     def scores(self, batch: Batch) -> dict[str, Tensor]:
         """Probabilities (B, K) of every trajectory to choose from: the sub-scores, and `imitation` that sums to 1."""
         with evaluating(self):
-            logits = self._logits(batch, self.get_buffer("choices"))
+            logits = self.logits(batch, batch.status, self.get_buffer("choices"))
         return {name: value.softmax(dim=1) if name == IMITATION else value.sigmoid() for name, value in logits.items()}
 
     def choose(self, scores: Mapping[str, Tensor]) -> Tensor:
@@ -274,16 +287,24 @@ class GtrsDense(Planner):
     def plan(self, batch: Batch) -> Tensor:
         return self.get_buffer("choices")[self.choose(self.scores(batch))]
 
-    def _logits(self, batch: Batch, trajectories: Tensor) -> dict[str, Tensor]:
+    def logits(self, batch: Batch, status: Tensor, trajectories: Tensor) -> dict[str, Tensor]:
+        """Logits (B, K) by name of trajectories (K, 40, 3), for a status that may be another than the batch's."""
         if batch.image is None:
             raise ValueError("gtrs_dense: a batch without images")
-        image, status = batch.image, batch.status
+        image = batch.image
         if self.training:
             image = shifted(image, round(self.settings.image_shift * image.shape[-1]))
-            deviation = status.new_zeros(STATUS)
-            deviation[VELOCITY] = status.new_tensor(self.settings.velocity_noise_mps)
-            status = status + deviation * torch.randn_like(status)
         return self.scorer(trajectories, self.tokens(image), status)
+
+    def _noisy(self, status: Tensor) -> Tensor:
+        deviation = status.new_tensor(self.settings.velocity_noise_mps)
+        if self.settings.noise_of == "sample":
+            drawn = torch.randn_like(status[:, VELOCITY])
+        else:  # as the public code draws them, one after the other
+            drawn = torch.stack([torch.randn((), device=status.device) for _ in deviation])
+        noisy = status.clone()
+        noisy[:, VELOCITY] += deviation * drawn
+        return noisy
 
     def _picked(self) -> Tensor:
         """Sorted indices of the vocabulary for one training step; all of it in evaluation."""
@@ -292,6 +313,14 @@ class GtrsDense(Planner):
         if not self.training or self.settings.kept == 1.0:
             return torch.arange(size, device=device)
         return torch.randperm(size, device=device)[: max(1, round(self.settings.kept * size))].sort().values
+
+
+def inference_arrays(settings: GtrsDenseSettings) -> dict[str, FloatArray]:
+    """`inference_vocabulary` where the settings name one. Raises ValueError where its file is missing or unfit."""
+    file = settings.inference_vocabulary
+    if file is None:
+        return {}
+    return {"inference_vocabulary": Vocabulary(read_array(file, "inference_vocabulary"), file).trajectories}
 
 
 def _choices(settings: GtrsDenseSettings, arrays: Mapping[str, FloatArray], vocabulary: Vocabulary) -> Vocabulary:

@@ -67,8 +67,8 @@ class Ltf(Planner):
     def needs_to_plan(self) -> Needs:
         return Needs(image=self.settings.image)
 
-    def _decode(self, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
-        """Plans (B, 8, 3), queries of agents (B, N, width), features from above."""
+    def decoded(self, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
+        """Plans (B, 8, 3), queries of agents (B, N, width), features from above (B, C, rows, columns)."""
         assert batch.image is not None
         fused = self.fusion(batch.image)
         cells = self.reduce(fused.latent).flatten(2).transpose(1, 2)
@@ -79,10 +79,10 @@ class Ltf(Planner):
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         s = self.settings
-        plan, queries, above = self._decode(batch)
+        plan, queries, above = self.decoded(batch)
         auxiliary = auxiliary_losses(s, batch, self.bev_head(above), *self.agent_head(queries))
         return {"trajectory": s.trajectory_weight * imitation_l1(plan, batch), **auxiliary}
 
     def plan(self, batch: Batch) -> Tensor:
         with evaluating(self):
-            return self._decode(batch)[0]
+            return self.decoded(batch)[0]

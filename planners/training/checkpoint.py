@@ -23,6 +23,7 @@ import numpy as np
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
+from torch import Tensor
 
 from factory.config.compose import ConfigError
 from planners.models.planner import Planner
@@ -123,6 +124,11 @@ def load_weights(planner: Planner, folder: Path) -> None:
         stored = load_file(folder / WEIGHTS)
     except (OSError, SafetensorError) as error:
         raise ConfigError(f"{folder / WEIGHTS}: {error}: restore the checkpoint") from error
+    put_weights(planner, stored, f"{folder}: not a checkpoint of this {planner.name}")
+
+
+def put_weights(planner: Planner, stored: Mapping[str, Tensor], refusal: str) -> None:
+    """Raises ConfigError that begins with `refusal` where a weight is missing, unknown or of another shape."""
     own = planner.state_dict()
     wrong = [f"{name} is missing" for name in own if name not in stored]
     wrong += [f"{name} is unknown" for name in stored if name not in own]
@@ -133,7 +139,7 @@ def load_weights(planner: Planner, folder: Path) -> None:
     ]
     if wrong:
         more = f" and {len(wrong) - 3} more" if len(wrong) > 3 else ""
-        raise ConfigError(f"{folder}: not a checkpoint of this {planner.name}: {'; '.join(wrong[:3])}{more}")
+        raise ConfigError(f"{refusal}: {'; '.join(wrong[:3])}{more}")
     planner.load_state_dict(stored)
 
 

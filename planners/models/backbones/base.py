@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Self
 
 import torch
 from torch import Tensor, nn
@@ -19,6 +19,8 @@ class BackboneSettings:
     pretrained: str | None = None  # .safetensors, .pth or .pt under the published names; null: random weights
     prefix: str = ""  # before the names in that file, such as "img_backbone."; entries without it are not read
     widths: tuple[int, ...] = (16, 32, 64, 128)  # of `small`, one residual block each
+    pixels: Literal["imagenet", "unit"] = "imagenet"  # 0 .. 255 become ImageNet's mean 0 and deviation 1, or 0 .. 1
+    frozen_norm: bool = False  # normalisations keep their statistics in training; scale and shift are learned
 
 
 class Backbone(nn.Module, ABC):
@@ -28,13 +30,15 @@ class Backbone(nn.Module, ABC):
         super().__init__()
         self.settings, self.channels = settings, channels
         self.weights_missing = settings.pretrained is not None
-        mean, std = torch.tensor(IMAGENET_MEAN).view(3, 1, 1), torch.tensor(IMAGENET_STD).view(3, 1, 1)
+        imagenet = settings.pixels == "imagenet"
+        mean = torch.tensor(IMAGENET_MEAN if imagenet else (0.0, 0.0, 0.0)).view(3, 1, 1)
+        std = torch.tensor(IMAGENET_STD if imagenet else (1.0, 1.0, 1.0)).view(3, 1, 1)
         self.register_buffer("shift", -mean / std, persistent=False)
         self.register_buffer("scale", 1.0 / (255.0 * std), persistent=False)
         self.register_load_state_dict_post_hook(_weights_came)
 
     def normalised(self, image: Tensor) -> Tensor:
-        """uint8 RGB (B, 3, h, w) as float with ImageNet's mean 0 and deviation 1; a float input as it is.
+        """uint8 RGB (B, 3, h, w) as the float that `pixels` says; a float input as it is.
 
         Raises RuntimeError where the settings name weights that nobody loaded.
         """
@@ -46,6 +50,15 @@ class Backbone(nn.Module, ABC):
         if image.dtype != torch.uint8:
             return image
         return torch.addcmul(self.get_buffer("shift"), image, self.get_buffer("scale"))
+
+    def train(self, mode: bool = True) -> Self:
+        """As of every module, but that normalisations with `frozen_norm` stay in evaluation."""
+        super().train(mode)
+        if self.settings.frozen_norm:
+            for module in self.modules():
+                if isinstance(module, nn.BatchNorm2d):
+                    module.eval()
+        return self
 
     @abstractmethod
     def enter(self, image: Tensor) -> Tensor:

@@ -1,5 +1,6 @@
 """Published names and numbers of the backbones, and weights from files."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -182,6 +183,26 @@ def test_pictures_are_normalised_as_imagenet_and_other_inputs_are_left_alone() -
     expected = ((image.permute(0, 2, 3, 1) / 255 - mean) / std).permute(0, 3, 1, 2)
     torch.testing.assert_close(model.normalised(image), expected, rtol=1e-5, atol=1e-5)
     assert torch.equal(model.normalised(expected), expected)
+
+
+def test_pixels_may_be_0_to_1() -> None:
+    image = torch.randint(0, 256, (2, 3, 4, 4), dtype=torch.uint8)
+    model = build_backbone(replace(SMALL, pixels="unit"))
+    torch.testing.assert_close(model.normalised(image), image / 255, rtol=1e-6, atol=0.0)
+
+
+def test_frozen_normalisations_keep_their_statistics_and_learn_their_scale() -> None:
+    image = torch.randint(0, 256, (2, 3, 32, 32), dtype=torch.uint8)
+    for frozen in (True, False):
+        model = build_backbone(BackboneSettings(name="small", frozen_norm=frozen))
+        before = model.get_buffer("bn1.running_mean").clone()
+        still = model.eval()(image)[-1]
+        moved = model.train()(image)[-1]
+        moved.sum().backward()
+        assert torch.equal(model.get_buffer("bn1.running_mean"), before) == frozen
+        assert torch.equal(moved, still) == frozen
+        scale = model.get_parameter("bn1.weight")
+        assert model.training and scale.grad is not None and bool(scale.grad.any())
 
 
 def test_no_file_is_recorded_as_none() -> None:

@@ -1,5 +1,7 @@
 """Anchors, noise, and the decoder of a diffusion planner, piece by piece."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,6 +11,7 @@ from planners.models.anchors import checked_anchors, cluster_anchors, read_array
 from planners.models.diffusiondrive import (
     FOCAL_ALPHA,
     DiffusionDecoder,
+    DiffusionDriveSettings,
     focal,
     from_unit,
     kept,
@@ -96,6 +99,30 @@ def test_points_fall_into_the_cells_that_the_raster_draws_them_in() -> None:
     assert read.flatten().tolist() == [0.0, 3.0, 12.0, 10.0]
 
 
+def test_points_fall_into_the_same_cells_of_a_raster_that_is_turned() -> None:
+    layout = BevLayout(ahead_m=30.0, behind_m=10.0, side_m=20.0, cell_m=10.0)
+    points = torch.tensor([[25.0, 15.0], [-5.0, 15.0], [5.0, -5.0]])
+    raster = torch.arange(16.0).reshape(1, 1, *layout.shape)
+    there = on_map(points, layout)[None, None], on_map(points, replace(layout, first="near_right"))[None, None]
+    read = torch.nn.functional.grid_sample(raster, there[0], align_corners=False)
+    turned = torch.nn.functional.grid_sample(raster.flip(2, 3), there[1], align_corners=False)
+    torch.testing.assert_close(read, turned)
+
+
+def test_centred_points_look_as_if_the_raster_reached_behind_as_far_as_ahead() -> None:
+    """GridSampleCrossBEVAttention: y / 32 is the column, x / 32 the row, over a raster of 0 .. 32 m."""
+    layout = BevLayout(first="near_right")
+    points = torch.randn(5, 2) * 16
+    torch.testing.assert_close(on_map(points, layout, "centred"), points.flip(-1) / 32, rtol=1e-5, atol=1e-6)
+
+
+def test_closed_waves_end_at_the_slowest() -> None:
+    """SinusoidalPosEmb: rates 10,000^(-i / (n - 1)) for i = 0 .. n - 1; else the last one is one step before."""
+    step = torch.tensor([1.0])
+    assert waves(step, 8, closed=True)[0, 3].item() == pytest.approx(1e-4)
+    assert waves(step, 8)[0, 3].item() == pytest.approx(1e-3)
+
+
 def test_waves_tell_positions_apart_from_a_metre_to_kilometres() -> None:
     x = torch.tensor([0.0, 0.25, 100.0])
     told = waves(x, 32, 2 * torch.pi)
@@ -107,7 +134,7 @@ def test_waves_tell_positions_apart_from_a_metre_to_kilometres() -> None:
 
 def test_a_layer_of_a_cascade_starts_where_the_layer_before_put_the_plans() -> None:
     torch.manual_seed(0)
-    decoder = DiffusionDecoder(16, 2, 32, 2, 0.0, BevLayout())
+    decoder = DiffusionDecoder(DiffusionDriveSettings(width=16, heads=2, hidden=32, refinements=2, dropout=0.0))
     for layer in decoder.layers:
         torch.nn.init.zeros_(layer.offsets[-1].weight)
         torch.nn.init.constant_(layer.offsets[-1].bias, 1.0)

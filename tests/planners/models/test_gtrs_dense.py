@@ -132,6 +132,32 @@ def test_a_training_step_sees_half_the_vocabulary_by_torchs_own_dice() -> None:
     assert torch.equal(model.eval()._picked(), torch.arange(K))
 
 
+def test_a_sub_score_may_have_no_head() -> None:
+    batch, _ = labelled(2)
+    model, whole = planner(replace(TINY, without=("hc",))), planner()
+    assert set(model(batch)) == set(whole(batch)) - {"hc"}
+    assert model.plan(batch).shape == (2, 40, 3)
+    for name, said in (("hc2", "not one of"), ("nc", "weighting=release needs it")):
+        with pytest.raises(ValueError, match=said):
+            replace(TINY, without=(name,))
+
+
+def test_noise_is_one_for_the_batch_or_another_for_each_sample() -> None:
+    batch, _ = labelled(4)
+    for noise_of, distinct in (("batch", 1), ("sample", 4)):
+        model = planner(replace(TINY, noise_of=noise_of, velocity_noise_mps=(1.0, 0.2)))
+        torch.manual_seed(0)
+        off = model._noisy(batch.status) - batch.status
+        assert len(off[:, 4].unique()) == len(off[:, 5].unique()) == distinct
+        assert not off[:, :4].any() and not off[:, 6:].any()
+    torch.manual_seed(0)
+    along, across = torch.randn(()), torch.randn(())  # as the public code draws them
+    off = planner(replace(TINY, noise_of="batch", velocity_noise_mps=(1.0, 0.2)))
+    torch.manual_seed(0)
+    drawn = (off._noisy(torch.zeros(1, 8)))[0, 4:6]
+    torch.testing.assert_close(drawn, torch.stack([along, across * 0.2]))
+
+
 def test_the_imitated_distribution_is_a_softmax_of_squared_distances() -> None:
     at_2hz = torch.zeros(3, 8, 3)
     at_2hz[1, 0, 0], at_2hz[2, 4, 2] = 1.0, 0.5  # squared distances 0, 1, 0.25

@@ -1,11 +1,12 @@
 """The files of conf/planner that come with the regressing planners say what the code and the paper say."""
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
 import yaml
 
-from factory.config.compose import conf_dir, fill
+from factory.config.compose import ConfigError, conf_dir, fill
 from planners.models.backbones.base import BackboneSettings
 from planners.models.ego_mlp import EgoMlpBevSettings, EgoMlpSettings
 from planners.models.ltf import LtfSettings
@@ -27,7 +28,7 @@ def choice(name: str) -> PlannerChoice:
     return PlannerChoice(content["name"], content.get("settings", {}))
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*NAMES, "ltf_public"])
 def test_every_file_fills_its_planner(name: str) -> None:
     settings_of(choice(name))
     if name != "constant_velocity":
@@ -38,6 +39,26 @@ def test_the_unmarked_files_are_the_defaults() -> None:
     defaults = {"ltf": LtfSettings(), "ego_mlp": EgoMlpSettings(), "ego_mlp_bev": EgoMlpBevSettings()}
     for name, expected in defaults.items():
         assert settings_of(choice(name)) == expected and "settings" not in read(name)
+
+
+@pytest.mark.parametrize("name", ["ltf", "diffusiondrive", "gtrs_dense", "gtrs_dense_v2_99"])
+def test_public_planners_are_as_large_and_train_as_the_paper_s(name: str) -> None:
+    ours, public = settings_of(choice(name)), settings_of(choice(f"{name}_public"))
+    assert read(name)["training"] == read(f"{name}_public")["training"]
+    assert (public.image, public.width, public.hidden, public.layers) == (
+        ours.image,
+        ours.width,
+        ours.hidden,
+        ours.layers,
+    )
+    backbone = public.fusion.backbone if getattr(public, "encoder", "fused") == "fused" else public.backbone
+    assert backbone.pixels == "unit" and backbone.frozen_norm == (backbone.name == "vovnet99")
+
+
+def test_a_misspelt_setting_of_a_public_planner_is_an_error() -> None:
+    wrong = replace(choice("ltf_public"), settings={"fusion": {"image_token": [8, 32]}})
+    with pytest.raises(ConfigError, match="image_token"):
+        settings_of(wrong)
 
 
 def test_ltf_trains_as_in_the_paper() -> None:

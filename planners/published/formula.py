@@ -1,0 +1,74 @@
+"""Weights and inputs out of names and shapes, so that two programs make the same ones and nobody has to store them.
+
+numpy alone, and Python 3.9: the public code's own interpreter imports it.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from typing import Any
+
+import numpy as np
+
+BATCH = 2
+ENTRIES, ANCHORS, AGENTS = 64, 20, 30
+BEV = (128, 256)
+SCORES = (  # of the public code's pickles, in which each is an array over the vocabulary
+    *("no_at_fault_collisions", "drivable_area_compliance", "time_to_collision_within_bound", "ego_progress"),
+    *("driving_direction_compliance", "lane_keeping", "traffic_light_compliance", "history_comfort"),
+)
+
+
+def drawn(name: str, shape: tuple[int, ...]) -> Any:
+    """Numbers of 0 .. 1 that depend on the name alone: float32 `shape`."""
+    return np.random.Generator(np.random.Philox(zlib.crc32(name.encode()))).random(shape, np.float32)
+
+
+def weight(name: str, shape: tuple[int, ...]) -> Any:
+    """A weight of that name in a state dict: of a size at which 34 layers neither vanish nor explode.
+
+    Matrices and kernels have variance 1 / fan-in, scales lie around 1, offsets around 0, variances in 0.5 .. 1.5;
+    what has a leading 1 (positions, the latent picture) has variance 1.
+    """
+    if name.endswith("num_batches_tracked"):
+        return np.zeros(shape, np.int64)
+    values = drawn(name, shape)
+    if name.endswith("running_var"):
+        return values + np.float32(0.5)
+    values = (2.0 * values - 1.0) * np.float32(math.sqrt(3.0))
+    if len(shape) > 1:
+        return values * np.float32(1.0 if shape[0] == 1 and len(shape) > 2 else 1.0 / math.sqrt(math.prod(shape[1:])))
+    return np.float32(1.0 if name.endswith("weight") else 0.0) + np.float32(0.1) * values
+
+
+def inputs(width: int, height: int) -> dict[str, Any]:
+    """What a model is shown and told: BATCH samples with pictures of `width` x `height`."""
+    patches = (drawn("image", (BATCH, 3, height // 8, width // 8)) * 256).astype(np.uint8)
+    status = np.zeros((BATCH, 8), np.float32)
+    status[np.arange(BATCH), np.arange(BATCH)] = 1.0
+    status[:, 4:] = drawn("status", (BATCH, 4)) * np.array([10.0, 0.5, 2.0, 0.5], np.float32)
+    agents = drawn("agents", (BATCH, AGENTS, 5)) * np.array([64.0, 64.0, 6.0, 6.0, 3.0], np.float32)
+    agents[..., :2] -= 32.0
+    agents[..., 2] -= 3.0
+    scores = {f"score {name}": np.floor(drawn(name, (BATCH, ENTRIES)) * 3.0) / 2.0 for name in SCORES}
+    return {
+        "image": patches.repeat(8, axis=2).repeat(8, axis=3),
+        "status": status,
+        "plan": arcs("plan", BATCH, 8),
+        "agents": agents,
+        "agents_valid": drawn("there", (BATCH, AGENTS)) < 0.5,
+        "bev": (drawn("bev", (BATCH, *BEV)) * 7.0).astype(np.uint8),
+        "vocabulary": arcs("vocabulary", ENTRIES, 40),
+        "anchors": np.ascontiguousarray(arcs("anchors", ANCHORS, 8)[..., :2]),
+        **{name: values.astype(np.float32) for name, values in scores.items()},
+    }
+
+
+def arcs(name: str, count: int, poses: int) -> Any:
+    """(count, poses, 3) float32 x, y, heading over 4 s, at 2 .. 12 m/s and -0.04 .. 0.04 1/m."""
+    speed = 2.0 + 10.0 * drawn(name + " speed", (count, 1)).astype(np.float64)
+    curvature = (drawn(name + " curvature", (count, 1)).astype(np.float64) - 0.5) * 0.08 + 1e-6
+    heading = speed * curvature * np.arange(1, poses + 1) * (4.0 / poses)
+    x, y = np.sin(heading) / curvature, (1.0 - np.cos(heading)) / curvature
+    return np.stack([x, y, heading], axis=-1).astype(np.float32)

@@ -1,0 +1,87 @@
+"""`python -m planners import <checkpoint> planner=<name>_public out=<folder>`: a released planner as one of ours.
+
+    python -m planners import ltf.ckpt planner=ltf_public out=runs/ltf_public
+    python -m planners import diffusiondrive.ckpt planner=diffusiondrive_public out=runs/diffusiondrive_public
+    python -m planners import gtrs.ckpt planner=gtrs_dense_public out=runs/gtrs_public \\
+        planner.settings.inference_vocabulary=8192.npy
+    python -m planners import gtrs_vov.ckpt planner=gtrs_dense_v2_99_public out=runs/gtrs_v2_99_public
+
+Takes the Lightning checkpoints of NAVSIM's and SimScale's training (Latent TransFuser, DiffusionDrive, GTRS-Dense).
+Every weight of the file is moved or told of. What comes out is a training's folder: `python -m planners evaluate
+planner=<out>`, `train init_from=<out>` and NAVSIM's agent take it. GTRS-Dense chooses from the vocabulary that it was
+trained with unless another one is named. Nothing of the file runs: it is read as tensors and plain values.
+"""
+
+import hashlib
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from torch import Tensor
+
+from factory.config.compose import ConfigError, compose, fill
+from planners.command import command
+from planners.published.imported import Imported, imported
+from planners.published.weights import read_public
+from planners.training.checkpoint import FOLDER, save_checkpoint
+from planners.training.train import PlannerEntry
+
+FROZEN_IN = "_trajectory_head"  # what of it is no weight of ours is not learned there either
+
+
+@dataclass(frozen=True)
+class ImportConfig:
+    """Everything on the command line."""
+
+    planner: PlannerEntry
+    checkpoint: str
+    out: str  # folder; it may not hold a training
+
+
+@command
+def main(argv: Sequence[str]) -> None:
+    """The command."""
+    files = [word for word in argv if Path(word).is_file()]  # Lightning's names hold equals signs
+    words = [word for word in argv if word not in files]
+    if len(files) > 1:
+        raise ConfigError(f"{' and '.join(files)}: one checkpoint at a time")
+    quoted = [f"checkpoint='{name}'" for name in files]
+    config = fill(ImportConfig, compose("import_planner", [*quoted, *words], ImportConfig), "import")
+    import_to(config)
+
+
+def import_to(config: ImportConfig) -> Path:
+    """Write the checkpoint's planner under `out` and say what became of every weight. Raises ConfigError."""
+    out, path = Path(config.out).absolute(), Path(config.checkpoint)
+    if (out / FOLDER).exists():
+        raise ConfigError(f"out={config.out} holds a training already: choose another folder")
+    if not path.is_file():
+        raise ConfigError(f"checkpoint={config.checkpoint}: there is no such file")
+    public = read_public(path)
+    found = imported(config.planner, public, str(path))
+    with path.open("rb") as file:
+        source = f"{path.name} {hashlib.file_digest(file, 'sha256').hexdigest()}"
+    record = {
+        "trained": {"imported": source},
+        "backbones": {"all": source},
+        "parameters": sum(parameter.numel() for parameter in found.planner.parameters()),
+    }
+    folder = save_checkpoint(out, 0, found.planner, record, {})
+    print(account(found, public))
+    print(f"imported: {folder}")
+    return folder
+
+
+def account(found: Imported, public: dict[str, Tensor]) -> str:
+    """How many numbers of a public model went where."""
+    moved = {name for names in found.came_from.values() for name in names}
+    count = sum(public[name].numel() for name in moved)
+    lines = [f"{count:,} numbers in {len(moved)} arrays are the planner's weights"]
+    parts: Counter[str] = Counter()
+    for name, value in found.aside.items():
+        words = name.split(".")
+        is_frozen = words[0] == FROZEN_IN
+        part = ".".join(words[:2]) if is_frozen else words[0]
+        parts[f"{part}: {'what the planner is built around' if is_frozen else 'in no forward pass'}"] += value.numel()
+    return "\n".join([*lines, *(f"{count:,} of {name}" for name, count in parts.items())])

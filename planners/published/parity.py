@@ -1,0 +1,93 @@
+"""`python -m planners parity <public checkout> python=<its interpreter>`: our planners against the public code.
+
+    python -m planners parity SimScale python=navsim_env/bin/python
+    python -m planners parity SimScale python=... cases=[gtrs_dense_v2_99] width=2048 height=512
+    python -m planners parity SimScale python=... record=tests/planners/published/recorded
+
+The public models (ltf, diffusiondrive, gtrs_dense, gtrs_dense_v2_99) are built of the checkout's source in its own
+Python, with weights and inputs made of their names by a formula; ours get the same weights by way of the import. Held
+against each other: all outputs in evaluation, and in training mode the losses with their terms and the norm of the
+gradient of every matrix, without dropout, since its random numbers differ. Differences are absolute for outputs and
+relative for the others.
+    train=false          outputs alone, which takes less memory
+    checkpoints=true     weights go through a Lightning checkpoint that the public trainer's libraries write
+    record=<folder>      keep what the public side said, for tests that have no checkout
+Exit code 3 where something is further from the public code than `tolerance` (metres of boxes ten times, gradients a
+hundred times: so far goes rounding in float32).
+"""
+
+import os
+import subprocess
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from factory.config.arguments import WORD, Refused
+from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES
+from planners.published.ours import CASES, differences, planner_of, read_recorded
+from planners.published.weights import read_public
+
+BESIDE = "import sys; sys.path[:0] = sys.argv[1:3]; from planners.published.beside import main; main(sys.argv[2:])"
+
+
+@dataclass(frozen=True)
+class Request:
+    """The command line."""
+
+    code: str = field(metadata=WORD)  # a checkout of SimScale
+    python: str  # an interpreter with what the checkout needs
+    cases: tuple[str, ...] = CASES
+    width: int = 256
+    height: int = 64
+    tolerance: float = 1e-4
+    train: bool = True
+    checkpoints: bool = False
+    record: str | None = None
+
+    def __post_init__(self) -> None:
+        if unknown := [case for case in self.cases if case not in CASES]:
+            raise ValueError(f"cases={','.join(unknown)}: give some of {', '.join(CASES)}")
+        if self.width % 32 or self.height % 32 or not self.width or not self.height:
+            raise ValueError(f"width={self.width} height={self.height}: both must be multiples of 32")
+        if not (Path(self.code) / "navsim" / "agents").is_dir():
+            raise ValueError(f"{self.code}: no checkout of the public code, there is no navsim/agents in it")
+
+
+def main(request: Request) -> int:
+    """Compare and print. Raises Refused where the public side cannot be run."""
+    worst = COMPLETE
+    for case in request.cases:
+        with tempfile.TemporaryDirectory() as folder:
+            path, checkpoint = said_beside(request, case, Path(folder))
+            recorded = read_recorded(path)
+            public = None if checkpoint is None else read_public(checkpoint)
+            if request.record is not None:
+                kept = Path(request.record)
+                kept.mkdir(parents=True, exist_ok=True)
+                (kept / f"{case}_{request.width}x{request.height}.npz").write_bytes(path.read_bytes())
+        found = planner_of(recorded, public)
+        aside = sum(value.numel() for value in found.aside.values())
+        ours = sum(parameter.numel() for parameter in found.planner.parameters())
+        print(f"{case}, {request.width} x {request.height}; public code: {recorded.origin}")
+        print(f"  parameters: {recorded.parameters:,} public = {ours:,} ours + {aside:,} frozen or unused")
+        worst = worst if recorded.parameters == ours + aside else COMPLETE_WITH_FAILURES
+        for row in differences(recorded, found):
+            worst = worst if row.is_within(request.tolerance) else COMPLETE_WITH_FAILURES
+            print(f"  {row.what:<42}{row.largest:10.1e}   of {row.size:.4g}")
+    return worst
+
+
+def said_beside(request: Request, case: str, folder: Path) -> tuple[Path, Path | None]:
+    """What the public code says of a case, and its checkpoint where one is wanted. Raises Refused."""
+    said, checkpoint = folder / "said.npz", folder / "model.ckpt"
+    checkout, code = Path(__file__).resolve().parents[2], Path(request.code).resolve()
+    words = [str(checkout), str(code), case, str(request.width), str(request.height), str(said)]
+    words += [str(int(request.train)), str(checkpoint) if request.checkpoints else ""]
+    environment = {"NAVSIM_EXP_ROOT": str(folder), **os.environ}
+    done = subprocess.run(  # noqa: S603 - the user's own interpreter
+        [request.python, "-c", BESIDE, *words], cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        last = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
+        raise Refused(f"{request.python} could not run the {case} of {request.code}: {last}")
+    return said, checkpoint if request.checkpoints else None

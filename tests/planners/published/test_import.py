@@ -1,0 +1,54 @@
+"""`python -m planners import`: from a Lightning checkpoint to a folder that everything else takes."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from planners.evaluation.planner_names import planner_of as evaluated_planner
+from planners.published.formula import inputs
+from planners.published.import_planner import main
+from planners.published.ours import batch_of, formula_weights
+from planners.training.checkpoint import read_record
+from tests.planners.published.test_parity import TOLERANCE, recorded
+
+
+@pytest.mark.slow
+def test_a_checkpoint_becomes_a_folder_that_plans_as_the_public_model(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one, path, out = recorded("ltf"), tmp_path / "epoch=99-step=123.ckpt", tmp_path / "out"
+    weights = formula_weights(one.names, inputs(*one.picture))
+    named = {f"agent._transfuser_model.{name}": value for name, value in weights.items()}
+    torch.save({"state_dict": named, "global_step": 123}, path)
+    size = ["planner.settings.image.width=256", "planner.settings.image.height=64"]
+    assert main([str(path), "planner=ltf_public", f"out={out}", *size]) == 0
+    said = capsys.readouterr().out
+    assert f"in {len(one.names)} arrays are the planner's weights" in said
+    record = read_record(out)
+    assert record["parameters"] == one.parameters and record["trained"]["imported"].startswith(f"{path.name} ")
+    planner = evaluated_planner(str(out))
+    assert planner.load is not None
+    plan = planner.load().plan(batch_of(one.picture))
+    assert np.abs(plan.numpy() - one.results["eval trajectory"]).max() < TOLERANCE
+    assert main([str(path), "planner=ltf_public", f"out={out}", *size]) == 2
+    assert "holds a training already" in capsys.readouterr().err
+
+
+def test_what_does_not_fit_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "a.ckpt"
+    torch.save({"state_dict": {"agent._transfuser_model._status_encoding.weight": torch.ones(1)}}, path)
+    (tmp_path / "b.ckpt").write_bytes(b"")
+    for words, said in (
+        ([str(path), f"out={tmp_path / 'out'}", "planner=ltf_publik"], "ltf_public"),
+        ([str(path), f"out={tmp_path / 'out'}", "planner.settings.fusion.image_token=[8,32]"], "image_token"),
+        ([str(path), f"out={tmp_path / 'out'}"], "lacks _backbone.image_encoder"),
+        ([str(path), str(tmp_path / "b.ckpt"), f"out={tmp_path / 'out'}"], "one checkpoint at a time"),
+        ([f"checkpoint={tmp_path / 'c.ckpt'}", f"out={tmp_path / 'out'}"], "there is no such file"),
+        ([str(path)], "out"),
+    ):
+        assert main(words) == 2, words
+        error = capsys.readouterr().err
+        assert said in error and error.count("\n") == 1, error
+    assert not (tmp_path / "out").exists()

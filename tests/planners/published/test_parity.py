@@ -1,0 +1,155 @@
+"""Our planners say what the public code said: against arrays that its own modules wrote (see the records' origin).
+
+`python -m planners parity <public checkout> python=<its interpreter> record=tests/planners/published/recorded` writes
+them anew.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from factory.config.compose import ConfigError
+from planners.models.registry import PlannerChoice
+from planners.published.families import SCORES
+from planners.published.formula import inputs, weight
+from planners.published.imported import imported
+from planners.published.ours import (
+    CASES,
+    FROZEN,
+    GRADIENTS,
+    Difference,
+    PublicRecord,
+    differences,
+    planner_of,
+    preset,
+    read_recorded,
+)
+
+RECORDED = Path(__file__).parent / "recorded"
+TOLERANCE = 1e-4
+# of the public agents with every parameter, learnt or not
+PARAMETERS = {
+    "ltf": 56_035_685,
+    "diffusiondrive": 60_780_943 + 20 * 8 * 2,
+}
+
+
+def recorded(case: str, size: str = "256x64") -> PublicRecord:
+    return read_recorded(RECORDED / f"{case}_{size}.npz")
+
+
+def on_meta(case: PublicRecord) -> dict[str, Tensor]:
+    """The public model's weights by name and shape alone, but for the arrays that a planner is built around."""
+    given = inputs(*case.picture)
+    frozen = {name: FROZEN[last] for name in case.names if (last := name.rpartition(".")[2]) in FROZEN}
+    shapes = {name: torch.empty(shape, device="meta") for name, shape in case.names.items()}
+    return {**shapes, **{name: torch.from_numpy(given[what]) for name, what in frozen.items()}}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
+def test_outputs_losses_and_gradients_are_the_public_code_s(case: str) -> None:
+    one = recorded(case)
+    rows = differences(one, planner_of(one))
+    assert [row for row in rows if not row.is_within(TOLERANCE)] == []
+    assert {row.what for row in rows} >= {"eval trajectory", "train loss"} and rows[-1].what.startswith(GRADIENTS)
+
+
+@pytest.mark.slow
+def test_latent_transfuser_is_the_public_one_at_the_paper_s_picture() -> None:
+    one = recorded("ltf", "2048x512")
+    assert one.picture == (2048, 512)
+    assert [row for row in differences(one, planner_of(one)) if not row.is_within(TOLERANCE)] == []
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_every_number_of_the_public_model_is_ours_or_named(case: str) -> None:
+    one = recorded(case)
+    with torch.device("meta"):
+        found = imported(preset(case, one.picture), on_meta(one), case)
+    moved = {name for names in found.came_from.values() for name in names}
+    assert moved | set(found.aside) == set(one.names) and not moved & set(found.aside)
+    ours = sum(parameter.numel() for parameter in found.planner.parameters())
+    assert one.parameters == ours + sum(value.numel() for value in found.aside.values())
+    assert one.parameters == PARAMETERS.get(case, one.parameters)
+    tops = {name.split(".")[0] for name in found.aside}
+    assert (
+        tops
+        == {
+            "ltf": set(),
+            "diffusiondrive": {"_trajectory_head"},
+            "gtrs_dense": {"_trajectory_head", "_tf_decoder", "_agent_head"},
+            "gtrs_dense_v2_99": {"_trajectory_head", "_tf_decoder", "_agent_head"},
+        }[case]
+    )
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_weight_too_few_or_too_many_or_of_another_shape_is_refused_by_name(case: str) -> None:
+    one = recorded(case)
+    choice, public = preset(case, one.picture), on_meta(one)
+    some = next(name for name in public if name.endswith(("conv1.weight", "stem_1/conv.weight")))
+    fewer = {name: value for name, value in public.items() if name != "_status_encoding.bias"}
+    other = {**public, some: torch.empty(3, 3, device="meta")}
+    for changed, said in (
+        (fewer, "lacks _status_encoding.bias"),
+        ({**public, "_backbone.extra": torch.empty(1)}, "_backbone.extra, of which this planner knows nothing"),
+        (other, r"is \(3, 3\), not \("),
+    ):
+        with torch.device("meta"), pytest.raises(ConfigError, match=said):
+            imported(choice, changed, "it")
+
+
+def test_another_planner_s_checkpoint_is_told_by_its_weights() -> None:
+    wrong = {"ltf": "diffusiondrive", "diffusiondrive": "ltf", "gtrs_dense": "gtrs_dense_v2_99"}
+    wrong["gtrs_dense_v2_99"] = "gtrs_dense"
+    for case, asked in wrong.items():
+        one = recorded(case)
+        with torch.device("meta"), pytest.raises(ConfigError, match=f"its weights look like planner={case}_public$"):
+            imported(preset(asked, one.picture), on_meta(one), "it")
+
+
+def test_planners_without_public_checkpoints_are_refused() -> None:
+    with pytest.raises(ConfigError, match="only ltf, diffusiondrive, gtrs_dense have public checkpoints"):
+        imported(PlannerChoice("ego_mlp"), {}, "it")
+
+
+def test_the_formula_depends_on_the_name_alone_and_neither_vanishes_nor_explodes() -> None:
+    one = weight("a.weight", (400, 300))
+    assert np.array_equal(one, weight("a.weight", (400, 300))) and not np.array_equal(
+        one, weight("b.weight", (400, 300))
+    )
+    assert one.std() == pytest.approx(300**-0.5, rel=0.01) and abs(one.mean()) < 1e-3
+    assert weight("a.running_var", (100,)).min() >= 0.5 and weight("norm.weight", (100,)).min() > 0.8
+    assert weight("a.num_batches_tracked", ()) == 0
+    assert weight("pos_emb", (1, 50, 50)).std() == pytest.approx(1.0, rel=0.05)
+
+
+def test_inputs_are_of_the_kinds_that_planners_are_shown() -> None:
+    given = inputs(128, 64)
+    assert given["image"].dtype == np.uint8 and given["image"].shape == (2, 3, 64, 128)
+    assert (given["status"][:, :4].sum(axis=1) == 1.0).all()
+    assert set(np.unique(given["bev"])) == set(range(7))
+    for name in SCORES:
+        assert set(np.unique(given[f"score {name}"])) <= {0.0, 0.5, 1.0}
+    speed = np.linalg.norm(np.diff(given["vocabulary"][..., :2], axis=1), axis=-1) * 10.0
+    assert speed.min() > 1.9 and speed.max() < 12.1
+
+
+def test_a_record_holds_where_it_is_from_and_others_are_refused(tmp_path: Path) -> None:
+    assert "SimScale commit f51ad645" in recorded("ltf").origin
+    (tmp_path / "a.npz").write_bytes(b"PK")
+    with pytest.raises(ConfigError, match="no record of a public model"):
+        read_recorded(tmp_path / "a.npz")
+    np.savez(tmp_path / "b.npz", told=np.array("{}"))
+    with pytest.raises(ConfigError, match="no record of a public model"):
+        read_recorded(tmp_path / "b.npz")
+
+
+def test_a_difference_is_judged_with_what_rounding_makes_of_it() -> None:
+    row = Difference("it", largest=5e-4, size=1.0)
+    assert not row.is_within(TOLERANCE) and replace(row, rounding=10.0).is_within(TOLERANCE)
