@@ -204,6 +204,6 @@ def save_as_lightning(agent: Any, given: dict[str, Any], path: str) -> None:
     trainer = pl.Trainer(
         max_steps=1, accelerator="cpu", logger=False, callbacks=[callback], enable_progress_bar=False, num_nodes=1
     )
-    trainer.fit(AgentModule(), torch.utils.data.DataLoader([0]))
+    trainer.fit(AgentModule(), torch.utils.data.DataLoader(torch.utils.data.TensorDataset(torch.zeros(1))))
     filled(model_of(agent), given)  # a step, even one of no loss, decays weights
     trainer.save_checkpoint(path)

@@ -4,6 +4,7 @@ Names are those of OpenDriveLab/SimScale 04cda10, navsim/agents/{transfuser,diff
 """
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -139,11 +140,11 @@ def gtrs_dense(moves: Moves, settings: GtrsDenseSettings) -> Arrays:
     return {"vocabulary": moves.kept(f"{head}.vocab").double().numpy()}
 
 
-FAMILIES: Mapping[str, Callable[[Moves, object], Arrays]] = {
+FAMILIES: Mapping[str, Callable[[Moves, Any], Arrays]] = {  # each takes its own planner's settings
     "ltf": ltf,
     "diffusiondrive": diffusiondrive,
     "gtrs_dense": gtrs_dense,
-}  # type: ignore[dict-item]  # each takes its own planner's settings
+}
 
 
 def _batched(embedding: Tensor) -> Tensor:
