@@ -123,7 +123,7 @@ def test_who_wants_more_than_navsim_shows_is_refused(tmp_path: Path) -> None:
         Pilot("pdm_closed")
     with pytest.raises(ConfigError, match="takes samples"):
         Pilot("tests.planners.navsim.test_pilot:OfSamples")
-    assert asked(Pilot("constant_velocity"), agent_input(()))[-1] == pytest.approx([4 * 6.2, 0.0, 0.0])
+    assert asked(Pilot("constant_velocity"), agent_input(()))[-1] == pytest.approx([4 * np.hypot(6.2, 0.1), 0.0, 0.0])
 
 
 class OfSamples:
