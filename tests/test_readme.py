@@ -36,6 +36,8 @@ from planners.evaluation.compare import CompareSettings
 from planners.evaluation.compare import main as compare_main
 from planners.evaluation.evaluate import settings_of as evaluate_settings
 from planners.evaluation.replay import settings_of as replay_settings
+from planners.models.registry import settings_of
+from planners.published.import_planner import config_of as import_config
 from planners.study.agreement import main as agreement_main
 from planners.study.recipe import Recipe
 from planners.study.report import ReportRequest
@@ -174,6 +176,8 @@ def test_every_command_is_one_its_program_takes(
             *arguments,
         ]:
             fill(TrainConfig, compose("train", given(arguments)), "train")
+        case ["python", "-m", "planners", "import", *arguments]:
+            settings_of(import_config(given(arguments)).planner)
         case ["python", "-m", "planners", "evaluate" | "ensemble", *arguments]:
             evaluate_settings([argument for argument in arguments if not argument.startswith("models=")])
         case ["python", "-m", "planners", "compare", *arguments] if any(

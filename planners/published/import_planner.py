@@ -42,13 +42,17 @@ class ImportConfig:
 @command
 def main(argv: Sequence[str]) -> None:
     """The command."""
-    files = [word for word in argv if Path(word).is_file()]  # Lightning's names hold equals signs
-    words = [word for word in argv if word not in files]
+    import_to(config_of(argv))
+
+
+def config_of(argv: Sequence[str]) -> ImportConfig:
+    """The settings of a command line. Raises ConfigError."""
+    # Lightning's names hold equals signs
+    files = [word for word in argv if Path(word).is_file() or not ("=" in word or word.startswith("-"))]
     if len(files) > 1:
         raise ConfigError(f"{' and '.join(files)}: one checkpoint at a time")
-    quoted = [f"checkpoint='{name}'" for name in files]
-    config = fill(ImportConfig, compose("import_planner", [*quoted, *words], ImportConfig), "import")
-    import_to(config)
+    words = [*(f"checkpoint='{name}'" for name in files), *(word for word in argv if word not in files)]
+    return fill(ImportConfig, compose("import_planner", words, ImportConfig), "import")
 
 
 def import_to(config: ImportConfig) -> Path:

@@ -46,6 +46,7 @@ def test_what_does_not_fit_is_one_line(tmp_path: Path, capsys: pytest.CaptureFix
         ([str(path), f"out={tmp_path / 'out'}"], "lacks _backbone.image_encoder"),
         ([str(path), str(tmp_path / "b.ckpt"), f"out={tmp_path / 'out'}"], "one checkpoint at a time"),
         ([f"checkpoint={tmp_path / 'c.ckpt'}", f"out={tmp_path / 'out'}"], "there is no such file"),
+        ([str(tmp_path / "c.ckpt"), f"out={tmp_path / 'out'}"], "there is no such file"),
         ([str(path)], "out"),
     ):
         assert main(words) == 2, words
