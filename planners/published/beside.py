@@ -207,3 +207,4 @@ def save_as_lightning(agent: Any, given: dict[str, Any], path: str) -> None:
     trainer.fit(AgentModule(), torch.utils.data.DataLoader(torch.utils.data.TensorDataset(torch.zeros(1))))
     filled(model_of(agent), given)  # a step, even one of no loss, decays weights
     trainer.save_checkpoint(path)
+    agent.zero_grad()

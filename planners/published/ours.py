@@ -84,10 +84,10 @@ def formula_weights(names: Mapping[str, list[int]], given: Mapping[str, Array]) 
     return state
 
 
-def preset(case: str, picture: tuple[int, int]) -> PlannerChoice:
-    """The planner of conf/planner/<case>_public.yaml for pictures of another size, without dropout."""
+def preset(case: str, picture: tuple[int, int], *changed: str) -> PlannerChoice:
+    """The planner of conf/planner/<case>_public.yaml for pictures of another size, without dropout; words change it."""
     size = [f"planner.settings.image.{name}={n}" for name, n in zip(("width", "height"), picture)]
-    words = [f"planner={case}_public", "checkpoint=none", "out=none", *size, *WITHOUT_DROPOUT[case]]
+    words = [f"planner={case}_public", "checkpoint=none", "out=none", *size, *WITHOUT_DROPOUT[case], *changed]
     entry = fill(PlannerEntry, compose("import_planner", words)["planner"], "planner")
     return PlannerChoice(entry.name, entry.settings)
 

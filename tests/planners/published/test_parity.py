@@ -23,7 +23,9 @@ from planners.published.ours import (
     GRADIENTS,
     Difference,
     PublicRecord,
+    batch_of,
     differences,
+    formula_weights,
     planner_of,
     preset,
     read_recorded,
@@ -68,6 +70,24 @@ def test_latent_transfuser_is_the_public_one_at_the_paper_s_picture() -> None:
     one = recorded("ltf", "2048x512")
     assert one.picture == (2048, 512)
     assert [row for row in differences(one, planner_of(one)) if not row.is_within(TOLERANCE)] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("case", "changed", "apart_m"),
+    [
+        ("ltf", "fusion.backbone.pixels=imagenet", 0.01),
+        ("diffusiondrive", "points_on=cell", 0.01),
+        ("diffusiondrive", "bev.first=far_left", 0.01),
+        ("diffusiondrive", "step_waves=half_open", 0.001),
+    ],
+)
+def test_without_what_the_public_code_does_plans_are_others(case: str, changed: str, apart_m: float) -> None:
+    one = recorded(case)
+    choice = preset(case, one.picture, f"planner.settings.{changed}")
+    found = imported(choice, formula_weights(one.names, inputs(*one.picture)), "it")
+    plan = found.planner.plan(batch_of(one.picture))
+    assert np.abs(plan.numpy() - one.results["eval trajectory"])[..., :2].max() > apart_m
 
 
 @pytest.mark.parametrize("case", CASES)
