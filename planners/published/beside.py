@@ -19,11 +19,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from planners.published.formula import SCORES, inputs, weight
+from planners.published.formula import CELLS, FROZEN, SCORES, SEED, inputs, weight
 
-FROZEN = {"vocab": "vocabulary", "plan_anchor": "anchors"}  # last word of a parameter's name -> the input it is
-SEED = 0  # of what the model itself draws
-CELLS = 8  # of the map from above every so many rows and columns are kept
 TOKENS = ("a", "b")
 V2_99 = "gtrs_dense_v2_99"
 

@@ -14,6 +14,9 @@ import numpy as np
 BATCH = 2
 ENTRIES, ANCHORS, AGENTS = 64, 20, 30
 BEV = (128, 256)
+CELLS = 8  # of the map from above every so many rows and columns are compared
+SEED = 0  # of what a model itself draws
+FROZEN = {"vocab": "vocabulary", "plan_anchor": "anchors"}  # last word of a parameter's name -> the input that it is
 SCORES = (  # of the public code's pickles, in which each is an array over the vocabulary
     *("no_at_fault_collisions", "drivable_area_compliance", "time_to_collision_within_bound", "ego_progress"),
     *("driving_direction_compliance", "lane_keeping", "traffic_light_compliance", "history_comfort"),

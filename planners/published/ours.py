@@ -17,17 +17,14 @@ from planners.models.ltf import Ltf
 from planners.models.planner import Planner, evaluating
 from planners.models.registry import PlannerChoice
 from planners.published.families import SCORES
-from planners.published.formula import inputs, weight
+from planners.published.formula import CELLS, FROZEN, SEED, inputs, weight
 from planners.published.imported import Imported, imported
 from planners.training.train import PlannerEntry
 from tasks.world.arrays import Array
 
-FROZEN = {"vocab": "vocabulary", "plan_anchor": "anchors"}  # last word of a public name -> the input that it is
-CELLS = 8  # of the map from above every so many rows and columns are compared
 GRADIENTS = "gradients"
 ROUNDING_OF_GRADIENTS = 100.0  # in float32 ours are up to 8e-4 of themselves away from ours in float64 (LTF)
 ROUNDING_OF_BOXES = 10.0  # their metres are 32 times what a head says
-SEED = 0  # of what a model itself draws
 WITHOUT_DROPOUT = {  # generators differ, and dropout with them
     "ltf": ["planner.settings.fusion.dropout=0.0"],
     "diffusiondrive": ["planner.settings.fusion.dropout=0.0", "planner.settings.dropout=0.0"],

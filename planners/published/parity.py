@@ -84,9 +84,15 @@ def said_beside(request: Request, case: str, folder: Path) -> tuple[Path, Path |
     words = [str(checkout), str(code), case, str(request.width), str(request.height), str(said)]
     words += [str(int(request.train)), str(checkpoint) if request.checkpoints else ""]
     environment = {"NAVSIM_EXP_ROOT": str(folder), **os.environ}
-    done = subprocess.run(  # noqa: S603 - the user's own interpreter
-        [request.python, "-c", BESIDE, *words], cwd=folder, env=environment, capture_output=True, text=True, check=False
-    )
+    # it starts in another folder; resolved, a virtual environment's link would lead out of it
+    python = str(Path(request.python).absolute()) if "/" in request.python else request.python
+    asked = [python, "-c", BESIDE, *words]
+    try:
+        done = subprocess.run(  # noqa: S603 - the user's own interpreter
+            asked, cwd=folder, env=environment, capture_output=True, text=True, check=False
+        )
+    except OSError as error:
+        raise Refused(f"python={request.python} could not be started: {error.strerror}") from error
     if done.returncode:
         last = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
         raise Refused(f"{request.python} could not run the {case} of {request.code}: {last}")

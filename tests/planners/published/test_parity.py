@@ -4,6 +4,7 @@
 them anew.
 """
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,14 +13,14 @@ import pytest
 import torch
 from torch import Tensor
 
+from factory.config.arguments import Refused, parse
 from factory.config.compose import ConfigError
 from planners.models.registry import PlannerChoice
 from planners.published.families import SCORES
-from planners.published.formula import inputs, weight
+from planners.published.formula import FROZEN, inputs, weight
 from planners.published.imported import imported
 from planners.published.ours import (
     CASES,
-    FROZEN,
     GRADIENTS,
     Difference,
     PublicRecord,
@@ -30,6 +31,7 @@ from planners.published.ours import (
     preset,
     read_recorded,
 )
+from planners.published.parity import Request, said_beside
 
 RECORDED = Path(__file__).parent / "recorded"
 TOLERANCE = 1e-4
@@ -172,6 +174,23 @@ def test_a_record_holds_where_it_is_from_and_others_are_refused(tmp_path: Path) 
     np.savez(tmp_path / "b.npz", told=np.array("{}"))
     with pytest.raises(ConfigError, match="no record of a public model"):
         read_recorded(tmp_path / "b.npz")
+
+
+def test_what_the_command_cannot_do_is_refused_in_one_line(tmp_path: Path) -> None:
+    code = tmp_path / "public"
+    (code / "navsim" / "agents").mkdir(parents=True)
+    for words, said in (
+        ([str(tmp_path), "python=python"], "there is no navsim/agents in it"),
+        ([str(code), "python=python", "cases=[ltf,lft]"], "cases=lft: give some of ltf, "),
+        ([str(code), "python=python", "width=100"], "width=100 height=64: both must be multiples of 32"),
+    ):
+        with pytest.raises(Refused, match=said):
+            parse(Request, words)
+    silent = Request(str(code), str(tmp_path / "absent"))
+    with pytest.raises(Refused, match="absent could not be started"):
+        said_beside(silent, "ltf", tmp_path)
+    with pytest.raises(Refused, match=r"could not run the ltf of .*No module named"):
+        said_beside(replace(silent, python=sys.executable), "ltf", tmp_path)
 
 
 def test_a_difference_is_judged_with_what_rounding_makes_of_it() -> None:
