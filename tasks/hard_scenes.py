@@ -58,6 +58,17 @@ class GivenScenes:
         return scene_of_clip(dict(self.follow_ups)[candidate][before])
 
 
+@dataclass(frozen=True)
+class OneStageClip:
+    """One clip of a one-stage benchmark: a logged frame, whose earlier one is another clip's or none."""
+
+    clip: Clip
+
+    def stage_one(self) -> Scene:
+        """The logged scene at T."""
+        return scene_of_clip(self.clip)
+
+
 def frame_digest(frame: str, planner: PdmSettings) -> str:
     """Of what a frame (one of tasks.stages.FRAMES) is made by, as an expert's."""
     if frame == HUMAN_BEFORE:

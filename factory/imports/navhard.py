@@ -220,7 +220,8 @@ def write_benchmark(store: Store, groups: Sequence[SceneGroup], reader: GroupRea
         named = {"clip_id": group.clip_id, "dataset": DATASET, "log_id": reader.log_id(group), "start_ms": 0}
         wanted = {(e.clip_id, e.expert, e.candidate_index) for e in entries_of([group], reader)}
         if wanted <= made and group.clip_id in scenes:
-            clips.append({**named, "follow_ups": list(range(len(group.pairs)))})
+            tokens = {"tokens": [group.now, group.before], "follow_up_tokens": [list(pair) for pair in group.pairs]}
+            clips.append({**named, "follow_ups": list(range(len(group.pairs))), **tokens})
         else:
             left_out.append({**named, "why": "failed", "follow_ups": len(group.pairs)})
     document = {

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from factory.store.location import Location
 
 if TYPE_CHECKING:
-    from tasks.hard_scenes import BenchmarkClip, GivenScenes
+    from tasks.hard_scenes import BenchmarkClip, GivenScenes, OneStageClip
 
 FORMAT = 1
 PACKAGES = ("tasks.", "factory.")  # whose dataclasses and enums a file may name
@@ -85,19 +85,19 @@ class SceneFiles:
 
     location: Location
 
-    def store(self, scenes: "BenchmarkClip | GivenScenes") -> None:
+    def store(self, scenes: "BenchmarkClip | GivenScenes | OneStageClip") -> None:
         """Whole or not at all; in place of an older one."""
         self.location.write(f"{scenes.clip.clip_id}.npz", encode(scenes))
 
-    def load(self, clip_id: str) -> "BenchmarkClip | GivenScenes":
+    def load(self, clip_id: str) -> "BenchmarkClip | GivenScenes | OneStageClip":
         """Raises FileNotFoundError where the clip has none, BadCacheFile for a damaged or foreign file."""
-        from tasks.hard_scenes import BenchmarkClip, GivenScenes
+        from tasks.hard_scenes import BenchmarkClip, GivenScenes, OneStageClip
 
         data = self.location.read(f"{clip_id}.npz")
         if data is None:
             raise FileNotFoundError(f"{self.location.uri}/{clip_id}.npz: no scenes of this clip; run the factory again")
         scenes = decode(data)
-        if not isinstance(scenes, BenchmarkClip | GivenScenes):
+        if not isinstance(scenes, BenchmarkClip | GivenScenes | OneStageClip):
             raise BadCacheFile(f"{self.location.uri}/{clip_id}.npz holds {type(scenes).__name__}, not a clip's scenes")
         return scenes
 

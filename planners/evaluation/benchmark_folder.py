@@ -5,7 +5,8 @@ benchmark.json says which clips count and with which follow-ups; what else stand
 
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -15,6 +16,8 @@ from factory.store.cache import SceneFiles
 from factory.store.location import Location
 from factory.store.reader import Sample, SampleTable
 from planners.evaluation.frames import ClipScenes, FrameKey, FramePair
+from tasks.hard_scenes import BenchmarkClip, GivenScenes, OneStageClip
+from tasks.world.clip import Scene
 
 IDENTITY = ("attempt_id", "clip_id", "expert", "candidate_index", "image_source", "settings_hash", "stage_versions")
 HOW = "make it with python -m factory.run preset=hard_benchmark, to its end"
@@ -31,14 +34,15 @@ class BenchmarkFolder:
         """
         self.path, location = path, Location.parse(path)
         self._document = location.read(BENCHMARK_FILE) or b""
-        self._follow_ups, self._logs = _clips_of(path, self._document)
+        self._listed = _listed(path, self._document)
+        self._follow_ups = {clip_id: clip.follow_ups for clip_id, clip in self._listed.clips.items()}
         try:
             self.table = SampleTable(path)
         except (FileNotFoundError, ValueError) as error:
             raise ConfigError(f"benchmark={path}: {error}") from error
         rows = self.table.table(IDENTITY).to_pylist()
         found = {FrameKey(row["clip_id"], row["expert"], row["candidate_index"]): row for row in rows}
-        wanted = [key for clip_id in self._follow_ups for key in _frames_of(clip_id, self._follow_ups[clip_id])]
+        wanted = [key for clip_id in self._listed.clips for key in self._frames_of(clip_id)]
         if lacking := [key for key in wanted if key not in found]:
             raise ConfigError(f"benchmark={path}: {lacking[0]} has no sample: {HOW}")
         self._rows = {key: found[key] for key in wanted}
@@ -66,7 +70,33 @@ class BenchmarkFolder:
 
     def log_of(self, clip_id: str) -> str:
         """The id of the clip's log."""
-        return self._logs[clip_id]
+        return self._listed.clips[clip_id].log_id
+
+    @property
+    def one_stage(self) -> bool:
+        """Whether each clip is one logged frame."""
+        return self._listed.stages == 1
+
+    @property
+    def left_out(self) -> int:
+        """Clips that were asked for and do not count."""
+        return self._listed.left_out
+
+    @cached_property
+    def tokens(self) -> dict[FrameKey, str]:
+        """NAVSIM's tokens of the frames; none where it was not made of NAVSIM's files."""
+        named = [(clip.tokens, self._frames_of(clip_id)) for clip_id, clip in self._listed.clips.items()]
+        return {key: token for tokens, keys in named if tokens for key, token in zip(keys, tokens, strict=True)}
+
+    def before_of(self, clip_id: str) -> str | None:
+        """The clip whose frame is the one 0.5 s before, of a one-stage benchmark; None: there is none."""
+        return self._listed.clips[clip_id].before
+
+    def _frames_of(self, clip_id: str) -> list[FrameKey]:
+        """Now and before of the log, then of each follow-up; of one stage now alone."""
+        now, before = FrameKey.logged(clip_id)
+        follow_ups = (key for i in self._follow_ups[clip_id] for key in FrameKey.follow_up(clip_id, i))
+        return [now] if self.one_stage else [now, before, *follow_ups]
 
     def image_source(self, key: FrameKey) -> str:
         """photo, render, map or none."""
@@ -86,8 +116,10 @@ class BenchmarkFolder:
 
     def scenes(self, clip_id: str) -> ClipScenes:
         """The worlds of a clip's frames. Raises ConfigError where the file is damaged or lacks one."""
+        stored = self._stored(clip_id)
         try:
-            stored = self._scenes.load(clip_id)
+            if isinstance(stored, OneStageClip):
+                raise ConfigError(f"benchmark={self.path} is of one stage: it has no pairs of frames")
             return ClipScenes(
                 clip_id,
                 FramePair(stored.stage_one(), stored.stage_one(before=True)),
@@ -97,34 +129,69 @@ class BenchmarkFolder:
                 },
             )
         except (ValueError, KeyError) as error:
-            raise ConfigError(f"benchmark={self.path}: scenes of clip {clip_id}: {error}: {HOW}") from error
+            if isinstance(error, ConfigError):
+                raise
+            raise self._damaged(clip_id, error) from error
+
+    def scene(self, clip_id: str) -> Scene:
+        """The world of the logged frame now. Raises ConfigError where the file is damaged."""
+        return self._stored(clip_id).stage_one()
+
+    def _stored(self, clip_id: str) -> BenchmarkClip | GivenScenes | OneStageClip:
+        try:
+            return self._scenes.load(clip_id)
+        except (ValueError, KeyError) as error:
+            raise self._damaged(clip_id, error) from error
+
+    def _damaged(self, clip_id: str, error: Exception) -> ConfigError:
+        return ConfigError(f"benchmark={self.path}: scenes of clip {clip_id}: {error}: {HOW}")
+
+
+@dataclass(frozen=True)
+class _Clip:
+    """An entry of benchmark.json."""
+
+    log_id: str
+    follow_ups: tuple[int, ...]
+    tokens: tuple[str, ...]  # of its frames; none where they are not of NAVSIM
+    before: str | None  # of one stage
+
+
+@dataclass(frozen=True)
+class _Listed:
+    """What benchmark.json says."""
+
+    stages: int
+    clips: Mapping[str, _Clip]
+    left_out: int
 
 
 def logs_of(path: str) -> dict[str, str]:
     """Clip -> log of a benchmark, from its document alone. Raises ConfigError where there is none."""
-    return _clips_of(path, Location.parse(path).read(BENCHMARK_FILE) or b"")[1]
+    clips = _listed(path, Location.parse(path).read(BENCHMARK_FILE) or b"").clips
+    return {clip_id: clip.log_id for clip_id, clip in clips.items()}
 
 
-def _clips_of(path: str, document: bytes) -> tuple[dict[str, list[int]], dict[str, str]]:
-    """Clip -> candidate indices of its follow-ups, clip -> its log."""
+def _listed(path: str, document: bytes) -> _Listed:
     if not document:
         raise ConfigError(f"benchmark={path}: no {BENCHMARK_FILE} here: {HOW}")
     try:
         stored: dict[str, Any] = json.loads(document)
         if stored["format"] != FORMAT:
             raise ConfigError(f"benchmark={path}: format {stored['format']}, this version reads {FORMAT}")
-        clips = {str(clip["clip_id"]): [int(i) for i in clip["follow_ups"]] for clip in stored["clips"]}
-        logs = {str(clip["clip_id"]): str(clip["log_id"]) for clip in stored["clips"]}
+        clips = {str(clip["clip_id"]): _clip(clip) for clip in stored["clips"]}
+        left_out = stored["left_out"]
     except (KeyError, TypeError, ValueError) as error:
         if isinstance(error, ConfigError):
             raise
         raise ConfigError(f"benchmark={path}: {BENCHMARK_FILE} cannot be read ({error}): {HOW}") from error
     if not clips:
-        why = "; ".join(sorted({str(clip["why"]) for clip in stored["left_out"]})) or "it read none"
+        why = "; ".join(sorted({str(clip["why"]) for clip in left_out})) or "it read none"
         raise ConfigError(f"benchmark={path}: none of its clips counts: {why}")
-    return clips, logs
+    return _Listed(int(stored.get("stages", 2)), clips, len(left_out))
 
 
-def _frames_of(clip_id: str, follow_ups: Sequence[int]) -> list[FrameKey]:
-    """Now and before of the log, then of each follow-up."""
-    return [*FrameKey.logged(clip_id), *(key for i in follow_ups for key in FrameKey.follow_up(clip_id, i))]
+def _clip(entry: Mapping[str, Any]) -> _Clip:
+    pairs = entry.get("follow_up_tokens", ())
+    tokens = (*entry.get("tokens", ()), *(token for pair in pairs for token in pair))
+    return _Clip(str(entry["log_id"]), tuple(map(int, entry["follow_ups"])), tokens, entry.get("before"))

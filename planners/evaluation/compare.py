@@ -4,7 +4,10 @@
     python -m planners compare a=[eval/real_0,eval/real_1] b=[eval/sim_0,eval/sim_1] out=difference.csv
     python -m planners compare table=docs/study/clips.csv a=gtrs_dense-real-steps-0 b=gtrs_dense-pdm_closed5-epochs-0
 
-A run is a folder that `python -m planners evaluate` made of one planner, or a column of a study's clips.csv. Several
+    python -m planners compare a=ltf_sim_navhard.csv.gz b=evaluations/ltf
+
+A run is a folder that `python -m planners evaluate` made of one planner, a column of a study's clips.csv, or a table
+that NAVSIM's own scripts wrote (`.csv`, `.csv.gz`), against which a folder stands with the tables that it has. Several
 runs of a side are trainings of one planner with other seeds: clips and seeds are both drawn, pairs of seeds where both
 sides have equally many. Intervals over logs and over towns, where they are known, draw all clips of one together:
 clips of one log share their scene, and an interval over clips alone is too narrow.
@@ -23,6 +26,7 @@ from planners.command import command
 from planners.evaluation.aggregation import ClipResult, by_clip
 from planners.evaluation.bootstrap import LEVELS, Interval, clusters_of, paired_interval
 from planners.evaluation.clip_scores import Measured, check_same_clips, measured, read_clips
+from planners.evaluation.public import held
 from planners.evaluation.score_rows import read_record, read_rows
 from planners.evaluation.score_table import FILTERS_NOTE
 from tasks.reward.one_stage import COLUMNS
@@ -32,7 +36,7 @@ from tasks.reward.one_stage import COLUMNS
 class CompareSettings:
     """Everything on the command line of `planners compare`."""
 
-    a: str | list[str]  # folder of an evaluated planner, or a list of them
+    a: str | list[str]  # folder of an evaluated planner, table of NAVSIM's, or a list of them
     b: str | list[str]
     table: str | None = None  # clips.csv of a study, of which a and b are columns
     column: str = "score"  # or a sub-score: nc dac tlc ddc ep ttc lk hc ec
@@ -42,7 +46,7 @@ class CompareSettings:
     out: str | None = None  # a CSV file
 
 
-Measure = tuple[str, str]  # stage, human filter
+Measure = held.Measure
 ByLevel = Mapping[str, Interval]  # of planners.evaluation.bootstrap.LEVELS, those that are known
 
 
@@ -103,25 +107,38 @@ def is_clear_row(row: Mapping[str, Any]) -> bool:
     return bool(known) and all(row[f"low{end}"] > 0.0 or row[f"high{end}"] < 0.0 for end in known)
 
 
-def text_of(found: Mapping[Measure, ByLevel], confidence: float) -> str:
-    """A table to be printed."""
+def compare_tables(a: Sequence[str], b: Sequence[str], settings: CompareSettings) -> dict[Measure, ByLevel]:
+    """The same where a run is a table of NAVSIM's. Raises ConfigError."""
+    runs = held.read_side(a), held.read_side(b)
+    of_a, of_b = (held.measured_of(side, settings.column) for side in runs)
+    held.check_same_tokens(of_a, of_b)
+    found: dict[Measure, ByLevel] = dict(intervals(of_a, of_b, settings))
+    summaries = held.summaries(*runs, settings.column)
+    return found | {name: {"clip": one} for name, one in summaries.items()}
+
+
+def text_of(found: Mapping[Measure, ByLevel], confidence: float, of_tables: bool = False) -> str:
+    """A table to be printed; of_tables: of `compare_tables`."""
     percent = f"{100 * confidence:g} %"
     levels = [level for level in LEVELS if any(level in by_level for by_level in found.values())]
     over = "".join(f"   {f'{percent} over {level}s':<18}" for level in levels)
     lines = [f"{'stage':<10} {'filter':<11}{'a':>9}{'b':>9}{'b - a':>9}{over}"]
     for (stage, human_filter), by_level in found.items():
         one = by_level["clip"]
-        said = "".join(f"   {_bounds(by_level[level]):<18}" for level in levels)
+        nothing = "no interval" if of_tables else "only one"
+        said = "".join(f"   {_bounds(by_level[level], nothing):<18}" for level in levels)
         line = f"{stage:<10} {human_filter:<11}{one.a:9.4f}{one.b:9.4f}{one.difference:+9.4f}{said}"
         lines.append(f"{line}{'  *' if is_clear(by_level) else ''}".rstrip())
     lines.append(f"*: zero lies outside of each {percent} interval")
-    if "log" not in levels:
+    if of_tables:
+        lines.append(held.NOTE)
+    elif "log" not in levels:
         lines.append("the runs do not say which log a clip is of: evaluate them again for intervals over logs")
     return "\n".join([*lines, *FILTERS_NOTE])
 
 
-def _bounds(one: Interval) -> str:
-    return f"{one.low:+.4f} .. {one.high:+.4f}" if np.isfinite(one.low) else "only one"
+def _bounds(one: Interval, nothing: str) -> str:
+    return f"{one.low:+.4f} .. {one.high:+.4f}" if np.isfinite(one.low) else nothing
 
 
 def write_csv(path: Path, found: Mapping[Measure, ByLevel]) -> None:
@@ -163,16 +180,19 @@ def main(argv: Sequence[str]) -> None:
     settings = fill(CompareSettings, compose("compare", argv, CompareSettings), "compare")
     if settings.column not in COLUMNS:
         raise ConfigError(f"compare.column={settings.column}: one of {', '.join(COLUMNS)}")
+    of_tables = False
     sides = [[side] if isinstance(side, str) else side for side in (settings.a, settings.b)]
     if settings.table is not None:
         if settings.column != "score":
             raise ConfigError(f"compare.column={settings.column}: {settings.table} holds scores alone")
         of_a, of_b = (read_clips(Path(settings.table), side) for side in sides)
         found = intervals(of_a, of_b, settings)
+    elif of_tables := any(map(held.is_table, [*sides[0], *sides[1]])):
+        found = compare_tables(sides[0], sides[1], settings)
     else:
         a, b = (read_runs(side) for side in sides)
         check_same_rules([*sides[0], *sides[1]])
         found = compare(a, b, settings)
-    print(text_of(found, settings.confidence))
+    print(text_of(found, settings.confidence, of_tables))
     if settings.out is not None:
         write_csv(Path(settings.out), found)

@@ -12,6 +12,7 @@ is not planned or scored again unless it, the benchmark or the rules changed; th
 All planners of a command share what scoring prepares of a frame, so name several at once.
 
     summary.csv, summary.png      all planners of this command
+    <planner>/navsim_*.csv        of NAVSIM's benchmarks: the tables that its own scripts write, by the score's filter
     one_stage                     the logged frames, as navtest
     stage_one, stage_two, final   as navhard: stage two weighted by how near a follow-up starts to the plan's end,
                                   final the product of both stages
@@ -37,13 +38,24 @@ from planners.evaluation.benchmark_folder import BenchmarkFolder
 from planners.evaluation.frames import Benchmark, FrameKey
 from planners.evaluation.planner_names import EvaluatedPlanner, composed, needs_of, planners_of
 from planners.evaluation.planning import all_plans
+from planners.evaluation.public.tables import write_tables
 from planners.evaluation.score_rows import RECORD, FrameRow, is_done, read_rows, write_record, write_rows
 from planners.evaluation.score_table import table_text, write_table
-from planners.evaluation.scoring import Plans, Rules, prepare_clip, score_clip
+from planners.evaluation.scoring import (
+    ClipFrames,
+    LoneFrame,
+    Plans,
+    Rules,
+    prepare_clip,
+    prepare_lone,
+    score_clip,
+    score_lone,
+)
 from planners.evaluation.tags import TAG_COLUMNS, tags_of
 from tasks.experts.pdm_closed.planner import PdmSettings
 from tasks.rollout.simulate import TrafficSettings
 from tasks.stages import stage_versions
+from tasks.world.arrays import Array
 
 MOST_UNIFORM = 0.2  # share of clips in the uniform fallback
 
@@ -108,6 +120,8 @@ def evaluate(benchmark: Benchmark, who: Sequence[EvaluatedPlanner], settings: Ev
         for one in waiting:
             (out / one.label / RECORD).unlink(missing_ok=True)  # what the folder holds is about to be replaced
             write_rows(out / one.label, rows[one.label])
+            if benchmark.tokens:
+                write_tables(out / one.label, rows[one.label], benchmark.tokens)
             write_record(out / one.label, {**identities[one.label], "planner": one.label, "frames": len(keys)})
     lines = [line for one in who for line in lines_of(one.label, summarise(read_rows(out / one.label)))]
     if settings.tables:
@@ -143,19 +157,32 @@ def _scored(
     rows: dict[str, list[FrameRow]] = {one.label: [] for one in who}
     clips = list(dict.fromkeys(key.clip_id for key in keys))
     tags = {key: tags_of(sample) for key, sample in benchmark.stream(TAG_COLUMNS)}
+    driven: dict[tuple[str, str | None], Array] = {}  # of the clip before
     spent = 0.0
     with Counter("clips scored", len(clips)) as progress:
         for done, clip_id in enumerate(clips, start=1):
-            prepared = prepare_clip(benchmark.scenes(clip_id), rules)
+            prepared = _prepared(benchmark, clip_id, rules)
             began = time.perf_counter()
+            last, driven = driven, {}
             for one in who:
-                own = plans[one.label] if one.privileged is None else one.privileged(prepared)
-                scored = score_clip(prepared, own, tags)
+                own = plans[one.label] if one.privileged is None else one.privileged(prepared.frames)
+                if isinstance(prepared, LoneFrame):
+                    before = last.get((one.label, benchmark.before_of(clip_id)))
+                    row, driven[one.label, clip_id] = score_lone(prepared, own, before, tags)
+                    scored = [row]
+                else:
+                    scored = score_clip(prepared, own, tags)
                 rows[one.label] += [replace(row, log_id=benchmark.log_of(clip_id)) for row in scored]
             spent += time.perf_counter() - began
             n_rows = sum(map(len, rows.values()))
             progress.show(done, f"{1000.0 * spent / n_rows:.1f} ms a frame and planner")
     return rows
+
+
+def _prepared(benchmark: Benchmark, clip_id: str, rules: Rules) -> ClipFrames | LoneFrame:
+    if benchmark.one_stage:
+        return prepare_lone(clip_id, benchmark.scene(clip_id), rules)
+    return prepare_clip(benchmark.scenes(clip_id), rules)
 
 
 def fallback_notes(lines: Sequence[SummaryLine]) -> list[str]:

@@ -1,7 +1,8 @@
 """The frames of a benchmark: what a planner is shown, and the worlds its plans are driven in.
 
 A clip has a logged frame now (at T) and one 0.5 s before; and for each follow-up a simulated frame now (at T+H) and one
-0.5 s before. Planning reads the samples, scoring the scenes: neither needs the other.
+0.5 s before. In a one-stage benchmark it is a logged frame alone, and the one 0.5 s before is another clip's, if any's.
+Planning reads the samples, scoring the scenes: neither needs the other.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -70,6 +71,12 @@ class Benchmark(Protocol):
     @property
     def keys(self) -> Sequence[FrameKey]: ...
 
+    @property
+    def tokens(self) -> Mapping[FrameKey, str]: ...  # NAVSIM's of the frames; none where they are not of NAVSIM
+
+    @property
+    def one_stage(self) -> bool: ...  # has `scene` and `before_of` in place of `scenes`
+
     def log_of(self, clip_id: str) -> str: ...
 
     def image_source(self, key: FrameKey) -> str: ...
@@ -79,3 +86,7 @@ class Benchmark(Protocol):
     def sample(self, key: FrameKey) -> Sample: ...
 
     def scenes(self, clip_id: str) -> ClipScenes: ...
+
+    def scene(self, clip_id: str) -> Scene: ...
+
+    def before_of(self, clip_id: str) -> str | None: ...

@@ -30,13 +30,14 @@ from factory.config.compose import ConfigError, compose
 from factory.config.plugins import installed, names
 from factory.config.words import nearest
 from planners.data.batch import Needs
-from planners.evaluation.scoring import ClipFrames, Plans, human_plans, pdm_plans
+from planners.evaluation.frames import FrameKey
+from planners.evaluation.scoring import Plans, PreparedFrame, human_plans, pdm_plans
 from planners.models.gtrs_dense import Ensemble, GtrsDense
 from planners.models.planner import Planner
 from planners.models.registry import BUILT_IN, OWN, PlannerChoice, build_planner
 from planners.training import checkpoint
 
-Privileged = Callable[[ClipFrames], Plans]
+Privileged = Callable[[Mapping[FrameKey, PreparedFrame]], Plans]  # of a clip's frames
 
 PRIVILEGED: Mapping[str, Privileged] = {"human": human_plans, "pdm_closed": pdm_plans}
 UNTRAINED = ("constant_velocity",)

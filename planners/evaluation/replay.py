@@ -131,7 +131,7 @@ def replay(
 
 def _plans(benchmark: Benchmark, one: EvaluatedPlanner, prepared: ClipFrames) -> Mapping[FrameKey, Array]:
     if one.privileged is not None:
-        return one.privileged(prepared)
+        return one.privileged(prepared.frames)
     assert one.load is not None
     made = one.load()
     keys = [key for key in benchmark.keys if key.clip_id == prepared.clip_id]

@@ -128,6 +128,34 @@ class ClipFrames:
     logged: PreparedPair  # the same among the two-stage evaluation's
     follow_ups: Mapping[int, PreparedPair]  # candidate index -> frames
 
+    @property
+    def frames(self) -> dict[FrameKey, PreparedFrame]:
+        """Every frame that is planned from."""
+        pairs = [(FrameKey.logged(self.clip_id), self.logged)]
+        pairs += [(FrameKey.follow_up(self.clip_id, i), pair) for i, pair in self.follow_ups.items()]
+        return {key: frame for keys, pair in pairs for key, frame in zip(keys, pair)}
+
+
+@dataclass(frozen=True)
+class LoneFrame:
+    """A clip of a one-stage benchmark."""
+
+    key: FrameKey
+    frame: PreparedFrame
+
+    @property
+    def frames(self) -> dict[FrameKey, PreparedFrame]:
+        """It alone."""
+        return {self.key: self.frame}
+
+
+def prepare_lone(clip_id: str, scene: Scene, rules: Rules) -> LoneFrame:
+    """Everything of a logged frame that does not depend on a plan. Raises ValueError naming the clip."""
+    try:
+        return LoneFrame(FrameKey.logged(clip_id).now, prepare_frame(scene, rules.one_stage, rules.pdm, logged=True))
+    except ValueError as error:
+        raise ValueError(f"clip {clip_id}: {error}") from error
+
 
 def prepare_clip(scenes: ClipScenes, rules: Rules) -> ClipFrames:
     """Everything of a clip's frames that does not depend on a plan. Raises ValueError naming clip and frame."""
@@ -149,17 +177,37 @@ def prepare_clip(scenes: ClipScenes, rules: Rules) -> ClipFrames:
 Plans = Mapping[FrameKey, Array]  # frame -> (40, 3) in its ego frame
 
 
-def human_plans(clip: ClipFrames) -> dict[FrameKey, Array]:
+def human_plans(frames: Mapping[FrameKey, PreparedFrame]) -> dict[FrameKey, Array]:
     """The log's drive where there is one: nobody drove from a follow-up frame."""
-    poses = [frame.human_poses for frame in clip.logged if frame.human_poses is not None]
-    return dict(zip(FrameKey.logged(clip.clip_id), poses, strict=True))
+    return {key: frame.human_poses for key, frame in frames.items() if frame.human_poses is not None}
 
 
-def pdm_plans(clip: ClipFrames) -> dict[FrameKey, Array]:
+def pdm_plans(frames: Mapping[FrameKey, PreparedFrame]) -> dict[FrameKey, Array]:
     """PDM-Closed's proposal from every frame."""
-    pairs = [(FrameKey.logged(clip.clip_id), clip.logged)]
-    pairs += [(FrameKey.follow_up(clip.clip_id, i), pair) for i, pair in clip.follow_ups.items()]
-    return {key: frame.pdm_poses for keys, pair in pairs for key, frame in zip(keys, pair)}
+    return {key: frame.pdm_poses for key, frame in frames.items()}
+
+
+def score_lone(
+    lone: LoneFrame, plans: Plans, before: Array | None, tags: Mapping[FrameKey, Sequence[str]]
+) -> tuple[FrameRow, Array]:
+    """The row of a one-stage benchmark's frame, and the states (41, 11) that its plan was driven to.
+
+    before: those of the same planner's plan 0.5 s before; None: there is no such frame, the row has no extended comfort
+    and its score goes without (docs/reward.md 2k). Raises ValueError as `score_clip`.
+    """
+    poses, start = _checked(lone.key, plans), lone.frame.scene.ego_state[: HEADING + 1]
+    driven = drive(lone.frame, poses)
+    ec = np.nan if before is None else float(extended_comfort(driven.states[None], before[None], INTERVAL_S).ec[0])
+    row = FrameRow(
+        stage="one_stage",
+        key=lone.key,
+        scores=frame_scores(driven.scores, lone.frame.human, ec),
+        progress_m=float(driven.scores.ep_raw_m[0]),
+        start=start,
+        end=to_world(start, poses[-1]),
+        tags=tuple(tags.get(lone.key, ())),
+    )
+    return row, driven.states
 
 
 def score_clip(clip: ClipFrames, plans: Plans, tags: Mapping[FrameKey, Sequence[str]] | None = None) -> list[FrameRow]:

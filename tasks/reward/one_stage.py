@@ -73,7 +73,10 @@ def means_of(frames: Sequence[FrameScores]) -> FrameScores:
 
 
 def means_over(columns: Array) -> Array:
-    """Means (C,) of rows (N, C), each over the rows that have the column; NaN where none does."""
+    """Means (C,) of rows (N, C), each over the rows that have the column; NaN where none does.
+
+    Each column is summed by itself, in pairs as pandas sums it: the published means come back to the last digit.
+    """
     known = ~np.isnan(columns)
-    total = np.where(known, columns, 0.0).sum(axis=0)
+    total = np.ascontiguousarray(np.where(known, columns, 0.0).T).sum(axis=1)
     return np.divide(total, known.sum(axis=0), out=np.full(len(total), np.nan), where=known.any(axis=0))

@@ -89,6 +89,8 @@ class StreetBenchmark:
         self._scenes = {clip_id: clip_scenes(replace(street_clip(), clip_id=clip_id)) for clip_id in clip_ids}
         frames = {key: scene for scenes in self._scenes.values() for key, scene in frames_of(scenes).items()}
         self.keys = tuple(frames)
+        self.tokens: dict[FrameKey, str] = {}
+        self.one_stage = False
         self._rows = {key: sample(key, scene) for key, scene in frames.items()}
 
     def log_of(self, clip_id: str) -> str:
@@ -107,6 +109,12 @@ class StreetBenchmark:
 
     def scenes(self, clip_id: str) -> ClipScenes:
         return self._scenes[clip_id]
+
+    def scene(self, clip_id: str) -> Scene:
+        return self._scenes[clip_id].logged.now
+
+    def before_of(self, clip_id: str) -> str | None:
+        return None
 
 
 def sample(key: FrameKey, scene: Scene) -> dict[str, Any]:

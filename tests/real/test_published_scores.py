@@ -13,8 +13,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from planners.evaluation.compare import main
+from planners.evaluation.public.tables import read_table
 from tasks.reward.epdms import Scores
-from tasks.reward.one_stage import COLUMNS, FrameScores, columns_of, means_of
+from tasks.reward.one_stage import COLUMNS, FrameScores, columns_of, means_of, means_over
 from tasks.subscores import RECORDS
 
 Array = NDArray[np.float64]
@@ -126,3 +128,34 @@ def test_the_published_stage_two_is_no_plain_mean_of_the_follow_up_rows(shared_r
     # A weighted mean lies within its rows in every column.
     assert (stage_two >= published.stage_two.min(axis=0)).all()
     assert (stage_two <= published.stage_two.max(axis=0)).all()
+
+
+@pytest.mark.parametrize("name", ["ltf_sim_navtest", *NAVHARD])
+def test_a_released_table_makes_its_own_summary_again_to_the_last_digit(shared_root: Path, name: str) -> None:
+    """Of logged frames, in every column; which rows weigh what in stage two, no file says."""
+    table = read_table(shared_root / "reference" / "simscale_csv" / f"{name}.csv.gz")
+    assert table.human_filter == "unfiltered" and not table.failed
+    again, published = means_over(np.stack(list(table.logged.values()))), table.summary[table.stage]
+    # the public script takes rows in the split's order, which the file has not: one score ends in another bit
+    ends_otherwise = [SCORE] if name.startswith("gtrs") else []
+    np.testing.assert_array_equal(np.delete(again, ends_otherwise), np.delete(published, ends_otherwise))
+    np.testing.assert_array_max_ulp(again, published, 2)
+
+
+def test_compare_takes_released_tables_on_both_sides(
+    shared_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    a, b = (shared_root / "reference" / "simscale_csv" / f"{name}.csv.gz" for name in NAVHARD)
+    assert main([f"a={a}", f"b={b}", "draws=50", f"out={tmp_path / 'found.csv'}"]) == 0
+    capsys.readouterr()
+    with (tmp_path / "found.csv").open() as file:
+        found = {(row["stage"], row["human_filter"]): row for row in csv.DictReader(file)}
+    assert len(found) == 5
+    for side, name in zip("ab", NAVHARD):
+        combined = next(row for row in rows_of(shared_root, name) if row["token"] == "extended_pdm_score_combined")
+        assert float(found["final", "unfiltered"][side]) == float(combined["score"])
+        assert float(found["stage_two", "none"][side]) == pytest.approx(NAVHARD[name], abs=1e-11)
+        stage_one = navhard(shared_root, name).summary["stage_one"][SCORE]
+        assert float(found["stage_one", "unfiltered"][side]) == pytest.approx(stage_one, abs=1e-14)
+    assert (found["final", "unfiltered"]["low"], found["final", "unfiltered"]["high"]) == ("", "")
+    assert float(found["stage_one", "unfiltered"]["low"]) > 0.0

@@ -105,7 +105,7 @@ def test_the_pair_shares_its_extended_comfort(clip: ClipFrames) -> None:
 
 def test_human_and_pdm_closed_bound_a_plan_that_stands_or_races(clip: ClipFrames) -> None:
     scenes = clip_scenes()
-    human, pdm = score_clip(clip, human_plans(clip)), score_clip(clip, pdm_plans(clip))
+    human, pdm = score_clip(clip, human_plans(clip.frames)), score_clip(clip, pdm_plans(clip.frames))
     bad = [score_clip(clip, same_plan_everywhere(scenes, straight(v))) for v in (0.0, 25.0)]
     for i in range(3):
         assert human[i].scores.filtered[SCORE] > 0.9

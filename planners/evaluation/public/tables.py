@@ -1,0 +1,203 @@
+"""NAVSIM's own table of a planner's scores: the CSV of `run_pdm_score.py` and `run_pdm_score_one_stage.py`.
+
+A row for each token, then the summary: the mean of one stage, or stage one, stage two and both combined of two stages
+(autonomousvision/navsim @ 0a380a9, navsim/planning/script/run_pdm_score.py:368-455 and run_pdm_score_one_stage.py).
+Both of the code's eras have the same columns. That of the paper (SimScale @ f51ad64) has filtered sub-scores beside an
+unfiltered score, that of today filters the score too: `write_tables` writes one file of each kind.
+"""
+
+import csv
+import gzip
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from planners.evaluation.aggregation import HumanFilter, Summary, by_clip, summary_of
+from planners.evaluation.frames import FrameKey
+from planners.evaluation.score_rows import FrameRow
+from tasks.reward.formula import EC_WEIGHT, TOTAL_WEIGHT, multiplied, weighted
+from tasks.reward.one_stage import COLUMNS, FrameScores, means_over
+from tasks.subscores import RECORDS
+from tasks.world.arrays import Array
+
+FILTERS: tuple[HumanFilter, ...] = ("unfiltered", "filtered")
+LONG = {record.name: record.long_name for record in RECORDS}  # in the public order
+PLACES = [COLUMNS.index(name) for name in LONG]
+ONE, TWO = "_stage_one", "_stage_two"
+SCORE = COLUMNS.index("score")
+AVERAGE = "average_all_frames"
+EXTENDED = {stage: f"extended_pdm_score_{stage}" for stage in ("stage_one", "stage_two", "combined")}
+SAME = 1e-9  # of a mean, whatever the order of its rows; of a row's score, whatever the order of its terms
+
+
+def file_name(human_filter: HumanFilter) -> str:
+    """Of a planner's table in its folder, by the filter of its score."""
+    return f"navsim_{human_filter}.csv"
+
+
+def head_of(two_stage: bool) -> list[str]:
+    """The columns behind the row's number, in their order."""
+    names = [name + end for end in ((ONE, TWO) if two_stage else ("",)) for name in LONG.values()]
+    return ["token", "valid", *names, "score"]
+
+
+def write_tables(folder: Path, rows: Sequence[FrameRow], tokens: Mapping[FrameKey, str]) -> None:
+    """Both tables of a planner's rows; rows of one clip follow each other. Raises KeyError for a frame without token.
+
+    With follow-ups it is the table of two stages, else of one. A row without a score is not `valid`, as one of which
+    the public script says that the agent failed.
+    """
+    results = {clip.clip_id: clip for clip in by_clip(rows)}
+    summary = summary_of([results[clip_id] for clip_id in dict.fromkeys(row.key.clip_id for row in rows)])
+    two_stage = summary.two_stage is not None
+    stages = ("stage_one", "stage_two") if two_stage else ("one_stage",)
+    ordered = [row for stage in stages for row in rows if row.stage == stage]
+    for human_filter in FILTERS:
+        lines = [_line(tokens[row.key], row.stage, row.scores, human_filter, two_stage) for row in ordered]
+        lines += _summary_lines(summary, human_filter, all(line[1] == "True" for line in lines))
+        with (folder / file_name(human_filter)).open("w", newline="") as file:
+            table = csv.writer(file, lineterminator="\n")
+            table.writerow(["", *head_of(two_stage)])
+            table.writerows([number, *line] for number, line in enumerate(lines))
+
+
+def _line(token: str, stage: str, scores: FrameScores, human_filter: HumanFilter, two_stage: bool) -> list[str]:
+    own = scores.filtered[PLACES]
+    none = np.full(len(own), np.nan)
+    numbers = own if not two_stage else np.append(own, none) if stage == "stage_one" else np.append(none, own)
+    score = float(getattr(scores, human_filter)[SCORE])
+    return [token, str(not np.isnan(score)), *map(_text, [*numbers, score])]
+
+
+def _summary_lines(summary: Summary, human_filter: HumanFilter, valid: bool) -> list[list[str]]:
+    two_stage = summary.two_stage
+    if two_stage is None:
+        means = _line(AVERAGE, "one_stage", summary.one_stage, human_filter, False)
+        return [[AVERAGE, str(valid), *means[2:]]]
+    after = FrameScores(two_stage.stage_two, two_stage.stage_two)
+    one, two = (
+        _line(EXTENDED[stage], stage, scores, human_filter, True)[2:]
+        for stage, scores in (("stage_one", two_stage.stage_one), ("stage_two", after))
+    )
+    n, final = len(LONG), float(getattr(two_stage.final, human_filter)[SCORE])
+    combined = [*one[:n], *two[n:-1], _text(final)]
+    return [[EXTENDED[name], str(valid), *line] for name, line in zip(EXTENDED, (one, two, combined))]
+
+
+def _text(value: float) -> str:
+    """The shortest text of just this number, as pandas writes it."""
+    return "" if np.isnan(value) else repr(float(value))
+
+
+@dataclass(frozen=True)
+class PublicTable:
+    """What such a file holds, ours or another's."""
+
+    file: str
+    logged: Mapping[str, Array]  # token -> (C,) COLUMNS
+    follow_ups: Mapping[str, Array]  # the same; none of one stage
+    summary: Mapping[str, Array]  # of one_stage, or stage_one, stage_two and final, of which only the score is anything
+    failed: tuple[str, ...] = ()  # tokens without any number
+
+    @property
+    def stage(self) -> str:
+        """Of the logged frames."""
+        return "one_stage" if "one_stage" in self.summary else "stage_one"
+
+    @cached_property
+    def human_filter(self) -> HumanFilter:
+        """Of its score: unfiltered where some logged row has another than its own filtered sub-scores make."""
+        rows = np.stack(list(self.logged.values()))
+        known = ~np.isnan(rows[:, SCORE])
+        differs = np.abs(score_of_columns(rows[known]) - rows[known, SCORE]) > SAME
+        return "unfiltered" if differs.any() else "filtered"
+
+    def scores(self, human_filter: HumanFilter) -> dict[str, Array] | None:
+        """Token -> (C,) of the logged frames; None: a file of filtered scores does not hold the unfiltered ones."""
+        if human_filter == self.human_filter:
+            return dict(self.logged)
+        if human_filter == "unfiltered":
+            return None
+        rows = np.stack(list(self.logged.values()))
+        rows[:, SCORE] = score_of_columns(rows)
+        return dict(zip(self.logged, rows))
+
+
+def score_of_columns(rows: Array) -> Array:
+    """(N,) what sub-scores (N, C) of COLUMNS make, without extended comfort where there is none."""
+    named = {name: rows[:, i] for i, name in enumerate(COLUMNS)}
+    known = ~np.isnan(named["ec"])
+    terms = weighted(named) + np.where(known, EC_WEIGHT * np.nan_to_num(named["ec"]), 0.0)
+    made: Array = multiplied(named) * (terms / (TOTAL_WEIGHT + np.where(known, EC_WEIGHT, 0.0)))
+    return made
+
+
+def read_table(path: Path) -> PublicTable:
+    """A file of either script, `.csv` or `.csv.gz`.
+
+    Raises OSError, or ValueError for a file of other columns, one without its summary rows, a token that stands twice
+    and a summary of logged frames that is not the mean of the file's own rows.
+    """
+    lines = list(_lines(path))
+    head = lines[0] if lines else []
+    two_stage = head[1:] == head_of(True)
+    if not two_stage and head[1:] != head_of(False):
+        raise ValueError(f"{path}: no table of NAVSIM's: its columns must be {', '.join(head_of(False))}, or of stages")
+    ends = set(EXTENDED.values()) if two_stage else {AVERAGE}
+    found: dict[str, tuple[Array, Array, float]] = {}
+    for number, line in enumerate(lines[1:], start=2):
+        if len(line) != len(head):
+            raise ValueError(f"{path}, line {number}: {len(line)} cells, the head has {len(head)}")
+        if line[1] in found:
+            raise ValueError(f"{path}, line {number}: token {line[1]} stands there twice")
+        try:
+            numbers = np.array([float(cell or "nan") for cell in line[3:]])
+        except ValueError as error:
+            raise ValueError(f"{path}, line {number}: {error}") from error
+        parts = numbers[: len(LONG)], numbers[len(LONG) : -1] if two_stage else numbers[:0]
+        found[line[1]] = *parts, float(numbers[-1])
+    if missing := sorted(ends - found.keys()):
+        raise ValueError(f"{path}: no row {missing[0]}: it was not written to its end")
+    rows = {token: of_one for token, of_one in found.items() if token not in ends}
+    logged = {token: _columns(one, score) for token, (one, _, score) in rows.items() if np.isfinite(one).any()}
+    follow_ups = {token: _columns(two, score) for token, (_, two, score) in rows.items() if np.isfinite(two).any()}
+    if not logged:
+        raise ValueError(f"{path}: no scored row of a logged frame")
+    summary = {"one_stage": _columns(found[AVERAGE][0], found[AVERAGE][2])} if not two_stage else _stages_of(found)
+    failed = tuple(token for token in rows if token not in logged and token not in follow_ups)
+    table = PublicTable(str(path), logged, follow_ups, summary, failed)
+    _check_summary(table)
+    return table
+
+
+def _lines(path: Path) -> Iterator[list[str]]:
+    with gzip.open(path, "rt", newline="") if path.suffix == ".gz" else path.open(newline="") as file:
+        yield from csv.reader(file)
+
+
+def _stages_of(found: Mapping[str, tuple[Array, Array, float]]) -> dict[str, Array]:
+    one, two, both = (found[EXTENDED[name]] for name in EXTENDED)
+    return {
+        "stage_one": _columns(one[0], one[2]),
+        "stage_two": _columns(two[1], two[2]),
+        "final": _columns(np.full(len(LONG), np.nan), both[2]),
+    }
+
+
+def _columns(sub_scores: Array, score: float) -> Array:
+    row = np.full(len(COLUMNS), np.nan)
+    row[PLACES], row[SCORE] = sub_scores, score
+    return row
+
+
+def _check_summary(table: PublicTable) -> None:
+    said, again = table.summary[table.stage], means_over(np.stack(list(table.logged.values())))
+    for name, written, mean in zip(COLUMNS, said, again):
+        if not np.isclose(written, mean, rtol=0.0, atol=SAME, equal_nan=True):
+            raise ValueError(
+                f"{table.file}: the summary of {table.stage} says {written} for {LONG.get(name, name)}, its "
+                f"{len(table.logged)} rows make {mean}: rows are missing or were changed"
+            )
