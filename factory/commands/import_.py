@@ -1,4 +1,4 @@
-"""`python -m factory import simscale|navhard root=<folder> out=<folder or URL>`: others' samples as a table of ours.
+"""`python -m factory import simscale|navhard|navtest root=<folder> out=<folder or URL>`: others' samples as ours.
 
     python -m factory import simscale root=SimScale_data out=runs/simscale maps=nuplan/maps
     python -m factory import simscale root=exported out=runs/back only=[synthetic_reaction_pdm_v1.0-0]
@@ -17,6 +17,10 @@ navhard: NAVSIM's two-stage benchmark, which `python -m planners evaluate benchm
     root=<folder>        synthetic_scene_pickles and sensor_blobs of the second stage
     logs=, sensors=      of the first stage; pictures=false needs no sensors
     split=<.yaml>        whose reactive_all_mapping says which scenes belong together
+navtest: its one-stage benchmark, the frames that a scene filter or split names, for the same `evaluate`.
+    python -m factory import navtest root=navsim_logs/test sensors=sensor_blobs/test maps=maps \\
+        split=.../train_test_split/navtest.yaml out=runs/navtest
+    root=<folder>        the logs; sensors=, pictures= and maps= as above
 The same command again goes on, and tries what failed once more. What is kept and what is lost: docs/navsim.md.
 """
 
@@ -36,7 +40,7 @@ if TYPE_CHECKING:
 class Request:
     """The command line."""
 
-    source: Literal["simscale", "navhard"] = field(metadata=WORD)
+    source: Literal["simscale", "navhard", "navtest"] = field(metadata=WORD)
     root: str
     out: str
     maps: str | None = None
@@ -51,9 +55,11 @@ class Request:
     def __post_init__(self) -> None:
         if (self.rewards is None) != (self.vocabulary is None):
             raise ValueError("rewards= and vocabulary= go together: scores mean nothing without their trajectories")
-        if self.source == "navhard":
-            if missing := [name for name in ("logs", "maps", "split") if getattr(self, name) is None]:
-                raise ValueError(f"{missing[0]}=... is missing: import navhard takes logs=, maps= and split=")
+        if self.source != "simscale":
+            needed = ("logs", "maps", "split") if self.source == "navhard" else ("maps", "split")
+            if missing := [name for name in needed if getattr(self, name) is None]:
+                takes = ", ".join(f"{name}=" for name in needed)
+                raise ValueError(f"{missing[0]}=... is missing: import {self.source} takes {takes}")
             if (self.sensors is None) == self.pictures:
                 raise ValueError("sensors= and pictures=: give the folder of pictures, or pictures=false")
 
@@ -73,7 +79,8 @@ def main(request: Request) -> int:
         raise Refused(unusable)
     try:
         store = Store(Location.parse(request.out))
-        summary, told = _navhard(request, store) if request.source == "navhard" else _simscale(request, store)
+        answers = {"simscale": _simscale, "navhard": _navhard, "navtest": _navtest}
+        summary, told = answers[request.source](request, store)
     except (BadClip, ChangedRun, AnotherWriter, ValueError, OSError, ImportError, DeltaError) as error:
         raise Refused(one_line(error)) from error
     counts = summary.counts
@@ -105,27 +112,23 @@ def _simscale(request: Request, store: "Store") -> tuple["RunSummary", str]:
 
 
 def _navhard(request: Request, store: "Store") -> tuple["RunSummary", str]:
-    from factory.imports.navhard import (
-        GroupReader,
-        NavsimFolders,
-        entries_of,
-        groups_of,
-        logs_of_tokens,
-        write_benchmark,
-    )
-    from factory.imports.table import identity_of, import_rows
+    from factory.imports.navhard import NavsimFolders, import_navhard
     from factory.readers.navsim.filters import read_selection
 
     logs, maps = _folder(request.logs), _folder(request.maps)
     assert logs is not None and maps is not None and request.split is not None
-    selection = read_selection(request.split)
-    groups = groups_of(selection)
-    tokens = frozenset(token for group in groups for token in (group.now, group.before))
     places = NavsimFolders(logs, _folder(request.sensors), Path(request.root).expanduser(), maps)
-    reader = GroupReader(places, logs_of_tokens(logs, tokens, selection.scene_filter.log_names), store)
-    identity = identity_of(request.source, {"pictures": request.pictures, "split": selection.name})
-    summary = import_rows(store, identity, entries_of(groups, reader))
-    return summary, write_benchmark(store, groups, reader, identity)
+    return import_navhard(store, read_selection(request.split), places)
+
+
+def _navtest(request: Request, store: "Store") -> tuple["RunSummary", str]:
+    from factory.imports.navtest import import_navtest
+    from factory.readers.navsim.filters import read_selection
+
+    maps = _folder(request.maps)
+    assert maps is not None and request.split is not None
+    logs = Path(request.root).expanduser()
+    return import_navtest(store, read_selection(request.split), logs, _folder(request.sensors), maps)
 
 
 def _folder(path: str | None) -> Path | None:

@@ -13,9 +13,10 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+from factory.graph.execute import RunSummary
+from factory.imports.logged import logged_frame
 from factory.imports.scenes import (
     HISTORY_FRAMES,
-    SCENE_FRAMES,
     Origin,
     label_columns_of,
     logged_label,
@@ -23,11 +24,11 @@ from factory.imports.scenes import (
     scene_of,
     world_columns,
 )
-from factory.imports.table import Entry
+from factory.imports.table import Entry, identity_of, import_rows
 from factory.readers.base import BadClip
 from factory.readers.navsim.filters import Selection
-from factory.readers.navsim.log import Frame, LogFrames, read_frames
-from factory.readers.navsim.road import RoadAhead, road_around
+from factory.readers.navsim.log import LogFrames, read_frames
+from factory.readers.navsim.road import road_around
 from factory.readers.navsim.synthetic import SyntheticScene, read_scene_pickle
 from factory.readers.navsim.tracks import ego_states
 from factory.stages.benchmark import BENCHMARK_FILE, FORMAT
@@ -140,15 +141,8 @@ class GroupReader:
         return self._log
 
     def _logged(self, log: LogFrames, token: str, group: SceneGroup) -> tuple[Scene, dict[str, object]]:
-        at = next((i for i, frame in enumerate(log.frames) if frame.token == token), -1)
-        first = at - HISTORY_FRAMES + 1
-        if at < 0 or first < 0 or first + SCENE_FRAMES > len(log.frames):
-            raise BadClip(log.file, f"token {token}", "not here with 1.5 s before and 4 s after it")
-        frames = log.frames[first : first + SCENE_FRAMES]
-        road = self._road(frames, log.file, at)
-        scene = scene_of(frames, road, self._origin(log.file, log.name, group, token))
-        seen = self._seen(frames[:HISTORY_FRAMES], self.places.sensors, ImageSource.PHOTO, log.file)
-        return scene, {**world_columns(scene, frames[HISTORY_FRAMES - 1].command), **logged_label(scene), **seen}
+        origin = self._origin(log.file, log.name, group, token)
+        return logged_frame(log, token, self.places.maps, self.places.sensors, origin)
 
     def _synthetic(self, token: str, group: SceneGroup, log: str) -> tuple[Scene, dict[str, object]]:
         path = self.places.scenes / "synthetic_scene_pickles" / f"{token}.pkl"
@@ -156,21 +150,15 @@ class GroupReader:
         if found.token != token:
             raise BadClip(str(path), "scene_metadata.initial_token", f"is {found.token}, the file's name says {token}")
         history = found.frames[:HISTORY_FRAMES]
-        road = self._road(history, str(path), HISTORY_FRAMES - 1)
+        xy, now = ego_states(history)[:, :2], history[-1]
+        road = road_around(self.places.maps, now, xy, now.pose, str(path), HISTORY_FRAMES - 1)
         scene = scene_of(found.frames, road, self._origin(str(path), log, group, token), HISTORY_FRAMES)
-        blobs = None if self.places.sensors is None else self.places.scenes / "sensor_blobs"
         plan = plan_for(scene, PdmSettings())
         label = label_columns_of(scene, plan.driven[1:, : HEADING + 1])
-        seen = self._seen(history, blobs, ImageSource.RENDER, str(path))
+        seen: dict[str, object] = dict(NO_IMAGES)
+        if self.places.sensors is not None:
+            seen = pictures(history, self.places.scenes / "sensor_blobs", ImageSource.RENDER, str(path))
         return scene, {**world_columns(scene, history[-1].command), **label, **seen}
-
-    def _road(self, driven: Sequence[Frame], file: str, number: int) -> RoadAhead:
-        """At the fourth of these frames, which has this number in its file."""
-        now = driven[HISTORY_FRAMES - 1]
-        return road_around(self.places.maps, now, ego_states(driven)[:, :2], now.pose, file, number)
-
-    def _seen(self, frames: Sequence[Frame], folder: Path | None, source: ImageSource, file: str) -> dict[str, object]:
-        return dict(NO_IMAGES) if folder is None else pictures(frames, folder, source, file)
 
     def _origin(self, file: str, log: str, group: SceneGroup, token: str) -> Origin:
         digest = sha256(token.encode()).hexdigest()
@@ -205,6 +193,19 @@ def logs_of_tokens(logs: Path, tokens: frozenset[str], names: Sequence[str] | No
     if not found:
         raise ValueError(f"logs={logs}: none of the {len(tokens)} stage-one tokens is in the logs here")
     return found
+
+
+def import_navhard(store: Store, selection: Selection, places: NavsimFolders) -> tuple[RunSummary, str]:
+    """Every frame of the split's groups into a store, and its benchmark; how that ended, and a line about it.
+
+    Raises ValueError and BadClip where nothing can begin, and what `import_rows` raises.
+    """
+    groups = groups_of(selection)
+    tokens = frozenset(token for group in groups for token in (group.now, group.before))
+    reader = GroupReader(places, logs_of_tokens(places.logs, tokens, selection.scene_filter.log_names), store)
+    identity = identity_of(DATASET, {"pictures": places.sensors is not None, "split": selection.name})
+    summary = import_rows(store, identity, entries_of(groups, reader))
+    return summary, write_benchmark(store, groups, reader, identity)
 
 
 def write_benchmark(store: Store, groups: Sequence[SceneGroup], reader: GroupReader, identity: RunIdentity) -> str:

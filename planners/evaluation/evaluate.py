@@ -205,8 +205,12 @@ def evaluated(argv: Sequence[str]) -> None:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     settings = settings_of(argv)
     who = planners_of(settings.planner, settings.planners, settings.bounds, settings.settings)
-    lines = evaluate(BenchmarkFolder(settings.benchmark), who, settings)
+    benchmark = BenchmarkFolder(settings.benchmark)
+    lines = evaluate(benchmark, who, settings)
     print(table_text(lines))
+    if benchmark.tokens and benchmark.left_out:
+        total = benchmark.left_out + len({key.clip_id for key in benchmark.keys})
+        print(f"{benchmark.left_out} of its {total} clips are left out: no published number is over so few")
     print("".join(fallback_notes(lines)), end="")
     if settings.tables:
         print(f"look at {Path(settings.out) / 'summary.png'}")

@@ -2,7 +2,6 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -10,62 +9,20 @@ import yaml
 
 from factory.__main__ import main as factory
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES
-from factory.readers.av2.reader import read_log
-from factory.readers.restricted_pickle import load_plain
-from factory.readers.settings import TownSettings
-from factory.readers.town.write import write_logs
 from factory.store.samples import Store
 from planners.evaluation.benchmark_folder import BenchmarkFolder
 from planners.evaluation.scoring import drive, prepare_frame
 from tasks.experts.pdm_closed.planner import PdmSettings
 from tasks.rollout.simulate import TrafficSettings
 from tasks.subscores import JUDGED
-from tests.factory.readers.geopackage_writer import CITIES, ORIGIN, stub_rows, town_rows, write_geopackage, write_root
-from tests.factory.readers.navsim import scene_pickles
-from tests.factory.readers.openscene_writer import Place, write_openscene
+from tests.factory.imports.navsim_town import NOW, TOKENS, frames_of, write_installation, write_split
 
 pytestmark = pytest.mark.slow  # a town, a city's map, PDM-Closed
-NOW, TOKENS = 4, ("0000000000005a00c", "0000000000005a00b")
 
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A log, its city and one group: frames 4 and 3 of the log, then 12 and 11."""
-    root = tmp_path_factory.mktemp("navhard")
-    location = next(iter(CITIES))
-    write_root(root / "maps", "sg-one-north", stub_rows())
-    (folder,) = write_logs(root / "av2", (1,), 0, TownSettings(cameras=(), lidar_beams=0))
-    log = read_log(folder)
-    rows = town_rows(log.road_map)
-    version, zone = CITIES[location]
-    (root / "maps" / location / version / "map.gpkg").unlink(missing_ok=True)
-    write_geopackage(root / "maps" / location / version / "map.gpkg", rows, zone)
-    blocks = log.road_map.roadblock_of
-    number = {blocks[str(row["fid"])]: str(row["lane_group_fid"]) for row in rows["lanes_polygons"]}
-    number |= {blocks[str(row["fid"])]: str(row["lane_group_connector_fid"]) for row in rows["lane_connectors"]}
-    place = Place(location, np.append(ORIGIN, 0.0), roadblock_number=number.__getitem__)
-    path = write_openscene(root, "test", folder.name, log, place)
-    frames = frames_of(path)
-    scenes = root / "navhard_two_stage" / "synthetic_scene_pickles"
-    scenes.mkdir(parents=True)
-    for token, at in zip(TOKENS, (NOW + 8, NOW + 7)):
-        scene_pickles.write_scene(scenes, scene_pickles.scene_of_log(frames, at, token))
-    write_split(root, frames)
-    return root
-
-
-def frames_of(path: Path) -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = load_plain(path.read_bytes(), str(path))
-    return found
-
-
-def write_split(root: Path, frames: list[dict[str, Any]], *further: Any) -> None:
-    now, before = frames[NOW]["token"], frames[NOW - 1]["token"]
-    mapping = [[now, before, [list(TOKENS)]], *further]
-    split = {"defaults": [{"scene_filter": "small"}], "data_split": "test", "reactive_all_mapping": mapping}
-    (root / "split.yaml").write_text(yaml.safe_dump(split))
-    (root / "scene_filter").mkdir(exist_ok=True)
-    (root / "scene_filter" / "small.yaml").write_text(yaml.safe_dump({"tokens": [now, before]}))
+    return write_installation(tmp_path_factory.mktemp("navhard"))
 
 
 def imported(root: Path, out: Path) -> int:
