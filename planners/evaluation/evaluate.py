@@ -5,11 +5,14 @@
     python -m planners evaluate benchmark=runs/hard planners={real: runs/a, with_sim: runs/b}
     python -m planners evaluate benchmark=runs/hard planner=runs/gtrs +settings.inference_entries=8192
 
-The benchmark is the folder that `python -m factory.run preset=hard_benchmark` made. Who may stand under `planner=`, and
-what a planner of one's own looks like, planners/evaluation/planner_names.py says. Every planner gets a folder: its
-plans, a row of sub-scores for each frame (frames.parquet, frames.csv), and record.json, written last. What is done
-is not planned or scored again unless it, the benchmark or the rules changed; the same command goes on after a kill.
-All planners of a command share what scoring prepares of a frame, so name several at once.
+    python -m planners evaluate benchmark=navhard data=/data/openscene planner=runs/ltf
+
+The benchmark is the folder that `python -m factory.run preset=hard_benchmark` or `python -m factory import` made, or
+`navhard` or `navtest`, which are made of NAVSIM's folders first (planners/evaluation/public/by_name.py). Who may stand
+under `planner=`, and what a planner of one's own looks like, planners/evaluation/planner_names.py says. Every planner
+gets a folder: its plans, a row of sub-scores for each frame (frames.parquet, frames.csv), and record.json, written
+last. What is done is not planned or scored again unless it, the benchmark or the rules changed; the same command goes
+on after a kill. All planners of a command share what scoring prepares of a frame, so name several at once.
 
     summary.csv, summary.png      all planners of this command
     <planner>/navsim_*.csv        of NAVSIM's benchmarks: the tables that its own scripts write, by the score's filter
@@ -38,6 +41,7 @@ from planners.evaluation.benchmark_folder import BenchmarkFolder
 from planners.evaluation.frames import Benchmark, FrameKey
 from planners.evaluation.planner_names import EvaluatedPlanner, composed, needs_of, planners_of
 from planners.evaluation.planning import all_plans
+from planners.evaluation.public.by_name import SPLITS, NavsimData, benchmark_by_name
 from planners.evaluation.public.tables import write_tables
 from planners.evaluation.score_rows import RECORD, FrameRow, is_done, read_rows, write_record, write_rows
 from planners.evaluation.score_table import table_text, write_table
@@ -64,7 +68,12 @@ MOST_UNIFORM = 0.2  # share of clips in the uniform fallback
 class EvaluateSettings:
     """Everything on the command line of `planners evaluate`."""
 
-    benchmark: str  # the folder that factory.run preset=hard_benchmark made
+    benchmark: str  # the folder that factory.run preset=hard_benchmark made, or navhard or navtest
+    data: str | None = None  # of navhard and navtest: NAVSIM's folders; null: its own variable OPENSCENE_DATA_ROOT
+    maps: str | None = None  # nuPlan's; null: NUPLAN_MAPS_ROOT, or `maps` in data
+    split: str | None = None  # the split's .yaml; null: that of the checkout in NAVSIM_DEVKIT_ROOT
+    pictures: bool = True  # false: a benchmark without any
+    made: str = "benchmarks"  # navhard and navtest are made in a folder of their name here
     planner: str | None = None  # a training's folder, human, pdm_closed, constant_velocity, or my.module:MyPlanner
     planners: list[str] | dict[str, str] | None = None  # several: a list, or {label: planner, ...}
     out: str = "evaluations"  # a folder for each planner, and the table of all
@@ -200,12 +209,22 @@ def settings_of(argv: Sequence[str]) -> EvaluateSettings:
     return fill(EvaluateSettings, composed("evaluate", argv, EvaluateSettings), "evaluate")
 
 
+def _folder(settings: EvaluateSettings) -> str:
+    """Where the benchmark is, made where it is asked for by its name. Raises ConfigError."""
+    given = NavsimData(settings.data, settings.maps, settings.split, settings.pictures)
+    if settings.benchmark in SPLITS:
+        return benchmark_by_name(settings.benchmark, given, settings.made)
+    if given != NavsimData():
+        raise ConfigError(f"data=, maps=, split= and pictures= are of benchmark={' or '.join(SPLITS)} alone")
+    return settings.benchmark
+
+
 def evaluated(argv: Sequence[str]) -> None:
     """Evaluate and print what a command line asks for. Raises ConfigError, or OSError for a folder that is none."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     settings = settings_of(argv)
     who = planners_of(settings.planner, settings.planners, settings.bounds, settings.settings)
-    benchmark = BenchmarkFolder(settings.benchmark)
+    benchmark = BenchmarkFolder(_folder(settings))
     lines = evaluate(benchmark, who, settings)
     print(table_text(lines))
     if benchmark.tokens and benchmark.left_out:

@@ -1,0 +1,114 @@
+"""NAVSIM's benchmarks by their names: one command from its folders to the table, made once, refused by what lacks."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+import yaml
+
+from planners.evaluation.evaluate import main
+from planners.evaluation.public.by_name import IN_DEVKIT
+from planners.evaluation.public.tables import read_table
+from tests.factory.imports.navsim_town import NOW, TOKENS, frames_of, write_installation
+
+pytestmark = pytest.mark.slow  # a town, a city's map, PDM-Closed
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """NAVSIM's folders and a checkout with the two splits."""
+    root = write_installation(tmp_path_factory.mktemp("openscene"))
+    (path,) = (root / "navsim_logs" / "test").glob("*.pkl")
+    frames = frames_of(path)
+    splits = root / "devkit" / IN_DEVKIT
+    (splits / "scene_filter").mkdir(parents=True)
+    shutil.move(root / "split.yaml", splits / "navhard_two_stage.yaml")
+    shutil.move(root / "scene_filter" / "small.yaml", splits / "scene_filter" / "small.yaml")
+    lone = {"tokens": [frames[at]["token"] for at in (NOW - 1, NOW)], "frame_interval": 1, "num_future_frames": 8}
+    (splits / "scene_filter" / "navtest.yaml").write_text(yaml.safe_dump(lone))
+    split = {"defaults": [{"scene_filter": "navtest"}], "data_split": "test"}
+    (splits / "navtest.yaml").write_text(yaml.safe_dump(split))
+    return root
+
+
+@pytest.fixture(autouse=True)
+def variables(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("OPENSCENE_DATA_ROOT", "NUPLAN_MAPS_ROOT"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("NAVSIM_DEVKIT_ROOT", str(root / "devkit"))
+
+
+def words(root: Path, name: str, out: Path) -> list[str]:
+    who = ["planner=constant_velocity", "bounds=false", "pictures=false"]
+    return [f"benchmark={name}", f"data={root}", *who, f"made={out / 'made'}", f"out={out / 'out'}"]
+
+
+def test_navhard_and_navtest_are_one_command_each_and_made_once(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lines = {
+        "navhard": ["stage_one", "stage_one", "stage_two", "follow_ups", "final", "final"],
+        "navtest": ["one_stage", "one_stage"],
+    }
+    for name, stages in lines.items():
+        out = tmp_path / name
+        assert main(words(root, name, out)) == 0
+        said = capsys.readouterr().out
+        assert f"benchmark {out}/made/{name}: " in said and "left out 0" in said
+        told = [line.split()[1] for line in said.splitlines() if line.startswith("constant_velocity ")]
+        assert told[-len(stages) :] == stages
+        table = read_table(out / "out" / "constant_velocity" / "navsim_filtered.csv")
+        assert set(table.follow_ups) == (set(TOKENS) if name == "navhard" else set())
+        assert len(table.logged) == 2
+        # by NAVSIM's own variables, and what is whole is not made again
+        monkeypatch.setenv("OPENSCENE_DATA_ROOT", str(root))
+        assert main([word for word in words(root, name, out) if not word.startswith("data=")]) == 0
+        assert "left out" not in capsys.readouterr().out
+
+
+def test_a_benchmark_of_other_files_is_not_taken_for_this_one(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(words(root, "navtest", tmp_path)) == 0
+    (log,) = (root / "navsim_logs" / "test").glob("*.pkl")
+    copy = tmp_path / "copy"
+    shutil.copytree(root, copy)
+    (copy / log.relative_to(root)).touch()
+    assert main(words(copy, "navtest", tmp_path)) == 2
+    assert "was made of other files than these: remove it, or choose another made=" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"data": None}, "give data=... or set OPENSCENE_DATA_ROOT"),
+        ({"data": "nowhere"}, "data nowhere is missing: the folder of navsim_logs"),
+        ({"maps": "nowhere"}, "maps nowhere is missing: nuPlan's maps"),
+        ({"split": "nowhere.yaml"}, "split nowhere.yaml is missing"),
+        ({"pictures": "true"}, "sensor_blobs/test is missing: the pictures of its logs (pictures=false"),
+        ({"benchmark": "runs/hard"}, "are of benchmark=navhard or navtest alone"),
+    ],
+)
+def test_what_is_missing_is_named(
+    root: Path, tmp_path: Path, change: dict[str, str | None], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = dict(word.split("=", 1) for word in words(root, "navhard", tmp_path))
+    asked = {name: value for name, value in (given | change).items() if value is not None}
+    assert main([f"{name}={value}" for name, value in asked.items()]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "made").exists()
+
+
+def test_a_folder_without_logs_or_scenes_is_named(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    empty = tmp_path / "empty"
+    (empty / "maps").mkdir(parents=True)
+    assert main(words(empty, "navtest", tmp_path)) == 2
+    assert f"{empty}/navsim_logs/test is missing: its logs" in capsys.readouterr().err
+    (empty / "navsim_logs" / "test").mkdir(parents=True)
+    assert main(words(empty, "navhard", tmp_path)) == 2
+    assert "synthetic_scene_pickles is missing: the scenes of its second stage" in capsys.readouterr().err
+    monkeypatch.delenv("NAVSIM_DEVKIT_ROOT")
+    assert main(words(root, "navtest", tmp_path)) == 2
+    assert "give split=... or set NAVSIM_DEVKIT_ROOT" in capsys.readouterr().err
