@@ -62,7 +62,7 @@ mutants: install
 	$(PY) -m tests.mutants --only "$(ONLY)" -j $(or $(J),2)
 
 # All quick tables, or NAME=reward (or another tests/bench/bench_*.py) ARGS="its own": loader's threads= and table=,
-# planners' device=, render's scene file. PEER=<...> of reward and render: what runs beside ours; see there.
+# planners' device=, render's scene file. PEER=<...> of reward, traffic and render: what runs beside; see there.
 bench: install
 	$(if $(filter reward loader memory,$(NAME)),OMP_NUM_THREADS=1) $(PY) -m tests.bench$(if $(NAME),.bench_$(NAME)) $(ARGS)
 

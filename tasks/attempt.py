@@ -63,12 +63,15 @@ def drive_and_judge(
     with timed("rollout"):
         rollout = simulate(scene, plan.poses, traffic)
     with timed("reward"):
-        return judge(scene, plan, rollout, pdm_plan or plan_for(scene, planner))
+        return judge(scene, plan, rollout, pdm_plan or plan_for(scene, planner), traffic.leaves_out_touching)
 
 
-def judge(scene: Scene, plan: Plan, rollout: Rollout, pdm_plan: PdmPlan) -> Judged:
-    """Score a rollout from the scene in the two-row batch [PDM-Closed, rollout]."""
-    prepared = prepare_scene(scene, rollout.agents)
+def judge(scene: Scene, plan: Plan, rollout: Rollout, pdm_plan: PdmPlan, drop_touching: bool = True) -> Judged:
+    """Score a rollout from the scene in the two-row batch [PDM-Closed, rollout].
+
+    drop_touching: who touches the ego at the start is left out, see `TrafficSettings.leaves_out_touching`.
+    """
+    prepared = prepare_scene(scene, rollout.agents, drop_touching)
     scores = score(prepared, np.array([pdm_plan.driven, rollout.ego_states]), normalise="pairs")
     return Judged(scene, plan, rollout, scores, prepared, pdm_plan.driven)
 

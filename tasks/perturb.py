@@ -166,13 +166,14 @@ def perturb(
     fate = np.where(~reached, "reached_gate", np.where(~black, "white_cell", "not_needed")).astype(object)
     fate[np.isfinite(scores)] = "score"
     traffic_scene = prepare_traffic(scene, traffic)
+    touched_from = start if traffic.leaves_out_touching else None
     proven: dict[int, Candidate] = {}
 
     def passes_reactive(place: int) -> bool:
         member = int(kept[place])
         rollout = roll_out(traffic_scene, states[member].copy())
         pair = np.concatenate([pdm_states, rollout.ego_states[None]])
-        reactive = score(among(replay, rollout.agents, start), pair, normalise="pairs")
+        reactive = score(among(replay, rollout.agents, touched_from), pair, normalise="pairs")
         good = bool(reactive.pdm_score[1] >= settings.epdms_min)
         fate[member] = "kept" if good else "reactive"
         if good:

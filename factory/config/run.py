@@ -57,7 +57,7 @@ class RewardSettings(ExpertGate):
     """What an expert's drive must reach, and the vocabulary labels that stand in every sample."""
 
     labels: Literal["vocabulary", "none"] = "vocabulary"  # of a whole vocabulary, for planners that learn to score
-    traffic: Literal["replay", "idm"] = "replay"  # that of the sample's own judged drive, or one that answers to each
+    traffic: Literal["replay", "idm", "navsim"] = "replay"  # of the sample's own judged drive, or that answers to each
     label_vocabulary: str | None = None  # another .npy file (K, 40, 3); null: the run's vocabulary
 
     def __post_init__(self) -> None:

@@ -41,11 +41,11 @@ _one_at_a_time = Lock()
 def parts_of(simulates: bool, traffic: str, label_traffic: str | None, render: RenderSettings) -> list[str]:
     """What a run enters.
 
-    simulates: it has another expert than `human`; traffic, label_traffic: "idm" or "replay", of the drives and of the
-    labels (None: it makes none).
+    simulates: it has another expert than `human`; traffic, label_traffic: the mode of the drives' traffic and of the
+    labels' (None: it makes none). The public traffic, "navsim", has no kernels.
     """
     parts = ["judge"]
-    if label_traffic == "idm":
+    if label_traffic in ("idm", "navsim"):  # scored among the answers
         parts.append("answers")
     elif simulates and traffic == "idm":
         parts.append("drive")

@@ -102,7 +102,8 @@ def _driven(frame: PreparedFrame, poses: Array) -> tuple[Array, PreparedScene]:
     """States (41, 11), and the world with the traffic that answered to them."""
     ego = frame.scene.ego_state
     states = track(ego, to_world(ego[: HEADING + 1], poses)[None])[0]
-    return states, among(frame.world, roll_out(frame.traffic, states).agents, ego)
+    touched_from = ego if frame.traffic.settings.leaves_out_touching else None
+    return states, among(frame.world, roll_out(frame.traffic, states).agents, touched_from)
 
 
 def _with_human(frame: PreparedFrame) -> PreparedFrame:

@@ -27,7 +27,7 @@ class Labelling:
     """Which trajectories samples are labelled with, and among which traffic."""
 
     vocabulary: Vocabulary
-    traffic: TrafficSettings  # replay: the traffic that the sample was judged in; idm: traffic that answers to each
+    traffic: TrafficSettings  # replay: the traffic that the sample was judged in; else traffic that answers to each
 
 
 def vocabulary_labels(
@@ -59,8 +59,8 @@ def vocabulary_labels(
 def reactive_scores(scene: Scene, states: Array, traffic: TrafficSettings) -> Scores:
     """Score simulated ego states (K, 41, 11); progress is related in pairs with row 0, as `score` does.
 
-    A row does not depend on the others but for that: row 0, too, drives among the traffic that answers to it. As in
-    every prepared scene, an agent that touches the ego at the start is left out for good.
+    A row does not depend on the others but for that: row 0, too, drives among the traffic that answers to it. An agent
+    that touches the ego at the start is left out for good, but in the public reactive traffic.
     Raises ValueError for other shapes or non-finite states.
     """
     states = checked("states", states)
@@ -69,7 +69,8 @@ def reactive_scores(scene: Scene, states: Array, traffic: TrafficSettings) -> Sc
     prepared = prepare_scene(scene, now)
     collision_score = collision_scores(now.kinds)
     is_agent = collision_score == 0.0
-    keep = ~(now.valid[0] & touching(ego_boxes(scene.ego_state, PACIFICA), now.boxes[0]))
+    touches = now.valid[0] & touching(ego_boxes(scene.ego_state, PACIFICA), now.boxes[0])
+    keep = ~(touches & traffic.leaves_out_touching)
     parts = []
     for start in range(0, len(states), EGOS_AT_ONCE):
         egos = states[start : start + EGOS_AT_ONCE]

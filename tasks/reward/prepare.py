@@ -103,10 +103,10 @@ def prepare(
     )
 
 
-def prepare_scene(scene: Scene, agents: AgentTracks) -> PreparedScene:
+def prepare_scene(scene: Scene, agents: AgentTracks, drop_touching: bool = True) -> PreparedScene:
     """Prepare step `scene.step` of a clip against `agents` (41 steps, row 0 is that step): a rollout's or the log's.
 
-    Lights are red for on-route lane connectors over steps scene.step .. scene.step + 40.
+    Lights are red for on-route lane connectors over steps scene.step .. scene.step + 40; drop_touching: see `prepare`.
     """
     clip = scene.clip
     return prepare(
@@ -116,6 +116,7 @@ def prepare_scene(scene: Scene, agents: AgentTracks) -> PreparedScene:
         route_lane_ids=clip.route.lane_ids,
         objects=agents,
         red_lanes=_red_connectors(clip, scene.step),
+        drop_touching=drop_touching,
     )
 
 

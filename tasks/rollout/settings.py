@@ -10,9 +10,12 @@ MOST = 1000.0  # of any setting, and of speeds [m/s]: the length of paths grows 
 
 @dataclass(frozen=True)
 class TrafficSettings:
-    """How the others move. IDM's parameters are the public benchmark's (docs/reward.md 5)."""
+    """How the others move. IDM's parameters are the public benchmark's (docs/reward.md 5).
 
-    mode: Literal["idm", "replay"] = "idm"  # idm: they react; replay: the log
+    `navsim` asks for the first five and the exponent; its other rules are the public code's own.
+    """
+
+    mode: Literal["idm", "replay", "navsim"] = "idm"  # idm: they react; navsim: as in the public code; replay: the log
     target_speed_mps: float = 10.0  # where the lane has no speed limit
     min_gap_m: float = 1.0
     headway_s: float = 1.5
@@ -24,8 +27,8 @@ class TrafficSettings:
     blend_length_m: float = 20.0  # over which a start beside the path fades onto it
 
     def __post_init__(self) -> None:
-        if self.mode not in ("idm", "replay"):
-            raise ValueError(f"traffic mode must be idm or replay, not {self.mode!r}")
+        if self.mode not in ("idm", "replay", "navsim"):
+            raise ValueError(f"traffic mode must be idm, replay or navsim, not {self.mode!r}")
         for name in ("target_speed_mps", "headway_s", "accel_max", "decel_max", "blend_length_m"):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"traffic {name} must be positive, not {getattr(self, name)}")
@@ -33,3 +36,8 @@ class TrafficSettings:
             value = getattr(self, field.name)
             if field.name != "mode" and not 0.0 <= value <= MOST:
                 raise ValueError(f"traffic {field.name} must lie within 0 .. {MOST:g}, not {value}")
+
+    @property
+    def leaves_out_touching(self) -> bool:
+        """Whether who touches the ego at the start is left out of the score: not in the public reactive evaluation."""
+        return self.mode != "navsim"

@@ -14,6 +14,8 @@ The ego is tracked first, since it follows its plan whatever the traffic does; t
   things appear by their log.
 * Pedestrians and cyclists walk their log; before a step into a driven vehicle they wait, then go on late along the
   same log. Neither they nor replayed vehicles wait for the ego: its reward must not profit from their care.
+
+That is `mode=idm`. In `navsim` the traffic is the public evaluation's, to the letter (tasks/rollout/navsim).
 """
 
 from collections.abc import Iterable, Iterator
@@ -28,6 +30,8 @@ from tasks.rollout.idm import IdmDriver
 from tasks.rollout.lane_following import LanePath, find_path, logged_path, straight_path
 from tasks.rollout.lane_index import index_lanes
 from tasks.rollout.lqr import track
+from tasks.rollout.navsim.agents import NavsimAgents, navsim_agents
+from tasks.rollout.navsim.drive import answer
 from tasks.rollout.roles import NEVER, clocks, join_steps, later_join_step, logged_track, stands_always, start_step
 from tasks.rollout.scene_paths import numbered, stack_paths
 from tasks.rollout.settings import MOST, TrafficSettings
@@ -49,8 +53,9 @@ class TrafficScene:
 
     scene: Scene
     settings: TrafficSettings
-    roles: Roles | None  # None: replay
+    roles: Roles | None  # None: replay, or navsim
     paths: Paths | None
+    navsim: NavsimAgents | None = None  # None: another mode
 
 
 @dataclass(frozen=True)
@@ -67,6 +72,8 @@ def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
     """Roles and paths of all agents; once per scene, however many rollouts follow."""
     if settings.mode == "replay":
         return TrafficScene(scene, settings, None, None)
+    if settings.mode == "navsim":
+        return TrafficScene(scene, settings, None, None, navsim_agents(scene, settings.target_speed_mps))
     now, log = scene.agents, scene.clip.agents
     n, start = len(now), scene.step
     moved = np.zeros(n, dtype=bool) if scene.ever_simulated is None else scene.ever_simulated
@@ -124,6 +131,8 @@ def roll_out(traffic: TrafficScene, ego_states: Array) -> Rollout:
     scene = traffic.scene
     start = scene.step
     window = scene.agents.window(start, start + HORIZON_STEPS + 1)
+    if traffic.navsim is not None:
+        return _public_rollout(traffic.navsim, traffic.settings, window, start, ego_states)
     if traffic.roles is None or traffic.paths is None or len(window) == 0:
         return Rollout(start, ego_states, window, np.zeros(len(window), dtype=bool))
     rows, motion = drive(*_script(traffic, window), *_ego_boxes(ego_states))
@@ -142,10 +151,31 @@ def roll_out_many(traffic: TrafficScene, ego_states: Array) -> Rollouts:
     start = traffic.scene.step
     window = traffic.scene.agents.window(start, start + HORIZON_STEPS + 1)
     many, n = len(ego_states), len(window)
+    if traffic.navsim is not None:
+        shape = (many, HORIZON_STEPS + 1, n)
+        out = Rollouts(np.empty((*shape, 5)), np.empty((*shape, 2)), np.empty(shape, bool), np.empty((many, n), bool))
+        for b, states in enumerate(ego_states):
+            one = _public_rollout(traffic.navsim, traffic.settings, window, start, states)
+            out.boxes[b], out.velocities[b], out.valid[b] = one.agents.boxes, one.agents.velocities, one.agents.valid
+            out.simulated[b] = one.simulated
+        return out
     if traffic.roles is None or traffic.paths is None or n == 0:
         alike: Any = [np.broadcast_to(a, (many, *a.shape)) for a in (window.boxes, window.velocities, window.valid)]
         return Rollouts(alike[0], alike[1], alike[2], np.zeros((many, n), dtype=bool))
     return Rollouts(*drive_many(*_script(traffic, window), *_ego_boxes(ego_states)))
+
+
+def _public_rollout(
+    agents: NavsimAgents, settings: TrafficSettings, window: AgentTracks, start: int, ego_states: Array
+) -> Rollout:
+    """Boxes keep the height that they have now: the public traffic lives in the plane."""
+    boxes, velocities, valid = answer(agents, settings, window, ego_states)
+    vehicle = np.array([kind == AgentKind.VEHICLE for kind in window.kinds], dtype=bool)
+    center_z = np.where(vehicle, np.where(valid, window.center_z[0], np.nan), window.center_z)
+    driven = np.zeros(len(window), dtype=bool)
+    driven[[agent.row for agent in agents.driven]] = True
+    moved = replace(window, boxes=boxes, velocities=velocities, valid=valid, center_z=center_z)
+    return Rollout(start, ego_states, moved, driven)
 
 
 def _check_states(ego_states: Array) -> None:

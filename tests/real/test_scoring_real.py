@@ -17,7 +17,7 @@ from reference_scenes import loader
 from factory.readers.av2.reader import AV2Reader, log_folders
 from factory.readers.base import ClipRef
 from planners.evaluation.frames import Pair
-from planners.evaluation.scoring import PreparedFrame, Rules, drive, prepare_frame, score_pair
+from planners.evaluation.scoring import PreparedFrame, Rules, among_other_traffic, drive, prepare_frame, score_pair
 from tasks.reward.one_stage import COLUMNS, frame_scores
 from tasks.rollout.simulate import TrafficScene, TrafficSettings
 from tasks.subscores import RECORDS
@@ -69,6 +69,25 @@ def test_a_plan_against_pdm_closed_scores_as_the_public_scorer_says(shared_root:
             ours = found.filtered[COLUMNS.index(column)]
             assert ours == pytest.approx(row[public], abs=1e-6), (name, k, row["policy"], column)
         assert found.unfiltered[-1] == pytest.approx(row["pdm_score"], abs=1e-6), (name, k, row["policy"])
+
+
+@pytest.mark.parametrize("name", WHOLE)
+def test_a_plan_among_the_public_traffic_of_our_own_making_scores_as_the_public_scorer_says(
+    shared_root: Path, name: str
+) -> None:
+    """`traffic=navsim`, the human's drive among it too: the rows of the public reactive policy."""
+    frame = among_other_traffic(frame_of(shared_root, name), TrafficSettings(mode="navsim"))
+    plans = loader(shared_root).proposals(name, 256)
+    rows = json.loads((shared_root / "reference" / name / "official_pdm_score_rows.json").read_text())["rows"]
+    reactive = [row for row in rows if row["policy"] == "idm"]
+    assert len(reactive) == 3
+    for row in reactive:
+        driven = drive(frame, plans[row["proposal"]])
+        found = frame_scores(driven.scores, frame.human)
+        for column, public in PUBLIC.items():
+            ours = found.filtered[COLUMNS.index(column)]
+            assert ours == pytest.approx(row[public], abs=1e-6), (name, row["proposal"], column)
+        assert found.unfiltered[-1] == pytest.approx(row["pdm_score"], abs=1e-6), (name, row["proposal"])
 
 
 @pytest.mark.parametrize("name", WHOLE[:2])

@@ -370,5 +370,6 @@ def _notes(facts: Mapping[str, Any], files: Sequence[str]) -> Iterator[str]:
         yield f"{n:,} samples have no labels: GTRS would stop at their tokens"
     if rewards and not any(path.endswith(".npy") for path in files):
         yield f"the trajectories of vocabulary {facts['vocabulary']} are not known here: give vocabulary=<its .npy>"
-    if "idm" in facts["label_traffic"]:
-        yield "rewards are of traffic that answers (label_traffic=idm); SimScale's are of traffic that replays its log"
+    if answers := [mode for mode in facts["label_traffic"] if mode != "replay"]:
+        answering = f"label_traffic={', '.join(answers)}"
+        yield f"rewards are of traffic that answers ({answering}); SimScale's are of traffic that replays its log"

@@ -75,6 +75,13 @@ def test_replayed_traffic_needs_no_idm(tmp_path: Path, towns: str) -> None:
     assert not any(name.startswith("tasks/rollout/traffic") for name in after)
 
 
+def test_the_public_traffic_has_no_kernels(tmp_path: Path, towns: str) -> None:
+    public = ("traffic=navsim", "reward.labels=none")
+    before, after = run_with_these(["judge"], tmp_path, *TOWN, *BLIND, *public, towns, "executor=local")
+    assert after == before
+    assert not any(name.startswith("tasks/rollout/traffic") for name in after)
+
+
 def test_labels_among_traffic_that_answers_compile_nothing(tmp_path: Path, towns: str) -> None:
     answers = ("reward.traffic=idm", "experts=[human]")
     before, after = run_with_these(["judge", "answers"], tmp_path, *TOWN, *BLIND, *answers, towns, "executor=local")
