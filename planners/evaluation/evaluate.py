@@ -8,11 +8,12 @@
     python -m planners evaluate benchmark=navhard data=/data/openscene planner=runs/ltf
 
 The benchmark is the folder that `python -m factory.run preset=hard_benchmark` or `python -m factory import` made, or
-`navhard` or `navtest`, which are made of NAVSIM's folders first (planners/evaluation/public/by_name.py). Who may stand
-under `planner=`, and what a planner of one's own looks like, planners/evaluation/planner_names.py says. Every planner
-gets a folder: its plans, a row of sub-scores for each frame (frames.parquet, frames.csv), and record.json, written
-last. What is done is not planned or scored again unless it, the benchmark or the rules changed; the same command goes
-on after a kill. All planners of a command share what scoring prepares of a frame, so name several at once.
+`navhard` or `navtest`, which are made of NAVSIM's folders first (planners/evaluation/public/by_name.py) and are among
+the public traffic unless `traffic@two_stage_traffic=` says otherwise. Who may stand under `planner=`, and what a
+planner of one's own looks like, planners/evaluation/planner_names.py says. Every planner gets a folder: its plans, a
+row of sub-scores for each frame (frames.parquet, frames.csv), and record.json, written last. What is done is not
+planned or scored again unless it, the benchmark or the rules changed; the same command goes on after a kill. All
+planners of a command share what scoring prepares of a frame, so name several at once.
 
     summary.csv, summary.png      all planners of this command
     <planner>/navsim_*.csv        of NAVSIM's benchmarks: the tables that its own scripts write, by the score's filter
@@ -205,8 +206,14 @@ def fallback_notes(lines: Sequence[SummaryLine]) -> list[str]:
 
 
 def settings_of(argv: Sequence[str]) -> EvaluateSettings:
-    """The settings of a command line. Raises ConfigError."""
-    return fill(EvaluateSettings, composed("evaluate", argv, EvaluateSettings), "evaluate")
+    """The settings of a command line. Raises ConfigError.
+
+    A benchmark by its name is evaluated among the public traffic, unless the words choose another.
+    """
+    settings = fill(EvaluateSettings, composed("evaluate", argv, EvaluateSettings), "evaluate")
+    if settings.benchmark in SPLITS and not any("two_stage_traffic" in word for word in argv):
+        return replace(settings, two_stage_traffic=TrafficSettings(mode="navsim"))
+    return settings
 
 
 def _folder(settings: EvaluateSettings) -> str:

@@ -288,6 +288,8 @@ def test_the_command_line_is_typed_and_complains_by_name(capsys: pytest.CaptureF
     assert settings_of(["benchmark=x"]) == EvaluateSettings(benchmark="x", out="evaluations")
     assert settings_of(["benchmark=x", "planners={a: runs/a}"]).planners == {"a": "runs/a"}
     assert settings_of(["benchmark=x", "planners=[runs/a]", "planner=a:B"]).planner == "a:B"
+    assert settings_of(["benchmark=navhard"]).two_stage_traffic.mode == "navsim"
+    assert settings_of(["benchmark=navhard", "traffic@two_stage_traffic=idm"]).two_stage_traffic.mode == "idm"
     for argv, message in (
         (["planner=human"], "benchmark"),
         ([f"benchmark={tmp_path}", "planer=human"], "planer"),

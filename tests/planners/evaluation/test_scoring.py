@@ -15,7 +15,9 @@ from planners.evaluation.scoring import (
     pdm_plans,
     prepare_clip,
     prepare_frame,
+    prepare_lone,
     score_clip,
+    score_lone,
     score_pair,
 )
 from tasks.attempt import drive_and_judge
@@ -101,6 +103,20 @@ def test_the_pair_shares_its_extended_comfort(clip: ClipFrames) -> None:
     assert [row.scores.unfiltered[ec] for row in other[:3]] == [0.0, 0.0, 0.0]
     for a, b in zip(steady[3:], other[3:]):
         np.testing.assert_array_equal(a.scores.unfiltered, b.scores.unfiltered)
+
+
+def test_a_lone_frame_scores_as_the_logged_frame_among_the_one_stage_evaluation_s_traffic(clip: ClipFrames) -> None:
+    scenes, rules = clip_scenes(), Rules()
+    lone = prepare_lone(clip.clip_id, scenes.logged.now, rules)
+    assert lone.frame.traffic.settings == rules.one_stage != rules.two_stage
+    plans = same_plan_everywhere(scenes, straight(8.0))
+    plans[FrameKey.logged(clip.clip_id)[1]] = straight(2.0)
+    before = drive(clip.alone.before, straight(2.0)).states
+    wanted, (row, _) = score_clip(clip, plans)[0], score_lone(lone, plans, before, {})
+    np.testing.assert_array_equal(row.scores.filtered, wanted.scores.filtered)
+    np.testing.assert_array_equal(row.end, wanted.end)
+    alone, _ = score_lone(lone, plans, None, {})
+    assert np.isnan(alone.scores.filtered[COLUMNS.index("ec")]) and row.scores.filtered[COLUMNS.index("ec")] == 0.0
 
 
 def test_human_and_pdm_closed_bound_a_plan_that_stands_or_races(clip: ClipFrames) -> None:
