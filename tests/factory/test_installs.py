@@ -37,6 +37,7 @@ UNSEEN = {  # declared without an import statement of ours
     "tensorboard": "torch.utils.tensorboard imports it",
 }
 RAY_ONLY = {"factory/graph/on_ray.py"}  # loaded by executor=ray alone
+OF_OTHERS = {"planners/published/beside.py"}  # what the public code's own Python runs, with what that has
 GPU = re.compile(r"torch|triton|nvidia|cuda|cudnn|nccl|gsplat")
 
 
@@ -73,8 +74,8 @@ def _modules(node: ast.AST, at_import: bool) -> Iterator[str]:
 )
 def test_every_import_is_declared_where_it_belongs(package: str, extras: tuple[str, ...]) -> None:
     allowed = set().union(*map(declared, extras))
-    undeclared = {name: files for name, files in imports(package).items() if name not in allowed}
-    assert not undeclared
+    undeclared = {name: files - OF_OTHERS for name, files in imports(package).items() if name not in allowed}
+    assert not any(undeclared.values()), undeclared
 
 
 @pytest.mark.parametrize("package", ["tasks", "factory"])

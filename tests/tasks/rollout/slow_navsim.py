@@ -60,7 +60,7 @@ class Driver:
     def footprint(self, headway: float) -> shapely.Geometry:
         half = self.about.length / 2
         stop = self.clamp(self.progress + half + self.speed * headway)
-        return self.strip(self.clamp(self.progress - half), stop).union(self.body)
+        return shapely.unary_union([self.strip(self.clamp(self.progress - half), stop), self.body])
 
 
 def drive(agents: NavsimAgents, settings: TrafficSettings, ego_states: Array) -> tuple[Array, Array]:
