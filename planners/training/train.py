@@ -7,8 +7,8 @@
     python -m planners train executor=ray ray.processes=8 ray.gpus=1 ...    on a Ray cluster
     python -m planners train ... --cfg                          the settings, resolved
 
-The same command on the same `out` goes on where it stopped, to the identical curve. Exit codes: 0 complete, 2 bad
-settings or data, 4 interrupted and resumable.
+The same command on the same `out` goes on where it stopped, to the identical curve; with `resume=further` also to more
+steps or on another number of processes. Exit codes: 0 complete, 2 bad settings or data, 4 interrupted and resumable.
 """
 
 import dataclasses
@@ -37,6 +37,7 @@ from planners.training.fit import Loop, TrainingSettings, fit, total_steps
 from planners.training.processes import RaySettings, TrainingProcess, joined
 
 LARGEST_BATCH = 32
+FURTHER = frozenset({"steps", "processes", "accumulate"})  # what may be another with resume=further
 
 
 def validation(
@@ -84,6 +85,7 @@ class TrainConfig:
     steps: int | None = None  # optimiser steps in all; null: planner.training.epochs
     seed: int = 0  # of the weights at the start, the order and everything random in a step
     init_from: str | None = None  # folder of a training of the same planner, or a checkpoint: whose weights go on
+    resume: Literal["identical", "further"] = "identical"  # further: other steps, processes, accumulate; another curve
     executor: Literal["process", "ray"] = "process"  # process: alone, or as torchrun starts it; ray: Ray Train
     device: Literal["auto", "cpu", "cuda"] = "auto"
     precision: Literal["auto", "fp32", "bf16"] = "auto"  # auto: bf16 on a GPU, fp32 elsewhere
@@ -162,9 +164,11 @@ def train(config: TrainConfig, process: TrainingProcess) -> None:
     check = validation(config.data, planner, process, config.workers) if config.data.val else None
     identity = _identity(config, dataset, steps, process)
     resume_from = _begun(out, config, identity)
-    backbones = _first_weights(planner, config) if resume_from is None else read_record(resume_from)["backbones"]
+    before = {} if resume_from is None else read_record(resume_from)
+    backbones = _first_weights(planner, config) if resume_from is None else before["backbones"]
     record = {
         "trained": identity,
+        **_until_here(before, identity),
         "samples": {"real": int((~dataset.rows.simulated).sum()), "simulated": int(dataset.rows.simulated.sum())},
         "backbones": backbones,
         "parameters": sum(parameter.numel() for parameter in planner.parameters()),
@@ -233,13 +237,26 @@ def _begun(out: Path, config: TrainConfig, identity: Mapping[str, Any]) -> Path 
     record = read_record(out)
     now = {**identity, "planner.name": config.planner.name, "planner.settings": as_record(settings_of(config.planner))}
     then = {**record["trained"], **{f"planner.{key}": value for key, value in record["planner"].items()}}
-    differs = [f"{key} {then.get(key)} -> {value}" for key, value in now.items() if then.get(key) != value]
-    if differs:
+    differs = {key: f"{key} {then.get(key)} -> {value}" for key, value in now.items() if then.get(key) != value}
+    allowed = FURTHER if config.resume == "further" else frozenset()
+    if differs.keys() - allowed:
+        further = ", or resume=further" if differs.keys() <= FURTHER else ""
         raise ConfigError(
-            f"out={config.out} holds a training with other settings: {'; '.join(differs)}: choose another out, "
-            "or give the settings it began with"
+            f"out={config.out} holds a training with other settings: {'; '.join(differs.values())}: choose another "
+            f"out, or give the settings it began with{further}"
         )
+    if record["step"] > identity["steps"]:
+        raise ConfigError(f"out={config.out} has done {record['step']} steps: ask for as many in all, or more")
     return newest(out)
+
+
+def _until_here(before: Mapping[str, Any], identity: Mapping[str, Any]) -> dict[str, Any]:
+    """For the record: up to which step a training that goes on further was computed with other settings."""
+    earlier = list(before.get("earlier", []))
+    if before and before["trained"] != identity:
+        changed = {key: before["trained"][key] for key in sorted(FURTHER) if before["trained"][key] != identity[key]}
+        earlier.append({"until_step": before["step"], **changed})
+    return {"earlier": earlier} if earlier else {}
 
 
 def _plan_text(config: TrainConfig, record: Mapping[str, Any], loader: Loader, resume_from: Path | None) -> str:

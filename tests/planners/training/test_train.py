@@ -100,6 +100,27 @@ def test_a_planner_is_trained_further_from_the_weights_of_another_training(
 
 
 @pytest.mark.slow
+def test_a_training_goes_further_where_it_is_asked_to_and_the_record_says_from_where(
+    table: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole, further = tmp_path / "whole", tmp_path / "further"
+    assert main(command(table, whole, "steps=5", "accumulate=2")) == 0
+    assert main(command(table, further, "steps=3", "accumulate=2")) == 0
+    more = command(table, further, "steps=5", "accumulate=2")
+    assert main(more) == 2
+    assert "steps 3 -> 5" in (said := capsys.readouterr().err) and "resume=further" in said
+    assert main([*more, "resume=further"]) == 0
+    assert (further / LOSSES).read_text() == (whole / LOSSES).read_text()  # a constant rate asks for no end
+    assert main(command(table, further, "steps=7", "resume=further")) == 0
+    record = read_record(further)
+    assert record["earlier"] == [{"until_step": 3, "steps": 3}, {"until_step": 5, "steps": 5, "accumulate": 2}]
+    assert "earlier" not in read_record(whole) and record["trained"]["steps"] == 7
+    for refused, why in (("steps=4", "has done 7 steps"), ("seed=5", "seed 0 -> 5")):
+        assert main(command(table, further, refused, "resume=further")) == 2
+        assert why in (said := capsys.readouterr().err) and "or resume=further" not in said
+
+
+@pytest.mark.slow
 def test_another_planner_or_other_settings_do_not_go_on_in_a_folder(
     table: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

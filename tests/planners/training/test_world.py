@@ -5,14 +5,17 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import numpy as np
 import pytest
 import torch
 import torch.multiprocessing as mp
 
-from planners.training.checkpoint import newest
+from planners.training.checkpoint import newest, read_record
 from planners.training.curves import LOSSES
 from planners.training.fit import Loop, TrainingSettings, fit
 from planners.training.processes import joined
+from planners.training.train import main
+from tests.planners.samples import sample, write_table
 from tests.planners.toy import Toy, ToyBatches, ToySettings
 
 TRAINING = TrainingSettings(epochs=2, batch_size=4, learning_rate=0.01)
@@ -94,3 +97,25 @@ def test_two_processes_compute_what_one_does(tmp_path: Path) -> None:
         return [float(line.split(",")[1]) for line in lines]
 
     torch.testing.assert_close(torch.tensor(totals("two")), torch.tensor(totals("one")), rtol=1e-4, atol=1e-6)
+
+
+def half_of_a_command(rank: int, out: Path) -> None:
+    assert main(command(out, "half", "steps=5")) == 0
+
+
+def command(out: Path, name: str, *more: str) -> list[str]:
+    planner = ["planner=custom", "planner.name=tests.planners.toy:Toy", "+planner.settings.dropout=0.0"]
+    sizes = ["planner.training.batch_size=4", "planner.training.learning_rate=0.01", "device=cpu"]
+    return [*planner, *sizes, f"data.real=[{out / 'table'}]", f"out={out / name}", *more]
+
+
+@pytest.mark.slow
+def test_what_two_processes_began_one_goes_on_with_and_sees_the_same_samples(tmp_path: Path) -> None:
+    write_table(tmp_path / "table", [sample(i) for i in range(12)], shard_rows=10, group_rows=4)
+    in_two(half_of_a_command, tmp_path)
+    assert main(command(tmp_path, "half", "steps=9")) == 2
+    assert main(command(tmp_path, "half", "steps=9", "resume=further")) == 0
+    assert main(command(tmp_path, "alone", "steps=9")) == 0
+    assert read_record(tmp_path / "half")["earlier"] == [{"until_step": 5, "processes": 2, "steps": 5}]
+    curves = [np.loadtxt(tmp_path / name / LOSSES, delimiter=",", skiprows=1) for name in ("half", "alone")]
+    np.testing.assert_allclose(*curves, rtol=1e-4, atol=1e-6)
