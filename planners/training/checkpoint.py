@@ -15,7 +15,7 @@ import os
 import shutil
 import zipfile
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,10 +35,23 @@ RECORD, WEIGHTS, ARRAYS, TRAINING = "record.json", "weights.safetensors", "array
 KEPT = 2  # the newest ones of a training
 
 
+@dataclass(frozen=True)
+class Keep:
+    """Which checkpoints of a training stay beside the newest ones."""
+
+    every: int = 0  # those of every so many steps; 0: none
+    best: str | None = None  # the one with the least of this, a key of its record's `validation`
+
+
 def save_checkpoint(
-    out: Path, step: int, planner: Planner, record: Mapping[str, Any], training: Mapping[str, Any]
+    out: Path,
+    step: int,
+    planner: Planner,
+    record: Mapping[str, Any],
+    training: Mapping[str, Any],
+    keep: Keep = Keep(),
 ) -> Path:
-    """Write checkpoint `step` under `out` and remove all but the newest; returns its folder.
+    """Write checkpoint `step` under `out` and remove those that do not stay; returns its folder.
 
     record: what is to be known of the training, plain values; the planner's name and settings are added.
     """
@@ -53,9 +66,17 @@ def save_checkpoint(
     torch.save(dict(training), unfinished / TRAINING)
     shutil.rmtree(folder, ignore_errors=True)
     os.replace(unfinished, folder)
+    stays = None if keep.best is None else best(out, keep.best)
     for old in checkpoints(out)[:-KEPT]:
-        shutil.rmtree(old)
+        if old != stays and not (keep.every and int(old.name) % keep.every == 0):
+            shutil.rmtree(old)
     return folder
+
+
+def best(out: Path, measure: str) -> Path | None:
+    """The earliest checkpoint with the least of a measure among those that were validated; None where none was."""
+    measured = {path: read_record(path).get("validation", {}).get(measure) for path in checkpoints(out)}
+    return min((path for path, value in measured.items() if value is not None), key=measured.__getitem__, default=None)
 
 
 def as_record(settings: Any) -> dict[str, Any]:

@@ -7,7 +7,7 @@ the loader's position needs to be kept.
 import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import chain, count, islice
 from pathlib import Path
 from threading import Event
@@ -23,7 +23,7 @@ from factory.graph.progress import Counter
 from planners.command import Stopped
 from planners.data.batch import Batch
 from planners.models.planner import Planner
-from planners.training.checkpoint import load_training, load_weights, save_checkpoint
+from planners.training.checkpoint import Keep, best, load_training, load_weights, read_record, save_checkpoint
 from planners.training.curves import Curves
 from planners.training.processes import TrainingProcess
 
@@ -95,6 +95,7 @@ class Loop:
     log_every: int = 20  # steps between looks at the losses, which cost a wait for the device
     checkpoint_every: int = 1000
     validate_every: int = 0  # 0: only after the last step
+    keep: Keep = field(default_factory=Keep)  # checkpoints beside the newest
 
 
 def total_steps(batches: Batches, training: TrainingSettings, steps: int | None) -> int:
@@ -129,7 +130,7 @@ def fit(
     unlogged: list[Tensor] = []
     names: list[str] = []
 
-    def save(step: int) -> None:
+    def save(step: int, measured: Mapping[str, float]) -> None:
         if process.writes:
             state = {
                 "version": STATE_VERSION,
@@ -137,7 +138,8 @@ def fit(
                 "optimiser": optimiser.state_dict(),
                 "loader": batches.state(),
             }
-            save_checkpoint(out, step, planner, record, state)
+            of_it = {"validation": dict(measured)} if loop.keep.best is not None and measured else {}
+            save_checkpoint(out, step, planner, {**record, **of_it}, state, loop.keep)
         process.wait()
 
     def log(step: int) -> float:
@@ -153,9 +155,12 @@ def fit(
                 curves.loss(at, learning_rate(training, at, loop.steps), dict(zip(names, row)))
         return float(sum(values[-1]))
 
-    def check(step: int) -> None:
-        if validate is not None and curves is not None:
-            curves.validation(step, validate(planner))
+    def check(step: int) -> dict[str, float]:
+        if validate is None or curves is None:
+            return {}
+        measured = validate(planner)
+        curves.validation(step, measured)
+        return measured
 
     asked = Event()
     with asked_to_stop(asked.set), Counter("steps", loop.steps, first, quiet=not process.writes) as counter:
@@ -170,14 +175,18 @@ def fit(
             looks = step % loop.log_every == 0 or step == loop.steps
             # Several processes must agree, and ask each other rarely.
             stopping = process.anyone(asked.is_set()) if process.size == 1 or looks else False
-            saves = step % loop.checkpoint_every == 0 or step == loop.steps or stopping
-            if looks or saves:
+            saves = _multiple(step, loop.checkpoint_every) or _multiple(step, loop.keep.every) or step == loop.steps
+            saves = saves or stopping
+            measured: dict[str, float] = {}
+            if _multiple(step, loop.validate_every) or step == loop.steps:
+                measured = check(step)
+                if loop.keep.best is not None:
+                    saves = process.anyone(saves or _is_best(out, loop.keep.best, measured))
+            if looks or saves:  # a checkpoint whose losses are not written would leave a gap after a kill
                 loss = log(step)
             counter.show(step, f"loss {loss:.4f}")
-            if (loop.validate_every and step % loop.validate_every == 0) or step == loop.steps:
-                check(step)
             if saves:
-                save(step)
+                save(step, measured)
             if stopping and step < loop.steps:
                 raise Stopped(f"stopped after step {step} of {loop.steps}; the same command goes on")
     if curves is not None:
@@ -213,6 +222,18 @@ def _step(
         torch.nn.utils.clip_grad_norm_(model.parameters(), clip)
     optimiser.step()
     return sums
+
+
+def _multiple(step: int, every: int) -> bool:
+    return every > 0 and step % every == 0
+
+
+def _is_best(out: Path, measure: str, measured: Mapping[str, float]) -> bool:
+    """Whether no checkpoint is as good; never in a process that has not measured."""
+    if measure not in measured:
+        return False
+    before = best(out, measure)
+    return before is None or measured[measure] < read_record(before)["validation"][measure]
 
 
 def _endless(batches: Batches, n: int) -> Iterator[Batch]:

@@ -32,7 +32,17 @@ from planners.data.mix import MixSettings
 from planners.models.backbones.registry import load_pretrained
 from planners.models.planner import Planner
 from planners.models.registry import PlannerChoice, build_planner, planner_class, settings_of
-from planners.training.checkpoint import as_record, checkpoints, digest, load_arrays, load_weights, newest, read_record
+from planners.training.checkpoint import (
+    Keep,
+    as_record,
+    best,
+    checkpoints,
+    digest,
+    load_arrays,
+    load_weights,
+    newest,
+    read_record,
+)
 from planners.training.fit import Loop, TrainingSettings, fit, total_steps
 from planners.training.processes import RaySettings, TrainingProcess, joined
 
@@ -94,12 +104,20 @@ class TrainConfig:
     log_every: int = 20  # steps
     checkpoint_every: int = 1000  # steps
     validate_every: int = 0  # steps; 0: after the last one
+    keep_every: int = 0  # steps: checkpoints of their multiples stay; 0: only the newest two
+    keep_best: Literal["ade_m", "fde_m"] | None = None  # the checkpoint with the least of it on data.val stays as well
     ray: RaySettings = field(default_factory=RaySettings)
 
     def __post_init__(self) -> None:
         for name in ("accumulate", "log_every", "checkpoint_every"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}={getattr(self, name)}: must be at least 1")
+        if self.keep_every < 0:
+            raise ValueError(f"keep_every={self.keep_every}: must be at least 1, or 0 for none")
+        if self.keep_best is not None and not (self.data.val and self.validate_every):
+            raise ValueError(
+                f"keep_best={self.keep_best}: name data.val, and validate_every, to have some to choose from"
+            )
         if self.steps is not None and self.steps < 1:
             raise ValueError(f"steps={self.steps}: must be at least 1, or null for planner.training.epochs")
 
@@ -183,11 +201,14 @@ def train(config: TrainConfig, process: TrainingProcess) -> None:
         log_every=config.log_every,
         checkpoint_every=config.checkpoint_every,
         validate_every=config.validate_every,
+        keep=Keep(config.keep_every, config.keep_best),
     )
     process.wait()  # nobody looks for checkpoints any more
     fit(planner, loader, training, loop, process, out, record, resume_from, check)
     if process.writes:
         print(f"trained: {newest(out)}")
+        if config.keep_best is not None:
+            print(f"least {config.keep_best}: {best(out, config.keep_best)}")
 
 
 def _planner(config: TrainConfig, settings: Any, dataset: Dataset) -> Planner:

@@ -16,7 +16,7 @@ from factory.config.compose import ConfigError
 from planners.command import Stopped
 from planners.data.batch import Batch
 from planners.models.registry import PlannerChoice, build_planner
-from planners.training.checkpoint import checkpoints, digest, load_planner, newest
+from planners.training.checkpoint import Keep, best, checkpoints, digest, load_planner, newest, read_record
 from planners.training.curves import LOSSES, VALIDATION
 from planners.training.fit import Loop, TrainingSettings, fit, total_steps
 from planners.training.processes import TrainingProcess
@@ -225,6 +225,56 @@ def test_a_checkpoint_is_the_planner_and_only_the_newest_stay(tmp_path: Path) ->
     assert torch.equal(loaded.plan(batch), trained.eval().plan(batch))
     assert len(digest(tmp_path)) == 16
     assert digest(tmp_path) != digest(checkpoints(tmp_path)[0])
+
+
+def test_every_nth_checkpoint_stays_beside_the_newest(tmp_path: Path) -> None:
+    train(tmp_path, ToyBatches(20, 4), checkpoint_every=4, keep=Keep(every=5))
+    assert [int(path.name) for path in checkpoints(tmp_path)] == [5, 10, 12, 15]
+    train(tmp_path / "both", ToyBatches(20, 4), checkpoint_every=4, keep=Keep(every=8))
+    assert [int(path.name) for path in checkpoints(tmp_path / "both")] == [8, 12, 15]
+
+
+VALUES = {2: 3.0, 4: 1.0, 6: 2.0, 8: 1.0, 10: 5.0, 12: 4.0, 14: 1.5, 15: 9.0}
+
+
+@pytest.mark.parametrize("stop_after", [None, 3, 9])
+def test_the_best_checkpoint_stays_whatever_interrupts(tmp_path: Path, stop_after: int | None) -> None:
+    """Validated every second step: the first with the least value is that of step 4, also where step 8 equals it."""
+    at = iter(VALUES.values())
+    keep = {"validate_every": 2, "checkpoint_every": 5, "keep": Keep(best="off_m")}
+
+    def go_on(batches: ToyBatches, resume: Path | None = None) -> None:
+        loop = Loop(seed=1, steps=15, **keep)  # type: ignore[arg-type]
+        fit(toy(), batches, TRAINING, loop, ALONE, tmp_path, {}, resume, lambda planner: {"off_m": next(at)})
+
+    if stop_after is None:
+        go_on(ToyBatches(20, 4))
+    else:
+        with pytest.raises(Stopped):
+            go_on(Interrupted(20, 4, stop_after))
+        go_on(ToyBatches(20, 4), newest(tmp_path))
+    assert [int(path.name) for path in checkpoints(tmp_path)] == [4, 10, 15]
+    found = best(tmp_path, "off_m")
+    assert found is not None and found.name == "00000004"
+    assert read_record(found)["validation"] == {"off_m": 1.0}
+    assert best(tmp_path, "another") is None
+
+
+def test_a_training_killed_behind_its_best_checkpoint_goes_on_from_it_without_a_gap(tmp_path: Path) -> None:
+    class Killed(Exception):
+        pass
+
+    def once(planner: Any) -> dict[str, float]:
+        if best(tmp_path, "weight") is not None:
+            raise Killed
+        return measured(planner)
+
+    loop = Loop(seed=1, steps=15, validate_every=2, log_every=20, keep=Keep(best="weight"))
+    with pytest.raises(Killed):
+        fit(toy(), ToyBatches(20, 4), TRAINING, loop, ALONE, tmp_path, {}, None, once)
+    assert newest(tmp_path).name == "00000002"
+    train(tmp_path, ToyBatches(20, 4), newest(tmp_path))
+    assert [int(row["step"]) for row in rows(tmp_path / LOSSES)] == list(range(15))
 
 
 def test_a_checkpoint_of_another_planner_is_refused_by_name(tmp_path: Path) -> None:

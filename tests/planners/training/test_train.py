@@ -37,9 +37,17 @@ def command(table: str, out: Path, *more: str, sim: bool = True) -> list[str]:
 
 
 def test_it_trains_and_says_what_with(table: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(command(table, tmp_path, f"data.val=[{table}]", "mix.imitation=real", "validate_every=10")) == 0
+    assert (
+        main(
+            command(
+                table, tmp_path, f"data.val=[{table}]", "mix.imitation=real", "validate_every=10", "keep_best=ade_m"
+            )
+        )
+        == 0
+    )
     said = capsys.readouterr().out
     assert "real: 8 samples" in said and "recovery: 16" in said and "18 steps; begins" in said
+    assert f"least ade_m: {tmp_path}" in said
     record = read_record(tmp_path)
     assert record["step"] == 18
     assert record["trained"]["mix"]["imitation"] == "real"
@@ -148,6 +156,7 @@ def test_another_planner_or_other_settings_do_not_go_on_in_a_folder(
         (("planner.training.batch_size=100",), "lower planner.training.batch_size"),
         (("accumulate=3",), "accumulate=3"),
         (("device=cuda",), "device=cuda"),
+        (("keep_best=ade_m",), "name data.val"),
         (("init_from=nowhere",), "nowhere: no checkpoint"),
         (("planner=gtrs_dense_small",), "vocabulary"),
     ],
