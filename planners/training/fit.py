@@ -25,6 +25,7 @@ from planners.data.batch import Batch
 from planners.models.planner import Planner
 from planners.training.checkpoint import Keep, best, load_training, load_weights, read_record, save_checkpoint
 from planners.training.curves import Curves
+from planners.training.ema import RAW, Averaged
 from planners.training.processes import TrainingProcess
 
 
@@ -40,6 +41,7 @@ class TrainingSettings:
     weight_decay: float = 0.0
     warmup_steps: int = 0  # over which the rate rises linearly
     gradient_clip: float | None = None  # largest norm of the gradient; None: any
+    ema: float = 0.0  # decay of the averaged weights, which are then what is validated and saved; 0: as they are
 
     def __post_init__(self) -> None:
         for name, low in (("epochs", 1), ("batch_size", 1), ("warmup_steps", 0)):
@@ -49,6 +51,8 @@ class TrainingSettings:
             raise ValueError(f"learning_rate={self.learning_rate}: must be positive and finite")
         if self.gradient_clip is not None and not self.gradient_clip > 0.0:
             raise ValueError(f"gradient_clip={self.gradient_clip}: must be positive, or null for none")
+        if not 0.0 <= self.ema < 1.0:
+            raise ValueError(f"ema={self.ema}: must be a decay below 1, such as 0.999, or 0 for none")
 
 
 def learning_rate(settings: TrainingSettings, step: int, steps: int) -> float:
@@ -116,15 +120,17 @@ def fit(
 ) -> None:
     """Train `planner` in place, from a checkpoint where one is given, to the last step.
 
-    Writes `losses.csv` (every step), `validation.csv`, TensorBoard events and checkpoints under `out`.
+    Writes `losses.csv` (every step), `validation.csv`, TensorBoard events and checkpoints under `out`. With
+    `training.ema` those are of the averaged weights, and `planner` ends with the raw ones.
     Raises Stopped after SIGINT or SIGTERM, with a checkpoint written; FloatingPointError, with the step, where the loss
     is no number.
     """
     planner.to(process.device)
     optimiser = build_optimiser(training, planner)
-    first = 0
+    first, averages = 0, None
     if resume_from is not None:
-        first = _resume(resume_from, planner, optimiser, batches)
+        first, averages = _resume(resume_from, training, planner, optimiser, batches)
+    averaged = Averaged(planner, training.ema, averages) if training.ema and process.writes else None
     model = _wrapped(planner, process)
     curves = Curves(out, first) if process.writes else None
     unlogged: list[Tensor] = []
@@ -139,7 +145,8 @@ def fit(
                 "loader": batches.state(),
             }
             of_it = {"validation": dict(measured)} if loop.keep.best is not None and measured else {}
-            save_checkpoint(out, step, planner, {**record, **of_it}, state, loop.keep)
+            with _to_be_saved(averaged) as raw:
+                save_checkpoint(out, step, planner, {**record, **of_it}, {**state, **raw}, loop.keep)
         process.wait()
 
     def log(step: int) -> float:
@@ -158,7 +165,8 @@ def fit(
     def check(step: int) -> dict[str, float]:
         if validate is None or curves is None:
             return {}
-        measured = validate(planner)
+        with _to_be_saved(averaged):
+            measured = validate(planner)
         curves.validation(step, measured)
         return measured
 
@@ -172,6 +180,8 @@ def fit(
             names = names or list(terms)
             unlogged.append(torch.stack(list(terms.values())))
             step += 1
+            if averaged is not None:
+                averaged.update(step)
             looks = step % loop.log_every == 0 or step == loop.steps
             # Several processes must agree, and ask each other rarely.
             stopping = process.anyone(asked.is_set()) if process.size == 1 or looks else False
@@ -242,14 +252,28 @@ def _endless(batches: Batches, n: int) -> Iterator[Batch]:
     return islice(chain.from_iterable(epochs), n)
 
 
-def _resume(folder: Path, planner: Planner, optimiser: torch.optim.Optimizer, batches: Batches) -> int:
+def _to_be_saved(averaged: Averaged | None) -> AbstractContextManager[dict[str, Any]]:
+    """Inside, the planner is what is validated and saved; gives what going on needs beside it."""
+    return nullcontext({}) if averaged is None else averaged.in_planner()
+
+
+def _resume(
+    folder: Path, training: TrainingSettings, planner: Planner, optimiser: torch.optim.Optimizer, batches: Batches
+) -> tuple[int, dict[str, Tensor] | None]:
+    """The steps that are done, and the averaged weights where there are some."""
     state = load_training(folder)
     if state.get("version") != STATE_VERSION:
         raise ValueError(f"{folder}: training state {state.get('version')}, this version goes on from {STATE_VERSION}")
+    if (RAW in state) != (training.ema > 0.0):
+        raise ValueError(f"{folder}: trained {'with' if RAW in state else 'without'} ema, not with ema={training.ema}")
     load_weights(planner, folder)
+    averages = None
+    if RAW in state:
+        averages = {name: value.detach().clone() for name, value in planner.state_dict().items()}
+        planner.load_state_dict(state[RAW])
     optimiser.load_state_dict(state["optimiser"])
     batches.resume(state["loader"])
-    return int(state["step"])
+    return int(state["step"]), averages
 
 
 def _wrapped(planner: Planner, process: TrainingProcess) -> torch.nn.Module:

@@ -257,7 +257,7 @@ def _begun(out: Path, config: TrainConfig, identity: Mapping[str, Any]) -> Path 
         return None
     record = read_record(out)
     now = {**identity, "planner.name": config.planner.name, "planner.settings": as_record(settings_of(config.planner))}
-    then = {**record["trained"], **{f"planner.{key}": value for key, value in record["planner"].items()}}
+    then = {**_as_now(record["trained"]), **{f"planner.{key}": value for key, value in record["planner"].items()}}
     differs = {key: f"{key} {then.get(key)} -> {value}" for key, value in now.items() if then.get(key) != value}
     allowed = FURTHER if config.resume == "further" else frozenset()
     if differs.keys() - allowed:
@@ -271,11 +271,19 @@ def _begun(out: Path, config: TrainConfig, identity: Mapping[str, Any]) -> Path 
     return newest(out)
 
 
+def _as_now(trained: Mapping[str, Any]) -> dict[str, Any]:
+    """An identity, settings of training that its version did not have yet at their defaults, as it was computed."""
+    fields = dataclasses.fields(TrainingSettings)
+    defaults = {f.name: f.default for f in fields if f.default is not dataclasses.MISSING}
+    return {**trained, "planner.training": {**defaults, **trained["planner.training"]}}
+
+
 def _until_here(before: Mapping[str, Any], identity: Mapping[str, Any]) -> dict[str, Any]:
     """For the record: up to which step a training that goes on further was computed with other settings."""
     earlier = list(before.get("earlier", []))
-    if before and before["trained"] != identity:
-        changed = {key: before["trained"][key] for key in sorted(FURTHER) if before["trained"][key] != identity[key]}
+    then = before.get("trained", identity)
+    changed = {key: then[key] for key in sorted(FURTHER) if then[key] != identity[key]}
+    if changed:
         earlier.append({"until_step": before["step"], **changed})
     return {"earlier": earlier} if earlier else {}
 

@@ -30,7 +30,7 @@ def test_warm_up_rises_linearly_and_the_schedule_follows() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("epochs", 0), ("batch_size", 0), ("learning_rate", 0.0), ("gradient_clip", -1.0)]
+    ("name", "value"), [("epochs", 0), ("batch_size", 0), ("learning_rate", 0.0), ("gradient_clip", -1.0), ("ema", 1.0)]
 )
 def test_impossible_settings_are_refused_by_name(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=name):
