@@ -53,6 +53,7 @@ class LatentFusion(nn.Module):
         self.image = build_backbone(settings.backbone)
         own = replace(settings.backbone, pretrained=None)
         self.latent = build_backbone(own, settings.latent_channels)
+        self.latent.over_pictures = False
         size = settings.latent_size
         self.picture = nn.Parameter(torch.randn(1, settings.latent_channels, size, size))
         self.channels = self.image.channels

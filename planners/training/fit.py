@@ -4,18 +4,17 @@ Everything random in a step comes from a seed made of (run seed, step, rank), so
 the loader's position needs to be kept.
 """
 
-import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from itertools import chain, count, islice
 from pathlib import Path
 from threading import Event
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
 from factory.exits import asked_to_stop
@@ -26,52 +25,8 @@ from planners.models.planner import Planner
 from planners.training.checkpoint import Keep, best, load_training, load_weights, read_record, save_checkpoint
 from planners.training.curves import Curves
 from planners.training.ema import RAW, Averaged
+from planners.training.optim import TrainingSettings, build_optimiser, learning_rate, set_rate
 from planners.training.processes import TrainingProcess
-
-
-@dataclass(frozen=True)
-class TrainingSettings:
-    """What stands under `training` in conf/planner/*.yaml; the paper's values for its sizes (supplement, table 4)."""
-
-    epochs: int
-    batch_size: int  # of all processes and accumulated parts together
-    learning_rate: float
-    schedule: Literal["constant", "cosine"] = "constant"
-    optimiser: Literal["adam", "adamw"] = "adam"
-    weight_decay: float = 0.0
-    warmup_steps: int = 0  # over which the rate rises linearly
-    gradient_clip: float | None = None  # largest norm of the gradient; None: any
-    ema: float = 0.0  # decay of the averaged weights, which are then what is validated and saved; 0: as they are
-
-    def __post_init__(self) -> None:
-        for name, low in (("epochs", 1), ("batch_size", 1), ("warmup_steps", 0)):
-            if getattr(self, name) < low:
-                raise ValueError(f"{name}={getattr(self, name)}: must be at least {low}")
-        if not 0.0 < self.learning_rate < math.inf:
-            raise ValueError(f"learning_rate={self.learning_rate}: must be positive and finite")
-        if self.gradient_clip is not None and not self.gradient_clip > 0.0:
-            raise ValueError(f"gradient_clip={self.gradient_clip}: must be positive, or null for none")
-        if not 0.0 <= self.ema < 1.0:
-            raise ValueError(f"ema={self.ema}: must be a decay below 1, such as 0.999, or 0 for none")
-
-
-def learning_rate(settings: TrainingSettings, step: int, steps: int) -> float:
-    """The rate of step 0 .. steps - 1: warm-up, then constant, or a cosine that falls to nothing after the last."""
-    rate = settings.learning_rate
-    if step < settings.warmup_steps:
-        return rate * (step + 1) / settings.warmup_steps
-    if settings.schedule == "constant":
-        return rate
-    share = (step - settings.warmup_steps) / max(steps - settings.warmup_steps, 1)
-    return rate * 0.5 * (1.0 + math.cos(math.pi * min(share, 1.0)))
-
-
-def build_optimiser(settings: TrainingSettings, model: nn.Module) -> torch.optim.Optimizer:
-    """Adam or AdamW over everything that learns, in one kernel for all parameters."""
-    kind = torch.optim.Adam if settings.optimiser == "adam" else torch.optim.AdamW
-    learns = [parameter for parameter in model.parameters() if parameter.requires_grad]
-    return kind(learns, lr=settings.learning_rate, weight_decay=settings.weight_decay, fused=True)
-
 
 STATE_VERSION = 1
 
@@ -132,6 +87,7 @@ def fit(
         first, averages = _resume(resume_from, training, planner, optimiser, batches)
     averaged = Averaged(planner, training.ema, averages) if training.ema and process.writes else None
     model = _wrapped(planner, process)
+    epoch_steps = batches.n_batches(0)
     curves = Curves(out, first) if process.writes else None
     unlogged: list[Tensor] = []
     names: list[str] = []
@@ -159,7 +115,7 @@ def fit(
                 parts = ", ".join(f"{name} {value:g}" for name, value in zip(names, row))
                 raise FloatingPointError(f"the loss of step {at} is no number ({parts}): try a smaller learning_rate")
             if curves is not None:
-                curves.loss(at, learning_rate(training, at, loop.steps), dict(zip(names, row)))
+                curves.loss(at, learning_rate(training, at, loop.steps, epoch_steps), dict(zip(names, row)))
         return float(sum(values[-1]))
 
     def check(step: int) -> dict[str, float]:
@@ -175,7 +131,7 @@ def fit(
         step, loss = first, float("nan")
         for batch in _endless(batches, loop.steps - first):
             torch.manual_seed(_step_seed(loop.seed, step, process.rank))
-            rate = learning_rate(training, step, loop.steps)
+            rate = learning_rate(training, step, loop.steps, epoch_steps)
             terms = _step(model, optimiser, batch, rate, training.gradient_clip, loop, process)
             names = names or list(terms)
             unlogged.append(torch.stack(list(terms.values())))
@@ -214,8 +170,7 @@ def _step(
 ) -> dict[str, Tensor]:
     """One optimiser step; the terms of the loss, detached."""
     model.train()
-    for group in optimiser.param_groups:
-        group["lr"] = rate
+    set_rate(optimiser, rate)
     optimiser.zero_grad(set_to_none=True)
     sums: dict[str, Tensor] = {}
     for i, part in enumerate(batch.parts(loop.accumulate)):

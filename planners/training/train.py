@@ -43,7 +43,8 @@ from planners.training.checkpoint import (
     newest,
     read_record,
 )
-from planners.training.fit import Loop, TrainingSettings, fit, total_steps
+from planners.training.fit import Loop, fit, total_steps
+from planners.training.optim import TrainingSettings
 from planners.training.processes import RaySettings, TrainingProcess, joined
 
 LARGEST_BATCH = 32

@@ -19,7 +19,7 @@ from factory.config.compose import compose, fill
 from planners.data.batch import Batch, Needs
 from planners.models.planner import Planner
 from planners.models.registry import planner_class, settings_of
-from planners.training.fit import build_optimiser
+from planners.training.optim import build_optimiser
 from planners.training.train import PlannerEntry
 from tasks.subscores import LABELLED
 from tasks.world.kinematic_vocabulary import kinematic_trajectories

@@ -26,6 +26,8 @@ class BackboneSettings:
 class Backbone(nn.Module, ABC):
     """`enter`, then `stage` 0 .. 3, between which a planner may change the features; `forward` is all of them."""
 
+    over_pictures = True  # False of one over something else, which learns as the rest does
+
     def __init__(self, settings: BackboneSettings, channels: tuple[int, ...]) -> None:
         super().__init__()
         self.settings, self.channels = settings, channels

@@ -13,7 +13,7 @@ from planners.data.batch import Batch, BevLayout, ImageLayout
 from planners.models.anchors import cluster_anchors
 from planners.models.diffusiondrive import DiffusionDrive, DiffusionDriveSettings, from_unit, to_unit
 from planners.models.planner import TrainingData
-from planners.training.fit import TrainingSettings
+from planners.training.optim import TrainingSettings
 from tests.planners import scenes
 
 WAYS = 4

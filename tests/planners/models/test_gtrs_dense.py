@@ -12,7 +12,7 @@ from planners.data.batch import Batch, ImageLayout
 from planners.models.backbones.base import BackboneSettings
 from planners.models.gtrs_dense import GtrsDense, GtrsDenseSettings, imitated, shifted
 from planners.models.planner import TrainingData
-from planners.training.fit import TrainingSettings
+from planners.training.optim import TrainingSettings
 from tasks.subscores import LABELLED
 from tasks.world.vocabulary import Vocabulary
 from tests.planners import scenes

@@ -11,7 +11,7 @@ from planners.models.backbones.base import BackboneSettings
 from planners.models.ego_mlp import EgoMlpBevSettings, EgoMlpSettings
 from planners.models.ltf import LtfSettings
 from planners.models.registry import PlannerChoice, build_planner, settings_of
-from planners.training.fit import TrainingSettings
+from planners.training.optim import TrainingSettings
 from tests.planners.made_batch import made_batch
 
 NAMES = ("constant_velocity", "ego_mlp", "ego_mlp_small", "ego_mlp_bev", "ego_mlp_bev_small", "ltf", "ltf_small")

@@ -10,7 +10,8 @@ from torch import Tensor
 from planners.command import Stopped
 from planners.training.checkpoint import load_planner, load_training, newest
 from planners.training.ema import RAW, Averaged
-from planners.training.fit import Loop, TrainingSettings, fit
+from planners.training.fit import Loop, fit
+from planners.training.optim import TrainingSettings
 from tests.planners.toy import Toy, ToyBatches, ToySettings
 from tests.planners.training.test_fit import ALONE, Interrupted, measured, rows
 

@@ -18,7 +18,8 @@ from planners.data.batch import Batch
 from planners.models.registry import PlannerChoice, build_planner
 from planners.training.checkpoint import Keep, best, checkpoints, digest, load_planner, newest, read_record
 from planners.training.curves import LOSSES, VALIDATION
-from planners.training.fit import Loop, TrainingSettings, fit, total_steps
+from planners.training.fit import Loop, fit, total_steps
+from planners.training.optim import TrainingSettings
 from planners.training.processes import TrainingProcess
 from tests.planners.toy import Toy, ToyBatches, ToySettings, toy_batch
 
@@ -181,6 +182,14 @@ def test_the_rate_of_a_step_is_the_schedules_and_the_one_that_is_logged(tmp_path
     assert optimiser.rates == pytest.approx(logged, rel=1e-5)
     assert optimiser.rates[:4] == pytest.approx([0.01 / 3, 0.02 / 3, 0.01, 0.01])
     assert optimiser.rates[-1] == pytest.approx(0.005 * (1.0 + math.cos(math.pi * 11 / 12)))
+
+
+def test_an_epoch_of_a_schedule_is_the_loaders(tmp_path: Path, stepped_by: list[Sgd]) -> None:
+    training = TrainingSettings(epochs=3, batch_size=4, learning_rate=0.01, warmup_epochs=2.0, by_epoch=True)
+    fit(without_chance(), ToyBatches(20, 4), training, Loop(1, 15, log_every=4), ALONE, tmp_path, {})
+    (optimiser,) = stepped_by
+    assert optimiser.rates == pytest.approx([0.005] * 5 + [0.01] * 10)
+    assert [float(row["learning_rate"]) for row in rows(tmp_path / LOSSES)] == optimiser.rates
 
 
 class Dice(Toy):

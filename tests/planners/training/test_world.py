@@ -12,7 +12,8 @@ import torch.multiprocessing as mp
 
 from planners.training.checkpoint import newest, read_record
 from planners.training.curves import LOSSES
-from planners.training.fit import Loop, TrainingSettings, fit
+from planners.training.fit import Loop, fit
+from planners.training.optim import TrainingSettings
 from planners.training.processes import joined
 from planners.training.train import main
 from tests.planners.samples import sample, write_table
