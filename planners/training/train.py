@@ -29,7 +29,7 @@ from planners.data.feed import open_data
 from planners.data.index import Dataset, DataSettings
 from planners.data.loader import Loader
 from planners.data.mix import MixSettings
-from planners.models.backbones.registry import load_pretrained
+from planners.models.backbones.registry import load_pretrained, set_recompute
 from planners.models.planner import Planner
 from planners.models.registry import PlannerChoice, build_planner, planner_class, settings_of
 from planners.training.checkpoint import (
@@ -101,6 +101,7 @@ class TrainConfig:
     device: Literal["auto", "cpu", "cuda"] = "auto"
     precision: Literal["auto", "fp32", "bf16"] = "auto"  # auto: bf16 on a GPU, fp32 elsewhere
     accumulate: int = 1  # parts that a batch is computed in
+    recompute: bool = False  # backbones over pictures keep no activations: less memory, a forward pass more
     workers: int = 2  # threads that decode
     log_every: int = 20  # steps
     checkpoint_every: int = 1000  # steps
@@ -163,6 +164,7 @@ def train(config: TrainConfig, process: TrainingProcess) -> None:
     dataset = open_data(config.data, mix=config.mix)
     torch.manual_seed(config.seed)
     planner = _planner(config, settings, dataset)
+    set_recompute(planner, config.recompute)
     loader = Loader(
         dataset,
         planner.needs,

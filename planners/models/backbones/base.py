@@ -1,11 +1,14 @@
 """What an image backbone is: four feature maps at strides 4, 8, 16, 32 from a picture."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal, Self
 
 import torch
 from torch import Tensor, nn
+
+from planners.models.backbones.recompute import recomputed
 
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of red, green, blue in 0 .. 1
 STRIDES = (4, 8, 16, 32)
@@ -27,6 +30,7 @@ class Backbone(nn.Module, ABC):
     """`enter`, then `stage` 0 .. 3, between which a planner may change the features; `forward` is all of them."""
 
     over_pictures = True  # False of one over something else, which learns as the rest does
+    recompute = False  # whether blocks keep no activations for the backward pass; results stay the same
 
     def __init__(self, settings: BackboneSettings, channels: tuple[int, ...]) -> None:
         super().__init__()
@@ -52,6 +56,13 @@ class Backbone(nn.Module, ABC):
         if image.dtype != torch.uint8:
             return image
         return torch.addcmul(self.get_buffer("shift"), image, self.get_buffer("scale"))
+
+    def through(self, blocks: Iterable[nn.Module], features: Tensor) -> Tensor:
+        """The features after one block after the other."""
+        again = self.recompute and torch.is_grad_enabled()
+        for block in blocks:
+            features = recomputed(block, features) if again else block(features)
+        return features
 
     def train(self, mode: bool = True) -> Self:
         """As of every module, but that normalisations with `frozen_norm` stay in evaluation."""

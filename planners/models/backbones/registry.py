@@ -36,6 +36,13 @@ def build_backbone(settings: BackboneSettings, in_channels: int = 3) -> Backbone
     return VoVNet99(settings)
 
 
+def set_recompute(model: nn.Module, on: bool) -> None:
+    """Whether the backbones of a model that are over pictures keep no activations for the backward pass."""
+    for module in model.modules():
+        if isinstance(module, Backbone) and module.over_pictures:
+            module.recompute = on
+
+
 def load_pretrained(model: nn.Module) -> dict[str, str]:
     """Loads what every backbone of a model names, and says what that was: module -> "none", or file and sha256.
 

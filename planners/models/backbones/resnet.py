@@ -54,4 +54,4 @@ class ResNet(Backbone):
         return self.maxpool(self.relu(self.bn1(self.conv1(self.normalised(image)))))
 
     def stage(self, index: int, features: Tensor) -> Tensor:
-        return self.get_submodule(f"layer{index + 1}")(features)
+        return self.through(self.get_submodule(f"layer{index + 1}").children(), features)

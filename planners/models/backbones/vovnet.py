@@ -85,4 +85,4 @@ class VoVNet99(Backbone):
         return self.get_submodule("stem")(self.normalised(image).flip(1))
 
     def stage(self, index: int, features: Tensor) -> Tensor:
-        return self.get_submodule(f"stage{index + 2}")(features)
+        return self.through(self.get_submodule(f"stage{index + 2}").children(), features)
