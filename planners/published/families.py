@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from factory.exports.navsim.rewards import METRICS
 from planners.models.anchors import WAYPOINTS
 from planners.models.diffusiondrive import POINT_FEATURES, DiffusionDriveSettings
 from planners.models.gtrs_dense import IMITATION, GtrsDenseSettings
@@ -19,16 +20,7 @@ from tasks.world.arrays import FloatArray
 Arrays = dict[str, FloatArray]
 
 # GTRS's heads and scores by the names that they have here
-SCORES = {
-    "no_at_fault_collisions": "nc",
-    "drivable_area_compliance": "dac",
-    "driving_direction_compliance": "ddc",
-    "traffic_light_compliance": "tlc",
-    "ego_progress": "ep",
-    "time_to_collision_within_bound": "ttc",
-    "lane_keeping": "lk",
-    "history_comfort": "hc",
-}
+SCORES = {public: name for public, name in METRICS.items() if name != "score"}
 
 
 def fusion(moves: Moves, ours: str) -> None:
