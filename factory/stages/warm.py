@@ -18,11 +18,14 @@ import numpy as np
 
 from factory.graph.work import NotReady
 from tasks.attempt import drive_and_judge
-from tasks.experts.pdm_closed.planner import PdmSettings
+from tasks.experts.pdm_closed.forecast import forecast
+from tasks.experts.pdm_closed.proposals import proposals
+from tasks.experts.pdm_closed.settings import PdmSettings
 from tasks.experts.protocol import Plan
 from tasks.kernels.compiled import USED, cache_dir, make_cache_dir, not_kept, processor, write_whole
 from tasks.render import warm as render_warm
 from tasks.render.settings import RenderMode, RenderSettings, SceneFrom
+from tasks.reward.epdms import score
 from tasks.reward.labels import Labelling, reactive_scores, vocabulary_labels
 from tasks.reward.prepare import prepare_scene
 from tasks.reward.verdicts import INDEX_FROM_ROWS
@@ -34,6 +37,7 @@ from tasks.world.kinematic_vocabulary import kinematic_trajectories
 from tasks.world.lanes import Lane, RoadMap, Route
 from tasks.world.vocabulary import Vocabulary
 
+REPLAY = TrafficSettings(mode="replay")
 ENOUGH_S = 0.2  # between two looks whether compiling is to be given up
 _one_at_a_time = Lock()
 
@@ -44,7 +48,7 @@ def parts_of(simulates: bool, traffic: str, label_traffic: str | None, render: R
     simulates: it has another expert than `human`; traffic, label_traffic: the mode of the drives' traffic and of the
     labels' (None: it makes none). The public traffic, "navsim", has no kernels.
     """
-    parts = ["judge"]
+    parts = ["judge", "plan"]
     if label_traffic in ("idm", "navsim"):  # scored among the answers
         parts.append("answers")
     elif simulates and traffic == "idm":
@@ -144,8 +148,7 @@ def _ended(part: "subprocess.Popen[str]", enough: Event) -> str:
 
 def _warm(name: str) -> int:
     """One part, in this process; the exit code."""
-    gc.freeze()
-    gc.set_threshold(200_000, 50, 100)  # the compiler's many small objects die by themselves: 7 % of its time saved
+    gc.disable()  # a process that ends soon: some 220 MB more for a sixth of its time
     PARTS[name]()
     listed = "\n".join(sorted(path.relative_to(cache_dir()).as_posix() for path in USED))
     try:
@@ -158,16 +161,26 @@ def _warm(name: str) -> int:
 
 
 def _judge() -> None:
-    """Tracks, plans and scores, a few trajectories and many.
+    """Scores, of a few trajectories and of many, and all that an attempt among the log's traffic enters.
 
-    The map comes first: `drive` begins with the tracker, which is there when it is needed here.
+    `plan` is compiled meanwhile and takes half as long: it is there when the attempt asks for it.
     """
     scene, ahead = _tiny_scene()
-    prepare_scene(scene, scene.agents.window(scene.step, scene.step + HORIZON_STEPS + 1))
-    replay = TrafficSettings(mode="replay")
-    judged = drive_and_judge(scene, Plan(ahead), replay, PdmSettings())
-    labelling = Labelling(Vocabulary(kinematic_trajectories(INDEX_FROM_ROWS, 0)), replay)
+    prepared = prepare_scene(scene, scene.agents.window(scene.step, scene.step + HORIZON_STEPS + 1))
+    standing = np.tile(scene.ego_state, (INDEX_FROM_ROWS, HORIZON_STEPS + 1, 1))
+    score(prepared, standing[:2], normalise="pairs")
+    score(prepared, standing)
+    judged = drive_and_judge(scene, Plan(ahead), REPLAY, PdmSettings())
+    labelling = Labelling(Vocabulary(kinematic_trajectories(INDEX_FROM_ROWS, 0)), REPLAY)
     vocabulary_labels(labelling, scene, judged.prepared, judged.reference)
+
+
+def _plan() -> None:
+    """The tracker, and what PDM-Closed proposes."""
+    scene, ahead = _tiny_scene()
+    simulate(scene, ahead, REPLAY)
+    seen = forecast(scene.ego_state, scene.agents.window(scene.step, scene.step + 1))
+    proposals(scene.ego_state, scene.centerline, seen, None, PdmSettings())
 
 
 def _drive() -> None:
@@ -180,7 +193,7 @@ def _answers() -> None:
     """The same, and traffic around each of several egos, scored."""
     _drive()
     scene, ahead = _tiny_scene()
-    states = simulate(scene, ahead, TrafficSettings(mode="replay")).ego_states
+    states = simulate(scene, ahead, REPLAY).ego_states
     reactive_scores(scene, np.stack([states] * 2), TrafficSettings())
 
 
@@ -190,8 +203,15 @@ def _fit() -> None:
     render_warm.compile_fit_kernels()
 
 
-PARTS = {"judge": _judge, "drive": _drive, "answers": _answers, "render": render_warm.compile_kernels, "fit": _fit}
-INCLUDED = {"answers": ("drive",), "fit": ("render",)}
+PARTS = {
+    "judge": _judge,
+    "plan": _plan,
+    "drive": _drive,
+    "answers": _answers,
+    "render": render_warm.compile_kernels,
+    "fit": _fit,
+}
+INCLUDED = {"judge": ("plan",), "answers": ("drive",), "fit": ("render",)}
 DISK_FULL = 5  # exit code of a part whose files could not be kept
 
 

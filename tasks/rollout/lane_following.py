@@ -258,8 +258,7 @@ def _log_offset(center: Array, heading: Array, log_poses: Array) -> Array:
     grid = PATH_SPACING_M * np.arange(float(n))
     beside = frenet(center, grid, log_poses)
     at, offset, m = np.empty(len(beside)), np.empty(len(beside)), 0
-    order = np.argsort(beside[:, 0], kind="mergesort")
-    for i in order:
+    for i in _order_along(beside):
         s, left = beside[i, 0], beside[i, 1]
         turned = abs(wrapped(log_poses[i, 2] - interpolated(s, grid, heading)))
         usable = abs(left) <= MAX_LOG_OFFSET_M and turned <= SNAP_HEADING_RAD and s > 0.0 and s < grid[-1]
@@ -274,6 +273,19 @@ def _log_offset(center: Array, heading: Array, log_poses: Array) -> Array:
         u = min(max((grid[k] - at[-1]) / FADE_M, 0.0), 1.0)
         profile[k] = interpolated(grid[k], at, offset) * (1.0 - u * u * (3.0 - 2.0 * u))
     return _smoothed(profile)
+
+
+@kernel
+def _order_along(beside: Array) -> Ints:
+    """(R,) rows (R, 2) by their first column, equals as they come: a log drives on, so few places are exchanged."""
+    order = np.empty(len(beside), np.int64)
+    for i in range(len(beside)):
+        k = i
+        while k > 0 and beside[order[k - 1], 0] > beside[i, 0]:
+            order[k] = order[k - 1]
+            k -= 1
+        order[k] = i
+    return order
 
 
 @kernel

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from tasks.kernels.compiled import kernel
-from tasks.rollout.polylines import interpolated, lengths_along
+from tasks.rollout.polylines import extent, interpolated, lengths_along
 from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.frames import wrap_angle
 from tasks.world.geometry import to_line, wrapped
@@ -84,9 +84,11 @@ def _discs_around(points: Array, first: Ints) -> Array:
     out = np.zeros((len(first) - 1, 3))
     for lane in range(len(out)):
         xy = points[first[lane] : first[lane + 1]]
-        x, y = 0.5 * (xy[:, 0].min() + xy[:, 0].max()), 0.5 * (xy[:, 1].min() + xy[:, 1].max())
-        out[lane, 0], out[lane, 1] = x, y
-        out[lane, 2] = math.sqrt(((xy[:, 0] - x) ** 2 + (xy[:, 1] - y) ** 2).max())
+        (left, right), (low, high) = extent(xy[:, 0]), extent(xy[:, 1])
+        x, y, square = 0.5 * (left + right), 0.5 * (low + high), 0.0
+        for k in range(len(xy)):
+            square = max(square, (xy[k, 0] - x) ** 2 + (xy[k, 1] - y) ** 2)
+        out[lane, 0], out[lane, 1], out[lane, 2] = x, y, math.sqrt(square)
     return out
 
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tasks.kernels.compiled import inner_kernel, kernel
+from tasks.rollout.polylines import extent
 from tasks.world.arrays import Array
 
 Box = Array | tuple[float, float, float, float, float]  # centre x, y [m], heading [rad], length, width [m]
@@ -51,18 +52,19 @@ def stretches_of(xy: Array, heading: Array) -> Array:
     for m in range(n_paths):
         for b in range(n):
             first, last = b * CELLS, min((b + 1) * CELLS, n_points - 1)
-            turned = heading[m, first : last + 1]
-            middle = 0.5 * (turned.min() + turned.max())
+            least, largest = extent(heading[m, first : last + 1])
+            middle = 0.5 * (least + largest)
             ux, uy = math.cos(middle), math.sin(middle)
             along = xy[m, first : last + 1, 0] * ux + xy[m, first : last + 1, 1] * uy
             across = xy[m, first : last + 1, 1] * ux - xy[m, first : last + 1, 0] * uy
-            u, v = 0.5 * (along.min() + along.max()), 0.5 * (across.min() + across.max())
-            half_u, half_v = 0.5 * (along.max() - along.min()), 0.5 * (across.max() - across.min())
+            (back, front), (right, left) = extent(along), extent(across)
+            u, v = 0.5 * (back + front), 0.5 * (right + left)
+            half_u, half_v = 0.5 * (front - back), 0.5 * (left - right)
             out[m, b, 0], out[m, b, 1] = u * ux - v * uy, u * uy + v * ux
             out[m, b, 2], out[m, b, 3] = ux, uy
             out[m, b, 4], out[m, b, 5] = half_u, half_v
             out[m, b, 6] = math.hypot(half_u, half_v)
-            out[m, b, 7] = turned.max() - middle
+            out[m, b, 7] = largest - middle
     return out
 
 

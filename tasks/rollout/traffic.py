@@ -91,23 +91,36 @@ def drive_many(
     valid, was_driven = np.empty((n_egos, n_rows, n), np.bool_), np.empty((n_egos, n), np.bool_)
     rows, motion, diverged = empty_rows(n_rows, n), empty_motion(n_rows, n), nobody_diverged(n)
     for b in range(n_egos):
-        rows.boxes[:], rows.velocities[:], rows.valid[:] = recorded.boxes, recorded.velocities, recorded.valid
-        rows.center_z[:], rows.radius[:] = recorded.center_z, recorded.radius
+        for t in range(n_rows):
+            for i in range(n + 1):
+                _copy(recorded, t, i, rows.boxes, rows.velocities, rows.valid)
+                rows.center_z[t, i], rows.radius[t, i] = recorded.center_z[t, i], recorded.radius[t, i]
         diverged.found[:], diverged.size[0] = False, 0
         _set_ego(rows, diverged, ego_boxes[b], ego_velocities[b])
         for t in range(n_rows - 1):
             _step(start, log, roles, paths, driver, t, rows, diverged, motion, record)
-        boxes[b], velocities[b], valid[b] = rows.boxes[:, :n], rows.velocities[:, :n], rows.valid[:, :n]
+        for t in range(n_rows):
+            for i in range(n):
+                _copy(rows, t, i, boxes[b], velocities[b], valid[b])
         for i in range(n):
             moved = motion.was_driven if diverged.found[i] else record.was_driven
             was_driven[b, i] = moved[n_rows - 1, i]
     return boxes, velocities, valid, was_driven
 
 
+@hidden_kernel
+def _copy(rows: RolloutRows, t: int, i: int, boxes: Array, velocities: Array, valid: Bools) -> None:
+    """Where i is in row t; element by element: numba takes seconds to compile the copy of a slice."""
+    for k in range(5):
+        boxes[t, i, k] = rows.boxes[t, i, k]
+    velocities[t, i, 0], velocities[t, i, 1] = rows.velocities[t, i, 0], rows.velocities[t, i, 1]
+    valid[t, i] = rows.valid[t, i]
+
+
 @kernel
 def _set_ego(rows: RolloutRows, diverged: Diverged, boxes: Array, velocities: Array) -> None:
     ego = len(diverged.found) - 1
-    for t in range(boxes.shape[0]):  # element by element: numba takes seconds to compile the copy of a slice
+    for t in range(boxes.shape[0]):
         for k in range(5):
             rows.boxes[t, ego, k] = boxes[t, k]
         rows.velocities[t, ego, 0], rows.velocities[t, ego, 1] = velocities[t, 0], velocities[t, 1]

@@ -34,7 +34,7 @@ LISTENERS = (
     "--ray-client-server-port",
 )
 UPLOADED = ("factory", "tasks", "planners", "conf", "pyproject.toml", ".rayignore", ".gitignore")
-PARTS = ["judge", "drive"]  # of factory.stages.warm
+PARTS = ["judge", "plan", "drive"]  # of factory.stages.warm
 SMALL = ("clips.n_clips=1", "clips.settings.cameras=[]", "clips.settings.lidar_beams=0", "render=none")
 SMALL_JOB = ("rounds=5", *SMALL, "vocabulary.k=64", "experts=[human]")
 LEFT_AT_HOME = (  # what lies in a checkout that was worked with

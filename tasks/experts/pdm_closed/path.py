@@ -99,13 +99,13 @@ def project(paths: DrivePaths, path: int, px: float, py: float) -> float:
     arithmetic of GEOS, so that ties between segments fall as they do for the public planner.
     """
     x, y, along, inverse = paths.x[path], paths.y[path], paths.progress[path], paths.inverse_square[path]
-    squares = np.empty(inverse.shape[0])
+    squares, bound = np.empty(inverse.shape[0]), np.inf
     next_x, next_y = x[1:], y[1:]
     for k in range(inverse.shape[0]):
         ex, ey = next_x[k] - x[k], next_y[k] - y[k]
         ux, uy = px - x[k], py - y[k]
         squares[k] = to_line(ux, uy, ex, ey, (ux * ex + uy * ey) * inverse[k])[1]
-    bound = squares.min()
+        bound = min(bound, squares[k])
     bound += _TIE_M2 * (1.0 + bound)
     nearest, found = np.inf, 0.0
     for k in range(inverse.shape[0]):

@@ -37,7 +37,8 @@ def comfort_history(past_states: Array) -> Array:
     past = past_states.copy()
     heading = past[:, HEADING].copy()
     unwrap(heading)
-    past[:, HEADING] = heading
+    for k in range(len(past)):  # element by element: numba takes seconds to compile the copy of a slice
+        past[k, HEADING] = heading[k]
     past[:, STEERING + 1 :] = 0.0
     rows = np.empty((HISTORY_ROWS, EGO_STATE_SIZE))
     for row in range(HISTORY_ROWS):
