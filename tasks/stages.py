@@ -36,7 +36,7 @@ HUMAN_BEFORE, FOLLOW_UP, FOLLOW_UP_BEFORE = FRAMES = ("human_before", "follow_up
 PICTURE_FAULTS = ("holes", "lens_covered", "blank", "blurred", "unlike_photos")  # tasks.render.gate
 
 STAGES: tuple[Stage, ...] = (
-    Stage("clip", 3, "clip", ("ego_standing", "broken_tracks", "route_ended", "no_earlier_frame")),
+    Stage("clip", 4, "clip", ("ego_standing", "broken_tracks", "route_ended", "no_earlier_frame")),
     Stage("perturb", 1, "clip", ("no_gated_candidate", "no_good_candidate")),
     Stage("rollout", 2, "attempt", ("route_ended",)),
     Stage("expert", 1, "attempt", ("no_plan",)),

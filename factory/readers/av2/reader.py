@@ -122,28 +122,29 @@ def read_log(folder: Path) -> AV2Log:
 
 
 def read_cameras(folder: Path) -> tuple[Camera, ...]:
-    """The calibrated cameras of a log, in file order; none where the log has no calibration. Raises BadClip."""
+    """The calibrated cameras of a log, in file order; none where the log has no calibration. Raises BadClip.
+
+    Argoverse releases photos without distortion: its own API projects by fx, fy, cx and cy alone (PinholeCamera of
+    av2.geometry.camera). k1, k2 and k3 of the same file tell what the lens was like, and are not read.
+    """
     path, pose_path = folder / INTRINSICS, folder / EXTRINSICS
     if not path.exists() and not pose_path.exists():
         return ()
-    columns = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "height_px", "width_px")
+    columns = ("fx_px", "fy_px", "cx_px", "cy_px", "height_px", "width_px")
     table = read_feather(path, ("sensor_name", *columns))
     mounts = read_feather(pose_path, ("sensor_name", *POSE_COLUMNS))
     poses = numbers(pose_path, mounts, POSE_COLUMNS)
     turned = rotations(pose_path, poses).as_matrix()
     mount_of = {str(name): i for i, name in enumerate(mounts["sensor_name"])}
     cameras = []
-    for name, (fx, fy, cx, cy, k1, k2, k3, height, width) in zip(
-        table["sensor_name"].astype(str), numbers(path, table, columns)
-    ):
+    for name, (fx, fy, cx, cy, height, width) in zip(table["sensor_name"].astype(str), numbers(path, table, columns)):
         if name not in mount_of:
             raise BadClip(str(pose_path), "sensor_name", f"no pose of camera {name}")
         mount, row = np.eye(4), mount_of[name]
         mount[:3, :3], mount[:3, 3] = turned[row], poses[row, 4:]
         intrinsics = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        distortion = np.array([k1, k2, 0.0, 0.0, k3])  # Argoverse has radial terms only
         try:
-            cameras.append(Camera(str(name), int(width), int(height), intrinsics, distortion, mount))
+            cameras.append(Camera(str(name), int(width), int(height), intrinsics, np.zeros(5), mount))
         except ValueError as error:
             raise BadClip(str(path), "calibration", str(error)) from error
     return tuple(cameras)

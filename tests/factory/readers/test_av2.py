@@ -12,6 +12,7 @@ import pytest
 
 from factory.readers.av2.reader import AV2Reader, read_cameras
 from factory.readers.base import BadClip, ClipRef
+from factory.stages.sensors import encode_jpeg, load_photos
 from tasks.world.agents import AgentKind
 from tasks.world.clip import CLIP_STEPS, NOW
 from tasks.world.lanes import LightState
@@ -235,7 +236,7 @@ def test_light_phases_hold_until_the_next_row(log: Path) -> None:
 
 def calibrate(log: Path, **changed: float) -> None:
     """One camera, its intrinsics or mount changed."""
-    (log / "calibration").mkdir()
+    (log / "calibration").mkdir(exist_ok=True)
     numbers = {"fx_px": 500.0, "fy_px": 510.0, "cx_px": 320.0, "cy_px": 240.0, "k1": 0.0, "k2": 0.0, "k3": 0.0}
     shape = {"height_px": 480, "width_px": 640}
     intrinsics = {name: changed.get(name, value) for name, value in (numbers | shape).items()}
@@ -277,6 +278,28 @@ def test_images_and_sweeps_carry_the_pose_of_their_stamp(log: Path) -> None:
     assert [round(image.time_s, 9) for image in second.images] == [0.03] and not third.images
     assert np.allclose(second.images[0].world_from_ego[:2, 3], road(np.array(SPEED * 1.03), np.array(0.0)))
     assert [round(clip.sweeps[0].time_s, 9) for clip in (first, second, third)] == [2.5, 1.5, 0.5]
+
+
+def test_ring_photos_are_taken_as_released_at_full_size_and_each_with_its_own_stamp(log: Path) -> None:
+    """Argoverse took the distortion out before it released them; k1..k3 tell of the lens (av2-api projects without)."""
+    calibrate(log, k1=-0.240732, k2=-0.212243, k3=0.325902, width_px=1550, height_px=2048, cx_px=778.0, cy_px=1013.5)
+    folder = log / "sensors" / "cameras" / "front"
+    folder.mkdir(parents=True)
+    photo = np.kron(np.random.default_rng(0).integers(40, 215, (64, 50, 3)), np.ones((32, 31, 1))).astype(np.uint8)
+    stamps_ns = START_NS + 1_000_000_000 + 49_950_000 * np.arange(60) + 1_234_567  # 20 Hz, between the poses' stamps
+    for stamp in stamps_ns:
+        (folder / f"{stamp}.jpg").touch()
+    (folder / f"{stamps_ns[0]}.jpg").write_bytes(encode_jpeg(photo, 95))
+    reader = AV2Reader(log)
+    clip = reader.read(reader.index().refs[0])
+    assert not clip.cameras[0].distortion.any()
+    assert [image.time_s for image in clip.images] == pytest.approx((stamps_ns - START_NS) / 1e9, abs=1e-9)
+    expected = road(SPEED * (stamps_ns - START_NS) / 1e9, np.zeros(60))
+    assert np.abs(np.stack([image.world_from_ego[:2, 3] for image in clip.images]) - expected).max() < 1e-7
+    (loaded,) = load_photos(clip.images[:1], clip.cameras, 1550, 2048)
+    assert loaded.rgb.shape == (2048, 1550, 3)
+    assert np.abs(loaded.rgb.astype(int) - photo).mean() < 3.0  # a JPEG away from it: nothing was bent
+    assert loaded.intrinsics.tolist() == clip.cameras[0].intrinsics.tolist()
 
 
 def test_clip_ids_and_digest_know_the_content_but_not_the_place(log: Path, tmp_path: Path) -> None:
