@@ -14,7 +14,7 @@ from factory.config.plugins import with_experts
 from factory.config.shapes import defaults_of, keys_of, merged
 from factory.config.words import ConfigError, nearest
 from factory.job import in_submitted_job
-from factory.readers.settings import LogClips, NavsimClips, Py123dClips, TownClips, TownsClips
+from factory.readers.settings import LogClips, NavsimClips, Py123dClips, ScenarioNetClips, TownClips, TownsClips
 from tasks.experts.pdm_closed.settings import PdmSettings
 from tasks.experts.recovery.settings import RecoverySettings
 from tasks.render.settings import RenderMode, RenderSettings
@@ -24,11 +24,12 @@ from tasks.stages import FRAMES, TASKS
 
 MOST_K = 2**17  # of a kinematic vocabulary: 126 MB of trajectories, eight times the largest in use
 AV2 = "factory.readers.av2.reader.AV2Reader"
+SCENARIONET = "factory.readers.scenarionet.reader.ScenarioNetReader"
 READERS: Mapping[str, type[Any]] = {  # `_target_` of a built-in reader -> its settings
     AV2: LogClips,
     "factory.readers.navsim.reader.NavsimReader": NavsimClips,
     "factory.readers.py123d.reader.Py123dReader": Py123dClips,
-    "factory.readers.scenarionet.reader.ScenarioNetReader": LogClips,
+    SCENARIONET: ScenarioNetClips,
     "factory.readers.town.reader.SyntheticReader": TownClips,
     "factory.readers.town.towns.SyntheticTownsReader": TownsClips,
 }

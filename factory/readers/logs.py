@@ -52,6 +52,7 @@ class LoggedDrive:
     ego_states: Array  # (S, 11), NaN where the log has no continuous drive
     agents: AgentTracks  # S steps
     segment: Ints  # (S,) number of the unbroken stretch a step belongs to, -1: none; no window leaves it
+    earliest: int = 0  # step before which no window begins
 
 
 @dataclass(frozen=True)
@@ -155,6 +156,7 @@ class LogReader(ABC, Generic[Log]):
                 skipped[log_id] = drive
                 continue
             driven = np.flatnonzero(np.isfinite(drive.ego_states).all(axis=1))
+            driven = driven[driven >= drive.earliest]
             first, n_steps = (int(driven[0]), int(driven[-1] - driven[0]) + 1) if len(driven) else (0, 0)
             # The first window begins where the ego's drive does.
             starts = range(self.windows.first_step, n_steps - CLIP_STEPS + 1, self.windows.stride_steps)
@@ -242,6 +244,16 @@ def route_of_drive(road_map: RoadMap, poses: Array, file: str, field: str) -> Ro
         return route_of_log(road_map, poses[::ROUTE_SAMPLE_STEPS])
     except NoRoute as error:
         raise BadClip(file, field, str(error)) from error
+
+
+def within(files: Sequence[SensorFile], start: int, stop: int) -> tuple[SensorFile, ...]:
+    """Those of the steps start..stop-1, half a step around them included, timed since step `start`.
+
+    files: timed since the log's first step.
+    """
+    first, last = start * STEP_S, (stop - 1) * STEP_S
+    inside = (file for file in files if first - STEP_S / 2 < file.time_s <= last + STEP_S / 2)
+    return tuple(replace(file, time_s=file.time_s - first) for file in inside)
 
 
 def present(agents: AgentTracks) -> AgentTracks:

@@ -66,6 +66,14 @@ class Py123dClips(LogClips):
     sensor_root: str | None = None  # of the data set that was converted, for its photos; null: clips without
 
 
+@dataclass(frozen=True)
+class ScenarioNetClips(LogClips):
+    """Clips of ScenarioNet's conversions, which hold no photos themselves."""
+
+    cameras: str | None = None  # cameras.json of the log, or a folder of such of each (docs/photos.md); null: no photos
+    sensor_root: str | None = None  # what its paths of photos and sweeps count from; null: the folder it lies in
+
+
 FRAME_STEPS = 5  # of NAVSIM's logs, 2 Hz
 
 

@@ -3,14 +3,14 @@
 Classes of plug-ins, folders of logs, the cameras of their rigs. What only reading a clip can tell comes later.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from factory.config.classes import class_of
 from factory.config.plugins import offered
-from factory.config.run import AV2, READERS, RunConfig, built_in_classes, refuse_missing_root
+from factory.config.run import AV2, SCENARIONET, RunConfig, built_in_classes, refuse_missing_root
 from factory.config.words import ConfigError
-from factory.readers.settings import LogClips
 from tasks.render.settings import RenderMode
 
 
@@ -40,9 +40,13 @@ def refuse_cameras_of_no_rig(config: RunConfig) -> None:
     Towns' rigs are settings, and held against them; the rig of a user's own reader is known when a clip is read.
     """
     target, root, wanted = config.clips.get("_target_"), config.clips.get("root"), config.render.cameras
-    if READERS.get(str(target)) is not LogClips:
+    if target not in (AV2, SCENARIONET):
         return
-    rig = _argoverse_rig(Path(str(root)).expanduser(), config.clips["only"]) if target == AV2 else ()
+    rig: tuple[str, ...] = ()
+    if target == AV2:
+        rig = _argoverse_rig(Path(str(root)).expanduser(), config.clips["only"])
+    elif config.clips["cameras"] is not None:
+        rig = _scenarionet_rig(Path(str(root)).expanduser(), config.clips)
     if not wanted or config.render.mode is RenderMode.NONE:
         return
     if not rig and config.render.mode is RenderMode.MAP:
@@ -50,8 +54,22 @@ def refuse_cameras_of_no_rig(config: RunConfig) -> None:
 
         rig = tuple(camera.name for camera in RIGS[config.render.map_rig])
     if missing := [name for name in wanted if name not in rig]:
-        has = f"this rig has {', '.join(rig)}" if rig else f"no log under {root} has calibrated cameras"
+        none = f"no log under {root} has calibrated cameras"
+        if target == SCENARIONET:
+            none += "; clips.cameras=<sidecar> brings some"
+        has = f"this rig has {', '.join(rig)}" if rig else none
         raise ConfigError(f"render.cameras: no camera {', '.join(missing)}; {has}")
+
+
+def _scenarionet_rig(root: Path, clips: Mapping[str, Any]) -> tuple[str, ...]:
+    from factory.readers.scenarionet.reader import scenario_files
+    from factory.readers.scenarionet.sidecars import camera_names, sidecars_of
+
+    try:
+        log_ids = [log_id for log_id in scenario_files(root) if not clips["only"] or log_id in clips["only"]]
+        return camera_names(sidecars_of(Path(clips["cameras"]).expanduser(), log_ids).values())
+    except ValueError as error:
+        raise ConfigError(f"clips: {error}") from error
 
 
 def _argoverse_rig(root: Path, only: Sequence[str]) -> tuple[str, ...]:

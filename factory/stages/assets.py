@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from factory.graph.work import Stopped, never
+from factory.readers.videos import file_and_frame
 from factory.stages.fitting import fitted
 from factory.stages.scene_file import SUFFIX, BadScene, read_scene, write_scene
 from factory.stages.sensors import block_of, chosen_cameras, load_sensors, load_sweeps, taken_by
@@ -131,8 +132,8 @@ def block_id(clip: Clip, settings: RenderSettings) -> str:
     how = (settings.width, settings.height, sorted(settings.cameras), made)
     digest.update(json.dumps([made_of, how], sort_keys=True).encode())
     for file in (*block.images, *block.sweeps):
-        path = Path(file.uri)
+        path, _ = file_and_frame(file.uri)
         size = path.stat().st_size if path.is_file() else None  # one that is missing is named when it is read
-        digest.update(f"{file.sensor}\x1f{path.name}\x1f{size}\x1f{file.time_s!r}".encode())
+        digest.update(f"{file.sensor}\x1f{Path(file.uri).name}\x1f{size}\x1f{file.time_s!r}".encode())
         digest.update(np.ascontiguousarray(file.world_from_ego).tobytes())
     return digest.hexdigest()[:16]

@@ -1,6 +1,6 @@
 """Opens what a clip's sensor files point to: photos and lidar sweeps as arrays."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,7 +9,9 @@ import numpy as np
 
 from factory.readers.av2.log import read_feather
 from factory.readers.base import BadClip
+from factory.readers.nuscenes_points import read_points
 from factory.readers.pcd import read_pcd
+from factory.readers.videos import file_and_frame, video_frames
 from tasks.render.scene.sensed import Photo, Sweep, on_ego
 from tasks.render.views import undistorted
 from tasks.world.arrays import Bytes
@@ -45,7 +47,10 @@ def load_sensors(block: Block, cameras: Sequence[Camera], width: int, height: in
 def load_photos(files: Sequence[SensorFile], cameras: Sequence[Camera], width: int, height: int) -> tuple[Photo, ...]:
     """The files that `cameras` took, without distortion, resized to width x height. Raises BadClip."""
     took = {camera.name: camera for camera in cameras}
-    return tuple(_photo(file, took[file.sensor], width, height) for file in files if file.sensor in took)
+    mine = [file for file in files if file.sensor in took]
+    opened = ((row, mine[row], image) for row, image in _opened(mine, took))
+    photos = {row: _photo(file, image, took[file.sensor], width, height) for row, file, image in opened}
+    return tuple(photos[row] for row in range(len(mine)))
 
 
 def taken_by(cameras: Sequence[Camera], files: Sequence[SensorFile]) -> tuple[SensorFile, ...]:
@@ -83,12 +88,25 @@ def decode_image(data: bytes, name: str) -> Bytes:
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
 
 
-def _photo(file: SensorFile, camera: Camera, width: int, height: int) -> Photo:
-    try:
-        data = Path(file.uri).read_bytes()
-    except OSError as error:
-        raise BadClip(file.uri, "image", f"cannot be read: {error.strerror}") from error
-    image = decode_image(data, file.uri)
+def _opened(files: Sequence[SensorFile], took: Mapping[str, Camera]) -> Iterator[tuple[int, Bytes]]:
+    """Row and picture of each file, one in memory at a time; a video is gone through once. Raises BadClip."""
+    filmed: dict[tuple[Path, str], dict[int, int]] = {}  # video and camera -> frame -> row
+    for row, file in enumerate(files):
+        path, frame = file_and_frame(file.uri)
+        if frame is None:
+            try:
+                data = path.read_bytes()
+            except OSError as error:
+                raise BadClip(file.uri, "image", f"cannot be read: {error.strerror}") from error
+            yield row, decode_image(data, file.uri)
+        else:
+            filmed.setdefault((path, file.sensor), {})[frame] = row
+    for (path, sensor), rows in filmed.items():
+        for frame, image in video_frames(path, rows, took[sensor].width, took[sensor].height):
+            yield rows[frame], image
+
+
+def _photo(file: SensorFile, image: Bytes, camera: Camera, width: int, height: int) -> Photo:
     if image.shape[:2] != (camera.height, camera.width):
         size = f"{image.shape[1]}x{image.shape[0]}"
         raise BadClip(file.uri, "size", f"{size}, but {camera.name} takes {camera.width}x{camera.height}")
@@ -113,15 +131,21 @@ def _photo(file: SensorFile, camera: Camera, width: int, height: int) -> Photo:
 
 
 def load_sweeps(files: Sequence[SensorFile], with_intensity: bool = False) -> tuple[Sweep, ...]:
-    """Sweeps as Argoverse 2 (.feather) and OpenScene (.pcd) store them: points in the ego frame. Raises BadClip."""
+    """Sweeps of Argoverse 2 (.feather), OpenScene (.pcd), nuScenes (.bin): points in the ego frame. Raises BadClip."""
     return tuple(_sweep(file, with_intensity) for file in files)
 
 
 def _sweep(file: SensorFile, with_intensity: bool) -> Sweep:
     path, columns = Path(file.uri), (*XYZ, INTENSITY) if with_intensity else XYZ
-    table = read_pcd(path, columns) if path.suffix == ".pcd" else read_feather(path, columns)
+    table = _READ_SWEEP.get(path.suffix, read_feather)(path, columns)
     points = np.stack([table[name] for name in XYZ], axis=1).astype(np.float32)
+    if file.ego_from_sensor is not None:
+        turn = file.ego_from_sensor
+        points = (points @ turn[:3, :3].T + turn[:3, 3]).astype(np.float32)
     if on_ego(points).all():
         raise BadClip(file.uri, "x y z", f"none of the {len(points)} returns lies outside of the ego's own body")
     intensity = np.clip(table[INTENSITY], 0, 255).astype(np.uint8) if with_intensity else None
     return Sweep(file.time_s, points, file.world_from_ego, intensity)
+
+
+_READ_SWEEP = {".pcd": read_pcd, ".bin": read_points}

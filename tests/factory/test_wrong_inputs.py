@@ -103,6 +103,7 @@ MISTYPED = [  # told before anything heavy is imported
     run("out=a_file/below", says=["a_file is not a folder"]),
     run("out=/proc/nowhere", says=["out=/proc/nowhere: cannot be written"]),
 ]
+A_SCENE = ("clips=scenarionet", "clips.root=a_scene.pkl")
 WRONG = [
     *MISTYPED,
     run("out=ftp://host/x", says=["a URL of s3, gs"]),
@@ -123,8 +124,11 @@ WRONG = [
         "clips.root=a_folder",
         "render=auto",
         "render.cameras=[front]",
-        says=["no log under a_folder"],
+        says=["no log under a_folder", "clips.cameras=<sidecar> brings some"],
     ),
+    run(*A_SCENE, "clips.cameras=a_rig", "render=auto", "render.cameras=[nope]", says=["this rig has CAM_FRONT"]),
+    run(*A_SCENE, "clips.cameras=a_folder", says=["clips.cameras=a_folder: no cameras.json here"]),
+    run(*A_SCENE, "clips.camera=a_rig", says=["clips.camera", "did you mean clips.cameras=?"]),
     run("vocabulary.file=nowhere.npy", says=["nowhere.npy", "No such file"]),
     run("vocabulary.file=broken.npy", says=["broken.npy: not readable as a numpy file: it holds no plain numbers"]),
     run("vocabulary.file=shape.npy", says=["shape.npy: trajectories have shape (3, 4), expected (K >= 1, 40, 3)"]),
@@ -153,6 +157,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "broken.npy").write_bytes(b"\x00broken")
     (tmp_path / "a_module.py").write_text("{}['x']")
     np.save(tmp_path / "shape.npy", np.zeros((3, 4)))
+    (tmp_path / "a_scene.pkl").write_bytes(b"broken")  # that the rig's names are looked for before shows
+    (tmp_path / "a_rig").mkdir()
+    (tmp_path / "a_rig" / "cameras.json").write_text('{"cameras": {"CAM_FRONT": {}}}')
     for name in ("a_log", "a_rigless_log"):  # broken from the poses on: they are not looked at
         (tmp_path / name).mkdir()
         (tmp_path / name / POSES).write_bytes(b"broken")

@@ -9,11 +9,11 @@ from typing import Any
 from factory.readers.av2.log import LogMotion, step_times, world_from_ego_at
 from factory.readers.av2.reader import BLOCK_STEPS, BLOCK_STRIDE_STEPS
 from factory.readers.base import SPLITS, BadClip, ClipRef
-from factory.readers.logs import STEP_MS, LoggedDrive, LogReader, Recorded, WholeLog, present, route_of_drive
+from factory.readers.logs import STEP_MS, LoggedDrive, LogReader, Recorded, WholeLog, present, route_of_drive, within
 from factory.readers.py123d.arrow import ArrowFile, check_version, open_metadata
 from factory.readers.py123d.log import BOXES, EGO, LIGHTS, drive_of, lights_of, read_motion
 from factory.readers.py123d.map import read_map
-from factory.readers.py123d.sensors import camera_files, has_photos, read_rig, recorded_photos, recorded_sweeps, within
+from factory.readers.py123d.sensors import camera_files, has_photos, read_rig, recorded_photos, recorded_sweeps
 from factory.readers.py123d.sources import SOURCES, ConvertedSet
 from factory.readers.settings import Py123dClips
 from tasks.world.camera import Camera, SensorFile

@@ -4,19 +4,17 @@
 photos where `sensor_root` says where they are, sweeps where they are Argoverse 2's feathers.
 """
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 
-from factory.readers.av2.log import SAME_FRAME_S, LogMotion, seconds_since, world_from_ego_at
+from factory.readers.av2.log import LogMotion, seconds_since, world_from_ego_at
 from factory.readers.base import BadClip
 from factory.readers.py123d.arrow import ArrowFile, numbers, open_file, open_metadata
 from factory.readers.py123d.log import EGO, matrices
 from tasks.world.arrays import Array
 from tasks.world.camera import Camera, SensorFile
-from tasks.world.clip import STEP_S
 
 PINHOLE, LIDAR, SWEEP_SUFFIX = "pinhole", "lidar.lidar_merged.arrow", ".feather"
 
@@ -63,13 +61,6 @@ def recorded_sweeps(motion: LogMotion, sensor_root: Path) -> tuple[SensorFile, .
     times_s = seconds_since(motion.start_ns, file.stamps_ns())
     sweeps = _files(file, "lidar", sensor_root, times_s, world_from_ego_at(motion, times_s))
     return tuple(sweep for sweep in sweeps if sweep.uri.endswith(SWEEP_SUFFIX))
-
-
-def within(files: tuple[SensorFile, ...], start: int, stop: int) -> tuple[SensorFile, ...]:
-    """Those of the steps start..stop-1, seconds since step `start`."""
-    first, last = start * STEP_S, (stop - 1) * STEP_S
-    inside = (file for file in files if first - SAME_FRAME_S < file.time_s <= last + SAME_FRAME_S)
-    return tuple(replace(file, time_s=file.time_s - first) for file in inside)
 
 
 def _camera(file: ArrowFile, rear_from_imu: Array) -> Camera:

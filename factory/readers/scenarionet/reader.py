@@ -1,13 +1,14 @@
 """Reads ScenarioNet's scenario pickles (Li et al. 2023) as clips: nuScenes, Waymo and nuPlan conversions.
 
 A scenario is a dict: `metadata` (dataset, ts, sdc_id, map), `length`, `tracks`, `map_features`, `dynamic_map_states`.
-There are no cameras and no lidar in it. A database folder lists its scenarios in `dataset_summary.pkl` (file name ->
-metadata) and their folders in `dataset_mapping.pkl` (file name -> folder relative to the database).
+There are no cameras and no lidar in it: a sidecar brings them (photos.py). A database folder lists its scenarios in
+`dataset_summary.pkl` (file name -> metadata) and their folders in `dataset_mapping.pkl` (file name -> folder relative
+to the database).
 """
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -15,9 +16,11 @@ from typing import Any
 import numpy as np
 
 from factory.readers.base import BadClip, ClipRef, bytes_of
-from factory.readers.logs import STEP_MS, LoggedDrive, LogReader, Recorded, WholeLog, route_of_drive
+from factory.readers.logs import STEP_MS, LoggedDrive, LogReader, Recorded, WholeLog, present, route_of_drive, within
 from factory.readers.restricted_pickle import load_plain
 from factory.readers.scenarionet.map import road_map, traffic_lights
+from factory.readers.scenarionet.photos import NO_PHOTOGRAPHS, Photographs, in_step, read_photographs
+from factory.readers.scenarionet.sidecars import load_sidecar, sidecars_of
 from factory.readers.scenarionet.tracks import (
     SOURCES,
     Source,
@@ -28,18 +31,26 @@ from factory.readers.scenarionet.tracks import (
     read_track,
     sample_times,
 )
+from factory.readers.settings import ScenarioNetClips
 from factory.readers.splits import folder_split, nuscenes_split, waymo_split
+from tasks.world.arrays import Array
+from tasks.world.clip import CLIP_STEPS, STEP_S, Block
 from tasks.world.frames import upright
 from tasks.world.lanes import TrafficLights
 
 SUMMARY, MAPPING = "dataset_summary.pkl", "dataset_mapping.pkl"
+# Of the stretches that are reconstructed: 20 s, as far apart as any clip still lies in one, so that a scene of
+# nuScenes, 20 s and no more, is one.
+BLOCK_STEPS = 200
+BLOCK_STRIDE_STEPS = BLOCK_STEPS - CLIP_STEPS
 
 
 @dataclass(frozen=True)
 class ScenarioLog(WholeLog):
-    """One log, whole, with the segments of its drive."""
+    """One log, whole, with the segments of its drive and what its sidecar brings."""
 
     motion: LoggedDrive
+    photographs: Photographs = NO_PHOTOGRAPHS
 
 
 class ScenarioNetReader(LogReader[ScenarioLog]):
@@ -51,6 +62,34 @@ class ScenarioNetReader(LogReader[ScenarioLog]):
     data_set = "scenarionet"
     length_is = "of driving"
 
+    def __init__(
+        self,
+        root: str | Path,
+        cameras: str | Path | None = ScenarioNetClips.cameras,
+        sensor_root: str | Path | None = ScenarioNetClips.sensor_root,
+        **windows: Any,
+    ) -> None:
+        """cameras: a log's sidecar or a folder of such, None: no photos; sensor_root: of what they name, None: theirs.
+
+        windows: as of LogReader. Raises ValueError.
+        """
+        super().__init__(root, **windows)
+        self.cameras, self.sensor_root = (
+            None if path is None else Path(path).expanduser().absolute() for path in (cameras, sensor_root)
+        )
+        if self.sensor_root is not None and not self.sensor_root.is_dir():
+            raise ValueError(f"clips.sensor_root={self.sensor_root}: no such folder")
+        if self.sensor_root is not None and self.cameras is None:
+            raise ValueError("clips.sensor_root goes with clips.cameras, which says what the photos below it show")
+
+    @cached_property
+    def _sidecars(self) -> dict[Path, Path]:
+        """Pickle -> sidecar, of the logs that have one."""
+        if self.cameras is None:
+            return {}
+        chosen = self._chosen()
+        return {chosen[log_id]: path for log_id, path in sidecars_of(self.cameras, chosen).items()}
+
     @cached_property
     def _files(self) -> dict[str, Path]:
         return scenario_files(self.root)
@@ -61,23 +100,66 @@ class ScenarioNetReader(LogReader[ScenarioLog]):
 
     def drive(self, path: Path) -> LoggedDrive:
         """Ego and agents of the scenario in this file. Raises BadClip."""
+        sidecars = self._sidecars  # looked for before a scenario is opened
         scenario, _ = read_scenario(path)
-        return read_motion(scenario, str(path))
+        drive = read_motion(scenario, str(path))
+        if path not in sidecars:
+            return drive
+        found = self._photographs(path, drive.ego_states)  # told here, once, what would fail each of its clips
+        first = int(np.argmax(drive.segment >= 0))
+        return replace(drive, earliest=in_step(found, first, len(drive.segment)))
 
     def load(self, path: Path) -> ScenarioLog:
-        """The scenario in this file. Raises BadClip."""
-        return read_log(path)
+        """The scenario in this file, with its photos. Raises BadClip."""
+        log = read_log(path)
+        if path not in self._sidecars:
+            return log
+        found = self._photographs(path, log.ego_states)
+        return replace(log, photographs=found, content_digest=_digest(log.content_digest, found.data))
 
     def digest(self, ref: ClipRef) -> str:
-        """The clip's content digest, from the bytes of its log's file alone. Raises BadClip."""
-        return hashlib.sha256(bytes_of(self.path_of(ref))).hexdigest()
+        """The clip's content digest, from the bytes of its log's file and sidecar alone. Raises BadClip."""
+        path = self.path_of(ref)
+        digest = hashlib.sha256(bytes_of(path)).hexdigest()
+        return _digest(digest, load_sidecar(self._sidecars[path])[1]) if path in self._sidecars else digest
+
+    def block(self, ref: ClipRef) -> str | None:
+        """Log and second at which the block begins that the clip is rendered from; None where the log has no photos."""
+        if self.path_of(ref) not in self._sidecars:
+            return None
+        return f"{ref.log_id}@{_block_start(ref.start_ms // STEP_MS) * STEP_S:g}s"
 
     def recorded(self, log: ScenarioLog, start: int, stop: int) -> Recorded:
-        """The ego's poses, the format has no sensors. Raises BadClip where the ego's drive is broken."""
+        """The ego's poses, photos and sweeps of a window. Raises BadClip where the ego's drive is broken."""
         ego_states = log.motion.ego_states[start:stop]
         if not np.isfinite(ego_states).all():
             raise BadClip(log.file, "tracks[sdc]", f"the ego's drive is broken in the window at {start * STEP_MS} ms")
-        return Recorded(upright(ego_states))  # the format's ego has no roll or pitch, its road is at z = 0
+        poses = upright(ego_states)  # the format's ego has no roll or pitch, its road is at z = 0
+        found = log.photographs
+        if not found.images:
+            return Recorded(poses)
+        sensed = within(found.images, start, stop), within(found.sweeps, start, stop)
+        return Recorded(poses, found.cameras, *sensed, _block(log, start))
+
+    def _photographs(self, path: Path, ego_states: Array) -> Photographs:
+        sidecar = self._sidecars[path]
+        return read_photographs(sidecar, self.sensor_root or sidecar.parent, ego_states)
+
+
+def _block_start(start: int) -> int:
+    """The step at which the block begins that a clip from step `start` on lies in."""
+    return start // BLOCK_STRIDE_STEPS * BLOCK_STRIDE_STEPS
+
+
+def _block(log: ScenarioLog, start: int) -> Block:
+    first = _block_start(start)
+    stop = min(first + BLOCK_STEPS, len(log.ego_states))
+    sensed = within(log.photographs.images, first, stop), within(log.photographs.sweeps, first, stop)
+    return Block(first * STEP_S, present(log.agents.window(first, stop)), *sensed)
+
+
+def _digest(scenario: str, sidecar: bytes) -> str:
+    return hashlib.sha256(f"{scenario}\x1f{len(sidecar)}\x1f".encode() + sidecar).hexdigest()
 
 
 def scenario_files(root: Path) -> dict[str, Path]:
