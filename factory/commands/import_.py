@@ -1,4 +1,4 @@
-"""`python -m factory import simscale|navhard|navtest root=<folder> out=<folder or URL>`: others' samples as ours.
+"""`python -m factory import simscale|navhard|navtest|nuscenes-cameras root=<folder> out=<...>`: others' data as ours.
 
     python -m factory import simscale root=SimScale_data out=runs/simscale maps=nuplan/maps
     python -m factory import simscale root=exported out=runs/back only=[synthetic_reaction_pdm_v1.0-0]
@@ -21,6 +21,13 @@ navtest: its one-stage benchmark, the frames that a scene filter or split names,
     python -m factory import navtest root=navsim_logs/test sensors=sensor_blobs/test maps=maps \\
         split=.../train_test_split/navtest.yaml out=runs/navtest
     root=<folder>        the logs; sensors=, pictures= and maps= as above
+nuscenes-cameras: where nuScenes' photos and lidar are, as sidecars of ScenarioNet's logs (docs/photos.md), one file a
+scene below out=, which `clips=scenarionet clips.cameras=<out> clips.sensor_root=<root>` takes.
+    python -m factory import nuscenes-cameras root=/data/nuscenes version=v1.0-mini out=/data/photos
+    root=<folder>        samples, sweeps, v1.0-*; nothing of it is copied
+    version=v1.0-mini    of the tables; needed where several are there
+    sweeps=false         keyframes alone: photos at 2 Hz instead of 12; lidar is always that of keyframes
+    only=[scene-0103]    these scenes alone
 The same command again goes on, and tries what failed once more. What is kept and what is lost: docs/navsim.md.
 """
 
@@ -36,11 +43,14 @@ if TYPE_CHECKING:
     from factory.store.samples import Store
 
 
+CAMERAS = "nuscenes-cameras"
+
+
 @dataclass(frozen=True)
 class Request:
     """The command line."""
 
-    source: Literal["simscale", "navhard", "navtest"] = field(metadata=WORD)
+    source: Literal["simscale", "navhard", "navtest", "nuscenes-cameras"] = field(metadata=WORD)
     root: str
     out: str
     maps: str | None = None
@@ -51,8 +61,14 @@ class Request:
     logs: str | None = None
     sensors: str | None = None
     split: str | None = None
+    version: str | None = None
+    sweeps: bool = True
 
     def __post_init__(self) -> None:
+        if self.source == CAMERAS:
+            return
+        if self.version is not None or not self.sweeps:
+            raise ValueError(f"version= and sweeps= are of import {CAMERAS}")
         if (self.rewards is None) != (self.vocabulary is None):
             raise ValueError("rewards= and vocabulary= go together: scores mean nothing without their trajectories")
         if self.source != "simscale":
@@ -66,6 +82,8 @@ class Request:
 
 def main(request: Request) -> int:
     """Write the rows and say how it ended. Raises Refused."""
+    if request.source == CAMERAS:
+        return _cameras(request)
     from deltalake.exceptions import DeltaError
 
     from factory.readers.base import BadClip
@@ -129,6 +147,27 @@ def _navtest(request: Request, store: "Store") -> tuple["RunSummary", str]:
     assert maps is not None and request.split is not None
     logs = Path(request.root).expanduser()
     return import_navtest(store, read_selection(request.split), logs, _folder(request.sensors), maps)
+
+
+def _cameras(request: Request) -> int:
+    """Write the sidecars and say what each holds. Raises Refused."""
+    from factory.imports.nuscenes_cameras import import_cameras
+    from factory.readers.base import BadClip
+
+    root, out = Path(request.root).expanduser(), Path(request.out).expanduser()
+    photos = 0
+    try:
+        for done in import_cameras(root, out, request.version, request.only, request.sweeps):
+            photos += done.photos
+            where = f"{done.photos:,} photos of {done.cameras} cameras, {done.sweeps} sweeps: {done.path}"
+            print(f"{done.scene}  {where if done.photos else 'no photo is there: no sidecar'}")
+            if done.missing:
+                print(f"  {len(done.missing):,} files of the tables are not there, such as {done.missing[0]}")
+    except (BadClip, ValueError, OSError) as error:
+        raise Refused(one_line(error)) from error
+    if not photos:
+        raise Refused(f"{root}: none of the photos that its tables name is there; unpack samples/ and sweeps/ into it")
+    return 0
 
 
 def _folder(path: str | None) -> Path | None:
