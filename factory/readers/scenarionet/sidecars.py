@@ -34,9 +34,9 @@ def sidecars_of(cameras: Path, log_ids: Iterable[str]) -> dict[str, Path]:
         raise ValueError(f"{said}: no such file or folder")
     found = {}
     for log_id in ids:
-        names = (log_id, log_id.rpartition("_")[2])
-        if path := next((path for name in names if (path := cameras / name / NAME).is_file()), None):
-            found[log_id] = path
+        places = (cameras / name / NAME for name in (log_id, log_id.rpartition("_")[2]))
+        if there := [place for place in places if place.is_file()]:
+            found[log_id] = there[0]
     if not found:
         raise ValueError(f"{said}: no {NAME} here, nor in <log id>/ of any log that is read: {', '.join(ids[:3])}")
     return found
