@@ -13,6 +13,7 @@ import pytest
 import scenarionet_scenarios as town
 
 from factory.readers.base import BadClip
+from factory.readers.scenarionet.photos import read_photographs
 from factory.readers.scenarionet.reader import ScenarioNetReader
 from factory.readers.videos import file_and_frame, frame_uri, video_frames
 from factory.stages.assets import Sensing, block_id, sensing
@@ -253,6 +254,16 @@ def test_a_bad_sidecar_breaks_its_log_and_names_the_field(
     reader = ScenarioNetReader(log, cameras=write(tmp_path / "photos", content, pictures=False))
     (problem,) = reader.index().broken.values()
     assert re.search(rf"photos/cameras\.json: {said}" if not said.startswith("no drive") else said, problem), problem
+
+
+def test_the_documented_example_is_read_as_its_page_says(tmp_path: Path) -> None:
+    page = (Path(__file__).resolve().parents[3] / "docs" / "photos.md").read_text()
+    (example,) = re.findall(r"```json\n(.*?)```", page, re.DOTALL)
+    (tmp_path / "cameras.json").write_text(example)
+    found = read_photographs(tmp_path / "cameras.json", tmp_path, np.full((5, 11), np.nan))
+    assert (found.cameras[0].name, found.cameras[0].width, found.images[0].time_s) == ("CAM_FRONT", 1600, 0.0)
+    assert found.sweeps[0].ego_from_sensor[:3, 3].tolist() == [0.94, 0.0, 1.84]
+    assert found.images[0].uri.startswith(str(tmp_path / "samples" / "CAM_FRONT"))
 
 
 @pytest.mark.parametrize("text", ["", "[1, 2]", "{", "[" * 100_000])
