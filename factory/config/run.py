@@ -195,13 +195,14 @@ def run_config(values: Mapping[str, Any]) -> RunConfig:
 
 
 def refuse_relative_root(clips: Mapping[str, Any]) -> None:
-    """Raises ConfigError for a relative clips.root inside a submitted Ray job, whose folder is a temporary copy."""
-    root = clips.get("root")
-    if in_submitted_job() and isinstance(root, str) and not Path(root).expanduser().is_absolute():
-        raise ConfigError(
-            f"clips.root={root} is relative, and a submitted job runs in a copy of the working directory: "
-            "name an absolute path that every node sees"
-        )
+    """Raises ConfigError for relative logs or photos inside a submitted Ray job, whose folder is a temporary copy."""
+    for key in ("root", "cameras", "sensor_root") if clips.get("_target_") in READERS else ("root",):
+        path = clips.get(key)
+        if in_submitted_job() and isinstance(path, str) and not Path(path).expanduser().is_absolute():
+            raise ConfigError(
+                f"clips.{key}={path} is relative, and a submitted job runs in a copy of the working directory: "
+                "name an absolute path that every node sees"
+            )
 
 
 def refuse_missing_root(clips: Mapping[str, Any]) -> None:
