@@ -27,6 +27,7 @@ from planners.training.curves import Curves
 from planners.training.ema import RAW, Averaged
 from planners.training.optim import TrainingSettings, build_optimiser, learning_rate, set_rate
 from planners.training.processes import TrainingProcess
+from planners.training.sync_norm import synchronise
 
 STATE_VERSION = 1
 
@@ -81,6 +82,8 @@ def fit(
     is no number.
     """
     planner.to(process.device)
+    if training.sync_batch_norm:
+        synchronise(planner)
     optimiser = build_optimiser(training, planner)
     first, averages = 0, None
     if resume_from is not None:

@@ -27,6 +27,7 @@ class TrainingSettings:
     backbone_rate: float = 1.0  # factor of the rate for backbones over pictures
     gradient_clip: float | None = None  # largest norm of the gradient; None: any
     ema: float = 0.0  # decay of the averaged weights, which are then what is validated and saved; 0: as they are
+    sync_batch_norm: bool = False  # statistics of a batch are those of all processes' parts together
 
     def __post_init__(self) -> None:
         for name, low in (("epochs", 1), ("batch_size", 1), ("warmup_steps", 0)):
