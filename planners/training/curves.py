@@ -25,9 +25,9 @@ class Curves:
         self._board = SummaryWriter(str(out / "tensorboard"), purge_step=first_step)
         self._wandb = _wandb_run(out)
 
-    def loss(self, step: int, rate: float, terms: Mapping[str, float]) -> None:
-        """The losses that step `step` began with."""
-        row = {"total": sum(terms.values()), **terms, "learning_rate": rate}
+    def loss(self, step: int, rate: float, terms: Mapping[str, float], more: Mapping[str, float] = {}) -> None:
+        """The losses that step `step` began with, and what else is to be known of it."""
+        row = {"total": sum(terms.values()), **terms, "learning_rate": rate, **more}
         self._write(LOSSES, "loss", step, row)
 
     def validation(self, step: int, measured: Mapping[str, float]) -> None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from itertools import chain, count, islice
 from pathlib import Path
 from threading import Event
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import torch
@@ -30,6 +30,10 @@ from planners.training.processes import TrainingProcess
 from planners.training.sync_norm import synchronise
 
 STATE_VERSION = 1
+Precision = Literal["fp32", "bf16", "fp16"]  # fp16: gradients of a scaled loss, steps that overflow are left out
+AUTOCAST = {"bf16": torch.bfloat16, "fp16": torch.float16}
+SCALER = "scaler"  # in a checkpoint's training state: the scale of the loss and the steps since it changed
+SCALING = ("loss_scale", "skipped")  # columns of an fp16 training's losses: the scale it had, 1 for a step left out
 
 
 class Batches(Protocol):
@@ -51,7 +55,7 @@ class Loop:
     seed: int
     steps: int  # in all
     accumulate: int = 1  # parts that a batch is computed in, one after the other
-    bf16: bool = False
+    precision: Precision = "fp32"
     log_every: int = 20  # steps between looks at the losses, which cost a wait for the device
     checkpoint_every: int = 1000
     validate_every: int = 0  # 0: only after the last step
@@ -85,9 +89,10 @@ def fit(
     if training.sync_batch_norm:
         synchronise(planner)
     optimiser = build_optimiser(training, planner)
+    scaler = torch.amp.GradScaler(process.device.type, enabled=loop.precision == "fp16")
     first, averages = 0, None
     if resume_from is not None:
-        first, averages = _resume(resume_from, training, planner, optimiser, batches)
+        first, averages = _resume(resume_from, training, planner, optimiser, scaler, batches)
     averaged = Averaged(planner, training.ema, averages) if training.ema and process.writes else None
     model = _wrapped(planner, process)
     epoch_steps = batches.n_batches(0)
@@ -102,6 +107,7 @@ def fit(
                 "step": step,
                 "optimiser": optimiser.state_dict(),
                 "loader": batches.state(),
+                **({SCALER: scaler.state_dict()} if scaler.is_enabled() else {}),
             }
             of_it = {"validation": dict(measured)} if loop.keep.best is not None and measured else {}
             with _to_be_saved(averaged) as raw:
@@ -114,12 +120,17 @@ def fit(
         done = range(step - len(values), step)
         unlogged.clear()
         for at, row in zip(done, values):
+            terms = dict(zip(names, row))
             if not np.isfinite(row).all():
-                parts = ", ".join(f"{name} {value:g}" for name, value in zip(names, row))
-                raise FloatingPointError(f"the loss of step {at} is no number ({parts}): try a smaller learning_rate")
+                parts = ", ".join(f"{name} {value:g}" for name, value in terms.items())
+                other = ", or precision=bf16 or fp32" if scaler.is_enabled() else ""
+                raise FloatingPointError(
+                    f"the loss of step {at} is no number ({parts}): try a smaller learning_rate{other}"
+                )
             if curves is not None:
-                curves.loss(at, learning_rate(training, at, loop.steps, epoch_steps), dict(zip(names, row)))
-        return float(sum(values[-1]))
+                rate = learning_rate(training, at, loop.steps, epoch_steps)
+                curves.loss(at, rate, terms, dict(zip(SCALING, row[len(names) :])))
+        return float(sum(values[-1][: len(names)]))
 
     def check(step: int) -> dict[str, float]:
         if validate is None or curves is None:
@@ -135,9 +146,9 @@ def fit(
         for batch in _endless(batches, loop.steps - first):
             torch.manual_seed(_step_seed(loop.seed, step, process.rank))
             rate = learning_rate(training, step, loop.steps, epoch_steps)
-            terms = _step(model, optimiser, batch, rate, training.gradient_clip, loop, process)
+            terms, scaling = _step(model, optimiser, scaler, batch, rate, training.gradient_clip, loop, process)
             names = names or list(terms)
-            unlogged.append(torch.stack(list(terms.values())))
+            unlogged.append(torch.stack([*terms.values(), *scaling]))
             step += 1
             if averaged is not None:
                 averaged.update(step)
@@ -165,13 +176,14 @@ def fit(
 def _step(
     model: torch.nn.Module,
     optimiser: torch.optim.Optimizer,
+    scaler: torch.amp.GradScaler,
     batch: Batch,
     rate: float,
     clip: float | None,
     loop: Loop,
     process: TrainingProcess,
-) -> dict[str, Tensor]:
-    """One optimiser step; the terms of the loss, detached."""
+) -> tuple[dict[str, Tensor], list[Tensor]]:
+    """One optimiser step; the terms of the loss, detached, and SCALING where there is some, without a wait for it."""
     model.train()
     set_rate(optimiser, rate)
     optimiser.zero_grad(set_to_none=True)
@@ -182,14 +194,18 @@ def _step(
             model.no_sync() if isinstance(model, DistributedDataParallel) and not last else nullcontext()
         )
         with waits:
-            with torch.autocast(process.device.type, torch.bfloat16, enabled=loop.bf16):
+            with torch.autocast(process.device.type, AUTOCAST.get(loop.precision), enabled=loop.precision != "fp32"):
                 terms = {name: term.float() / loop.accumulate for name, term in model(part.to(process.device)).items()}
-            torch.stack(list(terms.values())).sum().backward()
+            scaler.scale(torch.stack(list(terms.values())).sum()).backward()
         sums = {name: sums.get(name, torch.zeros(())).to(term.device) + term.detach() for name, term in terms.items()}
     if clip is not None:
+        scaler.unscale_(optimiser)  # nothing without a scale, as are the next two
         torch.nn.utils.clip_grad_norm_(model.parameters(), clip)
-    optimiser.step()
-    return sums
+    one = torch.ones((), device=process.device)
+    before = scaler.scale(one)
+    scaler.step(optimiser)
+    scaler.update()
+    return sums, [before, (scaler.scale(one) < before).float()] if scaler.is_enabled() else []
 
 
 def _multiple(step: int, every: int) -> bool:
@@ -216,7 +232,12 @@ def _to_be_saved(averaged: Averaged | None) -> AbstractContextManager[dict[str, 
 
 
 def _resume(
-    folder: Path, training: TrainingSettings, planner: Planner, optimiser: torch.optim.Optimizer, batches: Batches
+    folder: Path,
+    training: TrainingSettings,
+    planner: Planner,
+    optimiser: torch.optim.Optimizer,
+    scaler: torch.amp.GradScaler,
+    batches: Batches,
 ) -> tuple[int, dict[str, Tensor] | None]:
     """The steps that are done, and the averaged weights where there are some."""
     state = load_training(folder)
@@ -224,12 +245,15 @@ def _resume(
         raise ValueError(f"{folder}: training state {state.get('version')}, this version goes on from {STATE_VERSION}")
     if (RAW in state) != (training.ema > 0.0):
         raise ValueError(f"{folder}: trained {'with' if RAW in state else 'without'} ema, not with ema={training.ema}")
+    if (SCALER in state) != scaler.is_enabled():
+        raise ValueError(f"{folder}: trained {'in' if SCALER in state else 'not in'} fp16: go on in the same precision")
     load_weights(planner, folder)
     averages = None
     if RAW in state:
         averages = {name: value.detach().clone() for name, value in planner.state_dict().items()}
         planner.load_state_dict(state[RAW])
     optimiser.load_state_dict(state["optimiser"])
+    scaler.load_state_dict(state.get(SCALER, {}))
     batches.resume(state["loader"])
     return int(state["step"]), averages
 

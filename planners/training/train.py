@@ -43,7 +43,7 @@ from planners.training.checkpoint import (
     newest,
     read_record,
 )
-from planners.training.fit import Loop, fit, total_steps
+from planners.training.fit import Loop, Precision, fit, total_steps
 from planners.training.optim import TrainingSettings
 from planners.training.processes import RaySettings, TrainingProcess, joined
 
@@ -99,7 +99,7 @@ class TrainConfig:
     resume: Literal["identical", "further"] = "identical"  # further: other steps, processes, accumulate; another curve
     executor: Literal["process", "ray"] = "process"  # process: alone, or as torchrun starts it; ray: Ray Train
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    precision: Literal["auto", "fp32", "bf16"] = "auto"  # auto: bf16 on a GPU, fp32 elsewhere
+    precision: Literal["auto", "fp32", "bf16", "fp16"] = "auto"  # auto: bf16 on a GPU, fp32 elsewhere
     accumulate: int = 1  # parts that a batch is computed in
     recompute: bool = False  # backbones over pictures keep no activations: less memory, a forward pass more
     workers: int = 2  # threads that decode
@@ -200,7 +200,7 @@ def train(config: TrainConfig, process: TrainingProcess) -> None:
         seed=config.seed,
         steps=steps,
         accumulate=config.accumulate,
-        bf16=config.precision == "bf16" or (config.precision == "auto" and process.device.type == "cuda"),
+        precision=_precision(config, process),
         log_every=config.log_every,
         checkpoint_every=config.checkpoint_every,
         validate_every=config.validate_every,
@@ -235,6 +235,12 @@ def _first_weights(planner: Planner, config: TrainConfig) -> dict[str, str]:
     load_weights(planner, folder)
     backbones: dict[str, str] = read_record(folder)["backbones"]
     return backbones
+
+
+def _precision(config: TrainConfig, process: TrainingProcess) -> Precision:
+    if config.precision == "auto":
+        return "bf16" if process.device.type == "cuda" else "fp32"
+    return config.precision
 
 
 def _identity(config: TrainConfig, dataset: Dataset, steps: int, process: TrainingProcess) -> dict[str, Any]:
