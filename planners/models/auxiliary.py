@@ -36,7 +36,7 @@ class BevHead(nn.Module):
 def bev_loss(logits: Tensor, bev: Tensor) -> Tensor:
     """Cross-entropy of logits (B, N_CLASSES, rows, columns) against the newest of rasters (B, T, rows, columns)."""
     wanted = bev[:, -1].long()
-    return F.cross_entropy(logits, torch.where(wanted == BevClass.ROUTE, int(BevClass.CENTERLINE), wanted))
+    return F.cross_entropy(logits, torch.where(wanted == int(BevClass.ROUTE), int(BevClass.CENTERLINE), wanted))
 
 
 class AgentHead(nn.Module):

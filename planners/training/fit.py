@@ -32,6 +32,7 @@ from planners.training.sync_norm import synchronise
 STATE_VERSION = 1
 Precision = Literal["fp32", "bf16", "fp16"]  # fp16: gradients of a scaled loss, steps that overflow are left out
 AUTOCAST = {"bf16": torch.bfloat16, "fp16": torch.float16}
+COMPILED = {"fallback_random": True}  # what is random is drawn as without, so that curves are the same to rounding
 SCALER = "scaler"  # in a checkpoint's training state: the scale of the loss and the steps since it changed
 SCALING = ("loss_scale", "skipped")  # columns of an fp16 training's losses: the scale it had, 1 for a step left out
 
@@ -56,6 +57,7 @@ class Loop:
     steps: int  # in all
     accumulate: int = 1  # parts that a batch is computed in, one after the other
     precision: Precision = "fp32"
+    compiled: bool = False  # whether the losses and their gradients are computed by torch.compile
     log_every: int = 20  # steps between looks at the losses, which cost a wait for the device
     checkpoint_every: int = 1000
     validate_every: int = 0  # 0: only after the last step
@@ -95,6 +97,8 @@ def fit(
         first, averages = _resume(resume_from, training, planner, optimiser, scaler, batches)
     averaged = Averaged(planner, training.ema, averages) if training.ema and process.writes else None
     model = _wrapped(planner, process)
+    if loop.compiled:
+        model.compile(options=COMPILED)  # in place: weights keep their names, and plans are made as ever
     epoch_steps = batches.n_batches(0)
     curves = Curves(out, first) if process.writes else None
     unlogged: list[Tensor] = []

@@ -13,6 +13,8 @@ steps or on another number of processes. Exit codes: 0 complete, 2 bad settings 
 
 import dataclasses
 import json
+import os
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -48,7 +50,7 @@ from planners.training.optim import TrainingSettings
 from planners.training.processes import RaySettings, TrainingProcess, joined
 
 LARGEST_BATCH = 32
-FURTHER = frozenset({"steps", "processes", "accumulate"})  # what may be another with resume=further
+FURTHER = frozenset({"steps", "processes", "accumulate", "compile"})  # what may be another with resume=further
 
 
 def validation(
@@ -96,11 +98,12 @@ class TrainConfig:
     steps: int | None = None  # optimiser steps in all; null: planner.training.epochs
     seed: int = 0  # of the weights at the start, the order and everything random in a step
     init_from: str | None = None  # folder of a training of the same planner, or a checkpoint: whose weights go on
-    resume: Literal["identical", "further"] = "identical"  # further: other steps, processes, accumulate; another curve
+    resume: Literal["identical", "further"] = "identical"  # further: other steps, processes, accumulate, compile
     executor: Literal["process", "ray"] = "process"  # process: alone, or as torchrun starts it; ray: Ray Train
     device: Literal["auto", "cpu", "cuda"] = "auto"
     precision: Literal["auto", "fp32", "bf16", "fp16"] = "auto"  # auto: bf16 on a GPU, fp32 elsewhere
     accumulate: int = 1  # parts that a batch is computed in
+    compile: bool = False  # losses by torch.compile: minutes once, then faster; the curve is the same to rounding
     recompute: bool = False  # backbones over pictures keep no activations: less memory, a forward pass more
     workers: int = 2  # threads that decode
     log_every: int = 20  # steps
@@ -120,6 +123,8 @@ class TrainConfig:
             raise ValueError(
                 f"keep_best={self.keep_best}: name data.val, and validate_every, to have some to choose from"
             )
+        if self.compile and shutil.which(compiler := os.environ.get("CXX", "g++")) is None:
+            raise ValueError(f"compile=true, but there is no {compiler}: install a C++ compiler, or name yours in CXX")
         if self.steps is not None and self.steps < 1:
             raise ValueError(f"steps={self.steps}: must be at least 1, or null for planner.training.epochs")
 
@@ -201,6 +206,7 @@ def train(config: TrainConfig, process: TrainingProcess) -> None:
         steps=steps,
         accumulate=config.accumulate,
         precision=_precision(config, process),
+        compiled=config.compile,
         log_every=config.log_every,
         checkpoint_every=config.checkpoint_every,
         validate_every=config.validate_every,
@@ -253,6 +259,7 @@ def _identity(config: TrainConfig, dataset: Dataset, steps: int, process: Traini
         "seed": config.seed,
         "init_from": None if config.init_from is None else digest(config.init_from),
         "precision": config.precision,
+        "compile": config.compile,
         "accumulate": config.accumulate,
         "processes": process.size,
     }
@@ -281,16 +288,16 @@ def _begun(out: Path, config: TrainConfig, identity: Mapping[str, Any]) -> Path 
 
 
 def _as_now(trained: Mapping[str, Any]) -> dict[str, Any]:
-    """An identity, settings of training that its version did not have yet at their defaults, as it was computed."""
+    """An identity, settings that its version did not have yet at their defaults, as it was computed."""
     fields = dataclasses.fields(TrainingSettings)
     defaults = {f.name: f.default for f in fields if f.default is not dataclasses.MISSING}
-    return {**trained, "planner.training": {**defaults, **trained["planner.training"]}}
+    return {"compile": False, **trained, "planner.training": {**defaults, **trained["planner.training"]}}
 
 
 def _until_here(before: Mapping[str, Any], identity: Mapping[str, Any]) -> dict[str, Any]:
     """For the record: up to which step a training that goes on further was computed with other settings."""
     earlier = list(before.get("earlier", []))
-    then = before.get("trained", identity)
+    then = _as_now(before["trained"]) if before else identity
     changed = {key: then[key] for key in sorted(FURTHER) if then[key] != identity[key]}
     if changed:
         earlier.append({"until_step": before["step"], **changed})
