@@ -265,7 +265,13 @@ def _resume(
 def _wrapped(planner: Planner, process: TrainingProcess) -> torch.nn.Module:
     if process.size == 1:
         return planner
-    return DistributedDataParallel(planner, device_ids=[process.device] if process.device.type == "cuda" else None)
+    return DistributedDataParallel(
+        planner,
+        device_ids=[process.device] if process.device.type == "cuda" else None,
+        # Else gradients are dealt to buckets anew after the first step, and a sum over three or more processes, whose
+        # order depends on its place in a bucket, is another after a restart.
+        find_unused_parameters=True,
+    )
 
 
 def _step_seed(seed: int, step: int, rank: int) -> int:
