@@ -6,14 +6,15 @@ anchors to step 8 and decodes twice, at steps 10 and 0. Constants are those of t
 also OpenDriveLab/SimScale 04cda10, navsim/agents/diffusiondrive: transfuser_model_v2.py, transfuser_config.py,
 modules/multimodal_loss.py), without lidar as in SimScale. The scene comes from LTF's encoder.
 
-Different here: the noise to plan from is drawn once, so that a scene has one plan whatever else is in the batch. And
-plans may be offsets from the anchors (`offsets_from`) instead of the noisy points. As noise is added to anchors and not
-to labels, it says nothing about the label, and all that offsets from noisy points do with it is take it out again:
-that a wide network learns in 100 epochs, a narrow one does not in 30. And a point reads the cell of the raster from
-above that it lies in (`BevLayout`); the public code reads a raster supervised for 0 .. 32 m ahead as if it reached from
--32 to 32 m (`points_on="centred"`), and the slowest wave of its noise step is the last of a closed range
-(`step_waves="closed"`). As there, the feed-forward has no shortcut, every layer starts from the same feature of
-the noisy plan, and a layer's plans lie where the layer before put them.
+Different here: the noise to plan from is drawn once, so that a scene has one plan whatever else is in the batch
+(`planning_noise="drawn"`: for every scene and call, as in the public code). And plans may be offsets from the anchors
+(`offsets_from`) instead of the noisy points. As noise is added to anchors and not to labels, it says nothing about
+the label, and all that offsets from noisy points do with it is take it out again: that a wide network learns in 100
+epochs, a narrow one does not in 30. And a point reads the cell of the raster from above that it lies in
+(`BevLayout`); the public code reads a raster supervised for 0 .. 32 m ahead as if it reached from -32 to 32 m
+(`points_on="centred"`), and the slowest wave of its noise step is the last of a closed range (`step_waves="closed"`).
+As there, the feed-forward has no shortcut, every layer starts from the same feature of the noisy plan, and a layer's
+plans lie where the layer before put them.
 """
 
 import math
@@ -31,6 +32,7 @@ from planners.models.anchors import WAYPOINTS, checked_anchors, cluster_anchors,
 from planners.models.attention import Attention, Decoder
 from planners.models.auxiliary import AgentHead, BevHead, auxiliary_losses
 from planners.models.planner import Planner, TrainingData, evaluating
+from planners.models.start import Start, begin, clone_first
 from planners.models.transfuser import FusionSettings, LatentFusion
 from tasks.world.arrays import FloatArray
 
@@ -240,6 +242,8 @@ class DiffusionDriveSettings:
     agent_class_weight: float = 10.0
     agent_box_weight: float = 1.0
     bev_weight: float = 14.0
+    start: Start = "torch"  # whose draw the weights begin with
+    planning_noise: Literal["fixed", "drawn"] = "fixed"  # drawn: for every scene anew, from torch's own generator
 
 
 class EncodedScene(NamedTuple):
@@ -299,6 +303,9 @@ class DiffusionDrive(Planner):
         reach_m = max(settings.bev.ahead_m, settings.bev.side_m)
         self.agent_head = AgentHead(settings.width, settings.hidden, reach_m)
         self.bev_head = BevHead(settings.fusion.bev_channels, settings.bev.shape)
+        begin(self, settings.start)
+        if settings.start == "public":
+            clone_first(self.decoder.layers)
 
     @classmethod
     def fixed_arrays(cls, settings: DiffusionDriveSettings, data: TrainingData) -> dict[str, FloatArray]:
@@ -356,10 +363,12 @@ class DiffusionDrive(Planner):
         return self.decoder(points, base, step, scene.above, scene.agents, scene.ego)
 
     def denoised(self, scene: EncodedScene) -> Tensor:
-        """Plans (B, 8, 3) from the noise that stays the same."""
-        n, levels = len(scene.ego), self.get_buffer("kept")
-        start = noised(to_unit(self.get_buffer("anchors")), self.get_buffer("first_noise"), levels[NOISED_TO])
-        at = start.expand(n, -1, -1, -1)
+        """Plans (B, 8, 3) from the noise that stays the same, or is drawn here."""
+        n, levels, anchors = len(scene.ego), self.get_buffer("kept"), self.get_buffer("anchors")
+        noise = self.get_buffer("first_noise").expand(n, -1, -1, -1)
+        if self.settings.planning_noise == "drawn":
+            noise = torch.randn((n, *anchors.shape), device=anchors.device)
+        at = noised(to_unit(anchors), noise, levels[NOISED_TO])
         for step in DENOISED_AT:
             steps = torch.full((n,), step, device=at.device)
             plans, logits = self._decoded(at, steps, scene)[-1]

@@ -27,6 +27,7 @@ from planners.models.attention import Decoder, Layer
 from planners.models.backbones.base import STRIDES, BackboneSettings
 from planners.models.backbones.registry import build_backbone
 from planners.models.planner import Planner, TrainingData, evaluating
+from planners.models.start import Start, begin
 from planners.models.transfuser import FusionSettings, LatentFusion
 from tasks.reward.label_bytes import Normalise
 from tasks.subscores import HALVES, LABELLED
@@ -163,6 +164,7 @@ class GtrsDenseSettings:
     sigma_m2: float = 0.5  # of the imitated distribution
     without: tuple[str, ...] = ()  # sub-scores that no head learns
     among_bias: bool = True  # of the attention in which the vocabulary's trajectories see each other
+    start: Start = "torch"  # whose draw the weights begin with
 
     def __post_init__(self) -> None:
         weighting = WEIGHTINGS[self.weighting]
@@ -228,6 +230,7 @@ class GtrsDense(Planner):
         else:
             self.tokens = PictureTokens(settings.backbone, settings.image, settings.width)
         self.scorer = TrajectoryScorer(settings)
+        begin(self, settings.start)
 
     @classmethod
     def fixed_arrays(cls, settings: GtrsDenseSettings, data: TrainingData) -> dict[str, FloatArray]:

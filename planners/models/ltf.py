@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from planners.data.batch import Batch, BevLayout, ImageLayout, Needs
 from planners.models.auxiliary import AgentHead, BevHead, auxiliary_losses
 from planners.models.planner import PlanFrom, Planner, bounded_heading, evaluating, imitation_l1, planned_from
+from planners.models.start import Start, begin
 from planners.models.transfuser import FusionSettings, LatentFusion
 from tasks.world.arrays import FloatArray
 
@@ -36,6 +37,7 @@ class LtfSettings:
     agent_class_weight: float = 10.0
     agent_box_weight: float = 1.0
     bev_weight: float = 10.0
+    start: Start = "torch"  # whose draw the weights begin with
 
 
 class Ltf(Planner):
@@ -58,6 +60,7 @@ class Ltf(Planner):
         self.plan_head = nn.Sequential(nn.Linear(width, settings.hidden), nn.ReLU(), nn.Linear(settings.hidden, 24))
         self.agent_head = AgentHead(width, settings.hidden, max(settings.bev.ahead_m, settings.bev.side_m))
         self.bev_head = BevHead(settings.fusion.bev_channels, settings.bev.shape)
+        begin(self, settings.start)
 
     @property
     def needs(self) -> Needs:

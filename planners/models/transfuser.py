@@ -59,7 +59,7 @@ class LatentFusion(nn.Module):
         self.channels = self.image.channels
         self.to_image = nn.ModuleList(nn.Conv2d(c, c, 1) for c in self.channels)
         self.to_latent = nn.ModuleList(nn.Conv2d(c, c, 1) for c in self.channels)
-        self.exchanges = nn.ModuleList(_Exchange(c, settings) for c in self.channels)
+        self.exchanges = nn.ModuleList(Exchange(c, settings) for c in self.channels)
         bev = settings.bev_channels
         self.lateral = nn.Conv2d(self.channels[-1], bev, 1)
         self.up = nn.ModuleList(nn.Conv2d(bev, bev, 3, padding=1) for _ in range(2))
@@ -89,12 +89,12 @@ def _stretched(tokens: Tensor, like: Tensor) -> Tensor:
     return F.interpolate(tokens, like.shape[2:], mode="bilinear")
 
 
-class _Exchange(nn.Module):
+class Exchange(nn.Module):
     """Transformer blocks over the tokens of both views.
 
-    Published code draws their weights with deviation 0.02 at any width, which torch's own 0.58 / sqrt(width) is at the
-    widest, 512. At a narrow planner's 64 that is too little for one view to reach the other: 32 samples learnt by
-    heart were 1.05 m off after 150 steps, and are 0.28 m with torch's.
+    Published code draws their weights with deviation 0.02 at any width (planners.models.start), which torch's own
+    0.58 / sqrt(width) is at the widest, 512. At a narrow planner's 64 that is too little for one view to reach the
+    other: 32 samples learnt by heart were 1.05 m off after 150 steps, and are 0.28 m with torch's.
     """
 
     def __init__(self, width: int, settings: FusionSettings) -> None:

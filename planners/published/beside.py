@@ -21,7 +21,6 @@ import torch
 
 from planners.published.formula import CELLS, FROZEN, SCORES, SEED, inputs, weight
 
-TOKENS = ("a", "b")
 V2_99 = "gtrs_dense_v2_99"
 
 
@@ -35,9 +34,7 @@ def main(argv: list[str]) -> None:
     filled(model_of(agent), given)
     if argv[6]:
         save_as_lightning(agent, given, argv[6])
-    for module in agent.modules():
-        if isinstance(module, torch.nn.Dropout):
-            module.p = 0.0
+    without_dropout(agent)
     told = {
         "names": {name: list(value.shape) for name, value in model_of(agent).state_dict().items()},
         "parameters": sum(parameter.numel() for parameter in agent.parameters()),
@@ -49,6 +46,13 @@ def main(argv: list[str]) -> None:
     outputs = evaluated(agent, case, given)  # first: training moves the statistics that evaluation normalises by
     losses, told["gradients"] = trained(agent, case, given) if argv[5] == "1" else ({}, [])
     np.savez_compressed(out, told=np.array(json.dumps(told)), **outputs, **losses)
+
+
+def without_dropout(agent: Any) -> None:
+    """Its random numbers are drawn in another order there."""
+    for module in agent.modules():
+        if isinstance(module, torch.nn.Dropout):
+            module.p = 0.0
 
 
 def origin(code: str) -> str:
@@ -63,8 +67,8 @@ def model_of(agent: Any) -> Any:
     return agent.model if hasattr(agent, "model") else agent._transfuser_model
 
 
-def built(case: str, given: dict[str, Any], folder: Path, width: int, height: int) -> Any:
-    """The agent, around files of weights that it insists on and that `filled` replaces."""
+def built(case: str, given: dict[str, Any], folder: Path, width: int, height: int, rate: float = 1e-4) -> Any:
+    """The agent, around files of weights that it insists on and that `filled` replaces; rate: that it learns with."""
     import timm
 
     resnet = folder / "resnet34.bin"
@@ -73,14 +77,14 @@ def built(case: str, given: dict[str, Any], folder: Path, width: int, height: in
         from navsim.agents.transfuser.transfuser_agent import TransfuserAgent
         from navsim.agents.transfuser.transfuser_config import TransfuserConfig
 
-        return TransfuserAgent(TransfuserConfig(bkb_path=str(resnet)), lr=1e-4)
+        return TransfuserAgent(TransfuserConfig(bkb_path=str(resnet)), lr=rate)
     if case == "diffusiondrive":
         from navsim.agents.diffusiondrive.transfuser_agent import TransfuserAgent
         from navsim.agents.diffusiondrive.transfuser_config import TransfuserConfig
 
         np.save(folder / "anchors.npy", given["anchors"])
         config = TransfuserConfig(bkb_path=str(resnet), plan_anchor_path=str(folder / "anchors.npy"))
-        return TransfuserAgent(config, lr=6e-4)
+        return TransfuserAgent(config, lr=rate)
     from navsim.agents.backbones.vov import VoVNet
     from navsim.agents.gtrs_dense.gtrs_agent import GTRSAgent
     from navsim.agents.gtrs_dense.hydra_config import HydraConfig
@@ -103,29 +107,44 @@ def built(case: str, given: dict[str, Any], folder: Path, width: int, height: in
         torch.save({"state_dict": named}, folder / "vov.pth")
         cells = {"img_vert_anchors": height // 32, "img_horz_anchors": width // 32}
         values.update(backbone_type="vov", vov_ckpt=str(folder / "vov.pth"), **cells)
-    agent = GTRSAgent(HydraConfig(**values), lr=1e-4)
+    agent = GTRSAgent(HydraConfig(**values), lr=rate)
     agent.vocab_pdm_score_full = {
-        token: {name: given[f"score {name}"][i] for name in SCORES} for i, token in enumerate(TOKENS)
+        token: {name: given[f"score {name}"][i] for name in SCORES} for i, token in enumerate(tokens(given))
     }
     return agent
 
 
-def filled(model: Any, given: dict[str, Any]) -> None:
-    """Put the formula's weights into a model."""
+def filled(model: Any, given: dict[str, Any], formula: Any = weight) -> None:
+    """Put a formula's weights into a model."""
     state = {}
     for name, value in model.state_dict().items():
         frozen = FROZEN.get(name.rpartition(".")[2])
-        made = weight(name, tuple(value.shape)) if frozen is None else given[frozen]
+        made = formula(name, tuple(value.shape)) if frozen is None else given[frozen]
         state[name] = torch.from_numpy(made)
     model.load_state_dict(state)
 
 
-def features(given: dict[str, Any], case: str, rows: slice = slice(None)) -> dict[str, Any]:
-    """Inputs as the public feature builders make them: pictures are 0 .. 1."""
+def tokens(given: dict[str, Any]) -> list[str]:
+    """A name for each sample."""
+    return [str(i) for i in range(len(given["image"]))]
+
+
+def features(given: dict[str, Any], case: str, rows: Any = slice(None)) -> dict[str, Any]:
+    """Inputs of some samples as the public feature builders make them: pictures are 0 .. 1."""
     image = torch.from_numpy(given["image"][rows]).float() / 255.0
     status = torch.from_numpy(given["status"][rows].copy())
     listed = case.startswith("gtrs")
     return {"camera_feature": [image] if listed else image, "status_feature": [status] if listed else status}
+
+
+def targets(given: dict[str, Any], rows: Any = slice(None)) -> dict[str, Any]:
+    """What the public target builders would have made of those samples."""
+    return {
+        "trajectory": torch.from_numpy(given["plan"][rows]),
+        "agent_states": torch.from_numpy(given["agents"][rows]),
+        "agent_labels": torch.from_numpy(given["agents_valid"][rows]),
+        "bev_semantic_map": torch.from_numpy(given["bev"][rows]),
+    }
 
 
 def evaluated(agent: Any, case: str, given: dict[str, Any]) -> dict[str, Any]:
@@ -152,21 +171,15 @@ def trained(agent: Any, case: str, given: dict[str, Any]) -> tuple[dict[str, Any
     """Loss and its terms in training mode, norms of the matrices' gradients, and whose those are."""
     agent.train()
     torch.manual_seed(SEED)
-    targets = {
-        "trajectory": torch.from_numpy(given["plan"]),
-        "agent_states": torch.from_numpy(given["agents"]),
-        "agent_labels": torch.from_numpy(given["agents_valid"]),
-        "bev_semantic_map": torch.from_numpy(given["bev"]),
-    }
-    shown = features(given, case)
+    shown, wanted_of_it = features(given, case), targets(given)
     if case == "diffusiondrive":
-        predicted = agent.forward(shown, targets)
+        predicted = agent.forward(shown, wanted_of_it)
     else:
         predicted = agent.forward(shown)
     if case.startswith("gtrs"):
-        answer = agent.compute_loss(shown, targets, predicted, list(TOKENS))
+        answer = agent.compute_loss(shown, wanted_of_it, predicted, tokens(given))
     else:
-        answer = agent.compute_loss(shown, targets, predicted)
+        answer = agent.compute_loss(shown, wanted_of_it, predicted)
     if isinstance(answer, dict):
         answer = answer.pop("loss"), answer
     loss, terms = answer if isinstance(answer, tuple) else (answer, {})
@@ -175,9 +188,14 @@ def trained(agent: Any, case: str, given: dict[str, Any]) -> tuple[dict[str, Any
         f"train {name}": np.float64(float(torch.as_tensor(value).detach()))
         for name, value in {"loss": loss, **terms}.items()
     }
-    learned = {name: p.grad for name, p in model_of(agent).named_parameters() if p.grad is not None and p.dim() > 1}
-    norms = [float(gradient.double().norm()) for gradient in learned.values()]
-    return {**values, "gradients": np.array(norms)}, list(learned)
+    names, norms = gradients(model_of(agent))
+    return {**values, "gradients": norms}, names
+
+
+def gradients(model: Any) -> tuple[list[str], Any]:
+    """Names of the matrices that have a gradient, and its norms."""
+    learned = {name: p.grad for name, p in model.named_parameters() if p.grad is not None and p.dim() > 1}
+    return list(learned), np.array([float(gradient.double().norm()) for gradient in learned.values()])
 
 
 def save_as_lightning(agent: Any, given: dict[str, Any], path: str) -> None:

@@ -45,23 +45,47 @@ def weight(name: str, shape: tuple[int, ...]) -> Any:
     return np.float32(1.0 if name.endswith("weight") else 0.0) + np.float32(0.1) * values
 
 
-def inputs(width: int, height: int) -> dict[str, Any]:
-    """What a model is shown and told: BATCH samples with pictures of `width` x `height`."""
-    patches = (drawn("image", (BATCH, 3, height // 8, width // 8)) * 256).astype(np.uint8)
-    status = np.zeros((BATCH, 8), np.float32)
-    status[np.arange(BATCH), np.arange(BATCH)] = 1.0
-    status[:, 4:] = drawn("status", (BATCH, 4)) * np.array([10.0, 0.5, 2.0, 0.5], np.float32)
-    agents = drawn("agents", (BATCH, AGENTS, 5)) * np.array([64.0, 64.0, 6.0, 6.0, 3.0], np.float32)
+def first_weight(name: str, shape: tuple[int, ...]) -> Any:
+    """A weight of that name of the kind that a public training begins with.
+
+    As torch, timm and the public GPT draw them: variance 1 / (3 fan-in), of kernels without bias 2 / fan-out, of the
+    GPT's matrices 0.02^2, of embeddings and latent pictures 1; scales are 1 and offsets 0, the last scale of a residual
+    block 0, so that it begins as its shortcut.
+    """
+    if name.endswith("num_batches_tracked"):
+        return np.zeros(shape, np.int64)
+    if len(shape) < 2:
+        is_scale = name.endswith(("running_var", "weight")) and not name.endswith("bn2.weight")
+        return np.full(shape, 1.0 if is_scale else 0.0, np.float32)
+    if name.endswith("pos_emb"):
+        return np.zeros(shape, np.float32)
+    deviation = 1.0 / math.sqrt(3.0 * math.prod(shape[1:]))
+    if ".transformers." in name:
+        deviation = 0.02
+    elif "embedding" in name or name.endswith("lidar_latent"):
+        deviation = 1.0
+    elif "_encoder." in name:
+        deviation = math.sqrt(2.0 / (shape[0] * math.prod(shape[2:])))
+    return (2.0 * drawn(name, shape) - 1.0) * np.float32(math.sqrt(3.0) * deviation)
+
+
+def inputs(width: int, height: int, count: int = BATCH) -> dict[str, Any]:
+    """What a model is shown and told: `count` samples with pictures of `width` x `height`."""
+    patches = (drawn("image", (count, 3, height // 8, width // 8)) * 256).astype(np.uint8)
+    status = np.zeros((count, 8), np.float32)
+    status[np.arange(count), np.arange(count) % 4] = 1.0
+    status[:, 4:] = drawn("status", (count, 4)) * np.array([10.0, 0.5, 2.0, 0.5], np.float32)
+    agents = drawn("agents", (count, AGENTS, 5)) * np.array([64.0, 64.0, 6.0, 6.0, 3.0], np.float32)
     agents[..., :2] -= 32.0
     agents[..., 2] -= 3.0
-    scores = {f"score {name}": np.floor(drawn(name, (BATCH, ENTRIES)) * 3.0) / 2.0 for name in SCORES}
+    scores = {f"score {name}": np.floor(drawn(name, (count, ENTRIES)) * 3.0) / 2.0 for name in SCORES}
     return {
         "image": patches.repeat(8, axis=2).repeat(8, axis=3),
         "status": status,
-        "plan": arcs("plan", BATCH, 8),
+        "plan": arcs("plan", count, 8),
         "agents": agents,
-        "agents_valid": drawn("there", (BATCH, AGENTS)) < 0.5,
-        "bev": (drawn("bev", (BATCH, *BEV)) * 7.0).astype(np.uint8),
+        "agents_valid": drawn("there", (count, AGENTS)) < 0.5,
+        "bev": (drawn("bev", (count, *BEV)) * 7.0).astype(np.uint8),
         "vocabulary": arcs("vocabulary", ENTRIES, 40),
         "anchors": np.ascontiguousarray(arcs("anchors", ANCHORS, 8)[..., :2]),
         **{name: values.astype(np.float32) for name, values in scores.items()},

@@ -1,9 +1,10 @@
 """Our half of a comparison: a planner with the public model's weights, shown and told the same as it was."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from factory.config.compose import ConfigError, compose, fill
 from planners.data.batch import Batch
-from planners.models.diffusiondrive import DiffusionDrive
+from planners.models.diffusiondrive import DiffusionDrive, EncodedScene
 from planners.models.gtrs_dense import IMITATION, WEIGHTINGS, GtrsDense, total
 from planners.models.ltf import Ltf
 from planners.models.planner import Planner, evaluating
@@ -71,21 +72,28 @@ def read_recorded(path: Path) -> PublicRecord:
         raise ConfigError(f"{path} is no record of a public model: {error}") from error
 
 
-def formula_weights(names: Mapping[str, list[int]], given: Mapping[str, Array]) -> dict[str, Tensor]:
+def formula_weights(
+    names: Mapping[str, list[int]], given: Mapping[str, Array], formula: Callable[..., Any] = weight
+) -> dict[str, Tensor]:
     """The public state dict of these names, as the public side filled it."""
     state = {}
     for name, shape in names.items():
         frozen = FROZEN.get(name.rpartition(".")[2])
-        values = weight(name, tuple(shape)) if frozen is None else given[frozen]
+        values = formula(name, tuple(shape)) if frozen is None else given[frozen]
         state[name] = torch.from_numpy(values)
     return state
 
 
-def preset(case: str, picture: tuple[int, int], *changed: str) -> PlannerChoice:
-    """The planner of conf/planner/<case>_public.yaml for pictures of another size, without dropout; words change it."""
+def preset_entry(case: str, picture: tuple[int, int], *changed: str) -> PlannerEntry:
+    """conf/planner/<case>_public.yaml for pictures of another size, without dropout; words change it."""
     size = [f"planner.settings.image.{name}={n}" for name, n in zip(("width", "height"), picture)]
     words = [f"planner={case}_public", "checkpoint=none", "out=none", *size, *WITHOUT_DROPOUT[case], *changed]
-    entry = fill(PlannerEntry, compose("import_planner", words)["planner"], "planner")
+    return fill(PlannerEntry, compose("import_planner", words)["planner"], "planner")
+
+
+def preset(case: str, picture: tuple[int, int], *changed: str) -> PlannerChoice:
+    """The planner of it, without its training."""
+    entry = preset_entry(case, picture, *changed)
     return PlannerChoice(entry.name, entry.settings)
 
 
@@ -96,9 +104,9 @@ def planner_of(recorded: PublicRecord, public: Mapping[str, Tensor] | None = Non
     return imported(preset(recorded.case, recorded.picture), public, f"the recorded {recorded.case}")
 
 
-def batch_of(picture: tuple[int, int]) -> Batch:
-    """The formula's inputs as a batch."""
-    given = {name: torch.from_numpy(values) for name, values in inputs(*picture).items()}
+def batch_of(arrays: Mapping[str, Any]) -> Batch:
+    """Inputs of the formula's kind as a batch."""
+    given = {name: torch.from_numpy(values) for name, values in arrays.items()}
     n = len(given["image"])
     return Batch(
         tuple(map(str, range(n))),
@@ -123,7 +131,7 @@ def evaluated(planner: Planner, batch: Batch) -> dict[str, Tensor]:
             plan, queries, above = planner.decoded(batch)
         elif isinstance(planner, DiffusionDrive):
             scene = planner.scene(batch)
-            plan, queries, above = planner.denoised(scene), scene.agents, scene.bev
+            plan, queries, above = _denoised(planner, scene), scene.agents, scene.bev
         elif isinstance(planner, GtrsDense):
             return _scored(planner, batch)
         else:
@@ -131,6 +139,15 @@ def evaluated(planner: Planner, batch: Batch) -> dict[str, Tensor]:
         boxes, there = planner.agent_head(queries)
         cells = planner.bev_head(above)[..., ::CELLS, ::CELLS]
     return {"trajectory": plan, "agent_states": boxes, "agent_labels": there, "bev_semantic_map": cells}
+
+
+def _denoised(planner: DiffusionDrive, scene: EncodedScene) -> Tensor:
+    """Plans, the noise of each scene drawn from the same seed, as beside."""
+    plans = []
+    for i in range(len(scene.ego)):
+        torch.manual_seed(SEED)
+        plans.append(planner.denoised(EncodedScene(*(part[i : i + 1] for part in scene))))
+    return torch.cat(plans)
 
 
 def _scored(planner: GtrsDense, batch: Batch) -> dict[str, Tensor]:
@@ -143,21 +160,32 @@ def _scored(planner: GtrsDense, batch: Batch) -> dict[str, Tensor]:
 
 def trained(found: Imported, batch: Batch) -> tuple[dict[str, float], dict[tuple[str, ...], float]]:
     """The loss and its terms by public names, and norms of gradients by the public matrices that they belong to."""
-    planner = found.planner.train()
     torch.manual_seed(SEED)
-    losses = planner.losses(batch)
-    torch.stack(list(losses.values())).sum().backward()
-    values = {"loss": sum(float(loss.detach()) for loss in losses.values())}
+    losses, norms = _stepped_back(found, batch)
+    values = {"loss": sum(losses.values())}
     for name, ours in TERMS.items():
         if all(one in losses for one in ours):
-            values[name] = sum(float(losses[one].detach()) for one in ours)
+            values[name] = sum(losses[one] for one in ours)
+    return values, norms
+
+
+def gradient_norms(found: Imported, batch: Batch) -> dict[tuple[str, ...], float]:
+    """Norms of gradients by the public matrices that they belong to; the gradients stay."""
+    return _stepped_back(found, batch)[1]
+
+
+def _stepped_back(found: Imported, batch: Batch) -> tuple[dict[str, float], dict[tuple[str, ...], float]]:
+    planner = found.planner.train()
+    losses = planner.losses(batch)
+    torch.stack(list(losses.values())).sum().backward()
     squares: dict[tuple[str, ...], float] = {}
     for name, parameter in planner.named_parameters():
         if parameter.grad is not None and name in found.came_from:
             key = found.came_from[name]
             squares[key] = squares.get(key, 0.0) + float(parameter.grad.double().square().sum())
     planner.eval()
-    return values, {key: square**0.5 for key, square in squares.items()}
+    terms = {name: float(loss.detach()) for name, loss in losses.items()}
+    return terms, {key: square**0.5 for key, square in squares.items()}
 
 
 @dataclass(frozen=True)
@@ -176,7 +204,7 @@ class Difference:
 
 def differences(recorded: PublicRecord, found: Imported) -> list[Difference]:
     """Everything recorded against ours. Raises ConfigError where one side has what the other lacks."""
-    batch, theirs = batch_of(recorded.picture), recorded.results
+    batch, theirs = batch_of(inputs(*recorded.picture)), recorded.results
     rows = []
     outputs = {f"eval {name}": values.numpy() for name, values in evaluated(found.planner, batch).items()}
     if missing := sorted(outputs.keys() ^ {name for name in theirs if name.startswith("eval ")}):
@@ -194,13 +222,17 @@ def _differences_in_training(recorded: PublicRecord, found: Imported, batch: Bat
         if f"train {name}" in theirs:
             wanted = float(theirs[f"train {name}"])
             rows.append(Difference(f"train {name}", abs(value - wanted) / max(abs(wanted), 1e-9), abs(wanted)))
-    norms = dict(zip(recorded.gradients, theirs["gradients"].tolist()))
+    norms = {(name,): norm for name, norm in zip(recorded.gradients, theirs["gradients"].tolist())}
+    return [*rows, gradient_difference(norms, gradients)]
+
+
+def gradient_difference(norms: Mapping[tuple[str, ...], float], ours: Mapping[tuple[str, ...], float]) -> Difference:
+    """Norms of the public matrices, one each, against ours, whose matrices may be several of theirs."""
     apart = [
         (abs(norm - wanted) / max(wanted, 1e-9), wanted)
-        for key, norm in gradients.items()
-        if all(name in norms for name in key)
-        for wanted in [sum(norms[name] ** 2 for name in key) ** 0.5]
+        for key, norm in ours.items()
+        if all((name,) in norms for name in key)
+        for wanted in [sum(norms[name,] ** 2 for name in key) ** 0.5]
     ]
     largest, size = max(off for off, _ in apart), max(size for _, size in apart)
-    rows.append(Difference(f"{GRADIENTS} of {len(apart)} matrices", largest, size, ROUNDING_OF_GRADIENTS))
-    return rows
+    return Difference(f"{GRADIENTS} of {len(apart)} matrices", largest, size, ROUNDING_OF_GRADIENTS)

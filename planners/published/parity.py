@@ -27,7 +27,7 @@ from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES
 from planners.published.ours import CASES, differences, planner_of, read_recorded
 from planners.published.weights import read_public
 
-BESIDE = "import sys; sys.path[:0] = sys.argv[1:3]; from planners.published.beside import main; main(sys.argv[2:])"
+BESIDE = "import sys; sys.path[:0] = sys.argv[1:3]; from planners.published.{0} import main; main(sys.argv[2:])"
 
 
 @dataclass(frozen=True)
@@ -80,13 +80,19 @@ def main(request: Request) -> int:
 def said_beside(request: Request, case: str, folder: Path) -> tuple[Path, Path | None]:
     """What the public code says of a case, and its checkpoint where one is wanted. Raises Refused."""
     said, checkpoint = folder / "said.npz", folder / "model.ckpt"
-    checkout, code = Path(__file__).resolve().parents[2], Path(request.code).resolve()
-    words = [str(checkout), str(code), case, str(request.width), str(request.height), str(said)]
+    words = [case, str(request.width), str(request.height), str(said)]
     words += [str(int(request.train)), str(checkpoint) if request.checkpoints else ""]
+    run_beside(request, "beside", words, case, folder)
+    return said, checkpoint if request.checkpoints else None
+
+
+def run_beside(request: Request, module: str, words: list[str], case: str, folder: Path) -> None:
+    """`main` of a module of this room in the public code's Python, told the checkout and the words. Raises Refused."""
+    checkout, code = Path(__file__).resolve().parents[2], Path(request.code).resolve()
     environment = {"NAVSIM_EXP_ROOT": str(folder), **os.environ}
     # it starts in another folder; resolved, a virtual environment's link would lead out of it
     python = str(Path(request.python).absolute()) if "/" in request.python else request.python
-    asked = [python, "-c", BESIDE, *words]
+    asked = [python, "-c", BESIDE.format(module), str(checkout), str(code), *words]
     try:
         done = subprocess.run(  # noqa: S603 - the user's own interpreter
             asked, cwd=folder, env=environment, capture_output=True, text=True, check=False
@@ -96,4 +102,3 @@ def said_beside(request: Request, case: str, folder: Path) -> tuple[Path, Path |
     if done.returncode:
         last = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
         raise Refused(f"{request.python} could not run the {case} of {request.code}: {last}")
-    return said, checkpoint if request.checkpoints else None

@@ -148,7 +148,7 @@ def fit(
     with asked_to_stop(asked.set), Counter("steps", loop.steps, first, quiet=not process.writes) as counter:
         step, loss = first, float("nan")
         for batch in _endless(batches, loop.steps - first):
-            torch.manual_seed(_step_seed(loop.seed, step, process.rank))
+            torch.manual_seed(step_seed(loop.seed, step, process.rank))
             rate = learning_rate(training, step, loop.steps, epoch_steps)
             terms, scaling = _step(model, optimiser, scaler, batch, rate, training.gradient_clip, loop, process)
             names = names or list(terms)
@@ -274,6 +274,6 @@ def _wrapped(planner: Planner, process: TrainingProcess) -> torch.nn.Module:
     )
 
 
-def _step_seed(seed: int, step: int, rank: int) -> int:
+def step_seed(seed: int, step: int, rank: int) -> int:
     """Of all that is random in a step; never from what happened before it."""
     return int(np.random.SeedSequence([seed, step, rank]).generate_state(1, np.uint64)[0] >> 1)

@@ -25,6 +25,7 @@ class TrainingSettings:
     by_epoch: bool = False  # the rate changes where an epoch begins, as in the public code, and not at every step
     lowest_rate: float = 0.0  # that a cosine falls to
     backbone_rate: float = 1.0  # factor of the rate for backbones over pictures
+    backbone_decay: float | None = None  # their weight decay; None: weight_decay
     gradient_clip: float | None = None  # largest norm of the gradient; None: any
     ema: float = 0.0  # decay of the averaged weights, which are then what is validated and saved; 0: as they are
     sync_batch_norm: bool = False  # statistics of a batch are those of all processes' parts together
@@ -41,6 +42,9 @@ class TrainingSettings:
             raise ValueError(f"lowest_rate={self.lowest_rate}: must be within 0 .. learning_rate={self.learning_rate}")
         if not 0.0 < self.backbone_rate < math.inf:
             raise ValueError(f"backbone_rate={self.backbone_rate}: must be a positive factor; 1 for no other rate")
+        for name in ("weight_decay", "backbone_decay"):
+            if not 0.0 <= (getattr(self, name) or 0.0) < math.inf:
+                raise ValueError(f"{name}={getattr(self, name)}: must be a finite share, 0 for none")
         if self.gradient_clip is not None and not self.gradient_clip > 0.0:
             raise ValueError(f"gradient_clip={self.gradient_clip}: must be positive, or null for none")
         if not 0.0 <= self.ema < 1.0:
@@ -71,15 +75,21 @@ def build_optimiser(settings: TrainingSettings, model: nn.Module) -> torch.optim
     """Adam or AdamW over everything that learns, in one kernel for all parameters of a rate."""
     kind = torch.optim.Adam if settings.optimiser == "adam" else torch.optim.AdamW
     groups: list[dict[str, Any]] = [{"params": [p for p in model.parameters() if p.requires_grad]}]
-    if settings.backbone_rate != 1.0:
+    decay = settings.weight_decay if settings.backbone_decay is None else settings.backbone_decay
+    if settings.backbone_rate != 1.0 or decay != settings.weight_decay:
         over_pictures = [m for m in model.modules() if isinstance(m, Backbone) and m.over_pictures]
         if not over_pictures:
-            raise ValueError(f"backbone_rate={settings.backbone_rate}, but the planner has no backbone over pictures")
+            asked = f"backbone_rate={settings.backbone_rate} backbone_decay={settings.backbone_decay}"
+            raise ValueError(f"{asked}, but the planner has no backbone over pictures")
         slow = {id(parameter) for module in over_pictures for parameter in module.parameters()}
         learns = groups[0]["params"]
         groups = [
             {"params": [p for p in learns if id(p) not in slow]},
-            {"params": [p for p in learns if id(p) in slow], FACTOR: settings.backbone_rate},
+            {
+                "params": [p for p in learns if id(p) in slow],
+                FACTOR: settings.backbone_rate,
+                "weight_decay": decay,
+            },
         ]
     return kind(groups, lr=settings.learning_rate, weight_decay=settings.weight_decay, fused=True)
 

@@ -30,7 +30,7 @@ def test_a_checkpoint_becomes_a_folder_that_plans_as_the_public_model(
     assert record["parameters"] == one.parameters and record["trained"]["imported"].startswith(f"{path.name} ")
     planner = evaluated_planner(str(out))
     assert planner.load is not None
-    plan = planner.load().plan(batch_of(one.picture))
+    plan = planner.load().plan(batch_of(inputs(*one.picture)))
     assert np.abs(plan.numpy() - one.results["eval trajectory"]).max() < TOLERANCE
     assert main([str(path), "planner=ltf_public", f"out={out}", *size]) == 2
     assert "holds a training already" in capsys.readouterr().err

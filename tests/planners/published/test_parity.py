@@ -88,7 +88,7 @@ def test_without_what_the_public_code_does_plans_are_others(case: str, changed: 
     one = recorded(case)
     choice = preset(case, one.picture, f"planner.settings.{changed}")
     found = imported(choice, formula_weights(one.names, inputs(*one.picture)), "it")
-    plan = found.planner.plan(batch_of(one.picture))
+    plan = found.planner.plan(batch_of(inputs(*one.picture)))
     assert np.abs(plan.numpy() - one.results["eval trajectory"])[..., :2].max() > apart_m
 
 

@@ -60,6 +60,8 @@ def test_by_epoch_the_rates_are_those_of_the_public_scheduler() -> None:
         ("warmup_epochs", -1.0),
         ("lowest_rate", 0.6),
         ("backbone_rate", 0.0),
+        ("weight_decay", -0.1),
+        ("backbone_decay", math.inf),
     ],
 )
 def test_impossible_settings_are_refused_by_name(name: str, value: float) -> None:
@@ -100,3 +102,15 @@ def test_backbones_over_pictures_have_a_rate_of_their_own_and_every_parameter_on
     assert len(build_optimiser(settings(), model).param_groups) == 1
     with pytest.raises(ValueError, match="no backbone over pictures"):
         build_optimiser(settings(backbone_rate=0.1), model.head)
+
+
+def test_backbones_over_pictures_may_decay_otherwise_at_the_same_rate() -> None:
+    model = Seeing()
+    optimiser = build_optimiser(settings(optimiser="adamw", weight_decay=0.1, backbone_decay=0.0), model)
+    set_rate(optimiser, 0.25)
+    decays = {id(p): group["weight_decay"] for group in optimiser.param_groups for p in group["params"]}
+    for name, parameter in model.named_parameters():
+        assert decays[id(parameter)] == (0.0 if name.startswith("fusion.image.") else 0.1), name
+    assert {group["lr"] for group in optimiser.param_groups} == {0.25}
+    same = settings(optimiser="adamw", weight_decay=0.1, backbone_decay=0.1)
+    assert len(build_optimiser(same, model).param_groups) == 1
