@@ -41,6 +41,7 @@ class BevLayout:
     cell_m: float = 0.25
     times_s: tuple[float, ...] = (0.0,)  # one raster each, with the agents as they were then; now or before
     first: Literal["far_left", "near_right"] = "far_left"  # the cell that comes first
+    drawn_as: Literal["ours", "public"] = "ours"  # see planners.data.bev
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -1,7 +1,9 @@
 """A sample seen from above: what lies where in the ego frame at now, as a raster of classes and as boxes.
 
 The classes, their order and the drawing follow the public Latent TransFuser for NAVSIM (TransfuserConfig,
-TransfuserTargetBuilder), but for cyclists, whom it leaves out, and the route, which it does not draw.
+TransfuserTargetBuilder), but for cyclists, whom it leaves out, and the route, which it does not draw. With
+`drawn_as="public"` they are left out here as well, crossings too, whose class is its walkways', and coordinates are cut
+off at whole cells as there; among the nearest vehicles are then those behind, whom the losses leave out.
 """
 
 from collections.abc import Mapping, Sequence
@@ -53,6 +55,9 @@ def bev_raster(sample: Mapping[str, Any], layout: BevLayout) -> Bytes:
     Raises ValueError for a time to come or before a sample begins.
     """
     steps = [_step(time_s) for time_s in layout.times_s]
+    if layout.drawn_as == "public":
+        rasters = np.stack([_as_public(sample, layout, step) for step in steps])
+        return rasters if layout.first == "near_right" else np.ascontiguousarray(rasters[:, ::-1, ::-1])
     ground = np.full(layout.shape, BevClass.BACKGROUND, np.uint8)
     for name, what in (
         ("drivable_rings", BevClass.ROAD),
@@ -78,15 +83,43 @@ def bev_raster(sample: Mapping[str, Any], layout: BevLayout) -> Bytes:
     return np.ascontiguousarray(rasters[:, ::-1, ::-1]) if layout.first == "near_right" else rasters
 
 
+def _as_public(sample: Mapping[str, Any], layout: BevLayout, step: int) -> Bytes:
+    """(rows, columns), nearest and right first, as TransfuserTargetBuilder._compute_bev_semantic_map draws.
+
+    OpenCV draws with x along columns there, and what it draws is not the same the other way round.
+    """
+    drawn = np.zeros(layout.shape[::-1], np.uint8)
+    origin = np.array([layout.behind_m, layout.side_m]) / layout.cell_m
+
+    def cells(points: NDArray[Any]) -> NDArray[np.int32]:
+        return (np.asarray(points, np.float64)[..., :2] / layout.cell_m + origin).astype(np.int32)
+
+    for name in ("drivable_rings", "lane_polygons"):
+        for ring in sample[name]:
+            cv2.fillPoly(drawn, [cells(ring)], int(BevClass.ROAD))
+    width = max(round(LINE_M / layout.cell_m), 1)
+    for line in sample["lane_centerlines"]:
+        cv2.polylines(drawn, [cells(line)], False, int(BevClass.CENTERLINE), width)
+    boxes, valid = _agents(sample)
+    for what in (BevClass.STATIC, BevClass.VEHICLE, BevClass.PEDESTRIAN):
+        of_it = [DRAWN_AS[kind] == what and kind != AgentKind.BICYCLE for kind in sample["agent_kinds"]]
+        for box in cells(box_corners(boxes[valid[:, step] & np.array(of_it, bool), step].astype(np.float64))):
+            cv2.fillPoly(drawn, [box], int(what))
+    return np.ascontiguousarray(drawn.T)
+
+
 def nearest_agents(sample: Mapping[str, Any], layout: BevLayout, n: int) -> tuple[F32, Bools]:
     """Vehicles at now whose centre is inside the layout, nearest first: boxes (n, 5) float32 and whether there is one.
+
+    With `drawn_as="public"` those behind too, as far as ahead.
 
     Boxes are centre x, y [m], heading [rad], length, width [m] in the frame of the ego at now; zeros where none is.
     """
     boxes, there = _agents(sample)
     now, x, y = boxes[:, NOW_INDEX], boxes[:, NOW_INDEX, 0], boxes[:, NOW_INDEX, 1]
     wanted = there[:, NOW_INDEX] & np.array([kind == AgentKind.VEHICLE for kind in sample["agent_kinds"]], bool)
-    wanted &= (-layout.behind_m <= x) & (x <= layout.ahead_m) & (np.abs(y) <= layout.side_m)
+    behind_m = layout.ahead_m if layout.drawn_as == "public" else layout.behind_m
+    wanted &= (-behind_m <= x) & (x <= layout.ahead_m) & (np.abs(y) <= layout.side_m)
     found = np.flatnonzero(wanted)
     found = found[np.argsort(np.hypot(x[found], y[found]), kind="stable")][:n]
     nearest, valid = np.zeros((n, 5), np.float32), np.zeros(n, bool)

@@ -99,3 +99,24 @@ def arcs(name: str, count: int, poses: int) -> Any:
     heading = speed * curvature * np.arange(1, poses + 1) * (4.0 / poses)
     x, y = np.sin(heading) / curvature, (1.0 - np.cos(heading)) / curvature
     return np.stack([x, y, heading], axis=-1).astype(np.float32)
+
+
+KINDS = ("vehicle", "pedestrian", "bicycle", "traffic_cone", "barrier", "czone_sign", "generic_object")
+NEAR_M = 40.0  # somewhat further than a raster reaches
+
+
+def street(boxes: int = 420, rings: int = 6, lines: int = 8) -> dict[str, Any]:
+    """Things around the ego: boxes (n, 5) with their kinds, every kind in turn, rings (m, 8, 2), lines (k, 6, 2)."""
+    of_boxes = drawn("boxes", (boxes, 5)) * np.array([2 * NEAR_M, 2 * NEAR_M, 6.0, 5.0, 3.0], np.float32)
+    of_boxes += np.array([-NEAR_M, -NEAR_M, -3.0, 0.2, 0.2], np.float32)
+    angles = np.arange(8) * (np.pi / 4.0)
+    radii = 4.0 + 12.0 * drawn("radii", (rings, 8, 1))
+    centres = (drawn("centres", (rings, 1, 2)) - 0.5) * 2.0 * NEAR_M
+    way = (drawn("way", (lines, 6, 2)) - 0.3) * 16.0
+    starts = (drawn("starts", (lines, 1, 2)) - 0.7) * NEAR_M
+    return {
+        "boxes": of_boxes.astype(np.float32),
+        "kinds": [KINDS[i % len(KINDS)] for i in range(boxes)],
+        "rings": (centres + radii * np.stack([np.cos(angles), np.sin(angles)], -1)).astype(np.float32),
+        "lines": (starts + way.cumsum(axis=1)).astype(np.float32),
+    }

@@ -37,7 +37,8 @@ UNSEEN = {  # declared without an import statement of ours
     "tensorboard": "torch.utils.tensorboard imports it",
 }
 RAY_ONLY = {"factory/graph/on_ray.py"}  # loaded by executor=ray alone
-OF_OTHERS = {"planners/published/beside.py"}  # what the public code's own Python runs, with what that has
+# what the public code's own Python runs, with what that has
+OF_OTHERS = {f"planners/published/{name}beside.py" for name in ("", "lesson_", "targets_")}
 GPU = re.compile(r"torch|triton|nvidia|cuda|cudnn|nccl|gsplat")
 
 
