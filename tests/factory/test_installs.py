@@ -38,7 +38,7 @@ UNSEEN = {  # declared without an import statement of ours
 }
 RAY_ONLY = {"factory/graph/on_ray.py"}  # loaded by executor=ray alone
 # what the public code's own Python runs, with what that has
-OF_OTHERS = {f"planners/published/{name}beside.py" for name in ("", "lesson_", "targets_")}
+OF_OTHERS = {f"planners/published/{name}beside.py" for name in ("", "lesson_", "start_", "targets_")}
 GPU = re.compile(r"torch|triton|nvidia|cuda|cudnn|nccl|gsplat")
 
 

@@ -58,6 +58,21 @@ def test_a_plan_has_eight_poses_and_is_the_same_every_time_whatever_else_is_in_t
     assert not first.requires_grad and first[..., 2].abs().max() <= torch.pi
 
 
+def test_noise_that_is_drawn_is_another_for_every_call_and_scene_and_the_seed_s() -> None:
+    batch, model = scene_batch(1), planner(replace(TINY, planning_noise="drawn"))
+    twice = replace(
+        batch,
+        attempt_ids=batch.attempt_ids * 2,
+        status=batch.status.repeat(2, 1),
+        image=None if batch.image is None else batch.image.repeat(2, 1, 1, 1),
+    )
+    torch.manual_seed(3)
+    first, again = model.plan(twice), model.plan(twice)
+    assert not torch.allclose(first, again, atol=1e-3) and not torch.allclose(first[0], first[1], atol=1e-3)
+    torch.manual_seed(3)
+    assert torch.equal(model.plan(twice), first)
+
+
 def test_losses_reach_every_parameter_also_where_nothing_imitates() -> None:
     batch = scene_batch(4)
     nothing = replace(
