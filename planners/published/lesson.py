@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from factory.config.compose import ConfigError
@@ -56,10 +57,10 @@ class Lesson:
     double: bool  # in float64, in which rounding is too small to tell
 
     @property
-    def order(self) -> Array:
+    def order(self) -> NDArray[np.int64]:
         """(steps, BATCH) int64: samples of every batch; each comes once before any comes again."""
         rounds = -(-self.steps * BATCH // SAMPLES)
-        rows = [np.argsort(drawn(f"order {i}", (SAMPLES,)), kind="stable") for i in range(rounds)]
+        rows = [np.argsort(drawn(f"order {i}", (SAMPLES,)), kind="stable").astype(np.int64) for i in range(rounds)]
         return np.concatenate(rows)[: self.steps * BATCH].reshape(-1, BATCH)
 
     @property
@@ -142,7 +143,7 @@ def read_lesson(path: Path) -> PublicLesson:
         width, height = told["picture"]
         steps = told["steps"]
         lesson = lesson_of(told["case"], (width, height), steps, told["rate"], told["double"])
-        gradients = {(name,): float(norm) for name, norm in zip(told["matrices"], norms)}
+        gradients: dict[tuple[str, ...], float] = {(name,): float(norm) for name, norm in zip(told["matrices"], norms)}
         versions = ", ".join(f"{name} {version}" for name, version in told["versions"].items())
         learned = LessonCurve(losses, rates, gradients, told["optimiser"])
         return PublicLesson(lesson, learned, told["names"], f"{told['code']} ({versions})")

@@ -41,9 +41,10 @@ def main(argv: list[str]) -> None:
     with np.load(lesson, allow_pickle=False) as stored:
         given = {name: stored[name] for name in stored.files}
     told = json.loads(str(given.pop("told")))
+    width, height = told["picture"]
     with tempfile.TemporaryDirectory() as folder:
         os.environ.setdefault("NAVSIM_DEVKIT_ROOT", code)
-        agent = built(told["case"], given, Path(folder), *told["picture"], told["rate"])
+        agent = built(told["case"], given, Path(folder), width, height, told["rate"])
     filled(model_of(agent), given, first_weight)
     without_dropout(agent)
     watch = watched(pl.Callback)(given["seeds"])
@@ -69,8 +70,8 @@ def main(argv: list[str]) -> None:
         matrices=watch.matrices,
         optimiser=watch.optimiser,
     )
-    said = {"losses": watch.losses, "rates": watch.rates, "gradients": watch.gradients}
-    np.savez_compressed(out, told=np.array(json.dumps(told)), **{name: np.array(x) for name, x in said.items()})
+    losses, rates = np.array(watch.losses), np.array(watch.rates)
+    np.savez_compressed(out, told=np.array(json.dumps(told)), losses=losses, rates=rates, gradients=watch.gradients)
 
 
 def lightning_module(case: str) -> Any:
@@ -105,7 +106,8 @@ def watched(callback: Any) -> Any:
     class Seeing(callback):  # type: ignore[misc,unused-ignore]
         def __init__(self, seeds: Any) -> None:
             self.seeds = seeds
-            self.losses, self.rates = [], []
+            self.losses: list[float] = []
+            self.rates: list[list[float]] = []
 
         def on_train_batch_start(self, trainer: Any, module: Any, batch: Any, index: int) -> None:
             torch.manual_seed(int(self.seeds[trainer.global_step]))

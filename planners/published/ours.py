@@ -222,7 +222,9 @@ def _differences_in_training(recorded: PublicRecord, found: Imported, batch: Bat
         if f"train {name}" in theirs:
             wanted = float(theirs[f"train {name}"])
             rows.append(Difference(f"train {name}", abs(value - wanted) / max(abs(wanted), 1e-9), abs(wanted)))
-    norms = {(name,): norm for name, norm in zip(recorded.gradients, theirs["gradients"].tolist())}
+    norms: dict[tuple[str, ...], float] = {
+        (name,): norm for name, norm in zip(recorded.gradients, theirs["gradients"].tolist())
+    }
     return [*rows, gradient_difference(norms, gradients)]
 
 

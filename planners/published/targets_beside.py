@@ -26,7 +26,7 @@ def main(argv: list[str]) -> None:
     code, out = argv
     around = street()
     builder = TransfuserTargetBuilder(TransfuserConfig())
-    told = annotations(around)
+    told = annotated(around)
     bev = builder._compute_bev_semantic_map(told, Map(around), StateSE2(0.0, 0.0, 0.0))
     agents, there = builder._compute_agent_targets(told)
     versions = {"python": sys.version.split()[0], "numpy": np.__version__, "opencv": cv2.__version__}
@@ -36,7 +36,7 @@ def main(argv: list[str]) -> None:
     )
 
 
-def annotations(around: dict[str, Any]) -> Any:
+def annotated(around: dict[str, Any]) -> Any:
     """The boxes as a frame's annotations hold them: x, y, z, length, width, height, heading."""
     boxes = np.zeros((len(around["boxes"]), 7), np.float32)
     boxes[:, [0, 1, 6, 3, 4]] = around["boxes"]

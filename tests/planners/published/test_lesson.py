@@ -32,7 +32,7 @@ from planners.published.parity import Request, run_beside
 from planners.training.optim import learning_rate
 
 RECORDS = Path(__file__).parent / "recorded"
-FAMILIES = ("diffusiondrive", "gtrs_dense")
+FAMILIES = ("ltf", "diffusiondrive", "gtrs_dense")
 TOLERANCE = 1e-4
 HELD = 12  # steps of the record, for a test of half a minute
 
