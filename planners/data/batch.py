@@ -25,6 +25,7 @@ class ImageLayout:
     height: int = 512
     rows_cut: float = 28 / 1080  # share of the height, above and below
     sides_cut: float = 416 / 1920  # share of the width, on both sides of every camera but the middle one
+    decoding: Literal["reduced", "full"] = "reduced"  # full: as the public code does, see planners.data.images
 
 
 @dataclass(frozen=True)

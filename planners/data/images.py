@@ -1,18 +1,25 @@
 """One wide picture of a sample: its front cameras at now, cut, decoded and resized side by side.
 
-A JPEG is decoded at a half, a quarter or an eighth of its size where that is still as large as what is wanted of it.
-At the paper's setting (three 1920 x 1080 pictures, 2048 x 512 wanted) the halves have the wanted size already: 14.4
-instead of 34.8 ms a sample, and 0.15 of 255 away from decoding in full and averaging (rendered pictures).
+With `decoding="reduced"` a JPEG is decoded at a half, a quarter or an eighth of its size where that is still as large
+as what is wanted of it. At the paper's setting (three 1920 x 1080 pictures, 2048 x 512 wanted) the halves have the
+wanted size already. With `"full"` the picture is, there, that of the public code to the last bit: decoded in full, cut,
+joined and given to cv2.resize (TransfuserFeatureBuilder), which averages four pixels into one. What either costs:
+`python -m tests.bench.bench_decoding`.
+
+libjpeg-turbo decodes by way of simplejpeg, whose pixels are OpenCV's and Pillow's in less than half of OpenCV's time:
+OpenCV takes new memory for every picture, and half of its time goes into the system's handing it out.
 """
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from threading import local
 from typing import Any
 
 import cv2
 import numpy as np
+import simplejpeg
 
 from factory.store.reader import TIME_TOLERANCE_S
 from planners.data.batch import ImageLayout
@@ -20,8 +27,8 @@ from tasks.world.arrays import Array, Bytes
 
 SAME_YAW = math.radians(5.0)  # cameras of a stereo pair are no neighbours
 AS_GOOD = math.radians(2.0)  # of cameras that look ahead equally well the first by name is the front one
-REDUCED_BY = {2: cv2.IMREAD_REDUCED_GRAYSCALE_2, 4: cv2.IMREAD_REDUCED_GRAYSCALE_4, 8: cv2.IMREAD_REDUCED_GRAYSCALE_8}
-RGB_AT = {1: cv2.IMREAD_COLOR_RGB} | {f: flag | cv2.IMREAD_COLOR_RGB for f, flag in REDUCED_BY.items()}  # grey is 0
+FACTORS = (1, 2, 4, 8)  # by which a JPEG can be decoded smaller, without its finer waves
+_THREAD = local()  # what each thread decodes into, so that memory is asked for once
 
 
 def stitched(sample: Mapping[str, Any], layout: ImageLayout) -> Bytes:
@@ -74,14 +81,26 @@ def stitch(jpegs: Sequence[Bytes], layout: ImageLayout, out: Bytes) -> None:
     """Write the picture of JPEGs, left to right, into `out` (layout.height, layout.width, 3) as RGB.
 
     Every camera is brought to the same height, and together they are brought to the width.
-    Raises ValueError for what is not a JPEG.
+    Raises ValueError for what is not a JPEG, or a damaged one.
     """
     sizes = tuple(jpeg_size(jpeg) for jpeg in jpegs)
     for jpeg, part in zip(jpegs, _parts(sizes, layout)):
-        pixels = cv2.imdecode(jpeg, RGB_AT[part.factor])
-        if pixels is None or pixels.shape[:2] != part.decoded:
-            raise ValueError("an image is not a JPEG that can be decoded")
-        _place(np.asarray(pixels, np.uint8), part, out)
+        _place(_decoded(jpeg, part.decoded), part, out)
+
+
+def _decoded(jpeg: Bytes, size: tuple[int, int]) -> Bytes:
+    """(rows, columns, 3) RGB until the thread decodes again. size: its own over one of FACTORS, rounded up."""
+    rows, columns = size
+    room: Bytes | None = getattr(_THREAD, "room", None)
+    if room is None or len(room) < rows * columns * 3:
+        room = _THREAD.room = np.empty(rows * columns * 3, np.uint8)
+    try:
+        pixels: Bytes = simplejpeg.decode_jpeg(jpeg, "RGB", min_height=rows, min_width=columns, buffer=room)
+    except ValueError as error:
+        raise ValueError(f"an image is not a JPEG that can be decoded: {error}") from error
+    if pixels.shape[:2] != size:
+        raise ValueError(f"an image of {columns} x {rows} was decoded to {pixels.shape[1]} x {pixels.shape[0]}")
+    return pixels
 
 
 def stitch_pixels(images: Sequence[Bytes], layout: ImageLayout, out: Bytes) -> None:
@@ -128,7 +147,8 @@ def _parts(sizes: tuple[tuple[int, int], ...], layout: ImageLayout) -> tuple[_Pa
     edges = np.round(widths / widths[-1] * layout.width).astype(int).tolist()
     parts = []
     for size, cut, (rows, columns), start, stop in zip(sizes, cuts, lengths, edges, edges[1:]):
-        factor = max(f for f in RGB_AT if f == 1 or (rows // f >= layout.height and columns // f >= stop - start))
+        smaller = FACTORS if layout.decoding == "reduced" else (1,)
+        factor = max(f for f in smaller if f == 1 or (rows // f >= layout.height and columns // f >= stop - start))
         decoded = -(-size[0] // factor), -(-size[1] // factor)
         shrinks = rows > 2 * factor * layout.height or columns > 2 * factor * (stop - start)
         how = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR

@@ -1,8 +1,11 @@
 """The stitched picture: which cameras, which parts of them, where."""
 
+import io
+
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from planners.data.batch import ImageLayout
 from planners.data.images import chosen_cameras, jpeg_size, stitch, stitched
@@ -109,6 +112,36 @@ def test_decoding_at_a_fraction_is_near_to_decoding_in_full() -> None:
         assert np.abs(picture.astype(int) - mean).mean() < 1.0
 
 
+def seen(seed: int, width: int = 1920, height: int = 1080) -> Pixels:
+    """Shapes and edges at all scales, none of which repeats."""
+    rng = np.random.default_rng(seed)
+    scales = [rng.integers(0, 86, (height // n, width // n, 3), dtype=np.uint8) for n in (4, 20, 120)]
+    return np.sum([cv2.resize(scale, (width, height)) for scale in scales], axis=0).clip(0, 255).astype(np.uint8)
+
+
+def test_decoded_in_full_the_picture_is_the_public_code_s_to_the_bit() -> None:
+    """Opened with Pillow, cut, joined and resized as TransfuserFeatureBuilder does with three 1920 x 1080 pictures."""
+    views = [jpeg(seen(i)) for i in range(3)]
+    left, front, right = (np.asarray(Image.open(io.BytesIO(view))) for view in views)
+    joined = np.concatenate([left[28:-28, 416:-416], front[28:-28], right[28:-28, 416:-416]], axis=1)
+    public = cv2.resize(joined, (2048, 512))
+    full, reduced = (np.empty((512, 2048, 3), np.uint8) for _ in range(2))
+    stitch([np.frombuffer(view, np.uint8) for view in views], ImageLayout(decoding="full"), full)
+    assert (full == public).all()
+    stitch([np.frombuffer(view, np.uint8) for view in views], ImageLayout(), reduced)
+    off = np.abs(reduced.astype(int) - public).mean()
+    assert 0.0 < off < 3.0, "colours of single pixels, half of which JPEG leaves out"
+
+
+def test_pixels_are_those_of_opencv_at_every_fraction() -> None:
+    data = np.frombuffer(jpeg(seen(1, 320, 192)), np.uint8)
+    by = {2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4, 8: cv2.IMREAD_REDUCED_COLOR_8}
+    for factor, flag in {1: cv2.IMREAD_COLOR, **by}.items():
+        picture = np.empty((192 // factor, 320 // factor, 3), np.uint8)
+        stitch([data], ImageLayout(width=320 // factor, height=192 // factor, rows_cut=0.0), picture)
+        assert (picture == cv2.imdecode(data, flag)[..., ::-1]).all(), factor
+
+
 def test_a_small_picture_is_enlarged_and_a_huge_one_averaged() -> None:
     rng = np.random.default_rng(0)
     noise = rng.integers(0, 2, (512, 1024, 1), dtype=np.uint8).repeat(3, axis=2) * 255
@@ -129,6 +162,9 @@ def test_what_cannot_be_stitched_says_why() -> None:
     headless = [image | {"jpeg": image["jpeg"][:200]} for image in sample["images"]]
     with pytest.raises(ValueError, match="not a JPEG"):
         stitched(sample | {"images": headless}, PUBLIC)
+    whole = jpeg(seen(0, 320, 192))
+    with pytest.raises(ValueError, match="not a JPEG that can be decoded: Premature end"):
+        stitched(pictures(dict.fromkeys(FRONT_YAWS, whole[: len(whole) // 2])), PUBLIC)
     with pytest.raises(ValueError, match="leave nothing of an image of 32 x 18"):
         stitched(sample, ImageLayout(sides_cut=0.5))
 
