@@ -24,15 +24,21 @@ from tasks.reward.label_bytes import CRC_BYTES
 from tasks.subscores import LABELLED
 from tasks.world.arrays import Bools, Bytes
 
+Stitch = Callable[[Sequence[Bytes], ImageLayout, Bytes], None]
+
 
 class StoredRows:
     """Some rows of one row group."""
 
-    def __init__(self, table: pa.Table, cameras: Sequence[tuple[str, ...]], in_place: bool = False) -> None:
+    def __init__(
+        self, table: pa.Table, cameras: Sequence[tuple[str, ...]], in_place: bool = False, stitched: Stitch = stitch
+    ) -> None:
         """cameras: (rows) of each row's picture; none for rows that are not asked for.
 
         in_place: pictures stay in the table, which stays as a whole; else they are copied, and other images can go.
+        stitched: how a picture is made of its JPEGs.
         """
+        self._stitched = stitched
         self._jpegs: list[tuple[Bytes, ...]] = []
         if "images" in table.column_names:
             self._jpegs = _jpegs_at_now(_whole(table["images"]), cameras, in_place)
@@ -67,7 +73,7 @@ class StoredRows:
         if kept is not None:
             out[:] = kept
             return
-        stitch(self.jpegs(row), layout, out)
+        self._stitched(self.jpegs(row), layout, out)
         if keep:
             self._pictures[row, layout] = out.copy()
 

@@ -53,14 +53,18 @@ class DataSettings:
     seed: int = 0  # of the two draws; a smaller share or limit is a part of a larger one
     storage_options: dict[str, str] = field(default_factory=dict)  # of object stores, as deltalake calls them
     copy: str | None = None  # folder of this machine for a compact copy of what is read, see planners.data.local_copy
+    pictures: str | None = None  # folder of this machine for decoded pictures, see planners.data.pictures
+    pictures_gb: float = 100.0  # that it takes at most, 10^9 bytes; what is beyond is decoded in every pass
 
     def __post_init__(self) -> None:
         if not 0.0 < self.real_share <= 1.0:
             raise ValueError(f"real_share={self.real_share}: must be above 0 and at most 1")
         if self.limit_sim is not None and self.limit_sim < 1:
             raise ValueError(f"limit_sim={self.limit_sim}: must be at least 1; data.sim=[] leaves simulation out")
-        if self.copy is not None and "://" in self.copy:
-            raise ValueError(f"data.copy={self.copy}: must be a folder of this machine")
+        for name in ("copy", "pictures"):
+            folder = getattr(self, name)
+            if folder is not None and "://" in folder:
+                raise ValueError(f"data.{name}={folder}: must be a folder of this machine")
 
     def tables(self, part: str) -> tuple[str, ...]:
         """The tables of `real`, `sim` or `val`."""

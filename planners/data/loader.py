@@ -23,6 +23,7 @@ from planners.data.decode import BatchBuffer, count_labels
 from planners.data.feed import make_feed, mixed_samples
 from planners.data.index import Dataset
 from planners.data.mix import EpochOrder, MixSettings, Side, make_order
+from planners.data.pictures import GB
 from planners.data.windows import Inline, Memory, Window
 from tasks.world.arrays import Ints
 
@@ -144,6 +145,9 @@ class Loader:
             there = sum(copy.path.exists() for copy in copies.values())
             rest = "" if there == len(copies) else ", the others when they are first read"
             lines.append(f"{there} of {len(copies)} files are copied to {self.dataset.settings.copy}{rest}")
+        if pictures := self._memory.pictures:
+            held_gb = pictures.held_bytes() / GB
+            lines.append(f"decoded pictures: {held_gb:.1f} of at most {pictures.limit_gb:g} GB in {pictures.folder}")
         return "\n".join(lines)
 
     def _settings(self) -> dict[str, Any]:

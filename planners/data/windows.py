@@ -17,8 +17,10 @@ import pyarrow as pa
 from planners.data.decode import StoredRows
 from planners.data.feed import Feed
 from planners.data.files import leaves
+from planners.data.images import stitch
 from planners.data.local_copy import copies_of
 from planners.data.mix import WindowKey
+from planners.data.pictures import pictures_of
 from tasks.world.arrays import Ints
 
 AHEAD = 2  # windows of a side that are in memory, the one in use among them
@@ -73,6 +75,7 @@ class Memory:
         """staying: side -> its samples, for those that fit into one window."""
         self._feed, self._staying = feed, staying
         self.copies = copies_of(feed)
+        self.pictures = pictures_of(feed)
         self._stay: dict[int, _Reading] = {}
         self._checked: set[tuple[int, int]] = set()  # row groups whose pages were found undamaged
 
@@ -157,5 +160,6 @@ class Memory:
         cameras: list[tuple[str, ...]] = [()] * table.num_rows
         for sample, place in zip(samples.tolist(), places.tolist()):
             cameras[place] = self._feed.cameras[sample]
-        stored = StoredRows(table, cameras, in_place=mapped)
+        stitched = stitch if self.pictures is None else self.pictures.stitch
+        stored = StoredRows(table, cameras, in_place=mapped, stitched=stitched)
         return {sample: (stored, place) for sample, place in zip(samples.tolist(), places.tolist())}

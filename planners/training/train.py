@@ -60,7 +60,8 @@ def validation(
 
     Raises ValueError where the tables are not what the planner needs.
     """
-    dataset = open_data(DataSettings(real=data.tables("val"), storage_options=data.storage_options, copy=data.copy))
+    where = {name: getattr(data, name) for name in ("storage_options", "copy", "pictures", "pictures_gb")}
+    dataset = open_data(DataSettings(real=data.tables("val"), **where))
     needs = replace(planner.needs, labels=None)
     size = max(n for n in range(1, LARGEST_BATCH + 1) if len(dataset) % n == 0)  # no sample is left out
     loader = Loader(dataset, needs, MixSettings(), size, workers=workers)

@@ -227,7 +227,7 @@ def counted_pictures(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         decoded.append(1)
         stitch(*arguments)
 
-    monkeypatch.setattr("planners.data.decode.stitch", watched)
+    monkeypatch.setattr("planners.data.windows.stitch", watched)
     return decoded
 
 
