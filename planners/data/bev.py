@@ -57,7 +57,7 @@ def bev_raster(sample: Mapping[str, Any], layout: BevLayout) -> Bytes:
     steps = [_step(time_s) for time_s in layout.times_s]
     if layout.drawn_as == "public":
         rasters = np.stack([_as_public(sample, layout, step) for step in steps])
-        return rasters if layout.first == "near_right" else np.ascontiguousarray(rasters[:, ::-1, ::-1])
+        return rasters if layout.first == "near_right" else np.ascontiguousarray(np.flip(rasters, (1, 2)))
     ground = np.full(layout.shape, BevClass.BACKGROUND, np.uint8)
     for name, what in (
         ("drivable_rings", BevClass.ROAD),
