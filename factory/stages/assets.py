@@ -95,7 +95,7 @@ def asset_for(
             if settings.scene is SceneFrom.FIT:
                 asset = fitted(path, data, block.agents, settings.fit, threads, stopped)
             else:
-                asset = build_asset(data.photos, data.sweeps, block.agents, settings.asset)
+                asset = build_asset(data.photos, data.sweeps, block.agents, settings.asset, data.road)
         else:
             asset = lidar_asset(load_sweeps(block.sweeps, with_intensity=True), block.agents)
         return write_scene(path, replace(asset, block=range_of(clip, block)))
@@ -126,7 +126,7 @@ def block_id(clip: Clip, settings: RenderSettings) -> str:
     """16 hex digits of everything the scene depends on; of the sensor files, which are not opened, names and sizes."""
     digest = hashlib.sha256()
     block = block_of(clip)
-    made_of = (ASSET_VERSION, clip.dataset, clip.log_id, block.start_s, clip.content_digest)
+    made_of = (ASSET_VERSION, clip.dataset, clip.log_id, block.start_s, block.ground_m, clip.content_digest)
     part = "fit" if settings.scene is SceneFrom.FIT else "asset"
     made = asdict(settings)[part] | REMOVED[part]
     how = (settings.width, settings.height, sorted(settings.cameras), made)

@@ -38,7 +38,7 @@ def fitted(
     A fit that was killed or halted comes to the same bytes as one that was not. Raises Halted once it is `stopped`,
     with all of its iterations kept, and ValueError without photos to learn from.
     """
-    problem, state = prepare(data.photos, data.sweeps, agents, settings, threads=threads)
+    problem, state = prepare(data.photos, data.sweeps, agents, settings, threads=threads, road=data.road)
     begun, said = path.with_suffix(BEGUN), path.with_suffix(SAID)
     state = _resumed(begun, state)
     first, began = state.iteration, time.monotonic()

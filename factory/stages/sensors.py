@@ -12,9 +12,10 @@ from factory.readers.base import BadClip
 from factory.readers.nuscenes_points import read_points
 from factory.readers.pcd import read_pcd
 from factory.readers.videos import file_and_frame, video_frames
+from tasks.render.scene.driven_road import driven_road
 from tasks.render.scene.sensed import Photo, Sweep, on_ego
 from tasks.render.views import undistorted
-from tasks.world.arrays import Bytes
+from tasks.world.arrays import Array, Bytes
 from tasks.world.camera import Camera, SensorFile
 from tasks.world.clip import Block, Clip
 
@@ -28,6 +29,7 @@ class SensorData:
 
     photos: tuple[Photo, ...]  # without distortion, at the size asked for
     sweeps: tuple[Sweep, ...]
+    road: Array | None = None  # (M, 3) points of the road where the ego drove, world; of blocks without lidar
 
 
 def block_of(clip: Clip) -> Block:
@@ -41,7 +43,10 @@ def load_sensors(block: Block, cameras: Sequence[Camera], width: int, height: in
     Raises BadClip where a file is missing, broken or not of its camera's size.
     """
     photos = load_photos(block.images, cameras, width, height)
-    return SensorData(photos, load_sweeps(block.sweeps))
+    if block.sweeps or block.ground_m is None or not block.images:
+        return SensorData(photos, load_sweeps(block.sweeps))
+    poses = np.stack([file.world_from_ego for file in sorted(block.images, key=lambda file: file.time_s)])
+    return SensorData(photos, (), driven_road(poses, block.ground_m))
 
 
 def load_photos(files: Sequence[SensorFile], cameras: Sequence[Camera], width: int, height: int) -> tuple[Photo, ...]:

@@ -23,6 +23,7 @@ class Block:
     agents: AgentTracks  # 10 Hz from `start_s` on
     images: tuple[SensorFile, ...]
     sweeps: tuple[SensorFile, ...]
+    ground_m: float | None = None  # z of the road under the ego in the ego's frame; None: not known
 
 
 @dataclass(frozen=True)

@@ -42,6 +42,7 @@ SUMMARY, MAPPING = "dataset_summary.pkl", "dataset_mapping.pkl"
 # Of the stretches that are reconstructed: 20 s, as far apart as any clip still lies in one, so that a scene of
 # nuScenes, 20 s and no more, is one.
 BLOCK_STEPS = 200
+GROUND_M = 0.0  # of the ego's frame, in sidecars and in the plane of the log: it stands on the road
 BLOCK_STRIDE_STEPS = BLOCK_STEPS - CLIP_STEPS
 
 
@@ -155,7 +156,7 @@ def _block(log: ScenarioLog, start: int) -> Block:
     first = _block_start(start)
     stop = min(first + BLOCK_STEPS, len(log.ego_states))
     sensed = within(log.photographs.images, first, stop), within(log.photographs.sweeps, first, stop)
-    return Block(first * STEP_S, present(log.agents.window(first, stop)), *sensed)
+    return Block(first * STEP_S, present(log.agents.window(first, stop)), *sensed, GROUND_M)
 
 
 def _digest(scenario: str, sidecar: bytes) -> str:

@@ -14,7 +14,7 @@ from tasks.render.fit.road import Road, above_road, find_road, lay_flat
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.state import BACKGROUND, FitState, logits_of
 from tasks.render.scene.build import held_out_rows, sky_of, surfaces
-from tasks.render.scene.features import triangulated
+from tasks.render.scene.features import known_without_lidar
 from tasks.render.scene.movers import behind_boxes
 from tasks.render.scene.sensed import Photo, Sweep, Tracks, fuse, shifted
 from tasks.render.scene.sight import Seen, see
@@ -57,9 +57,10 @@ def prepare(
     settings: FitSettings,
     held_out: Collection[int] | None = None,
     threads: int = 2,
+    road: Array | None = None,
 ) -> tuple[Problem, FitState]:
     """The problem and its first state. `held_out`: indices of photos that only measure, else as `settings` says.
-    The number of `threads` changes no bit, here and in all of the fit.
+    The number of `threads` changes no bit, here and in all of the fit. `road`: as of `build_asset`.
 
     Raises ValueError without photos to train on.
     """
@@ -71,7 +72,7 @@ def prepare(
     tracks = Tracks(agents, origin)
     train = [p for i, p in enumerate(local) if i not in out]
     static, per_track = fuse([replace(s, world_from_ego=shifted(s.world_from_ego, -origin)) for s in sweeps], tracks)
-    static = static if sweeps else triangulated(train, tracks)
+    static = static if sweeps else known_without_lidar(train, tracks, None if road is None else road - origin)
 
     first_seen = [i for k, group in enumerate(instants(train)) if k % settings.start_every == 0 for i in group]
     looked_at = [train[i] for i in sorted(first_seen)]
@@ -87,10 +88,10 @@ def prepare(
     alike = in_agreement(looked_at, exposures[sorted(first_seen)])
     background, nodes = surfaces(alike, seen, tracks)
     eyes = np.stack([p.world_from_camera[:3, 3] for p in train])
-    road = find_road(static, eyes) if settings.road else None
+    surface = find_road(static, eyes) if settings.road else None
     cars = [nodes.get(i) for i in tracks.ids]
     bodies = _bodies(cars, tracks, [p.time_s for p in train])
-    state = _first_state(background, cars, bodies, sky_of(alike, seen).rgb, exposures, road, settings)
+    state = _first_state(background, cars, bodies, sky_of(alike, seen).rgb, exposures, surface, settings)
     unknown = [track_id not in nodes for track_id in tracks.ids]
     shots = [_shot(p, tracks, np.array(unknown, bool)) for p in local]
     problem = Problem(
@@ -98,7 +99,7 @@ def prepare(
         tuple(shot for i, shot in enumerate(shots) if i not in out),
         tuple(shot for i, shot in enumerate(shots) if i in out),
         tracks,
-        road,
+        surface,
     )
     return problem, state
 

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from tasks.render.scene.driven_road import with_road
 from tasks.render.scene.movers import owners
 from tasks.render.scene.sensed import Photo, Tracks, voxel_rows
 from tasks.render.scene.stereo import MAX_BASELINE_M, MIN_BASELINE_M
@@ -17,6 +18,12 @@ RATIO = 0.8  # Lowe 2004: the second best match must be this much worse
 OFF_PX = 1.0  # a point may miss its corner by this much in either photo
 LEAST_PARALLAX_DEG = 0.7
 FARTHEST_M = 80.0
+
+
+def known_without_lidar(photos: Sequence[Photo], tracks: Tracks, road: Array | None) -> Array:
+    """Points (M, 3) that stay, in the photos' frame: corners, and the `road` (K, 3) where that is known."""
+    points = triangulated(photos, tracks)
+    return points if road is None else with_road(points, road)
 
 
 def triangulated(photos: Sequence[Photo], tracks: Tracks) -> Array:

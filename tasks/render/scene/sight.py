@@ -50,6 +50,15 @@ def see(
         np.concatenate(points), np.concatenate(labels), photo.intrinsics, photo.world_from_camera, width, height
     )
     depth, label = dense_depth(sparse, label, rgb)
+    rays = directions(photo.intrinsics, photo.world_from_camera, width, height)
+    eye = np.ascontiguousarray(photo.world_from_camera[:3, 3])
+
+    def behind(depth: F32, boxes: Array) -> Bools:
+        return np.asarray(behind_boxes((rays * depth[..., None]).reshape(-1, 3) + eye, eye, boxes)).reshape(depth.shape)
+
+    if not per_track:  # without lidar on them nothing but their boxes tells what hides the street behind it
+        hidden = (depth > 0.0) & behind(depth, boxes[valid])
+        depth, label = np.where(hidden, np.float32(0.0), depth), np.where(hidden, np.int32(SHALLOW), label)
     unknown = depth == 0.0
     brightness = rgb.mean(axis=-1)
     bright = (brightness > 0.6) | ((rgb[..., 2] > rgb[..., 0] + 0.04) & (brightness > 0.4))
@@ -61,12 +70,7 @@ def see(
     else:
         guess, sky = hints[0], unknown & (bright | (hints[0] == 0.0))
     depth = np.where(unknown & ~sky, guess, depth).astype(np.float32)
-    seen_to = (
-        directions(photo.intrinsics, photo.world_from_camera, width, height)
-        * np.where(depth > 0, depth, FAR_M)[..., None]
-    )
-    eye = np.ascontiguousarray(photo.world_from_camera[:3, 3])
-    passing = behind_boxes(seen_to.reshape(-1, 3) + eye, eye, boxes[valid & tracks.driving]).reshape(height, width)
+    passing = behind(np.where(depth > 0, depth, np.float32(FAR_M)), boxes[valid & tracks.driving])
     return Seen(depth, label, sky, passing)
 
 
