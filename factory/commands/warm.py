@@ -1,4 +1,4 @@
-"""`python -m factory warm [part ...]`: compile the kernels before the first run, some 60 s on a core.
+"""`python -m factory warm [part ...]`: compile the kernels before the first run, some 110 s on a core.
 
     python -m factory warm                  all of them, and what the synthetic town is drawn with
     python -m factory warm drive judge      parts: what a run that only drives needs, what scores need

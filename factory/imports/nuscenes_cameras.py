@@ -1,6 +1,6 @@
 """Photos and lidar of nuScenes' own folders as sidecars of ScenarioNet's logs, one file a scene (docs/photos.md).
 
-From nuScenes' schema (nuscenes-devkit @ d9de17a, docs/schema_nuscenes.md): tables are JSON lists of rows that name each
+From nuScenes' schema (nuscenes-devkit @ d9de17a, its page on the schema): tables are JSON lists of rows that name each
 other by tokens. Photos are undistorted, each has an ego pose of its own, and the world is the city's map frame, which
 ScenarioNet keeps. Its clock counts keyframes as 0.5 s each, so stamps are put on that.
 """

@@ -192,8 +192,9 @@ def _add_up(table: Array, in_pairs: bool) -> None:
         for row in _FACTORS:
             multiplier *= table[row, k]
         table[_MULTIPLIER, k] = multiplier
-    table[_EP] = relative_progress(table[_EP_RAW_M], table[_MULTIPLIER], in_pairs)
+    ep = relative_progress(table[_EP_RAW_M], table[_MULTIPLIER], in_pairs)
     for k in range(table.shape[1]):
+        table[_EP, k] = ep[k]
         total = 0.0
         for row, weight in _TERMS:
             total += weight * table[row, k]

@@ -15,6 +15,7 @@ import shapely.ops
 from tasks.experts.pdm_closed.forecast import Things
 from tasks.experts.pdm_closed.path import DrivePaths, project
 from tasks.kernels.compiled import kernel
+from tasks.rollout.polylines import extent
 from tasks.world.arrays import Array, Ints
 from tasks.world.geometry import ring_contains, segments_touch, to_line
 
@@ -98,7 +99,7 @@ def _in_corridor(
     if not outside < 0.0:  # also where the corridor is empty (NaN)
         return False, outside
     inside = _edges_around(swept, path, x, y, squares)
-    clearance = math.sqrt(squares.min()) - radius - ROUNDING_M
+    clearance = math.sqrt(extent(squares)[0]) - radius - ROUNDING_M
     if clearance >= 0.0:
         return inside, clearance
     ring_x = things.x[sample, things.first[m] : things.first[m + 1]]

@@ -124,9 +124,8 @@ def _drive(
                     sample = step // SAMPLE_STEPS
                     nearest = _nearest_ahead(things, lead_progress_m[path, sample], sample, progress, footprint)
                     _write_lead(paths, path, things, nearest, progress, poses[p, step - 1, 2], written)
-                    leads[p, step] = written
-                else:
-                    leads[p, step] = leads[p, step - 1]  # before the first search all zeros: no gap, so it brakes hard
+                for k in range(3):  # before the first search all zeros: no gap, so it brakes hard
+                    leads[p, step, k] = written[k] if looks else leads[p, step - 1, k]
                 after = idm_step(progress, speed, leads[p, step], targets_mps[p - first], idm)
                 motion[p, step, 0], motion[p, step, 1] = after
                 poses[p, step, 0], poses[p, step, 1], poses[p, step, 2] = pose_at(paths, path, after[0])

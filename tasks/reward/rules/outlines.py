@@ -62,8 +62,8 @@ def _edges(points: Array, ends: Ints) -> tuple[Array, Ints]:
         last = ends[i + 1] - 1
         for k in range(ends[i], ends[i + 1]):
             if points[k, 0] != points[last, 0] or points[k, 1] != points[last, 1]:
-                edges[n, :2] = points[last]
-                edges[n, 2:] = points[k]
+                edges[n, 0], edges[n, 1] = points[last, 0], points[last, 1]
+                edges[n, 2], edges[n, 3] = points[k, 0], points[k, 1]
                 n += 1
                 last = k
         first[i + 1] = n
