@@ -129,7 +129,7 @@ def fit(
                 parts = ", ".join(f"{name} {value:g}" for name, value in terms.items())
                 other = ", or precision=bf16 or fp32" if scaler.is_enabled() else ""
                 raise FloatingPointError(
-                    f"the loss of step {at} is no number ({parts}): try a smaller learning_rate{other}"
+                    f"the loss of step {at} is not finite ({parts}): try a smaller learning_rate{other}"
                 )
             if curves is not None:
                 rate = learning_rate(training, at, loop.steps, epoch_steps)

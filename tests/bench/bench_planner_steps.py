@@ -196,7 +196,7 @@ def counted_alone(name: str, batch: int) -> Measured:
 
 
 def operations(loss: Callable[[], Tensor]) -> tuple[float, float]:
-    """Of the way to the loss, and of that and the way back."""
+    """Of the forward pass to the loss, and of forward and backward pass together."""
     with FlopCounterMode(display=False) as counted, sdpa_kernel(SDPBackend.MATH):
         ahead = loss()
         forward = counted.get_total_flops()
