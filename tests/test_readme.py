@@ -22,6 +22,7 @@ from factory.commands.dashboard import Request as DashboardRequest
 from factory.commands.explain import Request as ExplainRequest
 from factory.commands.export import Request as ExportRequest
 from factory.commands.import_ import Request as ImportRequest
+from factory.commands.scene import Request as SceneRequest
 from factory.commands.table import COMMANDS, PLANNERS
 from factory.config.arguments import parse
 from factory.config.compose import compose, conf_dir, fill
@@ -160,6 +161,8 @@ def test_every_command_is_one_its_program_takes(
             parse(ExportRequest, arguments)  # a run of NAVSIM's logs
         case ["python", "-m", "factory", "import", *arguments]:
             parse(ImportRequest, arguments)  # its folders are a user's
+        case ["python", "-m", "factory", "scene", *arguments]:
+            parse(SceneRequest, arguments)  # its files are a user's
         case ["python", "-m", "factory", *arguments]:
             assert door_main(arguments) == 0, capsys.readouterr().err
         case ["python", "-m", "factory.run", "--help"]:

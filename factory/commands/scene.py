@@ -1,39 +1,61 @@
-"""`python -m factory scene info|export|import ...`: the scene file of a block, looked into and exchanged.
+"""`python -m factory scene info|export|import|view ...`: the scene file of a block, looked into and exchanged.
 
 info SCENE...                       what is in it: Gaussians, nodes, sky, range, quality, digest
 export SCENE to=FOLDER              background.ply, one node-<track id>.ply a vehicle, sky.png, scene.json
-import FILE.ply to=SCENE            the .ply as a background under a plain sky; origin=x,y,z puts it into the world [m]
-import FILE.ply to=SCENE like=OTHER the same with the origin, nodes, sky and range of another scene
+export SCENE to=FOLDER format=spz   the same, a tenth the size; format=ckpt: checkpoints, of the background as of
+                                    WorldEngine, of vehicles as of nerfstudio's splatfacto
+import FILE to=SCENE                a .ply, .spz or checkpoint (.ckpt, .pt, .pth: splatfacto, MTGS, WorldEngine) as a
+                                    scene under a plain sky; origin=x,y,z puts it into the world [m]
+import FILE to=SCENE like=OTHER     the same with the origin, nodes, sky and range of another scene
+view SCENE out=RUN                  in the browser, until Ctrl-C, with the log's drives and the run's samples through
+                                    it; without out= the scene alone. port=8267, host=127.0.0.1
 
-The .ply files are standard 3D Gaussian splatting (gsplat, nerfstudio, SuperSplat). A background is in metres from the
-scene's origin, a node in its box's frame. A block's scene lies in <out>/cache/block-*.safetensors; an edited one put
-back under the same name is what the next run draws.
+traversal=N takes the colours of an MTGS checkpoint's N-th traversal (default: their mean), transforms=FILE takes back
+nerfstudio's dataparser_transforms.json. The .ply files are standard 3D Gaussian splatting (gsplat, nerfstudio,
+SuperSplat). A background is in metres from the scene's origin, a node in its box's frame. A block's scene lies in
+<out>/cache/block-*.safetensors; an edited one put back under the same name is what the next run draws.
 """
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from threading import Event
 from typing import Literal
 
 from factory.config.arguments import WORD, Refused
+
+PORT = 8267  # the dashboard is at 8266
 
 
 @dataclass(frozen=True)
 class Request:
     """The command line."""
 
-    action: Literal["info", "export", "import"] = field(metadata=WORD)
+    action: Literal["info", "export", "import", "view"] = field(metadata=WORD)
     files: tuple[str, ...] = field(metadata=WORD)
     to: str | None = None
     like: str | None = None
     origin: str | None = None
+    format: Literal["ply", "spz", "ckpt"] | None = None
+    traversal: int | None = None
+    transforms: str | None = None
+    out: str | None = None
+    port: int | None = None
+    host: str | None = None
 
     def __post_init__(self) -> None:
-        if self.action == "info" and (self.to, self.like, self.origin) != (None, None, None):
-            raise ValueError("scene info takes files alone")
-        if self.action != "info" and (self.to is None or len(self.files) != 1):
-            raise ValueError(f"scene {self.action} takes one file and to=...; see --help")
-        if self.action == "export" and (self.like, self.origin) != (None, None):
-            raise ValueError("like= and origin= are of scene import")
+        if self.action != "info" and len(self.files) != 1:
+            raise ValueError(f"scene {self.action} takes one file; see --help")
+        if self.action in ("export", "import") and self.to is None:
+            raise ValueError(f"scene {self.action} takes to=...; see --help")
+        takes = {
+            "info": (),
+            "export": ("to", "format"),
+            "import": ("to", "like", "origin", "traversal", "transforms"),
+            "view": ("out", "port", "host"),
+        }[self.action]
+        for name in ("to", "like", "origin", "format", "traversal", "transforms", "out", "port", "host"):
+            if getattr(self, name) is not None and name not in takes:
+                raise ValueError(f"scene {self.action} takes no {name}=; see --help")
         if self.like is not None and self.origin is not None:
             raise ValueError("give origin= or like=: the other scene has an origin of its own")
 
@@ -42,14 +64,44 @@ def main(request: Request) -> None:
     """Do it. Raises Refused for what cannot be read or makes no sense."""
     from factory.stages.scene_file import read_scene, write_scene
     from factory.views.scene_parts import export, imported, info_text
+    from factory.views.splat_files import read_splats
 
     file, to = Path(request.files[0]), Path(request.to or "")
     try:
-        if request.action == "info":
-            print("\n\n".join(info_text(path, read_scene(path)) for path in map(Path, request.files)))
-        elif request.action == "export":
-            print("\n".join(map(str, export(read_scene(file), to))))
-        else:
-            print(info_text(to, write_scene(to, imported(file, request.like, request.origin))))
+        match request.action:
+            case "info":
+                print("\n\n".join(info_text(path, read_scene(path)) for path in map(Path, request.files)))
+            case "export":
+                print("\n".join(map(str, export(read_scene(file), to, f".{request.format or 'ply'}"))))
+            case "import":
+                transforms = None if request.transforms is None else Path(request.transforms)
+                found = read_splats(file, request.traversal, transforms)
+                print(info_text(to, write_scene(to, imported(found, request.like, request.origin))))
+                if found.left_out:
+                    print(f"left out    {', '.join(found.left_out)}: bodies that bend need their network")
+            case "view":
+                view(request)
     except (ValueError, OSError) as error:
         raise Refused(str(error)) from error
+
+
+def view(request: Request) -> None:
+    """Until Ctrl-C. Raises ValueError and OSError."""
+    from factory.stages.scene_file import read_scene
+    from factory.views.board.server import LOOPBACK
+    from factory.views.scene_view import NOTHING, drives_through, shown
+    from factory.views.status import open_store
+
+    asset = read_scene(Path(request.files[0]))
+    here = NOTHING if request.out is None else drives_through(open_store(request.out), asset)
+    server = shown(asset, here, request.host or LOOPBACK[0], PORT if request.port is None else request.port)
+    told = f"{len(here.samples)} samples and {len(here.logged)} logged drives" if request.out else "no run's drives"
+    print(f"{request.files[0]}, {told}: http://{server.get_host()}:{server.get_port()}/ until Ctrl-C", flush=True)
+    if server.get_host() not in LOOPBACK:
+        print("warning: everyone who reaches this port sees the scene; there is no password")
+    try:
+        Event().wait()
+    except KeyboardInterrupt:
+        print()
+    finally:
+        server.stop()

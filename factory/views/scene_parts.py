@@ -3,17 +3,19 @@
 import json
 import re
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from factory.stages.scene_file import BadScene, described_by, read_scene
+from factory.views.splat_files import background_bytes, node_bytes
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.lidar_only import plain_sky
 from tasks.render.splatting import sh
+from tasks.render.splatting.checkpoints import SplatCheckpoint
 from tasks.render.splatting.gaussians import Gaussians
-from tasks.render.splatting.ply import from_ply, to_ply
 
 
 def info_text(path: Path, asset: RenderAsset) -> str:
@@ -35,16 +37,20 @@ def info_text(path: Path, asset: RenderAsset) -> str:
     return "\n".join([*lines, f"exposures   {len(asset.exposures)}"])
 
 
-def export(asset: RenderAsset, folder: Path) -> list[Path]:
-    """Writes the parts into a folder; returns their paths. Raises BadScene where a part holds NaN."""
+def export(asset: RenderAsset, folder: Path, suffix: str = ".ply") -> list[Path]:
+    """Writes the parts into a folder, Gaussians as `suffix` says; returns their paths.
+
+    Raises BadScene where a part cannot be written so.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    files = {"background.ply": asset.background}
-    files |= {f"node-{re.sub(r'[^A-Za-z0-9._-]', '_', name)}.ply": node for name, node in asset.nodes.items()}
-    if len(files) < 1 + len(asset.nodes):
+    nodes = {f"node-{re.sub(r'[^A-Za-z0-9._-]', '_', name)}{suffix}": node for name, node in asset.nodes.items()}
+    if len(nodes) < len(asset.nodes):
         raise BadScene(f"track ids {', '.join(asset.nodes)}: two of them make the same file name")
-    for name, part in files.items():
+    files = {f"background{suffix}": partial(background_bytes, asset.background, suffix, asset.origin)}
+    files |= {name: partial(node_bytes, node, suffix) for name, node in nodes.items()}
+    for name, written in files.items():
         try:
-            (folder / name).write_bytes(to_ply(part))
+            (folder / name).write_bytes(written())
         except ValueError as error:
             raise BadScene(f"{name}: {error}") from error
     sky = np.rint(np.clip(asset.sky.rgb, 0.0, 1.0) * 255.0).astype(np.uint8)
@@ -54,18 +60,28 @@ def export(asset: RenderAsset, folder: Path) -> list[Path]:
     return [folder / name for name in (*files, "sky.png", "scene.json")]
 
 
-def imported(path: Path, like: str | None = None, origin: str | None = None) -> RenderAsset:
-    """A .ply as the background of a scene of unknown quality. Raises BadScene, ValueError or OSError."""
-    try:
-        background = from_ply(path.read_bytes())
-    except ValueError as error:
-        raise BadScene(f"{path}: {error}") from error
-    if not len(background):
-        raise BadScene(f"{path}: ply: vertex: no Gaussian in it")
-    if like is not None:
-        other = read_scene(Path(like))
-        return replace(other, background=background, psnr_db=float("nan"), n_held_out=0, views=(), digest="")
-    return RenderAsset(_place(origin or "0,0,0"), background, {}, plain_sky(), float("nan"))
+def imported(found: SplatCheckpoint, like: str | None = None, origin: str | None = None) -> RenderAsset:
+    """What a file holds as a scene of unknown quality. Raises BadScene or ValueError.
+
+    like: the scene that origin, sky, range and, where the file has none, vehicles are of. origin: x,y,z [m] of the
+    file's zero in the world; where the file says it, that must not be given.
+    """
+    if found.origin is not None and origin is not None:
+        raise ValueError("origin=: the file itself says where it lies in the world")
+    place = _place(origin or "0,0,0") if found.origin is None else found.origin
+    if like is None:
+        return RenderAsset(place, found.background, found.nodes, plain_sky(), float("nan"))
+    other = read_scene(Path(like))
+    return replace(
+        other,
+        origin=other.origin if found.origin is None else found.origin,
+        background=found.background,
+        nodes=found.nodes or other.nodes,
+        psnr_db=float("nan"),
+        n_held_out=0,
+        digest="",
+        views=(),
+    )
 
 
 def _place(text: str) -> np.ndarray:

@@ -57,7 +57,7 @@ def from_ply(data: bytes) -> Gaussians:
     """The Gaussians of a file, SH degree 0 to 3, rotations made unit.
 
     Raises ValueError that names the field: for a file that is ascii, compressed or no ply, for properties that are
-    absent or of another type than float, truncated data, NaN and infinity.
+    absent or of another type than float, truncated data, NaN and, but for an opacity, infinity.
     """
     header = _header(data)
     absent = [name for name in REQUIRED if name not in header.types]
@@ -78,7 +78,7 @@ def from_ply(data: bytes) -> Gaussians:
     length = np.linalg.norm(quats, axis=1, keepdims=True)
     if not (length > 0.0).all():
         raise ValueError(f"ply: rot: {int((length == 0.0).sum())} rotations are all zero")
-    logit = _columns(table, ("opacity",))[:, 0].astype(np.float64)
+    logit = _columns(table, ("opacity",), infinite=True)[:, 0].astype(np.float64)  # of 0 and 1, as spz's tools write
     coefficients = _columns(table, rest).reshape(len(table), 3, found // 3).transpose(0, 2, 1)
     return Gaussians(
         means=_columns(table, POSITION),
@@ -143,15 +143,16 @@ def _table(data: bytes, header: _Header) -> NDArray[np.void]:
     return np.frombuffer(data, row, header.count, header.start)
 
 
-def _columns(table: NDArray[np.void], names: tuple[str, ...]) -> F32:
-    """(N, len(names)), finite."""
+def _columns(table: NDArray[np.void], names: tuple[str, ...], infinite: bool = False) -> F32:
+    """(N, len(names)), finite unless `infinite` is a value too."""
     out = np.empty((len(table), len(names)), np.float32)
     for k, name in enumerate(names):
         with np.errstate(over="ignore"):  # a double that is infinite as a float is found below
             out[:, k] = table[name]
-        bad = len(table) - int(np.isfinite(out[:, k]).sum())
-        if bad:
-            raise ValueError(f"ply: property {name}: {bad} of {len(table)} values are NaN or infinite")
+        good = ~np.isnan(out[:, k]) if infinite else np.isfinite(out[:, k])
+        if not good.all():
+            fault = "NaN" if infinite else "NaN or infinite"
+            raise ValueError(f"ply: property {name}: {int((~good).sum())} of {len(table)} values are {fault}")
     return out
 
 

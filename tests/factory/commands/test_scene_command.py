@@ -97,13 +97,19 @@ def test_what_cannot_be_done_is_an_error_that_says_why(
     for argv, said in (
         (["info", str(tmp_path / "none")], "none: cannot be read"),
         (["info", ball], "bad.ply: cannot be read"),
-        (["export", str(stored)], "export takes one file and to="),
-        (["fly", str(stored)], "'fly': must be one of info, export, import"),
-        (["info", str(stored), to], "info takes files alone"),
+        (["export", str(stored)], "export takes to="),
+        (["fly", str(stored)], "'fly': must be one of info, export, import, view"),
+        (["info", str(stored), to], "info takes no to="),
+        (["view", str(stored), to], "view takes no to="),
+        (["view", str(stored), f"out={tmp_path / 'no run'}"], "no run"),
+        (["export", str(stored), to, "format=obj"], "format=obj"),
+        (["import", str(stored), to], "expected a name that ends in .ply, .spz, .ckpt, .pt, .pth"),
         (["import", ball, to], "bad.ply: ply: property opacity: absent"),
         (["import", str(tmp_path / "empty.ply"), to], "no Gaussian in it"),
         (["import", str(tmp_path / "gone.ply"), to], "No such file"),
-        (["import", ball], "import takes one file and to="),
+        (["import", ball], "import takes to="),
+        (["import", ball, ball, to], "import takes one file"),
+        (["import", ball, to, "traversal=1"], "traversal= is of a checkpoint of MTGS"),
     ):
         assert main(argv) == 2, argv
         assert said in capsys.readouterr().err, argv

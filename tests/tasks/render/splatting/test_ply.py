@@ -100,11 +100,22 @@ def test_an_absent_property_is_named(name: str) -> None:
         from_ply(by_hand(values))
 
 
-@pytest.mark.parametrize("name", ["z", "opacity", "f_rest_3", "rot_2"])
-@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+NAN, INF = float("nan"), float("inf")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [(name, NAN) for name in ("z", "opacity", "f_rest_3", "rot_2")] + [("z", INF), ("rot_2", INF)]
+)
 def test_nan_and_infinity_are_named(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=f"property {name}: 1 of 1 values"):
         from_ply(by_hand(PLAIN | REST | {name: value}))
+
+
+def test_a_logit_without_bound_is_an_opacity_of_0_or_1() -> None:
+    """As the tools of .spz write them, whose 8 bits know both."""
+    for logit, opacity in ((float("inf"), 1.0), (float("-inf"), 0.0)):
+        found = from_ply(by_hand(PLAIN | {"opacity": logit})).opacities
+        assert 0.0 < found[0] < 1.0 and found[0] == pytest.approx(opacity, abs=1e-6)
 
 
 WHOLE = by_hand(PLAIN)
