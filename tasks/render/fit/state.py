@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tasks.render.fit.adam import Learned
+from tasks.render.fit.road import Road, lay_flat
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.world.arrays import F32, Bools, FloatArray, Ints, ShortInts
 
@@ -35,6 +36,20 @@ class FitState:
         means, quats, log_scales, logits, colours, rest = (self.learned[name].values for name in SHAPES)
         rest = rest.reshape(len(self), -1, 3)
         return Gaussians(means, quats, log_scales, opacities_of(logits[:, 0]), colours, rest)
+
+    def seen(self, rows: Ints, depths: F32, screen: F32) -> F32:
+        """Notes what a photo says of `rows` (M,): their depths (M,) in it, their derivatives (M, 2) by the place on it.
+
+        Returns the nearest depths (M,) so far.
+        """
+        self.nearest[rows] = np.minimum(self.nearest[rows], depths)
+        self.wanted[rows] += np.hypot(screen[:, 0], screen[:, 1])
+        return self.nearest[rows]
+
+    def lay_flat(self, rows: Ints, road: Road) -> None:
+        """Those of `rows` (M,) that lie on the road stay on it."""
+        means, quats, log_scales = (self.learned[name].values for name in ("means", "quats", "log_scales"))
+        lay_flat(means, quats, log_scales, rows[self.road[rows]], road)
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:
         """By name, for whoever stores them."""
