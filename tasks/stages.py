@@ -54,11 +54,11 @@ class Task:
     stages: tuple[str, ...]  # as their seconds are told
     per: str  # block, clip, attempt, batch
     memory_gb: float  # that its worker holds meanwhile; claimed of its node, as is a core
-    may_draw: bool = False  # claims its share of a GPU where pictures are drawn on one
+    may_draw: bool = False  # or fits what is drawn: claims its share of a GPU where that is done on one
 
 
 TASKS: tuple[Task, ...] = (
-    Task("reconstruct", ("reconstruct",), "block", 2.0),  # on as many cores as it is told
+    Task("reconstruct", ("reconstruct",), "block", 2.0, may_draw=True),  # on as many cores as it is told
     Task("perturb", ("clip", "render", "perturb"), "clip", 1.0),
     Task("drive", ("rollout", "expert", "reward"), "attempt", 1.0),
     Task("render", ("render",), "attempt", 1.0, may_draw=True),  # only of drives that the reward accepts

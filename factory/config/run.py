@@ -115,7 +115,9 @@ class RunConfig:
     experts: tuple[str, ...] = ("pdm_closed", "recovery", "human")  # who drives
     executor: Literal["ray", "local"] = "ray"  # local: in this process, for a debugger
     workers: int | None = None  # processes; null: every core; on a cluster that grows: tasks at once
-    gpu_share: float = 0.1  # of a GPU that a task which draws claims with render.backend=gsplat; 1/share share one
+    gpu_share: float = (
+        0.1  # of a GPU that a task which draws or fits claims with render.backend=gsplat; 1/share share one
+    )
     graph: GraphChoice = field(default_factory=GraphChoice)
     limit: int | None = None  # read this many clips only
     seed: int = 0  # of every random draw

@@ -25,6 +25,7 @@ from factory.stages.sensors import block_of, chosen_cameras, load_sensors, load_
 from tasks.render.scene.asset import BlockRange, RenderAsset
 from tasks.render.scene.build import build_asset
 from tasks.render.scene.lidar_only import lidar_asset
+from tasks.render.scene.settings import Backend
 from tasks.render.scene.stereo import MAX_BASELINE_M, MIN_BASELINE_M
 from tasks.render.settings import REMOVED, RenderSettings, SceneFrom
 from tasks.world.arrays import Array
@@ -93,7 +94,7 @@ def asset_for(
         if made_of is not Sensing.LIDAR_ONLY:
             data = load_sensors(block, cameras, settings.width, settings.height)
             if settings.scene is SceneFrom.FIT:
-                asset = fitted(path, data, block.agents, settings.fit, threads, stopped)
+                asset = fitted(path, data, block.agents, settings.fit, threads, stopped, settings.backend)
             else:
                 asset = build_asset(data.photos, data.sweeps, block.agents, settings.asset, data.road)
         else:
@@ -129,6 +130,8 @@ def block_id(clip: Clip, settings: RenderSettings) -> str:
     made_of = (ASSET_VERSION, clip.dataset, clip.log_id, block.start_s, block.ground_m, clip.content_digest)
     part = "fit" if settings.scene is SceneFrom.FIT else "asset"
     made = asdict(settings)[part] | REMOVED[part]
+    if settings.scene is SceneFrom.FIT and settings.backend is not Backend.CPU:
+        made["backend"] = settings.backend  # another fit to the last bits, so that a run on CPUs never meets it
     how = (settings.width, settings.height, sorted(settings.cameras), made)
     digest.update(json.dumps([made_of, how], sort_keys=True).encode())
     for file in (*block.images, *block.sweeps):

@@ -12,11 +12,12 @@ from factory.graph.work import Halted, Stopped, never
 from factory.stages.sensors import SensorData
 from factory.store.disk import whole_file
 from factory.wording import time_text
-from tasks.render.fit.reconstruct import advance, finish
+from tasks.render.fit.reconstruct import advance, backend_of, finish
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import prepare
 from tasks.render.fit.state import FitState
 from tasks.render.scene.asset import RenderAsset
+from tasks.render.scene.settings import Backend
 from tasks.world.agents import AgentTracks
 
 STRETCH = 500  # iterations between two saves
@@ -32,12 +33,14 @@ def fitted(
     settings: FitSettings,
     threads: int,
     stopped: Stopped = never,
+    backend: Backend = Backend.CPU,
 ) -> RenderAsset:
     """The scene of a block's sensors; what is half done lies beside `path`, where the scene will be stored.
 
     A fit that was killed or halted comes to the same bytes as one that was not. Raises Halted once it is `stopped`,
-    with all of its iterations kept, and ValueError without photos to learn from.
+    with all of its iterations kept, ValueError without photos to learn from, and BackendMissing.
     """
+    drawing = backend_of(backend, threads)
     problem, state = prepare(data.photos, data.sweeps, agents, settings, threads=threads, road=data.road)
     begun, said = path.with_suffix(BEGUN), path.with_suffix(SAID)
     state = _resumed(begun, state)
@@ -51,7 +54,7 @@ def fitted(
         said.write_text(json.dumps({"block": path.stem, "text": text}))
 
     while state.iteration < settings.iterations:
-        advance(problem, state, settings, state.iteration + STRETCH, say, threads, stopped)
+        advance(problem, state, settings, state.iteration + STRETCH, say, threads, stopped, drawing)
         arrays = state.arrays()
         with whole_file(begun, sum(array.nbytes for array in arrays.values())) as draft, draft.open("wb") as file:
             np.savez(file, **arrays)  # type: ignore[arg-type]

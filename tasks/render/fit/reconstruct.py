@@ -15,7 +15,9 @@ from tasks.render.fit.start import Problem, prepare
 from tasks.render.fit.state import BACKGROUND, FitState
 from tasks.render.scene.asset import Exposure, RenderAsset, ViewQuality, psnr
 from tasks.render.scene.sensed import Photo, Sweep
+from tasks.render.scene.settings import Backend
 from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
+from tasks.render.splatting.gsplat_backend import require
 from tasks.world.agents import AgentTracks
 from tasks.world.arrays import F32
 
@@ -77,6 +79,17 @@ def advance(
             progress(at, float(np.mean(losses)), float(np.mean(scores)))
             losses, scores = [], []
     drawing.give_back(held, state)
+
+
+def backend_of(backend: Backend, threads: int) -> FitBackend:
+    """Who draws for the fit. Raises BackendMissing where it cannot work on this machine."""
+    if backend is Backend.CPU:
+        return OnCpu(threads)
+    require()
+    from tasks.render.fit.on_torch import OnTorch  # torch is loaded only where it is asked for
+    from tasks.render.splatting.tensors import by_gsplat
+
+    return OnTorch(by_gsplat, "cuda")
 
 
 def decayed(end: float, progress: float) -> float:

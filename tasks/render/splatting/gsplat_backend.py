@@ -50,9 +50,9 @@ def arguments(scene: Gaussians, cameras: Sequence[Pinhole]) -> dict[str, Any]:
     means (N, 3), quats (N, 4), scales (N, 3), opacities (N,), colors (N, 3) or, with sh_degree, coefficients (N, K, 3),
     viewmats (C, 4, 4) camera from scene, Ks (C, 3, 3). All cameras are of one size.
     """
-    degree = sh.COUNTS.index(scene.sh_rest.shape[1])
-    colours = scene.colours
-    if degree:
+    count = scene.sh_rest.shape[1]
+    colours = np.maximum(scene.colours, 0.0)  # as the kernels do; gsplat does it for higher degrees alone
+    if count:
         base = (scene.colours - 0.5) / sh.C0  # gsplat adds the half again
         colours = np.concatenate([base[:, None], scene.sh_rest], axis=1)
     arrays = {
@@ -64,12 +64,18 @@ def arguments(scene: Gaussians, cameras: Sequence[Pinhole]) -> dict[str, Any]:
         "viewmats": np.stack([np.linalg.inv(camera.world_from_camera) for camera in cameras]),
         "Ks": np.stack([camera.intrinsics for camera in cameras]),
     }
-    return {name: np.ascontiguousarray(array, np.float32) for name, array in arrays.items()} | {
-        "width": cameras[0].width,
-        "height": cameras[0].height,
+    arrays = {name: np.ascontiguousarray(array, np.float32) for name, array in arrays.items()}
+    return arrays | plain_arguments(cameras[0].width, cameras[0].height, count)
+
+
+def plain_arguments(width: int, height: int, count: int) -> dict[str, Any]:
+    """The arguments that are no arrays; `count` of the coefficients beyond degree 0."""
+    return {
+        "width": width,
+        "height": height,
         "near_plane": NEAR_M,
         "eps2d": DILATION_PX2,
-        "sh_degree": degree or None,
+        "sh_degree": sh.COUNTS.index(count) or None,
         "render_mode": "RGB+ED",  # the last channel is the depth, a mean by weight
         "packed": True,  # memory follows what is seen, not cameras x Gaussians
     }

@@ -36,7 +36,7 @@ def test_the_tasks_of_an_attempt() -> None:
     assert (
         attempt_tasks("none", apart=False) == attempt_tasks("auto", apart=True) == (("drive",), ("render",), ("label",))
     )
-    assert [task.name for task in TASKS if task.may_draw] == ["render"]
+    assert [task.name for task in TASKS if task.may_draw] == ["reconstruct", "render"]
 
 
 def test_the_page_of_concepts_names_every_task() -> None:
@@ -193,8 +193,8 @@ def test_the_town_s_pictures_are_drawn_on_the_gpu_node_and_its_drives_made_on_th
     assert made.exit_code == COMPLETE and made.counts["rejected"] > 0
     tasks = [json.loads(line) for line in journal.read_text().splitlines()]
     places = {name: {two_nodes[node] for task, node, *_ in tasks if task == name} for name, *_ in tasks}
-    driving = ("reconstruct", "perturb", "drive", "label")  # the last though its pictures lie where they were drawn
-    assert places == {**{task: {"cpu"} for task in driving}, "render": {"gpu"}}
+    driving = ("perturb", "drive", "label")  # the last though its pictures lie where they were drawn
+    assert places == {**{task: {"cpu"} for task in driving}, "reconstruct": {"gpu"}, "render": {"gpu"}}
     drives, pictures = ([span for task, _, *span in tasks if task == name] for name in ("drive", "render"))
     assert len(pictures) == made.counts["accepted"], "only what the reward accepts is drawn"
     assert any(min(pictures)[0] < began < max(pictures)[0] for began, _ in drives)

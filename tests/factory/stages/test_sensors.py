@@ -1,6 +1,7 @@
 """Sensor files opened, broken ones named, and scenes stored."""
 
 import re
+import sys
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -20,7 +21,9 @@ from factory.stages.sensors import block_of, chosen_cameras, decode_image, encod
 from tasks.render.fit import reconstruct
 from tasks.render.fit.settings import FitSettings
 from tasks.render.scene.build import AssetSettings, psnr
+from tasks.render.scene.settings import Backend
 from tasks.render.settings import RenderSettings, SceneFrom
+from tasks.render.splatting.gsplat_backend import BackendMissing
 from tasks.world.agents import AgentTracks
 from tasks.world.camera import Camera, SensorFile
 from tasks.world.clip import CLIP_STEPS, Clip
@@ -165,6 +168,19 @@ def test_a_photo_of_another_size_makes_another_block(clip: Clip, tmp_path: Path)
     assert block_id(clip, SETTINGS) != before
     with pytest.raises(BadClip, match=re.escape(clip.images[0].uri)):
         asset_for(clip, SETTINGS, tmp_path)
+
+
+def test_a_scene_fitted_by_another_backend_is_kept_apart(
+    clip: Clip, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that is built in one go is the same with any; one that is fitted needs what its backend needs."""
+    fit = replace(SETTINGS, scene=SceneFrom.FIT)
+    on_gpu = replace(fit, backend=Backend.GSPLAT)
+    assert block_id(clip, on_gpu) != block_id(clip, fit)
+    assert block_id(clip, replace(SETTINGS, backend=Backend.GSPLAT)) == block_id(clip, SETTINGS)
+    monkeypatch.setitem(sys.modules, "gsplat", None)
+    with pytest.raises(BackendMissing, match="needs torch and gsplat"):
+        asset_for(clip, on_gpu, tmp_path)
 
 
 def test_a_scene_says_which_stretch_of_driving_it_stands_for(clip: Clip, tmp_path: Path) -> None:

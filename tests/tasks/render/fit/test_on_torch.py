@@ -1,0 +1,169 @@
+"""The fit over torch's tensors, by this package's kernels, is the fit on the CPU."""
+
+from collections.abc import Iterator
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import street
+import torch
+
+from tasks.render.fit.adam import Learned
+from tasks.render.fit.backend import Derivatives
+from tasks.render.fit.in_tensors import LearnedTensor, lay_flat, photo_loss
+from tasks.render.fit.losses import photo_loss as photo_loss_by_hand
+from tasks.render.fit.losses import target_of
+from tasks.render.fit.on_cpu import OnCpu
+from tasks.render.fit.on_torch import OnTorch
+from tasks.render.fit.reconstruct import advance, finish
+from tasks.render.fit.road import find_road
+from tasks.render.fit.road import lay_flat as lay_flat_by_hand
+from tasks.render.fit.settings import FitSettings
+from tasks.render.fit.start import Problem, prepare
+from tasks.render.fit.state import FitState
+from tasks.render.scene.sensed import Photo, Sweep
+from tasks.render.splatting.gradient import Gradients
+from tasks.render.splatting.tensors import by_kernels
+
+SETTINGS = FitSettings(
+    iterations=24,
+    start_gaussians=1500,
+    most_gaussians=2200,
+    refine_every=6,
+    refine_from=6,
+    pose_from=4,
+    stereo_photos=1,
+    sh_degree=2,
+)
+TENSORS = OnTorch(by_kernels, "cpu")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread() -> Iterator[None]:
+    """Tensors this small are no work for two."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def few() -> tuple[list[Photo], list[Sweep]]:
+    photos, sweeps = street.drive(5)
+    half = np.diag([0.5, 0.5, 1.0])
+    small = [replace(p, rgb=np.ascontiguousarray(p.rgb[::2, ::2]), intrinsics=half @ p.intrinsics) for p in photos]
+    return small, sweeps[::2]
+
+
+@pytest.fixture(scope="module")
+def prepared() -> tuple[Problem, FitState]:
+    return prepare(*few(), street.tracks(), SETTINGS, held_out=[2])
+
+
+def fresh(state: FitState) -> FitState:
+    return FitState.from_arrays(state.arrays())
+
+
+def numbers(found: Derivatives) -> dict[str, np.ndarray]:
+    gaussians = {field.name: getattr(found.gaussians, field.name) for field in fields(Gradients)}
+    whole = {field.name: getattr(found, field.name) for field in fields(Derivatives)} | gaussians
+    return {name: np.asarray(value, float) for name, value in whole.items() if name != "gaussians"}
+
+
+@pytest.mark.parametrize("weights", [{}, {"ssim_weight": 0.0, "opaque_weight": 0.0}, {"ssim_weight": 1.0}])
+def test_one_photo_says_the_same_of_all_that_is_learned(prepared: tuple[Problem, FitState], weights: dict) -> None:
+    problem, state, settings = prepared[0], fresh(prepared[1]), replace(SETTINGS, **weights)
+    rng = np.random.default_rng(0)
+    for name, size in (("exposure", 0.05), ("poses", 0.005), ("sh_rest", 0.05), ("quats", 0.2)):
+        values = state.learned[name].values
+        values += rng.normal(0.0, size, values.shape)
+    for row in range(len(problem.train)):
+        by_hand = numbers(OnCpu().derivatives(problem, state, row, settings))
+        by_torch = numbers(TENSORS.derivatives(problem, TENSORS.take(state), row, settings))
+        for name, expected in by_hand.items():
+            assert by_torch[name].shape == expected.shape, name
+            error = np.linalg.norm(by_torch[name] - expected)
+            assert error <= 1e-4 * np.linalg.norm(expected), (name, error / np.linalg.norm(expected))
+
+
+def test_the_loop_over_tensors_fits_the_same_scene(prepared: tuple[Problem, FitState]) -> None:
+    """Poses, exposures, road, a car, growth and relocation included: within 0.1 dB of a photo held out."""
+    problem, one, other = prepared[0], fresh(prepared[1]), fresh(prepared[1])
+    advance(problem, one, SETTINGS, SETTINGS.iterations)
+    advance(problem, other, SETTINGS, SETTINGS.iterations, backend=TENSORS)
+    assert len(one) == len(other) > len(prepared[1]) and other.iteration == SETTINGS.iterations
+    assert finish(problem, one).psnr_db == pytest.approx(finish(problem, other).psnr_db, abs=0.1)
+    for name in ("poses", "exposure", "sky"):
+        moved = one.learned[name].values - prepared[1].learned[name].values
+        apart = one.learned[name].values - other.learned[name].values
+        assert np.linalg.norm(apart) < 0.1 * np.linalg.norm(moved), name
+
+
+def test_a_fit_may_go_on_with_another_backend(prepared: tuple[Problem, FitState]) -> None:
+    """Half done on the CPU, stored, and handed on; what tensors take they give back."""
+    problem, state = prepared[0], fresh(prepared[1])
+    advance(problem, state, SETTINGS, 12)
+    before = {name: array.copy() for name, array in state.arrays().items()}
+    TENSORS.give_back(TENSORS.take(state), state)
+    assert before.keys() == state.arrays().keys()
+    for name, array in state.arrays().items():
+        np.testing.assert_array_equal(array, before[name], err_msg=name)
+        assert array.dtype == before[name].dtype
+    half = finish(problem, state).psnr_db
+    advance(problem, state, SETTINGS, SETTINGS.iterations, backend=TENSORS)
+    assert finish(problem, state).psnr_db > half
+
+
+def test_what_is_taken_is_a_copy(prepared: tuple[Problem, FitState]) -> None:
+    state = fresh(prepared[1])
+    TENSORS.take(state).learned["means"].values[:] = 0.0
+    assert state.learned["means"].values.any()
+
+
+def test_adam_steps_tensors_as_it_steps_arrays() -> None:
+    rng = np.random.default_rng(1)
+    start = rng.normal(size=(20, 3)).astype(np.float32)
+    array = Learned.of(start)
+    tensor = LearnedTensor(*(torch.tensor(getattr(Learned.of(start), each.name)) for each in fields(Learned)))
+    for _ in range(8):
+        rows = np.sort(rng.choice(20, 7, replace=False))
+        gradient = rng.normal(size=(7, 3)).astype(np.float32)
+        scale = rng.uniform(0.5, 2.0, 7).astype(np.float32)
+        array.step(rows, gradient, 0.1, scale)
+        tensor.step(torch.tensor(rows), torch.tensor(gradient), 0.1, torch.tensor(scale))
+    for each in fields(Learned):
+        np.testing.assert_allclose(getattr(tensor, each.name).numpy(), getattr(array, each.name), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("ssim_weight", [0.0, 0.3, 1.0])
+def test_the_loss_of_a_picture_is_the_one_written_by_hand(ssim_weight: float) -> None:
+    rng = np.random.default_rng(2)
+    photo, ignored = rng.integers(0, 256, (23, 31, 3), dtype=np.uint8), rng.random((23, 31)) < 0.2
+    picture = rng.uniform(-0.1, 1.1, (23, 31, 3)).astype(np.float32)
+    target = target_of(photo, ignored)
+    loss, gradient = photo_loss_by_hand(picture, target, ssim_weight)
+    given = torch.tensor(picture, requires_grad=True)
+    found = photo_loss(given, torch.tensor(target.rgb), torch.tensor(target.weight), ssim_weight)
+    assert found.item() == pytest.approx(loss, rel=1e-5)
+    (by_picture,) = torch.autograd.grad(found, given)
+    np.testing.assert_allclose(by_picture.numpy(), gradient, atol=1e-4 * np.abs(gradient).max())
+
+
+def test_tensors_are_laid_on_the_road_as_arrays_are() -> None:
+    """A road that rises and bends; Gaussians on it, off it, and beyond its ends."""
+    rng = np.random.default_rng(3)
+    at = rng.uniform([-10.0, -6.0], [40.0, 6.0], (20000, 2))
+    ground = np.column_stack([at, 0.05 * at[:, 0] + 0.3 * np.sin(0.1 * at[:, 0]) - 0.02 * at[:, 1]])
+    eyes = np.column_stack([np.arange(0.0, 30.0, 2.0), np.zeros(15), 0.05 * np.arange(0.0, 30.0, 2.0) + 1.6])
+    road = find_road(ground, eyes)
+    assert road is not None
+    means = rng.uniform([-30.0, -20.0, -1.0], [60.0, 20.0, 3.0], (500, 3)).astype(np.float32)
+    quats = rng.normal(size=(500, 4)).astype(np.float32)
+    log_scales = rng.normal(-4.0, 2.0, (500, 3)).astype(np.float32)
+    rows = np.arange(0, 500, 2)
+    tensors = [torch.tensor(array) for array in (means, quats, log_scales)]
+    lay_flat(*tensors, torch.tensor(rows), road)
+    before = means.copy()
+    lay_flat_by_hand(means, quats, log_scales, rows, road)
+    assert 50 < (means[rows] != before[rows]).any(axis=1).sum() < len(rows)
+    for tensor, array in zip(tensors, (means, quats, log_scales)):
+        np.testing.assert_allclose(tensor.numpy(), array, atol=2e-6)
