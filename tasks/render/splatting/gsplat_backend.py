@@ -1,14 +1,15 @@
-"""The CUDA backend: the same Gaussians through `gsplat.rasterization` (gsplat >= 1.5.3), all cameras of a size at once.
+"""The CUDA backend: the same Gaussians through `gsplat.rasterization` (gsplat 1.5.3), all cameras of a size at once.
 
 Its conventions are those of the CPU rasteriser: quaternions w first, world-to-camera matrices with z forward, the
-centre of pixel (0, 0) at (0.5, 0.5), contributions cut off at 1/255 and capped at 0.999. What differs is passed on
-(near plane, screen dilation) or below 8 bits (no more than 1e-4 of the light is dropped instead of 1e-3).
+centre of pixel (0, 0) at (0.5, 0.5), contributions cut off at 1/255 and capped at 0.999 (later versions cap at 0.99).
+What differs is passed on (near plane, screen dilation) or below 8 bits (no more than 1e-4 of the light is dropped
+instead of 1e-3). Pictures and derivatives are held against gsplat's own reference by tests.bench.peer_gsplat.
 torch and gsplat are loaded by the first call, nowhere else; gsplat compiles its CUDA sources then, once per machine.
 """
 
 import importlib
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -91,18 +92,32 @@ def view_of(colours_and_depth: F32, alpha: F32, backdrop: F32) -> View:
 def rasterize_all(scene: Gaussians, cameras: Sequence[Pinhole], backdrops: Sequence[F32]) -> list[View]:
     """What `tasks.render.scene.engine.render` draws with on CUDA: one view a camera. Raises BackendMissing."""
     torch, gsplat = require()
+
+    def draw(given: dict[str, Any]) -> tuple[F32, F32]:
+        on_device = {k: torch.from_numpy(v).cuda() if isinstance(v, np.ndarray) else v for k, v in given.items()}
+        with torch.inference_mode():
+            drawn, covered, _ = gsplat.rasterization(**on_device)
+        return drawn.cpu().numpy(), covered.cpu().numpy()
+
+    return drawn_by(draw, scene, cameras, backdrops)
+
+
+def drawn_by(
+    draw: Callable[[dict[str, Any]], tuple[F32, F32]],
+    scene: Gaussians,
+    cameras: Sequence[Pinhole],
+    backdrops: Sequence[F32],
+) -> list[View]:
+    """One view a camera, all of a size at once; `draw` takes `arguments` and gives (C, H, W, 4) and (C, H, W, 1)."""
     by_size: dict[tuple[int, int], list[int]] = defaultdict(list)
     for i, camera in enumerate(cameras):
         by_size[camera.width, camera.height].append(i)
     views: dict[int, View] = {}
     for (width, height), rows in by_size.items():
-        pictures, alphas = np.zeros((len(rows), height, width, 4)), np.zeros((len(rows), height, width, 1))
+        pictures = np.zeros((len(rows), height, width, 4), np.float32)
+        alphas = np.zeros((len(rows), height, width, 1), np.float32)
         if len(scene):
-            given = arguments(scene, [cameras[i] for i in rows])
-            on_device = {k: torch.from_numpy(v).cuda() if isinstance(v, np.ndarray) else v for k, v in given.items()}
-            with torch.inference_mode():
-                drawn, covered, _ = gsplat.rasterization(**on_device)
-            pictures, alphas = drawn.cpu().numpy(), covered.cpu().numpy()
+            pictures, alphas = draw(arguments(scene, [cameras[i] for i in rows]))
         for i, picture, alpha in zip(rows, pictures, alphas):
             views[i] = view_of(picture.astype(np.float32), alpha.astype(np.float32), backdrops[i])
     return [views[i] for i in range(len(cameras))]

@@ -16,7 +16,7 @@ NEAR_M = 0.3  # closer ones would cover the picture
 DILATION_PX2 = 0.1  # added to the screen covariance; 0.3, made for megapixels, blurs images this small (measured)
 MIN_ALPHA = 1.0 / 255.0  # a weaker contribution is not visible in 8 bits
 MAX_REACH = math.sqrt(2.0 * math.log(1.0 / MIN_ALPHA))  # standard deviations at which opacity 1 falls to MIN_ALPHA
-MAX_TANGENT_RATIO = 1.3  # the Jacobian is linearised at most this far outside the picture
+BESIDE = 0.15  # of its size beside the picture, the furthest that the Jacobian is linearised at; as in gsplat
 TILE = 16  # pixels along a tile's side; a row is one value of tasks.kernels.simd
 
 # Columns of a projected row, which fills one cache line; colours are filled in by whoever shades.
@@ -146,10 +146,10 @@ def _ellipses(block: Any, rows: Any, centre: Any, fx: Any, fy: Any, cx: Any, cy:
 def tangent_limits(fx: float, fy: float, cx: float, cy: float, width: int, height: int) -> Any:
     """The least and largest x / z, then y / z, at which the projection is linearised."""
     return (
-        fill(-MAX_TANGENT_RATIO * cx / fx),
-        fill(MAX_TANGENT_RATIO * (width - cx) / fx),
-        fill(-MAX_TANGENT_RATIO * cy / fy),
-        fill(MAX_TANGENT_RATIO * (height - cy) / fy),
+        fill(-(cx + BESIDE * width) / fx),
+        fill((width - cx + BESIDE * width) / fx),
+        fill(-(cy + BESIDE * height) / fy),
+        fill((height - cy + BESIDE * height) / fy),
     )
 
 

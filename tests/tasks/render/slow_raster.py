@@ -9,7 +9,7 @@ from torch import Tensor
 
 from tasks.render.splatting.gaussians import Gaussians, rotations_of
 from tasks.render.splatting.pixels import MAX_ALPHA
-from tasks.render.splatting.project import DILATION_PX2, MAX_TANGENT_RATIO, MIN_ALPHA, NEAR_M
+from tasks.render.splatting.project import BESIDE, DILATION_PX2, MIN_ALPHA, NEAR_M
 
 
 @dataclass
@@ -128,8 +128,8 @@ def slow_render(
     rows = rows[torch.argsort(z[rows], stable=True)]
     x, y, z, opacities = x[rows], y[rows], z[rows], opacities[rows]
 
-    tx = (x / z).clamp(-MAX_TANGENT_RATIO * cx / fx, MAX_TANGENT_RATIO * (width - cx) / fx)
-    ty = (y / z).clamp(-MAX_TANGENT_RATIO * cy / fy, MAX_TANGENT_RATIO * (height - cy) / fy)
+    tx = (x / z).clamp(-(cx + BESIDE * width) / fx, (width - cx + BESIDE * width) / fx)
+    ty = (y / z).clamp(-(cy + BESIDE * height) / fy, (height - cy + BESIDE * height) / fy)
     zero = torch.zeros_like(z)
     jacobian = torch.stack(
         [torch.stack([fx / z, zero, -fx / z * tx], 1), torch.stack([zero, fy / z, -fy / z * ty], 1)], 1

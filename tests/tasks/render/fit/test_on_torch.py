@@ -23,7 +23,8 @@ from tasks.render.fit.start import Problem, prepare
 from tasks.render.fit.state import FitState
 from tasks.render.scene.sensed import Photo, Sweep
 from tasks.render.splatting.gradient import Gradients
-from tasks.render.splatting.tensors import by_kernels
+from tasks.render.splatting.tensors import by_kernels, splatted
+from tests.bench import peer_gsplat
 
 SETTINGS = FitSettings(
     iterations=24,
@@ -45,6 +46,12 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+def through_reference() -> OnTorch:
+    """As with render.backend=gsplat, but for CUDA."""
+    pytest.importorskip("gsplat", reason="gsplat is not installed")
+    return OnTorch(lambda scene, eye: splatted(peer_gsplat.rasterization, scene, eye), "cpu")
 
 
 def few() -> tuple[list[Photo], list[Sweep]]:
@@ -85,6 +92,25 @@ def test_one_photo_says_the_same_of_all_that_is_learned(prepared: tuple[Problem,
             assert error <= 1e-4 * np.linalg.norm(expected), (name, error / np.linalg.norm(expected))
 
 
+def test_one_photo_through_gsplat_s_reference_says_the_same(prepared: tuple[Problem, FitState]) -> None:
+    """Rows, owners' frames, camera and places as gsplat hands them out; within the light that a tile drops, 1e-3.
+
+    By SSIM alone: L1 has a kink at each pixel that is right already.
+    """
+    problem, state, settings = prepared[0], fresh(prepared[1]), replace(SETTINGS, ssim_weight=1.0)
+    reference = through_reference()
+    by_hand = OnCpu().derivatives(problem, state, 1, settings)
+    by_gsplat = reference.derivatives(problem, reference.take(state), 1, settings)
+    for name in ("exposure", "camera"):
+        expected = getattr(by_hand, name)
+        assert np.linalg.norm(getattr(by_gsplat, name) - expected) <= 1e-3 * np.linalg.norm(expected), name
+    for name in ("means", "quats", "log_scales", "logits", "colours", "sh_rest", "screen"):
+        whole = [np.zeros((len(state), *getattr(by_hand.gaussians, name).shape[1:])) for _ in range(2)]
+        for found, dense in zip((by_hand, by_gsplat), whole):
+            dense[np.asarray(found.rows)] = getattr(found.gaussians, name)
+        assert np.linalg.norm(whole[1] - whole[0]) <= 1e-3 * np.linalg.norm(whole[0]), name
+
+
 def test_the_loop_over_tensors_fits_the_same_scene(prepared: tuple[Problem, FitState]) -> None:
     """Poses, exposures, road, a car, growth and relocation included: within 0.1 dB of a photo held out."""
     problem, one, other = prepared[0], fresh(prepared[1]), fresh(prepared[1])
@@ -96,6 +122,15 @@ def test_the_loop_over_tensors_fits_the_same_scene(prepared: tuple[Problem, FitS
         moved = one.learned[name].values - prepared[1].learned[name].values
         apart = one.learned[name].values - other.learned[name].values
         assert np.linalg.norm(apart) < 0.1 * np.linalg.norm(moved), name
+
+
+@pytest.mark.slow
+def test_gsplat_s_reference_fits_the_same_scene(prepared: tuple[Problem, FitState]) -> None:
+    problem, one, other = prepared[0], fresh(prepared[1]), fresh(prepared[1])
+    advance(problem, one, SETTINGS, SETTINGS.iterations)
+    advance(problem, other, SETTINGS, SETTINGS.iterations, backend=through_reference())
+    assert len(one) == len(other)
+    assert finish(problem, one).psnr_db == pytest.approx(finish(problem, other).psnr_db, abs=0.1)
 
 
 def test_a_fit_may_go_on_with_another_backend(prepared: tuple[Problem, FitState]) -> None:

@@ -2,6 +2,7 @@
 
 import sys
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,11 +11,12 @@ import street
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.engine import Backend, check, render, vehicles_at
 from tasks.render.splatting import sh
-from tasks.render.splatting.gaussians import Gaussians
-from tasks.render.splatting.gsplat_backend import BackendMissing, arguments, require, view_of
+from tasks.render.splatting.gaussians import EMPTY, Gaussians
+from tasks.render.splatting.gsplat_backend import BackendMissing, arguments, drawn_by, require, view_of
 from tasks.render.splatting.project import DILATION_PX2, NEAR_M
-from tasks.render.splatting.raster import colours_seen, splat
+from tasks.render.splatting.raster import forward
 from tasks.world.camera import Pinhole
+from tests.bench import peer_gsplat
 
 POSE = street.ego_pose(3.0, 0.4) @ street.EGO_FROM_CAMERA
 FRONT = Pinhole(street.INTRINSICS, POSE, street.WIDTH, street.HEIGHT)
@@ -89,30 +91,30 @@ def test_the_cpu_needs_nothing_and_a_machine_without_gpu_is_told_so() -> None:
         check(Backend.GSPLAT)
 
 
-def test_gsplat_s_own_reference_in_torch_projects_and_colours_as_the_cpu_does() -> None:
-    torch = pytest.importorskip("torch")
-    twin = pytest.importorskip("gsplat.cuda._torch_impl", reason="gsplat is not installed")
-    scene = cloud(400, 15)
-    given = arguments(scene, [FRONT])
-    tensors = {name: torch.from_numpy(value) for name, value in given.items() if isinstance(value, np.ndarray)}
-    covariances, _ = twin._quat_scale_to_covar_preci(tensors["quats"], tensors["scales"], compute_preci=False)
-    size = (FRONT.width, FRONT.height)
-    limits = {"eps2d": given["eps2d"], "near_plane": given["near_plane"]}
-    _, means2d, depths, conics, _ = twin._fully_fused_projection(
-        tensors["means"], covariances, tensors["viewmats"], tensors["Ks"], *size, **limits
-    )
-    splats = splat(scene, FRONT.intrinsics, POSE, *size)
-    index, projected = splats.index, splats.projected
-    inside = (projected[:, :2] > 0.0).all(axis=1) & (projected[:, :2] < size).all(axis=1)
-    index, projected = index[inside], projected[inside]
-    assert len(index) > 100
-    np.testing.assert_allclose(means2d[0, index].numpy(), projected[:, :2], atol=1e-4)
-    np.testing.assert_allclose(depths[0, index].numpy(), projected[:, 2], rtol=1e-6)
-    np.testing.assert_allclose(conics[0, index].numpy(), projected[:, 3:6], rtol=1e-4, atol=1e-6)
-    directions = tensors["means"] - torch.from_numpy(POSE[:3, 3].astype(np.float32))
-    colours = twin._spherical_harmonics(given["sh_degree"], directions, tensors["colors"]).numpy() + 0.5
-    seen = colours_seen(scene, POSE[:3, 3].copy(), np.arange(len(scene)))
-    np.testing.assert_allclose(np.maximum(colours, 0.0), seen, atol=1e-5)
+def test_gsplat_s_reference_draws_the_cpu_s_image(street_asset: RenderAsset) -> None:
+    """All cameras at once, of two sizes; vehicles, a sky, colours below zero."""
+    pytest.importorskip("gsplat", reason="gsplat is not installed")
+    import torch
+
+    def draw(given: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+        double = {k: torch.from_numpy(v).double() if isinstance(v, np.ndarray) else v for k, v in given.items()}
+        drawn, alpha, _ = peer_gsplat.rasterization(**double)
+        return drawn.numpy(), alpha.numpy()
+
+    half = np.diag([0.5, 0.5, 1.0]) @ FRONT.intrinsics
+    aside = replace(FRONT, world_from_camera=street.ego_pose(0.0, -1.0) @ street.EGO_FROM_CAMERA)
+    cameras = [FRONT, replace(FRONT, intrinsics=half, width=FRONT.width // 2, height=FRONT.height // 2), aside]
+    sky = [np.random.default_rng(1).random((c.height, c.width, 3)).astype(np.float32) for c in cameras]
+    dark = cloud(300, 0)
+    dark = replace(dark, colours=dark.colours - 0.4)
+    for scene in (street_asset.background.take(slice(0, 1500)), dark, cloud(300, 8), EMPTY):
+        for view, camera, behind in zip(drawn_by(draw, scene, cameras, sky), cameras, sky):
+            size = (camera.width, camera.height)
+            expected = forward(scene, camera.intrinsics, camera.world_from_camera, *size, behind).view
+            np.testing.assert_allclose(view.rgb, expected.rgb, atol=2e-3)  # the light that a tile drops
+            np.testing.assert_allclose(view.alpha, expected.alpha, atol=2e-3)
+            solid = expected.alpha > 0.5
+            np.testing.assert_allclose(view.depth[solid], expected.depth[solid], rtol=5e-3)
 
 
 def test_the_gpu_draws_the_cpu_s_image(street_asset: RenderAsset) -> None:

@@ -14,7 +14,7 @@ from tasks.render.splatting.gaussians import (
     rotations_of,
 )
 from tasks.render.splatting.pixels import MAX_ALPHA
-from tasks.render.splatting.project import DILATION_PX2, MAX_TANGENT_RATIO, MIN_ALPHA, NEAR_M
+from tasks.render.splatting.project import BESIDE, DILATION_PX2, MIN_ALPHA, NEAR_M
 from tasks.render.splatting.raster import forward, gather, splat
 
 INTRINSICS = np.array([[60.0, 0.0, 37.0], [0.0, 58.0, 22.0], [0.0, 0.0, 1.0]])
@@ -58,8 +58,8 @@ def slow_rasterize(
         x, y, z = means[i]
         if z < NEAR_M:
             continue
-        tx = np.clip(x / z, -MAX_TANGENT_RATIO * cx / fx, MAX_TANGENT_RATIO * (WIDTH - cx) / fx)
-        ty = np.clip(y / z, -MAX_TANGENT_RATIO * cy / fy, MAX_TANGENT_RATIO * (HEIGHT - cy) / fy)
+        tx = np.clip(x / z, -(cx + BESIDE * WIDTH) / fx, (WIDTH - cx + BESIDE * WIDTH) / fx)
+        ty = np.clip(y / z, -(cy + BESIDE * HEIGHT) / fy, (HEIGHT - cy + BESIDE * HEIGHT) / fy)
         jacobian = np.array([[fx / z, 0.0, -fx / z * tx], [0.0, fy / z, -fy / z * ty]])
         conic = np.linalg.inv(jacobian @ covariances[i] @ jacobian.T + DILATION_PX2 * np.eye(2))
         du, dv = u - (fx * x / z + cx), v - (fy * y / z + cy)
