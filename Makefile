@@ -10,7 +10,7 @@ DEMO   := runs/demo
 TORCH       ?= torch==2.13.0$(if $(filter Linux,$(shell uname -s)),+cpu)
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 
-.PHONY: install demo test unit lint format docs mutants bench study clean
+.PHONY: install demo test unit lint format docs mutants bench gpu-check study clean
 
 install: $(VENV)/.installed
 
@@ -65,6 +65,15 @@ mutants: install
 # planners' device=, render's scene file. PEER=<...> of reward, traffic and render: what runs beside; see there.
 bench: install
 	$(if $(filter reward loader memory,$(NAME)),OMP_NUM_THREADS=1) $(PY) -m tests.bench$(if $(NAME),.bench_$(NAME)) $(ARGS)
+
+# Where there is a GPU: whether render.backend=gsplat agrees with the CPU, and how fast it is beside plain gsplat. PyTorch
+# with CUDA comes by TORCH=torch==2.13.0; gsplat compiles its kernels the first time (needs nvcc, some minutes).
+$(VENV)/.gpu: $(VENV)/.installed
+	$(PY) -m pip install -q -c constraints.txt -e ".[gpu]"
+	touch $@
+
+gpu-check: $(VENV)/.gpu
+	$(PY) -m tests.bench.gpu_check $(ARGS)
 
 # The co-training study of docs/study.md: its data, then trainings, scores and tables. MINUTES=25: a part of either.
 # Both go on where they stopped. On real logs, without images: python -m planners study_logs shared=../shared

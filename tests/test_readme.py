@@ -208,6 +208,7 @@ def test_every_command_is_one_its_program_takes(
             parse(AnalysisSettings, arguments)
         case ["python", "-m", "tests.bench.bench_kitti", _, *arguments]:
             known = {field.name for field in fields(FitSettings)} | {"out", "validate", "threads", "first", "last"}
+            known |= {"by"}
             assert set(pairs(given(arguments))) <= known
         case ["python", "-m", "examples.csv_logs", folder]:
             write_log(Path(folder) / "street")  # what it does, see tests/test_extending.py

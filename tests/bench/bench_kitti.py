@@ -4,7 +4,8 @@ Drive 2011_09_26_0001. Held out: frames with index mod 8 = 4; trained on image_0
 frames are not read at all and index mod 8 = 0 is held out instead: what knobs are to be tuned on. image_03, half a
 metre to the side, is never trained on; one affine colour and one rigid correction for the whole drive are fitted to its
 photos of training frames. Settings are those of `FitSettings`, for instance iterations=2000; `first=28 last=60` takes
-these frames of the drive only, and a few minutes.
+these frames of the drive only, and a few minutes. `by=gsplat` fits on a GPU, `by=tensors` by the same loop over tensors
+through the CPU's kernels.
 """
 
 import sys
@@ -20,13 +21,16 @@ from factory.readers.kitti import read_drive, steadied
 from factory.stages.scene_file import write_scene
 from tasks.render.fit.corrections import affine_between, corrected, exposed
 from tasks.render.fit.losses import ssim, target_of
-from tasks.render.fit.reconstruct import advance, corrections_at, finish, picture_of
+from tasks.render.fit.on_torch import OnTorch
+from tasks.render.fit.reconstruct import advance, backend_of, corrections_at, finish, picture_of
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import Problem, prepare
 from tasks.render.fit.state import FitState
 from tasks.render.scene.asset import psnr
 from tasks.render.scene.engine import render
 from tasks.render.scene.sensed import Photo, shifted
+from tasks.render.scene.settings import Backend
+from tasks.render.splatting.tensors import by_kernels
 from tasks.world.camera import Pinhole
 
 F32, F64 = NDArray[np.float32], NDArray[np.float64]
@@ -112,9 +116,12 @@ def main() -> None:
     """Trains, prints a table, writes pictures, the state and the scene."""
     root, options = Path(sys.argv[1]), dict(option.split("=", 1) for option in sys.argv[2:])
     out = Path(options.pop("out", "out/bench_kitti"))
+    by = options.pop("by", "cpu")
     validate, threads = options.pop("validate", "0") == "1", int(options.pop("threads", "2"))
     kinds = {field.name: type(getattr(FitSettings(), field.name)) for field in fields(FitSettings)}
     out.mkdir(parents=True, exist_ok=True)
+
+    backend = OnTorch(by_kernels, "cpu") if by == "tensors" else backend_of(Backend(by), threads)
 
     drive = steadied(read_drive(root))
     span = int(options.pop("first", "0")), int(options.pop("last", len(drive.times_s) - 1)) + 1
@@ -135,7 +142,7 @@ def main() -> None:
     told: list[float] = []
     for until in [at for at in SHOWN_AT if at < settings.iterations] + [settings.iterations]:
         started = time.perf_counter()
-        advance(problem, state, settings, until, lambda at, loss, score: told.append(score), threads)
+        advance(problem, state, settings, until, lambda at, loss, score: told.append(score), threads, backend=backend)
         seconds += time.perf_counter() - started
         np.savez(out / "state.npz", **state.arrays())
         mean = np.mean(told[-5:]) if told else np.nan  # of the last 500 iterations

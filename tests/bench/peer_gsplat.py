@@ -170,21 +170,21 @@ def pose() -> NDArray[np.float64]:
     return out
 
 
-def answers(draw: Draw, scene: Gaussians, intrinsics: Any, dtype: torch.dtype) -> Arrays:
+def answers(draw: Draw, scene: Gaussians, intrinsics: Any, dtype: torch.dtype, device: str = "cpu") -> Arrays:
     """Pictures, and the derivatives of one scalar of them by all that is learned, by the camera and by the places."""
     logits = torch.logit(torch.tensor(scene.opacities, dtype=torch.float64))
     arrays = (scene.means, scene.quats, scene.log_scales, logits, scene.colours, scene.sh_rest)
-    leaves = [torch.as_tensor(array).to(dtype).clone().requires_grad_() for array in arrays]
-    motion = torch.zeros(6, dtype=dtype, requires_grad=True)
+    leaves = [torch.as_tensor(array).to(device, dtype).clone().requires_grad_() for array in arrays]
+    motion = torch.zeros(6, dtype=dtype, device=device, requires_grad=True)
     seen = draw(SceneTensors(*leaves), Eye(np.array(intrinsics), pose(), WIDTH, HEIGHT, motion))
     v, u = np.mgrid[:HEIGHT, :WIDTH] / 10.0  # a smooth upstream: derivatives are not of single pixels
     ups = [np.sin(u + k) * np.cos(v - 2 * k) for k in range(5)]
     pictures = [*seen.rgb.unbind(-1), seen.depth * (seen.alpha.detach() > 0.05), seen.alpha]
-    total = sum((torch.as_tensor(up).to(dtype) * picture).sum() for up, picture in zip(ups, pictures))
+    total = sum((torch.as_tensor(up).to(device, dtype) * picture).sum() for up, picture in zip(ups, pictures))
     by = torch.autograd.grad(total, [*leaves, motion, seen.screen], materialize_grads=True)
     out = {"rgb": seen.rgb, "depth": seen.depth, "alpha": seen.alpha, "index": seen.index}
     out |= dict(zip((*(f"d {name}" for name in LEARNED), "d camera", "d screen"), by))
-    return {name: tensor.detach().numpy() for name, tensor in out.items()}
+    return {name: tensor.detach().cpu().numpy() for name, tensor in out.items()}
 
 
 def of_gsplat(scene: Gaussians, intrinsics: Any) -> Arrays:

@@ -2,6 +2,7 @@
 it names, with torch's own derivatives."""
 
 import math
+from typing import Any
 
 import cv2
 import numpy as np
@@ -53,15 +54,27 @@ def photo_loss(rgb: Tensor, photo: Tensor, weight: Tensor, ssim_weight: float) -
 
 
 def _similarity(x: Tensor, y: Tensor) -> Tensor:
-    """(H, W, 3) SSIM of each pixel and channel."""
-    mean_x, mean_y = _blur(x), _blur(y)
-    cross = _blur(x * y) - mean_x * mean_y
-    spread = _blur(x * x) - mean_x**2 + _blur(y * y) - mean_y**2
+    """(H, W, 3) SSIM of each pixel and channel; `y` is not derived by."""
+    mean_x, square_x, product = Blurred.apply(torch.cat([x, x * x, x * y], dim=-1)).split(3, dim=-1)
+    mean_y, square_y = _blur(torch.cat([y, y * y], dim=-1)).split(3, dim=-1)
+    cross, spread = product - mean_x * mean_y, square_x - mean_x**2 + square_y - mean_y**2
     return (2.0 * mean_x * mean_y + C1) * (2.0 * cross + C2) / ((mean_x**2 + mean_y**2 + C1) * (spread + C2))
 
 
+class Blurred(torch.autograd.Function):
+    """`_blur`, which is its own adjoint: torch would derive the convolution at a multiple of its cost."""
+
+    @staticmethod
+    def forward(ctx: Any, image: Tensor) -> Tensor:
+        return _blur(image)
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor) -> Tensor:
+        return _blur(upstream[0])
+
+
 def _blur(image: Tensor) -> Tensor:
-    """`losses._blur`, (H, W, 3)."""
+    """`losses._blur`, (H, W, C)."""
     taps = torch.from_numpy(cv2.getGaussianKernel(WINDOW, SIGMA, cv2.CV_32F)[:, 0]).to(image)
     across = conv2d(image.permute(2, 0, 1)[:, None], taps.view(1, 1, 1, -1), padding=(0, WINDOW // 2))
     return conv2d(across, taps.view(1, 1, -1, 1), padding=(WINDOW // 2, 0))[:, 0].permute(1, 2, 0)

@@ -1,0 +1,279 @@
+"""What a GPU makes of render.backend=gsplat, in five minutes and without data: `make gpu-check`, or
+
+    python -m tests.bench.gpu_check [gaussians=100000] [iterations=200] [width=480] [height=270] [threads=] [on=cuda]
+
+It prints whether pictures, derivatives and a fit agree with the CPU's, then iterations and views per second and memory,
+each beside plain gsplat on the same scene. Exit code 0: all agree; 1: something does not; 2: there is no CUDA device,
+or no gsplat. `on=cpu` runs all of it through this package's kernels, to try the script itself.
+"""
+
+import os
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import count
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from tasks.render.fit.adam import Learned
+from tasks.render.fit.backend import FitBackend
+from tasks.render.fit.corrections import EXPOSURE_SIZE, POSE_SIZE
+from tasks.render.fit.in_tensors import photo_loss
+from tasks.render.fit.losses import target_of
+from tasks.render.fit.on_cpu import OnCpu
+from tasks.render.fit.on_torch import OnTorch
+from tasks.render.fit.reconstruct import advance, finish
+from tasks.render.fit.settings import FitSettings
+from tasks.render.fit.start import Problem, Shot
+from tasks.render.fit.state import BACKGROUND, FitState, logits_of
+from tasks.render.scene.asset import psnr
+from tasks.render.scene.sensed import Photo, Tracks
+from tasks.render.scene.sky import COLUMNS, ROWS
+from tasks.render.splatting.gaussians import Gaussians
+from tasks.render.splatting.gsplat_backend import BackendMissing, rasterize_all, require
+from tasks.render.splatting.raster import View, forward
+from tasks.render.splatting.tensors import Draw, Eye, SceneTensors, by_gsplat, by_kernels, learned_arguments
+from tasks.world.camera import Pinhole
+from tests.bench.bench_render import cloud
+from tests.bench.peer_gsplat import SCENES, answers, apart, of_kernels
+
+CLOSE = 1e-3  # of an array's length: CUDA's exponential is good to 2e-6, and sums come in any order
+BEHIND_A_WALL = 5e-3  # light that a tile drops and gsplat does not
+ALIKE_DB = 55.0  # of two pictures of a scene
+APART_DB = 0.1  # of two fits, on photos held out
+PHOTOS, HELD_OUT = 24, (5, 17)
+BEFORE_TIMED = 10  # iterations
+LESS = "its defaults, no sky, exposure, poses or density, torch's Adam"
+CALLS = 4  # between two waits for the device
+SKY = 0.6
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where all of it runs."""
+
+    name: str
+    device: str
+    draw: Draw
+    plain: Callable[[SceneTensors, Eye], Tensor]  # rgb (H, W, 3), by nothing of ours
+
+    def done(self) -> None:
+        """Waits for what was asked of the device."""
+        if self.device == "cuda":
+            torch.cuda.synchronize()
+
+    def timed(self, call: Callable[[], object], least_s: float = 2.0) -> float:
+        """Calls per second, after one that warms up."""
+        call()
+        self.done()
+        began, n = time.perf_counter(), 0
+        while time.perf_counter() - began < least_s:
+            for _ in range(CALLS):
+                call()
+            self.done()
+            n += CALLS
+        return n / (time.perf_counter() - began)
+
+    def peak_mb(self) -> str:
+        """Of the device's memory since the last call."""
+        if self.device != "cuda":
+            return ""
+        peak = torch.cuda.max_memory_allocated() / 2**20
+        torch.cuda.reset_peak_memory_stats()
+        return f"{peak:.0f}"
+
+
+def on_cuda(rasterization: Callable[..., Any]) -> Place:
+    """gsplat as this project calls it, and with its own defaults."""
+
+    def plain(scene: SceneTensors, eye: Eye) -> Tensor:
+        given = learned_arguments(scene, eye) | {"packed": False, "render_mode": "RGB"}
+        rgb: Tensor = rasterization(**given)[0][0]
+        return rgb
+
+    return Place("render.backend=gsplat", "cuda", by_gsplat, plain)
+
+
+ON_CPU = Place("tensors through the kernels", "cpu", by_kernels, lambda scene, eye: by_kernels(scene, eye).rgb)
+
+
+def parity(place: Place) -> bool:
+    """Prints by how much pictures and derivatives differ; whether by no more than they may."""
+    print(f"\nLargest difference from the CPU's kernels, as a share of an array's length (at most {CLOSE:g}):\n")
+    print("| scene | pictures | derivatives | |\n|---|---|---|---|")
+    well = True
+    for name, (scene, intrinsics) in SCENES.items():
+        ours = of_kernels(scene, intrinsics)
+        found = apart(ours, answers(place.draw, scene, intrinsics, torch.float32, place.device))
+        most = [max(v for what, v in found.items() if what.startswith("d ") is by) for by in (False, True)]
+        close = max(most) < (BEHIND_A_WALL if "wall" in name else CLOSE)
+        well &= close
+        print(f"| {name} | {most[0]:.1e} | {most[1]:.1e} | {'well' if close else 'NOT WELL'} |", flush=True)
+    return well
+
+
+def problem_of(n: int, width: int, height: int, threads: int) -> tuple[Problem, FitState]:
+    """Photos of a seeded cloud of n Gaussians from a short drive, and a start that has been shaken; no road, nobody."""
+    truth, rng = cloud(n), np.random.default_rng(1)
+    k = np.array([[0.6 * width, 0.0, width / 2], [0.0, 0.6 * width, height / 2], [0.0, 0.0, 1.0]])
+    shots = []
+    for i in range(PHOTOS):
+        pose = np.eye(4)
+        pose[:3, 3] = rng.uniform(-0.5, 0.5, 3)
+        picture = forward(truth, k, pose, width, height, np.full(3, SKY, np.float32), threads).view.rgb
+        rgb = np.rint(255.0 * np.clip(picture, 0.0, 1.0)).astype(np.uint8)
+        photo = Photo("front", 0.1 * i, rgb, k, pose)
+        shots.append(Shot(photo, target_of(rgb), np.zeros((height, width), bool)))
+    held_out = tuple(shots[i] for i in HELD_OUT)
+    train = tuple(shot for i, shot in enumerate(shots) if i not in HELD_OUT)
+    return Problem(np.zeros(3), train, held_out, Tracks(None, np.zeros(3)), None), shaken(truth, len(train))
+
+
+def shaken(truth: Gaussians, n_photos: int) -> FitState:
+    """A state near the truth, grey."""
+    rng, n = np.random.default_rng(2), len(truth)
+    sizes = np.exp(truth.log_scales)
+    learned = {
+        "means": truth.means + rng.normal(size=(n, 3)) * sizes,
+        "quats": truth.quats,
+        "log_scales": truth.log_scales + rng.normal(0.0, 0.2, (n, 3)),
+        "logits": logits_of(np.full((n, 1), 0.5)),
+        "colours": np.full((n, 3), 0.5),
+        "sh_rest": np.zeros((n, 0)),
+        "sky": np.full((ROWS * COLUMNS, 3), 0.5),
+        "exposure": np.zeros((n_photos, EXPOSURE_SIZE)),
+        "poses": np.zeros((n_photos, POSE_SIZE)),
+    }
+    nothing, far = np.zeros(n, np.float32), np.full(n, np.inf, np.float32)
+    owner = np.full(n, BACKGROUND, np.int32)
+    arrays = {name: Learned.of(values) for name, values in learned.items()}
+    return FitState(0, arrays, owner, np.zeros(n, bool), far, nothing)
+
+
+def fits(place: Place, problem: Problem, start: FitState, settings: FitSettings, threads: int) -> bool:
+    """The same fit on the CPU and there; whether both come out alike."""
+    print(f"\nThe same {settings.iterations} iterations, density control every {settings.refine_every} included:\n")
+    print("| fit by | iterations/s | held out [dB] | Gaussians | device memory [MB] |\n|---|---|---|---|---|")
+    scores = []
+    backends: tuple[tuple[str, FitBackend], ...] = (
+        (f"CPU, {threads} threads", OnCpu(threads)),
+        (place.name, OnTorch(place.draw, place.device)),
+    )
+    for name, backend in backends:
+        state = FitState.from_arrays(start.arrays())
+        advance(problem, state, settings, BEFORE_TIMED, backend=backend)
+        place.peak_mb()
+        began = time.perf_counter()
+        advance(problem, state, settings, settings.iterations, backend=backend)
+        place.done()
+        per_s = (settings.iterations - BEFORE_TIMED) / (time.perf_counter() - began)
+        scores.append(finish(problem, state, threads).psnr_db)
+        print(f"| {name} | {per_s:.1f} | {scores[-1]:.2f} | {len(state):,} | {place.peak_mb()} |", flush=True)
+    per_s = plain(place, problem, start, settings)
+    print(f"| plain gsplat: {LESS} | {per_s:.1f} | | {len(start):,} | {place.peak_mb()} |", flush=True)
+    return abs(scores[0] - scores[1]) <= APART_DB
+
+
+def plain(place: Place, problem: Problem, start: FitState, settings: FitSettings) -> float:
+    """Iterations per second of the shortest loop that fits the same photos by the same loss."""
+    names = ("means", "quats", "log_scales", "logits", "colours")
+    leaves = [torch.tensor(start.learned[name].values, device=place.device, requires_grad=True) for name in names]
+    adam = torch.optim.Adam([{"params": [leaf], "lr": 1e-3} for leaf in leaves])
+    nothing = torch.zeros(len(start), 0, 3, device=place.device)
+    motion = torch.zeros(6, device=place.device)
+    photos = [torch.tensor(shot.target.rgb, device=place.device) for shot in problem.train]
+    everywhere = torch.ones(problem.train[0].photo.rgb.shape[:2], device=place.device)
+    turn = count()
+
+    def iterate() -> None:
+        i = next(turn) % len(photos)
+        shot, (means, quats, log_scales, logits, colours) = problem.train[i].photo, leaves
+        scene = SceneTensors(means, quats, log_scales, logits[:, 0], colours, nothing)
+        height, width = shot.rgb.shape[:2]
+        rgb = place.plain(scene, Eye(shot.intrinsics, shot.world_from_camera, width, height, motion))
+        loss = photo_loss(rgb, photos[i], everywhere, settings.ssim_weight)
+        adam.zero_grad()
+        loss.backward()
+        adam.step()
+
+    return place.timed(iterate, 5.0)
+
+
+def views(place: Place, n: int, sizes: Sequence[tuple[int, int]], threads: int) -> bool:
+    """Pictures per second of one scene: by the engine, scene and pictures travelling, and by gsplat alone."""
+    print("\nDrawing a scene, all cameras of an instant at once; the first picture against the CPU's:\n")
+    print("| size | cameras | PSNR [dB] | CPU views/s | engine views/s | plain gsplat views/s | device memory [MB] |")
+    print("|---|---|---|---|---|---|---|")
+    scene, well = cloud(n), True
+    leaves = [torch.tensor(a, device=place.device) for a in (scene.means, scene.quats, scene.log_scales)]
+    logits = torch.logit(torch.tensor(scene.opacities, device=place.device))
+    others = (torch.tensor(scene.colours, device=place.device), torch.zeros(n, 0, 3, device=place.device))
+    on_device, still = SceneTensors(*leaves, logits, *others), torch.zeros(6, device=place.device)
+    for width, height in sizes:
+        k = np.array([[0.6 * width, 0.0, width / 2], [0.0, 0.6 * width, height / 2], [0.0, 0.0, 1.0]])
+        behind = np.full((height, width, 3), SKY, np.float32)
+        draw = partial(forward, scene, k, np.eye(4), width, height, behind, threads)
+        on_cpu, expected = place.timed(draw), draw().view.rgb
+        for many in (1, 8):
+            cameras = [Pinhole(k, _shifted(0.1 * i), width, height) for i in range(many)]
+            engine = partial(rasterize_all if place.device == "cuda" else _on_cpu, scene, cameras, [behind] * many)
+            alone = partial(
+                _alone, place, on_device, [Eye(k, c.world_from_camera, width, height, still) for c in cameras]
+            )
+            score = psnr(engine()[0].rgb, expected)
+            well &= score > ALIKE_DB
+            place.peak_mb()
+            rates = f"{on_cpu:.1f} | {many * place.timed(engine):.1f} | {many * place.timed(alone):.1f}"
+            print(f"| {width}x{height} | {many} | {score:.1f} | {rates} | {place.peak_mb()} |", flush=True)
+    return well
+
+
+def _alone(place: Place, scene: SceneTensors, eyes: Sequence[Eye]) -> None:
+    with torch.inference_mode():
+        for eye in eyes:
+            place.plain(scene, eye)
+
+
+def _on_cpu(scene: Gaussians, cameras: Sequence[Pinhole], behind: Sequence[NDArray[np.float32]]) -> list[View]:
+    return [
+        forward(scene, c.intrinsics, c.world_from_camera, c.width, c.height, b).view for c, b in zip(cameras, behind)
+    ]
+
+
+def _shifted(x: float) -> NDArray[np.float64]:
+    pose = np.eye(4)
+    pose[0, 3] = x
+    return pose
+
+
+def main(options: dict[str, str]) -> int:
+    """The exit code."""
+    place, threads = ON_CPU, int(options.get("threads", os.cpu_count() or 1))
+    n, iterations = int(options.get("gaussians", "100000")), int(options.get("iterations", "200"))
+    width, height = int(options.get("width", "480")), int(options.get("height", "270"))
+    if options.get("on", "cuda") == "cuda":
+        try:
+            _, gsplat = require()
+        except BackendMissing as error:
+            print(error, file=sys.stderr)
+            return 2
+        place, card = on_cuda(gsplat.rasterization), torch.cuda.get_device_properties(0)
+        versions = f"torch {torch.__version__}, gsplat {gsplat.__version__}"
+        print(f"{card.name}, {card.total_memory / 2**30:.0f} GB; {versions}")
+    began = time.perf_counter()
+    settings = FitSettings(iterations=iterations, most_gaussians=int(1.2 * n), refine_every=50, refine_from=50)
+    well = parity(place)
+    well &= fits(place, *problem_of(n, width, height, threads), settings, threads)
+    well &= views(place, n, ((width, height), (4 * width, 4 * height)), threads)
+    print(f"\n{'all agree' if well else 'NOT ALL AGREE'}; {time.perf_counter() - began:.0f} s")
+    return 0 if well else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(dict(option.split("=", 1) for option in sys.argv[1:])))

@@ -1,0 +1,27 @@
+"""`make gpu-check`: what it says where there is no GPU, and that its tables come out."""
+
+import sys
+
+import pytest
+
+from tests.bench.gpu_check import main
+
+
+def test_without_gsplat_it_says_so_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "gsplat", None)
+    assert main({}) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.count("\n") == 1 and "needs torch and gsplat" in err
+
+
+@pytest.mark.slow
+def test_through_the_kernels_all_agrees(capsys: pytest.CaptureFixture[str]) -> None:
+    """A small one: seven scenes, two fits and the plain one, pictures of two sizes."""
+    options = {"on": "cpu", "gaussians": "400", "iterations": "14", "width": "64", "height": "36", "threads": "1"}
+    assert main(options) == 0
+    lines = capsys.readouterr().out.splitlines()
+    rows = [line for line in lines if line.startswith("| ") and "---" not in line]
+    assert len(rows) == (1 + 7) + (1 + 3) + (1 + 4) and sum(line.endswith("| well |") for line in rows) == 7
+    assert lines[-1].startswith("all agree")
