@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tasks.render.fit.backdrop import SkyCells, backdrop, backdrop_gradient, sky_cells
+from tasks.render.fit.backdrop import backdrop_gradient
 from tasks.render.fit.backend import Derivatives
 from tasks.render.fit.composition import OwnedGaussians, parts_of
 from tasks.render.fit.corrections import corrected, exposed, exposed_gradient
@@ -16,6 +16,7 @@ from tasks.render.fit.start import Problem
 from tasks.render.fit.state import FitState
 from tasks.render.scene.asset import psnr
 from tasks.render.scene.sensed import Photo
+from tasks.render.scene.sky_lookup import SkyCells, backdrop, sky_cells
 from tasks.render.splatting.gaussians import Gaussians, concatenate, moved
 from tasks.render.splatting.gradient import Gradients, backward, unmoved
 from tasks.render.splatting.project import DEPTH

@@ -59,7 +59,7 @@ def render(
     """
     scene = scene_at(asset, vehicles.track_ids, vehicles.kinds, vehicles.boxes)
     local = [replace(camera, world_from_camera=shifted(camera.world_from_camera, -asset.origin)) for camera in cameras]
-    backdrops = [asset.sky.seen_by(c.intrinsics, c.world_from_camera, c.width, c.height) for c in local]
+    backdrops = [asset.sky.seen_by(c.intrinsics, c.world_from_camera, c.width, c.height, threads) for c in local]
     views = RASTERISERS[backend](scene, local, backdrops, threads)
     return [replace(view, rgb=np.clip(view.rgb, 0.0, 1.0)) for view in views]
 

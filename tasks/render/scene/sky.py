@@ -6,9 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
+from tasks.render.scene.sky_lookup import COLUMNS, ROWS, backdrop, sky_cells
 from tasks.world.arrays import F32, Array, Bools
-
-ROWS, COLUMNS = 256, 1024  # elevation +90 deg .. -90 deg, azimuth -180 deg .. 180 deg
 
 SKY_WEIGHT = 1.0e4  # against one pixel of something else in the same direction
 
@@ -20,17 +19,11 @@ class SkyMap:
 
     rgb: F32  # (ROWS, COLUMNS, 3) in [0, 1], world directions
 
-    def seen_by(self, intrinsics: Array, world_from_camera: Array, width: int, height: int) -> F32:
+    def seen_by(self, intrinsics: Array, world_from_camera: Array, width: int, height: int, threads: int = 1) -> F32:
         """The backdrop (H, W, 3) of a camera."""
-        rows, columns = _cells(directions(intrinsics, world_from_camera, width, height))
-        y0 = np.clip(np.floor(rows).astype(np.intp), 0, ROWS - 2)
-        x0 = np.floor(columns).astype(np.intp)
-        fy = np.clip(rows - y0, 0.0, 1.0)[..., None]
-        fx = (columns - x0)[..., None]
-        left, right = x0 % COLUMNS, (x0 + 1) % COLUMNS
-        top = self.rgb[y0, left] * (1 - fx) + self.rgb[y0, right] * fx
-        bottom = self.rgb[y0 + 1, left] * (1 - fx) + self.rgb[y0 + 1, right] * fx
-        return np.asarray(top * (1 - fy) + bottom * fy, np.float32)
+        where = sky_cells(intrinsics, world_from_camera, width, height, threads)
+        cells = np.require(self.rgb, np.float32, ["C", "W"])  # kernels compile once more for read-only arrays
+        return backdrop(cells.reshape(-1, 3), where, threads)
 
 
 def directions(intrinsics: Array, world_from_camera: Array, width: int, height: int) -> Array:
