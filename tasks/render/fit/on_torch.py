@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -96,7 +95,8 @@ class OnTorch:
         asked = [*leaves, exposure, eye.motion, seen.screen]
         by = torch.autograd.grad(loss, asked, materialize_grads=True)
         means, quats, log_scales, logits, colours, sh_rest, sky, d_exposure, d_camera, screen = by
-        rows = torch.from_numpy(np.concatenate([part.rows for part in parts])).to(self.device)[seen.index]
+        spans = [torch.arange(span.start, span.stop, device=self.device) for span in map(_span, parts)]
+        rows = torch.cat(spans)[seen.index]
         shapes = {"means": means, "quats": quats, "log_scales": log_scales, "logits": logits[:, 0], "colours": colours}
         back: dict[str, Any] = {name: tensor[rows] for name, tensor in shapes.items()}
         back |= {"index": rows, "sh_rest": sh_rest[rows].view(len(rows), -1, 3), "screen": screen}
@@ -116,7 +116,11 @@ def _composed(leaves: Sequence[Tensor], parts: Sequence[OwnedGaussians]) -> Scen
     every = SceneTensors(means, quats, log_scales, logits[:, 0], colours, sh_rest.view(len(means), -1, 3))
     scenes = []
     for part in parts:
-        span = slice(int(part.rows[0]), int(part.rows[-1]) + 1) if len(part.rows) else slice(0)
-        mine = SceneTensors(*(tensor[span] for tensor in every.parts()))
+        mine = SceneTensors(*(tensor[_span(part)] for tensor in every.parts()))
         scenes.append(mine if part.scene_from_owner is None else moved(mine, part.scene_from_owner))
     return SceneTensors(*(torch.cat(tensors) for tensors in zip(*(scene.parts() for scene in scenes))))
+
+
+def _span(part: OwnedGaussians) -> slice:
+    """Its rows of the state."""
+    return slice(int(part.rows[0]), int(part.rows[-1]) + 1) if len(part.rows) else slice(0, 0)
