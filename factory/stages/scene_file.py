@@ -27,11 +27,12 @@ from safetensors.numpy import save
 
 from factory.store.disk import whole_file
 from factory.store.identity import canonical_json
-from tasks.render.scene.asset import BlockRange, Exposure, RenderAsset, ViewQuality
+from tasks.render.scene.asset import BlockRange, ClassQuality, Exposure, RenderAsset, ViewQuality
 from tasks.render.scene.sky import SkyMap
 from tasks.render.splatting.gaussians import Gaussians
 
 FORMAT, VERSION = "driving-data-factory scene", 1
+MEASURES = ("psnr_db", "ssim", "away_m")  # of views and their classes: NaN or infinite, maybe
 KEY = "scene"  # one entry: safetensors writes several in no fixed order
 SUFFIX = ".safetensors"
 Tensors = Mapping[str, NDArray[Any]]
@@ -112,9 +113,7 @@ def described_by(asset: RenderAsset) -> dict[str, Any]:
         "nodes": list(asset.nodes),
         "psnr_db": _number(asset.psnr_db),
         "n_held_out": asset.n_held_out,
-        "views": [
-            asdict(view) | {"psnr_db": _number(view.psnr_db), "ssim": _number(view.ssim)} for view in asset.views
-        ],
+        "views": [_plain(asdict(view)) for view in asset.views],
         "exposures": [[exposure.camera, exposure.time_s] for exposure in asset.exposures],
         "block": None if block is None else asdict(block) | {"low": block.low.tolist(), "high": block.high.tolist()},
     }
@@ -126,7 +125,6 @@ def scene_of(tensors: Tensors, described: Mapping[str, Any], digest: str) -> Ren
     def part(name: str) -> Gaussians:
         return Gaussians(**{field.name: tensors[f"{name}.{field.name}"] for field in fields(Gaussians)})
 
-    views = [view | {name: _nan(view[name]) for name in ("psnr_db", "ssim")} for view in described["views"]]
     block = described["block"]
     if block is not None:
         block = BlockRange(**block | {side: np.array(block[side], np.float64) for side in ("low", "high")})
@@ -138,7 +136,7 @@ def scene_of(tensors: Tensors, described: Mapping[str, Any], digest: str) -> Ren
         psnr_db=_nan(described["psnr_db"]),
         n_held_out=described["n_held_out"],
         digest=digest,
-        views=tuple(ViewQuality(**view) for view in views),
+        views=tuple(_view(view) for view in described["views"]),
         exposures=tuple(
             Exposure(camera, time_s, tensors["exposures"][i])
             for i, (camera, time_s) in enumerate(described["exposures"])
@@ -154,6 +152,23 @@ def digest_of(tensors: Tensors, described: Mapping[str, Any]) -> str:
         digest.update(f"\x1f{name}\x1f{array.dtype.str}\x1f{array.shape}\x1f".encode())
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()[:16]
+
+
+def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
+    """A view's fields as JSON has them, those of its classes as well."""
+    numbers = {name: _number(value) for name, value in values.items() if isinstance(value, float)}
+    parts = {name: [_plain(part) for part in value] for name, value in values.items() if isinstance(value, tuple)}
+    return dict(values) | numbers | parts
+
+
+def _view(plain: Mapping[str, Any]) -> ViewQuality:
+    """The opposite of `_plain` for a view; older files have fewer measures."""
+    classes = tuple(ClassQuality(**_measures(part)) for part in plain.get("classes", ()))
+    return ViewQuality(**_measures(plain) | {"classes": classes})
+
+
+def _measures(plain: Mapping[str, Any]) -> dict[str, Any]:
+    return dict(plain) | {name: _nan(plain[name]) for name in MEASURES if name in plain}
 
 
 def _number(value: float) -> float | str | None:

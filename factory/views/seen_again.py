@@ -221,9 +221,9 @@ def drawn(
         )
         for camera in cameras
     ]
-    return [
-        np.rint(view.rgb * 255.0).astype(np.uint8) for view in render(asset, eyes, there, threads=os.cpu_count() or 1)
-    ]
+    affines = [asset.affine_of(camera["name"]) for camera in cameras]
+    views = render(asset, eyes, there, threads=os.cpu_count() or 1, affines=affines)
+    return [np.rint(view.rgb * 255.0).astype(np.uint8) for view in views]
 
 
 def pose_at(row: Row, step: int) -> Array:

@@ -73,11 +73,12 @@ def unfit(
     """
     width, height = looked_at_size(size, settings)
     rig = [camera.resized(width, height) for camera in cameras]
+    affines = [asset.affine_of(camera.name) for camera in cameras]
     for pose, step in zip(world_from_ego, steps, strict=True):
         there = vehicles_at(agents, step * STEP_S, pose[:2, 3], settings.reach_m)
         eyes = [Pinhole(c.intrinsics, pose @ c.ego_from_camera, c.width, c.height) for c in rig]
         scene = composed(asset, there, pose[:3, 3], settings.reach_m)
-        views = render(scene, eyes, backend=backend)
+        views = render(scene, eyes, backend=backend, affines=affines)
         for camera, eye, view, found in zip(rig, eyes, views, measures(scene, eyes, views, pose, backend), strict=True):
             inside = _tracks_around(eye.world_from_camera[:3, 3], there)
             fault = ("lens_covered", f"inside track {inside[0]}") if inside else fault_of(found, settings)

@@ -141,7 +141,7 @@ def likeness_to_photo(
     height, width = photo.rgb.shape[:2]
     eye = Pinhole(photo.intrinsics, photo.world_from_camera, width, height)
     there = vehicles_at(agents, photo.time_s)
-    seen = _exposed(asset, photo, render(asset, [eye], there, backend)[0].rgb)
+    seen = render(asset, [eye], there, backend, affines=[_affine(asset, photo)])[0].rgb
     similar = similarity(seen, photo.rgb.astype(np.float32) / np.float32(255.0))
     out = {}
     for track_id in track_ids:
@@ -173,13 +173,11 @@ def _blurred(picture: F32) -> F32:
     return np.asarray(cv2.GaussianBlur(picture, (0, 0), SIGMA_PX, borderType=cv2.BORDER_REFLECT), np.float32)
 
 
-def _exposed(asset: RenderAsset, photo: Photo, rgb: F32) -> F32:
-    """The picture as the photo's camera exposed then, by the photo of its camera that was aligned nearest in time."""
+def _affine(asset: RenderAsset, photo: Photo) -> F32:
+    """(3, 4) how the photo's camera exposed then, by the photo of its camera that was aligned nearest in time."""
     mine = [found for found in asset.exposures if found.camera == photo.camera]
-    if not mine:
-        return rgb
-    affine = min(mine, key=lambda found: abs(found.time_s - photo.time_s)).affine
-    return np.asarray(np.clip(rgb @ affine[:, :3].T + affine[:, 3], 0.0, 1.0), np.float32)
+    nearest = min(mine, key=lambda found: abs(found.time_s - photo.time_s), default=None)
+    return asset.affine_of(photo.camera) if nearest is None else nearest.affine
 
 
 def _projected(boxes: Array, points: Array, intrinsics: Array, world_from_camera: Array) -> tuple[Array, Array, Array]:

@@ -1,22 +1,24 @@
 """What photos do not agree about: how bright the scene is, an affine colour for each, and where its camera was.
 
-Cameras that looked at the same instant are made to agree on the lidar points that several of them saw before anything
-is coloured by the photos, as in the paper's data engine (section 3DGS Simulation Data Engine); the fit goes on from
-there.
+Cameras are made to agree on the lidar points that several of them saw at the same instants (`agreement`) before
+anything is coloured by the photos, as in the paper's data engine (section 3DGS Simulation Data Engine); the fit goes on
+from there.
 """
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import reduce
+from operator import add
 
 import numpy as np
 
+from tasks.render.fit.agreement import aligned, shared
 from tasks.render.scene.sensed import Photo
 from tasks.render.scene.sight import Seen
 from tasks.world.arrays import F32, Array, Bools, FloatArray
 
 EXPOSURE_SIZE = 12  # a photo's row: 3 x 3 matrix minus identity, then 3 offsets
 POSE_SIZE = 6  # a photo's row: shift [m], turn [rad], both in its camera's frame
-ROUNDS = 20  # of fitting each camera to the mean of all
 INSTANT_S = 0.05  # photos no further apart were taken at once
 POINTS = 40_000  # of the cloud are looked at, evenly
 NEAR = 0.05  # of its depth: a point this close to what the photo shows there is seen
@@ -40,6 +42,21 @@ def inverse(row: F32) -> F32:
     return np.concatenate([(back - np.eye(3)).ravel(), -back @ offset]).astype(np.float32)
 
 
+def after(row: F32, first: F32) -> F32:
+    """The row (12,) that does what `first` does and then what `row` does."""
+    matrix, offset = matrix_of(row)
+    before, shift = matrix_of(first)
+    together = matrix @ before - np.eye(3, dtype=np.float32)
+    return np.concatenate([together.ravel(), matrix @ shift + offset]).astype(np.float32)
+
+
+def reference(cameras: Sequence[str], rows: F32) -> F32:
+    """The row (12,) of a camera that exposes as the `cameras` (N,) do on average, each by its own mean over its photos'
+    rows (N, 12)."""
+    of = np.array(cameras)
+    return np.mean([rows[of == camera].mean(axis=0) for camera in dict.fromkeys(cameras)], axis=0, dtype=np.float32)
+
+
 def exposed_gradient(rgb: F32, row: F32, d_exposed: F32) -> tuple[F32, F32]:
     """Gradients by rgb (H, W, 3) and by the row (12,)."""
     matrix, _ = matrix_of(row)
@@ -59,37 +76,26 @@ def affine_between(source: FloatArray, target: FloatArray, ridge: float = 1e-3) 
     return np.concatenate([off[:3].T.ravel(), off[3]]).astype(np.float32)
 
 
-def aligned(colours: Array, seen: Bools) -> F32:
-    """Rows (C, 12) that make cameras of one instant agree on the lidar points that several of them see.
-
-    `colours` (C, M, 3) in [0, 1] of M projected points in C cameras, `seen` (C, M). Each camera in turn is fitted to
-    what all of them say of its points; the mean colour stays. Cameras that share no point keep theirs.
-    """
-    rows = np.zeros((len(colours), EXPOSURE_SIZE), np.float32)
-    common = seen.sum(axis=0) > 1
-    for _ in range(ROUNDS):
-        now = np.stack([exposed(c.astype(np.float32), row) for c, row in zip(colours, rows)])
-        mean = (now * seen[..., None]).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)[:, None]
-        for c in range(len(colours)):
-            use = seen[c] & common
-            if use.sum() >= 8:
-                rows[c] = affine_between(colours[c, use], mean[use], 1e-2)
-    return rows
-
-
 def exposures_of(photos: Sequence[Photo], seen: Sequence[Seen], points: Array) -> F32:
-    """Rows (N, 12) of the photos: photo colour = row applied to what the cameras of its instant agree on.
+    """Rows (N, 12) of the photos: photo colour = row applied to what all cameras agree on. Photos of a camera have one.
 
-    `points` (M, 3) lidar that stays, in the photos' frame. Zeros, which is identity, where a photo shares no point.
+    `points` (M, 3) that stay, in the photos' frame. Zeros, which is identity, where a camera shares no point.
     """
     rows = np.zeros((len(photos), EXPOSURE_SIZE), np.float32)
+    cameras = list(dict.fromkeys(photo.camera for photo in photos))
     cloud = points[:: max(1, len(points) // POINTS)]
+    found = []
     for instant in instants(photos):
         if len(instant) < 2:
             continue
-        looked = [_colours(photos[i], seen[i], cloud) for i in instant]
-        found = aligned(np.stack([colours for colours, _ in looked]), np.stack([shown for _, shown in looked]))
-        rows[instant] = [inverse(row) for row in found]
+        colours, shown = np.zeros((len(cameras), len(cloud), 3)), np.zeros((len(cameras), len(cloud)), bool)
+        for i in instant:
+            c = cameras.index(photos[i].camera)
+            colours[c], shown[c] = _colours(photos[i], seen[i], cloud)
+        found.append(shared(colours, shown))
+    if found:
+        back = [inverse(row) for row in aligned(reduce(add, found))]
+        rows[:] = [back[cameras.index(photo.camera)] for photo in photos]
     return rows
 
 

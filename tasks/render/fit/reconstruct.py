@@ -6,14 +6,14 @@ from dataclasses import replace
 import numpy as np
 
 from tasks.render.fit.backend import Derivatives, FitBackend, Held
-from tasks.render.fit.corrections import between, corrected, exposed, matrix_of
+from tasks.render.fit.corrections import after, between, corrected, exposed, inverse, matrix_of, reference
 from tasks.render.fit.density import refine
-from tasks.render.fit.losses import ssim
 from tasks.render.fit.on_cpu import OnCpu, compose, look
+from tasks.render.fit.quality import measured
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import Problem, prepare
 from tasks.render.fit.state import BACKGROUND, FitState
-from tasks.render.scene.asset import Exposure, RenderAsset, ViewQuality, psnr
+from tasks.render.scene.asset import Exposure, RenderAsset, mean_psnr_db
 from tasks.render.scene.sensed import Photo, Sweep
 from tasks.render.scene.settings import Backend
 from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
@@ -166,25 +166,36 @@ def corrections_at(problem: Problem, state: FitState, camera: str, time_s: float
 
 
 def finish(problem: Problem, state: FitState, threads: int = 2) -> RenderAsset:
-    """The scene as it is rendered, with the PSNR of the photos held out."""
+    """The scene as it is rendered, with what it makes of the photos held out.
+
+    What all cameras make of the scene's light on average is folded into it: its own colours are those of photos.
+    """
+    rows, cameras = state.learned["exposure"].values, [shot.photo.camera for shot in problem.train]
+    common = reference(cameras, rows)
+    matrix, _ = matrix_of(common)
     every = state.gaussians()
-    every = replace(every, quats=every.quats / np.linalg.norm(every.quats, axis=1, keepdims=True))
+    every = replace(
+        every,
+        quats=every.quats / np.linalg.norm(every.quats, axis=1, keepdims=True),
+        colours=exposed(every.colours, common),
+        sh_rest=every.sh_rest @ matrix.T,
+    )
+    sky = exposed(state.learned["sky"].values, common)
     nodes = {problem.tracks.ids[j]: every.take(state.owner == j) for j in np.unique(state.owner[state.owner >= 0])}
-    views = []
-    for shot in problem.held_out:
-        picture, photo = picture_of(problem, state, shot.photo, threads), shot.photo
-        quality = psnr(picture, shot.target.rgb), ssim(picture, shot.target)[0]
-        views.append(ViewQuality(photo.camera, photo.time_s, *quality, held_out=True))
-    return RenderAsset(
+    asset = RenderAsset(
         problem.origin,
         every.take(state.owner == BACKGROUND),
         nodes,
-        SkyMap(np.clip(state.learned["sky"].values, 0.0, 1.0).reshape(ROWS, COLUMNS, 3)),
-        float(np.mean([view.psnr_db for view in views])) if views else float("nan"),
-        len(views),
-        views=tuple(views),
+        SkyMap(np.clip(sky, 0.0, 1.0).reshape(ROWS, COLUMNS, 3)),
+        float("nan"),
         exposures=tuple(
-            Exposure(shot.photo.camera, shot.photo.time_s, np.column_stack(matrix_of(row)))
-            for shot, row in zip(problem.train, state.learned["exposure"].values)
+            Exposure(shot.photo.camera, shot.photo.time_s, np.column_stack(matrix_of(after(row, inverse(common)))))
+            for shot, row in zip(problem.train, rows)
         ),
     )
+    views = []
+    for shot in problem.held_out:
+        photo = shot.photo
+        pose = corrected(photo.world_from_camera, corrections_at(problem, state, photo.camera, photo.time_s)[0])
+        views.append(measured(asset, problem, shot, pose, threads))
+    return replace(asset, views=tuple(views), psnr_db=mean_psnr_db(views), n_held_out=len(views))

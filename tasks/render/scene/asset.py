@@ -27,14 +27,26 @@ class BlockRange:
 
 
 @dataclass(frozen=True)
+class ClassQuality:
+    """How well the pixels of one class come out in a photo."""
+
+    name: str  # road, vehicles or rest
+    share: float  # of the photo's pixels
+    psnr_db: float
+    ssim: float
+
+
+@dataclass(frozen=True)
 class ViewQuality:
-    """How well one photo comes out."""
+    """How well one photo comes out; NaN where something was not measured."""
 
     camera: str
     time_s: float  # since the block's first step
     psnr_db: float
-    ssim: float  # NaN where it was not measured
+    ssim: float
     held_out: bool  # the scene was built without this photo
+    away_m: float = float("nan")  # from the nearest photo that the scene was built from and that looks the same way
+    classes: tuple[ClassQuality, ...] = ()  # those that the photo shows
 
 
 @dataclass(frozen=True)
@@ -58,8 +70,28 @@ class RenderAsset:
     n_held_out: int = 0
     digest: str = ""  # of everything else; filled by whoever stores the scene
     views: tuple[ViewQuality, ...] = ()  # photo by photo, where that was measured
-    exposures: tuple[Exposure, ...] = ()  # of the photos, where they were aligned; images at new poses have none
+    exposures: tuple[Exposure, ...] = ()  # of the photos, where they were aligned
     block: BlockRange | None = None  # filled by whoever knows the log
+
+    def affine_of(self, camera: str) -> F32:
+        """(3, 4) what a camera makes of the scene's light at poses that no photo was taken from: the mean over its
+        photos; the identity for one whose photos were not aligned."""
+        mine = [exposure.affine for exposure in self.exposures if exposure.camera == camera]
+        return np.mean(mine, axis=0, dtype=np.float32) if mine else np.eye(3, 4, dtype=np.float32)
+
+
+def camera_psnr_db(asset: RenderAsset) -> dict[str, float]:
+    """Mean PSNR [dB] of each camera's photos that were held out, where photos were measured one by one."""
+    held_out = [view for view in asset.views if view.held_out]
+    cameras = dict.fromkeys(view.camera for view in held_out)
+    found = {camera: mean_psnr_db([view for view in held_out if view.camera == camera]) for camera in cameras}
+    return {camera: value for camera, value in found.items() if not np.isnan(value)}
+
+
+def mean_psnr_db(views: Sequence[ViewQuality]) -> float:
+    """Mean over the views that were measured; NaN without one."""
+    known = [view.psnr_db for view in views if not np.isnan(view.psnr_db)]
+    return float(np.mean(known)) if known else float("nan")
 
 
 def psnr(a: NDArray[np.generic], b: NDArray[np.generic]) -> float:
@@ -67,6 +99,11 @@ def psnr(a: NDArray[np.generic], b: NDArray[np.generic]) -> float:
     peak = 255.0 if a.dtype == np.uint8 else 1.0
     error = float(np.mean((a.astype(np.float64) - b.astype(np.float64)) ** 2))
     return float("inf") if error == 0.0 else 10.0 * float(np.log10(peak**2 / error))
+
+
+def developed(rgb: F32, affine: F32) -> F32:
+    """A picture (H, W, 3) of the scene's light as a camera with `affine` (3, 4) shows it."""
+    return np.asarray(rgb @ affine[:, :3].T + affine[:, 3], np.float32)
 
 
 def scene_at(asset: RenderAsset, track_ids: Sequence[str], kinds: Sequence[AgentKind], boxes: Array) -> Gaussians:

@@ -12,7 +12,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from tasks.render.scene.asset import RenderAsset, scene_at
+from tasks.render.scene.asset import RenderAsset, developed, scene_at
 from tasks.render.scene.movers import boxes_at
 from tasks.render.scene.sensed import shifted
 from tasks.render.scene.settings import Backend
@@ -50,8 +50,12 @@ def render(
     vehicles: Vehicles = NOBODY,
     backend: Backend = Backend.CPU,
     threads: int = 1,
+    affines: Sequence[F32] | None = None,
 ) -> list[View]:
     """What each of the `cameras` sees of the scene with `vehicles` in it: rgb in [0, 1], depth [m], alpha.
+
+    `affines` (3, 4), one a camera, are what they make of the scene's light (`RenderAsset.affine_of`); without them
+    pictures show the light itself, which is that of photos on average.
 
     Behind everything is the sky, so that a camera which sees no Gaussian gets a picture of the sky map with alpha 0,
     never a black one. `threads` are the CPU backend's and change no byte. Raises BackendMissing where the backend
@@ -61,6 +65,8 @@ def render(
     local = [replace(camera, world_from_camera=shifted(camera.world_from_camera, -asset.origin)) for camera in cameras]
     backdrops = [asset.sky.seen_by(c.intrinsics, c.world_from_camera, c.width, c.height, threads) for c in local]
     views = RASTERISERS[backend](scene, local, backdrops, threads)
+    if affines is not None:
+        views = [replace(view, rgb=developed(view.rgb, affine)) for view, affine in zip(views, affines, strict=True)]
     return [replace(view, rgb=np.clip(view.rgb, 0.0, 1.0)) for view in views]
 
 

@@ -11,7 +11,7 @@ from safetensors import safe_open
 from safetensors.numpy import save_file
 
 from factory.stages.scene_file import KEY, BadScene, described_by, digest_of, read_scene, tensors_of, write_scene
-from tasks.render.scene.asset import BlockRange, Exposure, RenderAsset, ViewQuality
+from tasks.render.scene.asset import BlockRange, ClassQuality, Exposure, RenderAsset, ViewQuality
 from tasks.render.scene.sky import SkyMap
 from tasks.render.splatting.gaussians import EMPTY, Gaussians
 
@@ -31,7 +31,7 @@ def scene() -> RenderAsset:
         psnr_db=27.123456789,
         n_held_out=3,
         views=(
-            ViewQuality("front", 0.5, 28.5, 0.91, True),
+            ViewQuality("front", 0.5, 28.5, 0.91, True, 3.25, (ClassQuality("road", 0.3, 30.5, 0.9),)),
             ViewQuality("front", 1.0, float("inf"), float("nan"), False),
         ),
         exposures=(Exposure("front", 0.5, np.eye(3, 4, dtype=np.float32) * 1.1),),
@@ -53,6 +53,17 @@ def test_everything_comes_back(tmp_path: Path) -> None:
     assert back.block is not None and back.block.low.tolist() == [-1.5, 2.0]
     assert back.psnr_db == 27.123456789
     assert [path.name for path in (tmp_path / "deep").iterdir()] == ["x.safetensors"]  # no drafts left
+
+
+def test_a_file_from_before_distances_and_classes_were_measured_is_read(tmp_path: Path) -> None:
+    described = described_by(scene())
+    for view in described["views"]:
+        del view["away_m"], view["classes"]
+    tensors = tensors_of(scene())
+    digest = digest_of(tensors, described)
+    save_file(tensors, tmp_path / "old", metadata={KEY: json.dumps(described | {"digest": digest})})
+    first, _ = read_scene(tmp_path / "old").views
+    assert (first.camera, first.psnr_db) == ("front", 28.5) and np.isnan(first.away_m) and first.classes == ()
 
 
 def test_a_scene_of_nothing_but_sky_and_without_a_measure_is_a_scene(tmp_path: Path) -> None:

@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 
 from tasks.render.fit.backdrop import backdrop_gradient
-from tasks.render.fit.corrections import affine_between, aligned, between, corrected, exposed, exposed_gradient, motion
+from tasks.render.fit.corrections import (
+    affine_between,
+    after,
+    between,
+    corrected,
+    exposed,
+    exposed_gradient,
+    motion,
+    reference,
+)
 from tasks.render.fit.reconstruct import decayed, photo_at
 from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
 from tasks.render.scene.sky_lookup import backdrop, sky_cells
@@ -37,16 +46,16 @@ def test_an_affine_colour_is_found_again() -> None:
     assert not affine_between(np.zeros((0, 3)), np.zeros((0, 3))).any()
 
 
-def test_cameras_of_an_instant_agree_on_shared_lidar_points_after_alignment() -> None:
-    truth = RNG.uniform(0.2, 0.8, (300, 3))
-    seen = np.zeros((3, 300), bool)
-    seen[0, :200], seen[1, 100:] = True, True  # the third shares nothing
-    colours = np.stack([truth * 0.9, truth * 1.1 + 0.02, truth])
-    rows = aligned(colours, seen)
-    now = [exposed(c.astype(np.float32), row) for c, row in zip(colours, rows)]
-    before = np.abs(colours[0] - colours[1])[100:200].mean()
-    assert np.abs(now[0] - now[1])[100:200].mean() < 0.1 * before
-    assert not rows[2].any()
+def test_two_rows_after_another_do_what_one_does() -> None:
+    rgb = RNG.uniform(0, 1, (5, 3)).astype(np.float32)
+    one, two = RNG.normal(0.0, 0.1, (2, 12)).astype(np.float32)
+    np.testing.assert_allclose(exposed(rgb, after(two, one)), exposed(exposed(rgb, one), two), atol=1e-6)
+
+
+def test_each_camera_counts_once_in_the_common_exposure_however_many_photos_it_took() -> None:
+    rows = np.zeros((4, 12), np.float32)
+    rows[:, 0] = 0.3, 0.3, 0.0, -0.1
+    assert reference(["a", "a", "a", "b"], rows)[0] == pytest.approx(0.05)
 
 
 def test_a_motion_is_rigid_and_small_ones_add_up() -> None:
