@@ -22,6 +22,7 @@ from factory.store.identity import UNLISTED, RunIdentity, canonical_json
 from tasks.caches import user_cache
 from tasks.experts.pdm_closed.settings import PdmSettings
 from tasks.experts.protocol import Expert, tried_once
+from tasks.render.fit.lpips import BadWeights, lpips_of
 from tasks.render.rigs import RIGS
 from tasks.render.scene import engine
 from tasks.render.settings import REMOVED, RenderMode
@@ -37,6 +38,7 @@ RIGS_LOOKED_AT = 3  # clips, for the names of their cameras
 ABSENT = object()
 # Settings that came later: at what held before there was a choice they are left out, so that older tables go on.
 ADDED: dict[str, object] = {"perturb.interleaved": True, "perturb.order": "drawn", "perturb.at_most": None}
+ADDED |= {"render.psnr_over": "block"}
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,9 @@ def refuse_missing_backend(config: RunConfig) -> None:
         return
     try:
         engine.check(config.render.backend)
-    except BackendMissing as error:
+        if config.render.lpips:
+            lpips_of(config.render.lpips)
+    except (BackendMissing, BadWeights) as error:
         raise ConfigError(str(error)) from error
 
 
@@ -222,6 +226,7 @@ def identity_of(config: RunConfig, vocabulary: Vocabulary, labelling: Labelling 
     settings |= {f"traffic.{key}": value for key, value in traffic.REMOVED.items()}
     for part, gone in REMOVED.items():
         settings[f"render.{part}"] = dataclasses.asdict(getattr(config.render, part)) | gone
+    del settings["render.lpips"]  # measures alone
     settings = {key: plain for key, plain in settings.items() if plain != ADDED.get(key, ABSENT)}
     settings["reward.label_vocabulary"] = None if labelling is None else labelling.vocabulary.digest
     versions = stage_versions()

@@ -22,6 +22,7 @@ from factory.readers.videos import file_and_frame
 from factory.stages.fitting import fitted
 from factory.stages.scene_file import SUFFIX, BadScene, read_scene, write_scene
 from factory.stages.sensors import block_of, chosen_cameras, load_sensors, load_sweeps, taken_by
+from tasks.render.fit.lpips import lpips_of
 from tasks.render.scene.asset import BlockRange, RenderAsset
 from tasks.render.scene.build import build_asset
 from tasks.render.scene.lidar_only import lidar_asset
@@ -94,7 +95,8 @@ def asset_for(
         if made_of is not Sensing.LIDAR_ONLY:
             data = load_sensors(block, cameras, settings.width, settings.height)
             if settings.scene is SceneFrom.FIT:
-                asset = fitted(path, data, block.agents, settings.fit, threads, stopped, settings.backend)
+                lpips = lpips_of(settings.lpips) if settings.lpips else None
+                asset = fitted(path, data, block.agents, settings.fit, threads, stopped, settings.backend, lpips)
             else:
                 asset = build_asset(data.photos, data.sweeps, block.agents, settings.asset, data.road)
         else:
@@ -132,7 +134,9 @@ def block_id(clip: Clip, settings: RenderSettings) -> str:
     made = asdict(settings)[part] | REMOVED[part]
     if settings.scene is SceneFrom.FIT and settings.backend is not Backend.CPU:
         made["backend"] = settings.backend  # another fit to the last bits, so that a run on CPUs never meets it
-    how = (settings.width, settings.height, sorted(settings.cameras), made)
+    how: list[object] = [settings.width, settings.height, sorted(settings.cameras), made]
+    if settings.lpips and part == "fit":  # a scene without the measure is made again
+        how.append([[Path(name).name, Path(name).stat().st_size] for name in settings.lpips])
     digest.update(json.dumps([made_of, how], sort_keys=True).encode())
     for file in (*block.images, *block.sweeps):
         path, _ = file_and_frame(file.uri)

@@ -12,6 +12,7 @@ from factory.graph.work import Halted, Stopped, never
 from factory.stages.sensors import SensorData
 from factory.store.disk import whole_file
 from factory.wording import time_text
+from tasks.render.fit.lpips import Lpips
 from tasks.render.fit.reconstruct import advance, backend_of, finish
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import prepare
@@ -34,6 +35,7 @@ def fitted(
     threads: int,
     stopped: Stopped = never,
     backend: Backend = Backend.CPU,
+    lpips: Lpips | None = None,
 ) -> RenderAsset:
     """The scene of a block's sensors; what is half done lies beside `path`, where the scene will be stored.
 
@@ -61,7 +63,7 @@ def fitted(
         if state.iteration < settings.iterations and stopped():
             said.unlink(missing_ok=True)
             raise Halted(f"{path.stem}: {state.iteration} of {settings.iterations} iterations are done")
-    asset = finish(problem, state, threads)
+    asset = finish(problem, state, threads, lpips)
     begun.unlink(missing_ok=True)
     said.unlink(missing_ok=True)
     return asset

@@ -19,11 +19,12 @@ from factory.stages.assets import Sensing, asset_for, scene_path, sensing
 from factory.stages.sensors import block_of, chosen_cameras, encode_jpeg, load_photos, taken_by
 from tasks.attempt import Judged
 from tasks.perturb import Candidate
+from tasks.render.block_gate import poor_block
 from tasks.render.gate import looked_at_size, unfit
 from tasks.render.likeness import Album, likeness_to_photo, sightings
 from tasks.render.map_drawing import draw_map_views
 from tasks.render.rigs import RIGS
-from tasks.render.scene.build import RenderAsset
+from tasks.render.scene.asset import RenderAsset
 from tasks.render.settings import STEPS_OF, ImageSource, PsnrGate, RenderMode, RenderSettings
 from tasks.render.views import pose_on_ground, render_views
 from tasks.stages import Rejected
@@ -70,8 +71,9 @@ class Imaging:
         if sensing(clip, self.settings) not in (Sensing.PHOTOS, Sensing.PHOTOS_ONLY):
             return None
         asset = _block(clip, self.settings, self.cache_dir)
-        if self._below(asset) and self.settings.psnr_gate is PsnrGate.REJECT:
-            return Rejected("render", "psnr", f"block at {asset.psnr_db:.2f} dB, below {self.settings.psnr_min:g}")
+        found = poor_block(asset, self.settings)
+        if found is not None and self.settings.psnr_gate is PsnrGate.REJECT:
+            return Rejected("render", "psnr", found)
         return None
 
     def pictures(self, clip: Clip, candidate: Candidate | None, judged: Judged) -> dict[str, object]:
@@ -93,7 +95,7 @@ class Imaging:
             return NO_IMAGES
         asset = _block(clip, self.settings, self.cache_dir)
         tags = [TAG_OF[made_of]] if made_of in TAG_OF else []
-        if self._below(asset):
+        if poor_block(asset, self.settings) is not None:
             tags.append(LOW_PSNR)
         return self._drawn(clip, judged, asset, cameras) | {"tags": tags}
 
@@ -128,9 +130,6 @@ class Imaging:
             album,
             stored,
         )
-
-    def _below(self, asset: RenderAsset) -> bool:
-        return asset.psnr_db < self.settings.psnr_min  # not so where nothing was held out: NaN
 
     def _near_sweeps(self, clip: Clip, judged: Judged) -> bool:
         """Whether every pose to be drawn is within reach of a place that a sweep was taken from."""

@@ -32,7 +32,7 @@ from tasks.render.scene.sky import SkyMap
 from tasks.render.splatting.gaussians import Gaussians
 
 FORMAT, VERSION = "driving-data-factory scene", 1
-MEASURES = ("psnr_db", "ssim", "away_m")  # of views and their classes: NaN or infinite, maybe
+MEASURES = ("psnr_db", "ssim", "lpips", "away_m")  # of views and their classes: NaN or infinite, maybe
 KEY = "scene"  # one entry: safetensors writes several in no fixed order
 SUFFIX = ".safetensors"
 Tensors = Mapping[str, NDArray[Any]]
@@ -91,6 +91,15 @@ def find_scene(folder: Path, digest: str) -> RenderAsset | None:
         if header.get("digest") == digest:
             return read_scene(path)
     return None
+
+
+def stored_views(path: Path) -> tuple[ViewQuality, ...]:
+    """What was measured on a scene's photos, by its header alone. Raises BadScene where it has none."""
+    try:
+        with safe_open(path, framework="numpy") as file:
+            return tuple(_view(view) for view in json.loads((file.metadata() or {})[KEY])["views"])
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
+        raise BadScene(f"{path}: no scene: {type(error).__name__} {error}") from error
 
 
 def tensors_of(asset: RenderAsset) -> dict[str, NDArray[Any]]:

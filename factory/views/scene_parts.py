@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from factory.stages.scene_file import BadScene, described_by, read_scene
+from factory.views.scene_quality import camera_rows
 from factory.views.splat_files import background_bytes, node_bytes
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.lidar_only import plain_sky
@@ -29,6 +30,7 @@ def info_text(path: Path, asset: RenderAsset) -> str:
     lines += [f"node        {name}: {_counted(node)}" for name, node in asset.nodes.items()]
     held_out = f"{asset.psnr_db:.2f} dB over {asset.n_held_out} held-out photos"
     lines.append(f"psnr        {held_out if np.isfinite(asset.psnr_db) else 'not measured'}")
+    lines += [f"camera      {row.camera}: {row.text}" for row in camera_rows(asset.views)]
     lines += [
         f"view        {view.camera} at {view.time_s:.2f} s: {view.psnr_db:.2f} dB, SSIM {view.ssim:.3f}"
         f"{', held out' if view.held_out else ''}"

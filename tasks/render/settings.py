@@ -37,6 +37,13 @@ class PsnrGate(StrEnum):
     MARK = "mark"  # samples are kept, tagged low_psnr
 
 
+class PsnrOver(StrEnum):
+    """Whose mean is held against psnr_min."""
+
+    CAMERA = "camera"  # each camera's photos: the worst camera decides
+    BLOCK = "block"  # all photos of a block, as the paper does
+
+
 class ImageSource(StrEnum):
     """Where a sample's images come from."""
 
@@ -98,7 +105,11 @@ class RenderSettings:
     height: int = 180  # pixels
     jpeg_quality: int = 90  # 1 to 100
     psnr_min: float = 27.0  # [dB] what a block's held-out photos must come out with; 0: anything
+    psnr_over: PsnrOver = PsnrOver.CAMERA  # camera: none may be below psnr_min; block: the mean over all may not
     psnr_gate: PsnrGate = PsnrGate.REJECT  # what becomes of a block below psnr_min
+    lpips: tuple[
+        str, ...
+    ] = ()  # files of weights: held-out photos are measured by LPIPS as well, which decides nothing
     gate: GateSettings = field(default_factory=GateSettings)  # what every rendered picture of a drive must come up to
     lidar_only_reach_m: float = 15.0  # without photos: images only this close to where a sweep was taken; 0: none
     map_rig: Literal["front", "three_front", "ring_six"] = "three_front"  # for mode=map without a rig

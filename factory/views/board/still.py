@@ -33,7 +33,8 @@ POLICY = (
 def still_page(store: Store, extra: Mapping[str, Any]) -> bytes:
     """The file.
 
-    extra: what the live page does not show: facts, settings, left_out, rejected, strips (static/extra.js reads it).
+    extra: what the live page does not show: facts, settings, scenes, left_out, rejected, strips (static/extra.js reads
+    it).
     """
     shot, pictures = Watch(store).now(), Pictures(store)
     looks = gallery(shot, {"simulated": "1"}, 1, N_LOOKS)

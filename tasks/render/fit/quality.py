@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from tasks.render.fit.losses import Target, ssim
+from tasks.render.fit.lpips import Lpips
 from tasks.render.fit.road import Road, above_road
 from tasks.render.fit.start import Problem, Shot
 from tasks.render.scene.asset import ClassQuality, RenderAsset, ViewQuality, psnr
@@ -22,19 +23,23 @@ from tasks.world.arrays import F32, Array, Bools
 from tasks.world.camera import Pinhole
 
 ROAD_M = 30.0  # from the camera; farther a pixel is too long a piece of road
-ON_ROAD_M = 0.05  # above or below the surface
-STEPS = 6  # of following a ray down to it
+NEAREST_M, STEPS = 0.5, 60  # where a ray is followed from, and in how many steps
 LEAST_PIXELS = 40  # of a class in a photo, that it is measured
 SAME_WAY = 0.87  # cosine: photos that look within 30 degrees of each other
 
 
 def measured(
-    asset: RenderAsset, problem: Problem, shot: Shot, scene_from_camera: Array, threads: int = 1
+    asset: RenderAsset,
+    problem: Problem,
+    shot: Shot,
+    scene_from_camera: Array,
+    threads: int = 1,
+    lpips: Lpips | None = None,
 ) -> ViewQuality:
     """Of a photo that was held out, as `asset` shows it from a pose (4, 4) in the problem's frame.
 
     The camera has the colours that it has at any new pose, and tracks are where they were. Pixels without weight say
-    nothing.
+    nothing; LPIPS, whose layers see far around, is of the whole picture.
     """
     photo, target = shot.photo, shot.target
     height, width = target.weight.shape
@@ -58,6 +63,7 @@ def measured(
         psnr(picture[counted], target.rgb[counted]) if counted.any() else float("nan"),
         ssim(picture, target)[0],
         held_out=True,
+        lpips=float("nan") if lpips is None else lpips(picture, target.rgb),
         away_m=away(photo, [other.photo for other in problem.train]),
         classes=tuple(of for of in found if of is not None),
     )
@@ -75,15 +81,14 @@ def classes_of(photo: Photo, vehicles: Array, road: Road | None) -> dict[str, Bo
 
 
 def meets(road: Road, eye: Array, rays: Array) -> Bools:
-    """Which rays (M, 3) from `eye` (3,) meet the known road within ROAD_M: Newton's method from a level road below."""
-    steep = -rays[:, 2] / np.linalg.norm(rays, axis=1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-        length = np.where(steep > 0.0, above_road(eye[None], road)[0] / steep, np.nan)
-        for _ in range(STEPS):
-            length = length + above_road(eye + length[:, None] * unit, road) / steep
-        height = above_road(eye + length[:, None] * unit, road)
-        return np.asarray((length > 0.0) & (length < ROAD_M) & (np.abs(height) < ON_ROAD_M))
+    """Which rays (M, 3) from `eye` (3,) go below the known road within ROAD_M, not where it is unknown."""
+    unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    over, found = np.zeros(len(rays), bool), np.zeros(len(rays), bool)
+    for length in np.geomspace(NEAREST_M, ROAD_M, STEPS):
+        height = above_road((eye + length * unit).astype(np.float32), road)
+        found |= over & (height <= 0.0)
+        over = ~found & (height > 0.0)
+    return found
 
 
 def away(photo: Photo, others: Sequence[Photo]) -> float:

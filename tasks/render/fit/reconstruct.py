@@ -8,6 +8,7 @@ import numpy as np
 from tasks.render.fit.backend import Derivatives, FitBackend, Held
 from tasks.render.fit.corrections import after, between, corrected, exposed, inverse, matrix_of, reference
 from tasks.render.fit.density import refine
+from tasks.render.fit.lpips import Lpips
 from tasks.render.fit.on_cpu import OnCpu, compose, look
 from tasks.render.fit.quality import measured
 from tasks.render.fit.settings import FitSettings
@@ -165,8 +166,8 @@ def corrections_at(problem: Problem, state: FitState, camera: str, time_s: float
     return between(times, poses[rows], time_s), between(times, colours[rows], time_s)
 
 
-def finish(problem: Problem, state: FitState, threads: int = 2) -> RenderAsset:
-    """The scene as it is rendered, with what it makes of the photos held out.
+def finish(problem: Problem, state: FitState, threads: int = 2, lpips: Lpips | None = None) -> RenderAsset:
+    """The scene as it is rendered, with what it makes of the photos held out; `lpips` measures them as well.
 
     What all cameras make of the scene's light on average is folded into it: its own colours are those of photos.
     """
@@ -197,5 +198,5 @@ def finish(problem: Problem, state: FitState, threads: int = 2) -> RenderAsset:
     for shot in problem.held_out:
         photo = shot.photo
         pose = corrected(photo.world_from_camera, corrections_at(problem, state, photo.camera, photo.time_s)[0])
-        views.append(measured(asset, problem, shot, pose, threads))
+        views.append(measured(asset, problem, shot, pose, threads, lpips))
     return replace(asset, views=tuple(views), psnr_db=mean_psnr_db(views), n_held_out=len(views))

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tasks.render.scene.asset import RenderAsset, psnr, scene_at
+from tasks.render.scene.asset import RenderAsset, ViewQuality, mean_psnr_db, psnr, scene_at
 from tasks.render.scene.choose import BACKGROUND, Look, choose, count_free_space, with_mirror_image
 from tasks.render.scene.engine import Vehicles, render
 from tasks.render.scene.features import known_without_lidar
@@ -62,10 +62,8 @@ def build_asset(
     asset = _refit(asset, train, seen, tracks)
     if not held_out:
         return asset
-    scores = [
-        psnr(photos[i].rgb.astype(np.float32) / 255.0, _picture(asset, photos[i], tracks)) for i in sorted(held_out)
-    ]
-    return replace(asset, psnr_db=float(np.mean(scores)), n_held_out=len(scores))
+    views = tuple(_measured(asset, photos[i], tracks) for i in sorted(held_out))
+    return replace(asset, psnr_db=mean_psnr_db(views), n_held_out=len(views), views=views)
 
 
 def held_out_rows(photos: Sequence[Photo], every: int) -> frozenset[int]:
@@ -155,6 +153,11 @@ def _picture(asset: RenderAsset, photo: Photo, tracks: Tracks) -> F32:
     height, width = photo.rgb.shape[:2]
     camera = Pinhole(photo.intrinsics, shifted(photo.world_from_camera, asset.origin), width, height)
     return render(asset, [camera], present)[0].rgb
+
+
+def _measured(asset: RenderAsset, photo: Photo, tracks: Tracks) -> ViewQuality:
+    of = psnr(photo.rgb.astype(np.float32) / np.float32(255.0), _picture(asset, photo, tracks))
+    return ViewQuality(photo.camera, photo.time_s, of, float("nan"), held_out=True)
 
 
 def _refit(asset: RenderAsset, photos: Sequence[Photo], seen: Sequence[Seen], tracks: Tracks) -> RenderAsset:

@@ -31,7 +31,7 @@ def scene() -> RenderAsset:
         psnr_db=27.123456789,
         n_held_out=3,
         views=(
-            ViewQuality("front", 0.5, 28.5, 0.91, True, 3.25, (ClassQuality("road", 0.3, 30.5, 0.9),)),
+            ViewQuality("front", 0.5, 28.5, 0.91, True, 0.25, 3.5, (ClassQuality("road", 0.3, 30.5, 0.9),)),
             ViewQuality("front", 1.0, float("inf"), float("nan"), False),
         ),
         exposures=(Exposure("front", 0.5, np.eye(3, 4, dtype=np.float32) * 1.1),),
@@ -58,7 +58,7 @@ def test_everything_comes_back(tmp_path: Path) -> None:
 def test_a_file_from_before_distances_and_classes_were_measured_is_read(tmp_path: Path) -> None:
     described = described_by(scene())
     for view in described["views"]:
-        del view["away_m"], view["classes"]
+        del view["lpips"], view["away_m"], view["classes"]
     tensors = tensors_of(scene())
     digest = digest_of(tensors, described)
     save_file(tensors, tmp_path / "old", metadata={KEY: json.dumps(described | {"digest": digest})})

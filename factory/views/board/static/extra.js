@@ -1,11 +1,12 @@
-// What a report shows beyond the live page: rejected attempts, cameras beside the log's photos, what was left out, settings.
+// What a report shows beyond the live page: rejected attempts, cameras beside the log's photos, how good the scenes are,
+// what was left out, settings.
 
 import { extra, h, jpeg, section, table } from "./dom.js";
 
 const ROWS = { now: "", earlier: "up to now", photos: "photo and rendering of the same pose", aside: "the same instant from the side" };
 
 export function extraSections() {
-  return extra ? [rejected(), strips(), leftOut(), settings()] : [];
+  return extra ? [rejected(), strips(), scenes(), leftOut(), settings()] : [];
 }
 
 function figure(one) {
@@ -25,7 +26,12 @@ function strips() {
   return section("Camera frames", "photo: the log's own image. render: drawn from the block's reconstruction at the simulated poses. map: lanes and boxes drawn.", extra.strips.map(one));
 }
 
-const listed = (name, rows) => table(name, ["what", "why"], Object.entries(rows).map(([k, v]) => h("tr", null, h("th", { scope: "row" }, k), h("td", null, v))));
+const listed = (name, rows, heads = ["what", "why"]) => table(name, heads, Object.entries(rows).map(([k, v]) => h("tr", null, h("th", { scope: "row" }, k), h("td", null, v))));
+
+function scenes() {
+  const found = Object.entries(extra.scenes ?? {}).filter(([, rows]) => Object.keys(rows).length);
+  return found.length ? section("How well scenes show photos they were not made of", "Means over each camera's photos that were held out.", found.map(([title, rows]) => [h("h3", null, title), listed("scenes", rows, ["camera", "held-out photos"])])) : null;
+}
 
 function leftOut() {
   const found = Object.entries(extra.left_out ?? {}).filter(([, rows]) => Object.keys(rows).length);
