@@ -211,7 +211,13 @@ def test_every_command_is_one_its_program_takes(
             known |= {"by"}
             assert set(pairs(given(arguments))) <= known
         case ["python", "-m", "tests.bench.bench_colours", _, *arguments]:
-            known = {field.name for field in fields(FitSettings)} | {"width", "height", "threads", "hold_out"}
+            known = {field.name for field in fields(FitSettings)} | {
+                "width",
+                "height",
+                "threads",
+                "hold_out",
+                "calibration",
+            }
             assert set(pairs(given(arguments))) <= known
         case ["python", "-m", "examples.csv_logs", folder]:
             write_log(Path(folder) / "street")  # what it does, see tests/test_extending.py

@@ -3,8 +3,8 @@
 A surround rig of eight cameras at 2 Hz. The same photos are drawn twice from where their cameras were: as the fit
 exposed each of them, and as pictures of simulated drives are drawn, which know the camera alone. Both are held against
 the photo; what lies between them is what a picture at a new pose loses in colour. Instants 20 and 27 are kept for
-tests and are never read. Options: width=240 height=135 threads=2 hold_out=<instants, which only measure> and the
-settings of `FitSettings`.
+tests and are never read. Options: width=240 height=135 threads=2 hold_out=<instants, which only measure>
+calibration=<file> and the settings of `FitSettings`.
 """
 
 import json
@@ -29,9 +29,16 @@ TESTED = (20, 27)  # instants
 SETTINGS = replace(FitSettings(), iterations=600, start_gaussians=60_000, most_gaussians=80_000, hold_out_every=0)
 
 
-def surround_photos(folder: Path, width: int, height: int) -> tuple[list[Photo], list[int]]:
-    """The photos without lens distortion, and the instant of each; instants kept for tests are not among them."""
+def surround_photos(
+    folder: Path, width: int, height: int, calibration: Path | None = None
+) -> tuple[list[Photo], list[int]]:
+    """The photos without lens distortion, and the instant of each; instants kept for tests are not among them.
+
+    `calibration`: a file with other `cameras` and `frames`.
+    """
     told = json.loads((folder / "cameras.json").read_text())
+    if calibration is not None:
+        told |= json.loads(calibration.read_text())
     cameras, files, numbers = [], [], []
     for name, row in told["cameras"].items():
         mount = np.eye(4)
@@ -52,9 +59,10 @@ def main() -> None:
     width, height = int(options.pop("width", "240")), int(options.pop("height", "135"))
     threads = int(options.pop("threads", "2"))
     out = {int(number) for number in options.pop("hold_out", "19,24").split(",") if number}
+    given = options.pop("calibration", "")
     kinds = {field.name: type(getattr(SETTINGS, field.name)) for field in fields(FitSettings)}
     settings = replace(SETTINGS, **{k: kinds[k](float(v)) for k, v in options.items()})
-    photos, numbers = surround_photos(folder, width, height)
+    photos, numbers = surround_photos(folder, width, height, Path(given) if given else None)
     held_out = [i for i, number in enumerate(numbers) if number in out]
 
     cpu = time.process_time()

@@ -1,8 +1,9 @@
 """A block of the synthetic town, reconstructed and looked at where no photo was: `python -m tests.bench.bench_town`.
 
-The painter of the town knows what is to be seen from everywhere: from held-out photos' poses, from 2 m to either side,
-turned by 20 degrees, and with every vehicle put 3 m ahead and 0.8 m to the left. Only photos, lidar, poses and boxes go
-into the scene. Options: log=0 width=320 height=180 out=out/bench_town threads=2 and the settings of `FitSettings`.
+The painter of the town knows what is to be seen from everywhere: from held-out photos' poses, from 1 and 2 m to either
+side, turned by 20 degrees (road, vehicles and the rest apart), and with every vehicle put 3 m ahead and 0.8 m to the
+left. Only photos, lidar, poses and boxes go into the scene. Options: log=0 width=320 height=180 out=out/bench_town
+threads=2 lpips=<weights,...> and the settings of `FitSettings`.
 A camera that would be within 0.6 m of somebody's box is left out. With moved vehicles all pixels count whose sight line
 meets the box of one of them within 40 m, whatever else is in front.
 """
@@ -24,6 +25,9 @@ from factory.readers.town.drive import TownDrive
 from factory.readers.town.town import log_name, plan_log
 from factory.readers.town.write import write_log
 from factory.stages.sensors import block_of, load_sensors
+from factory.views.scene_quality import camera_rows
+from tasks.render.fit.lpips import Lpips, lpips_of
+from tasks.render.fit.quality import LEAST_PIXELS as LEAST_OF_CLASS
 from tasks.render.fit.reconstruct import advance, finish
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import prepare
@@ -54,6 +58,7 @@ SETTINGS = FitSettings(
 )
 CENTRE = "ring_front_center"
 SHOWN = 6  # pictures of each kind
+CLASSES = ("road", "vehicles", "rest")
 
 
 def painter(theatre: Theatre) -> Painter:
@@ -79,12 +84,19 @@ def with_moved_vehicles(drive: TownDrive) -> TownDrive:
     return replace(drive, tracks=tuple(tracks))
 
 
-def row(name: str, views: Sequence[Compared]) -> str:
-    """A line of the table: mean PSNR and SSIM of the views, and the worst."""
+def row(name: str, views: Sequence[Compared], lpips: Lpips | None) -> str:
+    """A line of the table: means over the views, the worst PSNR, mean PSNR by class."""
     scores = np.array([(view.psnr_db, view.ssim) for view in views])
-    return (
-        f"| {name} | {scores[:, 0].mean():.2f} | {scores[:, 1].mean():.3f} | {scores[:, 0].min():.1f} | {len(views)} |"
-    )
+    told = [f"{scores[:, 0].mean():.2f}", f"{scores[:, 1].mean():.3f}"]
+    told.append("" if lpips is None else f"{np.mean([lpips(view.picture, view.truth) for view in views]):.3f}")
+    told += [f"{scores[:, 0].min():.1f}", *(by_class(views, of) for of in CLASSES), str(len(views))]
+    return f"| {name} | " + " | ".join(told) + " |"
+
+
+def by_class(views: Sequence[Compared], name: str) -> str:
+    """Mean PSNR inside a class, of the views that show it."""
+    shown = [view for view in views if name in view.classes and view.classes[name].sum() >= LEAST_OF_CLASS]
+    return f"{np.mean([view.psnr_db_in(view.classes[name]) for view in shown]):.2f}" if shown else ""
 
 
 def picture(views: Sequence[Compared]) -> NDArray[np.uint8]:
@@ -102,6 +114,8 @@ def main() -> None:
     """Writes the log, trains, prints a table, writes pictures."""
     options = dict(option.split("=", 1) for option in sys.argv[1:])
     log, threads = int(options.pop("log", "0")), int(options.pop("threads", "2"))
+    weights = options.pop("lpips", "")
+    lpips = lpips_of(weights.split(",")) if weights else None
     width, height = int(options.pop("width", "320")), int(options.pop("height", "180"))
     out = Path(options.pop("out", "out/bench_town"))
     kinds = {field.name: type(getattr(SETTINGS, field.name)) for field in fields(FitSettings)}
@@ -130,7 +144,7 @@ def main() -> None:
             print(f"{iteration}: loss {loss:.4f}, training photos {score:.2f} dB, {seconds:.0f} s", flush=True)
 
     advance(problem, state, settings, settings.iterations, told, threads)
-    asset = finish(problem, state, threads)
+    asset = finish(problem, state, threads, lpips)
     seconds, cpu_s = time.perf_counter() - began, time.process_time() - cpu
 
     photos = [data.photos[i] for i in sorted(held_out_rows(data.photos, settings.hold_out_every))]
@@ -140,21 +154,29 @@ def main() -> None:
         block.agents,
         painter(Theatre(town.scenery, drive, town.sun_azimuth, town.sun_elevation, town.sky_seed)),
         painter(Theatre(town.scenery, with_moved_vehicles(drive), town.sun_azimuth, town.sun_elevation, town.sky_seed)),
+        problem.road,
     )
     kinds_of_view = {
         "held out": views.compared(photos),
+        "1 m to the left": views.compared([sideways(p, ahead[p.time_s], 1.0) for p in photos]),
+        "1 m to the right": views.compared([sideways(p, ahead[p.time_s], -1.0) for p in photos]),
         "2 m to the left": views.compared([sideways(p, ahead[p.time_s], 2.0) for p in photos]),
         "2 m to the right": views.compared([sideways(p, ahead[p.time_s], -2.0) for p in photos]),
         "turned 20 degrees left": views.compared([beside(p, left_rad=np.deg2rad(20.0)) for p in photos]),
         "turned 20 degrees right": views.compared([beside(p, left_rad=-np.deg2rad(20.0)) for p in photos]),
         "moved vehicles, inside their boxes": views.compared_moved(photos),
     }
-    print(f"\n| log {log} at {width}x{height} | PSNR [dB] | SSIM | worst [dB] | views |\n|---|---|---|---|---|")
-    print(f"| held-out photos (JPEG) | {asset.psnr_db:.2f} | | | {asset.n_held_out} |")
+    print(
+        f"\n| log {log} at {width}x{height} | PSNR [dB] | SSIM | LPIPS | worst [dB] | road | vehicles | rest | views |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|")
     for name, compared in kinds_of_view.items():
-        print(row(name, compared))
+        print(row(name, compared, lpips))
         path = out / f"log{log}-{name.replace(' ', '-').replace(',', '')}.png"
         cv2.imwrite(str(path), cv2.cvtColor(picture(compared), cv2.COLOR_RGB2BGR))
+    print()
+    for told in camera_rows(asset.views):
+        print(f"{told.camera}, against the JPEG photos: {told.text}")
     took = f"{seconds:.0f} s on {threads} threads, CPU {cpu_s:.0f} s"
     print(f"\n{settings.iterations} iterations, {len(state)} Gaussians, {took}")
 

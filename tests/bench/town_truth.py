@@ -1,16 +1,18 @@
 """What a scene shows from poses where no photo was taken, beside what the painter of the town shows from there."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tasks.render.fit.losses import ssim, target_of
+from tasks.render.fit.quality import classes_of
+from tasks.render.fit.road import Road
 from tasks.render.scene.asset import RenderAsset, psnr
 from tasks.render.scene.engine import Vehicles, render, vehicles_at
 from tasks.render.scene.movers import behind_boxes
-from tasks.render.scene.sensed import Photo
+from tasks.render.scene.sensed import Photo, shifted
 from tasks.render.scene.sky import directions
 from tasks.render.scene.stereo import FAR_M
 from tasks.world.agents import AgentKind, AgentTracks
@@ -31,12 +33,15 @@ class Compared:
     truth: F32  # (H, W, 3) in [0, 1]
     picture: F32
     inside: NDArray[np.bool_] | None = None  # (H, W) what counts; None: all
+    classes: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)  # (H, W) road, vehicles, rest
 
     @property
     def psnr_db(self) -> float:
-        if self.inside is None:
-            return psnr(self.picture, self.truth)
-        return psnr(self.picture[self.inside], self.truth[self.inside])
+        return self.psnr_db_in(self.inside)
+
+    def psnr_db_in(self, inside: NDArray[np.bool_] | None) -> float:
+        """Of these pixels (H, W); None: all."""
+        return psnr(self.picture, self.truth) if inside is None else psnr(self.picture[inside], self.truth[inside])
 
     @property
     def ssim(self) -> float:
@@ -76,9 +81,17 @@ def moved_on(boxes: Array, kinds: Sequence[AgentKind]) -> Array:
 class Truth:
     """A scene held against the painter."""
 
-    def __init__(self, asset: RenderAsset, agents: AgentTracks, painter: Painter, painter_moved: Painter) -> None:
-        """`painter_moved` paints the street with its vehicles where `moved_on` puts them."""
-        self.asset, self.agents, self.painter, self.painter_moved = asset, agents, painter, painter_moved
+    def __init__(
+        self,
+        asset: RenderAsset,
+        agents: AgentTracks,
+        painter: Painter,
+        painter_moved: Painter,
+        road: Road | None = None,
+    ) -> None:
+        """`painter_moved` paints the street with its vehicles where `moved_on` puts them. `road` as in the asset."""
+        self.asset, self.agents, self.road = asset, agents, road
+        self.painter, self.painter_moved = painter, painter_moved
 
     def compared(self, photos: Sequence[Photo]) -> list[Compared]:
         """Of cameras where and when `photos` say (world); those inside somebody are left out."""
@@ -86,8 +99,15 @@ class Truth:
         for photo in photos:
             there = vehicles_at(self.agents, photo.time_s)
             if not _in_the_way(photo, there.boxes):
-                out.append(Compared(_unit(self.painter(photo.time_s, photo)), self._seen(photo, there)))
+                truth = _unit(self.painter(photo.time_s, photo))
+                out.append(Compared(truth, self._seen(photo, there), classes=self._classes(photo, there)))
         return out
+
+    def _classes(self, photo: Photo, there: Vehicles) -> Mapping[str, NDArray[np.bool_]]:
+        local = replace(photo, world_from_camera=shifted(photo.world_from_camera, -self.asset.origin))
+        rows = [kind == AgentKind.VEHICLE for kind in there.kinds]
+        boxes = there.boxes[np.array(rows, bool)] - np.concatenate([self.asset.origin, np.zeros(4)])
+        return classes_of(local, boxes, self.road)
 
     def compared_moved(self, photos: Sequence[Photo]) -> list[Compared]:
         """The same with moved vehicles, inside the boxes of those near; views that show little of them are left out."""
