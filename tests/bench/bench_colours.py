@@ -87,7 +87,9 @@ def main() -> None:
         print(f"| {name} | " + " | ".join(f"{value:.2f}" for value in row) + " |")
     print("| mean | " + " | ".join(f"{value:.2f}" for value in np.mean(rows, axis=0)) + " |")
     gains = [float(np.trace(exposure.affine[:, :3]) / 3.0) for exposure in asset.exposures]
-    print(f"gains from scene to photo: {min(gains, default=1.0):.2f} to {max(gains, default=1.0):.2f}")
+    own = [float(np.trace(asset.affine_of(exposure.camera)[:, :3]) / 3.0) for exposure in asset.exposures]
+    rest = np.sqrt(np.mean((np.array(gains) / np.array(own) - 1.0) ** 2))
+    print(f"gains from scene to photo: {min(gains):.2f} to {max(gains):.2f}; photo against camera {rest:.3f} (RMS)")
 
 
 if __name__ == "__main__":
