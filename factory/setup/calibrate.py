@@ -33,7 +33,7 @@ WATCHED = (
     "render.width",
     "render.height",
     "render.psnr_min",
-    "render.psnr_over",
+    "render.camera_psnr_min",
     "render.psnr_gate",
     "render.gate.enabled",
 )

@@ -4,18 +4,23 @@ PSNR depends on that size: fine texture, which no scene has in full, is averaged
 """
 
 from tasks.render.scene.asset import RenderAsset, camera_psnr_db
-from tasks.render.settings import PsnrOver, RenderSettings
+from tasks.render.settings import RenderSettings
 
 
 def poor_block(asset: RenderAsset, settings: RenderSettings) -> str | None:
-    """In what a block does not come up to `psnr_min`; None where it does, or where nothing was held out."""
-    least, whole = settings.psnr_min, f"block at {asset.psnr_db:.2f} dB"
+    """In what a block does not come up to `psnr_min` and, camera by camera, `camera_psnr_min`.
+
+    None where it does, where nothing was held out, and where `psnr_min` is 0: then any block will do.
+    """
+    if settings.psnr_min == 0.0:
+        return None
     photos = f"{asset.n_held_out} held-out photos at {settings.width}x{settings.height}"
-    if settings.psnr_over is PsnrOver.CAMERA:
-        found = camera_psnr_db(asset)
-        below = sorted((value, camera) for camera, value in found.items() if value < least)
-        if below:
-            value, camera = below[0]
-            poor = f"{camera} at {value:.2f} dB, below {least:g} like {len(below)} of {len(found)} cameras"
-            return f"{poor}; {whole} over {photos}"
-    return f"{whole} over {photos}, below {least:g}" if asset.psnr_db < least else None
+    if asset.psnr_db < settings.psnr_min:
+        return f"block at {asset.psnr_db:.2f} dB over {photos}, below {settings.psnr_min:g}"
+    cameras = camera_psnr_db(asset)
+    below = sorted((value, name) for name, value in cameras.items() if value < settings.camera_psnr_min)
+    if below:
+        value, name = below[0]
+        like = f"{settings.camera_psnr_min:g} like {len(below)} of {len(cameras)} cameras"
+        return f"{name} at {value:.2f} dB, below {like}; block at {asset.psnr_db:.2f} dB over {photos}"
+    return None

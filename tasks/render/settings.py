@@ -37,13 +37,6 @@ class PsnrGate(StrEnum):
     MARK = "mark"  # samples are kept, tagged low_psnr
 
 
-class PsnrOver(StrEnum):
-    """Whose mean is held against psnr_min."""
-
-    CAMERA = "camera"  # each camera's photos: the worst camera decides
-    BLOCK = "block"  # all photos of a block, as the paper does
-
-
 class ImageSource(StrEnum):
     """Where a sample's images come from."""
 
@@ -105,7 +98,7 @@ class RenderSettings:
     height: int = 180  # pixels
     jpeg_quality: int = 90  # 1 to 100
     psnr_min: float = 27.0  # [dB] what a block's held-out photos must come out with; 0: anything
-    psnr_over: PsnrOver = PsnrOver.CAMERA  # camera: none may be below psnr_min; block: the mean over all may not
+    camera_psnr_min: float = 20.0  # [dB] and those of each of its cameras; 0: anything
     psnr_gate: PsnrGate = PsnrGate.REJECT  # what becomes of a block below psnr_min
     lpips: tuple[
         str, ...
@@ -123,6 +116,7 @@ class RenderSettings:
             "height": (16, math.inf),
             "jpeg_quality": (1, 100),
             "psnr_min": (0.0, math.inf),
+            "camera_psnr_min": (0.0, math.inf),
             "lidar_only_reach_m": (0.0, math.inf),
         }
         _check("render", self, bounds)

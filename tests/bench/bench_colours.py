@@ -86,6 +86,8 @@ def main() -> None:
         rows.append(row)
         print(f"| {name} | " + " | ".join(f"{value:.2f}" for value in row) + " |")
     print("| mean | " + " | ".join(f"{value:.2f}" for value in np.mean(rows, axis=0)) + " |")
+    similar = np.mean([view.ssim for view in asset.views]) if asset.views else np.nan
+    print(f"held out: {asset.psnr_db:.2f} dB, SSIM {similar:.3f}")
     gains = [float(np.trace(exposure.affine[:, :3]) / 3.0) for exposure in asset.exposures]
     own = [float(np.trace(asset.affine_of(exposure.camera)[:, :3]) / 3.0) for exposure in asset.exposures]
     rest = np.sqrt(np.mean((np.array(gains) / np.array(own) - 1.0) ** 2))

@@ -27,7 +27,7 @@ def test_the_preset_is_the_paper_s_set_up(vocabulary: Vocabulary) -> None:
     assert differences(config, vocabulary) == []
     assert setup_text(config, vocabulary) == "set-up: the paper's (preset=paper)"
     assert (config.rounds, config.vocabulary.k, config.render.width, config.render.height) == (5, 16384, 1920, 1080)
-    assert (config.render.psnr_min, str(config.render.psnr_over)) == (27.0, "block")
+    assert (config.render.psnr_min, config.render.camera_psnr_min) == (27.0, 0.0)
     assert (config.perturb.epdms_min, config.reward.progress_above) == (0.8, 0.5)
 
 
@@ -39,7 +39,7 @@ def test_the_defaults_differ_in_vocabulary_pictures_and_gates() -> None:
         "expert.recovery.smooth=True (False)",
         "render.width=320 (1920)",
         "render.height=180 (1080)",
-        "render.psnr_over=camera (block)",
+        "render.camera_psnr_min=20.0 (0.0)",
         "render.gate.enabled=True (False)",
     ]
     assert "\n" not in setup_text(config, choose_vocabulary(config.vocabulary))
