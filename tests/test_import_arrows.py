@@ -22,7 +22,7 @@ ROOMS = {
     "tasks": (
         *("caches", "subscores", "stages", "settings", "kernels", "world", "rollout", "reward.rules", "reward"),
         *("experts", "perturb", "attempt", "hard_scenes", "trajectories"),
-        *("render.splatting", "render.scene", "render.fit", "render"),
+        *("render.splatting", "render.scene", "render.rig", "render.fit", "render"),
     ),
     "factory": (
         *("exits", "wording", "job", "readers.settings", "readers.town.settings", "config", "readers", "store"),

@@ -23,6 +23,7 @@ from tasks.caches import user_cache
 from tasks.experts.pdm_closed.settings import PdmSettings
 from tasks.experts.protocol import Expert, tried_once
 from tasks.render.fit.lpips import BadWeights, lpips_of
+from tasks.render.rig.settings import RigSettings
 from tasks.render.rigs import RIGS
 from tasks.render.scene import engine
 from tasks.render.settings import REMOVED, RenderMode
@@ -38,7 +39,7 @@ RIGS_LOOKED_AT = 3  # clips, for the names of their cameras
 ABSENT = object()
 # Settings that came later: at what held before there was a choice they are left out, so that older tables go on.
 ADDED: dict[str, object] = {"perturb.interleaved": True, "perturb.order": "drawn", "perturb.at_most": None}
-ADDED |= {"render.camera_psnr_min": 0.0}
+ADDED |= {"render.camera_psnr_min": 0.0, "render.rig": dataclasses.asdict(RigSettings())}
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ import numpy as np
 from factory.graph.work import Stopped, never
 from factory.readers.videos import file_and_frame
 from factory.stages.fitting import fitted
+from factory.stages.rig import corrected_rig, known_of, wanted
 from factory.stages.scene_file import SUFFIX, BadScene, read_scene, write_scene
 from factory.stages.sensors import block_of, chosen_cameras, load_sensors, load_sweeps, taken_by
 from tasks.render.fit.lpips import lpips_of
@@ -93,12 +94,18 @@ def asset_for(
             except BadScene as error:
                 log.warning("%s; it is built again", error)
         if made_of is not Sensing.LIDAR_ONLY:
+            found = None
+            if wanted(block, settings.rig):
+                block, cameras, found = corrected_rig(path, block, cameras, settings.rig)
             data = load_sensors(block, cameras, settings.width, settings.height)
+            if found is not None:
+                data = replace(data, known=known_of(data, block, found))
             if settings.scene is SceneFrom.FIT:
                 lpips = lpips_of(settings.lpips) if settings.lpips else None
                 asset = fitted(path, data, block.agents, settings.fit, threads, stopped, settings.backend, lpips)
             else:
-                asset = build_asset(data.photos, data.sweeps, block.agents, settings.asset, data.road)
+                asset = build_asset(data.photos, data.sweeps, block.agents, settings.asset, data.known)
+            asset = replace(asset, rig=cameras if found is not None else ())
         else:
             asset = lidar_asset(load_sweeps(block.sweeps, with_intensity=True), block.agents)
         return write_scene(path, replace(asset, block=range_of(clip, block)))
@@ -137,6 +144,8 @@ def block_id(clip: Clip, settings: RenderSettings) -> str:
     how: list[object] = [settings.width, settings.height, sorted(settings.cameras), made]
     if settings.lpips and part == "fit":  # a scene without the measure is made again
         how.append([[Path(name).name, Path(name).stat().st_size] for name in settings.lpips])
+    if wanted(block, settings.rig) or not block.sweeps:
+        how.append(asdict(settings.rig))
     digest.update(json.dumps([made_of, how], sort_keys=True).encode())
     for file in (*block.images, *block.sweeps):
         path, _ = file_and_frame(file.uri)

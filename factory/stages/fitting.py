@@ -43,7 +43,7 @@ def fitted(
     with all of its iterations kept, ValueError without photos to learn from, and BackendMissing.
     """
     drawing = backend_of(backend, threads)
-    problem, state = prepare(data.photos, data.sweeps, agents, settings, threads=threads, road=data.road)
+    problem, state = prepare(data.photos, data.sweeps, agents, settings, threads=threads, known=data.known)
     begun, said = path.with_suffix(BEGUN), path.with_suffix(SAID)
     state = _resumed(begun, state)
     first, began = state.iteration, time.monotonic()

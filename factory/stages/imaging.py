@@ -97,7 +97,7 @@ class Imaging:
         tags = [TAG_OF[made_of]] if made_of in TAG_OF else []
         if poor_block(asset, self.settings) is not None:
             tags.append(LOW_PSNR)
-        return self._drawn(clip, judged, asset, cameras) | {"tags": tags}
+        return self._drawn(clip, judged, asset, asset.as_corrected(cameras)) | {"tags": tags}
 
     def unfit(self, clip: Clip, candidate: Candidate, judged: Judged, shared: Sequence[int] = ()) -> Rejected | None:
         """Why a simulated drive cannot be shown: what `tasks.render.gate` finds on its pictures from T to T+2H.
@@ -118,9 +118,10 @@ class Imaging:
         looks = self.settings.gate.vehicle_min > 0.0  # at vehicles
         album = _kept_album(_of_block(clip, self.settings, self.cache_dir)) if looks else None
         states = np.concatenate([candidate.rollout.ego_states, judged.rollout.ego_states[1:]])
+        asset = _block(clip, self.settings, self.cache_dir)
         return unfit(
-            _block(clip, self.settings, self.cache_dir),
-            chosen_cameras(clip.cameras, self.settings.cameras),
+            asset,
+            asset.as_corrected(chosen_cameras(clip.cameras, self.settings.cameras)),
             pose_on_ground(clip.world_from_ego, states[[step - start for step in steps]]),
             judged.scene.agents.overwritten(now, judged.rollout.agents),
             steps,
@@ -261,7 +262,7 @@ def _kept(block: _Block) -> RenderAsset | None:
 
 def album_of(clip: Clip, asset: RenderAsset, settings: RenderSettings) -> Album:
     """The photos of a clip's block; one is opened when a vehicle is first held against it. Raises BadClip then."""
-    block, cameras = block_of(clip), chosen_cameras(clip.cameras, settings.cameras)
+    block, cameras = block_of(clip), asset.as_corrected(chosen_cameras(clip.cameras, settings.cameras))
     shown = sightings(block.images, cameras, block.agents)
     tracks: dict[int, list[str]] = {}
     for track_id, seen in shown.items():

@@ -9,7 +9,8 @@
 | `exposures` | (P, 3, 4) | what each photo made of the light, where they were aligned |
 
 The header's entry `scene` holds the rest: format, the nodes' track ids, quality photo by photo, the photos of the
-exposures, the block's range, and the digest over all of it. No code runs when a file is read.
+exposures, the block's range, the cameras where they were corrected, and the digest over all of it. No code runs when a
+file is read.
 """
 
 import hashlib
@@ -30,11 +31,13 @@ from factory.store.identity import canonical_json
 from tasks.render.scene.asset import BlockRange, ClassQuality, Exposure, RenderAsset, ViewQuality
 from tasks.render.scene.sky import SkyMap
 from tasks.render.splatting.gaussians import Gaussians
+from tasks.world.camera import Camera
 
 FORMAT, VERSION = "driving-data-factory scene", 1
 MEASURES = ("psnr_db", "ssim", "lpips", "away_m")  # of views and their classes: NaN or infinite, maybe
 KEY = "scene"  # one entry: safetensors writes several in no fixed order
 SUFFIX = ".safetensors"
+CALIBRATED = ("intrinsics", "distortion", "ego_from_camera")  # of a camera, arrays
 Tensors = Mapping[str, NDArray[Any]]
 
 
@@ -116,6 +119,7 @@ def tensors_of(asset: RenderAsset) -> dict[str, NDArray[Any]]:
 def described_by(asset: RenderAsset) -> dict[str, Any]:
     """What of the scene is no array, as plain JSON values; NaN is null."""
     block = asset.block
+    rig = [asdict(camera) | {name: getattr(camera, name).tolist() for name in CALIBRATED} for camera in asset.rig]
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -125,7 +129,7 @@ def described_by(asset: RenderAsset) -> dict[str, Any]:
         "views": [_plain(asdict(view)) for view in asset.views],
         "exposures": [[exposure.camera, exposure.time_s] for exposure in asset.exposures],
         "block": None if block is None else asdict(block) | {"low": block.low.tolist(), "high": block.high.tolist()},
-    }
+    } | ({"rig": rig} if rig else {})
 
 
 def scene_of(tensors: Tensors, described: Mapping[str, Any], digest: str) -> RenderAsset:
@@ -151,6 +155,10 @@ def scene_of(tensors: Tensors, described: Mapping[str, Any], digest: str) -> Ren
             for i, (camera, time_s) in enumerate(described["exposures"])
         ),
         block=block,
+        rig=tuple(
+            Camera(**camera | {name: np.array(camera[name], np.float64) for name in CALIBRATED})
+            for camera in described.get("rig", ())
+        ),
     )
 
 

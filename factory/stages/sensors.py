@@ -13,9 +13,10 @@ from factory.readers.nuscenes_points import read_points
 from factory.readers.pcd import read_pcd
 from factory.readers.videos import file_and_frame, video_frames
 from tasks.render.scene.driven_road import driven_road
+from tasks.render.scene.features import NOTHING_KNOWN, Known
 from tasks.render.scene.sensed import Photo, Sweep, on_ego
 from tasks.render.views import undistorted
-from tasks.world.arrays import Array, Bytes
+from tasks.world.arrays import Bytes
 from tasks.world.camera import Camera, SensorFile
 from tasks.world.clip import Block, Clip
 
@@ -29,7 +30,7 @@ class SensorData:
 
     photos: tuple[Photo, ...]  # without distortion, at the size asked for
     sweeps: tuple[Sweep, ...]
-    road: Array | None = None  # (M, 3) points of the road where the ego drove, world; of blocks without lidar
+    known: Known = NOTHING_KNOWN  # of blocks without lidar, world
 
 
 def block_of(clip: Clip) -> Block:
@@ -46,15 +47,15 @@ def load_sensors(block: Block, cameras: Sequence[Camera], width: int, height: in
     if block.sweeps or block.ground_m is None or not block.images:
         return SensorData(photos, load_sweeps(block.sweeps))
     poses = np.stack([file.world_from_ego for file in sorted(block.images, key=lambda file: file.time_s)])
-    return SensorData(photos, (), driven_road(poses, block.ground_m))
+    return SensorData(photos, (), Known(road=driven_road(poses, block.ground_m)))
 
 
 def load_photos(files: Sequence[SensorFile], cameras: Sequence[Camera], width: int, height: int) -> tuple[Photo, ...]:
     """The files that `cameras` took, without distortion, resized to width x height. Raises BadClip."""
     took = {camera.name: camera for camera in cameras}
-    mine = [file for file in files if file.sensor in took]
-    opened = ((row, mine[row], image) for row, image in _opened(mine, took))
-    photos = {row: _photo(file, image, took[file.sensor], width, height) for row, file, image in opened}
+    mine = taken_by(cameras, files)
+    opened = opened_photos(mine, cameras)
+    photos = {row: _photo(mine[row], image, took[mine[row].sensor], width, height) for row, image in opened}
     return tuple(photos[row] for row in range(len(mine)))
 
 
@@ -93,8 +94,21 @@ def decode_image(data: bytes, name: str) -> Bytes:
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
 
 
+def opened_photos(files: Sequence[SensorFile], cameras: Sequence[Camera]) -> Iterator[tuple[int, Bytes]]:
+    """Row and picture of each file of the `cameras`, as it was taken, one in memory at a time. Raises BadClip.
+
+    A video is gone through once.
+    """
+    took = {camera.name: camera for camera in cameras}
+    for row, image in _opened(files, took):
+        file, camera = files[row], took[files[row].sensor]
+        if image.shape[:2] != (camera.height, camera.width):
+            size = f"{image.shape[1]}x{image.shape[0]}"
+            raise BadClip(file.uri, "size", f"{size}, but {camera.name} takes {camera.width}x{camera.height}")
+        yield row, image
+
+
 def _opened(files: Sequence[SensorFile], took: Mapping[str, Camera]) -> Iterator[tuple[int, Bytes]]:
-    """Row and picture of each file, one in memory at a time; a video is gone through once. Raises BadClip."""
     filmed: dict[tuple[Path, str], dict[int, int]] = {}  # video and camera -> frame -> row
     for row, file in enumerate(files):
         path, frame = file_and_frame(file.uri)
@@ -112,9 +126,6 @@ def _opened(files: Sequence[SensorFile], took: Mapping[str, Camera]) -> Iterator
 
 
 def _photo(file: SensorFile, image: Bytes, camera: Camera, width: int, height: int) -> Photo:
-    if image.shape[:2] != (camera.height, camera.width):
-        size = f"{image.shape[1]}x{image.shape[0]}"
-        raise BadClip(file.uri, "size", f"{size}, but {camera.name} takes {camera.width}x{camera.height}")
     left, top, w, h = camera.window(width, height)
     flat = undistorted(image, camera)[top : top + h, left : left + w]
     shrinks = width < w

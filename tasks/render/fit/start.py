@@ -14,7 +14,7 @@ from tasks.render.fit.road import Road, above_road, find_road, lay_flat
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.state import BACKGROUND, FitState, logits_of
 from tasks.render.scene.build import held_out_rows, sky_of, surfaces
-from tasks.render.scene.features import known_without_lidar
+from tasks.render.scene.features import NOTHING_KNOWN, Known, Points, known_without_lidar
 from tasks.render.scene.movers import behind_boxes
 from tasks.render.scene.sensed import Photo, Sweep, Tracks, fuse, shifted
 from tasks.render.scene.sight import Seen, see
@@ -57,10 +57,10 @@ def prepare(
     settings: FitSettings,
     held_out: Collection[int] | None = None,
     threads: int = 2,
-    road: Array | None = None,
+    known: Known = NOTHING_KNOWN,
 ) -> tuple[Problem, FitState]:
     """The problem and its first state. `held_out`: indices of photos that only measure, else as `settings` says.
-    The number of `threads` changes no bit, here and in all of the fit. `road`: as of `build_asset`.
+    The number of `threads` changes no bit, here and in all of the fit. `known`: as of `build_asset`.
 
     Raises ValueError without photos to train on.
     """
@@ -72,23 +72,23 @@ def prepare(
     tracks = Tracks(agents, origin)
     train = [p for i, p in enumerate(local) if i not in out]
     static, per_track = fuse([replace(s, world_from_ego=shifted(s.world_from_ego, -origin)) for s in sweeps], tracks)
-    static = static if sweeps else known_without_lidar(train, tracks, None if road is None else road - origin)
+    points = Points(static) if sweeps else known_without_lidar(train, tracks, known.shifted(-origin))
 
     first_seen = [i for k, group in enumerate(instants(train)) if k % settings.start_every == 0 for i in group]
     looked_at = [train[i] for i in sorted(first_seen)]
 
     def look(first: int, last: int) -> list[Seen]:
         n = settings.stereo_photos
-        return [see(p, train, static, per_track, tracks, n) for p in looked_at[first:last]]
+        return [see(p, train, points, per_track, tracks, n) for p in looked_at[first:last]]
 
     seen = [s for part in in_chunks(look, len(looked_at), 1, threads) for s in part]
     exposures = np.zeros((len(train), EXPOSURE_SIZE), np.float32)
     if settings.exposure_rate > 0.0:
-        exposures = _exposures(train, looked_at, exposures_of(looked_at, seen, static))
+        exposures = _exposures(train, looked_at, exposures_of(looked_at, seen, points.every))
     alike = in_agreement(looked_at, exposures[sorted(first_seen)])
     background, nodes = surfaces(alike, seen, tracks)
     eyes = np.stack([p.world_from_camera[:3, 3] for p in train])
-    surface = find_road(static, eyes) if settings.road else None
+    surface = find_road(points.every, eyes) if settings.road else None
     cars = [nodes.get(i) for i in tracks.ids]
     bodies = _bodies(cars, tracks, [p.time_s for p in train])
     state = _first_state(background, cars, bodies, sky_of(alike, seen).rgb, exposures, surface, settings)

@@ -12,6 +12,7 @@ from tasks.render.scene.sky import SkyMap
 from tasks.render.splatting.gaussians import Gaussians, concatenate, moved
 from tasks.world.agents import AgentKind
 from tasks.world.arrays import F32, Array
+from tasks.world.camera import Camera
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,12 @@ class RenderAsset:
     views: tuple[ViewQuality, ...] = ()  # photo by photo, where that was measured
     exposures: tuple[Exposure, ...] = ()  # of the photos, where they were aligned
     block: BlockRange | None = None  # filled by whoever knows the log
+    rig: tuple[Camera, ...] = ()  # cameras that its photos were corrected to; empty: they are as given
+
+    def as_corrected(self, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
+        """The cameras to draw it with: of the scene's own rig those of the same names, where it has one."""
+        mine = {camera.name: camera for camera in self.rig}
+        return tuple(mine.get(camera.name, camera) for camera in cameras)
 
     def affine_of(self, camera: str) -> F32:
         """(3, 4) what a camera makes of the scene's light at poses that no photo was taken from: the mean over its

@@ -14,7 +14,7 @@ import numpy as np
 from tasks.render.scene.asset import RenderAsset, ViewQuality, mean_psnr_db, psnr, scene_at
 from tasks.render.scene.choose import BACKGROUND, Look, choose, count_free_space, with_mirror_image
 from tasks.render.scene.engine import Vehicles, render
-from tasks.render.scene.features import known_without_lidar
+from tasks.render.scene.features import NOTHING_KNOWN, Known, Points, known_without_lidar
 from tasks.render.scene.movers import owners, world_from_boxes
 from tasks.render.scene.sensed import Photo, Sweep, Tracks, fuse, shifted
 from tasks.render.scene.settings import AssetSettings
@@ -38,11 +38,11 @@ def build_asset(
     sweeps: Sequence[Sweep],
     agents: AgentTracks | None,
     settings: AssetSettings,
-    road: Array | None = None,
+    known: Known = NOTHING_KNOWN,
 ) -> RenderAsset:
     """The scene of one block. `agents`: 10 Hz tracks whose first step is time 0 of photos and sweeps.
 
-    road: points (M, 3) of it that are known without lidar; where there are sweeps these know better.
+    known: what is known without lidar; where there are sweeps these know better.
     Raises ValueError without photos: there is nothing to take colours from.
     """
     if not photos:
@@ -54,8 +54,8 @@ def build_asset(
     train = [p for i, p in enumerate(photos) if i not in held_out]
     tracks = Tracks(agents, origin)
     static, per_track = fuse(sweeps, tracks)
-    static = static if sweeps else known_without_lidar(train, tracks, None if road is None else road - origin)
-    seen = [see(p, train, static, per_track, tracks, settings.stereo_photos) for p in train]
+    points = Points(static) if sweeps else known_without_lidar(train, tracks, known.shifted(-origin))
+    seen = [see(p, train, points, per_track, tracks, settings.stereo_photos) for p in train]
     background, nodes = surfaces(train, seen, tracks)
     sky = sky_of(train, seen)
     asset = RenderAsset(origin, background, nodes, sky, float("nan"))

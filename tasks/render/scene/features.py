@@ -1,11 +1,12 @@
 """Points without lidar: corners found in two photos whose poses are known, and where their rays meet."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from tasks.render.scene.driven_road import with_road
+from tasks.render.scene.driven_road import beside_road
 from tasks.render.scene.movers import owners
 from tasks.render.scene.sensed import Photo, Tracks, voxel_rows
 from tasks.render.scene.stereo import MAX_BASELINE_M, MIN_BASELINE_M
@@ -20,10 +21,40 @@ LEAST_PARALLAX_DEG = 0.7
 FARTHEST_M = 80.0
 
 
-def known_without_lidar(photos: Sequence[Photo], tracks: Tracks, road: Array | None) -> Array:
-    """Points (M, 3) that stay, in the photos' frame: corners, and the `road` (K, 3) where that is known."""
-    points = triangulated(photos, tracks)
-    return points if road is None else with_road(points, road)
+@dataclass(frozen=True)
+class Known:
+    """Points of a block that are known without lidar."""
+
+    road: Array | None = None  # (K, 3) where the ego drove
+    corners: Array | None = None  # (M, 3) of the rig's adjustment; None: photos of one camera are matched in pairs
+
+    def shifted(self, by: Array) -> "Known":
+        """Moved by (3,)."""
+        return Known(*(None if points is None else points + by for points in (self.road, self.corners)))
+
+
+NOTHING_KNOWN = Known()
+
+
+@dataclass(frozen=True)
+class Points:
+    """Where surfaces are, for sure."""
+
+    dense: Array  # (M, 3) of lidar or of the driven road: between them surfaces go on
+    corners: Array | None = None  # (K, 3) far apart; None: there is lidar
+
+    @property
+    def every(self) -> Array:
+        """(M + K, 3)"""
+        return self.dense if self.corners is None else np.concatenate([self.corners, self.dense])
+
+
+def known_without_lidar(photos: Sequence[Photo], tracks: Tracks, known: Known) -> Points:
+    """What is known of a block without lidar, in the photos' frame."""
+    corners = triangulated(photos, tracks) if known.corners is None else known.corners
+    if known.road is None:
+        return Points(np.zeros((0, 3)), corners)
+    return Points(known.road, beside_road(corners, known.road))
 
 
 def triangulated(photos: Sequence[Photo], tracks: Tracks) -> Array:

@@ -5,14 +5,17 @@ Lidar gives sparse depth, gaps are closed along surfaces; what lidar does not re
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from tasks.render.scene.depth import dense_depth, sparse_depth
+from tasks.render.scene.features import Points
 from tasks.render.scene.movers import behind_boxes, world_from_boxes
 from tasks.render.scene.sensed import Photo, Tracks
 from tasks.render.scene.sky import directions
-from tasks.render.scene.stereo import FAR_M, MAX_BASELINE_M, MIN_BASELINE_M, sweep_depth
+from tasks.render.scene.stereo import FAR_M, MAX_BASELINE_M, MIN_BASELINE_M, Compared, sweep_depth
+from tasks.render.scene.wide_stereo import partners, wide_depth
 from tasks.world.arrays import F32, Array, Bools, ShortInts
 
 SHALLOW = -2  # label of a pixel without lidar
@@ -31,7 +34,7 @@ class Seen:
 def see(
     photo: Photo,
     others: Sequence[Photo],
-    static: Array,
+    known: Points,
     per_track: dict[int, Array],
     tracks: Tracks,
     stereo_photos: int,
@@ -41,7 +44,7 @@ def see(
     rgb = photo.rgb.astype(np.float32) / 255.0
     boxes, valid = tracks.at(photo.time_s)
     poses = world_from_boxes(boxes)
-    points, labels = [static], [np.full(len(static), -1, np.int32)]
+    points, labels = [known.dense], [np.full(len(known.dense), -1, np.int32)]
     for j, mine in per_track.items():
         if valid[j]:
             points.append(mine @ poses[j, :3, :3].T + poses[j, :3, 3])
@@ -62,10 +65,14 @@ def see(
     unknown = depth == 0.0
     brightness = rgb.mean(axis=-1)
     bright = (brightness > 0.6) | ((rgb[..., 2] > rgb[..., 0] + 0.04) & (brightness > 0.4))
-    neighbours = _neighbours(photo, others, stereo_photos)
-    hints = _hints(depth)
+    hints, camera = _hints(depth), (photo.intrinsics, photo.world_from_camera)
+    if known.corners is None:
+        neighbours, sweep = _neighbours(photo, others, stereo_photos), partial(sweep_depth, rgb, hints)
+    else:
+        anchors, _ = sparse_depth(known.corners, np.zeros(len(known.corners), np.int32), *camera, width, height)
+        neighbours, sweep = partners(photo, others, stereo_photos), partial(wide_depth, rgb, anchors)
     if neighbours:
-        guess, cost, sky_cost = sweep_depth(rgb, hints, neighbours, photo.intrinsics, photo.world_from_camera, unknown)
+        guess, cost, sky_cost = sweep(neighbours, *camera, unknown)
         sky = unknown & ((bright & (sky_cost < 1.3 * cost + 0.03)) | (guess >= FAR_M))
     else:
         guess, sky = hints[0], unknown & (bright | (hints[0] == 0.0))
@@ -94,7 +101,7 @@ def _hints(depth: F32) -> F32:
     ).astype(np.float32)
 
 
-def _neighbours(photo: Photo, others: Sequence[Photo], n: int) -> list[tuple[F32, Array, Array]]:
+def _neighbours(photo: Photo, others: Sequence[Photo], n: int) -> list[Compared]:
     """The n photos whose baseline is closest to 1 m and that look the same way."""
     candidates = []
     for i, other in enumerate(others):

@@ -4,6 +4,7 @@ A plane sweep (Collins 1996): each hypothesis of a pixel's depth says where neig
 hypothesis under which the colours agree best, over a small window, wins.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -16,13 +17,14 @@ FAR_M = 1.0e4  # stands for the sky
 LEVELS_M = (*(float(z) for z in 1.0 / np.linspace(1.0 / 5.0, 1.0 / 160.0, 28)), FAR_M)
 WINDOW_PX = 7
 MIN_BASELINE_M, MAX_BASELINE_M = 0.3, 6.0  # less: no parallax; more: nothing in common
+Compared = tuple[F32, Array, Array]  # a photo's rgb (H, W, 3) in [0, 1], intrinsics, world_from_camera
 UNSEEN_COST = 0.25  # of a pixel whose hypothesis lies outside the other photo
 
 
 def sweep_depth(
     rgb: F32,
     hints: F32,
-    others: list[tuple[F32, Array, Array]],
+    others: Sequence[Compared],
     intrinsics: Array,
     world_from_camera: Array,
     wanted: Bools,
@@ -33,22 +35,49 @@ def sweep_depth(
     intrinsics, world_from_camera) of at least one other photo. Pixels that are not `wanted` (H, W) hold nothing of use.
     """
     height, width = rgb.shape[:2]
-    photos = np.stack([other_rgb for other_rgb, _, _ in others])
-    from_here = [np.linalg.inv(pose) @ world_from_camera for _, _, pose in others]
-    turned = np.stack([k @ pose[:3, :3] for (_, k, _), pose in zip(others, from_here)])
-    shifts = np.stack([k @ pose[:3, 3] for (_, k, _), pose in zip(others, from_here)])
-    around = cv2.dilate(wanted.astype(np.uint8), np.ones((WINDOW_PX, WINDOW_PX), np.uint8)).astype(np.bool_)
     best, best_cost = np.zeros((height, width), np.float32), np.full((height, width), np.inf, np.float32)
     sky_cost = best_cost
     for hypothesis in (*hints, *LEVELS_M):
         depth = np.broadcast_to(np.asarray(hypothesis, np.float32), (height, width))
-        raw = _disagreement(rgb, photos, turned, shifts, intrinsics, np.ascontiguousarray(depth), around)
-        cost = np.where(depth > 0, cv2.blur(raw, (WINDOW_PX, WINDOW_PX)), np.float32(np.inf))
+        cost = with_cost(rgb, others, intrinsics, world_from_camera, depth, wanted, WINDOW_PX)
         better = cost < best_cost
         best, best_cost = np.where(better, depth, best), np.where(better, cost, best_cost)
         if isinstance(hypothesis, float) and hypothesis == FAR_M:
             sky_cost = cost
     return best, best_cost, sky_cost
+
+
+def with_cost(
+    rgb: F32,
+    others: Sequence[Compared],
+    intrinsics: Array,
+    world_from_camera: Array,
+    depth: F32,
+    wanted: Bools,
+    window: int,
+) -> F32:
+    """(H, W) disagreement over a window of pixels where these are as deep as `depth` (H, W); infinite where it is 0."""
+    around = cv2.dilate(wanted.astype(np.uint8), np.ones((window, window), np.uint8)).astype(np.bool_)
+    raw = disagreement(rgb, others, intrinsics, world_from_camera, depth, around)
+    return np.asarray(np.where(depth > 0, cv2.blur(raw, (window, window)), np.float32(np.inf)))
+
+
+def disagreement(
+    rgb: F32,
+    others: Sequence[Compared],
+    intrinsics: Array,
+    world_from_camera: Array,
+    depth: F32,
+    wanted: Bools,
+) -> F32:
+    """(H, W) what `_disagreement` says, pixel by pixel."""
+    photos = np.stack([other_rgb for other_rgb, _, _ in others])
+    from_here = [np.linalg.inv(pose) @ world_from_camera for _, _, pose in others]
+    turned = np.stack([k @ pose[:3, :3] for (_, k, _), pose in zip(others, from_here)])
+    shifts = np.stack([k @ pose[:3, 3] for (_, k, _), pose in zip(others, from_here)])
+    return np.asarray(
+        _disagreement(rgb, photos, turned, shifts, intrinsics, np.ascontiguousarray(depth, np.float32), wanted)
+    )
 
 
 @kernel

@@ -9,6 +9,7 @@ import street
 from tasks.render.fit.corrections import exposed, exposures_of, in_agreement, instants, inverse
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import prepare
+from tasks.render.scene.features import Points
 from tasks.render.scene.sensed import Photo, Tracks, fuse
 from tasks.render.scene.sight import see
 
@@ -42,7 +43,7 @@ def test_photos_of_an_instant_come_out_alike_on_what_both_see() -> None:
     photos = pair()
     tracks = Tracks(None, np.zeros(3))
     static, _ = fuse([street.sweep(x, 0.1 * x, with_car=False) for x in (0.0, 1.0, 2.0, 3.0)], tracks)
-    seen = [see(p, photos, static, {}, tracks, 1) for p in photos]
+    seen = [see(p, photos, Points(static), {}, tracks, 1) for p in photos]
     rows = exposures_of(photos, seen, static)
     alike = in_agreement(photos, rows)
     ground = slice(50, 70), slice(20, 100)

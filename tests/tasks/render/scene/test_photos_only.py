@@ -5,6 +5,7 @@ import pytest
 import street
 
 from tasks.render.scene.build import AssetSettings, build_asset
+from tasks.render.scene.features import Points
 from tasks.render.scene.sensed import Photo, Tracks
 from tasks.render.scene.sight import see
 from tasks.world.agents import AgentKind, AgentTracks
@@ -22,7 +23,8 @@ def test_a_road_that_is_known_lies_behind_a_car_and_not_on_it() -> None:
         ("car",), (AgentKind.VEHICLE,), box, np.zeros((1, 1, 2)), np.ones((1, 1), bool), np.full((1, 1), 0.8),
         np.array([1.6]),
     )  # fmt: skip
-    free, hidden = (see(photo, [], road, {}, Tracks(agents, np.zeros(3)), 0).depth for agents in (None, car))
+    known = Points(road, np.zeros((0, 3)))
+    free, hidden = (see(photo, [], known, {}, Tracks(agents, np.zeros(3)), 0).depth for agents in (None, car))
     assert free[38, 48] == pytest.approx(1.5 * 60.0 / 6.5, rel=0.1)  # 14 m, the road there
     assert hidden[38, 48] != pytest.approx(free[38, 48], rel=0.2)
     assert hidden[60, 48] == pytest.approx(free[60, 48], rel=1e-6)  # in front of the car nothing changes

@@ -1,0 +1,1 @@
+"""A rig's calibration and poses, corrected by what its photos show together."""

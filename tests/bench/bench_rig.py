@@ -1,0 +1,118 @@
+"""A real rig of eight cameras at 2 Hz: `python -m tests.bench.bench_rig <openscene_0101> [out=DIR] [setting=value]`.
+
+Instants 20 and 27 of all cameras are held out: they are matched for their poses, and nothing else is taken from them.
+With `validate=1` those two are not read at all and instants 18 and 24 are held out instead: what knobs are to be tuned
+on. `adjust=0` leaves the calibration as given. Settings are those of `FitSettings`, for instance iterations=2000.
+"""
+
+import json
+import sys
+import time
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+
+from factory.stages.rig import lines_of
+from factory.stages.sensors import load_photos, opened_photos
+from tasks.render.fit.losses import ssim
+from tasks.render.fit.reconstruct import advance, picture_of
+from tasks.render.fit.settings import FitSettings
+from tasks.render.fit.start import prepare
+from tasks.render.rig.corners import corners_of
+from tasks.render.rig.correct import Correction, corrected
+from tasks.render.rig.ground import ground_below
+from tasks.render.rig.settings import RigSettings
+from tasks.render.scene.asset import psnr
+from tasks.render.scene.driven_road import driven_road
+from tasks.render.scene.features import Known
+from tasks.world.camera import Camera, SensorFile
+
+SIZE = (480, 270)
+HELD_OUT, VALIDATED = (20, 27), (18, 24)
+SETTINGS = replace(FitSettings(), iterations=6000, start_gaussians=300_000, most_gaussians=350_000)
+
+
+def read_block(root: Path, left_out: tuple[int, ...]) -> tuple[list[Camera], list[SensorFile], list[int]]:
+    """The rig, its photos and the instant of each."""
+    told = json.loads((root / "cameras.json").read_text())
+    cameras = []
+    for name, row in told["cameras"].items():
+        mount = np.eye(4)
+        mount[:3, :3], mount[:3, 3] = row["cam_to_ego"]["R"], row["cam_to_ego"]["t"]
+        arrays = np.array(row["K"], np.float64), np.array(row["dist_k1k2p1p2k3"], np.float64), mount
+        cameras.append(Camera(name, told["width"], told["height"], *arrays))
+    files, instants = [], []
+    for k, frame in enumerate(told["frames"]):
+        pose, number = np.array(frame["ego_to_world"]), frame["frame"]
+        for camera in cameras if number not in left_out else ():
+            path = root / f"frame_{number}" / f"{camera.name}.jpg"
+            files.append(SensorFile(camera.name, str(path), 0.5 * k, pose))
+            instants.append(number)
+    return cameras, files, instants
+
+
+def correct(cameras: list[Camera], files: list[SensorFile], settings: RigSettings) -> Correction:
+    """As a run does it, and what it says of each camera."""
+    opened = {}
+    for row, image in opened_photos(files, cameras):
+        opened[row] = corners_of(image, settings.width, settings.corners)
+    found = corrected(cameras, files, [opened[row] for row in range(len(files))], settings)
+    assert found is not None, "too few corners were matched"
+    print("\n".join(lines_of(found)), f"{len(found.points)} points", sep="\n", flush=True)
+    return found
+
+
+def main() -> None:
+    """Corrects the rig, trains and prints what comes out camera by camera."""
+    root, options = Path(sys.argv[1]), dict(option.split("=", 1) for option in sys.argv[2:])
+    validate, threads = options.pop("validate", "0") == "1", int(options.pop("threads", "2"))
+    adjust, ground = options.pop("adjust", "1") == "1", options.pop("ground", "")
+    rig = RigSettings(**{k.removeprefix("rig."): float(options.pop(k)) for k in list(options) if k.startswith("rig.")})
+    kinds = {field.name: type(getattr(FitSettings(), field.name)) for field in fields(FitSettings)}
+    settings = replace(SETTINGS, **{k: kinds[k](float(v)) for k, v in options.items()})
+
+    cameras, files, instants = read_block(root, HELD_OUT if validate else ())
+    known, started = Known(), time.process_time()
+    if adjust:
+        found = correct(cameras, files, rig)
+        cameras, files, known = list(found.cameras), list(found.files), Known(corners=found.points)
+    if ground:
+        poses = np.stack([file.world_from_ego for file in files])
+        known = replace(known, road=driven_road(poses, float(ground)))
+    photos = load_photos(files, cameras, *SIZE)
+    if adjust and not ground:
+        poses = np.stack([file.world_from_ego for file in files])
+        height = ground_below(photos, poses)
+        print(f"the road lies {height} m above the ego's origin")
+        known = replace(known, road=None if height is None else driven_road(poses, height))
+    print(f"{time.process_time() - started:.0f} CPU s for the rig", flush=True)
+    started = time.process_time()
+    out = VALIDATED if validate else HELD_OUT
+    held_out = [i for i, instant in enumerate(instants) if instant in out]
+    problem, state = prepare(photos, [], None, settings, held_out, threads, known)
+    print(
+        f"{time.process_time() - started:.0f} CPU s to prepare {len(state)} Gaussians, {state.road.sum()} of them road"
+    )
+    told: list[float] = []
+    for until in [at for at in (2000, 4000) if at < settings.iterations] + [settings.iterations]:
+        started = time.process_time()
+        advance(problem, state, settings, until, lambda at, loss, score: told.append(score), threads)
+        rows = {}
+        for shot in problem.held_out:
+            picture = picture_of(problem, state, shot.photo, threads)
+            score = psnr(picture, shot.target.rgb), ssim(picture, shot.target)[0]
+            rows.setdefault(shot.photo.camera, []).append(score)
+            rows.setdefault(f"at {shot.photo.time_s:g} s", []).append(score)
+        mean = np.mean([score for name in (c.name for c in cameras) for score in rows[name]], axis=0)
+        each = ", ".join(f"{name.removeprefix('CAM_')} {np.mean(row, axis=0)[0]:.1f}" for name, row in rows.items())
+        cpu = time.process_time() - started
+        print(
+            f"{until} iterations, {cpu:.0f} CPU s, {len(state)}: training {np.mean(told[-5:]):.2f}, "
+            f"held out {mean[0]:.2f} / {mean[1]:.3f}: {each}",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()

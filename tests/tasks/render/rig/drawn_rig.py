@@ -1,0 +1,86 @@
+"""A rig whose corners are known in closed form: points of a street, each with a descriptor of its own.
+
+Four cameras with a lens, 12 instants at 2 Hz along a bend driven faster and faster, poses and calibration as given.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tasks.render.rig.corners import UNIT, Corners
+from tasks.render.rig.normal import residuals
+from tasks.render.rig.rig import Rig, given_rig, motions
+from tasks.world.camera import Camera, SensorFile
+
+Array = NDArray[np.float64]
+WIDTH, HEIGHT, FOCAL = 960, 540, 700.0
+YAWS_DEG = {"front": 0.0, "left": 60.0, "back": 180.0, "right": -60.0}
+LENS = np.array([-0.2, 0.08, 0.001, -0.0005, -0.01])
+INSTANTS, NOISE_PX, POINTS = 12, 0.3, 2000
+
+
+def mount(yaw_deg: float) -> Array:
+    """ego_from_camera (4, 4)."""
+    yaw = np.radians(yaw_deg)
+    forward, down = np.array([np.cos(yaw), np.sin(yaw), 0.0]), np.array([0.0, 0.0, -1.0])
+    out = np.eye(4)
+    out[:3, :3] = np.stack([np.cross(down, forward), down, forward], axis=1)
+    out[:3, 3] = [1.0 + 0.7 * np.cos(yaw), 0.7 * np.sin(yaw), 1.5]
+    return out
+
+
+def cameras() -> list[Camera]:
+    """As they are."""
+    k = np.array([[FOCAL, 0.0, WIDTH / 2], [0.0, FOCAL, HEIGHT / 2], [0.0, 0.0, 1.0]])
+    return [Camera(name, WIDTH, HEIGHT, k, LENS, mount(yaw)) for name, yaw in YAWS_DEG.items()]
+
+
+def ego_pose(time_s: float) -> Array:
+    """(4, 4) on the bend; the ego accelerates from 4 m/s by 1 m/s2 and turns the more, the longer it drives."""
+    times = np.linspace(0.0, time_s, 200)
+    heading = 0.02 * times**2
+    speed = 4.0 + times
+    step = np.diff(times, prepend=0.0)
+    pose = motions(np.array([[np.sum(speed * np.cos(heading) * step), np.sum(speed * np.sin(heading) * step), 0, 0, 0,
+                              heading[-1]]]))  # fmt: skip
+    return np.asarray(pose[0])
+
+
+def files(names: list[str]) -> list[SensorFile]:
+    """A photo of each camera at each instant."""
+    return [SensorFile(name, f"{name}/{k}.jpg", 0.5 * k, ego_pose(0.5 * k)) for k in range(INSTANTS) for name in names]
+
+
+def corners_seen(
+    rig: list[Camera], taken: list[SensorFile], late_s: Callable[[str], float] = lambda name: 0.0, seed: int = 0
+) -> list[Corners]:
+    """Of each file what its camera saw, `late_s` after its stamp: points on both sides of the street, with noise."""
+    rng = np.random.Generator(np.random.Philox(key=[seed, 7]))
+    along, side = rng.uniform(-30.0, 70.0, POINTS), rng.choice([-1.0, 1.0], POINTS) * rng.uniform(4.0, 16.0, POINTS)
+    points = np.column_stack([along, side + 0.004 * along**2, rng.uniform(-0.2, 7.0, POINTS)])
+    looks = rng.normal(size=(POINTS, 128)) ** 2
+    looks = np.rint(UNIT * np.sqrt(looks / looks.sum(axis=1, keepdims=True))).astype(np.float32)
+    row = {camera.name: k for k, camera in enumerate(rig)}
+    late = [replace(file, world_from_ego=ego_pose(file.time_s + late_s(file.sensor))) for file in taken]
+    known, shots = given_rig(rig, late)
+    out = []
+    for i, file in enumerate(taken):
+        at = _off(known, points, row[file.sensor], shots.world_from_ego[i])
+        pose = shots.world_from_ego[i] @ rig[row[file.sensor]].ego_from_camera
+        ahead = (points - pose[:3, 3]) @ pose[:3, 2]
+        seen = (ahead > 2.0) & (ahead < 40.0) & (at > 0.0).all(axis=1) & (at < [WIDTH, HEIGHT]).all(axis=1)
+        x, y = (((points - pose[:3, 3]) @ pose[:3, k])[seen] / ahead[seen] for k in range(2))
+        rows = np.flatnonzero(seen)[np.hypot(x, y) < 1.0]  # beyond, the lens folds
+        noise = rng.normal(size=(len(rows), 2)) * NOISE_PX
+        out.append(Corners(at[rows] + noise, looks[rows], 1.0))
+    return out
+
+
+def _off(rig: Rig, points: Array, camera: int, world_from_ego: Array) -> Array:
+    """(M, 2) pixels of the points."""
+    n = len(points)
+    views, at = np.zeros(n, np.int64), np.zeros((n, 2))
+    poses = np.linalg.inv(world_from_ego)[None], np.linalg.inv(rig.ego_from_camera)
+    return np.asarray(residuals(points, np.arange(n), views, at, np.array([camera]), *poses, rig.lenses))
