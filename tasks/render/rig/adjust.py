@@ -59,6 +59,15 @@ def adjusted(rig: Rig, shots: Shots, matched: Matched, sigmas: Array) -> Bundle:
     return Bundle(now, points, with_company((last < OUT * WIDTHS_PX[-1]) & there[matched.point_of], matched))
 
 
+def without(matched: Matched, views: Array) -> Matched:
+    """Without the corners of some photos, and without points that then have fewer than two."""
+    keep = ~np.isin(matched.view_of, views)
+    count = np.bincount(matched.point_of, keep, len(matched.starts) - 1)
+    keep &= (count >= 2)[matched.point_of]
+    ends = np.cumsum(count[count >= 2]).astype(np.int64)
+    return Matched(np.concatenate([[0], ends]), matched.view_of[keep], matched.at[keep], matched.pixel[keep])
+
+
 def with_company(used: Bools, matched: Matched) -> Bools:
     """Without corners whose point has no second one."""
     count = np.bincount(matched.point_of, used, len(matched.starts) - 1)

@@ -6,16 +6,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from tasks.render.rig.adjust import Bundle, Matched, adjusted, offsets, triangulated
+from tasks.render.rig.adjust import Bundle, Matched, adjusted, offsets, triangulated, without
 from tasks.render.rig.corners import Corners
 from tasks.render.rig.matching import matched_corners, pairs
 from tasks.render.rig.normal import N_CAMERA
-from tasks.render.rig.rig import Rig, Shots, camera_of_rig, given_rig
+from tasks.render.rig.rig import Rig, Shots, camera_of_rig, given_rig, twists_of
 from tasks.render.rig.settings import RigSettings
 from tasks.world.arrays import Array
 from tasks.world.camera import Camera, SensorFile
 
 LEAST_CORNERS = 50  # of an instant: with fewer its correction is that between the instants before and after
+TOO_FAR = 10.0  # times what poses are expected to be off by: no pose is
 STRANGE = 0.15  # of the share of corners that agree in half of a camera's photos
 LEAST_POINTS = 200  # of a block, below which nothing is corrected
 
@@ -60,20 +61,33 @@ def corrected(
     local = shots.world_from_ego.copy()
     local[:, :3, 3] -= shift
     shots = replace(shots, world_from_ego=local)
-    matched = matched_corners(corners, pairs(rig, shots, cameras, settings.partners))
+    matched = matched_corners(rig, shots, corners, pairs(rig, shots, cameras, settings.partners))
     if len(matched.starts) <= LEAST_POINTS:
         return None
-    bundle = adjusted(rig, shots, matched, sigmas_of(cameras, len(rig.corrections), settings))
+    sigmas = sigmas_of(cameras, len(rig.corrections), settings)
+    bundle = adjusted(rig, shots, matched, sigmas)
+    strangers = _strangers(bundle, shots, matched, corners, settings)
+    if strangers:
+        matched = without(matched, np.array(strangers))
+        if len(matched.starts) <= LEAST_POINTS:
+            return None
+        bundle = adjusted(rig, shots, matched, sigmas)
     points = bundle.points[np.bincount(matched.point_of, bundle.used, len(bundle.points)) > 0]
     if len(points) < LEAST_POINTS:
         return None
     times = np.array([file.time_s for file in files])
     end = replace(bundle.rig, corrections=_between(bundle, shots, matched, times))
     poses = end.ego_poses(shots)
+    start = replace(end, corrections=rig.corrections).ego_poses(shots)
+    middle, scale = poses[:, :3, 3].mean(axis=0), _scale(poses[:, :3, 3], start[:, :3, 3])
+    mounts = end.ego_from_camera.copy()
+    mounts[:, :3, 3] *= scale
+    end = replace(end, ego_from_camera=mounts)
+    poses[:, :3, 3] = middle + scale * (poses[:, :3, 3] - middle)
+    points = middle + scale * (points - middle)
+    of_pose = twists_of(np.linalg.inv(start) @ poses)
+    of_camera = end.away_from(rig)[6 * len(rig.corrections) :].reshape(-1, N_CAMERA)
     poses[:, :3, 3] += shift
-    away = end.away_from(rig)
-    n = 6 * len(rig.corrections)
-    of_instant, of_camera = away[:n].reshape(-1, 6), away[n:].reshape(-1, N_CAMERA)
     before, after = _before_and_after(rig, bundle, shots, matched)
     camera_of = shots.camera_of[matched.view_of]
     changes = []
@@ -97,16 +111,24 @@ def corrected(
         tuple(replace(file, world_from_ego=pose) for file, pose in zip(files, poses)),
         points + shift,
         tuple(changes),
-        float(np.sqrt((of_instant[:, :3] ** 2).sum(axis=1).mean())),
-        float(np.degrees(np.sqrt((of_instant[:, 3:] ** 2).sum(axis=1).mean()))),
-        _strangers(bundle, shots, matched, corners),
+        float(np.sqrt((of_pose[:, :3] ** 2).sum(axis=1).mean())),
+        float(np.degrees(np.sqrt((of_pose[:, 3:] ** 2).sum(axis=1).mean()))),
+        strangers,
     )
+
+
+def _scale(places: Array, given: Array) -> float:
+    """By what places (V, 3) spread less than those given: photos tell no scale, the drive as logged does."""
+    off, wanted = places - places.mean(axis=0), given - given.mean(axis=0)
+    spread = float((off * off).sum())
+    return float((off * wanted).sum()) / spread if spread > 1.0 else 1.0
 
 
 def sigmas_of(cameras: Sequence[Camera], n_instants: int, settings: RigSettings) -> Array:
     """(n,) what each parameter of a rig may be off by, in the order of `Rig.away_from`."""
-    of_instant = [settings.pose_shift_m] * 3 + [np.radians(settings.pose_turn_deg)] * 3
-    rows = [np.tile(of_instant, n_instants)]
+    of_instant = np.repeat([settings.pose_shift_m, np.radians(settings.pose_turn_deg)], 3)
+    # Poses are off together, bit by bit along the drive: all of them weigh as much as one camera does.
+    rows = [np.tile(of_instant * np.sqrt(n_instants), n_instants)]
     for camera in cameras:
         mount = [settings.shift_m] * 3 + [np.radians(settings.turn_deg)] * 3
         pinhole = [settings.focal * camera.intrinsics[0, 0]] * 2 + [settings.centre * camera.width] * 2
@@ -135,15 +157,20 @@ def _between(bundle: Bundle, shots: Shots, matched: Matched, times: Array) -> Ar
     return out
 
 
-def _strangers(bundle: Bundle, shots: Shots, matched: Matched, corners: Sequence[Corners]) -> tuple[int, ...]:
-    """Photos of whose corners far fewer agree with the others than is usual for their camera."""
+def _strangers(
+    bundle: Bundle, shots: Shots, matched: Matched, corners: Sequence[Corners], settings: RigSettings
+) -> tuple[int, ...]:
+    """Photos of whose corners far fewer agree than is usual for their camera, or but where the ego cannot have been."""
+    away = twists_of(bundle.rig.corrections)[shots.instant_of]
+    elsewhere = np.linalg.norm(away[:, :3], axis=1) > TOO_FAR * settings.pose_shift_m
+    elsewhere |= np.degrees(np.linalg.norm(away[:, 3:], axis=1)) > TOO_FAR * settings.pose_turn_deg
     agree = np.bincount(matched.view_of, bundle.used, len(corners)) / np.maximum([len(c.at) for c in corners], 1)
     looked_at = np.array([len(c.at) for c in corners]) >= LEAST_CORNERS
     out = []
     for k in range(len(bundle.rig.lenses)):
         mine = np.flatnonzero((shots.camera_of == k) & looked_at)
         if len(mine):
-            out += [int(row) for row in mine if agree[row] < STRANGE * np.median(agree[mine])]
+            out += [int(row) for row in mine if elsewhere[row] or agree[row] < STRANGE * np.median(agree[mine])]
     return tuple(sorted(out))
 
 

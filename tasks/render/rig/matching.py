@@ -6,13 +6,14 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from tasks.render.rig.adjust import Matched
+from tasks.render.rig.adjust import Matched, offsets, rays, triangulated
 from tasks.render.rig.corners import Corners, matches
 from tasks.render.rig.rig import Rig, Shots
 from tasks.world.arrays import Array
 from tasks.world.camera import Camera
 
 DEPTHS_M = (5.0, 12.0, 40.0)  # at which it is asked what two photos share
+LIKELY, LIKELY_SHARE = 0.09, 0.5  # 5 degrees that a match may be off as given; share of a pair's that must not be
 GRID = (6, 4)  # pixels of a photo that are asked for, across and down
 LEAST_SHARE = 0.15  # of the first photo that the second must show
 BASELINES_M = (0.3, 20.0)  # less: no parallax; more: nothing looks the same
@@ -58,14 +59,32 @@ def _shared(i: int, poses: Array, rig: Rig, shots: Shots, cameras: Sequence[Came
     return np.asarray(inside.mean(axis=1))
 
 
-def matched_corners(corners: Sequence[Corners], compared: Sequence[tuple[int, int]]) -> Matched:
-    """Matches of all pairs of photos, joined where they share a corner; without what has two corners in one photo."""
+def _likely(rig: Rig, shots: Shots, views: tuple[int, int], at_a: Array, at_b: Array) -> float:
+    """Share of two photos' matches (M, 2) that the rig as given explains but for some degrees."""
+    n = len(at_a)
+    at = np.stack([at_a, at_b], axis=1).reshape(-1, 2)
+    focal = rig.lenses[shots.camera_of[list(views)], 0]
+    pair = Matched(2 * np.arange(n + 1), np.tile(views, n), at, np.tile(focal, n))
+    points, there = triangulated(rig, shots, pair)
+    _, ways = rays(rig, shots, pair)
+    near = np.nan_to_num(offsets(rig, shots, pair, points).reshape(-1, 2).max(axis=1), nan=np.inf) < LIKELY
+    far = np.linalg.norm(ways[0::2] - ways[1::2], axis=1) < LIKELY
+    return float(((near & there) | far).mean())
+
+
+def matched_corners(rig: Rig, shots: Shots, corners: Sequence[Corners], compared: Sequence[tuple[int, int]]) -> Matched:
+    """Matches of all pairs of photos, joined where they share a corner; without what has two corners in one photo.
+
+    A pair of photos most of whose matches lie far from where the rig as given has them is left out: one of the two is
+    not what it is said to be.
+    """
     starts = np.concatenate([[0], np.cumsum([len(c.at) for c in corners])]).astype(np.int64)
     first, second = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     for i, j in compared:
         a, b = matches(corners[i], corners[j])
-        first.append(starts[i] + a)
-        second.append(starts[j] + b)
+        if len(a) and _likely(rig, shots, (i, j), corners[i].at[a], corners[j].at[b]) >= LIKELY_SHARE:
+            first.append(starts[i] + a)
+            second.append(starts[j] + b)
     edges = np.concatenate(first), np.concatenate(second)
     n = int(starts[-1])
     _, label = connected_components(coo_array((np.ones(len(edges[0]), bool), edges), shape=(n, n)), directed=False)

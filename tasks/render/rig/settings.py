@@ -24,7 +24,7 @@ class RigSettings:
     centre: float = 0.01  # of the principal point, as a share of the width
     lens: float = 0.02  # of k1, k2, k3; of p1, p2 a tenth
     stamp_s: float = 0.0  # of a camera's stamps against the ego's
-    pose_turn_deg: float = 0.5  # of the ego at an instant
+    pose_turn_deg: float = 0.5  # of the ego, root mean square over the drive
     pose_shift_m: float = 0.2
 
     def __post_init__(self) -> None:

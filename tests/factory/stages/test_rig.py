@@ -1,0 +1,153 @@
+"""From pictures on disk to a corrected rig: a street with printed walls, two cameras, seven instants."""
+
+import json
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from factory.readers.base import BadClip
+from factory.stages.rig import SAID, corrected_rig, wanted
+from tasks.render.rig.ground import ground_below
+from tasks.render.rig.rig import motions, twists_of
+from tasks.render.rig.settings import Adjust, RigSettings
+from tasks.render.scene.asset import RenderAsset
+from tasks.render.scene.sensed import Photo
+from tasks.render.scene.sky import SkyMap
+from tasks.render.splatting.gaussians import EMPTY
+from tasks.world.agents import AgentTracks
+from tasks.world.camera import Camera, SensorFile
+from tasks.world.clip import Block
+
+WIDTH, HEIGHT, FOCAL, WALL_M, ROAD_M, CELL_M = 400, 224, 260.0, 6.0, -0.3, 0.03
+NOBODY = AgentTracks(
+    (), (), np.zeros((96, 0, 5)), np.zeros((96, 0, 2)), np.zeros((96, 0), bool), np.zeros((96, 0)), np.zeros(0)
+)
+
+
+def camera(name: str, yaw_deg: float) -> Camera:
+    yaw = np.radians(yaw_deg)
+    forward, down = np.array([np.cos(yaw), np.sin(yaw), 0.0]), np.array([0.0, 0.0, -1.0])
+    mount = np.eye(4)
+    mount[:3, :3] = np.stack([np.cross(down, forward), down, forward], axis=1)
+    mount[:3, 3] = [1.5, 0.3 * np.sin(yaw), 1.5]
+    k = np.array([[FOCAL, 0.0, WIDTH / 2], [0.0, FOCAL, HEIGHT / 2], [0.0, 0.0, 1.0]])
+    return Camera(name, WIDTH, HEIGHT, k, np.zeros(5), mount)
+
+
+CAMERAS = (camera("front", 0.0), camera("left", 50.0))
+
+
+def prints() -> list[np.ndarray]:
+    """Of the road and of the walls: blots of several sizes, grey."""
+    rng = np.random.default_rng(0)
+    out = []
+    for _ in range(3):
+        sheet = np.zeros((1024, 2048), np.float32)
+        for cells in (8, 32, 128):
+            blots = rng.normal(size=(cells, 2 * cells)).astype(np.float32)
+            sheet += cv2.resize(blots, sheet.shape[::-1], interpolation=cv2.INTER_CUBIC)
+        out.append(np.clip(120.0 + 35.0 * sheet, 0.0, 255.0))
+    return out
+
+
+def picture(pose: np.ndarray, sheets: list[np.ndarray]) -> np.ndarray:
+    """(H, W, 3) what a camera at a pose (4, 4) sees of the road at ROAD_M and the walls at +-WALL_M."""
+    u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    rays = np.stack([(u - WIDTH / 2) / FOCAL, (v - HEIGHT / 2) / FOCAL, np.ones_like(u)], -1) @ pose[:3, :3].T
+    eye, best = pose[:3, 3], np.full(u.shape, 80.0)
+    out = np.full(u.shape, 200.0, np.float32)
+    for sheet, axis, at in zip(sheets, (2, 1, 1), (ROAD_M, WALL_M, -WALL_M)):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = (at - eye[axis]) / rays[..., axis]
+        near = (t > 0.0) & (t < best)
+        points = eye + np.where(near, t, 0.0)[..., None] * rays
+        along, other = points[..., 0] + 10.0, points[..., 3 - axis] + 10.0
+        size = (along / CELL_M).astype(np.float32), (other / CELL_M).astype(np.float32)
+        drawn = cv2.remap(sheet, *size, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+        out, best = np.where(near, drawn, out), np.where(near, t, best)
+    return np.repeat(np.rint(out).astype(np.uint8)[..., None], 3, axis=-1)
+
+
+def ego(k: int) -> np.ndarray:
+    return motions(np.array([[1.2 * k, 0.02 * k * k, 0.0, 0.0, 0.0, 0.03 * k]]))[0]
+
+
+@pytest.fixture(scope="module")
+def block(tmp_path_factory: pytest.TempPathFactory) -> Block:
+    folder, sheets, files = tmp_path_factory.mktemp("photos"), prints(), []
+    for k in range(7):
+        for one in CAMERAS:
+            path = folder / f"{one.name}_{k}.png"
+            cv2.imwrite(str(path), picture(ego(k) @ one.ego_from_camera, sheets))
+            files.append(SensorFile(one.name, str(path), 0.5 * k, ego(k)))
+    return Block(0.0, NOBODY, tuple(files), ())
+
+
+def turned(one: Camera, turn_deg: tuple[float, float, float]) -> Camera:
+    motion = motions(np.array([[0.0, 0.0, 0.0, *np.radians(turn_deg)]]))[0]
+    return replace(one, ego_from_camera=one.ego_from_camera @ motion)
+
+
+@pytest.mark.slow
+def test_a_turned_camera_is_put_right_told_and_drawn_with(
+    block: Block, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    said = (CAMERAS[0], turned(CAMERAS[1], (1.0, -1.5, 0.8)))
+    with caplog.at_level(logging.INFO):
+        same, found, correction = corrected_rig(tmp_path / "block-1.safetensors", block, said, RigSettings())
+    assert correction is not None and len(same.images) == len(block.images)
+    # What both cameras are turned by is the ego's frame as well, which photos do not know.
+    true, now = (np.linalg.inv(rig[0].ego_from_camera) @ rig[1].ego_from_camera for rig in (CAMERAS, found))
+    (twist,) = twists_of((np.linalg.inv(true) @ now)[None])
+    assert np.degrees(np.linalg.norm(twist[3:])) < 0.35  # 0.30
+    told = json.loads((tmp_path / f"block-1{SAID}").read_text())
+    by_name = {row["camera"]: row for row in told["cameras"]}
+    assert by_name["left"]["after_px"] < 0.5 < by_name["left"]["before_px"]
+    assert told["used"][1]["ego_from_camera"] == found[1].ego_from_camera.tolist()
+    assert "left: moved" in caplog.text
+    asset = RenderAsset(np.zeros(3), EMPTY, {}, SkyMap(np.zeros((2, 2, 3), np.float32)), 30.0, rig=found)
+    assert asset.as_corrected([said[1]]) == (found[1],)
+    assert replace(asset, rig=()).as_corrected([said[1]]) == (said[1],)
+
+
+@pytest.mark.slow
+def test_swapped_files_are_left_out_and_named(block: Block, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    images = list(block.images)
+    a, b = 6, 7  # both cameras at one instant
+    images[a], images[b] = replace(images[a], uri=images[b].uri), replace(images[b], uri=images[a].uri)
+    swapped = replace(block, images=tuple(images))
+    kept, _, correction = corrected_rig(tmp_path / "block-2.safetensors", swapped, CAMERAS, RigSettings())
+    assert correction is not None and correction.strangers == (a, b)
+    assert len(kept.images) == len(images) - 2 and images[a].uri in caplog.text
+
+
+def test_a_photo_of_another_size_than_its_camera_s_is_named(block: Block, tmp_path: Path) -> None:
+    said = (replace(CAMERAS[0], width=WIDTH + 8), CAMERAS[1])
+    with pytest.raises(BadClip, match=r"front_0\.png"):
+        corrected_rig(tmp_path / "block-3.safetensors", block, said, RigSettings())
+
+
+def test_by_default_blocks_without_lidar_are_corrected(block: Block) -> None:
+    sweep = SensorFile("lidar", "0.feather", 0.0, np.eye(4))
+    with_lidar = replace(block, sweeps=(sweep,))
+    assert wanted(block, RigSettings()) and not wanted(with_lidar, RigSettings())
+    assert wanted(with_lidar, RigSettings(adjust=Adjust.ON)) and not wanted(block, RigSettings(adjust=Adjust.OFF))
+    assert not wanted(replace(block, images=()), RigSettings(adjust=Adjust.ON))
+
+
+@pytest.mark.slow
+def test_the_road_is_found_where_it_is(block: Block) -> None:
+    rig = {one.name: one for one in CAMERAS}
+    photos = [
+        Photo(file.sensor, file.time_s, cv2.imread(file.uri), rig[file.sensor].intrinsics,
+              file.world_from_ego @ rig[file.sensor].ego_from_camera)
+        for file in block.images
+    ]  # fmt: skip
+    poses = np.stack([file.world_from_ego for file in block.images])
+    assert ground_below(photos, poses) == pytest.approx(ROAD_M, abs=0.03)
+    grey = [replace(photo, rgb=np.full_like(photo.rgb, 90)) for photo in photos]
+    assert ground_below(grey, poses) is None
