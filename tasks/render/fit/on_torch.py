@@ -58,6 +58,10 @@ class OnTorch:
     draw: Draw
     device: str
 
+    def __post_init__(self) -> None:
+        # In this process: containers that set TORCH_ALLOW_TF32_CUBLAS_OVERRIDE multiply by ten bits, poses need more.
+        torch.set_float32_matmul_precision("highest")
+
     def take(self, state: FitState) -> StateTensors:
         """A copy of it, on the device."""
         learned: dict[str, Any] = dict(state.learned)

@@ -148,6 +148,15 @@ def test_a_fit_may_go_on_with_another_backend(prepared: tuple[Problem, FitState]
     assert finish(problem, state).psnr_db > half
 
 
+def test_matrices_are_multiplied_by_all_of_their_bits() -> None:
+    """Some containers ask for ten, which is a decimetre at a hundred metres."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("medium")
+    OnTorch(by_kernels, "cpu")
+    assert torch.get_float32_matmul_precision() == "highest"
+    torch.set_float32_matmul_precision(before)
+
+
 def test_what_is_taken_is_a_copy(prepared: tuple[Problem, FitState]) -> None:
     state = fresh(prepared[1])
     TENSORS.take(state).learned["means"].values[:] = 0.0
