@@ -144,7 +144,7 @@ def block_id(clip: Clip, settings: RenderSettings) -> str:
     how: list[object] = [settings.width, settings.height, sorted(settings.cameras), made]
     if settings.lpips and part == "fit":  # a scene without the measure is made again
         how.append([[Path(name).name, Path(name).stat().st_size] for name in settings.lpips])
-    if wanted(block, settings.rig) or not block.sweeps:
+    if wanted(block, settings.rig):
         how.append(asdict(settings.rig))
     digest.update(json.dumps([made_of, how], sort_keys=True).encode())
     for file in (*block.images, *block.sweeps):

@@ -40,8 +40,8 @@ NOTHING_KNOWN = Known()
 class Points:
     """Where surfaces are, for sure."""
 
-    dense: Array  # (M, 3) of lidar or of the driven road: between them surfaces go on
-    corners: Array | None = None  # (K, 3) far apart; None: there is lidar
+    dense: Array  # (M, 3) between which surfaces go on
+    corners: Array | None = None  # (K, 3) of a rig's adjustment: between them nothing is known
 
     @property
     def every(self) -> Array:
@@ -52,9 +52,10 @@ class Points:
 def known_without_lidar(photos: Sequence[Photo], tracks: Tracks, known: Known) -> Points:
     """What is known of a block without lidar, in the photos' frame."""
     corners = triangulated(photos, tracks) if known.corners is None else known.corners
-    if known.road is None:
-        return Points(np.zeros((0, 3)), corners)
-    return Points(known.road, beside_road(corners, known.road))
+    road = np.zeros((0, 3)) if known.road is None else known.road
+    if len(road):
+        corners = beside_road(corners, road)
+    return Points(np.concatenate([corners, road])) if known.corners is None else Points(road, corners)
 
 
 def triangulated(photos: Sequence[Photo], tracks: Tracks) -> Array:

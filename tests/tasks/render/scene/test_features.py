@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from tasks.render.scene.features import triangulated
+from tasks.render.scene.features import Known, known_without_lidar, triangulated
 from tasks.render.scene.sensed import Photo, Tracks
 from tasks.world.agents import AgentKind, AgentTracks
 
@@ -57,3 +57,12 @@ def test_what_can_move_is_left_out() -> None:
     inside = np.abs(everything[:, 1] - 2.0) < 1.9
     assert inside.any() and len(without) < len(everything)
     assert not (np.abs(without[:, 1] - 2.0) < 1.9).any()
+
+
+def test_corners_of_a_rig_are_points_and_corners_of_pairs_are_surfaces() -> None:
+    road, corners = np.zeros((4, 3)), np.full((3, 3), 20.0)
+    known = known_without_lidar([], STILL, Known(road, corners).shifted(np.ones(3)))
+    assert known.corners is not None and (known.corners == 21.0).all() and (known.dense == 1.0).all()
+    assert len(known.every) == 7
+    pairs = known_without_lidar([], STILL, Known(road))
+    assert pairs.corners is None and len(pairs.dense) == 4

@@ -23,7 +23,7 @@ def test_a_road_that_is_known_lies_behind_a_car_and_not_on_it() -> None:
         ("car",), (AgentKind.VEHICLE,), box, np.zeros((1, 1, 2)), np.ones((1, 1), bool), np.full((1, 1), 0.8),
         np.array([1.6]),
     )  # fmt: skip
-    known = Points(road, np.zeros((0, 3)))
+    known = Points(road)
     free, hidden = (see(photo, [], known, {}, Tracks(agents, np.zeros(3)), 0).depth for agents in (None, car))
     assert free[38, 48] == pytest.approx(1.5 * 60.0 / 6.5, rel=0.1)  # 14 m, the road there
     assert hidden[38, 48] != pytest.approx(free[38, 48], rel=0.2)
