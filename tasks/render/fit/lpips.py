@@ -4,6 +4,7 @@ The weights are a user's files, as the public packages have them: torchvision's 
 (`weights/v0.1/alex.pth`), or both in one, the state of `lpips.LPIPS(net="alex")`. torch is loaded by `lpips_of` alone.
 """
 
+import importlib
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -28,7 +29,7 @@ class BadWeights(ValueError):
 def lpips_of(files: Sequence[str | Path]) -> Lpips:
     """The measure with these weights. Raises BadWeights."""
     try:
-        import torch
+        torch = importlib.import_module("torch")
     except ImportError as error:
         raise BadWeights(f'LPIPS needs torch ({error}): pip install -e ".[planners]"') from error
     network = _layers(_read(files, torch))
