@@ -239,7 +239,7 @@ def test_completion_knows_commands_keys_groups_and_choices() -> None:
     assert set(candidates(["export"], "m")) == {"mcap", "mp4", "navsim", "rerun"}
     assert {"out=", "workers="} <= set(candidates(["retry"], ""))
     assert {"clip=", "clips=", "tries="} <= set(candidates(["explain"], ""))
-    assert set(candidates(["scene"], "")) == {"info", "export", "import"}
+    assert set(candidates(["scene"], "")) == {"info", "export", "import", "view"}
     assert not list(candidates(["nothing"], ""))
 
 
