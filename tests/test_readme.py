@@ -206,6 +206,9 @@ def test_every_command_is_one_its_program_takes(
             parse(ReportRequest, arguments)
         case ["python", "-m", "planners", "analysis", *arguments]:
             parse(AnalysisSettings, arguments)
+        case ["python", "-m", "tests.bench.bench_rig" | "tests.bench.bench_front", _, *arguments]:
+            known = {field.name for field in fields(FitSettings)} | {"out", "validate", "threads", "adjust", "ground"}
+            assert set(pairs(given(arguments))) <= known
         case ["python", "-m", "tests.bench.bench_kitti", _, *arguments]:
             known = {field.name for field in fields(FitSettings)} | {"out", "validate", "threads", "first", "last"}
             known |= {"by"}

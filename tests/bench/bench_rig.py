@@ -1,4 +1,4 @@
-"""A real rig of eight cameras at 2 Hz: `python -m tests.bench.bench_rig <openscene_0101> [out=DIR] [setting=value]`.
+"""A real rig of eight cameras at 2 Hz: `python -m tests.bench.bench_rig <openscene_0101> [setting=value]`.
 
 Instants 20 and 27 of all cameras are held out: they are matched for their poses, and nothing else is taken from them.
 With `validate=1` those two are not read at all and instants 18 and 24 are held out instead: what knobs are to be tuned
