@@ -24,7 +24,7 @@ from factory.stages.rig import corrected_rig, known_of, wanted
 from factory.stages.scene_file import SUFFIX, BadScene, read_scene, write_scene
 from factory.stages.sensors import block_of, chosen_cameras, load_sensors, load_sweeps, taken_by
 from tasks.render.fit.lpips import lpips_of
-from tasks.render.scene.asset import BlockRange, RenderAsset
+from tasks.render.scene.asset import BlockRange, RenderAsset, TakenFrom
 from tasks.render.scene.build import build_asset
 from tasks.render.scene.lidar_only import lidar_asset
 from tasks.render.scene.settings import Backend
@@ -105,7 +105,9 @@ def asset_for(
                 asset = fitted(path, data, block.agents, settings.fit, threads, stopped, settings.backend, lpips)
             else:
                 asset = build_asset(data.photos, data.sweeps, block.agents, settings.asset, data.known)
-            asset = replace(asset, rig=cameras if found is not None else ())
+            if found is not None:
+                taken = (TakenFrom(file.sensor, file.time_s, file.world_from_ego) for file in block.images)
+                asset = replace(asset, rig=cameras, taken=tuple(taken))
         else:
             asset = lidar_asset(load_sweeps(block.sweeps, with_intensity=True), block.agents)
         return write_scene(path, replace(asset, block=range_of(clip, block)))

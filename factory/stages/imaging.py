@@ -263,7 +263,8 @@ def _kept(block: _Block) -> RenderAsset | None:
 def album_of(clip: Clip, asset: RenderAsset, settings: RenderSettings) -> Album:
     """The photos of a clip's block; one is opened when a vehicle is first held against it. Raises BadClip then."""
     block, cameras = block_of(clip), asset.as_corrected(chosen_cameras(clip.cameras, settings.cameras))
-    shown = sightings(block.images, cameras, block.agents)
+    files = asset.photos_of(block.images)
+    shown = sightings(files, cameras, block.agents)
     tracks: dict[int, list[str]] = {}
     for track_id, seen in shown.items():
         for row in seen.photos:
@@ -273,7 +274,7 @@ def album_of(clip: Clip, asset: RenderAsset, settings: RenderSettings) -> Album:
 
     def likeness(track_id: str, row: int) -> float:
         if row not in known:
-            (photo,) = load_photos([block.images[row]], cameras, *size)
+            (photo,) = load_photos([files[row]], cameras, *size)
             known[row] = likeness_to_photo(asset, photo, block.agents, tracks[row], settings.backend)
         return known[row][track_id]
 

@@ -6,6 +6,7 @@
 | `background.<field>` | (N, ...) | the street: one tensor for each field of `Gaussians` |
 | `nodes.<i>.<field>` | (N_i, ...) | the i-th track, in its box's frame |
 | `sky` | (rows, columns, 3) | colours by direction |
+| `taken` | (P, 4, 4) float64 | where the ego was at each photo, where the photos corrected that |
 | `exposures` | (P, 3, 4) | what each photo made of the light, where they were aligned |
 
 The header's entry `scene` holds the rest: format, the nodes' track ids, quality photo by photo, the photos of the
@@ -28,7 +29,7 @@ from safetensors.numpy import save
 
 from factory.store.disk import whole_file
 from factory.store.identity import canonical_json
-from tasks.render.scene.asset import BlockRange, ClassQuality, Exposure, RenderAsset, ViewQuality
+from tasks.render.scene.asset import BlockRange, ClassQuality, Exposure, RenderAsset, TakenFrom, ViewQuality
 from tasks.render.scene.sky import SkyMap
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.world.camera import Camera
@@ -113,6 +114,8 @@ def tensors_of(asset: RenderAsset) -> dict[str, NDArray[Any]]:
         out |= {f"{name}.{field.name}": getattr(part, field.name) for field in fields(Gaussians)}
     if asset.exposures:
         out["exposures"] = np.stack([exposure.affine for exposure in asset.exposures])
+    if asset.taken:
+        out["taken"] = np.stack([photo.world_from_ego for photo in asset.taken])
     return {name: np.ascontiguousarray(array) for name, array in out.items()}
 
 
@@ -120,6 +123,7 @@ def described_by(asset: RenderAsset) -> dict[str, Any]:
     """What of the scene is no array, as plain JSON values; NaN is null."""
     block = asset.block
     rig = [asdict(camera) | {name: getattr(camera, name).tolist() for name in CALIBRATED} for camera in asset.rig]
+    taken = [[photo.camera, photo.time_s] for photo in asset.taken]
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -129,7 +133,7 @@ def described_by(asset: RenderAsset) -> dict[str, Any]:
         "views": [_plain(asdict(view)) for view in asset.views],
         "exposures": [[exposure.camera, exposure.time_s] for exposure in asset.exposures],
         "block": None if block is None else asdict(block) | {"low": block.low.tolist(), "high": block.high.tolist()},
-    } | ({"rig": rig} if rig else {})
+    } | {name: values for name, values in (("rig", rig), ("taken", taken)) if values}
 
 
 def scene_of(tensors: Tensors, described: Mapping[str, Any], digest: str) -> RenderAsset:
@@ -158,6 +162,10 @@ def scene_of(tensors: Tensors, described: Mapping[str, Any], digest: str) -> Ren
         rig=tuple(
             Camera(**camera | {name: np.array(camera[name], np.float64) for name in CALIBRATED})
             for camera in described.get("rig", ())
+        ),
+        taken=tuple(
+            TakenFrom(camera, time_s, tensors["taken"][i])
+            for i, (camera, time_s) in enumerate(described.get("taken", ()))
         ),
     )
 

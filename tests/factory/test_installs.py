@@ -75,7 +75,11 @@ def _modules(node: ast.AST, at_import: bool) -> Iterator[str]:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("package", "extras"),
-    [("tasks", ("run", "gpu")), ("factory", ("run", "rerun", "view", "gpu", "navsim")), ("planners", ("planners", "wandb"))],
+    [
+        ("tasks", ("run", "gpu")),
+        ("factory", ("run", "rerun", "view", "gpu", "navsim")),
+        ("planners", ("planners", "wandb")),
+    ],
 )
 def test_every_import_is_declared_where_it_belongs(package: str, extras: tuple[str, ...]) -> None:
     allowed = set().union(*map(declared, extras))

@@ -1,7 +1,7 @@
 """The scene of a block: what a reconstruction gives and every rendering starts from."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from tasks.render.scene.sky import SkyMap
 from tasks.render.splatting.gaussians import Gaussians, concatenate, moved
 from tasks.world.agents import AgentKind
 from tasks.world.arrays import F32, Array
-from tasks.world.camera import Camera
+from tasks.world.camera import Camera, SensorFile
 
 
 @dataclass(frozen=True)
@@ -61,6 +61,15 @@ class Exposure:
 
 
 @dataclass(frozen=True)
+class TakenFrom:
+    """Where the ego was when a photo of the scene was taken, as the photos say."""
+
+    camera: str
+    time_s: float  # since the block's first step
+    world_from_ego: Array  # (4, 4)
+
+
+@dataclass(frozen=True)
 class RenderAsset:
     """A block's scene. World coordinates minus `origin` everywhere, so that float32 is exact to less than a mm."""
 
@@ -75,11 +84,20 @@ class RenderAsset:
     exposures: tuple[Exposure, ...] = ()  # of the photos, where they were aligned
     block: BlockRange | None = None  # filled by whoever knows the log
     rig: tuple[Camera, ...] = ()  # cameras that its photos were corrected to; empty: they are as given
+    taken: tuple[TakenFrom, ...] = ()  # its photos, where their poses were corrected
 
     def as_corrected(self, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
         """The cameras to draw it with: of the scene's own rig those of the same names, where it has one."""
         mine = {camera.name: camera for camera in self.rig}
         return tuple(mine.get(camera.name, camera) for camera in cameras)
+
+    def photos_of(self, files: Sequence[SensorFile]) -> tuple[SensorFile, ...]:
+        """The files that it was made of, at the poses it was made with; all as given, where none was corrected."""
+        if not self.taken:
+            return tuple(files)
+        poses = {(photo.camera, photo.time_s): photo.world_from_ego for photo in self.taken}
+        mine = [file for file in files if (file.sensor, file.time_s) in poses]
+        return tuple(replace(file, world_from_ego=poses[file.sensor, file.time_s]) for file in mine)
 
     def affine_of(self, camera: str) -> F32:
         """(3, 4) what a camera makes of the scene's light at poses that no photo was taken from: the mean over its

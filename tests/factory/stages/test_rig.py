@@ -14,7 +14,7 @@ from factory.stages.rig import SAID, corrected_rig, wanted
 from tasks.render.rig.ground import ground_below
 from tasks.render.rig.rig import motions, twists_of
 from tasks.render.rig.settings import Adjust, RigSettings
-from tasks.render.scene.asset import RenderAsset
+from tasks.render.scene.asset import RenderAsset, TakenFrom
 from tasks.render.scene.sensed import Photo
 from tasks.render.scene.sky import SkyMap
 from tasks.render.splatting.gaussians import EMPTY
@@ -112,6 +112,20 @@ def test_a_turned_camera_is_put_right_told_and_drawn_with(
     asset = RenderAsset(np.zeros(3), EMPTY, {}, SkyMap(np.zeros((2, 2, 3), np.float32)), 30.0, rig=found)
     assert asset.as_corrected([said[1]]) == (found[1],)
     assert replace(asset, rig=()).as_corrected([said[1]]) == (said[1],)
+
+
+def test_photos_are_looked_at_from_where_the_scene_says_that_they_were_taken(block: Block) -> None:
+    """Else a vehicle, fitted at corrected poses, is held against a photo that is decimetres off; and photos that the
+    scene left out are not looked at."""
+    moved = np.eye(4)
+    moved[0, 3] = 0.4
+    taken = [TakenFrom(file.sensor, file.time_s, moved @ file.world_from_ego) for file in block.images[2:]]
+    asset = RenderAsset(np.zeros(3), EMPTY, {}, SkyMap(np.zeros((2, 2, 3), np.float32)), 30.0, taken=tuple(taken))
+    found = asset.photos_of(block.images)
+    assert [file.uri for file in found] == [file.uri for file in block.images[2:]]
+    for file, given in zip(found, block.images[2:]):
+        np.testing.assert_allclose(file.world_from_ego[:3, 3] - given.world_from_ego[:3, 3], [0.4, 0.0, 0.0])
+    assert replace(asset, taken=()).photos_of(block.images) == block.images
 
 
 @pytest.mark.slow

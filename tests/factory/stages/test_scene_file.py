@@ -11,7 +11,7 @@ from safetensors import safe_open
 from safetensors.numpy import save_file
 
 from factory.stages.scene_file import KEY, BadScene, described_by, digest_of, read_scene, tensors_of, write_scene
-from tasks.render.scene.asset import BlockRange, ClassQuality, Exposure, RenderAsset, ViewQuality
+from tasks.render.scene.asset import BlockRange, ClassQuality, Exposure, RenderAsset, TakenFrom, ViewQuality
 from tasks.render.scene.sky import SkyMap
 from tasks.render.splatting.gaussians import EMPTY, Gaussians
 
@@ -36,6 +36,7 @@ def scene() -> RenderAsset:
         ),
         exposures=(Exposure("front", 0.5, np.eye(3, 4, dtype=np.float32) * 1.1),),
         block=BlockRange("av2", "log", 10.0, 30.0, np.array([-1.5, 2.0]), np.array([8.0, 3.25])),
+        taken=(TakenFrom("front", 0.1 + 0.2, np.eye(4) * 0.1),),
     )
 
 
@@ -52,6 +53,7 @@ def test_everything_comes_back(tmp_path: Path) -> None:
     assert back.views[0] == asset.views[0] and np.isnan(back.views[1].ssim) and np.isinf(back.views[1].psnr_db)
     assert back.block is not None and back.block.low.tolist() == [-1.5, 2.0]
     assert back.psnr_db == 27.123456789
+    assert (back.taken[0].camera, back.taken[0].time_s) == ("front", 0.1 + 0.2)  # by which files are found again
     assert [path.name for path in (tmp_path / "deep").iterdir()] == ["x.safetensors"]  # no drafts left
 
 
@@ -89,6 +91,7 @@ def test_the_same_scene_is_the_same_bytes(tmp_path: Path) -> None:
         lambda s: replace(s, views=s.views[:1]),
         lambda s: replace(s, exposures=()),
         lambda s: replace(s, block=None),
+        lambda s: replace(s, taken=()),
         lambda s: replace(s, background=s.background.take(np.arange(29))),
     ],
 )
