@@ -207,7 +207,14 @@ def test_every_command_is_one_its_program_takes(
         case ["python", "-m", "planners", "analysis", *arguments]:
             parse(AnalysisSettings, arguments)
         case ["python", "-m", "tests.bench.bench_rig" | "tests.bench.bench_front", _, *arguments]:
-            known = {field.name for field in fields(FitSettings)} | {"out", "validate", "threads", "adjust", "ground"}
+            known = {field.name for field in fields(FitSettings)} | {
+                "out",
+                "validate",
+                "threads",
+                "adjust",
+                "ground",
+                "matched",
+            }
             assert set(pairs(given(arguments))) <= known
         case ["python", "-m", "tests.bench.bench_kitti", _, *arguments]:
             known = {field.name for field in fields(FitSettings)} | {"out", "validate", "threads", "first", "last"}

@@ -1,13 +1,17 @@
 """A front camera at 2 Hz beside a ScenarioNet log: `python -m tests.bench.bench_front <nuscenes_front> [name=value]`.
 
-Photos with index mod 8 = 4 are held out: matched for their poses, nothing else is taken from them. With `adjust=0`
-poses and calibration are as given. Boxes are the log's. Names are those of `FitSettings`.
+Photos with index mod 8 = 4 are held out: matched for their poses, nothing else is taken from them; with `matched=0` not
+even that, and their poses are moved as those before and after were. With `adjust=0` poses and calibration are as given.
+Boxes are the log's. Names are those of `FitSettings`.
 """
 
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
+
+from scipy.spatial.transform import Rotation, Slerp
 
 from factory.readers.scenarionet.reader import ScenarioNetReader
 from factory.stages.rig import corrected_rig, known_of, lines_of
@@ -15,16 +19,52 @@ from factory.stages.sensors import block_of, load_sensors
 from tasks.render.fit.reconstruct import advance, finish
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import prepare
+from tasks.render.rig.correct import Correction
 from tasks.render.rig.settings import RigSettings
+from tasks.world.camera import Camera, SensorFile
+from tasks.world.clip import Block
 
 SIZE = (400, 225)
+EVERY = 8  # of the photos one is held out, as `hold_out_every` has it
+Pair = tuple[SensorFile, SensorFile]  # as given and as corrected
+Corrected = tuple[Block, tuple[Camera, ...], Correction | None]
 SETTINGS = replace(FitSettings(), iterations=1500, start_gaussians=120_000, most_gaussians=160_000, stereo_photos=6)
+
+
+def beside(given: SensorFile, before: Pair, after: Pair) -> SensorFile:
+    """A file at the pose between its neighbours' corrections, each a file as given and as corrected."""
+    share = (given.time_s - before[0].time_s) / (after[0].time_s - before[0].time_s)
+    moves = [new.world_from_ego[:3, 3] - old.world_from_ego[:3, 3] for old, new in (before, after)]
+    turns = Rotation.from_matrix(
+        [new.world_from_ego[:3, :3] @ old.world_from_ego[:3, :3].T for old, new in (before, after)]
+    )
+    pose = given.world_from_ego.copy()
+    pose[:3, :3] = Slerp([0.0, 1.0], turns)(share).as_matrix() @ pose[:3, :3]
+    pose[:3, 3] += (1.0 - share) * moves[0] + share * moves[1]
+    return replace(given, world_from_ego=pose)
+
+
+def unmatched(
+    path: Path, block: Block, cameras: Sequence[Camera]
+) -> tuple[Block, tuple[Camera, ...], Correction | None]:
+    """The block corrected without its held-out photos, which are moved as their neighbours were."""
+    kept = [k for k in range(len(block.images)) if k % EVERY != EVERY // 2]
+    given = {k: block.images[k] for k in kept}
+    fewer = replace(block, images=tuple(given.values()))
+    corrected, rig, found = corrected_rig(path, fewer, cameras, RigSettings())
+    known = dict(zip(kept, corrected.images, strict=True))
+    files = [
+        known[k] if k in known else beside(file, (given[k - 1], known[k - 1]), (given[k + 1], known[k + 1]))
+        for k, file in enumerate(block.images)
+    ]
+    return replace(block, images=tuple(files)), rig, found
 
 
 def main() -> None:
     """Corrects, trains and prints what comes out photo by photo."""
     root, options = Path(sys.argv[1]), dict(option.split("=", 1) for option in sys.argv[2:])
     adjust, threads = options.pop("adjust", "1") == "1", int(options.pop("threads", "2"))
+    matched = options.pop("matched", "1") == "1"
     out = Path(options.pop("out", "out/bench_front"))
     out.mkdir(parents=True, exist_ok=True)
     kinds = {field.name: type(getattr(FitSettings(), field.name)) for field in fields(FitSettings)}
@@ -33,7 +73,11 @@ def main() -> None:
     clip, started = reader.read(reader.index().refs[0]), time.process_time()
     block, cameras, found = block_of(clip), clip.cameras, None
     if adjust:
-        block, cameras, found = corrected_rig(out / "front.safetensors", block, cameras, RigSettings())
+        path = out / "front.safetensors"
+        if matched:
+            block, cameras, found = corrected_rig(path, block, cameras, RigSettings())
+        else:
+            block, cameras, found = unmatched(path, block, cameras)
     data = load_sensors(block, cameras, *SIZE)
     if found is not None:
         data = replace(data, known=known_of(data, block, found))
