@@ -87,7 +87,8 @@ def test_a_clip_has_the_photos_of_its_window_where_and_when_its_sidecar_says(log
     for image in front:
         np.testing.assert_allclose(image.world_from_ego, pose_at(1.0 + image.time_s))
     assert sensing(clip, RenderSettings()) is Sensing.PHOTOS_ONLY
-    road = load_sensors(block_of(clip), clip.cameras, *SIZE).road  # where the ego drove, 0.2 m up as its poses say
+    # Where the ego drove, 0.2 m up as its poses say.
+    road = load_sensors(block_of(clip), clip.cameras, *SIZE).known.road
     assert road is not None and np.abs(road[:, 2] - 0.2).max() < 1e-9
     assert [road[:, 1].min(), road[:, 1].max()] == pytest.approx([town.EGO_Y - 3.0, town.EGO_Y + 3.0])
     photos = load_photos(front[:3], clip.cameras, *SIZE)
@@ -171,7 +172,7 @@ def test_sweeps_lie_in_the_lidar_s_frame_and_come_out_in_the_ego_s(log: Path, tm
     swept = load_sensors(block_of(clip), clip.cameras, *SIZE).sweeps
     np.testing.assert_allclose(swept[1].points, [[11.9, 0.0, 0.0], [20.9, 5.0, 2.0]], atol=1e-5)
     assert swept[1].world_from_ego.tolist() == pose_at(0.5)
-    assert load_sensors(block_of(clip), clip.cameras, *SIZE).road is None  # the lidar knows better
+    assert load_sensors(block_of(clip), clip.cameras, *SIZE).known.road is None  # the lidar knows better
     (folder / "lidar/2.pcd.bin").write_bytes(b"\0" * 39)
     with pytest.raises(BadClip, match=r"2\.pcd\.bin: points: 39 bytes are not rows of 5 float32"):
         load_sensors(block_of(clip), clip.cameras, *SIZE)
