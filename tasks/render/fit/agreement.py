@@ -100,7 +100,7 @@ def _root(matrix: Array) -> Array:
 
 
 def _to_photos(matrices: Array, offsets: Array, rows: Array) -> None:
-    """Moves the common colours of cameras `rows`, in place: the way back to photos is the identity on average."""
+    """Moves the common colours of cameras `rows`, in place: the exposures' inverses are the identity on average."""
     back = np.linalg.inv(matrices[rows])
     turn, shift = back.mean(axis=0), -np.einsum("cij,cj->ci", back, offsets[rows]).mean(axis=0)
     matrices[rows] = turn @ matrices[rows]

@@ -21,10 +21,10 @@ from tasks.render.fit.road import lay_flat as lay_flat_by_hand
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import Problem, prepare
 from tasks.render.fit.state import FitState
-from tasks.render.scene.sensed import Photo, Sweep
 from tasks.render.splatting.gradient import Gradients
 from tasks.render.splatting.tensors import by_kernels, splatted
 from tests.bench import peer_gsplat
+from tests.tasks.render.fit.test_reconstruct import few, fresh
 
 SETTINGS = FitSettings(
     iterations=24,
@@ -54,20 +54,9 @@ def through_reference() -> OnTorch:
     return OnTorch(lambda scene, eye: splatted(peer_gsplat.rasterization, scene, eye), "cpu")
 
 
-def few() -> tuple[list[Photo], list[Sweep]]:
-    photos, sweeps = street.drive(5)
-    half = np.diag([0.5, 0.5, 1.0])
-    small = [replace(p, rgb=np.ascontiguousarray(p.rgb[::2, ::2]), intrinsics=half @ p.intrinsics) for p in photos]
-    return small, sweeps[::2]
-
-
 @pytest.fixture(scope="module")
 def prepared() -> tuple[Problem, FitState]:
     return prepare(*few(), street.tracks(), SETTINGS, held_out=[2])
-
-
-def fresh(state: FitState) -> FitState:
-    return FitState.from_arrays(state.arrays())
 
 
 def numbers(found: Derivatives) -> dict[str, np.ndarray]:
