@@ -18,6 +18,7 @@ from tasks.world.arrays import F32, Array, Bools
 
 ROUNDS = 60  # of fitting each camera to all others; of a ring of eight 5 % of an error are left after 20
 LEAST = 8  # shared points that say something
+BRIGHTNESS_ROUNDS, DISAGREES = 10, 0.05  # of reweighting, and the difference of log colours from which less counts
 FLOOR, PULL = 1e-4, 0.2  # added to variances in [0, 1]^2: FLOOR always, PULL / n for n points
 
 
@@ -65,6 +66,34 @@ def aligned(of: Shared) -> F32:
     for number in np.unique(group[tied]):
         _to_photos(matrices, offsets, tied[group[tied] == number])
     return np.column_stack([(matrices - np.eye(3)).reshape(n, 9), offsets]).astype(np.float32)
+
+
+def brightness(grey: F32, seen: Bools) -> Array:
+    """Log of how much brighter each of N photos shows its points than the others do (N,); their mean is 0.
+
+    `grey` (N, M) in (0, 1] of M points in the photos that have `seen` (N, M) them. Least squares over log grey =
+    photo + point with Cauchy's weights; a photo that shares fewer than LEAST points with others gets 0.
+    """
+    logs = np.log(np.maximum(grey, 1e-2)).astype(np.float64)
+    shares = (seen & (seen.sum(axis=0) > 1)).astype(np.float64)
+    tied = shares.sum(axis=1) >= LEAST
+    out = np.zeros(len(grey))
+    for turn in range(BRIGHTNESS_ROUNDS if tied.any() else 0):
+        if turn == 0:
+            weight = shares
+        else:
+            weight = shares / (1.0 + ((logs - out[:, None] - _point_means(logs, out, weight)) / DISAGREES) ** 2)
+        of = np.maximum(weight.sum(axis=0), 1e-12)
+        system = np.diag(weight.sum(axis=1) + 1.0) - (weight / of) @ weight.T  # a point's own colour is eliminated
+        right = (weight * logs).sum(axis=1) - weight @ ((weight * logs).sum(axis=0) / of)
+        out = np.linalg.solve(system, right)
+        out[~tied] = 0.0
+        out[tied] -= out[tied].mean()
+    return out
+
+
+def _point_means(logs: Array, photos: Array, weight: Array) -> Array:
+    return np.asarray((weight * (logs - photos[:, None])).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-12))
 
 
 def _moments(count: Array, first: Array, second: Array) -> tuple[Array, Array]:

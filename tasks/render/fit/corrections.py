@@ -10,17 +10,21 @@ from dataclasses import replace
 from functools import reduce
 from operator import add
 
+import cv2
 import numpy as np
 
-from tasks.render.fit.agreement import aligned, shared
+from tasks.render.fit.agreement import aligned, brightness, shared
 from tasks.render.scene.sensed import Photo
 from tasks.render.scene.sight import Seen
-from tasks.world.arrays import F32, Array, Bools, FloatArray
+from tasks.world.arrays import F32, Array, Bools, Bytes, FloatArray
 
 EXPOSURE_SIZE = 12  # a photo's row: 3 x 3 matrix minus identity, then 3 offsets
 POSE_SIZE = 6  # a photo's row: shift [m], turn [rad], both in its camera's frame
 INSTANT_S = 0.05  # photos no further apart were taken at once
 POINTS = 40_000  # of the cloud are looked at, evenly
+OVER_TIME = 4_000_000  # pairs of photo and point at most by which the photos of a camera are compared
+STEADY = 0.05  # of its brightness: a camera that varies less has one exposure
+AROUND_PX = 5  # a point's brightness is the mean of a window
 NEAR = 0.05  # of its depth: a point this close to what the photo shows there is seen
 
 
@@ -77,13 +81,15 @@ def affine_between(source: FloatArray, target: FloatArray, ridge: float = 1e-3) 
 
 
 def exposures_of(photos: Sequence[Photo], seen: Sequence[Seen], points: Array) -> F32:
-    """Rows (N, 12) of the photos: photo colour = row applied to what all cameras agree on. Photos of a camera have one.
+    """Rows (N, 12) of the photos: photo colour = row applied to what all cameras agree on.
 
+    Photos of a camera have one, but for how bright each is where the camera exposes anew from photo to photo.
     `points` (M, 3) that stay, in the photos' frame. Zeros, which is identity, where a camera shares no point.
     """
     rows = np.zeros((len(photos), EXPOSURE_SIZE), np.float32)
     cameras = list(dict.fromkeys(photo.camera for photo in photos))
     cloud = points[:: max(1, len(points) // POINTS)]
+    gains = _gains(photos, seen, points)
     found = []
     for instant in instants(photos):
         if len(instant) < 2:
@@ -91,12 +97,31 @@ def exposures_of(photos: Sequence[Photo], seen: Sequence[Seen], points: Array) -
         colours, shown = np.zeros((len(cameras), len(cloud), 3)), np.zeros((len(cameras), len(cloud)), bool)
         for i in instant:
             c = cameras.index(photos[i].camera)
-            colours[c], shown[c] = _colours(photos[i], seen[i], cloud)
+            colours[c], shown[c] = _colours(photos[i].rgb, photos[i], seen[i], cloud)
+            colours[c] /= gains[i]
         found.append(shared(colours, shown))
     if found:
         back = [inverse(row) for row in aligned(reduce(add, found))]
         rows[:] = [back[cameras.index(photo.camera)] for photo in photos]
+    for i in np.flatnonzero(gains != 1.0).tolist():
+        gain = np.concatenate([((gains[i] - 1.0) * np.eye(3)).ravel(), np.zeros(3)]).astype(np.float32)
+        rows[i] = after(gain, rows[i])
     return rows
+
+
+def _gains(photos: Sequence[Photo], seen: Sequence[Seen], points: Array) -> Array:
+    """How much brighter than its camera's mean each photo is (N,); 1 for all of a camera that is STEADY."""
+    cloud = points[:: max(1, len(points) * len(photos) // OVER_TIME, len(points) // POINTS)]
+    grey, shown = np.ones((len(photos), len(cloud)), np.float32), np.zeros((len(photos), len(cloud)), bool)
+    for i, photo in enumerate(photos):
+        blurred = np.asarray(cv2.blur(photo.rgb, (AROUND_PX, AROUND_PX)), np.uint8)
+        colours, shown[i] = _colours(blurred, photo, seen[i], cloud)
+        grey[i] = colours.mean(axis=-1)
+    logs, of = brightness(grey, shown), np.array([photo.camera for photo in photos])
+    for camera in dict.fromkeys(of):
+        mine = logs[of == camera]
+        logs[of == camera] = mine - mine.mean() if np.ptp(mine) > STEADY else 0.0
+    return np.exp(logs)
 
 
 def instants(photos: Sequence[Photo]) -> list[list[int]]:
@@ -123,8 +148,8 @@ def in_agreement(photos: Sequence[Photo], rows: F32) -> list[Photo]:
     return out
 
 
-def _colours(photo: Photo, seen: Seen, points: Array) -> tuple[Array, Bools]:
-    """Colours (M, 3) in [0, 1] of the points in a photo, and which of them (M,) it shows."""
+def _colours(rgb: Bytes, photo: Photo, seen: Seen, points: Array) -> tuple[Array, Bools]:
+    """Colours (M, 3) in [0, 1] of the points in a photo's `rgb` (H, W, 3), and which of them (M,) it shows."""
     height, width = seen.depth.shape
     camera_from_scene = np.linalg.inv(photo.world_from_camera)
     x, y, z = (points @ camera_from_scene[:3, :3].T + camera_from_scene[:3, 3]).T
@@ -134,7 +159,7 @@ def _colours(photo: Photo, seen: Seen, points: Array) -> tuple[Array, Bools]:
     inside = (z > 0.5) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
     u, v = np.where(inside, column, 0).astype(int), np.where(inside, row, 0).astype(int)
     shown = inside & (np.abs(seen.depth[v, u] - z) < NEAR * z)
-    return photo.rgb[v, u] / 255.0, shown
+    return rgb[v, u] / 255.0, shown
 
 
 def motion(row: FloatArray) -> Array:

@@ -14,6 +14,7 @@ from tasks.render.fit.road import Road, above_road, find_road, lay_flat
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.state import BACKGROUND, FitState, logits_of
 from tasks.render.scene.build import held_out_rows, sky_of, surfaces
+from tasks.render.scene.confirmed import with_confirmed
 from tasks.render.scene.features import NOTHING_KNOWN, Known, Points, known_without_lidar
 from tasks.render.scene.movers import behind_boxes
 from tasks.render.scene.sensed import Photo, Sweep, Tracks, fuse, shifted
@@ -82,6 +83,8 @@ def prepare(
         return [see(p, train, points, per_track, tracks, n) for p in looked_at[first:last]]
 
     seen = [s for part in in_chunks(look, len(looked_at), 1, threads) for s in part]
+    if points.corners is not None:
+        seen = with_confirmed(looked_at, seen)
     exposures = np.zeros((len(train), EXPOSURE_SIZE), np.float32)
     if settings.exposure_rate > 0.0:
         exposures = _exposures(train, looked_at, exposures_of(looked_at, seen, points.every))

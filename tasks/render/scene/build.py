@@ -13,6 +13,7 @@ import numpy as np
 
 from tasks.render.scene.asset import RenderAsset, ViewQuality, mean_psnr_db, psnr, scene_at
 from tasks.render.scene.choose import BACKGROUND, Look, choose, count_free_space, with_mirror_image
+from tasks.render.scene.confirmed import with_confirmed
 from tasks.render.scene.engine import Vehicles, render
 from tasks.render.scene.features import NOTHING_KNOWN, Known, Points, known_without_lidar
 from tasks.render.scene.movers import owners, world_from_boxes
@@ -56,6 +57,8 @@ def build_asset(
     static, per_track = fuse(sweeps, tracks)
     points = Points(static) if sweeps else known_without_lidar(train, tracks, known.shifted(-origin))
     seen = [see(p, train, points, per_track, tracks, settings.stereo_photos) for p in train]
+    if points.corners is not None:
+        seen = with_confirmed(train, seen)
     background, nodes = surfaces(train, seen, tracks)
     sky = sky_of(train, seen)
     asset = RenderAsset(origin, background, nodes, sky, float("nan"))

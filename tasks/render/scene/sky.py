@@ -3,12 +3,15 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from tasks.render.scene.sky_lookup import COLUMNS, ROWS, backdrop, sky_cells
 from tasks.world.arrays import F32, Array, Bools
 
+WINDOWS = 96  # side by side in a picture, in which it is smooth or not
+SMOOTH, SMOOTH_SHARE = 0.02, 0.3  # deviation of the grey of a smooth window, and the share of them that makes it sky
 SKY_WEIGHT = 1.0e4  # against one pixel of something else in the same direction
 
 
@@ -24,6 +27,28 @@ class SkyMap:
         where = sky_cells(intrinsics, world_from_camera, width, height, threads)
         cells = np.require(self.rgb, np.float32, ["C", "W"])  # kernels compile once more for read-only arrays
         return backdrop(cells.reshape(-1, 3), where, threads)
+
+
+def may_be_sky(rgb: F32) -> Bools:
+    """Pixels (H, W) of a picture in [0, 1] that are as bright or as blue as the sky."""
+    grey = rgb.mean(axis=-1)
+    return np.asarray((grey > 0.6) | ((rgb[..., 2] > rgb[..., 0] + 0.04) & (grey > 0.4)))
+
+
+def no_worse(sky_cost: F32, cost: F32) -> Bools:
+    """Where the sky agrees with other photos about as well as the best depth does: (H, W)."""
+    return np.asarray(sky_cost < 1.3 * cost + 0.03)
+
+
+def smooth_around(rgb: F32, among: Bools) -> Bools:
+    """Pixels (H, W) around which much of what is `among` (H, W) is smooth: sky and its clouds, but no boarded wall."""
+    grey = rgb.mean(axis=-1)
+    n = max(rgb.shape[1] // WINDOWS, 2) // 2 * 2 + 1
+    mean = cv2.blur(grey, (n, n))
+    rough = np.sqrt(np.maximum(cv2.blur(grey * grey, (n, n)) - mean * mean, 0.0))
+    wide = (6 * n + 1, 6 * n + 1)
+    smooth = cv2.blur((among & (rough < SMOOTH)).astype(np.float32), wide)
+    return np.asarray(smooth > SMOOTH_SHARE * cv2.blur(among.astype(np.float32), wide))
 
 
 def directions(intrinsics: Array, world_from_camera: Array, width: int, height: int) -> Array:

@@ -12,6 +12,7 @@ import numpy as np
 
 from tasks.kernels.compiled import kernel
 from tasks.render.scene.sensed import Photo
+from tasks.render.scene.sky import may_be_sky, no_worse, smooth_around
 from tasks.render.scene.stereo import FAR_M, MIN_BASELINE_M, Compared, disagreement, with_cost
 from tasks.world.arrays import F32, Array, Bools
 
@@ -24,16 +25,22 @@ GRID, DEPTHS_M = (6, 4), (5.0, 10.0, 25.0)  # where in a photo, and how far away
 OF_CAMERA, BEST_M = 2, 3.0  # photos of the same camera that are always asked, and the way to them that is best
 GOOD_DEG = (2.0, 35.0)  # between two rays to a point: depth is told well from the first on, nothing looks alike beyond
 LEAST_WORTH = 0.02  # share of a photo that another must add
-ANCHORED = 0.4  # cost of another depth where one is known
+ANCHORED = 0.4  # cost of another depth where one is known, and of one below the road
+BRIGHT_SKY, SMOOTH_SKY = (
+    0.03,
+    0.2,
+)  # cost that the sky is spared where a pixel is bright, and where all around is smooth
+GAP_M = 12.0  # a bright pixel that far away or farther may be a gap through which the sky is seen
 FINER = (-0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75)  # of a level
 
 
 def wide_depth(
-    rgb: F32, anchors: F32, others: Sequence[Compared], intrinsics: Array, pose: Array, wanted: Bools
+    rgb: F32, anchors: F32, floor: F32, others: Sequence[Compared], intrinsics: Array, pose: Array, wanted: Bools
 ) -> tuple[F32, F32, F32]:
-    """As `sweep_depth`: best depth (H, W) [m], its cost, and the cost of the sky hypothesis.
+    """As `sweep_depth`: best depth (H, W) [m], its cost, and 0 where the sky is seen, infinity elsewhere.
 
-    `anchors` (H, W): depths that are known, 0 elsewhere.
+    `anchors` (H, W): depths that are known, 0 elsewhere; `floor` (H, W): depths of the road's plane, below which
+    nothing is, 0 above the horizon, where alone there may be sky.
     """
     here, there = locally_normalised(rgb), [(locally_normalised(other), k, at) for other, k, at in others]
     inverse = np.linspace(1.0 / NEAREST_M, 1.0 / FARTHEST_M, LEVELS)
@@ -45,12 +52,18 @@ def wide_depth(
         depth = np.full(shape, z, np.float32)
         raw = disagreement(small[0], few, small[1], pose, depth, everywhere)
         volume[level] = cv2.blur(np.minimum(raw, COST_MAX), (COARSE_PX, COARSE_PX))
-    _anchor(volume, anchors, float(inverse[0]), float(inverse[0] - inverse[1]))
+    step = float(inverse[0] - inverse[1])
+    _anchor(volume, anchors, float(inverse[0]), step)
+    _stand_on(volume, np.ascontiguousarray(floor[::2, ::2]), float(inverse[0]), step)
+    bright = may_be_sky(rgb) & (floor == 0.0)
+    smooth = bright & smooth_around(rgb, bright)
+    favour = BRIGHT_SKY * np.where(bright, 1.0, -1.0) + SMOOTH_SKY * smooth
+    volume[-1] -= favour[::2, ::2][: shape[0], : shape[1]].astype(np.float32)
     guide = cv2.resize(rgb, shape[::-1], interpolation=cv2.INTER_AREA)
     chosen = _chosen(np.ascontiguousarray(volume.transpose(1, 2, 0)), guide)
     height, width = rgb.shape[:2]
-    level = cv2.resize(chosen.astype(np.float32), (width, height), interpolation=cv2.INTER_NEAREST)
-    step = inverse[0] - inverse[1]
+    level, solid = (cv2.resize(c.astype(np.float32), (width, height), interpolation=cv2.INTER_NEAREST) for c in chosen)
+    level = np.where(bright, level, solid)  # wires are thinner than what is looked at together
     at = np.where(level < LEVELS - 1, inverse[0] - level * step, 0.0)
     finer = [np.where(at > 0.0, 1.0 / np.maximum(at + part * step, 1.0 / FAR_M), FAR_M) for part in FINER]
     sky = np.full((height, width), FAR_M, np.float32)
@@ -58,7 +71,10 @@ def wide_depth(
     costs = [with_cost(here, there, intrinsics, pose, d, wanted, FINE_PX) for d in depths]
     best = np.argmin(np.stack(costs[:-1]), axis=0)
     depth = np.take_along_axis(np.stack(depths[:-1]), best[None], axis=0)[0]
-    return depth, np.min(np.stack(costs[:-1]), axis=0), costs[-1]
+    cost = np.min(np.stack(costs[:-1]), axis=0)
+    gaps = bright & (depth > GAP_M) & no_worse(costs[-1], cost)
+    open_sky = smooth | gaps | (level == LEVELS - 1)
+    return depth, cost, np.where(open_sky, np.float32(0.0), np.float32(np.inf))
 
 
 def partners(photo: Photo, others: Sequence[Photo], n: int) -> list[Compared]:
@@ -130,43 +146,62 @@ def _anchor(volume: Any, anchors: Any, first: float, step: float) -> None:
 
 
 @kernel
+def _stand_on(volume: Any, floor: Any, first: float, step: float) -> None:
+    """Adds to the costs (L, h, w) of levels that lie below the floor (h, w)."""
+    for y in range(volume.shape[1]):
+        for x in range(volume.shape[2]):
+            if floor[y, x] > 0.0:
+                at = (first - 1.0 / floor[y, x]) / step
+                for level in range(max(0, int(at + 1.5) + 1), volume.shape[0]):
+                    volume[level, y, x] += ANCHORED
+
+
+@kernel
 def _chosen(volume: Any, guide: Any) -> Any:
-    """(H, W) level of least cost (H, W, L) summed over paths from four sides; a jump costs less at an edge."""
+    """Level (2, H, W) of least cost (H, W, L) summed over paths from eight sides, of all and of all but the last.
+
+    A jump costs less at an edge.
+    """
     height, width, levels = volume.shape
     total = np.zeros(volume.shape, np.float32)
-    path = np.empty((max(height, width), levels), np.float32)
-    for side in range(4):
-        lines, length = (height, width) if side < 2 else (width, height)
-        for line in range(lines):
-            least = np.float32(0.0)
-            for k in range(length):
-                along = k if side % 2 == 0 else length - 1 - k
-                y, x = (line, along) if side < 2 else (along, line)
-                lowest = np.float32(np.inf)
-                if k > 0:
-                    back = -1 if side % 2 == 0 else 1
-                    yy, xx = (y, x + back) if side < 2 else (y + back, x)
-                    edge = 0.0
+    before = np.empty((4, width, levels), np.float32)  # paths from the left, and from the row before: three ways
+    after = np.empty((4, width, levels), np.float32)
+    for way in (1, -1):  # down from the upper left, then up from the lower right
+        for row in range(height):
+            y = row if way == 1 else height - 1 - row
+            for column in range(width):
+                x = column if way == 1 else width - 1 - column
+                for side in range(4):
+                    xx, yy = (x - way, y) if side == 0 else (x + side - 2, y - way)
+                    inside = 0 <= xx < width and 0 <= yy < height
+                    path, last = after[side, x], before[side, xx] if side else after[0, xx]
+                    if not inside:
+                        for level in range(levels):
+                            path[level] = volume[y, x, level]
+                            total[y, x, level] += path[level]
+                        continue
+                    edge, least = 0.0, last[0]
                     for c in range(3):
                         edge += abs(guide[y, x, c] - guide[yy, xx, c])
+                    for level in range(1, levels):
+                        least = min(least, last[level])
                     jump = np.float32(JUMP / (1.0 + 10.0 * edge))
-                for level in range(levels):
-                    cost = volume[y, x, level]
-                    if k > 0:
-                        best = path[k - 1, level]
+                    for level in range(levels):
+                        best = min(last[level], least + jump)
                         if level > 0:
-                            best = min(best, path[k - 1, level - 1] + np.float32(STEP))
+                            best = min(best, last[level - 1] + np.float32(STEP))
                         if level < levels - 1:
-                            best = min(best, path[k - 1, level + 1] + np.float32(STEP))
-                        cost += min(best, least + jump) - least
-                    path[k, level] = cost
-                    total[y, x, level] += cost
-                    lowest = min(lowest, cost)
-                least = lowest
-    out = np.zeros((height, width), np.int32)
+                            best = min(best, last[level + 1] + np.float32(STEP))
+                        path[level] = volume[y, x, level] + best - least
+                        total[y, x, level] += path[level]
+            before, after = after, before
+    out = np.zeros((2, height, width), np.int32)
     for y in range(height):
         for x in range(width):
-            for level in range(1, levels):
-                if total[y, x, level] < total[y, x, out[y, x]]:
-                    out[y, x] = level
+            best = 0
+            for level in range(1, levels - 1):
+                if total[y, x, level] < total[y, x, best]:
+                    best = level
+            out[0, y, x] = best if total[y, x, best] <= total[y, x, levels - 1] else levels - 1
+            out[1, y, x] = best
     return out

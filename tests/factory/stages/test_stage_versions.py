@@ -320,7 +320,7 @@ GOLDEN: dict[str, Golden] = {
         },
     ),
     "render": Golden(
-        4,
+        5,
         {
             "rendered": (714.36471, 34.8568599),
             "drawn": (1001.11158, 15.1497572),

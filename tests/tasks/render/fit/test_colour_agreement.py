@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tasks.render.fit.agreement import aligned, shared
+from tasks.render.fit.agreement import aligned, brightness, shared
 from tasks.render.fit.corrections import exposed, inverse
 
 RNG = np.random.default_rng(7)
@@ -96,3 +96,24 @@ def test_a_handful_of_points_moves_little() -> None:
     few = found(np.stack([light[:10], 0.5 * light[:10]]))
     many = found(np.stack([light, 0.5 * light]))
     assert np.abs(few[:, :9]).max() < 0.5 * np.abs(many[:, :9]).max()
+
+
+def test_how_bright_photos_are_comes_out_whatever_is_seen_where_and_some_points_are_wrong() -> None:
+    rng = np.random.default_rng(3)
+    gains = np.exp(rng.uniform(-0.4, 0.4, 8))
+    points = rng.uniform(0.2, 0.6, 3000)
+    grey = np.float32(gains[:, None] * points * np.exp(rng.normal(0.0, 0.03, (8, 3000))))
+    seen = np.abs(np.linspace(0, 1, 3000) - np.linspace(0, 1, 8)[:, None]) < 0.25  # a drive: none sees all
+    wrong = rng.uniform(size=seen.shape) < 0.15
+    grey[wrong] = rng.uniform(0.05, 1.0, wrong.sum())
+    logs = brightness(grey, seen)
+    np.testing.assert_allclose(logs, np.log(gains) - np.log(gains).mean(), atol=0.03)
+    assert logs.mean() == pytest.approx(0.0, abs=1e-12)
+
+
+def test_a_photo_that_shares_nothing_is_as_bright_as_the_mean() -> None:
+    seen = np.ones((3, 50), bool)
+    seen[2] = False
+    grey = np.float32([[0.4] * 50, [0.2] * 50, [0.9] * 50])
+    np.testing.assert_allclose(brightness(grey, seen), [0.3466, -0.3466, 0.0], atol=0.01)
+    assert not brightness(grey, np.zeros((3, 50), bool)).any()

@@ -59,6 +59,20 @@ def test_photos_of_an_instant_come_out_alike_on_what_both_see() -> None:
         )
 
 
+def test_a_camera_that_exposes_anew_is_followed_from_photo_to_photo() -> None:
+    places, gains = (0.0, 0.5, 1.0, 1.5, 2.0), (1.0, 0.7, 1.1, 0.8, 1.0)
+    true = [street.photo(x, 0.25, x, with_car=False) for x in places]
+    photos = [developed(p, np.float32([*((g - 1.0) * np.eye(3)).ravel(), 0, 0, 0])) for p, g in zip(true, gains)]
+    tracks = Tracks(None, np.zeros(3))
+    static, _ = fuse([street.sweep(x, 0.1 * x, with_car=False) for x in (0.0, 1.0, 2.0, 3.0)], tracks)
+    seen = [see(p, photos, Points(static), {}, tracks, 1) for p in photos]
+    rows = exposures_of(photos, seen, static)
+    found = 1.0 + rows[:, 0]
+    np.testing.assert_allclose(found / found.mean(), np.array(gains) / np.mean(gains), rtol=0.03)
+    alike = [a.rgb.mean() / b.rgb.mean() for a, b in zip(in_agreement(photos, rows), true)]
+    assert np.ptp(alike) < 0.04 < np.ptp(gains)
+
+
 def test_one_camera_alone_is_left_as_it_is() -> None:
     photos, sweeps = street.drive(3, with_car=False)
     _, state = prepare(photos, sweeps, None, FitSettings(start_gaussians=200, stereo_photos=1), held_out=[])

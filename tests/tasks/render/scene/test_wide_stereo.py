@@ -11,6 +11,7 @@ from tasks.render.scene.wide_stereo import locally_normalised, partners, wide_de
 WIDTH, HEIGHT, FOCAL, WALL_M, BOX_M = 240, 160, 180.0, 12.0, 6.0
 K = np.array([[FOCAL, 0.0, WIDTH / 2], [0.0, FOCAL, HEIGHT / 2], [0.0, 0.0, 1.0]])
 ALL = np.ones((HEIGHT, WIDTH), bool)
+NOTHING = np.zeros((HEIGHT, WIDTH), np.float32)
 
 
 def print_of(seed: int) -> np.ndarray:
@@ -41,9 +42,9 @@ def swept(gain: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     rgb = here.rgb.astype(np.float32) / 255.0
     compared = partners(here, brighter, 4)
     assert len(compared) == 2
-    nothing = np.zeros((HEIGHT, WIDTH), np.float32)
-    found, cost, sky_cost = wide_depth(rgb, nothing, compared, here.intrinsics, here.world_from_camera, ALL)
-    assert np.median(cost) < 0.5 * np.median(sky_cost)
+    camera = here.intrinsics, here.world_from_camera
+    found, cost, sky_cost = wide_depth(rgb, NOTHING, NOTHING, compared, *camera, ALL)
+    assert np.isinf(sky_cost).mean() > 0.95 and np.median(cost) < 0.2
     return found, depth
 
 
@@ -52,6 +53,28 @@ def test_a_wall_and_a_box_are_where_they_are_whatever_the_exposure() -> None:
         found, depth = swept(gain)
         off = np.abs(np.log(found / depth))[8:-8, 40:-40]
         assert np.median(off) < 0.01 and (off < 0.05).mean() > 0.85, (gain, np.median(off), (off < 0.05).mean())
+
+
+def test_nothing_lies_below_the_road() -> None:
+    here, others = photo(2.0)[0], [photo(at)[0] for at in (0.0, 4.0)]
+    blank = [replace(p, rgb=np.full_like(p.rgb, 90)) for p in (here, *others)]
+    rgb, compared = blank[0].rgb.astype(np.float32) / 255.0, partners(blank[0], blank[1:], 4)
+    floor = np.where(np.arange(HEIGHT)[:, None] >= HEIGHT // 2, np.float32(7.0), np.float32(0.0)) * ALL
+    found, _, sky_cost = wide_depth(rgb, NOTHING, floor, compared, K, here.world_from_camera, ALL)
+    assert found[HEIGHT // 2 + 4 :].max() < 8.0
+    assert np.isinf(sky_cost).all(), "grey, and below the horizon"
+
+
+def test_bright_and_smooth_above_the_horizon_is_sky_whatever_fits_as_well() -> None:
+    here, others = photo(2.0)[0], [photo(at)[0] for at in (0.0, 4.0)]
+    white = []
+    for p in (here, *others):
+        rgb = p.rgb.copy()
+        rgb[:40] = 220
+        white.append(replace(p, rgb=rgb))
+    rgb, compared = white[0].rgb.astype(np.float32) / 255.0, partners(white[0], white[1:], 4)
+    _, _, sky_cost = wide_depth(rgb, NOTHING, NOTHING, compared, K, here.world_from_camera, ALL)
+    assert (sky_cost[:34] == 0.0).all() and np.isinf(sky_cost[50:]).mean() > 0.95
 
 
 def test_partners_show_what_no_other_shows_and_never_nothing() -> None:
