@@ -77,7 +77,7 @@ def main() -> None:
         for shots in (problem.train, problem.held_out):
             both = []
             for shot in (shot for shot in shots if shot.photo.camera == name):
-                photo, target = shot.photo, shot.target.rgb
+                photo, target = shot.photo, shot.compared.target.rgb
                 pose = corrected(photo.world_from_camera, corrections_at(problem, state, name, photo.time_s)[0])
                 eye = Pinhole(photo.intrinsics, shifted(pose, problem.origin), width, height)
                 drawn = render(asset, [eye], threads=threads, affines=[asset.affine_of(name)])[0].rgb

@@ -104,7 +104,7 @@ def correct(cameras: list[Camera], files: list[SensorFile], settings: RigSetting
 def _counted(problem: Problem, shot: Shot) -> Array:
     """Pixels (H, W) of a photo that show no vehicle which drives by."""
     boxes, valid = problem.tracks.at(shot.photo.time_s)
-    return ~classes_of(shot.photo, boxes[valid], None)["vehicles"] & (shot.target.weight > 0.0)
+    return ~classes_of(shot.photo, boxes[valid], None)["vehicles"] & (shot.compared.target.weight > 0.0)
 
 
 def main() -> None:
@@ -149,7 +149,7 @@ def main() -> None:
         for shot in problem.held_out:
             picture = picture_of(problem, state, shot.photo, threads)
             counted = _counted(problem, shot)
-            score = psnr(picture[counted], shot.target.rgb[counted]), ssim(picture, shot.target)[0]
+            score = psnr(picture[counted], shot.compared.target.rgb[counted]), ssim(picture, shot.compared.target)[0]
             rows.setdefault(shot.photo.camera, []).append(score)
             rows.setdefault(f"at {shot.photo.time_s:g} s", []).append(score)
         mean = np.mean([score for name in (c.name for c in cameras) for score in rows[name]], axis=0)

@@ -30,7 +30,7 @@ from tasks.render.fit.on_cpu import OnCpu
 from tasks.render.fit.on_torch import OnTorch
 from tasks.render.fit.reconstruct import advance, finish
 from tasks.render.fit.settings import FitSettings
-from tasks.render.fit.start import Problem, Shot
+from tasks.render.fit.start import Comparison, Problem, Shot
 from tasks.render.fit.state import BACKGROUND, FitState, logits_of
 from tasks.render.scene.asset import psnr
 from tasks.render.scene.sensed import Photo, Tracks
@@ -129,7 +129,7 @@ def problem_of(n: int, width: int, height: int, threads: int) -> tuple[Problem, 
         picture = forward(truth, k, pose, width, height, np.full(3, SKY, np.float32), threads).view.rgb
         rgb = np.rint(255.0 * np.clip(picture, 0.0, 1.0)).astype(np.uint8)
         photo = Photo("front", 0.1 * i, rgb, k, pose)
-        shots.append(Shot(photo, target_of(rgb), np.zeros((height, width), bool)))
+        shots.append(Shot(photo, None, Comparison(target_of(rgb), np.zeros((height, width), bool))))
     held_out = tuple(shots[i] for i in HELD_OUT)
     train = tuple(shot for i, shot in enumerate(shots) if i not in HELD_OUT)
     return Problem(np.zeros(3), train, held_out, Tracks(None, np.zeros(3)), None), shaken(truth, len(train))
@@ -187,7 +187,7 @@ def plain(place: Place, problem: Problem, start: FitState, settings: FitSettings
     adam = torch.optim.Adam([{"params": [leaf], "lr": 1e-3} for leaf in leaves])
     nothing = torch.zeros(len(start), 0, 3, device=place.device)
     motion = torch.zeros(6, device=place.device)
-    photos = [torch.tensor(shot.target.rgb, device=place.device) for shot in problem.train]
+    photos = [torch.tensor(shot.compared.target.rgb, device=place.device) for shot in problem.train]
     everywhere = torch.ones(problem.train[0].photo.rgb.shape[:2], device=place.device)
     turn = count()
 

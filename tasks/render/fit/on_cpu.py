@@ -42,21 +42,22 @@ class OnCpu:
     def derivatives(self, problem: Problem, held: FitState, row: int, settings: FitSettings) -> Derivatives:
         """As `FitBackend` has it."""
         shot, state = problem.train[row], held
+        compared = shot.compared
         camera = corrected(shot.photo.world_from_camera, state.learned["poses"].values[row])
         scene, parts = compose(problem, state, shot.photo)
         seen, sky = look(state, scene, shot.photo, camera, self.threads)
         colours = state.learned["exposure"].values[row]
         picture = exposed(seen.view.rgb, colours)
-        loss, d_picture = photo_loss(picture, shot.target, settings.ssim_weight)
+        loss, d_picture = photo_loss(picture, compared.target, settings.ssim_weight)
         d_rgb, d_colours = exposed_gradient(seen.view.rgb, colours, d_picture)
         d_alpha = None
         if settings.opaque_weight > 0.0:
-            through, d_alpha = opaque_loss(seen.view.alpha, shot.ground, settings.opaque_weight)
+            through, d_alpha = opaque_loss(seen.view.alpha, compared.ground, settings.opaque_weight)
             loss += through
         back = backward(seen, scene, d_rgb, d_alpha=d_alpha, threads=self.threads)
         cells, d_cells = backdrop_gradient(d_rgb, seen.view.alpha, sky)
         rows, mine = _of_owners(back, parts)
-        score = psnr(np.clip(picture, 0.0, 1.0), shot.target.rgb)
+        score = psnr(np.clip(picture, 0.0, 1.0), compared.target.rgb)
         depths = seen.splats.projected[:, DEPTH]
         return Derivatives(loss, score, d_colours, back.camera, cells, d_cells, rows, mine, depths)
 

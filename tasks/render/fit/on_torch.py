@@ -82,6 +82,7 @@ class OnTorch:
     def derivatives(self, problem: Problem, held: StateTensors, row: int, settings: FitSettings) -> Derivatives:
         """As `FitBackend` has it."""
         shot = problem.train[row]
+        compared = shot.compared
         leaves = [held.learned[name].values.detach().requires_grad_() for name in DEVICE_SIDE]
         exposure = self._sent(held.learned["exposure"].values[row]).requires_grad_()
         height, width = shot.photo.rgb.shape[:2]
@@ -92,9 +93,9 @@ class OnTorch:
 
         rgb, cells = before_sky(seen.rgb, seen.alpha, leaves[-1], eye.intrinsics, camera)
         picture, photo = exposed(rgb, exposure), self._sent(shot.photo.rgb).float() / 255.0
-        loss = photo_loss(picture, photo, self._sent(shot.target.weight), settings.ssim_weight)
+        loss = photo_loss(picture, photo, self._sent(compared.target.weight), settings.ssim_weight)
         if settings.opaque_weight > 0.0:
-            loss = loss + opaque_loss(seen.alpha, self._sent(shot.ground), settings.opaque_weight)
+            loss = loss + opaque_loss(seen.alpha, self._sent(compared.ground), settings.opaque_weight)
 
         asked = [*leaves, exposure, eye.motion, seen.screen]
         by = torch.autograd.grad(loss, asked, materialize_grads=True)

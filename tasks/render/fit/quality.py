@@ -41,7 +41,7 @@ def measured(
     The camera has the colours that it has at any new pose, and tracks are where they were. Pixels without weight say
     nothing; LPIPS, whose layers see far around, is of the whole picture.
     """
-    photo, target = shot.photo, shot.target
+    photo, target = shot.photo, shot.compared.target
     height, width = target.weight.shape
     boxes, valid = problem.tracks.at(photo.time_s)
     rows = np.flatnonzero(valid)

@@ -17,7 +17,7 @@ from tasks.render.scene.build import held_out_rows, sky_of, surfaces
 from tasks.render.scene.confirmed import with_confirmed
 from tasks.render.scene.features import NOTHING_KNOWN, Known, Points, known_without_lidar
 from tasks.render.scene.movers import behind_boxes
-from tasks.render.scene.sensed import Photo, Sweep, Tracks, fuse, shifted
+from tasks.render.scene.sensed import Photo, Sweep, Tracks, fuse, reduced, shifted
 from tasks.render.scene.sight import Seen, see
 from tasks.render.scene.sky import directions
 from tasks.render.scene.stereo import FAR_M
@@ -27,8 +27,18 @@ from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import F32, Array, Bools
 
 ROAD_TOP_M = 0.08  # a Gaussian that starts no further from the road's surface belongs to it
+START_WIDTH = 640  # pixels of a photo across, more of which say no better where surfaces are
+COMPARED_BYTES, KEPT_BYTES = 41, 10**9  # of a pixel in `Comparison`, and of all that are kept
 LOOKS_DOWN = 0.05  # sine of the angle below the horizon from which on a ray meets the ground
 UPRIGHT = 0.5  # unless it stands: the least vertical part of its normal
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What of a photo every comparison needs: ten times its own bytes."""
+
+    target: Target
+    ground: Bools  # (H, W) looks down, so that no sky can be behind
 
 
 @dataclass(frozen=True)
@@ -36,8 +46,13 @@ class Shot:
     """A photo as the fit uses it, in the block's local frame."""
 
     photo: Photo
-    target: Target
-    ground: Bools  # (H, W) looks down, so that no sky can be behind
+    hidden: Bools | None  # (H, W) pixels that are left out
+    kept: Comparison | None = None  # made anew each time where the block's do not fit into KEPT_BYTES
+
+    @property
+    def compared(self) -> Comparison:
+        """What is kept, or the same once more."""
+        return _compared(self.photo, self.hidden) if self.kept is None else self.kept
 
 
 @dataclass(frozen=True)
@@ -76,11 +91,12 @@ def prepare(
     points = Points(static) if sweeps else known_without_lidar(train, tracks, known.shifted(-origin))
 
     first_seen = [i for k, group in enumerate(instants(train)) if k % settings.start_every == 0 for i in group]
-    looked_at = [train[i] for i in sorted(first_seen)]
+    small = [reduced(p, START_WIDTH) for p in train]
+    looked_at = [small[i] for i in sorted(first_seen)]
 
     def look(first: int, last: int) -> list[Seen]:
         n = settings.stereo_photos
-        return [see(p, train, points, per_track, tracks, n) for p in looked_at[first:last]]
+        return [see(p, small, points, per_track, tracks, n) for p in looked_at[first:last]]
 
     seen = [s for part in in_chunks(look, len(looked_at), 1, threads) for s in part]
     if points.corners is not None:
@@ -96,7 +112,11 @@ def prepare(
     bodies = _bodies(cars, tracks, [p.time_s for p in train])
     state = _first_state(background, cars, bodies, sky_of(alike, seen).rgb, exposures, surface, settings)
     unknown = [track_id not in nodes for track_id in tracks.ids]
-    shots = [_shot(p, tracks, np.array(unknown, bool)) for p in local]
+    hidden = [_hidden(p, tracks, np.array(unknown, bool)) for p in local]
+    sizes = np.cumsum([COMPARED_BYTES * p.rgb[..., 0].size for p in local])
+    shots = [
+        Shot(p, h, _compared(p, h) if size <= KEPT_BYTES else None) for p, h, size in zip(local, hidden, sizes.tolist())
+    ]
     problem = Problem(
         origin,
         tuple(shot for i, shot in enumerate(shots) if i not in out),
@@ -129,18 +149,23 @@ def _bodies(nodes: Sequence[Gaussians | None], tracks: Tracks, times_s: Sequence
     ]
 
 
-def _shot(photo: Photo, tracks: Tracks, unknown: Bools) -> Shot:
-    """A photo, without what moves and has no Gaussians of its own: it would be painted on the street."""
+def _hidden(photo: Photo, tracks: Tracks, unknown: Bools) -> Bools | None:
+    """Pixels of what moves and has no Gaussians of its own: it would be painted on the street."""
+    boxes, valid = tracks.at(photo.time_s)
+    if not (valid & unknown).any():
+        return None
     height, width = photo.rgb.shape[:2]
     rays = directions(photo.intrinsics, photo.world_from_camera, width, height)
-    boxes, valid = tracks.at(photo.time_s)
-    hidden = None
-    if (valid & unknown).any():
-        eye = np.ascontiguousarray(photo.world_from_camera[:3, 3])
-        far = rays.reshape(-1, 3) * FAR_M + eye
-        hidden = behind_boxes(far, eye, boxes[valid & unknown]).reshape(height, width)
+    eye = np.ascontiguousarray(photo.world_from_camera[:3, 3])
+    far = rays.reshape(-1, 3) * FAR_M + eye
+    return np.asarray(behind_boxes(far, eye, boxes[valid & unknown]), bool).reshape(height, width)
+
+
+def _compared(photo: Photo, hidden: Bools | None) -> Comparison:
+    height, width = photo.rgb.shape[:2]
+    rays = directions(photo.intrinsics, photo.world_from_camera, width, height)
     ground = rays[..., 2] < -LOOKS_DOWN * np.linalg.norm(rays, axis=-1)
-    return Shot(photo, target_of(photo.rgb, hidden), ground)
+    return Comparison(target_of(photo.rgb, hidden), ground)
 
 
 def _first_state(

@@ -1,8 +1,9 @@
 """What the sensors recorded of a block: photos, sweeps, tracks; and the sweeps as one cloud, what moves apart."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from tasks.render.scene.movers import GROUND_CLEARANCE_M, boxes_at, driving, owners, world_from_boxes
@@ -23,6 +24,17 @@ class Photo:
     rgb: Bytes  # (H, W, 3)
     intrinsics: Array  # (3, 3) pixels, the centre of pixel (0, 0) at (0.5, 0.5)
     world_from_camera: Array  # (4, 4)
+
+
+def reduced(photo: Photo, width: int) -> Photo:
+    """The photo, `width` pixels across at most."""
+    rows, columns = photo.rgb.shape[:2]
+    if columns <= width:
+        return photo
+    size = (width, round(rows * width / columns))
+    scale = np.diag([size[0] / columns, size[1] / rows, 1.0])
+    rgb = np.asarray(cv2.resize(photo.rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return replace(photo, rgb=rgb, intrinsics=scale @ photo.intrinsics)
 
 
 @dataclass(frozen=True)

@@ -69,7 +69,7 @@ def test_pictures_at_logged_poses_are_as_good_as_with_the_photos_own_exposures(
     for c, camera in enumerate(GAINS):
         own, new = [], []
         for shot in (shot for shot in problem.train if shot.photo.camera == camera):
-            own.append(psnr(picture_of(problem, state, shot.photo), shot.target.rgb))
+            own.append(psnr(picture_of(problem, state, shot.photo), shot.compared.target.rgb))
             new.append(psnr(images[round(shot.photo.time_s / 0.25), c], shot.photo.rgb))
         assert np.mean(new) > np.mean(own) - 1.0, camera
 

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 import street
 
-from tasks.render.fit.losses import target_of
 from tasks.render.fit.quality import ROAD_M, away, classes_of, measured
 from tasks.render.fit.reconstruct import advance, finish
 from tasks.render.fit.road import CELL_M, Road
 from tasks.render.fit.settings import FitSettings
-from tasks.render.fit.start import Problem, prepare
+from tasks.render.fit.start import Problem, Shot, prepare
 from tasks.render.fit.state import FitState
 from tasks.render.scene.asset import ClassQuality, ViewQuality
 
@@ -97,10 +96,11 @@ def test_pixels_without_weight_are_not_measured(fitted: tuple[Problem, FitState]
     hidden = np.zeros(spoilt.shape[:2], bool)
     hidden[:20] = True
     pose = shot.photo.world_from_camera
-    masked = measured(asset, problem, replace(shot, target=target_of(spoilt, hidden)), pose)
-    clean = measured(asset, problem, replace(shot, target=target_of(shot.photo.rgb, hidden)), pose)
+    bad = replace(shot.photo, rgb=spoilt)
+    masked = measured(asset, problem, Shot(bad, hidden), pose)
+    clean = measured(asset, problem, Shot(shot.photo, hidden), pose)
     assert masked.psnr_db == clean.psnr_db and of(masked, "rest").psnr_db == of(clean, "rest").psnr_db
-    seen = measured(asset, problem, replace(shot, target=target_of(spoilt)), pose)
+    seen = measured(asset, problem, Shot(bad, None), pose)
     assert seen.psnr_db < masked.psnr_db - 3.0
 
 
@@ -109,7 +109,7 @@ def test_lpips_is_of_the_picture_and_the_photo(fitted: tuple[Problem, FitState])
 
     def distance(picture: np.ndarray, photo: np.ndarray) -> float:
         assert picture.shape == photo.shape == (72, 128, 3)
-        np.testing.assert_array_equal(photo, problem.held_out[0].target.rgb)
+        np.testing.assert_array_equal(photo, problem.held_out[0].compared.target.rgb)
         return float(np.abs(picture - photo).mean())
 
     (view,) = finish(problem, state, lpips=distance).views

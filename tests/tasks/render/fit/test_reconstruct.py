@@ -7,6 +7,7 @@ import pytest
 import street
 from numpy.typing import NDArray
 
+from tasks.render.fit import start
 from tasks.render.fit.adam import BETA1, Learned
 from tasks.render.fit.reconstruct import RATE_END, advance, corrections_at, finish, photo_at, picture_of, reconstruct
 from tasks.render.fit.road import SLACK_M
@@ -50,13 +51,34 @@ def fresh(state: FitState) -> FitState:
     return FitState.from_arrays(state.arrays())
 
 
+def test_what_of_the_photos_does_not_fit_into_memory_is_made_anew_each_time(
+    prepared: tuple[Problem, FitState], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(start, "KEPT_BYTES", 2 * start.COMPARED_BYTES * few()[0][0].rgb[..., 0].size)
+    photos, sweeps = few()
+    problem, state = prepare(photos, sweeps, street.tracks(), SETTINGS, held_out=[2])
+    assert [shot.kept is None for shot in prepared[0].train] == [False] * 4
+    assert [shot.kept is None for shot in problem.train] == [False, False, True, True]
+    other = fresh(prepared[1])
+    advance(problem, state, SETTINGS, 8)
+    advance(prepared[0], other, SETTINGS, 8)
+    for name, array in state.arrays().items():
+        np.testing.assert_array_equal(array, other.arrays()[name], err_msg=name)
+
+
+def test_what_is_kept_of_a_pixel_is_counted(prepared: tuple[Problem, FitState]) -> None:
+    kept = prepared[0].train[0].compared
+    arrays = (kept.target.rgb, kept.target.mean, kept.target.variance, kept.target.weight, kept.ground)
+    assert sum(a.nbytes for a in arrays) == start.COMPARED_BYTES * kept.ground.size
+
+
 def test_a_held_out_photo_comes_out_better_with_every_round(prepared: tuple[Problem, FitState]) -> None:
     problem, state = prepared[0], fresh(prepared[1])
     shot = problem.held_out[0]
     scores = []
     for until in (0, 8, 24):
         advance(problem, state, SETTINGS, until)
-        scores.append(psnr(picture_of(problem, state, shot.photo), shot.target.rgb))
+        scores.append(psnr(picture_of(problem, state, shot.photo), shot.compared.target.rgb))
     assert scores[1] > scores[0] + 1.0
     assert scores[2] > scores[1]
     assert len(state) > len(prepared[1])

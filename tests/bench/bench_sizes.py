@@ -1,0 +1,73 @@
+"""What a block of eight cameras takes at three sizes: `python -m tests.bench.bench_sizes <openscene_0101> [n=v]`.
+
+Each size is fitted for a few iterations in a process of its own: CPU seconds to prepare and an iteration, and memory at
+most. Calibration is as given: how well it comes out is `bench_rig`'s question. `iterations=` are timed after as many
+that are not; `threads=` share them; other names are those of `FitSettings`.
+"""
+
+import resource
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+from factory.stages.sensors import load_photos
+from tasks.render.fit.reconstruct import advance, finish
+from tasks.render.fit.settings import FitSettings
+from tasks.render.fit.start import prepare
+from tasks.render.scene.asset import psnr
+from tasks.render.scene.engine import Vehicles, render
+from tasks.world.camera import Pinhole
+from tests.bench.bench_rig import HELD_OUT, read_block
+
+SIZES = ((480, 270), (960, 540), (1920, 1080))
+SETTINGS = replace(FitSettings(), start_gaussians=300_000, most_gaussians=350_000)
+MB = 2**10  # of ru_maxrss, which is in KB
+
+
+def main() -> None:
+    """Prints one row a size."""
+    print(
+        "| size | photos | MB of photos | CPU s to prepare | CPU s an iteration | CPU s a picture | peak memory [MB] |"
+    )
+    print("|---|---|---|---|---|---|---|", flush=True)
+    for width, height in SIZES:
+        subprocess.run([sys.executable, "-m", __spec__.name, "--one", f"{width}x{height}", *sys.argv[1:]], check=True)
+
+
+def one(size: str, root: Path, options: dict[str, str]) -> None:
+    """One row."""
+    width, height = (int(part) for part in size.split("x"))
+    n, threads = int(options.pop("iterations", "40")), int(options.pop("threads", "2"))
+    kinds = {name: type(value) for name, value in vars(SETTINGS).items()}
+    settings = replace(SETTINGS, iterations=2 * n, **{k: kinds[k](float(v)) for k, v in options.items()})
+    cameras, files, instants = read_block(root, ())
+    photos = load_photos(files, cameras, width, height)
+    held_out = [row for row, instant in enumerate(instants) if instant in HELD_OUT]
+    started = time.process_time()
+    problem, state = prepare(photos, [], None, settings, held_out, threads)
+    prepared = time.process_time() - started
+    advance(problem, state, settings, n, threads=threads)
+    started = time.process_time()
+    advance(problem, state, settings, 2 * n, threads=threads)
+    each = (time.process_time() - started) / n
+    asset, photo = finish(replace(problem, held_out=()), state, threads), photos[0]
+    eye = Pinhole(photo.intrinsics, photo.world_from_camera, width, height)
+    nobody = Vehicles((), (), problem.tracks.at(0.0)[0])
+    render(asset, [eye], nobody, threads=threads)
+    started = time.process_time()
+    picture = render(asset, [eye], nobody, threads=threads)[0].rgb
+    drawn = time.process_time() - started
+    assert psnr(picture, photo.rgb.astype("float32") / 255.0) > 10.0
+    peak, held = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / MB, sum(p.rgb.nbytes for p in photos) / 2**20
+    print(
+        f"| {size} | {len(photos)} | {held:.0f} | {prepared:.0f} | {each:.3f} | {drawn:.2f} | {peak:,.0f} |", flush=True
+    )
+
+
+if __name__ == "__main__":
+    if sys.argv[1] == "--one":
+        one(sys.argv[2], Path(sys.argv[3]), dict(option.split("=", 1) for option in sys.argv[4:]))
+    else:
+        main()
