@@ -1,6 +1,7 @@
 """The recovery expert of a run: its table is built from the run's own clips and vocabularies where none is named."""
 
 import hashlib
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,8 @@ from factory.store.identity import canonical_json
 from tasks.caches import user_cache
 from tasks.experts.recovery.expert import Recovery, RecoverySettings, RecoveryTable
 from tasks.stages import stage_versions
+
+log = logging.getLogger(__name__)
 
 
 def recovery(run: RunContext, **settings: Any) -> Recovery:
@@ -51,7 +54,10 @@ def _table_of(run: RunContext, vocabularies: Sequence[str]) -> RecoveryTable:
     key = hashlib.sha256(canonical_json(made_of).encode()).hexdigest()[:16]
     cached = user_cache() / "tables" / f"recovery-{key}.npz"
     if cached.is_file():
-        return load_recovery_table(cached)
+        try:
+            return load_recovery_table(cached)
+        except ValueError as error:  # it has a digest of its own, as any table a user names
+            log.warning("%s; it is made again", error)
     built = build_recovery_table([train_windows(reader)], loaded)
     save_recovery_table(cached, built, {"clips": len(index.refs), "vocabularies": files})
     return built

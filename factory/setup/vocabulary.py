@@ -5,7 +5,6 @@ them a run later reads, so that a run's `limit` never changes what the experts k
 """
 
 import json
-import zipfile
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -121,7 +120,7 @@ def _load(path: str | Path) -> np.ndarray | dict[str, np.ndarray]:
         return loaded if isinstance(loaded, np.ndarray) else {key: loaded[key] for key in loaded.files}
     except OSError as error:
         raise ValueError(f"{path}: not readable as a numpy file: {error.strerror or error}") from error
-    except (ValueError, EOFError, zipfile.BadZipFile) as error:  # numpy takes what it does not know for a pickle
+    except Exception as error:  # numpy takes what it does not know for a pickle, zipfile and zlib have errors of theirs
         why = "it holds no plain numbers" if "pickled (object)" in str(error) else str(error)
         raise ValueError(f"{path}: not readable as a numpy file: {why}") from error
 

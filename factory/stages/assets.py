@@ -20,7 +20,7 @@ import numpy as np
 from factory.graph.work import Stopped, never
 from factory.readers.videos import file_and_frame
 from factory.stages.fitting import fitted
-from factory.stages.rig import corrected_rig, known_of, wanted
+from factory.stages.rig import corrected_rig, known_of, said_again, wanted
 from factory.stages.scene_file import SUFFIX, BadScene, read_scene, write_scene
 from factory.stages.sensors import block_of, chosen_cameras, load_sensors, load_sweeps, taken_by
 from tasks.render.fit.lpips import lpips_of
@@ -90,9 +90,13 @@ def asset_for(
     with only_builder(path):
         if path.exists():
             try:
-                return read_scene(path)
+                kept = read_scene(path)
             except BadScene as error:
                 log.warning("%s; it is built again", error)
+            else:
+                if made_of is not Sensing.LIDAR_ONLY and wanted(block, settings.rig):
+                    said_again(path, block, cameras, settings.rig)
+                return kept
         if made_of is not Sensing.LIDAR_ONLY:
             found = None
             if wanted(block, settings.rig):

@@ -19,6 +19,7 @@ from tasks.render.fit.start import prepare
 from tasks.render.fit.state import FitState
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.settings import Backend
+from tasks.sealed import check, seal
 from tasks.world.agents import AgentTracks
 
 STRETCH = 500  # iterations between two saves
@@ -58,8 +59,10 @@ def fitted(
     while state.iteration < settings.iterations:
         advance(problem, state, settings, state.iteration + STRETCH, say, threads, stopped, drawing)
         arrays = state.arrays()
-        with whole_file(begun, sum(array.nbytes for array in arrays.values())) as draft, draft.open("wb") as file:
-            np.savez(file, **arrays)  # type: ignore[arg-type]
+        with whole_file(begun, sum(array.nbytes for array in arrays.values())) as draft:
+            with draft.open("wb") as file:
+                np.savez(file, **arrays)  # type: ignore[arg-type]
+            seal(draft)
         if state.iteration < settings.iterations and stopped():
             said.unlink(missing_ok=True)
             raise Halted(f"{path.stem}: {state.iteration} of {settings.iterations} iterations are done")
@@ -85,6 +88,7 @@ def _resumed(begun: Path, start: FitState) -> FitState:
     if not begun.exists():
         return start
     try:
+        check(begun)
         with np.load(begun, allow_pickle=False) as arrays:
             return FitState.from_arrays(dict(arrays))
     except (ValueError, KeyError, OSError, zipfile.BadZipFile) as error:

@@ -4,7 +4,6 @@
 what their neighbours say, and the cameras as they were used.
 """
 
-import json
 import logging
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -21,6 +20,7 @@ from tasks.render.rig.masks import hidden_by
 from tasks.render.rig.settings import Adjust, RigSettings
 from tasks.render.scene.driven_road import driven_road
 from tasks.render.scene.features import Known
+from tasks.sealed import Damaged, sealed_json, unsealed_json
 from tasks.world.camera import Camera
 from tasks.world.clip import Block
 
@@ -55,7 +55,7 @@ def corrected_rig(
         return block, tuple(cameras), None
     for line in lines_of(found):
         log.info("%s: %s", path.stem, line)
-    text = json.dumps(described(found), indent=1)
+    text = sealed_json(described(found))
     with whole_file(path.with_suffix(SAID), len(text)) as draft:
         draft.write_text(text)
     for file in (files[row] for row in found.strangers):
@@ -63,6 +63,18 @@ def corrected_rig(
                     file.time_s, file.uri)  # fmt: skip
     kept = tuple(file for row, file in enumerate(found.files) if row not in found.strangers)
     return replace(block, images=kept), found.cameras, found
+
+
+def said_again(path: Path, block: Block, cameras: Sequence[Camera], settings: RigSettings) -> None:
+    """Writes what was found anew where the file beside `path` is damaged; the scene there stays. Raises BadClip."""
+    said = path.with_suffix(SAID)
+    try:
+        unsealed_json(said.read_bytes())
+    except FileNotFoundError:  # nothing was found, or somebody took it away
+        return
+    except Damaged as error:
+        log.warning("%s: %s; it is written again", said, error)
+        corrected_rig(path, block, cameras, settings)
 
 
 def known_of(data: SensorData, block: Block, found: Correction) -> Known:

@@ -3,6 +3,7 @@
 import fcntl
 import gc
 import hashlib
+import logging
 import os
 import subprocess
 import sys
@@ -30,6 +31,7 @@ from tasks.reward.labels import Labelling, reactive_scores, vocabulary_labels
 from tasks.reward.prepare import prepare_scene
 from tasks.reward.verdicts import INDEX_FROM_ROWS
 from tasks.rollout.simulate import TrafficSettings, simulate
+from tasks.sealed import Damaged, sealed, unsealed
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import Array
 from tasks.world.clip import CLIP_STEPS, HORIZON_STEPS, NOW, Clip, Scene, scene_of_clip
@@ -40,6 +42,7 @@ from tasks.world.vocabulary import Vocabulary
 REPLAY = TrafficSettings(mode="replay")
 ENOUGH_S = 0.2  # between two looks whether compiling is to be given up
 _one_at_a_time = Lock()
+log = logging.getLogger(__name__)
 
 
 def parts_of(simulates: bool, traffic: str, label_traffic: str | None, render: RenderSettings) -> list[str]:
@@ -117,10 +120,13 @@ def marker(name: str) -> Path:
 def _is_compiled(name: str) -> bool:
     """The part was compiled, and nobody has taken a file of it away since."""
     try:
-        listed = marker(name).read_text()
+        files = [cache_dir() / file for file in unsealed(marker(name).read_bytes()).decode().splitlines()]
     except OSError:  # not there, or in a folder that cannot be: whoever then writes into it says so
         return False
-    return all((cache_dir() / file).is_file() for file in listed.splitlines())
+    except Damaged as error:
+        log.warning("%s: %s; it is made again", marker(name), error)
+        return False
+    return all(file.is_file() for file in files)
 
 
 def _compile_part(name: str, enough: Event) -> None:
@@ -153,7 +159,7 @@ def _warm(name: str) -> int:
     listed = "\n".join(sorted(path.relative_to(cache_dir()).as_posix() for path in USED))
     try:
         for part in (name, *INCLUDED.get(name, ())):
-            write_whole(marker(part), listed.encode())
+            write_whole(marker(part), sealed(listed.encode()))
     except OSError as error:
         print(error, file=sys.stderr)
         return DISK_FULL

@@ -2,7 +2,7 @@
 
 A file is a plain zip of arrays (npz, no pickle) plus one JSON tree that says how frozen dataclasses, tuples, dicts and
 arrays nest. Reading it builds only dataclasses and enums of this distribution, by their fields, and nothing else.
-The zip's own checksums find damage; a damaged or foreign file counts as missing, with the reason.
+A seal (tasks.sealed) stands behind the zip; a damaged or foreign file counts as missing, with the reason.
 """
 
 import dataclasses
@@ -10,7 +10,6 @@ import enum
 import importlib
 import io
 import json
-import zipfile
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factory.store.location import Location
+from tasks.sealed import SEAL, SEAL_BYTES, Damaged, sealed, unsealed
 
 if TYPE_CHECKING:
     from tasks.hard_scenes import BenchmarkClip, GivenScenes, OneStageClip
@@ -59,8 +59,8 @@ def decode(data: bytes) -> Any:
             if tree["format"] != FORMAT:
                 raise BadCacheFile(f"format {tree['format']}, this version reads {FORMAT}")
             return _decode(tree["root"], {name: stored[name] for name in stored.files})
-    except (zipfile.BadZipFile, KeyError, ValueError, TypeError, AttributeError, ImportError, EOFError) as error:
-        raise BadCacheFile(str(error)) from error
+    except Exception as error:  # whatever a zip, an array's header or a class makes of bytes that are none of ours
+        raise BadCacheFile(str(error) or type(error).__name__) from error
 
 
 class ClipCache:
@@ -72,11 +72,11 @@ class ClipCache:
     def load(self, key: str) -> object | None:
         """The stored value, None where there is none. Raises BadCacheFile."""
         data = self.location.read(f"{key}.npz")
-        return None if data is None else decode(data)
+        return None if data is None else decode(_whole(data))
 
     def store(self, key: str, value: object) -> None:
         """Whole or not at all."""
-        self.location.write(f"{key}.npz", encode(value))
+        self.location.write(f"{key}.npz", sealed(encode(value)))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,23 +87,36 @@ class SceneFiles:
 
     def store(self, scenes: "BenchmarkClip | GivenScenes | OneStageClip") -> None:
         """Whole or not at all; in place of an older one."""
-        self.location.write(f"{scenes.clip.clip_id}.npz", encode(scenes))
+        self.location.write(f"{scenes.clip.clip_id}.npz", sealed(encode(scenes)))
 
     def load(self, clip_id: str) -> "BenchmarkClip | GivenScenes | OneStageClip":
-        """Raises FileNotFoundError where the clip has none, BadCacheFile for a damaged or foreign file."""
+        """Raises FileNotFoundError where the clip has none, BadCacheFile, with its name, for a damaged or foreign file.
+
+        Files of versions that sealed none have the zip's own checksums.
+        """
         from tasks.hard_scenes import BenchmarkClip, GivenScenes, OneStageClip
 
-        data = self.location.read(f"{clip_id}.npz")
+        data, path = self.location.read(f"{clip_id}.npz"), f"{self.location.uri}/{clip_id}.npz"
         if data is None:
-            raise FileNotFoundError(f"{self.location.uri}/{clip_id}.npz: no scenes of this clip; run the factory again")
-        scenes = decode(data)
+            raise FileNotFoundError(f"{path}: no scenes of this clip; run the factory again")
+        try:
+            scenes = decode(_whole(data) if data[-SEAL_BYTES:].startswith(SEAL) else data)
+        except BadCacheFile as error:
+            raise BadCacheFile(f"{path}: {error}; remove it, the command that made it writes it again") from error
         if not isinstance(scenes, BenchmarkClip | GivenScenes | OneStageClip):
-            raise BadCacheFile(f"{self.location.uri}/{clip_id}.npz holds {type(scenes).__name__}, not a clip's scenes")
+            raise BadCacheFile(f"{path} holds {type(scenes).__name__}, not a clip's scenes")
         return scenes
 
     def clip_ids(self) -> list[str]:
         """Of all clips that have scenes, sorted."""
         return [name.removesuffix(".npz") for name in self.location.names() if name.endswith(".npz")]
+
+
+def _whole(data: bytes) -> bytes:
+    try:
+        return unsealed(data)
+    except Damaged as error:
+        raise BadCacheFile(str(error)) from error
 
 
 class _Arrays:

@@ -5,12 +5,16 @@
 It holds all rows with the needed columns alone, of the images those at now of the chosen cameras, uncompressed, and is
 read by mapping it: pictures are decoded from where they lie. A file of a table never changes, and the digest is of its
 name, the columns, the cameras and the format, so that trainings with other rows share the copies and those with other
-columns or cameras have their own. A damaged copy is an error that names it. Nothing is ever removed; the folder can
-be deleted while no training runs.
+columns or cameras have their own. Nothing is ever removed; the folder can be deleted while no training runs.
+
+Each record batch is a stream of Arrow's of its own. Behind them stands where each lies and its checksum, as sealed
+JSON, and in the last 8 bytes the length of that. A copy that is found damaged is made again, with a line in the log.
 """
 
 import fcntl
 import hashlib
+import json
+import logging
 import os
 import zlib
 from dataclasses import dataclass
@@ -24,9 +28,12 @@ import pyarrow.compute as pc
 from factory.store.reader import TIME_TOLERANCE_S
 from planners.data.feed import Feed
 from planners.data.files import SampleFile, leaves
+from tasks.sealed import Damaged, sealed, unsealed
 
-FORMAT = 1
-CHECKSUM = b"crc32"
+FORMAT = 2
+ALIGNED_BYTES = 64  # Arrow's own
+LENGTH_BYTES = 8
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,24 +46,28 @@ class LocalCopy:
     cameras: tuple[str, ...]  # whose images are held
 
     def open(self) -> "CopyReader":
-        """Made first where it is not there. Raises OSError naming it where it cannot be made or is damaged."""
+        """Made first where it is not there. Raises OSError naming it where it cannot be made."""
         if not self.path.exists():
-            try:
-                self._make()
-            except OSError as error:
-                raise OSError(f"while it was copied to {self.path}: {error}") from error
-        return CopyReader(self.path)
+            self.make(None)
+        return CopyReader(self)
 
-    def _make(self) -> None:
+    def make(self, damaged: int | None) -> None:
         """Whole or not at all, by one of those who want it at a time, in whatever thread or process.
 
-        A draft that a killed process left is written anew: its lock is gone with it.
+        damaged: inode of a copy to be replaced. A draft that a killed process left is written anew: its lock is gone
+        with it. Raises OSError naming the copy.
         """
+        try:
+            self._make(damaged)
+        except OSError as error:
+            raise OSError(f"while it was copied to {self.path}: {error}") from error
+
+    def _make(self, damaged: int | None) -> None:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         draft = self.path.with_suffix(".draft")
         with draft.open("ab") as sink:
             fcntl.flock(sink, fcntl.LOCK_EX)
-            if self.path.exists():  # another made it meanwhile
+            if self.path.exists() and self.path.stat().st_ino != damaged:  # another made it meanwhile
                 draft.unlink(missing_ok=True)
                 return
             sink.seek(0)
@@ -67,49 +78,67 @@ class LocalCopy:
             draft.replace(self.path)
 
     def _write(self, sink: IO[bytes]) -> None:
-        parquet = self.file.open()
+        parquet, places, end = self.file.open(), [], 0
         paths = leaves(parquet, self.columns)
-        writer: pa.RecordBatchFileWriter | None = None
         for group in range(parquet.metadata.num_row_groups):
             table = parquet.read_row_group(group, columns=paths, use_threads=False).combine_chunks()
             if "images" in table.column_names:
                 images = _chosen(table["images"].combine_chunks(), self.cameras)
                 table = table.set_column(table.column_names.index("images"), "images", images)
-            (batch,) = table.to_batches()
-            batch = pa.ipc.read_record_batch(batch.serialize(), batch.schema)  # the buffers that a reader will see
-            if writer is None:
-                writer = pa.ipc.new_file(sink, batch.schema)
-            writer.write_batch(batch, custom_metadata={CHECKSUM: _checksum(batch)})
-        if writer is not None:
-            writer.close()
+            stream = pa.BufferOutputStream()
+            with pa.ipc.new_stream(stream, table.schema) as writer:
+                writer.write_table(table)
+            data = stream.getvalue()
+            places.append([end, data.size, zlib.crc32(data)])
+            sink.write(data)
+            sink.write(bytes(-data.size % ALIGNED_BYTES))
+            end += data.size + -data.size % ALIGNED_BYTES
+        index = sealed(json.dumps(places).encode())
+        sink.write(index + len(index).to_bytes(LENGTH_BYTES, "little"))
 
 
 class CopyReader:
     """Row groups of a copy, mapped into memory."""
 
-    def __init__(self, path: Path) -> None:
-        """Raises OSError for a damaged file."""
-        self._path = path
-        try:
-            self._reader = pa.ipc.open_file(pa.memory_map(str(path)))
-        except pa.ArrowInvalid as error:
-            raise self._damaged(str(error)) from error
+    def __init__(self, copy: LocalCopy) -> None:
+        self._copy = copy
+        self._mapped: tuple[int, pa.Buffer] | None = None  # its inode and what it holds
 
     def read_row_group(self, group: int) -> pa.Table:
         """All rows of it; nothing is copied. Checked each time, which also brings it from the disk in this thread.
 
-        Raises OSError naming the copy and what to do where it is damaged.
+        A damaged copy is made again. Raises OSError naming it where that cannot be done, or is of no use.
         """
+        inode, data = self._mapped or self._map()
         try:
-            batch, metadata = self._reader.get_batch_with_custom_metadata(group)
-        except (pa.ArrowException, OSError, ValueError) as error:
-            raise self._damaged(str(error)) from error
-        if metadata is None or metadata.get(CHECKSUM) != _checksum(batch):
-            raise self._damaged(f"checksum of row group {group}")
-        return pa.Table.from_batches([batch])
+            return _group_of(data, group)
+        except Damaged as error:
+            log.warning("%s: %s; it is made again", self._copy.path, error)
+        self._copy.make(inode)
+        try:
+            return _group_of(self._map()[1], group)
+        except Damaged as error:
+            raise OSError(f"its copy {self._copy.path}, just made again, is damaged: {error}") from error
 
-    def _damaged(self, what: str) -> OSError:
-        return OSError(f"its copy {self._path} is damaged ({what}): delete the copy, and it is made again")
+    def _map(self) -> tuple[int, pa.Buffer]:
+        path = self._copy.path
+        if path.stat().st_size:
+            with pa.memory_map(str(path)) as file:
+                self._mapped = path.stat().st_ino, file.read_buffer()
+        else:  # which cannot be mapped
+            self._mapped = path.stat().st_ino, pa.py_buffer(b"")
+        return self._mapped
+
+
+def _group_of(data: pa.Buffer, group: int) -> pa.Table:
+    """One row group of what a copy holds, nothing of which is parsed before its checksum is right. Raises Damaged."""
+    end = max(0, data.size - LENGTH_BYTES)
+    n_bytes = int.from_bytes(data[end:], "little")
+    offset, length, checksum = json.loads(unsealed(data[max(0, end - n_bytes) : end].to_pybytes()))[group]
+    block = data.slice(min(offset, data.size), length)
+    if zlib.crc32(block) != checksum:
+        raise Damaged(f"checksum of row group {group}")
+    return pa.ipc.open_stream(block).read_all()
 
 
 def copies_of(feed: Feed) -> dict[int, LocalCopy]:
@@ -136,12 +165,3 @@ def _chosen(images: pa.ListArray, cameras: tuple[str, ...]) -> pa.ListArray:
     kept = np.flatnonzero(at_now & of_them.to_numpy(zero_copy_only=False))
     offsets = np.searchsorted(kept, images.offsets.to_numpy())
     return pa.ListArray.from_arrays(pa.array(offsets, pa.int32()), entries.take(pa.array(kept)))
-
-
-def _checksum(batch: pa.RecordBatch) -> bytes:
-    value = batch.num_rows
-    for column in batch.columns:
-        for buffer in column.buffers():
-            if buffer is not None:
-                value = zlib.crc32(buffer, value)
-    return f"{value:08x}".encode()

@@ -13,6 +13,7 @@ over all samples has no use for what was used last. It can be deleted while no t
 
 import fcntl
 import hashlib
+import logging
 import os
 import zlib
 from collections.abc import Iterator, Sequence
@@ -34,6 +35,7 @@ DECODER = f"simplejpeg {simplejpeg.__version__}, OpenCV {cv2.__version__}"
 PARTS = 256
 CHECKSUM_BYTES = 4
 GB = 1e9
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -111,7 +113,10 @@ def _read(path: Path, key: str, out: Bytes) -> bool:
             n, checksum = file.readinto(out.data), file.read(CHECKSUM_BYTES + 1)
     except FileNotFoundError:
         return False
-    return n == out.nbytes and checksum == _checksum(key, out)
+    whole = n == out.nbytes and checksum == _checksum(key, out)
+    if not whole:
+        log.warning("%s: damaged; it is made again", path)
+    return whole
 
 
 def _checksum(key: str, picture: Bytes) -> bytes:

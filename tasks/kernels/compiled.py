@@ -11,6 +11,7 @@ changed for other code.
 """
 
 import hashlib
+import logging
 import os
 import pickle
 import re
@@ -33,8 +34,10 @@ from numba.core.serialize import dumps
 from numpy.typing import NDArray
 
 from tasks.caches import user_cache
+from tasks.sealed import Damaged, sealed, unsealed
 
 F = TypeVar("F", bound=Callable[..., Any])
+log = logging.getLogger(__name__)
 _ROOT = Path(__file__).resolve().parents[2]
 _PACKAGES = ("tasks", "factory")
 _FOLDER = re.compile(r"(kernels-[0-9a-f]{16})(-[0-9a-f]{8})?")  # with the second part: being removed
@@ -148,8 +151,11 @@ class KernelCache:
         target.refresh()
         path = self._path(signature)
         try:
-            kept = path.read_bytes()
+            kept = unsealed(path.read_bytes())
         except OSError:  # not there, or nobody's to read: compiled again, and save_overload says what is wrong
+            return None
+        except Damaged as error:
+            log.warning("%s: %s; compiled again", path, error)
             return None
         _use(path)
         return CompileResult._rebuild(target, *pickle.loads(kept))  # noqa: S301 -- machine code, written below
@@ -161,7 +167,7 @@ class KernelCache:
         path = self._path(signature)
         try:
             make_cache_dir()
-            write_whole(path, dumps(compiled._reduce()))
+            write_whole(path, sealed(dumps(compiled._reduce())))
         except OSError as error:
             warnings.warn(not_kept(error), RuntimeWarning, stacklevel=1)
             return

@@ -6,6 +6,7 @@ table a log, in the user's cache; it is made again where the log's size or time 
 
 import hashlib
 import io
+import logging
 from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass, fields
@@ -20,12 +21,14 @@ from factory.readers.navsim.filters import SceneFilter
 from factory.readers.navsim.log import LogFrames, read_frames
 from factory.readers.navsim.tracks import FRAMES_BEFORE, WINDOW_FRAMES
 from tasks.kernels.compiled import write_whole
+from tasks.sealed import sealed, unsealed
 from tasks.world.arrays import Bools, Ints
 
 TABLE_VERSION = 2  # of the tables kept
 FRAME_S, SLACK_S = 0.5, 0.05  # between two frames; more or less is a gap
 GAP, SHORT_HISTORY, SHORT_FUTURE = "gap_in_frames", "short_history", "short_future"
 NO_ROUTE, NO_BOXES, STANDING, ABSENT = "no_route", "not_annotated", "ego_standing", "absent_token"
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -91,13 +94,14 @@ def table_of(log: LogFrames) -> FrameTable:
 def kept_table(path: Path, cache_dir: Path) -> FrameTable | None:
     """The table of the log at `path`, if one was kept of just this file. Raises BadClip where there is no such file."""
     try:
-        data = _kept(path, cache_dir).read_bytes()
+        data = unsealed(_kept(path, cache_dir).read_bytes())
         rows = np.load(io.BytesIO(data), allow_pickle=False)
         return FrameTable(*(rows[column.name] for column in fields(FrameTable)))
     except FileNotFoundError:
         return None
-    except (ValueError, OSError, EOFError, IndexError):
-        return None  # what is no table is made again
+    except (ValueError, OSError, IndexError) as error:  # Damaged among them
+        log.warning("%s: %s; made again of %s", _kept(path, cache_dir), error, path)
+        return None
 
 
 def make_table(path: Path, cache_dir: Path) -> FrameTable:
@@ -116,7 +120,7 @@ def keep_table(table: FrameTable, path: Path, cache_dir: Path) -> None:
     data = io.BytesIO()
     np.save(data, rows, allow_pickle=False)
     cache_dir.mkdir(parents=True, exist_ok=True)
-    write_whole(_kept(path, cache_dir), data.getvalue())
+    write_whole(_kept(path, cache_dir), sealed(data.getvalue()))
 
 
 def _kept(path: Path, cache_dir: Path) -> Path:

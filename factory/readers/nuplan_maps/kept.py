@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from factory.readers.nuplan_maps.geopackage import KEYS, LINES, NUMBERS, Table, read_geopackage
 from tasks.caches import user_cache
+from tasks.sealed import check, seal
 
 log = logging.getLogger(__name__)
 
@@ -67,6 +68,7 @@ def save_tables(path: Path, tables: dict[str, Table]) -> None:
     try:
         with draft.open("wb") as file:
             np.savez(file, allow_pickle=False, **arrays)
+        seal(draft)
         draft.replace(path)
     finally:
         draft.unlink(missing_ok=True)
@@ -75,6 +77,7 @@ def save_tables(path: Path, tables: dict[str, Table]) -> None:
 def load_tables(path: Path) -> dict[str, Table]:
     """Raises BadMapCache."""
     try:
+        check(path)
         with np.load(path, allow_pickle=False) as stored:
             if int(stored["format"]) != FORMAT:
                 raise BadMapCache(f"format {int(stored['format'])}, this version reads {FORMAT}")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from factory.readers.base import BadClip
-from factory.stages.rig import SAID, corrected_rig, wanted
+from factory.stages.rig import SAID, corrected_rig, said_again, wanted
 from tasks.render.rig.ground import ground_below
 from tasks.render.rig.rig import motions, twists_of
 from tasks.render.rig.settings import Adjust, RigSettings
@@ -109,6 +109,11 @@ def test_a_turned_camera_is_put_right_told_and_drawn_with(
     assert by_name["left"]["after_px"] < 0.5 < by_name["left"]["before_px"]
     assert told["used"][1]["ego_from_camera"] == found[1].ego_from_camera.tolist()
     assert "left: moved" in caplog.text
+    path = tmp_path / f"block-1{SAID}"
+    whole = path.read_bytes()
+    path.write_bytes(whole.replace(b"after_px", b"aftfr_px", 1))
+    said_again(tmp_path / "block-1.safetensors", block, said, RigSettings())
+    assert path.read_bytes() == whole and f"{path}: its checksum" in caplog.text and "written again" in caplog.text
     asset = RenderAsset(np.zeros(3), EMPTY, {}, SkyMap(np.zeros((2, 2, 3), np.float32)), 30.0, rig=found)
     assert asset.as_corrected([said[1]]) == (found[1],)
     assert replace(asset, rig=()).as_corrected([said[1]]) == (said[1],)

@@ -10,6 +10,7 @@ import pytest
 
 from factory.stages.warm import compile_kernels, marker
 from tasks.kernels.compiled import cache_dir
+from tasks.sealed import unsealed
 
 pytestmark = pytest.mark.slow
 
@@ -34,7 +35,7 @@ def run_with_these(parts: list[str], tmp_path: Path, *arguments: str) -> tuple[s
     cache = tmp_path / "cache" / cache_dir().name
     for part in parts:
         listing = marker(part)
-        for name in (listing.name, *listing.read_text().splitlines()):
+        for name in (listing.name, *unsealed(listing.read_bytes()).decode().splitlines()):
             (cache / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(cache_dir() / name, cache / name)
     if (cache_dir() / "factory").is_dir():  # what paints the town

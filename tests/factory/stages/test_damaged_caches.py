@@ -1,0 +1,203 @@
+"""A cache is a cache: wherever a file in it is damaged, it is made again, the same, and one line says so."""
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from factory.graph.steps import Prepared, cache_key, prepare
+from factory.readers.navsim.windows import kept_table, make_table
+from factory.readers.nuplan_maps.kept import cache_file, kept_tables
+from factory.readers.settings import TownSettings
+from factory.readers.town.reader import SyntheticReader
+from factory.setup.recovery import _table_of
+from factory.setup.vocabulary import load_recovery_table, save_recovery_table, save_vocabulary
+from factory.stages.fitting import _resumed
+from factory.stages.scene_file import BadScene, read_scene, write_scene
+from factory.stages.warm import _is_compiled, marker, tiny_clip
+from factory.store.cache import BadCacheFile, SceneFiles, encode
+from factory.store.location import Location
+from tasks.experts.recovery.expert import RecoveryTable
+from tasks.hard_scenes import OneStageClip
+from tasks.kernels.compiled import kernel
+from tasks.sealed import SEAL_BYTES, seal, sealed
+from tasks.world.kinematic_vocabulary import kinematic_trajectories
+from tasks.world.vocabulary import Vocabulary
+from tests.factory.damage import damaged
+from tests.factory.readers.geopackage_writer import stub_rows, write_root
+from tests.factory.readers.navsim.logs import NAME, frame
+from tests.factory.readers.openscene_writer import write_frames
+from tests.factory.stages.test_scene_file import scene
+from tests.factory.toy import ToyWork, refs
+
+Lines = Callable[[], list[str]]
+
+
+@pytest.fixture
+def lines(caplog: pytest.LogCaptureFixture) -> Lines:
+    """What was logged since it was last asked."""
+
+    def taken() -> list[str]:
+        messages = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
+        caplog.clear()
+        return messages
+
+    return taken
+
+
+def test_a_prepared_clip(tmp_path: Path) -> None:
+    (ref,), work, out = refs(1), ToyWork(), Location(str(tmp_path))
+    golden = encode(prepare(work, out, ref)[1])
+    key = cache_key(ref.clip_id, work.identity.prepare_digest)
+    path = tmp_path / "cache" / "prepared" / f"{key}.npz"
+    whole = path.read_bytes()
+    for content in [*damaged(whole), whole[:-SEAL_BYTES]]:  # the last: as versions before wrote it
+        path.write_bytes(content)
+        report, clip = prepare(work, out, ref)
+        assert isinstance(report, Prepared) and not report.from_cache
+        assert report.note.startswith(f"cache file {key}: it") and report.note.endswith("; prepared again")
+        assert encode(clip) == golden and path.read_bytes() == whole
+    report, _ = prepare(work, out, ref)
+    assert isinstance(report, Prepared) and report.from_cache and not report.note
+
+
+def test_a_clip_s_scenes_are_named_and_older_ones_are_read(tmp_path: Path) -> None:
+    files, path = SceneFiles(Location(str(tmp_path))), tmp_path / "warm.npz"
+    files.store(OneStageClip(tiny_clip()))
+    whole, golden = path.read_bytes(), encode(files.load("warm"))
+    refused = 0
+    for content in damaged(whole):
+        path.write_bytes(content)
+        try:
+            assert encode(files.load("warm")) == golden  # the seal alone was hit, or cut off: as an older file
+        except BadCacheFile as error:
+            assert str(error).startswith(f"{path}: ")
+            refused += 1
+    assert refused > len(whole) / 50 - SEAL_BYTES
+    path.write_bytes(whole[:-SEAL_BYTES])
+    assert encode(files.load("warm")) == golden
+
+
+def test_a_scene_file(tmp_path: Path) -> None:
+    path = tmp_path / "block-1.safetensors"
+    write_scene(path, scene())
+    for content in damaged(path.read_bytes()):
+        path.write_bytes(content)
+        with pytest.raises(BadScene, match=f"{path}: "):
+            read_scene(path)
+
+
+def test_a_city_s_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lines: Lines) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    write_root(tmp_path, "us-ma-boston", stub_rows())
+    map_file = next(tmp_path.glob("us-ma-boston/*/map.gpkg"))
+    kept_tables(map_file)
+    path = cache_file(map_file)
+    whole = path.read_bytes()
+    for content in damaged(whole, every=len(whole) // 6):
+        path.write_bytes(content)
+        kept_tables(map_file)
+        (line,) = lines()
+        assert line.startswith(f"{path}: damaged") and path.read_bytes() == whole
+
+
+def test_the_table_of_a_log(tmp_path: Path, lines: Lines) -> None:
+    log = write_frames(tmp_path, "mini", NAME, [frame(k) for k in range(3)])
+    make_table(log, tmp_path / "kept")
+    (path,) = (tmp_path / "kept").iterdir()
+    whole = path.read_bytes()
+    for content in damaged(whole):
+        path.write_bytes(content)
+        assert kept_table(log, tmp_path / "kept") is None
+        (line,) = lines()
+        assert line.startswith(f"{path}: it") and line.endswith(f"made again of {log}")
+    make_table(log, tmp_path / "kept")
+    assert path.read_bytes() == whole
+
+
+def test_a_fit_that_is_half_done(tmp_path: Path, lines: Lines) -> None:
+    path, start = tmp_path / "block-1.fit.npz", SimpleNamespace()
+    with path.open("wb") as file:
+        np.savez(file, iteration=np.array(500), owner=np.arange(20))
+    seal(path)
+    for content in damaged(path.read_bytes()):
+        path.write_bytes(content)
+        assert _resumed(path, start) is start  # type: ignore[comparison-overlap, arg-type]
+        (line,) = lines()
+        assert line.startswith(f"{path} is damaged")
+
+
+def test_a_recovery_table_is_made_again_in_the_cache(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lines: Lines
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    reader = SyntheticReader(tmp_path / "towns", 1, 0, TownSettings(cameras=(), lidar_beams=0))
+    save_vocabulary(tmp_path / "v.npy", Vocabulary(kinematic_trajectories(20, 0)), {})
+    run = SimpleNamespace(
+        clips=lambda: (reader, reader.index()),
+        config=SimpleNamespace(vocabulary=SimpleNamespace(file=None), clips={"root": "town"}),
+    )
+    golden = _table_of(run, [str(tmp_path / "v.npy")]).digest  # type: ignore[arg-type]
+    (path,) = (tmp_path / "cache").rglob("recovery-*.npz")
+    whole = path.read_bytes()
+    for content in (whole[:9000] + bytes([whole[9000] ^ 1]) + whole[9001:], whole[:100], b""):
+        path.write_bytes(content)
+        assert _table_of(run, [str(tmp_path / "v.npy")]).digest == golden  # type: ignore[arg-type]
+        (line,) = lines()
+        assert line.startswith(f"{path}: ") and line.endswith("it is made again")
+        assert load_recovery_table(path).digest == golden
+
+
+def test_a_recovery_table_is_read_right_or_named(tmp_path: Path) -> None:
+    table, path = RecoveryTable(np.random.default_rng(0).normal(size=(3, 40, 3))), tmp_path / "table.npz"
+    save_recovery_table(path, table, {})
+    for content in damaged(path.read_bytes(), every=7):
+        path.write_bytes(content)
+        try:
+            assert load_recovery_table(path).trajectories.tobytes() == table.trajectories.tobytes()
+        except ValueError as error:
+            assert str(error).startswith(f"{path}: ")
+
+
+def test_compiled_kernels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lines: Lines) -> None:
+    def total(values: np.ndarray) -> float:
+        out = 0.0
+        for value in values:
+            out += value * value
+        return out
+
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    values = np.random.default_rng(0).normal(size=101)
+    golden = kernel(total)(values)
+    (path,) = tmp_path.rglob("*.kernel")
+    whole = path.read_bytes()
+    for content in damaged(whole, every=len(whole) // 3):
+        path.write_bytes(content)
+        assert kernel(total)(values) == golden
+        (line,) = lines()
+        assert line.startswith(f"{path}: it") and line.endswith("; compiled again")
+        again = kernel(total)
+        assert again(values) == golden and sum(again.stats.cache_hits.values()) == 1  # type: ignore[attr-defined]
+
+
+def test_the_list_of_a_part_s_kernels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lines: Lines) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    path = marker("judge")
+    path.parent.mkdir()
+    (path.parent / "a.kernel").touch()
+    path.write_bytes(sealed(b"a.kernel"))
+    assert _is_compiled("judge")
+    for content in damaged(sealed(b"a.kernel"), every=1):
+        path.write_bytes(content)
+        assert not _is_compiled("judge")
+        (line,) = lines()
+        assert line.startswith(f"{path}: it")
+
+
+def test_damage_is_damage() -> None:
+    """No copy that the others try is the file itself."""
+    whole = bytes(range(256)) * 3
+    assert whole not in damaged(whole) and len(list(damaged(whole))) == 24

@@ -1,0 +1,44 @@
+"""A seal finds every damage of what it stands behind, and of itself."""
+
+from pathlib import Path
+
+import pytest
+
+from tasks.sealed import Damaged, check, seal, sealed, sealed_json, unsealed, unsealed_json
+
+CONTENT = bytes(range(90))
+
+
+def damaged(whole: bytes) -> list[bytes]:
+    flips = [whole[:at] + bytes([whole[at] ^ 1 << bit]) + whole[at + 1 :] for at in range(len(whole)) for bit in (0, 7)]
+    return [*flips, *(whole[:n] for n in range(len(whole))), whole + b"\0", whole[1:], whole + whole]
+
+
+def test_what_is_whole_comes_back_and_a_file_is_sealed_as_bytes_are(tmp_path: Path) -> None:
+    for content in (CONTENT, b""):
+        assert unsealed(sealed(content)) == content
+        (tmp_path / "x").write_bytes(content)
+        seal(tmp_path / "x")
+        assert (tmp_path / "x").read_bytes() == sealed(content)
+        check(tmp_path / "x")
+
+
+def test_every_flip_and_every_cut_is_found(tmp_path: Path) -> None:
+    for data in damaged(sealed(CONTENT)):
+        (tmp_path / "x").write_bytes(data)
+        with pytest.raises(Damaged):
+            unsealed(data)
+        with pytest.raises(Damaged):
+            check(tmp_path / "x")
+
+
+def test_json_is_read_by_anyone_and_holds_its_own_checksum() -> None:
+    members = {"cameras": [{"name": "ü", "shift_m": [0.1, float("nan")]}], "left_out": [], "ego_shift_m": 1e-9}
+    text = sealed_json(members)
+    assert str(unsealed_json(text.encode())) == str(members)
+    for data in damaged(text.encode()):
+        with pytest.raises(Damaged):
+            unsealed_json(data)
+    for other in (b"[]", b"[" * 100_000, b'{"sha256": 1}', b"1", b'{"a": 1}'):
+        with pytest.raises(Damaged):
+            unsealed_json(other)
