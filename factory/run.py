@@ -114,6 +114,7 @@ def run(asked: Asked, only_plan: bool) -> int:
     from factory.store.funnel import image_sources_text
     from factory.store.location import BadLocation, Location
     from factory.store.samples import Store
+    from factory.store.table import DamagedLog
     from factory.views.board.report import remember, write_report
     from factory.views.card import write_card
     from factory.views.show import prepared_episode
@@ -121,7 +122,7 @@ def run(asked: Asked, only_plan: bool) -> int:
 
     try:
         store = Store(Location.parse(config.out))
-    except BadLocation as error:
+    except (BadLocation, DamagedLog) as error:
         raise ConfigError(str(error)) from error
     elsewhere = config.executor == "ray" and "RAY_ADDRESS" in os.environ  # a cluster's nodes compile for themselves
     with nullcontext() if elsewhere else compiling_ahead(kernels_of(config)):

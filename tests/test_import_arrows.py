@@ -20,7 +20,18 @@ FORBIDDEN = {
 # Of each package the rooms from the ground up: a module imports from its own room and those below it.
 ROOMS = {
     "tasks": (
-        *("caches", "sealed", "subscores", "stages", "settings", "kernels", "world", "rollout", "reward.rules", "reward"),
+        *(
+            "caches",
+            "sealed",
+            "subscores",
+            "stages",
+            "settings",
+            "kernels",
+            "world",
+            "rollout",
+            "reward.rules",
+            "reward",
+        ),
         *("experts", "perturb", "attempt", "hard_scenes", "trajectories"),
         *("render.splatting", "render.scene", "render.rig", "render.fit", "render"),
     ),

@@ -47,7 +47,9 @@ COMMANDS: Mapping[str, Command] = {
     "explain": Command("one clip: every candidate, why it fell, a film", "factory.commands.explain"),
     "vocabulary": Command("build a vocabulary or a recovery table from logs", "factory.commands.vocabulary"),
     "scene": Command("scene files of 3D Gaussians: info, import, export", "factory.commands.scene"),
-    "verify": Command("check a run's tables from their files", "factory.commands.verify"),
+    "verify": Command("check a run's tables and caches; repair them", "factory.commands.verify"),
+    "clean": Command("remove orphans and temporary files of a run", "factory.commands.clean"),
+    "compact": Command("merge a run's small shards", "factory.commands.compact"),
     "warm": Command("compile the kernels before the first run", "factory.commands.warm"),
     "completion": Command("completion for bash or zsh", "factory.commands.completion"),
 }

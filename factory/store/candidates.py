@@ -5,7 +5,8 @@ from dataclasses import asdict, dataclass, fields
 
 import pyarrow as pa
 
-from factory.store.table import KeyedTable, TableSpec, schema_of
+from factory.store.columns import schema_of
+from factory.store.table import KeyedTable, TableSpec
 
 
 @dataclass(frozen=True)

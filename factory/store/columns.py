@@ -5,7 +5,8 @@ where a ragged size stands behind the first, the value is a list of arrays.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
+from typing import Any, get_args, get_origin, get_type_hints
 
 import numpy as np
 import pyarrow as pa
@@ -22,6 +23,14 @@ _ARROW = {
     "int64": pa.int64(),
     "float32": pa.float32(),
     "float64": pa.float64(),
+}
+
+_ARROW_OF = {  # type of a dataclass' field -> of its column
+    str: pa.string(),
+    int: pa.int32(),
+    float: pa.float64(),
+    dict[str, int]: pa.map_(pa.string(), pa.int64()),
+    dict[str, float]: pa.map_(pa.string(), pa.float64()),
 }
 
 
@@ -162,3 +171,16 @@ def _read(column: Column, shape: tuple[Size, ...], value: pa.Scalar) -> object:
     if -1 in sizes:
         sizes[0] = len(value)
     return array.reshape(sizes)
+
+
+def schema_of(row: type) -> pa.Schema:
+    """The columns of a dataclass: its fields in their order."""
+
+    def arrow(hint: Any) -> pa.DataType:
+        if is_dataclass(hint):
+            return pa.struct(list(schema_of(hint)))  # type: ignore[arg-type]
+        if get_origin(hint) is tuple:
+            return pa.list_(arrow(get_args(hint)[0]))
+        return _ARROW_OF[hint]
+
+    return pa.schema([pa.field(name, arrow(hint)) for name, hint in get_type_hints(row).items()])

@@ -94,6 +94,13 @@ class Location:
         found = filesystem.get_file_info(fs.FileSelector(base, recursive=True, allow_not_found=True))
         return sorted(info.path[len(base) + 1 :] for info in found if info.type == fs.FileType.File)
 
+    def ages_s(self, now_s: float) -> dict[str, float]:
+        """Seconds since each file below, by its path relative to this folder, was last written."""
+        filesystem, base = self.filesystem()
+        found = filesystem.get_file_info(fs.FileSelector(base, recursive=True, allow_not_found=True))
+        files = (info for info in found if info.type == fs.FileType.File)
+        return {info.path[len(base) + 1 :]: now_s - (info.mtime_ns or 0) / 1e9 for info in files}
+
     def filesystem(self) -> tuple[fs.FileSystem, str]:
         if self.is_local:
             return fs.LocalFileSystem(), self.uri

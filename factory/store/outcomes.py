@@ -11,7 +11,8 @@ from enum import StrEnum
 
 import pyarrow as pa
 
-from factory.store.table import TableSpec, schema_of
+from factory.store.columns import schema_of
+from factory.store.table import TableSpec
 
 
 class Kind(StrEnum):

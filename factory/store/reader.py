@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 
 from factory.store.location import Location
 from factory.store.schema import SAMPLES, SCHEMA, SCHEMA_VERSION, VERSION_PROPERTY, table_to_rows
-from factory.store.table import KeyedTable, open_parquet, with_partition
+from factory.store.table import KeyedTable, naming, open_parquet, with_partition
 from tasks.reward.label_bytes import VocabularyLabels, decode
 from tasks.world.arrays import Bytes
 
@@ -94,8 +94,10 @@ class SampleTable:
     def sample(self, which: int | str, columns: Sequence[str] | None = None) -> Sample:
         """One sample, or some of its columns; reads the row group it stands in."""
         _, path, row = self._places[self._index[which] if isinstance(which, str) else which]
-        group, row = group_of(self._file(path), row)
-        (sample,) = read_rows(self._file(path), group, self._partitions[path], columns, slice(row, row + 1))
+        _check_columns(columns)
+        with naming(f"{self._table.location.uri}/{path}"):
+            group, row = group_of(self._file(path), row)
+            (sample,) = read_rows(self._file(path), group, self._partitions[path], columns, slice(row, row + 1))
         return sample
 
     def __iter__(self) -> Iterator[Sample]:
@@ -103,9 +105,14 @@ class SampleTable:
 
     def iterate(self, columns: Sequence[str] | None = None) -> Iterator[Sample]:
         """Every sample once, file by file, one row group in memory."""
+        _check_columns(columns)
         for path in sorted(self._partitions):
-            for group in range(self._file(path).metadata.num_row_groups):
-                yield from read_rows(self._file(path), group, self._partitions[path], columns)
+            with naming(f"{self._table.location.uri}/{path}"):
+                groups = self._file(path).metadata.num_row_groups
+            for group in range(groups):
+                with naming(f"{self._table.location.uri}/{path}"):
+                    rows = read_rows(self._file(path), group, self._partitions[path], columns)
+                yield from rows
 
 
 def samples_of(
@@ -136,12 +143,15 @@ def read_rows(
     rows: slice = slice(None),
 ) -> list[Sample]:
     """Rows of one row group of a file of a table of samples; columns None: all. Raises KeyError for unknown ones."""
+    _check_columns(columns)
     names = list(SCHEMA.names if columns is None else columns)
-    unknown = sorted(set(names) - set(SCHEMA.names))
-    if unknown:
-        raise KeyError(f"no columns {unknown}")
     stored = file.read_row_group(group, columns=[n for n in names if n not in partition])[rows]
     return table_to_rows(with_partition(stored, pa.schema([SCHEMA.field(n) for n in names]), partition))
+
+
+def _check_columns(columns: Sequence[str] | None) -> None:
+    if unknown := sorted(set(columns or ()) - set(SCHEMA.names)):
+        raise KeyError(f"no columns {unknown}")
 
 
 def image_of(sample: Mapping[str, Any], camera: str, time_s: float) -> Bytes:

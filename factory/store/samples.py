@@ -21,10 +21,12 @@ from factory.store.location import Location
 from factory.store.outcomes import OUTCOMES, Kind, Outcome, outcomes_table
 from factory.store.schema import LICENCES_PROPERTY, SAMPLES, SCHEMA_VERSION
 from factory.store.table import KeyedTable, Shard, write_shard
+from tasks.sealed import MEMBER, sealed_json, unsealed_json
 
 OnChange = Literal["stop", "keep", "redo"]
 RUN_FILE = "run.json"
 CURRENT_RUN = "current_run.json"  # what the newest run set out to do; over once last_run.json has its began_ms
+LAST_RUN = "last_run.json"
 IMPORTED = "import.source"  # a setting that tables of others' rows have, and no run
 WAYS_OUT = "Go on with on_change=keep, replace with on_change=redo, or choose another out"
 STATE = ["attempt_id", "clip_id", "expert", "expert_digest", "candidate_index", "settings_hash", "stage_versions"]
@@ -97,6 +99,10 @@ class Store:
         for expert in expert_digests:
             if not re.fullmatch(r"[A-Za-z0-9_-]+", expert):
                 raise ChangedRun(f"expert {expert!r}: a name is letters, digits, _ and - (it becomes a folder)")
+        for table in (self.samples, self.candidates, self.outcomes):
+            if (lost := table.lost_commit()) is not None:
+                where = f"{table.location.uri}: commit {lost} is gone from the table's log"
+                raise ChangedRun(f"{where}; python -m factory verify out={self.location.uri} repair=true puts it back")
         records = self.runs()
         record: dict[str, Any] = {
             "settings": dict(identity.settings),
@@ -144,8 +150,8 @@ class Store:
                 table.claim()
                 table.commit([], drop=list(table))
         if list(records) != self.runs():
-            document = {"schema_version": SCHEMA_VERSION, "runs": list(records)}
-            self.location.write(RUN_FILE, (json.dumps(document, indent=1, sort_keys=True) + "\n").encode())
+            document = json.loads(canonical_json({"schema_version": SCHEMA_VERSION, "runs": list(records)}))
+            self.location.write(RUN_FILE, sealed_json(document).encode())
         for table in (self.candidates, self.samples, self.outcomes):
             table.claim()
         twice = {key for key in self.outcomes if key in self.samples}
@@ -167,13 +173,21 @@ class Store:
         if data is None:
             return []
         try:
-            document = json.loads(data)
+            # Versions before wrote none: what is whole without one is taken.
+            document = unsealed_json(data) if f'"{MEMBER}"'.encode() in data else json.loads(data)
             version, runs = document["schema_version"], list(document["runs"])
         except (ValueError, KeyError, TypeError) as error:
             raise ChangedRun(f"{self.location.uri}/{RUN_FILE}: not readable: {error}") from error
         if version != SCHEMA_VERSION:
             raise ChangedRun(f"{self.location.uri}: schema_version {version}, this version writes {SCHEMA_VERSION}")
         return runs
+
+    def began_ms(self, ended: bool = False) -> int:
+        """When the newest run began, since 1970; ended: when that which ended last did. 0 where nothing says so."""
+        try:
+            return int(json.loads(self.location.read(LAST_RUN if ended else CURRENT_RUN) or b"{}").get("began_ms", 0))
+        except (ValueError, TypeError, AttributeError):  # damaged: it is for people, and verify names it
+            return 0
 
     def history(self, identity: RunIdentity, expert_digests: Mapping[str, str]) -> History:
         """Everything the tables know, samples winning over outcomes of the same attempt."""

@@ -12,12 +12,12 @@ import hashlib
 import json
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, is_dataclass
+from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, get_args, get_origin, get_type_hints
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -26,16 +26,11 @@ from deltalake import CommitProperties, DeltaTable, Transaction
 from deltalake.exceptions import CommitFailedError
 from deltalake.transaction import AddAction, RemoveAction
 
+from factory.store.commit_copies import COPIES, CommitCopies
 from factory.store.disk import needs_disk
 from factory.store.location import Location
+from factory.wording import one_line
 
-ARROW = {  # type of a dataclass' field -> of its column
-    str: pa.string(),
-    int: pa.int32(),
-    float: pa.float64(),
-    dict[str, int]: pa.map_(pa.string(), pa.int64()),
-    dict[str, float]: pa.map_(pa.string(), pa.float64()),
-}
 APP_ID = "driving-data-factory"
 ACTION_BYTES = 1024  # of the log, about, that a file added or removed takes
 SCHEMA_BYTES = 16 * 1024  # of the log, about, that a new table takes
@@ -45,6 +40,14 @@ ROW_GROUP_BYTES = 4 * 2**20  # uncompressed; one sample costs one group, and a g
 
 class DuplicateKey(RuntimeError):
     """A commit would store a key twice. Nothing was written."""
+
+
+class DamagedFile(OSError):
+    """A file of the table cannot be read; the message names it."""
+
+
+class DamagedLog(OSError):
+    """A file of the table's log is damaged."""
 
 
 class AnotherWriter(RuntimeError):
@@ -61,19 +64,6 @@ class TableSpec:
     partition_by: tuple[str, ...] = ()
     properties: Mapping[str, str] | None = None
     packed: tuple[str, ...] = ()  # leaves whose values are compressed already, as their paths in a file
-
-
-def schema_of(row: type) -> pa.Schema:
-    """The columns of a dataclass: its fields in their order."""
-
-    def arrow(hint: Any) -> pa.DataType:
-        if is_dataclass(hint):
-            return pa.struct(list(schema_of(hint)))  # type: ignore[arg-type]
-        if get_origin(hint) is tuple:
-            return pa.list_(arrow(get_args(hint)[0]))
-        return ARROW[hint]
-
-    return pa.schema([pa.field(name, arrow(hint)) for name, hint in get_type_hints(row).items()])
 
 
 @dataclass(frozen=True)
@@ -143,9 +133,26 @@ class KeyedTable:
 
     def __init__(self, location: Location, spec: TableSpec) -> None:
         self.location, self.spec = location, spec
+        self.copies = CommitCopies(location)
         self._delta: DeltaTable | None = None
-        if DeltaTable.is_deltatable(location.uri, storage_options=dict(location.options)):
-            self._delta = DeltaTable(location.uri, storage_options=dict(location.options))
+        with self._log_naming():
+            if DeltaTable.is_deltatable(location.uri, storage_options=dict(location.options)):
+                self._delta = DeltaTable(location.uri, storage_options=dict(location.options))
+
+    @contextmanager
+    def _log_naming(self) -> Iterator[None]:
+        """What a damaged log raises while it is read, a panic of delta-rs among it, is a DamagedLog."""
+        try:
+            yield
+        except BaseException as error:
+            panic = type(error).__name__ == "PanicException"  # no Exception, and importable from nowhere
+            if not panic and not isinstance(error, Exception):
+                raise
+            found = [f"{damage.name} {damage.problem}" for damage in self.copies.damage()]
+            if panic or found:
+                said = "; ".join(found) or f"its log cannot be read: {one_line(error)}"
+                raise DamagedLog(f"{self.location.uri}: {said}; python -m factory verify says all") from error
+            raise
 
     @cached_property
     def _path_of(self) -> dict[str, str]:
@@ -176,7 +183,8 @@ class KeyedTable:
             return {}
         parts = {name: f"partition.{name}" for name in self.spec.partition_by}
         facts = ["path", "size_bytes", "num_records", "modification_time"]
-        actions = pa.table(self._delta.get_add_actions(flatten=True)).select([*facts, *parts.values()])
+        with self._log_naming():
+            actions = pa.table(self._delta.get_add_actions(flatten=True)).select([*facts, *parts.values()])
         return {
             a["path"]: LiveFile(
                 {name: str(a[part]) for name, part in parts.items()},
@@ -224,6 +232,13 @@ class KeyedTable:
         schema = self.spec.schema if columns is None else pa.schema([self.spec.schema.field(c) for c in columns])
         return pa.concat_tables([schema.empty_table(), *(rows for _, rows in self.files(columns))])
 
+    def lost_commit(self) -> int | None:
+        """The number of a commit that was made and that the log does not have any more; None where it has all."""
+        if self._delta is None:
+            return self.copies.lost(-1)
+        self.refresh()
+        return self.copies.lost(self._delta.version())
+
     def claim(self) -> None:
         """Create the table if need be, and make the commits of every older run fail from here on."""
         self._transact([])
@@ -262,6 +277,21 @@ class KeyedTable:
         for written in (*kept, *add):
             path_of.update(dict.fromkeys(written.keys, written.path))
 
+    def replace_files(self, drop: Collection[str], add: Sequence[tuple[Shard, int]] = ()) -> None:
+        """Files out of the table and others, with the time [ms] of their rows, into it, in one transaction.
+
+        What samples there are does not change by those that are added. Raises AnotherWriter.
+        """
+        live, now_ms, names = self.live_files(), int(time.time() * 1000), {shard.path for shard, _ in add}
+        actions: list[AddAction | RemoveAction] = [
+            RemoveAction(path, not add, now_ms, None, dict(live[path])) for path in sorted(set(drop) - names)
+        ]
+        for shard, written_ms in add:
+            stats = json.dumps({"numRecords": len(shard.keys)})
+            actions.append(AddAction(shard.path, shard.size, shard.partition, written_ms, False, stats))
+        self._transact(actions)
+        self.__dict__.pop("_path_of", None)
+
     @property
     def properties(self) -> Mapping[str, str]:
         """The table's own metadata; empty before its first commit."""
@@ -277,6 +307,7 @@ class KeyedTable:
             table.alter.set_table_properties({name: value}, raise_if_not_exists=False)
         table.update_incremental()
         self._check_alone(version)
+        self._note_commit(version + 1)
 
     def _without(self, path: str, partition: Mapping[str, str], dropped: set[str]) -> Shard | None:
         rows = self.read_file(path, partition)
@@ -301,6 +332,11 @@ class KeyedTable:
         version = table.version()
         table.update_incremental()
         self._check_alone(version)
+        self._note_commit(version + 1)
+
+    def _note_commit(self, version: int) -> None:
+        with needs_disk(f"{self.location.uri}/{COPIES}", SCHEMA_BYTES):
+            self.copies.note(version)
 
     def _check_alone(self, version: int) -> None:
         """Between `version` and now there was one commit, our own."""
@@ -341,7 +377,16 @@ def open_parquet(location: Location, path: str) -> pq.ParquetFile:
 
 def read_parquet(location: Location, path: str, columns: Sequence[str] | None) -> pa.Table:
     """Some columns of one Parquet file. Raises OSError naming the file for a damaged page."""
-    try:
+    with naming(f"{location.uri}/{path}"):
         return open_parquet(location, path).read(columns=list(columns) if columns is not None else None)
-    except (OSError, pa.ArrowException) as error:
-        raise OSError(f"{location.uri}/{path}: {error}") from error
+
+
+@contextmanager
+def naming(path: str) -> Iterator[None]:
+    """What is raised while a Parquet file is read, by a damaged page, footer or schema, is a DamagedFile."""
+    try:
+        yield
+    except (FileNotFoundError, DamagedFile):  # with their file's name
+        raise
+    except (OSError, pa.ArrowException, ValueError, LookupError, RuntimeError, MemoryError, OverflowError) as error:
+        raise DamagedFile(f"{path}: cannot be read: {one_line(error)}") from error

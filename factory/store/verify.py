@@ -1,19 +1,33 @@
 """Checks a store from its files alone.
 
-Damage is what must not be: a file of the log that is missing or fails its checksums, or whose own expert and round are
-not those that the log says; a key twice, a round out of order, an episode that is not whole.
+Damage is what must not be: a file of a log that is not what was committed; a file that the log names and that is
+missing or of another size, content or count, or whose own expert and round are not those that the log says; a key
+twice, a round out of order; an episode, a clip's scenes or a prepared clip that is not whole.
 Orphans are harmless: files no commit names, left behind by a run that died, and episodes of rows that were replaced;
 readers ignore them.
 """
 
+import hashlib
+import json
+import re
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import pyarrow as pa
 import pyarrow.compute as pc
+import pyarrow.parquet as pq
 
+from factory.store.cache import BadCacheFile, check_kept
+from factory.store.commit_copies import COPIES, LOG, CommitCopies, LogDamage
 from factory.store.episodes import FOLDER, check_episode, episode_name
-from factory.store.samples import IMPORTED, Store
-from factory.store.table import KeyedTable, read_parquet
+from factory.store.location import Location
+from factory.store.samples import CURRENT_RUN, IMPORTED, LAST_RUN, ChangedRun, Store
+from factory.store.table import DamagedFile, KeyedTable, LiveFile, naming
+
+TABLES = ("candidates", "samples", "outcomes")
+KEPT = ("cache/prepared", "scenes")  # sealed files
+NAMED = re.compile(r"part-([0-9a-f]{32})\.parquet")
 
 
 @dataclass(frozen=True)
@@ -23,41 +37,118 @@ class Verdict:
     n_samples: int
     damage: tuple[str, ...]
     orphans: tuple[str, ...]  # relative to `out`
+    files: tuple[str, ...] = ()  # relative to `out`: damaged ones that a repair takes out, to be made again
+
+
+@dataclass(frozen=True)
+class DamagedPart:
+    """One file, relative to `out`."""
+
+    name: str
+    problem: str
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.problem}"
+
+
+def damaged_logs(out: Location) -> list[tuple[str, LogDamage]]:
+    """Table, and what of its log is not what was committed; asked before the tables are opened."""
+    return [(name, damage) for name in TABLES for damage in CommitCopies(out.child(name)).damage()]
 
 
 def verify(store: Store) -> Verdict:
-    """Read every live file and episode with its checksums, and hold the tables against each other."""
-    damage: list[str] = []
-    orphans: list[str] = []
+    """Read every live file, episode and kept file, and hold the tables against each other."""
+    damage = [f"{name}/{found.name}: {found.problem}" for name, found in damaged_logs(store.location)]
+    broken: list[DamagedPart] = []
     for table in (store.samples, store.candidates, store.outcomes):
-        damage += _damaged_files(table)
+        broken += _damaged_files(table)
+    orphans = orphaned(store)
+    kept = _damaged_kept(store.location)
+    if damage or broken:
+        damage += [*map(str, (*broken, *kept)), "keys and rounds were not checked: fix the files first"]
+        return Verdict(0, tuple(damage), tuple(orphans), tuple(found.name for found in (*broken, *kept)))
+    damage += _twice(store)
+    try:
+        damage += _broken_rounds(store) + _unknown_settings(store)
+    except ChangedRun as error:
+        damage.append(str(error))
+    kept += _damaged_episodes(store)
+    damage += map(str, kept)
+    orphans += outdated_episodes(store)
+    return Verdict(len(store.samples), tuple(damage), tuple(orphans), tuple(found.name for found in kept))
+
+
+def orphaned(store: Store) -> list[str]:
+    """Files in the tables' folders that no log names, relative to `out`."""
+    orphans = []
+    for table in (store.samples, store.candidates, store.outcomes):
         live, name = table.live_files(), table.spec.name
-        files = [file for file in table.location.names() if not file.startswith("_delta_log/")]
+        files = [file for file in table.location.names() if not file.startswith((f"{LOG}/", f"{COPIES}/"))]
         orphans += [f"{name}/{file}" for file in files if file not in live]
-    if damage:
-        return Verdict(0, (*damage, "keys and rounds were not checked: fix the files first"), tuple(orphans))
-    damage += _twice(store) + _broken_rounds(store)
-    broken, outdated = _episodes(store)
-    damage, orphans = damage + broken, orphans + outdated
-    known = {run["settings_hash"] for run in store.runs()}
-    for name in sorted(set(store.samples.read(["settings_hash"])["settings_hash"].to_pylist()) - known):
-        damage.append(f"samples: settings_hash {name} is not in run.json")
-    return Verdict(len(store.samples), tuple(damage), tuple(orphans))
+    return orphans
 
 
-def _damaged_files(table: KeyedTable) -> list[str]:
+def outdated_episodes(store: Store) -> list[str]:
+    """Files beside the episodes that are none of a row that is there, relative to `out`."""
+    live = _live_episodes(store)
+    return [f"{FOLDER}/{name}" for name in store.location.child(FOLDER).names() if name not in live]
+
+
+def _live_episodes(store: Store) -> set[str]:
+    rows = store.samples.read(["attempt_id", "settings_hash", "stage_versions"]).to_pylist()
+    return {episode_name(row) for row in rows}
+
+
+def _damaged_files(table: KeyedTable) -> list[DamagedPart]:
     found = []
-    for path, partition in sorted(table.live_files().items()):
+    for path, file in sorted(table.file_facts().items()):
         try:
-            table.read_file(path, partition)
-            stated = read_parquet(table.location, path, list(partition))  # nothing in a file of a version before 0.2
-        except OSError as error:
-            found.append(str(error))
-            continue
-        for name in stated.column_names:
-            values = sorted(map(str, pc.unique(stated[name]).to_pylist()))
-            if values != [partition[name]]:
-                found.append(f"{table.spec.name}/{path}: {name} is {', '.join(values)}, the log says {partition[name]}")
+            problem = _problem_of(table, path, file)
+        except DamagedFile as error:
+            problem = str(error).removeprefix(f"{table.location.uri}/{path}: ")
+        if problem:
+            found.append(DamagedPart(f"{table.spec.name}/{path}", problem))
+    return found
+
+
+def _problem_of(table: KeyedTable, path: str, file: LiveFile) -> str:
+    """What is wrong with a file that the log names; nothing where it is whole. Raises DamagedFile."""
+    data = table.location.read(path)
+    if data is None:
+        return "is missing"
+    if len(data) != file.n_bytes:
+        return f"has {len(data):,} bytes, the log says {file.n_bytes:,}"
+    named = NAMED.fullmatch(path.rpartition("/")[2])
+    if named and hashlib.sha256(data).hexdigest()[:32] != named[1]:
+        return "its content is not what its name says"
+    with naming(f"{table.location.uri}/{path}"):
+        parquet = pq.ParquetFile(pa.BufferReader(data), page_checksum_verification=True)
+        if file.n_rows and parquet.metadata.num_rows != file.n_rows:
+            return f"has {parquet.metadata.num_rows} rows, the log says {file.n_rows}"
+        rows = parquet.read()
+        for name in [n for n in table.spec.schema.names if n not in file.partition]:
+            rows[name].cast(table.spec.schema.field(name).type)
+        for name in set(file.partition) & set(rows.column_names):  # nothing in a file of a version before 0.2
+            values = sorted(map(str, pc.unique(rows[name]).to_pylist()))
+            if values != [file.partition[name]]:
+                return f"{name} is {', '.join(values)}, the log says {file.partition[name]}"
+    return ""
+
+
+def _damaged_kept(out: Location) -> list[DamagedPart]:
+    """Sealed files of the cache and the scenes, and what the newest run says of itself."""
+    found = []
+    for folder in KEPT:
+        for name in out.child(folder).names():
+            try:
+                check_kept(out.child(folder).read(name) or b"")
+            except BadCacheFile as error:
+                found.append(DamagedPart(f"{folder}/{name}", f"{error}; the next run makes it again"))
+    for name in (CURRENT_RUN, LAST_RUN):
+        try:
+            dict(json.loads(out.read(name) or b"{}"))
+        except (ValueError, TypeError) as error:
+            found.append(DamagedPart(name, f"not readable: {error}; the next run writes it anew"))
     return found
 
 
@@ -87,18 +178,19 @@ def _broken_rounds(store: Store) -> list[str]:
     ]
 
 
-def _episodes(store: Store) -> tuple[list[str], list[str]]:
-    """Damaged episodes, and files beside them that are no episode of a row that is there."""
-    folder = store.location.child(FOLDER)
-    rows = store.samples.read(["attempt_id", "settings_hash", "stage_versions"]).to_pylist()
-    live = {episode_name(row) for row in rows}
-    damage, orphans = [], []
+def _unknown_settings(store: Store) -> list[str]:
+    known = {run["settings_hash"] for run in store.runs()}
+    names: Sequence[str] = store.samples.read(["settings_hash"])["settings_hash"].to_pylist()
+    return [f"samples: settings_hash {name} is not in run.json" for name in sorted(set(names) - known)]
+
+
+def _damaged_episodes(store: Store) -> list[DamagedPart]:
+    folder, live, found = store.location.child(FOLDER), _live_episodes(store), []
     for name in folder.names():
-        if name not in live:
-            orphans.append(f"{FOLDER}/{name}")
-            continue
         try:
-            check_episode(folder.read(name) or b"")
+            if name in live:
+                check_episode(folder.read(name) or b"")
         except ValueError as error:
-            damage.append(f"{FOLDER}/{name}: {error}; remove it, the command that made the run writes it again")
-    return damage, orphans
+            problem = f"{error}; remove it, the command that made the run writes it again"
+            found.append(DamagedPart(f"{FOLDER}/{name}", problem))
+    return found

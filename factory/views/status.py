@@ -12,6 +12,7 @@ from factory.exits import MEANING
 from factory.wording import one_line
 
 if TYPE_CHECKING:
+    from factory.store.location import Location
     from factory.store.samples import Store
 
 RETRY = {
@@ -43,21 +44,31 @@ class NothingThere(Refused):
 
 def open_store(out: str) -> "Store":
     """Raises NothingThere where there is no run, Refused where there can be none."""
-    if not out.strip():
-        raise Refused("out= is empty: name the folder or URL of a run (a shell variable that is not set?)")
-    os.environ.setdefault("RUST_LOG", "error")  # what the object store's client warns of, the error says again
+    location = out_of(out)
     from deltalake.exceptions import DeltaError
 
-    from factory.store.location import BadLocation
     from factory.store.samples import Store
 
     try:
-        store = Store(out)
-    except (BadLocation, OSError, DeltaError) as error:
+        store = Store(location)
+    except (OSError, DeltaError) as error:
         raise Refused(f"out={out}: {one_line(error)}") from error
     if store.samples.version is None and store.outcomes.version is None and store.candidates.version is None:
         raise NothingThere(store.location.uri)
     return store
+
+
+def out_of(out: str) -> "Location":
+    """Where a run is. Raises Refused where there can be none."""
+    if not out.strip():
+        raise Refused("out= is empty: name the folder or URL of a run (a shell variable that is not set?)")
+    os.environ.setdefault("RUST_LOG", "error")  # what the object store's client warns of, the error says again
+    from factory.store.location import BadLocation, Location
+
+    try:
+        return Location.parse(out)
+    except BadLocation as error:
+        raise Refused(f"out={out}: {one_line(error)}") from error
 
 
 def status_lines(store: "Store") -> Iterable[str]:

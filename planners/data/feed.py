@@ -13,6 +13,7 @@ import pyarrow as pa
 
 from factory.store.reader import TIME_TOLERANCE_S
 from factory.store.schema import LABEL_COLUMNS
+from factory.store.table import naming
 from planners.data.batch import ImageLayout, Needs
 from planners.data.files import group_bytes, group_rows, leaves
 from planners.data.images import chosen_cameras
@@ -128,10 +129,9 @@ def _file_part(
     cameras: list[tuple[str, ...]] = [()] * len(here)
     if needs.image is not None:
         places = (np.cumsum(rows) - rows)[groups] + dataset.rows.place[here]
-        seen = parquet.read(
-            columns=leaves(parquet, ["cameras.name", "cameras.ego_from_camera", "images.camera", "images.time_s"]),
-            use_threads=False,
-        )
+        members = leaves(parquet, ["cameras.name", "cameras.ego_from_camera", "images.camera", "images.time_s"])
+        with naming(dataset.files[number].where):
+            seen = parquet.read(columns=members, use_threads=False)
         cameras = _cameras(dataset, here, seen, places, needs.image)
         stored = np.add.reduceat(np.diff(_list(seen, "images").offsets.to_numpy()), np.cumsum(rows) - rows)
         share = rows / np.maximum(np.bincount(groups, minlength=len(rows)), 1)

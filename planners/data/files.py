@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 from pyarrow import fs
 
 from factory.store.reader import sample_table
+from factory.store.table import naming
 from tasks.world.arrays import Ints
 
 FOOTER_BYTES = 2**25  # as they are stored; parsed they take eight times that
@@ -64,7 +65,16 @@ class SampleFile:
     expert: str
 
     def open(self, check_pages: bool = True) -> pq.ParquetFile:
-        """check_pages: whether reading a damaged page raises OSError."""
+        """check_pages: whether reading a damaged page raises OSError. Raises OSError with the file's name."""
+        with naming(self.where):
+            return self._open(check_pages)
+
+    @property
+    def where(self) -> str:
+        """For messages."""
+        return f"{self.table}: {self.path}"
+
+    def _open(self, check_pages: bool) -> pq.ParquetFile:
         local = isinstance(self.filesystem, fs.LocalFileSystem)
         parquet = pq.ParquetFile(
             self.path,

@@ -13,9 +13,11 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from factory.store.location import Location
+from factory.store.table import naming
 from planners.data.batch import TrainingData
 from planners.data.files import SampleFile, files_of, group_rows, leaves
 from tasks.world.arrays import F32, Array, Bools, Ints, ShortInts
@@ -140,11 +142,12 @@ class Dataset:
         labels = np.empty((len(self), 8, 3), np.float32)
         for number in np.unique(self.rows.file):
             here = np.flatnonzero(self.rows.file == number)
-            parquet = self.files[number].open()
-            stored = parquet.read(columns=leaves(parquet, ["label_2hz"]))["label_2hz"].combine_chunks()
-            starts = np.concatenate([[0], np.cumsum(group_rows(parquet))])
-            values = stored.flatten().flatten().to_numpy().reshape(-1, 8, 3)
-            labels[here] = values[starts[self.rows.group[here]] + self.rows.place[here]]
+            with naming(self.files[number].where):
+                parquet = self.files[number].open()
+                stored = parquet.read(columns=leaves(parquet, ["label_2hz"]))["label_2hz"].combine_chunks()
+                starts = np.concatenate([[0], np.cumsum(group_rows(parquet))])
+                values = stored.flatten().flatten().to_numpy().reshape(-1, 8, 3)
+                labels[here] = values[starts[self.rows.group[here]] + self.rows.place[here]]
         return labels
 
     def text(self) -> str:
@@ -200,9 +203,15 @@ def _rows_of(file: SampleFile, number: int) -> SampleRows:
     """The index columns of one file. Raises ValueError naming missing ones."""
     parquet = file.open()
     try:
-        table = parquet.read(columns=leaves(parquet, INDEX_COLUMNS), use_threads=False).combine_chunks()
+        columns = leaves(parquet, INDEX_COLUMNS)
     except ValueError as error:
         raise ValueError(f"{file.table}: {error} in {file.path}; make the table again with this version") from error
+    with naming(file.where):
+        table = parquet.read(columns=columns, use_threads=False).combine_chunks()
+        return _index_of(file, number, parquet, table)
+
+
+def _index_of(file: SampleFile, number: int, parquet: pq.ParquetFile, table: pa.Table) -> SampleRows:
     counts, n = group_rows(parquet), table.num_rows
 
     def text(name: str) -> NDArray[np.str_]:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from factory.store.table import naming
 from planners.data.decode import StoredRows
 from planners.data.feed import Feed
 from planners.data.files import leaves
@@ -132,15 +133,11 @@ class Memory:
         file = self._feed.dataset.files[number]
         groups = self._feed.dataset.rows.group[samples]
         found: dict[int, Place] = {}
-        try:
+        with naming(file.where):
             read = self._reader(number, np.unique(groups))
             for group in np.unique(groups).tolist():
                 found |= self._rows(read(group), samples[groups == group], number in self.copies)
                 self._checked.add((number, group))
-        except FileNotFoundError:
-            raise  # names its file
-        except OSError as error:
-            raise OSError(f"{file.table}: {file.path}: {error}") from error
         return found
 
     def _reader(self, number: int, groups: Ints) -> Callable[[int], pa.Table]:

@@ -1,5 +1,6 @@
 """A shard says of itself which expert and round it holds, and every engine reads a table of such shards as before."""
 
+import hashlib
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -39,9 +40,13 @@ def without_place(out: Path, to: Path) -> Path:
     shards = []
     for path, partition in store.samples.live_files().items():
         rows = pq.ParquetFile(to / "samples" / path).read()
+        sink = pa.BufferOutputStream()
+        pq.write_table(rows.drop_columns(["expert", "round"]), sink, store_schema=False)
+        data = sink.getvalue().to_pybytes()
+        path = f"{path.rpartition('/')[0]}/part-{hashlib.sha256(data).hexdigest()[:32]}.parquet"
         target = to / "old" / path
         target.parent.mkdir(parents=True)
-        pq.write_table(rows.drop_columns(["expert", "round"]), target, store_schema=False)
+        target.write_bytes(data)
         shards.append(Shard(path, target.stat().st_size, partition, tuple(rows["attempt_id"].to_pylist())))
     old.commit(shards)
     shutil.rmtree(to / "samples")
@@ -122,7 +127,9 @@ def test_a_shard_in_another_s_place_is_damage(out: Path, tmp_path: Path) -> None
     store = Store(tmp_path / "out")
     (path,) = (path for path, part in store.samples.live_files().items() if part == {"round": "0", "expert": "human"})
     file = tmp_path / "out" / "samples" / path
-    rows = pq.ParquetFile(file).read()
-    at = rows.column_names.index("expert")
-    pq.write_table(rows.set_column(at, "expert", pa.array(["recovery"] * rows.num_rows)), file, store_schema=False)
-    assert f"samples/{path}: expert is recovery, the log says human" in verify(store).damage[0]
+    keys = tuple(pq.ParquetFile(file).read(["attempt_id"])["attempt_id"].to_pylist())
+    moved = f"round=0/expert=recovery/{file.name}"
+    file.rename(file.parents[2] / moved)
+    shard = Shard(moved, (file.parents[2] / moved).stat().st_size, {"round": "0", "expert": "recovery"}, keys)
+    store.samples.replace_files([path], [(shard, 0)])
+    assert f"samples/{moved}: expert is human, the log says recovery" in verify(store).damage[0]

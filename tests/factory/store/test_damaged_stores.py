@@ -1,0 +1,236 @@
+"""verify survives every damage and names the file; a repair takes out what was damaged, and the run makes it again."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from factory.commands.table import COMMANDS
+from factory.exits import BAD_CONFIG, COMPLETE, DAMAGED
+from factory.graph.episodes import EpisodesWanted
+from factory.graph.execute import execute
+from factory.store.episodes import Message, episode_bytes
+from factory.store.reader import SampleTable
+from factory.store.samples import Store
+from factory.store.upkeep import restore_logs
+from factory.store.verify import damaged_logs, verify
+from tests.factory.damage import damaged
+from tests.factory.tables import assert_same_tables
+from tests.factory.toy import ToyWork, refs
+
+check = COMMANDS["verify"].load()
+
+
+EPISODE = episode_bytes([Message("/a", 0, {"x": 1})], {"id": "a"})
+
+
+def run(out: Path, *, clips: int = 3) -> int:
+    made = EpisodesWanted(1, lambda row, clip: EPISODE)
+    experts, quiet = ["recovery", "human"], lambda line: None
+    return execute(ToyWork(), refs(clips), experts, 2, Store(out), "local", say=quiet, episodes=made).exit_code
+
+
+@pytest.fixture(scope="module")
+def golden(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("golden") / "out"
+    assert run(out) == COMPLETE
+    return out
+
+
+@pytest.fixture
+def out(golden: Path, tmp_path: Path) -> Path:
+    shutil.copytree(golden, tmp_path / "out")
+    return tmp_path / "out"
+
+
+def told(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str]:
+    code = check(list(arguments))
+    return code, capsys.readouterr().out
+
+
+def files(out: Path, pattern: str) -> list[Path]:
+    return sorted(path for path in out.glob(pattern) if path.is_file())
+
+
+@pytest.mark.parametrize("folder", ["_delta_log", "_commits"])
+def test_every_damage_of_a_log_is_named_and_put_back(out: Path, folder: str) -> None:
+    location = Store(out).location
+    for path in files(out, f"*/{folder}/*"):
+        whole, name = path.read_bytes(), str(path.relative_to(out))
+        copies = [*damaged(whole, every=max(50, len(whole) // 60)), None]
+        for content in copies:
+            path.unlink() if content is None else path.write_bytes(content)
+            if content is None and folder == "_commits" and not path.name.startswith("0" * 20):
+                path.write_bytes(whole)  # the newest copy is gone: its writer was killed before it wrote it
+                continue
+            assert [f"{table}/{found.name}" for table, found in damaged_logs(location)] == [name]
+            assert restore_logs(location) == [name] and path.read_bytes() == whole and not damaged_logs(location)
+
+
+def test_the_command_says_so_and_repairs_a_log(out: Path, golden: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = files(out, "samples/_delta_log/*.json")[-1]
+    whole = path.read_bytes()
+    for content in (b"\xff" * 100, whole.replace(b'"size":', b'"sire":'), whole[:-30], None):
+        path.unlink() if content is None else path.write_bytes(content)
+        code, said = told(capsys, str(out))
+        assert code == DAMAGED and f"DAMAGED samples/_delta_log/{path.name}: is " in said
+        code, said = told(capsys, str(out), "repair=true")
+        assert code == COMPLETE and f"put back samples/_delta_log/{path.name}" in said
+    assert_same_tables(out, golden)
+
+
+def test_a_lost_last_commit_is_noticed_by_the_run_too(out: Path, golden: Path) -> None:
+    files(out, "samples/_delta_log/*.json")[-1].unlink()
+    assert len(Store(out).samples) < len(Store(golden).samples)
+    summary = execute(ToyWork(), refs(3), ["recovery", "human"], 2, Store(out), "local", say=lambda line: None)
+    assert summary.exit_code == BAD_CONFIG
+    assert "commit 3 is gone from the table's log; python -m factory verify out=" in summary.message
+    assert check([str(out), "repair=true"]) == COMPLETE
+    assert_same_tables(out, golden)
+
+
+def test_a_writer_that_was_killed_before_its_copy_is_no_damage(out: Path) -> None:
+    files(out, "samples/_commits/*.json")[-1].unlink()
+    assert verify(Store(out)).damage == ()
+    store = Store(out)
+    store.samples.claim()
+    assert len(files(out, "samples/_commits/*.json")) == len(files(out, "samples/_delta_log/*.json"))
+    assert verify(Store(out)).damage == ()
+
+
+def test_a_table_of_a_version_without_copies_is_whole_and_gets_them(out: Path) -> None:
+    for folder in out.glob("*/_commits"):
+        shutil.rmtree(folder)
+    assert verify(Store(out)).damage == ()
+    Store(out).samples.claim()
+    assert len(files(out, "samples/_commits/*.json")) == len(files(out, "samples/_delta_log/*.json"))
+
+
+def test_checkpoints_are_held_too(out: Path) -> None:
+    table = Store(out).samples
+    while not files(out, "samples/_delta_log/*.parquet"):
+        table.claim()
+    (checkpoint,), last = files(out, "samples/_delta_log/*.parquet"), out / "samples/_delta_log/_last_checkpoint"
+    location = Store(out).location
+    for path in (checkpoint, last):
+        whole = path.read_bytes()
+        for content in damaged(whole, every=max(1, len(whole) // 40)):
+            path.write_bytes(content)
+            assert [found.name for _, found in damaged_logs(location)] == [f"_delta_log/{path.name}"]
+            restore_logs(location)
+            assert path.read_bytes() == whole
+    for path in files(out, "samples/_delta_log/*.json")[:50]:
+        path.unlink()  # as delta-rs tidies commits that a checkpoint holds
+    assert not damaged_logs(location) and len(Store(out).samples)
+
+
+@pytest.mark.parametrize("part", ["samples/*/*/*.parquet", "outcomes/*.parquet", "candidates/*.parquet"])
+def test_a_damaged_file_of_a_table_is_taken_out_and_made_again(
+    out: Path, golden: Path, part: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = files(out, part)[0]
+    whole, name = path.read_bytes(), path.relative_to(out)
+    for content in damaged(whole, every=len(whole) // 30):
+        path.write_bytes(content)
+        first, *_ = verify(Store(out)).damage
+        assert first.startswith(f"{name}: ")
+    others = {other: other.read_bytes() for other in files(out, "*/**/*.parquet") if other != path}
+    code, said = told(capsys, str(out), "repair=true")
+    assert code == COMPLETE and f"taken out {name}" in said and not path.exists()
+    assert {other: other.read_bytes() for other in files(out, "*/**/*.parquet")} == others
+    assert run(out) == COMPLETE
+    assert_same_tables(out, golden)
+    assert verify(Store(out)).damage == ()
+    path.unlink() if path.exists() else files(out, part)[0].unlink()
+    code, said = told(capsys, str(out))
+    assert code == DAMAGED and ": is missing" in said
+
+
+@pytest.mark.parametrize("part", ["episodes/*.mcap", "cache/prepared/*.npz", "run.json", "current_run.json"])
+def test_damage_beside_the_tables_is_named_and_taken_out(
+    out: Path, golden: Path, part: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = files(out, part)[0]
+    whole, name = path.read_bytes(), path.relative_to(out)
+    for content in (whole[:-9], whole[: len(whole) // 2], b"\xff" * 40, whole[:30] + b"\0" + whole[31:]):
+        path.write_bytes(content)
+        code, said = told(capsys, str(out))
+        assert code == DAMAGED and str(name) in said, content
+    if part == "run.json":  # what the rows were made with nobody can make again
+        return
+    code, said = told(capsys, str(out), "repair=true")
+    assert code == COMPLETE and f"taken out {name}" in said
+    assert run(out) == COMPLETE
+    assert_same_tables(out, golden)
+    if not part.startswith("current"):
+        assert path.is_file() is part.startswith("episodes")  # a clip whose attempts are done is not prepared again
+
+
+def test_the_reader_refuses_with_the_file_s_name(out: Path) -> None:
+    path = files(out, "samples/*/*/*.parquet")[0]
+    whole, refused = path.read_bytes(), 0
+    expected = list(map(str, SampleTable(out)))
+    for content in damaged(whole, every=len(whole) // 40):
+        path.write_bytes(content)
+        try:
+            assert list(map(str, SampleTable(out))) == expected, "what nothing was read from, such as an index of pages"
+        except OSError as error:
+            assert path.name in str(error)
+            refused += 1
+    assert refused >= 30
+
+
+def test_nothing_is_repaired_while_a_run_writes(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = files(out, "samples/*/*/*.parquet")[0]
+    path.write_bytes(b"")
+    (out / "last_run.json").write_text(json.dumps({"began_ms": 1}))
+    for name, more in (("verify", ["repair=true"]), ("clean", []), ("compact", [])):
+        assert COMMANDS[name].load()([f"out={out}", *more]) == BAD_CONFIG
+        assert "a run is writing here; wait until it has ended" in capsys.readouterr().err
+    assert path.exists()
+
+
+def test_leftovers_go_once_they_are_old(out: Path, golden: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    clean = COMMANDS["clean"].load()
+    shard = files(out, "samples/*/*/*.parquet")[0]
+    left = [shard.with_name(f"part-{'0' * 32}.parquet"), out / "cache/.x.npz.12345678.tmp", out / "episodes/x.mcap"]
+    for path in left:
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(b"x")
+    assert clean([f"out={out}"]) == 0 and all(path.exists() for path in left)
+    assert clean([f"out={out}", "older_than=0min", "say=true"]) == 0 and all(path.exists() for path in left)
+    said = capsys.readouterr().out
+    assert all(f"leftover  {path.relative_to(out)}" in said for path in left)
+    assert clean([f"out={out}", "older_than=0min"]) == 0 and not any(path.exists() for path in left)
+    assert_same_tables(out, golden)
+    assert verify(Store(out)) == verify(Store(golden)) and files(out, "episodes/*")
+    assert clean([f"out={out}", "older_than=soon"]) == BAD_CONFIG
+    assert "must be a number of days, hours or minutes" in capsys.readouterr().err
+
+
+def test_compacting_merges_files_and_changes_no_sample(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, whole = tmp_path / "out", tmp_path / "whole"
+    for n in (1, 3, 5):  # three runs, a file each in every round and expert
+        run(out, clips=n)
+    run(whole, clips=5)
+    before, facts = list(map(str, SampleTable(out))), Store(out).samples.file_facts()
+    opened = SampleTable(out)
+    assert COMMANDS["compact"].load()([f"out={out}"]) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert [line.split() for line in said][1] == ["samples", "9", "files,", "now", "3"]
+    after = Store(out).samples.file_facts()
+    assert len(after) == 3 and max(f.written_ms for f in after.values()) == max(f.written_ms for f in facts.values())
+    assert sorted(map(str, SampleTable(out))) == sorted(before) and sorted(map(str, opened)) == sorted(before)
+    assert_same_tables(out, whole)
+    found = verify(Store(out))
+    assert found.damage == () and len([name for name in found.orphans if name.startswith("samples")]) == 9
+    assert run(out, clips=5) == COMPLETE and COMMANDS["compact"].load()([f"out={out}"]) == 0
+    assert capsys.readouterr().out.splitlines()[1].split() == ["samples", "3", "files,", "now", "3"]
+
+
+def test_a_damaged_log_is_named_by_whoever_opens_the_table(out: Path) -> None:
+    path = files(out, "samples/_delta_log/*.json")[0]
+    path.write_bytes(path.read_bytes().replace(b"schemaString", b"schemaStrinh"))
+    with pytest.raises(OSError, match=f"samples: _delta_log/{path.name} is not what was written"):
+        Store(out)
