@@ -14,6 +14,9 @@ clip. With it a run sees that a log was changed though its clips lie prepared in
 `block(ref) -> str | None`, names the block that the clip is rendered from, as cheaply; with it the block is built once,
 as a task of its own, before its clips are prepared.
 
+A format that may bring its reader down or never end, as pickles may, is `untrusted`: the index reads each log in
+another process, and a log that kills it is broken as any other.
+
 Wherever the input is broken, raise `BadClip(file, field, how to fix it)`. Units: metres, radians, seconds, one world
 frame per log; the columns of ego states are named in tasks.world.vehicle, absent agents hold NaN and valid = False.
 """
@@ -28,6 +31,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 
+from factory.readers.apart import Apart
 from factory.readers.base import SPLITS, BadClip, ClipIndex, ClipRef, split_of
 from factory.readers.settings import LogClips, WindowSettings
 from factory.readers.validate import validate_clip
@@ -86,6 +90,15 @@ class Recorded:
     block: Block | None = None
 
 
+@dataclass(frozen=True)
+class LogWindows:
+    """What the index takes of one log."""
+
+    starts: tuple[int, ...] = ()  # first steps of the windows that are clips
+    dropped: Mapping[str, int] = field(default_factory=dict)  # the others, by reason
+    skipped: str = ""  # why the log as a whole has none
+
+
 Log = TypeVar("Log", bound=WholeLog)
 
 
@@ -96,6 +109,7 @@ class LogReader(ABC, Generic[Log]):
     """
 
     data_set: ClassVar[str]  # name where none is given
+    untrusted: ClassVar[bool] = False  # the format can bring a reader down: the index reads it in another process
     length_is: ClassVar[str] = "long"  # "12.3 s ..." of a log that is too short
 
     def __init__(
@@ -146,29 +160,36 @@ class LogReader(ABC, Generic[Log]):
         dropped: Counter[str] = Counter()
         skipped: dict[str, str] = {}
         broken: dict[ClipRef, str] = {}
-        for log_id, path in self._chosen().items():
+        chosen = self._chosen()
+        elsewhere = Apart(self.windows_of) if self.untrusted else None
+        for log_id, path in chosen.items():
             try:
-                drive = self.drive(path)
+                found = self.windows_of(path) if elsewhere is None else elsewhere(path, str(path))
             except BadClip as error:
                 broken[ClipRef(self.name, log_id, 0)] = str(error)
                 continue
-            if isinstance(drive, str):
-                skipped[log_id] = drive
-                continue
-            driven = np.flatnonzero(np.isfinite(drive.ego_states).all(axis=1))
-            driven = driven[driven >= drive.earliest]
-            first, n_steps = (int(driven[0]), int(driven[-1] - driven[0]) + 1) if len(driven) else (0, 0)
-            # The first window begins where the ego's drive does.
-            starts = range(self.windows.first_step, n_steps - CLIP_STEPS + 1, self.windows.stride_steps)
-            if not starts:
-                needs_s = (self.windows.first_step + CLIP_STEPS) * STEP_S
-                skipped[log_id] = f"{n_steps * STEP_S:.1f} s {self.length_is}, a clip needs {needs_s:.1f} s"
-            for start in (first + offset for offset in starts):
-                if reason := self._drop_reason(drive, start, start + CLIP_STEPS):
-                    dropped[reason] += 1
-                else:
-                    refs.append(ClipRef(self.name, log_id, start * STEP_MS))
+            if found.skipped:
+                skipped[log_id] = found.skipped
+            dropped += Counter(found.dropped)
+            refs += [ClipRef(self.name, log_id, start * STEP_MS) for start in found.starts]
         return ClipIndex(tuple(refs), dict(dropped), skipped, broken)
+
+    def windows_of(self, path: Path) -> LogWindows:
+        """The windows of one log. Raises BadClip."""
+        drive = self.drive(path)
+        if isinstance(drive, str):
+            return LogWindows(skipped=drive)
+        driven = np.flatnonzero(np.isfinite(drive.ego_states).all(axis=1))
+        driven = driven[driven >= drive.earliest]
+        first, n_steps = (int(driven[0]), int(driven[-1] - driven[0]) + 1) if len(driven) else (0, 0)
+        # The first window begins where the ego's drive does.
+        starts = range(self.windows.first_step, n_steps - CLIP_STEPS + 1, self.windows.stride_steps)
+        if not starts:
+            needs_s = (self.windows.first_step + CLIP_STEPS) * STEP_S
+            return LogWindows(skipped=f"{n_steps * STEP_S:.1f} s {self.length_is}, a clip needs {needs_s:.1f} s")
+        reasons = {first + i: self._drop_reason(drive, first + i, first + i + CLIP_STEPS) for i in starts}
+        kept = tuple(start for start, reason in reasons.items() if reason is None)
+        return LogWindows(kept, Counter(reason for reason in reasons.values() if reason is not None))
 
     def read(self, ref: ClipRef) -> Clip:
         """The validated clip. Raises BadClip."""

@@ -2,7 +2,8 @@
 
 A pickle is a program. Three walls stand before and around it:
 1. the opcodes are read first, without running any: only those that build plain values may occur, every length is
-   checked against the file, and no memo index may exceed the number of opcodes (else 5 bytes could ask for 64 GB);
+   checked against the file, no memo index may exceed the number of opcodes (else 5 bytes could ask for 64 GB), nothing
+   is nested deeper than `pickle_shape.MAX_DEPTH`, and no key of a dict or set is a tuple that takes long to hash;
 2. every global is answered with a function made for this one load; the named object is never imported or called;
 3. arrays and copied containers are paid for from a budget of `BUDGET_PER_BYTE` x file size (+ 16 MB), so that one big
    value cannot be copied without end. Opcodes themselves cost at most some 100 bytes of memory per byte read.
@@ -10,7 +11,6 @@ A pickle is a program. Three walls stand before and around it:
 
 import io
 import pickle
-import pickletools
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any, ClassVar
@@ -18,6 +18,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from factory.readers.base import MAX_FILE_BYTES, BadClip
+from factory.readers.pickle_shape import MAX_HASHED, check_opcodes
 
 BUDGET_PER_BYTE = 8
 BUDGET_BASE_BYTES = 1 << 24
@@ -85,23 +86,11 @@ class Record:
 def _load(data: bytes, file: str, opcodes: frozenset[str], classes: frozenset[str]) -> Any:
     if len(data) > MAX_FILE_BYTES:
         raise BadClip(file, "pickle", f"{len(data)} bytes; more than {MAX_FILE_BYTES} are refused")
-    _check_opcodes(data, file, opcodes)
+    check_opcodes(data, file, opcodes)
     try:
         return _Unpickler(data, file, classes).load()
     except _LOAD_ERRORS as error:
         raise BadClip(file, "pickle", f"not a readable pickle ({type(error).__name__}: {error})") from error
-
-
-def _check_opcodes(data: bytes, file: str, allowed: frozenset[str]) -> None:
-    """Raises BadClip where an opcode may do more than build plain values, or the stream is cut off."""
-    try:
-        for count, (opcode, argument, position) in enumerate(pickletools.genops(data)):
-            if opcode.name not in allowed:
-                raise BadClip(file, "pickle", f"opcode {opcode.name} at byte {position} is refused")
-            if opcode.name in ("PUT", "BINPUT", "LONG_BINPUT") and (argument or 0) > count:
-                raise BadClip(file, "pickle", f"memo index {argument} at byte {position} is refused")
-    except (ValueError, EOFError, OverflowError) as error:
-        raise BadClip(file, "pickle", f"truncated or not a pickle ({error})") from error
 
 
 class _Unpickler(pickle.Unpickler):
@@ -144,6 +133,16 @@ class _Array(np.ndarray):
         self.spend(len(raw))
         checked: Any = (version, shape, dtype.dtype, bool(is_fortran), raw)
         super().__setstate__(checked)
+
+
+def _hashed(value: object, left: int) -> int:
+    """What is left of `left` values once those that hashing a tuple goes through are taken; below 0: too many."""
+    left -= 1
+    for item in value if isinstance(value, tuple) and left >= 0 else ():
+        left = _hashed(item, left)
+        if left < 0:
+            break
+    return left
 
 
 def _stand_ins(file: str, budget: int, classes: frozenset[str]) -> dict[tuple[str, str], Callable[..., Any]]:
@@ -196,6 +195,8 @@ def _stand_ins(file: str, budget: int, classes: frozenset[str]) -> dict[tuple[st
     def copied(kind: Callable[[Iterable[object]], Any]) -> Callable[..., Any]:
         def build(items: list[object] | tuple[object, ...] | str = ()) -> Any:
             spend(64 * len(items))
+            if kind in (set, frozenset) and any(_hashed(item, MAX_HASHED) < 0 for item in items):
+                raise BadClip(file, "pickle", "a member of a set is a tuple of too many")
             return kind(items)
 
         return build

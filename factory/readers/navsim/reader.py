@@ -11,12 +11,13 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from factory.readers.apart import Apart
 from factory.readers.base import SPLITS, BadClip, ClipIndex, ClipRef, bytes_of, split_of
 from factory.readers.logs import CACHED_LOGS
 from factory.readers.navsim.filters import Selection, read_selection
@@ -255,11 +256,12 @@ class NavsimReader:
     def _tables(self, logs: Mapping[str, Path]) -> Iterable[tuple[str, FrameTable | BadClip]]:
         """The table of each log, or what is wrong with it; what takes long is told on stderr."""
         began, made, told = time.monotonic(), 0, 0.0
+        made_apart = Apart(partial(make_table, cache_dir=self.cache_dir))
         for i, (log_id, path) in enumerate(logs.items(), start=1):
             try:
                 table = kept_table(path, self.cache_dir)
                 if table is None:
-                    table = make_table(path, self.cache_dir)
+                    table = made_apart(path, str(path))
                     made += 1
             except BadClip as error:
                 yield log_id, error

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from factory.readers.base import BadClip, ClipRef, bytes_of
+from factory.readers.base import BadClip, ClipIndex, ClipRef, bytes_of
 from factory.readers.logs import STEP_MS, LoggedDrive, LogReader, Recorded, WholeLog, present, route_of_drive, within
 from factory.readers.restricted_pickle import load_plain
 from factory.readers.scenarionet.map import road_map, traffic_lights
@@ -61,6 +61,7 @@ class ScenarioNetReader(LogReader[ScenarioLog]):
     """
 
     data_set = "scenarionet"
+    untrusted = True
     length_is = "of driving"
 
     def __init__(
@@ -99,9 +100,14 @@ class ScenarioNetReader(LogReader[ScenarioLog]):
         """Log id -> pickle, listed once. Raises ValueError where the root holds no scenario."""
         return self._files
 
+    def index(self) -> ClipIndex:
+        """As of LogReader; sidecars are looked for before a scenario is opened, and once for all of them."""
+        _ = self._sidecars
+        return super().index()
+
     def drive(self, path: Path) -> LoggedDrive:
         """Ego and agents of the scenario in this file. Raises BadClip."""
-        sidecars = self._sidecars  # looked for before a scenario is opened
+        sidecars = self._sidecars
         scenario, _ = read_scenario(path)
         drive = read_motion(scenario, str(path))
         if path not in sidecars:

@@ -134,3 +134,41 @@ def test_persistent_ids_and_extension_codes_are_refused():
     for stream in (b"Pname\n.", b"\x80\x02\x82\x01."):
         with pytest.raises(BadClip, match="opcode"):
             load_plain(stream, "clip.pkl")
+
+
+DOUBLED = b"2\x86"  # DUP TUPLE2: twice the value before
+
+
+@pytest.mark.parametrize(
+    "stream",
+    [
+        b"\x80\x04}K\x01" + DOUBLED * 180 + b"K\x01s.",
+        b"\x80\x04}K\x01" + DOUBLED * 50 + b"K\x01s.",
+        b"\x80\x04\x8f(K\x01" + DOUBLED * 50 + b"\x90.",
+        b"\x80\x04(K\x01" + DOUBLED * 50 + b"\x91.",
+        b"\x80\x04(K\x01" + DOUBLED * 50 + b"K\x01d.",
+        b"\x80\x04}(K\x01" + DOUBLED * 50 + b"K\x01u.",
+        b"\x80\x04cbuiltins\nset\n(K\x01" + DOUBLED * 50 + b"l\x85R.",
+        b"\x80\x04}cbuiltins\ntuple\n(K\x01" + DOUBLED * 50 + b"l\x85RK\x01s.",
+        b"\x80\x04}K\x01" + b"\x85" * 300_000 + b"K\x01s.",
+        b"\x80\x04" + b"]" * 100_000 + b"a" * 99_999 + b".",
+        b"\x80\x04" + b"}K\x01" * 100_000 + b"}" + b"s" * 100_000 + b".",
+    ],
+    ids=lambda stream: f"{len(stream)} bytes",
+)
+def test_keys_that_never_hash_and_nests_that_overflow_are_refused_unread(stream: bytes) -> None:
+    """180 pairs of the pair before hold 2^180 values: in 370 bytes a key whose hash never ends."""
+    with pytest.raises(BadClip, match=r"clip.pkl: pickle: (values nested|a key of|a member of)"):
+        load_plain(stream, "clip.pkl")
+
+
+def test_keys_of_a_few_values_and_large_tuples_that_are_no_keys_load() -> None:
+    value = {(1, ("a", 2.5)): tuple(range(5000)), "deep": [[[[(), {}]]]], "set": {(1, 2), frozenset({(3,)})}}
+    for protocol in (0, 2, 4, 5):
+        assert roundtrip(value, protocol) == value
+
+
+def test_what_is_taken_from_an_empty_stack_is_no_pickle() -> None:
+    for stream in (b"\x80\x04\x85.", b"\x80\x04a.", b"\x80\x04(s.", b"\x80\x04h\x05.", b"0.", b"1."):
+        with pytest.raises(BadClip, match="truncated or not a pickle"):
+            load_plain(stream, "clip.pkl")

@@ -1,0 +1,138 @@
+"""Files of others, looked at in another process: what brings that down, or never ends, costs one file and no run.
+
+One process for all that are looked at in this one, started with the first and again after a file that it did not
+survive. It ends with this process, whose end of the pipe closes.
+"""
+
+import atexit
+import os
+import pickle
+import resource
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from threading import Lock
+from typing import Any, Generic, TypeVar
+
+from factory.readers.base import BadClip
+
+LIMIT_S = 300.0  # for one file; the longest logs take seconds
+MEMORY_BYTES = 16 * 2**30  # beyond what a file of 1 GB may ask for
+FUNCTION, ARGUMENT = b"f", b"a"
+A = TypeVar("A")
+R = TypeVar("R")
+
+
+class ReadApart:
+    """A process that answers one question after the other."""
+
+    def __init__(self) -> None:
+        ours, theirs = socket.socketpair()
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+        command = [sys.executable, "-m", "factory.readers.apart", str(theirs.fileno())]
+        self._process = subprocess.Popen(  # noqa: S603 (ours)
+            command, env=environment, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, start_new_session=True
+        )
+        theirs.close()
+        self._pipe: Connection[Any, Any] = Connection(ours.detach())
+
+        self._told = b""
+
+    def ask(self, function: bytes, argument: bytes, limit_s: float) -> Any:
+        """The answer. Raises TimeoutError, and EOFError or OSError where the process died."""
+        if function != self._told:
+            self._pipe.send_bytes(FUNCTION + function)
+            self._told = function
+        self._pipe.send_bytes(ARGUMENT + argument)
+        if not self._pipe.poll(limit_s):
+            raise TimeoutError
+        return self._pipe.recv()
+
+    def end(self) -> int:
+        """Kill it, if it lives; how it ended."""
+        self._pipe.close()
+        self._process.kill()
+        return self._process.wait()
+
+
+_lock = Lock()
+_running: list[ReadApart] = []
+
+
+class Apart(Generic[A, R]):
+    """A function, answered in the other process; it is sent there once for all arguments that follow each other."""
+
+    def __init__(self, function: Callable[[A], R]) -> None:
+        self._function = pickle.dumps(function)
+
+    def __call__(self, argument: A, file: str, limit_s: float = LIMIT_S) -> R:
+        """What the function returns; what it raises is raised.
+
+        Raises BadClip with the file's name where it takes longer than `limit_s`, more memory than there is for it, or
+        brings the process down.
+        """
+        with _lock:
+            is_well, answer = self._asked(pickle.dumps(argument), file, limit_s)
+        if is_well:
+            found: R = answer
+            return found
+        if isinstance(answer, MemoryError):
+            raise BadClip(file, "file", "reading it takes more memory than there is for it") from answer
+        raise answer
+
+    def _asked(self, argument: bytes, file: str, limit_s: float) -> Any:
+        if not _running:
+            _running.append(ReadApart())
+        try:
+            return _running[0].ask(self._function, argument, limit_s)
+        except TimeoutError:
+            _end()
+            raise BadClip(file, "file", f"reading it was given up after {limit_s:g} s") from None
+        except (EOFError, OSError) as error:
+            raise BadClip(file, "file", f"its reader {_how(_end())} over it") from error
+        except BaseException:  # a signal while it waits: the answer would be taken for the next question's
+            _end()
+            raise
+
+
+def _end() -> int:
+    return _running.pop().end() if _running else 0
+
+
+def _how(code: int) -> str:
+    return f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
+
+
+atexit.register(_end)
+
+
+def _answer_all(pipe: "Connection[Any, Any]") -> None:
+    """The other process: until its pipe closes."""
+    _, most = resource.getrlimit(resource.RLIMIT_DATA)
+    allowed = MEMORY_BYTES if most == resource.RLIM_INFINITY else min(most, MEMORY_BYTES)
+    resource.setrlimit(resource.RLIMIT_DATA, (allowed, most))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    told, function = b"", None
+    while True:
+        try:
+            question = pipe.recv_bytes()
+        except EOFError:
+            return
+        if question[:1] == FUNCTION:
+            told, function = question[1:], None
+            continue
+        signal.alarm(int(LIMIT_S) + 60)  # who asked may be gone
+        try:
+            function = function or pickle.loads(told)  # noqa: S301 (our own parent's)
+            answer = True, function(pickle.loads(question[1:]))  # noqa: S301
+        except Exception as error:
+            answer = False, error
+        signal.alarm(0)
+        pipe.send(answer)
+
+
+if __name__ == "__main__":
+    _answer_all(Connection(int(sys.argv[1])))

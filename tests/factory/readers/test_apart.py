@@ -1,0 +1,74 @@
+"""A file that brings its reader down, or never ends, costs its own clips and nothing else."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from factory.readers.apart import Apart
+from factory.readers.base import BadClip
+from factory.readers.scenarionet.reader import ScenarioNetReader
+from tests.factory.readers.scenarionet_scenarios import nuscenes, save
+
+
+def pid_of(_: int) -> int:
+    return os.getpid()
+
+
+def killed(number: int) -> None:
+    os.kill(os.getpid(), number)
+
+
+def doubled(value: int) -> int:
+    return 2 * value
+
+
+def refused(file: str) -> None:
+    raise BadClip(file, "field", "is wrong")
+
+
+def hungry(n_bytes: int) -> int:
+    return len(bytes(n_bytes))
+
+
+def test_one_process_answers_all_and_another_follows_one_that_died() -> None:
+    first = Apart(pid_of)(0, "a")
+    assert first != os.getpid() and [Apart(doubled)(n, "a") for n in range(3)] == [0, 2, 4]
+    assert Apart(pid_of)(0, "a") == first
+    for number in (signal.SIGSEGV, signal.SIGKILL):
+        with pytest.raises(BadClip, match=f"b: file: its reader was killed by {number.name} over it"):
+            Apart(killed)(number, "b")
+    assert Apart(pid_of)(0, "a") not in (first, os.getpid())
+
+
+def test_what_never_ends_is_given_up_and_what_is_raised_is_raised() -> None:
+    with pytest.raises(BadClip, match=r"c: file: reading it was given up after 0\.2 s"):
+        Apart(time.sleep)(60.0, "c", limit_s=0.2)
+    with pytest.raises(BadClip, match="d: field: is wrong"):
+        Apart(refused)("d", "d")
+    with pytest.raises(BadClip, match="e: file: reading it takes more memory than there is for it"):
+        Apart(hungry)(2**40, "e")
+    assert Apart(doubled)(4, "a") == 8
+
+
+class FatalReader(ScenarioNetReader):
+    """Dies of the file that is named fatal."""
+
+    def drive(self, path: Path) -> object:  # type: ignore[override]
+        if "fatal" in path.name:
+            os.kill(os.getpid(), signal.SIGSEGV)
+        return super().drive(path)
+
+
+def test_a_fatal_log_of_a_folder_is_broken_and_the_others_are_clips(tmp_path: Path) -> None:
+    for name in ("sd_a.pkl", "sd_fatal.pkl", "sd_z.pkl"):
+        save(nuscenes(), tmp_path, name)
+    index = FatalReader(tmp_path).index()
+    assert {ref.log_id for ref in index.refs} == {"sd_a", "sd_z"}
+    ((ref, said),) = index.broken.items()
+    assert ref.log_id == "sd_fatal" and said == (
+        f"{tmp_path / 'sd_fatal.pkl'}: file: its reader was killed by SIGSEGV over it"
+    )
+    assert ScenarioNetReader(tmp_path).index().refs[0] in index.refs
