@@ -30,7 +30,7 @@ from tasks.render.fit.on_cpu import OnCpu
 from tasks.render.fit.on_torch import OnTorch
 from tasks.render.fit.reconstruct import advance, finish
 from tasks.render.fit.settings import FitSettings
-from tasks.render.fit.start import Comparison, Problem, Shot
+from tasks.render.fit.start import PhotoTarget, Problem, Shot
 from tasks.render.fit.state import BACKGROUND, FitState, logits_of
 from tasks.render.scene.asset import psnr
 from tasks.render.scene.sensed import Photo, Tracks
@@ -129,7 +129,7 @@ def problem_of(n: int, width: int, height: int, threads: int) -> tuple[Problem, 
         picture = forward(truth, k, pose, width, height, np.full(3, SKY, np.float32), threads).view.rgb
         rgb = np.rint(255.0 * np.clip(picture, 0.0, 1.0)).astype(np.uint8)
         photo = Photo("front", 0.1 * i, rgb, k, pose)
-        shots.append(Shot(photo, None, Comparison(target_of(rgb), np.zeros((height, width), bool))))
+        shots.append(Shot(photo, None, PhotoTarget(target_of(rgb), np.zeros((height, width), bool))))
     held_out = tuple(shots[i] for i in HELD_OUT)
     train = tuple(shot for i, shot in enumerate(shots) if i not in HELD_OUT)
     return Problem(np.zeros(3), train, held_out, Tracks(None, np.zeros(3)), None), shaken(truth, len(train))

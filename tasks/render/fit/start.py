@@ -28,14 +28,14 @@ from tasks.world.arrays import F32, Array, Bools
 
 ROAD_TOP_M = 0.08  # a Gaussian that starts no further from the road's surface belongs to it
 START_WIDTH = 640  # pixels of a photo across, more of which say no better where surfaces are
-COMPARED_BYTES, KEPT_BYTES = 41, 10**9  # of a pixel in `Comparison`, and of all that are kept
+COMPARED_BYTES, KEPT_BYTES = 41, 10**9  # of a pixel in `PhotoTarget`, and of all that are kept
 LOOKS_DOWN = 0.05  # sine of the angle below the horizon from which on a ray meets the ground
 UPRIGHT = 0.5  # unless it stands: the least vertical part of its normal
 
 
 @dataclass(frozen=True)
-class Comparison:
-    """What of a photo every comparison needs: ten times its own bytes."""
+class PhotoTarget:
+    """What a picture is compared with: ten times its own bytes."""
 
     target: Target
     ground: Bools  # (H, W) looks down, so that no sky can be behind
@@ -47,10 +47,10 @@ class Shot:
 
     photo: Photo
     hidden: Bools | None  # (H, W) pixels that are left out
-    kept: Comparison | None = None  # made anew each time where the block's do not fit into KEPT_BYTES
+    kept: PhotoTarget | None = None  # made anew each time where the block's do not fit into KEPT_BYTES
 
     @property
-    def compared(self) -> Comparison:
+    def compared(self) -> PhotoTarget:
         """What is kept, or the same once more."""
         return _compared(self.photo, self.hidden) if self.kept is None else self.kept
 
@@ -161,11 +161,11 @@ def _hidden(photo: Photo, tracks: Tracks, unknown: Bools) -> Bools | None:
     return np.asarray(behind_boxes(far, eye, boxes[valid & unknown]), bool).reshape(height, width)
 
 
-def _compared(photo: Photo, hidden: Bools | None) -> Comparison:
+def _compared(photo: Photo, hidden: Bools | None) -> PhotoTarget:
     height, width = photo.rgb.shape[:2]
     rays = directions(photo.intrinsics, photo.world_from_camera, width, height)
     ground = rays[..., 2] < -LOOKS_DOWN * np.linalg.norm(rays, axis=-1)
-    return Comparison(target_of(photo.rgb, hidden), ground)
+    return PhotoTarget(target_of(photo.rgb, hidden), ground)
 
 
 def _first_state(
