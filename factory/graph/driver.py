@@ -22,13 +22,18 @@ from factory.graph.steps import Attempted, Failure, HalfBuilt, HandedOn, Prepare
 from factory.graph.walk import Blocked, Complete, Exhausted, Step, Try, tries_before
 from factory.store.disk import DiskFull
 from factory.store.identity import RunIdentity, Stamp, attempt_id
-from factory.store.outcomes import Kind, Outcome
+from factory.store.outcomes import ErrorKind, Kind, Outcome
 from factory.store.samples import Past
 from factory.store.table import Shard
 from tasks.stages import Rejected
 
 CLIPS_PER_WORKER = 2  # open at once: one works while the next is being prepared
 WAIT_S = 0.5
+ILL_IN_A_ROW = 6  # tasks that fail by the machine, or three for every task at once: then the run stops
+
+
+class MachineIll(RuntimeError):
+    """Task after task fails by the machine."""
 
 
 @dataclass
@@ -40,6 +45,7 @@ class Executed:
     attempts: int = 0
     found_done: int = 0  # attempts settled by earlier runs
     episodes: int = 0  # files written
+    uncached: int = 0  # prepared clips that could not be kept for later runs
 
     def __str__(self) -> str:
         episodes = f"; wrote {self.episodes} episodes" if self.episodes else ""
@@ -87,6 +93,8 @@ class Driver:
         self._walks_left: dict[str, int] = {}
         self._held: dict[tuple[str, str], tuple[list[PendingRow], list[Outcome]]] = {}  # redo: until the walk ends
         self._stopping = threading.Event()
+        self._ill_in_a_row = 0
+        self._uncached = ""  # why the first could not be kept
         self._tally = Tally()
         self._wanted = {
             (clip.ref.clip_id, walk.expert): _wanted(walk, rounds) for clip in plan.todo for walk in clip.walks
@@ -113,11 +121,14 @@ class Driver:
         return self._stopping.is_set()
 
     def loop(self, graph: Graph, gatherer: Gatherer, metrics: RunMetrics, episodes: Episodes | None = None) -> None:
-        """Until nothing is left, or until stopped and drained. Raises DiskFull once a disk is full."""
+        """Until nothing is left, or until stopped and drained. Raises DiskFull once a disk is full, and MachineIll."""
         self._graph, self._gatherer, self._metrics, self._episodes = graph, gatherer, metrics, episodes
         gatherer.committed = self._committed
         with ProgressLine(len(self._plan.todo), self._forecast.left_s, doing=self._doing) as progress:
             self._work_through(graph, gatherer, progress)
+        if self.executed.uncached:
+            what = f"{self.executed.uncached} prepared clips could not be kept ({self._uncached})"
+            self.notes.append(f"{what}; a later run that needs them prepares them again")
 
     def _work_through(self, graph: Graph, gatherer: Gatherer, progress: ProgressLine) -> None:
         self._queue = BlockQueue(self._plan.todo, self._block_of, graph.parallelism)
@@ -178,6 +189,7 @@ class Driver:
         self._metrics.task(ticket.step, ticket.queued_s, report)
         if isinstance(report, Failure) and report.disk_full:
             raise DiskFull(report.disk_full)
+        self._count_illness(report)
         if self._gatherer.finished(ticket, report):
             return
         if self._episodes is not None and self._episodes.finished(ticket, report):
@@ -189,6 +201,13 @@ class Driver:
             self._take_prepared(self._preparing.pop(ticket), ticket.result, report)
         else:
             self._take_attempt(self._trying.pop(ticket), ticket.result, report)
+
+    def _count_illness(self, report: Any) -> None:
+        ill = isinstance(report, Failure) and report.kind is ErrorKind.MACHINE
+        self._ill_in_a_row = self._ill_in_a_row + 1 if ill else 0
+        if self._ill_in_a_row >= max(ILL_IN_A_ROW, 3 * self._graph.parallelism):
+            said = report.error.splitlines()[-1]
+            raise MachineIll(f"the machine failed {self._ill_in_a_row} tasks in a row, the last one by: {said}")
 
     def _take_block(self, build: Build, report: Reconstructed | HalfBuilt | Failure) -> None:
         if isinstance(report, HalfBuilt):
@@ -219,6 +238,8 @@ class Driver:
                 self.notes.append(f"clip {clip_id}: its prepared clip was not in the cache; prepared again")
             self.executed.prepared += not report.from_cache
             self.executed.from_cache += report.from_cache
+            self.executed.uncached += bool(report.uncached)
+            self._uncached = self._uncached or report.uncached
             clip.n_candidates = len(report.clip.candidates)
             is_listed = clip.listed is not None and clip.listed.content_digest == report.clip.content_digest
             rows = [] if is_listed else [self._records.candidates(clip.ref, report.clip)]

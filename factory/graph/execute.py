@@ -18,7 +18,7 @@ from deltalake.exceptions import DeltaError
 
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, asked_to_stop
 from factory.graph.batch import SHARD_BYTES, SHARD_SECONDS, Gatherer, WriteFailed
-from factory.graph.driver import Driver, Executed
+from factory.graph.driver import Driver, Executed, MachineIll
 from factory.graph.episodes import Episodes, EpisodesWanted
 from factory.graph.local import NO_CLAIMS, Claims, ClusterLacks, Fuse, Graph, LocalGraph
 from factory.graph.metrics import RunMetrics
@@ -136,6 +136,8 @@ def execute(
             code, message = INTERRUPTED, "interrupted; run the same command again to go on"
     except DiskFull as error:
         code, message, disk_full = INTERRUPTED, out_of_disk(error), True
+    except MachineIll as error:
+        code, message = INTERRUPTED, f"{error}; put it right and run the same command again: no clip is blamed"
     except (AnotherWriter, WriteFailed) as error:
         code, message = INTERRUPTED, str(error)
     except (OSError, DeltaError) as error:  # what holds the tables fails: a share that went away, a lost network

@@ -22,7 +22,18 @@ os.environ.setdefault("RAY_task_oom_retries", "2")  # Ray's own default retries 
 
 import ray
 from ray.autoscaler.sdk import request_resources
-from ray.exceptions import RayError, RayTaskError
+from ray.exceptions import (
+    LocalRayletDiedError,
+    NodeDiedError,
+    ObjectLostError,
+    ObjectStoreFullError,
+    OutOfDiskError,
+    OutOfMemoryError,
+    RayError,
+    RaySystemError,
+    RayTaskError,
+    RuntimeEnvSetupError,
+)
 from ray.util.metrics import Counter, Gauge, Histogram
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
@@ -40,12 +51,17 @@ from factory.graph.local import (
 from factory.graph.metrics import METRICS, Metric, Recorder, Type
 from factory.graph.steps import Failure
 from factory.graph.work import NotReady, Work, never
+from factory.store.illness import why_ill
 from factory.store.location import BadLocation, Location
 from factory.store.outcomes import ErrorKind
 from factory.wording import one_line
 from tasks.stages import TASKS
 
 MAX_RETRIES = 2  # of a task whose worker died
+ILL = (  # what Ray says when it is the machine that failed
+    *(NodeDiedError, LocalRayletDiedError, RaySystemError, RuntimeEnvSetupError),
+    *(OutOfMemoryError, ObjectLostError, ObjectStoreFullError, OutOfDiskError),
+)
 PROBE_SECONDS = 120.0
 ANSWER_S = 10.0  # for a cluster's port to be reached
 GPU_WAIT_S = 900.0  # for the first node with one to come
@@ -167,7 +183,7 @@ class RayGraph:
         try:
             report, worked_s = ray.get(reference)
         except RayError as error:
-            report, worked_s = Failure(ErrorKind.SYSTEM, f"{type(error).__name__}: {error}"[:2000]), 0.0
+            report, worked_s = Failure(_kind_of(error), f"{type(error).__name__}: {error}"[:2000]), 0.0
         ticket.queued_s = max(0.0, time.monotonic() - ticket.submitted - worked_s)
         return ticket, report
 
@@ -175,6 +191,12 @@ class RayGraph:
         self._tickets.clear()
         if self._connected:
             ray.shutdown()
+
+
+def _kind_of(error: RayError) -> ErrorKind:
+    """A worker that died may have died of its clip; a node, its memory or its object store are the machine's."""
+    ill = isinstance(error, ILL) or why_ill(error.cause if isinstance(error, RayTaskError) else error)
+    return ErrorKind.MACHINE if ill else ErrorKind.SYSTEM
 
 
 class RayPool(Executor):

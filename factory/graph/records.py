@@ -50,6 +50,7 @@ class Records:
         if isinstance(what, Rejected):
             became = {"kind": Kind.REJECTED.value, "stage": what.stage, "reason": what.reason, "detail": what.detail}
         elif isinstance(what, Failure):
+            tries -= what.kind is ErrorKind.MACHINE  # never counts
             poison = what.kind is ErrorKind.SYSTEM and tries + 1 >= QUARANTINE_AFTER
             kind = ErrorKind.POISON if poison else what.kind
             became = {"kind": Kind.FAILED.value, "error_kind": kind.value, "error": what.error}

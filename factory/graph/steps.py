@@ -19,11 +19,13 @@ from factory.store.cache import BadCacheFile, ClipCache, SceneFiles
 from factory.store.disk import why_disk_full
 from factory.store.episodes import FOLDER, episode_name
 from factory.store.identity import Stamp
+from factory.store.illness import own_place, why_ill
 from factory.store.location import Location
 from factory.store.outcomes import ErrorKind
 from factory.store.reader import samples_of
 from factory.store.schema import SAMPLES, sample_row_to_table
 from factory.store.table import Shard, write_shard
+from factory.wording import one_line
 from tasks.stages import Rejected
 
 ERROR_LINES = 12  # of a traceback that an outcome keeps
@@ -45,6 +47,7 @@ class Prepared:
     clip: PreparedClip  # without what its attempts alone need
     from_cache: bool
     note: str = ""  # why the cache was of no use, where a file was there
+    uncached: str = ""  # why it could not be kept for later runs
     seconds: Mapping[str, float] = field(default_factory=dict)
 
 
@@ -120,6 +123,8 @@ def prepare(
             stored = cache.load(key)
         except BadCacheFile as error:
             stored, note = None, f"cache file {key}: {error}; prepared again"
+        except OSError as error:
+            stored, note = None, f"cache file {key}: cannot be read: {one_line(error)}; prepared again"
         found = work.content_digest(ref) if stored is not None or wanted_content is not None else None
         _refuse_changed(ref, found, wanted_content)
         if isinstance(stored, PreparedClip) and found not in (None, stored.content_digest):
@@ -128,7 +133,7 @@ def prepare(
             _refuse_changed(ref, stored.content_digest, wanted_content)
             _keep_scenes(out, stored)
             seconds = {"cache": time.perf_counter() - began}
-            return Prepared(replace(stored, payload=None, scenes=None), True, note, seconds), stored
+            return Prepared(replace(stored, payload=None, scenes=None), True, note, "", seconds), stored
         result = work.prepare(ref)
         if isinstance(result, Rejected):
             _refuse_changed(ref, f"none ({result.reason})", wanted_content)  # the clip had candidates
@@ -136,17 +141,28 @@ def prepare(
         if result.clip_id != ref.clip_id:
             raise ValueError(f"prepare({ref.clip_id}) returned clip {result.clip_id}")
         _refuse_changed(ref, result.content_digest, wanted_content)
-        cache.store(key, result)
+        uncached = _why_uncached(cache, key, result)
         _keep_scenes(out, result)
-        return Prepared(replace(result, payload=None, scenes=None), False, note, result.seconds), result
+        return Prepared(replace(result, payload=None, scenes=None), False, note, uncached, result.seconds), result
     except Exception as error:  # the boundary where whatever a stage or a user's reader raises becomes data
         return failure_of(error), None
+
+
+def _why_uncached(cache: ClipCache, key: str, clip: PreparedClip) -> str:
+    """Keep a prepared clip; what stopped that, if anything did: a result that could not be cached is still a result."""
+    try:
+        cache.store(key, clip)
+    except OSError as error:
+        return f"{cache.location.uri}: {one_line(error)}"
+    return ""
 
 
 def _keep_scenes(out: Location, clip: PreparedClip) -> None:
     """Before any attempt, so that no row stands without them; written anew each time, they may be of older settings."""
     if clip.scenes is not None:
-        SceneFiles(out.child("scenes")).store(clip.scenes)
+        scenes = out.child("scenes")
+        with own_place(scenes.uri):
+            SceneFiles(scenes).store(clip.scenes)
 
 
 def _refuse_changed(ref: ClipRef, found: str | None, wanted: str | None) -> None:
@@ -239,9 +255,10 @@ def warm(work: Work, draws: bool) -> tuple[str | Failure, None]:
 
 
 def failure_of(error: BaseException) -> Failure:
-    """Broken input, an ailing machine, or a bug; with the last lines of the traceback."""
+    """Broken input, an ailing machine, what may be either, or a bug; with the last lines of the traceback."""
     if isinstance(error, BadClip):
         return Failure(ErrorKind.INPUT, str(error))
     kind = ErrorKind.SYSTEM if isinstance(error, OSError | MemoryError) else ErrorKind.BUG
+    kind = ErrorKind.MACHINE if why_ill(error) else kind
     lines = "".join(traceback.format_exception(error)).strip().splitlines()
     return Failure(kind, "\n".join(lines[-ERROR_LINES:]), why_disk_full(error))

@@ -12,6 +12,8 @@ from factory.graph.work import HUMAN_CANDIDATE
 from factory.store.outcomes import ErrorKind, Kind
 from factory.store.samples import Past
 
+TRIED_AGAIN = (ErrorKind.MACHINE, ErrorKind.SYSTEM)  # by the next run, by itself
+
 
 @dataclass(frozen=True)
 class Try:
@@ -71,15 +73,15 @@ def next_step(
 
 
 def retry_policy(retry: bool, versions_json: str) -> Callable[[Past], bool]:
-    """Which failures of earlier runs this run tries again: system failures; with `retry`, or under other stage
-    versions than the failure's, all."""
+    """Which failures of earlier runs this run tries again: those of the machine or the system; with `retry`, or under
+    other stage versions than the failure's, all."""
 
     def may_retry(past: Past) -> bool:
-        return retry or past.error_kind == ErrorKind.SYSTEM or past.stage_versions != versions_json
+        return retry or past.error_kind in TRIED_AGAIN or past.stage_versions != versions_json
 
     return may_retry
 
 
 def tries_before(past: Past | None) -> int:
-    """Runs that already failed at this attempt for the system's sake."""
-    return past.tries if past is not None and past.error_kind == ErrorKind.SYSTEM else 0
+    """Runs that already failed at this attempt and count against it."""
+    return past.tries if past is not None and past.error_kind in TRIED_AGAIN else 0

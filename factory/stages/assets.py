@@ -10,7 +10,7 @@ import hashlib
 import json
 import logging
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
 from enum import Enum
 from pathlib import Path
@@ -23,6 +23,7 @@ from factory.stages.fitting import fitted
 from factory.stages.rig import corrected_rig, known_of, said_again, wanted
 from factory.stages.scene_file import SUFFIX, BadScene, read_scene, write_scene
 from factory.stages.sensors import block_of, chosen_cameras, load_sensors, load_sweeps, taken_by
+from factory.store.illness import own_place
 from tasks.render.fit.lpips import lpips_of
 from tasks.render.scene.asset import BlockRange, RenderAsset, TakenFrom
 from tasks.render.scene.build import build_asset
@@ -86,7 +87,6 @@ def asset_for(
     if made_of is Sensing.NOTHING:
         return None
     path = scene_path(clip, settings, cache_dir)
-    path.parent.mkdir(parents=True, exist_ok=True)
     with only_builder(path):
         if path.exists():
             try:
@@ -132,8 +132,11 @@ def range_of(clip: Clip, block: Block) -> BlockRange:
 
 @contextmanager
 def only_builder(path: Path) -> Iterator[None]:
-    """Held by one process of the machine at a time; the kernel frees it when its holder dies."""
-    with path.with_suffix(".lock").open("w") as file:
+    """Held by one process of the machine at a time; the kernel frees it when its holder dies. Raises Refused."""
+    with ExitStack() as held:
+        with own_place(path.parent):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            file = held.enter_context(path.with_suffix(".lock").open("w"))
         fcntl.flock(file, fcntl.LOCK_EX)
         yield
 

@@ -26,7 +26,8 @@ class ErrorKind(StrEnum):
     NONE = ""
     INPUT = "input"  # the clip is broken: waits for retry or a raised stage version
     BUG = "bug"  # the code raised: likewise
-    SYSTEM = "system"  # a worker died, a disk was full: the next run tries again
+    MACHINE = "machine"  # the machine is ill (factory.store.illness): the next run tries again, however often
+    SYSTEM = "system"  # a worker died at it, a file could not be read: the next run tries again
     POISON = "poison"  # failed(system) in QUARANTINE_AFTER runs: waits like a bug
 
 
@@ -52,7 +53,7 @@ class Outcome:
     detail: str = ""
     error_kind: str = ""  # ErrorKind
     error: str = ""  # last lines of the traceback
-    tries: int = 1  # runs that tried it
+    tries: int = 1  # runs that tried it; failed(machine): those that count
     n_tried: int = 0  # exhausted: length of the candidate list
     subscores: dict[str, float] = field(default_factory=dict)  # rejected: as far as known
     seconds: dict[str, float] = field(default_factory=dict)  # stage -> seconds

@@ -27,8 +27,9 @@ REASON_WORDS = {
     "no_good_candidate": "no trajectory scores well enough",
     "input": "input is broken",
     "bug": "the code raised",
-    "system": "machine trouble",
-    "poison": "machine trouble again and again",
+    "machine": "the machine was ill",
+    "system": "a worker died, or a file could not be read",
+    "poison": "workers died at it again and again",
 }
 GATE_WORDS = {
     "raw_longitudinal": "raw end pose too far along",

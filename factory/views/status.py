@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 RETRY = {
     "input": "fix or take out the named file, then python -m factory retry out=...",
     "bug": "python -m factory retry out=..., once the code or the plug-in is fixed",
+    "machine": "the machine was ill, which never counts: the next run of the same command tries it again by itself",
     "system": "the next run of the same command tries it again by itself",
     "poison": "it brought workers down in several runs; python -m factory retry out=... tries it once more",
 }
