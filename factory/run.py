@@ -97,6 +97,18 @@ def kernels_of(config: RunConfig) -> list[str]:
     return parts_of(simulates(config), config.traffic.mode, label_traffic, config.render)
 
 
+def labels_limit(config: RunConfig) -> dict[str, float]:
+    """Seconds that labelling may take where traffic answers to each trajectory: up to a second each, of 16,384."""
+    return {"label": 6 * 3600.0} if config.reward.traffic == "navsim" and config.reward.labels != "none" else {}
+
+
+def isolates(config: RunConfig) -> bool:
+    """Whether executor=local works in a process of its own: where asked for, or where a plug-in works."""
+    used = [config.clips, *(spec for name, spec in config.expert.items() if name in config.experts)]
+    foreign = any(not str(spec.get("_target_", "")).startswith(("factory.", "tasks.")) for spec in used)
+    return config.graph.isolated == "always" or (config.graph.isolated == "auto" and foreign)
+
+
 def run(asked: Asked, only_plan: bool) -> int:
     """Plan, execute, commit, report; or plan alone. The command line is checked before anything heavy is imported."""
     config = load_config(asked.words)
@@ -106,6 +118,7 @@ def run(asked: Asked, only_plan: bool) -> int:
 
     from factory.graph.episodes import EpisodesWanted
     from factory.graph.execute import execute
+    from factory.graph.limits import Limits
     from factory.graph.local import Claims
     from factory.setup.calibrate import calibrate, plan_text
     from factory.setup.settings import assemble
@@ -143,6 +156,8 @@ def run(asked: Asked, only_plan: bool) -> int:
             config.workers,
             claims=Claims(config.gpu_share if assembled.work.draws_on_gpu else 0.0, config.graph.memory_gb),
             fuse=config.graph.fuse,
+            isolated=isolates(config),
+            limits=Limits({**labels_limit(config), **config.graph.limit_s}, config.graph.limit_gb),
             on_change=config.on_change,
             retry=config.retry_failed,
             shard_seconds=config.shard_seconds,

@@ -54,16 +54,20 @@ class Task:
     stages: tuple[str, ...]  # as their seconds are told
     per: str  # block, clip, attempt, batch
     memory_gb: float  # that its worker holds meanwhile; claimed of its node, as is a core
+    limit_s: float  # what takes longer is ended
+    limit_gb: float | None = 8.0  # what holds more is ended; None: more than nine tenths of the machine's
     may_draw: bool = False  # or fits what is drawn: claims its share of a GPU where that is done on one
 
 
 TASKS: tuple[Task, ...] = (
-    Task("reconstruct", ("reconstruct",), "block", 2.0, may_draw=True),  # on as many cores as it is told
-    Task("perturb", ("clip", "render", "perturb"), "clip", 1.0),
-    Task("drive", ("rollout", "expert", "reward"), "attempt", 1.0),
-    Task("render", ("render",), "attempt", 1.0, may_draw=True),  # only of drives that the reward accepts
-    Task("label", ("labels",), "attempt", 1.0),
-    Task("write", (), "batch", 1.0),
+    Task(
+        "reconstruct", ("reconstruct",), "block", 2.0, 86_400.0, None, may_draw=True
+    ),  # on as many cores as it is told
+    Task("perturb", ("clip", "render", "perturb"), "clip", 1.0, 3600.0),
+    Task("drive", ("rollout", "expert", "reward"), "attempt", 1.0, 600.0),
+    Task("render", ("render",), "attempt", 1.0, 1200.0, may_draw=True),  # only of drives that the reward accepts
+    Task("label", ("labels",), "attempt", 1.0, 1200.0),
+    Task("write", (), "batch", 1.0, 1200.0),
 )
 # Fused into one task, `drive+render+label`, unless drawing claims a GPU: a task costs Ray some 40 ms, and what a drive
 # hands on is up to 5 MB. With a GPU they are tasks of their own, so that nothing but pictures holds it.

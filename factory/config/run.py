@@ -93,15 +93,19 @@ class GraphChoice:
     """How the work is cut into tasks, and what they claim on Ray; rows do not depend on it."""
 
     fuse: Literal["auto", "all", "none"] = "auto"  # drive, render, label in one task; auto: unless drawing claims a GPU
+    isolated: Literal["auto", "always", "never"] = "auto"  # executor=local in a process of its own; auto: with plug-ins
     memory_gb: dict[str, float] = field(default_factory=dict)  # by task, where it is not the 1 GB (reconstruct: 2)
+    limit_s: dict[str, float] = field(default_factory=dict)  # seconds after which a task is ended, by task
+    limit_gb: dict[str, float] = field(default_factory=dict)  # memory beyond which a task is ended, by task
 
     def __post_init__(self) -> None:
         known = [task.name for task in TASKS]
-        for name, claimed in self.memory_gb.items():
-            if name not in known:
-                raise ValueError(f"memory_gb.{name}: there is no such task{nearest(name, known)}; there are {known}")
-            if not claimed >= 0.0:
-                raise ValueError(f"memory_gb.{name}={claimed}: must not be negative")
+        for key in ("memory_gb", "limit_s", "limit_gb"):
+            for name, value in getattr(self, key).items():
+                if name not in known:
+                    raise ValueError(f"{key}.{name}: there is no such task{nearest(name, known)}; there are {known}")
+                if not value >= 0.0:
+                    raise ValueError(f"{key}.{name}={value}: must not be negative")
 
 
 @dataclass(frozen=True)

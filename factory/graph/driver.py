@@ -4,7 +4,9 @@ Attempts of one walk are a chain, walks are parallel. Results go to the gatherer
 Everything the driver knows it can know again from the tables, so it can die at any moment.
 """
 
+import math
 import threading
+import time
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -29,6 +31,8 @@ from tasks.stages import Rejected
 
 CLIPS_PER_WORKER = 2  # open at once: one works while the next is being prepared
 WAIT_S = 0.5
+DRAIN_S = 18.0  # of the 30 that are given after a first signal
+WRITE_S = 6.0  # to write what is done, after that
 ILL_IN_A_ROW = 6  # tasks that fail by the machine, or three for every task at once: then the run stops
 
 
@@ -93,6 +97,7 @@ class Driver:
         self._walks_left: dict[str, int] = {}
         self._held: dict[tuple[str, str], tuple[list[PendingRow], list[Outcome]]] = {}  # redo: until the walk ends
         self._stopping = threading.Event()
+        self._deadline = math.inf
         self._ill_in_a_row = 0
         self._uncached = ""  # why the first could not be kept
         self._tally = Tally()
@@ -104,6 +109,11 @@ class Driver:
     def stop(self) -> None:
         """Begin nothing more; what is in flight is finished and committed."""
         self._stopping.set()
+
+    def hurry(self) -> None:
+        """As `stop`, for who is soon killed: what is in flight for more than DRAIN_S is left undone."""
+        self._deadline = time.monotonic() + DRAIN_S
+        self.stop()
 
     @property
     def seconds(self) -> dict[str, tuple[int, float]]:
@@ -147,10 +157,17 @@ class Driver:
             progress.show(self._tally)
             self._show_state()
             idle = not self._preparing and not self._trying and not gatherer.n_writing
+            if time.monotonic() > self._deadline:
+                in_hand = len(self._preparing) + len(self._trying) + len(self._building)
+                self.notes.append(f"{in_hand} tasks did not end within {DRAIN_S:.0f} s of the signal: left undone")
+                self._deadline += WRITE_S
+                break
             if idle and (self.interrupted or not self._queue):  # half a block is left: the next run goes on with it
                 break
         gatherer.send()
-        while gatherer.n_writing or (self._episodes is not None and self._episodes.is_due):
+        while time.monotonic() < self._deadline and (
+            gatherer.n_writing or (self._episodes is not None and self._episodes.is_due)
+        ):
             if self.interrupted and self._episodes is not None:
                 self._episodes.stop()
             finished = graph.wait(WAIT_S)

@@ -18,11 +18,15 @@ from deltalake.exceptions import DeltaError
 
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, asked_to_stop
 from factory.graph.batch import SHARD_BYTES, SHARD_SECONDS, Gatherer, WriteFailed
+from factory.graph.crashes import counted, crash_of
 from factory.graph.driver import Driver, Executed, MachineIll
 from factory.graph.episodes import Episodes, EpisodesWanted
+from factory.graph.guard import CRASHED
+from factory.graph.limits import NO_LIMITS, Limits, notes_folder
 from factory.graph.local import NO_CLAIMS, Claims, ClusterLacks, Fuse, Graph, LocalGraph
 from factory.graph.metrics import RunMetrics
 from factory.graph.plan import RunPlan, make_plan
+from factory.graph.records import Records
 from factory.graph.walk import Try, retry_policy
 from factory.graph.work import NotReady, Work
 from factory.readers.base import ClipRef
@@ -66,6 +70,8 @@ def execute(
     ray_address: str | None = None,
     claims: Claims = NO_CLAIMS,
     fuse: Fuse = "auto",
+    limits: Limits = NO_LIMITS,
+    isolated: bool = False,
     shard_bytes: int = SHARD_BYTES,
     shard_seconds: float = SHARD_SECONDS,
     minutes: float | None = None,
@@ -76,7 +82,8 @@ def execute(
     """Make the samples of `rounds` rounds for every clip and expert, as far as the store does not hold them already.
 
     workers: processes of a local Ray cluster, None: one per CPU. retry: try failed(input | bug) attempts again too.
-    claims: on Ray. fuse: whether the stages of an attempt are one task; auto: not where drawing claims a GPU.
+    claims: on Ray. limits: of a task, beyond which it is ended. fuse: whether the stages of an attempt are one task;
+    auto: not where drawing claims a GPU. isolated: executor=local works in a process of its own, which may die.
     minutes: after which nothing new is begun, as after an interruption. episodes: MCAP files to be written
     beside the samples. command: the settings as they were given, kept for `retry`.
     Invalid arguments come back as exit code 2 with a message and nothing written.
@@ -100,6 +107,8 @@ def execute(
         return RunSummary(BAD_CONFIG, str(error))
     except OSError as error:
         return RunSummary(BAD_CONFIG, f"{error}; python -m factory verify {store.location.uri} says what is damaged")
+    notes = notes_folder(store.location)
+    plan, died = counted(crash_of(notes), plan, Records(identity, digests), policy)
     driver = Driver(identity, plan, digests, rounds, policy, work.block, work.doing)
     if plan.frozen:
         driver.notes.append(f"{len(plan.frozen)} clips kept as they are: their candidates come from other settings")
@@ -107,22 +116,30 @@ def execute(
     try:
         is_due = plan.todo or (pictured is not None and pictured.is_due)
         graph: Graph | None = None
-        if is_due and executor == "local":
+        if is_due and executor == "local" and isolated:
+            from factory.graph.isolated import IsolatedGraph
+
+            graph = IsolatedGraph(work, store.location, lambda: driver.interrupted, fuse, limits)
+        elif is_due and executor == "local":
             graph = LocalGraph(work, store.location, lambda: driver.interrupted, fuse)
         elif is_due:
             from factory.graph.on_ray import RayGraph
 
-            graph = RayGraph(work, store.location, workers, ray_address, claims, fuse)
+            graph = RayGraph(work, store.location, workers, ray_address, claims, fuse, limits)
     except (BadLocation, ClusterLacks, NotReady, ConnectionError) as error:
         return RunSummary(BAD_CONFIG, str(error))
     except KeyboardInterrupt:
         return RunSummary(INTERRUPTED, "stopped before anything was begun")
     try:
         store.begin(records)
+        if died:
+            store.commit([], [], died)
+            driver.notes.append(f"the run before this one died at {died[0].error.partition(': ')[2]}; it comes last")
+        (notes / CRASHED).unlink(missing_ok=True)
         if graph is not None:
             began_ms = _announce(store, plan, experts, rounds, command)
             metrics = RunMetrics(graph.recorder, store.location)
-            with asked_to_stop(driver.stop), _alarm(driver.stop, minutes):
+            with asked_to_stop(driver.hurry), _alarm(driver.stop, minutes):
                 if pictured is not None:
                     pictured.begin(graph)
                 driver.loop(graph, Gatherer(graph, store, shard_bytes, shard_seconds), metrics, pictured)

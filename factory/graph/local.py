@@ -8,12 +8,16 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
 from factory.graph import steps
+from factory.graph.frozen import frozen
+from factory.graph.guard import Guard
+from factory.graph.limits import described, notes_folder
 from factory.graph.metrics import NoRecorder, Recorder
 from factory.graph.work import Stopped, Work, never
 from factory.store.location import Location
 from tasks.stages import ATTEMPT, TASKS
 
 Fuse = Literal["auto", "all", "none"]
+MAX_RETRIES = 2  # of a task whose worker died
 
 
 @dataclass(frozen=True)
@@ -97,7 +101,7 @@ class _Box:
 
 
 class LocalGraph:
-    """Graph in this process."""
+    """Graph in this process. Nothing ends a task here; a guard sees signals through, and says what was in hand."""
 
     parallelism = 1
 
@@ -108,6 +112,8 @@ class LocalGraph:
         self.recorder: Recorder = NoRecorder()
         self._supplied = {"work": work, "out": out, "stopped": stopped}
         self._waiting: deque[tuple[Ticket, str, tuple[Any, ...]]] = deque()
+        self._notes = notes_folder(out)
+        self._guard: Guard | None = None
         work.warm()
 
     def submit(self, step: str, *args: Any) -> Ticket:
@@ -122,8 +128,13 @@ class LocalGraph:
         function, wants = STEPS[step]
         plain = [arg.value if isinstance(arg, _Box) else arg for arg in args]
         ticket.queued_s = time.monotonic() - ticket.submitted
-        report, ticket.result.value = function(*(self._supplied[name] for name in wants), *plain)
+        self._guard = self._guard or Guard(self._notes, alone=True)
+        with self._guard.watching({**described(step, ticket.step, args), "limited": False}):
+            report, result = function(*(self._supplied[name] for name in wants), *plain)
+        ticket.result.value = frozen(result)
         return ticket, report
 
     def close(self) -> None:
         self._waiting.clear()
+        if self._guard is not None:
+            self._guard.close()

@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
@@ -21,23 +22,15 @@ os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
 os.environ.setdefault("RAY_task_oom_retries", "2")  # Ray's own default retries a task that runs out of memory for ever
 
 import ray
+from ray import exceptions
 from ray.autoscaler.sdk import request_resources
-from ray.exceptions import (
-    LocalRayletDiedError,
-    NodeDiedError,
-    ObjectLostError,
-    ObjectStoreFullError,
-    OutOfDiskError,
-    OutOfMemoryError,
-    RayError,
-    RaySystemError,
-    RayTaskError,
-    RuntimeEnvSetupError,
-)
+from ray.exceptions import RayError, RayTaskError
 from ray.util.metrics import Counter, Gauge, Histogram
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
+from factory.graph.limits import NO_LIMITS, Costs, Limits, cleared, described, notes_folder, put_away, watched
 from factory.graph.local import (
+    MAX_RETRIES,
     NO_CLAIMS,
     STEPS,
     Claims,
@@ -57,13 +50,14 @@ from factory.store.outcomes import ErrorKind
 from factory.wording import one_line
 from tasks.stages import TASKS
 
-MAX_RETRIES = 2  # of a task whose worker died
 ILL = (  # what Ray says when it is the machine that failed
-    *(NodeDiedError, LocalRayletDiedError, RaySystemError, RuntimeEnvSetupError),
-    *(OutOfMemoryError, ObjectLostError, ObjectStoreFullError, OutOfDiskError),
+    *(exceptions.NodeDiedError, exceptions.LocalRayletDiedError, exceptions.RaySystemError),
+    *(exceptions.RuntimeEnvSetupError, exceptions.OutOfMemoryError, exceptions.ObjectLostError),
+    *(exceptions.ObjectStoreFullError, exceptions.OutOfDiskError),
 )
 PROBE_SECONDS = 120.0
 ANSWER_S = 10.0  # for a cluster's port to be reached
+WARMING = {"key": "warm", "what": "compiling kernels", "run": "", "limited": False}
 GPU_WAIT_S = 900.0  # for the first node with one to come
 WORKER_ENV = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 FORWARDED_ENV = ("NUMBA_CACHE_DIR",)
@@ -109,6 +103,7 @@ class RayGraph:
         address: str | None = None,
         claims: Claims = NO_CLAIMS,
         fuse: Fuse = "auto",
+        limits: Limits = NO_LIMITS,
     ) -> None:
         """workers: CPUs of a cluster started here, tasks at once on one that is there already; None: all its CPUs.
 
@@ -123,6 +118,8 @@ class RayGraph:
         self.cores = min(self.parallelism, *(_of_nodes("CPU") or [1]))  # none yet where a cluster grows from nothing
         self.recorder: Recorder = RayRecorder()
         self._supplied: dict[str, Any] = {"work": [ray.put(work)], "out": out, "stopped": never}  # list: a reference
+        self._costs, self._notes = Costs(limits), notes_folder(out)
+        self._run = cleared(self._notes)
         self._tickets: dict[Any, Ticket] = {}
         self._ready: deque[Any] = deque()
         self._held_back: dict[bool, deque[tuple[Ticket, str, tuple[Any, ...]]]] = {False: deque(), True: deque()}
@@ -133,7 +130,7 @@ class RayGraph:
             self.attempt_tasks: Sequence[Sequence[str]] = attempt_tasks(fuse, apart=self._gpu_share > 0.0)
             self._after_drawing = _after_drawing(self.attempt_tasks) if self._gpu_share else frozenset()
             _prove_shared(out, "out", "shared storage or a URL")
-            _warm_every_node(self._supplied["work"], with_gpu_only=self._gpu_share > 0.0)
+            _warm_every_node(self._supplied["work"], self._notes, with_gpu_only=self._gpu_share > 0.0)
         except BaseException:
             self.close()
             raise
@@ -163,7 +160,8 @@ class RayGraph:
                 memory = memory if self._most_memory is None else min(memory, self._most_memory)
                 cores = cores_of(step, args)
                 task = _run.options(name=ticket.step, num_cpus=cores, num_gpus=gpu, memory=memory or None)
-                report, ticket.result = task.remote(step, len(supplied), *supplied, *args)
+                told = described(step, ticket.step, args) | self._costs.limits(ticket.step) | {"run": self._run}
+                report, ticket.result = task.remote(step, (self._notes, told), len(supplied), *supplied, *args)
                 self._tickets[report] = ticket
                 self._flying[draws] += 1
 
@@ -184,6 +182,8 @@ class RayGraph:
             report, worked_s = ray.get(reference)
         except RayError as error:
             report, worked_s = Failure(_kind_of(error), f"{type(error).__name__}: {error}"[:2000]), 0.0
+        if not isinstance(report, Failure):
+            self._costs.took(ticket.step, worked_s)
         ticket.queued_s = max(0.0, time.monotonic() - ticket.submitted - worked_s)
         return ticket, report
 
@@ -191,6 +191,7 @@ class RayGraph:
         self._tickets.clear()
         if self._connected:
             ray.shutdown()
+        put_away(self._notes)
 
 
 def _kind_of(error: RayError) -> ErrorKind:
@@ -269,12 +270,12 @@ def _after_drawing(tasks: Sequence[Sequence[str]]) -> frozenset[str]:
 
 
 @ray.remote(num_cpus=1, num_returns=2, max_retries=MAX_RETRIES)
-def _run(step: str, n_supplied: int, *args: Any) -> tuple[Any, Any]:
-    """A function of factory.graph.steps in a worker: its report with the seconds it took, and its result."""
+def _run(step: str, watch: tuple[Path, dict[str, Any]], n_supplied: int, *args: Any) -> tuple[Any, Any]:
+    """A function of factory.graph.steps in a worker, under watch: its report with the seconds it took, its result."""
     began = time.perf_counter()
     supplied = [_held(arg) if isinstance(arg, list) else arg for arg in args[:n_supplied]]
     given = [ray.get(arg.reference) if isinstance(arg, Fetched) else arg for arg in args[n_supplied:]]
-    report, result = STEPS[step][0](*supplied, *given)
+    report, result = watched(*watch, STEPS[step][0], *supplied, *given)
     return (report, time.perf_counter() - began), result
 
 
@@ -384,11 +385,14 @@ def _prove_shared(out: Location, setting: str, wanted: str) -> None:
         raise BadLocation(f"{setting}={out.uri} is not the same folder on nodes {blind}: name {wanted}")
 
 
-def _warm_every_node(work: list[Any], with_gpu_only: bool) -> None:
+def _warm_every_node(work: list[Any], notes: Path, with_gpu_only: bool) -> None:
     """Kernels on every node; what attempts draw with where they are made: on all nodes, or on those with a GPU."""
     nodes = _nodes()
     draws = _nodes("GPU") if with_gpu_only else nodes
-    reports = [_run.options(name="warm", scheduling_strategy=_on(n)).remote("warm", 1, work, n in draws) for n in nodes]
+    reports = [
+        _run.options(name="warm", scheduling_strategy=_on(n)).remote("warm", (notes, WARMING), 1, work, n in draws)
+        for n in nodes
+    ]
     for node, (report, _) in zip(nodes, reports):
         try:
             answer, _ = ray.get(report)

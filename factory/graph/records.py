@@ -46,12 +46,12 @@ class Records:
         subscores: dict[str, float],
         seconds: dict[str, float],
     ) -> Outcome:
-        """Of what is not accepted; key: the attempt's id. A failure of the system is poison after QUARANTINE_AFTER."""
+        """Of what is not accepted; key: the attempt's id. A death or a limit is poison after QUARANTINE_AFTER."""
         if isinstance(what, Rejected):
             became = {"kind": Kind.REJECTED.value, "stage": what.stage, "reason": what.reason, "detail": what.detail}
         elif isinstance(what, Failure):
             tries -= what.kind is ErrorKind.MACHINE  # never counts
-            poison = what.kind is ErrorKind.SYSTEM and tries + 1 >= QUARANTINE_AFTER
+            poison = what.kind in (ErrorKind.SYSTEM, ErrorKind.LIMIT) and tries + 1 >= QUARANTINE_AFTER
             kind = ErrorKind.POISON if poison else what.kind
             became = {"kind": Kind.FAILED.value, "error_kind": kind.value, "error": what.error}
         else:

@@ -144,7 +144,11 @@ def prepare(
         uncached = _why_uncached(cache, key, result)
         _keep_scenes(out, result)
         return Prepared(replace(result, payload=None, scenes=None), False, note, uncached, result.seconds), result
-    except Exception as error:  # the boundary where whatever a stage or a user's reader raises becomes data
+    except KeyboardInterrupt:
+        raise
+    except (
+        BaseException
+    ) as error:  # the boundary where whatever a stage or a user's code raises, SystemExit too, becomes data
         return failure_of(error), None
 
 
@@ -196,7 +200,9 @@ def attempt(
             psnr_db=psnr_db,
         )
         return report, row
-    except Exception as error:  # the same boundary
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # the same boundary
         return failure_of(error), None
 
 
@@ -223,7 +229,9 @@ def episodes(work: Work, out: Location, wanted: EpisodesOf) -> tuple[EpisodesWri
                 written += 1
             except Exception as error:  # one that cannot be made costs no other
                 errors.append(f"sample {key}: {failure_of(error).error.splitlines()[-1]}")
-    except Exception as error:  # the same boundary
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # the same boundary
         return failure_of(error), None
     return EpisodesWritten(written, tuple(errors)), None
 
@@ -239,7 +247,9 @@ def reconstruct(
         return Reconstructed(built.seconds, built.from_cache, built.psnr_db), None
     except Halted:
         return HalfBuilt(), None
-    except Exception as error:  # the same boundary
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # the same boundary
         return failure_of(error), None
 
 
@@ -249,7 +259,9 @@ def warm(work: Work, draws: bool) -> tuple[str | Failure, None]:
         work.warm(draws)
     except NotReady as error:
         return Failure(ErrorKind.INPUT, str(error)), None
-    except Exception as error:  # the same boundary
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # the same boundary
         return failure_of(error), None
     return "", None
 

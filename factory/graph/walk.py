@@ -12,7 +12,7 @@ from factory.graph.work import HUMAN_CANDIDATE
 from factory.store.outcomes import ErrorKind, Kind
 from factory.store.samples import Past
 
-TRIED_AGAIN = (ErrorKind.MACHINE, ErrorKind.SYSTEM)  # by the next run, by itself
+TRIED_AGAIN = (ErrorKind.MACHINE, ErrorKind.SYSTEM, ErrorKind.LIMIT)  # by the next run, by itself
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def next_step(
 
 
 def retry_policy(retry: bool, versions_json: str) -> Callable[[Past], bool]:
-    """Which failures of earlier runs this run tries again: those of the machine or the system; with `retry`, or under
+    """Which failures of earlier runs this run tries again: those of machine, system and limits; with `retry`, or under
     other stage versions than the failure's, all."""
 
     def may_retry(past: Past) -> bool:

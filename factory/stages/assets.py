@@ -132,7 +132,7 @@ def range_of(clip: Clip, block: Block) -> BlockRange:
 
 @contextmanager
 def only_builder(path: Path) -> Iterator[None]:
-    """Held by one process of the machine at a time; the kernel frees it when its holder dies. Raises Refused."""
+    """Held by one process of the machine at a time; the kernel frees it when its holder dies. Raises PlaceRefused."""
     with ExitStack() as held:
         with own_place(path.parent):
             path.parent.mkdir(parents=True, exist_ok=True)

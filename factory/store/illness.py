@@ -25,19 +25,19 @@ OS_ERROR = re.compile(r"\(os error (\d+)\)")
 SHORT_OF_MEMORY = 0.1  # of it is left: then a MemoryError is the machine's, else of what was asked for
 
 
-class Refused(OSError):
+class PlaceRefused(OSError):
     """A place that the run itself writes to cannot be written."""
 
 
 @contextmanager
 def own_place(where: str | os.PathLike[str]) -> Iterator[None]:
-    """Around what is written there by the run: whatever goes wrong with it is no clip's. Raises Refused."""
+    """Around what is written there by the run: whatever goes wrong with it is no clip's. Raises PlaceRefused."""
     try:
         yield
     except OSError as error:
         if why_ill(error):
             raise
-        raise Refused(f"{os.fspath(where)} cannot be written: {error.strerror or error}") from error
+        raise PlaceRefused(f"{os.fspath(where)} cannot be written: {error.strerror or error}") from error
 
 
 def why_ill(error: BaseException) -> str:
@@ -46,7 +46,7 @@ def why_ill(error: BaseException) -> str:
     while seen is not None:
         if isinstance(seen, MemoryError) and _memory_left() < SHORT_OF_MEMORY:
             return f"out of memory: {seen}"
-        if isinstance(seen, Refused | DiskFull | ConnectionError | TimeoutError) or _is_ill(seen):
+        if isinstance(seen, PlaceRefused | DiskFull | ConnectionError | TimeoutError) or _is_ill(seen):
             return str(seen)
         seen = seen.__cause__ or seen.__context__
     return ""

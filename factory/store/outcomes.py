@@ -28,7 +28,8 @@ class ErrorKind(StrEnum):
     BUG = "bug"  # the code raised: likewise
     MACHINE = "machine"  # the machine is ill (factory.store.illness): the next run tries again, however often
     SYSTEM = "system"  # a worker died at it, a file could not be read: the next run tries again
-    POISON = "poison"  # failed(system) in QUARANTINE_AFTER runs: waits like a bug
+    LIMIT = "limit"  # ended over its seconds or its memory: the next run tries again
+    POISON = "poison"  # failed(system | limit) in QUARANTINE_AFTER runs: waits like a bug
 
 
 QUARANTINE_AFTER = 3  # runs, each with Ray's own retries

@@ -29,6 +29,7 @@ REASON_WORDS = {
     "bug": "the code raised",
     "machine": "the machine was ill",
     "system": "a worker died, or a file could not be read",
+    "limit": "ended over its limits of time or memory",
     "poison": "workers died at it again and again",
 }
 GATE_WORDS = {

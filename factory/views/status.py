@@ -3,6 +3,7 @@
 import json
 import os
 import shlex
+import time
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -20,6 +21,8 @@ RETRY = {
     "bug": "python -m factory retry out=..., once the code or the plug-in is fixed",
     "machine": "the machine was ill, which never counts: the next run of the same command tries it again by itself",
     "system": "the next run of the same command tries it again by itself",
+    "limit": "the next run of the same command tries it again by itself, in three runs at most; "
+    "graph.limit_s.<task>= and graph.limit_gb.<task>= give it more",
     "poison": "it brought workers down in several runs; python -m factory retry out=... tries it once more",
 }
 IMPORT_AGAIN = "give the same command again, python -m factory import {} ..."  # of what it was imported from
@@ -89,7 +92,21 @@ def status_lines(store: "Store") -> Iterable[str]:
     yield ""
     yield funnel_of(store).text().rstrip()
     yield ""
+    yield from _in_work(store)
     yield from _last_run(store)
+
+
+def _in_work(store: "Store") -> Iterable[str]:
+    """Tasks that have been at work for long, as their guards said in the last half minute."""
+    from factory.graph.guard import SHOWN_S, WORK, read_note
+    from factory.graph.limits import notes_folder
+
+    for path in sorted(notes_folder(store.location).glob(f"*{WORK}")):
+        if (note := read_note(path)) is None or time.time() - path.stat().st_mtime > 3 * SHOWN_S:
+            continue
+        least = f"of at most {note['seconds']:.0f} " if note.get("seconds") else ""
+        held = f"{note['held_gb']:.1f} GB, process {note['pid']} on {note['host']}"
+        yield f"at work       {note['what']}: {time.time() - note['since']:.0f} s {least}so far, {held}"
 
 
 def _last_run(store: "Store") -> Iterable[str]:

@@ -13,13 +13,15 @@ from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES
 from factory.graph import on_ray as graph
 from factory.graph.episodes import EpisodesWanted
 from factory.graph.execute import execute
+from factory.graph.limits import Limits
 from factory.graph.local import Claims
 from factory.graph.on_ray import ray  # with the environment that keeps it on loopback
 from factory.store.samples import Store
 from factory.store.verify import verify
 from factory.views.show import prepared_episode
 from tests.factory.filmed import FilmedWork
-from tests.factory.tables import assert_same_tables, tables_of
+from tests.factory.graph.wild import WildWork
+from tests.factory.tables import assert_same_rows, assert_same_tables, tables_of
 from tests.factory.toy import ToyWork, ran, refs
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow]
@@ -144,3 +146,19 @@ def test_a_clip_that_kills_its_workers_hurts_nobody_else(tmp_path: Path, two_cpu
     run(tmp_path / "never", "local", ToyWork(), 2, 1)
     assert_same_tables(tmp_path / "out", tmp_path / "never")
     assert verify(Store(tmp_path / "out")).damage == ()
+
+
+def test_a_loop_is_ended_on_a_worker_too_and_tried_once_a_run(tmp_path: Path, two_cpus: None) -> None:
+    journal = str(tmp_path / "journal")
+    work = WildWork(wild=(("log0:0:recovery:0", "loop"),), journal=journal)
+    limits = Limits(seconds={"drive": 1.0, "render": 0.0, "label": 0.0})
+    summary = execute(
+        work, refs(3), EXPERTS, 1, Store(tmp_path / "out"), "ray", 2, limits=limits, say=lambda line: None
+    )
+    assert summary.exit_code == COMPLETE_WITH_FAILURES
+    (failed,) = [o for o in tables_of(tmp_path / "out")[1] if o["kind"] == "failed"]  # type: ignore[index]
+    assert failed["error_kind"] == "limit" and "wild.py" in failed["error"]
+    assert ran(journal, "loop") == 1
+    assert run(tmp_path / "out", "local", ToyWork(), 1, 1, 3).exit_code == COMPLETE
+    run(tmp_path / "never", "local", ToyWork(), 1, 1, 3)
+    assert_same_rows(tables_of(tmp_path / "out")[0], tables_of(tmp_path / "never")[0])

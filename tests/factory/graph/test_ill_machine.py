@@ -13,7 +13,7 @@ from factory.graph.steps import failure_of
 from factory.graph.work import Driven, Dropped, PreparedClip
 from factory.store.cache import ClipCache
 from factory.store.disk import DiskFull
-from factory.store.illness import Refused, own_place, why_ill
+from factory.store.illness import PlaceRefused, own_place, why_ill
 from factory.store.outcomes import ErrorKind
 from tests.factory.graph.runs import run
 from tests.factory.tables import assert_same_tables, tables_of
@@ -91,11 +91,11 @@ def test_illness_after_illness_stops_the_run_with_its_reason(tmp_path: Path, pla
 
 
 def test_a_place_of_the_run_s_own_that_refuses_is_the_machine_s(tmp_path: Path) -> None:
-    with pytest.raises(Refused, match="cannot be written: Permission denied"), own_place(tmp_path):
+    with pytest.raises(PlaceRefused, match="cannot be written: Permission denied"), own_place(tmp_path):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), "x")
     with pytest.raises(OSError, match="Input/output") as found, own_place(tmp_path):
         raise OSError(errno.EIO, os.strerror(errno.EIO), "x")
-    assert not isinstance(found.value, Refused)
+    assert not isinstance(found.value, PlaceRefused)
 
 
 @pytest.mark.parametrize(

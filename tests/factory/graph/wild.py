@@ -1,0 +1,40 @@
+"""A plug-in's ways to fail: loop, swallow memory, crash, leave, change what it is given."""
+
+import os
+import signal
+import sys
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from factory.graph.work import Driven, Dropped, PreparedClip
+from tests.factory.toy import ToyWork
+
+
+@dataclass(frozen=True)
+class WildWork(ToyWork):
+    """`wild` maps the toy's names of attempts to what the expert does there."""
+
+    wild: tuple[tuple[str, str], ...] = ()
+
+    def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> Driven | Dropped:
+        payload = prepared.payload
+        assert isinstance(payload, dict)
+        match dict(self.wild).get(f"{payload['name']}:{expert}:{candidate}"):
+            case "loop":
+                self._note("loop begins")
+                while True:
+                    time.sleep(0.01)
+            case "memory":
+                held = np.ones(40_000_000)  # 0.32 GB
+                time.sleep(60.0 * held[0])
+            case "segfault":
+                os.kill(os.getpid(), signal.SIGSEGV)
+            case "os._exit":
+                os._exit(0)
+            case "sys.exit":
+                sys.exit(0)
+            case "mutate":
+                payload["states"] += 1.0
+        return super().drive(prepared, candidate, expert)
