@@ -10,7 +10,7 @@ DEMO   := runs/demo
 TORCH       ?= torch==2.13.0$(if $(filter Linux,$(shell uname -s)),+cpu)
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 
-.PHONY: install demo test unit lint format docs mutants bench gpu-check study clean
+.PHONY: install demo test unit lint format docs chaos mutants bench gpu-check study clean
 
 install: $(VENV)/.installed
 
@@ -48,6 +48,12 @@ lint: install
 format: install
 	$(PY) -m ruff format .
 	$(PY) -m ruff check --fix .
+
+# Every kind of file with 5,000 mutants each (half an hour), and one flipped bit at a time in what a run keeps.
+# N=<mutants of each kind>, KINDS="ply spz".
+chaos: install
+	$(PY) -m tests.chaos.fuzz $(or $(N),5000) $(KINDS)
+	$(PY) -m tests.chaos.flips
 
 # The site of the pages, into build/site; whatever MkDocs would warn of ends it. The variable leaves out a notice of the
 # theme's makers about what comes after it.

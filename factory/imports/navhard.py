@@ -80,7 +80,7 @@ def groups_of(selection: Selection) -> list[SceneGroup]:
         try:
             now, before, pairs = entry
             group = SceneGroup(now, before, tuple((first, second) for first, second in pairs))
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise ValueError(f"{selection.name}: reactive_all_mapping[{i}] is not [now, before, [pairs]]") from error
         if not group.pairs or not all(isinstance(t, str) for t in (now, before, *sum(group.pairs, ()))):
             raise ValueError(f"{selection.name}: reactive_all_mapping[{i}]: expected tokens as text, one pair or more")

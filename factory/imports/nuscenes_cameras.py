@@ -243,7 +243,7 @@ def _pose(row: Mapping[str, Any], file: Path) -> Array:
 def _numbers(row: Mapping[str, Any], key: str, shape: tuple[int, ...], file: Path) -> Array:
     try:
         array = np.array(row.get(key), np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         array = np.zeros(0)
     if array.shape != shape or not np.isfinite(array).all():
         raise BadClip(str(file), key, f"{row.get('token')}: expected {' x '.join(map(str, shape))} finite numbers")

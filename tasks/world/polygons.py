@@ -12,6 +12,7 @@ from tasks.world.arrays import Array, Bools
 from tasks.world.lanes import MapLayer, MapPolygon, RoadMap
 
 CENTERLINE_SPACING_M = 0.75  # docs/reward.md 0
+MAX_LANE_M = 20_000.0  # longer is a broken coordinate, and would ask for any amount of points
 PLACES_KEPT = 8  # of each map
 MAP_RADIUS_M = 100.0  # docs/reward.md 0
 
@@ -29,6 +30,13 @@ def resample(polyline: Array, n_points: int) -> Array:
     return np.stack([np.interp(at, along, column) for column in polyline.T], axis=1)
 
 
+def n_spaced(length_m: float) -> int:
+    """Points of a centreline of that length. Raises ValueError beyond MAX_LANE_M."""
+    if not length_m <= MAX_LANE_M:
+        raise ValueError(f"a lane of {length_m:.0f} m")
+    return max(2, int(np.ceil(length_m / CENTERLINE_SPACING_M)) + 1)
+
+
 def with_headings(points: Array) -> Array:
     """Points (P, 2), P >= 2, with the direction [rad] of the segment that starts there; the last repeats: (P, 3)."""
     steps = np.diff(points, axis=0)
@@ -39,10 +47,11 @@ def with_headings(points: Array) -> Array:
 def centerline_from_boundaries(left: Array, right: Array) -> Array:
     """Centreline (P, 3) x, y, heading: mean of the two boundaries (B, 2+), P = max(2, ceil(L / 0.75) + 1).
 
-    L is the mean of the two lengths; each boundary is resampled uniformly by arc length (docs/reward.md 0).
+    L is the mean of the two lengths; each boundary is resampled uniformly by arc length (docs/reward.md 0). Raises
+    ValueError where L is beyond MAX_LANE_M.
     """
     length = (arc_lengths(left)[-1] + arc_lengths(right)[-1]) / 2.0
-    n_points = max(2, int(np.ceil(length / CENTERLINE_SPACING_M)) + 1)
+    n_points = n_spaced(length)
     return with_headings((resample(left[:, :2], n_points) + resample(right[:, :2], n_points)) / 2.0)
 
 

@@ -34,6 +34,7 @@ VELOCITY_HALF_WINDOW_S = 0.55
 STANDING_SPEED_MPS = 0.1  # slower is standing: velocity (and the ego's acceleration) exactly 0
 SAME_FRAME_S = STEP_S / 2  # a step sees the annotated frame that is at most this far away
 ROUNDING_S = 1e-9
+MAX_LOG_S = 86_400.0  # longer is a broken stamp, and would ask for any amount of steps
 
 _CATEGORIES = {
     AgentKind.VEHICLE: "REGULAR_VEHICLE LARGE_VEHICLE BUS ARTICULATED_BUS SCHOOL_BUS BOX_TRUCK TRUCK TRUCK_CAB "
@@ -76,8 +77,10 @@ class LogMotion:
 
     @property
     def n_steps(self) -> int:
-        """Steps of 0.1 s that have an annotated frame and a pose at their end."""
+        """Steps of 0.1 s that have an annotated frame and a pose at their end. Raises BadClip beyond MAX_LOG_S."""
         last = min(self.frame_times_s[-1] + SAME_FRAME_S, self.pose_times_s[-1] + MIN_POSE_SPACING_S)
+        if last > MAX_LOG_S:
+            raise BadClip(str(self.folder), "timestamps", f"a log of {last / 3600:.0f} h")
         return int(np.floor(last / STEP_S)) + 1
 
     def seconds(self, stamps_ns: Ints) -> Array:
@@ -102,7 +105,7 @@ def read_feather(path: Path, columns: tuple[str, ...]) -> dict[str, NDArray[np.g
         table.validate(full=True)
     except FileNotFoundError as error:
         raise BadClip(str(path), "file", "missing") from error
-    except (pa.ArrowException, OSError) as error:
+    except (pa.ArrowException, OSError, ValueError) as error:  # a name that is no text
         raise BadClip(str(path), "file", f"cannot be read as feather, truncated? {error}") from error
     if table.num_rows == 0:
         raise BadClip(str(path), "file", "holds no rows")

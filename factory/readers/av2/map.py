@@ -27,7 +27,7 @@ def read_map(path: Path) -> RoadMap:
     """The log's map, lanes in file order, roadblocks named. Raises BadClip naming the lane or area at fault."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise BadClip(str(path), "json", f"cannot be read: {error}") from error
     segments = _section(path, content, "lane_segments")
     lanes = {str(key): _lane(path, str(key), value) for key, value in segments.items()}
@@ -75,7 +75,7 @@ def _lane(path: Path, key: str, raw: Any) -> Lane:
         )
     except KeyError as error:
         raise BadClip(str(path), field, f"missing key or unknown lane type {error}") from error
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise BadClip(str(path), field, str(error)) from error
 
 
@@ -83,7 +83,7 @@ def _points(path: Path, field: str, raw: Any) -> Array:
     """(B, 3) x, y, z [m], B >= 2."""
     try:
         points = np.array([[point["x"], point["y"], point["z"]] for point in raw], dtype=np.float64)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise BadClip(str(path), field, f"not a list of x, y, z points ({error})") from error
     if len(points) < 2 or not np.isfinite(points).all():
         raise BadClip(str(path), field, "needs at least two finite points")
@@ -97,7 +97,7 @@ def _closed(points: Array) -> Array:
 def _area_ring(path: Path, field: str, raw: Any) -> Array:
     try:
         return valid_ring(_closed(_points(path, f"{field}.area_boundary", raw["area_boundary"])[:, :2]))
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise BadClip(str(path), f"{field}.area_boundary", f"not a polygon ({error})") from error
 
 

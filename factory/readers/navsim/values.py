@@ -62,7 +62,7 @@ class Values:
         value = self.get(key)
         try:
             array = np.array(value, np.float64)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise self.bad(key, f"holds no numbers ({_short(value)})") from error
         if array.size == 0 and shape[0] is None:  # an empty list says nothing of its columns
             array = array.reshape(0, *(n or 0 for n in shape[1:]))

@@ -149,7 +149,7 @@ def _table(path: Path, layer: str, target: str) -> Table:
             raise BadClip(str(path), where, "is missing")
         try:
             numbers = given[name].astype(np.float64)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise BadClip(str(path), where, f"is not a column of numbers ({error})") from error
         if name in KEYS[layer]:
             null = np.flatnonzero(~np.isfinite(numbers))

@@ -66,7 +66,7 @@ class ArrowFile:
         """(size,) finite numbers of the metadata. Raises BadClip."""
         try:
             vector = np.asarray(self.value(name, list), np.float64)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise BadClip(str(self.path), f"metadata.{name}", f"not numbers ({error})") from error
         if vector.shape != (size,) or not np.isfinite(vector).all():
             raise BadClip(str(self.path), f"metadata.{name}", f"expected {size} finite numbers")
@@ -81,7 +81,7 @@ def open_file(path: Path) -> ArrowFile:
         table.validate(full=True)
     except FileNotFoundError as error:
         raise BadClip(str(path), "file", "missing") from error
-    except (pa.ArrowException, OSError) as error:
+    except (pa.ArrowException, OSError, ValueError) as error:  # a name that is no text
         raise BadClip(str(path), "file", f"cannot be read as an Arrow file, truncated? {error}") from error
     return ArrowFile(path, table, _metadata(path, table.schema))
 
@@ -93,7 +93,7 @@ def open_metadata(path: Path) -> ArrowFile:
             schema = pa.ipc.open_file(source).schema
     except FileNotFoundError as error:
         raise BadClip(str(path), "file", "missing") from error
-    except (pa.ArrowException, OSError) as error:
+    except (pa.ArrowException, OSError, ValueError) as error:  # a name that is no text
         raise BadClip(str(path), "file", f"cannot be read as an Arrow file, truncated? {error}") from error
     return ArrowFile(path, schema.empty_table(), _metadata(path, schema))
 
@@ -135,7 +135,7 @@ def unpacked(path: Path, field: str, data: bytes) -> dict[str, Any]:
     """A msgpack dictionary; arrays of floats in it as arrays of float64. Raises BadClip."""
     try:
         content = msgpack.unpackb(data, object_hook=_array, raw=False)
-    except (KeyError, TypeError, ValueError, msgpack.UnpackException) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, RecursionError, msgpack.UnpackException) as error:
         raise BadClip(str(path), field, f"is no msgpack of plain values and arrays ({error})") from error
     if not isinstance(content, dict):
         raise BadClip(str(path), field, f"holds a {type(content).__name__}, not a dictionary")

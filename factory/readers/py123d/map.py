@@ -145,7 +145,10 @@ def _centerline(objects: MapObjects, lane: RawLane, content: Mapping[str, Any], 
     if source.own_centerlines:
         return with_headings(lane.line)
     sides = (_line(objects, lane.lane_id, content, f"{side}_boundary") for side in ("left", "right"))
-    return centerline_from_boundaries(*sides)
+    try:
+        return centerline_from_boundaries(*sides)
+    except ValueError as error:
+        raise BadClip(str(objects.file.path), f"boundaries of lane {lane.lane_id}", str(error)) from error
 
 
 def _drivable_areas(

@@ -226,7 +226,7 @@ def _array(value: object, shape: tuple[int, ...], file: str, field: str) -> Arra
     """Finite numbers of a shape, as nested lists."""
     try:
         array = np.array(value, np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise BadClip(file, field, f"is not numbers, expected {_said(shape)} of them") from error
     if value is None or array.shape != shape:
         found = "missing" if value is None else f"shape {array.shape}"

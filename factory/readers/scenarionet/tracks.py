@@ -291,5 +291,5 @@ def floats(value: object, file: str, field: str) -> Array:
     """The value as an array. Raises BadClip where it is none of numbers."""
     try:
         return np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise BadClip(file, field, f"not numbers ({error})") from error

@@ -33,6 +33,16 @@ def move(lanes: Iterable[dict]) -> None:
             point["y"] += 5000.0
 
 
+def stretch(lanes: Iterable[dict], to: float = 4e8) -> None:
+    for lane in lanes:
+        lane["left_lane_boundary"][-1]["x"] = to
+
+
+def years_later(columns: dict[str, list]) -> None:
+    last = max(columns["timestamp_ns"])
+    columns["timestamp_ns"] = [stamp + 10**17 * (stamp == last) for stamp in columns["timestamp_ns"]]
+
+
 BROKEN = {
     "missing poses": (lambda log: (log / "city_SE3_egovehicle.feather").unlink(), "city_SE3_egovehicle.feather: file"),
     "truncated feather": (lambda log: cut_short(log / "annotations.feather"), "annotations.feather: file"),
@@ -74,6 +84,18 @@ BROKEN = {
     ),
     "no map": (lambda log: the_map(log).unlink(), "log_map_archive_*.json"),
     "truncated map": (lambda log: cut_short(the_map(log)), "json: cannot be read"),
+    "a lane as far as the moon": (  # at a point every 0.75 m half a billion
+        lambda log: edit_map(log, lambda content: stretch(content["lane_segments"].values())),
+        "]: a lane of",
+    ),
+    "a coordinate beyond floats": (
+        lambda log: edit_map(log, lambda content: stretch(content["lane_segments"].values(), 10**400)),
+        "left_lane_boundary: not a list of x, y, z points",
+    ),
+    "stamps of years": (
+        lambda log: [edit(log / name, years_later) for name in ("annotations.feather", "city_SE3_egovehicle.feather")],
+        "timestamps: a log of",
+    ),
     "empty map": (lambda log: edit_map(log, lambda content: content["lane_segments"].clear()), "lane_segments"),
     "bicycle lanes only": (
         lambda log: edit_map(

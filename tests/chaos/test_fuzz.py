@@ -1,0 +1,46 @@
+"""A short fuzz of every kind of file; the full one: `make chaos`."""
+
+import logging
+from pathlib import Path
+
+import pytest
+
+from factory.readers.apart import Apart
+from tests.chaos.fuzz import Question, answer, fuzzed
+from tests.chaos.fuzzed_kinds import KINDS, write_all
+from tests.chaos.mutants_of_files import rng_of
+
+pytestmark = pytest.mark.slow  # a town is painted, and each kind's reader is warmed in the other process
+
+SHORT = 20
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    logging.disable()
+    path = tmp_path_factory.mktemp("fuzzed")
+    write_all(path)
+    return path
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_mutant_is_accepted_or_refused_and_does_nothing_else(folder: Path, kind: str) -> None:
+    said: list[str] = []
+    told = fuzzed(folder, kind, range(SHORT), said.append)
+    assert not said and sum(told.values()) == SHORT
+
+
+# Mutants that were neither: an int beyond a float in a map and in a log, a filter that is no text.
+@pytest.mark.parametrize(
+    ("kind", "number"), [("json, a map", 284), ("pickle, OpenScene", 453), ("yaml, a scene filter", 10)]
+)
+def test_what_was_found_stays_found(folder: Path, kind: str, number: int) -> None:
+    assert Apart(answer)(Question(str(folder), kind, number), kind) == "refused"
+
+
+def test_a_mutant_is_the_same_again_and_no_copy(folder: Path) -> None:
+    for kind, opened in KINDS.items():
+        readable = opened(folder)
+        whole = readable.path.read_bytes()
+        mutants = [readable.mutant(whole, rng_of(kind, number)) for number in (0, 1, 2, 0)]
+        assert mutants[0] == mutants[3] and len({*mutants, whole}) >= 3, kind
