@@ -30,10 +30,17 @@ def test_a_mutant_is_accepted_or_refused_and_does_nothing_else(folder: Path, kin
     assert not said and sum(told.values()) == SHORT
 
 
-# Mutants that were neither: an int beyond a float in a map and in a log, a filter that is no text.
-@pytest.mark.parametrize(
-    ("kind", "number"), [("json, a map", 284), ("pickle, OpenScene", 453), ("yaml, a scene filter", 10)]
-)
+FOUND = [
+    ("json, a map", 284),  # an int beyond a float
+    ("pickle, OpenScene", 453),  # the same
+    ("pickle, OpenScene", 3297),  # a camera whose path is an array
+    ("yaml, a scene filter", 10),  # no text
+    ("feather, intrinsics", 1645),  # a column whose name is no text
+    ("arrow, 123D's map", 55),  # a lane of 10^100 km
+]
+
+
+@pytest.mark.parametrize(("kind", "number"), FOUND)
 def test_what_was_found_stays_found(folder: Path, kind: str, number: int) -> None:
     assert Apart(answer)(Question(str(folder), kind, number), kind) == "refused"
 

@@ -185,7 +185,8 @@ def cameras_of(cams: Values) -> tuple[FrameCamera, ...]:
     found = []
     for name in CAMERA_NAMES:
         camera = cams.inner(by_name[name])
-        if camera.get("data_path", None) in (None, ""):
+        named = camera.get("data_path", None)
+        if named is None or (isinstance(named, str) and not named):  # else text() says what it is
             continue
         ego_from_camera = np.eye(4)
         ego_from_camera[:3, :3] = camera.numbers("sensor2lidar_rotation", (3, 3))
