@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 from factory.config.compose import ConfigError, conf_dir
 from factory.config.plugins import choices
-from factory.config.run import RunConfig, composed_run, load_config, shapes_in
+from factory.config.run import RunConfig, composed_run, load_config, photos_alone, shapes_in
 from factory.config.shapes import defaults_of, described
 from factory.config.words import Asked, asked_of
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, as_program
@@ -94,7 +94,7 @@ def kernels_of(config: RunConfig) -> list[str]:
     from factory.stages.warm import parts_of
 
     label_traffic = None if config.reward.labels == "none" else config.reward.traffic
-    return parts_of(simulates(config), config.traffic.mode, label_traffic, config.render)
+    return parts_of(simulates(config), config.traffic.mode, label_traffic, config.render, photos_alone(config))
 
 
 def labels_limit(config: RunConfig) -> dict[str, float]:

@@ -26,7 +26,7 @@ def main(request: Request) -> None:
     if unknown := sorted(set(request.parts) - PARTS.keys()):
         raise Refused(f"no part {', '.join(unknown)}; there are {', '.join(PARTS)}")
     try:
-        compile_kernels(list(request.parts) or ["judge", "plan", "answers", "fit"])
+        compile_kernels(list(request.parts) or ["judge", "plan", "answers", "fit", "rig"])
     except NotReady as error:
         raise Refused(str(error)) from error
     if not request.parts:

@@ -200,6 +200,12 @@ def run_config(values: Mapping[str, Any]) -> RunConfig:
     return config
 
 
+def photos_alone(config: RunConfig) -> bool:
+    """Whether clips may have photos and no lidar, as far as the settings of their reader tell. Raises ConfigError."""
+    shape = READERS.get(config.clips.get("_target_", ""))
+    return shape is None or bool(fill(shape, without_labels(config.clips), "clips").photos_alone)
+
+
 def refuse_relative_root(clips: Mapping[str, Any]) -> None:
     """Raises ConfigError for relative logs or photos inside a submitted Ray job, whose folder is a temporary copy."""
     for key in ("root", "cameras", "sensor_root") if clips.get("_target_") in READERS else ("root",):

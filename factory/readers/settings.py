@@ -57,6 +57,11 @@ class LogClips:
         """Which windows of a log are taken."""
         return WindowSettings(self.stride_s, self.min_top_speed_mps, self.first_window)
 
+    @property
+    def photos_alone(self) -> bool:
+        """Whether clips may have photos and no lidar; Argoverse's have both."""
+        return False
+
 
 @dataclass(frozen=True)
 class Py123dClips(LogClips):
@@ -65,6 +70,11 @@ class Py123dClips(LogClips):
     maps_root: str | None = None  # of the maps that logs share; null: `maps` beside `logs`
     sensor_root: str | None = None  # of the data set that was converted, for its photos; null: clips without
 
+    @property
+    def photos_alone(self) -> bool:
+        """Whether clips may have photos and no lidar."""
+        return self.sensor_root is not None
+
 
 @dataclass(frozen=True)
 class ScenarioNetClips(LogClips):
@@ -72,6 +82,11 @@ class ScenarioNetClips(LogClips):
 
     cameras: str | None = None  # cameras.json of the log, or a folder of such of each (docs/photos.md); null: no photos
     sensor_root: str | None = None  # what its paths of photos and sweeps count from; null: the folder it lies in
+
+    @property
+    def photos_alone(self) -> bool:
+        """Whether clips may have photos and no lidar."""
+        return self.cameras is not None
 
 
 FRAME_STEPS = 5  # of NAVSIM's logs, 2 Hz
@@ -98,6 +113,11 @@ class NavsimClips:
         windows = WindowSettings(self.stride_s, self.min_top_speed_mps, self.first_window)
         if windows.stride_steps % FRAME_STEPS:
             raise ValueError(f"stride_s must be a multiple of 0.5 s, NAVSIM's frames, not {self.stride_s}")
+
+    @property
+    def photos_alone(self) -> bool:
+        """Whether clips may have photos and no lidar."""
+        return self.sensors is not None
 
     @property
     def stride_frames(self) -> int:
@@ -153,6 +173,11 @@ class TownSettings:
         if self.lidar_beams < 0 or self.lidar_azimuths < 1:
             raise ValueError(f"impossible lidar: {self.lidar_beams} beams, {self.lidar_azimuths} azimuths")
 
+    @property
+    def photos_alone(self) -> bool:
+        """Whether clips have photos and no lidar."""
+        return bool(self.cameras) and self.lidar_beams == 0
+
 
 @dataclass(frozen=True)
 class TownClips:
@@ -166,6 +191,11 @@ class TownClips:
     def __post_init__(self) -> None:
         if self.n_clips < 1:
             raise ValueError(f"clips.n_clips: a town needs at least one clip, not {self.n_clips}")
+
+    @property
+    def photos_alone(self) -> bool:
+        """Whether clips have photos and no lidar."""
+        return self.settings.photos_alone
 
 
 @dataclass(frozen=True)
@@ -192,3 +222,8 @@ class TownsClips:
     def chosen(self) -> tuple[int, ...]:
         """The towns' seeds."""
         return tuple(range(self.first_seed, self.first_seed + self.n_towns)) if self.seeds is None else self.seeds
+
+    @property
+    def photos_alone(self) -> bool:
+        """Whether clips have photos and no lidar."""
+        return self.settings.photos_alone

@@ -12,7 +12,7 @@ from typing import Any
 
 from factory.config.classes import class_of
 from factory.config.compose import ConfigError, build
-from factory.config.run import RunConfig, VocabularyChoice, refuse_relative_root
+from factory.config.run import RunConfig, VocabularyChoice, photos_alone, refuse_relative_root
 from factory.readers.base import BadClip, ClipIndex, ClipReader
 from factory.setup.vocabulary import load_vocabulary
 from factory.stages.frames import BenchmarkWork
@@ -131,6 +131,7 @@ def assemble(config: RunConfig) -> Run:
         seed=config.seed,
         identity=identity_of(config, vocabulary, labelling),
         cache_dir=cache_folder(config),
+        photos_alone=photos_alone(config),
     )
     return Run(config, reader, index, work)
 

@@ -129,6 +129,7 @@ class FactoryWork:
     seed: int
     identity: RunIdentity
     cache_dir: str  # of reconstructed blocks
+    photos_alone: bool  # clips may have photos and no lidar
 
     def warm(self, draws: bool = True) -> None:
         """This run's kernels, and no others, into the on-disk cache. Raises NotReady."""
@@ -140,7 +141,7 @@ class FactoryWork:
             except BackendMissing as error:
                 raise NotReady(str(error)) from error
         label_traffic = None if self.labelling is None else self.labelling.traffic.mode
-        compile_kernels(parts_of(self._simulates, self.traffic.mode, label_traffic, self.render))
+        compile_kernels(parts_of(self._simulates, self.traffic.mode, label_traffic, self.render, self.photos_alone))
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -25,6 +25,7 @@ from tasks.experts.pdm_closed.settings import PdmSettings
 from tasks.experts.protocol import Plan
 from tasks.kernels.compiled import USED, cache_dir, make_cache_dir, not_kept, processor, write_whole
 from tasks.render import warm as render_warm
+from tasks.render.rig.settings import Adjust
 from tasks.render.settings import RenderMode, RenderSettings, SceneFrom
 from tasks.reward.epdms import score
 from tasks.reward.labels import Labelling, reactive_scores, vocabulary_labels
@@ -45,11 +46,14 @@ _one_at_a_time = Lock()
 log = logging.getLogger(__name__)
 
 
-def parts_of(simulates: bool, traffic: str, label_traffic: str | None, render: RenderSettings) -> list[str]:
+def parts_of(
+    simulates: bool, traffic: str, label_traffic: str | None, render: RenderSettings, photos_alone: bool
+) -> list[str]:
     """What a run enters.
 
     simulates: it has another expert than `human`; traffic, label_traffic: the mode of the drives' traffic and of the
-    labels' (None: it makes none). The public traffic, "navsim", has no kernels.
+    labels' (None: it makes none). The public traffic, "navsim", has no kernels. photos_alone: clips may have photos and
+    no lidar.
     """
     parts = ["judge", "plan"]
     if label_traffic in ("idm", "navsim"):  # scored among the answers
@@ -58,6 +62,8 @@ def parts_of(simulates: bool, traffic: str, label_traffic: str | None, render: R
         parts.append("drive")
     if render.mode is RenderMode.AUTO:
         parts.append("fit" if render.scene is SceneFrom.FIT else "render")
+        if render.rig.adjust is Adjust.ON or (render.rig.adjust is Adjust.AUTO and photos_alone):
+            parts.append("rig")
     return parts
 
 
@@ -216,6 +222,7 @@ PARTS = {
     "answers": _answers,
     "render": render_warm.compile_kernels,
     "fit": _fit,
+    "rig": render_warm.compile_rig_kernels,
 }
 INCLUDED = {"judge": ("plan",), "answers": ("drive",), "fit": ("render",)}
 DISK_FULL = 5  # exit code of a part whose files could not be kept

@@ -4,12 +4,19 @@ import numpy as np
 
 from tasks.render.fit.reconstruct import reconstruct
 from tasks.render.fit.settings import FitSettings
+from tasks.render.rig.adjust import Bundle, Matched, adjusted
+from tasks.render.rig.normal import N_CAMERA
+from tasks.render.rig.rig import given_rig
 from tasks.render.scene.build import AssetSettings, RenderAsset, build_asset
+from tasks.render.scene.confirmed import confirmed
 from tasks.render.scene.sensed import Photo, Sweep
+from tasks.render.scene.wide_stereo import partners, wide_depth
 from tasks.render.splatting.sh import turned
 from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.camera import Camera, SensorFile
 
 FRONT = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 1.5], [0.0, 0.0, 0.0, 1.0]])
+POINTS = ((8.0, 1.0, 1.0), (9.0, -1.0, 2.0))  # that the rig is adjusted to
 
 
 def compile_kernels() -> RenderAsset:
@@ -24,6 +31,27 @@ def compile_fit_kernels() -> RenderAsset:
         iterations=4, start_gaussians=200, most_gaussians=300, refine_every=2, refine_from=2, pose_from=0
     )
     return reconstruct(*_seen(), settings, held_out=[1])
+
+
+def compile_rig_kernels() -> Bundle:
+    """Adjusts a rig of one camera at three places to two points that it sees, and looks for a photo's depth in others.
+
+    What else a block without lidar enters, the other two compile.
+    """
+    photos, _, _ = _seen()
+    photo, k = photos[1], photos[1].intrinsics
+    rgb, nowhere, everywhere = (
+        np.zeros((32, 32, 3), np.float32),
+        np.zeros((32, 32), np.float32),
+        np.ones((32, 32), bool),
+    )
+    wide_depth(rgb, nowhere, nowhere, partners(photo, photos, 2), k, photo.world_from_camera, everywhere)
+    confirmed(photos, [nowhere] * len(photos))
+    files = [SensorFile(p.camera, "", p.time_s, p.world_from_camera @ np.linalg.inv(FRONT)) for p in photos]
+    rig, shots = given_rig([Camera(photo.camera, 32, 32, k, np.zeros(5), FRONT)], files)
+    at = [[16.0 - 20.0 * y / (x - k), 16.0 + 20.0 * (1.5 - z) / (x - k)] for x, y, z in POINTS for k in range(3)]
+    matched = Matched(np.array([0, 3, 6]), np.tile(np.arange(3), 2), np.array(at), np.ones(6))
+    return adjusted(rig, shots, matched, np.ones(6 * len(files) + N_CAMERA))
 
 
 def _seen() -> tuple[list[Photo], list[Sweep], AgentTracks]:

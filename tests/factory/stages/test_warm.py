@@ -8,9 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from factory.stages.warm import compile_kernels, marker
+from factory.config.run import load_config, photos_alone
+from factory.stages.warm import compile_kernels, marker, parts_of
 from tasks.kernels.compiled import cache_dir
 from tasks.sealed import unsealed
+from tasks.render.rig.settings import Adjust, RigSettings
+from tasks.render.settings import RenderMode, RenderSettings
 
 pytestmark = pytest.mark.slow
 
@@ -31,6 +34,11 @@ def kept(cache: Path) -> set[str]:
 
 def run_with_these(parts: list[str], tmp_path: Path, *arguments: str) -> tuple[set[str], set[str]]:
     """A run whose cache holds what the parts list alone: the files before it and after it."""
+    return done_with_these(parts, tmp_path, "-m", "factory.run", *arguments, f"out={tmp_path / 'out'}")
+
+
+def done_with_these(parts: list[str], tmp_path: Path, *command: str) -> tuple[set[str], set[str]]:
+    """The same of any words for Python."""
     compile_kernels(parts)
     cache = tmp_path / "cache" / cache_dir().name
     for part in parts:
@@ -42,7 +50,7 @@ def run_with_these(parts: list[str], tmp_path: Path, *arguments: str) -> tuple[s
         shutil.copytree(cache_dir() / "factory", cache / "factory")
     before = kept(cache)
     done = subprocess.run(
-        [sys.executable, "-m", "factory.run", *arguments, f"out={tmp_path / 'out'}"],
+        [sys.executable, *command],
         env=os.environ | {"NUMBA_CACHE_DIR": str(cache.parent)},
         cwd=REPOSITORY,
         capture_output=True,
@@ -61,6 +69,61 @@ def test_a_run_on_a_town_with_cameras_compiles_nothing(tmp_path: Path, towns: st
     before, after = run_with_these(["judge", "plan", "drive", "fit"], tmp_path, *drawn, towns, "executor=local")
     assert after == before
     assert any(name.startswith("tasks/render/") for name in after)
+
+
+CORRECTED = """
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+sys.path.insert(0, {tests!r})
+from printed_street import CAMERAS, photographed
+
+from factory.stages.assets import asset_for
+from factory.stages.warm import tiny_clip
+from tasks.render.fit.settings import FitSettings
+from tasks.render.settings import RenderSettings
+
+folder = Path({folder!r})
+clip = replace(tiny_clip(), block=photographed(folder), cameras=CAMERAS)
+fit = FitSettings(iterations=4, start_gaussians=500, most_gaussians=600, refine_every=2, refine_from=2, pose_from=0)
+scene = asset_for(clip, RenderSettings(width=100, height=56, fit=fit), folder)
+assert scene is not None and scene.rig, "the rig is corrected"
+"""
+
+
+def test_a_block_whose_rig_is_corrected_compiles_nothing(tmp_path: Path) -> None:
+    told = CORRECTED.format(tests=str(Path(__file__).parent), folder=str(tmp_path))
+    before, after = done_with_these(["fit", "rig"], tmp_path, "-c", told)
+    assert after == before
+    assert any(name.startswith("tasks/render/rig/") for name in after)
+
+
+def test_kernels_of_the_rig_s_correction_are_compiled_where_it_may_be_corrected() -> None:
+    def asked(photos_alone: bool, **how: object) -> bool:
+        render = RenderSettings(**how)  # type: ignore[arg-type]
+        return "rig" in parts_of(True, "idm", None, render, photos_alone)
+
+    assert asked(photos_alone=True) and not asked(photos_alone=False)
+    assert asked(photos_alone=False, rig=RigSettings(adjust=Adjust.ON))
+    assert not asked(photos_alone=True, rig=RigSettings(adjust=Adjust.OFF))
+    assert not asked(photos_alone=True, mode=RenderMode.MAP)
+
+
+@pytest.mark.parametrize(
+    ("words", "alone"),
+    [
+        (["clips=synthetic"], False),
+        (["clips=synthetic", "clips.settings.lidar_beams=0"], True),
+        (["clips=av2", "clips.root=."], False),
+        (["clips=scenarionet", "clips.root=."], False),
+        (["clips=scenarionet", "clips.root=.", "clips.cameras=."], True),
+        (["clips=navsim", "clips.root=.", "clips.maps=.", "clips.sensors=."], True),
+        (["clips=custom", "clips._target_=my_package.MyReader"], True),
+    ],
+)
+def test_a_reader_s_settings_tell_whether_photos_may_come_without_lidar(words: list[str], alone: bool) -> None:
+    assert photos_alone(load_config([*words, "out=somewhere"])) is alone
 
 
 def test_a_run_without_images_needs_no_renderer(tmp_path: Path, towns: str) -> None:
