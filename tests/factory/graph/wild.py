@@ -6,10 +6,18 @@ import sys
 import time
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 
 from factory.graph.work import Driven, Dropped, PreparedClip
 from tests.factory.toy import ToyWork
+
+
+@numba.njit
+def _for_ever(counted: np.ndarray) -> None:
+    """Holds the interpreter's lock: neither a signal's handler nor another thread gets in."""
+    while counted[0] >= 0.0:
+        counted[0] += 1.0
 
 
 @dataclass(frozen=True)
@@ -26,6 +34,9 @@ class WildWork(ToyWork):
                 self._note("loop begins")
                 while True:
                     time.sleep(0.01)
+            case "compiled loop":
+                self._note("loop begins")
+                _for_ever(np.zeros(1))
             case "memory":
                 held = np.ones(40_000_000)  # 0.32 GB
                 time.sleep(60.0 * held[0])

@@ -1,0 +1,59 @@
+"""The first SIGTERM ends a run within 30 s, whatever hangs in it, and the same command goes on."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from factory.exits import COMPLETE, INTERRUPTED
+from tests.factory.graph.runs import run
+from tests.factory.tables import assert_same_rows, tables_of
+from tests.pages import REPOSITORY
+
+CODE = """
+import sys
+from factory.graph.execute import execute
+from factory.store.samples import Store
+from tests.factory.graph.wild import WildWork
+from tests.factory.toy import refs
+
+if __name__ == "__main__":
+    out, journal, how, executor = sys.argv[1:]
+    work = WildWork(wild=(("log0:0:recovery:0", how),), journal=journal)
+    ended = execute(work, refs(2), ["recovery", "human"], 1, Store(out), executor.split("+")[0], 2, shard_seconds=0.1,
+                    isolated="isolated" in executor)
+    sys.exit(ended.exit_code)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(200)
+@pytest.mark.parametrize(
+    ("executor", "how", "code"),
+    [
+        ("local", "loop", INTERRUPTED),
+        ("local", "compiled loop", -signal.SIGKILL),
+        ("local+isolated", "compiled loop", INTERRUPTED),
+        pytest.param("ray", "compiled loop", INTERRUPTED, marks=pytest.mark.ray),
+    ],
+)
+def test_a_first_signal_ends_a_run_that_hangs(tmp_path: Path, executor: str, how: str, code: int) -> None:
+    script, journal, out = tmp_path / "script.py", tmp_path / "journal", tmp_path / "out"
+    script.write_text(CODE)
+    words = [sys.executable, str(script), str(out), str(journal), how, executor]
+    running = subprocess.Popen(words, env=os.environ | {"PYTHONPATH": str(REPOSITORY)})
+    while not (journal.exists() and "loop begins" in journal.read_text()):
+        assert running.poll() is None
+        time.sleep(0.1)
+    time.sleep(1.0)  # until it is in the loop
+    running.terminate()
+    began = time.monotonic()
+    assert running.wait(60.0) == code
+    assert time.monotonic() - began < 30.0
+    assert run(out, n=2, rounds=1, experts=["recovery", "human"]).exit_code == COMPLETE
+    run(tmp_path / "never", n=2, rounds=1, experts=["recovery", "human"])
+    assert_same_rows(tables_of(out)[0], tables_of(tmp_path / "never")[0])
