@@ -131,7 +131,11 @@ def execute(
     except KeyboardInterrupt:
         return RunSummary(INTERRUPTED, "stopped before anything was begun")
     try:
-        store.begin(records)
+        if store.begin(records):  # another run committed while this one was getting ready
+            history = store.history(identity, digests)
+            plan = make_plan(refs, experts, rounds, history, identity, on_change, policy, work.once)
+            driver = Driver(identity, plan, digests, rounds, policy, work.block, work.doing)
+            died = []
         if died:
             store.commit([], [], died)
             driver.notes.append(f"the run before this one died at {died[0].error.partition(': ')[2]}; it comes last")

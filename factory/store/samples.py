@@ -138,8 +138,11 @@ class Store:
         known = self.runs()
         return bool(known) and len(records) == 1 and bool(differences(known[-1], records[0]))
 
-    def begin(self, records: Sequence[Mapping[str, object]]) -> None:
+    def begin(self, records: Sequence[Mapping[str, object]]) -> bool:
         """The first writes of a run: record its settings, fence off older runs, tidy up after a crash.
+
+        Of two runs the one that begins later wins: whatever the older has not committed by now it never will. True:
+        another run committed something since this store was opened, so that what was known of it is out of date.
 
         A run that starts over drops what became of attempts under the settings that were. A crash between two commits
         leaves a failed outcome beside the sample that its retry became; it goes. One that is newer than the sample of
@@ -152,8 +155,11 @@ class Store:
         if list(records) != self.runs():
             document = json.loads(canonical_json({"schema_version": SCHEMA_VERSION, "runs": list(records)}))
             self.location.write(RUN_FILE, sealed_json(document).encode())
+        moved = False
         for table in (self.candidates, self.samples, self.outcomes):
+            before = set(table.live_files())
             table.claim()
+            moved = moved or set(table.live_files()) != before
         twice = {key for key in self.outcomes if key in self.samples}
         if twice:
             age = run_number(records)
@@ -166,6 +172,7 @@ class Store:
                 for table in (self.samples, self.outcomes)
             )
             self.outcomes.commit([], drop=[key for key in twice if outcomes[key] <= samples[key]])
+        return moved
 
     def runs(self) -> list[dict[str, Any]]:
         """The settings the rows were made with, oldest first. Raises ChangedRun for an unreadable run.json."""

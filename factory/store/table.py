@@ -34,6 +34,7 @@ from factory.wording import one_line
 APP_ID = "driving-data-factory"
 ACTION_BYTES = 1024  # of the log, about, that a file added or removed takes
 SCHEMA_BYTES = 16 * 1024  # of the log, about, that a new table takes
+CLAIMS = 20  # of one table, by a run that begins while another commits
 AHEAD = 16  # files of an object store that are read at once
 ROW_GROUP_BYTES = 4 * 2**20  # uncompressed; one sample costs one group, and a group 13 kB of the file's footer
 
@@ -240,8 +241,19 @@ class KeyedTable:
         return self.copies.lost(self._delta.version())
 
     def claim(self) -> None:
-        """Create the table if need be, and make the commits of every older run fail from here on."""
-        self._transact([])
+        """Create the table if need be, and make the commits of every older run fail from here on.
+
+        An older run may commit at the same moment: then once more, as the newest claim is to stand. What was committed
+        since the table was opened is seen from here on. Raises AnotherWriter.
+        """
+        for left in reversed(range(CLAIMS)):
+            self.refresh()
+            try:
+                self._transact([])
+                return
+            except AnotherWriter:
+                if not left:
+                    raise
 
     def commit(self, add: Sequence[Shard], drop: Iterable[str] = ()) -> None:
         """Add files and drop rows by key, in one transaction; a dropped key that is not there is no error.

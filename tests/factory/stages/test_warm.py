@@ -11,9 +11,9 @@ import pytest
 from factory.config.run import load_config, photos_alone
 from factory.stages.warm import compile_kernels, marker, parts_of
 from tasks.kernels.compiled import cache_dir
-from tasks.sealed import unsealed
 from tasks.render.rig.settings import Adjust, RigSettings
 from tasks.render.settings import RenderMode, RenderSettings
+from tasks.sealed import unsealed
 
 pytestmark = pytest.mark.slow
 

@@ -1,0 +1,76 @@
+"""Two runs on one store: the one that begins later wins, whenever the older commits."""
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from factory.exits import COMPLETE, INTERRUPTED
+from factory.graph.execute import RunSummary
+from factory.store.location import Location
+from factory.store.outcomes import OUTCOMES, Kind, Outcome, outcomes_table
+from factory.store.table import AnotherWriter, KeyedTable, write_shard
+from tests.factory.graph.runs import run
+from tests.factory.tables import assert_same_tables
+from tests.factory.toy import ToyWork
+
+
+def an_outcome(key: str) -> Outcome:
+    return Outcome(key, "clip", "toy", "log0", "recovery", "recovery-1", 0, Kind.REJECTED, "settings", "{}")
+
+
+def test_a_claim_stands_though_the_older_run_commits_at_the_same_moment(tmp_path: Path) -> None:
+    where = Location.parse(tmp_path / "outcomes")
+    older = KeyedTable(where, OUTCOMES)
+    older.claim()
+    newer = KeyedTable(where, OUTCOMES)
+    older.commit([write_shard(where, OUTCOMES, outcomes_table([an_outcome("a")]))])
+    newer.claim()
+    assert "a" in newer
+    with pytest.raises(AnotherWriter):
+        older.commit([write_shard(where, OUTCOMES, outcomes_table([an_outcome("b")]))])
+    newer.commit([write_shard(where, OUTCOMES, outcomes_table([an_outcome("b")]))])
+
+
+@dataclass(frozen=True)
+class LateWork(ToyWork):
+    """Getting ready takes it a whole run of another."""
+
+    out: str = ""
+
+    def warm(self, draws: bool = True) -> None:
+        assert run(Path(self.out)).exit_code == COMPLETE
+
+
+def test_what_the_older_run_commits_while_the_newer_gets_ready_is_not_made_again(
+    tmp_path: Path, plain: Callable[..., Path]
+) -> None:
+    newer = run(tmp_path / "out", LateWork(out=str(tmp_path / "out")))
+    assert newer.exit_code == COMPLETE and newer.executed.attempts == 0
+    assert_same_tables(tmp_path / "out", plain())
+
+
+@pytest.mark.slow
+def test_in_each_of_six_trials_the_newer_wins(tmp_path: Path, plain: Callable[..., Path]) -> None:
+    for trial in range(6):
+        out, begun, ended = tmp_path / f"out{trial}", threading.Event(), dict[str, RunSummary]()
+
+        @dataclass(frozen=True)
+        class Older(ToyWork):
+            def prepare(self, ref):  # type: ignore[no-untyped-def]
+                begun.set()  # noqa: B023
+                return super().prepare(ref)
+
+        def drive(name: str, work: ToyWork) -> None:
+            ended[name] = run(out, work, shard_seconds=0.0)  # noqa: B023
+
+        older = threading.Thread(target=drive, args=("older", Older(seconds=0.05)))
+        older.start()
+        assert begun.wait(20.0)
+        drive("newer", ToyWork(seconds=0.01))
+        older.join()
+        assert (ended["newer"].exit_code, ended["older"].exit_code) == (COMPLETE, INTERRUPTED)
+        assert "another run has taken over" in ended["older"].message
+        assert_same_tables(out, plain())
