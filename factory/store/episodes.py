@@ -21,7 +21,8 @@ from mcap_protobuf.schema import register_schema
 FOLDER = "episodes"  # beside the table, of those that a run writes
 LIBRARY = "driving-data-factory"
 CHUNK_BYTES = 1 << 20
-DATA_END_BYTES = 1 + 8 + 4  # opcode, length, checksum of everything before
+DATA_END = b"\x0f" + (4).to_bytes(8, "little")  # opcode and length; the checksum of everything before follows
+DATA_END_BYTES = len(DATA_END) + 4
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,8 @@ def check_episode(data: bytes) -> None:
         raise ValueError("it ends before its footer")
     content, summary = data[: last.summary_start - DATA_END_BYTES], data[last.summary_start : -MAGIC_SIZE - 4]
     data_end = data[len(content) : last.summary_start]
+    if not data_end.startswith(DATA_END):
+        raise ValueError("its data do not end where they should")
     if zlib.crc32(content) != int.from_bytes(data_end[-4:], "little") or zlib.crc32(summary) != last.summary_crc:
         raise ValueError("its checksum is another")
 

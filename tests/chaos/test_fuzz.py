@@ -36,6 +36,7 @@ FOUND = [
     ("pickle, OpenScene", 3297),  # a camera whose path is an array
     ("yaml, a scene filter", 10),  # no text
     ("feather, intrinsics", 1645),  # a column whose name is no text
+    ("mcap", 1909),  # an opcode that no checksum covers
     ("arrow, 123D's map", 55),  # a lane of 10^100 km
 ]
 
