@@ -1,8 +1,8 @@
 """What a block of eight cameras takes at three sizes: `python -m tests.bench.bench_sizes <openscene_0101> [n=v]`.
 
-Each size is fitted for a few iterations in a process of its own: CPU seconds to prepare and an iteration, and memory at
-most. Calibration is as given: how well it comes out is `bench_rig`'s question. `iterations=` are timed after as many
-that are not; `threads=` share them; other names are those of `FitSettings`.
+Each size is fitted for a few iterations in a process of its own: CPU seconds to prepare, an iteration and a picture,
+and memory at most. Calibration is as given: how well it comes out is `bench_rig`'s question. `iterations=` are timed
+after as many that are not; `threads=` share them; other names are those of `FitSettings`.
 """
 
 import resource
@@ -12,7 +12,9 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from factory.stages.sensors import load_photos
+import numpy as np
+
+from factory.stages.sensors import encode_jpeg, load_photos
 from tasks.render.fit.reconstruct import advance, finish
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import prepare
@@ -23,15 +25,14 @@ from tests.bench.bench_rig import HELD_OUT, read_block
 
 SIZES = ((480, 270), (960, 540), (1920, 1080))
 SETTINGS = replace(FitSettings(), start_gaussians=300_000, most_gaussians=350_000)
+JPEG_QUALITY = 90  # the default of runs
 MB = 2**10  # of ru_maxrss, which is in KB
 
 
 def main() -> None:
     """Prints one row a size."""
-    print(
-        "| size | photos | MB of photos | CPU s to prepare | CPU s an iteration | CPU s a picture | peak memory [MB] |"
-    )
-    print("|---|---|---|---|---|---|---|", flush=True)
+    told = "size | photos | MB of photos | CPU s to prepare | an iteration | a picture | peak memory [MB] | a JPEG [kB]"
+    print(f"| {told} |\n|---|---|---|---|---|---|---|---|", flush=True)
     for width, height in SIZES:
         subprocess.run([sys.executable, "-m", __spec__.name, "--one", f"{width}x{height}", *sys.argv[1:]], check=True)
 
@@ -61,9 +62,9 @@ def one(size: str, root: Path, options: dict[str, str]) -> None:
     drawn = time.process_time() - started
     assert psnr(picture, photo.rgb.astype("float32") / 255.0) > 10.0
     peak, held = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / MB, sum(p.rgb.nbytes for p in photos) / 2**20
-    print(
-        f"| {size} | {len(photos)} | {held:.0f} | {prepared:.0f} | {each:.3f} | {drawn:.2f} | {peak:,.0f} |", flush=True
-    )
+    jpeg = np.mean([len(encode_jpeg(p.rgb, JPEG_QUALITY)) for p in photos[::5]]) / 1e3
+    row = f"{size} | {len(photos)} | {held:.0f} | {prepared:.0f} | {each:.3f} | {drawn:.2f} | {peak:,.0f} | {jpeg:.0f}"
+    print(f"| {row} |", flush=True)
 
 
 if __name__ == "__main__":
