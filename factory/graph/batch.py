@@ -5,7 +5,7 @@ them stand, the driver commits the whole batch. What is not committed when a run
 """
 
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -40,6 +40,7 @@ class PendingCommit:
     """What one commit holds."""
 
     rows: dict[tuple[int, str], list[PendingRow]] = field(default_factory=lambda: defaultdict(list))
+    n_bytes: Counter[tuple[int, str]] = field(default_factory=Counter)  # of rows: asked on every turn of the loop
     candidates: list[ClipCandidates] = field(default_factory=list)
     outcomes: list[Outcome] = field(default_factory=list)
     replaced: list[str] = field(default_factory=list)  # attempt_ids whose old rows go
@@ -55,7 +56,7 @@ class PendingCommit:
     @property
     def largest(self) -> int:
         """Bytes of the largest partition."""
-        return max((sum(row.n_bytes for row in rows) for rows in self.rows.values()), default=0)
+        return max(self.n_bytes.values(), default=0)
 
 
 class Gatherer:
@@ -92,6 +93,7 @@ class Gatherer:
             self._open.opened = self._clock()
         for row in rows:
             self._open.rows[row.partition].append(row)
+            self._open.n_bytes[row.partition] += row.n_bytes
         self._open.candidates.extend(candidates)
         self._open.outcomes.extend(outcomes)
         self._open.replaced.extend(replaced)

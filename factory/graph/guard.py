@@ -111,6 +111,7 @@ def main(pid: int, folder: Path, stack: Path, alone: bool) -> None:
                 began, shown = now, now
         if task and (why := _over(task, now - began, held_gb(pid))):
             _write(folder / f"{task['key']}{OVER}", {**task, "why": why, "stack": _where(pid, stack)})
+            (folder / f"{task['key']}{WORK}").unlink(missing_ok=True)  # before anybody can see that it has ended
             os.kill(pid, signal.SIGKILL)
             task = {}
             break

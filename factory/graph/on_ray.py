@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
@@ -159,7 +160,7 @@ class RayGraph:
                 memory = self._claims.memory_bytes(ticket.step)
                 memory = memory if self._most_memory is None else min(memory, self._most_memory)
                 cores = cores_of(step, args)
-                task = _run.options(name=ticket.step, num_cpus=cores, num_gpus=gpu, memory=memory or None)
+                task = _claiming(ticket.step, cores, gpu, memory or None)
                 told = described(step, ticket.step, args) | self._costs.limits(ticket.step) | {"run": self._run}
                 report, ticket.result = task.remote(step, (self._notes, told), len(supplied), *supplied, *args)
                 self._tickets[report] = ticket
@@ -192,6 +193,12 @@ class RayGraph:
         if self._connected:
             ray.shutdown()
         put_away(self._notes)
+
+
+@cache
+def _claiming(name: str, cores: int, gpu: float | None, memory: int | None) -> Any:
+    """The remote function with what it claims; built once, as Ray takes its time over it."""
+    return _run.options(name=name, num_cpus=cores, num_gpus=gpu, memory=memory)
 
 
 def _kind_of(error: RayError) -> ErrorKind:

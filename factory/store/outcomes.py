@@ -6,7 +6,7 @@ Timings live here and nowhere else.
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 import pyarrow as pa
@@ -65,4 +65,6 @@ OUTCOMES = TableSpec("outcomes", SCHEMA, "attempt_id")
 
 
 def outcomes_table(outcomes: Sequence[Outcome]) -> pa.Table:
-    return pa.Table.from_pylist([asdict(outcome) for outcome in outcomes], schema=SCHEMA)
+    """Column by column: a row holds nothing that had to be copied first."""
+    columns = [pa.array([getattr(row, field.name) for row in outcomes], field.type) for field in SCHEMA]
+    return pa.Table.from_arrays(columns, schema=SCHEMA)

@@ -1,6 +1,7 @@
 """A short fuzz of every kind of file; the full one: `make chaos`."""
 
 import logging
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -16,11 +17,12 @@ SHORT = 20
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     logging.disable()
     path = tmp_path_factory.mktemp("fuzzed")
     write_all(path)
-    return path
+    yield path
+    logging.disable(logging.NOTSET)  # other tests of this process look at what is logged
 
 
 @pytest.mark.parametrize("kind", KINDS)

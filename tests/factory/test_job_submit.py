@@ -19,6 +19,7 @@ import pytest
 from factory.stages.warm import compile_kernels, marker
 from factory.store.reader import SampleTable
 from tasks.kernels.compiled import cache_dir
+from tasks.sealed import unsealed
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow]
 
@@ -137,7 +138,7 @@ def give_compiled_kernels(head: Head) -> Path:
     cache = head.folder / "cache" / "driving-data-factory" / cache_dir().name
     for part in PARTS:
         listing = marker(part)
-        for name in (listing.name, *listing.read_text().splitlines()):
+        for name in (listing.name, *unsealed(listing.read_bytes()).decode().splitlines()):
             (cache / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(cache_dir() / name, cache / name)
     return cache
