@@ -56,7 +56,7 @@ def test_a_process_that_dies_costs_its_own_attempt_and_no_other(
     ("how", "limits", "why"),
     [
         ("loop", Limits(seconds={"drive": 1.0, "render": 0.0, "label": 0.0}), "at work for more than 1 s"),
-        ("memory", Limits(gb={"drive": 0.35, "render": 0.35, "label": 0.35}), "more than 0.3 GB"),
+        ("memory", Limits(gb={"drive": 1.0, "render": 1.0, "label": 1.0}), "more than 1.0 GB"),
     ],
 )
 def test_what_is_over_its_limits_is_ended_and_says_where_it_stood(

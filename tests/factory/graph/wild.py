@@ -38,7 +38,7 @@ class WildWork(ToyWork):
                 self._note("loop begins")
                 _for_ever(np.zeros(1))
             case "memory":
-                held = np.ones(40_000_000)  # 0.32 GB
+                held = np.ones(150_000_000)  # 1.2 GB, far above what a process has without
                 time.sleep(60.0 * held[0])
             case "segfault":
                 os.kill(os.getpid(), signal.SIGSEGV)
