@@ -93,7 +93,7 @@ class Imaging:
         made_of = sensing(clip, self.settings)
         if made_of is Sensing.NOTHING or (made_of is Sensing.LIDAR_ONLY and not self._near_sweeps(clip, judged)):
             return NO_IMAGES
-        asset = _block(clip, self.settings, self.cache_dir)
+        asset = in_time_of(clip, _block(clip, self.settings, self.cache_dir))
         tags = [TAG_OF[made_of]] if made_of in TAG_OF else []
         if poor_block(asset, self.settings) is not None:
             tags.append(LOW_PSNR)
@@ -118,7 +118,7 @@ class Imaging:
         looks = self.settings.gate.vehicle_min > 0.0  # at vehicles
         album = _kept_album(_of_block(clip, self.settings, self.cache_dir)) if looks else None
         states = np.concatenate([candidate.rollout.ego_states, judged.rollout.ego_states[1:]])
-        asset = _block(clip, self.settings, self.cache_dir)
+        asset = in_time_of(clip, _block(clip, self.settings, self.cache_dir))
         return unfit(
             asset,
             asset.as_corrected(chosen_cameras(clip.cameras, self.settings.cameras)),
@@ -225,6 +225,11 @@ def _block(clip: Clip, settings: RenderSettings, cache_dir: str) -> RenderAsset:
     asset = _kept(_of_block(clip, settings, cache_dir))
     assert asset is not None, "asked for a block only where there are sensors"
     return asset
+
+
+def in_time_of(clip: Clip, asset: RenderAsset) -> RenderAsset:
+    """The scene of a clip's block, its times counted from the clip's first step."""
+    return asset.since(clip.start_s - block_of(clip).start_s)
 
 
 def scene_lookups() -> tuple[int, int]:

@@ -111,7 +111,7 @@ def real_and_rendered(
 
     `photos`: VIEW_COLUMNS of a human sample, whose agents are the log's; `only` these cameras, all for none.
     """
-    agents, pairs = agents_of(photos), []
+    agents, pairs, scene = agents_of(photos), [], _in_time_of(photos, asset)
     for camera in sorted(photos["cameras"], key=_looks_right):
         mine = [image for image in photos["images"] if image["camera"] == camera["name"]]
         if only and camera["name"] not in only:
@@ -121,7 +121,7 @@ def real_and_rendered(
             continue
         photo = decoded(nearest)
         pose = np.reshape(nearest["ego_pose"], (4, 4))
-        (again,) = drawn(asset, [camera], pose, agents, nearest["time_s"])
+        (again,) = drawn(scene, [camera], pose, agents, nearest["time_s"])
         gap = _now(photos) + nearest["time_s"] - at_s
         said = "at the sample's now" if abs(gap) < STEP_S / 2 else f"{gap:+.1f} s from the sample's now"
         pairs.append(
@@ -145,13 +145,14 @@ def from_the_side(asset: RenderAsset, row: Row) -> list[CaptionedPicture]:
     if front is None:
         return []
     rig, agents = [camera for camera in row["cameras"] if camera["name"] == front], agents_of(row)
+    scene = _in_time_of(row, asset)
     out = []
     for aside_m in ASIDE_M:
         pose = pose_at(row, NOW_INDEX)
         pose[:3, 3] += aside_m * pose[:3, 1]
         side = f"{abs(aside_m):g} m to the {'left' if aside_m > 0 else 'right'}"
         caption = side if aside_m else f"{front}, rendered at now"
-        out.append(CaptionedPicture(drawn(asset, rig, pose, agents, 0.0)[0], caption))
+        out.append(CaptionedPicture(drawn(scene, rig, pose, agents, 0.0)[0], caption))
     return out
 
 
@@ -180,11 +181,11 @@ def film(row: Row, asset: RenderAsset | None, logged: Array | None = None) -> It
     A rendered sample is drawn anew at every step where its scene is at hand; else stored images stand until the next.
     """
     agents = agents_of(row)
-    rendered = asset is not None and row["image_source"] == ImageSource.RENDER
+    scene = _in_time_of(row, asset) if asset is not None and row["image_source"] == ImageSource.RENDER else None
     for step in range(AGENT_STEPS):
         time_s = (step - NOW_INDEX) * STEP_S
-        if rendered and asset is not None:
-            views = drawn(asset, row["cameras"], pose_at(row, step), agents, time_s)
+        if scene is not None:
+            views = drawn(scene, row["cameras"], pose_at(row, step), agents, time_s)
             named = zip(row["cameras"], views)
             tiles = [tile(view, f"{camera['name']}  {time_s:+.1f} s") for camera, view in named]
         else:
@@ -207,11 +208,21 @@ def _standing(row: Row, time_s: float) -> Iterable[Image]:
             yield note(f"{camera['name']}: no image at {time_s:+.1f} s")
 
 
+def _in_time_of(row: Row, asset: RenderAsset) -> RenderAsset:
+    """The scene, its times counted as those of the row's agents."""
+    first_s = _now(row) - NOW_INDEX * STEP_S
+    return asset if asset.block is None else asset.since(first_s - asset.block.start_s)
+
+
 def drawn(
     asset: RenderAsset, cameras: Sequence[Mapping[str, Any]], world_from_ego: Array, agents: AgentTracks, time_s: float
 ) -> list[Image]:
-    """What cameras of a row see from a pose (4, 4), with the row's agents `time_s` after its now."""
-    there = vehicles_at(agents, time_s + NOW_INDEX * STEP_S, world_from_ego[:2, 3], VISIBLE_M)
+    """What cameras of a row see from a pose (4, 4), with the row's agents `time_s` after its now.
+
+    The scene's time is that of the agents.
+    """
+    agents_s = time_s + NOW_INDEX * STEP_S
+    there = vehicles_at(agents, agents_s, world_from_ego[:2, 3], VISIBLE_M)
     eyes = [
         Pinhole(
             np.reshape(camera["intrinsics"], (3, 3)),
@@ -221,7 +232,7 @@ def drawn(
         )
         for camera in cameras
     ]
-    affines = [asset.affine_of(camera["name"]) for camera in cameras]
+    affines = [asset.affine_of(camera["name"], agents_s) for camera in cameras]
     views = render(asset, eyes, there, threads=os.cpu_count() or 1, affines=affines)
     return [np.rint(view.rgb * 255.0).astype(np.uint8) for view in views]
 

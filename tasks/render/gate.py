@@ -67,17 +67,17 @@ def unfit(
 ) -> Rejected | None:
     """The first picture of a drive that is not fit to be a sample's; None where all are.
 
-    `world_from_ego` (F, 4, 4) in 3-D, `steps` (F,) rows of `agents` at these instants, `size` width, height [px] of
-    the pictures to be stored, whose shape the small ones have. Of the `stored` steps alone vehicles are held against
-    the photos of an `album`: what is torn elsewhere nobody learns from.
+    `world_from_ego` (F, 4, 4) in 3-D, `steps` (F,) rows of `agents` at these instants, whose first is the scene's time
+    0, `size` width, height [px] of the pictures to be stored, whose shape the small ones have. Of the `stored` steps
+    alone vehicles are held against the photos of an `album`: what is torn elsewhere nobody learns from.
     """
     width, height = looked_at_size(size, settings)
     rig = [camera.resized(width, height) for camera in cameras]
-    affines = [asset.affine_of(camera.name) for camera in cameras]
     for pose, step in zip(world_from_ego, steps, strict=True):
         there = vehicles_at(agents, step * STEP_S, pose[:2, 3], settings.reach_m)
         eyes = [Pinhole(c.intrinsics, pose @ c.ego_from_camera, c.width, c.height) for c in rig]
         scene = composed(asset, there, pose[:3, 3], settings.reach_m)
+        affines = [asset.affine_of(camera.name, step * STEP_S) for camera in cameras]
         views = render(scene, eyes, backend=backend, affines=affines)
         for camera, eye, view, found in zip(rig, eyes, views, measures(scene, eyes, views, pose, backend), strict=True):
             inside = _tracks_around(eye.world_from_camera[:3, 3], there)

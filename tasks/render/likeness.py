@@ -136,12 +136,12 @@ def likeness_to_photo(
 ) -> dict[str, float]:
     """How like the photo the scene draws each track, inside its outline; tracks without any pixel have 0.
 
-    `agents` are the block's, with the photo's time. The scene gets the photo's exposure where it has learned one.
+    `agents` are the block's, with the photo's time. The scene gets the exposure that its camera had then.
     """
     height, width = photo.rgb.shape[:2]
     eye = Pinhole(photo.intrinsics, photo.world_from_camera, width, height)
     there = vehicles_at(agents, photo.time_s)
-    seen = render(asset, [eye], there, backend, affines=[_affine(asset, photo)])[0].rgb
+    seen = render(asset, [eye], there, backend, affines=[asset.affine_of(photo.camera, photo.time_s)])[0].rgb
     similar = similarity(seen, photo.rgb.astype(np.float32) / np.float32(255.0))
     out = {}
     for track_id in track_ids:
@@ -171,13 +171,6 @@ def similarity(a: F32, b: F32) -> F32:
 
 def _blurred(picture: F32) -> F32:
     return np.asarray(cv2.GaussianBlur(picture, (0, 0), SIGMA_PX, borderType=cv2.BORDER_REFLECT), np.float32)
-
-
-def _affine(asset: RenderAsset, photo: Photo) -> F32:
-    """(3, 4) how the photo's camera exposed then, by the photo of its camera that was aligned nearest in time."""
-    mine = [found for found in asset.exposures if found.camera == photo.camera]
-    nearest = min(mine, key=lambda found: abs(found.time_s - photo.time_s), default=None)
-    return asset.affine_of(photo.camera) if nearest is None else nearest.affine
 
 
 def _projected(boxes: Array, points: Array, intrinsics: Array, world_from_camera: Array) -> tuple[Array, Array, Array]:

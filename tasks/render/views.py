@@ -30,13 +30,14 @@ def render_views(
 
     `world_from_ego` (F, 4, 4) in 3-D (`pose_on_ground`), `steps` (F,) rows of `agents` at these instants. The images
     are those of ideal pinholes, `camera.resized(width, height)` with distortion zero: photos are undistorted before
-    they enter the scene. Each camera shows the scene in its own colours.
+    they enter the scene. Each camera shows the scene in its own colours at that time, step 0 being the scene's 0
+    (`RenderAsset.since`).
     Raises BackendMissing where the backend cannot work on this machine.
     """
     out = np.empty((len(steps), len(cameras), height, width, 3), np.uint8)
     rig = [camera.resized(width, height) for camera in cameras]
-    affines = [asset.affine_of(camera.name) for camera in cameras]
     for f, step in enumerate(steps):
+        affines = [asset.affine_of(camera.name, step * STEP_S) for camera in cameras]
         there = vehicles_at(agents, step * STEP_S, world_from_ego[f, :2, 3], VISIBLE_M)
         eyes = [Pinhole(c.intrinsics, world_from_ego[f] @ c.ego_from_camera, width, height) for c in rig]
         for c, view in enumerate(render(asset, eyes, there, backend, affines=affines)):

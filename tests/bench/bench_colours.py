@@ -80,7 +80,7 @@ def main() -> None:
                 photo, target = shot.photo, shot.compared.target.rgb
                 pose = corrected(photo.world_from_camera, corrections_at(problem, state, name, photo.time_s)[0])
                 eye = Pinhole(photo.intrinsics, shifted(pose, problem.origin), width, height)
-                drawn = render(asset, [eye], threads=threads, affines=[asset.affine_of(name)])[0].rgb
+                drawn = render(asset, [eye], threads=threads, affines=[asset.affine_of(name, photo.time_s)])[0].rgb
                 both.append([psnr(picture, target) for picture in (picture_of(problem, state, photo, threads), drawn)])
             row += list(np.mean(both, axis=0)) if both else [np.nan, np.nan]
         rows.append(row)
@@ -89,7 +89,8 @@ def main() -> None:
     similar = np.mean([view.ssim for view in asset.views]) if asset.views else np.nan
     print(f"held out: {asset.psnr_db:.2f} dB, SSIM {similar:.3f}")
     gains = [float(np.trace(exposure.affine[:, :3]) / 3.0) for exposure in asset.exposures]
-    own = [float(np.trace(asset.affine_of(exposure.camera)[:, :3]) / 3.0) for exposure in asset.exposures]
+    of = np.array([exposure.camera for exposure in asset.exposures])
+    own = [float(np.mean(np.array(gains)[of == camera])) for camera in of]
     rest = np.sqrt(np.mean((np.array(gains) / np.array(own) - 1.0) ** 2))
     print(f"gains from scene to photo: {min(gains):.2f} to {max(gains):.2f}; photo against camera {rest:.3f} (RMS)")
 

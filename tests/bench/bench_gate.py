@@ -23,7 +23,7 @@ from factory.config.run import load_config
 from factory.graph.work import PreparedClip
 from factory.setup.settings import assemble
 from factory.stages.assets import asset_for
-from factory.stages.imaging import album_of
+from factory.stages.imaging import album_of, in_time_of
 from factory.stages.pipeline import FactoryWork
 from factory.stages.sensors import chosen_cameras
 from tasks.render.gate import GateSettings, looked_at_size, unfit
@@ -72,6 +72,7 @@ def labelled(seed: int, clips: int, most: int, every: int, out: Path) -> list[La
         assert asset is not None, "a town has photos"
         album, town = album_of(clip, asset, work.render), Painted(seed, ref.log_id)
         timed_album = album_of(clip, asset, work.render)  # whose photos are opened while the clock runs
+        asset = in_time_of(clip, asset)
         size = looked_at_size((work.render.width, work.render.height), settings)
         rig = [camera.resized(*size) for camera in chosen_cameras(clip.cameras, work.render.cameras)]
         for drive in drives(work, prepared, EXPERTS, most):

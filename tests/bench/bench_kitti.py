@@ -158,7 +158,8 @@ def main() -> None:
             there = pose.copy()
             there[:3, 3] += problem.origin + shift * pose[:3, 0]
             eye = Pinhole(photo.intrinsics, there, width, height)
-            strip.append(render(asset, [eye], threads=threads, affines=[asset.affine_of(photo.camera)])[0].rgb)
+            affines = [asset.affine_of(photo.camera, photo.time_s)]
+            strip.append(render(asset, [eye], threads=threads, affines=affines)[0].rgb)
         picture = np.rint(255 * np.clip(np.vstack(strip), 0, 1)).astype(np.uint8)[..., ::-1]
         cv2.imwrite(str(out / f"shifted_{frame:03d}.png"), picture)
 

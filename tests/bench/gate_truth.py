@@ -107,7 +107,7 @@ class Painted:
             scene = theatre.at(first + step)
             there = vehicles_at(drive.agents, step * STEP_S, pose[:2, 3], VISIBLE_M)
             eyes = [Pinhole(c.intrinsics, pose @ c.ego_from_camera, c.width, c.height) for c in rig]
-            views = render(asset, eyes, there, affines=[asset.affine_of(c.name) for c in rig])
+            views = render(asset, eyes, there, affines=[asset.affine_of(c.name, step * STEP_S) for c in rig])
             for camera, eye, seen in zip(rig, eyes, views, strict=True):
                 truth = _unit(paint(scene, replace(camera, distortion=np.zeros(5)), pose))
                 yield Shown(camera.name, step, eye, pose, there, seen.rgb, truth)
@@ -121,7 +121,7 @@ def verdicts(
     pose = shown.world_from_ego
     there = vehicles_at(drive.agents, shown.step * STEP_S, pose[:2, 3], settings.reach_m)
     scene = composed(asset, there, pose[:3, 3], settings.reach_m)
-    views = render(scene, [shown.eye], affines=[asset.affine_of(shown.camera)])
+    views = render(scene, [shown.eye], affines=[asset.affine_of(shown.camera, shown.step * STEP_S)])
     fault = fault_of(measures(scene, [shown.eye], views, pose)[0], settings)
     least = NOTHING_LARGE
     for j, _ in large_vehicles(there, shown.eye, views[0], settings.vehicle_share):

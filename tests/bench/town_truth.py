@@ -131,7 +131,8 @@ class Truth:
     def _seen(self, photo: Photo, there: Vehicles) -> F32:
         height, width = photo.rgb.shape[:2]
         eye = Pinhole(photo.intrinsics, photo.world_from_camera, width, height)
-        return np.clip(render(self.asset, [eye], there, affines=[self.asset.affine_of(photo.camera)])[0].rgb, 0.0, 1.0)
+        affine = self.asset.affine_of(photo.camera, photo.time_s)
+        return np.clip(render(self.asset, [eye], there, affines=[affine])[0].rgb, 0.0, 1.0)
 
 
 def _in_the_way(photo: Photo, boxes: Array) -> bool:

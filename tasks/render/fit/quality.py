@@ -38,8 +38,8 @@ def measured(
 ) -> ViewQuality:
     """Of a photo that was held out, as `asset` shows it from a pose (4, 4) in the problem's frame.
 
-    The camera has the colours that it has at any new pose, and tracks are where they were. Pixels without weight say
-    nothing; LPIPS, whose layers see far around, is of the whole picture.
+    The camera has the colours that it has at any new pose then, and tracks are where they were. Pixels without weight
+    say nothing; LPIPS, whose layers see far around, is of the whole picture.
     """
     photo, target = shot.photo, shot.compared.target
     height, width = target.weight.shape
@@ -51,7 +51,7 @@ def measured(
         boxes[rows] + np.concatenate([problem.origin, np.zeros(4)]),
     )
     eye = Pinhole(photo.intrinsics, shifted(scene_from_camera, problem.origin), width, height)
-    affines = [asset.affine_of(photo.camera)]
+    affines = [asset.affine_of(photo.camera, photo.time_s)]
     picture = render(asset, [eye], there, threads=threads, affines=affines)[0].rgb
     vehicles = boxes[[j for j in rows if problem.tracks.kinds[j] == AgentKind.VEHICLE]]
     classes = classes_of(photo, vehicles, problem.road)

@@ -1,5 +1,6 @@
 """The scene of a block: what a reconstruction gives and every rendering starts from."""
 
+from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -99,11 +100,23 @@ class RenderAsset:
         mine = [file for file in files if (file.sensor, file.time_s) in poses]
         return tuple(replace(file, world_from_ego=poses[file.sensor, file.time_s]) for file in mine)
 
-    def affine_of(self, camera: str) -> F32:
-        """(3, 4) what a camera makes of the scene's light at poses that no photo was taken from: the mean over its
-        photos; the identity for one whose photos were not aligned."""
-        mine = [exposure.affine for exposure in self.exposures if exposure.camera == camera]
-        return np.mean(mine, axis=0, dtype=np.float32) if mine else np.eye(3, 4, dtype=np.float32)
+    def since(self, first_s: float) -> "RenderAsset":
+        """The same scene, its times counted from `first_s` on, as a clip within the block counts them."""
+        moved = (replace(exposure, time_s=exposure.time_s - first_s) for exposure in self.exposures)
+        return replace(self, exposures=tuple(moved))
+
+    def affine_of(self, camera: str, time_s: float) -> F32:
+        """(3, 4) what a camera makes of the scene's light at a time, wherever it is: linear between its photos before
+        and after, for it exposes anew from place to place; the identity for one whose photos were not aligned."""
+        mine = sorted((e for e in self.exposures if e.camera == camera), key=lambda e: e.time_s)
+        if not mine:
+            return np.eye(3, 4, dtype=np.float32)
+        after = bisect_left([e.time_s for e in mine], time_s)
+        if after in (0, len(mine)):
+            return mine[max(after - 1, 0)].affine
+        first, last = mine[after - 1], mine[after]
+        share = np.float32((time_s - first.time_s) / (last.time_s - first.time_s))
+        return np.asarray(first.affine + share * (last.affine - first.affine), np.float32)
 
 
 def camera_psnr_db(asset: RenderAsset) -> dict[str, float]:

@@ -14,9 +14,12 @@ from factory.readers.base import BadClip
 from factory.readers.settings import TownSettings
 from factory.readers.town.reader import SyntheticReader
 from factory.setup.settings import assemble
-from factory.stages.imaging import photo_at, scene_lookups
+from factory.stages.imaging import in_time_of, photo_at, scene_lookups
 from factory.stages.pipeline import FactoryWork
 from factory.stages.sensors import block_of
+from tasks.render.scene.asset import Exposure, RenderAsset
+from tasks.render.scene.sky import SkyMap
+from tasks.render.splatting.gaussians import EMPTY
 from tasks.stages import HUMAN
 from tasks.world.clip import Clip
 
@@ -125,6 +128,18 @@ def test_of_many_photos_the_nearest_is_taken(town: Path, tmp_path: Path) -> None
     first = clip.images[0]
     often = replace(clip, images=tuple(replace(first, time_s=0.05 * k + 0.02) for k in range(100)))
     assert photo_at(often, first.sensor, 1.0).time_s == pytest.approx(1.02)
+
+
+def test_a_clip_is_drawn_with_what_its_cameras_made_of_the_light_in_its_own_time(town: Path, tmp_path: Path) -> None:
+    """The scene counts from the block's first step, two seconds before the clip's."""
+    clip = clip_of(town, tmp_path)
+    block = replace(block_of(clip), start_s=clip.start_s - 2.0)
+    gains = tuple(
+        Exposure("front", time_s, np.float32(gain * np.eye(3, 4))) for time_s, gain in ((2.0, 1.5), (3.0, 0.5))
+    )
+    asset = RenderAsset(np.zeros(3), EMPTY, {}, SkyMap(np.zeros((2, 4, 3), np.float32)), 30.0, exposures=gains)
+    scene = in_time_of(replace(clip, block=block), asset)
+    assert [float(scene.affine_of("front", time_s)[0, 0]) for time_s in (0.0, 0.5, 1.0)] == [1.5, 1.0, 0.5]
 
 
 @pytest.mark.slow
