@@ -49,7 +49,7 @@ class ReadApart:
         self._pipe.send_bytes(ARGUMENT + argument)
         if not self._pipe.poll(limit_s):
             raise TimeoutError
-        return self._pipe.recv()
+        return self._pipe.recv()  # ours, where files are data as they are here: nothing of them was run
 
     def end(self) -> int:
         """Kill it, if it lives; how it ended."""

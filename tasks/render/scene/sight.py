@@ -18,7 +18,6 @@ from tasks.render.scene.stereo import FAR_M, MAX_BASELINE_M, MIN_BASELINE_M, Com
 from tasks.render.scene.wide_stereo import partners, wide_depth
 from tasks.world.arrays import F32, Array, Bools, ShortInts
 
-NEAR_ROAD = 400  # points of the road that say how high it is at a camera
 SHALLOW = -2  # label of a pixel without lidar
 
 
@@ -71,7 +70,7 @@ def see(
     else:
         anchors, _ = sparse_depth(known.corners, np.zeros(len(known.corners), np.int32), *camera, width, height)
         neighbours = partners(photo, others, stereo_photos)
-        sweep = partial(wide_depth, rgb, anchors, floor_depth(known.dense, eye, rays))
+        sweep = partial(wide_depth, rgb, anchors, rays[..., 2] >= 0.0)
     if neighbours:
         guess, cost, sky_cost = sweep(neighbours, *camera, unknown)
         sky = unknown & ((bright & no_worse(sky_cost, cost)) | (guess >= FAR_M))
@@ -80,19 +79,6 @@ def see(
     depth = np.where(unknown & ~sky, guess, depth).astype(np.float32)
     passing = behind(np.where(depth > 0, depth, np.float32(FAR_M)), boxes[valid & tracks.driving])
     return Seen(depth, label, sky, passing)
-
-
-def floor_depth(road: Array, eye: Array, rays: Array) -> F32:
-    """Depth (H, W) [m] at which `rays` (H, W, 3) from `eye` (3,) meet the road's level there, FAR_M at most.
-
-    `road` (M, 3): its points nearest to the eye say how high it is. 0 for rays that rise.
-    """
-    falls = rays[..., 2] < 0.0
-    if len(road) == 0:
-        return np.where(falls, np.float32(FAR_M), np.float32(0.0))
-    away = np.hypot(road[:, 0] - eye[0], road[:, 1] - eye[1])
-    below = eye[2] - float(np.median(road[np.argsort(away)[:NEAR_ROAD], 2]))
-    return np.where(falls, np.minimum(below / np.maximum(-rays[..., 2], 1e-6), FAR_M), 0.0).astype(np.float32)
 
 
 def _hints(depth: F32) -> F32:
