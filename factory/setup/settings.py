@@ -16,6 +16,7 @@ from factory.config.run import RunConfig, VocabularyChoice, photos_alone, refuse
 from factory.readers.base import BadClip, ClipIndex, ClipReader
 from factory.setup.vocabulary import load_vocabulary
 from factory.stages.frames import BenchmarkWork
+from factory.stages.own_body import masks_digest, refuse_unknown_masks
 from factory.stages.pipeline import FactoryWork
 from factory.stages.sensors import chosen_cameras
 from factory.store.identity import UNLISTED, RunIdentity, canonical_json
@@ -39,6 +40,7 @@ RIGS_LOOKED_AT = 3  # clips, for the names of their cameras
 ABSENT = object()
 # Settings that came later: at what held before there was a choice they are left out, so that older tables go on.
 ADDED: dict[str, object] = {"perturb.interleaved": True, "perturb.order": "drawn", "perturb.at_most": None}
+ADDED |= {"render.own_body": ""}
 ADDED |= {"render.camera_psnr_min": 0.0, "render.rig": dataclasses.asdict(RigSettings())}
 
 
@@ -137,12 +139,12 @@ def assemble(config: RunConfig) -> Run:
 
 
 def refuse_unknown_cameras(config: RunConfig, reader: ClipReader, index: ClipIndex) -> None:
-    """Raises ConfigError where render.cameras names one that the rig of the first readable clip with cameras lacks.
+    """Raises ConfigError where render.cameras or a mask names one that the rig of the first readable clip lacks.
 
     Rigs that differ from log to log are told apart by the attempts themselves.
     """
-    wanted = config.render.cameras
-    if not wanted or config.render.mode is RenderMode.NONE:
+    wanted, masks = config.render.cameras, config.render.own_body
+    if not (wanted or masks) or config.render.mode is RenderMode.NONE:
         return
     for ref in index.refs[:RIGS_LOOKED_AT]:
         try:
@@ -153,6 +155,7 @@ def refuse_unknown_cameras(config: RunConfig, reader: ClipReader, index: ClipInd
             rig = RIGS[config.render.map_rig]
         if rig:
             chosen_cameras(rig, wanted)
+            refuse_unknown_masks(masks, rig)
             return
 
 
@@ -229,6 +232,7 @@ def identity_of(config: RunConfig, vocabulary: Vocabulary, labelling: Labelling 
     for part, gone in REMOVED.items():
         settings[f"render.{part}"] = dataclasses.asdict(getattr(config.render, part)) | gone
     del settings["render.lpips"]  # measures alone
+    settings["render.own_body"] = masks_digest(config.render.own_body)
     settings = {key: plain for key, plain in settings.items() if plain != ADDED.get(key, ABSENT)}
     settings["reward.label_vocabulary"] = None if labelling is None else labelling.vocabulary.digest
     versions = stage_versions()

@@ -20,6 +20,7 @@ import numpy as np
 from factory.graph.work import Stopped, never
 from factory.readers.videos import file_and_frame
 from factory.stages.fitting import fitted
+from factory.stages.own_body import masks_digest, read_masks
 from factory.stages.rig import corrected_rig, known_of, said_again, wanted
 from factory.stages.scene_file import SUFFIX, BadScene, read_scene, write_scene
 from factory.stages.sensors import block_of, chosen_cameras, load_sensors, load_sweeps, taken_by
@@ -28,6 +29,7 @@ from tasks.render.fit.lpips import lpips_of
 from tasks.render.scene.asset import BlockRange, RenderAsset, TakenFrom
 from tasks.render.scene.build import build_asset
 from tasks.render.scene.lidar_only import lidar_asset
+from tasks.render.scene.sensed import own_bodies
 from tasks.render.scene.settings import Backend
 from tasks.render.scene.stereo import MAX_BASELINE_M, MIN_BASELINE_M
 from tasks.render.settings import REMOVED, RenderSettings, SceneFrom
@@ -86,7 +88,7 @@ def asset_for(
     made_of = sensing(clip, settings)
     if made_of is Sensing.NOTHING:
         return None
-    path = scene_path(clip, settings, cache_dir)
+    path, masks = scene_path(clip, settings, cache_dir), read_masks(settings.own_body, cameras)
     with only_builder(path):
         if path.exists():
             try:
@@ -95,13 +97,13 @@ def asset_for(
                 log.warning("%s; it is built again", error)
             else:
                 if made_of is not Sensing.LIDAR_ONLY and wanted(block, settings.rig):
-                    said_again(path, block, cameras, settings.rig)
+                    said_again(path, block, cameras, settings.rig, masks)
                 return kept
         if made_of is not Sensing.LIDAR_ONLY:
             found = None
             if wanted(block, settings.rig):
-                block, cameras, found = corrected_rig(path, block, cameras, settings.rig)
-            data = load_sensors(block, cameras, settings.width, settings.height)
+                block, cameras, found = corrected_rig(path, block, cameras, settings.rig, masks)
+            data = load_sensors(block, cameras, settings.width, settings.height, masks)
             if found is not None:
                 data = replace(data, known=known_of(data, block, found))
             if settings.scene is SceneFrom.FIT:
@@ -112,6 +114,7 @@ def asset_for(
             if found is not None:
                 taken = (TakenFrom(file.sensor, file.time_s, file.world_from_ego) for file in block.images)
                 asset = replace(asset, rig=cameras, taken=tuple(taken))
+            asset = replace(asset, bodies=own_bodies(data.photos))
         else:
             asset = lidar_asset(load_sweeps(block.sweeps, with_intensity=True), block.agents)
         return write_scene(path, replace(asset, block=range_of(clip, block)))
@@ -155,6 +158,8 @@ def block_id(clip: Clip, settings: RenderSettings) -> str:
         how.append([[Path(name).name, Path(name).stat().st_size] for name in settings.lpips])
     if wanted(block, settings.rig):
         how.append(asdict(settings.rig))
+    if settings.own_body:
+        how.append(["own_body", masks_digest(settings.own_body)])
     digest.update(json.dumps([made_of, how], sort_keys=True).encode())
     for file in (*block.images, *block.sweeps):
         path, _ = file_and_frame(file.uri)

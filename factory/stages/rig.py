@@ -5,12 +5,13 @@ what their neighbours say, and the cameras as they were used.
 """
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 
+from factory.stages.own_body import NO_MASKS
 from factory.stages.sensors import SensorData, opened_photos, taken_by
 from factory.store.disk import whole_file
 from tasks.render.rig.corners import corners_of
@@ -21,6 +22,7 @@ from tasks.render.rig.settings import Adjust, RigSettings
 from tasks.render.scene.driven_road import driven_road
 from tasks.render.scene.features import Known
 from tasks.sealed import Damaged, sealed_json, unsealed_json
+from tasks.world.arrays import Bools
 from tasks.world.camera import Camera
 from tasks.world.clip import Block
 
@@ -36,7 +38,11 @@ def wanted(block: Block, settings: RigSettings) -> bool:
 
 
 def corrected_rig(
-    path: Path, block: Block, cameras: Sequence[Camera], settings: RigSettings
+    path: Path,
+    block: Block,
+    cameras: Sequence[Camera],
+    settings: RigSettings,
+    own_body: Mapping[str, Bools] = NO_MASKS,
 ) -> tuple[Block, tuple[Camera, ...], Correction | None]:
     """Block and cameras as the photos say they are, and what was found, which is written beside `path`.
 
@@ -47,7 +53,7 @@ def corrected_rig(
     corners = {}
     for row, image in opened_photos(files, cameras):
         (camera,) = (camera for camera in cameras if camera.name == files[row].sensor)
-        hidden = hidden_by(block.agents, camera, files[row])
+        hidden = hidden_by(block.agents, camera, files[row], own_body.get(camera.name))
         corners[row] = corners_of(image, settings.width, settings.corners, hidden)
     found = corrected(cameras, files, [corners[row] for row in range(len(files))], settings)
     if found is None:
@@ -65,7 +71,9 @@ def corrected_rig(
     return replace(block, images=kept), found.cameras, found
 
 
-def said_again(path: Path, block: Block, cameras: Sequence[Camera], settings: RigSettings) -> None:
+def said_again(
+    path: Path, block: Block, cameras: Sequence[Camera], settings: RigSettings, own_body: Mapping[str, Bools] = NO_MASKS
+) -> None:
     """Writes what was found anew where the file beside `path` is damaged; the scene there stays. Raises BadClip."""
     said = path.with_suffix(SAID)
     try:
@@ -74,7 +82,7 @@ def said_again(path: Path, block: Block, cameras: Sequence[Camera], settings: Ri
         return
     except Damaged as error:
         log.warning("%s: %s; it is written again", said, error)
-        corrected_rig(path, block, cameras, settings)
+        corrected_rig(path, block, cameras, settings, own_body)
 
 
 def known_of(data: SensorData, block: Block, found: Correction) -> Known:

@@ -7,6 +7,7 @@
 | `nodes.<i>.<field>` | (N_i, ...) | the i-th track, in its box's frame |
 | `sky` | (rows, columns, 3) | colours by direction |
 | `taken` | (P, 4, 4) float64 | where the ego was at each photo, where the photos corrected that |
+| `bodies.<i>` | (H, W, 4) uint8 | what the i-th camera that sees one sees of the own body |
 | `exposures` | (P, 3, 4) | what each photo made of the light, where they were aligned |
 
 The header's entry `scene` holds the rest: format, the nodes' track ids, quality photo by photo, the photos of the
@@ -29,7 +30,7 @@ from safetensors.numpy import save
 
 from factory.store.disk import whole_file
 from factory.store.identity import canonical_json
-from tasks.render.scene.asset import BlockRange, ClassQuality, Exposure, RenderAsset, TakenFrom, ViewQuality
+from tasks.render.scene.asset import BlockRange, ClassQuality, Exposure, OwnBody, RenderAsset, TakenFrom, ViewQuality
 from tasks.render.scene.sky import SkyMap
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.world.camera import Camera
@@ -116,6 +117,7 @@ def tensors_of(asset: RenderAsset) -> dict[str, NDArray[Any]]:
         out["exposures"] = np.stack([exposure.affine for exposure in asset.exposures])
     if asset.taken:
         out["taken"] = np.stack([photo.world_from_ego for photo in asset.taken])
+    out |= {f"bodies.{i}": body.rgba for i, body in enumerate(asset.bodies)}
     return {name: np.ascontiguousarray(array) for name, array in out.items()}
 
 
@@ -124,6 +126,7 @@ def described_by(asset: RenderAsset) -> dict[str, Any]:
     block = asset.block
     rig = [asdict(camera) | {name: getattr(camera, name).tolist() for name in CALIBRATED} for camera in asset.rig]
     taken = [[photo.camera, photo.time_s] for photo in asset.taken]
+    bodies = [body.camera for body in asset.bodies]
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -133,7 +136,7 @@ def described_by(asset: RenderAsset) -> dict[str, Any]:
         "views": [_plain(asdict(view)) for view in asset.views],
         "exposures": [[exposure.camera, exposure.time_s] for exposure in asset.exposures],
         "block": None if block is None else asdict(block) | {"low": block.low.tolist(), "high": block.high.tolist()},
-    } | {name: values for name, values in (("rig", rig), ("taken", taken)) if values}
+    } | {name: values for name, values in (("rig", rig), ("taken", taken), ("bodies", bodies)) if values}
 
 
 def scene_of(tensors: Tensors, described: Mapping[str, Any], digest: str) -> RenderAsset:
@@ -167,6 +170,7 @@ def scene_of(tensors: Tensors, described: Mapping[str, Any], digest: str) -> Ren
             TakenFrom(camera, time_s, tensors["taken"][i])
             for i, (camera, time_s) in enumerate(described.get("taken", ()))
         ),
+        bodies=tuple(OwnBody(camera, tensors[f"bodies.{i}"]) for i, camera in enumerate(described.get("bodies", ()))),
     )
 
 

@@ -1,7 +1,7 @@
 """Opens what a clip's sensor files point to: photos and lidar sweeps as arrays."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -12,11 +12,12 @@ from factory.readers.base import BadClip
 from factory.readers.nuscenes_points import read_points
 from factory.readers.pcd import read_pcd
 from factory.readers.videos import file_and_frame, video_frames
+from factory.stages.own_body import NO_MASKS, resized_mask
 from tasks.render.scene.driven_road import driven_road
 from tasks.render.scene.features import NOTHING_KNOWN, Known
 from tasks.render.scene.sensed import Photo, Sweep, on_ego
 from tasks.render.views import undistorted
-from tasks.world.arrays import Bytes
+from tasks.world.arrays import Bools, Bytes
 from tasks.world.camera import Camera, SensorFile
 from tasks.world.clip import Block, Clip
 
@@ -38,12 +39,16 @@ def block_of(clip: Clip) -> Block:
     return clip.block or Block(clip.start_s, clip.agents, clip.images, clip.sweeps)
 
 
-def load_sensors(block: Block, cameras: Sequence[Camera], width: int, height: int) -> SensorData:
-    """All sweeps of the block and the photos its `cameras` took, resized to width x height.
+def load_sensors(
+    block: Block, cameras: Sequence[Camera], width: int, height: int, own_body: Mapping[str, Bools] = NO_MASKS
+) -> SensorData:
+    """All sweeps of the block and the photos its `cameras` took, resized to width x height, with their `own_body`.
 
     Raises BadClip where a file is missing, broken or not of its camera's size.
     """
-    photos = load_photos(block.images, cameras, width, height)
+    masks = {c.name: resized_mask(own_body[c.name], c, width, height) for c in cameras if c.name in own_body}
+    taken = load_photos(block.images, cameras, width, height)
+    photos = tuple(replace(photo, own_body=masks.get(photo.camera)) for photo in taken)
     if block.sweeps or block.ground_m is None or not block.images:
         return SensorData(photos, load_sweeps(block.sweeps))
     poses = np.stack([file.world_from_ego for file in sorted(block.images, key=lambda file: file.time_s)])

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter
 
 from tasks.render.likeness import Album, expected, eye_in_box, large_vehicles
-from tasks.render.scene.asset import RenderAsset, scene_at
+from tasks.render.scene.asset import OwnBody, RenderAsset, scene_at
 from tasks.render.scene.engine import Backend, Vehicles, render, vehicles_at
 from tasks.render.scene.movers import world_from_boxes
 from tasks.render.scene.sky import directions
@@ -79,7 +79,9 @@ def unfit(
         scene = composed(asset, there, pose[:3, 3], settings.reach_m)
         affines = [asset.affine_of(camera.name, step * STEP_S) for camera in cameras]
         views = render(scene, eyes, backend=backend, affines=affines)
-        for camera, eye, view, found in zip(rig, eyes, views, measures(scene, eyes, views, pose, backend), strict=True):
+        own = [asset.own_body(camera.name) for camera in cameras]
+        looked_at = measures(scene, eyes, views, pose, backend, own)
+        for camera, eye, view, found in zip(rig, eyes, views, looked_at, strict=True):
             inside = _tracks_around(eye.world_from_camera[:3, 3], there)
             fault = ("lens_covered", f"inside track {inside[0]}") if inside else fault_of(found, settings)
             if fault is None and album is not None and step in stored:
@@ -136,12 +138,15 @@ def measures(
     views: Sequence[View],
     world_from_ego: Array,
     backend: Backend = Backend.CPU,
+    own: Sequence[OwnBody | None] | None = None,
 ) -> list[Measures]:
-    """Of the view that each camera has of a composed scene."""
+    """Of the view that each camera has of a composed scene; nothing is missed where its `own` body is in front."""
     out = []
-    for eye, seen in zip(eyes, views, strict=True):
+    for eye, seen, body in zip(eyes, views, own or [None] * len(eyes), strict=True):
         rays = directions(eye.intrinsics, eye.world_from_camera, eye.width, eye.height)
         road = meets_road(rays, eye.world_from_camera[:3, 3], world_from_ego)
+        if body is not None:
+            road &= ~body.in_front(eye.width, eye.height)
         close = _on_the_lens(scene.background, eye.world_from_camera[:3, 3] - scene.origin)
         lens = render(replace(scene, background=close), [eye], backend=backend)[0].alpha if len(close) else None
         out.append(measured(seen, road, lens))

@@ -108,6 +108,7 @@ class RenderSettings:
     lidar_only_reach_m: float = 15.0  # without photos: images only this close to where a sweep was taken; 0: none
     map_rig: Literal["front", "three_front", "ring_six"] = "three_front"  # for mode=map without a rig
     scene: SceneFrom = SceneFrom.FIT  # discs: built in one go, seconds a block; fit: then fitted to its photos, minutes
+    own_body: str = ""  # folder of masks, <camera>.png, of what the rig sees of the ego itself
     rig: RigSettings = field(default_factory=RigSettings)  # whether cameras and poses are corrected first
     asset: AssetSettings = field(default_factory=AssetSettings)
     fit: FitSettings = field(default_factory=FitSettings)

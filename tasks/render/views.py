@@ -31,7 +31,7 @@ def render_views(
     `world_from_ego` (F, 4, 4) in 3-D (`pose_on_ground`), `steps` (F,) rows of `agents` at these instants. The images
     are those of ideal pinholes, `camera.resized(width, height)` with distortion zero: photos are undistorted before
     they enter the scene. Each camera shows the scene in its own colours at that time, step 0 being the scene's 0
-    (`RenderAsset.since`).
+    (`RenderAsset.since`), and before it what it sees of the car that carries it.
     Raises BackendMissing where the backend cannot work on this machine.
     """
     out = np.empty((len(steps), len(cameras), height, width, 3), np.uint8)
@@ -42,11 +42,15 @@ def render_views(
         eyes = [Pinhole(c.intrinsics, world_from_ego[f] @ c.ego_from_camera, width, height) for c in rig]
         for c, view in enumerate(render(asset, eyes, there, backend, affines=affines)):
             out[f, c] = np.rint(view.rgb * 255.0).astype(np.uint8)
+            if (body := asset.own_body(cameras[c].name)) is not None:
+                out[f, c] = body.drawn_on(out[f, c])
     return out
 
 
 def undistorted(image: Bytes, camera: Camera) -> Bytes:
-    """The photo (H, W, 3) an ideal pinhole of the same intrinsics would have taken; outside of the photo: edge colours.
+    """The photo (H, W, 3), or a mask of it (H, W), that an ideal pinhole of the same intrinsics would have taken.
+
+    Outside of the photo: edge colours.
 
     `Camera.distortion` is Brown's model as OpenCV has it. Where an ideal pinhole sees x, y over depth, the lens shows
     x s + 2 p1 x y + p2 (r2 + 2 x^2), y s + p1 (r2 + 2 y^2) + 2 p2 x y with s = 1 + k1 r2 + k2 r2^2 + k3 r2^3.

@@ -150,15 +150,16 @@ def _bodies(nodes: Sequence[Gaussians | None], tracks: Tracks, times_s: Sequence
 
 
 def _hidden(photo: Photo, tracks: Tracks, unknown: Bools) -> Bools | None:
-    """Pixels of what moves and has no Gaussians of its own: it would be painted on the street."""
+    """Pixels of what moves and has no Gaussians of its own, the own body too: it would be painted on the street."""
     boxes, valid = tracks.at(photo.time_s)
     if not (valid & unknown).any():
-        return None
+        return photo.own_body
     height, width = photo.rgb.shape[:2]
     rays = directions(photo.intrinsics, photo.world_from_camera, width, height)
     eye = np.ascontiguousarray(photo.world_from_camera[:3, 3])
     far = rays.reshape(-1, 3) * FAR_M + eye
-    return np.asarray(behind_boxes(far, eye, boxes[valid & unknown]), bool).reshape(height, width)
+    hidden = np.asarray(behind_boxes(far, eye, boxes[valid & unknown]), bool).reshape(height, width)
+    return hidden if photo.own_body is None else hidden | photo.own_body
 
 
 def _compared(photo: Photo, hidden: Bools | None) -> PhotoTarget:

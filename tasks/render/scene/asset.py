@@ -4,6 +4,7 @@ from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,7 +13,7 @@ from tasks.render.scene.movers import world_from_boxes
 from tasks.render.scene.sky import SkyMap
 from tasks.render.splatting.gaussians import Gaussians, concatenate, moved
 from tasks.world.agents import AgentKind
-from tasks.world.arrays import F32, Array
+from tasks.world.arrays import F32, Array, Bools, Bytes
 from tasks.world.camera import Camera, SensorFile
 
 
@@ -62,6 +63,25 @@ class Exposure:
 
 
 @dataclass(frozen=True)
+class OwnBody:
+    """What one camera sees of the car that carries it, wherever that is."""
+
+    camera: str
+    rgba: Bytes  # (H, W, 4) its colours in photos, and 255 where it is
+
+    def in_front(self, width: int, height: int) -> Bools:
+        """(height, width) pixels of a picture that show mostly the body."""
+        return np.asarray(cv2.resize(self.rgba[..., 3], (width, height), interpolation=cv2.INTER_AREA) >= 128)
+
+    def drawn_on(self, picture: Bytes) -> Bytes:
+        """A picture (h, w, 3) of the same camera with the body in front."""
+        size = picture.shape[1], picture.shape[0]
+        over = cv2.resize(self.rgba, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+        share = over[..., 3:] / 255.0
+        return np.rint(over[..., :3] * share + picture * (1.0 - share)).astype(np.uint8)
+
+
+@dataclass(frozen=True)
 class TakenFrom:
     """Where the ego was when a photo of the scene was taken, as the photos say."""
 
@@ -86,11 +106,16 @@ class RenderAsset:
     block: BlockRange | None = None  # filled by whoever knows the log
     rig: tuple[Camera, ...] = ()  # cameras that its photos were corrected to; empty: they are as given
     taken: tuple[TakenFrom, ...] = ()  # its photos, where their poses were corrected
+    bodies: tuple[OwnBody, ...] = ()  # of the cameras that were said to see one
 
     def as_corrected(self, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
         """The cameras to draw it with: of the scene's own rig those of the same names, where it has one."""
         mine = {camera.name: camera for camera in self.rig}
         return tuple(mine.get(camera.name, camera) for camera in cameras)
+
+    def own_body(self, camera: str) -> OwnBody | None:
+        """What a camera sees of the car that carries it."""
+        return next((body for body in self.bodies if body.camera == camera), None)
 
     def photos_of(self, files: Sequence[SensorFile]) -> tuple[SensorFile, ...]:
         """The files that it was made of, at the poses it was made with; all as given, where none was corrected."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from tasks.render.scene.asset import OwnBody
 from tasks.render.scene.movers import GROUND_CLEARANCE_M, boxes_at, driving, owners, world_from_boxes
 from tasks.world.agents import MOVING_KINDS, AgentTracks
 from tasks.world.arrays import F32, Array, Bools, Bytes, Indices
@@ -13,6 +14,7 @@ from tasks.world.vehicle import PACIFICA
 
 EGO_MARGIN_M = 0.3
 FUSED_VOXEL_M = 0.07
+MEDIAN_PHOTOS = 25  # of a camera, at most, that say what the own body looks like
 
 
 @dataclass(frozen=True)
@@ -24,6 +26,7 @@ class Photo:
     rgb: Bytes  # (H, W, 3)
     intrinsics: Array  # (3, 3) pixels, the centre of pixel (0, 0) at (0.5, 0.5)
     world_from_camera: Array  # (4, 4)
+    own_body: Bools | None = None  # (H, W) shows the car that carries the camera
 
 
 def reduced(photo: Photo, width: int) -> Photo:
@@ -34,7 +37,21 @@ def reduced(photo: Photo, width: int) -> Photo:
     size = (width, round(rows * width / columns))
     scale = np.diag([size[0] / columns, size[1] / rows, 1.0])
     rgb = np.asarray(cv2.resize(photo.rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
-    return replace(photo, rgb=rgb, intrinsics=scale @ photo.intrinsics)
+    body = photo.own_body
+    if body is not None:
+        body = np.asarray(cv2.resize(body.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST), bool)
+    return replace(photo, rgb=rgb, intrinsics=scale @ photo.intrinsics, own_body=body)
+
+
+def own_bodies(photos: Sequence[Photo]) -> tuple[OwnBody, ...]:
+    """What each camera sees of the car that carries it: the colours that its pixels mostly have."""
+    masks = {photo.camera: photo.own_body for photo in photos if photo.own_body is not None}
+    found = []
+    for camera, mask in masks.items():
+        mine = [photo.rgb for photo in photos if photo.camera == camera]
+        rgb = np.median(np.stack(mine[:: -(-len(mine) // MEDIAN_PHOTOS)]), axis=0)
+        found.append(OwnBody(camera, np.rint(np.dstack([rgb, 255.0 * mask])).astype(np.uint8)))
+    return tuple(found)
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ class Seen:
     depth: F32  # [m]; 0: nothing known
     label: ShortInts  # -1 background, row of a track, SHALLOW
     sky: Bools
-    passing: Bools  # pixels at or behind something that drives: no witnesses of the street
+    passing: Bools  # pixels at or behind something that drives, or of the own body: no witnesses of the street
 
 
 def see(
@@ -62,7 +62,9 @@ def see(
     if not per_track:  # without lidar on them nothing but their boxes tells what hides the street behind it
         hidden = (depth > 0.0) & behind(depth, boxes[valid])
         depth, label = np.where(hidden, np.float32(0.0), depth), np.where(hidden, np.int32(SHALLOW), label)
-    unknown = depth == 0.0
+    own = np.zeros((height, width), bool) if photo.own_body is None else photo.own_body
+    depth = np.where(own, np.float32(0.0), depth)
+    unknown = (depth == 0.0) & ~own
     bright = may_be_sky(rgb)
     hints, camera = _hints(depth), (photo.intrinsics, photo.world_from_camera)
     if known.corners is None:
@@ -77,7 +79,7 @@ def see(
     else:
         guess, sky = hints[0], unknown & (bright | (hints[0] == 0.0))
     depth = np.where(unknown & ~sky, guess, depth).astype(np.float32)
-    passing = behind(np.where(depth > 0, depth, np.float32(FAR_M)), boxes[valid & tracks.driving])
+    passing = behind(np.where(depth > 0, depth, np.float32(FAR_M)), boxes[valid & tracks.driving]) | own
     return Seen(depth, label, sky, passing)
 
 
