@@ -187,7 +187,7 @@ class Imaging:
             "camera": camera,
             "time_s": float(time_s),
             "ego_pose": pose.ravel(),
-            "jpeg": encode_jpeg(rgb, self.settings.jpeg_quality),
+            "jpeg": encode_jpeg(rgb, self.settings.jpeg_quality, self.settings.jpeg_chroma),
         }
 
     def _rig(self, cameras: Sequence[Camera]) -> list[dict[str, object]]:

@@ -8,7 +8,7 @@ from types import MappingProxyType
 import cv2
 import numpy as np
 
-from tasks.render.views import undistorted
+from tasks.render.views import straightened, undistorted
 from tasks.world.arrays import Bools
 from tasks.world.camera import Camera
 
@@ -63,7 +63,10 @@ def refuse_unknown_masks(folder: str, rig: Sequence[Camera]) -> None:
 def resized_mask(mask: Bools, camera: Camera, width: int, height: int) -> Bools:
     """A mask (H, W) as its camera's photos are shown: without distortion, the middle, width x height."""
     left, top, w, h = camera.window(width, height)
-    flat = undistorted(mask.astype(np.uint8) * 255, camera)[top : top + h, left : left + w]
+    grey = mask.astype(np.uint8) * 255
+    if camera.fisheye is not None:
+        grey = straightened(grey, camera.fisheye)
+    flat = undistorted(grey, camera)[top : top + h, left : left + w]
     return np.asarray(cv2.resize(flat, (width, height), interpolation=cv2.INTER_AREA) >= WHITE)
 
 

@@ -33,7 +33,7 @@ from factory.store.identity import canonical_json
 from tasks.render.scene.asset import BlockRange, ClassQuality, Exposure, OwnBody, RenderAsset, TakenFrom, ViewQuality
 from tasks.render.scene.sky import SkyMap
 from tasks.render.splatting.gaussians import Gaussians
-from tasks.world.camera import Camera
+from tasks.world.camera import Camera, Fisheye
 
 FORMAT, VERSION = "driving-data-factory scene", 1
 MEASURES = ("psnr_db", "ssim", "lpips", "away_m")  # of views and their classes: NaN or infinite, maybe
@@ -124,7 +124,7 @@ def tensors_of(asset: RenderAsset) -> dict[str, NDArray[Any]]:
 def described_by(asset: RenderAsset) -> dict[str, Any]:
     """What of the scene is no array, as plain JSON values; NaN is null."""
     block = asset.block
-    rig = [asdict(camera) | {name: getattr(camera, name).tolist() for name in CALIBRATED} for camera in asset.rig]
+    rig = [_calibration(camera) for camera in asset.rig]
     taken = [[photo.camera, photo.time_s] for photo in asset.taken]
     bodies = [body.camera for body in asset.bodies]
     return {
@@ -162,10 +162,7 @@ def scene_of(tensors: Tensors, described: Mapping[str, Any], digest: str) -> Ren
             for i, (camera, time_s) in enumerate(described["exposures"])
         ),
         block=block,
-        rig=tuple(
-            Camera(**camera | {name: np.array(camera[name], np.float64) for name in CALIBRATED})
-            for camera in described.get("rig", ())
-        ),
+        rig=tuple(_camera(camera) for camera in described.get("rig", ())),
         taken=tuple(
             TakenFrom(camera, time_s, tensors["taken"][i])
             for i, (camera, time_s) in enumerate(described.get("taken", ()))
@@ -188,6 +185,19 @@ def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
     numbers = {name: _number(value) for name, value in values.items() if isinstance(value, float)}
     parts = {name: [_plain(part) for part in value] for name, value in values.items() if isinstance(value, tuple)}
     return dict(values) | numbers | parts
+
+
+def _calibration(camera: Camera) -> dict[str, Any]:
+    plain = {name: getattr(camera, name) for name in ("name", "width", "height")}
+    plain |= {name: getattr(camera, name).tolist() for name in CALIBRATED}
+    lens = camera.fisheye
+    return plain if lens is None else plain | {"fisheye": [lens.intrinsics.tolist(), lens.terms.tolist()]}
+
+
+def _camera(plain: Mapping[str, Any]) -> Camera:
+    arrays = {name: np.array(plain[name], np.float64) for name in CALIBRATED}
+    lens = Fisheye(*(np.array(part, np.float64) for part in plain["fisheye"])) if "fisheye" in plain else None
+    return Camera(**dict(plain) | arrays | {"fisheye": lens})
 
 
 def _view(plain: Mapping[str, Any]) -> ViewQuality:

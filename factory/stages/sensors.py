@@ -16,12 +16,17 @@ from factory.stages.own_body import NO_MASKS, resized_mask
 from tasks.render.scene.driven_road import driven_road
 from tasks.render.scene.features import NOTHING_KNOWN, Known
 from tasks.render.scene.sensed import Photo, Sweep, on_ego
-from tasks.render.views import undistorted
+from tasks.render.settings import Chroma
+from tasks.render.views import straightened, undistorted
 from tasks.world.arrays import Bools, Bytes
 from tasks.world.camera import Camera, SensorFile
 from tasks.world.clip import Block, Clip
 
 XYZ, INTENSITY = ("x", "y", "z"), "intensity"
+SAMPLING: Mapping[Chroma, int] = {
+    "420": cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420,
+    "444": cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
+}
 NO_PICTURE = 1.0  # standard deviation [grey levels] that a photo has at least, at night too
 
 
@@ -81,9 +86,10 @@ def chosen_cameras(rig: Sequence[Camera], names: Sequence[str] | None) -> tuple[
     return tuple(by_name[name] for name in names)
 
 
-def encode_jpeg(image: Bytes, quality: int) -> bytes:
-    """An rgb image (H, W, 3) as JPEG bytes; quality 1..100."""
-    done, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
+def encode_jpeg(image: Bytes, quality: int, chroma: Chroma = "420") -> bytes:
+    """An rgb image (H, W, 3) as JPEG bytes; quality 1..100, colour at half the size each way (420) or whole (444)."""
+    how = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, SAMPLING[chroma]]
+    done, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), how)
     if not done:
         raise ValueError(f"no JPEG of an image of shape {image.shape}")
     return data.tobytes()
@@ -100,9 +106,9 @@ def decode_image(data: bytes, name: str) -> Bytes:
 
 
 def opened_photos(files: Sequence[SensorFile], cameras: Sequence[Camera]) -> Iterator[tuple[int, Bytes]]:
-    """Row and picture of each file of the `cameras`, as it was taken, one in memory at a time. Raises BadClip.
+    """Row and picture of each file of the `cameras`, one in memory at a time, as it was taken but for a fisheye's.
 
-    A video is gone through once.
+    A video is gone through once. Raises BadClip.
     """
     took = {camera.name: camera for camera in cameras}
     for row, image in _opened(files, took):
@@ -110,7 +116,7 @@ def opened_photos(files: Sequence[SensorFile], cameras: Sequence[Camera]) -> Ite
         if image.shape[:2] != (camera.height, camera.width):
             size = f"{image.shape[1]}x{image.shape[0]}"
             raise BadClip(file.uri, "size", f"{size}, but {camera.name} takes {camera.width}x{camera.height}")
-        yield row, image
+        yield row, image if camera.fisheye is None else straightened(image, camera.fisheye)
 
 
 def _opened(files: Sequence[SensorFile], took: Mapping[str, Camera]) -> Iterator[tuple[int, Bytes]]:

@@ -20,6 +20,9 @@ REMOVED: dict[str, dict[str, object]] = {
 }
 
 
+Chroma = Literal["420", "444"]
+
+
 class RenderMode(StrEnum):
     AUTO = "auto"  # from the block's scene where its sensors allow one, else no images
     MAP = "map"  # lanes, paint and boxes on plain ground; marked as such
@@ -98,6 +101,7 @@ class RenderSettings:
     width: int = 320  # pixels
     height: int = 180  # pixels
     jpeg_quality: int = 90  # 1 to 100
+    jpeg_chroma: Chroma = "420"  # colours at half the size each way; 444: whole
     psnr_min: float = 27.0  # [dB] what a block's held-out photos must come out with; 0: anything
     camera_psnr_min: float = 20.0  # [dB] and those of each of its cameras; 0: anything
     psnr_gate: PsnrGate = PsnrGate.REJECT  # what becomes of a block below psnr_min

@@ -9,7 +9,7 @@ from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.engine import Backend, render, vehicles_at
 from tasks.world.agents import AgentTracks
 from tasks.world.arrays import Array, Bytes
-from tasks.world.camera import Camera, Pinhole
+from tasks.world.camera import Camera, Fisheye, Pinhole
 from tasks.world.clip import STEP_S
 from tasks.world.vehicle import HEADING, X, Y
 
@@ -68,6 +68,14 @@ def undistorted(image: Bytes, camera: Camera) -> Bytes:
     seen_y = y * stretch + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
     map_x, map_y = (fx * seen_x + cx - 0.5).astype(np.float32), (fy * seen_y + cy - 0.5).astype(np.float32)
     return np.asarray(cv2.remap(image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+
+
+def straightened(image: Bytes, lens: Fisheye) -> Bytes:
+    """A fisheye's photo (H, W, 3), or a mask of it (H, W), as a pinhole of the same intrinsics takes it."""
+    to_first_centre = np.array([[1.0, 0.0, -0.5], [0.0, 1.0, -0.5], [0.0, 0.0, 1.0]])  # OpenCV's pixels begin there
+    k, size = to_first_centre @ lens.intrinsics, (image.shape[1], image.shape[0])
+    maps = cv2.fisheye.initUndistortRectifyMap(k, lens.terms, np.eye(3), k, size, cv2.CV_32FC1)
+    return np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
 def pose_on_ground(logged: Array, ego_states: Array) -> Array:

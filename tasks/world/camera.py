@@ -10,6 +10,18 @@ ROTATION_SLACK = 1e-3  # of calibrations written with few digits
 
 
 @dataclass(frozen=True)
+class Fisheye:
+    """A lens by the angle theta to its axis, as OpenCV's `fisheye` has it (Kannala and Brandt 2006).
+
+    What is seen at theta lies theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) focal lengths from the
+    centre. Photos become those of a pinhole with the same `intrinsics` as they are opened.
+    """
+
+    intrinsics: Array  # (3, 3) pixels
+    terms: Array  # (4,) k1, k2, k3, k4
+
+
+@dataclass(frozen=True)
 class Camera:
     """A pinhole camera with lens distortion, mounted on the ego. Camera frame: x right, y down, z forward.
 
@@ -23,6 +35,7 @@ class Camera:
     intrinsics: Array  # (3, 3) pixels
     distortion: Array  # (5,) k1, k2, p1, p2, k3; zeros for an undistorted image
     ego_from_camera: Array  # (4, 4) rigid
+    fisheye: Fisheye | None = None  # the lens its photos were taken with, which all else knows nothing of
 
     def __post_init__(self) -> None:
         for name, shape in (("intrinsics", (3, 3)), ("distortion", (5,)), ("ego_from_camera", (4, 4))):

@@ -12,7 +12,7 @@ from factory.readers.scenarionet.sidecars import cameras_in, load_sidecar
 from factory.readers.videos import frame_uri
 from tasks.world.arrays import Array
 from tasks.world.bounds import all_within
-from tasks.world.camera import ROTATION_SLACK, Camera, SensorFile
+from tasks.world.camera import ROTATION_SLACK, Camera, Fisheye, SensorFile
 from tasks.world.clip import STEP_S
 from tasks.world.frames import upright, wrap_angle
 from tasks.world.vehicle import HEADING, X, Y
@@ -139,9 +139,14 @@ def _camera(name: str, fields: Mapping[str, Any], file: str, under: str) -> Came
     distortion = np.zeros(5)
     if "distortion" in fields:
         distortion = _array(fields["distortion"], (5,), file, under + "distortion")
+    fisheye = None
+    if "fisheye" in fields:
+        if distortion.any():
+            raise BadClip(file, under + "fisheye", "a lens is either a fisheye or has `distortion`")
+        fisheye = Fisheye(intrinsics, _array(fields["fisheye"], (4,), file, under + "fisheye"))
     mount = _rigid(fields.get("cam_to_ego"), file, under + "cam_to_ego")
     try:
-        return Camera(name, width, height, intrinsics, distortion, mount)
+        return Camera(name, width, height, intrinsics, distortion, mount, fisheye)
     except ValueError as error:
         raise BadClip(file, under.rstrip(".") or "camera", str(error)) from error
 

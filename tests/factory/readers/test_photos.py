@@ -233,6 +233,8 @@ BAD: list[tuple[Callable[[Sidecar], object], str]] = [
     (camera("K", [[-50, 0, 32], [0, 50, 24], [0, 0, 1]]), "cameras.left: camera left: intrinsics: focal lengths"),
     (camera("distortion", [0.1] * 4), r"cameras.left.distortion: shape \(4,\), expected 5 numbers"),
     (camera("distortion", [math.nan] * 5), "cameras.left.distortion: holds NaN, infinity or numbers beyond 1e8"),
+    (camera("fisheye", [0.1] * 5), r"cameras.left.fisheye: shape \(5,\), expected 4 numbers"),
+    (lambda c: c["cameras"]["left"].update(fisheye=[0] * 4, distortion=[0.1] * 5), "cameras.front.fisheye: a lens"),
     (camera("cam_to_ego", {"R": K}), "cameras.left.cam_to_ego.t: missing, expected 3 numbers"),
     (camera("cam_to_ego", {"R": K, "t": [0, 0, 0]}), "cameras.left.cam_to_ego: is not a rotation and a shift"),
     (camera("cam_to_ego", np.diag([1.0, 1.0, -1.0, 1.0]).tolist()), "cameras.left.cam_to_ego: mirrors"),
