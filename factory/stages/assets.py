@@ -26,9 +26,10 @@ from factory.stages.scene_file import SUFFIX, BadScene, read_scene, write_scene
 from factory.stages.sensors import block_of, chosen_cameras, load_sensors, load_sweeps, taken_by
 from factory.store.illness import own_place
 from tasks.render.fit.lpips import lpips_of
-from tasks.render.scene.asset import BlockRange, RenderAsset, TakenFrom
+from tasks.render.scene.asset import BlockRange, RenderAsset, TakenFrom, rises_of
 from tasks.render.scene.build import build_asset
 from tasks.render.scene.lidar_only import lidar_asset
+from tasks.render.scene.movers import lifted
 from tasks.render.scene.sensed import own_bodies
 from tasks.render.scene.settings import Backend
 from tasks.render.scene.stereo import MAX_BASELINE_M, MIN_BASELINE_M
@@ -100,24 +101,33 @@ def asset_for(
                     said_again(path, block, cameras, settings.rig, masks)
                 return kept
         if made_of is not Sensing.LIDAR_ONLY:
-            found = None
+            agents, taken, found = block.agents, tuple[TakenFrom, ...](), None
             if wanted(block, settings.rig):
+                given = block.images
                 block, cameras, found = corrected_rig(path, block, cameras, settings.rig, masks)
+                taken = taken_from(given, block.images) if found is not None else ()
+                agents = lifted(agents, *rises_of(taken))
             data = load_sensors(block, cameras, settings.width, settings.height, masks)
             if found is not None:
                 data = replace(data, known=known_of(data, block, found))
             if settings.scene is SceneFrom.FIT:
                 lpips = lpips_of(settings.lpips) if settings.lpips else None
-                asset = fitted(path, data, block.agents, settings.fit, threads, stopped, settings.backend, lpips)
+                asset = fitted(path, data, agents, settings.fit, threads, stopped, settings.backend, lpips)
             else:
-                asset = build_asset(data.photos, data.sweeps, block.agents, settings.asset, data.known)
-            if found is not None:
-                taken = (TakenFrom(file.sensor, file.time_s, file.world_from_ego) for file in block.images)
-                asset = replace(asset, rig=cameras, taken=tuple(taken))
-            asset = replace(asset, bodies=own_bodies(data.photos))
+                asset = build_asset(data.photos, data.sweeps, agents, settings.asset, data.known)
+            asset = replace(asset, rig=cameras if taken else (), taken=taken, bodies=own_bodies(data.photos))
         else:
             asset = lidar_asset(load_sweeps(block.sweeps, with_intensity=True), block.agents)
         return write_scene(path, replace(asset, block=range_of(clip, block)))
+
+
+def taken_from(given: Sequence[SensorFile], used: Sequence[SensorFile]) -> tuple[TakenFrom, ...]:
+    """Where the photos that are used of those given were taken."""
+    logged = {(file.sensor, file.time_s): file.world_from_ego[2, 3] for file in given}
+    return tuple(
+        TakenFrom(f.sensor, f.time_s, f.world_from_ego, float(f.world_from_ego[2, 3] - logged[f.sensor, f.time_s]))
+        for f in used
+    )
 
 
 def scene_path(clip: Clip, settings: RenderSettings, cache_dir: str | Path) -> Path:

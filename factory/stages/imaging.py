@@ -119,11 +119,12 @@ class Imaging:
         album = _kept_album(_of_block(clip, self.settings, self.cache_dir)) if looks else None
         states = np.concatenate([candidate.rollout.ego_states, judged.rollout.ego_states[1:]])
         asset = in_time_of(clip, _block(clip, self.settings, self.cache_dir))
+        agents = judged.scene.agents.overwritten(now, judged.rollout.agents)
         return unfit(
             asset,
             asset.as_corrected(chosen_cameras(clip.cameras, self.settings.cameras)),
-            pose_on_ground(clip.world_from_ego, states[[step - start for step in steps]]),
-            judged.scene.agents.overwritten(now, judged.rollout.agents),
+            pose_on_ground(asset.on_road(clip.world_from_ego), states[[step - start for step in steps]]),
+            asset.lifted(agents, first_of(clip)),
             steps,
             (self.settings.width, self.settings.height),
             self.settings.gate,
@@ -148,14 +149,16 @@ class Imaging:
     ) -> dict[str, object]:
         scene, rollout = judged.scene, judged.rollout
         offsets = STEPS_OF[self.settings.frames]
-        poses = pose_on_ground(clip.world_from_ego, self._ego_states(judged))
+        logged = clip.world_from_ego if asset is None else asset.on_road(clip.world_from_ego)
+        poses = pose_on_ground(logged, self._ego_states(judged))
         agents = scene.agents.overwritten(scene.step, rollout.agents)
         steps = [scene.step + offset for offset in offsets]
         seen = (cameras, poses, agents, steps, self.settings.width, self.settings.height)
         if asset is None:
             images = draw_map_views(clip.road_map, *seen)
         else:
-            images = render_views(asset, *seen, self.settings.backend)
+            lifted = asset.lifted(agents, first_of(clip))
+            images = render_views(asset, cameras, poses, lifted, *seen[3:], self.settings.backend)
         found = [
             self._image(camera.name, offset * STEP_S, poses[f], images[f, c])
             for f, offset in enumerate(offsets)
@@ -229,7 +232,12 @@ def _block(clip: Clip, settings: RenderSettings, cache_dir: str) -> RenderAsset:
 
 def in_time_of(clip: Clip, asset: RenderAsset) -> RenderAsset:
     """The scene of a clip's block, its times counted from the clip's first step."""
-    return asset.since(clip.start_s - block_of(clip).start_s)
+    return asset.since(first_of(clip))
+
+
+def first_of(clip: Clip) -> float:
+    """Seconds from the first step of a clip's block to its own."""
+    return clip.start_s - block_of(clip).start_s
 
 
 def scene_lookups() -> tuple[int, int]:
@@ -269,7 +277,8 @@ def album_of(clip: Clip, asset: RenderAsset, settings: RenderSettings) -> Album:
     """The photos of a clip's block; one is opened when a vehicle is first held against it. Raises BadClip then."""
     block, cameras = block_of(clip), asset.as_corrected(chosen_cameras(clip.cameras, settings.cameras))
     files = asset.photos_of(block.images)
-    shown = sightings(files, cameras, block.agents)
+    agents = asset.lifted(block.agents, 0.0)
+    shown = sightings(files, cameras, agents)
     tracks: dict[int, list[str]] = {}
     for track_id, seen in shown.items():
         for row in seen.photos:
@@ -280,7 +289,7 @@ def album_of(clip: Clip, asset: RenderAsset, settings: RenderSettings) -> Album:
     def likeness(track_id: str, row: int) -> float:
         if row not in known:
             (photo,) = load_photos([files[row]], cameras, *size)
-            known[row] = likeness_to_photo(asset, photo, block.agents, tracks[row], settings.backend)
+            known[row] = likeness_to_photo(asset, photo, agents, tracks[row], settings.backend)
         return known[row][track_id]
 
     return Album(shown, likeness)

@@ -125,7 +125,7 @@ def described_by(asset: RenderAsset) -> dict[str, Any]:
     """What of the scene is no array, as plain JSON values; NaN is null."""
     block = asset.block
     rig = [_calibration(camera) for camera in asset.rig]
-    taken = [[photo.camera, photo.time_s] for photo in asset.taken]
+    taken = [[photo.camera, photo.time_s, photo.rise_m] for photo in asset.taken]
     bodies = [body.camera for body in asset.bodies]
     return {
         "format": FORMAT,
@@ -164,8 +164,8 @@ def scene_of(tensors: Tensors, described: Mapping[str, Any], digest: str) -> Ren
         block=block,
         rig=tuple(_camera(camera) for camera in described.get("rig", ())),
         taken=tuple(
-            TakenFrom(camera, time_s, tensors["taken"][i])
-            for i, (camera, time_s) in enumerate(described.get("taken", ()))
+            TakenFrom(camera, time_s, tensors["taken"][i], *more)
+            for i, (camera, time_s, *more) in enumerate(described.get("taken", ()))
         ),
         bodies=tuple(OwnBody(camera, tensors[f"bodies.{i}"]) for i, camera in enumerate(described.get("bodies", ()))),
     )

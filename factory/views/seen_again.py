@@ -111,7 +111,7 @@ def real_and_rendered(
 
     `photos`: VIEW_COLUMNS of a human sample, whose agents are the log's; `only` these cameras, all for none.
     """
-    agents, pairs, scene = agents_of(photos), [], _in_time_of(photos, asset)
+    agents, pairs, scene = _agents_in(photos, asset), [], _in_time_of(photos, asset)
     for camera in sorted(photos["cameras"], key=_looks_right):
         mine = [image for image in photos["images"] if image["camera"] == camera["name"]]
         if only and camera["name"] not in only:
@@ -120,8 +120,7 @@ def real_and_rendered(
         if nearest is None:
             continue
         photo = decoded(nearest)
-        pose = np.reshape(nearest["ego_pose"], (4, 4))
-        (again,) = drawn(scene, [camera], pose, agents, nearest["time_s"])
+        (again,) = drawn(scene, *_as_taken(asset, camera, nearest, _now(photos)), agents, nearest["time_s"])
         gap = _now(photos) + nearest["time_s"] - at_s
         said = "at the sample's now" if abs(gap) < STEP_S / 2 else f"{gap:+.1f} s from the sample's now"
         pairs.append(
@@ -144,7 +143,7 @@ def from_the_side(asset: RenderAsset, row: Row) -> list[CaptionedPicture]:
     front = front_camera(row)
     if front is None:
         return []
-    rig, agents = [camera for camera in row["cameras"] if camera["name"] == front], agents_of(row)
+    rig, agents = [camera for camera in row["cameras"] if camera["name"] == front], _agents_in(row, asset)
     scene = _in_time_of(row, asset)
     out = []
     for aside_m in ASIDE_M:
@@ -180,7 +179,7 @@ def film(row: Row, asset: RenderAsset | None, logged: Array | None = None) -> It
 
     A rendered sample is drawn anew at every step where its scene is at hand; else stored images stand until the next.
     """
-    agents = agents_of(row)
+    agents = agents_of(row) if asset is None else _agents_in(row, asset)
     scene = _in_time_of(row, asset) if asset is not None and row["image_source"] == ImageSource.RENDER else None
     for step in range(AGENT_STEPS):
         time_s = (step - NOW_INDEX) * STEP_S
@@ -210,8 +209,31 @@ def _standing(row: Row, time_s: float) -> Iterable[Image]:
 
 def _in_time_of(row: Row, asset: RenderAsset) -> RenderAsset:
     """The scene, its times counted as those of the row's agents."""
-    first_s = _now(row) - NOW_INDEX * STEP_S
-    return asset if asset.block is None else asset.since(first_s - asset.block.start_s)
+    return asset.since(_first_of(row, asset))
+
+
+def _agents_in(row: Row, asset: RenderAsset) -> AgentTracks:
+    """The row's agents as high above the scene's road as they were logged."""
+    return asset.lifted(agents_of(row), _first_of(row, asset))
+
+
+def _first_of(row: Row, asset: RenderAsset) -> float:
+    """Seconds from the first step of the scene's block to that of the row's agents."""
+    return 0.0 if asset.block is None else _now(row) - NOW_INDEX * STEP_S - asset.block.start_s
+
+
+def _as_taken(
+    asset: RenderAsset, camera: Mapping[str, Any], image: Mapping[str, Any], now_s: float
+) -> tuple[list[Mapping[str, Any]], Array]:
+    """Camera and pose (4, 4) of a photo as the scene has them, where it corrected them, else as the row has them."""
+    if asset.block is not None:
+        at_s = now_s + image["time_s"] - asset.block.start_s
+        taken = [p.world_from_ego for p in asset.taken if p.camera == camera["name"] and abs(p.time_s - at_s) < 1e-3]
+        rig = [mine.resized(camera["width"], camera["height"]) for mine in asset.rig if mine.name == camera["name"]]
+        if taken and rig:
+            calibration = {"intrinsics": rig[0].intrinsics, "ego_from_camera": rig[0].ego_from_camera}
+            return [dict(camera) | calibration], taken[0]
+    return [camera], np.reshape(image["ego_pose"], (4, 4))
 
 
 def drawn(

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tasks.render.scene.boxes import box_gaussians
-from tasks.render.scene.movers import world_from_boxes
+from tasks.render.scene.movers import lifted, world_from_boxes
 from tasks.render.scene.sky import SkyMap
 from tasks.render.splatting.gaussians import Gaussians, concatenate, moved
-from tasks.world.agents import AgentKind
+from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import F32, Array, Bools, Bytes
 from tasks.world.camera import Camera, SensorFile
 
@@ -88,6 +88,7 @@ class TakenFrom:
     camera: str
     time_s: float  # since the block's first step
     world_from_ego: Array  # (4, 4)
+    rise_m: float = 0.0  # higher than the log has it
 
 
 @dataclass(frozen=True)
@@ -125,6 +126,16 @@ class RenderAsset:
         mine = [file for file in files if (file.sensor, file.time_s) in poses]
         return tuple(replace(file, world_from_ego=poses[file.sensor, file.time_s]) for file in mine)
 
+    def on_road(self, logged: Array) -> Array:
+        """Poses (S, 4, 4) of the ego that say how high the scene's road is and how it leans: the `logged` ones, or
+        those of its photos where these were corrected."""
+        return np.stack([photo.world_from_ego for photo in self.taken]) if self.taken else logged
+
+    def lifted(self, agents: AgentTracks, first_s: float) -> AgentTracks:
+        """Tracks whose first step is at `first_s` of the block, as high above the scene's road as they were logged."""
+        times, rises = rises_of(self.taken)
+        return lifted(agents, times - first_s, rises)
+
     def since(self, first_s: float) -> "RenderAsset":
         """The same scene, its times counted from `first_s` on, as a clip within the block counts them."""
         moved = (replace(exposure, time_s=exposure.time_s - first_s) for exposure in self.exposures)
@@ -142,6 +153,12 @@ class RenderAsset:
         first, last = mine[after - 1], mine[after]
         share = np.float32((time_s - first.time_s) / (last.time_s - first.time_s))
         return np.asarray(first.affine + share * (last.affine - first.affine), np.float32)
+
+
+def rises_of(taken: Sequence[TakenFrom]) -> tuple[Array, Array]:
+    """Times (T,) of photos, ascending, and how much higher (T,) [m] they were taken than the log has it."""
+    rows = np.array(sorted((photo.time_s, photo.rise_m) for photo in taken)).reshape(-1, 2)
+    return rows[:, 0], rows[:, 1]
 
 
 def camera_psnr_db(asset: RenderAsset) -> dict[str, float]:

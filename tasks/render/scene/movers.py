@@ -1,5 +1,6 @@
 """Boxes that move: where they are at an instant, and which points are theirs."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,19 @@ def boxes_at(agents: AgentTracks, time_s: float) -> tuple[Array, Bools]:
     heading = first[:, 2] + share * wrap_angle(second[:, 2] - first[:, 2])
     boxes = np.column_stack([xy, z, heading, first[:, 3:5], agents.heights])
     return boxes, agents.valid[before] & agents.valid[after]
+
+
+def lifted(agents: AgentTracks, times_s: Array, rises_m: Array) -> AgentTracks:
+    """The tracks moved up by `rises_m` (T,) at `times_s` (T,), ascending, in seconds since their first step.
+
+    A box is logged as high as its sensor saw it above the ego's own road; where photos say that this lies higher or
+    lower than the log has it, so does the box. What they say of the ego's place in the plane moves no box: on nuScenes,
+    where boxes come with better poses than photos here, they fit the photos as they are.
+    """
+    if len(times_s) == 0:
+        return agents
+    rise = np.interp(np.arange(agents.n_steps) * STEP_S, times_s, rises_m)
+    return replace(agents, center_z=agents.center_z + rise[:, None])
 
 
 def world_from_boxes(boxes: Array) -> Array:
