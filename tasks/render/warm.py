@@ -45,7 +45,7 @@ def compile_rig_kernels() -> Bundle:
         np.zeros((32, 32), np.float32),
         np.ones((32, 32), bool),
     )
-    wide_depth(rgb, nowhere, everywhere, partners(photo, photos, 2), k, photo.world_from_camera, everywhere)
+    wide_depth(rgb, nowhere, nowhere, partners(photo, photos, 2), k, photo.world_from_camera, everywhere)
     confirmed(photos, [nowhere] * len(photos))
     files = [SensorFile(p.camera, "", p.time_s, p.world_from_camera @ np.linalg.inv(FRONT)) for p in photos]
     rig, shots = given_rig([Camera(photo.camera, 32, 32, k, np.zeros(5), FRONT)], files)

@@ -13,7 +13,7 @@ from torch.nn.functional import pad
 from tasks.render.fit.adam import BETA1, BETA2, EPSILON
 from tasks.render.fit.backdrop import HIDDEN
 from tasks.render.fit.losses import C1, C2, SIGMA, WINDOW
-from tasks.render.fit.road import CELL_M, SLACK_M, THICKNESS_M, Road
+from tasks.render.fit.road import CELL_M, LONGEST_M, SLACK_M, THICKNESS_M, Road
 from tasks.render.scene.sky import COLUMNS, ROWS
 from tasks.world.arrays import Array
 
@@ -143,6 +143,7 @@ def lay_flat(means: Tensor, quats: Tensor, log_scales: Tensor, rows: Tensor, roa
     height, slope_x, slope_y = here.unbind(1)
     means[rows, 2] = torch.minimum(torch.maximum(z, height - SLACK_M), height + SLACK_M).float()
     log_scales[rows, 2] = log_scales[rows, 2].clamp(max=math.log(THICKNESS_M))
+    log_scales[rows, :2] = log_scales[rows, :2].clamp(max=math.log(LONGEST_M))
     quats[rows] = _upright(quats[rows].double(), slope_x, slope_y).float()
 
 

@@ -24,6 +24,9 @@ LEAST_POINTS = 30
 ALONG_M = 4.0  # a plane is fitted about this often
 SLACK_M = 0.02  # how far a road Gaussian may leave the lidar's surface
 THICKNESS_M = 0.005  # of a road Gaussian
+# Standard deviation: a rasteriser draws a Gaussian as it looks at its middle, and one that reaches from afar to beneath
+# the camera hangs as a veil before what is above the horizon.
+LONGEST_M = 0.8
 
 
 @dataclass(frozen=True)
@@ -129,7 +132,15 @@ def above_road(means: FloatArray, road: Road) -> Array:
 
 @kernel
 def _lay(
-    means: Any, quats: Any, log_scales: Any, rows: Any, heights: Any, slopes: Any, corner: Any, thick: float
+    means: Any,
+    quats: Any,
+    log_scales: Any,
+    rows: Any,
+    heights: Any,
+    slopes: Any,
+    corner: Any,
+    thick: float,
+    longest: float,
 ) -> None:
     for k in range(rows.shape[0]):
         i = rows[k]
@@ -137,7 +148,8 @@ def _lay(
         if z != z:
             continue
         means[i, 2] = min(max(means[i, 2], z - SLACK_M), z + SLACK_M)
-        log_scales[i, 2] = min(log_scales[i, 2], thick)
+        for axis in range(3):
+            log_scales[i, axis] = min(log_scales[i, axis], thick if axis == 2 else longest)
         # Turn the third axis onto the normal the shortest way: q' = (1 + a.n, a x n) q.
         w, x, y, s = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
         length = np.sqrt(w * w + x * x + y * y + s * s)
@@ -157,6 +169,6 @@ def _lay(
 
 
 def lay_flat(means: F32, quats: F32, log_scales: F32, rows: Ints, road: Road) -> None:
-    """Puts Gaussians at `rows` onto the road, in place: at most SLACK_M off it, no thicker than THICKNESS_M, their
-    third axis along its normal. Those beyond the road stay as they are."""
-    _lay(means, quats, log_scales, rows, road.heights, road.slopes, road.corner, float(np.log(THICKNESS_M)))
+    """Puts Gaussians at `rows` onto the road, in place: at most SLACK_M off it, no thicker than THICKNESS_M and
+    no longer than LONGEST_M, their third axis along its normal. Those beyond the road stay as they are."""
+    _lay(means, quats, log_scales, rows, road.heights, road.slopes, road.corner, *np.log([THICKNESS_M, LONGEST_M]))

@@ -4,15 +4,20 @@ Asphalt has few corners that photos could be matched by, and those found lie any
 them, a road is painted by what lies metres below it, and its paint breaks from half a metre beside the drive.
 """
 
+import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from tasks.world.arrays import Array
+from tasks.render.scene.stereo import FAR_M
+from tasks.world.arrays import F32, Array
 
 SPACING_M = 0.2  # of the points
 WIDE_M = 3.0  # to either side: nothing else stood where the ego drove
 AHEAD_M = 20.0  # straight on from where it was last
 CLEAR_M = 0.25  # a corner this high above the road stands on it
+COLUMNS_PX, STEPS_ALONG = 32, 40  # between rays that are followed to the road, and how they are
+SOME = 3000  # points that say how high it is
+NEAR_M, SEEN_M = 0.5, 200.0  # from where, and how far
 BESIDE_M = 10.0  # from the drive, as far as the road is taken to go on; below it is nothing
 
 
@@ -35,6 +40,33 @@ def driven_road(world_from_ego: Array, ground_m: float, spacing_m: float = SPACI
         middle = pose[:3, 3] + ground_m * pose[:3, 2] + along[:, None] * way
         parts.append((middle[:, None] + across[:, None] * pose[:3, 1]).reshape(-1, 3))
     return np.concatenate(parts)
+
+
+def road_depth(road: Array, eye: Array, rays: Array) -> F32:
+    """Depth (H, W) [m], FAR_M at most, at which `rays` (H, W, 3) from `eye` (3,) meet the `road` (M, 3); 0 above the
+    horizon.
+
+    Wherever it is looked at the road is as high as where the drive came nearest. Without one there is nothing below the
+    horizon that is too far.
+    """
+    height, width = rays.shape[:2]
+    if len(road) == 0:
+        return np.where(rays[..., 2] < 0.0, np.float32(FAR_M), np.float32(0.0))
+    few, road = rays[:, ::COLUMNS_PX], road[:: max(1, len(road) // SOME)]
+    along = np.geomspace(NEAR_M, SEEN_M, STEPS_ALONG)[:, None, None]
+    _, nearest = cKDTree(road[:, :2]).query(eye[:2] + along[..., None] * few[..., :2])
+    over = eye[2] + along * few[..., 2] - road[nearest, 2]
+    after = np.argmax(over <= 0.0, axis=0)[None]
+    before = np.maximum(after - 1, 0)
+    high, low = (np.take_along_axis(over, rows, axis=0) for rows in (before, after))
+    share = np.clip(high / np.maximum(high - low, 1e-9), 0.0, 1.0)
+    depth = (along[before[0], 0, 0] * (1.0 - share) + along[after[0], 0, 0] * share)[0]
+    # As high a plane everywhere would be met there, and planes can be taken between pixels.
+    met = np.where(low[0] <= 0.0, eye[2] + depth * few[..., 2], road[nearest[-1], 2])
+    u, v = np.meshgrid(np.arange(width, dtype=np.float32) / COLUMNS_PX, np.arange(height, dtype=np.float32))
+    plane = cv2.remap(met.astype(np.float32), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    depth = np.clip((eye[2] - plane) / np.maximum(-rays[..., 2], 1e-6), 0.0, FAR_M)
+    return np.where(rays[..., 2] < 0.0, depth, 0.0).astype(np.float32)
 
 
 def beside_road(points: Array, road: Array) -> Array:

@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 
 from tasks.render.scene.depth import dense_depth, sparse_depth
+from tasks.render.scene.driven_road import road_depth
 from tasks.render.scene.features import Points
 from tasks.render.scene.movers import behind_boxes, world_from_boxes
 from tasks.render.scene.sensed import Photo, Tracks
@@ -72,7 +73,7 @@ def see(
     else:
         anchors, _ = sparse_depth(known.corners, np.zeros(len(known.corners), np.int32), *camera, width, height)
         neighbours = partners(photo, others, stereo_photos)
-        sweep = partial(wide_depth, rgb, anchors, rays[..., 2] >= 0.0)
+        sweep = partial(wide_depth, rgb, anchors, road_depth(known.dense, eye, rays))
     if neighbours:
         guess, cost, sky_cost = sweep(neighbours, *camera, unknown)
         sky = unknown & ((bright & no_worse(sky_cost, cost)) | (guess >= FAR_M))

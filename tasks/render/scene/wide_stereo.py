@@ -25,6 +25,7 @@ GRID, DEPTHS_M = (6, 4), (5.0, 10.0, 25.0)  # where in a photo, and how far away
 OF_CAMERA, BEST_M = 2, 3.0  # photos of the same camera that are always asked, and the way to them that is best
 GOOD_DEG = (2.0, 35.0)  # between two rays to a point: depth is told well from the first on, nothing looks alike beyond
 LEAST_WORTH = 0.02  # share of a photo that another must add
+BELOW, SLACK = 0.4, 0.1  # cost of what lies below the road, and share of its depth by which it may be lower
 ANCHORED = 0.4  # cost of another depth where one is known
 BRIGHT_SKY, SMOOTH_SKY = (
     0.03,
@@ -35,11 +36,18 @@ FINER = (-0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75)  # of a level
 
 
 def wide_depth(
-    rgb: F32, anchors: F32, rises: Bools, others: Sequence[Compared], intrinsics: Array, pose: Array, wanted: Bools
+    rgb: F32,
+    anchors: F32,
+    floor: F32,
+    others: Sequence[Compared],
+    intrinsics: Array,
+    pose: Array,
+    wanted: Bools,
 ) -> tuple[F32, F32, F32]:
     """As `sweep_depth`: best depth (H, W) [m], its cost, and 0 where the sky is seen, infinity elsewhere.
 
-    `anchors` (H, W): depths that are known, 0 elsewhere; `rises` (H, W): above the horizon, where alone sky may be.
+    `anchors` (H, W): depths that are known, 0 elsewhere; `floor` (H, W): depths of the road, below which nothing is,
+    0 above the horizon, where alone there may be sky.
     """
     here, there = locally_normalised(rgb), [(locally_normalised(other), k, at) for other, k, at in others]
     inverse = np.linspace(1.0 / NEAREST_M, 1.0 / FARTHEST_M, LEVELS)
@@ -53,7 +61,8 @@ def wide_depth(
         volume[level] = cv2.blur(np.minimum(raw, COST_MAX), (COARSE_PX, COARSE_PX))
     step = float(inverse[0] - inverse[1])
     _anchor(volume, anchors, float(inverse[0]), step)
-    bright = may_be_sky(rgb) & rises
+    _stand_on(volume, np.ascontiguousarray(floor[::2, ::2]), float(inverse[0]), step, BELOW, SLACK)
+    bright = may_be_sky(rgb) & (floor == 0.0)
     smooth = bright & smooth_around(rgb, bright)
     favour = BRIGHT_SKY * np.where(bright, 1.0, -1.0) + SMOOTH_SKY * smooth
     volume[-1] -= favour[::2, ::2][: shape[0], : shape[1]].astype(np.float32)
@@ -141,6 +150,17 @@ def _anchor(volume: Any, anchors: Any, first: float, step: float) -> None:
                 for level in range(volume.shape[0]):
                     if abs(level - at) > 1.5:
                         volume[level, row, column] += ANCHORED
+
+
+@kernel
+def _stand_on(volume: Any, floor: Any, first: float, step: float, more: float, slack: float) -> None:
+    """Adds to the costs (L, h, w) of levels that lie below the floor (h, w) by more than a share of its depth."""
+    for y in range(volume.shape[1]):
+        for x in range(volume.shape[2]):
+            if floor[y, x] > 0.0:
+                at = (first - 1.0 / (floor[y, x] * (1.0 + slack))) / step
+                for level in range(max(0, int(np.ceil(at))), volume.shape[0]):
+                    volume[level, y, x] += more
 
 
 @kernel

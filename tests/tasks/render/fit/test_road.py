@@ -1,8 +1,9 @@
 """The road found in lidar points, and Gaussians laid on it."""
 
 import numpy as np
+import pytest
 
-from tasks.render.fit.road import THICKNESS_M, above_road, find_road, lay_flat
+from tasks.render.fit.road import LONGEST_M, THICKNESS_M, above_road, find_road, lay_flat
 from tasks.render.splatting.gaussians import rotations_of
 
 RNG = np.random.default_rng(0)
@@ -37,11 +38,13 @@ def test_road_gaussians_lie_flat_on_the_surface_and_keep_their_heading() -> None
     quats = RNG.normal(size=(50, 4)).astype(np.float32)
     quats[0] = np.array([np.cos(0.4), 0.0, 0.0, np.sin(0.4)])  # flat already, turned by 0.8 rad
     log_scales = np.full((50, 3), np.log(0.1), np.float32)
+    log_scales[1, 0], log_scales[45, 0] = np.log(4.0), np.log(4.0)
     others = means[40:].copy()
     lay_flat(means, quats, log_scales, np.arange(40), road)
     turns = rotations_of(quats / np.linalg.norm(quats, axis=1, keepdims=True))
     assert (np.abs(turns[:40, 2, 2]) > 0.995).all()
     assert (np.abs(above_road(means[:40], road)) < 0.021).all()
     assert (log_scales[:40, 2] <= np.log(THICKNESS_M) + 1e-6).all()
+    assert np.exp(log_scales[[1, 45, 0], 0]) == pytest.approx([LONGEST_M, 4.0, 0.1])
     assert np.isclose(np.arctan2(turns[0, 1, 0], turns[0, 0, 0]), 0.8, atol=0.05)
     np.testing.assert_array_equal(means[40:], others)

@@ -43,7 +43,7 @@ def swept(gain: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     compared = partners(here, brighter, 4)
     assert len(compared) == 2
     camera = here.intrinsics, here.world_from_camera
-    found, cost, sky_cost = wide_depth(rgb, NOTHING, ALL, compared, *camera, ALL)
+    found, cost, sky_cost = wide_depth(rgb, NOTHING, NOTHING, compared, *camera, ALL)
     assert np.isinf(sky_cost).mean() > 0.95 and np.median(cost) < 0.2
     return found, depth
 
@@ -55,13 +55,29 @@ def test_a_wall_and_a_box_are_where_they_are_whatever_the_exposure() -> None:
         assert np.median(off) < 0.01 and (off < 0.05).mean() > 0.85, (gain, np.median(off), (off < 0.05).mean())
 
 
+def test_nothing_lies_below_the_road_but_what_may_be_lower_by_a_tenth() -> None:
+    """Faint texture that fits best at the wall, 12 m away, where the road is met after 7 m."""
+    here, others = photo(2.0)[0], [photo(at)[0] for at in (0.0, 4.0)]
+    faint = [replace(p, rgb=np.uint8(90.0 + 0.04 * (p.rgb.astype(float) - 120.0))) for p in (here, *others)]
+    rgb, compared = faint[0].rgb.astype(np.float32) / 255.0, partners(faint[0], faint[1:], 4)
+    low = (np.arange(HEIGHT)[:, None] >= HEIGHT // 2) & ALL
+    camera = K, here.world_from_camera
+    unbounded, _, _ = wide_depth(rgb, NOTHING, NOTHING, compared, *camera, ALL)
+    found, _, _ = wide_depth(rgb, NOTHING, np.where(low, np.float32(7.0), np.float32(0.0)), compared, *camera, ALL)
+    slack, _, _ = wide_depth(rgb, NOTHING, np.where(low, np.float32(11.3), np.float32(0.0)), compared, *camera, ALL)
+    assert (unbounded[HEIGHT // 2 + 4 :] > 9.0).mean() > 0.6
+    assert found[HEIGHT // 2 + 4 :].max() < 8.5
+    assert (slack[HEIGHT // 2 + 4 :] > 11.5).mean() > 0.4
+
+
 def test_below_the_horizon_there_is_no_sky_however_bright_and_smooth() -> None:
     here, others = photo(2.0)[0], [photo(at)[0] for at in (0.0, 4.0)]
     white = [replace(p, rgb=np.full_like(p.rgb, 220)) for p in (here, *others)]
     rgb, compared = white[0].rgb.astype(np.float32) / 255.0, partners(white[0], white[1:], 4)
-    rises = (np.arange(HEIGHT)[:, None] < HEIGHT // 2) & ALL
-    _, _, sky_cost = wide_depth(rgb, NOTHING, rises, compared, K, here.world_from_camera, ALL)
-    assert ((sky_cost == 0.0) == rises).all()
+    high = (np.arange(HEIGHT)[:, None] < HEIGHT // 2) & ALL
+    floor = np.where(high, np.float32(0.0), np.float32(30.0))
+    _, _, sky_cost = wide_depth(rgb, NOTHING, floor, compared, K, here.world_from_camera, ALL)
+    assert ((sky_cost == 0.0) == high).all()
 
 
 def test_bright_and_smooth_above_the_horizon_is_sky_whatever_fits_as_well() -> None:
@@ -72,7 +88,7 @@ def test_bright_and_smooth_above_the_horizon_is_sky_whatever_fits_as_well() -> N
         rgb[:40] = 220
         white.append(replace(p, rgb=rgb))
     rgb, compared = white[0].rgb.astype(np.float32) / 255.0, partners(white[0], white[1:], 4)
-    _, _, sky_cost = wide_depth(rgb, NOTHING, ALL, compared, K, here.world_from_camera, ALL)
+    _, _, sky_cost = wide_depth(rgb, NOTHING, NOTHING, compared, K, here.world_from_camera, ALL)
     assert (sky_cost[:34] == 0.0).all() and np.isinf(sky_cost[50:]).mean() > 0.95
 
 
