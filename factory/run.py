@@ -163,6 +163,7 @@ def run(asked: Asked, only_plan: bool) -> int:
             shard_seconds=config.shard_seconds,
             minutes=config.minutes,
             episodes=EpisodesWanted(config.one_episode_in, prepared_episode) if config.one_episode_in else None,
+            mcap_shards=config.store.episodes == "all",
             command=asked.words,
         )
     if summary.message:

@@ -14,7 +14,7 @@ from typing import Any
 
 from factory.graph.batch import Gatherer, PendingRow
 from factory.graph.blocks import BlockOf, BlockQueue, Build
-from factory.graph.episodes import Episodes
+from factory.graph.episodes import Beside
 from factory.graph.local import Graph, Ticket
 from factory.graph.metrics import RunMetrics
 from factory.graph.plan import CLIP_CANDIDATE, ClipPlan, RunPlan, WalkState, wants_payload
@@ -52,7 +52,7 @@ class Executed:
     uncached: int = 0  # prepared clips that could not be kept for later runs
 
     def __str__(self) -> str:
-        episodes = f"; wrote {self.episodes} episodes" if self.episodes else ""
+        episodes = f"; wrote {self.episodes} MCAP files" if self.episodes else ""
         return (
             f"executed {self.prepared} perturb tasks ({self.from_cache} from cache) and {self.attempts} attempts; "
             f"found {self.found_done} attempts done{episodes}"
@@ -130,7 +130,7 @@ class Driver:
     def interrupted(self) -> bool:
         return self._stopping.is_set()
 
-    def loop(self, graph: Graph, gatherer: Gatherer, metrics: RunMetrics, episodes: Episodes | None = None) -> None:
+    def loop(self, graph: Graph, gatherer: Gatherer, metrics: RunMetrics, episodes: Beside | None = None) -> None:
         """Until nothing is left, or until stopped and drained. Raises DiskFull once a disk is full, and MachineIll."""
         self._graph, self._gatherer, self._metrics, self._episodes = graph, gatherer, metrics, episodes
         gatherer.committed = self._committed

@@ -20,7 +20,7 @@ from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUP
 from factory.graph.batch import SHARD_BYTES, SHARD_SECONDS, Gatherer, WriteFailed
 from factory.graph.crashes import counted, crash_of
 from factory.graph.driver import Driver, Executed, MachineIll
-from factory.graph.episodes import Episodes, EpisodesWanted
+from factory.graph.episodes import Beside, Episodes, EpisodesWanted, McapShards, Together
 from factory.graph.guard import CRASHED
 from factory.graph.limits import NO_LIMITS, Limits, notes_folder
 from factory.graph.local import NO_CLAIMS, Claims, ClusterLacks, Fuse, Graph, LocalGraph
@@ -76,6 +76,7 @@ def execute(
     shard_seconds: float = SHARD_SECONDS,
     minutes: float | None = None,
     episodes: EpisodesWanted | None = None,
+    mcap_shards: bool = False,
     command: Sequence[str] | None = None,
     say: Callable[[str], None] = print,
 ) -> RunSummary:
@@ -85,7 +86,8 @@ def execute(
     claims: on Ray. limits: of a task, beyond which it is ended. fuse: whether the stages of an attempt are one task;
     auto: not where drawing claims a GPU. isolated: executor=local works in a process of its own, which may die.
     minutes: after which nothing new is begun, as after an interruption. episodes: MCAP files to be written
-    beside the samples. command: the settings as they were given, kept for `retry`.
+    beside the samples; mcap_shards: all samples as MCAP shards too. command: the settings as they were given, kept for
+    `retry`.
     Invalid arguments come back as exit code 2 with a message and nothing written.
     """
     if not refs or not experts or rounds < 1:
@@ -102,7 +104,9 @@ def execute(
             on_change = "keep"
         policy = retry_policy(retry, identity.versions_json)
         plan = make_plan(refs, experts, rounds, history, identity, on_change, policy, work.once)
-        pictured = Episodes(store, episodes, refs) if episodes else None
+        parts: list[Beside] = [McapShards(store)] if mcap_shards else []
+        parts += [Episodes(store, episodes, refs)] if episodes else []
+        pictured = Together(parts) if parts else None
     except ChangedRun as error:
         return RunSummary(BAD_CONFIG, str(error))
     except OSError as error:
@@ -151,7 +155,7 @@ def execute(
                     pictured.tidy()
         code = COMPLETE_WITH_FAILURES if driver.has_failures else COMPLETE
         if pictured is not None and pictured.errors:
-            text = f"{len(pictured.errors)} episodes were not written ({pictured.errors[0]})"
+            text = f"{len(pictured.errors)} MCAP files were not written ({pictured.errors[0]})"
             code, message = INTERRUPTED, f"{text}; run the same command again to write them"
         if driver.interrupted:
             code, message = INTERRUPTED, "interrupted; run the same command again to go on"

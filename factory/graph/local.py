@@ -76,6 +76,7 @@ STEPS: Mapping[str, tuple[Any, tuple[str, ...]]] = {  # its function, and what i
     "attempt": (steps.attempt, ("work",)),
     "write": (steps.write, ("out",)),
     "episodes": (steps.episodes, ("work", "out")),
+    "mcap_shard": (steps.mcap_shard, ("out",)),
     "warm": (steps.warm, ("work",)),
 }
 

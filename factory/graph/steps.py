@@ -21,6 +21,7 @@ from factory.store.episodes import FOLDER, episode_name
 from factory.store.identity import Stamp
 from factory.store.illness import own_place, why_ill
 from factory.store.location import Location
+from factory.store.mcap_shards.mirror import write_mcap_shard
 from factory.store.outcomes import ErrorKind
 from factory.store.reader import samples_of
 from factory.store.schema import SAMPLES, sample_row_to_table
@@ -234,6 +235,14 @@ def episodes(work: Work, out: Location, wanted: EpisodesOf) -> tuple[EpisodesWri
     except BaseException as error:  # the same boundary
         return failure_of(error), None
     return EpisodesWritten(written, tuple(errors)), None
+
+
+def mcap_shard(out: Location, path: str, partition: Mapping[str, str]) -> tuple[Shard | Failure, None]:
+    """A committed shard of samples as an MCAP shard, to be committed."""
+    try:
+        return write_mcap_shard(out, path, partition), None
+    except OSError as error:
+        return failure_of(error), None
 
 
 def reconstruct(

@@ -14,50 +14,80 @@ files they stand in; `iterate` goes file by file instead, which is what a pass o
 import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from factory.store.location import Location
+from factory.store.mcap_shards.mirror import McapTable, open_shard
+from factory.store.mcap_shards.shard import McapShard
 from factory.store.schema import SAMPLES, SCHEMA, SCHEMA_VERSION, VERSION_PROPERTY, table_to_rows
 from factory.store.table import KeyedTable, naming, open_parquet, with_partition
 from tasks.reward.label_bytes import VocabularyLabels, decode
-from tasks.world.arrays import Bytes
+from tasks.world.arrays import Bytes, Ints
 
 if TYPE_CHECKING:
     import torch
 
 Sample = dict[str, Any]
+Format = Literal["parquet", "mcap"]
+StoredFile: TypeAlias = pq.ParquetFile | McapShard
 TIME_TOLERANCE_S = 0.05
 
 
-def sample_table(path: str | os.PathLike[str], storage_options: Mapping[str, str] | None = None) -> KeyedTable:
-    """The table of samples at a run's `out`, or at its folder `samples`.
+def sample_table(
+    path: str | os.PathLike[str], storage_options: Mapping[str, str] | None = None, format: Format = "parquet"
+) -> KeyedTable:
+    """The table of samples at a run's `out`, or at its folder `samples`; format=mcap: that of MCAP shards at its `out`.
 
-    Raises FileNotFoundError where there is none, ValueError where its columns are those of another version.
+    Raises FileNotFoundError where there is none, ValueError where its columns are those of another version, or where
+    the MCAP shards are not those of the samples beside them.
     """
     location = Location.parse(path, storage_options)
-    here = KeyedTable(location, SAMPLES)
-    table = here if here.version is not None else KeyedTable(location.child("samples"), SAMPLES)
+    if format == "mcap":
+        table: KeyedTable = _mcap_table(location)
+    else:
+        here = KeyedTable(location, SAMPLES)
+        table = here if here.version is not None else KeyedTable(location.child("samples"), SAMPLES)
     if table.version is None:
-        raise FileNotFoundError(f"{location.uri}: no table of samples here or in its folder samples")
+        folder = "its folder samples_mcap" if format == "mcap" else "here or in its folder samples"
+        raise FileNotFoundError(f"{location.uri}: no table of samples {folder}")
     version = table.properties.get(VERSION_PROPERTY)
     if version != str(SCHEMA_VERSION):
         raise ValueError(f"{location.uri}: schema_version {version}, this version reads {SCHEMA_VERSION}")
     return table
 
 
+def _mcap_table(out: Location) -> McapTable:
+    """Raises ValueError where its shards are not those of the samples beside it."""
+    table, samples = McapTable(out), KeyedTable(out.child(SAMPLES.name), SAMPLES)
+    if table.version is not None and samples.version is not None:
+        behind, outdated = len(table.behind(samples)), len(table.outdated(samples))
+        if behind or outdated:
+            raise ValueError(
+                f"{table.location.uri}: lacks {behind} shards of the samples and has {outdated} of others; "
+                "the run's command with store.episodes=all brings it up to date"
+            )
+    return table
+
+
 class SampleTable:
     """The samples of one store, read-only."""
 
-    def __init__(self, path: str | os.PathLike[str], storage_options: Mapping[str, str] | None = None) -> None:
-        """path: the run's `out` or its folder `samples`.
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        storage_options: Mapping[str, str] | None = None,
+        format: Format = "parquet",
+    ) -> None:
+        """path: the run's `out`, or with Parquet its folder `samples`; format: which of its two tables is read.
 
-        Raises FileNotFoundError where there is no table, ValueError where its columns are those of another version.
+        Raises FileNotFoundError where there is no table, ValueError where its columns are those of another version or
+        its MCAP shards are not those of the samples.
         """
-        self._table = sample_table(path, storage_options)
+        self._table = sample_table(path, storage_options, format)
         self._partitions = self._table.live_files()
         places = [
             (key, path, row)
@@ -66,7 +96,8 @@ class SampleTable:
         ]
         self._places = sorted(places)
         self._index = {key: i for i, (key, _, _) in enumerate(self._places)}
-        self._file = lru_cache(maxsize=32)(partial(open_parquet, self._table.location))
+        opener = open_shard if format == "mcap" else open_parquet
+        self._file = lru_cache(maxsize=32)(partial(opener, self._table.location))
 
     def __len__(self) -> int:
         return len(self._places)
@@ -108,7 +139,7 @@ class SampleTable:
         _check_columns(columns)
         for path in sorted(self._partitions):
             with naming(f"{self._table.location.uri}/{path}"):
-                groups = self._file(path).metadata.num_row_groups
+                groups = len(group_rows(self._file(path)))
             for group in range(groups):
                 with naming(f"{self._table.location.uri}/{path}"):
                     rows = read_rows(self._file(path), group, self._partitions[path], columns)
@@ -126,17 +157,26 @@ def samples_of(
             yield from read_rows(file, group, partition, None, slice(i, i + 1))
 
 
-def group_of(file: pq.ParquetFile, row: int) -> tuple[int, int]:
+def group_rows(file: StoredFile) -> Ints:
+    """(groups,) rows of each row group of a file."""
+    if isinstance(file, McapShard):
+        return file.rows
+    metadata = file.metadata
+    return np.array([metadata.row_group(g).num_rows for g in range(metadata.num_row_groups)], np.int64)
+
+
+def group_of(file: StoredFile, row: int) -> tuple[int, int]:
     """The row group that a file's row stands in, and its place there."""
     group = 0
-    while row >= file.metadata.row_group(group).num_rows:
-        row -= file.metadata.row_group(group).num_rows
-        group += 1
+    for n in group_rows(file).tolist():
+        if row < n:
+            break
+        group, row = group + 1, row - n
     return group, row
 
 
 def read_rows(
-    file: pq.ParquetFile,
+    file: StoredFile,
     group: int,
     partition: Mapping[str, str],
     columns: Sequence[str] | None,
@@ -145,8 +185,14 @@ def read_rows(
     """Rows of one row group of a file of a table of samples; columns None: all. Raises KeyError for unknown ones."""
     _check_columns(columns)
     names = list(SCHEMA.names if columns is None else columns)
-    stored = file.read_row_group(group, columns=[n for n in names if n not in partition])[rows]
+    stored = _stored(file, group, [n for n in names if n not in partition])[rows]
     return table_to_rows(with_partition(stored, pa.schema([SCHEMA.field(n) for n in names]), partition))
+
+
+def _stored(file: StoredFile, group: int, names: Sequence[str]) -> pa.Table:
+    if isinstance(file, McapShard):
+        return file.read_row_group(group, [leaf for leaf in file.leaves if leaf.partition(".")[0] in names])
+    return file.read_row_group(group, columns=names)
 
 
 def _check_columns(columns: Sequence[str] | None) -> None:

@@ -15,7 +15,7 @@ from factory.store.commit_copies import COPIES, LOG, CommitCopies
 from factory.store.location import Location
 from factory.store.samples import Store
 from factory.store.table import KeyedTable, Shard, write_shard
-from factory.store.verify import TABLES, Verdict, damaged_logs, orphaned, outdated_episodes
+from factory.store.verify import TABLES, Verdict, damaged_logs, orphaned, outdated_episodes, tables_in
 
 TEMPORARY = re.compile(r"(.*/)?(\..*\.tmp|\.trial-[0-9a-f]+|_commit_.*\.tmp|.*\.draft)")
 FULL_BYTES = 128 * 2**20  # of a shard, as a run closes it
@@ -58,7 +58,7 @@ def restore_logs(out: Location) -> list[str]:
 
 def drop_damaged(store: Store, verdict: Verdict) -> None:
     """Take the damaged files of a verdict out of their tables, a transaction each, and away."""
-    for table in tables_of(store):
+    for table in tables_in(store):
         if drop := [path for path in table.live_files() if f"{table.spec.name}/{path}" in verdict.files]:
             table.replace_files(drop)
     for name in verdict.files:

@@ -22,12 +22,15 @@ from factory.store.cache import BadCacheFile, check_kept
 from factory.store.commit_copies import COPIES, LOG, CommitCopies, LogDamage
 from factory.store.episodes import FOLDER, check_episode, episode_name
 from factory.store.location import Location
+from factory.store.mcap_shards.mirror import NAMED as MCAP_NAMED
+from factory.store.mcap_shards.mirror import SAMPLES_MCAP, McapTable
+from factory.store.mcap_shards.shard import McapShard
 from factory.store.samples import CURRENT_RUN, IMPORTED, LAST_RUN, ChangedRun, Store
 from factory.store.table import DamagedFile, KeyedTable, LiveFile, naming
 
-TABLES = ("candidates", "samples", "outcomes")
+TABLES = ("candidates", "samples", "outcomes", SAMPLES_MCAP.name)
 KEPT = ("cache/prepared", "scenes")  # sealed files
-NAMED = re.compile(r"part-([0-9a-f]{32})\.parquet")
+NAMED = re.compile(r"(.*/)?part-([0-9a-f]{32})\.parquet")
 
 
 @dataclass(frozen=True)
@@ -56,11 +59,17 @@ def damaged_logs(out: Location) -> list[tuple[str, LogDamage]]:
     return [(name, damage) for name in TABLES for damage in CommitCopies(out.child(name)).damage()]
 
 
+def tables_in(store: Store) -> list[KeyedTable]:
+    """All that there are, that of MCAP shards where a run wrote some."""
+    mcap = McapTable(store.location)
+    return [store.samples, store.candidates, store.outcomes, *([mcap] if mcap.version is not None else [])]
+
+
 def verify(store: Store) -> Verdict:
     """Read every live file, episode and kept file, and hold the tables against each other."""
     damage = [f"{name}/{found.name}: {found.problem}" for name, found in damaged_logs(store.location)]
     broken: list[DamagedPart] = []
-    for table in (store.samples, store.candidates, store.outcomes):
+    for table in tables_in(store):
         broken += _damaged_files(table)
     orphans = orphaned(store)
     kept = _damaged_kept(store.location)
@@ -81,7 +90,7 @@ def verify(store: Store) -> Verdict:
 def orphaned(store: Store) -> list[str]:
     """Files in the tables' folders that no log names, relative to `out`."""
     orphans = []
-    for table in (store.samples, store.candidates, store.outcomes):
+    for table in tables_in(store):
         live, name = table.live_files(), table.spec.name
         files = [file for file in table.location.names() if not file.startswith((f"{LOG}/", f"{COPIES}/"))]
         orphans += [f"{name}/{file}" for file in files if file not in live]
@@ -118,10 +127,14 @@ def _problem_of(table: KeyedTable, path: str, file: LiveFile) -> str:
         return "is missing"
     if len(data) != file.n_bytes:
         return f"has {len(data):,} bytes, the log says {file.n_bytes:,}"
-    named = NAMED.fullmatch(path.rpartition("/")[2])
-    if named and hashlib.sha256(data).hexdigest()[:32] != named[1]:
+    is_mcap = isinstance(table, McapTable)
+    named = (MCAP_NAMED if is_mcap else NAMED).fullmatch(path)
+    if named and hashlib.sha256(data).hexdigest()[:32] != named[2]:
         return "its content is not what its name says"
     with naming(f"{table.location.uri}/{path}"):
+        if is_mcap:
+            n_rows = int(McapShard(pa.BufferReader(data)).rows.sum())
+            return "" if n_rows == file.n_rows else f"has {n_rows} rows, the log says {file.n_rows}"
         parquet = pq.ParquetFile(pa.BufferReader(data), page_checksum_verification=True)
         if file.n_rows and parquet.metadata.num_rows != file.n_rows:
             return f"has {parquet.metadata.num_rows} rows, the log says {file.n_rows}"
@@ -154,7 +167,7 @@ def _damaged_kept(out: Location) -> list[DamagedPart]:
 
 def _twice(store: Store) -> list[str]:
     found = []
-    for table in (store.samples, store.candidates, store.outcomes):
+    for table in tables_in(store):
         seen: set[str] = set()
         for path, rows in table.files([table.spec.key]):
             for key in rows[table.spec.key].to_pylist():

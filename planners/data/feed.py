@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 import pyarrow as pa
 
-from factory.store.reader import TIME_TOLERANCE_S
+from factory.store.reader import TIME_TOLERANCE_S, group_rows
 from factory.store.schema import LABEL_COLUMNS
 from factory.store.table import naming
 from planners.data.batch import ImageLayout, Needs
-from planners.data.files import group_bytes, group_rows, leaves
+from planners.data.files import group_bytes, leaves, read_all
 from planners.data.images import chosen_cameras
 from planners.data.index import OPEN_FILES, Dataset, DataSettings, open_dataset
 from planners.data.mix import MixSettings, Samples, check_sides, sample_weights
@@ -131,7 +131,7 @@ def _file_part(
         places = (np.cumsum(rows) - rows)[groups] + dataset.rows.place[here]
         members = leaves(parquet, ["cameras.name", "cameras.ego_from_camera", "images.camera", "images.time_s"])
         with naming(dataset.files[number].where):
-            seen = parquet.read(columns=members, use_threads=False)
+            seen = read_all(parquet, members)
         cameras = _cameras(dataset, here, seen, places, needs.image)
         stored = np.add.reduceat(np.diff(_list(seen, "images").offsets.to_numpy()), np.cumsum(rows) - rows)
         share = rows / np.maximum(np.bincount(groups, minlength=len(rows)), 1)

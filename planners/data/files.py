@@ -1,4 +1,7 @@
-"""The Parquet files of sample tables as the loader reads them: row group by row group, single columns, single leaves.
+"""The files of sample tables as the loader reads them: row group by row group, single columns, single leaves.
+
+They are Parquet shards, or with `data.format=mcap` the MCAP shards of the same samples, which have their row groups and
+leaves, so that batches are the same.
 
 A column is read with all that is nested in it; of a column of structs single members can be named, such as
 `images.jpeg`, and the others stay on disk.
@@ -10,15 +13,19 @@ from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from threading import Lock
+from typing import TypeAlias
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 from pyarrow import fs
 
-from factory.store.reader import sample_table
+from factory.store.mcap_shards.shard import McapShard, ShardIndex
+from factory.store.reader import Format, StoredFile, sample_table
 from factory.store.table import naming
 from tasks.world.arrays import Ints
 
+Footer: TypeAlias = pq.FileMetaData | ShardIndex
 FOOTER_BYTES = 2**25  # as they are stored; parsed they take eight times that
 
 
@@ -31,17 +38,17 @@ class Footers:
     def __init__(self, limit: int) -> None:
         """limit: bytes of footers that are kept."""
         self._limit, self._held = limit, 0
-        self._footers: OrderedDict[str, pq.FileMetaData] = OrderedDict()
+        self._footers: OrderedDict[str, Footer] = OrderedDict()
         self._lock = Lock()
 
-    def of(self, path: str) -> pq.FileMetaData | None:
+    def of(self, path: str) -> Footer | None:
         """The footer of a file; None where it must be read."""
         with self._lock:
             if path in self._footers:
                 self._footers.move_to_end(path)
             return self._footers.get(path)
 
-    def keep(self, path: str, footer: pq.FileMetaData) -> None:
+    def keep(self, path: str, footer: Footer) -> None:
         """Keep one footer more, and drop those that were not asked for the longest as far as need be."""
         with self._lock:
             if path not in self._footers:
@@ -64,8 +71,11 @@ class SampleFile:
     round: int
     expert: str
 
-    def open(self, check_pages: bool = True) -> pq.ParquetFile:
-        """check_pages: whether reading a damaged page raises OSError. Raises OSError with the file's name."""
+    def open(self, check_pages: bool = True) -> StoredFile:
+        """check_pages: whether reading a damaged page of Parquet raises OSError; damaged chunks of MCAP always do.
+
+        Raises OSError with the file's name.
+        """
         with naming(self.where):
             return self._open(check_pages)
 
@@ -74,12 +84,18 @@ class SampleFile:
         """For messages."""
         return f"{self.table}: {self.path}"
 
-    def _open(self, check_pages: bool) -> pq.ParquetFile:
+    def _open(self, check_pages: bool) -> StoredFile:
         local = isinstance(self.filesystem, fs.LocalFileSystem)
+        filesystem = fs.LocalFileSystem(use_mmap=True) if local else self.filesystem
+        footer = _FOOTERS.of(self.path)
+        if self.path.endswith(".mcap"):
+            shard = McapShard(filesystem.open_input_file(self.path), footer)
+            _FOOTERS.keep(self.path, shard.index)
+            return shard
         parquet = pq.ParquetFile(
             self.path,
-            metadata=_FOOTERS.of(self.path),
-            filesystem=fs.LocalFileSystem(use_mmap=True) if local else self.filesystem,
+            metadata=footer,
+            filesystem=filesystem,
             page_checksum_verification=check_pages,
             pre_buffer=not local,
         )
@@ -87,12 +103,16 @@ class SampleFile:
         return parquet
 
 
-def files_of(table: str | os.PathLike[str], storage_options: Mapping[str, str] | None = None) -> list[SampleFile]:
+def files_of(
+    table: str | os.PathLike[str], storage_options: Mapping[str, str] | None = None, format: Format = "parquet"
+) -> list[SampleFile]:
     """The files of a table of samples in the order of their names, which are their contents' digests.
 
-    Raises FileNotFoundError where there is no table, ValueError where its columns are those of another version.
+    Those of MCAP shards begin with their Parquet shards' digests: either way the order is the same. Raises
+    FileNotFoundError where there is no table, ValueError where its columns are those of another version or its MCAP
+    shards are not those of the samples.
     """
-    found = sample_table(table, storage_options)
+    found = sample_table(table, storage_options, format)
     filesystem, base = found.location.filesystem()
     return [
         SampleFile(os.fspath(table), filesystem, f"{base}/{path}", int(partition["round"]), partition["expert"])
@@ -100,7 +120,7 @@ def files_of(table: str | os.PathLike[str], storage_options: Mapping[str, str] |
     ]
 
 
-def leaves(file: pq.ParquetFile, columns: Sequence[str]) -> list[str]:
+def leaves(file: StoredFile, columns: Sequence[str]) -> list[str]:
     """The paths of the leaves under columns and members (`label_2hz`, `images.jpeg`) of a file, for reading.
 
     Raises ValueError naming those it has not.
@@ -112,25 +132,38 @@ def leaves(file: pq.ParquetFile, columns: Sequence[str]) -> list[str]:
     return [path for path, plain in paths if any(_under(plain, c) for c in columns)]
 
 
-def group_rows(file: pq.ParquetFile) -> Ints:
-    """(groups,) rows of each row group."""
-    metadata = file.metadata
-    return np.array([metadata.row_group(g).num_rows for g in range(metadata.num_row_groups)], np.int64)
+def read_group(file: StoredFile, group: int, paths: Sequence[str]) -> pa.Table:
+    """Leaves of one row group, in this thread."""
+    if isinstance(file, McapShard):
+        return file.read_row_group(group, paths)
+    return file.read_row_group(group, columns=paths, use_threads=False)
 
 
-def group_bytes(file: pq.ParquetFile, columns: Sequence[str]) -> Ints:
-    """(groups, columns) uncompressed bytes of columns and members, as the footer says."""
+def read_all(file: StoredFile, paths: Sequence[str]) -> pa.Table:
+    """Leaves of all row groups, in this thread."""
+    return file.read(paths) if isinstance(file, McapShard) else file.read(columns=paths, use_threads=False)
+
+
+def group_bytes(file: StoredFile, columns: Sequence[str]) -> Ints:
+    """(groups, columns) uncompressed bytes of columns and members in Parquet, as the footer says."""
     paths = _paths(file)
     numbers = [[i for i, (_, plain) in enumerate(paths) if _under(plain, column)] for column in columns]
-    groups = (file.metadata.row_group(g) for g in range(file.metadata.num_row_groups))
-    sizes = [[sum(group.column(i).total_uncompressed_size for i in under) for under in numbers] for group in groups]
+    if isinstance(file, McapShard):
+        of_leaf = np.array(list(file.leaves.values()), np.int64).T
+        sizes = [[int(group[under].sum()) for under in numbers] for group in of_leaf]
+    else:
+        groups = (file.metadata.row_group(g) for g in range(file.metadata.num_row_groups))
+        sizes = [[sum(group.column(i).total_uncompressed_size for i in under) for under in numbers] for group in groups]
     return np.array(sizes, np.int64).reshape(-1, len(columns))
 
 
-def _paths(file: pq.ParquetFile) -> list[tuple[str, str]]:
+def _paths(file: StoredFile) -> list[tuple[str, str]]:
     """Of every leaf its path, and that without what engines put, under several names, between a list and its items."""
-    schema = file.metadata.schema
-    paths = (schema.column(i).path for i in range(len(schema)))
+    if isinstance(file, McapShard):
+        paths = list(file.leaves)
+    else:
+        schema = file.metadata.schema
+        paths = [schema.column(i).path for i in range(len(schema))]
     return [(path, re.sub(r"\.(list\.(element|item)|bag\.array_element)", "", path)) for path in paths]
 
 

@@ -13,13 +13,13 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from factory.store.location import Location
+from factory.store.reader import Format, StoredFile, group_rows
 from factory.store.table import naming
 from planners.data.batch import TrainingData
-from planners.data.files import SampleFile, files_of, group_rows, leaves
+from planners.data.files import SampleFile, files_of, leaves, read_all
 from tasks.world.arrays import F32, Array, Bools, Ints, ShortInts
 
 HUMAN = "human"
@@ -54,6 +54,7 @@ class DataSettings:
     limit_sim: int | None = None  # as many simulated samples, drawn from those that the rest leaves
     seed: int = 0  # of the two draws; a smaller share or limit is a part of a larger one
     storage_options: dict[str, str] = field(default_factory=dict)  # of object stores, as deltalake calls them
+    format: Format = "parquet"  # mcap: read the MCAP shards of a run with store.episodes=all; batches are the same
     copy: str | None = None  # folder of this machine for a compact copy of what is read, see planners.data.local_copy
     pictures: str | None = None  # folder of this machine for decoded pictures, see planners.data.pictures
     pictures_gb: float = 100.0  # that it takes at most, 10^9 bytes; what is beyond is decoded in every pass
@@ -180,7 +181,9 @@ def open_dataset(settings: DataSettings) -> Dataset:
         raise ValueError("there are no samples to read: give data.real=[<out of a run>], data.sim=[...] or both")
     files, wanted = [], []
     for uri, kinds in sides.items():
-        found = [file for file in files_of(uri, settings.storage_options) if (file.expert != HUMAN) in kinds]
+        found = [
+            file for file in files_of(uri, settings.storage_options, settings.format) if (file.expert != HUMAN) in kinds
+        ]
         files += found
         wanted.append((uri, kinds, {file.expert != HUMAN for file in found}))
     for uri, kinds, there in wanted:
@@ -207,11 +210,11 @@ def _rows_of(file: SampleFile, number: int) -> SampleRows:
     except ValueError as error:
         raise ValueError(f"{file.table}: {error} in {file.path}; make the table again with this version") from error
     with naming(file.where):
-        table = parquet.read(columns=columns, use_threads=False).combine_chunks()
+        table = read_all(parquet, columns).combine_chunks()
         return _index_of(file, number, parquet, table)
 
 
-def _index_of(file: SampleFile, number: int, parquet: pq.ParquetFile, table: pa.Table) -> SampleRows:
+def _index_of(file: SampleFile, number: int, parquet: StoredFile, table: pa.Table) -> SampleRows:
     counts, n = group_rows(parquet), table.num_rows
 
     def text(name: str) -> NDArray[np.str_]:

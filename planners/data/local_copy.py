@@ -25,9 +25,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from factory.store.reader import TIME_TOLERANCE_S
+from factory.store.reader import TIME_TOLERANCE_S, group_rows
 from planners.data.feed import Feed
-from planners.data.files import SampleFile, leaves
+from planners.data.files import SampleFile, leaves, read_group
 from tasks.sealed import Damaged, sealed, unsealed
 
 FORMAT = 2
@@ -80,8 +80,8 @@ class LocalCopy:
     def _write(self, sink: IO[bytes]) -> None:
         parquet, places, end = self.file.open(), [], 0
         paths = leaves(parquet, self.columns)
-        for group in range(parquet.metadata.num_row_groups):
-            table = parquet.read_row_group(group, columns=paths, use_threads=False).combine_chunks()
+        for group in range(len(group_rows(parquet))):
+            table = read_group(parquet, group, paths).combine_chunks()
             if "images" in table.column_names:
                 images = _chosen(table["images"].combine_chunks(), self.cameras)
                 table = table.set_column(table.column_names.index("images"), "images", images)

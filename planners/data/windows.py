@@ -17,7 +17,7 @@ import pyarrow as pa
 from factory.store.table import naming
 from planners.data.decode import StoredRows
 from planners.data.feed import Feed
-from planners.data.files import leaves
+from planners.data.files import leaves, read_group
 from planners.data.images import stitch
 from planners.data.local_copy import copies_of
 from planners.data.mix import WindowKey
@@ -147,7 +147,7 @@ class Memory:
         checked = all((number, group) in self._checked for group in groups.tolist())
         parquet = self._feed.dataset.files[number].open(check_pages=not checked)
         paths = leaves(parquet, self._feed.columns)
-        return lambda group: parquet.read_row_group(group, columns=paths, use_threads=False)
+        return lambda group: read_group(parquet, group, paths)
 
     def _rows(self, table: pa.Table, samples: Ints, mapped: bool) -> dict[int, Place]:
         """Those of a row group that are wanted. Of one that is mapped nothing needs to be cut: it takes no memory."""
