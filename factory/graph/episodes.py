@@ -165,7 +165,7 @@ class McapShards:
     def begin(self, graph: Graph) -> None:
         """Raises AnotherWriter."""
         self._graph = graph
-        self._table.claim()
+        self._table.claim(self._samples.epoch)
         self.committed(())
 
     def tidy(self) -> None:

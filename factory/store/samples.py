@@ -139,27 +139,29 @@ class Store:
         return bool(known) and len(records) == 1 and bool(differences(known[-1], records[0]))
 
     def begin(self, records: Sequence[Mapping[str, object]]) -> bool:
-        """The first writes of a run: record its settings, fence off older runs, tidy up after a crash.
+        """The first writes of a run: fence off older runs, record its settings, tidy up after a crash.
 
-        Of two runs the one that begins later wins: whatever the older has not committed by now it never will. True:
-        another run committed something since this store was opened, so that what was known of it is out of date.
+        Of two runs the one that begins later wins: whatever the older has not committed by now it never will. Of runs
+        that begin at once it is the one whose claim comes last in the log of candidates. True: another run committed
+        something since this store was opened, so that what was known of it is out of date. Raises AnotherWriter.
 
         A run that starts over drops what became of attempts under the settings that were. A crash between two commits
         leaves a failed outcome beside the sample that its retry became; it goes. One that is newer than the sample of
         the same attempt, of a redo that failed, stays.
         """
-        if self.starts_over(records):
+        starts_over, moved, epoch = self.starts_over(records), False, None
+        tables = (self.candidates, self.samples, self.outcomes)
+        above = max(table.epoch for table in tables)  # which differ only where one was put back or made anew
+        for table in tables:
+            before = set(table.live_files())
+            epoch = table.claim(epoch, above)
+            moved = moved or set(table.live_files()) != before
+        if starts_over:
             for table in (self.candidates, self.outcomes):
-                table.claim()
                 table.commit([], drop=list(table))
         if list(records) != self.runs():
             document = json.loads(canonical_json({"schema_version": SCHEMA_VERSION, "runs": list(records)}))
             self.location.write(RUN_FILE, sealed_json(document).encode())
-        moved = False
-        for table in (self.candidates, self.samples, self.outcomes):
-            before = set(table.live_files())
-            table.claim()
-            moved = moved or set(table.live_files()) != before
         twice = {key for key in self.outcomes if key in self.samples}
         if twice:
             age = run_number(records)
