@@ -86,6 +86,8 @@ class CommitCopies:
     def _unsealed(self) -> tuple[Mapping[str, bytes], list[LogDamage]]:
         whole, problems = {}, []
         for name in self._copies.names():
+            if name != LAST and not NUMBERED.fullmatch(name):  # a draft that a killed writer left
+                continue
             try:
                 whole[name] = unsealed(self._copies.read(name) or b"")
             except Damaged as error:

@@ -234,3 +234,11 @@ def test_a_damaged_log_is_named_by_whoever_opens_the_table(out: Path) -> None:
     path.write_bytes(path.read_bytes().replace(b"schemaString", b"schemaStrinh"))
     with pytest.raises(OSError, match=f"samples: _delta_log/{path.name} is not what was written"):
         Store(out)
+
+
+def test_the_draft_of_a_copy_that_a_killed_writer_left_is_no_damage(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    store.samples.claim()
+    copy = tmp_path / "samples/_commits" / f"{1:020}.json"
+    (copy.parent / f".{2:020}.json.0123abcd.tmp").write_bytes(copy.read_bytes())
+    assert verify(Store(tmp_path)).damage == ()
