@@ -49,11 +49,14 @@ format: install
 	$(PY) -m ruff format .
 	$(PY) -m ruff check --fix .
 
-# Every kind of file with 5,000 mutants each (half an hour), and one flipped bit at a time in what a run keeps.
+# Every kind of file with 5,000 mutants each (half an hour), one flipped bit at a time in what a run keeps, processes
+# killed at any moment, clips that do harm.
 # N=<mutants of each kind>, KINDS="ply spz".
 chaos: install
 	$(PY) -m tests.chaos.fuzz $(or $(N),5000) $(KINDS)
 	$(PY) -m tests.chaos.flips
+	$(PY) -m tests.chaos.kills
+	$(PY) -m tests.chaos.poison
 
 # The site of the pages, into build/site; whatever MkDocs would warn of ends it. The variable leaves out a notice of the
 # theme's makers about what comes after it.

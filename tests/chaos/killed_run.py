@@ -1,0 +1,49 @@
+"""The run that tests.chaos.kills kills: `python -m tests.chaos.killed_run OUT EXECUTOR JOURNAL`."""
+
+import sys
+from pathlib import Path
+
+from factory.graph.execute import execute
+from factory.store.samples import Store
+from tests.factory.toy import ToyWork, refs
+
+EXPERTS = ["recovery", "pdm_closed", "human"]
+CLIPS, ROUNDS, TASK_S = 4, 2, 0.01
+
+
+def drive(out: str, executor: str, journal: str, seconds: float = TASK_S, notes: str = "") -> int:
+    """The command: one run in this process; executor=node: on a cluster of two nodes, the second's pid in `notes`."""
+    address = None
+    if executor == "node":
+        from ray.cluster_utils import Cluster
+
+        cluster = Cluster()
+        cluster.add_node(num_cpus=1, num_gpus=0, include_dashboard=False)
+        second = cluster.add_node(num_cpus=1, num_gpus=0)
+        (raylet,) = second.all_processes["raylet"]
+        Path(notes).write_text(str(raylet.process.pid))
+        address, executor = cluster.address, "ray"
+    work = ToyWork(journal=journal, seconds=seconds)
+    summary = execute(
+        work,
+        refs(CLIPS),
+        EXPERTS,
+        ROUNDS,
+        Store(out),
+        executor,  # type: ignore[arg-type]
+        2,
+        ray_address=address,
+        shard_seconds=0.1,
+        mcap_shards=True,
+        say=str,
+    )
+    return summary.exit_code
+
+
+def leave(*given: str) -> None:
+    """The same, and the process with it."""
+    sys.exit(drive(*given))
+
+
+if __name__ == "__main__":
+    leave(*sys.argv[1:])
