@@ -11,7 +11,8 @@
 | `/episode/<attempt_id>.mcap` | the sample for Foxglove, Lichtblick or Rerun |
 
 Answers of /api/ are the JSON that the named functions return; an error is `{"error": why}` with 400 (a
-question put wrongly), 403 (asked under another host name), 404 (not there) or 503 (the tables cannot be read now).
+question put wrongly), 403 (asked under another host name), 404 (not there), 500 (a bug, with a line on stderr) or 503
+(the tables cannot be read now).
 """
 
 import json
@@ -28,10 +29,12 @@ import pyarrow as pa
 from deltalake.exceptions import DeltaError
 
 from factory.store.samples import ChangedRun, Store
+from factory.views.board.connections import Connections
 from factory.views.board.gallery import BadRequest, NotThere, failures, gallery, whole
 from factory.views.board.overview import overview
 from factory.views.board.pictures import Pictures
 from factory.views.board.watch import LOOK_EVERY_S, Watch
+from factory.wording import one_line
 
 STATIC = Path(__file__).parent / "static"
 KINDS = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
@@ -46,6 +49,7 @@ HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "X-Frame-Options": "DENY",
 }
+CONNECTIONS = 64  # at once; browsers open six
 FOREVER = "private, max-age=86400, immutable"
 
 
@@ -79,7 +83,10 @@ class Board:
             return _json({"error": f"the tables cannot be read now: {error}"}, 503)
 
     def _answer(self, target: str) -> Answer:
-        parts = urlsplit(target)
+        try:
+            parts = urlsplit(target)
+        except ValueError as error:
+            raise BadRequest(f"no address: {error}") from error
         query = dict(parse_qsl(parts.query, keep_blank_values=True))
         match parts.path.split("/")[1:]:
             case [""]:
@@ -144,15 +151,30 @@ def _static(name: str) -> Answer:
 
 
 class Server(ThreadingHTTPServer):
-    """Serves a board; a thread a connection."""
+    """Serves a board; a thread a connection, CONNECTIONS at most."""
 
     daemon_threads = True
     allow_reuse_address = True
+    request_queue_size = 128
 
     def __init__(self, board: Board, host: str, port: int) -> None:
-        self.board = board
+        self.board, self.connections = board, Connections(CONNECTIONS)
         self.host_names = {*LOOPBACK, host} if host in LOOPBACK else None  # None: any
         super().__init__((host, port), Handler)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        self.connections.come(request)
+        super().process_request(request, client_address)
+
+    def shutdown_request(self, request: Any) -> None:
+        super().shutdown_request(request)
+        self.connections.gone(request)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """One line, and none where the other side has gone."""
+        error = sys.exception()
+        if error is not None and not isinstance(error, OSError):
+            print(f"{client_address[0]}: {type(error).__name__}: {one_line(error)}", file=sys.stderr)
 
 
 class Handler(BaseHTTPRequestHandler):
@@ -161,25 +183,40 @@ class Handler(BaseHTTPRequestHandler):
     server: Server
     protocol_version = "HTTP/1.1"
     server_version, sys_version = "factory", ""
-    timeout = 60
+    timeout = 20  # seconds without a byte
     disable_nagle_algorithm = True  # with it, and headers and body sent apart, an answer waits 40 ms for nothing
     wbufsize = -1
 
     def do_GET(self) -> None:
+        self.server.connections.asks(self.connection)
+        if {"content-length", "transfer-encoding"} & {name.lower() for name in self.headers}:
+            self.close_connection = True  # a body is not read, and is no next request
+        try:
+            answer = self._answer()
+        except Exception as error:  # the page goes on with the rest
+            print(f"{self.path[:200]!r}: {type(error).__name__}: {one_line(error)}", file=sys.stderr)
+            answer = _json({"error": "a bug: the dashboard's own output says which"}, 500)
+        self._send(answer)
+        self.server.connections.answered(self.connection)
+
+    def _answer(self) -> Answer:
         names = self.server.host_names
-        asked = (urlsplit(f"//{self.headers.get('Host', '')}").hostname or "").lower()
+        try:
+            asked = (urlsplit(f"//{self.headers.get('Host', '')}").hostname or "").lower()
+        except ValueError:
+            return _json({"error": "the header Host is none"}, 400)
         if names is not None and asked not in names:
-            self._send(
-                _json({"error": f"this server answers to {', '.join(sorted(names))}, not to {asked or 'no name'}"}, 403)
-            )
-        else:
-            self._send(self.server.board.answer(self.path))
+            said = f"this server answers to {', '.join(sorted(names))}, not to {asked or 'no name'}"
+            return _json({"error": said}, 403)
+        return self.server.board.answer(self.path)
 
     def _send(self, answer: Answer) -> None:
         self.send_response(answer.status)
         self.send_header("Content-Type", answer.kind)
         self.send_header("Content-Length", str(len(answer.body)))
         self.send_header("Cache-Control", answer.cache)
+        if self.close_connection:
+            self.send_header("Connection", "close")
         for name, value in HEADERS.items():
             self.send_header(name, value)
         self.end_headers()
@@ -188,4 +225,7 @@ class Handler(BaseHTTPRequestHandler):
     def log_message(self, format: str, *args: object) -> None:
         """Only what went wrong is said."""
         if len(args) > 1 and str(args[1]) >= "500":
-            print(f"{self.address_string()} {format % args}", file=sys.stderr)
+            print(f"{self.address_string()} {format % args!a}", file=sys.stderr)
+
+    def log_error(self, format: str, *args: object) -> None:
+        """What was refused is told to who asked for it."""

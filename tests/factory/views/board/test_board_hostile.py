@@ -1,0 +1,109 @@
+"""Whatever is sent to the dashboard: an answer or a closed connection, no traceback; others are served meanwhile."""
+
+import http.client
+import random
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import suppress
+
+import pytest
+
+from factory.store.samples import Store
+from factory.views.board.server import CONNECTIONS, Board, Server
+
+At = tuple[str, int]
+HOST = b"Host: localhost\r\n\r\n"
+MALFORMED = {
+    "no HTTP": b"\x16\x03\x01\x00\xa5\x01\x00\x00\xa1\x03\x03\r\n\r\n",
+    "nothing": b"\r\n\r\n",
+    "bad method": b"BREW /api/overview HTTP/1.1\r\n" + HOST,
+    "bad version": b"GET / HTTP/99.99\r\n" + HOST,
+    "no version's number": b"GET / HTTP/x\r\n" + HOST,
+    "huge header": b"GET / HTTP/1.1\r\nX: " + b"a" * 200_000 + b"\r\n" + HOST,
+    "many headers": b"GET / HTTP/1.1\r\n" + b"X: a\r\n" * 500 + HOST,
+    "huge address": b"GET /" + b"a" * 100_000 + b" HTTP/1.1\r\n" + HOST,
+    "bad percent": b"GET /api/samples?expert=%zz%ff%00&page=%31 HTTP/1.1\r\n" + HOST,
+    "bytes": b"GET /\xff\xfe\x80?\xc3\x28=\x9f HTTP/1.1\r\n" + HOST,
+    "traversal": b"GET /static/../../../../etc/passwd HTTP/1.1\r\n" + HOST,
+    "traversal, quoted": b"GET /static/%2e%2e%2f%2e%2e%2fetc%2fpasswd HTTP/1.1\r\n" + HOST,
+    "bracket": b"GET //[x/y HTTP/1.1\r\n" + HOST,
+    "bracket in Host": b"GET / HTTP/1.1\r\nHost: [x\r\n\r\n",
+    "no Host": b"GET / HTTP/1.1\r\n\r\n",
+    "huge numbers": b"GET /api/samples?page=99999999&size=99999999 HTTP/1.1\r\n" + HOST,
+    "unknown filter": b"GET /api/samples?order=%27&expert=%00 HTTP/1.1\r\n" + HOST,
+    "large body": b"POST /api/samples HTTP/1.1\r\nContent-Length: 10000000\r\n" + HOST + b"x" * 10_000_000,
+    "body of a GET": b"GET /nothing HTTP/1.1\r\nContent-Length: 40\r\n"
+    + HOST
+    + b"GET /api/overview HTTP/1.1\r\n"
+    + HOST,
+    "negative length": b"GET /nothing HTTP/1.1\r\nContent-Length: -1\r\n" + HOST,
+    "half": b"GET /api/over",
+}
+
+
+@pytest.fixture(scope="module")
+def at(tmp_path_factory: pytest.TempPathFactory) -> Iterator[At]:
+    with Server(Board(Store(tmp_path_factory.mktemp("none"))), "127.0.0.1", 0) as server:
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        yield "127.0.0.1", server.server_address[1]
+        server.shutdown()
+        thread.join()
+
+
+def sent(at: At, data: bytes) -> bytes:
+    """What comes back until the connection is closed by the other side, as it is once nothing more is sent."""
+    with socket.create_connection(at, timeout=20) as connection, suppress(ConnectionError):
+        connection.sendall(data)
+        with suppress(OSError):  # it is closed already
+            connection.shutdown(socket.SHUT_WR)
+        parts = []
+        while part := connection.recv(65536):
+            parts.append(part)
+        return b"".join(parts)
+    return b""
+
+
+def is_answered(at: At) -> bool:
+    connection = http.client.HTTPConnection(*at, timeout=20)
+    connection.request("GET", "/static/board.css")
+    answer = connection.getresponse()
+    connection.close()
+    return answer.status == 200
+
+
+@pytest.mark.parametrize("name", MALFORMED)
+def test_what_is_malformed_is_refused(at: At, name: str, capfd: pytest.CaptureFixture[str]) -> None:
+    back = sent(at, MALFORMED[name])
+    heads = [line for line in back.split(b"\r\n") if line.startswith(b"HTTP/1.1 ")]
+    assert len(heads) <= 1 and not any(head[9:10] == b"2" for head in heads if name not in ("bad percent", "bytes"))
+    assert b"root:" not in back and "Traceback" not in capfd.readouterr().err
+    assert is_answered(at)
+
+
+def test_random_bytes_bring_nothing_down(at: At, capfd: pytest.CaptureFixture[str]) -> None:
+    chance = random.Random(1)
+    good = b"GET /api/samples?page=1&size=12&order=newest HTTP/1.1\r\n" + HOST
+    for _ in range(200):
+        data = bytearray(good)
+        for _ in range(chance.randrange(1, 6)):
+            data[chance.randrange(len(data))] = chance.randrange(256)
+        back = sent(at, bytes(data[: chance.choice((len(data), chance.randrange(len(data))))]))
+        assert b"HTTP/1.1 500" not in back, data
+    assert "Traceback" not in capfd.readouterr().err and is_answered(at)
+
+
+@pytest.mark.slow
+def test_five_hundred_open_connections_keep_nobody_out(at: At) -> None:
+    """Half of them have sent half a request."""
+    before = threading.active_count()
+    held = []
+    for number in range(500):
+        held.append(socket.create_connection(at, timeout=20))
+        held[-1].sendall(b"GET / HT" if number % 2 else b"")
+    assert is_answered(at)
+    assert threading.active_count() <= before + CONNECTIONS
+    for connection in held:
+        connection.close()
+    assert is_answered(at)
