@@ -47,6 +47,14 @@ def main(argv: Sequence[str], only_plan: bool = False) -> int:
     except DiskFull as error:
         print(f"error: {error}; free disk space and run the same command again", file=sys.stderr)
         return INTERRUPTED
+    except Exception as error:
+        from factory.store.illness import why_ill
+        from factory.wording import one_line
+
+        if not why_ill(error):
+            raise
+        print(f"error: {one_line(error)}; run the same command again to go on", file=sys.stderr)
+        return INTERRUPTED
 
 
 def dealt(refs: Sequence["ClipRef"], hands: int) -> list["ClipRef"]:
@@ -171,11 +179,11 @@ def run(asked: Asked, only_plan: bool) -> int:
     if summary.exit_code == BAD_CONFIG or summary.funnel is None:
         return summary.exit_code
     print(summary.funnel.text())
+    if summary.is_broken:
+        return summary.exit_code
     print(image_sources_text(store, [ref.clip_id for ref in refs]))
     if summary.seconds:
         print(seconds_text(summary.seconds))
-    if summary.disk_full:
-        return summary.exit_code
     if set(config.experts) >= NEEDED and summary.exit_code == COMPLETE:
         print(write_benchmark(store, refs, assembled.work.identity, config.rounds, config.benchmark))
     remember(store, assembled)

@@ -121,7 +121,8 @@ class Gatherer:
         if batch is None:
             return False
         if isinstance(report, Failure):
-            raise WriteFailed(f"a file of samples could not be written: {report.error.splitlines()[-1]}")
+            said = report.error.splitlines()[-1]
+            raise WriteFailed(f"a file of samples could not be written: {said}; run the same command again to go on")
         batch.shards.append(report)
         batch.writing -= 1
         if not batch.writing:

@@ -32,6 +32,7 @@ from factory.graph.work import NotReady, Work
 from factory.readers.base import ClipRef
 from factory.store.disk import DiskFull
 from factory.store.funnel import Funnel, funnel_of
+from factory.store.illness import why_ill
 from factory.store.location import BadLocation
 from factory.store.outcomes import Kind
 from factory.store.samples import CURRENT_RUN, NOTHING, ChangedRun, OnChange, Store
@@ -39,6 +40,7 @@ from factory.store.table import AnotherWriter
 from factory.wording import one_line
 
 Executor = Literal["local", "ray"]
+AGAIN = "run the same command again to go on"
 
 
 @dataclass
@@ -53,7 +55,7 @@ class RunSummary:
     notes: list[str] = field(default_factory=list)
     funnel: Funnel | None = None
     began_ms: int = 0  # since 1970; 0: nothing was left to do
-    disk_full: bool = False  # the message says where; then no page is written
+    is_broken: bool = False  # by what it writes to or works on, as the message says: then no page is written
 
 
 def execute(
@@ -109,14 +111,16 @@ def execute(
         pictured = Together(parts) if parts else None
     except ChangedRun as error:
         return RunSummary(BAD_CONFIG, str(error))
-    except OSError as error:
+    except (OSError, DeltaError) as error:
+        if why_ill(error):
+            return RunSummary(INTERRUPTED, f"{one_line(error)}; {AGAIN}")
         return RunSummary(BAD_CONFIG, f"{error}; python -m factory verify {store.location.uri} says what is damaged")
     notes = notes_folder(store.location)
     plan, died = counted(crash_of(notes), plan, Records(identity, digests), policy)
     driver = Driver(identity, plan, digests, rounds, policy, work.block, work.doing)
     if plan.frozen:
         driver.notes.append(f"{len(plan.frozen)} clips kept as they are: their candidates come from other settings")
-    code, message, began_ms, disk_full = COMPLETE, "", 0, False
+    code, message, began_ms, is_broken = COMPLETE, "", 0, False
     try:
         is_due = plan.todo or (pictured is not None and pictured.is_due)
         graph: Graph | None = None
@@ -160,31 +164,35 @@ def execute(
         if driver.interrupted:
             code, message = INTERRUPTED, "interrupted; run the same command again to go on"
     except DiskFull as error:
-        code, message, disk_full = INTERRUPTED, out_of_disk(error), True
+        code, message, is_broken = INTERRUPTED, out_of_disk(error), True
     except MachineIll as error:
-        code, message = INTERRUPTED, f"{error}; put it right and run the same command again: no clip is blamed"
+        text = f"{error}; put it right and run the same command again: no clip is blamed"
+        code, message, is_broken = INTERRUPTED, text, True
     except (AnotherWriter, WriteFailed) as error:
-        code, message = INTERRUPTED, str(error)
+        code, message, is_broken = INTERRUPTED, str(error), True
     except (OSError, DeltaError) as error:  # what holds the tables fails: a share that went away, a lost network
-        code, message = INTERRUPTED, f"{one_line(error)}; run the same command again to go on"
+        code, message, is_broken = INTERRUPTED, f"{one_line(error)}; {AGAIN}", True
     except KeyboardInterrupt:
         code, message = INTERRUPTED, "stopped at once; run the same command again"
     finally:
         if graph is not None:
             graph.close()
-    funnel = funnel_of(store, [ref.clip_id for ref in refs])
+    funnel = None
+    try:
+        funnel = funnel_of(store, [ref.clip_id for ref in refs])
+    except (OSError, DeltaError) as error:
+        code, message, is_broken = INTERRUPTED, message or f"{one_line(error)}; {AGAIN}", True
     counts = _counts(plan)
     summary = RunSummary(
-        code, message, counts, driver.executed, driver.seconds, driver.notes, funnel, began_ms, disk_full
+        code, message, counts, driver.executed, driver.seconds, driver.notes, funnel, began_ms, is_broken
     )
     if began_ms or code:
         try:
             record_summary(store, summary)
         except OSError as error:  # the same disk or share
-            summary.exit_code = INTERRUPTED
-            summary.disk_full = summary.disk_full or isinstance(error, DiskFull)
+            summary.exit_code, summary.is_broken = INTERRUPTED, True
             summary.message = summary.message or (
-                out_of_disk(error) if isinstance(error, DiskFull) else f"{one_line(error)}; run the same command again"
+                out_of_disk(error) if isinstance(error, DiskFull) else f"{one_line(error)}; {AGAIN}"
             )
     for line in (*summary.notes, str(summary.executed)):
         say(line)

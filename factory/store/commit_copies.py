@@ -48,6 +48,11 @@ class CommitCopies:
         """The number of a commit that was made and is newer than `version`, which the table says is its newest."""
         return version + 1 if self._copies.has(_json(version + 1)) else None
 
+    def log_has(self, version: int, text: str = "") -> bool:
+        """A commit of this number is in the log, whatever its listing says, and has a text in it."""
+        found = self._log.read(_json(version))
+        return found is not None and text.encode() in found
+
     def damage(self) -> list[LogDamage]:
         """What is not as it was. Of a table without copies, of an earlier version, nothing can be said."""
         copies, problems = self._unsealed()

@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from deltalake.exceptions import DeltaError
+
 from factory.store.disk import DiskFull
 
 NUMBERS = frozenset(
@@ -20,7 +22,9 @@ NUMBERS = frozenset(
     if hasattr(errno, name)
 )
 # What object stores' clients say in an OSError without a number; a file that is not there is no illness.
-STORE = re.compile(r"AWS Error (?!NO_SUCH|RESOURCE_NOT_FOUND)|Generic (?:S3|GCS|MicrosoftAzure) error")
+STORE = re.compile(
+    r"AWS Error (?!NO_SUCH|RESOURCE_NOT_FOUND)|Generic (?:S3|GCS|MicrosoftAzure) error|lacked the necessary privileges"
+)
 OS_ERROR = re.compile(r"\(os error (\d+)\)")
 SHORT_OF_MEMORY = 0.1  # of it is left: then a MemoryError is the machine's, else of what was asked for
 
@@ -53,6 +57,8 @@ def why_ill(error: BaseException) -> str:
 
 
 def _is_ill(error: BaseException) -> bool:
+    if isinstance(error, DeltaError):
+        return STORE.search(str(error)) is not None
     if not isinstance(error, OSError):
         return False
     if error.errno is not None:

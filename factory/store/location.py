@@ -70,7 +70,7 @@ class Location:
         return bool(filesystem.get_file_info(f"{base}/{name}").type == fs.FileType.File)
 
     def write(self, name: str, data: bytes) -> None:
-        """Whole file or no file: rename on local disk (flushed first), one put on an object store.
+        """Whole file or no file: rename on local disk (flushed first), on an object store an upload that is completed.
 
         Raises DiskFull where the disk is full.
         """

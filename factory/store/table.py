@@ -13,11 +13,12 @@ Measured here: 5-12 ms per commit on local disk.
 
 import hashlib
 import json
+import secrets
 import time
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -26,11 +27,12 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from deltalake import CommitProperties, DeltaTable, Transaction
-from deltalake.exceptions import CommitFailedError
+from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundError
 from deltalake.transaction import AddAction, RemoveAction
 
 from factory.store.commit_copies import COPIES, CommitCopies
 from factory.store.disk import needs_disk
+from factory.store.late_listing import until_listed
 from factory.store.location import Location
 from factory.wording import one_line
 
@@ -39,6 +41,7 @@ EPOCH_ID = f"{APP_ID}.epoch"
 ACTION_BYTES = 1024  # of the log, about, that a file added or removed takes
 SCHEMA_BYTES = 16 * 1024  # of the log, about, that a new table takes
 CLAIMS = 20  # of one table, by a run that begins while another commits
+CLAIM_PAUSE_S = 0.1  # on an object store after the first, and half as long again after each: 50 s in all
 AHEAD = 16  # files of an object store that are read at once
 ROW_GROUP_BYTES = 4 * 2**20  # uncompressed; one sample costs one group, and a group 13 kB of the file's footer
 
@@ -139,6 +142,7 @@ class KeyedTable:
     def __init__(self, location: Location, spec: TableSpec) -> None:
         self.location, self.spec = location, spec
         self.copies = CommitCopies(location)
+        self._token = secrets.token_hex(16)  # stands in every commit of this writer
         self._delta: DeltaTable | None = None
         with self._log_naming():
             if DeltaTable.is_deltatable(location.uri, storage_options=dict(location.options)):
@@ -239,10 +243,16 @@ class KeyedTable:
 
     def lost_commit(self) -> int | None:
         """The number of a commit that was made and that the log does not have any more; None where it has all."""
-        if self._delta is None:
-            return self.copies.lost(-1)
-        self.refresh()
-        return self.copies.lost(self._delta.version())
+        lost: int | None = None
+
+        def is_sure() -> bool:
+            nonlocal lost
+            self.refresh()
+            lost = self.copies.lost(-1 if self.version is None else self.version)
+            return lost is None or not self.copies.log_has(lost)
+
+        until_listed(is_sure, f"a commit of {self.location.uri}")
+        return lost
 
     @property
     def epoch(self) -> int:
@@ -265,15 +275,14 @@ class KeyedTable:
             if mine <= self.epoch:
                 raise self._lost()
             try:
-                self._write([], mine)
+                self._transact([], mine)
                 break
             except AnotherWriter:
-                if not left:
+                self.refresh()
+                if not left or self.epoch > mine:  # a later claim followed at once
                     raise
-        self.refresh()
-        if self.epoch != mine:  # a later claim followed at once
-            raise self._lost()
-        self._note_commit(self.version or 0)
+                if not self.location.is_local:  # perhaps a commit that is not listed yet
+                    time.sleep(min(CLAIM_PAUSE_S * 1.5 ** (CLAIMS - left), 5.0))
         return mine
 
     def commit(self, add: Sequence[Shard], drop: Iterable[str] = ()) -> None:
@@ -335,61 +344,72 @@ class KeyedTable:
     def set_property(self, name: str, value: str) -> None:
         """One more commit, of metadata. Raises AnotherWriter."""
         table = self._delta if self._delta is not None else self._create()
-        version = table.version()
-        with needs_disk(f"{self.location.uri}/_delta_log", ACTION_BYTES):
-            table.alter.set_table_properties({name: value}, raise_if_not_exists=False)
-        table.update_incremental()
-        self._check_alone(version)
-        self._note_commit(version + 1)
+        with self._committing(table, 1):
+            table.alter.set_table_properties(
+                {name: value}, raise_if_not_exists=False, commit_properties=self._properties()
+            )
 
     def _without(self, path: str, partition: Mapping[str, str], dropped: set[str]) -> Shard | None:
         rows = self.read_file(path, partition)
         rows = rows.filter(pc.invert(pc.is_in(rows[self.spec.key], value_set=pa.array(sorted(dropped), pa.string()))))
         return write_shard(self.location, self.spec, rows) if rows.num_rows else None
 
-    def _transact(self, actions: list[AddAction | RemoveAction]) -> None:
-        version = self._write(actions)
-        self._delta.update_incremental()  # type: ignore[union-attr]
-        self._check_alone(version)
-        self._note_commit(version + 1)
-
-    def _write(self, actions: list[AddAction | RemoveAction], epoch: int | None = None) -> int:
-        """Put one commit at the end of the log that was seen, whose version is returned. Raises AnotherWriter."""
+    def _transact(self, actions: list[AddAction | RemoveAction], epoch: int | None = None) -> None:
+        """Put one commit, with a claim's epoch, at the end of the log that was seen. Raises AnotherWriter."""
         table = self._delta if self._delta is not None else self._create()
-        number = (table.transaction_version(APP_ID) or 0) + 1
-        said = [Transaction(APP_ID, number), *([Transaction(EPOCH_ID, epoch)] if epoch is not None else [])]
-        properties = CommitProperties(app_transactions=said, max_commit_retries=0)
-        try:
-            with needs_disk(f"{self.location.uri}/_delta_log", ACTION_BYTES * (1 + len(actions))):
-                table.create_write_transaction(
-                    actions,
-                    mode="append",
-                    schema=self.spec.schema,
-                    partition_by=list(self.spec.partition_by),
-                    commit_properties=properties,
-                )
-        except CommitFailedError as error:
-            raise self._lost() from error
-        return table.version()
+        said = [Transaction(APP_ID, (table.transaction_version(APP_ID) or 0) + 1)]
+        if epoch is not None:
+            said.append(Transaction(EPOCH_ID, epoch))
+        with self._committing(table, 1 + len(actions)):
+            table.create_write_transaction(
+                actions,
+                mode="append",
+                schema=self.spec.schema,
+                partition_by=list(self.spec.partition_by),
+                commit_properties=self._properties(*said),
+            )
 
     def _lost(self) -> AnotherWriter:
         return AnotherWriter(f"{self.spec.name}: another run has taken over {self.location.uri}")
 
-    def _note_commit(self, version: int) -> None:
+    def _properties(self, *transactions: Transaction) -> CommitProperties:
+        return CommitProperties({"writer": self._token}, max_commit_retries=0, app_transactions=list(transactions))
+
+    @contextmanager
+    def _committing(self, table: DeltaTable, n_actions: int) -> Iterator[None]:
+        """Around one commit: it is ours and the newest, and has its copy. Raises AnotherWriter.
+
+        A client whose answer got lost asks again, and is told that somebody was faster: the log says who it was.
+        """
+        version = table.version() + 1
+        try:
+            with needs_disk(f"{self.location.uri}/_delta_log", ACTION_BYTES * n_actions):
+                yield
+        except DeltaError as error:
+            if not self.copies.log_has(version, self._token):
+                if not isinstance(error, CommitFailedError):
+                    raise
+                raise self._lost() from error
+        self._see(table, version)
+        if self.version != version:
+            raise self._lost()
         with needs_disk(f"{self.location.uri}/{COPIES}", SCHEMA_BYTES):
             self.copies.note(version)
 
-    def _check_alone(self, version: int) -> None:
-        """Between `version` and now there was one commit, our own."""
-        if self.version != version + 1:
-            raise self._lost()
+    def _see(self, table: DeltaTable, version: int) -> None:
+        def is_seen() -> bool:
+            with suppress(TableNotFoundError):
+                table.update_incremental()
+            return table.version() >= version
+
+        until_listed(is_seen, f"commit {version} of {self.location.uri}")
 
     def _create(self) -> DeltaTable:
         with needs_disk(f"{self.location.uri}/_delta_log", SCHEMA_BYTES):
             if self.location.is_local:
                 Path(self.location.uri).mkdir(parents=True, exist_ok=True)
             try:
-                self._delta = DeltaTable.create(
+                DeltaTable.create(
                     self.location.uri,
                     self.spec.schema,
                     mode="ignore",
@@ -400,10 +420,16 @@ class KeyedTable:
                     commit_properties=CommitProperties(max_commit_retries=0),  # else it is made a second time
                     storage_options=dict(self.location.options),
                 )
-            except CommitFailedError:  # another run makes it at the same moment
-                self.refresh()
-                if self._delta is None:
+            except DeltaError:
+                if not self.copies.log_has(0):
                     raise
+
+        def is_seen() -> bool:
+            self.refresh()
+            return self._delta is not None
+
+        until_listed(is_seen, f"the first commit of {self.location.uri}")
+        assert self._delta is not None
         return self._delta
 
 

@@ -1,10 +1,6 @@
 """The same store behind an object-store URL, against a local S3 server."""
 
 import json
-import socket
-import subprocess
-import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,44 +14,18 @@ from factory.store.samples import Store
 from factory.store.verify import verify
 from factory.views.board.server import Board
 from factory.views.show import prepared_episode
+from tests.chaos.bad_store import BUCKET, credentials, moto_server
 from tests.factory.filmed import FilmedWork
 from tests.factory.tables import assert_same_tables
 from tests.factory.toy import ToyWork, refs
-
-BUCKET = "bucket"
 
 
 @pytest.fixture(scope="module")
 def s3() -> Iterator[dict[str, str]]:
     """Storage options of a server in its own process: in a thread of this one it would wait for deltalake's lock."""
-    boto3 = pytest.importorskip("boto3")
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    quiet = subprocess.DEVNULL
-    server = subprocess.Popen(
-        [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)], stdout=quiet, stderr=quiet
-    )
-    try:
-        for _ in range(100):
-            with socket.socket() as client:
-                if client.connect_ex(("127.0.0.1", port)) == 0:
-                    break
-            time.sleep(0.1)
-        url = f"http://127.0.0.1:{port}"
-        keys = {"aws_access_key_id": "a", "aws_secret_access_key": "b", "region_name": "us-east-1"}
-        boto3.client("s3", endpoint_url=url, **keys).create_bucket(Bucket=BUCKET)
-        yield {
-            "AWS_ENDPOINT_URL": url,
-            "AWS_ACCESS_KEY_ID": "a",
-            "AWS_SECRET_ACCESS_KEY": "b",
-            "AWS_REGION": "us-east-1",
-            "AWS_ALLOW_HTTP": "true",
-            "AWS_S3_ALLOW_UNSAFE_RENAME": "true",
-        }
-    finally:
-        server.terminate()
-        server.wait(timeout=10)
+    pytest.importorskip("boto3")
+    with moto_server() as url:
+        yield credentials(url)
 
 
 @pytest.mark.slow

@@ -1,0 +1,67 @@
+"""A bucket that misbehaves ends a run with one line at most; the same command then makes the same rows."""
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.chaos.bad_store import BUCKET, BadStore, Fault, What, bad_store, environment_of
+from tests.chaos.object_stores import ROOT, TROUBLES, check, undisturbed
+
+pytestmark = pytest.mark.slow
+LOG = "_delta_log/0.*json"
+COMMIT = """
+import sys
+import pyarrow as pa
+from factory.store.location import Location
+from factory.store.table import KeyedTable, TableSpec, write_shard
+spec = TableSpec("t", pa.schema([("k", pa.string())]), "k")
+table = KeyedTable(Location.parse(sys.argv[1]), spec)
+assert table.lost_commit() is None
+table.claim()
+table.set_property("a.b", sys.argv[2])
+table.commit([write_shard(table.location, spec, pa.table({"k": [sys.argv[2]]}))])
+print(*sorted(table))
+"""
+
+
+@pytest.fixture(scope="module")
+def store() -> Iterator[BadStore]:
+    pytest.importorskip("boto3")
+    with bad_store() as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def golden() -> Iterator[Path]:
+    with undisturbed() as made:
+        yield made
+
+
+@pytest.mark.parametrize("name", ["503 from then on", "no right to write any more", "SIGKILL in a commit"])
+def test_the_same_command_makes_the_same_rows(store: BadStore, golden: Path, name: str) -> None:
+    number = list(TROUBLES).index(name)
+    check(store, golden, f"s3://{BUCKET}/run-{number}", TROUBLES[name]())
+
+
+def committed(store: BadStore, name: str, key: str, fault: Fault | None) -> str:
+    """Keys of a table in another process, which commits one."""
+    store.fault = fault
+    words = [sys.executable, "-c", COMMIT, f"s3://{BUCKET}/{name}", key]
+    done = subprocess.run(words, cwd=ROOT, env=environment_of(store), capture_output=True, text=True, timeout=300)
+    store.fault = None
+    return done.stdout.strip() or done.stderr
+
+
+@pytest.mark.parametrize("number", [1, 2, 3, 4])  # the table's own, its claim, its metadata, its rows
+def test_a_commit_whose_answer_is_lost_is_known_as_ones_own(store: BadStore, number: int) -> None:
+    unanswered = Fault(What.UNANSWERED, "PUT", LOG, first=number, times=1)
+    assert committed(store, f"lost-{number}", "a", unanswered) == "a" and unanswered.met == 1
+    assert committed(store, f"lost-{number}", "b", None) == "a b"
+
+
+def test_listings_that_are_behind_are_waited_for(store: BadStore) -> None:
+    for keys in ("a", "a b"):
+        assert committed(store, "behind", keys[-1], Fault(What.UNLISTED, seconds=2.0)) == keys
