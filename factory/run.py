@@ -11,6 +11,7 @@ complete, 2 bad settings or no clip (nothing is written), 3 complete with failed
 
 import os
 import sys
+import time
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from itertools import zip_longest
@@ -117,6 +118,11 @@ def isolates(config: RunConfig) -> bool:
     return config.graph.isolated == "always" or (config.graph.isolated == "auto" and foreign)
 
 
+def left(minutes: float | None, began: float) -> float | None:
+    """Of so many minutes since then, on the monotonic clock."""
+    return None if minutes is None else max(0.0, minutes - (time.monotonic() - began) / 60.0)
+
+
 def run(asked: Asked, only_plan: bool) -> int:
     """Plan, execute, commit, report; or plan alone. The command line is checked before anything heavy is imported."""
     config = load_config(asked.words)
@@ -125,7 +131,7 @@ def run(asked: Asked, only_plan: bool) -> int:
     refuse_what_is_not_there(config)
 
     from factory.graph.episodes import EpisodesWanted
-    from factory.graph.execute import execute
+    from factory.graph.execute import execute, on_new_clusters
     from factory.graph.limits import Limits
     from factory.graph.local import Claims
     from factory.setup.calibrate import calibrate, plan_text
@@ -154,25 +160,28 @@ def run(asked: Asked, only_plan: bool) -> int:
         if only_plan:
             print(calibrate(assembled, refs, store))
             return 0
-        summary = execute(
-            assembled.work,
-            refs,
-            config.experts,
-            config.rounds,
-            store,
-            config.executor,
-            config.workers,
-            claims=Claims(config.gpu_share if assembled.work.draws_on_gpu else 0.0, config.graph.memory_gb),
-            fuse=config.graph.fuse,
-            isolated=isolates(config),
-            limits=Limits({**labels_limit(config), **config.graph.limit_s}, config.graph.limit_gb),
-            on_change=config.on_change,
-            retry=config.retry_failed,
-            shard_seconds=config.shard_seconds,
-            minutes=config.minutes,
-            episodes=EpisodesWanted(config.one_episode_in, prepared_episode) if config.one_episode_in else None,
-            mcap_shards=config.store.episodes == "all",
-            command=asked.words,
+        began = time.monotonic()
+        summary = on_new_clusters(
+            lambda: execute(
+                assembled.work,
+                refs,
+                config.experts,
+                config.rounds,
+                store,
+                config.executor,
+                config.workers,
+                claims=Claims(config.gpu_share if assembled.work.draws_on_gpu else 0.0, config.graph.memory_gb),
+                fuse=config.graph.fuse,
+                isolated=isolates(config),
+                limits=Limits({**labels_limit(config), **config.graph.limit_s}, config.graph.limit_gb),
+                on_change=config.on_change,
+                retry=config.retry_failed,
+                shard_seconds=config.shard_seconds,
+                minutes=left(config.minutes, began),
+                episodes=EpisodesWanted(config.one_episode_in, prepared_episode) if config.one_episode_in else None,
+                mcap_shards=config.store.episodes == "all",
+                command=asked.words,
+            )
         )
     if summary.message:
         print(summary.message, file=sys.stderr)

@@ -23,7 +23,7 @@ from factory.graph.driver import Driver, Executed, MachineIll
 from factory.graph.episodes import Beside, Episodes, EpisodesWanted, McapShards, Together
 from factory.graph.guard import CRASHED
 from factory.graph.limits import NO_LIMITS, Limits, notes_folder
-from factory.graph.local import NO_CLAIMS, Claims, ClusterLacks, Fuse, Graph, LocalGraph
+from factory.graph.local import NO_CLAIMS, Claims, ClusterDied, ClusterLacks, Fuse, Graph, LocalGraph
 from factory.graph.metrics import RunMetrics
 from factory.graph.plan import RunPlan, make_plan
 from factory.graph.records import Records
@@ -41,6 +41,7 @@ from factory.wording import one_line
 
 Executor = Literal["local", "ray"]
 AGAIN = "run the same command again to go on"
+NEW_CLUSTERS = 3  # in one run, for those of its own that die
 
 
 @dataclass
@@ -55,6 +56,7 @@ class RunSummary:
     notes: list[str] = field(default_factory=list)
     funnel: Funnel | None = None
     began_ms: int = 0  # since 1970; 0: nothing was left to do
+    lost_cluster: bool = False  # the run's own, which another may replace
     is_broken: bool = False  # by what it writes to or works on, as the message says: then no page is written
 
 
@@ -120,7 +122,7 @@ def execute(
     driver = Driver(identity, plan, digests, rounds, policy, work.block, work.doing)
     if plan.frozen:
         driver.notes.append(f"{len(plan.frozen)} clips kept as they are: their candidates come from other settings")
-    code, message, began_ms, is_broken = COMPLETE, "", 0, False
+    code, message, began_ms, is_broken, lost_cluster = COMPLETE, "", 0, False, False
     try:
         is_due = plan.todo or (pictured is not None and pictured.is_due)
         graph: Graph | None = None
@@ -168,8 +170,9 @@ def execute(
     except MachineIll as error:
         text = f"{error}; put it right and run the same command again: no clip is blamed"
         code, message, is_broken = INTERRUPTED, text, True
-    except (AnotherWriter, WriteFailed) as error:
+    except (AnotherWriter, WriteFailed, ClusterDied) as error:
         code, message, is_broken = INTERRUPTED, str(error), True
+        lost_cluster = isinstance(error, ClusterDied) and error.is_ours
     except (OSError, DeltaError) as error:  # what holds the tables fails: a share that went away, a lost network
         code, message, is_broken = INTERRUPTED, f"{one_line(error)}; {AGAIN}", True
     except KeyboardInterrupt:
@@ -184,7 +187,9 @@ def execute(
         code, message, is_broken = INTERRUPTED, message or f"{one_line(error)}; {AGAIN}", True
     counts = _counts(plan)
     summary = RunSummary(
-        code, message, counts, driver.executed, driver.seconds, driver.notes, funnel, began_ms, is_broken
+        *(code, message, counts, driver.executed, driver.seconds, driver.notes, funnel, began_ms),
+        lost_cluster=lost_cluster,
+        is_broken=is_broken,
     )
     if began_ms or code:
         try:
@@ -202,6 +207,16 @@ def execute(
 def out_of_disk(error: DiskFull) -> str:
     """What to do where a disk is full."""
     return f"{error}; free disk space and run the same command again: it goes on from what is committed"
+
+
+def on_new_clusters(once: Callable[[], RunSummary], say: Callable[[str], None] = print) -> RunSummary:
+    """A run, and again on a new cluster where its own died: it goes on from what is committed."""
+    for number in range(1, NEW_CLUSTERS + 1):
+        summary = once()
+        if not summary.lost_cluster:
+            return summary
+        say(f"{summary.message}; a new cluster is started, {number} of {NEW_CLUSTERS}")
+    return once()
 
 
 @contextmanager

@@ -38,6 +38,15 @@ class ClusterLacks(ValueError):
     """The cluster has no node that the run could use."""
 
 
+class ClusterDied(RuntimeError):
+    """What Ray runs on this machine died in the middle of a run."""
+
+    def __init__(self, said: str, is_ours: bool) -> None:
+        """is_ours: the run began the cluster, for itself."""
+        super().__init__(said)
+        self.is_ours = is_ours
+
+
 NO_CLAIMS = Claims()
 
 

@@ -35,6 +35,7 @@ from factory.graph.local import (
     NO_CLAIMS,
     STEPS,
     Claims,
+    ClusterDied,
     ClusterLacks,
     Fuse,
     Ticket,
@@ -56,6 +57,7 @@ ILL = (  # what Ray says when it is the machine that failed
     *(exceptions.RuntimeEnvSetupError, exceptions.OutOfMemoryError, exceptions.ObjectLostError),
     *(exceptions.ObjectStoreFullError, exceptions.OutOfDiskError),
 )
+VITAL = ("raylet", "gcs_server")
 PROBE_SECONDS = 120.0
 ANSWER_S = 10.0  # for a cluster's port to be reached
 WARMING = {"key": "warm", "what": "compiling kernels", "run": "", "limited": False}
@@ -167,6 +169,9 @@ class RayGraph:
                 self._flying[draws] += 1
 
     def wait(self, timeout_s: float) -> tuple[Ticket, Any] | None:
+        """Raises ClusterDied."""
+        if self._is_ours and (dead := _dead_part()):
+            raise ClusterDied(f"Ray's {dead} died", is_ours=True)
         if not self._ready and self._tickets:
             pending = list(self._tickets)
             some, _ = ray.wait(pending, num_returns=1, timeout=timeout_s, fetch_local=True)
@@ -181,6 +186,9 @@ class RayGraph:
         self._dispatch()
         try:
             report, worked_s = ray.get(reference)
+        except exceptions.LocalRayletDiedError as error:
+            said = "Ray's raylet on this machine died; run the same command again once Ray is up"
+            raise ClusterDied(said, self._is_ours) from error
         except RayError as error:
             report, worked_s = Failure(_kind_of(error), f"{type(error).__name__}: {error}"[:2000]), 0.0
         if not isinstance(report, Failure):
@@ -329,6 +337,15 @@ def _at_once(workers: int | None, is_ours: bool) -> int:
     """Tasks: of a cluster of our own no more than it has cores, of another what was asked for, as it may grow."""
     available = int(ray.cluster_resources().get("CPU", 1))
     return max(1, min(workers or available, available) if is_ours else workers or available)
+
+
+def _dead_part() -> str:
+    """A process of a cluster that this one began, where it has died.
+
+    Looked at before anything is asked of Ray, which ends this process when it finds the object store gone.
+    """
+    node = ray._private.worker._global_node
+    return next((name for name, _ in node.dead_processes() if name in VITAL), "") if node is not None else ""
 
 
 def _must_answer(address: str) -> None:

@@ -1,0 +1,61 @@
+"""A raylet that dies in the middle of a run: on a cluster of its own the run goes on by itself, three times at most."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from factory.graph.execute import NEW_CLUSTERS, RunSummary, execute, on_new_clusters
+from factory.store.samples import Store
+from factory.store.verify import verify
+from tests.chaos.killed_driver import EXPERTS
+from tests.factory.tables import assert_same_tables
+from tests.factory.toy import ToyWork, refs
+
+ROOT = Path(__file__).parents[2]
+RUN = """
+import sys
+from factory.graph import driver
+from factory.graph.execute import execute, on_new_clusters
+from factory.graph.on_ray import ray
+from factory.store.samples import Store
+from tests.chaos.killed_driver import EXPERTS
+from tests.factory.toy import ToyWork, refs
+
+take, seen = driver.Driver._take_attempt, []
+
+def killing(self, *given):
+    seen.append(given)
+    if len(seen) == 6:
+        ray._private.worker._global_node.all_processes["raylet"][0].process.kill()
+    take(self, *given)
+
+driver.Driver._take_attempt = killing
+store = Store(sys.argv[1])
+ended = on_new_clusters(lambda: execute(ToyWork(), refs(5), EXPERTS, 2, store, "ray", 1, shard_seconds=0.05))
+sys.exit(ended.exit_code)
+"""
+
+
+@pytest.mark.ray
+@pytest.mark.slow
+def test_a_run_goes_on_where_its_own_raylet_dies(tmp_path: Path) -> None:
+    words = [sys.executable, "-c", RUN, str(tmp_path / "out")]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
+    assert done.stdout.count("a new cluster is started") == 1 and "Ray's raylet died" in done.stdout
+    execute(ToyWork(), refs(5), EXPERTS, 2, Store(tmp_path / "plain"), "local", say=lambda line: None)
+    assert_same_tables(tmp_path / "out", tmp_path / "plain")
+    assert verify(Store(tmp_path / "out")).damage == ()
+
+
+def test_no_more_than_three_clusters_are_started_anew() -> None:
+    runs, told = [], list[str]()
+
+    def once() -> RunSummary:
+        runs.append(1)
+        return RunSummary(4, "Ray's raylet died", lost_cluster=True)
+
+    assert on_new_clusters(once, told.append).exit_code == 4
+    assert len(runs) == 1 + NEW_CLUSTERS and [line[-6:] for line in told] == ["1 of 3", "2 of 3", "3 of 3"]
