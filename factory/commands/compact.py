@@ -21,7 +21,8 @@ class Request:
 def main(request: Request) -> None:
     """Merge and say what became of each table. Raises Refused."""
     from factory.store.disk import DiskFull
-    from factory.store.table import AnotherWriter, DamagedFile
+    from factory.store.parquet_file import DamagedFile
+    from factory.store.table import AnotherWriter
     from factory.store.upkeep import RunGoesOn, compact, refuse_held
 
     store = open_store(request.out)

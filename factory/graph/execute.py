@@ -30,8 +30,8 @@ from factory.graph.records import Records
 from factory.graph.walk import Try, retry_policy
 from factory.graph.work import NotReady, Work
 from factory.readers.base import ClipRef
+from factory.store.counts.funnel import Funnel, funnel_of
 from factory.store.disk import DiskFull
-from factory.store.funnel import Funnel, funnel_of
 from factory.store.illness import why_ill
 from factory.store.location import BadLocation
 from factory.store.outcomes import Kind
@@ -146,6 +146,7 @@ def execute(
             plan = make_plan(refs, experts, rounds, history, identity, on_change, policy, work.once)
             driver = Driver(identity, plan, digests, rounds, policy, work.block, work.doing)
             died = []
+        store.plan({expert: 1 if work.once(expert) else rounds for expert in experts}, [ref.clip_id for ref in refs])
         if died:
             store.commit([], [], died)
             driver.notes.append(f"the run before this one died at {died[0].error.partition(': ')[2]}; it comes last")

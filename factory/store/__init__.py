@@ -1,1 +1,1 @@
-"""Where samples, outcomes and candidates live."""
+"""Where plans, candidates, samples and outcomes live."""

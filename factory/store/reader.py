@@ -23,8 +23,9 @@ import pyarrow.parquet as pq
 from factory.store.location import Location
 from factory.store.mcap_shards.mirror import McapTable, open_shard
 from factory.store.mcap_shards.shard import McapShard
+from factory.store.parquet_file import naming, open_parquet, with_partition
 from factory.store.schema import SAMPLES, SCHEMA, SCHEMA_VERSION, VERSION_PROPERTY, table_to_rows
-from factory.store.table import KeyedTable, naming, open_parquet, with_partition
+from factory.store.table import KeyedTable
 from tasks.reward.label_bytes import VocabularyLabels, decode
 from tasks.world.arrays import Bytes, Ints
 

@@ -1,4 +1,4 @@
-"""A store: the tables samples, candidates and outcomes, the cache beside them, and what they say is done.
+"""A store: the tables plans, candidates, samples and outcomes, the cache beside them, and what they say is done.
 
 The sample commit is the truth. A group of results is committed in the order candidates, samples, outcomes, so that a
 crash in between loses at most the outcomes, whose attempts the next run tries again with the same result.
@@ -19,6 +19,7 @@ from factory.store.candidates import CANDIDATES, ClipCandidates, Listed, candida
 from factory.store.identity import UNLISTED, RunIdentity, canonical_json
 from factory.store.location import Location
 from factory.store.outcomes import OUTCOMES, Kind, Outcome, outcomes_table
+from factory.store.plans import PLANS, plan_table
 from factory.store.schema import LICENCES_PROPERTY, SAMPLES, SCHEMA_VERSION
 from factory.store.table import KeyedTable, Shard, write_shard
 from tasks.sealed import MEMBER, sealed_json, unsealed_json
@@ -82,6 +83,12 @@ class Store:
         self.samples = KeyedTable(self.location.child("samples"), SAMPLES)
         self.candidates = KeyedTable(self.location.child("candidates"), CANDIDATES)
         self.outcomes = KeyedTable(self.location.child("outcomes"), OUTCOMES)
+        self.plans = KeyedTable(self.location.child("plans"), PLANS)
+
+    @property
+    def tables(self) -> tuple[KeyedTable, ...]:
+        """In the order in which they are written."""
+        return self.plans, self.candidates, self.samples, self.outcomes
 
     @property
     def cache(self) -> ClipCache:
@@ -99,7 +106,7 @@ class Store:
         for expert in expert_digests:
             if not re.fullmatch(r"[A-Za-z0-9_-]+", expert):
                 raise ChangedRun(f"expert {expert!r}: a name is letters, digits, _ and - (it becomes a folder)")
-        for table in (self.samples, self.candidates, self.outcomes):
+        for table in self.tables:
             if (lost := table.lost_commit()) is not None:
                 where = f"{table.location.uri}: commit {lost} is gone from the table's log"
                 raise ChangedRun(f"{where}; python -m factory verify out={self.location.uri} repair=true puts it back")
@@ -150,14 +157,14 @@ class Store:
         the same attempt, of a redo that failed, stays.
         """
         starts_over, moved, epoch = self.starts_over(records), False, None
-        tables = (self.candidates, self.samples, self.outcomes)
+        tables = (self.candidates, self.plans, self.samples, self.outcomes)
         above = max(table.epoch for table in tables)  # which differ only where one was put back or made anew
         for table in tables:
             before = set(table.live_files())
             epoch = table.claim(epoch, above)
             moved = moved or set(table.live_files()) != before
         if starts_over:
-            for table in (self.candidates, self.outcomes):
+            for table in (self.plans, self.candidates, self.outcomes):
                 table.commit([], drop=list(table))
         if list(records) != self.runs():
             document = json.loads(canonical_json({"schema_version": SCHEMA_VERSION, "runs": list(records)}))
@@ -222,6 +229,15 @@ class Store:
             if not past.current:
                 stale[place].add(past.attempt_id)
         return History(walks, {place: frozenset(ids) for place, ids in stale.items()}, listed_of(self.candidates))
+
+    def plan(self, rounds: Mapping[str, int], clip_ids: Sequence[str]) -> None:
+        """Write down what a run sets out to do, expert -> samples of each clip; nothing where that is known already.
+
+        Raises AnotherWriter.
+        """
+        rows = plan_table(rounds, clip_ids)
+        if rows["plan_id"][0].as_py() not in self.plans:
+            self.plans.commit([write_shard(self.plans.location, PLANS, rows)])
 
     def commit(
         self,

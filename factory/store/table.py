@@ -34,6 +34,7 @@ from factory.store.commit_copies import COPIES, CommitCopies
 from factory.store.disk import needs_disk
 from factory.store.late_listing import until_listed
 from factory.store.location import Location
+from factory.store.parquet_file import encoded_text, read_parquet, with_partition
 from factory.wording import one_line
 
 APP_ID = "driving-data-factory"
@@ -48,10 +49,6 @@ ROW_GROUP_BYTES = 4 * 2**20  # uncompressed; one sample costs one group, and a g
 
 class DuplicateKey(RuntimeError):
     """A commit would store a key twice. Nothing was written."""
-
-
-class DamagedFile(OSError):
-    """A file of the table cannot be read; the message names it."""
 
 
 class DamagedLog(OSError):
@@ -212,34 +209,43 @@ class KeyedTable:
             self._delta = DeltaTable(self.location.uri, storage_options=dict(self.location.options))
         self.__dict__.pop("_path_of", None)
 
-    def files(self, columns: Sequence[str] | None = None) -> Iterable[tuple[str, pa.Table]]:
+    def files(self, columns: Sequence[str] | None = None, encoded: bool = False) -> Iterable[tuple[str, pa.Table]]:
         """(path, its rows) for every live file, in path order; columns None: all, partition columns included.
+
+        encoded: texts as numbers into a dictionary, for what counts over many rows of few different ones.
 
         On an object store, where a file costs round trips and little else, AHEAD more are being read meanwhile.
         """
         live = sorted(self.live_files().items())
         if self.location.is_local:
-            yield from ((path, self.read_file(path, partition, columns)) for path, partition in live)
+            yield from ((path, self.read_file(path, partition, columns, encoded)) for path, partition in live)
             return
         with ThreadPoolExecutor(AHEAD) as pool:
             reading: deque[tuple[str, Future[pa.Table]]] = deque()
             for path, partition in live:
-                reading.append((path, pool.submit(self.read_file, path, partition, columns)))
+                reading.append((path, pool.submit(self.read_file, path, partition, columns, encoded)))
                 if len(reading) > AHEAD:
                     first, rows = reading.popleft()
                     yield first, rows.result()
             yield from ((path, rows.result()) for path, rows in reading)
 
-    def read_file(self, path: str, partition: Mapping[str, str], columns: Sequence[str] | None = None) -> pa.Table:
-        """One file's rows in the table's schema, page checksums verified."""
-        schema = self.spec.schema if columns is None else pa.schema([self.spec.schema.field(c) for c in columns])
-        stored = [name for name in schema.names if name not in partition]
-        return with_partition(read_parquet(self.location, path, stored), schema, partition)
+    def read_file(
+        self, path: str, partition: Mapping[str, str], columns: Sequence[str] | None = None, encoded: bool = False
+    ) -> pa.Table:
+        """One file's rows in the table's schema, page checksums verified; encoded: as of `files`."""
+        schema = self.schema_of(columns, encoded)
+        return with_partition(read_parquet(self.location, path, schema, partition), schema, partition)
 
-    def read(self, columns: Sequence[str] | None = None) -> pa.Table:
-        """All rows."""
-        schema = self.spec.schema if columns is None else pa.schema([self.spec.schema.field(c) for c in columns])
-        return pa.concat_tables([schema.empty_table(), *(rows for _, rows in self.files(columns))])
+    def read(self, columns: Sequence[str] | None = None, encoded: bool = False) -> pa.Table:
+        """All rows; encoded: as of `files`."""
+        parts = (rows for _, rows in self.files(columns, encoded))
+        return pa.concat_tables([self.schema_of(columns, encoded).empty_table(), *parts])
+
+    def schema_of(self, columns: Sequence[str] | None = None, encoded: bool = False) -> pa.Schema:
+        """Of some columns, None: all; encoded: as of `files`."""
+        names = self.spec.schema.names if columns is None else columns
+        fields = [self.spec.schema.field(name) for name in names]
+        return pa.schema([encoded_text(field) for field in fields] if encoded else fields)
 
     def lost_commit(self) -> int | None:
         """The number of a commit that was made and that the log does not have any more; None where it has all."""
@@ -431,35 +437,3 @@ class KeyedTable:
         until_listed(is_seen, f"the first commit of {self.location.uri}")
         assert self._delta is not None
         return self._delta
-
-
-def with_partition(stored: pa.Table, schema: pa.Schema, partition: Mapping[str, object]) -> pa.Table:
-    """The columns of `schema` from what a file holds and what the log says of it."""
-    n = stored.num_rows
-    arrays = [
-        pa.repeat(pa.scalar(partition[f.name]).cast(f.type), n) if f.name in partition else stored[f.name].cast(f.type)
-        for f in schema
-    ]
-    return pa.table(arrays, schema=schema)
-
-
-def open_parquet(location: Location, path: str) -> pq.ParquetFile:
-    filesystem, base = location.filesystem()
-    return pq.ParquetFile(f"{base}/{path}", filesystem=filesystem, page_checksum_verification=True)
-
-
-def read_parquet(location: Location, path: str, columns: Sequence[str] | None) -> pa.Table:
-    """Some columns of one Parquet file. Raises OSError naming the file for a damaged page."""
-    with naming(f"{location.uri}/{path}"):
-        return open_parquet(location, path).read(columns=list(columns) if columns is not None else None)
-
-
-@contextmanager
-def naming(path: str) -> Iterator[None]:
-    """What is raised while a Parquet file is read, by a damaged page, footer or schema, is a DamagedFile."""
-    try:
-        yield
-    except (FileNotFoundError, DamagedFile):  # with their file's name
-        raise
-    except (OSError, pa.ArrowException, ValueError, LookupError, RuntimeError, MemoryError, OverflowError) as error:
-        raise DamagedFile(f"{path}: cannot be read: {one_line(error)}") from error

@@ -6,7 +6,7 @@ Each change of a table is one transaction; what samples there are is changed by 
 import re
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import pyarrow as pa
@@ -39,7 +39,7 @@ class Merged:
 def refuse_held(store: Store) -> None:
     """Raises RunGoesOn where a run has begun, not ended, and done something lately."""
     current, last = store.began_ms(), store.began_ms(ended=True)
-    written = (file.written_ms for table in tables_of(store) for file in table.file_facts().values())
+    written = (file.written_ms for table in store.tables for file in table.file_facts().values())
     quiet_s = time.time() - max([current, *written]) / 1e3
     if current and current != last and quiet_s < QUIET_S:
         raise RunGoesOn(
@@ -83,7 +83,7 @@ def compact(store: Store, full_bytes: int = FULL_BYTES) -> Iterator[Merged]:
 
     The rows keep their bytes and the times at which they came into the table.
     """
-    for table in tables_of(store):
+    for table in store.tables:
         facts = table.file_facts()
         drop: list[str] = []
         add: list[tuple[Shard, int]] = []
@@ -113,8 +113,3 @@ def _groups(table: KeyedTable, full_bytes: int) -> list[list[str]]:
             groups[-1].append(path)
             held += n_bytes
     return [group for group in groups if len(group) > 1]
-
-
-def tables_of(store: Store) -> Sequence[KeyedTable]:
-    """In the order in which they are written."""
-    return store.candidates, store.samples, store.outcomes

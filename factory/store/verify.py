@@ -25,10 +25,11 @@ from factory.store.location import Location
 from factory.store.mcap_shards.mirror import NAMED as MCAP_NAMED
 from factory.store.mcap_shards.mirror import SAMPLES_MCAP, McapTable
 from factory.store.mcap_shards.shard import McapShard
+from factory.store.parquet_file import DamagedFile, naming
 from factory.store.samples import CURRENT_RUN, IMPORTED, LAST_RUN, ChangedRun, Store
-from factory.store.table import DamagedFile, KeyedTable, LiveFile, naming
+from factory.store.table import KeyedTable, LiveFile
 
-TABLES = ("candidates", "samples", "outcomes", SAMPLES_MCAP.name)
+TABLES = ("plans", "candidates", "samples", "outcomes", SAMPLES_MCAP.name)
 KEPT = ("cache/prepared", "scenes")  # sealed files
 NAMED = re.compile(r"(.*/)?part-([0-9a-f]{32})\.parquet")
 
@@ -62,7 +63,7 @@ def damaged_logs(out: Location) -> list[tuple[str, LogDamage]]:
 def tables_in(store: Store) -> list[KeyedTable]:
     """All that there are, that of MCAP shards where a run wrote some."""
     mcap = McapTable(store.location)
-    return [store.samples, store.candidates, store.outcomes, *([mcap] if mcap.version is not None else [])]
+    return [*store.tables, *([mcap] if mcap.version is not None else [])]
 
 
 def verify(store: Store) -> Verdict:

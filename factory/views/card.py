@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from factory import __version__
-from factory.store.funnel import Funnel, funnel_of
+from factory.store.counts.funnel import Funnel, funnel_of
 from factory.store.outcomes import Kind
 from factory.store.samples import CURRENT_RUN, Store
 from factory.store.schema import SCHEMA_VERSION

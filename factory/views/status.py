@@ -77,12 +77,12 @@ def out_of(out: str) -> "Location":
 
 def status_lines(store: "Store") -> Iterable[str]:
     """Tables, counts, funnel and the newest run."""
-    from factory.store.funnel import funnel_of
+    from factory.store.counts.funnel import funnel_of
 
     samples = store.samples.read(["expert", "round", "split", "image_source", "dataset"]).to_pylist()
     outcomes = Counter(store.outcomes.read(["kind"])["kind"].to_pylist())
     yield f"store       {store.location.uri}"
-    for table in (store.samples, store.candidates, store.outcomes):
+    for table in (store.samples, store.candidates, store.outcomes, store.plans):
         version = "not there yet" if table.version is None else f"version {table.version}"
         yield f"{table.spec.name:<12}{len(table):,} rows, {len(table.live_files())} files, {version}"
     for title in ("dataset", "split", "image_source"):
@@ -90,8 +90,13 @@ def status_lines(store: "Store") -> Iterable[str]:
         yield f"{title:<14}" + (", ".join(f"{name} {n}" for name, n in sorted(counts.items())) or "no samples")
     yield "not samples   " + (", ".join(f"{kind} {n}" for kind, n in sorted(outcomes.items())) or "none")
     yield ""
-    yield funnel_of(store).text().rstrip()
+    funnel = funnel_of(store)
+    yield funnel.text().rstrip()
     yield ""
+    if funnel.balance.stages:
+        yield "planned = accepted + rejected + failed + pending"
+        yield funnel.balance.text().rstrip()
+        yield ""
     yield from _in_work(store)
     yield from _last_run(store)
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 import pyarrow as pa
 
+from factory.store.parquet_file import naming
 from factory.store.reader import TIME_TOLERANCE_S, group_rows
 from factory.store.schema import LABEL_COLUMNS
-from factory.store.table import naming
 from planners.data.batch import ImageLayout, Needs
 from planners.data.files import group_bytes, leaves, read_all
 from planners.data.images import chosen_cameras

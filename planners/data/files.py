@@ -21,8 +21,8 @@ import pyarrow.parquet as pq
 from pyarrow import fs
 
 from factory.store.mcap_shards.shard import McapShard, ShardIndex
+from factory.store.parquet_file import naming
 from factory.store.reader import Format, StoredFile, sample_table
-from factory.store.table import naming
 from tasks.world.arrays import Ints
 
 Footer: TypeAlias = pq.FileMetaData | ShardIndex

@@ -16,8 +16,8 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from factory.store.location import Location
+from factory.store.parquet_file import naming
 from factory.store.reader import Format, StoredFile, group_rows
-from factory.store.table import naming
 from planners.data.batch import TrainingData
 from planners.data.files import SampleFile, files_of, leaves, read_all
 from tasks.world.arrays import F32, Array, Bools, Ints, ShortInts

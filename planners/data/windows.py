@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from factory.store.table import naming
+from factory.store.parquet_file import naming
 from planners.data.decode import StoredRows
 from planners.data.feed import Feed
 from planners.data.files import leaves, read_group

@@ -11,6 +11,7 @@ from factory.graph.execute import execute
 from factory.store.samples import Store
 from factory.store.verify import verify
 from tests.chaos.killed_driver import EXPERTS, MOMENTS
+from tests.factory.graph.balanced import balance
 from tests.factory.tables import assert_same_tables
 from tests.factory.toy import ToyWork, ran, refs
 
@@ -36,10 +37,14 @@ def check(tmp_path: Path, undisturbed: Path, executor: str, moment: str) -> None
     killed = drive(out, executor, moment, before)
     assert killed.returncode == -9, killed.stderr
     store = Store(out)
+    left = balance(out)
+    assert left.samples["planned"] == 5 * (2 + 2 + 1)
+    assert (left.samples["pending"] == 0) == (moment == "everything is committed, the driver has not said so")
     settled = len(store.samples) + sum(kind == "rejected" for kind in store.outcomes.read()["kind"].to_pylist())
     again = drive(out, "local", "never", after)  # either executor resumes the other's run
     assert again.returncode == 0, again.stderr
     assert_same_tables(out, undisturbed)
+    assert balance(out) == balance(undisturbed) and balance(out).samples["pending"] == 0
     assert verify(Store(out)).damage == ()
     total = len(Store(undisturbed).samples) + sum(
         kind == "rejected" for kind in Store(undisturbed).outcomes.read()["kind"].to_pylist()

@@ -5,11 +5,12 @@ A share or a time that is not defined is null; names end in their unit, `_ms` is
 
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
-from factory.store.funnel import Funnel
+from factory.store.counts.funnel import Funnel
 from factory.store.outcomes import Kind
 from factory.views.board.gallery import FILTERS
 from factory.views.board.watch import Snapshot
@@ -64,6 +65,8 @@ def overview(shot: Snapshot, where: str, now_s: float) -> Json:
         "reasons": _reasons(funnel),
         "clip_reasons": [_reason(name, count) for name, count in before.most_common()],
         "gates": [_reason(gate, count, words=GATE_WORDS) for gate, count in funnel.gates.items()],
+        "balance": [asdict(one) for one in funnel.balance.stages],  # planned = accepted + rejected + failed + pending
+        "planned": funnel.balance.samples,  # the same of all samples
         "throughput": _throughput(shot, now_s),
         "stage_times": stage_times,  # worker seconds
         "stage_times_of": of,  # what they are measured on
@@ -182,7 +185,7 @@ def _throughput(shot: Snapshot, now_s: float) -> Json:
 
 
 def _walks(shot: Snapshot, began_ms: int, elapsed_s: float) -> tuple[int, int, float | None]:
-    """Walks that ended since the run began, those it had before it, and the seconds left at this rate."""
+    """Walks that ended since the run began, these and those still pending, and the seconds left at this rate."""
     rounds, experts = shot.current["rounds"], shot.current["experts"]
     ended = {
         (row["clip_id"], row["expert"])
@@ -194,7 +197,7 @@ def _walks(shot: Snapshot, began_ms: int, elapsed_s: float) -> tuple[int, int, f
             ended |= {(row["clip_id"], expert) for expert in ([row["expert"]] if row["expert"] else experts)}
         elif row["_written_ms"] >= began_ms and row["candidate_index"] < 0:
             ended.add((row["clip_id"], row["expert"]))
-    walks = max(int(shot.current["walks_left"]), len(ended))
+    walks = len(ended) + shot.funnel.balance.walks_pending
     return len(ended), walks, (walks - len(ended)) * elapsed_s / len(ended) if ended else None
 
 

@@ -19,10 +19,10 @@ import cv2
 import numpy as np
 import pyarrow as pa
 
+from factory.store.parquet_file import open_parquet, with_partition
 from factory.store.reader import decoded, group_of
 from factory.store.samples import Store
 from factory.store.schema import AGENT_STEPS, SAMPLES, SCHEMA, table_to_rows
-from factory.store.table import open_parquet, with_partition
 from factory.views.board.gallery import BadRequest, NotThere, place_of
 from factory.views.board.watch import Snapshot
 from factory.views.episode_messages import episode_of

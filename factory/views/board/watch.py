@@ -20,14 +20,25 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from factory.store import funnel
+from factory.store.counts import funnel
+from factory.store.plans import PLANS
 from factory.store.samples import CURRENT_RUN, Store
 from factory.store.table import KeyedTable, LiveFile
 from tasks.world.arrays import F32
 
-SAMPLE_COLUMNS = (*funnel.SAMPLE_COLUMNS, "dataset", "log_id", "split", "licence", "round", "command", "image_source")
+SAMPLE_COLUMNS = (
+    "attempt_id",
+    *funnel.SAMPLE_COLUMNS,
+    "dataset",
+    "log_id",
+    "split",
+    "licence",
+    "round",
+    "command",
+    "image_source",
+)
 SAMPLE_COLUMNS += ("stage1_score", "stage2_score", "candidate_end")
-OUTCOME_COLUMNS = (*funnel.OUTCOME_COLUMNS, "log_id", "detail", "error", "tries", "seconds")
+OUTCOME_COLUMNS = ("attempt_id", *funnel.OUTCOME_COLUMNS, "log_id", "detail", "error", "tries", "seconds")
 CANDIDATE_COLUMNS = (*funnel.LIST_COLUMNS, "candidates")
 LOOK_EVERY_S = 2.0
 
@@ -108,11 +119,12 @@ def end_points_of(column: pa.ChunkedArray) -> F32:
 class Snapshot:
     """The run at one instant. Row tables have the columns named above, and _file, _row, _written_ms."""
 
-    version: str  # of the three tables, "-" for one that is not there yet
+    version: str  # of samples, outcomes and candidates, "-" for one that is not there yet
     taken_s: float  # since 1970
     samples: pa.Table
     outcomes: pa.Table
     candidates: pa.Table
+    plans: pa.Table
     sample_paths: Sequence[str]  # by _file
     candidate_paths: Sequence[str]
     sample_bytes: int
@@ -144,8 +156,7 @@ class Snapshot:
 
     @cached_property
     def funnel(self) -> funnel.Funnel:
-        lists = self.candidates.select(funnel.LIST_COLUMNS).to_pylist()
-        return funnel.funnel_of_rows(self.sample_rows, self.outcome_rows, lists, self.runs)
+        return funnel.funnel_of_tables(self.samples, self.outcomes, self.candidates, self.plans, self.runs)
 
     @cached_property
     def newest_first(self) -> pa.Table:
@@ -162,6 +173,7 @@ class Watch:
         self._outcomes = Watched(store.outcomes, OUTCOME_COLUMNS)
         self._samples = Watched(store.samples, SAMPLE_COLUMNS)
         self._candidates = Watched(store.candidates, CANDIDATE_COLUMNS)
+        self._plans = PLANS.schema.empty_table()
         self._lock = threading.Lock()
         self._snapshot: Snapshot | None = None
         self._due_s = 0.0
@@ -184,6 +196,8 @@ class Watch:
         if known is not None and not any(changed) and told == self._told:
             return known
         self._told = told
+        self.store.plans.refresh()
+        self._plans = self.store.plans.read()
         ends = [part.end_points for part in self._candidates.parts.values() if part.end_points is not None]
         return Snapshot(
             version=".".join("-" if t.table.version is None else str(t.table.version) for t in tables),
@@ -191,6 +205,7 @@ class Watch:
             samples=self._samples.rows(),
             outcomes=self._outcomes.rows(),
             candidates=self._candidates.rows(),
+            plans=self._plans,
             sample_paths=tuple(self._samples.paths),
             candidate_paths=tuple(self._candidates.paths),
             sample_bytes=sum(file.n_bytes for file in self._samples.files.values()),

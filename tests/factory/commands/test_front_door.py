@@ -20,7 +20,7 @@ from factory.commands.table import COMMANDS, PLANNERS
 from factory.exits import MEANING
 from factory.graph.episodes import EpisodesWanted
 from factory.graph.execute import execute
-from factory.store.funnel import funnel_of
+from factory.store.counts.funnel import funnel_of
 from factory.store.samples import CURRENT_RUN, Store
 from factory.views.show import prepared_episode
 from factory.views.status import failed_line

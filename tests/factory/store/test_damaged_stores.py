@@ -218,7 +218,7 @@ def test_compacting_merges_files_and_changes_no_sample(tmp_path: Path, capsys: p
     opened = SampleTable(out)
     assert COMMANDS["compact"].load()([f"out={out}"]) == 0
     said = capsys.readouterr().out.splitlines()
-    assert [line.split() for line in said][1] == ["samples", "9", "files,", "now", "3"]
+    assert [line.split() for line in said][2] == ["samples", "9", "files,", "now", "3"]
     after = Store(out).samples.file_facts()
     assert len(after) == 3 and max(f.written_ms for f in after.values()) == max(f.written_ms for f in facts.values())
     assert sorted(map(str, SampleTable(out))) == sorted(before) and sorted(map(str, opened)) == sorted(before)
@@ -226,7 +226,7 @@ def test_compacting_merges_files_and_changes_no_sample(tmp_path: Path, capsys: p
     found = verify(Store(out))
     assert found.damage == () and len([name for name in found.orphans if name.startswith("samples")]) == 9
     assert run(out, clips=5) == COMPLETE and COMMANDS["compact"].load()([f"out={out}"]) == 0
-    assert capsys.readouterr().out.splitlines()[1].split() == ["samples", "3", "files,", "now", "3"]
+    assert capsys.readouterr().out.splitlines()[2].split() == ["samples", "3", "files,", "now", "3"]
 
 
 def test_a_damaged_log_is_named_by_whoever_opens_the_table(out: Path) -> None:

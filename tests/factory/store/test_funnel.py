@@ -1,14 +1,67 @@
 """The funnel counts from the tables alone."""
 
+from collections import Counter, defaultdict
 from pathlib import Path
 
+import pyarrow as pa
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES
 from factory.graph.execute import execute
-from factory.store.funnel import FunnelRow, _expert_rows, funnel_of, image_sources_text
+from factory.store.counts.attempts import OUTCOME_COLUMNS, SAMPLE_COLUMNS, Attempts, attempts_of
+from factory.store.counts.funnel import FunnelRow, expert_rows, funnel_of, image_sources_text
+from factory.store.outcomes import OUTCOMES
 from factory.store.samples import Store
+from factory.store.schema import SAMPLES
 from tests.factory.toy import ToyWork, refs
+
+Walks = dict[str, dict[str, list[tuple[int, str]]]]  # expert -> clip -> candidate and why it fell, "": accepted
+RUN = {"settings_hash": "s", "stage_versions": {}, "expert_digests": {}}
+MADE = {"expert_digest": "d", "settings_hash": "s", "stage_versions": "{}"}
+
+
+def attempts(walks: Walks) -> Attempts:
+    """As they would stand in the tables, in any order."""
+    samples, outcomes = [], []
+    for expert, clips in walks.items():
+        for clip, tries in clips.items():
+            for candidate, why in reversed(tries):
+                row = MADE | {"expert": expert, "clip_id": clip, "candidate_index": candidate}
+                stage, _, reason = why.partition(".")
+                kind = "exhausted" if why == "exhausted" else "failed" if stage == "failed" else "rejected"
+                became = {"kind": kind, "stage": stage, "reason": reason, "error_kind": reason}
+                (outcomes.append(row | became) if why else samples.append(row))
+    tables = [
+        pa.Table.from_pylist(rows, schema=pa.schema([spec.schema.field(name) for name in columns]))
+        for rows, spec, columns in ((samples, SAMPLES, SAMPLE_COLUMNS), (outcomes, OUTCOMES, OUTCOME_COLUMNS))
+    ]
+    return attempts_of(tables[0], tables[1], [RUN])
+
+
+def slow_rows(expert: str, clips: dict[str, list[tuple[int, str]]]) -> list[FunnelRow]:
+    """Attempt by attempt."""
+    accepted, first_tries, reasons = Counter[int](), Counter[int](), defaultdict[int, Counter[str]](Counter)
+    tried = {clip: [one for one in sorted(tries) if one[1] != "exhausted"] for clip, tries in clips.items()}
+    for tries in tried.values():
+        at, fresh = 0, True
+        for _, why in tries:
+            if why:
+                reasons[at][why] += 1
+                fresh = False
+            else:
+                accepted[at] += 1
+                first_tries[at] += fresh
+                at, fresh = at + 1, True
+    rows, before = [], len(clips)
+    simulated = any(candidate >= 0 for tries in tried.values() for candidate, _ in tries)
+    for number in range(max([*accepted, *reasons], default=-1) + 1):
+        failed = sum(n for why, n in reasons[number].items() if why.startswith("failed."))
+        counts = (accepted[number], reasons[number].total() - failed, failed, before, accepted[number], len(clips))
+        rows.append(FunnelRow(expert, number, *counts, dict(reasons[number]), first_tries[number], simulated))
+        before = accepted[number]
+    return rows
 
 
 def test_an_attempt_belongs_to_the_round_it_was_tried_for() -> None:
@@ -17,12 +70,35 @@ def test_an_attempt_belongs_to_the_round_it_was_tried_for() -> None:
         "b": [(0, ""), (1, "reward.nc")],
         "c": [(0, "failed.bug")],
     }
-    first, second = _expert_rows("recovery", clips)[:2]
+    first, second = expert_rows(attempts({"recovery": clips}), 0)[:2]
     assert first == FunnelRow("recovery", 0, 2, 1, 1, 3, 2, 3, {"reward.nc": 1, "failed.bug": 1}, 1)
     assert second == FunnelRow("recovery", 1, 1, 2, 0, 2, 1, 3, {"reward.ep": 1, "reward.nc": 1})
     assert first.first_try_rate == pytest.approx(1 / 3) and second.first_try_rate == 0.0  # clip b; nobody
     assert first.attempt_rate == 0.5 and first.clip_rate == pytest.approx(2 / 3)
     assert second.clip_rate == 0.5 and second.clip_rate_of_all == pytest.approx(1 / 3)
+
+
+@given(
+    st.dictionaries(
+        st.sampled_from(["recovery", "pdm_closed", "human"]),
+        st.dictionaries(
+            st.sampled_from("abcdef"),
+            st.lists(
+                st.sampled_from(["", "reward.nc", "render.holes", "failed.bug", "exhausted"]), min_size=1, max_size=9
+            ),
+            min_size=1,
+        ),
+    )
+)
+@settings(max_examples=100, deadline=None)
+def test_the_funnel_is_that_of_a_count_attempt_by_attempt(whys: dict[str, dict[str, list[str]]]) -> None:
+    walks = {
+        expert: {clip: [(i - (expert == "human"), why) for i, why in enumerate(tries)] for clip, tries in clips.items()}
+        for expert, clips in whys.items()
+    }
+    found = attempts(walks)
+    for number, expert in enumerate(found.experts):
+        assert expert_rows(found, number) == slow_rows(expert, walks[expert])
 
 
 def test_the_funnel_adds_up_to_the_tables(tmp_path: Path) -> None:

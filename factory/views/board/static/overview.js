@@ -34,7 +34,7 @@ function header(o) {
   const state = [h("span", { class: `pill ${s.tone}` }, s.word)];
   if (s.last_commit_ms) state.push(h("span", { class: "dim" }, `last commit ${clock(s.last_commit_ms)}`));
   return h("header", null, h("div", null, h("h1", null, o.where.split("/").filter(Boolean).pop()), ...state), h("p", { class: "path" }, o.where),
-    h("p", { class: "story" }, told), s.detail ? h("p", { class: "note" }, s.detail) : null, progress(o.throughput),
+    h("p", { class: "story" }, told), s.detail ? h("p", { class: "note" }, s.detail) : null, progress(o.throughput), plan(o.planned),
     h("div", { class: "tiles" }, tiles),
     h("dl", null, Object.entries({ ...o.facts, ...extra?.facts }).map(([k, v]) => h("div", null, h("dt", null, k), h("dd", null, v)))),
     o.notes.map((note) => h("p", { class: "note" }, note)));
@@ -45,6 +45,12 @@ function progress(t) {
   const left = t.eta_s === null ? "time left: not known yet" : `about ${span(t.eta_s)} left`;
   return h("div", { class: "progress" }, bar(t.walks ? t.walks_done / t.walks : 0, `${count(t.walks_done)} of ${count(t.walks)}`),
     h("small", null, `walks ended (one clip with one expert) since ${clock(t.began_ms)}; ${left}`));
+}
+
+function plan(p) {
+  if (!p.planned) return null;
+  return h("p", { class: "note" }, `${plural(p.planned, "sample")} planned: ${count(p.accepted)} made, ${count(p.rejected)} rejected, ` +
+    `${count(p.failed)} failed, ${count(p.pending)} pending`);
 }
 
 function looks(newest) {

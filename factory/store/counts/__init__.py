@@ -1,0 +1,1 @@
+"""What the tables come to: attempts as columns, the funnel, the balance of what was planned."""

@@ -1,0 +1,130 @@
+"""All attempts of a store as columns of integers: what counts over millions of rows is drawn from.
+
+One row per clip, expert and candidate: that of the newest run; of one run the sample. So a candidate counts once, and
+what a redo failed at is seen, not the old sample that it was to replace.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from factory.store.outcomes import Kind
+from factory.store.samples import MADE_UNDER, run_number
+
+Ints = NDArray[np.int64]
+ATTEMPT_COLUMNS = [*(name for name in MADE_UNDER if name != "attempt_id"), "clip_id", "candidate_index"]
+SAMPLE_COLUMNS = ATTEMPT_COLUMNS
+OUTCOME_COLUMNS = [*ATTEMPT_COLUMNS, "kind", "stage", "reason", "error_kind"]
+ACCEPTED, EXHAUSTED = "", "exhausted"  # among `whys`
+
+
+@dataclass(frozen=True)
+class Attempts:
+    """In the order of expert, clip, candidate; all arrays (N,). The expert "" stands for the clip as a whole."""
+
+    clip_ids: tuple[str, ...]  # by `clip`
+    experts: tuple[str, ...]  # by `expert`, sorted
+    whys: tuple[str, ...]  # by `why`: ACCEPTED, EXHAUSTED, "stage.reason" or "failed.kind"
+    clip: Ints
+    expert: Ints
+    candidate: Ints
+    why: Ints
+
+    @cached_property
+    def accepted(self) -> NDArray[np.bool_]:
+        """Where a sample stands."""
+        return self.why == self.whys.index(ACCEPTED)
+
+    @cached_property
+    def exhausted(self) -> NDArray[np.bool_]:
+        """Where a walk came to the end of its list: no attempt."""
+        return self.why == self.whys.index(EXHAUSTED)
+
+    @cached_property
+    def failed(self) -> NDArray[np.bool_]:
+        """Where something broke."""
+        return np.array([why.startswith("failed.") for why in self.whys])[self.why]
+
+    @cached_property
+    def starts(self) -> Ints:
+        """Places at which a walk begins, one for each (expert, clip) with rows."""
+        new = (np.diff(self.expert, prepend=-1) != 0) | (np.diff(self.clip, prepend=-1) != 0)
+        return np.flatnonzero(new)
+
+    @cached_property
+    def round(self) -> Ints:
+        """That each attempt was tried for: the accepted ones before it in its walk."""
+        before: Ints = np.cumsum(self.accepted) - self.accepted
+        lengths = np.diff(self.starts, append=len(before))
+        return before - np.repeat(before[self.starts], lengths)
+
+
+def attempts_of(samples: pa.Table, outcomes: pa.Table, runs: Sequence[Mapping[str, Any]]) -> Attempts:
+    """From rows with the columns SAMPLE_COLUMNS and OUTCOME_COLUMNS; runs: the records of run.json, oldest first."""
+    rows = pa.concat_tables([outcomes.select(ATTEMPT_COLUMNS), samples.select(ATTEMPT_COLUMNS)])
+    n_outcomes = outcomes.num_rows
+    clip, clip_ids = codes(rows["clip_id"])
+    expert, experts = codes(rows["expert"])
+    candidate = rows["candidate_index"].to_numpy().astype(np.int64)
+    why, whys = _whys(outcomes)
+    why = np.concatenate([why, np.zeros(samples.num_rows, np.int64)])
+    width = int(candidate.max(initial=-1)) + 2
+    place = (expert * max(1, len(clip_ids)) + clip) * width + candidate + 1
+    age = 2 * _ages(rows, runs) + (np.arange(len(place)) >= n_outcomes)
+    order = np.lexsort((age, place))  # stable: of rows alike the last counts
+    newest = order[np.diff(place[order], append=-1) != 0]
+    return Attempts(clip_ids, experts, whys, clip[newest], expert[newest], candidate[newest], why[newest])
+
+
+def codes(column: pa.ChunkedArray) -> tuple[Ints, tuple[str, ...]]:
+    """A number for each text, in the order of the texts, and the texts."""
+    if not pa.types.is_dictionary(column.type):
+        column = column.dictionary_encode()
+    whole = column.unify_dictionaries().combine_chunks()
+    if isinstance(whole, pa.ChunkedArray):  # of no chunk
+        return np.zeros(0, np.int64), ()
+    texts = np.array(whole.dictionary.to_pylist(), object)
+    used, at = np.unique(whole.indices.to_numpy().astype(np.int64), return_inverse=True)
+    order = np.argsort(texts[used])
+    number = np.empty(len(order), np.int64)
+    number[order] = np.arange(len(order))
+    return number[at], tuple(texts[used][order])
+
+
+def _whys(outcomes: pa.Table) -> tuple[Ints, tuple[str, ...]]:
+    """What became of the rows of `outcomes`, in words; the first word is that of samples."""
+    columns = [codes(outcomes[name]) for name in ("kind", "stage", "reason", "error_kind")]
+    distinct, at = _distinct([numbers for numbers, _ in columns])
+    words = [_why(*(texts[number] for number, (_, texts) in zip(row, columns))) for row in distinct.tolist()]
+    known = list(dict.fromkeys([ACCEPTED, EXHAUSTED, *words]))
+    return np.array([known.index(word) for word in words], np.int64)[at], tuple(known)
+
+
+def _why(kind: str, stage: str, reason: str, error_kind: str) -> str:
+    if kind == Kind.EXHAUSTED:
+        return EXHAUSTED
+    return f"failed.{error_kind}" if kind == Kind.FAILED else f"{stage}.{reason}"
+
+
+def _ages(rows: pa.Table, runs: Sequence[Mapping[str, Any]]) -> Ints:
+    """The number of the run that each row is of (factory.store.samples.run_number)."""
+    names = [name for name in MADE_UNDER if name != "attempt_id"]
+    columns = [codes(rows[name]) for name in names]
+    distinct, at = _distinct([numbers for numbers, _ in columns])
+    number = run_number(runs)
+    made = [{n: texts[i] for n, i, (_, texts) in zip(names, row, columns)} for row in distinct.tolist()]
+    return np.array([number(row) for row in made], np.int64)[at]
+
+
+def _distinct(columns: Sequence[Ints]) -> tuple[Ints, Ints]:
+    """The different rows (D, columns), and which of them each row is."""
+    key = np.zeros(len(columns[0]), np.int64)
+    for numbers in columns:
+        key = key * (int(numbers.max(initial=0)) + 1) + numbers
+    _, first, at = np.unique(key, return_index=True, return_inverse=True)
+    return np.stack([numbers[first] for numbers in columns], axis=1), at
