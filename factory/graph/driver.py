@@ -22,10 +22,10 @@ from factory.graph.progress import ProgressLine, RunForecast, Tally, Workload
 from factory.graph.records import Records, past_of
 from factory.graph.steps import Attempted, Failure, HalfBuilt, HandedOn, Prepared, Reconstructed
 from factory.graph.walk import Blocked, Complete, Exhausted, Step, Try, tries_before
+from factory.store.counts.history import Past
 from factory.store.disk import DiskFull
 from factory.store.identity import RunIdentity, Stamp, attempt_id
 from factory.store.outcomes import ErrorKind, Kind, Outcome
-from factory.store.samples import Past
 from factory.store.table import Shard
 from tasks.stages import Rejected
 
@@ -290,6 +290,7 @@ class Driver:
             self._try(Trial(clip, walk, prepared, stamp), prepared)
             return
         self._finish(clip, walk, step)
+        walk.put_away()
         self._walks_left[clip.ref.clip_id] -= 1
         if not self._walks_left[clip.ref.clip_id]:
             del self._walks_left[clip.ref.clip_id]
@@ -385,5 +386,4 @@ class Driver:
 
 def _wanted(walk: WalkState, rounds: int) -> int:
     """Samples that the walk is still to make, as far as its list lasts."""
-    found = sum(past.kind is Kind.ACCEPTED for past in walk.known.values())
-    return max(0, (1 if walk.once else rounds) - found)
+    return max(0, (1 if walk.once else rounds) - walk.n_found)

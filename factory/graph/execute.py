@@ -31,11 +31,12 @@ from factory.graph.walk import Try, retry_policy
 from factory.graph.work import NotReady, Work
 from factory.readers.base import ClipRef
 from factory.store.counts.funnel import Funnel, funnel_of
+from factory.store.counts.history import NOTHING
 from factory.store.disk import DiskFull
 from factory.store.illness import why_ill
 from factory.store.location import BadLocation
 from factory.store.outcomes import Kind
-from factory.store.samples import CURRENT_RUN, NOTHING, ChangedRun, OnChange, Store
+from factory.store.samples import CURRENT_RUN, ChangedRun, OnChange, Store
 from factory.store.table import AnotherWriter
 from factory.wording import one_line
 
@@ -186,7 +187,7 @@ def execute(
         funnel = funnel_of(store, [ref.clip_id for ref in refs])
     except (OSError, DeltaError) as error:
         code, message, is_broken = INTERRUPTED, message or f"{one_line(error)}; {AGAIN}", True
-    counts = _counts(plan)
+    counts = {} if funnel is None else _counts(funnel, experts)
     summary = RunSummary(
         *(code, message, counts, driver.executed, driver.seconds, driver.notes, funnel, began_ms),
         lost_cluster=lost_cluster,
@@ -235,14 +236,16 @@ def _alarm(stop: Callable[[], None], minutes: float | None) -> Iterator[None]:
         timer.cancel()
 
 
-def _counts(plan: RunPlan) -> dict[str, int]:
+def _counts(funnel: Funnel, experts: Sequence[str]) -> dict[str, int]:
     """Attempts of the planned clips by what became of them; clip-level rows among them."""
-    counts = dict.fromkeys((kind.value for kind in Kind), 0)
-    for clip in (*plan.todo, *plan.done):
-        pasts = [past for walk in clip.walks for past in walk.known.values()]
-        for past in (*pasts, *([clip.past] if clip.past is not None else [])):
-            counts[past.kind.value] += 1
-    return counts
+    rows = [row for row in funnel.rows if row.expert in experts]
+    broken = sum(n for why, n in funnel.clip_outcomes.items() if why.startswith("failed."))
+    return {
+        Kind.ACCEPTED.value: sum(row.accepted for row in rows),
+        Kind.REJECTED.value: sum(row.rejected for row in rows) + sum(funnel.clip_outcomes.values()) - broken,
+        Kind.FAILED.value: sum(row.failed for row in rows) + broken,
+        Kind.EXHAUSTED.value: sum(funnel.exhausted.get(expert, 0) for expert in experts),
+    }
 
 
 def _announce(store: Store, plan: RunPlan, experts: Sequence[str], rounds: int, command: Sequence[str] | None) -> int:

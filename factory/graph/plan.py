@@ -2,14 +2,16 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property, partial
 
 from factory.graph.walk import Exhausted, Step, Try, next_step
 from factory.graph.work import HUMAN_CANDIDATE
 from factory.readers.base import ClipRef
 from factory.store.candidates import Listed
+from factory.store.counts.history import History, Past
 from factory.store.identity import UNLISTED, RunIdentity
 from factory.store.outcomes import Kind
-from factory.store.samples import WAYS_OUT, ChangedRun, History, OnChange, Past
+from factory.store.samples import WAYS_OUT, ChangedRun, OnChange
 
 Policy = Callable[[Past], bool]
 CLIP_CANDIDATE = HUMAN_CANDIDATE  # of a row about the clip as a whole (its expert is empty)
@@ -21,8 +23,18 @@ class WalkState:
 
     expert: str
     once: bool  # tried once, on the log itself
-    known: dict[int, Past]
+    recall: Callable[[], dict[int, Past]]  # what the tables say of it
     stale: frozenset[str] = frozenset()  # redo: attempt_ids whose rows this walk replaces as a whole
+    n_found: int = 0  # samples that were there when the run began
+
+    @cached_property
+    def known(self) -> dict[int, Past]:
+        """Candidate -> what became of it; unpacked when it is asked for, and until it is put away."""
+        return self.recall()
+
+    def put_away(self) -> None:
+        """The tables tell it again; of walks that are not at work nothing is kept."""
+        self.__dict__.pop("known", None)
 
     def step(self, n_candidates: int, rounds: int, may_retry: Policy) -> Step:
         return next_step(self.once, n_candidates, rounds, self.known, may_retry)
@@ -77,7 +89,7 @@ def make_plan(
     done: list[ClipPlan] = []
     frozen: list[ClipRef] = []
     found = 0
-    others = {clip_id for clip_id, expert in history.walks if expert not in ("", *experts)}
+    others = history.clips_of({*history.experts} - {"", *experts})
     for ref in refs:
         stored = listed = history.candidates.get(ref.clip_id)
         if stored is not None and _of_other_settings(stored, identity):
@@ -101,6 +113,9 @@ def make_plan(
         )
         found += sum(past.kind in (Kind.ACCEPTED, Kind.REJECTED) for walk in clip.walks for past in walk.known.values())
         (todo if _has_work(clip, rounds, may_retry) else done).append(clip)
+        for walk in clip.walks:
+            walk.n_found = sum(past.kind is Kind.ACCEPTED for past in walk.known.values())
+            walk.put_away()
     return RunPlan(tuple(todo), tuple(done), tuple(frozen), found)
 
 
@@ -109,14 +124,14 @@ def _refuse_mixing(
 ) -> None:
     relisted = {clip_id for clip_id, row in history.candidates.items() if _of_other_settings(row, identity)}
     if on_change == "stop":
-        old = {clip_id for clip_id, expert in history.stale if expert in ("", *experts)} | relisted
+        old = history.clips_of({"", *experts}, stale=True) | relisted
         mixed = [ref for ref in refs if ref.clip_id in old]
         if mixed:
             where = f"clip {mixed[0].clip_id} of log {mixed[0].log_id}"
             raise ChangedRun(f"{len(mixed)} of {len(refs)} clips, as {where}, hold rows of other settings. {WAYS_OUT}")
     if on_change == "redo":
         wanted = {ref.clip_id for ref in refs} & relisted
-        left = sorted({expert for clip_id, expert in history.walks if clip_id in wanted} - {"", *experts})
+        left = sorted(history.experts_of(wanted) - {"", *experts})
         if left:
             raise ChangedRun(
                 f"redo replaces candidate lists that rows of {', '.join(left)} stand on: name these experts too, or "
@@ -129,12 +144,13 @@ def _of_other_settings(stored: Listed, identity: RunIdentity) -> bool:
 
 
 def _walk(history: History, clip_id: str, expert: str, on_change: OnChange, once: bool) -> WalkState:
-    known = dict(history.walks.get((clip_id, expert), {}))
-    stale = history.stale.get((clip_id, expert), frozenset()) if on_change == "redo" else frozenset()
+    stale = history.stale(clip_id, expert) if on_change == "redo" else frozenset()
     if stale:  # the walk is made anew from its first candidate; what an earlier redo failed at stands
+        known = history.known(clip_id, expert)
         stale |= {past.attempt_id for past in known.values()}
-        known = {i: past for i, past in known.items() if past.current and past.kind is Kind.FAILED}
-    return WalkState(expert, once, known, stale)
+        failed = {i: past for i, past in known.items() if past.current and past.kind is Kind.FAILED}
+        return WalkState(expert, once, partial(dict, failed), stale)
+    return WalkState(expert, once, partial(history.known, clip_id, expert))
 
 
 def _has_work(clip: ClipPlan, rounds: int, may_retry: Policy) -> bool:

@@ -8,9 +8,9 @@ from factory.graph.walk import Exhausted, Try
 from factory.graph.work import PreparedClip
 from factory.readers.base import ClipRef
 from factory.store.candidates import ClipCandidates
+from factory.store.counts.history import Past
 from factory.store.identity import RunIdentity, Stamp, attempt_id
 from factory.store.outcomes import QUARANTINE_AFTER, ErrorKind, Kind, Outcome
-from factory.store.samples import Past
 from tasks.stages import Rejected
 
 

@@ -9,8 +9,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from factory.graph.work import HUMAN_CANDIDATE
+from factory.store.counts.history import Past
 from factory.store.outcomes import ErrorKind, Kind
-from factory.store.samples import Past
 
 TRIED_AGAIN = (ErrorKind.MACHINE, ErrorKind.SYSTEM, ErrorKind.LIMIT)  # by the next run, by itself
 

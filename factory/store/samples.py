@@ -7,18 +7,17 @@ crash in between loses at most the outcomes, whose attempts the next run tries a
 import json
 import os
 import re
-import sys
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import chain
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, Literal
 
 from factory.store.cache import ClipCache
-from factory.store.candidates import CANDIDATES, ClipCandidates, Listed, candidates_table, listed_of
+from factory.store.candidates import CANDIDATES, ClipCandidates, candidates_table, listed_of
+from factory.store.counts.codes import both
+from factory.store.counts.history import OUTCOME_STATE, SAMPLE_STATE, History, history_of
 from factory.store.identity import UNLISTED, RunIdentity, canonical_json
 from factory.store.location import Location
-from factory.store.outcomes import OUTCOMES, Kind, Outcome, outcomes_table
+from factory.store.outcomes import OUTCOMES, Outcome, outcomes_table
 from factory.store.plans import PLANS, plan_table
 from factory.store.schema import LICENCES_PROPERTY, SAMPLES, SCHEMA_VERSION
 from factory.store.table import KeyedTable, Shard, write_shard
@@ -30,10 +29,7 @@ CURRENT_RUN = "current_run.json"  # what the newest run set out to do; over once
 LAST_RUN = "last_run.json"
 IMPORTED = "import.source"  # a setting that tables of others' rows have, and no run
 WAYS_OUT = "Go on with on_change=keep, replace with on_change=redo, or choose another out"
-STATE = ["attempt_id", "clip_id", "expert", "expert_digest", "candidate_index", "settings_hash", "stage_versions"]
 MADE_UNDER = ["attempt_id", "expert", "expert_digest", "settings_hash", "stage_versions"]
-SAMPLE_STATE = [*STATE, "round"]
-OUTCOME_STATE = [*STATE, "kind", "error_kind", "tries"]
 
 
 def imported_from(runs: Sequence[Mapping[str, Any]]) -> str | None:
@@ -43,34 +39,6 @@ def imported_from(runs: Sequence[Mapping[str, Any]]) -> str | None:
 
 class ChangedRun(ValueError):
     """The run's settings, versions or expert inputs differ from the table's; the message says where."""
-
-
-Place = tuple[str, str]
-
-
-@dataclass(frozen=True, slots=True)
-class Past:
-    """What the tables say about one attempt."""
-
-    attempt_id: str
-    kind: Kind
-    current: bool  # made under the run's own settings, versions and expert inputs
-    round: int = -1  # accepted: its round
-    error_kind: str = ""  # failed: ErrorKind
-    tries: int = 0  # failed: runs that tried it
-    stage_versions: str = ""  # under which
-
-
-@dataclass(frozen=True)
-class History:
-    """What the tables say. A walk is a (clip_id, expert); the expert "" stands for the clip as a whole."""
-
-    walks: Mapping[Place, Mapping[int, Past]]  # candidate -> what became of it; a current row hides one that is not
-    stale: Mapping[Place, frozenset[str]]  # attempt_ids of rows that are not current
-    candidates: Mapping[str, Listed]  # clip_id -> what is known of its list
-
-
-NOTHING = History({}, {}, {})
 
 
 class Store:
@@ -169,7 +137,7 @@ class Store:
         if list(records) != self.runs():
             document = json.loads(canonical_json({"schema_version": SCHEMA_VERSION, "runs": list(records)}))
             self.location.write(RUN_FILE, sealed_json(document).encode())
-        twice = {key for key in self.outcomes if key in self.samples}
+        twice = set(both(self.outcomes.keys(), self.samples.keys()).astype(str).tolist())
         if twice:
             age = run_number(records)
             samples, outcomes = (
@@ -207,28 +175,13 @@ class Store:
 
     def history(self, identity: RunIdentity, expert_digests: Mapping[str, str]) -> History:
         """Everything the tables know, samples winning over outcomes of the same attempt."""
-
-        walks: dict[Place, dict[int, Past]] = defaultdict(dict)
-        stale: dict[Place, set[str]] = defaultdict(set)
-        made_by = identity.settings_hash, identity.versions_json
-        for row in chain(_rows(self.outcomes, OUTCOME_STATE), _rows(self.samples, SAMPLE_STATE)):
-            place, candidate, digest = (row["clip_id"], row["expert"]), row["candidate_index"], row["expert_digest"]
-            past = Past(
-                row["attempt_id"],
-                Kind(row.get("kind", Kind.ACCEPTED)),
-                (row["settings_hash"], row["stage_versions"]) == made_by
-                and digest == expert_digests.get(row["expert"], digest),
-                row.get("round", -1),
-                row.get("error_kind", ""),
-                row.get("tries", 0),
-                sys.intern(row["stage_versions"]),
-            )
-            known = walks[place].get(candidate)
-            if known is None or past.current or not known.current:
-                walks[place][candidate] = past
-            if not past.current:
-                stale[place].add(past.attempt_id)
-        return History(walks, {place: frozenset(ids) for place, ids in stale.items()}, listed_of(self.candidates))
+        return history_of(
+            self.outcomes.read(OUTCOME_STATE, encoded=True),
+            self.samples.read(SAMPLE_STATE, encoded=True),
+            listed_of(self.candidates),
+            (identity.settings_hash, identity.versions_json),
+            expert_digests,
+        )
 
     def plan(self, rounds: Mapping[str, int], clip_ids: Sequence[str]) -> None:
         """Write down what a run sets out to do, expert -> samples of each clip; nothing where that is known already.
@@ -267,12 +220,6 @@ class Store:
         named = {line for line in (*known.split("; "), *licences) if line}
         if "; ".join(sorted(named)) != known:
             self.samples.set_property(LICENCES_PROPERTY, "; ".join(sorted(named)))
-
-
-def _rows(table: KeyedTable, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """Row by row; no more than a file's at a time."""
-    for _, rows in table.files(columns):
-        yield from rows.to_pylist()
 
 
 def run_number(records: Sequence[Mapping[str, Any]]) -> Callable[[Mapping[str, Any]], int]:

@@ -15,7 +15,7 @@ import hashlib
 import json
 import secrets
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -31,7 +31,9 @@ from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundErr
 from deltalake.transaction import AddAction, RemoveAction
 
 from factory.store.commit_copies import COPIES, CommitCopies
+from factory.store.counts.codes import Bytes
 from factory.store.disk import needs_disk
+from factory.store.key_index import KeyIndex
 from factory.store.late_listing import until_listed
 from factory.store.location import Location
 from factory.store.parquet_file import encoded_text, read_parquet, with_partition
@@ -161,23 +163,27 @@ class KeyedTable:
             raise
 
     @cached_property
-    def _path_of(self) -> dict[str, str]:
-        """Key -> the file it stands in."""
+    def _index(self) -> KeyIndex:
+        """In which file each key stands."""
         key = self.spec.key
-        return {k: path for path, rows in self.files([key]) for k in rows[key].to_pylist()}
+        return KeyIndex((path, rows[key]) for path, rows in self.files([key]))
+
+    def keys(self) -> Bytes:
+        """(N,) sorted."""
+        return self._index.keys()
 
     @property
     def version(self) -> int | None:
         return None if self._delta is None else self._delta.version()
 
     def __len__(self) -> int:
-        return len(self._path_of)
+        return len(self._index)
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._path_of)
+        return iter(self._index)
 
     def __contains__(self, key: str) -> bool:
-        return key in self._path_of
+        return bool(self._index.files_of([key]))
 
     def live_files(self) -> dict[str, Mapping[str, str]]:
         """Path -> partition values of every file that the log names."""
@@ -207,12 +213,12 @@ class KeyedTable:
             self._delta.update_incremental()
         elif DeltaTable.is_deltatable(self.location.uri, storage_options=dict(self.location.options)):
             self._delta = DeltaTable(self.location.uri, storage_options=dict(self.location.options))
-        self.__dict__.pop("_path_of", None)
+        self.__dict__.pop("_index", None)
 
     def files(self, columns: Sequence[str] | None = None, encoded: bool = False) -> Iterable[tuple[str, pa.Table]]:
         """(path, its rows) for every live file, in path order; columns None: all, partition columns included.
 
-        encoded: texts as numbers into a dictionary, for what counts over many rows of few different ones.
+        encoded: texts but the key as numbers into a dictionary, for what counts over many rows of few different ones.
 
         On an object store, where a file costs round trips and little else, AHEAD more are being read meanwhile.
         """
@@ -245,7 +251,7 @@ class KeyedTable:
         """Of some columns, None: all; encoded: as of `files`."""
         names = self.spec.schema.names if columns is None else columns
         fields = [self.spec.schema.field(name) for name in names]
-        return pa.schema([encoded_text(field) for field in fields] if encoded else fields)
+        return pa.schema([encoded_text(f) if encoded and f.name != self.spec.key else f for f in fields])
 
     def lost_commit(self) -> int | None:
         """The number of a commit that was made and that the log does not have any more; None where it has all."""
@@ -296,17 +302,16 @@ class KeyedTable:
 
         Raises DuplicateKey and AnotherWriter; in both cases the table stays as it was.
         """
-        dropped = {key for key in drop if key in self._path_of}
-        new: dict[str, str] = {}
-        for shard in add:
-            for key in shard.keys:
-                if key in new or (key in self._path_of and key not in dropped):
-                    raise DuplicateKey(f"{self.spec.name}: {self.spec.key} {key} would be stored twice")
-                new[key] = shard.path
+        index = self._index  # as it was before the transaction
+        path_of = index.files_of(drop)
+        dropped, touched = set(path_of), set(path_of.values())
+        new = [key for shard in add for key in shard.keys]
+        twice = [key for key in index.files_of(new) if key not in dropped]
+        if twice or len(set(new)) < len(new):
+            key = twice[0] if twice else next(key for key, n in Counter(new).items() if n > 1)
+            raise DuplicateKey(f"{self.spec.name}: {self.spec.key} {key} would be stored twice")
         if not add and not dropped:
             return
-        path_of = self._path_of  # as it was before the transaction
-        touched = {self._path_of[key] for key in dropped}
         live = self.live_files() if touched else {}
         kept = [rest for path in sorted(touched) if (rest := self._without(path, live[path], dropped)) is not None]
         adds = {shard.path: shard for shard in (*add, *kept)}
@@ -320,10 +325,7 @@ class KeyedTable:
                 stats = json.dumps({"numRecords": len(shard.keys)})
                 actions.append(AddAction(path, shard.size, shard.partition, now_ms, True, stats))
         self._transact(actions)
-        for key in dropped:
-            del path_of[key]
-        for written in (*kept, *add):
-            path_of.update(dict.fromkeys(written.keys, written.path))
+        index.change(dropped, {key: written.path for written in (*kept, *add) for key in written.keys})
 
     def replace_files(self, drop: Collection[str], add: Sequence[tuple[Shard, int]] = ()) -> None:
         """Files out of the table and others, with the time [ms] of their rows, into it, in one transaction.
@@ -338,7 +340,7 @@ class KeyedTable:
             stats = json.dumps({"numRecords": len(shard.keys)})
             actions.append(AddAction(shard.path, shard.size, shard.partition, written_ms, False, stats))
         self._transact(actions)
-        self.__dict__.pop("_path_of", None)
+        self.__dict__.pop("_index", None)
 
     @property
     def properties(self) -> Mapping[str, str]:

@@ -13,10 +13,10 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from factory.store.counts.codes import Ints, codes, distinct
 from factory.store.outcomes import Kind
 from factory.store.samples import MADE_UNDER, run_number
 
-Ints = NDArray[np.int64]
 ATTEMPT_COLUMNS = [*(name for name in MADE_UNDER if name != "attempt_id"), "clip_id", "candidate_index"]
 SAMPLE_COLUMNS = ATTEMPT_COLUMNS
 OUTCOME_COLUMNS = [*ATTEMPT_COLUMNS, "kind", "stage", "reason", "error_kind"]
@@ -81,26 +81,11 @@ def attempts_of(samples: pa.Table, outcomes: pa.Table, runs: Sequence[Mapping[st
     return Attempts(clip_ids, experts, whys, clip[newest], expert[newest], candidate[newest], why[newest])
 
 
-def codes(column: pa.ChunkedArray) -> tuple[Ints, tuple[str, ...]]:
-    """A number for each text, in the order of the texts, and the texts."""
-    if not pa.types.is_dictionary(column.type):
-        column = column.dictionary_encode()
-    whole = column.unify_dictionaries().combine_chunks()
-    if isinstance(whole, pa.ChunkedArray):  # of no chunk
-        return np.zeros(0, np.int64), ()
-    texts = np.array(whole.dictionary.to_pylist(), object)
-    used, at = np.unique(whole.indices.to_numpy().astype(np.int64), return_inverse=True)
-    order = np.argsort(texts[used])
-    number = np.empty(len(order), np.int64)
-    number[order] = np.arange(len(order))
-    return number[at], tuple(texts[used][order])
-
-
 def _whys(outcomes: pa.Table) -> tuple[Ints, tuple[str, ...]]:
     """What became of the rows of `outcomes`, in words; the first word is that of samples."""
     columns = [codes(outcomes[name]) for name in ("kind", "stage", "reason", "error_kind")]
-    distinct, at = _distinct([numbers for numbers, _ in columns])
-    words = [_why(*(texts[number] for number, (_, texts) in zip(row, columns))) for row in distinct.tolist()]
+    rows, at = distinct([numbers for numbers, _ in columns])
+    words = [_why(*(texts[number] for number, (_, texts) in zip(row, columns))) for row in rows.tolist()]
     known = list(dict.fromkeys([ACCEPTED, EXHAUSTED, *words]))
     return np.array([known.index(word) for word in words], np.int64)[at], tuple(known)
 
@@ -115,16 +100,7 @@ def _ages(rows: pa.Table, runs: Sequence[Mapping[str, Any]]) -> Ints:
     """The number of the run that each row is of (factory.store.samples.run_number)."""
     names = [name for name in MADE_UNDER if name != "attempt_id"]
     columns = [codes(rows[name]) for name in names]
-    distinct, at = _distinct([numbers for numbers, _ in columns])
+    different, at = distinct([numbers for numbers, _ in columns])
     number = run_number(runs)
-    made = [{n: texts[i] for n, i, (_, texts) in zip(names, row, columns)} for row in distinct.tolist()]
+    made = [{n: texts[i] for n, i, (_, texts) in zip(names, row, columns)} for row in different.tolist()]
     return np.array([number(row) for row in made], np.int64)[at]
-
-
-def _distinct(columns: Sequence[Ints]) -> tuple[Ints, Ints]:
-    """The different rows (D, columns), and which of them each row is."""
-    key = np.zeros(len(columns[0]), np.int64)
-    for numbers in columns:
-        key = key * (int(numbers.max(initial=0)) + 1) + numbers
-    _, first, at = np.unique(key, return_index=True, return_inverse=True)
-    return np.stack([numbers[first] for numbers in columns], axis=1), at

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from factory.store.counts.attempts import Attempts, Ints
+from factory.store.counts.attempts import Attempts
+from factory.store.counts.codes import Ints
 from tasks.stages import STAGES
 
 CLIP, PERTURB, WRITE = STAGES[0].name, STAGES[1].name, STAGES[-1].name

@@ -4,8 +4,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from factory.graph.walk import Blocked, Complete, Exhausted, Step, Try, next_step, retry_policy
+from factory.store.counts.history import Past
 from factory.store.outcomes import ErrorKind, Kind
-from factory.store.samples import Past
 
 
 def never(past: Past) -> bool:
