@@ -177,7 +177,8 @@ class KeyedTable:
         return None if self._delta is None else self._delta.version()
 
     def __len__(self) -> int:
-        return len(self._index)
+        counts = [file.n_rows for file in self.file_facts().values()]
+        return sum(counts) if all(counts) else len(self._index)  # the log tells, but of files of others perhaps
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._index)

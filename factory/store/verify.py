@@ -10,16 +10,16 @@ readers ignore them.
 import hashlib
 import json
 import re
-from collections import defaultdict
-from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from factory.store.cache import BadCacheFile, check_kept
 from factory.store.commit_copies import COPIES, LOG, CommitCopies, LogDamage
+from factory.store.counts.codes import codes, fixed_bytes
 from factory.store.episodes import FOLDER, check_episode, episode_name
 from factory.store.location import Location
 from factory.store.mcap_shards.mirror import NAMED as MCAP_NAMED
@@ -105,6 +105,9 @@ def outdated_episodes(store: Store) -> list[str]:
 
 
 def _live_episodes(store: Store) -> set[str]:
+    """Of samples that are there; rows are looked at only where there is an episode."""
+    if not store.location.child(FOLDER).names():
+        return set()
     rows = store.samples.read(["attempt_id", "settings_hash", "stage_versions"]).to_pylist()
     return {episode_name(row) for row in rows}
 
@@ -169,32 +172,42 @@ def _damaged_kept(out: Location) -> list[DamagedPart]:
 def _twice(store: Store) -> list[str]:
     found = []
     for table in tables_in(store):
-        seen: set[str] = set()
-        for path, rows in table.files([table.spec.key]):
-            for key in rows[table.spec.key].to_pylist():
-                if key in seen:
-                    found.append(f"{table.spec.name}: {key} stands twice, again in {path}")
-                seen.add(key)
+        parts = [(path, fixed_bytes(rows[table.spec.key])) for path, rows in table.files([table.spec.key])]
+        if not parts:
+            continue
+        keys = np.concatenate([keys for _, keys in parts])
+        file = np.repeat(np.arange(len(parts)), [len(keys) for _, keys in parts])
+        order = np.argsort(keys, kind="stable")
+        again = order[1:][keys[order[1:]] == keys[order[:-1]]]
+        for place in np.sort(again).tolist():
+            found.append(f"{table.spec.name}: {keys[place].decode()} stands twice, again in {parts[file[place]][0]}")
     return found
 
 
 def _broken_rounds(store: Store) -> list[str]:
     """Rounds of a walk count 0, 1, 2 ... in the order of its candidates. Of imported rows they are their source's."""
     imported = {run["settings_hash"] for run in store.runs() if IMPORTED in run["settings"]}
-    walks: dict[tuple[str, str], list[tuple[int, int]]] = defaultdict(list)
-    for row in store.samples.read(["clip_id", "expert", "candidate_index", "round", "settings_hash"]).to_pylist():
-        if row["settings_hash"] not in imported:
-            walks[row["clip_id"], row["expert"]].append((row["candidate_index"], row["round"]))
-    return [
-        f"samples: clip {clip_id}, expert {expert}: candidates and rounds {sorted(rows)}"
-        for (clip_id, expert), rows in sorted(walks.items())
-        if [number for _, number in sorted(rows)] != list(range(len(rows)))
-    ]
+    rows = store.samples.read(["clip_id", "expert", "candidate_index", "round", "settings_hash"], encoded=True)
+    rows = rows.filter(pc.invert(pc.is_in(rows["settings_hash"], value_set=pa.array(sorted(imported), pa.string()))))
+    (clip, clip_ids), (expert, experts) = codes(rows["clip_id"]), codes(rows["expert"])
+    candidate, number = (rows[name].to_numpy() for name in ("candidate_index", "round"))
+    walk = clip * max(1, len(experts)) + expert
+    order = np.lexsort((number, candidate, walk))
+    walk, candidate, number = walk[order], candidate[order], number[order]
+    first = np.diff(walk, prepend=-1) != 0
+    starts = np.flatnonzero(first)
+    ordinal = np.arange(len(walk)) - np.repeat(starts, np.diff(starts, append=len(walk)))
+    found = []
+    for broken in np.unique(walk[number != ordinal]).tolist():
+        pairs = [(int(c), int(r)) for c, r in zip(candidate[walk == broken], number[walk == broken])]
+        of = f"clip {clip_ids[broken // len(experts)]}, expert {experts[broken % len(experts)]}"
+        found.append(f"samples: {of}: candidates and rounds {pairs}")
+    return found
 
 
 def _unknown_settings(store: Store) -> list[str]:
     known = {run["settings_hash"] for run in store.runs()}
-    names: Sequence[str] = store.samples.read(["settings_hash"])["settings_hash"].to_pylist()
+    _, names = codes(store.samples.read(["settings_hash"], encoded=True)["settings_hash"])
     return [f"samples: settings_hash {name} is not in run.json" for name in sorted(set(names) - known)]
 
 

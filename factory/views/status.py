@@ -13,8 +13,11 @@ from factory.exits import MEANING
 from factory.wording import one_line
 
 if TYPE_CHECKING:
+    import pyarrow as pa
+
     from factory.store.location import Location
     from factory.store.samples import Store
+    from factory.store.table import KeyedTable
 
 RETRY = {
     "input": "fix or take out the named file, then python -m factory retry out=...",
@@ -79,14 +82,14 @@ def status_lines(store: "Store") -> Iterable[str]:
     """Tables, counts, funnel and the newest run."""
     from factory.store.counts.funnel import funnel_of
 
-    samples = store.samples.read(["expert", "round", "split", "image_source", "dataset"]).to_pylist()
-    outcomes = Counter(store.outcomes.read(["kind"])["kind"].to_pylist())
+    samples = store.samples.read(["split", "image_source", "dataset"], encoded=True)
+    outcomes = counted(store.outcomes.read(["kind"], encoded=True)["kind"])
     yield f"store       {store.location.uri}"
     for table in (store.samples, store.candidates, store.outcomes, store.plans):
         version = "not there yet" if table.version is None else f"version {table.version}"
         yield f"{table.spec.name:<12}{len(table):,} rows, {len(table.live_files())} files, {version}"
     for title in ("dataset", "split", "image_source"):
-        counts = Counter(row[title] for row in samples)
+        counts = counted(samples[title])
         yield f"{title:<14}" + (", ".join(f"{name} {n}" for name, n in sorted(counts.items())) or "no samples")
     yield "not samples   " + (", ".join(f"{kind} {n}" for kind, n in sorted(outcomes.items())) or "none")
     yield ""
@@ -143,6 +146,22 @@ def failed_line(store: "Store") -> str:
     )
 
 
+def counted(column: "pa.ChunkedArray") -> dict[str, int]:
+    """Text -> rows, of a column of texts as numbers into a dictionary."""
+    return {row["values"]: row["counts"] for row in column.unify_dictionaries().value_counts().to_pylist()}
+
+
+def rows_where(table: "KeyedTable", column: str, value: str) -> list[dict[str, Any]]:
+    """Whole rows with that value; only files that hold some are read whole."""
+    import pyarrow.compute as pc
+
+    found, live = [], table.live_files()
+    for path, rows in table.files([column]):
+        if pc.any(at := pc.equal(rows[column], value)).as_py():
+            found += table.read_file(path, live[path]).filter(at).to_pylist()
+    return found
+
+
 def fate(row: Mapping[str, Any]) -> str:
     """What became of an attempt that is no sample, from its row of outcomes."""
     why = row["error"] or f"{row['stage']}.{row['reason']} {row['detail']}".strip(". ")
@@ -151,7 +170,7 @@ def fate(row: Mapping[str, Any]) -> str:
 
 def _failed(store: "Store") -> tuple[list[dict[str, Any]], dict[str, int]]:
     """By log, clip and walk; how many of each kind of error."""
-    rows = [row for row in store.outcomes.read().to_pylist() if row["kind"] == "failed"]
+    rows = rows_where(store.outcomes, "kind", "failed")
     rows.sort(key=lambda row: (row["log_id"], row["clip_id"], row["expert"], row["candidate_index"]))
     return rows, dict(sorted(Counter(row["error_kind"] for row in rows).items()))
 

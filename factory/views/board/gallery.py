@@ -8,7 +8,7 @@ import pyarrow.compute as pc
 
 from factory.store.outcomes import Kind
 from factory.store.table import KeyedTable
-from factory.views.board.watch import Snapshot
+from factory.views.board.watch import Snapshot, plain
 from factory.views.report_words import REASON_WORDS, to_the_side, turned
 from factory.views.status import fate, how_to_retry
 from tasks.subscores import SUBSCORES
@@ -70,7 +70,7 @@ def gallery(shot: Snapshot, wanted: Mapping[str, str], page: int = 1, size: int 
 def failures(shot: Snapshot, page: int = 1, size: int = 50) -> Json:
     """A page of failed attempts with their errors, by log; of a failed clip `expert` is empty. Raises BadRequest."""
     rows = shot.outcomes.filter(pc.equal(shot.outcomes["kind"], Kind.FAILED.value))
-    rows = rows.sort_by([("log_id", "ascending"), ("clip_id", "ascending"), ("attempt_id", "ascending")])
+    rows = plain(rows).sort_by([("log_id", "ascending"), ("clip_id", "ascending"), ("attempt_id", "ascending")])
 
     def failure(row: Row) -> Json:
         kind = row["error_kind"]

@@ -9,11 +9,13 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 
 from factory.store.counts.funnel import Funnel
 from factory.store.outcomes import Kind
 from factory.views.board.gallery import FILTERS
-from factory.views.board.watch import Snapshot
+from factory.views.board.watch import Snapshot, plain
 from factory.views.report_words import GATE_WORDS, PAPER_CLIP_PERCENT, REASON_WORDS, STATUS
 from tasks.stages import STAGES
 
@@ -21,6 +23,7 @@ QUIET_S = 900.0  # a run that commits nothing for so long is said to be quiet
 N_BUCKETS = 60
 BINS = (40, 24)  # along, aside
 REACH_M = (20.0, 2.0)  # where run.json does not say: the paper's
+WALK = ["clip_id", "expert", "candidate_index"]
 STEPS = {
     "clip": "the clip was read",
     "perturb": "the perturbation held",
@@ -38,7 +41,7 @@ def overview(shot: Snapshot, where: str, now_s: float) -> Json:
     """All of it; `now_s` since 1970."""
     funnel = shot.funnel
     simulated = [row for row in funnel.rows if row.simulated]
-    failed = [row for row in shot.outcome_rows if row["kind"] == Kind.FAILED]
+    failed = shot.outcomes.filter(pc.equal(shot.outcomes["kind"], Kind.FAILED.value))
     stage_times, of = _stage_times(shot)
     before = Counter(funnel.clip_outcomes) + Counter(funnel.clips_without_candidates)
     return {
@@ -48,11 +51,12 @@ def overview(shot: Snapshot, where: str, now_s: float) -> Json:
         "state": _state(shot, now_s),
         "counts": {
             "samples": shot.samples.num_rows,
-            "simulated": sum(row["candidate_index"] >= 0 for row in shot.sample_rows),  # not a logged drive
+            "simulated": pc.sum(pc.greater_equal(shot.samples["candidate_index"], 0)).as_py()
+            or 0,  # not a logged drive
             "simulated_attempts": sum(row.tried for row in simulated),
             "attempts": sum(row.tried for row in funnel.rows),
             "rejected": sum(row.rejected for row in funnel.rows),
-            "failed": len(failed),  # attempts and clips
+            "failed": failed.num_rows,  # attempts and clips
             "clips": funnel.clips_prepared,
             "candidates": funnel.candidates,
             "sample_bytes": shot.sample_bytes,
@@ -71,8 +75,8 @@ def overview(shot: Snapshot, where: str, now_s: float) -> Json:
         "stage_times": stage_times,  # worker seconds
         "stage_times_of": of,  # what they are measured on
         "coverage": _coverage(shot),
-        "failed_kinds": dict(Counter(row["error_kind"] for row in failed).most_common()),
-        "facets": {name: sorted({str(row[name]) for row in shot.sample_rows}) for name in FILTERS},
+        "failed_kinds": dict(Counter(_counts(failed["error_kind"])).most_common()),
+        "facets": {name: sorted(map(str, _counts(shot.samples[name]))) for name in FILTERS},
     }
 
 
@@ -93,14 +97,22 @@ def _quiet(shot: Snapshot, now_s: float) -> bool:
 
 def _facts(shot: Snapshot) -> dict[str, str]:
     """What the tables say about where the samples come from."""
-    sources = Counter(row["image_source"] for row in shot.sample_rows)
+    samples = shot.samples
+    sources = Counter(_counts(samples["image_source"]))
     return {
-        "data set": ", ".join(sorted({row["dataset"] for row in shot.sample_rows})) or "-",
-        "logs with samples": str(len({row["log_id"] for row in shot.sample_rows})),
+        "data set": ", ".join(sorted(_counts(samples["dataset"]))) or "-",
+        "logs with samples": str(len(_counts(samples["log_id"]))),
         "images": ", ".join(f"{name} {count:,}" for name, count in sources.most_common()) or "-",
-        "licences": ", ".join(sorted({row["licence"] for row in shot.sample_rows if row["licence"]})) or "-",
+        "licences": ", ".join(sorted(filter(None, _counts(samples["licence"])))) or "-",
         "settings": str(shot.runs[-1]["settings_hash"]) if shot.runs else "-",
     }
+
+
+def _counts(column: pa.ChunkedArray) -> dict[Any, int]:
+    """Value -> rows."""
+    if pa.types.is_dictionary(column.type):
+        column = column.unify_dictionaries()
+    return {row["values"]: row["counts"] for row in pc.value_counts(column).to_pylist()}
 
 
 def _steps(funnel: Funnel) -> list[Json]:
@@ -187,16 +199,17 @@ def _throughput(shot: Snapshot, now_s: float) -> Json:
 def _walks(shot: Snapshot, began_ms: int, elapsed_s: float) -> tuple[int, int, float | None]:
     """Walks that ended since the run began, these and those still pending, and the seconds left at this rate."""
     rounds, experts = shot.current["rounds"], shot.current["experts"]
-    ended = {
-        (row["clip_id"], row["expert"])
-        for row in shot.sample_rows
-        if row["_written_ms"] >= began_ms and (row["candidate_index"] < 0 or row["round"] >= rounds - 1)
-    }
-    for row in shot.outcome_rows:
-        if row["_written_ms"] >= began_ms and (row["kind"] in (Kind.EXHAUSTED, Kind.FAILED) or not row["expert"]):
-            ended |= {(row["clip_id"], expert) for expert in ([row["expert"]] if row["expert"] else experts)}
-        elif row["_written_ms"] >= began_ms and row["candidate_index"] < 0:
-            ended.add((row["clip_id"], row["expert"]))
+    samples, outcomes = (
+        plain(rows.filter(pc.greater_equal(rows["_written_ms"], began_ms)).select(columns))
+        for rows, columns in ((shot.samples, [*WALK, "round"]), (shot.outcomes, [*WALK, "kind"]))
+    )
+    once = pc.less(samples["candidate_index"], 0)
+    last = samples.filter(pc.or_(once, pc.greater_equal(samples["round"], rounds - 1)))
+    ended = set(zip(last["clip_id"].to_pylist(), last["expert"].to_pylist()))
+    stands = pc.is_in(outcomes["kind"], value_set=pa.array([Kind.EXHAUSTED.value, Kind.FAILED.value]))
+    last = outcomes.filter(pc.or_(stands, pc.less(outcomes["candidate_index"], 0)))  # of a whole clip it is -1 too
+    for clip_id, expert in zip(last["clip_id"].to_pylist(), last["expert"].to_pylist()):
+        ended |= {(clip_id, name) for name in ([expert] if expert else experts)}
     walks = len(ended) + shot.funnel.balance.walks_pending
     return len(ended), walks, (walks - len(ended)) * elapsed_s / len(ended) if ended else None
 
@@ -214,8 +227,7 @@ def _coverage(shot: Snapshot) -> Json:
     along = float(settings.get("perturb.max_longitudinal_m", REACH_M[0]))
     aside = float(settings.get("perturb.max_lateral_m", REACH_M[1]))
     edges = (np.linspace(-aside, aside, BINS[1] + 1), np.linspace(-along, along, BINS[0] + 1))
-    ends = [row["candidate_end"][:2] for row in shot.sample_rows if row["candidate_end"] is not None]
-    accepted = np.asarray(ends, np.float64).reshape(-1, 2)
+    accepted = pc.list_flatten(shot.samples["candidate_end"]).to_numpy().reshape(-1, 4)[:, :2]
 
     def counted(points: np.ndarray) -> list[list[int]]:
         return np.histogram2d(points[:, 1], points[:, 0], edges)[0].astype(int).tolist()

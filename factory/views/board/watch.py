@@ -77,11 +77,11 @@ class Watched:
     def rows(self) -> pa.Table:
         """All of them."""
         names = [name for name in self._columns if name not in ("seconds", "candidates")]
-        schema = pa.schema([self.table.spec.schema.field(name) for name in names])
-        return pa.concat_tables([_placed(schema.empty_table(), 0, 0), *(part.rows for part in self.parts.values())])
+        empty = self.table.schema_of(names, encoded=True).empty_table()
+        return pa.concat_tables([_placed(empty, 0, 0), *(part.rows for part in self.parts.values())])
 
     def _read(self, path: str, file: LiveFile) -> WatchedFile:
-        rows = self.table.read_file(path, file.partition, self._columns)
+        rows = self.table.read_file(path, file.partition, self._columns, encoded=True)
         self.paths.append(path)
         seconds, ends = {}, None
         if "seconds" in self._columns:
@@ -89,6 +89,12 @@ class Watched:
         if "candidates" in self._columns:
             ends, rows = end_points_of(rows["candidates"]), rows.drop_columns(["candidates"])
         return WatchedFile(_placed(rows, len(self.paths) - 1, file.written_ms), seconds, ends)
+
+
+def plain(rows: pa.Table) -> pa.Table:
+    """Some rows with their texts as texts, which can be sorted and listed."""
+    kinds = [f.with_type(f.type.value_type) if pa.types.is_dictionary(f.type) else f for f in rows.schema]
+    return rows.cast(pa.schema(kinds))
 
 
 def _placed(rows: pa.Table, file: int, written_ms: int) -> pa.Table:
@@ -100,12 +106,12 @@ def _placed(rows: pa.Table, file: int, written_ms: int) -> pa.Table:
 
 def seconds_of(column: pa.ChunkedArray) -> dict[str, tuple[int, float]]:
     """Stage -> (attempts, seconds) of a column of maps."""
-    totals: dict[str, tuple[int, float]] = {}
-    for row in column.to_pylist():
-        for stage, spent in row or ():
-            n, total = totals.get(stage, (0, 0.0))
-            totals[stage] = n + 1, total + spent
-    return totals
+    flat = [pa.table([chunk.keys, chunk.items], names=["stage", "s"]) for chunk in column.chunks if len(chunk.keys)]
+    if not flat:
+        return {}
+    sums = pa.concat_tables(flat).group_by("stage").aggregate([("s", "count"), ("s", "sum")])
+    rows = zip(*(sums[name].to_pylist() for name in ("stage", "s_count", "s_sum")))
+    return {stage: (n, seconds) for stage, n, seconds in rows}
 
 
 def end_points_of(column: pa.ChunkedArray) -> F32:
@@ -117,7 +123,8 @@ def end_points_of(column: pa.ChunkedArray) -> F32:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """The run at one instant. Row tables have the columns named above, and _file, _row, _written_ms."""
+    """The run at one instant. Row tables have the columns named above, texts but keys as numbers into a dictionary (see
+    `plain`), and _file, _row, _written_ms."""
 
     version: str  # of samples, outcomes and candidates, "-" for one that is not there yet
     taken_s: float  # since 1970
@@ -144,15 +151,6 @@ class Snapshot:
     def live(self) -> bool:
         """A run was announced that has not told how it ended."""
         return bool(self.current) and self.current["began_ms"] != self.last.get("began_ms")
-
-    @cached_property
-    def sample_rows(self) -> list[dict[str, Any]]:
-        """As dicts."""
-        return self.samples.to_pylist()
-
-    @cached_property
-    def outcome_rows(self) -> list[dict[str, Any]]:
-        return self.outcomes.to_pylist()
 
     @cached_property
     def funnel(self) -> funnel.Funnel:
