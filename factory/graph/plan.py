@@ -111,10 +111,12 @@ def make_plan(
             listed.n_candidates if listed is not None else 0,
             stored.content_digest if stored is not None and stays else None,
         )
-        found += sum(past.kind in (Kind.ACCEPTED, Kind.REJECTED) for walk in clip.walks for past in walk.known.values())
+        for walk in clip.walks:
+            kinds = [past.kind for past in walk.known.values()]
+            walk.n_found = kinds.count(Kind.ACCEPTED)
+            found += walk.n_found + kinds.count(Kind.REJECTED)
         (todo if _has_work(clip, rounds, may_retry) else done).append(clip)
         for walk in clip.walks:
-            walk.n_found = sum(past.kind is Kind.ACCEPTED for past in walk.known.values())
             walk.put_away()
     return RunPlan(tuple(todo), tuple(done), tuple(frozen), found)
 

@@ -28,7 +28,7 @@ class KeyIndex:
         return len(self.keys())
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self.keys().astype(str).tolist())
+        return (key.decode() for key in self.keys().tolist())
 
     def keys(self) -> Bytes:
         """(N,) sorted."""

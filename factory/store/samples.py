@@ -137,7 +137,7 @@ class Store:
         if list(records) != self.runs():
             document = json.loads(canonical_json({"schema_version": SCHEMA_VERSION, "runs": list(records)}))
             self.location.write(RUN_FILE, sealed_json(document).encode())
-        twice = set(both(self.outcomes.keys(), self.samples.keys()).astype(str).tolist())
+        twice = {key.decode() for key in both(self.outcomes.keys(), self.samples.keys()).tolist()}
         if twice:
             age = run_number(records)
             samples, outcomes = (
