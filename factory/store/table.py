@@ -32,8 +32,8 @@ from deltalake.transaction import AddAction, RemoveAction
 
 from factory.store.commit_copies import COPIES, CommitCopies
 from factory.store.counts.codes import Bytes
+from factory.store.counts.key_index import KeyIndex
 from factory.store.disk import needs_disk
-from factory.store.key_index import KeyIndex
 from factory.store.late_listing import until_listed
 from factory.store.location import Location
 from factory.store.parquet_file import encoded_text, read_parquet, with_partition

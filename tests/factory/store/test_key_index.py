@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from factory.store import key_index
-from factory.store.key_index import KeyIndex
+from factory.store.counts import key_index
+from factory.store.counts.key_index import KeyIndex
 
 KEYS = st.text("abcdé", min_size=1, max_size=4)
 CHANGES = st.lists(st.tuples(st.sets(KEYS), st.dictionaries(KEYS, st.sampled_from(["x", "y", "z"]))))
