@@ -7,13 +7,13 @@ import pyarrow.parquet as pq
 import pytest
 
 from factory.stages.rows import label_columns
-from factory.store.reader import SampleTable, labels_of
+from factory.store.reader import SampleTable, group_rows, labels_of
 from factory.store.schema import COLUMNS, LABEL_COLUMNS
 from planners.data.batch import COMMANDS, BevLayout, ImageLayout, Needs
 from planners.data.bev import bev_raster, nearest_agents
 from planners.data.decode import BatchBuffer, StoredRows, count_labels
 from planners.data.feed import BEV_COLUMNS, PLAN_COLUMNS
-from planners.data.files import Footers, files_of, group_bytes, group_rows, leaves
+from planners.data.files import Footers, files_of, group_bytes, leaves
 from planners.data.images import stitched
 from tasks.reward.label_bytes import VocabularyLabels
 from tasks.world.agents import AgentKind
