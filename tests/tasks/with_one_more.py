@@ -9,7 +9,7 @@ from factory.config.compose import fill
 from factory.stages.rows import label_columns, score_columns
 from factory.store.candidates import CANDIDATES
 from factory.store.counts.funnel import funnel_of_tables
-from factory.store.outcomes import Kind
+from factory.store.outcomes import OUTCOMES, Kind
 from factory.store.plans import PLANS
 from factory.store.reader import labels_of
 from factory.store.schema import COLUMNS as STORED
@@ -77,7 +77,7 @@ def told(scores: Scores) -> None:
     outcome |= {"stage": rejected.stage, "reason": rejected.reason}
     outcome |= {"expert_digest": "d", "settings_hash": "s", "stage_versions": "{}"}
     empty = [spec.schema.empty_table() for spec in (SAMPLES, CANDIDATES, PLANS)]
-    funnel = funnel_of_tables(empty[0], pa.Table.from_pylist([outcome]), *empty[1:], [])
+    funnel = funnel_of_tables(empty[0], pa.Table.from_pylist([outcome], OUTCOMES.schema), *empty[1:], [])
     assert funnel.rows[0].reasons == {"reward.sl": 1} and "sl 1" in funnel.text()
     assert _reasons(funnel)[0]["words"] == REASON_WORDS["sl"] == "drove too fast"
     assert "| SL | `speed_limit_compliance` | 0, 1 | weighs 3 | 2m | drove too fast |" in docs_table()
