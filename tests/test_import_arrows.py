@@ -139,7 +139,8 @@ def test_only_the_graph_its_metrics_and_trainings_on_a_cluster_import_ray() -> N
         for path in (ROOT / package).rglob("*.py")
         if "ray" in imported_modules(path)
     }
-    assert users == {"factory/graph/on_ray.py", "planners/training/on_ray.py"}
+    graph = {f"factory/graph/on_ray/{name}.py" for name in ("cluster", "graph", "pool")}
+    assert users == graph | {"planners/training/on_ray.py"}
 
 
 def test_no_module_shadows_the_standard_library() -> None:

@@ -14,8 +14,8 @@ from factory.graph.local import Graph, Ticket
 from factory.graph.steps import Failure
 from factory.store.candidates import ClipCandidates
 from factory.store.outcomes import Outcome
+from factory.store.parquet_file import Shard
 from factory.store.samples import Store
-from factory.store.table import Shard
 
 SHARD_BYTES = 128 * 2**20
 SHARD_SECONDS = 30.0

@@ -26,7 +26,7 @@ from factory.store.counts.history import Past
 from factory.store.disk import DiskFull
 from factory.store.identity import RunIdentity, Stamp, attempt_id
 from factory.store.outcomes import ErrorKind, Kind, Outcome
-from factory.store.table import Shard
+from factory.store.parquet_file import Shard
 from tasks.stages import Rejected
 
 CLIPS_PER_WORKER = 2  # open at once: one works while the next is being prepared

@@ -134,7 +134,7 @@ def execute(
         elif is_due and executor == "local":
             graph = LocalGraph(work, store.location, lambda: driver.interrupted, fuse)
         elif is_due:
-            from factory.graph.on_ray import RayGraph
+            from factory.graph.on_ray.graph import RayGraph
 
             graph = RayGraph(work, store.location, workers, ray_address, claims, fuse, limits)
     except (BadLocation, ClusterLacks, NotReady, ConnectionError) as error:

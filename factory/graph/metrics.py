@@ -19,7 +19,7 @@ from typing import Protocol
 from factory.graph.steps import Attempted, Failure, Prepared, Reconstructed
 from factory.store.location import Location
 from factory.store.outcomes import Kind, Outcome
-from factory.store.table import Shard
+from factory.store.parquet_file import Shard
 
 GAUGES_EVERY_S = 1.0
 DISK_EVERY_S = 10.0

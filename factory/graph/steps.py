@@ -23,9 +23,9 @@ from factory.store.illness import own_place, why_ill
 from factory.store.location import Location
 from factory.store.mcap_shards.mirror import write_mcap_shard
 from factory.store.outcomes import ErrorKind
+from factory.store.parquet_file import Shard, write_shard
 from factory.store.reader import samples_of
 from factory.store.schema import SAMPLES, sample_row_to_table
-from factory.store.table import Shard, write_shard
 from factory.wording import one_line
 from tasks.stages import Rejected
 

@@ -6,7 +6,8 @@ from dataclasses import asdict, dataclass, fields
 import pyarrow as pa
 
 from factory.store.columns import schema_of
-from factory.store.table import KeyedTable, TableSpec
+from factory.store.parquet_file import TableSpec
+from factory.store.table import KeyedTable
 
 
 @dataclass(frozen=True)

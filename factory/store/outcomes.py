@@ -12,7 +12,7 @@ from enum import StrEnum
 import pyarrow as pa
 
 from factory.store.columns import schema_of
-from factory.store.table import TableSpec
+from factory.store.parquet_file import TableSpec
 
 
 class Kind(StrEnum):

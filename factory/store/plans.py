@@ -9,7 +9,8 @@ from collections.abc import Collection, Mapping, Sequence
 
 import pyarrow as pa
 
-from factory.store.table import KeyedTable, TableSpec
+from factory.store.parquet_file import TableSpec
+from factory.store.table import KeyedTable
 
 SCHEMA = pa.schema(
     [

@@ -18,9 +18,10 @@ from factory.store.counts.history import OUTCOME_STATE, SAMPLE_STATE, History, h
 from factory.store.identity import UNLISTED, RunIdentity, canonical_json
 from factory.store.location import Location
 from factory.store.outcomes import OUTCOMES, Outcome, outcomes_table
+from factory.store.parquet_file import Shard, write_shard
 from factory.store.plans import PLANS, plan_table
 from factory.store.schema import LICENCES_PROPERTY, SAMPLES, SCHEMA_VERSION
-from factory.store.table import KeyedTable, Shard, write_shard
+from factory.store.table import KeyedTable
 from tasks.sealed import MEMBER, sealed_json, unsealed_json
 
 OnChange = Literal["stop", "keep", "redo"]

@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from factory.store.columns import BadRow, Column
 from factory.store.identity import Stamp
-from factory.store.table import TableSpec
+from factory.store.parquet_file import TableSpec
 from tasks.subscores import HALVES, JUDGED, SUBSCORES, WHOLES
 
 SCHEMA_VERSION = 3

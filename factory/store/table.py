@@ -11,7 +11,6 @@ runs that begin at once the last in that one log is the newest everywhere, and n
 Measured here: 5-12 ms per commit on local disk.
 """
 
-import hashlib
 import json
 import secrets
 import time
@@ -25,7 +24,6 @@ from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 from deltalake import CommitProperties, DeltaTable, Transaction
 from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundError
 from deltalake.transaction import AddAction, RemoveAction
@@ -36,7 +34,7 @@ from factory.store.counts.key_index import KeyIndex
 from factory.store.disk import needs_disk
 from factory.store.late_listing import until_listed
 from factory.store.location import Location
-from factory.store.parquet_file import encoded_text, read_parquet, with_partition
+from factory.store.parquet_file import Shard, TableSpec, encoded_text, read_parquet, with_partition, write_shard
 from factory.wording import one_line
 
 APP_ID = "driving-data-factory"
@@ -46,7 +44,6 @@ SCHEMA_BYTES = 16 * 1024  # of the log, about, that a new table takes
 CLAIMS = 20  # of one table, by a run that begins while another commits
 CLAIM_PAUSE_S = 0.1  # on an object store after the first, and half as long again after each: 50 s in all
 AHEAD = 16  # files of an object store that are read at once
-ROW_GROUP_BYTES = 4 * 2**20  # uncompressed; one sample costs one group, and a group 13 kB of the file's footer
 
 
 class DuplicateKey(RuntimeError):
@@ -62,28 +59,6 @@ class AnotherWriter(RuntimeError):
 
 
 @dataclass(frozen=True)
-class TableSpec:
-    """What a table is; `key` is its unique column."""
-
-    name: str
-    schema: pa.Schema
-    key: str
-    partition_by: tuple[str, ...] = ()
-    properties: Mapping[str, str] | None = None
-    packed: tuple[str, ...] = ()  # leaves whose values are compressed already, as their paths in a file
-
-
-@dataclass(frozen=True)
-class Shard:
-    """One written, not yet committed file."""
-
-    path: str  # relative to the table
-    size: int  # bytes
-    partition: Mapping[str, str]
-    keys: tuple[str, ...]
-
-
-@dataclass(frozen=True)
 class LiveFile:
     """One file that the log names."""
 
@@ -91,48 +66,6 @@ class LiveFile:
     n_bytes: int
     n_rows: int
     written_ms: int  # since 1970: when its rows came into the table, or were rewritten without others
-
-
-def write_shard(location: Location, spec: TableSpec, rows: pa.Table) -> Shard:
-    """Write rows of ONE partition, sorted by key, as one file under the table's folder. Idempotent.
-
-    The partition's columns stand in the file too, where Delta does not need them: a file alone says what it holds.
-    Row groups hold at most 4 MB, or one row. Without Arrow's own schema every engine reads plain lists as the Delta log
-    says. Packed leaves are stored as they are: neither zstd nor a dictionary makes a JPEG smaller.
-    """
-    rows = rows.select(spec.schema.names).cast(spec.schema).sort_by(spec.key)
-    partition = {}
-    for name in spec.partition_by:
-        (value,) = pc.unique(rows[name]).to_pylist()
-        partition[name] = str(value)
-    keys = tuple(rows[spec.key].to_pylist())
-    group_rows = max(1, int(ROW_GROUP_BYTES // max(1, rows.nbytes // max(1, rows.num_rows))))
-    sink = pa.BufferOutputStream()
-    leaves = [path for field in rows.schema for path in _leaf_paths(field.name, field.type)]
-    pq.write_table(
-        rows,
-        sink,
-        row_group_size=group_rows,
-        compression={path: "none" if path in spec.packed else "zstd" for path in leaves},
-        use_dictionary=[path for path in leaves if path not in spec.packed],
-        write_page_checksum=True,
-        write_page_index=True,
-        store_schema=False,
-    )
-    data = sink.getvalue().to_pybytes()
-    folder = "".join(f"{name}={value}/" for name, value in partition.items())
-    path = f"{folder}part-{hashlib.sha256(data).hexdigest()[:32]}.parquet"
-    location.write(path, data)
-    return Shard(path, len(data), partition, keys)
-
-
-def _leaf_paths(path: str, kind: pa.DataType) -> list[str]:
-    """The paths in a file of the leaves under a column or member."""
-    if pa.types.is_struct(kind):
-        return [leaf for member in kind for leaf in _leaf_paths(f"{path}.{member.name}", member.type)]
-    if pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind):
-        return _leaf_paths(f"{path}.list.element", kind.value_type)
-    return [path]
 
 
 class KeyedTable:

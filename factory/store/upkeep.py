@@ -13,8 +13,9 @@ import pyarrow as pa
 
 from factory.store.commit_copies import COPIES, LOG, CommitCopies
 from factory.store.location import Location
+from factory.store.parquet_file import Shard, write_shard
 from factory.store.samples import Store
-from factory.store.table import KeyedTable, Shard, write_shard
+from factory.store.table import KeyedTable
 from factory.store.verify import TABLES, Verdict, damaged_logs, orphaned, outdated_episodes, tables_in
 
 TEMPORARY = re.compile(r"(.*/)?(\..*\.tmp|\.trial-[0-9a-f]+|_commit_.*\.tmp|.*\.draft)")

@@ -26,9 +26,10 @@ import pyarrow as pa
 from factory.store.candidates import CANDIDATES
 from factory.store.location import Location
 from factory.store.outcomes import OUTCOMES
+from factory.store.parquet_file import TableSpec, write_shard
 from factory.store.samples import Store
 from factory.store.schema import SAMPLES
-from factory.store.table import KeyedTable, TableSpec, write_shard
+from factory.store.table import KeyedTable
 from factory.views.board.server import STATIC
 
 SHARD_BYTES = 64 * 2**20

@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
+from factory.store.parquet_file import write_shard
 from factory.store.samples import Store
 from factory.store.schema import sample_row_to_table
-from factory.store.table import write_shard
 from tasks.world.kinematic_vocabulary import kinematic_trajectories
 from tasks.world.vocabulary import Vocabulary
 from tests.planners.samples import grey_pictures, labels, sample

@@ -24,7 +24,7 @@ from typing import Any
 from factory.config.arguments import answer
 from factory.exits import COMPLETE
 from factory.graph.execute import execute
-from factory.graph.on_ray import ray  # with the environment that keeps it on loopback
+from factory.graph.on_ray.cluster import ray  # with the environment that keeps it on loopback
 from factory.graph.work import Columns, Driven
 from factory.readers.base import ClipRef
 from factory.store.samples import Store

@@ -12,6 +12,7 @@ import math
 import resource
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
@@ -30,9 +31,9 @@ from factory.readers.base import ClipRef
 from factory.store.candidates import CANDIDATES
 from factory.store.identity import RunIdentity, attempt_id
 from factory.store.outcomes import OUTCOMES
+from factory.store.parquet_file import Shard, TableSpec, write_shard
 from factory.store.samples import Store
 from factory.store.schema import SAMPLES, sample_row_to_table
-from factory.store.table import Shard, TableSpec, write_shard
 from tests.factory.toy import ToyWork, row_of, stream
 
 EXPERTS = ("pdm_closed", "recovery")
@@ -221,12 +222,18 @@ def card(out: Path) -> None:
     write_card(Store(out))
 
 
+def show(out: Path) -> None:
+    """Five samples as one picture."""
+    with tempfile.TemporaryDirectory() as folder:
+        command("show", "sample=5", f"to={folder}/samples.png")(out)
+
+
 STEPS: dict[str, Step] = {
     "open": open_,
     "resume": plan,
     "extend": lambda out: plan(out, ROUNDS + 1),
     "status": command("status"),
-    "show": command("show", "sample=5", "to=/tmp/bench_store.png"),
+    "show": show,
     "dashboard": dashboard,
     "report": command("report"),
     "card": card,

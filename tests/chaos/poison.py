@@ -39,6 +39,7 @@ HUMAN = "human"
 LIMITS = Limits(
     seconds={"drive": 30.0, "render": 0.0, "label": 0.0}, gb={"drive": 1.2, "render": 1.2, "label": 1.2}
 )  # memory: what stands for 8 GB here
+RAN = "code of a pickle ran"  # a file
 HOW: Mapping[str, tuple[str, str]] = {  # kind -> what is told of it, and a pattern in the message
     "loop": ("limit", "at work for more than"),
     "compiled loop": ("limit", "at work for more than"),
@@ -55,10 +56,13 @@ HOW: Mapping[str, tuple[str, str]] = {  # kind -> what is told of it, and a patt
 
 
 class Hostile:
-    """Runs code where it is unpickled by pickle itself."""
+    """Runs code where it is unpickled by pickle itself: it leaves a file."""
+
+    def __init__(self, ran: Path) -> None:
+        self.ran = ran
 
     def __reduce__(self) -> tuple[object, tuple[str]]:
-        return exec, ("open('/tmp/hostile', 'w')",)
+        return exec, (f"open({str(self.ran)!r}, 'w')",)
 
 
 @dataclass(frozen=True)
@@ -89,7 +93,7 @@ class PoisonWork(WildWork):
 
 
 def write_files(folder: Path) -> None:
-    (folder / "hostile.pkl").write_bytes(pickle.dumps([Hostile()]))
+    (folder / "hostile.pkl").write_bytes(pickle.dumps([Hostile(folder / RAN)]))
     whole = merged_pcd(np.random.default_rng(0).normal(0.0, 20.0, (50, 4)) + 5.0)
     (folder / "truncated.pcd").write_bytes(whole[: len(whole) // 2])
 
@@ -142,13 +146,12 @@ def trial(folder: Path, executor: str, n: int, seed: int) -> list[str]:
 def main(clips: int = 100, local: int = 1, ray: int = 1, seed: int = 0) -> None:
     """Prints one table."""
     signal.alarm(3600)
-    Path("/tmp/hostile").unlink(missing_ok=True)
     with tempfile.TemporaryDirectory() as name:
         write_files(Path(name))
         print("| executor | kind | clips | told as | others, byte for byte | exit |\n|---|---|---|---|---|---|")
         for executor in ["local"] * local + ["ray"] * ray:
             print("\n".join(trial(Path(name), executor, clips, seed)), flush=True)
-    assert not Path("/tmp/hostile").exists(), "code of a pickle ran"
+            assert not Path(name, RAN).exists(), "code of a pickle ran"
 
 
 if __name__ == "__main__":

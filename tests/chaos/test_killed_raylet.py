@@ -18,7 +18,7 @@ RUN = """
 import sys
 from factory.graph import driver
 from factory.graph.execute import execute, on_new_clusters
-from factory.graph.on_ray import ray
+from factory.graph.on_ray.cluster import ray
 from factory.store.samples import Store
 from tests.chaos.killed_driver import EXPERTS
 from tests.factory.toy import ToyWork, refs

@@ -12,9 +12,9 @@ from factory.stages.benchmark import BENCHMARK_FILE
 from factory.stages.rows import sample_row
 from factory.store.cache import SceneFiles
 from factory.store.location import Location
+from factory.store.parquet_file import write_shard
 from factory.store.samples import Store
 from factory.store.schema import COLUMNS, SAMPLES, sample_row_to_table
-from factory.store.table import write_shard
 from planners.evaluation.frames import ClipScenes, FrameKey, FramePair
 from tasks.attempt import drive_and_judge
 from tasks.experts.pdm_closed.planner import PdmSettings

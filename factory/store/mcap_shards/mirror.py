@@ -14,9 +14,9 @@ import pyarrow as pa
 
 from factory.store.location import Location
 from factory.store.mcap_shards.shard import McapShard, shard_bytes
-from factory.store.parquet_file import naming, open_parquet, with_partition
+from factory.store.parquet_file import Shard, TableSpec, naming, open_parquet, with_partition
 from factory.store.schema import SAMPLES, SCHEMA
-from factory.store.table import KeyedTable, Shard, TableSpec
+from factory.store.table import KeyedTable
 
 SAMPLES_MCAP = TableSpec("samples_mcap", SCHEMA, "attempt_id", SAMPLES.partition_by, SAMPLES.properties)
 NAMED = re.compile(r"(.*part-[0-9a-f]{32})-([0-9a-f]{32})\.mcap")

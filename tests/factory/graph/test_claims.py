@@ -13,8 +13,9 @@ import pytest
 from factory.exits import COMPLETE, INTERRUPTED
 from factory.graph.execute import RunSummary
 from factory.store.outcomes import OUTCOMES, outcomes_table
+from factory.store.parquet_file import write_shard
 from factory.store.samples import Store
-from factory.store.table import AnotherWriter, write_shard
+from factory.store.table import AnotherWriter
 from tests.factory.graph.runs import run
 from tests.factory.graph.test_two_drivers import an_outcome
 from tests.factory.tables import assert_same_tables

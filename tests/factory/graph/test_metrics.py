@@ -27,8 +27,8 @@ from factory.graph.metrics import (
     Type,
 )
 from factory.store.location import Location
+from factory.store.parquet_file import Shard
 from factory.store.samples import Store
-from factory.store.table import Shard
 from tests.factory.toy import ToyWork, refs
 
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "metrics.md"

@@ -11,7 +11,8 @@ from factory.exits import COMPLETE, INTERRUPTED
 from factory.graph.execute import RunSummary
 from factory.store.location import Location
 from factory.store.outcomes import OUTCOMES, Kind, Outcome, outcomes_table
-from factory.store.table import AnotherWriter, KeyedTable, write_shard
+from factory.store.parquet_file import write_shard
+from factory.store.table import AnotherWriter, KeyedTable
 from tests.factory.graph.runs import run
 from tests.factory.tables import assert_same_tables
 from tests.factory.toy import ToyWork

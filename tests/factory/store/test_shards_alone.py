@@ -15,10 +15,11 @@ from deltalake import DeltaTable
 
 from factory.graph.execute import execute
 from factory.store.location import Location
+from factory.store.parquet_file import Shard
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
 from factory.store.schema import SAMPLES
-from factory.store.table import KeyedTable, Shard
+from factory.store.table import KeyedTable
 from factory.store.verify import verify
 from tests.factory.tables import assert_same_rows, assert_same_tables
 from tests.factory.toy import ToyWork, refs

@@ -1,33 +1,21 @@
-"""The graph as Ray tasks, on this machine or on a cluster. All that imports ray here.
+"""The graph's tasks in a cluster's workers.
 
 Large results stay in the object store and travel by reference. A worker that dies is retried by Ray; what then still
-fails becomes a steps.Failure. Nothing but loopback is opened for a cluster of our own, and `ray stop` is never called.
+fails becomes a steps.Failure.
 """
 
-import logging
-import os
-import secrets
-import socket
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import BrokenExecutor, Executor, Future
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
-
-os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")  # keeps every listener on 127.0.0.1
-os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-os.environ.setdefault("RAY_task_oom_retries", "2")  # Ray's own default retries a task that runs out of memory for ever
+from typing import Any
 
 import ray
 from ray import exceptions
-from ray.autoscaler.sdk import request_resources
 from ray.exceptions import RayError, RayTaskError
 from ray.util.metrics import Counter, Gauge, Histogram
-from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from factory.graph.limits import NO_LIMITS, Costs, Limits, cleared, described, notes_folder, put_away, watched
 from factory.graph.local import (
@@ -36,7 +24,6 @@ from factory.graph.local import (
     STEPS,
     Claims,
     ClusterDied,
-    ClusterLacks,
     Fuse,
     Ticket,
     attempt_tasks,
@@ -44,10 +31,20 @@ from factory.graph.local import (
     name_of,
 )
 from factory.graph.metrics import METRICS, Metric, Recorder, Type
+from factory.graph.on_ray.cluster import (
+    connect,
+    dead_part,
+    has_gpu,
+    nodes_of_cluster,
+    of_nodes,
+    on_node,
+    prove_shared,
+    tasks_at_once,
+)
 from factory.graph.steps import Failure
 from factory.graph.work import NotReady, Work, never
 from factory.store.illness import why_ill
-from factory.store.location import BadLocation, Location
+from factory.store.location import Location
 from factory.store.outcomes import ErrorKind
 from factory.wording import one_line
 from tasks.stages import TASKS
@@ -57,16 +54,7 @@ ILL = (  # what Ray says when it is the machine that failed
     *(exceptions.RuntimeEnvSetupError, exceptions.OutOfMemoryError, exceptions.ObjectLostError),
     *(exceptions.ObjectStoreFullError, exceptions.OutOfDiskError),
 )
-VITAL = ("raylet", "gcs_server")
-PROBE_SECONDS = 120.0
-ANSWER_S = 10.0  # for a cluster's port to be reached
 WARMING = {"key": "warm", "what": "compiling kernels", "run": "", "limited": False}
-GPU_WAIT_S = 900.0  # for the first node with one to come
-WORKER_ENV = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-FORWARDED_ENV = ("NUMBA_CACHE_DIR",)
-
-R = TypeVar("R")
-P = ParamSpec("P")
 
 _HELD: dict[str, Any] = {}  # per worker process: the run's Work, fetched once
 
@@ -116,9 +104,9 @@ class RayGraph:
         cannot do its part.
         """
         self._connected = not ray.is_initialized()
-        self._is_ours = self._connected and _connect(workers, address)
-        self.parallelism = _at_once(workers, self._is_ours)
-        self.cores = min(self.parallelism, *(_of_nodes("CPU") or [1]))  # none yet where a cluster grows from nothing
+        self._is_ours = self._connected and connect(workers, address)
+        self.parallelism = tasks_at_once(workers, self._is_ours)
+        self.cores = min(self.parallelism, *(of_nodes("CPU") or [1]))  # none yet where a cluster grows from nothing
         self.recorder: Recorder = RayRecorder()
         self._supplied: dict[str, Any] = {"work": [ray.put(work)], "out": out, "stopped": never}  # list: a reference
         self._costs, self._notes = Costs(limits), notes_folder(out)
@@ -128,11 +116,11 @@ class RayGraph:
         self._held_back: dict[bool, deque[tuple[Ticket, str, tuple[Any, ...]]]] = {False: deque(), True: deque()}
         self._flying = {False: 0, True: 0}  # both by whether a task claims a GPU
         try:
-            self._gpu_share = claims.gpu_share if claims.gpu_share and _has_gpu(wait=not self._is_ours) else 0.0
-            self._claims, self._most_memory = claims, max(_of_nodes("memory"), default=None)
+            self._gpu_share = claims.gpu_share if claims.gpu_share and has_gpu(wait=not self._is_ours) else 0.0
+            self._claims, self._most_memory = claims, max(of_nodes("memory"), default=None)
             self.attempt_tasks: Sequence[Sequence[str]] = attempt_tasks(fuse, apart=self._gpu_share > 0.0)
             self._after_drawing = _after_drawing(self.attempt_tasks) if self._gpu_share else frozenset()
-            _prove_shared(out, "out", "shared storage or a URL")
+            prove_shared(out, "out", "shared storage or a URL")
             _warm_every_node(self._supplied["work"], self._notes, with_gpu_only=self._gpu_share > 0.0)
         except BaseException:
             self.close()
@@ -170,7 +158,7 @@ class RayGraph:
 
     def wait(self, timeout_s: float) -> tuple[Ticket, Any] | None:
         """Raises ClusterDied."""
-        if self._is_ours and (dead := _dead_part()):
+        if self._is_ours and (dead := dead_part()):
             raise ClusterDied(f"Ray's {dead} died", is_ours=True)
         if not self._ready and self._tickets:
             pending = list(self._tickets)
@@ -215,59 +203,6 @@ def _kind_of(error: RayError) -> ErrorKind:
     return ErrorKind.MACHINE if ill else ErrorKind.SYSTEM
 
 
-class RayPool(Executor):
-    """Tasks of a core each as futures, of any function. What a task raises is its future's own exception."""
-
-    def __init__(self, workers: int | None, to: Location | None) -> None:
-        """Workers as of RayGraph; to: the folder that tasks write to.
-
-        Raises BadLocation where some node does not see it, ConnectionError where no cluster answers.
-        """
-        self._connected = not ray.is_initialized()
-        is_ours = self._connected and _connect(workers, None)
-        self.parallelism = _at_once(workers, is_ours)
-        self._references: dict[Future[Any], Any] = {}
-        try:
-            if to is not None:
-                _prove_shared(to, "to", "storage that all of them share")
-        except BaseException:
-            self.shutdown()
-            raise
-
-    def submit(self, function: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
-        """BrokenExecutor is raised by a future whose worker died, with all of its retries."""
-        reference = _call.remote(function, args, kwargs)
-        future: Future[R] = Future()
-        future.set_running_or_notify_cancel()
-        self._references[future] = reference  # by which it could be ended
-        reference.future().add_done_callback(lambda done: self._hand_on(done, future))
-        return future
-
-    def _hand_on(self, done: Future[R], future: Future[R]) -> None:
-        self._references.pop(future, None)
-        error = done.exception()
-        if error is None:
-            future.set_result(done.result())
-        elif isinstance(error, RayTaskError):  # Ray wraps what a task raised with its traceback
-            future.set_exception(error.cause)
-        else:
-            future.set_exception(BrokenExecutor(f"{type(error).__name__}: {one_line(error)}"))
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Leave the cluster; cancel_futures: end what is not done. What is done is in its future already."""
-        if cancel_futures:
-            for reference in list(self._references.values()):
-                ray.cancel(reference)
-        self._references.clear()
-        if self._connected:
-            ray.shutdown()
-
-
-@ray.remote(num_cpus=1, max_retries=MAX_RETRIES)
-def _call(function: Callable[..., Any], args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
-    return function(*args, **kwargs)
-
-
 @dataclass(frozen=True)
 class Fetched:
     """A result that a task fetches itself: Ray sends a task to the node where most of what it is given lies.
@@ -302,126 +237,19 @@ def _held(reference: list[Any]) -> Any:
     return _HELD[key]
 
 
-@ray.remote(num_cpus=0)
-def _sees(out: Location, name: str, token: bytes) -> bool:
-    return out.read(name) == token
-
-
-def _connect(workers: int | None, address: str | None) -> bool:
-    """Join the cluster of `address` or RAY_ADDRESS, else start one in this machine (then True).
-
-    Raises ConnectionError where nothing answers there; where nothing listens at once: Ray itself tries for minutes.
-    """
-    named = address or os.environ.get("RAY_ADDRESS", "")
-    environment = WORKER_ENV | {name: os.environ[name] for name in FORWARDED_ENV if name in os.environ}
-    where = address or ("auto" if os.environ.get("RAY_ADDRESS") else "local")
-    own: dict[str, Any] = {"num_cpus": workers, "include_dashboard": False} if where == "local" else {}
-    if where == "local":  # Ray warns that a cluster of our own asks for a token, as it should
-        logging.getLogger("ray._private.authentication.authentication_token_setup").setLevel(logging.ERROR)
-    try:
-        _must_answer(named)
-        ray.init(
-            address=where,
-            runtime_env={"env_vars": environment},
-            log_to_driver=False,
-            logging_level=logging.WARNING,
-            **own,
-        )
-    except ConnectionError as error:
-        said = f"no Ray cluster answers at RAY_ADDRESS={named} ({one_line(error)})"
-        raise ConnectionError(f"{said}; unset it to run on this machine alone") from error
-    return where == "local"
-
-
-def _at_once(workers: int | None, is_ours: bool) -> int:
-    """Tasks: of a cluster of our own no more than it has cores, of another what was asked for, as it may grow."""
-    available = int(ray.cluster_resources().get("CPU", 1))
-    return max(1, min(workers or available, available) if is_ours else workers or available)
-
-
-def _dead_part() -> str:
-    """A process of a cluster that this one began, where it has died.
-
-    Looked at before anything is asked of Ray, which ends this process when it finds the object store gone.
-    """
-    node = ray._private.worker._global_node
-    return next((name for name, _ in node.dead_processes() if name in VITAL), "") if node is not None else ""
-
-
-def _must_answer(address: str) -> None:
-    """Raises ConnectionError for a host:port, or ray://host:port, at which nothing listens."""
-    host, colon, port = address.removeprefix("ray://").rpartition(":")
-    if not (colon and port.isdecimal()):
-        return  # auto, local: Ray knows where
-    try:
-        socket.create_connection((host.strip("[]"), int(port)), timeout=ANSWER_S).close()
-    except OSError as error:
-        raise ConnectionError(str(error)) from error
-
-
-def _nodes(having: str = "") -> list[str]:
-    return [n["NodeID"] for n in ray.nodes() if n["Alive"] and (not having or n["Resources"].get(having))]
-
-
-def _of_nodes(resource: str) -> list[int]:
-    """Of each node that works: a head without cores does not."""
-    working = [node["Resources"] for node in ray.nodes() if node["Alive"] and node["Resources"].get("CPU")]
-    return [int(resources[resource]) for resources in working if resources.get(resource)]
-
-
-def _has_gpu(wait: bool) -> bool:
-    """Some node has a GPU; where none has, one is asked for and waited for."""
-    if _nodes("GPU") or not wait:
-        return bool(_nodes("GPU"))
-    request_resources(bundles=[{"GPU": 1}])
-    began = time.monotonic()
-    while not _nodes("GPU"):
-        if time.monotonic() - began > GPU_WAIT_S:
-            raise ClusterLacks(
-                f"no node of the cluster has a GPU, and none came in {GPU_WAIT_S:.0f} s: start one, or draw with "
-                "render.backend=cpu"
-            )
-        time.sleep(min(2.0, GPU_WAIT_S))
-    request_resources(bundles=[])  # the attempts themselves hold it from now on
-    return True
-
-
-def _on(node: str) -> NodeAffinitySchedulingStrategy:
-    return NodeAffinitySchedulingStrategy(node, soft=False)
-
-
-def _prove_shared(out: Location, setting: str, wanted: str) -> None:
-    """Every node reads what the driver wrote under `out`. Raises BadLocation with what is `wanted` of the setting."""
-    nodes = _nodes()
-    if len(nodes) < 2:
-        return
-    name, token = f"probe-{secrets.token_hex(8)}", secrets.token_bytes(16)
-    out.write(name, token)
-    try:
-        answers = ray.get(
-            [_sees.options(scheduling_strategy=_on(node)).remote(out, name, token) for node in nodes],
-            timeout=PROBE_SECONDS,
-        )
-    finally:
-        out.remove(name)
-    blind = [node for node, sees in zip(nodes, answers) if not sees]
-    if blind:
-        raise BadLocation(f"{setting}={out.uri} is not the same folder on nodes {blind}: name {wanted}")
-
-
 def _warm_every_node(work: list[Any], notes: Path, with_gpu_only: bool) -> None:
     """Kernels on every node; what attempts draw with where they are made: on all nodes, or on those with a GPU."""
-    nodes = _nodes()
-    draws = _nodes("GPU") if with_gpu_only else nodes
+    nodes = nodes_of_cluster()
+    draws = nodes_of_cluster("GPU") if with_gpu_only else nodes
     reports = [
-        _run.options(name="warm", scheduling_strategy=_on(n)).remote("warm", (notes, WARMING), 1, work, n in draws)
+        _run.options(name="warm", scheduling_strategy=on_node(n)).remote("warm", (notes, WARMING), 1, work, n in draws)
         for n in nodes
     ]
     for node, (report, _) in zip(nodes, reports):
         try:
             answer, _ = ray.get(report)
         except RayError as error:
-            if node not in _nodes():
+            if node not in nodes_of_cluster():
                 continue  # it has left the cluster: no task goes there
             raise NotReady(f"node {node} could not get its kernels ready: {one_line(error)}") from error
         if isinstance(answer, Failure):
