@@ -215,8 +215,8 @@ class KeyedTable:
         """
         if self._delta is None:
             self._create()
+        self.refresh()
         for left in reversed(range(CLAIMS)):
-            self.refresh()
             mine = max(self.epoch, above) + 1 if epoch is None else epoch
             if mine <= self.epoch:
                 raise self._lost()
@@ -224,11 +224,11 @@ class KeyedTable:
                 self._transact([], mine)
                 break
             except AnotherWriter:
+                if left and not self.location.is_local:  # perhaps a commit that is not listed yet
+                    time.sleep(min(CLAIM_PAUSE_S * 1.5 ** (CLAIMS - left), 5.0))
                 self.refresh()
                 if not left or self.epoch > mine:  # a later claim followed at once
                     raise
-                if not self.location.is_local:  # perhaps a commit that is not listed yet
-                    time.sleep(min(CLAIM_PAUSE_S * 1.5 ** (CLAIMS - left), 5.0))
         return mine
 
     def commit(self, add: Sequence[Shard], drop: Iterable[str] = ()) -> None:
