@@ -4,6 +4,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -26,13 +27,25 @@ def test_a_claim_stands_though_the_older_run_commits_at_the_same_moment(tmp_path
     where = Location.parse(tmp_path / "outcomes")
     older = KeyedTable(where, OUTCOMES)
     older.claim()
-    newer = KeyedTable(where, OUTCOMES)
-    older.commit([write_shard(where, OUTCOMES, outcomes_table([an_outcome("a")]))])
+
+    class Overtaken(KeyedTable):
+        """The older run commits between what this one has seen of the log and its claim."""
+
+        def _transact(self, *args: Any) -> None:
+            if "b" not in older:
+                commit(older, "b")
+            super()._transact(*args)
+
+    def commit(table: KeyedTable, key: str) -> None:
+        table.commit([write_shard(where, OUTCOMES, outcomes_table([an_outcome(key)]))])
+
+    newer = Overtaken(where, OUTCOMES)
+    commit(older, "a")
     newer.claim()
-    assert "a" in newer
+    assert "a" in newer and "b" in newer
     with pytest.raises(AnotherWriter):
-        older.commit([write_shard(where, OUTCOMES, outcomes_table([an_outcome("b")]))])
-    newer.commit([write_shard(where, OUTCOMES, outcomes_table([an_outcome("b")]))])
+        commit(older, "c")
+    commit(newer, "c")
 
 
 @dataclass(frozen=True)
