@@ -18,10 +18,10 @@ from factory.graph.episodes import Beside
 from factory.graph.local import Graph, Ticket
 from factory.graph.metrics import RunMetrics
 from factory.graph.plan import CLIP_CANDIDATE, ClipPlan, RunPlan, WalkState, wants_payload
-from factory.graph.progress import ProgressLine, RunForecast, Tally, Workload
+from factory.graph.progress import Executed, ProgressLine, RunForecast, Tally, Workload
 from factory.graph.records import Records, past_of
-from factory.graph.steps import Attempted, Failure, HalfBuilt, HandedOn, Prepared, Reconstructed
-from factory.graph.walk import Blocked, Complete, Exhausted, Step, Try, tries_before
+from factory.graph.steps import Attempted, Failure, HalfBuilt, HandedOn, Prepared, Reconstructed, Walked
+from factory.graph.walk import Blocked, Complete, Exhausted, Step, Stretch, Try, stretch, tries_before
 from factory.store.counts.history import Past
 from factory.store.disk import DiskFull
 from factory.store.identity import RunIdentity, Stamp, attempt_id
@@ -40,25 +40,6 @@ class MachineIll(RuntimeError):
     """Task after task fails by the machine."""
 
 
-@dataclass
-class Executed:
-    """What this run did itself, and what it found done."""
-
-    prepared: int = 0  # clip and perturb stages computed
-    from_cache: int = 0  # prepared clips taken from disk
-    attempts: int = 0
-    found_done: int = 0  # attempts settled by earlier runs
-    episodes: int = 0  # files written
-    uncached: int = 0  # prepared clips that could not be kept for later runs
-
-    def __str__(self) -> str:
-        episodes = f"; wrote {self.episodes} MCAP files" if self.episodes else ""
-        return (
-            f"executed {self.prepared} perturb tasks ({self.from_cache} from cache) and {self.attempts} attempts; "
-            f"found {self.found_done} attempts done{episodes}"
-        )
-
-
 @dataclass(frozen=True)
 class Trial:
     """An attempt in flight."""
@@ -68,6 +49,7 @@ class Trial:
     prepared: Any  # stands for the prepared clip
     stamp: Stamp
     tasks_done: int = 0  # of the graph's `attempt_tasks`
+    stretch: Stretch | None = None  # of the walk, from this attempt on
 
 
 class Driver:
@@ -204,9 +186,10 @@ class Driver:
 
     def _take(self, ticket: Ticket, report: Any) -> None:
         self._metrics.task(ticket.step, ticket.queued_s, report)
-        if isinstance(report, Failure) and report.disk_full:
-            raise DiskFull(report.disk_full)
-        self._count_illness(report)
+        last = report.reports[-1] if isinstance(report, Walked) else report
+        if isinstance(last, Failure) and last.disk_full:
+            raise DiskFull(last.disk_full)
+        self._count_illness(last)
         if self._gatherer.finished(ticket, report):
             return
         if self._episodes is not None and self._episodes.finished(ticket, report):
@@ -287,7 +270,9 @@ class Driver:
         clip.steps[walk.expert] = step
         if isinstance(step, Try) and not self.interrupted:
             stamp = self._records.stamp(clip.ref, walk.expert, step)
-            self._try(Trial(clip, walk, prepared, stamp), prepared)
+            ahead = 1 if walk.one_by_one else self._graph.ahead()
+            along = stretch(walk.once, clip.n_candidates, self._rounds, walk.known, step, ahead)
+            self._try(Trial(clip, walk, prepared, stamp, stretch=along if along.n > 1 else None), prepared)
             return
         self._finish(clip, walk, step)
         walk.put_away()
@@ -299,7 +284,11 @@ class Driver:
     def _try(self, trial: Trial, so_far: Any) -> None:
         """The next task of an attempt, from the result of the one before."""
         stages = self._graph.attempt_tasks[trial.tasks_done]
-        self._trying[self._graph.submit("attempt", stages, so_far, trial.stamp)] = trial
+        if trial.stretch is not None:
+            ticket = self._graph.submit("stretch", stages, so_far, trial.stamp, trial.stretch)
+        else:
+            ticket = self._graph.submit("attempt", stages, so_far, trial.stamp)
+        self._trying[ticket] = trial
 
     def _settle(self, clip: ClipPlan, walk: WalkState, n: int | None = None) -> None:
         """`n` of the samples that the walk was to make are behind it, None: all, made or not."""
@@ -325,11 +314,29 @@ class Driver:
         else:  # rows of an unfinished redo are made again, so that readers see the old walk or the new one
             self._gatherer.add(outcomes=[o for o in outcomes if o.kind == Kind.FAILED])
 
-    def _take_attempt(self, trial: Trial, result: Any, report: Attempted | HandedOn | Failure) -> None:
+    def _take_attempt(self, trial: Trial, result: Any, report: Attempted | HandedOn | Walked | Failure) -> None:
         if isinstance(report, HandedOn):
             self._try(replace(trial, tasks_done=trial.tasks_done + 1), result)
             return
-        clip, walk, stamp = trial.clip, trial.walk, trial.stamp
+        if isinstance(report, Walked):
+            self._take_stretch(trial, result, report)
+        elif trial.stretch is not None:  # lost with its worker, and at which of them nobody knows
+            trial.walk.one_by_one = True
+        else:
+            self._settle_attempt(trial, trial.stamp, result, report)
+        self._advance(trial.clip, trial.walk, trial.prepared)
+
+    def _take_stretch(self, trial: Trial, rows: Sequence[Any], walked: Walked) -> None:
+        stamp, accepted = trial.stamp, 0
+        for i, report in enumerate(walked.reports):
+            stamp = stamp.of(trial.clip.ref.clip_id, trial.stamp.candidate_index + i, trial.stamp.round + accepted)
+            is_accepted = isinstance(report, Attempted) and report.rejected is None
+            self._settle_attempt(trial, stamp, rows[accepted] if is_accepted else None, report)
+            accepted += is_accepted
+
+    def _settle_attempt(self, trial: Trial, stamp: Stamp, result: Any, report: Attempted | Failure) -> None:
+        """What became of an attempt goes on to the tables; result: stands for the row of an accepted one."""
+        clip, walk = trial.clip, trial.walk
         self.executed.attempts += 1
         known = walk.known.get(stamp.candidate_index)
         replaced = [known.attempt_id] if known is not None else []  # under keep perhaps of other expert inputs
@@ -356,7 +363,6 @@ class Driver:
             self._metrics.outcome(outcome, stamp.round)
             self._tally.rejected += outcome.kind == Kind.REJECTED
             self._tally.failed += outcome.kind == Kind.FAILED
-        self._advance(clip, walk, trial.prepared)
 
     def _keep(
         self,

@@ -19,13 +19,14 @@ from deltalake.exceptions import DeltaError
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, asked_to_stop
 from factory.graph.batch import SHARD_BYTES, SHARD_SECONDS, Gatherer, WriteFailed
 from factory.graph.crashes import counted, crash_of
-from factory.graph.driver import Driver, Executed, MachineIll
+from factory.graph.driver import Driver, MachineIll
 from factory.graph.episodes import Beside, Episodes, EpisodesWanted, McapShards, Together
 from factory.graph.guard import CRASHED
 from factory.graph.limits import NO_LIMITS, Limits, notes_folder
 from factory.graph.local import NO_CLAIMS, Claims, ClusterDied, ClusterLacks, Fuse, Graph, LocalGraph
 from factory.graph.metrics import RunMetrics
 from factory.graph.plan import RunPlan, make_plan
+from factory.graph.progress import Executed
 from factory.graph.records import Records
 from factory.graph.walk import Try, retry_policy
 from factory.graph.work import NotReady, Work

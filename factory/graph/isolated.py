@@ -74,6 +74,9 @@ class IsolatedGraph:
         self._waiting.append((ticket, step, args))
         return ticket
 
+    def ahead(self) -> int:
+        return 1
+
     def wait(self, timeout_s: float) -> tuple[Ticket, Any] | None:
         if self._stopped():
             self._stop.set()

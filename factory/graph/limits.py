@@ -48,17 +48,22 @@ class Costs:
 
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
-        self._seen: dict[str, list[float]] = defaultdict(lambda: [0, 0.0])
+        self._seen: dict[str, list[float]] = defaultdict(lambda: [0, 0.0, 0.0])  # how many, the longest, all together
 
     def took(self, name: str, seconds: float) -> None:
         """A task that ended well."""
-        seen = self._seen[name]
-        self._seen[name] = [seen[0] + 1, max(seen[1], seconds)]
+        n, longest, together = self._seen[name]
+        self._seen[name] = [n + 1, max(longest, seconds), together + seconds]
+
+    def within(self, name: str, seconds: float) -> int:
+        """How many of this name usually end in so many seconds; 1 until that is known."""
+        n, _, together = self._seen[name]
+        return max(1, int(seconds * n / together)) if n >= SEEN and together > 0.0 else 1
 
     def limits(self, name: str) -> dict[str, float | None]:
         """Of the next task of this name; what the settings give is not tightened."""
         seconds, gb = self._limits.of(name)
-        n, longest = self._seen[name]
+        n, longest, _ = self._seen[name]
         given = set(name.split("+")) & set(self._limits.seconds)
         if seconds is not None and n >= SEEN and not given:
             seconds = min(seconds, max(LEAST_S, TIMES * longest))

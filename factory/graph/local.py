@@ -72,6 +72,10 @@ class Graph(Protocol):
         """Run `step`; arguments may be results of earlier tickets. What STEPS says is supplied to it."""
         ...
 
+    def ahead(self) -> int:
+        """Attempts of a walk that one task is to make: 1, or more of a `stretch`, whose tasks have a list of rows."""
+        ...
+
     def wait(self, timeout_s: float) -> tuple[Ticket, Any] | None:
         """A finished task and its report (a steps.Failure where it died); None when the time is up."""
         ...
@@ -83,6 +87,7 @@ STEPS: Mapping[str, tuple[Any, tuple[str, ...]]] = {  # its function, and what i
     "reconstruct": (steps.reconstruct, ("work", "stopped")),
     "perturb": (steps.prepare, ("work", "out")),
     "attempt": (steps.attempt, ("work",)),
+    "stretch": (steps.attempt, ("work",)),  # of a walk: one attempt after the other
     "write": (steps.write, ("out",)),
     "episodes": (steps.episodes, ("work", "out")),
     "mcap_shard": (steps.mcap_shard, ("out",)),
@@ -97,7 +102,7 @@ def attempt_tasks(fuse: Fuse, apart: bool) -> tuple[tuple[str, ...], ...]:
 
 def name_of(step: str, args: tuple[Any, ...]) -> str:
     """What metrics and Ray call a task: an attempt's by the stages in it."""
-    return "+".join(args[0]) if step == "attempt" else step
+    return "+".join(args[0]) if step in ("attempt", "stretch") else step
 
 
 def cores_of(step: str, args: tuple[Any, ...]) -> int:
@@ -130,6 +135,9 @@ class LocalGraph:
         ticket = Ticket(name_of(step, args), _Box())
         self._waiting.append((ticket, step, args))
         return ticket
+
+    def ahead(self) -> int:
+        return 1
 
     def wait(self, timeout_s: float) -> tuple[Ticket, Any] | None:
         if not self._waiting:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Protocol
 
-from factory.graph.steps import Attempted, Failure, Prepared, Reconstructed
+from factory.graph.steps import Attempted, Failure, Prepared, Reconstructed, Walked
 from factory.store.location import Location
 from factory.store.outcomes import Kind, Outcome
 from factory.store.parquet_file import Shard
@@ -129,9 +129,14 @@ class RunMetrics:
 
     def task(self, step: str, queued_s: float, report: object) -> None:
         """A task came back, whatever it was."""
-        failed = isinstance(report, Failure)
+        attempts = report.reports if isinstance(report, Walked) else (report,)
+        failed = isinstance(attempts[-1], Failure)
         self._add(TASKS, 1, task=step, result="failed" if failed else "ok")
         self._add(QUEUE_WAIT, queued_s, task=step)
+        for each in attempts:
+            self._made(each)
+
+    def _made(self, report: object) -> None:
         if isinstance(report, Prepared | Reconstructed | Attempted):
             for stage, spent in report.seconds.items():
                 self._add(STAGE_SECONDS, spent, stage=stage)

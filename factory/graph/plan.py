@@ -26,6 +26,7 @@ class WalkState:
     recall: Callable[[], dict[int, Past]]  # what the tables say of it
     stale: frozenset[str] = frozenset()  # redo: attempt_ids whose rows this walk replaces as a whole
     n_found: int = 0  # samples that were there when the run began
+    one_by_one: bool = False  # a task that was to make several of its attempts died
 
     @cached_property
     def known(self) -> dict[int, Past]:

@@ -121,6 +121,25 @@ class Tally:
     failed: int = 0
 
 
+@dataclass
+class Executed:
+    """What this run did itself, and what it found done."""
+
+    prepared: int = 0  # clip and perturb stages computed
+    from_cache: int = 0  # prepared clips taken from disk
+    attempts: int = 0
+    found_done: int = 0  # attempts settled by earlier runs
+    episodes: int = 0  # files written
+    uncached: int = 0  # prepared clips that could not be kept for later runs
+
+    def __str__(self) -> str:
+        episodes = f"; wrote {self.episodes} MCAP files" if self.episodes else ""
+        return (
+            f"executed {self.prepared} perturb tasks ({self.from_cache} from cache) and {self.attempts} attempts; "
+            f"found {self.found_done} attempts done{episodes}"
+        )
+
+
 class ProgressLine(Bar):
     """Shows a Tally against `total` clips."""
 

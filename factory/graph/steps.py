@@ -84,6 +84,14 @@ class Attempted:
     psnr_db: float | None = None  # of the block that an accepted one is drawn from
 
 
+@dataclass(frozen=True)
+class Walked:
+    """Report on a stretch of a walk: one attempt after the other, the last one perhaps a failure."""
+
+    reports: tuple[Attempted | Failure, ...]
+    seconds: tuple[float, ...]  # that each took
+
+
 MakeEpisode = Callable[[Mapping[str, Any], PreparedClip], bytes]  # a sample's row and its prepared clip -> a file
 
 

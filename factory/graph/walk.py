@@ -5,7 +5,7 @@ A pure function of the list and of what became of its candidates, so that a resu
 on would give later samples another round than in a run without the incident, and rows must not depend on incidents.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
 
 from factory.graph.work import HUMAN_CANDIDATE
@@ -70,6 +70,23 @@ def next_step(
                 return Blocked(candidate, f"stored as round {past.round}, the walk makes it {accepted}")
             accepted += 1
     return Complete() if accepted == wanted or once else Exhausted(n_candidates)
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Attempts of a walk that one task makes: one after the other until one fails or enough are accepted."""
+
+    n: int  # attempts at most
+    samples: int  # accepted at most
+
+
+def stretch(once: bool, n_candidates: int, rounds: int, known: Container[int], begins: Try, most: int) -> Stretch:
+    """Up to `most` attempts that nothing is known of but the first, whatever becomes of those before them."""
+    if once:
+        return Stretch(1, 1)
+    end = min(n_candidates, begins.candidate + most)
+    n = next((i for i in range(begins.candidate + 1, end) if i in known), end) - begins.candidate
+    return Stretch(n, min(n, rounds - begins.round))
 
 
 def retry_policy(retry: bool, versions_json: str) -> Callable[[Past], bool]:

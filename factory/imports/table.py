@@ -9,8 +9,8 @@ import pyarrow as pa
 
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, asked_to_stop
 from factory.graph.batch import SHARD_BYTES
-from factory.graph.execute import Executed, RunSummary, record_summary
-from factory.graph.progress import Counter
+from factory.graph.execute import RunSummary, record_summary
+from factory.graph.progress import Counter, Executed
 from factory.readers.base import BadClip
 from factory.store.columns import BadRow
 from factory.store.disk import DiskFull

@@ -1,7 +1,7 @@
 """The table `candidates`: one row per prepared clip with its ordered candidate list and what each gate dropped."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 
 import pyarrow as pa
 
@@ -56,7 +56,13 @@ CANDIDATES = TableSpec("candidates", SCHEMA, "clip_id")
 
 
 def candidates_table(rows: Sequence[ClipCandidates]) -> pa.Table:
-    return pa.Table.from_pylist([asdict(row) | {"n_candidates": len(row.candidates)} for row in rows], schema=SCHEMA)
+    return pa.Table.from_pylist(
+        [
+            vars(row) | {"candidates": [vars(each) for each in row.candidates], "n_candidates": len(row.candidates)}
+            for row in rows
+        ],
+        schema=SCHEMA,
+    )
 
 
 def listed_of(table: KeyedTable) -> dict[str, Listed]:

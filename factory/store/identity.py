@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 UNLISTED = "unlisted"  # prepare_digest of clips prepared for the log's own drive alone: no perturb work, no list
@@ -42,6 +42,11 @@ class Stamp:
     vocabulary_digest: str
     settings_hash: str
     stage_versions: str
+
+    def of(self, clip_id: str, candidate: int, round: int) -> "Stamp":
+        """Of another attempt of the same walk."""
+        key = attempt_id(clip_id, candidate, self.vocabulary_digest, self.expert, self.expert_digest)
+        return replace(self, attempt_id=key, candidate_index=candidate, round=round)
 
 
 def canonical_json(value: object) -> str:

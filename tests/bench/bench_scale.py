@@ -16,19 +16,23 @@ import resource
 import sys
 import tempfile
 import time
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from factory.config.arguments import answer
 from factory.exits import COMPLETE
 from factory.graph.execute import execute
 from factory.graph.on_ray.cluster import ray  # with the environment that keeps it on loopback
-from factory.graph.work import Columns, Driven
+from factory.graph.work import Columns, Driven, Dropped, PreparedClip
 from factory.readers.base import ClipRef
 from factory.store.samples import Store
-from tests.factory.toy import ToyWork, stream
+from tasks.stages import Rejected
+from tests.factory.toy import ToyWork, any_row
 
 EXPERTS = ("pdm_closed", "recovery")
 CANDIDATES = 16  # of a clip; half of them are accepted, so that five rounds take ten
@@ -57,16 +61,25 @@ class Request:
 
 @dataclass(frozen=True)
 class WaitingWork(ToyWork):
-    """Rows with some weight."""
+    """Stages that wait, and rows with some weight."""
 
     row_kb: int = 20
+
+    def drive(self, prepared: PreparedClip, candidate: int, expert: str) -> Driven | Dropped:
+        name = f"{prepared.clip_id}:{expert}:{candidate}"
+        time.sleep(self.seconds)
+        chance = zlib.crc32(name.encode()) / 2**32
+        if chance < self.threshold:
+            return Dropped(Rejected("reward", "nc"), {"nc": chance}, {"reward": 0.01})
+        digest = prepared.content_digest
+        return Driven((name, any_row() | {"clip_id": prepared.clip_id, "content_digest": digest}), {"reward": 0.01})
 
     def draw(self, driven: Driven) -> Columns:
         drawn = super().draw(driven)
         assert isinstance(drawn, Columns)
         name, _ = driven.payload  # type: ignore[misc]
         image: Any = drawn.row["images"]
-        noise = stream(name, "picture").bytes(self.row_kb * 1024)
+        noise = np.random.default_rng(zlib.crc32(name.encode())).bytes(self.row_kb * 1024)
         return replace(drawn, row={**drawn.row, "images": [{**image[0], "jpeg": noise}]})
 
 

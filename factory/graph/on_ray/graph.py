@@ -41,8 +41,10 @@ from factory.graph.on_ray.cluster import (
     prove_shared,
     tasks_at_once,
 )
-from factory.graph.steps import Failure
-from factory.graph.work import NotReady, Work, never
+from factory.graph.steps import Failure, Walked
+from factory.graph.walk import Stretch
+from factory.graph.work import NotReady, PreparedClip, Work, never
+from factory.store.identity import Stamp
 from factory.store.illness import why_ill
 from factory.store.location import Location
 from factory.store.outcomes import ErrorKind
@@ -54,6 +56,7 @@ ILL = (  # what Ray says when it is the machine that failed
     *(exceptions.RuntimeEnvSetupError, exceptions.OutOfMemoryError, exceptions.ObjectLostError),
     *(exceptions.ObjectStoreFullError, exceptions.OutOfDiskError),
 )
+AHEAD_S = 1.0  # of attempts that one task makes: the driver bears some hundreds of tasks a second
 WARMING = {"key": "warm", "what": "compiling kernels", "run": "", "limited": False}
 
 _HELD: dict[str, Any] = {}  # per worker process: the run's Work, fetched once
@@ -132,6 +135,12 @@ class RayGraph:
         self._dispatch()
         return ticket
 
+    def ahead(self) -> int:
+        """As many as usually end in AHEAD_S, where one task makes a whole attempt."""
+        if len(self.attempt_tasks) > 1:
+            return 1
+        return self._costs.within("+".join(self.attempt_tasks[0]), AHEAD_S)
+
     def _draws(self, ticket: Ticket) -> bool:
         return self._gpu_share > 0.0 and any(task.may_draw for task in TASKS if task.name in ticket.step.split("+"))
 
@@ -150,9 +159,15 @@ class RayGraph:
                 memory = self._claims.memory_bytes(ticket.step)
                 memory = memory if self._most_memory is None else min(memory, self._most_memory)
                 cores = cores_of(step, args)
-                task = _claiming(ticket.step, cores, gpu, memory or None)
-                told = described(step, ticket.step, args) | self._costs.limits(ticket.step) | {"run": self._run}
-                report, ticket.result = task.remote(step, (self._notes, told), len(supplied), *supplied, *args)
+                told = self._costs.limits(ticket.step) | {"run": self._run}
+                if step == "stretch":
+                    rows = args[-1].samples
+                    task = _claiming(_walk, ticket.step, cores, gpu, memory or None, 1 + rows)
+                    report, *ticket.result = task.remote((self._notes, told), *supplied, *args)
+                else:
+                    told = described(step, ticket.step, args) | told
+                    task = _claiming(_run, ticket.step, cores, gpu, memory or None, 2)
+                    report, ticket.result = task.remote(step, (self._notes, told), len(supplied), *supplied, *args)
                 self._tickets[report] = ticket
                 self._flying[draws] += 1
 
@@ -179,7 +194,10 @@ class RayGraph:
             raise ClusterDied(said, self._is_ours) from error
         except RayError as error:
             report, worked_s = Failure(_kind_of(error), f"{type(error).__name__}: {error}"[:2000]), 0.0
-        if not isinstance(report, Failure):
+        if isinstance(report, Walked):
+            for seconds in report.seconds:
+                self._costs.took(ticket.step, seconds)
+        elif not isinstance(report, Failure):
             self._costs.took(ticket.step, worked_s)
         ticket.queued_s = max(0.0, time.monotonic() - ticket.submitted - worked_s)
         return ticket, report
@@ -192,9 +210,9 @@ class RayGraph:
 
 
 @cache
-def _claiming(name: str, cores: int, gpu: float | None, memory: int | None) -> Any:
+def _claiming(function: Any, name: str, cores: int, gpu: float | None, memory: int | None, returns: int) -> Any:
     """The remote function with what it claims; built once, as Ray takes its time over it."""
-    return _run.options(name=name, num_cpus=cores, num_gpus=gpu, memory=memory)
+    return function.options(name=name, num_cpus=cores, num_gpus=gpu, memory=memory, num_returns=returns)
 
 
 def _kind_of(error: RayError) -> ErrorKind:
@@ -227,6 +245,39 @@ def _run(step: str, watch: tuple[Path, dict[str, Any]], n_supplied: int, *args: 
     given = [ray.get(arg.reference) if isinstance(arg, Fetched) else arg for arg in args[n_supplied:]]
     report, result = watched(*watch, STEPS[step][0], *supplied, *given)
     return (report, time.perf_counter() - began), result
+
+
+@ray.remote(num_cpus=1, max_retries=MAX_RETRIES)
+def _walk(
+    watch: tuple[Path, dict[str, Any]],
+    held: list[Any],
+    stages: Sequence[str],
+    prepared: PreparedClip,
+    stamp: Stamp,
+    stretch: Stretch,
+) -> tuple[Any, ...]:
+    """A stretch of a walk from `stamp` on, each attempt under watch: its report with the seconds it took, and rows.
+
+    What it makes does not depend on how long it takes, so that Ray can make lost rows again.
+    """
+    notes, told = watch
+    work, first = _held(held), stamp.round
+    name = "+".join(stages)
+    reports: list[Any] = []
+    seconds: list[float] = []
+    rows: list[Any] = []
+    for candidate in range(stamp.candidate_index, stamp.candidate_index + stretch.n):
+        began = time.perf_counter()
+        stamp = stamp.of(prepared.clip_id, candidate, first + len(rows))
+        given = (stages, prepared, stamp)
+        report, row = watched(notes, told | described("attempt", name, given), STEPS["attempt"][0], work, *given)
+        reports.append(report)
+        seconds.append(time.perf_counter() - began)
+        rows += [row] if row is not None else []
+        if isinstance(report, Failure) or len(rows) == stretch.samples:
+            break
+    empty = [None] * (stretch.samples - len(rows))
+    return (Walked(tuple(reports), tuple(seconds)), sum(seconds)), *rows, *empty
 
 
 def _held(reference: list[Any]) -> Any:

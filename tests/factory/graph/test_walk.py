@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from factory.graph.walk import Blocked, Complete, Exhausted, Step, Try, next_step, retry_policy
+from factory.graph.walk import Blocked, Complete, Exhausted, Step, Stretch, Try, next_step, retry_policy, stretch
 from factory.store.counts.history import Past
 from factory.store.outcomes import ErrorKind, Kind
 
@@ -42,6 +42,36 @@ def test_any_lost_results_are_made_again_the_same(accepts: list[bool], rounds: i
     whole, step, _ = walk(accepts, rounds)
     kept = {candidate: p for candidate, p in whole.items() if candidate not in lost}
     assert walk(accepts, rounds, kept)[:2] == (whole, step)
+
+
+@given(LISTS, st.integers(1, 4), st.integers(1, 5), st.sets(st.integers(0, 11)))
+def test_in_stretches_a_walk_makes_the_attempts_that_it_makes_one_by_one(
+    accepts: list[bool], rounds: int, most: int, lost: set[int]
+) -> None:
+    whole, end, _ = walk(accepts, rounds)
+    known = {candidate: p for candidate, p in whole.items() if candidate not in lost}
+    made = []
+    while isinstance(step := next_step(False, len(accepts), rounds, known, never), Try):
+        along = stretch(False, len(accepts), rounds, known, step, most)
+        assert 1 <= along.n <= most
+        accepted = 0
+        for candidate in range(step.candidate, step.candidate + along.n):
+            assert candidate not in known
+            made.append(candidate)
+            good = accepts[candidate]
+            known[candidate] = past(Kind.ACCEPTED, step.round + accepted) if good else past(Kind.REJECTED)
+            accepted += good
+            if accepted == along.samples:
+                break
+    assert (known, step) == (whole, end)
+    assert made == sorted(set(whole) & lost)
+
+
+def test_a_stretch_tries_a_failure_again_and_goes_on_behind_it() -> None:
+    known = {0: past(Kind.ACCEPTED, 0), 1: past(Kind.FAILED, error="system"), 4: past(Kind.REJECTED)}
+    assert stretch(False, 9, 4, known, Try(1, 1), 6) == Stretch(3, 3)
+    assert stretch(False, 9, 2, known, Try(1, 1), 6) == Stretch(3, 1)
+    assert stretch(True, 9, 4, {}, Try(-1, 0), 6) == Stretch(1, 1)
 
 
 def test_a_walk_ends_complete_or_exhausted() -> None:
