@@ -33,16 +33,19 @@ class CommitCopies:
         self._log, self._copies = table.child(LOG), table.child(COPIES)
 
     def note(self, version: int) -> None:
-        """Copy what the newest commit wrote, and what earlier ones did where a writer was killed before it could."""
+        """Copy what the newest commit wrote, and what earlier ones did where a writer was killed before it could.
+
+        The commit itself comes last, so that where its copy is there, that of its checkpoint is as well.
+        """
         since = version
         if version and not self._copies.has(_json(version - 1)):
             have = set(self._copies.names())
             since = next((number for number in range(version, 0, -1) if _json(number - 1) in have), 0)
         for number in range(since, version + 1):
+            if self._log.has(_checkpoint(number)):
+                self._copy(_checkpoint(number))
+                self._copy(LAST)
             self._copy(_json(number))
-        if self._log.has(_checkpoint(version)):
-            self._copy(_checkpoint(version))
-            self._copy(LAST)
 
     def lost(self, version: int) -> int | None:
         """The number of a commit that was made and is newer than `version`, which the table says is its newest."""

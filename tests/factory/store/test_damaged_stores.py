@@ -10,6 +10,7 @@ from factory.commands.table import COMMANDS
 from factory.exits import BAD_CONFIG, COMPLETE, DAMAGED
 from factory.graph.episodes import EpisodesWanted
 from factory.graph.execute import execute
+from factory.store.commit_copies import CommitCopies
 from factory.store.episodes import Message, episode_bytes
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
@@ -242,3 +243,35 @@ def test_the_draft_of_a_copy_that_a_killed_writer_left_is_no_damage(tmp_path: Pa
     copy = tmp_path / "samples/_commits" / f"{1:020}.json"
     (copy.parent / f".{2:020}.json.0123abcd.tmp").write_bytes(copy.read_bytes())
     assert verify(Store(tmp_path)).damage == ()
+
+
+class Killed(BaseException):
+    """A writer, there and then."""
+
+
+@pytest.mark.parametrize("copied", range(3))
+def test_a_writer_killed_while_it_copies_a_checkpoint_is_no_damage_then_or_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, copied: int
+) -> None:
+    table, copy, names = Store(tmp_path).samples, CommitCopies._copy, list[str]()
+    table.claim()
+    table.set_property("delta.checkpointInterval", "4")
+
+    def until_killed(copies: CommitCopies, name: str) -> bool:
+        if len(names) == copied:
+            raise Killed
+        names.append(name)
+        return copy(copies, name)
+
+    monkeypatch.setattr(CommitCopies, "_copy", until_killed)
+    with pytest.raises(Killed):
+        table.claim()
+    monkeypatch.undo()
+    assert files(tmp_path, f"samples/_delta_log/{3:020}.checkpoint.parquet")
+    assert verify(Store(tmp_path)).damage == ()
+    Store(tmp_path).samples.claim()
+    assert verify(Store(tmp_path)).damage == ()
+    assert {path.name for path in files(tmp_path, "samples/_commits/*")} >= {
+        f"{3:020}.checkpoint.parquet",
+        f"{3:020}.json",
+    }
