@@ -31,6 +31,7 @@ from factory.store.table import KeyedTable, LiveFile
 
 TABLES = ("plans", "candidates", "samples", "outcomes", SAMPLES_MCAP.name)
 KEPT = ("cache/prepared", "scenes")  # sealed files
+DRAFT = re.compile(r"\..*\.tmp")  # that a killed run left
 NAMED = re.compile(r"(.*/)?part-([0-9a-f]{32})\.parquet")
 
 
@@ -157,6 +158,8 @@ def _damaged_kept(out: Location) -> list[DamagedPart]:
     found = []
     for folder in KEPT:
         for name in out.child(folder).names():
+            if DRAFT.fullmatch(name):
+                continue
             try:
                 check_kept(out.child(folder).read(name) or b"")
             except BadCacheFile as error:

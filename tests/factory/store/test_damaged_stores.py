@@ -237,11 +237,14 @@ def test_a_damaged_log_is_named_by_whoever_opens_the_table(out: Path) -> None:
         Store(out)
 
 
-def test_the_draft_of_a_copy_that_a_killed_writer_left_is_no_damage(tmp_path: Path) -> None:
+def test_drafts_that_a_killed_writer_left_are_no_damage(tmp_path: Path) -> None:
     store = Store(tmp_path)
     store.samples.claim()
     copy = tmp_path / "samples/_commits" / f"{1:020}.json"
     (copy.parent / f".{2:020}.json.0123abcd.tmp").write_bytes(copy.read_bytes())
+    for folder in ("cache/prepared", "scenes"):
+        (tmp_path / folder).mkdir(parents=True)
+        (tmp_path / folder / ".clip.npz.0123abcd.tmp").write_bytes(b"half")
     assert verify(Store(tmp_path)).damage == ()
 
 
