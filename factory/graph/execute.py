@@ -140,6 +140,8 @@ def execute(
             graph = RayGraph(work, store.location, workers, ray_address, claims, fuse, limits)
     except (BadLocation, ClusterLacks, NotReady, ConnectionError) as error:
         return RunSummary(BAD_CONFIG, str(error))
+    except ClusterDied as error:
+        return RunSummary(INTERRUPTED, str(error), lost_cluster=error.is_ours)
     except KeyboardInterrupt:
         return RunSummary(INTERRUPTED, "stopped before anything was begun")
     try:

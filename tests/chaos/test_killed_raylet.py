@@ -36,6 +36,35 @@ store = Store(sys.argv[1])
 ended = on_new_clusters(lambda: execute(ToyWork(), refs(5), EXPERTS, 2, store, "ray", 1, shard_seconds=0.05))
 sys.exit(ended.exit_code)
 """
+START = """
+import os
+import threading
+import time
+from factory.graph.local import ClusterDied
+from factory.graph.on_ray.cluster import connect
+from tests.chaos.kills import PROGRAMS
+from tests.chaos.processes import below, kill
+
+def killing():
+    while not (found := [pid for pid, line in below(os.getpid()).items() if PROGRAMS["raylet"] in line]):
+        time.sleep(0.01)
+    kill(found[0])
+
+threading.Thread(target=killing, daemon=True).start()
+try:
+    connect(1, None)
+except ClusterDied as error:
+    print("our own" if error.is_ours else "another", error)
+"""
+
+
+@pytest.mark.ray
+@pytest.mark.slow
+def test_a_cluster_that_dies_while_it_is_started_is_one_that_died() -> None:
+    """Ray itself waits half a minute and raises an Exception of no narrower class."""
+    words = [sys.executable, "-c", START]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert "our own Ray did not start" in done.stdout and done.returncode == 0, done.stderr
 
 
 @pytest.mark.ray

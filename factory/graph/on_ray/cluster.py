@@ -14,7 +14,7 @@ import ray
 from ray.autoscaler.sdk import request_resources
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from factory.graph.local import ClusterLacks
+from factory.graph.local import ClusterDied, ClusterLacks
 from factory.store.location import BadLocation, Location
 from factory.wording import one_line
 
@@ -35,6 +35,7 @@ def connect(workers: int | None, address: str | None) -> bool:
     """Join the cluster of `address` or RAY_ADDRESS, else start one in this machine (then True).
 
     Raises ConnectionError where nothing answers there; where nothing listens at once: Ray itself tries for minutes.
+    Raises ClusterDied where one of our own does not come up.
     """
     named = address or os.environ.get("RAY_ADDRESS", "")
     environment = WORKER_ENV | {name: os.environ[name] for name in FORWARDED_ENV if name in os.environ}
@@ -51,7 +52,11 @@ def connect(workers: int | None, address: str | None) -> bool:
             logging_level=logging.WARNING,
             **own,
         )
-    except ConnectionError as error:
+    except Exception as error:
+        if where == "local":  # of no narrower class where a process of Ray's dies meanwhile
+            raise ClusterDied(f"Ray did not start ({one_line(error)})", is_ours=True) from error
+        if not isinstance(error, ConnectionError):
+            raise
         said = f"no Ray cluster answers at RAY_ADDRESS={named} ({one_line(error)})"
         raise ConnectionError(f"{said}; unset it to run on this machine alone") from error
     return where == "local"

@@ -104,7 +104,7 @@ class RayGraph:
         More workers than a cluster has CPUs now are what makes one grow that can. A cluster without a GPU is asked for
         one where tasks claim it, and waited for; memory is claimed up to what the largest node has.
         Raises BadLocation when some node does not see `out`, ClusterLacks when no GPU comes, NotReady when a node
-        cannot do its part.
+        cannot do its part, ClusterDied when a cluster of our own does not come up or dies meanwhile.
         """
         self._connected = not ray.is_initialized()
         self._is_ours = self._connected and connect(workers, address)
@@ -125,8 +125,11 @@ class RayGraph:
             self._after_drawing = _after_drawing(self.attempt_tasks) if self._gpu_share else frozenset()
             prove_shared(out, "out", "shared storage or a URL")
             _warm_every_node(self._supplied["work"], self._notes, with_gpu_only=self._gpu_share > 0.0)
-        except BaseException:
+        except BaseException as error:
+            dead = dead_part() if self._is_ours else ""
             self.close()
+            if dead and isinstance(error, Exception):
+                raise ClusterDied(f"Ray's {dead} died", is_ours=True) from error
             raise
 
     def submit(self, step: str, *args: Any) -> Ticket:
