@@ -2,6 +2,7 @@
 
 import sys
 from pathlib import Path
+from typing import Any
 
 from factory.graph.execute import execute
 from factory.store.samples import Store
@@ -11,9 +12,14 @@ EXPERTS = ["recovery", "pdm_closed", "human"]
 CLIPS, ROUNDS, TASK_S = 4, 2, 0.01
 
 
-def drive(out: str, executor: str, journal: str, seconds: float = TASK_S, notes: str = "") -> int:
-    """The command: one run in this process; executor=node: on a cluster of two nodes, the second's pid in `notes`."""
+def drive(out: str, executor: str, journal: str, seconds: float = TASK_S, notes: str = "", clips: int = CLIPS) -> int:
+    """The command: one run in this process; executor=node: on a cluster of two nodes, the second's pid in `notes`.
+
+    executor=ADDRESS, with a colon: on the cluster there.
+    """
     address = None
+    if ":" in executor:
+        address, executor = executor, "ray"
     if executor == "node":
         from ray.cluster_utils import Cluster
 
@@ -26,7 +32,7 @@ def drive(out: str, executor: str, journal: str, seconds: float = TASK_S, notes:
     work = ToyWork(journal=journal, seconds=seconds)
     summary = execute(
         work,
-        refs(CLIPS),
+        refs(clips),
         EXPERTS,
         ROUNDS,
         Store(out),
@@ -40,7 +46,7 @@ def drive(out: str, executor: str, journal: str, seconds: float = TASK_S, notes:
     return summary.exit_code
 
 
-def leave(*given: str) -> None:
+def leave(*given: Any) -> None:
     """The same, and the process with it."""
     sys.exit(drive(*given))
 

@@ -1,13 +1,13 @@
 """SIGKILL at moments drawn by chance: `python -m tests.chaos.kills [seed=0] [minutes=60] [local=50] [workers=100]...`
 
-A run of toy samples is killed and the same command given again, until it says that it is complete; then samples,
-outcomes, candidates and MCAP shards must be those of an undisturbed run, nothing missing and nothing twice, and no
-attempt that was committed may have been made again. What is killed, and how often:
+A run of toy samples is killed, the same command given and killed again, and at last given until it says that it is
+complete; then samples, outcomes, candidates and MCAP shards must be those of an undisturbed run, nothing missing and
+nothing twice, and no attempt that was committed may have been made again. What is killed, and how often:
 
     local     the driver of executor=local          raylet   Ray's process of a node, of a cluster of one
-    ray       the driver of executor=ray            gcs      Ray's process of a cluster
-    workers   a worker of executor=ray, every so often while runs go on
-    node      a whole node of two
+    ray       the same on a cluster of its own      gcs      Ray's process of a cluster
+    cluster   the same on one that goes on          agent    Ray's agent of a node
+    workers   a worker, while runs go on            node     a whole node of two
 
 A row a kind, of as many as there was time for. `made twice` counts attempts that ran before and after the kill, `not
 committed` those that had run and were not settled then: the first cannot exceed the second. `first` is the worst time
@@ -22,7 +22,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -32,15 +34,18 @@ from factory.store.location import Location
 from factory.store.mcap_shards.mirror import McapTable
 from factory.store.samples import Store
 from factory.store.verify import verify
-from tests.chaos.killed_run import drive, leave
-from tests.chaos.processes import below, command, kill
+from tests.chaos.killed_run import CLIPS, drive, leave
+from tests.chaos.processes import below, kill, put_away, workers_below
 from tests.factory.tables import assert_same_rows, tables_of
 from tests.pages import REPOSITORY
 
 AGAIN = 5  # commands until one says that it is complete
 OVER_S = 90.0  # after which a run whose cluster was killed is ended
-PROGRAMS = {"raylet": "/raylet/raylet ", "gcs": "/gcs_server"}
-KINDS = {"local": 50, "ray": 5, "workers": 100, "raylet": 2, "gcs": 2, "node": 2}  # how often, unless said otherwise
+KILLS_A_RUN = 5  # of drivers, until the command is left alone
+TIMED = 5  # runs from one timed to the next
+MANY = 24  # clips of a run whose workers are killed
+PROGRAMS = {"raylet": "/raylet/raylet ", "gcs": "/gcs_server", "agent": "ray::DashboardAgent"}
+KINDS = {"local": 50, "ray": 10, "cluster": 40, "workers": 100, "raylet": 3, "gcs": 3, "agent": 2, "node": 3}
 
 
 def _started(*given: object) -> multiprocessing.process.BaseProcess:
@@ -65,6 +70,7 @@ class Told:
     made_twice: int = 0
     first_s: list[float] = field(default_factory=list)
     ended: int = 0  # runs that went on for OVER_S without what was killed
+    exits: Counter[int] = field(default_factory=Counter)  # of the runs that lost a part
 
     def row(self) -> str:
         first = f"{max(self.first_s):.1f} s" if self.first_s else "-"
@@ -72,9 +78,9 @@ class Told:
         return f"| {self.kind} | {' | '.join(map(str, numbers))} | {first} |"
 
 
-def attempts(journal: Path) -> list[str]:
+def attempts(*journals: Path) -> list[str]:
     """Names of the attempts that ran."""
-    lines = journal.read_text().splitlines() if journal.exists() else []
+    lines = [line for journal in journals if journal.exists() for line in journal.read_text().splitlines()]
     return [line.split()[1] for line in lines if line.startswith("attempt ")]
 
 
@@ -85,30 +91,47 @@ def settled(out: Path) -> int:
     return len(store.samples) + kinds.count("rejected")
 
 
-def again(out: Path, before: Path, told: Told, fresh: bool) -> None:
-    """Give the command until it is complete; count what it made anew. fresh: by a new interpreter, and timed."""
-    done, ran, after = settled(out), attempts(before), before.with_suffix(".after")
-    began = time.monotonic()
-    for _ in range(AGAIN):
-        if fresh:
-            given = [sys.executable, "-m", "tests.chaos.killed_run", str(out), "local", str(after)]
-            process = subprocess.Popen(given, cwd=REPOSITORY, env=os.environ | {"PYTHONPATH": str(REPOSITORY)})
-            while process.poll() is None and not attempts(after):
-                time.sleep(0.02)
-            if attempts(after):
-                told.first_s.append(time.monotonic() - began)
-            exit_code = process.wait()
-            fresh = False
-        else:
-            exit_code = drive(str(out), "local", str(after))
-        if exit_code == COMPLETE:
-            break
-    assert exit_code == COMPLETE, exit_code
-    lost = len(ran) - done
-    made_twice = len(set(ran) & set(attempts(after)))
-    assert made_twice <= lost, f"{made_twice} attempts were made twice, {lost} were not committed"
-    told.uncommitted += lost
-    told.made_twice += made_twice
+@dataclass
+class Trial:
+    """One `out`, and the journals of the commands that it was given."""
+
+    out: Path
+    told: Told
+    journals: list[Path] = field(default_factory=list)
+
+    @contextmanager
+    def command(self) -> Iterator[Path]:
+        """A command's journal; then counts what it made anew. Raises AssertionError where that was committed."""
+        ran, done = set(attempts(*self.journals)), settled(self.out) if self.journals else 0
+        journal = self.out.with_name(f"{self.out.name}.journal{len(self.journals)}")
+        self.journals.append(journal)
+        yield journal
+        lost, made_twice = len(ran) - done, len(ran & set(attempts(journal)))
+        assert made_twice <= lost, f"{made_twice} attempts were made twice, {lost} were not committed"
+        self.told.uncommitted += lost
+        self.told.made_twice += made_twice
+
+    def again(self, fresh: str = "", clips: int = CLIPS) -> None:
+        """Give the command until it is complete. fresh: by a new interpreter, with this executor, and timed."""
+        for _ in range(AGAIN):
+            with self.command() as journal:
+                exit_code = (
+                    self._timed(fresh, journal) if fresh else drive(str(self.out), "local", str(journal), clips=clips)
+                )
+            fresh = ""
+            if exit_code == COMPLETE:
+                return
+        raise AssertionError(f"exit code {exit_code} after {AGAIN} commands")
+
+    def _timed(self, executor: str, journal: Path) -> int:
+        began = time.monotonic()
+        given = [sys.executable, "-m", "tests.chaos.killed_run", str(self.out), executor, str(journal)]
+        process = subprocess.Popen(given, cwd=REPOSITORY, env=os.environ | {"PYTHONPATH": str(REPOSITORY)})
+        while process.poll() is None and not attempts(journal):
+            time.sleep(0.02)
+        if attempts(journal):
+            self.told.first_s.append(time.monotonic() - began)
+        return process.wait()
 
 
 def untold(row: Any) -> dict[str, Any]:
@@ -134,92 +157,102 @@ def compare(out: Path, golden: Path, told: Told) -> None:
 
 
 def drivers(kind: str, n: int, folder: Path, golden: Path, rng: random.Random, end: float = math.inf) -> Told:
-    """Kill the driver at any moment of its run."""
-    told, whole_s = Told(f"driver, executor={kind}"), 0.0
-    for trial in range(-2, n):  # the first runs are for their time alone
-        if time.monotonic() > end:
-            break
-        out, journal = folder / f"{kind}{trial}", folder / f"{kind}{trial}.journal"
-        process = _started(str(out), kind, str(journal))
-        while process.is_alive() and not journal.exists():
-            time.sleep(0.01)
-        began = time.monotonic()
-        process.join(None if trial < 0 else rng.uniform(0.0, whole_s))
-        if trial < 0:
-            whole_s = time.monotonic() - began
-            continue
-        assert process.pid is not None
-        others = below(process.pid)
-        told.kills += kill(process.pid)
-        process.join()
-        _put_away(others)
-        told.runs += 1
-        again(out, journal, told, fresh=not told.first_s or trial % 5 == 0)
-        compare(out, golden, told)
+    """Kill the driver at any moment of its run, and the next that goes on from there."""
+    names = {"local": "driver, executor=local", "ray": "driver, its own Ray", "cluster": "driver, a standing cluster"}
+    told, whole_s = Told(names[kind]), 0.0
+    with standing() if kind == "cluster" else nullcontext(kind) as executor:
+        for number in range(-2, n):  # the first runs are for their time alone
+            trial = Trial(folder / f"{kind}{number}", told)
+            if told.kills >= n or time.monotonic() > end:
+                break
+            for _ in range(KILLS_A_RUN if number >= 0 else 1):
+                if told.kills >= n:
+                    break
+                with trial.command() as journal:
+                    process = _started(str(trial.out), executor, str(journal))
+                    while process.is_alive() and not journal.exists():
+                        time.sleep(0.01)
+                    began = time.monotonic()
+                    process.join(None if number < 0 else rng.uniform(0.0, 2.0 * whole_s / KILLS_A_RUN))
+                    whole_s = time.monotonic() - began if number < 0 else whole_s
+                    assert process.pid is not None
+                    others = below(process.pid)
+                    told.kills += process.is_alive() and kill(process.pid)
+                    process.join()
+                    put_away(others)
+                if process.exitcode == COMPLETE:
+                    break
+            if number >= 0:
+                told.runs += 1
+                trial.again("" if number % TIMED else executor)
+                compare(trial.out, golden, told)
     return told
 
 
-def workers(n: int, folder: Path, golden: Path, rng: random.Random, end: float = math.inf) -> Told:
-    """Kill a worker, wait a little, kill another, in run after run."""
+@contextmanager
+def standing() -> Iterator[str]:
+    """The address of a cluster of one node that outlives its drivers."""
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 2, "num_gpus": 0, "include_dashboard": False})
+    try:
+        yield cluster.address
+    finally:
+        cluster.shutdown()
+
+
+def workers(n: int, folder: Path, golden: Path, rng: random.Random, end: float = math.inf, clips: int = MANY) -> Told:
+    """Kill a worker, wait until there are two again and a little, kill another, in run after run."""
     told = Told("worker, executor=ray")
     while told.kills < n and time.monotonic() < end:
-        out, journal = folder / f"workers{told.runs}", folder / f"workers{told.runs}.journal"
-        process = _started(str(out), "ray", str(journal), 0.1)
-        assert process.pid is not None
-        while process.is_alive() and told.kills < n:
-            time.sleep(rng.uniform(0.05, 0.4))
-            at_work = [pid for pid, line in below(process.pid).items() if line.startswith("ray::")]
-            if at_work and attempts(journal):
-                told.kills += kill(rng.choice(sorted(at_work)))
-        process.join()
+        trial = Trial(folder / f"workers{told.runs}", told)
+        with trial.command() as journal:
+            process = _started(str(trial.out), "ray", str(journal), 0.1, "", clips)
+            assert process.pid is not None
+            while process.is_alive() and told.kills < n:
+                time.sleep(rng.uniform(0.05, 0.4))
+                at_work = workers_below(process.pid)
+                if len(at_work) > 1 and attempts(journal):
+                    told.kills += kill(rng.choice(at_work))
+            process.join()
         told.runs += 1
-        again(out, journal, told, fresh=False)
-        compare(out, golden, told)
+        trial.again(clips=clips)
+        compare(trial.out, golden, told)
     return told
 
 
 def parts(kind: str, n: int, folder: Path, golden: Path, rng: random.Random, end: float = math.inf) -> Told:
     """Kill a process of Ray's, or one node with all that is on it, while attempts are at work."""
-    names = {"raylet": "raylet", "gcs": "GCS, executor=ray", "node": "one node of two"}
+    names = {"raylet": "raylet", "gcs": "GCS", "agent": "an agent of Ray's", "node": "one node of two"}
     told = Told(names[kind])
-    for trial in range(n):
-        if time.monotonic() > end:
-            break
-        out, journal, notes = (folder / f"{kind}{trial}{end}" for end in ("", ".journal", ".pid"))
-        process = _started(str(out), "node" if kind == "node" else "ray", str(journal), 0.1, str(notes))
-        assert process.pid is not None
-        while process.is_alive() and not attempts(journal):
-            time.sleep(0.1)
-        time.sleep(rng.uniform(0.0, 2.0))
-        others = below(process.pid)
-        if kind == "node":
-            raylet = int(notes.read_text())
-            chosen = [raylet, *below(raylet)]
-        else:
-            chosen = [pid for pid, line in others.items() if PROGRAMS[kind] in line][:1]
-        told.kills += sum(map(kill, chosen)) > 0
-        process.join(OVER_S)
-        if process.is_alive():
-            told.ended += 1
-            kill(process.pid)
-            process.join()
-        _put_away(others)
+    while told.runs < n and time.monotonic() < end:
+        trial, notes = Trial(folder / f"{kind}{told.runs}", told), folder / f"{kind}{told.runs}.pid"
+        with trial.command() as journal:
+            process = _started(str(trial.out), "node" if kind == "node" else "ray", str(journal), 0.1, str(notes))
+            assert process.pid is not None
+            while process.is_alive() and not attempts(journal):
+                time.sleep(0.1)
+            time.sleep(rng.uniform(0.0, 2.0))
+            others = below(process.pid)
+            if kind == "node":
+                raylet = int(notes.read_text())
+                chosen = [raylet, *below(raylet)]
+            else:
+                chosen = [pid for pid, line in others.items() if PROGRAMS[kind] in line][:1]
+            told.kills += sum(map(kill, chosen)) > 0
+            process.join(OVER_S)
+            if process.is_alive():
+                told.ended += 1
+                kill(process.pid)
+                process.join()
+            put_away(others)
+        told.exits[process.exitcode or 0] += 1
         told.runs += 1
-        again(out, journal, told, fresh=False)
-        compare(out, golden, told)
-    if told.ended:
-        told.kind += f" ({told.ended} runs were ended after {OVER_S:.0f} s)"
+        trial.again()
+        compare(trial.out, golden, told)
+    exits = ", ".join(f"{code}: {count}" for code, count in sorted(told.exits.items()))
+    told.kind += f" (exit codes {exits}; {told.ended} ended after {OVER_S:.0f} s)"
     return told
-
-
-def _put_away(processes: dict[int, str]) -> None:
-    """What a killed driver had started, where it did not go with it."""
-    end = time.monotonic() + 5.0
-    while time.monotonic() < end and any(command(pid) == line for pid, line in processes.items()):
-        time.sleep(0.1)
-    for pid, line in processes.items():
-        if line and command(pid) == line:
-            kill(pid)
 
 
 def main(**asked: int) -> None:
@@ -227,20 +260,20 @@ def main(**asked: int) -> None:
     rng, end = random.Random(asked.pop("seed", 0)), time.monotonic() + 60.0 * asked.pop("minutes", 60)
     assert set(asked) <= set(KINDS), f"there are {list(KINDS)}"
     with tempfile.TemporaryDirectory() as name:
-        folder, golden = Path(name), Path(name) / "golden"
+        folder, golden, many = Path(name), Path(name) / "golden", Path(name) / "many"
         drive(str(golden), "local", "", 0.0)
-        told: dict[str, Callable[[int], Told]] = {
-            "local": lambda n: drivers("local", n, folder, golden, rng, end),
-            "ray": lambda n: drivers("ray", n, folder, golden, rng, end),
-            "workers": lambda n: workers(n, folder, golden, rng, end),
-            "raylet": lambda n: parts("raylet", n, folder, golden, rng, end),
-            "gcs": lambda n: parts("gcs", n, folder, golden, rng, end),
-            "node": lambda n: parts("node", n, folder, golden, rng, end),
-        }
+        if "workers" in (asked or KINDS):
+            drive(str(many), "local", "", 0.0, clips=MANY)
+
+        def told(kind: str, n: int) -> Told:
+            if kind == "workers":
+                return workers(n, folder, many, rng, end)
+            return (drivers if kind in ("local", "ray", "cluster") else parts)(kind, n, folder, golden, rng, end)
+
         print("| killed | kills | runs | missing | twice | not committed | made twice | first |")
         print("|---|---|---|---|---|---|---|---|", flush=True)
         for kind, n in (asked or KINDS).items():
-            print(told[kind](n).row(), flush=True)
+            print(told(kind, n).row(), flush=True)
 
 
 if __name__ == "__main__":

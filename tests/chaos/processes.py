@@ -2,6 +2,7 @@
 
 import os
 import signal
+import time
 from pathlib import Path
 
 
@@ -31,6 +32,12 @@ def command(pid: int) -> str:
         return ""
 
 
+def workers_below(pid: int) -> list[int]:
+    """Ray's workers, at work or idle; its agents have names like theirs, and a raylet ends with either of them."""
+    named = ((child, line) for child, line in below(pid).items() if line.startswith("ray::"))
+    return sorted(child for child, line in named if not line.endswith("Agent"))
+
+
 def kill(pid: int) -> bool:
     """SIGKILL; False where it is gone."""
     try:
@@ -38,3 +45,13 @@ def kill(pid: int) -> bool:
     except ProcessLookupError:
         return False
     return True
+
+
+def put_away(processes: dict[int, str]) -> None:
+    """What a killed driver had started, where it did not go with it."""
+    end = time.monotonic() + 5.0
+    while time.monotonic() < end and any(command(pid) == line for pid, line in processes.items()):
+        time.sleep(0.1)
+    for pid, line in processes.items():
+        if line and command(pid) == line:
+            kill(pid)
