@@ -35,7 +35,7 @@ from tasks.stages import Rejected
 from tests.factory.toy import ToyWork, any_row
 
 EXPERTS = ("pdm_closed", "recovery")
-CANDIDATES = 16  # of a clip; half of them are accepted, so that five rounds take ten
+CANDIDATES = 16  # of a clip; where half of them are accepted, five rounds take ten
 
 
 @dataclass(frozen=True)
@@ -48,10 +48,13 @@ class Request:
     wait_ms: int = 200  # of a stage
     rounds: int = 5
     row_kb: int = 20
+    accepted: float = 0.5  # share of the attempts; the others cost a worker hardly anything
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[1-9]\d*(,[1-9]\d*)*", self.nodes):
             raise ValueError(f"nodes={self.nodes}: give numbers with commas between them, as 1,2,4")
+        if not 0.0 < self.accepted <= 1.0:
+            raise ValueError(f"accepted={self.accepted}: give a share above 0, at most 1")
 
     @property
     def each(self) -> list[int]:
@@ -96,9 +99,10 @@ def measured(request: Request, nodes: int) -> str:
     """A row of the table: a run on so many nodes."""
     from ray.cluster_utils import Cluster
 
-    per_clip = len(EXPERTS) * min(2 * request.rounds, CANDIDATES)
+    per_clip = len(EXPERTS) * min(round(request.rounds / request.accepted), CANDIDATES)
     refs = [ClipRef("waiting", f"log{i // 50}", 1000 * i) for i in range(math.ceil(request.attempts / per_clip))]
-    work = WaitingWork(n_candidates=CANDIDATES, seconds=request.wait_ms / 1000, row_kb=request.row_kb)
+    threshold, seconds = 1.0 - request.accepted, request.wait_ms / 1000
+    work = WaitingWork(n_candidates=CANDIDATES, threshold=threshold, seconds=seconds, row_kb=request.row_kb)
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": request.cpus, "include_dashboard": False})
     try:
         for _ in range(nodes - 1):
