@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from factory.config.arguments import WORD, Refused
 from factory.exits import COMPLETE, INTERRUPTED
 from factory.exports.navsim.settings import Layout, Missing
-from factory.views.show import find, logged_drive, sample_ids
+from factory.views.show import find, logged_drive, open_samples
 from factory.views.status import open_store
 
 if TYPE_CHECKING:
@@ -100,19 +100,17 @@ def main(request: Request) -> int:
 
 def export(request: Request) -> Iterator[Path]:
     """Write the files; their paths as they are written. Raises Refused where there is nothing, or no file can be."""
-    from factory.store.reader import SampleTable
-
     store, target = open_store(request.out), Path(request.to).expanduser()
+    table = open_samples(store)
     if request.sample is not None:
-        chosen = [find(store, request.sample)]
+        chosen = [find(table, store, request.sample)]
     else:
-        chosen = sample_ids(store)[:: request.every]
+        chosen = list(table.attempt_ids[:: request.every])
     suffix = ".rrd" if request.format == "rerun" else f".{request.format}"
     is_file = target.suffix == suffix and not target.is_dir()
     if is_file and request.every is not None:
         raise Refused(f"to={request.to}: every=... writes a file for each sample; name a folder")
     try:
-        table = SampleTable(store.location.uri, store.location.options)
         for attempt_id in chosen:
             path = target if is_file else target / f"sample_{attempt_id}{suffix}"
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -23,11 +23,12 @@ from factory.views.show import (
     labelled_trajectories,
     logged_drive,
     number_lines,
-    sample_ids,
+    open_samples,
 )
 from factory.views.status import open_store
 
 if TYPE_CHECKING:
+    from factory.store.reader import SampleTable
     from factory.store.samples import Store
 
 
@@ -52,21 +53,18 @@ class Request:
 def main(request: Request) -> None:
     """Print the lines as they come. Raises Refused where there is nothing to show."""
     store = open_store(request.out)
-    which = request.sample
-    for line in sample_ids(store) if which is None else sample_lines(store, find(store, which), request):
+    table, which = open_samples(store), request.sample
+    for line in table.attempt_ids if which is None else sample_lines(store, table, which, request):
         print(line, flush=True)
 
 
-def sample_lines(store: "Store", attempt_id: str, request: Request) -> Iterator[str]:
+def sample_lines(store: "Store", table: "SampleTable", which: str, request: Request) -> Iterator[str]:
     """One sample's numbers; writes its picture and says where it is."""
-    from factory.store.reader import SampleTable
     from factory.views.sample_picture import encoded, sample_sheet
     from factory.views.seen_again import again_sheet, digest_of, film, scene_of, stacked
 
-    try:
-        row = SampleTable(store.location.uri, store.location.options)[attempt_id]
-    except ValueError as error:  # of another schema version
-        raise Refused(str(error)) from error
+    attempt_id = find(table, store, which)
+    row = table[attempt_id]
     path = _picture_path(attempt_id, request.to)
     drawn = labelled_trajectories(row, request.vocabulary)
     yield from number_lines(row)

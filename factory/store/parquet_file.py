@@ -2,7 +2,7 @@
 called."""
 
 import hashlib
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -88,15 +88,12 @@ def _leaf_paths(path: str, kind: pa.DataType) -> list[str]:
 def with_partition(stored: pa.Table, schema: pa.Schema, partition: Mapping[str, object]) -> pa.Table:
     """The columns of `schema` from what a file holds and what the log says of it."""
     n = stored.num_rows
-    arrays = [
-        _repeated(partition[f.name], f.type, n) if f.name in partition else stored[f.name].cast(f.type) for f in schema
-    ]
-    return pa.table(arrays, schema=schema)
+    arrays = [_repeated(partition[f.name], f.type, n) if f.name in partition else stored[f.name] for f in schema]
+    same = (array if array.type == f.type else array.cast(f.type) for array, f in zip(arrays, schema))
+    return pa.table(list(same), schema=schema)
 
 
 def _repeated(value: object, kind: pa.DataType, n: int) -> pa.Array:
-    if pa.types.is_dictionary(kind):
-        return pa.DictionaryArray.from_arrays(pa.repeat(pa.scalar(0, kind.index_type), n), [value])
     return pa.repeat(pa.scalar(value).cast(kind), n)
 
 
@@ -105,19 +102,19 @@ def encoded_text(field: pa.Field) -> pa.Field:
     return field.with_type(pa.dictionary(pa.int32(), pa.string())) if field.type == pa.string() else field
 
 
-def open_parquet(location: Location, path: str, encoded: Sequence[str] = ()) -> pq.ParquetFile:
-    """One file; encoded: columns that are read as numbers into a dictionary."""
+def open_parquet(location: Location, path: str) -> pq.ParquetFile:
+    """One file. Only where reading costs round trips are a read's columns fetched together, before they are decoded."""
     filesystem, base = location.filesystem()
     options: dict[str, Any] = {"filesystem": filesystem, "page_checksum_verification": True}
-    return pq.ParquetFile(f"{base}/{path}", read_dictionary=list(encoded), **options)
+    return pq.ParquetFile(f"{base}/{path}", pre_buffer=not location.is_local, **options)
 
 
 def read_parquet(location: Location, path: str, schema: pa.Schema, without: Collection[str] = ()) -> pa.Table:
     """The columns of `schema` that stand in a file. Raises DamagedFile for a damaged page."""
     names = [name for name in schema.names if name not in without]
-    encoded = [name for name in names if pa.types.is_dictionary(schema.field(name).type)]
     with naming(f"{location.uri}/{path}"):
-        return open_parquet(location, path, encoded).read(columns=names)
+        file = open_parquet(location, path)
+        return file.read(columns=names, use_threads=not location.is_local)  # threads cost more than small columns do
 
 
 @contextmanager

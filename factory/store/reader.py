@@ -20,6 +20,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from factory.store.counts.codes import beginning, fixed_bytes
 from factory.store.location import Location
 from factory.store.mcap_shards.mirror import McapTable, open_shard
 from factory.store.mcap_shards.shard import McapShard
@@ -90,18 +91,19 @@ class SampleTable:
         """
         self._table = sample_table(path, storage_options, format)
         self._partitions = self._table.live_files()
-        places = [
-            (key, path, row)
-            for path, keys in self._table.files(["attempt_id"])
-            for row, key in enumerate(keys["attempt_id"].to_pylist())
-        ]
-        self._places = sorted(places)
-        self._index = {key: i for i, (key, _, _) in enumerate(self._places)}
+        files = [(path, fixed_bytes(rows["attempt_id"])) for path, rows in self._table.files(["attempt_id"])]
+        counts = [len(keys) for _, keys in files]
+        keys = np.concatenate([np.zeros(0, "S1"), *(keys for _, keys in files)])
+        rows = np.concatenate([np.zeros(0, np.int32), *(np.arange(n, dtype=np.int32) for n in counts)])
+        order = np.argsort(keys, kind="stable")
+        self._keys, self._rows = keys[order], rows[order]  # (N,) sorted, and of each its row in its file,
+        self._files = np.repeat(np.arange(len(files), dtype=np.int32), counts)[order]  # which is of this number
+        self._paths = [path for path, _ in files]
         opener = open_shard if format == "mcap" else open_parquet
         self._file = lru_cache(maxsize=32)(partial(opener, self._table.location))
 
     def __len__(self) -> int:
-        return len(self._places)
+        return len(self._keys)
 
     @property
     def schema(self) -> pa.Schema:
@@ -111,7 +113,11 @@ class SampleTable:
     @property
     def attempt_ids(self) -> tuple[str, ...]:
         """In the table's order."""
-        return tuple(key for key, _, _ in self._places)
+        return tuple(key.decode() for key in self._keys.tolist())
+
+    def beginning(self, prefix: str) -> list[str]:
+        """Those attempt_ids that begin so, in the table's order."""
+        return beginning(self._keys, prefix)
 
     def table(self, columns: Sequence[str] | None = None) -> pa.Table:
         """Some columns of all samples, ordered by attempt_id; reads nothing but these columns."""
@@ -125,12 +131,19 @@ class SampleTable:
 
     def sample(self, which: int | str, columns: Sequence[str] | None = None) -> Sample:
         """One sample, or some of its columns; reads the row group it stands in."""
-        _, path, row = self._places[self._index[which] if isinstance(which, str) else which]
+        at = self._place(which) if isinstance(which, str) else which
+        path = self._paths[self._files[at]]
         _check_columns(columns)
         with naming(f"{self._table.location.uri}/{path}"):
-            group, row = group_of(self._file(path), row)
+            group, row = group_of(self._file(path), int(self._rows[at]))
             (sample,) = read_rows(self._file(path), group, self._partitions[path], columns, slice(row, row + 1))
         return sample
+
+    def _place(self, attempt_id: str) -> int:
+        at = int(np.searchsorted(self._keys, attempt_id.encode()))
+        if at == len(self._keys) or self._keys[at].decode() != attempt_id:
+            raise KeyError(attempt_id)
+        return at
 
     def __iter__(self) -> Iterator[Sample]:
         return self.iterate()

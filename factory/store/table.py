@@ -29,7 +29,7 @@ from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundErr
 from deltalake.transaction import AddAction, RemoveAction
 
 from factory.store.commit_copies import COPIES, CommitCopies
-from factory.store.counts.codes import Bytes
+from factory.store.counts.codes import Bytes, packed
 from factory.store.counts.key_index import KeyIndex
 from factory.store.disk import needs_disk
 from factory.store.late_listing import until_listed
@@ -76,6 +76,7 @@ class KeyedTable:
         self.copies = CommitCopies(location)
         self._token = secrets.token_hex(16)  # stands in every commit of this writer
         self._delta: DeltaTable | None = None
+        self._facts: tuple[int, dict[str, LiveFile]] = (-1, {})  # of a version
         with self._log_naming():
             if DeltaTable.is_deltatable(location.uri, storage_options=dict(location.options)):
                 self._delta = DeltaTable(location.uri, storage_options=dict(location.options))
@@ -119,6 +120,10 @@ class KeyedTable:
     def __contains__(self, key: str) -> bool:
         return bool(self._index.files_of([key]))
 
+    def path_of(self, key: str) -> str:
+        """The file that a key stands in. Raises KeyError."""
+        return self._index.files_of([key])[key]
+
     def live_files(self) -> dict[str, Mapping[str, str]]:
         """Path -> partition values of every file that the log names."""
         return {path: file.partition for path, file in self.file_facts().items()}
@@ -127,10 +132,15 @@ class KeyedTable:
         """Path -> what the log says of every file that it names; reads no file."""
         if self._delta is None:
             return {}
+        if self._facts[0] != self._delta.version():
+            self._facts = (self._delta.version(), self._read_facts(self._delta))
+        return dict(self._facts[1])
+
+    def _read_facts(self, delta: DeltaTable) -> dict[str, LiveFile]:
         parts = {name: f"partition.{name}" for name in self.spec.partition_by}
         facts = ["path", "size_bytes", "num_records", "modification_time"]
         with self._log_naming():
-            actions = pa.table(self._delta.get_add_actions(flatten=True)).select([*facts, *parts.values()])
+            actions = pa.table(delta.get_add_actions(flatten=True)).select([*facts, *parts.values()])
         return {
             a["path"]: LiveFile(
                 {name: str(a[part]) for name, part in parts.items()},
@@ -149,40 +159,40 @@ class KeyedTable:
             self._delta = DeltaTable(self.location.uri, storage_options=dict(self.location.options))
         self.__dict__.pop("_index", None)
 
-    def files(self, columns: Sequence[str] | None = None, encoded: bool = False) -> Iterable[tuple[str, pa.Table]]:
+    def files(self, columns: Sequence[str] | None = None) -> Iterable[tuple[str, pa.Table]]:
         """(path, its rows) for every live file, in path order; columns None: all, partition columns included.
-
-        encoded: texts but the key as numbers into a dictionary, for what counts over many rows of few different ones.
 
         On an object store, where a file costs round trips and little else, AHEAD more are being read meanwhile.
         """
         live = sorted(self.live_files().items())
         if self.location.is_local:
-            yield from ((path, self.read_file(path, partition, columns, encoded)) for path, partition in live)
+            yield from ((path, self.read_file(path, partition, columns)) for path, partition in live)
             return
         with ThreadPoolExecutor(AHEAD) as pool:
             reading: deque[tuple[str, Future[pa.Table]]] = deque()
             for path, partition in live:
-                reading.append((path, pool.submit(self.read_file, path, partition, columns, encoded)))
+                reading.append((path, pool.submit(self.read_file, path, partition, columns)))
                 if len(reading) > AHEAD:
                     first, rows = reading.popleft()
                     yield first, rows.result()
             yield from ((path, rows.result()) for path, rows in reading)
 
-    def read_file(
-        self, path: str, partition: Mapping[str, str], columns: Sequence[str] | None = None, encoded: bool = False
-    ) -> pa.Table:
-        """One file's rows in the table's schema, page checksums verified; encoded: as of `files`."""
-        schema = self.schema_of(columns, encoded)
+    def read_file(self, path: str, partition: Mapping[str, str], columns: Sequence[str] | None = None) -> pa.Table:
+        """One file's rows in the table's schema, page checksums verified."""
+        schema = self.schema_of(columns)
         return with_partition(read_parquet(self.location, path, schema, partition), schema, partition)
 
     def read(self, columns: Sequence[str] | None = None, encoded: bool = False) -> pa.Table:
-        """All rows; encoded: as of `files`."""
-        parts = (rows for _, rows in self.files(columns, encoded))
-        return pa.concat_tables([self.schema_of(columns, encoded).empty_table(), *parts])
+        """All rows.
+
+        encoded: texts but the key as numbers into dictionaries, for what counts over many rows of few different ones.
+        """
+        parts = (rows for _, rows in self.files(columns))
+        found = packed(parts, self.spec.key) if encoded else parts
+        return pa.concat_tables([self.schema_of(columns, encoded).empty_table(), *found])
 
     def schema_of(self, columns: Sequence[str] | None = None, encoded: bool = False) -> pa.Schema:
-        """Of some columns, None: all; encoded: as of `files`."""
+        """Of some columns, None: all; encoded: as of `read`."""
         names = self.spec.schema.names if columns is None else columns
         fields = [self.spec.schema.field(name) for name in names]
         return pa.schema([encoded_text(f) if encoded and f.name != self.spec.key else f for f in fields])

@@ -10,6 +10,7 @@ readers ignore them.
 import hashlib
 import json
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +20,7 @@ import pyarrow.parquet as pq
 
 from factory.store.cache import BadCacheFile, check_kept
 from factory.store.commit_copies import COPIES, LOG, CommitCopies, LogDamage
-from factory.store.counts.codes import codes, fixed_bytes
+from factory.store.counts.codes import codes, fixed_bytes, packed
 from factory.store.episodes import FOLDER, check_episode, episode_name
 from factory.store.location import Location
 from factory.store.mcap_shards.mirror import NAMED as MCAP_NAMED
@@ -30,6 +31,7 @@ from factory.store.samples import CURRENT_RUN, IMPORTED, LAST_RUN, ChangedRun, S
 from factory.store.table import KeyedTable, LiveFile
 
 TABLES = ("plans", "candidates", "samples", "outcomes", SAMPLES_MCAP.name)
+OF_WALKS = ["clip_id", "expert", "candidate_index", "round", "settings_hash"]
 KEPT = ("cache/prepared", "scenes")  # sealed files
 DRAFT = re.compile(r"\..*\.tmp")  # that a killed run left
 NAMED = re.compile(r"(.*/)?part-([0-9a-f]{32})\.parquet")
@@ -78,9 +80,11 @@ def verify(store: Store) -> Verdict:
     if damage or broken:
         damage += [*map(str, (*broken, *kept)), "keys and rounds were not checked: fix the files first"]
         return Verdict(0, tuple(damage), tuple(orphans), tuple(found.name for found in (*broken, *kept)))
-    damage += _twice(store)
+    rows: list[pa.Table] = []
+    for table in tables_in(store):
+        damage += _twice(table, rows if table is store.samples else None)
     try:
-        damage += _broken_rounds(store) + _unknown_settings(store)
+        damage += _broken_rows(rows, store)
     except ChangedRun as error:
         damage.append(str(error))
     kept += _damaged_episodes(store)
@@ -143,14 +147,22 @@ def _problem_of(table: KeyedTable, path: str, file: LiveFile) -> str:
         parquet = pq.ParquetFile(pa.BufferReader(data), page_checksum_verification=True)
         if file.n_rows and parquet.metadata.num_rows != file.n_rows:
             return f"has {parquet.metadata.num_rows} rows, the log says {file.n_rows}"
-        rows = parquet.read()
-        for name in [n for n in table.spec.schema.names if n not in file.partition]:
-            rows[name].cast(table.spec.schema.field(name).type)
-        for name in set(file.partition) & set(rows.column_names):  # nothing in a file of a version before 0.2
+        said = [name for name in file.partition if name in parquet.schema_arrow.names]  # none in a file before 0.2
+        rows = parquet.read(said, use_threads=False) if named else parquet.read()  # the name says the rest of the bytes
+        _check_columns(table, file, parquet.schema_arrow.empty_table() if named else rows)
+        for name in said:
             values = sorted(map(str, pc.unique(rows[name]).to_pylist()))
             if values != [file.partition[name]]:
                 return f"{name} is {', '.join(values)}, the log says {file.partition[name]}"
     return ""
+
+
+def _check_columns(table: KeyedTable, file: LiveFile, rows: pa.Table) -> None:
+    """Raises KeyError or ArrowException where rows are none of the table's."""
+    wanted = [field for field in table.spec.schema if field.name not in file.partition]
+    for field in wanted:
+        if rows.schema.field(field.name).type != field.type:
+            rows[field.name].cast(field.type)
 
 
 def _damaged_kept(out: Location) -> list[DamagedPart]:
@@ -172,25 +184,32 @@ def _damaged_kept(out: Location) -> list[DamagedPart]:
     return found
 
 
-def _twice(store: Store) -> list[str]:
-    found = []
-    for table in tables_in(store):
-        parts = [(path, fixed_bytes(rows[table.spec.key])) for path, rows in table.files([table.spec.key])]
-        if not parts:
-            continue
-        keys = np.concatenate([keys for _, keys in parts])
-        file = np.repeat(np.arange(len(parts)), [len(keys) for _, keys in parts])
-        order = np.argsort(keys, kind="stable")
-        again = order[1:][keys[order[1:]] == keys[order[:-1]]]
-        for place in np.sort(again).tolist():
-            found.append(f"{table.spec.name}: {keys[place].decode()} stands twice, again in {parts[file[place]][0]}")
-    return found
+def _twice(table: KeyedTable, kept: list[pa.Table] | None) -> list[str]:
+    """Keys that stand twice; kept: takes the columns OF_WALKS, read at the same time."""
+    paths, parts, key = [], [np.zeros(0, "S1")], table.spec.key
+    for path, rows in table.files([key] if kept is None else [key, *OF_WALKS]):
+        paths.append(path)
+        parts.append(fixed_bytes(rows[key]))
+        if kept is not None:
+            kept.append(rows.select(OF_WALKS))
+    keys = np.concatenate(parts)
+    file = np.repeat(np.arange(len(paths)), [len(keys) for keys in parts[1:]])
+    order = np.argsort(keys, kind="stable")
+    again = np.sort(order[1:][keys[order[1:]] == keys[order[:-1]]]).tolist()
+    return [f"{table.spec.name}: {keys[at].decode()} stands twice, again in {paths[file[at]]}" for at in again]
 
 
-def _broken_rounds(store: Store) -> list[str]:
+def _broken_rows(parts: Sequence[pa.Table], store: Store) -> list[str]:
+    """Of samples, with the columns OF_WALKS: rounds out of order, and settings that nothing is known of."""
+    rows = pa.concat_tables([store.samples.schema_of(OF_WALKS, encoded=True).empty_table(), *packed(parts, "")])
+    unknown = set(codes(rows["settings_hash"])[1]) - {run["settings_hash"] for run in store.runs()}
+    named = [f"samples: settings_hash {name} is not in run.json" for name in sorted(unknown)]
+    return [*_broken_rounds(rows, store), *named]
+
+
+def _broken_rounds(rows: pa.Table, store: Store) -> list[str]:
     """Rounds of a walk count 0, 1, 2 ... in the order of its candidates. Of imported rows they are their source's."""
     imported = {run["settings_hash"] for run in store.runs() if IMPORTED in run["settings"]}
-    rows = store.samples.read(["clip_id", "expert", "candidate_index", "round", "settings_hash"], encoded=True)
     rows = rows.filter(pc.invert(pc.is_in(rows["settings_hash"], value_set=pa.array(sorted(imported), pa.string()))))
     (clip, clip_ids), (expert, experts) = codes(rows["clip_id"]), codes(rows["expert"])
     candidate, number = (rows[name].to_numpy() for name in ("candidate_index", "round"))
@@ -206,12 +225,6 @@ def _broken_rounds(store: Store) -> list[str]:
         of = f"clip {clip_ids[broken // len(experts)]}, expert {experts[broken % len(experts)]}"
         found.append(f"samples: {of}: candidates and rounds {pairs}")
     return found
-
-
-def _unknown_settings(store: Store) -> list[str]:
-    known = {run["settings_hash"] for run in store.runs()}
-    _, names = codes(store.samples.read(["settings_hash"], encoded=True)["settings_hash"])
-    return [f"samples: settings_hash {name} is not in run.json" for name in sorted(set(names) - known)]
 
 
 def _damaged_episodes(store: Store) -> list[DamagedPart]:

@@ -9,21 +9,21 @@ import re
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from factory import __version__
-from factory.store.counts.funnel import Funnel, funnel_of
+from factory.store.counts.codes import codes
+from factory.store.counts.funnel import Funnel, funnel_of_tables, funnel_tables
 from factory.store.outcomes import Kind
 from factory.store.samples import CURRENT_RUN, Store
 from factory.store.schema import SCHEMA_VERSION
+from factory.views.status import counted
 
 FILE = "README.md"
 MARK = "# written by python -m factory, and again by its next run"  # a README without it is the user's own
 SOURCE = ["dataset", "licence", "split"]
-COLUMNS = [*SOURCE, "log_id", "clip_id", "expert", "round", "candidate_index"]
-COLUMNS += ["image_source", "psnr", "tags", "settings_hash"]
+COLUMNS = [*SOURCE, "log_id", "round", "image_source", "psnr", "tags"]  # beside those of the funnel
 SIZES = ((10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"), (10**7, "1M<n<10M"))
 LICENCES = {  # as a row's licence begins -> the identifier of the convention
     r"Apache-2\.0\b": "apache-2.0",
@@ -49,15 +49,15 @@ def write_card(store: Store) -> str:
 
 def card(store: Store) -> str:
     """The text: YAML front matter, then Markdown."""
-    samples = store.samples.read(COLUMNS)
+    samples, outcomes, lists = funnel_tables(store, COLUMNS)
     orphans = _orphans(store)
     parts = (
         _front_matter(samples, orphans),
         _what(store, samples),
         _sources(samples),
         _how(store),
-        _funnel(funnel_of(store)),
-        _limits(store, samples, orphans),
+        _funnel(funnel_of_tables(samples, outcomes, lists, store.plans.read(), store.runs())),
+        _limits(store, samples, outcomes, orphans),
     )
     return "\n".join(line for part in parts for line in part) + "\n"
 
@@ -83,7 +83,7 @@ def _front_matter(samples: pa.Table, orphans: int) -> Iterator[str]:
 
 
 def _what(store: Store, samples: pa.Table) -> Iterator[str]:
-    clips = pc.count_distinct(samples["clip_id"]).as_py()
+    clips = len(_values(samples, "clip_id"))
     yield f"\n# Driving samples of {_datasets(samples)}\n"
     yield (
         f"{samples.num_rows:,} samples from {clips:,} clips for training end-to-end planners: history, map, agents, "
@@ -94,9 +94,7 @@ def _what(store: Store, samples: pa.Table) -> Iterator[str]:
         f"there in simulation. {_gate(store)}"
     )
     yield f"\nThe run is {_state(store)}.\n"
-    counts = samples.group_by(["expert", "round"]).aggregate([([], "count_all")])
-    rows = sorted(zip(*(counts[name].to_pylist() for name in ("expert", "round", "count_all"))))
-    yield from _table(("expert", "round", "samples"), rows)
+    yield from _table(("expert", "round", "samples"), _counts(samples, ["expert", "round"]))
     yield (
         "\n`samples` is a Delta table of Parquet files, one sample a row; `outcomes` says what became of every other "
         "attempt, `candidates` which perturbations each clip has. Columns, units and frames stand in the factory's "
@@ -109,12 +107,7 @@ def _what(store: Store, samples: pa.Table) -> Iterator[str]:
 def _sources(samples: pa.Table) -> Iterator[str]:
     yield "\n## Where it comes from\n"
     yield "Every row carries the licence of its source; it covers what is made of it.\n"
-    counts = samples.group_by(SOURCE).aggregate(
-        [("log_id", "count_distinct"), ("clip_id", "count_distinct"), ([], "count_all")]
-    )
-    names = (*SOURCE, "log_id_count_distinct", "clip_id_count_distinct", "count_all")
-    rows = sorted(zip(*(counts[name].to_pylist() for name in names)))
-    yield from _table((*SOURCE, "logs", "clips", "samples"), rows)
+    yield from _table((*SOURCE, "logs", "clips", "samples"), _counts(samples, SOURCE, ["log_id", "clip_id"]))
 
 
 def _how(store: Store) -> Iterator[str]:
@@ -145,13 +138,12 @@ def _funnel(funnel: Funnel) -> Iterator[str]:
     yield from _table(head, rows)
 
 
-def _limits(store: Store, samples: pa.Table, orphans: int) -> Iterator[str]:
+def _limits(store: Store, samples: pa.Table, outcomes: pa.Table, orphans: int) -> Iterator[str]:
     """What a user must know; each line only where it is so."""
     yield "\n## Known limits\n"
-    simulated = samples.filter(pc.greater_equal(samples["candidate_index"], 0))
-    sources = dict(zip(*(simulated["image_source"].value_counts().field(i).to_pylist() for i in (0, 1))))
+    simulated = samples.filter(pc.greater_equal(samples["candidate_index"], 0)).select(["image_source", "psnr"])
+    sources = counted(simulated["image_source"])
     settings = _record(store)["settings"]
-    kinds = store.outcomes.read(["kind"])["kind"].to_pylist()
     if simulated.num_rows:
         yield (
             f"- The labels of {simulated.num_rows:,} samples are simulated drives of a pseudo-expert, not of a human. "
@@ -160,8 +152,8 @@ def _limits(store: Store, samples: pa.Table, orphans: int) -> Iterator[str]:
     if "human" in _values(samples, "expert"):
         yield "- Human samples are scored and never filtered: some break the reward's rules."
     if rendered := sources.get("render", 0):
-        psnr = np.array(simulated["psnr"].drop_null().to_pylist())
-        worst = f", {psnr.min():.1f} to {psnr.max():.1f} dB on held-out photos" if psnr.size else ""
+        psnr = pc.min_max(simulated["psnr"]).as_py()
+        worst = "" if psnr["min"] is None else f", {psnr['min']:.1f} to {psnr['max']:.1f} dB on held-out photos"
         yield (
             f"- The pictures of {rendered:,} samples are rendered from reconstructed streets{worst}; "
             "surfaces that no sensor saw are filled in."
@@ -182,7 +174,7 @@ def _limits(store: Store, samples: pa.Table, orphans: int) -> Iterator[str]:
         yield "- `synthetic` is drawn test data: no real street, no real traffic."
     if (lines := len(_values(samples, "settings_hash"))) > 1:
         yield f"- Rows of {lines} different settings stand side by side (column `settings_hash`, file run.json)."
-    if failed := kinds.count(Kind.FAILED):
+    if failed := counted(outcomes["kind"]).get(Kind.FAILED, 0):
         yield f"- {failed:,} attempts failed and are not in it (`python -m factory failed out=...`)."
     if orphans:
         yield f"- {orphans:,} files under `samples` belong to no commit: read the table, not the folder."
@@ -219,9 +211,24 @@ def _orphans(store: Store) -> int:
     return sum(name.endswith(".parquet") and name not in live for name in store.samples.location.names())
 
 
+def _counts(samples: pa.Table, by: Sequence[str], distinct: Sequence[str] = ()) -> list[tuple[object, ...]]:
+    """Of each group, in order: its values, the different values of other columns, its rows."""
+    texts = {name: codes(samples[name]) for name in (*by, *distinct) if name != "round"}
+    numbers = {name: texts[name][0] if name in texts else samples[name].to_numpy() for name in (*by, *distinct)}
+    groups = (
+        pa.table(numbers)
+        .group_by(list(by))
+        .aggregate([*((name, "count_distinct") for name in distinct), ([], "count_all")])
+    )
+    ordered = groups.sort_by([(name, "ascending") for name in by])
+    values = (pa.array(texts[name][1]).take(ordered[name]) if name in texts else ordered[name] for name in by)
+    counts = (ordered[name] for name in (*(f"{name}_count_distinct" for name in distinct), "count_all"))
+    return list(zip(*(column.to_pylist() for column in (*values, *counts))))
+
+
 def _values(samples: pa.Table, column: str) -> list[str]:
     """The different texts of a column, sorted."""
-    return sorted(pc.unique(samples[column]).to_pylist())
+    return sorted(counted(samples[column]))
 
 
 def _datasets(samples: pa.Table) -> str:

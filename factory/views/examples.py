@@ -11,11 +11,17 @@ from functools import cache
 from itertools import islice
 from typing import Any, TypeVar
 
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
 from factory.graph.steps import cache_key
 from factory.graph.work import PreparedClip
 from factory.readers.base import BadClip, ClipRef
 from factory.stages.pipeline import FactoryWork, PerturbedClip, payload_of
 from factory.store.cache import BadCacheFile
+from factory.store.counts.codes import fixed_bytes
+from factory.store.outcomes import Kind
 from factory.store.reader import SampleTable, decoded
 from factory.store.samples import Store
 from factory.views.drawing import attempt_picture
@@ -35,6 +41,7 @@ from factory.views.seen_again import (
     real_and_rendered,
     scene_of,
 )
+from factory.views.status import counted
 from tasks.render.settings import ImageSource
 
 N_EXAMPLES = 6
@@ -43,6 +50,7 @@ PER_VALUE = 200
 MAX_PREPARED_AGAIN = 2  # clips whose prepared form is gone from the cache: a few seconds each
 BEV_PX = (640, 640)  # 80 m
 CAMERA_PX = 320  # width of a camera frame on the page
+SHOWN = ("clip_id", "log_id", "expert", "candidate_index", "stage", "reason", "detail", "settings_hash")
 LABELS = ("attempt_id", "clip_id", "log_id", "expert", "round", "image_source")
 Row = Mapping[str, Any]
 T = TypeVar("T")
@@ -80,6 +88,24 @@ def spread(rows: Iterable[T], keys: Callable[[T], Sequence[Hashable]], order: Ca
     return chosen
 
 
+def few_of_each(rows: pa.Table, first: str) -> list[dict[str, Any]]:
+    """All that `spread` looks at of rows with attempt_ids as their order and a column as its first key."""
+    values = counted(rows[first])
+    parts = (rows.filter(pc.equal(rows[first], value)) for value in values)
+    by_id = [("attempt_id", "ascending")]
+    return [row for part in parts for row in part.take(pc.select_k_unstable(part, PER_VALUE, by_id)).to_pylist()]
+
+
+def rejected_rows(store: Store) -> list[dict[str, Any]]:
+    """Of simulated attempts that were turned down and are no sample, those that `rejected_examples` looks at."""
+    names = ("attempt_id", "kind", "expert", "candidate_index", "reason", *SHOWN)
+    rows = store.outcomes.read(list(dict.fromkeys(names)), encoded=True)
+    simulated = pc.and_(pc.greater_equal(rows["candidate_index"], 0), pc.not_equal(rows["expert"], ""))
+    rows = rows.filter(pc.and_(simulated, pc.equal(rows["kind"], Kind.REJECTED.value)))
+    taken = np.isin(fixed_bytes(rows["attempt_id"]), store.samples.keys())
+    return few_of_each(rows.filter(pa.array(~taken)), "reason")
+
+
 def rejected_examples(rejected: Sequence[Row], picture: Callable[[Row], Picture | None]) -> list[Picture]:
     """A few of the simulated attempts that were turned down (rows of outcomes).
 
@@ -95,8 +121,8 @@ def strips_of(store: Store) -> list[dict[str, Any]]:
 
     photos: the log's, each followed by the scene seen from its pose, where that is kept; aside: from beside the ego.
     """
-    labels = store.samples.read(LABELS).to_pylist()
-    pictured = [row for row in labels if row["image_source"] != "none"]
+    labels = store.samples.read(LABELS, encoded=True)
+    pictured = few_of_each(labels.filter(pc.not_equal(labels["image_source"], "none")), "image_source")
     if not pictured:
         return []
     table = SampleTable(store.location.uri, store.location.options)

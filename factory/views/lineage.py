@@ -1,11 +1,12 @@
 """Where an attempt comes from: run, clip, candidate, attempt, sample, with digests, versions and files."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from factory.config.arguments import Refused
 from factory.views.report_words import to_the_side, turned
+from factory.views.status import rows_where
 
 if TYPE_CHECKING:
     from factory.store.samples import Store
@@ -35,10 +36,12 @@ def lineage(store: "Store", which: str) -> list[Part]:
 
 
 def _meant(store: "Store", which: str) -> str:
-    ids = sorted(store.samples)
+    from factory.store.counts.codes import beginning
+
+    ids = store.samples.keys()
     if which.isascii() and which.isdecimal() and int(which) < len(ids):
-        return ids[int(which)]
-    found = sorted({key for table in (store.samples, store.outcomes) for key in table if key.startswith(which)})
+        return ids[int(which)].decode()
+    found = sorted({*beginning(ids, which), *beginning(store.outcomes.keys(), which)})
     if len(found) != 1:
         some = f": {', '.join(found[:8])}" if found else ""
         raise Refused(f"sample={which} is the beginning of {len(found)} attempts{some}")
@@ -47,28 +50,26 @@ def _meant(store: "Store", which: str) -> str:
 
 def _row(table: "KeyedTable", attempt_id: str) -> tuple[str, Row]:
     """The file it stands in, and the row without what is large."""
-    import pyarrow.compute as pc
-
     large = {"images", "cameras", "label_subscores", "label_progress"}
     small = [f.name for f in table.spec.schema if f.name not in large and not f.name.startswith(("agent_", "lane_"))]
-    for path, keys in table.files([table.spec.key]):
-        if attempt_id in keys[table.spec.key].to_pylist():
-            rows = table.read_file(path, table.live_files()[path], small)
-            return path, rows.filter(pc.equal(rows[table.spec.key], attempt_id)).to_pylist()[0]
-    raise Refused(f"{attempt_id} is in no file of {table.location.uri}: python -m factory verify says what is damaged")
+    return _found(table, attempt_id, small)
+
+
+def _found(table: "KeyedTable", key: str, columns: Sequence[str]) -> tuple[str, Row]:
+    """A key's file, and these columns of its row."""
+    import pyarrow.compute as pc
+
+    path = table.path_of(key)
+    rows = table.read_file(path, table.live_files()[path], columns)
+    return path, rows.filter(pc.equal(rows[table.spec.key], key)).to_pylist()[0]
 
 
 def _clip(store: "Store", row: Row) -> Row:
     """The clip's row of candidates with its file, empty where it has none."""
     if row["clip_id"] not in store.candidates:
         return {}
-    import pyarrow.compute as pc
-
-    for path, rows in store.candidates.files():
-        found = rows.filter(pc.equal(rows["clip_id"], row["clip_id"])).to_pylist()
-        if found:
-            return {**found[0], "file": path}
-    return {}
+    path, found = _found(store.candidates, row["clip_id"], store.candidates.spec.schema.names)
+    return {**found, "file": path}
 
 
 def _run_facts(store: "Store", record: Row, number: int, row: Row) -> list[tuple[str, object]]:
@@ -114,11 +115,11 @@ def _candidate_facts(row: Row, clip: Row) -> list[tuple[str, object]]:
 
 
 def _attempt_facts(store: "Store", row: Row) -> list[tuple[str, object]]:
+    walk = {"clip_id": row["clip_id"], "expert": row["expert"]}
     earlier = [
         f"{o['candidate_index']} {o['kind']} by {o['stage']}.{o['reason']}".removesuffix(" by .")
-        for o in store.outcomes.read(["clip_id", "expert", "candidate_index", "kind", "stage", "reason"]).to_pylist()
-        if (o["clip_id"], o["expert"]) == (row["clip_id"], row["expert"])
-        and 0 <= o["candidate_index"] < row["candidate_index"]
+        for o in rows_where(store.outcomes, walk, ("candidate_index", "kind", "stage", "reason"))
+        if 0 <= o["candidate_index"] < row["candidate_index"]
     ]
     return [
         ("attempt", row["attempt_id"]),

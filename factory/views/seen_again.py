@@ -28,6 +28,7 @@ from factory.views.sample_picture import (
     sample_bev,
     tile,
 )
+from factory.views.status import rows_where
 from tasks.caches import user_cache
 from tasks.render.scene.asset import RenderAsset, psnr
 from tasks.render.scene.engine import render, vehicles_at
@@ -73,9 +74,10 @@ def digest_of(store: Store, row: Row) -> str | None:
     """Of the scene that a row was rendered from, for a row of photos that of another row of its clip; None: none."""
     if row["asset_digest"] is not None:
         return str(row["asset_digest"])
-    others = store.samples.read(("clip_id", "asset_digest")).to_pylist()
-    of_clip = {other["asset_digest"] for other in others if other["clip_id"] == row["clip_id"]}
-    return min(of_clip - {None}, default=None)
+    if row["image_source"] != ImageSource.PHOTO:
+        return None
+    others = rows_where(store.samples, {"clip_id": row["clip_id"]}, ("asset_digest",))
+    return min({other["asset_digest"] for other in others} - {None}, default=None)
 
 
 def scene_of(store: Store, digest: str) -> RenderAsset | None:
@@ -91,13 +93,8 @@ def photographed(store: Store, row: Row, asset: RenderAsset) -> dict[str, Any] |
     """Of the human samples with photos in the scene's stretch of the row's log, the one nearest in time; None: none."""
     first, last = (-np.inf, np.inf) if asset.block is None else (asset.block.start_s, asset.block.end_s)
     wanted = ("attempt_id", "log_id", "image_source", "clip_start_s", "now_s")
-    found = [
-        other
-        for other in store.samples.read(wanted).to_pylist()
-        if other["log_id"] == row["log_id"]
-        and other["image_source"] == ImageSource.PHOTO
-        and first <= _now(other) <= last
-    ]
+    of_log = rows_where(store.samples, {"log_id": row["log_id"], "image_source": ImageSource.PHOTO.value}, wanted)
+    found = [other for other in of_log if first <= _now(other) <= last]
     if not found:
         return None
     nearest = min(found, key=lambda other: (abs(_now(other) - _now(row)), other["attempt_id"]))

@@ -4,36 +4,42 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from factory.config.arguments import Refused
-from factory.views.status import fate
+from factory.views.status import fate, rows_where
 
 if TYPE_CHECKING:
     from factory.graph.work import PreparedClip
+    from factory.store.reader import SampleTable
     from factory.store.samples import Store
     from tasks.world.arrays import Array
 
 
-def sample_ids(store: "Store") -> list[str]:
-    """In the order of ordinals. Raises Refused where there are none."""
-    ids = sorted(store.samples)
-    if not ids:
+def open_samples(store: "Store") -> "SampleTable":
+    """Its samples. Raises Refused where there are none, or they are of another schema version."""
+    from factory.store.reader import SampleTable
+
+    if not len(store.samples):
         raise Refused(f"{store.location.uri} holds no sample; python -m factory status shows why")
-    return ids
+    try:
+        return SampleTable(store.location.uri, store.location.options)
+    except ValueError as error:
+        raise Refused(str(error)) from error
 
 
-def find(store: "Store", which: str) -> str:
+def find(table: "SampleTable", store: "Store", which: str) -> str:
     """The attempt_id meant by an ordinal, an id or the beginning of one. Raises Refused."""
-    ids = sample_ids(store)
-    if which.isascii() and which.isdecimal() and int(which) < len(ids):
-        return ids[int(which)]
-    found = [key for key in ids if key.startswith(which)]
+    from factory.store.counts.codes import beginning
+
+    if which.isascii() and which.isdecimal() and int(which) < len(table):
+        return str(table.sample(int(which), ("attempt_id",))["attempt_id"])
+    found = table.beginning(which)
     if len(found) == 1:
         return found[0]
     if found:
         raise Refused(f"sample={which} is the beginning of {len(found)} ids: {', '.join(found[:8])}")
-    dropped = [row for row in store.outcomes.read().to_pylist() if row["attempt_id"].startswith(which)]
+    dropped = beginning(store.outcomes.keys(), which)
     if len(dropped) == 1:
-        raise Refused(fate(dropped[0]))
-    raise Refused(f"no sample {which}: ids begin otherwise, ordinals go from 0 to {len(ids) - 1}; see list=true")
+        raise Refused(fate(rows_where(store.outcomes, {"attempt_id": dropped[0]})[0]))
+    raise Refused(f"no sample {which}: ids begin otherwise, ordinals go from 0 to {len(table) - 1}; see list=true")
 
 
 def labelled_trajectories(row: dict[str, Any], file: str | None) -> "Array | None":

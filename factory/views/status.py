@@ -6,6 +6,7 @@ import shlex
 import time
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from functools import reduce
 from typing import TYPE_CHECKING, Any
 
 from factory.config.arguments import Refused
@@ -80,10 +81,10 @@ def out_of(out: str) -> "Location":
 
 def status_lines(store: "Store") -> Iterable[str]:
     """Tables, counts, funnel and the newest run."""
-    from factory.store.counts.funnel import funnel_of
+    from factory.store.counts.funnel import funnel_of_tables, funnel_tables
 
-    samples = store.samples.read(["split", "image_source", "dataset"], encoded=True)
-    outcomes = counted(store.outcomes.read(["kind"], encoded=True)["kind"])
+    samples, fell, lists = funnel_tables(store, ("split", "image_source", "dataset"))
+    outcomes = counted(fell["kind"])
     yield f"store       {store.location.uri}"
     for table in (store.samples, store.candidates, store.outcomes, store.plans):
         version = "not there yet" if table.version is None else f"version {table.version}"
@@ -93,7 +94,7 @@ def status_lines(store: "Store") -> Iterable[str]:
         yield f"{title:<14}" + (", ".join(f"{name} {n}" for name, n in sorted(counts.items())) or "no samples")
     yield "not samples   " + (", ".join(f"{kind} {n}" for kind, n in sorted(outcomes.items())) or "none")
     yield ""
-    funnel = funnel_of(store)
+    funnel = funnel_of_tables(samples, fell, lists, store.plans.read(), store.runs())
     yield funnel.text().rstrip()
     yield ""
     if funnel.balance.stages:
@@ -151,14 +152,17 @@ def counted(column: "pa.ChunkedArray") -> dict[str, int]:
     return {row["values"]: row["counts"] for row in column.unify_dictionaries().value_counts().to_pylist()}
 
 
-def rows_where(table: "KeyedTable", column: str, value: str) -> list[dict[str, Any]]:
-    """Whole rows with that value; only files that hold some are read whole."""
+def rows_where(
+    table: "KeyedTable", values: Mapping[str, str], columns: Sequence[str] | None = None
+) -> list[dict[str, Any]]:
+    """Rows with these values, None: whole; more than these columns is read only of files that hold some."""
     import pyarrow.compute as pc
 
     found, live = [], table.live_files()
-    for path, rows in table.files([column]):
-        if pc.any(at := pc.equal(rows[column], value)).as_py():
-            found += table.read_file(path, live[path]).filter(at).to_pylist()
+    for path, rows in table.files(list(values)):
+        fits = [pc.equal(rows[name], value) for name, value in values.items()]
+        if pc.any(at := reduce(pc.and_, fits)).as_py():
+            found += table.read_file(path, live[path], columns).filter(at).to_pylist()
     return found
 
 
@@ -170,7 +174,7 @@ def fate(row: Mapping[str, Any]) -> str:
 
 def _failed(store: "Store") -> tuple[list[dict[str, Any]], dict[str, int]]:
     """By log, clip and walk; how many of each kind of error."""
-    rows = rows_where(store.outcomes, "kind", "failed")
+    rows = rows_where(store.outcomes, {"kind": "failed"})
     rows.sort(key=lambda row: (row["log_id"], row["clip_id"], row["expert"], row["candidate_index"]))
     return rows, dict(sorted(Counter(row["error_kind"] for row in rows).items()))
 

@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from factory.store.counts.codes import Ints, codes, distinct
+from factory.store.counts.codes import Codes, Ints, codes, distinct
 from factory.store.outcomes import Kind
 from factory.store.samples import MADE_UNDER, run_number
 
@@ -30,10 +30,10 @@ class Attempts:
     clip_ids: tuple[str, ...]  # by `clip`
     experts: tuple[str, ...]  # by `expert`, sorted
     whys: tuple[str, ...]  # by `why`: ACCEPTED, EXHAUSTED, "stage.reason" or "failed.kind"
-    clip: Ints
-    expert: Ints
-    candidate: Ints
-    why: Ints
+    clip: Codes
+    expert: Codes
+    candidate: Codes
+    why: Codes
 
     @cached_property
     def accepted(self) -> NDArray[np.bool_]:
@@ -67,27 +67,30 @@ class Attempts:
 def attempts_of(samples: pa.Table, outcomes: pa.Table, runs: Sequence[Mapping[str, Any]]) -> Attempts:
     """From rows with the columns SAMPLE_COLUMNS and OUTCOME_COLUMNS; runs: the records of run.json, oldest first."""
     rows = pa.concat_tables([outcomes.select(ATTEMPT_COLUMNS), samples.select(ATTEMPT_COLUMNS)])
-    n_outcomes = outcomes.num_rows
+    n_outcomes, n_ages = outcomes.num_rows, 2 * len(runs) + 2
     clip, clip_ids = codes(rows["clip_id"])
     expert, experts = codes(rows["expert"])
-    candidate = rows["candidate_index"].to_numpy().astype(np.int64)
+    candidate = rows["candidate_index"].to_numpy()
     why, whys = _whys(outcomes)
-    why = np.concatenate([why, np.zeros(samples.num_rows, np.int64)])
-    width = int(candidate.max(initial=-1)) + 2
-    place = (expert * max(1, len(clip_ids)) + clip) * width + candidate + 1
-    age = 2 * _ages(rows, runs) + (np.arange(len(place)) >= n_outcomes)
-    order = np.lexsort((age, place))  # stable: of rows alike the last counts
-    newest = order[np.diff(place[order], append=-1) != 0]
+    why = np.concatenate([why, np.zeros(samples.num_rows, np.int32)])
+    age = 2 * (_ages(rows, runs) + 1)  # -1: of no record
+    age[n_outcomes:] += 1
+    place = expert.astype(np.int64)
+    for size, number in ((len(clip_ids), clip), (int(candidate.max(initial=-1)) + 2, candidate + 1), (n_ages, age)):
+        place *= size
+        place += number
+    order = np.argsort(place, kind="stable")  # of rows alike the last counts
+    newest = order[np.diff(place[order] // n_ages, append=-1) != 0]
     return Attempts(clip_ids, experts, whys, clip[newest], expert[newest], candidate[newest], why[newest])
 
 
-def _whys(outcomes: pa.Table) -> tuple[Ints, tuple[str, ...]]:
+def _whys(outcomes: pa.Table) -> tuple[Codes, tuple[str, ...]]:
     """What became of the rows of `outcomes`, in words; the first word is that of samples."""
     columns = [codes(outcomes[name]) for name in ("kind", "stage", "reason", "error_kind")]
     rows, at = distinct([numbers for numbers, _ in columns])
     words = [_why(*(texts[number] for number, (_, texts) in zip(row, columns))) for row in rows.tolist()]
     known = list(dict.fromkeys([ACCEPTED, EXHAUSTED, *words]))
-    return np.array([known.index(word) for word in words], np.int64)[at], tuple(known)
+    return np.array([known.index(word) for word in words], np.int32)[at], tuple(known)
 
 
 def _why(kind: str, stage: str, reason: str, error_kind: str) -> str:
@@ -96,11 +99,11 @@ def _why(kind: str, stage: str, reason: str, error_kind: str) -> str:
     return f"failed.{error_kind}" if kind == Kind.FAILED else f"{stage}.{reason}"
 
 
-def _ages(rows: pa.Table, runs: Sequence[Mapping[str, Any]]) -> Ints:
+def _ages(rows: pa.Table, runs: Sequence[Mapping[str, Any]]) -> Codes:
     """The number of the run that each row is of (factory.store.samples.run_number)."""
     names = [name for name in MADE_UNDER if name != "attempt_id"]
     columns = [codes(rows[name]) for name in names]
     different, at = distinct([numbers for numbers, _ in columns])
     number = run_number(runs)
     made = [{n: texts[i] for n, i, (_, texts) in zip(names, row, columns)} for row in different.tolist()]
-    return np.array([number(row) for row in made], np.int64)[at]
+    return np.array([number(row) for row in made], np.int32)[at]

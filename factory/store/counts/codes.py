@@ -1,6 +1,6 @@
 """Texts of millions of rows as integers: a number for each different text."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 import pyarrow as pa
@@ -8,31 +8,60 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 Ints = NDArray[np.int64]
+Codes = NDArray[np.int32]
+PACKED_ROWS = 2**16
 Bytes = NDArray[np.bytes_]
 
 
-def codes(column: pa.ChunkedArray) -> tuple[Ints, tuple[str, ...]]:
+def codes(column: pa.ChunkedArray) -> tuple[Codes, tuple[str, ...]]:
     """A number for each text, in the order of the texts, and the texts."""
     if not pa.types.is_dictionary(column.type):
         column = column.dictionary_encode()
     whole = column.unify_dictionaries().combine_chunks()
     if isinstance(whole, pa.ChunkedArray):  # of no chunk
-        return np.zeros(0, np.int64), ()
-    texts = np.array(whole.dictionary.to_pylist(), object)
-    used, at = np.unique(whole.indices.to_numpy().astype(np.int64), return_inverse=True)
-    order = np.argsort(texts[used])
-    number = np.empty(len(order), np.int64)
-    number[order] = np.arange(len(order))
-    return number[at], tuple(texts[used][order])
+        return np.zeros(0, np.int32), ()
+    texts, at = np.array(whole.dictionary.to_pylist(), object), whole.indices.to_numpy()
+    used = np.flatnonzero(np.bincount(at, minlength=len(texts)))
+    used = used[np.argsort(texts[used])]
+    number = np.empty(len(texts), np.int32)
+    number[used] = np.arange(len(used))
+    return number[at], tuple(texts[used])
 
 
-def distinct(columns: Sequence[Ints]) -> tuple[Ints, Ints]:
-    """The different rows (D, columns), and which of them each row is."""
-    key = np.zeros(len(columns[0]), np.int64)
+def packed(parts: Iterable[pa.Table], key: str) -> Iterator[pa.Table]:
+    """The rows in tables of at least PACKED_ROWS, the last one aside; texts but the key as numbers into a dictionary.
+
+    Dictionaries of many small files would cost more than their texts.
+    """
+    held: list[pa.Table] = []
+    for rows in parts:
+        held.append(rows)
+        if sum(rows.num_rows for rows in held) >= PACKED_ROWS:
+            yield _encoded(held, key)
+            held = []
+    if held:
+        yield _encoded(held, key)
+
+
+def _encoded(parts: Sequence[pa.Table], key: str) -> pa.Table:
+    rows = pa.concat_tables(parts)
+    for at, field in enumerate(rows.schema):
+        if field.type == pa.string() and field.name != key:
+            rows = rows.set_column(at, field.name, rows[field.name].dictionary_encode())
+    return rows.combine_chunks()
+
+
+def distinct(columns: Sequence[Ints | Codes]) -> tuple[Ints, Codes]:
+    """The different rows (D, columns) in order, and which of them each row is; of columns of few different numbers."""
+    rows, at = np.zeros((1, 0), np.int64), np.zeros(len(columns[0]), np.int32)
     for numbers in columns:
-        key = key * (int(numbers.max(initial=0)) + 1) + numbers
-    _, first, at = np.unique(key, return_index=True, return_inverse=True)
-    return np.stack([numbers[first] for numbers in columns], axis=1), at
+        width = int(numbers.max(initial=0)) + 1
+        at = at * np.int32(width) + numbers.astype(np.int32, copy=False)
+        used = np.flatnonzero(np.bincount(at, minlength=len(rows) * width))
+        number = np.empty(len(rows) * width, np.int32)
+        number[used] = np.arange(len(used))
+        rows, at = np.column_stack([rows[used // width], used % width]), number[at]
+    return rows, at
 
 
 def fixed_bytes(column: pa.ChunkedArray | pa.Array) -> Bytes:
@@ -49,6 +78,12 @@ def _fixed(texts: pa.Array) -> Bytes:
         return np.array([text.encode() for text in texts.to_pylist()], np.bytes_)
     start = int.from_bytes(texts.buffers()[1][4 * texts.offset : 4 * texts.offset + 4], "little")
     return np.frombuffer(texts.buffers()[2], f"S{width}", len(texts), start)
+
+
+def beginning(keys: Bytes, prefix: str) -> list[str]:
+    """Those of sorted keys that begin so, in order."""
+    first, behind = prefix.encode(), prefix.encode() + b"\xff"  # a byte that is in no text
+    return [key.decode() for key in keys[np.searchsorted(keys, first) : np.searchsorted(keys, behind)].tolist()]
 
 
 def both(a: Bytes, b: Bytes) -> Bytes:

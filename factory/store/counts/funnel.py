@@ -103,15 +103,22 @@ class Funnel:
 
 def funnel_of(store: Store, clip_ids: Collection[str] | None = None) -> Funnel:
     """The funnel of a store, or of some of its clips."""
-    samples, outcomes, lists = (
-        _of_clips(table.read(columns, encoded=True), clip_ids)
-        for table, columns in (
-            (store.samples, SAMPLE_COLUMNS),
-            (store.outcomes, OUTCOME_COLUMNS),
-            (store.candidates, LIST_COLUMNS),
-        )
-    )
+    samples, outcomes, lists = (_of_clips(rows, clip_ids) for rows in funnel_tables(store))
     return funnel_of_tables(samples, outcomes, lists, plans_of(store.plans, clip_ids), store.runs())
+
+
+def funnel_tables(store: Store, more: Sequence[str] = ()) -> tuple[pa.Table, pa.Table, pa.Table]:
+    """Samples, outcomes and lists of candidates with the columns that a funnel needs; more: others of samples.
+
+    Texts are numbers into a dictionary.
+    """
+    columns = list(dict.fromkeys([*SAMPLE_COLUMNS, *more]))
+    samples = store.samples.read(columns, encoded=True)
+    return (
+        samples,
+        store.outcomes.read(OUTCOME_COLUMNS, encoded=True),
+        store.candidates.read(LIST_COLUMNS, encoded=True),
+    )
 
 
 def funnel_of_tables(
@@ -127,9 +134,8 @@ def funnel_of_tables(
     if "" in attempts.experts:
         whole = attempts.why[attempts.expert == attempts.experts.index("")]
         of_clips = np.bincount(whole, minlength=len(attempts.whys))
-    without = (
-        lists.filter(pc.not_equal(lists["reason"], "")).group_by(["stage", "reason"]).aggregate([([], "count_all")])
-    )
+    empty = lists.select(["stage", "reason"]).filter(pc.not_equal(lists["reason"], "")).unify_dictionaries()
+    without = empty.group_by(["stage", "reason"]).aggregate([([], "count_all")])
     return Funnel(
         rows=tuple(
             row for number, name in enumerate(attempts.experts) if name for row in expert_rows(attempts, number)
@@ -167,7 +173,7 @@ def expert_rows(attempts: Attempts, number: int) -> list[FunnelRow]:
     at, why, accepted = attempts.round[tried], attempts.why[tried], attempts.accepted[tried]
     rounds, n_whys = int(at.max()) + 1, len(attempts.whys)
     counts = np.bincount(at * n_whys + why, minlength=rounds * n_whys).reshape(rounds, n_whys)
-    first = accepted & (np.diff(attempts.clip[tried] * (rounds + 1) + at, prepend=-1) != 0)
+    first = accepted & (np.diff(attempts.clip[tried].astype(np.int64) * (rounds + 1) + at, prepend=-1) != 0)
     first_tries = np.bincount(at[first], minlength=rounds)
     simulated = bool((attempts.candidate[tried] >= 0).any())
     rows, before = [], clips

@@ -11,7 +11,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from factory.store.candidates import Listed
-from factory.store.counts.codes import Bytes, Ints, codes, distinct, fixed_bytes
+from factory.store.counts.codes import Bytes, Codes, Ints, codes, distinct, fixed_bytes
 from factory.store.outcomes import Kind
 
 MADE_BY = ["expert", "expert_digest", "settings_hash", "stage_versions"]
@@ -127,7 +127,7 @@ def history_of(
 
 
 def _fates(
-    outcomes: pa.Table, samples: pa.Table, versions: Ints, version_texts: Sequence[str]
+    outcomes: pa.Table, samples: pa.Table, versions: Codes, version_texts: Sequence[str]
 ) -> tuple[NDArray[np.int32], tuple[tuple[Kind, int, str, int, str], ...]]:
     """What became of each row, as a place among the few different fates."""
     n = samples.num_rows

@@ -29,10 +29,8 @@ class McapTable(KeyedTable):
         """out: the store."""
         super().__init__(out.child(SAMPLES_MCAP.name), SAMPLES_MCAP)
 
-    def read_file(
-        self, path: str, partition: Mapping[str, str], columns: Sequence[str] | None = None, encoded: bool = False
-    ) -> pa.Table:
-        schema = self.schema_of(columns, encoded)
+    def read_file(self, path: str, partition: Mapping[str, str], columns: Sequence[str] | None = None) -> pa.Table:
+        schema = self.schema_of(columns)
         with naming(f"{self.location.uri}/{path}"):
             shard = open_shard(self.location, path)
             stored = shard.read([leaf for leaf in shard.leaves if leaf.partition(".")[0] in schema.names])

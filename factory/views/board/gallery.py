@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
@@ -12,6 +13,7 @@ from factory.views.board.watch import Snapshot, plain
 from factory.views.report_words import REASON_WORDS, to_the_side, turned
 from factory.views.status import fate, how_to_retry
 from tasks.subscores import SUBSCORES
+from tasks.world.arrays import Ints
 
 FILTERS = ("expert", "round", "image_source", "command", "split", "log_id")
 SIMULATED = "simulated"  # simulated=1: no logged drives
@@ -43,49 +45,56 @@ class NotThere(LookupError):
     """What was asked for is not in the tables; the message says so."""
 
 
-def chosen(shot: Snapshot, wanted: Mapping[str, str], order: str = "newest") -> pa.Table:
-    """Rows that fit, in order. Raises BadRequest for an unknown filter or order."""
+def chosen(shot: Snapshot, wanted: Mapping[str, str], order: str = "newest") -> Ints:
+    """Places in `samples` of the rows that fit, in order. Raises BadRequest for an unknown filter or order."""
     if order not in ORDERS:
         raise BadRequest(f"order={order}: must be one of {', '.join(ORDERS)}")
-    rows = shot.newest_first
+    rows, fits = shot.samples, np.ones(shot.samples.num_rows, bool)
     for name, value in wanted.items():
         if name == SIMULATED:
-            rows = rows.filter(pc.greater_equal(rows["candidate_index"], 0))
+            fits &= rows["candidate_index"].to_numpy() >= 0
             continue
         if name not in FILTERS:
             raise BadRequest(f"{name}: samples can be filtered by {', '.join((*FILTERS, SIMULATED))}")
         if name == "round" and not value.isdecimal():
             raise BadRequest(f"round={value}: must be a number")
-        rows = rows.filter(pc.equal(rows[name], int(value) if name == "round" else value))
+        fits &= pc.equal(rows[name], int(value) if name == "round" else value).to_numpy()
+    places = shot.newest_first[fits[shot.newest_first]]
     if not ORDERS[order]:
-        return rows
-    return rows.sort_by([*ORDERS[order], ("_written_ms", "descending"), ("attempt_id", "ascending")])
+        return places
+    keys = rows.select([name for name, _ in ORDERS[order]]).take(places)
+    return places[np.asarray(pc.sort_indices(keys, sort_keys=ORDERS[order]))]  # stable: of equals the newest first
 
 
 def gallery(shot: Snapshot, wanted: Mapping[str, str], page: int = 1, size: int = 12, order: str = "newest") -> Json:
     """One page of cards, counted from 1; beyond the last it is empty. Raises BadRequest."""
-    return {"version": shot.version, **_page(chosen(shot, wanted, order), page, size, lambda row: card_of(shot, row))}
+    places = chosen(shot, wanted, order)
+    return {"version": shot.version, **_page(shot.samples, places, page, size, lambda row: card_of(shot, row))}
 
 
 def failures(shot: Snapshot, page: int = 1, size: int = 50) -> Json:
     """A page of failed attempts with their errors, by log; of a failed clip `expert` is empty. Raises BadRequest."""
     rows = shot.outcomes.filter(pc.equal(shot.outcomes["kind"], Kind.FAILED.value))
-    rows = plain(rows).sort_by([("log_id", "ascending"), ("clip_id", "ascending"), ("attempt_id", "ascending")])
+    by = [("log_id", "ascending"), ("clip_id", "ascending"), ("attempt_id", "ascending")]
+    order = np.asarray(pc.sort_indices(plain(rows.select([name for name, _ in by])), sort_keys=by))
 
     def failure(row: Row) -> Json:
         kind = row["error_kind"]
         known = {"kind": kind, "words": REASON_WORDS.get(kind, ""), "retry": how_to_retry(kind, shot.runs)}
         return {name: row[name] for name in FAILED} | known
 
-    return _page(rows, page, size, failure, most=size)
+    return _page(rows, order, page, size, failure, most=size)
 
 
-def _page(rows: pa.Table, page: int, size: int, item: Callable[[Row], Json], most: int = MOST_A_PAGE) -> Json:
+def _page(
+    rows: pa.Table, order: Ints, page: int, size: int, item: Callable[[Row], Json], most: int = MOST_A_PAGE
+) -> Json:
+    """order: places in `rows`, of which a page's are unpacked."""
     if page < 1 or not 1 <= size <= most:
         raise BadRequest(f"page={page} size={size}: pages begin at 1, a page holds 1 to {most}")
-    items = [item(row) for row in rows.slice((page - 1) * size, size).to_pylist()]
-    pages = max(1, -(-rows.num_rows // size))
-    return {"total": rows.num_rows, "page": page, "pages": pages, "size": size, "items": items}
+    items = [item(row) for at in order[(page - 1) * size :][:size] for row in rows.slice(at, 1).to_pylist()]
+    pages = max(1, -(-len(order) // size))
+    return {"total": len(order), "page": page, "pages": pages, "size": size, "items": items}
 
 
 def card_of(shot: Snapshot, row: Row) -> Json:
@@ -96,9 +105,9 @@ def card_of(shot: Snapshot, row: Row) -> Json:
 
 def place_of(shot: Snapshot, attempt_id: str) -> int:
     """Its place in `newest_first`. Raises NotThere, which says what became of the attempt if anything did."""
-    at = pc.index(shot.newest_first["attempt_id"], attempt_id).as_py()
+    at = pc.index(shot.samples["attempt_id"], attempt_id).as_py()
     if at >= 0:
-        return int(at)
+        return int(np.flatnonzero(shot.newest_first == at)[0])
     other = shot.outcomes.filter(pc.equal(shot.outcomes["attempt_id"], attempt_id)).to_pylist()
     raise NotThere(fate(other[0]) if other else f"no sample {attempt_id}")
 
@@ -106,11 +115,10 @@ def place_of(shot: Snapshot, attempt_id: str) -> int:
 def whole(shot: Snapshot, attempt_id: str, row: Row, candidates: KeyedTable) -> Json:
     """One sample's page from its whole row; newer, older: its neighbours in the gallery. Raises NotThere."""
     at = place_of(shot, attempt_id)
-    rows = shot.newest_first
-    card = card_of(shot, rows.slice(at, 1).to_pylist()[0])
+    card = card_of(shot, shot.newest(at))
 
     def neighbour(place: int) -> str | None:
-        return rows["attempt_id"][place].as_py() if 0 <= place < rows.num_rows else None
+        return shot.newest(place)["attempt_id"] if 0 <= place < shot.samples.num_rows else None
 
     return {
         "item": card,

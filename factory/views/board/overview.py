@@ -227,7 +227,6 @@ def _coverage(shot: Snapshot) -> Json:
     along = float(settings.get("perturb.max_longitudinal_m", REACH_M[0]))
     aside = float(settings.get("perturb.max_lateral_m", REACH_M[1]))
     edges = (np.linspace(-aside, aside, BINS[1] + 1), np.linspace(-along, along, BINS[0] + 1))
-    accepted = pc.list_flatten(shot.samples["candidate_end"]).to_numpy().reshape(-1, 4)[:, :2]
 
     def counted(points: np.ndarray) -> list[list[int]]:
         return np.histogram2d(points[:, 1], points[:, 0], edges)[0].astype(int).tolist()
@@ -237,6 +236,6 @@ def _coverage(shot: Snapshot) -> Json:
         "reach_along_m": along,
         "reach_aside_m": aside,
         "candidates": counted(shot.end_points),
-        "accepted": counted(accepted),
+        "accepted": counted(shot.accepted_points),
         "beyond": int((~inside).sum()),  # end points outside
     }

@@ -148,11 +148,8 @@ class Pictures:
 
     def _place(self, shot: Snapshot, attempt_id: str) -> tuple[str, int, Mapping[str, object]]:
         """Its file, its row in it, and what the file's path says."""
-        at = place_of(shot, attempt_id)
-        file, row, *partition = (
-            shot.newest_first[name][at].as_py() for name in ("_file", "_row", *SAMPLES.partition_by)
-        )
-        return shot.sample_paths[file], row, dict(zip(SAMPLES.partition_by, partition))
+        row = shot.newest(place_of(shot, attempt_id))
+        return shot.sample_paths[row["_file"]], row["_row"], {name: row[name] for name in SAMPLES.partition_by}
 
 
 def _jpeg(image: Mapping[str, Any], small: bool) -> bytes:

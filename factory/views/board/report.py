@@ -44,20 +44,11 @@ def write_report(store: "Store", to: str | None = None) -> str:
 
 def remember(store: "Store", assembled: "Run") -> None:
     """Write report.json, for this report and later ones."""
-    from factory.store.outcomes import Kind
-    from factory.views.examples import Again, rejected_examples
+    from factory.views.examples import Again, rejected_examples, rejected_rows
 
-    taken = set(store.samples)
-    rejected = [
-        row
-        for row in store.outcomes.read().to_pylist()
-        if row["kind"] == Kind.REJECTED
-        and row["expert"]
-        and row["candidate_index"] >= 0
-        and row["attempt_id"] not in taken
-    ]
     config, index, vocabulary = assembled.config, assembled.index, assembled.work.vocabulary
-    drawn = rejected_examples(rejected, Again(store, assembled.work, {ref.clip_id: ref for ref in index.refs}).picture)
+    again = Again(store, assembled.work, {ref.clip_id: ref for ref in index.refs})
+    drawn = rejected_examples(rejected_rows(store), again.picture)
     n_found = len(index.refs) + len(index.broken)
     planned = n_found if config.limit is None else min(config.limit, n_found)
     told = {

@@ -13,12 +13,12 @@ from typing import Any
 from factory.store.reader import decoded
 from factory.store.samples import Store
 from factory.store.schema import NOW_INDEX
-from factory.views.board.gallery import card_of, failures, gallery, whole
+from factory.views.board.gallery import card_of, failures, gallery, place_of, whole
 from factory.views.board.overview import overview
 from factory.views.board.pictures import Pictures
 from factory.views.board.server import STATIC
 from factory.views.board.watch import Snapshot, Watch
-from factory.views.examples import CAMERA_PX, spread
+from factory.views.examples import CAMERA_PX, few_of_each, spread
 from factory.views.sample_picture import front_camera, images_at_now, small_jpeg
 
 N_SAMPLES = 18  # in the gallery, each with a page and some 150 kB of pictures
@@ -58,10 +58,10 @@ def still_page(store: Store, extra: Mapping[str, Any]) -> bytes:
 
 def _shown(shot: Snapshot, always: Sequence[str]) -> list[Mapping[str, Any]]:
     """Rows of samples, newest first: some that must be there, and others as unlike each other as can be."""
-    rows = shot.newest_first.to_pylist()
+    rows = few_of_each(shot.samples.select(["attempt_id", "expert", "clip_id", "round"]), "expert")
     varied = spread(rows, lambda r: (r["expert"], r["clip_id"], r["round"]), lambda r: str(r["attempt_id"]))
     ids = list(dict.fromkeys([*always, *(row["attempt_id"] for row in varied)]))[:N_SAMPLES]
-    return [row for row in rows if row["attempt_id"] in set(ids)]
+    return [shot.newest(place) for place in sorted(place_of(shot, attempt_id) for attempt_id in ids)]
 
 
 def _with_pictures(found: Mapping[str, Any], row: Mapping[str, Any], kept: dict[str, str]) -> list[dict[str, Any]]:

@@ -11,7 +11,7 @@ knows to count once; the next look sees the whole group.
 import json
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -19,12 +19,14 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from numpy.typing import NDArray
 
 from factory.store.counts import funnel
+from factory.store.counts.codes import PACKED_ROWS, packed
 from factory.store.plans import PLANS
 from factory.store.samples import CURRENT_RUN, Store
 from factory.store.table import KeyedTable, LiveFile
-from tasks.world.arrays import F32
+from tasks.world.arrays import F32, Ints
 
 SAMPLE_COLUMNS = (
     "attempt_id",
@@ -41,15 +43,19 @@ SAMPLE_COLUMNS += ("stage1_score", "stage2_score", "candidate_end")
 OUTCOME_COLUMNS = ("attempt_id", *funnel.OUTCOME_COLUMNS, "log_id", "detail", "error", "tries", "seconds")
 CANDIDATE_COLUMNS = (*funnel.LIST_COLUMNS, "candidates")
 LOOK_EVERY_S = 2.0
+UNPACKED = ("seconds", "candidates", "candidate_end")  # columns of which only sums and end points are kept
+Points = NDArray[np.floating]
+MOST_PARTS = 256  # of a table
 
 
 @dataclass(frozen=True)
-class WatchedFile:
-    """What is kept of one file; `rows` has the columns _file, _row and _written_ms beside those of the table."""
+class WatchedFiles:
+    """What is kept of some files; `rows` has the columns _file, _row and _written_ms beside those of the table."""
 
     rows: pa.Table
     seconds: Mapping[str, tuple[int, float]] = field(default_factory=dict)  # outcomes: stage -> attempts, seconds
-    end_points: F32 | None = None  # candidates: (N, 2) x, y [m], frame of the logged pose at T+H
+    # (N, 2) x, y [m] of candidates, or of samples where they began, frame of the logged pose at T+H
+    end_points: Points = field(default_factory=lambda: np.zeros((0, 2), np.float32))
 
 
 class Watched:
@@ -58,7 +64,7 @@ class Watched:
     def __init__(self, table: KeyedTable, columns: Sequence[str]) -> None:
         self.table, self._columns = table, list(columns)
         self.files: Mapping[str, LiveFile] = {}
-        self.parts: dict[str, WatchedFile] = {}
+        self.parts: dict[tuple[str, ...], WatchedFiles] = {}
         self.paths: list[str] = []  # by the number in _file
         self._seen: int | None = None
 
@@ -67,28 +73,62 @@ class Watched:
         self.table.refresh()
         if self.table.version == self._seen:
             return False
-        files = self.table.file_facts()
-        parts = {}
-        for path, file in sorted(files.items()):
-            parts[path] = self.parts[path] if path in self.parts else self._read(path, file)
-        self.files, self.parts, self._seen = files, parts, self.table.version
+        self.files, self._seen = self.table.file_facts(), self.table.version
+        self.parts = {paths: part for paths, part in self.parts.items() if self.files.keys() >= set(paths)}
+        if len(self.parts) > MOST_PARTS:  # of a run that is watched, a few files each
+            self.parts = {sum(self.parts, ()): _together(list(self.parts.values()))}
+        known = {path for paths in self.parts for path in paths}
+        for paths in self._groups(sorted(self.files.keys() - known)):
+            self.parts[paths] = self._read(paths)
         return True
+
+    def _groups(self, paths: Sequence[str]) -> Iterator[tuple[str, ...]]:
+        """Files that are read together: one, or more with PACKED_ROWS rows."""
+        group: list[str] = []
+        for path in paths:
+            group.append(path)
+            if sum(self.files[path].n_rows for path in group) >= PACKED_ROWS:
+                yield tuple(group)
+                group = []
+        if group:
+            yield tuple(group)
 
     def rows(self) -> pa.Table:
         """All of them."""
-        names = [name for name in self._columns if name not in ("seconds", "candidates")]
+        names = [name for name in self._columns if name not in UNPACKED]
         empty = self.table.schema_of(names, encoded=True).empty_table()
-        return pa.concat_tables([_placed(empty, 0, 0), *(part.rows for part in self.parts.values())])
+        return pa.concat_tables(
+            [_placed(empty, 0, LiveFile({}, 0, 0, 0)), *(part.rows for part in self.parts.values())]
+        )
 
-    def _read(self, path: str, file: LiveFile) -> WatchedFile:
-        rows = self.table.read_file(path, file.partition, self._columns, encoded=True)
+    def _read(self, paths: Sequence[str]) -> WatchedFiles:
+        read = [self._read_file(path) for path in paths]
+        (rows,) = packed([pa.concat_tables(file.rows for file in read)], self.table.spec.key)
+        return WatchedFiles(rows, _summed([file.seconds for file in read]), _joined(read))
+
+    def _read_file(self, path: str) -> WatchedFiles:
+        file = self.files[path]
+        rows = self.table.read_file(path, file.partition, self._columns)
         self.paths.append(path)
-        seconds, ends = {}, None
+        kept = _placed(rows.drop_columns([n for n in UNPACKED if n in rows.column_names]), len(self.paths) - 1, file)
         if "seconds" in self._columns:
-            seconds, rows = seconds_of(rows["seconds"]), rows.drop_columns(["seconds"])
+            return WatchedFiles(kept, seconds=seconds_of(rows["seconds"]))
         if "candidates" in self._columns:
-            ends, rows = end_points_of(rows["candidates"]), rows.drop_columns(["candidates"])
-        return WatchedFile(_placed(rows, len(self.paths) - 1, file.written_ms), seconds, ends)
+            return WatchedFiles(kept, end_points=end_points_of(rows["candidates"]))
+        if "candidate_end" in self._columns:
+            return WatchedFiles(
+                kept, end_points=pc.list_flatten(rows["candidate_end"]).to_numpy().reshape(-1, 4)[:, :2]
+            )
+        return WatchedFiles(kept)
+
+
+def _together(parts: Sequence[WatchedFiles]) -> WatchedFiles:
+    rows = pa.concat_tables(part.rows for part in parts).unify_dictionaries().combine_chunks()
+    return WatchedFiles(rows, _summed([part.seconds for part in parts]), _joined(parts))
+
+
+def _joined(parts: Iterable[WatchedFiles]) -> Points:
+    return np.concatenate([np.zeros((0, 2), np.float32), *(part.end_points for part in parts)])
 
 
 def plain(rows: pa.Table) -> pa.Table:
@@ -97,11 +137,11 @@ def plain(rows: pa.Table) -> pa.Table:
     return rows.cast(pa.schema(kinds))
 
 
-def _placed(rows: pa.Table, file: int, written_ms: int) -> pa.Table:
+def _placed(rows: pa.Table, number: int, file: LiveFile) -> pa.Table:
     n = rows.num_rows
-    rows = rows.append_column("_file", pa.repeat(pa.scalar(file, pa.int32()), n))
+    rows = rows.append_column("_file", pa.repeat(pa.scalar(number, pa.int32()), n))
     rows = rows.append_column("_row", pa.array(np.arange(n), pa.int32()))
-    return rows.append_column("_written_ms", pa.repeat(pa.scalar(written_ms, pa.int64()), n))
+    return rows.append_column("_written_ms", pa.repeat(pa.scalar(file.written_ms, pa.int64()), n))
 
 
 def seconds_of(column: pa.ChunkedArray) -> dict[str, tuple[int, float]]:
@@ -136,7 +176,8 @@ class Snapshot:
     candidate_paths: Sequence[str]
     sample_bytes: int
     seconds: Mapping[str, tuple[int, float]]  # stage -> attempts, seconds: of rejected attempts
-    end_points: F32  # (N, 2) of all candidates
+    end_points: Points  # (N, 2) x, y [m] of all candidates, frame of the logged pose at T+H
+    accepted_points: Points  # (N, 2) likewise, of those that became samples
     runs: Sequence[Mapping[str, Any]]  # records of run.json, oldest first
     last: Mapping[str, Any]  # last_run.json, empty where there is none
     current: Mapping[str, Any]  # current_run.json, likewise
@@ -157,9 +198,15 @@ class Snapshot:
         return funnel.funnel_of_tables(self.samples, self.outcomes, self.candidates, self.plans, self.runs)
 
     @cached_property
-    def newest_first(self) -> pa.Table:
-        """Samples: those committed last first, and by attempt_id within a file's time."""
-        return self.samples.sort_by([("_written_ms", "descending"), ("attempt_id", "ascending")])
+    def newest_first(self) -> Ints:
+        """Places of samples: those committed last first, and by attempt_id within a file's time."""
+        keys = [("_written_ms", "descending"), ("attempt_id", "ascending")]
+        return np.asarray(pc.sort_indices(self.samples, sort_keys=keys)).astype(np.int64)
+
+    def newest(self, place: int) -> Mapping[str, Any]:
+        """The sample at a place of `newest_first`."""
+        (row,) = self.samples.slice(self.newest_first[place], 1).to_pylist()
+        return dict(row)
 
 
 class Watch:
@@ -196,7 +243,6 @@ class Watch:
         self._told = told
         self.store.plans.refresh()
         self._plans = self.store.plans.read()
-        ends = [part.end_points for part in self._candidates.parts.values() if part.end_points is not None]
         return Snapshot(
             version=".".join("-" if t.table.version is None else str(t.table.version) for t in tables),
             taken_s=time.time(),
@@ -208,7 +254,8 @@ class Watch:
             candidate_paths=tuple(self._candidates.paths),
             sample_bytes=sum(file.n_bytes for file in self._samples.files.values()),
             seconds=_summed([part.seconds for part in self._outcomes.parts.values()]),
-            end_points=np.concatenate([np.zeros((0, 2), np.float32), *ends]),
+            end_points=_joined(self._candidates.parts.values()),
+            accepted_points=_joined(self._samples.parts.values()),
             runs=self.store.runs(),
             last=json.loads(told[1] or b"{}"),
             current=json.loads(told[2] or b"{}"),

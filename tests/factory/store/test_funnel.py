@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES
 from factory.graph.execute import execute
+from factory.store.candidates import ClipCandidates
 from factory.store.counts.attempts import OUTCOME_COLUMNS, SAMPLE_COLUMNS, Attempts, attempts_of
 from factory.store.counts.funnel import FunnelRow, expert_rows, funnel_of, image_sources_text
 from factory.store.outcomes import OUTCOMES
@@ -158,3 +159,14 @@ def test_a_redo_that_failed_is_seen_and_not_mended_by_the_next_run(tmp_path: Pat
     assert run(broken, on_change="keep") == COMPLETE_WITH_FAILURES
     assert run(ToyWork(threshold=0.29), on_change="redo", retry=True) == COMPLETE
     assert sum(row.failed for row in funnel_of(Store(tmp_path)).rows) == 0
+
+
+def test_clips_without_candidates_are_counted_over_files_of_different_reasons(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    for number, reason in enumerate(("gate", "speed", "", "speed")):
+        made = {"clip_id": f"c{number}", "stage": "perturb" if reason else "", "reason": reason}
+        rest = dict.fromkeys(("dataset", "log_id", "content_digest", "prepare_digest", "vocabulary_digest"), "x")
+        store.commit([ClipCandidates(**made, **rest, gate_counts={"lateral": 2}, candidates=())], [], [])
+    funnel = funnel_of(store)
+    assert funnel.clips_without_candidates == {"perturb.speed": 2, "perturb.gate": 1}
+    assert funnel.clips_prepared == 4 and funnel.gates == {"lateral": 8}

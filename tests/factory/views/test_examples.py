@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 from factory.config.run import load_config
@@ -12,7 +13,16 @@ from factory.graph.execute import execute
 from factory.setup.settings import Run, assemble
 from factory.store.reader import SampleTable, decoded
 from factory.store.samples import Store
-from factory.views.examples import Again, Row, rejected_examples, spread, strips_of
+from factory.views.examples import (
+    PER_VALUE,
+    Again,
+    Row,
+    few_of_each,
+    rejected_examples,
+    rejected_rows,
+    spread,
+    strips_of,
+)
 from factory.views.sample_picture import encoded, fitted, sample_sheet
 from tests.factory.toy import ToyWork, refs
 
@@ -34,6 +44,26 @@ def test_examples_are_spread_and_do_not_depend_on_the_order_of_rows() -> None:
     assert chosen(rows[::-1]) == first
     assert len({row["reason"] for row in rows if row["id"] in first}) == 6
     assert len({row["clip"] for row in rows if row["id"] in first}) == 6
+
+
+def test_spread_needs_no_more_than_few_of_each() -> None:
+    rows = [{"attempt_id": f"{i * 7919 % 900:03d}", "reason": f"r{i % 3}", "clip": i % 11} for i in range(900)]
+    table = pa.table({name: [row[name] for row in rows] for name in rows[0]})
+    table = table.set_column(1, "reason", table["reason"].dictionary_encode())
+
+    def chosen(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        return spread(rows, lambda r: (r["reason"], r["clip"]), lambda r: str(r["attempt_id"]))
+
+    few = few_of_each(table, "reason")
+    assert len(few) == 3 * PER_VALUE and chosen(few) == chosen(rows)
+
+
+def test_rejected_rows_are_simulated_attempts_that_are_no_sample(store: Store) -> None:
+    found = {row["attempt_id"]: row for row in rejected_rows(store)}
+    expected = [r for r in store.outcomes.read().to_pylist() if r["kind"] == "rejected" and r["candidate_index"] >= 0]
+    assert found and sorted(found) == sorted(row["attempt_id"] for row in expected)
+    for row in expected:
+        assert found[row["attempt_id"]].items() <= row.items()
 
 
 def test_an_image_that_is_none_says_so(store: Store) -> None:
