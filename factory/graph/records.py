@@ -53,7 +53,7 @@ class Records:
             tries -= what.kind is ErrorKind.MACHINE  # never counts
             poison = what.kind in (ErrorKind.SYSTEM, ErrorKind.LIMIT) and tries + 1 >= QUARANTINE_AFTER
             kind = ErrorKind.POISON if poison else what.kind
-            became = {"kind": Kind.FAILED.value, "error_kind": kind.value, "error": what.error}
+            became = {"kind": Kind.FAILED.value, "stage": what.task, "error_kind": kind.value, "error": what.error}
         else:
             became = {"kind": Kind.EXHAUSTED.value}
         return Outcome(

@@ -13,7 +13,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from factory.graph.work import Dropped, Halted, NotReady, PreparedClip, Stopped, Underway, Work, go_on
+from factory.graph.work import Columns, Dropped, Halted, NotReady, PreparedClip, Stopped, Underway, Work, go_on
 from factory.readers.base import BadClip, ClipRef
 from factory.store.cache import BadCacheFile, ClipCache, SceneFiles
 from factory.store.disk import why_disk_full
@@ -39,6 +39,7 @@ class Failure:
     kind: ErrorKind
     error: str
     disk_full: str = ""  # what a full disk said: nothing more can be written, and nothing failed by itself
+    task: str = ""  # of an attempt, where it is known (tasks.stages.ATTEMPT)
 
 
 @dataclass(frozen=True)
@@ -189,9 +190,14 @@ def attempt(
 ) -> tuple[Attempted | HandedOn | Failure, pa.Table | Underway | None]:
     """Some stages of one attempt, from where it stands; an accepted one is checked against the schema here, where its
     traceback still means something."""
-    began = time.perf_counter()
+    began, task = time.perf_counter(), ""
     try:
-        result = go_on(work, stages, so_far, stamp.candidate_index, stamp.expert)
+        result: Underway | Columns | Dropped
+        for task in stages:
+            result = go_on(work, [task], so_far, stamp.candidate_index, stamp.expert)
+            if not isinstance(result, Underway):
+                break
+            so_far = result
         if isinstance(result, Underway):
             return HandedOn(), result
         seconds = result.seconds or {"attempt": time.perf_counter() - began}
@@ -212,7 +218,7 @@ def attempt(
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # the same boundary
-        return failure_of(error), None
+        return replace(failure_of(error), task=task), None
 
 
 def write(out: Location, *rows: pa.Table) -> tuple[Shard | Failure, None]:

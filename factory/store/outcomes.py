@@ -49,7 +49,7 @@ class Outcome:
     kind: str  # Kind
     settings_hash: str
     stage_versions: str  # canonical JSON
-    stage: str = ""  # rejected: by which stage
+    stage: str = ""  # rejected: by which stage; failed: in which task of an attempt, where that is known
     reason: str = ""  # rejected: why
     detail: str = ""
     error_kind: str = ""  # ErrorKind

@@ -117,7 +117,7 @@ def _candidate_facts(row: Row, clip: Row) -> list[tuple[str, object]]:
 def _attempt_facts(store: "Store", row: Row) -> list[tuple[str, object]]:
     walk = {"clip_id": row["clip_id"], "expert": row["expert"]}
     earlier = [
-        f"{o['candidate_index']} {o['kind']} by {o['stage']}.{o['reason']}".removesuffix(" by .")
+        f"{o['candidate_index']} {o['kind']} by {o['stage']}.{o['reason']}".rstrip(".").removesuffix(" by ")
         for o in rows_where(store.outcomes, walk, ("candidate_index", "kind", "stage", "reason"))
         if 0 <= o["candidate_index"] < row["candidate_index"]
     ]

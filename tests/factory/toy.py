@@ -173,6 +173,7 @@ class ToyWork:
     def label(self, driven: Driven) -> Columns:
         name, row = driven.payload  # type: ignore[misc]
         self._note(f"label {name} on {where()}")
+        self._trouble(f"{name}:label")
         return Columns({key: value for key, value in row.items() if key not in PICTURES}, {"labels": 0.03})
 
     def _note(self, line: str) -> None:

@@ -16,11 +16,13 @@ from numpy.typing import NDArray
 from factory.store.counts.codes import Codes, Ints, codes, distinct
 from factory.store.outcomes import Kind
 from factory.store.samples import MADE_UNDER, run_number
+from tasks.stages import ATTEMPT, TASKS
 
 ATTEMPT_COLUMNS = [*(name for name in MADE_UNDER if name != "attempt_id"), "clip_id", "candidate_index"]
 SAMPLE_COLUMNS = ATTEMPT_COLUMNS
 OUTCOME_COLUMNS = [*ATTEMPT_COLUMNS, "kind", "stage", "reason", "error_kind"]
 ACCEPTED, EXHAUSTED = "", "exhausted"  # among `whys`
+STAGES_OF = {task.name: task.stages for task in TASKS}
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,7 @@ class Attempts:
     expert: Codes
     candidate: Codes
     why: Codes
+    task: Codes  # place in tasks.stages.ATTEMPT of the task that it ended in, behind them all where it was accepted
 
     @cached_property
     def accepted(self) -> NDArray[np.bool_]:
@@ -71,8 +74,9 @@ def attempts_of(samples: pa.Table, outcomes: pa.Table, runs: Sequence[Mapping[st
     clip, clip_ids = codes(rows["clip_id"])
     expert, experts = codes(rows["expert"])
     candidate = rows["candidate_index"].to_numpy()
-    why, whys = _whys(outcomes)
+    why, whys, task = _whys(outcomes)
     why = np.concatenate([why, np.zeros(samples.num_rows, np.int32)])
+    task = np.concatenate([task, np.full(samples.num_rows, len(ATTEMPT), np.int32)])
     age = 2 * (_ages(rows, runs) + 1)  # -1: of no record
     age[n_outcomes:] += 1
     place = expert.astype(np.int64)
@@ -81,16 +85,23 @@ def attempts_of(samples: pa.Table, outcomes: pa.Table, runs: Sequence[Mapping[st
         place += number
     order = np.argsort(place, kind="stable")  # of rows alike the last counts
     newest = order[np.diff(place[order] // n_ages, append=-1) != 0]
-    return Attempts(clip_ids, experts, whys, clip[newest], expert[newest], candidate[newest], why[newest])
+    return Attempts(clip_ids, experts, whys, clip[newest], expert[newest], candidate[newest], why[newest], task[newest])
 
 
-def _whys(outcomes: pa.Table) -> tuple[Codes, tuple[str, ...]]:
-    """What became of the rows of `outcomes`, in words; the first word is that of samples."""
+def _whys(outcomes: pa.Table) -> tuple[Codes, tuple[str, ...], Codes]:
+    """What became of the rows of `outcomes`, in words, of which the first is for samples; the tasks they ended in."""
     columns = [codes(outcomes[name]) for name in ("kind", "stage", "reason", "error_kind")]
     rows, at = distinct([numbers for numbers, _ in columns])
-    words = [_why(*(texts[number] for number, (_, texts) in zip(row, columns))) for row in rows.tolist()]
+    found = [[texts[number] for number, (_, texts) in zip(row, columns)] for row in rows.tolist()]
+    words = [_why(*row) for row in found]
     known = list(dict.fromkeys([ACCEPTED, EXHAUSTED, *words]))
-    return np.array([known.index(word) for word in words], np.int32)[at], tuple(known)
+    tasks = np.array([_task(stage) for _, stage, _, _ in found], np.int32)
+    return np.array([known.index(word) for word in words], np.int32)[at], tuple(known), tasks[at]
+
+
+def _task(stage: str) -> int:
+    """Place in ATTEMPT of the task of that stage or name; of one that was not told the first."""
+    return next((i for i, name in enumerate(ATTEMPT) if stage == name or stage in STAGES_OF[name]), 0)
 
 
 def _why(kind: str, stage: str, reason: str, error_kind: str) -> str:

@@ -1,7 +1,10 @@
 """What was planned and what became of it, from the tables alone: planned = accepted + rejected + failed + pending.
 
-Counted are clips on the way to their list of candidates, and then samples: one for each clip, expert and round that a
-run set out to make. A walk that ended, at the end of its list or at a failed attempt, ended for all rounds ahead of it.
+Counted are clips on the way to their list of candidates; then, for each expert, attempts from task to task: all that
+its walks came to, and of a walk that has not ended the next one, which pends at the first task; and then samples: one
+for each clip, expert and round that a run set out to make. A walk that ended, at the end of its list or at a failed
+attempt, ended for all rounds ahead of it. A failed attempt of which no task was told, as its process died or ran over
+its limits, counts at the first.
 """
 
 import io
@@ -16,7 +19,7 @@ from rich.table import Table
 
 from factory.store.counts.attempts import Attempts
 from factory.store.counts.codes import Ints
-from tasks.stages import STAGES
+from tasks.stages import ATTEMPT, STAGES
 
 CLIP, PERTURB, WRITE = STAGES[0].name, STAGES[1].name, STAGES[-1].name
 COUNTS = ("planned", "accepted", "rejected", "failed", "pending")
@@ -25,12 +28,13 @@ BALANCE_COLUMNS = ["clip_id", "stage", "reason"]  # of `candidates`
 
 @dataclass(frozen=True)
 class Balance:
-    """One stage; of the last one, which a sample has passed when it is there, each round of an expert."""
+    """One stage, or task of attempts; of the last one, which a sample has passed when it is there, each round of an
+    expert."""
 
     stage: str
     expert: str  # empty: of clips
-    round: int  # -1: of clips
-    planned: int  # clips, or samples
+    round: int  # -1: of clips or attempts
+    planned: int  # clips, attempts or samples
     accepted: int  # went on to the next stage, or are samples
     rejected: int  # turned down for good: their clip was, or their walk came to its end
     failed: int  # stand at a failed clip or attempt
@@ -85,10 +89,28 @@ def balance_of(plans: pa.Table, attempts: Attempts, lists: pa.Table) -> BalanceS
     for expert, wanted in sorted(rounds.items()):
         fell, broke, made = _ends(attempts, expert, at, len(clips))
         fell, broke = fell | dropped, broke | broken
-        walks_pending += int(np.count_nonzero((made < wanted) & ~fell & ~broke))
+        pending = int(np.count_nonzero((made < wanted) & ~fell & ~broke))
+        walks_pending += pending
+        found += _of_attempts(attempts, expert, at, pending)
         for number in range(int(wanted.max())):
             found.append(_balance(WRITE, expert, number, wanted > number, made > number, fell, broke))
     return BalanceSheet(tuple(found), walks_pending)
+
+
+def _of_attempts(attempts: Attempts, expert: str, at: Ints, pending: int) -> list[Balance]:
+    """A line for each task; pending: walks that have not ended, each with one attempt that is to be made next."""
+    mine = np.zeros(len(attempts.task), bool)
+    if expert in attempts.experts:
+        mine = (attempts.expert == attempts.experts.index(expert)) & (at[attempts.clip] >= 0) & ~attempts.exhausted
+    failed = np.bincount(attempts.task[mine & attempts.failed], minlength=len(ATTEMPT) + 1)
+    ended = np.bincount(attempts.task[mine], minlength=len(ATTEMPT) + 1)
+    found = []
+    for number, task in enumerate(ATTEMPT):
+        left, broke = int(ended[number + 1 :].sum()), int(failed[number])
+        fell = int(ended[number]) - broke
+        found.append(Balance(task, expert, -1, left + fell + broke + pending, left, fell, broke, pending))
+        pending = 0
+    return found
 
 
 def planned_rounds(plans: pa.Table) -> tuple[NDArray[np.object_], dict[str, Ints]]:

@@ -6,6 +6,8 @@ from factory.store.counts.balance import BalanceSheet
 from factory.store.counts.funnel import funnel_of
 from factory.store.samples import Store
 
+TASK_OF = {"rollout": "drive", "expert": "drive", "reward": "drive", "render": "render", "label": "label"}
+ATTEMPT = ("drive", "render", "label")
 Counts = tuple[int, int, int, int, int]  # planned, accepted, rejected, failed, pending
 
 
@@ -56,4 +58,15 @@ def slow(store: Store) -> dict[tuple[str, str, int], Counts]:
             ended = "failed" if "failed" in kinds else "rejected" if "exhausted" in kinds else fate or "pending"
             for number in range(rounds):
                 count("write", expert, number, "accepted" if number in made else ended)
+            attempts = [
+                o for o in outcomes if (o["clip_id"], o["expert"]) == (clip, expert) and o["kind"] != "exhausted"
+            ]
+            ends = [("", "")] * len(made) + [(o["kind"], TASK_OF.get(o["stage"], "drive")) for o in attempts]
+            ends += [("pending", "drive")] if ended == "pending" and len(made) < rounds else []
+            for became, where in ends:
+                passed = ATTEMPT.index(where) if where else len(ATTEMPT)
+                for task in ATTEMPT[:passed]:
+                    count(task, expert, -1, "accepted")
+                if became:
+                    count(where, expert, -1, became)
     return {key: tuple(row) for key, row in sorted(found.items())}  # type: ignore[misc]

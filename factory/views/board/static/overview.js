@@ -7,7 +7,7 @@ import { card } from "./gallery.js";
 
 export async function overviewPage() {
   const [o, newest] = await Promise.all([ask("/api/overview"), ask("/api/samples?size=6&simulated=1")]);
-  return [header(o), looks(newest), funnel(o), acceptance(o), reasons(o), throughput(o), times(o), coverage(o), trouble(o), gates(o), ...extraSections()];
+  return [header(o), looks(newest), funnel(o), balance(o), acceptance(o), reasons(o), throughput(o), times(o), coverage(o), trouble(o), gates(o), ...extraSections()];
 }
 
 function header(o) {
@@ -69,6 +69,16 @@ function funnel(o) {
       h("td", { class: "n" }, step.dropped ? `-${count(step.dropped)}` : ""),
       h("td", { class: "n dim roomy" }, most ? percent(step.left / most) : "-")));
   return section("From perturbation to sample", "How many of the perturbed drives are left after each stage.", table("steps", ["after", "left", "fell", "of all*"], rows));
+}
+
+function balance(o) {
+  if (!o.balance.length) return null;
+  const counts = ["planned", "accepted", "rejected", "failed", "pending"];
+  const rows = o.balance.map((b) => {
+    const who = [b.expert, b.round < 0 ? "" : `round ${b.round}`].filter(Boolean).join(", ");
+    return h("tr", { "data-balance": [b.stage, b.expert, b.round].join(" ") }, h("th", { scope: "row" }, b.stage, h("small", null, who)), counts.map((name) => h("td", { class: "n" }, count(b[name]))));
+  });
+  return section("What was planned", "Clips, then each expert's attempts from task to task, then samples by round: planned = accepted + rejected + failed + pending.", table("balance", ["stage", ...counts], rows));
 }
 
 function acceptance(o) {
