@@ -5,8 +5,9 @@
                              arrays.npz          what the planner is built around: vocabulary, anchors
                              training.pt         optimiser and loader; only tensors and plain values are read back
 
-A checkpoint is written beside its place and moved there whole. No file of it holds code; a planner of a user's own
-package is imported by the name that the record gives, from what is installed.
+A checkpoint is written beside its place and moved there whole. The record holds the checksums of the others and its
+own; none of a checkpoint of an earlier version. No file of it holds code; a planner of a user's own package is imported
+by the name that the record gives, from what is installed.
 """
 
 import hashlib
@@ -28,10 +29,12 @@ from torch import Tensor
 from factory.config.compose import ConfigError
 from planners.models.planner import Planner
 from planners.models.registry import PlannerChoice, build_planner, planner_class
+from tasks.sealed import MEMBER, sealed_json, unsealed_json
 from tasks.world.arrays import FloatArray
 
 FOLDER = "checkpoints"
 RECORD, WEIGHTS, ARRAYS, TRAINING = "record.json", "weights.safetensors", "arrays.npz", "training.pt"
+FILES = "files"  # of the record: a checksum of each other file
 KEPT = 2  # the newest ones of a training
 
 
@@ -60,10 +63,11 @@ def save_checkpoint(
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir(parents=True)
     who = {"planner": {"name": planner.chosen_as, "settings": as_record(planner.settings)}, "step": step}
-    (unfinished / RECORD).write_text(json.dumps({**who, **record}, indent=1))
     save_file({k: v.contiguous() for k, v in planner.state_dict().items()}, unfinished / WEIGHTS)
     np.savez(unfinished / ARRAYS, **planner.arrays)  # type: ignore[arg-type]
     torch.save(dict(training), unfinished / TRAINING)
+    files = {FILES: {name: _sha256(unfinished / name) for name in (WEIGHTS, ARRAYS, TRAINING)}}
+    (unfinished / RECORD).write_text(sealed_json({**who, **record, **files}))
     shutil.rmtree(folder, ignore_errors=True)
     os.replace(unfinished, folder)
     stays = None if keep.best is None else best(out, keep.best)
@@ -103,7 +107,9 @@ def newest(path: Path) -> Path:
 def read_record(path: Path) -> dict[str, Any]:
     """What a checkpoint says of itself. Raises ConfigError."""
     try:
-        record = json.loads((newest(path) / RECORD).read_text())
+        data = (newest(path) / RECORD).read_bytes()
+        record = json.loads(data)
+        record = unsealed_json(data) if MEMBER in record else record
         record["planner"]["name"], record["planner"]["settings"], record["step"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(f"{path}: its {RECORD} cannot be read ({error}): restore the checkpoint") from error
@@ -132,6 +138,7 @@ def load_planner(path: str | Path, changed: Mapping[str, Any] | None = None) -> 
 
 def load_arrays(folder: Path) -> dict[str, FloatArray]:
     """What a checkpoint's planner is built around, by name. Raises ConfigError."""
+    _refuse_damaged(folder, ARRAYS)
     try:
         with np.load(folder / ARRAYS, allow_pickle=False) as stored:
             return {name: stored[name] for name in stored.files}
@@ -141,6 +148,7 @@ def load_arrays(folder: Path) -> dict[str, FloatArray]:
 
 def load_weights(planner: Planner, folder: Path) -> None:
     """Raises ConfigError where the weights are damaged or another model's, naming what differs."""
+    _refuse_damaged(folder, WEIGHTS)
     try:
         stored = load_file(folder / WEIGHTS)
     except (OSError, SafetensorError) as error:
@@ -166,12 +174,29 @@ def put_weights(planner: Planner, stored: Mapping[str, Tensor], refusal: str) ->
 
 def load_training(folder: Path) -> dict[str, Any]:
     """The state that a training goes on from. Raises ConfigError for a file that is damaged or holds anything else."""
+    _refuse_damaged(folder, TRAINING, f"remove {folder} to go on from the one before")
     try:
         state = torch.load(folder / TRAINING, map_location="cpu", weights_only=True)
     except Exception as error:  # whatever a damaged zip or a refused object raises
         raise ConfigError(f"{folder / TRAINING}: {error}: remove {folder} to go on from the one before") from error
     assert isinstance(state, dict)
     return state
+
+
+def _refuse_damaged(folder: Path, name: str, remedy: str = "restore the checkpoint") -> None:
+    """Raises ConfigError where a file is not what the record says."""
+    stated = read_record(folder).get(FILES, {}).get(name)
+    try:
+        damaged = stated is not None and _sha256(folder / name) != stated
+    except OSError as error:
+        raise ConfigError(f"{folder / name}: {error}: {remedy}") from error
+    if damaged:
+        raise ConfigError(f"{folder / name}: its checksum is another than when it was written: {remedy}")
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def digest(path: str | Path) -> str:

@@ -1,7 +1,8 @@
-"""One flipped bit at a time in files that a run keeps: `python -m tests.chaos.flips [FLIPS]` prints a table.
+"""One flipped bit at a time in files that a run keeps: `python -m tests.chaos.flips [FLIPS] [WORD]` prints a table.
 
-Of each file: how often the damage was found, how often what came out was the same all the same (a byte that nothing
-says anything with), and how often something else came out or raised, which must be never.
+Of each file, or of those whose kind has the word in it: how often the damage was found, how often what came out was the
+same all the same (a byte that nothing says anything with), and how often something else came out or raised, which must
+be never.
 """
 
 import logging
@@ -10,10 +11,13 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+import torch
 
+from factory.config.compose import ConfigError
 from factory.graph.execute import execute
 from factory.graph.steps import prepare
 from factory.setup.vocabulary import load_recovery_table, save_recovery_table
@@ -23,9 +27,11 @@ from factory.store.reader import SampleTable
 from factory.store.samples import Store
 from factory.store.upkeep import restore_logs
 from factory.store.verify import damaged_logs, verify
+from planners.training.checkpoint import load_planner, load_training, save_checkpoint
 from tasks.experts.recovery.expert import RecoveryTable
 from tests.factory.stages.test_scene_file import scene
 from tests.factory.toy import ToyWork, refs
+from tests.planners.toy import Toy, ToySettings
 
 Outcome = str
 FLIPS = 1500
@@ -90,7 +96,20 @@ def kinds(out: Path) -> dict[str, tuple[Path, int, Callable[[], Outcome]]]:
         except BadScene:
             return "found"
 
-    return {
+    trained = save_checkpoint(out, 1, trained_planner(), {}, {"optimiser": {"step": torch.arange(200.0)}})
+    learned = learned_of(trained)
+
+    def checkpoint(path: Path) -> Outcome:
+        try:
+            return "same" if learned_of(trained) == learned else "other"
+        except ConfigError as error:
+            return "found" if path.name in str(error) else "unnamed"
+
+    parts = {
+        f"checkpoint of a training, {path.name}": (path, 1, partial(checkpoint, path))
+        for path in sorted(trained.iterdir())
+    }
+    return parts | {
         "prepared clip, as a run loads it": (cached, 1, again),
         "recovery table": (table, 1, recovery),
         "scene of a block": (block, 1, drawn_scene),
@@ -101,13 +120,27 @@ def kinds(out: Path) -> dict[str, tuple[Path, int, Callable[[], Outcome]]]:
     }
 
 
-def main(flips: int = FLIPS) -> None:
+def trained_planner() -> Toy:
+    torch.manual_seed(0)
+    return Toy(ToySettings(), {"mean_plan": np.random.default_rng(0).normal(size=(8, 3))})
+
+
+def learned_of(folder: Path) -> str:
+    """What a checkpoint's planner plans with and its training goes on from. Raises ConfigError."""
+    planner = load_planner(folder)
+    weights = {name: weight.tolist() for name, weight in planner.state_dict().items()}
+    arrays = {name: array.tolist() for name, array in planner.arrays.items()}
+    return repr((planner.settings, weights, arrays, load_training(folder)["optimiser"]["step"].tolist()))
+
+
+def main(flips: int = FLIPS, word: str = "") -> None:
     logging.disable()
     folder = Path(tempfile.mkdtemp())
     out = folder / "out"
     execute(ToyWork(), refs(3), ["recovery", "human"], 2, Store(out), "local", say=lambda line: None)
     print("| file | flips | found | the same came out | anything else |\n|---|---|---|---|---|")
-    for kind, (path, part, look) in kinds(out).items():
+    chosen = {kind: how for kind, how in kinds(out).items() if word in kind}
+    for kind, (path, part, look) in chosen.items():
         told = flipped(path, flips // part, look)
         rest = ", ".join(f"{told[name]} {name}" for name in told if name not in ("found", "same")) or "0"
         print(f"| {kind} | {flips // part} | {told['found']} | {told['same']} | {rest} |", flush=True)
@@ -115,4 +148,4 @@ def main(flips: int = FLIPS) -> None:
 
 
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))
+    main(*map(int, sys.argv[1:2]), *sys.argv[2:])

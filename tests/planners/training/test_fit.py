@@ -4,6 +4,7 @@ import csv
 import json
 import math
 import os
+import re
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +17,16 @@ from factory.config.compose import ConfigError
 from planners.command import Stopped
 from planners.data.batch import Batch
 from planners.models.registry import PlannerChoice, build_planner
-from planners.training.checkpoint import Keep, best, checkpoints, digest, load_planner, newest, read_record
+from planners.training.checkpoint import (
+    Keep,
+    best,
+    checkpoints,
+    digest,
+    load_planner,
+    load_training,
+    newest,
+    read_record,
+)
 from planners.training.curves import LOSSES, VALIDATION
 from planners.training.fit import Loop, fit, total_steps
 from planners.training.optim import TrainingSettings
@@ -291,6 +301,7 @@ def test_a_checkpoint_of_another_planner_is_refused_by_name(tmp_path: Path) -> N
     record = newest(tmp_path) / "record.json"
     changed = json.loads(record.read_text())
     changed["planner"]["settings"]["hidden"] = 9
+    del changed["sha256"]  # as one of an earlier version
     record.write_text(json.dumps(changed))
     with pytest.raises(ConfigError, match=r"not a checkpoint of this .*net.0.weight is \(8, 8\), not \(9, 8\)"):
         load_planner(tmp_path)
@@ -313,3 +324,28 @@ def test_damaged_weights_are_named(tmp_path: Path) -> None:
     weights.write_bytes(weights.read_bytes()[:40])
     with pytest.raises(ConfigError, match=r"weights\.safetensors: .*restore the checkpoint"):
         load_planner(tmp_path)
+
+
+def test_a_flipped_bit_in_any_file_of_a_checkpoint_is_found_and_named(tmp_path: Path) -> None:
+    train(tmp_path, ToyBatches(20, 4))
+    folder = newest(tmp_path)
+    for path in sorted(folder.iterdir()):
+        whole = path.read_bytes()
+        for at in range(0, len(whole), max(1, len(whole) // 50)):
+            path.write_bytes(whole[:at] + bytes([whole[at] ^ 16]) + whole[at + 1 :])
+            with pytest.raises(ConfigError, match=re.escape(path.name)):
+                load_planner(tmp_path)
+                load_training(folder)
+        path.write_bytes(whole)
+    load_planner(tmp_path)
+
+
+def test_a_checkpoint_of_a_version_without_checksums_is_read(tmp_path: Path) -> None:
+    train(tmp_path, ToyBatches(20, 4))
+    path = newest(tmp_path) / "record.json"
+    record = json.loads(path.read_text())
+    del record["sha256"], record["files"]
+    path.write_text(json.dumps(record, indent=1))
+    assert read_record(tmp_path) == record
+    load_planner(tmp_path)
+    load_training(newest(tmp_path))
