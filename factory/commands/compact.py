@@ -1,8 +1,9 @@
 """`python -m factory compact out=<folder or URL>`: merge the small shards of a run into larger ones.
 
 Of each round and expert, files below 64 MB are merged into files of up to 128 MB, one transaction a table. No sample
-changes: readers, trainings and their order are the same before and after. What was merged is left for readers that are
-open; `python -m factory clean` removes it. While a run writes here the command is refused.
+changes: readers, trainings and their order are the same before and after. MCAP shards (store.episodes=all) follow, and
+those that the samples lack are written. What was merged is left for readers that are open; `python -m factory clean`
+removes it. While a run writes here the command is refused.
 """
 
 from dataclasses import dataclass
@@ -29,7 +30,7 @@ def main(request: Request) -> None:
     try:
         refuse_held(store)
         for merged in compact(store):
-            print(f"{merged.table:<12}{merged.before} files, now {merged.after}")
+            print(f"{merged.table:<13}{merged.before} files, now {merged.after}")
     except (RunGoesOn, AnotherWriter, DiskFull) as error:
         raise Refused(str(error)) from error
     except DamagedFile as error:

@@ -13,6 +13,7 @@ import pyarrow as pa
 
 from factory.store.commit_copies import COPIES, LOG, CommitCopies
 from factory.store.location import Location
+from factory.store.mcap_shards.mirror import McapTable, write_mcap_shard
 from factory.store.parquet_file import Shard, write_shard
 from factory.store.samples import Store
 from factory.store.table import KeyedTable
@@ -82,8 +83,11 @@ def leftovers(store: Store, older_s: float, now_s: float) -> list[str]:
 def compact(store: Store, full_bytes: int = FULL_BYTES) -> Iterator[Merged]:
     """Merge the small files of each partition of each table. Raises DamagedFile, before anything of its table is done.
 
-    The rows keep their bytes and the times at which they came into the table.
+    The rows keep their bytes and the times at which they came into the table. MCAP shards, where there are any, follow
+    those of samples: they are written before these are committed, and committed right after them.
     """
+    mcap = McapTable(store.location)
+    followers: list[Shard] = []
     for table in store.tables:
         facts = table.file_facts()
         drop: list[str] = []
@@ -93,9 +97,17 @@ def compact(store: Store, full_bytes: int = FULL_BYTES) -> Iterator[Merged]:
             shard = write_shard(table.location, table.spec, rows)
             add.append((shard, max(facts[path].written_ms for path in group)))
             drop += group
+        if table is store.samples and mcap.version is not None:
+            merged = {shard.path: shard.partition for shard, _ in add}
+            others = {path: of for path, of in mcap.behind(table).items() if path not in drop}
+            followers = [write_mcap_shard(store.location, path, of) for path, of in (merged | others).items()]
         if add:
             table.replace_files(drop, add)
         yield Merged(table.spec.name, len(facts), len(table.file_facts()))
+        if table is store.samples and mcap.version is not None:
+            there = len(mcap.live_files())
+            mcap.keep_up(table, followers)
+            yield Merged(mcap.spec.name, there, len(mcap.live_files()))
 
 
 def _groups(table: KeyedTable, full_bytes: int) -> list[list[str]]:

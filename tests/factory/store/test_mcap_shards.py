@@ -26,6 +26,7 @@ from factory.store.mcap_shards.wire import parse, varint
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
 from factory.store.schema import BOOKKEEPING
+from factory.store.upkeep import compact
 from factory.store.verify import verify
 from tests.factory.damage import damaged
 from tests.factory.tables import assert_same_rows
@@ -171,12 +172,18 @@ def run(out: Path, shards: bool = True, **options: Any) -> RunSummary:
     )
 
 
-def assert_in_step(out: Path) -> None:
+def assert_rows_in_step(out: Path) -> None:
     """The MCAP shards are those of the samples, one for each, and hold the same rows."""
     table, store = McapTable(Location.parse(out)), Store(out)
     assert sorted(map(source_of, table.live_files())) == sorted(store.samples.live_files())
     assert_same_rows(table.read().sort_by("attempt_id"), store.samples.read().sort_by("attempt_id"))
-    assert verify(store).damage == () and verify(store).orphans == ()
+    assert verify(store).damage == ()
+
+
+def assert_in_step(out: Path) -> None:
+    """And nothing lies beside them."""
+    assert_rows_in_step(out)
+    assert verify(Store(out)).orphans == ()
     parquet, mcap = SampleTable(out), SampleTable(out, format="mcap")
     assert mcap.attempt_ids == parquet.attempt_ids
     assert repr(mcap[len(mcap) - 1]) == repr(parquet[len(parquet) - 1])
@@ -210,6 +217,46 @@ def test_they_may_be_asked_for_later_and_follow_what_is_replaced(tmp_path: Path)
     run(tmp_path, work=other)
     live = McapTable(Location.parse(tmp_path)).live_files()
     assert sorted(map(source_of, live)) == sorted(Store(tmp_path).samples.live_files())
+
+
+def test_compacting_brings_them_along(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for rounds in (1, 2):
+        run(tmp_path, rounds=rounds)
+    run(tmp_path, shards=False, rounds=3)  # whose samples have none yet
+    table, before = McapTable(Location.parse(tmp_path)), SampleTable(tmp_path)
+    rows, opened = list(map(str, before)), set(table.live_files())
+    assert [found.after for found in compact(Store(tmp_path)) if found.table == "samples_mcap"] == [
+        len(Store(tmp_path).samples.live_files())
+    ]
+    table.refresh()
+    assert not opened & set(table.live_files()), "every shard was merged with another"
+    assert_rows_in_step(tmp_path)
+    assert sorted(map(str, SampleTable(tmp_path, format="mcap"))) == sorted(rows)
+    version = McapTable(Location.parse(tmp_path)).version
+    assert all(found.before == found.after for found in compact(Store(tmp_path)))
+    assert McapTable(Location.parse(tmp_path)).version == version, "there was nothing to do"
+    assert run(tmp_path, rounds=3).executed.episodes == 0
+
+
+def test_a_compaction_killed_between_the_two_tables_is_made_good_by_the_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Killed(BaseException):
+        pass
+
+    def die(*arguments: Any) -> None:
+        raise Killed
+
+    for rounds in (1, 2):
+        run(tmp_path, rounds=rounds)
+    with monkeypatch.context() as patched:
+        patched.setattr(McapTable, "keep_up", die)
+        with pytest.raises(Killed):
+            list(compact(Store(tmp_path)))
+    with pytest.raises(ValueError, match="lacks"):
+        SampleTable(tmp_path, format="mcap")
+    list(compact(Store(tmp_path)))
+    assert_rows_in_step(tmp_path)
 
 
 def test_a_run_killed_between_the_two_tables_ends_in_the_same_shards(
