@@ -43,13 +43,14 @@ class Request:
 
 def main(request: Request) -> None:
     """Remove and name them. Raises Refused."""
-    from factory.store.upkeep import RunGoesOn, leftovers, refuse_held
+    from factory.store.table import AnotherWriter
+    from factory.store.upkeep import RunGoesOn, hold, leftovers, refuse_held
 
     store = open_store(request.out)
     try:
-        refuse_held(store)
+        (refuse_held if request.say else hold)(store)
         found = leftovers(store, request.older_s, time.time())
-    except (RunGoesOn, OSError) as error:
+    except (RunGoesOn, AnotherWriter, OSError) as error:
         raise Refused(str(error)) from error
     for name in found:
         if not request.say:

@@ -24,11 +24,11 @@ def main(request: Request) -> None:
     from factory.store.disk import DiskFull
     from factory.store.parquet_file import DamagedFile
     from factory.store.table import AnotherWriter
-    from factory.store.upkeep import RunGoesOn, compact, refuse_held
+    from factory.store.upkeep import RunGoesOn, compact, hold
 
     store = open_store(request.out)
     try:
-        refuse_held(store)
+        hold(store)
         for merged in compact(store):
             print(f"{merged.table:<13}{merged.before} files, now {merged.after}")
     except (RunGoesOn, AnotherWriter, DiskFull) as error:

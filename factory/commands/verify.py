@@ -33,8 +33,8 @@ class Request:
 
 def main(request: Request) -> int:
     """Print the verdict, after the repair where one is asked for."""
-    from factory.store.table import DamagedLog
-    from factory.store.upkeep import RunGoesOn, drop_damaged, refuse_held, restore_logs
+    from factory.store.table import AnotherWriter, DamagedLog
+    from factory.store.upkeep import RunGoesOn, drop_damaged, hold, restore_logs
     from factory.store.verify import damaged_logs
 
     out = out_of(request.out)
@@ -50,7 +50,7 @@ def main(request: Request) -> int:
         store = open_store(request.out)
         verdict = _verdict(request.out)
         if request.repair and verdict.files:
-            refuse_held(store)
+            hold(store)
             drop_damaged(store, verdict)
             for name in verdict.files:
                 print(f"taken out {name}")
@@ -58,7 +58,7 @@ def main(request: Request) -> int:
     except DamagedLog as error:
         print(f"DAMAGED {error}")
         return DAMAGED
-    except RunGoesOn as error:
+    except (RunGoesOn, AnotherWriter) as error:
         raise Refused(str(error)) from error
     for line in verdict.damage:
         print(f"DAMAGED {line}")

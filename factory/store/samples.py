@@ -125,13 +125,10 @@ class Store:
         leaves a failed outcome beside the sample that its retry became; it goes. One that is newer than the sample of
         the same attempt, of a redo that failed, stays.
         """
-        starts_over, moved, epoch = self.starts_over(records), False, None
-        tables = (self.candidates, self.plans, self.samples, self.outcomes)
-        above = max(table.epoch for table in tables)  # which differ only where one was put back or made anew
-        for table in tables:
-            before = set(table.live_files())
-            epoch = table.claim(epoch, above)
-            moved = moved or set(table.live_files()) != before
+        starts_over = self.starts_over(records)
+        before = [set(table.live_files()) for table in self.tables]
+        self.claim()
+        moved = [set(table.live_files()) for table in self.tables] != before
         if starts_over:
             for table in (self.plans, self.candidates, self.outcomes):
                 table.commit([], drop=list(table))
@@ -151,6 +148,20 @@ class Store:
             )
             self.outcomes.commit([], drop=[key for key in twice if outcomes[key] <= samples[key]])
         return moved
+
+    def claim(self, create: bool = True) -> None:
+        """Fence off every run that began earlier: it commits nothing any more. Raises AnotherWriter.
+
+        create: tables that are not there yet; else they are left out.
+        """
+        tables = (self.candidates, self.plans, self.samples, self.outcomes)
+        above, epoch = (
+            max(table.epoch for table in tables),
+            None,
+        )  # which differ only where one was put back or made anew
+        for table in tables:
+            if create or table.version is not None:
+                epoch = table.claim(epoch, above)
 
     def runs(self) -> list[dict[str, Any]]:
         """The settings the rows were made with, oldest first. Raises ChangedRun for an unreadable run.json."""

@@ -38,6 +38,16 @@ class Merged:
     after: int
 
 
+def hold(store: Store) -> None:
+    """Before a change: claim the tables as a run does, so that one which was quiet for long commits nothing any more,
+    no file that is cleaned away among it. Raises RunGoesOn as `refuse_held` does, and AnotherWriter."""
+    refuse_held(store)
+    store.claim(create=False)
+    mcap = McapTable(store.location)
+    if mcap.version is not None:
+        mcap.claim(store.samples.epoch)
+
+
 def refuse_held(store: Store) -> None:
     """Raises RunGoesOn where a run has begun, not ended, and done something lately."""
     current, last = store.began_ms(), store.began_ms(ended=True)

@@ -4,6 +4,7 @@ import json
 import shutil
 from pathlib import Path
 
+import pyarrow as pa
 import pytest
 
 from factory.commands.table import COMMANDS
@@ -12,8 +13,11 @@ from factory.graph.episodes import EpisodesWanted
 from factory.graph.execute import execute
 from factory.store.commit_copies import CommitCopies
 from factory.store.episodes import Message, episode_bytes
+from factory.store.parquet_file import write_shard
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
+from factory.store.schema import SAMPLES
+from factory.store.table import AnotherWriter
 from factory.store.upkeep import restore_logs
 from factory.store.verify import damaged_logs, verify
 from tests.factory.damage import damaged
@@ -190,6 +194,21 @@ def test_nothing_is_repaired_while_a_run_writes(out: Path, capsys: pytest.Captur
         assert COMMANDS[name].load()([f"out={out}", *more]) == BAD_CONFIG
         assert "a run is writing here; wait until it has ended" in capsys.readouterr().err
     assert path.exists()
+
+
+def test_a_run_that_was_quiet_for_long_commits_nothing_after_its_leftovers_went(out: Path) -> None:
+    quiet = Store(out)
+    quiet.begin(quiet.runs())  # it writes a shard and does not come to its commit
+    rows = quiet.samples.read().slice(0, 1)
+    changed = rows.set_column(0, "attempt_id", pa.array(["0" * 16]))
+    shard = write_shard(quiet.samples.location, SAMPLES, changed)
+    assert COMMANDS["clean"].load()([f"out={out}", "older_than=0min", "say=true"]) == 0
+    assert Store(out).samples.version == quiet.samples.version
+    assert COMMANDS["clean"].load()([f"out={out}", "older_than=0min"]) == 0
+    assert not (out / "samples" / shard.path).exists()
+    with pytest.raises(AnotherWriter):
+        quiet.samples.commit([shard])
+    assert verify(Store(out)).damage == ()
 
 
 def test_leftovers_go_once_they_are_old(out: Path, golden: Path, capsys: pytest.CaptureFixture[str]) -> None:
