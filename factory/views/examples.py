@@ -9,7 +9,7 @@ from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import islice
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -20,9 +20,9 @@ from factory.graph.work import PreparedClip
 from factory.readers.base import BadClip, ClipRef
 from factory.stages.pipeline import FactoryWork, PerturbedClip, payload_of
 from factory.store.cache import BadCacheFile
-from factory.store.counts.codes import fixed_bytes
+from factory.store.counts.codes import equals, fixed_bytes
 from factory.store.outcomes import Kind
-from factory.store.reader import SampleTable, decoded
+from factory.store.reader import decoded
 from factory.store.samples import Store
 from factory.views.drawing import attempt_picture
 from factory.views.sample_picture import (
@@ -43,6 +43,10 @@ from factory.views.seen_again import (
 )
 from factory.views.status import counted
 from tasks.render.settings import ImageSource
+
+if TYPE_CHECKING:
+    from factory.views.board.pictures import Pictures
+    from factory.views.board.watch import Snapshot
 
 N_EXAMPLES = 6
 N_STRIPS = 4
@@ -91,7 +95,7 @@ def spread(rows: Iterable[T], keys: Callable[[T], Sequence[Hashable]], order: Ca
 def few_of_each(rows: pa.Table, first: str) -> list[dict[str, Any]]:
     """All that `spread` looks at of rows with attempt_ids as their order and a column as its first key."""
     values = counted(rows[first])
-    parts = (rows.filter(pc.equal(rows[first], value)) for value in values)
+    parts = (rows.filter(pa.array(equals(rows[first], value))) for value in values)
     by_id = [("attempt_id", "ascending")]
     return [row for part in parts for row in part.take(pc.select_k_unstable(part, PER_VALUE, by_id)).to_pylist()]
 
@@ -116,20 +120,17 @@ def rejected_examples(rejected: Sequence[Row], picture: Callable[[Row], Picture 
     return list(islice(made, N_EXAMPLES))
 
 
-def strips_of(store: Store) -> list[dict[str, Any]]:
+def strips_of(store: Store, shot: "Snapshot", pictures: "Pictures") -> list[dict[str, Any]]:
     """What the cameras of a few samples saw, each a title, a source and rows of pictures.
 
     photos: the log's, each followed by the scene seen from its pose, where that is kept; aside: from beside the ego.
     """
-    labels = store.samples.read(LABELS, encoded=True)
-    pictured = few_of_each(labels.filter(pc.not_equal(labels["image_source"], "none")), "image_source")
-    if not pictured:
-        return []
-    table = SampleTable(store.location.uri, store.location.options)
+    labels = shot.samples.select(LABELS)
+    pictured = few_of_each(labels.filter(pa.array(~equals(labels["image_source"], "none"))), "image_source")
     order = spread(pictured, lambda r: (r["image_source"], r["expert"], r["clip_id"]), lambda r: str(r["attempt_id"]))
     strips = []
     for row in order[:N_STRIPS]:
-        sample = table.sample(row["attempt_id"], VIEW_COLUMNS)
+        sample = pictures.row(shot, row["attempt_id"], VIEW_COLUMNS)
         front = front_camera(sample)
         earlier = earlier_images(sample, front) if front is not None else []
         photos, aside = _seen_again(store, sample) if row["image_source"] == ImageSource.RENDER else ((), ())

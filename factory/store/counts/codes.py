@@ -28,6 +28,14 @@ def codes(column: pa.ChunkedArray) -> tuple[Codes, tuple[str, ...]]:
     return number[at], tuple(texts[used])
 
 
+def equals(column: pa.ChunkedArray, text: str) -> NDArray[np.bool_]:
+    """(N,) where a column of texts, numbers into dictionaries or not, has this one; without writing the texts out."""
+    if not pa.types.is_dictionary(column.type):
+        return np.asarray(pc.equal(column, text), bool)
+    parts = [chunk.indices.to_numpy() == chunk.dictionary.index(text).as_py() for chunk in column.chunks]
+    return np.concatenate([np.zeros(0, bool), *parts])
+
+
 def packed(parts: Iterable[pa.Table], key: str) -> Iterator[pa.Table]:
     """The rows in tables of at least PACKED_ROWS, the last one aside; texts but the key as numbers into a dictionary.
 

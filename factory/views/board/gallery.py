@@ -7,6 +7,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from factory.store.counts.codes import equals
 from factory.store.outcomes import Kind
 from factory.store.table import KeyedTable
 from factory.views.board.watch import Snapshot, plain
@@ -58,7 +59,7 @@ def chosen(shot: Snapshot, wanted: Mapping[str, str], order: str = "newest") -> 
             raise BadRequest(f"{name}: samples can be filtered by {', '.join((*FILTERS, SIMULATED))}")
         if name == "round" and not value.isdecimal():
             raise BadRequest(f"round={value}: must be a number")
-        fits &= pc.equal(rows[name], int(value) if name == "round" else value).to_numpy()
+        fits &= rows[name].to_numpy() == int(value) if name == "round" else equals(rows[name], value)
     places = shot.newest_first[fits[shot.newest_first]]
     if not ORDERS[order]:
         return places
@@ -74,7 +75,7 @@ def gallery(shot: Snapshot, wanted: Mapping[str, str], page: int = 1, size: int 
 
 def failures(shot: Snapshot, page: int = 1, size: int = 50) -> Json:
     """A page of failed attempts with their errors, by log; of a failed clip `expert` is empty. Raises BadRequest."""
-    rows = shot.outcomes.filter(pc.equal(shot.outcomes["kind"], Kind.FAILED.value))
+    rows = shot.outcomes.filter(pa.array(equals(shot.outcomes["kind"], Kind.FAILED.value)))
     by = [("log_id", "ascending"), ("clip_id", "ascending"), ("attempt_id", "ascending")]
     order = np.asarray(pc.sort_indices(plain(rows.select([name for name, _ in by])), sort_keys=by))
 
@@ -164,8 +165,8 @@ def _siblings(shot: Snapshot, card: Row, candidates: KeyedTable) -> list[Json]:
     """All candidates of the clip in the order of the walk, with what this expert made of them."""
 
     def of_walk(rows: pa.Table) -> list[Json]:
-        mine = pc.and_(pc.equal(rows["clip_id"], card["clip_id"]), pc.equal(rows["expert"], card["expert"]))
-        return rows.filter(mine).to_pylist()
+        mine = equals(rows["clip_id"], card["clip_id"]) & equals(rows["expert"], card["expert"])
+        return [row for at in np.flatnonzero(mine) for row in rows.slice(at, 1).to_pylist()]
 
     known: dict[int, Json] = {}
     for row in of_walk(shot.outcomes):

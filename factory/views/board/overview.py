@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from factory.store.counts.codes import equals
 from factory.store.counts.funnel import Funnel
 from factory.store.outcomes import Kind
 from factory.views.board.gallery import FILTERS
@@ -41,7 +42,7 @@ def overview(shot: Snapshot, where: str, now_s: float) -> Json:
     """All of it; `now_s` since 1970."""
     funnel = shot.funnel
     simulated = [row for row in funnel.rows if row.simulated]
-    failed = shot.outcomes.filter(pc.equal(shot.outcomes["kind"], Kind.FAILED.value))
+    failed = shot.outcomes.filter(pa.array(equals(shot.outcomes["kind"], Kind.FAILED.value)))
     stage_times, of = _stage_times(shot)
     before = Counter(funnel.clip_outcomes) + Counter(funnel.clips_without_candidates)
     return {

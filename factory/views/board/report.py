@@ -20,18 +20,22 @@ TOLD = "report.json"  # what only the newest run knows: its facts, what its read
 
 def write_report(store: "Store", to: str | None = None) -> str:
     """Write the file, into `out` where no other place is named; where it is now. Raises Refused where it cannot be."""
+    from factory.views.board.pictures import Pictures
     from factory.views.board.still import still_page
+    from factory.views.board.watch import Watch
     from factory.views.examples import strips_of
     from factory.views.scene_quality import scene_tables
 
     told: dict[str, Any] = json.loads(store.location.read(TOLD) or b"{}")
+    shot, pictures = Watch(store).now(), Pictures(store)
     told["strips"] = [
-        strip | {"rows": {name: _plain(row) for name, row in strip["rows"].items()}} for strip in strips_of(store)
+        strip | {"rows": {name: _plain(row) for name, row in strip["rows"].items()}}
+        for strip in strips_of(store, shot, pictures)
     ]
     told["scenes"] = scene_tables(Path(store.location.uri, "cache")) if store.location.is_local else {}
     settings = store.runs()[-1]["settings"] if store.runs() else {}
     told["settings"] = {name: str(value) for name, value in settings.items()}
-    page = still_page(store, told)
+    page = still_page(store, shot, pictures, told)
     if to is None:
         store.location.write(FILE, page)
         return f"{store.location.uri}/{FILE}"

@@ -17,7 +17,7 @@ from factory.views.board.gallery import card_of, failures, gallery, place_of, wh
 from factory.views.board.overview import overview
 from factory.views.board.pictures import Pictures
 from factory.views.board.server import STATIC
-from factory.views.board.watch import Snapshot, Watch
+from factory.views.board.watch import Snapshot
 from factory.views.examples import CAMERA_PX, few_of_each, spread
 from factory.views.sample_picture import front_camera, images_at_now, small_jpeg
 
@@ -30,13 +30,12 @@ POLICY = (
 )
 
 
-def still_page(store: Store, extra: Mapping[str, Any]) -> bytes:
+def still_page(store: Store, shot: Snapshot, pictures: Pictures, extra: Mapping[str, Any]) -> bytes:
     """The file.
 
     extra: what the live page does not show: facts, settings, scenes, left_out, rejected, strips (static/extra.js reads
     it).
     """
-    shot, pictures = Watch(store).now(), Pictures(store)
     looks = gallery(shot, {"simulated": "1"}, 1, N_LOOKS)
     items = [card_of(shot, row) for row in _shown(shot, [item["attempt_id"] for item in looks["items"]])]
     kept: dict[str, str] = {}

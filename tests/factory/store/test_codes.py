@@ -5,7 +5,7 @@ import pyarrow as pa
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from factory.store.counts.codes import PACKED_ROWS, beginning, codes, distinct, fixed_bytes, packed
+from factory.store.counts.codes import PACKED_ROWS, beginning, codes, distinct, equals, fixed_bytes, packed
 
 WORDS = st.lists(st.sampled_from(["", "a", "ab", "b", "é", "z"]), max_size=12)
 PARTS = st.lists(WORDS, max_size=5)
@@ -20,6 +20,7 @@ def test_codes_number_the_different_texts_in_their_order(parts: list[list[str]],
     numbers, texts = codes(column)
     flat = [word for words in parts for word in words]
     assert texts == tuple(sorted(set(flat))) and [texts[i] for i in numbers] == flat
+    assert equals(column, "ab").tolist() == [word == "ab" for word in flat]
 
 
 @settings(max_examples=50, deadline=None)

@@ -13,6 +13,8 @@ from factory.graph.execute import execute
 from factory.setup.settings import Run, assemble
 from factory.store.reader import SampleTable, decoded
 from factory.store.samples import Store
+from factory.views.board.pictures import Pictures
+from factory.views.board.watch import Watch
 from factory.views.examples import (
     PER_VALUE,
     Again,
@@ -67,12 +69,16 @@ def test_rejected_rows_are_simulated_attempts_that_are_no_sample(store: Store) -
 
 
 def test_an_image_that_is_none_says_so(store: Store) -> None:
-    captions = [picture.caption for strip in strips_of(store) for picture in strip["rows"]["now"]]
+    captions = [picture.caption for strip in seen(store) for picture in strip["rows"]["now"]]
     assert captions and all("cannot be decoded" in caption for caption in captions)  # the toy's are random bytes
 
 
 def test_a_store_without_samples_has_no_strips(tmp_path: Path) -> None:
-    assert strips_of(Store(tmp_path)) == []
+    assert seen(Store(tmp_path)) == []
+
+
+def seen(store: Store) -> list[dict[str, Any]]:
+    return strips_of(store, Watch(store).now(), Pictures(store))
 
 
 def test_a_picture_keeps_its_aspect_and_survives_coding() -> None:

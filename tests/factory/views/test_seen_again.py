@@ -14,6 +14,8 @@ from factory.graph.execute import execute
 from factory.setup.settings import assemble
 from factory.store.reader import SampleTable, decoded
 from factory.store.samples import Store
+from factory.views.board.pictures import Pictures
+from factory.views.board.watch import Watch
 from factory.views.examples import strips_of
 from factory.views.report_words import REASON_WORDS
 from factory.views.sample_picture import sample_bev
@@ -139,7 +141,7 @@ def test_show_writes_the_picture_and_the_film(
 
 
 def test_the_report_shows_photos_with_their_renderings_and_the_view_from_the_side(store: Store) -> None:
-    strips = {strip["source"]: strip["rows"] for strip in strips_of(store)}
+    strips = {strip["source"]: strip["rows"] for strip in strips_of(store, Watch(store).now(), Pictures(store))}
     assert len(strips["render"]["photos"]) == 2 and len(strips["render"]["aside"]) == len(ASIDE_M)
     assert strips["photo"]["photos"] == strips["photo"]["aside"] == ()
 
