@@ -221,7 +221,10 @@ def on_new_clusters(once: Callable[[], RunSummary], say: Callable[[str], None] =
         if not summary.lost_cluster:
             return summary
         say(f"{summary.message}; a new cluster is started, {number} of {NEW_CLUSTERS}")
-    return once()
+    summary = once()
+    if summary.lost_cluster:
+        summary.message += f"; {AGAIN}"
+    return summary
 
 
 @contextmanager

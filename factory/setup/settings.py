@@ -20,6 +20,7 @@ from factory.stages.own_body import masks_digest, refuse_unknown_masks
 from factory.stages.pipeline import FactoryWork
 from factory.stages.sensors import chosen_cameras
 from factory.store.identity import UNLISTED, RunIdentity, canonical_json
+from factory.store.illness import why_ill
 from tasks.caches import user_cache
 from tasks.experts.pdm_closed.settings import PdmSettings
 from tasks.experts.protocol import Expert, tried_once
@@ -75,6 +76,8 @@ def open_reader(clips: Mapping[str, Any]) -> tuple[ClipReader, ClipIndex]:
     try:
         index = reader.index()
     except (ValueError, OSError) as error:
+        if why_ill(error):  # a full disk under the user's cache is no wrong setting
+            raise
         raise ConfigError(f"clips: {error}") from error
     if not index.refs and not index.broken:
         reasons = [f"{reason} x{count}" for reason, count in index.dropped.items()]

@@ -6,8 +6,11 @@ Nothing but loopback is opened for a cluster of our own, and `ray stop` is never
 import logging
 import os
 import secrets
+import shutil
 import socket
+import tempfile
 import time
+from pathlib import Path
 from typing import Any
 
 import ray
@@ -15,6 +18,7 @@ from ray.autoscaler.sdk import request_resources
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from factory.graph.local import ClusterDied, ClusterLacks
+from factory.store.disk import existing
 from factory.store.location import BadLocation, Location
 from factory.wording import one_line
 
@@ -52,14 +56,23 @@ def connect(workers: int | None, address: str | None) -> bool:
             logging_level=logging.WARNING,
             **own,
         )
-    except Exception as error:
-        if where == "local":  # of no narrower class where a process of Ray's dies meanwhile
-            raise ClusterDied(f"Ray did not start ({one_line(error)})", is_ours=True) from error
+    except Exception as error:  # Ray has none of its own for what keeps it from beginning
+        if where == "local":
+            ray.shutdown()
+            raise ClusterDied(
+                f"Ray did not begin on this machine ({one_line(error)}); {_files_of_ray()}", True
+            ) from error
         if not isinstance(error, ConnectionError):
             raise
         said = f"no Ray cluster answers at RAY_ADDRESS={named} ({one_line(error)})"
         raise ConnectionError(f"{said}; unset it to run on this machine alone") from error
     return where == "local"
+
+
+def _files_of_ray() -> str:
+    """Where a cluster of our own has its files, and the space that is left there: what keeps it from beginning."""
+    folder = os.environ.get("RAY_TMPDIR") or os.environ.get("TMPDIR") or tempfile.gettempdir()
+    return f"its files lie in {folder}, where {shutil.disk_usage(existing(Path(folder))).free:,} bytes are free"
 
 
 def tasks_at_once(workers: int | None, is_ours: bool) -> int:

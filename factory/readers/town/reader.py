@@ -96,5 +96,8 @@ def finish_whole(unfinished: Path, root: Path, write: Callable[[Path], object]) 
         except OSError:
             if not root.is_dir():  # else another worker was first, with the same bytes
                 raise
+    except OSError as error:
+        error.filename = error.filename or str(root)  # Arrow and a flush name none
+        raise
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)

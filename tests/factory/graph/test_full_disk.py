@@ -1,5 +1,6 @@
 """A disk that fills up ends a run with exit code 4, loses nothing that was committed, and the same command goes on."""
 
+import errno
 import re
 import subprocess
 from collections.abc import Iterator
@@ -16,6 +17,8 @@ from factory.store.disk import DiskFull, needs_disk, why_disk_full
 from factory.store.samples import Store
 from factory.store.usable import why_unusable
 from factory.store.verify import verify
+from tasks.caches import user_cache
+from tests.chaos.full_disks import PAGE, at_level, needed
 from tests.factory.tables import assert_same_rows, assert_same_tables, tables_of
 from tests.factory.toy import ToyWork, refs
 
@@ -141,3 +144,44 @@ def test_what_a_full_disk_said_is_found_behind_other_errors_and_in_delta_s_words
     except RuntimeError as error:
         assert failure_of(error).disk_full == why_disk_full(error) == "/a/file: the disk is full"
     assert failure_of(ValueError("else")).disk_full == ""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("place", ["graph", "cache"])
+def test_little_space_in_a_place_ends_the_run_and_the_same_command_goes_on(
+    disk: Path, tmp_path: Path, place: str
+) -> None:
+    need, golden = needed(place, tmp_path / "golden")
+    n_bytes = need // 3 // PAGE * PAGE
+    assert at_level(place, n_bytes, golden, tmp_path / "trial") == "exit code 4"
+
+
+def test_a_full_disk_under_the_user_s_cache_is_told_with_its_path_and_is_no_wrong_setting(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*given: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("factory.readers.town.reader.write_town", full)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(user_cache()))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    assert run_main([*TOWN, f"out={tmp_path / 'out'}"]) == INTERRUPTED
+    (told,) = [line for line in capsys.readouterr().err.splitlines() if "space" in line]
+    assert str(tmp_path / "cache/driving-data-factory/towns") in told and "run the same command again" in told
+
+
+def test_ray_that_cannot_begin_ends_the_run_with_one_line_that_says_how_full_its_place_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def timed_out(*given: object, **options: object) -> None:
+        raise RuntimeError("Timed out waiting for file gcs_server_port")
+
+    monkeypatch.setattr("ray.init", timed_out)
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setenv("RAY_TMPDIR", str(tmp_path))
+    summary = execute(ToyWork(), refs(1), ["human"], 1, Store(tmp_path / "out"), "ray", say=lambda line: None)
+    assert summary.exit_code == INTERRUPTED and not (tmp_path / "out").exists()
+    said = (
+        rf"Ray did not begin on this machine \(Timed out .*\); its files lie in {tmp_path}, where [\d,]+ bytes are free"
+    )
+    assert re.fullmatch(f"{said}; run the same command again to go on", summary.message), summary.message
