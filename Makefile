@@ -50,12 +50,15 @@ format: install
 	$(PY) -m ruff check --fix .
 
 # Every kind of file with 5,000 mutants each (half an hour), one flipped bit at a time in what a run keeps, processes
-# killed at any moment, clips that do harm.
+# killed at any moment and at every step of a commit (Linux, a C compiler), little space in every place (root), clips
+# that do harm.
 # N=<mutants of each kind>, KINDS="ply spz".
 chaos: install
 	$(PY) -m tests.chaos.fuzz $(or $(N),5000) $(KINDS)
 	$(PY) -m tests.chaos.flips
 	$(PY) -m tests.chaos.kills
+	$(PY) -m tests.chaos.commit_steps
+	$(PY) -m tests.chaos.full_disks
 	$(PY) -m tests.chaos.poison
 
 # The site of the pages, into build/site; whatever MkDocs would warn of ends it. The variable leaves out a notice of the
