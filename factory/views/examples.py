@@ -9,7 +9,7 @@ from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import islice
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -43,10 +43,6 @@ from factory.views.seen_again import (
 )
 from factory.views.status import counted
 from tasks.render.settings import ImageSource
-
-if TYPE_CHECKING:
-    from factory.views.board.pictures import Pictures
-    from factory.views.board.watch import Snapshot
 
 N_EXAMPLES = 6
 N_STRIPS = 4
@@ -120,17 +116,18 @@ def rejected_examples(rejected: Sequence[Row], picture: Callable[[Row], Picture 
     return list(islice(made, N_EXAMPLES))
 
 
-def strips_of(store: Store, shot: "Snapshot", pictures: "Pictures") -> list[dict[str, Any]]:
+def strips_of(store: Store, samples: pa.Table, row_of: Callable[[str, Sequence[str]], Row]) -> list[dict[str, Any]]:
     """What the cameras of a few samples saw, each a title, a source and rows of pictures.
 
+    samples: all of them, with LABELS; row_of: some columns of one, by its attempt_id.
     photos: the log's, each followed by the scene seen from its pose, where that is kept; aside: from beside the ego.
     """
-    labels = shot.samples.select(LABELS)
+    labels = samples.select(LABELS)
     pictured = few_of_each(labels.filter(pa.array(~equals(labels["image_source"], "none"))), "image_source")
     order = spread(pictured, lambda r: (r["image_source"], r["expert"], r["clip_id"]), lambda r: str(r["attempt_id"]))
     strips = []
     for row in order[:N_STRIPS]:
-        sample = pictures.row(shot, row["attempt_id"], VIEW_COLUMNS)
+        sample = row_of(row["attempt_id"], VIEW_COLUMNS)
         front = front_camera(sample)
         earlier = earlier_images(sample, front) if front is not None else []
         photos, aside = _seen_again(store, sample) if row["image_source"] == ImageSource.RENDER else ((), ())

@@ -7,7 +7,7 @@ from typing import Any, ParamSpec, TypeVar
 import ray
 from ray.exceptions import RayTaskError
 
-from factory.graph.local import MAX_RETRIES
+from factory.graph.local import MAX_RETRIES, ClusterDied
 from factory.graph.on_ray.cluster import connect, prove_shared, tasks_at_once
 from factory.store.location import Location
 from factory.wording import one_line
@@ -22,10 +22,14 @@ class RayPool(Executor):
     def __init__(self, workers: int | None, to: Location | None) -> None:
         """Workers as of RayGraph; to: the folder that tasks write to.
 
-        Raises BadLocation where some node does not see it, ConnectionError where no cluster answers.
+        Raises BadLocation where some node does not see it, ConnectionError where no cluster answers, or none
+        begins here.
         """
         self._connected = not ray.is_initialized()
-        is_ours = self._connected and connect(workers, None)
+        try:
+            is_ours = self._connected and connect(workers, None)
+        except ClusterDied as error:
+            raise ConnectionError(str(error)) from error
         self.parallelism = tasks_at_once(workers, is_ours)
         self._references: dict[Future[Any], Any] = {}
         try:

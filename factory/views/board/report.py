@@ -4,6 +4,7 @@ import base64
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +31,7 @@ def write_report(store: "Store", to: str | None = None) -> str:
     shot, pictures = Watch(store).now(), Pictures(store)
     told["strips"] = [
         strip | {"rows": {name: _plain(row) for name, row in strip["rows"].items()}}
-        for strip in strips_of(store, shot, pictures)
+        for strip in strips_of(store, shot.samples, partial(pictures.row, shot))
     ]
     told["scenes"] = scene_tables(Path(store.location.uri, "cache")) if store.location.is_local else {}
     settings = store.runs()[-1]["settings"] if store.runs() else {}

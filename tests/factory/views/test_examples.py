@@ -1,6 +1,7 @@
 """Examples for a report: spread over a run, the same in any order and with or without the cache."""
 
 import shutil
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -78,7 +79,8 @@ def test_a_store_without_samples_has_no_strips(tmp_path: Path) -> None:
 
 
 def seen(store: Store) -> list[dict[str, Any]]:
-    return strips_of(store, Watch(store).now(), Pictures(store))
+    shot = Watch(store).now()
+    return strips_of(store, shot.samples, partial(Pictures(store).row, shot))
 
 
 def test_a_picture_keeps_its_aspect_and_survives_coding() -> None:

@@ -1,6 +1,7 @@
 """A stored sample's block seen again: photos beside renderings of their poses, the side views, the film."""
 
 import shutil
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -141,7 +142,9 @@ def test_show_writes_the_picture_and_the_film(
 
 
 def test_the_report_shows_photos_with_their_renderings_and_the_view_from_the_side(store: Store) -> None:
-    strips = {strip["source"]: strip["rows"] for strip in strips_of(store, Watch(store).now(), Pictures(store))}
+    shot = Watch(store).now()
+    made = strips_of(store, shot.samples, partial(Pictures(store).row, shot))
+    strips = {strip["source"]: strip["rows"] for strip in made}
     assert len(strips["render"]["photos"]) == 2 and len(strips["render"]["aside"]) == len(ASIDE_M)
     assert strips["photo"]["photos"] == strips["photo"]["aside"] == ()
 
