@@ -4,7 +4,7 @@ A share or a time that is not defined is null; names end in their unit, `_ms` is
 """
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -229,14 +229,17 @@ def _coverage(shot: Snapshot) -> Json:
     aside = float(settings.get("perturb.max_lateral_m", REACH_M[1]))
     edges = (np.linspace(-aside, aside, BINS[1] + 1), np.linspace(-along, along, BINS[0] + 1))
 
-    def counted(points: np.ndarray) -> list[list[int]]:
-        return np.histogram2d(points[:, 1], points[:, 0], edges)[0].astype(int).tolist()
+    def counted(parts: Sequence[np.ndarray]) -> list[list[int]]:
+        counts = np.zeros((BINS[1], BINS[0]), int)
+        for points in parts:
+            counts += np.histogram2d(points[:, 1], points[:, 0], edges)[0].astype(int)
+        return counts.tolist()
 
-    inside = (np.abs(shot.end_points[:, 0]) <= along) & (np.abs(shot.end_points[:, 1]) <= aside)
+    beyond = sum(int(np.count_nonzero((np.abs(points) > (along, aside)).any(1))) for points in shot.end_points)
     return {
         "reach_along_m": along,
         "reach_aside_m": aside,
         "candidates": counted(shot.end_points),
         "accepted": counted(shot.accepted_points),
-        "beyond": int((~inside).sum()),  # end points outside
+        "beyond": beyond,  # end points outside
     }

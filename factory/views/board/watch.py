@@ -176,8 +176,8 @@ class Snapshot:
     candidate_paths: Sequence[str]
     sample_bytes: int
     seconds: Mapping[str, tuple[int, float]]  # stage -> attempts, seconds: of rejected attempts
-    end_points: Points  # (N, 2) x, y [m] of all candidates, frame of the logged pose at T+H
-    accepted_points: Points  # (N, 2) likewise, of those that became samples
+    end_points: Sequence[Points]  # each (N, 2) x, y [m], of all candidates, frame of the logged pose at T+H
+    accepted_points: Sequence[Points]  # likewise, of those that became samples
     runs: Sequence[Mapping[str, Any]]  # records of run.json, oldest first
     last: Mapping[str, Any]  # last_run.json, empty where there is none
     current: Mapping[str, Any]  # current_run.json, likewise
@@ -254,8 +254,8 @@ class Watch:
             candidate_paths=tuple(self._candidates.paths),
             sample_bytes=sum(file.n_bytes for file in self._samples.files.values()),
             seconds=_summed([part.seconds for part in self._outcomes.parts.values()]),
-            end_points=_joined(self._candidates.parts.values()),
-            accepted_points=_joined(self._samples.parts.values()),
+            end_points=[part.end_points for part in self._candidates.parts.values()],
+            accepted_points=[part.end_points for part in self._samples.parts.values()],
             runs=self.store.runs(),
             last=json.loads(told[1] or b"{}"),
             current=json.loads(told[2] or b"{}"),
