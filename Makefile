@@ -51,7 +51,7 @@ format: install
 
 # Every kind of file with 5,000 mutants each (half an hour), one flipped bit at a time in what a run keeps, processes
 # killed at any moment and at every step of a commit (Linux, a C compiler), little space in every place (root), clips
-# that do harm.
+# that do harm, a run under kills for HOURS (2).
 # N=<mutants of each kind>, KINDS="ply spz".
 chaos: install
 	$(PY) -m tests.chaos.fuzz $(or $(N),5000) $(KINDS)
@@ -60,6 +60,7 @@ chaos: install
 	$(PY) -m tests.chaos.commit_steps
 	$(PY) -m tests.chaos.full_disks
 	$(PY) -m tests.chaos.poison
+	$(PY) -m tests.chaos.long_run hours=$(or $(HOURS),2)
 
 # The site of the pages, into build/site; whatever MkDocs would warn of ends it. The variable leaves out a notice of the
 # theme's makers about what comes after it.

@@ -10,8 +10,8 @@ nothing twice, and no attempt that was committed may have been made again. What 
     workers   a worker, while runs go on            node     a whole node of two
 
 A row a kind, of as many as there was time for. `made twice` counts attempts that ran before and after the kill, `not
-committed` those that had run and were not settled then: the first cannot exceed the second. `first` is the worst time
-from the second command, a new interpreter, to its first new attempt.
+committed` those that had run and were not settled then, of killed workers the one in hand: the first cannot exceed the
+second. `first` is the worst time from a last command, a new interpreter, to its first new attempt.
 """
 
 import math
@@ -205,7 +205,7 @@ def workers(n: int, folder: Path, golden: Path, rng: random.Random, end: float =
     """Kill a worker, wait until there are two again and a little, kill another, in run after run."""
     told = Told("worker, executor=ray")
     while told.kills < n and time.monotonic() < end:
-        trial = Trial(folder / f"workers{told.runs}", told)
+        trial, before = Trial(folder / f"workers{told.runs}", told), told.kills
         with trial.command() as journal:
             process = _started(str(trial.out), "ray", str(journal), 0.1, "", clips)
             assert process.pid is not None
@@ -215,6 +215,11 @@ def workers(n: int, folder: Path, golden: Path, rng: random.Random, end: float =
                 if len(at_work) > 1 and attempts(journal):
                     told.kills += kill(rng.choice(at_work))
             process.join()
+        in_hand, names = told.kills - before, attempts(journal)
+        made_twice = len(names) - len(set(names))
+        assert made_twice <= in_hand, f"{made_twice} attempts were made twice, {in_hand} workers killed"
+        told.uncommitted += in_hand
+        told.made_twice += made_twice
         told.runs += 1
         trial.again(clips=clips)
         compare(trial.out, golden, told)
