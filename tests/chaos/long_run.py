@@ -103,26 +103,33 @@ def endure(words: list[str], executor: str, every_s: float, rng: random.Random, 
             process = start(words, log)
             others: dict[int, str] = {}
             before, n_kills, n_plans, moved = planned(journal), len(met.kills), -1, time.monotonic()
-            while process.poll() is None:
-                time.sleep(min(1.0, every_s / 10.0))
-                now = time.monotonic()
-                if now - told >= SAMPLE_S:
-                    told, others = now, below(process.pid)
-                    seen = [("driver", process.pid)] + [("worker", pid) for pid in workers_of(process.pid, executor)]
-                    held = [Held(now - began, what, pid, mb) for what, pid in seen if (mb := rss_mb(pid)) is not None]
-                    write(folder / "memory.csv", held)
-                    if planned(journal) > n_plans:
-                        n_plans, moved = planned(journal), now
-                if due == float("inf") and planned(journal) > at_last:
-                    due = now + rng.uniform(0.2, 1.8) * every_s
-                    victim = rng.choices(list(chances), [*chances.values()])[0]
-                if now >= due and strike(victim, process.pid, executor, rng):
-                    met.kills.append((now - began, victim))
-                    due, at_last = float("inf"), planned(journal)
-                    print(f"{now - began:7.0f} s  {victim} killed, {at_last} plans", flush=True)
-                if now - moved > STALLED_S:
-                    met.stalled += 1
-                    kill(process.pid)
+            try:
+                while process.poll() is None:
+                    time.sleep(min(1.0, every_s / 10.0))
+                    now = time.monotonic()
+                    if now - told >= SAMPLE_S:
+                        told, others = now, below(process.pid)
+                        seen = [("driver", process.pid)] + [
+                            ("worker", pid) for pid in workers_of(process.pid, executor)
+                        ]
+                        held = [
+                            Held(now - began, what, pid, mb) for what, pid in seen if (mb := rss_mb(pid)) is not None
+                        ]
+                        write(folder / "memory.csv", held)
+                        if planned(journal) > n_plans:
+                            n_plans, moved = planned(journal), now
+                    if due == float("inf") and planned(journal) > at_last:
+                        due = now + rng.uniform(0.2, 1.8) * every_s
+                        victim = rng.choices(list(chances), [*chances.values()])[0]
+                    if now >= due and strike(victim, process.pid, executor, rng):
+                        met.kills.append((now - began, victim))
+                        due, at_last = float("inf"), planned(journal)
+                        print(f"{now - began:7.0f} s  {victim} killed, {at_last} plans", flush=True)
+                    if now - moved > STALLED_S:
+                        met.stalled += 1
+                        kill(process.pid)
+            finally:  # where we are to end, it does too
+                process.kill()
             met.exits[process.wait()] += 1
             print(f"{time.monotonic() - began:7.0f} s  exit code {process.returncode}", flush=True)
             put_away(others)
