@@ -10,7 +10,7 @@ import pyarrow.compute as pc
 import pytest
 
 from factory.exits import COMPLETE, INTERRUPTED
-from factory.graph.execute import RunSummary, execute
+from factory.graph.execute import RunSummary, execute, on_new_clusters
 from factory.graph.steps import failure_of
 from factory.run import main as run_main
 from factory.store.disk import DiskFull, needs_disk, why_disk_full
@@ -179,8 +179,12 @@ def test_ray_that_cannot_begin_ends_the_run_with_one_line_that_says_how_full_its
     monkeypatch.setattr("ray.init", timed_out)
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     monkeypatch.setenv("RAY_TMPDIR", str(tmp_path))
-    summary = execute(ToyWork(), refs(1), ["human"], 1, Store(tmp_path / "out"), "ray", say=lambda line: None)
-    assert summary.exit_code == INTERRUPTED and not (tmp_path / "out").exists()
+    out, told = tmp_path / "out", list[str]()
+    summary = on_new_clusters(
+        lambda: execute(ToyWork(), refs(1), ["human"], 1, Store(out), "ray", say=told.append), told.append
+    )
+    assert summary.exit_code == INTERRUPTED and not out.exists()
+    assert [line.rpartition("; ")[2] for line in told] == [f"a new cluster is started, {i} of 3" for i in (1, 2, 3)]
     said = (
         rf"Ray did not begin on this machine \(Timed out .*\); its files lie in {tmp_path}, where [\d,]+ bytes are free"
     )
