@@ -54,8 +54,8 @@ format: install
 # that do harm, a run under kills for HOURS (2).
 # N=<mutants of each kind>, KINDS="ply spz".
 chaos: install
-	$(PY) -m tests.chaos.fuzz $(or $(N),5000) $(KINDS)
-	$(PY) -m tests.chaos.flips
+	$(PY) -m tests.chaos.damaged_files.fuzz $(or $(N),5000) $(KINDS)
+	$(PY) -m tests.chaos.damaged_files.flips
 	$(PY) -m tests.chaos.kills
 	$(PY) -m tests.chaos.commit_steps
 	$(PY) -m tests.chaos.full_disks

@@ -87,7 +87,7 @@ STEPS: Mapping[str, tuple[Any, tuple[str, ...]]] = {  # its function, and what i
     "reconstruct": (steps.reconstruct, ("work", "stopped")),
     "perturb": (steps.prepare, ("work", "out")),
     "attempt": (steps.attempt, ("work",)),
-    "stretch": (steps.attempt, ("work",)),  # of a walk: one attempt after the other
+    "stretch": (steps.attempt, ("work",)),  # one after the other
     "write": (steps.write, ("out",)),
     "episodes": (steps.episodes, ("work", "out")),
     "mcap_shard": (steps.mcap_shard, ("out",)),

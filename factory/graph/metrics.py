@@ -97,7 +97,8 @@ IN_FLIGHT = Metric(
     Type.GAUGE,
     "",
     ("what",),
-    "`walks` of open clips, `attempts`, `clips` being prepared, `blocks` being built, `batches` being written.",
+    "`walks` of open clips, `attempts` (a stretch counts once), `clips` being prepared, `blocks` being built, "
+    "`batches` being written.",
 )
 DISK = Metric("factory_disk_bytes", Type.GAUGE, "B", (), "Size of the file system of a local `out`.")
 DISK_FREE = Metric("factory_disk_free_bytes", Type.GAUGE, "B", (), "Free space there.")

@@ -13,7 +13,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from factory.graph.work import Columns, Dropped, Halted, NotReady, PreparedClip, Stopped, Underway, Work, go_on
+from factory.graph.work import Dropped, Halted, NotReady, PreparedClip, Stopped, Underway, Work, go_on
 from factory.readers.base import BadClip, ClipRef
 from factory.store.cache import BadCacheFile, ClipCache, SceneFiles
 from factory.store.disk import why_disk_full
@@ -190,11 +190,10 @@ def attempt(
 ) -> tuple[Attempted | HandedOn | Failure, pa.Table | Underway | None]:
     """Some stages of one attempt, from where it stands; an accepted one is checked against the schema here, where its
     traceback still means something."""
-    began, task = time.perf_counter(), ""
+    began, stage = time.perf_counter(), ""
     try:
-        result: Underway | Columns | Dropped
-        for task in stages:
-            result = go_on(work, [task], so_far, stamp.candidate_index, stamp.expert)
+        for stage in stages:
+            result = go_on(work, stage, so_far, stamp.candidate_index, stamp.expert)
             if not isinstance(result, Underway):
                 break
             so_far = result
@@ -218,7 +217,7 @@ def attempt(
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # the same boundary
-        return replace(failure_of(error), task=task), None
+        return replace(failure_of(error), task=stage), None
 
 
 def write(out: Location, *rows: pa.Table) -> tuple[Shard | Failure, None]:

@@ -4,7 +4,7 @@ The executors know clips, candidates and attempts only through `Work`. It is pic
 whatever the worker, the order or the retry, the same arguments give the same result.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Protocol
 
@@ -151,39 +151,36 @@ class Underway:
 
 
 def go_on(
-    work: Work, stages: Sequence[str], so_far: PreparedClip | Underway, candidate: int, expert: str
+    work: Work, stage: str, so_far: PreparedClip | Underway, candidate: int, expert: str
 ) -> Underway | Columns | Dropped:
-    """Some stages of an attempt (tasks.stages.ATTEMPT), one after the other, from where it stands.
+    """The next stage of an attempt (tasks.stages.ATTEMPT) from where it stands.
 
     Columns: the sample's. Seconds are those of all stages so far.
     """
-    for stage in stages:
-        if stage == "drive":
-            assert isinstance(so_far, PreparedClip)
-            driven = work.drive(so_far, candidate, expert)
-            if isinstance(driven, Dropped):
-                return driven
-            so_far = Underway(driven)
-            continue
-        assert isinstance(so_far, Underway)
-        driven, drawn = so_far.driven, so_far.drawn
-        if stage == "render":
-            found = work.draw(driven)
-            if isinstance(found, Dropped):
-                return replace(found, seconds={**driven.seconds, **found.seconds})
-            so_far = Underway(driven, found)
-        else:
-            assert stage == "label" and drawn is not None
-            labelled = work.label(driven)
-            tags = [*labelled.row["tags"], *drawn.row.get("tags", ())]  # type: ignore[misc]
-            seconds = {**driven.seconds, **drawn.seconds, **labelled.seconds}
-            return Columns({**labelled.row, **drawn.row, "tags": tags}, seconds, drawn.scene_at_hand)
+    if stage == "drive":
+        assert isinstance(so_far, PreparedClip)
+        driven = work.drive(so_far, candidate, expert)
+        return driven if isinstance(driven, Dropped) else Underway(driven)
     assert isinstance(so_far, Underway)
-    return so_far
+    driven, drawn = so_far.driven, so_far.drawn
+    if stage == "render":
+        found = work.draw(driven)
+        if isinstance(found, Dropped):
+            return replace(found, seconds={**driven.seconds, **found.seconds})
+        return Underway(driven, found)
+    assert stage == "label" and drawn is not None
+    labelled = work.label(driven)
+    tags = [*labelled.row["tags"], *drawn.row.get("tags", ())]  # type: ignore[misc]
+    seconds = {**driven.seconds, **drawn.seconds, **labelled.seconds}
+    return Columns({**labelled.row, **drawn.row, "tags": tags}, seconds, drawn.scene_at_hand)
 
 
 def attempted(work: Work, prepared: PreparedClip, candidate: int, expert: str) -> Columns | Dropped:
     """One attempt, whole."""
-    result = go_on(work, ATTEMPT, prepared, candidate, expert)
-    assert not isinstance(result, Underway)
-    return result
+    so_far: PreparedClip | Underway = prepared
+    for stage in ATTEMPT:
+        result = go_on(work, stage, so_far, candidate, expert)
+        if not isinstance(result, Underway):
+            return result
+        so_far = result
+    raise AssertionError(f"{ATTEMPT[-1]} does not end an attempt")

@@ -155,10 +155,8 @@ class Store:
         create: tables that are not there yet; else they are left out.
         """
         tables = (self.candidates, self.plans, self.samples, self.outcomes)
-        above, epoch = (
-            max(table.epoch for table in tables),
-            None,
-        )  # which differ only where one was put back or made anew
+        above = max(table.epoch for table in tables)  # which differ only where one was put back or made anew
+        epoch = None
         for table in tables:
             if create or table.version is not None:
                 epoch = table.claim(epoch, above)

@@ -20,7 +20,6 @@ import shutil
 import signal
 import sys
 import tempfile
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,6 +34,7 @@ from factory.store.table import KeyedTable
 from factory.store.verify import verify
 from tests.chaos.file_steps import FAULTS, Step, Stepped, Trial, stepping, steps_of
 from tests.chaos.kills import Told, compare
+from tests.chaos.trials import Findings
 from tests.factory.toy import ToyWork, refs
 
 EXPERTS = ["recovery", "human"]
@@ -219,17 +219,14 @@ def main(every: int = 1, runs: Sequence[Run] = RUNS) -> int:
             (folder := Path(name) / str(place)).mkdir()
             golden = undisturbed(run, folder, stepped)
             for fault in FAULTS:
-                told = Counter[str]()
+                found = Findings(FINE)
                 for step in golden.steps[::every]:
                     if fault.startswith("half") and (step.call != "write" or step.n_bytes < 2):
                         continue
-                    found = disturbed(golden, step.number, fault, folder / "trial", stepped)
-                    if found not in FINE:
-                        print(f"{run.name}, {fault}, {step}: {found}", file=sys.stderr, flush=True)
-                    told[found if found in FINE else "else"] += 1
-                findings += told["else"]
-                counts = " | ".join(str(told[kind]) for kind in (*FINE, "else"))
-                print(f"| {run.name} | {fault} | {told.total()} | {counts} |", flush=True)
+                    ended = disturbed(golden, step.number, fault, folder / "trial", stepped)
+                    found.note(f"{run.name}, {fault}, {step}", ended)
+                findings += found.n_others
+                print(f"| {run.name} | {fault} | {found.told.total()} | {found.cells} |", flush=True)
     return findings
 
 

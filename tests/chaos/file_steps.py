@@ -10,13 +10,14 @@ import os
 import shutil
 import subprocess
 import sys
-import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 
+from tests.chaos.trials import leave_by
 from tests.pages import REPOSITORY
 
 FAULTS = {"killed before it": 1, "refused with EIO": 2, "half written, then killed": 3}
@@ -105,28 +106,17 @@ def _serve(imports: Sequence[str]) -> None:
         trial = Trial(**json.loads(line))
         child = os.fork()
         if child == 0:
-            _run(trial)
+            leave_by(partial(_run, trial), Path(trial.words))
         _, status = os.waitpid(child, 0)
         print(os.waitstatus_to_exitcode(status), flush=True)
 
 
-def _run(trial: Trial) -> None:
-    """Never returns."""
-    code = 1
-    try:
-        for number in (1, 2):
-            os.dup2(os.open(trial.words, os.O_WRONLY | os.O_CREAT | os.O_APPEND), number)
-        log = os.open(trial.log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-        module, _, name = trial.function.partition(":")
-        function: Callable[[str], int] = getattr(import_module(module), name)
-        ctypes.CDLL(None).file_steps_arm(os.fsencode(trial.out), ctypes.c_long(trial.number), trial.fault, log)
-        code = function(trial.out)
-    except BaseException:
-        traceback.print_exc()
-    finally:
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
+def _run(trial: Trial) -> int:
+    log = os.open(trial.log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    module, _, name = trial.function.partition(":")
+    function: Callable[[str], int] = getattr(import_module(module), name)
+    ctypes.CDLL(None).file_steps_arm(os.fsencode(trial.out), ctypes.c_long(trial.number), trial.fault, log)
+    return function(trial.out)
 
 
 if __name__ == "__main__":

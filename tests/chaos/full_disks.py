@@ -23,12 +23,12 @@ import sys
 import tempfile
 import threading
 import time
-import traceback
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 import pyarrow.compute as pc
@@ -42,8 +42,9 @@ from factory.store.samples import Store
 from factory.store.verify import verify
 from tasks.caches import user_cache
 from tasks.stages import Rejected
-from tests.chaos.kills import put_away, untold
-from tests.chaos.processes import below, kill
+from tests.chaos.kills import untold
+from tests.chaos.processes import below, kill, put_away
+from tests.chaos.trials import Findings, leave_by
 from tests.factory.tables import assert_same_rows, tables_of
 from tests.factory.toy import ToyWork, ran, refs
 
@@ -161,30 +162,25 @@ class Trial:
         return self.folder / (f"again.{name}" if self.is_again else name)
 
 
-def work(trial: Trial) -> None:
-    """Never returns."""
-    code, place = 1, trial.place
-    for number in (1, 2):
-        os.dup2(os.open(trial.file("words"), os.O_WRONLY | os.O_CREAT | os.O_APPEND), number)
-    try:
-        if place.is_memory and not trial.is_again:
-            if ctypes.CDLL(None, use_errno=True).unshare(NEW_NAMESPACE):
-                raise OSError(ctypes.get_errno(), "no file systems of its own")
-            subprocess.run(["mount", "--make-rprivate", "/"], check=True)
-            mount(SHM, ENOUGH if place.is_later else trial.n_bytes)
-        if place.variable:
-            os.environ.setdefault("NUMBA_CACHE_DIR", str(user_cache()))  # which takes minutes to fill
-            os.environ[place.variable], tempfile.tempdir = str(trial.disk), None
-        if not trial.is_again:
-            threading.Thread(target=_watch, args=(trial,), daemon=True).start()
-        run = place.again if trial.is_again else place.run
-        code = run(str(trial.out), str(trial.file("journal")))
-    except BaseException:
-        traceback.print_exc()
-    finally:
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
+def work(trial: Trial) -> NoReturn:
+    """The run, where there is little space."""
+    leave_by(partial(_run, trial), trial.file("words"))
+
+
+def _run(trial: Trial) -> int:
+    place = trial.place
+    if place.is_memory and not trial.is_again:
+        if ctypes.CDLL(None, use_errno=True).unshare(NEW_NAMESPACE):
+            raise OSError(ctypes.get_errno(), "no file systems of its own")
+        subprocess.run(["mount", "--make-rprivate", "/"], check=True)
+        mount(SHM, ENOUGH if place.is_later else trial.n_bytes)
+    if place.variable:
+        os.environ.setdefault("NUMBA_CACHE_DIR", str(user_cache()))  # which takes minutes to fill
+        os.environ[place.variable], tempfile.tempdir = str(trial.disk), None
+    if not trial.is_again:
+        threading.Thread(target=_watch, args=(trial,), daemon=True).start()
+    run = place.again if trial.is_again else place.run
+    return run(str(trial.out), str(trial.file("journal")))
 
 
 def _watch(trial: Trial) -> None:
@@ -294,16 +290,13 @@ def main(levels: int = LEVELS, names: Sequence[str] = tuple(PLACES)) -> int:
     with tempfile.TemporaryDirectory() as root:
         for name in names:
             need, golden = needed(name, Path(root, name))
-            told = Counter[str]()
+            found = Findings(kinds)
             for level in range(levels):
                 n_bytes = -(-need * level // levels // PAGE) * PAGE
-                found = at_level(name, n_bytes, golden, Path(root, f"{name}.{level}"))
-                if found not in kinds:
-                    print(f"{name}, {n_bytes:,} bytes free: {found}", file=sys.stderr, flush=True)
-                told[found if found in kinds else "else"] += 1
-            findings += told["else"]
-            counts = " | ".join(str(told[kind]) for kind in (*kinds, "else"))
-            print(f"| {name} | {need / 1e6:.1f} MB | {told.total()} | {counts} |", flush=True)
+                ended = at_level(name, n_bytes, golden, Path(root, f"{name}.{level}"))
+                found.note(f"{name}, {n_bytes:,} bytes free", ended)
+            findings += found.n_others
+            print(f"| {name} | {need / 1e6:.1f} MB | {found.told.total()} | {found.cells} |", flush=True)
     return findings
 
 

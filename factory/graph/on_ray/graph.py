@@ -41,7 +41,7 @@ from factory.graph.on_ray.cluster import (
     prove_shared,
     tasks_at_once,
 )
-from factory.graph.steps import Failure, Walked
+from factory.graph.steps import Failure, Walked, attempt
 from factory.graph.walk import Stretch
 from factory.graph.work import NotReady, PreparedClip, Work, never
 from factory.store.identity import Stamp
@@ -162,15 +162,11 @@ class RayGraph:
                 memory = self._claims.memory_bytes(ticket.step)
                 memory = memory if self._most_memory is None else min(memory, self._most_memory)
                 cores = cores_of(step, args)
-                told = self._costs.limits(ticket.step) | {"run": self._run}
-                if step == "stretch":
-                    rows = args[-1].samples
-                    task = _claiming(_walk, ticket.step, cores, gpu, memory or None, 1 + rows)
-                    report, *ticket.result = task.remote((self._notes, told), *supplied, *args)
-                else:
-                    told = described(step, ticket.step, args) | told
-                    task = _claiming(_run, ticket.step, cores, gpu, memory or None, 2)
-                    report, ticket.result = task.remote(step, (self._notes, told), len(supplied), *supplied, *args)
+                n_rows = args[-1].samples if step == "stretch" else 1
+                task = _claiming(ticket.step, cores, gpu, memory or None, 1 + n_rows)
+                told = described(step, ticket.step, args) | self._costs.limits(ticket.step) | {"run": self._run}
+                report, *results = task.remote(step, (self._notes, told), len(supplied), *supplied, *args)
+                ticket.result = results if step == "stretch" else results[0]
                 self._tickets[report] = ticket
                 self._flying[draws] += 1
 
@@ -213,9 +209,9 @@ class RayGraph:
 
 
 @cache
-def _claiming(function: Any, name: str, cores: int, gpu: float | None, memory: int | None, returns: int) -> Any:
+def _claiming(name: str, cores: int, gpu: float | None, memory: int | None, returns: int) -> Any:
     """The remote function with what it claims; built once, as Ray takes its time over it."""
-    return function.options(name=name, num_cpus=cores, num_gpus=gpu, memory=memory, num_returns=returns)
+    return _run.options(name=name, num_cpus=cores, num_gpus=gpu, memory=memory, num_returns=returns)
 
 
 def _kind_of(error: RayError) -> ErrorKind:
@@ -241,46 +237,46 @@ def _after_drawing(tasks: Sequence[Sequence[str]]) -> frozenset[str]:
 
 
 @ray.remote(num_cpus=1, num_returns=2, max_retries=MAX_RETRIES)
-def _run(step: str, watch: tuple[Path, dict[str, Any]], n_supplied: int, *args: Any) -> tuple[Any, Any]:
-    """A function of factory.graph.steps in a worker, under watch: its report with the seconds it took, its result."""
+def _run(step: str, watch: tuple[Path, dict[str, Any]], n_supplied: int, *args: Any) -> tuple[Any, ...]:
+    """A function of factory.graph.steps in a worker, under watch: its report with the seconds it took, its result; of
+    a stretch each sample's."""
     began = time.perf_counter()
     supplied = [_held(arg) if isinstance(arg, list) else arg for arg in args[:n_supplied]]
     given = [ray.get(arg.reference) if isinstance(arg, Fetched) else arg for arg in args[n_supplied:]]
-    report, result = watched(*watch, STEPS[step][0], *supplied, *given)
-    return (report, time.perf_counter() - began), result
+    if step == "stretch":
+        report, *results = _stretch(watch, *supplied, *given)
+    else:
+        report, *results = watched(*watch, STEPS[step][0], *supplied, *given)
+    return (report, time.perf_counter() - began), *results
 
 
-@ray.remote(num_cpus=1, max_retries=MAX_RETRIES)
-def _walk(
+def _stretch(
     watch: tuple[Path, dict[str, Any]],
-    held: list[Any],
+    work: Work,
     stages: Sequence[str],
     prepared: PreparedClip,
     stamp: Stamp,
     stretch: Stretch,
-) -> tuple[Any, ...]:
-    """A stretch of a walk from `stamp` on, each attempt under watch: its report with the seconds it took, and rows.
+) -> list[Any]:
+    """A stretch of a walk from `stamp` on, each attempt under watch: report, then a row or None for each sample.
 
     What it makes does not depend on how long it takes, so that Ray can make lost rows again.
     """
     notes, told = watch
-    work, first = _held(held), stamp.round
-    name = "+".join(stages)
+    first, name = stamp.round, "+".join(stages)
     reports: list[Any] = []
     seconds: list[float] = []
     rows: list[Any] = []
     for candidate in range(stamp.candidate_index, stamp.candidate_index + stretch.n):
         began = time.perf_counter()
-        stamp = stamp.of(prepared.clip_id, candidate, first + len(rows))
-        given = (stages, prepared, stamp)
-        report, row = watched(notes, told | described("attempt", name, given), STEPS["attempt"][0], work, *given)
+        given = stages, prepared, stamp.of(prepared.clip_id, candidate, first + len(rows))
+        report, row = watched(notes, told | described("attempt", name, given), attempt, work, *given)
         reports.append(report)
         seconds.append(time.perf_counter() - began)
         rows += [row] if row is not None else []
         if isinstance(report, Failure) or len(rows) == stretch.samples:
             break
-    empty = [None] * (stretch.samples - len(rows))
-    return (Walked(tuple(reports), tuple(seconds)), sum(seconds)), *rows, *empty
+    return [Walked(tuple(reports), tuple(seconds)), *rows, *[None] * (stretch.samples - len(rows))]
 
 
 def _held(reference: list[Any]) -> Any:

@@ -1,6 +1,7 @@
 """Texts of millions of rows as integers: a number for each different text."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -9,8 +10,9 @@ from numpy.typing import NDArray
 
 Ints = NDArray[np.int64]
 Codes = NDArray[np.int32]
-PACKED_ROWS = 2**16
 Bytes = NDArray[np.bytes_]
+T = TypeVar("T")
+PACKED_ROWS = 2**16
 
 
 def codes(column: pa.ChunkedArray) -> tuple[Codes, tuple[str, ...]]:
@@ -41,14 +43,21 @@ def packed(parts: Iterable[pa.Table], key: str) -> Iterator[pa.Table]:
 
     Dictionaries of many small files would cost more than their texts.
     """
-    held: list[pa.Table] = []
-    for rows in parts:
-        held.append(rows)
-        if sum(rows.num_rows for rows in held) >= PACKED_ROWS:
-            yield _encoded(held, key)
-            held = []
-    if held:
-        yield _encoded(held, key)
+    return (_encoded(pack, key) for pack in in_packs(parts, lambda rows: int(rows.num_rows)))
+
+
+def in_packs(parts: Iterable[T], rows_of: Callable[[T], int]) -> Iterator[list[T]]:
+    """In order, as many together as have PACKED_ROWS rows or more; the last ones may have fewer."""
+    pack: list[T] = []
+    n_rows = 0
+    for part in parts:
+        pack.append(part)
+        n_rows += rows_of(part)
+        if n_rows >= PACKED_ROWS:
+            yield pack
+            pack, n_rows = [], 0
+    if pack:
+        yield pack
 
 
 def _encoded(parts: Sequence[pa.Table], key: str) -> pa.Table:

@@ -11,7 +11,7 @@ knows to count once; the next look sees the whole group.
 import json
 import threading
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -22,7 +22,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from factory.store.counts import funnel
-from factory.store.counts.codes import PACKED_ROWS, packed
+from factory.store.counts.codes import in_packs, packed
 from factory.store.plans import PLANS
 from factory.store.samples import CURRENT_RUN, Store
 from factory.store.table import KeyedTable, LiveFile
@@ -78,20 +78,9 @@ class Watched:
         if len(self.parts) > MOST_PARTS:  # of a run that is watched, a few files each
             self.parts = {sum(self.parts, ()): _together(list(self.parts.values()))}
         known = {path for paths in self.parts for path in paths}
-        for paths in self._groups(sorted(self.files.keys() - known)):
-            self.parts[paths] = self._read(paths)
+        for pack in in_packs(sorted(self.files.keys() - known), lambda path: self.files[path].n_rows):
+            self.parts[tuple(pack)] = self._read(pack)
         return True
-
-    def _groups(self, paths: Sequence[str]) -> Iterator[tuple[str, ...]]:
-        """Files that are read together: one, or more with PACKED_ROWS rows."""
-        group: list[str] = []
-        for path in paths:
-            group.append(path)
-            if sum(self.files[path].n_rows for path in group) >= PACKED_ROWS:
-                yield tuple(group)
-                group = []
-        if group:
-            yield tuple(group)
 
     def rows(self) -> pa.Table:
         """All of them."""

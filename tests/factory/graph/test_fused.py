@@ -74,7 +74,7 @@ def test_a_real_drive_travels_between_tasks_and_makes_the_same_row(town: Factory
             result: object = prepared
             for stage in ATTEMPT:
                 travelled = pickle.loads(pickle.dumps(result))
-                result = go_on(town, [stage], travelled, candidate, expert)
+                result = go_on(town, stage, travelled, candidate, expert)
                 if not isinstance(result, Underway):
                     break
             assert type(result) is type(whole)

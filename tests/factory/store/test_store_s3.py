@@ -14,7 +14,7 @@ from factory.store.samples import Store
 from factory.store.verify import verify
 from factory.views.board.server import Board
 from factory.views.show import prepared_episode
-from tests.chaos.bad_store import BUCKET, credentials, moto_server
+from tests.chaos.buckets.bad_store import BUCKET, credentials, moto_server
 from tests.factory.filmed import FilmedWork
 from tests.factory.tables import assert_same_tables
 from tests.factory.toy import ToyWork, refs

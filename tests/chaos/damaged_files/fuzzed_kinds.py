@@ -31,7 +31,7 @@ from tasks.experts.recovery.expert import RecoveryTable
 from tasks.world.camera import SensorFile
 from tasks.world.kinematic_vocabulary import kinematic_trajectories
 from tasks.world.vocabulary import Vocabulary
-from tests.chaos.mutants_of_files import Rng, of_bytes, of_json, of_pickle, of_text
+from tests.chaos.damaged_files.mutants_of_files import Rng, of_bytes, of_json, of_pickle, of_text
 from tests.factory.readers import scenarionet_scenarios
 from tests.factory.readers.navsim import scene_pickles
 from tests.factory.readers.navsim.logs import NAME, frame

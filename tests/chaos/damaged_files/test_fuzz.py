@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from factory.readers.apart import Apart
-from tests.chaos.fuzz import Question, answer, fuzzed
-from tests.chaos.fuzzed_kinds import KINDS, write_all
-from tests.chaos.mutants_of_files import rng_of
+from tests.chaos.damaged_files.fuzz import Question, answer, fuzzed
+from tests.chaos.damaged_files.fuzzed_kinds import KINDS, write_all
+from tests.chaos.damaged_files.mutants_of_files import rng_of
 
 pytestmark = pytest.mark.slow  # a town is painted, and each kind's reader is warmed in the other process
 

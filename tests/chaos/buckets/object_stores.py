@@ -1,4 +1,4 @@
-"""A run whose bucket misbehaves, and the same command again: `python -m tests.chaos.object_stores [NAME ...]`.
+"""A run whose bucket misbehaves, and the same command again: `python -m tests.chaos.buckets.object_stores [NAME ...]`.
 
 Prints a line for each trouble: what the run ended with and said, what the next one, without the trouble, ended with,
 and how its rows compare with those of a run that nothing disturbed.
@@ -15,10 +15,10 @@ from pathlib import Path
 from factory.store.location import Location
 from factory.store.samples import Store
 from factory.store.verify import verify
-from tests.chaos.bad_store import BUCKET, BadStore, Fault, What, bad_store, credentials, environment_of
+from tests.chaos.buckets.bad_store import BUCKET, BadStore, Fault, What, bad_store, credentials, environment_of
 from tests.factory.tables import assert_same_tables
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 WORDS = (
     *("executor=local", "render=none", "reward.labels=none", "vocabulary.k=64"),
     *("experts=[recovery,human]", "limit=2", "rounds=1", "shard_seconds=0.1"),

@@ -1,4 +1,4 @@
-"""Every reader against mutants of its files, in another process: `python -m tests.chaos.fuzz [N] [KINDS]`.
+"""Every reader against mutants of its files, elsewhere: `python -m tests.chaos.damaged_files.fuzz [N] [KINDS]`.
 
 Of each kind N mutants (5,000 where it is not said) are read. A mutant is accepted, where what comes out passes the
 reader's own checks and, of kinds with a checksum, is what went in; or it is refused, by the errors that the reader
@@ -17,8 +17,8 @@ from typing import Any
 
 from factory.readers.apart import Apart
 from factory.readers.base import BadClip
-from tests.chaos.fuzzed_kinds import KINDS, Readable, write_all
-from tests.chaos.mutants_of_files import rng_of
+from tests.chaos.damaged_files.fuzzed_kinds import KINDS, Readable, write_all
+from tests.chaos.damaged_files.mutants_of_files import rng_of
 
 N, LIMIT_S = 5000, 10.0
 RUNS = ("os.system", "os.exec", "os.posix_spawn", "os.fork", "subprocess.Popen", "socket.connect", "ctypes.dlopen")
@@ -107,6 +107,6 @@ def main(n: int = N, only: tuple[str, ...] = ()) -> int:
 
 
 if __name__ == "__main__":
-    from tests.chaos.fuzz import main  # so that another process can import what it is asked
+    from tests.chaos.damaged_files.fuzz import main  # so that another process can import what it is asked
 
     sys.exit(bool(main(*map(int, sys.argv[1:2]), only=tuple(sys.argv[2:]))))

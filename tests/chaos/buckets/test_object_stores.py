@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.chaos.bad_store import BUCKET, BadStore, Fault, What, bad_store, environment_of
-from tests.chaos.object_stores import ROOT, TROUBLES, check, undisturbed
+from tests.chaos.buckets.bad_store import BUCKET, BadStore, Fault, What, bad_store, environment_of
+from tests.chaos.buckets.object_stores import ROOT, TROUBLES, check, undisturbed
 
 pytestmark = pytest.mark.slow
 LOG = "_delta_log/0.*json"
