@@ -4,11 +4,17 @@ A batch closes when the rows of one partition reach 128 MB or after 30 s; its sh
 them stand, the driver commits the whole batch. What is not committed when a run dies is tried again by the next one.
 """
 
+import ctypes
+import ctypes.util
+import sys
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
+
+import pyarrow as pa
 
 from factory.graph.local import Graph, Ticket
 from factory.graph.steps import Failure
@@ -57,6 +63,23 @@ class PendingCommit:
     def largest(self) -> int:
         """Bytes of the largest partition."""
         return max(self.n_bytes.values(), default=0)
+
+
+@cache
+def _trim() -> Callable[[int], int] | None:
+    """glibc's malloc_trim; None where the C library has none."""
+    name = ctypes.util.find_library("c") if sys.platform == "linux" else None
+    return getattr(ctypes.CDLL(name), "malloc_trim", None) if name else None
+
+
+def give_back_freed() -> None:
+    """Hand memory that is free, but kept for later, back to the machine: of the C library's many arenas and Arrow's.
+
+    A driver of days would else hold what each of its threads once needed. About a millisecond.
+    """
+    pa.default_memory_pool().release_unused()
+    if trim := _trim():
+        trim(0)
 
 
 class Gatherer:
@@ -134,3 +157,5 @@ class Gatherer:
         began = time.perf_counter()
         self._store.commit(batch.candidates, batch.shards, batch.outcomes, batch.replaced, batch.unlisted, licences)
         self.committed(batch.shards, time.perf_counter() - began)
+        batch.rows.clear()
+        give_back_freed()

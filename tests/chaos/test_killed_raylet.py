@@ -19,19 +19,25 @@ import sys
 from factory.graph import driver
 from factory.graph.execute import execute, on_new_clusters
 from factory.graph.on_ray.cluster import ray
+from factory.graph.on_ray.graph import RayGraph
 from factory.store.samples import Store
 from tests.chaos.killed_driver import EXPERTS
 from tests.factory.toy import ToyWork, refs
 
-take, seen = driver.Driver._take_attempt, []
+seen = []
 
-def killing(self, *given):
-    seen.append(given)
-    if len(seen) == 6:
-        ray._private.worker._global_node.all_processes["raylet"][0].process.kill()
-    take(self, *given)
+def killing(kind, name, at):
+    honest = getattr(kind, name)
 
-driver.Driver._take_attempt = killing
+    def method(self, *given, **named):
+        seen.append(given)
+        if len(seen) == at:
+            ray._private.worker._global_node.all_processes["raylet"][0].process.kill()
+        return honest(self, *given, **named)
+
+    setattr(kind, name, method)
+
+killing(*{"warming": (RayGraph, "_warm_every_node", 1), "working": (driver.Driver, "_take_attempt", 6)}[sys.argv[2]])
 store = Store(sys.argv[1])
 ended = on_new_clusters(lambda: execute(ToyWork(), refs(5), EXPERTS, 2, store, "ray", 1, shard_seconds=0.05))
 sys.exit(ended.exit_code)
@@ -69,8 +75,9 @@ def test_a_cluster_that_dies_while_it_is_started_is_one_that_died() -> None:
 
 @pytest.mark.ray
 @pytest.mark.slow
-def test_a_run_goes_on_where_its_own_raylet_dies(tmp_path: Path) -> None:
-    words = [sys.executable, "-c", RUN, str(tmp_path / "out")]
+@pytest.mark.parametrize("while_", ["warming", "working"])
+def test_a_run_goes_on_where_its_own_raylet_dies(tmp_path: Path, while_: str) -> None:
+    words = [sys.executable, "-c", RUN, str(tmp_path / "out"), while_]
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
     assert done.stdout.count("a new cluster is started") == 1 and "Ray's raylet died" in done.stdout

@@ -57,6 +57,7 @@ ILL = (  # what Ray says when it is the machine that failed
     *(exceptions.ObjectStoreFullError, exceptions.OutOfDiskError),
 )
 AHEAD_S = 1.0  # of attempts that one task makes: the driver bears some hundreds of tasks a second
+LOOK_S = 1.0  # between two looks at whether a cluster lives
 WARMING = {"key": "warm", "what": "compiling kernels", "run": "", "limited": False}
 
 _HELD: dict[str, Any] = {}  # per worker process: the run's Work, fetched once
@@ -124,13 +125,40 @@ class RayGraph:
             self.attempt_tasks: Sequence[Sequence[str]] = attempt_tasks(fuse, apart=self._gpu_share > 0.0)
             self._after_drawing = _after_drawing(self.attempt_tasks) if self._gpu_share else frozenset()
             prove_shared(out, "out", "shared storage or a URL")
-            _warm_every_node(self._supplied["work"], self._notes, with_gpu_only=self._gpu_share > 0.0)
+            self._warm_every_node(with_gpu_only=self._gpu_share > 0.0)
         except BaseException as error:
             dead = dead_part() if self._is_ours else ""
             self.close()
             if dead and isinstance(error, Exception):
                 raise ClusterDied(f"Ray's {dead} died", is_ours=True) from error
             raise
+
+    def _warm_every_node(self, with_gpu_only: bool) -> None:
+        """Kernels on every node; what attempts draw with where they are made: on all nodes, or on those with a GPU."""
+        nodes, work, watch = nodes_of_cluster(), self._supplied["work"], (self._notes, WARMING)
+        draws = nodes_of_cluster("GPU") if with_gpu_only else nodes
+        reports = [
+            _run.options(name="warm", scheduling_strategy=on_node(n)).remote("warm", watch, 1, work, n in draws)[0]
+            for n in nodes
+        ]
+        waiting = reports
+        while waiting:
+            self._must_live()
+            _, waiting = ray.wait(waiting, num_returns=len(waiting), timeout=LOOK_S)
+        for node, report in zip(nodes, reports):
+            try:
+                answer, _ = ray.get(report)
+            except RayError as error:
+                if node not in nodes_of_cluster():
+                    continue  # it has left the cluster: no task goes there
+                raise NotReady(f"node {node} could not get its kernels ready: {one_line(error)}") from error
+            if isinstance(answer, Failure):
+                raise NotReady(answer.error) if answer.kind is ErrorKind.INPUT else RuntimeError(answer.error)
+
+    def _must_live(self) -> None:
+        """Raises ClusterDied where a cluster of our own has lost one of its processes."""
+        if self._is_ours and (dead := dead_part()):
+            raise ClusterDied(f"Ray's {dead} died", is_ours=True)
 
     def submit(self, step: str, *args: Any) -> Ticket:
         ticket = Ticket(name_of(step, args), None)
@@ -172,8 +200,7 @@ class RayGraph:
 
     def wait(self, timeout_s: float) -> tuple[Ticket, Any] | None:
         """Raises ClusterDied."""
-        if self._is_ours and (dead := dead_part()):
-            raise ClusterDied(f"Ray's {dead} died", is_ours=True)
+        self._must_live()
         if not self._ready and self._tickets:
             pending = list(self._tickets)
             some, _ = ray.wait(pending, num_returns=1, timeout=timeout_s, fetch_local=True)
@@ -285,22 +312,3 @@ def _held(reference: list[Any]) -> Any:
         _HELD.clear()
         _HELD[key] = ray.get(reference[0])
     return _HELD[key]
-
-
-def _warm_every_node(work: list[Any], notes: Path, with_gpu_only: bool) -> None:
-    """Kernels on every node; what attempts draw with where they are made: on all nodes, or on those with a GPU."""
-    nodes = nodes_of_cluster()
-    draws = nodes_of_cluster("GPU") if with_gpu_only else nodes
-    reports = [
-        _run.options(name="warm", scheduling_strategy=on_node(n)).remote("warm", (notes, WARMING), 1, work, n in draws)
-        for n in nodes
-    ]
-    for node, (report, _) in zip(nodes, reports):
-        try:
-            answer, _ = ray.get(report)
-        except RayError as error:
-            if node not in nodes_of_cluster():
-                continue  # it has left the cluster: no task goes there
-            raise NotReady(f"node {node} could not get its kernels ready: {one_line(error)}") from error
-        if isinstance(answer, Failure):
-            raise NotReady(answer.error) if answer.kind is ErrorKind.INPUT else RuntimeError(answer.error)
