@@ -15,7 +15,7 @@ from typing import Any
 from factory.graph.batch import Gatherer, PendingRow
 from factory.graph.blocks import BlockOf, BlockQueue, Build
 from factory.graph.episodes import Beside
-from factory.graph.local import Graph, Ticket
+from factory.graph.local import Graph, MachineIll, Ticket
 from factory.graph.metrics import RunMetrics
 from factory.graph.plan import CLIP_CANDIDATE, ClipPlan, RunPlan, WalkState, wants_payload
 from factory.graph.progress import Executed, ProgressLine, RunForecast, Tally, Workload
@@ -34,10 +34,6 @@ WAIT_S = 0.5
 DRAIN_S = 18.0  # of the 30 that are given after a first signal
 WRITE_S = 6.0  # to write what is done, after that
 ILL_IN_A_ROW = 6  # tasks that fail by the machine, or three for every task at once: then the run stops
-
-
-class MachineIll(RuntimeError):
-    """Task after task fails by the machine."""
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,11 @@ from deltalake.exceptions import DeltaError
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, asked_to_stop
 from factory.graph.batch import SHARD_BYTES, SHARD_SECONDS, Gatherer, WriteFailed
 from factory.graph.crashes import counted, crash_of
-from factory.graph.driver import Driver, MachineIll
+from factory.graph.driver import Driver
 from factory.graph.episodes import Beside, Episodes, EpisodesWanted, McapShards, Together
 from factory.graph.guard import CRASHED
 from factory.graph.limits import NO_LIMITS, Limits, notes_folder
-from factory.graph.local import NO_CLAIMS, Claims, ClusterDied, ClusterLacks, Fuse, Graph, LocalGraph
+from factory.graph.local import NO_CLAIMS, Claims, ClusterDied, ClusterLacks, Fuse, Graph, LocalGraph, MachineIll
 from factory.graph.metrics import RunMetrics
 from factory.graph.plan import RunPlan, make_plan
 from factory.graph.progress import Executed
@@ -142,6 +142,11 @@ def execute(
         return RunSummary(BAD_CONFIG, str(error))
     except ClusterDied as error:
         return RunSummary(INTERRUPTED, str(error), lost_cluster=error.is_ours)
+    except (MachineIll, OSError) as error:  # while kernels are compiled
+        if isinstance(error, OSError) and not why_ill(error):
+            raise
+        said = out_of_disk(error) if isinstance(error, DiskFull) else f"{one_line(error)}; {AGAIN}"
+        return RunSummary(INTERRUPTED, said)
     except KeyboardInterrupt:
         return RunSummary(INTERRUPTED, "stopped before anything was begun")
     try:

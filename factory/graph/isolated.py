@@ -19,9 +19,9 @@ from typing import Any
 
 from factory.graph.frozen import frozen
 from factory.graph.limits import NO_LIMITS, Costs, Limits, cleared, described, notes_folder, put_away, watched
-from factory.graph.local import MAX_RETRIES, STEPS, Fuse, Ticket, attempt_tasks, name_of
+from factory.graph.local import MAX_RETRIES, STEPS, Fuse, Ticket, attempt_tasks, name_of, unready
 from factory.graph.metrics import NoRecorder, Recorder
-from factory.graph.steps import Failure
+from factory.graph.steps import Failure, warm
 from factory.graph.work import NotReady, Stopped, Work, never
 from factory.store.location import Location
 from factory.store.outcomes import ErrorKind
@@ -148,9 +148,9 @@ class IsolatedGraph:
             said = self._pipe.recv()
         except EOFError:
             self._process.join()
-            said = f"the process for plug-ins ended with exit code {self._process.exitcode}"
-        if said:
-            raise NotReady(said)
+            raise NotReady(f"the process for plug-ins ended with exit code {self._process.exitcode}") from None
+        if isinstance(said, Failure):
+            raise unready(said)
 
 
 def _serve(pipe: Connection, work: Work, out: Location, stop: Any, notes: Path) -> None:
@@ -169,12 +169,10 @@ def _serve(pipe: Connection, work: Work, out: Location, stop: Any, notes: Path) 
         kept.move_to_end(arg.number)
         return kept[arg.number]
 
-    try:
-        work.warm()
-    except NotReady as error:
-        pipe.send(str(error))
+    said, _ = warm(work, draws=True)
+    pipe.send(said)
+    if isinstance(said, Failure):
         return
-    pipe.send("")
     try:
         while (message := pipe.recv()) is not None:
             number, step, task, args = message

@@ -12,8 +12,11 @@ from factory.graph.frozen import frozen
 from factory.graph.guard import Guard
 from factory.graph.limits import described, notes_folder
 from factory.graph.metrics import NoRecorder, Recorder
-from factory.graph.work import Stopped, Work, never
+from factory.graph.steps import Failure
+from factory.graph.work import NotReady, Stopped, Work, never
+from factory.store.disk import DiskFull
 from factory.store.location import Location
+from factory.store.outcomes import ErrorKind
 from tasks.stages import ATTEMPT, TASKS
 
 Fuse = Literal["auto", "all", "none"]
@@ -36,6 +39,10 @@ class Claims:
 
 class ClusterLacks(ValueError):
     """The cluster has no node that the run could use."""
+
+
+class MachineIll(RuntimeError):
+    """The machine fails what it is given, or task after task."""
 
 
 class ClusterDied(RuntimeError):
@@ -113,6 +120,15 @@ def cores_of(step: str, args: tuple[Any, ...]) -> int:
 @dataclass
 class _Box:
     value: Any = None
+
+
+def unready(failure: Failure) -> Exception:
+    """What is to be raised where a machine could not get its kernels."""
+    if failure.disk_full:
+        return DiskFull(failure.disk_full)
+    if failure.kind is ErrorKind.MACHINE:
+        return MachineIll(failure.error.splitlines()[-1])
+    return NotReady(failure.error) if failure.kind is ErrorKind.INPUT else RuntimeError(failure.error)
 
 
 class LocalGraph:

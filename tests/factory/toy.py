@@ -1,5 +1,6 @@
 """A small, deterministic Work with real numbers: candidates and rows come from a Philox stream of (clip, candidate)."""
 
+import errno
 import hashlib
 import os
 import signal
@@ -198,6 +199,19 @@ def ran(journal: str, word: str) -> int:
     """Tasks of a kind that really ran; a journal that nobody began holds none."""
     path = Path(journal)
     return sum(line.startswith(word) for line in path.read_text().splitlines()) if path.exists() else 0
+
+
+COLD = "/kernels/of/mine"
+
+
+@dataclass(frozen=True)
+class ColdWork(ToyWork):
+    """Its kernels cannot be written."""
+
+    number: int = errno.ENOSPC
+
+    def warm(self, draws: bool = True) -> None:
+        raise OSError(self.number, os.strerror(self.number), COLD)
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ from factory.graph.local import (
     attempt_tasks,
     cores_of,
     name_of,
+    unready,
 )
 from factory.graph.metrics import METRICS, Metric, Recorder, Type
 from factory.graph.on_ray.cluster import (
@@ -153,7 +154,7 @@ class RayGraph:
                     continue  # it has left the cluster: no task goes there
                 raise NotReady(f"node {node} could not get its kernels ready: {one_line(error)}") from error
             if isinstance(answer, Failure):
-                raise NotReady(answer.error) if answer.kind is ErrorKind.INPUT else RuntimeError(answer.error)
+                raise unready(answer)
 
     def _must_live(self) -> None:
         """Raises ClusterDied where a cluster of our own has lost one of its processes."""

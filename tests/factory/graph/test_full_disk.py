@@ -20,7 +20,7 @@ from factory.store.verify import verify
 from tasks.caches import user_cache
 from tests.chaos.full_disks import PAGE, at_level, needed
 from tests.factory.tables import assert_same_rows, assert_same_tables, tables_of
-from tests.factory.toy import ToyWork, refs
+from tests.factory.toy import COLD, ColdWork, ToyWork, refs
 
 LARGE = "64m"
 TOWN = ["clips.n_clips=3", "clips.settings.cameras=[]", "clips.settings.lidar_beams=0", "render=none"]
@@ -168,6 +168,17 @@ def test_a_full_disk_under_the_user_s_cache_is_told_with_its_path_and_is_no_wron
     assert run_main([*TOWN, f"out={tmp_path / 'out'}"]) == INTERRUPTED
     (told,) = [line for line in capsys.readouterr().err.splitlines() if "space" in line]
     assert str(tmp_path / "cache/driving-data-factory/towns") in told and "run the same command again" in told
+
+
+@pytest.mark.parametrize("executor", ["local", "isolated", pytest.param("ray", marks=pytest.mark.ray)])
+@pytest.mark.parametrize("work", [ColdWork(number=errno.ENOSPC), ColdWork(number=errno.EIO)])
+def test_a_machine_that_is_ill_while_kernels_are_compiled_is_no_bug_and_no_wrong_setting(
+    tmp_path: Path, work: ToyWork, executor: str
+) -> None:
+    out, where = tmp_path / "out", "ray" if executor == "ray" else "local"
+    summary = execute(work, refs(1), ["human"], 1, Store(out), where, 1, isolated=executor == "isolated")  # type: ignore[arg-type]
+    assert summary.exit_code == INTERRUPTED and not [*out.rglob("*.parquet")]
+    assert COLD in summary.message and "run the same command again" in summary.message
 
 
 def test_ray_that_cannot_begin_ends_the_run_with_one_line_that_says_how_full_its_place_is(
