@@ -11,9 +11,12 @@ view SCENE out=RUN                  in the browser, until Ctrl-C, with the log's
                                     it; without out= the scene alone. port=8267, host=127.0.0.1
 
 traversal=N takes the colours of an MTGS checkpoint's N-th traversal (default: their mean), transforms=FILE takes back
-nerfstudio's dataparser_transforms.json. The .ply files are standard 3D Gaussian splatting (gsplat, nerfstudio,
-SuperSplat). A background is in metres from the scene's origin, a node in its box's frame. A block's scene lies in
-<out>/cache/block-*.safetensors; an edited one put back under the same name is what the next run draws.
+nerfstudio's dataparser_transforms.json. antialiased=true|false: how a file was made to be drawn (rasterize_mode of
+gsplat), where it does not say so; .spz, MTGS and WorldEngine do, of others it is that of like=, or false.
+
+The .ply files are standard 3D Gaussian splatting (gsplat, nerfstudio, SuperSplat). A background is in metres from the
+scene's origin, a node in its box's frame. A block's scene lies in <out>/cache/block-*.safetensors; an edited one put
+back under the same name is what the next run draws.
 """
 
 from dataclasses import dataclass, field
@@ -38,6 +41,7 @@ class Request:
     format: Literal["ply", "spz", "ckpt"] | None = None
     traversal: int | None = None
     transforms: str | None = None
+    antialiased: bool | None = None
     out: str | None = None
     port: int | None = None
     host: str | None = None
@@ -50,10 +54,10 @@ class Request:
         takes = {
             "info": (),
             "export": ("to", "format"),
-            "import": ("to", "like", "origin", "traversal", "transforms"),
+            "import": ("to", "like", "origin", "traversal", "transforms", "antialiased"),
             "view": ("out", "port", "host"),
         }[self.action]
-        for name in ("to", "like", "origin", "format", "traversal", "transforms", "out", "port", "host"):
+        for name in ("to", "like", "origin", "format", "traversal", "transforms", "antialiased", "out", "port", "host"):
             if getattr(self, name) is not None and name not in takes:
                 raise ValueError(f"scene {self.action} takes no {name}=; see --help")
         if self.like is not None and self.origin is not None:
@@ -76,7 +80,9 @@ def main(request: Request) -> None:
             case "import":
                 transforms = None if request.transforms is None else Path(request.transforms)
                 found = read_splats(file, request.traversal, transforms)
-                print(info_text(to, write_scene(to, imported(found, request.like, request.origin))))
+                print(
+                    info_text(to, write_scene(to, imported(found, request.like, request.origin, request.antialiased)))
+                )
                 if found.left_out:
                     print(f"left out    {', '.join(found.left_out)}: bodies that bend need their network")
             case "view":

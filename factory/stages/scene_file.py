@@ -33,6 +33,7 @@ from factory.store.identity import canonical_json
 from tasks.render.scene.asset import BlockRange, ClassQuality, Exposure, OwnBody, RenderAsset, TakenFrom, ViewQuality
 from tasks.render.scene.sky import SkyMap
 from tasks.render.splatting.gaussians import Gaussians
+from tasks.render.splatting.project import OF_DISCS, ScreenFilter
 from tasks.world.camera import Camera, Fisheye
 
 FORMAT, VERSION = "driving-data-factory scene", 1
@@ -130,6 +131,7 @@ def described_by(asset: RenderAsset) -> dict[str, Any]:
     return {
         "format": FORMAT,
         "version": VERSION,
+        "screen": list(asset.screen),
         "nodes": list(asset.nodes),
         "psnr_db": _number(asset.psnr_db),
         "n_held_out": asset.n_held_out,
@@ -156,6 +158,7 @@ def scene_of(tensors: Tensors, described: Mapping[str, Any], digest: str) -> Ren
         psnr_db=_nan(described["psnr_db"]),
         n_held_out=described["n_held_out"],
         digest=digest,
+        screen=ScreenFilter(*described.get("screen", OF_DISCS)),  # older files have none
         views=tuple(_view(view) for view in described["views"]),
         exposures=tuple(
             Exposure(camera, time_s, tensors["exposures"][i])

@@ -17,6 +17,7 @@ from tasks.render.scene.lidar_only import plain_sky
 from tasks.render.splatting import sh
 from tasks.render.splatting.checkpoints import SplatCheckpoint
 from tasks.render.splatting.gaussians import Gaussians
+from tasks.render.splatting.project import ANTIALIASED, CLASSIC, ScreenFilter
 
 
 def info_text(path: Path, asset: RenderAsset) -> str:
@@ -26,6 +27,7 @@ def info_text(path: Path, asset: RenderAsset) -> str:
         x, y = (f"{low:.1f} .. {high:.1f}" for low, high in zip(block.low, block.high))
         lines.append(f"block       {block.dataset} {block.log_id}, {block.start_s:.1f} to {block.end_s:.1f} s")
         lines.append(f"sensors at  x {x}, y {y} m")
+    lines.append(f"drawn       {_drawn(asset.screen)}")
     lines.append(f"background  {_counted(asset.background)}")
     lines += [f"node        {name}: {_counted(node)}" for name, node in asset.nodes.items()]
     held_out = f"{asset.psnr_db:.2f} dB over {asset.n_held_out} held-out photos"
@@ -48,8 +50,8 @@ def export(asset: RenderAsset, folder: Path, suffix: str = ".ply") -> list[Path]
     nodes = {f"node-{re.sub(r'[^A-Za-z0-9._-]', '_', name)}{suffix}": node for name, node in asset.nodes.items()}
     if len(nodes) < len(asset.nodes):
         raise BadScene(f"track ids {', '.join(asset.nodes)}: two of them make the same file name")
-    files = {f"background{suffix}": partial(background_bytes, asset.background, suffix, asset.origin)}
-    files |= {name: partial(node_bytes, node, suffix) for name, node in nodes.items()}
+    files = {f"background{suffix}": partial(background_bytes, asset.background, suffix, asset.origin, asset.screen)}
+    files |= {name: partial(node_bytes, node, suffix, asset.screen) for name, node in nodes.items()}
     for name, written in files.items():
         try:
             (folder / name).write_bytes(written())
@@ -62,22 +64,27 @@ def export(asset: RenderAsset, folder: Path, suffix: str = ".ply") -> list[Path]
     return [folder / name for name in (*files, "sky.png", "scene.json")]
 
 
-def imported(found: SplatCheckpoint, like: str | None = None, origin: str | None = None) -> RenderAsset:
+def imported(
+    found: SplatCheckpoint, like: str | None = None, origin: str | None = None, antialiased: bool | None = None
+) -> RenderAsset:
     """What a file holds as a scene of unknown quality. Raises BadScene or ValueError.
 
     like: the scene that origin, sky, range and, where the file has none, vehicles are of. origin: x,y,z [m] of the
-    file's zero in the world; where the file says it, that must not be given.
+    file's zero in the world; where the file says it, that must not be given. antialiased: how it was made to be drawn;
+    None: as the file says, else as the other scene, else not so.
     """
+    screen = found.screen if antialiased is None else (ANTIALIASED if antialiased else CLASSIC)
     if found.origin is not None and origin is not None:
         raise ValueError("origin=: the file itself says where it lies in the world")
     place = _place(origin or "0,0,0") if found.origin is None else found.origin
     if like is None:
-        return RenderAsset(place, found.background, found.nodes, plain_sky(), float("nan"))
+        return RenderAsset(place, found.background, found.nodes, plain_sky(), float("nan"), screen=screen or CLASSIC)
     other = read_scene(Path(like))
     return replace(
         other,
         origin=other.origin if found.origin is None else found.origin,
         background=found.background,
+        screen=screen or other.screen,
         nodes=found.nodes or other.nodes,
         psnr_db=float("nan"),
         n_held_out=0,
@@ -94,6 +101,10 @@ def _place(text: str) -> np.ndarray:
     if place.shape != (3,) or not np.isfinite(place).all():
         raise ValueError(f"origin={text}: expected x,y,z in metres")
     return place
+
+
+def _drawn(screen: ScreenFilter) -> str:
+    return f"{'antialiased' if screen.keeps_light else 'classic'}, {screen.dilation_px2:g} px2 wider"
 
 
 def _counted(part: Gaussians) -> str:

@@ -13,6 +13,7 @@ from factory.stages.scene_file import BadScene
 from tasks.render.splatting.checkpoints import SplatCheckpoint, from_checkpoint, splatfacto, worldengine
 from tasks.render.splatting.gaussians import Gaussians, moved
 from tasks.render.splatting.ply import from_ply, to_ply
+from tasks.render.splatting.project import ANTIALIASED, ScreenFilter
 from tasks.render.splatting.spz import from_spz, to_spz
 from tasks.world.arrays import Array
 
@@ -37,7 +38,7 @@ def read_splats(path: Path, traversal: int | None = None, transforms: Path | Non
             found = from_checkpoint(_loaded(path), traversal)
         else:
             data = path.read_bytes()
-            found = SplatCheckpoint(from_ply(data) if suffix == ".ply" else from_spz(data, zstd))
+            found = SplatCheckpoint(from_ply(data)) if suffix == ".ply" else _of_spz(data)
     except ValueError as error:
         raise BadScene(f"{path}: {error}") from error
     if not len(found.background):
@@ -49,14 +50,14 @@ def read_splats(path: Path, traversal: int | None = None, transforms: Path | Non
     return replace(found, background=taken_back(found.background, *transform_of(transforms)))
 
 
-def background_bytes(gaussians: Gaussians, suffix: str, origin: Array) -> bytes:
+def background_bytes(gaussians: Gaussians, suffix: str, origin: Array, screen: ScreenFilter) -> bytes:
     """A street's file; a checkpoint is WorldEngine's, `origin` (3,) [m] in the world. Raises ValueError."""
-    return _saved(worldengine(gaussians, origin)) if suffix in CHECKPOINTS else _bytes(gaussians, suffix)
+    return _saved(worldengine(gaussians, origin)) if suffix in CHECKPOINTS else _bytes(gaussians, suffix, screen)
 
 
-def node_bytes(gaussians: Gaussians, suffix: str) -> bytes:
+def node_bytes(gaussians: Gaussians, suffix: str, screen: ScreenFilter) -> bytes:
     """A vehicle's file; a checkpoint is splatfacto's. Raises ValueError."""
-    return _saved(splatfacto(gaussians)) if suffix in CHECKPOINTS else _bytes(gaussians, suffix)
+    return _saved(splatfacto(gaussians)) if suffix in CHECKPOINTS else _bytes(gaussians, suffix, screen)
 
 
 def transform_of(path: Path) -> tuple[Array, float]:
@@ -87,8 +88,13 @@ def zstd(data: bytes, size: int) -> bytes:
     return pa.decompress(data, size, codec="zstd", asbytes=True)
 
 
-def _bytes(gaussians: Gaussians, suffix: str) -> bytes:
-    return (to_ply if suffix == ".ply" else to_spz)(gaussians)
+def _bytes(gaussians: Gaussians, suffix: str, screen: ScreenFilter) -> bytes:
+    return to_ply(gaussians) if suffix == ".ply" else to_spz(gaussians, screen.keeps_light)
+
+
+def _of_spz(data: bytes) -> SplatCheckpoint:
+    found, antialiased = from_spz(data, zstd)
+    return SplatCheckpoint(found, screen=ANTIALIASED if antialiased else None)
 
 
 def _loaded(path: Path) -> object:

@@ -47,6 +47,7 @@ def rasterization(
     height: int,
     near_plane: float,
     eps2d: float,
+    rasterize_mode: str,
     sh_degree: int | None,
     packed: bool,
     render_mode: str,
@@ -54,7 +55,7 @@ def rasterization(
     """`gsplat.rasterization` from its own parts, on the CPU and of any precision; the last entry for one camera."""
     assert packed and render_mode == "RGB+ED"
     scene = (means, quats, scales, opacities, colors)
-    how = (width, height, near_plane, eps2d, sh_degree)
+    how = (width, height, near_plane, eps2d, rasterize_mode == "antialiased", sh_degree)
     drawn, alpha, meta = zip(*(_seen_by(scene, viewmats[c : c + 1], Ks[c : c + 1], *how) for c in range(len(Ks))))
     return torch.cat(drawn), torch.cat(alpha), meta[0]
 
@@ -67,14 +68,17 @@ def _seen_by(
     height: int,
     near_plane: float,
     eps2d: float,
+    antialiased: bool,
     sh_degree: int | None,
 ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
     means, quats, scales, opacities, colors = scene
     twin = importlib.import_module("gsplat.cuda._torch_impl")
     covariances, _ = twin._quat_scale_to_covar_preci(quats, scales, compute_preci=False)
-    radii, means2d, depths, conics, _ = twin._fully_fused_projection(
-        means, covariances, viewmats, Ks, width, height, eps2d=eps2d, near_plane=near_plane
+    radii, means2d, depths, conics, left = twin._fully_fused_projection(
+        means, covariances, viewmats, Ks, width, height, eps2d, near_plane, calc_compensations=antialiased
     )
+    if antialiased:
+        opacities = opacities * left[0]
     index = ((radii[0] > 0).all(dim=1) & (opacities >= FAINTEST)).nonzero()[:, 0]
     centres, conics, depths, opacities = means2d[0, index], conics[0, index], depths[0, index], opacities[index]
     if sh_degree is None:

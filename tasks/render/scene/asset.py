@@ -12,6 +12,7 @@ from tasks.render.scene.boxes import box_gaussians
 from tasks.render.scene.movers import lifted, world_from_boxes
 from tasks.render.scene.sky import SkyMap
 from tasks.render.splatting.gaussians import Gaussians, concatenate, moved
+from tasks.render.splatting.project import FITTED, ScreenFilter
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import F32, Array, Bools, Bytes
 from tasks.world.camera import Camera, SensorFile
@@ -108,6 +109,7 @@ class RenderAsset:
     rig: tuple[Camera, ...] = ()  # cameras that its photos were corrected to; empty: they are as given
     taken: tuple[TakenFrom, ...] = ()  # its photos, where their poses were corrected
     bodies: tuple[OwnBody, ...] = ()  # of the cameras that were said to see one
+    screen: ScreenFilter = FITTED  # what its Gaussians were made to be drawn through
 
     def as_corrected(self, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
         """The cameras to draw it with: of the scene's own rig those of the same names, where it has one."""

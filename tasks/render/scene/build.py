@@ -24,6 +24,7 @@ from tasks.render.scene.sky import SkyMap, directions, sky_of_views
 from tasks.render.scene.stereo import FAR_M
 from tasks.render.scene.surfels import discs_of_photo, gaussians_of
 from tasks.render.splatting.gaussians import EMPTY, Gaussians
+from tasks.render.splatting.project import OF_DISCS
 from tasks.render.splatting.raster import gather, shade, splat
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import F32, Array, Bools
@@ -61,7 +62,7 @@ def build_asset(
         seen = with_confirmed(train, seen)
     background, nodes = surfaces(train, seen, tracks)
     sky = sky_of(train, seen)
-    asset = RenderAsset(origin, background, nodes, sky, float("nan"))
+    asset = RenderAsset(origin, background, nodes, sky, float("nan"), screen=OF_DISCS)
     asset = _refit(asset, train, seen, tracks)
     if not held_out:
         return asset
@@ -180,7 +181,7 @@ def _refit(asset: RenderAsset, photos: Sequence[Photo], seen: Sequence[Seen], tr
         there, boxes = _members(asset, tracks, photo.time_s)
         there = [j for j in there if tracks.ids[j] in place]
         ids = [tracks.ids[j] for j in there]
-        splats = splat(scene_at(asset, ids, [AgentKind.VEHICLE] * len(ids), boxes[there]), *camera)
+        splats = splat(scene_at(asset, ids, [AgentKind.VEHICLE] * len(ids), boxes[there]), *camera, screen=asset.screen)
         spans = [0, *(place[name] for name in ids)]
         rows = np.concatenate([np.arange(starts[k], starts[k + 1]) for k in spans])[splats.index]
         drawn = shade(splats, colours[rows], asset.sky.seen_by(*camera)).rgb

@@ -17,6 +17,7 @@ from tasks.render.scene.movers import boxes_at
 from tasks.render.scene.sensed import shifted
 from tasks.render.scene.settings import Backend
 from tasks.render.splatting.gaussians import Gaussians
+from tasks.render.splatting.project import ScreenFilter
 from tasks.render.splatting.raster import View, forward
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import F32, Array
@@ -64,7 +65,7 @@ def render(
     scene = scene_at(asset, vehicles.track_ids, vehicles.kinds, vehicles.boxes)
     local = [replace(camera, world_from_camera=shifted(camera.world_from_camera, -asset.origin)) for camera in cameras]
     backdrops = [asset.sky.seen_by(c.intrinsics, c.world_from_camera, c.width, c.height, threads) for c in local]
-    views = RASTERISERS[backend](scene, local, backdrops, threads)
+    views = RASTERISERS[backend](scene, local, backdrops, threads, asset.screen)
     if affines is not None:
         views = [replace(view, rgb=developed(view.rgb, affine)) for view, affine in zip(views, affines, strict=True)]
     return [replace(view, rgb=np.clip(view.rgb, 0.0, 1.0)) for view in views]
@@ -78,21 +79,26 @@ def check(backend: Backend) -> None:
         require()
 
 
-Rasteriser = Callable[[Gaussians, Sequence[Pinhole], Sequence[F32], int], list[View]]
-"""Gaussians, cameras and (H, W, 3) backdrops in one frame, threads -> views; colours may leave [0, 1]."""
+Rasteriser = Callable[[Gaussians, Sequence[Pinhole], Sequence[F32], int, ScreenFilter], list[View]]
+"""Gaussians, cameras and (H, W, 3) backdrops in one frame, threads, what all is drawn through -> views; colours may
+leave [0, 1]."""
 
 
-def _on_cpu(scene: Gaussians, cameras: Sequence[Pinhole], backdrops: Sequence[F32], threads: int) -> list[View]:
+def _on_cpu(
+    scene: Gaussians, cameras: Sequence[Pinhole], backdrops: Sequence[F32], threads: int, screen: ScreenFilter
+) -> list[View]:
     return [
-        forward(scene, camera.intrinsics, camera.world_from_camera, camera.width, camera.height, backdrop, threads).view
-        for camera, backdrop in zip(cameras, backdrops)
+        forward(scene, c.intrinsics, c.world_from_camera, c.width, c.height, backdrop, threads, screen).view
+        for c, backdrop in zip(cameras, backdrops)
     ]
 
 
-def _with_gsplat(scene: Gaussians, cameras: Sequence[Pinhole], backdrops: Sequence[F32], threads: int) -> list[View]:
+def _with_gsplat(
+    scene: Gaussians, cameras: Sequence[Pinhole], backdrops: Sequence[F32], threads: int, screen: ScreenFilter
+) -> list[View]:
     from tasks.render.splatting.gsplat_backend import rasterize_all  # torch is loaded only where it is asked for
 
-    return rasterize_all(scene, cameras, backdrops)
+    return rasterize_all(scene, cameras, backdrops, screen)
 
 
 RASTERISERS: Mapping[Backend, Rasteriser] = MappingProxyType({Backend.CPU: _on_cpu, Backend.GSPLAT: _with_gsplat})

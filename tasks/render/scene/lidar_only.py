@@ -18,6 +18,7 @@ from tasks.render.scene.sensed import Sweep, Tracks, on_ego, shifted, voxel_rows
 from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
 from tasks.render.scene.surfels import Discs, concatenate_discs, gaussians_of
 from tasks.render.splatting.gaussians import EMPTY, concatenate
+from tasks.render.splatting.project import OF_DISCS
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import F32, Array, Bools, Bytes
 
@@ -63,7 +64,7 @@ def lidar_asset(sweeps: Sequence[Sweep], agents: AgentTracks | None) -> RenderAs
             nodes[tracks.ids[j]] = concatenate([gaussians_of(whole), inner])
     street = _thinned(static)
     background = gaussians_of(street) if len(street.points) else EMPTY
-    return RenderAsset(origin, background, nodes, plain_sky(), float("nan"))
+    return RenderAsset(origin, background, nodes, plain_sky(), float("nan"), screen=OF_DISCS)
 
 
 def grey_of(intensity: Bytes) -> F32:

@@ -24,6 +24,7 @@ import numpy as np
 from tasks.render.splatting import sh
 from tasks.render.splatting.gaussians import Gaussians, concatenate, rotations_of
 from tasks.render.splatting.ply import LEAST, MOST
+from tasks.render.splatting.project import ANTIALIASED, ScreenFilter
 from tasks.world.arrays import F32, Array
 
 PARAMETERS = ("means", "scales", "quats", "features_dc", "features_rest", "opacities")
@@ -45,6 +46,7 @@ class SplatCheckpoint:
     nodes: Mapping[str, Gaussians] = field(default_factory=dict)  # token -> in its box's frame
     origin: Array | None = None  # (3,) [m] of the scene's zero in the world, where the file says it
     left_out: tuple[str, ...] = ()  # parts
+    screen: ScreenFilter | None = None  # what it was made to be drawn through, where the file says it
 
 
 @dataclass(frozen=True)
@@ -71,8 +73,17 @@ def from_checkpoint(content: object, traversal: int | None = None) -> SplatCheck
     street = [_gaussians(parts[name], name, traversal) for name in (BACKGROUND, SKY) if name in parts]
     origin = parts[BACKGROUND].config.get("recon2world_translation")
     return SplatCheckpoint(
-        concatenate(street), nodes, None if origin is None else np.asarray(origin, np.float64).reshape(-1)[:3], left_out
+        concatenate(street),
+        nodes,
+        None if origin is None else np.asarray(origin, np.float64).reshape(-1)[:3],
+        left_out,
+        None if _is_splatfacto(content) else ANTIALIASED,  # rasterize_mode of mtgs.yaml and of MTGS.py; eps2d as it is
     )
+
+
+def _is_splatfacto(content: Any) -> bool:
+    """No scene of several parts, whose classes are MTGS's."""
+    return "pipeline" in content and not any("gaussian_models." in name for name in content["pipeline"])
 
 
 def splatfacto(gaussians: Gaussians) -> dict[str, Any]:

@@ -56,8 +56,8 @@ def backward(
     sizes = ((n, 3), (n, 4), (n, 3), (n,), (n, 2), (n, 3), (n, count, 3))
     means, quats, log_scales, logits, screen, colours, sh_rest = (np.empty(size, np.float32) for size in sizes)
     shapes, light = (means, quats, log_scales, logits, screen), (gaussians.means, gaussians.colours, gaussians.sh_rest)
-    camera_from_scene, size = splats.camera_from_scene, (splats.width, splats.height)
-    scene = (gaussians.means, gaussians.quats, gaussians.log_scales, camera_from_scene, splats.intrinsics, *size)
+    camera_from_scene, view = splats.camera_from_scene, (splats.width, splats.height, splats.screen.keeps_light)
+    scene = (gaussians.means, gaussians.quats, gaussians.log_scales, camera_from_scene, splats.intrinsics, *view)
 
     def run(first: int, last: int) -> Array:
         camera = np.zeros(6)

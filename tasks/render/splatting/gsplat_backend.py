@@ -2,7 +2,7 @@
 
 Its conventions are those of the CPU rasteriser: quaternions w first, world-to-camera matrices with z forward, the
 centre of pixel (0, 0) at (0.5, 0.5), contributions cut off at 1/255 and capped at 0.999 (later versions cap at 0.99).
-What differs is passed on (near plane, screen dilation) or below 8 bits (no more than 1e-4 of the light is dropped
+What differs is passed on (near plane, the screen's filter) or below 8 bits (no more than 1e-4 of the light is dropped
 instead of 1e-3). Pictures and derivatives are held against gsplat's own reference by tests.bench.peer_gsplat.
 torch and gsplat are loaded by the first call, nowhere else; gsplat compiles its CUDA sources then, once per machine.
 """
@@ -16,7 +16,7 @@ import numpy as np
 
 from tasks.render.splatting import sh
 from tasks.render.splatting.gaussians import Gaussians
-from tasks.render.splatting.project import DILATION_PX2, NEAR_M
+from tasks.render.splatting.project import FITTED, NEAR_M, ScreenFilter
 from tasks.render.splatting.raster import View
 from tasks.world.arrays import F32
 from tasks.world.camera import Pinhole
@@ -45,7 +45,7 @@ def require() -> tuple[Any, Any]:
     return torch, gsplat
 
 
-def arguments(scene: Gaussians, cameras: Sequence[Pinhole]) -> dict[str, Any]:
+def arguments(scene: Gaussians, cameras: Sequence[Pinhole], screen: ScreenFilter = FITTED) -> dict[str, Any]:
     """What `gsplat.rasterization` is called with: arrays float32 by its names, and plain settings.
 
     means (N, 3), quats (N, 4), scales (N, 3), opacities (N,), colors (N, 3) or, with sh_degree, coefficients (N, K, 3),
@@ -66,16 +66,17 @@ def arguments(scene: Gaussians, cameras: Sequence[Pinhole]) -> dict[str, Any]:
         "Ks": np.stack([camera.intrinsics for camera in cameras]),
     }
     arrays = {name: np.ascontiguousarray(array, np.float32) for name, array in arrays.items()}
-    return arrays | plain_arguments(cameras[0].width, cameras[0].height, count)
+    return arrays | plain_arguments(cameras[0].width, cameras[0].height, count, screen)
 
 
-def plain_arguments(width: int, height: int, count: int) -> dict[str, Any]:
+def plain_arguments(width: int, height: int, count: int, screen: ScreenFilter = FITTED) -> dict[str, Any]:
     """The arguments that are no arrays; `count` of the coefficients beyond degree 0."""
     return {
         "width": width,
         "height": height,
         "near_plane": NEAR_M,
-        "eps2d": DILATION_PX2,
+        "eps2d": screen.dilation_px2,
+        "rasterize_mode": "antialiased" if screen.keeps_light else "classic",
         "sh_degree": sh.COUNTS.index(count) or None,
         "render_mode": "RGB+ED",  # the last channel is the depth, a mean by weight
         "packed": True,  # memory follows what is seen, not cameras x Gaussians
@@ -89,7 +90,9 @@ def view_of(colours_and_depth: F32, alpha: F32, backdrop: F32) -> View:
     return View(rgb.astype(np.float32), np.where(covered > 0.0, colours_and_depth[..., 3], 0.0), covered)
 
 
-def rasterize_all(scene: Gaussians, cameras: Sequence[Pinhole], backdrops: Sequence[F32]) -> list[View]:
+def rasterize_all(
+    scene: Gaussians, cameras: Sequence[Pinhole], backdrops: Sequence[F32], screen: ScreenFilter = FITTED
+) -> list[View]:
     """What `tasks.render.scene.engine.render` draws with on CUDA: one view a camera. Raises BackendMissing."""
     torch, gsplat = require()
 
@@ -99,7 +102,7 @@ def rasterize_all(scene: Gaussians, cameras: Sequence[Pinhole], backdrops: Seque
             drawn, covered, _ = gsplat.rasterization(**on_device)
         return drawn.cpu().numpy(), covered.cpu().numpy()
 
-    return drawn_by(draw, scene, cameras, backdrops)
+    return drawn_by(draw, scene, cameras, backdrops, screen)
 
 
 def drawn_by(
@@ -107,6 +110,7 @@ def drawn_by(
     scene: Gaussians,
     cameras: Sequence[Pinhole],
     backdrops: Sequence[F32],
+    screen: ScreenFilter = FITTED,
 ) -> list[View]:
     """One view a camera, all of a size at once; `draw` takes `arguments` and gives (C, H, W, 4) and (C, H, W, 1)."""
     by_size: dict[tuple[int, int], list[int]] = defaultdict(list)
@@ -117,7 +121,7 @@ def drawn_by(
         pictures = np.zeros((len(rows), height, width, 4), np.float32)
         alphas = np.zeros((len(rows), height, width, 1), np.float32)
         if len(scene):
-            pictures, alphas = draw(arguments(scene, [cameras[i] for i in rows]))
+            pictures, alphas = draw(arguments(scene, [cameras[i] for i in rows], screen))
         for i, picture, alpha in zip(rows, pictures, alphas):
             views[i] = view_of(picture.astype(np.float32), alpha.astype(np.float32), backdrops[i])
     return [views[i] for i in range(len(cameras))]

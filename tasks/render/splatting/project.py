@@ -5,7 +5,7 @@ determinant from minors, so that neither is the small difference of large number
 """
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,18 +13,31 @@ from tasks.kernels.compiled import inlined, kernel
 from tasks.kernels.simd import LANES, fill, fused, larger, load, root, smaller, store
 
 NEAR_M = 0.3  # closer ones would cover the picture
-DILATION_PX2 = 0.1  # added to the screen covariance; 0.3, made for megapixels, blurs images this small (measured)
 MIN_ALPHA = 1.0 / 255.0  # a weaker contribution is not visible in 8 bits
 MAX_REACH = math.sqrt(2.0 * math.log(1.0 / MIN_ALPHA))  # standard deviations at which opacity 1 falls to MIN_ALPHA
 BESIDE = 0.15  # of its size beside the picture, the furthest that the Jacobian is linearised at; as in gsplat
 TILE = 16  # pixels along a tile's side; a row is one value of tasks.kernels.simd
 
-# Columns of a projected row, which fills one cache line; colours are filled in by whoever shades.
+
+class ScreenFilter(NamedTuple):
+    """What a scene's Gaussians are drawn through, so that none falls between two pixels: what it was made with."""
+
+    dilation_px2: float  # added to the screen covariance
+    keeps_light: bool  # opacity falls as the area grows (Yu et al. 2024): no brighter and no wider from afar
+
+
+FITTED = ScreenFilter(0.15, True)  # of scenes that are made here (docs/reconstruction.md)
+CLASSIC = ScreenFilter(0.3, False)  # Kerbl et al. 2023, and what gsplat and nerfstudio do if nothing is said
+ANTIALIASED = ScreenFilter(0.3, True)  # what gsplat calls so
+OF_DISCS = ScreenFilter(0.1, False)  # of scenes of discs that nothing was fitted to; 0.3 blurs pictures this small
+
+# Columns of a projected row, which fills one cache line; colours are filled in by whoever shades. OPACITY is as given,
+# LOG_OPACITY that of the peak on the picture.
 U, V, DEPTH, CONIC_XX, CONIC_XY, CONIC_YY, OPACITY, LOG_OPACITY, TOP, BOTTOM, RED, GREEN, BLUE = range(13)
 PROJECTED_SIZE = 16
 
-# Rows of a block of 16 Gaussians: mean, quaternion, log-scales, then half the ellipse's box.
-X, Y, Z, QW, QX, QY, QZ, S0, S1, S2, HALF_U, HALF_V = (np.uint64(LANES * row) for row in range(12))
+# Rows of a block of 16 Gaussians: mean, quaternion, log-scales, half the ellipse's box, what the filter left of it.
+X, Y, Z, QW, QX, QY, QZ, S0, S1, S2, HALF_U, HALF_V, SHARE = (np.uint64(LANES * row) for row in range(13))
 BLOCK_SIZE = 28 * LANES  # with space for what the backward pass adds
 
 # exp(x) = polynomial(x / 64)^64 for x from -30 to 12: its relative error is below 1e-5 there.
@@ -110,14 +123,23 @@ def slope_on_picture(rows: Any, near: Any, a: Any, jx: Any) -> Any:
 
 
 @inlined
+def area_of(du: Any, dv: Any) -> Any:
+    """The determinant of a screen covariance, whose half axes are du and dv, triples of Lanes."""
+    return _minor(du, dv, 0, 1) + _minor(du, dv, 0, 2) + _minor(du, dv, 1, 2)
+
+
+@inlined
 def _minor(du: Any, dv: Any, i: Any, k: Any) -> Any:
     m = du[i] * dv[k] - du[k] * dv[i]
     return m * m
 
 
 @inlined
-def _ellipses(block: Any, rows: Any, centre: Any, fx: Any, fy: Any, cx: Any, cy: Any, limits: Any) -> None:
-    """Replaces a block's Gaussians by U, V, DEPTH, conics (rows X to QY) and half the box at one standard deviation."""
+def _ellipses(
+    block: Any, rows: Any, centre: Any, fx: Any, fy: Any, cx: Any, cy: Any, limits: Any, dilation: Any
+) -> None:
+    """Replaces a block's Gaussians by U, V, DEPTH, conics (rows X to QY), half the box at one standard deviation and
+    the share that the determinant before the dilation is of that after."""
     x, y, z = seen_from(rows, centre, block)
     nearness = fill(np.float32(1.0)) / z
     tx, ty = x * nearness, y * nearness
@@ -127,10 +149,9 @@ def _ellipses(block: Any, rows: Any, centre: Any, fx: Any, fy: Any, cx: Any, cy:
     s = exponential(load(block, S0)), exponential(load(block, S1)), exponential(load(block, S2))
     du = s[0] * dot(to_u, axes[0]), s[1] * dot(to_u, axes[1]), s[2] * dot(to_u, axes[2])
     dv = s[0] * dot(to_v, axes[0]), s[1] * dot(to_v, axes[1]), s[2] * dot(to_v, axes[2])
-    dilation = fill(np.float32(DILATION_PX2))
     xx, xy, yy = dot(du, du), dot(du, dv), dot(dv, dv)
-    minors = _minor(du, dv, 0, 1) + _minor(du, dv, 0, 2) + _minor(du, dv, 1, 2)
-    inverse = fill(np.float32(1.0)) / (minors + dilation * (xx + yy + dilation))  # of the determinant
+    area = area_of(du, dv)
+    inverse = fill(np.float32(1.0)) / (area + dilation * (xx + yy + dilation))  # of the determinant
     xx, yy = xx + dilation, yy + dilation
     store(block, X, fused(fx, tx, cx))
     store(block, Y, fused(fy, ty, cy))
@@ -140,6 +161,7 @@ def _ellipses(block: Any, rows: Any, centre: Any, fx: Any, fy: Any, cx: Any, cy:
     store(block, QY, xx * inverse)
     store(block, HALF_U, root(xx))
     store(block, HALF_V, root(yy))
+    store(block, SHARE, area * inverse)
 
 
 @inlined
@@ -163,15 +185,17 @@ def project(
     intrinsics: Any,
     width: int,
     height: int,
+    dilation_px2: float,
+    keeps_light: bool,
     first: int,
     last: int,
 ) -> Any:
     """Which of the Gaussians `first` to `last` can be seen, and their ellipses.
 
     Arrays as in `Gaussians`, quaternions of any length; `camera_from_scene` (4, 4) and `intrinsics` (3, 3) [px]
-    float64, the centre of pixel (0, 0) being at (0.5, 0.5). Returns index (M,) int64; projected (M, 16) float32, rows
-    of pixels TOP <= y < BOTTOM being all that it shows on; tiles (M, 4) int32, x0 <= x < x1, y0 <= y < y1 that it
-    touches.
+    float64, the centre of pixel (0, 0) being at (0.5, 0.5); then a ScreenFilter. Returns index (M,) int64; projected
+    (M, 16) float32, rows of pixels TOP <= y < BOTTOM being all that it shows on; tiles (M, 4) int32, x0 <= x < x1,
+    y0 <= y < y1 that it touches.
     """
     index = np.empty(last - first, np.int64)
     out = np.empty((last - first, PROJECTED_SIZE), np.float32)
@@ -181,12 +205,12 @@ def project(
     rows, centre = turned_by(camera_from_scene)
     fx, fy, cx, cy = intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]
     limits = tangent_limits(fx, fy, cx, cy, width, height)
-    middle_u, middle_v = width / 2.0, height / 2.0
+    middle_u, middle_v, dilation = width / 2.0, height / 2.0, fill(np.float32(dilation_px2))
     for start in range(first, last, LANES):
         n = min(LANES, last - start)
         for k in range(n):
             gather(means, quats, log_scales, start + k, block, k)
-        _ellipses(block, rows, centre, fill(fx), fill(fy), fill(cx), fill(cy), limits)
+        _ellipses(block, rows, centre, fill(fx), fill(fy), fill(cx), fill(cy), limits, dilation)
         for k in range(n):
             i, lane = start + k, np.uint64(k)
             if not (block[Z + lane] >= NEAR_M and opacities[i] > MIN_ALPHA):
@@ -196,6 +220,10 @@ def project(
             if abs(u - middle_u) > half_u + middle_u or abs(v - middle_v) > half_v + middle_v:
                 continue  # beside the picture: most of a long street is
             log_opacity = math.log(opacities[i])
+            if keeps_light:
+                if not block[SHARE + lane] * opacities[i] * opacities[i] > MIN_ALPHA * MIN_ALPHA:
+                    continue
+                log_opacity += 0.5 * math.log(block[SHARE + lane])
             reach = math.sqrt(2.0 * (log_opacity - math.log(MIN_ALPHA)))
             half_u, half_v = reach * block[HALF_U + lane], reach * block[HALF_V + lane]
             # Pixels whose centres the box of the ellipse holds; as floats, for they can be too far for integers.

@@ -23,6 +23,7 @@ from tasks.render.splatting.project import (
     X,
     Y,
     Z,
+    area_of,
     axes_of,
     dot,
     exponential,
@@ -34,8 +35,10 @@ from tasks.render.splatting.project import (
     turned_by,
 )
 
-# Rows of a block beyond those of `project`: conics, what the pixels brought, and the derivatives by place and opacity.
-CXX, CXY, CYY, BY_XX, BY_XY, BY_YY, BY_DEPTH, D_U, D_V = (np.uint64(LANES * row) for row in range(12, 21))
+# Rows of a block beyond those of `project`: conics, what the pixels brought, and the derivatives by place and by the
+# logarithm of the peak, where the filter lowers it.
+CXX, CXY, CYY, BY_XX, BY_XY, BY_YY, BY_DEPTH, D_U, D_V, BY_PEAK = (np.uint64(LANES * row) for row in range(12, 22))
+LEAST_AREA = np.float32(1e-20)  # [px4] of what is not on the picture
 
 
 @inlined
@@ -95,6 +98,12 @@ def _pulled_back(block: Any, rows: Any, centre: Any, fx: Any, fy: Any, limits: A
     # By each half axis p = s * axis: du = to_u . p and dv = to_v . p make up the screen covariance.
     du = s[0] * dot(to_u, axes[0]), s[1] * dot(to_u, axes[1]), s[2] * dot(to_u, axes[2])
     dv = s[0] * dot(to_v, axes[0]), s[1] * dot(to_v, axes[1]), s[2] * dot(to_v, axes[2])
+    xx, xy, yy = dot(du, du), dot(du, dv), dot(dv, dv)
+    by_peak, inverse = load(block, BY_PEAK), fill(np.float32(1.0)) / larger(area_of(du, dv), fill(LEAST_AREA))
+    half = fill(np.float32(0.5)) * by_peak  # the peak has half the logarithm of the determinants' ratio
+    d_xx = d_xx + half * (yy * inverse - load(block, CXX))
+    d_xy = d_xy - by_peak * (xy * inverse + load(block, CXY))
+    d_yy = d_yy + half * (xx * inverse - load(block, CYY))
     twice_xx, twice_yy = d_xx + d_xx, d_yy + d_yy
     d_du = twice_xx * du[0] + d_xy * dv[0], twice_xx * du[1] + d_xy * dv[1], twice_xx * du[2] + d_xy * dv[2]
     d_dv = twice_yy * dv[0] + d_xy * du[0], twice_yy * dv[1] + d_xy * du[1], twice_yy * dv[2] + d_xy * du[2]
@@ -153,6 +162,7 @@ def project_gradient(
     intrinsics: Any,
     width: int,
     height: int,
+    keeps_light: bool,
     index: Any,
     projected: Any,
     sums: Any,
@@ -188,6 +198,8 @@ def project_gradient(
             d_screen[row, 0] = cxx * sums[row, Q_X] + cxy * sums[row, Q_Y]
             d_screen[row, 1] = cxy * sums[row, Q_X] + cyy * sums[row, Q_Y]
             d_logits[row] = sums[row, Q] * (np.float32(1.0) - projected[row, OPACITY])
+            if keeps_light:
+                block[BY_PEAK + lane] = sums[row, Q]
             block[CXX + lane], block[CXY + lane], block[CYY + lane] = cxx, cxy, cyy
             block[D_U + lane], block[D_V + lane] = d_screen[row, 0], d_screen[row, 1]
             block[BY_XX + lane], block[BY_XY + lane] = sums[row, Q_XX], sums[row, Q_XY]

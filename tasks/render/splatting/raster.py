@@ -14,7 +14,7 @@ from tasks.kernels.threads import in_chunks
 from tasks.render.splatting import sh
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.pixels import aligned, blend, carry_back
-from tasks.render.splatting.project import BLUE, DEPTH, PROJECTED_SIZE, RED, project
+from tasks.render.splatting.project import BLUE, DEPTH, FITTED, PROJECTED_SIZE, RED, ScreenFilter, project
 from tasks.render.splatting.tiles import deal
 from tasks.world.arrays import F32, Array, Bools, Ints, ShortInts
 
@@ -44,6 +44,7 @@ class Splats:
     camera_from_scene: Array  # (4, 4)
     width: int
     height: int
+    screen: ScreenFilter
 
 
 @dataclass(frozen=True)
@@ -56,14 +57,20 @@ class ForwardPass:
 
 
 def splat(
-    gaussians: Gaussians, intrinsics: Array, scene_from_camera: Array, width: int, height: int, threads: int = 1
+    gaussians: Gaussians,
+    intrinsics: Array,
+    scene_from_camera: Array,
+    width: int,
+    height: int,
+    threads: int = 1,
+    screen: ScreenFilter = FITTED,
 ) -> Splats:
     """Projects and sorts. `intrinsics` (3, 3) pixels, without skew; `scene_from_camera` (4, 4) rigid."""
     camera_from_scene = np.ascontiguousarray(np.linalg.inv(scene_from_camera))
     scene = (gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.opacities)
     intrinsics = np.array(intrinsics, np.float64)  # a copy: kernels compile once more for read-only arrays
 
-    project_some = partial(project, *scene, camera_from_scene, intrinsics, width, height)
+    project_some = partial(project, *scene, camera_from_scene, intrinsics, width, height, *screen)
     parts = in_chunks(project_some, len(gaussians), GAUSSIANS_CHUNK, threads)
     start = np.cumsum([0, *(len(part[0]) for part in parts)])
     index, projected = np.empty(start[-1], np.int64), _cache_lines(start[-1])
@@ -76,7 +83,9 @@ def splat(
 
     in_chunks(place, len(parts), 1, threads)
     tile_start, tile_splats = deal(projected[:, DEPTH], tiles, width, height, threads)
-    return Splats(index, projected, tiles, tile_start, tile_splats, intrinsics, camera_from_scene, width, height)
+    return Splats(
+        index, projected, tiles, tile_start, tile_splats, intrinsics, camera_from_scene, width, height, screen
+    )
 
 
 def _cache_lines(n: int) -> F32:
@@ -93,6 +102,7 @@ def forward(
     height: int,
     background: F32,
     threads: int = 1,
+    screen: ScreenFilter = FITTED,
 ) -> ForwardPass:
     """The picture of a pinhole camera, with what `tasks.render.splatting.gradient.backward` needs.
 
@@ -100,7 +110,7 @@ def forward(
     y down, z forward; `background` (3,) or (H, W, 3) rgb behind everything. Kerbl et al. 2023, with per-Gaussian depth
     order.
     """
-    splats = splat(gaussians, intrinsics, scene_from_camera, width, height, threads)
+    splats = splat(gaussians, intrinsics, scene_from_camera, width, height, threads, screen)
     splats.projected[:, RED : BLUE + 1] = colours_seen(gaussians, scene_from_camera[:3, 3], splats.index, threads)
     view, tile_end = _shade(splats, background, threads)
     return ForwardPass(view, splats, tile_end)

@@ -29,7 +29,7 @@ HEADER = np.dtype(
 LEGACY_BYTES, ZSTD_BYTES = 16, 32  # of a header
 MOST_BITS = 12  # behind the point of a position: quarters of a millimetre, up to 2 km
 MOST_EXPANDED = 1024  # times what a file holds; honest ones stay far below
-HAS_EXTENSIONS = 2
+IS_ANTIALIASED, HAS_EXTENSIONS = 1, 2  # bits of the flags
 COLOUR_SCALE = np.float32(0.15)  # of the constant coefficient, in which colours beyond 0 and 1 have room
 SQRT_HALF = np.float32(np.sqrt(0.5))
 MAGNITUDE = 511  # largest of a rotation's component: 9 bits, and one for the sign
@@ -41,8 +41,11 @@ Bytes = NDArray[np.uint8]
 Inflate = Callable[[bytes, int], bytes]  # a stream of zstd and its size -> what it holds; raises OSError
 
 
-def to_spz(gaussians: Gaussians) -> bytes:
-    """The file's bytes. Raises ValueError for NaN, infinity and for means too far from the origin for 24 bits."""
+def to_spz(gaussians: Gaussians, antialiased: bool) -> bytes:
+    """The file's bytes; `antialiased`: whether they are to be drawn so.
+
+    Raises ValueError for NaN, infinity and for means too far from the origin for 24 bits.
+    """
     for name in ("means", "quats", "log_scales", "opacities", "colours", "sh_rest"):
         if not np.isfinite(getattr(gaussians, name)).all():
             raise ValueError(f"spz: {name}: NaN or infinity")
@@ -52,7 +55,7 @@ def to_spz(gaussians: Gaussians) -> bytes:
     if bits is None:
         raise ValueError(f"spz: means: {reach:.0f} m from the origin; 24 bits reach {2**23:,} m")
     header = np.zeros(1, HEADER)
-    header[0] = (MAGIC, VERSION, len(gaussians), degree, bits, 0)
+    header[0] = (MAGIC, VERSION, len(gaussians), degree, bits, IS_ANTIALIASED if antialiased else 0)
     colours = (gaussians.colours - np.float32(0.5)) / np.float32(sh.C0)
     turned = gaussians.sh_rest * SH_TURN[: gaussians.sh_rest.shape[1], None]
     attributes = (
@@ -67,8 +70,8 @@ def to_spz(gaussians: Gaussians) -> bytes:
     return gzip.compress(head + b"".join(part.tobytes() for part in attributes), mtime=0)
 
 
-def from_spz(data: bytes, zstd: Inflate) -> Gaussians:
-    """The Gaussians of a file; `zstd` is asked for those of version 4.
+def from_spz(data: bytes, zstd: Inflate) -> tuple[Gaussians, bool]:
+    """The Gaussians of a file, and whether they are to be drawn antialiased; `zstd` is asked for those of version 4.
 
     Raises ValueError that names the field where it is no spz, of another version, damaged, or holds extensions, which
     may change what the rest means.
@@ -83,7 +86,7 @@ def from_spz(data: bytes, zstd: Inflate) -> Gaussians:
     quats = (_from_smallest_three if version >= 3 else _from_first_three)(rotations)
     constant = (colours.reshape(n, 3) / np.float32(255.0) - np.float32(0.5)) / COLOUR_SCALE
     turned = (rest.reshape(n, coefficients, 3).astype(np.float32) - 128.0) / np.float32(128.0)
-    return Gaussians(
+    found = Gaussians(
         means=(fixed.astype(np.float32) * np.float32(2.0**-packed.bits) * TURN).astype(np.float32),
         quats=quats,
         log_scales=scales.reshape(n, 3).astype(np.float32) / np.float32(16.0) - np.float32(10.0),
@@ -91,6 +94,7 @@ def from_spz(data: bytes, zstd: Inflate) -> Gaussians:
         colours=(0.5 + sh.C0 * constant).astype(np.float32),
         sh_rest=turned * SH_TURN[:coefficients, None],
     )
+    return found, packed.antialiased
 
 
 @dataclass(frozen=True)
@@ -99,6 +103,7 @@ class _Packed:
     count: int
     degree: int
     bits: int
+    antialiased: bool
     attributes: tuple[Bytes, ...]  # positions, opacities, colours, scales, rotations, coefficients
 
 
@@ -121,11 +126,11 @@ def _packed(data: bytes, zstd: Inflate) -> _Packed:
     each = (9, 1, 3, 3, 3 if version == 2 else 4, 3 * sh.COUNTS[degree])
     sizes = [count * width for width in each]
     if is_zstd:
-        return _Packed(version, count, degree, bits, _streams(data, sizes, zstd))
+        return _Packed(version, count, degree, bits, bool(flags & IS_ANTIALIASED), _streams(data, sizes, zstd))
     ends = LEGACY_BYTES + np.cumsum(sizes)
     if len(plain) != ends[-1]:
         raise ValueError(f"spz: {count:,} Gaussians take {ends[-1]:,} bytes, {len(plain):,} found")
-    return _Packed(version, count, degree, bits, tuple(
+    return _Packed(version, count, degree, bits, bool(flags & IS_ANTIALIASED), tuple(
         np.frombuffer(plain, np.uint8, size, int(end) - size) for size, end in zip(sizes, ends)
     ))  # fmt: skip
 

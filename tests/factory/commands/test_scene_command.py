@@ -13,6 +13,7 @@ from factory.stages.scene_file import read_scene, write_scene
 from tasks.render.scene.engine import render
 from tasks.render.splatting.gaussians import EMPTY, Gaussians
 from tasks.render.splatting.ply import from_ply, to_ply
+from tasks.render.splatting.project import ANTIALIASED, CLASSIC, FITTED
 from tasks.world.camera import Pinhole
 from tests.factory.stages.test_scene_file import scene
 
@@ -72,6 +73,25 @@ def test_a_block_goes_out_as_ply_and_comes_back_edited_with_its_vehicles_and_its
     assert back.origin.tolist() == whole.origin.tolist() and back.block is not None
     np.testing.assert_allclose(back.background.sh_rest, whole.background.sh_rest[:10])
     assert back.digest != whole.digest and np.isnan(back.psnr_db) and back.views == ()
+
+
+def test_a_scene_is_drawn_as_it_was_made_to_be_where_that_is_known(
+    stored: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_scene(tmp_path / "fitted", replace(read_scene(stored), screen=FITTED))
+    drawn = "drawn       antialiased, 0.15 px2 wider"
+    assert main(["info", str(tmp_path / "fitted")]) == 0 and drawn in capsys.readouterr().out
+    for suffix, more, screen in (
+        ("ply", [], CLASSIC),
+        ("ply", ["antialiased=true"], ANTIALIASED),
+        ("ply", [f"like={tmp_path / 'fitted'}"], FITTED),
+        ("spz", [], ANTIALIASED),
+        ("spz", ["antialiased=false", f"like={tmp_path / 'fitted'}"], CLASSIC),
+    ):
+        assert main(["export", str(tmp_path / "fitted"), f"to={tmp_path / 'out'}", f"format={suffix}"]) == 0
+        to = tmp_path / "back"
+        assert main(["import", str(tmp_path / "out" / f"background.{suffix}"), f"to={to}", *more]) == 0
+        assert read_scene(to).screen == screen, (suffix, more)
 
 
 def test_a_foreign_ply_is_a_scene_that_can_be_drawn_where_it_is_put(tmp_path: Path) -> None:

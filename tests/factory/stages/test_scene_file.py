@@ -14,6 +14,7 @@ from factory.stages.scene_file import KEY, BadScene, described_by, digest_of, re
 from tasks.render.scene.asset import BlockRange, ClassQuality, Exposure, RenderAsset, TakenFrom, ViewQuality
 from tasks.render.scene.sky import SkyMap
 from tasks.render.splatting.gaussians import EMPTY, Gaussians
+from tasks.render.splatting.project import CLASSIC, OF_DISCS
 
 
 def gaussians(n: int, count: int, seed: int) -> Gaussians:
@@ -37,6 +38,7 @@ def scene() -> RenderAsset:
         exposures=(Exposure("front", 0.5, np.eye(3, 4, dtype=np.float32) * 1.1),),
         block=BlockRange("av2", "log", 10.0, 30.0, np.array([-1.5, 2.0]), np.array([8.0, 3.25])),
         taken=(TakenFrom("front", 0.1 + 0.2, np.eye(4) * 0.1),),
+        screen=CLASSIC,
     )
 
 
@@ -49,7 +51,7 @@ def test_everything_comes_back(tmp_path: Path) -> None:
     for name, array in tensors_of(asset).items():
         stored = tensors_of(back)[name]
         assert (stored.dtype, stored.tobytes()) == (array.dtype, array.tobytes()), name
-    assert described_by(back) == described_by(asset)
+    assert described_by(back) == described_by(asset) and back.screen == asset.screen == CLASSIC
     assert back.views[0] == asset.views[0] and np.isnan(back.views[1].ssim) and np.isinf(back.views[1].psnr_db)
     assert back.block is not None and back.block.low.tolist() == [-1.5, 2.0]
     assert back.psnr_db == 27.123456789
@@ -59,12 +61,14 @@ def test_everything_comes_back(tmp_path: Path) -> None:
 
 def test_a_file_from_before_distances_and_classes_were_measured_is_read(tmp_path: Path) -> None:
     described = described_by(scene())
+    del described["screen"]
     for view in described["views"]:
         del view["lpips"], view["away_m"], view["classes"]
     tensors = tensors_of(scene())
     digest = digest_of(tensors, described)
     save_file(tensors, tmp_path / "old", metadata={KEY: json.dumps(described | {"digest": digest})})
     first, _ = read_scene(tmp_path / "old").views
+    assert read_scene(tmp_path / "old").screen == OF_DISCS  # all were drawn so
     assert (first.camera, first.psnr_db) == ("front", 28.5) and np.isnan(first.away_m) and first.classes == ()
 
 

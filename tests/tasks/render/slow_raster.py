@@ -9,7 +9,7 @@ from torch import Tensor
 
 from tasks.render.splatting.gaussians import Gaussians, rotations_of
 from tasks.render.splatting.pixels import MAX_ALPHA
-from tasks.render.splatting.project import BESIDE, DILATION_PX2, MIN_ALPHA, NEAR_M
+from tasks.render.splatting.project import BESIDE, FITTED, MIN_ALPHA, NEAR_M, ScreenFilter
 
 
 @dataclass
@@ -105,6 +105,7 @@ def slow_render(
     background: Tensor,
     motion: Tensor | None = None,
     window: tuple[int, int, int, int] | None = None,
+    screen: ScreenFilter = FITTED,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """rgb (H, W, 3), depth, alpha (H, W) over `background` (H, W, 3).
 
@@ -135,7 +136,11 @@ def slow_render(
         [torch.stack([fx / z, zero, -fx / z * tx], 1), torch.stack([zero, fy / z, -fy / z * ty], 1)], 1
     )
     axes = jacobian @ turn @ (rotations(gaussians.quats) * gaussians.log_scales.exp()[:, None, :])[rows]
-    conic = torch.linalg.inv(axes @ axes.transpose(1, 2) + DILATION_PX2 * torch.eye(2, dtype=dtype))
+    sharp = axes @ axes.transpose(1, 2)
+    wider = sharp + screen.dilation_px2 * torch.eye(2, dtype=dtype)
+    conic = torch.linalg.inv(wider)
+    if screen.keeps_light:
+        opacities = opacities * (torch.linalg.det(sharp) / torch.linalg.det(wider)).sqrt()
 
     center = -turn.T @ shift
     directions = gaussians.means - center

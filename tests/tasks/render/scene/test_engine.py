@@ -40,7 +40,7 @@ def test_the_pipeline_s_frames_are_the_same_function_s(street_asset: RenderAsset
 def test_a_backend_is_one_function_in_the_table_and_draws_the_pipeline_s_frames(
     street_asset: RenderAsset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def backdrop_alone(scene, cameras, backdrops, threads):  # type: ignore[no-untyped-def]
+    def backdrop_alone(scene, cameras, backdrops, threads, screen):  # type: ignore[no-untyped-def]
         empty = np.zeros((street.HEIGHT, street.WIDTH), np.float32)
         return [View(2.0 * backdrop, empty, empty) for backdrop in backdrops]
 

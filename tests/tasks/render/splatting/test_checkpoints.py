@@ -8,6 +8,7 @@ import pytest
 from tasks.render.splatting import sh
 from tasks.render.splatting.checkpoints import from_checkpoint, gauss_params, splatfacto, worldengine
 from tasks.render.splatting.gaussians import Gaussians, moved, rotations_of
+from tasks.render.splatting.project import ANTIALIASED
 from tests.tasks.render.splatting.test_ply import some
 from tests.tasks.render.splatting.test_spz import apart
 
@@ -32,12 +33,13 @@ def light(scene: Gaussians, towards: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("count", sh.COUNTS)
 def test_what_goes_out_comes_back(count: int) -> None:
     scene = some(40, count)
-    for content in (
-        splatfacto(scene),
-        worldengine(scene, np.array([1.0, 2.0, 3.0])),
-        trained({"background": gauss_params(scene)}),
+    for content, screen in (
+        (splatfacto(scene), None),
+        (worldengine(scene, np.array([1.0, 2.0, 3.0])), ANTIALIASED),
+        (trained({"background": gauss_params(scene)}), ANTIALIASED),
     ):
         found = from_checkpoint(content)
+        assert found.screen == screen
         assert max(apart(scene, found.background).values()) < 2e-6 and not found.nodes
     assert from_checkpoint(worldengine(scene, np.array([1.0, 2.0, 3.0]))).origin.tolist() == [1.0, 2.0, 3.0]  # type: ignore[union-attr]
 

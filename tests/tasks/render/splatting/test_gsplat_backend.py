@@ -13,7 +13,7 @@ from tasks.render.scene.engine import Backend, check, render, vehicles_at
 from tasks.render.splatting import sh
 from tasks.render.splatting.gaussians import EMPTY, Gaussians
 from tasks.render.splatting.gsplat_backend import BackendMissing, arguments, drawn_by, require, view_of
-from tasks.render.splatting.project import DILATION_PX2, NEAR_M
+from tasks.render.splatting.project import CLASSIC, FITTED, NEAR_M
 from tasks.render.splatting.raster import forward
 from tasks.world.camera import Pinhole
 from tests.bench import peer_gsplat
@@ -55,7 +55,10 @@ def test_it_is_given_the_cameras_the_scales_and_all_coefficients(count: int, deg
         given["viewmats"] @ [FRONT.world_from_camera, aside.world_from_camera], [np.eye(4)] * 2, atol=1e-6
     )
     assert (given["width"], given["height"], given["sh_degree"]) == (street.WIDTH, street.HEIGHT, degree)
-    assert (given["near_plane"], given["eps2d"], given["render_mode"]) == (NEAR_M, DILATION_PX2, "RGB+ED")
+    assert (given["near_plane"], given["eps2d"], given["render_mode"]) == (NEAR_M, FITTED.dilation_px2, "RGB+ED")
+    assert given["rasterize_mode"] == "antialiased"
+    classic = arguments(scene, [FRONT], CLASSIC)
+    assert (classic["eps2d"], classic["rasterize_mode"]) == (0.3, "classic")
     plain = given["colors"] if degree is None else 0.5 + sh.C0 * given["colors"][:, 0]
     np.testing.assert_allclose(plain, scene.colours, atol=1e-6)
 

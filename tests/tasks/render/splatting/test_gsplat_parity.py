@@ -68,7 +68,7 @@ def test_the_fit_calls_gsplat_as_the_drawing_does(count: int) -> None:
     drawing, fitting = given(count)
     assert drawing.keys() == fitting.keys()
     plain = {name: value for name, value in drawing.items() if not isinstance(value, np.ndarray)}
-    assert plain == {name: fitting[name] for name in plain} and len(plain) == 7
+    assert plain == {name: fitting[name] for name in plain} and len(plain) == 8
     for name in drawing.keys() - plain.keys():
         np.testing.assert_allclose(fitting[name], drawing[name], rtol=1e-5, atol=1e-6, err_msg=name)
 

@@ -14,7 +14,7 @@ from tasks.render.splatting.gaussians import (
     rotations_of,
 )
 from tasks.render.splatting.pixels import MAX_ALPHA
-from tasks.render.splatting.project import BESIDE, DILATION_PX2, MIN_ALPHA, NEAR_M
+from tasks.render.splatting.project import BESIDE, CLASSIC, FITTED, MIN_ALPHA, NEAR_M, ScreenFilter
 from tasks.render.splatting.raster import forward, gather, splat
 
 INTRINSICS = np.array([[60.0, 0.0, 37.0], [0.0, 58.0, 22.0], [0.0, 0.0, 1.0]])
@@ -45,7 +45,10 @@ def pose(yaw: float, position: tuple[float, float, float]) -> NDArray[np.float64
 
 
 def slow_rasterize(
-    gaussians: Gaussians, scene_from_camera: NDArray[np.float64], background: NDArray[np.float32]
+    gaussians: Gaussians,
+    scene_from_camera: NDArray[np.float64],
+    background: NDArray[np.float32],
+    screen: ScreenFilter = FITTED,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Every Gaussian on every pixel, in float64, nearest first."""
     camera = np.linalg.inv(scene_from_camera)
@@ -61,10 +64,14 @@ def slow_rasterize(
         tx = np.clip(x / z, -(cx + BESIDE * WIDTH) / fx, (WIDTH - cx + BESIDE * WIDTH) / fx)
         ty = np.clip(y / z, -(cy + BESIDE * HEIGHT) / fy, (HEIGHT - cy + BESIDE * HEIGHT) / fy)
         jacobian = np.array([[fx / z, 0.0, -fx / z * tx], [0.0, fy / z, -fy / z * ty]])
-        conic = np.linalg.inv(jacobian @ covariances[i] @ jacobian.T + DILATION_PX2 * np.eye(2))
+        sharp = jacobian @ covariances[i] @ jacobian.T
+        wider = sharp + screen.dilation_px2 * np.eye(2)
+        conic, peak = np.linalg.inv(wider), gaussians.opacities[i]
+        if screen.keeps_light:
+            peak = peak * np.sqrt(np.linalg.det(sharp) / np.linalg.det(wider))
         du, dv = u - (fx * x / z + cx), v - (fy * y / z + cy)
         power = -0.5 * (conic[0, 0] * du**2 + 2 * conic[0, 1] * du * dv + conic[1, 1] * dv**2)
-        alpha = np.minimum(gaussians.opacities[i] * np.exp(power), MAX_ALPHA)
+        alpha = np.minimum(peak * np.exp(power), MAX_ALPHA)
         weight = np.where(alpha >= MIN_ALPHA, alpha, 0.0) * light
         light = light - weight
         rgb += weight[..., None] * gaussians.colours[i]
@@ -74,12 +81,13 @@ def slow_rasterize(
     return rgb + light[..., None] * background, mean_depth, alpha
 
 
-@pytest.mark.parametrize(("n", "sigma"), [(40, 0.6), (800, 0.15), (3000, 0.5)])
-def test_the_kernel_equals_its_slow_twin(n: int, sigma: float) -> None:
+@pytest.mark.parametrize("screen", [FITTED, CLASSIC])
+@pytest.mark.parametrize(("n", "sigma"), [(40, 0.6), (800, 0.15), (3000, 0.5), (3000, 0.02)])
+def test_the_kernel_equals_its_slow_twin(n: int, sigma: float, screen: ScreenFilter) -> None:
     scene, view = cloud(n, seed=n, sigma=sigma), pose(0.2, (0.3, -0.1, -0.5))
     background = np.random.default_rng(1).uniform(0, 1, (HEIGHT, WIDTH, 3)).astype(np.float32)
-    fast = forward(scene, INTRINSICS, view, WIDTH, HEIGHT, background).view
-    rgb, depth, alpha = slow_rasterize(scene, view, background)
+    fast = forward(scene, INTRINSICS, view, WIDTH, HEIGHT, background, screen=screen).view
+    rgb, depth, alpha = slow_rasterize(scene, view, background, screen)
     assert np.abs(fast.rgb - rgb).max() <= 2.0 / 255.0
     assert np.abs(fast.alpha - alpha).max() <= 2.0 / 255.0
     solid = alpha > 0.05
@@ -112,6 +120,20 @@ def one(
         np.array([opacity], np.float32),
         np.array([colour], np.float32),
     )
+
+
+@pytest.mark.parametrize("metres", [10.0, 20.0, 40.0])
+def test_what_is_smaller_than_a_pixel_sheds_the_light_that_its_area_does(metres: float) -> None:
+    """The sum of alpha is 2 pi opacity times the root of the determinant before the filter; after it for the classic
+    one, which makes a small thing the brighter the farther off it is."""
+    ball = one((0.0, 0.0, metres), 0.2, 0.99, (1.0, 1.0, 1.0))
+    px = 0.2 * np.array([INTRINSICS[0, 0], INTRINSICS[1, 1]]) / metres
+    square = np.array([[INTRINSICS[0, 0], 0.0, 8.0], [0.0, INTRINSICS[1, 1], 8.0], [0.0, 0.0, 1.0]])
+    for screen in (ScreenFilter(4.0, True), ScreenFilter(4.0, False)):  # wide enough to be summed up by pixels
+        alpha = forward(ball, square, np.eye(4), 16, 16, BLACK, screen=screen).view.alpha
+        area = px.prod() if screen.keeps_light else np.sqrt(np.prod(px**2 + 4.0))
+        least = 2.0 * np.pi * np.sqrt(np.prod(px**2 + 4.0)) * MIN_ALPHA  # cut off around
+        assert alpha.sum() == pytest.approx(max(2.0 * np.pi * 0.99 * area - least, 0.0), rel=0.03)
 
 
 def test_the_nearer_gaussian_hides_the_farther_one_in_whatever_order_they_are_stored() -> None:
