@@ -28,6 +28,7 @@ from factory.store.cache import BadCacheFile, decode, encode
 from factory.store.episodes import Message, check_episode, episode_bytes
 from factory.views.splat_files import background_bytes, read_splats
 from tasks.experts.recovery.expert import RecoveryTable
+from tasks.render.splatting.project import CLASSIC
 from tasks.world.camera import SensorFile
 from tasks.world.kinematic_vocabulary import kinematic_trajectories
 from tasks.world.vocabulary import Vocabulary
@@ -68,7 +69,7 @@ def write_all(folder: Path) -> None:
     (folder / "clip.npz").write_bytes(encode(replace(tiny_clip())))
     write_scene(folder / "scene.safetensors", scene())
     for suffix in (".ply", ".spz"):
-        (folder / f"splats{suffix}").write_bytes(background_bytes(scene().background, suffix, np.zeros(3)))
+        (folder / f"splats{suffix}").write_bytes(background_bytes(scene().background, suffix, np.zeros(3), CLASSIC))
     picture = np.random.default_rng(0).integers(0, 255, (24, 32, 3), np.uint8)
     for suffix in (".png", ".jpg"):
         (folder / f"picture{suffix}").write_bytes(cv2.imencode(suffix, cv2.blur(picture, (5, 5)))[1].tobytes())

@@ -18,9 +18,9 @@ SHORT = 20
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    logging.disable()
     path = tmp_path_factory.mktemp("fuzzed")
     write_all(path)
+    logging.disable()
     yield path
     logging.disable(logging.NOTSET)  # other tests of this process look at what is logged
 
