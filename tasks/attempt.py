@@ -3,6 +3,7 @@
 `rollout -> expert -> rollout -> reward` of tasks.stages; rendering follows elsewhere, only for what the reward kept.
 """
 
+import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -13,8 +14,11 @@ from tasks.experts.pdm_closed.path import MIN_PROGRESS_M, path_length_m
 from tasks.experts.pdm_closed.planner import PdmClosed, PdmPlan, PdmSettings, plan_for
 from tasks.experts.protocol import Expert, Plan
 from tasks.reward.epdms import Scores, score
+from tasks.reward.off_route import way_on_m
 from tasks.reward.prepare import PreparedScene, prepare_scene
-from tasks.rollout.simulate import TrafficSettings, next_scene, simulate
+from tasks.reward.second_after import BRAKING_MPS2, hit_after_s
+from tasks.rollout.lqr import track
+from tasks.rollout.simulate import TrafficScene, TrafficSettings, next_scene, prepare_traffic, roll_out
 from tasks.settings import ExpertGate
 from tasks.stages import Rejected
 from tasks.world.arrays import Array
@@ -61,9 +65,19 @@ def drive_and_judge(
     pdm_plan: plan_for(scene, planner), where it is known already.
     """
     with timed("rollout"):
-        rollout = simulate(scene, plan.poses, traffic)
+        ready = prepare_traffic(scene, traffic)
+    return _driven_among(ready, plan, planner, timed, pdm_plan)
+
+
+def _driven_among(
+    traffic: TrafficScene, plan: Plan, planner: PdmSettings, timed: Timed, pdm_plan: PdmPlan | None
+) -> Judged:
+    scene = traffic.scene
+    with timed("rollout"):
+        rollout = roll_out(traffic, track(scene.ego_state, np.asarray(plan.poses)[None])[0])
     with timed("reward"):
-        return judge(scene, plan, rollout, pdm_plan or plan_for(scene, planner), traffic.leaves_out_touching)
+        pdm_plan = pdm_plan or plan_for(scene, planner)
+        return judge(scene, plan, rollout, pdm_plan, traffic.settings.leaves_out_touching)
 
 
 def judge(scene: Scene, plan: Plan, rollout: Rollout, pdm_plan: PdmPlan, drop_touching: bool = True) -> Judged:
@@ -82,6 +96,25 @@ def verdict(scores: Scores, gate: ExpertGate) -> Rejected | None:
     if not scores.ep[1] > gate.progress_above:
         failed.append(f"ep={scores.ep[1]:.3f}")
     return Rejected("reward", failed[0].split("=")[0], " ".join(failed)) if failed else None
+
+
+def end_verdict(judged: Judged, traffic: TrafficScene, gate: ExpertGate) -> Rejected | None:
+    """None where a drive's end leads on as the gate asks (docs/reward.md 2m); traffic: as the drive met it."""
+    clip, states = judged.scene.clip, judged.rollout.ego_states
+    if gate.off_route:
+        metres = way_on_m(clip.road_map, clip.route, states[-1, : HEADING + 1])
+        if metres is None:
+            return Rejected("reward", "off_route", "ends on no lane of the route")
+        if metres < math.inf:
+            return Rejected("reward", "off_route", f"ends on a lane that leaves the route within {metres:.1f} m")
+    if gate.after:
+        going_on = hit_after_s(traffic, judged.prepared, states)
+        if going_on < math.inf:
+            braking = hit_after_s(traffic, judged.prepared, states, BRAKING_MPS2)
+            if braking < math.inf:
+                when = f"after {going_on:.1f} s, after {braking:.1f} s when it brakes"
+                return Rejected("reward", "after", f"hits somebody {when}")
+    return None
 
 
 def attempt(
@@ -105,8 +138,11 @@ def attempt(
         plan = expert.plan(scene, rng) if pdm_plan is None else Plan(pdm_plan.poses)
     if isinstance(plan, Rejected):
         return plan
-    judged = drive_and_judge(scene, plan, traffic, planner, timed, pdm_plan)
-    return judged, verdict(judged.scores, gate)
+    with timed("rollout"):
+        ready = prepare_traffic(scene, traffic)
+    judged = _driven_among(ready, plan, planner, timed, pdm_plan)
+    with timed("reward"):
+        return judged, verdict(judged.scores, gate) or end_verdict(judged, ready, gate)
 
 
 def human_sample(

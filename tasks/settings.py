@@ -34,10 +34,15 @@ class PerturbSettings:
 
 @dataclass(frozen=True)
 class ExpertGate:
-    """Which sub-scores an expert's rollout must reach (paper, supplement: S_m = 1 for all but EP, EP > 0.5)."""
+    """Which sub-scores an expert's rollout must reach (paper, supplement: S_m = 1 for all but EP, EP > 0.5).
+
+    And what its end must lead to (docs/reward.md 2m), of which the paper says nothing.
+    """
 
     full: tuple[str, ...] = JUDGED  # EC needs an earlier plan: there is none
     progress_above: float = 0.5  # EP that a drive must exceed
+    off_route: bool = True  # refuse a drive that ends beside the route's lanes, or where none of them goes on
+    after: bool = True  # refuse one after which somebody is hit within a second, at its speed and braking alike
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.full if name not in JUDGED]

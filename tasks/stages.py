@@ -33,6 +33,7 @@ class Rejected:
 HUMAN = "human"  # the expert that is the log itself
 # The frames of a benchmark (tasks.hard_scenes): they stand where an expert's name does, in settings and tables.
 HUMAN_BEFORE, FOLLOW_UP, FOLLOW_UP_BEFORE = FRAMES = ("human_before", "follow_up", "follow_up_before")
+END_FAULTS = ("off_route", "after")  # of a drive that reaches every sub-score: what its end leads to (tasks.attempt)
 PICTURE_FAULTS = ("holes", "lens_covered", "blank", "blurred", "unlike_photos")  # tasks.render.gate
 
 STAGES: tuple[Stage, ...] = (
@@ -40,7 +41,7 @@ STAGES: tuple[Stage, ...] = (
     Stage("perturb", 1, "clip", ("no_gated_candidate", "no_good_candidate")),
     Stage("rollout", 2, "attempt", ("route_ended",)),
     Stage("expert", 1, "attempt", ("no_plan",)),
-    Stage("reward", 1, "attempt", SUBSCORES),
+    Stage("reward", 1, "attempt", (*SUBSCORES, *END_FAULTS)),
     Stage("render", 6, "attempt", ("psnr", *PICTURE_FAULTS)),
     Stage("write", 3, "attempt", ()),
 )

@@ -127,18 +127,42 @@ def simulate(scene: Scene, poses: Array, settings: TrafficSettings) -> Rollout:
 
 def roll_out(traffic: TrafficScene, ego_states: Array) -> Rollout:
     """The traffic's answer to an ego whose states (41, 11) are known. ValueError where they are none."""
-    _check_states(ego_states[None])
-    scene = traffic.scene
-    start = scene.step
-    window = scene.agents.window(start, start + HORIZON_STEPS + 1)
+    _check_states(ego_states[None], HORIZON_STEPS + 1)
+    return Rollout(traffic.scene.step, ego_states, *_answer(traffic, ego_states))
+
+
+def roll_on(traffic: TrafficScene, ego_states: Array) -> AgentTracks:
+    """The same for longer than H: T rows of the traffic around an ego with states (T, 11), 41 as `roll_out`'s.
+
+    After the log's end, which is the clip's, who replays it goes straight on as fast as there, and lights stay as they
+    are. ValueError where the states are none.
+    """
+    _check_states(ego_states[None], len(ego_states))
+    return _answer(traffic, ego_states)[0]
+
+
+def _answer(traffic: TrafficScene, ego_states: Array) -> tuple[AgentTracks, Bools]:
+    """The tracks of T rows around an ego with states (T, 11), and who was driven (N,)."""
+    start, n_rows = traffic.scene.step, len(ego_states)
+    window = _lasting(traffic.scene.agents, start + n_rows).window(start, start + n_rows)
     if traffic.navsim is not None:
-        return _public_rollout(traffic.navsim, traffic.settings, window, start, ego_states)
+        return _public_answer(traffic.navsim, traffic.settings, window, ego_states)
     if traffic.roles is None or traffic.paths is None or len(window) == 0:
-        return Rollout(start, ego_states, window, np.zeros(len(window), dtype=bool))
+        return window, np.zeros(len(window), dtype=bool)
     rows, motion = drive(*_script(traffic, window), *_ego_boxes(ego_states))
     n = len(window)
-    agents = replace(window, **{name: getattr(rows, name)[:, :n].copy() for name in PER_STEP})
-    return Rollout(start, ego_states, agents, motion.was_driven[-1])
+    return replace(window, **{name: getattr(rows, name)[:, :n].copy() for name in PER_STEP}), motion.was_driven[-1]
+
+
+def _lasting(agents: AgentTracks, n_steps: int) -> AgentTracks:
+    """Tracks over at least so many steps: who is there at the last one goes straight on as fast as there."""
+    more = n_steps - agents.n_steps
+    if more <= 0:
+        return agents
+    steps = np.minimum(np.arange(n_steps), agents.n_steps - 1)
+    out: dict[str, Any] = {name: getattr(agents, name)[steps] for name in PER_STEP}
+    out["boxes"][-more:, :, :2] += STEP_S * np.arange(1, more + 1)[:, None, None] * out["velocities"][-more:]
+    return replace(agents, **out)
 
 
 def roll_out_many(traffic: TrafficScene, ego_states: Array) -> Rollouts:
@@ -147,7 +171,7 @@ def roll_out_many(traffic: TrafficScene, ego_states: Array) -> Rollouts:
     The result takes 2.3 kB per agent and ego: split B to bound memory. With replayed traffic it is one log, seen B
     times. ValueError where the states are not (B, 41, 11) or not finite.
     """
-    _check_states(ego_states)
+    _check_states(ego_states, HORIZON_STEPS + 1)
     start = traffic.scene.step
     window = traffic.scene.agents.window(start, start + HORIZON_STEPS + 1)
     many, n = len(ego_states), len(window)
@@ -155,9 +179,8 @@ def roll_out_many(traffic: TrafficScene, ego_states: Array) -> Rollouts:
         shape = (many, HORIZON_STEPS + 1, n)
         out = Rollouts(np.empty((*shape, 5)), np.empty((*shape, 2)), np.empty(shape, bool), np.empty((many, n), bool))
         for b, states in enumerate(ego_states):
-            one = _public_rollout(traffic.navsim, traffic.settings, window, start, states)
-            out.boxes[b], out.velocities[b], out.valid[b] = one.agents.boxes, one.agents.velocities, one.agents.valid
-            out.simulated[b] = one.simulated
+            agents, out.simulated[b] = _public_answer(traffic.navsim, traffic.settings, window, states)
+            out.boxes[b], out.velocities[b], out.valid[b] = agents.boxes, agents.velocities, agents.valid
         return out
     if traffic.roles is None or traffic.paths is None or n == 0:
         alike: Any = [np.broadcast_to(a, (many, *a.shape)) for a in (window.boxes, window.velocities, window.valid)]
@@ -165,21 +188,20 @@ def roll_out_many(traffic: TrafficScene, ego_states: Array) -> Rollouts:
     return Rollouts(*drive_many(*_script(traffic, window), *_ego_boxes(ego_states)))
 
 
-def _public_rollout(
-    agents: NavsimAgents, settings: TrafficSettings, window: AgentTracks, start: int, ego_states: Array
-) -> Rollout:
+def _public_answer(
+    agents: NavsimAgents, settings: TrafficSettings, window: AgentTracks, ego_states: Array
+) -> tuple[AgentTracks, Bools]:
     """Boxes keep the height that they have now: the public traffic lives in the plane."""
     boxes, velocities, valid = answer(agents, settings, window, ego_states)
     vehicle = np.array([kind == AgentKind.VEHICLE for kind in window.kinds], dtype=bool)
     center_z = np.where(vehicle, np.where(valid, window.center_z[0], np.nan), window.center_z)
     driven = np.zeros(len(window), dtype=bool)
     driven[[agent.row for agent in agents.driven]] = True
-    moved = replace(window, boxes=boxes, velocities=velocities, valid=valid, center_z=center_z)
-    return Rollout(start, ego_states, moved, driven)
+    return replace(window, boxes=boxes, velocities=velocities, valid=valid, center_z=center_z), driven
 
 
-def _check_states(ego_states: Array) -> None:
-    expected = (HORIZON_STEPS + 1, EGO_STATE_SIZE)
+def _check_states(ego_states: Array, n_rows: int) -> None:
+    expected = (n_rows, EGO_STATE_SIZE)
     if ego_states.ndim != 3 or ego_states.shape[1:] != expected:
         raise ValueError(f"ego_states must be (B, {expected[0]}, {expected[1]}), not {ego_states.shape}")
     if not all_within(ego_states):
@@ -192,12 +214,16 @@ def _script(
 ) -> tuple[int, AgentStates, AgentStates, Roles, Paths, IdmDriver]:
     """All that the kernels need to know but the ego."""
     assert traffic.roles is not None and traffic.paths is not None
+    start, paths = traffic.scene.step, traffic.paths
+    if window.n_steps > len(paths.line_state):  # lights and stops stay as the last step knows them
+        more = window.n_steps - len(paths.line_state)
+        paths = paths._replace(line_state=np.concatenate([paths.line_state, np.repeat(paths.line_state[-1:], more, 0)]))
     return (
-        traffic.scene.step,
-        _agent_states(traffic.scene.clip.agents),
+        start,
+        _agent_states(_lasting(traffic.scene.clip.agents, start + window.n_steps)),
         _agent_states(window.window(0, 1)),
         Roles(*_writable(traffic.roles)),
-        Paths(*_writable(traffic.paths)),
+        Paths(*_writable(paths)),
         IdmDriver(*(getattr(traffic.settings, name) for name in IdmDriver._fields)),
     )
 

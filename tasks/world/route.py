@@ -152,6 +152,30 @@ class RouteFinder:
         center = pose[:2] + PACIFICA.rear_axle_to_center * forward
         return self._ids[int(np.argmin(self._rings.distances(center)))]
 
+    def metres_ahead(self, pose: Array, within_m: float, within_rad: float, enough_m: float) -> float | None:
+        """Metres that lanes of the route lead on from a rear-axle pose (3,), along the longest way; inf: to its end.
+
+        None where no lane of the route lies within `within_m` of the pose and runs within `within_rad` of its heading.
+        Of a way that is `enough_m` long no more is looked at. Lanes are not changed on it.
+        """
+        waiting: list[tuple[str, float]] = []  # a lane, and the way up to its end
+        for index in np.flatnonzero(self._rings.distances(pose[:2]) <= within_m).tolist():
+            line = self._lanes[self._ids[index]].centerline
+            at = int(np.argmin(np.hypot(*(line[:, :2] - pose[:2]).T)))
+            if abs(float(wrap_angle(line[at, 2] - pose[2]))) <= within_rad:
+                waiting.append((self._ids[index], float(np.hypot(*np.diff(line[at:, :2], axis=0).T).sum())))
+        longest: dict[str, float] = {}
+        while waiting:
+            lane_id, metres = waiting.pop()
+            if self._block_of[lane_id] == self._blocks[-1]:
+                return np.inf
+            if metres > longest.get(lane_id, -1.0):
+                longest[lane_id] = metres
+                if metres < enough_m:
+                    following = (other for other in self._lanes[lane_id].successors if other in self._lanes)
+                    waiting += [(other, metres + self._lengths[other]) for other in following]
+        return max(longest.values(), default=None)
+
     def lane_path_from(self, start: str) -> list[str]:
         """Cheapest lane path (cost: lane length) to the last of the next 30 route roadblocks.
 
