@@ -28,6 +28,8 @@ WATCHED = (
     "pdm",
     "reward.full",
     "reward.progress_above",
+    "reward.off_route",
+    "reward.after",
     "expert.recovery.smooth",
     "render.mode",
     "render.width",

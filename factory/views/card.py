@@ -188,7 +188,10 @@ def _gate(store: Store) -> str:
     full, above = settings.get("reward.full", []), settings.get("reward.progress_above", -1.0)
     asked = [f"full marks in {', '.join(full).upper()}"] if full else []
     asked += [f"EP above {above}"] if above >= 0.0 else []
-    return f"Such a drive had to earn {' and '.join(asked)}." if asked else "No such drive was refused for its score."
+    ends = ["lead on along the route"] if settings.get("reward.off_route") else []
+    ends += ["allow for a second after it without a collision"] if settings.get("reward.after") else []
+    scored = f"Such a drive had to earn {' and '.join(asked)}." if asked else "No such drive was refused for its score."
+    return f"{scored} Its end had to {' and '.join(ends)}." if ends else scored
 
 
 def _record(store: Store) -> dict[str, Any]:

@@ -12,6 +12,8 @@ STATUS = {  # exit code -> words, tone
 
 REASON_WORDS = {
     **{record.name: record.wrong for record in RECORDS},
+    "off_route": "the route does not go on where the drive ends",
+    "after": "somebody is hit in the second after the drive",
     "no_plan": "the expert found no plan",
     "route_ended": "no route is left to drive along",
     "psnr": "block reconstructed too poorly",

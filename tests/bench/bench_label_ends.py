@@ -1,9 +1,10 @@
-"""What labels' ends lead to, before and after the gates: `python -m tests.bench.bench_label_ends clips=av2 clips.root=<logs> ...`
+"""What labels' ends lead to, with and without the gates on them: `python -m tests.bench.bench_label_ends clips=av2 ...`
 
-By the words of `python -m factory.run`. Every candidate of every clip is driven by every expert, whatever `rounds` says;
-told of those with full marks, which is all that the published gate asks. Beside the gates' own verdicts stand measures
-that no gate uses: ends farther than 2 m from the route inside a junction, and labels whose own path asks for another
-command than the sample's. The human drives are measured and never refused.
+By the words of `python -m factory.run`. Every candidate of every clip is driven by every expert, whatever `rounds`
+says; told are those with full marks, which is all that the published gate asks. Beside what the gates take stand
+measures that they do not use: ends in a junction farther than 2 m from the route, labels that take another turn than
+the command says, and collisions at fault in the second after it at the label's last speed. The human drives are
+measured, too, and never refused.
 """
 
 import math
@@ -11,104 +12,112 @@ import sys
 import tempfile
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from factory.config.run import load_config
 from factory.graph.work import HUMAN_CANDIDATE
+from factory.readers.base import ClipRef
 from factory.setup.settings import assemble
-from factory.stages.pipeline import FactoryWork, drive_of  # noqa: F401
+from factory.stages.pipeline import FactoryWork
 from tasks.attempt import Judged, end_verdict, verdict
-from tasks.reward.second_after import BRAKING_MPS2, hit_after_s
+from tasks.reward.second_after import hit_after_s
 from tasks.rollout.simulate import TrafficScene, TrafficSettings, prepare_traffic
 from tasks.settings import ExpertGate
-from tasks.stages import Rejected
-from tasks.world.clip import Clip
+from tasks.stages import END_FAULTS, Rejected
 from tasks.world.command import driving_command
 from tasks.world.polygons import Rings
 from tasks.world.vehicle import HEADING
 
-OPEN = {"off_route": False, "after": False}
-COLUMNS = {
-    "full marks": "",
-    "far": "> 2 m off in a junction",
-    "command": "another command",
-    "hit": "hit at its speed",
-    "off_route": "`off_route`",
-    "after": "`after`",
-    "kept": "kept",
-    "far kept": "> 2 m off in a junction",
-    "command kept": "another command",
-    "hit kept": "hit at its speed",
+FAR_M = 2.0
+NO_ENDS = dict.fromkeys(END_FAULTS, False)
+MEASURES = {
+    "off": f"end > {FAR_M:g} m off the route in a junction",
+    "turn": "another turn than commanded",
+    "hit": "a hit within 1 s at their speed",
 }
 
 
-def far_off(clip: Clip, judged: Judged) -> bool:
-    """The rear axle ends in a junction, farther than 2 m from every lane of the route."""
-    lanes, end = clip.road_map.lanes, judged.rollout.ego_states[-1, :2]
+def is_far_off(judged: Judged) -> bool:
+    """The rear axle ends in a junction, farther than FAR_M from every lane of the route."""
+    clip, end = judged.scene.clip, judged.rollout.ego_states[-1, :2]
+    lanes = clip.road_map.lanes
     inside = [lane.ring for lane in lanes.values() if lane.is_intersection and lane.drives_cars]
     on_route = [lanes[name].ring for name in clip.route.lane_ids if name in lanes]
-    return bool(inside) and bool(Rings(inside).contains(end).any()) and float(Rings(on_route).distances(end).min()) > 2.0
+    in_junction = bool(inside) and bool(Rings(inside).contains(end).any())
+    return in_junction and float(Rings(on_route).distances(end).min()) > FAR_M
 
 
-def other_command(judged: Judged) -> bool:
-    """Its first 20 m, taken for a route, ask for another command than the sample's."""
-    states, scene = judged.rollout.ego_states[:, : HEADING + 1], judged.scene
-    own, given = driving_command(states, states[0]), driving_command(scene.centerline, states[0])
-    return "unknown" not in (own, given) and own != given
+def turns_elsewhere(judged: Judged) -> bool:
+    """Its first 20 m, seen along the route at its start, ask for another command than the sample has."""
+    line, own = judged.scene.centerline, judged.rollout.ego_states[:, : HEADING + 1].copy()
+    given = driving_command(line, own[0])
+    own[0, HEADING] = line[int(np.argmin(np.hypot(*(line[:, :2] - own[0, :2]).T))), HEADING]
+    taken = driving_command(own, own[0])
+    return "unknown" not in (given, taken) and given != taken
 
 
-def drives(work: FactoryWork, names: tuple[str, ...], refs: list) -> Iterator[tuple[str, Judged, TrafficScene]]:
-    """Expert, drive and its traffic of all that have full marks; of the human all."""
+def drives(work: FactoryWork, refs: Sequence[ClipRef]) -> Iterator[tuple[str, float, Judged, TrafficScene]]:
+    """Every attempt: expert, seconds it took, its drive and the traffic that met it."""
     for ref in refs:
         prepared = work.prepare(ref)
         if isinstance(prepared, Rejected):
             continue
-        for name in names:
+        for name in work.names:
             once = work.once(name)
             for candidate in [HUMAN_CANDIDATE] if once else range(len(prepared.candidates)):
-                drive = work.trace(prepared, candidate, name)
-                if drive.judged is not None:
+                start = time.thread_time()
+                judged = work.trace(prepared, candidate, name).judged
+                took = time.thread_time() - start
+                if judged is not None:
                     traffic = TrafficSettings(mode="replay") if once else work.traffic
-                    yield name, drive.judged, prepare_traffic(drive.judged.scene, traffic)
+                    yield name, took, judged, prepare_traffic(judged.scene, traffic)
 
 
-def main(words: list[str]) -> int:
-    """Drives, and prints the table."""
+def main(words: Sequence[str]) -> int:
+    """Drives, and prints the tables."""
     counts: dict[str, Counter[str]] = defaultdict(Counter)
     seconds: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as folder:
         run = assemble(load_config([*words, "executor=local", "render=none", "reward.labels=none", f"out={folder}"]))
-        work = replace(run.work, gate=replace(run.work.gate, **OPEN))
-        refs = run.index.refs[: run.config.limit]
-        for name, judged, traffic in drives(work, run.config.experts, refs):
-            tally = counts[name]
-            tally["tried"] += 1
-            if verdict(judged.scores, work.gate) is not None and not work.once(name):
-                continue
-            tally["full marks"] += 1
-            clip, states = judged.scene.clip, judged.rollout.ego_states
-            found = {"far": far_off(clip, judged), "command": other_command(judged)}
-            found["hit"] = hit_after_s(traffic, judged.prepared, states) < math.inf
-            refused = []
-            for gate in ("off_route", "after"):
-                start = time.thread_time()
-                said = end_verdict(judged, traffic, ExpertGate(**(OPEN | {gate: True})))
-                seconds[gate] += time.thread_time() - start
-                refused += [] if said is None else [said]
-            tally.update(said.reason for said in refused)
-            tally.update(key for key, holds in found.items() if holds)
-            if not refused:
-                tally.update(f"{key} kept" for key, holds in found.items() if holds)
-            tally["kept"] += not refused
-            seconds["drives"] += 1
-    keys = ["tried", *COLUMNS]
-    for name, tally in counts.items():
-        print(name, {key: tally[key] for key in keys})
-    print({gate: 1e3 * seconds[gate] / seconds["drives"] for gate in ("off_route", "after")})
+        work = replace(run.work, gate=replace(run.work.gate, **NO_ENDS))
+        work.warm(draws=False)
+        for name, took, judged, traffic in drives(work, run.index.refs[: run.config.limit]):
+            counts[name]["tried"] += 1
+            seconds["attempts"] += took
+            if work.once(name) or verdict(judged.scores, work.gate) is None:
+                counts[name].update(told(judged, traffic, seconds))
+    keys = ["tried", "full", *MEASURES, *END_FAULTS, "kept", *(f"kept {key}" for key in MEASURES)]
+    heads = ["tried", "full marks", *MEASURES.values(), *(f"refused: `{gate}`" for gate in END_FAULTS), "kept"]
+    print("|", " | ".join(["expert", *heads, *(f"of these: {words}" for words in MEASURES.values())]), "|")
+    print("|---" * (len(keys) + 1) + "|")
+    for name, found in counts.items():
+        print(f"| {name} |", " | ".join(str(found[key]) for key in keys), "|")
+    tried, full = (sum(found[key] for found in counts.values()) for key in ("tried", "full"))
+    costs = [f"{gate} {1e3 * seconds[gate] / max(full, 1):.2f}" for gate in END_FAULTS]
+    share = 100.0 * sum(seconds[gate] for gate in END_FAULTS) / seconds["attempts"]
+    print(f"\nms of CPU a drive with full marks: {', '.join(costs)}; of all {tried} attempts' time {share:.1f} %")
     return 0
+
+
+def told(judged: Judged, traffic: TrafficScene, seconds: Counter[str]) -> Iterator[str]:
+    """What is counted of a drive with full marks; the time that each gate took is added to `seconds`."""
+    yield "full"
+    hit = hit_after_s(traffic, judged.prepared, judged.rollout.ego_states) < math.inf
+    measured = {"off": is_far_off(judged), "turn": turns_elsewhere(judged), "hit": hit}
+    yield from (key for key, holds in measured.items() if holds)
+    refused = []
+    for gate in END_FAULTS:
+        start = time.thread_time()
+        found = end_verdict(judged, traffic, ExpertGate(**{**NO_ENDS, gate: True}))
+        seconds[gate] += time.thread_time() - start
+        refused += [gate] if found is not None else []
+    yield from refused[:1]  # as the funnel counts them: under the first
+    if not refused:
+        yield "kept"
+        yield from (f"kept {key}" for key, holds in measured.items() if holds)
 
 
 if __name__ == "__main__":

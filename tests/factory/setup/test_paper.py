@@ -37,6 +37,8 @@ def test_the_defaults_differ_in_vocabulary_pictures_and_gates() -> None:
     assert found == [
         "vocabulary of 1,024 kinematic trajectories (16,384 human ones)",
         "expert.recovery.smooth=True (False)",
+        "reward.off_route=True (False)",
+        "reward.after=True (False)",
         "render.width=320 (1920)",
         "render.height=180 (1080)",
         "render.camera_psnr_min=20.0 (0.0)",
@@ -50,6 +52,7 @@ def test_the_defaults_differ_in_vocabulary_pictures_and_gates() -> None:
     [
         ("perturb.epdms_min=0.5", "perturb.epdms_min=0.5 (0.8)"),
         ("perturb=dense", "perturb.max_longitudinal_m=8.0 (20.0)"),
+        ("reward.off_route=true", "reward.off_route=True (False)"),
         ("reward.progress_above=-1", "reward.progress_above=-1.0 (0.5)"),
         ("traffic=replay", "traffic.mode=replay (idm)"),
         ("render.psnr_gate=mark", "render.psnr_gate=mark (reject)"),

@@ -7,7 +7,7 @@ import pytest
 import shapely
 
 from tasks.world.frames import to_world
-from tasks.world.lanes import Lane, MapLayer, MapPolygon, RoadMap
+from tasks.world.lanes import Lane, MapLayer, MapPolygon, RoadMap, Route
 from tasks.world.polygons import (
     Rings,
     centerline_from_boundaries,
@@ -209,3 +209,46 @@ def test_layers_come_in_the_reference_s_order_and_only_within_the_radius() -> No
     road_map = RoadMap(road.lanes, (area, far), roadblock_of=road.roadblock_of)
     tokens = [polygon.token for polygon in polygons_near(road_map, np.array([10.0, 0.0]), radius_m=45.0)]
     assert tokens == ["a", "b", "o", "j", "k", "int_j", "int_k", "da_1"]
+
+
+def ahead(poses: np.ndarray, pose: tuple[float, float, float], motion: np.ndarray | None = None) -> float | None:
+    """Metres of 20 that the route of poses goes on from a pose, within 0.5 m and 0.5 rad of its lanes."""
+    road_map, at = two_lane_road(motion), np.array(pose)
+    if motion is not None:
+        poses, at = to_world(motion, poses), to_world(motion, at)
+    return RouteFinder(road_map, route_of_log(road_map, poses)).metres_ahead(at, 0.5, 0.5, 20.0)
+
+
+@pytest.mark.parametrize("motion", [None, np.array([120.0, -40.0, 1.1])])
+def test_the_way_ahead_is_as_long_as_the_route_s_lanes_in_a_row(motion: np.ndarray | None) -> None:
+    """Straight on over j to c: a leads to k, which is off the route, 50 m from where it begins."""
+    straight = drive((5, -4), (60, -4))
+    assert ahead(straight, (35.0, 0.0, 0.0), motion) == pytest.approx(15.0, abs=0.4)  # points lie 0.74 m apart
+    assert ahead(straight, (10.0, 0.0, 0.0), motion) == pytest.approx(40.0, abs=0.4)
+    assert ahead(straight, (35.0, -4.0, 0.0), motion) == pytest.approx(35.0, abs=0.4)  # 15 on b, all 20 of j
+    assert ahead(straight, (60.0, -4.0, 0.0), motion) == np.inf  # c is the route's last
+    assert ahead(straight, (150.0, -4.0, 0.0), motion) == np.inf
+    left = drive((5, 0), (50, 0))
+    assert ahead(left, (49.0, -4.0, 0.0), motion) == pytest.approx(1.0, abs=0.4)
+
+
+def test_a_pose_beside_the_route_s_lanes_or_across_them_has_no_way_ahead() -> None:
+    straight = drive((5, -4), (60, -4))
+    assert ahead(straight, (30.0, -6.4, 0.4)) is not None
+    assert ahead(straight, (30.0, -6.6, 0.4)) is None
+    assert ahead(straight, (30.0, -4.0, 0.6)) is None
+    assert ahead(straight, (30.0, -4.0, 0.4 - 2.0 * np.pi)) is not None
+    assert ahead(straight, (61.0, 6.0, 0.4)) is None  # on k, which the route does not take
+    assert ahead(straight, (30.0, 4.0, 0.0)) is None  # on the lane of those who come
+
+
+def test_a_way_ahead_that_goes_in_a_circle_has_an_end() -> None:
+    """Two short lanes that lead to each other, and the route's last one elsewhere."""
+    road_map = mapped(
+        lane("s", [(0, 0), (6, 0)], successors=("t",)),
+        lane("t", [(6, 0), (12, 0)], successors=("s",)),
+        lane("z", [(500, 0), (520, 0)]),
+    )
+    blocks = tuple(road_map.roadblock_of[name] for name in "stz")
+    finder = RouteFinder(road_map, Route(("s", "t", "z"), blocks, frozenset("stz")))
+    assert finder.metres_ahead(np.array([0.0, 0.0, 0.0]), 0.5, 0.5, 20.0) == pytest.approx(24.0)
