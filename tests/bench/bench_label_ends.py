@@ -51,10 +51,10 @@ def is_far_off(judged: Judged) -> bool:
 
 
 def turns_elsewhere(judged: Judged) -> bool:
-    """Its first 20 m, seen along the route at its start, ask for another command than the sample has."""
+    """Its first 20 m, seen from the route beside its start, ask for another command than the sample has."""
     line, own = judged.scene.centerline, judged.rollout.ego_states[:, : HEADING + 1].copy()
     given = driving_command(line, own[0])
-    own[0, HEADING] = line[int(np.argmin(np.hypot(*(line[:, :2] - own[0, :2]).T))), HEADING]
+    own[0] = line[int(np.argmin(np.hypot(*(line[:, :2] - own[0, :2]).T)))]
     taken = driving_command(own, own[0])
     return "unknown" not in (given, taken) and given != taken
 

@@ -12,12 +12,14 @@ from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings
 from tasks.experts.protocol import Expert, Plan
 from tasks.experts.recovery.expert import Recovery, RecoveryTable
 from tasks.reward.epdms import Scores
-from tasks.rollout.simulate import TrafficSettings, simulate
-from tasks.stages import STAGES, Rejected
+from tasks.reward.second_after import BRAKING_MPS2, hit_after_s
+from tasks.rollout.simulate import TrafficSettings, prepare_traffic, simulate
+from tasks.stages import END_FAULTS, STAGES, Rejected
 from tasks.subscores import JUDGED
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip, Rollout, Scene, scene_of_clip
 from tasks.world.frames import to_world
 from tasks.world.kinematic_vocabulary import kinematic_trajectories
+from tests.tasks.bad_ends import Aside, Close, shift
 from tests.tasks.streets import moved, perturbed, same_poses, street_clip
 
 GATE = ExpertGate()
@@ -28,14 +30,6 @@ def scores(**values: float) -> Scores:
     """Two rows: row 0 all zero, row 1 perfect but for `values`."""
     row: dict[str, NDArray[np.float64]] = {field.name: np.array([0.0, 1.0]) for field in fields(Scores)}
     return Scores(**row | {name: np.array([0.0, value]) for name, value in values.items()})  # type: ignore[arg-type]
-
-
-def shift(speed: float, side_m: float) -> NDArray[np.float64]:
-    """(40, 3) at constant speed to `side_m` to the left within 2.5 s."""
-    step = np.arange(1, HORIZON_STEPS + 1)
-    share = np.minimum(step / 25.0, 1.0)
-    slope = side_m * 6.0 * share * (1.0 - share) / (2.5 * speed)
-    return np.column_stack([0.1 * speed * step, side_m * share**2 * (3.0 - 2.0 * share), np.arctan(slope)])
 
 
 def first_stage(clip: Clip) -> Rollout:
@@ -160,6 +154,83 @@ def test_a_route_that_has_ended_is_a_rejection_not_an_error(scene: Scene) -> Non
     result = attempt(at_the_end, PdmClosed(), GATE, TrafficSettings(), PdmSettings(), RNG)
     assert isinstance(result, Rejected)
     assert (result.stage, result.reason) == ("rollout", "route_ended")
+
+
+ASKS_FOR_ENDS = ExpertGate(full=(), progress_above=-1.0)
+REPLAY = TrafficSettings(mode="replay")
+
+
+def ended(scene: Scene, expert: Expert, gate: ExpertGate) -> Rejected | None:
+    result = attempt(scene, expert, gate, REPLAY, PdmSettings(), RNG)
+    assert not isinstance(result, Rejected)
+    return result[1]
+
+
+def test_a_drive_that_ends_beside_the_route_is_refused_where_that_is_asked(scene: Scene) -> None:
+    rejected = ended(scene, Aside(), ASKS_FOR_ENDS)
+    assert rejected == Rejected("reward", "off_route", "ends on no lane of the route")
+    assert ended(scene, Aside(), replace(ASKS_FOR_ENDS, off_route=False)) is None
+
+
+def test_a_drive_that_ends_on_a_lane_that_leaves_the_route_is_refused(scene: Scene) -> None:
+    """The street's lane ends some way beyond where PDM-Closed gets to, and the route goes on elsewhere."""
+    judged, rejected = tried(scene, PdmClosed())
+    assert rejected is None
+    end_x, clip = float(judged.rollout.ego_states[-1, 0]), scene.clip
+    for name, suffix in (("out", ""), ("out_left", "_left")):
+        assert clip.road_map.lanes[name].lane_id == f"out{suffix}"
+    for left_m, leads_on in ((25.0, True), (8.0, False)):
+        lanes = {}
+        for name, lane in clip.road_map.lanes.items():
+            line = lane.centerline
+            if name.startswith("out"):
+                line = line[line[:, 0] <= end_x + left_m]
+            lanes[name] = replace(lane, centerline=line)
+        route = replace(clip.route, roadblock_ids=(*clip.route.roadblock_ids, "rb_elsewhere"))
+        ends = replace(scene, clip=replace(clip, road_map=replace(clip.road_map, lanes=lanes), route=route))
+        found = ended(ends, PdmClosed(), replace(ASKS_FOR_ENDS, after=False))
+        assert (found is None) == leads_on
+        if found is not None:
+            assert found.reason == "off_route" and "leaves the route within" in found.detail
+
+
+def test_a_drive_that_ends_a_moment_before_a_collision_is_refused_where_that_is_asked(scene: Scene) -> None:
+    rejected = ended(scene, Close(), ASKS_FOR_ENDS)
+    assert rejected is not None and (rejected.stage, rejected.reason) == ("reward", "after")
+    assert "hits somebody after 0." in rejected.detail and "when it brakes" in rejected.detail
+    assert ended(scene, Close(), replace(ASKS_FOR_ENDS, after=False)) is None
+
+
+def test_a_collision_that_braking_prevents_refuses_nothing(scene: Scene) -> None:
+    """The car ahead is 7.5 m farther on: at 10 m/s more than it the ego hits it still, braking it does not."""
+    agents = scene.agents
+    farther = replace(scene, agents=replace(agents, boxes=agents.boxes + np.array([7.5, 0.0, 0.0, 0.0, 0.0])))
+    result = attempt(farther, Close(), ASKS_FOR_ENDS, REPLAY, PdmSettings(), RNG)
+    assert not isinstance(result, Rejected)
+    judged, rejected = result
+    traffic = prepare_traffic(farther, REPLAY)
+    assert hit_after_s(traffic, judged.prepared, judged.rollout.ego_states) < np.inf
+    assert hit_after_s(traffic, judged.prepared, judged.rollout.ego_states, BRAKING_MPS2) == np.inf
+    assert rejected is None
+
+
+def test_sub_scores_come_before_ends_and_the_route_before_the_second_after(scene: Scene) -> None:
+    both = ended(scene, Aside(), GATE)
+    assert both is not None and both.reason in JUDGED
+    assert set(END_FAULTS) <= set(next(stage.reasons for stage in STAGES if stage.name == "reward"))
+
+
+def test_what_an_end_leads_to_changes_neither_drive_nor_scores(scene: Scene, table: RecoveryTable) -> None:
+    """Traffic that went on for a second is asked beside the rollout, which stays as it was to the last bit."""
+    without = replace(GATE, off_route=False, after=False)
+    for expert in (PdmClosed(), Recovery(table)):
+        (a, _), (b, _) = (
+            attempt(scene, expert, gate, TrafficSettings(), PdmSettings(), RNG)  # type: ignore[misc]
+            for gate in (GATE, without)
+        )
+        np.testing.assert_array_equal(a.rollout.ego_states, b.rollout.ego_states, strict=True)
+        np.testing.assert_array_equal(a.rollout.agents.boxes, b.rollout.agents.boxes, strict=True)
+        np.testing.assert_array_equal(a.scores.pdm_score, b.scores.pdm_score, strict=True)
 
 
 class OffTheRoad:

@@ -29,6 +29,7 @@ from tests.tasks.streets import street_clip
 VOCABULARY = Vocabulary(kinematic_trajectories(3, 0))
 SIZE = ["render.width=64", "render.height=36", "render.scene=discs", "vocabulary.k=300"]
 SIZE += ["render.psnr_min=0", "render.gate.vehicle_min=0", "experts=[pdm_closed,human]"]
+OPEN = ["reward.full=[]", "reward.progress_above=-1", "reward.off_route=false", "reward.after=false"]
 
 
 def work_on(root: Path, out: Path, *overrides: str) -> FactoryWork:
@@ -143,9 +144,7 @@ def test_a_rejected_attempt_is_no_sample(small_town: Path, tmp_path: Path) -> No
 def test_with_an_open_gate_the_log_s_future_is_the_label_of_every_perturbed_state(
     small_town: Path, tmp_path: Path
 ) -> None:
-    work = work_on(
-        small_town, tmp_path, "reward.full=[]", "reward.progress_above=-1", "render=none", "experts=[logged]"
-    )
+    work = work_on(small_town, tmp_path, *OPEN, "render=none", "experts=[logged]")
     prepared = prepared_by(work)
     log = work.reader.read(work.reader.index().refs[0]).ego_states
     results = [attempted(work, prepared, row.index, "logged") for row in prepared.candidates[:4]]
@@ -206,6 +205,7 @@ def test_a_clip_s_candidates_are_drawn_from_a_stream_of_the_run_s_seed_and_its_o
         ("traffic=replay", True),
         ("seed=1", True),
         ("reward.progress_above=0.6", False),  # judges attempts only
+        ("reward.off_route=false", False),
         ("render.width=128", True),  # another block, which may be refused
         ("render.psnr_min=0", True),
         ("experts=[pdm_closed]", False),
@@ -216,6 +216,14 @@ def test_what_a_prepared_clip_depends_on(override: str, prepares_anew: bool) -> 
     before = identity_of(load_config([]), VOCABULARY, None).prepare_digest
     after = identity_of(load_config([override]), VOCABULARY, None).prepare_digest
     assert (before != after) == prepares_anew
+
+
+def test_gates_that_are_off_are_no_part_of_what_rows_are_made_under_and_gates_that_are_on_are() -> None:
+    """So tables of before there was a choice go on without them, and are refused by name with them."""
+    off = identity_of(load_config(["reward.off_route=false", "reward.after=false"]), VOCABULARY, None)
+    on = identity_of(load_config([]), VOCABULARY, None)
+    assert dict(on.settings) == dict(off.settings) | {"reward.off_route": True, "reward.after": True}
+    assert on.settings_hash != off.settings_hash and on.prepare_digest == off.prepare_digest
 
 
 def test_weights_that_only_measure_are_no_part_of_what_rows_are_made_under(tmp_path: Path) -> None:
