@@ -167,7 +167,12 @@ def test_every_command_is_one_its_program_takes(
             assert door_main(arguments) == 0, capsys.readouterr().err
         case ["python", "-m", "factory.run", "--help"]:
             assert run_main(["--help"]) == 0
-        case ["python", "-m", "factory.run" | "tests.bench.kill_resume" | "tests.bench.bench_pairs", *arguments]:
+        case [
+            "python",
+            "-m",
+            "factory.run" | "tests.bench.kill_resume" | "tests.bench.bench_pairs" | "tests.bench.bench_label_ends",
+            *arguments,
+        ]:
             load_config(given(arguments))
         case ["python", "-m", "planners", "train", *arguments] | [
             "torchrun",

@@ -30,8 +30,9 @@ from tasks.render.settings import RenderMode, RenderSettings, SceneFrom
 from tasks.reward.epdms import score
 from tasks.reward.labels import Labelling, reactive_scores, vocabulary_labels
 from tasks.reward.prepare import prepare_scene
+from tasks.reward.second_after import hit_after_s
 from tasks.reward.verdicts import INDEX_FROM_ROWS
-from tasks.rollout.simulate import TrafficSettings, simulate
+from tasks.rollout.simulate import TrafficSettings, prepare_traffic, simulate
 from tasks.sealed import Damaged, sealed, unsealed
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import Array
@@ -185,6 +186,7 @@ def _judge() -> None:
     judged = drive_and_judge(scene, Plan(ahead), REPLAY, PdmSettings())
     labelling = Labelling(Vocabulary(kinematic_trajectories(INDEX_FROM_ROWS, 0)), REPLAY)
     vocabulary_labels(labelling, scene, judged.prepared, judged.reference)
+    hit_after_s(prepare_traffic(scene, REPLAY), judged.prepared, judged.rollout.ego_states)
 
 
 def _plan() -> None:

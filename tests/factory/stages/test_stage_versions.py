@@ -31,8 +31,10 @@ from tasks.render.scene.engine import NOBODY, render
 from tasks.render.views import render_views
 from tasks.reward.epdms import Scores, score
 from tasks.reward.label_bytes import VocabularyLabels
+from tasks.reward.off_route import way_on_m
 from tasks.reward.prepare import prepare_scene
-from tasks.rollout.simulate import TrafficSettings, simulate
+from tasks.reward.second_after import BRAKING_MPS2, hit_after_s
+from tasks.rollout.simulate import TrafficSettings, prepare_traffic, simulate
 from tasks.stages import STAGES, stage_versions
 from tasks.world.camera import Camera, Pinhole
 from tasks.world.chance import stream
@@ -156,11 +158,19 @@ def plans() -> dict[str, object]:
 
 
 def rewards() -> dict[str, object]:
-    """The stage `reward`: every sub-score of sixty drives from T."""
+    """The stage `reward`: every sub-score of sixty drives from T, and what their ends lead to."""
     scene = scene_of_clip(street_clip())
-    poses = to_world(scene.ego_state[:3], kinematic_trajectories(60, 2))
-    scores = score(prepare_scene(scene, scene.agents.window(NOW, NOW + 41)), straight_states(scene, poses))
-    return {field.name: getattr(scores, field.name) for field in fields(Scores)}
+    states = straight_states(scene, to_world(scene.ego_state[:3], kinematic_trajectories(60, 2)))
+    prepared = prepare_scene(scene, scene.agents.window(NOW, NOW + 41))
+    scores, clip, traffic = score(prepared, states), scene.clip, prepare_traffic(scene, TrafficSettings())
+    onward = replace(clip.route, roadblock_ids=(*clip.route.roadblock_ids, "rb_elsewhere"))
+    ways = [way_on_m(clip.road_map, onward, one[-1, :3] + [240.0, 0.0, 0.0]) for one in states]
+    ends = {
+        "way on": [-1.0 if metres is None else metres for metres in ways],
+        "hit": [hit_after_s(traffic, prepared, one) for one in states],
+        "hit braking": [hit_after_s(traffic, prepared, one, BRAKING_MPS2) for one in states],
+    }
+    return {field.name: getattr(scores, field.name) for field in fields(Scores)} | ends
 
 
 def blocks(images: NDArray[np.uint8]) -> NDArray[np.float64]:
@@ -317,6 +327,9 @@ GOLDEN: dict[str, Golden] = {
             "hc_index": (7745.96669, -71.7041948),
             "ego_areas": (6.3673562, 0.00517916111),
             "comfort": (18.973666, 0.050716014),
+            "way on": (3496.78756, -406.624998),
+            "hit": (7100.90841, -127.986939),
+            "hit braking": (7487.92272, -295.910856),
         },
     ),
     "render": Golden(
