@@ -1,0 +1,97 @@
+"""What labels' ends lead to on the shared logs: no human is refused, and recovery's that leave the route are."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from factory.readers.av2.reader import AV2Reader
+from factory.readers.base import ClipReader
+from factory.readers.scenarionet.reader import ScenarioNetReader
+from tasks.attempt import ExpertGate, Judged, attempt, end_verdict, human_sample, perturbed_scene
+from tasks.experts.human import Human
+from tasks.experts.pdm_closed.planner import PdmSettings
+from tasks.experts.recovery.expert import Recovery, RecoveryTable
+from tasks.perturb import Perturbation, PerturbSettings, perturb
+from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_on
+from tasks.stages import Rejected
+from tasks.world.agents import PER_STEP
+from tasks.world.chance import stream
+from tasks.world.clip import HORIZON_STEPS, Clip, scene_of_clip
+from tasks.world.polygons import Rings
+from tasks.world.vocabulary import Vocabulary
+
+AV2 = ("data", "av2", "sensor", "val")
+LOG, START_MS = "7fab2350-7eaf-3b7e-a39d-6937a4c1bede", 1000  # the route turns left at a junction
+PUBLISHED = ExpertGate(off_route=False, after=False)
+PDM, RNG = PdmSettings(), np.random.default_rng(0)  # who drives here draws nothing
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("reader", "folder"), [(AV2Reader, AV2), (ScenarioNetReader, ("data", "scenarionet", "nuscenes"))]
+)
+def test_no_human_drive_is_one_that_would_be_refused(
+    shared_root: Path, reader: type[AV2Reader] | type[ScenarioNetReader], folder: tuple[str, ...]
+) -> None:
+    logs: ClipReader = reader(shared_root.joinpath(*folder))
+    refs = logs.index().refs
+    assert len(refs) in (14, 61)
+    for ref in refs:
+        judged = human_sample(scene_of_clip(logs.read(ref)), Human(), PDM, RNG)
+        replayed = prepare_traffic(judged.scene, TrafficSettings(mode="replay"))
+        assert end_verdict(judged, replayed, ExpertGate()) is None, ref
+
+
+@pytest.fixture(scope="module")
+def clip(shared_root: Path) -> Clip:
+    reader = AV2Reader(shared_root.joinpath(*AV2, LOG))
+    return reader.read(next(ref for ref in reader.index().refs if ref.start_ms == START_MS))
+
+
+@pytest.fixture(scope="module")
+def driven(clip: Clip, shared_root: Path) -> list[tuple[Judged, Rejected | None, Rejected | None]]:
+    """Recovery's attempts: drive, the published gate's verdict, and that with the gates on ends."""
+    human: NDArray[np.float64] = np.load(shared_root / "data" / "vocabulary" / "human_8192x40x3.npy")
+    rng, traffic = stream(0, clip.clip_id, "perturb"), TrafficSettings()
+    found = perturb(clip, Vocabulary(human), PerturbSettings(), traffic, PDM, rng)
+    assert isinstance(found, Perturbation)
+    expert, out = Recovery(RecoveryTable(human)), []
+    for candidate in found.candidates:
+        scene = perturbed_scene(clip, candidate.rollout)
+        pair = [attempt(scene, expert, gate, traffic, PDM, RNG) for gate in (PUBLISHED, ExpertGate())]
+        if not isinstance(pair[0], Rejected) and not isinstance(pair[1], Rejected):
+            out.append((pair[0][0], pair[0][1], pair[1][1]))
+    return out
+
+
+def off_route_m(judged: Judged) -> float:
+    """Of the rear axle at the end, to the nearest lane of the route."""
+    clip = judged.scene.clip
+    rings = Rings([clip.road_map.lanes[name].ring for name in clip.route.lane_ids if name in clip.road_map.lanes])
+    return float(rings.distances(judged.rollout.ego_states[-1, :2]).min())
+
+
+def test_full_marks_far_off_the_route_are_refused_and_what_is_kept_ends_on_it(
+    driven: list[tuple[Judged, Rejected | None, Rejected | None]],
+) -> None:
+    full = [(judged, asked) for judged, published, asked in driven if published is None]
+    assert max(off_route_m(judged) for judged, _ in full) > 5.0  # what the gate is for
+    assert all(asked is not None and asked.reason == "off_route" for judged, asked in full if off_route_m(judged) > 0.5)
+    kept = [off_route_m(judged) for judged, asked in full if asked is None]
+    assert kept and max(kept) <= 0.5
+    assert all(published is None or published == asked for _, published, asked in driven)  # sub-scores come first
+
+
+def test_the_second_after_changes_no_bit_of_what_was_scored(
+    driven: list[tuple[Judged, Rejected | None, Rejected | None]],
+) -> None:
+    for judged, _, _ in driven[:4]:
+        states = judged.rollout.ego_states
+        on = roll_on(
+            prepare_traffic(judged.scene, TrafficSettings()), np.concatenate([states, states[-1:].repeat(10, 0)])
+        )
+        for name in PER_STEP:
+            kept = getattr(on, name)[: HORIZON_STEPS + 1]
+            np.testing.assert_array_equal(kept, getattr(judged.rollout.agents, name), strict=True)
