@@ -27,11 +27,12 @@ from tasks.reward.second_after import hit_after_s
 from tasks.rollout.simulate import TrafficScene, TrafficSettings, prepare_traffic
 from tasks.settings import ExpertGate
 from tasks.stages import END_FAULTS, Rejected
-from tasks.world.command import driving_command
-from tasks.world.polygons import Rings
+from tasks.world.command import LOOKAHEAD_M, driving_command
+from tasks.world.polygons import Rings, arc_lengths
 from tasks.world.vehicle import HEADING
 
 FAR_M = 2.0
+LANE_M = 3.5
 NO_ENDS = dict.fromkeys(END_FAULTS, False)
 MEASURES = {
     "off": f"end > {FAR_M:g} m off the route in a junction",
@@ -51,12 +52,17 @@ def is_far_off(judged: Judged) -> bool:
 
 
 def turns_elsewhere(judged: Judged) -> bool:
-    """Its first 20 m, seen from the route beside its start, ask for another command than the sample has."""
+    """Its first 20 m, seen from the route beside its start, ask for another command than the sample has.
+
+    And lead more than a lane's width off the route: a change of lanes is no turn.
+    """
     line, own = judged.scene.centerline, judged.rollout.ego_states[:, : HEADING + 1].copy()
     given = driving_command(line, own[0])
     own[0] = line[int(np.argmin(np.hypot(*(line[:, :2] - own[0, :2]).T)))]
     taken = driving_command(own, own[0])
-    return "unknown" not in (given, taken) and given != taken
+    there = own[min(int(np.searchsorted(arc_lengths(own), LOOKAHEAD_M)), len(own) - 1), :2]
+    aside_m = float(np.hypot(*(line[:, :2] - there).T).min())
+    return "unknown" not in (given, taken) and given != taken and aside_m > LANE_M
 
 
 def drives(work: FactoryWork, refs: Sequence[ClipRef]) -> Iterator[tuple[str, float, Judged, TrafficScene]]:
