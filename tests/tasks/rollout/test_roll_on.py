@@ -49,6 +49,19 @@ def test_the_rows_of_a_rollout_do_not_change_by_a_bit_where_it_goes_on(seed: int
             np.testing.assert_array_equal(kept, getattr(shorter, name), strict=True)
 
 
+def test_the_public_traffic_goes_on_as_well() -> None:
+    """Its vehicles drive on, what is none goes on along its log and then straight on; the first 41 rows stay."""
+    walker = Track(20.0, -6.0, np.pi / 2, 1.2, AgentKind.PEDESTRIAN, (0.6, 0.6))
+    scene = at_the_end(worlds.scene(worlds.straight_road(), walker, Track(0.0, speed=5.0), ego=(60.0, -50.0, 0.0)))
+    traffic = prepare_traffic(scene, TrafficSettings(mode="navsim"))
+    ego = np.repeat(scene.ego_state[None], LONG, axis=0)
+    on, shorter = roll_on(traffic, ego), roll_out(traffic, ego[: HORIZON_STEPS + 1]).agents
+    for name in PER_STEP:
+        np.testing.assert_array_equal(getattr(on, name)[: HORIZON_STEPS + 1], getattr(shorter, name), strict=True)
+    assert on.valid.all() and (np.diff(on.boxes[:, 1, 0])[1:] > 0.4).all()
+    assert np.diff(on.boxes[:, 0, 1]) == pytest.approx(0.12)
+
+
 def parked_ego() -> NDArray[np.float64]:
     """(51, 11) far away."""
     return np.tile(np.array([*worlds.FAR_EGO, *np.zeros(EGO_STATE_SIZE - 3)]), (LONG, 1))
