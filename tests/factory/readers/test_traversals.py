@@ -45,8 +45,6 @@ def test_nobody_is_taken_of_another_world_another_street_or_for_a_few_metres() -
     }
     assert others["crossing"].places[:, 1].min() < 0.0 < others["crossing"].places[:, 1].max()
     found = traversals({"me": MINE, **others}, "me", 100, 301, 9)
-    assert found == () or [other.log_id for other in found] == ["crossing"]
-    assert [other.log_id for other in found] != ["parallel"]
     # 24 m of the crossing street lie within 12 m, of which samples 10 m apart show 20.
     assert [other.log_id for other in found] == ["crossing"]
     assert traversals({"me": MINE, **others}, "me", 300, 401, 9) == ()
