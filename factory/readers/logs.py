@@ -14,6 +14,10 @@ clip. With it a run sees that a log was changed though its clips lie prepared in
 `block(ref) -> str | None`, names the block that the clip is rendered from, as cheaply; with it the block is built once,
 as a task of its own, before its clips are prepared.
 
+Three more make a block's scene of other logs' drives through the same place as well (`traversals=N`): `world(path)`
+names the frame that a log's poses are in where other logs share it, `block_steps(start)` gives the steps of a window's
+block, and `log_digest(path)` the content digest of a log.
+
 A format that may bring its reader down or never end, as pickles may, is `untrusted`: the index reads each log in
 another process, and a log that kills it is broken as any other.
 
@@ -33,7 +37,8 @@ import numpy as np
 
 from factory.readers.apart import Apart
 from factory.readers.base import SPLITS, BadClip, ClipIndex, ClipRef, split_of
-from factory.readers.settings import LogClips, WindowSettings
+from factory.readers.settings import LogClips, WindowSettings, check_traversals
+from factory.readers.traversals import DrivenPath, OtherDrive, Traversal, digest_with, joined, path_of, traversals
 from factory.readers.validate import validate_clip
 from tasks.world.agents import AgentTracks
 from tasks.world.arrays import Array, Ints
@@ -121,11 +126,13 @@ class LogReader(ABC, Generic[Log]):
         first_window: int = LogClips.first_window,
         only: Sequence[str] = LogClips.only,
         split: str | None = LogClips.split,
+        traversals: int = LogClips.traversals,
     ) -> None:
         """name: the data set's name, part of every clip id; first_window: of each log, skips those before it.
 
         only: ids of the logs to take, of all that are there where none is named; split: of every clip, whatever its
-        data set says. Raises ValueError for an impossible stride, first window or split.
+        data set says; traversals: other logs' drives that a block is made of as well, at most. Raises ValueError for
+        an impossible stride, first window, split or number of traversals.
         """
         if split is not None and split not in SPLITS:
             raise ValueError(f"clips.split={split} is none of {', '.join(SPLITS)}; null: the data set's own")
@@ -133,6 +140,8 @@ class LogReader(ABC, Generic[Log]):
         self.name = self.data_set if name is None else name
         self.windows = WindowSettings(stride_s, min_top_speed_mps, first_window)
         self.only, self.split = tuple(only), split
+        check_traversals(traversals)
+        self.traversals = traversals
         self._logs: dict[str, Log] = {}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -154,6 +163,18 @@ class LogReader(ABC, Generic[Log]):
     def recorded(self, log: Log, start: int, stop: int) -> Recorded:
         """What steps start..stop-1 of the log have besides states. Raises BadClip."""
 
+    def world(self, path: Path) -> str | None:
+        """Name of the frame of the log's poses that other logs share; None: none is known to. Raises BadClip."""
+        return None
+
+    def block_steps(self, start: int) -> tuple[int, int]:
+        """Steps first..stop-1 of a log that the block of the window from step `start` on takes, where it has them."""
+        raise NotImplementedError(f"{type(self).__name__} names worlds, but not the steps of its blocks")
+
+    def log_digest(self, path: Path) -> str:
+        """The content digest of the log at a path. Raises BadClip."""
+        raise NotImplementedError(f"{type(self).__name__} names worlds, but has no digest of its logs")
+
     def index(self) -> ClipIndex:
         """All windows of all logs, ordered by log id and time. Raises ValueError where the root holds no log."""
         refs: list[ClipRef] = []
@@ -161,6 +182,8 @@ class LogReader(ABC, Generic[Log]):
         skipped: dict[str, str] = {}
         broken: dict[ClipRef, str] = {}
         chosen = self._chosen()
+        if self.traversals:
+            self._driven  # noqa: B018 - found once, before workers get the reader
         importable = type(self).__module__ != "__main__"  # else no other process knows the class
         elsewhere = Apart(self.windows_of) if self.untrusted and importable else None
         for log_id, path in chosen.items():
@@ -221,11 +244,49 @@ class LogReader(ABC, Generic[Log]):
             cameras=recorded.cameras,
             images=recorded.images,
             sweeps=recorded.sweeps,
-            block=recorded.block,
+            block=None if recorded.block is None else self._with_others(ref, recorded.block),
             licence=log.licence,
-            content_digest=log.content_digest,
+            content_digest=self.digest_with_others(ref, log.content_digest),
         )
         return validate_clip(clip, log.file)
+
+    def digest_with_others(self, ref: ClipRef, digest: str) -> str:
+        """The content digest of a clip whose log's is `digest`: that of the drives its block is made of is in it."""
+        return digest_with(digest, self._others(ref), lambda log_id: self.log_digest(self.logs()[log_id]))
+
+    def _others(self, ref: ClipRef) -> tuple[Traversal, ...]:
+        """The other drives that the block of a clip is made of as well."""
+        if not self.traversals or ref.log_id not in self._driven:
+            return ()
+        return traversals(self._driven, ref.log_id, *self.block_steps(ref.start_ms // STEP_MS), self.traversals)
+
+    def _with_others(self, ref: ClipRef, block: Block) -> Block:
+        others = []
+        for other in self._others(ref):
+            log = self._log(replace(ref, log_id=other.log_id))
+            start, stop = other.start, min(other.stop, len(log.ego_states))
+            seen = self.recorded(log, start, stop)
+            agents = present(log.agents.window(start, stop))
+            if seen.images or seen.sweeps:
+                others.append(OtherDrive(other.log_id, agents, seen.cameras, seen.images, seen.sweeps))
+        return joined(block, others) if others else block
+
+    @cached_property
+    def _driven(self) -> dict[str, DrivenPath]:
+        """Where the logs' egos were, of those that share a world and can be read. Raises ValueError where none does."""
+        found, worlds = {}, False
+        for log_id, path in self._chosen().items():
+            try:
+                world = self.world(path)
+                worlds = worlds or world is not None
+                drive = None if world is None else self.drive(path)
+            except BadClip:  # the index says what is wrong with it
+                continue
+            if world is not None and isinstance(drive, LoggedDrive):
+                found[log_id] = path_of(world, drive.ego_states)
+        if not worlds:
+            raise ValueError(f"clips.traversals={self.traversals}: no log under {self.root} says which world it shares")
+        return found
 
     def _chosen(self) -> Mapping[str, Path]:
         logs = self.logs()
@@ -256,7 +317,7 @@ class LogReader(ABC, Generic[Log]):
     def _log(self, ref: ClipRef) -> Log:
         if ref.log_id not in self._logs:
             log = self.load(self.path_of(ref))
-            self._logs = dict([*self._logs.items(), (ref.log_id, log)][-CACHED_LOGS:])
+            self._logs = dict([*self._logs.items(), (ref.log_id, log)][-(CACHED_LOGS + self.traversals) :])
         return self._logs[ref.log_id]
 
 

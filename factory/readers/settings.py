@@ -38,6 +38,12 @@ class WindowSettings:
         return self.first * self.stride_steps
 
 
+def check_traversals(traversals: int) -> None:
+    """Raises ValueError for a number that cannot be."""
+    if traversals < 0:
+        raise ValueError(f"clips.traversals must be 0 or more, not {traversals}")
+
+
 @dataclass(frozen=True)
 class LogClips:
     """Clips of logs of one format."""
@@ -48,9 +54,11 @@ class LogClips:
     first_window: int = 0  # of each log; those before it are skipped
     only: tuple[str, ...] = ()  # ids of logs; []: all under the root
     split: Split | None = None  # of every clip; null: the data set's own, else by the hash of the log's id
+    traversals: int = 0  # other logs' drives through the same place, at most, that a block's scene is made of as well
 
     def __post_init__(self) -> None:
         self.windows  # noqa: B018 - raises ValueError for a stride or a first window that cannot be
+        check_traversals(self.traversals)
 
     @property
     def windows(self) -> WindowSettings:
@@ -107,9 +115,11 @@ class NavsimClips:
     only: tuple[str, ...] = ()  # names of logs; []: all under the root
     split: Split | None = None  # of every clip; null: by the name of the filter or the folder, else the log's hash
     cache_dir: str | None = None  # of what is known of each log's frames; null: the user's cache
+    traversals: int = 0  # other logs' drives through the same place, at most, that a block's scene is made of as well
 
     def __post_init__(self) -> None:
-        """Raises ValueError for a stride or a first window that cannot be."""
+        """Raises ValueError for a stride, a first window or a number of traversals that cannot be."""
+        check_traversals(self.traversals)
         windows = WindowSettings(self.stride_s, self.min_top_speed_mps, self.first_window)
         if windows.stride_steps % FRAME_STEPS:
             raise ValueError(f"stride_s must be a multiple of 0.5 s, NAVSIM's frames, not {self.stride_s}")
@@ -187,8 +197,10 @@ class TownClips:
     n_clips: int = 12  # the town's first
     seed: int = 0  # of the town
     settings: TownSettings = field(default_factory=TownSettings)
+    traversals: int = 0  # other logs' drives through the same place, at most, that a block's scene is made of as well
 
     def __post_init__(self) -> None:
+        check_traversals(self.traversals)
         if self.n_clips < 1:
             raise ValueError(f"clips.n_clips: a town needs at least one clip, not {self.n_clips}")
 
@@ -210,8 +222,10 @@ class TownsClips:
     first_window: int = 0  # of each log; those before it are skipped
     cache_dir: str | None = None  # each town is written there once; null: the user's cache
     settings: TownSettings = field(default_factory=TownSettings)
+    traversals: int = 0  # other logs' drives through the same place, at most, that a block's scene is made of as well
 
     def __post_init__(self) -> None:
+        check_traversals(self.traversals)
         chosen = self.chosen
         if not chosen or min(chosen) < 0 or len(set(chosen)) < len(chosen):
             raise ValueError(f"clips.seeds: each town's seed once, 0 or more, at least one; not {list(chosen)}")

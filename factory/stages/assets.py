@@ -9,7 +9,7 @@ import fcntl
 import hashlib
 import json
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
 from enum import Enum
@@ -23,7 +23,7 @@ from factory.stages.fitting import fitted
 from factory.stages.own_body import masks_digest, read_masks
 from factory.stages.rig import corrected_rig, known_of, said_again, wanted
 from factory.stages.scene_file import SUFFIX, BadScene, read_scene, write_scene
-from factory.stages.sensors import block_of, chosen_cameras, load_sensors, load_sweeps, taken_by
+from factory.stages.sensors import block_cameras, block_of, chosen_cameras, load_sensors, load_sweeps, taken_by
 from factory.store.illness import own_place
 from tasks.render.fit.lpips import lpips_of
 from tasks.render.scene.asset import BlockRange, RenderAsset, TakenFrom, rises_of
@@ -34,9 +34,9 @@ from tasks.render.scene.sensed import own_bodies
 from tasks.render.scene.settings import Backend
 from tasks.render.scene.stereo import MAX_BASELINE_M, MIN_BASELINE_M
 from tasks.render.settings import REMOVED, RenderSettings, SceneFrom
-from tasks.world.arrays import Array
-from tasks.world.camera import SensorFile
-from tasks.world.clip import Block, Clip
+from tasks.world.arrays import Array, Bools
+from tasks.world.camera import Camera, SensorFile
+from tasks.world.clip import Block, Clip, of_other_log, own_name
 
 ASSET_VERSION = 9  # raised by hand when the same sensors give another scene
 PARALLAX_SHARE = 0.9  # without lidar, a photo with no other in stereo reach shows sky alone; so few may be like that
@@ -85,11 +85,12 @@ def asset_for(
     Raises BadClip where a sensor file is broken, ValueError for a camera the rig does not have, and Halted where a fit
     is `stopped`.
     """
-    block, cameras = block_of(clip), chosen_cameras(clip.cameras, settings.cameras)
+    block, rig = block_of(clip), chosen_cameras(clip.cameras, settings.cameras)
+    cameras = block_cameras(block, rig)
     made_of = sensing(clip, settings)
     if made_of is Sensing.NOTHING:
         return None
-    path, masks = scene_path(clip, settings, cache_dir), read_masks(settings.own_body, cameras)
+    path, masks = scene_path(clip, settings, cache_dir), masks_of(cameras, read_masks(settings.own_body, rig))
     with only_builder(path):
         if path.exists():
             try:
@@ -118,7 +119,27 @@ def asset_for(
             asset = replace(asset, rig=cameras if taken else (), taken=taken, bodies=own_bodies(data.photos))
         else:
             asset = lidar_asset(load_sweeps(block.sweeps, with_intensity=True), block.agents)
-        return write_scene(path, replace(asset, block=range_of(clip, block)))
+        return write_scene(path, replace(own_part(asset), block=range_of(clip, block)))
+
+
+def own_part(asset: RenderAsset) -> RenderAsset:
+    """A scene without what is of other logs' drives through it alone: their clips have a block of their own."""
+    return replace(
+        asset,
+        nodes={name: node for name, node in asset.nodes.items() if not of_other_log(name)},
+        exposures=tuple(exposure for exposure in asset.exposures if not of_other_log(exposure.camera)),
+        rig=tuple(camera for camera in asset.rig if not of_other_log(camera.name)),
+        taken=tuple(photo for photo in asset.taken if not of_other_log(photo.camera)),
+        bodies=tuple(body for body in asset.bodies if not of_other_log(body.camera)),
+    )
+
+
+def masks_of(cameras: Sequence[Camera], own: Mapping[str, Bools]) -> dict[str, Bools]:
+    """Masks of a block's cameras from those of its own rig: the same camera of another log's sees about the same of its
+    car."""
+    masks = {camera.name: own.get(own_name(camera.name)) for camera in cameras}
+    size = {camera.name: (camera.height, camera.width) for camera in cameras}
+    return {name: mask for name, mask in masks.items() if mask is not None and mask.shape == size[name]}
 
 
 def taken_from(given: Sequence[SensorFile], used: Sequence[SensorFile]) -> tuple[TakenFrom, ...]:
@@ -137,7 +158,7 @@ def scene_path(clip: Clip, settings: RenderSettings, cache_dir: str | Path) -> P
 
 def range_of(clip: Clip, block: Block) -> BlockRange:
     """When and where the sensors of a clip's block were."""
-    files = (*block.images, *block.sweeps)
+    files = [file for file in (*block.images, *block.sweeps) if file.time_s <= block.own_s]
     places = np.stack([file.world_from_ego[:2, 3] for file in files])
     end_s = block.start_s + max(file.time_s for file in files)
     return BlockRange(clip.dataset, clip.log_id, block.start_s, end_s, places.min(axis=0), places.max(axis=0))

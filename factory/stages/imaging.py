@@ -8,7 +8,7 @@ without photos gives grey pictures near its sweeps, tagged `lidar_only`; photos 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,7 @@ from tasks.attempt import Judged
 from tasks.perturb import Candidate
 from tasks.render.block_gate import poor_block
 from tasks.render.gate import looked_at_size, unfit
-from tasks.render.likeness import Album, likeness_to_photo, sightings
+from tasks.render.likeness import Album, fading_of, likeness_to_photo, sightings
 from tasks.render.map_drawing import draw_map_views
 from tasks.render.rigs import RIGS
 from tasks.render.scene.asset import RenderAsset
@@ -292,7 +292,9 @@ def album_of(clip: Clip, asset: RenderAsset, settings: RenderSettings) -> Album:
             known[row] = likeness_to_photo(asset, photo, agents, tracks[row], settings.backend)
         return known[row][track_id]
 
-    return Album(shown, likeness)
+    held_out = {(view.camera, view.time_s) for view in asset.views if view.held_out}
+    rows = frozenset(row for row, file in enumerate(files) if (file.sensor, file.time_s) in held_out)
+    return Album(shown, likeness, cache(lambda: fading_of(shown, likeness, rows)))
 
 
 @lru_cache(maxsize=2)

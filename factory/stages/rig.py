@@ -12,14 +12,14 @@ from pathlib import Path
 import numpy as np
 
 from factory.stages.own_body import NO_MASKS
-from factory.stages.sensors import SensorData, opened_photos, taken_by
+from factory.stages.sensors import SensorData, opened_photos, poses_of, taken_by
 from factory.store.disk import whole_file
 from tasks.render.rig.corners import corners_of
 from tasks.render.rig.correct import Correction, corrected
 from tasks.render.rig.ground import ground_below
 from tasks.render.rig.masks import hidden_by
 from tasks.render.rig.settings import Adjust, RigSettings
-from tasks.render.scene.driven_road import driven_road
+from tasks.render.scene.driven_road import driven_roads
 from tasks.render.scene.features import Known
 from tasks.sealed import Damaged, sealed_json, unsealed_json
 from tasks.world.arrays import Bools
@@ -89,11 +89,11 @@ def known_of(data: SensorData, block: Block, found: Correction) -> Known:
     """What is known of a corrected block: its corners, and the road, looked for where no reader says where it is."""
     road = data.known.road
     if road is None and not data.sweeps:
-        poses = np.stack([file.world_from_ego for file in block.images])
+        poses, times_s = poses_of(block.images)
         ground_m = ground_below(data.photos, poses)
         if ground_m is not None:
             log.info("road: %.2f m above the ego's origin", ground_m)
-            road = driven_road(poses[np.argsort([file.time_s for file in block.images], kind="stable")], ground_m)
+            road = driven_roads(poses, times_s, ground_m)
     return Known(road, found.points)
 
 

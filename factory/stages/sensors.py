@@ -13,14 +13,14 @@ from factory.readers.nuscenes_points import read_points
 from factory.readers.pcd import read_pcd
 from factory.readers.videos import file_and_frame, video_frames
 from factory.stages.own_body import NO_MASKS, resized_mask
-from tasks.render.scene.driven_road import driven_road
+from tasks.render.scene.driven_road import driven_roads
 from tasks.render.scene.features import NOTHING_KNOWN, Known
 from tasks.render.scene.sensed import Photo, Sweep, on_ego
 from tasks.render.settings import Chroma
 from tasks.render.views import straightened, undistorted
-from tasks.world.arrays import Bools, Bytes
+from tasks.world.arrays import Array, Bools, Bytes
 from tasks.world.camera import Camera, SensorFile
-from tasks.world.clip import Block, Clip
+from tasks.world.clip import Block, Clip, own_name
 
 XYZ, INTENSITY = ("x", "y", "z"), "intensity"
 SAMPLING: Mapping[Chroma, int] = {
@@ -56,8 +56,7 @@ def load_sensors(
     photos = tuple(replace(photo, own_body=masks.get(photo.camera)) for photo in taken)
     if block.sweeps or block.ground_m is None or not block.images:
         return SensorData(photos, load_sweeps(block.sweeps))
-    poses = np.stack([file.world_from_ego for file in sorted(block.images, key=lambda file: file.time_s)])
-    return SensorData(photos, (), Known(road=driven_road(poses, block.ground_m)))
+    return SensorData(photos, (), Known(road=driven_roads(*poses_of(block.images), block.ground_m)))
 
 
 def load_photos(files: Sequence[SensorFile], cameras: Sequence[Camera], width: int, height: int) -> tuple[Photo, ...]:
@@ -73,6 +72,18 @@ def taken_by(cameras: Sequence[Camera], files: Sequence[SensorFile]) -> tuple[Se
     """The files that one of the `cameras` took, in their order."""
     names = {camera.name for camera in cameras}
     return tuple(file for file in files if file.sensor in names)
+
+
+def poses_of(files: Sequence[SensorFile]) -> tuple[Array, Array]:
+    """Where the ego was when each was taken: poses (F, 4, 4) and times (F,) [s]."""
+    return np.stack([file.world_from_ego for file in files]), np.array([file.time_s for file in files])
+
+
+def block_cameras(block: Block, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
+    """The `cameras` that are chosen of the block's own rig, and those of other logs' drives that have their names."""
+    names = {camera.name for camera in cameras}
+    others = (camera for camera in block.other_cameras if own_name(camera.name) in names)
+    return (*cameras, *others)
 
 
 def chosen_cameras(rig: Sequence[Camera], names: Sequence[str] | None) -> tuple[Camera, ...]:

@@ -3,10 +3,13 @@
 A vehicle that passed the cameras in a few photos can be fitted to streaks: they look right from nowhere, also not from
 where its photos were taken. So the scene is drawn as one photo shows it, from the place that is nearest to here as the
 vehicle sees it, and both are compared inside the vehicle's outline. What is found there fades with the way from that
-place to here: a side that no photo shows, or a look from much nearer, is a guess.
+place to here: a side that no photo shows, or a look from much nearer, is a guess. How fast it fades is for the photos
+to say that the scene was not made of: few photos a second are fitted each for itself, and from between them the
+vehicle is torn.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import math
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -23,7 +26,12 @@ from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import F32, Array, Bools, Ints
 from tasks.world.camera import Camera, Pinhole, SensorFile
 
-FADING = 0.2  # likeness falls by exp(-0.2) where the eye moves by as much as it was away from the vehicle
+FADING = 0.2  # at least: likeness falls by exp(-0.2) where the eye moves by as much as it was away from the vehicle
+LEAST_LIKE = 0.05  # below, a vehicle is not there at all, and its likeness says no more
+LEAST_HELD_OUT = 10  # looks at vehicles in photos held out, fewer of which say nothing
+LEAST_GAP = 0.1  # between such a photo and the nearest other, below which a look says more of noise than of the way
+OTHERS_WAY = 0.2
+MOST_HELD_OUT = 100  # that are compared
 TELLING_M = 40.0  # a photo from farther tells nothing of how a vehicle looks from near
 SHOWN = 0.3  # share of a vehicle's points that a photo must have in view
 SIGMA_PX = 1.5  # of the window of SSIM (Wang et al. 2004), on pictures of half the size: blur alone is forgiven
@@ -54,6 +62,7 @@ class Album:
 
     sightings: Mapping[str, Sightings]  # by track id
     likeness: Callable[[str, int], float]  # of a track as the scene draws it to a photo that shows it, 0 to 1
+    fading: Callable[[], Mapping[str, float]] = dict  # of tracks; FADING of others
 
 
 def sightings(files: Sequence[SensorFile], cameras: Sequence[Camera], agents: AgentTracks) -> dict[str, Sightings]:
@@ -92,7 +101,35 @@ def expected(album: Album, track_id: str, eye: Array) -> float:
     if seen is None:
         return 0.0
     photo, gap = seen.nearest(eye)
-    return album.likeness(track_id, photo) * float(np.exp(-FADING * gap))
+    return album.likeness(track_id, photo) * math.exp(-album.fading().get(track_id, FADING) * gap)
+
+
+def fading_of(
+    seen: Mapping[str, Sightings], likeness: Callable[[str, int], float], held_out: Collection[int]
+) -> Mapping[str, float]:
+    """How fast the likeness of each track fades away from the photos that a scene was made of.
+
+    Each look at a vehicle in one of the photos (rows) `held_out` is held against what the nearest other photo of it
+    says: it loses so much by so much of a way. What all lose together counts for each track as if it were OTHERS_WAY of
+    its own, which it has little of. No less than FADING, which is what too few looks say.
+    """
+    looks = [(name, k) for name, mine in seen.items() for k in range(len(mine.photos)) if mine.photos[k] in held_out]
+    lost: dict[str, list[tuple[float, float]]] = {}
+    for name, k in looks[:: max(1, math.ceil(len(looks) / MOST_HELD_OUT))]:
+        mine = seen[name]
+        used = ~np.isin(mine.photos, list(held_out))
+        if not used.any():
+            continue
+        photo, gap = Sightings(mine.photos[used], mine.eyes[used]).nearest(mine.eyes[k])
+        if gap >= LEAST_GAP:
+            there, here = (max(likeness(name, row), LEAST_LIKE) for row in (photo, int(mine.photos[k])))
+            lost.setdefault(name, []).append((math.log(there / here), gap))
+    every = np.array([row for mine in lost.values() for row in mine]).reshape(-1, 2)
+    if len(every) < LEAST_HELD_OUT:
+        return {}
+    usual = max(FADING, every[:, 0].sum() / every[:, 1].sum())
+    sums = {name: np.sum(lost.get(name, [(0.0, 0.0)]), axis=0) for name in seen}
+    return {n: max(FADING, float((loss + usual * OTHERS_WAY) / (way + OTHERS_WAY))) for n, (loss, way) in sums.items()}
 
 
 def large_vehicles(there: Vehicles, eye: Pinhole, view: View, share: float) -> Iterator[tuple[int, float]]:

@@ -1,5 +1,6 @@
 """A clip: one real recording window, validated; a scene: the world at one of its instants."""
 
+import math
 from dataclasses import dataclass
 
 from tasks.world.agents import AgentTracks
@@ -13,6 +14,8 @@ HISTORY_STEPS = 15  # 1.5 s before T
 HORIZON_STEPS = 40  # H = 4 s
 NOW = HISTORY_STEPS  # index of T in a clip's arrays
 CLIP_STEPS = HISTORY_STEPS + 1 + 2 * HORIZON_STEPS  # 96
+OTHER_LOG = "/"  # in the name of a track, camera or lidar of a block that is another log's: <log id>/<its own name>
+DRIVES_APART_S = 10.0  # between two drives through one place, on the clock of a block
 
 
 @dataclass(frozen=True)
@@ -24,6 +27,18 @@ class Block:
     images: tuple[SensorFile, ...]
     sweeps: tuple[SensorFile, ...]
     ground_m: float | None = None  # z of the road under the ego in the ego's frame; None: not known
+    own_s: float = math.inf  # what comes later are other logs' drives through the place, one after the other
+    other_cameras: tuple[Camera, ...] = ()  # of those drives
+
+
+def of_other_log(name: str) -> bool:
+    """Whether a track, camera or lidar of a block is of another log than the block."""
+    return OTHER_LOG in name
+
+
+def own_name(name: str) -> str:
+    """What a log itself calls a track, camera or lidar of a block."""
+    return name.rpartition(OTHER_LOG)[2]
 
 
 @dataclass(frozen=True)

@@ -40,6 +40,7 @@ from tasks.world.lanes import LightState, RoadMap, TrafficLights
 LICENCE = "CC BY-NC-SA 4.0 (Argoverse 2)"
 LIGHTS = "traffic_lights.feather"
 BLOCK_STEPS, BLOCK_STRIDE_STEPS = 200, 100  # of the stretches that are reconstructed
+BEFORE_CITY, AFTER_CITY = "____", "_city_"  # log_map_archive_<log>____PIT_city_57819.json
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,20 @@ class AV2Reader(LogReader[AV2Log]):
 
     def digest(self, ref: ClipRef) -> str:
         """The clip's content digest, from the bytes of its log's files alone. Raises BadClip."""
-        return content_digest(self.path_of(ref))
+        return self.digest_with_others(ref, self.log_digest(self.path_of(ref)))
+
+    def log_digest(self, path: Path) -> str:
+        """sha256 of the log in this folder, but for pixels and points. Raises BadClip."""
+        return content_digest(path)
+
+    def world(self, path: Path) -> str:
+        """The city, as the name of the log's map has it. Raises BadClip."""
+        return map_file(path).stem.partition(BEFORE_CITY)[2].partition(AFTER_CITY)[0]
+
+    def block_steps(self, start: int) -> tuple[int, int]:
+        """20 s that begin at a multiple of 10 s."""
+        first = start // BLOCK_STRIDE_STEPS * BLOCK_STRIDE_STEPS
+        return first, first + BLOCK_STEPS
 
     def block(self, ref: ClipRef) -> str | None:
         """Log and second at which the block begins that the clip is rendered from; None where the log has no photos."""

@@ -10,7 +10,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ import numpy as np
 
 from factory.readers.apart import Apart
 from factory.readers.base import SPLITS, BadClip, ClipIndex, ClipRef, bytes_of, split_of
-from factory.readers.logs import CACHED_LOGS
+from factory.readers.logs import CACHED_LOGS, STEP_MS
 from factory.readers.navsim.filters import Selection, read_selection
 from factory.readers.navsim.log import LogFrames, frames_of
 from factory.readers.navsim.rig import blobs_of, rig_of
@@ -48,6 +48,7 @@ from factory.readers.nuplan_maps.geopackage import DOWNLOAD, map_file
 from factory.readers.nuplan_maps.kept import file_digest
 from factory.readers.restricted_pickle import load_plain
 from factory.readers.settings import NavsimClips
+from factory.readers.traversals import DrivenPath, OtherDrive, Traversal, digest_with, joined, traversals
 from factory.readers.validate import validate_clip
 from factory.wording import time_text
 from tasks.caches import user_cache
@@ -95,11 +96,15 @@ class NavsimReader:
         only: Sequence[str] = NavsimClips.only,
         split: str | None = NavsimClips.split,
         cache_dir: str | Path | None = NavsimClips.cache_dir,
+        traversals: int = NavsimClips.traversals,
     ) -> None:
         """Arguments: see NavsimClips. Raises ValueError for what is no filter, stride or split."""
         if split is not None and split not in SPLITS:
             raise ValueError(f"clips.split={split} is none of {', '.join(SPLITS)}; null: by the filter and the folder")
-        settings = NavsimClips(str(root), str(maps), stride_s=stride_s, first_window=first_window)
+        settings = NavsimClips(
+            str(root), str(maps), stride_s=stride_s, first_window=first_window, traversals=traversals
+        )
+        self.traversals = settings.traversals
         self.root, self.maps = (Path(folder).expanduser().absolute() for folder in (root, maps))
         self.sensors = None if sensors is None else Path(sensors).expanduser().absolute()
         self.name, self.only, self.split = name, tuple(only), split
@@ -134,6 +139,8 @@ class NavsimReader:
             raise ValueError(f"{self.sensors}: no such folder; clips.sensors=null reads clips without pictures")
         scenes = self.choice.scene_filter
         tokens = None if scenes is None or scenes.tokens is None else frozenset(scenes.tokens)
+        if self.traversals:
+            self._driven  # noqa: B018 - found once, before workers get the reader
         refs: list[ClipRef] = []
         dropped: Counter[str] = Counter()
         skipped: dict[str, str] = {}
@@ -186,7 +193,7 @@ class NavsimReader:
                 problem = f"no picture of the frames {start} to {start + WINDOW_FRAMES - 1} of {ref.log_id} is here"
                 raise BadClip(str(self.sensors), "blobs", f"{problem}; clips.sensors=null reads clips without pictures")
             images, sweeps = blobs.images, blobs.sweeps
-            block = self._block(opened, start)
+            block = self._with_others(ref, self._block(opened, start))
             cameras = rig_of(frames[now], block.images, opened.log.file)
         clip = Clip(
             clip_id=ref.clip_id,
@@ -207,23 +214,20 @@ class NavsimReader:
             block=block,
             licence=LICENCE,
             frame_tokens=(frames[now].token, frames[now + HORIZON_FRAMES].token),
-            content_digest=opened.content_digest,
+            content_digest=digest_with(opened.content_digest, self._others(ref), self._log_digest),
         )
         return validate_clip(clip, opened.log.file)
 
     def digest(self, ref: ClipRef) -> str:
         """The clip's content digest, from the bytes of its log's file and of its city's map. Raises BadClip."""
-        path = self._path_of(ref)
-        table = kept_table(path, self.cache_dir) or make_table(path, self.cache_dir)
-        return _digest(bytes_of(path), map_file(self.maps, table.location))
+        self._path_of(ref)
+        return digest_with(self._log_digest(ref.log_id), self._others(ref), self._log_digest)
 
     def block(self, ref: ClipRef) -> str | None:
         """Log and second at which the block begins that the clip is rendered from; None without sensors."""
         if self.sensors is None:
             return None
-        path = self._path_of(ref)
-        table = kept_table(path, self.cache_dir) or make_table(path, self.cache_dir)
-        first, _ = _block_frames(table, _frame_at(ref, table, str(path)))
+        table, first, _ = self._block_of(ref)
         return f"{ref.log_id}@{table.start_ms[first] / 1000:g}s"
 
     def split_of(self, log_id: str) -> str:
@@ -296,8 +300,53 @@ class NavsimReader:
             log = frames_of(load_plain(data, str(path)), path)
             table = table_of(log)
             opened = OpenLog(log, table, _digest(data, map_file(self.maps, table.location)))
-            self._logs = dict([*self._logs.items(), (ref.log_id, opened)][-CACHED_LOGS:])
+            self._logs = dict([*self._logs.items(), (ref.log_id, opened)][-(CACHED_LOGS + self.traversals) :])
         return self._logs[ref.log_id]
+
+    def _table(self, path: Path) -> FrameTable:
+        return kept_table(path, self.cache_dir) or make_table(path, self.cache_dir)
+
+    def _log_digest(self, log_id: str) -> str:
+        path = self.logs()[log_id]
+        return _digest(bytes_of(path), map_file(self.maps, self._table(path).location))
+
+    def _block_of(self, ref: ClipRef) -> tuple[FrameTable, int, int]:
+        """The log's table, and the frames first..stop-1 of the block that the clip is rendered from. Raises BadClip."""
+        path = self._path_of(ref)
+        table = self._table(path)
+        return table, *_block_frames(table, _frame_at(ref, table, str(path)))
+
+    @cached_property
+    def _driven(self) -> dict[str, DrivenPath]:
+        """Where the logs' egos were, of those that can be read."""
+        tables = ((log_id, table) for log_id, table in self._tables(self._chosen()) if isinstance(table, FrameTable))
+        return {
+            log_id: DrivenPath(table.location, table.start_ms // STEP_MS, np.stack([table.x_m, table.y_m], axis=1))
+            for log_id, table in tables
+        }
+
+    def _others(self, ref: ClipRef) -> tuple[Traversal, ...]:
+        """The other drives that the block of a clip is made of as well."""
+        if not self.traversals or self.sensors is None or ref.log_id not in self._driven:
+            return ()
+        table, first, stop = self._block_of(ref)
+        steps = table.start_ms // STEP_MS
+        return traversals(self._driven, ref.log_id, int(steps[first]), int(steps[stop - 1]) + 1, self.traversals)
+
+    def _with_others(self, ref: ClipRef, block: Block) -> Block:
+        assert self.sensors is not None
+        others = []
+        for other in self._others(ref):
+            opened = self._open(replace(ref, log_id=other.log_id))
+            steps, stretch = opened.table.start_ms // STEP_MS, opened.table.stretch
+            inside = np.flatnonzero((steps >= other.start) & (steps < other.stop))
+            inside = inside[stretch[inside] == stretch[inside[0]]]
+            frames = opened.log.frames[inside[0] : inside[-1] + 1]
+            blobs = blobs_of(frames, self.sensors)
+            if blobs.images or blobs.sweeps:
+                cameras = rig_of(frames[len(frames) // 2], blobs.images, opened.log.file)
+                others.append(OtherDrive(other.log_id, stretch_agents(frames), cameras, blobs.images, blobs.sweeps))
+        return joined(block, others) if others else block
 
     def _block(self, opened: OpenLog, start: int) -> Block:
         """Up to 20 s that begin at a multiple of 10 s of the stretch and hold the window."""

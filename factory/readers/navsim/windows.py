@@ -22,9 +22,9 @@ from factory.readers.navsim.log import LogFrames, read_frames
 from factory.readers.navsim.tracks import FRAMES_BEFORE, WINDOW_FRAMES
 from tasks.kernels.compiled import write_whole
 from tasks.sealed import sealed, unsealed
-from tasks.world.arrays import Bools, Ints
+from tasks.world.arrays import Array, Bools, Ints
 
-TABLE_VERSION = 2  # of the tables kept
+TABLE_VERSION = 3  # of the tables kept
 FRAME_S, SLACK_S = 0.5, 0.05  # between two frames; more or less is a gap
 GAP, SHORT_HISTORY, SHORT_FUTURE = "gap_in_frames", "short_history", "short_future"
 NO_ROUTE, NO_BOXES, STANDING, ABSENT = "no_route", "not_annotated", "ego_standing", "absent_token"
@@ -41,6 +41,8 @@ class FrameTable:
     annotated: Bools  # (F,)
     speeds: NDArray[np.float32]  # (F,) of the ego [m/s]
     locations: NDArray[np.str_]  # (F,) the city, the same in all frames
+    x_m: Array  # (F,) of the rear axle on the city's map
+    y_m: Array  # (F,)
 
     @property
     def location(self) -> str:
@@ -88,6 +90,8 @@ def table_of(log: LogFrames) -> FrameTable:
         annotated=np.array([frame.boxes is not None for frame in frames]),
         speeds=np.array([np.hypot(*frame.dynamic_state[:2]) for frame in frames], np.float32),
         locations=np.array([frame.map_location for frame in frames]),
+        x_m=np.array([frame.pose[0] for frame in frames], np.float64),
+        y_m=np.array([frame.pose[1] for frame in frames], np.float64),
     )
 
 

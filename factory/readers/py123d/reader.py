@@ -86,8 +86,23 @@ class Py123dReader(LogReader[Py123dLog]):
 
     def digest(self, ref: ClipRef) -> str:
         """The clip's content digest, from the bytes of its log's files alone. Raises BadClip."""
-        header = open_header(self.path_of(ref))
+        return self.digest_with_others(ref, self.log_digest(self.path_of(ref)))
+
+    def log_digest(self, path: Path) -> str:
+        """sha256 of the log in this folder, but for pixels and points. Raises BadClip."""
+        header = open_header(path)
         return content_digest(header, map_file(header, self.maps_root))
+
+    def world(self, path: Path) -> str | None:
+        """The map that the log shares with others; None where it has one of its own. Raises BadClip."""
+        header = open_header(path)
+        shares = not header.metadata["map_metadata"].get("map_is_per_log")
+        return map_file(header, self.maps_root).stem if shares else None
+
+    def block_steps(self, start: int) -> tuple[int, int]:
+        """20 s that begin at a multiple of 10 s."""
+        first = start // BLOCK_STRIDE_STEPS * BLOCK_STRIDE_STEPS
+        return first, first + BLOCK_STEPS
 
     def block(self, ref: ClipRef) -> str | None:
         """Log and second at which the block begins that the clip is rendered from; None where there are no photos."""

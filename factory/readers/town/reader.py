@@ -34,6 +34,10 @@ class SensedReader(AV2Reader):
         """The clip's content digest, without reading it. Raises BadClip."""
         return self._sensed(super().digest(ref))
 
+    def world(self, path: Path) -> str:
+        """The town; another seed's of the same name lies at the same places. Raises BadClip."""
+        return f"{super().world(path)} of {path.name.split('-')[1]}"
+
     def _sensed(self, digest: str) -> str:
         return hashlib.sha256(f"{digest}{self.split or ''}{json.dumps(asdict(self.settings))}".encode()).hexdigest()
 
@@ -51,11 +55,12 @@ class SyntheticReader(SensedReader):
         n_clips: int = TownClips.n_clips,
         seed: int = TownClips.seed,
         settings: TownSettings | None = None,
+        traversals: int = TownClips.traversals,
     ) -> None:
         """cache_dir: where towns are kept; None: in the user's cache. Raises ValueError for n_clips < 1."""
         clips = TownClips(n_clips=n_clips, seed=seed, settings=settings or TownSettings())
         self.n_clips, self.seed, self.settings = clips.n_clips, clips.seed, clips.settings
-        super().__init__(town_folder(cache_dir, seed, [n_clips], self.settings))
+        super().__init__(town_folder(cache_dir, seed, [n_clips], self.settings), traversals=traversals)
 
     def logs(self) -> dict[str, Path]:
         """Log id -> folder; writes the town if it is missing."""

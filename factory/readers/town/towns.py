@@ -28,13 +28,15 @@ class SyntheticTownsReader(SensedReader):
         first_window: int = TownsClips.first_window,
         cache_dir: str | Path | None = None,
         settings: TownSettings | None = None,
+        traversals: int = TownsClips.traversals,
     ) -> None:
         """seeds: None: `n_towns` of them from `first_seed` on; split: of every clip, whatever its log's hash says.
 
         Raises ValueError for repeated or no seeds, an unknown split, or more logs than a town has kinds of drives.
         """
         chosen = TownsClips(None if seeds is None else tuple(seeds), first_seed, n_towns, logs_per_town).chosen
-        super().__init__(cache_dir or user_cache() / "towns", first_window=first_window, split=split)
+        folder = cache_dir or user_cache() / "towns"
+        super().__init__(folder, first_window=first_window, split=split, traversals=traversals)
         self.settings = settings or TownSettings()
         self.towns = tuple(self._town(seed, logs_per_town) for seed in chosen)
 

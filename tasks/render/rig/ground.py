@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import uniform_filter
 
-from tasks.render.scene.driven_road import WIDE_M, driven_road
+from tasks.render.scene.driven_road import WIDE_M, driven_roads
 from tasks.render.scene.sensed import Photo
 from tasks.world.arrays import F32, Array, Bools
 
@@ -26,7 +26,7 @@ LEAST_LIKENESS = 0.3  # correlation at the best height, below which none is righ
 def ground_below(photos: Sequence[Photo], world_from_ego: Array) -> float | None:
     """z [m] of the road in the frame of the ego, poses (V, 4, 4) of the photos; None where photos do not tell."""
     order = np.argsort([photo.time_s for photo in photos], kind="stable")
-    path = world_from_ego[order]
+    times_s = np.array([photo.time_s for photo in photos])
     greys = [cv2.cvtColor(photo.rgb, cv2.COLOR_RGB2GRAY).astype(np.float32) for photo in photos]
     pairs: list[tuple[int, int]] = []
     for name in sorted({photo.camera for photo in photos}):
@@ -34,7 +34,7 @@ def ground_below(photos: Sequence[Photo], world_from_ego: Array) -> float | None
         pairs += pairwise(mine)
     likeness = np.zeros(len(HEIGHTS_M))
     for k, height in enumerate(HEIGHTS_M):
-        points = driven_road(path, float(height), ACROSS_M)
+        points = driven_roads(world_from_ego, times_s, float(height), ACROSS_M)
         across = round(2.0 * WIDE_M / ACROSS_M) + 1
         laid = [_laid(photo, grey, points, across) for photo, grey in zip(photos, greys)]
         found = [_correlations(*laid[a], *laid[b]) for a, b in pairs]

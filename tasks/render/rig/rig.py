@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from tasks.world.arrays import Array, Ints
 from tasks.world.camera import Camera, SensorFile
+from tasks.world.clip import DRIVES_APART_S
 
 INSTANT_S = 0.05  # photos no further apart were taken at once, by one pose of the ego
 
@@ -116,7 +117,10 @@ def _twists(poses: Array, times: Array) -> Array:
         return np.zeros((len(times), 6))
     row = np.searchsorted(stamps, times)
     before, after = np.maximum(row - 1, 0), np.minimum(row + 1, len(stamps) - 1)
+    before = np.where(stamps[row] - stamps[before] > DRIVES_APART_S / 2.0, row, before)  # of another drive
+    after = np.where(stamps[after] - stamps[row] > DRIVES_APART_S / 2.0, row, after)
     here = np.linalg.inv(at[row])
-    per_s = (stamps[after] - stamps[before])[:, None]
+    between = stamps[after] - stamps[before]
+    per_s = np.where(between > 0.0, between, 1.0)[:, None]  # alone in its drive: not known to move
     moved = twists_of(here @ at[after]) - twists_of(here @ at[before])
     return np.asarray(moved / per_s)

@@ -29,6 +29,7 @@ from tasks.render.splatting.raster import gather, shade, splat
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import F32, Array, Bools
 from tasks.world.camera import Pinhole
+from tasks.world.clip import of_other_log
 
 MIN_NODE_DISCS = 40  # a track seen less is drawn as a plain box
 RELAXATION = 0.6
@@ -71,7 +72,10 @@ def build_asset(
 
 
 def held_out_rows(photos: Sequence[Photo], every: int) -> frozenset[int]:
-    """Indices of the photos that only measure: of each camera every `every`-th, from the middle of the first on."""
+    """Indices of the photos that only measure: of each camera every `every`-th, from the middle of the first on.
+
+    Those of other logs' drives through the place all help: what is measured is the same with and without them.
+    """
     if every == 0:
         return frozenset()
     count: dict[str, int] = {}
@@ -79,7 +83,7 @@ def held_out_rows(photos: Sequence[Photo], every: int) -> frozenset[int]:
     for i, photo in enumerate(photos):
         at = count.get(photo.camera, 0)
         count[photo.camera] = at + 1
-        if at % every == every // 2:
+        if at % every == every // 2 and not of_other_log(photo.camera):
             out.add(i)
     return frozenset(out)
 

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from tasks.render.scene.stereo import FAR_M
 from tasks.world.arrays import F32, Array
+from tasks.world.clip import DRIVES_APART_S
 
 SPACING_M = 0.2  # of the points
 WIDE_M = 3.0  # to either side: nothing else stood where the ego drove
@@ -40,6 +41,16 @@ def driven_road(world_from_ego: Array, ground_m: float, spacing_m: float = SPACI
         middle = pose[:3, 3] + ground_m * pose[:3, 2] + along[:, None] * way
         parts.append((middle[:, None] + across[:, None] * pose[:3, 1]).reshape(-1, 3))
     return np.concatenate(parts)
+
+
+def driven_roads(world_from_ego: Array, times_s: Array, ground_m: float, spacing_m: float = SPACING_M) -> Array:
+    """Points (M, 3) of the road under the drives through a block: poses (F, 4, 4) at times (F,) [s], in any order.
+
+    What is `DRIVES_APART_S` apart on the block's clock are two drives, and between them is no road.
+    """
+    order = np.argsort(times_s, kind="stable")
+    ends = np.flatnonzero(np.diff(times_s[order]) > DRIVES_APART_S / 2.0) + 1
+    return np.concatenate([driven_road(world_from_ego[d], ground_m, spacing_m) for d in np.split(order, ends)])
 
 
 def road_depth(road: Array, eye: Array, rays: Array) -> F32:

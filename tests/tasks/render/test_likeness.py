@@ -10,10 +10,13 @@ from numpy.typing import NDArray
 from tasks.render.gate import GateSettings, unfit
 from tasks.render.likeness import (
     FADING,
+    LEAST_HELD_OUT,
+    OTHERS_WAY,
     Album,
     Sightings,
     expected,
     eye_in_box,
+    fading_of,
     large_vehicles,
     likeness_to_photo,
     outline_of,
@@ -127,6 +130,46 @@ def test_likeness_fades_with_the_way_from_the_nearest_photo() -> None:
     assert expected(album, "car", np.array([-10.0, 0.0, 0.0])) == pytest.approx(0.9)
     assert expected(album, "car", np.array([-8.0, 0.0, 0.0])) == pytest.approx(0.9 * np.exp(-FADING * 2.0 / 8.0))
     assert expected(album, "car", np.array([0.0, 4.0, 0.0])) == pytest.approx(0.5 * np.exp(-FADING * 1.0 / 4.0))
+
+
+def looks(n: int, of: str) -> dict[str, Sightings]:
+    """n tracks that two photos show, 10 m away and, held out (rows from 100 on), 8 m: a quarter of the way there."""
+    eyes = np.array([[-10.0, 0.0, 0.0], [-8.0, 0.0, 0.0]])
+    return {f"{of}{k}": Sightings(np.array([0, 100 + k]), eyes) for k in range(n)}
+
+
+def test_fading_is_what_photos_held_out_lose_by_the_way_to_the_nearest_other() -> None:
+    poor, fine = looks(LEAST_HELD_OUT, "poor"), looks(LEAST_HELD_OUT, "fine")
+    alike = {"poor": 0.9 * np.exp(-1.5 * 0.25), "fine": 0.9}
+
+    def likeness(track_id: str, row: int) -> float:
+        return 0.9 if row < 100 else float(alike[track_id[:4]])
+
+    held_out = range(100, 200)
+    found = fading_of(poor, likeness, held_out)
+    assert found == pytest.approx(dict.fromkeys(poor, 1.5))
+    # Half of them lose nothing: each is between itself and what all lose, 0.75, which weighs as much as OTHERS_WAY.
+    both = fading_of(
+        {**poor, **fine, "unseen": Sightings(np.array([0]), np.array([[-9.0, 0.0, 0.0]]))}, likeness, held_out
+    )
+    assert both["poor0"] == pytest.approx((1.5 * 0.25 + 0.75 * OTHERS_WAY) / (0.25 + OTHERS_WAY))
+    assert both["fine3"] == pytest.approx(0.75 * OTHERS_WAY / (0.25 + OTHERS_WAY))
+    assert both["unseen"] == pytest.approx(0.75)
+    assert fading_of(fine, likeness, held_out) == pytest.approx(dict.fromkeys(fine, FADING))
+
+
+def test_too_few_or_too_near_looks_say_nothing_of_fading() -> None:
+    few = looks(LEAST_HELD_OUT - 1, "poor")
+    assert fading_of(few, lambda _track, row: 0.9 if row < 100 else 0.1, range(100, 200)) == {}
+    near = {name: replace(mine, eyes=mine.eyes * [[1.0], [1.2]]) for name, mine in looks(40, "poor").items()}
+    assert fading_of(near, lambda _track, row: 0.9 if row < 100 else 0.1, range(100, 200)) == {}
+    assert fading_of(looks(40, "poor"), lambda _track, row: 0.9 if row < 100 else 0.1, ()) == {}
+
+
+def test_a_vehicle_is_expected_to_fade_as_its_album_says() -> None:
+    seen = Sightings(np.array([7]), np.array([[-10.0, 0.0, 0.0]]))
+    album = Album({"car": seen}, lambda _track, _row: 0.9, lambda: {"car": 1.1})
+    assert expected(album, "car", np.array([-8.0, 0.0, 0.0])) == pytest.approx(0.9 * np.exp(-1.1 * 2.0 / 8.0))
 
 
 def test_an_eye_in_box_coordinates_stays_where_both_move_and_turn() -> None:

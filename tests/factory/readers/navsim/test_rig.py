@@ -231,3 +231,15 @@ def test_a_segment_shorter_than_its_own_length_is_no_jpeg(tmp_path: Path, length
     (tmp_path / "a.jpg").write_bytes(b"\xff\xd8\xff\xe0" + length.to_bytes(2) + bytes(50))
     with pytest.raises(BadClip, match="cut off"):
         jpeg_size(tmp_path / "a.jpg")
+
+
+def test_a_block_takes_in_another_log_of_the_same_place(written: Path) -> None:
+    alone, reader = read(reader_of(written)), reader_of(written, traversals=1)
+    clip = read(reader)
+    (ref,) = (ref for ref in reader.index().refs if ref.log_id == NAME)
+    assert clip.content_digest == reader.digest(ref) != alone.content_digest
+    block, own = block_of(clip), block_of(alone)
+    assert [f.sensor for f in block.images[len(own.images) :]] == [f"{OTHER}/{f.sensor}" for f in own.images]
+    assert {camera.name for camera in block.other_cameras} == {f"{OTHER}/{name}" for name in CAMERA_NAMES}
+    assert [c.name for c in clip.cameras] == [c.name for c in alone.cameras]
+    assert min(f.time_s for f in block.images[len(own.images) :]) > block.own_s

@@ -41,6 +41,8 @@ def table(n: int, **other: np.ndarray) -> FrameTable:
             annotated=np.ones(n, bool),
             speeds=np.full(n, 8.0, np.float32),
             locations=np.full(n, "us-ma-boston"),
+            x_m=4.0 * np.arange(n),
+            y_m=np.zeros(n),
         ),
         **other,
     )
