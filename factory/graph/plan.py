@@ -1,10 +1,10 @@
 """What a run has to do: for every clip, what the tables already know about its walks, and whether anything is left."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 
-from factory.graph.walk import Exhausted, Step, Try, next_step
+from factory.graph.walk import Complete, Exhausted, Step, Try, candidate_order, next_step
 from factory.graph.work import HUMAN_CANDIDATE
 from factory.readers.base import ClipRef
 from factory.store.candidates import Listed
@@ -91,6 +91,8 @@ def make_plan(
     frozen: list[ClipRef] = []
     found = 0
     others = history.clips_of({*history.experts} - {"", *experts})
+    whole_clips = history.clips_of([""])
+    ended = {expert: history.complete(expert, *_asked(once(expert), rounds)) for expert in experts}
     for ref in refs:
         stored = listed = history.candidates.get(ref.clip_id)
         if stored is not None and _of_other_settings(stored, identity):
@@ -100,6 +102,11 @@ def make_plan(
             stored = listed = None
         if stored is not None and UNLISTED == stored.prepare_digest != identity.prepare_digest:
             listed = None  # its drive is stored, its candidates are to be found
+        if listed is not None and ref.clip_id not in whole_clips and all(ref.clip_id in ended[e] for e in experts):
+            found += sum(ended[expert][ref.clip_id][1] for expert in experts)
+            n_samples = {expert: ended[expert][ref.clip_id][0] for expert in experts}
+            done.append(_complete(history, ref, listed, n_samples, once))
+            continue
         walks = tuple(_walk(history, ref.clip_id, expert, on_change, once(expert)) for expert in experts)
         whole = _walk(history, ref.clip_id, "", on_change, True)
         stays = on_change != "redo" or any(walk.known and not walk.stale for walk in walks) or ref.clip_id in others
@@ -120,6 +127,23 @@ def make_plan(
         for walk in clip.walks:
             walk.put_away()
     return RunPlan(tuple(todo), tuple(done), tuple(frozen), found)
+
+
+def _asked(once: bool, rounds: int) -> tuple[int, int]:
+    """The first candidate of a walk, and how many samples it is to have."""
+    return candidate_order(once, 1)[0], 1 if once else rounds
+
+
+def _complete(
+    history: History, ref: ClipRef, listed: Listed, n_found: Mapping[str, int], once: Callable[[str], bool]
+) -> ClipPlan:
+    """A clip of which nothing is unpacked; n_found: expert -> samples."""
+    walks = tuple(
+        WalkState(expert, once(expert), partial(history.known, ref.clip_id, expert), n_found=n)
+        for expert, n in n_found.items()
+    )
+    steps: dict[str, Step] = dict.fromkeys(n_found, Complete())
+    return ClipPlan(ref, walks, None, listed, frozenset(), listed.n_candidates, listed.content_digest, steps=steps)
 
 
 def _refuse_mixing(

@@ -1,7 +1,8 @@
 """Where a store lives: a folder or an object-store URL, with the few file operations the store needs."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -12,6 +13,7 @@ from factory.job import in_submitted_job
 from factory.store.disk import whole_file
 
 REMOTE = ("s3", "gs", "abfs", "abfss", "file")  # what both Arrow and Delta write to
+LISTED_AGAIN = 3  # times, where a folder vanished while it was being listed
 
 
 class BadLocation(ValueError):
@@ -90,21 +92,30 @@ class Location:
 
     def names(self) -> list[str]:
         """Paths of all files below, relative to this folder, sorted."""
-        filesystem, base = self.filesystem()
-        found = filesystem.get_file_info(fs.FileSelector(base, recursive=True, allow_not_found=True))
-        return sorted(info.path[len(base) + 1 :] for info in found if info.type == fs.FileType.File)
+        return sorted(self._files())
 
     def ages_s(self, now_s: float) -> dict[str, float]:
         """Seconds since each file below, by its path relative to this folder, was last written."""
+        return {name: now_s - (info.mtime_ns or 0) / 1e9 for name, info in self._files().items()}
+
+    def _files(self) -> dict[str, fs.FileInfo]:
+        """All files below. Other processes make and remove folders there: one that is gone when Arrow, which has seen
+        its name, comes to open it is a FileNotFoundError. Then it is listed again. Raises it at the last time."""
         filesystem, base = self.filesystem()
-        found = filesystem.get_file_info(fs.FileSelector(base, recursive=True, allow_not_found=True))
-        files = (info for info in found if info.type == fs.FileType.File)
-        return {info.path[len(base) + 1 :]: now_s - (info.mtime_ns or 0) / 1e9 for info in files}
+        below = fs.FileSelector(base, recursive=True, allow_not_found=True)
+        for _ in range(LISTED_AGAIN):
+            with suppress(FileNotFoundError):
+                return _by_name(filesystem.get_file_info(below), base)
+        return _by_name(filesystem.get_file_info(below), base)
 
     def filesystem(self) -> tuple[fs.FileSystem, str]:
         if self.is_local:
             return fs.LocalFileSystem(), self.uri
         return _remote(os.getpid(), self.uri, tuple(sorted(self.options.items())))
+
+
+def _by_name(found: Iterable[fs.FileInfo], base: str) -> dict[str, fs.FileInfo]:
+    return {info.path[len(base) + 1 :]: info for info in found if info.type == fs.FileType.File}
 
 
 @lru_cache(maxsize=64)

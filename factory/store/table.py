@@ -15,11 +15,11 @@ import json
 import secrets
 import time
 from collections import Counter, deque
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import pyarrow as pa
@@ -32,7 +32,7 @@ from factory.store.commit_copies import COPIES, CommitCopies
 from factory.store.counts.codes import Bytes, packed
 from factory.store.counts.key_index import KeyIndex
 from factory.store.disk import needs_disk
-from factory.store.late_listing import until_listed
+from factory.store.late_listing import broke_off, listed, until_listed
 from factory.store.location import Location
 from factory.store.parquet_file import Shard, TableSpec, encoded_text, read_parquet, with_partition, write_shard
 from factory.wording import one_line
@@ -78,8 +78,12 @@ class KeyedTable:
         self._delta: DeltaTable | None = None
         self._facts: tuple[int, dict[str, LiveFile]] = (-1, {})  # of a version
         with self._log_naming():
-            if DeltaTable.is_deltatable(location.uri, storage_options=dict(location.options)):
-                self._delta = DeltaTable(location.uri, storage_options=dict(location.options))
+            self._delta = listed(self._opened)
+
+    def _opened(self) -> DeltaTable | None:
+        options = dict(self.location.options)
+        is_there = DeltaTable.is_deltatable(self.location.uri, storage_options=options)
+        return DeltaTable(self.location.uri, storage_options=options) if is_there else None
 
     @contextmanager
     def _log_naming(self) -> Iterator[None]:
@@ -154,9 +158,9 @@ class KeyedTable:
     def refresh(self) -> None:
         """For a reader: see what was committed since the table was opened or last refreshed."""
         if self._delta is not None:
-            self._delta.update_incremental()
-        elif DeltaTable.is_deltatable(self.location.uri, storage_options=dict(self.location.options)):
-            self._delta = DeltaTable(self.location.uri, storage_options=dict(self.location.options))
+            listed(self._delta.update_incremental)
+        else:
+            self._delta = listed(self._opened)
         self.__dict__.pop("_index", None)
 
     def files(self, columns: Sequence[str] | None = None) -> Iterable[tuple[str, pa.Table]]:
@@ -296,10 +300,8 @@ class KeyedTable:
     def set_property(self, name: str, value: str) -> None:
         """One more commit, of metadata. Raises AnotherWriter."""
         table = self._delta if self._delta is not None else self._create()
-        with self._committing(table, 1):
-            table.alter.set_table_properties(
-                {name: value}, raise_if_not_exists=False, commit_properties=self._properties()
-            )
+        change = partial(table.alter.set_table_properties, {name: value}, raise_if_not_exists=False)
+        self._commit(table, 1, lambda: change(commit_properties=self._properties()))
 
     def _without(self, path: str, partition: Mapping[str, str], dropped: set[str]) -> Shard | None:
         rows = self.read_file(path, partition)
@@ -312,14 +314,17 @@ class KeyedTable:
         said = [Transaction(APP_ID, (table.transaction_version(APP_ID) or 0) + 1)]
         if epoch is not None:
             said.append(Transaction(EPOCH_ID, epoch))
-        with self._committing(table, 1 + len(actions)):
-            table.create_write_transaction(
+        self._commit(
+            table,
+            1 + len(actions),
+            lambda: table.create_write_transaction(
                 actions,
                 mode="append",
                 schema=self.spec.schema,
                 partition_by=list(self.spec.partition_by),
                 commit_properties=self._properties(*said),
-            )
+            ),
+        )
 
     def _lost(self) -> AnotherWriter:
         return AnotherWriter(f"{self.spec.name}: another run has taken over {self.location.uri}")
@@ -327,21 +332,27 @@ class KeyedTable:
     def _properties(self, *transactions: Transaction) -> CommitProperties:
         return CommitProperties({"writer": self._token}, max_commit_retries=0, app_transactions=list(transactions))
 
-    @contextmanager
-    def _committing(self, table: DeltaTable, n_actions: int) -> Iterator[None]:
-        """Around one commit: it is ours and the newest, and has its copy. Raises AnotherWriter.
+    def _commit(self, table: DeltaTable, n_actions: int, commit: Callable[[], object]) -> None:
+        """Make one commit: it is ours and the newest, and has its copy. Raises AnotherWriter.
 
-        A client whose answer got lost asks again, and is told that somebody was faster: the log says who it was.
+        A client whose answer got lost asks again, and is told that somebody was faster: the log says who it was. It
+        does so too where a listing broke off, which may have been before the commit or after it.
         """
         version = table.version() + 1
-        try:
-            with needs_disk(f"{self.location.uri}/_delta_log", ACTION_BYTES * n_actions):
-                yield
-        except DeltaError as error:
-            if not self.copies.log_has(version, self._token):
-                if not isinstance(error, CommitFailedError):
-                    raise
-                raise self._lost() from error
+
+        def once() -> None:
+            try:
+                with needs_disk(f"{self.location.uri}/_delta_log", ACTION_BYTES * n_actions):
+                    commit()
+            except (DeltaError, OSError) as error:
+                may_be_made = isinstance(error, DeltaError) or broke_off(error)
+                if may_be_made and self.copies.log_has(version, self._token):
+                    return
+                if isinstance(error, CommitFailedError):
+                    raise self._lost() from error
+                raise
+
+        listed(once)
         self._see(table, version)
         if self.version != version:
             raise self._lost()
@@ -351,7 +362,7 @@ class KeyedTable:
     def _see(self, table: DeltaTable, version: int) -> None:
         def is_seen() -> bool:
             with suppress(TableNotFoundError):
-                table.update_incremental()
+                listed(table.update_incremental)
             return table.version() >= version
 
         until_listed(is_seen, f"commit {version} of {self.location.uri}")
@@ -361,17 +372,7 @@ class KeyedTable:
             if self.location.is_local:
                 Path(self.location.uri).mkdir(parents=True, exist_ok=True)
             try:
-                DeltaTable.create(
-                    self.location.uri,
-                    self.spec.schema,
-                    mode="ignore",
-                    partition_by=list(self.spec.partition_by),
-                    name=self.spec.name,
-                    configuration=self.spec.properties,
-                    raise_if_key_not_exists=False,
-                    commit_properties=CommitProperties(max_commit_retries=0),  # else it is made a second time
-                    storage_options=dict(self.location.options),
-                )
+                listed(self._create_once)
             except DeltaError:
                 if not self.copies.log_has(0):
                     raise
@@ -383,3 +384,17 @@ class KeyedTable:
         until_listed(is_seen, f"the first commit of {self.location.uri}")
         assert self._delta is not None
         return self._delta
+
+    def _create_once(self) -> None:
+        """Where it is there already, by another run or by ourselves, it stays as it is."""
+        DeltaTable.create(
+            self.location.uri,
+            self.spec.schema,
+            mode="ignore",
+            partition_by=list(self.spec.partition_by),
+            name=self.spec.name,
+            configuration=self.spec.properties,
+            raise_if_key_not_exists=False,
+            commit_properties=CommitProperties(max_commit_retries=0),  # else it is made a second time
+            storage_options=dict(self.location.options),
+        )

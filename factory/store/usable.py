@@ -84,12 +84,13 @@ def main(arguments: list[str]) -> int:
     from deltalake.exceptions import DeltaError
     from pyarrow import ArrowException
 
+    from factory.store.late_listing import listed
     from factory.store.location import BadLocation, Location
 
     try:
         location = Location.parse(arguments[0])
         name = f".trial-{secrets.token_hex(8)}"
-        DeltaTable.is_deltatable(location.child("samples").uri)
+        listed(lambda: DeltaTable.is_deltatable(location.child("samples").uri))
         location.write(name, b"")
         location.remove(name)
     except (OSError, ValueError, ArrowException, DeltaError, BadLocation) as error:

@@ -90,10 +90,12 @@ def spread(rows: Iterable[T], keys: Callable[[T], Sequence[Hashable]], order: Ca
 
 def few_of_each(rows: pa.Table, first: str) -> list[dict[str, Any]]:
     """All that `spread` looks at of rows with attempt_ids as their order and a column as its first key."""
-    values = counted(rows[first])
-    parts = (rows.filter(pa.array(equals(rows[first], value))) for value in values)
-    by_id = [("attempt_id", "ascending")]
-    return [row for part in parts for row in part.take(pc.select_k_unstable(part, PER_VALUE, by_id)).to_pylist()]
+    ids, found = rows.select(["attempt_id"]), list[dict[str, Any]]()
+    for value in counted(rows[first]):
+        places = np.flatnonzero(equals(rows[first], value))
+        few = pc.select_k_unstable(ids.take(places), PER_VALUE, [("attempt_id", "ascending")])
+        found += rows.take(places[few.to_numpy()]).to_pylist()
+    return found
 
 
 def rejected_rows(store: Store) -> list[dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""A fault at every step of a run's commits: `python -m tests.chaos.commit_steps [EVERY]` prints a table.
+"""A fault at every step of a run's commits: `python -m tests.chaos.commit_steps [EVERY] [ROW ...]` prints a table.
 
 A step is a call that makes, fills, flushes, renames, links or removes a file or folder under `out`, be it Python's,
 Arrow's or delta-rs's (tests.chaos.file_steps). At each of them (or one in EVERY) a run is killed, or the call fails
@@ -10,7 +10,8 @@ with EIO, or, of writes, half of the bytes are written and then it is killed. Af
 - the same command again is complete, and its store is that of the undisturbed run.
 
 Two runs: one on a new folder; one that makes one clip of two again, with other settings (on_change=redo), which
-rewrites files without the rows that it replaces, where the logs are about to get their checkpoints.
+rewrites files without the rows that it replaces, where the logs are about to get their checkpoints. ROW is a part of
+what a row is called, as "checkpoints, refused": only such rows are made.
 """
 
 import hashlib
@@ -210,15 +211,18 @@ def _seen(golden: Undisturbed, met: Sequence[Step], out: Path, code: int) -> str
     return "went on"
 
 
-def main(every: int = 1, runs: Sequence[Run] = RUNS) -> int:
-    """Print the table; the number of findings."""
+def main(every: int = 1, *rows: str) -> int:
+    """Print the table, or some rows of it; the number of findings."""
     findings = 0
     print("| run | fault | steps | old | new | went on | anything else |\n|---|---|---|---|---|---|---|", flush=True)
     with tempfile.TemporaryDirectory() as name, stepping(Path(name), __name__) as stepped:
-        for place, run in enumerate(runs):
+        for place, run in enumerate(RUNS):
+            faults = [fault for fault in FAULTS if not rows or any(row in f"{run.name}, {fault}" for row in rows)]
+            if not faults:
+                continue
             (folder := Path(name) / str(place)).mkdir()
             golden = undisturbed(run, folder, stepped)
-            for fault in FAULTS:
+            for fault in faults:
                 found = Findings(FINE)
                 for step in golden.steps[::every]:
                     if fault.startswith("half") and (step.call != "write" or step.n_bytes < 2):
@@ -233,4 +237,4 @@ def main(every: int = 1, runs: Sequence[Run] = RUNS) -> int:
 if __name__ == "__main__":
     from tests.chaos.commit_steps import main  # so that another process can import what it runs
 
-    sys.exit(bool(main(*map(int, sys.argv[1:]))))
+    sys.exit(bool(main(*map(int, sys.argv[1:2]), *sys.argv[2:])))

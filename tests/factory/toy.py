@@ -215,6 +215,14 @@ class ColdWork(ToyWork):
 
 
 @dataclass(frozen=True)
+class DyingWork(ToyWork):
+    """Where its kernels are to be compiled the process dies."""
+
+    def warm(self, draws: bool = True) -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+@dataclass(frozen=True)
 class TakesItsNodeAway(ToyWork):
     """Where its kernels are to be compiled on one node of a Ray cluster, that node dies."""
 

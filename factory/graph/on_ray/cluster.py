@@ -18,13 +18,14 @@ from ray.autoscaler.sdk import request_resources
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from factory.graph.local import ClusterDied, ClusterLacks
-from factory.store.disk import existing
+from factory.store.disk import DiskFull, existing
 from factory.store.location import BadLocation, Location
 from factory.wording import one_line
 
 VITAL = ("raylet", "gcs_server")
 PROBE_SECONDS = 120.0
 ANSWER_S = 10.0  # for a cluster's port to be reached
+OWN_BYTES = 2**20  # of files of a cluster of our own, before it does anything: less, and another will not begin either
 GPU_WAIT_S = 900.0  # for the first node with one to come
 WORKER_ENV = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 FORWARDED_ENV = ("NUMBA_CACHE_DIR",)
@@ -39,7 +40,8 @@ def connect(workers: int | None, address: str | None) -> bool:
     """Join the cluster of `address` or RAY_ADDRESS, else start one in this machine (then True).
 
     Raises ConnectionError where nothing answers there; where nothing listens at once: Ray itself tries for minutes.
-    Raises ClusterDied where one of our own does not come up.
+    Raises ClusterDied where one of our own does not come up, DiskFull where there is no space for its files: another
+    would wait half a minute in vain, as this one did.
     """
     named = address or os.environ.get("RAY_ADDRESS", "")
     environment = WORKER_ENV | {name: os.environ[name] for name in FORWARDED_ENV if name in os.environ}
@@ -59,9 +61,11 @@ def connect(workers: int | None, address: str | None) -> bool:
     except Exception as error:  # Ray has none of its own for what keeps it from beginning
         if where == "local":
             ray.shutdown()
-            raise ClusterDied(
-                f"Ray did not begin on this machine ({one_line(error)}); {_files_of_ray()}", True
-            ) from error
+            folder, free = _files_of_ray()
+            said = f"Ray did not begin on this machine ({one_line(error)}); its files lie in {folder}"
+            if free < OWN_BYTES:
+                raise DiskFull(f"{said}: the disk is full, {free:,} bytes are free") from error
+            raise ClusterDied(f"{said}, where {free:,} bytes are free", True) from error
         if not isinstance(error, ConnectionError):
             raise
         said = f"no Ray cluster answers at RAY_ADDRESS={named} ({one_line(error)})"
@@ -69,10 +73,10 @@ def connect(workers: int | None, address: str | None) -> bool:
     return where == "local"
 
 
-def _files_of_ray() -> str:
-    """Where a cluster of our own has its files, and the space that is left there: what keeps it from beginning."""
+def _files_of_ray() -> tuple[str, int]:
+    """Where a cluster of our own has its files, and the bytes that are free there."""
     folder = os.environ.get("RAY_TMPDIR") or os.environ.get("TMPDIR") or tempfile.gettempdir()
-    return f"its files lie in {folder}, where {shutil.disk_usage(existing(Path(folder))).free:,} bytes are free"
+    return folder, shutil.disk_usage(existing(Path(folder))).free
 
 
 def tasks_at_once(workers: int | None, is_ours: bool) -> int:

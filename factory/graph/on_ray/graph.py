@@ -25,6 +25,7 @@ from factory.graph.local import (
     Claims,
     ClusterDied,
     Fuse,
+    MachineIll,
     Ticket,
     attempt_tasks,
     cores_of,
@@ -105,8 +106,9 @@ class RayGraph:
 
         More workers than a cluster has CPUs now are what makes one grow that can. A cluster without a GPU is asked for
         one where tasks claim it, and waited for; memory is claimed up to what the largest node has.
-        Raises BadLocation when some node does not see `out`, ClusterLacks when no GPU comes, NotReady when a node
-        cannot do its part, ClusterDied when a cluster of our own does not come up or dies meanwhile.
+        Raises BadLocation when some node does not see `out`, ClusterLacks when no GPU comes, NotReady or MachineIll
+        when a node cannot do its part, ClusterDied when a cluster of our own does not come up or dies meanwhile, and
+        DiskFull when there is no space for it.
         """
         self._connected = not ray.is_initialized()
         self._is_ours = self._connected and connect(workers, address)
@@ -152,7 +154,7 @@ class RayGraph:
             except RayError as error:
                 if node not in nodes_of_cluster():
                     continue  # it has left the cluster: no task goes there
-                raise NotReady(f"node {node} could not get its kernels ready: {one_line(error)}") from error
+                raise _unready(error, f"node {node} could not get its kernels ready: {one_line(error)}") from error
             if isinstance(answer, Failure):
                 raise unready(answer)
 
@@ -246,6 +248,12 @@ def _kind_of(error: RayError) -> ErrorKind:
     """A worker that died may have died of its clip; a node, its memory or its object store are the machine's."""
     ill = isinstance(error, ILL) or why_ill(error.cause if isinstance(error, RayTaskError) else error)
     return ErrorKind.MACHINE if ill else ErrorKind.SYSTEM
+
+
+def _unready(error: RayError, said: str) -> Exception:
+    """Where a task that gets kernels ready did not end: its code is to blame, else Ray or the machine."""
+    is_of_code = isinstance(error, RayTaskError) and _kind_of(error) is not ErrorKind.MACHINE
+    return NotReady(said) if is_of_code else MachineIll(said)
 
 
 @dataclass(frozen=True)

@@ -52,8 +52,9 @@ def write_one(town: TownFolder, settings: TownSettings) -> None:
 def write_all(towns: Sequence[TownFolder], settings: TownSettings) -> None:
     """Writes the towns that are missing, as many at once as there are cores; how far it is goes to stderr.
 
-    Raises RuntimeError where a town could not be written: what its process said stands on stderr, and the towns that
-    others were writing are given up. Interrupted, it leaves whole towns and nothing else.
+    Raises what a process was refused a file with, a full disk say, as if the town had been written here; RuntimeError
+    where it ended otherwise, with what it said on stderr. The towns that others were writing are given up then.
+    Interrupted, it leaves whole towns and nothing else.
     """
     missing = [town for town in towns if not town.root.is_dir()]
     at_once = min(len(missing), os.cpu_count() or 1, MOST_PAINTERS) if settings.cameras or settings.lidar_beams else 1
@@ -81,6 +82,8 @@ def write_all(towns: Sequence[TownFolder], settings: TownSettings) -> None:
                 painting[_painter(town, begun[-1], settings, lifeline)] = town
             for child in [child for child in painting if child.poll() is not None]:
                 town = painting.pop(child)
+                if refused := _refused(child):
+                    raise refused
                 if child.returncode != 0:
                     ended = f"its process ended with exit {child.returncode} and said above why"
                     raise RuntimeError(
@@ -94,7 +97,7 @@ def write_all(towns: Sequence[TownFolder], settings: TownSettings) -> None:
         for child in painting:
             child.kill()
         for child in painting:
-            child.wait()
+            child.communicate()
         for folder in begun:
             shutil.rmtree(folder, ignore_errors=True)  # where its town is whole, it is gone
 
@@ -102,15 +105,27 @@ def write_all(towns: Sequence[TownFolder], settings: TownSettings) -> None:
 def _painter(town: TownFolder, unfinished: Path, settings: TownSettings, lifeline: int) -> "subprocess.Popen[bytes]":
     told = {"seed": town.seed, "indices": town.indices, "root": str(town.root), "settings": asdict(settings)}
     command = [sys.executable, "-m", __name__, json.dumps(told | {"unfinished": str(unfinished)})]
-    return subprocess.Popen(command, stdin=lifeline)  # noqa: S603 - a list, no shell
+    return subprocess.Popen(command, stdin=lifeline, stdout=subprocess.PIPE)  # noqa: S603 - a list, no shell
+
+
+def _refused(ended: "subprocess.Popen[bytes]") -> OSError | None:
+    """What a painter that ended was refused, as it told."""
+    told, _ = ended.communicate()
+    return OSError(*json.loads(told)) if told else None
 
 
 def main(told: str) -> None:
-    """A painter's process: one town, on one core."""
+    """A painter's process: one town, on one core. Tells on standard output what it is refused."""
     threading.Thread(target=_end_with_input, daemon=True).start()
     town = json.loads(told)
     arguments = town["indices"], town["seed"], TownSettings(**town["settings"])
-    finish_whole(Path(town["unfinished"]), Path(town["root"]), lambda folder: write_logs(folder, *arguments, threads=1))
+    unfinished, root = Path(town["unfinished"]), Path(town["root"])
+    try:
+        finish_whole(unfinished, root, lambda folder: write_logs(folder, *arguments, threads=1))
+    except OSError as error:
+        if error.errno is None:
+            raise
+        print(json.dumps([error.errno, error.strerror, os.fspath(error.filename)]))
 
 
 def _end_with_input() -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from factory.store.counts.codes import Codes, Ints, codes, distinct
+from factory.store.counts.codes import Codes, Ints, codes, combinations
 from factory.store.outcomes import Kind
 from factory.store.samples import MADE_UNDER, run_number
 from tasks.stages import ATTEMPT, TASKS
@@ -60,11 +60,12 @@ class Attempts:
         return np.flatnonzero(new)
 
     @cached_property
-    def round(self) -> Ints:
+    def round(self) -> Codes:
         """That each attempt was tried for: the accepted ones before it in its walk."""
-        before: Ints = np.cumsum(self.accepted) - self.accepted
-        lengths = np.diff(self.starts, append=len(before))
-        return before - np.repeat(before[self.starts], lengths)
+        before: Codes = np.cumsum(self.accepted, dtype=np.int32)
+        before -= self.accepted
+        before -= np.repeat(before[self.starts], np.diff(self.starts, append=len(before)))
+        return before
 
 
 def attempts_of(samples: pa.Table, outcomes: pa.Table, runs: Sequence[Mapping[str, Any]]) -> Attempts:
@@ -79,20 +80,39 @@ def attempts_of(samples: pa.Table, outcomes: pa.Table, runs: Sequence[Mapping[st
     task = np.concatenate([task, np.full(samples.num_rows, len(ATTEMPT), np.int32)])
     age = 2 * (_ages(rows, runs) + 1)  # -1: of no record
     age[n_outcomes:] += 1
-    place = expert.astype(np.int64)
-    for size, number in ((len(clip_ids), clip), (int(candidate.max(initial=-1)) + 2, candidate + 1), (n_ages, age)):
+    sizes = len(clip_ids), int(candidate.max(initial=-1)) + 2, n_ages
+    newest = _last_of_each(_ordered(expert, list(zip(sizes, (clip, candidate + 1, age)))), n_ages)
+    columns = [clip, expert, candidate, why, task]
+    del clip, expert, candidate, why, task, age  # of millions of rows each as a whole and as it is kept, in turn
+    kept = [columns.pop(0)[newest] for _ in range(len(columns))]
+    return Attempts(clip_ids, experts, whys, *kept)
+
+
+def _ordered(first: Codes, then: Sequence[tuple[int, Codes]]) -> Ints:
+    """A number for each row, in the order of several columns; then: with how many values each."""
+    place = first.astype(np.int64)
+    for size, number in then:
         place *= size
         place += number
-    order = np.argsort(place, kind="stable")  # of rows alike the last counts
-    newest = order[np.diff(place[order] // n_ages, append=-1) != 0]
-    return Attempts(clip_ids, experts, whys, clip[newest], expert[newest], candidate[newest], why[newest], task[newest])
+    return place
+
+
+def _last_of_each(place: Ints, n_ages: int) -> Ints:
+    """Of places that differ in their age alone, which counts in ones, the row of the last; of rows alike the last.
+
+    The places are written over.
+    """
+    order = np.argsort(place, kind="stable")
+    place[:] = place[order]
+    place //= n_ages
+    is_last = np.ones(len(place), bool)
+    np.not_equal(place[1:], place[:-1], out=is_last[:-1])
+    return order[is_last]
 
 
 def _whys(outcomes: pa.Table) -> tuple[Codes, tuple[str, ...], Codes]:
     """What became of the rows of `outcomes`, in words, of which the first is for samples; the tasks they ended in."""
-    columns = [codes(outcomes[name]) for name in ("kind", "stage", "reason", "error_kind")]
-    rows, at = distinct([numbers for numbers, _ in columns])
-    found = [[texts[number] for number, (_, texts) in zip(row, columns)] for row in rows.tolist()]
+    found, at = combinations(outcomes, ("kind", "stage", "reason", "error_kind"))
     words = [_why(*row) for row in found]
     known = list(dict.fromkeys([ACCEPTED, EXHAUSTED, *words]))
     tasks = np.array([_task(stage) for _, stage, _, _ in found], np.int32)
@@ -113,8 +133,7 @@ def _why(kind: str, stage: str, reason: str, error_kind: str) -> str:
 def _ages(rows: pa.Table, runs: Sequence[Mapping[str, Any]]) -> Codes:
     """The number of the run that each row is of (factory.store.samples.run_number)."""
     names = [name for name in MADE_UNDER if name != "attempt_id"]
-    columns = [codes(rows[name]) for name in names]
-    different, at = distinct([numbers for numbers, _ in columns])
+    found, at = combinations(rows, names)
     number = run_number(runs)
-    made = [{n: texts[i] for n, i, (_, texts) in zip(names, row, columns)} for row in different.tolist()]
+    made = [dict(zip(names, texts)) for texts in found]
     return np.array([number(row) for row in made], np.int32)[at]

@@ -68,9 +68,23 @@ def _encoded(parts: Sequence[pa.Table], key: str) -> pa.Table:
     return rows.combine_chunks()
 
 
-def distinct(columns: Sequence[Ints | Codes]) -> tuple[Ints, Codes]:
+def combinations(rows: pa.Table, names: Sequence[str]) -> tuple[list[tuple[str, ...]], Codes]:
+    """The different combinations of texts that some columns have, and which of them each row has."""
+    texts: list[tuple[str, ...]] = []
+
+    def one_by_one() -> Iterator[Codes]:  # of millions of rows a column's numbers take their place in memory
+        for name in names:
+            numbers, different = codes(rows[name])
+            texts.append(different)
+            yield numbers
+
+    found, at = distinct(one_by_one())
+    return [tuple(words[i] for i, words in zip(row, texts)) for row in found.tolist()], at
+
+
+def distinct(columns: Iterable[Ints | Codes]) -> tuple[Ints, Codes]:
     """The different rows (D, columns) in order, and which of them each row is; of columns of few different numbers."""
-    rows, at = np.zeros((1, 0), np.int64), np.zeros(len(columns[0]), np.int32)
+    rows, at = np.zeros((1, 0), np.int64), np.zeros(1, np.int32)
     for numbers in columns:
         width = int(numbers.max(initial=0)) + 1
         at = at * np.int32(width) + numbers.astype(np.int32, copy=False)

@@ -80,6 +80,34 @@ class History:
         clips = set(np.unique(walks[np.isin(walks % max(1, len(self.experts)), numbers)] // max(1, len(self.experts))))
         return {clip_id for clip_id, number in self.clip_ids.items() if number in clips}
 
+    def complete(self, expert: str, first: int, wanted: int) -> dict[str, tuple[int, int]]:
+        """clip_id -> samples, attempts of those walks of an expert that show at once that they have all they should.
+
+        All their rows are current and none failed; candidates are `first`, first + 1 and so on, one row each, and the
+        accepted ones stand in rounds 0, 1 and so on, to `wanted` of them at least.
+        """
+        if expert not in self.experts:
+            return {}
+        walks = np.arange(self.experts.index(expert), len(self.starts) - 1, len(self.experts))
+        lengths = self.starts[walks + 1] - self.starts[walks]
+        starts = np.cumsum(lengths) - lengths  # of walks among the expert's own rows
+        walk, ordinal = np.repeat(np.arange(len(walks)), lengths), np.arange(lengths.sum()) - np.repeat(starts, lengths)
+        rows = np.repeat(self.starts[walks], lengths) + ordinal
+        rows = rows[np.lexsort((self.candidate[rows], walk))]
+        became, kinds = self.became[rows], [fate[0] for fate in self.fates]
+        accepted = np.array([kind is Kind.ACCEPTED for kind in kinds])[became]
+        settled = np.array([kind in (Kind.ACCEPTED, Kind.REJECTED) for kind in kinds])[became]
+        number = np.array([fate[1] for fate in self.fates])[became]
+        made = np.cumsum(accepted)
+        before = made - accepted - np.repeat((made - accepted)[starts[lengths > 0]], lengths[lengths > 0])
+        in_order = (self.candidate[rows] == first + ordinal) & (~accepted | (number == before))
+        broken = np.bincount(walk[~(settled & in_order & self.current[rows])], minlength=len(walks))
+        samples = np.bincount(walk[accepted], minlength=len(walks))
+        clip_ids = list(self.clip_ids)
+        which = np.flatnonzero((broken == 0) & (samples >= wanted))
+        found = zip(which.tolist(), samples[which].tolist(), lengths[which].tolist())
+        return {clip_ids[clip]: (n_samples, n) for clip, n_samples, n in found}
+
     def _rows(self, clip_id: str, expert: str) -> slice:
         clip = self.clip_ids.get(clip_id)
         if clip is None or expert not in self.experts:

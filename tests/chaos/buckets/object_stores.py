@@ -32,6 +32,7 @@ TROUBLES: Mapping[str, Callable[[], Fault]] = {
     "late answers, 2 s, to 20 requests": lambda: Fault(What.LATE, first=40, times=20, seconds=2.0),
     "a commit's answer, 40 s late": lambda: Fault(What.LATE, "PUT", COMMIT, first=3, times=1, seconds=40.0),
     "half an answer, five times": lambda: Fault(What.TORN, "GET", first=20, times=5),
+    "half listings, five times": lambda: Fault(What.TORN, "GET", "list-type=2&prefix|start-after", first=30, times=5),
     "half answers from then on": lambda: Fault(What.TORN, "GET", first=70),
     "credentials expire early": lambda: Fault(What.EXPIRED, first=60),
     "credentials expire at a shard": lambda: Fault(What.EXPIRED, first=177),

@@ -20,7 +20,7 @@ from factory.store.verify import verify
 from tasks.caches import user_cache
 from tests.chaos.full_disks import PAGE, at_level, needed
 from tests.factory.tables import assert_same_rows, assert_same_tables, tables_of
-from tests.factory.toy import COLD, ColdWork, ToyWork, refs
+from tests.factory.toy import COLD, ColdWork, DyingWork, ToyWork, refs
 
 LARGE = "64m"
 TOWN = ["clips.n_clips=3", "clips.settings.cameras=[]", "clips.settings.lidar_beams=0", "render=none"]
@@ -200,3 +200,30 @@ def test_ray_that_cannot_begin_ends_the_run_with_one_line_that_says_how_full_its
         rf"Ray did not begin on this machine \(Timed out .*\); its files lie in {tmp_path}, where [\d,]+ bytes are free"
     )
     assert re.fullmatch(f"{said}; run the same command again to go on", summary.message), summary.message
+
+
+def test_ray_without_space_for_its_files_is_not_begun_again(
+    disk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each new cluster would wait for half a minute for what it cannot write."""
+
+    def timed_out(*given: object, **options: object) -> None:
+        raise RuntimeError("Timed out waiting for file gcs_server_port")
+
+    monkeypatch.setattr("ray.init", timed_out)
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setenv("RAY_TMPDIR", str(disk))
+    resize(disk, "64k")
+    out, told = tmp_path / "out", list[str]()
+    summary = on_new_clusters(
+        lambda: execute(ToyWork(), refs(1), ["human"], 1, Store(out), "ray", say=told.append), told.append
+    )
+    assert summary.exit_code == INTERRUPTED and not out.exists() and not told
+    assert f"its files lie in {disk}: the disk is full, 65,536 bytes are free; free disk space" in summary.message
+
+
+@pytest.mark.ray
+def test_a_worker_that_dies_while_kernels_are_compiled_is_no_wrong_setting(tmp_path: Path) -> None:
+    summary = execute(DyingWork(), refs(1), ["human"], 1, Store(tmp_path / "out"), "ray", 1)
+    assert summary.exit_code == INTERRUPTED and not (tmp_path / "out" / "samples").exists()
+    assert "could not get its kernels ready" in summary.message and "run the same command again" in summary.message
