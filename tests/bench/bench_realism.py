@@ -32,6 +32,7 @@ CONSTANT_VELOCITY = "constant velocity"
 TRAFFIC: dict[str, TrafficSettings | None] = {
     CONSTANT_VELOCITY: None,
     "public IDM": TrafficSettings(mode="navsim"),
+    "IDM, yields=false": TrafficSettings(yields=False),
     "IDM": TrafficSettings(),
 }
 
