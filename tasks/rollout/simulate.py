@@ -15,6 +15,9 @@ The ego is tracked first, since it follows its plan whatever the traffic does; t
 * Pedestrians and cyclists walk their log; before a step into a driven vehicle they wait, then go on late along the
   same log. Neither they nor replayed vehicles wait for the ego: its reward must not profit from their care.
 
+* With `yields` a driver keeps the speeds and stops of its log instead of a target speed, and gives way to others, not
+  to the ego, where ways cross or merge (tasks/rollout/yielding).
+
 That is `mode=idm`. In `navsim` the traffic is the public evaluation's, to the letter (tasks/rollout/navsim).
 """
 
