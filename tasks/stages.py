@@ -38,8 +38,8 @@ PICTURE_FAULTS = ("holes", "lens_covered", "blank", "blurred", "unlike_photos") 
 
 STAGES: tuple[Stage, ...] = (
     Stage("clip", 4, "clip", ("ego_standing", "broken_tracks", "route_ended", "no_earlier_frame")),
-    Stage("perturb", 1, "clip", ("no_gated_candidate", "no_good_candidate")),
-    Stage("rollout", 2, "attempt", ("route_ended",)),
+    Stage("perturb", 2, "clip", ("no_gated_candidate", "no_good_candidate")),
+    Stage("rollout", 3, "attempt", ("route_ended",)),
     Stage("expert", 1, "attempt", ("no_plan",)),
     Stage("reward", 1, "attempt", (*SUBSCORES, *END_FAULTS)),
     Stage("render", 7, "attempt", ("psnr", *PICTURE_FAULTS)),

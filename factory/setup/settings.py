@@ -42,7 +42,7 @@ ABSENT = object()
 # Settings that came later: at what held before there was a choice they are left out, so that older tables go on.
 ADDED: dict[str, object] = {"perturb.interleaved": True, "perturb.order": "drawn", "perturb.at_most": None}
 ADDED |= {"reward.off_route": False, "reward.after": False}
-ADDED |= {"render.own_body": "", "render.jpeg_chroma": "420"}
+ADDED |= {"render.own_body": "", "render.jpeg_chroma": "420", "traffic.yields": False}
 ADDED |= {"render.camera_psnr_min": 0.0, "render.rig": dataclasses.asdict(RigSettings())}
 
 

@@ -30,7 +30,7 @@ from tasks.rollout.idm import (
 )
 from tasks.rollout.lane_index import SNAP_M
 from tasks.rollout.stretches import CorridorAhead, in_view, may_meet
-from tasks.rollout.traffic_state import ABSENT, DRIVEN, NOBODY, Roles, RolloutRows
+from tasks.rollout.traffic_state import ABSENT, DRIVEN, NOBODY, AgentStates, Roles, RolloutRows, Yielding
 from tasks.world.arrays import Array, Ints
 from tasks.world.geometry import wrapped
 
@@ -142,9 +142,12 @@ def road_acceleration(paths: Paths, driver: IdmDriver, t: int, m: int, s: float,
 @inner_kernel
 def hardest_acceleration(
     paths: Paths, driver: IdmDriver, rows: RolloutRows, t: int, i: int, way: Way, speed: float,
-    others: Ints, n_others: int, accel: float, leader: int,
+    others: Ints, n_others: int, accel: float, leader: int, yielding: Yielding | None,
 ) -> tuple[float, int]:  # fmt: skip
-    """(acceleration [m/s2], leader) of agent i, driven, for the others on the list; `accel` without them."""
+    """(acceleration [m/s2], leader) of agent i, driven, for the others on the list; `accel` without them.
+
+    One that keeps its intent slows down for a leader from what it could do at most, not from what it means to do.
+    """
     view = look_ahead(paths, way, driver.blend_length_m, driver.lookahead_m)
     for a in range(n_others):
         j = others[a]
@@ -157,7 +160,10 @@ def hardest_acceleration(
         gap, h = gap_to(paths, driver, rows, t, i, way, view, j)
         if gap < np.inf:
             lead_speed = rows.velocities[t, j, 0] * math.cos(h) + rows.velocities[t, j, 1] * math.sin(h)
-            free = free_acceleration(speed, paths.target_speed[way.path, cell_of(paths, way.s)], driver)
+            if yielding is None:
+                free = free_acceleration(speed, paths.target_speed[way.path, cell_of(paths, way.s)], driver)
+            else:
+                free = driver.accel_max
             behind = following_acceleration(free, speed, gap, lead_speed, driver)
             if behind < accel:
                 accel, leader = behind, j
@@ -183,17 +189,27 @@ def touches_driven(
 
 @inner_kernel
 def is_clear(
-    roles: Roles, driver: IdmDriver, log_boxes: Array, k: int, i: int,
-    rows: RolloutRows, t: int, mode: Ints, others: Ints, n_others: int,
+    roles: Roles, driver: IdmDriver, log: AgentStates, k: int, i: int,
+    rows: RolloutRows, t: int, mode: Ints, others: Ints, n_others: int, yielding: Yielding | None,
 ) -> bool:  # fmt: skip
-    """May agent i appear as in step k of its log, as far as those of the list, already there in row t, let it?"""
+    """May agent i appear as in step k of its log, as far as those of the list, already there in row t, let it?
+
+    A vehicle needs the minimum gap at both ends; one that keeps its intent its headway too, and room to brake.
+    """
     if not roles.enters_clear[i]:
-        return not (roles.moving_kind[i] and touches_driven(log_boxes, k, i, rows, t, mode, others, n_others))
-    x, y, heading, length, width = box_of(log_boxes, k, i)
-    grown = (x, y, heading, length + 2.0 * driver.min_gap_m, width)
+        return not (roles.moving_kind[i] and touches_driven(log.boxes, k, i, rows, t, mode, others, n_others))
+    x, y, heading, length, width = box_of(log.boxes, k, i)
     for a in range(n_others):
         j = others[a]
-        if mode[j] != ABSENT and boxes_overlap(grown, box_of(rows.boxes, t, j)):
+        if mode[j] == ABSENT:
+            continue
+        margin = driver.min_gap_m
+        if yielding is not None:
+            c, s = math.cos(heading), math.sin(heading)
+            speed = log.velocities[k, i, 0] * c + log.velocities[k, i, 1] * s
+            closing = speed - rows.velocities[t, j, 0] * c - rows.velocities[t, j, 1] * s
+            margin += driver.headway_s * speed + closing * closing / (2.0 * driver.decel_max)
+        if boxes_overlap((x, y, heading, length + 2.0 * margin, width), box_of(rows.boxes, t, j)):
             return False
     return True
 

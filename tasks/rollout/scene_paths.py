@@ -30,14 +30,18 @@ def stack_paths(
     logged_ways: list[LanePath | None],
     target_speed_mps: float,
     decel_max: float,
+    logged_stops: bool = True,
 ) -> Paths:
-    """The agents' paths and logged ways (N,), as `numbered` counts them; a logged way's own speeds tell it to stop."""
+    """The agents' paths and logged ways (N,), as `numbered` counts them; a logged way's own speeds tell it to stop.
+
+    logged_stops: whether a stop of a log at a junction makes a stop line.
+    """
     chosen = [path for path in found + logged_ways if path is not None]
     n_points = len(chosen[0].xy) if chosen else 2
     xy = np.array([path.xy for path in chosen]).reshape(-1, n_points, 2)
     heading = np.array([path.heading for path in chosen]).reshape(-1, n_points)
     limit = np.array([path.speed_limit_mps for path in chosen]).reshape(-1, n_points)
-    lines = _stop_lines(scene, found)
+    lines = _stop_lines(scene, found, logged_stops)
     counts = [len(of_path) for of_path in lines] + [0] * (len(chosen) - len(lines))
     states = [state for of_path in lines for _, state in of_path]
     return Paths(
@@ -64,12 +68,12 @@ def _target_speeds(limit: Array, heading: Array, default: float, decel_max: floa
     return speeds
 
 
-def _stop_lines(scene: Scene, found: list[LanePath | None]) -> list[list[StopLine]]:
-    """Of each path there is: the lights along it, and where the vehicle's log stops."""
+def _stop_lines(scene: Scene, found: list[LanePath | None], logged: bool) -> list[list[StopLine]]:
+    """Of each path there is: the lights along it, and where the vehicle's log stops if that is wanted (`logged`)."""
     log = scene.clip.agents
     stopped = log.valid & (np.hypot(*np.moveaxis(log.velocities, -1, 0)) < STANDS_BELOW_MPS)
     return [
-        [*_light_lines(scene, path), *_logged_stops(scene, path, i, stopped[:, i])]
+        [*_light_lines(scene, path), *(_logged_stops(scene, path, i, stopped[:, i]) if logged else ())]
         for i, path in enumerate(found)
         if path is not None
     ]

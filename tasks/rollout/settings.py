@@ -25,6 +25,7 @@ class TrafficSettings:
     emergency_decel: float = 8.0  # m/s2, what tyres can; the public traffic knows no limit
     lookahead_m: float = 60.0
     blend_length_m: float = 20.0  # over which a start beside the path fades onto it
+    yields: bool = True  # idm: drivers keep the intent of their log, and give way where paths cross or merge
 
     def __post_init__(self) -> None:
         if self.mode not in ("idm", "replay", "navsim"):
@@ -34,7 +35,7 @@ class TrafficSettings:
                 raise ValueError(f"traffic {name} must be positive, not {getattr(self, name)}")
         for field in fields(self):
             value = getattr(self, field.name)
-            if field.name != "mode" and not 0.0 <= value <= MOST:
+            if field.name not in ("mode", "yields") and not 0.0 <= value <= MOST:
                 raise ValueError(f"traffic {field.name} must lie within 0 .. {MOST:g}, not {value}")
 
     @property

@@ -15,11 +15,15 @@ The ego is tracked first, since it follows its plan whatever the traffic does; t
 * Pedestrians and cyclists walk their log; before a step into a driven vehicle they wait, then go on late along the
   same log. Neither they nor replayed vehicles wait for the ego: its reward must not profit from their care.
 
+* With `yields` a driver keeps the speeds and stops of its log instead of a target speed, and gives way to others, not
+  to the ego, where ways cross or merge (tasks/rollout/yielding).
+
 That is `mode=idm`. In `navsim` the traffic is the public evaluation's, to the letter (tasks/rollout/navsim).
 """
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -36,7 +40,8 @@ from tasks.rollout.roles import NEVER, clocks, join_steps, later_join_step, logg
 from tasks.rollout.scene_paths import numbered, stack_paths
 from tasks.rollout.settings import MOST, TrafficSettings
 from tasks.rollout.traffic import drive, drive_many
-from tasks.rollout.traffic_state import AgentStates, Roles
+from tasks.rollout.traffic_state import AgentStates, Roles, Yielding
+from tasks.rollout.yielding.prepare import yielding_in
 from tasks.world.agents import MOVING_KINDS, PER_STEP, AgentKind, AgentTracks
 from tasks.world.arrays import Array, Bools
 from tasks.world.bounds import LARGEST, all_within
@@ -44,7 +49,9 @@ from tasks.world.boxes import ego_boxes
 from tasks.world.clip import HORIZON_STEPS, STEP_S, Rollout, Scene
 from tasks.world.vehicle import EGO_STATE_SIZE, HEADING, PACIFICA, VX, VY
 
+SHORTEST_HEADWAY_S = 0.5  # of who keeps its intent: logged drivers follow as near as that
 LOG_STRIDE = 3  # every third logged pose tells a way
+_indexed_lanes = lru_cache(maxsize=4)(index_lanes)  # clips of one log share the map
 
 
 @dataclass(frozen=True)
@@ -56,6 +63,7 @@ class TrafficScene:
     roles: Roles | None  # None: replay, or navsim
     paths: Paths | None
     navsim: NavsimAgents | None = None  # None: another mode
+    yielding: Yielding | None = None  # None: drivers give way to nobody, or another mode
 
 
 @dataclass(frozen=True)
@@ -80,7 +88,7 @@ def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
     is_vehicle = np.array([kind == AgentKind.VEHICLE for kind in now.kinds], dtype=bool)
     moving_kind = np.array([kind in MOVING_KINDS for kind in now.kinds], dtype=bool)
     standing = is_vehicle & stands_always(log) & ~(moved & now.valid[start])
-    index = index_lanes(scene.clip.road_map)
+    index = _indexed_lanes(scene.clip.road_map)
     ahead_m = _path_length(scene, settings)
 
     join, hold = join_steps(index, scene), np.zeros(n, dtype=np.int64)
@@ -116,8 +124,12 @@ def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
         moving_kind=moving_kind,
         enters_clear=is_vehicle & ~standing,
     )
-    paths = stack_paths(scene, found, logged_ways, settings.target_speed_mps, settings.decel_max)
-    return TrafficScene(scene, settings, roles, paths)
+    paths = stack_paths(
+        scene, found, logged_ways, settings.target_speed_mps, settings.decel_max, logged_stops=not settings.yields
+    )
+    if not settings.yields:
+        return TrafficScene(scene, settings, roles, paths)
+    return TrafficScene(scene, settings, roles, paths, yielding=yielding_in(scene, roles, paths, _agent_states(log)))
 
 
 def simulate(scene: Scene, poses: Array, settings: TrafficSettings) -> Rollout:
@@ -149,7 +161,7 @@ def _answer(traffic: TrafficScene, ego_states: Array) -> tuple[AgentTracks, Bool
         return _public_answer(traffic.navsim, traffic.settings, window, ego_states)
     if traffic.roles is None or traffic.paths is None or len(window) == 0:
         return window, np.zeros(len(window), dtype=bool)
-    rows, motion = drive(*_script(traffic, window), *_ego_boxes(ego_states))
+    rows, motion = drive(*_script(traffic, window), *_ego_boxes(ego_states), _yielding(traffic))
     n = len(window)
     return replace(window, **{name: getattr(rows, name)[:, :n].copy() for name in PER_STEP}), motion.was_driven[-1]
 
@@ -185,7 +197,7 @@ def roll_out_many(traffic: TrafficScene, ego_states: Array) -> Rollouts:
     if traffic.roles is None or traffic.paths is None or n == 0:
         alike: Any = [np.broadcast_to(a, (many, *a.shape)) for a in (window.boxes, window.velocities, window.valid)]
         return Rollouts(alike[0], alike[1], alike[2], np.zeros((many, n), dtype=bool))
-    return Rollouts(*drive_many(*_script(traffic, window), *_ego_boxes(ego_states)))
+    return Rollouts(*drive_many(*_script(traffic, window), *_ego_boxes(ego_states), _yielding(traffic)))
 
 
 def _public_answer(
@@ -212,20 +224,27 @@ def _check_states(ego_states: Array, n_rows: int) -> None:
 def _script(
     traffic: TrafficScene, window: AgentTracks
 ) -> tuple[int, AgentStates, AgentStates, Roles, Paths, IdmDriver]:
-    """All that the kernels need to know but the ego."""
+    """All that the kernels need to know but the ego, and who gives way."""
     assert traffic.roles is not None and traffic.paths is not None
     start, paths = traffic.scene.step, traffic.paths
     if window.n_steps > len(paths.line_state):  # lights and stops stay as the last step knows them
         more = window.n_steps - len(paths.line_state)
         paths = paths._replace(line_state=np.concatenate([paths.line_state, np.repeat(paths.line_state[-1:], more, 0)]))
+    driver = IdmDriver(*(getattr(traffic.settings, name) for name in IdmDriver._fields))
+    if traffic.yielding is not None:
+        driver = driver._replace(headway_s=min(driver.headway_s, SHORTEST_HEADWAY_S))
     return (
         start,
         _agent_states(_lasting(traffic.scene.clip.agents, start + window.n_steps)),
         _agent_states(window.window(0, 1)),
         Roles(*_writable(traffic.roles)),
         Paths(*_writable(paths)),
-        IdmDriver(*(getattr(traffic.settings, name) for name in IdmDriver._fields)),
+        driver,
     )
+
+
+def _yielding(traffic: TrafficScene) -> Yielding | None:
+    return None if traffic.yielding is None else Yielding(*_writable(traffic.yielding))
 
 
 def _ego_boxes(ego_states: Array) -> tuple[Array, Array]:

@@ -43,10 +43,13 @@ from tasks.rollout.traffic_state import (
     Motion,
     Roles,
     RolloutRows,
+    Yielding,
     empty_motion,
     empty_rows,
     nobody_diverged,
 )
+from tasks.rollout.yielding.give_way import has_way, yields_for
+from tasks.rollout.yielding.intent import intended_acceleration, turned_at
 from tasks.world.arrays import Array, Bools
 from tasks.world.geometry import wrapped
 
@@ -54,11 +57,12 @@ from tasks.world.geometry import wrapped
 @kernel
 def drive(
     start: int, log: AgentStates, now: AgentStates, roles: Roles, paths: Paths, driver: IdmDriver,
-    ego_boxes: Array, ego_velocities: Array,
+    ego_boxes: Array, ego_velocities: Array, yielding: Yielding | None,
 ) -> tuple[RolloutRows, Motion]:  # fmt: skip
     """The traffic's answer to one ego: boxes (T, 5) (true centre) and world velocities (T, 2), T = 41.
 
-    start: the clip's step of row 0; log: the clip's tracks over all its steps; now: the agents (1, N) at `start`.
+    start: the clip's step of row 0; log: the clip's tracks over all its steps; now: the agents (1, N) at `start`;
+    yielding: None where drivers have no intent but their target speed, and give way to nobody.
     """
     n_rows, n = ego_boxes.shape[0], roles.path.shape[0]
     rows, motion, diverged = empty_rows(n_rows, n), empty_motion(n_rows, n), nobody_diverged(n)
@@ -71,14 +75,14 @@ def drive(
         if now.valid[0, i]:
             motion.mode[0, i] = STANDING if roles.standing[i] else REPLAYED
     for t in range(n_rows - 1):
-        _step(start, log, roles, paths, driver, t, rows, diverged, motion, motion)
+        _step(start, log, roles, paths, driver, t, rows, diverged, motion, motion, yielding)
     return rows, motion
 
 
 @kernel
 def drive_many(
     start: int, log: AgentStates, now: AgentStates, roles: Roles, paths: Paths, driver: IdmDriver,
-    ego_boxes: Array, ego_velocities: Array,
+    ego_boxes: Array, ego_velocities: Array, yielding: Yielding | None,
 ) -> tuple[Array, Array, Bools, Bools]:  # fmt: skip
     """The traffic's answer to each of B egos (B, T, 5), (B, T, 2): as `drive` to it alone, to the last bit.
 
@@ -86,7 +90,7 @@ def drive_many(
     """
     n_egos, n_rows, n = ego_boxes.shape[0], ego_boxes.shape[1], roles.path.shape[0]
     nowhere = np.full((n_rows, 5), np.inf)
-    recorded, record = drive(start, log, now, roles, paths, driver, nowhere, np.zeros((n_rows, 2)))
+    recorded, record = drive(start, log, now, roles, paths, driver, nowhere, np.zeros((n_rows, 2)), yielding)
     boxes, velocities = np.empty((n_egos, n_rows, n, 5)), np.empty((n_egos, n_rows, n, 2))
     valid, was_driven = np.empty((n_egos, n_rows, n), np.bool_), np.empty((n_egos, n), np.bool_)
     rows, motion, diverged = empty_rows(n_rows, n), empty_motion(n_rows, n), nobody_diverged(n)
@@ -98,7 +102,7 @@ def drive_many(
         diverged.found[:], diverged.size[0] = False, 0
         _set_ego(rows, diverged, ego_boxes[b], ego_velocities[b])
         for t in range(n_rows - 1):
-            _step(start, log, roles, paths, driver, t, rows, diverged, motion, record)
+            _step(start, log, roles, paths, driver, t, rows, diverged, motion, record, yielding)
         for t in range(n_rows):
             for i in range(n):
                 _copy(rows, t, i, boxes[b], velocities[b], valid[b])
@@ -185,22 +189,22 @@ def _stay(rows: RolloutRows, t: int, i: int) -> None:
 @hidden_kernel
 def _step(
     start: int, log: AgentStates, roles: Roles, paths: Paths, driver: IdmDriver, t: int,
-    rows: RolloutRows, diverged: Diverged, motion: Motion, record: Motion,
+    rows: RolloutRows, diverged: Diverged, motion: Motion, record: Motion, yielding: Yielding | None,
 ) -> None:  # fmt: skip
     """From row t to row t + 1; `record`: the motion of another rollout, for those that have not diverged."""
-    _switch_to_idm(roles, paths, driver, t, rows, diverged, motion, record)
+    _switch_to_idm(roles, paths, driver, t, rows, diverged, motion, record, yielding)
     for i in range(motion.mode.shape[1]):
         if diverged.found[i]:
             _carry(motion, t, motion, t + 1, i)
-    _drive_on(start, roles, paths, driver, t, rows, diverged, motion, record)
+    _drive_on(start, roles, paths, driver, t, rows, diverged, motion, record, yielding)
     _replay(log, roles, t, rows, diverged, motion, record)
-    _admit(start, log, roles, driver, t, rows, diverged, motion, record)
+    _admit(start, log, roles, driver, t, rows, diverged, motion, record, yielding)
 
 
 @hidden_kernel
 def _switch_to_idm(
     roles: Roles, paths: Paths, driver: IdmDriver, t: int,
-    rows: RolloutRows, diverged: Diverged, motion: Motion, record: Motion,
+    rows: RolloutRows, diverged: Diverged, motion: Motion, record: Motion, yielding: Yielding | None,
 ) -> None:  # fmt: skip
     """Who is on its path and due switches to IDM, at its own pose and speed; so does who must brake on its log."""
     n, mode = motion.mode.shape[1], diverged.mode
@@ -237,6 +241,8 @@ def _switch_to_idm(
             mode[i] = DRIVEN
             if diverged.found[i]:
                 s, offset, turn, speed = start_on(paths, m, rows, t, i, driver)
+                if yielding is not None:
+                    turn = wrapped(turn - turned_at(yielding, m, s))
                 motion.mode[t, i], motion.path[t, i], motion.travelled[t, i] = DRIVEN, m, 0.0
                 motion.s[t, i], motion.offset[t, i], motion.turn[t, i], motion.speed[t, i] = s, offset, turn, speed
                 motion.base_z[t, i] = rows.center_z[t, i] - paths.height[m, cell_of(paths, s)]
@@ -245,7 +251,7 @@ def _switch_to_idm(
 @hidden_kernel
 def _drive_on(
     start: int, roles: Roles, paths: Paths, driver: IdmDriver, t: int,
-    rows: RolloutRows, diverged: Diverged, motion: Motion, record: Motion,
+    rows: RolloutRows, diverged: Diverged, motion: Motion, record: Motion, yielding: Yielding | None,
 ) -> None:  # fmt: skip
     """Those who are driven look at row t and move."""
     for i in range(motion.mode.shape[1]):
@@ -255,25 +261,36 @@ def _drive_on(
         m, s, travelled, speed, offset, turn = _motion_of(t, i, diverged, motion, record)
         if start + t < roles.hold_until[i] and travelled == 0.0 and m == roles.path[i]:
             if diverged.found[i]:
-                _advance(paths, driver, t, i, 0.0, 0.0, rows, motion)
+                _advance(paths, driver, t, i, 0.0, 0.0, rows, motion, yielding)
             continue
         afresh, accel, leader = diverged.found[i], 0.0, NOBODY
         if not afresh:
             accel, leader = record.accel[t, i], record.leader[t, i]
             afresh = leader != NOBODY and diverged.found[leader]
         if afresh:
-            accel, leader = road_acceleration(paths, driver, t, m, s, speed, rows.boxes[t, i, 3]), NOBODY
+            leader = NOBODY
+            if yielding is None:
+                accel = road_acceleration(paths, driver, t, m, s, speed, rows.boxes[t, i, 3])
+            else:
+                nose = s + 0.5 * rows.boxes[t, i, 3]
+                accel = intended_acceleration(yielding, paths, driver, m, s, speed, start, t, nose)
         others = diverged.everyone if afresh else diverged.listed
         n_others = len(others) if afresh else diverged.size[0]
         way = way_of(rows, t, i, m, s, travelled, offset, turn)
-        accel, leader = hardest_acceleration(paths, driver, rows, t, i, way, speed, others, n_others, accel, leader)
+        accel, leader = hardest_acceleration(
+            paths, driver, rows, t, i, way, speed, others, n_others, accel, leader, yielding
+        )
+        if yielding is not None:
+            accel, leader = yields_for(
+                yielding, driver, start, t, i, m, s, speed, rows, diverged, motion, record, afresh, accel, leader
+            )
         if not diverged.found[i]:
             if accel == record.accel[t, i]:
                 continue
             _diverge_at(t, i, t + 1, rows, diverged, motion, record)
         motion.accel[t, i], motion.leader[t, i], motion.was_driven[t + 1, i] = accel, leader, True
         step_m, new_speed = advance(speed, accel)
-        _advance(paths, driver, t, i, step_m, new_speed, rows, motion)
+        _advance(paths, driver, t, i, step_m, new_speed, rows, motion, yielding)
 
 
 @hidden_kernel
@@ -294,8 +311,9 @@ def _motion_of(
 
 @hidden_kernel
 def _advance(
-    paths: Paths, driver: IdmDriver, t: int, i: int, step_m: float, new_speed: float, rows: RolloutRows, motion: Motion
-) -> None:
+    paths: Paths, driver: IdmDriver, t: int, i: int, step_m: float, new_speed: float, rows: RolloutRows, motion: Motion,
+    yielding: Yielding | None,
+) -> None:  # fmt: skip
     """Agent i, driven, is `step_m` on along its path in row t + 1."""
     m, s, travelled = motion.path[t + 1, i], motion.s[t + 1, i] + step_m, motion.travelled[t + 1, i] + step_m
     motion.s[t + 1, i], motion.travelled[t + 1, i], motion.speed[t + 1, i] = s, travelled, new_speed
@@ -304,6 +322,8 @@ def _advance(
         offset, turn = motion.offset[t + 1, i], motion.turn[t + 1, i]
         x, y, h = pose_on_path(paths, m, s, travelled, offset, turn, driver.blend_length_m)
         rows.boxes[t + 1, i, 0], rows.boxes[t + 1, i, 1] = x, y
+        if yielding is not None:
+            h += turned_at(yielding, m, s)
         rows.boxes[t + 1, i, 2] = wrapped(h)
     h = rows.boxes[t + 1, i, 2]
     rows.velocities[t + 1, i, 0], rows.velocities[t + 1, i, 1] = new_speed * math.cos(h), new_speed * math.sin(h)
@@ -353,7 +373,7 @@ def _replay(
 @hidden_kernel
 def _admit(
     start: int, log: AgentStates, roles: Roles, driver: IdmDriver, t: int,
-    rows: RolloutRows, diverged: Diverged, motion: Motion, record: Motion,
+    rows: RolloutRows, diverged: Diverged, motion: Motion, record: Motion, yielding: Yielding | None,
 ) -> None:  # fmt: skip
     """Newcomers, judged against everyone who was already there."""
     n = motion.mode.shape[1]
@@ -366,8 +386,10 @@ def _admit(
         others = diverged.everyone if afresh else diverged.listed
         n_others = len(others) if afresh else diverged.size[0]
         enters = far_from_ego(roles, log.boxes, k, i, rows, t + 1) and is_clear(
-            roles, driver, log.boxes, k, i, rows, t + 1, diverged.mode, others, n_others
+            roles, driver, log, k, i, rows, t + 1, diverged.mode, others, n_others, yielding
         )
+        if yielding is not None and enters and roles.path[i] >= 0:
+            enters = has_way(yielding, driver, roles.path[i], k, t + 1, log, i, rows, diverged, motion, record, afresh)
         if not diverged.found[i]:
             if enters == record.enters[t, i]:
                 continue

@@ -27,6 +27,23 @@ class Roles(NamedTuple):
     enters_clear: Bools  # (N,) vehicles that may only enter with clearance to the ego
 
 
+class Yielding(NamedTuple):
+    """What drivers mean to do on each of M paths, and the Z zones where two of them cannot be at once; S clip steps."""
+
+    at: Array  # (M, S) path length that the log has come to [m]; never falls
+    speed: Array  # (M, S) of the log there [m/s], 0 where it stands
+    last: Ints  # (M,) step of the log's end
+    turned: Array  # (M, P) of a body against the path [rad], as its log is
+    zone_start: Ints  # (M + 1,) zones of path m: zone_start[m]..zone_start[m + 1] - 1
+    zone_agent: Ints  # (Z,) whom the zone is shared with
+    zone_path: Ints  # (Z,) on which path, -1: on its log
+    zone_in: Array  # (Z,) path length at which the zone begins [m]
+    zone_out: Array  # (Z,) and at which it ends
+    other_in: Array  # (Z,) the same along the other's path [m]; or the first step of its log in there
+    other_out: Array  # (Z,) and the last
+    gives_way: Bools  # (Z,) the other one goes first
+
+
 class AgentStates(NamedTuple):
     """Agents over S steps."""
 

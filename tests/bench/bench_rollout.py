@@ -6,6 +6,7 @@ python -m tests.bench.bench_rollout ../shared/data/av2/sensor/val
 import sys
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -39,19 +40,21 @@ def among_nearest(scene: Scene) -> Scene:
 
 
 def main(root: Path) -> None:
-    """Two rows per third clip, 25 agents and all of them: who is there, and milliseconds per part of a rollout."""
-    reader, settings = AV2Reader(root), TrafficSettings()
+    """Four rows per third clip, 25 agents and all, without and with giving way: who is there, and milliseconds."""
+    reader = AV2Reader(root)
     trajectories = kinematic_trajectories(N_EGOS, 0)
-    print(f"| log | start s | agents now | with a path | prepare ms | one ego ms | {N_EGOS} egos ms |")
-    print("|---|---|---|---|---|---|---|")
+    print(f"| log | start s | agents now | with a path | yields | prepare ms | one ego ms | {N_EGOS} egos ms |")
+    print("|---|---|---|---|---|---|---|---|")
     for ref in reader.index().refs[::3]:
         whole = scene_of_clip(reader.read(ref))
-        for scene in (among_nearest(whole), whole):
+        for scene, yields in product((among_nearest(whole), whole), (False, True)):
+            settings = TrafficSettings(yields=yields)
             traffic = prepare_traffic(scene, settings)
             states = track(scene.ego_state, trajectories, local=True)
             paths = int((traffic.roles.path >= 0).sum()) if traffic.roles else 0
             print(
                 f"| {ref.log_id[:8]} | {ref.start_ms / 1e3:.0f} | {int(scene.agents.valid[NOW].sum())} | {paths} "
+                f"| {yields} "
                 f"| {cpu_milliseconds(partial(prepare_traffic, scene, settings), 5):.1f} "
                 f"| {cpu_milliseconds(partial(roll_out, traffic, states[0]), 40):.2f} "
                 f"| {cpu_milliseconds(partial(roll_out_many, traffic, states), 5):.0f} |",

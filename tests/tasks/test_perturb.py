@@ -32,13 +32,18 @@ from tasks.world.vocabulary import Vocabulary
 from tests.tasks.streets import moved, street_clip
 
 SETTINGS = PerturbSettings()
+TRAFFIC = TrafficSettings()
 
 
 def perturbed(
-    clip: Clip, trajectories: NDArray[np.float64], settings: PerturbSettings = SETTINGS, seed: int = 0
+    clip: Clip,
+    trajectories: NDArray[np.float64],
+    settings: PerturbSettings = SETTINGS,
+    seed: int = 0,
+    traffic: TrafficSettings = TRAFFIC,
 ) -> Perturbation | Rejected:
     rng = stream(seed, clip.clip_id, "perturb")
-    return perturb(clip, Vocabulary(trajectories), settings, TrafficSettings(), PdmSettings(), rng)
+    return perturb(clip, Vocabulary(trajectories), settings, traffic, PdmSettings(), rng)
 
 
 @pytest.fixture(scope="module")
@@ -148,8 +153,8 @@ def slow_start_ahead() -> Clip:
 
 def test_a_perturbation_that_only_the_log_makes_room_for_is_dropped(trajectories: NDArray[np.float64]) -> None:
     """What stays and what goes is what the traffic's own answer says, driven and scored once more by hand."""
-    clip = slow_start_ahead()
-    found = perturbed(clip, trajectories)
+    clip, traffic = slow_start_ahead(), TrafficSettings(yields=False)
+    found = perturbed(clip, trajectories, traffic=traffic)
     counts = found.counts if isinstance(found, Rejected) else found.gate_counts
     assert counts["reactive_score"] > 3
     assert isinstance(found, Perturbation)
@@ -160,7 +165,7 @@ def test_a_perturbation_that_only_the_log_makes_room_for_is_dropped(trajectories
         assert not np.isfinite(replayed) or (replayed >= SETTINGS.epdms_min) == (fate != "score")
         if fate not in ("kept", "reactive"):
             continue
-        rollout = simulate(scene, to_world(scene.ego_state[:3], trajectories[index]), TrafficSettings())
+        rollout = simulate(scene, to_world(scene.ego_state[:3], trajectories[index]), traffic)
         pair = np.stack([rival, rollout.ego_states])
         reacting = score(prepare_scene(scene, rollout.agents), pair, normalise="pairs").pdm_score[1]
         assert (reacting >= SETTINGS.epdms_min) == (fate == "kept")

@@ -185,7 +185,9 @@ def test_the_town_s_pictures_are_drawn_on_the_gpu_node_and_its_drives_made_on_th
 ) -> None:
     """Drives go on between the first picture and the last, and the rows are those of one process."""
     root, journal = town.reader.root, tmp_path / "journal"  # type: ignore[attr-defined]
-    work = work_on(root, tmp_path / "blocks", "render.gate.enabled=false")  # the block is built by this run
+    work = work_on(
+        root, tmp_path / "blocks", "render.gate.enabled=false", "traffic.yields=false"
+    )  # rejects; builds the block
     noted = NotedWork(**{f.name: getattr(work, f.name) for f in fields(work)}, journal=str(journal))
     what = (work.reader.index().refs, ["pdm_closed", "human"], 3)
     on_two = Store(tmp_path / "ray")

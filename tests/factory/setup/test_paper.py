@@ -37,6 +37,7 @@ def test_the_defaults_differ_in_vocabulary_pictures_and_gates() -> None:
     assert found == [
         "vocabulary of 1,024 kinematic trajectories (16,384 human ones)",
         "expert.recovery.smooth=True (False)",
+        "traffic.yields=True (False)",
         "reward.off_route=True (False)",
         "reward.after=True (False)",
         "render.width=320 (1920)",

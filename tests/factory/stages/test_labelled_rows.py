@@ -77,7 +77,7 @@ def differing(row: dict[str, object], scores: Scores) -> list[str]:
 
 
 def test_by_default_a_simulated_sample_is_labelled_among_its_simulated_traffic() -> None:
-    work = street().work
+    work = street("traffic.yields=false").work  # else it is the log's
     accepted, judged = sample(work, "pdm_closed")
     row = dict(accepted.row)
     assert row["label_vocabulary"] == work.vocabulary.digest and row["label_traffic"] == "replay"

@@ -54,7 +54,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def out(logs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run") / "out"
     words = ["clips=av2", f"clips.root={logs}", "experts=[human,pdm_closed]", "render=none", "reward.labels=none"]
-    assert run_main([*words, "vocabulary.k=128", "executor=local", f"out={folder}"]) == 0
+    assert run_main([*words, "traffic.yields=false", "vocabulary.k=128", "executor=local", f"out={folder}"]) == 0
     return folder
 
 

@@ -22,7 +22,7 @@ from tasks.world.kinematic_vocabulary import kinematic_trajectories
 from tasks.world.vocabulary import Vocabulary
 from tests.tasks.streets import street_clip
 
-REPLAY, IDM = TrafficSettings(mode="replay"), TrafficSettings()
+REPLAY, IDM = TrafficSettings(mode="replay"), TrafficSettings(yields=False)  # who yields does as in the log here
 VOCABULARY = Vocabulary(kinematic_trajectories(60, 3))
 KEPT = (*HALVES, *WHOLES, "ep_raw_m")
 

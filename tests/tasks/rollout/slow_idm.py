@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tasks.kernels.compiled import kernel
+from tasks.rollout.traffic_state import Yielding
 from tasks.world.clip import STEP_S
 from tests.tasks.rollout.slow_corridor import (
     PATH_SPACING_M,
@@ -28,6 +29,7 @@ from tests.tasks.rollout.slow_corridor import (
     pose_on_path,
     project_on_path,
 )
+from tests.tasks.rollout.slow_yielding import has_way, intended, turned_on, waits_before
 
 Array = NDArray[np.float64]
 
@@ -78,9 +80,14 @@ class AgentStates(NamedTuple):
 @kernel
 def idm_acceleration(speed: float, target_speed: float, gap: float, lead_speed: float, driver: IdmDriver) -> float:
     """Acceleration [m/s2]; gap = inf on a free road."""
-    gap = max(gap, SMALLEST_GAP_M)
     free = driver.accel * (1.0 - (speed / target_speed) ** driver.exponent)
-    free = max(free, -driver.decel)
+    return following_acceleration(max(free, -driver.decel), speed, gap, lead_speed, driver)
+
+
+@kernel
+def following_acceleration(free: float, speed: float, gap: float, lead_speed: float, driver: IdmDriver) -> float:
+    """[m/s2] of one whose acceleration on a free road would be `free`."""
+    gap = max(gap, SMALLEST_GAP_M)
     closing = speed * (speed - lead_speed) / (2.0 * math.sqrt(driver.accel * driver.decel))
     desired = driver.min_gap + max(0.0, speed * driver.headway + closing)
     ratio = desired / gap
@@ -186,6 +193,27 @@ def _is_free(box: Array, row: Array, mode: NDArray[np.int64], ego: Array, margin
 
 
 @kernel
+def _has_room(
+    box: Array, velocity: Array, row: Array, velocities: Array, mode: NDArray[np.int64],
+    ego: Array, ego_velocity: Array, driver: IdmDriver,
+) -> bool:  # fmt: skip
+    """As _is_free, with a headway and the way to brake to the other's speed at both ends."""
+    c, s = math.cos(box[2]), math.sin(box[2])
+    speed = velocity[0] * c + velocity[1] * s
+    grown = box.copy()
+    for j in range(mode.shape[0] + 1):
+        if j < mode.shape[0] and mode[j] == ABSENT:
+            continue
+        other, v = (ego, ego_velocity) if j == mode.shape[0] else (row[j], velocities[j])
+        closing = speed - v[0] * c - v[1] * s
+        margin = driver.min_gap + (driver.headway * speed + closing * closing / (2.0 * driver.decel))
+        grown[3] = box[3] + 2.0 * margin
+        if boxes_overlap(grown, other):
+            return False
+    return True
+
+
+@kernel
 def drive(
     start: int,
     log: AgentStates,
@@ -195,6 +223,7 @@ def drive(
     ego_boxes: Array,
     ego_velocities: Array,
     driver: IdmDriver,
+    yielding: Yielding | None,
 ) -> tuple[Array, Array, NDArray[np.bool_], Array, NDArray[np.bool_]]:
     """Boxes (T, N, 5), velocities (T, N, 2), valid (T, N), centre z (T, N) and who was driven (N,).
 
@@ -248,10 +277,13 @@ def drive(
             if m >= 0:
                 mode[i], path[i], travelled[i] = DRIVEN, m, 0.0
                 s[i], offset[i], turn[i], speed[i] = _start_on(paths, m, boxes[t, i], velocities[t, i], driver)
+                if yielding is not None:
+                    turn[i] = (turn[i] - turned_on(yielding, m, s[i]) + math.pi) % (2.0 * math.pi) - math.pi
                 k = min(max(round(s[i] / PATH_SPACING_M), 0), paths.heading.shape[1] - 1)
                 base_z[i] = center_z[t, i] - paths.height[m, k]
 
         # Everyone driven looks at row t and moves to row t + 1.
+        s_now, speed_now = s.copy(), speed.copy()
         for i in range(n):
             if mode[i] != DRIVEN:
                 continue
@@ -263,10 +295,16 @@ def drive(
                 was_driven[i] = True
                 k = min(max(round(s[i] / PATH_SPACING_M), 0), paths.heading.shape[1] - 1)
                 target = paths.target_speed[m, k]
-                accel = idm_acceleration(speed[i], target, np.inf, 0.0, driver)
+                free = max(driver.accel * (1.0 - (speed[i] / target) ** driver.exponent), -driver.decel)
+                accel = following_acceleration(free, speed[i], np.inf, 0.0, driver)
+                if yielding is not None:
+                    accel = intended(
+                        yielding, m, s[i], speed[i], start + t, free, driver.decel, driver.emergency_decel, driver.accel
+                    )
+                    free = driver.accel
                 line = stop_line_gap(paths, m, t, s[i] + 0.5 * length, speed[i], driver.decel)
                 if line < np.inf:
-                    accel = min(accel, idm_acceleration(speed[i], target, line, 0.0, driver))
+                    accel = min(accel, following_acceleration(free, speed[i], line, 0.0, driver))
                 for j in range(n + 1):
                     if j == i or (j < n and mode[j] == ABSENT) or (j < n and not valid[t, j]):
                         continue
@@ -278,12 +316,24 @@ def drive(
                     if gap < np.inf:
                         v = ego_velocities[t] if j == n else velocities[t, j]
                         lead_speed = v[0] * math.cos(h) + v[1] * math.sin(h)
-                        accel = min(accel, idm_acceleration(speed[i], target, gap, lead_speed, driver))
+                        accel = min(accel, following_acceleration(free, speed[i], gap, lead_speed, driver))
+                if yielding is not None:
+                    for z in range(yielding.zone_start[m], yielding.zone_start[m + 1]):
+                        j = yielding.zone_agent[z]
+                        gap = waits_before(
+                            yielding, z, start + t, s[i], speed[i], 0.5 * length,
+                            valid[t, j], path[j] if mode[j] == DRIVEN else -1, mode[j] == REPLAYED, clock[j],
+                            s_now[j], speed_now[j], 0.5 * boxes[t, j, 3], driver.emergency_decel, driver.accel,
+                        )  # fmt: skip
+                        if gap < np.inf:
+                            accel = min(accel, following_acceleration(driver.accel, speed[i], gap, 0.0, driver))
                 step_m, new_speed = advance(speed[i], accel)
             s[i] += step_m
             travelled[i] += step_m
             speed[i] = new_speed
             x, y, h = pose_on_path(paths, m, s[i], travelled[i], offset[i], turn[i], driver.blend_length)
+            if yielding is not None:
+                h += turned_on(yielding, m, s[i])
             k = min(max(round(s[i] / PATH_SPACING_M), 0), paths.heading.shape[1] - 1)
             if step_m == 0.0:
                 boxes[t + 1, i] = boxes[t, i]  # a standing car keeps its box to the last bit
@@ -325,7 +375,18 @@ def drive(
             box, ego = log.boxes[k, i], ego_boxes[t + 1]
             if roles.enters_clear[i]:
                 far = math.hypot(box[0] - ego[0], box[1] - ego[1]) >= driver.enter_clearance
-                if not (far and _is_free(box, boxes[t + 1], mode, ego, driver.min_gap)):
+                free = _is_free(box, boxes[t + 1], mode, ego, driver.min_gap)
+                if yielding is not None:
+                    free = _has_room(
+                        box, log.velocities[k, i], boxes[t + 1], velocities[t + 1], mode, ego, ego_velocities[t + 1],
+                        driver,
+                    )  # fmt: skip
+                    v = math.hypot(log.velocities[k, i, 0], log.velocities[k, i, 1])
+                    free = free and has_way(
+                        yielding, roles.path[i], k, v, 0.5 * box[3], mode, path, s, speed, 0.5 * boxes[t + 1, :, 3],
+                        driver.emergency_decel,
+                    )  # fmt: skip
+                if not (far and free):
                     continue
             elif roles.moving_kind[i] and _touches_driven(box, boxes[t + 1], mode, i):
                 continue

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from tasks.rollout.rules import CORRIDOR_MARGIN_M, ENTER_CLEARANCE_M, LARGEST_OFFSET_M
 from tasks.rollout.simulate import (
+    SHORTEST_HEADWAY_S,
     Rollouts,
     TrafficScene,
     TrafficSettings,
@@ -26,6 +27,7 @@ from tests.tasks.rollout import slow_corridor, slow_idm, worlds
 Array = NDArray[np.float64]
 
 IDM = TrafficSettings()
+BOTH = pytest.mark.parametrize("yields", [False, True])
 seeds = st.integers(0, 2**31)
 
 
@@ -40,8 +42,9 @@ def slow_roll_out(traffic: TrafficScene, ego_states: Array) -> Rollout:
     cos, sin = np.cos(heading), np.sin(heading)
     size = np.full((41, 2), (PACIFICA.length, PACIFICA.width))
     x, y = (ego_states[:, k] + PACIFICA.rear_axle_to_center * d for k, d in ((X, cos), (Y, sin)))
+    headway_s = of.headway_s if traffic.yielding is None else min(of.headway_s, SHORTEST_HEADWAY_S)
     driver = slow_idm.IdmDriver(
-        of.min_gap_m, of.headway_s, of.accel_max, of.decel_max, of.exponent, of.emergency_decel, of.lookahead_m,
+        of.min_gap_m, headway_s, of.accel_max, of.decel_max, of.exponent, of.emergency_decel, of.lookahead_m,
         CORRIDOR_MARGIN_M, of.blend_length_m, LARGEST_OFFSET_M, ENTER_CLEARANCE_M,
     )  # fmt: skip
     boxes, velocities, valid, center_z, driven = slow_idm.drive(
@@ -53,6 +56,7 @@ def slow_roll_out(traffic: TrafficScene, ego_states: Array) -> Rollout:
         np.column_stack([x, y, heading, size]),
         np.column_stack([cos * speed, sin * speed]),
         driver,
+        traffic.yielding,
     )
     agents = replace(window, boxes=boxes, velocities=velocities, valid=valid, center_z=center_z)
     return Rollout(scene.step, ego_states, agents, driven)
@@ -85,27 +89,34 @@ def assert_row_is(rollouts: Rollouts, b: int, rollout: Rollout) -> None:
     assert rollouts.simulated[b].tolist() == rollout.simulated.tolist()
 
 
-@given(seeds)
+@BOTH
+@given(seed=seeds)
 @settings(max_examples=25)
-def test_the_traffic_equals_its_slow_twin(seed: int) -> None:
-    for traffic, egos in stages(seed):
+def test_the_traffic_equals_its_slow_twin(yields: bool, seed: int) -> None:
+    for traffic, egos in stages(seed, TrafficSettings(yields=yields)):
         for ego in egos[:3]:
             assert_same(roll_out(traffic, ego), slow_roll_out(traffic, ego))
 
 
-@given(seeds, st.sampled_from([0.5, 3.0, 20.0]), st.sampled_from([3.0, 25.0, 200.0]))
+@BOTH
+@given(
+    seed=seeds, blend_length_m=st.sampled_from([0.5, 3.0, 20.0]), lookahead_m=st.sampled_from([3.0, 25.0, 200.0])
+)  # fmt: skip
 @settings(max_examples=15)
-def test_so_it_does_under_other_settings(seed: int, blend_length_m: float, lookahead_m: float) -> None:
+def test_so_it_does_under_other_settings(yields: bool, seed: int, blend_length_m: float, lookahead_m: float) -> None:
     """Also where the corridor reaches beyond the path's end."""
-    of = TrafficSettings(blend_length_m=blend_length_m, lookahead_m=lookahead_m, min_gap_m=3.0, emergency_decel=5.0)
+    of = TrafficSettings(
+        blend_length_m=blend_length_m, lookahead_m=lookahead_m, min_gap_m=3.0, emergency_decel=5.0, yields=yields
+    )
     for traffic, egos in stages(seed, of):
         assert_same(roll_out(traffic, egos[0]), slow_roll_out(traffic, egos[0]))
 
 
-@given(seeds)
+@BOTH
+@given(seed=seeds)
 @settings(max_examples=25)
-def test_each_of_many_rollouts_is_that_of_its_ego_alone(seed: int) -> None:
-    for traffic, egos in stages(seed):
+def test_each_of_many_rollouts_is_that_of_its_ego_alone(yields: bool, seed: int) -> None:
+    for traffic, egos in stages(seed, TrafficSettings(yields=yields)):
         rollouts = roll_out_many(traffic, egos)
         for b, ego in enumerate(egos):
             assert_row_is(rollouts, b, roll_out(traffic, ego))

@@ -17,6 +17,7 @@ from tests.tasks.rollout import worlds
 from tests.tasks.rollout.worlds import Track
 
 IDM = TrafficSettings()
+PLAIN = TrafficSettings(yields=False)  # whoever is driven wants to go at its target speed
 
 
 def run(scene: Scene, settings: TrafficSettings = IDM) -> Rollout:
@@ -31,7 +32,7 @@ def overlap_area(agents: AgentTracks, i: int, j: int) -> float:
 
 
 def test_a_car_alone_accelerates_towards_the_target_speed_on_its_lane() -> None:
-    rollout = run(worlds.scene(worlds.straight_road(), Track(0.0, speed=5.0)))
+    rollout = run(worlds.scene(worlds.straight_road(), Track(0.0, speed=5.0)), PLAIN)
     speed = rollout.agents.velocities[:, 0, 0]
     assert rollout.simulated.tolist() == [True]
     assert (np.diff(speed) > 0).all() and 8.0 < speed[-1] < 9.0
@@ -49,8 +50,8 @@ def test_the_lanes_speed_limit_replaces_the_default_target() -> None:
 def test_a_follower_stops_behind_a_standing_car_with_the_minimum_gap() -> None:
     """Two rollouts long: it never touches, and settles about min_gap_m behind."""
     scene = worlds.scene(worlds.straight_road(), Track(0.0, speed=8.0), Track(32.0))
-    first = run(scene)
-    second = run(next_scene(scene, first, scene.centerline))
+    first = run(scene, PLAIN)
+    second = run(next_scene(scene, first, scene.centerline), PLAIN)
     boxes = np.concatenate([first.agents.boxes, second.agents.boxes[1:]])
     gap = boxes[:, 1, 0] - boxes[:, 0, 0] - worlds.CAR[0]
     assert gap.min() > 0.9 and gap[-1] < 4.0
@@ -61,7 +62,7 @@ def test_a_follower_stops_behind_a_standing_car_with_the_minimum_gap() -> None:
 def test_a_follower_brakes_for_the_ego_where_the_egos_body_is() -> None:
     """Rear axle at 30 m: the bumper it must not touch is 1.127 m behind that."""
     scene = worlds.scene(worlds.straight_road(), Track(0.0, speed=8.0), ego=(30.0, 0.0, 0.0))
-    rollout = run(next_scene(scene, run(scene), scene.centerline))
+    rollout = run(next_scene(scene, run(scene, PLAIN), scene.centerline), PLAIN)
     nose = rollout.agents.boxes[-1, 0, 0] + worlds.CAR[0] / 2.0
     assert 30.0 - 1.127 - 4.0 < nose < 30.0 - 1.127 - 0.9
 
@@ -132,8 +133,8 @@ def test_a_stop_at_a_junction_that_only_the_log_explains_is_kept() -> None:
     """The log stops at x = 55 (nose 57.3, entry at 60) from 2 s after T on: a light the map does not have."""
     way = np.minimum(55.0, 55.0 - 8.0 * STEP_S * (NOW + 20 - np.arange(CLIP_STEPS)))
     scene = worlds.scene(worlds.fork(), Track(0.0, poses=np.column_stack([way, 0 * way, 0 * way])))
-    first = run(scene)
-    last = run(next_scene(scene, first, scene.centerline)).agents.boxes[-1, 0, 0]
+    first = run(scene, PLAIN)
+    last = run(next_scene(scene, first, scene.centerline), PLAIN).agents.boxes[-1, 0, 0]
     assert 52.0 < last < 58.0
 
 
@@ -233,7 +234,7 @@ def test_a_pedestrian_waits_for_a_driven_car_and_then_goes_on_late() -> None:
     """It crosses at x = 14 just when a car is there whose driver does not look (no lookahead)."""
     walker = Track(14.0, kind=AgentKind.PEDESTRIAN, size=(0.6, 0.6), poses=walk(14.0, -3.6, 1.0))
     scene = worlds.scene(worlds.straight_road(), Track(-6.0, speed=8.0), walker)
-    agents = run(scene, replace(IDM, lookahead_m=0.01)).agents
+    agents = run(scene, replace(PLAIN, lookahead_m=0.01)).agents
     by_log = agents.boxes.copy()
     by_log[:, 1] = scene.agents.boxes[NOW : NOW + 41, 1]
     assert overlap_area(replace(agents, boxes=by_log), 0, 1) > 0.05
@@ -289,7 +290,8 @@ def test_row_zero_is_the_scene_and_nothing_jumps() -> None:
     assert moved.max() < 1.1 and turned.max() < 0.06
 
 
-def test_the_order_of_the_agents_does_not_matter() -> None:
+@pytest.mark.parametrize("settings", [PLAIN, IDM])
+def test_the_order_of_the_agents_does_not_matter(settings: TrafficSettings) -> None:
     scene = busy_scene()
     order = np.array([3, 5, 0, 4, 2, 1])
 
@@ -304,8 +306,8 @@ def test_the_order_of_the_agents_does_not_matter() -> None:
             agents.heights[order],
         )
 
-    plain = run(scene)
-    other = run(scene_of_clip(replace(scene.clip, agents=shuffled(scene.clip.agents))))
+    plain = run(scene, settings)
+    other = run(scene_of_clip(replace(scene.clip, agents=shuffled(scene.clip.agents))), settings)
     assert np.array_equal(plain.agents.boxes[:, order], other.agents.boxes, equal_nan=True)
     assert np.array_equal(plain.simulated[order], other.simulated)
 
@@ -329,10 +331,11 @@ def moved_scene(scene: Scene, angle: float, shift: tuple[float, float]) -> Scene
     )
 
 
-def test_a_shifted_and_turned_world_rolls_out_the_same() -> None:
+@pytest.mark.parametrize("settings", [PLAIN, IDM])
+def test_a_shifted_and_turned_world_rolls_out_the_same(settings: TrafficSettings) -> None:
     scene = busy_scene()
     angle, shift = 2.1, (3000.0, -1500.0)
-    expected, got = run(scene).agents, run(moved_scene(scene, angle, shift)).agents
+    expected, got = run(scene, settings).agents, run(moved_scene(scene, angle, shift), settings).agents
     assert np.array_equal(expected.valid, got.valid)
     c, s = np.cos(angle), np.sin(angle)
     xy = expected.boxes[..., :2] @ np.array([[c, s], [-s, c]]) + shift
