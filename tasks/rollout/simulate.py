@@ -125,8 +125,11 @@ def simulate(scene: Scene, poses: Array, settings: TrafficSettings) -> Rollout:
     return roll_out(prepare_traffic(scene, settings), track(scene.ego_state, np.asarray(poses)[None])[0])
 
 
-def roll_out(traffic: TrafficScene, ego_states: Array) -> Rollout:
-    """The traffic's answer to an ego whose states (41, 11) are known. ValueError where they are none."""
+def roll_out(traffic: TrafficScene, ego_states: Array, steps: int = HORIZON_STEPS) -> Rollout:
+    """The traffic's answer to an ego whose states (41, 11) are known. ValueError where they are none.
+
+    steps: of the rollout that are to happen: `simulated` names who is moved by IDM in those, not who would be later.
+    """
     _check_states(ego_states[None])
     scene = traffic.scene
     start = scene.step
@@ -138,7 +141,7 @@ def roll_out(traffic: TrafficScene, ego_states: Array) -> Rollout:
     rows, motion = drive(*_script(traffic, window), *_ego_boxes(ego_states))
     n = len(window)
     agents = replace(window, **{name: getattr(rows, name)[:, :n].copy() for name in PER_STEP})
-    return Rollout(start, ego_states, agents, motion.was_driven[-1])
+    return Rollout(start, ego_states, agents, motion.was_driven[steps])
 
 
 def roll_out_many(traffic: TrafficScene, ego_states: Array) -> Rollouts:
@@ -213,13 +216,14 @@ def _ego_boxes(ego_states: Array) -> tuple[Array, Array]:
 def next_scene(scene: Scene, rollout: Rollout, centerline: Array, steps: int = HORIZON_STEPS) -> Scene:
     """The scene `steps` of 0.1 s into a rollout: the rollout's world up to then, the log after it.
 
-    centerline (P, 3): the route ahead of the ego's new pose; steps: at least as many as a scene has history.
+    centerline (P, 3): the route ahead of the ego's new pose.
     """
     moved = rollout.simulated if scene.ever_simulated is None else rollout.simulated | scene.ever_simulated
+    driven = np.concatenate([scene.ego_history, rollout.ego_states[1 : steps + 1]])
     return Scene(
         clip=scene.clip,
         step=rollout.start_step + steps,
-        ego_history=rollout.ego_states[steps + 1 - len(scene.ego_history) : steps + 1],
+        ego_history=driven[-len(scene.ego_history) :],
         agents=scene.agents.overwritten(rollout.start_step, rollout.agents.window(0, steps + 1)),
         centerline=centerline,
         ever_simulated=moved,
