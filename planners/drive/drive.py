@@ -23,7 +23,7 @@ from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
-from factory.config.compose import need_run_extra
+from factory.config.compose import ConfigError, need_run_extra
 from factory.graph.each import WorkerDied, each
 from factory.graph.progress import Counter
 from factory.graph.work import Halted
@@ -37,8 +37,10 @@ from planners.drive.settings import DriveSettings, Pictures, settings_of
 from planners.drive.starts import LOGGED
 from planners.drive.summary import Row, differences_of, lines_of, summary_text, write_summary
 from planners.drive.table import FACTS, Committer, DriveRow, open_drives
-from planners.drive.work import Contender, DriveItem, DriveWork, NotDriven
+from planners.drive.work import Contender, DriveItem, DriveWork, NotDriven, reads_towns
 from planners.evaluation.planner_names import planners_of
+from tasks.render.scene import engine
+from tasks.render.splatting.gsplat_backend import BackendMissing
 
 SHOWN_FAILURES = 5
 
@@ -46,10 +48,17 @@ SHOWN_FAILURES = 5
 def drive_all(settings: DriveSettings) -> tuple[list[Row], list[NotDriven]]:
     """Drive what is not driven yet: the rows of all that were asked for, by planner and clip, and what could not be.
 
-    Raises ConfigError, Stopped where it was interrupted, WorkerDied, AnotherWriter.
+    Raises ConfigError, Halted where it was interrupted, WorkerDied, AnotherWriter.
     """
     contenders = _contenders(settings)
     reader, index = open_reader(settings.clips)
+    if any("truth" in kinds for _, kinds in contenders) and not reads_towns(reader):
+        raise ConfigError("pictures=truth is the painter's of the synthetic town: give pictures=engine for these clips")
+    if any("engine" in kinds for _, kinds in contenders):
+        try:
+            engine.check(settings.render.backend)
+        except BackendMissing as error:
+            raise ConfigError(str(error)) from error
     out = Location.parse(settings.out)
     work = DriveWork(reader, choose_vocabulary(settings.vocabulary), settings, out)
     items = list(_items(work, index.refs[: settings.limit], contenders))

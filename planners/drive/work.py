@@ -8,12 +8,17 @@ from functools import lru_cache
 from typing import Any
 
 from factory.readers.base import BadClip, ClipReader, ClipRef
+from factory.readers.town.reader import SensedReader
+from factory.setup.settings import cache_folder
 from factory.store.identity import canonical_json
 from factory.store.location import Location
 from planners.drive.drivers import Driver, driver_of
 from planners.drive.eyes import Eyes, NoEyes
+from planners.drive.films import write_film
 from planners.drive.loop import DRIVE_VERSION, ClosedLoop, drive
 from planners.drive.measures import measures_of
+from planners.drive.painted import PaintedEyes, town_lights
+from planners.drive.rendered import RenderedEyes, rendered_eyes
 from planners.drive.settings import DriveSettings, Pictures
 from planners.drive.starts import LOGGED, DriveStart, lengthened, logged_start, perturbed_starts
 from planners.drive.table import DriveKey, DriveRow
@@ -113,7 +118,8 @@ class DriveWork:
 
     def _clip(self, item: DriveItem) -> Clip:
         last = NOW + HORIZON_STEPS if any(key.start != LOGGED for _, key in item.keys) else NOW
-        return lengthened(self.reader.read(item.ref), self.settings.loop.clip_steps(last))
+        clip, n_steps = self.reader.read(item.ref), self.settings.loop.clip_steps(last)
+        return lengthened(clip, n_steps, town_lights(clip, n_steps) if reads_towns(self.reader) else None)
 
     def _starts(self, clip: Clip, wanted: set[int]) -> dict[int, DriveStart]:
         found = [logged_start(clip)] if LOGGED in wanted else []
@@ -128,10 +134,20 @@ class DriveWork:
         return {start.number: start for start in found}
 
     def _eyes(self, clip: Clip, pictures: Pictures) -> Eyes:
-        return NoEyes()
+        if pictures == "engine":
+            return rendered_eyes(clip, self.settings.render, self.settings.cache or cache_folder(self.out.uri))
+        return PaintedEyes(clip, self.settings.render) if pictures == "truth" else NoEyes()
 
     def _driver(self, who: Contender) -> Driver:
         return _kept_driver(who, canonical_json(self.settings.settings), self.settings.pdm, self.settings.device)
+
+    def _film(self, who: Contender, key: DriveKey, made: ClosedLoop, eyes: Eyes) -> str:
+        """One drive in so many has one, chosen by its id."""
+        one_in = self.settings.one_film_in
+        if one_in == 0 or int(key.drive_id, 16) % one_in:
+            return ""
+        start = "log" if key.start == LOGGED else f"start {key.start}"
+        return write_film(self.out, key.drive_id, made, eyes.rig, f"{who.label}, {key.pictures}, {start}")
 
     def _row(self, who: Contender, key: DriveKey, made: ClosedLoop, eyes: Eyes) -> DriveRow:
         clip, hit = made.start.scene.clip, made.hit
@@ -149,16 +165,21 @@ class DriveWork:
             planner=who.label,
             planner_digest=who.digest,
             pictures=key.pictures,
-            psnr_db=math.nan,
+            psnr_db=eyes.asset.psnr_db if isinstance(eyes, RenderedEyes) else math.nan,
             ended=str(made.ended),
             hit_track="" if hit is None else hit.track_id,
             hit_kind="" if hit is None else hit.kind,
             hit_speed_mps=math.nan if hit is None else hit.speed_mps,
-            film="",
+            film=self._film(who, key, made, eyes),
             settings=key.settings,
             ego_states=tuple(map(tuple, made.ego_states.tolist())),
             plans=tuple(map(tuple, made.plans.reshape(len(made.plans), -1).tolist())),
         )
+
+
+def reads_towns(reader: ClipReader) -> bool:
+    """Whether a reader's logs are of the synthetic town, whose painter can be asked for more."""
+    return isinstance(reader, SensedReader)
 
 
 @lru_cache(maxsize=8)
