@@ -10,6 +10,7 @@ import numpy as np
 from factory.store.location import Location
 from factory.store.reader import decoded
 from factory.views.bev import BACKGROUND, EXPERT, LOGGED, PERTURBED, Boxes, DrawnPath, draw_bev, write, write_mp4
+from factory.views.board.drives import FILMS
 from factory.views.drawing import map_shapes
 from factory.views.sample_picture import fitted, front_camera
 from planners.drive.loop import PLAN_STEPS, ClosedLoop
@@ -18,7 +19,6 @@ from tasks.world.arrays import Image
 from tasks.world.clip import STEP_S
 from tasks.world.vehicle import HEADING, VX
 
-FILMS = "films"  # folder under `out`
 BEV_PX, CAMERA_PX = (560, 560), (720, 405)  # width, height
 HOLD = 10  # pictures that the end is shown for
 
