@@ -40,7 +40,9 @@ ROOMS = {
         *("exports", "graph", "stages", "setup", "imports", "views", "views.board"),
         *("run", "commands", "__main__"),
     ),
-    "planners": ("command", "data", "models", "training", "published", "evaluation", "navsim", "study", "__main__"),
+    "planners": (
+        *("command", "data", "models", "training", "published", "evaluation", "drive", "navsim", "study", "__main__"),
+    ),
 }
 MOST_MODULES = 20  # in a room
 

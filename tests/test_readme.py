@@ -32,6 +32,7 @@ from factory.readers.town.reader import SyntheticReader
 from factory.run import main as run_main
 from factory.stages.warm import PARTS
 from planners.__main__ import main as planners_main
+from planners.drive.settings import settings_of as drive_settings
 from planners.evaluation.analysis import AnalysisSettings
 from planners.evaluation.compare import CompareSettings
 from planners.evaluation.compare import main as compare_main
@@ -205,6 +206,8 @@ def test_every_command_is_one_its_program_takes(
             fill(Recipe, compose(name, arguments), name)
         case ["python", "-m", "planners", "replay", *arguments]:
             replay_settings(arguments)
+        case ["python", "-m", "planners", "drive", *arguments] | ["python", "-m", "planners.drive", *arguments]:
+            drive_settings(arguments)
         case ["python", "-m", "planners", "study", *arguments]:
             fill(StudySettings, compose("study", arguments), "study")
         case ["python", "-m", "planners", "report", *arguments]:

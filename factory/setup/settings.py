@@ -136,7 +136,7 @@ def assemble(config: RunConfig) -> Run:
         render=config.render,
         seed=config.seed,
         identity=identity_of(config, vocabulary, labelling),
-        cache_dir=cache_folder(config),
+        cache_dir=cache_folder(config.out),
         photos_alone=photos_alone(config),
     )
     return Run(config, reader, index, work)
@@ -255,8 +255,8 @@ def identity_of(config: RunConfig, vocabulary: Vocabulary, labelling: Labelling 
     return RunIdentity(settings, versions, vocabulary.digest, digest if simulates(config) else UNLISTED)
 
 
-def cache_folder(config: RunConfig) -> str:
+def cache_folder(out: str) -> str:
     """Where blocks and tables are kept: beside the run's tables when `out` is a folder, else in the user's cache."""
-    if "://" in config.out:
+    if "://" in out:
         return str(user_cache() / "assets")
-    return str(Path(config.out).absolute() / "cache")
+    return str(Path(out).absolute() / "cache")

@@ -160,7 +160,7 @@ class Imaging:
             lifted = asset.lifted(agents, first_of(clip))
             images = render_views(asset, cameras, poses, lifted, *seen[3:], self.settings.backend)
         found = [
-            self._image(camera.name, offset * STEP_S, poses[f], images[f, c])
+            self.image(camera.name, offset * STEP_S, poses[f], images[f, c])
             for f, offset in enumerate(offsets)
             for c, camera in enumerate(cameras)
         ]
@@ -168,7 +168,7 @@ class Imaging:
         measured: dict[str, object] = {}
         if asset is not None:
             measured = {"asset_digest": asset.digest, "psnr": asset.psnr_db if np.isfinite(asset.psnr_db) else None}
-        return {"cameras": self._rig(cameras), "images": found, "image_source": str(source), **measured}
+        return {"cameras": self.rig(cameras), "images": found, "image_source": str(source), **measured}
 
     def _photos(self, clip: Clip, judged: Judged, cameras: Sequence[Camera]) -> dict[str, object]:
         now_s = judged.scene.step * STEP_S
@@ -180,12 +180,13 @@ class Imaging:
         photos = load_photos(files, cameras, self.settings.width, self.settings.height)
         poses = {(file.sensor, file.time_s): file.world_from_ego for file in files}
         found = [
-            self._image(photo.camera, photo.time_s - now_s, poses[photo.camera, photo.time_s], photo.rgb)
+            self.image(photo.camera, photo.time_s - now_s, poses[photo.camera, photo.time_s], photo.rgb)
             for photo in photos
         ]
-        return {"cameras": self._rig(cameras), "images": found, "image_source": str(ImageSource.PHOTO)}
+        return {"cameras": self.rig(cameras), "images": found, "image_source": str(ImageSource.PHOTO)}
 
-    def _image(self, camera: str, time_s: float, pose: Array, rgb: Bytes) -> dict[str, object]:
+    def image(self, camera: str, time_s: float, pose: Array, rgb: Bytes) -> dict[str, object]:
+        """An entry of the column `images`: `time_s` from now, of the ego at `pose` (4, 4), rgb (H, W, 3)."""
         return {
             "camera": camera,
             "time_s": float(time_s),
@@ -193,7 +194,7 @@ class Imaging:
             "jpeg": encode_jpeg(rgb, self.settings.jpeg_quality, self.settings.jpeg_chroma),
         }
 
-    def _rig(self, cameras: Sequence[Camera]) -> list[dict[str, object]]:
+    def rig(self, cameras: Sequence[Camera]) -> list[dict[str, object]]:
         """The pinholes the images were drawn with: resized, without distortion."""
         resized = [camera.resized(self.settings.width, self.settings.height) for camera in cameras]
         return [

@@ -27,6 +27,7 @@ _ARROW = {
 
 _ARROW_OF = {  # type of a dataclass' field -> of its column
     str: pa.string(),
+    bool: pa.bool_(),
     int: pa.int32(),
     float: pa.float64(),
     dict[str, int]: pa.map_(pa.string(), pa.int64()),

@@ -20,7 +20,7 @@ import hashlib
 import inspect
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -51,10 +51,15 @@ class EvaluatedPlanner:
     digest: str  # the same digest plans the same
     load: Callable[[], Any] | None = None  # with one of the faces above; None: privileged
     privileged: Privileged | None = None
+    spec: str = ""  # that named it
 
 
 def planner_of(spec: str, label: str | None = None, changed: Mapping[str, Any] | None = None) -> EvaluatedPlanner:
     """Who `spec` names; changed: settings of trained planners, see load_planner. Raises ConfigError for nobody."""
+    return replace(_named(spec, label, changed), spec=spec)
+
+
+def _named(spec: str, label: str | None, changed: Mapping[str, Any] | None) -> EvaluatedPlanner:
     name = label or spec.strip("/").replace("/", "_").replace(":", ".")
     plugin = installed("planner", spec, [*PRIVILEGED, *BUILT_IN])
     if plugin is not None:

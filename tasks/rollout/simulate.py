@@ -137,10 +137,13 @@ def simulate(scene: Scene, poses: Array, settings: TrafficSettings) -> Rollout:
     return roll_out(prepare_traffic(scene, settings), track(scene.ego_state, np.asarray(poses)[None])[0])
 
 
-def roll_out(traffic: TrafficScene, ego_states: Array) -> Rollout:
-    """The traffic's answer to an ego whose states (41, 11) are known. ValueError where they are none."""
+def roll_out(traffic: TrafficScene, ego_states: Array, steps: int = HORIZON_STEPS) -> Rollout:
+    """The traffic's answer to an ego whose states (41, 11) are known. ValueError where they are none.
+
+    steps: of the rollout that are to happen: `simulated` names who is moved by IDM in those, not who would be later.
+    """
     _check_states(ego_states[None], HORIZON_STEPS + 1)
-    return Rollout(traffic.scene.step, ego_states, *_answer(traffic, ego_states))
+    return Rollout(traffic.scene.step, ego_states, *_answer(traffic, ego_states, steps))
 
 
 def roll_on(traffic: TrafficScene, ego_states: Array) -> AgentTracks:
@@ -150,11 +153,11 @@ def roll_on(traffic: TrafficScene, ego_states: Array) -> AgentTracks:
     are. ValueError where the states are none.
     """
     _check_states(ego_states[None], len(ego_states))
-    return _answer(traffic, ego_states)[0]
+    return _answer(traffic, ego_states, HORIZON_STEPS)[0]
 
 
-def _answer(traffic: TrafficScene, ego_states: Array) -> tuple[AgentTracks, Bools]:
-    """The tracks of T rows around an ego with states (T, 11), and who was driven (N,)."""
+def _answer(traffic: TrafficScene, ego_states: Array, steps: int) -> tuple[AgentTracks, Bools]:
+    """The tracks of T rows around an ego with states (T, 11), and who was driven in the first `steps` (N,)."""
     start, n_rows = traffic.scene.step, len(ego_states)
     window = _lasting(traffic.scene.agents, start + n_rows).window(start, start + n_rows)
     if traffic.navsim is not None:
@@ -163,7 +166,7 @@ def _answer(traffic: TrafficScene, ego_states: Array) -> tuple[AgentTracks, Bool
         return window, np.zeros(len(window), dtype=bool)
     rows, motion = drive(*_script(traffic, window), *_ego_boxes(ego_states), _yielding(traffic))
     n = len(window)
-    return replace(window, **{name: getattr(rows, name)[:, :n].copy() for name in PER_STEP}), motion.was_driven[-1]
+    return replace(window, **{name: getattr(rows, name)[:, :n].copy() for name in PER_STEP}), motion.was_driven[steps]
 
 
 def _lasting(agents: AgentTracks, n_steps: int) -> AgentTracks:
@@ -258,13 +261,14 @@ def _ego_boxes(ego_states: Array) -> tuple[Array, Array]:
 def next_scene(scene: Scene, rollout: Rollout, centerline: Array, steps: int = HORIZON_STEPS) -> Scene:
     """The scene `steps` of 0.1 s into a rollout: the rollout's world up to then, the log after it.
 
-    centerline (P, 3): the route ahead of the ego's new pose; steps: at least as many as a scene has history.
+    centerline (P, 3): the route ahead of the ego's new pose.
     """
     moved = rollout.simulated if scene.ever_simulated is None else rollout.simulated | scene.ever_simulated
+    driven = np.concatenate([scene.ego_history, rollout.ego_states[1 : steps + 1]])
     return Scene(
         clip=scene.clip,
         step=rollout.start_step + steps,
-        ego_history=rollout.ego_states[steps + 1 - len(scene.ego_history) : steps + 1],
+        ego_history=driven[-len(scene.ego_history) :],
         agents=scene.agents.overwritten(rollout.start_step, rollout.agents.window(0, steps + 1)),
         centerline=centerline,
         ever_simulated=moved,

@@ -5,6 +5,8 @@ Nothing finer than a pixel may be left in a picture: it would shimmer from photo
 from photos could tell how. One shading per pixel differs by 30 to 36 dB from the picture with 64, four by 35 to 40.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from factory.readers.town.drive import TownDrive
@@ -14,6 +16,7 @@ from factory.readers.town.raster import Mesh, rasterise
 from factory.readers.town.scenery import Scenery, lamps_lit
 from factory.readers.town.shade import LitScene, Sun, shade
 from factory.readers.town.textures import TREELINE
+from factory.readers.town.traffic import TownTrack
 from tasks.world.arrays import F32, Array, Bytes, ShortInts
 from tasks.world.camera import Camera
 
@@ -61,13 +64,17 @@ class Theatre:
     def at(self, step: int) -> LitScene:
         """The scene at a step of the drive."""
         drive = self._drive
+        return self.among(drive.tracks, step, drive.ego[step, :2], float(drive.times_s[step]))
+
+    def among(self, tracks: Sequence[TownTrack], step: int, around: Array, time_s: float) -> LitScene:
+        """The scene with these tracks where they are at a step, those near a place (2,), and the lights of a time."""
         moving = [
             figure(track, step)
-            for track in drive.tracks
-            if np.hypot(*(track.poses[step, :2] - drive.ego[step, :2])) < MOVING_RANGE_M  # false where absent (NaN)
+            for track in tracks
+            if np.hypot(*(track.poses[step, :2] - around)) < MOVING_RANGE_M  # false where absent (NaN)
         ]
         for lamps, group in zip(self._scenery.lamps, self._scenery.lamp_groups, strict=True):
-            moving.append(lamps_lit(lamps, drive.signals.state(int(group), float(drive.times_s[step]))))
+            moving.append(lamps_lit(lamps, self._drive.signals.state(int(group), time_s)))
         actors, standing = merged(moving), self._standing
         shadow = standing.shadow.copy()
         cast(shadow, actors, standing.sun)

@@ -7,7 +7,9 @@
 | `/api/samples?page=1&size=12&order=newest&expert=...` | factory.views.board.gallery.gallery; filters: FILTERS there |
 | `/api/samples/<attempt_id>` | factory.views.board.gallery.whole |
 | `/api/failed?page=1` | factory.views.board.gallery.failures |
+| `/api/drives` | factory.views.board.drives.told |
 | `/picture/<attempt_id>/<name>.jpg` | a JPEG, see factory.views.board.pictures |
+| `/film/<drive_id>.mp4` | a planner's drive as a film |
 | `/episode/<attempt_id>.mcap` | the sample for Foxglove, Lichtblick or Rerun |
 
 Answers of /api/ are the JSON that the named functions return; an error is `{"error": why}` with 400 (a
@@ -30,6 +32,7 @@ from deltalake.exceptions import DeltaError
 
 from factory.store.samples import ChangedRun, Store
 from factory.views.board.connections import Connections
+from factory.views.board.drives import Drives, told
 from factory.views.board.gallery import BadRequest, NotThere, failures, gallery, whole
 from factory.views.board.overview import overview
 from factory.views.board.pictures import Pictures
@@ -70,6 +73,7 @@ class Board:
         self.watch = Watch(store, look_every_s)
         self._store = store
         self._pictures = Pictures(store)
+        self._drives = Drives(store.location)
 
     def answer(self, target: str) -> Answer:
         """The answer to GET `target`, path and query."""
@@ -105,6 +109,13 @@ class Board:
                 return _json(whole(shot, attempt_id, row, self._store.candidates))
             case ["api", "failed"]:
                 return _json(failures(self.watch.now(), _number(query, "page", 1)))
+            case ["api", "drives"]:
+                return _json(told(self._drives.rows()))
+            case ["film", name]:
+                film = self._drives.film(_checked(name.removesuffix(".mp4")))
+                if film is None:
+                    raise NotThere(f"no film {name}")
+                return Answer(200, "video/mp4", film, FOREVER)
             case ["picture", attempt_id, name]:
                 return self._picture(_checked(attempt_id), name, query)
             case ["episode", name]:

@@ -12,10 +12,18 @@ from numba.extending import register_jitable
 
 from tasks.kernels.compiled import kernel
 from tasks.reward.rules.ego import checked
-from tasks.reward.rules.smooth import jerk_of, plan_yaw_accel_of, smooth_accel, unwrap, yaw_accel_of, yaw_rate_of
+from tasks.reward.rules.smooth import (
+    JERK_WEIGHTS,
+    jerk_of,
+    plan_yaw_accel_of,
+    smooth_accel,
+    unwrap,
+    yaw_accel_of,
+    yaw_rate_of,
+)
 from tasks.world.arrays import Array, Bools
 from tasks.world.clip import HORIZON_STEPS, STEP_S
-from tasks.world.vehicle import AX, AY, EGO_STATE_SIZE, HEADING, STEERING, YAW_ACCEL, YAW_RATE
+from tasks.world.vehicle import AX, AY, EGO_STATE_SIZE, HEADING, PACIFICA, STEERING, YAW_ACCEL, YAW_RATE
 
 # (6, 2): longitudinal, lateral acceleration [m/s2]; jerk; longitudinal jerk [m/s3]; yaw acceleration; yaw rate
 LIMITS = np.array([(-4.05, 2.40), *((-most, most) for most in (4.89, 8.37, 4.13, 1.93, 0.95))])
@@ -25,6 +33,7 @@ PAST_PERIOD_STEPS = 5  # the history comes at 2 Hz
 HISTORY_ROWS = 14  # -1.5 .. -0.2 s: the row at -0.1 s is missing in the public metric
 HISTORY_START = -15  # step of the first row
 N_FLAGS = 6
+LONGEST_FILTER = len(JERK_WEIGHTS)  # samples
 _SCRATCH_ROWS = N_FLAGS + 4
 
 
@@ -71,14 +80,7 @@ def comfort_along(
     before = len(history)
     _load(history, rear_axle_to_center, lon[:before], lat[:before], magnitude[:before], heading[:before])
     _load(states, rear_axle_to_center, lon[before:], lat[before:], magnitude[before:], heading[before:])
-    unwrap(heading)
-    smooth_accel(lon, judged[0])
-    smooth_accel(lat, judged[1])
-    smooth_accel(magnitude, lat)
-    jerk_of(lat, judged[2])
-    jerk_of(judged[0], judged[3])
-    yaw_accel_of(heading, judged[4])
-    yaw_rate_of(heading, judged[5])
+    _judge(lon, lat, magnitude, heading, judged)
     comfortable = True
     for f in range(N_FLAGS):
         flags[f] = _all_within(judged[f], LIMITS[f, 0], LIMITS[f, 1])
@@ -87,6 +89,19 @@ def comfort_along(
         return math.inf
     row = _first_beyond(judged)
     return float(row + HISTORY_START) if row < before else float(row - before)
+
+
+@kernel
+def _judge(lon: Array, lat: Array, magnitude: Array, heading: Array, judged: Array) -> None:
+    """The limited quantities (6, T) of a drive that is loaded; overwrites it."""
+    unwrap(heading)
+    smooth_accel(lon, judged[0])
+    smooth_accel(lat, judged[1])
+    smooth_accel(magnitude, lat)
+    jerk_of(lat, judged[2])
+    jerk_of(judged[0], judged[3])
+    yaw_accel_of(heading, judged[4])
+    yaw_rate_of(heading, judged[5])
 
 
 @kernel
@@ -117,6 +132,30 @@ def _first_beyond(judged: Array) -> int:
             if not (LIMITS[f, 0] < judged[f, t] and judged[f, t] < LIMITS[f, 1]):
                 return t
         t += 1
+
+
+def comfortable(states: Array) -> Bools:
+    """(T,) whether each instant of a drive (T, 11) of any length keeps the six limits of history comfort.
+
+    Raises ValueError where the drive is shorter than the longest filter, 1.5 s.
+    """
+    if states.ndim != 2 or states.shape[1] != EGO_STATE_SIZE or len(states) < LONGEST_FILTER:
+        raise ValueError(f"states must be (T >= {LONGEST_FILTER}, {EGO_STATE_SIZE}), got {states.shape}")
+    within = np.ones(len(states), dtype=np.bool_)
+    _within_limits(np.ascontiguousarray(states, np.float64), PACIFICA.rear_axle_to_center, within)
+    return within
+
+
+@kernel
+def _within_limits(states: Array, rear_axle_to_center: float, within: Bools) -> None:
+    n = len(states)
+    scratch = np.empty((_SCRATCH_ROWS, n))
+    judged, lon, lat, magnitude, heading = scratch[:N_FLAGS], scratch[6], scratch[7], scratch[8], scratch[9]
+    _load(states, rear_axle_to_center, lon, lat, magnitude, heading)
+    _judge(lon, lat, magnitude, heading, judged)
+    for t in range(n):
+        for f in range(N_FLAGS):
+            within[t] &= LIMITS[f, 0] < judged[f, t] and judged[f, t] < LIMITS[f, 1]
 
 
 @dataclass(frozen=True)

@@ -84,6 +84,26 @@ def test_who_was_driven_once_stays_so_also_where_a_later_rollout_drives_others()
     assert after.ever_simulated is not None and after.ever_simulated.tolist() == [True, True, False]
 
 
+def test_half_a_second_into_a_rollout_the_ego_s_history_is_of_before_and_since() -> None:
+    scene = worlds.scene(worlds.straight_road(), Track(0.0, speed=8.0), ego=(30.0, 0.0, 0.0))
+    rollout = run(scene)
+    after = next_scene(scene, rollout, scene.centerline, steps=5)
+    assert after.step == scene.step + 5
+    np.testing.assert_array_equal(after.ego_history[:11], scene.ego_history[5:])
+    np.testing.assert_array_equal(after.ego_history[11:], rollout.ego_states[1:6])
+    np.testing.assert_array_equal(after.agents.boxes[NOW + 1 : NOW + 6], rollout.agents.boxes[1:6])
+
+
+def test_who_would_be_driven_later_is_not_when_the_rollout_is_left_before() -> None:
+    """A car that waits at a junction until its log starts, 2 s from now."""
+    waits = np.column_stack([np.full(CLIP_STEPS, 20.0), np.zeros(CLIP_STEPS), np.zeros(CLIP_STEPS)])
+    waits[NOW + 20 :, 0] += 0.8 * np.arange(CLIP_STEPS - NOW - 20)
+    scene = worlds.scene(worlds.straight_road(), Track(0.0, poses=waits))
+    states, traffic = run(scene).ego_states, prepare_traffic(scene, IDM)
+    assert roll_out(traffic, states).simulated.tolist() == [True]
+    assert roll_out(traffic, states, 5).simulated.tolist() == [False]
+
+
 def test_a_car_leaves_its_first_segment_and_takes_the_fork_its_log_takes() -> None:
     turn = np.column_stack([np.linspace(28.5, 60, 30), np.zeros(30), np.zeros(30)])
     arc = np.radians(np.linspace(0, 90, 30))

@@ -6,8 +6,8 @@ import { extraSections } from "./extra.js";
 import { card } from "./gallery.js";
 
 export async function overviewPage() {
-  const [o, newest] = await Promise.all([ask("/api/overview"), ask("/api/samples?size=6&simulated=1")]);
-  return [header(o), looks(newest), funnel(o), balance(o), acceptance(o), reasons(o), throughput(o), times(o), coverage(o), trouble(o), gates(o), ...extraSections()];
+  const [o, newest, driven] = await Promise.all([ask("/api/overview"), ask("/api/samples?size=6&simulated=1"), ask("/api/drives")]);
+  return [header(o), looks(newest), drives(driven), funnel(o), balance(o), acceptance(o), reasons(o), throughput(o), times(o), coverage(o), trouble(o), gates(o), ...extraSections()];
 }
 
 function header(o) {
@@ -58,6 +58,25 @@ function looks(newest) {
   const cards = newest.items.map((item) => card(item));
   return section("What it looks like", lead, cards.length ? h("div", { class: "cards looks" }, cards) : h("p", { class: "nothing" }, "There is no simulated sample yet."),
     h("p", null, h("a", { href: "#/gallery" }, "All samples")));
+}
+
+function drives(d) {
+  if (!d.total) return null;
+  const lines = d.lines.map((l) =>
+    h("tr", { "data-driver": [l.planner, l.pictures, l.start].join(" ") },
+      h("th", { scope: "row" }, l.planner, h("small", null, `${l.start}${l.pictures === "none" ? "" : `, ${l.pictures}`}`)),
+      h("td", { class: "n" }, count(l.drives)), h("td", null, bar(l.route_completed, percent(l.route_completed))),
+      h("td", { class: "n" }, percent(l.at_fault_collision)), h("td", { class: "n" }, percent(l.off_road)), h("td", { class: "n roomy" }, percent(l.comfortable)),
+      h("td", { class: "n roomy" }, l.m_between_failures === null ? `> ${count(Math.round(1000 * l.km))}` : count(Math.round(l.m_between_failures)))));
+  const each = d.drives.map((r) =>
+    h("tr", { "data-drive": r.drive_id },
+      h("th", { scope: "row" }, r.planner, h("small", null, `${r.log_id}${r.start < 0 ? "" : `, start ${r.start}`}`)),
+      h("td", null, r.at_fault_collision ? `hit a ${r.hit_kind.toLowerCase()}` : r.ended.replace("_", " ")),
+      h("td", { class: "n" }, percent(r.route_completed)), h("td", { class: "n roomy" }, span(r.duration_s)),
+      h("td", null, r.film ? h("a", { href: `/film/${r.drive_id}.mp4` }, "film") : "")));
+  return section("Planners in closed loop", "Each plans twice a second and drives on among traffic that answers, until a collision, the end of the road or of the known scene, or its time is up. Intervals: summary.csv.",
+    table("drivers", ["planner", "drives", "route completed", "at fault", "off road", "comfortable*", "m between failures*"], lines),
+    h("details", null, h("summary", null, `The drives, those that failed first`), table("drives", ["drive", "ended", "route", "time*", ""], each)));
 }
 
 function funnel(o) {

@@ -1,0 +1,151 @@
+"""`python -m planners drive planner=<who>`: closed loop, from logged or perturbed starts until something ends it.
+
+    python -m planners drive planner=runs/ltf
+    python -m planners drive planner=runs/ltf pictures=[truth,engine] perturbed=2 films=all out=runs/drives
+    python -m planners drive clips=av2 clips.root=/data/av2/val planners=[runs/a,runs/b] pictures=engine executor=ray
+
+Who may stand under `planner=`, planners/evaluation/planner_names.py says. Every 0.5 s the planner looks and plans, its
+plan is followed at 10 Hz, the traffic answers. A drive ends with a collision, at the road's end, `bound_m` from where
+the log's sensors were, after `seconds`, and the human's own with its log. docs/driving.md says what is measured.
+
+    out/drives          a Delta table, one row a drive; what stands there is not driven again
+    out/summary.csv     all planners of this command, with intervals
+    out/differences.csv what the engine's pictures change, of planners that drove with both
+    out/films           MP4 files, as many as films= says
+
+Exit codes: 0 complete, 2 settings or files that do not fit, 3 some drives could not be made, 4 interrupted, and the
+same command goes on.
+"""
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+from factory.config.compose import ConfigError, need_run_extra
+from factory.graph.each import WorkerDied, each
+from factory.graph.progress import Counter
+from factory.graph.work import Halted
+from factory.readers.base import ClipRef
+from factory.setup.settings import choose_vocabulary, open_reader
+from factory.store.location import Location
+from factory.store.table import AnotherWriter, KeyedTable
+from planners.command import Failed, Stopped, command
+from planners.drive.drivers import driver_of
+from planners.drive.settings import DriveSettings, Pictures, settings_of
+from planners.drive.starts import LOGGED
+from planners.drive.summary import Row, differences_of, lines_of, summary_text, write_summary
+from planners.drive.table import FACTS, Committer, DriveRow, open_drives
+from planners.drive.work import Contender, DriveItem, DriveWork, NotDriven, reads_towns
+from planners.evaluation.planner_names import planners_of
+from tasks.render.scene import engine
+from tasks.render.splatting.gsplat_backend import BackendMissing
+
+SHOWN_FAILURES = 5
+
+
+def drive_all(settings: DriveSettings) -> tuple[list[Row], list[NotDriven]]:
+    """Drive what is not driven yet: the rows of all that were asked for, by planner and clip, and what could not be.
+
+    Raises ConfigError, Halted where it was interrupted, WorkerDied, AnotherWriter.
+    """
+    contenders = _contenders(settings)
+    reader, index = open_reader(settings.clips)
+    if any("truth" in kinds for _, kinds in contenders) and not reads_towns(reader):
+        raise ConfigError("pictures=truth is the painter's of the synthetic town: give pictures=engine for these clips")
+    if any("engine" in kinds for _, kinds in contenders):
+        try:
+            engine.check(settings.render.backend)
+        except BackendMissing as error:
+            raise ConfigError(str(error)) from error
+    out = Location.parse(settings.out)
+    work = DriveWork(reader, choose_vocabulary(settings.vocabulary), settings, out)
+    items = list(_items(work, index.refs[: settings.limit], contenders))
+    table = open_drives(out)
+    table.claim()
+    failed = [NotDriven(ref.clip_id, why) for ref, why in index.broken.items()]
+    failed += _drive(work, items, table)
+    label_of = {key.drive_id: who.label for item in items for who, key in item.keys}
+    found = {row["drive_id"]: row for row in table.read(FACTS).to_pylist()}
+    rows = [found[drive_id] | {"planner": label} for drive_id, label in label_of.items() if drive_id in found]
+    order = [who.label for who, _ in contenders]
+    return sorted(rows, key=lambda row: order.index(row["planner"])), failed
+
+
+def _contenders(settings: DriveSettings) -> list[tuple[Contender, tuple[Pictures, ...]]]:
+    """Who drives, and which pictures each is shown. Raises ConfigError for nobody."""
+    found: list[tuple[Contender, tuple[Pictures, ...]]] = []
+    for one in planners_of(settings.planner, settings.planners, settings.bounds, settings.settings):
+        looks = driver_of(one, settings.pdm).needs_pictures
+        found.append((Contender(one.label, one.spec, one.digest), settings.pictures if looks else ("none",)))
+    return found
+
+
+def _items(
+    work: DriveWork, refs: Sequence[ClipRef], contenders: Sequence[tuple[Contender, tuple[Pictures, ...]]]
+) -> Iterator[DriveItem]:
+    """All drives of a clip that see the same are one item: its world is at hand once."""
+    settings = work.settings
+    starts = ([LOGGED] if settings.logged else []) + list(range(settings.perturbed))
+    kinds = list(dict.fromkeys(kind for _, kinds in contenders for kind in kinds))
+    for ref in refs:
+        for kind in kinds:
+            who = [one for one, seen in contenders if kind in seen]
+            keys = [(one, work.key_of(ref, start, one, kind)) for start in starts for one in who]
+            yield DriveItem(ref, kind, tuple(keys))
+
+
+def _drive(work: DriveWork, items: Sequence[DriveItem], table: KeyedTable) -> list[NotDriven]:
+    """Make the drives that the table does not hold and commit them as they come; those that could not be made."""
+    done = set(table)
+    waiting = [replace(item, keys=left) for item in items if (left := item.missing(done))]
+    total = sum(len(item.keys) for item in items)
+    failed: list[NotDriven] = []
+    settings, rows = work.settings, Committer(table)
+    n_done = total - sum(len(item.keys) for item in waiting)
+    try:
+        with (
+            Counter("drives", total, before=n_done) as progress,
+            closing(each(work, waiting, settings.executor, settings.workers, work.out)) as results,
+        ):
+            for made in results:
+                rows.add(row for row in made if isinstance(row, DriveRow))
+                failed += [row for row in made if isinstance(row, NotDriven)]
+                n_done += len(made)
+                progress.show(n_done)
+    finally:
+        rows.close()
+    return failed
+
+
+def drive_command(argv: Sequence[str]) -> None:
+    """Drive and print what a command line asks for. Raises ConfigError, Failed, Stopped."""
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    settings = settings_of(argv)
+    if settings.executor == "ray":
+        need_run_extra("ray")
+    try:
+        rows, failed = drive_all(settings)
+    except (Halted, KeyboardInterrupt) as error:
+        raise Stopped("interrupted; what is driven is kept, and the same command goes on") from error
+    except (WorkerDied, AnotherWriter) as error:
+        raise Failed(str(error)) from error
+    if rows:
+        lines, apart = lines_of(rows, settings.confidence), differences_of(rows, settings.confidence)
+        print(summary_text(lines, apart, settings.confidence))
+        if work_folder := local_folder(settings.out):
+            write_summary(work_folder, lines, apart)
+            print(f"look at {work_folder}")
+    if failed:
+        shown = "; ".join(f"clip {one.clip_id}: {one.why}" for one in failed[:SHOWN_FAILURES])
+        raise Failed(f"{len(failed)} drives or clips could not be driven: {shown}")
+
+
+def local_folder(out: str) -> Path | None:
+    """Where tables of numbers go; None on an object store, whose table of drives says all."""
+    place = Location.parse(out)
+    return Path(place.uri) if place.is_local else None
+
+
+main = command(drive_command)

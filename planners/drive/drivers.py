@@ -1,0 +1,107 @@
+"""Who drives: the log's own drive, PDM-Closed, and every planner that `planners evaluate` knows."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any, Protocol
+
+import numpy as np
+
+from factory.store.reader import Sample
+from planners.evaluation.planner_names import EvaluatedPlanner, needs_of
+from planners.evaluation.planning import plans_of
+from planners.evaluation.scoring import human_plans, pdm_plans
+from tasks.experts.pdm_closed.planner import PdmClosed
+from tasks.experts.pdm_closed.settings import PdmSettings
+from tasks.experts.protocol import Plan
+from tasks.world.arrays import Array
+from tasks.world.chance import stream
+from tasks.world.clip import HORIZON_STEPS, STEP_S, Scene
+from tasks.world.frames import to_world
+from tasks.world.vehicle import HEADING, VX
+
+
+class DriveEnd(StrEnum):
+    """Why a drive ended."""
+
+    COLLISION = "collision"  # the ego's body touched another, whoever is to blame
+    ROAD_END = "road_end"  # the front bumper is at the end of the route's last lane
+    SCENE_END = "scene_end"  # farther than `bound_m` from all places that the log's sensors were at
+    TIME = "time"  # `seconds` are over
+    LOG_END = "log_end"  # of the log's own drive, which is known no further
+    NO_PLAN = "no_plan"  # the expert found none
+
+
+MakeSample = Callable[[], Sample]  # a sample's row of the scene, with pictures where there are cameras
+
+
+class Driver(Protocol):
+    """Plans anew every 0.5 s. Pure: the same scene, seen the same way, gives the same plan."""
+
+    @property
+    def needs_pictures(self) -> bool:
+        """Whether its plans depend on pictures."""
+        ...
+
+    def plan(self, scene: Scene, look: MakeSample) -> Array | DriveEnd:
+        """(40, 3) world poses at 0.1 .. 4.0 s; or why it drives no further. Raises ValueError for what is no plan."""
+        ...
+
+
+@dataclass(frozen=True)
+class HumanDriver:
+    """Follows the log pose by pose, at the times of the log, wherever it has come to itself."""
+
+    needs_pictures: bool = False
+
+    def plan(self, scene: Scene, look: MakeSample) -> Array | DriveEnd:
+        """Beyond the log's last pose straight on at its last speed, which the tracker looks at for its last second."""
+        ahead = scene.clip.ego_states[scene.step + 1 :]
+        if len(ahead) == 0:
+            return DriveEnd.LOG_END
+        poses = ahead[:HORIZON_STEPS, : HEADING + 1]
+        further = np.arange(1, HORIZON_STEPS - len(poses) + 1)[:, None] * STEP_S * ahead[-1, VX]
+        straight = np.concatenate([further, np.zeros((len(further), 2))], axis=1)
+        return np.concatenate([poses, to_world(poses[-1], straight)])
+
+
+@dataclass(frozen=True)
+class PdmClosedDriver:
+    """The privileged planner: sees the world's boxes and lights as they are now."""
+
+    settings: PdmSettings
+    needs_pictures: bool = False
+
+    def plan(self, scene: Scene, look: MakeSample) -> Array | DriveEnd:
+        """NO_PLAN where the route ahead has no length."""
+        made = PdmClosed(self.settings).plan(scene, stream(0, scene.clip.clip_id, "drive"))
+        return made.poses if isinstance(made, Plan) else DriveEnd.NO_PLAN
+
+
+@dataclass(frozen=True)
+class PlannerDriver:
+    """A planner with one of the faces of planners.evaluation.planner_names."""
+
+    made: Any
+    device: str = "cpu"
+
+    @property
+    def needs_pictures(self) -> bool:
+        """Where it takes samples itself it may look at them."""
+        needs = needs_of(self.made)
+        return needs is None or needs.image is not None
+
+    def plan(self, scene: Scene, look: MakeSample) -> Array | DriveEnd:
+        """Raises ValueError, naming the sample, for what is no plan."""
+        return to_world(scene.ego_state[: HEADING + 1], plans_of(self.made, [look()], self.device)[0])
+
+
+def driver_of(one: EvaluatedPlanner, pdm: PdmSettings, device: str = "cpu") -> Driver:
+    """The driver that an evaluated planner is, its weights read."""
+    if one.privileged is human_plans:
+        return HumanDriver()
+    if one.privileged is pdm_plans:
+        return PdmClosedDriver(pdm)
+    assert one.load is not None
+    made = one.load()
+    return PlannerDriver(made.to(device) if hasattr(made, "to") else made, device)

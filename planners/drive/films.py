@@ -1,0 +1,82 @@
+"""A drive as a film at 10 Hz: from above, and what the front camera saw when the plan of the moment was made."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from factory.store.location import Location
+from factory.store.reader import decoded
+from factory.views.bev import BACKGROUND, EXPERT, LOGGED, PERTURBED, Boxes, DrawnPath, draw_bev, write, write_mp4
+from factory.views.board.drives import FILMS
+from factory.views.drawing import map_shapes
+from factory.views.sample_picture import fitted, front_camera
+from planners.drive.loop import PLAN_STEPS, ClosedLoop
+from planners.drive.measures import measures_of
+from tasks.world.arrays import Image
+from tasks.world.clip import STEP_S
+from tasks.world.vehicle import HEADING, VX
+
+BEV_PX, CAMERA_PX = (560, 560), (720, 405)  # width, height
+HOLD = 10  # pictures that the end is shown for
+
+
+Rig = Sequence[Mapping[str, Any]] | None  # the column `cameras`
+
+
+def write_film(out: Location, drive_id: str, made: ClosedLoop, rig: Rig, title: str) -> str:
+    """The film's file under `out`, written whole."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder, "drive.mp4")
+        write_mp4(path, pictures_of(made, rig, title))
+        out.child(FILMS).write(f"{drive_id}.mp4", path.read_bytes())
+    return f"{FILMS}/{drive_id}.mp4"
+
+
+def pictures_of(made: ClosedLoop, rig: Rig, title: str) -> Iterator[Image]:
+    """RGB pictures (560, 1280, 3), one each 0.1 s, the last several times."""
+    sheet = None
+    for step in range(made.n_steps + 1):
+        sheet = _sheet(made, rig, title, step)
+        yield sheet
+    if sheet is not None:
+        yield from [sheet] * HOLD
+
+
+def _sheet(made: ClosedLoop, rig: Rig, title: str, step: int) -> Image:
+    clip, pose = made.start.scene.clip, made.ego_states[step, : HEADING + 1]
+    ways = [
+        DrawnPath(clip.ego_states[made.start.scene.step :, : HEADING + 1], LOGGED, "logged", dashed=True),
+        DrawnPath(made.ego_states[: step + 1], PERTURBED, "driven"),
+    ]
+    planned = min(step // PLAN_STEPS, len(made.plans) - 1)
+    if planned >= 0:
+        ways.append(DrawnPath(made.plans[planned], EXPERT, "plan", dashed=True))
+    shapes = map_shapes(clip, made.start.scene.step + step)
+    boxes = Boxes(made.agents.boxes[step], made.agents.kinds)
+    bev = draw_bev(pose, shapes, boxes, pose, ways, f"{title}  t = {step * STEP_S:.1f} s", BEV_PX)
+    sheet = np.full((BEV_PX[1], BEV_PX[0] + CAMERA_PX[0], 3), BACKGROUND, np.uint8)
+    sheet[:, : BEV_PX[0]] = bev
+    images = made.looks[planned] if planned >= 0 else ()
+    front = front_camera({"images": images, "cameras": rig})
+    if front is not None:
+        seen = next(image for image in images if image["camera"] == front)
+        sheet[: CAMERA_PX[1], BEV_PX[0] :] = fitted(decoded(seen), *CAMERA_PX)
+    for row, line in enumerate(_lines(made, front, step, planned)):
+        write(sheet, line, (BEV_PX[0] + 12, CAMERA_PX[1] + 26 + 24 * row), 0.5)
+    return sheet
+
+
+def _lines(made: ClosedLoop, front: str | None, step: int, planned: int) -> list[str]:
+    seen = "sees no pictures" if front is None else f"camera {front} at {planned * PLAN_STEPS * STEP_S:.1f} s"
+    along = made.along_m[step] - made.along_m[0]
+    told = [seen, f"{made.ego_states[step, VX]:.1f} m/s  {along:.0f} of {made.road.length_m:.0f} m of the route"]
+    told.append("off the road" if made.off_road[step] else "")
+    if step == made.n_steps:
+        found, hit = measures_of(made), made.hit
+        whom = "" if hit is None else f": {hit.kind.lower()} {hit.track_id}, {'at' if hit.at_fault else 'not at'} fault"
+        told.append(f"ended: {made.ended}{whom}")
+        told.append(f"route {100.0 * found.route_completed:.0f} %, comfortable {100.0 * found.comfortable:.0f} %")
+    return told

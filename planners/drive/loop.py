@@ -1,0 +1,184 @@
+"""The closed loop: look, plan, follow the plan for 0.5 s among traffic that answers, and again.
+
+The plan is tracked at 10 Hz by the LQR on the kinematic bicycle that follows every plan here (docs/reward.md 1a); the
+traffic is prepared anew from where all have come to, as between the two stages of a sample. What ends a drive is looked
+at at every 0.1 s (DriveEnd). A collision is at the ego's fault by the rule of no at-fault collision; off the road is a
+body with a corner in no drivable area (docs/reward.md 2a, 2b).
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from planners.drive.drivers import DriveEnd, Driver
+from planners.drive.eyes import Eyes, Images, NoEyes, Sight
+from planners.drive.road import RouteAhead, distance_m, road_from
+from planners.drive.starts import DriveStart
+from tasks.reward.epdms import Scores, score
+from tasks.reward.prepare import prepare_scene
+from tasks.rollout.lqr import track
+from tasks.rollout.simulate import TrafficSettings, next_scene, prepare_traffic, roll_out
+from tasks.world.agents import AgentTracks
+from tasks.world.arrays import Array, Bools, Ints
+from tasks.world.boxes import ego_boxes, touching
+from tasks.world.clip import HORIZON_STEPS, STEP_S, Rollout
+from tasks.world.route import RouteFinder
+from tasks.world.vehicle import HEADING, PACIFICA, VX, VY, X, Y
+
+DRIVE_VERSION = 1  # raised by hand whenever the same start is driven otherwise
+PLAN_STEPS = 5  # of 0.1 s between two plans: 2 Hz
+NON_DRIVABLE = 1  # column of Scores.ego_areas
+
+
+@dataclass(frozen=True)
+class LoopSettings:
+    """What every drive depends on."""
+
+    seconds: float = 20.0  # after which a drive ends
+    bound_m: float = 30.0  # from the nearest place that the log's sensors were at
+    traffic: TrafficSettings = field(default_factory=TrafficSettings)
+
+    def __post_init__(self) -> None:
+        if not 0.5 <= self.seconds <= 600.0:
+            raise ValueError(f"seconds={self.seconds}: a drive lasts from 0.5 to 600 s")
+        if not 0.0 < self.bound_m < np.inf:
+            raise ValueError(f"bound_m={self.bound_m}: must be positive and finite [m]")
+
+    @property
+    def n_steps(self) -> int:
+        """Of 0.1 s, of the longest drive."""
+        return round(self.seconds / STEP_S)
+
+    def clip_steps(self, start_step: int) -> int:
+        """That a clip must have for drives from this step of it: a horizon is looked at beyond the last."""
+        return start_step + self.n_steps + PLAN_STEPS + HORIZON_STEPS + 1
+
+
+@dataclass(frozen=True)
+class Hit:
+    """What the ego's body touched."""
+
+    track_id: str
+    kind: str
+    at_fault: bool
+    speed_mps: float  # of the ego
+
+
+@dataclass(frozen=True)
+class ClosedLoop:
+    """A drive. S + 1 instants 0.1 s apart, the first of them the start's; P plans, the first made at the start."""
+
+    start: DriveStart
+    road: RouteAhead
+    ego_states: Array  # (S + 1, 11)
+    agents: AgentTracks  # S + 1 steps
+    off_road: Bools  # (S + 1,)
+    along_m: Array  # (S + 1,) arc length of the rear axle along the road
+    plans: Array  # (P, 40, 3) world
+    looks: tuple[Images, ...]  # (P,) what the cameras saw
+    ended: DriveEnd
+    hit: Hit | None
+
+    @property
+    def n_steps(self) -> int:
+        """S."""
+        return len(self.ego_states) - 1
+
+
+def drive(
+    start: DriveStart, driver: Driver, settings: LoopSettings | None = None, eyes: Eyes | None = None
+) -> ClosedLoop:
+    """Drive on from the start until something ends it.
+
+    eyes: the cameras of a driver that looks; None: there are none. Raises ValueError where the clip has too few steps
+    (`lengthened`), its map has none of the route's lanes, or the driver's answer is no plan.
+    """
+    settings, seen, scene = settings or LoopSettings(), eyes or NoEyes(), start.scene
+    if scene.clip.agents.n_steps < settings.clip_steps(scene.step):
+        raise ValueError(f"the clip must have {settings.clip_steps(scene.step)} steps, not {scene.clip.agents.n_steps}")
+    finder = RouteFinder(scene.clip.road_map, scene.clip.route)
+    course, sight = _Course(start, settings), Sight(seen)
+    plans: list[Array] = []
+    looks: list[Images] = []
+    while course.ended is None:
+        looked = sight.look(scene)
+        plan = driver.plan(scene, looked.sample)
+        if isinstance(plan, DriveEnd):
+            course.ended = plan
+            break
+        plans.append(plan)
+        looks.append(looked.images)
+        tracked = track(scene.ego_state, plan[None])[0]
+        rollout = roll_out(prepare_traffic(scene, settings.traffic), tracked, PLAN_STEPS)
+        steps = course.follow(rollout, score(prepare_scene(scene, rollout.agents), tracked[None]))
+        ahead = finder.centerline_from(tracked[steps, : HEADING + 1])
+        scene = next_scene(scene, rollout, ahead, steps)
+    first, n = start.scene.step, len(course.states)
+    return ClosedLoop(
+        start=start,
+        road=course.road,
+        ego_states=np.stack(course.states),
+        agents=scene.agents.window(first, first + n),
+        off_road=np.array(course.off_road[:n] or [False], dtype=bool),
+        along_m=np.array(course.along_m),
+        plans=np.stack(plans) if plans else np.empty((0, HORIZON_STEPS, 3)),
+        looks=tuple(looks),
+        ended=course.ended,
+        hit=course.hit,
+    )
+
+
+class _Course:
+    """A drive as far as it has come."""
+
+    def __init__(self, start: DriveStart, settings: LoopSettings) -> None:
+        scene = start.scene
+        self.start, self.settings = start, settings
+        self.road = road_from(scene.centerline, scene.ego_state[: HEADING + 1], start.known, settings.bound_m)
+        self.states, self.along_m, self.off_road = [scene.ego_state], [self.road.start_m], list[bool]()
+        self.ended: DriveEnd | None = None
+        self.hit: Hit | None = None
+        # Who touches the ego from the start on is no collision, as in the public log replay, until it is apart.
+        self._excused = _touched(scene.ego_state, scene.agents, scene.step)
+
+    def follow(self, rollout: Rollout, scores: Scores) -> int:
+        """Take the rollout's next PLAN_STEPS, or those up to where the drive ends; how many."""
+        flags = scores.ego_areas[0, :, NON_DRIVABLE]
+        self.off_road += flags[:1].tolist() if not self.off_road else []
+        for step in range(1, PLAN_STEPS + 1):
+            state = rollout.ego_states[step]
+            self.states.append(state)
+            self.along_m.append(self.road.place_m(state[[X, Y]], self.along_m[-1]))
+            touched = _touched(state, rollout.agents, step)
+            self.hit = _hit(rollout, scores, step, np.setdiff1d(touched, self._excused))
+            self._excused = np.intersect1d(touched, self._excused)
+            self.ended = self._end(state)
+            self.off_road.append(bool(flags[step]) and self.ended is not DriveEnd.ROAD_END)  # it has arrived
+            if self.ended is not None:
+                return step
+        return PLAN_STEPS
+
+    def _end(self, state: Array) -> DriveEnd | None:
+        if self.hit is not None:
+            return DriveEnd.COLLISION
+        if self.along_m[-1] >= self.road.end_m:
+            return DriveEnd.ROAD_END
+        if distance_m(state[None, [X, Y]], self.start.known)[0] > self.settings.bound_m:
+            return DriveEnd.SCENE_END
+        return DriveEnd.TIME if len(self.states) > self.settings.n_steps else None
+
+
+def _touched(state: Array, agents: AgentTracks, step: int) -> Ints:
+    """Rows of the agents whose box touches the ego's body at a step."""
+    found: Ints = np.flatnonzero(agents.valid[step] & touching(ego_boxes(state, PACIFICA), agents.boxes[step]))
+    return found
+
+
+def _hit(rollout: Rollout, scores: Scores, step: int, touched: Ints) -> Hit | None:
+    """The collision at a step, of those touched the first; scores: of the rollout, one row."""
+    if len(touched) == 0:
+        return None
+    row = int(touched[0])
+    at_fault = bool(scores.first_failures["nc"][0] == step)
+    speed_mps = float(np.hypot(*rollout.ego_states[step, [VX, VY]]))
+    return Hit(rollout.agents.track_ids[row], str(rollout.agents.kinds[row]), at_fault, speed_mps)

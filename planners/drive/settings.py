@@ -1,0 +1,91 @@
+"""Everything on the command line of `planners drive`, typed."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from factory.config.compose import fill, refuse_unknown
+from factory.config.run import READERS, VocabularyChoice, refuse_missing_root, without_labels
+from factory.config.shapes import defaults_of, merged
+from planners.drive.loop import LoopSettings
+from planners.evaluation.planner_names import composed
+from tasks.experts.pdm_closed.settings import PdmSettings
+from tasks.render.settings import RenderSettings
+from tasks.rollout.settings import TrafficSettings
+from tasks.settings import PerturbSettings
+
+Pictures = Literal["truth", "engine", "none"]
+
+
+@dataclass(frozen=True)
+class DriveSettings:
+    """Who drives, from where, among whom, seeing what."""
+
+    clips: dict[str, Any]  # the reader, and which clips of its data
+    planner: str | None = None  # a training's folder, human, pdm_closed, constant_velocity, or my.module:MyPlanner
+    planners: list[str] | dict[str, str] | None = None  # several: a list, or {label: planner, ...}
+    bounds: bool = True  # human, pdm_closed and constant_velocity too
+    settings: dict[str, Any] = field(default_factory=dict)  # of planning, changed in all trained planners
+    pictures: tuple[Pictures, ...] = ("truth",)  # of planners that look: truth: the town's painter; engine: scenes
+    logged: bool = True  # drive from the log at T
+    perturbed: int = 0  # drive from so many candidates of each clip too, at T+H
+    seconds: float = 20.0  # after which a drive ends
+    bound_m: float = 30.0  # from the nearest place that the log's sensors were at, beyond which a drive ends
+    films: int | Literal["none", "all"] = "none"  # or n for one drive in n: MP4 files under out/films
+    out: str = "drives"  # folder or URL; the same command on it drives what is not driven yet
+    cache: str | None = None  # folder of scenes, such as a run's out/cache; null: out/cache
+    executor: Literal["local", "ray"] = "local"
+    workers: int | None = None  # processes; null: one here, every core on Ray
+    limit: int | None = None  # the first so many clips only
+    seed: int = 0  # of the perturbations
+    device: str = "cpu"  # or cuda
+    confidence: float = 0.95  # of the intervals
+    vocabulary: VocabularyChoice = field(default_factory=VocabularyChoice)
+    perturb: PerturbSettings = field(default_factory=PerturbSettings)
+    traffic: TrafficSettings = field(default_factory=TrafficSettings)
+    pdm: PdmSettings = field(default_factory=PdmSettings)
+    render: RenderSettings = field(default_factory=RenderSettings)
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for what cannot be driven."""
+        self.loop  # noqa: B018 - raises ValueError for bounds of a drive that cannot be
+        for name in ("workers", "limit"):
+            if getattr(self, name) is not None and getattr(self, name) < 1:
+                raise ValueError(f"{name}={getattr(self, name)}: must be positive, or null for no bound")
+        if self.perturbed < 0 or not (self.logged or self.perturbed):
+            raise ValueError(f"perturbed={self.perturbed}, logged={self.logged}: there is nothing to drive from")
+        if self.films == 0 or self.one_film_in < 0:
+            raise ValueError(f"films={self.films}: must be none, all, or n for one drive in n")
+        if len(set(self.pictures)) < len(self.pictures) or not self.pictures:
+            raise ValueError(f"pictures={list(self.pictures)}: each kind once, at least one")
+        if not 0.0 < self.confidence < 1.0:
+            raise ValueError(f"confidence={self.confidence}: must lie between 0 and 1")
+
+    @property
+    def loop(self) -> LoopSettings:
+        """What every drive depends on."""
+        return LoopSettings(self.seconds, self.bound_m, self.traffic)
+
+    @property
+    def one_film_in(self) -> int:
+        """Drives; 0 for no film at all."""
+        return {"none": 0, "all": 1}[self.films] if isinstance(self.films, str) else self.films
+
+
+def settings_of(argv: Sequence[str]) -> DriveSettings:
+    """The settings of a command line. Raises ConfigError."""
+    values = composed("drive", argv, DriveSettings)
+    settings = fill(DriveSettings, values | {"clips": _typed(values["clips"])}, "")
+    refuse_missing_root(settings.clips)
+    return settings
+
+
+def _typed(clips: Mapping[str, Any]) -> dict[str, Any]:
+    """The reader's settings with its defaults, held against their types where it is a built-in one."""
+    shape = READERS.get(clips.get("_target_", ""))
+    if shape is None:
+        return dict(clips)
+    refuse_unknown(shape, without_labels(clips), "clips")
+    full = {**clips, **merged(defaults_of(shape), clips)}
+    fill(shape, without_labels(full), "clips")
+    return full

@@ -1,0 +1,199 @@
+"""What many drives add up to: shares and rates with intervals over clips, logs or towns, and what pictures change."""
+
+import csv
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from planners.drive.starts import LOGGED
+from planners.evaluation.bootstrap import LEVELS, Interval, clusters_of, paired_interval
+from tasks.world.arrays import Array
+
+Row = Mapping[str, Any]  # of the table `drives`
+M_PER_KM = 1000.0
+SHARES: Mapping[str, Callable[[Row], float]] = {  # of each drive, 0 .. 1
+    "route_completed": lambda row: float(row["route_completed"]),
+    "at_fault_collision": lambda row: float(row["at_fault_collision"]),
+    "off_road": lambda row: float(row["off_road_events"] > 0),
+    "comfortable": lambda row: float(row["comfortable"]),
+}
+
+
+@dataclass(frozen=True)
+class DriveLine:
+    """All drives of one planner that saw the same, from starts of one kind."""
+
+    planner: str
+    pictures: str
+    start: str  # logged, perturbed
+    drives: int
+    clips: int
+    level: str  # of LEVELS, that the intervals draw: the highest of which there are two
+    shares: Mapping[str, Interval]  # of SHARES: mean (`b`), low, high
+    km: float
+    failures: int
+    failures_per_km: Interval
+
+    @property
+    def m_between_failures(self) -> tuple[float, float, float]:
+        """Metres driven for each failure, and bounds; infinite where there was none."""
+        rate = self.failures_per_km
+        with np.errstate(divide="ignore"):
+            mean, high, low = M_PER_KM / np.maximum(np.array([rate.b, rate.low, rate.high]), 0.0)
+        return float(mean), float(low), float(high)
+
+
+def start_of(row: Row) -> str:
+    """logged or perturbed."""
+    return "logged" if row["start"] == LOGGED else "perturbed"
+
+
+def lines_of(rows: Sequence[Row], confidence: float = 0.95) -> list[DriveLine]:
+    """A line for each planner, kind of pictures and kind of start, in the order in which they first come."""
+    groups: dict[tuple[str, str, str], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((row["planner"], row["pictures"], start_of(row)), []).append(row)
+    return [_line(*key, group, confidence) for key, group in groups.items()]
+
+
+def _line(planner: str, pictures: str, start: str, rows: Sequence[Row], confidence: float) -> DriveLine:
+    level, clusters = _highest_level(rows)
+    km = np.maximum([row["distance_m"] / M_PER_KM for row in rows], 1e-9)  # a drive that stands weighs nothing
+    failed = np.array([row["off_road_events"] + row["at_fault_collision"] for row in rows], dtype=float)
+
+    def interval(values: Array, weights: Array | None = None) -> Interval:
+        return _mean(values, clusters, confidence, weights)
+
+    return DriveLine(
+        planner=planner,
+        pictures=pictures,
+        start=start,
+        drives=len(rows),
+        clips=len({row["clip_id"] for row in rows}),
+        level=level,
+        shares={name: interval(np.array([share(row) for row in rows])) for name, share in SHARES.items()},
+        km=float(km.sum()),
+        failures=int(failed.sum()),
+        failures_per_km=interval(failed / km, km),
+    )
+
+
+def _mean(values: Array, clusters: Sequence[str], confidence: float, weights: Array | None = None) -> Interval:
+    counts = np.ones_like(values) if weights is None else weights
+    return paired_interval(
+        np.zeros((1, len(values))),
+        values[None],
+        weights=(counts[None], counts[None]),
+        clusters=clusters,
+        confidence=confidence,
+    )
+
+
+def _highest_level(rows: Sequence[Row]) -> tuple[str, Sequence[str]]:
+    """Of clips that share a log or a town, whole ones are drawn: no independent draws else (planners.evaluation)."""
+    known = clusters_of([row["clip_id"] for row in rows], [row["log_id"] for row in rows])
+    several = [level for level in LEVELS if level in known and len(set(known[level])) > 1]
+    level = several[-1] if several else "clip"
+    return level, known[level]
+
+
+@dataclass(frozen=True)
+class PicturesDifference:
+    """What one planner's drives change where it sees the engine's pictures in place of the painter's."""
+
+    planner: str
+    start: str
+    drives: int  # pairs
+    level: str
+    shares: Mapping[str, Interval]  # b (engine) - a (truth)
+
+
+def differences_of(rows: Sequence[Row], confidence: float = 0.95) -> list[PicturesDifference]:
+    """Over the starts that were driven with both. None where there are none."""
+    both: dict[tuple[str, str], dict[tuple[str, int], dict[str, Row]]] = {}
+    for row in rows:
+        pairs = both.setdefault((row["planner"], start_of(row)), {})
+        pairs.setdefault((row["clip_id"], row["start"]), {})[row["pictures"]] = row
+    found = []
+    for (planner, start), pairs in both.items():
+        twice = [pair for pair in pairs.values() if {"truth", "engine"} <= pair.keys()]
+        if not twice:
+            continue
+        level, clusters = _highest_level([pair["truth"] for pair in twice])
+        shares = {
+            name: paired_interval(
+                np.array([[share(pair["truth"]) for pair in twice]]),
+                np.array([[share(pair["engine"]) for pair in twice]]),
+                clusters=clusters,
+                confidence=confidence,
+            )
+            for name, share in SHARES.items()
+        }
+        found.append(PicturesDifference(planner, start, len(twice), level, shares))
+    return found
+
+
+def summary_text(lines: Sequence[DriveLine], differences: Sequence[PicturesDifference], confidence: float) -> str:
+    """Tables to be printed, in percent."""
+    head = ["planner", "pictures", "start", "drives", *(f"{name} %" for name in SHARES), "km", "failures", "m between"]
+    rows = [head]
+    for line in lines:
+        shares = [_bounded(one.b, one, 100.0) for one in line.shares.values()]
+        mean, low, high = line.m_between_failures
+        between = f"{mean:.0f} [{low:.0f}, {high:.0f}]" if line.failures else f"> {M_PER_KM * line.km:.0f}"
+        facts = [line.planner, line.pictures, line.start, str(line.drives)]
+        rows.append([*facts, *shares, f"{line.km:.2f}", str(line.failures), between])
+    told = _table(rows)
+    if differences:
+        rows = [["engine - truth", "start", "pairs", *(f"{name} %" for name in SHARES)]]
+        for one in differences:
+            shares = [_bounded(share.difference, share, 100.0, "+") for share in one.shares.values()]
+            rows.append([one.planner, one.start, str(one.drives), *shares])
+        told += ["", *_table(rows)]
+    levels = ", ".join(dict.fromkeys(line.level for line in lines))
+    told.append(f"[{100 * confidence:g} % intervals over {levels}s; nan: from one alone nothing can be drawn]")
+    return "\n".join(told)
+
+
+def _bounded(value: float, one: Interval, scale: float, sign: str = "") -> str:
+    return f"{scale * value:{sign}.1f} [{scale * one.low:{sign}.1f}, {scale * one.high:{sign}.1f}]"
+
+
+def _table(rows: Sequence[Sequence[str]]) -> list[str]:
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip() for row in rows]
+
+
+def write_summary(folder: Path, lines: Sequence[DriveLine], differences: Iterable[PicturesDifference]) -> None:
+    """`summary.csv`, and `differences.csv` where there are any."""
+    rows: list[dict[str, object]] = []
+    for line in lines:
+        mean, low, high = line.m_between_failures
+        facts = {name: getattr(line, name) for name in ("planner", "pictures", "start", "drives", "clips", "level")}
+        between = {"m_between_failures": mean, "m_between_failures_low": low, "m_between_failures_high": high}
+        rows.append(facts | _columns(line.shares, "b") | {"km": line.km, "failures": line.failures} | between)
+    _write_csv(folder / "summary.csv", rows)
+    apart: list[dict[str, object]] = [
+        {"planner": one.planner, "start": one.start, "pairs": one.drives, "level": one.level}
+        | _columns(one.shares, "difference")
+        for one in differences
+    ]
+    if apart:
+        _write_csv(folder / "differences.csv", apart)
+
+
+def _columns(shares: Mapping[str, Interval], middle: str) -> dict[str, object]:
+    found: dict[str, object] = {}
+    for name, one in shares.items():
+        found |= {name: getattr(one, middle), f"{name}_low": one.low, f"{name}_high": one.high}
+    return found
+
+
+def _write_csv(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
+    with path.open("w", newline="") as file:
+        table = csv.DictWriter(file, list(rows[0]))
+        table.writeheader()
+        table.writerows(rows)

@@ -1,0 +1,191 @@
+"""One item of a command's work: all drives of a clip that see the same, made where the clip's world is at hand."""
+
+import json
+import math
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from typing import Any
+
+from factory.readers.base import BadClip, ClipReader, ClipRef
+from factory.readers.town.reader import SensedReader
+from factory.setup.settings import cache_folder
+from factory.store.identity import canonical_json
+from factory.store.location import Location
+from planners.drive.drivers import Driver, driver_of
+from planners.drive.eyes import Eyes, NoEyes
+from planners.drive.films import write_film
+from planners.drive.loop import DRIVE_VERSION, ClosedLoop, drive
+from planners.drive.measures import measures_of
+from planners.drive.painted import PaintedEyes, town_lights
+from planners.drive.rendered import RenderedEyes, rendered_eyes
+from planners.drive.settings import DriveSettings, Pictures
+from planners.drive.starts import LOGGED, DriveStart, lengthened, logged_start, perturbed_starts
+from planners.drive.table import DriveKey, DriveRow
+from planners.evaluation.planner_names import planner_of
+from tasks.perturb import Perturbation, perturb
+from tasks.stages import stage_versions
+from tasks.world.chance import stream
+from tasks.world.clip import HORIZON_STEPS, NOW, Clip
+from tasks.world.vocabulary import Vocabulary
+
+
+@dataclass(frozen=True)
+class Contender:
+    """Someone who drives, as workers are told of them."""
+
+    label: str
+    spec: str
+    digest: str
+
+
+@dataclass(frozen=True)
+class DriveItem:
+    """Drives of one clip."""
+
+    ref: ClipRef
+    pictures: Pictures
+    keys: tuple[tuple[Contender, DriveKey], ...]  # not driven yet
+
+    def missing(self, done: Collection[str]) -> tuple[tuple[Contender, DriveKey], ...]:
+        """The drives whose ids are not among those that are done."""
+        return tuple((who, key) for who, key in self.keys if key.drive_id not in done)
+
+    def __str__(self) -> str:
+        return f"clip {self.ref.clip_id} of {self.ref.log_id}, pictures={self.pictures}"
+
+
+@dataclass(frozen=True)
+class NotDriven:
+    """A drive that could not be made: tried again by the same command."""
+
+    clip_id: str
+    why: str
+
+
+@dataclass(frozen=True)
+class DriveWork:
+    """What makes drives of items; picklable."""
+
+    reader: ClipReader
+    vocabulary: Vocabulary
+    settings: DriveSettings
+    out: Location
+
+    def key_of(self, ref: ClipRef, start: int, who: Contender, pictures: Pictures) -> DriveKey:
+        """Of one drive, without opening the clip."""
+        digest = getattr(self.reader, "digest", None)
+        content = "" if digest is None else str(digest(ref))
+        told = canonical_json(self._depends_on(start, who, pictures))
+        return DriveKey(ref.clip_id, content, start, who.digest, pictures, told)
+
+    def _depends_on(self, start: int, who: Contender, pictures: Pictures) -> Mapping[str, Any]:
+        s = self.settings
+        found: dict[str, Any] = {
+            "drive": DRIVE_VERSION,
+            "stages": stage_versions(),
+            "loop": {"seconds": s.seconds, "bound_m": s.bound_m},
+            "traffic": asdict(s.traffic),
+        }
+        if start != LOGGED:
+            found |= {"seed": s.seed, "vocabulary": self.vocabulary.digest, "perturb": asdict(s.perturb)}
+        if start != LOGGED or who.spec == "pdm_closed":
+            found["pdm"] = asdict(s.pdm)
+        if pictures != "none":
+            found["render"] = asdict(s.render)
+        return found
+
+    def __call__(self, item: DriveItem) -> list[DriveRow | NotDriven]:
+        """Drive all of it. What is wrong with a clip, its pictures or a planner's answer is told of each drive."""
+        try:
+            return list(self._driven(item))
+        except (BadClip, ValueError) as error:
+            return [NotDriven(item.ref.clip_id, str(error))]
+
+    def _driven(self, item: DriveItem) -> Iterator[DriveRow | NotDriven]:
+        clip = self._clip(item)
+        starts = self._starts(clip, {key.start for _, key in item.keys})
+        eyes = self._eyes(clip, item.pictures)
+        for who, key in item.keys:
+            if key.start not in starts:
+                continue  # the clip has fewer
+            try:
+                made = drive(starts[key.start], self._driver(who), self.settings.loop, eyes)
+            except ValueError as error:
+                yield NotDriven(clip.clip_id, f"{who.label}: {error}")
+            else:
+                yield self._row(who, key, made, eyes)
+
+    def _clip(self, item: DriveItem) -> Clip:
+        last = NOW + HORIZON_STEPS if any(key.start != LOGGED for _, key in item.keys) else NOW
+        clip, n_steps = self.reader.read(item.ref), self.settings.loop.clip_steps(last)
+        return lengthened(clip, n_steps, town_lights(clip, n_steps) if reads_towns(self.reader) else None)
+
+    def _starts(self, clip: Clip, wanted: set[int]) -> dict[int, DriveStart]:
+        found = [logged_start(clip)] if LOGGED in wanted else []
+        at_most = max(wanted) + 1
+        if at_most > 0:
+            rng = stream(self.settings.seed, clip.clip_id, "perturb")
+            s = self.settings
+            listed = perturb(clip, self.vocabulary, s.perturb, s.traffic, s.pdm, rng)
+            found += (
+                perturbed_starts(clip, listed, at_most, s.traffic, s.pdm) if isinstance(listed, Perturbation) else []
+            )
+        return {start.number: start for start in found}
+
+    def _eyes(self, clip: Clip, pictures: Pictures) -> Eyes:
+        if pictures == "engine":
+            return rendered_eyes(clip, self.settings.render, self.settings.cache or cache_folder(self.out.uri))
+        return PaintedEyes(clip, self.settings.render) if pictures == "truth" else NoEyes()
+
+    def _driver(self, who: Contender) -> Driver:
+        return _kept_driver(who, canonical_json(self.settings.settings), self.settings.pdm, self.settings.device)
+
+    def _film(self, who: Contender, key: DriveKey, made: ClosedLoop, eyes: Eyes) -> str:
+        """One drive in so many has one, chosen by its id."""
+        one_in = self.settings.one_film_in
+        if one_in == 0 or int(key.drive_id, 16) % one_in:
+            return ""
+        start = "log" if key.start == LOGGED else f"start {key.start}"
+        return write_film(self.out, key.drive_id, made, eyes.rig, f"{who.label}, {key.pictures}, {start}")
+
+    def _row(self, who: Contender, key: DriveKey, made: ClosedLoop, eyes: Eyes) -> DriveRow:
+        clip, hit = made.start.scene.clip, made.hit
+        return DriveRow(
+            **vars(measures_of(made)),
+            drive_id=key.drive_id,
+            clip_id=clip.clip_id,
+            dataset=clip.dataset,
+            log_id=clip.log_id,
+            content_digest=key.content_digest,
+            licence=clip.licence,
+            start=key.start,
+            candidate_index=made.start.candidate_index,
+            start_step=made.start.scene.step,
+            planner=who.label,
+            planner_digest=who.digest,
+            pictures=key.pictures,
+            psnr_db=eyes.asset.psnr_db if isinstance(eyes, RenderedEyes) else math.nan,
+            ended=str(made.ended),
+            hit_track="" if hit is None else hit.track_id,
+            hit_kind="" if hit is None else hit.kind,
+            hit_speed_mps=math.nan if hit is None else hit.speed_mps,
+            film=self._film(who, key, made, eyes),
+            settings=key.settings,
+            ego_states=tuple(map(tuple, made.ego_states.tolist())),
+            plans=tuple(map(tuple, made.plans.reshape(len(made.plans), -1).tolist())),
+        )
+
+
+def reads_towns(reader: ClipReader) -> bool:
+    """Whether a reader's logs are of the synthetic town, whose painter can be asked for more."""
+    return isinstance(reader, SensedReader)
+
+
+@lru_cache(maxsize=8)
+def _kept_driver(who: Contender, changed: str, pdm: Any, device: str) -> Driver:
+    """A worker's own, read once. Raises ValueError where it is another than was named when the command began."""
+    one = planner_of(who.spec, who.label, json.loads(changed))
+    if one.digest != who.digest:
+        raise ValueError(f"{who.spec} has changed since the command began: run it again when its training is through")
+    return driver_of(one, pdm, device)

@@ -1,0 +1,161 @@
+"""The command: what it refuses, what it writes, and that it drives nothing twice."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
+from factory.readers.settings import TownSettings
+from factory.readers.town.reader import SyntheticReader
+from factory.store.location import Location
+from planners.drive import drive as command
+from planners.drive import work
+from planners.drive.drive import main
+from planners.drive.table import open_drives
+
+WITHOUT_SENSORS = ["clips.settings.cameras=[]", "clips.settings.lidar_beams=0"]
+
+
+@pytest.fixture(scope="module")
+def towns(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A town of one log without sensors, written once."""
+    folder = tmp_path_factory.mktemp("towns")
+    for n_clips in (1, 2):
+        SyntheticReader(folder, n_clips, settings=TownSettings(cameras=(), lidar_beams=0, steps_per_photo=1)).index()
+    return folder
+
+
+def words(towns: Path, out: Path, *more: str) -> list[str]:
+    """A command of two clips of which each drive takes a second at most."""
+    town = [f"clips.cache_dir={towns}", "clips.n_clips=2", *WITHOUT_SENSORS]
+    return ["planner=constant_velocity", "bounds=false", "seconds=3", f"out={out}", *town, *more]
+
+
+def rows(out: Path) -> list[dict[str, object]]:
+    """Of the table, by their ids."""
+    return sorted(open_drives(Location.parse(out)).read().to_pylist(), key=lambda row: row["drive_id"])
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ("secnds=3", "secnds"),
+        ("seconds=0.1", "seconds=0.1"),
+        ("clips.n_clip=1", "clips.n_clip"),
+        ("pictures=[photo]", "pictures"),
+        ("logged=false", "nothing to drive from"),
+        ("films=0", "films=0"),
+        ("traffic.mode=fast", "traffic"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused_and_nothing_is_written(
+    wrong: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([f"out={tmp_path / 'out'}", "planner=constant_velocity", wrong]) == BAD_CONFIG
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_unknown_planner_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([f"out={tmp_path / 'out'}", "planner=nobody"]) == BAD_CONFIG
+    assert "planner=nobody" in capsys.readouterr().err
+
+
+def test_what_is_driven_is_not_driven_again(
+    towns: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One clip, then both, then none: the rows of before stay, and the summary is of all that was asked for."""
+    driven: list[str] = []
+    drive = work.drive
+
+    def counted(start, *arguments):  # type: ignore[no-untyped-def]
+        driven.append(start.scene.clip.clip_id)
+        return drive(start, *arguments)
+
+    monkeypatch.setattr(work, "drive", counted)
+    assert main(words(towns, tmp_path, "limit=1")) == COMPLETE
+    first = rows(tmp_path)
+    assert len(first) == len(driven) == 1
+    assert main(words(towns, tmp_path)) == COMPLETE
+    both = rows(tmp_path)
+    assert len(both) == len(driven) == 2
+    assert str(first[0]) in map(str, both)
+    told = capsys.readouterr().out
+    assert main(words(towns, tmp_path)) == COMPLETE
+    assert len(driven) == 2
+    assert capsys.readouterr().out == told[told.rindex("planner ") :]
+
+
+def test_other_settings_are_other_drives(towns: Path, tmp_path: Path) -> None:
+    """They stand in one table, and what does not depend on a setting is not driven again."""
+    assert main(words(towns, tmp_path, "limit=1")) == COMPLETE
+    assert main(words(towns, tmp_path, "limit=1", "pdm.max_speed_fraction=1.0", "render.width=64")) in (
+        COMPLETE,
+        BAD_CONFIG,
+    )
+    n_before = len(rows(tmp_path))
+    assert main(words(towns, tmp_path, "limit=1", "bound_m=20")) == COMPLETE
+    assert len(rows(tmp_path)) == n_before + 1
+
+
+def test_a_row_holds_the_drive(towns: Path, tmp_path: Path) -> None:
+    assert main(words(towns, tmp_path, "limit=1")) == COMPLETE
+    (row,) = rows(tmp_path)
+    assert (row["planner"], row["pictures"], row["start"], row["ended"]) == ("constant_velocity", "none", -1, "time")
+    assert row["duration_s"] == pytest.approx(3.0)
+    assert len(row["ego_states"]) == 31 and len(row["ego_states"][0]) == 11  # type: ignore[arg-type, index]
+    assert len(row["plans"]) == 6 and len(row["plans"][0]) == 120  # type: ignore[arg-type, index]
+
+
+def test_a_drive_that_cannot_be_made_is_told_and_the_others_are_kept(
+    towns: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drive, bad = work.drive, []
+
+    def sometimes(start, *arguments):  # type: ignore[no-untyped-def]
+        bad.append(1)
+        if len(bad) == 1:
+            raise ValueError("a plan must be (8 or 40, 3) finite numbers")
+        return drive(start, *arguments)
+
+    monkeypatch.setattr(work, "drive", sometimes)
+    assert main(words(towns, tmp_path)) == COMPLETE_WITH_FAILURES
+    assert "1 drives or clips could not be driven" in capsys.readouterr().err
+    assert len(rows(tmp_path)) == 1
+    assert main(words(towns, tmp_path)) == COMPLETE
+    assert len(rows(tmp_path)) == 2
+
+
+def test_an_interrupted_command_keeps_what_it_has_and_goes_on(
+    towns: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    each = command.each
+
+    def first_alone(function, items, *arguments) -> Iterator[object]:  # type: ignore[no-untyped-def]
+        yield from each(function, list(items)[:1], *arguments)
+        raise command.Halted
+
+    monkeypatch.setattr(command, "each", first_alone)
+    assert main(words(towns, tmp_path)) == INTERRUPTED
+    assert "the same command goes on" in capsys.readouterr().err
+    assert len(rows(tmp_path)) == 1
+    monkeypatch.setattr(command, "each", each)
+    assert main(words(towns, tmp_path)) == COMPLETE
+    assert len(rows(tmp_path)) == 2
+
+
+@pytest.mark.slow
+def test_processes_make_the_rows_that_one_makes(towns: Path, tmp_path: Path) -> None:
+    assert main(words(towns, tmp_path / "one", "perturbed=1")) == COMPLETE
+    assert main(words(towns, tmp_path / "two", "perturbed=1", "workers=2")) == COMPLETE
+    assert str(rows(tmp_path / "one")) == str(rows(tmp_path / "two"))
+    assert {row["start"] for row in rows(tmp_path / "one")} == {-1, 0}
+
+
+@pytest.mark.ray
+@pytest.mark.slow
+def test_ray_makes_the_rows_that_one_makes(towns: Path, tmp_path: Path) -> None:
+    assert main(words(towns, tmp_path / "one")) == COMPLETE
+    assert main(words(towns, tmp_path / "ray", "executor=ray", "workers=2")) == COMPLETE
+    assert str(rows(tmp_path / "one")) == str(rows(tmp_path / "ray"))

@@ -1,0 +1,55 @@
+"""A drive's film: a picture for every 0.1 s, with what was seen."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from factory.exits import COMPLETE
+from factory.stages.sensors import encode_jpeg
+from planners.drive.drive import main
+from planners.drive.films import BEV_PX, CAMERA_PX, HOLD, pictures_of
+from planners.drive.loop import LoopSettings, drive
+from tasks.render.settings import ImageSource
+from tasks.world.clip import Scene
+from tests.planners.drive.streets import Steady, car, start_on, street_with
+from tests.planners.drive.test_drive import rows, words
+from tests.planners.drive.test_drive import towns as towns  # the fixture
+
+SETTINGS = LoopSettings(seconds=1.2, bound_m=1000.0)
+
+
+@dataclass(frozen=True)
+class RedEyes:
+    """One camera that sees red."""
+
+    source: ImageSource = ImageSource.PHOTO
+    rig: tuple[Mapping[str, Any], ...] = ({"name": "front", "ego_from_camera": np.eye(4)[[2, 0, 1, 3]].ravel()},)
+    offsets: tuple[int, ...] = (0,)
+
+    def look(self, scene: Scene, offset: int) -> list[Mapping[str, Any]]:
+        red = np.full((36, 64, 3), (250, 0, 0), np.uint8)
+        return [{"camera": "front", "time_s": 0.0, "jpeg": encode_jpeg(red, 95)}]
+
+
+@pytest.mark.parametrize("eyes", [None, RedEyes()])
+def test_a_film_has_a_picture_for_every_tenth_of_a_second(eyes: RedEyes | None) -> None:
+    made = drive(start_on(street_with(car(50.0)), SETTINGS), Steady(8.0), SETTINGS, eyes)
+    pictures = list(pictures_of(made, None if eyes is None else eyes.rig, "a"))
+    assert len(pictures) == made.n_steps + 1 + HOLD == 23
+    assert {picture.shape for picture in pictures} == {(BEV_PX[1], BEV_PX[0] + CAMERA_PX[0], 3)}
+    middle = pictures[0][CAMERA_PX[1] // 2, BEV_PX[0] + CAMERA_PX[0] // 2].astype(int)
+    assert (middle[0] - middle[1] > 200) == (eyes is not None)
+    assert (pictures[0] != pictures[5]).any()
+
+
+def test_the_table_names_the_films(towns: Path, tmp_path: Path) -> None:
+    assert main(words(towns, tmp_path, "films=all", "seconds=0.5")) == COMPLETE
+    found = rows(tmp_path)
+    assert len(found) == 2
+    assert all((tmp_path / str(row["film"])).stat().st_size > 1000 for row in found)
+    assert main(words(towns, tmp_path, "films=none", "seconds=0.6")) == COMPLETE
+    assert sum(row["film"] == "" for row in rows(tmp_path)) == 2

@@ -1,0 +1,82 @@
+"""Worlds that go on past their log, and how far along a road a place lies."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from planners.drive.road import road_from
+from planners.drive.starts import known_places, lengthened, perturbed_starts
+from tasks.experts.pdm_closed.settings import PdmSettings
+from tasks.rollout.settings import TrafficSettings
+from tasks.world.camera import SensorFile
+from tasks.world.clip import CLIP_STEPS, NOW, Block
+from tasks.world.lanes import LightState
+from tests.tasks.streets import perturbed, street_clip
+
+
+def test_after_the_log_things_stay_and_who_moved_is_gone() -> None:
+    clip = lengthened(street_clip(), 200)
+    there = dict(zip(clip.agents.track_ids, clip.agents.valid[CLIP_STEPS:].T))
+    assert there["cone"].all()
+    assert not any(there[name].any() for name in ("ahead", "left", "walker"))
+    assert (clip.agents.boxes[CLIP_STEPS:, 3] == clip.agents.boxes[CLIP_STEPS - 1, 3]).all()
+    assert clip.lights.states.shape == (200, 1)
+    assert (clip.lights.states[CLIP_STEPS:] == LightState.UNKNOWN).all()
+
+
+def test_what_the_block_knows_of_the_log_is_used() -> None:
+    """A block that begins a second before the clip and ends a second after it."""
+    clip = street_clip()
+    log = lengthened(clip, CLIP_STEPS + 20).agents
+    boxes = np.arange(log.n_steps)[:, None, None] * np.ones(log.boxes.shape[1:])
+    known = replace(log, boxes=boxes, valid=np.ones_like(log.valid))
+    longer = lengthened(replace(clip, block=Block(clip.start_s - 1.0, known, (), ())), 200)
+    assert (longer.agents.boxes[: CLIP_STEPS + 10, 0, 0] == np.arange(10, CLIP_STEPS + 20)).all()
+    assert not longer.agents.valid[CLIP_STEPS + 10 :, 0].any()
+
+
+def test_lights_that_somebody_knows_are_taken() -> None:
+    clip = street_clip()
+    lights = replace(clip.lights, states=np.full((200, 1), LightState.RED, np.int8))
+    assert (lengthened(clip, 200, lights).lights.states == LightState.RED).all()
+    with pytest.raises(ValueError, match="must span 201 steps, got 200"):
+        lengthened(clip, 201, lights)
+
+
+def test_the_world_is_known_where_the_ego_and_the_sensors_were() -> None:
+    clip, pose = street_clip(), np.eye(4)
+    pose[:2, 3] = 200.0, 5.0
+    block = Block(clip.start_s, clip.agents, (SensorFile("front", "1.jpg", 20.0, pose),), ())
+    places = known_places(replace(clip, block=block))
+    assert len(places) == CLIP_STEPS + 1
+    assert [200.0, 5.0] in places.tolist()
+
+
+def test_perturbed_starts_are_those_that_pdm_closed_can_drive_on_from() -> None:
+    """In the order of the candidates; more are not there than asked for."""
+    clip = lengthened(street_clip(), 300)
+    listed = perturbed(clip, 400)
+    found = perturbed_starts(clip, listed, 2, TrafficSettings(), PdmSettings())
+    assert [start.number for start in found] == list(range(len(found)))
+    assert 0 < len(found) <= 2
+    for start in found:
+        assert start.scene.step == NOW + 40
+        assert (start.scene.ego_state == listed.candidates[start.candidate_index].rollout.ego_states[-1]).all()
+
+
+def test_a_place_is_found_near_the_one_before_where_a_road_crosses_itself() -> None:
+    """A loop of 200 m that comes back over its own beginning: the crossing lies at 50 m and at 250 m of the road."""
+    corners = np.array([[0.0, 0.0], [100.0, 0.0], [100.0, 50.0], [50.0, 50.0], [50.0, -50.0]])
+    line = np.column_stack([corners, np.zeros(len(corners))])
+    road = road_from(line, np.zeros(3), np.zeros((1, 2)), bound_m=1e6)
+    crossing = np.array([50.0, 0.0])
+    assert road.place_m(crossing, 48.0) == pytest.approx(50.0)
+    assert road.place_m(crossing, 248.0) == pytest.approx(250.0)
+
+
+def test_a_road_is_known_up_to_its_first_unknown_place() -> None:
+    line = np.column_stack([np.arange(0.0, 301.0), np.zeros(301), np.zeros(301)])
+    road = road_from(line, np.array([10.0, 1.0, 0.0]), np.array([[10.0, 0.0], [60.0, 0.0], [200.0, 0.0]]), bound_m=30.0)
+    assert (road.start_m, road.known_m) == (10.0, 90.0)
+    assert road.length_m == 80.0
