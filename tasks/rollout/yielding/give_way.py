@@ -89,10 +89,10 @@ def has_way(
 
     Not where its log is faster than its schedule, which is as fast as a car can be: then the log is wrong.
     """
-    known = min(k, yielding.at.shape[1] - 1)  # `log` may go on beyond the clip's
-    if math.hypot(log.velocities[k, i, 0], log.velocities[k, i, 1]) > yielding.speed[m, known] + FASTER_MPS:
+    scheduled = min(k, yielding.at.shape[1] - 1)  # a log may be made longer than its schedule
+    s, front, speed = yielding.at[m, scheduled], 0.5 * log.boxes[k, i, 3], yielding.speed[m, scheduled]
+    if math.hypot(log.velocities[k, i, 0], log.velocities[k, i, 1]) > speed + FASTER_MPS:
         return False
-    s, front = yielding.at[m, known], 0.5 * log.boxes[k, i, 3]
     for z in range(yielding.zone_start[m], yielding.zone_start[m + 1]):
         j, o = yielding.zone_agent[z], yielding.zone_path[z]
         if o < 0 or not (afresh or diverged.found[j]) or diverged.mode[j] != DRIVEN:
@@ -101,7 +101,7 @@ def has_way(
         if own.path[t, j] != o or own.s[t, j] - other_front > yielding.other_out[z]:
             continue
         if is_committed(own.speed[t, j], yielding.other_in[z] - own.s[t, j] - other_front, driver) and is_committed(
-            yielding.speed[m, known], yielding.zone_in[z] - s - front, driver
+            speed, yielding.zone_in[z] - s - front, driver
         ):
             return False
     return True

@@ -72,11 +72,13 @@ def test_after_the_log_s_end_who_replays_it_goes_straight_on_and_who_is_driven_i
     car, parked = Track(0.0, speed=5.0), Track(-30.0, 6.0)
     gone = Track(60.0, -9.0, 0.0, 1.0, AgentKind.PEDESTRIAN, (0.6, 0.6), last=CLIP_STEPS - 3)
     scene = at_the_end(worlds.scene(worlds.straight_road(), walker, car, parked, gone))
-    on = roll_on(prepare_traffic(scene, IDM), parked_ego())
-    assert np.diff(on.boxes[:, 0, 1]) == pytest.approx(0.12) and on.boxes[:, 0, 0] == pytest.approx(20.0)
-    assert (np.diff(on.velocities[:, 1, 0]) > 0.0).all()  # a free road: it accelerates through all 51 rows
-    assert (on.boxes[:, 2] == on.boxes[0, 2]).all() and on.valid[:, :3].all()
-    assert on.valid[:-12, 3].all() and not on.valid[-12:, 3].any()  # who left its log does not come back
+    for yields in (False, True):
+        on = roll_on(prepare_traffic(scene, TrafficSettings(yields=yields)), parked_ego())
+        assert np.diff(on.boxes[:, 0, 1]) == pytest.approx(0.12) and on.boxes[:, 0, 0] == pytest.approx(20.0)
+        speed = on.velocities[:, 1, 0]  # a free road: it accelerates through all 51 rows, or keeps its log's speed
+        assert speed == pytest.approx(5.0) if yields else (np.diff(speed) > 0.0).all()
+        assert (on.boxes[:, 2] == on.boxes[0, 2]).all() and on.valid[:, :3].all()
+        assert on.valid[:-12, 3].all() and not on.valid[-12:, 3].any()  # who left its log does not come back
 
 
 def test_a_light_is_after_the_log_s_end_what_it_was_at_it() -> None:
