@@ -32,7 +32,7 @@ def simulated(clip: Clip) -> tuple[Candidate, Judged]:
     candidate = perturbed(clip).candidates[0]
     scene = perturbed_scene(clip, candidate.rollout)
     plan = PdmClosed().plan(scene, RNG)
-    return candidate, judge(scene, plan, TrafficSettings(), PdmSettings())  # type: ignore[arg-type]
+    return candidate, judge(scene, plan, TrafficSettings(yields=False), PdmSettings())  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")

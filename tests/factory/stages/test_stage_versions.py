@@ -167,7 +167,8 @@ def rewards() -> dict[str, object]:
     scene = scene_of_clip(street_clip())
     states = straight_states(scene, to_world(scene.ego_state[:3], kinematic_trajectories(60, 2)))
     prepared = prepare_scene(scene, scene.agents.window(NOW, NOW + 41))
-    scores, clip, traffic = score(prepared, states), scene.clip, prepare_traffic(scene, TrafficSettings())
+    scores, clip = score(prepared, states), scene.clip
+    traffic = prepare_traffic(scene, TrafficSettings(yields=False))
     onward = replace(clip.route, roadblock_ids=(*clip.route.roadblock_ids, "rb_elsewhere"))
     ways = [way_on_m(clip.road_map, onward, one[-1, :3] + [240.0, 0.0, 0.0]) for one in states]
     ends = {
