@@ -16,7 +16,7 @@ as a task of its own, before its clips are prepared.
 
 Three more make a block's scene of other logs' drives through the same place as well (`traversals=N`): `world(path)`
 names the frame that a log's poses are in where other logs share it, `block_steps(start)` gives the steps of a window's
-block, and `log_digest(path)` the content digest of a log.
+block where that is longer than the window, and `log_digest(path)` the content digest of a log without loading it.
 
 A format that may bring its reader down or never end, as pickles may, is `untrusted`: the index reads each log in
 another process, and a log that kills it is broken as any other.
@@ -169,11 +169,11 @@ class LogReader(ABC, Generic[Log]):
 
     def block_steps(self, start: int) -> tuple[int, int]:
         """Steps first..stop-1 of a log that the block of the window from step `start` on takes, where it has them."""
-        raise NotImplementedError(f"{type(self).__name__} names worlds, but not the steps of its blocks")
+        return start, start + CLIP_STEPS
 
     def log_digest(self, path: Path) -> str:
-        """The content digest of the log at a path. Raises BadClip."""
-        raise NotImplementedError(f"{type(self).__name__} names worlds, but has no digest of its logs")
+        """The content digest of the log at a path; readers that need not load it for that override. Raises BadClip."""
+        return self.load(path).content_digest
 
     def index(self) -> ClipIndex:
         """All windows of all logs, ordered by log id and time. Raises ValueError where the root holds no log."""

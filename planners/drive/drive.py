@@ -37,7 +37,7 @@ from planners.drive.settings import DriveSettings, Pictures, settings_of
 from planners.drive.starts import LOGGED
 from planners.drive.summary import Row, differences_of, lines_of, summary_text, write_summary
 from planners.drive.table import FACTS, Committer, DriveRow, open_drives
-from planners.drive.work import Contender, DriveItem, DriveWork, NotDriven, reads_towns
+from planners.drive.work import DriveItem, DriveWork, DrivingPlanner, NotDriven, reads_towns
 from planners.evaluation.planner_names import planners_of
 from tasks.render.scene import engine
 from tasks.render.splatting.gsplat_backend import BackendMissing
@@ -50,18 +50,18 @@ def drive_all(settings: DriveSettings) -> tuple[list[Row], list[NotDriven]]:
 
     Raises ConfigError, Halted where it was interrupted, WorkerDied, AnotherWriter.
     """
-    contenders = _contenders(settings)
+    planners = _planners(settings)
     reader, index = open_reader(settings.clips)
-    if any("truth" in kinds for _, kinds in contenders) and not reads_towns(reader):
+    if any("truth" in kinds for _, kinds in planners) and not reads_towns(reader):
         raise ConfigError("pictures=truth is the painter's of the synthetic town: give pictures=engine for these clips")
-    if any("engine" in kinds for _, kinds in contenders):
+    if any("engine" in kinds for _, kinds in planners):
         try:
             engine.check(settings.render.backend)
         except BackendMissing as error:
             raise ConfigError(str(error)) from error
     out = Location.parse(settings.out)
     work = DriveWork(reader, choose_vocabulary(settings.vocabulary), settings, out)
-    items = list(_items(work, index.refs[: settings.limit], contenders))
+    items = list(_items(work, index.refs[: settings.limit], planners))
     table = open_drives(out)
     table.claim()
     failed = [NotDriven(ref.clip_id, why) for ref, why in index.broken.items()]
@@ -69,29 +69,29 @@ def drive_all(settings: DriveSettings) -> tuple[list[Row], list[NotDriven]]:
     label_of = {key.drive_id: who.label for item in items for who, key in item.keys}
     found = {row["drive_id"]: row for row in table.read(FACTS).to_pylist()}
     rows = [found[drive_id] | {"planner": label} for drive_id, label in label_of.items() if drive_id in found]
-    order = [who.label for who, _ in contenders]
+    order = [who.label for who, _ in planners]
     return sorted(rows, key=lambda row: order.index(row["planner"])), failed
 
 
-def _contenders(settings: DriveSettings) -> list[tuple[Contender, tuple[Pictures, ...]]]:
+def _planners(settings: DriveSettings) -> list[tuple[DrivingPlanner, tuple[Pictures, ...]]]:
     """Who drives, and which pictures each is shown. Raises ConfigError for nobody."""
-    found: list[tuple[Contender, tuple[Pictures, ...]]] = []
+    found: list[tuple[DrivingPlanner, tuple[Pictures, ...]]] = []
     for one in planners_of(settings.planner, settings.planners, settings.bounds, settings.settings):
         looks = driver_of(one, settings.pdm).needs_pictures
-        found.append((Contender(one.label, one.spec, one.digest), settings.pictures if looks else ("none",)))
+        found.append((DrivingPlanner(one.label, one.spec, one.digest), settings.pictures if looks else ("none",)))
     return found
 
 
 def _items(
-    work: DriveWork, refs: Sequence[ClipRef], contenders: Sequence[tuple[Contender, tuple[Pictures, ...]]]
+    work: DriveWork, refs: Sequence[ClipRef], planners: Sequence[tuple[DrivingPlanner, tuple[Pictures, ...]]]
 ) -> Iterator[DriveItem]:
     """All drives of a clip that see the same are one item: its world is at hand once."""
     settings = work.settings
     starts = ([LOGGED] if settings.logged else []) + list(range(settings.perturbed))
-    kinds = list(dict.fromkeys(kind for _, kinds in contenders for kind in kinds))
+    kinds = list(dict.fromkeys(kind for _, kinds in planners for kind in kinds))
     for ref in refs:
         for kind in kinds:
-            who = [one for one, seen in contenders if kind in seen]
+            who = [one for one, seen in planners if kind in seen]
             keys = [(one, work.key_of(ref, start, one, kind)) for start in starts for one in who]
             yield DriveItem(ref, kind, tuple(keys))
 

@@ -31,7 +31,7 @@ from tasks.world.vocabulary import Vocabulary
 
 
 @dataclass(frozen=True)
-class Contender:
+class DrivingPlanner:
     """Someone who drives, as workers are told of them."""
 
     label: str
@@ -45,9 +45,9 @@ class DriveItem:
 
     ref: ClipRef
     pictures: Pictures
-    keys: tuple[tuple[Contender, DriveKey], ...]  # not driven yet
+    keys: tuple[tuple[DrivingPlanner, DriveKey], ...]  # not driven yet
 
-    def missing(self, done: Collection[str]) -> tuple[tuple[Contender, DriveKey], ...]:
+    def missing(self, done: Collection[str]) -> tuple[tuple[DrivingPlanner, DriveKey], ...]:
         """The drives whose ids are not among those that are done."""
         return tuple((who, key) for who, key in self.keys if key.drive_id not in done)
 
@@ -72,14 +72,14 @@ class DriveWork:
     settings: DriveSettings
     out: Location
 
-    def key_of(self, ref: ClipRef, start: int, who: Contender, pictures: Pictures) -> DriveKey:
+    def key_of(self, ref: ClipRef, start: int, who: DrivingPlanner, pictures: Pictures) -> DriveKey:
         """Of one drive, without opening the clip."""
         digest = getattr(self.reader, "digest", None)
         content = "" if digest is None else str(digest(ref))
         told = canonical_json(self._depends_on(start, who, pictures))
         return DriveKey(ref.clip_id, content, start, who.digest, pictures, told)
 
-    def _depends_on(self, start: int, who: Contender, pictures: Pictures) -> Mapping[str, Any]:
+    def _depends_on(self, start: int, who: DrivingPlanner, pictures: Pictures) -> Mapping[str, Any]:
         s = self.settings
         found: dict[str, Any] = {
             "drive": DRIVE_VERSION,
@@ -138,10 +138,10 @@ class DriveWork:
             return rendered_eyes(clip, self.settings.render, self.settings.cache or cache_folder(self.out.uri))
         return PaintedEyes(clip, self.settings.render) if pictures == "truth" else NoEyes()
 
-    def _driver(self, who: Contender) -> Driver:
+    def _driver(self, who: DrivingPlanner) -> Driver:
         return _kept_driver(who, canonical_json(self.settings.settings), self.settings.pdm, self.settings.device)
 
-    def _film(self, who: Contender, key: DriveKey, made: ClosedLoop, eyes: Eyes) -> str:
+    def _film(self, who: DrivingPlanner, key: DriveKey, made: ClosedLoop, eyes: Eyes) -> str:
         """One drive in so many has one, chosen by its id."""
         one_in = self.settings.one_film_in
         if one_in == 0 or int(key.drive_id, 16) % one_in:
@@ -149,7 +149,7 @@ class DriveWork:
         start = "log" if key.start == LOGGED else f"start {key.start}"
         return write_film(self.out, key.drive_id, made, eyes.rig, f"{who.label}, {key.pictures}, {start}")
 
-    def _row(self, who: Contender, key: DriveKey, made: ClosedLoop, eyes: Eyes) -> DriveRow:
+    def _row(self, who: DrivingPlanner, key: DriveKey, made: ClosedLoop, eyes: Eyes) -> DriveRow:
         clip, hit = made.start.scene.clip, made.hit
         return DriveRow(
             **vars(measures_of(made)),
@@ -183,7 +183,7 @@ def reads_towns(reader: ClipReader) -> bool:
 
 
 @lru_cache(maxsize=8)
-def _kept_driver(who: Contender, changed: str, pdm: Any, device: str) -> Driver:
+def _kept_driver(who: DrivingPlanner, changed: str, pdm: Any, device: str) -> Driver:
     """A worker's own, read once. Raises ValueError where it is another than was named when the command began."""
     one = planner_of(who.spec, who.label, json.loads(changed))
     if one.digest != who.digest:
