@@ -8,7 +8,7 @@ import shapely
 
 from tasks.world.clip import NOW
 from tasks.world.frames import box_corners
-from tests.bench.realism import DEEP_M, FEATURES, box_distance, faults_of, likelihood
+from tests.bench.realism import DEEP_M, FEATURES, box_distance, faults_of, likelihood, nearest
 from tests.tasks.rollout import worlds
 from tests.tasks.rollout.worlds import Track
 
@@ -29,6 +29,16 @@ def test_the_distance_of_boxes_is_shapely_s_and_below_zero_how_far_one_must_be_m
     assert (shapely.area(shapely.intersection(*shapes))[~apart] > 0.0).all()
     inside = box_distance(np.array([0.0, 0.0, 0.0, 4.0, 2.0]), np.array([1.0, 1.7, 0.0, 4.0, 2.0]))
     assert inside == pytest.approx(-0.3)
+
+
+def test_the_nearest_one_is_as_far_as_boxes_with_round_corners_are() -> None:
+    """4 x 2 m, radius 0.7 m: side by side as far as rectangles, corner to corner farther."""
+    boxes = np.array([[[0.0, 0.0, 0.0, 4.0, 2.0], [5.0, 3.0, 0.0, 4.0, 2.0], [0.0, -2.5, 0.0, 4.0, 2.0]]])
+    there, first = np.ones((1, 3), bool), np.array([0])
+    assert nearest(boxes, there, first) == pytest.approx(np.array([[0.5]]))
+    assert nearest(boxes[:, :2], there[:, :2], first) == pytest.approx(np.array([[2.4 * np.sqrt(2.0) - 1.4]]))
+    boxes[0, 1, :2] = 3.9, 1.9  # rectangles overlap by 0.1 m each way, round corners are apart
+    assert nearest(boxes[:, :2], there[:, :2], first) == pytest.approx(np.array([[1.3 * np.sqrt(2.0) - 1.4]]))
 
 
 def test_values_that_keep_to_their_bin_are_as_likely_as_the_pseudocounts_leave_them() -> None:

@@ -5,16 +5,22 @@ python -m tests.bench.bench_realism [SHARED] [--features]
 SHARED (../shared) holds two Argoverse 2 logs and seven nuScenes scenes. Every clip among the logged ego. Likelihoods
 are of the first 4 s and of vehicles that are there at T and do not stand over their whole log; faults are of 8 s in two
 rollouts, the second from where the first leads. A row for each traffic: constant velocity, the public reactive traffic
-(traffic=navsim) and ours.
+(traffic=navsim) and ours. PEER=<python> names one that can import the challenge's own code, as
+tests/bench/peer_simagents.py says: then that code judges the rollouts of every fifth clip too, and a table says by how
+much features and likelihoods differ.
 """
 
+import os
+import subprocess
 import sys
+import tempfile
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factory.readers.av2.reader import AV2Reader
 from factory.readers.base import ClipReader
@@ -26,7 +32,18 @@ from tasks.world.boxes import ego_boxes
 from tasks.world.clip import HORIZON_STEPS, STEP_S, Clip, Rollout, scene_of_clip
 from tasks.world.lanes import RoadMap
 from tasks.world.vehicle import PACIFICA
-from tests.bench.realism import FEATURES, GROUPS, Array, Faults, RoadEdge, by_group, faults_of, features_of, likelihood
+from tests.bench.realism import (
+    FEATURES,
+    GROUPS,
+    Array,
+    Faults,
+    RoadEdge,
+    by_group,
+    faults_of,
+    features_of,
+    likelihood,
+    with_ego,
+)
 
 CONSTANT_VELOCITY = "constant velocity"
 TRAFFIC: dict[str, TrafficSettings | None] = {
@@ -35,6 +52,9 @@ TRAFFIC: dict[str, TrafficSettings | None] = {
     "IDM, yields=false": TrafficSettings(yields=False),
     "IDM": TrafficSettings(),
 }
+ADAPTER = Path(__file__).with_name("peer_simagents.py")
+BESIDE_EVERY = 5  # clips
+EDGE_EVERY = 10  # steps at which the peer looks for the road's edge, which takes it long
 
 
 def constant_velocity(agents: AgentTracks) -> AgentTracks:
@@ -63,11 +83,16 @@ def rollouts(clip: Clip, settings: TrafficSettings | None) -> Iterator[tuple[Age
         scene = next_scene(scene, rollout, clip.centerline)
 
 
+def _judged_rows(clip: Clip, logged: AgentTracks) -> NDArray[np.intp]:
+    """Vehicles that are there at T and do not stand over their whole log."""
+    drives = np.array([kind == AgentKind.VEHICLE for kind in logged.kinds]) & logged.valid[0]
+    return np.flatnonzero(drives & ~stands_always(clip.agents))
+
+
 def judged(clip: Clip, settings: TrafficSettings | None, edge: RoadEdge) -> tuple[dict[str, float], float, Faults]:
     """Likelihoods, mean displacement [m] and faults of one clip; no likelihoods where nobody drives."""
     (logged, simulated, ego), second = rollouts(clip, settings)
-    drives = np.array([kind == AgentKind.VEHICLE for kind in logged.kinds]) & logged.valid[0]
-    rows = np.flatnonzero(drives & ~stands_always(clip.agents))
+    rows = _judged_rows(clip, logged)
     faults = faults_of(logged, simulated, ego) + faults_of(*second)
     if not len(rows):
         return {}, np.nan, faults
@@ -75,6 +100,56 @@ def judged(clip: Clip, settings: TrafficSettings | None, edge: RoadEdge) -> tupl
     both = (logged.valid & simulated.valid)[:, rows]
     off = np.hypot(*np.moveaxis(simulated.boxes[:, rows, :2] - logged.boxes[:, rows, :2], -1, 0))[both]
     return {name: likelihood(of, wanted[name], found[name]) for name, of in FEATURES.items()}, float(off.mean()), faults
+
+
+@dataclass
+class Apart:
+    """By how much ours and the challenge's own differ, over everything that was compared."""
+
+    most: float = 0.0
+    values: int = 0
+    other: int = 0  # values farther apart than a thousandth
+
+    def add(self, ours: Array, theirs: Array) -> None:
+        both = np.isfinite(ours) & np.isfinite(theirs)
+        if both.any():
+            off = np.abs(ours - theirs)[both]
+            self.most, self.other = max(self.most, float(off.max())), self.other + int((off > 1e-3).sum())
+            self.values += int(both.sum())
+
+
+def beside(python: str, clip: Clip, settings: TrafficSettings | None, edge: RoadEdge, apart: dict[str, Apart]) -> None:
+    """The same rollout by the challenge's own code. Raises CalledProcessError where it stops."""
+    logged, simulated, ego = next(iter(rollouts(clip, settings)))
+    rows = _judged_rows(clip, logged)
+    if not len(rows):
+        return
+    tracks = [with_ego(agents, ego) for agents in (logged, simulated)]
+    edge_steps = np.arange(0, len(ego), EDGE_EVERY)
+    with tempfile.TemporaryDirectory() as folder:
+        given, answer = Path(folder) / "in.npz", Path(folder) / "out.npz"
+        rings = edge.rings()
+        np.savez(
+            given,
+            boxes=np.stack([boxes for boxes, _ in tracks]),
+            valid=np.stack([valid for _, valid in tracks]),
+            rows=rows,
+            edge_xy=np.concatenate(rings),
+            edge_ends=np.cumsum([len(ring) for ring in rings]),
+            edge_steps=edge_steps,
+        )
+        subprocess.run([python, "-W", "ignore", str(ADAPTER), str(given), str(answer)], check=True)
+        with np.load(answer) as loaded:
+            theirs = dict(loaded)
+    ours = [features_of(agents, ego, rows, edge) for agents in (logged, simulated)]
+    for name in FEATURES:
+        if name in theirs and ours[0][name].shape == theirs[name][0].shape:
+            apart[name].add(np.stack([of[name] for of in ours]), theirs[name])
+    whole = np.stack([valid[:, rows] for _, valid in tracks]).all(axis=(0, 1))
+    for name, feature in FEATURES.items():
+        if f"likelihood {name}" in theirs:
+            value = likelihood(feature, *(of[name][:, whole] for of in ours))
+            apart[f"likelihood of {name}"].add(np.array([value]), theirs[f"likelihood {name}"][None])
 
 
 def table(reader: ClipReader, stride: int, all_features: bool) -> None:
@@ -85,7 +160,9 @@ def table(reader: ClipReader, stride: int, all_features: bool) -> None:
     faults: dict[str, Faults] = defaultdict(lambda: Faults(0, 0, 0, 0, 0, 0, 0))
     refused: dict[str, int] = defaultdict(int)
     edges: dict[int, tuple[RoadMap, RoadEdge]] = {}  # clips of one log share their map
-    for ref in refs:
+    apart: dict[str, Apart] = defaultdict(Apart)
+    python = os.environ.get("PEER", "")
+    for number, ref in enumerate(refs):
         clip = reader.read(ref)
         key = id(clip.road_map)
         if key not in edges:
@@ -100,6 +177,8 @@ def table(reader: ClipReader, stride: int, all_features: bool) -> None:
             if of:
                 likelihoods[name].append(of)
                 off[name].append(displacement)
+            if python and number % BESIDE_EVERY == 0:
+                beside(python, clip, settings, edges[key][1], apart)
     names = list(FEATURES) if all_features else []
     print(
         f"| {len(refs)} clips | {' | '.join((*GROUPS, *names))} | displacement m | new overlaps (with ego) | deep "
@@ -115,6 +194,10 @@ def table(reader: ClipReader, stride: int, all_features: bool) -> None:
             f"| {f.hard_brakes} of {f.vehicles} | {f.rolling} of {f.standing} | {refused[name]} |",
             flush=True,
         )
+    if apart:
+        print("\n| beside the challenge's own code | values | farther apart than 1e-3 | most |\n|---|---|---|---|")
+        for name, of in apart.items():
+            print(f"| {name} | {of.values} | {of.other} | {of.most:.2g} |", flush=True)
 
 
 def main(shared: Path, all_features: bool = False, stride: int = 1) -> None:

@@ -4,9 +4,10 @@ From the public definition (waymo-research/waymo-open-dataset, `wdl_limited/sim_
 `trajectory_features.py`, `interaction_features.py`, `map_metric_features.py`, and of 2025
 `challenge_2025_sim_agents_config.textproto`). Every vehicle's simulated values make a histogram over the rollout's
 steps; the likelihood of the logged values under it is averaged as logarithm over a scenario's vehicles and steps, and
-its exponential over scenarios. What differs: one rollout of 4 s in place of 32 of 8 s, in the plane, rectangles without
-rounded corners, no lights. A vehicle that a simulator takes away has no values: the pseudocounts alone, so every bin is
-as likely.
+its exponential over scenarios. What differs: one rollout of 4 s in place of 32 of 8 s, in the plane, no lights, and a
+difference of two headings is taken the shorter way round where times to collision are asked for, too. A vehicle that a
+simulator takes away has no values: the pseudocounts alone, so every bin is as likely.
+`PEER=<python> python -m tests.bench.bench_realism` holds features and likelihoods against that code.
 """
 
 from collections.abc import Mapping
@@ -28,6 +29,7 @@ FAR_M = 1e10
 MOST_TTC_S = 5.0
 GRAZE_M, DEEP_M = 0.1, 0.5  # boxes are annotated by hand to a decimetre
 ROLLS_M, STANDS_M = 1.0, 0.5
+ROUNDED = 0.7  # of half a box's shorter side: the radius of its corners
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,11 @@ class RoadEdge:
             [edge for line in lines for edge in shapely.linestrings(np.stack([line[:-1], line[1:]], axis=1))]
         )
 
+    def rings(self) -> list[Array]:
+        """The outline (P, 2) [m], closed, the road to its left."""
+        polygons = [shapely.geometry.polygon.orient(area) for area in shapely.get_parts(self._area)]
+        return [np.asarray(ring.coords) for area in polygons for ring in (area.exterior, *area.interiors)]
+
     def signed_distance(self, xy: Array) -> Array:
         """(...,) [m] of points (..., 2), above 0 off the road."""
         flat = xy.reshape(-1, 2)
@@ -105,8 +112,11 @@ def with_ego(agents: AgentTracks, ego_boxes: Array) -> tuple[Array, Bools]:
 
 
 def nearest(boxes: Array, valid: Bools, rows: NDArray[np.intp]) -> Array:
-    """(S, R) [m] from vehicles to the nearest other."""
+    """(S, R) [m] from vehicles to the nearest other, between boxes whose corners are round."""
     out = np.full((len(boxes), len(rows)), np.nan)
+    radius = 0.5 * ROUNDED * boxes[..., 3:].min(axis=-1)
+    cores = boxes.copy()
+    cores[..., 3:] -= 2.0 * radius[..., None]
     for r, i in enumerate(rows.tolist()):
         away = np.hypot(boxes[..., 0] - boxes[:, i : i + 1, 0], boxes[..., 1] - boxes[:, i : i + 1, 1])
         away -= 0.5 * np.hypot(boxes[..., 3], boxes[..., 4])  # no nearer than this
@@ -117,8 +127,8 @@ def nearest(boxes: Array, valid: Bools, rows: NDArray[np.intp]) -> Array:
             & (away < np.nanmin(np.where(valid, away, np.nan), axis=1, initial=40.0)[:, None] + 60.0)
         )
         near[:, i] = False
-        own = np.broadcast_to(boxes[:, i : i + 1], boxes.shape)
-        distance[near] = box_distance(own[near], boxes[near])
+        own = np.broadcast_to(cores[:, i : i + 1], boxes.shape)
+        distance[near] = box_distance(own[near], cores[near]) - (radius + radius[:, i : i + 1])[near]
         out[:, r] = np.where(valid[:, i], distance.min(axis=1), np.nan)
     return out
 
