@@ -6,8 +6,8 @@ SHARED (../shared) holds two Argoverse 2 logs and seven nuScenes scenes. Every c
 are of the first 4 s and of vehicles that are there at T and do not stand over their whole log; faults are of 8 s in two
 rollouts, the second from where the first leads. A row for each traffic: constant velocity, the public reactive traffic
 (traffic=navsim) and ours. PEER=<python> names one that can import the challenge's own code, as
-tests/bench/peer_simagents.py says: then that code judges the rollouts of every fifth clip too, and a table says by how
-much features and likelihoods differ.
+tests/bench/peer_simagents.py says: then that code judges some rollouts of every tenth clip too, and a table says by
+how much features and likelihoods differ.
 """
 
 import os
@@ -53,8 +53,9 @@ TRAFFIC: dict[str, TrafficSettings | None] = {
     "IDM": TrafficSettings(),
 }
 ADAPTER = Path(__file__).with_name("peer_simagents.py")
-BESIDE_EVERY = 5  # clips
-EDGE_EVERY = 10  # steps at which the peer looks for the road's edge, which takes it long
+BESIDE = (CONSTANT_VELOCITY, "IDM")  # the one drives into others and off the road, the other does not
+BESIDE_EVERY = 10  # clips
+EDGE_EVERY = 20  # steps at which the peer looks for the road's edge, which takes it long
 
 
 def constant_velocity(agents: AgentTracks) -> AgentTracks:
@@ -177,7 +178,7 @@ def table(reader: ClipReader, stride: int, all_features: bool) -> None:
             if of:
                 likelihoods[name].append(of)
                 off[name].append(displacement)
-            if python and number % BESIDE_EVERY == 0:
+            if python and name in BESIDE and number % BESIDE_EVERY == 0:
                 beside(python, clip, settings, edges[key][1], apart)
     names = list(FEATURES) if all_features else []
     print(

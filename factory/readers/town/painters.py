@@ -19,12 +19,13 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 from factory.readers.settings import TownSettings
-from factory.readers.town.reader import finish_whole, make_whole, unfinished_folder
 from factory.readers.town.town import log_name
 from factory.readers.town.write import write_logs
+from factory.readers.whole_folder import finish_whole, make_whole, mend, unfinished_folder
 from factory.wording import time_text
 
 MOST_PAINTERS = 8  # processes; each takes half a gigabyte
@@ -47,6 +48,13 @@ class TownFolder:
 def write_one(town: TownFolder, settings: TownSettings) -> None:
     """Writes the town whole, unless it is there."""
     make_whole(town.root, lambda folder: write_logs(folder, town.indices, town.seed, settings))
+
+
+def mend_all(towns: Sequence[TownFolder], settings: TownSettings) -> None:
+    """Makes the files of those that are there and damaged again."""
+    for town in towns:
+        if town.root.is_dir():
+            mend(town.root, partial(write_logs, indices=town.indices, seed=town.seed, settings=settings))
 
 
 def write_all(towns: Sequence[TownFolder], settings: TownSettings) -> None:

@@ -2,10 +2,6 @@
 
 import hashlib
 import json
-import os
-import shutil
-import tempfile
-from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -13,6 +9,7 @@ from factory.readers.av2.reader import AV2Reader
 from factory.readers.base import ClipIndex, ClipRef
 from factory.readers.settings import TownClips, TownSettings
 from factory.readers.town.write import write_town
+from factory.readers.whole_folder import make_whole, mend
 from tasks.caches import user_cache
 from tasks.world.clip import Clip
 
@@ -46,7 +43,8 @@ class SyntheticReader(SensedReader):
     """Clips of a seed's town. It is test data and a first look, no replacement for real logs.
 
     The town is written on first use, into a folder named by everything that its bytes depend on, and moved there
-    whole: parallel workers and killed processes never leave or see half a town.
+    whole: parallel workers and killed processes never leave or see half a town. Who indexes it, once before a run's
+    workers start, holds its files against their checksums.
     """
 
     def __init__(
@@ -64,13 +62,18 @@ class SyntheticReader(SensedReader):
 
     def logs(self) -> dict[str, Path]:
         """Log id -> folder; writes the town if it is missing."""
-        make_whole(self.root, lambda folder: write_town(folder, self.n_clips, self.seed, self.settings))
+        make_whole(self.root, self._write)
         return super().logs()
 
     def index(self) -> ClipIndex:
-        """The first n_clips windows, in the order of the logs."""
+        """The first n_clips windows, in the order of the logs; a town that was damaged is mended."""
+        if self.root.is_dir():
+            mend(self.root, self._write)
         index = super().index()
         return replace(index, refs=index.refs[: self.n_clips])
+
+    def _write(self, folder: Path) -> None:
+        write_town(folder, self.n_clips, self.seed, self.settings)
 
 
 def town_folder(cache_dir: str | Path | None, seed: int, logs: list[object], settings: TownSettings) -> Path:
@@ -78,31 +81,3 @@ def town_folder(cache_dir: str | Path | None, seed: int, logs: list[object], set
     key = json.dumps([TOWN_VERSION, *logs, seed, asdict(settings)])
     name = f"town-{seed}-{hashlib.sha256(key.encode()).hexdigest()[:16]}"
     return Path(cache_dir or user_cache() / "towns").expanduser().absolute() / name
-
-
-def make_whole(root: Path, write: Callable[[Path], object]) -> None:
-    """The folder `root` with what `write` writes into it, unless it is there: whole or not at all."""
-    if not root.is_dir():
-        finish_whole(unfinished_folder(root), root, write)
-
-
-def unfinished_folder(root: Path) -> Path:
-    """A new empty folder beside `root`, to become it."""
-    root.parent.mkdir(parents=True, exist_ok=True)
-    return Path(tempfile.mkdtemp(prefix=f".{root.name}-", dir=root.parent))
-
-
-def finish_whole(unfinished: Path, root: Path, write: Callable[[Path], object]) -> None:
-    """Has `unfinished` written and renames it to `root`; it is gone afterwards, whatever happened."""
-    try:
-        write(unfinished)
-        try:
-            os.rename(unfinished, root)
-        except OSError:
-            if not root.is_dir():  # else another worker was first, with the same bytes
-                raise
-    except OSError as error:
-        error.filename = error.filename or str(root)  # Arrow and a flush name none
-        raise
-    finally:
-        shutil.rmtree(unfinished, ignore_errors=True)

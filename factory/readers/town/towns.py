@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from factory.readers.base import ClipRef
+from factory.readers.base import ClipIndex, ClipRef
 from factory.readers.settings import LOGS_PER_TOWN, TownsClips, TownSettings
-from factory.readers.town.painters import TownFolder, write_all
+from factory.readers.town.painters import TownFolder, mend_all, write_all
 from factory.readers.town.reader import SensedReader, town_folder
 from tasks.caches import user_cache
 
@@ -14,8 +14,8 @@ class SyntheticTownsReader(SensedReader):
     """Clips of the towns of several seeds; no seed's clips depend on which other seeds are read.
 
     A town has eighteen kinds of drives. Of each town the next `logs_per_town` are taken, so that a few towns hold every
-    kind. Each town is written on first use into a folder of its own and moved there whole: indexing writes them all,
-    before a run's workers start, and a reader elsewhere writes those it reads from.
+    kind. Each town is written on first use into a folder of its own and moved there whole: indexing mends and writes
+    them all, before a run's workers start, and a reader elsewhere writes those it reads from.
     """
 
     def __init__(
@@ -44,6 +44,11 @@ class SyntheticTownsReader(SensedReader):
         """Of all towns, in the order of the seeds; writes the towns that are missing."""
         write_all(self.towns, self.settings)
         return {name: folder for town in self.towns for name, folder in town.logs().items()}
+
+    def index(self) -> ClipIndex:
+        """All windows of all towns; a town that was damaged is mended."""
+        mend_all(self.towns, self.settings)
+        return super().index()
 
     def path_of(self, ref: ClipRef) -> Path:
         """The folder of the clip's log; writes its town if it is missing. Raises BadClip where there is none."""

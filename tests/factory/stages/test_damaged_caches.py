@@ -12,7 +12,9 @@ from factory.graph.steps import Prepared, cache_key, prepare
 from factory.readers.navsim.windows import kept_table, make_table
 from factory.readers.nuplan_maps.kept import cache_file, kept_tables
 from factory.readers.settings import TownSettings
-from factory.readers.town.reader import SyntheticReader
+from factory.readers.town.reader import SensedReader, SyntheticReader
+from factory.readers.town.towns import SyntheticTownsReader
+from factory.readers.whole_folder import SUMS
 from factory.setup.recovery import _table_of
 from factory.setup.vocabulary import load_recovery_table, save_recovery_table, save_vocabulary
 from factory.stages.fitting import _resumed
@@ -201,3 +203,35 @@ def test_damage_is_damage() -> None:
     """No copy that the others try is the file itself."""
     whole = bytes(range(256)) * 3
     assert whole not in damaged(whole) and len(list(damaged(whole))) == 24
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("several", [False, True])
+def test_a_town(tmp_path: Path, lines: Lines, several: bool) -> None:
+    """Tables and maps alike; whoever indexes it mends it, and clips are what they were."""
+    settings = TownSettings(cameras=(), lidar_beams=0)
+    if several:
+        reader: SensedReader = SyntheticTownsReader([3], logs_per_town=1, cache_dir=tmp_path, settings=settings)
+    else:
+        reader = SyntheticReader(tmp_path, 1, 0, settings)
+    ref = reader.index().refs[0]
+    golden = reader.digest(ref)
+    (root,) = tmp_path.iterdir()
+    whole = {path: path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
+    assert {path.name for path in whole} >= {"annotations.feather", SUMS}
+    at = root / next(path for path in whole if path.name == "annotations.feather")
+    at.write_bytes(whole[at][:-1] + b"-")
+    assert reader.digest(ref) != golden
+    changes: list[tuple[Path, bytes | None]] = [(at, whole[at][:-1] + b"-"), (root / SUMS, b"{}")]
+    for path, change in changes if several else [*changes, (at, None), (root / SUMS, None)]:
+        if change is None:
+            path.unlink()
+        else:
+            path.write_bytes(change)
+        assert reader.index().refs[0] == ref
+        (line,) = lines()
+        assert line.startswith(f"{root} is damaged (") and path.name in line
+        assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == whole
+    assert reader.digest(ref) == golden
+    assert reader.index().refs and not lines()
+    assert list(tmp_path.iterdir()) == [root]
