@@ -132,6 +132,7 @@ class RunConfig:
     graph: GraphChoice = field(default_factory=GraphChoice)
     limit: int | None = None  # read this many clips only
     seed: int = 0  # of every random draw
+    explore: str | None = None  # of `python -m planners explore`, folder or URL: a planner's states are candidates too
     on_change: Literal["stop", "keep", "redo"] = "stop"  # when settings or stage versions differ from the table's
     retry_failed: bool = False  # run attempts again that failed on their input or by a bug
     minutes: float | None = None  # after which nothing new is begun (exit code 4); the same command goes on
