@@ -21,6 +21,7 @@ from tasks.reward.epdms import Scores, score
 from tasks.reward.prepare import among, prepare_scene
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out
+from tasks.sampling import CellWeights, by_lot
 from tasks.settings import PerturbSettings
 from tasks.stages import Rejected
 from tasks.world.arrays import Array, Bools, Ints
@@ -130,13 +131,14 @@ def perturb(
     planner: PdmSettings,
     rng: np.random.Generator,
     proposals: Sequence[Proposal] = (),
+    wanted: CellWeights | None = None,
 ) -> Perturbation | Rejected:
     """The ordered candidates of a clip, or Rejected "no_gated_candidate" or "no_good_candidate".
 
     traffic: of the reactive check; planner: PDM-Closed, the first row of every two-row batch that normalises progress;
     rng: the clip's `perturb` stream, which draws one permutation of the vocabulary; proposals: of a planner, beside it.
     The order is the failing proposals, worst first; then, one of either in turn, the other ones and the vocabulary's in
-    the order of the settings.
+    the order of the settings; or, where cells are wanted more than others, in that of a lot by these weights.
     """
     scene = scene_of_clip(clip)
     start = scene.ego_state
@@ -179,6 +181,8 @@ def perturb(
     rank[walk_order] = np.arange(len(walk_order))
     usable = np.flatnonzero((reached & black)[:n_gated])
     kept = first_good_per_cell(cells, usable[np.argsort(rank[gated[usable]])], passes_replay)
+    if wanted is not None:
+        kept = kept[by_lot(wanted.of(cells[kept]), rng)]
     proposed = [n_gated + place for place in worst_first(proposals) if reached[n_gated + place]]
     kept_proposed = first_good_per_cell(cells, np.array(proposed, dtype=np.int64), passes_replay)
     counts["replay_score"] = int((scores[:n_gated] < settings.epdms_min).sum())

@@ -13,7 +13,8 @@ from typing import Any
 from factory.config.classes import class_of
 from factory.config.compose import ConfigError, build
 from factory.config.run import RunConfig, VocabularyChoice, photos_alone, refuse_relative_root
-from factory.readers.base import BadClip, ClipIndex, ClipReader
+from factory.readers.base import BadClip, ClipIndex, ClipReader, ClipRef
+from factory.setup.sample import Sampled, choose_sample, chosen_clips
 from factory.setup.vocabulary import load_vocabulary
 from factory.stages.frames import BenchmarkWork
 from factory.stages.own_body import masks_digest, refuse_unknown_masks
@@ -56,6 +57,12 @@ class Run:
     reader: ClipReader
     index: ClipIndex
     work: FactoryWork
+    sampled: Sampled
+
+    @property
+    def refs(self) -> list[ClipRef]:
+        """The clips that it is asked for, those of broken logs among them."""
+        return chosen_clips(self.config, [*self.index.refs, *self.index.broken], self.sampled)
 
 
 @dataclass(frozen=True)
@@ -118,6 +125,7 @@ def assemble(config: RunConfig) -> Run:
         vocabulary = choose_vocabulary(config.vocabulary)
         labelling = choose_labelling(config, vocabulary)
         explored = choose_explored(config)
+        sampled = choose_sample(config)
         experts = {
             name: build_expert(RunContext(config, name, opened)) for name in config.experts if name not in FRAMES
         }
@@ -138,12 +146,13 @@ def assemble(config: RunConfig) -> Run:
         labelling=labelling,
         render=config.render,
         seed=config.seed,
-        identity=identity_of(config, vocabulary, labelling, explored),
+        identity=identity_of(config, vocabulary, labelling, explored, sampled.digest),
         cache_dir=cache_folder(config.out),
         photos_alone=photos_alone(config),
         explored=explored,
+        wanted_cells=sampled.cells,
     )
-    return Run(config, reader, index, work)
+    return Run(config, reader, index, work, sampled)
 
 
 def refuse_unknown_cameras(config: RunConfig, reader: ClipReader, index: ClipIndex) -> None:
@@ -235,12 +244,16 @@ def _must_have(plugged: object, members: Sequence[str], where: str, what: str) -
 
 
 def identity_of(
-    config: RunConfig, vocabulary: Vocabulary, labelling: Labelling | None, explored: Explored | None = None
+    config: RunConfig,
+    vocabulary: Vocabulary,
+    labelling: Labelling | None,
+    explored: Explored | None = None,
+    candidates_by: str = "",
 ) -> RunIdentity:
     """What the rows depend on besides clip, candidate and expert. Where data lies and who works on it is not in it.
 
     Candidates are numbered among the vocabulary's and a planner's together: with proposals the vocabulary's digest, and
-    so every attempt's id, is of both.
+    so every attempt's id, is of both; and of what orders them, candidates_by, where that is no mere draw.
     """
     science: dict[str, Any] = {
         "perturb": config.perturb,
@@ -258,13 +271,16 @@ def identity_of(
     del settings["render.lpips"]  # measures alone
     settings["render.own_body"] = masks_digest(config.render.own_body)
     settings = {key: plain for key, plain in settings.items() if plain != ADDED.get(key, ABSENT)}
-    digest = vocabulary.digest
+    told: dict[str, object] = {}
     if explored is not None:
-        settings |= {
-            "explore.planner": f"{explored.planner} {explored.planner_digest}",
-            "explore.digest": explored.digest,
-        }
-        digest = hashlib.sha256(f"{vocabulary.digest} {explored.digest}".encode()).hexdigest()[:16]
+        told["explore.planner"] = f"{explored.planner} {explored.planner_digest}"
+        told["explore.digest"] = explored.digest
+    if candidates_by:
+        told["sample.candidates"] = candidates_by
+    settings |= told
+    digest = vocabulary.digest
+    if told:
+        digest = hashlib.sha256(canonical_json([vocabulary.digest, told]).encode()).hexdigest()[:16]
     settings["reward.label_vocabulary"] = None if labelling is None else labelling.vocabulary.digest
     versions = stage_versions()
     early: dict[str, object] = {

@@ -27,6 +27,7 @@ from tasks.render.settings import RenderMode, RenderSettings
 from tasks.render.splatting.gsplat_backend import BackendMissing
 from tasks.reward.labels import Labelling, vocabulary_labels
 from tasks.rollout.simulate import TrafficSettings
+from tasks.sampling import CellWeights
 from tasks.stages import Rejected
 from tasks.subscores import OF_ONE_PLAN
 from tasks.world.arrays import Array
@@ -133,6 +134,7 @@ class FactoryWork:
     cache_dir: str  # of reconstructed blocks
     photos_alone: bool  # clips may have photos and no lidar
     explored: Explored | None = field(default=None, kw_only=True)  # a planner's proposals, beside the vocabulary
+    wanted_cells: CellWeights | None = field(default=None, kw_only=True)  # where candidates are wanted to end
 
     def warm(self, draws: bool = True) -> None:
         """This run's kernels, and no others, into the on-disk cache. Raises NotReady."""
@@ -193,7 +195,8 @@ class FactoryWork:
             blocked = self.imaging.block_verdict(clip) if asked else None
         with watch.of("perturb"):
             rng, proposals = stream(self.seed, clip.clip_id, "perturb"), self._proposals(clip)
-            found = blocked or perturb(clip, self.vocabulary, self.perturb, self.traffic, self.pdm, rng, proposals)
+            how = (self.perturb, self.traffic, self.pdm, rng, proposals, self.wanted_cells)
+            found = blocked or perturb(clip, self.vocabulary, *how)
         return WholeClip(clip, found, watch.seconds)
 
     def _proposals(self, clip: Clip) -> tuple[Proposal, ...]:

@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass
 
 from factory.readers.base import BadClip, ClipReader, ClipRef
 from factory.setup.settings import cache_folder
+from factory.stages.rows import scene_tags
 from factory.store.explored.table import ExploredClip, ProposalRow
 from factory.store.identity import canonical_json
 from factory.store.location import Location
@@ -15,8 +16,9 @@ from planners.drive.work import DrivingPlanner, NotDriven, eyes_of, kept_driver,
 from planners.explore.drift import CLIP_STEPS, Drift, drift, from_the_log
 from planners.explore.settings import ExploreSettings
 from tasks.stages import stage_versions
-from tasks.world.clip import Clip
-from tasks.world.vehicle import VX
+from tasks.world.clip import NOW, Clip, scene_of_clip
+from tasks.world.command import driving_command
+from tasks.world.vehicle import HEADING, VX
 
 EXPLORE_VERSION = 1  # raised by hand whenever the same planner in the same clip proposes otherwise
 
@@ -67,6 +69,7 @@ class ExploreWork:
             log_id=clip.log_id,
             content_digest=clip.content_digest,
             licence=clip.licence,
+            tags=tags_at_now(clip),
             planner=self.planner.label,
             planner_digest=self.planner.digest,
             settings=self.depends_on,
@@ -83,6 +86,12 @@ class ExploreWork:
     def _eyes(self, clip: Clip) -> Eyes:
         s = self.settings
         return eyes_of(clip, s.pictures if self.looks else "none", s.render, s.cache or cache_folder(self.out.uri))
+
+
+def tags_at_now(clip: Clip) -> tuple[str, ...]:
+    """As a sample's that begins with the log at T."""
+    command = driving_command(clip.centerline, clip.ego_states[NOW, : HEADING + 1])
+    return tuple(scene_tags(scene_of_clip(clip), command))
 
 
 def proposal_row(number: int, one: Drift) -> ProposalRow:

@@ -49,6 +49,7 @@ class ExploredClip:
     log_id: str
     content_digest: str
     licence: str
+    tags: tuple[str, ...]  # what is in the scene at T
     planner: str
     planner_digest: str
     settings: str  # all that the proposals depend on beside clip and planner, canonical JSON
@@ -63,8 +64,22 @@ class ExploredClip:
         return hashlib.sha256(canonical_json(asdict(self)).encode()).hexdigest()[:16]
 
 
-COUNTED = {"digest": pa.string(), "n_proposals": pa.int32(), "n_failing": pa.int32()}  # beside what a clip holds
-FACTS = ("clip_id", "planner", "planner_digest", "settings", *COUNTED)  # what is not as long as a drive
+COUNTED = {  # beside what a clip holds
+    "digest": pa.string(),
+    "n_proposals": pa.int32(),
+    "n_failing": pa.int32(),
+    "ends": pa.list_(pa.list_(pa.float64())),  # x, y [m], heading [rad] of each proposal
+    "fails_from": pa.list_(pa.string()),
+}
+FACTS = (
+    "clip_id",
+    "planner",
+    "planner_digest",
+    "settings",
+    "digest",
+    "n_proposals",
+    "n_failing",
+)  # what is not as long as a drive
 SCHEMA = pa.schema([*schema_of(ExploredClip), *(pa.field(name, kind) for name, kind in COUNTED.items())])
 EXPLORED = TableSpec(TABLE, SCHEMA, "clip_id")
 
@@ -81,8 +96,14 @@ def write_explored(table: KeyedTable, clips: Sequence[ExploredClip]) -> None:
 
 
 def _counted(clip: ExploredClip) -> dict[str, object]:
-    failing = sum(bool(one.fails) for one in clip.proposals)
-    return {"digest": clip.digest, "n_proposals": len(clip.proposals), "n_failing": failing}
+    fails_from = [one.fails for one in clip.proposals]
+    return {
+        "digest": clip.digest,
+        "n_proposals": len(fails_from),
+        "n_failing": sum(map(bool, fails_from)),
+        "ends": [[one.end_x, one.end_y, one.end_heading] for one in clip.proposals],
+        "fails_from": fails_from,
+    }
 
 
 def explored_clips(rows: pa.Table) -> list[ExploredClip]:

@@ -27,7 +27,7 @@ def proposal(number: int, fails: str = "") -> ProposalRow:
 
 def row(clip_id: str = CLIP.clip_id, **changed: object) -> ExploredClip:
     found = ExploredClip(
-        *(clip_id, "town", "log", "as it was", "free", "someone", "0a1b", "{}", 0.25, "dac", {"lateral": 1}),
+        *(clip_id, "town", "log", "as it was", "free", ("slow",), "someone", "0a1b", "{}", 0.25, "dac", {"lateral": 1}),
         proposals=(proposal(0), proposal(2, "nc")),
     )
     return replace(found, **changed)  # type: ignore[arg-type]
