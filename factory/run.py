@@ -154,8 +154,7 @@ def run(asked: Asked, only_plan: bool) -> int:
     elsewhere = config.executor == "ray" and "RAY_ADDRESS" in os.environ  # a cluster's nodes compile for themselves
     with nullcontext() if elsewhere else compiling_ahead(kernels_of(config)):
         assembled = assemble(config)
-        wanted = [*assembled.index.refs, *assembled.index.broken][: config.limit]
-        refs = dealt(wanted, config.workers or os.cpu_count() or 1)
+        refs = dealt(assembled.refs, config.workers or os.cpu_count() or 1)
         print(plan_text(assembled, refs), flush=True)
         if only_plan:
             print(calibrate(assembled, refs, store))

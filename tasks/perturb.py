@@ -4,19 +4,24 @@ Paper, section "Trajectory Perturbation" and the configuration table of its supp
 gates on the reached end pose, an interleaved grid over those, per cell the first trajectory in seeded order with a
 non-reactive EPDMS at the threshold (log replay), then the same threshold under reactive traffic on the kept ones only.
 Scores are needed only until a cell is filled, so cells are walked abreast: the same result at a fraction of the scores.
+
+Beside the vocabulary's there may be motions that a planner drove itself into (tasks.proposals). They pass the same
+gates on their end and the same two scores, one a cell, of any cell; those where the planner then failed come first.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import islice
 
 import numpy as np
 
 from tasks.experts.pdm_closed.planner import PdmSettings, plan_for
+from tasks.proposals import Proposal, alternating, index_of, worst_first
 from tasks.reward.epdms import Scores, score
 from tasks.reward.prepare import among, prepare_scene
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out
+from tasks.sampling import CellWeights, by_lot
 from tasks.settings import PerturbSettings
 from tasks.stages import Rejected
 from tasks.world.arrays import Array, Bools, Ints
@@ -25,18 +30,21 @@ from tasks.world.frames import to_local, to_world
 from tasks.world.vehicle import HEADING, VX
 from tasks.world.vocabulary import Vocabulary
 
+PROPOSED = ("reached_gate", "score", "reactive")  # what drops proposals, counted where there are some
+
 
 @dataclass(frozen=True)
 class Candidate:
     """A perturbation of one clip, with the reactive rollout that proved it."""
 
-    vocabulary_index: int
+    vocabulary_index: int  # row of the vocabulary; below 0: of a proposal, tasks.proposals.index_of
     end_pose: Array  # (3,) reached at T+H, in the frame of the logged pose at T+H
     cell: tuple[int, int]  # longitudinal, lateral index of the grid
     score: float  # EPDMS (/14) under log replay
     reactive_score: float  # EPDMS (/14) under reactive traffic
     reactive_scores: Scores  # row 1 is the candidate, row 0 PDM-Closed
     rollout: Rollout
+    fails: str | None = None  # of a proposal: the sub-score that its planner then failed, "": none; None: no proposal
 
 
 @dataclass(frozen=True)
@@ -50,9 +58,12 @@ class Perturbation:
 
 @dataclass(frozen=True)
 class Considered:
-    """Every vocabulary trajectory that passed the raw gates, and what became of it: for `explain` and pictures."""
+    """Every vocabulary trajectory that passed the raw gates, then every proposal, and what became of it.
 
-    vocabulary_index: Ints  # (G,)
+    For `explain` and pictures.
+    """
+
+    vocabulary_index: Ints  # (G,) below 0: a proposal
     end_pose: Array  # (G, 3) reached, in the frame of the logged pose at T+H
     fate: tuple[str, ...]  # (G,) "reached_gate", "white_cell", "not_needed", "score", "reactive", "kept"
     score: Array  # (G,) EPDMS under log replay, NaN where it was not needed
@@ -119,11 +130,15 @@ def perturb(
     traffic: TrafficSettings,
     planner: PdmSettings,
     rng: np.random.Generator,
+    proposals: Sequence[Proposal] = (),
+    wanted: CellWeights | None = None,
 ) -> Perturbation | Rejected:
     """The ordered candidates of a clip, or Rejected "no_gated_candidate" or "no_good_candidate".
 
     traffic: of the reactive check; planner: PDM-Closed, the first row of every two-row batch that normalises progress;
-    rng: the clip's `perturb` stream, which draws one permutation of the vocabulary.
+    rng: the clip's `perturb` stream, which draws one permutation of the vocabulary; proposals: of a planner, beside it.
+    The order is the failing proposals, worst first; then, one of either in turn, the other ones and the vocabulary's in
+    the order of the settings; or, where cells are wanted more than others, in that of a lot by these weights.
     """
     scene = scene_of_clip(clip)
     start = scene.ego_state
@@ -135,22 +150,27 @@ def perturb(
     raw_fails = gate_failures(raw_ends, settings)
     gated = np.flatnonzero(~np.logical_or.reduce(list(raw_fails.values())))
     counts = {f"raw_{name}": int(fails.sum()) for name, fails in raw_fails.items()}
-    if len(gated) == 0:
+    n_gated = len(gated)  # proposals stand behind them
+    if n_gated + len(proposals) == 0:
         detail = f"none of {len(raw_ends)} trajectories ends near the log"
         return Rejected("perturb", "no_gated_candidate", detail, counts)
 
-    states = track(start, to_world(start[: HEADING + 1], vocabulary.trajectories[gated]))
+    driven = [track(start, to_world(start[: HEADING + 1], vocabulary.trajectories[gated]))] if n_gated else []
+    states = np.concatenate([*driven, *(proposal.ego_states[None] for proposal in proposals)])
+    index = np.concatenate([gated, np.array([index_of(one.number) for one in proposals], dtype=np.int64)])
     ends = to_local(target, states[:, -1, : HEADING + 1])
     end_fails = gate_failures(ends, settings)
     reached = ~np.logical_or.reduce(list(end_fails.values()))
-    counts |= {f"reached_{name}": int(fails.sum()) for name, fails in end_fails.items()}
+    counts |= {f"reached_{name}": int(fails[:n_gated].sum()) for name, fails in end_fails.items()}
     cells = grid_cells(ends, settings)
-    black = (cells.sum(axis=1) % 2 == 0) | (not settings.interleaved)  # the interleaved half of the grid
+    is_proposed = np.arange(len(index)) >= n_gated
+    # The interleaved half of the grid; of proposals all of it.
+    black = (cells.sum(axis=1) % 2 == 0) | (not settings.interleaved) | is_proposed
     counts["white_cell"] = int((reached & ~black).sum())
 
     replay = prepare_scene(scene, scene.agents.window(NOW, NOW + HORIZON_STEPS + 1))
     pdm_states = plan_for(scene, planner).driven[None]
-    scores = np.full(len(gated), np.nan)
+    scores = np.full(len(index), np.nan)
 
     def passes_replay(members: Ints) -> Bools:
         result = score(replay, np.concatenate([pdm_states, states[members]]), normalise="pairs")
@@ -159,9 +179,13 @@ def perturb(
 
     rank = np.empty(len(walk_order), dtype=np.int64)
     rank[walk_order] = np.arange(len(walk_order))
-    usable = np.flatnonzero(reached & black)
+    usable = np.flatnonzero((reached & black)[:n_gated])
     kept = first_good_per_cell(cells, usable[np.argsort(rank[gated[usable]])], passes_replay)
-    counts["replay_score"] = int((scores < settings.epdms_min).sum())
+    if wanted is not None:
+        kept = kept[by_lot(wanted.of(cells[kept]), rng)]
+    proposed = [n_gated + place for place in worst_first(proposals) if reached[n_gated + place]]
+    kept_proposed = first_good_per_cell(cells, np.array(proposed, dtype=np.int64), passes_replay)
+    counts["replay_score"] = int((scores[:n_gated] < settings.epdms_min).sum())
 
     fate = np.where(~reached, "reached_gate", np.where(~black, "white_cell", "not_needed")).astype(object)
     fate[np.isfinite(scores)] = "score"
@@ -169,36 +193,43 @@ def perturb(
     touched_from = start if traffic.leaves_out_touching else None
     proven: dict[int, Candidate] = {}
 
-    def passes_reactive(place: int) -> bool:
-        member = int(kept[place])
+    def passes_reactive(member: int) -> bool:
         rollout = roll_out(traffic_scene, states[member].copy())
         pair = np.concatenate([pdm_states, rollout.ego_states[None]])
         reactive = score(among(replay, rollout.agents, touched_from), pair, normalise="pairs")
         good = bool(reactive.pdm_score[1] >= settings.epdms_min)
         fate[member] = "kept" if good else "reactive"
         if good:
-            proven[place] = Candidate(
-                vocabulary_index=int(gated[member]),
+            proven[member] = Candidate(
+                vocabulary_index=int(index[member]),
                 end_pose=ends[member],
                 cell=(int(cells[member, 0]), int(cells[member, 1])),
                 score=float(scores[member]),
                 reactive_score=float(reactive.pdm_score[1]),
                 reactive_scores=reactive,
                 rollout=rollout,
+                fails=proposals[member - n_gated].fails if is_proposed[member] else None,
             )
         return good
 
-    at_most = len(kept) if settings.at_most is None else settings.at_most
-    fate[kept] = "not_needed"
+    fate[kept] = fate[kept_proposed] = "not_needed"
+    failing = [int(member) for member in kept_proposed if proposals[member - n_gated].fails]
+    others = [int(member) for member in kept_proposed if not proposals[member - n_gated].fails]
+    at_most = len(kept) + len(kept_proposed) if settings.at_most is None else settings.at_most
+    chosen = list(islice(filter(passes_reactive, failing), at_most))
+    at_most -= len(chosen)
     if settings.order == "spread":
-        places = spread_out(ends[kept, :2], passes_reactive, at_most)
+        rest = np.concatenate([kept, np.array(others, dtype=np.int64)])
+        chosen += [int(rest[i]) for i in spread_out(ends[rest, :2], lambda i: passes_reactive(int(rest[i])), at_most)]
     else:
-        places = list(islice(filter(passes_reactive, range(len(kept))), at_most))
-    candidates = [proven[place] for place in places]
-    counts["reactive_score"] = int((fate == "reactive").sum())
+        chosen += islice(filter(passes_reactive, alternating(others, kept.tolist())), at_most)
+    candidates = [proven[member] for member in chosen]
+    counts["reactive_score"] = int((fate[:n_gated] == "reactive").sum())
+    if proposals:
+        counts |= {f"proposed_{what}": int((fate[n_gated:] == what).sum()) for what in PROPOSED}
     if not candidates:
         return Rejected("perturb", "no_good_candidate", ", ".join(f"{k} {v}" for k, v in counts.items()), counts)
-    return Perturbation(tuple(candidates), counts, Considered(gated, ends, tuple(fate), scores))
+    return Perturbation(tuple(candidates), counts, Considered(index, ends, tuple(fate), scores))
 
 
 def end_speed_mps(candidate: Candidate) -> float:

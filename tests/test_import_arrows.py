@@ -32,7 +32,7 @@ ROOMS = {
             "reward.rules",
             "reward",
         ),
-        *("experts", "perturb", "attempt", "hard_scenes", "trajectories"),
+        *("experts", "proposals", "sampling", "perturb", "attempt", "hard_scenes", "trajectories"),
         *("render.splatting", "render.scene", "render.rig", "render.fit", "render"),
     ),
     "factory": (
@@ -41,7 +41,8 @@ ROOMS = {
         *("run", "commands", "__main__"),
     ),
     "planners": (
-        *("command", "data", "models", "training", "published", "evaluation", "drive", "navsim", "study", "__main__"),
+        *("command", "data", "models", "training", "published"),
+        *("evaluation", "drive", "explore", "navsim", "study", "__main__"),
     ),
 }
 MOST_MODULES = 20  # in a room

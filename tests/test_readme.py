@@ -38,6 +38,8 @@ from planners.evaluation.compare import CompareSettings
 from planners.evaluation.compare import main as compare_main
 from planners.evaluation.evaluate import settings_of as evaluate_settings
 from planners.evaluation.replay import settings_of as replay_settings
+from planners.explore.alternate import AlternateSettings
+from planners.explore.settings import settings_of as explore_settings
 from planners.models.registry import settings_of
 from planners.published.import_planner import config_of as import_config
 from planners.study.agreement import main as agreement_main
@@ -208,6 +210,10 @@ def test_every_command_is_one_its_program_takes(
             replay_settings(arguments)
         case ["python", "-m", "planners", "drive", *arguments] | ["python", "-m", "planners.drive", *arguments]:
             drive_settings(arguments)
+        case ["python", "-m", "planners", "explore", *arguments]:
+            explore_settings(arguments)
+        case ["python", "-m", "planners", "alternate", *arguments]:
+            fill(AlternateSettings, compose("alternate", arguments, AlternateSettings), "alternate")
         case ["python", "-m", "planners", "study", *arguments]:
             fill(StudySettings, compose("study", arguments), "study")
         case ["python", "-m", "planners", "report", *arguments]:

@@ -13,14 +13,17 @@ from typing import Any
 from factory.config.classes import class_of
 from factory.config.compose import ConfigError, build
 from factory.config.run import RunConfig, VocabularyChoice, photos_alone, refuse_relative_root
-from factory.readers.base import BadClip, ClipIndex, ClipReader
+from factory.readers.base import BadClip, ClipIndex, ClipReader, ClipRef
+from factory.setup.sample import Sampled, choose_sample, chosen_clips
 from factory.setup.vocabulary import load_vocabulary
 from factory.stages.frames import BenchmarkWork
 from factory.stages.own_body import masks_digest, refuse_unknown_masks
 from factory.stages.pipeline import FactoryWork
 from factory.stages.sensors import chosen_cameras
+from factory.store.explored.proposals import Explored, explored_in
 from factory.store.identity import UNLISTED, RunIdentity, canonical_json
 from factory.store.illness import why_ill
+from factory.store.location import Location
 from tasks.caches import user_cache
 from tasks.experts.pdm_closed.settings import PdmSettings
 from tasks.experts.protocol import Expert, tried_once
@@ -54,6 +57,12 @@ class Run:
     reader: ClipReader
     index: ClipIndex
     work: FactoryWork
+    sampled: Sampled
+
+    @property
+    def refs(self) -> list[ClipRef]:
+        """The clips that it is asked for, those of broken logs among them."""
+        return chosen_clips(self.config, [*self.index.refs, *self.index.broken], self.sampled)
 
 
 @dataclass(frozen=True)
@@ -115,6 +124,8 @@ def assemble(config: RunConfig) -> Run:
     try:  # what takes no clips comes first
         vocabulary = choose_vocabulary(config.vocabulary)
         labelling = choose_labelling(config, vocabulary)
+        explored = choose_explored(config)
+        sampled = choose_sample(config)
         experts = {
             name: build_expert(RunContext(config, name, opened)) for name in config.experts if name not in FRAMES
         }
@@ -135,11 +146,13 @@ def assemble(config: RunConfig) -> Run:
         labelling=labelling,
         render=config.render,
         seed=config.seed,
-        identity=identity_of(config, vocabulary, labelling),
+        identity=identity_of(config, vocabulary, labelling, explored, sampled.digest),
         cache_dir=cache_folder(config.out),
         photos_alone=photos_alone(config),
+        explored=explored,
+        wanted_cells=sampled.cells,
     )
-    return Run(config, reader, index, work)
+    return Run(config, reader, index, work, sampled)
 
 
 def refuse_unknown_cameras(config: RunConfig, reader: ClipReader, index: ClipIndex) -> None:
@@ -177,6 +190,16 @@ def choose_labelling(config: RunConfig, vocabulary: Vocabulary) -> Labelling | N
     named = config.reward.label_vocabulary
     chosen = vocabulary if named is None else load_vocabulary(named)
     return Labelling(chosen, dataclasses.replace(config.traffic, mode=config.reward.traffic))
+
+
+def choose_explored(config: RunConfig) -> Explored | None:
+    """The planner's proposals that the run takes, None for none. Raises ValueError where the folder holds none."""
+    if config.explore is None:
+        return None
+    try:
+        return explored_in(Location.parse(config.explore, setting="explore"))
+    except ValueError as error:
+        raise ConfigError(f"explore={config.explore}: {error}") from error
 
 
 def build_expert(run: RunContext) -> Expert:
@@ -220,8 +243,18 @@ def _must_have(plugged: object, members: Sequence[str], where: str, what: str) -
         raise ConfigError(f"{where}: {type(plugged).__name__} is not {what}: it has no {', '.join(missing)}")
 
 
-def identity_of(config: RunConfig, vocabulary: Vocabulary, labelling: Labelling | None) -> RunIdentity:
-    """What the rows depend on besides clip, candidate and expert. Where data lies and who works on it is not in it."""
+def identity_of(
+    config: RunConfig,
+    vocabulary: Vocabulary,
+    labelling: Labelling | None,
+    explored: Explored | None = None,
+    candidates_by: str = "",
+) -> RunIdentity:
+    """What the rows depend on besides clip, candidate and expert. Where data lies and who works on it is not in it.
+
+    Candidates are numbered among the vocabulary's and a planner's together: with proposals the vocabulary's digest, and
+    so every attempt's id, is of both; and of what orders them, candidates_by, where that is no mere draw.
+    """
     science: dict[str, Any] = {
         "perturb": config.perturb,
         "traffic": config.traffic,
@@ -238,6 +271,16 @@ def identity_of(config: RunConfig, vocabulary: Vocabulary, labelling: Labelling 
     del settings["render.lpips"]  # measures alone
     settings["render.own_body"] = masks_digest(config.render.own_body)
     settings = {key: plain for key, plain in settings.items() if plain != ADDED.get(key, ABSENT)}
+    told: dict[str, object] = {}
+    if explored is not None:
+        told["explore.planner"] = f"{explored.planner} {explored.planner_digest}"
+        told["explore.digest"] = explored.digest
+    if candidates_by:
+        told["sample.candidates"] = candidates_by
+    settings |= told
+    digest = vocabulary.digest
+    if told:
+        digest = hashlib.sha256(canonical_json([vocabulary.digest, told]).encode()).hexdigest()[:16]
     settings["reward.label_vocabulary"] = None if labelling is None else labelling.vocabulary.digest
     versions = stage_versions()
     early: dict[str, object] = {
@@ -251,8 +294,8 @@ def identity_of(config: RunConfig, vocabulary: Vocabulary, labelling: Labelling 
     if set(config.experts) & set(FRAMES):  # then a prepared clip has its earlier frame
         made_of.append("earlier frame")
     prepared = canonical_json(made_of)
-    digest = hashlib.sha256(prepared.encode()).hexdigest()[:16]
-    return RunIdentity(settings, versions, vocabulary.digest, digest if simulates(config) else UNLISTED)
+    listed = hashlib.sha256(prepared.encode()).hexdigest()[:16] if simulates(config) else UNLISTED
+    return RunIdentity(settings, versions, digest, listed)
 
 
 def cache_folder(out: str) -> str:

@@ -15,16 +15,19 @@ from factory.stages.fitting import fits_going_on
 from factory.stages.imaging import Imaging, scene_lookups
 from factory.stages.rows import label_columns, sample_row
 from factory.store.candidates import CandidateRow
+from factory.store.explored.proposals import Explored
 from factory.store.identity import UNLISTED, RunIdentity
 from tasks.attempt import ExpertGate, Judged, Timed, attempt, has_route, human_sample, perturbed_scene
 from tasks.experts.pdm_closed.planner import PdmSettings
 from tasks.experts.protocol import Expert, tried_once
 from tasks.perturb import Candidate, Perturbation, PerturbSettings, end_speed_mps, perturb
+from tasks.proposals import Proposal
 from tasks.render.scene.engine import Backend, check
 from tasks.render.settings import RenderMode, RenderSettings
 from tasks.render.splatting.gsplat_backend import BackendMissing
 from tasks.reward.labels import Labelling, vocabulary_labels
 from tasks.rollout.simulate import TrafficSettings
+from tasks.sampling import CellWeights
 from tasks.stages import Rejected
 from tasks.subscores import OF_ONE_PLAN
 from tasks.world.arrays import Array
@@ -130,6 +133,8 @@ class FactoryWork:
     identity: RunIdentity
     cache_dir: str  # of reconstructed blocks
     photos_alone: bool  # clips may have photos and no lidar
+    explored: Explored | None = field(default=None, kw_only=True)  # a planner's proposals, beside the vocabulary
+    wanted_cells: CellWeights | None = field(default=None, kw_only=True)  # where candidates are wanted to end
 
     def warm(self, draws: bool = True) -> None:
         """This run's kernels, and no others, into the on-disk cache. Raises NotReady."""
@@ -189,10 +194,14 @@ class FactoryWork:
             asked = self.render.refuses_blocks or self._simulates
             blocked = self.imaging.block_verdict(clip) if asked else None
         with watch.of("perturb"):
-            found = blocked or perturb(
-                clip, self.vocabulary, self.perturb, self.traffic, self.pdm, stream(self.seed, clip.clip_id, "perturb")
-            )
+            rng, proposals = stream(self.seed, clip.clip_id, "perturb"), self._proposals(clip)
+            how = (self.perturb, self.traffic, self.pdm, rng, proposals, self.wanted_cells)
+            found = blocked or perturb(clip, self.vocabulary, *how)
         return WholeClip(clip, found, watch.seconds)
+
+    def _proposals(self, clip: Clip) -> tuple[Proposal, ...]:
+        """Raises BadClip where a planner drove in the clip as it was."""
+        return () if self.explored is None else self.explored.of(clip)
 
     def _read(self, ref: ClipRef, watch: Stopwatch) -> Clip | Rejected:
         if ref in self.broken:

@@ -21,6 +21,7 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from factory.config.compose import ConfigError, need_run_extra
@@ -36,7 +37,7 @@ from planners.drive.drivers import driver_of
 from planners.drive.settings import DriveSettings, Pictures, settings_of
 from planners.drive.starts import LOGGED
 from planners.drive.summary import Row, differences_of, lines_of, summary_text, write_summary
-from planners.drive.table import FACTS, Committer, DriveRow, open_drives
+from planners.drive.table import FACTS, Committer, DriveRow, open_drives, write_rows
 from planners.drive.work import DriveItem, DriveWork, DrivingPlanner, NotDriven, reads_towns
 from planners.evaluation.planner_names import planners_of
 from tasks.render.scene import engine
@@ -102,7 +103,7 @@ def _drive(work: DriveWork, items: Sequence[DriveItem], table: KeyedTable) -> li
     waiting = [replace(item, keys=left) for item in items if (left := item.missing(done))]
     total = sum(len(item.keys) for item in items)
     failed: list[NotDriven] = []
-    settings, rows = work.settings, Committer(table)
+    settings, rows = work.settings, Committer(partial(write_rows, table))
     n_done = total - sum(len(item.keys) for item in waiting)
     try:
         with (

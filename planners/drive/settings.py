@@ -75,12 +75,12 @@ class DriveSettings:
 def settings_of(argv: Sequence[str]) -> DriveSettings:
     """The settings of a command line. Raises ConfigError."""
     values = composed("drive", argv, DriveSettings)
-    settings = fill(DriveSettings, values | {"clips": _typed(values["clips"])}, "")
+    settings = fill(DriveSettings, values | {"clips": typed_clips(values["clips"])}, "")
     refuse_missing_root(settings.clips)
     return settings
 
 
-def _typed(clips: Mapping[str, Any]) -> dict[str, Any]:
+def typed_clips(clips: Mapping[str, Any]) -> dict[str, Any]:
     """The reader's settings with its defaults, held against their types where it is a built-in one."""
     shape = READERS.get(clips.get("_target_", ""))
     if shape is None:

@@ -2,8 +2,9 @@
 
 import hashlib
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, fields
+from typing import Generic, TypeVar
 
 import pyarrow as pa
 
@@ -15,6 +16,7 @@ from factory.store.table import KeyedTable
 from planners.drive.measures import DriveMeasures
 
 COMMIT_EVERY_S = 10.0  # a killed command drives as much again
+Row = TypeVar("Row")
 
 
 @dataclass(frozen=True)
@@ -77,13 +79,13 @@ def write_rows(table: KeyedTable, rows: Sequence[DriveRow]) -> None:
     table.commit([write_shard(table.location, DRIVES, pa.Table.from_arrays(columns, schema=SCHEMA))])
 
 
-class Committer:
-    """Gathers rows and commits them every COMMIT_EVERY_S, and when it is closed."""
+class Committer(Generic[Row]):
+    """Gathers rows and writes them, a commit each time, every COMMIT_EVERY_S and when it is closed."""
 
-    def __init__(self, table: KeyedTable) -> None:
-        self._table, self._rows, self._last = table, list[DriveRow](), time.monotonic()
+    def __init__(self, write: Callable[[Sequence[Row]], None]) -> None:
+        self._write, self._rows, self._last = write, list[Row](), time.monotonic()
 
-    def add(self, rows: Iterable[DriveRow]) -> None:
+    def add(self, rows: Iterable[Row]) -> None:
         """Rows to be committed."""
         self._rows += rows
         if time.monotonic() - self._last > COMMIT_EVERY_S:
@@ -92,5 +94,5 @@ class Committer:
     def close(self) -> None:
         """Commit what is gathered."""
         if self._rows:
-            write_rows(self._table, self._rows)
+            self._write(self._rows)
         self._rows, self._last = [], time.monotonic()

@@ -24,6 +24,7 @@ from planners.drive.starts import LOGGED, DriveStart, lengthened, logged_start, 
 from planners.drive.table import DriveKey, DriveRow
 from planners.evaluation.planner_names import planner_of
 from tasks.perturb import Perturbation, perturb
+from tasks.render.settings import RenderSettings
 from tasks.stages import stage_versions
 from tasks.world.chance import stream
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip
@@ -134,12 +135,10 @@ class DriveWork:
         return {start.number: start for start in found}
 
     def _eyes(self, clip: Clip, pictures: Pictures) -> Eyes:
-        if pictures == "engine":
-            return rendered_eyes(clip, self.settings.render, self.settings.cache or cache_folder(self.out.uri))
-        return PaintedEyes(clip, self.settings.render) if pictures == "truth" else NoEyes()
+        return eyes_of(clip, pictures, self.settings.render, self.settings.cache or cache_folder(self.out.uri))
 
     def _driver(self, who: DrivingPlanner) -> Driver:
-        return _kept_driver(who, canonical_json(self.settings.settings), self.settings.pdm, self.settings.device)
+        return kept_driver(who, canonical_json(self.settings.settings), self.settings.pdm, self.settings.device)
 
     def _film(self, who: DrivingPlanner, key: DriveKey, made: ClosedLoop, eyes: Eyes) -> str:
         """One drive in so many has one, chosen by its id."""
@@ -177,13 +176,20 @@ class DriveWork:
         )
 
 
+def eyes_of(clip: Clip, pictures: Pictures, render: RenderSettings, cache_dir: str) -> Eyes:
+    """The cameras of drives of a clip. Raises BadClip where the engine has no scene of it."""
+    if pictures == "engine":
+        return rendered_eyes(clip, render, cache_dir)
+    return PaintedEyes(clip, render) if pictures == "truth" else NoEyes()
+
+
 def reads_towns(reader: ClipReader) -> bool:
     """Whether a reader's logs are of the synthetic town, whose painter can be asked for more."""
     return isinstance(reader, SensedReader)
 
 
 @lru_cache(maxsize=8)
-def _kept_driver(who: DrivingPlanner, changed: str, pdm: Any, device: str) -> Driver:
+def kept_driver(who: DrivingPlanner, changed: str, pdm: Any, device: str) -> Driver:
     """A worker's own, read once. Raises ValueError where it is another than was named when the command began."""
     one = planner_of(who.spec, who.label, json.loads(changed))
     if one.digest != who.digest:

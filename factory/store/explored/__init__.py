@@ -1,0 +1,1 @@
+"""What planners proposed: a table of their drives, and what a run takes from it."""

@@ -1,0 +1,1 @@
+"""Where a planner drives itself: proposals for the factory, and turns of training and exploring."""

@@ -1,0 +1,48 @@
+"""Proposals: motions that a planner drove itself into, which perturb a clip as vocabulary trajectories do.
+
+A vocabulary says where an ego could be; a planner's own drive says where it will be. What is learned from the states
+that a learner itself comes to is worth more than what is learned from others (DAgger, Ross, Gordon and Bagnell 2011).
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from tasks.world.arrays import Array
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """Where a planner drove from the log, and how it did from there."""
+
+    number: int  # names it among its clip's, 0 ...
+    ego_states: Array  # (41, 11) T .. T+H, world; row 0 is the log's
+    score: float  # EPDMS (/14) of its own drive from T+H on
+    fails: str  # the first sub-score for which the reward would reject that drive; "": none
+
+
+def index_of(number: int) -> int:
+    """What stands for a proposal where a vocabulary trajectory has its row: -1 - number, which no row is."""
+    return -1 - number
+
+
+def number_of(index: int) -> int | None:
+    """The proposal that `index_of` made this index from; None where it is a row of the vocabulary."""
+    return -1 - index if index < 0 else None
+
+
+def worst_first(proposals: Sequence[Proposal]) -> list[int]:
+    """Places of those where the planner then failed, then of the others, each by its score; ties by number."""
+
+    def rank(place: int) -> tuple[bool, float, int]:
+        one = proposals[place]
+        return not one.fails, one.score, one.number
+
+    return sorted(range(len(proposals)), key=rank)
+
+
+def alternating(first: Sequence[int], second: Sequence[int]) -> Iterator[int]:
+    """One of either in turn; when one is at its end, what is left of the other."""
+    shared = min(len(first), len(second))
+    for pair in zip(first, second):
+        yield from pair
+    yield from (*first[shared:], *second[shared:])
