@@ -25,12 +25,14 @@ from tasks.world.frames import to_local, to_world
 from tasks.world.vehicle import HEADING, VX
 from tasks.world.vocabulary import Vocabulary
 
+OF_LOG = -1  # where a vocabulary's index stands
+
 
 @dataclass(frozen=True)
 class Candidate:
     """A perturbation of one clip, with the reactive rollout that proved it."""
 
-    vocabulary_index: int
+    vocabulary_index: int  # OF_LOG: none of the vocabulary's, the log itself
     end_pose: Array  # (3,) reached at T+H, in the frame of the logged pose at T+H
     cell: tuple[int, int]  # longitudinal, lateral index of the grid
     score: float  # EPDMS (/14) under log replay
@@ -125,6 +127,8 @@ def perturb(
     traffic: of the reactive check; planner: PDM-Closed, the first row of every two-row batch that normalises progress;
     rng: the clip's `perturb` stream, which draws one permutation of the vocabulary.
     """
+    if settings.at_log:
+        return log_alone(clip, traffic, planner)
     scene = scene_of_clip(clip)
     start = scene.ego_state
     target = clip.ego_states[NOW + HORIZON_STEPS, : HEADING + 1]  # the logged pose at T+H
@@ -199,6 +203,28 @@ def perturb(
     if not candidates:
         return Rejected("perturb", "no_good_candidate", ", ".join(f"{k} {v}" for k, v in counts.items()), counts)
     return Perturbation(tuple(candidates), counts, Considered(gated, ends, tuple(fate), scores))
+
+
+def log_alone(clip: Clip, traffic: TrafficSettings, planner: PdmSettings) -> Perturbation:
+    """The log's own drive as the only candidate, among the traffic that answers to it; no score keeps it out."""
+    scene, states = scene_of_clip(clip), clip.ego_states[NOW : NOW + HORIZON_STEPS + 1]
+    pdm_states = plan_for(scene, planner).driven[None]
+    replay = prepare_scene(scene, scene.agents.window(NOW, NOW + HORIZON_STEPS + 1))
+    rollout = roll_out(prepare_traffic(scene, traffic), states.copy())
+    touched_from = scene.ego_state if traffic.leaves_out_touching else None
+    pair = np.concatenate([pdm_states, states[None]])
+    reactive = score(among(replay, rollout.agents, touched_from), pair, normalise="pairs")
+    logged = Candidate(
+        vocabulary_index=OF_LOG,
+        end_pose=np.zeros(3),
+        cell=(0, 0),
+        score=float(score(replay, pair, normalise="pairs").pdm_score[1]),
+        reactive_score=float(reactive.pdm_score[1]),
+        reactive_scores=reactive,
+        rollout=rollout,
+    )
+    known = Considered(np.array([OF_LOG]), np.zeros((1, 3)), ("kept",), np.array([logged.score]))
+    return Perturbation((logged,), {}, known)
 
 
 def end_speed_mps(candidate: Candidate) -> float:

@@ -133,7 +133,7 @@ def _sensors() -> tuple[Column, ...]:
     return (
         Column("cameras", "struct", ("C",), about="rig; null where there is none", nullable=True, members=camera),
         Column("images", "struct", ("I",), about="null: image_source is none", nullable=True, members=image),
-        Column("image_source", "string", about="photo, render, map or none"),
+        Column("image_source", "string", about="photo, render, map, painter or none"),
         Column("psnr", "float64", unit="dB", about="of the block's reconstruction", nullable=True),
         Column("asset_digest", "string", about="of the reconstruction the images were rendered from", nullable=True),
         Column("tags", "string", ("T",), about="what is in the scene"),

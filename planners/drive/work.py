@@ -10,6 +10,7 @@ from typing import Any
 from factory.readers.base import BadClip, ClipReader, ClipRef
 from factory.readers.town.reader import SensedReader
 from factory.setup.settings import cache_folder
+from factory.stages.painted import town_lights
 from factory.store.identity import canonical_json
 from factory.store.location import Location
 from planners.drive.drivers import Driver, driver_of
@@ -17,7 +18,7 @@ from planners.drive.eyes import Eyes, NoEyes
 from planners.drive.films import write_film
 from planners.drive.loop import DRIVE_VERSION, ClosedLoop, drive
 from planners.drive.measures import measures_of
-from planners.drive.painted import PaintedEyes, town_lights
+from planners.drive.painted import PaintedEyes
 from planners.drive.rendered import RenderedEyes, rendered_eyes
 from planners.drive.settings import DriveSettings, Pictures
 from planners.drive.starts import LOGGED, DriveStart, lengthened, logged_start, perturbed_starts
