@@ -49,8 +49,9 @@ class DriveItem:
     keys: tuple[tuple[DrivingPlanner, DriveKey], ...]  # not driven yet
 
     def missing(self, done: Collection[str]) -> tuple[tuple[DrivingPlanner, DriveKey], ...]:
-        """The drives whose ids are not among those that are done."""
-        return tuple((who, key) for who, key in self.keys if key.drive_id not in done)
+        """The drives whose ids are not among those that are done, each once: two trainings may be the same planner."""
+        first = {key.drive_id: (who, key) for who, key in reversed(self.keys) if key.drive_id not in done}
+        return tuple(reversed(first.values()))
 
     def __str__(self) -> str:
         return f"clip {self.ref.clip_id} of {self.ref.log_id}, pictures={self.pictures}"
