@@ -16,7 +16,7 @@ from itertools import islice
 import numpy as np
 
 from tasks.experts.pdm_closed.planner import PdmSettings, plan_for
-from tasks.proposals import Proposal, alternating, index_of, worst_first
+from tasks.proposals import OF_LOG, Proposal, alternating, index_of, worst_first
 from tasks.reward.epdms import Scores, score
 from tasks.reward.prepare import among, prepare_scene
 from tasks.rollout.lqr import track
@@ -37,7 +37,7 @@ PROPOSED = ("reached_gate", "score", "reactive")  # what drops proposals, counte
 class Candidate:
     """A perturbation of one clip, with the reactive rollout that proved it."""
 
-    vocabulary_index: int  # row of the vocabulary; below 0: of a proposal, tasks.proposals.index_of
+    vocabulary_index: int  # row of the vocabulary; below 0: the log, or a proposal, tasks.proposals.index_of
     end_pose: Array  # (3,) reached at T+H, in the frame of the logged pose at T+H
     cell: tuple[int, int]  # longitudinal, lateral index of the grid
     score: float  # EPDMS (/14) under log replay
@@ -140,6 +140,8 @@ def perturb(
     The order is the failing proposals, worst first; then, one of either in turn, the other ones and the vocabulary's in
     the order of the settings; or, where cells are wanted more than others, in that of a lot by these weights.
     """
+    if settings.at_log:
+        return log_alone(clip, traffic, planner)
     scene = scene_of_clip(clip)
     start = scene.ego_state
     target = clip.ego_states[NOW + HORIZON_STEPS, : HEADING + 1]  # the logged pose at T+H
@@ -230,6 +232,28 @@ def perturb(
     if not candidates:
         return Rejected("perturb", "no_good_candidate", ", ".join(f"{k} {v}" for k, v in counts.items()), counts)
     return Perturbation(tuple(candidates), counts, Considered(index, ends, tuple(fate), scores))
+
+
+def log_alone(clip: Clip, traffic: TrafficSettings, planner: PdmSettings) -> Perturbation:
+    """The log's own drive as the only candidate, among the traffic that answers to it; no score keeps it out."""
+    scene, states = scene_of_clip(clip), clip.ego_states[NOW : NOW + HORIZON_STEPS + 1]
+    pdm_states = plan_for(scene, planner).driven[None]
+    replay = prepare_scene(scene, scene.agents.window(NOW, NOW + HORIZON_STEPS + 1))
+    rollout = roll_out(prepare_traffic(scene, traffic), states.copy())
+    touched_from = scene.ego_state if traffic.leaves_out_touching else None
+    pair = np.concatenate([pdm_states, states[None]])
+    reactive = score(among(replay, rollout.agents, touched_from), pair, normalise="pairs")
+    logged = Candidate(
+        vocabulary_index=OF_LOG,
+        end_pose=np.zeros(3),
+        cell=(0, 0),
+        score=float(score(replay, pair, normalise="pairs").pdm_score[1]),
+        reactive_score=float(reactive.pdm_score[1]),
+        reactive_scores=reactive,
+        rollout=rollout,
+    )
+    known = Considered(np.array([OF_LOG]), np.zeros((1, 3)), ("kept",), np.array([logged.score]))
+    return Perturbation((logged,), {}, known)
 
 
 def end_speed_mps(candidate: Candidate) -> float:

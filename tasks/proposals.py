@@ -9,6 +9,8 @@ from dataclasses import dataclass
 
 from tasks.world.arrays import Array
 
+OF_LOG = -1  # stands for the log itself where a vocabulary trajectory has its row
+
 
 @dataclass(frozen=True)
 class Proposal:
@@ -21,13 +23,13 @@ class Proposal:
 
 
 def index_of(number: int) -> int:
-    """What stands for a proposal where a vocabulary trajectory has its row: -1 - number, which no row is."""
-    return -1 - number
+    """What stands for a proposal where a vocabulary trajectory has its row: -2 - number."""
+    return OF_LOG - 1 - number
 
 
 def number_of(index: int) -> int | None:
-    """The proposal that `index_of` made this index from; None where it is a row of the vocabulary."""
-    return -1 - index if index < 0 else None
+    """The proposal that `index_of` made this index from; None where it is the log or a row of the vocabulary."""
+    return OF_LOG - 1 - index if index < OF_LOG else None
 
 
 def worst_first(proposals: Sequence[Proposal]) -> list[int]:

@@ -20,6 +20,7 @@ class PerturbSettings:
     interleaved: bool = True  # every second cell of the grid, as on a chessboard; False: every cell
     order: Literal["drawn", "spread"] = "drawn"  # of the candidates: as drawn, or see spread_out
     at_most: int | None = None  # candidates a clip; None: all there are
+    at_log: bool = False  # the only candidate is the log itself, whatever it scores: what is made of no perturbation
 
     def __post_init__(self) -> None:
         gates = ("max_heading_deg", "max_longitudinal_m", "max_lateral_m")

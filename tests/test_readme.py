@@ -46,6 +46,7 @@ from planners.study.agreement import main as agreement_main
 from planners.study.recipe import Recipe
 from planners.study.report import ReportRequest
 from planners.study.scaling import ScalingSettings
+from planners.study.sceptic import ScepticSettings
 from planners.study.study import StudySettings
 from planners.training.train import TrainConfig
 from tasks.caches import user_cache
@@ -216,6 +217,8 @@ def test_every_command_is_one_its_program_takes(
             fill(AlternateSettings, compose("alternate", arguments, AlternateSettings), "alternate")
         case ["python", "-m", "planners", "study", *arguments]:
             fill(StudySettings, compose("study", arguments), "study")
+        case ["python", "-m", "planners", "sceptic", *arguments]:
+            fill(ScepticSettings, compose("sceptic", arguments, ScepticSettings), "sceptic")
         case ["python", "-m", "planners", "report", *arguments]:
             parse(ReportRequest, arguments)
         case ["python", "-m", "planners", "analysis", *arguments]:

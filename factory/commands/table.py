@@ -73,6 +73,7 @@ PLANNERS: Mapping[str, Command] = {
     "study": Command("whether simulated data helps: all of docs/study.md", "planners.study.study"),
     "study_data": Command("the study's data, by runs of the factory", "planners.study.recipe", "data"),
     "study_logs": Command("the study's part on real logs", "planners.study.recipe", "logs"),
+    "sceptic": Command("simulated samples beside other additions, scored by driving", "planners.study.sceptic"),
     "report": Command("a study's tables and pictures from its frames", "planners.study.report"),
     "agreement": Command("whether a study made again says the same", "planners.study.agreement"),
 }

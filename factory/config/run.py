@@ -14,7 +14,15 @@ from factory.config.plugins import with_experts
 from factory.config.shapes import defaults_of, keys_of, merged
 from factory.config.words import ConfigError, nearest
 from factory.job import in_submitted_job
-from factory.readers.settings import LogClips, NavsimClips, Py123dClips, ScenarioNetClips, TownClips, TownsClips
+from factory.readers.settings import (
+    LogClips,
+    NavsimClips,
+    Py123dClips,
+    ScenarioNetClips,
+    TownClips,
+    TownsClips,
+    TownSettings,
+)
 from tasks.experts.pdm_closed.settings import PdmSettings
 from tasks.experts.recovery.settings import RecoverySettings
 from tasks.render.settings import RenderMode, RenderSettings
@@ -223,10 +231,14 @@ def run_config(values: Mapping[str, Any]) -> RunConfig:
         group, _, name = key.partition(".")
         filled = fill(shape, without_labels(values[group][name] if name else values[group]), key)
         if isinstance(filled, TownClips | TownsClips):
-            rig = filled.settings.cameras  # other rigs are known when clips are read
+            painted = config.render.mode is RenderMode.PAINTER  # of a town without photos, by its usual cameras
+            rig = filled.settings.cameras or (TownSettings().cameras if painted else ())  # others: when clips are read
             asked = config.render.cameras if rig and config.render.mode is not RenderMode.NONE else ()
             if missing := [name for name in asked if name not in rig]:
                 raise ConfigError(f"render.cameras: no camera {', '.join(missing)}; this rig has {', '.join(rig)}")
+    reader = READERS.get(config.clips.get("_target_", ""))
+    if config.render.mode is RenderMode.PAINTER and reader not in (TownClips, TownsClips):
+        raise ConfigError("render.mode=painter: only the synthetic town has a painter, and these clips are of no town")
     if config.executor == "ray":
         need_run_extra("ray")
     return config

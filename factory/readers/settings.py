@@ -218,6 +218,7 @@ class TownsClips:
     first_seed: int = 0  # of the towns
     n_towns: int = 1  # one a seed
     logs_per_town: int = 3  # of 18 kinds of drives, others in the next seed's town; a log holds three clips
+    first_log: int = 0  # of each town's turn; those before it are skipped: logs_per_town for others of the same towns
     split: Split = "train"  # of every clip, whatever its log's hash says
     first_window: int = 0  # of each log; those before it are skipped
     cache_dir: str | None = None  # each town is written there once; null: the user's cache
@@ -231,6 +232,10 @@ class TownsClips:
             raise ValueError(f"clips.seeds: each town's seed once, 0 or more, at least one; not {list(chosen)}")
         if not 1 <= self.logs_per_town <= LOGS_PER_TOWN:
             raise ValueError(f"clips.logs_per_town={self.logs_per_town}: a town has 1 to {LOGS_PER_TOWN} logs")
+        if not 0 <= self.first_log <= LOGS_PER_TOWN - self.logs_per_town:
+            raise ValueError(
+                f"clips.first_log={self.first_log}: a town has {LOGS_PER_TOWN} logs, {self.logs_per_town} are taken"
+            )
 
     @property
     def chosen(self) -> tuple[int, ...]:

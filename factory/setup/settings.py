@@ -44,6 +44,7 @@ RIGS_LOOKED_AT = 3  # clips, for the names of their cameras
 ABSENT = object()
 # Settings that came later: at what held before there was a choice they are left out, so that older tables go on.
 ADDED: dict[str, object] = {"perturb.interleaved": True, "perturb.order": "drawn", "perturb.at_most": None}
+ADDED |= {"perturb.at_log": False}
 ADDED |= {"reward.off_route": False, "reward.after": False}
 ADDED |= {"render.own_body": "", "render.jpeg_chroma": "420", "traffic.yields": False}
 ADDED |= {"render.camera_psnr_min": 0.0, "render.rig": dataclasses.asdict(RigSettings())}

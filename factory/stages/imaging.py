@@ -1,4 +1,4 @@
-"""The render stage: a sample's images, from the block's scene, the log's own photos, or drawn from the map.
+"""The render stage: a sample's images, from the block's scene, the log's own photos, the map or the town's painter.
 
 A human sample of a clip with photos keeps them, whatever its block. Every other sample is drawn from the block where
 `factory.stages.assets.sensing` finds something to make it of, else written with image_source=none and no images. Lidar
@@ -16,6 +16,7 @@ import numpy as np
 from factory.graph.work import Stopped, never
 from factory.readers.base import BadClip
 from factory.stages.assets import Sensing, asset_for, scene_path, sensing
+from factory.stages.painted import town_cameras, town_pictures
 from factory.stages.sensors import block_of, chosen_cameras, encode_jpeg, load_photos, taken_by
 from tasks.attempt import Judged
 from tasks.perturb import Candidate
@@ -85,6 +86,8 @@ class Imaging:
         if self.settings.mode is RenderMode.MAP:
             rig = clip.cameras or RIGS[self.settings.map_rig]
             return self._drawn(clip, judged, None, chosen_cameras(rig, self.settings.cameras))
+        if self.settings.mode is RenderMode.PAINTER:
+            return self._painted(clip, judged)
         if self.settings.mode is RenderMode.NONE:
             return NO_IMAGES
         cameras = chosen_cameras(clip.cameras, self.settings.cameras)
@@ -169,6 +172,16 @@ class Imaging:
         if asset is not None:
             measured = {"asset_digest": asset.digest, "psnr": asset.psnr_db if np.isfinite(asset.psnr_db) else None}
         return {"cameras": self.rig(cameras), "images": found, "image_source": str(source), **measured}
+
+    def _painted(self, clip: Clip, judged: Judged) -> dict[str, object]:
+        scene, states = judged.scene, self._ego_states(judged)
+        cameras = town_cameras(clip, self.settings)
+        agents = scene.agents.overwritten(scene.step, judged.rollout.agents)
+        found: list[dict[str, object]] = []
+        for offset, state in zip(STEPS_OF[self.settings.frames], states):
+            pose, taken = town_pictures(clip, cameras, agents, scene.step + offset, state)
+            found += [self.image(one.name, offset * STEP_S, pose, rgb) for one, rgb in zip(cameras, taken)]
+        return {"cameras": self.rig(cameras), "images": found, "image_source": str(ImageSource.PAINTER)}
 
     def _photos(self, clip: Clip, judged: Judged, cameras: Sequence[Camera]) -> dict[str, object]:
         now_s = judged.scene.step * STEP_S

@@ -37,7 +37,10 @@ def _lineage() -> tuple[Column, ...]:
         Column("round", "int32", about="ordinal of the accepted attempt of its (clip, expert); partition"),
         Column("candidate_index", "int32", about="place in the clip's candidate list; -1 human"),
         Column(
-            "vocabulary_index", "int32", nullable=True, about="row of the vocabulary; -1 - n: proposal n; null human"
+            "vocabulary_index",
+            "int32",
+            nullable=True,
+            about="row of the vocabulary; -1: the log; -2 - n: proposal n; null human",
         ),
         Column("vocabulary_digest", "string"),
         Column("settings_hash", "string", about="of the run's settings, see run.json"),
@@ -135,7 +138,7 @@ def _sensors() -> tuple[Column, ...]:
     return (
         Column("cameras", "struct", ("C",), about="rig; null where there is none", nullable=True, members=camera),
         Column("images", "struct", ("I",), about="null: image_source is none", nullable=True, members=image),
-        Column("image_source", "string", about="photo, render, map or none"),
+        Column("image_source", "string", about="photo, render, map, painter or none"),
         Column("psnr", "float64", unit="dB", about="of the block's reconstruction", nullable=True),
         Column("asset_digest", "string", about="of the reconstruction the images were rendered from", nullable=True),
         Column("tags", "string", ("T",), about="what is in the scene"),

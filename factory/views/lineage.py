@@ -115,9 +115,11 @@ def _candidate_facts(row: Row, clip: Row, record: Row) -> list[tuple[str, object
 
 
 def _moved_by(index: int, clip: Row, record: Row) -> tuple[str, object]:
-    """What perturbs the ego: a row of the vocabulary, or where a planner drove itself."""
-    from tasks.proposals import number_of
+    """What perturbs the ego: a row of the vocabulary, or where a planner drove itself; or nothing does."""
+    from tasks.proposals import OF_LOG, number_of
 
+    if index == OF_LOG:
+        return "perturbed by", "nothing: the log itself"
     number = number_of(index)
     if number is None:
         return "vocabulary row", f"{index} of {clip['vocabulary_digest']}"

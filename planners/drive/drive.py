@@ -18,9 +18,9 @@ same command goes on.
 """
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -46,11 +46,52 @@ from tasks.render.splatting.gsplat_backend import BackendMissing
 SHOWN_FAILURES = 5
 
 
+@dataclass(frozen=True)
+class DrivesAsked:
+    """Drives that a command asks for, whether they are made or not."""
+
+    work: DriveWork
+    items: Sequence[DriveItem]
+    broken: Mapping[ClipRef, str]
+    planners: Sequence[str]  # labels, in order
+
+    def rows(self, table: KeyedTable) -> list[Row]:
+        """Those of the table, by planner and clip, under the labels of now."""
+        found = {row["drive_id"]: row for row in table.read(FACTS).to_pylist()}
+        asked = [(who.label, found.get(key.drive_id)) for item in self.items for who, key in item.keys]
+        rows = [row | {"planner": label} for label, row in asked if row is not None]
+        return sorted(rows, key=lambda row: self.planners.index(row["planner"]))
+
+    def is_made(self, table: KeyedTable) -> bool:
+        """Whether nothing is left: of an item's drives, which are committed together, some are there."""
+        done = set(table)
+        return not self.broken and all(any(key.drive_id in done for _, key in item.keys) for item in self.items)
+
+
 def drive_all(settings: DriveSettings) -> tuple[list[Row], list[NotDriven]]:
     """Drive what is not driven yet: the rows of all that were asked for, by planner and clip, and what could not be.
 
     Raises ConfigError, Halted where it was interrupted, WorkerDied, AnotherWriter.
     """
+    asked = _asked(settings)
+    table = open_drives(asked.work.out)
+    table.claim()
+    failed = [NotDriven(ref.clip_id, why) for ref, why in asked.broken.items()]
+    failed += _drive(asked.work, asked.items, table)
+    return asked.rows(table), failed
+
+
+def driven(settings: DriveSettings) -> tuple[list[Row], bool]:
+    """The rows that are there of all that were asked for, and whether that is all; nothing is driven.
+
+    Raises ConfigError.
+    """
+    asked = _asked(settings)
+    table = open_drives(asked.work.out)
+    return asked.rows(table), asked.is_made(table)
+
+
+def _asked(settings: DriveSettings) -> DrivesAsked:
     planners = _planners(settings)
     reader, index = open_reader(settings.clips)
     if any("truth" in kinds for _, kinds in planners) and not reads_towns(reader):
@@ -63,15 +104,7 @@ def drive_all(settings: DriveSettings) -> tuple[list[Row], list[NotDriven]]:
     out = Location.parse(settings.out)
     work = DriveWork(reader, choose_vocabulary(settings.vocabulary), settings, out)
     items = list(_items(work, index.refs[: settings.limit], planners))
-    table = open_drives(out)
-    table.claim()
-    failed = [NotDriven(ref.clip_id, why) for ref, why in index.broken.items()]
-    failed += _drive(work, items, table)
-    label_of = {key.drive_id: who.label for item in items for who, key in item.keys}
-    found = {row["drive_id"]: row for row in table.read(FACTS).to_pylist()}
-    rows = [found[drive_id] | {"planner": label} for drive_id, label in label_of.items() if drive_id in found]
-    order = [who.label for who, _ in planners]
-    return sorted(rows, key=lambda row: order.index(row["planner"])), failed
+    return DrivesAsked(work, items, index.broken, [who.label for who, _ in planners])
 
 
 def _planners(settings: DriveSettings) -> list[tuple[DrivingPlanner, tuple[Pictures, ...]]]:

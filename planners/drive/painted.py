@@ -1,50 +1,16 @@
-"""The synthetic town as its painter shows it, from wherever a drive has come to: pictures without a reconstruction.
+"""A drive's cameras as the synthetic town's painter shows them: pictures without a reconstruction."""
 
-A log of the town is planned again from its name, as it was when it was written; who is painted is who the simulation
-has there, each as the log's own figure. The town's lights go on beyond the log.
-"""
-
-import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
-import numpy as np
-
-from factory.readers.settings import TownSettings
-from factory.readers.town.draw import Theatre, paint
-from factory.readers.town.drive import TownDrive
-from factory.readers.town.sensors import build_rig, world_from_ego
-from factory.readers.town.town import Town, log_name, plan_log
-from factory.readers.town.traffic import TownTrack
 from factory.stages.imaging import Imaging
-from factory.stages.sensors import chosen_cameras
+from factory.stages.painted import town_cameras, town_pictures
 from planners.drive.eyes import Images, states_at
 from tasks.render.settings import STEPS_OF, ImageSource, RenderSettings
 from tasks.world.camera import Camera
 from tasks.world.clip import STEP_S, Clip, Scene
-from tasks.world.lanes import TrafficLights
-from tasks.world.vehicle import HEADING, X, Y
-
-_LOG = re.compile(r"town-(\d+)-(\d{4})-")  # factory.readers.town.town.log_name
-
-
-def town_log(log_id: str) -> tuple[int, int]:
-    """Seed and number of a town's log. Raises ValueError for the log of another data set."""
-    found = _LOG.match(log_id)
-    if found is None or log_name(int(found[1]), int(found[2])) != log_id:
-        raise ValueError(f"log {log_id} is not of the synthetic town: there is no painter of it")
-    return int(found[1]), int(found[2])
-
-
-def town_lights(clip: Clip, n_steps: int) -> TrafficLights:
-    """The clip's lights over `n_steps` steps from its first one. Raises ValueError for a clip of no town."""
-    town, drive = _planned(*town_log(clip.log_id))
-    times_s = _time_of(drive, clip, np.arange(n_steps))
-    groups = [town.streets.lanes[int(lane_id)].light_group for lane_id in clip.lights.lane_ids]
-    states = [[drive.signals.state(group, float(time_s)) for group in groups] for time_s in times_s]
-    return replace(clip.lights, states=np.array(states, np.int8).reshape(n_steps, len(groups)))
 
 
 @dataclass(frozen=True)
@@ -58,9 +24,7 @@ class PaintedEyes:
     @cached_property
     def cameras(self) -> tuple[Camera, ...]:
         """As pinholes of the wanted size. Raises ValueError for one that the rig does not have."""
-        width, height = self.settings.width, self.settings.height
-        rig = self.clip.cameras or build_rig(TownSettings().cameras, width, height)
-        return tuple(camera.resized(width, height) for camera in chosen_cameras(rig, self.settings.cameras))
+        return town_cameras(self.clip, self.settings)
 
     @property
     def rig(self) -> Sequence[Mapping[str, Any]]:
@@ -72,39 +36,11 @@ class PaintedEyes:
 
     def look(self, scene: Scene, offset: int) -> Images:
         """Raises ValueError where the clip is of no town."""
-        log, step = town_log(self.clip.log_id), scene.step + offset
-        state, (_, drive) = states_at(scene, offset)[0], _planned(*log)
-        time_s = float(_time_of(drive, scene.clip, np.array([step]))[0])
-        lit = _theatre(*log).among(_tracks(drive, scene), step, state[[X, Y]], time_s)
-        pose = world_from_ego(state[: HEADING + 1])
-        taken = [(camera.name, paint(lit, camera, pose)) for camera in self.cameras]
-        return [self._imaging.image(name, offset * STEP_S, pose, rgb) for name, rgb in taken]
+        state = states_at(scene, offset)[0]
+        pose, taken = town_pictures(scene.clip, self.cameras, scene.agents, scene.step + offset, state)
+        names = (camera.name for camera in self.cameras)
+        return [self._imaging.image(name, offset * STEP_S, pose, rgb) for name, rgb in zip(names, taken)]
 
     @property
     def _imaging(self) -> Imaging:
         return Imaging(self.settings, "")
-
-
-def _tracks(drive: TownDrive, scene: Scene) -> list[TownTrack]:
-    """The log's figures where the scene has them."""
-    figures = {track.track_id: track for track in drive.tracks}
-    agents = scene.agents
-    poses = np.where(agents.valid[..., None], agents.boxes[..., :3], np.nan)
-    return [replace(figures[name], poses=poses[:, i]) for i, name in enumerate(agents.track_ids)]
-
-
-def _time_of(drive: TownDrive, clip: Clip, steps: np.ndarray) -> np.ndarray:
-    """Times of the town's clock at steps of a clip."""
-    return float(drive.times_s[0]) + clip.start_s + steps * STEP_S
-
-
-@lru_cache(maxsize=4)
-def _planned(seed: int, number: int) -> tuple[Town, TownDrive]:
-    return plan_log(seed, number)
-
-
-@lru_cache(maxsize=1)
-def _theatre(seed: int, number: int) -> Theatre:
-    """Hundreds of megabytes, and seconds to build: drives of one log come one after the other."""
-    town, drive = _planned(seed, number)
-    return Theatre(town.scenery, drive, town.sun_azimuth, town.sun_elevation, town.sky_seed)

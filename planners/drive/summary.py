@@ -60,7 +60,7 @@ def lines_of(rows: Sequence[Row], confidence: float = 0.95) -> list[DriveLine]:
 
 
 def _line(planner: str, pictures: str, start: str, rows: Sequence[Row], confidence: float) -> DriveLine:
-    level, clusters = _highest_level(rows)
+    level, clusters = highest_level(rows)
     km = np.maximum([row["distance_m"] / M_PER_KM for row in rows], 1e-9)  # a drive that stands weighs nothing
     failed = np.array([row["off_road_events"] + row["at_fault_collision"] for row in rows], dtype=float)
 
@@ -92,7 +92,7 @@ def _mean(values: Array, clusters: Sequence[str], confidence: float, weights: Ar
     )
 
 
-def _highest_level(rows: Sequence[Row]) -> tuple[str, Sequence[str]]:
+def highest_level(rows: Sequence[Row]) -> tuple[str, Sequence[str]]:
     """Of clips that share a log or a town, whole ones are drawn: no independent draws else (planners.evaluation)."""
     known = clusters_of([row["clip_id"] for row in rows], [row["log_id"] for row in rows])
     several = [level for level in LEVELS if level in known and len(set(known[level])) > 1]
@@ -122,7 +122,7 @@ def differences_of(rows: Sequence[Row], confidence: float = 0.95) -> list[Pictur
         twice = [pair for pair in pairs.values() if {"truth", "engine"} <= pair.keys()]
         if not twice:
             continue
-        level, clusters = _highest_level([pair["truth"] for pair in twice])
+        level, clusters = highest_level([pair["truth"] for pair in twice])
         shares = {
             name: paired_interval(
                 np.array([[share(pair["truth"]) for pair in twice]]),

@@ -10,6 +10,7 @@ from typing import Any
 from factory.readers.base import BadClip, ClipReader, ClipRef
 from factory.readers.town.reader import SensedReader
 from factory.setup.settings import cache_folder
+from factory.stages.painted import town_lights
 from factory.store.identity import canonical_json
 from factory.store.location import Location
 from planners.drive.drivers import Driver, driver_of
@@ -17,7 +18,7 @@ from planners.drive.eyes import Eyes, NoEyes
 from planners.drive.films import write_film
 from planners.drive.loop import DRIVE_VERSION, ClosedLoop, drive
 from planners.drive.measures import measures_of
-from planners.drive.painted import PaintedEyes, town_lights
+from planners.drive.painted import PaintedEyes
 from planners.drive.rendered import RenderedEyes, rendered_eyes
 from planners.drive.settings import DriveSettings, Pictures
 from planners.drive.starts import LOGGED, DriveStart, lengthened, logged_start, perturbed_starts
@@ -49,8 +50,9 @@ class DriveItem:
     keys: tuple[tuple[DrivingPlanner, DriveKey], ...]  # not driven yet
 
     def missing(self, done: Collection[str]) -> tuple[tuple[DrivingPlanner, DriveKey], ...]:
-        """The drives whose ids are not among those that are done."""
-        return tuple((who, key) for who, key in self.keys if key.drive_id not in done)
+        """The drives whose ids are not among those that are done, each once: two trainings may be the same planner."""
+        first = {key.drive_id: (who, key) for who, key in reversed(self.keys) if key.drive_id not in done}
+        return tuple(reversed(first.values()))
 
     def __str__(self) -> str:
         return f"clip {self.ref.clip_id} of {self.ref.log_id}, pictures={self.pictures}"

@@ -99,7 +99,7 @@ class BenchmarkFolder:
         return [now] if self.one_stage else [now, before, *follow_ups]
 
     def image_source(self, key: FrameKey) -> str:
-        """photo, render, map or none."""
+        """photo, render, map, painter or none."""
         return str(self._rows[key]["image_source"])
 
     def stream(self, columns: Sequence[str]) -> Iterator[tuple[FrameKey, Sample]]:

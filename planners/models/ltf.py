@@ -13,7 +13,16 @@ from torch import Tensor, nn
 
 from planners.data.batch import Batch, BevLayout, ImageLayout, Needs
 from planners.models.auxiliary import AgentHead, BevHead, auxiliary_losses
-from planners.models.planner import PlanFrom, Planner, bounded_heading, evaluating, imitation_l1, planned_from
+from planners.models.planner import (
+    PlanFrom,
+    Planner,
+    Status,
+    bounded_heading,
+    evaluating,
+    imitation_l1,
+    planned_from,
+    seen_status,
+)
 from planners.models.start import Start, begin
 from planners.models.transfuser import FusionSettings, LatentFusion
 from tasks.world.arrays import FloatArray
@@ -32,6 +41,7 @@ class LtfSettings:
     heads: int = 8
     dropout: float = 0.0
     plan_from: PlanFrom = "zero"  # what the regressed positions are added to
+    status: Status = "all"  # what of the ego's own it sees; speed: no acceleration
     agents: int = 30
     trajectory_weight: float = 10.0
     agent_class_weight: float = 10.0
@@ -75,7 +85,7 @@ class Ltf(Planner):
         assert batch.image is not None
         fused = self.fusion(batch.image)
         cells = self.reduce(fused.latent).flatten(2).transpose(1, 2)
-        keys = torch.cat([cells, self.status(batch.status)[:, None]], 1) + self.key_position
+        keys = torch.cat([cells, self.status(seen_status(self.settings.status, batch))[:, None]], 1) + self.key_position
         queries = self.decoder(self.queries.expand(len(batch), -1, -1), keys)
         plan = bounded_heading(self.plan_head(queries[:, 0]).float().view(-1, 8, 3))
         return planned_from(self.settings.plan_from, plan, batch), queries[:, 1:], fused.bev

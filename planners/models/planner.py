@@ -88,6 +88,21 @@ def evaluating(model: nn.Module) -> Iterator[None]:
         model.train(before)
 
 
+Status = Literal["all", "speed"]  # what of the ego's status is seen; speed: command and velocity, no acceleration
+
+
+def seen_status(which: Status, batch: Batch) -> Tensor:
+    """(B, 8) of `batch.status`, zeros for what is not seen.
+
+    Acceleration tells what the log's driver is already doing, bend and brake, and a planner that drives on its own
+    errors is told what these are doing: it goes on with them (de Haan et al. 2019, causal confusion).
+    """
+    if which == "all":
+        return batch.status
+    known = len(COMMANDS) + 2
+    return torch.cat([batch.status[:, :known], torch.zeros_like(batch.status[:, known:])], -1)
+
+
 PlanFrom = Literal["zero", "constant_velocity"]  # what regressed poses are added to
 
 

@@ -8,6 +8,7 @@ from typing import Any, Literal
 Budget = Literal["epochs", "steps"]
 Imitation = Literal["all", "real", "none"]
 ALL_EXPERTS = "all"
+ALONE = {"begin": "other towns", "more": "real, and more real"}  # data without simulated samples, in words
 SWEEP = "sweep"  # the one part of `python -m planners scaling`
 
 
@@ -83,8 +84,8 @@ class Comparison:
 
 def words_of(row: Mapping[str, Any], counted: bool = True) -> str:
     """What a planner was trained on, in words; what is as usual is left out, and the rounds where not `counted`."""
-    if row["data"] == "begin":
-        return "other towns"
+    if row["data"] in ALONE:
+        return ALONE[row["data"]]
     rounds = "1 round" if row["rounds"] == 1 else f"{row['rounds']} rounds"
     said = ["real"] if row["rounds"] == 0 else [f"+ {row['data']}", rounds] if counted else [row["data"]]
     said += {"all": [], "real": ["rewards only"], "none": ["no imitation"]}[row["imitation"]]

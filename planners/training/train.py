@@ -25,7 +25,7 @@ import cv2
 import torch
 
 from factory.config.compose import ConfigError, compose, fill
-from factory.config.shapes import described, merged, plain
+from factory.config.shapes import defaults_of, described, merged, plain
 from planners.command import command
 from planners.data.feed import open_data
 from planners.data.index import Dataset, DataSettings
@@ -274,7 +274,9 @@ def _begun(out: Path, config: TrainConfig, identity: Mapping[str, Any]) -> Path 
         return None
     record = read_record(out)
     now = {**identity, "planner.name": config.planner.name, "planner.settings": as_record(settings_of(config.planner))}
-    then = {**_as_now(record["trained"]), **{f"planner.{key}": value for key, value in record["planner"].items()}}
+    who = record["planner"]
+    settings = merged(defaults_of(planner_class(who["name"]).settings_type), who["settings"])
+    then = {**_as_now(record["trained"]), "planner.name": who["name"], "planner.settings": settings}
     differs = {key: f"{key} {then.get(key)} -> {value}" for key, value in now.items() if then.get(key) != value}
     allowed = FURTHER if config.resume == "further" else frozenset()
     if differs.keys() - allowed:

@@ -26,6 +26,7 @@ Chroma = Literal["420", "444"]
 class RenderMode(StrEnum):
     AUTO = "auto"  # from the block's scene where its sensors allow one, else no images
     MAP = "map"  # lanes, paint and boxes on plain ground; marked as such
+    PAINTER = "painter"  # what a camera would have taken: of the synthetic town alone, by the painter of its photos
     NONE = "none"
 
 
@@ -47,6 +48,7 @@ class ImageSource(StrEnum):
     PHOTO = "photo"
     RENDER = "render"
     MAP = "map"
+    PAINTER = "painter"
     NONE = "none"
 
 
@@ -94,7 +96,7 @@ class GateSettings:
 class RenderSettings:
     """The render stage's settings."""
 
-    mode: RenderMode = RenderMode.AUTO  # auto: clips with cameras or lidar; map: lanes and boxes, drawn
+    mode: RenderMode = RenderMode.AUTO  # auto: clips with cameras or lidar; map: lanes, boxes; painter: the town
     backend: Backend = Backend.CPU  # gsplat: CUDA, needs the extra [gpu]
     frames: Frames = Frames.HISTORY  # at 2 Hz; all: T-1.5 s .. the end, history: a planner's input
     cameras: tuple[str, ...] = ()  # by name; empty: every camera of the rig

@@ -68,7 +68,7 @@ MISTYPED = [  # told before anything heavy is imported
     run("--cfg", "all", says=["--cfg all: the settings of the run alone are shown"]),
     run("vocabulary.k=99999999", says=["k=99999999", "at most 131,072"]),
     run("perturb.epdms_min=high", says=["perturb.epdms_min: must be a number (got 'high')"]),
-    run("render.mode=atuo", says=["render.mode: must be auto, map or none; did you mean auto?"]),
+    run("render.mode=atuo", says=["render.mode: must be auto, map, painter or none; did you mean auto?"]),
     run("pdm.shared_lead_memory=maybe", says=["pdm.shared_lead_memory: must be true or false"]),
     run("benchmark.min_follow_ups=many", says=["benchmark.min_follow_ups: must be a whole number"]),
     run("dry_run=true", says=["dry_run: there is no such setting"]),

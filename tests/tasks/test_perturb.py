@@ -20,6 +20,7 @@ from tasks.perturb import (
     perturb,
     spread_out,
 )
+from tasks.proposals import OF_LOG
 from tasks.reward.epdms import score
 from tasks.reward.prepare import prepare_scene
 from tasks.rollout.simulate import TrafficSettings, simulate
@@ -299,3 +300,24 @@ def test_a_dense_grid_takes_every_cell_and_the_first_of_its_spread_are_those_of_
 def test_a_bound_without_room_is_refused() -> None:
     with pytest.raises(ValueError, match="at_most must be positive"):
         PerturbSettings(at_most=0)
+
+
+def test_the_log_alone_is_the_candidate_that_ends_where_the_log_does(trajectories: NDArray[np.float64]) -> None:
+    """Whatever threshold others must reach."""
+    clip = street_clip()
+    result = perturbed(clip, trajectories, replace(SETTINGS, at_log=True, epdms_min=1.0))
+    assert isinstance(result, Perturbation)
+    (logged,) = result.candidates
+    assert logged.vocabulary_index == OF_LOG and logged.cell == (0, 0)
+    np.testing.assert_array_equal(logged.end_pose, np.zeros(3))
+    np.testing.assert_array_equal(logged.rollout.ego_states, clip.ego_states[NOW : NOW + HORIZON_STEPS + 1])
+    assert 0.0 <= logged.reactive_score <= 1.0
+
+
+def test_among_replayed_traffic_the_log_alone_is_the_log(trajectories: NDArray[np.float64]) -> None:
+    clip = street_clip()
+    result = perturbed(clip, trajectories, replace(SETTINGS, at_log=True), traffic=TrafficSettings(mode="replay"))
+    assert isinstance(result, Perturbation)
+    (logged,) = result.candidates
+    np.testing.assert_array_equal(logged.rollout.agents.boxes, clip.agents.boxes[NOW : NOW + HORIZON_STEPS + 1])
+    assert logged.score == logged.reactive_score

@@ -14,8 +14,9 @@ class SyntheticTownsReader(SensedReader):
     """Clips of the towns of several seeds; no seed's clips depend on which other seeds are read.
 
     A town has eighteen kinds of drives. Of each town the next `logs_per_town` are taken, so that a few towns hold every
-    kind. Each town is written on first use into a folder of its own and moved there whole: indexing mends and writes
-    them all, before a run's workers start, and a reader elsewhere writes those it reads from.
+    kind; `first_log` begins so many later. Each town is written on first use into a folder of its own and moved there
+    whole: indexing mends and writes them all, before a run's workers start, and a reader elsewhere writes those it
+    reads from.
     """
 
     def __init__(
@@ -24,6 +25,7 @@ class SyntheticTownsReader(SensedReader):
         first_seed: int = TownsClips.first_seed,
         n_towns: int = TownsClips.n_towns,
         logs_per_town: int = TownsClips.logs_per_town,
+        first_log: int = TownsClips.first_log,
         split: str = TownsClips.split,
         first_window: int = TownsClips.first_window,
         cache_dir: str | Path | None = None,
@@ -34,11 +36,12 @@ class SyntheticTownsReader(SensedReader):
 
         Raises ValueError for repeated or no seeds, an unknown split, or more logs than a town has kinds of drives.
         """
-        chosen = TownsClips(None if seeds is None else tuple(seeds), first_seed, n_towns, logs_per_town).chosen
+        seeds = None if seeds is None else tuple(seeds)
+        clips = TownsClips(seeds, first_seed, n_towns, logs_per_town, first_log)
         folder = cache_dir or user_cache() / "towns"
         super().__init__(folder, first_window=first_window, split=split, traversals=traversals)
         self.settings = settings or TownSettings()
-        self.towns = tuple(self._town(seed, logs_per_town) for seed in chosen)
+        self.towns = tuple(self._town(seed, logs_per_town, first_log) for seed in clips.chosen)
 
     def logs(self) -> dict[str, Path]:
         """Of all towns, in the order of the seeds; writes the towns that are missing."""
@@ -58,6 +61,6 @@ class SyntheticTownsReader(SensedReader):
                 return town.logs()[ref.log_id]
         return super().path_of(ref)
 
-    def _town(self, seed: int, n_logs: int) -> TownFolder:
-        indices = tuple((seed * n_logs + i) % LOGS_PER_TOWN for i in range(n_logs))
+    def _town(self, seed: int, n_logs: int, first: int) -> TownFolder:
+        indices = tuple((seed * n_logs + first + i) % LOGS_PER_TOWN for i in range(n_logs))
         return TownFolder(seed, indices, town_folder(self.root, seed, ["logs", indices], self.settings))

@@ -52,7 +52,7 @@ def test_a_choice_is_its_dataclass_with_what_its_file_says(name: str, expected: 
 
 def test_every_setting_has_a_default_and_a_meaning_and_is_shown_with_both() -> None:
     shown = settings_text([]).splitlines()
-    assert "  width: 320  # pixels" in shown and "  mode: auto  # auto | map | none; " in "\n".join(shown)
+    assert "  width: 320  # pixels" in shown and "  mode: auto  # auto | map | painter | none; " in "\n".join(shown)
     assert yaml.safe_load("\n".join(shown)) == composed_run([])
     silent = [line for line in shown if "  # " not in line and not re.search(r"_target_|name: |kind: |^  \w+:$", line)]
     assert [line for line in silent if not re.search(r"_(m|mps|s|mps2|deg)\b", line)] == []

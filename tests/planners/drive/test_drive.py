@@ -12,6 +12,7 @@ from factory.store.location import Location
 from planners.drive import drive as command
 from planners.drive import work
 from planners.drive.drive import main
+from planners.drive.settings import settings_of
 from planners.drive.table import open_drives
 
 WITHOUT_SENSORS = ["clips.settings.cameras=[]", "clips.settings.lidar_beams=0"]
@@ -85,6 +86,16 @@ def test_what_is_driven_is_not_driven_again(
     assert main(words(towns, tmp_path)) == COMPLETE
     assert len(driven) == 2
     assert capsys.readouterr().out == told[told.rindex("planner ") :]
+
+
+def test_one_planner_under_two_names_drives_once_and_stands_under_both(towns: Path, tmp_path: Path) -> None:
+    asked = [word for word in words(towns, tmp_path, "limit=1") if not word.startswith("planner=")]
+    asked.append("planners={a: constant_velocity, b: constant_velocity}")
+    settings = settings_of(asked)
+    assert command.driven(settings) == ([], False)
+    made, failed = command.drive_all(settings)
+    assert [row["planner"] for row in made] == ["a", "b"] and failed == []
+    assert len(rows(tmp_path)) == 1 and str(command.driven(settings)) == str((made, True))  # NaN is not itself
 
 
 def test_other_settings_are_other_drives(towns: Path, tmp_path: Path) -> None:

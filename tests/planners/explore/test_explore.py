@@ -18,6 +18,7 @@ from factory.views.lineage import lineage
 from planners.explore import explore as command
 from planners.explore import work
 from planners.explore.explore import main
+from tasks.proposals import index_of
 
 WITHOUT_SENSORS = ["clips.settings.cameras=[]", "clips.settings.lidar_beams=0"]
 
@@ -197,7 +198,7 @@ def test_a_run_tries_what_the_planner_fails_at_first_and_its_tables_name_the_pla
     assert "explored: " in capsys.readouterr().out
     store, plain = Store(tmp_path / "out"), Store(tmp_path / "plain")
     fails_of = {
-        (row.clip_id, -1 - one.number): one.fails
+        (row.clip_id, index_of(one.number)): one.fails
         for row in explored_clips(open_explored(Location.parse(explored)).read())
         for one in row.proposals
     }

@@ -62,6 +62,18 @@ def test_from_constant_velocity_a_head_that_says_nothing_keeps_the_speed() -> No
     assert not from_zero.plan(batch()).any() and straight.any()
 
 
+def test_a_planner_that_sees_its_speed_alone_plans_the_same_however_it_accelerates() -> None:
+    """And another plan at another speed or command; one that sees all is told."""
+    here = batch()
+    pushed, faster = here.status.clone(), here.status.clone()
+    pushed[:, 6:] += 2.0
+    faster[:, 4] += 2.0
+    for model in (planner(), planner(replace(TINY, status="speed"))):
+        plan, blind = model.plan(here), model.settings.status == "speed"
+        assert torch.equal(model.plan(replace(here, status=pushed)), plan) == blind
+        assert not torch.equal(model.plan(replace(here, status=faster)), plan)
+
+
 def test_the_papers_size_is_56_million_parameters() -> None:
     with torch.device("meta"):
         model = Ltf(LtfSettings(), {})

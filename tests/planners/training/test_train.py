@@ -70,6 +70,7 @@ def test_a_training_of_a_version_without_a_setting_is_gone_on_with_at_its_defaul
     path = newest(tmp_path) / "record.json"
     record = json.loads(path.read_text())
     assert record["trained"]["planner.training"].pop("ema") == 0.0
+    assert record["planner"]["settings"].pop("hidden") == 8
     del record["sha256"]
     path.write_text(json.dumps(record))
     assert main(command(table, tmp_path, "+planner.training.ema=0.9")) == 2

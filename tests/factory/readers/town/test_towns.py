@@ -53,6 +53,18 @@ def test_nine_towns_of_two_logs_have_every_kind_of_drive_once(folder: Path) -> N
     assert sorted(indices) == list(range(LOGS_PER_TOWN)) and len(SCENARIOS) == LOGS_PER_TOWN
 
 
+def test_others_of_the_same_towns_are_those_behind_the_first(folder: Path) -> None:
+    first, second = (reader_of(folder, [4, 5], 3, first_log=n).towns for n in (0, 3))
+    for one, other in zip(first, second):
+        assert one.seed == other.seed
+        assert not set(one.indices) & set(other.indices)
+        assert other.indices == tuple((one.indices[-1] + 1 + i) % LOGS_PER_TOWN for i in range(3))
+        assert one.root != other.root
+    assert first == reader_of(folder, [4, 5], 3).towns
+    with pytest.raises(ValueError, match="first_log=16"):
+        reader_of(folder, [4], 3, first_log=16)
+
+
 @pytest.mark.slow
 def test_a_log_has_the_same_bytes_whatever_logs_are_written_beside_it(tmp_path: Path) -> None:
     write_town(tmp_path / "all", 4, 3, BLIND)

@@ -1,0 +1,258 @@
+"""What the arms of an experiment come to in closed loop, and beside the bounds: every number with an interval.
+
+An arm is one set-up's trainings with several seeds. All are held against each other on the drives that everybody has
+made; whole towns are drawn, or whole logs or clips where there are no two towns, and pairs of seeds with them.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from planners.command import Failed, Stopped
+from planners.drive.drive import drive_all, driven
+from planners.drive.settings import DriveSettings, settings_of
+from planners.drive.summary import M_PER_KM, SHARES, highest_level, start_of
+from planners.evaluation.aggregation import BOUNDS, name_of, scores_of_clips, write_csv
+from planners.evaluation.bootstrap import Interval, paired_interval
+from planners.evaluation.compare import CompareSettings, compare, row_of
+from planners.evaluation.frames_file import FRAMES
+from planners.study.report import read_study
+from planners.study.setups import Setup
+from planners.training.many import Means, Training
+from tasks.world.arrays import Array
+
+Row = Mapping[str, Any]
+Start = tuple[str, int]  # clip, number of the start
+KINDS = ("logged", "perturbed")
+STAGES = (("stage_two", "none"), ("final", "unfiltered"))  # of the benchmark, as the paper's tables have them
+DRIVES = "drives"
+RULES = CompareSettings(a="", b="")  # draws, confidence and seed as `python -m planners compare` has them
+
+
+def clean_route(row: Row) -> float:
+    """Route completed where nothing went wrong: 0 of a drive with a collision at fault, or off the road."""
+    failed = row["at_fault_collision"] or row["off_road_events"] > 0
+    return 0.0 if failed else float(row["route_completed"])
+
+
+def failures(row: Row) -> float:
+    """Collisions at fault and departures from the road."""
+    return float(row["off_road_events"] + row["at_fault_collision"])
+
+
+IN_PERCENT: Mapping[str, Callable[[Row], float]] = {"clean_route": clean_route, **SHARES}
+PER_KM = "failures_per_km"
+DRIVEN = (*IN_PERCENT, PER_KM)  # measures, the first of them the one that arms are judged by
+
+
+@dataclass(frozen=True)
+class HeldAgainst:
+    """One arm beside another."""
+
+    part: str
+    arm: str
+    reference: str
+
+
+@dataclass(frozen=True)
+class ArmDrives:
+    """Drives of arms and bounds from the same starts of one kind."""
+
+    kind: str  # of KINDS
+    rows: Mapping[str, Sequence[Sequence[Row]]]  # arm or bound -> seed -> start
+    level: str  # that intervals draw: town, else log, else clip
+    clusters: Sequence[str]  # of each start
+
+    def values(self, who: str, measure: str) -> tuple[Array, Array]:
+        """(seeds, starts) of a measure, and what each counts in a mean."""
+        if measure != PER_KM:
+            found = np.array([[100.0 * IN_PERCENT[measure](row) for row in rows] for rows in self.rows[who]])
+            return found, np.ones_like(found)
+        km = np.array([[max(row["distance_m"] / M_PER_KM, 1e-9) for row in rows] for rows in self.rows[who]])
+        return np.array([[failures(row) for row in rows] for rows in self.rows[who]]) / km, km
+
+    def difference(self, who: str, reference: str | None, measure: str) -> Interval:
+        """Of a measure from the reference's; None: from nothing."""
+        b, weight_b = self.values(who, measure)
+        a, weight_a = (np.zeros_like(b), weight_b) if reference is None else self.values(reference, measure)
+        return paired_interval(a, b, weights=(weight_a, weight_b), clusters=self.clusters)
+
+
+def arm_of(label: str) -> str:
+    """Of a training's label."""
+    return label.rpartition("-")[0]
+
+
+def drive_settings(arms: Sequence[Training], out: str, drives: str) -> DriveSettings:
+    """Of these trainings and the bounds. Raises ConfigError."""
+    named = ",".join(f"{one.label}: '{one.spec(Path(out))}'" for one in arms)
+    return settings_of([*drives.split(), f"planners={{{named}}}", f"out={Path(out) / DRIVES}"])
+
+
+def drive_arms(arms: Sequence[Training], out: str, drives: str, means: Means) -> Stopped | None:
+    """Drive what is not driven, seed by seed; why it is not all. Raises Failed for drives that could not be made."""
+    for seed, batch in groupby(arms, key=lambda one: one.facts["seed"]):
+        chosen = drive_settings(list(batch), out, drives)
+        if means.left_s == 0.0:
+            if driven(chosen)[1]:
+                continue
+            return Stopped(f"drives of seed {seed} and those behind it are not made: the same command goes on")
+        _, failed = drive_all(chosen)
+        if failed:
+            raise Failed(
+                f"{len(failed)} drives could not be made, the first of clip {failed[0].clip_id}: {failed[0].why}"
+            )
+    return None
+
+
+def arms_of(arms: Sequence[Training], out: str, drives: str) -> list[ArmDrives]:
+    """What is driven so far, by kind of start: seeds with which every arm has driven, starts that all have made."""
+    trained = [one for one in arms if (Path(out) / "trainings" / one.label).is_dir()]
+    rows = driven(drive_settings(trained, out, drives))[0] if trained else []
+    found = []
+    for kind in KINDS:
+        by_label: dict[str, dict[Start, Row]] = {}
+        for row in rows:
+            if start_of(row) == kind:
+                by_label.setdefault(row["planner"], {})[row["clip_id"], row["start"]] = row
+        if one := _paired(kind, by_label, [one.label for one in arms]):
+            found.append(one)
+    return found
+
+
+def _paired(kind: str, by_label: Mapping[str, Mapping[Start, Row]], labels: Sequence[str]) -> ArmDrives | None:
+    names = list(dict.fromkeys(map(arm_of, labels)))
+    seeds = sorted({label.rpartition("-")[2] for label in labels}, key=int)
+    whole = [seed for seed in seeds if all(f"{name}-{seed}" in by_label for name in names)]
+    sides = {name: [by_label[f"{name}-{seed}"] for seed in whole] for name in names}
+    sides |= {name: [by_label[name]] for name in BOUNDS if name in by_label}
+    every = [one for side in sides.values() for one in side]
+    starts = sorted(set.intersection(*(set(one) for one in every))) if whole else []
+    if not starts:
+        return None
+    level, clusters = highest_level([every[0][start] for start in starts])
+    return ArmDrives(
+        kind, {name: [[one[s] for s in starts] for one in side] for name, side in sides.items()}, level, clusters
+    )
+
+
+def differences_of(found: Sequence[ArmDrives], pairs: Sequence[HeldAgainst]) -> list[dict[str, Any]]:
+    """Rows of driving_differences.csv: pairs of arms, and each arm beside the bounds that drive."""
+    arms = list(dict.fromkeys(one.arm for one in pairs) | dict.fromkeys(one.reference for one in pairs))
+    rows = []
+    for one in found:
+        bounds = [name for name in ("constant_velocity", "pdm_closed") if name in one.rows]
+        every = [*pairs, *(HeldAgainst(bound, arm, bound) for bound in bounds for arm in arms)]
+        for pair in every:
+            facts = {**vars(pair), "start": one.kind, "seeds": len(one.rows[pair.arm]), "level": one.level}
+            rows += [facts | _bounds(name, one.difference(pair.arm, pair.reference, name)) for name in DRIVEN]
+    return rows
+
+
+def _bounds(measure: str, one: Interval) -> dict[str, Any]:
+    return {"measure": measure, "difference": one.difference, "low": one.low, "high": one.high}
+
+
+def against_bounds(report: Path, setups: Sequence[Setup], seeds: int) -> list[dict[str, Any]]:
+    """Rows of bounds_held.csv: each arm on the benchmark, less constant velocity and PDM-Closed, in points of EPDMS."""
+    clips = read_study(report / FRAMES).clips
+    rows = []
+    for bound in ("constant_velocity", "pdm_closed"):
+        for setup in dict.fromkeys(setups):
+            runs = [clips[label] for seed in range(seeds) if (label := setup.label_of(seed)) in clips]
+            if not runs or bound not in clips:
+                continue
+            intervals = compare([clips[bound]], runs, RULES)
+            for stage in STAGES:
+                each = [scores_of_clips(run)[name_of(*stage)] for run in runs]
+                facts = {"arm": setup.label, "reference": bound, "seeds": len(runs), "stage": stage[0]}
+                rows.append(facts | {"epdms": float(np.mean(each))} | row_of(intervals.get(stage)))
+    return rows
+
+
+def write_arms(
+    report: Path,
+    found: Sequence[ArmDrives],
+    differences: Sequence[Mapping[str, Any]],
+    held: Sequence[Mapping[str, Any]],
+) -> None:
+    """driving.csv, driving_differences.csv, bounds_held.csv and sceptic.md."""
+    rows = []
+    for one in found:
+        for name, drives in one.rows.items():
+            facts = {"arm": name, "start": one.kind, "seeds": len(drives), "starts": len(drives[0]), "level": one.level}
+            for measure in DRIVEN:
+                mean = one.difference(name, None, measure)
+                rows.append(facts | {"measure": measure, "mean": mean.b, "low": mean.low, "high": mean.high})
+    write_csv(report / "driving.csv", rows)
+    write_csv(report / "driving_differences.csv", differences)
+    if held:
+        write_csv(report / "bounds_held.csv", held)
+    (report / "sceptic.md").write_text(text_of(found, differences, held) + "\n")
+
+
+def text_of(
+    found: Sequence[ArmDrives], differences: Sequence[Mapping[str, Any]], held: Sequence[Mapping[str, Any]]
+) -> str:
+    """Tables to be read: means of each arm and bound, then what is held against what."""
+    lines: list[str] = []
+    for one in found:
+        seeds = max(len(drives) for drives in one.rows.values())
+        n = len(next(iter(one.rows.values()))[0])
+        lines += [f"## Driving from {one.kind} starts", ""]
+        lines += [f"{n} starts, {seeds} seeds; 95 % intervals over {one.level}s.", ""]
+        lines += _table(["", *map(words_of, DRIVEN)], [[name, *_means(one, name)] for name in one.rows])
+        mine = [row for row in differences if row["start"] == one.kind]
+        pairs = list(dict.fromkeys((row["arm"], row["reference"]) for row in mine))
+        at = {(row["arm"], row["reference"], row["measure"]): row for row in mine}
+        body = [[f"{arm} - {other}", *(_apart(at[arm, other, name]) for name in DRIVEN)] for arm, other in pairs]
+        lines += _table(["", *map(words_of, DRIVEN)], body)
+    if held:
+        lines += [
+            "## The benchmark beside the bounds",
+            "",
+            "EPDMS in percent; 95 % intervals over clips and towns.",
+            "",
+        ]
+        lines += _table(["", "stage", "EPDMS", "over clips", "over towns"], [_held(row) for row in held])
+    return "\n".join(lines)
+
+
+def words_of(measure: str) -> str:
+    """A measure as a table's head."""
+    return f"{measure.replace('_', ' ')}{'' if measure == PER_KM else ' %'}"
+
+
+def _means(one: ArmDrives, name: str) -> list[str]:
+    found = [one.difference(name, None, measure) for measure in DRIVEN]
+    return [f"{mean.b:.1f} [{mean.low:.1f}, {mean.high:.1f}]" for mean in found]
+
+
+def _apart(row: Mapping[str, Any]) -> str:
+    bold = "**" if row["low"] > 0.0 or row["high"] < 0.0 else ""
+    return f"{bold}{row['difference']:+.1f}{bold} [{row['low']:+.1f}, {row['high']:+.1f}]"
+
+
+def _held(row: Mapping[str, Any]) -> list[str]:
+    spans = [f"{row[low]:+.1f} .. {row[high]:+.1f}" if row[low] != "" else "" for low, high in _ENDS]
+    return [
+        f"{row['arm']} - {row['reference']}",
+        row["stage"],
+        f"{row['epdms']:.1f} ({row['difference']:+.1f})",
+        *spans,
+    ]
+
+
+_ENDS = (("low", "high"), ("low_town", "high_town"))
+
+
+def _table(head: Sequence[str], body: Sequence[Sequence[str]]) -> list[str]:
+    return [_line(head), _line(["---"] * len(head)), *map(_line, body), ""]
+
+
+def _line(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"

@@ -1,0 +1,84 @@
+"""Arms of an experiment: what they drove from the same starts, by closed forms of drives made up."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from planners.study import arms as module
+from planners.study.arms import ArmDrives, HeldAgainst, arms_of, clean_route, differences_of, text_of
+from planners.training.many import Training
+from tests.planners.drive.test_summary import row
+
+ARMS = ("ltf-real-steps", "ltf-more-steps")
+PAIR = HeldAgainst("real alone", ARMS[1], ARMS[0])
+
+
+def training(label: str) -> Training:
+    return Training(label, facts={"seed": int(label[-1])})
+
+
+def drives_of(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Any, rows: list[dict[str, Any]], seeds: int = 1
+) -> list[ArmDrives]:
+    """What is found of drives that are there."""
+    everyone = [training(f"{arm}-{seed}") for seed in range(seeds) for arm in ARMS]
+    for one in everyone:
+        (tmp_path / "trainings" / one.label).mkdir(parents=True, exist_ok=True)
+    monkeypatch.setattr(module, "drive_settings", lambda *_: None)
+    monkeypatch.setattr(module, "driven", lambda _: (rows, True))
+    return arms_of(everyone, str(tmp_path), "")
+
+
+def test_a_drive_with_a_failure_has_completed_nothing_cleanly() -> None:
+    assert clean_route(row(0, route_completed=0.7)) == 0.7
+    assert clean_route(row(0, route_completed=0.7, off_road_events=2)) == 0.0
+    assert clean_route(row(0, route_completed=0.7, at_fault_collision=True)) == 0.0
+
+
+def test_arms_are_held_against_each_other_where_all_have_driven(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
+    """The second arm completes a tenth more of every route, but of a fourth one that the first has not driven."""
+    rows = [row(i, planner=f"{ARMS[0]}-0", route_completed=0.5) for i in range(3)]
+    rows += [row(i, planner=f"{ARMS[1]}-0", route_completed=0.6) for i in range(4)]
+    rows += [row(i, planner="constant_velocity", route_completed=0.2) for i in range(3)]
+    (found,) = drives_of(monkeypatch, tmp_path, rows)
+    assert (found.kind, found.level, len(found.clusters)) == ("logged", "town", 3)
+    apart = {(one["arm"], one["reference"], one["measure"]): one for one in differences_of([found], [PAIR])}
+    more = apart[ARMS[1], ARMS[0], "clean_route"]
+    assert [more[name] for name in ("difference", "low", "high")] == pytest.approx([10.0, 10.0, 10.0])
+    assert apart[ARMS[0], "constant_velocity", "route_completed"]["difference"] == pytest.approx(30.0)
+    assert "**+10.0** [+10.0, +10.0]" in text_of([found], list(apart.values()), [])
+
+
+def test_towns_are_drawn_whole_and_failures_count_by_the_kilometre(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Any
+) -> None:
+    """Two towns of two drives; the second arm fails once in the first town: 1 in 4 km, drawn 0 to 2 of 2 towns."""
+    log = {i: f"town-{i // 2}-000{i % 2}-straight" for i in range(4)}
+    rows = [row(i, planner=f"{ARMS[0]}-0", log_id=log[i]) for i in range(4)]
+    rows += [row(i, planner=f"{ARMS[1]}-0", log_id=log[i], off_road_events=int(i == 0)) for i in range(4)]
+    (found,) = drives_of(monkeypatch, tmp_path, rows)
+    one = found.difference(ARMS[1], ARMS[0], "failures_per_km")
+    assert (one.difference, one.low, one.high) == pytest.approx((0.25, 0.0, 0.5))
+    clean = found.difference(ARMS[1], None, "clean_route")
+    assert (clean.b, clean.low, clean.high) == pytest.approx((75.0, 50.0, 100.0))
+
+
+def test_a_seed_that_an_arm_has_not_driven_counts_for_none(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
+    labels = [f"{ARMS[0]}-0", f"{ARMS[1]}-0", f"{ARMS[0]}-1"]
+    rows = [row(i, planner=label, start=start) for label in labels for i in range(2) for start in (-1, 0)]
+    found = drives_of(monkeypatch, tmp_path, rows, seeds=2)
+    assert [one.kind for one in found] == ["logged", "perturbed"]
+    assert all(len(one.rows[arm]) == 1 for one in found for arm in ARMS)
+    assert drives_of(monkeypatch, tmp_path, rows[:2], seeds=2) == []
+
+
+def test_seeds_are_pairs(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
+    """The same gain in each of two seeds that differ by much has no width."""
+    rows = []
+    for seed, base in ((0, 0.1), (1, 0.8)):
+        rows += [row(i, planner=f"{ARMS[0]}-{seed}", route_completed=base) for i in range(2)]
+        rows += [row(i, planner=f"{ARMS[1]}-{seed}", route_completed=base + 0.1) for i in range(2)]
+    (found,) = drives_of(monkeypatch, tmp_path, rows, seeds=2)
+    one = found.difference(ARMS[1], ARMS[0], "clean_route")
+    np.testing.assert_allclose((one.difference, one.low, one.high), 10.0)
