@@ -3,7 +3,6 @@
 `rollout -> expert -> rollout -> reward` of tasks.stages; rendering follows elsewhere, only for what the reward kept.
 """
 
-import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -13,10 +12,9 @@ import numpy as np
 from tasks.experts.pdm_closed.path import MIN_PROGRESS_M, path_length_m
 from tasks.experts.pdm_closed.planner import PdmClosed, PdmPlan, PdmSettings, plan_for
 from tasks.experts.protocol import Expert, Plan
+from tasks.reward.ends import end_fault
 from tasks.reward.epdms import Scores, score
-from tasks.reward.off_route import way_on_m
 from tasks.reward.prepare import PreparedScene, prepare_scene
-from tasks.reward.second_after import BRAKING_MPS2, hit_after_s
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficScene, TrafficSettings, next_scene, prepare_traffic, roll_out
 from tasks.settings import ExpertGate
@@ -100,21 +98,7 @@ def verdict(scores: Scores, gate: ExpertGate) -> Rejected | None:
 
 def end_verdict(judged: Judged, traffic: TrafficScene, gate: ExpertGate) -> Rejected | None:
     """None where a drive's end leads on as the gate asks (docs/reward.md 2m); traffic: as the drive met it."""
-    clip, states = judged.scene.clip, judged.rollout.ego_states
-    if gate.off_route:
-        metres = way_on_m(clip.road_map, clip.route, states[-1, : HEADING + 1])
-        if metres is None:
-            return Rejected("reward", "off_route", "ends on no lane of the route")
-        if metres < math.inf:
-            return Rejected("reward", "off_route", f"ends on a lane that leaves the route within {metres:.1f} m")
-    if gate.after:
-        going_on = hit_after_s(traffic, judged.prepared, states)
-        if going_on < math.inf:
-            braking = hit_after_s(traffic, judged.prepared, states, BRAKING_MPS2)
-            if braking < math.inf:
-                when = f"after {going_on:.1f} s, after {braking:.1f} s when it brakes"
-                return Rejected("reward", "after", f"hits somebody {when}")
-    return None
+    return end_fault(traffic, judged.prepared, judged.rollout.ego_states, gate)
 
 
 def attempt(

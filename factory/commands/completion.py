@@ -16,7 +16,7 @@ from factory.commands.table import COMMANDS
 from factory.config.arguments import RUN, WORD, given_as, keys_of
 from factory.config.compose import conf_dir
 from factory.config.plugins import choices
-from factory.config.run import RecoverySources, RunConfig, reader_of
+from factory.config.run import EXPERTS, RunConfig, built_in_classes, reader_of
 from factory.config.shapes import choices_of, dataclass_in
 from factory.config.shapes import keys_of as settings_in
 
@@ -106,11 +106,13 @@ def candidates(words: Sequence[str], last: str) -> Iterable[str]:
 
 
 def settings_of(given: Sequence[str]) -> dict[str, list[str]]:
-    """Setting -> its choices where they are few: groups, the run's keys, those of the chosen reader and of recovery."""
+    """Setting -> its choices where they are few: groups, the run's keys, the chosen reader's, the experts'."""
     folder = conf_dir()
     chosen = dict(re.findall(r"^  - (\w+): (\w+)$", (folder / "run.yaml").read_text(), re.M))
     chosen.update({key: value for key, _, value in (word.partition("=") for word in given) if key in chosen})
-    typed = dict(settings_in(RunConfig)) | dict(settings_in(RecoverySources, "expert.recovery."))
+    typed = dict(settings_in(RunConfig))
+    for name, target in built_in_classes("expert").items():
+        typed |= dict(settings_in(EXPERTS[target], f"expert.{name}.")) if target in EXPERTS else {}
     reader = reader_of(chosen["clips"])
     typed |= {} if reader is None else dict(settings_in(reader, "clips."))
     found = {key: choices_of(hint) for key, hint in typed.items() if key != "expert" and dataclass_in(hint) is None}

@@ -24,7 +24,9 @@ from factory.readers.settings import (
     TownSettings,
 )
 from tasks.experts.pdm_closed.settings import PdmSettings
+from tasks.experts.pdm_smooth.settings import SmoothSettings
 from tasks.experts.recovery.settings import RecoverySettings
+from tasks.experts.vocabulary.settings import VocabularySettings
 from tasks.render.settings import RenderMode, RenderSettings
 from tasks.rollout.settings import TrafficSettings
 from tasks.settings import ExpertGate, PerturbSettings, SampleWeights
@@ -41,7 +43,9 @@ READERS: Mapping[str, type[Any]] = {  # `_target_` of a built-in reader -> its s
     "factory.readers.town.reader.SyntheticReader": TownClips,
     "factory.readers.town.towns.SyntheticTownsReader": TownsClips,
 }
-RECOVERY = "factory.setup.recovery.recovery"  # `_target_` of the built-in expert that has settings of its own
+RECOVERY = "factory.setup.recovery.recovery"
+PDM_SMOOTH = "factory.setup.experts.pdm_smooth"
+VOCABULARY = "factory.setup.experts.vocabulary"
 
 
 @dataclass(frozen=True)
@@ -114,6 +118,20 @@ class RecoverySources(RecoverySettings):
 
     table: str | None = None  # .npz of `factory vocabulary table=...`; null: the clips' TRAIN windows and vocabularies
     vocabularies: tuple[str, ...] = ()  # further .npy files of human trajectories, beside the run's vocabulary.file
+
+
+@dataclass(frozen=True)
+class VocabularySources(VocabularySettings):
+    """A sampling expert, and what it samples."""
+
+    file: str | None = None  # .npy (K, 40, 3) of human trajectories; null: the run's vocabulary
+
+
+EXPERTS: Mapping[str, type[Any]] = {  # `_target_` of a built-in expert that has settings of its own -> them
+    RECOVERY: RecoverySources,
+    PDM_SMOOTH: SmoothSettings,
+    VOCABULARY: VocabularySources,
+}
 
 
 @dataclass(frozen=True)
@@ -277,10 +295,12 @@ def load_config(words: Sequence[str]) -> RunConfig:
 def shapes_in(values: Mapping[str, Any]) -> dict[str, type[Any]]:
     """Key -> dataclass of the built-in reader and experts that a run's settings name."""
     reader = READERS.get(values["clips"].get("_target_", ""))
-    recovery = {
-        f"expert.{name}": RecoverySources for name, spec in values["expert"].items() if spec.get("_target_") == RECOVERY
+    experts = {
+        f"expert.{name}": EXPERTS[spec["_target_"]]
+        for name, spec in values["expert"].items()
+        if spec.get("_target_") in EXPERTS
     }
-    return {**({} if reader is None else {"clips": reader}), **recovery}
+    return {**({} if reader is None else {"clips": reader}), **experts}
 
 
 def without_labels(spec: Mapping[str, Any]) -> dict[str, Any]:

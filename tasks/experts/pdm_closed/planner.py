@@ -7,7 +7,7 @@ the proposal fail traffic light compliance, as in nuPlan's PDM.
 """
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -72,11 +72,7 @@ def plan_pdm_closed(
     has no length, or the speed limit is not positive.
     """
     _refuse_nonsense(ego_state, agents)
-    red_on_route = red_lane_ids & route_lane_ids
-    red = [
-        polygon for polygon in polygons if polygon.layer is MapLayer.LANE_CONNECTOR and polygon.token in red_on_route
-    ]
-    lights = tuple(shapely.Polygon(polygon.ring[:, :2]) for polygon in red)
+    red, lights = red_connectors(polygons, red_lane_ids & route_lane_ids)
     seen = forecast(ego_state, agents, lights)
     candidates = proposals(ego_state, centerline, seen, speed_limit_mps, settings)
     driven = candidates.poses[:, : SCORED_STEPS + 1]
@@ -87,7 +83,7 @@ def plan_pdm_closed(
         polygons=polygons,
         route_lane_ids=route_lane_ids,
         objects=seen.tracks(agents, SCORED_STEPS + 1),
-        red_lanes=tuple(polygon.token for polygon in red),
+        red_lanes=red,
         drop_touching=False,  # the forecast's tracks are without them
     )
     scores = score(prepared, simulated)
@@ -110,17 +106,6 @@ def _refuse_nonsense(ego_state: Array, agents: AgentTracks) -> None:
 def plan_for(scene: Scene, settings: PdmSettings = DEFAULTS) -> PdmPlan:
     """PDM-Closed from a scene, seeing its agents and lights at the scene's step only."""
     clip = scene.clip
-    lights = clip.lights
-    red_now = {
-        lane_id
-        for lane_id, state in zip(lights.lane_ids, lights.states[scene.step] if lights.lane_ids else ())
-        if state == LightState.RED
-    }
-    on_route = (clip.road_map.lanes.get(lane_id) for lane_id in sorted(clip.route.lane_ids))
-    starts = (
-        lane for lane in on_route if lane is not None and np.array_equal(lane.centerline[:2], scene.centerline[:2])
-    )
-    first = next(starts, None)
     center = ego_boxes(scene.ego_state, PACIFICA)[:2]
     return plan_pdm_closed(
         ego_state=scene.ego_state,
@@ -128,10 +113,38 @@ def plan_for(scene: Scene, settings: PdmSettings = DEFAULTS) -> PdmPlan:
         agents=scene.agents.window(scene.step, scene.step + 1),
         polygons=polygons_near(clip.road_map, center, RADIUS_M),
         route_lane_ids=clip.route.lane_ids,
-        red_lane_ids=frozenset(red_now),
-        speed_limit_mps=None if first is None else first.speed_limit_mps,
+        red_lane_ids=red_now(scene),
+        speed_limit_mps=speed_limit_of(scene),
         settings=settings,
     )
+
+
+def red_connectors(
+    polygons: Sequence[MapPolygon], red_on_route: Collection[str]
+) -> tuple[tuple[str, ...], tuple[shapely.Polygon, ...]]:
+    """The connectors among `polygons` that are red on the route: their ids, and their areas."""
+    red = [
+        polygon for polygon in polygons if polygon.layer is MapLayer.LANE_CONNECTOR and polygon.token in red_on_route
+    ]
+    return tuple(polygon.token for polygon in red), tuple(shapely.Polygon(polygon.ring[:, :2]) for polygon in red)
+
+
+def red_now(scene: Scene) -> frozenset[str]:
+    """Lanes whose light is red at the scene's step."""
+    lights = scene.clip.lights
+    states = lights.states[scene.step] if lights.lane_ids else ()
+    return frozenset(lane_id for lane_id, state in zip(lights.lane_ids, states) if state == LightState.RED)
+
+
+def speed_limit_of(scene: Scene) -> float | None:
+    """Of the lane [m/s] that the scene's centre line starts on; None where unknown."""
+    clip = scene.clip
+    on_route = (clip.road_map.lanes.get(lane_id) for lane_id in sorted(clip.route.lane_ids))
+    starts = (
+        lane for lane in on_route if lane is not None and np.array_equal(lane.centerline[:2], scene.centerline[:2])
+    )
+    first = next(starts, None)
+    return None if first is None else first.speed_limit_mps
 
 
 @dataclass(frozen=True)

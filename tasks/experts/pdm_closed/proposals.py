@@ -120,10 +120,10 @@ def _drive(
                 if looks:
                     if not shared:
                         written[:] = 0.0
-                    _set_footprint(poses[p, step - 1], footprint)
+                    set_footprint(poses[p, step - 1], footprint)
                     sample = step // SAMPLE_STEPS
-                    nearest = _nearest_ahead(things, lead_progress_m[path, sample], sample, progress, footprint)
-                    _write_lead(paths, path, things, nearest, progress, poses[p, step - 1, 2], written)
+                    nearest = nearest_ahead(things, lead_progress_m[path, sample], sample, progress, footprint)
+                    write_lead(paths, path, things, nearest, progress, poses[p, step - 1, 2], written)
                 for k in range(3):  # before the first search all zeros: no gap, so it brakes hard
                     leads[p, step, k] = written[k] if looks else leads[p, step - 1, k]
                 after = idm_step(progress, speed, leads[p, step], targets_mps[p - first], idm)
@@ -133,7 +133,7 @@ def _drive(
 
 
 @kernel
-def _write_lead(
+def write_lead(
     paths: DrivePaths,
     path: int,
     things: Things,
@@ -156,7 +156,7 @@ def _write_lead(
 
 
 @kernel
-def _nearest_ahead(things: Things, ahead_m: Array, sample: int, progress: float, footprint: Array) -> tuple[float, int]:
+def nearest_ahead(things: Things, ahead_m: Array, sample: int, progress: float, footprint: Array) -> tuple[float, int]:
     """Distance [m] from the footprint (2, 4) to the nearest thing farther along than `progress`, and which; -1: none.
 
     ahead_m: (M,) arc length of each thing in the corridor, NaN for those that are not in it.
@@ -177,7 +177,7 @@ def _nearest_ahead(things: Things, ahead_m: Array, sample: int, progress: float,
 
 
 @kernel
-def _set_footprint(pose: Array, out: Array) -> None:
+def set_footprint(pose: Array, out: Array) -> None:
     """Corners (2, 4) x, y of the ego's body, its rear axle at `pose` (3,)."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     x, y = pose[0] + REAR_AXLE_TO_CENTER * c, pose[1] + REAR_AXLE_TO_CENTER * s
