@@ -43,11 +43,17 @@ class PerturbedClip:
     candidates: tuple[Candidate, ...]
 
 
-def logged_poses(prepared: object) -> Array | None:
-    """(81, 3) the log from T to T+2H, world frame, of a prepared clip; None of what is none, or is another work's."""
+def logged_clip(prepared: object) -> Clip | None:
+    """The clip of a prepared one, without its sensor files; None of what is none, or is another work's."""
     if not isinstance(prepared, PreparedClip) or not isinstance(prepared.payload, PerturbedClip):
         return None
-    return prepared.payload.clip.ego_states[NOW:, : HEADING + 1]
+    return prepared.payload.clip
+
+
+def logged_poses(prepared: object) -> Array | None:
+    """(81, 3) the log from T to T+2H, world frame, of a prepared clip; None as `logged_clip` has it."""
+    clip = logged_clip(prepared)
+    return None if clip is None else clip.ego_states[NOW:, : HEADING + 1]
 
 
 @dataclass(frozen=True)
