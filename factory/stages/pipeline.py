@@ -20,7 +20,7 @@ from tasks.attempt import ExpertGate, Judged, Timed, attempt, has_route, human_s
 from tasks.experts.pdm_closed.planner import PdmSettings
 from tasks.experts.protocol import Expert, tried_once
 from tasks.perturb import Candidate, Perturbation, PerturbSettings, end_speed_mps, perturb
-from tasks.render.scene.engine import Backend, check
+from tasks.render.scene.engine import check
 from tasks.render.settings import RenderMode, RenderSettings
 from tasks.render.splatting.gsplat_backend import BackendMissing
 from tasks.reward.labels import Labelling, vocabulary_labels
@@ -308,7 +308,7 @@ class FactoryWork:
     @property
     def draws_on_gpu(self) -> bool:
         """Attempts of this run draw pictures with CUDA."""
-        return self.render.mode is RenderMode.AUTO and self.render.backend is Backend.GSPLAT and self._simulates
+        return self.render.mode is RenderMode.AUTO and self.render.backend.on_gpu and self._simulates
 
     @property
     def imaging(self) -> Imaging:
