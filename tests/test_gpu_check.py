@@ -18,10 +18,11 @@ def test_without_gsplat_it_says_so_in_one_line(
 
 @pytest.mark.slow
 def test_through_the_kernels_all_agrees(capsys: pytest.CaptureFixture[str]) -> None:
-    """A small one: seven scenes, two fits and the plain one, pictures of two sizes."""
+    """A small one: seven scenes, two fits and the plain one, pictures of two sizes, each in six ways."""
     options = {"on": "cpu", "gaussians": "400", "iterations": "14", "width": "64", "height": "36", "threads": "1"}
+    options["seconds"] = "0.1"
     assert main(options) == 0
     lines = capsys.readouterr().out.splitlines()
     rows = [line for line in lines if line.startswith("| ") and "---" not in line]
-    assert len(rows) == (1 + 7) + (1 + 3) + (1 + 4) and sum(line.endswith("| well |") for line in rows) == 7
+    assert len(rows) == (1 + 7) + (1 + 3) + (1 + 2 * 6) and sum(line.endswith("| well |") for line in rows) == 7
     assert lines[-1].startswith("all agree")

@@ -3,7 +3,8 @@
 info SCENE...                       what is in it: Gaussians, nodes, sky, range, quality, digest
 export SCENE to=FOLDER              background.ply, one node-<track id>.ply a vehicle, sky.png, scene.json
 export SCENE to=FOLDER format=spz   the same, a tenth the size; format=ckpt: checkpoints, of the background as of
-                                    WorldEngine, of vehicles as of nerfstudio's splatfacto
+                                    WorldEngine, of vehicles as of nerfstudio's splatfacto; with out=RUN the former has
+                                    the vehicles too, where the log had them by the run's prepared clips
 import FILE to=SCENE                a .ply, .spz or checkpoint (.ckpt, .pt, .pth: splatfacto, MTGS, WorldEngine) as a
                                     scene under a plain sky; origin=x,y,z puts it into the world [m]
 import FILE to=SCENE like=OTHER     the same with the origin, nodes, sky and range of another scene
@@ -53,13 +54,15 @@ class Request:
             raise ValueError(f"scene {self.action} takes to=...; see --help")
         takes = {
             "info": (),
-            "export": ("to", "format"),
+            "export": ("to", "format", "out"),
             "import": ("to", "like", "origin", "traversal", "transforms", "antialiased"),
             "view": ("out", "port", "host"),
         }[self.action]
         for name in ("to", "like", "origin", "format", "traversal", "transforms", "antialiased", "out", "port", "host"):
             if getattr(self, name) is not None and name not in takes:
                 raise ValueError(f"scene {self.action} takes no {name}=; see --help")
+        if self.action == "export" and self.out is not None and self.format != "ckpt":
+            raise ValueError("out= brings vehicles' poses into a checkpoint: format=ckpt")
         if self.like is not None and self.origin is not None:
             raise ValueError("give origin= or like=: the other scene has an origin of its own")
 
@@ -68,7 +71,10 @@ def main(request: Request) -> None:
     """Do it. Raises Refused for what cannot be read or makes no sense."""
     from factory.stages.scene_file import read_scene, write_scene
     from factory.views.scene_parts import export, imported, info_text
+    from factory.views.scene_tracks import logged_vehicles
     from factory.views.splat_files import read_splats
+    from factory.views.status import open_store
+    from tasks.render.splatting.checkpoints import LoggedVehicle
 
     file, to = Path(request.files[0]), Path(request.to or "")
     try:
@@ -76,7 +82,12 @@ def main(request: Request) -> None:
             case "info":
                 print("\n\n".join(info_text(path, read_scene(path)) for path in map(Path, request.files)))
             case "export":
-                print("\n".join(map(str, export(read_scene(file), to, f".{request.format or 'ply'}"))))
+                asset, vehicles, unseen = read_scene(file), list[LoggedVehicle](), list[str]()
+                if request.out is not None:
+                    vehicles, unseen = logged_vehicles(open_store(request.out), asset)
+                print("\n".join(map(str, export(asset, to, f".{request.format or 'ply'}", vehicles))))
+                if unseen:
+                    print(f"left out    {', '.join(unseen)}: no clip of the run shows them here")
             case "import":
                 transforms = None if request.transforms is None else Path(request.transforms)
                 found = read_splats(file, request.traversal, transforms)

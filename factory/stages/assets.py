@@ -182,8 +182,8 @@ def block_id(clip: Clip, settings: RenderSettings) -> str:
     made_of = (ASSET_VERSION, clip.dataset, clip.log_id, block.start_s, block.ground_m, clip.content_digest)
     part = "fit" if settings.scene is SceneFrom.FIT else "asset"
     made = asdict(settings)[part] | REMOVED[part]
-    if settings.scene is SceneFrom.FIT and settings.backend is not Backend.CPU:
-        made["backend"] = settings.backend  # another fit to the last bits, so that a run on CPUs never meets it
+    if settings.scene is SceneFrom.FIT and settings.backend.on_gpu:
+        made["backend"] = Backend.GSPLAT  # another fit to the last bits, so that a run on CPUs never meets it
     how: list[object] = [settings.width, settings.height, sorted(settings.cameras), made]
     if settings.lpips and part == "fit":  # a scene without the measure is made again
         how.append([[Path(name).name, Path(name).stat().st_size] for name in settings.lpips])

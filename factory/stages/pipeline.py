@@ -22,7 +22,7 @@ from tasks.experts.pdm_closed.planner import PdmSettings
 from tasks.experts.protocol import Expert, kernels_of, tried_once
 from tasks.perturb import Candidate, Perturbation, PerturbSettings, end_speed_mps, perturb
 from tasks.proposals import Proposal
-from tasks.render.scene.engine import Backend, check
+from tasks.render.scene.engine import check
 from tasks.render.settings import RenderMode, RenderSettings
 from tasks.render.splatting.gsplat_backend import BackendMissing
 from tasks.reward.labels import Labelling, vocabulary_labels
@@ -46,11 +46,17 @@ class PerturbedClip:
     candidates: tuple[Candidate, ...]
 
 
-def logged_poses(prepared: object) -> Array | None:
-    """(81, 3) the log from T to T+2H, world frame, of a prepared clip; None of what is none, or is another work's."""
+def logged_clip(prepared: object) -> Clip | None:
+    """The clip of a prepared one, without its sensor files; None of what is none, or is another work's."""
     if not isinstance(prepared, PreparedClip) or not isinstance(prepared.payload, PerturbedClip):
         return None
-    return prepared.payload.clip.ego_states[NOW:, : HEADING + 1]
+    return prepared.payload.clip
+
+
+def logged_poses(prepared: object) -> Array | None:
+    """(81, 3) the log from T to T+2H, world frame, of a prepared clip; None as `logged_clip` has it."""
+    clip = logged_clip(prepared)
+    return None if clip is None else clip.ego_states[NOW:, : HEADING + 1]
 
 
 @dataclass(frozen=True)
@@ -313,7 +319,7 @@ class FactoryWork:
     @property
     def draws_on_gpu(self) -> bool:
         """Attempts of this run draw pictures with CUDA."""
-        return self.render.mode is RenderMode.AUTO and self.render.backend is Backend.GSPLAT and self._simulates
+        return self.render.mode is RenderMode.AUTO and self.render.backend.on_gpu and self._simulates
 
     @property
     def imaging(self) -> Imaging:

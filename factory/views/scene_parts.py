@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -15,7 +16,7 @@ from factory.views.splat_files import background_bytes, node_bytes
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.lidar_only import plain_sky
 from tasks.render.splatting import sh
-from tasks.render.splatting.checkpoints import SplatCheckpoint
+from tasks.render.splatting.checkpoints import LoggedVehicle, SplatCheckpoint
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.project import ANTIALIASED, CLASSIC, ScreenFilter
 
@@ -41,16 +42,20 @@ def info_text(path: Path, asset: RenderAsset) -> str:
     return "\n".join([*lines, f"exposures   {len(asset.exposures)}"])
 
 
-def export(asset: RenderAsset, folder: Path, suffix: str = ".ply") -> list[Path]:
+def export(
+    asset: RenderAsset, folder: Path, suffix: str = ".ply", vehicles: Sequence[LoggedVehicle] = ()
+) -> list[Path]:
     """Writes the parts into a folder, Gaussians as `suffix` says; returns their paths.
 
+    vehicles: those that stand in the background's checkpoint as well, with their poses.
     Raises BadScene where a part cannot be written so.
     """
     folder.mkdir(parents=True, exist_ok=True)
     nodes = {f"node-{re.sub(r'[^A-Za-z0-9._-]', '_', name)}{suffix}": node for name, node in asset.nodes.items()}
     if len(nodes) < len(asset.nodes):
         raise BadScene(f"track ids {', '.join(asset.nodes)}: two of them make the same file name")
-    files = {f"background{suffix}": partial(background_bytes, asset.background, suffix, asset.origin, asset.screen)}
+    street = partial(background_bytes, asset.background, suffix, asset.origin, asset.screen, vehicles)
+    files = {f"background{suffix}": street}
     files |= {name: partial(node_bytes, node, suffix, asset.screen) for name, node in nodes.items()}
     for name, written in files.items():
         try:

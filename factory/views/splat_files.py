@@ -1,7 +1,7 @@
 """Gaussians as files that other programs read and write: .ply, .spz, and checkpoints of torch."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 
 from factory.stages.scene_file import BadScene
-from tasks.render.splatting.checkpoints import SplatCheckpoint, from_checkpoint, splatfacto, worldengine
+from tasks.render.splatting.checkpoints import LoggedVehicle, SplatCheckpoint, from_checkpoint, splatfacto, worldengine
 from tasks.render.splatting.gaussians import Gaussians, moved
 from tasks.render.splatting.ply import from_ply, to_ply
 from tasks.render.splatting.project import ANTIALIASED, ScreenFilter
@@ -50,9 +50,20 @@ def read_splats(path: Path, traversal: int | None = None, transforms: Path | Non
     return replace(found, background=taken_back(found.background, *transform_of(transforms)))
 
 
-def background_bytes(gaussians: Gaussians, suffix: str, origin: Array, screen: ScreenFilter) -> bytes:
-    """A street's file; a checkpoint is WorldEngine's, `origin` (3,) [m] in the world. Raises ValueError."""
-    return _saved(worldengine(gaussians, origin)) if suffix in CHECKPOINTS else _bytes(gaussians, suffix, screen)
+def background_bytes(
+    gaussians: Gaussians,
+    suffix: str,
+    origin: Array,
+    screen: ScreenFilter,
+    vehicles: Sequence[LoggedVehicle] = (),
+) -> bytes:
+    """A street's file; a checkpoint is WorldEngine's, `origin` (3,) [m] in the world, and has its `vehicles`.
+
+    Raises ValueError.
+    """
+    if suffix in CHECKPOINTS:
+        return _saved(worldengine(gaussians, origin, vehicles))
+    return _bytes(gaussians, suffix, screen)
 
 
 def node_bytes(gaussians: Gaussians, suffix: str, screen: ScreenFilter) -> bytes:

@@ -1,6 +1,7 @@
 """What a GPU makes of render.backend=gsplat, in five minutes and without data: `make gpu-check`, or
 
-    python -m tests.bench.gpu_check [gaussians=100000] [iterations=200] [width=480] [height=270] [threads=] [on=cuda]
+    python -m tests.bench.gpu_check [gaussians=100000] [iterations=200] [width=480] [height=270] [threads=] [seconds=2]
+        [on=cuda]
 
 It prints whether pictures, derivatives and a fit agree with the CPU's, then iterations and views per second and memory,
 each beside plain gsplat on the same scene. Exit code 0: all agree; 1: something does not; 2: there is no CUDA device,
@@ -11,7 +12,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count
 from typing import Any
@@ -46,6 +47,9 @@ from tests.bench.peer_gsplat import SCENES, answers, apart, of_kernels
 CLOSE = 1e-3  # of an array's length: CUDA's exponential is good to 2e-6, and sums come in any order
 BEHIND_A_WALL = 5e-3  # light that a tile drops and gsplat does not
 ALIKE_DB = 55.0  # of two pictures of a scene
+ALIKE = 1e-3  # of two pictures in [0, 1], drawn in one call or in several: a quarter of a step of 8 bits
+RIG = 8  # cameras
+WAYS = ((1, 1, True), (1, 1, False), *((RIG, n, packed) for n in (RIG, 1) for packed in (True, False)))
 APART_DB = 0.1  # of two fits, on photos held out
 PHOTOS, HELD_OUT = 24, (5, 17)
 BEFORE_TIMED = 10  # iterations
@@ -61,19 +65,21 @@ class Place:
     name: str
     device: str
     draw: Draw
-    plain: Callable[[SceneTensors, Eye], Tensor]  # rgb (H, W, 3), by nothing of ours
+    plain: Callable[[SceneTensors, Sequence[Eye], bool], Tensor]  # rgb (C, H, W, 3), packed or not, by nothing of ours
+    engine: Callable[[Gaussians, Sequence[Pinhole], Sequence[NDArray[np.float32]], bool], list[View]]
+    least_s: float = 2.0  # that something is timed
 
     def done(self) -> None:
         """Waits for what was asked of the device."""
         if self.device == "cuda":
             torch.cuda.synchronize()
 
-    def timed(self, call: Callable[[], object], least_s: float = 2.0) -> float:
+    def timed(self, call: Callable[[], object]) -> float:
         """Calls per second, after one that warms up."""
         call()
         self.done()
         began, n = time.perf_counter(), 0
-        while time.perf_counter() - began < least_s:
+        while time.perf_counter() - began < self.least_s:
             for _ in range(CALLS):
                 call()
             self.done()
@@ -92,15 +98,33 @@ class Place:
 def on_cuda(rasterization: Callable[..., Any]) -> Place:
     """gsplat as this project calls it, and with its own defaults."""
 
-    def plain(scene: SceneTensors, eye: Eye) -> Tensor:
-        given = learned_arguments(scene, eye) | {"packed": False, "render_mode": "RGB"}
-        rgb: Tensor = rasterization(**given)[0][0]
+    def plain(scene: SceneTensors, eyes: Sequence[Eye], packed: bool) -> Tensor:
+        each = [learned_arguments(scene, eye) for eye in eyes]
+        cameras = {name: torch.cat([given[name] for given in each]) for name in ("viewmats", "Ks")}
+        rgb: Tensor = rasterization(**each[0] | cameras | {"packed": packed, "render_mode": "RGB"})[0]
         return rgb
 
-    return Place("render.backend=gsplat", "cuda", by_gsplat, plain)
+    def engine(
+        scene: Gaussians, cameras: Sequence[Pinhole], behind: Sequence[NDArray[np.float32]], packed: bool
+    ) -> list[View]:
+        return rasterize_all(scene, cameras, behind, packed=packed)
+
+    return Place("render.backend=gsplat", "cuda", by_gsplat, plain, engine)
 
 
-ON_CPU = Place("tensors through the kernels", "cpu", by_kernels, lambda scene, eye: by_kernels(scene, eye).rgb)
+def _of_tensors(scene: SceneTensors, eyes: Sequence[Eye], packed: bool) -> Tensor:
+    return torch.stack([by_kernels(scene, eye).rgb for eye in eyes])
+
+
+def _of_arrays(
+    scene: Gaussians, cameras: Sequence[Pinhole], behind: Sequence[NDArray[np.float32]], packed: bool
+) -> list[View]:
+    return [
+        forward(scene, c.intrinsics, c.world_from_camera, c.width, c.height, b).view for c, b in zip(cameras, behind)
+    ]
+
+
+ON_CPU = Place("tensors through the kernels", "cpu", by_kernels, _of_tensors, _of_arrays)
 
 
 def parity(place: Place) -> bool:
@@ -196,20 +220,25 @@ def plain(place: Place, problem: Problem, start: FitState, settings: FitSettings
         shot, (means, quats, log_scales, logits, colours) = problem.train[i].photo, leaves
         scene = SceneTensors(means, quats, log_scales, logits[:, 0], colours, nothing)
         height, width = shot.rgb.shape[:2]
-        rgb = place.plain(scene, Eye(shot.intrinsics, shot.world_from_camera, width, height, motion))
+        eye = Eye(shot.intrinsics, shot.world_from_camera, width, height, motion)
+        (rgb,) = place.plain(scene, [eye], False)
         loss = photo_loss(rgb, photos[i], everywhere, settings.ssim_weight)
         adam.zero_grad()
         loss.backward()
         adam.step()
 
-    return place.timed(iterate, 5.0)
+    return place.timed(iterate)
 
 
 def views(place: Place, n: int, sizes: Sequence[tuple[int, int]], threads: int) -> bool:
-    """Pictures per second of one scene: by the engine, scene and pictures travelling, and by gsplat alone."""
-    print("\nDrawing a scene, all cameras of an instant at once; the first picture against the CPU's:\n")
-    print("| size | cameras | PSNR [dB] | CPU views/s | engine views/s | plain gsplat views/s | device memory [MB] |")
-    print("|---|---|---|---|---|---|---|")
+    """Pictures per second of one scene, cameras together in one call and one by one, packed and dense: by the engine,
+    scene and pictures travelling, and by gsplat alone. Whether pictures are the CPU's, and those of every way alike."""
+    print("\nDrawing a scene; the worst picture against the CPU's, and against the same cameras one by one, packed:\n")
+    print(
+        "| size | cameras | in one call | | PSNR [dB] | apart | CPU views/s | engine views/s | plain gsplat views/s | "
+        "device memory [MB] |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|---|")
     scene, well = cloud(n), True
     leaves = [torch.tensor(a, device=place.device) for a in (scene.means, scene.quats, scene.log_scales)]
     logits = torch.logit(torch.tensor(scene.opacities, device=place.device))
@@ -218,32 +247,45 @@ def views(place: Place, n: int, sizes: Sequence[tuple[int, int]], threads: int) 
     for width, height in sizes:
         k = np.array([[0.6 * width, 0.0, width / 2], [0.0, 0.6 * width, height / 2], [0.0, 0.0, 1.0]])
         behind = np.full((height, width, 3), SKY, np.float32)
+        cameras = [Pinhole(k, _shifted(0.1 * i), width, height) for i in range(RIG)]
+        eyes = [Eye(k, c.world_from_camera, width, height, still) for c in cameras]
         draw = partial(forward, scene, k, np.eye(4), width, height, behind, threads)
-        on_cpu, expected = place.timed(draw), draw().view.rgb
-        for many in (1, 8):
-            cameras = [Pinhole(k, _shifted(0.1 * i), width, height) for i in range(many)]
-            engine = partial(rasterize_all if place.device == "cuda" else _on_cpu, scene, cameras, [behind] * many)
-            alone = partial(
-                _alone, place, on_device, [Eye(k, c.world_from_camera, width, height, still) for c in cameras]
-            )
-            score = psnr(engine()[0].rgb, expected)
-            well &= score > ALIKE_DB
+        on_cpu = place.timed(draw)
+        expected = [forward(scene, k, c.world_from_camera, width, height, behind, threads).view.rgb for c in cameras]
+        single = [view.rgb for c in cameras for view in place.engine(scene, [c], [behind], True)]
+        for many, at_once, packed in WAYS:
+            engine = partial(_by_engine, place, scene, cameras[:many], behind, at_once, packed)
+            alone = partial(_alone, place, on_device, eyes[:many], at_once, packed)
+            drawn = engine()
+            score = min(psnr(view.rgb, right) for view, right in zip(drawn, expected))
+            apart_by = max(float(np.abs(view.rgb - one).max()) for view, one in zip(drawn, single))
+            well &= score > ALIKE_DB and apart_by < ALIKE
             place.peak_mb()
             rates = f"{on_cpu:.1f} | {many * place.timed(engine):.1f} | {many * place.timed(alone):.1f}"
-            print(f"| {width}x{height} | {many} | {score:.1f} | {rates} | {place.peak_mb()} |", flush=True)
+            how = f"{at_once} | {'packed' if packed else 'dense'} | {score:.1f} | {apart_by:.1e}"
+            print(f"| {width}x{height} | {many} | {how} | {rates} | {place.peak_mb()} |", flush=True)
     return well
 
 
-def _alone(place: Place, scene: SceneTensors, eyes: Sequence[Eye]) -> None:
+def _by_engine(
+    place: Place,
+    scene: Gaussians,
+    cameras: Sequence[Pinhole],
+    behind: NDArray[np.float32],
+    at_once: int,
+    packed: bool,
+) -> list[View]:
+    drawn: list[View] = []
+    for i in range(0, len(cameras), at_once):
+        some = cameras[i : i + at_once]
+        drawn += place.engine(scene, some, [behind] * len(some), packed)
+    return drawn
+
+
+def _alone(place: Place, scene: SceneTensors, eyes: Sequence[Eye], at_once: int, packed: bool) -> None:
     with torch.inference_mode():
-        for eye in eyes:
-            place.plain(scene, eye)
-
-
-def _on_cpu(scene: Gaussians, cameras: Sequence[Pinhole], behind: Sequence[NDArray[np.float32]]) -> list[View]:
-    return [
-        forward(scene, c.intrinsics, c.world_from_camera, c.width, c.height, b).view for c, b in zip(cameras, behind)
-    ]
+        for i in range(0, len(eyes), at_once):
+            place.plain(scene, eyes[i : i + at_once], packed)
 
 
 def _shifted(x: float) -> NDArray[np.float64]:
@@ -266,6 +308,7 @@ def main(options: dict[str, str]) -> int:
         place, card = on_cuda(gsplat.rasterization), torch.cuda.get_device_properties(0)
         versions = f"torch {torch.__version__}, gsplat {gsplat.__version__}"
         print(f"{card.name}, {card.total_memory / 2**30:.0f} GB; {versions}")
+    place = replace(place, least_s=float(options.get("seconds", "2")))
     began = time.perf_counter()
     settings = FitSettings(iterations=iterations, most_gaussians=int(1.2 * n), refine_every=50, refine_from=50)
     well = parity(place)

@@ -52,8 +52,11 @@ def rasterization(
     packed: bool,
     render_mode: str,
 ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-    """`gsplat.rasterization` from its own parts, on the CPU and of any precision; the last entry for one camera."""
-    assert packed and render_mode == "RGB+ED"
+    """`gsplat.rasterization` from its own parts, on the CPU and of any precision; the last entry for one camera.
+
+    Camera after camera: whether they are `packed` is a matter of memory on a device.
+    """
+    assert render_mode == "RGB+ED"
     scene = (means, quats, scales, opacities, colors)
     how = (width, height, near_plane, eps2d, rasterize_mode == "antialiased", sh_degree)
     drawn, alpha, meta = zip(*(_seen_by(scene, viewmats[c : c + 1], Ks[c : c + 1], *how) for c in range(len(Ks))))

@@ -84,7 +84,7 @@ def advance(
 
 def backend_of(backend: Backend, threads: int) -> FitBackend:
     """Who draws for the fit. Raises BackendMissing where it cannot work on this machine."""
-    if backend is Backend.CPU:
+    if not backend.on_gpu:
         return OnCpu(threads)
     require()
     from tasks.render.fit.on_torch import OnTorch  # torch is loaded only where it is asked for

@@ -1,13 +1,14 @@
 """The one function that draws a scene: `render(asset, cameras, vehicles, backend) -> rgb, depth, alpha` per camera.
 
-Two backends with one face. `cpu` is the compiled tile rasteriser of this package: the same input gives the same bytes.
-`gsplat` draws the same Gaussians with CUDA, equal up to the last bits of 8-bit colours. Both draw ideal pinholes: a
-camera's distortion is taken out of its photos before they enter a scene (`views.undistorted`), so that images at new
-poses need none.
+Backends with one face. `cpu` is the compiled tile rasteriser of this package: the same input gives the same bytes.
+`gsplat` draws the same Gaussians with CUDA, equal up to the last bits of 8-bit colours, all cameras of a size in one
+call (`gsplat_dense` without packing what they see). All draw ideal pinholes: a camera's distortion is taken out of its
+photos before they enter a scene (`views.undistorted`), so that images at new poses need none.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from types import MappingProxyType
 
 import numpy as np
@@ -73,7 +74,7 @@ def render(
 
 def check(backend: Backend) -> None:
     """Raises BackendMissing where the backend cannot work on this machine, with how to fix it."""
-    if backend is Backend.GSPLAT:
+    if backend.on_gpu:
         from tasks.render.splatting.gsplat_backend import require
 
         require()
@@ -94,11 +95,18 @@ def _on_cpu(
 
 
 def _with_gsplat(
-    scene: Gaussians, cameras: Sequence[Pinhole], backdrops: Sequence[F32], threads: int, screen: ScreenFilter
+    scene: Gaussians,
+    cameras: Sequence[Pinhole],
+    backdrops: Sequence[F32],
+    threads: int,
+    screen: ScreenFilter,
+    packed: bool = True,
 ) -> list[View]:
     from tasks.render.splatting.gsplat_backend import rasterize_all  # torch is loaded only where it is asked for
 
-    return rasterize_all(scene, cameras, backdrops, screen)
+    return rasterize_all(scene, cameras, backdrops, screen, packed)
 
 
-RASTERISERS: Mapping[Backend, Rasteriser] = MappingProxyType({Backend.CPU: _on_cpu, Backend.GSPLAT: _with_gsplat})
+RASTERISERS: Mapping[Backend, Rasteriser] = MappingProxyType(
+    {Backend.CPU: _on_cpu, Backend.GSPLAT: _with_gsplat, Backend.GSPLAT_DENSE: partial(_with_gsplat, packed=False)}
+)

@@ -23,7 +23,9 @@ class SkyMap:
     rgb: F32  # (ROWS, COLUMNS, 3) in [0, 1], world directions
 
     def seen_by(self, intrinsics: Array, world_from_camera: Array, width: int, height: int, threads: int = 1) -> F32:
-        """The backdrop (H, W, 3) of a camera."""
+        """The backdrop (H, W, 3) of a camera. Raises ValueError for a map of another size, which a file may hold."""
+        if self.rgb.shape != (ROWS, COLUMNS, 3):
+            raise ValueError(f"sky: {self.rgb.shape}, expected ({ROWS}, {COLUMNS}, 3)")
         where = sky_cells(intrinsics, world_from_camera, width, height, threads)
         cells = np.require(self.rgb, np.float32, ["C", "W"])  # kernels compile once more for read-only arrays
         return backdrop(cells.reshape(-1, 3), where, threads)

@@ -15,14 +15,14 @@ are their mean; coefficients of a vehicle, there of directions in the world, are
 has in the middle of its log. Bending bodies need their network and are left out by name.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from tasks.render.splatting import sh
-from tasks.render.splatting.gaussians import Gaussians, concatenate, rotations_of
+from tasks.render.splatting.gaussians import Gaussians, concatenate, quats_of, rotations_of
 from tasks.render.splatting.ply import LEAST, MOST
 from tasks.render.splatting.project import ANTIALIASED, ScreenFilter
 from tasks.world.arrays import F32, Array
@@ -30,6 +30,7 @@ from tasks.world.arrays import F32, Array
 PARAMETERS = ("means", "scales", "quats", "features_dc", "features_rest", "opacities")
 BACKGROUND, SKY, RIGID, BENDING = "background", "skybox", "rigid_object_", "deformable_node_"
 OUT_OF_LOG_M = 1000.0  # height above which a pose says that the vehicle is not there (mtgs.py)
+ABSENT_M = 100_000.0  # the height that is written for one
 MIRRORED = "MirroredRigidSubModel"
 # Coefficients beyond the constant one that change their sign in a mirror of y (rigid_object_mirrored.py: m < 0).
 MIRROR_SH = np.array([-1, 1, 1, -1, -1, 1, 1, 1, -1, -1, -1, 1, 1, 1, 1], np.float32)
@@ -47,6 +48,16 @@ class SplatCheckpoint:
     origin: Array | None = None  # (3,) [m] of the scene's zero in the world, where the file says it
     left_out: tuple[str, ...] = ()  # parts
     screen: ScreenFilter | None = None  # what it was made to be drawn through, where the file says it
+
+
+@dataclass(frozen=True)
+class LoggedVehicle:
+    """A vehicle, and where the log had it."""
+
+    token: str  # without an underscore, at which WorldEngine cuts names
+    gaussians: Gaussians  # in its box's frame
+    times_s: Array  # (F,) since the log's first instant
+    scene_from_box: Array  # (F, 4, 4) [m]; NaN where it is not there
 
 
 @dataclass(frozen=True)
@@ -91,15 +102,35 @@ def splatfacto(gaussians: Gaussians) -> dict[str, Any]:
     return {"step": 0, "pipeline": {f"_model.gauss_params.{name}": a for name, a in parameters_of(gaussians).items()}}
 
 
-def worldengine(background: Gaussians, origin: Array) -> dict[str, Any]:
-    """A street as WorldEngine reads it, `origin` (3,) [m] in the world."""
-    config = {
-        "type": "VanillaGaussianSplattingModel",
-        "sh_degree": sh.COUNTS.index(background.sh_rest.shape[1]),
-        "scale_dim": 3,
-        "recon2world_translation": [float(value) for value in origin],
-    }
-    return {BACKGROUND: {"config": config, "state_dict": gauss_params(background)}}
+def worldengine(background: Gaussians, origin: Array, vehicles: Sequence[LoggedVehicle] = ()) -> dict[str, Any]:
+    """A street as WorldEngine reads it, `origin` (3,) [m] in the world, with its vehicles.
+
+    Raises ValueError for a vehicle that is nowhere in the log.
+    """
+    config = _config("VanillaGaussianSplattingModel", background)
+    config["recon2world_translation"] = [float(value) for value in origin]
+    street = {BACKGROUND: {"config": config, "state_dict": gauss_params(background)}}
+    return street | {f"{RIGID}{vehicle.token}": _logged(vehicle) for vehicle in vehicles}
+
+
+def _config(kind: str, gaussians: Gaussians) -> dict[str, Any]:
+    return {"type": kind, "sh_degree": sh.COUNTS.index(gaussians.sh_rest.shape[1]), "scale_dim": 3}
+
+
+def _logged(vehicle: LoggedVehicle) -> dict[str, Any]:
+    """A vehicle's part, as `_node` takes it back; stamps are microseconds (rigid_object.py)."""
+    rotations, places = vehicle.scene_from_box[:, :3, :3], vehicle.scene_from_box[:, :3, 3]
+    there = np.flatnonzero(np.isfinite(places).all(axis=1))
+    if not len(there) or len(places) < 2:  # of one pose WorldEngine takes it for a thing that never moves
+        raise ValueError(f"{vehicle.token}: it takes two instants, and a place at one of them, to write a vehicle")
+    middle = rotations[there[len(there) // 2]]
+    gaussians = replace(vehicle.gaussians, sh_rest=sh.turned(vehicle.gaussians.sh_rest, middle))
+    poses = np.tile([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, ABSENT_M], (len(places), 1))
+    poses[there] = np.concatenate([quats_of(rotations[there]), places[there]], axis=1)
+    config = _config("RigidSubModel", gaussians)
+    config["log_timestamps"] = np.rint(1e6 * vehicle.times_s).astype(np.int64)
+    logged = {"instance_quats": poses[:, :4].astype(np.float32), "instance_trans": poses[:, 4:].astype(np.float32)}
+    return {"config": config, "state_dict": gauss_params(gaussians) | logged}
 
 
 def gauss_params(gaussians: Gaussians) -> dict[str, F32]:

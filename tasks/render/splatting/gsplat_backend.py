@@ -45,7 +45,9 @@ def require() -> tuple[Any, Any]:
     return torch, gsplat
 
 
-def arguments(scene: Gaussians, cameras: Sequence[Pinhole], screen: ScreenFilter = FITTED) -> dict[str, Any]:
+def arguments(
+    scene: Gaussians, cameras: Sequence[Pinhole], screen: ScreenFilter = FITTED, packed: bool = True
+) -> dict[str, Any]:
     """What `gsplat.rasterization` is called with: arrays float32 by its names, and plain settings.
 
     means (N, 3), quats (N, 4), scales (N, 3), opacities (N,), colors (N, 3) or, with sh_degree, coefficients (N, K, 3),
@@ -66,10 +68,12 @@ def arguments(scene: Gaussians, cameras: Sequence[Pinhole], screen: ScreenFilter
         "Ks": np.stack([camera.intrinsics for camera in cameras]),
     }
     arrays = {name: np.ascontiguousarray(array, np.float32) for name, array in arrays.items()}
-    return arrays | plain_arguments(cameras[0].width, cameras[0].height, count, screen)
+    return arrays | plain_arguments(cameras[0].width, cameras[0].height, count, screen, packed)
 
 
-def plain_arguments(width: int, height: int, count: int, screen: ScreenFilter = FITTED) -> dict[str, Any]:
+def plain_arguments(
+    width: int, height: int, count: int, screen: ScreenFilter = FITTED, packed: bool = True
+) -> dict[str, Any]:
     """The arguments that are no arrays; `count` of the coefficients beyond degree 0."""
     return {
         "width": width,
@@ -79,7 +83,7 @@ def plain_arguments(width: int, height: int, count: int, screen: ScreenFilter = 
         "rasterize_mode": "antialiased" if screen.keeps_light else "classic",
         "sh_degree": sh.COUNTS.index(count) or None,
         "render_mode": "RGB+ED",  # the last channel is the depth, a mean by weight
-        "packed": True,  # memory follows what is seen, not cameras x Gaussians
+        "packed": packed,  # memory follows what is seen, not cameras x Gaussians
     }
 
 
@@ -91,7 +95,11 @@ def view_of(colours_and_depth: F32, alpha: F32, backdrop: F32) -> View:
 
 
 def rasterize_all(
-    scene: Gaussians, cameras: Sequence[Pinhole], backdrops: Sequence[F32], screen: ScreenFilter = FITTED
+    scene: Gaussians,
+    cameras: Sequence[Pinhole],
+    backdrops: Sequence[F32],
+    screen: ScreenFilter = FITTED,
+    packed: bool = True,
 ) -> list[View]:
     """What `tasks.render.scene.engine.render` draws with on CUDA: one view a camera. Raises BackendMissing."""
     torch, gsplat = require()
@@ -102,7 +110,7 @@ def rasterize_all(
             drawn, covered, _ = gsplat.rasterization(**on_device)
         return drawn.cpu().numpy(), covered.cpu().numpy()
 
-    return drawn_by(draw, scene, cameras, backdrops, screen)
+    return drawn_by(draw, scene, cameras, backdrops, screen, packed)
 
 
 def drawn_by(
@@ -111,6 +119,7 @@ def drawn_by(
     cameras: Sequence[Pinhole],
     backdrops: Sequence[F32],
     screen: ScreenFilter = FITTED,
+    packed: bool = True,
 ) -> list[View]:
     """One view a camera, all of a size at once; `draw` takes `arguments` and gives (C, H, W, 4) and (C, H, W, 1)."""
     by_size: dict[tuple[int, int], list[int]] = defaultdict(list)
@@ -121,7 +130,7 @@ def drawn_by(
         pictures = np.zeros((len(rows), height, width, 4), np.float32)
         alphas = np.zeros((len(rows), height, width, 1), np.float32)
         if len(scene):
-            pictures, alphas = draw(arguments(scene, [cameras[i] for i in rows], screen))
+            pictures, alphas = draw(arguments(scene, [cameras[i] for i in rows], screen, packed))
         for i, picture, alpha in zip(rows, pictures, alphas):
             views[i] = view_of(picture.astype(np.float32), alpha.astype(np.float32), backdrops[i])
     return [views[i] for i in range(len(cameras))]

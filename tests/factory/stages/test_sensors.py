@@ -178,6 +178,7 @@ def test_a_scene_fitted_by_another_backend_is_kept_apart(
     on_gpu = replace(fit, backend=Backend.GSPLAT)
     assert block_id(clip, on_gpu) != block_id(clip, fit)
     assert block_id(clip, replace(SETTINGS, backend=Backend.GSPLAT)) == block_id(clip, SETTINGS)
+    assert block_id(clip, replace(fit, backend=Backend.GSPLAT_DENSE)) == block_id(clip, on_gpu)  # the same fit
     monkeypatch.setitem(sys.modules, "gsplat", None)
     with pytest.raises(BackendMissing, match="needs torch and gsplat"):
         asset_for(clip, on_gpu, tmp_path)

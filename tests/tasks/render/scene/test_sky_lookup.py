@@ -43,3 +43,8 @@ def test_a_sky_that_nobody_may_write_to_is_seen_all_the_same() -> None:
     seen = SkyMap(rgb).seen_by(K, np.eye(4), *SIZE)
     rgb.setflags(write=False)
     np.testing.assert_array_equal(SkyMap(rgb).seen_by(K, np.eye(4), *SIZE), seen)
+
+
+def test_a_map_of_another_size_is_refused() -> None:
+    with pytest.raises(ValueError, match=rf"sky: \(8, 16, 3\), expected \({ROWS}, {COLUMNS}, 3\)"):
+        SkyMap(np.zeros((8, 16, 3), np.float32)).seen_by(K, np.eye(4), *SIZE)

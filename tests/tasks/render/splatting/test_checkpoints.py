@@ -1,14 +1,16 @@
 """Checkpoints of splatfacto, MTGS and WorldEngine: every part where it belongs, in the frame that it belongs to."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from tasks.render.splatting import sh
-from tasks.render.splatting.checkpoints import from_checkpoint, gauss_params, splatfacto, worldengine
+from tasks.render.splatting.checkpoints import LoggedVehicle, from_checkpoint, gauss_params, splatfacto, worldengine
 from tasks.render.splatting.gaussians import Gaussians, moved, rotations_of
 from tasks.render.splatting.project import ANTIALIASED
+from tasks.world.frames import upright
 from tests.tasks.render.splatting.test_ply import some
 from tests.tasks.render.splatting.test_spz import apart
 
@@ -89,6 +91,59 @@ def test_the_light_of_a_vehicle_is_that_of_its_place_in_the_middle_of_the_log() 
     for towards in np.eye(3):
         np.testing.assert_allclose(light(placed, towards), light(stored, towards), atol=1e-6)
     np.testing.assert_allclose(placed.means, stored.means @ pose[:3, :3].T + pose[:3, 3], atol=1e-4)
+
+
+def logged(token: str, node: Gaussians) -> LoggedVehicle:
+    """Five instants at 10 Hz from 2 s of the log on; absent at the first and the last, turning left on the way."""
+    turns = np.array([0.0, 0.2, 0.5, 0.9, 0.0])
+    poses = upright(np.column_stack([10.0 * np.arange(5.0), -np.arange(5.0), turns]))
+    poses[:, 2, 3] = 0.8
+    poses[[0, 4]] = np.nan
+    return LoggedVehicle(token, node, 2.0 + 0.1 * np.arange(5), poses)
+
+
+@pytest.mark.parametrize("count", sh.COUNTS)
+def test_vehicles_go_out_with_their_poses_and_come_back(count: int) -> None:
+    street, cars = some(10, count, 1), {"7f": some(6, count, 2), "a-8": some(4, 0, 3)}
+    content = worldengine(street, np.zeros(3), [logged(token, car) for token, car in cars.items()])
+    found = from_checkpoint(content)
+    assert list(found.nodes) == list(cars) and found.screen == ANTIALIASED
+    for token, car in cars.items():
+        assert max(apart(car, found.nodes[token]).values()) < 2e-6
+
+
+def test_a_vehicle_s_part_has_what_worldengine_s_loader_asks_for() -> None:
+    """render/mtgs/gaussian_model/rigid_object.py and vanilla_gaussian_splatting.py of a14fd10: of `config` these names,
+    of `state_dict` each parameter under gauss_params., instance_trans and instance_quats, a row for each stamp [us];
+    mtgs.py cuts the part's name at its last underscore and takes poses above 1 km for absent."""
+    vehicle = logged("7f", some(6, 3))
+    parts = worldengine(some(3, 3), np.zeros(3), [vehicle])
+    assert list(parts) == ["background", "rigid_object_7f"]
+    config, state = parts["rigid_object_7f"]["config"], parts["rigid_object_7f"]["state_dict"]
+    assert (config["type"], config["sh_degree"], config["scale_dim"]) == ("RigidSubModel", 1, 3)
+    assert "fourier_features_dim" not in config  # colours are no waves
+    assert config["log_timestamps"].tolist() == [2_000_000, 2_100_000, 2_200_000, 2_300_000, 2_400_000]
+    assert set(state) == {f"gauss_params.{name}" for name in NAMES} | {"instance_quats", "instance_trans"}
+    quats, places = state["instance_quats"], state["instance_trans"]
+    assert quats.shape == (5, 4) and places.shape == (5, 3) and quats.dtype == places.dtype == np.float32
+    assert (places[:, 2] < 1000.0).tolist() == [False, True, True, True, False]
+    np.testing.assert_allclose(np.linalg.norm(quats, axis=1), 1.0, atol=1e-6)
+    for k in (1, 2, 3):  # get_means: local @ rotation.T + place
+        pose = vehicle.scene_from_box[k]
+        placed = state["gauss_params.means"] @ rotations_of(quats[k][None])[0].T + places[k]
+        np.testing.assert_allclose(placed, moved(vehicle.gaussians, pose).means, atol=1e-4)
+    middle = moved(vehicle.gaussians, vehicle.scene_from_box[2])  # there its coefficients are of the world's directions
+    np.testing.assert_allclose(state["gauss_params.features_rest"], middle.sh_rest, atol=1e-6)
+
+
+def test_a_vehicle_that_is_nowhere_is_named() -> None:
+    vehicle = logged("7f", some(3, 0))
+    for bad in (
+        replace(vehicle, scene_from_box=np.full((5, 4, 4), np.nan)),
+        replace(vehicle, times_s=np.array([2.0]), scene_from_box=vehicle.scene_from_box[1:2]),
+    ):
+        with pytest.raises(ValueError, match="7f: it takes two instants"):
+            worldengine(some(3, 0), np.zeros(3), [bad])
 
 
 def test_half_a_vehicle_is_mirrored_about_its_length() -> None:

@@ -8,14 +8,17 @@ import numpy as np
 import pytest
 import street
 
+from tasks.render.gate import unfit
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.engine import Backend, check, render, vehicles_at
-from tasks.render.splatting import sh
+from tasks.render.settings import GateSettings
+from tasks.render.splatting import gsplat_backend, sh
 from tasks.render.splatting.gaussians import EMPTY, Gaussians
 from tasks.render.splatting.gsplat_backend import BackendMissing, arguments, drawn_by, require, view_of
 from tasks.render.splatting.project import CLASSIC, FITTED, NEAR_M
-from tasks.render.splatting.raster import forward
-from tasks.world.camera import Pinhole
+from tasks.render.splatting.raster import View, forward
+from tasks.render.views import render_views
+from tasks.world.camera import Camera, Pinhole
 from tests.bench import peer_gsplat
 
 POSE = street.ego_pose(3.0, 0.4) @ street.EGO_FROM_CAMERA
@@ -74,6 +77,55 @@ def test_its_colours_stand_before_the_sky_and_its_depth_only_where_something_is(
     np.testing.assert_array_equal(view.alpha, alpha[..., 0])
 
 
+def test_cameras_of_one_size_are_one_call_and_every_view_is_where_its_camera_was() -> None:
+    """What is drawn is told by the camera's place; three sizes between each other, packed or not as asked."""
+    scene, calls = cloud(20, 0), []
+
+    def draw(given: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+        calls.append((len(given["viewmats"]), given["width"], given["packed"]))
+        x = np.linalg.inv(given["viewmats"])[:, 0, 3]
+        shape = (len(x), given["height"], given["width"])
+        return np.broadcast_to(x[:, None, None, None], (*shape, 4)), np.ones((*shape, 1), np.float32)
+
+    sizes, places = [(8, 6), (4, 3), (8, 6), (5, 3), (4, 3), (8, 6)], np.arange(6.0)
+    cameras = []
+    for (width, height), x in zip(sizes, places):
+        pose = np.eye(4)
+        pose[0, 3] = x
+        cameras.append(Pinhole(street.INTRINSICS, pose, width, height))
+    sky = [np.zeros((c.height, c.width, 3), np.float32) for c in cameras]
+    for packed in (True, False):
+        calls.clear()
+        views = drawn_by(draw, scene, cameras, sky, packed=packed)
+        assert calls == [(3, 8, packed), (2, 4, packed), (1, 5, packed)]
+        assert [view.rgb.shape[:2] for view in views] == [(height, width) for width, height in sizes]
+        np.testing.assert_allclose([view.rgb.mean() for view in views], places, atol=1e-6)
+
+
+def test_the_rig_s_views_of_an_instant_are_asked_for_at_once(
+    monkeypatch: pytest.MonkeyPatch, street_asset: RenderAsset
+) -> None:
+    """By pictures of a sample and by the gate; with gsplat_dense each is told not to pack."""
+    asked: list[tuple[int, bool]] = []
+
+    def counted(scene: Gaussians, cameras: Any, backdrops: Any, screen: Any, packed: bool = True) -> list[View]:
+        asked.append((len(cameras), packed))
+        seen = [(c.intrinsics, c.world_from_camera, c.width, c.height, b) for c, b in zip(cameras, backdrops)]
+        return [forward(scene, *one, 1, screen).view for one in seen]
+
+    monkeypatch.setattr(gsplat_backend, "rasterize_all", counted)
+    rig = [Camera(n, street.WIDTH, street.HEIGHT, street.INTRINSICS, np.zeros(5), street.EGO_FROM_CAMERA) for n in "ab"]
+    poses, size = np.stack([street.ego_pose(1.5, 0.6), street.ego_pose(2.5, 0.6)]), (64, 36)
+    for backend, packed in ((Backend.GSPLAT, True), (Backend.GSPLAT_DENSE, False)):
+        asked.clear()
+        pictures = render_views(street_asset, rig, poses, street.tracks(), [4, 9], *size, backend)
+        assert asked == [(2, packed), (2, packed)]
+        np.testing.assert_array_equal(pictures, render_views(street_asset, rig, poses, street.tracks(), [4, 9], *size))
+        asked.clear()
+        unfit(street_asset, rig, poses[:1], street.tracks(), [4], size, GateSettings(), backend)
+        assert asked[0] == (2, packed)
+
+
 @pytest.mark.parametrize("name", ["torch", "gsplat"])
 def test_an_absent_package_is_named_with_how_to_get_it(
     monkeypatch: pytest.MonkeyPatch, name: str, street_asset: RenderAsset
@@ -82,6 +134,8 @@ def test_an_absent_package_is_named_with_how_to_get_it(
         monkeypatch.setitem(sys.modules, module, None if module == name else sys)
     with pytest.raises(BackendMissing, match=rf"needs torch and gsplat \(import of {name} .*\[gpu\]"):
         render(street_asset, [FRONT], backend=Backend.GSPLAT)
+    with pytest.raises(BackendMissing, match="needs torch and gsplat"):
+        check(Backend.GSPLAT_DENSE)
 
 
 def test_the_cpu_needs_nothing_and_a_machine_without_gpu_is_told_so() -> None:
@@ -95,7 +149,7 @@ def test_the_cpu_needs_nothing_and_a_machine_without_gpu_is_told_so() -> None:
 
 
 def test_gsplat_s_reference_draws_the_cpu_s_image(street_asset: RenderAsset) -> None:
-    """All cameras at once, of two sizes; vehicles, a sky, colours below zero."""
+    """All cameras at once, of two sizes, packed and not; vehicles, a sky, colours below zero."""
     pytest.importorskip("gsplat", reason="gsplat is not installed")
     import torch
 
@@ -110,8 +164,9 @@ def test_gsplat_s_reference_draws_the_cpu_s_image(street_asset: RenderAsset) -> 
     sky = [np.random.default_rng(1).random((c.height, c.width, 3)).astype(np.float32) for c in cameras]
     dark = cloud(300, 0)
     dark = replace(dark, colours=dark.colours - 0.4)
-    for scene in (street_asset.background.take(slice(0, 1500)), dark, cloud(300, 8), EMPTY):
-        for view, camera, behind in zip(drawn_by(draw, scene, cameras, sky), cameras, sky):
+    scenes = (street_asset.background.take(slice(0, 1500)), dark, cloud(300, 8), EMPTY)
+    for packed, scene in zip((True, False, True, False), scenes):
+        for view, camera, behind in zip(drawn_by(draw, scene, cameras, sky, packed=packed), cameras, sky):
             size = (camera.width, camera.height)
             expected = forward(scene, camera.intrinsics, camera.world_from_camera, *size, behind).view
             np.testing.assert_allclose(view.rgb, expected.rgb, atol=2e-3)  # the light that a tile drops
@@ -127,8 +182,10 @@ def test_the_gpu_draws_the_cpu_s_image(street_asset: RenderAsset) -> None:
         pytest.skip(str(error))
     there = vehicles_at(street.tracks(), 0.8)
     for asset in (street_asset, replace(street_asset, background=cloud(3000, 15))):
-        slow, fast = (render(asset, [FRONT], there, backend)[0] for backend in (Backend.CPU, Backend.GSPLAT))
-        assert np.abs(slow.rgb - fast.rgb).max() <= 2.0 / 255.0
-        np.testing.assert_allclose(fast.alpha, slow.alpha, atol=2.0 / 255.0)
-        solid = slow.alpha > 0.5
-        np.testing.assert_allclose(fast.depth[solid], slow.depth[solid], rtol=0.01)
+        (slow,) = render(asset, [FRONT], there)
+        for backend in (Backend.GSPLAT, Backend.GSPLAT_DENSE):
+            for fast in render(asset, [FRONT, FRONT], there, backend):
+                assert np.abs(slow.rgb - fast.rgb).max() <= 2.0 / 255.0
+                np.testing.assert_allclose(fast.alpha, slow.alpha, atol=2.0 / 255.0)
+                solid = slow.alpha > 0.5
+                np.testing.assert_allclose(fast.depth[solid], slow.depth[solid], rtol=0.01)

@@ -53,10 +53,10 @@ def test_what_is_recorded_is_what_the_installed_gsplat_says(name: str) -> None:
     assert max(apart(found, expected).values()) < 1e-6
 
 
-def given(count: int) -> tuple[Arrays, Arrays]:
+def given(count: int, packed: bool = True) -> tuple[Arrays, Arrays]:
     """What the drawing and what the fit call gsplat with, of one scene and camera."""
     scene, intrinsics = SCENES["degree 3" if count else "colours below zero"]
-    drawing = arguments(scene, [Pinhole(np.array(intrinsics), pose(), WIDTH, HEIGHT)])
+    drawing = arguments(scene, [Pinhole(np.array(intrinsics), pose(), WIDTH, HEIGHT)], packed=packed)
     logits = torch.logit(torch.tensor(scene.opacities))
     tensors = (scene.means, scene.quats, scene.log_scales, logits, scene.colours, scene.sh_rest)
     eye = Eye(np.array(CENTRED), pose(), WIDTH, HEIGHT, torch.zeros(6))
@@ -77,9 +77,13 @@ def test_every_argument_is_one_of_gsplat_s_and_what_is_not_said_has_a_default() 
     with np.load(RECORDED) as file:
         recorded, version = file["signature"].tolist(), str(file["version"])
     names, needed = [each.partition("=")[0] for each in recorded], [each for each in recorded if "=" not in each]
+    assert "packed=True" in recorded  # what it does where nothing is said, and we do
     for count in (0, 15):
-        for called in given(count):
-            assert set(needed) <= set(called) <= set(names)
+        for packed in (True, False):
+            drawing, fitting = given(count, packed)
+            assert drawing["packed"] is packed and fitting["packed"] is True  # the fit asks which rows are in view
+            for called in (drawing, fitting):
+                assert set(needed) <= set(called) <= set(names)
     (wanted,) = (r for r in map(Requirement, PROJECT["optional-dependencies"]["gpu"]) if r.name == "gsplat")
     assert wanted.specifier.contains(version)
     assert not wanted.specifier.contains("1.6.0"), "its main branch caps opacities at 0.99"
@@ -89,5 +93,6 @@ def test_the_installed_gsplat_has_the_recorded_signature() -> None:
     gsplat = pytest.importorskip("gsplat", reason="gsplat is not installed")
     with np.load(RECORDED) as file:
         assert file["signature"].tolist() == signature(gsplat.rasterization)
-    for called in given(15):
-        inspect.signature(gsplat.rasterization).bind(**called)
+    for packed in (True, False):
+        for called in given(15, packed):
+            inspect.signature(gsplat.rasterization).bind(**called)

@@ -1,0 +1,133 @@
+"""`scene export format=ckpt out=RUN`: a block with its vehicles, where the log had them, as WorldEngine reads it."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from factory.commands.table import COMMANDS
+from factory.graph.steps import cache_key
+from factory.graph.work import PreparedClip
+from factory.readers.base import ClipRef
+from factory.stages.pipeline import PerturbedClip, bare
+from factory.stages.scene_file import read_scene, write_scene
+from factory.store.candidates import ClipCandidates
+from factory.store.samples import Store
+from factory.views.scene_tracks import logged_vehicles
+from tasks.render.scene.asset import BlockRange, RenderAsset, TakenFrom
+from tasks.render.scene.engine import Vehicles, render, vehicles_at
+from tasks.render.scene.movers import boxes_at, world_from_boxes
+from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
+from tasks.render.splatting.project import ANTIALIASED
+from tasks.world.camera import Pinhole
+from tasks.world.clip import CLIP_STEPS, Clip
+from tests.tasks.render.splatting.test_ply import some
+from tests.tasks.streets import street_clip
+
+torch = pytest.importorskip("torch", reason="checkpoints take PyTorch")
+main = COMMANDS["scene"].load()
+ORIGIN = np.array([20.0, -5.0, 0.5])
+K = np.array([[60.0, 0.0, 48.0], [0.0, 60.0, 32.0], [0.0, 0.0, 1.0]])
+
+
+def clips() -> list[Clip]:
+    """Two of one log, the second 3 s later, and one of another log."""
+    clip = replace(street_clip(), start_s=10.0)
+    later = replace(clip, clip_id="later", start_s=13.0, agents=replace(clip.agents, boxes=clip.agents.boxes + 0.25))
+    return [clip, later, replace(clip, clip_id="elsewhere", log_id="another")]
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Store:
+    """What a run has kept of the clips: its table of candidates and the prepared clips, without any sensor file."""
+    store, rows = Store(tmp_path / "run"), []
+    for clip in clips():
+        rows.append(ClipCandidates(clip.clip_id, clip.dataset, clip.log_id, "c", "p", "v", {}, ()))
+        payload = PerturbedClip(ClipRef(clip.dataset, clip.log_id, 0), bare(clip), ())
+        store.cache.store(cache_key(clip.clip_id, "p"), PreparedClip(clip.clip_id, "c", (), {}, payload))
+    store.claim()
+    store.commit(rows, [], [])
+    return store
+
+
+@pytest.fixture
+def block(tmp_path: Path) -> Path:
+    """A scene of the first clip's block with two of its tracks and one that no clip shows."""
+    clip = clips()[0]
+    rng = np.random.default_rng(0)
+    nodes = {name: some(60, 3, k) for k, name in enumerate(clip.agents.track_ids[:2])} | {"never seen": some(4, 0, 9)}
+    for name, node in nodes.items():
+        nodes[name] = replace(node, means=(node.means * 0.3).astype(np.float32), log_scales=node.log_scales * 0 - 1.5)
+    asset = RenderAsset(
+        ORIGIN, some(40, 3, 7), nodes, SkyMap(rng.uniform(0, 1, (ROWS, COLUMNS, 3)).astype(np.float32)), 27.0,
+        block=BlockRange(clip.dataset, clip.log_id, 10.0, 24.0, np.zeros(2), np.ones(2)), screen=ANTIALIASED,
+    )  # fmt: skip
+    write_scene(tmp_path / "block.safetensors", asset)
+    return tmp_path / "block.safetensors"
+
+
+def beside(there: Vehicles, j: int) -> Pinhole:
+    """A camera 8 m beside a box, which looks at it."""
+    pose = np.eye(4)
+    pose[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]  # along the world's y
+    pose[:3, 3] = there.boxes[j, :3] + [0.0, -8.0, 0.3]
+    return Pinhole(K, pose, 96, 64)
+
+
+def test_a_block_goes_out_with_its_vehicles_and_its_pictures_come_back(
+    run: Store, block: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, back = tmp_path / "out", tmp_path / "back.safetensors"
+    asked = ["export", str(block), f"to={out}", "format=ckpt", f"out={run.location.uri}"]
+    assert main(asked) == 0
+    assert "left out    never seen: no clip of the run shows them here" in capsys.readouterr().out
+    assert main(["import", str(out / "background.ckpt"), f"to={back}", f"like={block}"]) == 0
+    whole, found = read_scene(block), read_scene(back)
+    assert len(found.nodes) == 2 and found.origin.tolist() == ORIGIN.tolist() and found.screen == ANTIALIASED
+    renamed = dict(zip(found.nodes, whole.nodes))
+    as_found = replace(found, nodes={renamed[token]: node for token, node in found.nodes.items()})
+    there = vehicles_at(clips()[0].agents, 4.0)
+    for name in renamed.values():
+        eye = beside(there, there.track_ids.index(name))
+        first, second = (render(asset, [eye], there)[0].rgb for asset in (whole, as_found))
+        nobody = render(whole, [eye])[0].rgb
+        np.testing.assert_allclose(second, first, atol=1e-5)
+        assert np.abs(first - nobody).max() > 0.1  # the vehicle is in the picture
+
+
+def test_poses_are_the_log_s_in_the_scene_s_frame_on_its_road_and_of_all_its_clips(run: Store, block: Path) -> None:
+    asset = replace(read_scene(block), taken=(TakenFrom("front", 0.0, np.eye(4), 0.4),))  # the road lies 0.4 m higher
+    vehicles, unseen = logged_vehicles(run, asset)
+    assert unseen == ["never seen"] and len(vehicles) == 2
+    first, later, _ = clips()
+    for j, vehicle in enumerate(vehicles):
+        assert len(vehicle.times_s) == CLIP_STEPS + 30 and np.diff(vehicle.times_s) == pytest.approx(0.1)
+        assert vehicle.times_s[0] == pytest.approx(10.0)
+        for row, clip, time_s in ((10, first, 1.0), (CLIP_STEPS + 20, later, 8.6)):
+            boxes, valid = boxes_at(clip.agents, time_s)
+            assert valid[j]
+            expected = world_from_boxes(boxes)[j]
+            expected[:3, 3] += [0.0, 0.0, 0.4] - ORIGIN
+            np.testing.assert_allclose(vehicle.scene_from_box[row], expected, atol=1e-9)
+
+
+def test_a_stretch_that_no_clip_of_the_run_lies_in_is_named(
+    run: Store, block: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asset = read_scene(block)
+    assert asset.block is not None
+    asked = [f"to={tmp_path / 'out'}", "format=ckpt", f"out={run.location.uri}"]
+    for block_range, said in (
+        (replace(asset.block, start_s=50.0, end_s=70.0), "no prepared clip of log"),
+        (None, "does not say which log it is of"),
+    ):
+        write_scene(tmp_path / "other.safetensors", replace(asset, block=block_range))
+        assert main(["export", str(tmp_path / "other.safetensors"), *asked]) == 2
+        assert said in capsys.readouterr().err
+    assert main(["export", str(block), f"to={tmp_path / 'out'}", f"out={run.location.uri}"]) == 2
+    assert "out= brings vehicles' poses into a checkpoint: format=ckpt" in capsys.readouterr().err
+    damaged = next(Path(run.cache.location.uri).glob(f"{clips()[0].clip_id}-*"))
+    damaged.write_bytes(damaged.read_bytes()[:-9])
+    assert main(["export", str(block), *asked]) == 2
+    assert f"{damaged.name}: " in capsys.readouterr().err
