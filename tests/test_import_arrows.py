@@ -41,7 +41,8 @@ ROOMS = {
         *("run", "commands", "__main__"),
     ),
     "planners": (
-        *("command", "data", "models", "training", "published", "evaluation", "drive", "navsim", "study", "__main__"),
+        *("command", "data", "models", "training", "published", "evaluation", "drive", "traffic", "navsim", "study"),
+        "__main__",
     ),
 }
 MOST_MODULES = 20  # in a room

@@ -32,6 +32,7 @@ from tasks.render.settings import REMOVED, RenderMode
 from tasks.render.splatting.gsplat_backend import BackendMissing
 from tasks.reward.labels import Labelling
 from tasks.rollout import settings as traffic
+from tasks.rollout.learned.policy import told
 from tasks.stages import FRAMES, stage_versions
 from tasks.world.kinematic_vocabulary import kinematic_trajectories
 from tasks.world.vocabulary import Vocabulary
@@ -115,6 +116,8 @@ def assemble(config: RunConfig) -> Run:
     try:  # what takes no clips comes first
         vocabulary = choose_vocabulary(config.vocabulary)
         labelling = choose_labelling(config, vocabulary)
+        for chosen in (config.traffic, *(() if labelling is None else (labelling.traffic,))):
+            told(chosen)  # of a policy: whether there is one
         experts = {
             name: build_expert(RunContext(config, name, opened)) for name in config.experts if name not in FRAMES
         }
@@ -224,7 +227,6 @@ def identity_of(config: RunConfig, vocabulary: Vocabulary, labelling: Labelling 
     """What the rows depend on besides clip, candidate and expert. Where data lies and who works on it is not in it."""
     science: dict[str, Any] = {
         "perturb": config.perturb,
-        "traffic": config.traffic,
         "pdm": config.pdm,
         "reward": config.reward,
         "render": config.render,
@@ -232,12 +234,15 @@ def identity_of(config: RunConfig, vocabulary: Vocabulary, labelling: Labelling 
     settings: dict[str, object] = {"seed": config.seed, "vocabulary": vocabulary.digest}
     for group, value in science.items():
         settings |= {f"{group}.{key}": plain for key, plain in dataclasses.asdict(value).items()}
+    settings |= {f"traffic.{key}": plain for key, plain in told(config.traffic).items()}
     settings |= {f"traffic.{key}": value for key, value in traffic.REMOVED.items()}
     for part, gone in REMOVED.items():
         settings[f"render.{part}"] = dataclasses.asdict(getattr(config.render, part)) | gone
     del settings["render.lpips"]  # measures alone
     settings["render.own_body"] = masks_digest(config.render.own_body)
     settings = {key: plain for key, plain in settings.items() if plain != ADDED.get(key, ABSENT)}
+    if labelling is not None and labelling.traffic.mode == "learned":
+        settings["traffic.weights"] = told(labelling.traffic)["weights"]
     settings["reward.label_vocabulary"] = None if labelling is None else labelling.vocabulary.digest
     versions = stage_versions()
     early: dict[str, object] = {
