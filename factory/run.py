@@ -115,6 +115,7 @@ def isolates(config: RunConfig) -> bool:
     """Whether executor=local works in a process of its own: where asked for, or where a plug-in works."""
     used = [config.clips, *(spec for name, spec in config.expert.items() if name in config.experts)]
     foreign = any(not str(spec.get("_target_", "")).startswith(("factory.", "tasks.")) for spec in used)
+    foreign |= config.traffic.mode == "learned" and not config.traffic.policy.startswith("tasks.")
     return config.graph.isolated == "always" or (config.graph.isolated == "auto" and foreign)
 
 

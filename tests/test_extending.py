@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from examples.csv_logs import CsvReader, write_log
+from examples.keep_gap import KeepGap
 from examples.keep_lane import KeepLane
 from examples.linear_planner import LinearPlanner
 from factory.config.compose import compose, fill
@@ -24,8 +25,12 @@ from planners.training.checkpoint import load_planner
 from planners.training.train import main as train_main
 from tasks.experts.protocol import Plan
 from tasks.kernels.compiled import cache_dir
+from tasks.rollout.learned.policy import told
+from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out
 from tasks.stages import Rejected
 from tasks.world.clip import scene_of_clip
+from tests.tasks.rollout import worlds
+from tests.tasks.rollout.worlds import Track
 from tests.tasks.streets import street_clip
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -104,6 +109,19 @@ def test_a_planner_is_its_class_and_a_file_of_its_settings(tmp_path: Path) -> No
     assert type(planner) is LinearPlanner and planner.settings.history is False
 
 
+def test_a_traffic_policy_is_a_class_that_the_settings_name() -> None:
+    """It brakes for the ego that stands 25 m ahead, and keeps its speed where nobody does."""
+    settings = TrafficSettings(mode="learned", policy="examples.keep_gap:KeepGap")
+    scene = worlds.scene(worlds.straight_road(), Track(0.0, speed=8.0), ego=(30.0, 0.0, 0.0))
+    ego = np.repeat(scene.ego_state[None], 41, axis=0)
+    behind, free = (
+        roll_out(prepare_traffic(scene, settings), ego + away).agents for away in (0.0, [0.0, 500.0] + [0.0] * 9)
+    )
+    assert free.velocities[:, 0, 0] == pytest.approx(8.0) and free.boxes[-1, 0, 0] == pytest.approx(32.0)
+    assert behind.velocities[-1, 0, 0] == 0.0 and behind.boxes[-1, 0, 0] < 25.0
+    assert told(settings) | {"weights": KeepGap().digest()} == told(settings)
+
+
 @pytest.mark.slow
 def test_the_script_scores_plans_without_ray_or_hydra() -> None:
     code = "import examples.score_plans, sys\nassert not {'ray', 'hydra', 'torch'} & set(sys.modules)"
@@ -152,7 +170,7 @@ def test_the_reader_names_file_and_field_of_what_is_wrong(
 
 
 def test_every_example_says_how_it_is_run_and_is_short() -> None:
-    assert len(EXAMPLES) == 4
+    assert len(EXAMPLES) == 5
     for path in EXAMPLES:
         text = path.read_text()
         assert re.search(r"python -m (factory\.|planners |examples\.)", text.split('"""')[1]), path.name

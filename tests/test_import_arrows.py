@@ -42,7 +42,7 @@ ROOMS = {
     ),
     "planners": (
         *("command", "data", "models", "training", "published"),
-        *("evaluation", "drive", "explore", "navsim", "study", "__main__"),
+        *("evaluation", "drive", "explore", "traffic", "navsim", "study", "__main__"),
     ),
 }
 MOST_MODULES = 20  # in a room

@@ -35,6 +35,7 @@ from tasks.render.settings import REMOVED, RenderMode
 from tasks.render.splatting.gsplat_backend import BackendMissing
 from tasks.reward.labels import Labelling
 from tasks.rollout import settings as traffic
+from tasks.rollout.learned.policy import told
 from tasks.stages import FRAMES, stage_versions
 from tasks.world.kinematic_vocabulary import kinematic_trajectories
 from tasks.world.vocabulary import Vocabulary
@@ -127,6 +128,8 @@ def assemble(config: RunConfig) -> Run:
         labelling = choose_labelling(config, vocabulary)
         explored = choose_explored(config)
         sampled = choose_sample(config)
+        for chosen in (config.traffic, *(() if labelling is None else (labelling.traffic,))):
+            told(chosen)  # of a policy: whether there is one
         experts = {
             name: build_expert(RunContext(config, name, opened)) for name in config.experts if name not in FRAMES
         }
@@ -258,7 +261,6 @@ def identity_of(
     """
     science: dict[str, Any] = {
         "perturb": config.perturb,
-        "traffic": config.traffic,
         "pdm": config.pdm,
         "reward": config.reward,
         "render": config.render,
@@ -266,22 +268,25 @@ def identity_of(
     settings: dict[str, object] = {"seed": config.seed, "vocabulary": vocabulary.digest}
     for group, value in science.items():
         settings |= {f"{group}.{key}": plain for key, plain in dataclasses.asdict(value).items()}
+    settings |= {f"traffic.{key}": plain for key, plain in told(config.traffic).items()}
     settings |= {f"traffic.{key}": value for key, value in traffic.REMOVED.items()}
     for part, gone in REMOVED.items():
         settings[f"render.{part}"] = dataclasses.asdict(getattr(config.render, part)) | gone
     del settings["render.lpips"]  # measures alone
     settings["render.own_body"] = masks_digest(config.render.own_body)
     settings = {key: plain for key, plain in settings.items() if plain != ADDED.get(key, ABSENT)}
-    told: dict[str, object] = {}
+    if labelling is not None and labelling.traffic.mode == "learned":
+        settings["traffic.weights"] = told(labelling.traffic)["weights"]
+    weak: dict[str, object] = {}
     if explored is not None:
-        told["explore.planner"] = f"{explored.planner} {explored.planner_digest}"
-        told["explore.digest"] = explored.digest
+        weak["explore.planner"] = f"{explored.planner} {explored.planner_digest}"
+        weak["explore.digest"] = explored.digest
     if candidates_by:
-        told["sample.candidates"] = candidates_by
-    settings |= told
+        weak["sample.candidates"] = candidates_by
+    settings |= weak
     digest = vocabulary.digest
-    if told:
-        digest = hashlib.sha256(canonical_json([vocabulary.digest, told]).encode()).hexdigest()[:16]
+    if weak:
+        digest = hashlib.sha256(canonical_json([vocabulary.digest, weak]).encode()).hexdigest()[:16]
     settings["reward.label_vocabulary"] = None if labelling is None else labelling.vocabulary.digest
     versions = stage_versions()
     early: dict[str, object] = {

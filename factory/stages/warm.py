@@ -33,7 +33,8 @@ from tasks.reward.labels import Labelling, reactive_scores, vocabulary_labels
 from tasks.reward.prepare import prepare_scene
 from tasks.reward.second_after import hit_after_s
 from tasks.reward.verdicts import INDEX_FROM_ROWS
-from tasks.rollout.simulate import TrafficSettings, prepare_traffic, simulate
+from tasks.rollout.learned.imitation import unfitted
+from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out_many, simulate
 from tasks.sealed import Damaged, sealed, unsealed
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import Array
@@ -58,7 +59,9 @@ def parts_of(
     no lidar.
     """
     parts = ["judge", "plan"]
-    if label_traffic in ("idm", "navsim"):  # scored among the answers
+    if label_traffic == "learned" or (simulates and traffic == "learned"):
+        parts.append("policy")
+    if label_traffic in ("idm", "navsim", "learned"):  # scored among the answers
         parts.append("answers")
     elif simulates and traffic == "idm":
         parts.append("drive")
@@ -204,6 +207,14 @@ def _drive() -> None:
     simulate(scene, ahead, TrafficSettings())
 
 
+def _policy() -> None:
+    """Traffic that a policy drives around one ego and around several, the policy that is fitted here among it."""
+    scene, ahead = _tiny_scene()
+    settings = TrafficSettings(mode="learned", policy=f"{unfitted.__module__}:{unfitted.__name__}")
+    states = simulate(scene, ahead, settings).ego_states
+    roll_out_many(prepare_traffic(scene, settings), np.stack([states] * 2))
+
+
 def _answers() -> None:
     """The same, and traffic around each of several egos, scored."""
     _drive()
@@ -229,6 +240,7 @@ PARTS = {
     "drive": _drive,
     "answers": _answers,
     "smooth": _smooth,
+    "policy": _policy,
     "render": render_warm.compile_kernels,
     "fit": _fit,
     "rig": render_warm.compile_rig_kernels,

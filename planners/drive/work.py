@@ -26,6 +26,7 @@ from planners.drive.table import DriveKey, DriveRow
 from planners.evaluation.planner_names import planner_of
 from tasks.perturb import Perturbation, perturb
 from tasks.render.settings import RenderSettings
+from tasks.rollout.learned.policy import told
 from tasks.stages import stage_versions
 from tasks.world.chance import stream
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip
@@ -88,7 +89,7 @@ class DriveWork:
             "drive": DRIVE_VERSION,
             "stages": stage_versions(),
             "loop": {"seconds": s.seconds, "bound_m": s.bound_m},
-            "traffic": asdict(s.traffic),
+            "traffic": told(s.traffic),
         }
         if start != LOGGED:
             found |= {"seed": s.seed, "vocabulary": self.vocabulary.digest, "perturb": asdict(s.perturb)}

@@ -58,6 +58,7 @@ from planners.evaluation.scoring import (
 )
 from planners.evaluation.tags import TAG_COLUMNS, tags_of
 from tasks.experts.pdm_closed.planner import PdmSettings
+from tasks.rollout.learned.policy import told
 from tasks.rollout.simulate import TrafficSettings
 from tasks.stages import stage_versions
 from tasks.world.arrays import Array
@@ -100,6 +101,11 @@ class EvaluateSettings:
         return Rules(self.one_stage_traffic, self.two_stage_traffic, self.pdm)
 
 
+def _told(rules: Rules) -> dict[str, object]:
+    """As a record holds them."""
+    return asdict(rules) | {"one_stage": told(rules.one_stage), "two_stage": told(rules.two_stage)}
+
+
 def evaluate(benchmark: Benchmark, who: Sequence[EvaluatedPlanner], settings: EvaluateSettings) -> list[SummaryLine]:
     """Plan, score, write; the lines of all planners in their order.
 
@@ -111,7 +117,7 @@ def evaluate(benchmark: Benchmark, who: Sequence[EvaluatedPlanner], settings: Ev
     shared = {
         "benchmark_digest": benchmark.digest,
         "clips": n_clips,
-        "rules": json.loads(json.dumps(asdict(settings.rules))),  # as it comes back from a file
+        "rules": json.loads(json.dumps(_told(settings.rules))),  # as it comes back from a file
         "stage_versions": stage_versions(),
     }
     identities = {one.label: {"planner_digest": one.digest, **shared} for one in who}

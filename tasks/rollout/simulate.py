@@ -18,7 +18,8 @@ The ego is tracked first, since it follows its plan whatever the traffic does; t
 * With `yields` a driver keeps the speeds and stops of its log instead of a target speed, and gives way to others, not
   to the ego, where ways cross or merge (tasks/rollout/yielding).
 
-That is `mode=idm`. In `navsim` the traffic is the public evaluation's, to the letter (tasks/rollout/navsim).
+That is `mode=idm`. In `navsim` the traffic is the public evaluation's, to the letter (tasks/rollout/navsim); in
+`learned` those whom IDM would drive along lanes are driven by a policy (tasks/rollout/learned).
 """
 
 from collections.abc import Iterable, Iterator
@@ -33,6 +34,8 @@ from tasks.rollout.corridor import Paths
 from tasks.rollout.idm import IdmDriver
 from tasks.rollout.lane_following import LanePath, find_path, logged_path, straight_path
 from tasks.rollout.lane_index import index_lanes
+from tasks.rollout.learned.drive import BEFORE, Worlds, drive_learned
+from tasks.rollout.learned.policy import KIND_NUMBER, SEEN_ROWS, RoadLines, policy_of
 from tasks.rollout.lqr import track
 from tasks.rollout.navsim.agents import NavsimAgents, navsim_agents
 from tasks.rollout.navsim.drive import answer
@@ -64,6 +67,7 @@ class TrafficScene:
     paths: Paths | None
     navsim: NavsimAgents | None = None  # None: another mode
     yielding: Yielding | None = None  # None: drivers give way to nobody, or another mode
+    streets: RoadLines | None = None  # None: another mode than learned
 
 
 @dataclass(frozen=True)
@@ -73,7 +77,7 @@ class Rollouts:
     boxes: Array  # (B, 41, N, 5) centre x [m], centre y [m], heading [rad], length [m], width [m]; NaN where absent
     velocities: Array  # (B, 41, N, 2) world frame [m/s]
     valid: Bools  # (B, 41, N)
-    simulated: Bools  # (B, N) True: moved by IDM at some step, False: replayed or standing
+    simulated: Bools  # (B, N) True: driven at some step, False: replayed or standing
 
 
 def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
@@ -124,10 +128,14 @@ def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
         moving_kind=moving_kind,
         enters_clear=is_vehicle & ~standing,
     )
+    yields = settings.yields and settings.mode == "idm"
     paths = stack_paths(
-        scene, found, logged_ways, settings.target_speed_mps, settings.decel_max, logged_stops=not settings.yields
+        scene, found, logged_ways, settings.target_speed_mps, settings.decel_max, logged_stops=not yields
     )
-    if not settings.yields:
+    if settings.mode == "learned":
+        streets = RoadLines(index.points, index.first, roles.path, paths)
+        return TrafficScene(scene, settings, roles, paths, streets=streets)
+    if not yields:
         return TrafficScene(scene, settings, roles, paths)
     return TrafficScene(scene, settings, roles, paths, yielding=yielding_in(scene, roles, paths, _agent_states(log)))
 
@@ -164,8 +172,12 @@ def _answer(traffic: TrafficScene, ego_states: Array, steps: int) -> tuple[Agent
         return _public_answer(traffic.navsim, traffic.settings, window, ego_states)
     if traffic.roles is None or traffic.paths is None or len(window) == 0:
         return window, np.zeros(len(window), dtype=bool)
-    rows, motion = drive(*_script(traffic, window), *_ego_boxes(ego_states), _yielding(traffic))
     n = len(window)
+    if traffic.streets is not None:
+        worlds = _learned(traffic, traffic.streets, window, ego_states[None])
+        per_step = {name: getattr(worlds, name)[BEFORE:, 0, :n].copy() for name in PER_STEP}
+        return replace(window, **per_step), worlds.driven_from[0] <= steps
+    rows, motion = drive(*_script(traffic, window), *_ego_boxes(ego_states), _yielding(traffic))
     return replace(window, **{name: getattr(rows, name)[:, :n].copy() for name in PER_STEP}), motion.was_driven[steps]
 
 
@@ -200,7 +212,35 @@ def roll_out_many(traffic: TrafficScene, ego_states: Array) -> Rollouts:
     if traffic.roles is None or traffic.paths is None or n == 0:
         alike: Any = [np.broadcast_to(a, (many, *a.shape)) for a in (window.boxes, window.velocities, window.valid)]
         return Rollouts(alike[0], alike[1], alike[2], np.zeros((many, n), dtype=bool))
+    if traffic.streets is not None:
+        worlds = _learned(traffic, traffic.streets, window, ego_states)
+        return Rollouts(
+            boxes=worlds.boxes[BEFORE:, :, :n].swapaxes(0, 1).copy(),
+            velocities=worlds.velocities[BEFORE:, :, :n].swapaxes(0, 1).copy(),
+            valid=worlds.valid[BEFORE:, :, :n].swapaxes(0, 1).copy(),
+            simulated=worlds.driven_from <= HORIZON_STEPS,
+        )
     return Rollouts(*drive_many(*_script(traffic, window), *_ego_boxes(ego_states), _yielding(traffic)))
+
+
+def _learned(traffic: TrafficScene, streets: RoadLines, window: AgentTracks, ego_states: Array) -> Worlds:
+    """The policy's answer to B egos with states (B, T, 11)."""
+    scene = traffic.scene
+    start, log, _, roles, paths, driver = _script(traffic, window)
+    past = scene.agents.window(start - BEFORE, start + 1)
+    kinds = np.array([KIND_NUMBER[kind] for kind in (*window.kinds, AgentKind.VEHICLE)])
+    return drive_learned(
+        policy_of(traffic.settings),
+        replace(streets, ways=paths),
+        kinds,
+        start,
+        log,
+        _agent_states(past),
+        roles,
+        driver,
+        egos=_ego_boxes(ego_states),
+        ego_past=_ego_boxes(scene.ego_history[-SEEN_ROWS:]),
+    )
 
 
 def _public_answer(
@@ -234,7 +274,7 @@ def _script(
         more = window.n_steps - len(paths.line_state)
         paths = paths._replace(line_state=np.concatenate([paths.line_state, np.repeat(paths.line_state[-1:], more, 0)]))
     driver = IdmDriver(*(getattr(traffic.settings, name) for name in IdmDriver._fields))
-    if traffic.yielding is not None:
+    if traffic.yielding is not None or traffic.streets is not None:
         driver = driver._replace(headway_s=min(driver.headway_s, SHORTEST_HEADWAY_S))
     return (
         start,

@@ -44,7 +44,7 @@ MISTYPED = [  # told before anything heavy is imported
     run("rounsd=5", says=["rounsd: there is no such setting", "did you mean rounds=?"]),
     run("render.widht=3", says=["did you mean render.width=?"]),
     run("preset=dmeo", says=["demo, hard_benchmark", "did you mean preset=demo?"]),
-    run("traffic=fast", says=["traffic=fast: there is idm, navsim, replay"]),
+    run("traffic=fast", says=["traffic=fast: there is idm, learned, navsim, replay"]),
     run("--rounds", "5", says=["settings have no dashes: rounds=5"]),
     run("--rounds=5", says=["rounds=5"]),
     run("rounds", "5", says=["'rounds': expected key=value"]),

@@ -80,7 +80,7 @@ def test_the_run_s_keys_are_those_of_its_dataclass() -> None:
             "perturb.max_lateral: there is no such setting; did you mean",
         ),
         ("+render.asset.gap=3", "render.asset.gap"),
-        ("traffic=fast", "traffic=fast: there is idm, navsim, replay"),
+        ("traffic=fast", "traffic=fast: there is idm, learned, navsim, replay"),
         ("colour=red", "colour"),
         ("rounds", "rounds"),
     ],

@@ -9,7 +9,9 @@ from factory.config.compose import ConfigError
 from factory.config.run import SCENARIONET, load_config, refuse_relative_root
 from factory.setup.settings import assemble
 from factory.setup.vocabulary import save_recovery_table
+from factory.store.identity import RunIdentity
 from tasks.experts.recovery.expert import RecoveryTable
+from tasks.rollout.learned.imitation import unfitted, weights_file
 from tasks.world.kinematic_vocabulary import kinematic_trajectories
 
 
@@ -69,3 +71,36 @@ def test_a_recovery_table_kept_of_train_logs_is_not_given_where_they_are_test(
     assert len(run.work.experts["recovery"].table)  # type: ignore[attr-defined]
     with pytest.raises(ConfigError, match="no train log"):
         assemble(load_config([*asked, "clips.split=test", "limit=1"]))
+
+
+def test_a_policy_s_file_is_in_the_key_of_rows_by_what_is_in_it(tmp_path: Path) -> None:
+    """The same file under two names gives the same rows; and no word of it stands in keys of other traffic."""
+    given = unfitted().weights
+    files = [tmp_path / name for name in ("a.npz", "b.npz", "c.npz")]
+    for file, bias in zip(files, (0.0, 0.0, 1.0)):
+        file.write_bytes(weights_file(given._replace(last_bias=given.last_bias + bias), "{}"))
+
+    def identity(*words: str) -> RunIdentity:
+        return assemble(load_config(["clips.n_clips=1", "experts=[pdm_closed]", *words])).work.identity
+
+    one, alike, other = (identity("traffic=learned", f"traffic.weights={file}") for file in files)
+    assert one.settings_hash == alike.settings_hash != other.settings_hash
+    assert one.prepare_digest == alike.prepare_digest != other.prepare_digest
+    labelled = identity("reward.traffic=learned", f"traffic.weights={files[0]}")
+    assert labelled.settings["traffic.weights"] == one.settings["traffic.weights"]
+    assert not {"traffic.weights", "traffic.policy"} & identity().settings.keys()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["traffic=learned"], "traffic weights is missing: mode=learned needs a file"),
+        (["traffic=learned", "traffic.weights=/no/such.npz"], r"traffic\.weights: /no/such\.npz: No such file"),
+        (["traffic.weights=some.npz"], r"traffic\.weights=some\.npz is for traffic=learned"),
+        (["reward.traffic=learned"], "traffic weights is missing"),
+        (["traffic=learned", "traffic.policy=nothing:At"], r"traffic\.policy=nothing:At: name one as"),
+    ],
+)
+def test_traffic_without_its_policy_is_refused(words: list[str], said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        assemble(load_config(["clips.n_clips=1", "experts=[pdm_closed]", *words]))
