@@ -2,7 +2,8 @@
 
 By the words of `python -m factory.run`. Every candidate of every clip, or the first `candidates=`, is driven by every
 expert, whatever `rounds` says. EC compares an expert's plan from a candidate's end with the one it makes half a second
-before it on the way there, both as the tracker drives them: as the benchmark's follow-up frames do.
+before it on the way there, both as the tracker drives them: as the benchmark's follow-up frames do. Of human drives,
+which are never refused, those count as accepted that have full marks.
 """
 
 import sys
@@ -36,11 +37,11 @@ COLUMNS = {
     "plan": "a plan %",
     "accepted": "accepted %",
     "clips": "clips with one %",
-    "hc": "HC %",
-    "ec": "EC %",
-    "kept_ec": "EC %",
+    "hc": "all: HC %",
+    "ec": "all: EC %",
+    "kept_ec": "accepted: EC %",
     "ep": "EP",
-    "epdms14": "EPDMS /14",
+    "epdms14": "EPDMS without EC",
     "epdms": "EPDMS with EC",
     "rough": "roughness",
     "ms": "ms a plan",
@@ -145,11 +146,15 @@ def measure(work: FactoryWork, prepared: PreparedClip, most: int | None, sums: d
                 found.clips[prepared.clip_id] = True
 
 
+def most_candidates(words: Sequence[str]) -> tuple[int | None, list[str]]:
+    """What `candidates=` says, None where nothing, and the words that are the run's."""
+    own = [word for word in words if word.startswith("candidates=")]
+    return int(own[-1].partition("=")[2]) if own else None, [word for word in words if word not in own]
+
+
 def main(words: Sequence[str]) -> int:
     """Drives, and prints the table."""
-    own = [word for word in words if word.startswith("candidates=")]
-    most = int(own[0].partition("=")[2]) if own else None
-    given = [word for word in words if word not in own]
+    most, given = most_candidates(words)
     sums: dict[str, Sums] = defaultdict(Sums)
     with tempfile.TemporaryDirectory() as folder:
         run = assemble(load_config([*given, "executor=local", "render=none", "reward.labels=none", f"out={folder}"]))
