@@ -36,9 +36,7 @@ def _lineage() -> tuple[Column, ...]:
         Column("expert_digest", "string", about="of the expert's inputs and settings"),
         Column("round", "int32", about="ordinal of the accepted attempt of its (clip, expert); partition"),
         Column("candidate_index", "int32", about="place in the clip's candidate list; -1 human"),
-        Column(
-            "vocabulary_index", "int32", nullable=True, about="row of the vocabulary; -1 - n: proposal n; null human"
-        ),
+        Column("vocabulary_index", "int32", nullable=True, about="row of the vocabulary; -1 - n: drift n; null human"),
         Column("vocabulary_digest", "string"),
         Column("settings_hash", "string", about="of the run's settings, see run.json"),
         Column("stage_versions", "string", about="canonical JSON, stage -> version"),

@@ -116,13 +116,13 @@ def _candidate_facts(row: Row, clip: Row, record: Row) -> list[tuple[str, object
 
 def _moved_by(index: int, clip: Row, record: Row) -> tuple[str, object]:
     """What perturbs the ego: a row of the vocabulary, or where a planner drove itself."""
-    from tasks.proposals import number_of
+    from tasks.drifts import number_of
 
     number = number_of(index)
     if number is None:
         return "vocabulary row", f"{index} of {clip['vocabulary_digest']}"
     said = dict(record.get("settings", {}))
-    return "proposal", f"{number} of planner {said.get('explore.planner')}, in explored {said.get('explore.digest')}"
+    return "drift", f"{number} of planner {said.get('explore.planner')}, in explored {said.get('explore.digest')}"
 
 
 def _attempt_facts(store: "Store", row: Row) -> list[tuple[str, object]]:
