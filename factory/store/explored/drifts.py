@@ -3,7 +3,7 @@
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -27,7 +27,7 @@ class Explored:
     n_drifts: int
     n_failing: int  # of them those where the planner then fails
 
-    @property
+    @cached_property
     def digest(self) -> str:
         """16 hex digits of every row."""
         rows = "\x1f".join(f"{clip_id} {digest}" for clip_id, digest in sorted(self.digests.items()))
@@ -41,7 +41,8 @@ class Explored:
         """
         if clip.clip_id not in self.digests:
             return ()
-        (row,) = explored_clips(_rows_of(_table(self.location.uri, _options(self.location)), clip.clip_id))
+        options = tuple(sorted(self.location.options.items()))
+        (row,) = explored_clips(_rows_of(_table(self.location.uri, options, self.digest), clip.clip_id))
         if row.digest != self.digests[clip.clip_id]:
             raise OSError(f"{self.location.uri}: clip {clip.clip_id} was explored anew since this run began")
         if row.content_digest != clip.content_digest:
@@ -76,11 +77,7 @@ def _rows_of(table: KeyedTable, clip_id: str) -> pa.Table:
     return rows.filter(pc.equal(rows["clip_id"], clip_id))
 
 
-def _options(location: Location) -> tuple[tuple[str, str], ...]:
-    return tuple(sorted(location.options.items()))
-
-
 @lru_cache(maxsize=2)
-def _table(uri: str, options: tuple[tuple[str, str], ...]) -> KeyedTable:
-    """A worker's own, opened once."""
+def _table(uri: str, options: tuple[tuple[str, str], ...], digest: str) -> KeyedTable:
+    """A worker's own, opened once for each state of it."""
     return open_explored(Location(uri, dict(options)))

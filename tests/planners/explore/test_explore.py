@@ -222,9 +222,14 @@ def test_a_run_tries_what_the_planner_fails_at_first_and_its_tables_name_the_pla
     assert HASTY.replace(":", ".") in told["drift"] and "hasty-1" in told["drift"]
     assert not set(store.samples.keys().tolist()) & set(plain.samples.keys().tolist())
 
+    capsys.readouterr()
     files = sorted(path.name for path in (tmp_path / "out" / "samples").rglob("*.parquet"))
     assert run.main(words) == COMPLETE
     assert sorted(path.name for path in (tmp_path / "out" / "samples").rglob("*.parquet")) == files
+    few = factory_words(towns, tmp_path / "few", f"explore={explored}", "sample=targeted", "limit=1")
+    assert run.main(few) == COMPLETE
+    assert len(lists(Store(tmp_path / "few"))) == 1
+    assert "hasty-1" in Store(tmp_path / "few").runs()[0]["settings"]["sample.candidates"]
     assert run.main(factory_words(towns, tmp_path / "out", "rounds=99")) == BAD_CONFIG
     assert "explore.planner" in capsys.readouterr().err
 
