@@ -5,7 +5,7 @@ gates on the reached end pose, an interleaved grid over those, per cell the firs
 non-reactive EPDMS at the threshold (log replay), then the same threshold under reactive traffic on the kept ones only.
 Scores are needed only until a cell is filled, so cells are walked abreast: the same result at a fraction of the scores.
 
-Beside the vocabulary's there may be motions that a planner drove itself into (tasks.proposals). They pass the same
+Beside the vocabulary's there may be motions that a planner drove itself into (tasks.drifts). They pass the same
 gates on their end and the same two scores, one a cell, of any cell; those where the planner then failed come first.
 """
 
@@ -15,8 +15,8 @@ from itertools import islice
 
 import numpy as np
 
+from tasks.drifts import OF_LOG, Drift, alternating, index_of, worst_first
 from tasks.experts.pdm_closed.planner import PdmSettings, plan_for
-from tasks.proposals import OF_LOG, Proposal, alternating, index_of, worst_first
 from tasks.reward.epdms import Scores, score
 from tasks.reward.prepare import among, prepare_scene
 from tasks.rollout.lqr import track
@@ -30,21 +30,21 @@ from tasks.world.frames import to_local, to_world
 from tasks.world.vehicle import HEADING, VX
 from tasks.world.vocabulary import Vocabulary
 
-PROPOSED = ("reached_gate", "score", "reactive")  # what drops proposals, counted where there are some
+DRIFT_FATES = ("reached_gate", "score", "reactive")  # what drops drifts, counted where there are some
 
 
 @dataclass(frozen=True)
 class Candidate:
     """A perturbation of one clip, with the reactive rollout that proved it."""
 
-    vocabulary_index: int  # row of the vocabulary; below 0: the log, or a proposal, tasks.proposals.index_of
+    vocabulary_index: int  # row of the vocabulary; below 0: the log, or a drift, tasks.drifts.index_of
     end_pose: Array  # (3,) reached at T+H, in the frame of the logged pose at T+H
     cell: tuple[int, int]  # longitudinal, lateral index of the grid
     score: float  # EPDMS (/14) under log replay
     reactive_score: float  # EPDMS (/14) under reactive traffic
     reactive_scores: Scores  # row 1 is the candidate, row 0 PDM-Closed
     rollout: Rollout
-    fails: str | None = None  # of a proposal: the sub-score that its planner then failed, "": none; None: no proposal
+    fails: str | None = None  # of a drift: the sub-score that its planner then failed, "": none; None: no drift
 
 
 @dataclass(frozen=True)
@@ -58,12 +58,12 @@ class Perturbation:
 
 @dataclass(frozen=True)
 class Considered:
-    """Every vocabulary trajectory that passed the raw gates, then every proposal, and what became of it.
+    """Every vocabulary trajectory that passed the raw gates, then every drift, and what became of it.
 
     For `explain` and pictures.
     """
 
-    vocabulary_index: Ints  # (G,) below 0: a proposal
+    vocabulary_index: Ints  # (G,) below 0: a drift
     end_pose: Array  # (G, 3) reached, in the frame of the logged pose at T+H
     fate: tuple[str, ...]  # (G,) "reached_gate", "white_cell", "not_needed", "score", "reactive", "kept"
     score: Array  # (G,) EPDMS under log replay, NaN where it was not needed
@@ -130,14 +130,14 @@ def perturb(
     traffic: TrafficSettings,
     planner: PdmSettings,
     rng: np.random.Generator,
-    proposals: Sequence[Proposal] = (),
+    drifts: Sequence[Drift] = (),
     wanted: CellWeights | None = None,
 ) -> Perturbation | Rejected:
     """The ordered candidates of a clip, or Rejected "no_gated_candidate" or "no_good_candidate".
 
     traffic: of the reactive check; planner: PDM-Closed, the first row of every two-row batch that normalises progress;
-    rng: the clip's `perturb` stream, which draws one permutation of the vocabulary; proposals: of a planner, beside it.
-    The order is the failing proposals, worst first; then, one of either in turn, the other ones and the vocabulary's in
+    rng: the clip's `perturb` stream, which draws one permutation of the vocabulary; drifts: of a planner, beside it.
+    The order is the failing drifts, worst first; then, one of either in turn, the other ones and the vocabulary's in
     the order of the settings; or, where cells are wanted more than others, in that of a lot by these weights.
     """
     if settings.at_log:
@@ -152,22 +152,22 @@ def perturb(
     raw_fails = gate_failures(raw_ends, settings)
     gated = np.flatnonzero(~np.logical_or.reduce(list(raw_fails.values())))
     counts = {f"raw_{name}": int(fails.sum()) for name, fails in raw_fails.items()}
-    n_gated = len(gated)  # proposals stand behind them
-    if n_gated + len(proposals) == 0:
+    n_gated = len(gated)  # drifts stand behind them
+    if n_gated + len(drifts) == 0:
         detail = f"none of {len(raw_ends)} trajectories ends near the log"
         return Rejected("perturb", "no_gated_candidate", detail, counts)
 
     driven = [track(start, to_world(start[: HEADING + 1], vocabulary.trajectories[gated]))] if n_gated else []
-    states = np.concatenate([*driven, *(proposal.ego_states[None] for proposal in proposals)])
-    index = np.concatenate([gated, np.array([index_of(one.number) for one in proposals], dtype=np.int64)])
+    states = np.concatenate([*driven, *(drift.ego_states[None] for drift in drifts)])
+    index = np.concatenate([gated, np.array([index_of(one.number) for one in drifts], dtype=np.int64)])
     ends = to_local(target, states[:, -1, : HEADING + 1])
     end_fails = gate_failures(ends, settings)
     reached = ~np.logical_or.reduce(list(end_fails.values()))
     counts |= {f"reached_{name}": int(fails[:n_gated].sum()) for name, fails in end_fails.items()}
     cells = grid_cells(ends, settings)
-    is_proposed = np.arange(len(index)) >= n_gated
-    # The interleaved half of the grid; of proposals all of it.
-    black = (cells.sum(axis=1) % 2 == 0) | (not settings.interleaved) | is_proposed
+    is_drift = np.arange(len(index)) >= n_gated
+    # The interleaved half of the grid; of drifts all of it.
+    black = (cells.sum(axis=1) % 2 == 0) | (not settings.interleaved) | is_drift
     counts["white_cell"] = int((reached & ~black).sum())
 
     replay = prepare_scene(scene, scene.agents.window(NOW, NOW + HORIZON_STEPS + 1))
@@ -185,8 +185,8 @@ def perturb(
     kept = first_good_per_cell(cells, usable[np.argsort(rank[gated[usable]])], passes_replay)
     if wanted is not None:
         kept = kept[by_lot(wanted.of(cells[kept]), rng)]
-    proposed = [n_gated + place for place in worst_first(proposals) if reached[n_gated + place]]
-    kept_proposed = first_good_per_cell(cells, np.array(proposed, dtype=np.int64), passes_replay)
+    drifted = [n_gated + place for place in worst_first(drifts) if reached[n_gated + place]]
+    kept_drifts = first_good_per_cell(cells, np.array(drifted, dtype=np.int64), passes_replay)
     counts["replay_score"] = int((scores[:n_gated] < settings.epdms_min).sum())
 
     fate = np.where(~reached, "reached_gate", np.where(~black, "white_cell", "not_needed")).astype(object)
@@ -210,14 +210,14 @@ def perturb(
                 reactive_score=float(reactive.pdm_score[1]),
                 reactive_scores=reactive,
                 rollout=rollout,
-                fails=proposals[member - n_gated].fails if is_proposed[member] else None,
+                fails=drifts[member - n_gated].fails if is_drift[member] else None,
             )
         return good
 
-    fate[kept] = fate[kept_proposed] = "not_needed"
-    failing = [int(member) for member in kept_proposed if proposals[member - n_gated].fails]
-    others = [int(member) for member in kept_proposed if not proposals[member - n_gated].fails]
-    at_most = len(kept) + len(kept_proposed) if settings.at_most is None else settings.at_most
+    fate[kept] = fate[kept_drifts] = "not_needed"
+    failing = [int(member) for member in kept_drifts if drifts[member - n_gated].fails]
+    others = [int(member) for member in kept_drifts if not drifts[member - n_gated].fails]
+    at_most = len(kept) + len(kept_drifts) if settings.at_most is None else settings.at_most
     chosen = list(islice(filter(passes_reactive, failing), at_most))
     at_most -= len(chosen)
     if settings.order == "spread":
@@ -227,8 +227,8 @@ def perturb(
         chosen += islice(filter(passes_reactive, alternating(others, kept.tolist())), at_most)
     candidates = [proven[member] for member in chosen]
     counts["reactive_score"] = int((fate[:n_gated] == "reactive").sum())
-    if proposals:
-        counts |= {f"proposed_{what}": int((fate[n_gated:] == what).sum()) for what in PROPOSED}
+    if drifts:
+        counts |= {f"drift_{what}": int((fate[n_gated:] == what).sum()) for what in DRIFT_FATES}
     if not candidates:
         return Rejected("perturb", "no_good_candidate", ", ".join(f"{k} {v}" for k, v in counts.items()), counts)
     return Perturbation(tuple(candidates), counts, Considered(index, ends, tuple(fate), scores))

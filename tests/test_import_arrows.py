@@ -32,7 +32,7 @@ ROOMS = {
             "reward.rules",
             "reward",
         ),
-        *("experts", "proposals", "sampling", "perturb", "attempt", "hard_scenes", "trajectories"),
+        *("experts", "drifts", "sampling", "perturb", "attempt", "hard_scenes", "trajectories"),
         *("render.splatting", "render.scene", "render.rig", "render.fit", "render"),
     ),
     "factory": (

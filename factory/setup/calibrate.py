@@ -55,7 +55,7 @@ def plan_text(run: Run, refs: Sequence[ClipRef]) -> str:
     if (explored := run.work.explored) is not None:
         asked = sum(ref.clip_id in explored.digests for ref in refs)
         lines.append(
-            f"explored: {explored.n_proposals} proposals of {explored.planner} ({explored.planner_digest}), which then "
+            f"explored: {explored.n_drifts} drifts of {explored.planner} ({explored.planner_digest}), which then "
             f"fails from {explored.n_failing}; {asked} of the {len(refs)} clips"
         )
     lines.append(f"experts: {', '.join(config.experts)}; rounds: {config.rounds}; out: {config.out}")

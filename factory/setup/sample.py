@@ -8,7 +8,7 @@ import numpy as np
 from factory.config.run import RunConfig
 from factory.config.words import ConfigError
 from factory.readers.base import ClipRef
-from factory.store.explored.proposals import Explored, explored_in
+from factory.store.explored.drifts import Explored, explored_in
 from factory.store.explored.table import open_explored
 from factory.store.location import Location
 from tasks.perturb import grid_cells

@@ -20,7 +20,7 @@ from factory.stages.frames import BenchmarkWork
 from factory.stages.own_body import masks_digest, refuse_unknown_masks
 from factory.stages.pipeline import FactoryWork
 from factory.stages.sensors import chosen_cameras
-from factory.store.explored.proposals import Explored, explored_in
+from factory.store.explored.drifts import Explored, explored_in
 from factory.store.identity import UNLISTED, RunIdentity, canonical_json
 from factory.store.illness import why_ill
 from factory.store.location import Location
@@ -197,7 +197,7 @@ def choose_labelling(config: RunConfig, vocabulary: Vocabulary) -> Labelling | N
 
 
 def choose_explored(config: RunConfig) -> Explored | None:
-    """The planner's proposals that the run takes, None for none. Raises ValueError where the folder holds none."""
+    """The planner's drifts that the run takes, None for none. Raises ValueError where the folder holds none."""
     if config.explore is None:
         return None
     try:
@@ -256,7 +256,7 @@ def identity_of(
 ) -> RunIdentity:
     """What the rows depend on besides clip, candidate and expert. Where data lies and who works on it is not in it.
 
-    Candidates are numbered among the vocabulary's and a planner's together: with proposals the vocabulary's digest, and
+    Candidates are numbered among the vocabulary's and a planner's together: with drifts the vocabulary's digest, and
     so every attempt's id, is of both; and of what orders them, candidates_by, where that is no mere draw.
     """
     science: dict[str, Any] = {

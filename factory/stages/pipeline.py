@@ -15,13 +15,13 @@ from factory.stages.fitting import fits_going_on
 from factory.stages.imaging import Imaging, scene_lookups
 from factory.stages.rows import label_columns, sample_row
 from factory.store.candidates import CandidateRow
-from factory.store.explored.proposals import Explored
+from factory.store.explored.drifts import Explored
 from factory.store.identity import UNLISTED, RunIdentity
 from tasks.attempt import ExpertGate, Judged, Timed, attempt, has_route, human_sample, perturbed_scene
+from tasks.drifts import Drift
 from tasks.experts.pdm_closed.planner import PdmSettings
 from tasks.experts.protocol import Expert, kernels_of, tried_once
 from tasks.perturb import Candidate, Perturbation, PerturbSettings, end_speed_mps, perturb
-from tasks.proposals import Proposal
 from tasks.render.scene.engine import check
 from tasks.render.settings import RenderMode, RenderSettings
 from tasks.render.splatting.gsplat_backend import BackendMissing
@@ -139,7 +139,7 @@ class FactoryWork:
     identity: RunIdentity
     cache_dir: str  # of reconstructed blocks
     photos_alone: bool  # clips may have photos and no lidar
-    explored: Explored | None = field(default=None, kw_only=True)  # a planner's proposals, beside the vocabulary
+    explored: Explored | None = field(default=None, kw_only=True)  # a planner's drifts, beside the vocabulary
     wanted_cells: CellWeights | None = field(default=None, kw_only=True)  # where candidates are wanted to end
 
     def warm(self, draws: bool = True) -> None:
@@ -202,12 +202,12 @@ class FactoryWork:
             asked = self.render.refuses_blocks or self._simulates
             blocked = self.imaging.block_verdict(clip) if asked else None
         with watch.of("perturb"):
-            rng, proposals = stream(self.seed, clip.clip_id, "perturb"), self._proposals(clip)
-            how = (self.perturb, self.traffic, self.pdm, rng, proposals, self.wanted_cells)
+            rng, drifts = stream(self.seed, clip.clip_id, "perturb"), self._drifts(clip)
+            how = (self.perturb, self.traffic, self.pdm, rng, drifts, self.wanted_cells)
             found = blocked or perturb(clip, self.vocabulary, *how)
         return WholeClip(clip, found, watch.seconds)
 
-    def _proposals(self, clip: Clip) -> tuple[Proposal, ...]:
+    def _drifts(self, clip: Clip) -> tuple[Drift, ...]:
         """Raises BadClip where a planner drove in the clip as it was."""
         return () if self.explored is None else self.explored.of(clip)
 

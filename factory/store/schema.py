@@ -40,7 +40,7 @@ def _lineage() -> tuple[Column, ...]:
             "vocabulary_index",
             "int32",
             nullable=True,
-            about="row of the vocabulary; -1: log; -2 - n: proposal n; null human",
+            about="row of the vocabulary; -1: log; -2 - n: drift n; null human",
         ),
         Column("vocabulary_digest", "string"),
         Column("settings_hash", "string", about="of the run's settings, see run.json"),

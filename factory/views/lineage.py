@@ -116,7 +116,7 @@ def _candidate_facts(row: Row, clip: Row, record: Row) -> list[tuple[str, object
 
 def _moved_by(index: int, clip: Row, record: Row) -> tuple[str, object]:
     """What perturbs the ego: a row of the vocabulary, or where a planner drove itself; or nothing does."""
-    from tasks.proposals import OF_LOG, number_of
+    from tasks.drifts import OF_LOG, number_of
 
     if index == OF_LOG:
         return "perturbed by", "nothing: the log itself"
@@ -124,7 +124,7 @@ def _moved_by(index: int, clip: Row, record: Row) -> tuple[str, object]:
     if number is None:
         return "vocabulary row", f"{index} of {clip['vocabulary_digest']}"
     said = dict(record.get("settings", {}))
-    return "proposal", f"{number} of planner {said.get('explore.planner')}, in explored {said.get('explore.digest')}"
+    return "drift", f"{number} of planner {said.get('explore.planner')}, in explored {said.get('explore.digest')}"
 
 
 def _attempt_facts(store: "Store", row: Row) -> list[tuple[str, object]]:

@@ -1,1 +1,1 @@
-"""Where a planner drives itself: proposals for the factory, and turns of training and exploring."""
+"""Where a planner drives itself: drifts for the factory, and turns of training and exploring."""

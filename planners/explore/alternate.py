@@ -132,7 +132,7 @@ class Turn:
     clips: int  # explored
     epdms: float  # of the planner's closed loop over the 4 s from T, mean over the clips
     fails: float  # share of these drives that the reward would reject
-    proposals: int
+    drifts: int
     failing: int  # of them those from which the planner fails
     held_out_clips: int
     held_out_epdms: float | None
@@ -151,19 +151,19 @@ def turns_of(settings: AlternateSettings, ended: int) -> list[Turn]:
         away = (
             _driven(settings.place("held_out", turn)) if settings.held_out_clips is not None else (0, None, None, 0, 0)
         )
-        clips, epdms, fails, proposals, failing = own
+        clips, epdms, fails, drifts, failing = own
         assert epdms is not None and fails is not None, "an explored turn has clips"
-        found.append(Turn(turn, samples, explored, clips, epdms, fails, proposals, failing, *away[:3]))
+        found.append(Turn(turn, samples, explored, clips, epdms, fails, drifts, failing, *away[:3]))
     return found
 
 
 def _driven(folder: str) -> tuple[int, float | None, float | None, int, int]:
-    """Clips, mean EPDMS from the log, share of clips in which it fails, proposals, failing ones."""
+    """Clips, mean EPDMS from the log, share of clips in which it fails, drifts, failing ones."""
     rows = open_explored(Location.parse(folder)).read([*FACTS, "score", "fails"]).to_pylist()
     n = len(rows)
     if n == 0:
         return 0, None, None, 0, 0
-    counts = [sum(row[name] for row in rows) for name in ("n_proposals", "n_failing")]
+    counts = [sum(row[name] for row in rows) for name in ("n_drifts", "n_failing")]
     return n, sum(row["score"] for row in rows) / n, sum(bool(row["fails"]) for row in rows) / n, counts[0], counts[1]
 
 

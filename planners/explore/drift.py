@@ -1,7 +1,7 @@
 """Where a planner drives itself within H of the log, and how it does from there.
 
 A way begins with the log, from T for `after_s`; there the planner takes over. In the open loop its plan at T is
-followed for all of H; in the closed loop it plans every 0.5 s. Where it is at T+H is what it proposes. From there it
+followed for all of H; in the closed loop it plans every 0.5 s. Where it is at T+H is its drift. From there it
 drives on in the closed loop for another H, and that drive is judged as an expert's is: by the reward's rules, against
 PDM-Closed, among the traffic that it met. Nothing ends a drive on the way: what it hit or left is what it is judged by.
 """
@@ -67,7 +67,7 @@ class Judgement:
 
 
 @dataclass(frozen=True)
-class Drift:
+class Drifted:
     """A state that a planner drove itself into."""
 
     way: Handover
@@ -88,7 +88,7 @@ def from_the_log(clip: Clip, driver: Driver, eyes: Eyes, judging: Judging) -> Ju
     return NO_PLAN if came is None else _verdict(scene_of_clip(clip), *came, judging)
 
 
-def drift(clip: Clip, way: Handover, driver: Driver, eyes: Eyes, judging: Judging) -> Drift | str:
+def drift(clip: Clip, way: Handover, driver: Driver, eyes: Eyes, judging: Judging) -> Drifted | str:
     """Where a way leads; why it leads nowhere: the gate of the perturbation that its end fails, or as `from_the_log`.
 
     clip: of CLIP_STEPS (planners.drive.starts.lengthened). Raises ValueError where the driver's answer is no plan.
@@ -105,7 +105,7 @@ def drift(clip: Clip, way: Handover, driver: Driver, eyes: Eyes, judging: Judgin
             return gate
     on = drive_on(there, driver, eyes, judging.traffic, HORIZON_STEPS, PLAN_STEPS)
     found = NO_PLAN if on is None else _verdict(there, *on, judging)
-    return found if isinstance(found, str) else Drift(way, states, end_pose, found)
+    return found if isinstance(found, str) else Drifted(way, states, end_pose, found)
 
 
 def handed_over(clip: Clip, step: int) -> Scene:

@@ -86,7 +86,7 @@ def _refuse_another(table: KeyedTable, work: ExploreWork) -> None:
     for row in table.read(["planner", "planner_digest", "settings"]).to_pylist():
         if (row["planner_digest"], row["settings"]) != mine:
             raise ConfigError(
-                f"out={work.settings.out} holds proposals of {row['planner']} ({row['planner_digest']}), or of other "
+                f"out={work.settings.out} holds drifts of {row['planner']} ({row['planner_digest']}), or of other "
                 "settings: choose another out"
             )
 
@@ -116,8 +116,8 @@ def _explore(work: ExploreWork, refs: Sequence[ClipRef], table: KeyedTable) -> l
 
 def told(rows: Sequence[ExploredClip]) -> str:
     """What was found, in three lines."""
-    proposals = [one for row in rows for one in row.proposals]
-    failing = Counter(one.fails for one in proposals if one.fails)
+    drifts = [one for row in rows for one in row.drifts]
+    failing = Counter(one.fails for one in drifts if one.fails)
     dropped = sum((Counter(row.dropped) for row in rows), Counter[str]())
     lost = Counter(row.fails for row in rows if row.fails)
     mean = sum(row.score for row in rows) / len(rows)
@@ -125,7 +125,7 @@ def told(rows: Sequence[ExploredClip]) -> str:
         [
             f"{rows[0].planner} ({rows[0].planner_digest}) in {len(rows)} clips: EPDMS {mean:.3f} over the 4 s from T, "
             f"fails in {lost.total()}{_listed(lost)}",
-            f"proposals: {len(proposals)}; from {failing.total()} of them it fails{_listed(failing)}",
+            f"drifts: {len(drifts)}; from {failing.total()} of them it fails{_listed(failing)}",
             f"ways that led nowhere: {dropped.total()}{_listed(dropped)}",
         ]
     )

@@ -33,7 +33,7 @@ class ExploreSettings:
     workers: int | None = None  # processes; null: one here, every core on Ray
     limit: int | None = None  # the first so many clips only
     device: str = "cpu"  # or cuda
-    perturb: PerturbSettings = field(default_factory=PerturbSettings)  # how far from the log a proposal may end
+    perturb: PerturbSettings = field(default_factory=PerturbSettings)  # how far from the log a drift may end
     traffic: TrafficSettings = field(default_factory=TrafficSettings)
     pdm: PdmSettings = field(default_factory=PdmSettings)
     reward: ExpertGate = field(default_factory=ExpertGate)  # what a drive of the planner must reach not to fail

@@ -6,21 +6,21 @@ from dataclasses import asdict, dataclass
 from factory.readers.base import BadClip, ClipReader, ClipRef
 from factory.setup.settings import cache_folder
 from factory.stages.rows import scene_tags
-from factory.store.explored.table import ExploredClip, ProposalRow
+from factory.store.explored.table import DriftRow, ExploredClip
 from factory.store.identity import canonical_json
 from factory.store.location import Location
 from planners.drive.eyes import Eyes
 from planners.drive.painted import town_lights
 from planners.drive.starts import lengthened
 from planners.drive.work import DrivingPlanner, NotDriven, eyes_of, kept_driver, reads_towns
-from planners.explore.drift import CLIP_STEPS, Drift, drift, from_the_log
+from planners.explore.drift import CLIP_STEPS, Drifted, drift, from_the_log
 from planners.explore.settings import ExploreSettings
 from tasks.stages import stage_versions
 from tasks.world.clip import NOW, Clip, scene_of_clip
 from tasks.world.command import driving_command
 from tasks.world.vehicle import HEADING, VX
 
-EXPLORE_VERSION = 1  # raised by hand whenever the same planner in the same clip proposes otherwise
+EXPLORE_VERSION = 1  # raised by hand whenever the same planner in the same clip drives otherwise
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class ExploreWork:
             score=0.0 if isinstance(log, str) else log.score,
             fails=log if isinstance(log, str) else log.fails,
             dropped=dict(sorted(Counter(one for one in found if isinstance(one, str)).items())),
-            proposals=tuple(proposal_row(i, one) for i, one in enumerate(found) if isinstance(one, Drift)),
+            drifts=tuple(drift_row(i, one) for i, one in enumerate(found) if isinstance(one, Drifted)),
         )
 
     def _clip(self, ref: ClipRef) -> Clip:
@@ -94,10 +94,10 @@ def tags_at_now(clip: Clip) -> tuple[str, ...]:
     return tuple(scene_tags(scene_of_clip(clip), command))
 
 
-def proposal_row(number: int, one: Drift) -> ProposalRow:
+def drift_row(number: int, one: Drifted) -> DriftRow:
     """As the table has it."""
     x, y, heading = (float(value) for value in one.end_pose)
-    return ProposalRow(
+    return DriftRow(
         number=number,
         way=str(one.way),
         end_x=x,

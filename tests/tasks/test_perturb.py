@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from tasks.drifts import OF_LOG
 from tasks.experts.pdm_closed.planner import PdmSettings, plan_for
 from tasks.perturb import (
     Perturbation,
@@ -20,7 +21,6 @@ from tasks.perturb import (
     perturb,
     spread_out,
 )
-from tasks.proposals import OF_LOG
 from tasks.reward.epdms import score
 from tasks.reward.prepare import prepare_scene
 from tasks.rollout.simulate import TrafficSettings, simulate

@@ -1,1 +1,1 @@
-"""What planners proposed: a table of their drives, and what a run takes from it."""
+"""Where planners drove themselves: a table of their drives, and what a run takes from it."""

@@ -1,4 +1,4 @@
-"""The table `explored` under the `out` of `python -m planners explore`: one row a clip, with a planner's proposals.
+"""The table `explored` under the `out` of `python -m planners explore`: one row a clip, with a planner's drifts.
 
 All rows of a table are of one planner and one set of settings, so that a run which takes it can name them.
 """
@@ -15,14 +15,14 @@ from factory.store.identity import canonical_json
 from factory.store.location import Location
 from factory.store.parquet_file import TableSpec, write_shard
 from factory.store.table import KeyedTable
-from tasks.proposals import Proposal
+from tasks.drifts import Drift
 
 TABLE = "explored"
 
 
 @dataclass(frozen=True)
-class ProposalRow:
-    """One proposal of a clip."""
+class DriftRow:
+    """One drift of a clip."""
 
     number: int  # 0 ... in the order of the ways; those of ways that led nowhere are left out
     way: str  # how the planner was let drive, such as "closed loop from 1.0 s"
@@ -35,9 +35,9 @@ class ProposalRow:
     subscores: dict[str, float]  # of that drive
     ego_states: tuple[tuple[float, ...], ...]  # (41, 11) at 10 Hz from T on, world
 
-    def as_proposal(self) -> Proposal:
+    def as_drift(self) -> Drift:
         """As a clip is perturbed by it."""
-        return Proposal(self.number, np.array(self.ego_states), self.score, self.fails)
+        return Drift(self.number, np.array(self.ego_states), self.score, self.fails)
 
 
 @dataclass(frozen=True)
@@ -52,11 +52,11 @@ class ExploredClip:
     tags: tuple[str, ...]  # what is in the scene at T
     planner: str
     planner_digest: str
-    settings: str  # all that the proposals depend on beside clip and planner, canonical JSON
+    settings: str  # all that the drifts depend on beside clip and planner, canonical JSON
     score: float  # EPDMS (/14) of the planner's closed loop from the log at T to T+H
-    fails: str  # as of a proposal, of that drive; or why there is none
-    dropped: dict[str, int]  # why ways led to no proposal -> ways
-    proposals: tuple[ProposalRow, ...]
+    fails: str  # as of a drift, of that drive; or why there is none
+    dropped: dict[str, int]  # why ways led to no drift -> ways
+    drifts: tuple[DriftRow, ...]
 
     @property
     def digest(self) -> str:
@@ -66,9 +66,9 @@ class ExploredClip:
 
 COUNTED = {  # beside what a clip holds
     "digest": pa.string(),
-    "n_proposals": pa.int32(),
+    "n_drifts": pa.int32(),
     "n_failing": pa.int32(),
-    "ends": pa.list_(pa.list_(pa.float64())),  # x, y [m], heading [rad] of each proposal
+    "ends": pa.list_(pa.list_(pa.float64())),  # x, y [m], heading [rad] of each drift
     "fails_from": pa.list_(pa.string()),
 }
 FACTS = (
@@ -77,7 +77,7 @@ FACTS = (
     "planner_digest",
     "settings",
     "digest",
-    "n_proposals",
+    "n_drifts",
     "n_failing",
 )  # what is not as long as a drive
 SCHEMA = pa.schema([*schema_of(ExploredClip), *(pa.field(name, kind) for name, kind in COUNTED.items())])
@@ -96,12 +96,12 @@ def write_explored(table: KeyedTable, clips: Sequence[ExploredClip]) -> None:
 
 
 def _counted(clip: ExploredClip) -> dict[str, object]:
-    fails_from = [one.fails for one in clip.proposals]
+    fails_from = [one.fails for one in clip.drifts]
     return {
         "digest": clip.digest,
-        "n_proposals": len(fails_from),
+        "n_drifts": len(fails_from),
         "n_failing": sum(map(bool, fails_from)),
-        "ends": [[one.end_x, one.end_y, one.end_heading] for one in clip.proposals],
+        "ends": [[one.end_x, one.end_y, one.end_heading] for one in clip.drifts],
         "fails_from": fails_from,
     }
 
@@ -110,6 +110,6 @@ def explored_clips(rows: pa.Table) -> list[ExploredClip]:
     """Rows of the table."""
     found = []
     for row in rows.drop_columns(list(COUNTED)).to_pylist(maps_as_pydicts="strict"):
-        proposals = tuple(ProposalRow(**one) for one in row.pop("proposals"))
-        found.append(ExploredClip(**row, proposals=proposals))
+        drifts = tuple(DriftRow(**one) for one in row.pop("drifts"))
+        found.append(ExploredClip(**row, drifts=drifts))
     return found

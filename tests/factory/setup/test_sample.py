@@ -27,7 +27,7 @@ def config(*words: str) -> RunConfig:
 def scores(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A planner that fails in one clip of forty, the only one with a pedestrian."""
     folder = tmp_path_factory.mktemp("scores")
-    good = [row(ref.clip_id, score=1.0, fails="", proposals=()) for ref in REFS if ref.clip_id != WEAK]
+    good = [row(ref.clip_id, score=1.0, fails="", drifts=()) for ref in REFS if ref.clip_id != WEAK]
     written(folder, *good, row(WEAK, score=0.0, fails="dac", tags=("near_pedestrian",)))
     return folder
 
@@ -84,7 +84,7 @@ def test_scores_are_explore_s_where_none_are_named(scores: Path) -> None:
         (["sample.drawn=true", "sample.tags={slow: -1}"], "not negative"),
         (["sample.rareness=1"], "sample.rareness"),
         (["sample=targeted", "sample.scores=x", "perturb=dense"], "two orders"),
-        (["sample=targeted", "sample.scores=nowhere"], "no proposals in"),
+        (["sample=targeted", "sample.scores=nowhere"], "no drifts in"),
     ],
 )
 def test_what_cannot_be_drawn_is_refused(words: list[str], said: str, tmp_path: Path) -> None:

@@ -111,5 +111,5 @@ def test_a_turn_on_the_town_makes_a_line_of_the_table(tmp_path: Path) -> None:
     with (tmp_path / "out" / TURNS).open() as file:
         (line,) = csv.DictReader(file)
     assert (line["turn"], line["samples"], line["explored_samples"], line["clips"]) == ("0", "2", "0", "2")
-    assert 0.0 <= float(line["epdms"]) <= 1.0 and int(line["failing"]) <= int(line["proposals"]) <= 2
+    assert 0.0 <= float(line["epdms"]) <= 1.0 and int(line["failing"]) <= int(line["drifts"]) <= 2
     assert line["held_out_epdms"] == ""

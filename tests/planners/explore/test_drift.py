@@ -9,7 +9,7 @@ from planners.drive.drivers import DriveEnd, MakeSample
 from planners.drive.eyes import NoEyes
 from planners.drive.loop import LoopSettings, drive
 from planners.drive.starts import lengthened
-from planners.explore.drift import CLIP_STEPS, NO_PLAN, Drift, Handover, Judging, drift, from_the_log, ways_of
+from planners.explore.drift import CLIP_STEPS, NO_PLAN, Drifted, Handover, Judging, drift, from_the_log, ways_of
 from tasks.experts.pdm_closed.settings import PdmSettings
 from tasks.perturb import PerturbSettings
 from tasks.rollout.lqr import track
@@ -26,9 +26,9 @@ def long(clip: Clip) -> Clip:
     return lengthened(clip, CLIP_STEPS)
 
 
-def came(clip: Clip, way: Handover, speed_mps: float, turn_rad: float = 0.0) -> Drift:
+def came(clip: Clip, way: Handover, speed_mps: float, turn_rad: float = 0.0) -> Drifted:
     found = drift(long(clip), way, Steady(speed_mps, turn_rad), NoEyes(), JUDGING)
-    assert isinstance(found, Drift), found
+    assert isinstance(found, Drifted), found
     return found
 
 
@@ -90,9 +90,7 @@ def test_a_drive_from_the_log_is_judged_over_the_first_four_seconds() -> None:
 @pytest.mark.parametrize(
     ("speed_mps", "turn_rad", "gate"), [(1.0, 0.0, "longitudinal"), (8.0, 0.03, "lateral"), (8.0, 0.6, "longitudinal")]
 )
-def test_what_drifts_beyond_the_perturbation_s_gates_proposes_nothing(
-    speed_mps: float, turn_rad: float, gate: str
-) -> None:
+def test_what_drifts_beyond_the_perturbation_s_gates_is_no_drift(speed_mps: float, turn_rad: float, gate: str) -> None:
     assert drift(long(street_with(nobody())), CLOSED, Steady(speed_mps, turn_rad), NoEyes(), JUDGING) == gate
 
 
@@ -108,5 +106,5 @@ class GivesUp:
 
 
 @pytest.mark.parametrize("last_step", [NOW, NOW + 10, NOW + HORIZON_STEPS, NOW + HORIZON_STEPS + 20])
-def test_who_has_no_plan_on_the_way_proposes_nothing(last_step: int) -> None:
+def test_who_has_no_plan_on_the_way_is_no_drift(last_step: int) -> None:
     assert drift(long(street_with(nobody())), CLOSED, GivesUp(last_step), NoEyes(), JUDGING) == NO_PLAN

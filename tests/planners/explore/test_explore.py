@@ -18,7 +18,7 @@ from factory.views.lineage import lineage
 from planners.explore import explore as command
 from planners.explore import work
 from planners.explore.explore import main
-from tasks.proposals import index_of
+from tasks.drifts import index_of
 
 WITHOUT_SENSORS = ["clips.settings.cameras=[]", "clips.settings.lidar_beams=0"]
 
@@ -92,11 +92,11 @@ def test_a_row_holds_the_drives_and_names_the_planner(explored: Path) -> None:
     assert len(found) == 2
     for row in found:
         assert (row.planner, row.planner_digest) == (HASTY.replace(":", "."), "hasty-1")
-        assert len(row.proposals) + sum(row.dropped.values()) == 3
-        for one in row.proposals:
+        assert len(row.drifts) + sum(row.dropped.values()) == 3
+        for one in row.drifts:
             assert np.array(one.ego_states).shape == (41, 11)
             assert 0.0 <= one.score <= 1.0 and bool(one.fails) == (one.fails in one.subscores)
-    assert any(row.proposals for row in found)
+    assert any(row.drifts for row in found)
 
 
 def test_what_is_explored_is_not_explored_again_and_the_parts_make_the_same_rows(
@@ -170,7 +170,7 @@ def test_a_planner_that_looks_is_shown_the_painter_s_pictures(towns: Path, tmp_p
     bright = "planner=tests.planners.drive.looking:Bright"
     assert main(words(towns, tmp_path, *small, bright, "pictures=truth", "perturb.max_longitudinal_m=60")) == COMPLETE
     (row,) = explored_clips(open_explored(Location.parse(tmp_path)).read())
-    speeds = [one.end_speed for one in row.proposals]
+    speeds = [one.end_speed for one in row.drifts]
     assert len(speeds) == 1 and 1.0 < speeds[0] < 10.0
     assert '"pictures":"truth"' in row.settings
 
@@ -200,19 +200,19 @@ def test_a_run_tries_what_the_planner_fails_at_first_and_its_tables_name_the_pla
     fails_of = {
         (row.clip_id, index_of(one.number)): one.fails
         for row in explored_clips(open_explored(Location.parse(explored)).read())
-        for one in row.proposals
+        for one in row.drifts
     }
-    n_proposed = 0
+    n_drifts = 0
     for clip_id, candidates in lists(store).items():
         own = [one for one in candidates if one["vocabulary_index"] >= 0]
         assert [one | {"index": 0} for one in own] == [one | {"index": 0} for one in lists(plain)[clip_id]]
-        proposed = [one for one in candidates if one["vocabulary_index"] < 0]
-        n_proposed += len(proposed)
-        failing = [bool(fails_of[clip_id, one["vocabulary_index"]]) for one in proposed]
+        drifted = [one for one in candidates if one["vocabulary_index"] < 0]
+        n_drifts += len(drifted)
+        failing = [bool(fails_of[clip_id, one["vocabulary_index"]]) for one in drifted]
         n_failing = sum(failing)
         assert failing == sorted(failing, reverse=True)
         assert all(one["vocabulary_index"] < 0 for one in candidates[:n_failing])
-    assert n_proposed > 0
+    assert n_drifts > 0
     samples = store.samples.read(["attempt_id", "clip_id", "vocabulary_index", "tags"]).to_pylist()
     for row in samples:
         fails = fails_of.get((row["clip_id"], row["vocabulary_index"]))
@@ -220,22 +220,25 @@ def test_a_run_tries_what_the_planner_fails_at_first_and_its_tables_name_the_pla
         assert [tag for tag in row["tags"] if tag.startswith("explored")] == expected
     of_planner = next(row["attempt_id"] for row in samples if row["vocabulary_index"] < 0)
     told = {name: str(value) for _, facts in lineage(store, of_planner) for name, value in facts}
-    assert HASTY.replace(":", ".") in told["proposal"] and "hasty-1" in told["proposal"]
+    assert HASTY.replace(":", ".") in told["drift"] and "hasty-1" in told["drift"]
     assert not set(store.samples.keys().tolist()) & set(plain.samples.keys().tolist())
 
+    capsys.readouterr()
     files = sorted(path.name for path in (tmp_path / "out" / "samples").rglob("*.parquet"))
     assert run.main(words) == COMPLETE
     assert sorted(path.name for path in (tmp_path / "out" / "samples").rglob("*.parquet")) == files
+    few = factory_words(towns, tmp_path / "few", f"explore={explored}", "sample=targeted", "limit=1")
+    assert run.main(few) == COMPLETE
+    assert len(lists(Store(tmp_path / "few"))) == 1
+    assert "hasty-1" in Store(tmp_path / "few").runs()[0]["settings"]["sample.candidates"]
     assert run.main(factory_words(towns, tmp_path / "out", "rounds=99")) == BAD_CONFIG
     assert "explore.planner" in capsys.readouterr().err
 
 
-def test_a_run_refuses_what_no_planner_proposed(
-    towns: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_refuses_what_is_no_planner_s(towns: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run.main(factory_words(towns, tmp_path / "out", "explore=planner")) == BAD_CONFIG
     assert "python -m planners explore" in capsys.readouterr().err
     (tmp_path / "empty").mkdir()
     assert run.main(factory_words(towns, tmp_path / "out", f"explore={tmp_path / 'empty'}")) == BAD_CONFIG
-    assert "no proposals in" in capsys.readouterr().err
+    assert "no drifts in" in capsys.readouterr().err
     assert not (tmp_path / "out" / "samples").exists()

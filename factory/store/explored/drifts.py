@@ -1,9 +1,9 @@
-"""The proposals that a run takes: whose they are, which clips have some, and those of one clip."""
+"""The drifts that a run takes: whose they are, which clips have some, and those of one clip."""
 
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -12,7 +12,7 @@ from factory.readers.base import BadClip
 from factory.store.explored.table import FACTS, explored_clips, open_explored
 from factory.store.location import Location
 from factory.store.table import KeyedTable
-from tasks.proposals import Proposal
+from tasks.drifts import Drift
 from tasks.world.clip import Clip
 
 
@@ -24,24 +24,25 @@ class Explored:
     planner: str
     planner_digest: str
     digests: Mapping[str, str] = field(repr=False)  # clip_id -> digest of its row
-    n_proposals: int
+    n_drifts: int
     n_failing: int  # of them those where the planner then fails
 
-    @property
+    @cached_property
     def digest(self) -> str:
         """16 hex digits of every row."""
         rows = "\x1f".join(f"{clip_id} {digest}" for clip_id, digest in sorted(self.digests.items()))
         return hashlib.sha256(rows.encode()).hexdigest()[:16]
 
-    def of(self, clip: Clip) -> tuple[Proposal, ...]:
-        """The clip's proposals by number; none where it was not explored.
+    def of(self, clip: Clip) -> tuple[Drift, ...]:
+        """The clip's drifts by number; none where it was not explored.
 
         Raises BadClip where the clip is another than the planner drove in, and OSError where the row was changed since
         the run began.
         """
         if clip.clip_id not in self.digests:
             return ()
-        (row,) = explored_clips(_rows_of(_table(self.location.uri, _options(self.location)), clip.clip_id))
+        options = tuple(sorted(self.location.options.items()))
+        (row,) = explored_clips(_rows_of(_table(self.location.uri, options, self.digest), clip.clip_id))
         if row.digest != self.digests[clip.clip_id]:
             raise OSError(f"{self.location.uri}: clip {clip.clip_id} was explored anew since this run began")
         if row.content_digest != clip.content_digest:
@@ -50,7 +51,7 @@ class Explored:
                 "clip",
                 f"content digest {clip.content_digest}, explored as {row.content_digest}: restore it or explore anew",
             )
-        return tuple(one.as_proposal() for one in row.proposals)
+        return tuple(one.as_drift() for one in row.drifts)
 
 
 def explored_in(location: Location) -> Explored:
@@ -59,14 +60,15 @@ def explored_in(location: Location) -> Explored:
     rows = table.read(FACTS).to_pylist()
     if not rows:
         raise ValueError(
-            f"no proposals in {location.uri}: python -m planners explore planner=<who> out=<folder> makes them"
+            f"no drifts in {location.uri}: python -m planners explore planner=<who> out=<folder> makes them"
         )
-    made = {(row["planner"], row["planner_digest"], row["settings"]) for row in rows}
+    made = {(row["planner_digest"], row["settings"]) for row in rows}
     if len(made) > 1:
-        raise ValueError(f"{location.uri}: proposals of {len(made)} planners or settings in one table")
+        raise ValueError(f"{location.uri}: drifts of {len(made)} planners or settings in one table")
     digests = {row["clip_id"]: row["digest"] for row in rows}
-    n_proposals, n_failing = (sum(row[name] for row in rows) for name in ("n_proposals", "n_failing"))
-    return Explored(location, rows[0]["planner"], rows[0]["planner_digest"], digests, n_proposals, n_failing)
+    n_drifts, n_failing = (sum(row[name] for row in rows) for name in ("n_drifts", "n_failing"))
+    planner = min(row["planner"] for row in rows)  # its folder may have moved meanwhile
+    return Explored(location, planner, rows[0]["planner_digest"], digests, n_drifts, n_failing)
 
 
 def _rows_of(table: KeyedTable, clip_id: str) -> pa.Table:
@@ -75,11 +77,7 @@ def _rows_of(table: KeyedTable, clip_id: str) -> pa.Table:
     return rows.filter(pc.equal(rows["clip_id"], clip_id))
 
 
-def _options(location: Location) -> tuple[tuple[str, str], ...]:
-    return tuple(sorted(location.options.items()))
-
-
 @lru_cache(maxsize=2)
-def _table(uri: str, options: tuple[tuple[str, str], ...]) -> KeyedTable:
-    """A worker's own, opened once."""
+def _table(uri: str, options: tuple[tuple[str, str], ...], digest: str) -> KeyedTable:
+    """A worker's own, opened once for each state of it."""
     return open_explored(Location(uri, dict(options)))

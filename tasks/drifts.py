@@ -1,7 +1,7 @@
-"""Proposals: motions that a planner drove itself into, which perturb a clip as vocabulary trajectories do.
+"""Drifts: motions that a planner drove itself into, which perturb a clip as vocabulary trajectories do.
 
-A vocabulary says where an ego could be; a planner's own drive says where it will be. What is learned from the states
-that a learner itself comes to is worth more than what is learned from others (DAgger, Ross, Gordon and Bagnell 2011).
+A vocabulary says where an ego could be, a planner's own drive where it will be. To label the states that the learner
+itself comes to is DAgger (Ross, Gordon and Bagnell 2011); here an expert does, where the reward accepts it.
 """
 
 from collections.abc import Iterator, Sequence
@@ -13,7 +13,7 @@ OF_LOG = -1  # stands for the log itself where a vocabulary trajectory has its r
 
 
 @dataclass(frozen=True)
-class Proposal:
+class Drift:
     """Where a planner drove from the log, and how it did from there."""
 
     number: int  # names it among its clip's, 0 ...
@@ -23,23 +23,23 @@ class Proposal:
 
 
 def index_of(number: int) -> int:
-    """What stands for a proposal where a vocabulary trajectory has its row: -2 - number."""
+    """What stands for a drift where a vocabulary trajectory has its row: -2 - number."""
     return OF_LOG - 1 - number
 
 
 def number_of(index: int) -> int | None:
-    """The proposal that `index_of` made this index from; None where it is the log or a row of the vocabulary."""
+    """The drift that `index_of` made this index from; None where it is the log or a row of the vocabulary."""
     return OF_LOG - 1 - index if index < OF_LOG else None
 
 
-def worst_first(proposals: Sequence[Proposal]) -> list[int]:
+def worst_first(drifts: Sequence[Drift]) -> list[int]:
     """Places of those where the planner then failed, then of the others, each by its score; ties by number."""
 
     def rank(place: int) -> tuple[bool, float, int]:
-        one = proposals[place]
+        one = drifts[place]
         return not one.fails, one.score, one.number
 
-    return sorted(range(len(proposals)), key=rank)
+    return sorted(range(len(drifts)), key=rank)
 
 
 def alternating(first: Sequence[int], second: Sequence[int]) -> Iterator[int]:
