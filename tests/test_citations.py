@@ -13,7 +13,10 @@ SOURCES = sorted(
     if path.suffix in (".py", ".yaml", ".yml", ".sh") and path != Path(__file__).resolve()
 )
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "deploy").rglob("*.md")])
-WRITTEN_BY_A_RUN = {"tables.md": "`python -m planners report` writes it beside its plots"}
+WRITTEN_BY_A_RUN = {
+    "tables.md": "`python -m planners report` writes it beside its plots",
+    "arms.md": "`python -m planners sceptic` writes it beside its tables",
+}
 
 CITED = re.compile(r"(?<![\w/<{])((?:[\w.-]+/)*[\w-]+\.md)\b")
 OF_REWARD = re.compile(r"docs/reward\.md ((?:\d[a-l]?(?:,? and |, )?)+)")

@@ -180,7 +180,7 @@ def write_arms(
     differences: Sequence[Mapping[str, Any]],
     held: Sequence[Mapping[str, Any]],
 ) -> None:
-    """driving.csv, driving_differences.csv, bounds_held.csv and sceptic.md."""
+    """driving.csv, driving_differences.csv, bounds_held.csv and arms.md."""
     rows = []
     for one in found:
         for name, drives in one.rows.items():
@@ -192,7 +192,7 @@ def write_arms(
     write_csv(report / "driving_differences.csv", differences)
     if held:
         write_csv(report / "bounds_held.csv", held)
-    (report / "sceptic.md").write_text(text_of(found, differences, held) + "\n")
+    (report / "arms.md").write_text(text_of(found, differences, held) + "\n")
 
 
 def text_of(

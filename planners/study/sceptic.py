@@ -14,7 +14,7 @@ Planners learn for equally many optimiser steps from real samples alone, and fro
 They are scored on towns that nobody learns from: by the two-stage benchmark, and by driving in closed loop, on true
 pictures, each against the others, constant velocity and PDM-Closed, with intervals over towns. What is written goes to
 `report`: what `python -m planners report` makes again of frames.parquet, bounds_held.csv of the benchmark, driving.csv,
-driving_differences.csv and sceptic.md, to be read.
+driving_differences.csv and arms.md, to be read.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,7 @@
-"""Samples as the town's painter shows them: the log's own look like its photos, others as their drives saw it."""
+"""Samples as the town's painter shows them, each where its drive has come to.
+
+That the painter shows the log's photos where the log drives, tests/planners/drive/test_painted.py says.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -9,21 +12,16 @@ import pytest
 
 from factory.config.compose import ConfigError
 from factory.config.run import load_config, run_config
-from factory.graph.work import HUMAN_CANDIDATE, Columns, PreparedClip, attempted
-from factory.readers.settings import TownSettings
+from factory.graph.work import Columns, PreparedClip, attempted
 from factory.setup.settings import assemble
 from factory.stages.pipeline import FactoryWork
 from tasks.render.scene.asset import psnr
-from tasks.stages import HUMAN
 
 CAMERA = "ring_front_center"
-PHOTOS = TownSettings((CAMERA,), 64, 36, jpeg_quality=95, photo_steps=16, steps_per_photo=5, lidar_beams=0)
 WORDS = ["clips=synthetic_towns", "clips.seeds=[3]", "clips.logs_per_town=1", "render.jpeg_quality=95"]
 WORDS += ["render.width=64", "render.height=36", "render.frames=now", "reward.labels=none", "executor=local"]
-WORDS += [f"clips.settings.{name}={getattr(PHOTOS, name)}" for name in ("width", "height", "jpeg_quality")]
-WORDS += ["clips.settings.photo_steps=16", "clips.settings.steps_per_photo=5", "clips.settings.lidar_beams=0"]
-WORDS += [f"clips.settings.cameras=[{CAMERA}]", f"render.cameras=[{CAMERA}]"]
-BLIND = ["clips.settings.cameras=[]", "render=none", "render.mode=painter"]
+WORDS += [f"render.cameras=[{CAMERA}]", "clips.settings.cameras=[]", "clips.settings.lidar_beams=0"]
+PAINTED = ["render=none", "render.mode=painter"]
 
 
 @pytest.fixture(scope="module")
@@ -55,20 +53,11 @@ def now(row: dict[str, object]) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_the_log_s_own_samples_are_painted_like_its_photos(towns: Path) -> None:
-    """Of a log without photos, by the town's usual cameras."""
-    photo = row_of(*prepared_by(towns, "experts=[human]", "render=none", "render.mode=auto"), HUMAN_CANDIDATE, HUMAN)
-    painted = row_of(*prepared_by(towns, "experts=[human]", *BLIND), HUMAN_CANDIDATE, HUMAN)
-    assert (photo["image_source"], painted["image_source"]) == ("photo", "painter")
-    assert psnr(now(painted), now(photo)) > 35.0
-
-
-@pytest.mark.slow
 def test_a_perturbed_drive_is_painted_where_it_has_come_to_and_the_log_alone_where_the_log_was(towns: Path) -> None:
     free = ["experts=[logged]", "reward.full=[]", "reward.progress_above=-1", "reward.off_route=false"]
     free += ["reward.after=false", "vocabulary.k=4096"]
-    moved = row_of(*prepared_by(towns, *BLIND, *free), 0, "logged")
-    logged = row_of(*prepared_by(towns, *BLIND, *free, "perturb.at_log=true", "traffic=replay"), 0, "logged")
+    moved = row_of(*prepared_by(towns, *PAINTED, *free), 0, "logged")
+    logged = row_of(*prepared_by(towns, *PAINTED, *free, "perturb.at_log=true", "traffic=replay"), 0, "logged")
     assert moved["image_source"] == logged["image_source"] == "painter"
     assert psnr(now(moved), now(logged)) < 30.0
     np.testing.assert_allclose(np.asarray(logged["candidate_end"])[:3], 0.0)
