@@ -21,7 +21,7 @@ from factory.graph.work import Stopped, never
 from factory.readers.videos import file_and_frame
 from factory.stages.fitting import fitted
 from factory.stages.own_body import masks_digest, read_masks
-from factory.stages.rig import corrected_rig, known_of, said_again, wanted
+from factory.stages.rig import UsedRig, corrected_rig, known_of, said_again, taken_from, used_rig, wanted
 from factory.stages.scene_file import SUFFIX, BadScene, read_scene, write_scene
 from factory.stages.sensors import block_cameras, block_of, chosen_cameras, load_sensors, load_sweeps, taken_by
 from factory.store.illness import own_place
@@ -122,6 +122,21 @@ def asset_for(
         return write_scene(path, replace(own_part(asset), block=range_of(clip, block)))
 
 
+def corrected_for(clip: Clip, settings: RenderSettings, cache_dir: str | Path) -> UsedRig | None:
+    """What the photos of the clip's block say of rig and poses, without the scene; None: all is used as given.
+
+    Raises BadClip and ValueError as `asset_for` does.
+    """
+    block, rig = block_of(clip), chosen_cameras(clip.cameras, settings.cameras)
+    seen = sensing(clip, settings) in (Sensing.PHOTOS, Sensing.PHOTOS_ONLY)
+    if not (seen and wanted(block, settings.rig)):
+        return None
+    cameras = block_cameras(block, rig)
+    path, masks = scene_path(clip, settings, cache_dir), masks_of(cameras, read_masks(settings.own_body, rig))
+    with only_builder(path):
+        return used_rig(path, block, cameras, settings.rig, masks)
+
+
 def own_part(asset: RenderAsset) -> RenderAsset:
     """A scene without what is of other logs' drives through it alone: their clips have a block of their own."""
     return replace(
@@ -140,15 +155,6 @@ def masks_of(cameras: Sequence[Camera], own: Mapping[str, Bools]) -> dict[str, B
     masks = {camera.name: own.get(own_name(camera.name)) for camera in cameras}
     size = {camera.name: (camera.height, camera.width) for camera in cameras}
     return {name: mask for name, mask in masks.items() if mask is not None and mask.shape == size[name]}
-
-
-def taken_from(given: Sequence[SensorFile], used: Sequence[SensorFile]) -> tuple[TakenFrom, ...]:
-    """Where the photos that are used of those given were taken."""
-    logged = {(file.sensor, file.time_s): file.world_from_ego[2, 3] for file in given}
-    return tuple(
-        TakenFrom(f.sensor, f.time_s, f.world_from_ego, float(f.world_from_ego[2, 3] - logged[f.sensor, f.time_s]))
-        for f in used
-    )
 
 
 def scene_path(clip: Clip, settings: RenderSettings, cache_dir: str | Path) -> Path:

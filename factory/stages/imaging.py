@@ -15,8 +15,10 @@ import numpy as np
 
 from factory.graph.work import Stopped, never
 from factory.readers.base import BadClip
-from factory.stages.assets import Sensing, asset_for, scene_path, sensing
+from factory.stages.assets import Sensing, asset_for, corrected_for, scene_path, sensing
 from factory.stages.painted import town_cameras, town_pictures
+from factory.stages.rig import SAID, UsedRig
+from factory.stages.rows import agent_columns
 from factory.stages.sensors import block_of, chosen_cameras, encode_jpeg, load_photos, taken_by
 from tasks.attempt import Judged
 from tasks.perturb import Candidate
@@ -29,10 +31,11 @@ from tasks.render.scene.asset import RenderAsset
 from tasks.render.settings import STEPS_OF, ImageSource, PsnrGate, RenderMode, RenderSettings
 from tasks.render.views import pose_on_ground, render_views
 from tasks.stages import Rejected
+from tasks.world.agents import AgentTracks
 from tasks.world.arrays import Array, Bytes
 from tasks.world.camera import Camera, SensorFile
-from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip
-from tasks.world.vehicle import X, Y
+from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, Scene
+from tasks.world.vehicle import HEADING, X, Y
 
 NO_IMAGES: dict[str, object] = {"cameras": None, "images": None, "image_source": str(ImageSource.NONE)}
 TAG_OF = {
@@ -62,6 +65,16 @@ class Imaging:
         asset = asset_for(clip, self.settings, self.cache_dir, threads, stopped)
         return found, asset.psnr_db if asset is not None and np.isfinite(asset.psnr_db) else None
 
+    def build_rig(self, clip: Clip) -> bool:
+        """Make sure of what the photos of the clip's block say of its rig: whether nothing was left to find out.
+
+        Raises BadClip for a broken photo.
+        """
+        said = scene_path(clip, self.settings, self.cache_dir).with_suffix(SAID)
+        before = said.exists()
+        corrected_for(clip, self.settings, self.cache_dir)
+        return said.exists() == before
+
     def block_verdict(self, clip: Clip) -> Rejected | None:
         """Build the clip's block, once, and say whether it is good enough to be rendered from.
 
@@ -78,10 +91,11 @@ class Imaging:
         return None
 
     def pictures(self, clip: Clip, candidate: Candidate | None, judged: Judged) -> dict[str, object]:
-        """The image columns of a sample, and the `tags` they add to its own.
+        """The image columns of a sample, the `tags` they add to its own, and heights as its pictures show them.
 
-        A human sample of a clip with photos keeps the photos; everything else is drawn at the simulated poses.
-        Raises BadClip for a broken sensor file, and for a human sample that lacks some of its photos.
+        A human sample of a clip with photos keeps the photos, cut and described by the rig as the scene has it;
+        everything else is drawn at the simulated poses. Raises BadClip for a broken sensor file, and for a human sample
+        that lacks some of its photos.
         """
         if self.settings.mode is RenderMode.MAP:
             rig = clip.cameras or RIGS[self.settings.map_rig]
@@ -171,6 +185,8 @@ class Imaging:
         measured: dict[str, object] = {}
         if asset is not None:
             measured = {"asset_digest": asset.digest, "psnr": asset.psnr_db if np.isfinite(asset.psnr_db) else None}
+            if asset.taken:
+                measured |= heights(scene, asset.on_road(logged), lifted)
         return {"cameras": self.rig(cameras), "images": found, "image_source": str(source), **measured}
 
     def _painted(self, clip: Clip, judged: Judged) -> dict[str, object]:
@@ -190,13 +206,19 @@ class Imaging:
             for offset in STEPS_OF[self.settings.frames]
             for camera in cameras
         ]
+        corrected, higher = _kept_rig(_of_block(clip, self.settings, self.cache_dir)), dict[str, object]()
+        if corrected is not None:
+            first_s = first_of(clip)
+            cameras, files = corrected.as_corrected(cameras), list(corrected.posed(files, first_s))
+            agents = judged.scene.agents.overwritten(judged.scene.step, judged.rollout.agents)
+            higher = heights(judged.scene, corrected.on_road(), corrected.lifted(agents, first_s))
         photos = load_photos(files, cameras, self.settings.width, self.settings.height)
         poses = {(file.sensor, file.time_s): file.world_from_ego for file in files}
         found = [
             self.image(photo.camera, photo.time_s - now_s, poses[photo.camera, photo.time_s], photo.rgb)
             for photo in photos
         ]
-        return {"cameras": self.rig(cameras), "images": found, "image_source": str(ImageSource.PHOTO)}
+        return {"cameras": self.rig(cameras), "images": found, "image_source": str(ImageSource.PHOTO), **higher}
 
     def image(self, camera: str, time_s: float, pose: Array, rgb: Bytes) -> dict[str, object]:
         """An entry of the column `images`: `time_s` from now, of the ego at `pose` (4, 4), rgb (H, W, 3)."""
@@ -221,6 +243,19 @@ class Imaging:
             }
             for camera in resized
         ]
+
+
+def heights(scene: Scene, on_road: Array, lifted: AgentTracks) -> dict[str, object]:
+    """The columns that say how high ego and agents of a sample are, where photos say what the log does not.
+
+    on_road: (P, 4, 4) poses of the ego on the road as photos show it; lifted: the sample's agents, as high above it as
+    they were logged. So they stand in its pictures where its pictures show them.
+    """
+    columns = agent_columns(lifted, scene.step, scene.ego_state[: HEADING + 1])
+    return {
+        "world_from_ego": pose_on_ground(on_road, scene.ego_state[None])[0],
+        "agent_center_z": columns["agent_center_z"],
+    }
 
 
 def photo_at(clip: Clip, camera: str, time_s: float) -> SensorFile:
@@ -285,6 +320,11 @@ def _place(of_clip: _Block) -> Path:
 @lru_cache(maxsize=2)
 def _kept(block: _Block) -> RenderAsset | None:
     return asset_for(block.clip, block.settings, Path(block.cache_dir))
+
+
+@lru_cache(maxsize=2)
+def _kept_rig(block: _Block) -> UsedRig | None:
+    return corrected_for(block.clip, block.settings, Path(block.cache_dir))
 
 
 def album_of(clip: Clip, asset: RenderAsset, settings: RenderSettings) -> Album:

@@ -234,18 +234,25 @@ class FactoryWork:
         return None if digest is None else str(digest(ref))
 
     def block(self, ref: ClipRef) -> str | None:
-        """The reader's name of the clip's block; None where it has none, or this run does not render from blocks."""
+        """The reader's name of the clip's block; None where it has none, or this run asks nothing of blocks."""
         named = getattr(self.reader, "block", None)
-        if named is None or ref in self.broken or not self._simulates or self.render.mode is not RenderMode.AUTO:
+        asked = self._simulates or self.render.rig.may_correct(self.photos_alone)
+        if named is None or ref in self.broken or not asked or self.render.mode is not RenderMode.AUTO:
             return None
         name = named(ref)
         return None if name is None else str(name)
 
     def reconstruct(self, ref: ClipRef, threads: int, stopped: Stopped = never) -> Built:
-        """The clip's block into this machine's cache. Raises BadClip, and Halted where a fit is `stopped`."""
+        """The clip's block into this machine's cache, of a run of the log's own drives what their photos need of it.
+
+        Raises BadClip, and Halted where a fit is `stopped`.
+        """
         watch = Stopwatch()
         with watch.of("reconstruct"):
-            found, psnr_db = self.imaging.build(read_clip(self.reader, ref), threads, stopped)
+            clip = read_clip(self.reader, ref)
+            if not self._simulates:
+                return Built(watch.seconds, self.imaging.build_rig(clip))
+            found, psnr_db = self.imaging.build(clip, threads, stopped)
         return Built(watch.seconds, found, psnr_db)
 
     def doing(self) -> str:

@@ -1,17 +1,20 @@
 """A block's cameras and poses corrected by its photos before anything is made of them, and what that changed, on disk.
 
 `block-<id>.rig.json` lies beside the scene: what was corrected camera by camera, photos that show something else than
-what their neighbours say, and the cameras as they were used.
+what their neighbours say, and cameras and poses as they were used. Photos that samples keep are cut and described by it
+as well, without the scene.
 """
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from factory.stages.own_body import NO_MASKS
+from factory.stages.scene_file import CALIBRATED
 from factory.stages.sensors import SensorData, opened_photos, poses_of, taken_by
 from factory.store.disk import whole_file
 from tasks.render.rig.corners import corners_of
@@ -19,15 +22,51 @@ from tasks.render.rig.correct import Correction, corrected
 from tasks.render.rig.ground import ground_below
 from tasks.render.rig.masks import hidden_by
 from tasks.render.rig.settings import Adjust, RigSettings
+from tasks.render.scene.asset import TakenFrom, rises_of
 from tasks.render.scene.driven_road import driven_roads
 from tasks.render.scene.features import Known
+from tasks.render.scene.movers import lifted
 from tasks.sealed import Damaged, sealed_json, unsealed_json
-from tasks.world.arrays import Bools
-from tasks.world.camera import Camera
+from tasks.world.agents import AgentTracks
+from tasks.world.arrays import Array, Bools
+from tasks.world.camera import Camera, SensorFile
 from tasks.world.clip import Block
 
 SAID = ".rig.json"
+SAME_S = 1e-3  # between the stamp of a photo counted from its clip and from its block
 log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class UsedRig:
+    """A block's cameras, and where its photos were taken, as these say; times count from the block's first step."""
+
+    cameras: tuple[Camera, ...]
+    taken: tuple[TakenFrom, ...]  # all photos, those among them that were left out of the scene
+
+    def as_corrected(self, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
+        """Those of the same names."""
+        mine = {camera.name: camera for camera in self.cameras}
+        return tuple(mine[camera.name] for camera in cameras)
+
+    def posed(self, files: Sequence[SensorFile], first_s: float) -> tuple[SensorFile, ...]:
+        """Photos of the block where they were taken; their own times count from `first_s` of it."""
+        return tuple(replace(file, world_from_ego=self._pose(file.sensor, file.time_s + first_s)) for file in files)
+
+    def _pose(self, camera: str, time_s: float) -> Array:
+        for photo in self.taken:
+            if photo.camera == camera and abs(photo.time_s - time_s) < SAME_S:
+                return photo.world_from_ego
+        raise KeyError(f"{camera} took no photo of the block at {time_s:.3f} s")
+
+    def on_road(self) -> Array:
+        """(P, 4, 4) poses that say how high the road is and how it leans."""
+        return np.stack([photo.world_from_ego for photo in self.taken])
+
+    def lifted(self, agents: AgentTracks, first_s: float) -> AgentTracks:
+        """Tracks whose first step is at `first_s` of the block, as high above that road as they were logged."""
+        times, rises = rises_of(self.taken)
+        return lifted(agents, times - first_s, rises)
 
 
 def wanted(block: Block, settings: RigSettings) -> bool:
@@ -46,8 +85,8 @@ def corrected_rig(
 ) -> tuple[Block, tuple[Camera, ...], Correction | None]:
     """Block and cameras as the photos say they are, and what was found, which is written beside `path`.
 
-    As given, and None, where too few corners are shared to find anything. Raises BadClip for a photo that is
-    missing, broken or not of its camera's size.
+    As given, and None, where too few corners are shared to find anything, which is written as well. Raises BadClip for
+    a photo that is missing, broken or not of its camera's size.
     """
     files = taken_by(cameras, block.images)
     corners = {}
@@ -58,17 +97,49 @@ def corrected_rig(
     found = corrected(cameras, files, [corners[row] for row in range(len(files))], settings)
     if found is None:
         log.warning("%s: too few corners are shared by the photos: calibration and poses are used as given", path.stem)
+        _say(path, {"cameras": [], "used": [], "taken": []})
         return block, tuple(cameras), None
     for line in lines_of(found):
         log.info("%s: %s", path.stem, line)
-    text = sealed_json(described(found))
-    with whole_file(path.with_suffix(SAID), len(text)) as draft:
-        draft.write_text(text)
+    _say(path, described(found, files))
     for file in (files[row] for row in found.strangers):
         log.warning("%s: %s at %.2f s is left out: it does not show what its neighbours do: %s", path.stem, file.sensor,
                     file.time_s, file.uri)  # fmt: skip
     kept = tuple(file for row, file in enumerate(found.files) if row not in found.strangers)
     return replace(block, images=kept), found.cameras, found
+
+
+def _say(path: Path, found: dict[str, object]) -> None:
+    text = sealed_json(found)
+    with whole_file(path.with_suffix(SAID), len(text)) as draft:
+        draft.write_text(text)
+
+
+def used_rig(
+    path: Path, block: Block, cameras: Sequence[Camera], settings: RigSettings, own_body: Mapping[str, Bools] = NO_MASKS
+) -> UsedRig | None:
+    """The rig as it is told beside `path`, found first where nothing is told there; None where nothing can be found.
+
+    Raises BadClip.
+    """
+    said = path.with_suffix(SAID)
+    try:
+        told = unsealed_json(said.read_bytes())
+    except FileNotFoundError:
+        told = {}
+    except Damaged as error:
+        log.warning("%s: %s; it is written again", said, error)
+        told = {}
+    if "taken" not in told:  # files of older versions have none
+        corrected_rig(path, block, cameras, settings, own_body)
+        told = unsealed_json(said.read_bytes())
+    used: dict[str, dict[str, Any]] = {
+        row["name"]: {key: np.array(row[key], np.float64) for key in CALIBRATED} for row in told["used"]
+    }
+    if not used:
+        return None
+    taken = (TakenFrom(name, t, np.reshape(pose, (4, 4)), *more) for name, t, *more, pose in told["taken"])
+    return UsedRig(tuple(replace(camera, **used[camera.name]) for camera in cameras), tuple(taken))
 
 
 def said_again(
@@ -78,7 +149,7 @@ def said_again(
     said = path.with_suffix(SAID)
     try:
         unsealed_json(said.read_bytes())
-    except FileNotFoundError:  # nothing was found, or somebody took it away
+    except FileNotFoundError:  # somebody took it away
         return
     except Damaged as error:
         log.warning("%s: %s; it is written again", said, error)
@@ -97,8 +168,19 @@ def known_of(data: SensorData, block: Block, found: Correction) -> Known:
     return Known(road, found.points)
 
 
-def described(found: Correction) -> dict[str, object]:
-    """What was found, as plain JSON values."""
+def taken_from(given: Sequence[SensorFile], used: Sequence[SensorFile]) -> tuple[TakenFrom, ...]:
+    """Where the photos that are used of those given were taken."""
+    logged = {(file.sensor, file.time_s): file.world_from_ego[2, 3] for file in given}
+    return tuple(
+        TakenFrom(
+            f.sensor, f.time_s, f.world_from_ego, float(f.world_from_ego[2, 3] - logged[f.sensor, f.time_s]), f.late_s
+        )
+        for f in used
+    )
+
+
+def described(found: Correction, given: Sequence[SensorFile]) -> dict[str, Any]:
+    """What was found of the photos as `given`, as plain JSON values."""
     return {
         "cameras": [asdict(change) for change in found.changes],
         "ego_shift_m": found.ego_shift_m,
@@ -106,13 +188,12 @@ def described(found: Correction) -> dict[str, object]:
         "points": len(found.points),
         "left_out": [[found.files[row].sensor, found.files[row].time_s] for row in found.strangers],
         "used": [
-            {
-                "name": camera.name,
-                "intrinsics": camera.intrinsics.tolist(),
-                "distortion": camera.distortion.tolist(),
-                "ego_from_camera": camera.ego_from_camera.tolist(),
-            }
+            {"name": camera.name} | {name: getattr(camera, name).tolist() for name in CALIBRATED}
             for camera in found.cameras
+        ],
+        "taken": [
+            [photo.camera, photo.time_s, photo.rise_m, photo.late_s, photo.world_from_ego.ravel().tolist()]
+            for photo in taken_from(given, found.files)
         ],
     }
 

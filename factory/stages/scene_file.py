@@ -126,7 +126,7 @@ def described_by(asset: RenderAsset) -> dict[str, Any]:
     """What of the scene is no array, as plain JSON values; NaN is null."""
     block = asset.block
     rig = [_calibration(camera) for camera in asset.rig]
-    taken = [[photo.camera, photo.time_s, photo.rise_m] for photo in asset.taken]
+    taken = [[photo.camera, photo.time_s, photo.rise_m, photo.late_s] for photo in asset.taken]
     bodies = [body.camera for body in asset.bodies]
     return {
         "format": FORMAT,
@@ -194,6 +194,8 @@ def _calibration(camera: Camera) -> dict[str, Any]:
     plain = {name: getattr(camera, name) for name in ("name", "width", "height")}
     plain |= {name: getattr(camera, name).tolist() for name in CALIBRATED}
     lens = camera.fisheye
+    if camera.readout_s:
+        plain |= {"readout_s": camera.readout_s}
     return plain if lens is None else plain | {"fisheye": [lens.intrinsics.tolist(), lens.terms.tolist()]}
 
 

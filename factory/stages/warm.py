@@ -26,7 +26,6 @@ from tasks.experts.pdm_smooth.planner import plan_smooth
 from tasks.experts.protocol import Plan
 from tasks.kernels.compiled import USED, cache_dir, make_cache_dir, not_kept, processor, write_whole
 from tasks.render import warm as render_warm
-from tasks.render.rig.settings import Adjust
 from tasks.render.settings import RenderMode, RenderSettings, SceneFrom
 from tasks.reward.epdms import score
 from tasks.reward.labels import Labelling, reactive_scores, vocabulary_labels
@@ -67,7 +66,7 @@ def parts_of(
         parts.append("drive")
     if render.mode is RenderMode.AUTO:
         parts.append("fit" if render.scene is SceneFrom.FIT else "render")
-        if render.rig.adjust is Adjust.ON or (render.rig.adjust is Adjust.AUTO and photos_alone):
+        if render.rig.may_correct(photos_alone):
             parts.append("rig")
     return parts
 

@@ -3,6 +3,7 @@
 Everything comes from the store: rows, and the scenes in its cache. Photos are those of the log's human samples.
 """
 
+import json
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -46,6 +47,7 @@ ASIDE_M = (2.0, 1.0, 0.0, -1.0, -2.0)  # left is positive, and on the left of th
 STRIP_PX = (320, 180 + CAPTION_PX + 4)
 HOLD_S = 0.5  # how long a stored image stands in a film: they are taken at 2 Hz,
 SLACK_S = 0.06  # give or take this much
+HEIGHTS_OF_PICTURES = 8  # the version of `render` from which on rows have heights as their pictures show them
 VIEW_COLUMNS = (
     *BEV_COLUMNS,
     *(name for name in SCHEMA.names if name.startswith("agent_") and name not in BEV_COLUMNS),
@@ -54,6 +56,7 @@ VIEW_COLUMNS = (
     "log_id",
     "clip_start_s",
     "now_s",
+    "stage_versions",
     "world_from_ego",
     "cameras",
     "images",
@@ -210,8 +213,10 @@ def _in_time_of(row: Row, asset: RenderAsset) -> RenderAsset:
 
 
 def _agents_in(row: Row, asset: RenderAsset) -> AgentTracks:
-    """The row's agents as high above the scene's road as they were logged."""
-    return asset.lifted(agents_of(row), _first_of(row, asset))
+    """The row's agents as high above the scene's road as they were logged; older rows have them as high as logged."""
+    agents = agents_of(row)
+    raised = json.loads(row["stage_versions"]).get("render", 0) >= HEIGHTS_OF_PICTURES
+    return agents if raised else asset.lifted(agents, _first_of(row, asset))
 
 
 def _first_of(row: Row, asset: RenderAsset) -> float:

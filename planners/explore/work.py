@@ -5,12 +5,12 @@ from dataclasses import asdict, dataclass
 
 from factory.readers.base import BadClip, ClipReader, ClipRef
 from factory.setup.settings import cache_folder
+from factory.stages.painted import town_lights
 from factory.stages.rows import scene_tags
 from factory.store.explored.table import DriftRow, ExploredClip
 from factory.store.identity import canonical_json
 from factory.store.location import Location
 from planners.drive.eyes import Eyes
-from planners.drive.painted import town_lights
 from planners.drive.starts import lengthened
 from planners.drive.work import DrivingPlanner, NotDriven, eyes_of, kept_driver, reads_towns
 from planners.explore.drift import CLIP_STEPS, Drifted, drift, from_the_log

@@ -7,6 +7,7 @@ import numpy as np
 from tasks.world.arrays import Array
 
 ROTATION_SLACK = 1e-3  # of calibrations written with few digits
+MAX_READOUT_S = 0.2  # slower is no camera of a car: seconds were meant to be milliseconds
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,7 @@ class Camera:
     distortion: Array  # (5,) k1, k2, p1, p2, k3; zeros for an undistorted image
     ego_from_camera: Array  # (4, 4) rigid
     fisheye: Fisheye | None = None  # the lens its photos were taken with, which all else knows nothing of
+    readout_s: float = 0.0  # from the first row's exposure to the last one's; below 0: from below; 0: all rows at once
 
     def __post_init__(self) -> None:
         for name, shape in (("intrinsics", (3, 3)), ("distortion", (5,)), ("ego_from_camera", (4, 4))):
@@ -44,6 +46,10 @@ class Camera:
                 raise ValueError(f"camera {self.name}: {name}: shape {np.shape(array)}, expected {shape}")
             if not np.isfinite(array).all():
                 raise ValueError(f"camera {self.name}: {name}: NaN or infinity")
+        if not abs(self.readout_s) <= MAX_READOUT_S:
+            raise ValueError(f"camera {self.name}: readout_s: {self.readout_s}, expected {MAX_READOUT_S:g} s at most")
+        if self.readout_s and self.fisheye is not None:
+            raise ValueError(f"camera {self.name}: readout_s: not for a fisheye, whose rows a pinhole has not")
         if self.width < 1 or self.height < 1:
             raise ValueError(f"camera {self.name}: size: {self.width}x{self.height} pixels")
         if min(self.intrinsics[0, 0], self.intrinsics[1, 1]) <= 0.0:
@@ -94,3 +100,9 @@ class SensorFile:
     time_s: float  # relative to the clip's start (its first step)
     world_from_ego: Array  # (4, 4) at this time
     ego_from_sensor: Array | None = None  # (4, 4) of a sweep whose points are in its sensor's frame; None: in the ego's
+    late_s: float = 0.0  # so much later than said was it taken, where photos say so; its pose is that of then
+
+    @property
+    def taken_s(self) -> float:
+        """When it was taken, on the clock of `time_s`, which it keeps as its name."""
+        return self.time_s + self.late_s

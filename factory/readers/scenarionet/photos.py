@@ -145,8 +145,11 @@ def _camera(name: str, fields: Mapping[str, Any], file: str, under: str) -> Came
             raise BadClip(file, under + "fisheye", "a lens is either a fisheye or has `distortion`")
         fisheye = Fisheye(intrinsics, _array(fields["fisheye"], (4,), file, under + "fisheye"))
     mount = _rigid(fields.get("cam_to_ego"), file, under + "cam_to_ego")
+    readout_s = fields.get("readout_s", 0.0)
+    if isinstance(readout_s, bool) or not isinstance(readout_s, int | float):
+        raise BadClip(file, under + "readout_s", f"{readout_s!r}: expected seconds from the first row to the last")
     try:
-        return Camera(name, width, height, intrinsics, distortion, mount, fisheye)
+        return Camera(name, width, height, intrinsics, distortion, mount, fisheye, float(readout_s))
     except ValueError as error:
         raise BadClip(file, under.rstrip(".") or "camera", str(error)) from error
 

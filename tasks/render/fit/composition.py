@@ -25,7 +25,7 @@ def parts_of(problem: Problem, owner: ShortInts, photo: Photo) -> list[OwnedGaus
     """The parts of the scene that a photo (pose local) may show, the background first; `owner` (N,) as of the state."""
     n = int(np.searchsorted(owner, 0))
     parts = [OwnedGaussians(0, np.arange(n), None)]
-    boxes, valid = problem.tracks.at(photo.time_s)
+    boxes, valid = problem.tracks.at(photo.taken_s)
     frames = world_from_boxes(boxes)
     for j in np.flatnonzero(valid & _in_view(boxes, photo)):
         first, last = np.searchsorted(owner, [j, j + 1])

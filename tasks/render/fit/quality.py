@@ -43,7 +43,7 @@ def measured(
     """
     photo, target = shot.photo, shot.compared.target
     height, width = target.weight.shape
-    boxes, valid = problem.tracks.at(photo.time_s)
+    boxes, valid = problem.tracks.at(photo.taken_s)
     rows = np.flatnonzero(valid)
     there = Vehicles(
         tuple(problem.tracks.ids[j] for j in rows),

@@ -109,7 +109,7 @@ def prepare(
     eyes = np.stack([p.world_from_camera[:3, 3] for p in train])
     surface = find_road(points.every, eyes) if settings.road else None
     cars = [nodes.get(i) for i in tracks.ids]
-    bodies = _bodies(cars, tracks, [p.time_s for p in train])
+    bodies = _bodies(cars, tracks, [p.taken_s for p in train])
     state = _first_state(background, cars, bodies, sky_of(alike, seen).rgb, exposures, surface, settings)
     unknown = [track_id not in nodes for track_id in tracks.ids]
     hidden = [_hidden(p, tracks, np.array(unknown, bool)) for p in local]
@@ -151,7 +151,7 @@ def _bodies(nodes: Sequence[Gaussians | None], tracks: Tracks, times_s: Sequence
 
 def _hidden(photo: Photo, tracks: Tracks, unknown: Bools) -> Bools | None:
     """Pixels of what moves and has no Gaussians of its own, the own body too: it would be painted on the street."""
-    boxes, valid = tracks.at(photo.time_s)
+    boxes, valid = tracks.at(photo.taken_s)
     if not (valid & unknown).any():
         return photo.own_body
     height, width = photo.rgb.shape[:2]

@@ -4,6 +4,7 @@ Cauchy's loss, whose width shrinks from round to round: what is far off at first
 then, and what stays far off does not count in the end. Levenberg-Marquardt with the points eliminated.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +31,7 @@ class Matched:
     view_of: Ints  # (N,) row of the photo
     at: Array  # (N, 2) pixels of the photo as taken
     pixel: Array  # (N,) pixels of the photo per pixel of the picture that corners were looked for in
+    after_s: Array | None = None  # (N,) how long after the middle row of its photo a corner was read; None: all at once
 
     @property
     def point_of(self) -> Ints:
@@ -46,10 +48,20 @@ class Bundle:
     used: Bools  # (N,)
 
 
-def adjusted(rig: Rig, shots: Shots, matched: Matched, sigmas: Array) -> Bundle:
-    """The rig that explains the corners best without leaving the given one by many `sigmas` (n,); 0 holds."""
-    now, points = rig, np.zeros((len(matched.starts) - 1, 3))
-    for width in WIDTHS_PX:
+def adjusted(
+    rig: Rig,
+    shots: Shots,
+    matched: Matched,
+    sigmas: Array,
+    start: Rig | None = None,
+    widths: Sequence[float] = WIDTHS_PX,
+) -> Bundle:
+    """The rig that explains the corners best without leaving the given one by many `sigmas` (n,); 0 holds.
+
+    `start`: where to begin, by default at the given one.
+    """
+    now, points = start or rig, np.zeros((len(matched.starts) - 1, 3))
+    for width in widths:
         points, there = triangulated(now, shots, matched)
         off = offsets(now, shots, matched, points)
         used = with_company((off < OUT * width) & there[matched.point_of], matched)
@@ -61,11 +73,24 @@ def adjusted(rig: Rig, shots: Shots, matched: Matched, sigmas: Array) -> Bundle:
 
 def without(matched: Matched, views: Array) -> Matched:
     """Without the corners of some photos, and without points that then have fewer than two."""
-    keep = ~np.isin(matched.view_of, views)
+    return part_of(matched, ~np.isin(matched.view_of, views))
+
+
+def part_of(matched: Matched, keep: Bools) -> Matched:
+    """The corners (N,) to keep, but for those whose point then has fewer than two."""
     count = np.bincount(matched.point_of, keep, len(matched.starts) - 1)
-    keep &= (count >= 2)[matched.point_of]
+    keep = keep & (count >= 2)[matched.point_of]
     ends = np.cumsum(count[count >= 2]).astype(np.int64)
-    return Matched(np.concatenate([[0], ends]), matched.view_of[keep], matched.at[keep], matched.pixel[keep])
+    after_s = None if matched.after_s is None else matched.after_s[keep]
+    return Matched(np.concatenate([[0], ends]), matched.view_of[keep], matched.at[keep], matched.pixel[keep], after_s)
+
+
+def read_after_s(matched: Matched, shots: Shots, readouts_s: Array, heights: Array) -> Array | None:
+    """(N,) how long after the middle row of its photo each corner was read; None where no camera (C,) reads by rows."""
+    if not readouts_s.any():
+        return None
+    camera_of = shots.camera_of[matched.view_of]
+    return np.asarray(readouts_s[camera_of] * (matched.at[:, 1] / heights[camera_of] - 0.5))
 
 
 def with_company(used: Bools, matched: Matched) -> Bools:
@@ -80,9 +105,22 @@ def offsets(rig: Rig, shots: Shots, matched: Matched, points: Array) -> Array:
 
 
 def _residuals(rig: Rig, shots: Shots, matched: Matched, points: Array) -> Array:
-    ego_from_world, camera_from_ego = np.linalg.inv(rig.ego_poses(shots)), np.linalg.inv(rig.ego_from_camera)
-    of_photo = matched.view_of, matched.at, shots.camera_of, ego_from_world, camera_from_ego, rig.lenses
+    view_of, seen = _seen(shots, matched)
+    ego_from_world = np.linalg.inv(rig.ego_poses(seen, _after(matched)))
+    of_photo = view_of, matched.at, seen.camera_of, ego_from_world, np.linalg.inv(rig.ego_from_camera), rig.lenses
     return np.asarray(residuals(points, matched.point_of, *of_photo))
+
+
+def _seen(shots: Shots, matched: Matched) -> tuple[Ints, Shots]:
+    """The photos and which a corner (N,) is of; where rows are read one after the other, each corner as its own."""
+    if matched.after_s is None:
+        return matched.view_of, shots
+    v = matched.view_of
+    return np.arange(len(v)), Shots(shots.camera_of[v], shots.instant_of[v], shots.world_from_ego[v], shots.twists[v])
+
+
+def _after(matched: Matched) -> Array | float:
+    return 0.0 if matched.after_s is None else matched.after_s
 
 
 def rays(rig: Rig, shots: Shots, matched: Matched) -> tuple[Array, Array]:
@@ -99,7 +137,8 @@ def rays(rig: Rig, shots: Shots, matched: Matched) -> tuple[Array, Array]:
             (seen[0] - 2.0 * p1 * x * y - p2 * (r2 + 2.0 * x * x)) / s,
             (seen[1] - p1 * (r2 + 2.0 * y * y) - 2.0 * p2 * x * y) / s,
         )
-    pose = (rig.ego_poses(shots) @ rig.ego_from_camera[shots.camera_of])[matched.view_of]
+    view_of, seen_by = _seen(shots, matched)
+    pose = (rig.ego_poses(seen_by, _after(matched)) @ rig.ego_from_camera[seen_by.camera_of])[view_of]
     way = np.einsum("nij,nj->ni", pose[:, :3, :3], np.column_stack([x, y, np.ones(len(x))]))
     return pose[:, :3, 3], way / np.linalg.norm(way, axis=1, keepdims=True)
 
@@ -132,6 +171,7 @@ def _settled(
     free = sigmas > 0.0
     trust = np.where(free, 1.0 / np.where(free, sigmas, 1.0) ** 2, 0.0)
     places = _places(rig, shots, matched)
+    view_of, seen = _seen(shots, matched)
     damping = DAMPING[0]
     width_px = width * matched.pixel
 
@@ -145,10 +185,10 @@ def _settled(
 
     cost, weights = cost_of(rig, points)
     for _ in range(STEPS):
-        ego_from_world, camera_from_ego = np.linalg.inv(rig.ego_poses(shots)), np.linalg.inv(rig.ego_from_camera)
+        ego_from_world = np.linalg.inv(rig.ego_poses(seen, _after(matched)))
         matrix, right, inverses, sides, mixed = normal_equations(
-            points, matched.starts, matched.view_of, matched.at, weights, damping, shots.camera_of, places,
-            ego_from_world, camera_from_ego, rig.lenses, shots.twists, len(sigmas),
+            points, matched.starts, view_of, matched.at, weights, damping, seen.camera_of, places,
+            ego_from_world, np.linalg.inv(rig.ego_from_camera), rig.lenses, seen.twists, len(sigmas),
         )  # fmt: skip
         right = right - trust * rig.away_from(given)
         matrix[np.diag_indices(len(sigmas))] = np.diag(matrix) * (1.0 + damping) + trust

@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from tasks.render.rig.adjust import Bundle, Matched, adjusted, offsets, triangulated, without
+from tasks.render.rig.adjust import Bundle, Matched, adjusted, offsets, read_after_s, triangulated, without
 from tasks.render.rig.corners import Corners
+from tasks.render.rig.late import delays, with_stamps
 from tasks.render.rig.matching import matched_corners, pairs
 from tasks.render.rig.normal import N_CAMERA
 from tasks.render.rig.rig import Rig, Shots, camera_of_rig, given_rig, twists_of
@@ -64,6 +65,8 @@ def corrected(
     matched = matched_corners(rig, shots, corners, pairs(rig, shots, cameras, settings.partners))
     if len(matched.starts) <= LEAST_POINTS:
         return None
+    readouts_s, heights = (np.array([getattr(c, name) for c in cameras]) for name in ("readout_s", "height"))
+    matched = replace(matched, after_s=read_after_s(matched, shots, readouts_s, heights))
     sigmas = sigmas_of(cameras, len(rig.corrections), settings)
     bundle = adjusted(rig, shots, matched, sigmas)
     strangers = _strangers(bundle, shots, matched, corners, settings)
@@ -72,6 +75,10 @@ def corrected(
         if len(matched.starts) <= LEAST_POINTS:
             return None
         bundle = adjusted(rig, shots, matched, sigmas)
+    if settings.stamp_s > 0.0:
+        believed = delays(rig, shots, matched, bundle, sigmas, settings.stamp_s).believed
+        if believed.any():
+            bundle = adjusted(rig, shots, matched, with_stamps(sigmas, believed, settings.stamp_s))
     points = bundle.points[np.bincount(matched.point_of, bundle.used, len(bundle.points)) > 0]
     if len(points) < LEAST_POINTS:
         return None
@@ -108,7 +115,10 @@ def corrected(
         )
     return Correction(
         tuple(camera_of_rig(camera, end, k) for k, camera in enumerate(cameras)),
-        tuple(replace(file, world_from_ego=pose) for file, pose in zip(files, poses)),
+        tuple(
+            replace(file, world_from_ego=pose, late_s=float(late))
+            for file, pose, late in zip(files, poses, end.stamps[shots.camera_of])
+        ),
         points + shift,
         tuple(changes),
         float(np.sqrt((of_pose[:, :3] ** 2).sum(axis=1).mean())),
@@ -125,7 +135,7 @@ def _scale(places: Array, given: Array) -> float:
 
 
 def sigmas_of(cameras: Sequence[Camera], n_instants: int, settings: RigSettings) -> Array:
-    """(n,) what each parameter of a rig may be off by, in the order of `Rig.away_from`."""
+    """(n,) what each parameter of a rig may be off by, in the order of `Rig.away_from`; stamps: nothing."""
     of_instant = np.repeat([settings.pose_shift_m, np.radians(settings.pose_turn_deg)], 3)
     # Poses are off together, bit by bit along the drive: all of them weigh as much as one camera does.
     rows = [np.tile(of_instant * np.sqrt(n_instants), n_instants)]
@@ -133,7 +143,7 @@ def sigmas_of(cameras: Sequence[Camera], n_instants: int, settings: RigSettings)
         mount = [settings.shift_m] * 3 + [np.radians(settings.turn_deg)] * 3
         pinhole = [settings.focal * camera.intrinsics[0, 0]] * 2 + [settings.centre * camera.width] * 2
         lens = settings.lens * np.array([1.0, 1.0, 0.1, 0.1, 1.0])
-        rows += [np.array(mount), np.array(pinhole), lens, np.array([settings.stamp_s])]
+        rows += [np.array(mount), np.array(pinhole), lens, np.zeros(1)]
     return np.concatenate(rows)
 
 

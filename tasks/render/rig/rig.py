@@ -32,9 +32,9 @@ class Rig:
     stamps: Array  # (C,) [s] that a camera's photos were taken later than said
     corrections: Array  # (T, 4, 4) of each instant: world_from_ego @ correction is where the ego was
 
-    def ego_poses(self, shots: Shots) -> Array:
-        """(V, 4, 4) corrected world_from_ego of the photos."""
-        late = motions(self.stamps[shots.camera_of, None] * shots.twists)
+    def ego_poses(self, shots: Shots, after_s: Array | float = 0.0) -> Array:
+        """(V, 4, 4) corrected world_from_ego of the photos, `after_s` (V,) after their middle row was read."""
+        late = motions((self.stamps[shots.camera_of] + after_s)[:, None] * shots.twists)
         return np.asarray(shots.world_from_ego @ late @ self.corrections[shots.instant_of])
 
     def moved(self, step: Array) -> "Rig":

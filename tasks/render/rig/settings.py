@@ -23,7 +23,7 @@ class RigSettings:
     focal: float = 0.01  # share of the focal lengths
     centre: float = 0.01  # of the principal point, as a share of the width
     lens: float = 0.02  # of k1, k2, k3; of p1, p2 a tenth
-    stamp_s: float = 0.0  # of a camera's stamps against the ego's
+    stamp_s: float = 0.05  # of a camera's stamps against the ego's, where photos can tell
     pose_turn_deg: float = 0.5  # of the ego, root mean square over the drive
     pose_shift_m: float = 0.2
 
@@ -35,3 +35,7 @@ class RigSettings:
         for name in sigmas:
             if not 0.0 <= getattr(self, name) < float("inf"):
                 raise ValueError(f"rig {name} must be 0 or more, not {getattr(self, name)}")
+
+    def may_correct(self, photos_alone: bool) -> bool:
+        """Whether a run may have a rig to correct; photos_alone: its clips may have photos and no lidar."""
+        return self.adjust is Adjust.ON or (self.adjust is Adjust.AUTO and photos_alone)

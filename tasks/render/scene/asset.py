@@ -90,6 +90,7 @@ class TakenFrom:
     time_s: float  # since the block's first step
     world_from_ego: Array  # (4, 4)
     rise_m: float = 0.0  # higher than the log has it
+    late_s: float = 0.0  # and later than `time_s`
 
 
 @dataclass(frozen=True)
@@ -124,9 +125,9 @@ class RenderAsset:
         """The files that it was made of, at the poses it was made with; all as given, where none was corrected."""
         if not self.taken:
             return tuple(files)
-        poses = {(photo.camera, photo.time_s): photo.world_from_ego for photo in self.taken}
-        mine = [file for file in files if (file.sensor, file.time_s) in poses]
-        return tuple(replace(file, world_from_ego=poses[file.sensor, file.time_s]) for file in mine)
+        taken = {(photo.camera, photo.time_s): photo for photo in self.taken}
+        pairs = [(file, taken.get((file.sensor, file.time_s))) for file in files]
+        return tuple(replace(f, world_from_ego=t.world_from_ego, late_s=t.late_s) for f, t in pairs if t is not None)
 
     def on_road(self, logged: Array) -> Array:
         """Poses (S, 4, 4) of the ego that say how high the scene's road is and how it leans: the `logged` ones, or

@@ -96,7 +96,7 @@ def surfaces(photos: Sequence[Photo], seen: Sequence[Seen], tracks: Tracks) -> t
     for photo, sight in zip(photos, seen):
         rgb = photo.rgb.astype(np.float32) / 255.0
         discs = discs_of_photo(rgb, sight.depth, sight.label, photo.intrinsics, photo.world_from_camera)
-        boxes, valid = tracks.at(photo.time_s)
+        boxes, valid = tracks.at(photo.taken_s)
         poses = world_from_boxes(boxes)
         owner = owners(discs.points, boxes, valid)
         at = (discs.pixels[:, 0], discs.pixels[:, 1])
@@ -156,7 +156,7 @@ def _members(asset: RenderAsset, tracks: Tracks, time_s: float) -> tuple[list[in
 
 def _picture(asset: RenderAsset, photo: Photo, tracks: Tracks) -> F32:
     """The rendering of a photo (pose local) as the scene was at its time."""
-    rows, boxes = _members(asset, tracks, photo.time_s)
+    rows, boxes = _members(asset, tracks, photo.taken_s)
     present = Vehicles(tuple(tracks.ids[j] for j in rows), tuple(tracks.kinds[j] for j in rows), boxes[rows])
     height, width = photo.rgb.shape[:2]
     camera = Pinhole(photo.intrinsics, shifted(photo.world_from_camera, asset.origin), width, height)
@@ -182,7 +182,7 @@ def _refit(asset: RenderAsset, photos: Sequence[Photo], seen: Sequence[Seen], tr
     for photo, sight in zip(photos, seen):
         height, width = photo.rgb.shape[:2]
         camera = photo.intrinsics, photo.world_from_camera, width, height
-        there, boxes = _members(asset, tracks, photo.time_s)
+        there, boxes = _members(asset, tracks, photo.taken_s)
         there = [j for j in there if tracks.ids[j] in place]
         ids = [tracks.ids[j] for j in there]
         splats = splat(scene_at(asset, ids, [AgentKind.VEHICLE] * len(ids), boxes[there]), *camera, screen=asset.screen)

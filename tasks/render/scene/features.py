@@ -72,7 +72,7 @@ def triangulated(photos: Sequence[Photo], tracks: Tracks) -> Array:
         for j in _partners(photos, i):
             first, second = _matches(found[i][1], found[j][1])
             points = _meeting(photo, photos[j], corners[i][first], corners[j][second])
-            for time_s in (photo.time_s, photos[j].time_s):
+            for time_s in (photo.taken_s, photos[j].taken_s):
                 boxes, valid = tracks.at(time_s)
                 points = points[owners(points, boxes, valid) < 0]
             parts.append(points)

@@ -27,6 +27,12 @@ class Photo:
     intrinsics: Array  # (3, 3) pixels, the centre of pixel (0, 0) at (0.5, 0.5)
     world_from_camera: Array  # (4, 4)
     own_body: Bools | None = None  # (H, W) shows the car that carries the camera
+    late_s: float = 0.0  # so much later than `time_s` says was it taken
+
+    @property
+    def taken_s(self) -> float:
+        """When everything was where it shows it."""
+        return self.time_s + self.late_s
 
 
 def reduced(photo: Photo, width: int) -> Photo:

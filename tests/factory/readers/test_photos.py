@@ -17,8 +17,15 @@ from factory.readers.scenarionet.photos import read_photographs
 from factory.readers.scenarionet.reader import ScenarioNetReader
 from factory.readers.videos import file_and_frame, frame_uri, video_frames
 from factory.stages.assets import Sensing, block_id, sensing
+from factory.stages.scene_file import read_scene, write_scene
 from factory.stages.sensors import block_of, encode_jpeg, load_photos, load_sensors
+from factory.store.cache import ClipCache
+from factory.store.location import Location
+from tasks.render.scene.asset import RenderAsset
+from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
 from tasks.render.settings import RenderSettings
+from tasks.render.splatting.gaussians import EMPTY
+from tasks.world.clip import Clip
 
 SIZE = (64, 48)
 LEVELS = np.array([40, 90, 140, 190, 240])  # grey of the left half of photo k, by k modulo 5
@@ -139,6 +146,22 @@ def test_a_camera_s_own_pose_stands_for_the_ego_s(log: Path, tmp_path: Path) -> 
         np.testing.assert_allclose(one.world_from_ego, other.world_from_ego, atol=1e-12)
 
 
+def test_a_camera_may_say_how_long_it_reads_its_rows(log: Path, tmp_path: Path) -> None:
+    """And the cache and the scene's file keep it."""
+    content = sidecar()
+    content["cameras"]["left"] = content["cameras"]["left"] | {"readout_s": -0.016}
+    reader = ScenarioNetReader(log, cameras=write(tmp_path / "photos", content, pictures=False))
+    clip = reader.read(reader.index().refs[0])
+    assert [one.readout_s for one in clip.cameras] == [0.0, -0.016]
+    cache = ClipCache(Location.parse(tmp_path / "cache"))
+    cache.store("clip", clip)
+    kept = cache.load("clip")
+    assert isinstance(kept, Clip) and [one.readout_s for one in kept.cameras] == [0.0, -0.016]
+    sky = SkyMap(np.zeros((ROWS, COLUMNS, 3), np.float32))
+    write_scene(tmp_path / "scene.safetensors", RenderAsset(np.zeros(3), EMPTY, {}, sky, 30.0, rig=clip.cameras))
+    assert [one.readout_s for one in read_scene(tmp_path / "scene.safetensors").rig] == [0.0, -0.016]
+
+
 def test_one_camera_may_stand_at_the_top_and_a_video_for_the_folder_of_its_pictures(log: Path, tmp_path: Path) -> None:
     """The layout of a front camera whose pictures were kept as `CAM_FRONT.mp4`."""
     mount = {"R": [row[:3] for row in MOUNT[:3]], "t": [row[3] for row in MOUNT[:3]]}
@@ -235,6 +258,10 @@ BAD: list[tuple[Callable[[Sidecar], object], str]] = [
     (camera("distortion", [math.nan] * 5), "cameras.left.distortion: holds NaN, infinity or numbers beyond 1e8"),
     (camera("fisheye", [0.1] * 5), r"cameras.left.fisheye: shape \(5,\), expected 4 numbers"),
     (lambda c: c["cameras"]["left"].update(fisheye=[0] * 4, distortion=[0.1] * 5), "cameras.front.fisheye: a lens"),
+    (camera("readout_s", "30 ms"), "cameras.left.readout_s: '30 ms': expected seconds from the first row to the last"),
+    (camera("readout_s", 30), "cameras.left: camera left: readout_s: 30.0, expected 0.2 s at most"),
+    (camera("readout_s", math.nan), "cameras.left: camera left: readout_s: nan, expected 0.2 s at most"),
+    (lambda c: c["cameras"]["left"].update(fisheye=[0] * 4, readout_s=0.03), "cameras.front: .* readout_s: not for"),
     (camera("cam_to_ego", {"R": K}), "cameras.left.cam_to_ego.t: missing, expected 3 numbers"),
     (camera("cam_to_ego", {"R": K, "t": [0, 0, 0]}), "cameras.left.cam_to_ego: is not a rotation and a shift"),
     (camera("cam_to_ego", np.diag([1.0, 1.0, -1.0, 1.0]).tolist()), "cameras.left.cam_to_ego: mirrors"),

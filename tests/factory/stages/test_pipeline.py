@@ -271,6 +271,8 @@ def test_the_log_s_own_drive_alone_needs_no_candidates_and_no_block(small_town: 
     work = work_on(small_town, tmp_path, "experts=[human]", "render.psnr_min=60")
     ref = work.reader.index().refs[0]
     assert work.block(ref) is None and work_on(small_town, tmp_path).block(ref) is not None
+    corrected = work_on(small_town, tmp_path, "experts=[human]", "render.rig.adjust=on")  # its rig alone
+    assert corrected.block(ref) is not None
     prepared = work.prepare(ref)
     assert isinstance(prepared, PreparedClip)
     assert prepared.candidates == () and prepared.dropped is None and work.identity.prepare_digest == UNLISTED

@@ -5,6 +5,7 @@ Four cameras with a lens, 12 instants at 2 Hz along a bend driven faster and fas
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,26 +49,47 @@ def ego_pose(time_s: float) -> Array:
     return np.asarray(pose[0])
 
 
-def files(names: list[str]) -> list[SensorFile]:
+def straight_on(time_s: float, speed_mps: float = 8.0) -> Array:
+    """(4, 4) along the street at one speed, where a delay is no other than a shifted mount."""
+    return np.asarray(motions(np.array([[speed_mps * time_s, 0.0, 0.0, 0.0, 0.0, 0.0]]))[0])
+
+
+def files(names: list[str], drive: Callable[[float], Array] = ego_pose, apart_s: float = 0.5) -> list[SensorFile]:
     """A photo of each camera at each instant."""
-    return [SensorFile(name, f"{name}/{k}.jpg", 0.5 * k, ego_pose(0.5 * k)) for k in range(INSTANTS) for name in names]
+    times = [apart_s * k for k in range(INSTANTS)]
+    return [SensorFile(name, f"{name}/{k}.jpg", t, drive(t)) for k, t in enumerate(times) for name in names]
+
+
+def street_points(rng: np.random.Generator) -> Array:
+    """(POINTS, 3) on both sides of the street."""
+    along, side = rng.uniform(-30.0, 70.0, POINTS), rng.choice([-1.0, 1.0], POINTS) * rng.uniform(4.0, 16.0, POINTS)
+    return np.column_stack([along, side + 0.004 * along**2, rng.uniform(-0.2, 7.0, POINTS)])
 
 
 def corners_seen(
-    rig: list[Camera], taken: list[SensorFile], late_s: Callable[[str], float] = lambda name: 0.0, seed: int = 0
+    rig: list[Camera],
+    taken: list[SensorFile],
+    late_s: Callable[[str], float] = lambda name: 0.0,
+    seed: int = 0,
+    drive: Callable[[float], Array] = ego_pose,
 ) -> list[Corners]:
-    """Of each file what its camera saw, `late_s` after its stamp: points on both sides of the street, with noise."""
+    """Of each file what its camera saw, `late_s` after its stamp: points on both sides of the street, with noise.
+
+    A camera that reads row by row sees each point from where it was as it read the point's row.
+    """
     rng = np.random.Generator(np.random.Philox(key=[seed, 7]))
-    along, side = rng.uniform(-30.0, 70.0, POINTS), rng.choice([-1.0, 1.0], POINTS) * rng.uniform(4.0, 16.0, POINTS)
-    points = np.column_stack([along, side + 0.004 * along**2, rng.uniform(-0.2, 7.0, POINTS)])
+    points = street_points(rng)
     looks = rng.normal(size=(POINTS, 128)) ** 2
     looks = np.rint(UNIT * np.sqrt(looks / looks.sum(axis=1, keepdims=True))).astype(np.float32)
     row = {camera.name: k for k, camera in enumerate(rig)}
-    late = [replace(file, world_from_ego=ego_pose(file.time_s + late_s(file.sensor))) for file in taken]
+    late = [replace(file, world_from_ego=drive(file.time_s + late_s(file.sensor))) for file in taken]
     known, shots = given_rig(rig, late)
     out = []
     for i, file in enumerate(taken):
         at = _off(known, points, row[file.sensor], shots.world_from_ego[i])
+        if readout_s := rig[row[file.sensor]].readout_s:
+            look = partial(_seen_at, known, points, row[file.sensor], drive, file.time_s + late_s(file.sensor))
+            at = by_rows(look, readout_s)
         pose = shots.world_from_ego[i] @ rig[row[file.sensor]].ego_from_camera
         ahead = (points - pose[:3, 3]) @ pose[:3, 2]
         seen = (ahead > 2.0) & (ahead < 40.0) & (at > 0.0).all(axis=1) & (at < [WIDTH, HEIGHT]).all(axis=1)
@@ -76,6 +98,28 @@ def corners_seen(
         noise = rng.normal(size=(len(rows), 2)) * NOISE_PX
         out.append(Corners(at[rows] + noise, looks[rows], 1.0))
     return out
+
+
+def by_rows(look: Callable[[float], Array], readout_s: float) -> Array:
+    """(M, 2) pixels of points, each as it is seen while its row is read; look(t): (M, 2) as all are t after the middle.
+
+    Between 33 instants pixels are linear in time.
+    """
+    times = np.linspace(-abs(readout_s), abs(readout_s), 33)
+    seen = np.nan_to_num(np.stack([look(time_s) for time_s in times]), posinf=1e6)
+    each, at = np.arange(seen.shape[1]), seen[16]
+    for _ in range(8):  # the row says when, and when says the row
+        now = np.interp(readout_s * (at[:, 1] / HEIGHT - 0.5), times, np.arange(len(times)))
+        k = np.minimum(now.astype(int), len(times) - 2)
+        share = (now - k)[:, None]
+        at = (1.0 - share) * seen[k, each] + share * seen[k + 1, each]
+    return at
+
+
+def _seen_at(
+    rig: Rig, points: Array, camera: int, drive: Callable[[float], Array], middle_s: float, after_s: float
+) -> Array:
+    return _off(rig, points, camera, drive(middle_s + after_s))
 
 
 def _off(rig: Rig, points: Array, camera: int, world_from_ego: Array) -> Array:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factory.stages.assets import taken_from
+from factory.stages.rig import taken_from
 from factory.stages.scene_file import read_scene, write_scene
 from tasks.render.scene.asset import RenderAsset, TakenFrom, rises_of
 from tasks.render.scene.movers import lifted
