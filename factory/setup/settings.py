@@ -31,6 +31,7 @@ from tasks.render.fit.lpips import BadWeights, lpips_of
 from tasks.render.rig.settings import RigSettings
 from tasks.render.rigs import RIGS
 from tasks.render.scene import engine
+from tasks.render.scene.settings import SceneDtype
 from tasks.render.settings import REMOVED, RenderMode
 from tasks.render.splatting.gsplat_backend import BackendMissing
 from tasks.reward.labels import Labelling
@@ -48,6 +49,7 @@ ADDED: dict[str, object] = {"perturb.interleaved": True, "perturb.order": "drawn
 ADDED |= {"perturb.at_log": False}
 ADDED |= {"reward.off_route": False, "reward.after": False}
 ADDED |= {"render.own_body": "", "render.jpeg_chroma": "420", "traffic.yields": False}
+ADDED |= {"render.scene_dtype": SceneDtype.FLOAT32}
 ADDED |= {"render.camera_psnr_min": 0.0, "render.rig": dataclasses.asdict(RigSettings())}
 
 

@@ -31,7 +31,7 @@ from tasks.render.scene.build import build_asset
 from tasks.render.scene.lidar_only import lidar_asset
 from tasks.render.scene.movers import lifted
 from tasks.render.scene.sensed import own_bodies
-from tasks.render.scene.settings import Backend
+from tasks.render.scene.settings import Backend, SceneDtype
 from tasks.render.scene.stereo import MAX_BASELINE_M, MIN_BASELINE_M
 from tasks.render.settings import REMOVED, RenderSettings, SceneFrom
 from tasks.world.arrays import Array, Bools
@@ -119,7 +119,7 @@ def asset_for(
             asset = replace(asset, rig=cameras if taken else (), taken=taken, bodies=own_bodies(data.photos))
         else:
             asset = lidar_asset(load_sweeps(block.sweeps, with_intensity=True), block.agents)
-        return write_scene(path, replace(own_part(asset), block=range_of(clip, block)))
+        return write_scene(path, replace(own_part(asset), block=range_of(clip, block)), settings.scene_dtype)
 
 
 def corrected_for(clip: Clip, settings: RenderSettings, cache_dir: str | Path) -> UsedRig | None:
@@ -197,6 +197,8 @@ def block_id(clip: Clip, settings: RenderSettings) -> str:
         how.append(asdict(settings.rig))
     if settings.own_body:
         how.append(["own_body", masks_digest(settings.own_body)])
+    if settings.scene_dtype is not SceneDtype.FLOAT32:
+        how.append(["scene_dtype", settings.scene_dtype])
     digest.update(json.dumps([made_of, how], sort_keys=True).encode())
     for file in (*block.images, *block.sweeps):
         path, _ = file_and_frame(file.uri)

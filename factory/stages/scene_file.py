@@ -10,6 +10,9 @@
 | `bodies.<i>` | (H, W, 4) uint8 | what the i-th camera that sees one sees of the own body |
 | `exposures` | (P, 3, 4) | what each photo made of the light, where they were aligned |
 
+With `SceneDtype.FLOAT16` what Gaussians are made of, but for their places (`means`), and the sky are float16, and the
+version is 2, which older programs refuse. Whoever reads gets float32 again, quaternions of length 1.
+
 The header's entry `scene` holds the rest: format, the nodes' track ids, quality photo by photo, the photos of the
 exposures, the block's range, the cameras where they were corrected, and the digest over all of it. No code runs when a
 file is read.
@@ -19,7 +22,7 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -31,12 +34,16 @@ from safetensors.numpy import save
 from factory.store.disk import whole_file
 from factory.store.identity import canonical_json
 from tasks.render.scene.asset import BlockRange, ClassQuality, Exposure, OwnBody, RenderAsset, TakenFrom, ViewQuality
+from tasks.render.scene.settings import SceneDtype
 from tasks.render.scene.sky import SkyMap
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.project import OF_DISCS, ScreenFilter
 from tasks.world.camera import Camera, Fisheye
 
-FORMAT, VERSION = "driving-data-factory scene", 1
+FORMAT = "driving-data-factory scene"
+VERSION_OF = {SceneDtype.FLOAT32: 1, SceneDtype.FLOAT16: 2}
+IN_HALF = ("quats", "log_scales", "opacities", "colours", "sh_rest")  # of a Gaussian, where the file is of 16 bits
+MOST_OPAQUE = np.float32(1.0 - 2.0**-11)  # of an opacity in 16 bits: below 1, so that its logit is finite
 MEASURES = ("psnr_db", "ssim", "lpips", "away_m")  # of views and their classes: NaN or infinite, maybe
 KEY = "scene"  # one entry: safetensors writes several in no fixed order
 SUFFIX = ".safetensors"
@@ -48,14 +55,17 @@ class BadScene(ValueError):
     """The file is no scene, or damaged: says which file and what."""
 
 
-def write_scene(path: Path, asset: RenderAsset) -> RenderAsset:
-    """Writes beside the path and renames; returns the scene with its digest."""
-    tensors, described = tensors_of(asset), described_by(asset)
+def write_scene(path: Path, asset: RenderAsset, dtype: SceneDtype = SceneDtype.FLOAT32) -> RenderAsset:
+    """Writes beside the path and renames; returns the scene as it is read back, with its digest.
+
+    Raises ValueError for what 16 bits do not hold.
+    """
+    tensors, described = tensors_of(asset, dtype), described_by(asset, dtype)
     digest = digest_of(tensors, described)
     data = save(dict(tensors), metadata={KEY: canonical_json(described | {"digest": digest})})
     with whole_file(path, len(data)) as draft:
         draft.write_bytes(data)
-    return replace(asset, digest=digest)
+    return scene_of(tensors, described, digest)
 
 
 def read_scene(path: Path) -> RenderAsset:
@@ -70,9 +80,9 @@ def read_scene(path: Path) -> RenderAsset:
         raise BadScene(f"{path}: no scene: its header has no entry {KEY!r}")
     try:
         described = json.loads(header)
-        if (described["format"], described["version"]) != (FORMAT, VERSION):
+        if described["format"] != FORMAT or described["version"] not in VERSION_OF.values():
             found = f"{described['format']!r} {described['version']}"
-            raise BadScene(f"{path}: format {found}, this version reads {FORMAT!r} {VERSION}")
+            raise BadScene(f"{path}: format {found}, this version reads {FORMAT!r} 1 and 2")
         stated = described.pop("digest")
         if digest_of(tensors, described) != stated:
             raise BadScene(f"{path}: the content does not match its digest {stated}")
@@ -108,12 +118,24 @@ def stored_views(path: Path) -> tuple[ViewQuality, ...]:
         raise BadScene(f"{path}: no scene: {type(error).__name__} {error}") from error
 
 
-def tensors_of(asset: RenderAsset) -> dict[str, NDArray[Any]]:
-    """The scene's arrays by their names in the file, contiguous."""
+def stored_dtype(path: Path) -> SceneDtype:
+    """What a scene's file holds its Gaussians in, by its header alone. Raises BadScene where it has none."""
+    try:
+        with safe_open(path, framework="numpy") as file:
+            version = json.loads((file.metadata() or {})[KEY])["version"]
+        return next(dtype for dtype, known in VERSION_OF.items() if known == version)
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError, StopIteration) as error:
+        raise BadScene(f"{path}: no scene: {type(error).__name__} {error}") from error
+
+
+def tensors_of(asset: RenderAsset, dtype: SceneDtype = SceneDtype.FLOAT32) -> dict[str, NDArray[Any]]:
+    """The scene's arrays by their names in the file, contiguous. Raises ValueError for what 16 bits do not hold."""
     out: dict[str, NDArray[Any]] = {"origin": asset.origin, "sky": asset.sky.rgb}
     parts = {"background": asset.background} | {f"nodes.{i}": node for i, node in enumerate(asset.nodes.values())}
     for name, part in parts.items():
         out |= {f"{name}.{field.name}": getattr(part, field.name) for field in fields(Gaussians)}
+    if dtype is SceneDtype.FLOAT16:
+        out = {name: _in_half(name, array) if _may_be_half(name) else array for name, array in out.items()}
     if asset.exposures:
         out["exposures"] = np.stack([exposure.affine for exposure in asset.exposures])
     if asset.taken:
@@ -122,7 +144,7 @@ def tensors_of(asset: RenderAsset) -> dict[str, NDArray[Any]]:
     return {name: np.ascontiguousarray(array) for name, array in out.items()}
 
 
-def described_by(asset: RenderAsset) -> dict[str, Any]:
+def described_by(asset: RenderAsset, dtype: SceneDtype = SceneDtype.FLOAT32) -> dict[str, Any]:
     """What of the scene is no array, as plain JSON values; NaN is null."""
     block = asset.block
     rig = [_calibration(camera) for camera in asset.rig]
@@ -130,7 +152,7 @@ def described_by(asset: RenderAsset) -> dict[str, Any]:
     bodies = [body.camera for body in asset.bodies]
     return {
         "format": FORMAT,
-        "version": VERSION,
+        "version": VERSION_OF[dtype],
         "screen": list(asset.screen),
         "nodes": list(asset.nodes),
         "psnr_db": _number(asset.psnr_db),
@@ -145,7 +167,7 @@ def scene_of(tensors: Tensors, described: Mapping[str, Any], digest: str) -> Ren
     """The opposite of `tensors_of` and `described_by`. Raises KeyError, TypeError, ValueError where one is absent."""
 
     def part(name: str) -> Gaussians:
-        return Gaussians(**{field.name: tensors[f"{name}.{field.name}"] for field in fields(Gaussians)})
+        return _whole({field.name: tensors[f"{name}.{field.name}"] for field in fields(Gaussians)})
 
     block = described["block"]
     if block is not None:
@@ -154,7 +176,7 @@ def scene_of(tensors: Tensors, described: Mapping[str, Any], digest: str) -> Ren
         origin=tensors["origin"],
         background=part("background"),
         nodes={name: part(f"nodes.{i}") for i, name in enumerate(described["nodes"])},
-        sky=SkyMap(tensors["sky"]),
+        sky=SkyMap(tensors["sky"].astype(np.float32)),
         psnr_db=_nan(described["psnr_db"]),
         n_held_out=described["n_held_out"],
         digest=digest,
@@ -172,6 +194,30 @@ def scene_of(tensors: Tensors, described: Mapping[str, Any], digest: str) -> Ren
         ),
         bodies=tuple(OwnBody(camera, tensors[f"bodies.{i}"]) for i, camera in enumerate(described.get("bodies", ()))),
     )
+
+
+def _may_be_half(name: str) -> bool:
+    return name == "sky" or name.rpartition(".")[2] in IN_HALF
+
+
+def _in_half(name: str, array: NDArray[Any]) -> NDArray[np.float16]:
+    """In 16 bits, rounded to the nearest. Raises ValueError where one is too large."""
+    if name.endswith(".opacities"):
+        array = np.minimum(array, MOST_OPAQUE)
+    with np.errstate(over="ignore"):
+        half = array.astype(np.float16)
+    if (np.isinf(half) & np.isfinite(array)).any():
+        raise ValueError(f"{name}: {np.abs(array).max():g} is more than 16 bits hold; keep the scene in float32")
+    return half
+
+
+def _whole(arrays: Mapping[str, NDArray[Any]]) -> Gaussians:
+    """Gaussians of a file's arrays; what was in 16 bits is float32, its quaternions of length 1 again."""
+    if arrays["quats"].dtype != np.float16:
+        return Gaussians(**arrays)
+    whole = {name: array.astype(np.float32) for name, array in arrays.items()}
+    quats = whole["quats"].astype(np.float64)
+    return Gaussians(**whole | {"quats": (quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32)})
 
 
 def digest_of(tensors: Tensors, described: Mapping[str, Any]) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from factory.stages.scene_file import BadScene, described_by, read_scene
+from factory.stages.scene_file import BadScene, described_by, read_scene, stored_dtype
 from factory.views.scene_quality import camera_rows
 from factory.views.splat_files import background_bytes, node_bytes
 from tasks.render.scene.asset import RenderAsset
@@ -23,7 +23,8 @@ from tasks.render.splatting.project import ANTIALIASED, CLASSIC, ScreenFilter
 
 def info_text(path: Path, asset: RenderAsset) -> str:
     """What a scene holds, a few lines."""
-    lines = [str(path), f"digest      {asset.digest}", f"origin      {', '.join(f'{v:.2f}' for v in asset.origin)} m"]
+    lines = [str(path), f"file        {stored_dtype(path)}, {path.stat().st_size / 1e6:.1f} MB"]
+    lines += [f"digest      {asset.digest}", f"origin      {', '.join(f'{v:.2f}' for v in asset.origin)} m"]
     if (block := asset.block) is not None:
         x, y = (f"{low:.1f} .. {high:.1f}" for low, high in zip(block.low, block.high))
         lines.append(f"block       {block.dataset} {block.log_id}, {block.start_s:.1f} to {block.end_s:.1f} s")

@@ -8,7 +8,7 @@ from typing import Literal
 
 from tasks.render.fit.settings import FitSettings
 from tasks.render.rig.settings import RigSettings
-from tasks.render.scene.settings import AssetSettings, Backend
+from tasks.render.scene.settings import AssetSettings, Backend, SceneDtype
 
 # Settings that are gone, as they always were: keys of blocks and tables hold them still, so that older ones go on.
 _FIT: dict[str, object] = {"depth_weight": 0.0, "opacity_weight": 0.0, "scale_weight": 0.0, "max_gap_px": (12, 24)}
@@ -114,6 +114,7 @@ class RenderSettings:
     lidar_only_reach_m: float = 15.0  # without photos: images only this close to where a sweep was taken; 0: none
     map_rig: Literal["front", "three_front", "ring_six"] = "three_front"  # for mode=map without a rig
     scene: SceneFrom = SceneFrom.FIT  # discs: built in one go, seconds a block; fit: then fitted to its photos, minutes
+    scene_dtype: SceneDtype = SceneDtype.FLOAT16  # of scenes' files; float16: all but the places of Gaussians
     own_body: str = ""  # folder of masks, <camera>.png, of what the rig sees of the ego itself
     rig: RigSettings = field(default_factory=RigSettings)  # whether cameras and poses are corrected first
     asset: AssetSettings = field(default_factory=AssetSettings)

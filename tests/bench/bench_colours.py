@@ -24,6 +24,7 @@ from tasks.render.scene.asset import psnr
 from tasks.render.scene.engine import render
 from tasks.render.scene.sensed import Photo, shifted
 from tasks.world.camera import Camera, Pinhole, SensorFile
+from tests.bench.stored_scene import Look, storage_table
 
 TESTED = (20, 27)  # instants
 SETTINGS = replace(FitSettings(), iterations=600, start_gaussians=60_000, most_gaussians=80_000, hold_out_every=0)
@@ -71,7 +72,7 @@ def main() -> None:
     asset = finish(problem, state, threads)
     print(f"{len(state)} Gaussians, {time.process_time() - cpu:.0f} CPU s")
     print("| camera | training, own exposure | as drawn at new poses | held out, between | as drawn at new poses |")
-    rows = []
+    rows, looks = [], []
     for name in dict.fromkeys(photo.camera for photo in photos):
         row = []
         for shots in (problem.train, problem.held_out):
@@ -80,6 +81,8 @@ def main() -> None:
                 photo, target = shot.photo, shot.compared.target.rgb
                 pose = corrected(photo.world_from_camera, corrections_at(problem, state, name, photo.time_s)[0])
                 eye = Pinhole(photo.intrinsics, shifted(pose, problem.origin), width, height)
+                if shots is problem.held_out:
+                    looks.append(Look(name, photo.time_s, eye, photo.rgb))
                 drawn = render(asset, [eye], threads=threads, affines=[asset.affine_of(name, photo.time_s)])[0].rgb
                 both.append([psnr(picture, target) for picture in (picture_of(problem, state, photo, threads), drawn)])
             row += list(np.mean(both, axis=0)) if both else [np.nan, np.nan]
@@ -92,6 +95,7 @@ def main() -> None:
     of = np.array([exposure.camera for exposure in asset.exposures])
     own = [float(np.mean(np.array(gains)[of == camera])) for camera in of]
     rest = np.sqrt(np.mean((np.array(gains) / np.array(own) - 1.0) ** 2))
+    print(storage_table(asset, looks, threads))
     print(f"gains from scene to photo: {min(gains):.2f} to {max(gains):.2f}; photo against camera {rest:.3f} (RMS)")
 
 

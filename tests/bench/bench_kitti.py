@@ -32,6 +32,7 @@ from tasks.render.scene.sensed import Photo, shifted
 from tasks.render.scene.settings import Backend
 from tasks.render.splatting.tensors import by_kernels
 from tasks.world.camera import Pinhole
+from tests.bench.stored_scene import Look, storage_table
 
 F32, F64 = NDArray[np.float32], NDArray[np.float64]
 FITTED_FRAMES = 12  # of image_03's training frames, for its affine colour and rigid correction
@@ -149,6 +150,12 @@ def main() -> None:
         print(f"| {until} | {seconds:.0f} | {len(state)} | {mean:.2f} | {trial.row()} |", flush=True)
 
     asset = write_scene(out / "kitti.safetensors", finish(problem, state, threads))
+    looks = []
+    for photo in (shot.photo for shot in problem.held_out):
+        pose = corrected(photo.world_from_camera, corrections_at(problem, state, photo.camera, photo.time_s)[0])
+        eye = Pinhole(photo.intrinsics, shifted(pose, problem.origin), *photo.rgb.shape[1::-1])
+        looks.append(Look(photo.camera, photo.time_s, eye, photo.rgb))
+    print(storage_table(asset, looks, threads))
     for frame in [f for f in SHOWN if f in frames]:
         photo = left[frames.index(frame)]
         pose = corrected(photo.world_from_camera, corrections_at(problem, state, photo.camera, photo.time_s)[0])

@@ -32,8 +32,10 @@ from tasks.render.fit.reconstruct import advance, finish
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import prepare
 from tasks.render.scene.build import held_out_rows
+from tasks.render.scene.engine import vehicles_at
 from tasks.render.scene.sensed import Photo
-from tasks.world.camera import Camera
+from tasks.world.camera import Camera, Pinhole
+from tests.bench.stored_scene import Look, storage_table
 from tests.bench.town_truth import MOVED_M, Compared, Painter, Truth, beside, sideways
 
 SETTINGS = FitSettings(
@@ -177,6 +179,12 @@ def main() -> None:
     print()
     for told in camera_rows(asset.views):
         print(f"{told.camera}, against the JPEG photos: {told.text}")
+    looks = [
+        Look(p.camera, p.time_s, Pinhole(p.intrinsics, p.world_from_camera, width, height), p.rgb, there)
+        for p in photos
+        for there in [vehicles_at(block.agents, p.time_s)]
+    ]
+    print(f"\n{storage_table(asset, looks, threads)}")
     took = f"{seconds:.0f} s on {threads} threads, CPU {cpu_s:.0f} s"
     print(f"\n{settings.iterations} iterations, {len(state)} Gaussians, {took}")
 

@@ -39,6 +39,7 @@ def test_info_says_what_is_in_a_scene(stored: Path, capsys: pytest.CaptureFixtur
     said = capsys.readouterr().out
     for line in (
         read_scene(stored).digest,
+        "file        float32, 0.0 MB",
         "block       av2 log, 10.0 to 30.0 s",
         "background  30 Gaussians, SH degree 1",
         "node        b/7 ü: 5 Gaussians, SH degree 3",

@@ -10,8 +10,19 @@ import pytest
 from safetensors import safe_open
 from safetensors.numpy import save_file
 
-from factory.stages.scene_file import KEY, BadScene, described_by, digest_of, read_scene, tensors_of, write_scene
+from factory.stages.scene_file import (
+    IN_HALF,
+    KEY,
+    BadScene,
+    described_by,
+    digest_of,
+    read_scene,
+    stored_dtype,
+    tensors_of,
+    write_scene,
+)
 from tasks.render.scene.asset import BlockRange, ClassQuality, Exposure, RenderAsset, TakenFrom, ViewQuality
+from tasks.render.scene.settings import SceneDtype
 from tasks.render.scene.sky import SkyMap
 from tasks.render.splatting.gaussians import EMPTY, Gaussians
 from tasks.render.splatting.project import CLASSIC, OF_DISCS
@@ -85,6 +96,48 @@ def test_the_same_scene_is_the_same_bytes(tmp_path: Path) -> None:
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
+def of_unit_length(part: Gaussians) -> Gaussians:
+    return replace(part, quats=part.quats / np.linalg.norm(part.quats, axis=1, keepdims=True))
+
+
+def test_in_16_bits_places_stay_and_all_else_is_the_nearest_number_of_11_bits(tmp_path: Path) -> None:
+    whole = replace(scene(), background=of_unit_length(gaussians(3000, 15, 0)))
+    opacities = np.linspace(1e-3, 1.0 - 2.0**-24, 3000).astype(np.float32)
+    whole = replace(whole, background=replace(whole.background, opacities=opacities))
+    path, plain = tmp_path / "half", tmp_path / "whole"
+    written = write_scene(path, whole, SceneDtype.FLOAT16)
+    back = read_scene(path)
+    write_scene(plain, whole)
+    assert (stored_dtype(path), stored_dtype(plain)) == (SceneDtype.FLOAT16, SceneDtype.FLOAT32)
+    assert path.stat().st_size < 0.56 * plain.stat().st_size  # 124 of 236 bytes a Gaussian, and the rest
+    for name, array in tensors_of(whole).items():
+        first, second = tensors_of(written)[name], tensors_of(back)[name]
+        assert first.tobytes() == second.tobytes() and second.dtype == array.dtype, name  # built or read: the same
+        if name.startswith("background.") and name.rpartition(".")[2] in IN_HALF:
+            error = 2.0 ** (-10 if name.endswith(".quats") else -11)  # a quaternion's length is put right
+            assert np.abs(second - array).max() > 0.0
+            assert (np.abs(second - array) <= 1.001 * error * np.abs(array) + 2.0**-24).all(), name
+    assert back.background.means.tobytes() == whole.background.means.tobytes()
+    np.testing.assert_allclose(np.linalg.norm(back.background.quats, axis=1), 1.0, atol=1e-6)
+    assert back.background.opacities.max() < 1.0
+    assert back.digest == written.digest != read_scene(plain).digest
+
+
+def test_a_file_of_16_bits_is_refused_by_programs_that_know_version_1_alone(tmp_path: Path) -> None:
+    write_scene(tmp_path / "x", scene(), SceneDtype.FLOAT16)
+    with safe_open(tmp_path / "x", framework="numpy") as file:
+        assert json.loads(file.metadata()[KEY])["version"] == 2
+        assert file.get_tensor("background.means").dtype == np.float32
+        assert {file.get_tensor(f"nodes.0.{name}").dtype for name in IN_HALF} == {np.dtype(np.float16)}
+
+
+def test_what_16_bits_do_not_hold_is_named_and_nothing_is_written(tmp_path: Path) -> None:
+    bright = replace(scene().background, colours=np.full((30, 3), 70_000.0, np.float32))
+    with pytest.raises(ValueError, match=r"background\.colours: 70000 is more than 16 bits hold; .* float32"):
+        write_scene(tmp_path / "x", replace(scene(), background=bright), SceneDtype.FLOAT16)
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize(
     "changed",
     [
@@ -112,11 +165,12 @@ def test_any_program_reads_the_file_without_this_project(tmp_path: Path) -> None
     assert header["nodes"] == ["b/7 ü", "a"] and header["views"][1]["ssim"] is None
 
 
-def test_one_flipped_bit_anywhere_in_the_tensors_is_found(tmp_path: Path) -> None:
+@pytest.mark.parametrize("dtype", SceneDtype)
+def test_one_flipped_bit_anywhere_in_the_tensors_is_found(tmp_path: Path, dtype: SceneDtype) -> None:
     path = tmp_path / "x"
-    write_scene(path, scene())
+    write_scene(path, scene(), dtype)
     whole = bytearray(path.read_bytes())
-    start = len(whole) - sum(array.nbytes for array in tensors_of(scene()).values())
+    start = len(whole) - sum(array.nbytes for array in tensors_of(scene(), dtype).values())
     for at in np.linspace(start, len(whole) - 1, 7).astype(int):
         damaged = whole.copy()
         damaged[at] ^= 1
@@ -146,7 +200,7 @@ def test_what_is_no_scene_is_named(tmp_path: Path) -> None:
         ("[]", "damaged"),
         ("{", "damaged: JSONDecodeError"),
         ('{"format":"other","version":1}', "format 'other' 1, this version reads"),
-        ('{"format":"driving-data-factory scene","version":2}', "scene' 2, this version reads"),
+        ('{"format":"driving-data-factory scene","version":3}', "scene' 3, this version reads"),
     ],
 )
 def test_a_foreign_header_is_named(tmp_path: Path, header: str, said: str) -> None:

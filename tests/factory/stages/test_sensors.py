@@ -16,12 +16,12 @@ from factory.graph.work import Halted, Stopped
 from factory.readers.base import BadClip
 from factory.stages import fitting
 from factory.stages.assets import Sensing, asset_for, block_id, sensing
-from factory.stages.scene_file import read_scene
+from factory.stages.scene_file import read_scene, stored_dtype
 from factory.stages.sensors import SAMPLING, block_of, chosen_cameras, decode_image, encode_jpeg, load_sensors
 from tasks.render.fit import reconstruct
 from tasks.render.fit.settings import FitSettings
 from tasks.render.scene.build import AssetSettings, psnr
-from tasks.render.scene.settings import Backend
+from tasks.render.scene.settings import Backend, SceneDtype
 from tasks.render.settings import RenderSettings, SceneFrom
 from tasks.render.splatting.gsplat_backend import BackendMissing
 from tasks.world.agents import AgentTracks
@@ -160,6 +160,19 @@ def test_a_block_is_built_once_and_read_back_the_same(clip: Clip, tmp_path: Path
     again = asset_for(clip, SETTINGS, tmp_path / "cache")
     assert again is not None and again.digest == first.digest
     assert again.background.colours.tobytes() == first.background.colours.tobytes()
+
+
+def test_a_block_in_16_bits_is_kept_apart_and_drawn_the_same_when_it_is_built_and_when_it_is_read(
+    clip: Clip, tmp_path: Path
+) -> None:
+    half, in_32 = (replace(SETTINGS, scene_dtype=dtype) for dtype in (SceneDtype.FLOAT16, SceneDtype.FLOAT32))
+    assert block_id(clip, half) != block_id(clip, in_32)
+    built, whole = asset_for(clip, half, tmp_path), asset_for(clip, in_32, tmp_path)
+    read = asset_for(clip, half, tmp_path)
+    assert built is not None and whole is not None and read is not None
+    assert read.background.colours.tobytes() == built.background.colours.tobytes()
+    assert read.background.colours.tobytes() != whole.background.colours.tobytes()
+    assert stored_dtype(tmp_path / f"block-{block_id(clip, half)}.safetensors") is SceneDtype.FLOAT16
 
 
 def test_a_photo_of_another_size_makes_another_block(clip: Clip, tmp_path: Path) -> None:
