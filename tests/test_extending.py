@@ -110,15 +110,15 @@ def test_a_planner_is_its_class_and_a_file_of_its_settings(tmp_path: Path) -> No
 
 
 def test_a_traffic_policy_is_a_class_that_the_settings_name() -> None:
-    """It brakes for the ego that stands 25 m ahead, and keeps its speed where nobody does."""
+    """It slows down behind the ego that stands ahead, whose rear is at x = 20.9, and keeps its speed where nobody does."""
     settings = TrafficSettings(mode="learned", policy="examples.keep_gap:KeepGap")
-    scene = worlds.scene(worlds.straight_road(), Track(0.0, speed=8.0), ego=(30.0, 0.0, 0.0))
+    scene = worlds.scene(worlds.straight_road(), Track(0.0, speed=8.0), ego=(22.0, 0.0, 0.0))
     ego = np.repeat(scene.ego_state[None], 41, axis=0)
     behind, free = (
         roll_out(prepare_traffic(scene, settings), ego + away).agents for away in (0.0, [0.0, 500.0] + [0.0] * 9)
     )
     assert free.velocities[:, 0, 0] == pytest.approx(8.0) and free.boxes[-1, 0, 0] == pytest.approx(32.0)
-    assert behind.velocities[-1, 0, 0] == 0.0 and behind.boxes[-1, 0, 0] < 25.0
+    assert behind.velocities[-1, 0, 0] < 1.0 and behind.boxes[-1, 0, 0] + 2.3 < 20.8
     assert told(settings) | {"weights": KeepGap().digest()} == told(settings)
 
 

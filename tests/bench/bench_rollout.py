@@ -1,6 +1,8 @@
 """Times reactive rollouts on real logs and prints the table of it: one core, CPU time, the median of several calls.
 
-python -m tests.bench.bench_rollout ../shared/data/av2/sensor/val
+python -m tests.bench.bench_rollout ../shared/data/av2/sensor/val [WEIGHTS]
+
+WEIGHTS: a file of `python -m planners train_traffic`; then traffic=learned has rows too.
 """
 
 import sys
@@ -39,22 +41,24 @@ def among_nearest(scene: Scene) -> Scene:
     return replace(scene, clip=replace(scene.clip, agents=few), agents=few)
 
 
-def main(root: Path) -> None:
-    """Four rows per third clip, 25 agents and all, without and with giving way: who is there, and milliseconds."""
+def main(root: Path, weights: str | None = None) -> None:
+    """Rows of every third clip, 25 agents and all, of each kind of traffic: who is there, and milliseconds."""
+    kinds = {"yields=false": TrafficSettings(yields=False), "idm": TrafficSettings()}
+    if weights is not None:
+        kinds["learned"] = TrafficSettings(mode="learned", weights=weights)
     reader = AV2Reader(root)
     trajectories = kinematic_trajectories(N_EGOS, 0)
-    print(f"| log | start s | agents now | with a path | yields | prepare ms | one ego ms | {N_EGOS} egos ms |")
+    print(f"| log | start s | agents now | with a path | traffic | prepare ms | one ego ms | {N_EGOS} egos ms |")
     print("|---|---|---|---|---|---|---|---|")
     for ref in reader.index().refs[::3]:
         whole = scene_of_clip(reader.read(ref))
-        for scene, yields in product((among_nearest(whole), whole), (False, True)):
-            settings = TrafficSettings(yields=yields)
+        for scene, (name, settings) in product((among_nearest(whole), whole), kinds.items()):
             traffic = prepare_traffic(scene, settings)
             states = track(scene.ego_state, trajectories, local=True)
             paths = int((traffic.roles.path >= 0).sum()) if traffic.roles else 0
             print(
                 f"| {ref.log_id[:8]} | {ref.start_ms / 1e3:.0f} | {int(scene.agents.valid[NOW].sum())} | {paths} "
-                f"| {yields} "
+                f"| {name} "
                 f"| {cpu_milliseconds(partial(prepare_traffic, scene, settings), 5):.1f} "
                 f"| {cpu_milliseconds(partial(roll_out, traffic, states[0]), 40):.2f} "
                 f"| {cpu_milliseconds(partial(roll_out_many, traffic, states), 5):.0f} |",
@@ -63,4 +67,4 @@ def main(root: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(Path(sys.argv[1]), *sys.argv[2:3])
