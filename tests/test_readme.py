@@ -252,6 +252,8 @@ def test_every_command_is_one_its_program_takes(
             assert set(pairs(given(arguments))) <= known
         case ["python", "-m", "tests.bench.bench_exploring", *arguments]:
             assert pairs(arguments).keys() == {"uniform", "targeted", "explored"}  # it reads what alternate left
+        case ["python", "-m", "tests.bench.bench_late", *arguments]:
+            assert set(pairs(given(arguments))) <= {"openscene", "front", "town", "corners"}
         case ["python", "-m", "examples.csv_logs", folder]:
             write_log(Path(folder) / "street")  # what it does, see tests/test_extending.py
         case ["python", "-m", module] if module.startswith("tests.bench."):
