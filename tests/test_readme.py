@@ -48,6 +48,7 @@ from planners.study.report import ReportRequest
 from planners.study.scaling import ScalingSettings
 from planners.study.sceptic import ScepticSettings
 from planners.study.study import StudySettings
+from planners.traffic.train_traffic import settings_of as traffic_settings
 from planners.training.train import TrainConfig
 from tasks.caches import user_cache
 from tasks.kernels.compiled import cache_dir
@@ -192,6 +193,8 @@ def test_every_command_is_one_its_program_takes(
             *arguments,
         ]:
             fill(TrainConfig, compose("train", given(arguments)), "train")
+        case ["python", "-m", "planners", "train_traffic", *arguments]:
+            traffic_settings(arguments)
         case ["python", "-m", "planners", "import", *arguments]:
             settings_of(import_config(given(arguments)).planner)
         case ["python", "-m", "planners", "evaluate" | "ensemble", *arguments]:
