@@ -110,7 +110,7 @@ def test_a_planner_is_its_class_and_a_file_of_its_settings(tmp_path: Path) -> No
 
 
 def test_a_traffic_policy_is_a_class_that_the_settings_name() -> None:
-    """It slows down behind the ego that stands ahead, whose rear is at x = 20.9, and keeps its speed where nobody does."""
+    """It slows down behind the ego that stands ahead, its rear at x = 20.9, and keeps its speed where nobody does."""
     settings = TrafficSettings(mode="learned", policy="examples.keep_gap:KeepGap")
     scene = worlds.scene(worlds.straight_road(), Track(0.0, speed=8.0), ego=(22.0, 0.0, 0.0))
     ego = np.repeat(scene.ego_state[None], 41, axis=0)

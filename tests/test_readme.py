@@ -257,6 +257,16 @@ def test_every_command_is_one_its_program_takes(
             assert pairs(arguments).keys() == {"uniform", "targeted", "explored"}  # it reads what alternate left
         case ["python", "-m", "tests.bench.bench_late", *arguments]:
             assert set(pairs(given(arguments))) <= {"openscene", "front", "town", "corners"}
+        case ["python", "-m", "tests.bench.bench_town", *arguments]:
+            known = {field.name for field in fields(FitSettings)} | {
+                "log",
+                "width",
+                "height",
+                "out",
+                "threads",
+                "lpips",
+            }
+            assert set(pairs(given(arguments))) <= known
         case ["python", "-m", "examples.csv_logs", folder]:
             write_log(Path(folder) / "street")  # what it does, see tests/test_extending.py
         case ["python", "-m", module] if module.startswith("tests.bench."):
