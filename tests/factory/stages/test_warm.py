@@ -156,7 +156,7 @@ def test_labels_among_traffic_that_answers_compile_nothing(tmp_path: Path, towns
 
 def test_experts_compile_nothing_beyond_the_parts_that_they_name(tmp_path: Path, towns: str) -> None:
     named = ("experts=[pdm_smooth,vocabulary]", "expert.vocabulary.rollouts=8", "reward.labels=none")
-    parts = ["judge", "plan", "answers", "smooth"]
+    parts = ["judge", "plan", "drive", "answers", "smooth"]
     before, after = run_with_these(parts, tmp_path, *TOWN, *BLIND, *named, towns, "executor=local")
     assert after == before
     assert any(name.startswith("tasks/experts/pdm_smooth/") for name in after)
