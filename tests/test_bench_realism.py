@@ -37,8 +37,27 @@ def test_the_nearest_one_is_as_far_as_boxes_with_round_corners_are() -> None:
     there, first = np.ones((1, 3), bool), np.array([0])
     assert nearest(boxes, there, first) == pytest.approx(np.array([[0.5]]))
     assert nearest(boxes[:, :2], there[:, :2], first) == pytest.approx(np.array([[2.4 * np.sqrt(2.0) - 1.4]]))
+    boxes[0, 1, :2] = 300.0, 0.0  # however far
+    assert nearest(boxes[:, :2], there[:, :2], first) == pytest.approx(np.array([[296.0]]))
     boxes[0, 1, :2] = 3.9, 1.9  # rectangles overlap by 0.1 m each way, round corners are apart
     assert nearest(boxes[:, :2], there[:, :2], first) == pytest.approx(np.array([[1.3 * np.sqrt(2.0) - 1.4]]))
+
+
+def test_the_nearest_is_that_of_all_pairs() -> None:
+    """What is left out beforehand is farther off: a lorry that reaches far among small ones, some of them away."""
+    rng = np.random.default_rng(1)
+    boxes = np.concatenate(
+        [rng.uniform(-60, 60, (20, 9, 2)), rng.uniform(-3, 3, (20, 9, 1)), rng.uniform(0.5, 20, (20, 9, 2))], axis=-1
+    )
+    valid = rng.random((20, 9)) < 0.8
+    found = nearest(boxes, valid, np.arange(9))
+    radius = 0.35 * boxes[..., 3:].min(axis=-1)
+    cores = boxes - np.stack([0.0 * radius] * 3 + [2.0 * radius] * 2, axis=-1)
+    for step, i in np.argwhere(valid):
+        others = np.flatnonzero(valid[step] & (np.arange(9) != i))
+        each = box_distance(np.broadcast_to(cores[step, i], (len(others), 5)), cores[step, others])
+        assert found[step, i] == pytest.approx((each - radius[step, others]).min() - radius[step, i])
+    assert np.isnan(found[~valid]).all()
 
 
 def test_values_that_keep_to_their_bin_are_as_likely_as_the_pseudocounts_leave_them() -> None:

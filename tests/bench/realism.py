@@ -118,15 +118,13 @@ def nearest(boxes: Array, valid: Bools, rows: NDArray[np.intp]) -> Array:
     cores = boxes.copy()
     cores[..., 3:] -= 2.0 * radius[..., None]
     for r, i in enumerate(rows.tolist()):
-        away = np.hypot(boxes[..., 0] - boxes[:, i : i + 1, 0], boxes[..., 1] - boxes[:, i : i + 1, 1])
-        away -= 0.5 * np.hypot(boxes[..., 3], boxes[..., 4])  # no nearer than this
-        distance = np.full(away.shape, FAR_M)
-        near = (
-            valid
-            & valid[:, i : i + 1]
-            & (away < np.nanmin(np.where(valid, away, np.nan), axis=1, initial=40.0)[:, None] + 60.0)
-        )
-        near[:, i] = False
+        apart = np.hypot(boxes[..., 0] - boxes[:, i : i + 1, 0], boxes[..., 1] - boxes[:, i : i + 1, 1])
+        reach = 0.5 * np.hypot(boxes[..., 3], boxes[..., 4])  # of a box from its middle
+        others = valid & valid[:, i : i + 1]
+        others[:, i] = False
+        no_farther = np.where(others, apart, np.inf).min(axis=1)  # than the nearest one's middle
+        near = others & (apart - reach - reach[:, i : i + 1] <= no_farther[:, None])
+        distance = np.full(apart.shape, FAR_M)
         own = np.broadcast_to(cores[:, i : i + 1], boxes.shape)
         distance[near] = box_distance(own[near], cores[near]) - (radius + radius[:, i : i + 1])[near]
         out[:, r] = np.where(valid[:, i], distance.min(axis=1), np.nan)
