@@ -15,6 +15,7 @@ from planners.drive.starts import lengthened
 from planners.drive.work import DrivingPlanner, NotDriven, eyes_of, kept_driver, reads_towns
 from planners.explore.drift import CLIP_STEPS, Drifted, drift, from_the_log
 from planners.explore.settings import ExploreSettings
+from tasks.rollout.learned.policy import told
 from tasks.stages import stage_versions
 from tasks.world.clip import NOW, Clip, scene_of_clip
 from tasks.world.command import driving_command
@@ -37,18 +38,18 @@ class ExploreWork:
     def depends_on(self) -> str:
         """All that a row depends on beside clip and planner, canonical JSON."""
         s = self.settings
-        told: dict[str, object] = {
+        known: dict[str, object] = {
             "explore": EXPLORE_VERSION,
             "stages": stage_versions(),
             "ways": [str(way) for way in s.ways],
             "gates": {name: value for name, value in asdict(s.perturb).items() if name.startswith("max_")},
-            "traffic": asdict(s.traffic),
+            "traffic": told(s.traffic),
             "pdm": asdict(s.pdm),
             "reward": asdict(s.reward),
         }
         if self.looks:
-            told |= {"pictures": s.pictures, "render": asdict(s.render)}
-        return canonical_json(told)
+            known |= {"pictures": s.pictures, "render": asdict(s.render)}
+        return canonical_json(known)
 
     def __call__(self, ref: ClipRef) -> ExploredClip | NotDriven:
         """What is wrong with a clip, its pictures or the planner's answers is told of it."""

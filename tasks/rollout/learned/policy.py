@@ -4,6 +4,7 @@
 policies of a user's own package satisfy the protocol too (docs/extend.md).
 """
 
+import errno
 import importlib
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -80,6 +81,12 @@ def told(settings: TrafficSettings) -> dict[str, object]:
     if settings.mode == "learned":
         return words | {"weights": policy_of(settings).digest()}
     return {name: word for name, word in words.items() if name not in ("weights", "policy")}
+
+
+def refuse_another(settings: TrafficSettings, digest: object) -> None:
+    """Raises OSError where a policy drives and its file is no longer what it was when rows were named by `digest`."""
+    if settings.mode == "learned" and policy_of(settings).digest() != digest:
+        raise OSError(errno.ESTALE, "is another file than when the run began; start it again", settings.weights)
 
 
 @lru_cache(maxsize=4)

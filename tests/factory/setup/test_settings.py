@@ -10,9 +10,12 @@ from factory.config.run import SCENARIONET, load_config, refuse_relative_root
 from factory.setup.settings import assemble
 from factory.setup.vocabulary import save_recovery_table
 from factory.store.identity import RunIdentity
+from factory.store.illness import why_ill
 from tasks.experts.recovery.expert import RecoveryTable
 from tasks.rollout.learned.imitation import unfitted, weights_file
 from tasks.world.kinematic_vocabulary import kinematic_trajectories
+
+BLIND = ("clips.n_clips=1", "clips.settings.cameras=[]", "clips.settings.lidar_beams=0")
 
 
 def test_a_relative_root_in_a_submitted_job_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -81,7 +84,7 @@ def test_a_policy_s_file_is_in_the_key_of_rows_by_what_is_in_it(tmp_path: Path) 
         file.write_bytes(weights_file(given._replace(last_bias=given.last_bias + bias), "{}"))
 
     def identity(*words: str) -> RunIdentity:
-        return assemble(load_config(["clips.n_clips=1", "experts=[pdm_closed]", *words])).work.identity
+        return assemble(load_config([*BLIND, "experts=[pdm_closed]", *words])).work.identity
 
     one, alike, other = (identity("traffic=learned", f"traffic.weights={file}") for file in files)
     assert one.settings_hash == alike.settings_hash != other.settings_hash
@@ -89,6 +92,21 @@ def test_a_policy_s_file_is_in_the_key_of_rows_by_what_is_in_it(tmp_path: Path) 
     labelled = identity("reward.traffic=learned", f"traffic.weights={files[0]}")
     assert labelled.settings["traffic.weights"] == one.settings["traffic.weights"]
     assert not {"traffic.weights", "traffic.policy"} & identity().settings.keys()
+
+
+@pytest.mark.slow
+def test_a_policy_that_is_changed_under_a_run_makes_no_row_by_the_name_of_the_old_one(tmp_path: Path) -> None:
+    """It is the machine's illness, not the clip's."""
+    given, file = unfitted().weights, tmp_path / "policy.npz"
+    file.write_bytes(weights_file(given, "{}"))
+    words = [*BLIND, "experts=[pdm_closed]", "render=none", "vocabulary.k=64", "traffic=learned"]
+    run = assemble(load_config([*words, f"traffic.weights={file}"]))
+    (ref,) = run.refs
+    run.work.prepare(ref)
+    file.write_bytes(weights_file(given._replace(last_bias=given.last_bias + 1.0), "{}"))
+    with pytest.raises(OSError, match="another file than when the run began") as refused:
+        run.work.prepare(ref)
+    assert why_ill(refused.value)
 
 
 @pytest.mark.parametrize(
@@ -103,4 +121,4 @@ def test_a_policy_s_file_is_in_the_key_of_rows_by_what_is_in_it(tmp_path: Path) 
 )
 def test_traffic_without_its_policy_is_refused(words: list[str], said: str) -> None:
     with pytest.raises(ConfigError, match=said):
-        assemble(load_config(["clips.n_clips=1", "experts=[pdm_closed]", *words]))
+        assemble(load_config([*BLIND, "experts=[pdm_closed]", *words]))
