@@ -1,6 +1,5 @@
 """The command: what it refuses, what it writes, and that it drives nothing twice."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,6 +13,7 @@ from planners.drive import work
 from planners.drive.drive import main
 from planners.drive.settings import settings_of
 from planners.drive.table import open_drives
+from tests.planners.faults import fail_once, interrupted_after_one
 
 WITHOUT_SENSORS = ["clips.settings.cameras=[]", "clips.settings.lidar_beams=0"]
 
@@ -122,15 +122,7 @@ def test_a_row_holds_the_drive(towns: Path, tmp_path: Path) -> None:
 def test_a_drive_that_cannot_be_made_is_told_and_the_others_are_kept(
     towns: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    drive, bad = work.drive, []
-
-    def sometimes(start, *arguments):  # type: ignore[no-untyped-def]
-        bad.append(1)
-        if len(bad) == 1:
-            raise ValueError("a plan must be (8 or 40, 3) finite numbers")
-        return drive(start, *arguments)
-
-    monkeypatch.setattr(work, "drive", sometimes)
+    fail_once(monkeypatch, work, "drive")
     assert main(words(towns, tmp_path)) == COMPLETE_WITH_FAILURES
     assert "1 drives or clips could not be driven" in capsys.readouterr().err
     assert len(rows(tmp_path)) == 1
@@ -139,19 +131,12 @@ def test_a_drive_that_cannot_be_made_is_told_and_the_others_are_kept(
 
 
 def test_an_interrupted_command_keeps_what_it_has_and_goes_on(
-    towns: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    towns: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    each = command.each
-
-    def first_alone(function, items, *arguments) -> Iterator[object]:  # type: ignore[no-untyped-def]
-        yield from each(function, list(items)[:1], *arguments)
-        raise command.Halted
-
-    monkeypatch.setattr(command, "each", first_alone)
-    assert main(words(towns, tmp_path)) == INTERRUPTED
+    with interrupted_after_one(command):
+        assert main(words(towns, tmp_path)) == INTERRUPTED
     assert "the same command goes on" in capsys.readouterr().err
     assert len(rows(tmp_path)) == 1
-    monkeypatch.setattr(command, "each", each)
     assert main(words(towns, tmp_path)) == COMPLETE
     assert len(rows(tmp_path)) == 2
 

@@ -1,6 +1,5 @@
 """The command, and the run that takes what it found: order, lineage, resume, and what is refused."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from planners.explore import explore as command
 from planners.explore import work
 from planners.explore.explore import main
 from tasks.drifts import index_of
+from tests.planners.faults import fail_once, interrupted_after_one
 
 WITHOUT_SENSORS = ["clips.settings.cameras=[]", "clips.settings.lidar_beams=0"]
 
@@ -120,18 +120,11 @@ def test_what_is_explored_is_not_explored_again_and_the_parts_make_the_same_rows
 
 
 def test_an_interrupted_command_keeps_what_it_has_and_goes_on(
-    towns: Path, explored: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    towns: Path, explored: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    each = command.each
-
-    def first_alone(function, items, *arguments) -> Iterator[object]:  # type: ignore[no-untyped-def]
-        yield from each(function, list(items)[:1], *arguments)
-        raise command.Halted
-
-    monkeypatch.setattr(command, "each", first_alone)
-    assert main(words(towns, tmp_path)) == INTERRUPTED
+    with interrupted_after_one(command):
+        assert main(words(towns, tmp_path)) == INTERRUPTED
     assert "the same command goes on" in capsys.readouterr().err
-    monkeypatch.setattr(command, "each", each)
     assert main(words(towns, tmp_path)) == COMPLETE
     assert rows(tmp_path) == rows(explored)
 
@@ -139,15 +132,7 @@ def test_an_interrupted_command_keeps_what_it_has_and_goes_on(
 def test_a_clip_that_cannot_be_explored_is_told_and_the_other_is_kept(
     towns: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    log, bad = work.from_the_log, []
-
-    def sometimes(clip, *arguments):  # type: ignore[no-untyped-def]
-        bad.append(1)
-        if len(bad) == 1:
-            raise ValueError("a plan must be (8 or 40, 3) finite numbers")
-        return log(clip, *arguments)
-
-    monkeypatch.setattr(work, "from_the_log", sometimes)
+    fail_once(monkeypatch, work, "from_the_log")
     assert main(words(towns, tmp_path)) == COMPLETE_WITH_FAILURES
     assert "1 clips could not be explored" in capsys.readouterr().err
     assert len(rows(tmp_path)) == 1
