@@ -17,6 +17,7 @@ from contextlib import nullcontext
 from itertools import zip_longest
 from typing import TYPE_CHECKING
 
+from factory.config.classes import class_of
 from factory.config.compose import ConfigError, conf_dir
 from factory.config.plugins import choices
 from factory.config.run import RunConfig, composed_run, load_config, photos_alone, shapes_in
@@ -112,10 +113,11 @@ def labels_limit(config: RunConfig) -> dict[str, float]:
 
 
 def isolates(config: RunConfig) -> bool:
-    """Whether executor=local works in a process of its own: where asked for, or where a plug-in works."""
+    """Whether executor=local works in a process of its own: where asked for, a plug-in works, or logs can do harm."""
     used = [config.clips, *(spec for name, spec in config.expert.items() if name in config.experts)]
     foreign = any(not str(spec.get("_target_", "")).startswith(("factory.", "tasks.")) for spec in used)
     foreign |= config.traffic.mode == "learned" and not config.traffic.policy.startswith("tasks.")
+    foreign |= bool(getattr(class_of(config.clips, "clips", "my_package.MyReader"), "untrusted", False))
     return config.graph.isolated == "always" or (config.graph.isolated == "auto" and foreign)
 
 

@@ -12,10 +12,12 @@ from pathlib import Path
 
 import pytest
 
+from factory.config.run import load_config
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
 from factory.graph.guard import CRASHED
 from factory.graph.limits import Costs, Limits, notes_folder
 from factory.graph.local import MAX_RETRIES
+from factory.run import isolates
 from factory.store.samples import Store
 from factory.views.status import status_lines
 from tests.factory.graph.runs import run
@@ -159,3 +161,19 @@ def test_what_tasks_took_so_far_says_what_the_next_may_take() -> None:
     assert costs.limits("perturb")["seconds"] == 600.0
     assert costs.limits("label")["seconds"] == 300.0
     assert given.limits("perturb")["seconds"] == 2000.0
+
+
+@pytest.mark.parametrize(
+    ("words", "apart"),
+    [
+        (["clips=synthetic"], False),
+        (["clips=av2", "clips.root=."], False),
+        (["clips=scenarionet", "clips.root=."], True),  # pickles
+        (["clips=scenarionet", "clips.root=.", "graph.isolated=never"], False),
+        (["clips=custom", "clips._target_=examples.csv_logs.CsvReader", "+clips.root=."], True),
+        (["traffic=learned", "traffic.policy=examples.keep_gap:KeepGap"], True),
+        (["clips=synthetic", "graph.isolated=always"], True),
+    ],
+)
+def test_what_may_bring_a_process_down_works_in_one_of_its_own(words: list[str], apart: bool) -> None:
+    assert isolates(load_config([*words, "out=somewhere"])) is apart
