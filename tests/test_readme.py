@@ -257,6 +257,8 @@ def test_every_command_is_one_its_program_takes(
             assert pairs(arguments).keys() == {"uniform", "targeted", "explored"}  # it reads what alternate left
         case ["python", "-m", "tests.bench.bench_late", *arguments]:
             assert set(pairs(given(arguments))) <= {"openscene", "front", "town", "corners"}
+        case ["python", "-m", "tests.bench.bench_gate", *arguments]:
+            assert set(pairs(arguments)) <= {"chosen", "held", "clips", "out", "drives", "every"}
         case ["python", "-m", "tests.bench.bench_town", *arguments]:
             known = {field.name for field in fields(FitSettings)} | {
                 "log",

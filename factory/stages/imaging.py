@@ -24,10 +24,12 @@ from tasks.attempt import Judged
 from tasks.perturb import Candidate
 from tasks.render.block_gate import poor_block
 from tasks.render.gate import looked_at_size, unfit
-from tasks.render.likeness import Album, fading_of, likeness_to_photo, sightings
+from tasks.render.likeness import Album, Snapshot, fading_of, likeness_to_photo, sightings
 from tasks.render.map_drawing import draw_map_views
 from tasks.render.rigs import RIGS
 from tasks.render.scene.asset import RenderAsset
+from tasks.render.scene.engine import vehicles_at
+from tasks.render.scene.sensed import Photo
 from tasks.render.settings import STEPS_OF, ImageSource, PsnrGate, RenderMode, RenderSettings
 from tasks.render.views import pose_on_ground, render_views
 from tasks.stages import Rejected
@@ -340,15 +342,23 @@ def album_of(clip: Clip, asset: RenderAsset, settings: RenderSettings) -> Album:
     size = looked_at_size((settings.width, settings.height), settings.gate)
     known: dict[int, dict[str, float]] = {}
 
+    @cache
+    def photo(row: int) -> Photo:
+        return load_photos([files[row]], cameras, *size)[0]
+
     def likeness(track_id: str, row: int) -> float:
         if row not in known:
-            (photo,) = load_photos([files[row]], cameras, *size)
-            known[row] = likeness_to_photo(asset, photo, agents, tracks[row], settings.backend)
+            known[row] = likeness_to_photo(asset, photo(row), agents, tracks[row], settings.backend)
         return known[row][track_id]
+
+    def taken(track_id: str, row: int) -> Snapshot:
+        there = vehicles_at(agents, photo(row).taken_s)
+        own = there.track_ids.index(track_id)
+        return Snapshot(photo(row), there.boxes[own], np.delete(there.boxes, own, axis=0))
 
     held_out = {(view.camera, view.time_s) for view in asset.views if view.held_out}
     rows = frozenset(row for row, file in enumerate(files) if (file.sensor, file.time_s) in held_out)
-    return Album(shown, likeness, cache(lambda: fading_of(shown, likeness, rows)))
+    return Album(shown, likeness, cache(lambda: fading_of(shown, likeness, rows)), taken)
 
 
 @lru_cache(maxsize=2)

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import uniform_filter
 
+from tasks.render.beside_photo import beside_photo
 from tasks.render.likeness import Album, expected, eye_in_box, large_vehicles
 from tasks.render.scene.asset import OwnBody, RenderAsset, scene_at
 from tasks.render.scene.engine import Backend, Vehicles, render, vehicles_at
@@ -40,6 +41,10 @@ ROAD_M = 20.0  # a ray that meets the road's plane nearer than this is not one a
 HOLE_MAX = 0.2  # share of those rays that meet nothing
 LENS_M = 0.8  # what is nearer than this is on the lens
 LENS_MAX = 0.2  # share of the picture that may be covered by it
+BEHIND_BOX_M = 0.7  # so far windows, bonnets and wheels lie behind their vehicle's box, seen from a slant
+BESIDE_RAD = 0.06  # by so much may such a place be off, from two places, for a picture to be held beside a photo
+BESIDE_GAP = 0.5  # and so far may these be apart, as a share of the distance
+BESIDE_SHARE = 0.3  # of a vehicle's outline, that both must show
 DETAIL_MIN = 0.06  # standard deviation of the grey picture less its 3 x 3 mean, as a share of the contrast
 
 
@@ -102,11 +107,32 @@ def unlike(album: Album, there: Vehicles, eye: Pinhole, view: View, settings: Ga
     if settings.vehicle_min == 0.0:
         return None
     for j, share in large_vehicles(there, eye, view, settings.vehicle_share):
-        track_id = there.track_ids[j]
-        alike = expected(album, track_id, eye_in_box(eye.world_from_camera[:3, 3], there.boxes[j]))
+        track_id, box = there.track_ids[j], there.boxes[j]
+        alike = expected(album, track_id, eye_in_box(eye.world_from_camera[:3, 3], box))
         if alike < settings.vehicle_min:
             return "unlike_photos", f"track {track_id} on {share:.0%} of the picture, expected likeness {alike:.2f}"
+        alike = seen_beside(album, there, j, eye, view)
+        if alike < settings.beside_min:
+            return (
+                "unlike_photos",
+                f"track {track_id} on {share:.0%} of the picture, likeness {alike:.2f} beside a photo",
+            )
     return None
+
+
+def seen_beside(album: Album, there: Vehicles, j: int, eye: Pinhole, view: View) -> float:
+    """How like the photo that was taken from nearest to here the j-th vehicle in a picture is, 0 to 1; 1 where no photo
+    was taken near enough to say."""
+    track_id, box = there.track_ids[j], there.boxes[j]
+    seen = album.sightings.get(track_id)
+    if seen is None or album.taken is None:
+        return 1.0
+    inside = eye_in_box(eye.world_from_camera[:3, 3], box)
+    row, gap = seen.nearest(inside)
+    if gap > BESIDE_GAP or gap * BEHIND_BOX_M > BESIDE_RAD * float(np.linalg.norm(inside)):
+        return 1.0
+    alike, share = beside_photo(view.rgb, eye, box, np.delete(there.boxes, j, axis=0), album.taken(track_id, row))
+    return alike if share >= BESIDE_SHARE else 1.0
 
 
 def fault_of(found: Measures, settings: GateSettings) -> tuple[str, str] | None:

@@ -57,12 +57,24 @@ class Sightings:
 
 
 @dataclass(frozen=True)
+class Snapshot:
+    """A photo of a vehicle, and who was where when it was taken."""
+
+    photo: Photo
+    box: Array  # (7,) the vehicle's
+    others: Array  # (N, 7) the boxes that may hide it
+
+
+@dataclass(frozen=True)
 class Album:
     """A block's photos, for holding vehicles against them."""
 
     sightings: Mapping[str, Sightings]  # by track id
     likeness: Callable[[str, int], float]  # of a track as the scene draws it to a photo that shows it, 0 to 1
     fading: Callable[[], Mapping[str, float]] = dict  # of tracks; FADING of others
+    taken: Callable[[str, int], Snapshot] | None = (
+        None  # a photo that shows a track; None: none is held beside pictures
+    )
 
 
 def sightings(files: Sequence[SensorFile], cameras: Sequence[Camera], agents: AgentTracks) -> dict[str, Sightings]:

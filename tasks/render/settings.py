@@ -76,19 +76,18 @@ def _check(what: str, settings: object, bounds: Mapping[str, tuple[float, float]
 
 @dataclass(frozen=True)
 class GateSettings:
-    """What every picture must come up to. What `vehicle_min` catches and loses is in docs/reconstruction.md."""
+    """What every picture must come up to. What the looks at vehicles catch and lose: docs/reconstruction.md."""
 
     enabled: bool = True  # whether pictures are looked at
     width: int = 160  # pixels of the pictures that are looked at, where those to be stored are no smaller
     reach_m: float = 30.0  # of the scene that is looked at
     contrast_min: float = 0.02  # standard deviation of the grey picture in [0, 1]: five grey levels
-    vehicle_min: float = (
-        0.7  # likeness to its photos that a large vehicle must be expected to have; 0: none is looked at
-    )
+    vehicle_min: float = 0.7  # likeness to its photos to be expected of a large vehicle; 0: no look at vehicles
+    beside_min: float = 0.75  # likeness that it must have beside a photo from near, place by place; 0: no such look
     vehicle_share: float = 0.05  # of a picture, from which on a vehicle is large
 
     def __post_init__(self) -> None:
-        shares = dict.fromkeys(("contrast_min", "vehicle_min", "vehicle_share"), (0.0, 1.0))
+        shares = dict.fromkeys(("contrast_min", "vehicle_min", "beside_min", "vehicle_share"), (0.0, 1.0))
         _check("render gate", self, {"width": (16, math.inf), "reach_m": (0.0, math.inf), **shares})
 
 

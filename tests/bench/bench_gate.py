@@ -36,6 +36,7 @@ from tests.bench.gate_truth import Painted, Shown, Simulated, drives, verdicts
 BAD, GOOD = 0.7, 0.8  # likeness to the truth: below, something is torn or smeared; from there on, nothing is
 LIMITS = (0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8)
 EXPERTS = ("pdm_closed", "recovery")
+NUMBERS = ("likeness", "share", "expected", "beside")
 STORED = [NOW + HORIZON_STEPS + offset for offset in STEPS_OF[Frames.HISTORY]]  # steps of a clip
 SHEET = 60  # pictures of a sheet
 
@@ -51,7 +52,8 @@ class Labelled:
     likeness: float  # to the truth, of the worst large vehicle; 1 where there is none
     share: float  # of the picture, of that vehicle; 0 where there is none
     fault: str  # of the gate's other measures
-    expected: float  # the gate's expectation
+    expected: float  # the gate's expectation, by the nearest photo
+    beside: float  # the likeness to that photo itself, seen from here; 1 where none is near enough
 
 
 def labelled(seed: int, clips: int, most: int, every: int, out: Path) -> list[Labelled]:
@@ -80,8 +82,8 @@ def labelled(seed: int, clips: int, most: int, every: int, out: Path) -> list[La
             costs.append([cpu_ms(drive, asset, clip, work, kept_album) for kept_album in (None, timed_album)])
             for shown in town.pictures(drive, asset, rig, every):
                 likeness, share = shown.label(settings.vehicle_share)
-                fault, expectation = verdicts(shown, drive, asset, album, settings)
-                rows.append(Labelled(ref.log_id, name, shown.camera, shown.step, likeness, share, fault, expectation))
+                fault, *alike = verdicts(shown, drive, asset, album, settings)
+                rows.append(Labelled(ref.log_id, name, shown.camera, shown.step, likeness, share, fault, *alike))
                 if share > 0.0:
                     worst = sorted([*worst, (likeness, shown)], key=lambda found: found[0])[:SHEET]
         print(
@@ -125,15 +127,15 @@ def read(path: Path) -> list[Labelled]:
     """Labels that `kept` wrote."""
     with path.open(newline="", encoding="utf-8") as file:
         found = [
-            row | {"step": int(row["step"])} | {name: float(row[name]) for name in ("likeness", "share", "expected")}
+            row | {"step": int(row["step"])} | {name: float(row[name]) for name in NUMBERS}
             for row in csv.DictReader(file)
         ]
     return [Labelled(**row) for row in found]  # type: ignore[arg-type]
 
 
-def table(rows: Sequence[Labelled], limits: Sequence[float]) -> str:
+def table(rows: Sequence[Labelled]) -> str:
     """Per limit what is refused of the pictures with a large vehicle, by label, and of the drives, of which only the
-    stored pictures count."""
+    stored pictures count: by what is expected of a vehicle, by how it is beside a photo, by both at the defaults."""
     large = [row for row in rows if row.share > 0.0]
     of = {
         "bad": [row for row in large if row.likeness < BAD],
@@ -147,17 +149,22 @@ def table(rows: Sequence[Labelled], limits: Sequence[float]) -> str:
         + f"; refused by the other measures: {sum(bool(row.fault) for row in of['bad'])} of the bad, "
         f"{sum(bool(row.fault) for row in of['good'])} of the good",
         "",
-        "| `vehicle_min` | bad caught | bad missed | fair lost | good lost | drives refused | with a bad picture "
-        "| drives with a bad picture let through |",
-        "|---|---|---|---|---|---|---|---|",
+        "| `vehicle_min` | `beside_min` | bad caught | bad missed | fair lost | good lost | drives refused "
+        "| with a bad picture | drives with a bad picture let through |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
-    for limit in limits:
-        caught, fair, good = (sum(row.expected < limit for row in found) for found in of.values())
-        refused = {row.drive for row in rows if row.expected < limit and row.step in STORED}
+    settings = GateSettings()
+    defaults = (settings.vehicle_min, settings.beside_min)
+    for expected, beside in (*((limit, 0.0) for limit in LIMITS), *((0.0, limit) for limit in LIMITS), defaults):
+        refused = [row.expected < expected or row.beside < beside for row in large]
+        fell = {row.drive for row, falls in zip(large, refused, strict=True) if falls and row.step in STORED}
+        gone = {id(row) for row, falls in zip(large, refused, strict=True) if falls}
+        caught, fair, good = (sum(id(row) in gone for row in found) for found in of.values())
+        limits = " | ".join(f"{limit:g}" if limit else "-" for limit in (expected, beside))
         lines.append(
-            f"| {limit:g} | {caught} ({caught / max(len(of['bad']), 1):.0%}) | {len(of['bad']) - caught} "
+            f"| {limits} | {caught} ({caught / max(len(of['bad']), 1):.0%}) | {len(of['bad']) - caught} "
             f"| {fair} ({fair / max(len(of['fair']), 1):.0%}) | {good} ({good / max(len(of['good']), 1):.1%}) "
-            f"| {len(refused)} | {len(refused & poor)} | {len(poor - refused)} |"
+            f"| {len(fell)} | {len(fell & poor)} | {len(poor - fell)} |"
         )
     return "\n".join(lines)
 
@@ -182,8 +189,7 @@ def main() -> None:
                 kept(path, labelled(seed, clips, most, every, out))
             rows += read(path)
         what = "limits were chosen on" if name == "chosen" else "held out"
-        print(f"\nseeds {', '.join(map(str, seeds))} ({what}): {table(rows, LIMITS)}")
-    print(f"\ndefault: vehicle_min={GateSettings().vehicle_min:g}")
+        print(f"\nseeds {', '.join(map(str, seeds))} ({what}): {table(rows)}")
 
 
 if __name__ == "__main__":

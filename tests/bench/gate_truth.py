@@ -17,7 +17,7 @@ from factory.readers.town.drive import TownDrive
 from factory.readers.town.town import log_name, plan_log
 from factory.stages.imaging import GATE_STRIDE
 from factory.stages.pipeline import FactoryWork, payload_of
-from tasks.render.gate import GateSettings, composed, fault_of, measures
+from tasks.render.gate import GateSettings, composed, fault_of, measures, seen_beside
 from tasks.render.likeness import Album, expected, eye_in_box, inside_mean, large_vehicles, outline_of, similarity
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.engine import Vehicles, render, vehicles_at
@@ -115,19 +115,20 @@ class Painted:
 
 def verdicts(
     shown: Shown, drive: Simulated, asset: RenderAsset, album: Album, settings: GateSettings
-) -> tuple[str, float]:
+) -> tuple[str, float, float]:
     """What the gate says of a picture: the fault without regard to photos, "" for none; the likeness expected of the
-    large vehicle that is to be least like its photos."""
+    large vehicle that is to be least like its photos; and that of the one that beside a photo is least like it."""
     pose = shown.world_from_ego
     there = vehicles_at(drive.agents, shown.step * STEP_S, pose[:2, 3], settings.reach_m)
     scene = composed(asset, there, pose[:3, 3], settings.reach_m)
     views = render(scene, [shown.eye], affines=[asset.affine_of(shown.camera, shown.step * STEP_S)])
     fault = fault_of(measures(scene, [shown.eye], views, pose)[0], settings)
-    least = NOTHING_LARGE
+    least, beside = NOTHING_LARGE, NOTHING_LARGE
     for j, _ in large_vehicles(there, shown.eye, views[0], settings.vehicle_share):
-        eye = eye_in_box(shown.eye.world_from_camera[:3, 3], there.boxes[j])
-        least = min(least, expected(album, there.track_ids[j], eye))
-    return "" if fault is None else fault[0], least
+        track_id, box = there.track_ids[j], there.boxes[j]
+        least = min(least, expected(album, track_id, eye_in_box(shown.eye.world_from_camera[:3, 3], box)))
+        beside = min(beside, seen_beside(album, there, j, shown.eye, views[0]))
+    return "" if fault is None else fault[0], least, beside
 
 
 def _with(drive: TownDrive, agents: AgentTracks, first: int) -> TownDrive:

@@ -34,7 +34,7 @@ from planners.training.optim import learning_rate
 RECORDS = Path(__file__).parent / "recorded"
 FAMILIES = ("ltf", "diffusiondrive", "gtrs_dense")
 TOLERANCE = 1e-4
-HELD = 12  # steps of the record, for a test of half a minute
+HELD = 6  # steps of the record, for a test of a quarter of a minute
 
 
 @pytest.mark.slow
