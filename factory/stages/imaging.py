@@ -24,7 +24,7 @@ from tasks.attempt import Judged
 from tasks.perturb import Candidate
 from tasks.render.block_gate import poor_block
 from tasks.render.gate import looked_at_size, unfit
-from tasks.render.likeness import Album, Shot, fading_of, likeness_to_photo, sightings
+from tasks.render.likeness import Album, VehiclePhoto, fading_of, likeness_to_photo, sightings
 from tasks.render.map_drawing import draw_map_views
 from tasks.render.rigs import RIGS
 from tasks.render.scene.asset import RenderAsset
@@ -351,10 +351,10 @@ def album_of(clip: Clip, asset: RenderAsset, settings: RenderSettings) -> Album:
             known[row] = likeness_to_photo(asset, photo(row), agents, tracks[row], settings.backend)
         return known[row][track_id]
 
-    def taken(track_id: str, row: int) -> Shot:
+    def taken(track_id: str, row: int) -> VehiclePhoto:
         there = vehicles_at(agents, photo(row).taken_s)
         own = there.track_ids.index(track_id)
-        return Shot(photo(row), there.boxes[own], np.delete(there.boxes, own, axis=0))
+        return VehiclePhoto(photo(row), there.boxes[own], np.delete(there.boxes, own, axis=0))
 
     held_out = {(view.camera, view.time_s) for view in asset.views if view.held_out}
     rows = frozenset(row for row, file in enumerate(files) if (file.sensor, file.time_s) in held_out)

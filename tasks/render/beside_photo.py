@@ -9,7 +9,7 @@ scene's own shape goes in: by its own depths a torn vehicle would look like ever
 import cv2
 import numpy as np
 
-from tasks.render.likeness import Shot, inside_mean, similarity
+from tasks.render.likeness import VehiclePhoto, inside_mean, similarity
 from tasks.render.scene.movers import behind_boxes, world_from_boxes
 from tasks.render.scene.sky import directions
 from tasks.world.arrays import F32, Array, Bools, Bytes, Ints
@@ -18,7 +18,7 @@ from tasks.world.camera import Pinhole
 SHIFTS_PX = (-2, -1, 0, 1, 2)  # by which the photo is moved either way to fit: a box is no car, nor where it is exactly
 
 
-def beside_photo(rgb: F32, eye: Pinhole, box: Array, others: Array, taken: Shot) -> tuple[float, float]:
+def beside_photo(rgb: F32, eye: Pinhole, box: Array, others: Array, taken: VehiclePhoto) -> tuple[float, float]:
     """How like a photo a picture (H, W, 3) of a vehicle is, 0 to 1, and the share of its outline that both show.
 
     `box` (7,) is the vehicle's and `others` (N, 7) those that may hide it, as `eye` sees them.

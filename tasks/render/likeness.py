@@ -57,7 +57,7 @@ class Sightings:
 
 
 @dataclass(frozen=True)
-class Shot:
+class VehiclePhoto:
     """A photo of a vehicle, and who was where when it was taken."""
 
     photo: Photo
@@ -72,7 +72,7 @@ class Album:
     sightings: Mapping[str, Sightings]  # by track id
     likeness: Callable[[str, int], float]  # of a track as the scene draws it to a photo that shows it, 0 to 1
     fading: Callable[[], Mapping[str, float]] = dict  # of tracks; FADING of others
-    taken: Callable[[str, int], Shot] | None = None  # a photo that shows a track; None: none is held beside pictures
+    taken: Callable[[str, int], VehiclePhoto] | None = None  # a track in a photo; None: there is none beside pictures
 
 
 def sightings(files: Sequence[SensorFile], cameras: Sequence[Camera], agents: AgentTracks) -> dict[str, Sightings]:

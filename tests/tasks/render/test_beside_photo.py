@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tasks.render.beside_photo import beside_photo, on_box
 from tasks.render.gate import BEHIND_BOX_M, BESIDE_GAP, BESIDE_RAD, GateSettings, seen_beside, unlike
-from tasks.render.likeness import Album, Sightings, Shot, eye_in_box
+from tasks.render.likeness import Album, Sightings, VehiclePhoto, eye_in_box
 from tasks.render.scene.engine import Vehicles
 from tasks.render.scene.sensed import Photo
 from tasks.render.splatting.raster import View
@@ -64,9 +64,9 @@ def painted(eye: Pinhole, boxes: Array, phase: float = 0.0) -> NDArray[np.float3
     return rgb.reshape(HEIGHT, WIDTH, 3).astype(np.float32)
 
 
-def shot(eye: Pinhole, box: Array = BOX, others: Array = NOBODY) -> Shot:
+def vehicle_photo(eye: Pinhole, box: Array = BOX, others: Array = NOBODY) -> VehiclePhoto:
     rgb = np.rint(255.0 * painted(eye, np.concatenate([box[None], others]))).astype(np.uint8)
-    return Shot(Photo("front", 0.0, rgb, INTRINSICS, eye.world_from_camera), box, others)
+    return VehiclePhoto(Photo("front", 0.0, rgb, INTRINSICS, eye.world_from_camera), box, others)
 
 
 def test_rays_meet_a_box_where_a_walk_along_them_first_enters_it() -> None:
@@ -84,7 +84,7 @@ def test_rays_meet_a_box_where_a_walk_along_them_first_enters_it() -> None:
 
 
 def test_a_vehicle_whole_from_elsewhere_is_like_its_photo_and_one_torn_is_not() -> None:
-    here, taken = eye_at(1.5, -0.8), shot(eye_at(0.0))
+    here, taken = eye_at(1.5, -0.8), vehicle_photo(eye_at(0.0))
     whole = painted(here, BOX[None])
     alike, share = beside_photo(whole, here, BOX, NOBODY, taken)
     assert alike > 0.93 and share > 0.9
@@ -96,7 +96,7 @@ def test_a_vehicle_whole_from_elsewhere_is_like_its_photo_and_one_torn_is_not() 
 
 
 def test_it_does_not_matter_where_in_the_world_both_are() -> None:
-    here, taken = eye_at(1.5, -0.8), shot(eye_at(0.0))
+    here, taken = eye_at(1.5, -0.8), vehicle_photo(eye_at(0.0))
     whole = painted(here, BOX[None])
     c, s = np.cos(0.7), np.sin(0.7)
     move = np.eye(4)
@@ -109,7 +109,7 @@ def test_it_does_not_matter_where_in_the_world_both_are() -> None:
 
 
 def test_a_pixel_or_two_off_is_forgiven() -> None:
-    here, taken = eye_at(0.0), shot(eye_at(0.0))
+    here, taken = eye_at(0.0), vehicle_photo(eye_at(0.0))
     moved = np.roll(painted(here, BOX[None]), (1, 2), axis=(0, 1))
     assert beside_photo(moved, here, BOX, NOBODY, taken)[0] > 0.97
 
@@ -117,10 +117,10 @@ def test_a_pixel_or_two_off_is_forgiven() -> None:
 def test_faces_that_the_photo_does_not_show_say_nothing() -> None:
     behind, beside = eye_at(0.0, 1.0), eye_at(10.0 - 3.0, -7.0)
     straight = BOX * [1, 1, 1, 0, 1, 1, 1]
-    _, share = beside_photo(painted(beside, straight[None]), beside, straight, NOBODY, shot(behind, straight))
+    _, share = beside_photo(painted(beside, straight[None]), beside, straight, NOBODY, vehicle_photo(behind, straight))
     assert share == 0.0  # of the side from the side: from behind there is the back alone
     ahead = eye_at(30.0)
-    assert beside_photo(painted(ahead, BOX[None]), ahead, BOX, NOBODY, shot(behind)) == (0.0, 0.0)
+    assert beside_photo(painted(ahead, BOX[None]), ahead, BOX, NOBODY, vehicle_photo(behind)) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("hidden", ["here", "in the photo"])
@@ -129,9 +129,14 @@ def test_what_others_hide_says_nothing(hidden: str) -> None:
     other = np.array([[5.0, 0.0, 0.6, 0.0, 1.0, 1.2, 1.2]])
     mine, theirs = (other, NOBODY) if hidden == "here" else (NOBODY, other)
     picture = painted(here, np.concatenate([BOX[None], mine]))
-    alike, share = beside_photo(picture, here, BOX, mine, shot(then, BOX, theirs))
+    alike, share = beside_photo(picture, here, BOX, mine, vehicle_photo(then, BOX, theirs))
     assert 0.2 < share < 0.9 and alike > 0.9
-    assert beside_photo(picture, here, BOX, NOBODY, shot(then, BOX, theirs) if len(mine) else shot(then))[1] > share
+    assert (
+        beside_photo(
+            picture, here, BOX, NOBODY, vehicle_photo(then, BOX, theirs) if len(mine) else vehicle_photo(then)
+        )[1]
+        > share
+    )
 
 
 def test_only_a_photo_from_near_enough_is_held_beside() -> None:
@@ -141,7 +146,7 @@ def test_only_a_photo_from_near_enough_is_held_beside() -> None:
     view = View(wrong, np.full((HEIGHT, WIDTH), 20.0, np.float32), np.ones((HEIGHT, WIDTH), np.float32))
 
     def album(eye: Array) -> Album:
-        return Album({"car": Sightings(np.array([0]), eye[None])}, lambda *_: 1.0, taken=lambda *_: shot(then))
+        return Album({"car": Sightings(np.array([0]), eye[None])}, lambda *_: 1.0, taken=lambda *_: vehicle_photo(then))
 
     near = eye_in_box(then.world_from_camera[:3, 3], BOX)
     assert seen_beside(album(near), there, 0, here, view) < 0.7
