@@ -1,9 +1,9 @@
 """A vehicle in a picture beside a photo of it that was taken from near: what is torn from here is not like it.
 
-A box is shape enough for a small step aside: each pixel of the vehicle's outline looks at a place of its box's surface
-and is held against the photo's pixel that looks at the same place. What lies a metre behind the box, as a bonnet does,
-is off by 0.01 rad after a step of 1 m at 10 m: a pixel of a picture of 160. Nothing of the
-scene's own shape goes in: by its own depths a torn vehicle would look like every photo that it was fitted to.
+A box is shape enough for a small step aside: each pixel of the vehicle's outline looks at a place of its box's
+surface and is held against the photo's pixel that looks at the same place. What lies a metre behind the box, as a
+bonnet does, is off by 0.01 rad after a step of 1 m at 10 m: a pixel of a picture of 160. Nothing of the scene's own
+shape goes in: by its own depths a torn vehicle would look like every photo that it was fitted to.
 """
 
 import cv2
@@ -21,10 +21,8 @@ SHIFTS_PX = (-2, -1, 0, 1, 2)  # by which the photo is moved either way to fit: 
 def beside_photo(rgb: F32, eye: Pinhole, box: Array, others: Array, taken: VehiclePhoto) -> tuple[float, float]:
     """How like a photo a picture (H, W, 3) of a vehicle is, 0 to 1, and the share of its outline that both show.
 
-    `box` (7,) is the vehicle's and `others` (N, 7) those that may hide it, as `eye` sees them.
-
-    Of the SSIM at half size over the places that both show, the best under small shifts of the photo. 0 and 0 where
-    there is none.
+    `box` (7,) is the vehicle's and `others` (N, 7) those that may hide it, as `eye` sees them. Likeness is the SSIM at
+    half size over the places that both show, the best under small shifts of the photo. 0 and 0 where there is none.
     """
     rays = directions(eye.intrinsics, eye.world_from_camera, eye.width, eye.height).reshape(-1, 3)
     place, photo = eye.world_from_camera[:3, 3], taken.photo
@@ -52,7 +50,7 @@ def beside_photo(rgb: F32, eye: Pinhole, box: Array, others: Array, taken: Vehic
     if not clear.any():
         return 0.0, 0.0
     shape = (eye.height, eye.width)
-    columns, rows = ((np.where(clear, place, 0.0) - 0.5).astype(np.float32).reshape(shape) for place in (u, v))
+    columns, rows = ((np.where(clear, at, 0.0) - 0.5).astype(np.float32).reshape(shape) for at in (u, v))
     return _best(rgb, photo.rgb, columns, rows, clear.reshape(shape)), float(clear.sum() / outline.sum())
 
 
