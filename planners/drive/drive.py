@@ -71,13 +71,18 @@ class DrivesAsked:
 def drive_all(settings: DriveSettings) -> tuple[list[Row], list[NotDriven]]:
     """Drive what is not driven yet: the rows of all that were asked for, by planner and clip, and what could not be.
 
-    Raises ConfigError, Halted where it was interrupted, WorkerDied, AnotherWriter.
+    Raises ConfigError; Stopped where it was interrupted; Failed where a process died or another command drives here.
     """
     asked = _asked(settings)
     table = open_drives(asked.work.out)
-    table.claim()
     failed = [NotDriven(ref.clip_id, why) for ref, why in asked.broken.items()]
-    failed += _drive(asked.work, asked.items, table)
+    try:
+        table.claim()
+        failed += _drive(asked.work, asked.items, table)
+    except (Halted, KeyboardInterrupt) as error:
+        raise Stopped("interrupted; what is driven is kept, and the same command goes on") from error
+    except (WorkerDied, AnotherWriter) as error:
+        raise Failed(str(error)) from error
     return asked.rows(table), failed
 
 
@@ -159,12 +164,7 @@ def drive_command(argv: Sequence[str]) -> None:
     settings = settings_of(argv)
     if settings.executor == "ray":
         need_run_extra("ray")
-    try:
-        rows, failed = drive_all(settings)
-    except (Halted, KeyboardInterrupt) as error:
-        raise Stopped("interrupted; what is driven is kept, and the same command goes on") from error
-    except (WorkerDied, AnotherWriter) as error:
-        raise Failed(str(error)) from error
+    rows, failed = drive_all(settings)
     if rows:
         lines, apart = lines_of(rows, settings.confidence), differences_of(rows, settings.confidence)
         print(summary_text(lines, apart, settings.confidence))

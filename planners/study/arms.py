@@ -94,7 +94,8 @@ def drive_settings(arms: Sequence[Training], out: str, drives: str) -> DriveSett
 
 
 def drive_arms(arms: Sequence[Training], out: str, drives: str, means: Means) -> Stopped | None:
-    """Drive what is not driven, seed by seed; why it is not all. Raises Failed for drives that could not be made."""
+    """Drive what is not driven, seed by seed; why it is not all. Raises Stopped where it is interrupted, Failed for
+    drives that could not be made."""
     for seed, batch in groupby(arms, key=lambda one: one.facts["seed"]):
         chosen = drive_settings(list(batch), out, drives)
         if means.left_s == 0.0:

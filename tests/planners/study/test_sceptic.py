@@ -10,8 +10,9 @@ import pytest
 
 from factory.config.compose import compose, fill
 from factory.config.run import load_config
-from factory.exits import COMPLETE
+from factory.exits import COMPLETE, INTERRUPTED
 from factory.run import main as run
+from planners.drive import drive
 from planners.drive.settings import settings_of
 from planners.evaluation.evaluate import main as evaluate
 from planners.study import recipe, sweep
@@ -19,6 +20,7 @@ from planners.study.sceptic import BEGIN, EXPERT, LOGGED, MORE, REDRAWN, Sceptic
 from planners.study.sweep import EVALUATIONS
 from planners.training.many import DONE, Training, folder_of
 from planners.training.train import main as train
+from tests.planners.faults import interrupted_after_one
 
 ADDED = {MORE: 9, REDRAWN: 8, LOGGED: 9, EXPERT: 9}
 FIRST_UNSEEN = 300  # no town of this seed or a later one was looked at before the settings were written
@@ -144,6 +146,9 @@ def test_the_whole_of_it_runs_and_says_the_same_again(
 ) -> None:
     words = [f"out={tmp_path / 'out'}", f"report={tmp_path / 'report'}", *TINY]
     words = [word.replace("clips.seeds", f"clips.cache_dir={tmp_path / 'towns'} clips.seeds") for word in words]
+    with interrupted_after_one(drive):
+        assert main(words) == INTERRUPTED
+    assert "what is driven is kept, and the same command goes on" in capsys.readouterr().err
     assert main(words) == COMPLETE, capsys.readouterr().err
     report = tmp_path / "report"
     made = {path.name: path.read_bytes() for path in report.iterdir()}
