@@ -142,11 +142,15 @@ def test_a_real_run_makes_the_same_rows_in_one_task_here_and_in_three_on_ray(tow
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
-    """A node with CPUs and one with a GPU, in name."""
+    """A node with CPUs and one with a GPU, in name.
+
+    The first has more cores than two tasks take: Ray holds a core for a moment after its task of one kind has ended,
+    and lends the GPU node's to the next of another kind if no other is free.
+    """
     from ray.cluster_utils import Cluster
 
     cluster = Cluster()
-    cluster.add_node(num_cpus=2, num_gpus=0, include_dashboard=False)
+    cluster.add_node(num_cpus=8, num_gpus=0, include_dashboard=False)
     cluster.add_node(num_cpus=1, num_gpus=1)
     ray.init(address=cluster.address, log_to_driver=False)
     cluster.wait_for_nodes()
