@@ -43,10 +43,10 @@ from planners.explore.settings import settings_of as explore_settings
 from planners.models.registry import settings_of
 from planners.published.import_planner import config_of as import_config
 from planners.study.agreement import main as agreement_main
+from planners.study.experiment import ExperimentSettings
 from planners.study.recipe import Recipe
 from planners.study.report import ReportRequest
 from planners.study.scaling import ScalingSettings
-from planners.study.sceptic import ScepticSettings
 from planners.study.study import StudySettings
 from planners.traffic.train_traffic import settings_of as traffic_settings
 from planners.training.train import TrainConfig
@@ -224,8 +224,8 @@ def test_every_command_is_one_its_program_takes(
             fill(AlternateSettings, compose("alternate", arguments, AlternateSettings), "alternate")
         case ["python", "-m", "planners", "study", *arguments]:
             fill(StudySettings, compose("study", arguments), "study")
-        case ["python", "-m", "planners", "sceptic", *arguments]:
-            fill(ScepticSettings, compose("sceptic", arguments, ScepticSettings), "sceptic")
+        case ["python", "-m", "planners", "sceptic" | "labels" as name, *arguments]:
+            fill(ExperimentSettings, compose(name, arguments, ExperimentSettings), name)
         case ["python", "-m", "planners", "report", *arguments]:
             parse(ReportRequest, arguments)
         case ["python", "-m", "planners", "analysis", *arguments]:

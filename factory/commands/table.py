@@ -75,6 +75,7 @@ PLANNERS: Mapping[str, Command] = {
     "study_data": Command("the study's data, by runs of the factory", "planners.study.recipe", "data"),
     "study_logs": Command("the study's part on real logs", "planners.study.recipe", "logs"),
     "sceptic": Command("simulated samples beside other additions, scored by driving", "planners.study.sceptic"),
+    "labels": Command("which expert's labels teach a planner most", "planners.study.labels"),
     "report": Command("a study's tables and pictures from its frames", "planners.study.report"),
     "agreement": Command("whether a study made again says the same", "planners.study.agreement"),
 }

@@ -5,7 +5,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from factory.config.plugins import offer_choices
 from factory.config.shapes import dataclass_in, defaults_of, keys_of, merged
@@ -135,6 +135,8 @@ def _path(cls: type[Any] | None, loc: Sequence[str | int]) -> list[str]:
         return [str(head), *_path(None, rest)]
     if cls is None or head not in (hints := get_type_hints(cls)):
         return []
+    if get_origin(hints[head]) is dict and dataclass_in(get_args(hints[head])[1]):
+        return [head, *map(str, rest)]
     return [head, *_path(dataclass_in(hints[head]), rest)]
 
 

@@ -11,7 +11,8 @@ import tokenize
 from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, Field, asdict, fields, is_dataclass
 from enum import Enum
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 SWITCH = ("false", "true")
 PLAIN = re.compile(r"[A-Za-z_/.~]([\w./:~-]*[\w./~-])?")  # text that YAML reads as text without quotes,
@@ -20,7 +21,7 @@ OTHERWISE = {"null", "~", "true", "false", "yes", "no", "on", "off", "y", "n"}  
 
 def dataclass_in(hint: Any) -> type[Any] | None:
     """The dataclass that a field's type is, or allows beside None."""
-    options = get_args(hint) if get_origin(hint) is not None else (hint,)
+    options = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     return next((option for option in options if isinstance(option, type) and is_dataclass(option)), None)
 
 

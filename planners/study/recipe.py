@@ -67,14 +67,23 @@ def make(recipe: Recipe) -> None:
 
 def factory(*words: str) -> None:
     """One command of the factory. Raises Stopped where it was interrupted, Failed where it ended with an error."""
-    print("python -m factory", *words, file=sys.stderr)
+    _done("factory", *words)
+
+
+def planners(*words: str) -> None:
+    """One command of the planners. Raises as `factory`."""
+    _done("planners", *words)
+
+
+def _done(package: str, *words: str) -> None:
+    print("python -m", package, *words, file=sys.stderr)
     stop = Event()
     with asked_to_stop(stop.set):
-        code = exit_code([sys.executable, "-m", "factory", *words], stop.is_set)
+        code = exit_code([sys.executable, "-m", package, *words], stop.is_set)
     if code == INTERRUPTED or stop.is_set():
         raise Stopped("the same command goes on")
     if code:
-        raise Failed(f"python -m factory {words[0]} ended with exit code {code}")
+        raise Failed(f"python -m {package} {words[0]} ended with exit code {code}")
 
 
 @command

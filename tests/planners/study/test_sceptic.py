@@ -16,18 +16,20 @@ from planners.drive import drive
 from planners.drive.settings import settings_of
 from planners.evaluation.evaluate import main as evaluate
 from planners.study import recipe, sweep
-from planners.study.sceptic import BEGIN, EXPERT, LOGGED, MORE, REDRAWN, ScepticSettings, comparisons, main, planned
+from planners.study.experiment import BEGIN, ExperimentSettings, comparisons, planned
+from planners.study.sceptic import main
 from planners.study.sweep import EVALUATIONS
 from planners.training.many import DONE, Training, folder_of
 from planners.training.train import main as train
 from tests.planners.faults import interrupted_after_one
 
+MORE, REDRAWN, LOGGED, EXPERT = "more", "redrawn", "logged", "pdm_closed"
 ADDED = {MORE: 9, REDRAWN: 8, LOGGED: 9, EXPERT: 9}
 FIRST_UNSEEN = 300  # no town of this seed or a later one was looked at before the settings were written
 
 
-def settings(*words: str) -> ScepticSettings:
-    return fill(ScepticSettings, compose("sceptic", words, ScepticSettings), "sceptic")
+def settings(*words: str) -> ExperimentSettings:
+    return fill(ExperimentSettings, compose("sceptic", words, ExperimentSettings), "sceptic")
 
 
 def option(overrides: tuple[str, ...], name: str) -> str | None:
@@ -85,7 +87,17 @@ def test_every_arm_is_held_against_real_alone_and_the_expert_against_each_contro
 
 @pytest.mark.parametrize(
     ("word", "said"),
-    [("steps=0", "steps=0"), ("seeds=0", "seeds=0"), ("rounds=0", "rounds=0"), ("+runs.x=y", "runs")],
+    [
+        ("steps=0", "steps=0"),
+        ("seeds=0", "seeds=0"),
+        ("rounds=0", "of experts and of rounds"),
+        ("arms.more.run=others", "runs lacks others"),
+        ("arms.logged.rounds=0", "of experts and of rounds"),
+        ("+arms.logged.expert=[logged]", "arms.logged.expert"),
+        ("+parts.other=[logged,recovery]", "recovery is no arm"),
+        ("taught=[more]", "taught"),
+        ("added=others", "added"),
+    ],
 )
 def test_what_is_no_experiment_is_refused(word: str, said: str) -> None:
     with pytest.raises(ValueError, match=said):
