@@ -146,6 +146,7 @@ def own_part(asset: RenderAsset) -> RenderAsset:
         rig=tuple(camera for camera in asset.rig if not of_other_log(camera.name)),
         taken=tuple(photo for photo in asset.taken if not of_other_log(photo.camera)),
         bodies=tuple(body for body in asset.bodies if not of_other_log(body.camera)),
+        shifts=asset.shifts.of([name for name in asset.shifts.track_ids if not of_other_log(name)]),
     )
 
 

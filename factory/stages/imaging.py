@@ -333,7 +333,7 @@ def album_of(clip: Clip, asset: RenderAsset, settings: RenderSettings) -> Album:
     """The photos of a clip's block; one is opened when a vehicle is first held against it. Raises BadClip then."""
     block, cameras = block_of(clip), asset.as_corrected(chosen_cameras(clip.cameras, settings.cameras))
     files = asset.photos_of(block.images)
-    agents = asset.lifted(block.agents, 0.0)
+    agents = asset.settled(block.agents, 0.0)
     shown = sightings(files, cameras, agents)
     tracks: dict[int, list[str]] = {}
     for track_id, seen in shown.items():

@@ -7,15 +7,16 @@
 | `nodes.<i>.<field>` | (N_i, ...) | the i-th track, in its box's frame |
 | `sky` | (rows, columns, 3) | colours by direction |
 | `taken` | (P, 4, 4) float64 | where the ego was at each photo, where the photos corrected that |
+| `shifts` | (N, K, 4) | how far the tracks that the photos show were off their logged boxes, every 0.5 s |
 | `bodies.<i>` | (H, W, 4) uint8 | what the i-th camera that sees one sees of the own body |
 | `exposures` | (P, 3, 4) | what each photo made of the light, where they were aligned |
 
 With `SceneDtype.FLOAT16` what Gaussians are made of, but for their places (`means`), and the sky are float16, and the
 version is 2, which older programs refuse. Whoever reads gets float32 again, quaternions of length 1.
 
-The header's entry `scene` holds the rest: format, the nodes' track ids, quality photo by photo, the photos of the
-exposures, the block's range, the cameras where they were corrected, and the digest over all of it. No code runs when a
-file is read.
+The header's entry `scene` holds the rest: format, the nodes' track ids and those of the shifts, quality photo by photo,
+the photos of the exposures, the block's range, the cameras where they were corrected, and the digest over all of it. No
+code runs when a file is read.
 """
 
 import hashlib
@@ -34,6 +35,7 @@ from safetensors.numpy import save
 from factory.store.disk import whole_file
 from factory.store.identity import canonical_json
 from tasks.render.scene.asset import BlockRange, ClassQuality, Exposure, OwnBody, RenderAsset, TakenFrom, ViewQuality
+from tasks.render.scene.movers import NO_SHIFTS, BoxShifts
 from tasks.render.scene.settings import SceneDtype
 from tasks.render.scene.sky import SkyMap
 from tasks.render.splatting.gaussians import Gaussians
@@ -140,6 +142,8 @@ def tensors_of(asset: RenderAsset, dtype: SceneDtype = SceneDtype.FLOAT32) -> di
         out["exposures"] = np.stack([exposure.affine for exposure in asset.exposures])
     if asset.taken:
         out["taken"] = np.stack([photo.world_from_ego for photo in asset.taken])
+    if asset.shifts.track_ids:
+        out["shifts"] = asset.shifts.rows
     out |= {f"bodies.{i}": body.rgba for i, body in enumerate(asset.bodies)}
     return {name: np.ascontiguousarray(array) for name, array in out.items()}
 
@@ -149,7 +153,8 @@ def described_by(asset: RenderAsset, dtype: SceneDtype = SceneDtype.FLOAT32) -> 
     block = asset.block
     rig = [_calibration(camera) for camera in asset.rig]
     taken = [[photo.camera, photo.time_s, photo.rise_m, photo.late_s] for photo in asset.taken]
-    bodies = [body.camera for body in asset.bodies]
+    bodies, shifts = [body.camera for body in asset.bodies], list(asset.shifts.track_ids)
+    more = {"rig": rig, "taken": taken, "bodies": bodies, "shifts": shifts}
     return {
         "format": FORMAT,
         "version": VERSION_OF[dtype],
@@ -160,7 +165,7 @@ def described_by(asset: RenderAsset, dtype: SceneDtype = SceneDtype.FLOAT32) -> 
         "views": [_plain(asdict(view)) for view in asset.views],
         "exposures": [[exposure.camera, exposure.time_s] for exposure in asset.exposures],
         "block": None if block is None else asdict(block) | {"low": block.low.tolist(), "high": block.high.tolist()},
-    } | {name: values for name, values in (("rig", rig), ("taken", taken), ("bodies", bodies)) if values}
+    } | {name: values for name, values in more.items() if values}
 
 
 def scene_of(tensors: Tensors, described: Mapping[str, Any], digest: str) -> RenderAsset:
@@ -192,6 +197,7 @@ def scene_of(tensors: Tensors, described: Mapping[str, Any], digest: str) -> Ren
             TakenFrom(camera, time_s, tensors["taken"][i], *more)
             for i, (camera, time_s, *more) in enumerate(described.get("taken", ()))
         ),
+        shifts=BoxShifts(tuple(described["shifts"]), tensors["shifts"]) if "shifts" in described else NO_SHIFTS,
         bodies=tuple(OwnBody(camera, tensors[f"bodies.{i}"]) for i, camera in enumerate(described.get("bodies", ()))),
     )
 

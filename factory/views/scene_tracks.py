@@ -70,7 +70,7 @@ def _clips_in(store: "Store", block: BlockRange) -> Iterator[Clip]:
 def _add(seen: dict[str, dict[int, Array]], clip: Clip, asset: RenderAsset, block: BlockRange) -> None:
     """Of a clip's tracks those that are `seen` by now, their boxes (7,), within the block."""
     first_s, length_s = clip.start_s - block.start_s, block.end_s - block.start_s
-    agents, origin = asset.lifted(clip.agents, first_s), np.append(asset.origin, np.zeros(4))
+    agents, origin = asset.settled(clip.agents, first_s), np.append(asset.origin, np.zeros(4))
     for j, name in enumerate(agents.track_ids):
         for k in np.flatnonzero(agents.valid[:, j]) if name in seen else ():
             time_s = first_s + k * STEP_S

@@ -34,6 +34,7 @@ from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import PhotoTarget, Problem, Shot
 from tasks.render.fit.state import BACKGROUND, FitState, logits_of
 from tasks.render.scene.asset import psnr
+from tasks.render.scene.movers import SHIFT_SIZE
 from tasks.render.scene.sensed import Photo, Tracks
 from tasks.render.scene.sky import COLUMNS, ROWS
 from tasks.render.splatting.gaussians import Gaussians
@@ -173,6 +174,7 @@ def shaken(truth: Gaussians, n_photos: int) -> FitState:
         "sky": np.full((ROWS * COLUMNS, 3), 0.5),
         "exposure": np.zeros((n_photos, EXPOSURE_SIZE)),
         "poses": np.zeros((n_photos, POSE_SIZE)),
+        "boxes": np.zeros((0, SHIFT_SIZE)),
     }
     nothing, far = np.zeros(n, np.float32), np.full(n, np.inf, np.float32)
     owner = np.full(n, BACKGROUND, np.int32)

@@ -14,7 +14,7 @@ from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import Problem
 from tasks.render.fit.state import FitState
 from tasks.render.splatting.gradient import Gradients
-from tasks.world.arrays import F32, Array
+from tasks.world.arrays import F32, Array, Ints
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,8 @@ class Derivatives:
     rows: Any  # (M,) of the state, ascending, that are in view
     gaussians: Gradients  # by those, in the frames of their owners
     depths: Any  # (M,) [m] of those
+    tracks: Ints  # (B,) of which the photo may show some
+    boxes: F32  # (B, SHIFT_SIZE) by what their boxes are off by at its time
 
 
 class Stepped(Protocol):
@@ -42,7 +44,7 @@ class Stepped(Protocol):
 
 
 class Held(Protocol):
-    """As `FitState`: all that is learned, wherever it lies; exposure and poses lie on the CPU."""
+    """As `FitState`: all that is learned, wherever it lies; exposure, poses and boxes lie on the CPU."""
 
     iteration: int
 

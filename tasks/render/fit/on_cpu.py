@@ -8,20 +8,21 @@ import numpy as np
 
 from tasks.render.fit.backdrop import backdrop_gradient
 from tasks.render.fit.backend import Derivatives
-from tasks.render.fit.composition import OwnedGaussians, parts_of
+from tasks.render.fit.composition import OwnedGaussians, by_box, parts_of
 from tasks.render.fit.corrections import corrected, exposed, exposed_gradient
 from tasks.render.fit.losses import opaque_loss, photo_loss
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import Problem
 from tasks.render.fit.state import FitState
 from tasks.render.scene.asset import psnr
+from tasks.render.scene.movers import SHIFT_SIZE
 from tasks.render.scene.sensed import Photo
 from tasks.render.scene.sky_lookup import SkyCells, backdrop, sky_cells
 from tasks.render.splatting.gaussians import Gaussians, concatenate, moved
 from tasks.render.splatting.gradient import Gradients, backward, unmoved
 from tasks.render.splatting.project import DEPTH
 from tasks.render.splatting.raster import ForwardPass, forward
-from tasks.world.arrays import Array, Ints
+from tasks.world.arrays import F32, Array, Ints
 
 _PER_GAUSSIAN = ("index", "means", "quats", "log_scales", "logits", "colours", "sh_rest", "screen")
 
@@ -44,7 +45,7 @@ class OnCpu:
         shot, state = problem.train[row], held
         compared = shot.compared
         camera = corrected(shot.photo.world_from_camera, state.learned["poses"].values[row])
-        scene, parts = compose(problem, state, shot.photo)
+        scene, parts = compose(problem, state, state.learned["boxes"].values, shot.photo)
         seen, sky = look(state, scene, shot.photo, camera, self.threads)
         colours = state.learned["exposure"].values[row]
         picture = exposed(seen.view.rgb, colours)
@@ -57,14 +58,19 @@ class OnCpu:
         back = backward(seen, scene, d_rgb, d_alpha=d_alpha, threads=self.threads)
         cells, d_cells = backdrop_gradient(d_rgb, seen.view.alpha, sky)
         rows, mine = _of_owners(back, parts)
+        tracks, boxes = _of_boxes(state, parts, rows, mine)
         score = psnr(np.clip(picture, 0.0, 1.0), compared.target.rgb)
         depths = seen.splats.projected[:, DEPTH]
-        return Derivatives(loss, score, d_colours, back.camera, cells, d_cells, rows, mine, depths)
+        return Derivatives(loss, score, d_colours, back.camera, cells, d_cells, rows, mine, depths, tracks, boxes)
 
 
-def compose(problem: Problem, state: FitState, photo: Photo) -> tuple[Gaussians, list[OwnedGaussians]]:
-    """All Gaussians that a photo (pose local) may show, in the scene, and whose they are; the background's first."""
-    every, parts = state.gaussians(), parts_of(problem, state.owner, photo)
+def compose(problem: Problem, state: FitState, off: F32, photo: Photo) -> tuple[Gaussians, list[OwnedGaussians]]:
+    """All Gaussians that a photo (pose local) may show, in the scene, and whose they are; the background's first.
+
+    `off` (tracks * knots, SHIFT_SIZE): what boxes are off by.
+    """
+    every = state.gaussians()
+    parts = parts_of(problem, state.owner, off, photo)
     scenes = []
     for part in parts:
         mine = every.take(slice(part.rows[0], part.rows[-1] + 1) if len(part.rows) else slice(0))
@@ -90,3 +96,20 @@ def _of_owners(back: Gradients, parts: Sequence[OwnedGaussians]) -> tuple[Ints, 
         rows.append(part.rows[piece.index - part.first])
     together = {name: np.concatenate([getattr(piece, name) for piece in pieces]) for name in _PER_GAUSSIAN}
     return np.concatenate(rows), Gradients(**together, camera=back.camera)
+
+
+def _of_boxes(state: FitState, parts: Sequence[OwnedGaussians], rows: Ints, mine: Gradients) -> tuple[Ints, F32]:
+    """Tracks (B,), and derivatives (B, SHIFT_SIZE) by what their boxes are off by; `rows` and `mine` of all parts."""
+    tracks, found = [], []
+    means, quats = (state.learned[name].values for name in ("means", "quats"))
+    for part in parts:
+        if part.track is not None:
+            span = slice(*np.searchsorted(rows, [part.rows[0], part.rows[-1] + 1]))
+            shift, turn = by_box(
+                part,
+                *(array.astype(np.float64) for array in (means[rows[span]], quats[rows[span]])),
+                *(array.astype(np.float64) for array in (mine.means[span], mine.quats[span])),
+            )
+            tracks.append(part.track)
+            found.append(np.append(shift, turn))
+    return np.array(tracks, np.int64), np.array(found, np.float32).reshape(-1, SHIFT_SIZE)

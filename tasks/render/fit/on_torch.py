@@ -1,29 +1,31 @@
 """The fit on a device of torch's: the state lies there, one photo an iteration goes there, and torch derives the loss.
 
-Exposure and poses, a few numbers a photo, stay on the CPU, and so does density control: it is the same code and the
-same draws, for which the state comes back. Sums on a GPU are added up in any order, so that no two fits are alike to
-the last bit.
+Exposure, poses and boxes, a few numbers a photo, stay on the CPU, and so does density control: it is the same code and
+the same draws, for which the state comes back. Sums on a GPU are added up in any order, so that no two fits are alike
+to the last bit.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from tasks.render.fit.adam import Learned
 from tasks.render.fit.backend import Derivatives
-from tasks.render.fit.composition import OwnedGaussians, parts_of
+from tasks.render.fit.composition import OwnedGaussians, by_box, parts_of
 from tasks.render.fit.corrections import corrected
 from tasks.render.fit.in_tensors import LearnedTensor, before_sky, exposed, lay_flat, opaque_loss, photo_loss
 from tasks.render.fit.road import Road
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import Problem
 from tasks.render.fit.state import SHAPES, FitState
+from tasks.render.scene.movers import SHIFT_SIZE
 from tasks.render.splatting.gradient import Gradients
 from tasks.render.splatting.tensors import Draw, Eye, SceneTensors, moved
-from tasks.world.arrays import ShortInts
+from tasks.world.arrays import F32, Ints, ShortInts
 
 DEVICE_SIDE = (*SHAPES, "sky")
 
@@ -33,7 +35,7 @@ class StateTensors:
     """`FitState`, of which the Gaussians and the sky lie on a device."""
 
     iteration: int
-    learned: dict[str, Any]  # LearnedTensor; exposure and poses: Learned
+    learned: dict[str, Any]  # LearnedTensor; exposure, poses and boxes: Learned
     owner: ShortInts  # (N,) on the CPU
     road: Tensor
     nearest: Tensor
@@ -72,7 +74,7 @@ class OnTorch:
         return StateTensors(state.iteration, learned, state.owner, *others)
 
     def give_back(self, held: StateTensors, state: FitState) -> None:
-        """Exposure and poses never left."""
+        """Exposure, poses and boxes never left."""
         state.iteration = held.iteration
         for name in DEVICE_SIDE:
             there = held.learned[name]
@@ -88,7 +90,7 @@ class OnTorch:
         height, width = shot.photo.rgb.shape[:2]
         camera = corrected(shot.photo.world_from_camera, held.learned["poses"].values[row])
         eye = Eye(shot.photo.intrinsics, camera, width, height, torch.zeros(6, device=self.device, requires_grad=True))
-        parts = parts_of(problem, held.owner, shot.photo)
+        parts = parts_of(problem, held.owner, held.learned["boxes"].values, shot.photo)
         seen = self.draw(_composed(leaves[:-1], parts), eye)
 
         rgb, cells = before_sky(seen.rgb, seen.alpha, leaves[-1], eye.intrinsics, camera)
@@ -102,13 +104,14 @@ class OnTorch:
         means, quats, log_scales, logits, colours, sh_rest, sky, d_exposure, d_camera, screen = by
         spans = [torch.arange(span.start, span.stop, device=self.device) for span in map(_span, parts)]
         rows = torch.cat(spans)[seen.index]
+        tracks, boxes = _of_boxes(parts, leaves[0].detach(), leaves[1].detach(), means, quats)
         shapes = {"means": means, "quats": quats, "log_scales": log_scales, "logits": logits[:, 0], "colours": colours}
         back: dict[str, Any] = {name: tensor[rows] for name, tensor in shapes.items()}
         back |= {"index": rows, "sh_rest": sh_rest[rows].view(len(rows), -1, 3), "screen": screen}
         back["camera"] = d_camera.double().cpu().numpy()
         error = torch.mean((picture.detach().clamp(0.0, 1.0) - photo).double() ** 2)
         score = float(-10.0 * torch.log10(error))
-        shown = (cells, sky[cells], rows, Gradients(**back), seen.depths)
+        shown = (cells, sky[cells], rows, Gradients(**back), seen.depths, tracks, boxes)
         return Derivatives(float(loss.detach()), score, d_exposure.cpu().numpy(), back["camera"], *shown)
 
     def _sent(self, array: object) -> Tensor:
@@ -124,6 +127,20 @@ def _composed(leaves: Sequence[Tensor], parts: Sequence[OwnedGaussians]) -> Scen
         mine = SceneTensors(*(tensor[_span(part)] for tensor in every.parts()))
         scenes.append(mine if part.scene_from_owner is None else moved(mine, part.scene_from_owner))
     return SceneTensors(*(torch.cat(tensors) for tensors in zip(*(scene.parts() for scene in scenes))))
+
+
+def _of_boxes(
+    parts: Sequence[OwnedGaussians], means: Tensor, quats: Tensor, d_means: Tensor, d_quats: Tensor
+) -> tuple[Ints, F32]:
+    """Tracks (B,), and derivatives (B, SHIFT_SIZE) by what their boxes are off by; the tensors are the state's."""
+    mine = [part for part in parts if part.track is not None]
+    found = [
+        torch.cat([shift, turn[None]])
+        for part in mine
+        for shift, turn in [by_box(part, *(one[_span(part)].double() for one in (means, quats, d_means, d_quats)))]
+    ]
+    together = torch.stack(found).float().cpu().numpy() if found else np.zeros((0, SHIFT_SIZE), np.float32)
+    return np.array([part.track for part in mine], np.int64), together
 
 
 def _span(part: OwnedGaussians) -> slice:

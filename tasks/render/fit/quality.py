@@ -14,7 +14,7 @@ from tasks.render.fit.road import Road, above_road
 from tasks.render.fit.start import Problem, Shot
 from tasks.render.scene.asset import ClassQuality, RenderAsset, ViewQuality, psnr
 from tasks.render.scene.engine import Vehicles, render
-from tasks.render.scene.movers import behind_boxes
+from tasks.render.scene.movers import behind_boxes, shifted_boxes
 from tasks.render.scene.sensed import Photo, shifted
 from tasks.render.scene.sky import directions
 from tasks.render.scene.stereo import FAR_M
@@ -38,12 +38,13 @@ def measured(
 ) -> ViewQuality:
     """Of a photo that was held out, as `asset` shows it from a pose (4, 4) in the problem's frame.
 
-    The camera has the colours that it has at any new pose then, and tracks are where they were. Pixels without weight
-    say nothing; LPIPS, whose layers see far around, is of the whole picture.
+    The camera has the colours that it has at any new pose then, and tracks are where photos say that they were. Pixels
+    without weight say nothing; LPIPS, whose layers see far around, is of the whole picture.
     """
     photo, target = shot.photo, shot.compared.target
     height, width = target.weight.shape
     boxes, valid = problem.tracks.at(photo.taken_s)
+    boxes = shifted_boxes(boxes, asset.shifts.at(photo.taken_s, problem.tracks.ids))
     rows = np.flatnonzero(valid)
     there = Vehicles(
         tuple(problem.tracks.ids[j] for j in rows),

@@ -15,17 +15,20 @@ from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import Problem, prepare
 from tasks.render.fit.state import BACKGROUND, FitState
 from tasks.render.scene.asset import Exposure, RenderAsset, mean_psnr_db
+from tasks.render.scene.movers import SHIFT_SIZE, BoxShifts, knots_at, shifted_boxes, world_from_boxes
 from tasks.render.scene.sensed import Photo, Sweep
 from tasks.render.scene.settings import Backend
 from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
+from tasks.render.splatting.gaussians import moved
 from tasks.render.splatting.gsplat_backend import require
 from tasks.world.agents import AgentTracks
-from tasks.world.arrays import F32
+from tasks.world.arrays import F32, Array
 
 REPORT_EVERY = 100
 RATE_END = 0.1  # what every rate but that of the means falls to, as a share of itself
 SH_RATE = 6e-4  # step size of what depends on the direction
 REFINE_UNTIL = 0.8  # share of the iterations
+LEAST_SHARE = 1e-3  # of a photo in a knot, for it to say anything there
 Progress = Callable[[int, float, float], None]  # iteration, mean loss and mean PSNR [dB] of the last REPORT_EVERY
 
 
@@ -107,15 +110,15 @@ def photo_at(iteration: int, n: int, seed: int) -> int:
 def _iterate(problem: Problem, held: Held, settings: FitSettings, backend: FitBackend) -> tuple[float, float]:
     row = photo_at(held.iteration, len(problem.train), settings.seed)
     found = backend.derivatives(problem, held, row, settings)
-    _step_world(held, settings, row, found)
+    _step_world(problem, held, settings, row, found)
     _step_gaussians(held, settings, found)
     if problem.road is not None:
         held.lay_flat(found.rows, problem.road)
     return found.loss, found.psnr_db
 
 
-def _step_world(held: Held, settings: FitSettings, row: int, found: Derivatives) -> None:
-    """Exposure and pose of the photo, and the sky behind it."""
+def _step_world(problem: Problem, held: Held, settings: FitSettings, row: int, found: Derivatives) -> None:
+    """Exposure and pose of the photo, the boxes that it shows, and the sky behind it."""
     at, fall = np.array([row]), decayed(RATE_END, held.iteration / settings.iterations)
     held.learned["exposure"].step(at, found.exposure[None], fall * settings.exposure_rate)
     if held.iteration >= settings.pose_from:
@@ -125,7 +128,25 @@ def _step_world(held: Held, settings: FitSettings, row: int, found: Derivatives)
         poses.step(at, found.camera[None].astype(np.float32), fall)
         rates = np.repeat([settings.shift_rate, settings.turn_rate], 3).astype(np.float32)
         poses.values[row] = before + rates * (poses.values[row] - before)
+        _step_boxes(problem, held, settings, row, found)
     held.learned["sky"].step(found.cells, found.sky, fall * settings.sky_rate)
+
+
+def _step_boxes(problem: Problem, held: Held, settings: FitSettings, row: int, found: Derivatives) -> None:
+    """Those that the photo may show, at the knots before and behind it."""
+    shown = found.boxes.any(axis=1)
+    if settings.box_shift_rate == settings.box_turn_rate == 0.0 or not shown.any():
+        return
+    boxes, n_knots = held.learned["boxes"], problem.tracks.n_knots
+    before, share = knots_at(problem.train[row].photo.taken_s, n_knots)
+    rates = np.array([settings.box_shift_rate] * 3 + [settings.box_turn_rate], np.float32)
+    fall = decayed(RATE_END, held.iteration / settings.iterations)
+    for knot, weight in ((before, 1.0 - share), (before + 1, share)):
+        if weight > LEAST_SHARE:
+            at = found.tracks[shown] * n_knots + knot
+            values = boxes.values[at].copy()
+            boxes.step(at, np.float32(weight) * found.boxes[shown], fall)
+            boxes.values[at] = values + np.float32(weight) * rates * (boxes.values[at] - values)
 
 
 def _step_gaussians(held: Held, settings: FitSettings, found: Derivatives) -> None:
@@ -151,7 +172,7 @@ def picture_of(problem: Problem, state: FitState, photo: Photo, threads: int = 1
     """
     row_pose, row_colour = corrections_at(problem, state, photo.camera, photo.time_s)
     camera = corrected(photo.world_from_camera, row_pose)
-    scene, _ = compose(problem, state, photo)
+    scene, _ = compose(problem, state, boxes_off(problem, state), photo)
     seen, _ = look(state, scene, photo, camera, threads)
     return np.clip(exposed(seen.view.rgb, row_colour), 0.0, 1.0)
 
@@ -166,6 +187,38 @@ def corrections_at(problem: Problem, state: FitState, camera: str, time_s: float
     return between(times, poses[rows], time_s), between(times, colours[rows], time_s)
 
 
+def boxes_off(problem: Problem, state: FitState) -> F32:
+    """What boxes are off by (tracks * knots, SHIFT_SIZE); a knot that no photo says anything of lies between those that
+    do, or has what the nearest has."""
+    learned, n_knots = state.learned["boxes"], problem.tracks.n_knots
+    out = learned.values.reshape(-1, n_knots, SHIFT_SIZE).copy()
+    for mine, stepped in zip(out, learned.steps.reshape(-1, n_knots) > 0):
+        if stepped.any():
+            there = np.flatnonzero(stepped)
+            for column in mine.T:
+                column[:] = np.interp(np.arange(n_knots), there, column[there])
+    return out.reshape(-1, SHIFT_SIZE)
+
+
+def box_shifts(problem: Problem, state: FitState) -> tuple[Array, BoxShifts]:
+    """What tracks' boxes are off by, less what each is off by on average: that is how its Gaussians lie in its box.
+
+    Returns as well where those go by that, poses (tracks, 4, 4).
+    """
+    n = len(problem.tracks.ids)
+    rows = boxes_off(problem, state).reshape(n, problem.tracks.n_knots, SHIFT_SIZE).astype(np.float64)
+    stepped = state.learned["boxes"].steps.reshape(n, problem.tracks.n_knots) > 0
+    moved_by = np.tile(np.eye(4), (n, 1, 1))
+    known = np.flatnonzero(stepped.any(axis=1))
+    for j in known:
+        mean = rows[j, stepped[j]].mean(axis=0)
+        box = np.zeros((1, 7))
+        moved_by[j] = world_from_boxes(shifted_boxes(box, mean[None]))[0]
+        turn = moved_by[j, :3, :3]
+        rows[j] = np.column_stack([(rows[j, :, :3] - mean[:3]) @ turn.T, rows[j, :, 3] - mean[3]])
+    return moved_by, BoxShifts(tuple(problem.tracks.ids[j] for j in known), rows[known].astype(np.float32))
+
+
 def finish(problem: Problem, state: FitState, threads: int = 2, lpips: Lpips | None = None) -> RenderAsset:
     """The scene as it is rendered, with what it makes of the photos held out; `lpips` measures them as well.
 
@@ -174,6 +227,7 @@ def finish(problem: Problem, state: FitState, threads: int = 2, lpips: Lpips | N
     rows, cameras = state.learned["exposure"].values, [shot.photo.camera for shot in problem.train]
     common = reference(cameras, rows)
     matrix, _ = matrix_of(common)
+    moved_by, shifts = box_shifts(problem, state)
     every = state.gaussians()
     every = replace(
         every,
@@ -182,7 +236,10 @@ def finish(problem: Problem, state: FitState, threads: int = 2, lpips: Lpips | N
         sh_rest=every.sh_rest @ matrix.T,
     )
     sky = exposed(state.learned["sky"].values, common)
-    nodes = {problem.tracks.ids[j]: every.take(state.owner == j) for j in np.unique(state.owner[state.owner >= 0])}
+    nodes = {
+        problem.tracks.ids[j]: moved(every.take(state.owner == j), moved_by[j])
+        for j in np.unique(state.owner[state.owner >= 0])
+    }
     asset = RenderAsset(
         problem.origin,
         every.take(state.owner == BACKGROUND),
@@ -193,6 +250,7 @@ def finish(problem: Problem, state: FitState, threads: int = 2, lpips: Lpips | N
             Exposure(shot.photo.camera, shot.photo.time_s, np.column_stack(matrix_of(after(row, inverse(common)))))
             for shot, row in zip(problem.train, rows)
         ),
+        shifts=shifts,
     )
     views = []
     for shot in problem.held_out:

@@ -35,7 +35,9 @@ class FitSettings:
     exposure_rate: float = 1e-3  # 0: the cameras agree, nothing is aligned
     turn_rate: float = 3e-4  # [rad] of the pose corrections
     shift_rate: float = 1e-3  # [m]
-    pose_from: int = 100  # iteration at which poses start to move
+    pose_from: int = 100  # iteration at which poses and boxes start to move
+    box_shift_rate: float = 2e-2  # [m] of where boxes are; 0: where they were logged
+    box_turn_rate: float = 2e-3  # [rad]
     mean_rate_end: float = 0.04  # what mean_rate falls to instead, as a share of itself
     # Density: relocation and growth of 3DGS as Markov chain Monte Carlo (Kheradmand et al. 2024).
     refine_every: int = 100  # iterations

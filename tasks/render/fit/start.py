@@ -16,7 +16,7 @@ from tasks.render.fit.state import BACKGROUND, FitState, logits_of
 from tasks.render.scene.build import held_out_rows, sky_of, surfaces
 from tasks.render.scene.confirmed import with_confirmed
 from tasks.render.scene.features import NOTHING_KNOWN, Known, Points, known_without_lidar
-from tasks.render.scene.movers import behind_boxes
+from tasks.render.scene.movers import SHIFT_SIZE, behind_boxes
 from tasks.render.scene.sensed import Photo, Sweep, Tracks, fuse, reduced, shifted
 from tasks.render.scene.sight import Seen, see
 from tasks.render.scene.sky import directions
@@ -110,7 +110,9 @@ def prepare(
     surface = find_road(points.every, eyes) if settings.road else None
     cars = [nodes.get(i) for i in tracks.ids]
     bodies = _bodies(cars, tracks, [p.taken_s for p in train])
-    state = _first_state(background, cars, bodies, sky_of(alike, seen).rgb, exposures, surface, settings)
+    state = _first_state(
+        background, cars, bodies, sky_of(alike, seen).rgb, exposures, surface, tracks.n_knots, settings
+    )
     unknown = [track_id not in nodes for track_id in tracks.ids]
     hidden = [_hidden(p, tracks, np.array(unknown, bool)) for p in local]
     sizes = np.cumsum([COMPARED_BYTES * p.rgb[..., 0].size for p in local])
@@ -176,6 +178,7 @@ def _first_state(
     sky: F32,
     exposures: F32,
     road: Road | None,
+    n_knots: int,
     settings: FitSettings,
 ) -> FitState:
     """Of the background's and of each track's discs as many as are wanted, each as much larger."""
@@ -206,6 +209,7 @@ def _first_state(
         "sky": Learned.of(sky.reshape(-1, 3)),
         "exposure": Learned.of(exposures),
         "poses": Learned.of(np.zeros((len(exposures), POSE_SIZE))),
+        "boxes": Learned.of(np.zeros((len(nodes) * n_knots, SHIFT_SIZE))),
     }
     nearest = np.full(len(start), np.inf, np.float32)
     return FitState(0, learned, owners, on_road, nearest, np.zeros(len(start), np.float32))

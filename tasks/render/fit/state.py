@@ -13,16 +13,19 @@ from tasks.world.arrays import F32, Bools, FloatArray, Ints, ShortInts
 
 BACKGROUND = -1
 SHAPES = ("means", "quats", "log_scales", "logits", "colours", "sh_rest")  # learned, one row per Gaussian
-WORLD = ("sky", "exposure", "poses")
+WORLD = ("sky", "exposure", "poses", "boxes")
 PER_GAUSSIAN = ("owner", "road", "nearest", "wanted")  # fields of FitState
 
 
 @dataclass
 class FitState:
-    """N Gaussians, each in the frame of its owner; stepped in place."""
+    """N Gaussians, each in the frame of its owner; stepped in place.
+
+    Of the world are learned: sky (cells, 3), exposure (photos, 12), poses (photos, 6), and boxes (tracks * knots, 4).
+    """
 
     iteration: int
-    learned: dict[str, Learned]  # SHAPES: (N, C); sky (cells, 3); exposure (photos, 12); poses (photos, 6)
+    learned: dict[str, Learned]  # SHAPES: (N, C); WORLD: see below
     owner: ShortInts  # (N,) ascending: BACKGROUND or row of a track
     road: Bools  # (N,) lies on the road
     nearest: F32  # (N,) [m] depth in the nearest photo so far; inf: not seen yet

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tasks.render.scene.boxes import box_gaussians
-from tasks.render.scene.movers import lifted, world_from_boxes
+from tasks.render.scene.movers import NO_SHIFTS, BoxShifts, lifted, world_from_boxes
 from tasks.render.scene.sky import SkyMap
 from tasks.render.splatting.gaussians import Gaussians, concatenate, moved
 from tasks.render.splatting.project import FITTED, ScreenFilter
@@ -110,6 +110,7 @@ class RenderAsset:
     rig: tuple[Camera, ...] = ()  # cameras that its photos were corrected to; empty: they are as given
     taken: tuple[TakenFrom, ...] = ()  # its photos, where their poses were corrected
     bodies: tuple[OwnBody, ...] = ()  # of the cameras that were said to see one
+    shifts: BoxShifts = NO_SHIFTS  # of its tracks, where photos were asked
     screen: ScreenFilter = FITTED  # what its Gaussians were made to be drawn through
 
     def as_corrected(self, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
@@ -138,6 +139,10 @@ class RenderAsset:
         """Tracks whose first step is at `first_s` of the block, as high above the scene's road as they were logged."""
         times, rises = rises_of(self.taken)
         return lifted(agents, times - first_s, rises)
+
+    def settled(self, agents: AgentTracks, first_s: float) -> AgentTracks:
+        """The log's own tracks, whose first step is at `first_s` of the block, where its photos show them."""
+        return self.shifts.settled(self.lifted(agents, first_s), first_s)
 
     def since(self, first_s: float) -> "RenderAsset":
         """The same scene, its times counted from `first_s` on, as a clip within the block counts them."""

@@ -1,13 +1,14 @@
-"""Boxes that move: where they are at an instant, and which points are theirs."""
+"""Boxes that move: where they are at an instant, where photos say that they were, and which points are theirs."""
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from tasks.kernels.compiled import kernel
 from tasks.world.agents import AgentTracks
-from tasks.world.arrays import Array, Bools
+from tasks.world.arrays import F32, Array, Bools, FloatArray
 from tasks.world.clip import STEP_S
 from tasks.world.frames import upright, wrap_angle
 
@@ -15,6 +16,8 @@ MARGIN_M = 0.15  # boxes are drawn tightly; mirrors and noise stick out
 BEYOND_M = 0.12  # around a driving box nothing is trusted to be the street
 DRIVING_M = 1.0
 GROUND_CLEARANCE_M = 0.12  # the road under a car stays behind when it leaves
+KNOT_S = 0.5  # between two instants that a box is off by numbers of their own: logs are annotated at 2 Hz at the least
+SHIFT_SIZE = 4  # along, across, up [m], in the box as it is turned; turn [rad]
 
 
 def boxes_at(agents: AgentTracks, time_s: float) -> tuple[Array, Bools]:
@@ -47,6 +50,67 @@ def lifted(agents: AgentTracks, times_s: Array, rises_m: Array) -> AgentTracks:
         return agents
     rise = np.interp(np.arange(agents.n_steps) * STEP_S, times_s, rises_m)
     return replace(agents, center_z=agents.center_z + rise[:, None])
+
+
+@dataclass(frozen=True)
+class BoxShifts:
+    """How far tracks were from where they were logged, as photos say: at knots every KNOT_S, linear between them."""
+
+    track_ids: tuple[str, ...]
+    rows: F32  # (N, K, SHIFT_SIZE); knot 0 is the block's first step
+
+    def at(self, time_s: float, track_ids: Sequence[str]) -> F32:
+        """(M, SHIFT_SIZE) of the tracks named, `time_s` since the block's first step; zeros of others."""
+        known = {name: n for n, name in enumerate(self.track_ids)}
+        out = np.zeros((len(track_ids), SHIFT_SIZE), np.float32)
+        mine = [m for m, name in enumerate(track_ids) if name in known]
+        if mine:
+            out[mine] = at_knots(self.rows[[known[track_ids[m]] for m in mine]], time_s)
+        return out
+
+    def of(self, track_ids: Sequence[str]) -> "BoxShifts":
+        """Of these tracks alone."""
+        rows = [self.track_ids.index(name) for name in track_ids]
+        return BoxShifts(tuple(track_ids), self.rows[rows])
+
+    def settled(self, agents: AgentTracks, first_s: float) -> AgentTracks:
+        """The tracks, whose first step is at `first_s` of the block, where photos say that they were."""
+        if not self.track_ids:
+            return agents
+        boxes, center_z = agents.boxes.copy(), agents.center_z.copy()
+        for k in range(agents.n_steps):
+            at = np.column_stack([boxes[k, :, :2], center_z[k], boxes[k, :, 2], boxes[k, :, 3:], agents.heights])
+            there = shifted_boxes(at, self.at(first_s + k * STEP_S, agents.track_ids))
+            boxes[k, :, :2], center_z[k], boxes[k, :, 2] = there[:, :2], there[:, 2], there[:, 3]
+        return replace(agents, boxes=boxes, center_z=center_z)
+
+
+NO_SHIFTS = BoxShifts((), np.zeros((0, 1, SHIFT_SIZE), np.float32))
+
+
+def knots_at(time_s: float, n_knots: int) -> tuple[int, float]:
+    """The knot before a time, and the share that the one behind it has of what is so then."""
+    at = float(np.clip(time_s / KNOT_S, 0.0, n_knots - 1.0))
+    before = min(int(at), max(n_knots - 2, 0))
+    return before, at - before
+
+
+def at_knots(rows: F32, time_s: float) -> F32:
+    """(N, C) of rows (N, K, C) at a time."""
+    before, share = knots_at(time_s, rows.shape[1])
+    after = min(before + 1, rows.shape[1] - 1)
+    return np.asarray((1.0 - share) * rows[:, before] + share * rows[:, after], np.float32)
+
+
+def shifted_boxes(boxes: Array, by: FloatArray) -> Array:
+    """Boxes (N, 7) turned, then moved in their own axes, by rows (N, SHIFT_SIZE)."""
+    out = boxes.copy()
+    out[:, 3] += by[:, 3]
+    cosine, sine = np.cos(out[:, 3]), np.sin(out[:, 3])
+    out[:, 0] += cosine * by[:, 0] - sine * by[:, 1]
+    out[:, 1] += sine * by[:, 0] + cosine * by[:, 1]
+    out[:, 2] += by[:, 2]
+    return out
 
 
 def world_from_boxes(boxes: Array) -> Array:

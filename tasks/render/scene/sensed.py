@@ -7,9 +7,10 @@ import cv2
 import numpy as np
 
 from tasks.render.scene.asset import OwnBody
-from tasks.render.scene.movers import GROUND_CLEARANCE_M, boxes_at, driving, owners, world_from_boxes
+from tasks.render.scene.movers import GROUND_CLEARANCE_M, KNOT_S, boxes_at, driving, owners, world_from_boxes
 from tasks.world.agents import MOVING_KINDS, AgentTracks
 from tasks.world.arrays import F32, Array, Bools, Bytes, Indices
+from tasks.world.clip import STEP_S
 from tasks.world.vehicle import PACIFICA
 
 EGO_MARGIN_M = 0.3
@@ -86,6 +87,12 @@ class Tracks:
         self.kinds = agents.kinds if agents is not None else ()
         self.driving = driving(agents) if agents is not None else np.zeros(0, bool)
         self._movable = np.array([kind in MOVING_KINDS for kind in self.kinds], bool)
+
+    @property
+    def n_knots(self) -> int:
+        """Instants that each box may be off at by numbers of their own, see BoxShifts."""
+        length_s = 0.0 if self._agents is None else (self._agents.n_steps - 1) * STEP_S
+        return int(np.ceil(length_s / KNOT_S - 1e-6)) + 1
 
     def at(self, time_s: float) -> tuple[Array, Bools]:
         """Boxes (N, 7) local, and which of them are there and movable (N,)."""

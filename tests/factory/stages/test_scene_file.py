@@ -22,6 +22,7 @@ from factory.stages.scene_file import (
     write_scene,
 )
 from tasks.render.scene.asset import BlockRange, ClassQuality, Exposure, RenderAsset, TakenFrom, ViewQuality
+from tasks.render.scene.movers import NO_SHIFTS, BoxShifts
 from tasks.render.scene.settings import SceneDtype
 from tasks.render.scene.sky import SkyMap
 from tasks.render.splatting.gaussians import EMPTY, Gaussians
@@ -49,6 +50,7 @@ def scene() -> RenderAsset:
         exposures=(Exposure("front", 0.5, np.eye(3, 4, dtype=np.float32) * 1.1),),
         block=BlockRange("av2", "log", 10.0, 30.0, np.array([-1.5, 2.0]), np.array([8.0, 3.25])),
         taken=(TakenFrom("front", 0.1 + 0.2, np.eye(4) * 0.1),),
+        shifts=BoxShifts(("a",), np.arange(12, dtype=np.float32).reshape(1, 3, 4)),
         screen=CLASSIC,
     )
 
@@ -65,7 +67,7 @@ def test_everything_comes_back(tmp_path: Path) -> None:
     assert described_by(back) == described_by(asset) and back.screen == asset.screen == CLASSIC
     assert back.views[0] == asset.views[0] and np.isnan(back.views[1].ssim) and np.isinf(back.views[1].psnr_db)
     assert back.block is not None and back.block.low.tolist() == [-1.5, 2.0]
-    assert back.psnr_db == 27.123456789
+    assert back.psnr_db == 27.123456789 and back.shifts.track_ids == ("a",)
     assert (back.taken[0].camera, back.taken[0].time_s) == ("front", 0.1 + 0.2)  # by which files are found again
     assert [path.name for path in (tmp_path / "deep").iterdir()] == ["x.safetensors"]  # no drafts left
 
@@ -149,6 +151,8 @@ def test_what_16_bits_do_not_hold_is_named_and_nothing_is_written(tmp_path: Path
         lambda s: replace(s, exposures=()),
         lambda s: replace(s, block=None),
         lambda s: replace(s, taken=()),
+        lambda s: replace(s, shifts=NO_SHIFTS),
+        lambda s: replace(s, shifts=BoxShifts(("b/7 ü",), s.shifts.rows)),
         lambda s: replace(s, background=s.background.take(np.arange(29))),
     ],
 )

@@ -69,7 +69,7 @@ def numbers(found: Derivatives) -> dict[str, np.ndarray]:
 def test_one_photo_says_the_same_of_all_that_is_learned(prepared: tuple[Problem, FitState], weights: dict) -> None:
     problem, state, settings = prepared[0], fresh(prepared[1]), replace(SETTINGS, **weights)
     rng = np.random.default_rng(0)
-    for name, size in (("exposure", 0.05), ("poses", 0.005), ("sh_rest", 0.05), ("quats", 0.2)):
+    for name, size in (("exposure", 0.05), ("poses", 0.005), ("sh_rest", 0.05), ("quats", 0.2), ("boxes", 0.05)):
         values = state.learned[name].values
         values += rng.normal(0.0, size, values.shape)
     for row in range(len(problem.train)):
@@ -107,7 +107,7 @@ def test_the_loop_over_tensors_fits_the_same_scene(prepared: tuple[Problem, FitS
     advance(problem, other, SETTINGS, SETTINGS.iterations, backend=TENSORS)
     assert len(one) == len(other) > len(prepared[1]) and other.iteration == SETTINGS.iterations
     assert finish(problem, one).psnr_db == pytest.approx(finish(problem, other).psnr_db, abs=0.1)
-    for name in ("poses", "exposure", "sky"):
+    for name in ("poses", "exposure", "sky", "boxes"):
         moved = one.learned[name].values - prepared[1].learned[name].values
         apart = one.learned[name].values - other.learned[name].values
         assert np.linalg.norm(apart) < 0.4 * np.linalg.norm(moved), name  # relocated ones differ by their last bits

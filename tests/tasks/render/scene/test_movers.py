@@ -1,9 +1,10 @@
-"""Which sight lines meet a box: as many points along each say it."""
+"""Which sight lines meet a box, as many points along each say it; and boxes where photos say that they were."""
 
 import numpy as np
 import pytest
+import street
 
-from tasks.render.scene.movers import BEYOND_M, behind_boxes
+from tasks.render.scene.movers import BEYOND_M, KNOT_S, BoxShifts, behind_boxes, boxes_at, shifted_boxes
 
 SAMPLES = 4000  # along a line
 
@@ -49,3 +50,22 @@ def test_an_eye_inside_a_box_sees_nothing_else() -> None:
 
 def test_without_boxes_every_line_is_free() -> None:
     assert not np.asarray(behind_boxes(np.ones((3, 3)), np.zeros(3), np.zeros((0, 7)))).any()
+
+
+def test_a_box_is_turned_and_then_moved_along_its_new_heading() -> None:
+    box = np.array([[10.0, 5.0, 1.0, 0.0, 4.0, 2.0, 1.5]])
+    found = shifted_boxes(box, np.array([[2.0, 0.5, 0.25, np.pi / 2]]))
+    np.testing.assert_allclose(found, [[9.5, 7.0, 1.25, np.pi / 2, 4.0, 2.0, 1.5]], atol=1e-12)
+
+
+def test_tracks_come_to_lie_where_photos_say_linear_between_knots_and_others_stay() -> None:
+    """The block's third knot is at 1 s; the tracks begin 0.7 s behind the block."""
+    tracks = street.tracks()
+    rows = np.zeros((1, 4, 4), np.float32)
+    rows[0, 2] = [0.4, -0.2, 0.1, 0.0]
+    settled = BoxShifts(("car",), rows).settled(tracks, 0.7)
+    assert KNOT_S == 0.5
+    for step, share in ((0, 0.4), (3, 1.0), (5, 0.6), (8, 0.0), (40, 0.0)):
+        off = boxes_at(settled, 0.1 * step)[0] - boxes_at(tracks, 0.1 * step)[0]
+        np.testing.assert_allclose(off[0, :4], share * np.array([0.4, -0.2, 0.1, 0.0]), atol=1e-6, err_msg=str(step))
+    assert BoxShifts(("other",), rows).settled(tracks, 0.0).boxes.tolist() == tracks.boxes.tolist()
