@@ -31,7 +31,7 @@ class Arm:
 
     __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}  # a misspelt key is an error
 
-    run: str  # a folder of runs
+    run: str  # a folder of runs, or several
     experts: tuple[str, ...] = ()  # whose samples; none: the run's real ones
     rounds: int = 0  # of candidates that simulated samples are taken from
 
@@ -64,7 +64,13 @@ class ExperimentSettings(SweepSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        missing = {BEGIN, TRAIN, HARD, *(arm.run for arm in self.arms.values()), *self.taught} - set(self.runs)
+        missing = {
+            BEGIN,
+            TRAIN,
+            HARD,
+            *(run for arm in self.arms.values() for run in arm.run.split()),
+            *self.taught,
+        } - set(self.runs)
         if missing:
             raise ValueError(f"runs lacks {', '.join(sorted(missing))}")
         if unknown := {name for part in self.parts.values() for name in part} - {REAL, *self.arms}:
@@ -113,18 +119,21 @@ def setup(settings: ExperimentSettings, planner: str, data: str) -> Setup:
     return Setup(planner, data, settings.arms[data].rounds if data in settings.arms else 0, "steps")
 
 
-def chosen(settings: ExperimentSettings, arm: Arm) -> DataSettings:
-    """The samples that an arm may take from."""
+def chosen(settings: ExperimentSettings, arm: Arm, run: str) -> DataSettings:
+    """The samples of a run that an arm may take from."""
     if not arm.experts:
-        return DataSettings(real=settings.table(arm.run))
+        return DataSettings(real=settings.table(run))
     return DataSettings(
-        sim=settings.table(arm.run), experts=arm.experts, max_round=arm.rounds - 1, psnr_min=settings.psnr_db
+        sim=settings.table(run), experts=arm.experts, max_round=arm.rounds - 1, psnr_min=settings.psnr_db
     )
 
 
 def added(settings: ExperimentSettings) -> dict[str, int]:
     """How many samples each arm adds."""
-    there = {name: len(open_dataset(chosen(settings, arm))) for name, arm in settings.arms.items()}
+    there = {
+        name: sum(len(open_dataset(chosen(settings, arm, run))) for run in arm.run.split())
+        for name, arm in settings.arms.items()
+    }
     most = there["more"] if settings.added == "more" else min(there.values())
     return {name: min(n, most) for name, n in there.items()}
 
@@ -135,13 +144,13 @@ def training_of(
     """One training of an arm, or of what all begin with."""
     own = [settings.table(BEGIN)] if data == BEGIN else [settings.table(TRAIN), settings.table(BEGIN)]
     arm = settings.arms.get(data)
-    real = [*own, settings.table(arm.run)] if arm and not arm.experts else own
+    tables = [settings.table(run) for run in arm.run.split()] if arm else []
+    real = [*own, *tables] if arm and not arm.experts else own
     overrides = [f"planner={settings.planners[planner]}", f"data.real=[{','.join(real)}]", f"seed={seed}"]
     if arm and arm.experts:
-        sim = chosen(settings, arm)
-        overrides += [f"data.sim=[{sim.sim}]", f"data.experts=[{','.join(sim.experts)}]"]
-        overrides += [f"data.max_round={sim.max_round}", f"data.limit_sim={n_added[data]}"]
-        overrides += [f"data.psnr_min={sim.psnr_min}"] if sim.psnr_min is not None else []
+        overrides += [f"data.sim=[{','.join(tables)}]", f"data.experts=[{','.join(arm.experts)}]"]
+        overrides += [f"data.max_round={arm.rounds - 1}", f"data.limit_sim={n_added[data]}"]
+        overrides += [f"data.psnr_min={settings.psnr_db}"] if settings.psnr_db is not None else []
     overrides += [f"data.val=[{settings.table(HARD)}]", *settings.train]
     if data == BEGIN:
         overrides.append(f"steps={settings.begin_steps}")

@@ -29,20 +29,28 @@ def test_nobody_is_scored_on_towns_that_anybody_learns_from() -> None:
     driven = towns_of(settings_of([*chosen.drives.split(), "planner=constant_velocity"]).clips)  # type: ignore[union-attr]
     assert driven == towns["hard"] and min(driven) >= FIRST_UNSEEN
     assert not driven & (towns["begin"] | towns["train"])
-    assert towns["train"] == towns["logged"] == towns["learned"] and not towns["begin"] & towns["train"]
+    assert towns["train"] == towns["more"] == towns["logged"] == towns["learned"]
+    n = runs["train"].clips["logs_per_town"]
+    first = [runs[name].clips["first_log"] for name in ("train", "more", "more_too")]
+    assert first == [0, n, 2 * n] and runs["more"].clips["logs_per_town"] == n, "other logs"
+    assert not towns["begin"] & towns["train"]
 
 
 def test_arms_differ_in_whose_labels_are_added_and_in_nothing_else() -> None:
     chosen = settings()
     arms = [one for one in planned(chosen, dict.fromkeys(chosen.arms, 7)) if one.facts["data"] != BEGIN]
-    assert [one.facts["data"] for one in arms[:8]] == ["real", "logged", *EXPERTS]
+    assert [one.facts["data"] for one in arms[:9]] == ["real", "more", "logged", *EXPERTS]
     assert len({tuple(w for w in one.overrides if not w.startswith(("data.", "seed="))) for one in arms}) == 1
-    assert len({option(one.overrides, "data.real") for one in arms}) == 1
+    real = {option(one.overrides, "data.real") for one in arms if one.facts["data"] != "more"}
+    assert (
+        len(real) == 1
+        and option(arms[1].overrides, "data.real") == real.pop()[:-1] + f",{chosen.out}/more,{chosen.out}/more_too]"
+    )  # type: ignore[index]
     assert {option(one.overrides, "data.limit_sim") for one in arms} == {None, "7"}
-    assert option(arms[6].overrides, "data.experts") == "[vocabulary,vocabulary_2]"
+    assert option(arms[7].overrides, "data.experts") == "[vocabulary,vocabulary_2]"
     held = {(one.setup.data, one.reference.data) for one in comparisons(chosen) if one.reference}
     assert {(name, "real") for name in chosen.arms} <= held
-    assert {(name, "pdm_closed") for name in chosen.arms if name != "pdm_closed"} <= held
+    assert {(name, "pdm_closed") for name in chosen.arms if name not in ("pdm_closed", "more")} <= held
 
 
 TINY = [  # one town: a log to begin with, one to learn from, a third to be scored on
@@ -52,6 +60,8 @@ TINY = [  # one town: a log to begin with, one to learn from, a third to be scor
     "common.states='vocabulary.k=4000'",
     "runs.train='${common.train} ${common.states} ${common.ungated} "
     "experts=[human,recovery,pdm_closed,pdm_smooth,vocabulary,vocabulary_2]'",
+    "runs.more='${common.begin} clips.first_log=2 limit=1 experts=[human]'",
+    "runs.more_too='${common.begin} clips.first_log=3 limit=1 experts=[human]'",
     "runs.learned='${common.train} ${common.states} ${common.ungated} experts=[learned] "
     "+expert.learned._target_=planners.drive.expert.learned +expert.learned.planner=${out}/teacher'",
     "runs.hard='preset=hard_benchmark ${common.blind} clips.split=test clips.seeds=[3] clips.logs_per_town=1 "
@@ -79,6 +89,8 @@ def test_the_whole_of_it_runs_and_the_teacher_s_labels_are_learned_from(
     assert "arms.md" not in made, "nothing is driven"
     rows = list(csv.DictReader((report / "trainings.csv").open()))
     counts = {row["data"]: (row["real"], row["simulated"]) for row in rows}
-    assert counts == {"begin": ("2", "0"), "real": ("3", "0")} | dict.fromkeys(["logged", *EXPERTS], ("3", "1"))
+    assert counts == {"begin": ("2", "0"), "real": ("3", "0"), "more": ("5", "0")} | dict.fromkeys(
+        ["logged", *EXPERTS], ("3", "1")
+    )
     assert main([*words, "minutes=0"]) == COMPLETE
     assert {path.name: path.read_bytes() for path in report.iterdir()} == made
