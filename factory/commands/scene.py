@@ -26,6 +26,7 @@ from threading import Event
 from typing import Literal
 
 from factory.config.arguments import WORD, Refused
+from factory.exits import asked_to_stop
 
 PORT = 8267  # the dashboard is at 8266
 
@@ -103,7 +104,7 @@ def main(request: Request) -> None:
 
 
 def view(request: Request) -> None:
-    """Until Ctrl-C. Raises ValueError and OSError."""
+    """Until Ctrl-C or SIGTERM. Raises ValueError and OSError."""
     from factory.stages.scene_file import read_scene
     from factory.views.board.server import LOOPBACK
     from factory.views.scene_view import NOTHING, drives_through, shown
@@ -113,12 +114,14 @@ def view(request: Request) -> None:
     here = NOTHING if request.out is None else drives_through(open_store(request.out), asset)
     server = shown(asset, here, request.host or LOOPBACK[0], PORT if request.port is None else request.port)
     told = f"{len(here.samples)} samples and {len(here.logged)} logged drives" if request.out else "no run's drives"
-    print(f"{request.files[0]}, {told}: http://{server.get_host()}:{server.get_port()}/ until Ctrl-C", flush=True)
-    if server.get_host() not in LOOPBACK:
-        print("warning: everyone who reaches this port sees the scene; there is no password")
+    ended = Event()
     try:
-        Event().wait()
-    except KeyboardInterrupt:
-        print()
+        with asked_to_stop(ended.set):
+            print(
+                f"{request.files[0]}, {told}: http://{server.get_host()}:{server.get_port()}/ until Ctrl-C", flush=True
+            )
+            if server.get_host() not in LOOPBACK:
+                print("warning: everyone who reaches this port sees the scene; there is no password")
+            ended.wait()
     finally:
         server.stop()
