@@ -55,6 +55,8 @@ class Held(Protocol):
 
     def lay_flat(self, rows: Any, road: Road) -> None: ...
 
+    def keep_round(self, rows: Any, background: float, boxes: float) -> None: ...
+
 
 class FitBackend(Protocol):
     """Draws and differentiates."""

@@ -147,6 +147,11 @@ def lay_flat(means: Tensor, quats: Tensor, log_scales: Tensor, rows: Tensor, roa
     quats[rows] = _upright(quats[rows].double(), slope_x, slope_y).float()
 
 
+def rounded(log_scales: Tensor, most: float) -> Tensor:
+    """`state.rounded`."""
+    return torch.maximum(log_scales, log_scales.amax(dim=1, keepdim=True) - math.log(most))
+
+
 def _upright(quats: Tensor, slope_x: Tensor, slope_y: Tensor) -> Tensor:
     """Quaternions (M, 4) turned the shortest way so that their third axes are along the road's normals."""
     w, x, y, s = (quats / quats.norm(dim=1, keepdim=True)).unbind(1)

@@ -17,11 +17,11 @@ from tasks.render.fit.adam import Learned
 from tasks.render.fit.backend import Derivatives
 from tasks.render.fit.composition import OwnedGaussians, by_box, parts_of
 from tasks.render.fit.corrections import corrected
-from tasks.render.fit.in_tensors import LearnedTensor, before_sky, exposed, lay_flat, opaque_loss, photo_loss
+from tasks.render.fit.in_tensors import LearnedTensor, before_sky, exposed, lay_flat, opaque_loss, photo_loss, rounded
 from tasks.render.fit.road import Road
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import Problem
-from tasks.render.fit.state import SHAPES, FitState
+from tasks.render.fit.state import BACKGROUND, SHAPES, FitState
 from tasks.render.scene.movers import SHIFT_SIZE
 from tasks.render.splatting.gradient import Gradients
 from tasks.render.splatting.tensors import Draw, Eye, SceneTensors, moved
@@ -51,6 +51,13 @@ class StateTensors:
         """`FitState.lay_flat`."""
         means, quats, log_scales = (self.learned[name].values for name in ("means", "quats", "log_scales"))
         lay_flat(means, quats, log_scales, rows[self.road[rows]], road)
+
+    def keep_round(self, rows: Tensor, background: float, boxes: float) -> None:
+        """`FitState.keep_round`."""
+        log_scales, owned = self.learned["log_scales"].values, rows >= int((self.owner == BACKGROUND).sum())
+        for most, mine in ((background, rows[~owned & ~self.road[rows]]), (boxes, rows[owned])):
+            if most > 0.0:
+                log_scales[mine] = rounded(log_scales[mine], most)
 
 
 @dataclass(frozen=True)

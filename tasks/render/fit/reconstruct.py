@@ -112,6 +112,7 @@ def _iterate(problem: Problem, held: Held, settings: FitSettings, backend: FitBa
     found = backend.derivatives(problem, held, row, settings)
     _step_world(problem, held, settings, row, found)
     _step_gaussians(held, settings, found)
+    held.keep_round(found.rows, settings.stretch, settings.box_stretch)
     if problem.road is not None:
         held.lay_flat(found.rows, problem.road)
     return found.loss, found.psnr_db

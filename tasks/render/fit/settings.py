@@ -39,6 +39,9 @@ class FitSettings:
     box_shift_rate: float = 2e-2  # [m] of where boxes are; 0: where they were logged
     box_turn_rate: float = 2e-3  # [rad]
     mean_rate_end: float = 0.04  # what mean_rate falls to instead, as a share of itself
+    # Shape: how often a Gaussian's longest side is its shortest, at most; 0: as often as it likes.
+    stretch: float = 0.0  # of the background, but for the road
+    box_stretch: float = 2.0  # of what lies in boxes
     # Density: relocation and growth of 3DGS as Markov chain Monte Carlo (Kheradmand et al. 2024).
     refine_every: int = 100  # iterations
     refine_from: int = 300  # iteration
@@ -64,3 +67,6 @@ class FitSettings:
         for name in ("ssim_weight", "mean_rate_end"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"fit {name} must be from 0 to 1, not {getattr(self, name)}")
+        for name in ("stretch", "box_stretch"):
+            if getattr(self, name) != 0.0 and not getattr(self, name) >= 1.0:
+                raise ValueError(f"fit {name} must be 0 (any) or 1 and more, not {getattr(self, name)}")

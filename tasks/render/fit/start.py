@@ -7,12 +7,12 @@ import numpy as np
 
 from tasks.kernels.threads import in_chunks
 from tasks.render.fit.adam import Learned
-from tasks.render.fit.body import unseen_body
 from tasks.render.fit.corrections import EXPOSURE_SIZE, POSE_SIZE, between, exposures_of, in_agreement, instants
 from tasks.render.fit.losses import Target, target_of
 from tasks.render.fit.road import Road, above_road, find_road, lay_flat
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.state import BACKGROUND, FitState, logits_of
+from tasks.render.scene.body import on_bodies, unseen_body
 from tasks.render.scene.build import held_out_rows, sky_of, surfaces
 from tasks.render.scene.confirmed import with_confirmed
 from tasks.render.scene.features import NOTHING_KNOWN, Known, Points, known_without_lidar
@@ -101,6 +101,8 @@ def prepare(
     seen = [s for part in in_chunks(look, len(looked_at), 1, threads) for s in part]
     if points.corners is not None:
         seen = with_confirmed(looked_at, seen)
+    if not sweeps:
+        seen = on_bodies(looked_at, seen, tracks)
     exposures = np.zeros((len(train), EXPOSURE_SIZE), np.float32)
     if settings.exposure_rate > 0.0:
         exposures = _exposures(train, looked_at, exposures_of(looked_at, seen, points.every))

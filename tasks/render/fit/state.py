@@ -54,6 +54,16 @@ class FitState:
         means, quats, log_scales = (self.learned[name].values for name in ("means", "quats", "log_scales"))
         lay_flat(means, quats, log_scales, rows[self.road[rows]], road)
 
+    def keep_round(self, rows: Ints, background: float, boxes: float) -> None:
+        """Of those of `rows` (M,) that lie on no road, no side stays shorter than the longest by more than a factor.
+
+        `background` and `boxes`: that factor of those of either, 0: none.
+        """
+        log_scales, owned = self.learned["log_scales"].values, self.owner[rows] != BACKGROUND
+        for most, mine in ((background, rows[~owned & ~self.road[rows]]), (boxes, rows[owned])):
+            if most > 0.0 and len(mine):
+                log_scales[mine] = rounded(log_scales[mine], most)
+
     def arrays(self) -> dict[str, NDArray[np.generic]]:
         """By name, for whoever stores them."""
         out: dict[str, NDArray[np.generic]] = {
@@ -79,6 +89,11 @@ class FitState:
             self.learned[name] = self.learned[name].take(rows)
         for name in PER_GAUSSIAN:
             setattr(self, name, getattr(self, name)[rows])
+
+
+def rounded(log_scales: F32, most: float) -> F32:
+    """Logarithms (M, 3) of sizes, the shorter ones raised to the longest over `most`."""
+    return np.maximum(log_scales, log_scales.max(axis=1, keepdims=True) - np.float32(np.log(most)))
 
 
 def opacities_of(logits: F32) -> F32:

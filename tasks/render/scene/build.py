@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from tasks.render.scene.asset import RenderAsset, ViewQuality, mean_psnr_db, psnr, scene_at
+from tasks.render.scene.body import on_bodies
 from tasks.render.scene.choose import BACKGROUND, Look, choose, count_free_space, with_mirror_image
 from tasks.render.scene.confirmed import with_confirmed
 from tasks.render.scene.engine import Vehicles, render
@@ -61,6 +62,8 @@ def build_asset(
     seen = [see(p, train, points, per_track, tracks, settings.stereo_photos) for p in train]
     if points.corners is not None:
         seen = with_confirmed(train, seen)
+    if not sweeps:
+        seen = on_bodies(train, seen, tracks)
     background, nodes = surfaces(train, seen, tracks)
     sky = sky_of(train, seen)
     asset = RenderAsset(origin, background, nodes, sky, float("nan"), screen=OF_DISCS)

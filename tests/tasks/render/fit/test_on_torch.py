@@ -181,6 +181,29 @@ def test_the_loss_of_a_picture_is_the_one_written_by_hand(ssim_weight: float) ->
     np.testing.assert_allclose(by_picture.numpy(), gradient, atol=1e-4 * np.abs(gradient).max())
 
 
+@pytest.mark.parametrize(("background", "boxes"), [(0.0, 2.0), (3.0, 0.0), (1.0, 1.5), (0.0, 0.0)])
+def test_sides_keep_to_their_longest_in_arrays_and_in_tensors(
+    prepared: tuple[Problem, FitState], background: float, boxes: float
+) -> None:
+    """Of the rows that are named alone, and of no Gaussian on the road."""
+    state = fresh(prepared[1])
+    rng = np.random.default_rng(4)
+    sizes = state.learned["log_scales"].values
+    sizes += rng.normal(0.0, 1.0, sizes.shape).astype(np.float32)
+    before, rows = sizes.copy(), np.arange(0, len(state), 2)
+    held = TENSORS.take(state)
+    held.keep_round(torch.tensor(rows), background, boxes)
+    state.keep_round(rows, background, boxes)
+    np.testing.assert_allclose(held.learned["log_scales"].values.numpy(), sizes, atol=1e-6)
+    np.testing.assert_array_equal(sizes[1::2], before[1::2])
+    np.testing.assert_array_equal(sizes[state.road], before[state.road])
+    np.testing.assert_array_equal(sizes.max(axis=1), before.max(axis=1))
+    for most, mine in ((background, (state.owner < 0) & ~state.road), (boxes, state.owner >= 0)):
+        stretch = np.exp(np.ptp(sizes[rows[mine[rows]]], axis=1))
+        assert mine[rows].sum() > 50
+        assert (stretch.max() <= most + 1e-4) if most else (stretch.max() > 10.0)
+
+
 def test_tensors_are_laid_on_the_road_as_arrays_are() -> None:
     """A road that rises and bends; Gaussians on it, off it, and beyond its ends."""
     rng = np.random.default_rng(3)

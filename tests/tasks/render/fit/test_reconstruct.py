@@ -310,3 +310,23 @@ def test_without_lidar_the_street_is_fitted_from_parallax_alone() -> None:
         reconstruct(photos, [], street.tracks(), replace(SETTINGS, iterations=n), held_out=[2]).psnr_db for n in (1, 24)
     )
     assert fitted > started + 0.5 and fitted > 18.0
+
+
+def test_gaussians_in_boxes_end_no_longer_than_asked_for(prepared: tuple[Problem, FitState]) -> None:
+    """Those that a photo has shown; what lies on the road stays thin."""
+    problem = prepared[0]
+    for most in (2.0, 0.0):
+        state = fresh(prepared[1])
+        advance(problem, state, replace(SETTINGS, box_stretch=most), SETTINGS.iterations)
+        stretch = np.exp(np.ptp(state.learned["log_scales"].values, axis=1))
+        shown = np.isfinite(state.nearest) & (state.owner >= 0)
+        assert shown.sum() > 100
+        assert (stretch[shown].max() <= 2.0 + 1e-4) == (most == 2.0)
+        assert stretch[state.road].min() > 2.0
+
+
+@pytest.mark.parametrize("name", ["stretch", "box_stretch"])
+@pytest.mark.parametrize("value", [0.5, -1.0, float("nan")])
+def test_a_stretch_below_one_is_no_shape(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=f"fit {name} must be 0"):
+        replace(FitSettings(), **{name: value})

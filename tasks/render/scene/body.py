@@ -1,0 +1,160 @@
+"""The body of a vehicle as far as its box tells: where it drives through photos, and what none of them shows of it.
+
+Photos of one instant hardly overlap, and at the next a vehicle that drives is elsewhere: what a sweep over them finds
+of it lies anywhere, most of it outside its box, where it would be taken for the street.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from tasks.kernels.compiled import kernel
+from tasks.render.scene.confirmed import STREET
+from tasks.render.scene.sensed import Photo, Tracks
+from tasks.render.scene.sight import SHALLOW, Seen
+from tasks.render.scene.sky import directions
+from tasks.render.splatting.gaussians import Gaussians
+from tasks.world.agents import AgentKind
+from tasks.world.arrays import Array, Bools
+
+SPACING_M = 0.3
+SIGMA_M = 0.17  # of a Gaussian along its face
+THICKNESS_M = 0.02
+FAR_M = 0.3  # from all that was seen: there it begins
+OPACITY = 0.95
+# Shares of half the box, from its centre: length, width, bottom, top.
+LOWER, CABIN, TALL = (0.94, 0.92, -0.65, 0.1), (0.5, 0.8, 0.1, 0.88), (0.95, 0.95, -0.65, 0.95)
+TALL_M = 2.2  # vehicles at least this high have no bonnet
+REACH_M = 40.0  # farther off boxes are not drawn as well as that
+BEFORE_M = 1.0  # what two photos saw so much nearer stands before the vehicle
+
+
+def on_bodies(photos: Sequence[Photo], seen: Sequence[Seen], tracks: Tracks) -> list[Seen]:
+    """The same, pixels that look at a vehicle which drives at the depth of its body.
+
+    Not those that look at a parked one before it, at what other photos confirmed to stand there (`with_confirmed`), or
+    at the own body.
+    """
+    vehicles = np.array([kind == AgentKind.VEHICLE for kind in tracks.kinds], bool)
+    if not (vehicles & tracks.driving).any():
+        return list(seen)
+    return [_on_bodies(photo, sight, tracks, vehicles) for photo, sight in zip(photos, seen)]
+
+
+def _on_bodies(photo: Photo, sight: Seen, tracks: Tracks, vehicles: Bools) -> Seen:
+    boxes, valid = tracks.at(photo.taken_s)
+    eye = np.ascontiguousarray(photo.world_from_camera[:3, 3])
+    away = np.linalg.norm(boxes[:, :2] - eye[:2], axis=1)
+    rows = np.flatnonzero(valid & vehicles & (away < REACH_M) & (away > boxes[:, 4] / 2.0))
+    if not len(rows):
+        return sight
+    height, width = sight.depth.shape
+    rays = directions(photo.intrinsics, photo.world_from_camera, width, height).reshape(-1, 3)
+    bodies = [(row, part) for row in rows for part in body_boxes(boxes[row])]
+    depth, first = nearest_box(rays, eye, np.stack([part for _, part in bodies]))
+    drives = (first >= 0) & tracks.driving[np.array([row for row, _ in bodies])[first]]
+    depth, drives = depth.reshape(height, width), drives.reshape(height, width)
+    hidden = (sight.label == STREET) & (sight.depth > 0.0) & (sight.depth < depth - BEFORE_M)
+    put = drives & ~hidden
+    if photo.own_body is not None:
+        put &= ~photo.own_body
+    return replace(
+        sight,
+        depth=np.where(put, depth, sight.depth).astype(np.float32),
+        label=np.where(put, np.int32(SHALLOW), sight.label),
+        sky=sight.sky & ~put,
+    )
+
+
+def body_boxes(box: Array) -> list[Array]:
+    """Boxes (7,) that make the body of the vehicle in a box (7,): bonnet and cabin, or one where it is tall."""
+    out = []
+    for length, width, low, high in _shares(box[6]):
+        part = box.copy()
+        part[2] += box[6] * (low + high) / 4.0
+        part[4:7] *= length, width, (high - low) / 2.0
+        out.append(part)
+    return out
+
+
+@kernel
+def nearest_box(rays: Any, eye: Any, boxes: Any) -> Any:
+    """How many lengths of rays (M, 3) from `eye` (3,) the first of boxes (N, 7) is away (M,), and which it is (M,).
+
+    Infinite, and -1, where a ray meets none. A box around the eye is not met.
+    """
+    along, which = np.full(rays.shape[0], np.inf), np.full(rays.shape[0], -1, np.int64)
+    for j in range(boxes.shape[0]):
+        cosine, sine = np.cos(boxes[j, 3]), np.sin(boxes[j, 3])
+        ex, ey, ez = eye[0] - boxes[j, 0], eye[1] - boxes[j, 1], eye[2] - boxes[j, 2]
+        start = (cosine * ex + sine * ey, cosine * ey - sine * ex, ez)
+        reach = 0.25 * (boxes[j, 4] ** 2 + boxes[j, 5] ** 2 + boxes[j, 6] ** 2)
+        beyond = ex * ex + ey * ey + ez * ez - reach
+        for i in range(rays.shape[0]):
+            dx, dy, dz = rays[i, 0], rays[i, 1], rays[i, 2]
+            towards = ex * dx + ey * dy + ez * dz
+            if towards > 0.0 or beyond * (dx * dx + dy * dy + dz * dz) > towards * towards:
+                continue  # most rays miss the ball around most boxes
+            step = (cosine * dx + sine * dy, cosine * dy - sine * dx, dz)
+            enter, leave = 0.0, np.inf
+            for axis in range(3):
+                half = 0.5 * boxes[j, 4 + axis]
+                if abs(step[axis]) < 1e-12:
+                    if abs(start[axis]) > half:
+                        leave = -1.0
+                    continue
+                a, b = (-half - start[axis]) / step[axis], (half - start[axis]) / step[axis]
+                enter, leave = max(enter, min(a, b)), min(leave, max(a, b))
+            if 0.0 < enter <= leave and enter < along[i]:
+                along[i], which[i] = enter, j
+    return along, which
+
+
+def unseen_body(seen: Gaussians, size: Array) -> Gaussians:
+    """What no photo shows of a vehicle, so that it is not hollow: Gaussians (M,) in the frame of its box of `size` (3,)
+    [m], coloured like the nearest of what was seen.
+
+    Where a photo does show the place, the fit takes away what is wrong; what none shows stays.
+    """
+    parts = [_faces(np.asarray(size) / 2.0, shares) for shares in _shares(size[2])]
+    points, scales = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
+    distance, nearest = cKDTree(seen.means).query(points)
+    far = distance > FAR_M
+    n = int(far.sum())
+    return Gaussians(
+        points[far].astype(np.float32),
+        np.tile(np.array([1.0, 0.0, 0.0, 0.0], np.float32), (n, 1)),
+        np.log(scales[far]).astype(np.float32),
+        np.full(n, OPACITY, np.float32),
+        seen.colours[nearest[far]],
+    )
+
+
+def _shares(height_m: float) -> tuple[tuple[float, float, float, float], ...]:
+    return (TALL,) if height_m >= TALL_M else (LOWER, CABIN)
+
+
+def _faces(half: Array, shares: tuple[float, float, float, float]) -> tuple[Array, Array]:
+    """Points (M, 3) and scales (M, 3) [m] on four sides and the top."""
+    x, y, low, high = half[0] * shares[0], half[1] * shares[1], half[2] * shares[2], half[2] * shares[3]
+    along, across, up = _spaced(-x, x), _spaced(-y, y), _spaced(low, high)
+    points, scales = [], []
+    for axis, at, grids in (
+        (0, (-x, x), (None, across, up)),
+        (1, (-y, y), (along, None, up)),
+        (2, (high,), (along, across, None)),
+    ):
+        for value in at:
+            grid = np.meshgrid(*(np.array([value]) if g is None else g for g in grids), indexing="ij")
+            points.append(np.stack(grid, axis=-1).reshape(-1, 3))
+            flat = np.full(3, SIGMA_M)
+            flat[axis] = THICKNESS_M
+            scales.append(np.tile(flat, (len(points[-1]), 1)))
+    return np.concatenate(points), np.concatenate(scales)
+
+
+def _spaced(first: float, last: float) -> Array:
+    return np.linspace(first, last, max(2, round((last - first) / SPACING_M) + 1))
