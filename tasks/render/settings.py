@@ -84,7 +84,7 @@ class GateSettings:
     contrast_min: float = 0.02  # standard deviation of the grey picture in [0, 1]: five grey levels
     vehicle_min: float = 0.7  # likeness to its photos to be expected of a large vehicle; 0: no look at vehicles
     beside_min: float = 0.75  # likeness that it must have beside a photo from near, place by place; 0: no such look
-    vehicle_share: float = 0.05  # of a picture, from which on a vehicle is large
+    vehicle_share: float = 0.02  # of a picture, from which on a vehicle is large
 
     def __post_init__(self) -> None:
         shares = dict.fromkeys(("contrast_min", "vehicle_min", "beside_min", "vehicle_share"), (0.0, 1.0))
