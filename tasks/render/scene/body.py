@@ -48,7 +48,7 @@ def _on_bodies(photo: Photo, sight: Seen, tracks: Tracks, vehicles: Bools) -> Se
     boxes, valid = tracks.at(photo.taken_s)
     eye = np.ascontiguousarray(photo.world_from_camera[:3, 3])
     away = np.linalg.norm(boxes[:, :2] - eye[:2], axis=1)
-    rows = np.flatnonzero(valid & vehicles & (away < REACH_M) & (away > boxes[:, 4] / 2.0))
+    rows = np.flatnonzero(valid & vehicles & (away < REACH_M))
     if not len(rows):
         return sight
     height, width = sight.depth.shape

@@ -110,6 +110,17 @@ def test_pixels_that_look_at_a_car_which_drives_lie_on_its_body() -> None:
         np.testing.assert_array_equal(getattr(found, name)[~on], getattr(seen, name)[~on], err_msg=name)
 
 
+def test_a_car_that_drives_past_the_camera_lies_on_its_body_as_well() -> None:
+    """Its middle is nearer than half its length; the camera looks along its side."""
+    past = street.tracks()
+    boxes = past.boxes.copy()
+    boxes[:, 0, 0] += street.photo(2.0, 0.0, AT_S).world_from_camera[0, 3] + 0.5 - street.car_box(AT_S)[0]
+    boxes[:, 0, 1] = 1.7
+    seen, found, _ = sighted(replace(past, boxes=boxes))
+    on = found.depth != seen.depth
+    assert on.sum() > 100 and found.depth[on].max() < 3.0
+
+
 def test_a_parked_car_keeps_what_photos_found_of_it() -> None:
     moving = street.tracks()
     at = round(10 * AT_S)
