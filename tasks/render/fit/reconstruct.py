@@ -8,6 +8,7 @@ import numpy as np
 from tasks.render.fit.backend import Derivatives, FitBackend, Held
 from tasks.render.fit.corrections import after, between, corrected, exposed, inverse, matrix_of, reference
 from tasks.render.fit.density import refine
+from tasks.render.fit.floaters import clear_floaters
 from tasks.render.fit.lpips import Lpips
 from tasks.render.fit.on_cpu import OnCpu, compose, look
 from tasks.render.fit.quality import measured
@@ -74,10 +75,14 @@ def advance(
         losses.append(loss)
         scores.append(score)
         held.iteration += 1
-        at, last = held.iteration, REFINE_UNTIL * settings.iterations
-        if at % settings.refine_every == 0 and settings.refine_from <= at <= last:
+        at = held.iteration
+        due = at % settings.refine_every == 0 and settings.refine_from <= at < settings.iterations
+        relocates = at <= REFINE_UNTIL * settings.iterations
+        if due and (relocates or problem.tracks.driving.any()):
             drawing.give_back(held, state)
-            refine(state, settings)
+            clear_floaters(problem, state)
+            if relocates:
+                refine(state, settings)
             held = drawing.take(state)
         if progress is not None and at % REPORT_EVERY == 0:
             progress(at, float(np.mean(losses)), float(np.mean(scores)))

@@ -38,24 +38,18 @@ def on_bodies(photos: Sequence[Photo], seen: Sequence[Seen], tracks: Tracks) -> 
     Not those that look at a parked one before it, at what other photos confirmed to stand there (`with_confirmed`), or
     at the own body.
     """
-    vehicles = np.array([kind == AgentKind.VEHICLE for kind in tracks.kinds], bool)
-    if not (vehicles & tracks.driving).any():
-        return list(seen)
-    return [_on_bodies(photo, sight, tracks, vehicles) for photo, sight in zip(photos, seen)]
+    return [_on_bodies(photo, sight, tracks) for photo, sight in zip(photos, seen)]
 
 
-def _on_bodies(photo: Photo, sight: Seen, tracks: Tracks, vehicles: Bools) -> Seen:
-    boxes, valid = tracks.at(photo.taken_s)
+def _on_bodies(photo: Photo, sight: Seen, tracks: Tracks) -> Seen:
     eye = np.ascontiguousarray(photo.world_from_camera[:3, 3])
-    away = np.linalg.norm(boxes[:, :2] - eye[:2], axis=1)
-    rows = np.flatnonzero(valid & vehicles & (away < REACH_M))
-    if not len(rows):
+    bodies, driving = bodies_near(*tracks.at(photo.taken_s), tracks, eye)
+    if not driving.any():
         return sight
     height, width = sight.depth.shape
     rays = directions(photo.intrinsics, photo.world_from_camera, width, height).reshape(-1, 3)
-    bodies = [(row, part) for row in rows for part in body_boxes(boxes[row])]
-    depth, first = nearest_box(rays, eye, np.stack([part for _, part in bodies]))
-    drives = (first >= 0) & tracks.driving[np.array([row for row, _ in bodies])[first]]
+    depth, first = nearest_box(rays, eye, bodies)
+    drives = (first >= 0) & driving[first]
     depth, drives = depth.reshape(height, width), drives.reshape(height, width)
     hidden = (sight.label == STREET) & (sight.depth > 0.0) & (sight.depth < depth - BEFORE_M)
     put = drives & ~hidden
@@ -67,6 +61,16 @@ def _on_bodies(photo: Photo, sight: Seen, tracks: Tracks, vehicles: Bools) -> Se
         label=np.where(put, np.int32(SHALLOW), sight.label),
         sky=sight.sky & ~put,
     )
+
+
+def bodies_near(boxes: Array, valid: Bools, tracks: Tracks, eye: Array) -> tuple[Array, Bools]:
+    """Bodies (M, 7) of the vehicles among the tracks' `boxes` (N, 7), those that are `valid` (N,) and within REACH_M of
+    an eye (3,); and which of them (M,) are of one that drives."""
+    vehicles = np.array([kind == AgentKind.VEHICLE for kind in tracks.kinds], bool)
+    away = np.linalg.norm(boxes[:, :2] - eye[:2], axis=1)
+    found = [(j, part) for j in np.flatnonzero(valid & vehicles & (away < REACH_M)) for part in body_boxes(boxes[j])]
+    bodies = np.array([part for _, part in found]).reshape(-1, 7)
+    return bodies, tracks.driving[[j for j, _ in found]]
 
 
 def body_boxes(box: Array) -> list[Array]:
