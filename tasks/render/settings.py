@@ -82,7 +82,7 @@ class GateSettings:
     width: int = 160  # pixels of the pictures that are looked at, where those to be stored are no smaller
     reach_m: float = 30.0  # of the scene that is looked at
     contrast_min: float = 0.02  # standard deviation of the grey picture in [0, 1]: five grey levels
-    vehicle_min: float = 0.7  # likeness to its photos to be expected of a large vehicle; 0: no look at vehicles
+    vehicle_min: float = 0.75  # likeness to its photos to be expected of a large vehicle; 0: no look at vehicles
     beside_min: float = 0.75  # likeness that it must have beside a photo from near, place by place; 0: no such look
     vehicle_share: float = 0.02  # of a picture, from which on a vehicle is large
 

@@ -30,6 +30,8 @@ def clear_floaters(problem: Problem, state: FitState) -> int:
     rows = floaters(problem, state)
     state.learned["logits"].values[rows] = GONE_LOGIT
     state.learned["logits"].forget(rows)
+    if state.noted:
+        state.averages["logits"][rows] = GONE_LOGIT
     return len(rows)
 
 

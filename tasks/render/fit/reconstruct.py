@@ -26,9 +26,9 @@ from tasks.world.agents import AgentTracks
 from tasks.world.arrays import F32, Array
 
 REPORT_EVERY = 100
-RATE_END = 0.1  # what every rate but that of the means falls to, as a share of itself
 SH_RATE = 6e-4  # step size of what depends on the direction
-REFINE_UNTIL = 0.8  # share of the iterations
+REFINE_UNTIL = 0.8  # share of the iterations; from there on
+NOTED_EVERY = 0.01  # share of them, what is learned is noted, and the scene is its mean
 LEAST_SHARE = 1e-3  # of a photo in a knot, for it to say anything there
 Progress = Callable[[int, float, float], None]  # iteration, mean loss and mean PSNR [dB] of the last REPORT_EVERY
 
@@ -84,10 +84,16 @@ def advance(
             if relocates:
                 refine(state, settings)
             held = drawing.take(state)
+        if not relocates and (at % max(1, round(NOTED_EVERY * settings.iterations)) == 0 or at == settings.iterations):
+            drawing.give_back(held, state)
+            state.note()
+            held = drawing.take(state)
         if progress is not None and at % REPORT_EVERY == 0:
             progress(at, float(np.mean(losses)), float(np.mean(scores)))
             losses, scores = [], []
     drawing.give_back(held, state)
+    if state.iteration >= settings.iterations:
+        state.settle(problem.road)
 
 
 def backend_of(backend: Backend, threads: int) -> FitBackend:
@@ -125,7 +131,7 @@ def _iterate(problem: Problem, held: Held, settings: FitSettings, backend: FitBa
 
 def _step_world(problem: Problem, held: Held, settings: FitSettings, row: int, found: Derivatives) -> None:
     """Exposure and pose of the photo, the boxes that it shows, and the sky behind it."""
-    at, fall = np.array([row]), decayed(RATE_END, held.iteration / settings.iterations)
+    at, fall = np.array([row]), decayed(settings.rate_end, held.iteration / settings.iterations)
     held.learned["exposure"].step(at, found.exposure[None], fall * settings.exposure_rate)
     if held.iteration >= settings.pose_from:
         poses = held.learned["poses"]
@@ -146,7 +152,7 @@ def _step_boxes(problem: Problem, held: Held, settings: FitSettings, row: int, f
     boxes, n_knots = held.learned["boxes"], problem.tracks.n_knots
     before, share = knots_at(problem.train[row].photo.taken_s, n_knots)
     rates = np.array([settings.box_shift_rate] * 3 + [settings.box_turn_rate], np.float32)
-    fall = decayed(RATE_END, held.iteration / settings.iterations)
+    fall = decayed(settings.rate_end, held.iteration / settings.iterations)
     for knot, weight in ((before, 1.0 - share), (before + 1, share)):
         if weight > LEAST_SHARE:
             at = found.tracks[shown] * n_knots + knot
@@ -159,7 +165,7 @@ def _step_gaussians(held: Held, settings: FitSettings, found: Derivatives) -> No
     """Those that the photo shows."""
     learned, rows, mine = held.learned, found.rows, found.gaussians
     nearest = held.seen(rows, found.depths, mine.screen)
-    fall = decayed(RATE_END, held.iteration / settings.iterations)
+    fall = decayed(settings.rate_end, held.iteration / settings.iterations)
     mean_rate = settings.mean_rate * decayed(settings.mean_rate_end, held.iteration / settings.iterations)
     learned["means"].step(rows, mine.means, mean_rate, nearest)
     learned["quats"].step(rows, mine.quats, fall * settings.quat_rate)

@@ -25,7 +25,8 @@ class FitSettings:
     # Loss.
     ssim_weight: float = 0.1  # loss = (1 - w) L1 + w (1 - SSIM)
     opaque_weight: float = 0.1  # of the mean light that passes where a photo looks at the ground
-    # Step sizes of Adam; each falls exponentially to a tenth of itself.
+    # Step sizes of Adam; each falls exponentially to a share of itself.
+    rate_end: float = 0.3  # that share, but for mean_rate
     mean_rate: float = 1.6e-3  # times the nearest viewing depth
     quat_rate: float = 4e-3  # of rotations
     scale_rate: float = 2e-2  # of sizes
@@ -38,7 +39,7 @@ class FitSettings:
     pose_from: int = 100  # iteration at which poses and boxes start to move
     box_shift_rate: float = 2e-2  # [m] of where boxes are; 0: where they were logged
     box_turn_rate: float = 2e-3  # [rad]
-    mean_rate_end: float = 0.04  # what mean_rate falls to instead, as a share of itself
+    mean_rate_end: float = 0.15  # that of mean_rate
     # Shape: how often a Gaussian's longest side is its shortest, at most; 0: as often as it likes.
     stretch: float = 0.0  # of the background, but for the road
     box_stretch: float = 2.0  # of what lies in boxes
@@ -64,7 +65,7 @@ class FitSettings:
             raise ValueError(f"fit road_share must be above 0, not {self.road_share}")
         if self.sh_degree not in range(4):
             raise ValueError(f"fit sh_degree must be 0 to 3, not {self.sh_degree}")
-        for name in ("ssim_weight", "mean_rate_end"):
+        for name in ("ssim_weight", "rate_end", "mean_rate_end"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"fit {name} must be from 0 to 1, not {getattr(self, name)}")
         for name in ("stretch", "box_stretch"):

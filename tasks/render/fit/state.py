@@ -1,7 +1,7 @@
 """All that the fit has learned so far: plain arrays, to be stored and handed back."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ BACKGROUND = -1
 SHAPES = ("means", "quats", "log_scales", "logits", "colours", "sh_rest")  # learned, one row per Gaussian
 WORLD = ("sky", "exposure", "poses", "boxes")
 PER_GAUSSIAN = ("owner", "road", "nearest", "wanted")  # fields of FitState
+COUNTS = ("iteration", "noted")
 
 
 @dataclass
@@ -30,6 +31,8 @@ class FitState:
     road: Bools  # (N,) lies on the road
     nearest: F32  # (N,) [m] depth in the nearest photo so far; inf: not seen yet
     wanted: F32  # (N,) how much more of it was asked for since the density was last looked at
+    averages: dict[str, F32] = field(default_factory=dict)  # of what is learned, by name; empty until it is noted
+    noted: int = 0  # how often it was
 
     def __len__(self) -> int:
         return len(self.owner)
@@ -64,24 +67,45 @@ class FitState:
             if most > 0.0 and len(mine):
                 log_scales[mine] = rounded(log_scales[mine], most)
 
+    def note(self) -> None:
+        """Takes what is learned now into its average. Rows must not be moved from the first time on."""
+        self.noted += 1
+        for name, learned in self.learned.items():
+            average = self.averages.setdefault(name, np.zeros_like(learned.values))
+            values = learned.values
+            if name == "quats":  # which, negated, turn the same way
+                values = np.where((average * values).sum(axis=1, keepdims=True) < 0.0, -values, values)
+            average += (values - average) / np.float32(self.noted)
+
+    def settle(self, road: Road | None) -> None:
+        """Puts everything where it was on average, on the road as well."""
+        for name, average in self.averages.items():
+            self.learned[name].values[:] = average
+        if road is not None:
+            self.lay_flat(np.arange(len(self)), road)
+
     def arrays(self) -> dict[str, NDArray[np.generic]]:
         """By name, for whoever stores them."""
         out: dict[str, NDArray[np.generic]] = {
-            f"{name}.{field.name}": getattr(learned, field.name)
+            f"{name}.{each.name}": getattr(learned, each.name)
             for name, learned in self.learned.items()
-            for field in fields(Learned)
+            for each in fields(Learned)
         }
-        out["iteration"] = np.array(self.iteration)
+        out |= {f"{name}.average": average for name, average in self.averages.items()}
+        out |= {name: np.array(getattr(self, name)) for name in COUNTS}
         return out | {name: getattr(self, name) for name in PER_GAUSSIAN}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[np.generic]]) -> "FitState":
         """The state that `arrays` gave, as a copy of its own. Raises KeyError where one is missing."""
         learned = {
-            name: Learned(*(np.array(arrays[f"{name}.{field.name}"]) for field in fields(Learned)))
+            name: Learned(*(np.array(arrays[f"{name}.{each.name}"]) for each in fields(Learned)))
             for name in SHAPES + WORLD
         }
-        return cls(int(arrays["iteration"]), learned, *(np.array(arrays[name]) for name in PER_GAUSSIAN))
+        owner, road, nearest, wanted = (np.array(arrays[name]) for name in PER_GAUSSIAN)
+        iteration, noted = (int(arrays[name]) for name in COUNTS)
+        averages = {name: np.array(arrays[f"{name}.average"], np.float32) for name in (learned if noted else ())}
+        return cls(iteration, learned, owner, road, nearest, wanted, averages, noted)
 
     def rows(self, rows: Ints) -> None:
         """Keeps these Gaussians, in this order; one may be named again and again."""

@@ -210,8 +210,10 @@ def test_floaters_become_transparent_and_forget_how_they_were_moved(prepared: Pr
     before = fresh(state)
     for name in ("first", "second"):
         getattr(state.learned["logits"], name)[:] = 1.0
+    state.note()
     assert clear_floaters(problem, state) == 1
     logits = state.learned["logits"]
+    assert state.averages["logits"][0] == GONE_LOGIT
     assert logits.values[0] == GONE_LOGIT and logits.first[0] == logits.second[0] == 0.0
     assert (logits.first[1:] == 1.0).all()
     np.testing.assert_array_equal(logits.values[1:], before.learned["logits"].values[1:])

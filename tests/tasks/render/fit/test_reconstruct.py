@@ -1,5 +1,6 @@
 """The loop, on a few small photos of the closed-form street."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -9,8 +10,16 @@ from numpy.typing import NDArray
 
 from tasks.render.fit import start
 from tasks.render.fit.adam import BETA1, Learned
-from tasks.render.fit.reconstruct import RATE_END, advance, corrections_at, finish, photo_at, picture_of, reconstruct
-from tasks.render.fit.road import SLACK_M
+from tasks.render.fit.reconstruct import (
+    REFINE_UNTIL,
+    advance,
+    corrections_at,
+    finish,
+    photo_at,
+    picture_of,
+    reconstruct,
+)
+from tasks.render.fit.road import SLACK_M, above_road
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import Problem, prepare
 from tasks.render.fit.state import SHAPES, FitState
@@ -90,13 +99,55 @@ def test_a_fit_that_was_stored_and_resumed_equals_the_uninterrupted_one_bit_for_
 ) -> None:
     problem = prepared[0]
     straight, broken = fresh(prepared[1]), fresh(prepared[1])
-    advance(problem, straight, SETTINGS, 15)
-    for until in (1, 7, 15):
+    advance(problem, straight, SETTINGS, SETTINGS.iterations)
+    for until in (1, 7, 15, 21, SETTINGS.iterations):
         broken = FitState.from_arrays(broken.arrays())
         advance(problem, broken, SETTINGS, until)
     assert straight.arrays().keys() == broken.arrays().keys()
     for name, array in straight.arrays().items():
         np.testing.assert_array_equal(array, broken.arrays()[name], err_msg=name)
+
+
+def test_the_scene_is_the_mean_of_what_was_learned_once_nothing_is_relocated(
+    prepared: tuple[Problem, FitState], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Noted every hundredth of the fit, here after each iteration: all that is learned, of the last fifth."""
+    problem, state = prepared[0], fresh(prepared[1])
+    settled = fresh(state)
+    advance(problem, settled, SETTINGS, SETTINGS.iterations)
+    monkeypatch.setattr(FitState, "settle", lambda self, road: None)
+    noted: dict[str, list[NDArray[np.float32]]] = {name: [] for name in state.learned}
+    first = math.floor(REFINE_UNTIL * SETTINGS.iterations) + 1
+    for until in range(first, SETTINGS.iterations + 1):
+        advance(problem, state, SETTINGS, until)
+        for name, values in noted.items():
+            values.append(state.learned[name].values.copy())
+    assert len(noted["sky"]) == 5
+    for name, values in noted.items():
+        rows = ~settled.road if name in SHAPES else np.ones(len(values[0]), bool)  # what lies on the road is laid on it
+        np.testing.assert_allclose(
+            settled.learned[name].values[rows], np.mean(values, axis=0)[rows], rtol=1e-5, atol=1e-6, err_msg=name
+        )
+
+
+def test_a_turn_and_its_negative_are_one_on_average(prepared: tuple[Problem, FitState]) -> None:
+    state = fresh(prepared[1])
+    before = state.learned["quats"].values.copy()
+    state.note()
+    state.learned["quats"].values[::2] *= -1.0
+    state.note()
+    state.settle(None)
+    np.testing.assert_allclose(state.learned["quats"].values, before, rtol=1e-6)
+
+
+def test_what_lies_on_the_road_lies_on_it_on_average(prepared: tuple[Problem, FitState]) -> None:
+    problem, state = prepared[0], fresh(prepared[1])
+    state.note()
+    state.averages["means"][state.road, 2] += 0.5
+    state.settle(problem.road)
+    assert problem.road is not None and state.road.sum() > 100
+    away = above_road(state.learned["means"].values[state.road].astype(np.float64), problem.road)
+    assert np.nanmax(np.abs(away)) < SLACK_M + 1e-4
 
 
 def test_the_number_of_threads_changes_no_bit(prepared: tuple[Problem, FitState]) -> None:
@@ -196,7 +247,7 @@ def test_a_camera_keeps_its_pose_until_pose_from_and_then_shifts_and_turns_at_ra
     assert not poses.any()
     row = photo_at(SETTINGS.pose_from, len(problem.train), SETTINGS.seed)
     advance(problem, state, SETTINGS, SETTINGS.pose_from + 1)
-    fall = RATE_END ** (SETTINGS.pose_from / SETTINGS.iterations)
+    fall = SETTINGS.rate_end ** (SETTINGS.pose_from / SETTINGS.iterations)
     rates = fall * np.repeat([SETTINGS.shift_rate, SETTINGS.turn_rate], 3)
     np.testing.assert_allclose(np.abs(poses[row]), rates, rtol=1e-3)
     assert not np.delete(poses, row, axis=0).any()
