@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -31,11 +32,24 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+def at_rest(out: Path) -> None:
+    """Waits until workers of a killed Ray driver have written what they had in hand: counts read before and after that
+    differ."""
+    for _ in range(60):
+        before = sorted(path for path in out.rglob("*") if path.is_file())
+        time.sleep(2.0)
+        if before == sorted(path for path in out.rglob("*") if path.is_file()):
+            return
+    raise TimeoutError(f"{out} is still written to two minutes after its driver was killed")
+
+
 def check(tmp_path: Path, undisturbed: Path, executor: str, moment: str) -> None:
     # Two journals: workers of a killed Ray driver may still finish what they have in hand.
     out, before, after = tmp_path / "out", tmp_path / "before", tmp_path / "after"
     killed = drive(out, executor, moment, before)
     assert killed.returncode == -9, killed.stderr
+    if executor == "ray":
+        at_rest(out)
     store = Store(out)
     left = balance(out)
     assert left.samples["planned"] == 5 * (2 + 2 + 1)

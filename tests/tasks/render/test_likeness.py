@@ -103,7 +103,7 @@ def test_what_stands_behind_an_opaque_car_does_not_matter(street_asset: RenderAs
     moved = street_asset.background.means + np.array([[1.4, 0.0, 0.0]], np.float32)
     elsewhere = replace(street_asset, background=replace(street_asset.background, means=moved))
     assert likeness_to_photo(elsewhere, photo, agents, ["car"])["car"] == pytest.approx(here, abs=0.1)
-    assert fault_at(elsewhere, BEHIND_IT) is None
+    assert fault_at(elsewhere, BEHIND_IT, settings=replace(SETTINGS, vehicle_min=0.7)) is None
 
 
 def test_no_vehicle_is_looked_at_without_an_album_or_where_no_picture_is_stored_or_at_zero(
