@@ -39,7 +39,7 @@ def floaters(problem: Problem, state: FitState) -> Ints:
     """Rows (M,) of Gaussians of the street, not of its road, that hide the body of a vehicle which drives in some photo
     by BEFORE_M or more, and that at most SHOWN_BY of the other photos which look there show in their own colour.
 
-    No other photo looks there: it goes too. A Gaussian behind a body that drives is not looked at.
+    No other photo looks there: it goes too. A photo in which such a body hides the place says nothing of it.
     """
     n = int(np.searchsorted(state.owner, BACKGROUND + 1))
     loose = ~state.road[:n] & (opacities_of(state.learned["logits"].values[:n, 0]) > LEAST_OPACITY)

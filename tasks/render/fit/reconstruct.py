@@ -27,8 +27,8 @@ from tasks.world.arrays import F32, Array
 
 REPORT_EVERY = 100
 SH_RATE = 6e-4  # step size of what depends on the direction
-REFINE_UNTIL = 0.8  # share of the iterations; from there on
-NOTED_EVERY = 0.01  # share of them, what is learned is noted, and the scene is its mean
+REFINE_UNTIL = 0.8  # share of the iterations after which nothing is relocated, and what is learned is averaged
+NOTED_EVERY = 0.01  # share of the iterations between two instants of that average
 LEAST_SHARE = 1e-3  # of a photo in a knot, for it to say anything there
 Progress = Callable[[int, float, float], None]  # iteration, mean loss and mean PSNR [dB] of the last REPORT_EVERY
 
