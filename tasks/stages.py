@@ -42,7 +42,7 @@ STAGES: tuple[Stage, ...] = (
     Stage("rollout", 3, "attempt", ("route_ended",)),
     Stage("expert", 1, "attempt", ("no_plan",)),
     Stage("reward", 1, "attempt", (*SUBSCORES, *END_FAULTS)),
-    Stage("render", 11, "attempt", ("psnr", *PICTURE_FAULTS)),
+    Stage("render", 12, "attempt", ("psnr", *PICTURE_FAULTS)),
     Stage("write", 3, "attempt", ()),
 )
 

@@ -10,6 +10,7 @@ from tests.bench import bench_decoding, bench_planner_steps
 from tests.bench.bench_planner_steps import counted_alone, hours, measured
 
 SMALL = "gtrs_dense_small"
+FIT_S_OWN = ("picture_of", "on_cpu import compose", "on_cpu import look")  # what the fit draws with, no sample
 
 
 @pytest.fixture
@@ -55,3 +56,9 @@ def test_decoding_s_tables_have_a_line_for_each_number_of_workers(
         line.split(" | ")[0][2:]: float(line.split(" | ")[-1][:-2]) for line in lines if line[:3] in ("| f", "| k")
     }
     assert per_core["kept"] > 2.0 * per_core["full"]
+
+
+def test_benches_draw_as_samples_are_drawn() -> None:
+    files = sorted(Path(bench_decoding.__file__).parent.glob("*.py"))
+    found = [f"{file.name}: {name}" for file in files for name in FIT_S_OWN if name in file.read_text()]
+    assert len(files) > 30 and not found, "draw the finished scene: tasks.render.fit.quality.drawn"

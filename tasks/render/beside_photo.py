@@ -75,13 +75,12 @@ def on_box(box: Array, eye: Array, rays: Array) -> tuple[Array, Ints, Array, Arr
 
 def _best(rgb: F32, photo: Bytes, columns: F32, rows: F32, clear: Bools) -> float:
     """Likeness of the `clear` pixels to the photo's at columns and rows (H, W) under the best of the shifts."""
-    mine = np.clip(rgb, 0.0, 1.0).astype(np.float32)
     theirs = photo.astype(np.float32) / np.float32(255.0)
     best = 0.0
     for down in SHIFTS_PX:
         for right in SHIFTS_PX:
             at = columns + np.float32(right), rows + np.float32(down)
             moved = cv2.remap(theirs, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            mixed = np.where(clear[..., None], moved, mine).astype(np.float32)
-            best = max(best, inside_mean(similarity(mine, mixed), clear))
+            mixed = np.where(clear[..., None], moved, rgb).astype(np.float32)
+            best = max(best, inside_mean(similarity(rgb, mixed), clear))
     return best

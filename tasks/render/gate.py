@@ -181,7 +181,7 @@ def measures(
 
 def measured(seen: View, road: Bools, lens: F32 | None = None) -> Measures:
     """Of one picture; `road` (H, W) pixels that are not to show sky, `lens` (H, W) alpha of what is on the lens."""
-    grey = np.clip(seen.rgb, 0.0, 1.0) @ GREY
+    grey = seen.rgb @ GREY
     contrast = float(grey.std())
     fine = grey - uniform_filter(grey, 3, mode="nearest")
     return Measures(

@@ -1,9 +1,8 @@
-"""Colours at new poses: `python -m tests.bench.bench_colours <openscene_0101> [hold_out=19,24] [setting=value]`.
+"""Colours of a rig's cameras: `python -m tests.bench.bench_colours <openscene_0101> [hold_out=19,24] [setting=value]`.
 
-A surround rig of eight cameras at 2 Hz. The same photos are drawn twice from where their cameras were: as the fit
-exposed each of them, and as pictures of simulated drives are drawn, which know the camera alone. Both are held against
-the photo; what lies between them is what a picture at a new pose loses in colour. Instants 20 and 27 are kept for
-tests and are never read. Options: width=240 height=135 threads=2 hold_out=<instants, which only measure>
+A surround rig of eight cameras at 2 Hz. Photos are drawn from where their cameras were, as pictures of simulated drives
+are drawn, and held against themselves: those that the fit saw and those held out, camera by camera. Instants 20 and 27
+are kept for tests and are never read. Options: width=240 height=135 threads=2 hold_out=<instants, which only measure>
 calibration=<file> and the settings of `FitSettings`.
 """
 
@@ -16,15 +15,14 @@ from pathlib import Path
 import numpy as np
 
 from factory.stages.sensors import load_photos
-from tasks.render.fit.corrections import corrected
-from tasks.render.fit.reconstruct import advance, corrections_at, finish, picture_of
+from tasks.render.fit.quality import drawn
+from tasks.render.fit.reconstruct import advance, finish, pose_of
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import prepare
 from tasks.render.scene.asset import psnr
-from tasks.render.scene.engine import render
 from tasks.render.scene.sensed import Photo, shifted
 from tasks.world.camera import Camera, Pinhole, SensorFile
-from tests.bench.stored_scene import Look, storage_table
+from tests.bench.stored_scene import Look, kept, storage_table
 
 TESTED = (20, 27)  # instants
 SETTINGS = replace(FitSettings(), iterations=600, start_gaussians=60_000, most_gaussians=80_000, hold_out_every=0)
@@ -71,21 +69,19 @@ def main() -> None:
     advance(problem, state, settings, settings.iterations, threads=threads)
     asset = finish(problem, state, threads)
     print(f"{len(state)} Gaussians, {time.process_time() - cpu:.0f} CPU s")
-    print("| camera | training, own exposure | as drawn at new poses | held out, between | as drawn at new poses |")
-    rows, looks = [], []
+    print("| camera | training | held out |")
+    scene, rows, looks = kept(asset), [], []
     for name in dict.fromkeys(photo.camera for photo in photos):
         row = []
         for shots in (problem.train, problem.held_out):
-            both = []
+            found = []
             for shot in (shot for shot in shots if shot.photo.camera == name):
-                photo, target = shot.photo, shot.compared.target.rgb
-                pose = corrected(photo.world_from_camera, corrections_at(problem, state, name, photo.time_s)[0])
-                eye = Pinhole(photo.intrinsics, shifted(pose, problem.origin), width, height)
+                photo, pose = shot.photo, pose_of(problem, state, shot.photo)
                 if shots is problem.held_out:
+                    eye = Pinhole(photo.intrinsics, shifted(pose, problem.origin), width, height)
                     looks.append(Look(name, photo.time_s, eye, photo.rgb))
-                drawn = render(asset, [eye], threads=threads, affines=[asset.affine_of(name, photo.time_s)])[0].rgb
-                both.append([psnr(picture, target) for picture in (picture_of(problem, state, photo, threads), drawn)])
-            row += list(np.mean(both, axis=0)) if both else [np.nan, np.nan]
+                found.append(psnr(drawn(scene, problem, photo, pose, threads), shot.compared.target.rgb))
+            row.append(float(np.mean(found)) if found else np.nan)
         rows.append(row)
         print(f"| {name} | " + " | ".join(f"{value:.2f}" for value in row) + " |")
     print("| mean | " + " | ".join(f"{value:.2f}" for value in np.mean(rows, axis=0)) + " |")

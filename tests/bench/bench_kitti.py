@@ -22,17 +22,18 @@ from factory.stages.scene_file import write_scene
 from tasks.render.fit.corrections import affine_between, corrected, exposed
 from tasks.render.fit.losses import ssim, target_of
 from tasks.render.fit.on_torch import OnTorch
-from tasks.render.fit.reconstruct import advance, backend_of, corrections_at, finish, picture_of
+from tasks.render.fit.quality import drawn
+from tasks.render.fit.reconstruct import advance, backend_of, corrections_at, finish, pose_of
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import Problem, prepare
 from tasks.render.fit.state import FitState
-from tasks.render.scene.asset import psnr
+from tasks.render.scene.asset import RenderAsset, psnr
 from tasks.render.scene.engine import render
 from tasks.render.scene.sensed import Photo, shifted
 from tasks.render.scene.settings import Backend
 from tasks.render.splatting.tensors import by_kernels
 from tasks.world.camera import Pinhole
-from tests.bench.stored_scene import Look, storage_table
+from tests.bench.stored_scene import Look, kept, storage_table
 
 F32, F64 = NDArray[np.float32], NDArray[np.float64]
 FITTED_FRAMES = 12  # of image_03's training frames, for its affine colour and rigid correction
@@ -44,18 +45,20 @@ SETTINGS = replace(FitSettings(), start_gaussians=240_000, most_gaussians=280_00
 
 
 class Beside:
-    """What the fit shows of image_03: posed by what was learned of image_02, plus a rigid correction."""
+    """What a scene shows of image_03: posed by what was learned of image_02, plus a rigid correction."""
 
-    def __init__(self, problem: Problem, state: FitState, left: dict[float, F64], threads: int) -> None:
-        self.problem, self.state, self.left, self.threads = problem, state, left, threads
+    def __init__(
+        self, asset: RenderAsset, problem: Problem, state: FitState, left: dict[float, F64], threads: int
+    ) -> None:
+        self.asset, self.problem, self.state, self.left, self.threads = asset, problem, state, left, threads
 
     def picture(self, photo: Photo, row: F64) -> F32:
         """`photo` local; `row` (6,) the correction."""
-        learned, colours = corrections_at(self.problem, self.state, "image_02", photo.time_s)
+        learned, _ = corrections_at(self.problem, self.state, "image_02", photo.time_s)
         left = self.left[photo.time_s]
         moved = corrected(left, learned) @ np.linalg.inv(left) @ photo.world_from_camera
-        there = replace(photo, world_from_camera=corrected(moved, row))
-        return np.clip(exposed(picture_of(self.problem, self.state, there, self.threads), colours), 0.0, 1.0)
+        as_left = replace(photo, camera="image_02")
+        return drawn(self.asset, self.problem, as_left, corrected(moved, row), self.threads)
 
     def fitted(self, photos: list[Photo], rigid: bool) -> tuple[F64, F32]:
         """Correction and affine colour (12,) that fit `photos` best: Gauss-Newton on what the affine leaves over."""
@@ -81,23 +84,26 @@ class Trial:
 
     problem: Problem
     state: FitState
-    beside: Beside
+    left: dict[float, F64]  # poses of image_02 by time
     test: list[Photo]  # image_03 of the frames held out
     chosen: list[Photo]  # image_03 of some frames trained on
     threads: int
 
     def row(self) -> str:
-        """Held-out image_02; image_03 as it comes, with an affine colour, and with a rigid correction as well."""
-        shots = self.problem.held_out
-        own = [picture_of(self.problem, self.state, s.photo, self.threads) for s in shots]
-        raw = [self.beside.picture(p, np.zeros(6)) for p in self.test]
-        _, plain = self.beside.fitted(self.chosen, rigid=False)
-        rigid, colour = self.beside.fitted(self.chosen, rigid=True)
+        """Held-out image_02; image_03 as it comes, with an affine colour, and with a rigid correction as well; by the
+        scene as it is now."""
+        asset = kept(finish(self.problem, self.state, self.threads))
+        beside = Beside(asset, self.problem, self.state, self.left, self.threads)
+        photos = [shot.photo for shot in self.problem.held_out]
+        own = [drawn(asset, self.problem, p, pose_of(self.problem, self.state, p), self.threads) for p in photos]
+        raw = [beside.picture(p, np.zeros(6)) for p in self.test]
+        _, plain = beside.fitted(self.chosen, rigid=False)
+        rigid, colour = beside.fitted(self.chosen, rigid=True)
         affine = [exposed(p, plain) for p in raw]
-        turned = [exposed(self.beside.picture(p, rigid), colour) for p in self.test]
+        turned = [exposed(beside.picture(p, rigid), colour) for p in self.test]
         print("    extrinsic [cm]", np.round(100 * rigid[:3], 2), "[deg]", np.round(np.degrees(rigid[3:]), 3))
-        beside = " | ".join(scores(pictures, self.test) for pictures in (raw, affine, turned))
-        return f"{scores(own, [s.photo for s in shots])} | {beside}"
+        columns = " | ".join(scores(pictures, self.test) for pictures in (raw, affine, turned))
+        return f"{scores(own, photos)} | {columns}"
 
 
 def scores(pictures: list[F32], photos: list[Photo]) -> str:
@@ -134,8 +140,8 @@ def main() -> None:
     left, right = (local(p, problem.origin) for p in (photos, drive.photos("image_03", frames)))
     trained = [p for i, p in enumerate(right) if i not in held_out]
     chosen = [trained[i] for i in np.linspace(0, len(trained) - 1, FITTED_FRAMES).astype(int)]
-    beside = Beside(problem, state, {p.time_s: p.world_from_camera for p in left}, threads)
-    trial = Trial(problem, state, beside, [right[i] for i in held_out], chosen, threads)
+    poses = {p.time_s: p.world_from_camera for p in left}
+    trial = Trial(problem, state, poses, [right[i] for i in held_out], chosen, threads)
 
     print(f"{time.perf_counter() - started:.0f} s to prepare {len(state)} Gaussians, {state.road.sum()} of them road")
     print("| iterations | s | Gaussians | training | image_02 | image_03 raw | affine | affine + extrinsic |")
@@ -152,13 +158,13 @@ def main() -> None:
     asset = write_scene(out / "kitti.safetensors", finish(problem, state, threads))
     looks = []
     for photo in (shot.photo for shot in problem.held_out):
-        pose = corrected(photo.world_from_camera, corrections_at(problem, state, photo.camera, photo.time_s)[0])
+        pose = pose_of(problem, state, photo)
         eye = Pinhole(photo.intrinsics, shifted(pose, problem.origin), *photo.rgb.shape[1::-1])
         looks.append(Look(photo.camera, photo.time_s, eye, photo.rgb))
     print(storage_table(asset, looks, threads))
     for frame in [f for f in SHOWN if f in frames]:
         photo = left[frames.index(frame)]
-        pose = corrected(photo.world_from_camera, corrections_at(problem, state, photo.camera, photo.time_s)[0])
+        pose = pose_of(problem, state, photo)
         height, width = photo.rgb.shape[:2]
         strip = []
         for shift in SHIFTS_M:
@@ -167,7 +173,7 @@ def main() -> None:
             eye = Pinhole(photo.intrinsics, there, width, height)
             affines = [asset.affine_of(photo.camera, photo.time_s)]
             strip.append(render(asset, [eye], threads=threads, affines=affines)[0].rgb)
-        picture = np.rint(255 * np.clip(np.vstack(strip), 0, 1)).astype(np.uint8)[..., ::-1]
+        picture = np.rint(255 * np.vstack(strip)).astype(np.uint8)[..., ::-1]
         cv2.imwrite(str(out / f"shifted_{frame:03d}.png"), picture)
 
 

@@ -20,8 +20,8 @@ from factory.stages.rig import lines_of
 from factory.stages.sensors import load_photos, opened_photos
 from tasks.render.fit.corrections import affine_between, exposed
 from tasks.render.fit.losses import ssim
-from tasks.render.fit.quality import classes_of
-from tasks.render.fit.reconstruct import advance, picture_of
+from tasks.render.fit.quality import classes_of, drawn
+from tasks.render.fit.reconstruct import advance, finish, pose_of
 from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import Problem, Shot, prepare
 from tasks.render.rig.corners import corners_of
@@ -35,6 +35,7 @@ from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import Array
 from tasks.world.camera import Camera, SensorFile
 from tasks.world.clip import STEP_S
+from tests.bench.stored_scene import kept
 
 SIZE = (480, 270)
 HELD_OUT, VALIDATED = (20, 27), (18, 24)
@@ -147,10 +148,10 @@ def main() -> None:
     for until in [at for at in (2000, 4000) if at < settings.iterations] + [settings.iterations]:
         started = time.process_time()
         advance(problem, state, settings, until, lambda at, loss, score: told.append(score), threads)
-        rows = {}
+        asset, rows = kept(finish(problem, state, threads)), {}
         coloured: dict[str, list[float]] = {}
         for shot in problem.held_out:
-            picture = picture_of(problem, state, shot.photo, threads)
+            picture = drawn(asset, problem, shot.photo, pose_of(problem, state, shot.photo), threads)
             counted, photo = _counted(problem, shot), shot.compared.target.rgb
             score = psnr(picture[counted], photo[counted]), ssim(picture, shot.compared.target)[0]
             own = exposed(picture, affine_between(picture[counted], photo[counted]))

@@ -35,7 +35,7 @@ from tasks.render.scene.build import held_out_rows
 from tasks.render.scene.engine import vehicles_at
 from tasks.render.scene.sensed import Photo
 from tasks.world.camera import Camera, Pinhole
-from tests.bench.stored_scene import Look, storage_table
+from tests.bench.stored_scene import Look, kept, storage_table
 from tests.bench.town_truth import MOVED_M, Compared, Painter, Truth, beside, sideways
 
 SETTINGS = FitSettings(
@@ -152,7 +152,7 @@ def main() -> None:
     photos = [data.photos[i] for i in sorted(held_out_rows(data.photos, settings.hold_out_every))]
     ahead = {photo.time_s: photo for photo in photos if photo.camera == CENTRE}
     views = Truth(
-        asset,
+        kept(asset),
         block.agents,
         painter(Theatre(town.scenery, drive, town.sun_azimuth, town.sun_elevation, town.sky_seed)),
         painter(Theatre(town.scenery, with_moved_vehicles(drive), town.sun_azimuth, town.sun_elevation, town.sky_seed)),

@@ -29,6 +29,7 @@ from tasks.render.fit.start import prepare
 from tasks.render.scene.build import held_out_rows
 from tasks.render.scene.sensed import Photo
 from tests.bench.bench_town import CENTRE, SETTINGS, by_class, painter
+from tests.bench.stored_scene import kept
 from tests.bench.town_truth import Painter, Truth, beside, sideways
 
 STEPS_PER_S = 10
@@ -75,7 +76,7 @@ def main() -> None:
         held_out = held_out_rows(data.photos, settings.hold_out_every)
         problem, state = prepare(data.photos, data.sweeps, block.agents, settings, held_out, threads)
         advance(problem, state, settings, settings.iterations, threads=threads)
-        asset = own_part(finish(problem, state, threads))
+        asset = kept(own_part(finish(problem, state, threads)))
         took = time.process_time() - began
         photos = [data.photos[i] for i in sorted(held_out)]
         ahead = {photo.time_s: photo for photo in photos if photo.camera == CENTRE}

@@ -14,6 +14,7 @@ from factory.stages.scene_file import read_scene, write_scene
 from tasks.render.scene.asset import RenderAsset, psnr
 from tasks.render.scene.engine import NOBODY, Vehicles, render
 from tasks.render.scene.settings import SceneDtype
+from tasks.render.settings import RenderSettings
 from tasks.world.arrays import F32, Bytes
 from tasks.world.camera import Pinhole
 from tests.bench.timing import cpu_milliseconds
@@ -30,6 +31,14 @@ class Look:
     eye: Pinhole  # world
     photo: Bytes  # (H, W, 3)
     there: Vehicles = NOBODY
+
+
+def kept(asset: RenderAsset) -> RenderAsset:
+    """The scene as a run's workers read it."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder, "block.safetensors")
+        write_scene(path, asset, RenderSettings().scene_dtype)
+        return read_scene(path)
 
 
 def storage_table(asset: RenderAsset, looks: Sequence[Look], threads: int) -> str:

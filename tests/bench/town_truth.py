@@ -132,7 +132,7 @@ class Truth:
         height, width = photo.rgb.shape[:2]
         eye = Pinhole(photo.intrinsics, photo.world_from_camera, width, height)
         affine = self.asset.affine_of(photo.camera, photo.time_s)
-        return np.clip(render(self.asset, [eye], there, affines=[affine])[0].rgb, 0.0, 1.0)
+        return render(self.asset, [eye], there, affines=[affine])[0].rgb
 
 
 def _in_the_way(photo: Photo, boxes: Array) -> bool:

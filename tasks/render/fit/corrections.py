@@ -138,14 +138,11 @@ def instants(photos: Sequence[Photo]) -> list[list[int]]:
 
 
 def in_agreement(photos: Sequence[Photo], rows: F32) -> list[Photo]:
-    """The photos as their instant's common exposure shows them."""
-    out = []
-    for photo, row in zip(photos, rows):
-        if row.any():
-            rgb = exposed(photo.rgb.astype(np.float32) / np.float32(255.0), inverse(row))
-            photo = replace(photo, rgb=np.rint(255.0 * np.clip(rgb, 0.0, 1.0)).astype(np.uint8))
-        out.append(photo)
-    return out
+    """The photos, whose `light` is as their instant's common exposure shows it."""
+    return [
+        replace(photo, to_common=np.column_stack(matrix_of(inverse(row)))) if row.any() else photo
+        for photo, row in zip(photos, rows)
+    ]
 
 
 def _colours(rgb: Bytes, photo: Photo, seen: Seen, points: Array) -> tuple[Array, Bools]:

@@ -61,7 +61,7 @@ def floaters(problem: Problem, state: FitState) -> Ints:
         mine = exposed(colours[looking], state.learned["exposure"].values[i])
         theirs = shot.photo.rgb.reshape(-1, 3)[pixel[looking]] / np.float32(255.0)
         looked += looking
-        shown[looking] += np.abs(mine - theirs).max(axis=1) < ALIKE
+        shown[looking] += np.abs(np.clip(mine, 0.0, 1.0) - theirs).max(axis=1) < ALIKE
     return rows[found[shown <= SHOWN_BY * looked]]
 
 

@@ -42,19 +42,9 @@ def measured(
     without weight say nothing; LPIPS, whose layers see far around, is of the whole picture.
     """
     photo, target = shot.photo, shot.compared.target
-    height, width = target.weight.shape
-    boxes, valid = problem.tracks.at(photo.taken_s)
-    boxes = shifted_boxes(boxes, asset.shifts.at(photo.taken_s, problem.tracks.ids))
-    rows = np.flatnonzero(valid)
-    there = Vehicles(
-        tuple(problem.tracks.ids[j] for j in rows),
-        tuple(problem.tracks.kinds[j] for j in rows),
-        boxes[rows] + np.concatenate([problem.origin, np.zeros(4)]),
-    )
-    eye = Pinhole(photo.intrinsics, shifted(scene_from_camera, problem.origin), width, height)
-    affines = [asset.affine_of(photo.camera, photo.time_s)]
-    picture = render(asset, [eye], there, threads=threads, affines=affines)[0].rgb
-    vehicles = boxes[[j for j in rows if problem.tracks.kinds[j] == AgentKind.VEHICLE]]
+    picture = drawn(asset, problem, photo, scene_from_camera, threads)
+    boxes, valid = boxes_in(asset, problem, photo)
+    vehicles = boxes[[j for j in np.flatnonzero(valid) if problem.tracks.kinds[j] == AgentKind.VEHICLE]]
     classes = classes_of(photo, vehicles, problem.road)
     found = [_of_class(name, picture, target, inside) for name, inside in classes.items()]
     counted = target.weight > 0.0
@@ -68,6 +58,28 @@ def measured(
         away_m=away(photo, [other.photo for other in problem.train]),
         classes=tuple(of for of in found if of is not None),
     )
+
+
+def drawn(asset: RenderAsset, problem: Problem, photo: Photo, scene_from_camera: Array, threads: int = 1) -> F32:
+    """What `asset` shows (H, W, 3) in place of a photo from a pose (4, 4) in the problem's frame: as pictures of
+    samples are drawn, in the colours of its camera then, its tracks where photos say that they were."""
+    boxes, valid = boxes_in(asset, problem, photo)
+    rows = np.flatnonzero(valid)
+    there = Vehicles(
+        tuple(problem.tracks.ids[j] for j in rows),
+        tuple(problem.tracks.kinds[j] for j in rows),
+        boxes[rows] + np.concatenate([problem.origin, np.zeros(4)]),
+    )
+    height, width = photo.rgb.shape[:2]
+    eye = Pinhole(photo.intrinsics, shifted(scene_from_camera, problem.origin), width, height)
+    affines = [asset.affine_of(photo.camera, photo.time_s)]
+    return render(asset, [eye], there, threads=threads, affines=affines)[0].rgb
+
+
+def boxes_in(asset: RenderAsset, problem: Problem, photo: Photo) -> tuple[Array, Bools]:
+    """Boxes (N, 7) of the problem's tracks when a photo was taken, in its frame, and which of them are there (N,)."""
+    boxes, valid = problem.tracks.at(photo.taken_s)
+    return shifted_boxes(boxes, asset.shifts.at(photo.taken_s, problem.tracks.ids)), valid
 
 
 def classes_of(photo: Photo, vehicles: Array, road: Road | None) -> dict[str, Bools]:

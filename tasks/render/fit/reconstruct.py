@@ -189,6 +189,11 @@ def picture_of(problem: Problem, state: FitState, photo: Photo, threads: int = 1
     return np.clip(exposed(seen.view.rgb, row_colour), 0.0, 1.0)
 
 
+def pose_of(problem: Problem, state: FitState, photo: Photo) -> Array:
+    """Where a photo (pose local) was taken (4, 4), as the corrections of its camera's before and after have it."""
+    return corrected(photo.world_from_camera, corrections_at(problem, state, photo.camera, photo.time_s)[0])
+
+
 def corrections_at(problem: Problem, state: FitState, camera: str, time_s: float) -> tuple[F32, F32]:
     """Pose correction (6,) and exposure (12,) of a camera at a time; zeros for one that no photo was learned from."""
     rows = [i for i, shot in enumerate(problem.train) if shot.photo.camera == camera]
@@ -256,7 +261,7 @@ def finish(problem: Problem, state: FitState, threads: int = 2, lpips: Lpips | N
         problem.origin,
         every.take(state.owner == BACKGROUND),
         nodes,
-        SkyMap(np.clip(sky, 0.0, 1.0).reshape(ROWS, COLUMNS, 3)),
+        SkyMap(np.maximum(sky, np.float32(0.0)).reshape(ROWS, COLUMNS, 3)),
         float("nan"),
         exposures=tuple(
             Exposure(shot.photo.camera, shot.photo.time_s, np.column_stack(matrix_of(after(row, inverse(common)))))
@@ -266,7 +271,5 @@ def finish(problem: Problem, state: FitState, threads: int = 2, lpips: Lpips | N
     )
     views = []
     for shot in problem.held_out:
-        photo = shot.photo
-        pose = corrected(photo.world_from_camera, corrections_at(problem, state, photo.camera, photo.time_s)[0])
-        views.append(measured(asset, problem, shot, pose, threads, lpips))
+        views.append(measured(asset, problem, shot, pose_of(problem, state, shot.photo), threads, lpips))
     return replace(asset, views=tuple(views), psnr_db=mean_psnr_db(views), n_held_out=len(views))

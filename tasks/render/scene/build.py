@@ -97,8 +97,7 @@ def surfaces(photos: Sequence[Photo], seen: Sequence[Seen], tracks: Tracks) -> t
     carvers = [np.where(s.sky, FAR_M, np.where(s.label == SHALLOW, 0.0, s.depth)).astype(np.float32) for s in seen]
     looks = []
     for photo, sight in zip(photos, seen):
-        rgb = photo.rgb.astype(np.float32) / 255.0
-        discs = discs_of_photo(rgb, sight.depth, sight.label, photo.intrinsics, photo.world_from_camera)
+        discs = discs_of_photo(photo.light, sight.depth, sight.label, photo.intrinsics, photo.world_from_camera)
         boxes, valid = tracks.at(photo.taken_s)
         poses = world_from_boxes(boxes)
         owner = owners(discs.points, boxes, valid)
@@ -145,7 +144,7 @@ def sky_of(photos: Sequence[Photo], seen: Sequence[Seen]) -> SkyMap:
             height, width = sight.depth.shape
             use = ~sight.passing
             rays = directions(photo.intrinsics, photo.world_from_camera, width, height)[use]
-            yield rays, photo.rgb[use].astype(np.float32) / 255.0, sight.sky[use]
+            yield rays, photo.light[use], sight.sky[use]
 
     return sky_of_views(views())
 

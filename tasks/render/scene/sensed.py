@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from tasks.render.scene.asset import OwnBody
+from tasks.render.scene.asset import OwnBody, developed
 from tasks.render.scene.movers import GROUND_CLEARANCE_M, KNOT_S, boxes_at, driving, owners, world_from_boxes
 from tasks.world.agents import MOVING_KINDS, AgentTracks
 from tasks.world.arrays import F32, Array, Bools, Bytes, Indices
@@ -29,6 +29,14 @@ class Photo:
     world_from_camera: Array  # (4, 4)
     own_body: Bools | None = None  # (H, W) shows the car that carries the camera
     late_s: float = 0.0  # so much later than `time_s` says was it taken
+    to_common: F32 | None = None  # (3, 4) affine colour that takes it into an exposure common to several cameras
+
+    @property
+    def light(self) -> F32:
+        """(H, W, 3) its colours in the common exposure, else as they are: from 0 on, and above 1 where a dark photo
+        shows what is brighter than white is there."""
+        rgb = self.rgb.astype(np.float32) / np.float32(255.0)
+        return rgb if self.to_common is None else np.maximum(developed(rgb, self.to_common), np.float32(0.0))
 
     @property
     def taken_s(self) -> float:

@@ -20,7 +20,7 @@ class SkyMap:
     """Infinitely far colours. Where no photo saw sky: the mean colour seen in that direction, so that a hole in the
     scene is no hole to the sky."""
 
-    rgb: F32  # (ROWS, COLUMNS, 3) in [0, 1], world directions
+    rgb: F32  # (ROWS, COLUMNS, 3) from 0 on, above 1 where a photo of mean exposure is white; world directions
 
     def seen_by(self, intrinsics: Array, world_from_camera: Array, width: int, height: int, threads: int = 1) -> F32:
         """The backdrop (H, W, 3) of a camera. Raises ValueError for a map of another size, which a file may hold."""
@@ -74,7 +74,7 @@ def _cells(rays: Array) -> tuple[Array, Array]:
 def sky_of_views(views: Iterable[tuple[Array, F32, Bools]]) -> SkyMap:
     """The mean of what views show of the sky (and, with next to no weight, of the street).
 
-    Each is directions (M, 3), their colours (M, 3) in [0, 1], and whether it was sky (M,). Cells nobody looked at take
+    Each is directions (M, 3), their colours (M, 3) from 0 on, and whether it was sky (M,). Cells nobody looked at take
     the colour of the nearest one that was; plain grey without any view.
     """
     sums = np.zeros((ROWS * COLUMNS, 4))

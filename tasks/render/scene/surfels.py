@@ -55,7 +55,7 @@ def concatenate_discs(parts: list[Discs]) -> Discs:
 def discs_of_photo(rgb: F32, depth: F32, label: ShortInts, intrinsics: Array, world_from_camera: Array) -> Discs:
     """Discs in the world, for every pixel with depth: blocks where colour, label and depth allow, else single pixels.
 
-    `rgb` (H, W, 3) in [0, 1], `depth` (H, W) [m] along the optical axis (0: none), `label` (H, W).
+    `rgb` (H, W, 3) from 0 on, `depth` (H, W) [m] along the optical axis (0: none), `label` (H, W).
     """
     height, width = depth.shape
     points = camera_rays(intrinsics, width, height) * depth[..., None].astype(np.float64)

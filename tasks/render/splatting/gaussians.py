@@ -24,7 +24,7 @@ class Gaussians:
     quats: F32  # (N, 4) w, x, y, z; unit; columns of the rotation are the axes of the scales
     log_scales: F32  # (N, 3) natural log of the standard deviations [m]
     opacities: F32  # (N,) in (0, 1)
-    colours: F32  # (N, 3) rgb, what all sides have in common (SH degree 0); in [0, 1] where there is no more than that
+    colours: F32  # (N, 3) rgb, what all sides have in common (SH degree 0); drawn as 0 below, above 1 as it is
     sh_rest: F32 = field(default_factory=lambda: _NO_SH)  # (N, M, 3), M 0, 3, 8 or 15: degrees 1 to 3, splatting.sh
 
     def __post_init__(self) -> None:

@@ -45,6 +45,21 @@ def test_a_block_goes_out_and_comes_back(stored: Path, tmp_path: Path, kind: str
     assert max(apart(whole.nodes["a"], node).values()) < (0.1 if kind == "spz" else 1e-5)
 
 
+@pytest.mark.parametrize(
+    ("kind", "count", "most"), [("ply", 0, 9.0), ("spz", 0, 1.44), ("ckpt", 0, 1.0), ("ckpt", 3, 9.0)]
+)
+def test_colours_brighter_than_white_go_out_as_far_as_the_format_has_room(
+    tmp_path: Path, kind: str, count: int, most: float
+) -> None:
+    bright = some(30, count)
+    bright = replace(bright, colours=np.linspace(0.1, 3.0, 90, dtype=np.float32).reshape(30, 3))
+    whole = write_scene(tmp_path / "block.safetensors", replace(scene(), background=bright, nodes={}))
+    np.testing.assert_array_equal(read_scene(tmp_path / "block.safetensors").background.colours, bright.colours)
+    assert main(["export", str(tmp_path / "block.safetensors"), f"to={tmp_path}", f"format={kind}"]) == 0
+    found = read_splats(tmp_path / f"background.{kind}").background
+    np.testing.assert_allclose(found.colours, np.minimum(whole.background.colours, most), atol=6e-3)
+
+
 def test_a_checkpoint_says_itself_where_it_lies(
     stored: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -40,7 +40,7 @@ def scene() -> RenderAsset:
         origin=np.array([600_000.25, 4_000_000.5, 30.0]),
         background=gaussians(30, 3, 0),
         nodes={"b/7 ü": gaussians(5, 15, 1), "a": gaussians(4, 0, 2)},
-        sky=SkyMap(np.random.default_rng(3).uniform(0, 1, (8, 16, 3)).astype(np.float32)),
+        sky=SkyMap(np.random.default_rng(3).uniform(0, 2, (8, 16, 3)).astype(np.float32)),
         psnr_db=27.123456789,
         n_held_out=3,
         views=(

@@ -136,7 +136,8 @@ def slow_floaters(problem: Problem, state: FitState) -> list[int]:
             near_enough = [(i, rgb) for i, depth, rgb in others if depth < FARTHER * nearest]
             mine = state.learned["colours"].values[row]
             like = [
-                np.abs(exposed(mine, state.learned["exposure"].values[i]) - rgb).max() < ALIKE for i, rgb in near_enough
+                np.abs(np.clip(exposed(mine, state.learned["exposure"].values[i]), 0.0, 1.0) - rgb).max() < ALIKE
+                for i, rgb in near_enough
             ]
             if sum(like) <= SHOWN_BY * len(like):
                 found.append(row)
