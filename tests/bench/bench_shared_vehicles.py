@@ -36,6 +36,7 @@ from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import F32, Array, Bools, Indices
 from tasks.world.camera import Pinhole
 from tests.bench.bench_town import CENTRE, SETTINGS, painter, with_moved_vehicles
+from tests.bench.stored_scene import kept
 from tests.bench.town_truth import IN_THE_WAY_M, LEAST_PIXELS, NEAR_M, Painter, moved_on, sideways
 
 FACES = ("front", "rear", "left", "right", "top", "bottom")
@@ -143,12 +144,12 @@ def of_log(log: int, width: int, height: int, threads: int, out: Path, settings:
     agents, data = block.agents, load_sensors(block, clip.cameras, width, height)
     middle = max(photo.time_s for photo in data.photos) / 2.0
     parts = [part_of(data, -1.0, middle), part_of(data, middle, np.inf)]
-    halves = [reconstruct(part.photos, part.sweeps, agents, settings, threads=threads) for part in parts]
+    halves = [kept(reconstruct(part.photos, part.sweeps, agents, settings, threads=threads)) for part in parts]
     twice = replace(settings, iterations=2 * settings.iterations)
     kept_out = [held_out(part, settings) for part in parts]
     taken = {(photo.camera, photo.time_s) for photos in kept_out for photo in photos}
     rows = [i for i, photo in enumerate(data.photos) if (photo.camera, photo.time_s) in taken]
-    whole = reconstruct(data.photos, data.sweeps, agents, twice, held_out=rows, threads=threads)
+    whole = kept(reconstruct(data.photos, data.sweeps, agents, twice, held_out=rows, threads=threads))
     kinds = dict(zip(agents.track_ids, agents.kinds))
     shared = [n for n in halves[0].nodes if n in halves[1].nodes and kinds[n] is AgentKind.VEHICLE]
     seen = [{name: faces_seen(part.photos, agents, name) for name in shared} for part in parts]
