@@ -12,7 +12,7 @@ files they stand in; `iterate` goes file by file instead, which is what a pass o
 """
 
 import os
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
@@ -99,8 +99,21 @@ class SampleTable:
         self._keys, self._rows = keys[order], rows[order]  # (N,) sorted, and of each its row in its file,
         self._files = np.repeat(np.arange(len(files), dtype=np.int32), counts)[order]  # which is of this number
         self._paths = [path for path, _ in files]
-        opener = open_shard if format == "mcap" else open_parquet
-        self._file = lru_cache(maxsize=32)(partial(opener, self._table.location))
+        self._file = self._kept_open()
+
+    def _kept_open(self) -> Callable[[str], StoredFile]:
+        """Path -> file, of those that were read last."""
+        opener: Callable[[Location, str], StoredFile]
+        opener = open_shard if isinstance(self._table, McapTable) else open_parquet
+        return lru_cache(maxsize=32)(partial(opener, self._table.location))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For another process, such as a DataLoader's worker: the same snapshot; it opens the files itself."""
+        return {name: value for name, value in self.__dict__.items() if name != "_file"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._file = self._kept_open()
 
     def __len__(self) -> int:
         return len(self._keys)

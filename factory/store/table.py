@@ -21,6 +21,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -80,10 +81,22 @@ class KeyedTable:
         with self._log_naming():
             self._delta = listed(self._opened)
 
-    def _opened(self) -> DeltaTable | None:
+    def __getstate__(self) -> dict[str, Any]:
+        """For another process: the version that is seen here, whatever is committed in the meantime."""
+        return {**self.__dict__, "_delta": self.version}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        version = state["_delta"]
+        self.__dict__.update(state)
+        self._token = secrets.token_hex(16)
+        with self._log_naming():
+            self._delta = None if version is None else listed(partial(self._opened, version))
+
+    def _opened(self, version: int | None = None) -> DeltaTable | None:
+        """version: None: the newest."""
         options = dict(self.location.options)
         is_there = DeltaTable.is_deltatable(self.location.uri, storage_options=options)
-        return DeltaTable(self.location.uri, storage_options=options) if is_there else None
+        return DeltaTable(self.location.uri, version, storage_options=options) if is_there else None
 
     @contextmanager
     def _log_naming(self) -> Iterator[None]:

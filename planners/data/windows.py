@@ -80,6 +80,11 @@ class Memory:
         self._stay: dict[int, _Reading] = {}
         self._checked: set[tuple[int, int]] = set()  # row groups whose pages were found undamaged
 
+    def __getstate__(self) -> dict[str, Any]:
+        """For another process, which reads for itself."""
+        lasting = ("_feed", "_staying", "copies", "pictures", "_checked")
+        return {name: self.__dict__[name] for name in lasting} | {"_stay": {}}
+
     def begin(self, windows: Sequence[Window], executor: Executor) -> None:
         """Start to read for an epoch; what an earlier one left is dropped, but what stays."""
         self._executor = executor

@@ -3,7 +3,9 @@
 import subprocess
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import fields
+from multiprocessing import get_context
 from pathlib import Path
 
 import cv2
@@ -12,7 +14,7 @@ import pytest
 
 from factory.commands.table import COMMANDS
 from factory.graph.execute import execute
-from factory.store.reader import SampleTable, image_of, labels_of, to_torch
+from factory.store.reader import Format, SampleTable, image_of, labels_of, to_torch
 from factory.store.samples import Store
 from factory.store.schema import LABEL_COLUMNS
 from factory.store.verify import verify
@@ -41,6 +43,30 @@ def test_samples_are_the_same_by_place_key_iteration_and_table(out: Path) -> Non
             assert one["stage2_score"] == scores["stage2_score"][i].as_py()
     assert samples.sample(0, ["round", "label_2hz"]).keys() == {"round", "label_2hz"}
     assert samples.schema.field("label_10hz").metadata[b"frame"] == b"ego at now"
+
+
+@pytest.mark.parametrize(("start", "format"), [("spawn", "parquet"), ("forkserver", "mcap")])
+def test_workers_of_a_data_loader_read_the_snapshot_that_was_opened_however_they_start(
+    start: str, format: Format, tmp_path: Path
+) -> None:
+    from torch.utils.data import DataLoader, Subset
+
+    def grown(n: int) -> None:
+        execute(ToyWork(), refs(n), ["recovery", "human"], 2, Store(tmp_path), "local", mcap_shards=True, say=len)
+
+    grown(1)
+    table = SampleTable(tmp_path, format=format)
+    expected = [table[i] for i in range(len(table))]  # files are open
+    grown(3)
+    assert len(SampleTable(tmp_path, format=format)) > len(table)
+    places = [len(table) - 1, 0]
+    for chosen, rows in ((table, expected), (Subset(table, places), [expected[i] for i in places])):  # type: ignore[arg-type]
+        loader = DataLoader(chosen, 2, num_workers=1, multiprocessing_context=start, collate_fn=list)  # type: ignore[arg-type]
+        read = [row for batch in loader for row in batch]
+        assert list(map(repr, read)) == list(map(repr, rows))
+    with ProcessPoolExecutor(1, get_context(start)) as process:
+        ids = process.submit(SampleTable.table, table, ["attempt_id"]).result()["attempt_id"].to_pylist()
+    assert tuple(ids) == table.attempt_ids
 
 
 def test_the_tables_metadata_names_version_and_licences(out: Path) -> None:

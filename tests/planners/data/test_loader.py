@@ -1,6 +1,7 @@
 """Batches: the same whatever reads them, equal shares for ranks, resumed exactly; what is wrong is named."""
 
 import json
+import pickle
 import threading
 import tracemalloc
 from collections.abc import Iterator
@@ -269,6 +270,12 @@ def test_batches_larger_than_several_windows_are_read_all_the_same(
     small_windows(monkeypatch)
     (batch,) = Loader(data, NEEDS, MixSettings(), 64).epoch(0)
     assert sorted(numbers(batch)) == list(range(64))
+
+
+def test_a_loader_that_was_read_goes_to_another_process_and_reads_the_same_there(data: Dataset) -> None:
+    loader = Loader(data, NEEDS, MixSettings(), BATCH)
+    read = [numbers(batch) for batch in loader.epoch(0)]
+    assert [numbers(batch) for batch in pickle.loads(pickle.dumps(loader)).epoch(0)] == read
 
 
 def test_a_loader_that_is_left_leaves_no_thread_behind(data: Dataset) -> None:
