@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING
 from factory.config.classes import class_of
 from factory.config.compose import ConfigError, conf_dir
 from factory.config.plugins import choices
-from factory.config.run import RunConfig, composed_run, load_config, photos_alone, shapes_in
+from factory.config.run import RunConfig, load_config, photos_alone
 from factory.config.shapes import defaults_of, described
-from factory.config.words import Asked, asked_of
+from factory.config.words import Asked, SettingsShown, asked_of
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, as_program
 from factory.setup.early import refuse_what_is_not_there
 from factory.store.disk import DiskFull
@@ -38,11 +38,10 @@ def main(argv: Sequence[str], only_plan: bool = False) -> int:
         print(help_text())
         return 0
     try:
-        asked = asked_of(argv)
-        if asked.shows:
-            print(settings_text(asked.words))
-            return 0
-        return run(asked, only_plan)
+        return run(asked_of(argv), only_plan)
+    except SettingsShown as settings:
+        print(settings)
+        return COMPLETE
     except (ConfigError, MemoryError) as error:
         print(f"error: {error}", file=sys.stderr)
         return BAD_CONFIG
@@ -84,12 +83,6 @@ def help_text() -> str:
     keys = {key: value for key, value in defaults_of(RunConfig).items() if key not in groups}
     told = "\n".join(described(keys, RunConfig, {}))
     return f"{__doc__}\nchoices\n{listed}\n\nkeys and defaults\n{told}"
-
-
-def settings_text(words: Sequence[str]) -> str:
-    """The settings of a command line as YAML, each with its meaning behind it."""
-    values = composed_run(words)
-    return "\n".join(described(values, RunConfig, shapes_in(values)))
 
 
 def seconds_text(seconds: Mapping[str, tuple[int, float]]) -> str:

@@ -8,6 +8,7 @@ from typing import Any
 
 from factory.config.compose import conf_dir
 from factory.config.shapes import defaults_of, described, merged
+from factory.config.words import SettingsShown
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
 
 
@@ -32,6 +33,8 @@ def command(answer: Callable[[Sequence[str]], None], keys: type[Any] | None = No
             return COMPLETE
         try:
             answer(argv)
+        except SettingsShown as settings:
+            print(settings)
         except (ValueError, OSError) as error:
             print(f"error: {error}", file=sys.stderr)
             return BAD_CONFIG

@@ -1,13 +1,14 @@
 """The arguments of a command: one parser, from `key=value` and plain words to a typed dataclass of its own."""
 
+import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, fields
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin, get_type_hints
 
-from factory.config.shapes import choices_of
-from factory.config.words import ConfigError, nearest
+from factory.config.shapes import choices_of, defaults_of, described, plain, to_give
+from factory.config.words import SHOW, ConfigError, SettingsShown, nearest, without_show
 from factory.exits import BAD_CONFIG
 
 if TYPE_CHECKING:
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 # Metadata of a field. Of WORD: it may stand without its key; the fields in their order, a tuple for all that is left.
 WORD = {"given": "word"}
 RUN = {"given": "run"}  # it takes every argument that is no field: settings of the run
+SOME = {**RUN, "of": "some"}  # of them what is given alone: the others are recorded, or of no use here
 Request = TypeVar("Request", bound="DataclassInstance")
 
 
@@ -32,6 +34,9 @@ def answer(command: ModuleType, argv: Sequence[str]) -> int:
         return 0
     try:
         return command.main(parse(command.Request, argv)) or 0
+    except SettingsShown as settings:
+        print(settings)
+        return 0
     except (Refused, ConfigError, MemoryError) as error:
         print(f"error: {error}", file=sys.stderr)
         return BAD_CONFIG
@@ -41,8 +46,9 @@ def parse(shape: type[Request], argv: Sequence[str]) -> Request:
     """A request out of arguments; its fields are the keys: text, a number, a switch, a Literal, a list of texts.
 
     Raises Refused for an unknown key, a value missing or of another kind, a key given twice, and a field without a
-    default that is not given.
+    default that is not given; with --cfg SettingsShown instead, whatever is not given yet.
     """
+    argv, shows = without_show(argv)
     kinds, words, rest = keys_of(shape), given_as(shape, WORD), given_as(shape, RUN)
     given: dict[str, Any] = dict.fromkeys(rest, ())
     for argument in argv:
@@ -65,6 +71,8 @@ def parse(shape: type[Request], argv: Sequence[str]) -> Request:
             known = [f"{name}=" for name in kinds]
             near = "" if key in kinds else nearest(key, known)
             raise Refused(f"{argument!r}: expected one of {'..., '.join(known)}...; see --help{near}")
+    if shows:
+        raise SettingsShown("\n".join(_shown(shape, given)))
     for field in fields(shape):
         if field.default is MISSING and field.name not in given:
             choices = "|".join(map(str, get_args(kinds[field.name])))
@@ -84,7 +92,32 @@ def keys_of(shape: type["DataclassInstance"]) -> dict[str, Any]:
 
 def given_as(shape: type["DataclassInstance"], how: Mapping[str, str]) -> list[str]:
     """The fields that are given as words, or that take the settings of the run."""
-    return [field.name for field in fields(shape) if field.metadata == how]
+    return [field.name for field in fields(shape) if how.items() <= field.metadata.items()]
+
+
+def _shown(shape: type["DataclassInstance"], given: Mapping[str, Any]) -> Iterator[str]:
+    """The keys of a request as YAML, and behind them the settings of the run that it takes."""
+    own = keys_of(shape)
+    values = {**to_give(shape), **defaults_of(shape), **{name: plain(value) for name, value in given.items()}}
+    yield from described({name: values[name] for name in own}, shape, {})
+    for name in given_as(shape, RUN):
+        groups = {re.split("[=.@]", word.lstrip("+"))[0] for word in given[name]}
+        keeps = True
+        for line in _settings_of_run(given[name]).splitlines():
+            if name in given_as(shape, SOME) and not line.startswith(" "):
+                keeps = line.partition(":")[0] in groups
+            if keeps:
+                yield line
+
+
+def _settings_of_run(words: Sequence[str]) -> str:
+    from factory.config.run import composed_run
+
+    try:
+        composed_run([SHOW[0], *words])
+    except SettingsShown as settings:
+        return str(settings)
+    raise AssertionError("what is only to be shown is shown")
 
 
 def _value(key: str, text: str, kind: Any) -> Any:

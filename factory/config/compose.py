@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from factory.config.plugins import offer_choices
-from factory.config.shapes import dataclass_in, defaults_of, keys_of, merged
-from factory.config.words import ConfigError, asked_of, nearest, no_such_choice, readable
+from factory.config.shapes import dataclass_in, defaults_of, described, keys_of, merged, to_give
+from factory.config.words import ConfigError, SettingsShown, asked_of, nearest, no_such_choice, readable
 from factory.job import runs_root
 
 T = TypeVar("T")
@@ -42,19 +42,27 @@ def conf_dir() -> Path:
     raise ConfigError(f"no conf/run.yaml in {here} or {here.parent}: the installation is incomplete, install it again")
 
 
-def compose(name: str, words: Sequence[str], shape: type[Any] | None = None) -> dict[str, Any]:
+def compose(
+    name: str,
+    words: Sequence[str],
+    shape: type[Any] | None = None,
+    completed: Callable[[dict[str, Any]], dict[str, Any]] = lambda values: values,
+    shapes: Callable[[Mapping[str, Any]], Mapping[str, type[Any]]] = lambda values: {},
+) -> dict[str, Any]:
     """The resolved configuration `name` with the settings and options of a command line.
 
     shape: the dataclass of its keys, whose defaults hold for what neither conf/ nor the words say; None: conf/ says
     all, and what is unknown is told when the values are filled in.
-    Raises ConfigError for a misspelt key, an unknown choice, bad syntax or a value that must be given and is not.
+    completed: adds what neither of them knows; shapes: of all values, key with dots -> dataclass of an open group.
+    Raises SettingsShown for --cfg, where what must be given may be missing, and ConfigError for a misspelt key, an
+    unknown choice, bad syntax or a value that must be given and is not.
     """
     asked = asked_of(words)
     need_run_extra("hydra", "omegaconf")
     import hydra
     from hydra.errors import HydraException, MissingConfigException
     from omegaconf import OmegaConf
-    from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+    from omegaconf.errors import InterpolationToMissingValueError, MissingMandatoryValue, OmegaConfBaseException
 
     OmegaConf.register_new_resolver("runs", runs_root, replace=True)
     groups = {path.name for root in (conf_dir(), *asked.folders) for path in root.iterdir() if path.is_dir()}
@@ -68,7 +76,13 @@ def compose(name: str, words: Sequence[str], shape: type[Any] | None = None) -> 
         overrides.append(f"hydra.searchpath=[{quoted}]")
     try:
         with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-            resolved = OmegaConf.to_container(hydra.compose(name, overrides), resolve=True, throw_on_missing=True)
+            found = hydra.compose(name, overrides)
+            try:
+                resolved = OmegaConf.to_container(found, resolve=True, throw_on_missing=not asked.shows)
+            except InterpolationToMissingValueError:  # a value that is made of one that must be given
+                if not asked.shows:
+                    raise
+                resolved = OmegaConf.to_container(found, resolve=False)
     except MissingMandatoryValue as error:
         key = str(error.full_key)
         what = "<folder>" if key.endswith("root") else "<value>"
@@ -80,10 +94,14 @@ def compose(name: str, words: Sequence[str], shape: type[Any] | None = None) -> 
         raise ConfigError(f"{str(error).strip()}{cause}".splitlines()[0]) from error
     assert isinstance(resolved, dict)
     values = {str(key): value for key, value in resolved.items()}
-    if shape is None:
-        return values
-    refuse_unknown(shape, values, "")
-    return merged(defaults_of(shape), values)
+    if shape is not None:
+        refuse_unknown(shape, values, "")
+        values = merged(defaults_of(shape), values)
+        values = {**to_give(shape), **values} if asked.shows else values
+    values = completed(values)
+    if asked.shows:
+        raise SettingsShown("\n".join(described(values, shape, shapes(values))))
+    return values
 
 
 def fill(cls: type[T], values: Mapping[str, Any], where: str) -> T:

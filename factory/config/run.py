@@ -231,8 +231,13 @@ class RunConfig:
 
 
 def composed_run(words: Sequence[str]) -> dict[str, Any]:
-    """The settings of a command line with all defaults, not yet typed. Raises ConfigError."""
-    values = with_experts(compose("run", words, RunConfig), conf_dir())
+    """The settings of a command line with all defaults, not yet typed. Raises ConfigError, SettingsShown."""
+    return compose("run", words, RunConfig, _with_groups, shapes_in)
+
+
+def _with_groups(values: Mapping[str, Any]) -> dict[str, Any]:
+    """With every installed expert, and the defaults of the chosen reader and of the experts."""
+    values = with_experts(values, conf_dir())
     for key, shape in shapes_in(values).items():
         group, _, name = key.partition(".")
         given = values[group][name] if name else values[group]

@@ -15,6 +15,7 @@ from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 SWITCH = ("false", "true")
+GIVE = "???"  # as Hydra has it: a value that must be given
 PLAIN = re.compile(r"[A-Za-z_/.~]([\w./:~-]*[\w./~-])?")  # text that YAML reads as text without quotes,
 OTHERWISE = {"null", "~", "true", "false", "yes", "no", "on", "off", "y", "n"}  # but for these
 
@@ -49,6 +50,11 @@ def choices_of(hint: Any) -> list[str]:
 def defaults_of(shape: type[Any]) -> dict[str, Any]:
     """Key -> default of every field that has one, as YAML would hold it."""
     return {field.name: plain(_default(field)) for field in fields(shape) if _default(field) is not MISSING}
+
+
+def to_give(shape: type[Any]) -> dict[str, Any]:
+    """Key -> ??? of every field that has no default."""
+    return {field.name: GIVE for field in fields(shape) if _default(field) is MISSING}
 
 
 def _default(field: Field[Any]) -> Any:
@@ -129,6 +135,6 @@ def described(
 def _scalar(value: Any) -> str:
     if isinstance(value, list):
         return f"[{', '.join(map(_scalar, value))}]"
-    if isinstance(value, str) and PLAIN.fullmatch(value) and value.lower() not in OTHERWISE:
+    if value == GIVE or (isinstance(value, str) and PLAIN.fullmatch(value) and value.lower() not in OTHERWISE):
         return value
     return json.dumps(value)

@@ -19,6 +19,13 @@ class ConfigError(ValueError):
     """The command line or a configuration file asks for something that does not exist or does not fit."""
 
 
+class SettingsShown(Exception):
+    """The command line asks for the settings alone: these, as YAML, are printed, and nothing else is done.
+
+    Raised by what reads the settings of a command, so that none can go on with what was only to be shown.
+    """
+
+
 @dataclass(frozen=True)
 class Asked:
     """What a command line asks for."""
@@ -29,25 +36,38 @@ class Asked:
 
     @property
     def words(self) -> list[str]:
-        """The same command line, without --cfg and every option one word."""
-        return [*(f"--config-dir={folder}" for folder in self.folders), *self.overrides]
+        """The same command line, every option one word."""
+        show = [SHOW[0]] if self.shows else []
+        return [*show, *(f"--config-dir={folder}" for folder in self.folders), *self.overrides]
+
+
+def without_show(words: Sequence[str]) -> tuple[list[str], bool]:
+    """The words without --cfg, and whether it was among them. Raises ConfigError where it asks for other settings."""
+    others: list[str] = []
+    shows = False
+    rest = list(words)
+    while rest:
+        word = rest.pop(0)
+        option, equals, value = word.partition("=")
+        if option not in SHOW:
+            others.append(word)
+            continue
+        shows = True
+        what = value if equals else rest.pop(0) if rest and rest[0] in ("job", "hydra", "all") else "job"
+        if what != "job":
+            raise ConfigError(f"{option} {what}: the settings of the run alone are shown: {option}")
+    return others, shows
 
 
 def asked_of(words: Sequence[str]) -> Asked:
     """The words sorted into settings and options. Raises ConfigError for a word that is neither."""
     overrides: list[str] = []
     folders: list[Path] = []
-    shows = False
-    rest = list(words)
+    rest, shows = without_show(words)
     while rest:
         word = rest.pop(0)
         option, equals, value = word.partition("=")
-        if option in SHOW:
-            shows = True
-            what = value if equals else rest.pop(0) if rest and rest[0] in ("job", "hydra", "all") else "job"
-            if what != "job":
-                raise ConfigError(f"{option} {what}: the settings of the run alone are shown: {option}")
-        elif option in FOLDER:
+        if option in FOLDER:
             if not equals:
                 value = rest.pop(0) if rest else ""
             if not value or not Path(value).expanduser().is_dir():

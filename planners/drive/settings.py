@@ -1,6 +1,6 @@
 """Everything on the command line of `planners drive`, typed."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -74,18 +74,18 @@ class DriveSettings:
 
 def settings_of(argv: Sequence[str]) -> DriveSettings:
     """The settings of a command line. Raises ConfigError."""
-    values = composed("drive", argv, DriveSettings)
-    settings = fill(DriveSettings, values | {"clips": typed_clips(values["clips"])}, "")
+    settings = fill(DriveSettings, composed("drive", argv, DriveSettings, with_clips), "")
     refuse_missing_root(settings.clips)
     return settings
 
 
-def typed_clips(clips: Mapping[str, Any]) -> dict[str, Any]:
-    """The reader's settings with its defaults, held against their types where it is a built-in one."""
+def with_clips(values: dict[str, Any]) -> dict[str, Any]:
+    """With the defaults of the reader's settings, held against their types where it is a built-in one."""
+    clips = values["clips"]
     shape = READERS.get(clips.get("_target_", ""))
     if shape is None:
-        return dict(clips)
+        return values
     refuse_unknown(shape, without_labels(clips), "clips")
     full = {**clips, **merged(defaults_of(shape), clips)}
     fill(shape, without_labels(full), "clips")
-    return full
+    return values | {"clips": full}

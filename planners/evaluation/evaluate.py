@@ -35,6 +35,7 @@ from pathlib import Path
 from typing import Any
 
 from factory.config.compose import ConfigError, fill
+from factory.config.shapes import plain
 from factory.graph.progress import Counter
 from planners.command import command
 from planners.evaluation.aggregation import SummaryLine, lines_of, summarise
@@ -216,10 +217,13 @@ def settings_of(argv: Sequence[str]) -> EvaluateSettings:
 
     A benchmark by its name is evaluated among the public traffic, unless the words choose another.
     """
-    settings = fill(EvaluateSettings, composed("evaluate", argv, EvaluateSettings), "evaluate")
-    if settings.benchmark in SPLITS and not any("two_stage_traffic" in word for word in argv):
-        return replace(settings, two_stage_traffic=TrafficSettings(mode="navsim"))
-    return settings
+
+    def completed(values: dict[str, Any]) -> dict[str, Any]:
+        if values["benchmark"] in SPLITS and not any("two_stage_traffic" in word for word in argv):
+            return values | {"two_stage_traffic": plain(TrafficSettings(mode="navsim"))}
+        return values
+
+    return fill(EvaluateSettings, composed("evaluate", argv, EvaluateSettings, completed), "evaluate")
 
 
 def _folder(settings: EvaluateSettings) -> str:
@@ -232,10 +236,14 @@ def _folder(settings: EvaluateSettings) -> str:
     return settings.benchmark
 
 
-def evaluated(argv: Sequence[str]) -> None:
-    """Evaluate and print what a command line asks for. Raises ConfigError, or OSError for a folder that is none."""
+def evaluate_command(argv: Sequence[str]) -> None:
+    """The command. Raises as `evaluated`."""
+    evaluated(settings_of(argv))
+
+
+def evaluated(settings: EvaluateSettings) -> None:
+    """Evaluate and print what settings ask for. Raises ConfigError, or OSError for a folder that is none."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    settings = settings_of(argv)
     who = planners_of(settings.planner, settings.planners, settings.bounds, settings.settings)
     benchmark = BenchmarkFolder(_folder(settings))
     lines = evaluate(benchmark, who, settings)
@@ -248,4 +256,4 @@ def evaluated(argv: Sequence[str]) -> None:
         print(f"look at {Path(settings.out) / 'summary.png'}")
 
 
-main = command(evaluated)
+main = command(evaluate_command)

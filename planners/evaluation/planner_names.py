@@ -117,14 +117,21 @@ def planners_of(
     return found
 
 
-def composed(name: str, argv: Sequence[str], shape: type[Any]) -> dict[str, Any]:
-    """The values of a command line and conf/<name>.yaml, typed by `shape`, with `planner=` as text. Raises ConfigError.
+def composed(
+    name: str,
+    argv: Sequence[str],
+    shape: type[Any],
+    completed: Callable[[dict[str, Any]], dict[str, Any]] = lambda values: values,
+) -> dict[str, Any]:
+    """The values of a command line and conf/<name>.yaml, typed by `shape`, with `planner=` as text.
 
     Hydra would take it for a choice among conf/planner, which are planners to be trained.
+    completed: as of `compose`. Raises ConfigError, SettingsShown.
     """
     who = [argument for argument in argv if argument.startswith("planner=")]
-    values = compose(name, [argument for argument in argv if argument not in who], shape)
-    return values | ({"planner": who[-1].split("=", 1)[1]} if who else {})
+    named = {"planner": who[-1].split("=", 1)[1]} if who else {}
+    others = [argument for argument in argv if argument not in who]
+    return compose(name, others, shape, lambda values: completed(values | named))
 
 
 def needs_of(made: Any) -> Needs | None:

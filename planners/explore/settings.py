@@ -7,7 +7,7 @@ from typing import Any, Literal
 from factory.config.compose import fill
 from factory.config.run import refuse_missing_root
 from planners.drive.loop import PLAN_STEPS
-from planners.drive.settings import Pictures, typed_clips
+from planners.drive.settings import Pictures, with_clips
 from planners.evaluation.planner_names import composed
 from planners.explore.drift import Handover, Judging, ways_of
 from tasks.experts.pdm_closed.settings import PdmSettings
@@ -64,7 +64,6 @@ class ExploreSettings:
 
 def settings_of(argv: Sequence[str]) -> ExploreSettings:
     """The settings of a command line. Raises ConfigError."""
-    values = composed("explore", argv, ExploreSettings)
-    settings = fill(ExploreSettings, values | {"clips": typed_clips(values["clips"])}, "")
+    settings = fill(ExploreSettings, composed("explore", argv, ExploreSettings, with_clips), "")
     refuse_missing_root(settings.clips)
     return settings

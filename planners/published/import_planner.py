@@ -21,6 +21,7 @@ from pathlib import Path
 from torch import Tensor
 
 from factory.config.compose import ConfigError, compose, fill
+from factory.config.words import SHOW, without_show
 from planners.command import command
 from planners.published.imported import Imported, imported
 from planners.published.weights import read_public
@@ -47,11 +48,13 @@ def main(argv: Sequence[str]) -> None:
 
 def config_of(argv: Sequence[str]) -> ImportConfig:
     """The settings of a command line. Raises ConfigError."""
+    argv, shows = without_show(argv)
     # Lightning's names hold equals signs
     files = [word for word in argv if Path(word).is_file() or not ("=" in word or word.startswith("-"))]
     if len(files) > 1:
         raise ConfigError(f"{' and '.join(files)}: one checkpoint at a time")
     words = [*(f"checkpoint='{name}'" for name in files), *(word for word in argv if word not in files)]
+    words += [SHOW[0]] if shows else []
     return fill(ImportConfig, compose("import_planner", words, ImportConfig), "import")
 
 

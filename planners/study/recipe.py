@@ -89,10 +89,10 @@ def _done(package: str, *words: str) -> None:
 @command
 def data(argv: Sequence[str]) -> None:
     """`python -m planners study_data`."""
-    make(fill(Recipe, compose("study_data", argv), "study_data"))
+    make(fill(Recipe, compose("study_data", argv, Recipe), "study_data"))
 
 
 @command
 def logs(argv: Sequence[str]) -> None:
     """`python -m planners study_logs`."""
-    make(fill(Recipe, compose("study_logs", argv), "study_logs"))
+    make(fill(Recipe, compose("study_logs", argv, Recipe), "study_logs"))

@@ -25,7 +25,7 @@ import cv2
 import torch
 
 from factory.config.compose import ConfigError, compose, fill
-from factory.config.shapes import defaults_of, described, merged, plain
+from factory.config.shapes import GIVE, defaults_of, merged, plain
 from planners.command import command
 from planners.data.feed import open_data
 from planners.data.index import Dataset, DataSettings
@@ -140,11 +140,7 @@ class TrainConfig:
 @command
 def main(argv: Sequence[str]) -> None:
     """The command."""
-    values = compose("train", [argument for argument in argv if argument != "--cfg"], TrainConfig)
-    if "--cfg" in argv:
-        print(settings_text(values))
-        return
-    config = fill(TrainConfig, values, "train")
+    config = fill(TrainConfig, compose("train", argv, TrainConfig, _with_planner_settings, _shapes_of), "train")
     if config.executor == "ray":
         from planners.training.on_ray import train_on_ray
 
@@ -154,12 +150,18 @@ def main(argv: Sequence[str]) -> None:
             train(config, process)
 
 
-def settings_text(values: Mapping[str, Any]) -> str:
-    """Composed settings as YAML, the planner's own with their defaults, each with its meaning behind it."""
+def _with_planner_settings(values: dict[str, Any]) -> dict[str, Any]:
+    """Composed settings with the defaults of the planner's own. Raises ConfigError."""
     entry = values["planner"]
+    if entry["name"] == GIVE:
+        return values
     own = settings_of(PlannerChoice(entry["name"], entry.get("settings", {})))
-    full = merged(values, {"planner": {"settings": plain(own)}})
-    return "\n".join(described(full, TrainConfig, {"planner.settings": type(own)}))
+    return merged(values, {"planner": {"settings": plain(own)}})
+
+
+def _shapes_of(values: Mapping[str, Any]) -> Mapping[str, type[Any]]:
+    name = values["planner"]["name"]
+    return {} if name == GIVE else {"planner.settings": planner_class(name).settings_type}
 
 
 def train(config: TrainConfig, process: TrainingProcess) -> None:

@@ -13,10 +13,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
+import yaml
 
 from factory.__main__ import main
 from factory.commands.completion import candidates, settings_of
-from factory.commands.table import COMMANDS, PLANNERS
+from factory.commands.table import COMMANDS, DOORS, PLANNERS
 from factory.exits import MEANING
 from factory.graph.episodes import EpisodesWanted
 from factory.graph.execute import execute
@@ -75,6 +76,61 @@ def test_every_command_is_listed_and_helps_itself_without_heavy_imports() -> Non
     )
     assert shown.returncode == 0, shown.stderr
     assert shown.stdout.lower().count("exit codes") >= len(COMMANDS)
+
+
+SHOW_ALL = """
+import contextlib, io, os, sys
+from factory.commands.table import DOORS, dispatch
+for door in DOORS.values():
+    for command in door.values():
+        command.load()
+STARTS = ("subprocess.Popen", "os.posix_spawn", "os.fork", "os.system", "os.exec", "socket.bind", "socket.connect")
+WRITES = ("os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.link", "os.symlink", "os.truncate")
+def watch(event, arguments):
+    writes = event == "open" and arguments[2] & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)
+    assert not writes and event not in STARTS + WRITES, (event, arguments)
+sys.addaudithook(watch)
+for package, door in DOORS.items():
+    for name in door:
+        with contextlib.redirect_stdout(io.StringIO()) as shown:
+            code = dispatch([name, *sys.argv[1:]], door, "")
+        print(package, name, code, len(shown.getvalue()))
+"""
+
+
+def test_every_command_shows_its_settings_and_neither_writes_nor_starts_anything(tmp_path: Path) -> None:
+    env = os.environ | {"PYTHONPATH": str(REPOSITORY), "PYTHONDONTWRITEBYTECODE": "1"}
+    script = [sys.executable, "-c", SHOW_ALL, "--cfg"]
+    done = subprocess.run(script, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    lines = [line.split() for line in done.stdout.splitlines()]
+    assert [line[:2] for line in lines] == [[package, name] for package, door in DOORS.items() for name in door]
+    assert [line for line in lines if line[2] != "0" or line[3] == "0"] == []
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("command", "shown"),
+    [
+        ("planners alternate turns=7 --cfg out=mine", {"turns": 7, "out": "mine", "draws": "uniform"}),
+        ("planners labels minutes=0 --cfg", {"minutes": 0, "begin_steps": 1000}),
+        ("planners.drive --cfg planner=human clips.n_clips=3", {"planner": "human", "seconds": 20.0}),
+        ("planners train planner=custom -c job steps=7", {"steps": 7, "seed": 0}),
+        ("factory.run clips=av2 --cfg rounds=5", {"rounds": 5, "executor": "ray"}),
+        ("factory explain --cfg tries=9 traffic=replay", {"clip": "0", "tries": 9, "rounds": 1}),
+        ("factory retry out=runs/a --cfg workers=3", {"out": "runs/a", "workers": 3}),
+        ("factory show --cfg 3 film=true", {"out": "???", "sample": "3", "film": True}),
+    ],
+)
+def test_settings_are_shown_as_they_are_given(command: str, shown: dict[str, object], tmp_path: Path) -> None:
+    door, *words = command.split()
+    env = os.environ | {"PYTHONPATH": str(REPOSITORY)}
+    script = [sys.executable, "-m", door, *words]
+    done = subprocess.run(script, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stderr) == (0, "")
+    found = yaml.safe_load(done.stdout)
+    assert {key: found.get(key) for key in shown} == shown
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

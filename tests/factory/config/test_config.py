@@ -14,7 +14,7 @@ import yaml
 
 from factory.config.compose import ConfigError, build, conf_dir, fill
 from factory.config.run import RewardSettings, RunConfig, composed_run, load_config
-from factory.run import settings_text
+from factory.config.words import SettingsShown
 from factory.setup.settings import (
     RunContext,
     assemble,
@@ -55,7 +55,9 @@ def test_a_choice_is_its_dataclass_with_what_its_file_says(name: str, expected: 
 
 
 def test_every_setting_has_a_default_and_a_meaning_and_is_shown_with_both() -> None:
-    shown = settings_text([]).splitlines()
+    with pytest.raises(SettingsShown) as settings:
+        composed_run(["--cfg"])
+    shown = str(settings.value).splitlines()
     assert "  width: 320  # pixels" in shown and "  mode: auto  # auto | map | painter | none; " in "\n".join(shown)
     assert yaml.safe_load("\n".join(shown)) == composed_run([])
     silent = [line for line in shown if "  # " not in line and not re.search(r"_target_|name: |kind: |^  \w+:$", line)]

@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import yaml
 import torch
 
 from factory.config.compose import ConfigError
@@ -81,6 +82,14 @@ def test_an_ensemble_of_planners_without_scores_is_refused(tmp_path: Path) -> No
     save_checkpoint(tmp_path / "toy", 1, Toy(ToySettings(), {}), {}, {"version": 1})
     with pytest.raises(ConfigError, match=r"averages the scores of gtrs_dense models, not .*toy"):
         planner_of(f"{saved(tmp_path / 'a', 0)}+{tmp_path / 'toy'}").load()
+
+
+def test_the_command_shows_the_models_beside_the_settings_of_the_evaluation(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["models=[a,b]", "--cfg", "device=cuda"]) == 0
+    shown = yaml.safe_load(capsys.readouterr().out)
+    assert (shown["models"], shown["device"], shown["benchmark"]) == (["a", "b"], "cuda", "???")
 
 
 def test_the_command_needs_two_models(capsys: pytest.CaptureFixture[str]) -> None:
