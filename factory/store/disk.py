@@ -1,29 +1,48 @@
-"""A disk that is full: told with the path and the bytes, wherever a run writes."""
+"""A disk that is full, or not to be written: told with the path, wherever a run writes."""
 
 import errno
 import os
+import re
 import secrets
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from factory.wording import one_line
+
 FULL = (errno.ENOSPC, errno.EDQUOT)
-SAID = tuple(f"(os error {number})" for number in FULL)  # how delta-rs says it, in an OSError without a number
+REFUSED = (errno.EACCES, errno.EPERM, errno.EROFS)
+SAID = re.compile(r"\(os error (\d+)\)")  # how delta-rs says it, in an OSError without a number
 
 
 class DiskFull(OSError):
     """The disk or the quota of a path is full; the message has the path, what is needed and what is free."""
 
 
+class NotWritable(OSError):
+    """Who runs this may not write at a path, or nobody may; the message has the path and the reason."""
+
+
+def _number_of(error: BaseException) -> int | None:
+    """The number of what the system said."""
+    if isinstance(error, OSError) and error.errno is not None:
+        return error.errno
+    said = SAID.search(str(error))
+    return None if said is None else int(said[1])
+
+
 @contextmanager
 def needs_disk(path: str | os.PathLike[str], n_bytes: int) -> Iterator[None]:
-    """For the writing of about `n_bytes` at a local path. Raises DiskFull where they find none."""
+    """For the writing of about `n_bytes` at a local path. Raises DiskFull where they find none, and NotWritable."""
     try:
         yield
     except OSError as error:
-        if isinstance(error, DiskFull) or (error.errno not in FULL and not any(said in str(error) for said in SAID)):
+        number = _number_of(error)
+        if isinstance(error, DiskFull | NotWritable) or number not in (*FULL, *REFUSED):
             raise
+        if number in REFUSED:
+            raise NotWritable(f"{path}: cannot be written: {os.strerror(number)}") from error
         free = shutil.disk_usage(existing(Path(path))).free
         raise DiskFull(f"{path}: the disk is full: {n_bytes:,} bytes are needed, {free:,} are free") from error
 
@@ -52,6 +71,20 @@ def why_disk_full(error: BaseException) -> str:
             return f"{seen.filename or 'a temporary file'}: the disk is full"
         seen = seen.__cause__ or seen.__context__
     return ""
+
+
+def why_not_written(error: BaseException) -> str:
+    """What a disk said that is full or not to be written, where that is behind the error; else nothing."""
+    seen: BaseException | None = error
+    while seen is not None:
+        if isinstance(seen, NotWritable):
+            return str(seen)
+        number = _number_of(seen)
+        if number in REFUSED:
+            where = getattr(seen, "filename", None)
+            return one_line(seen) if where is None else f"{where}: {os.strerror(number)}"
+        seen = seen.__cause__ or seen.__context__
+    return why_disk_full(error)
 
 
 def existing(path: Path) -> Path:

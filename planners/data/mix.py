@@ -135,13 +135,7 @@ class Order:
     @property
     def n_batches(self) -> int:
         """Global batches of an epoch; what is left of its pass is less than a batch, and dropped."""
-        if self.ratio is None:
-            return len(self.sides[0]) // self.batch_size
-        n_real = len(self.sides[0])
-        n = int(n_real / (self.batch_size * (1 - self.ratio))) + 1
-        while n * self.batch_size - self._n_sim(n) > n_real:
-            n -= 1
-        return n
+        return batches_in(len(self.sides[0]), self.batch_size, self.ratio)
 
     @property
     def sim_per_epoch(self) -> int:
@@ -170,7 +164,7 @@ class Order:
     def _n_sim(self, n_batches: int) -> int:
         """Simulated samples in the first batches of an epoch: the error is carried, and less than one sample."""
         assert self.ratio is not None
-        return int(n_batches * self.batch_size * self.ratio)  # truncates, which is floor here
+        return _simulated_in(n_batches, self.batch_size, self.ratio)
 
     def _piece(self, side: Side, first: int, count: int) -> tuple[Ints, Ints, list[WindowKey]]:
         """Samples first .. first + count of a side's endless stream, with their windows."""
@@ -185,6 +179,30 @@ class Order:
             keys += [(side.number, number, w) for w in range(int(window[-1]) + 1)]
             first, count = first + len(one[taken]), count - len(one[taken])
         return np.concatenate(rows), np.concatenate(windows), keys
+
+
+def batches_in(n_first: int, batch_size: int, ratio: Fraction | None) -> int:
+    """Global batches of a pass over `n_first` samples, of which a batch takes all but `ratio` of its places."""
+    if ratio is None:
+        return n_first // batch_size
+    n = int(n_first / (batch_size * (1 - ratio))) + 1
+    while n * batch_size - _simulated_in(n, batch_size, ratio) > n_first:
+        n -= 1
+    return n
+
+
+def _simulated_in(n_batches: int, batch_size: int, ratio: Fraction) -> int:
+    return int(n_batches * batch_size * ratio)  # truncates, which is floor here
+
+
+def fitting_batch(simulated: Bools, mix: MixSettings, batch_size: int, parts: int = 1) -> int:
+    """The largest batch of up to `batch_size`, in equal parts, that a pass over the samples has; 0 for none.
+
+    simulated: (n,) of each sample.
+    """
+    n_first = len(simulated) if mix.ratio is None else int((~simulated).sum())
+    sizes = range(batch_size, 0, -parts)
+    return next((size for size in sizes if batches_in(n_first, size, mix.ratio)), 0)
 
 
 def check_sides(mix: MixSettings, simulated: Bools) -> None:

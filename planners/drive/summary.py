@@ -1,6 +1,7 @@
 """What many drives add up to: shares and rates with intervals over clips, logs or towns, and what pictures change."""
 
 import csv
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -143,7 +144,8 @@ def summary_text(lines: Sequence[DriveLine], differences: Sequence[PicturesDiffe
     for line in lines:
         shares = [_bounded(one.b, one, 100.0) for one in line.shares.values()]
         mean, low, high = line.m_between_failures
-        between = f"{mean:.0f} [{low:.0f}, {high:.0f}]" if line.failures else f"> {M_PER_KM * line.km:.0f}"
+        interval = f"[{_known(low, '.0f')}, {_known(high, '.0f')}]"
+        between = f"{mean:.0f} {interval}" if line.failures else f"> {M_PER_KM * line.km:.0f}"
         facts = [line.planner, line.pictures, line.start, str(line.drives)]
         rows.append([*facts, *shares, f"{line.km:.2f}", str(line.failures), between])
     told = _table(rows)
@@ -154,12 +156,17 @@ def summary_text(lines: Sequence[DriveLine], differences: Sequence[PicturesDiffe
             rows.append([one.planner, one.start, str(one.drives), *shares])
         told += ["", *_table(rows)]
     levels = ", ".join(dict.fromkeys(line.level for line in lines))
-    told.append(f"[{100 * confidence:g} % intervals over {levels}s; nan: from one alone nothing can be drawn]")
+    told.append(f"[{100 * confidence:g} % intervals over {levels}s; -: from one alone nothing can be drawn]")
     return "\n".join(told)
 
 
 def _bounded(value: float, one: Interval, scale: float, sign: str = "") -> str:
-    return f"{scale * value:{sign}.1f} [{scale * one.low:{sign}.1f}, {scale * one.high:{sign}.1f}]"
+    low, high = (_known(scale * end, f"{sign}.1f") for end in (one.low, one.high))
+    return f"{_known(scale * value, f'{sign}.1f')} [{low}, {high}]"
+
+
+def _known(value: float, form: str) -> str:
+    return "-" if math.isnan(value) else f"{value:{form}}"
 
 
 def _table(rows: Sequence[Sequence[str]]) -> list[str]:

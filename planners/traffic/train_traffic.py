@@ -9,6 +9,7 @@ file. Minutes on one core; the same command, the same file. docs/realism.md has 
 """
 
 import json
+import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -74,8 +75,8 @@ def train_all(settings: TrainTraffic) -> Path:
         told = f"round {number + 1}: {sum(map(len, learned)):,} lessons, loss {loss:.4f}"
         if unseen:
             held_out = _lessons(unseen, network.weights, settings.seed, settings.rounds)
-            acceleration, beside = held_out_error(network, held_out)
-            told += f"; on {len(held_out):,} of logs left out: {acceleration:.2f} m/s2, {beside:.2f} m beside in 1 s"
+            off = ("-" if math.isnan(error) else f"{error:.2f}" for error in held_out_error(network, held_out))
+            told += "; on {:,} of logs left out: {} m/s2, {} m beside in 1 s".format(len(held_out), *off)
         print(told, flush=True)
     record = {
         "version": __version__,

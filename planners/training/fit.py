@@ -146,7 +146,7 @@ def fit(
 
     asked = Event()
     with asked_to_stop(asked.set), Counter("steps", loop.steps, first, quiet=not process.writes) as counter:
-        step, loss = first, float("nan")
+        step, shown = first, "-"  # until the losses are looked at
         for batch in _endless(batches, loop.steps - first):
             torch.manual_seed(step_seed(loop.seed, step, process.rank))
             rate = learning_rate(training, step, loop.steps, epoch_steps)
@@ -167,8 +167,8 @@ def fit(
                 if loop.keep.best is not None:
                     saves = process.anyone(saves or _is_best(out, loop.keep.best, measured))
             if looks or saves:  # a checkpoint whose losses are not written would leave a gap after a kill
-                loss = log(step)
-            counter.show(step, f"loss {loss:.4f}")
+                shown = f"{log(step):.4f}"
+            counter.show(step, f"loss {shown}")
             if saves:
                 save(step, measured)
             if stopping and step < loop.steps:

@@ -30,7 +30,7 @@ from planners.command import command
 from planners.data.feed import open_data
 from planners.data.index import Dataset, DataSettings
 from planners.data.loader import Loader
-from planners.data.mix import MixSettings
+from planners.data.mix import MixSettings, fitting_batch
 from planners.models.backbones.registry import load_pretrained, set_recompute
 from planners.models.planner import Planner
 from planners.models.registry import PlannerChoice, build_planner, planner_class, settings_of
@@ -166,10 +166,18 @@ def _shapes_of(values: Mapping[str, Any]) -> Mapping[str, type[Any]]:
 
 def train(config: TrainConfig, process: TrainingProcess) -> None:
     """The part of one process. Raises ConfigError or ValueError for what does not fit, Stopped when interrupted."""
-    training, out = config.training, Path(config.out).absolute()
+    out = Path(config.out).absolute()
     cv2.setNumThreads(1)  # pictures are decoded side by side already
     settings = settings_of(config.planner)
     dataset = open_data(config.data, mix=config.mix)
+    asked = config.training.batch_size
+    if asked % (process.size * config.accumulate):
+        raise ConfigError(
+            f"planner.training.batch_size={asked} does not divide into {process.size} processes times "
+            f"accumulate={config.accumulate} parts"
+        )
+    config = _with_fitting_batch(config, dataset, process)
+    training = config.training
     torch.manual_seed(config.seed)
     planner = _planner(config, settings, dataset)
     set_recompute(planner, config.recompute)
@@ -184,11 +192,6 @@ def train(config: TrainConfig, process: TrainingProcess) -> None:
         config.workers,
         pinned=process.device.type == "cuda",
     )
-    if training.batch_size % (process.size * config.accumulate):
-        raise ConfigError(
-            f"planner.training.batch_size={training.batch_size} does not divide into {process.size} processes times "
-            f"accumulate={config.accumulate} parts"
-        )
     steps = total_steps(loader, training, config.steps)
     check = validation(config.data, planner, process, config.workers) if config.data.val else None
     identity = _identity(config, dataset, steps, process)
@@ -203,6 +206,9 @@ def train(config: TrainConfig, process: TrainingProcess) -> None:
         "parameters": sum(parameter.numel() for parameter in planner.parameters()),
     }
     if process.writes:
+        if training.batch_size != asked:
+            why = f"a batch of {asked} takes more samples than there are"
+            print(f"note: planner.training.batch_size={asked} -> {training.batch_size}: {why}")
         print(_plan_text(config, record, loader, resume_from), flush=True)
     loop = Loop(
         seed=config.seed,
@@ -221,6 +227,21 @@ def train(config: TrainConfig, process: TrainingProcess) -> None:
         print(f"trained: {newest(out)}")
         if config.keep_best is not None:
             print(f"least {config.keep_best}: {best(out, config.keep_best)}")
+
+
+def _with_fitting_batch(config: TrainConfig, dataset: Dataset, process: TrainingProcess) -> TrainConfig:
+    """With a batch that the samples suffice for; a training that goes on keeps its own. Raises ConfigError."""
+    asked, parts = config.training.batch_size, process.size * config.accumulate
+    size = fitting_batch(dataset.rows.simulated, config.mix, asked, parts)
+    out = Path(config.out).absolute()
+    if size != asked and checkpoints(out):
+        size = int(_as_now(read_record(out)["trained"])["planner.training"]["batch_size"])
+    if not size or size % parts:
+        raise ConfigError(
+            f"a batch of {size or len(dataset)} samples does not divide into {process.size} processes times "
+            f"accumulate={config.accumulate} parts: take fewer"
+        )
+    return replace(config, planner=replace(config.planner, training=replace(config.training, batch_size=size)))
 
 
 def _planner(config: TrainConfig, settings: Any, dataset: Dataset) -> Planner:

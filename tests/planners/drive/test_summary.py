@@ -65,8 +65,13 @@ def test_what_the_engine_changes_is_over_the_starts_that_both_were_driven_from()
     assert differences_of(truth) == []
 
 
+def test_of_one_drive_there_is_no_interval_and_the_text_has_a_dash() -> None:
+    told = summary_text(lines_of([row(0)]), [], 0.95)
+    assert "[-, -]" in told and "nan" not in told
+
+
 def test_the_text_names_every_planner_and_what_its_brackets_are() -> None:
     rows = [row(0, pictures="truth"), row(1, pictures="truth"), row(0, pictures="engine"), row(1, pictures="engine")]
     told = summary_text(lines_of(rows), differences_of(rows), 0.95)
     assert "engine - truth" in told
-    assert told.endswith("[95 % intervals over towns; nan: from one alone nothing can be drawn]")
+    assert told.endswith("[95 % intervals over towns; -: from one alone nothing can be drawn]")

@@ -4,8 +4,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import yaml
 import torch
+import yaml
 
 from factory.config.compose import ConfigError
 from planners.data.batch import ImageLayout

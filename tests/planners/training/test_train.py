@@ -57,6 +57,67 @@ def test_it_trains_and_says_what_with(table: str, tmp_path: Path, capsys: pytest
     assert last[0] == "step,ade_m,fde_m" and [line.split(",")[0] for line in last[1:]] == ["10", "18"]
 
 
+def test_the_documented_first_training_takes_a_table_of_six_samples(tmp_path: Path) -> None:
+    """docs/extend.md's command on the real samples that `make demo` makes."""
+    write_table(tmp_path / "demo", [sample(i) for i in range(6)])
+    words = ["planner=custom", "planner.name=examples.linear_planner:LinearPlanner", "log_every=20", "workers=0"]
+    script = [sys.executable, "-m", "planners", "train", *words, f"data.real=[{tmp_path / 'demo'}]"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    for steps in ("steps=3", "steps=100"):  # begun, and gone on with
+        done = subprocess.run(
+            [*script, f"out={tmp_path / 'out'}", steps, "resume=further"],
+            cwd=tmp_path,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=300,
+        )
+        assert done.returncode == 0, done.stderr
+        (line,) = [line for line in done.stdout.splitlines() if line.startswith("note: ")]
+        assert "planner.training.batch_size=64 -> 6" in line
+    record = read_record(tmp_path / "out")
+    assert (record["step"], record["trained"]["planner.training"]["batch_size"]) == (100, 6)
+
+
+def test_a_loss_that_is_not_known_yet_is_a_dash(
+    table: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("factory.graph.progress.LINE_EVERY_S", 0.0)
+    assert main([*command(table, tmp_path), "steps=3", "log_every=2"]) == 0
+    shown = [line.rpartition("loss ")[2] for line in capsys.readouterr().err.splitlines() if line.startswith("steps")]
+    assert shown[0] == "-" and all(float(loss) > 0.0 for loss in shown[1:]) and len(shown) == 3
+
+
+@pytest.mark.parametrize(
+    ("more", "batch"),
+    [
+        (("planner.training.batch_size=64", "accumulate=4"), 24),
+        (("planner.training.batch_size=63", "accumulate=7"), 21),
+        (("planner.training.batch_size=64", "mix.sim_ratio=0.5"), 16),
+        (("planner.training.batch_size=64", "mix.sim_ratio=0.9"), 64),
+        (("planner.training.batch_size=64", "data.sim=[]"), 8),
+        (("planner.training.batch_size=8",), 8),
+    ],
+)
+def test_a_batch_is_no_larger_than_the_data_fills(
+    table: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], more: tuple[str, ...], batch: int
+) -> None:
+    assert main([*command(table, tmp_path), *more, "steps=1", "workers=0"]) == 0, capsys.readouterr().err
+    asked = int(more[0].rpartition("=")[2])
+    notes = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note: ")]
+    assert len(notes) == (asked != batch) and all(f"batch_size={asked} -> {batch}:" in note for note in notes)
+    assert read_record(tmp_path)["trained"]["planner.training"]["batch_size"] == batch
+
+
+def test_a_training_that_goes_on_keeps_the_batch_that_it_began_with(
+    table: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = [*command(table, tmp_path), "planner.training.batch_size=63", "resume=further", "workers=0"]
+    assert main([*asked, "steps=1", "accumulate=7"]) == 0
+    assert main([*asked, "steps=2", "accumulate=3"]) == 0, capsys.readouterr().err
+    assert read_record(tmp_path)["trained"]["planner.training"]["batch_size"] == 21
+
+
 def test_the_same_command_again_has_nothing_left_to_do(table: str, tmp_path: Path) -> None:
     for _ in range(2):
         assert main(command(table, tmp_path)) == 0
@@ -169,7 +230,7 @@ def test_another_planner_or_other_settings_do_not_go_on_in_a_folder(
         (("data.real=[nowhere]", "data.sim=[]"), "nowhere"),
         (("planner.name=tests.planners.toy:Toyy",), "tests.planners.toy has no Toyy; did you mean Toy?"),
         (("planner.name=nowhere:Toy",), "planner.name: nowhere:Toy: there is no module nowhere"),
-        (("planner.training.batch_size=100",), "lower planner.training.batch_size"),
+        (("planner.training.batch_size=100", "accumulate=50"), "does not divide into 1 processes times accumulate=50"),
         (("accumulate=3",), "accumulate=3"),
         (("device=cuda",), "device=cuda"),
         (("keep_best=ade_m",), "name data.val"),
