@@ -36,7 +36,17 @@ ROOMS = {
         *("render.splatting", "render.scene", "render.rig", "render.fit", "render"),
     ),
     "factory": (
-        *("exits", "wording", "job", "readers.settings", "readers.town.settings", "config", "readers", "store"),
+        *(
+            "exits",
+            "wording",
+            "job",
+            "files",
+            "readers.settings",
+            "readers.town.settings",
+            "config",
+            "readers",
+            "store",
+        ),
         *("exports", "graph", "stages", "setup", "imports", "views", "views.board"),
         *("run", "commands", "__main__"),
     ),

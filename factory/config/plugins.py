@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from factory.config.words import ConfigError
+from factory.files import matching
 from tasks.stages import FRAMES
 
 GROUPS = {
@@ -91,7 +92,7 @@ def choices(group: str, folders: Sequence[Path]) -> list[str]:
 
 
 def _files(group: str, folders: Sequence[Path]) -> set[str]:
-    return {file.stem for folder in folders for file in (folder / group).glob("*.yaml")}
+    return {file.stem for folder in folders for file in matching(folder / group, "*.yaml")}
 
 
 def offer_choices(overrides: Sequence[str], conf: Path, folders: Sequence[Path] = ()) -> None:

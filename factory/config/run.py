@@ -13,6 +13,7 @@ from factory.config.compose import compose, conf_dir, fill, need_run_extra, refu
 from factory.config.plugins import with_experts
 from factory.config.shapes import defaults_of, keys_of, merged
 from factory.config.words import ConfigError, nearest
+from factory.files import matching
 from factory.job import in_submitted_job
 from factory.readers.settings import (
     LogClips,
@@ -323,7 +324,8 @@ def without_labels(spec: Mapping[str, Any]) -> dict[str, Any]:
 def built_in_classes(group: str) -> dict[str, str]:
     """Choice -> `_target_` of the files in conf/<group>."""
     found = {
-        file.stem: re.search(r"^_target_: (\S+)", file.read_text(), re.M) for file in (conf_dir() / group).iterdir()
+        file.stem: re.search(r"^_target_: (\S+)", file.read_text(), re.M)
+        for file in matching(conf_dir() / group, "*.yaml")
     }
     return {name: target[1] for name, target in sorted(found.items()) if target}
 
@@ -336,7 +338,7 @@ def reader_of(choice: str) -> type[Any] | None:
 def _elsewhere(key: str) -> str:
     """Which other choices have this key of `clips`."""
     group, _, inner = key.partition(".")
-    names = sorted(file.stem for file in (conf_dir() / "clips").glob("*.yaml")) if group == "clips" else []
+    names = [file.stem for file in matching(conf_dir() / "clips", "*.yaml")] if group == "clips" else []
     shapes = {name: shape for name in names if (shape := reader_of(name)) is not None}
     having = [f"clips={name}" for name, shape in shapes.items() if inner in dict(keys_of(shape))]
     return f"{key} is a setting of {', '.join(having)}: choose one of them too" if having else ""

@@ -13,6 +13,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+from factory.files import matching
 from factory.graph.execute import RunSummary
 from factory.imports.logged import logged_frame
 from factory.imports.scenes import (
@@ -186,7 +187,7 @@ def logs_of_tokens(logs: Path, tokens: frozenset[str], names: Sequence[str] | No
 
     A log that is named and not here is left out: what needs it fails by name.
     """
-    paths = sorted(logs.glob("*.pkl")) if names is None else [logs / f"{name}.pkl" for name in sorted(names)]
+    paths = matching(logs, "*.pkl") if names is None else [logs / f"{name}.pkl" for name in sorted(names)]
     found: dict[str, Path] = {}
     for path in (path for path in paths if path.is_file()):
         found |= {frame.token: path for frame in read_frames(path).frames if frame.token in tokens}

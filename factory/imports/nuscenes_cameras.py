@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from factory.files import matching
 from factory.readers.base import BadClip
 from factory.readers.scenarionet.sidecars import NAME
 from factory.store.disk import whole_file
@@ -214,7 +215,7 @@ def on_scenarionet_clock(stamps_us: np.ndarray[Any, np.dtype[np.int64]], keyfram
 
 
 def _version(root: Path, version: str | None) -> str:
-    there = sorted(path.parent.name for path in root.glob("v1.0-*/scene.json"))
+    there = [path.parent.name for path in matching(root, "v1.0-*/scene.json")]
     if version in there:
         return str(version)
     if version is not None or len(there) != 1:

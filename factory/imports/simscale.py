@@ -15,6 +15,7 @@ from hashlib import sha256
 from itertools import pairwise
 from pathlib import Path
 
+from factory.files import folders_in, matching, matching_below
 from factory.graph.work import HUMAN_CANDIDATE
 from factory.imports.labels import vocabulary_labels
 from factory.imports.scenes import (
@@ -114,11 +115,12 @@ def parts_of(root: Path, only: Collection[str] = ()) -> list[Part]:
 
 
 def _folders(root: Path) -> Iterator[tuple[str, Path, Path]]:
-    for logs in sorted(root.glob("navsim_logs/*/")):
+    for logs in folders_in(root / "navsim_logs"):
         yield logs.name, logs, root / "sensor_blobs" / logs.name
     for top in (root, root / "SimScale"):
-        for logs in sorted(top.glob("*/meta_datas/")):
-            yield logs.parent.name, logs, logs.parent / "sensor_blobs_hist"
+        for folder in folders_in(top):
+            if (logs := folder / "meta_datas").is_dir():
+                yield folder.name, logs, folder / "sensor_blobs_hist"
 
 
 class Rewards:
@@ -128,7 +130,7 @@ class Rewards:
         """Raises ValueError where there is none."""
         self.vocabulary = vocabulary
         self._paths: dict[str, list[tuple[int, Path]]] = {}
-        for file in [path] if path.is_file() else sorted(path.rglob("*.pkl")):
+        for file in [path] if path.is_file() else matching_below(path, "*.pkl"):
             if (named := REWARDS.fullmatch(file.name)) is not None:
                 self._paths.setdefault(named["who"], []).append((int(named["round"]), file))
             elif (named := HUMAN_REWARDS.fullmatch(file.name)) is not None:
@@ -167,7 +169,7 @@ class Import:
 
     def entries(self, parts: Sequence[Part]) -> list[Entry]:
         """Every log of the parts, by the names of their files alone."""
-        return [self._entry(part, path) for part in parts for path in sorted(part.logs.glob("*.pkl"))]
+        return [self._entry(part, path) for part in parts for path in matching(part.logs, "*.pkl")]
 
     def _entry(self, part: Part, path: Path) -> Entry:
         named = re.fullmatch(LOG + part.suffix, path.stem)

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from factory.files import matching
 from factory.readers.base import BadClip
 from tasks.render.scene.sensed import Photo, Sweep
 from tasks.world.arrays import Array
@@ -73,7 +74,7 @@ class KittiDrive:
         ego_from_imu[2, 3] = IMU_HEIGHT_M
         turn = ego_from_imu @ imu_from_velo
         out = []
-        for path in sorted((self.folder / "velodyne_points" / "data").glob("*.bin")):
+        for path in matching(self.folder / "velodyne_points" / "data", "*.bin"):
             values = np.fromfile(path, np.float32)
             if len(values) % 4 or not np.isfinite(values).all():
                 raise BadClip(str(path), "points", f"{len(values)} values are not rows of four finite ones")
@@ -174,7 +175,7 @@ def _cameras(date: Path) -> dict[str, KittiCamera]:
 
 def _poses(folder: Path) -> Array:
     """World from IMU (frames, 4, 4): Mercator at the first latitude, then yaw, pitch, roll."""
-    paths = sorted(folder.glob("*.txt"))
+    paths = matching(folder, "*.txt")
     if not paths:
         raise BadClip(str(folder), "oxts", "no poses")
     rows = []

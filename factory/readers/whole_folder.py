@@ -11,6 +11,7 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
+from factory.files import matching_below
 from tasks.sealed import Damaged, sealed_json, unsealed_json
 
 log = logging.getLogger(__name__)
@@ -27,7 +28,8 @@ def make_whole(root: Path, write: Write) -> None:
 
 
 def unfinished_folder(root: Path) -> Path:
-    """A new empty folder beside `root`, to become it."""
+    """A new empty folder beside `root`, or beside what a link of that name leads to, to become it."""
+    root = root.resolve()
     root.parent.mkdir(parents=True, exist_ok=True)
     return Path(tempfile.mkdtemp(prefix=f".{root.name}-", dir=root.parent))
 
@@ -37,7 +39,7 @@ def finish_whole(unfinished: Path, root: Path, write: Write) -> None:
     try:
         _fill(unfinished, write)
         try:
-            os.rename(unfinished, root)
+            os.rename(unfinished, root.resolve())
         except OSError:
             if not root.is_dir():  # else another worker was first, with the same bytes
                 raise
@@ -64,7 +66,9 @@ def mend(root: Path, write: Write) -> None:
             there = root / name
             if not there.is_file() or _digest(there) != _digest(anew / name):
                 there.parent.mkdir(parents=True, exist_ok=True)
-                os.replace(anew / name, there)
+                beside = Path(shutil.move(anew / name, tempfile.mkdtemp(prefix=".", dir=there.parent)))
+                os.replace(beside, there)  # from the same disk, which a linked folder's need not be the root's
+                beside.parent.rmdir()
     finally:
         shutil.rmtree(anew, ignore_errors=True)
 
@@ -93,7 +97,7 @@ def _wrong(root: Path) -> str:
 
 def _files(folder: Path) -> list[str]:
     """All but the checksums."""
-    names = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+    names = (path.relative_to(folder).as_posix() for path in matching_below(folder, "*") if path.is_file())
     return sorted(name for name in names if name != SUMS)
 
 

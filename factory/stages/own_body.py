@@ -8,6 +8,7 @@ from types import MappingProxyType
 import cv2
 import numpy as np
 
+from factory.files import matching
 from tasks.render.views import straightened, undistorted
 from tasks.world.arrays import Bools
 from tasks.world.camera import Camera
@@ -71,7 +72,7 @@ def resized_mask(mask: Bools, camera: Camera, width: int, height: int) -> Bools:
 
 
 def _files(folder: str) -> dict[str, Path]:
-    files = {path.stem: path for path in sorted(Path(folder).glob("*.png"))}
+    files = {path.stem: path for path in matching(Path(folder), "*.png")}
     if not files:
         raise ValueError(f"render.own_body: {folder} holds no <camera>.png")
     return files

@@ -1,19 +1,18 @@
 """Where a store lives: a folder or an object-store URL, with the few file operations the store needs."""
 
 import os
-from collections.abc import Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 
 from pyarrow import fs
 
+from factory.files import is_data
 from factory.job import in_submitted_job
 from factory.store.disk import whole_file
 
 REMOTE = ("s3", "gs", "abfs", "abfss", "file")  # what both Arrow and Delta write to
-LISTED_AGAIN = 3  # times, where a folder vanished while it was being listed
 
 
 class BadLocation(ValueError):
@@ -99,14 +98,13 @@ class Location:
         return {name: now_s - (info.mtime_ns or 0) / 1e9 for name, info in self._files().items()}
 
     def _files(self) -> dict[str, fs.FileInfo]:
-        """All files below. Other processes make and remove folders there: one that is gone when Arrow, which has seen
-        its name, comes to open it is a FileNotFoundError. Then it is listed again. Raises it at the last time."""
+        """All files below."""
         filesystem, base = self.filesystem()
-        below = fs.FileSelector(base, recursive=True, allow_not_found=True)
-        for _ in range(LISTED_AGAIN):
-            with suppress(FileNotFoundError):
-                return _by_name(filesystem.get_file_info(below), base)
-        return _by_name(filesystem.get_file_info(below), base)
+        if isinstance(filesystem, fs.LocalFileSystem):
+            found = filesystem.get_file_info([os.fspath(path) for path in _local_files(Path(base))])
+        else:
+            found = filesystem.get_file_info(fs.FileSelector(base, recursive=True, allow_not_found=True))
+        return {info.path[len(base) + 1 :]: info for info in found if info.type == fs.FileType.File}
 
     def filesystem(self) -> tuple[fs.FileSystem, str]:
         if self.is_local:
@@ -114,8 +112,20 @@ class Location:
         return _remote(os.getpid(), self.uri, tuple(sorted(self.options.items())))
 
 
-def _by_name(found: Iterable[fs.FileInfo], base: str) -> dict[str, fs.FileInfo]:
-    return {info.path[len(base) + 1 :]: info for info in found if info.type == fs.FileType.File}
+def _local_files(folder: Path) -> Iterator[Path]:
+    """What is in a folder and is none. No link to a folder is followed, as what is listed may be removed.
+
+    Other processes make and remove folders there: one that is gone before it is opened has no files.
+    """
+    try:
+        entries = [entry for entry in os.scandir(folder) if is_data(entry.name)]
+    except FileNotFoundError:
+        return
+    for entry in entries:
+        if entry.is_dir(follow_symlinks=False):
+            yield from _local_files(folder / entry.name)
+        else:
+            yield folder / entry.name
 
 
 @lru_cache(maxsize=64)

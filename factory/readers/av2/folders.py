@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import get_args
 
+from factory.files import folders_in
 from factory.readers.settings import Split
 
 POSES, ANNOTATIONS = "city_SE3_egovehicle.feather", "annotations.feather"
@@ -19,8 +20,9 @@ def log_folders(root: Path) -> dict[str, Path]:
         return {root.name: root}
     if not root.is_dir():
         raise ValueError(f"{root}: no such folder")
-    parents = [root / split for split in get_args(Split) if (root / split).is_dir()] or [root]
-    folders = {folder.name: folder for parent in parents for folder in parent.iterdir() if _is_log(folder)}
+    there = folders_in(root)
+    parents = [root / split for split in get_args(Split) if root / split in there] or [root]
+    folders = {folder.name: folder for parent in parents for folder in folders_in(parent) if _is_log(folder)}
     if not folders:
         raise ValueError(
             f"{root}: no Argoverse 2 sensor log here; expected .../sensor, its train, val or test folder, or one log"

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from factory.files import matching
 from factory.readers.base import BadClip
 from tasks.world.arrays import Array
 from tasks.world.lanes import Lane, MapLayer, MapPolygon, RoadMap
@@ -17,7 +18,7 @@ CAR_LANE_TYPES = {"VEHICLE": True, "BUS": True, "BIKE": False}
 
 def map_file(log_folder: Path) -> Path:
     """The one vector map of a log. Raises BadClip."""
-    found = sorted((log_folder / "map").glob("log_map_archive_*.json"))
+    found = matching(log_folder / "map", "log_map_archive_*.json")
     if len(found) != 1:
         raise BadClip(str(log_folder / "map"), "log_map_archive_*.json", f"expected one vector map, found {len(found)}")
     return found[0]

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from factory.files import matching
 from factory.readers.av2.folders import ANNOTATIONS, EXTRINSICS, INTRINSICS, POSES, log_folders
 from factory.readers.av2.log import (
     POSE_COLUMNS,
@@ -207,7 +208,7 @@ def _licence(folder: Path) -> str:
 
 def _stamped(motion: LogMotion, sensor: str, folder: Path, suffix: str) -> list[tuple[str, Path, float]]:
     """Files named <timestamp_ns><suffix>, in time order. Raises BadClip for any other name."""
-    files = sorted(folder.glob(f"*{suffix}"))
+    files = matching(folder, f"*{suffix}")
     for path in files:
         if not path.stem.isdecimal():
             raise BadClip(str(path), "name", f"expected <timestamp_ns>{suffix}")

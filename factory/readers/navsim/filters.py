@@ -10,6 +10,8 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from factory.files import matching
+
 MAX_YAML_BYTES = 64 << 20
 TARGET = "navsim.common.dataclasses.SceneFilter"
 SUBFOLDER = "scene_filter"  # of a folder of splits
@@ -119,7 +121,7 @@ def _find(name: str, folder: str | Path | None) -> Path:
     for path in (parent / f"{name}.yaml", parent / SUBFOLDER / f"{name}.yaml"):
         if path.is_file():
             return path
-    there = sorted({path.stem for pattern in ("*.yaml", f"{SUBFOLDER}/*.yaml") for path in parent.glob(pattern)})
+    there = sorted({path.stem for pattern in ("*.yaml", f"{SUBFOLDER}/*.yaml") for path in matching(parent, pattern)})
     raise ValueError(f"{parent}: no {name}.yaml here or in {SUBFOLDER}/; there are {', '.join(there) or 'none'}")
 
 

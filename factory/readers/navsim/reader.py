@@ -17,6 +17,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from factory.files import matching
 from factory.readers.apart import Apart
 from factory.readers.base import SPLITS, BadClip, ClipIndex, ClipRef, bytes_of, split_of
 from factory.readers.logs import CACHED_LOGS, STEP_MS
@@ -366,9 +367,9 @@ def log_files(root: Path) -> dict[str, Path]:
         return {root.stem: root}
     if not root.is_dir():
         raise ValueError(f"{root}: no such folder or .pkl file; clips.root is navsim_logs/<split>, or one log of it")
-    files = {path.stem: path for path in sorted(root.glob("*.pkl"))}
+    files = {path.stem: path for path in matching(root, "*.pkl")}
     if not files:
-        splits = sorted(path.parent.name for path in root.glob("*/*.pkl"))
+        splits = [path.parent.name for path in matching(root, "*/*.pkl")]
         hint = f"; its folders {', '.join(dict.fromkeys(splits))} have some" if splits else ""
         raise ValueError(f"{root}: no log here; expected <log>.pkl files, as in navsim_logs/<split>{hint}")
     return files

@@ -16,6 +16,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from factory.files import matching
 from factory.readers.base import BadClip
 from tasks.world.arrays import Array, Ints
 
@@ -89,7 +90,7 @@ def map_file(maps_root: Path, location: str) -> Path:
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise BadClip(str(index), f"{location}.version", f"cannot be read: {error!r}") from error
     else:
-        versions = sorted(path.parent.name for path in folder.glob("*/map.gpkg"))
+        versions = [path.parent.name for path in matching(folder, "*/map.gpkg")]
         if len(versions) != 1:
             raise BadClip(str(folder), "version", f"without {INDEX} it must hold one version, it holds {versions}")
         version = versions[0]

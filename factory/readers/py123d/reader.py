@@ -6,6 +6,7 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
+from factory.files import matching_below
 from factory.readers.av2.log import LogMotion, step_times, world_from_ego_at
 from factory.readers.av2.reader import BLOCK_STEPS, BLOCK_STRIDE_STEPS
 from factory.readers.base import SPLITS, BadClip, ClipRef
@@ -124,7 +125,7 @@ def log_folders(root: Path) -> dict[str, Path]:
         raise ValueError(f"{root}: no such folder")
     above = root / "logs" if (root / "logs").is_dir() else root
     folders: dict[str, Path] = {}
-    for folder in sorted(found.parent for found in above.rglob(SYNC)):
+    for folder in sorted(found.parent for found in matching_below(above, SYNC)):
         if folder.name in folders:
             raise ValueError(
                 f"{root}: log {folder.name} stands in {folders[folder.name].parent.name} and {folder.parent.name}: "

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
+from factory.files import matching
 from factory.readers.av2.log import LogMotion, seconds_since, world_from_ego_at
 from factory.readers.base import BadClip
 from factory.readers.py123d.arrow import ArrowFile, numbers, open_file, open_metadata
@@ -21,7 +22,7 @@ PINHOLE, LIDAR, SWEEP_SUFFIX = "pinhole", "lidar.lidar_merged.arrow", ".feather"
 
 def camera_files(folder: Path) -> tuple[Path, ...]:
     """The tables of the log's cameras, by name."""
-    return tuple(sorted(folder.glob("camera.*.arrow")))
+    return tuple(matching(folder, "camera.*.arrow"))
 
 
 def read_rig(folder: Path) -> dict[Path, Camera]:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from factory.files import matching_below
 from factory.readers.base import BadClip, ClipIndex, ClipRef, bytes_of
 from factory.readers.logs import STEP_MS, LoggedDrive, LogReader, Recorded, WholeLog, present, route_of_drive, within
 from factory.readers.restricted_pickle import load_plain
@@ -179,7 +180,7 @@ def scenario_files(root: Path) -> dict[str, Path]:
     if not root.is_dir():
         raise ValueError(f"{root}: no such folder or .pkl file")
     files: dict[str, Path] = {}
-    for path in _listed(root) if (root / SUMMARY).is_file() else sorted(root.rglob("sd_*.pkl")):
+    for path in _listed(root) if (root / SUMMARY).is_file() else matching_below(root, "sd_*.pkl"):
         if path.stem in files:
             raise ValueError(f"{root}: {path.name} stands in two folders, {files[path.stem].parent} and {path.parent}")
         files[path.stem] = path

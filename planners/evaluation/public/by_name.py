@@ -13,6 +13,7 @@ from pathlib import Path
 
 from factory.config.compose import ConfigError
 from factory.exits import INTERRUPTED
+from factory.files import matching
 from factory.imports.navhard import NavsimFolders, import_navhard
 from factory.imports.navtest import import_navtest
 from factory.readers.navsim.filters import Selection, read_selection
@@ -129,13 +130,13 @@ def _there(name: str, setting: str, given: str | None, variable: str, what: str)
 def _digest(name: str, places: NavsimFolders, split: Path) -> str:
     """Of the split's files, and of the names, sizes and times of logs, maps and scenes; pictures are not looked at."""
     found = sha256(split.read_bytes())
-    filters = sorted((split.parent / "scene_filter").glob("*.yaml"))
+    filters = matching(split.parent / "scene_filter", "*.yaml")
     for path in filters:
         found.update(path.read_bytes())
     folders = [(places.logs, "*.pkl"), (places.maps, "*/*/map.gpkg")]
     folders += [(places.scenes / "synthetic_scene_pickles", "*.pkl")] if name == "navhard" else []
     for folder, pattern in folders:
-        for path in sorted(folder.glob(pattern)):
+        for path in matching(folder, pattern):
             stat = path.stat()
             found.update(f"{path.relative_to(folder)}\x1f{stat.st_size}\x1f{stat.st_mtime_ns}\x1e".encode())
     return found.hexdigest()[:16]

@@ -388,8 +388,10 @@ def rewards(k: int, seed: int) -> dict[str, np.ndarray]:
 def test_rewards_become_labels_that_say_the_same(released: Path, tmp_path: Path) -> None:
     k, token = 300, simscale.names(1, 0)[2]
     given = rewards(k, 0)
-    folder = tmp_path / "traj_pdm" / "sim"
+    folder = tmp_path / "another_disk" / "sim"
     folder.mkdir(parents=True)
+    (tmp_path / "traj_pdm").mkdir()
+    (tmp_path / "traj_pdm" / "sim").symlink_to(folder)
     (folder / "simcale_16384_pdm_v1.0-0.pkl").write_bytes(pickle.dumps({token: given}))
     np.save(tmp_path / "vocabulary.npy", np.random.default_rng(1).random((k, 40, 3)).astype(np.float32))
     words = (f"rewards={tmp_path / 'traj_pdm'}", f"vocabulary={tmp_path / 'vocabulary.npy'}")

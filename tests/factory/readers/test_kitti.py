@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from factory.readers.base import BadClip
 from factory.readers.kitti import EARTH_RADIUS_M, IMU_HEIGHT_M, KittiDrive, read_drive, steadied
+from tests.factory.data_folders import add_companions
 
 DATE = "2011_09_26"
 WEST_OF_HERE = 8.0
@@ -58,6 +59,14 @@ def test_photos_have_poses_in_the_world_and_intrinsics_of_their_own_size(root: P
     np.testing.assert_allclose(photos[1].world_from_camera[:3, 2], [0, 1, 0], atol=1e-9)
     right = read_drive(root).photos("image_03", [0])[0]
     np.testing.assert_allclose(right.world_from_camera[:3, 3], [1.0, -0.4, 0.0], atol=1e-6)
+
+
+def test_companions_of_its_files_are_none_of_the_drive(root: Path) -> None:
+    known = read_drive(root)
+    add_companions(root)
+    found = read_drive(root)
+    np.testing.assert_array_equal(found.world_from_imu, known.world_from_imu)
+    assert len(found.sweeps()) == len(known.sweeps()) == 1
 
 
 def test_sweeps_stand_on_the_road_and_land_in_the_same_world(root: Path) -> None:

@@ -14,6 +14,7 @@ from tasks.render.scene.asset import OwnBody, RenderAsset
 from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
 from tasks.render.splatting.gaussians import EMPTY
 from tasks.world.camera import Camera, SensorFile
+from tests.factory.data_folders import add_companions
 
 K = np.array([[60.0, 0.0, 48.0], [0.0, 60.0, 32.0], [0.0, 0.0, 1.0]])
 FRONT = np.array([[0.0, 0.0, 1.0, 1.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 1.5], [0.0, 0.0, 0.0, 1.0]])
@@ -29,6 +30,9 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_white_is_the_body_and_a_camera_without_a_file_sees_none(folder: Path) -> None:
+    digest = masks_digest(str(folder))
+    add_companions(folder)
+    assert masks_digest(str(folder)) == digest
     masks = read_masks(str(folder), [CAMERA, replace(CAMERA, name="front")])
     assert list(masks) == ["back"]
     assert masks["back"][48:].all() and not masks["back"][:48].any()

@@ -21,6 +21,7 @@ from factory.store.table import AnotherWriter
 from factory.store.upkeep import restore_logs
 from factory.store.verify import damaged_logs, verify
 from tests.factory.damage import damaged
+from tests.factory.data_folders import add_companions
 from tests.factory.tables import assert_same_tables
 from tests.factory.toy import ToyWork, refs
 
@@ -209,6 +210,23 @@ def test_a_run_that_was_quiet_for_long_commits_nothing_after_its_leftovers_went(
     with pytest.raises(AnotherWriter):
         quiet.samples.commit([shard])
     assert verify(Store(out)).damage == ()
+
+
+def test_nothing_behind_a_link_is_cleaned_away_and_companions_are_no_damage(
+    out: Path, golden: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    add_companions(out)
+    theirs = tmp_path / "theirs" / ".work.tmp"
+    theirs.parent.mkdir()
+    theirs.write_text("of somebody else")
+    (out / "samples" / "theirs").symlink_to(theirs.parent)
+    (out / "cache" / "round").symlink_to(out)
+    assert COMMANDS["clean"].load()([f"out={out}", "older_than=0min"]) == 0
+    assert capsys.readouterr().out == "0 files older than 0min\n"
+    assert theirs.exists()
+    code, said = told(capsys, str(out))
+    assert (code, said.count("orphan"), said.count("DAMAGED")) == (COMPLETE, 1, 0), said
+    assert verify(Store(out)) == verify(Store(golden))
 
 
 def test_leftovers_go_once_they_are_old(out: Path, golden: Path, capsys: pytest.CaptureFixture[str]) -> None:
