@@ -100,7 +100,7 @@ def main(request: Request) -> int:
 
 def export(request: Request) -> Iterator[Path]:
     """Write the files; their paths as they are written. Raises Refused where there is nothing, or no file can be."""
-    store, target = open_store(request.out), Path(request.to).expanduser()
+    store, target = open_store(request.out), Path(request.to)
     table = open_samples(store)
     if request.sample is not None:
         chosen = [find(table, store, request.sample)]

@@ -113,10 +113,10 @@ def _simscale(request: Request, store: "Store") -> tuple["RunSummary", str]:
     from factory.imports.table import identity_of, import_rows
     from factory.setup.vocabulary import load_vocabulary
 
-    parts = parts_of(Path(request.root).expanduser(), request.only)
+    parts = parts_of(Path(request.root), request.only)
     rewards = None
     if request.rewards is not None and request.vocabulary is not None:
-        rewards = Rewards(Path(request.rewards).expanduser(), load_vocabulary(request.vocabulary))
+        rewards = Rewards(Path(request.rewards), load_vocabulary(request.vocabulary))
     settings = {
         "maps": request.maps is not None,
         "pictures": request.pictures,
@@ -135,7 +135,7 @@ def _navhard(request: Request, store: "Store") -> tuple["RunSummary", str]:
 
     logs, maps = _folder(request.logs), _folder(request.maps)
     assert logs is not None and maps is not None and request.split is not None
-    places = NavsimFolders(logs, _folder(request.sensors), Path(request.root).expanduser(), maps)
+    places = NavsimFolders(logs, _folder(request.sensors), Path(request.root), maps)
     return import_navhard(store, read_selection(request.split), places)
 
 
@@ -145,7 +145,7 @@ def _navtest(request: Request, store: "Store") -> tuple["RunSummary", str]:
 
     maps = _folder(request.maps)
     assert maps is not None and request.split is not None
-    logs = Path(request.root).expanduser()
+    logs = Path(request.root)
     return import_navtest(store, read_selection(request.split), logs, _folder(request.sensors), maps)
 
 
@@ -154,7 +154,7 @@ def _cameras(request: Request) -> int:
     from factory.imports.nuscenes_cameras import import_cameras
     from factory.readers.base import BadClip
 
-    root, out = Path(request.root).expanduser(), Path(request.out).expanduser()
+    root, out = Path(request.root), Path(request.out)
     photos = 0
     try:
         for done in import_cameras(root, out, request.version, request.only, request.sweeps):
@@ -171,4 +171,4 @@ def _cameras(request: Request) -> int:
 
 
 def _folder(path: str | None) -> Path | None:
-    return None if path is None else Path(path).expanduser()
+    return None if path is None else Path(path)

@@ -91,7 +91,7 @@ def sample_lines(store: "Store", table: "SampleTable", which: str, request: Requ
 
 
 def _picture_path(attempt_id: str, to: str | None) -> Path:
-    target = Path(to or ".").expanduser()
+    target = Path(to or ".")
     if target.suffix.lower() == ".png":
         return target
     if target.suffix and not target.is_dir():

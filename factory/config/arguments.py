@@ -8,7 +8,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin, get_type_hints
 
 from factory.config.shapes import choices_of, defaults_of, described, plain, to_give
-from factory.config.words import SHOW, ConfigError, SettingsShown, nearest, without_show
+from factory.config.words import SHOW, ConfigError, SettingsShown, at_home, nearest, without_show
 from factory.exits import BAD_CONFIG
 from factory.store.disk import why_not_written
 
@@ -64,15 +64,15 @@ def parse(shape: type[Request], argv: Sequence[str]) -> Request:
         if key in kinds and value:
             if key in given:
                 raise Refused(f"{key} is given twice")
-            given[key] = _value(key, value, kinds[key])
+            given[key] = at_home(_value(key, value, kinds[key]), key)
         elif words and not equals and not argument.startswith("-"):
             name = words[0]
             if get_origin(kinds[name]) is tuple:
-                given[name] = (*given.get(name, ()), argument)
+                given[name] = (*given.get(name, ()), at_home(argument, name))
                 continue
             if name in given:
                 raise Refused(f"{name} is given twice")
-            given[name] = _value("", argument, kinds[words.pop(0)])
+            given[name] = at_home(_value("", argument, kinds[words.pop(0)]), name)
         elif rest:
             given[rest[0]] += (argument,)
         else:

@@ -9,7 +9,7 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from factory.config.plugins import offer_choices
 from factory.config.shapes import dataclass_in, defaults_of, described, keys_of, merged, to_give
-from factory.config.words import ConfigError, SettingsShown, asked_of, nearest, no_such_choice, readable
+from factory.config.words import ConfigError, SettingsShown, asked_of, at_home, nearest, no_such_choice, readable
 from factory.job import runs_root
 
 T = TypeVar("T")
@@ -93,7 +93,7 @@ def compose(
         cause = f" ({error.__cause__})" if error.__cause__ is not None else ""
         raise ConfigError(f"{str(error).strip()}{cause}".splitlines()[0]) from error
     assert isinstance(resolved, dict)
-    values = {str(key): value for key, value in resolved.items()}
+    values = {str(key): at_home(value, str(key)) for key, value in resolved.items()}
     if shape is not None:
         refuse_unknown(shape, values, "")
         values = merged(defaults_of(shape), values)

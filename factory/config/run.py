@@ -281,7 +281,7 @@ def refuse_relative_root(clips: Mapping[str, Any]) -> None:
     """Raises ConfigError for relative logs or photos inside a submitted Ray job, whose folder is a temporary copy."""
     for key in ("root", "cameras", "sensor_root") if clips.get("_target_") in READERS else ("root",):
         path = clips.get(key)
-        if in_submitted_job() and isinstance(path, str) and not Path(path).expanduser().is_absolute():
+        if in_submitted_job() and isinstance(path, str) and not Path(path).is_absolute():
             raise ConfigError(
                 f"clips.{key}={path} is relative, and a submitted job runs in a copy of the working directory: "
                 "name an absolute path that every node sees"
@@ -292,7 +292,7 @@ def refuse_missing_root(clips: Mapping[str, Any]) -> None:
     """Raises ConfigError where a built-in reader's clips.root is not there, before the reader is imported."""
     refuse_relative_root(clips)
     root = clips.get("root")
-    if clips.get("_target_") in READERS and isinstance(root, str) and not Path(root).expanduser().exists():
+    if clips.get("_target_") in READERS and isinstance(root, str) and not Path(root).exists():
         raise ConfigError(f"clips: {root}: no such folder")
 
 

@@ -4,14 +4,18 @@ A setting is `key=value`. Text that Hydra's grammar does not read, such as a pat
 Of Hydra's options two are kept: `--cfg` shows the settings, `--config-dir` adds a folder of one's own groups.
 """
 
-from collections.abc import Sequence
+import os
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
+from typing import Any
 
 SHOW = ("--cfg", "-c")
 FOLDER = ("--config-dir", "-cd")
 SEVERAL = ("--multirun", "-m")
+HOME = re.compile(r"(?<=[\[{,: ])~[^\s,:\[\]{}'\"]*")  # a path in a list or mapping, which Hydra reads in quotes alone
 NEEDS_READING = "[{'\""  # a value that begins so is a list, a mapping or quoted text, never plain text
 
 
@@ -70,9 +74,10 @@ def asked_of(words: Sequence[str]) -> Asked:
         if option in FOLDER:
             if not equals:
                 value = rest.pop(0) if rest else ""
-            if not value or not Path(value).expanduser().is_dir():
+            folder = Path(at_home(value, option))
+            if not value or not folder.is_dir():
                 raise ConfigError(f"{option} {value}: there is no such folder".replace("  ", " "))
-            folders.append(Path(value).expanduser().resolve())
+            folders.append(folder.resolve())
         elif option in SEVERAL:
             raise ConfigError(
                 f"{option}: a run fills one folder, so several runs are several commands: "
@@ -102,6 +107,8 @@ def readable(word: str) -> str:
         if not key or not all(letter.isalnum() or letter in "_.@/+~-" for letter in key):
             raise ConfigError(f"{word!r}: expected key=value; see --help") from error
         if value[:1] and value[0] in NEEDS_READING:
+            if (quoted := HOME.sub(r"'\g<0>'", value)) != value:
+                return readable(f"{key}={quoted}")
             raise ConfigError(
                 f"{word}: cannot be read; a list is {key}=[a,b], all of it in quotes for the shell"
             ) from (error)
@@ -110,6 +117,25 @@ def readable(word: str) -> str:
     if parsed.is_sweep_override():
         raise ConfigError(f"{word}: one value, or a list: {key}=[{value}]; several runs are several commands")
     return word
+
+
+def at_home(value: Any, key: str) -> Any:
+    """A value whose texts that begin with `~` or `~user`, in lists and mappings too, are paths in those home folders.
+
+    It goes by the text and not by the key, so that no key that names a file can be forgotten, a plug-in's among them.
+    Raises ConfigError naming the key where there is no such home.
+    """
+    if isinstance(value, Mapping):
+        return {name: at_home(inner, f"{key}.{name}" if key else str(name)) for name, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return type(value)(at_home(inner, key) for inner in value)
+    if not isinstance(value, str) or not value.startswith("~"):
+        return value
+    path = os.path.expanduser(value)  # a Path would raise, and lose a slash at the end
+    if path.startswith("~"):
+        home = value.partition("/")[0]
+        raise ConfigError(f"{key}={value}: there is no home folder {home}; a file that is called so here is ./{value}")
+    return path
 
 
 def no_such_choice(missing: str, choices: Sequence[str] | None) -> str:

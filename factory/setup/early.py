@@ -19,7 +19,7 @@ def refuse_what_is_not_there(config: RunConfig) -> None:
     refuse_missing_root(config.clips)
     refuse_missing_classes(config)
     refuse_cameras_of_no_rig(config)
-    if config.explore is not None and "://" not in config.explore and not Path(config.explore).expanduser().is_dir():
+    if config.explore is not None and "://" not in config.explore and not Path(config.explore).is_dir():
         raise ConfigError(
             f"explore={config.explore}: no such folder; python -m planners explore planner=<who> out={config.explore} "
             "makes it"
@@ -49,9 +49,9 @@ def refuse_cameras_of_no_rig(config: RunConfig) -> None:
         return
     rig: tuple[str, ...] = ()
     if target == AV2:
-        rig = _argoverse_rig(Path(str(root)).expanduser(), config.clips["only"])
+        rig = _argoverse_rig(Path(str(root)), config.clips["only"])
     elif config.clips["cameras"] is not None:
-        rig = _scenarionet_rig(Path(str(root)).expanduser(), config.clips)
+        rig = _scenarionet_rig(Path(str(root)), config.clips)
     if not wanted or config.render.mode is RenderMode.NONE:
         return
     if not rig and config.render.mode is RenderMode.MAP:
@@ -72,7 +72,7 @@ def _scenarionet_rig(root: Path, clips: Mapping[str, Any]) -> tuple[str, ...]:
 
     try:
         log_ids = [log_id for log_id in scenario_files(root) if not clips["only"] or log_id in clips["only"]]
-        return camera_names(sidecars_of(Path(clips["cameras"]).expanduser(), log_ids).values())
+        return camera_names(sidecars_of(Path(clips["cameras"]), log_ids).values())
     except ValueError as error:
         raise ConfigError(f"clips: {error}") from error
 

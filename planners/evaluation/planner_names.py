@@ -28,7 +28,7 @@ from typing import Any
 from factory.config.classes import object_named
 from factory.config.compose import ConfigError, compose
 from factory.config.plugins import installed, names
-from factory.config.words import nearest
+from factory.config.words import at_home, nearest
 from planners.data.batch import Needs
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.scoring import Plans, PreparedFrame, human_plans, pdm_plans
@@ -56,6 +56,7 @@ class EvaluatedPlanner:
 
 def planner_of(spec: str, label: str | None = None, changed: Mapping[str, Any] | None = None) -> EvaluatedPlanner:
     """Who `spec` names; changed: settings of trained planners, see load_planner. Raises ConfigError for nobody."""
+    spec = "+".join(at_home(member, "planner") for member in spec.split("+"))
     return replace(_named(spec, label, changed), spec=spec)
 
 

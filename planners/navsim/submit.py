@@ -73,7 +73,7 @@ def main(request: Request) -> None:
             first = _planned(scenes.first_stage(), pilot, n_poses, progress, 0)
             second = _planned(scenes.second_stage(), pilot, n_poses, progress, len(first))
         team = Team(request.team_name, request.authors, request.email, request.institution, request.country)
-        write_whole(Path(request.out).expanduser(), submission_bytes(team, first, second))
+        write_whole(Path(request.out), submission_bytes(team, first, second))
     except (BadClip, ValueError, OSError, RuntimeError) as error:  # RuntimeError: a device that is not there
         raise Refused(one_line(error)) from error
     print(f"{len(first):,} + {len(second):,} plans of the first and second stage: {request.out}")
@@ -100,7 +100,7 @@ def _folder(key: str, path: str | None) -> Path | None:
     """Raises ValueError where it is not there."""
     if path is None:
         return None
-    folder = Path(path).expanduser()
+    folder = Path(path)
     if not folder.is_dir():
         raise ValueError(f"{key}={path}: no such folder")
     return folder

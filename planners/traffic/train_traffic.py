@@ -85,7 +85,7 @@ def train_all(settings: TrainTraffic) -> Path:
         "seed": settings.seed,
         **asdict(settings.network),
     }
-    out = Path(settings.out).expanduser()
+    out = Path(settings.out)
     write_whole(out, weights_file(network.weights, json.dumps(record)))
     return out
 

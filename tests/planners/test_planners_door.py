@@ -1,12 +1,28 @@
 """What all commands do alike: help, exit codes, one line for what is wrong."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import pytest
 
+from factory.config.compose import ConfigError, compose
 from factory.exits import BAD_CONFIG, COMPLETE_WITH_FAILURES, INTERRUPTED
 from planners.command import Failed, Stopped, command
+from planners.drive.settings import DriveSettings
+from planners.evaluation.compare import CompareSettings
+from planners.evaluation.evaluate import EvaluateSettings
+from planners.evaluation.planner_names import planner_of
+from planners.evaluation.replay import ReplaySettings
+from planners.explore.alternate import AlternateSettings
+from planners.explore.settings import ExploreSettings
+from planners.published.import_planner import ImportConfig
+from planners.study.experiment import ExperimentSettings
+from planners.study.scaling import ScalingSettings
 from planners.study.scaling import main as scaling
+from planners.study.study import StudySettings
+from planners.traffic.train_traffic import TrainTraffic
+from planners.training.train import TrainConfig
+from tests.factory.text_keys import held, text_keys
 
 
 @pytest.mark.parametrize(
@@ -27,6 +43,47 @@ def test_what_is_raised_is_one_line_and_an_exit_code(
 
     assert main([]) == code
     assert capsys.readouterr().err == said
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "given"),
+    [
+        ("train", TrainConfig, ("out=x",)),
+        ("train", TrainConfig, ("out=x", "planner=gtrs_dense_small")),
+        ("import_planner", ImportConfig, ("out=x", "checkpoint=x", "planner=ltf_public")),
+        ("evaluate", EvaluateSettings, ("benchmark=x",)),
+        ("compare", CompareSettings, ("a=x", "b=y")),
+        ("drive", DriveSettings, ()),
+        ("explore", ExploreSettings, ()),
+        ("alternate", AlternateSettings, ()),
+        ("replay", ReplaySettings, ("benchmark=x", "clip=x")),
+        ("scaling", ScalingSettings, ()),
+        ("study", StudySettings, ()),
+        ("sceptic", ExperimentSettings, ()),
+        ("train_traffic", TrainTraffic, ("clips.root=x",)),
+    ],
+)
+def test_a_home_folder_is_one_in_every_key_that_takes_text(
+    name: str, shape: type, given: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    choices = {word.partition("=")[0] for word in given if word.startswith("planner=")}
+    keys = [key for key in text_keys(shape) if key not in choices and key != "planner"]
+    values = compose(name, [*given, *(f"{key}=~/x" for key in keys)], shape)
+    assert keys and {key: held(values, key) for key in keys} == dict.fromkeys(keys, f"{tmp_path}/x")
+
+
+def test_a_planner_of_the_home_folder_is_evaluated_alone_and_in_an_ensemble(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+    for spec in ("~/a", "~/a+~/b"):
+        with pytest.raises(ValueError, match=f"{tmp_path}/a.*no.*checkpoint"):
+            planner_of(spec)
+    with pytest.raises(ConfigError, match=r"^planner=~nobody\.here/a: there is no home folder ~nobody\.here"):
+        planner_of("~nobody.here/a")
 
 
 def test_a_fault_of_the_program_is_not_hidden() -> None:

@@ -108,7 +108,7 @@ def _maps(name: str, given: str | None, data: Path) -> Path:
 
 def _split(name: str, given: str | None) -> Path:
     if given is not None:
-        path = Path(given).expanduser()
+        path = Path(given)
     else:
         path = _there(name, "split", None, DEVKIT, "a checkout of NAVSIM, or give the split's .yaml")
         path = path / IN_DEVKIT / f"{SPLITS[name]}.yaml"

@@ -1,11 +1,17 @@
 """Arguments of the commands that look at a run."""
 
 from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
 from typing import Literal
 
 import pytest
 
-from factory.config.arguments import RUN, WORD, Refused, parse
+from factory.commands.table import COMMANDS, DOORS
+from factory.config.arguments import RUN, WORD, Refused, keys_of, parse
+from factory.config.shapes import choices_of
+from factory.config.words import ConfigError
+from tests.factory.text_keys import text_keys
 
 
 @dataclass(frozen=True)
@@ -26,6 +32,30 @@ class Ask:
 def test_values_become_what_the_fields_are() -> None:
     assert parse(Ask, ["out=s3://b/x=y", "every=10", "deep=True", "name=7"]) == Ask("s3://b/x=y", 3, 10, "7", True)
     assert parse(Ask, ["out=x"]) == Ask("x")
+
+
+ASKED = [
+    *(f"factory {name}" for name in COMMANDS if name not in ("run", "plan")),
+    *(f"planners {name}" for name in ("parity", "serve", "submit")),
+]
+
+
+@pytest.mark.parametrize("command", ASKED)
+def test_a_home_folder_is_one_in_every_key_that_takes_text(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    package, name = command.split()
+    shape = import_module(DOORS[package][name].module).Request
+    texts = [key for key in text_keys(shape) if key in keys_of(shape)]
+    chosen = [f"{key}={choices_of(hint)[0]}" for key, hint in keys_of(shape).items() if choices_of(hint)]
+    monkeypatch.setattr(shape, "__post_init__", lambda self: None, raising=False)  # what goes with what
+    found = parse(shape, [*chosen, *(f"{key}=~/x" for key in texts)])
+    for key in texts:
+        assert getattr(found, key) in (f"{tmp_path}/x", (f"{tmp_path}/x",)), key
+    for key in texts:
+        with pytest.raises(ConfigError, match=f"^{key}=~nobody.here/x: there is no home folder ~nobody.here"):
+            parse(shape, [f"{key}=~nobody.here/x"])
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,8 @@
 
 import dataclasses
 import math
+import os
+import pwd
 import re
 import shutil
 import subprocess
@@ -13,7 +15,7 @@ import pytest
 import yaml
 
 from factory.config.compose import ConfigError, build, conf_dir, fill
-from factory.config.run import RewardSettings, RunConfig, composed_run, load_config
+from factory.config.run import RewardSettings, RunConfig, composed_run, load_config, shapes_in
 from factory.config.words import SettingsShown
 from factory.setup.settings import (
     RunContext,
@@ -23,6 +25,7 @@ from factory.setup.settings import (
     refuse_missing_backend,
     simulates,
 )
+from tasks.caches import user_cache
 from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings
 from tasks.experts.pdm_smooth.planner import PdmSmooth, SmoothSettings
 from tasks.experts.vocabulary.expert import VocabularyExpert
@@ -31,6 +34,7 @@ from tasks.perturb import PerturbSettings
 from tasks.render.settings import RenderMode, RenderSettings
 from tasks.rollout.simulate import TrafficSettings
 from tasks.settings import ExpertGate
+from tests.factory.text_keys import held, text_keys
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 DENSE = PerturbSettings(max_longitudinal_m=8.0, step_longitudinal_m=1.0, interleaved=False, order="spread", at_most=32)
@@ -70,6 +74,57 @@ def test_the_run_s_keys_are_those_of_its_dataclass() -> None:
     assert (config.rounds, config.executor, config.limit) == (1, "ray", None)
     assert config.perturb == PerturbSettings()
     assert config.reward == RewardSettings()
+
+
+@pytest.mark.parametrize(
+    ("choice", "n_least"),
+    [
+        *((name, 15) for name in ("synthetic", "synthetic_towns")),
+        *((f"{name} clips.root=x", 18) for name in ("av2", "scenarionet", "py123d")),
+        ("navsim clips.root=x clips.maps=x", 20),
+    ],
+)
+def test_a_home_folder_is_one_in_every_key_that_takes_text(
+    choice: str, n_least: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    words = f"clips={choice}".split()
+    found = composed_run(words)
+    keys = text_keys(RunConfig) + [f"{at}.{key}" for at, shape in shapes_in(found).items() for key in text_keys(shape)]
+    assert {"out", "vocabulary.file", "reward.label_vocabulary", "expert.recovery.table"} < set(keys)
+    assert len(keys) >= n_least
+    for given, wanted in (("~/x", f"{tmp_path}/x"), ("[~/x,y]", [f"{tmp_path}/x", "y"])):
+        values = composed_run([*words, *(f"{key}={given}" for key in keys)])
+        assert {key: held(values, key) for key in keys} == dict.fromkeys(keys, wanted)
+
+
+@pytest.mark.slow
+def test_a_run_takes_its_files_from_the_home_folder(small_town: Path, tmp_path: Path) -> None:
+    clips = ["clips=av2", f"clips.root={small_town}", "clips.split=train"]
+    at_home = ["vocabulary.file=~/v.npy", "reward.label_vocabulary=~/v.npy", "expert.recovery.table=~/t.npz"]
+    settings = ["experts=[recovery]", "render=none", "perturb.epdms_min=0", "executor=local", "out=~/out"]
+    env = os.environ | {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(user_cache().parent)}
+    for words in (
+        ["vocabulary", "out=~/v.npy", "kinematic=true", "k=64"],
+        ["vocabulary", "table=~/t.npz", "vocabularies=[~/v.npy]", *clips],
+        ["run", *clips, *at_home, *settings],
+    ):
+        command = [sys.executable, "-m", "factory", *words]
+        done = subprocess.run(command, cwd=REPOSITORY, env=env, capture_output=True, text=True, timeout=280)
+        assert done.returncode == 0, done.stderr
+    assert f"64 trajectories ({tmp_path}/v.npy" in done.stdout and (tmp_path / "out" / "report.html").is_file()
+
+
+def test_a_plug_in_s_key_is_led_home_too_and_a_stranger_s_home_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    own = ["clips=custom", "clips._target_=my.Reader"]
+    assert composed_run([*own, "clips.logs={a: ~/a}"])["clips"]["logs"] == {"a": f"{tmp_path}/a"}
+    assert composed_run([*own, "clips.logs=~root/a"])["clips"]["logs"] == f"{pwd.getpwnam('root').pw_dir}/a"
+    assert composed_run([*own, "clips.logs=a~/b"])["clips"]["logs"] == "a~/b"
+    with pytest.raises(ConfigError, match=r"^clips\.logs\.a=~nobody\.here/a: there is no home folder ~nobody\.here;"):
+        composed_run([*own, "clips.logs={a: ~nobody.here/a}"])
 
 
 @pytest.mark.parametrize(
