@@ -10,13 +10,36 @@ DEMO   := runs/demo
 TORCH       ?= torch==2.13.0$(if $(filter Linux,$(shell uname -s)),+cpu)
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 
+# Says in one line what keeps PYTHON from being used, before anything is made from it; old versions run it too. Its
+# second part: whether the .venv that is there, perhaps half made, is one of that version with a pip that works.
+OLDEST := $(shell sed -n 's/^requires-python = ">=\(.*\)"/\1/p' pyproject.toml)
+define FITS
+import sys
+found = sys.executable + " is Python " + ".".join(map(str, sys.version_info[:3]))
+another = "; give another: make $(or $(firstword $(MAKECMDGOALS)),install) PYTHON=python$(OLDEST)"
+if sys.version_info[:2] < tuple(map(int, "$(OLDEST)".split("."))):
+    sys.exit(found + ", Python $(OLDEST) or later is needed" + another)
+try:
+    import ensurepip, venv
+except ImportError as error:
+    sys.exit(found + " and makes no .venv (%s), as where Debian's python%d.%d-venv is missing" % ((error,) + sys.version_info[:2]) + another)
+endef
+define IS_WHOLE
+import pip, sys
+sys.exit(sys.version.split()[0] != sys.argv[1])
+endef
+export FITS IS_WHOLE
+
 .PHONY: install demo test unit lint format docs chaos mutants bench gpu-check study clean
 
 install: $(VENV)/.installed
 
 # What a run needs; make demo installs no more.
 $(VENV)/.run: pyproject.toml constraints.txt
-	$(PYTHON) -m venv $(VENV)
+	@command -v $(PYTHON) >/dev/null || { echo "no $(PYTHON): give another by PYTHON=python$(OLDEST)" >&2; exit 1; }
+	@$(PYTHON) -c "$$FITS"
+	@$(PY) -c "$$IS_WHOLE" $$($(PYTHON) -c "import sys; print(sys.version.split()[0])") 2>/dev/null || \
+		$(PYTHON) -m venv --clear $(VENV)
 	$(PY) -m pip install -q --upgrade pip
 	$(PY) -m pip install -q -c constraints.txt -e ".[run]"
 	touch $@

@@ -2,9 +2,11 @@
 
 import ast
 import graphlib
+import re
 import subprocess
 import sys
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -178,3 +180,36 @@ def test_a_run_in_this_process_needs_no_ray() -> None:
 def test_importing_the_science_needs_numpy_only() -> None:
     heavy = {"numba", "osqp", "cv2", "shapely", "scipy", "torch", "ray", "pyarrow", "hydra"}
     assert not loaded_by("import tasks, tasks.world.clip, tasks.stages") & heavy
+
+
+NOT_OURS = {  # what the benchmarks' peers need, in environments of their own
+    "tests.bench.peer_navsim": "navsim",
+    "tests.bench.peer_simagents": "tensorflow",
+    "tests.bench.peer_traffic": "navsim",
+}
+IMPORTING = """
+import importlib, sys
+for name in sys.argv[1:]:
+    try:
+        importlib.import_module(name)
+    except ImportError as error:
+        print(name, error.name, error, sep=": ")
+"""
+
+
+@pytest.mark.slow
+def test_every_program_of_the_tests_imports() -> None:
+    """Benchmarks and trials that no test runs break unseen otherwise."""
+    files = sorted(path.relative_to(ROOT) for path in (ROOT / "tests").rglob("*.py"))
+    names = [".".join(path.with_suffix("").parts) for path in files if not path.name.startswith(("test_", "conftest"))]
+    assert {"tests.bench.__main__", "tests.bench.bench_rules", "tests.chaos.kills"} <= set(names)
+    words = [sys.executable, "-c", IMPORTING, *names]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=200)
+    assert done.returncode == 0, done.stderr
+    failed = dict(line.split(": ", 2)[:2] for line in done.stdout.splitlines())
+    assert failed.items() <= NOT_OURS.items(), done.stdout
+
+
+def test_every_program_that_the_makefile_runs_is_there() -> None:
+    named = re.findall(r"-m ((?:tests|factory|planners)[\w.]*)", (ROOT / "Makefile").read_text())
+    assert len(named) >= 10 and all(map(find_spec, named))

@@ -5,15 +5,22 @@ from pathlib import Path
 from tests.bench import bench_labels, bench_render, bench_reward, bench_rollout, bench_rules, bench_stages
 
 SHARED = Path("../shared")
-LOGS = SHARED / "data/av2/sensor/val"
 
-bench_reward.main(SHARED)
-if (SHARED / "reference").is_dir():
-    bench_rules.main(SHARED)
-bench_stages.main(LOGS)
-if LOGS.is_dir():
-    bench_rollout.main(LOGS)
-    bench_labels.main(SHARED)
-else:
-    print(f"the tables of rollouts and labels are left out: they need real traffic, and there is no folder {LOGS}")
-bench_render.main()
+
+def main(shared: Path) -> None:
+    """Prints the tables, without those whose data are not there."""
+    logs = shared / "data/av2/sensor/val"
+    bench_reward.main(shared)
+    if (shared / "reference").is_dir():
+        bench_rules.main(shared)
+    bench_stages.main(logs)
+    if logs.is_dir():
+        bench_rollout.main(logs)
+        bench_labels.main(shared)
+    else:
+        print(f"the tables of rollouts and labels are left out: they need real traffic, and there is no folder {logs}")
+    bench_render.main()
+
+
+if __name__ == "__main__":
+    main(SHARED)

@@ -24,7 +24,7 @@ from tasks.reward.rules.contacts import first_collision, first_time_to_collision
 from tasks.reward.rules.ego import place
 from tasks.reward.rules.lane_discipline import driving_direction, lane_keeping
 from tasks.reward.rules.lights import first_red
-from tasks.reward.verdicts import scratch_for, world_of
+from tasks.reward.verdicts import context_of, scratch_for
 from tasks.rollout.lqr import track
 from tests.real.reference_scenes import RECORDED_K, loader, prepared_scene
 
@@ -33,30 +33,30 @@ RULES = ("body", "areas", "NC", "TTC", "DDC", "TLC", "LK", "EP", "HC")
 
 
 @numba.njit
-def rules_up_to(last, world, obstacles, states, scratch, comfort):  # type: ignore[no-untyped-def]
+def rules_up_to(last, context, obstacles, states, scratch, comfort):  # type: ignore[no-untyped-def]
     """The first `last` of RULES on all states, in the order of the score; a rule's time is a difference."""
-    body, ego = scratch.body, world.ego
+    body, ego = scratch.body, context.ego
     total = 0.0
     for k in range(states.shape[0]):
         place(states[k], ego.rear_axle_to_center, body)
         if last > 1:
-            areas_along(world.map_index, body, ego.half_length, ego.half_width)
+            areas_along(context.map_index, body, ego.half_length, ego.half_width)
         if last > 2:
             total += first_collision(obstacles, states[k], body, ego.half_length, ego.half_width, scratch.ignored)[0]
         if last > 3:
             total += first_time_to_collision(
-                obstacles, states[k], body, world.map_index, ego.half_length, ego.half_width, scratch.ignored
+                obstacles, states[k], body, context.map_index, ego.half_length, ego.half_width, scratch.ignored
             )
         if last > 4:
             total += driving_direction(body)[0]
         if last > 5:
-            total += first_red(world.red_lanes, body, ego.half_length, ego.half_width)
+            total += first_red(context.red_lanes, body, ego.half_length, ego.half_width)
         if last > 6:
-            total += lane_keeping(world.centerline, body)
+            total += lane_keeping(context.centerline, body)
         if last > 7:
-            total += progress_m(world.centerline, body.x[0], body.y[0], body.x[-1], body.y[-1])
+            total += progress_m(context.centerline, body.x[0], body.y[0], body.x[-1], body.y[-1])
         if last > 8:
-            total += comfort_along(world.history, states[k], ego.rear_axle_to_center, scratch.comfort, comfort)
+            total += comfort_along(context.history, states[k], ego.rear_axle_to_center, scratch.comfort, comfort)
     return total
 
 
@@ -82,9 +82,9 @@ def main(root: Path) -> None:
         inputs = module.inputs(name)
         prepared = prepared_scene(inputs)
         states = track(inputs["ego_state0"], module.proposals(name, RECORDED)[:K], local=True)
-        obstacles, world = prepared.indexed_obstacles, world_of(prepared, with_history=True)
+        obstacles, context = prepared.indexed_obstacles, context_of(prepared, with_history=True)
         scratch, comfort = scratch_for(obstacles.boxes.shape[1]), np.empty(6, np.bool_)
-        given = (world, obstacles, states, scratch, comfort)
+        given = (context, obstacles, states, scratch, comfort)
         calls = [partial(rules_up_to, last, *given) for last in range(1, len(RULES) + 1)]
         rules_up_to(len(RULES), *given)
         times = least_us([*calls, partial(score, prepared, states)])

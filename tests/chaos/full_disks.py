@@ -303,4 +303,4 @@ def main(levels: int = LEVELS, names: Sequence[str] = tuple(PLACES)) -> int:
 if __name__ == "__main__":
     from tests.chaos.full_disks import main  # so that another process can import what it runs
 
-    sys.exit(bool(main(*map(int, sys.argv[1:2]), tuple(sys.argv[2:]) or tuple(PLACES))))
+    sys.exit(bool(main(*map(int, sys.argv[1:2]), names=tuple(sys.argv[2:]) or tuple(PLACES))))

@@ -4,6 +4,7 @@ import ast
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -221,3 +222,65 @@ def test_no_cuda_build_on_pypi_satisfies_what_the_tests_install(tmp_path: Path) 
 
 def _own(extra: str) -> list[str]:
     return list(PROJECT["optional-dependencies"][extra] if extra else PROJECT["dependencies"])
+
+
+OLD = "import sys; sys.version_info = (3, 9, 18, 'final', 0)\n"
+WITHOUT = "import sys; sys.modules['ensurepip'] = None\n"  # as Debian's python3 without python3-venv
+
+
+def python_that(tmp_path: Path, before: str) -> str:
+    """A Python that runs this before what it is given by -c."""
+    script = tmp_path / "python"
+    script.write_text(
+        f'#!/bin/sh\n[ "$1" = -c ] || exec {sys.executable} "$@"\nexec {sys.executable} -c "{before}$2"\n'
+    )
+    script.chmod(0o755)
+    return str(script)
+
+
+def make(tmp_path: Path, python: str, *words: str) -> tuple[Path, "subprocess.CompletedProcess[str]"]:
+    """The Makefile in a folder with what its install reads, without a package index."""
+    folder = tmp_path / "checkout"
+    folder.mkdir(exist_ok=True)
+    for name in ("Makefile", "pyproject.toml", "constraints.txt"):
+        shutil.copy(REPOSITORY / name, folder)
+    env = os.environ | {"PIP_NO_INDEX": "1", "PIP_CONFIG_FILE": os.devnull}
+    words = ("make", *words, f"PYTHON={python}")
+    return folder, subprocess.run(words, cwd=folder, env=env, capture_output=True, text=True, timeout=120)
+
+
+@pytest.mark.parametrize(
+    ("before", "said"),
+    [
+        (OLD, "is Python 3.9.18, Python 3.11 or later is needed; give another: make demo PYTHON=python3.11"),
+        (WITHOUT, "makes no .venv (import of ensurepip halted; None in sys.modules)"),
+        (None, "no nowhere/python: give another by PYTHON=python3.11"),
+    ],
+    ids=["old", "without what makes a .venv", "not there"],
+)
+def test_a_python_that_does_not_fit_is_refused_in_a_line_and_leaves_nothing(
+    tmp_path: Path, before: str | None, said: str
+) -> None:
+    python = "nowhere/python" if before is None else python_that(tmp_path, before)
+    folder, done = make(tmp_path, python, "demo")
+    line, *rest = done.stderr.splitlines()
+    assert said in line and done.returncode != 0
+    assert len(rest) == 1 and rest[0].startswith("make: *** "), done.stderr
+    assert not (folder / ".venv").exists()
+
+
+@pytest.mark.slow
+def test_make_replaces_a_venv_that_another_python_or_half_an_install_left(tmp_path: Path) -> None:
+    """Without an index the install itself ends in an error; what is made before is whole all the same."""
+    bin_folder = tmp_path / "checkout" / ".venv" / "bin"
+    bin_folder.mkdir(parents=True)
+    (bin_folder / "python").symlink_to("/nowhere/python3.9")  # venv itself keeps a link that is there
+    make(tmp_path, sys.executable)
+    found = subprocess.run(
+        [bin_folder / "python", "-c", "import pip, sys; print(sys.version)"], capture_output=True, text=True
+    )
+    assert found.stdout.strip() == sys.version, found.stderr
+    kept = bin_folder.parent / "kept"
+    kept.touch()
+    make(tmp_path, sys.executable)
+    assert kept.exists(), "what is whole is gone on with"
