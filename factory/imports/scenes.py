@@ -24,10 +24,12 @@ from factory.readers.navsim.tracks import (
     window_agents,
     world_from_ego,
 )
+from factory.readers.pictures import BadPicture, jpeg_size, refuse_size, without_exif
 from factory.stages.rows import scene_columns
 from tasks.render.settings import ImageSource
 from tasks.world.agents import PER_STEP, AgentTracks
 from tasks.world.arrays import Array
+from tasks.world.camera import Camera
 from tasks.world.clip import CLIP_STEPS, HORIZON_STEPS, NOW, STEP_S, Clip, Scene, scene_of_clip
 from tasks.world.frames import to_local
 from tasks.world.lanes import LightState, RoadMap, Route, TrafficLights
@@ -119,14 +121,15 @@ def label_columns_of(scene: Scene, poses: Array) -> dict[str, object]:
 
 
 def pictures(frames: Sequence[Frame], folder: Path, source: ImageSource, file: str) -> dict[str, object]:
-    """The columns of the pictures of frames that end now: the files' own bytes, with the rig of now. Raises BadClip.
+    """The columns of the pictures of frames that end now: the files' own bytes but for Exif, with the rig of now.
 
-    file: whose frames they are, named where they have none.
+    Raises BadClip. file: whose frames they are, named where they have none.
     """
     images = blobs_of(frames, folder).images
     if not images:
         raise BadClip(file, "cams", f"none of its pictures is in {folder}; pictures=false imports it without")
     now_s = (len(frames) - 1) * COARSE_STEPS * STEP_S
+    rig = {camera.name: camera for camera in rig_of(frames[-1], images, file)}
     return {
         "cameras": [
             {
@@ -137,14 +140,14 @@ def pictures(frames: Sequence[Frame], folder: Path, source: ImageSource, file: s
                 "distortion": camera.distortion,
                 "ego_from_camera": camera.ego_from_camera.ravel(),
             }
-            for camera in rig_of(frames[-1], images, file)
+            for camera in rig.values()
         ],
         "images": [
             {
                 "camera": image.sensor,
                 "time_s": image.time_s - now_s,
                 "ego_pose": image.world_from_ego.ravel(),
-                "jpeg": _jpeg(Path(image.uri)),
+                "jpeg": _jpeg(Path(image.uri), rig[image.sensor]),
             }
             for image in images
         ],
@@ -152,12 +155,16 @@ def pictures(frames: Sequence[Frame], folder: Path, source: ImageSource, file: s
     }
 
 
-def _jpeg(path: Path) -> bytes:
-    """A whole file. Raises BadClip where it is no JPEG or is cut off."""
+def _jpeg(path: Path, camera: Camera) -> bytes:
+    """A whole file, without Exif. Raises BadClip where it is no JPEG of the camera's size or is cut off."""
     try:
         data = path.read_bytes()
     except OSError as error:
         raise BadClip(str(path), "image", f"cannot be read: {error.strerror}") from error
-    if not data.startswith(b"\xff\xd8") or b"\xff\xd9" not in data[-64:]:
+    try:
+        refuse_size(jpeg_size(data), (camera.width, camera.height), camera.name)
+    except BadPicture as error:
+        raise BadClip(str(path), error.field, str(error)) from error
+    if b"\xff\xd9" not in data[-64:]:
         raise BadClip(str(path), "image", f"{len(data)} bytes that are no whole JPEG")
-    return data
+    return without_exif(data)

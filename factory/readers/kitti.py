@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 
-import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from factory.files import matching
 from factory.readers.base import BadClip
+from factory.readers.pictures import BadPicture, decode_rgb
 from tasks.render.scene.sensed import Photo, Sweep
 from tasks.world.arrays import Array
 
@@ -57,10 +57,10 @@ class KittiDrive:
             path = self.folder / camera / "data" / f"{frame:010d}.png"
             if not path.is_file():
                 raise BadClip(str(path), "image", "is missing; download the drive's synced+rectified data again")
-            image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-            if image is None:
-                raise BadClip(str(path), "image", "cannot be decoded; download the drive again")
-            rgb = np.ascontiguousarray(image[..., ::-1], np.uint8)
+            try:
+                rgb = decode_rgb(path.read_bytes())
+            except BadPicture as error:
+                raise BadClip(str(path), error.field, f"{error}; download the drive again") from error
             pose = self.world_from_imu[frame] @ np.linalg.inv(rig.camera_from_imu)
             intrinsics = rig.intrinsics_of(rgb.shape[1], rgb.shape[0])
             out.append(Photo(camera, float(self.times_s[frame]), rgb, intrinsics, pose))

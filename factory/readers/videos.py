@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from factory.readers.base import BadClip
+from factory.readers.pictures import MAX_PIXELS, BadPicture, refuse_size
 from tasks.world.arrays import Bytes
 
 _NAMED = re.compile(r"(?s)(.+)#frame=(\d{1,6})")  # a million frames at most: at 12 Hz a day of driving
@@ -37,14 +38,17 @@ def video_frames(video: Path, frames: Collection[int], width: int, height: int) 
             if not container.streams.video:
                 raise BadClip(file, "video", "holds no pictures")
             stream = container.streams.video[0]
-            if (stream.width, stream.height) != (width, height):
-                raise BadClip(file, "size", f"{stream.width}x{stream.height}, but its camera takes {width}x{height}")
+            refuse_size((stream.width, stream.height), (width, height))
+            stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}  # whatever the pictures themselves say
             for frame in container.decode(stream):
                 if shown > last:
                     return
+                refuse_size((frame.width, frame.height), (width, height))
                 if shown in frames:
                     yield shown, np.asarray(frame.to_ndarray(format="rgb24", width=width, height=height), np.uint8)
                 shown += 1
+    except BadPicture as error:
+        raise BadClip(file, error.field, str(error)) from error
     except (FFmpegError, OSError) as error:
         raise BadClip(file, "video", f"cannot be decoded after {shown} frames: {error}") from error
     if shown <= last:

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from factory.files import matching
+from factory.readers.pictures import BadPicture, decode_grey
 from tasks.render.views import straightened, undistorted
 from tasks.world.arrays import Bools
 from tasks.world.camera import Camera
@@ -30,12 +31,10 @@ def read_masks(folder: str, cameras: Sequence[Camera]) -> Mapping[str, Bools]:
         if camera.name not in files:
             continue
         path = files[camera.name]
-        mask = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_GRAYSCALE)
-        if mask is None:
-            raise ValueError(f"render.own_body: {path} is not an image that can be decoded")
-        if mask.shape != (camera.height, camera.width):
-            size = f"{mask.shape[1]}x{mask.shape[0]}"
-            raise ValueError(f"render.own_body: {path} is {size}, but its camera takes {camera.width}x{camera.height}")
+        try:
+            mask = decode_grey(path.read_bytes(), (camera.width, camera.height))
+        except BadPicture as error:
+            raise ValueError(f"render.own_body: {path} is {error}") from error
         found[camera.name] = np.asarray(mask >= WHITE)
     return found
 

@@ -11,6 +11,7 @@ from factory.readers.av2.log import read_feather
 from factory.readers.base import BadClip
 from factory.readers.nuscenes_points import read_points
 from factory.readers.pcd import read_pcd
+from factory.readers.pictures import BadPicture, decode_rgb
 from factory.readers.videos import file_and_frame, video_frames
 from factory.stages.own_body import NO_MASKS, resized_mask
 from tasks.render.scene.driven_road import driven_roads
@@ -106,14 +107,14 @@ def encode_jpeg(image: Bytes, quality: int, chroma: Chroma = "420") -> bytes:
     return data.tobytes()
 
 
-def decode_image(data: bytes, name: str) -> Bytes:
-    """Encoded bytes (JPEG or PNG) as rgb (H, W, 3). Raises BadClip that names `name`."""
-    if not data:
-        raise BadClip(name, "image", "the file is empty")
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    if image is None:
-        raise BadClip(name, "image", "not an image that can be decoded")
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
+def decode_image(data: bytes, name: str, camera: Camera | None = None) -> Bytes:
+    """Encoded bytes (JPEG or PNG) as rgb (H, W, 3). Raises BadClip that names `name`, also where it is not of the size
+    that its `camera` takes.
+    """
+    try:
+        return decode_rgb(data) if camera is None else decode_rgb(data, (camera.width, camera.height), camera.name)
+    except BadPicture as error:
+        raise BadClip(name, error.field, str(error)) from error
 
 
 def opened_photos(files: Sequence[SensorFile], cameras: Sequence[Camera]) -> Iterator[tuple[int, Bytes]]:
@@ -123,10 +124,7 @@ def opened_photos(files: Sequence[SensorFile], cameras: Sequence[Camera]) -> Ite
     """
     took = {camera.name: camera for camera in cameras}
     for row, image in _opened(files, took):
-        file, camera = files[row], took[files[row].sensor]
-        if image.shape[:2] != (camera.height, camera.width):
-            size = f"{image.shape[1]}x{image.shape[0]}"
-            raise BadClip(file.uri, "size", f"{size}, but {camera.name} takes {camera.width}x{camera.height}")
+        camera = took[files[row].sensor]
         yield row, image if camera.fisheye is None else straightened(image, camera.fisheye)
 
 
@@ -139,7 +137,7 @@ def _opened(files: Sequence[SensorFile], took: Mapping[str, Camera]) -> Iterator
                 data = path.read_bytes()
             except OSError as error:
                 raise BadClip(file.uri, "image", f"cannot be read: {error.strerror}") from error
-            yield row, decode_image(data, file.uri)
+            yield row, decode_image(data, file.uri, took[file.sensor])
         else:
             filmed.setdefault((path, file.sensor), {})[frame] = row
     for (path, sensor), rows in filmed.items():

@@ -20,6 +20,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from factory.readers.pictures import BadPicture, decode_rgb
 from factory.store.counts.codes import beginning, fixed_bytes
 from factory.store.location import Location
 from factory.store.mcap_shards.mirror import McapTable, open_shard
@@ -241,13 +242,10 @@ def image_of(sample: Mapping[str, Any], camera: str, time_s: float) -> Bytes:
 
 def decoded(image: Mapping[str, Any]) -> Bytes:
     """The pixels of one of a row's images (height, width, 3) uint8 RGB. Raises ValueError where it is no picture."""
-    import cv2
-
-    data = np.frombuffer(image["jpeg"], np.uint8)
-    pixels = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
-    if pixels is None:
-        raise ValueError(f"image of camera {image['camera']} at {image['time_s']:.1f} s cannot be decoded")
-    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+    try:
+        return decode_rgb(image["jpeg"])
+    except BadPicture as error:
+        raise ValueError(f"image of camera {image['camera']} at {image['time_s']:.1f} s: {error}") from error
 
 
 def labels_of(sample: Mapping[str, Any], vocabulary: str | None = None) -> VocabularyLabels:

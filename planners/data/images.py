@@ -21,6 +21,7 @@ import cv2
 import numpy as np
 import simplejpeg
 
+from factory.readers.pictures import jpeg_size
 from factory.store.reader import TIME_TOLERANCE_S
 from planners.data.batch import ImageLayout
 from tasks.world.arrays import Array, Bytes
@@ -83,7 +84,7 @@ def stitch(jpegs: Sequence[Bytes], layout: ImageLayout, out: Bytes) -> None:
     Every camera is brought to the same height, and together they are brought to the width.
     Raises ValueError for what is not a JPEG, or a damaged one.
     """
-    sizes = tuple(jpeg_size(jpeg) for jpeg in jpegs)
+    sizes = tuple(jpeg_size(jpeg)[::-1] for jpeg in jpegs)
     for jpeg, part in zip(jpegs, _parts(sizes, layout)):
         _place(_decoded(jpeg, part.decoded), part, out)
 
@@ -160,18 +161,3 @@ def _parts(sizes: tuple[tuple[int, int], ...], layout: ImageLayout) -> tuple[_Pa
 def _inside(n: int, share: float) -> slice:
     """What is left of n rows or columns that lose a share at either end."""
     return slice(round(share * n), n - round(share * n))
-
-
-def jpeg_size(jpeg: Bytes) -> tuple[int, int]:
-    """Rows, columns, from the header. Raises ValueError for what is not a JPEG."""
-    at = 2
-    head = jpeg[:2].tobytes()
-    while head == b"\xff\xd8" and at + 9 <= len(jpeg) and jpeg[at] == 0xFF:
-        marker = int(jpeg[at + 1])
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # a start of frame
-            rows, columns = jpeg[at + 5 : at + 9].view(">u2").tolist()
-            if rows and columns:
-                return rows, columns
-            break
-        at += 1 if marker == 0xFF else 2 + 256 * int(jpeg[at + 2]) + int(jpeg[at + 3])
-    raise ValueError(f"an image of {len(jpeg)} bytes is not a JPEG")

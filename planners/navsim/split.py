@@ -55,7 +55,10 @@ class ShownScene:
         if not images:
             raise BadClip(str(self.sensors / now.cameras[0].path), "image", f"missing, of token {self.token}")
         return tuple(
-            CameraShot(replace(camera, name=camera.name.lower()), decode_image(Path(image.uri).read_bytes(), image.uri))
+            CameraShot(
+                replace(camera, name=camera.name.lower()),
+                decode_image(Path(image.uri).read_bytes(), image.uri, camera),
+            )
             for camera, image in zip(rig_of(now, images, self.file), images)
         )
 

@@ -13,12 +13,11 @@ from pathlib import Path
 
 from factory.readers.base import BadClip
 from factory.readers.navsim.log import Frame
+from factory.readers.pictures import BadPicture, Size, jpeg_size
 from tasks.world.camera import Camera, SensorFile
 
 LIDAR = "lidar"
 FRAME_S = 0.5
-_FRAME_HEADERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # JPEG's segments that hold the picture's size
-_ALONE = frozenset((0x01, *range(0xD0, 0xD8)))  # markers without a segment
 
 
 @dataclass(frozen=True)
@@ -53,7 +52,7 @@ def rig_of(frame: Frame, images: Sequence[SensorFile], file: str) -> tuple[Camer
     cameras = []
     for camera in frame.cameras:
         if camera.name in first:
-            width, height = jpeg_size(Path(first[camera.name]))
+            width, height = _jpeg_size(Path(first[camera.name]))
             try:
                 cameras.append(
                     Camera(camera.name, width, height, camera.intrinsics, camera.distortion, camera.ego_from_camera)
@@ -63,28 +62,14 @@ def rig_of(frame: Frame, images: Sequence[SensorFile], file: str) -> tuple[Camer
     return tuple(cameras)
 
 
-def jpeg_size(path: Path) -> tuple[int, int]:
-    """Width and height [px] from a JPEG's header, without decoding it. Raises BadClip."""
+def _jpeg_size(path: Path) -> Size:
+    """Raises BadClip."""
     try:
-        with path.open("rb") as file:
-            if file.read(2) != b"\xff\xd8":
-                raise BadClip(str(path), "image", "no JPEG")
-            while True:
-                start, marker = file.read(1), file.read(1)
-                while marker == b"\xff":  # padding
-                    marker = file.read(1)
-                if start != b"\xff" or not marker:
-                    raise BadClip(str(path), "image", "a JPEG that is cut off")
-                if marker[0] in _ALONE:
-                    continue
-                length = int.from_bytes(file.read(2)) - 2
-                content = file.read(max(length, 0))
-                if len(content) != length or marker[0] == 0xDA:
-                    raise BadClip(str(path), "image", "a JPEG that is cut off")
-                if marker[0] in _FRAME_HEADERS and length >= 5:
-                    return int.from_bytes(content[3:5]), int.from_bytes(content[1:3])
+        return jpeg_size(path.read_bytes())
     except OSError as error:
         raise BadClip(str(path), "image", f"cannot be read: {error.strerror}") from error
+    except BadPicture as error:
+        raise BadClip(str(path), error.field, str(error)) from error
 
 
 def _below(folder: Path, path: str) -> Path:

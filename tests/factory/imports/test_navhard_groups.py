@@ -30,6 +30,7 @@ from tests.factory.imports.several_follow_ups import (
     write,
 )
 from tests.factory.readers.geopackage_writer import CITIES, stub_rows, write_geopackage
+from tests.pictures import turned
 
 pytestmark = pytest.mark.slow  # PDM-Closed from every scene
 PUBLIC = {  # group, frame, follow-up -> nc, dac, tlc, ddc, ep, ttc, lk, hc, ec, score
@@ -94,7 +95,12 @@ def test_rows_weights_and_final_score_are_the_public_code_s(root: Path, tmp_path
 
 
 def test_every_frame_has_the_pictures_of_its_own_history(root: Path, tmp_path: Path) -> None:
-    """Stage one those of the log, stage two those of the synthetic scenes, byte for byte, with their own rig."""
+    """Stage one those of the log, stage two those of the synthetic scenes, byte for byte, with their own rig.
+
+    But for Exif data, by which whoever opens a row's JPEG would turn it.
+    """
+    photo = root / "sensor_blobs/test" / log_frames()[max(GROUPS) - 1]["cams"]["CAM_B0"]["data_path"]
+    photo.write_bytes(turned(photo.read_bytes(), 3))
     assert imported(root, tmp_path / "out", f"sensors={root / 'sensor_blobs/test'}") == COMPLETE
     clips = [clip["clip_id"] for clip in json.loads((tmp_path / "out/benchmark.json").read_text())["clips"]]
     rig, rows = log_frames()[0]["cams"], list(SampleTable(tmp_path / "out"))

@@ -4,10 +4,12 @@ import json
 import math
 import re
 from collections.abc import Callable
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import av
+import cv2
 import numpy as np
 import pytest
 import scenarionet_scenarios as town
@@ -324,6 +326,31 @@ def test_where_no_sidecar_is_or_one_stands_for_several_logs_is_said_at_once(log:
         ScenarioNetReader(log, cameras=tmp_path / "photos", sensor_root=tmp_path / "gone")
     with pytest.raises(ValueError, match=r"goes with clips\.cameras"):
         ScenarioNetReader(log, sensor_root=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("size", "problem"),
+    [
+        ((128, 96), r"size: 128x96, but its camera takes 64x48"),
+        ((9000, 8000), "video: cannot be decoded after 1 frame"),
+    ],
+)
+def test_a_frame_that_is_larger_than_its_video_says_is_refused(
+    tmp_path: Path, size: tuple[int, int], problem: str
+) -> None:
+    """Before it is decoded where it has more pixels than any picture may have."""
+    frames = [cv2.imencode(".png", np.full((h, w), 90, np.uint8))[1].tobytes() for w, h in (SIZE, size, SIZE)]
+    with av.open(str(tmp_path / "a.avi"), "w") as container:
+        stream = container.add_stream("png", rate=2)
+        (stream.width, stream.height), stream.pix_fmt = SIZE, "gray"
+        for k, frame in enumerate(frames):
+            packet = av.Packet(frame)
+            packet.stream, packet.pts, packet.dts, packet.time_base = stream, k, k, Fraction(1, 2)
+            container.mux(packet)
+    shown = video_frames(tmp_path / "a.avi", {0, 1, 2}, *SIZE)
+    assert next(shown)[0] == 0
+    with pytest.raises(BadClip, match=rf"a\.avi: {problem}"):
+        next(shown)
 
 
 def test_frames_are_named_by_their_place_in_the_video() -> None:

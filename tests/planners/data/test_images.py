@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from factory.readers.pictures import jpeg_size
 from planners.data.batch import ImageLayout
-from planners.data.images import chosen_cameras, jpeg_size, stitch, stitched
+from planners.data.images import chosen_cameras, stitch, stitched
 from tests.planners.samples import FRONT_YAWS, Pixels, grey_pictures, jpeg, pictures, plain
 
 PUBLIC = ImageLayout(width=512, height=128)
@@ -172,4 +173,4 @@ def test_what_cannot_be_stitched_says_why() -> None:
 def test_the_size_is_read_from_the_header() -> None:
     for quality, flags in ((90, []), (50, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1]), (90, [cv2.IMWRITE_JPEG_RST_INTERVAL, 1])):
         data = cv2.imencode(".jpg", plain((1, 2, 3), 45, 31), [cv2.IMWRITE_JPEG_QUALITY, quality, *flags])[1]
-        assert jpeg_size(data.ravel()) == (31, 45)
+        assert jpeg_size(data.ravel()) == (45, 31)

@@ -267,7 +267,7 @@ def test_pictures_that_a_planner_lacks_are_named(files: Path, capsys: pytest.Cap
     assert f"{picture}: image: missing" in capsys.readouterr().err
     picture.write_bytes(b"")
     assert submit(files, folder, *here) == BAD_CONFIG
-    assert f"{picture}: image: no JPEG" in capsys.readouterr().err
+    assert f"{picture}: image: the file is empty" in capsys.readouterr().err
     picture.write_bytes(whole)
     scene = scene_pickles.scene_of_log(log_frames(), 12, TOKENS[0])
     scene_pickles.write_scene(files / "navhard_two_stage/synthetic_scene_pickles", scene)

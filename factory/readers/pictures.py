@@ -1,0 +1,159 @@
+"""Encoded pictures: what their header says, and their pixels as they are stored. All pictures are decoded here but for
+those of a planner's batches, which a faster decoder reads after the same look at the header.
+
+A kilobyte may declare 30,000 x 30,000 pixels, for which a decoder takes gigabytes: the header is looked at first. An
+EXIF orientation is not followed, which OpenCV does by itself: intrinsics are of the pixels as they are stored.
+"""
+
+from collections.abc import Iterator
+from typing import TypeAlias
+
+import numpy as np
+
+from tasks.world.arrays import Bytes
+
+MAX_PIXELS = 1 << 26  # 8192 x 8192, 200 MB decoded; the largest driving cameras have an eighth of it
+Size: TypeAlias = tuple[int, int]  # width, height [px]
+JPEG, PNG = b"\xff\xd8", b"\x89PNG\r\n\x1a\n"
+OTHERS = {  # what a file of another format begins with
+    b"BM": "BMP",
+    b"GIF8": "GIF",
+    b"II*\0": "TIFF",
+    b"MM\0*": "TIFF",
+    b"RIFF": "WebP",
+    b"PF": "PFM",
+    b"Pf": "PFM",
+    b"#?": "Radiance HDR",
+    b"v/1\x01": "OpenEXR",
+}
+SIZED = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # JPEG's segments that hold the picture's size
+ALONE = frozenset((0x01, *range(0xD0, 0xD8)))  # markers without a segment
+SCAN, APP1 = 0xDA, 0xE1  # where the pixels begin; Exif and XMP
+
+
+class BadPicture(ValueError):
+    """No picture that is decoded: says why; `field` is image or size."""
+
+    def __init__(self, problem: str, field: str = "image") -> None:
+        super().__init__(problem)
+        self.field = field
+
+
+def header_of(data: bytes | Bytes) -> tuple[str, Size]:
+    """JPEG or PNG, and the size that the header declares, whatever it is. Raises BadPicture."""
+    view = memoryview(data)
+    if view[:8] == PNG:
+        name, size = "PNG", (_number(view[16:20]), _number(view[20:24])) if view[12:16] == b"IHDR" else (0, 0)
+    elif view[:2] == JPEG:
+        name, size = (
+            "JPEG",
+            next((_size(view[at:end]) for marker, at, end in _segments(view) if marker in SIZED), (0, 0)),
+        )
+    else:
+        raise BadPicture(_other(bytes(view[:8])))
+    if not (size[0] and size[1]):
+        raise BadPicture(f"a {name} that is cut off")
+    return name, size
+
+
+def jpeg_size(data: bytes | Bytes) -> Size:
+    """Of a JPEG alone, at most MAX_PIXELS. Raises BadPicture."""
+    name, size = header_of(data)
+    if name != "JPEG":
+        raise BadPicture(f"a {name}, not a JPEG")
+    refuse_size(size)
+    return size
+
+
+def refuse_size(size: Size, wanted: Size | None = None, camera: str = "its camera") -> None:
+    """Raises BadPicture where a picture is not of its camera's size, or has more than MAX_PIXELS."""
+    if wanted is not None and size != wanted:
+        problem = f"but {camera} takes {_said(wanted)}: restore the picture, or correct the camera's size"
+        raise BadPicture(f"{_said(size)}, {problem}", "size")
+    if size[0] * size[1] > MAX_PIXELS:
+        raise BadPicture(f"{_said(size)}, more than the {MAX_PIXELS} pixels that are decoded: store it smaller", "size")
+
+
+def decode_rgb(data: bytes | Bytes, wanted: Size | None = None, camera: str = "its camera") -> Bytes:
+    """A JPEG or PNG (H, W, 3), of the size `wanted` where one is; grey, CMYK and 16 bits become RGB of 8.
+
+    Raises BadPicture, before anything is decoded where the header says so.
+    """
+    import cv2
+
+    return np.asarray(cv2.cvtColor(_decoded(data, cv2.IMREAD_COLOR, wanted, camera), cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def decode_grey(data: bytes | Bytes, wanted: Size | None = None, camera: str = "its camera") -> Bytes:
+    """The same in grey (H, W)."""
+    import cv2
+
+    return _decoded(data, cv2.IMREAD_GRAYSCALE, wanted, camera)
+
+
+def without_exif(jpeg: bytes) -> bytes:
+    """A JPEG without its Exif and XMP segments, byte for byte otherwise: nobody turns it by what these say.
+
+    Raises BadPicture for what is no JPEG.
+    """
+    jpeg_size(jpeg)
+    kept, rest = [], 0
+    for marker, at, end in _segments(memoryview(jpeg)):
+        if marker == APP1:
+            kept.append(jpeg[rest:at])
+            rest = end
+    return b"".join((*kept, jpeg[rest:]))
+
+
+def _decoded(data: bytes | Bytes, flags: int, wanted: Size | None, camera: str) -> Bytes:
+    import cv2
+
+    _, size = header_of(data)
+    refuse_size(size, wanted, camera)
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error as error:
+        raise BadPicture(f"not an image that can be decoded: {error.err}") from error
+    if pixels is None:
+        raise BadPicture("not an image that can be decoded")
+    return np.asarray(pixels, np.uint8)
+
+
+def _segments(jpeg: memoryview) -> Iterator[tuple[int, int, int]]:
+    """Marker, beginning and end of each segment of a JPEG before its pixels, as far as they are whole.
+
+    What stands between two segments is skipped, as decoders do.
+    """
+    at = 2
+    while at + 4 <= len(jpeg):
+        marker = jpeg[at + 1]
+        if jpeg[at] != 0xFF or marker in (0x00, 0xFF):
+            at += 1
+        elif marker in ALONE:
+            at += 2
+        else:
+            length = _number(jpeg[at + 2 : at + 4])
+            end = at + 2 + length
+            if length < 2 or end > len(jpeg) or marker == SCAN:
+                return
+            yield marker, at, end
+            at = end
+
+
+def _size(segment: memoryview) -> Size:
+    return _number(segment[7:9]), _number(segment[5:7])
+
+
+def _number(value: memoryview) -> int:
+    return int.from_bytes(value, "big")
+
+
+def _other(head: bytes) -> str:
+    if not head:
+        return "the file is empty"
+    other = next((f"a {name} file: convert it to" for begin, name in OTHERS.items() if head.startswith(begin)), "not")
+    return f"{other} a JPEG or PNG picture"
+
+
+def _said(size: Size) -> str:
+    return f"{size[0]}x{size[1]}"
