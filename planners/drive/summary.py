@@ -32,7 +32,7 @@ class DriveLine:
     start: str  # logged, perturbed
     drives: int
     clips: int
-    level: str  # of LEVELS, that the intervals draw: the highest of which there are two
+    level: str  # of LEVELS, that the intervals are over: the highest of which there are two
     shares: Mapping[str, Interval]  # of SHARES: mean (`b`), low, high
     km: float
     failures: int
@@ -94,7 +94,7 @@ def _mean(values: Array, clusters: Sequence[str], confidence: float, weights: Ar
 
 
 def highest_level(rows: Sequence[Row]) -> tuple[str, Sequence[str]]:
-    """Of clips that share a log or a town, whole ones are drawn: no independent draws else (planners.evaluation)."""
+    """Of clips that share a log or a town, whole ones are taken: no independent draws else (planners.evaluation)."""
     known = clusters_of([row["clip_id"] for row in rows], [row["log_id"] for row in rows])
     several = [level for level in LEVELS if level in known and len(set(known[level])) > 1]
     level = several[-1] if several else "clip"

@@ -1,11 +1,13 @@
-"""Paired bootstrap: how far the difference of two planners may lie from the measured one, over clips and seeds.
+"""How far the difference of two planners may lie from the measured one, over clips, logs or towns, and seeds.
 
 Both planners were scored on the same clips, so clips are drawn once for both and the differences keep their pairs.
-Clips that share a log or a town are no independent draws: where their clusters are given, whole clusters are drawn
-(Cameron, Gelbach & Miller 2008). From few clusters, as six towns are, an interval is rather too narrow than too wide.
 Several trainings of each are a second level: with equally many on both sides they are pairs (the same seeds) and are
 drawn as pairs, else on each side by itself. An interval runs between percentiles of the drawn differences
 (Efron & Tibshirani 1993, ch. 13).
+
+Clips that share a log or a town are no independent draws: where their clusters are given, whole clusters are drawn.
+From few clusters, as six towns are, such a bootstrap is too narrow, so the interval then holds the one of Student's t
+with a degree of freedom less than there are clusters as well (Cameron & Miller 2015, VI.A; trainings as they are).
 """
 
 import re
@@ -13,6 +15,7 @@ from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import stdtrit
 
 from tasks.world.arrays import Array, Indices
 
@@ -65,9 +68,9 @@ def paired_interval(
     """The mean of b minus that of a over the same C clips, with its interval.
 
     a, b: (S_a, C), (S_b, C) scores of each training on each clip; weights: of the same shapes, what each score counts
-    in a mean (the number of frames), by default equal; clusters: of each clip, by default its own. From a single
-    cluster nothing can be drawn, and the interval is NaN. Raises ValueError for other shapes, no clip, scores that are
-    not finite, or a confidence that is not between 0 and 1.
+    in a mean (the number of frames), by default equal; clusters: of each clip, whose interval is the wider of both, by
+    default each clip is drawn alone. From a single cluster nothing can be drawn, and the interval is NaN. Raises
+    ValueError for other shapes, no clip, scores that are not finite, or a confidence that is not between 0 and 1.
     """
     counts = weights if weights is not None else (np.ones_like(a), np.ones_like(b))
     _check(a, b, counts, confidence, draws)
@@ -85,7 +88,19 @@ def paired_interval(
         of_b = of_a if paired else _drawn(rng, size, len(b))
         differences[start : start + size] = _means(b, counts[1], of_b, clips) - _means(a, counts[0], of_a, clips)
     low, high = np.quantile(differences, [(1.0 - confidence) / 2.0, (1.0 + confidence) / 2.0])
+    if clusters is not None:
+        errors = _errors(b, counts[1], cluster_of_clip) - _errors(a, counts[0], cluster_of_clip)
+        error = np.sqrt(n_clusters / (n_clusters - 1) * (errors**2).sum())
+        half = stdtrit(n_clusters - 1, (1.0 + confidence) / 2.0) * error
+        low = min(low, max(mean_b - mean_a - half, b.min() - a.max()))  # no mean leaves the range of its scores
+        high = max(high, min(mean_b - mean_a + half, b.max() - a.min()))
     return Interval(mean_b - mean_a, float(low), float(high), mean_a, mean_b)
+
+
+def _errors(scores: Array, weights: Array, cluster_of_clip: Indices) -> Array:
+    """(G,) by how much the scores of each cluster move the weighted mean."""
+    off = weights * (scores - (scores * weights).sum() / weights.sum())
+    return np.bincount(cluster_of_clip, off.sum(axis=0)) / weights.sum()
 
 
 def _indices(clusters: Sequence[Hashable], n_clips: int) -> tuple[Indices, int]:

@@ -9,8 +9,8 @@
 A run is a folder that `python -m planners evaluate` made of one planner, a column of a study's clips.csv, or a table
 that NAVSIM's own scripts wrote (`.csv`, `.csv.gz`), against which a folder stands with the tables that it has. Several
 runs of a side are trainings of one planner with other seeds: clips and seeds are both drawn, pairs of seeds where both
-sides have equally many. Intervals over logs and over towns, where they are known, draw all clips of one together:
-clips of one log share their scene, and an interval over clips alone is too narrow.
+sides have equally many. Intervals over logs and over towns, where they are known, take all clips of one together
+(planners/evaluation/bootstrap.py): clips of one log share their scene, and an interval over clips alone is too narrow.
 """
 
 import csv
@@ -102,9 +102,9 @@ def row_of(found: ByLevel | None, scale: float = 100.0) -> dict[str, float | str
 
 
 def is_clear_row(row: Mapping[str, Any]) -> bool:
-    """The same of a row of `row_of`; not where it has no interval."""
+    """The same of a row of `row_of`; not where it has none over logs: clips of one log are no sample of any road."""
     known = [end for end in ("", "_log", "_town") if row.get(f"low{end}", "") != ""]
-    return bool(known) and all(row[f"low{end}"] > 0.0 or row[f"high{end}"] < 0.0 for end in known)
+    return "_log" in known and all(row[f"low{end}"] > 0.0 or row[f"high{end}"] < 0.0 for end in known)
 
 
 def compare_tables(a: Sequence[str], b: Sequence[str], settings: CompareSettings) -> dict[Measure, ByLevel]:

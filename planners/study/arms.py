@@ -1,7 +1,7 @@
 """What the arms of an experiment come to in closed loop, and beside the bounds: every number with an interval.
 
 An arm is one set-up's trainings with several seeds. All are held against each other on the drives that everybody has
-made; whole towns are drawn, or whole logs or clips where there are no two towns, and pairs of seeds with them.
+made; intervals are over whole towns, or whole logs or clips where there are no two towns, and over pairs of seeds.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -5,10 +5,9 @@
     python -m planners report folder=docs/study/logs/nuscenes/stage_two              of `python -m planners scaling`
 
 `folder` holds the frames.parquet that the study or a scaling sweep wrote; nothing else is read, nothing is trained or
-planned. `comparisons.csv` (means over seeds, differences with paired bootstrap intervals over seeds and clips, logs,
-towns), `trainings.csv` (each training), `clips.csv` (its score on each clip), `bounds.csv`, `tables.md` (to be read),
-`differences.png`, and where there are rounds enough `curves.csv` and pictures of it. Only the learning curves need the
-trainings' own folders.
+planned. `comparisons.csv` (means over seeds, differences with intervals over clips, logs and towns), `trainings.csv`
+(each training), `clips.csv` (its score on each clip), `bounds.csv`, `tables.md` (to be read), `differences.png`, and
+where there are rounds enough `curves.csv` and pictures of it. Only the learning curves need the trainings' own folders.
 """
 
 from collections import defaultdict
@@ -48,8 +47,9 @@ CURVES = {"final": "scaling.png", "stage_two": "scaling_stage_two.png"}
 RULES = CompareSettings(a="", b="")  # draws, confidence and seed as `python -m planners compare` has them
 CURVED = ("rounds", SWEEP)  # the parts that are scores over data
 INTERVALS = (
-    "In brackets: the difference from what the setup is held against, its 95 % interval over clips and, of stage two "
-    "and the final score, over logs and towns (paired bootstrap, with seeds); bold where zero lies outside of each."
+    "In brackets: the difference from what the setup is held against, its 95 % interval over clips (paired bootstrap, "
+    "with seeds) and, of stage two and the final score, over logs and towns (Student's t over these, or the bootstrap "
+    "where it is wider); bold where zero lies outside of each and there are several logs."
 )
 CLAIMED = ("stage_two", "final")  # the stages whose intervals over logs and towns are shown too
 
@@ -169,7 +169,7 @@ def _series(frames: StudyFrames) -> Mapping[tuple[str, str], list[str]]:
 
 
 def markdown_of(rows: Sequence[Row], human_filter: HumanFilter) -> str:
-    """EPDMS in percent; in brackets the difference from the reference with its intervals, bold where all exclude 0.
+    """EPDMS in percent; in brackets the difference from the reference with its intervals, bold where clear.
 
     The first interval is over clips. rows: those of comparisons.csv, a comparison's measures one after the other; of
     those with and without the human filter one is shown. A row that is itself a reference stands in front of what is
