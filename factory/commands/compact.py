@@ -21,7 +21,6 @@ class Request:
 
 def main(request: Request) -> None:
     """Merge and say what became of each table. Raises Refused."""
-    from factory.store.disk import DiskFull
     from factory.store.parquet_file import DamagedFile
     from factory.store.table import AnotherWriter
     from factory.store.upkeep import RunGoesOn, compact, hold
@@ -31,7 +30,7 @@ def main(request: Request) -> None:
         hold(store)
         for merged in compact(store):
             print(f"{merged.table:<13}{merged.before} files, now {merged.after}")
-    except (RunGoesOn, AnotherWriter, DiskFull) as error:
+    except (RunGoesOn, AnotherWriter) as error:
         raise Refused(str(error)) from error
     except DamagedFile as error:
         raise Refused(f"{error}; python -m factory verify out={request.out} repair=true takes it out") from error

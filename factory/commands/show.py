@@ -87,7 +87,7 @@ def sample_lines(store: "Store", table: "SampleTable", which: str, request: Requ
             write_mp4(path.with_suffix(".mp4"), film(row, scene, logged))
             yield f"film          {path.with_suffix('.mp4').resolve()}"
     except OSError as error:
-        raise Refused(f"to={request.to}: the picture cannot be written: {error}") from error
+        raise Refused(f"to={request.to or '.'}: the picture cannot be written: {error}") from error
 
 
 def _picture_path(attempt_id: str, to: str | None) -> Path:

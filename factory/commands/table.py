@@ -8,7 +8,7 @@ from importlib import import_module
 from types import ModuleType
 
 from factory import __version__
-from factory.config.arguments import answer
+from factory.config.arguments import answer, keys_of
 from factory.config.words import nearest
 from factory.exits import BAD_CONFIG
 
@@ -29,7 +29,22 @@ class Command:
         """What answers: arguments -> exit code."""
         module = self.imported()
         found: Callable[[Sequence[str]], int] = getattr(module, self.function)
-        return partial(answer, module) if hasattr(module, "Request") else found
+        return partial(_answered, module) if hasattr(module, "Request") else found
+
+
+def _answered(module: ModuleType, argv: Sequence[str]) -> int:
+    """As `answer`; where no file may be written or the disk is full, a line that says where, and exit code 2."""
+    try:
+        return answer(module, argv)
+    except Exception as error:
+        from factory.store.disk import why_not_written
+
+        why = why_not_written(error)
+        if not why:
+            raise
+        elsewhere = ", or give to=<another place>" if "to" in keys_of(module.Request) else ""
+        print(f"error: {why}{elsewhere}", file=sys.stderr)
+        return BAD_CONFIG
 
 
 COMMANDS: Mapping[str, Command] = {

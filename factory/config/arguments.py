@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin, get_type_h
 from factory.config.shapes import choices_of, defaults_of, described, plain, to_give
 from factory.config.words import SHOW, ConfigError, SettingsShown, at_home, nearest, without_show
 from factory.exits import BAD_CONFIG
-from factory.store.disk import why_not_written
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -40,13 +39,6 @@ def answer(command: ModuleType, argv: Sequence[str]) -> int:
         return 0
     except (Refused, ConfigError, MemoryError) as error:
         print(f"error: {error}", file=sys.stderr)
-        return BAD_CONFIG
-    except Exception as error:
-        why = why_not_written(error)
-        if not why:
-            raise
-        elsewhere = "give to=<another place>, or " if "to" in keys_of(command.Request) else ""
-        print(f"error: {why}; {elsewhere}run it as a user who may write there, or on a copy", file=sys.stderr)
         return BAD_CONFIG
 
 

@@ -74,17 +74,15 @@ def why_disk_full(error: BaseException) -> str:
 
 
 def why_not_written(error: BaseException) -> str:
-    """What a disk said that is full or not to be written, where that is behind the error; else nothing."""
+    """What a disk said that is full or not to be written, and what helps, where that is behind the error."""
     seen: BaseException | None = error
     while seen is not None:
-        if isinstance(seen, NotWritable):
-            return str(seen)
         number = _number_of(seen)
-        if number in REFUSED:
-            where = getattr(seen, "filename", None)
-            return one_line(seen) if where is None else f"{where}: {os.strerror(number)}"
+        if isinstance(seen, NotWritable) or number in REFUSED:
+            return f"{one_line(seen)}; run it as a user who may write there, or on a copy"
         seen = seen.__cause__ or seen.__context__
-    return why_disk_full(error)
+    full = why_disk_full(error)
+    return full and f"{full}; free disk space"
 
 
 def existing(path: Path) -> Path:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from deltalake.exceptions import DeltaError
 
-from factory.store.disk import DiskFull
+from factory.store.disk import DiskFull, NotWritable
 
 NUMBERS = frozenset(
     getattr(errno, name)
@@ -50,7 +50,7 @@ def why_ill(error: BaseException) -> str:
     while seen is not None:
         if isinstance(seen, MemoryError) and _memory_left() < SHORT_OF_MEMORY:
             return f"out of memory: {seen}"
-        if isinstance(seen, PlaceRefused | DiskFull | ConnectionError | TimeoutError) or _is_ill(seen):
+        if isinstance(seen, PlaceRefused | DiskFull | NotWritable | ConnectionError | TimeoutError) or _is_ill(seen):
             return str(seen)
         seen = seen.__cause__ or seen.__context__
     return ""

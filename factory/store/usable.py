@@ -11,7 +11,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from factory.store.disk import existing, needs_disk
+from factory.store.disk import NotWritable, existing, needs_disk
 from factory.wording import one_line
 
 TRIAL_BYTES = 4 * 2**20  # a row group, the least that samples with pictures are written in
@@ -52,6 +52,8 @@ def _why_not_local(out: str, path: Path, above: Path) -> str:
             finally:  # before the free space is told
                 trial.unlink(missing_ok=True)
     except OSError as error:
+        if isinstance(error, NotWritable):
+            return f"out={out}: {str(error).removeprefix(f'{path}: ')}"
         if error.errno is None:  # DiskFull, which says it all
             return f"out={out}: {error}"
         why = "no file can be made there" if error.errno == errno.ENOENT else error.strerror or str(error)

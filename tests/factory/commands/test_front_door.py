@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -21,6 +21,7 @@ from factory.commands.table import COMMANDS, DOORS, PLANNERS
 from factory.exits import MEANING
 from factory.graph.episodes import EpisodesWanted
 from factory.graph.execute import execute
+from factory.store.commit_copies import COPIES
 from factory.store.counts.funnel import funnel_of
 from factory.store.samples import CURRENT_RUN, Store
 from factory.views.show import prepared_episode
@@ -228,6 +229,57 @@ def test_lineage_of_what_is_no_sample_says_what_became_of_it(out: Path, capsys: 
     code, text, _ = ask(capsys, "lineage", f"out={out}", f"sample={rejected['attempt_id']}")
     assert code == 0 and "no sample" in text and f"reward.{rejected['reason']}" in text
     assert ask(capsys, "lineage", "zz", f"out={out}")[0] == 2
+
+
+# Of root alone: it may write whatever its capabilities, which are dropped here, let it.
+DROPPED = ["setpriv", "--bounding-set=-all", "--inh-caps=-all"] if os.getuid() == 0 else []
+
+
+@pytest.fixture(scope="module")
+def read_only(out: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The same samples where nobody may write, with a leftover, and something to repair."""
+    if DROPPED and shutil.which("setpriv") is None:
+        pytest.skip("root may write everywhere, and there is no setpriv to take that away")
+    folder = tmp_path_factory.mktemp("read_only") / "run"
+    shutil.copytree(out, folder)
+    leftover = folder / ".report.html.0.tmp"
+    leftover.touch()
+    os.utime(leftover, (0, 0))
+    copy = folder / "candidates" / COPIES / f"{0:020}.json"
+    copy.write_bytes(copy.read_bytes()[:-9])
+    rights = {place: place.stat().st_mode for place in (folder, *folder.rglob("*"))}
+    for place, mode in rights.items():
+        place.chmod(mode & 0o555)
+    yield folder
+    for place, mode in rights.items():
+        place.chmod(mode)
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        ("report", 2, "{out}/report.html: cannot be written: Permission denied; run it as"),
+        ("clean", 2, "{out}/"),
+        ("compact", 2, "{out}/"),
+        ("verify repair=true", 2, "{out}/"),
+        ("retry", 2, "out={out}: cannot be written: Permission denied"),
+        ("run executor=local", 2, "out={out}: cannot be written: Permission denied"),
+        ("import simscale root={out}", 2, "out={out}: cannot be written: Permission denied"),
+        ("export mcap sample=0 to=.", 0, ""),
+        ("status", 0, ""),
+    ],
+)
+def test_a_run_that_nobody_may_write_to_is_read_and_what_would_write_says_so_in_a_line(
+    words: str, code: int, said: str, read_only: Path, tmp_path: Path
+) -> None:
+    name, *rest = words.format(out=read_only).split()
+    script = [*DROPPED, sys.executable, "-m", "factory", name, *rest, f"out={read_only}"]
+    env = os.environ | {"PYTHONPATH": str(REPOSITORY)}
+    done = subprocess.run(script, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=120)
+    assert done.returncode == code, done.stderr
+    if code == 2:
+        (line,) = done.stderr.splitlines()
+        assert line.startswith("error: ") and said.format(out=read_only) in line and "Permission denied" in line
 
 
 @pytest.fixture
