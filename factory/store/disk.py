@@ -20,7 +20,7 @@ class DiskFull(OSError):
     """The disk or the quota of a path is full; the message has the path, what is needed and what is free."""
 
 
-class NotWritable(OSError):
+class NotWritable(PermissionError):
     """Who runs this may not write at a path, or nobody may; the message has the path and the reason."""
 
 
