@@ -1,6 +1,6 @@
 """What a run would take: the clips it would read, and attempts, hours and GB extrapolated from three clips.
 
-And in what its set-up differs from the paper's, which conf/preset/paper.yaml holds: one line at its start.
+And in what its set-up differs from the paper's, to which conf/preset/paper.yaml comes nearest: one line at its start.
 """
 
 import os
@@ -17,6 +17,7 @@ from factory.setup.settings import Run
 from factory.store.counts.funnel import funnel_of
 from factory.store.samples import Store
 from factory.store.schema import BOOKKEEPING, sample_row_to_table
+from tasks.render.settings import RenderMode
 from tasks.stages import TASKS, Rejected
 from tasks.world.vocabulary import Vocabulary
 
@@ -166,11 +167,21 @@ def by_the_tables(store: Store, experts: Sequence[str], rounds: int, n_clips: in
 
 
 def setup_text(config: RunConfig, vocabulary: Vocabulary) -> str:
-    """One line: that the set-up is the paper's, or every setting that is another, with the paper's in brackets."""
-    found = differences(config, vocabulary)
-    if not found:
-        return "set-up: the paper's (preset=paper)"
-    return f"set-up: not the paper's (in brackets; preset=paper): {', '.join(found)}"
+    """One line: settings that are not preset=paper's, with those in brackets, and what no preset makes the paper's."""
+    found = [*differences(config, vocabulary), *beyond_settings(config)]
+    return f"set-up: not the paper's (in brackets; preset=paper comes nearest): {', '.join(found)}"
+
+
+def beyond_settings(config: RunConfig) -> list[str]:
+    """What of this set-up is not as the paper's text (3.2, supplement) or the public code has it, in any preset."""
+    found = ["walks that go on to the next candidate until one is accepted (the rates fit one draw a round)"]
+    if config.traffic.mode == "idm":
+        found.append("IDM along the lane graph (the public code's brakes for each lane's end: traffic=navsim)")
+    if config.render.mode is not RenderMode.NONE:
+        found.append(f"render.frames={config.render.frames} (all of T .. T+2H)")
+        gate = "the project's own picture gate" if config.render.gate.enabled else "no picture gate"
+        found.append(f"{gate} (unstable renderings are left out, by a rule that is not published)")
+    return found
 
 
 def differences(config: RunConfig, vocabulary: Vocabulary) -> list[str]:

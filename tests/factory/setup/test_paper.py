@@ -1,5 +1,7 @@
-"""A run says in what it differs from the paper's set-up; the preset differs in nothing."""
+"""A run says in what it differs from the paper's set-up; the preset in no setting, and yet in what none decides."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +9,7 @@ import pytest
 
 from factory.config.compose import ConfigError
 from factory.config.run import RunConfig, load_config
-from factory.setup.calibrate import differences, setup_text
+from factory.setup.calibrate import beyond_settings, differences, setup_text
 from factory.setup.settings import choose_vocabulary
 from tasks.world.kinematic_vocabulary import kinematic_trajectories
 from tasks.world.vocabulary import Vocabulary
@@ -22,13 +24,32 @@ def paper(*overrides: str) -> RunConfig:
     return load_config(["preset=paper", "vocabulary.file=/mine.npy", *overrides])
 
 
-def test_the_preset_is_the_paper_s_set_up(vocabulary: Vocabulary) -> None:
+def test_the_preset_has_the_paper_s_settings(vocabulary: Vocabulary) -> None:
     config = paper()
     assert differences(config, vocabulary) == []
-    assert setup_text(config, vocabulary) == "set-up: the paper's (preset=paper)"
     assert (config.rounds, config.vocabulary.k, config.render.width, config.render.height) == (5, 16384, 1920, 1080)
     assert (config.render.psnr_min, config.render.camera_psnr_min) == (27.0, 0.0)
     assert (config.perturb.epdms_min, config.reward.progress_above) == (0.8, 0.5)
+
+
+def test_the_command_says_what_no_preset_makes_the_paper_s(tmp_path: Path) -> None:
+    np.save(tmp_path / "human.npy", kinematic_trajectories(16384, seed=0))
+    asked = ["preset=paper", f"vocabulary.file={tmp_path / 'human.npy'}", "clips=synthetic", "clips.n_clips=1"]
+    asked += ["clips.settings.cameras=[]", "clips.settings.lidar_beams=0", "experts=[human]", f"out={tmp_path / 'out'}"]
+    said = subprocess.run([sys.executable, "-m", "factory", "plan", *asked], capture_output=True, text=True, check=True)
+    (line,) = (line for line in said.stdout.splitlines() if line.startswith("set-up: "))
+    assert line == (
+        "set-up: not the paper's (in brackets; preset=paper comes nearest): walks that go on to the next candidate "
+        "until one is accepted (the rates fit one draw a round), IDM along the lane graph (the public code's brakes for "
+        "each lane's end: traffic=navsim), render.frames=history (all of T .. T+2H), no picture gate (unstable renderings are left out, "
+        "by a rule that is not published)"
+    )
+
+
+def test_what_a_run_has_not_is_not_said_of_it() -> None:
+    (walks,) = beyond_settings(paper("render=none", "traffic=navsim"))
+    assert walks.startswith("walks that go on")
+    assert "the project's own picture gate (unstable" in beyond_settings(load_config([]))[-1]
 
 
 def test_the_defaults_differ_in_vocabulary_pictures_and_gates() -> None:

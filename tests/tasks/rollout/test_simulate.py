@@ -208,6 +208,17 @@ def test_a_replayed_car_waits_neither_for_the_ego_nor_for_a_driven_car_beside_it
     assert np.array_equal(rollout.agents.boxes[:, 1], scene.agents.boxes[NOW : NOW + 41, 1])
 
 
+@pytest.mark.parametrize("settings", [IDM, PLAIN, *(TrafficSettings(mode=mode) for mode in ("replay", "navsim"))])
+@pytest.mark.parametrize("kind", [AgentKind.PEDESTRIAN, AgentKind.BICYCLE])
+def test_nobody_on_foot_or_on_a_bicycle_waits_for_the_ego(settings: TrafficSettings, kind: AgentKind) -> None:
+    """As every page says: they walk their log through an ego that stands on their way."""
+    walker = Track(0.0, kind=kind, size=(0.6, 0.6), poses=walk(14.0, -3.6, 1.0))
+    scene = worlds.scene(worlds.straight_road(), walker, ego=(13.0, 0.0, 0.0))
+    agents = run(scene, settings).agents
+    assert np.array_equal(agents.boxes[:, 0], scene.agents.boxes[NOW : NOW + 41, 0])
+    assert np.hypot(agents.boxes[:, 0, 0] - 14.4, agents.boxes[:, 0, 1]).min() < 0.5, "it meets the ego's body"
+
+
 def test_a_log_is_a_path_unless_it_stands_or_reverses() -> None:
     along = np.arange(0.0, 30.0, 0.4)
     track = np.column_stack([along, 0.05 * (-1.0) ** np.arange(75), 0 * along, 0.1 * along, np.full(75, 4.0)])
