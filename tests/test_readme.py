@@ -363,3 +363,16 @@ def test_there_is_something_to_check() -> None:
     assert len(PYTHON_BLOCKS) == 2
     assert len(ALL_COMMANDS) >= 60 and len(IN_PROSE) >= 40
     assert {"README.md", "docs/extend.md", "deploy/RUNBOOK.md"} <= {command.page for command in ALL_COMMANDS}
+
+
+WAITS = re.compile(r"[^.;:|]*\bwaits? for (?:the ego|an ego|it)\b[^.;:|]*")
+DENIED = re.compile(r"\b(?:not|never|nor|neither|nobody)\b")
+
+
+def test_no_page_says_that_traffic_waits_for_the_ego() -> None:
+    """Driven vehicles brake for one that is in their way; nobody waits (tests/tasks/rollout/test_simulate.py)."""
+    said = [
+        (page, one[0]) for page in PAGES for one in WAITS.finditer(" ".join((REPOSITORY / page).read_text().split()))
+    ]
+    assert {page for page, _ in said} >= {"docs/results.md", "docs/driving.md"}
+    assert not [one for one in said if not DENIED.search(one[1])]

@@ -147,7 +147,7 @@ def _limits(store: Store, samples: pa.Table, outcomes: pa.Table, orphans: int) -
     if simulated.num_rows:
         yield (
             f"- The labels of {simulated.num_rows:,} samples are simulated drives of a pseudo-expert, not of a human. "
-            f"Other agents follow `traffic.mode={settings.get('traffic.mode', 'none')}`; who replays a log in it does not "
+            f"Other agents follow `traffic.mode={settings.get('traffic.mode', 'none')}`; who replays a log does not "
             "wait for the ego."
         )
     if "human" in _values(samples, "expert"):

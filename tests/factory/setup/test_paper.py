@@ -40,9 +40,9 @@ def test_the_command_says_what_no_preset_makes_the_paper_s(tmp_path: Path) -> No
     (line,) = (line for line in said.stdout.splitlines() if line.startswith("set-up: "))
     assert line == (
         "set-up: not the paper's (in brackets; preset=paper comes nearest): walks that go on to the next candidate "
-        "until one is accepted (the rates fit one draw a round), IDM along the lane graph (the public code's brakes for "
-        "each lane's end: traffic=navsim), render.frames=history (all of T .. T+2H), no picture gate (unstable renderings are left out, "
-        "by a rule that is not published)"
+        "until one is accepted (the rates fit one draw a round), IDM along the lane graph (the public code's brakes "
+        "for each lane's end: traffic=navsim), render.frames=history (all of T .. T+2H), no picture gate (unstable "
+        "renderings are left out, by a rule that is not published)"
     )
 
 

@@ -16,6 +16,7 @@ from factory.setup.settings import assemble, identity_of, refuse_missing_backend
 from factory.stages.assets import block_id
 from factory.stages.pipeline import FactoryWork, WholeClip
 from factory.store.identity import UNLISTED
+from factory.store.schema import COLUMNS
 from tasks import stages
 from tasks.perturb import Perturbation, perturb
 from tasks.stages import HUMAN, HUMAN_BEFORE
@@ -278,4 +279,8 @@ def test_the_log_s_own_drive_alone_needs_no_candidates_and_no_block(small_town: 
     assert prepared.candidates == () and prepared.dropped is None and work.identity.prepare_digest == UNLISTED
     accepted = attempted(work, prepared, HUMAN_CANDIDATE, "human")
     assert isinstance(accepted, Columns) and accepted.row["image_source"] == "photo"
+    logged = work.reader.read(ref).ego_states[NOW : NOW + 1 + HORIZON_STEPS, :3]
+    label = to_local(logged[0], logged[1:])  # to the last bit of a float32: no tracker drove it
+    assert np.array_equal(np.float32(accepted.row["label_10hz"]), np.float32(label))  # type: ignore[arg-type]
+    assert "of `human` the log's" in COLUMNS["label_10hz"].about
     assert not list(tmp_path.rglob("block-*"))

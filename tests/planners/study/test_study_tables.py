@@ -15,9 +15,11 @@ from tests.planners.study.test_setups import settings
 
 
 def rows_of(
-    one: Comparison, epdms: float, difference: tuple[float, float, float] | None = None
+    one: Comparison, epdms: float, difference: tuple[float, float, float] | None = None, one_log: bool = False
 ) -> list[dict[str, Any]]:
     against = dict(zip(("difference", "low", "high"), difference or ("", "", "")))
+    if difference and not one_log:
+        against |= {"low_log": difference[1], "high_log": difference[2]}
     reference = {"reference": "some" if difference else "", **against}
     return [
         {**one.facts, "stage": stage, "human_filter": which, "epdms": epdms, "each": "1.0 2.0", **reference}
@@ -29,10 +31,11 @@ REAL = Setup("ltf", "real", 0, "steps")
 MORE = Setup("ltf", "pdm_closed", 5, "steps")
 
 
-def test_a_difference_is_bold_where_its_interval_leaves_out_zero() -> None:
+def test_a_difference_is_bold_where_its_intervals_leave_out_zero_and_there_are_several_logs() -> None:
     real, more = (Comparison("main", setup, None, 2, "steps") for setup in (REAL, MORE))
     clear, open_, worse = (5.04, 0.96, 10.0), (5.0, -1.0, 10.0), (-5.0, -9.0, -1.0)
     found = [*rows_of(real, 30.0), *rows_of(more, 35.04, clear), *rows_of(more, 35.0, open_), *rows_of(more, 25, worse)]
+    found += rows_of(more, 35.04, clear, one_log=True)
     text = markdown_of(found, "unfiltered")
     assert text.startswith("Scores are unfiltered: unfiltered compares with the paper's tables")
     assert max(map(len, text.partition("##")[0].splitlines())) <= 120
@@ -40,10 +43,11 @@ def test_a_difference_is_bold_where_its_interval_leaves_out_zero() -> None:
     assert lines[0] == "## main"
     assert lines[2].split(" | ")[4:-1] == ["one stage", "stage one", "stage two", "follow-ups (plain mean)", "final"]
     assert lines[4] == "| `ltf` | real | steps | 2 | 30.0 | 30.0 | 30.0 | 30.0 | 30.0 | 1.0 2.0 |"
-    assert lines[5].count("35.0 (**+5.0**: +1.0 .. +10.0)") == 5
-    assert lines[6].count("35.0 (+5.0: -1.0 .. +10.0)") == 5
-    assert lines[7].count("25.0 (**-5.0**: -9.0 .. -1.0)") == 5
-    assert {line.count("|") for line in lines[2:8]} == {11}
+    assert lines[5].count("35.0 (**+5.0**: +1.0 .. +10.0") == 5
+    assert lines[6].count("35.0 (+5.0: -1.0 .. +10.0") == 5
+    assert lines[7].count("25.0 (**-5.0**: -9.0 .. -1.0") == 5
+    assert lines[8].count("35.0 (+5.0: +1.0 .. +10.0)") == 5
+    assert {line.count("|") for line in lines[2:9]} == {11}
 
 
 def test_a_table_holds_scores_of_one_human_filter_and_says_which() -> None:
