@@ -227,7 +227,7 @@ def test_runs_are_compared_over_clips_logs_and_towns() -> None:
     assert "only one" in text_of(of_one_town, 0.95)
     row = row_of(of_one_town["final", "unfiltered"])
     of_one_log = row_of(compare([run(n_clips=2)], [run(0.1, n_clips=2)], SETTINGS)["final", "unfiltered"])
-    assert is_clear_row(row) and of_one_log["low"] > 0.0 and not is_clear_row(of_one_log)
+    assert is_clear_row(row) and float(of_one_log["low"]) > 0.0 and not is_clear_row(of_one_log)
     assert row["low_town"] == row["high_town"] == "" and row["low_log"] != ""
 
 
