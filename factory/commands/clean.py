@@ -44,6 +44,7 @@ class Request:
 def main(request: Request) -> None:
     """Remove and name them. Raises Refused."""
     from factory.store.disk import why_not_written
+    from factory.store.location import BadLocation
     from factory.store.table import AnotherWriter
     from factory.store.upkeep import RunGoesOn, hold, leftovers, refuse_held
 
@@ -51,7 +52,7 @@ def main(request: Request) -> None:
     try:
         (refuse_held if request.say else hold)(store)
         found = leftovers(store, request.older_s, time.time())
-    except (RunGoesOn, AnotherWriter, OSError) as error:
+    except (RunGoesOn, AnotherWriter, BadLocation, OSError) as error:
         raise Refused(why_not_written(error) or str(error)) from error
     for name in found:
         if not request.say:

@@ -21,6 +21,7 @@ class Request:
 
 def main(request: Request) -> None:
     """Merge and say what became of each table. Raises Refused."""
+    from factory.store.location import BadLocation
     from factory.store.parquet_file import DamagedFile
     from factory.store.table import AnotherWriter
     from factory.store.upkeep import RunGoesOn, compact, hold
@@ -30,7 +31,7 @@ def main(request: Request) -> None:
         hold(store)
         for merged in compact(store):
             print(f"{merged.table:<13}{merged.before} files, now {merged.after}")
-    except (RunGoesOn, AnotherWriter) as error:
+    except (RunGoesOn, AnotherWriter, BadLocation) as error:
         raise Refused(str(error)) from error
     except DamagedFile as error:
         raise Refused(f"{error}; python -m factory verify out={request.out} repair=true takes it out") from error

@@ -33,6 +33,7 @@ class Request:
 
 def main(request: Request) -> int:
     """Print the verdict, after the repair where one is asked for."""
+    from factory.store.location import BadLocation
     from factory.store.table import AnotherWriter, DamagedLog
     from factory.store.upkeep import RunGoesOn, drop_damaged, hold, restore_logs
     from factory.store.verify import damaged_logs
@@ -58,7 +59,7 @@ def main(request: Request) -> int:
     except DamagedLog as error:
         print(f"DAMAGED {error}")
         return DAMAGED
-    except (RunGoesOn, AnotherWriter) as error:
+    except (RunGoesOn, AnotherWriter, BadLocation) as error:
         raise Refused(str(error)) from error
     for line in verdict.damage:
         print(f"DAMAGED {line}")

@@ -5,7 +5,6 @@ builds the scene while the others wait for it; the file appears by an atomic ren
 nothing half done.
 """
 
-import fcntl
 import hashlib
 import json
 import logging
@@ -18,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from factory.graph.work import Stopped, never
+from factory.locks import locked
 from factory.readers.videos import file_and_frame
 from factory.stages.fitting import fitted
 from factory.stages.own_body import masks_digest, read_masks
@@ -178,7 +178,7 @@ def only_builder(path: Path) -> Iterator[None]:
         with own_place(path.parent):
             path.parent.mkdir(parents=True, exist_ok=True)
             file = held.enter_context(path.with_suffix(".lock").open("w"))
-        fcntl.flock(file, fcntl.LOCK_EX)
+        held.enter_context(locked(file))
         yield
 
 

@@ -1,6 +1,5 @@
 """Compiles every kernel once, into the on-disk cache, before workers start."""
 
-import fcntl
 import gc
 import hashlib
 import logging
@@ -10,7 +9,7 @@ import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from threading import Event, Lock, Thread
@@ -18,6 +17,7 @@ from threading import Event, Lock, Thread
 import numpy as np
 
 from factory.graph.work import NotReady
+from factory.locks import locked
 from tasks.attempt import drive_and_judge
 from tasks.experts.pdm_closed.forecast import forecast
 from tasks.experts.pdm_closed.proposals import proposals
@@ -104,9 +104,8 @@ def compile_kernels(parts: Sequence[str], enough: Event | None = None) -> None:
         with (cache_dir() / f"lock-{_key()}").open("w") as lock:
             if enough is None:  # somebody waits
                 print("compiling kernels, once for this version: about a minute", file=sys.stderr, flush=True)
-            with _one_at_a_time:
-                with suppress(OSError):  # a shared folder without locks: at worst two do the same work
-                    fcntl.flock(lock, fcntl.LOCK_EX)
+            with _one_at_a_time, ExitStack() as held:
+                held.enter_context(locked(lock))
                 missing = [name for name in parts if not _is_compiled(name)]
                 with ThreadPoolExecutor(os.cpu_count()) as pool:
                     list(pool.map(partial(_compile_part, enough=enough or Event()), missing))

@@ -53,6 +53,12 @@ class Location:
     def is_local(self) -> bool:
         return "://" not in self.uri
 
+    @property
+    def folder(self) -> Path | None:
+        """On this machine's file systems; None where it is on an object store."""
+        filesystem, base = self.filesystem()
+        return Path(base) if isinstance(filesystem, fs.LocalFileSystem) else None
+
     def child(self, name: str) -> "Location":
         return Location(f"{self.uri}/{name}", self.options)
 
@@ -100,8 +106,8 @@ class Location:
     def _files(self) -> dict[str, fs.FileInfo]:
         """All files below."""
         filesystem, base = self.filesystem()
-        if isinstance(filesystem, fs.LocalFileSystem):
-            found = filesystem.get_file_info([os.fspath(path) for path in _local_files(Path(base))])
+        if self.folder is not None:
+            found = filesystem.get_file_info([os.fspath(path) for path in _local_files(self.folder)])
         else:
             found = filesystem.get_file_info(fs.FileSelector(base, recursive=True, allow_not_found=True))
         return {info.path[len(base) + 1 :]: info for info in found if info.type == fs.FileType.File}

@@ -12,11 +12,12 @@ from dataclasses import dataclass
 import pyarrow as pa
 
 from factory.store.commit_copies import COPIES, LOG, CommitCopies
-from factory.store.location import Location
+from factory.store.location import BadLocation, Location
 from factory.store.mcap_shards.mirror import McapTable, write_mcap_shard
 from factory.store.parquet_file import Shard, write_shard
 from factory.store.samples import Store
 from factory.store.table import KeyedTable
+from factory.store.usable import why_no_links
 from factory.store.verify import TABLES, Verdict, damaged_logs, orphaned, outdated_episodes, tables_in
 
 TEMPORARY = re.compile(r"(.*/)?(\..*\.tmp|\.trial-[0-9a-f]+|_commit_.*\.tmp|.*\.draft)")
@@ -40,8 +41,10 @@ class Merged:
 
 def hold(store: Store) -> None:
     """Before a change: claim the tables as a run does, so that one which was quiet for long commits nothing any more,
-    no file that is cleaned away among it. Raises RunGoesOn as `refuse_held` does, and AnotherWriter."""
+    no file that is cleaned away among it. Raises RunGoesOn as `refuse_held` does, BadLocation and AnotherWriter."""
     refuse_held(store)
+    if store.location.folder is not None and (no_links := why_no_links(store.location.folder)):
+        raise BadLocation(no_links)
     store.claim(create=False)
     mcap = McapTable(store.location)
     if mcap.version is not None:

@@ -1,4 +1,5 @@
-"""Whether `out` can be written to, before anything else is done: a folder by a trial file, a URL by a trial object.
+"""Whether `out` can be written to, before anything else is done: a folder by a trial file and a link to it, a URL by a
+trial object.
 
 A client of an object store tries for minutes where credentials or the network are missing, so the trial of a URL is a
 process of its own that is ended after TRIAL_S: `python -m factory.store.usable URL`.
@@ -51,6 +52,8 @@ def _why_not_local(out: str, path: Path, above: Path) -> str:
                     os.fsync(file.fileno())
             finally:  # before the free space is told
                 trial.unlink(missing_ok=True)
+        if no_links := why_no_links(path):
+            return f"out={out}: {no_links}"
     except OSError as error:
         if isinstance(error, NotWritable):
             return f"out={out}: {str(error).removeprefix(f'{path}: ')}"
@@ -62,6 +65,32 @@ def _why_not_local(out: str, path: Path, above: Path) -> str:
         for place in created:
             if place.is_dir():
                 place.rmdir()
+    return ""
+
+
+def why_no_links(folder: Path) -> str:
+    """One line on why no table can be committed to in a folder that is there; nothing where it can. Leaves nothing.
+
+    A commit is a link that must not be there yet: so of two runs that want the same one alone makes it. Renaming, which
+    replaces what is there, would lose commits. Raises OSError where no file can be made at all.
+    """
+    trial = folder / f".trial-{secrets.token_hex(8)}"
+    link = trial.with_name(f"{trial.name}0")
+    try:
+        with needs_disk(folder, 0):
+            trial.touch()
+        os.link(trial, link)
+    except OSError as error:
+        if not trial.exists():
+            raise
+        why = error.strerror or str(error)
+        return (
+            f"{folder} is on a file system without hard links ({why}), by which commits keep two runs apart: "
+            "choose a folder on another one, or the URL of a bucket (s3://, gs://, abfs://)"
+        )
+    finally:
+        link.unlink(missing_ok=True)
+        trial.unlink(missing_ok=True)
     return ""
 
 

@@ -11,7 +11,6 @@ Each record batch is a stream of Arrow's of its own. Behind them stands where ea
 JSON, and in the last 8 bytes the length of that. A copy that is found damaged is made again, with a line in the log.
 """
 
-import fcntl
 import hashlib
 import json
 import logging
@@ -25,6 +24,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from factory.locks import locked
 from factory.store.reader import TIME_TOLERANCE_S, group_rows
 from planners.data.feed import Feed
 from planners.data.files import SampleFile, leaves, read_group
@@ -65,8 +65,7 @@ class LocalCopy:
     def _make(self, damaged: int | None) -> None:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         draft = self.path.with_suffix(".draft")
-        with draft.open("ab") as sink:
-            fcntl.flock(sink, fcntl.LOCK_EX)
+        with draft.open("ab") as sink, locked(sink):
             if self.path.exists() and self.path.stat().st_ino != damaged:  # another made it meanwhile
                 draft.unlink(missing_ok=True)
                 return

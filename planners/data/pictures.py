@@ -11,7 +11,6 @@ The folder is bounded by 256 parts, each of which takes no more when it is full:
 over all samples has no use for what was used last. It can be deleted while no training runs.
 """
 
-import fcntl
 import hashlib
 import logging
 import os
@@ -25,6 +24,7 @@ import cv2
 import numpy as np
 import simplejpeg
 
+from factory.locks import locked
 from planners.data.batch import ImageLayout
 from planners.data.feed import Feed
 from planners.data.images import stitch
@@ -132,6 +132,5 @@ def _held(part: Path) -> int:
 @contextmanager
 def _locked(path: Path) -> Iterator[None]:
     """Alone among threads and processes of this machine."""
-    with path.open("ab") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
+    with path.open("ab") as file, locked(file):
         yield

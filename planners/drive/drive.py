@@ -32,6 +32,7 @@ from factory.readers.base import ClipRef
 from factory.setup.settings import choose_vocabulary, open_reader
 from factory.store.location import Location
 from factory.store.table import AnotherWriter, KeyedTable
+from factory.store.usable import why_unusable
 from planners.command import Failed, Stopped, command
 from planners.drive.drivers import driver_of
 from planners.drive.settings import DriveSettings, Pictures, settings_of
@@ -73,6 +74,8 @@ def drive_all(settings: DriveSettings) -> tuple[list[Row], list[NotDriven]]:
 
     Raises ConfigError; Stopped where it was interrupted; Failed where a process died or another command drives here.
     """
+    if unusable := why_unusable(settings.out):
+        raise ConfigError(unusable)
     asked = _asked(settings)
     table = open_drives(asked.work.out)
     failed = [NotDriven(ref.clip_id, why) for ref, why in asked.broken.items()]

@@ -29,6 +29,7 @@ from factory.setup.settings import open_reader
 from factory.store.explored.table import ExploredClip, explored_clips, open_explored, write_explored
 from factory.store.location import Location
 from factory.store.table import AnotherWriter, KeyedTable
+from factory.store.usable import why_unusable
 from planners.command import Failed, Stopped, command
 from planners.drive.drivers import PlannerDriver, driver_of
 from planners.drive.table import Committer
@@ -50,6 +51,8 @@ def explore(settings: ExploreSettings) -> tuple[list[ExploredClip], list[NotDriv
     """
     if settings.planner is None:
         raise ConfigError("planner is missing: give planner=<training folder>")
+    if unusable := why_unusable(settings.out):
+        raise ConfigError(unusable)
     one = planner_of(settings.planner, changed=settings.settings)
     reader, index = open_reader(settings.clips)
     work = _work(settings, one, reader)
