@@ -24,6 +24,7 @@ from factory.config.run import RunConfig, load_config, photos_alone
 from factory.config.shapes import defaults_of, described
 from factory.config.words import Asked, SettingsShown, asked_of
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, as_program
+from factory.files import folders_in
 from factory.setup.early import refuse_what_is_not_there
 from factory.store.disk import DiskFull
 from factory.store.usable import why_unusable
@@ -78,7 +79,7 @@ def help_text() -> str:
     Imports nothing heavy.
     """
     folder = conf_dir()
-    groups = sorted(path.name for path in folder.iterdir() if path.is_dir())
+    groups = [path.name for path in folders_in(folder)]
     listed = "\n".join(f"  {group}: {', '.join(choices(group, [folder]))}" for group in groups)
     keys = {key: value for key, value in defaults_of(RunConfig).items() if key not in groups}
     told = "\n".join(described(keys, RunConfig, {}))

@@ -10,6 +10,7 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 from factory.config.plugins import offer_choices
 from factory.config.shapes import dataclass_in, defaults_of, described, keys_of, merged, to_give
 from factory.config.words import ConfigError, SettingsShown, asked_of, at_home, nearest, no_such_choice, readable
+from factory.files import folders_in
 from factory.job import runs_root
 
 T = TypeVar("T")
@@ -65,7 +66,7 @@ def compose(
     from omegaconf.errors import InterpolationToMissingValueError, MissingMandatoryValue, OmegaConfBaseException
 
     OmegaConf.register_new_resolver("runs", runs_root, replace=True)
-    groups = {path.name for root in (conf_dir(), *asked.folders) for path in root.iterdir() if path.is_dir()}
+    groups = {path.name for root in (conf_dir(), *asked.folders) for path in folders_in(root)}
     overrides = []  # held against the dataclasses and not against conf/, which says few keys: Hydra takes any
     for word in map(readable, asked.overrides):
         plain = word.lstrip("+")

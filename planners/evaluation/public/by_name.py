@@ -20,6 +20,7 @@ from factory.readers.navsim.filters import Selection, read_selection
 from factory.stages.benchmark import BENCHMARK_FILE
 from factory.store.location import Location
 from factory.store.samples import Store
+from factory.store.usable import why_unusable
 from planners.command import Stopped
 
 SPLITS: Mapping[str, str] = {"navhard": "navhard_two_stage", "navtest": "navtest"}  # name -> its split's file
@@ -54,13 +55,16 @@ def benchmark_by_name(name: str, given: NavsimData, made: str) -> str:
     store = Location.parse(out)
     source = {"benchmark": name, "pictures": given.pictures, "files": _digest(name, places, split)}
     kept = store.read(MADE_FROM)
+    whole = kept is not None and _is_whole(store)
+    if not whole and (unusable := why_unusable(out)):
+        raise ConfigError(f"benchmark={name}: {unusable}")
     if kept is None:
         store.write(MADE_FROM, json.dumps(source, indent=1).encode())
     elif other := [key for key, value in json.loads(kept).items() if source[key] != value]:
         raise ConfigError(
             f"benchmark={name}: {out} was made of other {other[0]} than these: remove it, or choose another made="
         )
-    elif _is_whole(store):
+    elif whole:
         return out
     _import(name, Store(store), selection, places)
     return out

@@ -15,6 +15,7 @@ import pytest
 import yaml
 
 from factory.config.compose import ConfigError, build, conf_dir, fill
+from factory.config.plugins import choices
 from factory.config.run import RewardSettings, RunConfig, composed_run, load_config, shapes_in
 from factory.config.words import SettingsShown
 from factory.setup.settings import (
@@ -34,6 +35,7 @@ from tasks.perturb import PerturbSettings
 from tasks.render.settings import RenderMode, RenderSettings
 from tasks.rollout.simulate import TrafficSettings
 from tasks.settings import ExpertGate
+from tests.factory.data_folders import add_companions
 from tests.factory.text_keys import held, text_keys
 
 REPOSITORY = Path(__file__).resolve().parents[3]
@@ -96,6 +98,14 @@ def test_a_home_folder_is_one_in_every_key_that_takes_text(
     for given, wanted in (("~/x", f"{tmp_path}/x"), ("[~/x,y]", [f"{tmp_path}/x", "y"])):
         values = composed_run([*words, *(f"{key}={given}" for key in keys)])
         assert {key: held(values, key) for key in keys} == dict.fromkeys(keys, wanted)
+
+
+def test_companions_of_files_of_configuration_are_no_choices(tmp_path: Path) -> None:
+    (tmp_path / "render").mkdir()
+    (tmp_path / "render" / "mine.yaml").write_text("mode: map\n")
+    add_companions(tmp_path)
+    assert choices("render", [tmp_path]) == ["mine"]
+    assert load_config([f"--config-dir={tmp_path}", "render=mine"]).render.mode is RenderMode.MAP
 
 
 @pytest.mark.slow
