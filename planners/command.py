@@ -53,7 +53,7 @@ def help_of(module: str, shape: type[Any] | None = None) -> str:
     """What the module says of itself, and the keys of its file in conf/ where it has one, with those of `shape`."""
     about, path = sys.modules[module].__doc__ or "", conf_dir() / f"{module.rpartition('.')[2]}.yaml"
     if shape is None:
-        return "\n".join([about, *([path.read_text()] if path.is_file() else [])])
+        return "\n".join([about, *([path.read_text(encoding="utf-8")] if path.is_file() else [])])
     from omegaconf import OmegaConf
 
     said = OmegaConf.to_container(OmegaConf.load(path), resolve=False)

@@ -108,7 +108,7 @@ def candidates(words: Sequence[str], last: str) -> Iterable[str]:
 def settings_of(given: Sequence[str]) -> dict[str, list[str]]:
     """Setting -> its choices where they are few: groups, the run's keys, the chosen reader's, the experts'."""
     folder = conf_dir()
-    chosen = dict(re.findall(r"^  - (\w+): (\w+)$", (folder / "run.yaml").read_text(), re.M))
+    chosen = dict(re.findall(r"^  - (\w+): (\w+)$", (folder / "run.yaml").read_text(encoding="utf-8"), re.M))
     chosen.update({key: value for key, _, value in (word.partition("=") for word in given) if key in chosen})
     typed = dict(settings_in(RunConfig))
     for name, target in built_in_classes("expert").items():

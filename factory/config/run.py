@@ -324,7 +324,7 @@ def without_labels(spec: Mapping[str, Any]) -> dict[str, Any]:
 def built_in_classes(group: str) -> dict[str, str]:
     """Choice -> `_target_` of the files in conf/<group>."""
     found = {
-        file.stem: re.search(r"^_target_: (\S+)", file.read_text(), re.M)
+        file.stem: re.search(r"^_target_: (\S+)", file.read_text(encoding="utf-8"), re.M)
         for file in matching(conf_dir() / group, "*.yaml")
     }
     return {name: target[1] for name, target in sorted(found.items()) if target}

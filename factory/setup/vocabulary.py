@@ -142,4 +142,4 @@ def save_recovery_table(path: str | Path, table: RecoveryTable, origin: dict[str
 def _describe(path: Path, content: dict[str, object]) -> None:
     text = json.dumps(content, indent=2, sort_keys=True) + "\n"
     with whole_file(path.with_suffix(".json"), len(text)) as draft:
-        draft.write_text(text)
+        draft.write_text(text, encoding="utf-8")

@@ -112,7 +112,7 @@ def corrected_rig(
 def _say(path: Path, found: dict[str, object]) -> None:
     text = sealed_json(found)
     with whole_file(path.with_suffix(SAID), len(text)) as draft:
-        draft.write_text(text)
+        draft.write_text(text, encoding="utf-8")
 
 
 def used_rig(

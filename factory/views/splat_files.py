@@ -74,7 +74,7 @@ def node_bytes(gaussians: Gaussians, suffix: str, screen: ScreenFilter) -> bytes
 def transform_of(path: Path) -> tuple[Array, float]:
     """Rigid (4, 4), and the scale after it, that led from the photos' frame to nerfstudio's. Raises BadScene."""
     try:
-        told = json.loads(path.read_text())
+        told = json.loads(path.read_text(encoding="utf-8"))
         matrix, scale = np.array(told["transform"], np.float64), float(told["scale"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise BadScene(f"{path}: expected nerfstudio's 'transform' (3 x 4) and 'scale': {error!r}") from error

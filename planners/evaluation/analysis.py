@@ -92,11 +92,11 @@ def analyse(rows: Sequence[FrameRow]) -> Analysis:
 def write_analysis(folder: Path, analysis: Analysis, title: str) -> None:
     """The three files of this module's docstring."""
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / "distribution.csv").open("w", newline="") as file:
+    with (folder / "distribution.csv").open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         table.writerow(["from", "to", "real_share", "simulated_share"])
         table.writerows(zip(EDGES[:-1].round(3), EDGES[1:].round(3), *analysis.shares))
-    with (folder / "tags.csv").open("w", newline="") as file:
+    with (folder / "tags.csv").open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         table.writerow(["tag", "real_frames", "real_epdms", "simulated_frames", "simulated_epdms"])
         for tag in analysis.tags:

@@ -85,7 +85,7 @@ def write_clips(path: Path, runs: Mapping[str, Sequence[ClipResult]]) -> None:
 
 def read_clips(path: Path, labels: Sequence[str]) -> dict[tuple[str, str], Measured]:
     """(stage, filter) -> scores of the runs `labels`. ValueError for a run it lacks, or no such table."""
-    with path.open(newline="") as file:
+    with path.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     if not rows or not set(FACTS) <= set(rows[0]):
         raise ValueError(f"{path}: no table of clips' scores: its columns must begin with {', '.join(FACTS)}")

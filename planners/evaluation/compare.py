@@ -143,7 +143,7 @@ def _bounds(one: Interval, nothing: str) -> str:
 
 def write_csv(path: Path, found: Mapping[Measure, ByLevel]) -> None:
     """One line a measure."""
-    with path.open("w", newline="") as file:
+    with path.open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         for n, (name, by_level) in enumerate(found.items()):
             row = row_of(by_level, scale=1.0)

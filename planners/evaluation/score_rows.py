@@ -119,7 +119,7 @@ def write_record(folder: Path, record: Mapping[str, Any]) -> None:
 def read_record(folder: Path) -> dict[str, Any]:
     """Raises ConfigError where there is none or it is damaged."""
     try:
-        record = json.loads((folder / RECORD).read_text())
+        record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise ConfigError(f"{folder}: no {RECORD}: no planner was evaluated here, or not to the end") from error
     except ValueError as error:

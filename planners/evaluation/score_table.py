@@ -24,7 +24,7 @@ FONT, SIZE = cv2.FONT_HERSHEY_SIMPLEX, 0.42
 
 def write_table(folder: Path, lines: Sequence[SummaryLine]) -> None:
     """`summary.csv` and `summary.png` in the folder."""
-    with (folder / "summary.csv").open("w", newline="") as file:
+    with (folder / "summary.csv").open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         table.writerow(HEAD)
         for line in lines:

@@ -203,7 +203,7 @@ def _done(out: Path) -> dict[str, list[str]]:
 
 
 def _write(path: Path, turns: Sequence[Turn]) -> None:
-    with path.open("w", newline="") as file:
+    with path.open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         table.writerow([field.name for field in fields(Turn)])
         table.writerows([_shown(turn) for turn in turns])

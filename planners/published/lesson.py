@@ -167,7 +167,7 @@ def learned(lesson: Lesson, names: Mapping[str, list[int]], first: int, out: Pat
         loop = Loop(SEED, lesson.steps, log_every=1, checkpoint_every=0)
         with suppress(Stopped):
             fit(found.planner, batches, lesson.training, loop, TrainingProcess(0, 1, torch.device("cpu")), out, {})
-    with (out / LOSSES).open(newline="") as file:
+    with (out / LOSSES).open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     losses = np.array([float(row["total"]) for row in rows])
     factors = [group.get(FACTOR, 1.0) for group in build_optimiser(lesson.training, found.planner).param_groups]

@@ -42,7 +42,7 @@ Pair = tuple[Interval, Interval]
 def read_differences(folder: Path) -> dict[Key, Interval]:
     """FACTS -> difference, of each comparison in the first part that makes it. ValueError for no such table."""
     path = folder / "comparisons.csv"
-    with path.open(newline="") as file:
+    with path.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     if not rows or not {*FACTS, *NUMBERS} <= set(rows[0]):
         raise ValueError(f"{path}: no table of a study's comparisons: it must have {', '.join((*FACTS, *NUMBERS))}")

@@ -193,7 +193,7 @@ def write_arms(
     write_csv(report / "driving_differences.csv", differences)
     if held:
         write_csv(report / "bounds_held.csv", held)
-    (report / "arms.md").write_text(text_of(found, differences, held) + "\n")
+    (report / "arms.md").write_text(text_of(found, differences, held) + "\n", encoding="utf-8")
 
 
 def text_of(

@@ -173,5 +173,5 @@ def difference_label(row: Mapping[str, Any]) -> str:
 
 def column(path: Path, name: str) -> np.ndarray:
     """(2, n) steps and values of one column of a curve."""
-    with path.open(newline="") as file:
+    with path.open(newline="", encoding="utf-8") as file:
         return np.array([(float(row["step"]), float(row[name])) for row in csv.DictReader(file)]).T

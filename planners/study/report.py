@@ -114,7 +114,7 @@ def write_tables(folder: Path, out: Path, human_filter: HumanFilter) -> str:
         write_csv(out / "bounds.csv", bounds)
     write_csv(out / "trainings.csv", trainings)
     write_clips(out / "clips.csv", {label: clips for label, clips in frames.clips.items() if label not in BOUNDS})
-    (out / "tables.md").write_text(markdown_of(rows, human_filter))
+    (out / "tables.md").write_text(markdown_of(rows, human_filter), encoding="utf-8")
     drawn = [row for row in rows if row["reference"] and row["human_filter"] == measures[row["stage"]]]
     if drawn:
         draw_differences(drawn, out / "differences.png")

@@ -56,9 +56,9 @@ class _CsvRows:
     def __init__(self, path: Path, first_step: int) -> None:
         kept = []
         if path.exists():
-            with path.open(newline="") as old:
+            with path.open(newline="", encoding="utf-8") as old:
                 kept = [row for row in csv.DictReader(old) if int(row["step"]) < first_step]
-        self.file = path.open("w", newline="")
+        self.file = path.open("w", newline="", encoding="utf-8")
         self._writer: csv.DictWriter[str] | None = None
         for row in kept:
             self.write(row)

@@ -91,14 +91,14 @@ def _text(data: bytes) -> str:
 def _document(kept: Mapping[str, Any]) -> bytes:
     """index.html with everything that it names inside; data is JSON in which no tag can begin."""
     scripts = {
-        path.stem: "data:text/javascript;base64," + _text(_bare(path.read_text()).encode())
+        path.stem: "data:text/javascript;base64," + _text(_bare(path.read_text(encoding="utf-8")).encode())
         for path in STATIC.glob("*.js")
     }
     data = json.dumps(kept, allow_nan=False).replace("<", "\\u003c")
-    page = (STATIC / "index.html").read_text()
+    page = (STATIC / "index.html").read_text(encoding="utf-8")
     page, links = re.subn(r"<link [^>]*>\n|<script [^>]*></script>\n", "", page)
     assert links == 3, "index.html names an icon, a style and a script"
-    style = (STATIC / "board.css").read_text()
+    style = (STATIC / "board.css").read_text(encoding="utf-8")
     inside = (
         f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n<style>{style}</style>\n'
         f'<script type="importmap">{json.dumps({"imports": scripts})}</script>\n'

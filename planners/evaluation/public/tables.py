@@ -58,7 +58,7 @@ def write_tables(folder: Path, rows: Sequence[FrameRow], tokens: Mapping[FrameKe
     for human_filter in FILTERS:
         lines = [_line(tokens[row.key], row.stage, row.scores, human_filter, two_stage) for row in ordered]
         lines += _summary_lines(summary, human_filter, all(line[1] == "True" for line in lines))
-        with (folder / file_name(human_filter)).open("w", newline="") as file:
+        with (folder / file_name(human_filter)).open("w", newline="", encoding="utf-8") as file:
             table = csv.writer(file, lineterminator="\n")
             table.writerow(["", *head_of(two_stage)])
             table.writerows([number, *line] for number, line in enumerate(lines))
@@ -174,7 +174,8 @@ def read_table(path: Path) -> PublicTable:
 
 
 def _lines(path: Path) -> Iterator[list[str]]:
-    with gzip.open(path, "rt", newline="") if path.suffix == ".gz" else path.open(newline="") as file:
+    opened = gzip.open if path.suffix == ".gz" else open
+    with opened(path, "rt", newline="", encoding="utf-8") as file:
         yield from csv.reader(file)
 
 
