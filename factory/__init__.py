@@ -1,8 +1,14 @@
 """The machine: clips in, committed samples out, exactly once."""
 
+import sys
+
+from factory.exits import end_at_interrupt
+
+if sys.argv[:1] == ["-m"] and {"factory", "planners"} & {word.partition(".")[0] for word in sys.orig_argv}:
+    end_at_interrupt()  # `python -m factory ...` imports this package before all else
+
 import importlib
 import importlib.util
-import sys
 from pathlib import Path
 
 

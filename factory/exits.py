@@ -1,11 +1,19 @@
-"""What a program ends with, and how signals end it: the one place for both."""
+"""What a program ends with, how signals end it, and what becomes of its output: the one place for these."""
 
+import errno
+import io
+import os
 import signal
+import stat
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
+from typing import TYPE_CHECKING, Any, TextIO
+
+if TYPE_CHECKING:
+    from _typeshed import ReadableBuffer
 
 COMPLETE, DAMAGED, BAD_CONFIG, COMPLETE_WITH_FAILURES, INTERRUPTED = range(5)
 MEANING = {
@@ -15,19 +23,120 @@ MEANING = {
     COMPLETE_WITH_FAILURES: "complete with failed attempts",
     INTERRUPTED: "interrupted, the same command goes on",
 }
+STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+OF_TERMINALS = (signal.SIGINT, signal.SIGHUP)  # Ctrl-C and a closed terminal reach every process that runs in it
+
+
+def end_at_interrupt() -> None:
+    """Until `as_program`, while modules are imported and nothing is begun: SIGINT is one line and INTERRUPTED."""
+
+    def end(number: int, frame: FrameType | None) -> None:
+        os.write(2, b"interrupted\n")
+        os._exit(INTERRUPTED)
+
+    if signal.getsignal(signal.SIGINT) == signal.default_int_handler:
+        signal.signal(signal.SIGINT, end)
 
 
 def as_program(main: Callable[[Sequence[str]], int]) -> None:
-    """Run the command line of this process and end with its exit code."""
-    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `... | head` ends quietly
-    sys.exit(main(sys.argv[1:]))
+    """Run the command line of this process and end with its exit code; INTERRUPTED and a line at a KeyboardInterrupt.
+
+    What it prints decides nothing: see `print_without_failing`.
+    """
+    print_without_failing()
+    if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
+        signal.signal(signal.SIGINT, _interrupt)
+    try:
+        code = main(sys.argv[1:])
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        code = INTERRUPTED
+    sys.exit(code)
+
+
+class _Interrupt(KeyboardInterrupt):
+    """By its exact type: where KeyboardInterrupt itself leaves an exec(), as of a dataclass, Python notes that and ends
+    the process by SIGINT, though the exception was caught."""
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    raise _Interrupt
+
+
+def as_worker() -> None:
+    """Begin a process that a program has started for itself, in `without_terminal`: only that program ends it."""
+    for number in OF_TERMINALS:
+        signal.signal(number, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, OF_TERMINALS)
+    print_without_failing()
+
+
+@contextmanager
+def without_terminal(*signals: signal.Signals) -> Iterator[None]:
+    """Processes begun inside do not receive these signals, all of OF_TERMINALS by default, before `as_worker`.
+
+    This process heeds them at the end of it, when who began others knows them and can end them.
+    """
+    numbers, held, handlers = signals or OF_TERMINALS, list[int](), dict[int, Any]()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
+    if threading.current_thread() is threading.main_thread():  # it handles what another thread receives, too
+        heeded = [number for number in numbers if callable(signal.getsignal(number))]
+        handlers = {number: signal.signal(number, lambda number, _: held.append(number)) for number in heeded}
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        for number in held:
+            signal.raise_signal(number)
+
+
+def print_without_failing() -> None:
+    """From now on standard output and error are dropped once nobody reads them: `... | head`, a closed terminal.
+
+    Characters that their encoding lacks are replaced: by question marks, which keep tables in line, on standard error
+    by escapes.
+    """
+    sys.stdout, sys.stderr = _never_failing(sys.stdout, "replace"), _never_failing(sys.stderr, "backslashreplace")
+
+
+def _never_failing(stream: TextIO, errors: str) -> TextIO:
+    if not isinstance(stream, io.TextIOWrapper):  # closed from the start, or a test's own
+        return stream
+    stream.flush()
+    file = _Output(stream.fileno(), "w", closefd=False)
+    return io.TextIOWrapper(
+        file if stream.write_through else io.BufferedWriter(file),  # PYTHONUNBUFFERED
+        encoding=stream.encoding,
+        errors=errors,
+        line_buffering=stream.line_buffering,
+        write_through=stream.write_through,
+    )
+
+
+class _Output(io.FileIO):
+    """Standard output or error; for this process and those it starts the null device once its reader has gone."""
+
+    def write(self, data: "ReadableBuffer") -> int:
+        try:
+            return super().write(data)
+        except OSError as error:
+            closed_terminal = error.errno == errno.EIO and stat.S_ISCHR(os.fstat(self.fileno()).st_mode)
+            if not closed_terminal and not isinstance(error, ConnectionError):
+                raise
+            with open(os.devnull, "wb") as nowhere:
+                os.dup2(nowhere.fileno(), self.fileno())
+            return super().write(data)
 
 
 @contextmanager
 def asked_to_stop(stop: Callable[[], object]) -> Iterator[None]:
-    """The first SIGINT or SIGTERM calls `stop`, a second one raises KeyboardInterrupt.
+    """The first SIGINT, SIGTERM or SIGHUP calls `stop`, a second one raises KeyboardInterrupt.
 
-    Changes nothing off the main thread: the signals of a Ray worker are Ray's.
+    A SIGHUP is never a second one, and is ignored after the first: a terminal that closes sends it, and its shell once
+    more. Where it is ignored from the start, as by nohup, it stays so. Changes nothing off the main thread: the signals
+    of a Ray worker are Ray's.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -35,14 +144,19 @@ def asked_to_stop(stop: Callable[[], object]) -> Iterator[None]:
     asked = threading.Event()
 
     def handle(number: int, frame: FrameType | None) -> None:
-        if asked.is_set():
-            raise KeyboardInterrupt
-        asked.set()
-        stop()
+        if number == signal.SIGHUP:
+            signal.signal(number, signal.SIG_IGN)
+        if not asked.is_set():
+            asked.set()
+            stop()
+        elif number != signal.SIGHUP:
+            _interrupt(number, frame)
 
-    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    heeded = [number for number in STOPS if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN]
+    before = {number: signal.signal(number, handle) for number in heeded}
     try:
         yield
     finally:
         for number, handler in before.items():
-            signal.signal(number, handler)
+            if signal.getsignal(number) == handle:
+                signal.signal(number, handler)

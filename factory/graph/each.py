@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from itertools import islice
 from typing import Literal, ParamSpec, TypeVar
 
-from factory.exits import asked_to_stop
+from factory.exits import as_worker, asked_to_stop, without_terminal
 from factory.graph.work import Halted
 from factory.store.location import Location
 
@@ -71,7 +71,8 @@ def _pool(executor: str, workers: int | None, to: Location | None) -> Iterator[t
     elif workers is None or workers == 1:
         pool, most = _Here(), 1
     else:
-        pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _apart)
+        with without_terminal():  # what keeps the pool's semaphores is a process, too
+            pool = _Processes(workers, multiprocessing.get_context("spawn"), _apart)
         most = IN_HAND * workers
     try:
         yield pool, most
@@ -91,8 +92,17 @@ class _Here(Executor):
         return future
 
 
+class _Processes(ProcessPoolExecutor):
+    """Processes that a terminal does not reach, also while they start."""
+
+    def submit(self, function: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
+        with without_terminal():  # they begin with the first item
+            return super().submit(function, *args, **kwargs)
+
+
 def _apart() -> None:
-    """A worker process out of reach of what a terminal sends to all, that ends when its driver was killed."""
+    """A worker process out of reach of what is sent to all of a terminal, that ends when its driver was killed."""
+    as_worker()
     os.setpgrp()
     driver = multiprocessing.parent_process()
     assert driver is not None

@@ -27,7 +27,8 @@ from typing import IO, Any
 TICK_S = 0.25
 SHOWN_S = 10.0  # at work for so long, a task is told of, and again every so often
 STACK_S = 0.5  # for the watched process to write where it stands
-ASKED_S, KILLED_S = 15.0, 25.0  # after a first SIGINT or SIGTERM: a second one, the end
+STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # as in factory.exits
+ASKED_S, KILLED_S = 15.0, 25.0  # after the first of them: a second one, the end
 MEMORY_SHARE = 0.9  # of the machine's that one process may hold, where there is no other limit
 STACK_LINES = 30
 WORK, OVER, CRASHED = ".work", ".over", "crashed"
@@ -44,13 +45,16 @@ class Guard:
         faulthandler.register(signal.SIGUSR1, self._stack, all_threads=False)
         script = [sys.executable, "-I", "-S", __file__]
         given = [str(os.getpid()), str(folder), self._stack.name, str(int(alone))]
-        self._guard = subprocess.Popen([*script, *given], stdin=subprocess.PIPE, start_new_session=True)  # noqa: S603
-        assert self._guard.stdin is not None
-        self._pipe = self._guard.stdin.fileno()
+        read, self._pipe = os.pipe()
+        self._guard = subprocess.Popen([*script, *given], stdin=read, start_new_session=True)  # noqa: S603
         self._wakes = alone and threading.current_thread() is threading.main_thread()
+        self._ends = [self._pipe]
         if self._wakes:
             os.set_blocking(self._pipe, False)
             signal.set_wakeup_fd(self._pipe, warn_on_full_buffer=False)
+            self._ends.append(read)  # held: a signal's byte then has where to go without the guard, too
+        else:
+            os.close(read)
 
     @contextmanager
     def watching(self, task: dict[str, Any]) -> Iterator[None]:
@@ -71,8 +75,8 @@ class Guard:
         if self._wakes:
             signal.set_wakeup_fd(-1)
         faulthandler.unregister(signal.SIGUSR1)
-        assert self._guard.stdin is not None
-        self._guard.stdin.close()
+        for end in self._ends:
+            os.close(end)
         self._guard.wait()
         self._stack.close()
         Path(self._stack.name).unlink(missing_ok=True)
@@ -101,7 +105,7 @@ def main(pid: int, folder: Path, stack: Path, alone: bool) -> None:
             data = os.read(0, 65536)
             if not data:
                 break
-            if asked == 0.0 and any(byte in (signal.SIGINT, signal.SIGTERM) for byte in data):
+            if asked == 0.0 and any(byte in STOPS for byte in data):
                 asked = now
             *lines, told = (told + bytes(byte for byte in data if byte >= 32 or byte == 10)).split(b"\n")
             for line in lines:

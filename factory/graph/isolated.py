@@ -17,6 +17,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+from factory.exits import as_worker, without_terminal
 from factory.graph.frozen import frozen
 from factory.graph.limits import NO_LIMITS, Costs, Limits, cleared, described, notes_folder, put_away, watched
 from factory.graph.local import MAX_RETRIES, STEPS, Fuse, Ticket, attempt_tasks, name_of, unready
@@ -60,7 +61,8 @@ class IsolatedGraph:
         self.recorder: Recorder = NoRecorder()
         self._work, self._out, self._stopped = work, out, stopped
         self._context = multiprocessing.get_context("spawn")
-        self._stop = self._context.Event()
+        with without_terminal():  # what keeps its semaphores is a process, too
+            self._stop = self._context.Event()
         self._costs, self._notes = Costs(limits), notes_folder(out)
         self._waiting: deque[tuple[Ticket, str, tuple[Any, ...]]] = deque()
         self._numbers, self._run = count(), cleared(self._notes)
@@ -140,23 +142,27 @@ class IsolatedGraph:
         given = (theirs, self._work, self._out, self._stop, self._notes)
         self._process = self._context.Process(target=_serve, args=given, daemon=False)
         try:
-            self._process.start()
+            with without_terminal():
+                self._process.start()
+            theirs.close()
+            said = self._pipe.recv()
         except (pickle.PicklingError, AttributeError, TypeError) as error:
             raise NotReady(f"no process of its own can be given this work ({error}): graph.isolated=never") from error
-        theirs.close()
-        try:
-            said = self._pipe.recv()
         except EOFError:
             self._process.join()
             raise NotReady(f"the process for plug-ins ended with exit code {self._process.exitcode}") from None
+        except KeyboardInterrupt:  # which the process does not hear
+            if self._process.pid is not None:
+                self._process.kill()
+            raise
         if isinstance(said, Failure):
             raise unready(said)
 
 
 def _serve(pipe: Connection, work: Work, out: Location, stop: Any, notes: Path) -> None:
     """The other process: a task at a time, until there is none or the run is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to both; the run decides
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    as_worker()
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the run decides
     supplied = {"work": work, "out": out, "stopped": stop.is_set}
     kept: OrderedDict[int, Any] = OrderedDict()
 
@@ -169,11 +175,11 @@ def _serve(pipe: Connection, work: Work, out: Location, stop: Any, notes: Path) 
         kept.move_to_end(arg.number)
         return kept[arg.number]
 
-    said, _ = warm(work, draws=True)
-    pipe.send(said)
-    if isinstance(said, Failure):
-        return
     try:
+        said, _ = warm(work, draws=True)
+        pipe.send(said)
+        if isinstance(said, Failure):
+            return
         while (message := pipe.recv()) is not None:
             number, step, task, args = message
             given = [value_of(arg) for arg in args]

@@ -16,6 +16,7 @@ from threading import Event, Lock, Thread
 
 import numpy as np
 
+from factory.exits import as_worker, without_terminal
 from factory.graph.work import NotReady
 from factory.locks import locked
 from tasks.attempt import drive_and_judge
@@ -106,9 +107,13 @@ def compile_kernels(parts: Sequence[str], enough: Event | None = None) -> None:
                 print("compiling kernels, once for this version: about a minute", file=sys.stderr, flush=True)
             with _one_at_a_time, ExitStack() as held:
                 held.enter_context(locked(lock))
-                missing = [name for name in parts if not _is_compiled(name)]
+                missing, enough = [name for name in parts if not _is_compiled(name)], enough or Event()
                 with ThreadPoolExecutor(os.cpu_count()) as pool:
-                    list(pool.map(partial(_compile_part, enough=enough or Event()), missing))
+                    try:
+                        list(pool.map(partial(_compile_part, enough=enough), missing))
+                    except KeyboardInterrupt:  # which a part does not hear
+                        enough.set()
+                        raise
     except OSError as error:
         raise NotReady(not_kept(error)) from error
 
@@ -143,7 +148,9 @@ def _compile_part(name: str, enough: Event) -> None:
     command = [sys.executable, "-m", "factory.stages.warm", name]
     if enough.is_set():
         raise RuntimeError(f"compiling the kernels of {name} was not begun")
-    with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) as part:  # noqa: S603 (ours)
+    with without_terminal():
+        part = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)  # noqa: S603 (ours)
+    with part:
         said = _ended(part, enough)
     if part.returncode == DISK_FULL:
         raise OSError(said.strip().splitlines()[-1])
@@ -163,6 +170,7 @@ def _ended(part: "subprocess.Popen[str]", enough: Event) -> str:
 
 def _warm(name: str) -> int:
     """One part, in this process; the exit code."""
+    as_worker()
     gc.disable()  # a process that ends soon: some 220 MB more for a sixth of its time
     PARTS[name]()
     listed = "\n".join(sorted(path.relative_to(cache_dir()).as_posix() for path in USED))

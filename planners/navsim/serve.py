@@ -11,6 +11,7 @@ undistort=   true for a planner that was trained on pinhole pictures
 
 import os
 import sys
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,6 +33,12 @@ class Request:
 
 def main(request: Request) -> None:
     """Answer until nobody asks any more. Raises Refused for a planner that cannot plan there."""
+    with suppress(BrokenPipeError):  # who asked has gone
+        answer_all(request)
+
+
+def answer_all(request: Request) -> None:
+    """The same. Raises BrokenPipeError where nobody waits for an answer."""
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # whatever prints must not come between the answers
     try:

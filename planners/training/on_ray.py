@@ -5,6 +5,7 @@ Checkpoints and curves are written by the training itself under `out`, which eve
 
 import logging
 import os
+import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -18,6 +19,7 @@ import ray
 from ray.train import RunConfig, ScalingConfig, WorkerGroupError
 from ray.train.torch import TorchConfig, TorchTrainer, get_device
 
+from factory.exits import without_terminal
 from planners.training.processes import RaySettings, TrainingProcess, joined
 
 T = TypeVar("T")
@@ -63,11 +65,12 @@ def _connected() -> Iterator[None]:
     if not there:  # Ray warns that a cluster of our own asks for a token, as it should
         logging.getLogger("ray._private.authentication.authentication_token_setup").setLevel(logging.ERROR)
     try:
-        ray.init(
-            address=None if there else "local",
-            include_dashboard=None if there else False,
-            logging_level=logging.WARNING,
-        )
+        with without_terminal(signal.SIGHUP):  # Ray keeps SIGINT from its processes itself
+            ray.init(
+                address=None if there else "local",
+                include_dashboard=None if there else False,
+                logging_level=logging.WARNING,
+            )
         yield
     finally:
         ray.shutdown()

@@ -7,6 +7,7 @@ import logging
 import os
 import secrets
 import shutil
+import signal
 import socket
 import tempfile
 import time
@@ -17,6 +18,7 @@ import ray
 from ray.autoscaler.sdk import request_resources
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
+from factory.exits import without_terminal
 from factory.graph.local import ClusterDied, ClusterLacks
 from factory.store.disk import DiskFull, existing
 from factory.store.location import BadLocation, Location
@@ -51,13 +53,14 @@ def connect(workers: int | None, address: str | None) -> bool:
         logging.getLogger("ray._private.authentication.authentication_token_setup").setLevel(logging.ERROR)
     try:
         must_answer(named)
-        ray.init(
-            address=where,
-            runtime_env={"env_vars": environment},
-            log_to_driver=False,
-            logging_level=logging.WARNING,
-            **own,
-        )
+        with without_terminal(signal.SIGHUP):  # Ray keeps SIGINT from its processes itself
+            ray.init(
+                address=where,
+                runtime_env={"env_vars": environment},
+                log_to_driver=False,
+                logging_level=logging.WARNING,
+                **own,
+            )
     except Exception as error:  # Ray has none of its own for what keeps it from beginning
         if where == "local":
             ray.shutdown()

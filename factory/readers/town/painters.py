@@ -22,6 +22,7 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
+from factory.exits import as_worker, without_terminal
 from factory.readers.settings import TownSettings
 from factory.readers.town.town import log_name
 from factory.readers.town.write import write_logs
@@ -87,7 +88,8 @@ def write_all(towns: Sequence[TownFolder], settings: TownSettings) -> None:
             while waiting and len(painting) < at_once:
                 town = waiting.popleft()
                 begun.append(unfinished_folder(town.root))
-                painting[_painter(town, begun[-1], settings, lifeline)] = town
+                with without_terminal():
+                    painting[_painter(town, begun[-1], settings, lifeline)] = town
             for child in [child for child in painting if child.poll() is not None]:
                 town = painting.pop(child)
                 if refused := _refused(child):
@@ -124,6 +126,7 @@ def _refused(ended: "subprocess.Popen[bytes]") -> OSError | None:
 
 def main(told: str) -> None:
     """A painter's process: one town, on one core. Tells on standard output what it is refused."""
+    as_worker()
     threading.Thread(target=_end_with_input, daemon=True).start()
     town = json.loads(told)
     arguments = town["indices"], town["seed"], TownSettings(**town["settings"])

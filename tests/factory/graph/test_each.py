@@ -17,6 +17,8 @@ from factory.graph.each import IN_HAND, WorkerDied, each
 from factory.graph.work import Halted
 from factory.store.location import BadLocation, Location
 from tests.factory.items import Elsewhere, OddItem, squared
+from tests.factory.test_exits import child_of, has_begun
+from tests.factory.test_exits import until as once
 
 ROOT = Path(__file__).resolve().parents[3]
 HERE: dict[str, Any] = {}
@@ -127,6 +129,20 @@ def test_workers_end_with_a_driver_that_is_killed(tmp_path: Path) -> None:
     driver.kill()
     driver.wait()
     until(lambda: not any(map(alive, workers)), 20.0)
+
+
+@pytest.mark.slow
+def test_workers_that_are_just_starting_do_not_hear_what_a_terminal_sends_to_all() -> None:
+    code = (
+        "from factory.graph.each import each; from factory.graph.work import Halted; "
+        "from tests.factory.items import squared\n"
+        "try:\n    list(each(squared, range(100), workers=2))\nexcept Halted:\n    print('halted')"
+    )
+    how: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, start_new_session=True, **how) as driver:
+        once(lambda: has_begun(child_of(driver, "spawn_main")), driver)
+        os.killpg(driver.pid, signal.SIGINT)
+        assert driver.communicate(timeout=60) == ("halted\n", "")
 
 
 def alive(pid: int) -> bool:

@@ -1,4 +1,4 @@
-"""The first SIGTERM ends a run within 30 s, whatever hangs in it, and the same command goes on."""
+"""The first SIGTERM or SIGHUP ends a run within 30 s, whatever hangs in it, and the same command goes on."""
 
 import os
 import signal
@@ -33,24 +33,28 @@ if __name__ == "__main__":
 @pytest.mark.slow
 @pytest.mark.timeout(200)
 @pytest.mark.parametrize(
-    ("executor", "how", "code"),
+    ("executor", "how", "number", "code"),
     [
-        ("local", "loop", INTERRUPTED),
-        ("local", "compiled loop", -signal.SIGKILL),
-        ("local+isolated", "compiled loop", INTERRUPTED),
-        pytest.param("ray", "compiled loop", INTERRUPTED, marks=pytest.mark.ray),
+        ("local", "loop", signal.SIGHUP, INTERRUPTED),
+        ("local", "compiled loop", signal.SIGTERM, -signal.SIGKILL),
+        ("local+isolated", "compiled loop", signal.SIGHUP, INTERRUPTED),
+        pytest.param("ray", "compiled loop", signal.SIGHUP, INTERRUPTED, marks=pytest.mark.ray),
     ],
 )
-def test_a_first_signal_ends_a_run_that_hangs(tmp_path: Path, executor: str, how: str, code: int) -> None:
+def test_a_first_signal_ends_a_run_that_hangs(
+    tmp_path: Path, executor: str, how: str, number: signal.Signals, code: int
+) -> None:
+    """SIGHUP goes to all of its processes, as from a terminal that closes."""
     script, journal, out = tmp_path / "script.py", tmp_path / "journal", tmp_path / "out"
     script.write_text(CODE)
     words = [sys.executable, str(script), str(out), str(journal), how, executor]
-    running = subprocess.Popen(words, env=os.environ | {"PYTHONPATH": str(REPOSITORY)})
+    environment = os.environ | {"PYTHONPATH": str(REPOSITORY)}
+    running = subprocess.Popen(words, env=environment, start_new_session=True)
     while not (journal.exists() and "loop begins" in journal.read_text()):
         assert running.poll() is None
         time.sleep(0.1)
     time.sleep(1.0)  # until it is in the loop
-    running.terminate()
+    (os.killpg if number == signal.SIGHUP else os.kill)(running.pid, number)
     began = time.monotonic()
     assert running.wait(60.0) == code
     assert time.monotonic() - began < 30.0

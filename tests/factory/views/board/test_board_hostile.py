@@ -1,16 +1,25 @@
 """Whatever is sent to the dashboard: an answer or a closed connection, no traceback; others are served meanwhile."""
 
 import http.client
+import os
 import random
+import re
+import signal
 import socket
+import struct
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import suppress
+from pathlib import Path
 
 import pytest
 
 from factory.store.samples import Store
 from factory.views.board.server import CONNECTIONS, Board, Server
+from tests.factory.graph.runs import run
+from tests.pages import REPOSITORY
 
 At = tuple[str, int]
 HOST = b"Host: localhost\r\n\r\n"
@@ -107,3 +116,68 @@ def test_five_hundred_open_connections_keep_nobody_out(at: At) -> None:
     for connection in held:
         connection.close()
     assert is_answered(at)
+
+
+CLIENTS = 1000
+ASKED = b"GET /static/board.js HTTP/1.1\r\n" + HOST
+RESET = struct.pack("ii", 1, 0)  # SO_LINGER: what is closed is reset
+
+
+def left_early(at: At, number: int) -> socket.socket | None:
+    """A client that goes in one way or another; one that does not is still there."""
+    client = socket.create_connection(at, timeout=20)
+    match number % 5:
+        case 0:  # says nothing
+            pass
+        case 1:  # reads nothing of what it asked for
+            client.sendall(ASKED * 3)
+        case 2:  # the same, and breaks the connection off
+            client.sendall(ASKED * 3)
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
+        case 3:
+            client.sendall(b"GET /api/over")
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
+        case 4:  # trickles, and stays
+            client.sendall(b"G")
+            return client
+    client.close()
+    return None
+
+
+def size_of(pid: int) -> tuple[int, int, int]:
+    """Threads, open files and resident kB of a process."""
+    status = Path(f"/proc/{pid}/status").read_text()
+    threads, kilobytes = (int(re.findall(rf"^{key}:\s+(\d+)", status, re.M)[0]) for key in ("Threads", "VmRSS"))
+    return threads, len(os.listdir(f"/proc/{pid}/fd")), kilobytes
+
+
+@pytest.mark.slow
+def test_the_dashboard_outlives_a_thousand_clients_that_leave_early(tmp_path: Path) -> None:
+    """And who read what it prints."""
+    run(tmp_path, n=1, rounds=1)
+    words = [sys.executable, "-m", "factory", "dashboard", f"out={tmp_path}", "port=0"]
+    with subprocess.Popen(words, cwd=REPOSITORY, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as served:
+        assert served.stdout is not None and served.stderr is not None
+        served.stdout.readline()
+        found = re.search(r"http://127\.0\.0\.1:(\d+)/", served.stdout.readline())
+        assert found
+        served.stdout.close()
+        at = "127.0.0.1", int(found[1])
+        assert is_answered(at)
+        threads, files, kilobytes = size_of(served.pid)
+        trickling: list[socket.socket] = []
+        for number in range(CLIENTS):
+            client = left_early(at, number)
+            trickling += [] if client is None else [client]
+            for one in trickling[-10:]:
+                with suppress(OSError):  # it had to make way
+                    one.sendall(b"E")
+        assert is_answered(at)
+        after = size_of(served.pid)
+        assert after[0] <= threads + CONNECTIONS and after[1] <= files + CONNECTIONS and after[2] <= kilobytes + 200_000
+        for one in trickling:
+            one.close()
+        assert is_answered(at)
+        served.send_signal(signal.SIGINT)
+        assert served.wait(30) == 0
+        assert served.stderr.read() == ""
