@@ -12,8 +12,9 @@ complete, 2 bad settings or no clip (nothing is written), 3 complete with failed
 import os
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
+from functools import partial
 from itertools import zip_longest
 from typing import TYPE_CHECKING
 
@@ -35,11 +36,16 @@ if TYPE_CHECKING:
 
 def main(argv: Sequence[str], only_plan: bool = False) -> int:
     """The command, or what it would take; returns the exit code."""
+    return _told(argv, lambda asked: run(asked, only_plan))
+
+
+def _told(argv: Sequence[str], do: Callable[[Asked], int]) -> int:
+    """Exit code of what a command line asks for; what it cannot have in a line."""
     if {"-h", "--help"} & set(argv):
         print(help_text())
         return 0
     try:
-        return run(asked_of(argv), only_plan)
+        return do(asked_of(argv))
     except SettingsShown as settings:
         print(settings)
         return COMPLETE
@@ -121,12 +127,46 @@ def left(minutes: float | None, began: float) -> float | None:
 
 
 def run(asked: Asked, only_plan: bool) -> int:
-    """Plan, execute, commit, report; or plan alone. The command line is checked before anything heavy is imported."""
+    """Plan, execute, commit, report; or plan alone. The command line is checked before anything heavy is imported.
+
+    A run on Ray, unless this process has joined a cluster already, is a process of its own, which Ray may end.
+    """
+    config = _checked(asked)
+    if config.executor == "local" or only_plan or ("ray" in sys.modules and sys.modules["ray"].is_initialized()):
+        return _run(config, asked, only_plan)
+    from factory.graph.apart import run_apart
+
+    work = partial(_run_again, tuple(asked.words), time.monotonic())
+    return run_apart(work, "RAY_ADDRESS" not in os.environ, lambda line: print(line, flush=True))
+
+
+def _checked(asked: Asked) -> RunConfig:
     config = load_config(asked.words)
     if unusable := why_unusable(config.out):
         raise ConfigError(unusable)
     refuse_what_is_not_there(config)
+    return config
 
+
+def _run_again(words: Sequence[str], first_began: float, begun: int, tell: Callable[[str], None]) -> int:
+    """The run in its own process. first_began: of the first one, on the monotonic clock; begun: as of run_apart."""
+
+    def say(line: str) -> None:
+        print(line, flush=True)
+        tell(line)
+
+    began = first_began if begun else None
+    return _told(words, lambda asked: _run(_checked(asked), asked, False, began, begun, say))
+
+
+def _run(
+    config: RunConfig,
+    asked: Asked,
+    only_plan: bool,
+    began: float | None = None,
+    begun: int = 0,
+    say: Callable[[str], None] = print,
+) -> int:
     from factory.graph.episodes import EpisodesWanted
     from factory.graph.execute import execute, on_new_clusters
     from factory.graph.limits import Limits
@@ -156,7 +196,7 @@ def run(asked: Asked, only_plan: bool) -> int:
         if only_plan:
             print(calibrate(assembled, refs, store))
             return 0
-        began = time.monotonic()
+        since = time.monotonic() if began is None else began
         summary = on_new_clusters(
             lambda: execute(
                 assembled.work,
@@ -173,11 +213,13 @@ def run(asked: Asked, only_plan: bool) -> int:
                 on_change=config.on_change,
                 retry=config.retry_failed,
                 shard_seconds=config.shard_seconds,
-                minutes=left(config.minutes, began),
+                minutes=left(config.minutes, since),
                 episodes=EpisodesWanted(config.one_episode_in, prepared_episode) if config.one_episode_in else None,
                 mcap_shards=config.store.episodes == "all",
                 command=asked.words,
-            )
+            ),
+            say,
+            begun,
         )
     if summary.message:
         print(summary.message, file=sys.stderr)

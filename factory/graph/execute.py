@@ -17,6 +17,7 @@ from typing import Literal
 from deltalake.exceptions import DeltaError
 
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, asked_to_stop
+from factory.graph.apart import AGAIN, NEW_CLUSTERS, begun_anew
 from factory.graph.batch import SHARD_BYTES, SHARD_SECONDS, Gatherer, WriteFailed
 from factory.graph.crashes import counted, crash_of
 from factory.graph.driver import Driver
@@ -42,8 +43,6 @@ from factory.store.table import AnotherWriter
 from factory.wording import one_line
 
 Executor = Literal["local", "ray"]
-AGAIN = "run the same command again to go on"
-NEW_CLUSTERS = 3  # in one run, for those of its own that die
 
 
 @dataclass
@@ -219,13 +218,16 @@ def out_of_disk(error: DiskFull) -> str:
     return f"{error}; free disk space and run the same command again: it goes on from what is committed"
 
 
-def on_new_clusters(once: Callable[[], RunSummary], say: Callable[[str], None] = print) -> RunSummary:
-    """A run, and again on a new cluster where its own died: it goes on from what is committed."""
-    for number in range(1, NEW_CLUSTERS + 1):
+def on_new_clusters(once: Callable[[], RunSummary], say: Callable[[str], None] = print, begun: int = 0) -> RunSummary:
+    """A run, and again on a new cluster where its own died: it goes on from what is committed.
+
+    begun: new clusters that it had before.
+    """
+    for number in range(begun + 1, NEW_CLUSTERS + 1):
         summary = once()
         if not summary.lost_cluster:
             return summary
-        say(f"{summary.message}; a new cluster is started, {number} of {NEW_CLUSTERS}")
+        say(begun_anew(summary.message, number))
     summary = once()
     if summary.lost_cluster:
         summary.message += f"; {AGAIN}"

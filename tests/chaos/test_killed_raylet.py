@@ -1,19 +1,30 @@
 """A raylet that dies in the middle of a run: on a cluster of its own the run goes on by itself, three times at most."""
 
+import os
+import secrets
+import signal
 import subprocess
 import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import pytest
 
+from factory.exits import INTERRUPTED
+from factory.graph.apart import run_apart
 from factory.graph.execute import NEW_CLUSTERS, RunSummary, execute, on_new_clusters
+from factory.run import main as run_main
 from factory.store.samples import Store
 from factory.store.verify import verify
 from tests.chaos.killed_driver import EXPERTS
+from tests.chaos.processes import command
 from tests.factory.tables import assert_same_tables
 from tests.factory.toy import ToyWork, refs
+from tests.pages import REPOSITORY
 
-ROOT = Path(__file__).parents[2]
 RUN = """
 import sys
 from factory.graph import driver
@@ -62,6 +73,124 @@ try:
 except ClusterDied as error:
     print("our own" if error.is_ours else "another", error)
 """
+COMMAND = """
+import os
+from pathlib import Path
+from ray._private import worker
+from factory.exits import as_program
+from factory.run import main
+
+done, honest = Path(os.environ["DONE"]), worker.connect
+
+def connect(node, *given, **named):
+    if not done.exists():
+        done.touch()
+        (raylet,) = node.all_processes["raylet"]
+        raylet.process.kill()
+        raylet.process.wait()
+    return honest(node, *given, **named)
+
+worker.connect = connect
+if __name__ == "__main__":
+    as_program(main)
+"""
+TOWN = ("clips.n_clips=2", "clips.settings.cameras=[]", "clips.settings.lidar_beams=0", "render=none")
+TOWN += ("vocabulary.k=128", "workers=1")
+
+
+def left_of(mark: str) -> list[str]:
+    """Processes that were given this environment, once they had a minute to end; Python's own helper left out."""
+    end = time.monotonic() + 60.0
+    while True:
+        found = []
+        for folder in Path("/proc").glob("[0-9]*"):
+            with suppress(OSError):  # gone meanwhile
+                if mark.encode() in (folder / "environ").read_bytes():
+                    found.append(command(int(folder.name)))
+        found = [line for line in found if "resource_tracker" not in line]
+        if not found or time.monotonic() > end:
+            return found
+        time.sleep(0.1)
+
+
+@pytest.mark.ray
+@pytest.mark.slow
+def test_a_command_goes_on_where_ray_ends_the_process_whose_raylet_is_gone(tmp_path: Path) -> None:
+    """Ray does so by _exit(1), and leaves what else it had started."""
+    script, out, mark = tmp_path / "run.py", tmp_path / "out", secrets.token_hex(16)
+    script.write_text(COMMAND)
+    words = [sys.executable, str(script), *TOWN, f"out={out}"]
+    environment = os.environ | {"PYTHONPATH": str(REPOSITORY), "MARK": mark, "DONE": str(tmp_path / "done")}
+    done = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0 and "Traceback" not in done.stderr, (done.returncode, done.stderr)
+    assert done.stdout.count("Ray's raylet died; a new cluster is started, 1 of 3") == 1
+    assert left_of(mark) == []
+    assert run_main([*TOWN, "executor=local", f"out={tmp_path / 'plain'}"]) == 0
+    assert_same_tables(out, tmp_path / "plain")
+    assert verify(Store(out)).damage == ()
+
+
+def ended_by_ray(journal: Path, begun: int, tell: Callable[[str], None]) -> int:
+    """A driver as Ray ends it, with a process of its cluster beside it and a new cluster begun in it at first."""
+    with journal.open("a") as file:
+        print(begun, file=file)
+    subprocess.Popen(["sleep", "1000"])
+    if begun == 0:
+        tell("a new cluster")
+    os._exit(1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("is_ours", [True, False])
+def test_a_command_whose_clusters_all_die_ends_with_a_line(
+    tmp_path: Path, is_ours: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("MARK", mark := secrets.token_hex(16))
+    said = list[str]()
+    assert run_apart(partial(ended_by_ray, tmp_path / "begun"), is_ours, said.append) == INTERRUPTED
+    begun = (tmp_path / "begun").read_text().split()
+    assert begun == (["0", "2", "3"] if is_ours else ["0"]), "one was begun in the process itself"
+    assert [line[-6:] for line in said] == (["2 of 3", "3 of 3"] if is_ours else [])
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "raylet" in line and "run the same command again" in line
+    monkeypatch.delenv("MARK")
+    assert left_of(mark) == []
+
+
+def ends(how: str, begun: int, tell: Callable[[str], None]) -> int:
+    match how:
+        case "code":
+            return 3
+        case "bug":
+            raise RuntimeError("a bug of ours")
+        case _:
+            os.kill(os.getpid(), signal.SIGKILL)
+            return 0
+
+
+APART = """
+import sys
+from contextlib import suppress
+from functools import partial
+from factory.graph.apart import run_apart
+from tests.chaos.test_killed_raylet import ends
+
+if __name__ == "__main__":
+    sys.exit(run_apart(partial(ends, sys.argv[1]), True, print))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("how", "code"), [("code", 3), ("bug", 1), ("killed", -signal.SIGKILL)])
+def test_a_command_ends_as_its_run_did(tmp_path: Path, how: str, code: int) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(APART)
+    environment = os.environ | {"PYTHONPATH": str(REPOSITORY)}
+    done = subprocess.run(
+        [sys.executable, str(script), how], env=environment, capture_output=True, text=True, timeout=100
+    )
+    assert done.returncode == code and "new cluster" not in done.stdout
+    assert done.stderr.count("RuntimeError: a bug of ours") == (how == "bug"), done.stderr
 
 
 @pytest.mark.ray
@@ -69,7 +198,7 @@ except ClusterDied as error:
 def test_a_cluster_that_dies_while_it_is_started_is_one_that_died() -> None:
     """Ray itself waits half a minute and raises an Exception of no narrower class."""
     words = [sys.executable, "-c", START]
-    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(words, cwd=REPOSITORY, capture_output=True, text=True, timeout=300)
     assert "our own Ray did not begin" in done.stdout and done.returncode == 0, done.stderr
 
 
@@ -78,7 +207,7 @@ def test_a_cluster_that_dies_while_it_is_started_is_one_that_died() -> None:
 @pytest.mark.parametrize("while_", ["warming", "working"])
 def test_a_run_goes_on_where_its_own_raylet_dies(tmp_path: Path, while_: str) -> None:
     words = [sys.executable, "-c", RUN, str(tmp_path / "out"), while_]
-    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(words, cwd=REPOSITORY, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
     assert done.stdout.count("a new cluster is started") == 1 and "Ray's raylet died" in done.stdout
     execute(ToyWork(), refs(5), EXPERTS, 2, Store(tmp_path / "plain"), "local", say=lambda line: None)

@@ -1,0 +1,122 @@
+"""A run on Ray in a process beside the command's, which outlives what Ray does to it.
+
+Ray's core worker ends its process by exit code 1, and Python is not asked, where it finds the raylet or the object
+store of its node gone. The command's own process then says so in a line, and goes on on a new cluster.
+"""
+
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from multiprocessing.connection import Connection
+from pathlib import Path
+from types import FrameType
+
+from factory.exits import INTERRUPTED
+
+AGAIN = "run the same command again to go on"
+NEW_CLUSTERS = 3  # in one run, for those of its own that die
+BY_RAY = 1  # its exit code of a process whose raylet is gone
+
+Run = Callable[[int, Callable[[str], None]], int]  # clusters begun anew before, says that another is; its exit code
+
+
+def run_apart(run: Run, is_ours: bool, say: Callable[[str], None]) -> int:
+    """run(clusters begun anew before, how it says of another one) in a process of its own; the exit code.
+
+    is_ours: the run begins its cluster itself, so another can replace it. SIGINT and SIGTERM are passed on; where a
+    signal ends that process, it ends this one. What it leaves behind where Ray ends it is ended.
+    """
+    context, begun = multiprocessing.get_context("spawn"), 0
+    while True:
+        ours, theirs = context.Pipe(duplex=False)
+        process = context.Process(target=_work, args=(theirs, run, begun))
+        process.start()
+        theirs.close()
+        assert process.pid is not None
+        with _passing_signals(process.pid):
+            process.join()
+        _end_session(process.pid)
+        lines, code = _said(ours)
+        if code is not None:
+            return code
+        ended = process.exitcode or 0
+        if ended < 0:
+            with suppress(OSError):  # SIGKILL
+                signal.signal(-ended, signal.SIG_DFL)
+            os.kill(os.getpid(), -ended)
+        if ended != BY_RAY:
+            return ended
+        begun += len(lines)
+        if not is_ours:
+            print(f"Ray ended the run, whose raylet has died; {AGAIN} once Ray is up", file=sys.stderr)
+            return INTERRUPTED
+        if begun == NEW_CLUSTERS:
+            print(f"Ray's raylet died; {AGAIN}", file=sys.stderr)
+            return INTERRUPTED
+        begun += 1
+        say(begun_anew("Ray's raylet died", begun))
+
+
+def begun_anew(said: str, number: int) -> str:
+    """The line about one of NEW_CLUSTERS."""
+    return f"{said}; a new cluster is started, {number} of {NEW_CLUSTERS}"
+
+
+def _work(pipe: Connection, run: Run, begun: int) -> None:
+    """The other process: a session of its own, so that a terminal's signals come by way of the command's alone."""
+    os.setsid()
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    command = multiprocessing.parent_process()
+    assert command is not None
+
+    def watch() -> None:
+        command.join()
+        os._exit(BY_RAY)
+
+    threading.Thread(target=watch, daemon=True).start()
+    code = 1
+    try:
+        code = run(begun, pipe.send)
+    finally:
+        pipe.send(code)
+    sys.exit(code)
+
+
+def _said(pipe: Connection) -> tuple[list[str], int | None]:
+    """Of a process that has ended: its lines, and its exit code where it came to say it."""
+    lines: list[str] = []
+    with suppress(EOFError):
+        while isinstance(message := pipe.recv(), str):
+            lines.append(message)
+        return lines, message
+    return lines, None
+
+
+@contextmanager
+def _passing_signals(pid: int) -> Iterator[None]:
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def pass_on(number: int, frame: FrameType | None) -> None:
+        with suppress(ProcessLookupError):
+            os.kill(pid, number)
+
+    before = {number: signal.signal(number, pass_on) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _end_session(session: int) -> None:
+    """End what a process that is gone had begun: Ray's processes of a cluster of its own."""
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            if int(stat.read_text().rpartition(")")[2].split()[3]) == session:
+                os.kill(int(stat.parent.name), signal.SIGKILL)
