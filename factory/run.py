@@ -137,7 +137,7 @@ def run(asked: Asked, only_plan: bool) -> int:
     from factory.graph.apart import run_apart
 
     work = partial(_run_again, tuple(asked.words), time.monotonic())
-    return run_apart(work, "RAY_ADDRESS" not in os.environ, lambda line: print(line, flush=True))
+    return run_apart(work, not os.environ.get("RAY_ADDRESS"), lambda line: print(line, flush=True))
 
 
 def _checked(asked: Asked) -> RunConfig:

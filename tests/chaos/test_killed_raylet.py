@@ -5,6 +5,7 @@ import secrets
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -13,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from factory.exits import INTERRUPTED
+from factory.exits import INTERRUPTED, asked_to_stop
 from factory.graph.apart import run_apart
 from factory.graph.execute import NEW_CLUSTERS, RunSummary, execute, on_new_clusters
 from factory.run import main as run_main
@@ -94,7 +95,13 @@ worker.connect = connect
 if __name__ == "__main__":
     as_program(main)
 """
-TOWN = ("clips.n_clips=2", "clips.settings.cameras=[]", "clips.settings.lidar_beams=0", "render=none")
+TOWN = (
+    "clips.n_clips=1",
+    "experts=[human]",
+    "clips.settings.cameras=[]",
+    "clips.settings.lidar_beams=0",
+    "render=none",
+)
 TOWN += ("vocabulary.k=128", "workers=1")
 
 
@@ -168,15 +175,23 @@ def ends(how: str, begun: int, tell: Callable[[str], None]) -> int:
             return 0
 
 
+def waits(journal: str, begun: int, tell: Callable[[str], None]) -> int:
+    """Until it is asked to stop."""
+    asked = threading.Event()
+    with asked_to_stop(asked.set):
+        Path(journal).write_text(str(os.getpid()))
+        assert asked.wait(100.0)
+    return INTERRUPTED
+
+
 APART = """
 import sys
-from contextlib import suppress
 from functools import partial
 from factory.graph.apart import run_apart
-from tests.chaos.test_killed_raylet import ends
+from tests.chaos.test_killed_raylet import ends, waits
 
 if __name__ == "__main__":
-    sys.exit(run_apart(partial(ends, sys.argv[1]), True, print))
+    sys.exit(run_apart(partial({"ends": ends, "waits": waits}[sys.argv[1]], sys.argv[2]), True, print))
 """
 
 
@@ -187,10 +202,25 @@ def test_a_command_ends_as_its_run_did(tmp_path: Path, how: str, code: int) -> N
     script.write_text(APART)
     environment = os.environ | {"PYTHONPATH": str(REPOSITORY)}
     done = subprocess.run(
-        [sys.executable, str(script), how], env=environment, capture_output=True, text=True, timeout=100
+        [sys.executable, str(script), "ends", how], env=environment, capture_output=True, text=True, timeout=100
     )
     assert done.returncode == code and "new cluster" not in done.stdout
     assert done.stderr.count("RuntimeError: a bug of ours") == (how == "bug"), done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, INTERRUPTED), (signal.SIGKILL, -signal.SIGKILL)])
+def test_a_signal_to_the_command_reaches_its_run(tmp_path: Path, number: signal.Signals, code: int) -> None:
+    script, journal, mark = tmp_path / "script.py", tmp_path / "journal", secrets.token_hex(16)
+    script.write_text(APART)
+    environment = os.environ | {"PYTHONPATH": str(REPOSITORY), "MARK": mark}
+    running = subprocess.Popen([sys.executable, str(script), "waits", str(journal)], env=environment)
+    while not (journal.exists() and journal.read_text()):
+        assert running.poll() is None
+        time.sleep(0.05)
+    running.send_signal(number)
+    assert running.wait(100.0) == code
+    assert left_of(mark) == []
 
 
 @pytest.mark.ray
