@@ -39,19 +39,25 @@ def end_at_interrupt() -> None:
 
 
 def as_program(main: Callable[[Sequence[str]], int]) -> None:
-    """Run the command line of this process and end with its exit code; INTERRUPTED and a line at a KeyboardInterrupt.
+    """Run the command line of this process and end with its exit code."""
+    sys.exit(exit_code_of(lambda: main(sys.argv[1:])))
 
-    What it prints decides nothing: see `print_without_failing`.
+
+def exit_code_of(work: Callable[[], int]) -> int:
+    """What the work of this process returns; INTERRUPTED, after a line, at a KeyboardInterrupt.
+
+    What it prints decides nothing: see `print_without_failing`. Signals of OF_TERMINALS are heeded from here on, where
+    the process was begun in `without_terminal`.
     """
     print_without_failing()
     if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
         signal.signal(signal.SIGINT, _interrupt)
     try:
-        code = main(sys.argv[1:])
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, OF_TERMINALS)
+        return work()
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
-        code = INTERRUPTED
-    sys.exit(code)
+        return INTERRUPTED
 
 
 class _Interrupt(KeyboardInterrupt):
@@ -130,6 +136,11 @@ class _Output(io.FileIO):
             return super().write(data)
 
 
+def heeded() -> list[signal.Signals]:
+    """The signals that ask this process to stop: STOPS, less a SIGHUP that is ignored, as by nohup."""
+    return [number for number in STOPS if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN]
+
+
 @contextmanager
 def asked_to_stop(stop: Callable[[], object]) -> Iterator[None]:
     """The first SIGINT, SIGTERM or SIGHUP calls `stop`, a second one raises KeyboardInterrupt.
@@ -152,8 +163,7 @@ def asked_to_stop(stop: Callable[[], object]) -> Iterator[None]:
         elif number != signal.SIGHUP:
             _interrupt(number, frame)
 
-    heeded = [number for number in STOPS if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN]
-    before = {number: signal.signal(number, handle) for number in heeded}
+    before = {number: signal.signal(number, handle) for number in heeded()}
     try:
         yield
     finally:

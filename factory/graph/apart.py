@@ -12,10 +12,11 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from types import FrameType
 
-from factory.exits import INTERRUPTED
+from factory.exits import INTERRUPTED, exit_code_of, heeded, without_terminal
 
 AGAIN = "run the same command again to go on"
 NEW_CLUSTERS = 3  # in one run, for those of its own that die
@@ -27,18 +28,19 @@ Run = Callable[[int, Callable[[str], None]], int]  # clusters begun anew before,
 def run_apart(run: Run, is_ours: bool, say: Callable[[str], None]) -> int:
     """run(clusters begun anew before, how it says of another one) in a process of its own; the exit code.
 
-    is_ours: the run begins its cluster itself, so another can replace it. SIGINT and SIGTERM are passed on; where a
-    signal ends that process, it ends this one. What it leaves behind where Ray ends it is ended.
+    is_ours: the run begins its cluster itself, so another can replace it. Signals that ask it to stop are passed on;
+    where a signal ends that process, it ends this one. What it leaves behind where Ray ends it is ended.
     """
     context, begun = multiprocessing.get_context("spawn"), 0
     while True:
         ours, theirs = context.Pipe(duplex=False)
         process = context.Process(target=_work, args=(theirs, run, begun))
-        process.start()
-        theirs.close()
-        assert process.pid is not None
-        with _passing_signals(process.pid):
+        with _passing_signals(process):
+            with without_terminal():
+                process.start()
+            theirs.close()
             process.join()
+        assert process.pid is not None
         _end_session(process.pid)
         lines, code = _said(ours)
         if code is not None:
@@ -69,7 +71,6 @@ def begun_anew(said: str, number: int) -> str:
 def _work(pipe: Connection, run: Run, begun: int) -> None:
     """The other process: a session of its own, so that a terminal's signals come by way of the command's alone."""
     os.setsid()
-    signal.signal(signal.SIGPIPE, signal.SIG_DFL)
     command = multiprocessing.parent_process()
     assert command is not None
 
@@ -80,7 +81,7 @@ def _work(pipe: Connection, run: Run, begun: int) -> None:
     threading.Thread(target=watch, daemon=True).start()
     code = 1
     try:
-        code = run(begun, pipe.send)
+        code = exit_code_of(lambda: run(begun, pipe.send))
     finally:
         pipe.send(code)
     sys.exit(code)
@@ -97,16 +98,17 @@ def _said(pipe: Connection) -> tuple[list[str], int | None]:
 
 
 @contextmanager
-def _passing_signals(pid: int) -> Iterator[None]:
+def _passing_signals(process: BaseProcess) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
 
     def pass_on(number: int, frame: FrameType | None) -> None:
-        with suppress(ProcessLookupError):
-            os.kill(pid, number)
+        if process.pid is not None:
+            with suppress(ProcessLookupError):
+                os.kill(process.pid, number)
 
-    before = {number: signal.signal(number, pass_on) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, pass_on) for number in heeded()}
     try:
         yield
     finally:

@@ -9,7 +9,7 @@ import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from threading import Event, Lock, Thread
@@ -105,8 +105,7 @@ def compile_kernels(parts: Sequence[str], enough: Event | None = None) -> None:
         with (cache_dir() / f"lock-{_key()}").open("w") as lock:
             if enough is None:  # somebody waits
                 print("compiling kernels, once for this version: about a minute", file=sys.stderr, flush=True)
-            with _one_at_a_time, ExitStack() as held:
-                held.enter_context(locked(lock))
+            with _one_at_a_time, locked(lock):
                 missing, enough = [name for name in parts if not _is_compiled(name)], enough or Event()
                 with ThreadPoolExecutor(os.cpu_count()) as pool:
                     try:
