@@ -1,9 +1,11 @@
 """Cache files that carry a checksum: what was damaged on disk is found before any of it is used.
 
-    <content> <SEAL> <sha256 of the content, 32 bytes>
+    <content> <SEAL> <sha256 of the content and of the file's key, 32 bytes>
 
-Formats that are read from their front, or that find their end themselves, such as npz, stay readable with it. JSON
-carries its own in a member. A checksum finds damage; it does not keep out who writes into the folder.
+The key is what a file is looked for by, such as its name: a whole file that stands under the key of another is damaged.
+Files that have none are found by whoever names them. Formats that are read from their front, or that find their end
+themselves, such as npz, stay readable with it. JSON carries its own in a member. A checksum finds damage; it does not
+keep out who writes into the folder.
 """
 
 import hashlib
@@ -21,27 +23,31 @@ class Damaged(ValueError):
     """A file is not as it was written: cut, overwritten, or of a version that sealed none."""
 
 
-def sealed(content: bytes) -> bytes:
+class Unkeyed(Damaged):
+    """A whole file of a version whose seals knew no keys: nobody can tell which it was."""
+
+
+def sealed(content: bytes, key: str = "") -> bytes:
     """What to write."""
-    return content + SEAL + hashlib.sha256(content).digest()
+    return content + SEAL + _keyed(hashlib.sha256(content), key)
 
 
-def unsealed(data: bytes) -> bytes:
-    """The content of what was read. Raises Damaged."""
+def unsealed(data: bytes, key: str = "") -> bytes:
+    """The content of what was read under a key. Raises Damaged."""
     content = data[:-SEAL_BYTES]
-    _compare(hashlib.sha256(content).digest(), data[-SEAL_BYTES:])
+    _compare(hashlib.sha256(content), data[-SEAL_BYTES:], key)
     return content
 
 
-def seal(path: Path) -> None:
+def seal(path: Path, key: str = "") -> None:
     """Appends the seal to a file that is written."""
     with path.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").digest()
+        sha = hashlib.file_digest(file, "sha256")
     with path.open("ab") as file:
-        file.write(SEAL + digest)
+        file.write(SEAL + _keyed(sha, key))
 
 
-def check(path: Path) -> None:
+def check(path: Path, key: str = "") -> None:
     """Holds a large file against its seal without having it in memory. Raises Damaged, OSError."""
     left, sha = path.stat().st_size - SEAL_BYTES, hashlib.sha256()
     with path.open("rb") as file:
@@ -51,7 +57,7 @@ def check(path: Path) -> None:
                 break
             sha.update(block)
             left -= len(block)
-        _compare(sha.digest(), file.read())
+        _compare(sha, file.read(), key)
 
 
 def sealed_json(members: Mapping[str, Any]) -> str:
@@ -75,8 +81,19 @@ def _json_digest(members: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(members).encode()).hexdigest()
 
 
-def _compare(digest: bytes, stated: bytes) -> None:
+def _keyed(sha: "hashlib._Hash", key: str) -> bytes:
+    if not key:
+        return sha.digest()
+    both = sha.copy()
+    both.update(b"\x1f" + key.encode())
+    return both.digest()
+
+
+def _compare(sha: "hashlib._Hash", stated: bytes, key: str) -> None:
     if len(stated) < SEAL_BYTES or not stated.startswith(SEAL):
         raise Damaged("it does not end with a checksum: it was cut, or an earlier version wrote it")
-    if stated != SEAL + digest:
-        raise Damaged("its checksum is another than when it was written")
+    if stated == SEAL + _keyed(sha, key):
+        return
+    if key and stated == SEAL + sha.digest():
+        raise Unkeyed("its checksum is without its name: an earlier version wrote it")
+    raise Damaged(f"its checksum is another than when it was written{' under this name' if key else ''}")

@@ -41,7 +41,7 @@ class BadPicture(ValueError):
 
 def header_of(data: bytes | Bytes) -> tuple[str, Size]:
     """JPEG or PNG, and the size that the header declares, whatever it is. Raises BadPicture."""
-    view = memoryview(data)
+    view = data.data if isinstance(data, np.ndarray) else memoryview(data)
     if view[:8] == PNG:
         name, size = "PNG", (_number(view[16:20]), _number(view[20:24])) if view[12:16] == b"IHDR" else (0, 0)
     elif view[:2] == JPEG:

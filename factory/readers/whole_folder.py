@@ -37,7 +37,7 @@ def unfinished_folder(root: Path) -> Path:
 def finish_whole(unfinished: Path, root: Path, write: Write) -> None:
     """Has `unfinished` written and renames it to `root`; it is gone afterwards, whatever happened."""
     try:
-        _fill(unfinished, write)
+        _fill(unfinished, write, root.name)
         try:
             os.rename(unfinished, root.resolve())
         except OSError:
@@ -53,41 +53,49 @@ def finish_whole(unfinished: Path, root: Path, write: Write) -> None:
 def mend(root: Path, write: Write) -> None:
     """Holds a folder that is there against its checksums; where it is damaged its files are made again.
 
-    They are moved into place one by one, so that who reads beside it finds every file, before or after. One line in the
-    log says what was wrong.
+    They are moved into place one by one, so that who reads beside it finds every file, before or after; what is not of
+    the folder goes. One line in the log says what was wrong.
     """
     if not (wrong := _wrong(root)):
         return
     log.warning("%s is damaged (%s); it is made again", root, wrong)
     anew = unfinished_folder(root)
     try:
-        _fill(anew, write)
-        for name in [*_files(anew), SUMS]:
+        _fill(anew, write, root.name)
+        own = [*_files(anew), SUMS]
+        for name in own:
             there = root / name
             if not there.is_file() or _digest(there) != _digest(anew / name):
                 there.parent.mkdir(parents=True, exist_ok=True)
                 beside = Path(shutil.move(anew / name, tempfile.mkdtemp(prefix=".", dir=there.parent)))
                 os.replace(beside, there)  # from the same disk, which a linked folder's need not be the root's
                 beside.parent.rmdir()
+        for name in set(_files(root)) - set(own):
+            (root / name).unlink()
+        for folder in sorted((path for path in root.rglob("*") if path.is_dir()), reverse=True):
+            if not any(folder.iterdir()):
+                folder.rmdir()
     finally:
         shutil.rmtree(anew, ignore_errors=True)
 
 
-def _fill(folder: Path, write: Write) -> None:
+def _fill(folder: Path, write: Write, name: str) -> None:
     write(folder)
     sums = {name: _digest(folder / name) for name in _files(folder)}
-    (folder / SUMS).write_text(sealed_json({"files": sums}))
+    (folder / SUMS).write_text(sealed_json({"folder": name, "files": sums}))
 
 
 def _wrong(root: Path) -> str:
     """The first file that is not as it was written, and why; empty: all are."""
     try:
-        sums = unsealed_json((root / SUMS).read_bytes())["files"]
+        told = unsealed_json((root / SUMS).read_bytes())
     except FileNotFoundError:
         return f"no {SUMS}: an earlier version wrote it"
     except Damaged as error:
         return f"{SUMS}: {error}"
-    for name, digest in sums.items():
+    if told.get("folder") != root.name:
+        return f"{SUMS} is of {told.get('folder', 'a folder without a name: an earlier version wrote it')}"
+    for name, digest in told["files"].items():
         if not (root / name).is_file():
             return f"{name} is missing"
         if _digest(root / name) != digest:

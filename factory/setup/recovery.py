@@ -20,6 +20,7 @@ from factory.setup.vocabulary import (
 from factory.store.identity import canonical_json
 from tasks.caches import user_cache
 from tasks.experts.recovery.expert import Recovery, RecoverySettings, RecoveryTable
+from tasks.sealed import check
 from tasks.stages import stage_versions
 
 log = logging.getLogger(__name__)
@@ -55,11 +56,12 @@ def _table_of(run: RunContext, vocabularies: Sequence[str]) -> RecoveryTable:
     cached = user_cache() / "tables" / f"recovery-{key}.npz"
     if cached.is_file():
         try:
+            check(cached, cached.name)
             return load_recovery_table(cached)
-        except ValueError as error:  # it has a digest of its own, as any table a user names
-            log.warning("%s; it is made again", error)
+        except ValueError as error:  # Damaged among them
+            log.warning("%s: %s; it is made again", cached, str(error).removeprefix(f"{cached}: "))
     built = build_recovery_table([train_windows(reader)], loaded)
-    save_recovery_table(cached, built, {"clips": len(index.refs), "vocabularies": files})
+    save_recovery_table(cached, built, {"clips": len(index.refs), "vocabularies": files}, cached.name)
     return built
 
 

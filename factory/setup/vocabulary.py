@@ -16,6 +16,7 @@ from factory.readers.base import BadClip, ClipReader
 from factory.readers.validate import read_clip
 from factory.store.disk import whole_file
 from tasks.experts.recovery.expert import RecoveryTable
+from tasks.sealed import seal
 from tasks.world.arrays import Array
 from tasks.world.clip import CLIP_STEPS, HORIZON_STEPS, STEP_S
 from tasks.world.vocabulary import Vocabulary, checked_trajectories, cluster, human_windows
@@ -132,10 +133,16 @@ def save_vocabulary(path: str | Path, vocabulary: Vocabulary, origin: dict[str, 
     _describe(Path(path), {"digest": vocabulary.digest, "k": len(vocabulary)} | origin)
 
 
-def save_recovery_table(path: str | Path, table: RecoveryTable, origin: dict[str, object]) -> None:
-    """Writes the .npz, and a .json beside it with the digest, the number of trajectories and `origin`."""
-    with whole_file(Path(path), table.trajectories.nbytes) as draft, draft.open("wb") as file:
-        np.savez(file, allow_pickle=False, trajectories=table.trajectories, digest=np.array(table.digest))
+def save_recovery_table(path: str | Path, table: RecoveryTable, origin: dict[str, object], key: str = "") -> None:
+    """Writes the .npz, and a .json beside it with the digest, the number of trajectories and `origin`.
+
+    key: that it is sealed with, of a file in a cache.
+    """
+    with whole_file(Path(path), table.trajectories.nbytes) as draft:
+        with draft.open("wb") as file:
+            np.savez(file, allow_pickle=False, trajectories=table.trajectories, digest=np.array(table.digest))
+        if key:
+            seal(draft, key)
     _describe(Path(path), {"digest": table.digest, "trajectories": len(table)} | origin)
 
 

@@ -38,7 +38,7 @@ from tasks.world.arrays import Array, Bools
 from tasks.world.camera import Camera, SensorFile
 from tasks.world.clip import Block, Clip, of_other_log, own_name
 
-ASSET_VERSION = 10  # raised by hand when the same sensors give another scene
+ASSET_VERSION = 10  # raised by hand when the same sensors give another scene, or it is kept otherwise
 PARALLAX_SHARE = 0.9  # without lidar, a photo with no other in stereo reach shows sky alone; so few may be like that
 log = logging.getLogger(__name__)
 
@@ -94,7 +94,7 @@ def asset_for(
     with only_builder(path):
         if path.exists():
             try:
-                kept = read_scene(path)
+                kept = read_scene(path, path.stem)
             except BadScene as error:
                 log.warning("%s; it is built again", error)
             else:

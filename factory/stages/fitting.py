@@ -62,7 +62,7 @@ def fitted(
         with whole_file(begun, sum(array.nbytes for array in arrays.values())) as draft:
             with draft.open("wb") as file:
                 np.savez(file, **arrays)  # type: ignore[arg-type]
-            seal(draft)
+            seal(draft, begun.name)
         if state.iteration < settings.iterations and stopped():
             said.unlink(missing_ok=True)
             raise Halted(f"{path.stem}: {state.iteration} of {settings.iterations} iterations are done")
@@ -88,7 +88,7 @@ def _resumed(begun: Path, start: FitState) -> FitState:
     if not begun.exists():
         return start
     try:
-        check(begun)
+        check(begun, begun.name)
         with np.load(begun, allow_pickle=False) as arrays:
             return FitState.from_arrays(dict(arrays))
     except (ValueError, KeyError, OSError, zipfile.BadZipFile) as error:

@@ -1,12 +1,13 @@
 """Whether what a run keeps of blocks under `out/cache` is whole: scenes, corrected rigs, half-done fits."""
 
+from contextlib import suppress
 from pathlib import Path
 
 from factory.stages.fitting import BEGUN
-from factory.stages.rig import SAID
+from factory.stages.rig import SAID, told_of
 from factory.stages.scene_file import SUFFIX, BadScene, read_scene
 from factory.store.location import Location
-from tasks.sealed import Damaged, check, unsealed_json
+from tasks.sealed import Damaged, Unkeyed, check
 
 
 def damaged_blocks(out: Location) -> dict[str, str]:
@@ -24,8 +25,9 @@ def damaged_blocks(out: Location) -> dict[str, str]:
 
 def _check(path: Path) -> None:
     if path.name.endswith(SUFFIX):
-        read_scene(path)
+        read_scene(path, path.stem, None)
     elif path.name.endswith(BEGUN):
-        check(path)
+        with suppress(Unkeyed):
+            check(path, path.name)
     elif path.name.endswith(SAID):
-        unsealed_json(path.read_bytes())
+        told_of(path)

@@ -110,9 +110,17 @@ def corrected_rig(
 
 
 def _say(path: Path, found: dict[str, object]) -> None:
-    text = sealed_json(found)
+    text = sealed_json({"block": path.stem, **found})
     with whole_file(path.with_suffix(SAID), len(text)) as draft:
         draft.write_text(text, encoding="utf-8")
+
+
+def told_of(said: Path) -> dict[str, Any]:
+    """What a file tells of its block; files of older versions do not name theirs. Raises Damaged, OSError."""
+    told = unsealed_json(said.read_bytes())
+    if told.pop("block", block := said.name.removesuffix(SAID)) != block:
+        raise Damaged("it was written of another block")
+    return told
 
 
 def used_rig(
@@ -124,7 +132,7 @@ def used_rig(
     """
     said = path.with_suffix(SAID)
     try:
-        told = unsealed_json(said.read_bytes())
+        told = told_of(said)
     except FileNotFoundError:
         told = {}
     except Damaged as error:
@@ -132,7 +140,7 @@ def used_rig(
         told = {}
     if "taken" not in told:  # files of older versions have none
         corrected_rig(path, block, cameras, settings, own_body)
-        told = unsealed_json(said.read_bytes())
+        told = told_of(said)
     used: dict[str, dict[str, Any]] = {
         row["name"]: {key: np.array(row[key], np.float64) for key in CALIBRATED} for row in told["used"]
     }
@@ -148,7 +156,7 @@ def said_again(
     """Writes what was found anew where the file beside `path` is damaged; the scene there stays. Raises BadClip."""
     said = path.with_suffix(SAID)
     try:
-        unsealed_json(said.read_bytes())
+        told_of(said)
     except FileNotFoundError:  # somebody took it away
         return
     except Damaged as error:

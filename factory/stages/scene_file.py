@@ -15,8 +15,8 @@ With `SceneDtype.FLOAT16` what Gaussians are made of, but for their places (`mea
 version is 2, which older programs refuse. Whoever reads gets float32 again, quaternions of length 1.
 
 The header's entry `scene` holds the rest: format, the nodes' track ids and those of the shifts, quality photo by photo,
-the photos of the exposures, the block's range, the cameras where they were corrected, and the digest over all of it. No
-code runs when a file is read.
+the photos of the exposures, the block's range, the cameras where they were corrected, the digest over all of it, and
+the name that the file was written under. No code runs when a file is read.
 """
 
 import hashlib
@@ -64,14 +64,18 @@ def write_scene(path: Path, asset: RenderAsset, dtype: SceneDtype = SceneDtype.F
     """
     tensors, described = tensors_of(asset, dtype), described_by(asset, dtype)
     digest = digest_of(tensors, described)
-    data = save(dict(tensors), metadata={KEY: canonical_json(described | {"digest": digest})})
+    header = described | {"digest": digest, "kept_as": path.stem}
+    data = save(dict(tensors), metadata={KEY: canonical_json(header)})
     with whole_file(path, len(data)) as draft:
         draft.write_bytes(data)
     return scene_of(tensors, described, digest)
 
 
-def read_scene(path: Path) -> RenderAsset:
-    """The stored scene. Raises BadScene that names the file, where it is no scene or not what its digest says."""
+def read_scene(path: Path, *kept_as: str | None) -> RenderAsset:
+    """The stored scene. Raises BadScene that names the file, where it is no scene or not what its digest says.
+
+    kept_as: names that it may have been written under, where that matters; None: of a version that told none.
+    """
     try:
         with safe_open(path, framework="numpy") as file:
             header = (file.metadata() or {}).get(KEY)
@@ -85,7 +89,9 @@ def read_scene(path: Path) -> RenderAsset:
         if described["format"] != FORMAT or described["version"] not in VERSION_OF.values():
             found = f"{described['format']!r} {described['version']}"
             raise BadScene(f"{path}: format {found}, this version reads {FORMAT!r} 1 and 2")
-        stated = described.pop("digest")
+        stated, name = described.pop("digest"), described.pop("kept_as", None)
+        if kept_as and name not in kept_as:
+            raise BadScene(f"{path}: it is of another block, written as {name}.safetensors")
         if digest_of(tensors, described) != stated:
             raise BadScene(f"{path}: the content does not match its digest {stated}")
         return scene_of(tensors, described, stated)

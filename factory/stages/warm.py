@@ -133,7 +133,9 @@ def marker(name: str) -> Path:
 def _is_compiled(name: str) -> bool:
     """The part was compiled, and nobody has taken a file of it away since."""
     try:
-        files = [cache_dir() / file for file in unsealed(marker(name).read_bytes()).decode().splitlines()]
+        files = [
+            cache_dir() / file for file in unsealed(marker(name).read_bytes(), marker(name).name).decode().splitlines()
+        ]
     except OSError:  # not there, or in a folder that cannot be: whoever then writes into it says so
         return False
     except Damaged as error:
@@ -175,7 +177,7 @@ def _warm(name: str) -> int:
     listed = "\n".join(sorted(path.relative_to(cache_dir()).as_posix() for path in USED))
     try:
         for part in (name, *INCLUDED.get(name, ())):
-            write_whole(marker(part), sealed(listed.encode()))
+            write_whole(marker(part), sealed(listed.encode(), marker(part).name))
     except OSError as error:
         print(error, file=sys.stderr)
         return DISK_FULL

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factory.store.location import Location
-from tasks.sealed import SEAL, SEAL_BYTES, Damaged, sealed, unsealed
+from tasks.sealed import SEAL, SEAL_BYTES, Damaged, Unkeyed, sealed, unsealed
 
 if TYPE_CHECKING:
     from tasks.hard_scenes import BenchmarkClip, GivenScenes, OneStageClip
@@ -32,6 +32,7 @@ MOVED = {
     "factory.clips.reader:ClipRef": "factory.readers.base:ClipRef",
 }
 DROPPED = {"factory.stages.pipeline:PerturbedClip": {"before"}}  # members that older files have and nobody reads
+_AGAIN = "the command that made it writes it again"
 _PLAIN = (str, int, float, bool, type(None))
 
 
@@ -70,13 +71,18 @@ class ClipCache:
         self.location = location
 
     def load(self, key: str) -> object | None:
-        """The stored value, None where there is none. Raises BadCacheFile."""
+        """The stored value, None where there is none, or one that does not name its key. Raises BadCacheFile."""
         data = self.location.read(f"{key}.npz")
-        return None if data is None else decode(_whole(data))
+        try:
+            return None if data is None else decode(unsealed(data, key))
+        except Unkeyed:
+            return None
+        except Damaged as error:
+            raise BadCacheFile(str(error)) from error
 
     def store(self, key: str, value: object) -> None:
         """Whole or not at all."""
-        self.location.write(f"{key}.npz", sealed(encode(value)))
+        self.location.write(f"{key}.npz", sealed(encode(value), key))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,9 +108,11 @@ class SceneFiles:
         try:
             scenes = decode(_whole(data) if SEAL in data[-SEAL_BYTES:] else data)
         except BadCacheFile as error:
-            raise BadCacheFile(f"{path}: {error}; remove it, the command that made it writes it again") from error
+            raise BadCacheFile(f"{path}: {error}; remove it, {_AGAIN}") from error
         if not isinstance(scenes, BenchmarkClip | GivenScenes | OneStageClip):
             raise BadCacheFile(f"{path} holds {type(scenes).__name__}, not a clip's scenes")
+        if scenes.clip.clip_id != clip_id:
+            raise BadCacheFile(f"{path} holds clip {scenes.clip.clip_id}; remove it, {_AGAIN}")
         return scenes
 
     def clip_ids(self) -> list[str]:
@@ -112,12 +120,20 @@ class SceneFiles:
         return [name.removesuffix(".npz") for name in self.location.names() if name.endswith(".npz")]
 
 
-def check_kept(data: bytes) -> None:
-    """Hold a kept file against its seal; one of a version that sealed none is decoded. Raises BadCacheFile."""
-    if SEAL in data[-SEAL_BYTES:]:
-        _whole(data)
-    else:
-        decode(data)
+def check_prepared(data: bytes, key: str) -> None:
+    """Hold the file of a prepared clip against its seal; one of an earlier version by what that sealed, or is decoded.
+
+    Raises BadCacheFile.
+    """
+    try:
+        if SEAL not in data[-SEAL_BYTES:]:
+            decode(data)
+        else:
+            unsealed(data, key)
+    except Unkeyed:
+        return
+    except (Damaged, BadCacheFile) as error:
+        raise BadCacheFile(f"{error}; the next run makes it again") from error
 
 
 def _whole(data: bytes) -> bytes:

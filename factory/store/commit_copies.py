@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from factory.store.location import Location
-from tasks.sealed import Damaged, sealed, unsealed
+from tasks.sealed import Damaged, Unkeyed, sealed, unsealed
 
 LOG, COPIES = "_delta_log", "_commits"
 LAST = "_last_checkpoint"  # where the newest checkpoint is; written over by each
@@ -83,13 +83,21 @@ class CommitCopies:
             if not self._copy(name):
                 self._copies.remove(name)
             return
-        self._log.write(name, unsealed(self._copies.read(name) or b""))
+        self._log.write(name, self._copy_of(name))
 
     def _copy(self, name: str) -> bool:
         data = self._log.read(name)
         if data is not None:
-            self._copies.write(name, sealed(data))
+            self._copies.write(name, sealed(data, name))
         return data is not None
+
+    def _copy_of(self, name: str) -> bytes:
+        """Those of earlier versions are held against their content alone. Raises Damaged."""
+        data = self._copies.read(name) or b""
+        try:
+            return unsealed(data, name)
+        except Unkeyed:
+            return unsealed(data)
 
     def _unsealed(self) -> tuple[Mapping[str, bytes], list[LogDamage]]:
         whole, problems = {}, []
@@ -97,7 +105,7 @@ class CommitCopies:
             if name != LAST and not NUMBERED.fullmatch(name):  # a draft that a killed writer left
                 continue
             try:
-                whole[name] = unsealed(self._copies.read(name) or b"")
+                whole[name] = self._copy_of(name)
             except Damaged as error:
                 problems.append(LogDamage(f"{COPIES}/{name}", str(error)))
         return whole, problems

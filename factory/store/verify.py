@@ -10,7 +10,7 @@ readers ignore them.
 import hashlib
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from factory.store.cache import BadCacheFile, check_kept
+from factory.store.cache import BadCacheFile, SceneFiles, check_prepared
 from factory.store.commit_copies import COPIES, LOG, CommitCopies, LogDamage
 from factory.store.counts.codes import codes, fixed_bytes, packed
 from factory.store.episodes import FOLDER, check_episode, episode_name
@@ -32,7 +32,7 @@ from factory.store.table import KeyedTable, LiveFile
 
 TABLES = ("plans", "candidates", "samples", "outcomes", SAMPLES_MCAP.name)
 OF_WALKS = ["clip_id", "expert", "candidate_index", "round", "settings_hash"]
-KEPT = ("cache/prepared", "scenes")  # sealed files
+PREPARED, SCENES = "cache/prepared", "scenes"
 DRAFT = re.compile(r"\..*\.tmp")  # that a killed run left
 NAMED = re.compile(r"(.*/)?part-([0-9a-f]{32})\.parquet")
 
@@ -166,16 +166,22 @@ def _check_columns(table: KeyedTable, file: LiveFile, rows: pa.Table) -> None:
 
 
 def _damaged_kept(out: Location) -> list[DamagedPart]:
-    """Sealed files of the cache and the scenes, and what the newest run says of itself."""
+    """Prepared clips, the scenes of clips, and what the newest run says of itself."""
     found = []
-    for folder in KEPT:
+    prepared, scenes = out.child(PREPARED), out.child(SCENES)
+    checks: dict[str, Callable[[str], object]] = {
+        PREPARED: lambda key: check_prepared(prepared.read(f"{key}.npz") or b"", key),
+        SCENES: SceneFiles(scenes).load,
+    }
+    for folder, check in checks.items():
         for name in out.child(folder).names():
             if DRAFT.fullmatch(name):
                 continue
             try:
-                check_kept(out.child(folder).read(name) or b"")
-            except BadCacheFile as error:
-                found.append(DamagedPart(f"{folder}/{name}", f"{error}; the next run makes it again"))
+                check(name.removesuffix(".npz"))
+            except (BadCacheFile, FileNotFoundError) as error:  # the latter: a file of another kind of name
+                problem = str(error).removeprefix(f"{out.child(folder).uri}/{name}").removeprefix(": ").strip()
+                found.append(DamagedPart(f"{folder}/{name}", problem))
     for name in (CURRENT_RUN, LAST_RUN):
         try:
             dict(json.loads(out.read(name) or b"{}"))

@@ -30,7 +30,7 @@ from planners.data.feed import Feed
 from planners.data.files import SampleFile, leaves, read_group
 from tasks.sealed import Damaged, sealed, unsealed
 
-FORMAT = 2
+FORMAT = 3
 ALIGNED_BYTES = 64  # Arrow's own
 LENGTH_BYTES = 8
 log = logging.getLogger(__name__)
@@ -92,7 +92,7 @@ class LocalCopy:
             sink.write(data)
             sink.write(bytes(-data.size % ALIGNED_BYTES))
             end += data.size + -data.size % ALIGNED_BYTES
-        index = sealed(json.dumps(places).encode())
+        index = sealed(json.dumps(places).encode(), self.path.name)
         sink.write(index + len(index).to_bytes(LENGTH_BYTES, "little"))
 
 
@@ -110,12 +110,12 @@ class CopyReader:
         """
         inode, data = self._mapped or self._map()
         try:
-            return _group_of(data, group)
+            return _group_of(data, group, self._copy.path.name)
         except Damaged as error:
             log.warning("%s: %s; it is made again", self._copy.path, error)
         self._copy.make(inode)
         try:
-            return _group_of(self._map()[1], group)
+            return _group_of(self._map()[1], group, self._copy.path.name)
         except Damaged as error:
             raise OSError(f"its copy {self._copy.path}, just made again, is damaged: {error}") from error
 
@@ -129,11 +129,15 @@ class CopyReader:
         return self._mapped
 
 
-def _group_of(data: pa.Buffer, group: int) -> pa.Table:
-    """One row group of what a copy holds, nothing of which is parsed before its checksum is right. Raises Damaged."""
+def _group_of(data: pa.Buffer, group: int, key: str) -> pa.Table:
+    """One row group of what a copy holds, nothing of which is parsed before its checksum is right. Raises Damaged.
+
+    key: the name that the copy has.
+    """
     end = max(0, data.size - LENGTH_BYTES)
     n_bytes = int.from_bytes(data[end:], "little")
-    offset, length, checksum = json.loads(unsealed(data[max(0, end - n_bytes) : end].to_pybytes()))[group]
+    index = data[max(0, end - n_bytes) : end].to_pybytes()
+    offset, length, checksum = json.loads(unsealed(index, key))[group]
     block = data.slice(min(offset, data.size), length)
     if zlib.crc32(block) != checksum:
         raise Damaged(f"checksum of row group {group}")

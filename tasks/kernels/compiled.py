@@ -151,7 +151,7 @@ class KernelCache:
         target.refresh()
         path = self._path(signature)
         try:
-            kept = unsealed(path.read_bytes())
+            kept = unsealed(path.read_bytes(), _key(path))
         except OSError:  # not there, or nobody's to read: compiled again, and save_overload says what is wrong
             return None
         except Damaged as error:
@@ -167,7 +167,7 @@ class KernelCache:
         path = self._path(signature)
         try:
             make_cache_dir()
-            write_whole(path, sealed(dumps(compiled._reduce())))
+            write_whole(path, sealed(dumps(compiled._reduce()), _key(path)))
         except OSError as error:
             warnings.warn(not_kept(error), RuntimeWarning, stacklevel=1)
             return
@@ -181,6 +181,11 @@ class KernelCache:
         """Forget every form of the function."""
         for path in Path(self.cache_path).glob(f"{self._name}-*.kernel"):
             path.unlink(missing_ok=True)
+
+
+def _key(path: Path) -> str:
+    """A kernel's file by its place in the cache: another one's machine code is not run for it."""
+    return path.relative_to(cache_dir()).as_posix()
 
 
 def write_whole(path: Path, data: bytes) -> None:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tasks.sealed import Damaged, check, seal, sealed, sealed_json, unsealed, unsealed_json
+from tasks.sealed import Damaged, Unkeyed, check, seal, sealed, sealed_json, unsealed, unsealed_json
 
 CONTENT = bytes(range(90))
 
@@ -30,6 +30,23 @@ def test_every_flip_and_every_cut_is_found(tmp_path: Path) -> None:
             unsealed(data)
         with pytest.raises(Damaged):
             check(tmp_path / "x")
+
+
+def test_a_file_is_whole_under_its_own_key_alone(tmp_path: Path) -> None:
+    data = sealed(CONTENT, "a")
+    (tmp_path / "x").write_bytes(data)
+    assert unsealed(data, "a") == CONTENT
+    check(tmp_path / "x", "a")
+    (tmp_path / "y").write_bytes(CONTENT)
+    seal(tmp_path / "y", "a")
+    assert (tmp_path / "y").read_bytes() == data
+    for key in ("b", "", "aa"):
+        with pytest.raises(Damaged):
+            unsealed(data, key)
+        with pytest.raises(Damaged):
+            check(tmp_path / "x", key)
+    with pytest.raises(Unkeyed, match="an earlier version wrote it"):
+        unsealed(sealed(CONTENT), "a")
 
 
 def test_json_is_read_by_anyone_and_holds_its_own_checksum() -> None:

@@ -24,7 +24,7 @@ from tasks.kernels.compiled import write_whole
 from tasks.sealed import sealed, unsealed
 from tasks.world.arrays import Array, Bools, Ints
 
-TABLE_VERSION = 3  # of the tables kept
+TABLE_VERSION = 4  # of the tables kept
 FRAME_S, SLACK_S = 0.5, 0.05  # between two frames; more or less is a gap
 GAP, SHORT_HISTORY, SHORT_FUTURE = "gap_in_frames", "short_history", "short_future"
 NO_ROUTE, NO_BOXES, STANDING, ABSENT = "no_route", "not_annotated", "ego_standing", "absent_token"
@@ -98,7 +98,8 @@ def table_of(log: LogFrames) -> FrameTable:
 def kept_table(path: Path, cache_dir: Path) -> FrameTable | None:
     """The table of the log at `path`, if one was kept of just this file. Raises BadClip where there is no such file."""
     try:
-        data = unsealed(_kept(path, cache_dir).read_bytes())
+        kept = _kept(path, cache_dir)
+        data = unsealed(kept.read_bytes(), kept.name)
         rows = np.load(io.BytesIO(data), allow_pickle=False)
         return FrameTable(*(rows[column.name] for column in fields(FrameTable)))
     except FileNotFoundError:
@@ -124,7 +125,8 @@ def keep_table(table: FrameTable, path: Path, cache_dir: Path) -> None:
     data = io.BytesIO()
     np.save(data, rows, allow_pickle=False)
     cache_dir.mkdir(parents=True, exist_ok=True)
-    write_whole(_kept(path, cache_dir), sealed(data.getvalue()))
+    kept = _kept(path, cache_dir)
+    write_whole(kept, sealed(data.getvalue(), kept.name))
 
 
 def _kept(path: Path, cache_dir: Path) -> Path:

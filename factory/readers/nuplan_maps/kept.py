@@ -16,7 +16,7 @@ from tasks.sealed import check, seal
 
 log = logging.getLogger(__name__)
 
-FORMAT = 1  # raise by hand whenever a GeoPackage gives other tables
+FORMAT = 2  # raise by hand whenever a GeoPackage gives other tables, or they are kept otherwise
 
 
 class BadMapCache(ValueError):
@@ -68,7 +68,7 @@ def save_tables(path: Path, tables: dict[str, Table]) -> None:
     try:
         with draft.open("wb") as file:
             np.savez(file, allow_pickle=False, **arrays)
-        seal(draft)
+        seal(draft, path.name)
         draft.replace(path)
     finally:
         draft.unlink(missing_ok=True)
@@ -77,7 +77,7 @@ def save_tables(path: Path, tables: dict[str, Table]) -> None:
 def load_tables(path: Path) -> dict[str, Table]:
     """Raises BadMapCache."""
     try:
-        check(path)
+        check(path, path.name)
         with np.load(path, allow_pickle=False) as stored:
             if int(stored["format"]) != FORMAT:
                 raise BadMapCache(f"format {int(stored['format'])}, this version reads {FORMAT}")

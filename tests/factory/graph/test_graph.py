@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import permutations
 from pathlib import Path
 
 import pytest
@@ -16,9 +17,11 @@ from factory.graph import execute as execution
 from factory.graph.execute import execute
 from factory.graph.work import Built, Driven, Dropped, Halted, PreparedClip, Stopped, never
 from factory.readers.base import ClipRef
+from factory.store.cache import BadCacheFile
 from factory.store.identity import UNLISTED
 from factory.store.samples import Store
 from factory.store.verify import verify
+from tasks.sealed import sealed, unsealed
 from tests.factory.graph.runs import EXPERTS, run
 from tests.factory.tables import assert_same_tables, tables_of
 from tests.factory.toy import ToyWork, ran, refs
@@ -42,6 +45,42 @@ def test_the_same_command_again_executes_nothing(tmp_path: Path) -> None:
     assert ran(journal, "") == tasks and second.executed.attempts == 0
     assert second.executed.found_done == first.executed.attempts
     assert second.counts == first.counts
+
+
+def test_a_prepared_clip_under_another_s_name_is_named_and_prepared_again(
+    tmp_path: Path, begun: Callable[..., Path], plain: Callable[..., Path]
+) -> None:
+    begun(rounds=1)
+    paths = sorted((tmp_path / "out/cache/prepared").iterdir())
+    whole, cache = [path.read_bytes() for path in paths], Store(tmp_path / "out").cache
+    assert len(paths) == 4 and verify(Store(tmp_path / "out")).damage == ()
+    for one, other in permutations(range(4), 2):
+        paths[one].write_bytes(whole[other])
+        with pytest.raises(BadCacheFile, match="under this name"):
+            cache.load(paths[one].stem)
+        paths[one].write_bytes(whole[one])
+        assert cache.load(paths[one].stem) is not None
+    paths[0].write_bytes(whole[1])
+    paths[1].write_bytes(whole[0])
+    damage = verify(Store(tmp_path / "out")).damage
+    assert [line.partition(": ")[0] for line in damage] == [f"cache/prepared/{path.name}" for path in paths[:2]]
+    later = run(tmp_path / "out", rounds=3)
+    assert later.executed.prepared == 2 and sum("prepared again" in note for note in later.notes) == 2
+    assert verify(Store(tmp_path / "out")).damage == () and [path.read_bytes() for path in paths] == whole
+    assert_same_tables(tmp_path / "out", plain(rounds=3))
+
+
+def test_a_prepared_clip_of_an_earlier_version_counts_as_none_and_is_no_damage(
+    tmp_path: Path, begun: Callable[..., Path], plain: Callable[..., Path]
+) -> None:
+    begun(rounds=1)
+    for path in (tmp_path / "out/cache/prepared").iterdir():
+        path.write_bytes(sealed(unsealed(path.read_bytes(), path.stem)))
+    assert verify(Store(tmp_path / "out")).damage == ()
+    later = run(tmp_path / "out", rounds=3)
+    assert later.executed.prepared == len(later.notes) == 4
+    assert all(note.endswith("was not in the cache; prepared again") for note in later.notes)
+    assert_same_tables(tmp_path / "out", plain(rounds=3))
 
 
 @pytest.mark.slow

@@ -18,6 +18,8 @@ from factory.readers.whole_folder import SUMS
 from factory.setup.recovery import _table_of
 from factory.setup.vocabulary import load_recovery_table, save_recovery_table, save_vocabulary
 from factory.stages.fitting import _resumed
+from factory.stages.kept_blocks import damaged_blocks
+from factory.stages.rig import SAID, _say, told_of
 from factory.stages.scene_file import BadScene, read_scene, write_scene
 from factory.stages.warm import _is_compiled, marker, tiny_clip
 from factory.store.cache import BadCacheFile, SceneFiles, encode
@@ -25,7 +27,7 @@ from factory.store.location import Location
 from tasks.experts.recovery.expert import RecoveryTable
 from tasks.hard_scenes import OneStageClip
 from tasks.kernels.compiled import kernel
-from tasks.sealed import SEAL_BYTES, seal, sealed
+from tasks.sealed import SEAL_BYTES, Damaged, seal, sealed, sealed_json, unsealed_json
 from tasks.world.kinematic_vocabulary import kinematic_trajectories
 from tasks.world.vocabulary import Vocabulary
 from tests.factory.damage import damaged
@@ -124,7 +126,7 @@ def test_a_fit_that_is_half_done(tmp_path: Path, lines: Lines) -> None:
     path, start = tmp_path / "block-1.fit.npz", SimpleNamespace()
     with path.open("wb") as file:
         np.savez(file, iteration=np.array(500), owner=np.arange(20))
-    seal(path)
+    seal(path, path.name)
     for content in damaged(path.read_bytes()):
         path.write_bytes(content)
         assert _resumed(path, start) is start  # type: ignore[comparison-overlap, arg-type]
@@ -145,7 +147,9 @@ def test_a_recovery_table_is_made_again_in_the_cache(
     golden = _table_of(run, [str(tmp_path / "v.npy")]).digest  # type: ignore[arg-type]
     (path,) = (tmp_path / "cache").rglob("recovery-*.npz")
     whole = path.read_bytes()
-    for content in (whole[:9000] + bytes([whole[9000] ^ 1]) + whole[9001:], whole[:100], b""):
+    save_recovery_table(tmp_path / "x.npz", RecoveryTable(np.zeros((3, 40, 3))), {}, "recovery-0.npz")
+    another = (tmp_path / "x.npz").read_bytes()
+    for content in (whole[:9000] + bytes([whole[9000] ^ 1]) + whole[9001:], whole[:100], b"", another):
         path.write_bytes(content)
         assert _table_of(run, [str(tmp_path / "v.npy")]).digest == golden  # type: ignore[arg-type]
         (line,) = lines()
@@ -190,13 +194,114 @@ def test_the_list_of_a_part_s_kernels(tmp_path: Path, monkeypatch: pytest.Monkey
     path = marker("judge")
     path.parent.mkdir()
     (path.parent / "a.kernel").touch()
-    path.write_bytes(sealed(b"a.kernel"))
+    path.write_bytes(sealed(b"a.kernel", path.name))
     assert _is_compiled("judge")
-    for content in damaged(sealed(b"a.kernel"), every=1):
+    for content in damaged(sealed(b"a.kernel", path.name), every=1):
         path.write_bytes(content)
         assert not _is_compiled("judge")
         (line,) = lines()
         assert line.startswith(f"{path}: it")
+
+
+Kept = tuple[list[Path], Callable[[int], object]]  # two files of a cache, and what is loaded by the key of each
+
+
+def prepared_clips(folder: Path) -> Kept:
+    work, out, both = ToyWork(), Location(str(folder)), refs(2)
+    keys = [cache_key(ref.clip_id, work.identity.prepare_digest) for ref in both]
+    return [folder / f"cache/prepared/{key}.npz" for key in keys], lambda i: encode(prepare(work, out, both[i])[1])
+
+
+def city_tables(folder: Path) -> Kept:
+    write_root(folder, "us-ma-boston", stub_rows(scale=2.0))
+    maps = [next(folder.glob(f"{city}/*/map.gpkg")) for city in ("us-ma-boston", "sg-one-north")]
+    return [cache_file(path) for path in maps], lambda i: kept_tables(maps[i])["lanes_polygons"].xy.tobytes()
+
+
+def log_tables(folder: Path) -> Kept:
+    logs = [write_frames(folder, split, NAME, [frame(k) for k in range(n)]) for split, n in (("mini", 3), ("test", 4))]
+    load = lambda i: len(kept_table(logs[i], folder / "kept") or make_table(logs[i], folder / "kept"))  # noqa: E731
+    found = []
+    for i in range(2):
+        load(i)
+        found += [path for path in (folder / "kept").iterdir() if path not in found]
+    return found, load
+
+
+def kernels(folder: Path) -> Kept:
+    def twice(value: float) -> float:
+        return 2.0 * value
+
+    def thrice(value: float) -> float:
+        return 3.0 * value
+
+    both, found = (twice, thrice), list[Path]()
+    for function in both:
+        kernel(function)(1.0)
+        found += [path for path in folder.rglob("*.kernel") if path not in found]
+    return found, lambda i: kernel(both[i])(1.0)
+
+
+@pytest.mark.parametrize("kind", [prepared_clips, city_tables, log_tables, kernels])
+def test_a_whole_file_under_another_s_name_is_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lines: Lines, kind: Callable[[Path], Kept]
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    paths, load = kind(tmp_path)
+    golden = [load(0), load(1)]
+    whole = [path.read_bytes() for path in paths]
+    assert golden[0] != golden[1] and whole[0] != whole[1] and not lines()
+    for i, path in enumerate(paths):
+        path.write_bytes(whole[1 - i])
+    assert [load(0), load(1)] == golden
+    if kind is not prepared_clips:  # which notes it in its report
+        assert [line.partition(": ")[0] for line in lines()] == list(map(str, paths))
+    assert kind is kernels or [path.read_bytes() for path in paths] == whole  # machine code differs by a counter
+    assert [load(0), load(1)] == golden and not lines()
+
+
+def test_what_is_half_done_and_a_list_of_kernels_are_not_another_s(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lines: Lines
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    start, fit = SimpleNamespace(), tmp_path / "block-1.fit.npz"
+    with fit.open("wb") as file:
+        np.savez(file, iteration=np.array(500), owner=np.arange(20))
+    seal(fit, fit.name)
+    assert _resumed(fit.rename(tmp_path / "block-2.fit.npz"), start) is start  # type: ignore[comparison-overlap, arg-type]
+    marker("judge").parent.mkdir()
+    marker("judge").write_bytes(sealed(b"", marker("judge").name))
+    assert _is_compiled("judge")
+    marker("judge").rename(marker("fit"))
+    assert not _is_compiled("fit")
+    assert [line.endswith(("begins again", "made again")) for line in lines()] == [True, True]
+
+
+def test_scenes_of_another_clip_are_refused_by_name(tmp_path: Path) -> None:
+    files = SceneFiles(Location(str(tmp_path)))
+    files.store(OneStageClip(tiny_clip()))
+    (tmp_path / "warm.npz").rename(tmp_path / "cold.npz")
+    with pytest.raises(BadCacheFile, match=rf"{tmp_path}/cold\.npz holds clip warm; remove it"):
+        files.load("cold")
+
+
+def test_a_kept_block_under_another_s_name_is_refused(tmp_path: Path) -> None:
+    """By whoever renders from it and by verify; scenes have no names where a user keeps them."""
+    for name in ("1", "2"):
+        path = tmp_path / f"cache/block-{name}.safetensors"
+        write_scene(path, scene())
+        _say(path, {"used": [], "taken": []})
+    assert not damaged_blocks(Location(str(tmp_path)))
+    for suffix in (".safetensors", SAID):
+        (tmp_path / f"cache/block-1{suffix}").rename(tmp_path / f"cache/block-2{suffix}")
+    other = tmp_path / "cache/block-2.safetensors"
+    with pytest.raises(BadScene, match=f"{other}: it is of another block, written as block-1"):
+        read_scene(other, other.stem)
+    assert read_scene(other).digest
+    with pytest.raises(Damaged, match="of another block"):
+        told_of(other.with_suffix(SAID))
+    assert damaged_blocks(Location(str(tmp_path))).keys() == {f"cache/block-2{s}" for s in (".safetensors", SAID)}
 
 
 def test_damage_is_damage() -> None:
@@ -235,3 +340,13 @@ def test_a_town(tmp_path: Path, lines: Lines, several: bool) -> None:
     assert reader.digest(ref) == golden
     assert reader.index().refs and not lines()
     assert list(tmp_path.iterdir()) == [root]
+    # Another town's folder under this one's name.
+    told = unsealed_json(whole[root / SUMS])
+    (root / SUMS).write_text(sealed_json(told | {"folder": "town-4"}))
+    (root / "another_log").mkdir()
+    (root / "another_log/map.json").write_text("{}")
+    assert reader.index().refs[0] == ref
+    (line,) = lines()
+    assert line.startswith(f"{root} is damaged ({SUMS} is of town-4)")
+    assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == whole
+    assert not (root / "another_log").exists()

@@ -56,7 +56,7 @@ def test_what_is_wrong_is_told_by_file(folder: Path) -> None:
     with pytest.raises(ValueError, match=r"holds no <camera>\.png"):
         masks_digest(str(folder / "nowhere"))
     (folder / "back.png").write_bytes(b"no picture")
-    with pytest.raises(ValueError, match=r"back\.png is not an image"):
+    with pytest.raises(ValueError, match=r"back\.png is not a JPEG or PNG picture"):
         read_masks(str(folder), [CAMERA])
 
 

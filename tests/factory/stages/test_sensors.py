@@ -219,6 +219,22 @@ def test_a_damaged_block_is_noticed_and_built_again(
     assert not list(tmp_path.glob(".scene-*"))
 
 
+def test_a_block_under_another_s_name_is_built_again(clip: Clip, tmp_path: Path) -> None:
+    both = [clip, replace(clip, log_id="another")]
+    paths = [tmp_path / f"block-{block_id(one, SETTINGS)}.safetensors" for one in both]
+    for one in both:
+        asset_for(one, SETTINGS, tmp_path)
+    whole = [path.read_bytes() for path in paths]
+    assert whole[0] != whole[1]
+    paths[0].write_bytes(whole[1])
+    paths[1].write_bytes(whole[0])
+    assert [asset.block.log_id for one in both if (asset := asset_for(one, SETTINGS, tmp_path)) and asset.block] == [
+        "log",
+        "another",
+    ]
+    assert [path.read_bytes() for path in paths] == whole
+
+
 def test_a_clip_without_lidar_or_without_a_rig_has_no_scene(clip: Clip, tmp_path: Path) -> None:
     assert asset_for(replace(clip, images=(), sweeps=()), SETTINGS, tmp_path) is None
     assert asset_for(replace(clip, cameras=(), images=()), SETTINGS, tmp_path) is None

@@ -13,6 +13,7 @@ from factory.graph.episodes import EpisodesWanted
 from factory.graph.execute import execute
 from factory.store.commit_copies import CommitCopies
 from factory.store.episodes import Message, episode_bytes
+from factory.store.location import Location
 from factory.store.parquet_file import write_shard
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
@@ -20,6 +21,7 @@ from factory.store.schema import SAMPLES
 from factory.store.table import AnotherWriter
 from factory.store.upkeep import restore_logs
 from factory.store.verify import damaged_logs, verify
+from tasks.sealed import sealed, unsealed
 from tests.factory.damage import damaged
 from tests.factory.data_folders import add_companions
 from tests.factory.tables import assert_same_tables
@@ -283,6 +285,20 @@ def test_drafts_that_a_killed_writer_left_are_no_damage(tmp_path: Path) -> None:
         (tmp_path / folder).mkdir(parents=True)
         (tmp_path / folder / ".clip.npz.0123abcd.tmp").write_bytes(b"half")
     assert verify(Store(tmp_path)).damage == ()
+
+
+def test_a_commit_s_copy_under_another_s_name_is_no_copy_of_it(out: Path) -> None:
+    """It is made again of the log, which is not written over; those of earlier versions are held by their content."""
+    log, (first, second, *_) = files(out, "samples/_delta_log/*.json"), files(out, "samples/_commits/*.json")
+    whole, logged = second.read_bytes(), [path.read_bytes() for path in log]
+    second.write_bytes(first.read_bytes())
+    assert [f"{name}/{damage.name}" for name, damage in damaged_logs(Location(str(out)))] == [
+        f"samples/_commits/{second.name}"
+    ]
+    check([f"out={out}", "repair=true"])
+    assert second.read_bytes() == whole and [path.read_bytes() for path in log] == logged
+    second.write_bytes(sealed(unsealed(whole, second.name)))
+    assert not damaged_logs(Location(str(out)))
 
 
 class Killed(BaseException):

@@ -95,6 +95,18 @@ def test_of_the_pictures_those_at_now_of_the_chosen_cameras_are_held(tmp_path: P
     assert len(copies(folder)) == 2, "other cameras, another copy"
 
 
+@pytest.mark.usefixtures("windows")
+def test_a_copy_under_another_s_name_is_made_again(out: str, folder: Path) -> None:
+    list(loader(out, folder).epoch(0))
+    whole = copies(folder)
+    for name, other in zip(whole, reversed(whole)):
+        (folder / name).write_bytes(whole[other])
+    assert len(whole) > 1 and copies(folder).items().isdisjoint(whole.items())
+    for a, b in zip(loader(out, None).epoch(0), loader(out, folder).epoch(0), strict=True):
+        assert_same(a, b)
+    assert copies(folder) == whole
+
+
 def test_labels_and_maps_are_copied_too(tmp_path: Path, folder: Path) -> None:
     needs = Needs(bev=BevLayout(cell_m=2.0, times_s=(0.0,)), n_agents=2, labels="vocabulary-1")
     made = sample(0)
