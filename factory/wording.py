@@ -1,6 +1,11 @@
 """Rates, times and errors as people say them."""
 
 import re
+from collections.abc import Collection, Iterator
+from itertools import islice
+
+MOST_SHOWN, ITEMS_SHOWN = 80, 4  # characters of a text, items of a container
+BITS_SHOWN = 256  # of an integer; Python writes out some 14,000
 
 
 def rate_text(per_s: float, what: str = "") -> str:
@@ -21,5 +26,45 @@ def time_text(seconds: float) -> str:
 
 def one_line(error: BaseException) -> str:
     """What an error says, without a client's colours and line breaks."""
-    plain = re.sub(r"\x1b\[[0-9;]*m", "", str(error)).replace("\u21b3", ":")
+    try:
+        said = str(error)
+    except ValueError:  # of an integer that Python does not write out, such as a missing key
+        said = ", ".join(map(shown, error.args))
+    plain = re.sub(r"\x1b\[[0-9;]*m", "", said).replace("\u21b3", ":")
     return " ".join(plain.split())[:300] or type(error).__name__
+
+
+def shown(value: object, inside: int = 2) -> str:
+    """A value out of a file as its `repr`, in bounded time and length whatever it is: what is long is cut.
+
+    `repr` itself may take for ever: of tuples that share others, of integers that Python does not write out.
+    inside: containers in each other of which the items are shown.
+    """
+    if isinstance(value, str | bytes | bytearray):
+        text = repr(value[:MOST_SHOWN])
+        return text if len(value) <= MOST_SHOWN else f"{text}... ({len(value):,} long)"
+    if isinstance(value, int) and value.bit_length() > BITS_SHOWN:
+        return f"an integer of {value.bit_length():,} bits"
+    if value is None or isinstance(value, int | float | complex):
+        return repr(value)
+    if isinstance(value, dict):
+        pairs = [f"{shown(key, inside - 1)}: {shown(value[key], inside - 1)}" for key in _first(value, inside)]
+        return f"{{{', '.join(pairs)}{_rest(value, inside)}}}"
+    if isinstance(value, list | tuple | set | frozenset):
+        opens, closes = (
+            ("[", "]") if isinstance(value, list) else ("(", ")") if isinstance(value, tuple) else ("{", "}")
+        )
+        items = ", ".join(shown(item, inside - 1) for item in _first(value, inside))
+        return f"{opens}{items}{_rest(value, inside)}{closes}"
+    if (shape := getattr(value, "shape", None)) == () and hasattr(value, "item"):
+        return shown(value.item(), 0)
+    return f"a {type(value).__name__}" + (f" of shape {shape}" if isinstance(shape, tuple) else "")
+
+
+def _first(value: Collection[object], inside: int) -> Iterator[object]:
+    return islice(value, ITEMS_SHOWN if inside > 0 else 0)
+
+
+def _rest(value: Collection[object], inside: int) -> str:
+    shown_items = min(len(value), ITEMS_SHOWN if inside > 0 else 0)
+    return "" if shown_items == len(value) else f"{', ' if shown_items else ''}..."

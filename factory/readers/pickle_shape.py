@@ -6,7 +6,7 @@ that 60 tuples of two references to the one before never end, and 100,000 nested
 
 import pickletools
 from collections.abc import Callable, Collection
-from typing import Any
+from typing import Any, BinaryIO
 
 from factory.readers.base import BadClip
 
@@ -72,6 +72,9 @@ class _Stack:
             self._push(self._pop(2))
         elif name == "BUILD":
             self._into(self._pop(1))
+        elif name == "BINPERSID":
+            self._pop(1)
+            items.append(_LEAF)
         elif name == "DUP":
             items.append(items[-1])
         elif name == "POP":
@@ -116,10 +119,10 @@ class _Stack:
                 raise self._refuse(f"a key of more than {MAX_HASHED} values")
 
 
-def check_opcodes(data: bytes, file: str, allowed: Collection[str]) -> None:
+def check_opcodes(data: bytes | BinaryIO, file: str, allowed: Collection[str]) -> None:
     """Raises BadClip where an opcode may do more than build plain values, or builds what takes too long or too deep.
 
-    Also where the stream is cut off, or takes from the stack what is not there.
+    Also where the stream is cut off, or takes from the stack what is not there. An open file is read up to its end.
     """
     position = 0
 

@@ -1,12 +1,14 @@
 """Pickles as data: plain containers and numeric numpy arrays, nothing that runs.
 
-A pickle is a program. Three walls stand before and around it:
+A pickle is a program. Four walls stand before and around it:
 1. the opcodes are read first, without running any: only those that build plain values may occur, every length is
    checked against the file, no memo index may exceed the number of opcodes (else 5 bytes could ask for 64 GB), nothing
    is nested deeper than `pickle_shape.MAX_DEPTH`, and no key of a dict or set is a tuple that takes long to hash;
 2. every global is answered with a function made for this one load; the named object is never imported or called;
 3. arrays and copied containers are paid for from a budget of `BUDGET_PER_BYTE` x file size (+ 16 MB), so that one big
-   value cannot be copied without end. Opcodes themselves cost at most some 100 bytes of memory per byte read.
+   value cannot be copied without end. Opcodes themselves cost at most some 100 bytes of memory per byte read;
+4. what came of it is no larger once every reference is followed than a file of its size may say, and nothing holds
+   itself (`plain_values`), so that whoever compares, converts or prints a value of it comes to an end.
 """
 
 import io
@@ -19,12 +21,14 @@ import numpy as np
 
 from factory.readers.base import MAX_FILE_BYTES, BadClip
 from factory.readers.pickle_shape import MAX_HASHED, check_opcodes
+from factory.readers.plain_values import check_values
+from factory.wording import shown
 
 BUDGET_PER_BYTE = 8
 BUDGET_BASE_BYTES = 1 << 24
 RECORD_BYTES = 512  # what a record is paid for with
 
-_PLAIN_OPCODES = """
+_ALL_PLAIN = """
     PROTO FRAME STOP MARK POP POP_MARK DUP NONE NEWTRUE NEWFALSE
     INT BININT BININT1 BININT2 LONG LONG1 LONG4 FLOAT BINFLOAT
     STRING BINSTRING SHORT_BINSTRING UNICODE BINUNICODE SHORT_BINUNICODE BINUNICODE8
@@ -34,7 +38,7 @@ _PLAIN_OPCODES = """
     GET BINGET LONG_BINGET PUT BINPUT LONG_BINPUT MEMOIZE
     GLOBAL STACK_GLOBAL REDUCE BUILD
 """
-_OPCODES = frozenset(_PLAIN_OPCODES.split())
+PLAIN_OPCODES = frozenset(_ALL_PLAIN.split())
 _DTYPE = re.compile(r"([biuf])(1|2|4|8)|[SU][1-9]\d{0,4}")
 # What a hostile or truncated stream can make the unpickler raise; BadClip passes through it untouched.
 _LOAD_ERRORS = (
@@ -49,7 +53,7 @@ def load_plain(data: bytes, file: str) -> Any:
     `file` names the source in errors. Raises BadClip for a truncated stream, a global that is not one of the plain
     containers or numpy's own array constructors (named), an array of objects, or a stream that outgrows its budget.
     """
-    return _load(data, file, _OPCODES, frozenset())
+    return _load(data, file, PLAIN_OPCODES, frozenset())
 
 
 def load_records(data: bytes, file: str, classes: Collection[str]) -> Any:
@@ -57,7 +61,7 @@ def load_records(data: bytes, file: str, classes: Collection[str]) -> Any:
 
     Nothing of them is imported, called or looked up. Raises BadClip as `load_plain` does.
     """
-    return _load(data, file, _OPCODES | {"NEWOBJ"}, frozenset(classes))
+    return _load(data, file, PLAIN_OPCODES | {"NEWOBJ"}, frozenset(classes))
 
 
 class Record:
@@ -88,9 +92,11 @@ def _load(data: bytes, file: str, opcodes: frozenset[str], classes: frozenset[st
         raise BadClip(file, "pickle", f"{len(data)} bytes; more than {MAX_FILE_BYTES} are refused")
     check_opcodes(data, file, opcodes)
     try:
-        return _Unpickler(data, file, classes).load()
+        value = _Unpickler(data, file, classes).load()
     except _LOAD_ERRORS as error:
         raise BadClip(file, "pickle", f"not a readable pickle ({type(error).__name__}: {error})") from error
+    check_values(value, len(data), file, "pickle")
+    return value
 
 
 class _Unpickler(pickle.Unpickler):
@@ -113,7 +119,7 @@ class _Dtype:
 
     def __init__(self, spec: object, file: str) -> None:
         if not isinstance(spec, str) or not _DTYPE.fullmatch(spec):
-            raise BadClip(file, "pickle", f"refused array type {spec!r}; only numbers, flags and text load")
+            raise BadClip(file, "pickle", f"refused array type {shown(spec)}; only numbers, flags and text load")
         self.dtype = np.dtype(spec)
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
@@ -169,7 +175,7 @@ def _stand_ins(file: str, budget: int, classes: frozenset[str]) -> dict[tuple[st
 
     def reconstruct(subtype: object, shape: object, code: object) -> np.ndarray:
         if subtype is not array_class:
-            raise BadClip(file, "pickle", f"refused array subclass {subtype!r}")
+            raise BadClip(file, "pickle", f"refused array subclass {shown(subtype)}")
         empty = np.empty(0, np.uint8).view(_Array)
         empty.spend = spend
         return empty

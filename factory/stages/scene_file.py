@@ -34,6 +34,7 @@ from safetensors.numpy import save
 
 from factory.store.disk import whole_file
 from factory.store.identity import canonical_json
+from factory.wording import shown
 from tasks.render.scene.asset import BlockRange, ClassQuality, Exposure, OwnBody, RenderAsset, TakenFrom, ViewQuality
 from tasks.render.scene.movers import NO_SHIFTS, BoxShifts
 from tasks.render.scene.settings import SceneDtype
@@ -87,7 +88,7 @@ def read_scene(path: Path, *kept_as: str | None) -> RenderAsset:
     try:
         described = json.loads(header)
         if described["format"] != FORMAT or described["version"] not in VERSION_OF.values():
-            found = f"{described['format']!r} {described['version']}"
+            found = f"{shown(described['format'])} {shown(described['version'])}"
             raise BadScene(f"{path}: format {found}, this version reads {FORMAT!r} 1 and 2")
         stated, name = described.pop("digest"), described.pop("kept_as", None)
         if kept_as and name not in kept_as:
@@ -95,7 +96,7 @@ def read_scene(path: Path, *kept_as: str | None) -> RenderAsset:
         if digest_of(tensors, described) != stated:
             raise BadScene(f"{path}: the content does not match its digest {stated}")
         return scene_of(tensors, described, stated)
-    except (KeyError, TypeError, ValueError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as error:
         if isinstance(error, BadScene):
             raise
         raise BadScene(f"{path}: damaged: {type(error).__name__} {error}") from error

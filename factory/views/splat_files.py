@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from factory.readers.torch_file import load_tensors
 from factory.stages.scene_file import BadScene
+from factory.wording import one_line
 from tasks.render.splatting.checkpoints import LoggedVehicle, SplatCheckpoint, from_checkpoint, splatfacto, worldengine
 from tasks.render.splatting.gaussians import Gaussians, moved
 from tasks.render.splatting.ply import from_ply, to_ply
@@ -39,8 +41,10 @@ def read_splats(path: Path, traversal: int | None = None, transforms: Path | Non
         else:
             data = path.read_bytes()
             found = SplatCheckpoint(from_ply(data)) if suffix == ".ply" else _of_spz(data)
-    except ValueError as error:
-        raise BadScene(f"{path}: {error}") from error
+    except BadScene:
+        raise
+    except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError) as error:  # of another's content
+        raise BadScene(f"{path}: {one_line(error)}") from error
     if not len(found.background):
         raise BadScene(f"{path}: no Gaussian in it")
     if transforms is None:
@@ -76,8 +80,8 @@ def transform_of(path: Path) -> tuple[Array, float]:
     try:
         told = json.loads(path.read_text(encoding="utf-8"))
         matrix, scale = np.array(told["transform"], np.float64), float(told["scale"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise BadScene(f"{path}: expected nerfstudio's 'transform' (3 x 4) and 'scale': {error!r}") from error
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+        raise BadScene(f"{path}: expected nerfstudio's 'transform' (3 x 4) and 'scale': {one_line(error)}") from error
     is_rigid = matrix.shape == (3, 4) and np.allclose(matrix[:, :3] @ matrix[:, :3].T, np.eye(3), atol=1e-4)
     if not is_rigid or not scale > 0.0:
         raise BadScene(f"{path}: 'transform' is no rigid 3 x 4 matrix, or 'scale' not above 0")
@@ -110,23 +114,17 @@ def _of_spz(data: bytes) -> SplatCheckpoint:
 
 def _loaded(path: Path) -> object:
     """Of tensors, arrays and plain values alone; nothing of the file runs. Raises BadScene."""
-    import pickle
-
-    try:
-        import torch
-    except ImportError as error:
-        raise BadScene(f"{path}: {NO_TORCH}") from error
     rebuilt: Any = np.zeros(0).__reduce__()[0]
     scalar: Any = np.float64(0.0).__reduce__()[0]
     kinds: list[Any] = [type(np.dtype(kind)) for kind in "fdilq?"]
     older = [(rebuilt, "numpy.core.multiarray._reconstruct"), (scalar, "numpy.core.multiarray.scalar")]  # numpy 1
     arrays = [np.ndarray, np.dtype, *kinds, rebuilt, scalar, *older]
     try:
-        with torch.serialization.safe_globals(arrays):
-            return _as_arrays(torch.load(path, map_location="cpu", weights_only=True))
-    except (pickle.UnpicklingError, RuntimeError, EOFError, KeyError) as error:
-        first = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-        raise BadScene(f"{path}: cannot be read as a checkpoint of tensors and plain values: {first}") from error
+        return _as_arrays(load_tensors(path, arrays))
+    except ImportError as error:
+        raise BadScene(f"{path}: {NO_TORCH}") from error
+    except ValueError as error:
+        raise BadScene(str(error)) from error
 
 
 def _as_arrays(value: Any) -> Any:

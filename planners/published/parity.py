@@ -31,10 +31,9 @@ import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import torch
-
 from factory.config.arguments import WORD, Refused
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES
+from factory.readers.torch_file import load_tensors
 from planners.published.lesson import (
     apart,
     differences_in_learning,
@@ -137,7 +136,7 @@ def _begun_alike(request: Request, case: str) -> bool:
         drawn = Path(folder) / "drawn.ckpt"
         run_beside(request, "start_beside", [case, *map(str, picture), str(drawn)], case, Path(folder))
         public, arrays = public_start(case, picture, drawn)
-        origin = torch.load(drawn, weights_only=True)["origin"]
+        origin = load_tensors(drawn)["origin"]
     if request.record is not None:
         write_start(public, case, origin, Path(request.record) / f"{case}_start.npz")
     said = spread_otherwise(public, our_start(case, picture, arrays))

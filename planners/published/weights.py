@@ -3,7 +3,6 @@
 A family's file says what goes where, with the methods of `Moves`; `Moves.done` refuses what nobody spoke of.
 """
 
-import pickle
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +11,7 @@ import torch
 from torch import Tensor
 
 from factory.config.compose import ConfigError
+from factory.readers.torch_file import load_tensors
 
 ANCHOR = "_status_encoding.weight"  # in every family's model, at its top
 
@@ -101,12 +101,11 @@ def read_public(path: Path) -> dict[str, Tensor]:
     Only tensors and plain values are read back; nothing of the file runs. Raises ConfigError.
     """
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        content = load_tensors(path)
     except OSError as error:
         raise ConfigError(f"{path}: {error}") from error
-    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError) as error:
-        first = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-        raise ConfigError(f"{path} cannot be read as a checkpoint of tensors and plain values: {first}") from error
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
     return model_weights(content, str(path))
 
 

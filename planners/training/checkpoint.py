@@ -27,6 +27,8 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from factory.config.compose import ConfigError
+from factory.readers.torch_file import load_tensors
+from factory.wording import one_line
 from planners.models.planner import Planner
 from planners.models.registry import PlannerChoice, build_planner, planner_class
 from tasks.sealed import MEMBER, sealed_json, unsealed_json
@@ -176,9 +178,11 @@ def load_training(folder: Path) -> dict[str, Any]:
     """The state that a training goes on from. Raises ConfigError for a file that is damaged or holds anything else."""
     _refuse_damaged(folder, TRAINING, f"remove {folder} to go on from the one before")
     try:
-        state = torch.load(folder / TRAINING, map_location="cpu", weights_only=True)
+        state = load_tensors(folder / TRAINING)
     except Exception as error:  # whatever a damaged zip or a refused object raises
-        raise ConfigError(f"{folder / TRAINING}: {error}: remove {folder} to go on from the one before") from error
+        raise ConfigError(
+            f"{folder / TRAINING}: {one_line(error)}: remove {folder} to go on from the one before"
+        ) from error
     assert isinstance(state, dict)
     return state
 

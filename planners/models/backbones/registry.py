@@ -9,10 +9,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
+from factory.readers.torch_file import load_tensors
+from factory.wording import one_line
 from planners.models.backbones.base import STRIDES, Backbone, BackboneSettings
 from planners.models.backbones.resnet import ResNet
 from planners.models.backbones.vovnet import VoVNet99
@@ -86,13 +87,9 @@ def _read(path: Path) -> Mapping[str, Tensor]:
     if not path.is_file():
         raise ValueError(f"backbone.pretrained: there is no file {path}")
     try:
-        content: Any = (
-            load_file(path)
-            if path.suffix == ".safetensors"
-            else torch.load(path, map_location="cpu", weights_only=True)
-        )
+        content: Any = load_file(path) if path.suffix == ".safetensors" else load_tensors(path)
     except Exception as error:  # whatever a damaged file, or an object that is no tensor, raises
-        raise ValueError(f"backbone.pretrained: {path} cannot be read as weights: {error}") from error
+        raise ValueError(f"backbone.pretrained: {path} cannot be read as weights: {one_line(error)}") from error
     for wrapper in ("state_dict", "model"):  # as trainers wrap their checkpoints
         if isinstance(content, Mapping) and isinstance(content.get(wrapper), Mapping):
             content = content[wrapper]
