@@ -14,7 +14,7 @@ from typing import Any
 import pyarrow as pa
 
 from factory.graph.work import Dropped, Halted, NotReady, PreparedClip, Stopped, Underway, Work, go_on
-from factory.readers.base import BadClip, ClipRef
+from factory.readers.base import BadClip, ClipRef, Unreadable
 from factory.store.cache import BadCacheFile, ClipCache, SceneFiles
 from factory.store.disk import why_disk_full
 from factory.store.episodes import FOLDER, episode_name
@@ -290,9 +290,10 @@ def warm(work: Work, draws: bool) -> tuple[str | Failure, None]:
 
 def failure_of(error: BaseException) -> Failure:
     """Broken input, an ailing machine, what may be either, or a bug; with the last lines of the traceback."""
-    if isinstance(error, BadClip):
+    if isinstance(error, BadClip) and not isinstance(error, Unreadable):
         return Failure(ErrorKind.INPUT, str(error))
-    kind = ErrorKind.SYSTEM if isinstance(error, OSError | MemoryError) else ErrorKind.BUG
+    raised = error.__cause__ if isinstance(error, Unreadable) else error
+    kind = ErrorKind.SYSTEM if isinstance(raised, OSError | MemoryError) else ErrorKind.BUG
     kind = ErrorKind.MACHINE if why_ill(error) else kind
     lines = "".join(traceback.format_exception(error)).strip().splitlines()
     return Failure(kind, "\n".join(lines[-ERROR_LINES:]), why_disk_full(error))

@@ -26,7 +26,8 @@ from factory.imports.scenes import (
     world_columns,
 )
 from factory.imports.table import Entry, identity_of, import_rows
-from factory.readers.base import BadClip
+from factory.readers.apart import Apart
+from factory.readers.base import BadClip, failing_as
 from factory.readers.navsim.filters import Selection
 from factory.readers.navsim.log import LogFrames, read_frames
 from factory.readers.navsim.road import road_around
@@ -106,7 +107,8 @@ class GroupReader:
         if self._group != group:
             self._group, self._why = group, None
             try:
-                self._rows = dict(self._read(group))
+                with failing_as(f"token {group.now}"):
+                    self._rows = dict(self._read(group))
             except BadClip as error:  # all of its frames fail with it: a group counts whole or not at all
                 self._why = error
         if self._why is not None:
@@ -182,6 +184,10 @@ def entries_of(groups: Sequence[SceneGroup], reader: GroupReader) -> list[Entry]
     ]
 
 
+def _tokens_in(path: Path) -> list[str]:
+    return [frame.token for frame in read_frames(path).frames]
+
+
 def logs_of_tokens(logs: Path, tokens: frozenset[str], names: Sequence[str] | None) -> dict[str, Path]:
     """Token -> the log that has it, of the logs that are named, None: of all. Raises BadClip, and ValueError for none.
 
@@ -190,7 +196,7 @@ def logs_of_tokens(logs: Path, tokens: frozenset[str], names: Sequence[str] | No
     paths = matching(logs, "*.pkl") if names is None else [logs / f"{name}.pkl" for name in sorted(names)]
     found: dict[str, Path] = {}
     for path in (path for path in paths if path.is_file()):
-        found |= {frame.token: path for frame in read_frames(path).frames if frame.token in tokens}
+        found |= {token: path for token in Apart(_tokens_in)(path, str(path)) if token in tokens}
     if not found:
         raise ValueError(f"logs={logs}: none of the {len(tokens)} stage-one tokens is in the logs here")
     return found

@@ -20,7 +20,7 @@ from factory.imports.table import Entry, identity_of, import_rows
 from factory.readers.navsim.filters import Selection
 from factory.readers.navsim.log import LogFrames, read_frames
 from factory.readers.navsim.reader import log_files
-from factory.readers.navsim.windows import Choice, kept_table, make_table, wanted_windows
+from factory.readers.navsim.windows import Choice, table_at, wanted_windows
 from factory.stages.benchmark import BENCHMARK_FILE, FORMAT
 from factory.store.cache import SceneFiles
 from factory.store.identity import RunIdentity
@@ -66,7 +66,7 @@ def lone_tokens(selection: Selection, logs: Path, cache_dir: Path) -> tuple[list
     for name, path in log_files(logs).items():
         if chosen.log_names is not None and name not in chosen.log_names:
             continue
-        table = kept_table(path, cache_dir) or make_table(path, cache_dir)
+        table = table_at(path, cache_dir)
         starts = table.start_ms
         for at in wanted_windows(table, Choice(1, 0, 0.0, chosen), wanted):
             found.append(LoneToken(str(table.tokens[at]), path, int(table.timestamps_us[at]), int(starts[at])))

@@ -18,6 +18,7 @@ from factory.files import matching
 from factory.readers.base import BadClip
 from factory.readers.scenarionet.sidecars import NAME
 from factory.store.disk import whole_file
+from factory.wording import shown
 from tasks.world.arrays import Array
 
 LIDAR = "LIDAR_TOP"
@@ -226,7 +227,7 @@ def _version(root: Path, version: str | None) -> str:
 
 def _below(name: str, file: Path) -> str:
     if Path(name).is_absolute() or ".." in Path(name).parts:
-        raise BadClip(str(file), "filename", f"{name!r} is no path below the folder of the data set")
+        raise BadClip(str(file), "filename", f"{shown(name)} is no path below the folder of the data set")
     return name
 
 
@@ -254,12 +255,12 @@ def _numbers(row: Mapping[str, Any], key: str, shape: tuple[int, ...], file: Pat
 def _text(row: Mapping[str, Any], key: str, file: Path) -> str:
     value = row.get(key)
     if not isinstance(value, str):
-        raise BadClip(str(file), key, f"missing in a row, or no text: {value!r}")
+        raise BadClip(str(file), key, f"missing in a row, or no text: {shown(value)}")
     return value
 
 
 def _whole(row: Mapping[str, Any], key: str, file: Path) -> int:
     value = row.get(key)
     if isinstance(value, bool) or not isinstance(value, int):
-        raise BadClip(str(file), key, f"missing in row {row.get('token')}, or no whole number: {value!r}")
+        raise BadClip(str(file), key, f"missing in row {shown(row.get('token'))}, or no whole number: {shown(value)}")
     return value

@@ -37,6 +37,7 @@ from factory.readers.navsim.tracks import ego_states
 from factory.readers.restricted_pickle import load_plain
 from factory.stages.imaging import NO_IMAGES
 from factory.stages.rows import label_columns
+from factory.wording import shown
 from tasks.render.settings import ImageSource
 from tasks.stages import HUMAN
 from tasks.world.vocabulary import Vocabulary
@@ -196,7 +197,9 @@ class Import:
         now, end = frames[at], frames[-1]
         token = re.fullmatch(TOKEN + part.suffix, now.token)
         if token is None:
-            raise BadClip(str(path), f"frames[{at}].token", f"is {now.token!r}, expected <16 hex digits>{part.suffix}")
+            raise BadClip(
+                str(path), f"frames[{at}].token", f"is {shown(now.token)}, expected <16 hex digits>{part.suffix}"
+            )
         # A and B: a simulated log begins at B and is named after A; a human one begins at A, and its last frame is B
         tokens = (named["seed"], token["frame"]) if part.suffix else (token["frame"], end.token)
         origin = Origin(

@@ -11,7 +11,7 @@ from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, asked_t
 from factory.graph.batch import SHARD_BYTES
 from factory.graph.execute import RunSummary, record_summary
 from factory.graph.progress import Counter, Executed
-from factory.readers.base import BadClip
+from factory.readers.base import BadClip, failing_as
 from factory.store.columns import BadRow
 from factory.store.disk import DiskFull
 from factory.store.identity import UNLISTED, RunIdentity, Stamp, attempt_id
@@ -35,7 +35,7 @@ class Entry:
     expert: str
     round: int
     candidate_index: int
-    make: Make  # everything but the Stamp's columns; raises BadClip, ValueError
+    make: Make  # everything but the Stamp's columns; whatever it raises fails the row
 
     def stamp(self, identity: RunIdentity) -> Stamp:
         """The bookkeeping of the row."""
@@ -134,7 +134,8 @@ class _Batch:
 def _try(batch: _Batch, entry: Entry, stamp: Stamp) -> bool:
     """Whether it failed, as an outcome of its own."""
     try:
-        row = entry.make()
+        with failing_as(f"log {entry.log_id}"):
+            row = entry.make()
         batch.add(sample_row_to_table([{**row, **asdict(stamp)}]), (entry.round, entry.expert), str(row["licence"]))
         return False
     except (BadClip, BadRow) as error:

@@ -1,26 +1,61 @@
 """What a reader is, and how a clip is named before anything of it is opened."""
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
+from factory.wording import one_line
 from tasks.world.clip import Clip
 
 SPLITS = ("train", "val", "test")
 MAX_FILE_BYTES = 1 << 30  # of a file that is read whole
+MOST_SAID = 1000  # characters of what is wrong: it may quote the file
 
 
 class BadClip(Exception):
     """The input is broken: says which file, which field, and how to fix it."""
 
     def __init__(self, file: str, field: str, problem: str) -> None:
+        field, problem = _cut(field), _cut(problem)
         super().__init__(f"{file}: {field}: {problem}")
         self.file, self.field, self.problem = file, field, problem
 
     def __reduce__(self) -> tuple[type["BadClip"], tuple[str, str, str]]:
-        return BadClip, (self.file, self.field, self.problem)
+        return type(self), (self.file, self.field, self.problem)
+
+
+class Unreadable(BadClip):
+    """The input is broken in a way that its reader did not foresee: it raised something else, which is the cause."""
+
+
+def _cut(text: str) -> str:
+    return text if len(text) <= MOST_SAID else f"{text[:MOST_SAID]}..."
+
+
+@contextmanager
+def failing_as(file: str) -> Iterator[None]:
+    """Around what a reader does with one file, folder or clip: whatever it raises over that is that one's failure.
+
+    Raises BadClip, Unreadable, and the OSError of another place, such as a full disk under the cache.
+    """
+    try:
+        yield
+    except BadClip:
+        raise
+    except Exception as error:
+        if isinstance(error, OSError) and not _is_of(error, file):
+            raise
+        problem = f"cannot be read: {type(error).__name__}: {one_line(error)}"
+        raise Unreadable(file, "reader", problem) from error
+
+
+def _is_of(error: OSError, file: str) -> bool:
+    if type(error) is OSError and error.errno is None:  # Arrow's, of a file that it does not understand
+        return True
+    return isinstance(error.filename, str) and Path(error.filename).is_relative_to(file)
 
 
 def bytes_of(path: Path) -> bytes:

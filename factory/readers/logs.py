@@ -36,7 +36,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 import numpy as np
 
 from factory.readers.apart import Apart
-from factory.readers.base import SPLITS, BadClip, ClipIndex, ClipRef, split_of
+from factory.readers.base import SPLITS, BadClip, ClipIndex, ClipRef, failing_as, split_of
 from factory.readers.settings import LogClips, WindowSettings, check_traversals
 from factory.readers.traversals import DrivenPath, OtherDrive, Traversal, digest_with, joined, path_of, traversals
 from factory.readers.validate import validate_clip
@@ -188,7 +188,8 @@ class LogReader(ABC, Generic[Log]):
         elsewhere = Apart(self.windows_of) if self.untrusted and importable else None
         for log_id, path in chosen.items():
             try:
-                found = self.windows_of(path) if elsewhere is None else elsewhere(path, str(path))
+                with failing_as(str(path)):
+                    found = self.windows_of(path) if elsewhere is None else elsewhere(path, str(path))
             except BadClip as error:
                 broken[ClipRef(self.name, log_id, 0)] = str(error)
                 continue
@@ -217,6 +218,10 @@ class LogReader(ABC, Generic[Log]):
 
     def read(self, ref: ClipRef) -> Clip:
         """The validated clip. Raises BadClip."""
+        with failing_as(str(self.path_of(ref))):
+            return self._read(ref)
+
+    def _read(self, ref: ClipRef) -> Clip:
         log = self._log(ref)
         start, rest = divmod(ref.start_ms, STEP_MS)
         stop = start + CLIP_STEPS
@@ -277,9 +282,10 @@ class LogReader(ABC, Generic[Log]):
         found, worlds = {}, False
         for log_id, path in self._chosen().items():
             try:
-                world = self.world(path)
-                worlds = worlds or world is not None
-                drive = None if world is None else self.drive(path)
+                with failing_as(str(path)):
+                    world = self.world(path)
+                    worlds = worlds or world is not None
+                    drive = None if world is None else self.drive(path)
             except BadClip:  # the index says what is wrong with it
                 continue
             if world is not None and isinstance(drive, LoggedDrive):

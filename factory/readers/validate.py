@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from factory.readers.base import SPLITS, BadClip, ClipReader, ClipRef
+from factory.readers.base import SPLITS, BadClip, ClipReader, ClipRef, failing_as
+from factory.wording import shown
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.camera import Camera
 from tasks.world.clip import CLIP_STEPS, Clip
@@ -25,12 +26,13 @@ MAPS_REMEMBERED = 4  # clips of a log share its map, and a reader keeps the last
 def read_clip(reader: ClipReader, ref: ClipRef) -> Clip:
     """The reader's clip, looked at. Raises BadClip naming the clip and the field."""
     where = f"clip {ref.clip_id} ({ref.dataset} {ref.log_id} at {ref.start_ms / 1000:g} s)"
-    clip = reader.read(ref)
+    with failing_as(where):
+        clip = reader.read(ref)
     if not isinstance(clip, Clip):
         raise BadClip(where, "read", f"gave a {type(clip).__name__}, expected a tasks.world.clip.Clip")
     for field in ("clip_id", "dataset", "log_id"):
         if getattr(clip, field) != getattr(ref, field):
-            raise BadClip(where, field, f"is {getattr(clip, field)!r}, expected the ref's {getattr(ref, field)!r}")
+            raise BadClip(where, field, f"is {shown(getattr(clip, field))}, expected the ref's {getattr(ref, field)!r}")
     return validate_clip(clip, where)
 
 
@@ -50,7 +52,7 @@ def _faults(clip: Clip) -> Iterator[Fault]:
         if not isinstance(getattr(clip, field), str):
             yield field, f"is a {type(getattr(clip, field)).__name__}, expected text"
     if clip.split not in SPLITS:
-        yield "split", f"{clip.split!r} is none of {', '.join(SPLITS)}"
+        yield "split", f"{shown(clip.split)} is none of {', '.join(SPLITS)}"
     yield from _array("ego_states", clip.ego_states, (CLIP_STEPS, EGO_STATE_SIZE))
     yield from _array("world_from_ego", clip.world_from_ego, (CLIP_STEPS, 4, 4))
     yield from _agent_faults(clip)
@@ -72,7 +74,7 @@ def _agent_faults(clip: Clip) -> Iterator[Fault]:
         yield "agents.valid", f"dtype {agents.valid.dtype}, expected bool"
     if len(agents.kinds) != n:
         yield "agents.kinds", "not one kind per track"
-    if strange := sorted({repr(kind) for kind in agents.kinds if not isinstance(kind, AgentKind)}):
+    if strange := sorted({shown(kind) for kind in agents.kinds if not isinstance(kind, AgentKind)}):
         yield "agents.kinds", f"{', '.join(strange)}: expected tasks.world.agents.AgentKind"
     if len(set(agents.track_ids)) != n:
         yield "agents.track_ids", "a track id stands twice"
@@ -92,13 +94,13 @@ def map_fault(road_map: RoadMap) -> Fault | None:
 def _map_faults(road_map: RoadMap) -> Iterator[Fault]:
     lanes = road_map.lanes
     for lane_id, lane in lanes.items():
-        yield from _lane_faults(f"road_map.lanes[{lane_id!r}]", lane_id, lane)
+        yield from _lane_faults(f"road_map.lanes[{shown(lane_id)}]", lane_id, lane)
     if not any(lane.drives_cars for lane in lanes.values()):
         yield "road_map.lanes", "no lane for cars"
     for name in ("drivable_areas", "intersections"):
         for i, area in enumerate(getattr(road_map, name) or ()):
             if not isinstance(area.layer, MapLayer):
-                yield f"road_map.{name}[{i}].layer", f"{area.layer!r}: expected tasks.world.lanes.MapLayer"
+                yield f"road_map.{name}[{i}].layer", f"{shown(area.layer)}: expected tasks.world.lanes.MapLayer"
             for ring in (area.ring, *area.holes):
                 yield from _ring(f"road_map.{name}[{i}]", ring)
     for i, ring in enumerate(road_map.crossings):
@@ -111,7 +113,7 @@ def _lane_faults(field: str, lane_id: str, lane: Any) -> Iterator[Fault]:
     if not isinstance(lane, Lane):
         yield field, f"is a {type(lane).__name__}, expected tasks.world.lanes.Lane"
     if lane.lane_id != lane_id:
-        yield field, f"its lane_id is {lane.lane_id!r}"
+        yield field, f"its lane_id is {shown(lane.lane_id)}"
     yield from _ring(f"{field}.ring", lane.ring)
     yield from _polyline(f"{field}.centerline", lane.centerline)
     for side in ("left_boundary", "right_boundary"):
@@ -184,4 +186,5 @@ def _polyline(field: str, line: Any) -> Iterator[Fault]:
 
 def _some(names: Sequence[object]) -> str:
     """The first few of many."""
-    return ", ".join(map(str, names[:3])) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+    first = ", ".join(name if isinstance(name, str) else shown(name) for name in names[:3])
+    return first + (f" and {len(names) - 3} more" if len(names) > 3 else "")

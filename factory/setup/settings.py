@@ -14,6 +14,8 @@ from factory.config.classes import class_of
 from factory.config.compose import ConfigError, build
 from factory.config.run import RunConfig, VocabularyChoice, photos_alone, refuse_relative_root
 from factory.readers.base import BadClip, ClipIndex, ClipReader, ClipRef
+from factory.readers.torch_file import check_checkpoint
+from factory.readers.validate import read_clip
 from factory.setup.sample import Sampled, choose_sample, chosen_clips
 from factory.setup.vocabulary import load_vocabulary
 from factory.stages.frames import BenchmarkWork
@@ -109,8 +111,10 @@ def refuse_missing_backend(config: RunConfig) -> None:
     try:
         engine.check(config.render.backend)
         if config.render.lpips:
+            for file in filter(Path.is_file, map(Path, config.render.lpips)):
+                check_checkpoint(file)
             lpips_of(config.render.lpips)
-    except (BackendMissing, BadWeights) as error:
+    except (BackendMissing, BadWeights, ValueError) as error:
         raise ConfigError(str(error)) from error
 
 
@@ -171,7 +175,7 @@ def refuse_unknown_cameras(config: RunConfig, reader: ClipReader, index: ClipInd
         return
     for ref in index.refs[:RIGS_LOOKED_AT]:
         try:
-            rig = reader.read(ref).cameras
+            rig = read_clip(reader, ref).cameras
         except BadClip:
             continue
         if not rig and config.render.mode is RenderMode.MAP:

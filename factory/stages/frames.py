@@ -8,7 +8,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass, replace
 
 from factory.graph.work import PreparedClip
-from factory.readers.base import BadClip, ClipRef
+from factory.readers.base import BadClip, ClipRef, Unreadable
 from factory.readers.validate import read_clip
 from factory.stages.pipeline import Drive, FactoryWork, Stopwatch, WholeClip, bare, payload_of
 from tasks.attempt import Timed, human_sample
@@ -64,6 +64,8 @@ class BenchmarkWork(FactoryWork):
         try:
             with watch.of("clip"):
                 return read_clip(self.reader, earlier)
+        except Unreadable:
+            raise
         except BadClip as error:  # the clip itself was read: what lies before it is no drive
             return Rejected("clip", "no_earlier_frame", str(error))
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from factory.readers.base import BadClip, ClipReader, ClipRef
 from factory.readers.town.reader import SensedReader
+from factory.readers.validate import read_clip
 from factory.setup.settings import cache_folder
 from factory.stages.painted import town_lights
 from factory.store.identity import canonical_json
@@ -122,7 +123,7 @@ class DriveWork:
 
     def _clip(self, item: DriveItem) -> Clip:
         last = NOW + HORIZON_STEPS if any(key.start != LOGGED for _, key in item.keys) else NOW
-        clip, n_steps = self.reader.read(item.ref), self.settings.loop.clip_steps(last)
+        clip, n_steps = read_clip(self.reader, item.ref), self.settings.loop.clip_steps(last)
         return lengthened(clip, n_steps, town_lights(clip, n_steps) if reads_towns(self.reader) else None)
 
     def _starts(self, clip: Clip, wanted: set[int]) -> dict[int, DriveStart]:

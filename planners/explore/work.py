@@ -4,6 +4,7 @@ from collections import Counter
 from dataclasses import asdict, dataclass
 
 from factory.readers.base import BadClip, ClipReader, ClipRef
+from factory.readers.validate import read_clip
 from factory.setup.settings import cache_folder
 from factory.stages.painted import town_lights
 from factory.stages.rows import scene_tags
@@ -81,7 +82,7 @@ class ExploreWork:
         )
 
     def _clip(self, ref: ClipRef) -> Clip:
-        clip = self.reader.read(ref)
+        clip = read_clip(self.reader, ref)
         return lengthened(clip, CLIP_STEPS, town_lights(clip, CLIP_STEPS) if reads_towns(self.reader) else None)
 
     def _eyes(self, clip: Clip) -> Eyes:

@@ -16,7 +16,7 @@ from factory.readers.navsim.log import Frame, read_frames
 from factory.readers.navsim.reader import log_files
 from factory.readers.navsim.rig import blobs_of, rig_of
 from factory.readers.navsim.synthetic import read_scene_pickle
-from factory.readers.navsim.windows import Choice, FrameTable, kept_table, make_table, wanted_windows
+from factory.readers.navsim.windows import Choice, FrameTable, table_at, wanted_windows
 from factory.stages.sensors import decode_image
 from planners.data.batch import COMMANDS
 from planners.navsim.agent import HISTORY
@@ -138,7 +138,7 @@ def _tables(logs: Path, names: Sequence[str] | None, cache_dir: Path) -> dict[Pa
             f"logs={logs}: {len(lacking)} of the split's {len(names)} logs are not here, such as {lacking[0]}"
         )
     paths = [path for name, path in there.items() if names is None or name in set(names)]
-    return {path: kept_table(path, cache_dir) or make_table(path, cache_dir) for path in paths}
+    return {path: table_at(path, cache_dir) for path in paths}
 
 
 def _refuse_absent(absent: Collection[str], n_tokens: int, logs: Path) -> None:

@@ -22,6 +22,7 @@ from factory import __version__
 from factory.config.compose import compose, fill
 from factory.config.run import refuse_missing_root
 from factory.readers.base import BadClip, ClipIndex, ClipReader
+from factory.readers.validate import read_clip
 from factory.setup.settings import open_reader
 from planners.command import command
 from planners.traffic.fit import Network, NetworkSettings, fit, held_out_error
@@ -97,7 +98,7 @@ def _clips(reader: ClipReader, index: ClipIndex, settings: TrainTraffic) -> Iter
         raise ValueError(f"without: there is no log {', '.join(sorted(unknown))}")
     for ref in index.refs[: settings.limit]:
         try:
-            clip = reader.read(ref)
+            clip = read_clip(reader, ref)
         except BadClip as error:
             print(f"left out: {error}", flush=True)
             continue

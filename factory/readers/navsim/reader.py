@@ -19,7 +19,7 @@ import numpy as np
 
 from factory.files import matching
 from factory.readers.apart import Apart
-from factory.readers.base import SPLITS, BadClip, ClipIndex, ClipRef, bytes_of, split_of
+from factory.readers.base import SPLITS, BadClip, ClipIndex, ClipRef, bytes_of, failing_as, split_of
 from factory.readers.logs import CACHED_LOGS, STEP_MS
 from factory.readers.navsim.filters import Selection, read_selection
 from factory.readers.navsim.log import LogFrames, frames_of
@@ -178,6 +178,10 @@ class NavsimReader:
 
     def read(self, ref: ClipRef) -> Clip:
         """The validated clip. Raises BadClip."""
+        with failing_as(str(self._path_of(ref))):
+            return self._read(ref)
+
+    def _read(self, ref: ClipRef) -> Clip:
         opened = self._open(ref)
         frames, table = opened.log.frames, opened.table
         start = _frame_at(ref, table, opened.log.file)
@@ -266,10 +270,11 @@ class NavsimReader:
         made_apart = Apart(partial(make_table, cache_dir=self.cache_dir))
         for i, (log_id, path) in enumerate(logs.items(), start=1):
             try:
-                table = kept_table(path, self.cache_dir)
-                if table is None:
-                    table = made_apart(path, str(path))
-                    made += 1
+                with failing_as(str(path)):
+                    table = kept_table(path, self.cache_dir)
+                    if table is None:
+                        table = made_apart(path, str(path))
+                        made += 1
             except BadClip as error:
                 yield log_id, error
                 continue

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from factory.readers.apart import Apart
-from factory.readers.base import BadClip
+from factory.readers.base import BadClip, Unreadable
 from tests.chaos.damaged_files.fuzzed_kinds import KINDS, Readable, write_all
 from tests.chaos.damaged_files.mutants_of_files import rng_of
 
@@ -44,6 +44,8 @@ def answer(question: Question) -> str:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             value = readable.read()
+    except Unreadable as error:
+        return f"raised {error.problem}"[:300]
     except readable.refusals as error:
         if readable.named and path.name not in str(error):
             return f"nameless refusal: {type(error).__name__} {error}"[:300]
