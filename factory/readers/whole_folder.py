@@ -8,7 +8,7 @@ import logging
 import os
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from factory.files import matching_below
@@ -70,19 +70,28 @@ def mend(root: Path, write: Write) -> None:
                 beside = Path(shutil.move(anew / name, tempfile.mkdtemp(prefix=".", dir=there.parent)))
                 os.replace(beside, there)  # from the same disk, which a linked folder's need not be the root's
                 beside.parent.rmdir()
-        for name in set(_files(root)) - set(own):
-            (root / name).unlink()
-        for folder in sorted((path for path in root.rglob("*") if path.is_dir()), reverse=True):
-            if not any(folder.iterdir()):
-                folder.rmdir()
+        _remove_others(root, own)
     finally:
         shutil.rmtree(anew, ignore_errors=True)
 
 
-def _fill(folder: Path, write: Write, name: str) -> None:
+def _remove_others(root: Path, own: Sequence[str]) -> None:
+    """Leaves the files `own` alone. Of a link to a folder of none of them the link goes, never what it leads to."""
+    for folder, below, files in os.walk(root, topdown=False):
+        here = Path(folder)
+        for path in (here / name for name in (*files, *below)):
+            name = path.relative_to(root).as_posix()
+            if path.is_dir() and not path.is_symlink():
+                if not any(path.iterdir()):
+                    path.rmdir()
+            elif name not in own and not any(kept.startswith(f"{name}/") for kept in own):
+                path.unlink()
+
+
+def _fill(folder: Path, write: Write, named: str) -> None:
     write(folder)
     sums = {name: _digest(folder / name) for name in _files(folder)}
-    (folder / SUMS).write_text(sealed_json({"folder": name, "files": sums}))
+    (folder / SUMS).write_text(sealed_json({"folder": named, "files": sums}))
 
 
 def _wrong(root: Path) -> str:

@@ -311,6 +311,8 @@ def tracks_of(
     tracks = []
     for rows in groups:
         track_id = str(ids[rows[0]])
+        if not track_id.strip():
+            raise BadClip(str(path), field, f"a box at {times_s[rows[0]]:.1f} s has an empty one")
         if (np.diff(times_s[rows]) <= 0.0).any():
             raise BadClip(str(path), field, f"track {track_id} stands twice in one frame")
         kind = kinds[rows[0]]

@@ -8,6 +8,7 @@ import numpy as np
 
 from factory.files import matching
 from factory.readers.base import BadClip
+from factory.readers.plain_values import id_text
 from tasks.world.arrays import Array
 from tasks.world.lanes import Lane, MapLayer, MapPolygon, RoadMap
 from tasks.world.polygons import centerline_from_boundaries, ring_from_boundaries, valid_ring
@@ -56,7 +57,7 @@ def _section(path: Path, content: Any, name: str) -> dict[str, Any]:
 def _lane(path: Path, key: str, raw: Any) -> Lane:
     field = f"lane_segments[{key}]"
     try:
-        beside = [None if lane is None else str(lane) for lane in (raw["left_neighbor_id"], raw["right_neighbor_id"])]
+        beside = [id_text(raw["left_neighbor_id"]), id_text(raw["right_neighbor_id"])]
         left = _points(path, f"{field}.left_lane_boundary", raw["left_lane_boundary"])
         right = _points(path, f"{field}.right_lane_boundary", raw["right_lane_boundary"])
         return Lane(
@@ -65,8 +66,8 @@ def _lane(path: Path, key: str, raw: Any) -> Lane:
             centerline=centerline_from_boundaries(left, right),
             is_intersection=bool(raw["is_intersection"]),
             drives_cars=CAR_LANE_TYPES[raw["lane_type"]],
-            successors=tuple(str(lane) for lane in raw["successors"]),
-            predecessors=tuple(str(lane) for lane in raw["predecessors"]),
+            successors=tuple(lane for lane in map(id_text, raw["successors"]) if lane is not None),
+            predecessors=tuple(lane for lane in map(id_text, raw["predecessors"]) if lane is not None),
             left_neighbor=beside[0],
             right_neighbor=beside[1],
             left_boundary=left,

@@ -11,6 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from factory.files import matching
+from factory.readers.apart import Apart
+from factory.readers.base import BadClip
+from factory.readers.plain_values import check_values
+from factory.wording import shown
 
 MAX_YAML_BYTES = 64 << 20
 TARGET = "navsim.common.dataclasses.SceneFilter"
@@ -71,7 +75,7 @@ def read_selection(name: str, folder: str | Path | None = None) -> Selection:
     _refuse_unknown(content, _SPLIT_KEYS, str(path))
     data_split, mapping = content.get("data_split"), content.get("reactive_all_mapping")
     if not isinstance(data_split, str):
-        raise ValueError(f"{path}: data_split: expected the name of a folder of logs, not {data_split!r}")
+        raise ValueError(f"{path}: data_split: expected the name of a folder of logs, not {shown(data_split)}")
     if mapping is not None and not isinstance(mapping, list):
         raise ValueError(f"{path}: reactive_all_mapping: expected a list, not a {type(mapping).__name__}")
     filter_path = path.parent / SUBFOLDER / f"{_filter_name(content, path)}.yaml"
@@ -89,18 +93,18 @@ def scene_filter_of(content: Mapping[str, Any], file: str) -> SceneFilter:
     known = frozenset(field.name for field in fields(SceneFilter))
     _refuse_unknown(content, known | _HYDRA_KEYS, file)
     if content.get("_target_", TARGET) != TARGET:
-        raise ValueError(f"{file}: _target_: {content['_target_']!r} is no scene filter, expected {TARGET}")
+        raise ValueError(f"{file}: _target_: {shown(content['_target_'])} is no scene filter, expected {TARGET}")
     checked: dict[str, Any] = {}
     for key, value in content.items():
         if key in _HYDRA_KEYS or (value is None and key not in ("num_history_frames", "num_future_frames", *_FLAGS)):
             continue
         if key in _COUNTS:
             if isinstance(value, bool) or not isinstance(value, int) or value < _COUNTS[key]:
-                raise ValueError(f"{file}: {key}: expected a whole number from {_COUNTS[key]} on, not {value!r}")
+                raise ValueError(f"{file}: {key}: expected a whole number from {_COUNTS[key]} on, not {shown(value)}")
             checked[key] = value
         elif key in _FLAGS:
             if not isinstance(value, bool):
-                raise ValueError(f"{file}: {key}: expected true or false, not {value!r}")
+                raise ValueError(f"{file}: {key}: expected true or false, not {shown(value)}")
             checked[key] = value
         elif key == "all_mapping":
             checked[key] = value
@@ -136,6 +140,14 @@ def _filter_name(content: Mapping[str, Any], path: Path) -> str:
 
 
 def _mapping(path: Path) -> dict[str, Any]:
+    """What a YAML file holds, read as logs are, in another process. Raises ValueError."""
+    try:
+        return Apart(_read)(path, str(path))
+    except BadClip as error:
+        raise ValueError(str(error)) from error
+
+
+def _read(path: Path) -> dict[str, Any]:
     """What a YAML file holds. Raises ValueError."""
     import yaml  # here alone: a filter is read by those who have one
 
@@ -150,8 +162,9 @@ def _mapping(path: Path) -> dict[str, Any]:
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the same rules, ten times as fast
     try:
         content = yaml.load(text, loader)  # noqa: S506 - both loaders are safe
-    except (yaml.YAMLError, RecursionError) as error:
+    except (yaml.YAMLError, RecursionError, ValueError) as error:  # a date or a number that is none
         raise ValueError(f"{path}: no YAML of plain values: {' '.join(str(error).split())}") from error
+    check_values(content, len(text), str(path), "YAML")
     if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
         raise ValueError(f"{path}: expected keys and values, found a {type(content).__name__}")
     return content
@@ -165,7 +178,7 @@ def _refuse_unknown(content: Mapping[str, Any], known: frozenset[str], file: str
 def _texts(value: object, where: str) -> tuple[str, ...]:
     if not isinstance(value, list):
         raise ValueError(f"{where}: expected a list of text, not a {type(value).__name__}")
-    strange = next((item for item in value if not isinstance(item, str)), None)
-    if strange is not None:
-        raise ValueError(f"{where}: {strange!r} is no text: put it in quotes")
+    for item in value:
+        if not isinstance(item, str):
+            raise ValueError(f"{where}: {shown(item)} is no text: put it in quotes")
     return tuple(value)

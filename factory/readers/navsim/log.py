@@ -16,7 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from factory.readers.base import BadClip, bytes_of
 from factory.readers.navsim.values import Values
+from factory.readers.plain_values import id_text
 from factory.readers.restricted_pickle import load_plain
+from factory.wording import shown
 from tasks.world.agents import AgentKind
 from tasks.world.arrays import Array
 
@@ -94,7 +96,7 @@ def frames_of(value: Any, path: Path) -> LogFrames:
             raise BadClip(file, f"frames[{i}].timestamp", "time does not go on")
     for i, frame in enumerate(frames):
         if frame.log_name != path.stem:  # NAVSIM finds logs by the one and scenes by the other
-            problem = f"is {frame.log_name!r}, but the file is named {path.stem!r}: rename the file"
+            problem = f"is {shown(frame.log_name)}, but the file is named {path.stem!r}: rename the file"
             raise BadClip(file, f"frames[{i}].log_name", problem)
     if len({frame.map_location for frame in frames}) > 1:
         raise BadClip(file, "map_location", "changes within the log")
@@ -156,11 +158,12 @@ def lights_of(values: Values) -> tuple[tuple[str, bool], ...]:
     out = []
     for light in lights:
         if not isinstance(light, list | tuple) or len(light) != 2:
-            raise values.bad("traffic_lights", f"holds {light!r}, expected (lane connector id, is_red)")
+            raise values.bad("traffic_lights", f"holds {shown(light)}, expected (lane connector id, is_red)")
         lane_id, is_red = light
-        if not isinstance(lane_id, int | np.integer | str) or not isinstance(is_red, bool | np.bool_ | int):
-            raise values.bad("traffic_lights", f"holds {light!r}, expected (lane connector id, is_red)")
-        out.append((str(lane_id), bool(is_red)))
+        name = id_text(lane_id)
+        if name is None or not isinstance(is_red, bool | np.bool_ | int):
+            raise values.bad("traffic_lights", f"holds {shown(light)}, expected (lane connector id, is_red)")
+        out.append((name, bool(is_red)))
     return tuple(out)
 
 
@@ -220,6 +223,8 @@ def boxes_of(anns: Values, names: Mapping[str, str] | None = None) -> FrameBoxes
             raise anns.bad(name, f"{len(column)} entries, but {n} boxes")
     if unknown := sorted(set(kinds) - KIND_OF_NAME.keys()):
         raise anns.bad(key["gt_names"], f"unknown class {', '.join(unknown)}; known: {', '.join(KIND_OF_NAME)}")
+    if not all(track.strip() for track in tracks):
+        raise anns.bad("track_tokens", "holds an empty token, which tells no objects apart")
     if len(set(tracks)) < n:
         raise anns.bad("track_tokens", f"{next(t for t in tracks if tracks.count(t) > 1)} stands twice in one frame")
     if (boxes[:, 3:6] <= 0.0).any():

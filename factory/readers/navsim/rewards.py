@@ -14,6 +14,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from factory.readers.base import BadClip
+from factory.wording import shown
 from tasks.world.arrays import Array
 
 LONG_BYTES = 2  # from here on bytes are content, of which the place is kept; one letter names an order
@@ -59,10 +60,10 @@ class _Numbers:
     def fill(self, shape: Any, kind: Any, place: Any) -> None:
         """Raises ValueError for what is no (K,) of floating point numbers with a place."""
         if not isinstance(kind, _Type) or kind.code not in TYPES:
-            raise ValueError(f"an array of {getattr(kind, 'code', kind)!r}, expected floating point numbers")
+            raise ValueError(f"an array of {shown(getattr(kind, 'code', kind))}, expected floating point numbers")
         self.type = kind.order + kind.code
         if not isinstance(place, _Place) or shape != (place.size // np.dtype(self.type).itemsize,):
-            raise ValueError(f"an array of shape {shape}, expected (K,)")
+            raise ValueError(f"an array of shape {shown(shape)}, expected (K,)")
         self.place = place
 
 
@@ -101,7 +102,7 @@ class RewardFile:
     def _add(self, token: Any, metrics: Any) -> None:
         """One entry of the outer dictionary. Raises ValueError."""
         if not isinstance(token, str) or not isinstance(metrics, dict) or not metrics:
-            raise ValueError(f"{token!r} is not the token of a dict of metrics")
+            raise ValueError(f"{shown(token)} is not the token of a dict of metrics")
         places = [value.place for value in metrics.values() if isinstance(value, _Numbers) and value.place]
         types = {value.type for value in metrics.values() if isinstance(value, _Numbers)}
         if len(places) < len(metrics) or len({place.size for place in places}) > 1 or len(types) > 1:
@@ -156,6 +157,8 @@ def _follow(file: BinaryIO, add: Any) -> None:
             _build(stack[-1], state)
         elif name in ("SETITEMS", "SETITEM"):
             items = popped(len(stack) - marks.pop() if name == "SETITEMS" else 2)
+            if not all(isinstance(key, str) for key in items[::2]):  # to hash a tuple may take for ever
+                raise ValueError(f"a key at byte {position} is no text")
             pairs = zip(items[::2], items[1::2], strict=True)
             if len(stack) > 1:
                 stack[-1].update(pairs)
@@ -189,13 +192,14 @@ def _called(called: Any, arguments: Any) -> _Type | _Numbers:
     """What a call stands for. Raises ValueError for any other than numpy's own of arrays."""
     name = called.name if isinstance(called, _Global) else ""
     if name == "numpy dtype":
-        return _Type(str(arguments[0]))
+        (code, *_) = arguments
+        return _Type(code if isinstance(code, str) else "")
     numbers = _Numbers()
     if name in FROM_BUFFER:
         place, kind, shape, _ = arguments
         numbers.fill(shape, kind, place)
     elif name not in RECONSTRUCT:
-        raise ValueError(f"refused call of {name or called!r}")
+        raise ValueError(f"refused call of {name or shown(called)}")
     return numbers
 
 

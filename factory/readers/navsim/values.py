@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from factory.readers.base import BadClip
+from factory.wording import shown
 from tasks.world.arrays import Array
 
 MISSING = object()
@@ -51,7 +52,7 @@ class Values:
         """Python's or numpy's. Raises BadClip."""
         value = self.get(key)
         if isinstance(value, bool | np.bool_) or not isinstance(value, int | np.integer):
-            raise self.bad(key, f"is {_short(value)}, expected a whole number")
+            raise self.bad(key, f"is {shown(value)}, expected a whole number")
         return int(value)
 
     def numbers(self, key: str, shape: tuple[int | None, ...]) -> Array:
@@ -63,7 +64,7 @@ class Values:
         try:
             array = np.array(value, np.float64)
         except (TypeError, ValueError, OverflowError) as error:
-            raise self.bad(key, f"holds no numbers ({_short(value)})") from error
+            raise self.bad(key, f"holds no numbers ({shown(value)})") from error
         if array.size == 0 and shape[0] is None:  # an empty list says nothing of its columns
             array = array.reshape(0, *(n or 0 for n in shape[1:]))
         if array.ndim != len(shape) or any(want not in (None, got) for want, got in zip(shape, array.shape)):
@@ -77,12 +78,7 @@ class Values:
         value = self.get(key)
         if isinstance(value, str) or not isinstance(value, Sequence | np.ndarray):
             raise self.bad(key, f"is a {type(value).__name__}, expected a list of text")
-        strange = next((item for item in value if not isinstance(item, str)), None)
-        if strange is not None:
-            raise self.bad(key, f"holds {_short(strange)}, expected text")
+        for item in value:
+            if not isinstance(item, str):
+                raise self.bad(key, f"holds {shown(item)}, expected text")
         return tuple(map(str, value))
-
-
-def _short(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."

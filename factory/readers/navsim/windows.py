@@ -10,12 +10,14 @@ import logging
 from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from factory.readers.apart import Apart
 from factory.readers.base import BadClip
 from factory.readers.navsim.filters import SceneFilter
 from factory.readers.navsim.log import LogFrames, read_frames
@@ -107,6 +109,11 @@ def kept_table(path: Path, cache_dir: Path) -> FrameTable | None:
     except (ValueError, OSError, IndexError) as error:  # Damaged among them
         log.warning("%s: %s; made again of %s", _kept(path, cache_dir), error, path)
         return None
+
+
+def table_at(path: Path, cache_dir: Path) -> FrameTable:
+    """The table of the log at `path`; one that was not kept is made in another process. Raises BadClip."""
+    return kept_table(path, cache_dir) or Apart(partial(make_table, cache_dir=cache_dir))(path, str(path))
 
 
 def make_table(path: Path, cache_dir: Path) -> FrameTable:

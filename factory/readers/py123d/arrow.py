@@ -16,6 +16,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from factory.readers.base import BadClip
+from factory.wording import shown
 from tasks.world.arrays import Array, Indices, Ints
 
 VERSIONS = ("0.6", "0.7")  # of py123d, whose files are read
@@ -59,7 +60,7 @@ class ArrowFile:
     def value(self, name: str, *kinds: type[Any]) -> Any:
         """A value of the metadata, of one of the types. Raises BadClip."""
         if not isinstance(self.metadata.get(name), kinds):
-            raise BadClip(str(self.path), f"metadata.{name}", f"is {self.metadata.get(name)!r:.60}")
+            raise BadClip(str(self.path), f"metadata.{name}", f"is {shown(self.metadata.get(name))}")
         return self.metadata[name]
 
     def vector(self, name: str, size: int) -> Array:

@@ -35,6 +35,7 @@ from factory.readers.av2.log import (
 )
 from factory.readers.base import BadClip
 from factory.readers.logs import LoggedDrive
+from factory.readers.plain_values import id_text
 from factory.readers.py123d.arrow import ArrowFile, numbers, open_file
 from factory.readers.py123d.sources import KINDS_OF_LABELS
 from factory.readers.scenarionet.tracks import FIT_STEPS, MAX_GAP_S, smooth_drive
@@ -172,7 +173,11 @@ def _tracks(boxes: ArrowFile, row: Indices, values: pa.Array, boxed: Indices, ti
     box = numbers(path, "bounding_box_se3", values, 10)[boxed]
     if (box[:, 7:] <= 0.0).any():
         raise BadClip(str(path), "bounding_box_se3", "a box has a size that is not positive")
-    tokens = np.array(ids.to_pylist(), dtype=np.str_)[boxed]
+    named = [id_text(token) for token in ids.to_pylist()]
+    if None in named:
+        frame = int(row[named.index(None)])
+        raise BadClip(str(path), "track_token", f"frame {frame} has a box that no token names: it is empty or no text")
+    tokens = np.array(named, dtype=np.str_)[boxed]
     kinds = _kinds(boxes, np.asarray(labels, np.int64)[boxed])
     headings = yaw_of(rotations(path, box[:, 3:7]))
     return tracks_of(path, "track_token", tokens, kinds, times_s[row[boxed]], box[:, :3], headings, box[:, 7:])

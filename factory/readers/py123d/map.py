@@ -16,10 +16,12 @@ from numpy.typing import NDArray
 from shapely.geometry import LineString, Polygon
 
 from factory.readers.base import BadClip
+from factory.readers.plain_values import id_text
 from factory.readers.py123d.arrow import ArrowFile, check_version, open_file, unpacked, whole
 from factory.readers.py123d.sources import ConvertedSet
 from factory.readers.scenarionet.lanes import RawLane, closed_ring, connector_ids, resampled_line
 from factory.readers.scenarionet.map import neighbours, paved_areas
+from factory.wording import shown
 from tasks.world.arrays import Array, Indices
 from tasks.world.lanes import Lane, MapLayer, MapPolygon, RoadMap
 from tasks.world.polygons import centerline_from_boundaries, valid_ring, with_headings
@@ -62,7 +64,7 @@ def read_map(path: Path, source: ConvertedSet, drive: Array) -> RoadMap:
     raw = {}
     for row in objects.rows(LANE):
         lane_id = objects.ids[row]
-        in_junction = _name(contents[lane_id].get("lane_group_id")) in junction if junction else None
+        in_junction = id_text(contents[lane_id].get("lane_group_id")) in junction if junction else None
         if (lane := _raw_lane(objects, row, contents[lane_id], in_junction)) is not None:
             raw[lane_id] = lane
     if all(lane.kind == BIKE for lane in raw.values()):
@@ -135,8 +137,8 @@ def _raw_lane(objects: MapObjects, row: int, content: Mapping[str, Any], in_junc
         interpolating=in_junction,
         entry=_names(objects, lane_id, content, "predecessor_ids"),
         exit=_names(objects, lane_id, content, "successor_ids"),
-        left=_name(content.get("left_lane_id")),
-        right=_name(content.get("right_lane_id")),
+        left=id_text(content.get("left_lane_id")),
+        right=id_text(content.get("right_lane_id")),
         speed_limit_mps=float(speed) if isinstance(speed, int | float) and 0.0 < speed < np.inf else None,
     )
 
@@ -171,7 +173,7 @@ def _roadblocks(path: Path, contents: Mapping[str, Mapping[str, Any]], lanes: Ma
     """Lane id -> the data set's own roadblock. Raises BadClip for a car lane without one."""
     blocks = {}
     for lane_id in (lane_id for lane_id, lane in lanes.items() if lane.drives_cars):
-        group = _name(contents[lane_id].get("lane_group_id"))
+        group = id_text(contents[lane_id].get("lane_group_id"))
         if group is None:
             raise BadClip(str(path), f"lane_group_id of lane {lane_id}", "missing")
         blocks[lane_id] = group
@@ -229,9 +231,5 @@ def _line(objects: MapObjects, lane_id: str, content: Mapping[str, Any], name: s
 def _names(objects: MapObjects, lane_id: str, content: Mapping[str, Any], name: str) -> tuple[str, ...]:
     ids = content.get(name)
     if not isinstance(ids, list):
-        raise BadClip(str(objects.file.path), f"{name} of lane {lane_id}", f"not a list: {ids!r:.40}")
-    return tuple(map(str, ids))
-
-
-def _name(value: object) -> str | None:
-    return None if value is None else str(value)
+        raise BadClip(str(objects.file.path), f"{name} of lane {lane_id}", f"not a list: {shown(ids)}")
+    return tuple(named for named in map(id_text, ids) if named is not None)

@@ -17,6 +17,7 @@ from factory.readers.py123d.map import read_map
 from factory.readers.py123d.sensors import camera_files, has_photos, read_rig, recorded_photos, recorded_sweeps
 from factory.readers.py123d.sources import SOURCES, ConvertedSet
 from factory.readers.settings import Py123dClips
+from factory.wording import shown
 from tasks.world.camera import Camera, SensorFile
 from tasks.world.clip import STEP_S, Block
 
@@ -148,7 +149,7 @@ def source_of(header: ArrowFile) -> ConvertedSet:
     """The data set that was converted. Raises BadClip for one that is not read."""
     name = header.value("dataset", str)
     if name not in SOURCES:
-        raise BadClip(str(header.path), "metadata.dataset", f"{name!r} is not read; {', '.join(SOURCES)} are")
+        raise BadClip(str(header.path), "metadata.dataset", f"{shown(name)} is not read; {', '.join(SOURCES)} are")
     return SOURCES[name]
 
 
@@ -163,7 +164,7 @@ def map_file(header: ArrowFile, maps_root: Path | None) -> Path:
     else:
         name = f"{told['dataset']}_{told.get('location')}.arrow"
         if Path(name).name != name:
-            raise BadClip(str(header.path), "metadata.map_metadata", f"names an impossible file {name!r}")
+            raise BadClip(str(header.path), "metadata.map_metadata", f"names an impossible file {shown(name)}")
         roots = [maps_root] if maps_root else [parent / "maps" for parent in folder.parents[1:4]]
         paths = [root / told["dataset"] / name for root in roots]
     found = next((path for path in paths if path.is_file()), None)

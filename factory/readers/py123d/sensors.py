@@ -14,6 +14,7 @@ from factory.readers.av2.log import LogMotion, seconds_since, world_from_ego_at
 from factory.readers.base import BadClip
 from factory.readers.py123d.arrow import ArrowFile, numbers, open_file, open_metadata
 from factory.readers.py123d.log import EGO, matrices
+from factory.wording import shown
 from tasks.world.arrays import Array
 from tasks.world.camera import Camera, SensorFile
 
@@ -102,6 +103,6 @@ def _files(file: ArrowFile, sensor: str, root: Path, times_s: Array, poses: Arra
     names = file.column("data").to_pylist()
     for name in names:
         if Path(name).is_absolute() or ".." in Path(name).parts:
-            raise BadClip(str(file.path), "data", f"{name!r} is no path under the sensor root")
+            raise BadClip(str(file.path), "data", f"{shown(name)} is no path under the sensor root")
     order = np.argsort(times_s, kind="stable")
     return [SensorFile(sensor, str(root / names[i]), float(times_s[i]), poses[i]) for i in order]

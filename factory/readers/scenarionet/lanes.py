@@ -24,7 +24,9 @@ from scipy.spatial import cKDTree
 from shapely.geometry import LineString, Polygon
 
 from factory.readers.base import BadClip
+from factory.readers.plain_values import id_text
 from factory.readers.scenarionet.tracks import floats
+from factory.wording import shown
 from tasks.world.arrays import Array
 from tasks.world.polygons import arc_lengths, n_spaced, resample
 
@@ -57,15 +59,17 @@ def raw_lanes(features: Mapping[str, Any], source: str, file: str) -> dict[str, 
     """All LANE_* features by id, in file order. Raises BadClip for an unknown kind, a lane without a line, or none."""
     lanes: dict[str, RawLane] = {}
     for key, feature in features.items():
-        lane_id = str(key)
-        field = f"map_features[{lane_id}]"
+        lane_id = id_text(key)
+        field = f"map_features[{shown(key) if lane_id is None else lane_id}]"
         if not isinstance(feature, dict) or not isinstance(feature.get("type"), str):
             raise BadClip(file, f"{field}.type", "missing")
         kind = feature["type"]
         if not kind.startswith("LANE_"):
             continue
+        if lane_id is None:
+            raise BadClip(file, field, "is no id of a lane, expected text or a number")
         if kind not in LANE_KINDS:
-            raise BadClip(file, f"{field}.type", f"unknown lane class {kind!r}")
+            raise BadClip(file, f"{field}.type", f"unknown lane class {shown(kind)}")
         line = resampled_line(points(feature, "polyline", file, field), file, f"{field}.polyline")
         if line is None:  # a lane shorter than a centimetre leads nowhere
             continue
@@ -173,13 +177,15 @@ def resampled_line(line: Array, file: str, field: str) -> Array | None:
 
 
 def _ids(value: object) -> tuple[str, ...] | None:
-    return tuple(map(str, value)) if isinstance(value, list | tuple | set | np.ndarray) else None
+    if not isinstance(value, list | tuple | set | np.ndarray):
+        return None
+    return tuple(name for name in map(id_text, value) if name is not None)
 
 
 def _flag(feature: Mapping[str, Any], name: str, file: str, field: str) -> bool | None:
     value = feature.get(name)
     if not isinstance(value, bool | np.bool_ | None):
-        raise BadClip(file, f"{field}.{name}", f"{value!r} is neither true nor false")
+        raise BadClip(file, f"{field}.{name}", f"{shown(value)} is neither true nor false")
     return None if value is None else bool(value)
 
 
@@ -189,12 +195,14 @@ def _neighbour(feature: Mapping[str, Any], name: str, nearest: int, file: str, f
     if not isinstance(value, Sequence) or isinstance(value, str | bytes) or not value:
         return None
     if not isinstance(value[nearest], dict):
-        return str(value[nearest])
+        return id_text(value[nearest])
     try:
         longest = max(value, key=lambda item: int(item["self_end_index"]) - int(item["self_start_index"]))
-        return str(longest["feature_id"])
+        return id_text(longest["feature_id"])
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise BadClip(file, f"{field}.{name}", f"no feature_id with an index range ({error!r})") from error
+        raise BadClip(
+            file, f"{field}.{name}", f"no feature_id with an index range ({type(error).__name__}: {error})"
+        ) from error
 
 
 def _speed_limit(feature: Mapping[str, Any], source: str) -> float | None:

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from shapely.geometry import Polygon
 
 from factory.readers.base import BadClip
+from factory.readers.plain_values import id_text
 from factory.readers.scenarionet.lanes import (
     CAR_LANE_KINDS,
     JOINT_M,
@@ -20,6 +21,7 @@ from factory.readers.scenarionet.lanes import (
     points,
     raw_lanes,
 )
+from factory.wording import shown
 from tasks.world.arrays import Array
 from tasks.world.lanes import Lane, LightState, MapLayer, MapPolygon, RoadMap, TrafficLights
 from tasks.world.polygons import with_headings
@@ -144,16 +146,19 @@ def traffic_lights(states: Mapping[str, Any], n_steps: int, file: str) -> Traffi
     """Lights over the log's own steps; two lights of one lane count as the more restrictive. Raises BadClip."""
     of_lane: dict[str, NDArray[np.int8]] = {}
     for key, light in states.items():
-        field = f"dynamic_map_states[{key}]"
+        field = f"dynamic_map_states[{id_text(key) or shown(key)}]"
         try:
-            lane_id, names = str(light["lane"]), list(light["state"]["object_state"])
+            lane_id, names = id_text(light["lane"]), list(light["state"]["object_state"])
         except (KeyError, TypeError, IndexError) as error:
-            raise BadClip(file, field, f"no lane or no state.object_state ({error!r})") from error
+            said = f"{type(error).__name__}: {error}"
+            raise BadClip(file, field, f"no lane or no state.object_state ({said})") from error
+        if lane_id is None:
+            raise BadClip(file, field, f"its lane is {shown(light['lane'])}, expected an id")
         if len(names) != n_steps:
             raise BadClip(file, f"{field}.state.object_state", f"{len(names)} steps, the log has {n_steps}")
         unknown = [name for name in names if not isinstance(name, str | None) or name not in LIGHT_STATES]
         if unknown:
-            raise BadClip(file, f"{field}.state.object_state", f"unknown light states, first {unknown[0]!r}")
+            raise BadClip(file, f"{field}.state.object_state", f"unknown light states, first {shown(unknown[0])}")
         row = np.array([LIGHT_STATES[name] for name in names], np.int8)
         of_lane[lane_id] = np.maximum(of_lane[lane_id], row) if lane_id in of_lane else row
     columns = list(of_lane.values())

@@ -10,6 +10,7 @@ import numpy as np
 from factory.readers.base import BadClip
 from factory.readers.scenarionet.sidecars import cameras_in, load_sidecar
 from factory.readers.videos import frame_uri
+from factory.wording import shown
 from tasks.world.arrays import Array
 from tasks.world.bounds import all_within
 from tasks.world.camera import ROTATION_SLACK, Camera, Fisheye, SensorFile
@@ -45,7 +46,7 @@ def read_photographs(path: Path, root: Path, ego_states: Array) -> Photographs:
     file = str(path)
     content, data = load_sidecar(path)
     if content.get("version", 1) != 1:
-        raise BadClip(file, "version", f"{content['version']!r}, this version reads 1")
+        raise BadClip(file, "version", f"{shown(content['version'])}, this version reads 1")
     described = cameras_in(content, file)
     if len(described) > MAX_CAMERAS:
         raise BadClip(file, "cameras", f"{len(described)} of them, at most {MAX_CAMERAS} are read")
@@ -61,7 +62,7 @@ def read_photographs(path: Path, root: Path, ego_states: Array) -> Photographs:
         field = f"frames[{i}]"
         name = entry.get("camera", only)
         if not isinstance(name, str) or name not in cameras:
-            raise BadClip(file, f"{field}.camera", f"{name!r} is none of {', '.join(cameras)}")
+            raise BadClip(file, f"{field}.camera", f"{shown(name)} is none of {', '.join(cameras)}")
         time_s = _time(entry, file, field)
         if (name, time_s) in seen:
             raise BadClip(file, f"{field}.t_s", f"{name} took two photos at {time_s:g} s")
@@ -108,10 +109,10 @@ class _Filmed:
     def uri(self, name: object, field: str) -> str:
         """Of a picture, or of a frame of the video that stands for its folder. Raises BadClip for a path elsewhere."""
         if not isinstance(name, str) or not name or "\0" in name:
-            raise BadClip(self.sidecar, field, f"{name!r} is no path of a picture")
+            raise BadClip(self.sidecar, field, f"{shown(name)} is no path of a picture")
         path = Path(name)
         if path.is_absolute() or ".." in path.parts:
-            raise BadClip(self.sidecar, field, f"{name!r}: paths are relative, below the folder of the photos")
+            raise BadClip(self.sidecar, field, f"{shown(name)}: paths are relative, below the folder of the photos")
         video = (self.root / path.parent).with_suffix(VIDEO)
         if path.stem.isascii() and path.stem.isdecimal() and video.is_file() and not (self.root / path.parent).is_dir():
             return frame_uri(video, int(path.stem))
@@ -131,7 +132,7 @@ def _camera(name: str, fields: Mapping[str, Any], file: str, under: str) -> Came
     width, height = fields.get("width"), fields.get("height")
     for key, value in (("width", width), ("height", height)):
         if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MAX_PIXELS:
-            raise BadClip(file, under + key, f"{value!r}: expected a whole number of pixels, 1 to {MAX_PIXELS}")
+            raise BadClip(file, under + key, f"{shown(value)}: expected a whole number of pixels, 1 to {MAX_PIXELS}")
     assert isinstance(width, int) and isinstance(height, int)
     intrinsics = _array(fields.get("K"), (3, 3), file, under + "K")
     if (intrinsics[2] != (0.0, 0.0, 1.0)).any() or intrinsics[0, 1] or intrinsics[1, 0]:
@@ -147,7 +148,7 @@ def _camera(name: str, fields: Mapping[str, Any], file: str, under: str) -> Came
     mount = _rigid(fields.get("cam_to_ego"), file, under + "cam_to_ego")
     readout_s = fields.get("readout_s", 0.0)
     if isinstance(readout_s, bool) or not isinstance(readout_s, int | float):
-        raise BadClip(file, under + "readout_s", f"{readout_s!r}: expected seconds from the first row to the last")
+        raise BadClip(file, under + "readout_s", f"{shown(readout_s)}: expected seconds from the first row to the last")
     try:
         return Camera(name, width, height, intrinsics, distortion, mount, fisheye, float(readout_s))
     except ValueError as error:
@@ -157,7 +158,7 @@ def _camera(name: str, fields: Mapping[str, Any], file: str, under: str) -> Came
 def _time(entry: Mapping[str, Any], file: str, field: str) -> float:
     value = entry.get("t_s")
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e6:
-        raise BadClip(file, f"{field}.t_s", f"{value!r}: expected seconds since the log's first instant")
+        raise BadClip(file, f"{field}.t_s", f"{shown(value)}: expected seconds since the log's first instant")
     return float(value)
 
 

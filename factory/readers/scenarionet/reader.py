@@ -16,8 +16,10 @@ from typing import Any
 import numpy as np
 
 from factory.files import matching_below
+from factory.readers.apart import Apart
 from factory.readers.base import BadClip, ClipIndex, ClipRef, bytes_of
 from factory.readers.logs import STEP_MS, LoggedDrive, LogReader, Recorded, WholeLog, present, route_of_drive, within
+from factory.readers.plain_values import id_text
 from factory.readers.restricted_pickle import load_plain
 from factory.readers.scenarionet.map import road_map, traffic_lights
 from factory.readers.scenarionet.photos import NO_PHOTOGRAPHS, Photographs, in_step, read_photographs
@@ -34,6 +36,7 @@ from factory.readers.scenarionet.tracks import (
 )
 from factory.readers.settings import ScenarioNetClips
 from factory.readers.splits import folder_split, nuscenes_split, waymo_split
+from factory.wording import shown
 from tasks.world.arrays import Array
 from tasks.world.clip import CLIP_STEPS, STEP_S, Block
 from tasks.world.frames import upright
@@ -190,23 +193,42 @@ def scenario_files(root: Path) -> dict[str, Path]:
 
 
 def _listed(root: Path) -> list[Path]:
-    """The database's scenarios by its summary and mapping. Merged databases point to folders beside their own."""
+    """The database's scenarios by its summary and mapping. Merged databases point to folders beside their own.
+
+    Both are read as logs are, in another process: they are as much a stranger's.
+    """
+    summary, mapped = root / SUMMARY, root / MAPPING
     try:
-        summary = load_plain((root / SUMMARY).read_bytes(), str(root / SUMMARY))
-        mapped = root / MAPPING
-        mapping = load_plain(mapped.read_bytes(), str(mapped)) if mapped.is_file() else {}
+        names = Apart(_names)(summary, str(summary))
+        folders = Apart(_folders)(mapped, str(mapped)) if mapped.is_file() else {}
     except BadClip as error:
         raise ValueError(str(error)) from error
-    if not isinstance(summary, Mapping) or not isinstance(mapping, Mapping):
-        raise ValueError(f"{root}: {SUMMARY} and {MAPPING} must hold dicts of file names")
-    paths = []
-    for name in summary:
-        folder = mapping.get(name, "")
-        named = isinstance(name, str) and name.endswith(".pkl") and PurePosixPath(name).name == name
-        if not named or not isinstance(folder, str) or PurePosixPath(folder).is_absolute():
-            raise ValueError(f"{root}: {SUMMARY} or {MAPPING} names an impossible file {name!r} in {folder!r}")
-        paths.append(root / folder / name)
-    return paths
+    return [root / folders.get(name, "") / name for name in names]
+
+
+def _names(path: Path) -> list[str]:
+    """File names that a summary describes. Raises BadClip."""
+    names = _dict_in(path)
+    for name in names:
+        if not isinstance(name, str) or not name.endswith(".pkl") or PurePosixPath(name).name != name:
+            raise BadClip(str(path), "name", f"an impossible file {shown(name)}")
+    return list(names)
+
+
+def _folders(path: Path) -> dict[str, str]:
+    """File name -> its folder, by a mapping. Raises BadClip."""
+    folders = _dict_in(path)
+    for name, folder in folders.items():
+        if not isinstance(folder, str) or PurePosixPath(folder).is_absolute():
+            raise BadClip(str(path), "folder", f"an impossible file {shown(name)} in {shown(folder)}")
+    return folders
+
+
+def _dict_in(path: Path) -> dict[Any, Any]:
+    found = load_plain(bytes_of(path), str(path))
+    if not isinstance(found, dict):
+        raise BadClip(str(path), "pickle", f"holds a {type(found).__name__}, expected a dict by file name")
+    return found
 
 
 def read_scenario(path: Path) -> tuple[dict[str, Any], str]:
@@ -226,7 +248,9 @@ def read_scenario(path: Path) -> tuple[dict[str, Any], str]:
 def _source(scenario: Mapping[str, Any], file: str) -> tuple[str, Source]:
     name = scenario["metadata"].get("dataset")
     if not isinstance(name, str) or name not in SOURCES:
-        raise BadClip(file, "metadata.dataset", f"{name!r} is not supported; conversions of {', '.join(SOURCES)} are")
+        raise BadClip(
+            file, "metadata.dataset", f"{shown(name)} is not supported; conversions of {', '.join(SOURCES)} are"
+        )
     return name, SOURCES[name]
 
 
@@ -235,13 +259,14 @@ def read_motion(scenario: Mapping[str, Any], file: str) -> LoggedDrive:
     n_frames, tracks = int(scenario["length"]), scenario["tracks"]
     _, source = _source(scenario, file)
     sdc_id = scenario["metadata"].get("sdc_id")
-    if not isinstance(sdc_id, str | int) or sdc_id not in tracks:
-        raise BadClip(file, "metadata.sdc_id", f"missing, or names no track: {sdc_id!r}")
+    named = id_text(sdc_id)
+    if named is None or sdc_id not in tracks:
+        raise BadClip(file, "metadata.sdc_id", f"missing, or names no track: {shown(sdc_id)}")
     at = frame_positions(sample_times(scenario["metadata"], n_frames, file))
     ego = read_track(tracks, sdc_id, n_frames, file)
     states, segment = ego_segments(ego, source, at)
     ground = ground_height(ego, at, file)
-    return LoggedDrive(states, agent_tracks(tracks, str(sdc_id), at, n_frames, ground, file), segment)
+    return LoggedDrive(states, agent_tracks(tracks, named, at, n_frames, ground, file), segment)
 
 
 def read_log(path: Path) -> ScenarioLog:
@@ -252,7 +277,7 @@ def read_log(path: Path) -> ScenarioLog:
     name, source = _source(scenario, file)
     n_frames, metadata = int(scenario["length"]), scenario["metadata"]
     lights = traffic_lights(scenario["dynamic_map_states"], n_frames, file)
-    lanes = road_map(scenario["map_features"], lights.lane_ids, name, str(metadata.get("map", "")), file)
+    lanes = road_map(scenario["map_features"], lights.lane_ids, name, id_text(metadata.get("map")) or "", file)
     route = route_of_drive(lanes, motion.ego_states[motion.segment >= 0, :3], file, "map_features")
     frames = np.floor(frame_positions(sample_times(metadata, n_frames, file)) + 1e-9).astype(int)
     known = [column for column, lane_id in enumerate(lights.lane_ids) if lane_id in lanes.lanes]

@@ -20,7 +20,9 @@ from scipy.linalg import solveh_banded
 from scipy.signal import savgol_filter
 
 from factory.readers.base import BadClip
+from factory.readers.plain_values import id_text
 from factory.readers.scenarionet.canbus import jumps, on_log_clock
+from factory.wording import shown
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.clip import STEP_S
@@ -137,16 +139,21 @@ def agent_tracks(
 ) -> AgentTracks:
     """All tracks but the ego at the fractional frames `at` (S,), heights above `ground` (S,). Raises BadClip."""
     ids, kinds, rows = [], [], []
-    for track_id in (key for key in tracks if str(key) != sdc_id):
+    for track_id in tracks:
+        name = id_text(track_id)
+        if name is None:
+            raise BadClip(file, f"tracks[{shown(track_id)}]", "is no id of a track, expected text or a number")
+        if name == sdc_id:
+            continue
         kind = tracks[track_id].get("type") if isinstance(tracks[track_id], dict) else None
         if not isinstance(kind, str) or kind not in KINDS:
-            raise BadClip(file, f"tracks[{track_id}].type", f"unknown class {kind!r}")
+            raise BadClip(file, f"tracks[{name}].type", f"unknown class {shown(kind)}")
         track = read_track(tracks, track_id, n_frames, file)
         if not track.valid.any():
             continue
         if not (np.isfinite(track.size).all() and (track.size[:2] > 0.0).all()):
-            raise BadClip(file, f"tracks[{track_id}].state", f"length, width, height are {track.size.tolist()}")
-        ids.append(str(track_id))
+            raise BadClip(file, f"tracks[{name}].state", f"length, width, height are {track.size.tolist()}")
+        ids.append(name)
         kinds.append(KINDS[kind])
         rows.append(track)
     valid = np.zeros((len(at), len(rows)), bool)

@@ -70,6 +70,10 @@ BROKEN = {
         "annotations.feather: category: unknown class ['DRAGON']",
     ),
     "track twice in a frame": (lambda log: edit(log / "annotations.feather", repeat_a_row), "track_uuid: track car"),
+    "a track without a name": (
+        lambda log: edit(log / "annotations.feather", set_value("track_uuid", 5, " ")),
+        "annotations.feather: track_uuid: a box at ",
+    ),
     "flat box": (
         lambda log: edit(log / "annotations.feather", set_value("width_m", 5, 0.0)),
         "annotations.feather: length_m width_m height_m",

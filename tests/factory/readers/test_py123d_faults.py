@@ -117,6 +117,10 @@ WHEN_LISTED = {  # what the choice of windows meets
     "unknown labels": (told(BOXES, box_detection_label_class="mine.Label"), "unknown labels Label; known: AV2Sensor"),
     "label beyond": (column(f"{BOXES}:label", set_first([99, 99])), "label: 99: AV2SensorBoxDetectionLabel has 30"),
     "labels of no box": (column(f"{BOXES}:label", set_first([18])), "track_token label: not one of each"),
+    "a track without a token": (
+        column(f"{BOXES}:track_token", set_first(["", "car"])),
+        f"{BOXES}: track_token: frame 0 has a box that no token names",
+    ),
     "twice in a frame": (column(f"{BOXES}:track_token", set_first(["car", "car"])), "track car stands twice"),
     "no boxes": (
         lambda log: [
