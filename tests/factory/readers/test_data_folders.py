@@ -136,7 +136,10 @@ def test_a_whole_folder_is_made_and_mended_behind_a_link_to_another_disk(tmp_pat
             (root / name).write_text("damaged")
         shutil.move(root / "a", tmp_path / "a")
         (root / "a").symlink_to(tmp_path / "a")
+        (tmp_path / "of_another" / "z").mkdir(parents=True)
+        (root / "stray").symlink_to(tmp_path / "of_another")
         mend(root, write)
+        assert (tmp_path / "of_another" / "z").is_dir() and not (root / "stray").exists()
         assert [(root / name).read_text() for name in ("a/x", "y")] == [f"{n} as it was written" for n in ("a/x", "y")]
         assert sorted(path.name for path in (*root.rglob("*"), *root.glob("a/*"))) == ["a", SUMS, "x", "y"]
         assert list(tmp_path.glob(".*")) == []
