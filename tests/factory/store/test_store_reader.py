@@ -61,7 +61,7 @@ def test_workers_of_a_data_loader_read_the_snapshot_that_was_opened_however_they
     assert len(SampleTable(tmp_path, format=format)) > len(table)
     places = [len(table) - 1, 0]
     for chosen, rows in ((table, expected), (Subset(table, places), [expected[i] for i in places])):  # type: ignore[arg-type]
-        loader = DataLoader(chosen, 2, num_workers=1, multiprocessing_context=start, collate_fn=list)  # type: ignore[arg-type]
+        loader = DataLoader(chosen, 2, num_workers=1, multiprocessing_context=start, collate_fn=list, timeout=300)  # type: ignore[arg-type]
         read = [row for batch in loader for row in batch]
         assert list(map(repr, read)) == list(map(repr, rows))
     with ProcessPoolExecutor(1, get_context(start)) as process:
