@@ -1,6 +1,6 @@
 """Checkpoints of torch as data: tensors, arrays and plain values, nothing that runs, and no more than the file may say.
 
-`torch.load(weights_only=True)` calls nothing of a stranger's; what it builds is as large as its references make it, and
+`torch.load` of weights alone calls nothing of a stranger's; what it builds is as large as its references make it, and
 a key of a dictionary may take for ever to hash. So the streams are looked through before, and the value after.
 """
 
