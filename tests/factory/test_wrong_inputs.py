@@ -246,7 +246,7 @@ def test_one_expert_needs_no_brackets_and_odd_paths_no_quotes(folder: Path) -> N
     values = composed_run(["experts=recovery", "render.cameras=front", "out=~/my (first) run=a", "render=none"])
     config = run_config(values)
     assert config.experts == ("recovery",) and config.render.cameras == ("front",)
-    assert config.out == "~/my (first) run=a"
+    assert config.out == str(Path.home() / "my (first) run=a")
 
 
 def test_hydra_s_habits_work(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
