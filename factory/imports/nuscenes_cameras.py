@@ -262,5 +262,5 @@ def _text(row: Mapping[str, Any], key: str, file: Path) -> str:
 def _whole(row: Mapping[str, Any], key: str, file: Path) -> int:
     value = row.get(key)
     if isinstance(value, bool) or not isinstance(value, int):
-        raise BadClip(str(file), key, f"missing in row {shown(row.get('token'))}, or no whole number: {shown(value)}")
+        raise BadClip(str(file), key, f"missing in row {row.get('token')}, or no whole number: {shown(value)}")
     return value
