@@ -177,8 +177,8 @@ def _step_gaussians(held: Held, settings: FitSettings, found: Derivatives) -> No
 
 
 def picture_of(problem: Problem, state: FitState, photo: Photo, threads: int = 1) -> F32:
-    """What the fit makes of a photo of the block that it need not have seen (H, W, 3); samples are drawn of what is
-    kept of it (`finish`).
+    """What the fit makes of a photo of the block that it need not have seen (H, W, 3); samples are drawn of what
+    `finish` keeps of it.
 
     Pose correction and exposure are those learned from the same camera, between the photos before and after.
     `photo.world_from_camera` is local (minus `problem.origin`).
