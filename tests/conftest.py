@@ -3,6 +3,7 @@
 `--hypothesis-profile=search` looks for new examples instead.
 """
 
+import signal
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,10 @@ UNTIMED = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow]) 
 settings.register_profile("search", UNTIMED)
 settings.register_profile("repeatable", UNTIMED, derandomize=True)
 settings.load_profile("repeatable")
+
+# Commands that tests start heed these, also where a shell or nohup has begun the suite itself with them ignored.
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")
