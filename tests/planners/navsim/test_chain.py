@@ -226,7 +226,7 @@ def _same_pictures(row: Mapping[str, Any], scene: Scene) -> None:
         shot = scene.frames[round(2.0 * image["time_s"]) + 3].cameras[name]
         small = cv2.resize(shot.image(), (80, 45), interpolation=cv2.INTER_AREA).astype(float)
         stored = decoded(image).astype(float)
-        assert np.abs(small - stored).mean() < 3.5  # grey levels: two JPEGs of grain a pixel across
+        assert np.abs(small - stored).mean() < 4.0  # grey levels: two JPEGs of grain a pixel across have 3.5
         scale = np.diag([1920 / 80, 1080 / 45, 1.0])
         np.testing.assert_allclose(shot.intrinsics, scale @ rig[name]["intrinsics"].reshape(3, 3))
         pose = rig[name]["ego_from_camera"].reshape(4, 4)
