@@ -182,14 +182,14 @@ def contents(folder: Path) -> list[tuple[str, int]]:
 
 @pytest.mark.parametrize("wrong", WRONG, ids=[wrong.name for wrong in WRONG])
 def test_a_wrong_input_ends_with_its_code_and_one_line_and_writes_nothing(
-    wrong: Wrong, folder: Path, capsys: pytest.CaptureFixture[str]
+    wrong: Wrong, folder: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     before = contents(folder)
     argv = wrong.argv
     if argv[0] == "run" and not any(word.startswith("out=") for word in argv):
         argv = ("run", "render=none", *argv[1:], "out=here")
     assert main(argv) == wrong.code
-    said = capsys.readouterr()
+    said = capfd.readouterr()
     assert said.err.startswith("error: ") and said.err.count("\n") == 1, said.err
     for words in wrong.says:
         assert words in said.err

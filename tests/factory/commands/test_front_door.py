@@ -259,8 +259,8 @@ def read_only(out: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[P
     ("words", "code", "said"),
     [
         ("report", 2, "{out}/report.html: cannot be written: Permission denied; run it as"),
-        ("clean", 2, "{out}/"),
-        ("compact", 2, "{out}/"),
+        ("clean", 2, "{out}"),
+        ("compact", 2, "{out}"),
         ("verify repair=true", 2, "{out}/"),
         ("retry", 2, "out={out}: cannot be written: Permission denied"),
         ("run executor=local", 2, "out={out}: cannot be written: Permission denied"),

@@ -62,7 +62,7 @@ def test_a_block_goes_out_as_ply_and_comes_back_edited_with_its_vehicles_and_its
     described = json.loads((tmp_path / "out" / "scene.json").read_text())
     assert described["origin"] == whole.origin.tolist() and described["digest"] == whole.digest
     sky = cv2.imread(str(tmp_path / "out" / "sky.png"))[..., ::-1]
-    np.testing.assert_array_equal(sky, np.rint(whole.sky.rgb * 255.0))
+    np.testing.assert_array_equal(sky, np.rint(np.clip(whole.sky.rgb, 0.0, 1.0) * 255.0))
 
     edited = from_ply((tmp_path / "out" / "background.ply").read_bytes()).take(np.arange(10))
     (tmp_path / "edited.ply").write_bytes(to_ply(edited))

@@ -241,7 +241,7 @@ def test_weights_that_only_measure_are_no_part_of_what_rows_are_made_under(tmp_p
 def test_weights_that_are_none_are_refused_before_a_run(tmp_path: Path) -> None:
     pytest.importorskip("torch")
     (tmp_path / "note.pth").write_text("no weights")
-    for name, said in (("note.pth", "no weights that torch can load"), ("absent.pth", "No such file")):
+    for name, said in (("note.pth", "cannot be read as a checkpoint"), ("absent.pth", "No such file")):
         with pytest.raises(ConfigError, match=said):
             refuse_missing_backend(load_config([f"render.lpips=[{tmp_path / name}]"]))
 

@@ -43,7 +43,7 @@ def done_with_these(parts: list[str], tmp_path: Path, *command: str) -> tuple[se
     cache = tmp_path / "cache" / cache_dir().name
     for part in parts:
         listing = marker(part)
-        for name in (listing.name, *unsealed(listing.read_bytes()).decode().splitlines()):
+        for name in (listing.name, *unsealed(listing.read_bytes(), listing.name).decode().splitlines()):
             (cache / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(cache_dir() / name, cache / name)
     if (cache_dir() / "factory").is_dir():  # what paints the town
