@@ -138,7 +138,7 @@ def give_compiled_kernels(head: Head) -> Path:
     cache = head.folder / "cache" / "driving-data-factory" / cache_dir().name
     for part in PARTS:
         listing = marker(part)
-        for name in (listing.name, *unsealed(listing.read_bytes()).decode().splitlines()):
+        for name in (listing.name, *unsealed(listing.read_bytes(), listing.name).decode().splitlines()):
             (cache / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(cache_dir() / name, cache / name)
     return cache
