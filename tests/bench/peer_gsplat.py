@@ -3,7 +3,7 @@
 Its compositing asks nerfacc for two sums and its CUDA part for a list of what meets what: both are written out here,
 the latter by the rules of its kernel (RasterizeToPixels3DGSFwd.cu of gsplat 1.5.3).
 
-    python -m tests.bench.peer_gsplat                compares, and prints the table of docs/reconstruction.md
+    python -m tests.bench.peer_gsplat                compares, and prints the table of docs/gpu.md
     python -m tests.bench.peer_gsplat <file.npz>     writes what gsplat says, for tests where it is not installed
 
 Needs gsplat 1.5.3: `pip install gsplat==1.5.3` (pure Python; nothing of it is compiled here).
