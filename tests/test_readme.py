@@ -173,12 +173,7 @@ def test_every_command_is_one_its_program_takes(
             assert door_main(arguments) == 0, capsys.readouterr().err
         case ["python", "-m", "factory.run", "--help"]:
             assert run_main(["--help"]) == 0
-        case [
-            "python",
-            "-m",
-            "factory.run" | "tests.bench.kill_resume" | "tests.bench.bench_pairs" | "tests.bench.bench_label_ends",
-            *arguments,
-        ]:
+        case ["python", "-m", "factory.run" | "tests.bench.bench_label_ends", *arguments]:
             load_config(given(arguments))
         case ["python", "-m", "tests.bench.bench_experts", *arguments]:
             most, words = most_candidates(given(arguments))
@@ -244,19 +239,8 @@ def test_every_command_is_one_its_program_takes(
             known = {field.name for field in fields(FitSettings)} | {"out", "validate", "threads", "first", "last"}
             known |= {"by"}
             assert set(pairs(given(arguments))) <= known
-        case ["python", "-m", "tests.bench.bench_colours", _, *arguments]:
-            known = {field.name for field in fields(FitSettings)} | {
-                "width",
-                "height",
-                "threads",
-                "hold_out",
-                "calibration",
-            }
-            assert set(pairs(given(arguments))) <= known
         case ["python", "-m", "tests.bench.bench_exploring", *arguments]:
             assert pairs(arguments).keys() == {"uniform", "targeted", "explored"}  # it reads what alternate left
-        case ["python", "-m", "tests.bench.bench_late", *arguments]:
-            assert set(pairs(given(arguments))) <= {"openscene", "front", "town", "corners"}
         case ["python", "-m", "tests.bench.bench_gate", *arguments]:
             assert set(pairs(arguments)) <= {"chosen", "held", "clips", "out", "drives", "every"}
         case ["python", "-m", "tests.bench.bench_town", *arguments]:

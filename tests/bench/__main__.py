@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from tests.bench import bench_labels, bench_render, bench_reward, bench_rollout, bench_rules, bench_stages
+from tests.bench import bench_labels, bench_render, bench_reward, bench_rollout
 
 SHARED = Path("../shared")
 
@@ -11,9 +11,6 @@ def main(shared: Path) -> None:
     """Prints the tables, without those whose data are not there."""
     logs = shared / "data/av2/sensor/val"
     bench_reward.main(shared)
-    if (shared / "reference").is_dir():
-        bench_rules.main(shared)
-    bench_stages.main(logs)
     if logs.is_dir():
         bench_rollout.main(logs)
         bench_labels.main(shared)

@@ -1,6 +1,6 @@
 """What it costs to keep a scene in 16 bits: file, time to read it, and pictures beside those of the scene in 32.
 
-Printed by the benches that fit a scene (`bench_town`, `bench_kitti`, `bench_colours`), on the photos held out.
+Printed by the benches that fit a scene (`bench_town`, `bench_kitti`), on the photos held out.
 """
 
 from collections.abc import Sequence
