@@ -8,7 +8,7 @@ and, of drives, bounds_held.csv, driving.csv, driving_differences.csv and arms.m
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
 
@@ -16,13 +16,12 @@ from factory.config.compose import compose, fill
 from planners.command import Stopped
 from planners.data.index import DataSettings, open_dataset
 from planners.study.arms import HeldAgainst, against_bounds, arms_of, differences_of, drive_arms, text_of, write_arms
-from planners.study.recipe import Recipe, make, planners
+from planners.study.recipe import Recipe, make
 from planners.study.setups import Comparison, Setup
 from planners.study.sweep import SweepSettings, run
 from planners.training.many import TRAININGS, Training
 
 BEGIN, TRAIN, HARD, REAL = "begin", "train", "hard", "real"  # runs that there must be; the arm that adds nothing
-TEACHER = "teacher"  # folder of the planner whose plans some arm's labels are
 
 
 @dataclass(frozen=True)
@@ -48,8 +47,6 @@ class ExperimentSettings(SweepSettings):
     common: dict[str, str]  # what several runs share
     one_cache: tuple[str, ...]  # runs that render from the same blocks
     vocabulary: str | None  # trajectories that samples are labelled with, made first; null: none
-    teacher: str | None  # settings of `python -m planners train`, for an expert of runs in `taught`; null: none
-    taught: tuple[str, ...]  # runs that need the teacher
     planners: dict[str, str]  # of conf/planner
     train: tuple[str, ...]  # further overrides of every `planners train`
     begin_steps: int  # that each planner is trained for in other towns first
@@ -64,21 +61,14 @@ class ExperimentSettings(SweepSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        missing = {
-            BEGIN,
-            TRAIN,
-            HARD,
-            *(run for arm in self.arms.values() for run in arm.run.split()),
-            *self.taught,
-        } - set(self.runs)
+        named = {BEGIN, TRAIN, HARD, *(run for arm in self.arms.values() for run in arm.run.split())}
+        missing = named - set(self.runs)
         if missing:
             raise ValueError(f"runs lacks {', '.join(sorted(missing))}")
         if unknown := {name for part in self.parts.values() for name in part} - {REAL, *self.arms}:
             raise ValueError(f"parts: {', '.join(sorted(unknown))} is no arm; arms are {REAL}, {', '.join(self.arms)}")
         if self.added == "more" and "more" not in self.arms:
             raise ValueError("added=more: there is no arm more")
-        if bool(self.taught) != bool(self.teacher):
-            raise ValueError("taught: runs that need the teacher, where there is one")
         for name in ("begin_steps", "steps", "rounds", "seeds"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}={getattr(self, name)}: must be at least 1")
@@ -103,15 +93,6 @@ class ExperimentSettings(SweepSettings):
             runs=self.runs,
             sweeps={},
         )
-
-
-def make_data(settings: ExperimentSettings) -> None:
-    """All runs, with the teacher before those that need it. Raises Stopped, Failed."""
-    recipe, taught = settings.recipe, {name: settings.runs[name] for name in settings.taught}
-    make(replace(recipe, runs={name: words for name, words in settings.runs.items() if name not in taught}))
-    if settings.teacher:
-        planners("train", *settings.teacher.split(), f"out={settings.table(TEACHER)}")
-        make(replace(settings.recipe, runs=taught))
 
 
 def setup(settings: ExperimentSettings, planner: str, data: str) -> Setup:
@@ -190,7 +171,7 @@ def experiment(name: str, argv: Sequence[str]) -> None:
     """Make, train, score, drive and report what is missing of conf/<name>.yaml. Raises ConfigError, Stopped, Failed."""
     settings = fill(ExperimentSettings, compose(name, argv, ExperimentSettings), name)
     if settings.left_s != 0.0:
-        make_data(settings)
+        make(settings.recipe)
     everyone, wanted = planned(settings, added(settings)), comparisons(settings)
     arms = [one for one in everyone if one.facts["data"] != BEGIN]
     try:

@@ -95,7 +95,6 @@ def test_every_arm_is_held_against_real_alone_and_the_expert_against_each_contro
         ("arms.logged.rounds=0", "of experts and of rounds"),
         ("+arms.logged.expert=[logged]", "arms.logged.expert"),
         ("+parts.other=[logged,recovery]", "recovery is no arm"),
-        ("taught=[more]", "taught"),
         ("added=others", "added"),
     ],
 )
