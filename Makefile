@@ -30,7 +30,7 @@ sys.exit(sys.version.split()[0] != sys.argv[1])
 endef
 export FITS IS_WHOLE
 
-.PHONY: install demo test unit lint format docs chaos mutants bench gpu-check study clean
+.PHONY: install demo test unit lint format docs chaos mutants bench gpu-check clean
 
 install: $(VENV)/.installed
 
@@ -110,12 +110,6 @@ $(VENV)/.gpu: $(VENV)/.installed
 
 gpu-check: $(VENV)/.gpu
 	$(PY) -m tests.bench.gpu_check $(ARGS)
-
-# The co-training study of docs/study.md: its data, then trainings, scores and tables. MINUTES=25: a part of either.
-# Both go on where they stopped. On real logs, without images: python -m planners study_logs shared=../shared
-study: install
-	$(PY) -m planners study_data $(if $(MINUTES),minutes=$(MINUTES))
-	$(PY) -m planners study $(if $(MINUTES),minutes=$(MINUTES))
 
 clean:
 	rm -rf $(VENV) runs build *.egg-info

@@ -14,6 +14,7 @@ from mkdocs.structure.files import File, Files
 from factory.commands.table import DOORS
 
 ROOT = Path(__file__).resolve().parents[1]
+FOLDERS = ("docs", "deploy", "experiments")  # of pages
 LINK = re.compile(r"\]\(([^)\s#]+)[^)]*\)")
 IN_PYTHON = (  # what others build on
     "tasks.trajectories",
@@ -30,7 +31,7 @@ IN_PYTHON = (  # what others build on
 
 def pages() -> list[Path]:
     """Every page of the repository."""
-    return sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "deploy").rglob("*.md")])
+    return sorted([*ROOT.glob("*.md"), *(page for folder in FOLDERS for page in (ROOT / folder).rglob("*.md"))])
 
 
 def commands_page() -> str:
@@ -64,10 +65,9 @@ def python_page() -> str:
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """The study's pages close the last section."""
-    studies = [*(ROOT / "docs").glob("study*.md"), *(ROOT / "docs/study").glob("*.md")]
+    """The experiments' pages close the last section."""
     (results,) = config.nav[-1].values()
-    results += sorted(str(path.relative_to(ROOT)) for path in studies if path.name != "tables.md")
+    results += sorted(str(path.relative_to(ROOT)) for path in (ROOT / "experiments").rglob("*.md"))
     return config
 
 

@@ -13,11 +13,7 @@ PAGES = sorted(
 )
 PROGRAMS = {"make", "python", ".venv/bin/python", "source", "ray", "torchrun"}
 PROGRAMS |= {"kubectl", "prometheus", "rsync", "export", "echo", "git", "pip", ".venv/bin/pip"}
-NO_COMMANDS = {  # pages with an unnamed block that is a drawing, or output alone
-    "docs/concepts.md",
-    "docs/study/details.md",
-    "docs/study/notes.md",
-}
+NO_COMMANDS = {"docs/concepts.md"}  # pages with an unnamed block that is a drawing, or output alone
 FENCED = re.compile(r"^```(\w*)\n(.*?)^```$", re.M | re.S)
 IN_PROSE = re.compile(r"`((?:python -m|make|ray job|torchrun) [^`]+)`")
 

@@ -12,10 +12,11 @@ SOURCES = sorted(
     for path in (ROOT / folder).rglob("*")
     if path.suffix in (".py", ".yaml", ".yml", ".sh") and path != Path(__file__).resolve()
 )
-PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "deploy").rglob("*.md")])
+FOLDERS = ("docs", "deploy", "experiments")
+PAGES = sorted([*ROOT.glob("*.md"), *(page for folder in FOLDERS for page in (ROOT / folder).rglob("*.md"))])
 WRITTEN_BY_A_RUN = {
-    "tables.md": "`python -m planners report` writes it beside its plots",
-    "arms.md": "`python -m planners sceptic` writes it beside its tables",
+    "tables.md": "`planners.study.report` writes it beside its CSVs",
+    "arms.md": "`planners.study.arms` writes it beside its CSVs",
 }
 
 CITED = re.compile(r"(?<![\w/<{])((?:[\w.-]+/)*[\w-]+\.md)\b")

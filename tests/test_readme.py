@@ -33,21 +33,13 @@ from factory.run import main as run_main
 from factory.stages.warm import PARTS
 from planners.__main__ import main as planners_main
 from planners.drive.settings import settings_of as drive_settings
-from planners.evaluation.analysis import AnalysisSettings
 from planners.evaluation.compare import CompareSettings
-from planners.evaluation.compare import main as compare_main
 from planners.evaluation.evaluate import settings_of as evaluate_settings
 from planners.evaluation.replay import settings_of as replay_settings
 from planners.explore.alternate import AlternateSettings
 from planners.explore.settings import settings_of as explore_settings
 from planners.models.registry import settings_of
 from planners.published.import_planner import config_of as import_config
-from planners.study.agreement import main as agreement_main
-from planners.study.experiment import ExperimentSettings
-from planners.study.recipe import Recipe
-from planners.study.report import ReportRequest
-from planners.study.scaling import ScalingSettings
-from planners.study.study import StudySettings
 from planners.traffic.train_traffic import settings_of as traffic_settings
 from planners.training.train import TrainConfig
 from tasks.caches import user_cache
@@ -62,7 +54,6 @@ IN_PROSE = list(dict.fromkeys(command for page in PAGES for command in named_in_
 PYTHON_BLOCKS = blocks("README.md", "python")
 RUN_ELSEWHERE = {
     "docs/queries.md": "tests/test_queries.py runs them",
-    "docs/study/notes.md": "needs the evaluations of a whole study; compiled only",
 }
 LEFT_OUT = {  # program, and why its commands are not read here; the files that they name have to be there
     "kubectl": "needs a cluster; tests/deploy holds its files against their schemas",
@@ -194,21 +185,8 @@ def test_every_command_is_one_its_program_takes(
             settings_of(import_config(given(arguments)).planner)
         case ["python", "-m", "planners", "evaluate" | "ensemble", *arguments]:
             evaluate_settings([argument for argument in arguments if not argument.startswith("models=")])
-        case ["python", "-m", "planners", "compare", *arguments] if any(
-            word.startswith("table=") for word in arguments
-        ):
-            monkeypatch.chdir(REPOSITORY)  # the study's tables lie there
-            assert compare_main(arguments) == 0, capsys.readouterr().err
         case ["python", "-m", "planners", "compare", *arguments]:
             fill(CompareSettings, compose("compare", arguments), "compare")
-        case ["python", "-m", "planners", "agreement", *arguments]:
-            monkeypatch.chdir(REPOSITORY)
-            kept = [word for word in arguments if not word.startswith("out=")]
-            assert agreement_main([*kept, f"out={demo_home / 'agreement.png'}"]) == 0, capsys.readouterr().err
-        case ["python", "-m", "planners", "scaling", *arguments]:
-            fill(ScalingSettings, compose("scaling", arguments), "scaling")
-        case ["python", "-m", "planners", "study_data" | "study_logs" as name, *arguments]:
-            fill(Recipe, compose(name, arguments), name)
         case ["python", "-m", "planners", "replay", *arguments]:
             replay_settings(arguments)
         case ["python", "-m", "planners", "drive", *arguments] | ["python", "-m", "planners.drive", *arguments]:
@@ -217,14 +195,6 @@ def test_every_command_is_one_its_program_takes(
             explore_settings(arguments)
         case ["python", "-m", "planners", "alternate", *arguments]:
             fill(AlternateSettings, compose("alternate", arguments, AlternateSettings), "alternate")
-        case ["python", "-m", "planners", "study", *arguments]:
-            fill(StudySettings, compose("study", arguments), "study")
-        case ["python", "-m", "planners", "sceptic" | "labels" as name, *arguments]:
-            fill(ExperimentSettings, compose(name, arguments, ExperimentSettings), name)
-        case ["python", "-m", "planners", "report", *arguments]:
-            parse(ReportRequest, arguments)
-        case ["python", "-m", "planners", "analysis", *arguments]:
-            parse(AnalysisSettings, arguments)
         case ["python", "-m", "tests.bench.bench_rig" | "tests.bench.bench_front", _, *arguments]:
             known = {field.name for field in fields(FitSettings)} | {
                 "out",

@@ -77,7 +77,6 @@ PLANNERS: Mapping[str, Command] = {
     "train_traffic": Command("fit a traffic policy to logs, for traffic=learned", "planners.traffic.train_traffic"),
     "evaluate": Command("EPDMS of planners on held-out clips", "planners.evaluation.evaluate"),
     "compare": Command("how two planners differ, with intervals", "planners.evaluation.compare"),
-    "scaling": Command("how scores grow with simulated data, by which law", "planners.study.scaling"),
     "serve": Command("plans for NAVSIM's own evaluation, whose agent asks", "planners.navsim.serve"),
     "submit": Command("plans of a NAVSIM split as its leaderboard takes them", "planners.navsim.submit"),
     "drive": Command("planners in closed loop, until something ends the drive", "planners.drive.drive"),
@@ -85,14 +84,6 @@ PLANNERS: Mapping[str, Command] = {
     "alternate": Command("data, training, exploring, in turns", "planners.explore.alternate"),
     "replay": Command("a planner on one clip as a film", "planners.evaluation.replay"),
     "ensemble": Command("several GTRS-Dense models as one", "planners.evaluation.ensemble"),
-    "analysis": Command("EPDMS on real and simulated frames, by tag", "planners.evaluation.analysis"),
-    "study": Command("whether simulated data helps: all of docs/study.md", "planners.study.study"),
-    "study_data": Command("the study's data, by runs of the factory", "planners.study.recipe", "data"),
-    "study_logs": Command("the study's part on real logs", "planners.study.recipe", "logs"),
-    "sceptic": Command("simulated samples beside other additions, scored by driving", "planners.study.sceptic"),
-    "labels": Command("which expert's labels teach a planner most", "planners.study.labels"),
-    "report": Command("a study's tables and pictures from its frames", "planners.study.report"),
-    "agreement": Command("whether a study made again says the same", "planners.study.agreement"),
 }
 DOORS = {"factory": COMMANDS, "planners": PLANNERS}  # package -> what `python -m <package>` knows
 

@@ -2,14 +2,12 @@
 
     python -m planners compare a=eval/ltf_real b=eval/ltf_sim
     python -m planners compare a=[eval/real_0,eval/real_1] b=[eval/sim_0,eval/sim_1] out=difference.csv
-    python -m planners compare table=docs/study/clips.csv a=gtrs_dense-real-steps-0 b=gtrs_dense-pdm_closed5-epochs-0
-
     python -m planners compare a=ltf_sim_navhard.csv.gz b=evaluations/ltf
 
-A run is a folder that `python -m planners evaluate` made of one planner, a column of a study's clips.csv, or a table
-that NAVSIM's own scripts wrote (`.csv`, `.csv.gz`), against which a folder stands with the tables that it has. Several
-runs of a side are trainings of one planner with other seeds: clips and seeds are both drawn, pairs of seeds where both
-sides have equally many. Intervals over logs and over towns, where they are known, take all clips of one together
+A run is a folder that `python -m planners evaluate` made of one planner, or a table that NAVSIM's own scripts wrote
+(`.csv`, `.csv.gz`), against which a folder stands with the tables that it has. Several runs of a side are trainings of
+one planner with other seeds: clips and seeds are both drawn, pairs of seeds where both sides have equally many.
+Intervals over logs and over towns, where they are known, take all clips of one together
 (planners/evaluation/bootstrap.py): clips of one log share their scene, and an interval over clips alone is too narrow.
 """
 
@@ -23,9 +21,8 @@ import numpy as np
 
 from factory.config.compose import ConfigError, compose, fill
 from planners.command import command
-from planners.evaluation.aggregation import ClipResult, by_clip
+from planners.evaluation.aggregation import ClipResult, Measured, by_clip, check_same_clips, measured
 from planners.evaluation.bootstrap import LEVELS, Interval, clusters_of, paired_interval
-from planners.evaluation.clip_scores import Measured, check_same_clips, measured, read_clips
 from planners.evaluation.public import held
 from planners.evaluation.score_rows import read_record, read_rows
 from planners.evaluation.score_table import FILTERS_NOTE
@@ -38,7 +35,6 @@ class CompareSettings:
 
     a: str | list[str]  # folder of an evaluated planner, table of NAVSIM's, or a list of them
     b: str | list[str]
-    table: str | None = None  # clips.csv of a study, of which a and b are columns
     column: str = "score"  # or a sub-score: nc dac tlc ddc ep ttc lk hc ec
     confidence: float = 0.95
     draws: int = 10_000
@@ -180,14 +176,8 @@ def main(argv: Sequence[str]) -> None:
     settings = fill(CompareSettings, compose("compare", argv, CompareSettings), "compare")
     if settings.column not in COLUMNS:
         raise ConfigError(f"compare.column={settings.column}: one of {', '.join(COLUMNS)}")
-    of_tables = False
     sides = [[side] if isinstance(side, str) else side for side in (settings.a, settings.b)]
-    if settings.table is not None:
-        if settings.column != "score":
-            raise ConfigError(f"compare.column={settings.column}: {settings.table} holds scores alone")
-        of_a, of_b = (read_clips(Path(settings.table), side) for side in sides)
-        found = intervals(of_a, of_b, settings)
-    elif of_tables := any(map(held.is_table, [*sides[0], *sides[1]])):
+    if of_tables := any(map(held.is_table, [*sides[0], *sides[1]])):
         found = compare_tables(sides[0], sides[1], settings)
     else:
         a, b = (read_runs(side) for side in sides)

@@ -1,1 +1,1 @@
-"""Many trainings and what they say together: sweeps, the study, its tables and pictures."""
+"""Many trainings and what they say together: sweeps, their tables, and arms that are held against each other."""

@@ -19,8 +19,7 @@ from planners.drive.summary import M_PER_KM, SHARES, highest_level, start_of
 from planners.evaluation.aggregation import BOUNDS, name_of, scores_of_clips, write_csv
 from planners.evaluation.bootstrap import Interval, paired_interval
 from planners.evaluation.compare import CompareSettings, compare, row_of
-from planners.evaluation.frames_file import FRAMES
-from planners.study.report import read_study
+from planners.study.report import FRAMES, read_study
 from planners.study.setups import Setup
 from planners.training.many import Means, Training
 from tasks.world.arrays import Array

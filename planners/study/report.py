@@ -1,32 +1,32 @@
-"""`python -m planners report folder=docs/study/published`: all tables and pictures again, from per-frame rows alone.
+"""What was compared, frame by frame, in one file, and the tables that are made of it alone.
 
-    python -m planners report folder=docs/study/published                            as the paper's tables
-    python -m planners report folder=docs/study/published human_filter=filtered out=/tmp/today
-    python -m planners report folder=docs/study/logs/nuscenes/stage_two              of `python -m planners scaling`
+frames.parquet has a row for each frame and planner: EPDMS (float32), where the frame starts and where the plan from a
+logged frame ends, which is what follow-ups are weighted by. Frames are the same for all planners, so that their columns
+take next to nothing. What was trained and what is held against what stands in the file's metadata.
 
-`folder` holds the frames.parquet that the study or a scaling sweep wrote; nothing else is read, nothing is trained or
-planned. `comparisons.csv` (means over seeds, differences with intervals over clips, logs and towns), `trainings.csv`
-(each training), `clips.csv` (its score on each clip), `bounds.csv`, `tables.md` (to be read), `differences.png`, and
-where there are rounds enough `curves.csv` and pictures of it. Only the learning curves need the trainings' own folders.
+`write_tables` makes of it comparisons.csv (means over seeds, differences with intervals over clips, logs and towns),
+trainings.csv (each training), bounds.csv and tables.md, to be read.
 """
 
-from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from textwrap import wrap
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 
-from factory.config.arguments import parse
-from planners.command import command
 from planners.evaluation.aggregation import (
     BOUNDS,
     MEASURES,
-    PAPER,
+    ClipResult,
     HumanFilter,
+    by_clip,
     name_of,
     scores_of_clips,
     shown,
@@ -34,18 +34,29 @@ from planners.evaluation.aggregation import (
     words_of_stage,
     write_csv,
 )
-from planners.evaluation.clip_scores import write_clips
+from planners.evaluation.benchmark_folder import logs_of
 from planners.evaluation.compare import CompareSettings, compare, is_clear_row, row_of
-from planners.evaluation.frames_file import FRAMES, Clips, read_frames, write_frames
-from planners.evaluation.scaling_law import FEWEST, fit_scaling
-from planners.evaluation.score_rows import FrameRow
+from planners.evaluation.frames import FrameKey
+from planners.evaluation.score_rows import FrameRow, read_rows
 from planners.evaluation.score_table import FILTERS_NOTE
-from planners.study.figures import Curve, draw_curves, draw_differences
-from planners.study.setups import SWEEP, Comparison, Setup, words_of
+from planners.study.setups import Comparison, Setup, words_of
+from tasks.reward.one_stage import COLUMNS, FrameScores
 
-CURVES = {"final": "scaling.png", "stage_two": "scaling_stage_two.png"}
+FRAMES = "frames.parquet"
+META = b"study"
+SCORE = COLUMNS.index("score")
+NAMES = ("training", "stage", "log_id", "clip_id", "kind")
+SCHEMA = pa.schema(
+    [
+        *((name, pa.string()) for name in NAMES),
+        ("candidate_index", pa.int32()),
+        ("score", pa.float32()),  # EPDMS, 0 .. 1
+        ("score_filtered", pa.float32()),  # null: the same
+        *((name, pa.float64()) for name in ("start_x", "start_y")),  # rear axle of the frame, world [m]
+        *((name, pa.float64()) for name in ("end_x", "end_y")),  # of the plan, world [m]; null for follow-ups
+    ]
+)
 RULES = CompareSettings(a="", b="")  # draws, confidence and seed as `python -m planners compare` has them
-CURVED = ("rounds", SWEEP)  # the parts that are scores over data
 INTERVALS = (
     "In brackets: the difference from what the setup is held against, its 95 % interval over clips (paired bootstrap, "
     "with seeds) and, of stage two and the final score, over logs and towns (Student's t over these, or the bootstrap "
@@ -54,20 +65,7 @@ INTERVALS = (
 CLAIMED = ("stage_two", "final")  # the stages whose intervals over logs and towns are shown too
 
 Row = dict[str, Any]  # of comparisons.csv
-Scores = Mapping[str, Mapping[str, float]]  # by label
-
-
-@dataclass(frozen=True)
-class ReportRequest:
-    """The command's keys."""
-
-    folder: str
-    out: str | None = None  # None: the folder
-    human_filter: HumanFilter = PAPER  # of tables.md and the pictures; the CSVs hold both
-
-    def __post_init__(self) -> None:
-        if self.human_filter not in ("unfiltered", "filtered"):
-            raise ValueError(f"human_filter={self.human_filter}: unfiltered or filtered")
+Clips = Mapping[str, Sequence[ClipResult]]  # by label of the planner; scores alone, no sub-scores
 
 
 @dataclass(frozen=True)
@@ -79,6 +77,13 @@ class StudyFrames:
     clips: Clips  # also of ensembles and bounds
 
 
+def rows_of(labels: Iterable[str], evaluations: Path, benchmark: str) -> Iterator[tuple[str, list[FrameRow]]]:
+    """The scored frames of each evaluated planner, with the logs of their clips as the benchmark has them."""
+    logs = logs_of(benchmark)
+    for label in labels:
+        yield label, [replace(row, log_id=logs[row.key.clip_id]) for row in read_rows(evaluations / label)]
+
+
 def write_study(
     path: Path,
     rows: Iterator[tuple[str, Sequence[FrameRow]]],
@@ -87,12 +92,32 @@ def write_study(
 ) -> None:
     """Write a StudyFrames of the rows of each planner, by its label. Whole or not at all."""
     meta = {"trainings": [dict(one) for one in trainings], "comparisons": [asdict(one) for one in comparisons]}
-    write_frames(path, rows, meta)
+    schema = SCHEMA.with_metadata({META: json.dumps(meta).encode()})
+    table = pa.concat_tables(_table(label, of_one) for label, of_one in rows).cast(schema)
+    unfinished = path.with_name(f".{path.name}.unfinished")
+    pq.write_table(
+        table,
+        unfinished,
+        compression="zstd",
+        compression_level=9,
+        use_dictionary=[*NAMES, "candidate_index", "start_x", "start_y"],
+        write_statistics=False,
+    )
+    unfinished.replace(path)
 
 
 def read_study(path: Path) -> StudyFrames:
     """What `write_study` wrote. Raises FileNotFoundError, or ValueError for a file that is none."""
-    meta, clips = read_frames(path)
+    table = pq.read_table(path)
+    kept = (table.schema.metadata or {}).get(META)
+    if kept is None or table.column_names != SCHEMA.names:
+        raise ValueError(f"{path}: no rows of a study: it must have the columns {', '.join(SCHEMA.names)}")
+    columns = (table[name].to_numpy(zero_copy_only=False) for name in SCHEMA.names)
+    clips = {
+        str(label): by_clip([_row(*values) for _, *values in rows])
+        for label, rows in groupby(zip(*columns), key=itemgetter(0))
+    }
+    meta = json.loads(kept)
     return StudyFrames(tuple(meta["trainings"]), tuple(map(_comparison, meta["comparisons"])), clips)
 
 
@@ -101,30 +126,48 @@ def _comparison(told: Mapping[str, Any]) -> Comparison:
     return Comparison(**{**told, **setups})
 
 
-def write_tables(folder: Path, out: Path, human_filter: HumanFilter) -> str:
-    """The files of this module's docstring, of `folder`; returns the two-stage scores, to be printed."""
-    frames, measures = read_study(folder / FRAMES), shown(human_filter)
+def _table(label: str, rows: Sequence[FrameRow]) -> pa.Table:
+    ordered = sorted(rows, key=lambda row: (row.key.clip_id, row.stage, row.key.candidate_index, row.key.kind))
+    return pa.Table.from_pylist([_flat(label, row) for row in ordered], SCHEMA)
+
+
+def _flat(label: str, row: FrameRow) -> dict[str, Any]:
+    score, filtered = (np.float32(values[SCORE]) for values in (row.scores.unfiltered, row.scores.filtered))
+    same = score == filtered or np.isnan(filtered)
+    ends = (None, None) if row.stage == "stage_two" else row.end
+    facts = (row.log_id, row.key.clip_id, row.key.kind, row.key.candidate_index)
+    return dict(
+        zip(SCHEMA.names, (label, row.stage, *facts, score, None if same else filtered, *row.start[:2], *ends[:2]))
+    )
+
+
+def _row(
+    stage: Any, log_id: str, clip_id: str, kind: str, candidate: int, score: float, filtered: float, *places: float
+) -> FrameRow:
+    """As it was scored, with NaN for what the file does not hold."""
+    scores = np.full((2, len(COLUMNS)), np.nan)
+    scores[:, SCORE] = score, score if np.isnan(filtered) else filtered
+    start, end = (np.array([*places[i : i + 2], np.nan]) for i in (0, 2))
+    key = FrameKey(clip_id, kind, int(candidate))
+    return FrameRow(stage, key, FrameScores(*scores), np.nan, start, end, log_id=log_id)
+
+
+def write_tables(frames: Path, out: Path, human_filter: HumanFilter) -> str:
+    """The tables of a file of `write_study`, into `out`; returns the two-stage scores, to be printed.
+
+    human_filter: of tables.md; the CSVs hold both.
+    """
+    study = read_study(frames)
     out.mkdir(parents=True, exist_ok=True)
-    scores = {label: scores_of_clips(clips) for label, clips in frames.clips.items()}
-    trainings = [{**facts, **scores[facts["training"]]} for facts in frames.trainings]
+    scores = {label: scores_of_clips(clips) for label, clips in study.clips.items()}
     bounds = [{"planner": name, **scores[name]} for name in BOUNDS if name in scores]
-    rows = compared(frames)
+    rows = compared(study)
     write_csv(out / "comparisons.csv", rows)
     if bounds:
         write_csv(out / "bounds.csv", bounds)
-    write_csv(out / "trainings.csv", trainings)
-    write_clips(out / "clips.csv", {label: clips for label, clips in frames.clips.items() if label not in BOUNDS})
+    write_csv(out / "trainings.csv", [{**facts, **scores[facts["training"]]} for facts in study.trainings])
     (out / "tables.md").write_text(markdown_of(rows, human_filter), encoding="utf-8")
-    drawn = [row for row in rows if row["reference"] and row["human_filter"] == measures[row["stage"]]]
-    if drawn:
-        draw_differences(drawn, out / "differences.png")
-    curves = {stage: curves_of(frames, scores, name_of(stage, measures[stage])) for stage in CURVES}
-    if any(one.law for one in curves["final"]):
-        heads = {stage: {"stage": stage, "human_filter": measures[stage]} for stage in curves}
-        write_csv(out / "curves.csv", [heads[stage] | one.row() for stage, found in curves.items() for one in found])
-        for stage, name in CURVES.items():
-            draw_curves(curves[stage], title_of(stage, measures[stage]), out / name)
-    return "\n".join([text_of(rows, bounds, measures["final"]), f"tables and pictures: {out}"])
+    return "\n".join([text_of(rows, bounds, shown(human_filter)["final"]), f"tables: {out}"])
 
 
 def compared(frames: StudyFrames) -> list[Row]:
@@ -141,31 +184,6 @@ def compared(frames: StudyFrames) -> list[Row]:
             row["reference"] = one.reference.label if one.reference else ""
             rows.append(row | row_of(intervals.get((stage, human_filter))))
     return rows
-
-
-def curves_of(frames: StudyFrames, scores: Scores, score: str) -> list[Curve]:
-    """Scores over the number of samples: a curve for each planner and kind of data, real samples alone in each."""
-    samples = {facts["training"]: facts["real"] + facts["simulated"] for facts in frames.trainings}
-    curves = []
-    for (planner, name), labels in _series(frames).items():
-        sizes, values = tuple(samples[label] for label in labels), tuple(scores[label][score] for label in labels)
-        law = fit_scaling(sizes, values) if len(set(sizes)) >= FEWEST else None
-        curves.append(Curve(planner, name, sizes, values, law))
-    return curves
-
-
-def _series(frames: StudyFrames) -> Mapping[tuple[str, str], list[str]]:
-    """(panel, curve) -> trainings, of the parts that are CURVED."""
-    found = defaultdict[tuple[str, str], dict[str, None]](dict)
-    of_setup = defaultdict[str, list[str]](list)
-    for facts in frames.trainings:
-        of_setup[facts["training"].rpartition("-")[0]].append(facts["training"])
-    for one in frames.comparisons:
-        if one.part in CURVED and one.setup.rounds:
-            labels = [label for setup in reversed(one.setups) for label in of_setup[setup.label]]
-            curve = f"{one.setup.planner}, equal {one.budget}", words_of(one.facts, counted=False)
-            found[curve] |= dict.fromkeys(labels)
-    return {name: list(labels) for name, labels in found.items()}
 
 
 def markdown_of(rows: Sequence[Row], human_filter: HumanFilter) -> str:
@@ -225,10 +243,3 @@ def text_of(found: Sequence[Row], bounds: Sequence[Row], human_filter: str) -> s
         score = bound[name_of("final", human_filter)]
         lines.append(f"{bound['planner']:<73}" + (f"{score:8.2f}" if np.isfinite(score) else "       -"))
     return "\n".join(lines)
-
-
-@command
-def main(argv: Sequence[str]) -> None:
-    """The command."""
-    request = parse(ReportRequest, argv)
-    print(write_tables(Path(request.folder), Path(request.out or request.folder), request.human_filter))

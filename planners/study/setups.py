@@ -9,7 +9,6 @@ Budget = Literal["epochs", "steps"]
 Imitation = Literal["all", "real", "none"]
 ALL_EXPERTS = "all"
 ALONE = {"begin": "other towns", "more": "real, and more real"}  # data without simulated samples, in words
-SWEEP = "sweep"  # the one part of `python -m planners scaling`
 
 
 @dataclass(frozen=True)

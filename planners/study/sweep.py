@@ -1,4 +1,4 @@
-"""Many trainings and their evaluation on one benchmark, by a few processes, and the report on what is done of it.
+"""Many trainings and their evaluation on one benchmark, by a few processes, and the tables of what is done.
 
 Resumable: what is trained or evaluated already is not again.
 """
@@ -16,13 +16,11 @@ from typing import Any
 from factory.graph.progress import Counter
 from planners.command import Failed, Stopped
 from planners.evaluation.aggregation import BOUNDS, PAPER, HumanFilter
-from planners.evaluation.frames_file import FRAMES, rows_of
 from planners.evaluation.planner_names import planner_of
 from planners.evaluation.score_rows import RECORD
 from planners.evaluation.score_rows import is_done as evaluation_is_done
 from planners.evaluation.score_rows import read_record as read_evaluation
-from planners.study.figures import draw_learning
-from planners.study.report import write_study, write_tables
+from planners.study.report import FRAMES, rows_of, write_study, write_tables
 from planners.study.setups import Comparison, so_far
 from planners.training.checkpoint import read_record
 from planners.training.many import ONE_THREAD, Means, Training, folder_of, is_done, stops_after, train_all
@@ -34,12 +32,12 @@ EVALUATED_TOGETHER = 24  # planners in one process at the most
 
 @dataclass(frozen=True, kw_only=True)
 class SweepSettings(Means):
-    """The keys that study and scaling share."""
+    """What every sweep is told."""
 
     benchmark: str  # the folder that factory.run preset=hard_benchmark made of held-out clips
     out: str  # the same command on the same folder goes on
-    report: str | None = None  # folder of the tables and pictures; null: out
-    human_filter: HumanFilter = PAPER  # of tables.md and the pictures, the paper's or today's; CSVs hold both
+    report: str | None = None  # folder of the tables; null: out
+    human_filter: HumanFilter = PAPER  # of tables.md, the paper's or today's; CSVs hold both
     evaluate: tuple[str, ...] = ()  # further overrides of `planners evaluate`
 
 
@@ -74,7 +72,7 @@ def evaluated(planned: Sequence[Training], out: Path) -> set[str]:
 
 
 def write_report(standing: Sequence[Comparison], trained: Sequence[Training], settings: SweepSettings) -> None:
-    """The per-frame rows of what is evaluated, and the tables and pictures, which are made of them alone."""
+    """The per-frame rows of what is evaluated, and the tables, which are made of them alone."""
     out, report = Path(settings.out), Path(settings.report or settings.out)
     report.mkdir(parents=True, exist_ok=True)
     compared = [one.setup.label_of(seed) for one in standing for seed in range(one.seeds)]
@@ -82,10 +80,7 @@ def write_report(standing: Sequence[Comparison], trained: Sequence[Training], se
     labels = dict.fromkeys([*(training.label for training in trained), *compared, *bounds])
     facts = [facts_of(training, out) for training in trained]
     write_study(report / FRAMES, rows_of(labels, out / EVALUATIONS, settings.benchmark), facts, standing)
-    first = min(training.facts["seed"] for training in trained)
-    drawn = {one.label: folder_of(out, one) for one in trained if one.facts["seed"] == first}
-    draw_learning(drawn, report / "learning.png")
-    print(write_tables(report, report, settings.human_filter))
+    print(write_tables(report / FRAMES, report, settings.human_filter))
 
 
 def facts_of(training: Training, out: Path) -> Mapping[str, Any]:

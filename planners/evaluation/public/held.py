@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from factory.config.compose import ConfigError
-from planners.evaluation.aggregation import HumanFilter
+from planners.evaluation.aggregation import HumanFilter, Measured
 from planners.evaluation.bootstrap import Interval
-from planners.evaluation.clip_scores import Measured
 from planners.evaluation.public.tables import FILTERS, PublicTable, file_name, read_table
 from tasks.reward.one_stage import COLUMNS
 from tasks.world.arrays import Array

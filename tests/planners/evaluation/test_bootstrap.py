@@ -1,22 +1,16 @@
 """Intervals with closed forms, over clips and seeds; two runs compared through their rows."""
 
-import csv
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from planners.evaluation.aggregation import ClipResult, by_clip, lines_of, score_of, summarise
+from planners.evaluation.aggregation import ClipResult, by_clip, lines_of, measured, score_of, summarise
 from planners.evaluation.bootstrap import paired_interval
-from planners.evaluation.clip_scores import measured
 from planners.evaluation.compare import CompareSettings, compare, is_clear, is_clear_row, row_of, text_of
 from planners.evaluation.score_rows import FrameRow
 from tests.planners.made_rows import clip_rows
 
-STUDY = Path(__file__).parents[3] / "docs" / "study"
 SETTINGS = CompareSettings(a="", b="", draws=500)
 
 
@@ -110,36 +104,6 @@ def test_an_interval_of_shares_does_not_leave_them() -> None:
     found = paired_interval(np.zeros_like(b), b, clusters=range(8), draws=500)
     assert (found.low, found.high) == (0.0, pytest.approx(0.125 * (1.0 + 2.364624)))
     assert paired_interval(np.zeros_like(b), 1.0 - b, clusters=range(8), draws=500).high == 1.0
-
-
-def test_the_studys_intervals_over_six_towns_are_students() -> None:
-    """The rows that docs/study.md takes from them, worked out beside this code."""
-    with (STUDY / "published" / "comparisons.csv").open(newline="") as file:
-        main = [row for row in csv.DictReader(file) if row["part"] == "main"]
-    rows = {(row["setup"], row["reference"], row["stage"], row["human_filter"]): row for row in main}
-    for planner, stage, human_filter, low, high in (
-        ("ltf", "stage_two", "none", -0.87, 19.80),
-        ("gtrs_dense", "final", "unfiltered", -1.00, 13.70),
-        ("gtrs_dense", "stage_two", "none", 1.41, 16.90),
-    ):
-        row = rows[f"{planner}-pdm_closed5-epochs", f"{planner}-real-steps", stage, human_filter]
-        assert (float(row["low_town"]), float(row["high_town"])) == pytest.approx((low, high), abs=0.006)
-
-
-def test_the_command_tells_no_difference_over_six_towns_from_a_bootstrap_that_is_too_narrow() -> None:
-    """docs/study.md's headline: stage two +6.8, -0.2 .. +13.9 over towns, where a bootstrap says +1.6 .. +13.1."""
-    runs = {
-        side: ",".join(
-            f"{planner}-{data}-{seed}" for planner in ("ltf", "diffusiondrive", "gtrs_dense") for seed in "012"
-        )
-        for side, data in (("a", "real-steps"), ("b", "pdm_closed5-epochs"))
-    }
-    named = [f"table={STUDY / 'published' / 'clips.csv'}", *(f"{side}=[{names}]" for side, names in runs.items())]
-    told = subprocess.run(
-        [sys.executable, "-m", "planners", "compare", *named, "draws=500"], capture_output=True, text=True, check=True
-    ).stdout
-    (line,) = (line for line in told.splitlines() if line.split()[:2] == ["stage_two", "none"])
-    assert "+0.0684" in line and "-0.0017 .. +0.1386" in line and not line.endswith("*")
 
 
 def test_of_one_cluster_there_is_no_interval() -> None:

@@ -1,83 +1,99 @@
-"""Sweeps: every combination once, its curves, and who evaluates what."""
+"""What a sweep reports on: all that is trained and evaluated as it is now, whatever was interrupted."""
 
-from typing import Any
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
+import torch
 
-from planners.study.figures import Curve
-from planners.study.report import StudyFrames, curves_of
-from planners.study.scaling import ScalingSettings, SweepData, comparisons_of, trainings_of
-from planners.study.sweep import EVALUATED_TOGETHER, shares_of
-from planners.training.many import Training
-
-
-def scaling(**changes: Any) -> ScalingSettings:
-    axes: dict[str, Any] = {
-        "planners": ("ltf",),
-        "experts": ("recovery", "pdm_closed"),
-        "rounds": (0, 1, 2, 3),
-        "sim_ratios": ("natural",),
-        "imitation": ("all",),
-        "real_shares": (1.0,),
-        "seeds": 2,
-    }
-    data = SweepData(("real",), ("sim",))
-    return ScalingSettings(data=data, benchmark="bench", out="out", **{**axes, **changes})
+from planners.command import Stopped
+from planners.evaluation.aggregation import scores_of
+from planners.evaluation.evaluate import EvaluateSettings, evaluate
+from planners.evaluation.planner_names import planner_of
+from planners.study import sweep as sweep_module
+from planners.study.setups import Comparison, Setup
+from planners.study.sweep import EVALUATIONS, SweepSettings, evaluated, run
+from planners.training.checkpoint import save_checkpoint
+from planners.training.many import DONE, Training, folder_of
+from tests.planners.evaluation.test_evaluate import settings
+from tests.planners.small_benchmark import StreetBenchmark, write_benchmark_folder
+from tests.planners.toy import Toy, ToySettings
 
 
-def test_every_combination_is_trained_once_and_real_samples_alone_not_once_an_expert() -> None:
-    trainings = trainings_of(scaling())
-    assert len(trainings) == len({t.label for t in trainings}) == 2 * (1 + 2 * 3)
-    alone = [t for t in trainings if t.facts["rounds"] == 0]
-    assert [t.facts["seed"] for t in alone] == [0, 1]
-    assert all("data.sim=[]" in t.overrides for t in alone)
-    third = next(t for t in trainings if t.facts["rounds"] == 3 and t.facts["data"] == "recovery")
-    assert {"data.max_round=2", "data.experts=[recovery]", "data.sim=[sim]"} <= set(third.overrides)
+def train(out: Path, training: Training, weight: float = 0.0, step: int = 1) -> None:
+    toy = Toy(ToySettings(), {})
+    for parameter in toy.parameters():
+        torch.nn.init.constant_(parameter, weight)
+    record = {"parameters": 2, "trained": {"steps": step}, "samples": {"real": 3, "simulated": 4}}
+    save_checkpoint(folder_of(out, training), step, toy, record, {})
+    (folder_of(out, training) / DONE).write_text(json.dumps(list(training.overrides)))
 
 
-def test_all_experts_together_are_one_axis_value() -> None:
-    (one,) = trainings_of(scaling(experts=("all",), rounds=(1,), seeds=1))
-    assert not any(o.startswith("data.experts") for o in one.overrides)
+def score(out: Path, rules: EvaluateSettings, *trainings: Training) -> None:
+    trained = [planner_of(str(folder_of(out, one)), one.label) for one in trainings]
+    evaluate(StreetBenchmark(), [planner_of("constant_velocity"), *trained], rules)
 
 
-def drawn(settings: ScalingSettings) -> list[Curve]:
-    facts = [
-        {"training": one.label, **one.facts, "real": 100, "simulated": 50 * one.facts["rounds"]}
-        for one in trainings_of(settings)
-    ]
-    scores = {one["training"]: {"final_unfiltered": 30.0 + one["rounds"]} for one in facts}
-    return curves_of(StudyFrames(tuple(facts), tuple(comparisons_of(settings)), {}), scores, "final_unfiltered")
+def test_what_is_evaluated_is_reported_and_what_changed_since_is_not(tmp_path: Path) -> None:
+    rules = settings(tmp_path / EVALUATIONS)
+    a, b, c = (Training(label, (f"seed={label}",)) for label in "abc")
+    planned = [a, b, c, Training("ab", members=("a", "b"))]
+    assert evaluated(planned, tmp_path) == set()
+    train(tmp_path, a)
+    assert evaluated(planned, tmp_path) == set(), "nothing is evaluated yet"
+    score(tmp_path, rules, a)
+    assert evaluated(planned, tmp_path) == {"a"}
+    train(tmp_path, c)
+    score(tmp_path, rules, c)
+    assert evaluated(planned, tmp_path) == {"a", "c"}, "a part behind one that is not done counts"
+
+    other_overrides = [replace(a, overrides=("seed=9",)), *planned[1:]]
+    assert evaluated(other_overrides, tmp_path) == {"c"}
+    train(tmp_path, a, weight=0.1, step=2)
+    assert evaluated(planned, tmp_path) == {"c"}, "it was trained again since"
+    score(tmp_path, rules, a)
+    assert evaluated(planned, tmp_path) == {"a", "c"}
+    score(tmp_path, replace(rules, one_stage_traffic=rules.two_stage_traffic), c)
+    assert evaluated(planned, tmp_path) == {"c"}, "the other was evaluated by other rules"
 
 
-def test_curves_hold_their_own_points_and_real_samples_alone() -> None:
-    recovery, pdm = drawn(scaling())
-    assert (recovery.label, pdm.label) == ("recovery", "pdm_closed")
-    for curve in (recovery, pdm):
-        assert sorted(curve.samples) == [100, 100, 150, 150, 200, 200, 250, 250]
-        assert curve.law is not None
-    (few,) = drawn(scaling(experts=("recovery",), rounds=(0, 1, 2)))
-    assert few.law is None and few.row()["a"] == ""
+def test_a_sweep_stops_where_something_is_missing_and_is_reported_when_all_is_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    benchmark = write_benchmark_folder(tmp_path / "benchmark")
+    sweep = SweepSettings(benchmark=str(benchmark), out=str(tmp_path), report=str(tmp_path / "report"))
+    setups = [Setup("ltf", data, rounds, "steps") for data, rounds in (("real", 0), ("recovery", 1))]
+    asked = first, second = [Training(one.label_of(0), ("seed=0",), {**vars(one), "seed": 0}) for one in setups]
+    wanted = [Comparison("main", setups[0], None, 1, "steps"), Comparison("main", setups[1], setups[0], 1, "steps")]
 
+    def cut_short(*_: object) -> None:
+        raise Stopped("out of minutes")
 
-def test_a_curve_is_named_after_what_is_not_as_usual() -> None:
-    labels = [one.label for one in drawn(scaling(experts=("recovery",), real_shares=(0.5, 1.0), imitation=("real",)))]
-    assert labels == ["recovery, rewards only, 50 % of the real", "recovery, rewards only"]
-    for curve in drawn(scaling(imitation=("all", "none"), seeds=1)):
-        assert len(curve.samples) == 4, "real samples alone with imitation, or without, as the curve's own"
+    monkeypatch.setattr(sweep_module, "train_all", cut_short)
+    train(tmp_path, first)
+    score(tmp_path, settings(tmp_path / EVALUATIONS), first)
+    with pytest.raises(Stopped, match="1 of 2 planners are evaluated: the same command goes on"):
+        run(sweep, asked, asked, wanted)
+    report = tmp_path / "report"
+    assert not report.exists()
 
-
-@pytest.mark.parametrize(("name", "value"), [("seeds", 0), ("rounds", (-1,)), ("planners", ("ltf", "ltf"))])
-def test_axes_that_are_none_are_refused(name: str, value: Any) -> None:
-    with pytest.raises(ValueError, match=name):
-        scaling(**{name: value})
-
-
-@pytest.mark.parametrize(("n", "processes"), [(0, 0), (1, 1), (16, 2), (48, 2), (49, 4)])
-def test_processes_evaluate_all_planners_and_as_many_of_each_kind(n: int, processes: int) -> None:
-    who = [Training(f"{'slow' if i < n / 2 else 'fast'}-{i}") for i in range(n)]
-    shares = shares_of(who, 2)
-    assert len(shares) == processes
-    assert sorted(one.label for share in shares for one in share) == sorted(one.label for one in who)
-    assert all(len(share) <= EVALUATED_TOGETHER for share in shares)
-    slow = [sum(one.label.startswith("slow") for one in share) for share in shares]
-    assert not slow or max(slow) - min(slow) <= 1
+    monkeypatch.setattr(sweep_module, "train_all", lambda trainings, out, means: train(out, second, weight=0.1))
+    monkeypatch.setattr(
+        sweep_module, "evaluate_all", lambda who, out, *_: score(out, settings(out / EVALUATIONS), first, second)
+    )
+    run(sweep, asked, asked, wanted)
+    assert "constant_velocity" in capsys.readouterr().out
+    alone, more = csv.DictReader((report / "trainings.csv").open())
+    assert (alone["data"], alone["optimiser_steps"], more["data"]) == ("real", "1", "recovery")
+    assert (alone["real"], more["simulated"]) == ("3", "4")
+    for row, training in ((alone, first), (more, second)):
+        for name, found in scores_of(tmp_path / EVALUATIONS / training.label).items():
+            assert float(row[name]) == pytest.approx(found, abs=1e-4)
+    differences = [row["difference"] for row in csv.DictReader((report / "comparisons.csv").open())]
+    assert "" in differences[: len(differences) // 2] and "" not in differences[len(differences) // 2 :]
+    made = {path.name: path.read_bytes() for path in report.iterdir()}
+    assert {"frames.parquet", "tables.md", "bounds.csv"} < set(made)
+    run(sweep, asked, asked, wanted)
+    assert {path.name: path.read_bytes() for path in report.iterdir()} == made
