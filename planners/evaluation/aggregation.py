@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from planners.evaluation.frames import FrameKey
-from planners.evaluation.score_rows import FrameRow, read_rows
+from planners.evaluation.score_rows import FrameRow
 from tasks.reward.one_stage import COLUMNS, FrameScores, means_of
 from tasks.reward.two_stage import Group, TwoStageScores, aggregate, is_uniform
 from tasks.world.arrays import Array
@@ -190,11 +190,6 @@ BOUNDS = ("human", "pdm_closed", "constant_velocity")
 def shown(human_filter: HumanFilter) -> dict[str, str]:
     """Stage -> the filter under which it stands in a table of so filtered scores."""
     return {stage: which for stage, which in MEASURES if which in (human_filter, "none")}
-
-
-def scores_of(folder: Path) -> dict[str, float]:
-    """`scores_of_clips` of one evaluated planner."""
-    return scores_of_clips(by_clip(read_rows(folder)))
 
 
 def scores_of_clips(clips: Sequence[ClipResult]) -> dict[str, float]:

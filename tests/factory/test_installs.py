@@ -23,7 +23,6 @@ from tests.factory.toy import refs
 
 OURS = {"tasks", "factory", "planners"}
 DISTRIBUTIONS = {  # of modules whose distribution has another name
-    "PIL": "pillow",
     "cv2": "opencv-python-headless",
     "foxglove_schemas_protobuf": "foxglove-schemas-protobuf",
     "google": "protobuf",

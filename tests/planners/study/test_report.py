@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from planners.evaluation.aggregation import BOUNDS, MEASURES, ClipResult, scores_of, scores_of_clips
+from planners.evaluation.aggregation import BOUNDS, MEASURES, ClipResult, by_clip, scores_of_clips
 from planners.evaluation.compare import compare
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.score_rows import FrameRow, read_rows, write_rows
@@ -72,7 +72,8 @@ def test_scores_of_the_file_are_those_of_the_folders(study: Path) -> None:
     bounds = {row["planner"]: row for row in table(study / "report" / "bounds.csv")}
     assert [*trainings, *bounds] == LABELS
     for label, found in {**trainings, **bounds}.items():
-        for name, score in scores_of(study / "evaluations" / label).items():
+        of_folder = scores_of_clips(by_clip(read_rows(study / "evaluations" / label)))
+        for name, score in of_folder.items():
             assert float(found[name]) == pytest.approx(score, abs=1e-4, nan_ok=True), (label, name)
     assert trainings[LABELS[1]]["simulated"] == "5"
     assert float(trainings[LABELS[0]]["stage_two"]) != pytest.approx(float(trainings[LABELS[0]]["follow_ups"]), abs=0.1)

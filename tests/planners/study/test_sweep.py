@@ -9,9 +9,10 @@ import pytest
 import torch
 
 from planners.command import Stopped
-from planners.evaluation.aggregation import scores_of
+from planners.evaluation.aggregation import by_clip, scores_of_clips
 from planners.evaluation.evaluate import EvaluateSettings, evaluate
 from planners.evaluation.planner_names import planner_of
+from planners.evaluation.score_rows import read_rows
 from planners.study import sweep as sweep_module
 from planners.study.setups import Comparison, Setup
 from planners.study.sweep import EVALUATIONS, SweepSettings, evaluated, run
@@ -89,7 +90,8 @@ def test_a_sweep_stops_where_something_is_missing_and_is_reported_when_all_is_do
     assert (alone["data"], alone["optimiser_steps"], more["data"]) == ("real", "1", "recovery")
     assert (alone["real"], more["simulated"]) == ("3", "4")
     for row, training in ((alone, first), (more, second)):
-        for name, found in scores_of(tmp_path / EVALUATIONS / training.label).items():
+        rows = read_rows(tmp_path / EVALUATIONS / training.label)
+        for name, found in scores_of_clips(by_clip(rows)).items():
             assert float(row[name]) == pytest.approx(found, abs=1e-4)
     differences = [row["difference"] for row in csv.DictReader((report / "comparisons.csv").open())]
     assert "" in differences[: len(differences) // 2] and "" not in differences[len(differences) // 2 :]
