@@ -73,7 +73,6 @@ COMMANDS: Mapping[str, Command] = {
 PLANNERS: Mapping[str, Command] = {
     "train": Command("fit a planner to logged and simulated samples", "planners.training.train"),
     "import": Command("a released checkpoint of the public code as ours", "planners.published.import_planner"),
-    "parity": Command("our planners against the public code, number by number", "planners.published.parity"),
     "train_traffic": Command("fit a traffic policy to logs, for traffic=learned", "planners.traffic.train_traffic"),
     "evaluate": Command("EPDMS of planners on held-out clips", "planners.evaluation.evaluate"),
     "compare": Command("how two planners differ, with intervals", "planners.evaluation.compare"),

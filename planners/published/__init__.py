@@ -1,1 +1,1 @@
-"""The public code's planners here: their checkpoints read into ours, and ours held against theirs."""
+"""The public code's planners here: their checkpoints read into ours."""

@@ -14,18 +14,21 @@ trained with unless another one is named. Nothing of the file runs: it is read a
 
 import hashlib
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor
 
 from factory.config.compose import ConfigError, compose, fill
 from factory.config.words import SHOW, without_show
 from planners.command import command
-from planners.published.imported import Imported, imported
-from planners.published.weights import read_public
-from planners.training.checkpoint import FOLDER, save_checkpoint
+from planners.models.gtrs_dense import GtrsDenseSettings, inference_arrays
+from planners.models.planner import Planner
+from planners.models.registry import PlannerChoice, build_planner, settings_of
+from planners.published.weights import FAMILIES, Moves, read_public
+from planners.training.checkpoint import FOLDER, put_weights, save_checkpoint
 from planners.training.train import PlannerEntry
 
 FROZEN_IN = "_trajectory_head"  # what of it is no weight of ours is not learned there either
@@ -78,6 +81,47 @@ def import_to(config: ImportConfig) -> Path:
     print(account(found, public))
     print(f"imported: {folder}")
     return folder
+
+
+@dataclass(frozen=True)
+class Imported:
+    """A planner, and an account of every number of the public model."""
+
+    planner: Planner
+    aside: dict[str, Tensor]  # public names that are no weights of ours: frozen arrays and unused parts
+    came_from: dict[str, tuple[str, ...]]  # our weight -> the public ones it was made of
+
+
+def imported(choice: PlannerChoice, public: Mapping[str, Tensor], source: str) -> Imported:
+    """The planner of a choice with the weights of a public model, in evaluation.
+
+    source: for messages. Raises ConfigError where a weight is missing, unknown, or of another shape.
+    """
+    if choice.name not in FAMILIES:
+        raise ConfigError(f"planner.name={choice.name}: only {', '.join(FAMILIES)} have public checkpoints")
+    settings = settings_of(choice)
+    moves = Moves(dict(public), source)
+    try:
+        arrays = FAMILIES[choice.name](moves, settings)
+        moves.done()
+    except ConfigError as error:
+        raise ConfigError(f"{error}; its weights look like planner={looks_like(public)}") from error
+    planner = build_planner(choice, {**arrays, **_chosen_from(settings)})
+    put_weights(planner, moves.ours, f"{source} does not fit planner={choice.name} with these settings")
+    return Imported(planner.eval(), moves.aside, moves.came_from)
+
+
+def looks_like(public: Mapping[str, Tensor]) -> str:
+    """The file of conf/planner whose public model has such weights."""
+    if any(name.startswith("_backbone.image_encoder.stem.") for name in public):
+        return "gtrs_dense_v2_99_public"
+    if "_trajectory_head.vocab" in public:
+        return "gtrs_dense_public"
+    return "diffusiondrive_public" if "_trajectory_head.plan_anchor" in public else "ltf_public"
+
+
+def _chosen_from(settings: Any) -> dict[str, Any]:
+    return dict(inference_arrays(settings)) if isinstance(settings, GtrsDenseSettings) else {}
 
 
 def account(found: Imported, public: dict[str, Tensor]) -> str:

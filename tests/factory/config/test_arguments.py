@@ -36,7 +36,7 @@ def test_values_become_what_the_fields_are() -> None:
 
 ASKED = [
     *(f"factory {name}" for name in COMMANDS if name not in ("run", "plan")),
-    *(f"planners {name}" for name in ("parity", "serve", "submit")),
+    *(f"planners {name}" for name in ("serve", "submit")),
 ]
 
 

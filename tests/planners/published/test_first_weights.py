@@ -1,21 +1,20 @@
 """Weights begin as the public agents draw theirs (see the records' origin).
 
-`python -m planners parity <public checkout> python=<its interpreter> cases=[ltf,diffusiondrive,gtrs_dense] start=true
-record=tests/planners/published/recorded` writes the records anew.
+`python -m experiments.parity <public checkout> --python <its interpreter> --what start --cases ltf diffusiondrive
+gtrs_dense --record tests/planners/published/recorded` writes the records anew.
 """
 
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from torch import nn
 
 from planners.models.registry import build_planner
-from planners.published.formula import inputs
-from planners.published.ours import preset
-from planners.published.start import Start, apart, our_start, read_start, start_of, write_start
+from tests.planners.published.formula import inputs
+from tests.planners.published.ours import preset
+from tests.planners.published.start import Start, apart, our_start, read_start, start_of
 
 RECORDS = Path(__file__).parent / "recorded"
 PICTURE = 256, 64
@@ -53,10 +52,3 @@ def test_copies_are_told_by_the_first_and_constants_are_none() -> None:
     model = nn.ModuleList([nn.Linear(3, 3), nn.Linear(3, 3), nn.LayerNorm(3)])
     model[1].load_state_dict(model[0].state_dict())
     assert start_of(model).twins == {"1.weight": "0.weight", "1.bias": "0.bias"}
-
-
-def test_a_start_reads_back(tmp_path: Path) -> None:
-    start = start_of(nn.Linear(3, 3))
-    write_start(start, "ltf", "here", tmp_path / "a" / "it.npz")
-    assert read_start(tmp_path / "a" / "it.npz") == (start, "ltf", "here")
-    assert np.isfinite(list(start.spread.values())).all()

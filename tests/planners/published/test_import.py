@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from planners.evaluation.planner_names import planner_of as evaluated_planner
-from planners.published.formula import inputs
 from planners.published.import_planner import main
-from planners.published.ours import batch_of, formula_weights
 from planners.training.checkpoint import read_record
+from tests.planners.published.formula import inputs
+from tests.planners.published.ours import batch_of, formula_weights
 from tests.planners.published.test_parity import TOLERANCE, recorded
 
 

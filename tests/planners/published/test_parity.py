@@ -1,11 +1,9 @@
 """Our planners say what the public code said: against arrays that its own modules wrote (see the records' origin).
 
-`python -m planners parity <public checkout> python=<its interpreter> record=tests/planners/published/recorded` writes
-them anew.
+`python -m experiments.parity <public checkout> --python <its interpreter> --record tests/planners/published/recorded`
+writes them anew.
 """
 
-import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,16 +11,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from factory.config.arguments import Refused, parse
 from factory.config.compose import ConfigError
 from planners.models.registry import PlannerChoice
-from planners.published.families import SCORES
-from planners.published.formula import FROZEN, inputs, weight
-from planners.published.imported import imported
-from planners.published.ours import (
+from planners.published.import_planner import imported
+from tests.planners.published.formula import FROZEN, inputs
+from tests.planners.published.ours import (
     CASES,
     GRADIENTS,
-    Difference,
     PublicRecord,
     batch_of,
     differences,
@@ -31,7 +26,6 @@ from planners.published.ours import (
     preset,
     read_recorded,
 )
-from planners.published.parity import Request, said_beside
 
 RECORDED = Path(__file__).parent / "recorded"
 TOLERANCE = 1e-4
@@ -62,6 +56,7 @@ def on_meta(case: PublicRecord) -> dict[str, Tensor]:
 @pytest.mark.parametrize("case", CASES)
 def test_outputs_losses_and_gradients_are_the_public_code_s(case: str) -> None:
     one = recorded(case)
+    assert "SimScale commit f51ad645" in one.origin
     rows = differences(one, planner_of(one))
     assert [row for row in rows if not row.is_within(TOLERANCE)] == []
     assert {row.what for row in rows} >= {"eval trajectory", "train loss"} and rows[-1].what.startswith(GRADIENTS)
@@ -142,57 +137,3 @@ def test_another_planner_s_checkpoint_is_told_by_its_weights() -> None:
 def test_planners_without_public_checkpoints_are_refused() -> None:
     with pytest.raises(ConfigError, match="only ltf, diffusiondrive, gtrs_dense have public checkpoints"):
         imported(PlannerChoice("ego_mlp"), {}, "it")
-
-
-def test_the_formula_depends_on_the_name_alone_and_neither_vanishes_nor_explodes() -> None:
-    one = weight("a.weight", (400, 300))
-    assert np.array_equal(one, weight("a.weight", (400, 300))) and not np.array_equal(
-        one, weight("b.weight", (400, 300))
-    )
-    assert one.std() == pytest.approx(300**-0.5, rel=0.01) and abs(one.mean()) < 1e-3
-    assert weight("a.running_var", (100,)).min() >= 0.5 and weight("norm.weight", (100,)).min() > 0.8
-    assert weight("a.num_batches_tracked", ()) == 0
-    assert weight("pos_emb", (1, 50, 50)).std() == pytest.approx(1.0, rel=0.05)
-
-
-def test_inputs_are_of_the_kinds_that_planners_are_shown() -> None:
-    given = inputs(128, 64)
-    assert given["image"].dtype == np.uint8 and given["image"].shape == (2, 3, 64, 128)
-    assert (given["status"][:, :4].sum(axis=1) == 1.0).all()
-    assert set(np.unique(given["bev"])) == set(range(7))
-    for name in SCORES:
-        assert set(np.unique(given[f"score {name}"])) <= {0.0, 0.5, 1.0}
-    speed = np.linalg.norm(np.diff(given["vocabulary"][..., :2], axis=1), axis=-1) * 10.0
-    assert speed.min() > 1.9 and speed.max() < 12.1
-
-
-def test_a_record_holds_where_it_is_from_and_others_are_refused(tmp_path: Path) -> None:
-    assert "SimScale commit f51ad645" in recorded("ltf").origin
-    (tmp_path / "a.npz").write_bytes(b"PK")
-    with pytest.raises(ConfigError, match="no record of a public model"):
-        read_recorded(tmp_path / "a.npz")
-    np.savez(tmp_path / "b.npz", told=np.array("{}"))
-    with pytest.raises(ConfigError, match="no record of a public model"):
-        read_recorded(tmp_path / "b.npz")
-
-
-def test_what_the_command_cannot_do_is_refused_in_one_line(tmp_path: Path) -> None:
-    code = tmp_path / "public"
-    (code / "navsim" / "agents").mkdir(parents=True)
-    for words, said in (
-        ([str(tmp_path), "python=python"], "there is no navsim/agents in it"),
-        ([str(code), "python=python", "cases=[ltf,lft]"], "cases=lft: give some of ltf, "),
-        ([str(code), "python=python", "width=100"], "width=100 height=64: both must be multiples of 32"),
-    ):
-        with pytest.raises(Refused, match=said):
-            parse(Request, words)
-    silent = Request(str(code), str(tmp_path / "absent"))
-    with pytest.raises(Refused, match="absent could not be started"):
-        said_beside(silent, "ltf", tmp_path)
-    with pytest.raises(Refused, match=r"could not run the ltf of .*No module named"):
-        said_beside(replace(silent, python=sys.executable), "ltf", tmp_path)
-
-
-def test_a_difference_is_judged_with_what_rounding_makes_of_it() -> None:
-    row = Difference("it", largest=5e-4, size=1.0)
-    assert not row.is_within(TOLERANCE) and replace(row, rounding=10.0).is_within(TOLERANCE)

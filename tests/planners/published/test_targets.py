@@ -1,7 +1,7 @@
 """What is learnt beside planning is the public target builder's, cell by cell (see the record's origin).
 
-`python -m planners parity <public checkout> python=<its interpreter> targets=true
-record=tests/planners/published/recorded` writes it anew.
+`python -m experiments.parity <public checkout> --python <its interpreter> --what targets --record
+tests/planners/published/recorded` writes it anew.
 """
 
 from dataclasses import replace
@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from planners.data.bev import BevClass, bev_raster, nearest_agents
-from planners.published.targets import PUBLIC, differences_in_targets, street_sample
+from tests.planners.published.targets import PUBLIC, differences_in_targets, street_sample
 
 RECORD = Path(__file__).parent / "recorded" / "targets.npz"
 

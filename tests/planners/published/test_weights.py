@@ -12,8 +12,7 @@ from torch import nn
 from factory.config.compose import ConfigError
 from planners.models.attention import Decoder
 from planners.models.diffusiondrive import waves
-from planners.published.families import _points_reordered
-from planners.published.weights import Moves, model_weights, read_public
+from planners.published.weights import Moves, _points_reordered, model_weights, read_public
 
 
 def lightning(path: Path, **more: Any) -> Path:

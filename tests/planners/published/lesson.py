@@ -1,8 +1,8 @@
 """A short training that the public code and ours go through alike, and our half of it.
 
-Both begin from the weights of planners.published.formula, see the same samples in the same batches, and draw what a
-model draws itself (noise, halves of a vocabulary) from the same seed in every step. Ours is planners.training.fit with
-the training of conf/planner/<case>_public.yaml; theirs planners.published.lesson_beside.
+Both begin from the weights of formula.py, see the same samples in the same batches, and draw what a model draws itself
+(noise, halves of a vocabulary) from the same seed in every step. Ours is planners.training.fit with the training of
+conf/planner/<case>_public.yaml; theirs that of experiments/parity/beside.py.
 """
 
 import csv
@@ -21,10 +21,14 @@ from torch import Tensor
 from factory.config.compose import ConfigError
 from planners.command import Stopped
 from planners.data.batch import Batch
-from planners.published.formula import AGENTS, drawn, first_weight, inputs
-from planners.published.imported import imported
-from planners.published.lesson_beside import Doubled, told_of
-from planners.published.ours import (
+from planners.published.import_planner import imported
+from planners.training.curves import LOSSES
+from planners.training.fit import Loop, fit, step_seed
+from planners.training.optim import FACTOR, TrainingSettings, build_optimiser
+from planners.training.processes import TrainingProcess
+from tasks.world.arrays import Array
+from tests.planners.published.formula import AGENTS, Doubled, drawn, first_weight, inputs, told_of
+from tests.planners.published.ours import (
     Difference,
     batch_of,
     formula_weights,
@@ -33,15 +37,9 @@ from planners.published.ours import (
     preset,
     preset_entry,
 )
-from planners.training.curves import LOSSES
-from planners.training.fit import Loop, fit, step_seed
-from planners.training.optim import FACTOR, TrainingSettings, build_optimiser
-from planners.training.processes import TrainingProcess
-from tasks.world.arrays import Array
 
 SAMPLES, BATCH = 8, 2
 SEED = 0
-RECORDED = 20  # steps that a record keeps
 ROUNDING_OF_CURVES = 10.0  # 1e-3 of a loss at a tolerance of 1e-4
 
 
@@ -92,28 +90,6 @@ def samples(picture: tuple[int, int]) -> dict[str, Any]:
     return given
 
 
-def write_lesson(lesson: Lesson, path: Path, first: int) -> None:
-    """The first `first` steps of the lesson as planners.published.lesson_beside reads them."""
-    told = {
-        "case": lesson.case,
-        "picture": lesson.picture,
-        "rate": lesson.training.learning_rate,
-        "epoch_steps": lesson.epoch_steps,
-        "steps": lesson.steps,
-        "double": lesson.double,
-    }
-    given = samples(lesson.picture)
-    np.savez(path, told=np.array(json.dumps(told)), order=lesson.order[:first], seeds=lesson.seeds, **given)
-
-
-def write_beginning(said: Path, out: Path) -> None:
-    """Keep the first steps of a public training for tests that have no checkout."""
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with np.load(said, allow_pickle=False) as stored:
-        kept = {name: stored[name][:RECORDED] if name in ("losses", "rates") else stored[name] for name in stored.files}
-    np.savez_compressed(out, **kept)
-
-
 @dataclass(frozen=True)
 class LessonCurve:
     """How a training went."""
@@ -121,12 +97,12 @@ class LessonCurve:
     losses: Array  # (n,) float64, of the first n steps
     rates: Array  # (n, groups)
     gradients: Mapping[tuple[str, ...], float]  # of the first step: public matrices -> norm
-    optimiser: dict[str, Any]  # see planners.published.lesson_beside.told_of
+    optimiser: dict[str, Any]  # see formula.told_of
 
 
 @dataclass(frozen=True)
 class PublicLesson:
-    """How it went there, as planners.published.lesson_beside writes it."""
+    """How it went there, as experiments.parity writes it."""
 
     lesson: Lesson
     learned: LessonCurve
@@ -135,7 +111,7 @@ class PublicLesson:
 
 
 def read_lesson(path: Path) -> PublicLesson:
-    """A file of planners.published.lesson_beside. Raises ConfigError."""
+    """A file of experiments.parity. Raises ConfigError."""
     try:
         with np.load(path, allow_pickle=False) as stored:
             told = json.loads(str(stored["told"]))

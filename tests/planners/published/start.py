@@ -15,10 +15,8 @@ import torch
 from torch import nn
 
 from planners.models.registry import build_planner
-from planners.published.imported import imported
-from planners.published.ours import preset
-from planners.published.weights import read_public
 from tasks.world.arrays import Array
+from tests.planners.published.ours import preset
 
 ALWAYS_READ = "tokens.backbone."  # V2-99's
 DEVIATIONS = 6.0  # that two draws of one distribution may be apart
@@ -48,12 +46,6 @@ def start_of(planner: nn.Module) -> Start:
     return Start(spread, twins)
 
 
-def public_start(case: str, picture: tuple[int, int], checkpoint: Path) -> tuple[Start, dict[str, Array]]:
-    """Of the public agent's draw by our names, and the arrays that its model is built around."""
-    planner = imported(preset(case, picture), read_public(checkpoint), case).planner
-    return start_of(planner), {name: np.asarray(array) for name, array in planner.arrays.items()}
-
-
 def our_start(case: str, picture: tuple[int, int], arrays: Mapping[str, Array]) -> Start:
     """Of the planner of conf/planner/<case>_public.yaml."""
     torch.manual_seed(1)
@@ -75,13 +67,6 @@ def apart(public: Start, ours: Start) -> list[str]:
         if public.twins.get(name) != ours.twins.get(name):
             said.append(f"{name}: a copy of {public.twins.get(name)} there, of {ours.twins.get(name)} here")
     return sorted(said)
-
-
-def write_start(start: Start, case: str, origin: str, path: Path) -> None:
-    """Keep a public start for tests that have no checkout."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    told = {"case": case, "origin": origin, "names": list(start.spread), "twins": dict(start.twins)}
-    np.savez_compressed(path, told=np.array(json.dumps(told)), spread=np.array(list(start.spread.values())))
 
 
 def read_start(path: Path) -> tuple[Start, str, str]:

@@ -1,9 +1,12 @@
-"""The public code's half of a comparison; it runs in the public code's own Python, which has torch, timm and NAVSIM.
+"""The public code's half of the comparisons; it runs in the public code's own Python, which has torch, timm and NAVSIM.
 
-    main([<checkout>, <case>, <picture width>, <picture height>, <out.npz>, <train: 0 or 1>, <out.ckpt, or nothing>])
+    python beside.py outputs <checkout> <case> <picture width> <picture height> <out.npz> <train: 0 or 1> <.ckpt or "">
+    python beside.py training <checkout> <lesson.npz> <out.npz>
+    python beside.py start <checkout> <case> <picture width> <picture height> <out.ckpt>
+    python beside.py targets <checkout> <out.npz>
 
-Builds the checkout's model of a case with the weights and inputs of planners.published.formula, and writes what it
-plans and loses; and, where asked, the model as its trainer would have saved it. Nothing is switched off but dropout.
+The checkout and tests/planners/published, whose formula makes weights and inputs, are on PYTHONPATH. Nothing is
+switched off but dropout.
 """
 
 from __future__ import annotations
@@ -13,19 +16,20 @@ import os
 import subprocess
 import sys
 import tempfile
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import torch
-
-from planners.published.formula import CELLS, FROZEN, SCORES, SEED, inputs, weight
+from formula import CELLS, FROZEN, SCORES, SEED, Doubled, first_weight, inputs, street, told_of, weight
 
 V2_99 = "gtrs_dense_v2_99"
 
 
-def main(argv: list[str]) -> None:
-    """See the module."""
+def outputs(argv: list[str]) -> None:
+    """The checkout's model of a case: what it plans and loses; where asked, as its trainer would have saved it."""
     code, case, width, height, out = argv[0], argv[1], int(argv[2]), int(argv[3]), argv[4]
     given = inputs(width, height)
     with tempfile.TemporaryDirectory() as folder:
@@ -43,9 +47,9 @@ def main(argv: list[str]) -> None:
         "code": origin(code),
         "versions": {"python": sys.version.split()[0], "torch": torch.__version__, "numpy": np.__version__},
     }
-    outputs = evaluated(agent, case, given)  # first: training moves the statistics that evaluation normalises by
+    said = evaluated(agent, case, given)  # first: training moves the statistics that evaluation normalises by
     losses, told["gradients"] = trained(agent, case, given) if argv[5] == "1" else ({}, [])
-    np.savez_compressed(out, told=np.array(json.dumps(told)), **outputs, **losses)
+    np.savez_compressed(out, told=np.array(json.dumps(told)), **said, **losses)
 
 
 def without_dropout(agent: Any) -> None:
@@ -223,3 +227,160 @@ def save_as_lightning(agent: Any, given: dict[str, Any], path: str) -> None:
     filled(model_of(agent), given)  # a step, even one of no loss, decays weights
     trainer.save_checkpoint(path)
     agent.zero_grad()
+
+
+def training(argv: list[str]) -> None:
+    """Train the agent by its own Lightning module, optimiser and schedule, on the batches of a lesson."""
+    import pytorch_lightning as pl
+
+    code, lesson, out = argv
+    with np.load(lesson, allow_pickle=False) as stored:
+        given = {name: stored[name] for name in stored.files}
+    told = json.loads(str(given.pop("told")))
+    width, height = told["picture"]
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ.setdefault("NAVSIM_DEVKIT_ROOT", code)
+        agent = built(told["case"], given, Path(folder), width, height, told["rate"])
+    filled(model_of(agent), given, first_weight)
+    without_dropout(agent)
+    watch = watched(pl.Callback)(given["seeds"])
+    trainer = pl.Trainer(
+        max_steps=len(given["order"]),
+        accelerator="cpu",
+        devices=1,
+        precision="64-true" if told["double"] else "32-true",
+        callbacks=[watch],
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+    )
+    module = lightning_module(told["case"])(agent=agent)
+    lessons = LessonBatches(given, told["case"], told["epoch_steps"], trainer)
+    with Doubled() if told["double"] else nullcontext():
+        trainer.fit(module, torch.utils.data.DataLoader(lessons, batch_size=None))
+    told.update(
+        names={name: list(value.shape) for name, value in model_of(agent).state_dict().items()},
+        code=origin(code),
+        versions={"torch": torch.__version__, "lightning": pl.__version__, "numpy": np.__version__},
+        matrices=watch.matrices,
+        optimiser=watch.optimiser,
+    )
+    losses, rates = np.array(watch.losses), np.array(watch.rates)
+    np.savez_compressed(out, told=np.array(json.dumps(told)), losses=losses, rates=rates, gradients=watch.gradients)
+
+
+def lightning_module(case: str) -> Any:
+    """The class that the public training script of a family wraps its agent in."""
+    if case == "ltf":
+        from navsim.planning.training.agent_lightning_module_transfuser import AgentLightningModule
+    elif case == "diffusiondrive":
+        from navsim.planning.training.agent_lightning_module_diffusiondrive import AgentLightningModule
+    else:
+        from navsim.planning.training.agent_lightning_module import AgentLightningModule
+    return AgentLightningModule
+
+
+class LessonBatches(torch.utils.data.Dataset):  # type: ignore[misc,unused-ignore]
+    """An epoch's batches as the public data sets collate them: features, targets, tokens."""
+
+    def __init__(self, given: dict[str, Any], case: str, epoch_steps: int, trainer: Any) -> None:
+        self.given, self.case, self.epoch_steps, self.trainer = given, case, epoch_steps, trainer
+
+    def __len__(self) -> int:
+        return self.epoch_steps
+
+    def __getitem__(self, index: int) -> Any:
+        rows = self.given["order"][self.trainer.current_epoch * self.epoch_steps + index]
+        names = tokens(self.given)
+        return features(self.given, self.case, rows), targets(self.given, rows), [names[row] for row in rows]
+
+
+def watched(callback: Any) -> Any:
+    """A Lightning callback (of the base class given) that seeds every step, and keeps what is compared."""
+
+    class Seeing(callback):  # type: ignore[misc,unused-ignore]
+        def __init__(self, seeds: Any) -> None:
+            self.seeds = seeds
+            self.losses: list[float] = []
+            self.rates: list[list[float]] = []
+
+        def on_train_batch_start(self, trainer: Any, module: Any, batch: Any, index: int) -> None:
+            torch.manual_seed(int(self.seeds[trainer.global_step]))
+
+        def on_after_backward(self, trainer: Any, module: Any) -> None:
+            if trainer.global_step == 0:
+                self.matrices, self.gradients = gradients(model_of(module.agent))
+
+        def on_before_optimizer_step(self, trainer: Any, module: Any, optimiser: Any) -> None:
+            if trainer.global_step == 0:
+                self.optimiser = told_of(optimiser)
+            self.rates.append([group["lr"] for group in optimiser.param_groups])
+
+        def on_train_batch_end(self, trainer: Any, module: Any, outputs: Any, batch: Any, index: int) -> None:
+            self.losses.append(float(outputs["loss"]))
+
+    return Seeing
+
+
+def start(argv: list[str]) -> None:
+    """What an agent draws its weights to be before a training."""
+    code, case, width, height, out = argv[0], argv[1], int(argv[2]), int(argv[3]), argv[4]
+    torch.manual_seed(SEED)
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ.setdefault("NAVSIM_DEVKIT_ROOT", code)
+        model = model_of(built(case, inputs(width, height), Path(folder), width, height))
+    torch.save({"state_dict": dict(model.state_dict()), "origin": origin(code)}, out)
+
+
+def targets_of_a_street(argv: list[str]) -> None:
+    """What the target builder makes of a made-up street."""
+    import cv2
+    from navsim.agents.diffusiondrive.transfuser_config import TransfuserConfig
+    from navsim.agents.diffusiondrive.transfuser_features import TransfuserTargetBuilder
+    from nuplan.common.actor_state.state_representation import StateSE2
+
+    code, out = argv
+    around = street()
+    builder = TransfuserTargetBuilder(TransfuserConfig())
+    told = annotated(around)
+    bev = builder._compute_bev_semantic_map(told, Map(around), StateSE2(0.0, 0.0, 0.0))
+    agents, there = builder._compute_agent_targets(told)
+    versions = {"python": sys.version.split()[0], "numpy": np.__version__, "opencv": cv2.__version__}
+    record = json.dumps({"code": origin(code), "versions": versions})
+    np.savez_compressed(
+        out, told=np.array(record), bev=bev.numpy().astype(np.uint8), agents=agents.numpy(), there=there.numpy()
+    )
+
+
+def annotated(around: dict[str, Any]) -> Any:
+    """The boxes as a frame's annotations hold them: x, y, z, length, width, height, heading."""
+    boxes = np.zeros((len(around["boxes"]), 7), np.float32)
+    boxes[:, [0, 1, 6, 3, 4]] = around["boxes"]
+    boxes[:, 5] = 1.0
+    return SimpleNamespace(boxes=boxes, names=around["kinds"])
+
+
+class Map:
+    """A map of nothing but lanes."""
+
+    def __init__(self, around: dict[str, Any]) -> None:
+        self.around = around
+
+    def get_proximal_map_objects(self, point: Any, radius: float, layers: Any) -> dict[Any, list[Any]]:
+        """All lanes, wherever the point is."""
+        from nuplan.common.maps.abstract_map import SemanticMapLayer
+        from shapely.geometry import LineString, Polygon
+
+        found: dict[Any, list[Any]] = {layer: [] for layer in layers}
+        if SemanticMapLayer.INTERSECTION in layers:
+            found[SemanticMapLayer.LANE] = [SimpleNamespace(polygon=Polygon(ring)) for ring in self.around["rings"]]
+        elif SemanticMapLayer.LANE in layers:
+            paths = [SimpleNamespace(linestring=LineString(line)) for line in self.around["lines"]]
+            found[SemanticMapLayer.LANE] = [SimpleNamespace(baseline_path=path) for path in paths]
+        return found
+
+
+if __name__ == "__main__":
+    commands = {"outputs": outputs, "training": training, "start": start, "targets": targets_of_a_street}
+    commands[sys.argv[1]](sys.argv[2:])

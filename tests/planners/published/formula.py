@@ -1,6 +1,6 @@
 """Weights and inputs out of names and shapes, so that two programs make the same ones and nobody has to store them.
 
-numpy alone, and Python 3.9: the public code's own interpreter imports it.
+numpy and torch alone, and Python 3.9: the public code's own interpreter imports it.
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ import zlib
 from typing import Any
 
 import numpy as np
+import torch
+from torch.overrides import TorchFunctionMode
 
 BATCH = 2
 ENTRIES, ANCHORS, AGENTS = 64, 20, 30
@@ -120,3 +122,22 @@ def street(boxes: int = 420, rings: int = 6, lines: int = 8) -> dict[str, Any]:
         "rings": (centres + radii * np.stack([np.cos(angles), np.sin(angles)], -1)).astype(np.float32),
         "lines": (starts + way.cumsum(axis=1)).astype(np.float32),
     }
+
+
+def told_of(optimiser: torch.optim.Optimizer) -> dict[str, Any]:
+    """What an optimiser does beside its rate, and to how many numbers that have a gradient."""
+    numbers: dict[str, int] = {}
+    for group in optimiser.param_groups:
+        does = {key: group[key] for key in ("eps", "amsgrad")}
+        does.update(betas=list(group["betas"]), weight_decay=float(group["weight_decay"]))
+        with_gradient = sum(parameter.numel() for parameter in group["params"] if parameter.grad is not None)
+        words = ", ".join(f"{key} {does[key]}" for key in sorted(does))
+        numbers[words] = numbers.get(words, 0) + with_gradient
+    return {"kind": type(optimiser).__name__, **{words: count for words, count in numbers.items() if count}}
+
+
+class Doubled(TorchFunctionMode):
+    """Inside, what would become float32 becomes float64, so that rounding tells nothing."""
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        return args[0].double() if func is torch.Tensor.float else func(*args, **(kwargs or {}))

@@ -17,11 +17,11 @@ from planners.models.gtrs_dense import IMITATION, WEIGHTINGS, GtrsDense, total
 from planners.models.ltf import Ltf
 from planners.models.planner import Planner, evaluating
 from planners.models.registry import PlannerChoice
-from planners.published.families import SCORES
-from planners.published.formula import CELLS, FROZEN, SEED, inputs, weight
-from planners.published.imported import Imported, imported
+from planners.published.import_planner import Imported, imported
+from planners.published.weights import SCORES
 from planners.training.train import PlannerEntry
 from tasks.world.arrays import Array
+from tests.planners.published.formula import CELLS, FROZEN, SEED, inputs, weight
 
 GRADIENTS = "gradients"
 ROUNDING_OF_GRADIENTS = 100.0  # in float32 ours are up to 8e-4 of themselves away from ours in float64 (LTF)
@@ -46,7 +46,7 @@ TERMS = {  # of the public losses and ours, where both tell them apart
 
 @dataclass(frozen=True)
 class PublicRecord:
-    """What the public model said, as planners.published.beside writes it."""
+    """What the public model said, as experiments.parity writes it."""
 
     case: str
     picture: tuple[int, int]  # width, height
@@ -58,7 +58,7 @@ class PublicRecord:
 
 
 def read_recorded(path: Path) -> PublicRecord:
-    """A file of planners.published.beside. Raises ConfigError."""
+    """A file of experiments.parity. Raises ConfigError."""
     try:
         with np.load(path, allow_pickle=False) as stored:
             told = json.loads(str(stored["told"]))

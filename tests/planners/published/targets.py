@@ -9,9 +9,9 @@ import numpy as np
 from factory.store.schema import AGENT_STEPS
 from planners.data.batch import BevLayout
 from planners.data.bev import BevClass, bev_raster, nearest_agents
-from planners.published.formula import AGENTS, street
-from planners.published.ours import Difference
 from tasks.world.agents import AgentKind
+from tests.planners.published.formula import AGENTS, street
+from tests.planners.published.ours import Difference
 
 PUBLIC = BevLayout(first="near_right", drawn_as="public")
 EDGES = 16.0  # cells beside a line that another OpenCV draws otherwise: 4.11 and 5.0 are 5 apart in 32,768
@@ -34,7 +34,7 @@ def street_sample() -> dict[str, Any]:
 
 
 def differences_in_targets(path: Path) -> tuple[str, list[Difference]]:
-    """Origin of a file of planners.published.targets_beside, and how far ours are from it, in cells and metres."""
+    """Origin of a file of experiments.parity, and how far ours are from it, in cells and metres."""
     with np.load(path, allow_pickle=False) as stored:
         told, theirs, agents, there = (
             json.loads(str(stored["told"])),
