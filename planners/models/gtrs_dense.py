@@ -24,8 +24,7 @@ from torch import Tensor, nn
 from planners.data.batch import Batch, ImageLayout, Needs
 from planners.models.anchors import read_array
 from planners.models.attention import Decoder, Layer
-from planners.models.backbones.base import STRIDES, BackboneSettings
-from planners.models.backbones.registry import build_backbone
+from planners.models.backbones import STRIDES, BackboneSettings, build_backbone
 from planners.models.planner import Planner, TrainingData, evaluating
 from planners.models.start import Start, begin
 from planners.models.transfuser import FusionSettings, LatentFusion

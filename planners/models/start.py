@@ -11,7 +11,7 @@ from typing import Literal
 from torch import nn
 
 from planners.models.attention import Attention, Decoder
-from planners.models.backbones.resnet import BasicBlock
+from planners.models.backbones import BasicBlock
 from planners.models.transfuser import Exchange
 
 Start = Literal["torch", "public"]  # whose draw weights are

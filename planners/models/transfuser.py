@@ -12,8 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from planners.models.backbones.base import STRIDES, BackboneSettings
-from planners.models.backbones.registry import build_backbone
+from planners.models.backbones import STRIDES, BackboneSettings, build_backbone
 
 
 @dataclass(frozen=True)

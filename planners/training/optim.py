@@ -7,7 +7,7 @@ from typing import Any, Literal
 import torch
 from torch import nn
 
-from planners.models.backbones.base import Backbone
+from planners.models.backbones import Backbone
 
 
 @dataclass(frozen=True)

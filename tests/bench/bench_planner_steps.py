@@ -26,7 +26,7 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
 from planners.data.batch import Batch
-from planners.models.backbones.registry import set_recompute
+from planners.models.backbones import set_recompute
 from planners.models.planner import Planner
 from planners.training.optim import TrainingSettings, build_optimiser
 from tests.bench.bench_planners import VOCABULARY, made, random_batch

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from planners.data.batch import Batch, BevLayout, ImageLayout
-from planners.models.backbones.base import BackboneSettings
+from planners.models.backbones import BackboneSettings
 from planners.models.transfuser import FusionSettings
 from tasks.reward.label_bytes import VocabularyLabels
 

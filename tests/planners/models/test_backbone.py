@@ -9,8 +9,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from planners.models.backbones.base import STRIDES, Backbone, BackboneSettings
-from planners.models.backbones.registry import build_backbone, load_pretrained
+from planners.models.backbones import STRIDES, Backbone, BackboneSettings, build_backbone, load_pretrained
 
 SMALL = BackboneSettings(name="small", widths=(4, 8, 12, 16))
 BN = ("weight", "bias", "running_mean", "running_var", "num_batches_tracked")

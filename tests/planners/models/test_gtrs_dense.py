@@ -9,7 +9,7 @@ from omegaconf import OmegaConf
 
 from factory.config.compose import conf_dir, fill
 from planners.data.batch import Batch, ImageLayout
-from planners.models.backbones.base import BackboneSettings
+from planners.models.backbones import BackboneSettings
 from planners.models.gtrs_dense import GtrsDense, GtrsDenseSettings, imitated, shifted
 from planners.models.planner import TrainingData
 from planners.training.optim import TrainingSettings

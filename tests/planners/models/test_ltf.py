@@ -11,8 +11,7 @@ from safetensors.torch import save_file
 from torch import nn
 
 from planners.data.batch import Batch, BevLayout, ImageLayout
-from planners.models.backbones.base import BackboneSettings
-from planners.models.backbones.registry import load_pretrained
+from planners.models.backbones import BackboneSettings, load_pretrained
 from planners.models.constant_velocity import ConstantVelocity, ConstantVelocitySettings
 from planners.models.ltf import Ltf, LtfSettings
 from planners.models.transfuser import FusionSettings, LatentFusion

@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from factory.config.compose import ConfigError, conf_dir, fill
-from planners.models.backbones.base import BackboneSettings
+from planners.models.backbones import BackboneSettings
 from planners.models.ego_mlp import EgoMlpBevSettings, EgoMlpSettings
 from planners.models.ltf import LtfSettings
 from planners.models.registry import PlannerChoice, build_planner, settings_of

@@ -6,8 +6,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from planners.models.backbones.base import Backbone, BackboneSettings
-from planners.models.backbones.registry import build_backbone, set_recompute
+from planners.models.backbones import Backbone, BackboneSettings, build_backbone, set_recompute
 from planners.models.transfuser import FusionSettings, LatentFusion
 
 

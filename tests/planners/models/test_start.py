@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from planners.models.attention import Attention, Decoder, Layer
-from planners.models.backbones.base import BackboneSettings
+from planners.models.backbones import BackboneSettings
 from planners.models.start import begin
 from planners.models.transfuser import FusionSettings, LatentFusion
 

@@ -5,7 +5,7 @@ import math
 import pytest
 from torch import nn
 
-from planners.models.backbones.base import BackboneSettings
+from planners.models.backbones import BackboneSettings
 from planners.models.transfuser import FusionSettings, LatentFusion
 from planners.training.optim import TrainingSettings, build_optimiser, learning_rate, set_rate
 

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from planners.data.batch import Batch
-from planners.models.backbones.base import BackboneSettings
-from planners.models.backbones.registry import build_backbone
+from planners.models.backbones import BackboneSettings, build_backbone
 from planners.training.checkpoint import load_planner
 from planners.training.fit import Loop, fit
 from planners.training.optim import TrainingSettings
