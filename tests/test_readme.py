@@ -38,7 +38,7 @@ from planners.evaluation.evaluate import settings_of as evaluate_settings
 from planners.evaluation.replay import settings_of as replay_settings
 from planners.explore.alternate import AlternateSettings
 from planners.explore.settings import settings_of as explore_settings
-from planners.models.registry import settings_of
+from planners.models.planner import settings_of
 from planners.published.import_planner import config_of as import_config
 from planners.traffic.train_traffic import settings_of as traffic_settings
 from planners.training.train import TrainConfig

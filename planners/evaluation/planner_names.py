@@ -33,8 +33,7 @@ from planners.data.batch import Needs
 from planners.evaluation.frames import FrameKey
 from planners.evaluation.scoring import Plans, PreparedFrame, human_plans, pdm_plans
 from planners.models.gtrs_dense import Ensemble, GtrsDense
-from planners.models.planner import Planner
-from planners.models.registry import BUILT_IN, OWN, PlannerChoice, build_planner
+from planners.models.planner import BUILT_IN, OWN, Planner, PlannerChoice, build_planner
 from planners.training import checkpoint
 
 Privileged = Callable[[Mapping[FrameKey, PreparedFrame]], Plans]  # of a clip's frames

@@ -21,20 +21,73 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from planners.data.batch import Batch, BevLayout, ImageLayout, Needs
-from planners.models.anchors import WAYPOINTS, checked_anchors, cluster_anchors, read_array
-from planners.models.attention import Attention, Decoder
-from planners.models.auxiliary import AgentHead, BevHead, auxiliary_losses
-from planners.models.planner import Planner, TrainingData, evaluating
-from planners.models.start import Start, begin, clone_first
-from planners.models.transfuser import FusionSettings, LatentFusion
+from planners.models.layers import (
+    AgentHead,
+    Attention,
+    BevHead,
+    Decoder,
+    FusionSettings,
+    LatentFusion,
+    Start,
+    auxiliary_losses,
+    begin,
+    clone_first,
+)
+from planners.models.planner import Planner, TrainingData, evaluating, read_array
 from tasks.world.arrays import FloatArray
+
+WAYPOINTS = 8  # 0.5 .. 4.0 s
+
+
+def checked_anchors(values: NDArray[Any], source: str) -> FloatArray:
+    """`values` as float64 (A, 8, 2). Raises ValueError naming `source`."""
+    if values.ndim != 3 or values.shape[1:] != (WAYPOINTS, 2) or len(values) == 0:
+        raise ValueError(f"{source}: anchors have shape {values.shape}, expected (A >= 1, {WAYPOINTS}, 2)")
+    if not np.isfinite(values).all():
+        raise ValueError(f"{source}: anchors hold NaN or infinity")
+    return values.astype(np.float64)
+
+
+def cluster_anchors(plans: FloatArray, count: int, seed: int, iterations: int = 100) -> FloatArray:
+    """Means (count, 8, 2) of k-means over the positions of plans (n, 8, >= 2), from a k-means++ start.
+
+    Equal arguments give equal results. Raises ValueError where there are fewer distinct plans than anchors.
+    """
+    points = plans[:, :, :2].reshape(len(plans), -1).astype(np.float64)
+    distinct = np.unique(points, axis=0)
+    if len(distinct) < count:
+        raise ValueError(f"{count} anchors cannot be made of {len(distinct)} distinct plans")
+    rng = np.random.Generator(np.random.Philox(key=seed))
+    centers = distinct[[int(rng.integers(len(distinct)))]]
+    while len(centers) < count:
+        mass = _squared(distinct, centers).min(axis=1)
+        centers = np.concatenate([centers, distinct[[rng.choice(len(distinct), p=mass / mass.sum())]]])
+    owner = np.full(len(points), -1)
+    for _ in range(iterations):
+        nearest = _squared(points, centers).argmin(axis=1)
+        if np.array_equal(nearest, owner):
+            break
+        owner = nearest
+        members = np.bincount(owner, minlength=count)
+        sums = np.zeros_like(centers)
+        np.add.at(sums, owner, points)
+        centers = np.where(members[:, None] > 0, sums / np.maximum(members, 1)[:, None], centers)
+    return centers.reshape(count, WAYPOINTS, 2)
+
+
+def _squared(points: FloatArray, centers: FloatArray) -> FloatArray:
+    """Squared distances (n, k)."""
+    return np.stack([((points - center) ** 2).sum(axis=1) for center in centers], axis=1)
+
 
 STEPS = 1000
 BETA_FIRST, BETA_LAST = 1e-4, 0.02

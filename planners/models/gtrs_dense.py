@@ -22,12 +22,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from planners.data.batch import Batch, ImageLayout, Needs
-from planners.models.anchors import read_array
-from planners.models.attention import Decoder, Layer
 from planners.models.backbones import STRIDES, BackboneSettings, build_backbone
-from planners.models.planner import Planner, TrainingData, evaluating
-from planners.models.start import Start, begin
-from planners.models.transfuser import FusionSettings, LatentFusion
+from planners.models.layers import Decoder, FusionSettings, LatentFusion, Layer, Start, begin
+from planners.models.planner import Planner, TrainingData, evaluating, read_array
 from tasks.reward.label_bytes import Normalise
 from tasks.subscores import HALVES, LABELLED
 from tasks.world.arrays import FloatArray

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from planners.data.batch import Batch, BevLayout, ImageLayout, Needs
-from planners.models.auxiliary import AgentHead, BevHead, auxiliary_losses
+from planners.models.layers import AgentHead, BevHead, FusionSettings, LatentFusion, Start, auxiliary_losses, begin
 from planners.models.planner import (
     PlanFrom,
     Planner,
@@ -23,8 +23,6 @@ from planners.models.planner import (
     planned_from,
     seen_status,
 )
-from planners.models.start import Start, begin
-from planners.models.transfuser import FusionSettings, LatentFusion
 from tasks.world.arrays import FloatArray
 
 

@@ -1,4 +1,4 @@
-"""What a planner is: settings, model, loss, decode. One file is one planner.
+"""What a planner is: settings, model, loss, decode; and planners by name, or by a class of a user's own package.
 
 A planner's file has a frozen dataclass of settings and a `Planner` made from it:
 
@@ -15,12 +15,20 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, ClassVar, Literal
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from factory.config.classes import object_named
+from factory.config.compose import ConfigError, fill
+from factory.config.plugins import installed, names
+from factory.config.shapes import defaults_of, merged
+from factory.config.words import nearest
 from planners.data.batch import COMMANDS, Batch, Needs, TrainingData
 from tasks.world.arrays import FloatArray
 
@@ -74,6 +82,17 @@ class Planner(nn.Module, ABC):
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         """The losses: what a distributed wrapper calls."""
         return self.losses(batch)
+
+
+def read_array(path: str, setting: str) -> NDArray[Any]:
+    """The array in a .npy file. Raises ValueError naming the setting and the file."""
+    try:
+        loaded = np.load(Path(path), allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise ValueError(f"{setting}={path}: not readable as a .npy file: {error}") from error
+    if not isinstance(loaded, np.ndarray):
+        raise ValueError(f"{setting}={path}: expected one array, found an archive of several")
+    return loaded
 
 
 @contextmanager
@@ -135,3 +154,52 @@ def straight_on(batch: Batch) -> Tensor:
     velocity = batch.status[:, len(COMMANDS) : len(COMMANDS) + 2].float()
     ahead = (velocity**2).sum(-1, keepdim=True).sqrt() * times_s
     return torch.stack([ahead, torch.zeros_like(ahead), torch.zeros_like(ahead)], -1)
+
+
+BUILT_IN = {
+    "constant_velocity": "planners.models.baselines:ConstantVelocity",
+    "ego_mlp": "planners.models.baselines:EgoMlp",
+    "ego_mlp_bev": "planners.models.baselines:EgoMlpBev",
+    "ltf": "planners.models.ltf:Ltf",
+    "diffusiondrive": "planners.models.diffusiondrive:DiffusionDrive",
+    "gtrs_dense": "planners.models.gtrs_dense:GtrsDense",
+}
+OWN = "my.module:MyPlanner"  # how a class of the user's own is named
+
+
+@dataclass(frozen=True)
+class PlannerChoice:
+    """A planner and its settings, as conf/planner/*.yaml and checkpoints name it."""
+
+    name: str  # one of BUILT_IN, of an installed package's, or my.module:MyPlanner
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
+def planner_class(name: str) -> type[Planner]:
+    """The class of a planner. Raises ConfigError where there is none of that name."""
+    plugin = installed("planner", name, BUILT_IN)
+    target = BUILT_IN.get(name, name) if plugin is None else plugin.reference
+    if ":" not in target:
+        known = [*BUILT_IN, *names("planner")]
+        meant = nearest(name, known)
+        raise ConfigError(f"planner.name={name}: none of {', '.join(known)}{meant}; or name a class, {OWN}")
+    cls: Any = object_named(target, "planner.name", OWN)
+    if not (isinstance(cls, type) and issubclass(cls, Planner)):
+        raise ConfigError(f"planner.name={name} is not a planners.models.planner.Planner")
+    return cls
+
+
+def settings_of(choice: PlannerChoice) -> Any:
+    """The planner's own settings, its defaults for what is not named. Raises ConfigError for one it does not have."""
+    shape = planner_class(choice.name).settings_type
+    return fill(shape, merged(defaults_of(shape), choice.settings), "planner.settings")
+
+
+def build_planner(choice: PlannerChoice, arrays: Mapping[str, FloatArray]) -> Planner:
+    """The planner around its fixed arrays. Raises ConfigError."""
+    try:
+        planner = planner_class(choice.name)(settings_of(choice), arrays)
+    except ValueError as error:
+        raise ConfigError(f"planner {choice.name}: {error}") from error
+    planner.chosen_as = choice.name
+    return planner

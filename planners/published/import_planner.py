@@ -25,8 +25,7 @@ from factory.config.compose import ConfigError, compose, fill
 from factory.config.words import SHOW, without_show
 from planners.command import command
 from planners.models.gtrs_dense import GtrsDenseSettings, inference_arrays
-from planners.models.planner import Planner
-from planners.models.registry import PlannerChoice, build_planner, settings_of
+from planners.models.planner import Planner, PlannerChoice, build_planner, settings_of
 from planners.published.weights import FAMILIES, Moves, read_public
 from planners.training.checkpoint import FOLDER, put_weights, save_checkpoint
 from planners.training.train import PlannerEntry

@@ -16,8 +16,7 @@ from torch import Tensor
 from factory.config.compose import ConfigError
 from factory.exports.navsim.rewards import METRICS
 from factory.readers.torch_file import load_tensors
-from planners.models.anchors import WAYPOINTS
-from planners.models.diffusiondrive import POINT_FEATURES, DiffusionDriveSettings
+from planners.models.diffusiondrive import POINT_FEATURES, WAYPOINTS, DiffusionDriveSettings
 from planners.models.gtrs_dense import IMITATION, GtrsDenseSettings
 from planners.models.ltf import LtfSettings
 from tasks.world.arrays import FloatArray
@@ -61,7 +60,7 @@ class Moves:
             self.came_from[f"{ours}.{kind}"] = parts
 
     def attention(self, name: str, ours: str) -> None:
-        """torch's MultiheadAttention, whose three maps are one, as planners.models.attention.Attention."""
+        """torch's MultiheadAttention, whose three maps are one, as planners.models.layers.Attention."""
         for kind in ("weight", "bias"):
             whole = self._taken(f"{name}.in_proj_{kind}")
             for part, values in zip(("query", "key", "value"), whole.chunk(3)):
@@ -70,7 +69,7 @@ class Moves:
         self.layer(f"{name}.out_proj", f"{ours}.out")
 
     def decoder(self, name: str, ours: str) -> None:
-        """torch's TransformerDecoder as planners.models.attention.Decoder."""
+        """torch's TransformerDecoder as planners.models.layers.Decoder."""
         numbers = sorted({int(key.removeprefix(f"{name}.layers.").split(".")[0]) for key in self._under(name)})
         for number in numbers:
             theirs, here = f"{name}.layers.{number}", f"{ours}.layers.{number}"

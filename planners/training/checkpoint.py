@@ -29,8 +29,7 @@ from torch import Tensor
 from factory.config.compose import ConfigError
 from factory.readers.torch_file import load_tensors
 from factory.wording import one_line
-from planners.models.planner import Planner
-from planners.models.registry import PlannerChoice, build_planner, planner_class
+from planners.models.planner import Planner, PlannerChoice, build_planner, planner_class
 from tasks.sealed import MEMBER, sealed_json, unsealed_json
 from tasks.world.arrays import FloatArray
 

@@ -32,8 +32,7 @@ from planners.data.index import Dataset, DataSettings
 from planners.data.loader import Loader
 from planners.data.mix import MixSettings, fitting_batch
 from planners.models.backbones import load_pretrained, set_recompute
-from planners.models.planner import Planner
-from planners.models.registry import PlannerChoice, build_planner, planner_class, settings_of
+from planners.models.planner import Planner, PlannerChoice, build_planner, planner_class, settings_of
 from planners.training.checkpoint import (
     Keep,
     as_record,

@@ -17,8 +17,7 @@ import torch
 
 from factory.config.compose import compose, fill
 from planners.data.batch import Batch, Needs
-from planners.models.planner import Planner
-from planners.models.registry import planner_class, settings_of
+from planners.models.planner import Planner, planner_class, settings_of
 from planners.training.optim import build_optimiser
 from planners.training.train import PlannerEntry
 from tasks.subscores import LABELLED

@@ -20,7 +20,7 @@ from factory.config.run import composed_run, load_config
 from factory.run import main as run_main
 from factory.store.reader import SampleTable
 from planners.evaluation.planner_names import planner_of
-from planners.models.registry import planner_class
+from planners.models.planner import planner_class
 from planners.training.train import main as train_main
 from tasks.kernels.compiled import cache_dir
 

@@ -7,7 +7,7 @@ import torch
 
 from planners.data.batch import Batch, BevLayout, ImageLayout
 from planners.models.backbones import BackboneSettings
-from planners.models.transfuser import FusionSettings
+from planners.models.layers import FusionSettings
 from tasks.reward.label_bytes import VocabularyLabels
 
 PICTURE = ImageLayout(width=64, height=32)

@@ -2,7 +2,7 @@
 
 import torch
 
-from planners.models.attention import Decoder
+from planners.models.layers import Decoder
 
 
 def test_one_set_of_queries_stands_for_as_many_as_there_are_memories() -> None:

@@ -8,7 +8,7 @@ import torch
 from torch.nn import functional as F
 
 from planners.data.bev import BevClass
-from planners.models.auxiliary import N_CLASSES, AgentHead, BevHead, agent_losses, bev_loss
+from planners.models.layers import N_CLASSES, AgentHead, BevHead, agent_losses, bev_loss
 
 SURE = 50.0
 

@@ -7,11 +7,12 @@ import pytest
 import torch
 
 from planners.data.batch import BevLayout
-from planners.models.anchors import checked_anchors, cluster_anchors, read_array
 from planners.models.diffusiondrive import (
     FOCAL_ALPHA,
     DiffusionDecoder,
     DiffusionDriveSettings,
+    checked_anchors,
+    cluster_anchors,
     focal,
     from_unit,
     kept,
@@ -21,6 +22,7 @@ from planners.models.diffusiondrive import (
     to_unit,
     waves,
 )
+from planners.models.planner import read_array
 
 
 def test_anchors_are_the_means_of_well_separated_clusters() -> None:

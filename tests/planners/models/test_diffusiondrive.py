@@ -10,8 +10,7 @@ from torch import Tensor
 
 from factory.config.compose import conf_dir, fill
 from planners.data.batch import Batch, BevLayout, ImageLayout
-from planners.models.anchors import cluster_anchors
-from planners.models.diffusiondrive import DiffusionDrive, DiffusionDriveSettings, from_unit, to_unit
+from planners.models.diffusiondrive import DiffusionDrive, DiffusionDriveSettings, cluster_anchors, from_unit, to_unit
 from planners.models.planner import TrainingData
 from planners.training.optim import TrainingSettings
 from tests.planners import scenes

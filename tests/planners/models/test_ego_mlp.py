@@ -7,8 +7,14 @@ import torch
 from torch import nn
 
 from planners.data.batch import Batch, BevLayout, Needs
-from planners.models.constant_velocity import ConstantVelocity, ConstantVelocitySettings
-from planners.models.ego_mlp import EgoMlp, EgoMlpBev, EgoMlpBevSettings, EgoMlpSettings
+from planners.models.baselines import (
+    ConstantVelocity,
+    ConstantVelocitySettings,
+    EgoMlp,
+    EgoMlpBev,
+    EgoMlpBevSettings,
+    EgoMlpSettings,
+)
 from planners.models.planner import Planner
 from tests.planners.made_batch import made_batch
 

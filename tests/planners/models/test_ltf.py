@@ -12,9 +12,9 @@ from torch import nn
 
 from planners.data.batch import Batch, BevLayout, ImageLayout
 from planners.models.backbones import BackboneSettings, load_pretrained
-from planners.models.constant_velocity import ConstantVelocity, ConstantVelocitySettings
+from planners.models.baselines import ConstantVelocity, ConstantVelocitySettings
+from planners.models.layers import FusionSettings, LatentFusion
 from planners.models.ltf import Ltf, LtfSettings
-from planners.models.transfuser import FusionSettings, LatentFusion
 from tests.planners.made_batch import made_batch
 
 TINY = LtfSettings(

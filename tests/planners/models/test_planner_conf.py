@@ -8,9 +8,9 @@ import yaml
 
 from factory.config.compose import ConfigError, conf_dir, fill
 from planners.models.backbones import BackboneSettings
-from planners.models.ego_mlp import EgoMlpBevSettings, EgoMlpSettings
+from planners.models.baselines import EgoMlpBevSettings, EgoMlpSettings
 from planners.models.ltf import LtfSettings
-from planners.models.registry import PlannerChoice, build_planner, settings_of
+from planners.models.planner import PlannerChoice, build_planner, settings_of
 from planners.training.optim import TrainingSettings
 from tests.planners.made_batch import made_batch
 

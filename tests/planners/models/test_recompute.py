@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from planners.models.backbones import Backbone, BackboneSettings, build_backbone, set_recompute
-from planners.models.transfuser import FusionSettings, LatentFusion
+from planners.models.layers import FusionSettings, LatentFusion
 
 
 def learnt(settings: BackboneSettings, recompute: bool, size: int = 64) -> tuple[Backbone, Tensor, int]:

@@ -6,10 +6,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from planners.models.attention import Attention, Decoder, Layer
 from planners.models.backbones import BackboneSettings
-from planners.models.start import begin
-from planners.models.transfuser import FusionSettings, LatentFusion
+from planners.models.layers import Attention, Decoder, FusionSettings, LatentFusion, Layer, begin
 
 
 class Parts(nn.Module):

@@ -7,8 +7,7 @@ import torch
 import yaml
 
 from factory.config.compose import conf_dir
-from planners.models.planner import Planner
-from planners.models.registry import PlannerChoice, build_planner
+from planners.models.planner import Planner, PlannerChoice, build_planner
 from planners.training.checkpoint import save_checkpoint
 from tasks.world.arrays import FloatArray
 from tests.planners import scenes

@@ -15,8 +15,7 @@ from planners.data.batch import Batch
 from planners.models.diffusiondrive import DiffusionDrive, EncodedScene
 from planners.models.gtrs_dense import IMITATION, WEIGHTINGS, GtrsDense, total
 from planners.models.ltf import Ltf
-from planners.models.planner import Planner, evaluating
-from planners.models.registry import PlannerChoice
+from planners.models.planner import Planner, PlannerChoice, evaluating
 from planners.published.import_planner import Imported, imported
 from planners.published.weights import SCORES
 from planners.training.train import PlannerEntry

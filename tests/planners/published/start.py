@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from planners.models.registry import build_planner
+from planners.models.planner import build_planner
 from tasks.world.arrays import Array
 from tests.planners.published.ours import preset
 

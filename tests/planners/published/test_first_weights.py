@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import nn
 
-from planners.models.registry import build_planner
+from planners.models.planner import build_planner
 from tests.planners.published.formula import inputs
 from tests.planners.published.ours import preset
 from tests.planners.published.start import Start, apart, our_start, read_start, start_of

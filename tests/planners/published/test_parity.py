@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from factory.config.compose import ConfigError
-from planners.models.registry import PlannerChoice
+from planners.models.planner import PlannerChoice
 from planners.published.import_planner import imported
 from tests.planners.published.formula import FROZEN, inputs
 from tests.planners.published.ours import (

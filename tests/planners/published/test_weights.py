@@ -10,8 +10,8 @@ import torch
 from torch import nn
 
 from factory.config.compose import ConfigError
-from planners.models.attention import Decoder
 from planners.models.diffusiondrive import waves
+from planners.models.layers import Decoder
 from planners.published.weights import Moves, _points_reordered, model_weights, read_public
 
 

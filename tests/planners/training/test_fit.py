@@ -16,7 +16,7 @@ import torch
 from factory.config.compose import ConfigError
 from planners.command import Stopped
 from planners.data.batch import Batch
-from planners.models.registry import PlannerChoice, build_planner
+from planners.models.planner import PlannerChoice, build_planner
 from planners.training.checkpoint import (
     Keep,
     best,

@@ -6,7 +6,7 @@ import pytest
 from torch import nn
 
 from planners.models.backbones import BackboneSettings
-from planners.models.transfuser import FusionSettings, LatentFusion
+from planners.models.layers import FusionSettings, LatentFusion
 from planners.training.optim import TrainingSettings, build_optimiser, learning_rate, set_rate
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from factory.config.compose import compose, fill
 from planners.models.ltf import LtfSettings
-from planners.models.registry import settings_of
+from planners.models.planner import settings_of
 from planners.training.checkpoint import load_planner, newest, read_record
 from planners.training.train import PlannerEntry, main
 from tests.pages import commands

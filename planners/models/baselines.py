@@ -1,7 +1,7 @@
-"""Planners without eyes: one that knows its own speed and command only, and one that is shown the world from above.
+"""Planners without eyes: one that goes straight on, one that knows its own speed and command, one that sees from above.
 
-The first is the public EgoStatusMLP of NAVSIM, whose defaults these are: what it scores is what a sample's ego status
-gives away. The second sees a raster of the labelled world and is named after it, so that nobody takes it for the first.
+The second is the public EgoStatusMLP of NAVSIM, whose defaults these are: what it scores is what a sample's ego status
+gives away. The third sees a raster of the labelled world and is named after it, so that nobody takes it for the second.
 """
 
 from collections.abc import Mapping
@@ -15,8 +15,34 @@ from torch.nn import functional as F
 
 from planners.data.batch import Batch, BevLayout, Needs
 from planners.data.bev import BevClass
-from planners.models.planner import PlanFrom, Planner, evaluating, imitation_l1, planned_from
+from planners.models.planner import PlanFrom, Planner, evaluating, imitation_l1, planned_from, straight_on
 from tasks.world.arrays import FloatArray
+
+
+@dataclass(frozen=True)
+class ConstantVelocitySettings:
+    """Nothing to set."""
+
+
+class ConstantVelocity(Planner):
+    """Speed stays, the heading does not turn; learns nothing: the least that a planner may do."""
+
+    name: ClassVar[str] = "constant_velocity"
+    settings_type = ConstantVelocitySettings
+
+    def __init__(self, settings: ConstantVelocitySettings, arrays: Mapping[str, FloatArray]) -> None:
+        super().__init__(settings, arrays)
+
+    @property
+    def needs(self) -> Needs:
+        return Needs()
+
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
+        """Raises ValueError: there is nothing to train."""
+        raise ValueError("constant_velocity has nothing to train: evaluate it as it is")
+
+    def plan(self, batch: Batch) -> Tensor:
+        return straight_on(batch)
 
 
 @dataclass(frozen=True)
