@@ -18,8 +18,8 @@ from factory.store.columns import Column
 from factory.store.reader import TIME_TOLERANCE_S, labels_of
 from factory.store.schema import COLUMNS, LABEL_COLUMNS
 from planners.data.batch import COMMANDS, Batch, BevLayout, ImageLayout, Needs
-from planners.data.feed import AGENT_COLUMNS, BEV_COLUMNS
 from planners.data.images import stitch
+from planners.data.index import AGENT_COLUMNS, BEV_COLUMNS
 from tasks.reward.label_bytes import CRC_BYTES
 from tasks.subscores import LABELLED
 from tasks.world.arrays import Bools, Bytes

@@ -18,8 +18,8 @@ from factory.store.schema import LABEL_COLUMNS, NOW_INDEX, SCHEMA
 from planners.data.batch import Batch, BevLayout, ImageLayout, Needs
 from planners.data.bev import bev_raster
 from planners.data.decode import BatchBuffer, StoredRows
-from planners.data.feed import BEV_COLUMNS
 from planners.data.images import stitched
+from planners.data.index import BEV_COLUMNS
 from planners.evaluation.frames import LOGGED_KINDS
 from tasks.world.arrays import Bytes
 

@@ -27,8 +27,7 @@ import torch
 from factory.config.compose import ConfigError, compose, fill
 from factory.config.shapes import GIVE, defaults_of, merged, plain
 from planners.command import command
-from planners.data.feed import open_data
-from planners.data.index import Dataset, DataSettings
+from planners.data.index import Dataset, DataSettings, open_data
 from planners.data.loader import Loader
 from planners.data.mix import MixSettings, fitting_batch
 from planners.models.backbones import load_pretrained, set_recompute

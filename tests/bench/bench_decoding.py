@@ -24,12 +24,10 @@ import simplejpeg
 import torch
 
 from planners.data.batch import ImageLayout, Needs
-from planners.data.feed import open_data
-from planners.data.images import stitch
-from planners.data.index import Dataset, DataSettings
+from planners.data.images import DecodedPictures, key_of, stitch
+from planners.data.index import Dataset, DataSettings, open_data
 from planners.data.loader import Loader
 from planners.data.mix import MixSettings
-from planners.data.pictures import DecodedPictures, key_of
 from tasks.world.arrays import Bytes
 from tests.bench.bench_loader import views
 from tests.bench.timing import least_and_median_cpu_ms

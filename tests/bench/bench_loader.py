@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 
 from factory.store.reader import TIME_TOLERANCE_S, SampleTable
 from planners.data.batch import ImageLayout, Needs
-from planners.data.feed import make_feed, open_data
-from planners.data.index import DataSettings
+from planners.data.index import DataSettings, make_feed, open_data
 from planners.data.loader import Loader
 from planners.data.mix import MixSettings
 from tests.planners.samples import FRONT_YAWS, camera, jpeg, sample, write_table

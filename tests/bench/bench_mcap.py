@@ -15,8 +15,7 @@ from factory.store.mcap_shards.mirror import McapTable, write_mcap_shard
 from factory.store.reader import Format, SampleTable
 from factory.store.samples import Store
 from planners.data.batch import ImageLayout, Needs
-from planners.data.feed import open_data
-from planners.data.index import DataSettings
+from planners.data.index import DataSettings, open_data
 from planners.data.loader import Loader
 from planners.data.mix import MixSettings
 from tests.planners.samples import FRONT_YAWS, jpeg, labels, pictures, sample, write_table

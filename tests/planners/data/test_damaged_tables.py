@@ -2,8 +2,7 @@
 
 from pathlib import Path
 
-from planners.data.feed import open_data
-from planners.data.index import DataSettings
+from planners.data.index import DataSettings, open_data
 from planners.data.loader import Loader
 from planners.data.mix import MixSettings
 from tests.factory.damage import damaged

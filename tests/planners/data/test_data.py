@@ -9,8 +9,7 @@ import pytest
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
 from planners.data.batch import BevLayout, ImageLayout, Needs
-from planners.data.feed import make_feed, mixed_samples, open_data
-from planners.data.index import Dataset, DataSettings
+from planners.data.index import Dataset, DataSettings, make_feed, mixed_samples, open_data
 from planners.data.mix import MixSettings, Weights
 from tests.planners.samples import FRONT_YAWS, grey_pictures, jpeg, pictures, plain, sample, write_table
 

@@ -12,9 +12,9 @@ from factory.store.schema import COLUMNS, LABEL_COLUMNS
 from planners.data.batch import COMMANDS, BevLayout, ImageLayout, Needs
 from planners.data.bev import bev_raster, nearest_agents
 from planners.data.decode import BatchBuffer, StoredRows, count_labels
-from planners.data.feed import BEV_COLUMNS, PLAN_COLUMNS
 from planners.data.files import Footers, files_of, group_bytes, leaves
 from planners.data.images import stitched
+from planners.data.index import BEV_COLUMNS, PLAN_COLUMNS
 from tasks.reward.label_bytes import VocabularyLabels
 from tasks.world.agents import AgentKind
 from tests.planners.samples import grey_pictures, labels, sample, write_table

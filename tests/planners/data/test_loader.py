@@ -15,10 +15,9 @@ import pytest
 import torch
 
 from planners.data.batch import Batch, ImageLayout, Needs
-from planners.data.feed import open_data
 from planners.data.files import SampleFile
 from planners.data.images import stitch
-from planners.data.index import Dataset, DataSettings
+from planners.data.index import Dataset, DataSettings, open_data
 from planners.data.loader import Loader
 from planners.data.mix import MixSettings, Weights, make_order
 from tests.factory.store.test_store_s3 import BUCKET, s3
@@ -228,7 +227,7 @@ def counted_pictures(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         decoded.append(1)
         stitch(*arguments)
 
-    monkeypatch.setattr("planners.data.windows.stitch", watched)
+    monkeypatch.setattr("planners.data.loader.stitch", watched)
     return decoded
 
 

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 from planners.data.batch import BevLayout, Needs
-from planners.data.feed import make_feed, open_data
-from planners.data.index import DataSettings
-from planners.data.loader import Loader
-from planners.data.local_copy import LocalCopy, copies_of
+from planners.data.files import LocalCopy
+from planners.data.index import DataSettings, make_feed, open_data
+from planners.data.loader import Loader, copies_of
 from planners.data.mix import MixSettings
 from tasks.world.agents import AgentKind
 from tests.factory.store.test_store_s3 import BUCKET, s3

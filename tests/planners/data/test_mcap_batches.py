@@ -10,9 +10,8 @@ from factory.store.location import Location
 from factory.store.mcap_shards.mirror import McapTable, write_mcap_shard
 from factory.store.samples import Store
 from planners.data.batch import BevLayout, Needs
-from planners.data.feed import open_data
 from planners.data.files import files_of
-from planners.data.index import DataSettings
+from planners.data.index import DataSettings, open_data
 from planners.data.loader import Loader
 from planners.data.mix import MixSettings
 from tests.planners.data.test_loader import BATCH, PICTURE, assert_same, rows, windows

@@ -9,12 +9,10 @@ import numpy as np
 import pytest
 
 from planners.data.batch import ImageLayout, Needs
-from planners.data.feed import open_data
-from planners.data.images import stitch
-from planners.data.index import DataSettings
+from planners.data.images import CHECKSUM_BYTES, GB, PARTS, DecodedPictures, key_of, stitch
+from planners.data.index import DataSettings, open_data
 from planners.data.loader import Loader
 from planners.data.mix import MixSettings
-from planners.data.pictures import CHECKSUM_BYTES, GB, PARTS, DecodedPictures, key_of
 from tasks.world.arrays import Bytes
 from tests.planners.samples import Pixels, grey_pictures, jpeg, plain, sample, write_table
 
@@ -50,7 +48,7 @@ def kept(tmp_path: Path) -> DecodedPictures:
 def no_decoder(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Names of what was asked of the decoder after all."""
     asked: list[str] = []
-    monkeypatch.setattr("planners.data.pictures.stitch", lambda *given: asked.append("stitch"))
+    monkeypatch.setattr("planners.data.images.stitch", lambda *given: asked.append("stitch"))
     return asked
 
 
@@ -58,7 +56,7 @@ def test_a_kept_picture_is_the_decoded_one_and_is_not_decoded_again(
     kept: DecodedPictures, no_decoder: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patched:
-        patched.setattr("planners.data.pictures.stitch", stitch)
+        patched.setattr("planners.data.images.stitch", stitch)
         assert (decoded(views(0), kept) == decoded(views(0))).all()
     assert (decoded(views(0), kept) == decoded(views(0))).all() and not no_decoder
     assert (decoded(views(1), kept) == 99).all() and no_decoder == ["stitch"]
@@ -85,7 +83,7 @@ def test_other_content_or_another_layout_is_another_picture(kept: DecodedPicture
 def test_a_damaged_entry_is_made_again(kept: DecodedPictures, damage: str, no_decoder: list[str]) -> None:
     path = entry_of(kept, views(0))
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("planners.data.pictures.stitch", stitch)
+        patched.setattr("planners.data.images.stitch", stitch)
         decoded(views(0), kept)
         whole = path.read_bytes()
         decoded(views(1), kept)
@@ -158,7 +156,7 @@ def test_batches_are_the_same_with_and_without(tmp_path: Path, workers: int, no_
     mix = MixSettings(shuffle_mb=1)
     expected = [batch.image for batch in Loader(plain_data, needs, mix, 8, workers=workers).epoch(0)]
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("planners.data.pictures.stitch", stitch)
+        patched.setattr("planners.data.images.stitch", stitch)
         first = Loader(data, needs, mix, 8, workers=workers)
         for batch, image in zip(first.epoch(0), expected, strict=True):
             assert batch.image is not None and image is not None and batch.image.equal(image)
