@@ -1,6 +1,6 @@
 """`python -m planners serve planner=<training>`: plans for NAVSIM's own evaluation, whose agent starts this.
 
-planners.navsim.agent.FactoryAgent asks on standard input and reads the plans on standard output (planners.navsim.wire).
+planners.navsim.agent.FactoryAgent asks on standard input and reads the plans on standard output.
 Nobody starts it by hand; what it prints goes to standard error.
 
 planner=     a training's folder, a+b, constant_velocity, or my.module:MyPlanner; it looks at pictures and status alone
@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from factory.config.arguments import Refused
+from planners.navsim.agent import receive, send
 from planners.navsim.pilot import Pilot, seen_of
-from planners.navsim.wire import receive, send
 
 
 @dataclass(frozen=True)

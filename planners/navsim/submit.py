@@ -19,21 +19,238 @@ fine=        true: 40 poses 0.1 s apart; without it 8 poses 0.5 s apart
 device=, cameras=, undistort=     as the agent takes them (docs/training.md)
 """
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from factory.config.arguments import Refused
+from factory.exports.navsim.pickles import dumps
 from factory.graph.progress import Counter
 from factory.readers.base import BadClip
-from factory.readers.navsim.filters import read_selection
+from factory.readers.navsim.filters import SceneFilter, Selection, read_selection
+from factory.readers.navsim.log import Frame, read_frames
+from factory.readers.navsim.reader import log_files
+from factory.readers.navsim.rig import blobs_of, rig_of
+from factory.readers.navsim.synthetic import read_scene_pickle
+from factory.readers.navsim.windows import Choice, FrameTable, table_at, wanted_windows
+from factory.stages.sensors import decode_image
 from factory.wording import one_line
-from planners.navsim.pilot import Pilot
-from planners.navsim.split import ShownScene, scenes_of
-from planners.navsim.submission import Team, submission_bytes
+from planners.data.batch import COMMANDS
+from planners.navsim.agent import HISTORY
+from planners.navsim.pilot import CameraShot, Pilot, Sighting
 from tasks.caches import user_cache
 from tasks.kernels.compiled import write_whole
 from tasks.world.arrays import Array
+from tasks.world.frames import to_local
+
+SCENES, BLOBS = "synthetic_scene_pickles", "sensor_blobs"  # of navhard_two_stage and its like
+
+
+@dataclass(frozen=True)
+class ShownScene:
+    """One scene up to now."""
+
+    token: str  # of the frame at now
+    frames: tuple[Frame, ...]  # HISTORY, now the last
+    sensors: Path | None  # folder of their pictures
+    file: str  # that they were read from
+
+    def sighting(self, cameras: Sequence[str]) -> Sighting:
+        """What an agent is shown, with these cameras at now, left to right. Raises BadClip."""
+        now = self.frames[-1]
+        history = to_local(now.pose, np.stack([frame.pose for frame in self.frames]))
+        one_hot = np.array([one == now.command for one in COMMANDS])
+        status = np.concatenate([one_hot, now.dynamic_state])
+        return Sighting(history.astype(np.float32), status.astype(np.float32), self._views(cameras))
+
+    def _views(self, names: Sequence[str]) -> tuple[CameraShot, ...]:
+        if not names:
+            return ()
+        assert self.sensors is not None
+        own = {camera.name.lower(): camera for camera in self.frames[-1].cameras}
+        if lacking := [name for name in names if name not in own]:
+            raise BadClip(self.file, f"token {self.token}", f"the frame names no picture of {', '.join(lacking)}")
+        now = replace(self.frames[-1], cameras=tuple(own[name] for name in names))
+        images = blobs_of([now], self.sensors).images
+        if not images:
+            raise BadClip(str(self.sensors / now.cameras[0].path), "image", f"missing, of token {self.token}")
+        return tuple(
+            CameraShot(
+                replace(camera, name=camera.name.lower()),
+                decode_image(Path(image.uri).read_bytes(), image.uri, camera),
+            )
+            for camera, image in zip(rig_of(now, images, self.file), images)
+        )
+
+
+@dataclass(frozen=True)
+class SplitScenes:
+    """All scenes that a split names; none is open yet."""
+
+    logged: Mapping[Path, tuple[int, ...]]  # log -> its frames at now
+    final_tokens: frozenset[str]  # of the last frames of these scenes
+    synthetic: tuple[Path, ...]
+    scene_filter: SceneFilter
+    sensors: Path | None
+    not_scenes: int  # tokens that are in a log, where the filter's own rules make no scene of them
+
+    def __len__(self) -> int:
+        return sum(map(len, self.logged.values())) + len(self.synthetic)
+
+    def first_stage(self) -> Iterator[ShownScene]:
+        """Log by log, one open at a time. Raises BadClip."""
+        for path, windows in self.logged.items():
+            frames = read_frames(path).frames
+            for now in windows:
+                yield ShownScene(frames[now].token, frames[now - HISTORY + 1 : now + 1], self.sensors, str(path))
+
+    def second_stage(self) -> Iterator[ShownScene | None]:
+        """Scene by scene; None for one that the public loader leaves out. Raises BadClip."""
+        chosen = self.scene_filter
+        for path in self.synthetic:
+            scene = read_scene_pickle(path, as_shown=True)
+            if scene.token != path.stem:
+                raise BadClip(str(path), "scene_metadata.initial_token", f"is {scene.token}, the file's name another")
+            of_another_log = chosen.log_names is not None and scene.log_name not in chosen.log_names
+            named = chosen.synthetic_scene_tokens
+            wanted = scene.original_scene in self.final_tokens if named is None else scene.token in named
+            left_out = of_another_log or not wanted
+            blobs = path.parent.parent / BLOBS
+            yield None if left_out else ShownScene(scene.token, scene.frames, blobs, str(path))
+
+
+def scenes_of(
+    selection: Selection, logs: Path, sensors: Path | None, root: Path | None, cache_dir: Path
+) -> SplitScenes:
+    """The scenes of a split among these folders; root: of the second stage, as import navhard takes it.
+
+    What an agent is asked to plan, as the public loader chooses it: rules of navsim/common/dataloader.py:19-173
+    (autonomousvision/navsim @ 0a380a9). Only what an agent is shown is read: no map, no future, no annotation.
+    Raises ValueError where what the split names is not there, BadClip for a log that is broken.
+    """
+    chosen = selection.scene_filter
+    if chosen.num_history_frames != HISTORY:
+        raise ValueError(
+            f"{selection.name}: num_history_frames is {chosen.num_history_frames}; planners take {HISTORY}"
+        )
+    tables = _tables(logs, chosen.log_names, cache_dir)
+    tokens = None if chosen.tokens is None else frozenset(chosen.tokens)
+    logged: dict[Path, tuple[int, ...]] = {}
+    final: set[str] = set()
+    found = 0
+    for path, table in tables.items():
+        windows = wanted_windows(table, Choice(1, 0, 0.0, chosen), tokens)
+        if chosen.max_scenes is not None:
+            windows = windows[: max(chosen.max_scenes - found, 0)]
+        found += len(windows)
+        if windows:
+            logged[path] = tuple(windows)
+            final.update(table.tokens[np.array(windows) + chosen.num_future_frames].tolist())
+    if tokens is not None:
+        _refuse_absent(tokens - {str(token) for table in tables.values() for token in table.tokens}, len(tokens), logs)
+    not_scenes = 0 if tokens is None or chosen.max_scenes is not None else len(tokens) - found
+    return SplitScenes(logged, frozenset(final), _second_stage(selection, root), chosen, sensors, not_scenes)
+
+
+def _tables(logs: Path, names: Sequence[str] | None, cache_dir: Path) -> dict[Path, FrameTable]:
+    """Of all logs, or of those that are named, sorted by name."""
+    there = log_files(logs)
+    if names is not None and (lacking := sorted(set(names) - there.keys())):
+        raise ValueError(
+            f"logs={logs}: {len(lacking)} of the split's {len(names)} logs are not here, such as {lacking[0]}"
+        )
+    paths = [path for name, path in there.items() if names is None or name in set(names)]
+    return {path: table_at(path, cache_dir) for path in paths}
+
+
+def _refuse_absent(absent: Collection[str], n_tokens: int, logs: Path) -> None:
+    if absent:
+        raise ValueError(
+            f"logs={logs}: {len(absent)} of the split's {n_tokens} tokens are in no log here: {min(absent)}, ..."
+        )
+
+
+def _second_stage(selection: Selection, root: Path | None) -> tuple[Path, ...]:
+    chosen = selection.scene_filter
+    tokens = dict.fromkeys(chosen.reactive_synthetic_initial_tokens or ()) if chosen.include_synthetic_scenes else {}
+    if not tokens:
+        return ()
+    if root is None:
+        raise ValueError(f"root=... is missing: {selection.name} has {len(tokens)} scenes of a second stage")
+    paths = [root / SCENES / f"{token}.pkl" for token in tokens]
+    if lacking := [path for path in paths if not path.is_file()]:
+        raise ValueError(
+            f"{lacking[0]}: no such file; {len(lacking)} of the {len(paths)} scenes of the second stage are missing"
+        )
+    return tuple(paths)
+
+
+HORIZON_S = 4.0
+
+
+@dataclass(frozen=True)
+class TrajectorySampling:
+    """nuPlan's: both counts and times, whichever of them it was made of."""
+
+    num_poses: int
+    time_horizon: float  # s
+    interval_length: float  # s
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """NAVSIM's."""
+
+    poses: Array  # (P, 3) float32 x, y [m], heading [rad] in the ego frame at now
+    trajectory_sampling: TrajectorySampling
+
+
+PUBLIC_NAMES: Mapping[type, str] = {
+    Trajectory: "navsim.common.dataclasses Trajectory",
+    TrajectorySampling: "nuplan.planning.simulation.trajectory.trajectory_sampling TrajectorySampling",
+}
+
+
+@dataclass(frozen=True)
+class Team:
+    """Whose submission it is, by the leaderboard's form."""
+
+    team_name: str
+    authors: str
+    email: str
+    institution: str
+    country: str
+
+
+def submission_bytes(team: Team, first_stage: Mapping[str, Array], second_stage: Mapping[str, Array]) -> bytes:
+    """The file's content. Stages: token -> (8 or 40, 3) float32 poses of 4 s; the second is empty where there is none.
+
+    A pickle of NAVSIM's own classes, written where they are not installed: keys, nesting and types are those of
+    run_create_submission_pickle.py (autonomousvision/navsim @ 0a380a9, navsim/planning/script), and
+    `run_pdm_score_from_submission.py` scores it. The two classes here go by the names of the public ones, with the
+    public ones' fields. Raises ValueError for plans of different lengths.
+    """
+    counts = {len(plan) for plan in (*first_stage.values(), *second_stage.values())}
+    if len(counts) != 1:
+        raise ValueError(f"plans of {sorted(counts)} poses: a submission has one or more, all of one length")
+    (count,) = counts
+    sampling = TrajectorySampling(count, HORIZON_S, HORIZON_S / count)
+    first, second = (
+        {token: Trajectory(plan, sampling) for token, plan in stage.items()} for stage in (first_stage, second_stage)
+    )
+    content = {
+        "team_name": team.team_name,
+        "authors": team.authors,
+        "email": team.email,
+        "institution": team.institution,
+        "country / region": team.country,
+        "first_stage_predictions": [first],
+        "second_stage_predictions": [second],
+    }
+    return dumps(content, PUBLIC_NAMES)
+
 
 N_POSES, N_FINE_POSES = 8, 40
 

@@ -24,10 +24,8 @@ from planners.data.batch import Batch
 from planners.models.planner import Planner
 from planners.training.checkpoint import Keep, best, load_training, load_weights, read_record, save_checkpoint
 from planners.training.curves import Curves
-from planners.training.ema import RAW, Averaged
-from planners.training.optim import TrainingSettings, build_optimiser, learning_rate, set_rate
-from planners.training.processes import TrainingProcess
-from planners.training.sync_norm import synchronise
+from planners.training.optim import RAW, Averaged, TrainingSettings, build_optimiser, learning_rate, set_rate
+from planners.training.processes import TrainingProcess, synchronise
 
 STATE_VERSION = 1
 Precision = Literal["fp32", "bf16", "fp16"]  # fp16: gradients of a scaled loss, steps that overflow are left out

@@ -12,15 +12,14 @@ import pytest
 import yaml
 
 from planners.navsim import agent
-from planners.navsim.agent import RemotePlanner, shown
+from planners.navsim.agent import LENGTH, RemotePlanner, receive, send, shown
 from planners.navsim.pilot import FRONT, Pilot, seen_of
-from planners.navsim.wire import LENGTH, receive, send
 from tests.planners.navsim.agent_inputs import agent_input
 from tests.planners.navsim.trained import made, saved
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 IN_NAVSIM_S_PYTHON = ("tasks", "factory", "planners", "planners/navsim")  # and of the last what follows
-ITS_OWN = ("planners/navsim/agent.py", "planners/navsim/wire.py")
+ITS_OWN = ("planners/navsim/agent.py", "planners/navsim/agent.py")
 
 
 def test_messages_come_back_as_they_were_sent() -> None:
@@ -87,7 +86,7 @@ def test_what_runs_in_navsim_s_python_is_of_its_version_and_needs_numpy_alone() 
             assert "from __future__ import annotations" in text, f"{file}: 3.9 has no X | None"
             named = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
             ours = {name for name in named if name and name.startswith(("planners", "factory", "tasks"))}
-            assert ours <= {"planners.navsim.wire"}
+            assert ours <= {"planners.navsim.agent"}
 
 
 def test_the_agent_s_file_names_every_setting_of_it() -> None:

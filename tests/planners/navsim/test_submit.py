@@ -17,8 +17,7 @@ from factory.readers.restricted_pickle import Record, load_records
 from planners.__main__ import main as planners
 from planners.navsim.agent import shown
 from planners.navsim.pilot import FRONT, Pilot, seen_of
-from planners.navsim.split import scenes_of
-from planners.navsim.submission import Team, submission_bytes
+from planners.navsim.submit import Team, scenes_of, submission_bytes
 from tests.factory.readers.navsim import scene_pickles
 from tests.factory.readers.openscene_writer import write_frames
 from tests.planners.navsim import agent_inputs

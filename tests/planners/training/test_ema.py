@@ -9,9 +9,8 @@ from torch import Tensor
 
 from planners.command import Stopped
 from planners.training.checkpoint import load_planner, load_training, newest
-from planners.training.ema import RAW, Averaged
 from planners.training.fit import Loop, fit
-from planners.training.optim import TrainingSettings
+from planners.training.optim import RAW, Averaged, TrainingSettings
 from tests.planners.toy import Toy, ToyBatches, ToySettings
 from tests.planners.training.test_fit import ALONE, Interrupted, measured, rows
 

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from planners.data.batch import Batch
 from planners.training.checkpoint import WEIGHTS, checkpoints, load_training, newest, read_record
 from planners.training.curves import LOSSES
-from planners.training.ema import RAW
+from planners.training.optim import RAW
 from tests.planners.samples import sample, write_table
 from tests.planners.toy import Toy, ToySettings
 

@@ -14,8 +14,7 @@ from planners.models.backbones import BackboneSettings, build_backbone
 from planners.training.checkpoint import load_planner
 from planners.training.fit import Loop, fit
 from planners.training.optim import TrainingSettings
-from planners.training.processes import TrainingProcess, joined
-from planners.training.sync_norm import synchronise
+from planners.training.processes import TrainingProcess, joined, synchronise
 from tests.planners.toy import Toy, ToyBatches, ToySettings
 from tests.planners.training.test_world import in_two, sgd
 
