@@ -18,7 +18,6 @@ from factory.config.compose import ConfigError
 from factory.readers.torch_file import load_tensors
 from planners.published.import_planner import imported
 from planners.published.weights import read_public
-from tasks.world.arrays import Array
 from tests.planners.published.lesson import (
     Lesson,
     apart,
@@ -165,7 +164,7 @@ def write_lesson(lesson: Lesson, path: Path, first: int) -> None:
         "steps": lesson.steps,
         "double": lesson.double,
     }
-    given: dict[str, Array] = samples(lesson.picture)
+    given = samples(lesson.picture)
     np.savez(path, told=np.array(json.dumps(told)), order=lesson.order[:first], seeds=lesson.seeds, **given)
 
 
