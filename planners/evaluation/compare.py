@@ -21,9 +21,9 @@ import numpy as np
 
 from factory.config.compose import ConfigError, compose, fill
 from planners.command import command
+from planners.evaluation import navsim
 from planners.evaluation.aggregation import ClipResult, Measured, by_clip, check_same_clips, measured
 from planners.evaluation.bootstrap import LEVELS, Interval, clusters_of, paired_interval
-from planners.evaluation.public import held
 from planners.evaluation.score_rows import read_record, read_rows
 from planners.evaluation.score_table import FILTERS_NOTE
 from tasks.reward.one_stage import COLUMNS
@@ -42,7 +42,7 @@ class CompareSettings:
     out: str | None = None  # a CSV file
 
 
-Measure = held.Measure
+Measure = navsim.Measure
 ByLevel = Mapping[str, Interval]  # of planners.evaluation.bootstrap.LEVELS, those that are known
 
 
@@ -105,11 +105,11 @@ def is_clear_row(row: Mapping[str, Any]) -> bool:
 
 def compare_tables(a: Sequence[str], b: Sequence[str], settings: CompareSettings) -> dict[Measure, ByLevel]:
     """The same where a run is a table of NAVSIM's. Raises ConfigError."""
-    runs = held.read_side(a), held.read_side(b)
-    of_a, of_b = (held.measured_of(side, settings.column) for side in runs)
-    held.check_same_tokens(of_a, of_b)
+    runs = navsim.read_side(a), navsim.read_side(b)
+    of_a, of_b = (navsim.measured_of(side, settings.column) for side in runs)
+    navsim.check_same_tokens(of_a, of_b)
     found: dict[Measure, ByLevel] = dict(intervals(of_a, of_b, settings))
-    summaries = held.summaries(*runs, settings.column)
+    summaries = navsim.summaries(*runs, settings.column)
     return found | {name: {"clip": one} for name, one in summaries.items()}
 
 
@@ -127,7 +127,7 @@ def text_of(found: Mapping[Measure, ByLevel], confidence: float, of_tables: bool
         lines.append(f"{line}{'  *' if is_clear(by_level) else ''}".rstrip())
     lines.append(f"*: zero lies outside of each {percent} interval")
     if of_tables:
-        lines.append(held.NOTE)
+        lines.append(navsim.NOTE)
     elif "log" not in levels:
         lines.append("the runs do not say which log a clip is of: evaluate them again for intervals over logs")
     return "\n".join([*lines, *FILTERS_NOTE])
@@ -177,7 +177,7 @@ def main(argv: Sequence[str]) -> None:
     if settings.column not in COLUMNS:
         raise ConfigError(f"compare.column={settings.column}: one of {', '.join(COLUMNS)}")
     sides = [[side] if isinstance(side, str) else side for side in (settings.a, settings.b)]
-    if of_tables := any(map(held.is_table, [*sides[0], *sides[1]])):
+    if of_tables := any(map(navsim.is_table, [*sides[0], *sides[1]])):
         found = compare_tables(sides[0], sides[1], settings)
     else:
         a, b = (read_runs(side) for side in sides)

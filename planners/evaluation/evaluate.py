@@ -8,8 +8,8 @@
     python -m planners evaluate benchmark=navhard data=/data/openscene planner=runs/ltf
 
 The benchmark is the folder that `python -m factory.run preset=hard_benchmark` or `python -m factory import` made, or
-`navhard` or `navtest`, which are made of NAVSIM's folders first (planners/evaluation/public/by_name.py) and are among
-the public traffic unless `traffic@two_stage_traffic=` says otherwise. Who may stand under `planner=`, and what a
+`navhard` or `navtest`, which are made of NAVSIM's folders first (planners/evaluation/navsim.py) and are
+among the public traffic unless `traffic@two_stage_traffic=` says otherwise. Who may stand under `planner=`, and what a
 planner of one's own looks like, planners/evaluation/planner_names.py says. Every planner gets a folder: its plans, a
 row of sub-scores for each frame (frames.parquet, frames.csv), and record.json, written last. What is done is not
 planned or scored again unless it, the benchmark or the rules changed; the same command goes on after a kill. All
@@ -41,10 +41,9 @@ from planners.command import command
 from planners.evaluation.aggregation import SummaryLine, lines_of, summarise
 from planners.evaluation.benchmark_folder import BenchmarkFolder
 from planners.evaluation.frames import Benchmark, FrameKey
+from planners.evaluation.navsim import SPLITS, NavsimData, benchmark_by_name, write_tables
 from planners.evaluation.planner_names import EvaluatedPlanner, composed, needs_of, planners_of
 from planners.evaluation.planning import all_plans
-from planners.evaluation.public.by_name import SPLITS, NavsimData, benchmark_by_name
-from planners.evaluation.public.tables import write_tables
 from planners.evaluation.score_rows import RECORD, FrameRow, is_done, read_rows, write_record, write_rows
 from planners.evaluation.score_table import table_text, write_table
 from planners.evaluation.scoring import (

@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from planners.evaluation.compare import main
-from planners.evaluation.public.tables import read_table
+from planners.evaluation.navsim import read_table
 from tasks.reward.epdms import Scores
 from tasks.reward.one_stage import COLUMNS, FrameScores, columns_of, means_of, means_over
 from tasks.subscores import RECORDS

@@ -24,7 +24,7 @@ from factory.store.samples import Store
 from factory.store.schema import SAMPLES, sample_row_to_table
 from planners.evaluation.evaluate import main
 from planners.evaluation.frames import FrameKey
-from planners.evaluation.public.tables import LONG, read_table
+from planners.evaluation.navsim import LONG, read_table
 from tasks.hard_scenes import OneStageClip
 from tasks.reward.one_stage import COLUMNS
 from tasks.world.clip import scene_of_clip

@@ -1,7 +1,7 @@
 """The trainings of docs/reproduce.md run as the page has them, but of small planners on a small table.
 
 That every other command of the page is one its program takes is tests/test_readme.py's; checkpoints are imported in
-tests/planners/published, navhard and navtest evaluated by name in tests/planners/evaluation/public.
+tests/planners/published, navhard and navtest evaluated by name in tests/planners/evaluation.
 """
 
 from pathlib import Path

@@ -12,8 +12,8 @@ from planners.evaluation.aggregation import summarise
 from planners.evaluation.compare import main
 from planners.evaluation.evaluate import EvaluateSettings, evaluate
 from planners.evaluation.frames import FrameKey
+from planners.evaluation.navsim import file_name, read_table, score_of_columns, write_tables
 from planners.evaluation.planner_names import planners_of
-from planners.evaluation.public.tables import file_name, read_table, score_of_columns, write_tables
 from planners.evaluation.score_rows import FrameRow, read_rows
 from tasks.reward.one_stage import COLUMNS, FrameScores
 from tests.planners.small_benchmark import StreetBenchmark

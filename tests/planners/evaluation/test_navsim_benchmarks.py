@@ -7,8 +7,7 @@ import pytest
 import yaml
 
 from planners.evaluation.evaluate import main
-from planners.evaluation.public.by_name import IN_DEVKIT
-from planners.evaluation.public.tables import read_table
+from planners.evaluation.navsim import IN_DEVKIT, read_table
 from tests.factory.imports.navsim_town import NOW, TOKENS, frames_of, write_installation
 
 pytestmark = pytest.mark.slow  # a town, a city's map, PDM-Closed
