@@ -116,7 +116,7 @@ def isolates(config: RunConfig) -> bool:
     """Whether executor=local works in a process of its own: where asked for, a plug-in works, or logs can do harm."""
     used = [config.clips, *(spec for name, spec in config.expert.items() if name in config.experts)]
     foreign = any(not str(spec.get("_target_", "")).startswith(("factory.", "tasks.")) for spec in used)
-    foreign |= config.traffic.mode == "learned" and not config.traffic.policy.startswith("tasks.")
+    foreign |= config.traffic.policy is not None
     foreign |= bool(getattr(class_of(config.clips, "clips", "my_package.MyReader"), "untrusted", False))
     return config.graph.isolated == "always" or (config.graph.isolated == "auto" and foreign)
 

@@ -25,7 +25,7 @@ from planners.training.checkpoint import load_planner
 from planners.training.train import main as train_main
 from tasks.experts.protocol import Plan
 from tasks.kernels.compiled import cache_dir
-from tasks.rollout.learned.policy import told
+from tasks.rollout.policy import traffic_record
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out
 from tasks.stages import Rejected
 from tasks.world.clip import scene_of_clip
@@ -111,7 +111,7 @@ def test_a_planner_is_its_class_and_a_file_of_its_settings(tmp_path: Path) -> No
 
 def test_a_traffic_policy_is_a_class_that_the_settings_name() -> None:
     """It slows down behind the ego that stands ahead, its rear at x = 20.9, and keeps its speed where nobody does."""
-    settings = TrafficSettings(mode="learned", policy="examples.keep_gap:KeepGap")
+    settings = TrafficSettings(mode="custom", policy="examples.keep_gap:KeepGap")
     scene = worlds.scene(worlds.straight_road(), Track(0.0, speed=8.0), ego=(22.0, 0.0, 0.0))
     ego = np.repeat(scene.ego_state[None], 41, axis=0)
     behind, free = (
@@ -119,7 +119,16 @@ def test_a_traffic_policy_is_a_class_that_the_settings_name() -> None:
     )
     assert free.velocities[:, 0, 0] == pytest.approx(8.0) and free.boxes[-1, 0, 0] == pytest.approx(32.0)
     assert behind.velocities[-1, 0, 0] < 1.0 and behind.boxes[-1, 0, 0] + 2.3 < 20.8
-    assert told(settings) | {"weights": KeepGap().digest()} == told(settings)
+    assert traffic_record(settings)["policy"] == f"examples.keep_gap:KeepGap {KeepGap().digest()}"
+
+
+@pytest.mark.slow
+def test_a_run_among_its_traffic_writes_samples(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    few = ("clips.n_clips=1", "clips.settings.cameras=[]", "clips.settings.lidar_beams=0", "vocabulary.k=256")
+    plain = ("render=none", "reward.labels=none", "executor=local", "experts=[pdm_closed]", f"out={out}")
+    assert run_main([*few, *plain, "traffic=custom", "traffic.policy=examples.keep_gap:KeepGap"]) == 0
+    assert len(SampleTable(out)) > 0
 
 
 @pytest.mark.slow

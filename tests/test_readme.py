@@ -40,7 +40,6 @@ from planners.explore.alternate import AlternateSettings
 from planners.explore.settings import settings_of as explore_settings
 from planners.models.planner import settings_of
 from planners.published.import_planner import config_of as import_config
-from planners.traffic.train_traffic import settings_of as traffic_settings
 from planners.training.train import TrainConfig
 from tasks.caches import user_cache
 from tasks.kernels.compiled import cache_dir
@@ -179,8 +178,6 @@ def test_every_command_is_one_its_program_takes(
             *arguments,
         ]:
             fill(TrainConfig, compose("train", given(arguments)), "train")
-        case ["python", "-m", "planners", "train_traffic", *arguments]:
-            traffic_settings(arguments)
         case ["python", "-m", "planners", "import", *arguments]:
             settings_of(import_config(given(arguments)).planner)
         case ["python", "-m", "planners", "evaluate" | "ensemble", *arguments]:

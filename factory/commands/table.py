@@ -73,7 +73,6 @@ COMMANDS: Mapping[str, Command] = {
 PLANNERS: Mapping[str, Command] = {
     "train": Command("fit a planner to logged and simulated samples", "planners.training.train"),
     "import": Command("a released checkpoint of the public code as ours", "planners.published.import_planner"),
-    "train_traffic": Command("fit a traffic policy to logs, for traffic=learned", "planners.traffic.train_traffic"),
     "evaluate": Command("EPDMS of planners on held-out clips", "planners.evaluation.evaluate"),
     "compare": Command("how two planners differ, with intervals", "planners.evaluation.compare"),
     "serve": Command("plans for NAVSIM's own evaluation, whose agent asks", "planners.navsim.serve"),

@@ -36,7 +36,7 @@ from tasks.stages import FRAMES, TASKS
 MOST_K = 2**17  # of a kinematic vocabulary: 126 MB of trajectories, eight times the largest in use
 AV2 = "factory.readers.av2.reader.AV2Reader"
 SCENARIONET = "factory.readers.scenarionet.reader.ScenarioNetReader"
-LabelTraffic = Literal["replay", "idm", "navsim", "learned"]
+LabelTraffic = Literal["replay", "idm", "navsim"]
 READERS: Mapping[str, type[Any]] = {  # `_target_` of a built-in reader -> its settings
     AV2: LogClips,
     "factory.readers.navsim.reader.NavsimReader": NavsimClips,
@@ -215,8 +215,6 @@ class RunConfig:
             raise ValueError("sample.candidates=weak and perturb.order=spread are two orders: choose one")
         if not 0.0 <= self.gpu_share <= 1.0:
             raise ValueError(f"gpu_share={self.gpu_share}: the share of one GPU that a task which draws claims, 0 to 1")
-        if self.traffic.weights is not None and "learned" not in (self.traffic.mode, self.reward.traffic):
-            raise ValueError(f"traffic.weights={self.traffic.weights} is for traffic=learned: leave one out")
         known = sorted({*self.expert, *FRAMES})
         unknown = [name for name in self.experts if name not in known]
         if unknown:

@@ -38,7 +38,7 @@ from tasks.render.settings import REMOVED, RenderMode
 from tasks.render.splatting.gsplat_backend import BackendMissing
 from tasks.reward.labels import Labelling
 from tasks.rollout import settings as traffic
-from tasks.rollout.learned.policy import told
+from tasks.rollout.policy import traffic_record
 from tasks.stages import FRAMES, stage_versions
 from tasks.world.kinematic_vocabulary import kinematic_trajectories
 from tasks.world.vocabulary import Vocabulary
@@ -134,8 +134,7 @@ def assemble(config: RunConfig) -> Run:
         labelling = choose_labelling(config, vocabulary)
         explored = choose_explored(config)
         sampled = choose_sample(config)
-        for chosen in (config.traffic, *(() if labelling is None else (labelling.traffic,))):
-            told(chosen)  # of a policy: whether there is one
+        traffic_record(config.traffic)  # whether there is its policy
         experts = {
             name: build_expert(RunContext(config, name, opened)) for name in config.experts if name not in FRAMES
         }
@@ -199,7 +198,7 @@ def choose_labelling(config: RunConfig, vocabulary: Vocabulary) -> Labelling | N
         return None
     named = config.reward.label_vocabulary
     chosen = vocabulary if named is None else load_vocabulary(named)
-    return Labelling(chosen, dataclasses.replace(config.traffic, mode=config.reward.traffic))
+    return Labelling(chosen, dataclasses.replace(config.traffic, mode=config.reward.traffic, policy=None))
 
 
 def choose_explored(config: RunConfig) -> Explored | None:
@@ -274,15 +273,13 @@ def identity_of(
     settings: dict[str, object] = {"seed": config.seed, "vocabulary": vocabulary.digest}
     for group, value in science.items():
         settings |= {f"{group}.{key}": plain for key, plain in dataclasses.asdict(value).items()}
-    settings |= {f"traffic.{key}": plain for key, plain in told(config.traffic).items()}
+    settings |= {f"traffic.{key}": plain for key, plain in traffic_record(config.traffic).items()}
     settings |= {f"traffic.{key}": value for key, value in traffic.REMOVED.items()}
     for part, gone in REMOVED.items():
         settings[f"render.{part}"] = dataclasses.asdict(getattr(config.render, part)) | gone
     del settings["render.lpips"]  # measures alone
     settings["render.own_body"] = masks_digest(config.render.own_body)
     settings = {key: plain for key, plain in settings.items() if plain != ADDED.get(key, ABSENT)}
-    if labelling is not None and labelling.traffic.mode == "learned":
-        settings["traffic.weights"] = told(labelling.traffic)["weights"]
     weak: dict[str, object] = {}
     if explored is not None:
         weak["explore.planner"] = f"{explored.planner} {explored.planner_digest}"

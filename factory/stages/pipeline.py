@@ -26,7 +26,7 @@ from tasks.render.scene.engine import check
 from tasks.render.settings import RenderMode, RenderSettings
 from tasks.render.splatting.gsplat_backend import BackendMissing
 from tasks.reward.labels import Labelling, vocabulary_labels
-from tasks.rollout.learned.policy import refuse_another
+from tasks.rollout.policy import refuse_another_policy
 from tasks.rollout.simulate import TrafficSettings
 from tasks.sampling import CellWeights
 from tasks.stages import Rejected
@@ -202,7 +202,7 @@ class FactoryWork:
         with watch.of("render"):  # before perturb work is spent; without a gate only a block that will be needed
             asked = self.render.refuses_blocks or self._simulates
             blocked = self.imaging.block_verdict(clip) if asked else None
-        self._hold(self.traffic)
+        self._refuse_another_policy()
         with watch.of("perturb"):
             rng, drifts = stream(self.seed, clip.clip_id, "perturb"), self._drifts(clip)
             how = (self.perturb, self.traffic, self.pdm, rng, drifts, self.wanted_cells)
@@ -277,7 +277,7 @@ class FactoryWork:
             judged = human_sample(scene_of_clip(payload.clip), driver, self.pdm, rng, timed)
             return Drive(payload.ref, None, judged, None)
         chosen = payload.candidates[candidate]
-        self._hold(self.traffic)
+        self._refuse_another_policy()
         with timed("rollout"):
             scene = perturbed_scene(payload.clip, chosen.rollout)
         result = attempt(scene, driver, self.gate, self.traffic, self.pdm, rng, timed)
@@ -309,16 +309,15 @@ class FactoryWork:
         judged = drive.sampled
         labels: dict[str, object] = {}
         if self.labelling is not None:
-            self._hold(self.labelling.traffic)
             with watch.of("labels"):
                 labelled = vocabulary_labels(self.labelling, judged.scene, judged.prepared, judged.reference)
                 labels = label_columns(labelled)
         row = sample_row(judged.scene.clip, drive.candidate, judged)
         return Columns({**row, **drive.told, **labels}, watch.seconds)
 
-    def _hold(self, traffic: TrafficSettings) -> None:
-        """Raises OSError where the policy that drives it was changed under the run: rows say which one it was."""
-        refuse_another(traffic, self.identity.settings.get("traffic.weights"))
+    def _refuse_another_policy(self) -> None:
+        """Raises OSError where the policy that drives is another one than the rows say."""
+        refuse_another_policy(self.traffic, self.identity.settings.get("traffic.policy"))
 
     @property
     def _simulates(self) -> bool:

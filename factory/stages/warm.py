@@ -33,8 +33,8 @@ from tasks.reward.labels import Labelling, reactive_scores, vocabulary_labels
 from tasks.reward.prepare import prepare_scene
 from tasks.reward.second_after import hit_after_s
 from tasks.reward.verdicts import INDEX_FROM_ROWS
-from tasks.rollout.learned.imitation import unfitted
-from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out_many, simulate
+from tasks.rollout.policy import SeenTraffic
+from tasks.rollout.simulate import TrafficSettings, prepare_traffic, simulate
 from tasks.sealed import Damaged, sealed, unsealed
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import Array
@@ -59,9 +59,9 @@ def parts_of(
     no lidar.
     """
     parts = ["judge", "plan"]
-    if label_traffic == "learned" or (simulates and traffic == "learned"):
+    if simulates and traffic == "custom":
         parts.append("policy")
-    if label_traffic in ("idm", "navsim", "learned"):  # scored among the answers
+    if label_traffic in ("idm", "navsim"):  # scored among the answers
         parts.append("answers")
     elif simulates and traffic == "idm":
         parts.append("drive")
@@ -214,12 +214,20 @@ def _drive() -> None:
     simulate(scene, ahead, TrafficSettings())
 
 
+class _Stands:
+    """A traffic policy that is none."""
+
+    def digest(self) -> str:
+        return ""
+
+    def next_states(self, seen: SeenTraffic) -> Array:
+        return np.pad(seen.boxes[-1, :-1, :3], ((0, 0), (0, 1)))
+
+
 def _policy() -> None:
-    """Traffic that a policy drives around one ego and around several, the policy that is fitted here among it."""
+    """Traffic that a policy of a user's own drives around one ego."""
     scene, ahead = _tiny_scene()
-    settings = TrafficSettings(mode="learned", policy=f"{unfitted.__module__}:{unfitted.__name__}")
-    states = simulate(scene, ahead, settings).ego_states
-    roll_out_many(prepare_traffic(scene, settings), np.stack([states] * 2))
+    simulate(scene, ahead, TrafficSettings(mode="custom", policy=f"{__name__}:{_Stands.__name__}"))
 
 
 def _answers() -> None:

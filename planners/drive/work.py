@@ -27,7 +27,7 @@ from planners.drive.table import DriveKey, DriveRow
 from planners.evaluation.planner_names import planner_of
 from tasks.perturb import Perturbation, perturb
 from tasks.render.settings import RenderSettings
-from tasks.rollout.learned.policy import told
+from tasks.rollout.policy import traffic_record
 from tasks.stages import stage_versions
 from tasks.world.chance import stream
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip
@@ -90,7 +90,7 @@ class DriveWork:
             "drive": DRIVE_VERSION,
             "stages": stage_versions(),
             "loop": {"seconds": s.seconds, "bound_m": s.bound_m},
-            "traffic": told(s.traffic),
+            "traffic": traffic_record(s.traffic),
         }
         if start != LOGGED:
             found |= {"seed": s.seed, "vocabulary": self.vocabulary.digest, "perturb": asdict(s.perturb)}

@@ -58,7 +58,7 @@ from planners.evaluation.scoring import (
 )
 from planners.evaluation.tags import TAG_COLUMNS, tags_of
 from tasks.experts.pdm_closed.planner import PdmSettings
-from tasks.rollout.learned.policy import told
+from tasks.rollout.policy import traffic_record
 from tasks.rollout.simulate import TrafficSettings
 from tasks.stages import stage_versions
 from tasks.world.arrays import Array
@@ -103,7 +103,10 @@ class EvaluateSettings:
 
 def _told(rules: Rules) -> dict[str, object]:
     """As a record holds them."""
-    return asdict(rules) | {"one_stage": told(rules.one_stage), "two_stage": told(rules.two_stage)}
+    return asdict(rules) | {
+        "one_stage": traffic_record(rules.one_stage),
+        "two_stage": traffic_record(rules.two_stage),
+    }
 
 
 def evaluate(benchmark: Benchmark, who: Sequence[EvaluatedPlanner], settings: EvaluateSettings) -> list[SummaryLine]:

@@ -16,7 +16,7 @@ from planners.drive.starts import lengthened
 from planners.drive.work import DrivingPlanner, NotDriven, eyes_of, kept_driver, reads_towns
 from planners.explore.drift import CLIP_STEPS, Drifted, drift, from_the_log
 from planners.explore.settings import ExploreSettings
-from tasks.rollout.learned.policy import told
+from tasks.rollout.policy import traffic_record
 from tasks.stages import stage_versions
 from tasks.world.clip import NOW, Clip, scene_of_clip
 from tasks.world.command import driving_command
@@ -44,7 +44,7 @@ class ExploreWork:
             "stages": stage_versions(),
             "ways": [str(way) for way in s.ways],
             "gates": {name: value for name, value in asdict(s.perturb).items() if name.startswith("max_")},
-            "traffic": told(s.traffic),
+            "traffic": traffic_record(s.traffic),
             "pdm": asdict(s.pdm),
             "reward": asdict(s.reward),
         }

@@ -19,7 +19,7 @@ The ego is tracked first, since it follows its plan whatever the traffic does; t
   to the ego, where ways cross or merge (tasks/rollout/yielding).
 
 That is `mode=idm`. In `navsim` the traffic is the public evaluation's, to the letter (tasks/rollout/navsim); in
-`learned` those whom IDM would drive along lanes are driven by a policy (tasks/rollout/learned).
+`custom` those whom IDM would drive are driven by a policy of a user's own (tasks/rollout/policy.py).
 """
 
 from collections.abc import Iterable, Iterator
@@ -34,16 +34,15 @@ from tasks.rollout.corridor import Paths
 from tasks.rollout.idm import IdmDriver
 from tasks.rollout.lane_following import LanePath, find_path, logged_path, straight_path
 from tasks.rollout.lane_index import index_lanes
-from tasks.rollout.learned.drive import BEFORE, Worlds, drive_learned
-from tasks.rollout.learned.policy import KIND_NUMBER, SEEN_ROWS, RoadLines, policy_of
 from tasks.rollout.lqr import track
 from tasks.rollout.navsim.agents import NavsimAgents, navsim_agents
 from tasks.rollout.navsim.drive import answer
+from tasks.rollout.policy import SEEN_ROWS, TrafficPolicy, drive_by_policy, policy_named
 from tasks.rollout.roles import NEVER, clocks, join_steps, later_join_step, logged_track, stands_always, start_step
 from tasks.rollout.scene_paths import numbered, stack_paths
 from tasks.rollout.settings import MOST, TrafficSettings
 from tasks.rollout.traffic import drive, drive_many
-from tasks.rollout.traffic_state import AgentStates, Roles, Yielding
+from tasks.rollout.traffic_state import AgentStates, Motion, Roles, RolloutRows, Yielding
 from tasks.rollout.yielding.prepare import yielding_in
 from tasks.world.agents import MOVING_KINDS, PER_STEP, AgentKind, AgentTracks
 from tasks.world.arrays import Array, Bools
@@ -67,7 +66,6 @@ class TrafficScene:
     paths: Paths | None
     navsim: NavsimAgents | None = None  # None: another mode
     yielding: Yielding | None = None  # None: drivers give way to nobody, or another mode
-    streets: RoadLines | None = None  # None: another mode than learned
 
 
 @dataclass(frozen=True)
@@ -132,9 +130,6 @@ def prepare_traffic(scene: Scene, settings: TrafficSettings) -> TrafficScene:
     paths = stack_paths(
         scene, found, logged_ways, settings.target_speed_mps, settings.decel_max, logged_stops=not yields
     )
-    if settings.mode == "learned":
-        streets = RoadLines(index.points, index.first, roles.path, paths)
-        return TrafficScene(scene, settings, roles, paths, streets=streets)
     if not yields:
         return TrafficScene(scene, settings, roles, paths)
     return TrafficScene(scene, settings, roles, paths, yielding=yielding_in(scene, roles, paths, _agent_states(log)))
@@ -172,12 +167,11 @@ def _answer(traffic: TrafficScene, ego_states: Array, steps: int) -> tuple[Agent
         return _public_answer(traffic.navsim, traffic.settings, window, ego_states)
     if traffic.roles is None or traffic.paths is None or len(window) == 0:
         return window, np.zeros(len(window), dtype=bool)
-    n = len(window)
-    if traffic.streets is not None:
-        worlds = _learned(traffic, traffic.streets, window, ego_states[None])
-        per_step = {name: getattr(worlds, name)[BEFORE:, 0, :n].copy() for name in PER_STEP}
-        return replace(window, **per_step), worlds.driven_from[0] <= steps
-    rows, motion = drive(*_script(traffic, window), *_ego_boxes(ego_states), _yielding(traffic))
+    n, policy = len(window), traffic.settings.policy
+    if policy is None:
+        rows, motion = drive(*_script(traffic, window), *_ego_boxes(ego_states), _yielding(traffic))
+    else:
+        rows, motion = _policy_answer(policy_named(policy), traffic, window, ego_states)
     return replace(window, **{name: getattr(rows, name)[:, :n].copy() for name in PER_STEP}), motion.was_driven[steps]
 
 
@@ -202,45 +196,27 @@ def roll_out_many(traffic: TrafficScene, ego_states: Array) -> Rollouts:
     start = traffic.scene.step
     window = traffic.scene.agents.window(start, start + HORIZON_STEPS + 1)
     many, n = len(ego_states), len(window)
-    if traffic.navsim is not None:
+    if traffic.settings.mode in ("navsim", "custom"):
         shape = (many, HORIZON_STEPS + 1, n)
         out = Rollouts(np.empty((*shape, 5)), np.empty((*shape, 2)), np.empty(shape, bool), np.empty((many, n), bool))
         for b, states in enumerate(ego_states):
-            agents, out.simulated[b] = _public_answer(traffic.navsim, traffic.settings, window, states)
+            agents, out.simulated[b] = _answer(traffic, states, HORIZON_STEPS)
             out.boxes[b], out.velocities[b], out.valid[b] = agents.boxes, agents.velocities, agents.valid
         return out
     if traffic.roles is None or traffic.paths is None or n == 0:
         alike: Any = [np.broadcast_to(a, (many, *a.shape)) for a in (window.boxes, window.velocities, window.valid)]
         return Rollouts(alike[0], alike[1], alike[2], np.zeros((many, n), dtype=bool))
-    if traffic.streets is not None:
-        worlds = _learned(traffic, traffic.streets, window, ego_states)
-        return Rollouts(
-            boxes=worlds.boxes[BEFORE:, :, :n].swapaxes(0, 1).copy(),
-            velocities=worlds.velocities[BEFORE:, :, :n].swapaxes(0, 1).copy(),
-            valid=worlds.valid[BEFORE:, :, :n].swapaxes(0, 1).copy(),
-            simulated=worlds.driven_from <= HORIZON_STEPS,
-        )
     return Rollouts(*drive_many(*_script(traffic, window), *_ego_boxes(ego_states), _yielding(traffic)))
 
 
-def _learned(traffic: TrafficScene, streets: RoadLines, window: AgentTracks, ego_states: Array) -> Worlds:
-    """The policy's answer to B egos with states (B, T, 11)."""
+def _policy_answer(
+    policy: TrafficPolicy, traffic: TrafficScene, window: AgentTracks, ego_states: Array
+) -> tuple[RolloutRows, Motion]:
     scene = traffic.scene
-    start, log, _, roles, paths, driver = _script(traffic, window)
-    past = scene.agents.window(start - BEFORE, start + 1)
-    kinds = np.array([KIND_NUMBER[kind] for kind in (*window.kinds, AgentKind.VEHICLE)])
-    return drive_learned(
-        policy_of(traffic.settings),
-        replace(streets, ways=paths),
-        kinds,
-        start,
-        log,
-        _agent_states(past),
-        roles,
-        driver,
-        egos=_ego_boxes(ego_states),
-        ego_past=_ego_boxes(scene.ego_history[-SEEN_ROWS:]),
-    )
+    kinds, first = (*window.kinds, AgentKind.VEHICLE), scene.step - SEEN_ROWS + 1
+    past = _agent_states(scene.agents.window(first, scene.step + 1))
+    egos = _ego_boxes(scene.ego_history[-SEEN_ROWS:]), _ego_boxes(ego_states)
+    return drive_by_policy(policy, kinds, scene.clip.road_map, *_script(traffic, window), past, *egos)
 
 
 def _public_answer(
@@ -274,7 +250,7 @@ def _script(
         more = window.n_steps - len(paths.line_state)
         paths = paths._replace(line_state=np.concatenate([paths.line_state, np.repeat(paths.line_state[-1:], more, 0)]))
     driver = IdmDriver(*(getattr(traffic.settings, name) for name in IdmDriver._fields))
-    if traffic.yielding is not None or traffic.streets is not None:
+    if traffic.yielding is not None:
         driver = driver._replace(headway_s=min(driver.headway_s, SHORTEST_HEADWAY_S))
     return (
         start,

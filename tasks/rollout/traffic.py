@@ -17,7 +17,7 @@ import math
 import numpy as np
 
 from tasks.kernels.compiled import hidden_kernel, kernel
-from tasks.rollout.corridor import Paths, pose_on_path
+from tasks.rollout.corridor import Paths, pose_on_path, project_on_path
 from tasks.rollout.idm import IdmDriver, advance
 from tasks.rollout.rules import (
     braked_for,
@@ -64,6 +64,17 @@ def drive(
     start: the clip's step of row 0; log: the clip's tracks over all its steps; now: the agents (1, N) at `start`;
     yielding: None where drivers have no intent but their target speed, and give way to nobody.
     """
+    rows, motion, diverged = first_row(now, roles, ego_boxes, ego_velocities)
+    for t in range(ego_boxes.shape[0] - 1):
+        _step(start, log, roles, paths, driver, t, rows, diverged, motion, motion, yielding)
+    return rows, motion
+
+
+@kernel
+def first_row(
+    now: AgentStates, roles: Roles, ego_boxes: Array, ego_velocities: Array
+) -> tuple[RolloutRows, Motion, Diverged]:
+    """Row 0 around one ego, boxes (T, 5) and velocities (T, 2); everybody is to be asked at every step."""
     n_rows, n = ego_boxes.shape[0], roles.path.shape[0]
     rows, motion, diverged = empty_rows(n_rows, n), empty_motion(n_rows, n), nobody_diverged(n)
     _set_ego(rows, diverged, ego_boxes, ego_velocities)
@@ -74,9 +85,43 @@ def drive(
         rows.valid[0, i] = now.valid[0, i]
         if now.valid[0, i]:
             motion.mode[0, i] = STANDING if roles.standing[i] else REPLAYED
-    for t in range(n_rows - 1):
-        _step(start, log, roles, paths, driver, t, rows, diverged, motion, motion, yielding)
-    return rows, motion
+    return rows, motion, diverged
+
+
+@kernel
+def begin_step(
+    start: int, roles: Roles, paths: Paths, driver: IdmDriver, t: int, rows: RolloutRows, diverged: Diverged,
+    motion: Motion,
+) -> Bools:  # fmt: skip
+    """(N,) whose next state a policy is asked for at row t: who is driven, and is not held by its log."""
+    _switch_to_idm(roles, paths, driver, t, rows, diverged, motion, motion, None)
+    asked = np.zeros(motion.mode.shape[1], np.bool_)
+    for i in range(len(asked)):
+        _carry(motion, t, motion, t + 1, i)
+        held = start + t < roles.hold_until[i] and motion.path[t, i] == roles.path[i] and not motion.was_driven[t, i]
+        asked[i] = diverged.mode[i] == DRIVEN and not held
+    return asked
+
+
+@kernel
+def finish_step(
+    start: int, log: AgentStates, roles: Roles, paths: Paths, driver: IdmDriver, t: int, asked: Bools, answer: Array,
+    rows: RolloutRows, diverged: Diverged, motion: Motion,
+) -> None:  # fmt: skip
+    """From row t to row t + 1: who is asked by the answer (N, 4) x, y, heading, speed; the others as in `drive`."""
+    for i in range(len(asked)):
+        if diverged.mode[i] != DRIVEN:
+            continue
+        _stay(rows, t, i)
+        if asked[i]:
+            x, y, h, speed = answer[i, 0], answer[i, 1], wrapped(answer[i, 2]), answer[i, 3]
+            m, s = motion.path[t, i], project_on_path(paths, motion.path[t, i], x, y)[0]
+            rows.boxes[t + 1, i, 0], rows.boxes[t + 1, i, 1], rows.boxes[t + 1, i, 2] = x, y, h
+            rows.velocities[t + 1, i, 0], rows.velocities[t + 1, i, 1] = speed * math.cos(h), speed * math.sin(h)
+            rows.center_z[t + 1, i] = motion.base_z[t, i] + paths.height[m, cell_of(paths, s)]
+            motion.was_driven[t + 1, i] = True
+    _replay(log, roles, t, rows, diverged, motion, motion)
+    _admit(start, log, roles, driver, t, rows, diverged, motion, motion, None)
 
 
 @kernel

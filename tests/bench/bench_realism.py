@@ -1,12 +1,11 @@
 """How like the logs the traffic is, in the features of the public sim-agents challenge, and what goes wrong in it.
 
-python -m tests.bench.bench_realism [SHARED] [--features] [--learned]
+python -m tests.bench.bench_realism [SHARED] [--features]
 
 SHARED (../shared) holds two Argoverse 2 logs and seven nuScenes scenes. Every clip among the logged ego. Likelihoods
 are of the first 4 s and of vehicles that are there at T and do not stand over their whole log; faults are of 8 s in two
 rollouts, the second from where the first leads. A row for each traffic: constant velocity, the public reactive traffic
-(traffic=navsim) and ours. With --learned, in place of these, that of traffic=learned alone: a policy is fitted first
-(`python -m planners train_traffic`, its defaults), for Argoverse 2 to nuScenes, for nuScenes to Argoverse 2.
+(traffic=navsim) and ours.
 PEER=<python> names one that can import the challenge's own code, as tests/bench/peer_simagents.py says: then that code
 judges some rollouts of every tenth clip too, and a table says by how much features and likelihoods differ.
 """
@@ -16,7 +15,7 @@ import subprocess
 import sys
 import tempfile
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -26,7 +25,6 @@ from numpy.typing import NDArray
 from factory.readers.av2.reader import AV2Reader
 from factory.readers.base import ClipReader
 from factory.readers.scenarionet.reader import ScenarioNetReader
-from planners.traffic.train_traffic import settings_of, train_all
 from tasks.rollout.roles import stands_always
 from tasks.rollout.simulate import TrafficSettings, next_scene, prepare_traffic, roll_out
 from tasks.world.agents import AgentKind, AgentTracks
@@ -49,8 +47,7 @@ from tests.bench.realism import (
 
 CONSTANT_VELOCITY = "constant velocity"
 LOGS = {"av2": "av2/sensor/val", "scenarionet": "scenarionet/nuscenes"}
-Traffic = TrafficSettings | None
-TRAFFIC: dict[str, Traffic] = {
+TRAFFIC: dict[str, TrafficSettings | None] = {
     CONSTANT_VELOCITY: None,
     "public IDM": TrafficSettings(mode="navsim"),
     "IDM, yields=false": TrafficSettings(yields=False),
@@ -157,7 +154,7 @@ def beside(python: str, clip: Clip, settings: TrafficSettings | None, edge: Road
             apart[f"likelihood of {name}"].add(np.array([value]), theirs[f"likelihood {name}"][None])
 
 
-def table(reader: ClipReader, stride: int, all_features: bool, traffic: Mapping[str, Traffic]) -> None:
+def table(reader: ClipReader, stride: int, all_features: bool) -> None:
     """A row for each traffic."""
     refs = reader.index().refs[::stride]
     likelihoods: dict[str, list[dict[str, float]]] = defaultdict(list)
@@ -172,7 +169,7 @@ def table(reader: ClipReader, stride: int, all_features: bool, traffic: Mapping[
         key = id(clip.road_map)
         if key not in edges:
             edges[key] = (clip.road_map, RoadEdge(clip.road_map))
-        for name, settings in traffic.items():
+        for name, settings in TRAFFIC.items():
             try:
                 of, displacement, wrong = judged(clip, settings, edges[key][1])
             except ValueError:  # as the public code, which cannot go on from everywhere
@@ -190,7 +187,7 @@ def table(reader: ClipReader, stride: int, all_features: bool, traffic: Mapping[
         "| brakes above 8 m/s2 | standing that roll | refused |"
     )
     print("|---" * (8 + len(GROUPS) - 1 + len(names)) + "|")
-    for name in traffic:
+    for name in TRAFFIC:
         of = {feature: float(np.mean([one[feature] for one in likelihoods[name]])) for feature in FEATURES}
         scores = [f"{value:.3f}" for value in (*by_group(of).values(), *(of[feature] for feature in names))]
         f = faults[name]
@@ -205,26 +202,12 @@ def table(reader: ClipReader, stride: int, all_features: bool, traffic: Mapping[
             print(f"| {name} | {of.values} | {of.other} | {of.most:.2g} |", flush=True)
 
 
-def learned(shared: Path, out: Path, of: str) -> dict[str, Traffic]:
-    """Of a policy that has seen no log of the data set that it is measured on."""
-    (other,) = LOGS.keys() - {of}
-    words = [f"clips={other}", f"clips.root={shared / 'data' / LOGS[other]}", f"out={out}"]
-    return {"learned": TrafficSettings(mode="learned", weights=str(train_all(settings_of(words))))}
-
-
-def main(shared: Path, all_features: bool = False, stride: int = 1, with_learned: bool = False) -> None:
+def main(shared: Path, all_features: bool = False, stride: int = 1) -> None:
     for of, kind in (("av2", AV2Reader), ("scenarionet", ScenarioNetReader)):
-        with tempfile.TemporaryDirectory() as folder:
-            traffic = learned(shared, Path(folder) / "traffic.npz", of) if with_learned else TRAFFIC
-            print(f"\n{LOGS[of]}, {stride} of its clips\n" if stride > 1 else f"\n{LOGS[of]}\n", flush=True)
-            table(kind(shared / "data" / LOGS[of]), stride, all_features, traffic)
+        print(f"\n{LOGS[of]}, {stride} of its clips\n" if stride > 1 else f"\n{LOGS[of]}\n", flush=True)
+        table(kind(shared / "data" / LOGS[of]), stride, all_features)
 
 
 if __name__ == "__main__":
     words = [word for word in sys.argv[1:] if not word.startswith("--")]
-    main(
-        Path(words[0]) if words else Path("../shared"),
-        "--features" in sys.argv,
-        int(words[1]) if words[1:] else 1,
-        "--learned" in sys.argv,
-    )
+    main(Path(words[0]) if words else Path("../shared"), "--features" in sys.argv, int(words[1]) if words[1:] else 1)

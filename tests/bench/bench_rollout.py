@@ -1,8 +1,6 @@
 """Times reactive rollouts on real logs and prints the table of it: one core, CPU time, the median of several calls.
 
-python -m tests.bench.bench_rollout ../shared/data/av2/sensor/val [WEIGHTS]
-
-WEIGHTS: a file of `python -m planners train_traffic`; then traffic=learned has rows too.
+python -m tests.bench.bench_rollout ../shared/data/av2/sensor/val
 """
 
 import sys
@@ -41,11 +39,9 @@ def among_nearest(scene: Scene) -> Scene:
     return replace(scene, clip=replace(scene.clip, agents=few), agents=few)
 
 
-def main(root: Path, weights: str | None = None) -> None:
+def main(root: Path) -> None:
     """Rows of every third clip, 25 agents and all, of each kind of traffic: who is there, and milliseconds."""
     kinds = {"yields=false": TrafficSettings(yields=False), "idm": TrafficSettings()}
-    if weights is not None:
-        kinds["learned"] = TrafficSettings(mode="learned", weights=weights)
     reader = AV2Reader(root)
     trajectories = kinematic_trajectories(N_EGOS, 0)
     print(f"| log | start s | agents now | with a path | traffic | prepare ms | one ego ms | {N_EGOS} egos ms |")
@@ -67,4 +63,4 @@ def main(root: Path, weights: str | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), *sys.argv[2:3])
+    main(Path(sys.argv[1]))

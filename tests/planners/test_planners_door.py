@@ -17,7 +17,6 @@ from planners.evaluation.replay import ReplaySettings
 from planners.explore.alternate import AlternateSettings
 from planners.explore.settings import ExploreSettings
 from planners.published.import_planner import ImportConfig
-from planners.traffic.train_traffic import TrainTraffic
 from planners.training.train import TrainConfig
 from tests.factory.text_keys import held, text_keys
 
@@ -54,7 +53,6 @@ def test_what_is_raised_is_one_line_and_an_exit_code(
         ("explore", ExploreSettings, ()),
         ("alternate", AlternateSettings, ()),
         ("replay", ReplaySettings, ("benchmark=x", "clip=x")),
-        ("train_traffic", TrainTraffic, ("clips.root=x",)),
     ],
 )
 def test_a_home_folder_is_one_in_every_key_that_takes_text(

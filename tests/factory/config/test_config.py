@@ -147,7 +147,7 @@ def test_a_plug_in_s_key_is_led_home_too_and_a_stranger_s_home_is_told(
             "perturb.max_lateral: there is no such setting; did you mean",
         ),
         ("+render.asset.gap=3", "render.asset.gap"),
-        ("traffic=fast", "traffic=fast: there is idm, learned, navsim, replay"),
+        ("traffic=fast", "traffic=fast: there is custom, idm, navsim, replay"),
         ("colour=red", "colour"),
         ("rounds", "rounds"),
     ],

@@ -172,7 +172,7 @@ def test_what_tasks_took_so_far_says_what_the_next_may_take() -> None:
         (["clips=navsim", "clips.root=.", "clips.maps=."], True),
         (["clips=scenarionet", "clips.root=.", "graph.isolated=never"], False),
         (["clips=custom", "clips._target_=examples.csv_logs.CsvReader", "+clips.root=."], True),
-        (["traffic=learned", "traffic.policy=examples.keep_gap:KeepGap"], True),
+        (["traffic=custom", "traffic.policy=examples.keep_gap:KeepGap"], True),
         (["clips=synthetic", "graph.isolated=always"], True),
     ],
 )

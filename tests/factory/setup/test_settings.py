@@ -12,7 +12,8 @@ from factory.setup.vocabulary import save_recovery_table
 from factory.store.identity import RunIdentity
 from factory.store.illness import why_ill
 from tasks.experts.recovery.expert import RecoveryTable
-from tasks.rollout.learned.imitation import unfitted, weights_file
+from tasks.rollout.policy import SeenTraffic
+from tasks.world.arrays import Array
 from tasks.world.kinematic_vocabulary import kinematic_trajectories
 
 BLIND = ("clips.n_clips=1", "clips.settings.cameras=[]", "clips.settings.lidar_beams=0")
@@ -76,35 +77,45 @@ def test_a_recovery_table_kept_of_train_logs_is_not_given_where_they_are_test(
         assemble(load_config([*asked, "clips.split=test", "limit=1"]))
 
 
-def test_a_policy_s_file_is_in_the_key_of_rows_by_what_is_in_it(tmp_path: Path) -> None:
-    """The same file under two names gives the same rows; and no word of it stands in keys of other traffic."""
-    given = unfitted().weights
-    files = [tmp_path / name for name in ("a.npz", "b.npz", "c.npz")]
-    for file, bias in zip(files, (0.0, 0.0, 1.0)):
-        file.write_bytes(weights_file(given._replace(last_bias=given.last_bias + bias), "{}"))
+class Standing:
+    """A traffic policy whose digest can be set."""
+
+    version = "1"
+
+    def digest(self) -> str:
+        return self.version
+
+    def next_states(self, seen: SeenTraffic) -> Array:
+        return np.pad(seen.boxes[-1, :-1, :3], ((0, 0), (0, 1)))
+
+
+POLICY = ("traffic=custom", f"traffic.policy={__name__}:Standing")
+
+
+def test_a_policy_is_in_the_key_of_rows_by_its_digest(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And no word of it stands in keys of other traffic."""
 
     def identity(*words: str) -> RunIdentity:
         return assemble(load_config([*BLIND, "experts=[pdm_closed]", *words])).work.identity
 
-    one, alike, other = (identity("traffic=learned", f"traffic.weights={file}") for file in files)
+    one, alike = identity(*POLICY), identity(*POLICY)
+    monkeypatch.setattr(Standing, "version", "2")
+    other = identity(*POLICY)
     assert one.settings_hash == alike.settings_hash != other.settings_hash
     assert one.prepare_digest == alike.prepare_digest != other.prepare_digest
-    labelled = identity("reward.traffic=learned", f"traffic.weights={files[0]}")
-    assert labelled.settings["traffic.weights"] == one.settings["traffic.weights"]
-    assert not {"traffic.weights", "traffic.policy"} & identity().settings.keys()
+    assert "traffic.policy" not in identity().settings
 
 
 @pytest.mark.slow
-def test_a_policy_that_is_changed_under_a_run_makes_no_row_by_the_name_of_the_old_one(tmp_path: Path) -> None:
+def test_a_policy_that_is_changed_under_a_run_makes_no_row_by_the_name_of_the_old_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """It is the machine's illness, not the clip's."""
-    given, file = unfitted().weights, tmp_path / "policy.npz"
-    file.write_bytes(weights_file(given, "{}"))
-    words = [*BLIND, "experts=[pdm_closed]", "render=none", "vocabulary.k=64", "traffic=learned"]
-    run = assemble(load_config([*words, f"traffic.weights={file}"]))
+    run = assemble(load_config([*BLIND, "experts=[pdm_closed]", "render=none", "vocabulary.k=64", *POLICY]))
     (ref,) = run.refs
     run.work.prepare(ref)
-    file.write_bytes(weights_file(given._replace(last_bias=given.last_bias + 1.0), "{}"))
-    with pytest.raises(OSError, match="another file than when the run began") as refused:
+    monkeypatch.setattr(Standing, "version", "2")
+    with pytest.raises(OSError, match="another digest than when the run began") as refused:
         run.work.prepare(ref)
     assert why_ill(refused.value)
 
@@ -112,11 +123,10 @@ def test_a_policy_that_is_changed_under_a_run_makes_no_row_by_the_name_of_the_ol
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["traffic=learned"], "traffic weights is missing: mode=learned needs a file"),
-        (["traffic=learned", "traffic.weights=/no/such.npz"], r"traffic\.weights: /no/such\.npz: No such file"),
-        (["traffic.weights=some.npz"], r"traffic\.weights=some\.npz is for traffic=learned"),
-        (["reward.traffic=learned"], "traffic weights is missing"),
-        (["traffic=learned", "traffic.policy=nothing:At"], r"traffic\.policy=nothing:At: name one as"),
+        (["traffic=custom"], r"traffic\.policy is missing"),
+        (["traffic.policy=my:Policy"], r"traffic\.policy=my:Policy with traffic=idm: traffic=custom takes one"),
+        (["reward.traffic=custom"], r"reward\.traffic: must be replay, idm or navsim"),
+        (["traffic=custom", "traffic.policy=nothing:At"], r"traffic\.policy=nothing:At: name one as"),
     ],
 )
 def test_traffic_without_its_policy_is_refused(words: list[str], said: str) -> None:
