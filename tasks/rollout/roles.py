@@ -1,11 +1,14 @@
-"""The agents' roles, as a scene's log gives them: who stands, who joins the lanes when, who starts when."""
+"""The agents' roles and paths, as a scene's log gives them: who stands, who joins the lanes when, who starts when."""
 
 import numpy as np
 
-from tasks.rollout.lane_index import LaneIndex, lane_costs, on_a_lane
+from tasks.rollout.corridor import PATH_SPACING_M, Paths, stretches_of
+from tasks.rollout.idm import CLOSED, CLOSED_IF_STOPPABLE, OPEN
+from tasks.rollout.lane_following import LaneIndex, LanePath, lane_costs, on_a_lane
 from tasks.world.agents import AgentTracks
-from tasks.world.arrays import Array, Bools, Ints
+from tasks.world.arrays import Array, Bools, Bytes, Ints
 from tasks.world.clip import HORIZON_STEPS, STEP_S, Scene
+from tasks.world.lanes import LightState
 
 NEVER = 1_000_000  # a step no clip has
 STANDS_WITHIN_M, STANDS_BELOW_MPS = 1.0, 0.3  # over a whole log: boxes of parked cars jitter by decimetres
@@ -70,3 +73,121 @@ def logged_track(scene: Scene, i: int, clock: int) -> Array:
         speed = np.hypot(*agents.velocities[steps, i].T)
         parts.append(np.column_stack([agents.boxes[steps, i, :3], agents.center_z[steps, i], speed])[seen])
     return np.concatenate(parts)
+
+
+# A scene's paths as the traffic's kernels take them: how fast one may drive where, and where one must stop when.
+
+StopLine = tuple[float, Bytes]  # path length [m], states (41,) at every step of the rollout
+
+LATERAL_ACCEL_MAX = 3.0  # m/s2, slows down in curves
+STOP_STEPS = 5  # a logged stop lasts at least this long
+STOP_BEFORE_ENTRY_M, STOP_BEHIND_ENTRY_M = 12.0, 2.0  # where, around a junction's entry, a stop belongs to it
+
+
+def numbered(found: list[LanePath | None]) -> Ints:
+    """Index of each path among those there are, -1 where there is none."""
+    has = np.array([path is not None for path in found], dtype=bool)
+    return np.where(has, np.cumsum(has) - 1, -1)
+
+
+def stack_paths(
+    scene: Scene,
+    found: list[LanePath | None],
+    logged_ways: list[LanePath | None],
+    target_speed_mps: float,
+    decel_max: float,
+    logged_stops: bool = True,
+) -> Paths:
+    """The agents' paths and logged ways (N,), as `numbered` counts them; a logged way's own speeds tell it to stop.
+
+    logged_stops: whether a stop of a log at a junction makes a stop line.
+    """
+    chosen = [path for path in found + logged_ways if path is not None]
+    n_points = len(chosen[0].xy) if chosen else 2
+    xy = np.array([path.xy for path in chosen]).reshape(-1, n_points, 2)
+    heading = np.array([path.heading for path in chosen]).reshape(-1, n_points)
+    limit = np.array([path.speed_limit_mps for path in chosen]).reshape(-1, n_points)
+    lines = _stop_lines(scene, found, logged_stops)
+    counts = [len(of_path) for of_path in lines] + [0] * (len(chosen) - len(lines))
+    states = [state for of_path in lines for _, state in of_path]
+    return Paths(
+        xy=xy,
+        heading=heading,
+        height=np.array([path.height for path in chosen]).reshape(-1, n_points),
+        target_speed=_target_speeds(limit, heading, target_speed_mps, decel_max),
+        stretches=stretches_of(xy, heading),
+        line_start=np.concatenate([[0], np.cumsum(counts, dtype=np.int64)]),
+        line_at=np.array([at for of_path in lines for at, _ in of_path], dtype=np.float64),
+        line_state=np.array(states, dtype=np.uint8).reshape(-1, HORIZON_STEPS + 1).T.copy(),
+    )
+
+
+def _target_speeds(limit: Array, heading: Array, default: float, decel_max: float) -> Array:
+    """(M, P) [m/s] the limit or the default, less in curves, and in time before them at comfortable deceleration."""
+    target = np.where(np.isnan(limit), default, limit)
+    curvature = np.abs(np.gradient(heading, PATH_SPACING_M, axis=1))
+    square = np.minimum(target**2, LATERAL_ACCEL_MAX / np.maximum(curvature, 1e-6))
+    # v^2 falls by at most 2 b per metre towards a slower place: a running minimum from the far end.
+    fall = 2.0 * decel_max * PATH_SPACING_M * np.arange(limit.shape[1])
+    square = np.minimum.accumulate((square + fall)[:, ::-1], axis=1)[:, ::-1] - fall
+    speeds: Array = np.sqrt(np.maximum(square, 1.0))
+    return speeds
+
+
+def _stop_lines(scene: Scene, found: list[LanePath | None], logged: bool) -> list[list[StopLine]]:
+    """Of each path there is: the lights along it, and where the vehicle's log stops if that is wanted (`logged`)."""
+    log = scene.clip.agents
+    stopped = log.valid & (np.hypot(*np.moveaxis(log.velocities, -1, 0)) < STANDS_BELOW_MPS)
+    return [
+        [*_light_lines(scene, path), *(_logged_stops(scene, path, i, stopped[:, i]) if logged else ())]
+        for i, path in enumerate(found)
+        if path is not None
+    ]
+
+
+def _light_lines(scene: Scene, path: LanePath) -> list[StopLine]:
+    lights, lines = scene.clip.lights, []
+    for lane_id, at in path.lane_entries:
+        if lane_id in lights.lane_ids:
+            column = lights.lane_ids.index(lane_id)
+            steps = np.minimum(np.arange(scene.step, scene.step + HORIZON_STEPS + 1), len(lights.states) - 1)
+            light = lights.states[steps, column]
+            state = np.full(len(light), OPEN, dtype=np.uint8)
+            state[light == LightState.YELLOW] = CLOSED_IF_STOPPABLE
+            state[light == LightState.RED] = CLOSED
+            lines.append((at, state))
+    return lines
+
+
+def _logged_stops(scene: Scene, path: LanePath, i: int, stopped: Bools) -> list[StopLine]:
+    """Stop lines agent i's own log, `stopped` (S,), implies: at a junction's entry, where it stops, until it leaves."""
+    entries = _junction_entries(scene, path)
+    if not entries or np.count_nonzero(stopped) < STOP_STEPS:
+        return []
+    log = scene.clip.agents
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], stopped.astype(np.int8), [0]])))
+    lines = []
+    for first, last in zip(edges[::2], edges[1::2]):
+        if last - first < STOP_STEPS or last <= scene.step:
+            continue
+        distance = np.hypot(*(path.xy - log.boxes[first, i, :2]).T)
+        nearest = int(np.argmin(distance))
+        if distance[nearest] > 3.0:
+            continue
+        nose = nearest * PATH_SPACING_M + 0.5 * log.boxes[first, i, 3]
+        near = [at for at in entries if nose - STOP_BEHIND_ENTRY_M <= at <= nose + STOP_BEFORE_ENTRY_M]
+        if near:
+            until = NEVER if last >= log.n_steps or not log.valid[last, i] else last
+            steps = np.arange(scene.step, scene.step + HORIZON_STEPS + 1)
+            lines.append((max(near[0], nose), np.where(steps < until, CLOSED, OPEN).astype(np.uint8)))
+    return lines
+
+
+def _junction_entries(scene: Scene, path: LanePath) -> list[float]:
+    lanes = scene.clip.road_map.lanes
+    inside, entries = False, []
+    for lane_id, at in path.lane_entries:
+        if lanes[lane_id].is_intersection and not inside:
+            entries.append(at)
+        inside = lanes[lane_id].is_intersection
+    return entries

@@ -12,11 +12,14 @@ from tasks.kernels.compiled import inner_kernel
 from tasks.rollout.corridor import (
     PATH_SPACING_M,
     Box,
+    CorridorAhead,
     Paths,
     Way,
     boxes_overlap,
     corridor_gap,
+    in_view,
     look_ahead,
+    may_meet,
     pose_on_path,
     project_on_path,
 )
@@ -28,8 +31,7 @@ from tasks.rollout.idm import (
     needed_deceleration,
     stop_line_gap,
 )
-from tasks.rollout.lane_index import SNAP_M
-from tasks.rollout.stretches import CorridorAhead, in_view, may_meet
+from tasks.rollout.lane_following import SNAP_M
 from tasks.rollout.traffic_state import ABSENT, DRIVEN, NOBODY, AgentStates, Roles, RolloutRows, Yielding
 from tasks.world.arrays import Array, Ints
 from tasks.world.geometry import wrapped

@@ -16,9 +16,9 @@ The ego is tracked first, since it follows its plan whatever the traffic does; t
   same log. Neither they nor replayed vehicles wait for the ego: its reward must not profit from their care.
 
 * With `yields` a driver keeps the speeds and stops of its log instead of a target speed, and gives way to others, not
-  to the ego, where ways cross or merge (tasks/rollout/yielding).
+  to the ego, where ways cross or merge (tasks/rollout/yielding.py).
 
-That is `mode=idm`. In `navsim` the traffic is the public evaluation's, to the letter (tasks/rollout/navsim); in
+That is `mode=idm`. In `navsim` the traffic is the public evaluation's, to the letter (tasks/rollout/navsim.py); in
 `custom` those whom IDM would drive are driven by a policy of a user's own (tasks/rollout/policy.py).
 """
 
@@ -32,18 +32,25 @@ from numpy.typing import NDArray
 
 from tasks.rollout.corridor import Paths
 from tasks.rollout.idm import IdmDriver
-from tasks.rollout.lane_following import LanePath, find_path, logged_path, straight_path
-from tasks.rollout.lane_index import index_lanes
+from tasks.rollout.lane_following import LanePath, find_path, index_lanes, logged_path, straight_path
 from tasks.rollout.lqr import track
-from tasks.rollout.navsim.agents import NavsimAgents, navsim_agents
-from tasks.rollout.navsim.drive import answer
+from tasks.rollout.navsim import NavsimAgents, answer, navsim_agents
 from tasks.rollout.policy import SEEN_ROWS, TrafficPolicy, drive_by_policy, policy_named
-from tasks.rollout.roles import NEVER, clocks, join_steps, later_join_step, logged_track, stands_always, start_step
-from tasks.rollout.scene_paths import numbered, stack_paths
+from tasks.rollout.roles import (
+    NEVER,
+    clocks,
+    join_steps,
+    later_join_step,
+    logged_track,
+    numbered,
+    stack_paths,
+    stands_always,
+    start_step,
+)
 from tasks.rollout.settings import MOST, TrafficSettings
 from tasks.rollout.traffic import drive, drive_many
 from tasks.rollout.traffic_state import AgentStates, Motion, Roles, RolloutRows, Yielding
-from tasks.rollout.yielding.prepare import yielding_in
+from tasks.rollout.yielding import yielding_in
 from tasks.world.agents import MOVING_KINDS, PER_STEP, AgentKind, AgentTracks
 from tasks.world.arrays import Array, Bools
 from tasks.world.bounds import LARGEST, all_within

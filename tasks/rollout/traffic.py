@@ -48,8 +48,7 @@ from tasks.rollout.traffic_state import (
     empty_rows,
     nobody_diverged,
 )
-from tasks.rollout.yielding.give_way import has_way, yields_for
-from tasks.rollout.yielding.intent import intended_acceleration, turned_at
+from tasks.rollout.yielding import has_way, intended_acceleration, turned_at, yields_for
 from tasks.world.arrays import Array, Bools
 from tasks.world.geometry import wrapped
 

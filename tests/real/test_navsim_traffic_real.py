@@ -10,7 +10,7 @@ from reference_scenes import SCENES, loader, logged_tracks
 
 from factory.readers.av2.reader import AV2Reader, log_folders, read_log
 from factory.readers.base import ClipRef
-from tasks.rollout.navsim.agents import bodies
+from tasks.rollout.navsim import bodies
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.clip import HISTORY_STEPS, NOW, Clip, Scene, scene_of_clip

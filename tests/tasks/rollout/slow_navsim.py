@@ -8,7 +8,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from tasks.rollout.navsim.agents import IdmAgent, NavsimAgents, bodies
+from tasks.rollout.navsim import IdmAgent, NavsimAgents, bodies
 from tasks.rollout.settings import TrafficSettings
 from tasks.world.vehicle import PACIFICA
 

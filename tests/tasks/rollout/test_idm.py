@@ -5,7 +5,7 @@ import pytest
 import shapely
 import shapely.ops
 
-from tasks.rollout.corridor import Paths, Way, boxes_overlap, corridor_gap, pose_on_path, project_on_path
+from tasks.rollout.corridor import Paths, Way, boxes_overlap, corridor_gap, pose_on_path, project_on_path, stretches_of
 from tasks.rollout.idm import (
     IdmDriver,
     advance,
@@ -14,7 +14,6 @@ from tasks.rollout.idm import (
     needed_deceleration,
     stop_line_gap,
 )
-from tasks.rollout.stretches import stretches_of
 from tasks.world.frames import box_corners
 
 DRIVER = IdmDriver(1.0, 1.5, 1.0, 2.0, 4.0, 8.0, 60.0, 20.0)

@@ -20,7 +20,7 @@ from tasks.attempt import drive_and_judge
 from tasks.experts.pdm_closed.planner import PdmSettings
 from tasks.experts.protocol import Plan
 from tasks.reward.labels import reactive_scores
-from tasks.rollout.navsim.drive import idm_acceleration
+from tasks.rollout.navsim import idm_acceleration
 from tasks.rollout.simulate import TrafficSettings, next_scene, prepare_traffic, roll_out, roll_out_many, simulate
 from tasks.world.agents import AgentKind
 from tasks.world.clip import NOW, STEP_S, Rollout, Scene

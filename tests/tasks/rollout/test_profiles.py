@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tasks.kernels.compiled import kernel
-from tasks.rollout.lqr import BLOCK
-from tasks.rollout.profiles import (
+from tasks.rollout.lqr import (
+    BLOCK,
     COUPLING,
     INITIAL_CURVATURE_PENALTY,
     TRACKING_STEPS,
