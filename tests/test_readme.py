@@ -44,7 +44,6 @@ from planners.training.train import TrainConfig
 from tasks.caches import user_cache
 from tasks.kernels.compiled import cache_dir
 from tasks.render.fit.settings import FitSettings
-from tests.bench.bench_experts import most_candidates
 from tests.factory.installs import SMALL, as_if_installed
 from tests.pages import PAGES, REPOSITORY, Command, blocks, commands, named_in_prose
 
@@ -165,9 +164,6 @@ def test_every_command_is_one_its_program_takes(
             assert run_main(["--help"]) == 0
         case ["python", "-m", "factory.run" | "tests.bench.bench_label_ends", *arguments]:
             load_config(given(arguments))
-        case ["python", "-m", "tests.bench.bench_experts", *arguments]:
-            most, words = most_candidates(given(arguments))
-            assert most and load_config(words)
         case ["python", "-m", "planners", "train", *arguments] | [
             "torchrun",
             "--nproc-per-node",

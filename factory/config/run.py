@@ -25,9 +25,7 @@ from factory.readers.settings import (
     TownSettings,
 )
 from tasks.experts.pdm_closed.settings import PdmSettings
-from tasks.experts.pdm_smooth.settings import SmoothSettings
 from tasks.experts.recovery.settings import RecoverySettings
-from tasks.experts.vocabulary.settings import VocabularySettings
 from tasks.render.settings import RenderMode, RenderSettings
 from tasks.rollout.settings import TrafficSettings
 from tasks.settings import ExpertGate, PerturbSettings, SampleWeights
@@ -46,8 +44,6 @@ READERS: Mapping[str, type[Any]] = {  # `_target_` of a built-in reader -> its s
     "factory.readers.town.towns.SyntheticTownsReader": TownsClips,
 }
 RECOVERY = "factory.setup.recovery.recovery"
-PDM_SMOOTH = "factory.setup.experts.pdm_smooth"
-VOCABULARY = "factory.setup.experts.vocabulary"
 
 
 @dataclass(frozen=True)
@@ -122,18 +118,7 @@ class RecoverySources(RecoverySettings):
     vocabularies: tuple[str, ...] = ()  # further .npy files of human trajectories, beside the run's vocabulary.file
 
 
-@dataclass(frozen=True)
-class VocabularySources(VocabularySettings):
-    """A sampling expert, and what it samples."""
-
-    file: str | None = None  # .npy (K, 40, 3) of human trajectories; null: the run's vocabulary
-
-
-EXPERTS: Mapping[str, type[Any]] = {  # `_target_` of a built-in expert that has settings of its own -> them
-    RECOVERY: RecoverySources,
-    PDM_SMOOTH: SmoothSettings,
-    VOCABULARY: VocabularySources,
-}
+EXPERTS: Mapping[str, type[Any]] = {RECOVERY: RecoverySources}  # `_target_` of a built-in expert -> its own settings
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from factory.store.identity import UNLISTED, RunIdentity
 from tasks.attempt import ExpertGate, Judged, Timed, attempt, has_route, human_sample, perturbed_scene
 from tasks.drifts import Drift
 from tasks.experts.pdm_closed.planner import PdmSettings
-from tasks.experts.protocol import Expert, kernels_of, tried_once
+from tasks.experts.protocol import Expert, tried_once
 from tasks.perturb import Candidate, Perturbation, PerturbSettings, end_speed_mps, perturb
 from tasks.render.scene.engine import check
 from tasks.render.settings import RenderMode, RenderSettings
@@ -153,9 +153,7 @@ class FactoryWork:
             except BackendMissing as error:
                 raise NotReady(str(error)) from error
         label_traffic = None if self.labelling is None else self.labelling.traffic.mode
-        parts = parts_of(self._simulates, self.traffic.mode, label_traffic, self.render, self.photos_alone)
-        asked = [part for expert in self.experts.values() for part in kernels_of(expert)]
-        compile_kernels(list(dict.fromkeys([*parts, *asked])))
+        compile_kernels(parts_of(self._simulates, self.traffic.mode, label_traffic, self.render, self.photos_alone))
 
     @property
     def names(self) -> tuple[str, ...]:

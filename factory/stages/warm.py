@@ -23,7 +23,6 @@ from tasks.attempt import drive_and_judge
 from tasks.experts.pdm_closed.forecast import forecast
 from tasks.experts.pdm_closed.proposals import proposals
 from tasks.experts.pdm_closed.settings import PdmSettings
-from tasks.experts.pdm_smooth.planner import plan_smooth
 from tasks.experts.protocol import Plan
 from tasks.kernels.compiled import USED, cache_dir, make_cache_dir, not_kept, processor, write_whole
 from tasks.render import warm as render_warm
@@ -238,11 +237,6 @@ def _answers() -> None:
     reactive_scores(scene, np.stack([states] * 2), TrafficSettings())
 
 
-def _smooth() -> None:
-    """What the smooth planner proposes."""
-    plan_smooth(_tiny_scene()[0])
-
-
 def _fit() -> None:
     """Scenes that are built and drawn, and fitted: in one process, for they share kernels."""
     render_warm.compile_kernels()
@@ -254,7 +248,6 @@ PARTS = {
     "plan": _plan,
     "drive": _drive,
     "answers": _answers,
-    "smooth": _smooth,
     "policy": _policy,
     "render": render_warm.compile_kernels,
     "fit": _fit,

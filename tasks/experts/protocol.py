@@ -47,11 +47,6 @@ def tried_once(expert: object) -> bool:
     return bool(getattr(expert, "once", False))
 
 
-def kernels_of(expert: object) -> tuple[str, ...]:
-    """Parts of factory.stages.warm that an expert says it enters, `kernels = (...)`, beside those of every run."""
-    return tuple(getattr(expert, "kernels", ()))
-
-
 class RunContext(Protocol):
     """What an expert is told of its run; factory.setup.settings has more of it."""
 

@@ -11,7 +11,7 @@ from tasks.reward.prepare import PreparedScene, collision_scores, prepare_scene
 from tasks.reward.rules.ego import checked
 from tasks.reward.rules.obstacles import STOPPED_SPEED_MPS
 from tasks.rollout.lqr import track
-from tasks.rollout.simulate import Rollouts, TrafficScene, TrafficSettings, prepare_traffic, roll_out_many
+from tasks.rollout.simulate import Rollouts, TrafficSettings, prepare_traffic, roll_out_many
 from tasks.world.arrays import Array, Bools
 from tasks.world.boxes import ego_boxes, touching
 from tasks.world.clip import HORIZON_STEPS, Scene
@@ -63,13 +63,8 @@ def reactive_scores(scene: Scene, states: Array, traffic: TrafficSettings) -> Sc
     that touches the ego at the start is left out for good, but in the public reactive traffic.
     Raises ValueError for other shapes or non-finite states.
     """
-    return scores_among_answers(prepare_traffic(scene, traffic), states)
-
-
-def scores_among_answers(ready: TrafficScene, states: Array) -> Scores:
-    """The same of a scene whose traffic is prepared."""
+    ready = prepare_traffic(scene, traffic)
     states = checked("states", states)
-    scene, traffic = ready.scene, ready.settings
     now = scene.agents.window(scene.step, scene.step + HORIZON_STEPS + 1)
     prepared = prepare_scene(scene, now)
     collision_score = collision_scores(now.kinds)

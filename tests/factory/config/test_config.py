@@ -28,13 +28,9 @@ from factory.setup.settings import (
 )
 from tasks.caches import user_cache
 from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings
-from tasks.experts.pdm_smooth.planner import PdmSmooth, SmoothSettings
-from tasks.experts.vocabulary.expert import VocabularyExpert
-from tasks.experts.vocabulary.settings import VocabularySettings
 from tasks.perturb import PerturbSettings
 from tasks.render.settings import RenderMode, RenderSettings
 from tasks.rollout.simulate import TrafficSettings
-from tasks.settings import ExpertGate
 from tests.factory.data_folders import add_companions
 from tests.factory.text_keys import held, text_keys
 
@@ -81,9 +77,9 @@ def test_the_run_s_keys_are_those_of_its_dataclass() -> None:
 @pytest.mark.parametrize(
     ("choice", "n_least"),
     [
-        *((name, 15) for name in ("synthetic", "synthetic_towns")),
-        *((f"{name} clips.root=x", 18) for name in ("av2", "scenarionet", "py123d")),
-        ("navsim clips.root=x clips.maps=x", 20),
+        *((name, 12) for name in ("synthetic", "synthetic_towns")),
+        *((f"{name} clips.root=x", 15) for name in ("av2", "scenarionet", "py123d")),
+        ("navsim clips.root=x clips.maps=x", 17),
     ],
 )
 def test_a_home_folder_is_one_in_every_key_that_takes_text(
@@ -231,15 +227,13 @@ def test_a_value_of_the_wrong_kind_is_an_error_that_names_it(override: str, mess
 
 
 def test_an_unknown_expert_is_an_error_and_lists_the_known() -> None:
-    known = r"\['follow_up', 'follow_up_before', 'human', 'human_before', 'logged', 'pdm_closed', 'pdm_smooth', .*\]"
+    known = r"\['follow_up', 'follow_up_before', 'human', 'human_before', 'logged', 'pdm_closed', 'recovery'\]"
     with pytest.raises(ConfigError, match=rf"\['mine'\] is not among {known}"):
         load_config(["experts=[human,mine]"])
 
 
 PDM = "+expert.mine._target_=tasks.experts.pdm_closed.planner.PdmClosed.of_run"
 RECOVERY = "+expert.mine._target_=factory.setup.recovery.recovery"
-SMOOTH = "+expert.mine._target_=factory.setup.experts.pdm_smooth"
-SAMPLES = "+expert.mine._target_=factory.setup.experts.vocabulary"
 
 
 def built(*overrides: str) -> object:
@@ -265,13 +259,7 @@ def test_an_expert_is_added_by_its_target_with_all_its_arguments() -> None:
         ([RECOVERY, "+expert.mine.speed=3"], r"expert\.mine\.speed: there is no such setting"),
         ([RECOVERY, "+expert.mine.table=[1]"], r"expert\.mine\.table"),
         ([RECOVERY, "+expert.mine.table=nowhere.npz"], r"expert\.mine\.table=nowhere.npz: there is no such file"),
-        ([SMOOTH, "+expert.mine.jerk=3"], r"expert\.mine\.jerk: there is no such setting"),
-        ([SMOOTH, "+expert.mine.response_s=0"], r"expert\.mine.*response_s must be positive"),
-        (
-            [SAMPLES, "+expert.mine.modes=3"],
-            r"expert\.mine\.modes: .*; did you mean expert\.mine\.mode=",
-        ),
-        ([SAMPLES, "+expert.mine.file=nowhere.npy"], r"expert\.mine: nowhere.npy: not readable"),
+        ([RECOVERY, "+expert.mine.smoth=false"], r"expert\.mine\.smoth: .*; did you mean expert\.mine\.smooth="),
     ],
 )
 def test_an_expert_that_cannot_be_made_is_an_error_that_names_what(overrides: list[str], message: str) -> None:
@@ -282,28 +270,6 @@ def test_an_expert_that_cannot_be_made_is_an_error_that_names_what(overrides: li
 def test_an_expert_that_asks_for_the_run_is_told_of_it() -> None:
     expert = built(PDM, "pdm.headway_s=2.5")
     assert isinstance(expert, PdmClosed) and expert.settings == PdmSettings(headway_s=2.5)
-
-
-def test_a_sampling_expert_judges_as_the_run_s_attempts_do() -> None:
-    asked = "traffic=replay", "reward.after=false", "reward.labels=none", "pdm.headway_s=2.5", "vocabulary.k=7"
-    expert = built(SAMPLES, *asked, "+expert.mine.mode=2")
-    assert isinstance(expert, VocabularyExpert)
-    assert (len(expert.vocabulary), expert.settings, expert.name) == (7, VocabularySettings(mode=2), "mine")
-    assert (expert.traffic.mode, expert.pdm.headway_s) == ("replay", 2.5)
-    assert expert.gate == ExpertGate(after=False)
-
-
-def test_the_smooth_planner_takes_its_settings() -> None:
-    expert = built(SMOOTH, "+expert.mine.merge_s=[4.0]")
-    assert isinstance(expert, PdmSmooth) and expert.settings == SmoothSettings(merge_s=(4.0,))
-
-
-def test_the_built_in_modes_differ_in_the_mode_alone() -> None:
-    config = load_config(["experts=[vocabulary,vocabulary_2,vocabulary_3]"])
-    no_clips: Any = None
-    made = [build_expert(RunContext(config, name, no_clips)) for name in config.experts]
-    assert [expert.settings for expert in made] == [VocabularySettings(mode=mode) for mode in (1, 2, 3)]  # type: ignore[attr-defined]
-    assert len({expert.digest() for expert in made}) == 3
 
 
 def test_experts_that_are_tried_once_say_so_themselves() -> None:

@@ -154,14 +154,6 @@ def test_labels_among_traffic_that_answers_compile_nothing(tmp_path: Path, towns
     assert after == before
 
 
-def test_experts_compile_nothing_beyond_the_parts_that_they_name(tmp_path: Path, towns: str) -> None:
-    named = ("experts=[pdm_smooth,vocabulary]", "expert.vocabulary.rollouts=8", "reward.labels=none")
-    parts = ["judge", "plan", "drive", "answers", "smooth"]
-    before, after = run_with_these(parts, tmp_path, *TOWN, *BLIND, *named, towns, "executor=local")
-    assert after == before
-    assert any(name.startswith("tasks/experts/pdm_smooth/") for name in after)
-
-
 @pytest.mark.ray
 def test_arrays_out_of_ray_s_store_need_no_forms_of_their_own(tmp_path: Path, towns: str) -> None:
     """They cannot be written, which is another type to numba."""

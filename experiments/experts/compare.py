@@ -1,4 +1,4 @@
-"""What experts' labels are like: `python -m tests.bench.bench_experts clips=av2 ... experts=[pdm_closed,pdm_smooth]`
+"""What experts' labels are like: `python -m experiments.experts.compare clips=av2 ... experts=[recovery,pdm_closed]`
 
 By the words of `python -m factory.run`. Every candidate of every clip, or the first `candidates=`, is driven by every
 expert, whatever `rounds` says. EC compares an expert's plan from a candidate's end with the one it makes half a second
@@ -22,7 +22,6 @@ from factory.setup.settings import assemble
 from factory.stages.pipeline import Drive, FactoryWork, payload_of
 from tasks.attempt import perturbed_scene, verdict
 from tasks.experts.protocol import Plan
-from tasks.experts.smoothness import roughness
 from tasks.hard_scenes import BEFORE_STEPS
 from tasks.reward.epdms import score_with_ec
 from tasks.reward.rules.comfort import extended_comfort
@@ -30,7 +29,8 @@ from tasks.rollout.lqr import track
 from tasks.stages import Rejected
 from tasks.world.arrays import Array
 from tasks.world.chance import stream
-from tasks.world.clip import HORIZON_STEPS, Scene, scene_of_clip
+from tasks.world.clip import HORIZON_STEPS, STEP_S, Scene, scene_of_clip
+from tasks.world.vehicle import AX, YAW_RATE
 
 COLUMNS = {
     "tried": "plans tried",
@@ -46,6 +46,21 @@ COLUMNS = {
     "rough": "roughness",
     "ms": "ms a plan",
 }
+
+
+JERK_MPS3, YAW_ACCEL_RADPS2 = 0.5, 0.1  # at which one weighs as much as the other: extended comfort's limits
+
+
+def roughness(states: Array) -> Array:
+    """(K,) of driven states (K, T, 11): RMS over time of longitudinal jerk and yaw acceleration, in units of the above.
+
+    The first jerk is that from the ego's acceleration now; its yaw rate now is left out, for logs leave it unknown.
+    """
+    jerk = np.diff(states[..., AX], axis=-1) / STEP_S
+    yaw_accel = np.diff(states[..., 1:, YAW_RATE], axis=-1) / STEP_S
+    squares = (jerk / JERK_MPS3) ** 2, (yaw_accel / YAW_ACCEL_RADPS2) ** 2
+    rough: Array = np.sqrt(squares[0].mean(axis=-1) + squares[1].mean(axis=-1))
+    return rough
 
 
 @dataclass

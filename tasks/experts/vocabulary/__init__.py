@@ -1,1 +1,0 @@
-"""The sampling expert: the best of a vocabulary, with the reward as its judge."""
