@@ -27,10 +27,10 @@ from tasks.experts.protocol import Plan
 from tasks.kernels.compiled import USED, cache_dir, make_cache_dir, not_kept, processor, write_whole
 from tasks.render import warm as render_warm
 from tasks.render.settings import RenderMode, RenderSettings, SceneFrom
+from tasks.reward.ends import hit_after_s
 from tasks.reward.epdms import score
 from tasks.reward.labels import Labelling, reactive_scores, vocabulary_labels
 from tasks.reward.prepare import prepare_scene
-from tasks.reward.second_after import hit_after_s
 from tasks.reward.verdicts import INDEX_FROM_ROWS
 from tasks.rollout.policy import SeenTraffic
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, simulate

@@ -9,11 +9,10 @@ from numba.extending import register_jitable
 from tasks.kernels.compiled import kernel
 from tasks.reward.prepare import N_TIMES, PreparedScene
 from tasks.reward.rules.area_flags import areas_along
-from tasks.reward.rules.centerline import Centerline, progress_m
+from tasks.reward.rules.centerline import Centerline, driving_direction, lane_keeping, progress_m
 from tasks.reward.rules.comfort import comfort_along, comfort_scratch
 from tasks.reward.rules.contacts import first_collision, first_time_to_collision, reach_of
 from tasks.reward.rules.ego import MULTIPLE_LANES, NON_DRIVABLE, ONCOMING, Body, empty_body, place
-from tasks.reward.rules.lane_discipline import driving_direction, lane_keeping
 from tasks.reward.rules.lights import RedLanes, first_red
 from tasks.reward.rules.map_index import MapIndex
 from tasks.reward.rules.obstacles import Obstacles, within_reach

@@ -23,7 +23,7 @@ from factory.readers.base import ClipRef
 from factory.setup.settings import assemble
 from factory.stages.pipeline import FactoryWork
 from tasks.attempt import Judged, end_verdict, verdict
-from tasks.reward.second_after import hit_after_s
+from tasks.reward.ends import hit_after_s
 from tasks.rollout.simulate import TrafficScene, TrafficSettings, prepare_traffic
 from tasks.settings import ExpertGate
 from tasks.stages import END_FAULTS, Rejected

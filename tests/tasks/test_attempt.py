@@ -11,8 +11,8 @@ from tasks.experts.human import Human
 from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings
 from tasks.experts.protocol import Expert, Plan
 from tasks.experts.recovery.expert import Recovery, RecoveryTable
+from tasks.reward.ends import BRAKING_MPS2, hit_after_s
 from tasks.reward.epdms import Scores
-from tasks.reward.second_after import BRAKING_MPS2, hit_after_s
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, simulate
 from tasks.stages import END_FAULTS, STAGES, Rejected
 from tasks.subscores import JUDGED

@@ -11,8 +11,20 @@ from numpy.typing import NDArray
 
 from tasks.kernels.compiled import kernel
 from tasks.reward.rules.ego import CENTER_IN_INTERSECTION, MULTIPLE_LANES, NON_DRIVABLE, ONCOMING, Body
-from tasks.reward.rules.grid import beside, middle, passes_between
-from tasks.reward.rules.map_index import DRIVABLE, FAR, FIRST, INTERSECTION, LANE, LAST, NEAR, ON_ROUTE, MapIndex
+from tasks.reward.rules.map_index import (
+    DRIVABLE,
+    FAR,
+    FIRST,
+    INTERSECTION,
+    LANE,
+    LAST,
+    NEAR,
+    ON_ROUTE,
+    MapIndex,
+    beside,
+    middle,
+    passes_between,
+)
 from tasks.world.arrays import Array, Bytes, ShortInts
 
 Bits = NDArray[np.uint64]

@@ -12,8 +12,7 @@ from tasks.kernels.compiled import kernel
 from tasks.reward.rules.area_flags import in_intersection
 from tasks.reward.rules.ego import OFF_LANE, Body
 from tasks.reward.rules.map_index import MapIndex
-from tasks.reward.rules.obstacles import Obstacles, box_at, cell_of, out_of_reach
-from tasks.reward.rules.overlap import Box, apart, centroid, touching
+from tasks.reward.rules.obstacles import Box, Obstacles, apart, box_at, cell_of, centroid, out_of_reach, touching
 from tasks.world.arrays import Array, Bools
 from tasks.world.vehicle import HEADING, X, Y
 

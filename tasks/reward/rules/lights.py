@@ -8,7 +8,7 @@ import numpy as np
 
 from tasks.kernels.compiled import kernel
 from tasks.reward.rules.ego import Body
-from tasks.reward.rules.outlines import outlines
+from tasks.reward.rules.map_index import outlines
 from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.lanes import MapPolygon
 

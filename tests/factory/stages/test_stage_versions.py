@@ -30,11 +30,10 @@ from tasks.render.rigs import RIGS
 from tasks.render.scene.build import AssetSettings, build_asset
 from tasks.render.scene.engine import NOBODY, render
 from tasks.render.views import render_views
+from tasks.reward.ends import BRAKING_MPS2, hit_after_s, way_on_m
 from tasks.reward.epdms import Scores, score
 from tasks.reward.label_bytes import VocabularyLabels
-from tasks.reward.off_route import way_on_m
 from tasks.reward.prepare import prepare_scene
-from tasks.reward.second_after import BRAKING_MPS2, hit_after_s
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, simulate
 from tasks.stages import STAGES, stage_versions
 from tasks.world.camera import Camera, Pinhole

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tasks.reward.off_route import NEAR_M, NEAR_RAD, way_on_m
+from tasks.reward.ends import NEAR_M, NEAR_RAD, way_on_m
 from tasks.world.clip import Clip
 from tasks.world.lanes import Route
 from tests.tasks.streets import LANE_M, street_clip

@@ -8,9 +8,16 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tasks.reward.rules.centerline import MAX_CELLS, index_centerline, is_off, locate_m, progress_m
+from tasks.reward.rules.centerline import (
+    MAX_CELLS,
+    driving_direction,
+    index_centerline,
+    is_off,
+    lane_keeping,
+    locate_m,
+    progress_m,
+)
 from tasks.reward.rules.ego import CENTER_IN_INTERSECTION, NON_DRIVABLE, ONCOMING, Body
-from tasks.reward.rules.lane_discipline import driving_direction, lane_keeping
 from tests.tasks.reward.slow import progress as slow
 
 ALONG_X = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 0.0], [25.0, 0.0], [60.0, 0.0]])  # with a joint of lanes

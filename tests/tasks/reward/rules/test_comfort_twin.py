@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import savgol_coeffs, savgol_filter
 
-from tasks.reward.rules import smooth
+from tasks.reward.rules import comfort
 from tasks.reward.rules.comfort import LIMITS, comfort_along, comfort_history, comfort_scratch, extended_comfort
 from tasks.world.vehicle import AX, AY, HEADING, PACIFICA, VX, YAW_ACCEL, YAW_RATE
 from tests.tasks.reward.slow import comfort as slow
@@ -84,7 +84,7 @@ def test_a_filter_equals_scipys_but_for_ties_of_the_rounding(name: str, n_rows: 
     samples = np.random.default_rng(n_rows).normal(size=(200, n_rows)).round(8)
     ours = np.empty_like(samples)
     for row, out in zip(samples, ours):
-        getattr(smooth, name)(row, out)
+        getattr(comfort, name)(row, out)
     theirs = np.round(savgol_filter(samples, window, order, deriv=derivative, delta=0.1), 8)
     # Samples of 8 decimals put one sum in 14 half-way between two roundings. There the last bits of the weights decide,
     # which scipy solves for with other bits on other processors.
@@ -94,11 +94,11 @@ def test_a_filter_equals_scipys_but_for_ties_of_the_rounding(name: str, n_rows: 
 
 def test_the_written_weights_are_scipys() -> None:
     weights = {
-        "smooth_accel": smooth.ACCEL_WEIGHTS,
-        "jerk_of": smooth.JERK_WEIGHTS,
-        "yaw_rate_of": smooth.YAW_RATE_WEIGHTS,
-        "yaw_accel_of": smooth.YAW_ACCEL_WEIGHTS,
-        "plan_yaw_accel_of": smooth.PLAN_YAW_ACCEL_WEIGHTS,
+        "smooth_accel": comfort.ACCEL_WEIGHTS,
+        "jerk_of": comfort.JERK_WEIGHTS,
+        "yaw_rate_of": comfort.YAW_RATE_WEIGHTS,
+        "yaw_accel_of": comfort.YAW_ACCEL_WEIGHTS,
+        "plan_yaw_accel_of": comfort.PLAN_YAW_ACCEL_WEIGHTS,
     }
     for name, (window, order, derivative) in FILTERS.items():
         theirs = savgol_coeffs(window, order, deriv=derivative, delta=0.1)[::-1]
@@ -109,7 +109,7 @@ def test_the_written_weights_are_scipys() -> None:
 @given(st.lists(st.floats(-10.0, 10.0) | st.sampled_from([0.0, np.pi, -np.pi, 2 * np.pi]), min_size=1, max_size=55))
 def test_unwrapping_is_numpys(angles: list[float]) -> None:
     unwrapped = np.array(angles)
-    smooth.unwrap(unwrapped)
+    comfort.unwrap(unwrapped)
     assert np.array_equal(unwrapped, np.unwrap(angles))
 
 
@@ -134,9 +134,9 @@ def test_a_ramp_of_acceleration_has_its_slope_as_jerk_and_more_at_the_start() ->
     """
     ramp = 10.0 + 0.1 * np.arange(55)
     accel, jerk = np.empty(55), np.empty(55)
-    smooth.smooth_accel(ramp, accel)
+    comfort.smooth_accel(ramp, accel)
     np.testing.assert_allclose(accel - ramp, [0.0] * 4 + [0.05] * 47 + [0.0] * 4, atol=1e-8)
-    smooth.jerk_of(accel, jerk)
+    comfort.jerk_of(accel, jerk)
     np.testing.assert_allclose(jerk[11:44], 1.0, atol=2e-7)
     middle, fall = 1.0 + 22 / 28 * 0.05, (154 - 11 * 56 / 3) / 4125.333
     np.testing.assert_allclose(jerk[:7], middle - fall * np.arange(7, 0, -1), atol=2e-7)  # row 0: 1.12639
@@ -178,10 +178,10 @@ def test_a_step_in_acceleration_has_its_greatest_jerk_one_row_before_it(low: flo
     4.1283 and is comfortable, one of 4.12 has 4.1384 at that row alone (its neighbours: 0.987 of it)."""
     accel = np.where(np.arange(55) < 30, low, 1.9)
     filtered, jerk = np.empty(55), np.empty(55)
-    smooth.smooth_accel(accel, filtered)
+    comfort.smooth_accel(accel, filtered)
     share = np.array([0, -3, 0, 7, 16, 25, 32, 35, 32]) / 32
     np.testing.assert_allclose(filtered[25:34], low + (1.9 - low) * share, atol=1e-8)
-    smooth.jerk_of(filtered, jerk)
+    comfort.jerk_of(filtered, jerk)
     np.testing.assert_allclose([jerk.argmax(), jerk.max()], [29, (1.9 - low) * 28.125 / 28], atol=1e-7)
     flags, first = judged(*series(accel=accel))
     assert flags.tolist() == [True, True, True, comfortable, True, True]
