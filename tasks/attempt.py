@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tasks.experts.pdm_closed.path import MIN_PROGRESS_M, path_length_m
 from tasks.experts.pdm_closed.planner import PdmClosed, PdmPlan, PdmSettings, plan_for
+from tasks.experts.pdm_closed.proposals import MIN_PROGRESS_M, path_length_m
 from tasks.experts.protocol import Expert, Plan
 from tasks.reward.ends import end_fault
 from tasks.reward.epdms import Scores, score

@@ -20,8 +20,7 @@ from factory.exits import as_worker, without_terminal
 from factory.graph.work import NotReady
 from factory.locks import locked
 from tasks.attempt import drive_and_judge
-from tasks.experts.pdm_closed.forecast import forecast
-from tasks.experts.pdm_closed.proposals import proposals
+from tasks.experts.pdm_closed.proposals import forecast, proposals
 from tasks.experts.pdm_closed.settings import PdmSettings
 from tasks.experts.protocol import Plan
 from tasks.kernels.compiled import USED, cache_dir, make_cache_dir, not_kept, processor, write_whole

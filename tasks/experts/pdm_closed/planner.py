@@ -13,9 +13,15 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 
-from tasks.experts.pdm_closed.forecast import RADIUS_M, forecast
-from tasks.experts.pdm_closed.path import MIN_PROGRESS_M, path_length_m
-from tasks.experts.pdm_closed.proposals import SCORED_STEPS, Proposals, proposals
+from tasks.experts.pdm_closed.proposals import (
+    MIN_PROGRESS_M,
+    RADIUS_M,
+    SCORED_STEPS,
+    Proposals,
+    forecast,
+    path_length_m,
+    proposals,
+)
 from tasks.experts.pdm_closed.settings import DEFAULTS, PdmSettings
 from tasks.experts.protocol import Plan, RunContext
 from tasks.reward.epdms import Scores, score

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tasks.experts.pdm_closed.forecast import forecast
 from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings, plan_for
-from tasks.experts.pdm_closed.proposals import driver, idm_step, proposals
+from tasks.experts.pdm_closed.proposals import driver, forecast, idm_step, proposals
 from tasks.experts.protocol import Plan
 from tasks.stages import Rejected
 from tasks.world.agents import AgentKind, AgentTracks

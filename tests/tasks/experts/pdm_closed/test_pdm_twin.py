@@ -10,9 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tasks.experts.pdm_closed.forecast import forecast
 from tasks.experts.pdm_closed.planner import PdmSettings
-from tasks.experts.pdm_closed.proposals import proposals
+from tasks.experts.pdm_closed.proposals import forecast, proposals
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.frames import box_corners
 from tasks.world.geometry import rings_distance, rings_touch

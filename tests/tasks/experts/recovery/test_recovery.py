@@ -7,8 +7,14 @@ import numpy as np
 import pytest
 
 from tasks.experts.protocol import Plan
-from tasks.experts.recovery.expert import Recovery, RecoverySettings, RecoveryTable, start_velocities
-from tasks.experts.recovery.feasible import FeasibleSettings, feasible
+from tasks.experts.recovery.expert import (
+    FeasibleSettings,
+    Recovery,
+    RecoverySettings,
+    RecoveryTable,
+    feasible,
+    start_velocities,
+)
 from tasks.stages import Rejected
 from tasks.world.clip import NOW, Scene
 from tasks.world.frames import to_local, to_world
