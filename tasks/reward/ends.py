@@ -108,6 +108,9 @@ def _first_hit(context: RuleContext, boxes: Array, is_stopped: Bools, collision_
     return first_collision(obstacles, states, body, ego.half_length, ego.half_width, ignored)[1]
 
 
+# What the gate asks of an end.
+
+
 def end_fault(traffic: TrafficScene, prepared: PreparedScene, states: Array, gate: ExpertGate) -> Rejected | None:
     """None where a drive with states (41, 11) leads on; traffic: as it met it; prepared: the scene it was judged in."""
     clip = traffic.scene.clip

@@ -429,6 +429,8 @@ def _edges_around(swept: Corridors, path: int, x: float, y: float, squares: Arra
     return crossings % 2 == 1
 
 
+# The proposals themselves.
+
 SCORED_STEPS = 40
 PROPOSAL_STEPS = 50  # the chosen one is driven on to 5 s
 SAMPLES = PROPOSAL_STEPS // SAMPLE_STEPS + 1

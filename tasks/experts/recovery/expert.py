@@ -195,6 +195,8 @@ def _solve(
     return np.asarray(result.x, dtype=np.float64)
 
 
+# The table of human trajectories, and the expert that searches it.
+
 FIT_STEPS = 5  # the start velocity is that of a parabola through the origin and the first 0.5 s
 START_HEADING, END_HEADING = 2, 5  # columns of the matching vector that are angles
 

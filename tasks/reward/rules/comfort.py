@@ -145,6 +145,8 @@ def unwrap(angles: Array) -> None:
         angles[i] += turned
 
 
+# The rules.
+
 # (6, 2): longitudinal, lateral acceleration [m/s2]; jerk; longitudinal jerk [m/s3]; yaw acceleration; yaw rate
 LIMITS = np.array([(-4.05, 2.40), *((-most, most) for most in (4.89, 8.37, 4.13, 1.93, 0.95))])
 EC_LIMITS = (0.7, 0.5, 0.1, 0.1)  # RMS of acceleration, jerk, yaw rate, yaw acceleration (SI)

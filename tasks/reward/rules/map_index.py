@@ -241,6 +241,8 @@ def _most_cells(edges: Array, cell_m: float) -> int:
 
 Bits = NDArray[np.uint64]
 
+# The index.
+
 ROUNDING = 1e-15  # above the error of a difference of two products, relative to their sum
 
 # Parts a region plays: rows of MapIndex.playing; 1 << part are the bits of MapIndex.parts

@@ -91,6 +91,8 @@ def centroid(box: Box) -> tuple[float, float]:
     return (sum_x / total, sum_y / total) if total > 0.0 else (box.x, box.y)
 
 
+# Who stands where when, laid out for the rules.
+
 N_TIMES = HORIZON_STEPS + 1
 STOPPED_SPEED_MPS = 0.05
 CELLS_PER_SIDE = 64  # a power of two
