@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -13,9 +14,11 @@ import numpy as np
 import pytest
 import torch
 
+from factory.run import main as run_factory
 from planners.training.checkpoint import load_planner, newest, read_record
 from planners.training.curves import LOSSES, VALIDATION
 from planners.training.train import main
+from tests.pages import commands
 from tests.planners.samples import sample, write_table
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -57,26 +60,63 @@ def test_it_trains_and_says_what_with(table: str, tmp_path: Path, capsys: pytest
     assert last[0] == "step,ade_m,fde_m" and [line.split(",")[0] for line in last[1:]] == ["10", "18"]
 
 
-def test_the_documented_first_training_takes_a_table_of_six_samples(tmp_path: Path) -> None:
-    """docs/extend.md's command on the real samples that `make demo` makes."""
-    write_table(tmp_path / "demo", [sample(i) for i in range(6)])
-    words = ["planner=custom", "planner.name=examples.linear_planner:LinearPlanner", "log_every=20", "workers=0"]
-    script = [sys.executable, "-m", "planners", "train", *words, f"data.real=[{tmp_path / 'demo'}]"]
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder in which `make demo` wrote runs/demo: three clips of it, seen and drawn small."""
+    home = tmp_path_factory.mktemp("demo")
+    small = ["clips.settings.width=96", "clips.settings.height=54", "render.width=80", "render.height=45"]
+    small += ["render.fit.iterations=20", "render.fit.start_gaussians=2000", "render.fit.most_gaussians=2500"]
+    small += ["render.fit.start_every=2", "render.fit.stereo_photos=2", "render.psnr_min=0"]
+    small += ["render.gate.enabled=false", "vocabulary.k=64", "rounds=1", "limit=3"]
+    small += ["clips.settings.lidar_beams=16", "clips.settings.lidar_azimuths=180"]
+    assert run_factory(["preset=demo", "executor=local", *small, f"out={home / 'runs/demo'}"]) == 0
+    return home
+
+
+def documented(page: str) -> list[str]:
+    """A page's first command that trains, of the demo's table and of a planner for a CPU."""
+    words = next(list(one.words) for one in commands(page) if one.words[:4] == ("python", "-m", "planners", "train"))
+    own = {"/data/samples": "runs/demo", "planner=ltf": "planner=ltf_small"}
+    for there, here in own.items():
+        words = [here if word == there else word.replace(f"[{there}]", f"[{here}]") for word in words]
+    return words[1:]
+
+
+def trained(home: Path, *words: str) -> tuple[list[str], dict[str, Any]]:
+    """What a training in `home` notes, and its record."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    for steps in ("steps=3", "steps=100"):  # begun, and gone on with
-        done = subprocess.run(
-            [*script, f"out={tmp_path / 'out'}", steps, "resume=further"],
-            cwd=tmp_path,
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=300,
-        )
-        assert done.returncode == 0, done.stderr
-        (line,) = [line for line in done.stdout.splitlines() if line.startswith("note: ")]
-        assert "planner.training.batch_size=64 -> 6" in line
-    record = read_record(tmp_path / "out")
-    assert (record["step"], record["trained"]["planner.training"]["batch_size"]) == (100, 6)
+    done = subprocess.run(
+        [sys.executable, *words], cwd=home, env=environment, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    out = next(word for word in reversed(words) if word.startswith("out="))
+    return [line for line in done.stdout.splitlines() if line.startswith("note: ")], read_record(home / out[4:])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("page", "asked", "size"), [("docs/extend.md", 64, 3), ("docs/training.md", 32, 9)])
+def test_the_documented_first_trainings_take_the_demo_s_table(page: str, asked: int, size: int, demo: Path) -> None:
+    """Of three human samples, and of all: the batch is as large as there are, also where one is gone on with."""
+    for steps in (2, 4):
+        notes, record = trained(demo, *documented(page), f"steps={steps}", "resume=further")
+        (note,) = notes
+        assert note.startswith(f"note: planner.training.batch_size={asked} -> {size}: "), note
+        assert (record["step"], record["trained"]["planner.training"]["batch_size"]) == (steps, size)
+
+
+@pytest.mark.slow
+def test_two_processes_of_torchrun_share_the_batch_that_the_demo_s_samples_fill(demo: Path) -> None:
+    """Three samples: a batch of two, one for each, which one of the processes notes."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    torchrun = ["-m", "torch.distributed.run", "--nproc-per-node", "2", "--master-port", str(port)]
+    more = ["steps=2", "device=cpu", "out=runs/two"]
+    notes, record = trained(demo, *torchrun, *documented("docs/extend.md"), *more)
+    (note,) = notes
+    assert note.startswith("note: planner.training.batch_size=64 -> 2: "), note
+    assert (record["step"], record["trained"]["planner.training"]["batch_size"]) == (2, 2)
+    assert record["trained"]["processes"] == 2
 
 
 def test_a_loss_that_is_not_known_yet_is_a_dash(
