@@ -177,7 +177,7 @@ def _run(
     from factory.stages.warm import compiling_ahead
     from factory.store.counts.funnel import image_sources_text
     from factory.store.location import BadLocation, Location
-    from factory.store.samples import Store
+    from factory.store.samples import OtherSchema, Store
     from factory.store.table import DamagedLog
     from factory.views.board.report import remember, write_report
     from factory.views.card import write_card
@@ -186,7 +186,7 @@ def _run(
 
     try:
         store = Store(Location.parse(config.out))
-    except (BadLocation, DamagedLog) as error:
+    except (BadLocation, DamagedLog, OtherSchema) as error:
         raise ConfigError(str(error)) from error
     elsewhere = config.executor == "ray" and "RAY_ADDRESS" in os.environ  # a cluster's nodes compile for themselves
     with nullcontext() if elsewhere else compiling_ahead(kernels_of(config)):

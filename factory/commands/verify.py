@@ -34,12 +34,14 @@ class Request:
 def main(request: Request) -> int:
     """Print the verdict, after the repair where one is asked for."""
     from factory.store.location import BadLocation
+    from factory.store.samples import OtherSchema, refuse_other_schema
     from factory.store.table import AnotherWriter, DamagedLog
     from factory.store.upkeep import RunGoesOn, drop_damaged, hold, restore_logs
     from factory.store.verify import damaged_logs
 
     out = out_of(request.out)
     try:
+        refuse_other_schema(out)
         if request.repair:
             for name in restore_logs(out):
                 print(f"put back {name}")
@@ -59,7 +61,7 @@ def main(request: Request) -> int:
     except DamagedLog as error:
         print(f"DAMAGED {error}")
         return DAMAGED
-    except (RunGoesOn, AnotherWriter, BadLocation) as error:
+    except (RunGoesOn, AnotherWriter, BadLocation, OtherSchema) as error:
         raise Refused(str(error)) from error
     for line in verdict.damage:
         print(f"DAMAGED {line}")

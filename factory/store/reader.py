@@ -26,7 +26,7 @@ from factory.store.location import Location
 from factory.store.mcap_shards.mirror import McapTable, open_shard
 from factory.store.mcap_shards.shard import McapShard
 from factory.store.parquet_file import naming, open_parquet, with_partition
-from factory.store.schema import SAMPLES, SCHEMA, SCHEMA_VERSION, VERSION_PROPERTY, table_to_rows
+from factory.store.schema import SAMPLES, SCHEMA, VERSION_PROPERTY, table_to_rows, why_other_schema
 from factory.store.table import KeyedTable
 from tasks.reward.label_bytes import VocabularyLabels, decode
 from tasks.world.arrays import Bytes, Ints
@@ -57,9 +57,8 @@ def sample_table(
     if table.version is None:
         folder = "its folder samples_mcap" if format == "mcap" else "here or in its folder samples"
         raise FileNotFoundError(f"{location.uri}: no table of samples {folder}")
-    version = table.properties.get(VERSION_PROPERTY)
-    if version != str(SCHEMA_VERSION):
-        raise ValueError(f"{location.uri}: schema_version {version}, this version reads {SCHEMA_VERSION}")
+    if other := why_other_schema(location.uri, table.properties.get(VERSION_PROPERTY)):
+        raise ValueError(other)
     return table
 
 

@@ -20,7 +20,7 @@ from factory.store.location import Location
 from factory.store.outcomes import OUTCOMES, Outcome, outcomes_table
 from factory.store.parquet_file import Shard, write_shard
 from factory.store.plans import PLANS, plan_table
-from factory.store.schema import LICENCES_PROPERTY, SAMPLES, SCHEMA_VERSION
+from factory.store.schema import LICENCES_PROPERTY, SAMPLES, SCHEMA_VERSION, why_other_schema
 from factory.store.table import KeyedTable
 from tasks.sealed import MEMBER, sealed_json, unsealed_json
 
@@ -42,13 +42,31 @@ class ChangedRun(ValueError):
     """The run's settings, versions or expert inputs differ from the table's; the message says where."""
 
 
+class OtherSchema(ChangedRun):
+    """The tables are of another version of the schema; the message names both and says how to make them again."""
+
+
+def refuse_other_schema(out: Location) -> None:
+    """Raises OtherSchema by run.json alone, that of earlier versions without a checksum too; opens no table."""
+    data = out.read(RUN_FILE)
+    if data is None:
+        return
+    try:
+        version = (unsealed_json(data) if f'"{MEMBER}"'.encode() in data else json.loads(data))["schema_version"]
+    except (ValueError, KeyError, TypeError):  # damaged: who needs the records says so
+        return
+    if other := why_other_schema(out.uri, version):
+        raise OtherSchema(other)
+
+
 class Store:
-    """One run's view of everything under `out`. Opening writes nothing."""
+    """One run's view of everything under `out`. Opening writes nothing, and raises OtherSchema before any table is."""
 
     def __init__(
         self, out: str | os.PathLike[str] | Location, storage_options: Mapping[str, str] | None = None
     ) -> None:
         self.location = out if isinstance(out, Location) else Location.parse(out, storage_options)
+        refuse_other_schema(self.location)
         self.samples = KeyedTable(self.location.child("samples"), SAMPLES)
         self.candidates = KeyedTable(self.location.child("candidates"), CANDIDATES)
         self.outcomes = KeyedTable(self.location.child("outcomes"), OUTCOMES)
@@ -104,7 +122,7 @@ class Store:
             if identity.prepare_digest == UNLISTED:  # lists of earlier runs stay what they are
                 record["prepare_digest"] = records[-1]["prepare_digest"]
             if on_change == "stop":
-                record["on_change"] = records[-1].get("on_change", "stop")
+                record["on_change"] = records[-1]["on_change"]
             if not changes:
                 records = records[:-1]
         return [*records, record]
@@ -167,14 +185,9 @@ class Store:
         if data is None:
             return []
         try:
-            # Versions before wrote none: what is whole without one is taken.
-            document = unsealed_json(data) if f'"{MEMBER}"'.encode() in data else json.loads(data)
-            version, runs = document["schema_version"], list(document["runs"])
+            return list(unsealed_json(data)["runs"])
         except (ValueError, KeyError, TypeError) as error:
             raise ChangedRun(f"{self.location.uri}/{RUN_FILE}: not readable: {error}") from error
-        if version != SCHEMA_VERSION:
-            raise ChangedRun(f"{self.location.uri}: schema_version {version}, this version writes {SCHEMA_VERSION}")
-        return runs
 
     def began_ms(self, ended: bool = False) -> int:
         """When the newest run began, since 1970; ended: when that which ended last did. 0 where nothing says so."""

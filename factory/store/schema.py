@@ -14,7 +14,7 @@ from factory.store.identity import Stamp
 from factory.store.parquet_file import TableSpec
 from tasks.subscores import HALVES, JUDGED, SUBSCORES, WHOLES
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 MAP_RADIUS_M = 64.0
 AGENT_STEPS = 56  # -1.5 .. 4.0 s at 10 Hz; index 15 is now
 NOW_INDEX = 15
@@ -189,6 +189,16 @@ SAMPLES = TableSpec(
     properties={VERSION_PROPERTY: str(SCHEMA_VERSION)},
     packed=("images.list.element.jpeg",),
 )
+
+
+def why_other_schema(uri: str, version: object) -> str:
+    """One line on why tables of this version of the schema are not opened; nothing where it is this one's."""
+    if str(version) == str(SCHEMA_VERSION):
+        return ""
+    return (
+        f"{uri}: schema_version {version}, this version reads and writes {SCHEMA_VERSION}: make the tables again, "
+        "by the command that made them with another out="
+    )
 
 
 def sample_row_to_table(rows: Sequence[Mapping[str, object]]) -> pa.Table:

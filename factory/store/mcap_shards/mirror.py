@@ -76,7 +76,7 @@ def write_mcap_shard(out: Location, path: str, partition: Mapping[str, str]) -> 
     samples = out.child(SAMPLES.name)
     with naming(f"{samples.uri}/{path}"):
         parquet = open_parquet(samples, path)
-        data = shard_bytes(parquet, partition)
+        data = shard_bytes(parquet)
         keys = tuple(parquet.read(columns=[SAMPLES_MCAP.key])[SAMPLES_MCAP.key].to_pylist())
     name = f"{path.removesuffix('.parquet')}-{hashlib.sha256(data).hexdigest()[:32]}.mcap"
     out.child(SAMPLES_MCAP.name).write(name, data)

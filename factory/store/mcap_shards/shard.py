@@ -29,7 +29,6 @@ from mcap_protobuf.schema import register_schema
 from factory.store.mcap_shards.rows import array_of, fields_of
 from factory.store.mcap_shards.topics import JPEG, PACKAGE, TOPICS, camera_topic, described, descriptor_set, topic_of
 from factory.store.mcap_shards.wire import Fields, parse
-from factory.store.schema import COLUMNS
 from tasks.sealed import sealed_json, unsealed_json
 from tasks.world.arrays import Ints
 
@@ -43,7 +42,7 @@ LARGE_BYTES = 2**40  # more than any chunk is to hold before it is closed
 IMAGE_DATA = 2  # field of CompressedImage
 
 
-def shard_bytes(file: pq.ParquetFile, partition: Mapping[str, str]) -> bytes:
+def shard_bytes(file: pq.ParquetFile) -> bytes:
     """An MCAP file of all that a Parquet shard holds."""
     stream = io.BytesIO()
     writer = Writer(stream, chunk_size=LARGE_BYTES, compression=CompressionType.ZSTD, enable_data_crcs=True)
@@ -56,7 +55,7 @@ def shard_bytes(file: pq.ParquetFile, partition: Mapping[str, str]) -> bytes:
     image_schema = register_schema(writer, CompressedImage)
     first = 0
     for group in range(file.metadata.num_row_groups):
-        rows = _with_partition(file.read_row_group(group), partition)
+        rows = file.read_row_group(group)
         times = [int(NS * (a + b)) for a, b in zip(rows["clip_start_s"].to_pylist(), rows["now_s"].to_pylist())]
         for name, topic in TOPICS.items():
             arrays = [(at, rows[at.column.name].combine_chunks()) for at in topic.columns]
@@ -214,15 +213,6 @@ def _layout(file: pq.ParquetFile) -> dict[str, str]:
     }
     layout = {"rows": [group.num_rows for group in groups], "bytes": sizes}
     return {"layout": sealed_json(layout)}
-
-
-def _with_partition(rows: pa.Table, partition: Mapping[str, str]) -> pa.Table:
-    """Shards of version 0.1.0 have expert and round in their folders' names alone."""
-    for name, value in partition.items():
-        if name not in rows.column_names:
-            kind = COLUMNS[name].arrow_type
-            rows = rows.append_column(name, pa.repeat(pa.scalar(value).cast(kind), rows.num_rows))
-    return rows
 
 
 def _pictures(rows: pa.Table) -> dict[str, list[tuple[int, float, bytes]]]:

@@ -2,7 +2,6 @@
 
 import io
 import struct
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -36,16 +35,16 @@ from tests.planners.samples import grey_pictures, sample, write_table
 IDS = {name: value for name, value in sample(0).items() if name in BOOKKEEPING}
 
 
-def a_shard(folder: Path, n: int = 7, group_rows: int = 3, **columns: Any) -> tuple[Path, Mapping[str, str]]:
-    """A Parquet shard of n samples, and its partition."""
+def a_shard(folder: Path, n: int = 7, group_rows: int = 3, **columns: Any) -> Path:
+    """A Parquet shard of n samples."""
     out = write_table(folder, [sample(i, **grey_pictures(3 * i), **columns) for i in range(n)], group_rows=group_rows)
-    ((path, partition),) = Store(out).samples.live_files().items()
-    return folder / "samples" / path, partition
+    ((path, _),) = Store(out).samples.live_files().items()
+    return folder / "samples" / path
 
 
-def both(path: Path, partition: Mapping[str, str]) -> tuple[McapShard, pq.ParquetFile]:
+def both(path: Path) -> tuple[McapShard, pq.ParquetFile]:
     parquet = pq.ParquetFile(path)
-    return McapShard(pa.BufferReader(shard_bytes(parquet, partition))), parquet
+    return McapShard(pa.BufferReader(shard_bytes(parquet))), parquet
 
 
 def test_every_value_of_every_column_comes_back(tmp_path: Path) -> None:
@@ -54,8 +53,8 @@ def test_every_value_of_every_column_comes_back(tmp_path: Path) -> None:
             rows = [row_of(stream("mcap", i)) | {**IDS, "attempt_id": f"attempt{i}"} for i in range(3)]
         folder = tmp_path / str(number)
         write_table(folder, rows, group_rows=2)
-        ((path, partition),) = Store(folder).samples.live_files().items()
-        mcap, parquet = both(folder / "samples" / path, partition)
+        ((path, _),) = Store(folder).samples.live_files().items()
+        mcap, parquet = both(folder / "samples" / path)
         assert mcap.rows.tolist() == [2, 1]
         assert_equal(mcap.read(list(mcap.leaves)), parquet.read())
 
@@ -80,7 +79,7 @@ def test_numbers_keep_their_bits_and_nulls_are_no_zeros(tmp_path: Path) -> None:
         "agent_heights": np.ones(1, np.float32),
         "agent_center_z": np.zeros((1, 56), np.float32),
     }
-    mcap, _ = both(*a_shard(tmp_path, 1, stage1_nc=-0.0, stage1_dac=None, label_subscores=None, **agents))
+    mcap, _ = both(a_shard(tmp_path, 1, stage1_nc=-0.0, stage1_dac=None, label_subscores=None, **agents))
     rows = mcap.read(list(mcap.leaves))
     kept = rows["agent_boxes"].combine_chunks().flatten().flatten().flatten().to_numpy()
     assert kept.tobytes() == boxes.tobytes()
@@ -89,8 +88,8 @@ def test_numbers_keep_their_bits_and_nulls_are_no_zeros(tmp_path: Path) -> None:
 
 
 def test_a_column_reads_its_own_chunks_and_no_others(tmp_path: Path) -> None:
-    path, partition = a_shard(tmp_path)
-    data = shard_bytes(pq.ParquetFile(path), partition)
+    path = a_shard(tmp_path)
+    data = shard_bytes(pq.ParquetFile(path))
     shard = McapShard(pa.BufferReader(data))
     chunk = shard.index.chunks[1, "/agents"]
     spoilt = bytearray(data)
@@ -104,8 +103,8 @@ def test_a_column_reads_its_own_chunks_and_no_others(tmp_path: Path) -> None:
 
 
 def test_any_other_reader_finds_typed_messages_by_topic_time_and_place(tmp_path: Path) -> None:
-    path, partition = a_shard(tmp_path)
-    rows, data = pq.read_table(path, partitioning=None).to_pylist(), shard_bytes(pq.ParquetFile(path), partition)
+    path = a_shard(tmp_path)
+    rows, data = pq.read_table(path, partitioning=None).to_pylist(), shard_bytes(pq.ParquetFile(path))
     reader = make_reader(io.BytesIO(data), validate_crcs=True, decoder_factories=[DecoderFactory()])
     summary = reader.get_summary()
     assert summary is not None and all(schema.encoding == "protobuf" for schema in summary.schemas.values())
@@ -151,9 +150,9 @@ def test_what_is_no_message_is_refused() -> None:
 
 
 def test_a_damaged_shard_is_refused_or_read_as_it_was(tmp_path: Path) -> None:
-    path, partition = a_shard(tmp_path, 3)
-    whole = shard_bytes(pq.ParquetFile(path), partition)
-    leaves, refused = list(both(path, partition)[0].leaves), 0
+    path = a_shard(tmp_path, 3)
+    whole = shard_bytes(pq.ParquetFile(path))
+    leaves, refused = list(both(path)[0].leaves), 0
     expected = repr(McapShard(pa.BufferReader(whole)).read(leaves).to_pylist())
     for content in damaged(whole, every=len(whole) // 60):
         try:

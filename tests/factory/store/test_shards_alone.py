@@ -1,6 +1,5 @@
 """A shard says of itself which expert and round it holds, and every engine reads a table of such shards as before."""
 
-import hashlib
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -14,14 +13,9 @@ import pytest
 from deltalake import DeltaTable
 
 from factory.graph.execute import execute
-from factory.store.location import Location
 from factory.store.parquet_file import Shard
-from factory.store.reader import SampleTable
 from factory.store.samples import Store
-from factory.store.schema import SAMPLES
-from factory.store.table import KeyedTable
 from factory.store.verify import verify
-from tests.factory.tables import assert_same_rows, assert_same_tables
 from tests.factory.toy import ToyWork, refs
 
 PLACE = ["attempt_id", "expert", "round"]
@@ -32,27 +26,6 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run")
     execute(ToyWork(), refs(3), ["recovery", "human"], 2, Store(folder), "local", say=lambda line: None)
     return folder
-
-
-def without_place(out: Path, to: Path) -> Path:
-    """The same run as version 0.1.0 wrote it: expert and round stand in the folders' names and in the log alone."""
-    shutil.copytree(out, to)
-    store, old = Store(to), KeyedTable(Location.parse(to / "old"), SAMPLES)
-    shards = []
-    for path, partition in store.samples.live_files().items():
-        rows = pq.ParquetFile(to / "samples" / path).read()
-        sink = pa.BufferOutputStream()
-        pq.write_table(rows.drop_columns(["expert", "round"]), sink, store_schema=False)
-        data = sink.getvalue().to_pybytes()
-        path = f"{path.rpartition('/')[0]}/part-{hashlib.sha256(data).hexdigest()[:32]}.parquet"
-        target = to / "old" / path
-        target.parent.mkdir(parents=True)
-        target.write_bytes(data)
-        shards.append(Shard(path, target.stat().st_size, partition, tuple(rows["attempt_id"].to_pylist())))
-    old.commit(shards)
-    shutil.rmtree(to / "samples")
-    (to / "old").rename(to / "samples")
-    return to
 
 
 def places(rows: list[dict[str, object]]) -> list[tuple[object, ...]]:
@@ -101,26 +74,9 @@ def delta_in_duckdb(uri: str) -> list[dict[str, object]]:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize("version", ["0.1.0", "now"])
-def test_every_engine_reads_expert_and_round_of_every_row(out: Path, tmp_path: Path, engine: str, version: str) -> None:
-    folder = out if version == "now" else without_place(out, tmp_path / "old")
+def test_every_engine_reads_expert_and_round_of_every_row(out: Path, engine: str) -> None:
     ours = Store(out).samples.read(PLACE).to_pylist()
-    assert places(ENGINES[engine](str(folder / "samples"))) == places(ours) and len(ours) >= 6
-
-
-def test_a_table_of_version_0_1_0_is_read_verified_and_gone_on_with(out: Path, tmp_path: Path) -> None:
-    old = without_place(out, tmp_path / "old")
-    assert_same_rows(SampleTable(old).table(), SampleTable(out).table())
-    assert [s["expert"] for s in SampleTable(old)] == [s["expert"] for s in SampleTable(out)]
-    assert verify(Store(old)).damage == ()
-    longer = tmp_path / "longer"
-    shutil.copytree(out, longer)
-    for folder in (old, longer):
-        execute(ToyWork(), refs(3), ["recovery", "human"], 3, Store(folder), "local", say=lambda line: None)
-    assert_same_tables(old, longer)
-    assert len(SampleTable(old)) > len(SampleTable(out)), "some shards say it themselves, some do not"
-    assert verify(Store(old)).damage == ()
-    assert places(ENGINES["polars"](str(old / "samples"))) == places(Store(longer).samples.read(PLACE).to_pylist())
+    assert places(ENGINES[engine](str(out / "samples"))) == places(ours) and len(ours) >= 6
 
 
 def test_a_shard_in_another_s_place_is_damage(out: Path, tmp_path: Path) -> None:

@@ -1,5 +1,7 @@
 """Reading samples: no Ray, no Hydra, little I/O; and verify, which reads everything."""
 
+import json
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -12,13 +14,15 @@ import cv2
 import numpy as np
 import pytest
 
-from factory.commands.table import COMMANDS
+from factory.commands.table import COMMANDS, dispatch
+from factory.exits import BAD_CONFIG
 from factory.graph.execute import execute
 from factory.store.reader import Format, SampleTable, image_of, labels_of, to_torch
 from factory.store.samples import Store
 from factory.store.schema import LABEL_COLUMNS
 from factory.store.verify import verify
 from tasks.reward.label_bytes import VocabularyLabels
+from tasks.sealed import sealed_json
 from tests.factory.toy import ToyWork, refs, row_of, stream
 
 main = COMMANDS["verify"].load()
@@ -72,7 +76,7 @@ def test_workers_of_a_data_loader_read_the_snapshot_that_was_opened_however_they
 def test_the_tables_metadata_names_version_and_licences(out: Path) -> None:
     properties = Store(out).samples.properties
     licences = set(SampleTable(out).table(["licence"])["licence"].to_pylist())
-    assert properties["factory.schema_version"] == "3"
+    assert properties["factory.schema_version"] == "4"
     assert set(properties["factory.licences"].split("; ")) == licences and len(licences) > 1
 
 
@@ -94,8 +98,32 @@ def test_a_table_of_another_version_is_named(tmp_path: Path) -> None:
     store = Store(tmp_path)
     execute(ToyWork(), refs(1), ["human"], 1, store, "local", say=lambda line: None)
     store.samples.set_property("factory.schema_version", "1")
-    with pytest.raises(ValueError, match=f"{tmp_path}.*schema_version 1, this version reads 3"):
+    with pytest.raises(ValueError, match=f"{tmp_path}.*schema_version 1, this version reads and writes 4: make the"):
         SampleTable(tmp_path)
+
+
+@pytest.mark.parametrize("is_sealed", [True, False], ids=["sealed", "as the first versions wrote it"])
+def test_tables_of_another_version_are_refused_in_one_line_and_left_as_they_are(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], is_sealed: bool
+) -> None:
+    execute(ToyWork(), refs(1), ["human"], 1, Store(tmp_path), "local", say=lambda line: None)
+    record = {"schema_version": 3, "runs": json.loads((tmp_path / "run.json").read_text())["runs"]}
+    (tmp_path / "run.json").write_text(sealed_json(record) if is_sealed else json.dumps(record))
+    shutil.rmtree(tmp_path / "samples" / "_commits")  # a repair would make them again
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    words = ["run executor=local", "plan executor=local", "verify", "verify repair=true"]
+    words += ["status", "failed", "retry", "clean", "compact", "report", "lineage sample=0", "show sample=0"]
+    for command in words:
+        name, *more = command.split()
+        capsys.readouterr()
+        where = str(tmp_path) if name == "verify" else f"out={tmp_path}"
+        assert dispatch([name, where, *more], COMMANDS, "") == BAD_CONFIG, name
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line == (
+            f"error: {tmp_path}: schema_version 3, this version reads and writes 4: make the tables again, "
+            "by the command that made them with another out="
+        )
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
 def test_vocabulary_labels_come_back_from_the_table(out: Path) -> None:
