@@ -30,14 +30,11 @@ from tasks.caches import user_cache
 from tasks.experts.pdm_closed.settings import PdmSettings
 from tasks.experts.protocol import Expert, tried_once
 from tasks.render.fit.lpips import BadWeights, lpips_of
-from tasks.render.rig.settings import RigSettings
 from tasks.render.rigs import RIGS
 from tasks.render.scene import engine
-from tasks.render.scene.settings import SceneDtype
-from tasks.render.settings import REMOVED, RenderMode
+from tasks.render.settings import RenderMode
 from tasks.render.splatting.gsplat_backend import BackendMissing
 from tasks.reward.labels import Labelling
-from tasks.rollout import settings as traffic
 from tasks.rollout.policy import traffic_record
 from tasks.stages import FRAMES, stage_versions
 from tasks.world.kinematic_vocabulary import kinematic_trajectories
@@ -45,14 +42,6 @@ from tasks.world.vocabulary import Vocabulary
 
 KINEMATIC_K = 1024
 RIGS_LOOKED_AT = 3  # clips, for the names of their cameras
-ABSENT = object()
-# Settings that came later: at what held before there was a choice they are left out, so that older tables go on.
-ADDED: dict[str, object] = {"perturb.interleaved": True, "perturb.order": "drawn", "perturb.at_most": None}
-ADDED |= {"perturb.at_log": False}
-ADDED |= {"reward.off_route": False, "reward.after": False}
-ADDED |= {"render.own_body": "", "render.jpeg_chroma": "420", "traffic.yields": False}
-ADDED |= {"render.scene_dtype": SceneDtype.FLOAT32}
-ADDED |= {"render.camera_psnr_min": 0.0, "render.rig": dataclasses.asdict(RigSettings())}
 
 
 @dataclass(frozen=True)
@@ -274,12 +263,8 @@ def identity_of(
     for group, value in science.items():
         settings |= {f"{group}.{key}": plain for key, plain in dataclasses.asdict(value).items()}
     settings |= {f"traffic.{key}": plain for key, plain in traffic_record(config.traffic).items()}
-    settings |= {f"traffic.{key}": value for key, value in traffic.REMOVED.items()}
-    for part, gone in REMOVED.items():
-        settings[f"render.{part}"] = dataclasses.asdict(getattr(config.render, part)) | gone
     del settings["render.lpips"]  # measures alone
     settings["render.own_body"] = masks_digest(config.render.own_body)
-    settings = {key: plain for key, plain in settings.items() if plain != ADDED.get(key, ABSENT)}
     weak: dict[str, object] = {}
     if explored is not None:
         weak["explore.planner"] = f"{explored.planner} {explored.planner_digest}"

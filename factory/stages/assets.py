@@ -33,7 +33,7 @@ from tasks.render.scene.movers import lifted
 from tasks.render.scene.sensed import own_bodies
 from tasks.render.scene.settings import Backend, SceneDtype
 from tasks.render.scene.stereo import MAX_BASELINE_M, MIN_BASELINE_M
-from tasks.render.settings import REMOVED, RenderSettings, SceneFrom
+from tasks.render.settings import RenderSettings, SceneFrom
 from tasks.world.arrays import Array, Bools
 from tasks.world.camera import Camera, SensorFile
 from tasks.world.clip import Block, Clip, of_other_log, own_name
@@ -188,7 +188,7 @@ def block_id(clip: Clip, settings: RenderSettings) -> str:
     block = block_of(clip)
     made_of = (ASSET_VERSION, clip.dataset, clip.log_id, block.start_s, block.ground_m, clip.content_digest)
     part = "fit" if settings.scene is SceneFrom.FIT else "asset"
-    made = asdict(settings)[part] | REMOVED[part]
+    made = asdict(settings)[part]
     if settings.scene is SceneFrom.FIT and settings.backend.on_gpu:
         made["backend"] = Backend.GSPLAT  # another fit to the last bits, so that a run on CPUs never meets it
     how: list[object] = [settings.width, settings.height, sorted(settings.cameras), made]

@@ -10,16 +10,6 @@ from tasks.render.fit.settings import FitSettings
 from tasks.render.rig.settings import RigSettings
 from tasks.render.scene.settings import AssetSettings, Backend, SceneDtype
 
-# Settings that are gone, as they always were: keys of blocks and tables hold them still, so that older ones go on.
-_FIT: dict[str, object] = {"depth_weight": 0.0, "opacity_weight": 0.0, "scale_weight": 0.0, "max_gap_px": (12, 24)}
-_FIT |= {"sh_rate": 6e-4, "rate_end": 0.1, "refine_until": 0.8, "dead_opacity": 0.01, "jitter": 0.5}
-REMOVED: dict[str, dict[str, object]] = {
-    "fit": _FIT | {"road_slack": 0.02, "road_thickness": 0.005},
-    "asset": {"max_gap_px": (12, 24), "refit_sweeps": 1},
-    "gate": {"road_m": 20.0, "hole_max": 0.2, "lens_m": 0.8, "lens_max": 0.2, "detail_min": 0.06},
-}
-
-
 Chroma = Literal["420", "444"]
 
 

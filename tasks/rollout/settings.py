@@ -3,8 +3,6 @@
 from dataclasses import dataclass, fields
 from typing import Literal
 
-# Settings that are gone, as they always were: keys of tables hold them still, so that older ones go on.
-REMOVED = {"lateral_accel_max": 3.0, "snap_distance_m": 3.0, "enter_clearance_m": 30.0, "corridor_margin_m": 0.1}
 MOST = 1000.0  # of any setting, and of speeds [m/s]: the length of paths grows with it
 
 

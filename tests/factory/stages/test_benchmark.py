@@ -214,11 +214,8 @@ def test_a_pair_falls_together_at_the_pictures(tmp_path: Path) -> None:
         assert [image["time_s"] for image in result.row["images"]] == [pytest.approx(0.0, abs=1e-6)]  # type: ignore[attr-defined]
 
 
-def test_settings_that_came_later_leave_older_tables_alone() -> None:
-    old = load_config([])
-    settings = identity_of(old, VOCABULARY, None).settings
-    assert not {"perturb.interleaved", "perturb.order", "perturb.at_most"} & set(settings)
+def test_a_run_of_pairs_of_frames_prepares_anew() -> None:
     dense = identity_of(load_config(["perturb=dense"]), VOCABULARY, None).settings
     assert dense["perturb.order"] == "spread" and dense["perturb.at_most"] == 32
     benchmark = identity_of(load_config([f"experts=[{','.join(EXPERTS)}]"]), VOCABULARY, None)
-    assert benchmark.prepare_digest != identity_of(old, VOCABULARY, None).prepare_digest
+    assert benchmark.prepare_digest != identity_of(load_config([]), VOCABULARY, None).prepare_digest
