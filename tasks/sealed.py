@@ -20,11 +20,7 @@ MEMBER = "sha256"  # of JSON
 
 
 class Damaged(ValueError):
-    """A file is not as it was written: cut, overwritten, or of a version that sealed none."""
-
-
-class Unkeyed(Damaged):
-    """A whole file of a version whose seals knew no keys: nobody can tell which it was."""
+    """A file is not as it was written: cut, or overwritten."""
 
 
 def sealed(content: bytes, key: str = "") -> bytes:
@@ -91,9 +87,6 @@ def _keyed(sha: "hashlib._Hash", key: str) -> bytes:
 
 def _compare(sha: "hashlib._Hash", stated: bytes, key: str) -> None:
     if len(stated) < SEAL_BYTES or not stated.startswith(SEAL):
-        raise Damaged("it does not end with a checksum: it was cut, or an earlier version wrote it")
-    if stated == SEAL + _keyed(sha, key):
-        return
-    if key and stated == SEAL + sha.digest():
-        raise Unkeyed("its checksum is without its name: an earlier version wrote it")
-    raise Damaged(f"its checksum is another than when it was written{' under this name' if key else ''}")
+        raise Damaged("it does not end with a checksum")
+    if stated != SEAL + _keyed(sha, key):
+        raise Damaged(f"its checksum is another than when it was written{' under this name' if key else ''}")

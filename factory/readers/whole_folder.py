@@ -99,11 +99,11 @@ def _wrong(root: Path) -> str:
     try:
         told = unsealed_json((root / SUMS).read_bytes())
     except FileNotFoundError:
-        return f"no {SUMS}: an earlier version wrote it"
+        return f"no {SUMS}"
     except Damaged as error:
         return f"{SUMS}: {error}"
     if told.get("folder") != root.name:
-        return f"{SUMS} is of {told.get('folder', 'a folder without a name: an earlier version wrote it')}"
+        return f"{SUMS} is of {told.get('folder')}"
     for name, digest in told["files"].items():
         if not (root / name).is_file():
             return f"{name} is missing"

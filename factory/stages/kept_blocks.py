@@ -1,13 +1,12 @@
 """Whether what a run keeps of blocks under `out/cache` is whole: scenes, corrected rigs, half-done fits."""
 
-from contextlib import suppress
 from pathlib import Path
 
 from factory.stages.fitting import BEGUN
 from factory.stages.rig import SAID, told_of
 from factory.stages.scene_file import SUFFIX, BadScene, read_scene
 from factory.store.location import Location
-from tasks.sealed import Damaged, Unkeyed, check
+from tasks.sealed import Damaged, check
 
 
 def damaged_blocks(out: Location) -> dict[str, str]:
@@ -25,9 +24,8 @@ def damaged_blocks(out: Location) -> dict[str, str]:
 
 def _check(path: Path) -> None:
     if path.name.endswith(SUFFIX):
-        read_scene(path, path.stem, None)
+        read_scene(path, path.stem)
     elif path.name.endswith(BEGUN):
-        with suppress(Unkeyed):
-            check(path, path.name)
+        check(path, path.name)
     elif path.name.endswith(SAID):
         told_of(path)

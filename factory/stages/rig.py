@@ -116,9 +116,9 @@ def _say(path: Path, found: dict[str, object]) -> None:
 
 
 def told_of(said: Path) -> dict[str, Any]:
-    """What a file tells of its block; files of older versions do not name theirs. Raises Damaged, OSError."""
+    """What a file tells of its block. Raises Damaged, OSError."""
     told = unsealed_json(said.read_bytes())
-    if told.pop("block", block := said.name.removesuffix(SAID)) != block:
+    if told.pop("block", None) != said.name.removesuffix(SAID):
         raise Damaged("it was written of another block")
     return told
 
@@ -133,12 +133,9 @@ def used_rig(
     said = path.with_suffix(SAID)
     try:
         told = told_of(said)
-    except FileNotFoundError:
-        told = {}
-    except Damaged as error:
-        log.warning("%s: %s; it is written again", said, error)
-        told = {}
-    if "taken" not in told:  # files of older versions have none
+    except (FileNotFoundError, Damaged) as error:
+        if isinstance(error, Damaged):
+            log.warning("%s: %s; it is written again", said, error)
         corrected_rig(path, block, cameras, settings, own_body)
         told = told_of(said)
     used: dict[str, dict[str, Any]] = {
@@ -146,7 +143,10 @@ def used_rig(
     }
     if not used:
         return None
-    taken = (TakenFrom(name, t, np.reshape(pose, (4, 4)), *more) for name, t, *more, pose in told["taken"])
+    taken = (
+        TakenFrom(name, time_s, np.reshape(pose, (4, 4)), rise_m, late_s)
+        for name, time_s, rise_m, late_s, pose in told["taken"]
+    )
     return UsedRig(tuple(replace(camera, **used[camera.name]) for camera in cameras), tuple(taken))
 
 

@@ -12,7 +12,7 @@
 | `exposures` | (P, 3, 4) | what each photo made of the light, where they were aligned |
 
 With `SceneDtype.FLOAT16` what Gaussians are made of, but for their places (`means`), and the sky are float16, and the
-version is 2, which older programs refuse. Whoever reads gets float32 again, quaternions of length 1.
+version is 2. Whoever reads gets float32 again, quaternions of length 1.
 
 The header's entry `scene` holds the rest: format, the nodes' track ids and those of the shifts, quality photo by photo,
 the photos of the exposures, the block's range, the cameras where they were corrected, the digest over all of it, and
@@ -40,7 +40,7 @@ from tasks.render.scene.movers import NO_SHIFTS, BoxShifts
 from tasks.render.scene.settings import SceneDtype
 from tasks.render.scene.sky import SkyMap
 from tasks.render.splatting.gaussians import Gaussians
-from tasks.render.splatting.project import OF_DISCS, ScreenFilter
+from tasks.render.splatting.project import ScreenFilter
 from tasks.world.camera import Camera, Fisheye
 
 FORMAT = "driving-data-factory scene"
@@ -72,10 +72,10 @@ def write_scene(path: Path, asset: RenderAsset, dtype: SceneDtype = SceneDtype.F
     return scene_of(tensors, described, digest)
 
 
-def read_scene(path: Path, *kept_as: str | None) -> RenderAsset:
+def read_scene(path: Path, kept_as: str = "") -> RenderAsset:
     """The stored scene. Raises BadScene that names the file, where it is no scene or not what its digest says.
 
-    kept_as: names that it may have been written under, where that matters; None: of a version that told none.
+    kept_as: the name that it was written under, where that matters.
     """
     try:
         with safe_open(path, framework="numpy") as file:
@@ -90,8 +90,8 @@ def read_scene(path: Path, *kept_as: str | None) -> RenderAsset:
         if described["format"] != FORMAT or described["version"] not in VERSION_OF.values():
             found = f"{shown(described['format'])} {shown(described['version'])}"
             raise BadScene(f"{path}: format {found}, this version reads {FORMAT!r} 1 and 2")
-        stated, name = described.pop("digest"), described.pop("kept_as", None)
-        if kept_as and name not in kept_as:
+        stated, name = described.pop("digest"), described.pop("kept_as")
+        if kept_as and name != kept_as:
             raise BadScene(f"{path}: it is of another block, written as {name}.safetensors")
         if digest_of(tensors, described) != stated:
             raise BadScene(f"{path}: the content does not match its digest {stated}")
@@ -192,7 +192,7 @@ def scene_of(tensors: Tensors, described: Mapping[str, Any], digest: str) -> Ren
         psnr_db=_nan(described["psnr_db"]),
         n_held_out=described["n_held_out"],
         digest=digest,
-        screen=ScreenFilter(*described.get("screen", OF_DISCS)),  # older files have none
+        screen=ScreenFilter(*described["screen"]),
         views=tuple(_view(view) for view in described["views"]),
         exposures=tuple(
             Exposure(camera, time_s, tensors["exposures"][i])
@@ -201,8 +201,8 @@ def scene_of(tensors: Tensors, described: Mapping[str, Any], digest: str) -> Ren
         block=block,
         rig=tuple(_camera(camera) for camera in described.get("rig", ())),
         taken=tuple(
-            TakenFrom(camera, time_s, tensors["taken"][i], *more)
-            for i, (camera, time_s, *more) in enumerate(described.get("taken", ()))
+            TakenFrom(camera, time_s, tensors["taken"][i], rise_m, late_s)
+            for i, (camera, time_s, rise_m, late_s) in enumerate(described.get("taken", ()))
         ),
         shifts=BoxShifts(tuple(described["shifts"]), tensors["shifts"]) if "shifts" in described else NO_SHIFTS,
         bodies=tuple(OwnBody(camera, tensors[f"bodies.{i}"]) for i, camera in enumerate(described.get("bodies", ()))),
@@ -265,8 +265,8 @@ def _camera(plain: Mapping[str, Any]) -> Camera:
 
 
 def _view(plain: Mapping[str, Any]) -> ViewQuality:
-    """The opposite of `_plain` for a view; older files have fewer measures."""
-    classes = tuple(ClassQuality(**_measures(part)) for part in plain.get("classes", ()))
+    """The opposite of `_plain` for a view."""
+    classes = tuple(ClassQuality(**_measures(part)) for part in plain["classes"])
     return ViewQuality(**_measures(plain) | {"classes": classes})
 
 

@@ -17,21 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factory.store.location import Location
-from tasks.sealed import SEAL, SEAL_BYTES, Damaged, Unkeyed, sealed, unsealed
+from tasks.sealed import Damaged, sealed, unsealed
 
 if TYPE_CHECKING:
     from tasks.hard_scenes import BenchmarkClip, GivenScenes, OneStageClip
 
 FORMAT = 1
 PACKAGES = ("tasks.", "factory.")  # whose dataclasses and enums a file may name
-# Names in files of version 0.1.0 whose classes have moved since.
-MOVED = {
-    "factory.pipeline:PerturbedClip": "factory.stages.pipeline:PerturbedClip",
-    "factory.work:PreparedClip": "factory.graph.work:PreparedClip",
-    "factory.work:CandidateRow": "factory.store.candidates:CandidateRow",
-    "factory.clips.reader:ClipRef": "factory.readers.base:ClipRef",
-}
-DROPPED = {"factory.stages.pipeline:PerturbedClip": {"before"}}  # members that older files have and nobody reads
 _AGAIN = "the command that made it writes it again"
 _PLAIN = (str, int, float, bool, type(None))
 
@@ -71,14 +63,9 @@ class ClipCache:
         self.location = location
 
     def load(self, key: str) -> object | None:
-        """The stored value, None where there is none, or one that does not name its key. Raises BadCacheFile."""
+        """The stored value, None where there is none. Raises BadCacheFile."""
         data = self.location.read(f"{key}.npz")
-        try:
-            return None if data is None else decode(unsealed(data, key))
-        except Unkeyed:
-            return None
-        except Damaged as error:
-            raise BadCacheFile(str(error)) from error
+        return None if data is None else decode(_whole(data, key))
 
     def store(self, key: str, value: object) -> None:
         """Whole or not at all."""
@@ -96,17 +83,14 @@ class SceneFiles:
         self.location.write(f"{scenes.clip.clip_id}.npz", sealed(encode(scenes)))
 
     def load(self, clip_id: str) -> "BenchmarkClip | GivenScenes | OneStageClip":
-        """Raises FileNotFoundError where the clip has none, BadCacheFile, with its name, for a damaged or foreign file.
-
-        Files of versions that sealed none have the zip's own checksums.
-        """
+        """Raises FileNotFoundError where the clip has none, BadCacheFile, naming it, for a damaged or foreign file."""
         from tasks.hard_scenes import BenchmarkClip, GivenScenes, OneStageClip
 
         data, path = self.location.read(f"{clip_id}.npz"), f"{self.location.uri}/{clip_id}.npz"
         if data is None:
             raise FileNotFoundError(f"{path}: no scenes of this clip; run the factory again")
         try:
-            scenes = decode(_whole(data) if SEAL in data[-SEAL_BYTES:] else data)
+            scenes = decode(_whole(data))
         except BadCacheFile as error:
             raise BadCacheFile(f"{path}: {error}; remove it, {_AGAIN}") from error
         if not isinstance(scenes, BenchmarkClip | GivenScenes | OneStageClip):
@@ -121,24 +105,16 @@ class SceneFiles:
 
 
 def check_prepared(data: bytes, key: str) -> None:
-    """Hold the file of a prepared clip against its seal; one of an earlier version by what that sealed, or is decoded.
-
-    Raises BadCacheFile.
-    """
+    """Hold the file of a prepared clip against its seal. Raises BadCacheFile."""
     try:
-        if SEAL not in data[-SEAL_BYTES:]:
-            decode(data)
-        else:
-            unsealed(data, key)
-    except Unkeyed:
-        return
-    except (Damaged, BadCacheFile) as error:
+        unsealed(data, key)
+    except Damaged as error:
         raise BadCacheFile(f"{error}; the next run makes it again") from error
 
 
-def _whole(data: bytes) -> bytes:
+def _whole(data: bytes, key: str = "") -> bytes:
     try:
-        return unsealed(data)
+        return unsealed(data, key)
     except Damaged as error:
         raise BadCacheFile(str(error)) from error
 
@@ -193,9 +169,7 @@ def _decode(node: Any, arrays: Mapping[str, NDArray[np.generic]]) -> Any:
         if not dataclasses.is_dataclass(kind):
             raise BadCacheFile(f"{node['class']} is no dataclass")
         build: Any = kind
-        dropped = DROPPED.get(MOVED.get(name := str(node["class"]), name), ())
-        members = {name: child for name, child in node["members"].items() if name not in dropped}
-        return build(**{name: _decode(child, arrays) for name, child in members.items()})
+        return build(**{name: _decode(child, arrays) for name, child in node["members"].items()})
     if "enum" in node:
         kind = _class(node["enum"])
         if not issubclass(kind, enum.Enum):
@@ -215,7 +189,7 @@ def _name(kind: type) -> str:
 
 
 def _class(name: str) -> Any:
-    module, _, qualname = MOVED.get(name, name).partition(":")
+    module, _, qualname = name.partition(":")
     if not module.startswith(PACKAGES) or "." in qualname:
         raise BadCacheFile(f"{name} is not a class a cache file may name")
     found = getattr(importlib.import_module(module), qualname)

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from factory.store.location import Location
-from tasks.sealed import Damaged, Unkeyed, sealed, unsealed
+from tasks.sealed import Damaged, sealed, unsealed
 
 LOG, COPIES = "_delta_log", "_commits"
 LAST = "_last_checkpoint"  # where the newest checkpoint is; written over by each
@@ -57,7 +57,7 @@ class CommitCopies:
         return found is not None and text.encode() in found
 
     def damage(self) -> list[LogDamage]:
-        """What is not as it was. Of a table without copies, of an earlier version, nothing can be said."""
+        """What is not as it was. Of a table without copies nothing can be said."""
         copies, problems = self._unsealed()
         there = set(self._log.names())
         newest = max((name for name in there & copies.keys() if name.endswith(".parquet")), default="")
@@ -92,12 +92,8 @@ class CommitCopies:
         return data is not None
 
     def _copy_of(self, name: str) -> bytes:
-        """Those of earlier versions are held against their content alone. Raises Damaged."""
-        data = self._copies.read(name) or b""
-        try:
-            return unsealed(data, name)
-        except Unkeyed:
-            return unsealed(data)
+        """Raises Damaged."""
+        return unsealed(self._copies.read(name) or b"", name)
 
     def _unsealed(self) -> tuple[Mapping[str, bytes], list[LogDamage]]:
         whole, problems = {}, []

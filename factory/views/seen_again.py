@@ -3,7 +3,6 @@
 Everything comes from the store: rows, and the scenes in its cache. Photos are those of the log's human samples.
 """
 
-import json
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -47,7 +46,6 @@ ASIDE_M = (2.0, 1.0, 0.0, -1.0, -2.0)  # left is positive, and on the left of th
 STRIP_PX = (320, 180 + CAPTION_PX + 4)
 HOLD_S = 0.5  # how long a stored image stands in a film: they are taken at 2 Hz,
 SLACK_S = 0.06  # give or take this much
-HEIGHTS_OF_PICTURES = 8  # the version of `render` from which on rows have heights as their pictures show them
 VIEW_COLUMNS = (
     *BEV_COLUMNS,
     *(name for name in SCHEMA.names if name.startswith("agent_") and name not in BEV_COLUMNS),
@@ -111,7 +109,7 @@ def real_and_rendered(
 
     `photos`: VIEW_COLUMNS of a human sample, whose agents are the log's; `only` these cameras, all for none.
     """
-    agents, pairs, scene = _agents_in(photos, asset), [], _in_time_of(photos, asset)
+    agents, pairs, scene = agents_of(photos), [], _in_time_of(photos, asset)
     for camera in sorted(photos["cameras"], key=_looks_right):
         mine = [image for image in photos["images"] if image["camera"] == camera["name"]]
         if only and camera["name"] not in only:
@@ -143,7 +141,7 @@ def from_the_side(asset: RenderAsset, row: Row) -> list[CaptionedPicture]:
     front = front_camera(row)
     if front is None:
         return []
-    rig, agents = [camera for camera in row["cameras"] if camera["name"] == front], _agents_in(row, asset)
+    rig, agents = [camera for camera in row["cameras"] if camera["name"] == front], agents_of(row)
     scene = _in_time_of(row, asset)
     out = []
     for aside_m in ASIDE_M:
@@ -179,7 +177,7 @@ def film(row: Row, asset: RenderAsset | None, logged: Array | None = None) -> It
 
     A rendered sample is drawn anew at every step where its scene is at hand; else stored images stand until the next.
     """
-    agents = agents_of(row) if asset is None else _agents_in(row, asset)
+    agents = agents_of(row)
     scene = _in_time_of(row, asset) if asset is not None and row["image_source"] == ImageSource.RENDER else None
     for step in range(AGENT_STEPS):
         time_s = (step - NOW_INDEX) * STEP_S
@@ -210,13 +208,6 @@ def _standing(row: Row, time_s: float) -> Iterable[Image]:
 def _in_time_of(row: Row, asset: RenderAsset) -> RenderAsset:
     """The scene, its times counted as those of the row's agents."""
     return asset.since(_first_of(row, asset))
-
-
-def _agents_in(row: Row, asset: RenderAsset) -> AgentTracks:
-    """The row's agents as high above the scene's road as they were logged; older rows have them as high as logged."""
-    agents = agents_of(row)
-    raised = json.loads(row["stage_versions"]).get("render", 0) >= HEIGHTS_OF_PICTURES
-    return agents if raised else asset.lifted(agents, _first_of(row, asset))
 
 
 def _first_of(row: Row, asset: RenderAsset) -> float:

@@ -6,8 +6,8 @@
                              training.pt         optimiser and loader; only tensors and plain values are read back
 
 A checkpoint is written beside its place and moved there whole. The record holds the checksums of the others and its
-own; none of a checkpoint of an earlier version. No file of it holds code; a planner of a user's own package is imported
-by the name that the record gives, from what is installed.
+own. No file of it holds code; a planner of a user's own package is imported by the name that the record gives, from
+what is installed.
 """
 
 import hashlib
@@ -30,7 +30,7 @@ from factory.config.compose import ConfigError
 from factory.readers.torch_file import load_tensors
 from factory.wording import one_line
 from planners.models.planner import Planner, PlannerChoice, build_planner, planner_class
-from tasks.sealed import MEMBER, sealed_json, unsealed_json
+from tasks.sealed import sealed_json, unsealed_json
 from tasks.world.arrays import FloatArray
 
 FOLDER = "checkpoints"
@@ -108,13 +108,10 @@ def newest(path: Path) -> Path:
 def read_record(path: Path) -> dict[str, Any]:
     """What a checkpoint says of itself. Raises ConfigError."""
     try:
-        data = (newest(path) / RECORD).read_bytes()
-        record = json.loads(data)
-        record = unsealed_json(data) if MEMBER in record else record
-        record["planner"]["name"], record["planner"]["settings"], record["step"]
+        record = unsealed_json((newest(path) / RECORD).read_bytes())
+        record["planner"]["name"], record["planner"]["settings"], record["step"], record[FILES]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(f"{path}: its {RECORD} cannot be read ({error}): restore the checkpoint") from error
-    assert isinstance(record, dict)
     return record
 
 
@@ -188,9 +185,8 @@ def load_training(folder: Path) -> dict[str, Any]:
 
 def _refuse_damaged(folder: Path, name: str, remedy: str = "restore the checkpoint") -> None:
     """Raises ConfigError where a file is not what the record says."""
-    stated = read_record(folder).get(FILES, {}).get(name)
     try:
-        damaged = stated is not None and _sha256(folder / name) != stated
+        damaged = _sha256(folder / name) != read_record(folder)[FILES][name]
     except OSError as error:
         raise ConfigError(f"{folder / name}: {error}: {remedy}") from error
     if damaged:

@@ -25,7 +25,7 @@ import cv2
 import torch
 
 from factory.config.compose import ConfigError, compose, fill
-from factory.config.shapes import GIVE, defaults_of, merged, plain
+from factory.config.shapes import GIVE, merged, plain
 from planners.command import command
 from planners.data.index import Dataset, DataSettings, open_data
 from planners.data.loader import Loader
@@ -233,7 +233,7 @@ def _with_fitting_batch(config: TrainConfig, dataset: Dataset, process: Training
     size = fitting_batch(dataset.rows.simulated, config.mix, asked, parts)
     out = Path(config.out).absolute()
     if size != asked and checkpoints(out):
-        size = int(_as_now(read_record(out)["trained"])["planner.training"]["batch_size"])
+        size = int(read_record(out)["trained"]["planner.training"]["batch_size"])
     if not size or size % parts:
         raise ConfigError(
             f"a batch of {size or len(dataset)} samples does not divide into {process.size} processes times "
@@ -296,8 +296,7 @@ def _begun(out: Path, config: TrainConfig, identity: Mapping[str, Any]) -> Path 
     record = read_record(out)
     now = {**identity, "planner.name": config.planner.name, "planner.settings": as_record(settings_of(config.planner))}
     who = record["planner"]
-    settings = merged(defaults_of(planner_class(who["name"]).settings_type), who["settings"])
-    then = {**_as_now(record["trained"]), "planner.name": who["name"], "planner.settings": settings}
+    then = {**record["trained"], "planner.name": who["name"], "planner.settings": who["settings"]}
     differs = {key: f"{key} {then.get(key)} -> {value}" for key, value in now.items() if then.get(key) != value}
     allowed = FURTHER if config.resume == "further" else frozenset()
     if differs.keys() - allowed:
@@ -311,17 +310,10 @@ def _begun(out: Path, config: TrainConfig, identity: Mapping[str, Any]) -> Path 
     return newest(out)
 
 
-def _as_now(trained: Mapping[str, Any]) -> dict[str, Any]:
-    """An identity, settings that its version did not have yet at their defaults, as it was computed."""
-    fields = dataclasses.fields(TrainingSettings)
-    defaults = {f.name: f.default for f in fields if f.default is not dataclasses.MISSING}
-    return {"compile": False, **trained, "planner.training": {**defaults, **trained["planner.training"]}}
-
-
 def _until_here(before: Mapping[str, Any], identity: Mapping[str, Any]) -> dict[str, Any]:
     """For the record: up to which step a training that goes on further was computed with other settings."""
     earlier = list(before.get("earlier", []))
-    then = _as_now(before["trained"]) if before else identity
+    then = before["trained"] if before else identity
     changed = {key: then[key] for key in sorted(FURTHER) if then[key] != identity[key]}
     if changed:
         earlier.append({"until_step": before["step"], **changed})

@@ -21,7 +21,6 @@ from factory.store.cache import BadCacheFile
 from factory.store.identity import UNLISTED
 from factory.store.samples import Store
 from factory.store.verify import verify
-from tasks.sealed import sealed, unsealed
 from tests.factory.graph.runs import EXPERTS, run
 from tests.factory.tables import assert_same_tables, tables_of
 from tests.factory.toy import ToyWork, ran, refs
@@ -67,19 +66,6 @@ def test_a_prepared_clip_under_another_s_name_is_named_and_prepared_again(
     later = run(tmp_path / "out", rounds=3)
     assert later.executed.prepared == 2 and sum("prepared again" in note for note in later.notes) == 2
     assert verify(Store(tmp_path / "out")).damage == () and [path.read_bytes() for path in paths] == whole
-    assert_same_tables(tmp_path / "out", plain(rounds=3))
-
-
-def test_a_prepared_clip_of_an_earlier_version_counts_as_none_and_is_no_damage(
-    tmp_path: Path, begun: Callable[..., Path], plain: Callable[..., Path]
-) -> None:
-    begun(rounds=1)
-    for path in (tmp_path / "out/cache/prepared").iterdir():
-        path.write_bytes(sealed(unsealed(path.read_bytes(), path.stem)))
-    assert verify(Store(tmp_path / "out")).damage == ()
-    later = run(tmp_path / "out", rounds=3)
-    assert later.executed.prepared == len(later.notes) == 4
-    assert all(note.endswith("was not in the cache; prepared again") for note in later.notes)
     assert_same_tables(tmp_path / "out", plain(rounds=3))
 
 

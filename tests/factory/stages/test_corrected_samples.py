@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from printed_street import CAMERAS, photographed
 
-from factory.readers.base import BadClip
 from factory.stages.imaging import Imaging, heights
 from factory.stages.rig import SAID, UsedRig, taken_from, used_rig
 from factory.stages.sensors import load_photos
@@ -21,7 +20,7 @@ from tasks.perturb import Candidate
 from tasks.render.rig.rig import motions, twists_of
 from tasks.render.rig.settings import Adjust, RigSettings
 from tasks.render.settings import RenderSettings, SceneFrom
-from tasks.sealed import sealed_json, unsealed_json
+from tasks.sealed import unsealed_json
 from tasks.world.camera import Camera, SensorFile
 from tasks.world.clip import NOW, STEP_S, Clip, scene_of_clip
 from tests.tasks.streets import street_clip
@@ -142,6 +141,3 @@ def test_what_photos_say_of_a_rig_is_found_once_also_where_it_is_nothing(clip: C
     assert used_rig(path, alone, clip.cameras, RigSettings()) is None
     gone = replace(block, images=(replace(block.images[0], uri=str(tmp_path / "gone.png")),))
     assert used_rig(path, gone, clip.cameras, RigSettings()) is None, "the photo is not opened again"
-    path.with_suffix(SAID).write_bytes(sealed_json({"cameras": [], "used": []}).encode())  # an older version's
-    with pytest.raises(BadClip, match=r"gone\.png"):
-        used_rig(path, gone, clip.cameras, RigSettings())

@@ -26,7 +26,7 @@ from tasks.render.scene.movers import NO_SHIFTS, BoxShifts
 from tasks.render.scene.settings import SceneDtype
 from tasks.render.scene.sky import SkyMap
 from tasks.render.splatting.gaussians import EMPTY, Gaussians
-from tasks.render.splatting.project import CLASSIC, OF_DISCS
+from tasks.render.splatting.project import CLASSIC
 
 
 def gaussians(n: int, count: int, seed: int) -> Gaussians:
@@ -72,19 +72,6 @@ def test_everything_comes_back(tmp_path: Path) -> None:
     assert [path.name for path in (tmp_path / "deep").iterdir()] == ["x.safetensors"]  # no drafts left
 
 
-def test_a_file_from_before_distances_and_classes_were_measured_is_read(tmp_path: Path) -> None:
-    described = described_by(scene())
-    del described["screen"]
-    for view in described["views"]:
-        del view["lpips"], view["away_m"], view["classes"]
-    tensors = tensors_of(scene())
-    digest = digest_of(tensors, described)
-    save_file(tensors, tmp_path / "old", metadata={KEY: json.dumps(described | {"digest": digest})})
-    first, _ = read_scene(tmp_path / "old").views
-    assert read_scene(tmp_path / "old").screen == OF_DISCS  # all were drawn so
-    assert (first.camera, first.psnr_db) == ("front", 28.5) and np.isnan(first.away_m) and first.classes == ()
-
-
 def test_a_scene_of_nothing_but_sky_and_without_a_measure_is_a_scene(tmp_path: Path) -> None:
     plain = RenderAsset(np.zeros(3), EMPTY, {}, scene().sky, float("nan"))
     write_scene(tmp_path / "x", plain)
@@ -125,7 +112,7 @@ def test_in_16_bits_places_stay_and_all_else_is_the_nearest_number_of_11_bits(tm
     assert back.digest == written.digest != read_scene(plain).digest
 
 
-def test_a_file_of_16_bits_is_refused_by_programs_that_know_version_1_alone(tmp_path: Path) -> None:
+def test_a_file_of_16_bits_says_so_and_holds_places_in_32(tmp_path: Path) -> None:
     write_scene(tmp_path / "x", scene(), SceneDtype.FLOAT16)
     with safe_open(tmp_path / "x", framework="numpy") as file:
         assert json.loads(file.metadata()[KEY])["version"] == 2
@@ -216,7 +203,7 @@ def test_a_foreign_header_is_named(tmp_path: Path, header: str, said: str) -> No
 def test_a_consistent_file_without_an_array_is_named(tmp_path: Path) -> None:
     tensors, described = tensors_of(scene()), described_by(scene())
     del tensors["nodes.1.quats"]
-    header = json.dumps(described | {"digest": digest_of(tensors, described)})
+    header = json.dumps(described | {"digest": digest_of(tensors, described), "kept_as": "x"})
     save_file(tensors, tmp_path / "x", metadata={KEY: header})
     with pytest.raises(BadScene, match=r"KeyError 'nodes\.1\.quats'"):
         read_scene(tmp_path / "x")

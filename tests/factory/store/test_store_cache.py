@@ -3,13 +3,12 @@
 import io
 import json
 import sys
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from factory.store.cache import MOVED, BadCacheFile, ClipCache, _class, _name, decode, encode
+from factory.store.cache import BadCacheFile, ClipCache, decode, encode
 from factory.store.candidates import CandidateRow
 from factory.store.location import Location
 from tasks.stages import Rejected
@@ -93,11 +92,3 @@ def test_damage_is_found_and_absence_is_none(tmp_path: Path) -> None:
         with pytest.raises(BadCacheFile):
             cache.load("x")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["x.npz"]  # no drafts left
-
-
-def test_a_file_written_before_its_classes_moved_is_read() -> None:
-    for then, now in MOVED.items():
-        assert _name(_class(then)) == now
-    row = CandidateRow(0, 7, 1.0, 2.0, 0.1, 5.0, (0, 1), 0.9, 0.8)
-    members = {field.name: getattr(row, field.name) for field in fields(row)} | {"cell": {"tuple": [0, 1]}}
-    assert decode(forged({"format": 1, "root": {"class": "factory.work:CandidateRow", "members": members}})) == row

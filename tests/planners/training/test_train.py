@@ -164,22 +164,6 @@ def test_the_same_command_again_has_nothing_left_to_do(table: str, tmp_path: Pat
     assert len((tmp_path / LOSSES).read_text().splitlines()) == 1 + 18
 
 
-def test_a_training_of_a_version_without_a_setting_is_gone_on_with_at_its_default(
-    table: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(command(table, tmp_path)) == 0
-    path = newest(tmp_path) / "record.json"
-    record = json.loads(path.read_text())
-    assert record["trained"]["planner.training"].pop("ema") == 0.0
-    assert record["planner"]["settings"].pop("hidden") == 8
-    del record["sha256"]
-    path.write_text(json.dumps(record))
-    assert main(command(table, tmp_path, "+planner.training.ema=0.9")) == 2
-    assert "'ema': 0.0" in capsys.readouterr().err
-    assert main(command(table, tmp_path)) == 0
-    assert "earlier" not in read_record(tmp_path)
-
-
 def test_real_samples_alone_are_enough(table: str, tmp_path: Path) -> None:
     assert main(command(table, tmp_path, sim=False)) == 0
     assert read_record(tmp_path)["step"] == 6

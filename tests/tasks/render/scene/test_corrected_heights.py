@@ -8,7 +8,7 @@ import pytest
 
 from factory.stages.rig import taken_from
 from factory.stages.scene_file import read_scene, write_scene
-from tasks.render.scene.asset import RenderAsset, TakenFrom, rises_of
+from tasks.render.scene.asset import RenderAsset, rises_of
 from tasks.render.scene.movers import lifted
 from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
 from tasks.render.splatting.gaussians import EMPTY
@@ -55,8 +55,7 @@ def test_boxes_rise_with_the_road_and_stay_where_they_are() -> None:
     assert lifted(PARKED, *rises_of(())) is PARKED
 
 
-def test_a_scene_file_keeps_how_much_and_older_ones_say_nothing(tmp_path: Path) -> None:
+def test_a_scene_file_keeps_how_much(tmp_path: Path) -> None:
     scene = climbing()
     write_scene(tmp_path / "scene.safetensors", scene)
     assert read_scene(tmp_path / "scene.safetensors").taken[0].rise_m == pytest.approx(0.8)
-    assert TakenFrom("front", 0.0, np.eye(4)).rise_m == 0.0
