@@ -18,8 +18,7 @@ from typing import Any, Protocol
 from factory.graph.local import Graph, Ticket
 from factory.graph.steps import EpisodesOf, EpisodesWritten, Failure, MakeEpisode
 from factory.readers.base import ClipRef
-from factory.store.episodes import FOLDER, episode_name, is_chosen
-from factory.store.mcap_shards.mirror import McapTable
+from factory.store.mcap_files import FOLDER, McapTable, episode_name, is_chosen
 from factory.store.samples import Store
 
 ROWS = ["attempt_id", "clip_id", "settings_hash", "stage_versions"]

@@ -17,11 +17,10 @@ from factory.graph.work import Dropped, Halted, NotReady, PreparedClip, Stopped,
 from factory.readers.base import BadClip, ClipRef, Unreadable
 from factory.store.cache import BadCacheFile, ClipCache, SceneFiles
 from factory.store.disk import why_disk_full
-from factory.store.episodes import FOLDER, episode_name
 from factory.store.identity import Stamp
 from factory.store.illness import own_place, why_ill
 from factory.store.location import Location
-from factory.store.mcap_shards.mirror import write_mcap_shard
+from factory.store.mcap_files import FOLDER, episode_name, write_mcap_shard
 from factory.store.outcomes import ErrorKind
 from factory.store.parquet_file import Shard, write_shard
 from factory.store.reader import samples_of

@@ -23,8 +23,7 @@ import pyarrow.parquet as pq
 from factory.readers.pictures import BadPicture, decode_rgb
 from factory.store.counts.codes import beginning, fixed_bytes
 from factory.store.location import Location
-from factory.store.mcap_shards.mirror import McapTable, open_shard
-from factory.store.mcap_shards.shard import McapShard
+from factory.store.mcap_files import McapShard, McapTable, open_shard
 from factory.store.parquet_file import naming, open_parquet, with_partition
 from factory.store.schema import SAMPLES, SCHEMA, VERSION_PROPERTY, table_to_rows, why_other_schema
 from factory.store.table import KeyedTable

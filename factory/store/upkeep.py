@@ -13,7 +13,7 @@ import pyarrow as pa
 
 from factory.store.commit_copies import COPIES, LOG, CommitCopies
 from factory.store.location import BadLocation, Location
-from factory.store.mcap_shards.mirror import McapTable, write_mcap_shard
+from factory.store.mcap_files import McapTable, write_mcap_shard
 from factory.store.parquet_file import Shard, write_shard
 from factory.store.samples import Store
 from factory.store.table import KeyedTable

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from factory.store.location import Location
-from factory.store.mcap_shards.mirror import McapTable, write_mcap_shard
+from factory.store.mcap_files import McapTable, write_mcap_shard
 from factory.store.reader import Format, SampleTable
 from factory.store.samples import Store
 from planners.data.batch import ImageLayout, Needs

@@ -28,7 +28,7 @@ from pathlib import Path
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
 from factory.graph.batch import SHARD_BYTES
 from factory.graph.execute import execute
-from factory.store.mcap_shards.mirror import McapTable
+from factory.store.mcap_files import McapTable
 from factory.store.reader import SampleTable
 from factory.store.samples import OnChange, Store
 from factory.store.table import KeyedTable

@@ -31,7 +31,7 @@ from typing import Any
 
 from factory.exits import COMPLETE
 from factory.store.location import Location
-from factory.store.mcap_shards.mirror import McapTable
+from factory.store.mcap_files import McapTable
 from factory.store.samples import Store
 from factory.store.verify import verify
 from tests.chaos.killed_run import CLIPS, drive, leave

@@ -12,8 +12,8 @@ from factory.exits import COMPLETE, INTERRUPTED
 from factory.graph import episodes
 from factory.graph.episodes import EpisodesWanted
 from factory.graph.execute import RunSummary, execute
-from factory.store.episodes import FOLDER, episode_name, is_chosen
 from factory.store.location import Location
+from factory.store.mcap_files import FOLDER, episode_name, is_chosen
 from factory.store.samples import Store
 from factory.store.verify import verify
 from factory.views.show import prepared_episode

@@ -12,8 +12,8 @@ from factory.exits import BAD_CONFIG, COMPLETE, DAMAGED
 from factory.graph.episodes import EpisodesWanted
 from factory.graph.execute import execute
 from factory.store.commit_copies import CommitCopies
-from factory.store.episodes import Message, episode_bytes
 from factory.store.location import Location
+from factory.store.mcap_files import Message, episode_bytes
 from factory.store.parquet_file import write_shard
 from factory.store.reader import SampleTable
 from factory.store.samples import Store

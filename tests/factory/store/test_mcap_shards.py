@@ -19,9 +19,7 @@ from factory.exits import COMPLETE
 from factory.graph import episodes
 from factory.graph.execute import RunSummary, execute
 from factory.store.location import Location
-from factory.store.mcap_shards.mirror import McapTable, source_of, write_mcap_shard
-from factory.store.mcap_shards.shard import McapShard, shard_bytes
-from factory.store.mcap_shards.wire import parse, varint
+from factory.store.mcap_files import McapShard, McapTable, parse, shard_bytes, source_of, varint, write_mcap_shard
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
 from factory.store.schema import BOOKKEEPING

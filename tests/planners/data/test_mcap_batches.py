@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from factory.store.location import Location
-from factory.store.mcap_shards.mirror import McapTable, write_mcap_shard
+from factory.store.mcap_files import McapTable, write_mcap_shard
 from factory.store.samples import Store
 from planners.data.batch import BevLayout, Needs
 from planners.data.files import files_of
