@@ -27,8 +27,7 @@ from factory.config.words import Asked, SettingsShown, asked_of
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED, as_program
 from factory.files import folders_in
 from factory.setup.early import refuse_what_is_not_there
-from factory.store.disk import DiskFull
-from factory.store.usable import why_unusable
+from factory.store.disk import DiskFull, why_unusable
 
 if TYPE_CHECKING:
     from factory.readers.base import ClipRef
@@ -56,7 +55,7 @@ def _told(argv: Sequence[str], do: Callable[[Asked], int]) -> int:
         print(f"error: {error}; free disk space and run the same command again", file=sys.stderr)
         return INTERRUPTED
     except Exception as error:
-        from factory.store.illness import why_ill
+        from factory.store.disk import why_ill
         from factory.wording import one_line
 
         if not why_ill(error):

@@ -87,10 +87,10 @@ def main(request: Request) -> int:
     from deltalake.exceptions import DeltaError
 
     from factory.readers.base import BadClip
+    from factory.store.disk import why_unusable
     from factory.store.location import Location
     from factory.store.samples import ChangedRun, Store
     from factory.store.table import AnotherWriter
-    from factory.store.usable import why_unusable
     from factory.views.status import failed_line
 
     if unusable := why_unusable(request.out):

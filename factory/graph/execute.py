@@ -34,8 +34,7 @@ from factory.graph.work import NotReady, Work
 from factory.readers.base import ClipRef
 from factory.store.counts.funnel import Funnel, funnel_of
 from factory.store.counts.history import NOTHING
-from factory.store.disk import DiskFull
-from factory.store.illness import why_ill
+from factory.store.disk import DiskFull, why_ill
 from factory.store.location import BadLocation
 from factory.store.outcomes import Kind
 from factory.store.samples import CURRENT_RUN, ChangedRun, OnChange, Store

@@ -16,9 +16,8 @@ import pyarrow as pa
 from factory.graph.work import Dropped, Halted, NotReady, PreparedClip, Stopped, Underway, Work, go_on
 from factory.readers.base import BadClip, ClipRef, Unreadable
 from factory.store.cache import BadCacheFile, ClipCache, SceneFiles
-from factory.store.disk import why_disk_full
+from factory.store.disk import own_place, why_disk_full, why_ill
 from factory.store.identity import Stamp
-from factory.store.illness import own_place, why_ill
 from factory.store.location import Location
 from factory.store.mcap_files import FOLDER, episode_name, write_mcap_shard
 from factory.store.outcomes import ErrorKind

@@ -22,9 +22,9 @@ from factory.stages.frames import BenchmarkWork
 from factory.stages.own_body import masks_digest, refuse_unknown_masks
 from factory.stages.pipeline import FactoryWork
 from factory.stages.sensors import chosen_cameras
+from factory.store.disk import why_ill
 from factory.store.explored.drifts import Explored, explored_in
 from factory.store.identity import UNLISTED, RunIdentity, canonical_json
-from factory.store.illness import why_ill
 from factory.store.location import Location
 from tasks.caches import user_cache
 from tasks.experts.pdm_closed.settings import PdmSettings

@@ -24,7 +24,7 @@ from factory.stages.own_body import masks_digest, read_masks
 from factory.stages.rig import UsedRig, corrected_rig, known_of, said_again, taken_from, used_rig, wanted
 from factory.stages.scene_file import SUFFIX, BadScene, read_scene, write_scene
 from factory.stages.sensors import block_cameras, block_of, chosen_cameras, load_sensors, load_sweeps, taken_by
-from factory.store.illness import own_place
+from factory.store.disk import own_place
 from tasks.render.fit.lpips import lpips_of
 from tasks.render.scene.asset import BlockRange, RenderAsset, TakenFrom, rises_of
 from tasks.render.scene.build import build_asset

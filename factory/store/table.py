@@ -12,7 +12,9 @@ Measured here: 5-12 ms per commit on local disk.
 """
 
 import json
+import re
 import secrets
+import sys
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -21,22 +23,256 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 from deltalake import CommitProperties, DeltaTable, Transaction
 from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundError
 from deltalake.transaction import AddAction, RemoveAction
 
-from factory.store.commit_copies import COPIES, CommitCopies
-from factory.store.counts.codes import Bytes, packed
-from factory.store.counts.key_index import KeyIndex
+from factory.store.counts.codes import Bytes, fixed_bytes, packed
 from factory.store.disk import needs_disk
-from factory.store.late_listing import broke_off, listed, until_listed
 from factory.store.location import Location
 from factory.store.parquet_file import Shard, TableSpec, encoded_text, read_parquet, with_partition, write_shard
 from factory.wording import one_line
+from tasks.sealed import Damaged, sealed, unsealed
+
+T = TypeVar("T")
+
+# Listings of an object store that are behind what was written, or break off. Amazon's list a key as soon as it is
+# there, others may be seconds late; who asks for a key by its name gets it at once. delta-rs's client asks again where
+# a file breaks off, but not where a listing does, or the words by which a store says that there is no such file;
+# Arrow's does for all of them.
+
+PAUSES_S = (0.0, 0.2, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0)  # a minute in all
+BROKE_OFF = re.compile(  # in what delta-rs says; where it asked again by itself the time is followed by how often
+    r"Error getting list response body|Error performing GET \S+ in \S+ - .*error reading a body", re.DOTALL
+)
+BROKEN_PAUSES_S = (0.1, 0.2, 0.5, 1.0, 2.0)  # each before asking once more
+
+
+class ListingBehind(TimeoutError):
+    """What was written is still not listed."""
+
+
+def until_listed(is_seen: Callable[[], bool], name: str) -> None:
+    """Look until it is seen. Raises ListingBehind after a minute."""
+    for pause_s in PAUSES_S:
+        time.sleep(pause_s)
+        if is_seen():
+            return
+    raise ListingBehind(f"{name} is there, and its store does not list it after {sum(PAUSES_S):.0f} s")
+
+
+def broke_off(error: BaseException) -> bool:
+    """What delta-rs raised is of an answer that ended before its end, and was not asked for again."""
+    return isinstance(error, DeltaError | OSError) and BROKE_OFF.search(str(error)) is not None
+
+
+def listed(ask: Callable[[], T]) -> T:
+    """What delta-rs, which lists meanwhile, answers; asked again, five times at most, where an answer broke off."""
+    for pause_s in BROKEN_PAUSES_S:
+        try:
+            return ask()
+        except (DeltaError, OSError) as error:
+            if not broke_off(error):
+                raise
+        time.sleep(pause_s)
+    return ask()
+
+
+# A sealed copy of every file of a table's log, beside it: `_commits/<name>` for `_delta_log/<name>`.
+#
+# Delta's log has no checksums, and a log whose last commit is gone is a whole log of an earlier time. The copies tell:
+# their newest number is the running count of commits, and what is damaged or gone is put back from them. A writer that
+# is killed between a commit and its copy leaves the copy to the next one.
+
+LOG, COPIES = "_delta_log", "_commits"
+LAST = "_last_checkpoint"  # where the newest checkpoint is; written over by each
+NUMBERED = re.compile(r"(\d{20})\.(json|checkpoint\.parquet)")
+
+
+@dataclass(frozen=True)
+class LogDamage:
+    """A file of the log, or of the copies, that is not what it was."""
+
+    name: str  # relative to the table
+    problem: str
+
+
+class CommitCopies:
+    """Of the table at a location."""
+
+    def __init__(self, table: Location) -> None:
+        self._log, self._copies = table.child(LOG), table.child(COPIES)
+
+    def note(self, version: int) -> None:
+        """Copy what the newest commit wrote, and what earlier ones did where a writer was killed before it could.
+
+        The commit itself comes last, so that where its copy is there, that of its checkpoint is as well.
+        """
+        since = version
+        if version and not self._copies.has(_json(version - 1)):
+            have = set(self._copies.names())
+            since = next((number for number in range(version, 0, -1) if _json(number - 1) in have), 0)
+        for number in range(since, version + 1):
+            if self._log.has(_checkpoint(number)):
+                self._copy(_checkpoint(number))
+                self._copy(LAST)
+            self._copy(_json(number))
+
+    def lost(self, version: int) -> int | None:
+        """The number of a commit that was made and is newer than `version`, which the table says is its newest."""
+        return version + 1 if self._copies.has(_json(version + 1)) else None
+
+    def log_has(self, version: int, text: str = "") -> bool:
+        """A commit of this number is in the log, whatever its listing says, and has a text in it."""
+        found = self._log.read(_json(version))
+        return found is not None and text.encode() in found
+
+    def damage(self) -> list[LogDamage]:
+        """What is not as it was. Of a table without copies nothing can be said."""
+        copies, problems = self._unsealed()
+        there = set(self._log.names())
+        newest = max((name for name in there & copies.keys() if name.endswith(".parquet")), default="")
+        for name in sorted(copies):
+            data = self._log.read(name) if name in there else None
+            if name == LAST:
+                problem = self._last_problem(data, copies[name], there)
+            elif data is None:  # commits before a checkpoint may be tidied away, and so may older checkpoints
+                problem = "" if name[:20] <= newest[:20] else "is missing"
+            else:
+                problem = "" if data == copies[name] else "is not what was written"
+            if problem:
+                problems.append(LogDamage(f"{LOG}/{name}", problem))
+        known = set(self._copies.names())
+        last = max((name for name in known if name.endswith(".json")), default="")
+        absent = (name for name in there if NUMBERED.fullmatch(name) and name < last and name not in known)
+        return problems + [LogDamage(f"{COPIES}/{name}", "is missing") for name in sorted(absent)]
+
+    def restore(self, found: LogDamage) -> None:
+        """Put a file of the log back from its copy, or a copy from its file."""
+        folder, _, name = found.name.partition("/")
+        if folder == COPIES:
+            if not self._copy(name):
+                self._copies.remove(name)
+            return
+        self._log.write(name, self._copy_of(name))
+
+    def _copy(self, name: str) -> bool:
+        data = self._log.read(name)
+        if data is not None:
+            self._copies.write(name, sealed(data, name))
+        return data is not None
+
+    def _copy_of(self, name: str) -> bytes:
+        """Raises Damaged."""
+        return unsealed(self._copies.read(name) or b"", name)
+
+    def _unsealed(self) -> tuple[Mapping[str, bytes], list[LogDamage]]:
+        whole, problems = {}, []
+        for name in self._copies.names():
+            if name != LAST and not NUMBERED.fullmatch(name):  # a draft that a killed writer left
+                continue
+            try:
+                whole[name] = self._copy_of(name)
+            except Damaged as error:
+                problems.append(LogDamage(f"{COPIES}/{name}", str(error)))
+        return whole, problems
+
+    def _last_problem(self, data: bytes | None, copy: bytes, there: set[str]) -> str:
+        if data in (None, copy):  # without it the log is read from its list of files
+            return ""
+        try:
+            version, copied = (int(json.loads(text)["version"]) for text in (data or b"", copy))
+        except (ValueError, KeyError, TypeError):
+            return "is not what was written"
+        newer = version > copied and _checkpoint(version) in there  # a writer was killed before it could copy
+        return "" if newer else "is not what was written"
+
+
+def _json(version: int) -> str:
+    return f"{version:020}.json"
+
+
+def _checkpoint(version: int) -> str:
+    return f"{version:020}.checkpoint.parquet"
+
+
+# In which file each key of a table stands: sorted arrays, some 20 bytes a key, and what changed since beside them.
+
+MERGED_AT = 20_000  # changes, or an eighth of all keys where that is more: then they are sorted in
+
+
+class KeyIndex:
+    """Keys that are not there any more stand in `_changed` as None until they are sorted in."""
+
+    def __init__(self, files: Iterable[tuple[str, pa.ChunkedArray]] = ()) -> None:
+        self._paths: list[str] = []
+        keys, numbers = [np.zeros(0, "S1")], [np.zeros(0, np.int32)]
+        for path, column in files:
+            keys.append(fixed_bytes(column))
+            numbers.append(np.full(len(column), len(self._paths), np.int32))
+            self._paths.append(path)
+        self._number_of = {path: number for number, path in enumerate(self._paths)}
+        self._changed: dict[str, int | None] = {}
+        self._sort(np.concatenate(keys), np.concatenate(numbers))
+
+    def __len__(self) -> int:
+        return len(self.keys())
+
+    def __iter__(self) -> Iterator[str]:
+        return (key.decode() for key in self.keys().tolist())
+
+    def keys(self) -> Bytes:
+        """(N,) sorted."""
+        if self._changed:
+            self._merge()
+        return self._keys
+
+    def files_of(self, keys: Iterable[str]) -> dict[str, str]:
+        """Those of the keys that are there, and the file each stands in."""
+        asked = list(dict.fromkeys(keys))
+        numbers = dict(zip(asked, self._numbers_of(asked)))
+        numbers |= {key: self._changed[key] for key in asked if key in self._changed}
+        return {key: self._paths[number] for key, number in numbers.items() if number is not None}
+
+    def change(self, drop: Iterable[str], add: Mapping[str, str]) -> None:
+        """Keys out, and keys with their files in."""
+        self._changed.update(dict.fromkeys(drop))
+        for key, path in add.items():
+            if path not in self._number_of:
+                self._number_of[path] = len(self._paths)
+                self._paths.append(path)
+            self._changed[key] = self._number_of[path]
+        if len(self._changed) > max(MERGED_AT, len(self._keys) // 8):
+            self._merge()
+
+    def _numbers_of(self, asked: Sequence[str]) -> list[int | None]:
+        if not len(self._keys) or not asked:
+            return [None] * len(asked)
+        encoded = [key.encode() for key in asked]
+        wanted = np.array(encoded, self._keys.dtype)  # of longer ones the beginning
+        at = np.minimum(np.searchsorted(self._keys, wanted), len(self._keys) - 1)
+        there = (self._keys[at] == wanted) & (np.fromiter(map(len, encoded), int) <= self._keys.itemsize)
+        return [number if found else None for number, found in zip(self._file[at].tolist(), there.tolist())]
+
+    def _merge(self) -> None:
+        stays = np.ones(len(self._keys), bool)
+        changed = [encoded for key in self._changed if len(encoded := key.encode()) <= self._keys.itemsize]
+        if len(self._keys) and changed:
+            stays = ~np.isin(self._keys, np.array(changed, self._keys.dtype), kind="sort")
+        added = [(key.encode(), number) for key, number in self._changed.items() if number is not None]
+        self._changed = {}
+        keys = np.concatenate([self._keys[stays], np.array([key for key, _ in added], np.bytes_)])
+        self._sort(keys, np.concatenate([self._file[stays], np.array([number for _, number in added], np.int32)]))
+
+    def _sort(self, keys: Bytes, numbers: np.ndarray) -> None:
+        order = np.argsort(keys, kind="stable")
+        self._keys, self._file = keys[order], numbers[order]
+
 
 APP_ID = "driving-data-factory"
 EPOCH_ID = f"{APP_ID}.epoch"
@@ -411,3 +647,24 @@ class KeyedTable:
             commit_properties=CommitProperties(max_commit_retries=0),  # else it is made a second time
             storage_options=dict(self.location.options),
         )
+
+
+def main(arguments: list[str]) -> int:
+    """The trial of a URL that `why_unusable` runs: both clients, a small object written and removed.
+
+    0, or 1 and why not on standard output.
+    """
+    try:
+        location = Location.parse(arguments[0])
+        name = f".trial-{secrets.token_hex(8)}"
+        listed(lambda: DeltaTable.is_deltatable(location.child("samples").uri))
+        location.write(name, b"")
+        location.remove(name)
+    except (OSError, ValueError, pa.ArrowException, DeltaError) as error:  # BadLocation among them
+        print(one_line(error))
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -11,13 +11,12 @@ from dataclasses import dataclass
 
 import pyarrow as pa
 
-from factory.store.commit_copies import COPIES, LOG, CommitCopies
+from factory.store.disk import why_no_links
 from factory.store.location import BadLocation, Location
 from factory.store.mcap_files import McapTable, write_mcap_shard
 from factory.store.parquet_file import Shard, write_shard
 from factory.store.samples import Store
-from factory.store.table import KeyedTable
-from factory.store.usable import why_no_links
+from factory.store.table import COPIES, LOG, CommitCopies, KeyedTable
 from factory.store.verify import TABLES, Verdict, damaged_logs, orphaned, outdated_episodes, tables_in
 
 TEMPORARY = re.compile(r"(.*/)?(\..*\.tmp|\.trial-[0-9a-f]+|_commit_.*\.tmp|.*\.draft)")

@@ -19,14 +19,13 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from factory.store.cache import BadCacheFile, SceneFiles, check_prepared
-from factory.store.commit_copies import COPIES, LOG, CommitCopies, LogDamage
 from factory.store.counts.codes import codes, fixed_bytes, packed
 from factory.store.location import Location
 from factory.store.mcap_files import FOLDER, SAMPLES_MCAP, McapShard, McapTable, check_episode, episode_name
 from factory.store.mcap_files import NAMED as MCAP_NAMED
 from factory.store.parquet_file import DamagedFile, naming
 from factory.store.samples import CURRENT_RUN, IMPORTED, LAST_RUN, ChangedRun, Store
-from factory.store.table import KeyedTable, LiveFile
+from factory.store.table import COPIES, LOG, CommitCopies, KeyedTable, LiveFile, LogDamage
 
 TABLES = ("plans", "candidates", "samples", "outcomes", SAMPLES_MCAP.name)
 OF_WALKS = ["clip_id", "expert", "candidate_index", "round", "settings_hash"]

@@ -30,9 +30,9 @@ from factory.graph.progress import Counter
 from factory.graph.work import Halted
 from factory.readers.base import ClipRef
 from factory.setup.settings import choose_vocabulary, open_reader
+from factory.store.disk import why_unusable
 from factory.store.location import Location
 from factory.store.table import AnotherWriter, KeyedTable
-from factory.store.usable import why_unusable
 from planners.command import Failed, Stopped, command
 from planners.drive.drivers import driver_of
 from planners.drive.settings import DriveSettings, Pictures, settings_of

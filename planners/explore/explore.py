@@ -26,10 +26,10 @@ from factory.graph.progress import Counter as Progress
 from factory.graph.work import Halted
 from factory.readers.base import ClipReader, ClipRef
 from factory.setup.settings import open_reader
+from factory.store.disk import why_unusable
 from factory.store.explored.table import ExploredClip, explored_clips, open_explored, write_explored
 from factory.store.location import Location
 from factory.store.table import AnotherWriter, KeyedTable
-from factory.store.usable import why_unusable
 from planners.command import Failed, Stopped, command
 from planners.drive.drivers import PlannerDriver, driver_of
 from planners.drive.table import Committer

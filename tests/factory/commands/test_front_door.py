@@ -21,9 +21,9 @@ from factory.commands.table import COMMANDS, DOORS, PLANNERS
 from factory.exits import MEANING
 from factory.graph.episodes import EpisodesWanted
 from factory.graph.execute import execute
-from factory.store.commit_copies import COPIES
 from factory.store.counts.funnel import funnel_of
 from factory.store.samples import CURRENT_RUN, Store
+from factory.store.table import COPIES
 from factory.views.show import prepared_episode
 from factory.views.status import failed_line
 from planners.__main__ import main as planners_main

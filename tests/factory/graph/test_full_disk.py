@@ -13,9 +13,8 @@ from factory.exits import COMPLETE, INTERRUPTED
 from factory.graph.execute import RunSummary, execute, on_new_clusters
 from factory.graph.steps import failure_of
 from factory.run import main as run_main
-from factory.store.disk import DiskFull, needs_disk, why_disk_full
+from factory.store.disk import DiskFull, needs_disk, why_disk_full, why_unusable
 from factory.store.samples import Store
-from factory.store.usable import why_unusable
 from factory.store.verify import verify
 from tasks.caches import user_cache
 from tests.chaos.full_disks import PAGE, at_level, needed

@@ -12,8 +12,7 @@ from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
 from factory.graph.steps import failure_of
 from factory.graph.work import Driven, Dropped, PreparedClip
 from factory.store.cache import ClipCache
-from factory.store.disk import DiskFull
-from factory.store.illness import PlaceRefused, own_place, why_ill
+from factory.store.disk import DiskFull, PlaceRefused, own_place, why_ill
 from factory.store.outcomes import ErrorKind
 from tests.factory.graph.runs import run
 from tests.factory.tables import assert_same_tables, tables_of
@@ -133,7 +132,7 @@ def test_a_file_that_is_damaged_or_missing_is_no_illness(error: OSError) -> None
 
 def test_memory_is_the_machine_s_only_where_little_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
     """A clip that asks for terabytes says nothing of the machine."""
-    monkeypatch.setattr("factory.store.illness._memory_left", lambda: 0.5)
+    monkeypatch.setattr("factory.store.disk._memory_left", lambda: 0.5)
     assert failure_of(MemoryError("Unable to allocate 7.28 TiB")).kind is ErrorKind.SYSTEM
-    monkeypatch.setattr("factory.store.illness._memory_left", lambda: 0.02)
+    monkeypatch.setattr("factory.store.disk._memory_left", lambda: 0.02)
     assert failure_of(MemoryError("Unable to allocate 1.00 MiB")).kind is ErrorKind.MACHINE

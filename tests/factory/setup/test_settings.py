@@ -9,8 +9,8 @@ from factory.config.compose import ConfigError
 from factory.config.run import SCENARIONET, load_config, refuse_relative_root
 from factory.setup.settings import assemble
 from factory.setup.vocabulary import save_recovery_table
+from factory.store.disk import why_ill
 from factory.store.identity import RunIdentity
-from factory.store.illness import why_ill
 from tasks.experts.recovery.expert import RecoveryTable
 from tasks.rollout.policy import SeenTraffic
 from tasks.world.arrays import Array

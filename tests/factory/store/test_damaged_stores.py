@@ -11,14 +11,13 @@ from factory.commands.table import COMMANDS
 from factory.exits import BAD_CONFIG, COMPLETE, DAMAGED
 from factory.graph.episodes import EpisodesWanted
 from factory.graph.execute import execute
-from factory.store.commit_copies import CommitCopies
 from factory.store.location import Location
 from factory.store.mcap_files import Message, episode_bytes
 from factory.store.parquet_file import write_shard
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
 from factory.store.schema import SAMPLES
-from factory.store.table import AnotherWriter
+from factory.store.table import AnotherWriter, CommitCopies
 from factory.store.upkeep import restore_logs
 from factory.store.verify import damaged_logs, verify
 from tests.factory.damage import damaged

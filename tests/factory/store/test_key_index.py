@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from factory.store.counts import key_index
-from factory.store.counts.key_index import KeyIndex
+from factory.store import table
+from factory.store.table import KeyIndex
 
 KEYS = st.text("abcdé", min_size=1, max_size=4)
 CHANGES = st.lists(st.tuples(st.sets(KEYS), st.dictionaries(KEYS, st.sampled_from(["x", "y", "z"]))))
@@ -20,7 +20,7 @@ def test_it_finds_what_a_dict_finds(
 ) -> None:
     files = [(path, pa.array([key for key, of in known.items() if of == path], pa.string())) for path in ("x", "y")]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(key_index, "MERGED_AT", merged_at)
+        patch.setattr(table, "MERGED_AT", merged_at)
         index, there = KeyIndex((path, pa.chunked_array([keys])) for path, keys in files), dict(known)
         for drop, add in changes:
             index.change(drop, add)
