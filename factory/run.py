@@ -174,7 +174,7 @@ def _run(
     from factory.setup.settings import assemble
     from factory.stages.benchmark import NEEDED, write_benchmark
     from factory.stages.warm import compiling_ahead
-    from factory.store.counts.funnel import image_sources_text
+    from factory.store.funnel import image_sources_text
     from factory.store.location import BadLocation, Location
     from factory.store.samples import OtherSchema, Store
     from factory.store.table import DamagedLog

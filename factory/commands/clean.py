@@ -46,7 +46,7 @@ def main(request: Request) -> None:
     from factory.store.disk import why_not_written
     from factory.store.location import BadLocation
     from factory.store.table import AnotherWriter
-    from factory.store.upkeep import RunGoesOn, hold, leftovers, refuse_held
+    from factory.store.verify import RunGoesOn, hold, leftovers, refuse_held
 
     store = open_store(request.out)
     try:

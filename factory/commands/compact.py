@@ -24,7 +24,7 @@ def main(request: Request) -> None:
     from factory.store.location import BadLocation
     from factory.store.parquet_file import DamagedFile
     from factory.store.table import AnotherWriter
-    from factory.store.upkeep import RunGoesOn, compact, hold
+    from factory.store.verify import RunGoesOn, compact, hold
 
     store = open_store(request.out)
     try:

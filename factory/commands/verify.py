@@ -36,8 +36,7 @@ def main(request: Request) -> int:
     from factory.store.location import BadLocation
     from factory.store.samples import OtherSchema, refuse_other_schema
     from factory.store.table import AnotherWriter, DamagedLog
-    from factory.store.upkeep import RunGoesOn, drop_damaged, hold, restore_logs
-    from factory.store.verify import damaged_logs
+    from factory.store.verify import RunGoesOn, damaged_logs, drop_damaged, hold, restore_logs
 
     out = out_of(request.out)
     try:

@@ -18,8 +18,7 @@ import pyarrow as pa
 
 from factory.graph.local import Graph, Ticket
 from factory.graph.steps import Failure
-from factory.store.candidates import ClipCandidates
-from factory.store.outcomes import Outcome
+from factory.store.attempts import ClipCandidates, Outcome
 from factory.store.parquet_file import Shard
 from factory.store.samples import Store
 

@@ -10,9 +10,8 @@ from factory.graph.plan import CLIP_CANDIDATE, ClipPlan, RunPlan
 from factory.graph.records import Records, past_of
 from factory.graph.steps import Failure
 from factory.graph.walk import Try, tries_before
-from factory.store.counts.history import Past
-from factory.store.identity import attempt_id
-from factory.store.outcomes import ErrorKind, Outcome
+from factory.store.attempts import ErrorKind, Outcome, Past
+from factory.store.schema import attempt_id
 
 
 def crash_of(folder: Path) -> Mapping[str, Any]:

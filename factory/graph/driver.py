@@ -22,11 +22,10 @@ from factory.graph.progress import Executed, ProgressLine, RunForecast, Tally, W
 from factory.graph.records import Records, past_of
 from factory.graph.steps import Attempted, Failure, HalfBuilt, HandedOn, Prepared, Reconstructed, Walked
 from factory.graph.walk import Blocked, Complete, Exhausted, Step, Stretch, Try, stretch, tries_before
-from factory.store.counts.history import Past
+from factory.store.attempts import ErrorKind, Kind, Outcome, Past
 from factory.store.disk import DiskFull
-from factory.store.identity import RunIdentity, Stamp, attempt_id
-from factory.store.outcomes import ErrorKind, Kind, Outcome
 from factory.store.parquet_file import Shard
+from factory.store.schema import RunIdentity, Stamp, attempt_id
 from tasks.stages import Rejected
 
 CLIPS_PER_WORKER = 2  # open at once: one works while the next is being prepared

@@ -32,11 +32,10 @@ from factory.graph.records import Records
 from factory.graph.walk import Try, retry_policy
 from factory.graph.work import NotReady, Work
 from factory.readers.base import ClipRef
-from factory.store.counts.funnel import Funnel, funnel_of
-from factory.store.counts.history import NOTHING
+from factory.store.attempts import NOTHING, Kind
 from factory.store.disk import DiskFull, why_ill
+from factory.store.funnel import Funnel, funnel_of
 from factory.store.location import BadLocation
-from factory.store.outcomes import Kind
 from factory.store.samples import CURRENT_RUN, ChangedRun, OnChange, Store
 from factory.store.table import AnotherWriter
 from factory.wording import one_line

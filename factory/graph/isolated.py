@@ -24,8 +24,8 @@ from factory.graph.local import MAX_RETRIES, STEPS, Fuse, Ticket, attempt_tasks,
 from factory.graph.metrics import NoRecorder, Recorder
 from factory.graph.steps import Failure, warm
 from factory.graph.work import NotReady, Stopped, Work, never
+from factory.store.attempts import ErrorKind
 from factory.store.location import Location
-from factory.store.outcomes import ErrorKind
 
 KEPT = 16  # results that the process keeps opened
 END_S = 5.0  # for it to end by itself

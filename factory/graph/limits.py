@@ -14,9 +14,9 @@ from typing import Any
 from factory.graph.guard import OVER, WORK, Guard, read_note
 from factory.graph.steps import Failure
 from factory.readers.base import ClipRef
-from factory.store.identity import Stamp
+from factory.store.attempts import ErrorKind
 from factory.store.location import Location
-from factory.store.outcomes import ErrorKind
+from factory.store.schema import Stamp
 from tasks.stages import TASKS
 
 SEEN = 20  # tasks of a name that must have ended before their cost says what another may take

@@ -14,9 +14,9 @@ from factory.graph.limits import described, notes_folder
 from factory.graph.metrics import NoRecorder, Recorder
 from factory.graph.steps import Failure
 from factory.graph.work import NotReady, Stopped, Work, never
+from factory.store.attempts import ErrorKind
 from factory.store.disk import DiskFull
 from factory.store.location import Location
-from factory.store.outcomes import ErrorKind
 from tasks.stages import ATTEMPT, TASKS
 
 Fuse = Literal["auto", "all", "none"]

@@ -17,8 +17,8 @@ from enum import StrEnum
 from typing import Protocol
 
 from factory.graph.steps import Attempted, Failure, Prepared, Reconstructed, Walked
+from factory.store.attempts import Kind, Outcome
 from factory.store.location import Location
-from factory.store.outcomes import Kind, Outcome
 from factory.store.parquet_file import Shard
 
 GAUGES_EVERY_S = 1.0

@@ -7,11 +7,9 @@ from functools import cached_property, partial
 from factory.graph.walk import Complete, Exhausted, Step, Try, candidate_order, next_step
 from factory.graph.work import HUMAN_CANDIDATE
 from factory.readers.base import ClipRef
-from factory.store.candidates import Listed
-from factory.store.counts.history import History, Past
-from factory.store.identity import UNLISTED, RunIdentity
-from factory.store.outcomes import Kind
+from factory.store.attempts import History, Kind, Listed, Past
 from factory.store.samples import WAYS_OUT, ChangedRun, OnChange
+from factory.store.schema import UNLISTED, RunIdentity
 
 Policy = Callable[[Past], bool]
 CLIP_CANDIDATE = HUMAN_CANDIDATE  # of a row about the clip as a whole (its expert is empty)

@@ -7,10 +7,8 @@ from factory.graph.steps import Failure
 from factory.graph.walk import Exhausted, Try
 from factory.graph.work import PreparedClip
 from factory.readers.base import ClipRef
-from factory.store.candidates import ClipCandidates
-from factory.store.counts.history import Past
-from factory.store.identity import RunIdentity, Stamp, attempt_id
-from factory.store.outcomes import QUARANTINE_AFTER, ErrorKind, Kind, Outcome
+from factory.store.attempts import QUARANTINE_AFTER, ClipCandidates, ErrorKind, Kind, Outcome, Past
+from factory.store.schema import RunIdentity, Stamp, attempt_id
 from tasks.stages import Rejected
 
 

@@ -15,15 +15,14 @@ import pyarrow as pa
 
 from factory.graph.work import Dropped, Halted, NotReady, PreparedClip, Stopped, Underway, Work, go_on
 from factory.readers.base import BadClip, ClipRef, Unreadable
+from factory.store.attempts import ErrorKind
 from factory.store.cache import BadCacheFile, ClipCache, SceneFiles
 from factory.store.disk import own_place, why_disk_full, why_ill
-from factory.store.identity import Stamp
 from factory.store.location import Location
 from factory.store.mcap_files import FOLDER, episode_name, write_mcap_shard
-from factory.store.outcomes import ErrorKind
 from factory.store.parquet_file import Shard, write_shard
 from factory.store.reader import samples_of
-from factory.store.schema import SAMPLES, sample_row_to_table
+from factory.store.schema import SAMPLES, Stamp, sample_row_to_table
 from factory.wording import one_line
 from tasks.stages import Rejected
 

@@ -9,8 +9,7 @@ from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
 
 from factory.graph.work import HUMAN_CANDIDATE
-from factory.store.counts.history import Past
-from factory.store.outcomes import ErrorKind, Kind
+from factory.store.attempts import ErrorKind, Kind, Past
 
 TRIED_AGAIN = (ErrorKind.MACHINE, ErrorKind.SYSTEM, ErrorKind.LIMIT)  # by the next run, by itself
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Protocol
 
 from factory.readers.base import ClipRef
-from factory.store.candidates import CandidateRow
-from factory.store.identity import RunIdentity
+from factory.store.attempts import CandidateRow
+from factory.store.schema import RunIdentity
 from tasks.stages import ATTEMPT, Rejected
 
 if TYPE_CHECKING:

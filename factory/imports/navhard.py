@@ -36,8 +36,8 @@ from factory.readers.navsim.tracks import ego_states
 from factory.stages.benchmark import BENCHMARK_FILE, FORMAT
 from factory.stages.imaging import NO_IMAGES
 from factory.store.cache import SceneFiles
-from factory.store.identity import RunIdentity
 from factory.store.samples import Store
+from factory.store.schema import RunIdentity
 from tasks.experts.pdm_closed.planner import PdmSettings, plan_for
 from tasks.hard_scenes import GivenScenes
 from tasks.render.settings import ImageSource

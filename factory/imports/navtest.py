@@ -23,8 +23,8 @@ from factory.readers.navsim.reader import log_files
 from factory.readers.navsim.windows import Choice, table_at, wanted_windows
 from factory.stages.benchmark import BENCHMARK_FILE, FORMAT
 from factory.store.cache import SceneFiles
-from factory.store.identity import RunIdentity
 from factory.store.samples import Store
+from factory.store.schema import RunIdentity
 from tasks.caches import user_cache
 from tasks.hard_scenes import OneStageClip
 from tasks.stages import HUMAN

@@ -12,13 +12,11 @@ from factory.graph.batch import SHARD_BYTES
 from factory.graph.execute import RunSummary, record_summary
 from factory.graph.progress import Counter, Executed
 from factory.readers.base import BadClip, failing_as
-from factory.store.columns import BadRow
+from factory.store.attempts import ErrorKind, Kind, Outcome
 from factory.store.disk import DiskFull
-from factory.store.identity import UNLISTED, RunIdentity, Stamp, attempt_id
-from factory.store.outcomes import ErrorKind, Kind, Outcome
 from factory.store.parquet_file import Shard, write_shard
 from factory.store.samples import IMPORTED, ChangedRun, Store
-from factory.store.schema import SAMPLES, sample_row_to_table
+from factory.store.schema import SAMPLES, UNLISTED, BadRow, RunIdentity, Stamp, attempt_id, sample_row_to_table
 
 VERSION = 1  # of what an import makes of a file; stands in stage_versions
 NO_VOCABULARY = ""  # in vocabulary_digest: what perturbed the ego is not known

@@ -14,7 +14,7 @@ from factory.graph.walk import candidate_order
 from factory.graph.work import Columns, attempted
 from factory.readers.base import ClipRef
 from factory.setup.settings import Run
-from factory.store.counts.funnel import funnel_of
+from factory.store.funnel import funnel_of
 from factory.store.samples import Store
 from factory.store.schema import BOOKKEEPING, sample_row_to_table
 from tasks.render.settings import RenderMode

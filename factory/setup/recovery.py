@@ -17,7 +17,7 @@ from factory.setup.vocabulary import (
     save_recovery_table,
     train_windows,
 )
-from factory.store.identity import canonical_json
+from factory.store.schema import canonical_json
 from tasks.caches import user_cache
 from tasks.experts.recovery.expert import Recovery, RecoverySettings, RecoveryTable
 from tasks.sealed import check

@@ -24,8 +24,8 @@ from factory.stages.pipeline import FactoryWork
 from factory.stages.sensors import chosen_cameras
 from factory.store.disk import why_ill
 from factory.store.explored.drifts import Explored, explored_in
-from factory.store.identity import UNLISTED, RunIdentity, canonical_json
 from factory.store.location import Location
+from factory.store.schema import UNLISTED, RunIdentity, canonical_json
 from tasks.caches import user_cache
 from tasks.experts.pdm_closed.settings import PdmSettings
 from tasks.experts.protocol import Expert, tried_once

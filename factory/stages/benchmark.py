@@ -12,8 +12,8 @@ from typing import Any
 from factory.config.run import BenchmarkSettings
 from factory.graph.work import HUMAN_CANDIDATE
 from factory.readers.base import ClipRef
-from factory.store.identity import RunIdentity
 from factory.store.samples import MADE_UNDER, Store
+from factory.store.schema import RunIdentity
 from tasks.hard_scenes import BEFORE_STEPS
 from tasks.stages import FOLLOW_UP, FOLLOW_UP_BEFORE, FRAMES, HUMAN, HUMAN_BEFORE
 from tasks.world.clip import STEP_S

@@ -14,9 +14,9 @@ from factory.readers.validate import read_clip
 from factory.stages.fitting import fits_going_on
 from factory.stages.imaging import Imaging, scene_lookups
 from factory.stages.rows import label_columns, sample_row
-from factory.store.candidates import CandidateRow
+from factory.store.attempts import CandidateRow
 from factory.store.explored.drifts import Explored
-from factory.store.identity import UNLISTED, RunIdentity
+from factory.store.schema import UNLISTED, RunIdentity
 from tasks.attempt import ExpertGate, Judged, Timed, attempt, has_route, human_sample, perturbed_scene
 from tasks.drifts import Drift
 from tasks.experts.pdm_closed.planner import PdmSettings

@@ -33,7 +33,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from factory.store.disk import whole_file
-from factory.store.identity import canonical_json
+from factory.store.schema import canonical_json
 from factory.wording import shown
 from tasks.render.scene.asset import BlockRange, ClassQuality, Exposure, OwnBody, RenderAsset, TakenFrom, ViewQuality
 from tasks.render.scene.movers import NO_SHIFTS, BoxShifts

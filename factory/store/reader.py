@@ -21,7 +21,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from factory.readers.pictures import BadPicture, decode_rgb
-from factory.store.counts.codes import beginning, fixed_bytes
+from factory.store.codes import beginning, fixed_bytes
 from factory.store.location import Location
 from factory.store.mcap_files import McapShard, McapTable, open_shard
 from factory.store.parquet_file import naming, open_parquet, with_partition

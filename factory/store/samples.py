@@ -11,16 +11,34 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, Literal
 
+from factory.store.attempts import (
+    CANDIDATES,
+    OUTCOME_STATE,
+    OUTCOMES,
+    PLANS,
+    SAMPLE_STATE,
+    ClipCandidates,
+    History,
+    Outcome,
+    candidates_table,
+    history_of,
+    listed_of,
+    outcomes_table,
+    plan_table,
+)
 from factory.store.cache import ClipCache
-from factory.store.candidates import CANDIDATES, ClipCandidates, candidates_table, listed_of
-from factory.store.counts.codes import both
-from factory.store.counts.history import OUTCOME_STATE, SAMPLE_STATE, History, history_of
-from factory.store.identity import UNLISTED, RunIdentity, canonical_json
+from factory.store.codes import both
 from factory.store.location import Location
-from factory.store.outcomes import OUTCOMES, Outcome, outcomes_table
 from factory.store.parquet_file import Shard, write_shard
-from factory.store.plans import PLANS, plan_table
-from factory.store.schema import LICENCES_PROPERTY, SAMPLES, SCHEMA_VERSION, why_other_schema
+from factory.store.schema import (
+    LICENCES_PROPERTY,
+    SAMPLES,
+    SCHEMA_VERSION,
+    UNLISTED,
+    RunIdentity,
+    canonical_json,
+    why_other_schema,
+)
 from factory.store.table import KeyedTable
 from tasks.sealed import MEMBER, sealed_json, unsealed_json
 

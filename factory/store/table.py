@@ -32,7 +32,7 @@ from deltalake import CommitProperties, DeltaTable, Transaction
 from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundError
 from deltalake.transaction import AddAction, RemoveAction
 
-from factory.store.counts.codes import Bytes, fixed_bytes, packed
+from factory.store.codes import Bytes, fixed_bytes, packed
 from factory.store.disk import needs_disk
 from factory.store.location import Location
 from factory.store.parquet_file import Shard, TableSpec, encoded_text, read_parquet, with_partition, write_shard

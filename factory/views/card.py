@@ -13,9 +13,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from factory import __version__
-from factory.store.counts.codes import codes
-from factory.store.counts.funnel import Funnel, funnel_of_tables, funnel_tables
-from factory.store.outcomes import Kind
+from factory.store.attempts import Kind
+from factory.store.codes import codes
+from factory.store.funnel import Funnel, funnel_of_tables, funnel_tables
 from factory.store.samples import CURRENT_RUN, Store
 from factory.store.schema import SCHEMA_VERSION
 from factory.views.status import counted

@@ -19,9 +19,9 @@ from factory.graph.steps import cache_key
 from factory.graph.work import PreparedClip
 from factory.readers.base import BadClip, ClipRef
 from factory.stages.pipeline import FactoryWork, PerturbedClip, payload_of
+from factory.store.attempts import Kind
 from factory.store.cache import BadCacheFile
-from factory.store.counts.codes import equals, fixed_bytes
-from factory.store.outcomes import Kind
+from factory.store.codes import equals, fixed_bytes
 from factory.store.reader import decoded
 from factory.store.samples import Store
 from factory.views.drawing import attempt_picture

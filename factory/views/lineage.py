@@ -36,7 +36,7 @@ def lineage(store: "Store", which: str) -> list[Part]:
 
 
 def _meant(store: "Store", which: str) -> str:
-    from factory.store.counts.codes import beginning
+    from factory.store.codes import beginning
 
     ids = store.samples.keys()
     if which.isascii() and which.isdecimal() and int(which) < len(ids):

@@ -83,7 +83,7 @@ def out_of(out: str) -> "Location":
 
 def status_lines(store: "Store") -> Iterable[str]:
     """Tables, counts, funnel and the newest run."""
-    from factory.store.counts.funnel import funnel_of_tables, funnel_tables
+    from factory.store.funnel import funnel_of_tables, funnel_tables
 
     samples, fell, lists = funnel_tables(store, ("split", "image_source", "dataset"))
     outcomes = counted(fell["kind"])

@@ -14,9 +14,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from factory.store.columns import Column
 from factory.store.reader import TIME_TOLERANCE_S, labels_of
-from factory.store.schema import COLUMNS, LABEL_COLUMNS
+from factory.store.schema import COLUMNS, LABEL_COLUMNS, Column
 from planners.data.batch import COMMANDS, Batch, BevLayout, ImageLayout, Needs
 from planners.data.images import stitch
 from planners.data.index import AGENT_COLUMNS, BEV_COLUMNS

@@ -8,10 +8,9 @@ from typing import Generic, TypeVar
 
 import pyarrow as pa
 
-from factory.store.columns import schema_of
-from factory.store.identity import canonical_json
 from factory.store.location import Location
 from factory.store.parquet_file import TableSpec, write_shard
+from factory.store.schema import canonical_json, schema_of
 from factory.store.table import KeyedTable
 from planners.drive.measures import DriveMeasures
 

@@ -12,8 +12,8 @@ from factory.readers.town.reader import SensedReader
 from factory.readers.validate import read_clip
 from factory.setup.settings import cache_folder
 from factory.stages.painted import town_lights
-from factory.store.identity import canonical_json
 from factory.store.location import Location
+from factory.store.schema import canonical_json
 from planners.drive.drivers import Driver, driver_of
 from planners.drive.eyes import Eyes, NoEyes
 from planners.drive.films import write_film

@@ -9,8 +9,8 @@ from factory.setup.settings import cache_folder
 from factory.stages.painted import town_lights
 from factory.stages.rows import scene_tags
 from factory.store.explored.table import DriftRow, ExploredClip
-from factory.store.identity import canonical_json
 from factory.store.location import Location
+from factory.store.schema import canonical_json
 from planners.drive.eyes import Eyes
 from planners.drive.starts import lengthened
 from planners.drive.work import DrivingPlanner, NotDriven, eyes_of, kept_driver, reads_towns

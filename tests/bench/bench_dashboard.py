@@ -23,9 +23,8 @@ from threading import local
 import numpy as np
 import pyarrow as pa
 
-from factory.store.candidates import CANDIDATES
+from factory.store.attempts import CANDIDATES, OUTCOMES
 from factory.store.location import Location
-from factory.store.outcomes import OUTCOMES
 from factory.store.parquet_file import TableSpec, write_shard
 from factory.store.samples import Store
 from factory.store.schema import SAMPLES

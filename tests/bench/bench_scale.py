@@ -43,7 +43,7 @@ WAITS = ("_private/worker.py:wait",)
 PARTS = (  # of a profile, from the outside in; they hold one another
     *("on_ray/graph.py:submit", "ray/remote_function.py:_remote", "_private/worker.py:get", "graph/metrics.py:_add"),
     *("graph/records.py:stamp", "graph/records.py:outcome", "graph/walk.py:next_step", "graph/batch.py:add"),
-    *("graph/batch.py:send_if_due", "graph/batch.py:_commit", "store/candidates.py:candidates_table"),
+    *("graph/batch.py:send_if_due", "graph/batch.py:_commit", "store/attempts.py:candidates_table"),
 )
 CANDIDATES = 16  # of a clip; where half of them are accepted, five rounds take ten
 

@@ -31,12 +31,10 @@ from factory.graph.execute import execute
 from factory.graph.plan import make_plan
 from factory.graph.walk import retry_policy
 from factory.readers.base import ClipRef
-from factory.store.candidates import CANDIDATES
-from factory.store.identity import RunIdentity, attempt_id
-from factory.store.outcomes import OUTCOMES
+from factory.store.attempts import CANDIDATES, OUTCOMES
 from factory.store.parquet_file import Shard, TableSpec, write_shard
 from factory.store.samples import Store
-from factory.store.schema import SAMPLES, sample_row_to_table
+from factory.store.schema import SAMPLES, RunIdentity, attempt_id, sample_row_to_table
 from tests.factory.toy import ToyWork, row_of, stream
 
 EXPERTS = ("pdm_closed", "recovery")

@@ -16,10 +16,8 @@ import numpy as np
 from factory.graph.work import Built, Columns, Driven, Dropped, PreparedClip, Stopped, never
 from factory.readers.base import BadClip, ClipRef
 from factory.stages.rows import label_columns
-from factory.store.candidates import CandidateRow
-from factory.store.columns import Column
-from factory.store.identity import UNLISTED, RunIdentity
-from factory.store.schema import BOOKKEEPING, FIELDS
+from factory.store.attempts import CandidateRow
+from factory.store.schema import BOOKKEEPING, FIELDS, UNLISTED, Column, RunIdentity
 from tasks.reward.label_bytes import HALVES, WHOLES, VocabularyLabels
 from tasks.stages import Rejected
 

@@ -7,11 +7,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from factory.stages.rows import label_columns
-from factory.store.identity import Stamp
 from factory.store.parquet_file import write_shard
 from factory.store.reader import SampleTable, labels_of
 from factory.store.samples import Store
-from factory.store.schema import LABEL_COLUMNS, SAMPLES, sample_row_to_table
+from factory.store.schema import LABEL_COLUMNS, SAMPLES, Stamp, sample_row_to_table
 from tasks.reward.label_bytes import UNITS_PER_M, VocabularyLabels
 from tasks.subscores import JUDGED, RECORDS
 from tests.factory.toy import row_of, stream

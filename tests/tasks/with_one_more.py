@@ -7,10 +7,8 @@ import pyarrow as pa
 
 from factory.config.compose import fill
 from factory.stages.rows import label_columns, score_columns
-from factory.store.candidates import CANDIDATES
-from factory.store.counts.funnel import funnel_of_tables
-from factory.store.outcomes import OUTCOMES, Kind
-from factory.store.plans import PLANS
+from factory.store.attempts import CANDIDATES, OUTCOMES, PLANS, Kind
+from factory.store.funnel import funnel_of_tables
 from factory.store.reader import labels_of
 from factory.store.schema import COLUMNS as STORED
 from factory.store.schema import SAMPLES

@@ -24,11 +24,10 @@ from factory.exports.navsim.pictures import BLACK, black_picture, shown
 from factory.exports.navsim.rewards import write_rewards
 from factory.exports.navsim.settings import CannotExport, ExportSettings
 from factory.store.disk import whole_file
-from factory.store.identity import canonical_json
 from factory.store.location import Location
 from factory.store.parquet_file import open_parquet
 from factory.store.reader import Sample, read_rows
-from factory.store.schema import LABEL_COLUMNS
+from factory.store.schema import LABEL_COLUMNS, canonical_json
 from factory.store.table import KeyedTable
 from factory.wording import rate_text, time_text
 from tasks.world.arrays import Array

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from factory.store.disk import needs_disk, whole_file
-from factory.store.identity import canonical_json
+from factory.store.schema import canonical_json
 
 MANIFEST, JOURNAL = "manifest.jsonl", ".journal.jsonl"
 FORMAT = "simscale-1"

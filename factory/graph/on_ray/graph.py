@@ -46,10 +46,10 @@ from factory.graph.on_ray.cluster import (
 from factory.graph.steps import Failure, Walked, attempt
 from factory.graph.walk import Stretch
 from factory.graph.work import NotReady, PreparedClip, Work, never
+from factory.store.attempts import ErrorKind
 from factory.store.disk import why_ill
-from factory.store.identity import Stamp
 from factory.store.location import Location
-from factory.store.outcomes import ErrorKind
+from factory.store.schema import Stamp
 from factory.wording import one_line
 from tasks.stages import TASKS
 

@@ -10,10 +10,9 @@ from dataclasses import asdict, dataclass
 import numpy as np
 import pyarrow as pa
 
-from factory.store.columns import schema_of
-from factory.store.identity import canonical_json
 from factory.store.location import Location
 from factory.store.parquet_file import TableSpec, write_shard
+from factory.store.schema import canonical_json, schema_of
 from factory.store.table import KeyedTable
 from tasks.drifts import Drift
 

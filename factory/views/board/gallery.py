@@ -7,8 +7,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from factory.store.counts.codes import equals
-from factory.store.outcomes import Kind
+from factory.store.attempts import Kind
+from factory.store.codes import equals
 from factory.store.table import KeyedTable
 from factory.views.board.watch import Snapshot, plain
 from factory.views.report_words import REASON_WORDS, to_the_side, turned

@@ -21,9 +21,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from factory.store.counts import funnel
-from factory.store.counts.codes import in_packs, packed
-from factory.store.plans import PLANS
+from factory.store import funnel
+from factory.store.attempts import PLANS
+from factory.store.codes import in_packs, packed
 from factory.store.samples import CURRENT_RUN, Store
 from factory.store.table import KeyedTable, LiveFile
 from tasks.world.arrays import F32, Ints

@@ -25,8 +25,7 @@ from factory.stages.scene_file import BadScene, read_scene, write_scene
 from factory.store.cache import encode
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
-from factory.store.upkeep import restore_logs
-from factory.store.verify import damaged_logs, verify
+from factory.store.verify import damaged_logs, restore_logs, verify
 from planners.training.checkpoint import load_planner, load_training, save_checkpoint
 from tasks.experts.recovery.expert import RecoveryTable
 from tests.factory.stages.test_scene_file import scene

@@ -21,7 +21,7 @@ from factory.commands.table import COMMANDS, DOORS, PLANNERS
 from factory.exits import MEANING
 from factory.graph.episodes import EpisodesWanted
 from factory.graph.execute import execute
-from factory.store.counts.funnel import funnel_of
+from factory.store.funnel import funnel_of
 from factory.store.samples import CURRENT_RUN, Store
 from factory.store.table import COPIES
 from factory.views.show import prepared_episode

@@ -2,8 +2,7 @@
 
 from pathlib import Path
 
-from factory.store.counts.balance import BalanceSheet
-from factory.store.counts.funnel import funnel_of
+from factory.store.funnel import BalanceSheet, funnel_of
 from factory.store.samples import Store
 
 TASK_OF = {"rollout": "drive", "expert": "drive", "reward": "drive", "render": "render", "label": "label"}

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
-from factory.store.counts.funnel import funnel_of
+from factory.store.funnel import funnel_of
 from factory.store.samples import Store
 from tasks.stages import ATTEMPT
 from tests.factory.graph.balanced import balance, counts

@@ -12,7 +12,7 @@ import pytest
 
 from factory.exits import COMPLETE, INTERRUPTED
 from factory.graph.execute import RunSummary
-from factory.store.outcomes import OUTCOMES, outcomes_table
+from factory.store.attempts import OUTCOMES, outcomes_table
 from factory.store.parquet_file import write_shard
 from factory.store.samples import Store
 from factory.store.table import AnotherWriter

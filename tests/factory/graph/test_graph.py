@@ -18,8 +18,8 @@ from factory.graph.execute import execute
 from factory.graph.work import Built, Driven, Dropped, Halted, PreparedClip, Stopped, never
 from factory.readers.base import ClipRef
 from factory.store.cache import BadCacheFile
-from factory.store.identity import UNLISTED
 from factory.store.samples import Store
+from factory.store.schema import UNLISTED
 from factory.store.verify import verify
 from tests.factory.graph.runs import EXPERTS, run
 from tests.factory.tables import assert_same_tables, tables_of

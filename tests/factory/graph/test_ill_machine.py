@@ -11,9 +11,9 @@ import pytest
 from factory.exits import COMPLETE, COMPLETE_WITH_FAILURES, INTERRUPTED
 from factory.graph.steps import failure_of
 from factory.graph.work import Driven, Dropped, PreparedClip
+from factory.store.attempts import ErrorKind
 from factory.store.cache import ClipCache
 from factory.store.disk import DiskFull, PlaceRefused, own_place, why_ill
-from factory.store.outcomes import ErrorKind
 from tests.factory.graph.runs import run
 from tests.factory.tables import assert_same_tables, tables_of
 from tests.factory.toy import ToyWork

@@ -10,11 +10,8 @@ from hypothesis import strategies as st
 
 from factory.graph.plan import ClipPlan, RunPlan, make_plan
 from factory.graph.walk import retry_policy
-from factory.store.candidates import Listed
-from factory.store.counts.history import OUTCOME_STATE, SAMPLE_STATE, History, history_of
-from factory.store.identity import attempt_id
-from factory.store.outcomes import OUTCOMES, Kind
-from factory.store.schema import SAMPLES
+from factory.store.attempts import OUTCOME_STATE, OUTCOMES, SAMPLE_STATE, History, Kind, Listed, history_of
+from factory.store.schema import SAMPLES, attempt_id
 from tests.factory.toy import ToyWork, refs
 
 WORK = ToyWork(n_candidates=4)

@@ -10,8 +10,8 @@ import pytest
 
 from factory.exits import COMPLETE, INTERRUPTED
 from factory.graph.execute import RunSummary
+from factory.store.attempts import OUTCOMES, Kind, Outcome, outcomes_table
 from factory.store.location import Location
-from factory.store.outcomes import OUTCOMES, Kind, Outcome, outcomes_table
 from factory.store.parquet_file import write_shard
 from factory.store.table import AnotherWriter, KeyedTable
 from tests.factory.graph.runs import run

@@ -4,8 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from factory.graph.walk import Blocked, Complete, Exhausted, Step, Stretch, Try, next_step, retry_policy, stretch
-from factory.store.counts.history import Past
-from factory.store.outcomes import ErrorKind, Kind
+from factory.store.attempts import ErrorKind, Kind, Past
 
 
 def never(past: Past) -> bool:

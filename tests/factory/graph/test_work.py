@@ -2,7 +2,7 @@
 
 import pytest
 
-from factory.store.identity import RunIdentity, attempt_id
+from factory.store.schema import RunIdentity, attempt_id
 
 KEY = {"clip_id": "clip", "candidate": 3, "vocabulary_digest": "v1", "expert": "recovery", "expert_digest": "table-1"}
 

@@ -10,7 +10,7 @@ from factory.config.run import SCENARIONET, load_config, refuse_relative_root
 from factory.setup.settings import assemble
 from factory.setup.vocabulary import save_recovery_table
 from factory.store.disk import why_ill
-from factory.store.identity import RunIdentity
+from factory.store.schema import RunIdentity
 from tasks.experts.recovery.expert import RecoveryTable
 from tasks.rollout.policy import SeenTraffic
 from tasks.world.arrays import Array

@@ -9,7 +9,7 @@ from factory.graph.execute import execute
 from factory.graph.work import HUMAN_CANDIDATE, Columns, PreparedClip, attempted
 from factory.setup.settings import assemble
 from factory.stages.pipeline import FactoryWork
-from factory.store.counts.funnel import Funnel, funnel_of
+from factory.store.funnel import Funnel, funnel_of
 from factory.store.samples import Store
 from factory.views.card import card
 from tasks.experts.protocol import Expert

@@ -15,8 +15,7 @@ from factory.readers.base import BadClip
 from factory.setup.settings import assemble, identity_of, refuse_missing_backend
 from factory.stages.assets import block_id
 from factory.stages.pipeline import FactoryWork, WholeClip
-from factory.store.identity import UNLISTED
-from factory.store.schema import COLUMNS
+from factory.store.schema import COLUMNS, UNLISTED
 from tasks import stages
 from tasks.perturb import Perturbation, perturb
 from tasks.stages import HUMAN, HUMAN_BEFORE

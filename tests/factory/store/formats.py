@@ -2,8 +2,7 @@
 
 from collections.abc import Sequence
 
-from factory.store.columns import Column
-from factory.store.schema import FIELDS
+from factory.store.schema import FIELDS, Column
 
 
 def formats_table(fields: Sequence[Column] = FIELDS, prefix: str = "") -> str:

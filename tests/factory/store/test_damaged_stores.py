@@ -18,8 +18,7 @@ from factory.store.reader import SampleTable
 from factory.store.samples import Store
 from factory.store.schema import SAMPLES
 from factory.store.table import AnotherWriter, CommitCopies
-from factory.store.upkeep import restore_logs
-from factory.store.verify import damaged_logs, verify
+from factory.store.verify import damaged_logs, restore_logs, verify
 from tests.factory.damage import damaged
 from tests.factory.data_folders import add_companions
 from tests.factory.tables import assert_same_tables

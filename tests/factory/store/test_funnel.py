@@ -10,10 +10,17 @@ from hypothesis import strategies as st
 
 from factory.exits import BAD_CONFIG, COMPLETE, COMPLETE_WITH_FAILURES
 from factory.graph.execute import execute
-from factory.store.candidates import ClipCandidates
-from factory.store.counts.attempts import OUTCOME_COLUMNS, SAMPLE_COLUMNS, Attempts, attempts_of
-from factory.store.counts.funnel import FunnelRow, expert_rows, funnel_of, image_sources_text
-from factory.store.outcomes import OUTCOMES
+from factory.store.attempts import OUTCOMES, ClipCandidates
+from factory.store.funnel import (
+    OUTCOME_COLUMNS,
+    SAMPLE_COLUMNS,
+    Attempts,
+    FunnelRow,
+    attempts_of,
+    expert_rows,
+    funnel_of,
+    image_sources_text,
+)
 from factory.store.samples import Store
 from factory.store.schema import SAMPLES
 from tests.factory.toy import ToyWork, refs

@@ -23,8 +23,7 @@ from factory.store.mcap_files import McapShard, McapTable, parse, shard_bytes, s
 from factory.store.reader import SampleTable
 from factory.store.samples import Store
 from factory.store.schema import BOOKKEEPING
-from factory.store.upkeep import compact
-from factory.store.verify import verify
+from factory.store.verify import compact, verify
 from tests.factory.damage import damaged
 from tests.factory.tables import assert_same_rows
 from tests.factory.toy import RAGGED, ToyWork, refs, row_of, stream
@@ -287,7 +286,7 @@ def test_the_same_shard_is_the_same_file(tmp_path: Path) -> None:
 
 
 def test_verify_names_a_damaged_shard_and_its_repair_has_it_made_again(tmp_path: Path) -> None:
-    from factory.store.upkeep import drop_damaged
+    from factory.store.verify import drop_damaged
 
     run(tmp_path)
     path = min(McapTable(Location.parse(tmp_path)).live_files())

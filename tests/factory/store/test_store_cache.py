@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from factory.store.attempts import CandidateRow
 from factory.store.cache import BadCacheFile, ClipCache, decode, encode
-from factory.store.candidates import CandidateRow
 from factory.store.location import Location
 from tasks.stages import Rejected
 from tasks.world.agents import AgentKind, AgentTracks

@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 
 from factory.graph.execute import execute
-from factory.store.candidates import Listed
-from factory.store.outcomes import Kind, Outcome
+from factory.store.attempts import Kind, Listed, Outcome
 from factory.store.samples import OnChange, Store
 from tests.factory.toy import ToyWork, refs
 

@@ -6,9 +6,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from factory.store.columns import BadRow
-from factory.store.identity import Stamp
-from factory.store.schema import COLUMNS, FIELDS, SCHEMA, sample_row_to_table, table_to_rows
+from factory.store.schema import COLUMNS, FIELDS, SCHEMA, BadRow, Stamp, sample_row_to_table, table_to_rows
 from tests.factory.store.formats import formats_table
 from tests.factory.toy import row_of, stream
 

@@ -11,10 +11,9 @@ import pyarrow.parquet as pq
 import pytest
 
 import factory.store.table as table_module
-from factory.store.identity import Stamp
 from factory.store.location import Location
 from factory.store.parquet_file import Shard, TableSpec, write_shard
-from factory.store.schema import SAMPLES, sample_row_to_table
+from factory.store.schema import SAMPLES, Stamp, sample_row_to_table
 from factory.store.table import AnotherWriter, DuplicateKey, KeyedTable
 from tests.factory.toy import row_of, stream
 

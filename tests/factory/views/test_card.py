@@ -10,7 +10,7 @@ import yaml
 from factory.commands.table import COMMANDS
 from factory.exits import COMPLETE, INTERRUPTED
 from factory.graph.execute import execute
-from factory.store.counts.funnel import funnel_of
+from factory.store.funnel import funnel_of
 from factory.store.samples import Store
 from factory.views.card import FILE, card, write_card
 from tests.factory.toy import ToyWork, refs

@@ -12,7 +12,7 @@ from factory.graph.work import PreparedClip
 from factory.readers.base import ClipRef
 from factory.stages.pipeline import PerturbedClip, bare
 from factory.stages.scene_file import read_scene, write_scene
-from factory.store.candidates import ClipCandidates
+from factory.store.attempts import ClipCandidates
 from factory.store.samples import Store
 from factory.views.scene_tracks import logged_vehicles
 from tasks.render.scene.asset import BlockRange, RenderAsset, TakenFrom

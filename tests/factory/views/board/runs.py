@@ -9,7 +9,7 @@ from typing import Any
 from factory.graph.execute import RunSummary, execute
 from factory.graph.work import Columns, Driven, Dropped, PreparedClip
 from factory.readers.base import ClipRef
-from factory.store.counts.funnel import funnel_of
+from factory.store.funnel import funnel_of
 from factory.store.samples import Store
 from tests.factory.toy import ToyWork
 from tests.planners.samples import FRONT_YAWS, jpeg, pictures, plain

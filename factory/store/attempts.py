@@ -1,18 +1,183 @@
-"""What the tables say of every attempt, as columns of some 60 bytes a row; a walk's part is unpacked when it is asked.
+"""What became of attempts: the tables `outcomes`, `candidates` and `plans`, and the history that a run goes on from."""
 
-A walk is a (clip_id, expert); the expert "" stands for the clip as a whole.
-"""
-
+import hashlib
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from enum import StrEnum
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from factory.store.candidates import Listed
-from factory.store.counts.codes import Bytes, Codes, Ints, codes, distinct, fixed_bytes
-from factory.store.outcomes import Kind
+from factory.store.codes import Bytes, Codes, Ints, codes, distinct, fixed_bytes
+from factory.store.parquet_file import TableSpec
+from factory.store.schema import schema_of
+from factory.store.table import KeyedTable
+
+# The table `outcomes`: what became of every attempt that is not a sample, one row per attempt_id.
+#
+# A row about a clip as a whole (a bad file, a standing ego) has candidate -1 and no expert; `exhausted` stands behind
+# the last candidate of a walk. A newer outcome of the same attempt replaces the older one. Timings live here and
+# nowhere else.
+
+
+class Kind(StrEnum):
+    ACCEPTED = "accepted"  # stands in `samples`, never here
+    REJECTED = "rejected"
+    FAILED = "failed"
+    EXHAUSTED = "exhausted"
+
+
+class ErrorKind(StrEnum):
+    NONE = ""
+    INPUT = "input"  # the clip is broken: waits for retry or a raised stage version
+    BUG = "bug"  # the code raised: likewise
+    MACHINE = "machine"  # the machine is ill (factory.store.disk): the next run tries again, however often
+    SYSTEM = "system"  # a worker died at it, a file could not be read: the next run tries again
+    LIMIT = "limit"  # ended over its seconds or its memory: the next run tries again
+    POISON = "poison"  # failed(system | limit) in QUARANTINE_AFTER runs: waits like a bug
+
+
+QUARANTINE_AFTER = 3  # runs, each with Ray's own retries
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One row of the table."""
+
+    attempt_id: str
+    clip_id: str
+    dataset: str
+    log_id: str
+    expert: str
+    expert_digest: str
+    candidate_index: int
+    kind: str  # Kind
+    settings_hash: str
+    stage_versions: str  # canonical JSON
+    stage: str = ""  # rejected: by which stage; failed: in which task of an attempt, where that is known
+    reason: str = ""  # rejected: why
+    detail: str = ""
+    error_kind: str = ""  # ErrorKind
+    error: str = ""  # last lines of the traceback
+    tries: int = 1  # runs that tried it; failed(machine): those that count
+    n_tried: int = 0  # exhausted: length of the candidate list
+    subscores: dict[str, float] = field(default_factory=dict)  # rejected: as far as known
+    seconds: dict[str, float] = field(default_factory=dict)  # stage -> seconds
+
+
+OUTCOME_SCHEMA = schema_of(Outcome)
+OUTCOMES = TableSpec("outcomes", OUTCOME_SCHEMA, "attempt_id")
+
+
+def outcomes_table(outcomes: Sequence[Outcome]) -> pa.Table:
+    """Column by column: a row holds nothing that had to be copied first."""
+    columns = [pa.array([getattr(row, field.name) for row in outcomes], field.type) for field in OUTCOME_SCHEMA]
+    return pa.Table.from_arrays(columns, schema=OUTCOME_SCHEMA)
+
+
+# The table `candidates`: one row per prepared clip with its ordered candidate list and what each gate dropped.
+
+
+@dataclass(frozen=True)
+class CandidateRow:
+    """One perturbation that passed every gate and filter, in the order in which walks try it."""
+
+    index: int  # place in the clip's ordered list, 0 ...
+    vocabulary_index: int  # -1: the log itself; -2 - number of a planner's drift
+    end_x: float  # [m] LQR-reached end pose, frame of the logged pose at T+H
+    end_y: float  # [m]
+    end_heading: float  # [rad]
+    end_speed: float  # [m/s]
+    cell: tuple[int, int]  # (longitudinal, lateral) cell of the interleaved grid
+    score: float  # EPDMS (/14) against log replay
+    reactive_score: float  # EPDMS (/14) among reacting agents
+
+
+@dataclass(frozen=True)
+class ClipCandidates:
+    """One row of the table."""
+
+    clip_id: str
+    dataset: str
+    log_id: str
+    content_digest: str
+    prepare_digest: str
+    vocabulary_digest: str
+    gate_counts: dict[str, int]
+    candidates: tuple[CandidateRow, ...]
+    stage: str = ""  # why there are none
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Listed:
+    """What a run must know of a clip's row; the candidates themselves stay in the table and in the prepared clip."""
+
+    prepare_digest: str
+    content_digest: str
+    n_candidates: int
+
+
+CANDIDATE_SCHEMA = schema_of(ClipCandidates)
+CANDIDATE_SCHEMA = CANDIDATE_SCHEMA.insert(
+    CANDIDATE_SCHEMA.get_field_index("candidates"), pa.field("n_candidates", pa.int32())
+)
+CANDIDATES = TableSpec("candidates", CANDIDATE_SCHEMA, "clip_id")
+
+
+def candidates_table(rows: Sequence[ClipCandidates]) -> pa.Table:
+    return pa.Table.from_pylist(
+        [
+            vars(row) | {"candidates": [vars(each) for each in row.candidates], "n_candidates": len(row.candidates)}
+            for row in rows
+        ],
+        schema=CANDIDATE_SCHEMA,
+    )
+
+
+def listed_of(table: KeyedTable) -> dict[str, Listed]:
+    """clip_id -> what the table says of the clip."""
+    rows = table.read(["clip_id", *(field.name for field in fields(Listed))])
+    return {row.pop("clip_id"): Listed(**row) for row in rows.to_pylist()}
+
+
+# The table `plans`: what runs set out to do, one row for each different answer, there before its first task is begun.
+#
+# What is planned under an `out` is all of them together: for each clip and expert the most rounds that any run asked
+# for. A plan is named by its content, so that the same command again finds its own.
+
+PLAN_SCHEMA = pa.schema(
+    [
+        pa.field("plan_id", pa.string()),
+        pa.field("rounds", pa.map_(pa.string(), pa.int32())),  # expert -> samples of each clip
+        pa.field("clip_ids", pa.list_(pa.string())),
+    ]
+)
+PLANS = TableSpec("plans", PLAN_SCHEMA, "plan_id")
+
+
+def plan_table(rounds: Mapping[str, int], clip_ids: Sequence[str]) -> pa.Table:
+    """One plan as a row."""
+    clips, wanted = sorted(clip_ids), dict(sorted(rounds.items()))
+    text = "\x1f".join((*(f"{expert} {n}" for expert, n in wanted.items()), "", *clips))
+    row = {"plan_id": hashlib.sha256(text.encode()).hexdigest()[:16], "rounds": wanted, "clip_ids": clips}
+    return pa.Table.from_pylist([row], schema=PLAN_SCHEMA)
+
+
+def plans_of(table: KeyedTable, clip_ids: Collection[str] | None = None) -> pa.Table:
+    """All plans, or as if some clips were all that there are."""
+    plans = table.read()
+    if clip_ids is None:
+        return plans
+    chosen = set(clip_ids)
+    rows = [row | {"clip_ids": [clip for clip in row["clip_ids"] if clip in chosen]} for row in plans.to_pylist()]
+    return pa.Table.from_pylist(rows, schema=PLAN_SCHEMA)
+
+
+# What the tables say of every attempt, as columns of some 60 bytes a row; a walk's part is unpacked when it is asked.
+#
+# A walk is a (clip_id, expert); the expert "" stands for the clip as a whole.
 
 MADE_BY = ["expert", "expert_digest", "settings_hash", "stage_versions"]
 STATE = ["attempt_id", "clip_id", *MADE_BY, "candidate_index"]

@@ -1,1 +1,0 @@
-"""What the tables come to: attempts as columns, the funnel, the balance of what was planned."""
