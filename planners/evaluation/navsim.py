@@ -33,9 +33,9 @@ from factory.imports.navhard import NavsimFolders, import_navhard
 from factory.imports.navtest import import_navtest
 from factory.readers.navsim.filters import Selection, read_selection
 from factory.stages.benchmark import BENCHMARK_FILE
+from factory.store.disk import why_unusable
 from factory.store.location import Location
 from factory.store.samples import Store
-from factory.store.usable import why_unusable
 from planners.command import Stopped
 from planners.evaluation.aggregation import HumanFilter, Measured, Summary, by_clip, summary_of
 from planners.evaluation.bootstrap import Interval
