@@ -4,47 +4,39 @@ Paper, section "Trajectory Perturbation" and the configuration table of its supp
 gates on the reached end pose, an interleaved grid over those, per cell the first trajectory in seeded order with a
 non-reactive EPDMS at the threshold (log replay), then the same threshold under reactive traffic on the kept ones only.
 Scores are needed only until a cell is filled, so cells are walked abreast: the same result at a fraction of the scores.
-
-Beside the vocabulary's there may be motions that a planner drove itself into (tasks.drifts). They pass the same
-gates on their end and the same two scores, one a cell, of any cell; those where the planner then failed come first.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import islice
 
 import numpy as np
 
-from tasks.drifts import OF_LOG, Drift, alternating, index_of, worst_first
 from tasks.experts.pdm_closed.planner import PdmSettings, plan_for
 from tasks.reward.epdms import Scores, score
 from tasks.reward.prepare import among, prepare_scene
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out
-from tasks.sampling import CellWeights, by_lot
 from tasks.settings import PerturbSettings
 from tasks.stages import Rejected
 from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip, Rollout, scene_of_clip
 from tasks.world.frames import to_local, to_world
 from tasks.world.vehicle import HEADING, VX
-from tasks.world.vocabulary import Vocabulary
-
-DRIFT_FATES = ("reached_gate", "score", "reactive")  # what drops drifts, counted where there are some
+from tasks.world.vocabulary import OF_LOG, Vocabulary
 
 
 @dataclass(frozen=True)
 class Candidate:
     """A perturbation of one clip, with the reactive rollout that proved it."""
 
-    vocabulary_index: int  # row of the vocabulary; below 0: the log, or a drift, tasks.drifts.index_of
+    vocabulary_index: int  # row of the vocabulary; OF_LOG: the log itself
     end_pose: Array  # (3,) reached at T+H, in the frame of the logged pose at T+H
     cell: tuple[int, int]  # longitudinal, lateral index of the grid
     score: float  # EPDMS (/14) under log replay
     reactive_score: float  # EPDMS (/14) under reactive traffic
     reactive_scores: Scores  # row 1 is the candidate, row 0 PDM-Closed
     rollout: Rollout
-    fails: str | None = None  # of a drift: the sub-score that its planner then failed, "": none; None: no drift
 
 
 @dataclass(frozen=True)
@@ -58,12 +50,9 @@ class Perturbation:
 
 @dataclass(frozen=True)
 class Considered:
-    """Every vocabulary trajectory that passed the raw gates, then every drift, and what became of it.
+    """Every vocabulary trajectory that passed the raw gates, and what became of it: for `explain` and pictures."""
 
-    For `explain` and pictures.
-    """
-
-    vocabulary_index: Ints  # (G,) below 0: a drift
+    vocabulary_index: Ints  # (G,)
     end_pose: Array  # (G, 3) reached, in the frame of the logged pose at T+H
     fate: tuple[str, ...]  # (G,) "reached_gate", "white_cell", "not_needed", "score", "reactive", "kept"
     score: Array  # (G,) EPDMS under log replay, NaN where it was not needed
@@ -130,15 +119,11 @@ def perturb(
     traffic: TrafficSettings,
     planner: PdmSettings,
     rng: np.random.Generator,
-    drifts: Sequence[Drift] = (),
-    wanted: CellWeights | None = None,
 ) -> Perturbation | Rejected:
     """The ordered candidates of a clip, or Rejected "no_gated_candidate" or "no_good_candidate".
 
     traffic: of the reactive check; planner: PDM-Closed, the first row of every two-row batch that normalises progress;
-    rng: the clip's `perturb` stream, which draws one permutation of the vocabulary; drifts: of a planner, beside it.
-    The order is the failing drifts, worst first; then, one of either in turn, the other ones and the vocabulary's in
-    the order of the settings; or, where cells are wanted more than others, in that of a lot by these weights.
+    rng: the clip's `perturb` stream, which draws one permutation of the vocabulary.
     """
     if settings.at_log:
         return log_alone(clip, traffic, planner)
@@ -152,27 +137,22 @@ def perturb(
     raw_fails = gate_failures(raw_ends, settings)
     gated = np.flatnonzero(~np.logical_or.reduce(list(raw_fails.values())))
     counts = {f"raw_{name}": int(fails.sum()) for name, fails in raw_fails.items()}
-    n_gated = len(gated)  # drifts stand behind them
-    if n_gated + len(drifts) == 0:
+    if len(gated) == 0:
         detail = f"none of {len(raw_ends)} trajectories ends near the log"
         return Rejected("perturb", "no_gated_candidate", detail, counts)
 
-    driven = [track(start, to_world(start[: HEADING + 1], vocabulary.trajectories[gated]))] if n_gated else []
-    states = np.concatenate([*driven, *(drift.ego_states[None] for drift in drifts)])
-    index = np.concatenate([gated, np.array([index_of(one.number) for one in drifts], dtype=np.int64)])
+    states = track(start, to_world(start[: HEADING + 1], vocabulary.trajectories[gated]))
     ends = to_local(target, states[:, -1, : HEADING + 1])
     end_fails = gate_failures(ends, settings)
     reached = ~np.logical_or.reduce(list(end_fails.values()))
-    counts |= {f"reached_{name}": int(fails[:n_gated].sum()) for name, fails in end_fails.items()}
+    counts |= {f"reached_{name}": int(fails.sum()) for name, fails in end_fails.items()}
     cells = grid_cells(ends, settings)
-    is_drift = np.arange(len(index)) >= n_gated
-    # The interleaved half of the grid; of drifts all of it.
-    black = (cells.sum(axis=1) % 2 == 0) | (not settings.interleaved) | is_drift
+    black = (cells.sum(axis=1) % 2 == 0) | (not settings.interleaved)  # the interleaved half of the grid
     counts["white_cell"] = int((reached & ~black).sum())
 
     replay = prepare_scene(scene, scene.agents.window(NOW, NOW + HORIZON_STEPS + 1))
     pdm_states = plan_for(scene, planner).driven[None]
-    scores = np.full(len(index), np.nan)
+    scores = np.full(len(gated), np.nan)
 
     def passes_replay(members: Ints) -> Bools:
         result = score(replay, np.concatenate([pdm_states, states[members]]), normalise="pairs")
@@ -181,13 +161,9 @@ def perturb(
 
     rank = np.empty(len(walk_order), dtype=np.int64)
     rank[walk_order] = np.arange(len(walk_order))
-    usable = np.flatnonzero((reached & black)[:n_gated])
+    usable = np.flatnonzero(reached & black)
     kept = first_good_per_cell(cells, usable[np.argsort(rank[gated[usable]])], passes_replay)
-    if wanted is not None:
-        kept = kept[by_lot(wanted.of(cells[kept]), rng)]
-    drifted = [n_gated + place for place in worst_first(drifts) if reached[n_gated + place]]
-    kept_drifts = first_good_per_cell(cells, np.array(drifted, dtype=np.int64), passes_replay)
-    counts["replay_score"] = int((scores[:n_gated] < settings.epdms_min).sum())
+    counts["replay_score"] = int((scores < settings.epdms_min).sum())
 
     fate = np.where(~reached, "reached_gate", np.where(~black, "white_cell", "not_needed")).astype(object)
     fate[np.isfinite(scores)] = "score"
@@ -195,43 +171,36 @@ def perturb(
     touched_from = start if traffic.leaves_out_touching else None
     proven: dict[int, Candidate] = {}
 
-    def passes_reactive(member: int) -> bool:
+    def passes_reactive(place: int) -> bool:
+        member = int(kept[place])
         rollout = roll_out(traffic_scene, states[member].copy())
         pair = np.concatenate([pdm_states, rollout.ego_states[None]])
         reactive = score(among(replay, rollout.agents, touched_from), pair, normalise="pairs")
         good = bool(reactive.pdm_score[1] >= settings.epdms_min)
         fate[member] = "kept" if good else "reactive"
         if good:
-            proven[member] = Candidate(
-                vocabulary_index=int(index[member]),
+            proven[place] = Candidate(
+                vocabulary_index=int(gated[member]),
                 end_pose=ends[member],
                 cell=(int(cells[member, 0]), int(cells[member, 1])),
                 score=float(scores[member]),
                 reactive_score=float(reactive.pdm_score[1]),
                 reactive_scores=reactive,
                 rollout=rollout,
-                fails=drifts[member - n_gated].fails if is_drift[member] else None,
             )
         return good
 
-    fate[kept] = fate[kept_drifts] = "not_needed"
-    failing = [int(member) for member in kept_drifts if drifts[member - n_gated].fails]
-    others = [int(member) for member in kept_drifts if not drifts[member - n_gated].fails]
-    at_most = len(kept) + len(kept_drifts) if settings.at_most is None else settings.at_most
-    chosen = list(islice(filter(passes_reactive, failing), at_most))
-    at_most -= len(chosen)
+    at_most = len(kept) if settings.at_most is None else settings.at_most
+    fate[kept] = "not_needed"
     if settings.order == "spread":
-        rest = np.concatenate([kept, np.array(others, dtype=np.int64)])
-        chosen += [int(rest[i]) for i in spread_out(ends[rest, :2], lambda i: passes_reactive(int(rest[i])), at_most)]
+        places = spread_out(ends[kept, :2], passes_reactive, at_most)
     else:
-        chosen += islice(filter(passes_reactive, alternating(others, kept.tolist())), at_most)
-    candidates = [proven[member] for member in chosen]
-    counts["reactive_score"] = int((fate[:n_gated] == "reactive").sum())
-    if drifts:
-        counts |= {f"drift_{what}": int((fate[n_gated:] == what).sum()) for what in DRIFT_FATES}
+        places = list(islice(filter(passes_reactive, range(len(kept))), at_most))
+    candidates = [proven[place] for place in places]
+    counts["reactive_score"] = int((fate == "reactive").sum())
     if not candidates:
         return Rejected("perturb", "no_good_candidate", ", ".join(f"{k} {v}" for k, v in counts.items()), counts)
-    return Perturbation(tuple(candidates), counts, Considered(index, ends, tuple(fate), scores))
+    return Perturbation(tuple(candidates), counts, Considered(gated, ends, tuple(fate), scores))
 
 
 def log_alone(clip: Clip, traffic: TrafficSettings, planner: PdmSettings) -> Perturbation:

@@ -1,7 +1,7 @@
 """What candidates and experts' drives must come up to. Light: importing it loads no numpy."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 from tasks.subscores import JUDGED
@@ -49,18 +49,3 @@ class ExpertGate:
         unknown = [name for name in self.full if name not in JUDGED]
         if unknown:
             raise ValueError(f"full names {', '.join(unknown)}; an expert's drive is judged by {', '.join(JUDGED)}")
-
-
-@dataclass(frozen=True)
-class SampleWeights:
-    """How clips are weighed against each other when some are drawn (tasks.sampling); 0 and nothing: all alike."""
-
-    tags: dict[str, float] = field(default_factory=dict)  # tag of the scene at T -> factor of clips that have it
-    rarity: float = 0.0  # power of one over the share of clips with the same tags
-    cluster: float = 0.0  # power of how often the planner fails in clips with the same tags
-    score: float = 0.0  # power of 1 - EPDMS of the planner in the clip itself
-
-    def __post_init__(self) -> None:
-        for name, value in (*self.tags.items(), *((key, getattr(self, key)) for key in ("rarity", "cluster", "score"))):
-            if not 0.0 <= value < math.inf:
-                raise ValueError(f"sample {name}={value}: must be finite and not negative")

@@ -34,7 +34,7 @@ ROOMS = {
             "reward.rules",
             "reward",
         ),
-        *("experts", "drifts", "sampling", "perturb", "attempt", "hard_scenes", "trajectories"),
+        *("experts", "perturb", "attempt", "hard_scenes", "trajectories"),
         *("render.splatting", "render.scene", "render.rig", "render.fit", "render"),
     ),
     "factory": (
@@ -45,7 +45,7 @@ ROOMS = {
     ),
     "planners": (
         *("command", "data", "models", "training", "published"),
-        *("evaluation", "drive", "explore", "traffic", "navsim", "study", "__main__"),
+        *("evaluation", "drive", "traffic", "navsim", "study", "__main__"),
     ),
 }
 MOST_MODULES = 20  # in a room

@@ -36,8 +36,6 @@ from planners.drive.settings import settings_of as drive_settings
 from planners.evaluation.compare import CompareSettings
 from planners.evaluation.evaluate import settings_of as evaluate_settings
 from planners.evaluation.replay import settings_of as replay_settings
-from planners.explore.alternate import AlternateSettings
-from planners.explore.settings import settings_of as explore_settings
 from planners.models.planner import settings_of
 from planners.published.import_planner import config_of as import_config
 from planners.training.train import TrainConfig
@@ -184,10 +182,6 @@ def test_every_command_is_one_its_program_takes(
             replay_settings(arguments)
         case ["python", "-m", "planners", "drive", *arguments] | ["python", "-m", "planners.drive", *arguments]:
             drive_settings(arguments)
-        case ["python", "-m", "planners", "explore", *arguments]:
-            explore_settings(arguments)
-        case ["python", "-m", "planners", "alternate", *arguments]:
-            fill(AlternateSettings, compose("alternate", arguments, AlternateSettings), "alternate")
         case ["python", "-m", "tests.bench.bench_rig" | "tests.bench.bench_front", _, *arguments]:
             known = {field.name for field in fields(FitSettings)} | {
                 "out",
@@ -202,8 +196,6 @@ def test_every_command_is_one_its_program_takes(
             known = {field.name for field in fields(FitSettings)} | {"out", "validate", "threads", "first", "last"}
             known |= {"by"}
             assert set(pairs(given(arguments))) <= known
-        case ["python", "-m", "tests.bench.bench_exploring", *arguments]:
-            assert pairs(arguments).keys() == {"uniform", "targeted", "explored"}  # it reads what alternate left
         case ["python", "-m", "tests.bench.bench_gate", *arguments]:
             assert set(pairs(arguments)) <= {"chosen", "held", "clips", "out", "drives", "every"}
         case ["python", "-m", "tests.bench.bench_town", *arguments]:

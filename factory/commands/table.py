@@ -78,8 +78,6 @@ PLANNERS: Mapping[str, Command] = {
     "serve": Command("plans for NAVSIM's own evaluation, whose agent asks", "planners.navsim.serve"),
     "submit": Command("plans of a NAVSIM split as its leaderboard takes them", "planners.navsim.submit"),
     "drive": Command("planners in closed loop, until something ends the drive", "planners.drive.drive"),
-    "explore": Command("where a planner drives itself, for runs to start from", "planners.explore.explore"),
-    "alternate": Command("data, training, exploring, in turns", "planners.explore.alternate"),
     "replay": Command("a planner on one clip as a film", "planners.evaluation.replay"),
     "ensemble": Command("several GTRS-Dense models as one", "planners.evaluation.ensemble"),
 }

@@ -28,7 +28,7 @@ from tasks.experts.pdm_closed.settings import PdmSettings
 from tasks.experts.recovery.settings import RecoverySettings
 from tasks.render.settings import RenderMode, RenderSettings
 from tasks.rollout.settings import TrafficSettings
-from tasks.settings import ExpertGate, PerturbSettings, SampleWeights
+from tasks.settings import ExpertGate, PerturbSettings
 from tasks.stages import FRAMES, TASKS
 
 MOST_K = 2**17  # of a kinematic vocabulary: 126 MB of trajectories, eight times the largest in use
@@ -77,26 +77,6 @@ class RewardSettings(ExpertGate):
             raise ValueError(
                 f"label_vocabulary={self.label_vocabulary} is for labels=vocabulary, but labels=none: leave one out"
             )
-
-
-@dataclass(frozen=True)
-class SampleChoice(SampleWeights):
-    """What a budget is spent on."""
-
-    drawn: bool = False  # `limit` draws its clips by lot, by the weights below; false: it takes the first ones
-    scores: str | None = None  # of `python -m planners explore`, folder or URL, whose planner weighs; null: explore's
-    candidates: Literal["listed", "weak"] = "listed"  # weak: by lot, those first that end where the planner often fails
-
-    @property
-    def needs_scores(self) -> bool:
-        """Whether it depends on what a planner showed."""
-        by_planner = self.tags or self.rarity or self.cluster or self.score
-        return bool(by_planner) or self.candidates == "weak"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if (self.tags or self.rarity or self.cluster or self.score) and not self.drawn:
-            raise ValueError("weights of clips are for drawn=true: limit takes the first clips otherwise")
 
 
 @dataclass(frozen=True)
@@ -165,14 +145,12 @@ class RunConfig:
     graph: GraphChoice = field(default_factory=GraphChoice)
     limit: int | None = None  # read this many clips only
     seed: int = 0  # of every random draw
-    explore: str | None = None  # of `python -m planners explore`, folder or URL: a planner's states are candidates too
     on_change: Literal["stop", "keep", "redo"] = "stop"  # when settings or stage versions differ from the table's
     retry_failed: bool = False  # run attempts again that failed on their input or by a bug
     minutes: float | None = None  # after which nothing new is begun (exit code 4); the same command goes on
     shard_seconds: float = 30.0  # between commits, if no partition reaches 128 MB before; longer: larger files
     episodes: int | Literal["none", "all"] = "none"  # or n for one sample in n: MCAP files under out/episodes
     store: StoreChoice = field(default_factory=StoreChoice)
-    sample: SampleChoice = field(default_factory=SampleChoice)
     vocabulary: VocabularyChoice = field(default_factory=VocabularyChoice)
     perturb: PerturbSettings = field(default_factory=PerturbSettings)
     traffic: TrafficSettings = field(default_factory=TrafficSettings)
@@ -196,8 +174,6 @@ class RunConfig:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ValueError(f"{name}={value}: must be positive, or null for no bound")
-        if self.sample.candidates == "weak" and self.perturb.order == "spread":
-            raise ValueError("sample.candidates=weak and perturb.order=spread are two orders: choose one")
         if not 0.0 <= self.gpu_share <= 1.0:
             raise ValueError(f"gpu_share={self.gpu_share}: the share of one GPU that a task which draws claims, 0 to 1")
         known = sorted({*self.expert, *FRAMES})

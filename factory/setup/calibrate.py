@@ -53,12 +53,6 @@ def plan_text(run: Run, refs: Sequence[ClipRef]) -> str:
     lines += [f"  broken log {ref.log_id}: {problem}" for ref, problem in index.broken.items()]
     vocabulary = run.work.vocabulary
     lines.append(f"vocabulary: {len(vocabulary)} trajectories ({vocabulary.source}, {vocabulary.digest})")
-    if (explored := run.work.explored) is not None:
-        asked = sum(ref.clip_id in explored.digests for ref in refs)
-        lines.append(
-            f"explored: {explored.n_drifts} drifts of {explored.planner} ({explored.planner_digest}), which then "
-            f"fails from {explored.n_failing}; {asked} of the {len(refs)} clips"
-        )
     lines.append(f"experts: {', '.join(config.experts)}; rounds: {config.rounds}; out: {config.out}")
     lines.append(setup_text(config, vocabulary))
     return "\n".join(lines)

@@ -19,11 +19,6 @@ def refuse_what_is_not_there(config: RunConfig) -> None:
     refuse_missing_root(config.clips)
     refuse_missing_classes(config)
     refuse_cameras_of_no_rig(config)
-    if config.explore is not None and "://" not in config.explore and not Path(config.explore).is_dir():
-        raise ConfigError(
-            f"explore={config.explore}: no such folder; python -m planners explore planner=<who> out={config.explore} "
-            "makes it"
-        )
 
 
 def refuse_missing_classes(config: RunConfig) -> None:

@@ -16,15 +16,12 @@ from factory.config.run import RunConfig, VocabularyChoice, photos_alone, refuse
 from factory.readers.base import BadClip, ClipIndex, ClipReader, ClipRef
 from factory.readers.torch_file import check_checkpoint
 from factory.readers.validate import read_clip
-from factory.setup.sample import Sampled, choose_sample, chosen_clips
 from factory.setup.vocabulary import load_vocabulary
 from factory.stages.frames import BenchmarkWork
 from factory.stages.own_body import masks_digest, refuse_unknown_masks
 from factory.stages.pipeline import FactoryWork
 from factory.stages.sensors import chosen_cameras
 from factory.store.disk import why_ill
-from factory.store.explored.drifts import Explored, explored_in
-from factory.store.location import Location
 from factory.store.schema import UNLISTED, RunIdentity, canonical_json
 from tasks.caches import user_cache
 from tasks.experts.pdm_closed.settings import PdmSettings
@@ -52,12 +49,11 @@ class Run:
     reader: ClipReader
     index: ClipIndex
     work: FactoryWork
-    sampled: Sampled
 
     @property
     def refs(self) -> list[ClipRef]:
         """The clips that it is asked for, those of broken logs among them."""
-        return chosen_clips(self.config, [*self.index.refs, *self.index.broken], self.sampled)
+        return [*self.index.refs, *self.index.broken][: self.config.limit]
 
 
 @dataclass(frozen=True)
@@ -121,8 +117,6 @@ def assemble(config: RunConfig) -> Run:
     try:  # what takes no clips comes first
         vocabulary = choose_vocabulary(config.vocabulary)
         labelling = choose_labelling(config, vocabulary)
-        explored = choose_explored(config)
-        sampled = choose_sample(config)
         traffic_record(config.traffic)  # whether there is its policy
         experts = {
             name: build_expert(RunContext(config, name, opened)) for name in config.experts if name not in FRAMES
@@ -144,13 +138,11 @@ def assemble(config: RunConfig) -> Run:
         labelling=labelling,
         render=config.render,
         seed=config.seed,
-        identity=identity_of(config, vocabulary, labelling, explored, sampled.digest),
+        identity=identity_of(config, vocabulary, labelling),
         cache_dir=cache_folder(config.out),
         photos_alone=photos_alone(config),
-        explored=explored,
-        wanted_cells=sampled.cells,
     )
-    return Run(config, reader, index, work, sampled)
+    return Run(config, reader, index, work)
 
 
 def refuse_unknown_cameras(config: RunConfig, reader: ClipReader, index: ClipIndex) -> None:
@@ -188,16 +180,6 @@ def choose_labelling(config: RunConfig, vocabulary: Vocabulary) -> Labelling | N
     named = config.reward.label_vocabulary
     chosen = vocabulary if named is None else load_vocabulary(named)
     return Labelling(chosen, dataclasses.replace(config.traffic, mode=config.reward.traffic, policy=None))
-
-
-def choose_explored(config: RunConfig) -> Explored | None:
-    """The planner's drifts that the run takes, None for none. Raises ValueError where the folder holds none."""
-    if config.explore is None:
-        return None
-    try:
-        return explored_in(Location.parse(config.explore, setting="explore"))
-    except ValueError as error:
-        raise ConfigError(f"explore={config.explore}: {error}") from error
 
 
 def build_expert(run: RunContext) -> Expert:
@@ -241,18 +223,8 @@ def _must_have(plugged: object, members: Sequence[str], where: str, what: str) -
         raise ConfigError(f"{where}: {type(plugged).__name__} is not {what}: it has no {', '.join(missing)}")
 
 
-def identity_of(
-    config: RunConfig,
-    vocabulary: Vocabulary,
-    labelling: Labelling | None,
-    explored: Explored | None = None,
-    candidates_by: str = "",
-) -> RunIdentity:
-    """What the rows depend on besides clip, candidate and expert. Where data lies and who works on it is not in it.
-
-    Candidates are numbered among the vocabulary's and a planner's together: with drifts the vocabulary's digest, and
-    so every attempt's id, is of both; and of what orders them, candidates_by, where that is no mere draw.
-    """
+def identity_of(config: RunConfig, vocabulary: Vocabulary, labelling: Labelling | None) -> RunIdentity:
+    """What the rows depend on besides clip, candidate and expert. Where data lies and who works on it is not in it."""
     science: dict[str, Any] = {
         "perturb": config.perturb,
         "pdm": config.pdm,
@@ -265,16 +237,6 @@ def identity_of(
     settings |= {f"traffic.{key}": plain for key, plain in traffic_record(config.traffic).items()}
     del settings["render.lpips"]  # measures alone
     settings["render.own_body"] = masks_digest(config.render.own_body)
-    weak: dict[str, object] = {}
-    if explored is not None:
-        weak["explore.planner"] = f"{explored.planner} {explored.planner_digest}"
-        weak["explore.digest"] = explored.digest
-    if candidates_by:
-        weak["sample.candidates"] = candidates_by
-    settings |= weak
-    digest = vocabulary.digest
-    if weak:
-        digest = hashlib.sha256(canonical_json([vocabulary.digest, weak]).encode()).hexdigest()[:16]
     settings["reward.label_vocabulary"] = None if labelling is None else labelling.vocabulary.digest
     versions = stage_versions()
     early: dict[str, object] = {
@@ -289,7 +251,7 @@ def identity_of(
         made_of.append("earlier frame")
     prepared = canonical_json(made_of)
     listed = hashlib.sha256(prepared.encode()).hexdigest()[:16] if simulates(config) else UNLISTED
-    return RunIdentity(settings, versions, digest, listed)
+    return RunIdentity(settings, versions, vocabulary.digest, listed)
 
 
 def cache_folder(out: str) -> str:

@@ -15,10 +15,8 @@ from factory.stages.fitting import fits_going_on
 from factory.stages.imaging import Imaging, scene_lookups
 from factory.stages.rows import label_columns, sample_row
 from factory.store.attempts import CandidateRow
-from factory.store.explored.drifts import Explored
 from factory.store.schema import UNLISTED, RunIdentity
 from tasks.attempt import ExpertGate, Judged, Timed, attempt, has_route, human_sample, perturbed_scene
-from tasks.drifts import Drift
 from tasks.experts.pdm_closed.planner import PdmSettings
 from tasks.experts.protocol import Expert, tried_once
 from tasks.perturb import Candidate, Perturbation, PerturbSettings, end_speed_mps, perturb
@@ -28,7 +26,6 @@ from tasks.render.splatting.gsplat_backend import BackendMissing
 from tasks.reward.labels import Labelling, vocabulary_labels
 from tasks.rollout.policy import refuse_another_policy
 from tasks.rollout.simulate import TrafficSettings
-from tasks.sampling import CellWeights
 from tasks.stages import Rejected
 from tasks.subscores import OF_ONE_PLAN
 from tasks.world.arrays import Array
@@ -140,8 +137,6 @@ class FactoryWork:
     identity: RunIdentity
     cache_dir: str  # of reconstructed blocks
     photos_alone: bool  # clips may have photos and no lidar
-    explored: Explored | None = field(default=None, kw_only=True)  # a planner's drifts, beside the vocabulary
-    wanted_cells: CellWeights | None = field(default=None, kw_only=True)  # where candidates are wanted to end
 
     def warm(self, draws: bool = True) -> None:
         """This run's kernels, and no others, into the on-disk cache. Raises NotReady."""
@@ -202,14 +197,9 @@ class FactoryWork:
             blocked = self.imaging.block_verdict(clip) if asked else None
         self._refuse_another_policy()
         with watch.of("perturb"):
-            rng, drifts = stream(self.seed, clip.clip_id, "perturb"), self._drifts(clip)
-            how = (self.perturb, self.traffic, self.pdm, rng, drifts, self.wanted_cells)
-            found = blocked or perturb(clip, self.vocabulary, *how)
+            rng = stream(self.seed, clip.clip_id, "perturb")
+            found = blocked or perturb(clip, self.vocabulary, self.perturb, self.traffic, self.pdm, rng)
         return WholeClip(clip, found, watch.seconds)
-
-    def _drifts(self, clip: Clip) -> tuple[Drift, ...]:
-        """Raises BadClip where a planner drove in the clip as it was."""
-        return () if self.explored is None else self.explored.of(clip)
 
     def _read(self, ref: ClipRef, watch: Stopwatch) -> Clip | Rejected:
         if ref in self.broken:

@@ -33,7 +33,6 @@ def sample_row(clip: Clip, candidate: Candidate | None, judged: Judged) -> dict[
     place = pose_on_ground(clip.world_from_ego, scene.ego_state[None])[0]
     return {
         **scene_columns(scene, scene.agents.overwritten(scene.step, judged.rollout.agents), place, command),
-        "tags": [*scene_tags(scene, command), *explored_tags(candidate)],
         "vocabulary_index": None if candidate is None else candidate.vocabulary_index,
         "parent_states": clip.ego_states[[NOW, NOW + HORIZON_STEPS]],
         "label_10hz": to_local(pose, label),
@@ -72,13 +71,6 @@ def scene_columns(scene: Scene, agents: AgentTracks, world_from_ego: Array, comm
         **map_columns(scene, pose),
         "tags": scene_tags(scene, command),
     }
-
-
-def explored_tags(candidate: Candidate | None) -> list[str]:
-    """Of where a planner drove itself: `explored`, and the sub-score that it then failed, `explored_dac`."""
-    if candidate is None or candidate.fails is None:
-        return []
-    return ["explored", *([f"explored_{candidate.fails}"] if candidate.fails else [])]
 
 
 def label_columns(labels: VocabularyLabels) -> dict[str, object]:

@@ -11,6 +11,7 @@ from tasks.world.clip import HORIZON_STEPS
 from tasks.world.frames import to_local
 from tasks.world.vehicle import HEADING
 
+OF_LOG = -1  # stands for the log itself where a trajectory has its row in the vocabulary
 MOST_LLOYD_STEPS = 30  # fewer when no window changes its centre
 CHUNK_ROWS = 4096  # windows whose distances to all centres are held at once: 4096 x 8192 x 8 B = 0.27 GB
 

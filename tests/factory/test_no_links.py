@@ -64,7 +64,6 @@ def test_a_new_folder_without_hard_links_is_refused_before_anything_is_written(
         ["factory", "run", "clips.n_clips=1", "executor=local", "render=none"],
         ["factory", "import", "simscale", f"root={tmp_path}"],
         ["planners", "drive", "planner=constant_velocity"],
-        ["planners", "explore", "planner=constant_velocity"],
     ):
         done = command("-m", *words, f"out={out}")
         assert (done.returncode, done.stdout) == (BAD_CONFIG, ""), (words, done.stderr)

@@ -14,8 +14,6 @@ from planners.evaluation.compare import CompareSettings
 from planners.evaluation.evaluate import EvaluateSettings
 from planners.evaluation.planner_names import planner_of
 from planners.evaluation.replay import ReplaySettings
-from planners.explore.alternate import AlternateSettings
-from planners.explore.settings import ExploreSettings
 from planners.published.import_planner import ImportConfig
 from planners.training.train import TrainConfig
 from tests.factory.text_keys import held, text_keys
@@ -50,8 +48,6 @@ def test_what_is_raised_is_one_line_and_an_exit_code(
         ("evaluate", EvaluateSettings, ("benchmark=x",)),
         ("compare", CompareSettings, ("a=x", "b=y")),
         ("drive", DriveSettings, ()),
-        ("explore", ExploreSettings, ()),
-        ("alternate", AlternateSettings, ()),
         ("replay", ReplaySettings, ("benchmark=x", "clip=x")),
     ],
 )

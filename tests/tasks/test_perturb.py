@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tasks.drifts import OF_LOG
 from tasks.experts.pdm_closed.planner import PdmSettings, plan_for
 from tasks.perturb import (
     Perturbation,
@@ -29,7 +28,7 @@ from tasks.world.chance import stream
 from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, scene_of_clip
 from tasks.world.frames import to_local, to_world
 from tasks.world.kinematic_vocabulary import kinematic_trajectories
-from tasks.world.vocabulary import Vocabulary
+from tasks.world.vocabulary import OF_LOG, Vocabulary
 from tests.tasks.streets import moved, street_clip
 
 SETTINGS = PerturbSettings()

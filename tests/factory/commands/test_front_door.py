@@ -113,7 +113,6 @@ def test_every_command_shows_its_settings_and_neither_writes_nor_starts_anything
 @pytest.mark.parametrize(
     ("command", "shown"),
     [
-        ("planners alternate turns=7 --cfg out=mine", {"turns": 7, "out": "mine", "draws": "uniform"}),
         ("planners.drive --cfg planner=human clips.n_clips=3", {"planner": "human", "seconds": 20.0}),
         ("planners train planner=custom -c job steps=7", {"steps": 7, "seed": 0}),
         ("factory.run clips=av2 --cfg rounds=5", {"rounds": 5, "executor": "ray"}),
