@@ -4,6 +4,9 @@ Paper, section "Trajectory Perturbation" and the configuration table of its supp
 gates on the reached end pose, an interleaved grid over those, per cell the first trajectory in seeded order with a
 non-reactive EPDMS at the threshold (log replay), then the same threshold under reactive traffic on the kept ones only.
 Scores are needed only until a cell is filled, so cells are walked abreast: the same result at a fraction of the scores.
+
+A clip may have starts of its own: trajectories, in the order in which they are wanted. They pass the same gates and
+scores, one a cell, of any cell, and are tried before the vocabulary's, which stay what they are without them.
 """
 
 from collections.abc import Callable
@@ -23,14 +26,17 @@ from tasks.world.arrays import Array, Bools, Ints
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip, Rollout, scene_of_clip
 from tasks.world.frames import to_local, to_world
 from tasks.world.vehicle import HEADING, VX
-from tasks.world.vocabulary import OF_LOG, Vocabulary
+from tasks.world.vocabulary import FIRST_START, OF_LOG, Vocabulary
+
+NO_STARTS = np.empty((0, HORIZON_STEPS, 3))
+START_FATES = ("reached_gate", "score", "reactive")  # what drops starts, counted where a clip has some
 
 
 @dataclass(frozen=True)
 class Candidate:
     """A perturbation of one clip, with the reactive rollout that proved it."""
 
-    vocabulary_index: int  # row of the vocabulary; OF_LOG: the log itself
+    vocabulary_index: int  # row of the vocabulary; OF_LOG: the log itself; FIRST_START - n: start n
     end_pose: Array  # (3,) reached at T+H, in the frame of the logged pose at T+H
     cell: tuple[int, int]  # longitudinal, lateral index of the grid
     score: float  # EPDMS (/14) under log replay
@@ -50,9 +56,12 @@ class Perturbation:
 
 @dataclass(frozen=True)
 class Considered:
-    """Every vocabulary trajectory that passed the raw gates, and what became of it: for `explain` and pictures."""
+    """Every vocabulary trajectory that passed the raw gates, then the clip's own starts, and what became of them.
 
-    vocabulary_index: Ints  # (G,)
+    For `explain` and pictures.
+    """
+
+    vocabulary_index: Ints  # (G,) as a candidate's
     end_pose: Array  # (G, 3) reached, in the frame of the logged pose at T+H
     fate: tuple[str, ...]  # (G,) "reached_gate", "white_cell", "not_needed", "score", "reactive", "kept"
     score: Array  # (G,) EPDMS under log replay, NaN where it was not needed
@@ -119,11 +128,13 @@ def perturb(
     traffic: TrafficSettings,
     planner: PdmSettings,
     rng: np.random.Generator,
+    starts: Array = NO_STARTS,
 ) -> Perturbation | Rejected:
     """The ordered candidates of a clip, or Rejected "no_gated_candidate" or "no_good_candidate".
 
     traffic: of the reactive check; planner: PDM-Closed, the first row of every two-row batch that normalises progress;
-    rng: the clip's `perturb` stream, which draws one permutation of the vocabulary.
+    rng: the clip's `perturb` stream, which draws one permutation of the vocabulary; starts: (S, 40, 3) of this clip, as
+    a vocabulary's.
     """
     if settings.at_log:
         return log_alone(clip, traffic, planner)
@@ -137,22 +148,27 @@ def perturb(
     raw_fails = gate_failures(raw_ends, settings)
     gated = np.flatnonzero(~np.logical_or.reduce(list(raw_fails.values())))
     counts = {f"raw_{name}": int(fails.sum()) for name, fails in raw_fails.items()}
-    if len(gated) == 0:
+    n_gated = len(gated)  # starts stand behind them
+    if n_gated + len(starts) == 0:
         detail = f"none of {len(raw_ends)} trajectories ends near the log"
         return Rejected("perturb", "no_gated_candidate", detail, counts)
 
-    states = track(start, to_world(start[: HEADING + 1], vocabulary.trajectories[gated]))
+    trajectories = np.concatenate([vocabulary.trajectories[gated], starts])
+    states = track(start, to_world(start[: HEADING + 1], trajectories))
+    index = np.concatenate([gated, FIRST_START - np.arange(len(starts))])
     ends = to_local(target, states[:, -1, : HEADING + 1])
     end_fails = gate_failures(ends, settings)
     reached = ~np.logical_or.reduce(list(end_fails.values()))
-    counts |= {f"reached_{name}": int(fails.sum()) for name, fails in end_fails.items()}
+    counts |= {f"reached_{name}": int(fails[:n_gated].sum()) for name, fails in end_fails.items()}
     cells = grid_cells(ends, settings)
-    black = (cells.sum(axis=1) % 2 == 0) | (not settings.interleaved)  # the interleaved half of the grid
+    is_start = np.arange(len(index)) >= n_gated
+    # The interleaved half of the grid; of starts all of it.
+    black = (cells.sum(axis=1) % 2 == 0) | (not settings.interleaved) | is_start
     counts["white_cell"] = int((reached & ~black).sum())
 
     replay = prepare_scene(scene, scene.agents.window(NOW, NOW + HORIZON_STEPS + 1))
     pdm_states = plan_for(scene, planner).driven[None]
-    scores = np.full(len(gated), np.nan)
+    scores = np.full(len(index), np.nan)
 
     def passes_replay(members: Ints) -> Bools:
         result = score(replay, np.concatenate([pdm_states, states[members]]), normalise="pairs")
@@ -161,9 +177,10 @@ def perturb(
 
     rank = np.empty(len(walk_order), dtype=np.int64)
     rank[walk_order] = np.arange(len(walk_order))
-    usable = np.flatnonzero(reached & black)
+    usable = np.flatnonzero((reached & black)[:n_gated])
     kept = first_good_per_cell(cells, usable[np.argsort(rank[gated[usable]])], passes_replay)
-    counts["replay_score"] = int((scores < settings.epdms_min).sum())
+    kept_starts = first_good_per_cell(cells, np.flatnonzero(reached & is_start), passes_replay)
+    counts["replay_score"] = int((scores[:n_gated] < settings.epdms_min).sum())
 
     fate = np.where(~reached, "reached_gate", np.where(~black, "white_cell", "not_needed")).astype(object)
     fate[np.isfinite(scores)] = "score"
@@ -171,16 +188,15 @@ def perturb(
     touched_from = start if traffic.leaves_out_touching else None
     proven: dict[int, Candidate] = {}
 
-    def passes_reactive(place: int) -> bool:
-        member = int(kept[place])
+    def passes_reactive(member: int) -> bool:
         rollout = roll_out(traffic_scene, states[member].copy())
         pair = np.concatenate([pdm_states, rollout.ego_states[None]])
         reactive = score(among(replay, rollout.agents, touched_from), pair, normalise="pairs")
         good = bool(reactive.pdm_score[1] >= settings.epdms_min)
         fate[member] = "kept" if good else "reactive"
         if good:
-            proven[place] = Candidate(
-                vocabulary_index=int(gated[member]),
+            proven[member] = Candidate(
+                vocabulary_index=int(index[member]),
                 end_pose=ends[member],
                 cell=(int(cells[member, 0]), int(cells[member, 1])),
                 score=float(scores[member]),
@@ -190,17 +206,22 @@ def perturb(
             )
         return good
 
-    at_most = len(kept) if settings.at_most is None else settings.at_most
-    fate[kept] = "not_needed"
+    fate[kept] = fate[kept_starts] = "not_needed"
+    at_most = len(index) if settings.at_most is None else settings.at_most
+    chosen = list(islice(filter(passes_reactive, kept_starts.tolist()), at_most))
+    at_most -= len(chosen)
     if settings.order == "spread":
-        places = spread_out(ends[kept, :2], passes_reactive, at_most)
+        spread = spread_out(ends[kept, :2], lambda place: passes_reactive(int(kept[place])), at_most)
+        chosen += kept[spread].tolist()
     else:
-        places = list(islice(filter(passes_reactive, range(len(kept))), at_most))
-    candidates = [proven[place] for place in places]
-    counts["reactive_score"] = int((fate == "reactive").sum())
+        chosen += islice(filter(passes_reactive, kept.tolist()), at_most)
+    candidates = [proven[member] for member in chosen]
+    counts["reactive_score"] = int((fate[:n_gated] == "reactive").sum())
+    if len(starts):
+        counts |= {f"start_{what}": int((fate[n_gated:] == what).sum()) for what in START_FATES}
     if not candidates:
         return Rejected("perturb", "no_good_candidate", ", ".join(f"{k} {v}" for k, v in counts.items()), counts)
-    return Perturbation(tuple(candidates), counts, Considered(gated, ends, tuple(fate), scores))
+    return Perturbation(tuple(candidates), counts, Considered(index, ends, tuple(fate), scores))
 
 
 def log_alone(clip: Clip, traffic: TrafficSettings, planner: PdmSettings) -> Perturbation:

@@ -80,6 +80,18 @@ class RewardSettings(ExpertGate):
 
 
 @dataclass(frozen=True)
+class PerturbSources(PerturbSettings):
+    """The gates of a perturbation, and what they are asked about beside the vocabulary."""
+
+    starts: str | None = None  # .parquet of start states by clip, tried before the vocabulary's; null: none
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.starts is not None and self.at_log:
+            raise ValueError(f"perturb starts={self.starts}: at_log=true tries the log alone: leave one out")
+
+
+@dataclass(frozen=True)
 class BenchmarkSettings:
     """What makes a clip of preset=hard_benchmark count."""
 
@@ -152,7 +164,7 @@ class RunConfig:
     episodes: int | Literal["none", "all"] = "none"  # or n for one sample in n: MCAP files under out/episodes
     store: StoreChoice = field(default_factory=StoreChoice)
     vocabulary: VocabularyChoice = field(default_factory=VocabularyChoice)
-    perturb: PerturbSettings = field(default_factory=PerturbSettings)
+    perturb: PerturbSources = field(default_factory=PerturbSources)
     traffic: TrafficSettings = field(default_factory=TrafficSettings)
     pdm: PdmSettings = field(default_factory=PdmSettings)
     reward: RewardSettings = field(default_factory=RewardSettings)

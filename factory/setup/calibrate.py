@@ -53,6 +53,9 @@ def plan_text(run: Run, refs: Sequence[ClipRef]) -> str:
     lines += [f"  broken log {ref.log_id}: {problem}" for ref, problem in index.broken.items()]
     vocabulary = run.work.vocabulary
     lines.append(f"vocabulary: {len(vocabulary)} trajectories ({vocabulary.source}, {vocabulary.digest})")
+    if starts := run.work.starts:
+        n_clips = sum(ref.clip_id in starts for ref in refs)
+        lines.append(f"starts: {sum(map(len, starts.values()))}; {n_clips} of the {len(refs)} clips have some")
     lines.append(f"experts: {', '.join(config.experts)}; rounds: {config.rounds}; out: {config.out}")
     lines.append(setup_text(config, vocabulary))
     return "\n".join(lines)

@@ -16,7 +16,7 @@ from factory.config.run import RunConfig, VocabularyChoice, photos_alone, refuse
 from factory.readers.base import BadClip, ClipIndex, ClipReader, ClipRef
 from factory.readers.torch_file import check_checkpoint
 from factory.readers.validate import read_clip
-from factory.setup.vocabulary import load_vocabulary
+from factory.setup.vocabulary import Starts, load_starts, load_vocabulary
 from factory.stages.frames import BenchmarkWork
 from factory.stages.own_body import masks_digest, refuse_unknown_masks
 from factory.stages.pipeline import FactoryWork
@@ -118,10 +118,13 @@ def assemble(config: RunConfig) -> Run:
         vocabulary = choose_vocabulary(config.vocabulary)
         labelling = choose_labelling(config, vocabulary)
         traffic_record(config.traffic)  # whether there is its policy
+        starts = None if config.perturb.starts is None else load_starts(config.perturb.starts)
         experts = {
             name: build_expert(RunContext(config, name, opened)) for name in config.experts if name not in FRAMES
         }
         reader, index = opened()
+        if starts is not None:
+            starts.refuse_other_clips(ref.clip_id for ref in (*index.refs, *index.broken))
     except ValueError as error:
         raise error if isinstance(error, ConfigError) else ConfigError(str(error)) from error
     frames = tuple(name for name in config.experts if name in FRAMES)
@@ -138,9 +141,10 @@ def assemble(config: RunConfig) -> Run:
         labelling=labelling,
         render=config.render,
         seed=config.seed,
-        identity=identity_of(config, vocabulary, labelling),
+        identity=identity_of(config, vocabulary, labelling, starts),
         cache_dir=cache_folder(config.out),
         photos_alone=photos_alone(config),
+        starts={} if starts is None else starts.of_clip,
     )
     return Run(config, reader, index, work)
 
@@ -223,8 +227,14 @@ def _must_have(plugged: object, members: Sequence[str], where: str, what: str) -
         raise ConfigError(f"{where}: {type(plugged).__name__} is not {what}: it has no {', '.join(missing)}")
 
 
-def identity_of(config: RunConfig, vocabulary: Vocabulary, labelling: Labelling | None) -> RunIdentity:
-    """What the rows depend on besides clip, candidate and expert. Where data lies and who works on it is not in it."""
+def identity_of(
+    config: RunConfig, vocabulary: Vocabulary, labelling: Labelling | None, starts: Starts | None = None
+) -> RunIdentity:
+    """What the rows depend on besides clip, candidate and expert. Where data lies and who works on it is not in it.
+
+    Candidates are numbered among the vocabulary's and the clips' own starts together: with starts the vocabulary's
+    digest, and so every attempt's id, is of both.
+    """
     science: dict[str, Any] = {
         "perturb": config.perturb,
         "pdm": config.pdm,
@@ -235,7 +245,11 @@ def identity_of(config: RunConfig, vocabulary: Vocabulary, labelling: Labelling 
     for group, value in science.items():
         settings |= {f"{group}.{key}": plain for key, plain in dataclasses.asdict(value).items()}
     settings |= {f"traffic.{key}": plain for key, plain in traffic_record(config.traffic).items()}
-    del settings["render.lpips"]  # measures alone
+    del settings["render.lpips"], settings["perturb.starts"]  # measures alone; a path
+    digest = vocabulary.digest
+    if starts is not None:
+        settings["perturb.starts"] = starts.digest
+        digest = hashlib.sha256(canonical_json([digest, starts.digest]).encode()).hexdigest()[:16]
     settings["render.own_body"] = masks_digest(config.render.own_body)
     settings["reward.label_vocabulary"] = None if labelling is None else labelling.vocabulary.digest
     versions = stage_versions()
@@ -251,7 +265,7 @@ def identity_of(config: RunConfig, vocabulary: Vocabulary, labelling: Labelling 
         made_of.append("earlier frame")
     prepared = canonical_json(made_of)
     listed = hashlib.sha256(prepared.encode()).hexdigest()[:16] if simulates(config) else UNLISTED
-    return RunIdentity(settings, versions, vocabulary.digest, listed)
+    return RunIdentity(settings, versions, digest, listed)
 
 
 def cache_folder(out: str) -> str:

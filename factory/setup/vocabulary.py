@@ -4,13 +4,16 @@ Both artefacts carry a digest of their trajectories. They are made from ALL trai
 them a run later reads, so that a run's `limit` never changes what the experts know.
 """
 
+import hashlib
 import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from factory.readers.base import BadClip, ClipReader
 from factory.readers.validate import read_clip
@@ -19,10 +22,11 @@ from tasks.experts.recovery.expert import RecoveryTable
 from tasks.sealed import seal
 from tasks.world.arrays import Array
 from tasks.world.clip import CLIP_STEPS, HORIZON_STEPS, STEP_S
-from tasks.world.vocabulary import Vocabulary, checked_trajectories, cluster, human_windows
+from tasks.world.vocabulary import Vocabulary, checked_trajectories, cluster, human_windows, trajectories_digest
 
 STEP_MS = round(STEP_S * 1000)
 TABLE_KEYS = ("trajectories", "digest")
+START_COLUMNS = ("clip_id", "trajectory")
 
 
 @dataclass(frozen=True)
@@ -100,6 +104,43 @@ def load_vocabulary(path: str | Path, first: int | None = None) -> Vocabulary:
     if first is not None and not 1 <= first <= len(values):
         raise ValueError(f"{path}: the first {first} of {len(values)} trajectories were asked for")
     return Vocabulary(values[:first], source=str(path))
+
+
+@dataclass(frozen=True)
+class Starts:
+    """Trajectories that lead single clips into states of somebody's choice, such as where a planner drove itself."""
+
+    of_clip: Mapping[str, Array]  # clip_id -> (S, 40, 3) ego frame at T, 0.1 .. 4.0 s, in the order of the file
+    digest: str  # 16 hex digits of all of it, whatever the order of the clips
+
+    def refuse_other_clips(self, clip_ids: Iterable[str]) -> None:
+        """Raises ValueError where none of these clips has a start."""
+        if self.of_clip.keys().isdisjoint(clip_ids):
+            raise ValueError(f"perturb.starts: none of its {len(self.of_clip)} clips is among those of clips=")
+
+
+def load_starts(path: str) -> Starts:
+    """Those of a Parquet file: a row each, of clip_id and trajectory (40, 3). Raises ValueError that names the file."""
+    where = f"perturb.starts={path}"
+    try:
+        file = pq.ParquetFile(path)
+        if missing := [name for name in START_COLUMNS if name not in file.schema_arrow.names]:
+            raise ValueError(f"no column {missing[0]}; it has {', '.join(file.schema_arrow.names)}")
+        rows = file.read(columns=list(START_COLUMNS)).to_pydict()
+    except (OSError, ValueError, pa.ArrowException) as error:
+        raise ValueError(f"{where}: {str(error).splitlines()[0]}") from error
+    if not all(isinstance(clip_id, str) for clip_id in rows["clip_id"]):
+        raise ValueError(f"{where}: clip_id must be text in every row")
+    try:
+        values = np.array(rows["trajectory"], dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{where}: every trajectory must be {HORIZON_STEPS} times x, y, heading") from error
+    trajectories, of_clip = checked_trajectories(values, where), dict[str, list[Array]]()
+    for clip_id, trajectory in zip(rows["clip_id"], trajectories, strict=True):
+        of_clip.setdefault(clip_id, []).append(trajectory)
+    found = {clip_id: np.array(of_clip[clip_id]) for clip_id in sorted(of_clip)}
+    named = "\x1f".join(f"{clip_id} {trajectories_digest(starts)}" for clip_id, starts in found.items())
+    return Starts(found, hashlib.sha256(named.encode()).hexdigest()[:16])
 
 
 def load_recovery_table(path: str | Path) -> RecoveryTable:

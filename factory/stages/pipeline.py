@@ -19,7 +19,7 @@ from factory.store.schema import UNLISTED, RunIdentity
 from tasks.attempt import ExpertGate, Judged, Timed, attempt, has_route, human_sample, perturbed_scene
 from tasks.experts.pdm_closed.planner import PdmSettings
 from tasks.experts.protocol import Expert, tried_once
-from tasks.perturb import Candidate, Perturbation, PerturbSettings, end_speed_mps, perturb
+from tasks.perturb import NO_STARTS, Candidate, Perturbation, PerturbSettings, end_speed_mps, perturb
 from tasks.render.scene.engine import check
 from tasks.render.settings import RenderMode, RenderSettings
 from tasks.render.splatting.gsplat_backend import BackendMissing
@@ -137,6 +137,7 @@ class FactoryWork:
     identity: RunIdentity
     cache_dir: str  # of reconstructed blocks
     photos_alone: bool  # clips may have photos and no lidar
+    starts: Mapping[str, Array] = field(default_factory=dict, kw_only=True)  # clip_id -> (S, 40, 3) of its own
 
     def warm(self, draws: bool = True) -> None:
         """This run's kernels, and no others, into the on-disk cache. Raises NotReady."""
@@ -197,8 +198,8 @@ class FactoryWork:
             blocked = self.imaging.block_verdict(clip) if asked else None
         self._refuse_another_policy()
         with watch.of("perturb"):
-            rng = stream(self.seed, clip.clip_id, "perturb")
-            found = blocked or perturb(clip, self.vocabulary, self.perturb, self.traffic, self.pdm, rng)
+            rng, starts = stream(self.seed, clip.clip_id, "perturb"), self.starts.get(clip.clip_id, NO_STARTS)
+            found = blocked or perturb(clip, self.vocabulary, self.perturb, self.traffic, self.pdm, rng, starts)
         return WholeClip(clip, found, watch.seconds)
 
     def _read(self, ref: ClipRef, watch: Stopwatch) -> Clip | Rejected:

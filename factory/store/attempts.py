@@ -84,7 +84,7 @@ class CandidateRow:
     """One perturbation that passed every gate and filter, in the order in which walks try it."""
 
     index: int  # place in the clip's ordered list, 0 ...
-    vocabulary_index: int  # -1: the log itself
+    vocabulary_index: int  # -1: the log itself; -2 - n: start n of the clip's own
     end_x: float  # [m] LQR-reached end pose, frame of the logged pose at T+H
     end_y: float  # [m]
     end_heading: float  # [rad]

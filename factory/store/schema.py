@@ -281,7 +281,7 @@ def _lineage() -> tuple[Column, ...]:
             "vocabulary_index",
             "int32",
             nullable=True,
-            about="row of the vocabulary; -1: log; null human",
+            about="row of the vocabulary; -1: log; -2 - n: start n; null human",
         ),
         Column("vocabulary_digest", "string"),
         Column("settings_hash", "string", about="of the run's settings, see run.json"),

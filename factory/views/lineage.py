@@ -29,7 +29,7 @@ def lineage(store: "Store", which: str) -> list[Part]:
     clip = _clip(store, row)
     parts = [("run", _run_facts(store, record, number, row)), ("clip", _clip_facts(store, row, clip))]
     if row["candidate_index"] >= 0:
-        parts.append(("candidate", _candidate_facts(row, clip)))
+        parts.append(("candidate", _candidate_facts(row, clip, record)))
     parts.append(("attempt", _attempt_facts(store, row)))
     parts.append(("sample", _sample_facts(store, row, path)) if is_sample else ("no sample", _fate(store, row, path)))
     return parts
@@ -99,7 +99,7 @@ def _clip_facts(store: "Store", row: Row, clip: Row) -> list[tuple[str, object]]
     ]
 
 
-def _candidate_facts(row: Row, clip: Row) -> list[tuple[str, object]]:
+def _candidate_facts(row: Row, clip: Row, record: Row) -> list[tuple[str, object]]:
     found = next((c for c in clip.get("candidates", ()) if c["index"] == row["candidate_index"]), None)
     facts: list[tuple[str, object]] = [("place in the list", row["candidate_index"])]
     if found is None:
@@ -107,19 +107,22 @@ def _candidate_facts(row: Row, clip: Row) -> list[tuple[str, object]]:
     x, y, heading, speed = (found[name] for name in ("end_x", "end_y", "end_heading", "end_speed"))
     return [
         *facts,
-        _moved_by(found["vocabulary_index"], clip),
+        _moved_by(found["vocabulary_index"], clip, record),
         ("ends", f"{x:+.2f} m along, {to_the_side(y)}, {turned(heading)}, at {speed:.2f} m/s"),
         ("grid cell", ", ".join(map(str, found["cell"]))),
         ("EPDMS", f"{found['score']:.3f} against log replay, {found['reactive_score']:.3f} among reacting agents"),
     ]
 
 
-def _moved_by(index: int, clip: Row) -> tuple[str, object]:
-    """What perturbs the ego: a row of the vocabulary, or nothing does."""
-    from tasks.world.vocabulary import OF_LOG
+def _moved_by(index: int, clip: Row, record: Row) -> tuple[str, object]:
+    """What perturbs the ego: a row of the vocabulary, or a start of the clip's own; or nothing does."""
+    from tasks.world.vocabulary import FIRST_START, OF_LOG
 
     if index == OF_LOG:
         return "perturbed by", "nothing: the log itself"
+    if index <= FIRST_START:
+        starts = dict(record.get("settings", {})).get("perturb.starts")
+        return "perturbed by", f"start {FIRST_START - index} of the clip in perturb.starts {starts}"
     return "vocabulary row", f"{index} of {clip['vocabulary_digest']}"
 
 

@@ -12,6 +12,7 @@ from tasks.world.frames import to_local
 from tasks.world.vehicle import HEADING
 
 OF_LOG = -1  # stands for the log itself where a trajectory has its row in the vocabulary
+FIRST_START = -2  # for the first of a clip's own start states; -3 for the second ...
 MOST_LLOYD_STEPS = 30  # fewer when no window changes its centre
 CHUNK_ROWS = 4096  # windows whose distances to all centres are held at once: 4096 x 8192 x 8 B = 0.27 GB
 

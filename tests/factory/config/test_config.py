@@ -16,7 +16,7 @@ import yaml
 
 from factory.config.compose import ConfigError, build, conf_dir, fill
 from factory.config.plugins import choices
-from factory.config.run import RewardSettings, RunConfig, composed_run, load_config, shapes_in
+from factory.config.run import PerturbSources, RewardSettings, RunConfig, composed_run, load_config, shapes_in
 from factory.config.words import SettingsShown
 from factory.setup.settings import (
     RunContext,
@@ -28,16 +28,15 @@ from factory.setup.settings import (
 )
 from tasks.caches import user_cache
 from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings
-from tasks.perturb import PerturbSettings
 from tasks.render.settings import RenderMode, RenderSettings
 from tasks.rollout.simulate import TrafficSettings
 from tests.factory.data_folders import add_companions
 from tests.factory.text_keys import held, text_keys
 
 REPOSITORY = Path(__file__).resolve().parents[3]
-DENSE = PerturbSettings(max_longitudinal_m=8.0, step_longitudinal_m=1.0, interleaved=False, order="spread", at_most=32)
+DENSE = PerturbSources(max_longitudinal_m=8.0, step_longitudinal_m=1.0, interleaved=False, order="spread", at_most=32)
 GROUPS = [
-    ("perturb/paper", PerturbSettings()),
+    ("perturb/paper", PerturbSources()),
     ("perturb/dense", DENSE),
     ("traffic/idm", TrafficSettings()),
     ("traffic/replay", TrafficSettings(mode="replay")),
@@ -70,7 +69,7 @@ def test_the_run_s_keys_are_those_of_its_dataclass() -> None:
     assert set(composed_run([])) == {field.name for field in dataclasses.fields(RunConfig)}
     config = load_config([])
     assert (config.rounds, config.executor, config.limit) == (1, "ray", None)
-    assert config.perturb == PerturbSettings()
+    assert config.perturb == PerturbSources()
     assert config.reward == RewardSettings()
 
 
