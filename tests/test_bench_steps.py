@@ -61,4 +61,4 @@ def test_decoding_s_tables_have_a_line_for_each_number_of_workers(
 def test_benches_draw_as_samples_are_drawn() -> None:
     files = sorted(Path(bench_decoding.__file__).parent.glob("*.py"))
     found = [f"{file.name}: {name}" for file in files for name in FIT_S_OWN if name in file.read_text()]
-    assert len(files) > 20 and not found, "draw the finished scene: tasks.render.fit.quality.drawn"
+    assert len(files) > 20 and not found, "draw the finished scene: tasks.render.fit.reconstruct.drawn"

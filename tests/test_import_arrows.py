@@ -35,7 +35,7 @@ ROOMS = {
             "reward",
         ),
         *("experts", "perturb", "attempt", "hard_scenes", "trajectories"),
-        *("render.splatting", "render.scene", "render.rig", "render.fit", "render"),
+        *("render.settings", "render.splatting", "render.scene", "render.rig", "render.fit", "render"),
     ),
     "factory": (
         *("exits", "wording", "job", "files", "locks"),

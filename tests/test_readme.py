@@ -41,7 +41,7 @@ from planners.published.import_planner import config_of as import_config
 from planners.training.train import TrainConfig
 from tasks.caches import user_cache
 from tasks.kernels.compiled import cache_dir
-from tasks.render.fit.settings import FitSettings
+from tasks.render.settings import FitSettings
 from tests.factory.installs import SMALL, as_if_installed
 from tests.pages import PAGES, REPOSITORY, Command, blocks, commands, named_in_prose
 

@@ -75,7 +75,7 @@ def main(request: Request) -> None:
     from factory.views.scene_tracks import logged_vehicles
     from factory.views.splat_files import read_splats
     from factory.views.status import open_store
-    from tasks.render.splatting.checkpoints import LoggedVehicle
+    from tasks.render.splatting.formats import LoggedVehicle
 
     file, to = Path(request.files[0]), Path(request.to or "")
     try:

@@ -102,8 +102,7 @@ def run(request: Request, reader: "ClipReader") -> list[str]:
 def write_kinematic(request: Request) -> str:
     """Writes the kinematic vocabulary of `k` and `seed`; a line of report."""
     from factory.setup.vocabulary import save_vocabulary
-    from tasks.world.kinematic_vocabulary import kinematic_trajectories
-    from tasks.world.vocabulary import Vocabulary
+    from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
 
     vocabulary = Vocabulary(kinematic_trajectories(request.k, request.seed), source="kinematic")
     save_vocabulary(str(request.out), vocabulary, {"source": "kinematic", "seed": request.seed})

@@ -26,7 +26,7 @@ from factory.store.schema import UNLISTED, RunIdentity, canonical_json
 from tasks.caches import user_cache
 from tasks.experts.pdm_closed.settings import PdmSettings
 from tasks.experts.protocol import Expert, tried_once
-from tasks.render.fit.lpips import BadWeights, lpips_of
+from tasks.render.fit.losses import BadWeights, lpips_of
 from tasks.render.rigs import RIGS
 from tasks.render.scene import engine
 from tasks.render.settings import RenderMode
@@ -34,8 +34,7 @@ from tasks.render.splatting.gsplat_backend import BackendMissing
 from tasks.reward.labels import Labelling
 from tasks.rollout.policy import traffic_record
 from tasks.stages import FRAMES, stage_versions
-from tasks.world.kinematic_vocabulary import kinematic_trajectories
-from tasks.world.vocabulary import Vocabulary
+from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
 
 KINEMATIC_K = 1024
 RIGS_LOOKED_AT = 3  # clips, for the names of their cameras

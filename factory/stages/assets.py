@@ -25,15 +25,13 @@ from factory.stages.rig import UsedRig, corrected_rig, known_of, said_again, tak
 from factory.stages.scene_file import SUFFIX, BadScene, read_scene, write_scene
 from factory.stages.sensors import block_cameras, block_of, chosen_cameras, load_sensors, load_sweeps, taken_by
 from factory.store.disk import own_place
-from tasks.render.fit.lpips import lpips_of
+from tasks.render.fit.losses import lpips_of
 from tasks.render.scene.asset import BlockRange, RenderAsset, TakenFrom, rises_of
-from tasks.render.scene.build import build_asset
-from tasks.render.scene.lidar_only import lidar_asset
+from tasks.render.scene.build import build_asset, lidar_asset
 from tasks.render.scene.movers import lifted
 from tasks.render.scene.sensed import own_bodies
-from tasks.render.scene.settings import Backend, SceneDtype
 from tasks.render.scene.stereo import MAX_BASELINE_M, MIN_BASELINE_M
-from tasks.render.settings import RenderSettings, SceneFrom
+from tasks.render.settings import Backend, RenderSettings, SceneDtype, SceneFrom
 from tasks.world.arrays import Array, Bools
 from tasks.world.camera import Camera, SensorFile
 from tasks.world.clip import Block, Clip, of_other_log, own_name

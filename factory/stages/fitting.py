@@ -12,13 +12,12 @@ from factory.graph.work import Halted, Stopped, never
 from factory.stages.sensors import SensorData
 from factory.store.disk import whole_file
 from factory.wording import time_text
-from tasks.render.fit.lpips import Lpips
+from tasks.render.fit.losses import Lpips
 from tasks.render.fit.reconstruct import advance, backend_of, finish
-from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import prepare
 from tasks.render.fit.state import FitState
 from tasks.render.scene.asset import RenderAsset
-from tasks.render.scene.settings import Backend
+from tasks.render.settings import Backend, FitSettings
 from tasks.sealed import check, seal
 from tasks.world.agents import AgentTracks
 

@@ -22,9 +22,16 @@ from factory.stages.rows import agent_columns
 from factory.stages.sensors import block_of, chosen_cameras, encode_jpeg, load_photos, taken_by
 from tasks.attempt import Judged
 from tasks.perturb import Candidate
-from tasks.render.block_gate import poor_block
-from tasks.render.gate import looked_at_size, unfit
-from tasks.render.likeness import Album, VehiclePhoto, fading_of, likeness_to_photo, sightings
+from tasks.render.gate import (
+    Album,
+    VehiclePhoto,
+    fading_of,
+    likeness_to_photo,
+    looked_at_size,
+    poor_block,
+    sightings,
+    unfit,
+)
 from tasks.render.map_drawing import draw_map_views
 from tasks.render.rigs import RIGS
 from tasks.render.scene.asset import RenderAsset

@@ -17,15 +17,12 @@ from factory.stages.own_body import NO_MASKS
 from factory.stages.scene_file import CALIBRATED
 from factory.stages.sensors import SensorData, opened_photos, poses_of, taken_by
 from factory.store.disk import whole_file
-from tasks.render.rig.corners import corners_of
-from tasks.render.rig.correct import Correction, corrected
-from tasks.render.rig.ground import ground_below
-from tasks.render.rig.masks import hidden_by
-from tasks.render.rig.settings import Adjust, RigSettings
+from tasks.render.rig.correct import Correction, corners_of, corrected, ground_below, hidden_by
 from tasks.render.scene.asset import TakenFrom, rises_of
 from tasks.render.scene.driven_road import driven_roads
 from tasks.render.scene.features import Known
 from tasks.render.scene.movers import lifted
+from tasks.render.settings import Adjust, RigSettings
 from tasks.sealed import Damaged, sealed_json, unsealed_json
 from tasks.world.agents import AgentTracks
 from tasks.world.arrays import Array, Bools

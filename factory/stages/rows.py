@@ -14,8 +14,8 @@ from tasks.subscores import OF_ONE_PLAN, SUBSCORES
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import Array
 from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, Scene
-from tasks.world.command import driving_command
 from tasks.world.frames import points_to_local, to_local
+from tasks.world.route import driving_command
 from tasks.world.vehicle import AX, AY, HEADING, VX, VY
 
 NEAR_M = 30.0  # for the tags

@@ -37,8 +37,8 @@ from factory.store.schema import canonical_json
 from factory.wording import shown
 from tasks.render.scene.asset import BlockRange, ClassQuality, Exposure, OwnBody, RenderAsset, TakenFrom, ViewQuality
 from tasks.render.scene.movers import NO_SHIFTS, BoxShifts
-from tasks.render.scene.settings import SceneDtype
 from tasks.render.scene.sky import SkyMap
+from tasks.render.settings import SceneDtype
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.project import ScreenFilter
 from tasks.world.camera import Camera, Fisheye

@@ -37,9 +37,8 @@ from tasks.sealed import Damaged, sealed, unsealed
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import Array
 from tasks.world.clip import CLIP_STEPS, HORIZON_STEPS, NOW, Clip, Scene, scene_of_clip
-from tasks.world.kinematic_vocabulary import kinematic_trajectories
 from tasks.world.lanes import Lane, RoadMap, Route
-from tasks.world.vocabulary import Vocabulary
+from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
 
 REPLAY = TrafficSettings(mode="replay")
 ENOUGH_S = 0.2  # between two looks whether compiling is to be given up

@@ -9,8 +9,8 @@ import numpy as np
 
 from tasks.world.agents import AgentKind
 from tasks.world.arrays import Array, Bytes, ShortInts
-from tasks.world.boxes import ego_boxes
 from tasks.world.frames import box_corners, points_to_local
+from tasks.world.geometry import ego_boxes
 from tasks.world.vehicle import PACIFICA
 
 Colour = tuple[int, int, int]  # RGB

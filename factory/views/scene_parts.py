@@ -14,9 +14,9 @@ from factory.stages.scene_file import BadScene, described_by, read_scene, stored
 from factory.views.scene_quality import camera_rows
 from factory.views.splat_files import background_bytes, node_bytes
 from tasks.render.scene.asset import RenderAsset
-from tasks.render.scene.lidar_only import plain_sky
+from tasks.render.scene.build import plain_sky
 from tasks.render.splatting import sh
-from tasks.render.splatting.checkpoints import LoggedVehicle, SplatCheckpoint
+from tasks.render.splatting.formats import LoggedVehicle, SplatCheckpoint
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.project import ANTIALIASED, CLASSIC, ScreenFilter
 

@@ -12,7 +12,7 @@ from factory.stages.scene_file import BadScene
 from factory.store.cache import BadCacheFile
 from tasks.render.scene.asset import BlockRange, RenderAsset
 from tasks.render.scene.movers import world_from_boxes
-from tasks.render.splatting.checkpoints import LoggedVehicle
+from tasks.render.splatting.formats import LoggedVehicle
 from tasks.world.arrays import Array
 from tasks.world.clip import STEP_S, Clip
 

@@ -12,11 +12,19 @@ import pyarrow as pa
 from factory.readers.torch_file import load_tensors
 from factory.stages.scene_file import BadScene
 from factory.wording import one_line
-from tasks.render.splatting.checkpoints import LoggedVehicle, SplatCheckpoint, from_checkpoint, splatfacto, worldengine
+from tasks.render.splatting.formats import (
+    LoggedVehicle,
+    SplatCheckpoint,
+    from_checkpoint,
+    from_ply,
+    from_spz,
+    splatfacto,
+    to_ply,
+    to_spz,
+    worldengine,
+)
 from tasks.render.splatting.gaussians import Gaussians, moved
-from tasks.render.splatting.ply import from_ply, to_ply
 from tasks.render.splatting.project import ANTIALIASED, ScreenFilter
-from tasks.render.splatting.spz import from_spz, to_spz
 from tasks.world.arrays import Array
 
 CHECKPOINTS = (".ckpt", ".pt", ".pth")

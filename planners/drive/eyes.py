@@ -15,7 +15,7 @@ from tasks.render.settings import ImageSource
 from tasks.render.views import pose_on_ground
 from tasks.world.arrays import Array
 from tasks.world.clip import HISTORY_STEPS, HORIZON_STEPS, STEP_S, Clip, Scene
-from tasks.world.command import driving_command
+from tasks.world.route import driving_command
 from tasks.world.vehicle import HEADING
 
 Images = Sequence[Mapping[str, Any]]  # entries of the column `images`

@@ -20,8 +20,8 @@ from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficSettings, next_scene, prepare_traffic, roll_out
 from tasks.world.agents import AgentTracks
 from tasks.world.arrays import Array, Bools, Ints
-from tasks.world.boxes import ego_boxes, touching
 from tasks.world.clip import HORIZON_STEPS, STEP_S, Rollout
+from tasks.world.geometry import ego_boxes, touching
 from tasks.world.route import RouteFinder
 from tasks.world.vehicle import HEADING, PACIFICA, VX, VY, X, Y
 

@@ -9,7 +9,7 @@ from factory.stages.assets import asset_for
 from factory.stages.imaging import Imaging, first_of, in_time_of
 from factory.stages.sensors import chosen_cameras
 from planners.drive.eyes import Images, ground_of, states_at
-from tasks.render.block_gate import poor_block
+from tasks.render.gate import poor_block
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.settings import STEPS_OF, ImageSource, PsnrGate, RenderSettings
 from tasks.render.views import pose_on_ground, render_views

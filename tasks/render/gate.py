@@ -2,31 +2,326 @@
 
 A sample is fit to learn from when its rig could have seen every instant from T to T+2H, in both stages, whichever of
 the pictures are stored; vehicles that fill much of a stored picture must also look like their photos
-(tasks/render/likeness.py). Pictures are looked at in small and only as far as `reach_m`: what is farther looks from
+(tasks/render/gate.py). Pictures are looked at in small and only as far as `reach_m`: what is farther looks from
 here as it did from where the photos were taken, and is most of a block's Gaussians.
 """
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from scipy.ndimage import uniform_filter
 
-from tasks.render.beside_photo import beside_photo
-from tasks.render.likeness import Album, expected, eye_in_box, large_vehicles
-from tasks.render.scene.asset import OwnBody, RenderAsset, scene_at
+from tasks.render.scene.asset import OwnBody, RenderAsset, camera_psnr_db, scene_at
 from tasks.render.scene.engine import Backend, Vehicles, render, vehicles_at
-from tasks.render.scene.movers import world_from_boxes
+from tasks.render.scene.movers import BEYOND_M, behind_boxes, boxes_at, world_from_boxes
+from tasks.render.scene.sensed import Photo
 from tasks.render.scene.sky import directions
-from tasks.render.settings import GateSettings
+from tasks.render.scene.stereo import FAR_M
+from tasks.render.settings import GateSettings, RenderSettings
 from tasks.render.splatting.gaussians import Gaussians, rotations_of
 from tasks.render.splatting.raster import View
 from tasks.stages import Rejected
-from tasks.world.agents import AgentTracks
-from tasks.world.arrays import F32, Array, Bools
-from tasks.world.camera import Camera, Pinhole
+from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.arrays import F32, Array, Bools, Bytes, Ints
+from tasks.world.camera import Camera, Pinhole, SensorFile
 from tasks.world.clip import STEP_S
+
+# How like its photos a vehicle near the camera looks, judged by the photo that was taken from nearest to here.
+#
+# A vehicle that passed the cameras in a few photos can be fitted to streaks: they look right from nowhere, also not
+# from where its photos were taken. So the scene is drawn as one photo shows it, from the place that is nearest to
+# here as the vehicle sees it, and both are compared inside the vehicle's outline. What is found there fades with the
+# way from that place to here: a side that no photo shows, or a look from much nearer, is a guess. How fast it fades
+# is for the photos to say that the scene was not made of: few photos a second are fitted each for itself, and from
+# between them the vehicle is torn.
+
+FADING = 0.2  # at least: likeness falls by exp(-0.2) where the eye moves by as much as it was away from the vehicle
+LEAST_LIKE = 0.05  # below, a vehicle is not there at all, and its likeness says no more
+LEAST_HELD_OUT = 10  # looks at vehicles in photos held out, fewer of which say nothing
+LEAST_GAP = 0.1  # between such a photo and the nearest other, below which a look says more of noise than of the way
+OTHERS_WAY = 0.2
+MOST_HELD_OUT = 100  # that are compared
+TELLING_M = 40.0  # a photo from farther tells nothing of how a vehicle looks from near
+SHOWN = 0.3  # share of a vehicle's points that a photo must have in view
+SIGMA_PX = 1.5  # of the window of SSIM (Wang et al. 2004), on pictures of half the size: blur alone is forgiven
+C1, C2 = 0.01**2, 0.03**2
+HIDDEN_M = 0.5  # what is drawn this much before a vehicle's nearest corner hides it
+CORNERS = np.stack(np.meshgrid((-0.5, 0.5), (-0.5, 0.5), (-0.5, 0.5), indexing="ij"), axis=-1).reshape(8, 3)
+POINTS = 0.9 * np.stack(np.meshgrid(*3 * [(-0.5, 0.0, 0.5)], indexing="ij"), axis=-1).reshape(27, 3)
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """The photos that show one track, and from where."""
+
+    photos: Ints  # (M,) rows of the block's photos
+    eyes: Array  # (M, 3) of the cameras, in the track's box then: centre, x along the heading [m]
+
+    def nearest(self, eye: Array) -> tuple[int, float]:
+        """The photo taken from nearest to `eye` (3,) in box coordinates, and how far from it, as a share of the eye's
+        distance from the centre."""
+        away = np.linalg.norm(self.eyes - eye, axis=1)
+        k = int(np.argmin(away))
+        return int(self.photos[k]), float(away[k] / max(float(np.linalg.norm(eye)), 1e-6))
+
+
+@dataclass(frozen=True)
+class VehiclePhoto:
+    """A photo of a vehicle, and who was where when it was taken."""
+
+    photo: Photo
+    box: Array  # (7,) the vehicle's
+    others: Array  # (N, 7) the boxes that may hide it
+
+
+@dataclass(frozen=True)
+class Album:
+    """A block's photos, for holding vehicles against them."""
+
+    sightings: Mapping[str, Sightings]  # by track id
+    likeness: Callable[[str, int], float]  # of a track as the scene draws it to a photo that shows it, 0 to 1
+    fading: Callable[[], Mapping[str, float]] = dict  # of tracks; FADING of others
+    taken: Callable[[str, int], VehiclePhoto] | None = None  # a track in a photo; None: there is none beside pictures
+
+
+def sightings(files: Sequence[SensorFile], cameras: Sequence[Camera], agents: AgentTracks) -> dict[str, Sightings]:
+    """Which of a block's photos show which vehicle; `agents` are the block's, with the files' times."""
+    rig = {camera.name: camera for camera in cameras}
+    found: dict[str, list[tuple[int, Array]]] = {}
+    for row, file in enumerate(files):
+        if file.sensor not in rig:
+            continue
+        camera = rig[file.sensor]
+        pose = file.world_from_ego @ camera.ego_from_camera
+        boxes, valid = boxes_at(agents, file.taken_s)
+        near = valid & (np.linalg.norm(boxes[:, :3] - pose[:3, 3], axis=1) < TELLING_M)
+        rows = [j for j in np.flatnonzero(near) if agents.kinds[j] == AgentKind.VEHICLE]
+        u, v, depth = _projected(boxes[rows], POINTS, camera.intrinsics, pose)
+        with np.errstate(invalid="ignore"):
+            inside = (depth > 0.0) & (u >= 0.0) & (u < camera.width) & (v >= 0.0) & (v < camera.height)
+        for j, share in zip(rows, inside.mean(axis=1), strict=True):
+            if share >= SHOWN:
+                found.setdefault(agents.track_ids[j], []).append((row, eye_in_box(pose[:3, 3], boxes[j])))
+    return {
+        track_id: Sightings(np.array([row for row, _ in seen]), np.stack([eye for _, eye in seen]))
+        for track_id, seen in found.items()
+    }
+
+
+def eye_in_box(eye: Array, box: Array) -> Array:
+    """A place (3,) in the coordinates of a box (7,): from its centre, x along its heading."""
+    return np.asarray((eye - box[:3]) @ world_from_boxes(box[None])[0, :3, :3])
+
+
+def expected(album: Album, track_id: str, eye: Array) -> float:
+    """The likeness, 0 to 1, that a track can be expected to have from `eye` (3,) in its box; 0 where no photo shows
+    it."""
+    seen = album.sightings.get(track_id)
+    if seen is None:
+        return 0.0
+    photo, gap = seen.nearest(eye)
+    return album.likeness(track_id, photo) * math.exp(-album.fading().get(track_id, FADING) * gap)
+
+
+def fading_of(
+    seen: Mapping[str, Sightings], likeness: Callable[[str, int], float], held_out: Collection[int]
+) -> Mapping[str, float]:
+    """How fast the likeness of each track fades away from the photos that a scene was made of.
+
+    Each look at a vehicle in one of the photos (rows) `held_out` is held against what the nearest other photo of it
+    says: it loses so much by so much of a way. What all lose together counts for each track as if it were OTHERS_WAY of
+    its own, which it has little of. No less than FADING, which is what too few looks say.
+    """
+    looks = [(name, k) for name, mine in seen.items() for k in range(len(mine.photos)) if mine.photos[k] in held_out]
+    lost: dict[str, list[tuple[float, float]]] = {}
+    for name, k in looks[:: max(1, math.ceil(len(looks) / MOST_HELD_OUT))]:
+        mine = seen[name]
+        used = ~np.isin(mine.photos, list(held_out))
+        if not used.any():
+            continue
+        photo, gap = Sightings(mine.photos[used], mine.eyes[used]).nearest(mine.eyes[k])
+        if gap >= LEAST_GAP:
+            there, here = (max(likeness(name, row), LEAST_LIKE) for row in (photo, int(mine.photos[k])))
+            lost.setdefault(name, []).append((math.log(there / here), gap))
+    every = np.array([row for mine in lost.values() for row in mine]).reshape(-1, 2)
+    if len(every) < LEAST_HELD_OUT:
+        return {}
+    usual = max(FADING, every[:, 0].sum() / every[:, 1].sum())
+    sums = {name: np.sum(lost.get(name, [(0.0, 0.0)]), axis=0) for name in seen}
+    return {n: max(FADING, float((loss + usual * OTHERS_WAY) / (way + OTHERS_WAY))) for n, (loss, way) in sums.items()}
+
+
+def large_vehicles(there: Vehicles, eye: Pinhole, view: View, share: float) -> Iterator[tuple[int, float]]:
+    """Rows of the vehicles that cover at least a share of a picture, each with its share, the nearest first.
+
+    `view` of the scene with them: what is behind a nearer vehicle or behind what the scene has there is not covered.
+    """
+    vehicles = np.array([kind == AgentKind.VEHICLE for kind in there.kinds], bool)
+    grown = there.boxes + np.array([0.0, 0.0, 0.0, 0.0, *3 * [2.0 * BEYOND_M]])
+    u, v, depth = _projected(grown, CORNERS, eye.intrinsics, eye.world_from_camera)
+    nearest = depth.min(axis=1, initial=np.inf)
+    with np.errstate(invalid="ignore"):
+        wide = np.clip(u, 0.0, eye.width), np.clip(v, 0.0, eye.height)
+        area = np.ptp(wide[0], axis=1) * np.ptp(wide[1], axis=1) if len(grown) else np.zeros(0)
+    possible = vehicles & (depth.max(axis=1, initial=-np.inf) > 0.0)
+    possible &= (nearest <= 0.0) | (area >= share * eye.width * eye.height)
+    rays = None
+    free = np.ones((eye.height, eye.width), bool)
+    for j in sorted(np.flatnonzero(possible), key=lambda j: nearest[j]):
+        if rays is None:
+            rays = directions(eye.intrinsics, eye.world_from_camera, eye.width, eye.height).reshape(-1, 3)
+        outline = outline_of(there.boxes[j], eye, rays)
+        hidden = (view.depth < nearest[j] - HIDDEN_M) & (view.alpha > 0.5)
+        covered = float((outline & free & ~hidden).mean())
+        free &= ~outline
+        if covered >= share:
+            yield int(j), covered
+
+
+def outline_of(box: Array, eye: Pinhole, rays: Array | None = None) -> Bools:
+    """(H, W) the pixels that look at a box (7,) in the world; `rays` (H * W, 3) where they are known."""
+    if rays is None:
+        rays = directions(eye.intrinsics, eye.world_from_camera, eye.width, eye.height).reshape(-1, 3)
+    place = np.ascontiguousarray(eye.world_from_camera[:3, 3])
+    met = behind_boxes(place + FAR_M * rays, place, np.ascontiguousarray(box[None]))
+    return np.asarray(met).reshape(eye.height, eye.width)
+
+
+def likeness_to_photo(
+    asset: RenderAsset, photo: Photo, agents: AgentTracks, track_ids: Sequence[str], backend: Backend = Backend.CPU
+) -> dict[str, float]:
+    """How like the photo the scene draws each track, inside its outline; tracks without any pixel have 0.
+
+    `agents` are the block's, with the photo's time. The scene gets the exposure that its camera had then.
+    """
+    height, width = photo.rgb.shape[:2]
+    eye = Pinhole(photo.intrinsics, photo.world_from_camera, width, height)
+    there = vehicles_at(agents, photo.taken_s)
+    seen = render(asset, [eye], there, backend, affines=[asset.affine_of(photo.camera, photo.time_s)])[0].rgb
+    similar = similarity(seen, photo.rgb.astype(np.float32) / np.float32(255.0))
+    out = {}
+    for track_id in track_ids:
+        inside = outline_of(there.boxes[there.track_ids.index(track_id)], eye)
+        out[track_id] = inside_mean(similar, inside)
+    return out
+
+
+def inside_mean(similar: F32, inside: Bools) -> float:
+    """Mean of a similarity map over the pixels inside, from 0 to 1; 0 where there are none."""
+    return max(0.0, float(similar[inside].mean())) if inside.any() else 0.0
+
+
+def similarity(a: F32, b: F32) -> F32:
+    """(H, W) SSIM of two pictures (H, W, 3) in [0, 1], mean over the channels, at half their size."""
+    height, width = a.shape[:2]
+    half = (max(1, width // 2), max(1, height // 2))
+    x, y = (np.asarray(cv2.resize(picture, half, interpolation=cv2.INTER_AREA), np.float32) for picture in (a, b))
+    mean_x, mean_y = _blurred(x), _blurred(y)
+    spread_x, spread_y = _blurred(x * x) - mean_x * mean_x, _blurred(y * y) - mean_y * mean_y
+    common = _blurred(x * y) - mean_x * mean_y
+    alike = (2.0 * mean_x * mean_y + C1) * (2.0 * common + C2)
+    alike /= (mean_x * mean_x + mean_y * mean_y + C1) * (spread_x + spread_y + C2)
+    small = alike.mean(axis=-1).astype(np.float32)
+    return np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_NEAREST), np.float32)
+
+
+def _blurred(picture: F32) -> F32:
+    return np.asarray(cv2.GaussianBlur(picture, (0, 0), SIGMA_PX, borderType=cv2.BORDER_REFLECT), np.float32)
+
+
+def _projected(boxes: Array, points: Array, intrinsics: Array, world_from_camera: Array) -> tuple[Array, Array, Array]:
+    """Pixels u, v and depths (N, P) of points (P, 3) of boxes (N, 7), in shares of their sizes; u, v mean nothing where
+    the depth is not positive."""
+    local = points * boxes[:, None, 4:7]
+    world = np.einsum("nij,npj->npi", world_from_boxes(boxes)[:, :3, :3], local) + boxes[:, None, :3]
+    camera = (world - world_from_camera[:3, 3]) @ world_from_camera[:3, :3]
+    depth = camera[..., 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u = intrinsics[0, 0] * camera[..., 0] / depth + intrinsics[0, 2]
+        v = intrinsics[1, 1] * camera[..., 1] / depth + intrinsics[1, 2]
+    return u, v, depth
+
+
+# A vehicle in a picture beside a photo of it that was taken from near: what is torn from here is not like it.
+#
+# A box is shape enough for a small step aside: each pixel of the vehicle's outline looks at a place of its box's
+# surface and is held against the photo's pixel that looks at the same place. What lies a metre behind the box, as a
+# bonnet does, is off by 0.01 rad after a step of 1 m at 10 m: a pixel of a picture of 160. Nothing of the scene's own
+# shape goes in: by its own depths a torn vehicle would look like every photo that it was fitted to.
+
+SHIFTS_PX = (-2, -1, 0, 1, 2)  # by which the photo is moved either way to fit: a box is no car, nor where it is exactly
+
+
+def beside_photo(rgb: F32, eye: Pinhole, box: Array, others: Array, taken: VehiclePhoto) -> tuple[float, float]:
+    """How like a photo a picture (H, W, 3) of a vehicle is, 0 to 1, and the share of its outline that both show.
+
+    `box` (7,) is the vehicle's and `others` (N, 7) those that may hide it, as `eye` sees them. Likeness is the SSIM at
+    half size over the places that both show, the best under small shifts of the photo. 0 and 0 where there is none.
+    """
+    rays = directions(eye.intrinsics, eye.world_from_camera, eye.width, eye.height).reshape(-1, 3)
+    place, photo = eye.world_from_camera[:3, 3], taken.photo
+    points, axis, side, along = on_box(box, place, rays)
+    outline = along < np.inf
+    if not outline.any():
+        return 0.0, 0.0
+    clear = outline.copy()
+    if len(others):
+        clear[outline] &= ~behind_boxes(
+            place + along[outline, None] * rays[outline], np.ascontiguousarray(place), others
+        )
+    their_eye = photo.world_from_camera[:3, 3]
+    inner = (their_eye - taken.box[:3]) @ world_from_boxes(taken.box[None])[0, :3, :3]
+    clear &= side * inner[axis] > box[4:7][axis] / 2.0  # the photo looks at that face
+    there = points @ world_from_boxes(taken.box[None])[0, :3, :3].T + taken.box[:3]
+    local = (there - their_eye) @ photo.world_from_camera[:3, :3]
+    height, width = photo.rgb.shape[:2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u = photo.intrinsics[0, 0] * local[:, 0] / local[:, 2] + photo.intrinsics[0, 2]
+        v = photo.intrinsics[1, 1] * local[:, 1] / local[:, 2] + photo.intrinsics[1, 2]
+        clear &= (local[:, 2] > 0.0) & (u > 0.0) & (u < width) & (v > 0.0) & (v < height)
+    if len(taken.others):
+        clear[clear] &= ~behind_boxes(there[clear], np.ascontiguousarray(their_eye), taken.others)
+    if not clear.any():
+        return 0.0, 0.0
+    shape = (eye.height, eye.width)
+    columns, rows = ((np.where(clear, at, 0.0) - 0.5).astype(np.float32).reshape(shape) for at in (u, v))
+    return _best(rgb, photo.rgb, columns, rows, clear.reshape(shape)), float(clear.sum() / outline.sum())
+
+
+def on_box(box: Array, eye: Array, rays: Array) -> tuple[Array, Ints, Array, Array]:
+    """Where rays (N, 3) from `eye` (3,) first meet a box (7,) that the eye is outside of.
+
+    Returns the places (N, 3) in box coordinates, the axis (N,) and the side (N,), 1 or -1, of the face, and how many
+    lengths of a ray they are away (N,); inf, and no meaning of the rest, where a ray misses the box.
+    """
+    turn = world_from_boxes(box[None])[0, :3, :3]
+    start, steps, half = (eye - box[:3]) @ turn, rays @ turn, box[4:7] / 2.0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first, second = (-half - start) / steps, (half - start) / steps
+    enter, leave = np.fmin(first, second), np.fmax(first, second)
+    axis = enter.argmax(axis=1)
+    along = enter.max(axis=1)
+    met = (along <= leave.min(axis=1)) & (along > 0.0)
+    along = np.where(met, along, np.inf)
+    side = -np.sign(np.take_along_axis(steps, axis[:, None], axis=1)[:, 0])
+    return start + np.where(met, along, 0.0)[:, None] * steps, axis, side, along
+
+
+def _best(rgb: F32, photo: Bytes, columns: F32, rows: F32, clear: Bools) -> float:
+    """Likeness of the `clear` pixels to the photo's at columns and rows (H, W) under the best of the shifts."""
+    theirs = photo.astype(np.float32) / np.float32(255.0)
+    best = 0.0
+    for down in SHIFTS_PX:
+        for right in SHIFTS_PX:
+            at = columns + np.float32(right), rows + np.float32(down)
+            moved = cv2.remap(theirs, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            mixed = np.where(clear[..., None], moved, rgb).astype(np.float32)
+            best = max(best, inside_mean(similarity(rgb, mixed), clear))
+    return best
+
 
 GREY = np.array([0.299, 0.587, 0.114], np.float32)  # luma of ITU-R BT.601
 SOLID = 0.5  # alpha from which a pixel counts as covered
@@ -226,3 +521,27 @@ def _tracks_around(eye: Array, there: Vehicles) -> list[str]:
     local = np.einsum("nij,ni->nj", world_from_boxes(there.boxes)[:, :3, :3], eye - there.boxes[:, :3])
     inside = (np.abs(local) < there.boxes[:, 4:7] / 2.0).all(axis=1)
     return [there.track_ids[j] for j in np.flatnonzero(inside)]
+
+
+# The gate for blocks: what a block's held-out photos must come out with, at the size that pictures are stored in.
+#
+# PSNR depends on that size: fine texture, which no scene has in full, is averaged away in small pictures.
+
+
+def poor_block(asset: RenderAsset, settings: RenderSettings) -> str | None:
+    """In what a block does not come up to `psnr_min` and, camera by camera, `camera_psnr_min`.
+
+    None where it does, where nothing was held out, and where `psnr_min` is 0: then any block will do.
+    """
+    if settings.psnr_min == 0.0:
+        return None
+    photos = f"{asset.n_held_out} held-out photos at {settings.width}x{settings.height}"
+    if asset.psnr_db < settings.psnr_min:
+        return f"block at {asset.psnr_db:.2f} dB over {photos}, below {settings.psnr_min:g}"
+    cameras = camera_psnr_db(asset)
+    below = sorted((value, name) for name, value in cameras.items() if value < settings.camera_psnr_min)
+    if below:
+        value, name = below[0]
+        like = f"{settings.camera_psnr_min:g} like {len(below)} of {len(cameras)} cameras"
+        return f"{name} at {value:.2f} dB, below {like}; block at {asset.psnr_db:.2f} dB over {photos}"
+    return None

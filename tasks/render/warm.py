@@ -3,14 +3,12 @@
 import numpy as np
 
 from tasks.render.fit.reconstruct import reconstruct
-from tasks.render.fit.settings import FitSettings
-from tasks.render.rig.adjust import Bundle, Matched, adjusted
-from tasks.render.rig.normal import N_CAMERA
-from tasks.render.rig.rig import given_rig
+from tasks.render.rig.adjust import N_CAMERA, Bundle, Matched, adjusted, given_rig
 from tasks.render.scene.build import AssetSettings, RenderAsset, build_asset
-from tasks.render.scene.confirmed import confirmed
+from tasks.render.scene.depth import confirmed
 from tasks.render.scene.sensed import Photo, Sweep
-from tasks.render.scene.wide_stereo import partners, wide_depth
+from tasks.render.scene.stereo import partners, wide_depth
+from tasks.render.settings import FitSettings
 from tasks.render.splatting.sh import turned
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.camera import Camera, SensorFile

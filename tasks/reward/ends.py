@@ -16,8 +16,8 @@ from tasks.settings import ExpertGate
 from tasks.stages import Rejected
 from tasks.world.agents import AgentTracks
 from tasks.world.arrays import Array, Bools
-from tasks.world.boxes import ego_boxes, touching
 from tasks.world.clip import HORIZON_STEPS, STEP_S
+from tasks.world.geometry import ego_boxes, touching
 from tasks.world.lanes import RoadMap, Route
 from tasks.world.route import RouteFinder
 from tasks.world.vehicle import AX, HEADING, PACIFICA, STEERING, VX, YAW_RATE, X, Y

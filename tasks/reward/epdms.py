@@ -25,7 +25,7 @@ from tasks.reward.rules.obstacles import N_TIMES, Obstacles, unindexed, with_obj
 from tasks.reward.verdicts import INDEX_FROM_ROWS, RuleContext, Verdicts, context_of, judge_one, scratch_for
 from tasks.subscores import INDEX, LABELLED
 from tasks.world.arrays import Array, Bools
-from tasks.world.bounds import LARGEST
+from tasks.world.geometry import LARGEST
 
 Normalise = Literal["batch", "pairs"]
 _NORMALISE = get_args(Normalise)

@@ -13,8 +13,8 @@ from tasks.reward.rules.obstacles import STOPPED_SPEED_MPS
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import Rollouts, TrafficSettings, prepare_traffic, roll_out_many
 from tasks.world.arrays import Array, Bools
-from tasks.world.boxes import ego_boxes, touching
 from tasks.world.clip import HORIZON_STEPS, Scene
+from tasks.world.geometry import ego_boxes, touching
 from tasks.world.vehicle import PACIFICA
 from tasks.world.vocabulary import Vocabulary
 

@@ -15,9 +15,8 @@ from tasks.reward.rules.map_index import MapIndex, index_map
 from tasks.reward.rules.obstacles import N_TIMES, Obstacles, index_obstacles, lay_out
 from tasks.world.agents import MOVING_KINDS, AgentKind, AgentTracks
 from tasks.world.arrays import Array, Bools
-from tasks.world.bounds import LARGEST, all_within
-from tasks.world.boxes import ego_boxes
 from tasks.world.clip import Clip, Scene
+from tasks.world.geometry import LARGEST, all_within, ego_boxes
 from tasks.world.lanes import LightState, MapLayer, MapPolygon
 from tasks.world.polygons import polygons_near
 from tasks.world.vehicle import EGO_STATE_SIZE, PACIFICA

@@ -20,8 +20,8 @@ import numpy as np
 from tasks.kernels.compiled import inlined, kernel, read_only
 from tasks.kernels.trig import sincos, wrap
 from tasks.world.arrays import Array
-from tasks.world.bounds import LARGEST
 from tasks.world.clip import HORIZON_STEPS, STEP_S
+from tasks.world.geometry import LARGEST
 from tasks.world.vehicle import (
     AX,
     AY,

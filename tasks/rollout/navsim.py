@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from tasks.rollout.settings import TrafficSettings
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import Array, Bools
-from tasks.world.boxes import ego_boxes
 from tasks.world.clip import STEP_S, Scene
+from tasks.world.geometry import ego_boxes
 from tasks.world.lanes import Lane, RoadMap
 from tasks.world.polygons import with_headings
 from tasks.world.vehicle import HEADING, PACIFICA, VX, VY, X, Y

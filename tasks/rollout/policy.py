@@ -20,7 +20,7 @@ from tasks.rollout.traffic import begin_step, finish_step, first_row
 from tasks.rollout.traffic_state import AgentStates, Motion, Roles, RolloutRows
 from tasks.world.agents import AgentKind
 from tasks.world.arrays import Array, Bools, Ints
-from tasks.world.bounds import all_within
+from tasks.world.geometry import all_within
 from tasks.world.lanes import RoadMap
 
 SEEN_ROWS = 11  # of 0.1 s: the second before now, and now

@@ -53,9 +53,8 @@ from tasks.rollout.traffic_state import AgentStates, Motion, Roles, RolloutRows,
 from tasks.rollout.yielding import yielding_in
 from tasks.world.agents import MOVING_KINDS, PER_STEP, AgentKind, AgentTracks
 from tasks.world.arrays import Array, Bools
-from tasks.world.bounds import LARGEST, all_within
-from tasks.world.boxes import ego_boxes
 from tasks.world.clip import HORIZON_STEPS, STEP_S, Rollout, Scene
+from tasks.world.geometry import LARGEST, all_within, ego_boxes
 from tasks.world.vehicle import EGO_STATE_SIZE, HEADING, PACIFICA, VX, VY
 
 SHORTEST_HEADWAY_S = 0.5  # of who keeps its intent: logged drivers follow as near as that

@@ -18,12 +18,11 @@ from factory.readers.scenarionet.reader import ScenarioNetReader
 from factory.stages.rig import corrected_rig, known_of, lines_of, taken_from
 from factory.stages.sensors import block_of, load_sensors
 from tasks.render.fit.reconstruct import advance, finish
-from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import prepare
 from tasks.render.rig.correct import Correction
-from tasks.render.rig.settings import RigSettings
 from tasks.render.scene.asset import rises_of
 from tasks.render.scene.movers import lifted
+from tasks.render.settings import FitSettings, RigSettings
 from tasks.world.camera import Camera, SensorFile
 from tasks.world.clip import Block
 

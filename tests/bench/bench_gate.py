@@ -2,7 +2,7 @@
 
 Drives that the reward accepts in runs of preset=demo on synthetic towns, every camera at 1 Hz from T to T+2H, before
 any gate. Each picture is labelled by what the painter of the town shows from the same pose with the same traffic:
-likeness (SSIM at half of 160 pixels' width, tasks/render/likeness.py) inside the outline of each vehicle that covers
+likeness (SSIM at half of 160 pixels' width, tasks/render/gate.py) inside the outline of each vehicle that covers
 `share` of the picture or more (0.02, the gate's own); the worst counts. Limits were chosen on the first seeds and are
 reported on the others. Options: chosen=0,1 held=2 clips=9 share=0.02 out=out/bench_gate, drives=4 of each clip and
 expert, every=2 of the gate's instants. A later call with the same `out` reads <out>/labels-<seed>.csv and only prints.
@@ -26,8 +26,7 @@ from factory.stages.assets import asset_for
 from factory.stages.imaging import album_of, in_time_of
 from factory.stages.pipeline import FactoryWork
 from factory.stages.sensors import chosen_cameras
-from tasks.render.gate import GateSettings, looked_at_size, unfit
-from tasks.render.likeness import Album
+from tasks.render.gate import Album, GateSettings, looked_at_size, unfit
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.settings import STEPS_OF, Frames
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip

@@ -22,15 +22,13 @@ from factory.stages.scene_file import write_scene
 from tasks.render.fit.corrections import affine_between, corrected, exposed
 from tasks.render.fit.losses import ssim, target_of
 from tasks.render.fit.on_torch import OnTorch
-from tasks.render.fit.quality import drawn
-from tasks.render.fit.reconstruct import advance, backend_of, corrections_at, finish, pose_of
-from tasks.render.fit.settings import FitSettings
+from tasks.render.fit.reconstruct import advance, backend_of, corrections_at, drawn, finish, pose_of
 from tasks.render.fit.start import Problem, prepare
 from tasks.render.fit.state import FitState
 from tasks.render.scene.asset import RenderAsset, psnr
 from tasks.render.scene.engine import render
 from tasks.render.scene.sensed import Photo, shifted
-from tasks.render.scene.settings import Backend
+from tasks.render.settings import Backend, FitSettings
 from tasks.render.splatting.tensors import by_kernels
 from tasks.world.camera import Pinhole
 from tests.bench.stored_scene import Look, kept, storage_table

@@ -27,8 +27,8 @@ from tasks.reward.ends import hit_after_s
 from tasks.rollout.simulate import TrafficScene, TrafficSettings, prepare_traffic
 from tasks.settings import ExpertGate
 from tasks.stages import END_FAULTS, Rejected
-from tasks.world.command import LOOKAHEAD_M, driving_command
 from tasks.world.polygons import Rings, arc_lengths
+from tasks.world.route import LOOKAHEAD_M, driving_command
 from tasks.world.vehicle import HEADING
 
 FAR_M = 2.0

@@ -20,8 +20,7 @@ import numpy as np
 from factory.store.parquet_file import write_shard
 from factory.store.samples import Store
 from factory.store.schema import sample_row_to_table
-from tasks.world.kinematic_vocabulary import kinematic_trajectories
-from tasks.world.vocabulary import Vocabulary
+from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
 from tests.planners.samples import grey_pictures, labels, sample
 
 FEW = 64

@@ -21,7 +21,7 @@ from planners.models.planner import Planner, planner_class, settings_of
 from planners.training.optim import build_optimiser
 from planners.training.train import PlannerEntry
 from tasks.subscores import LABELLED
-from tasks.world.kinematic_vocabulary import kinematic_trajectories
+from tasks.world.vocabulary import kinematic_trajectories
 from tests.bench.timing import cpu_milliseconds, memory_mb, milliseconds
 
 PAPER = ("ego_mlp", "ltf", "diffusiondrive", "gtrs_dense", "gtrs_dense_v2_99")

@@ -28,8 +28,8 @@ from factory.readers.scenarionet.reader import ScenarioNetReader
 from tasks.rollout.roles import stands_always
 from tasks.rollout.simulate import TrafficSettings, next_scene, prepare_traffic, roll_out
 from tasks.world.agents import AgentKind, AgentTracks
-from tasks.world.boxes import ego_boxes
 from tasks.world.clip import HORIZON_STEPS, STEP_S, Clip, Rollout, scene_of_clip
+from tasks.world.geometry import ego_boxes
 from tasks.world.lanes import RoadMap
 from tasks.world.vehicle import PACIFICA
 from tests.bench.realism import (

@@ -23,12 +23,12 @@ from factory.readers.town.reader import SyntheticReader
 from tasks.reward.epdms import Scores, score
 from tasks.reward.prepare import N_TIMES, PAST_STEPS, PreparedScene, prepare
 from tasks.rollout.lqr import track
-from tasks.world.boxes import ego_boxes
 from tasks.world.clip import NOW, scene_of_clip
 from tasks.world.frames import to_world
-from tasks.world.kinematic_vocabulary import kinematic_trajectories
+from tasks.world.geometry import ego_boxes
 from tasks.world.polygons import polygons_near
 from tasks.world.vehicle import PACIFICA
+from tasks.world.vocabulary import kinematic_trajectories
 from tests.bench.peer import BenchScene, Beside, beside, peer_python
 from tests.bench.timing import cpu_milliseconds, least_and_median_cpu_ms, memory_mb
 from tests.real.reference_scenes import RECORDED_K, SCENES, loader, logged_tracks, map_polygons

@@ -20,17 +20,13 @@ from factory.stages.rig import lines_of
 from factory.stages.sensors import load_photos, opened_photos
 from tasks.render.fit.corrections import affine_between, exposed
 from tasks.render.fit.losses import ssim
-from tasks.render.fit.quality import classes_of, drawn
-from tasks.render.fit.reconstruct import advance, finish, pose_of
-from tasks.render.fit.settings import FitSettings
+from tasks.render.fit.reconstruct import advance, classes_of, drawn, finish, pose_of
 from tasks.render.fit.start import Problem, Shot, prepare
-from tasks.render.rig.corners import corners_of
-from tasks.render.rig.correct import Correction, corrected
-from tasks.render.rig.ground import ground_below
-from tasks.render.rig.settings import RigSettings
+from tasks.render.rig.correct import Correction, corners_of, corrected, ground_below
 from tasks.render.scene.asset import psnr
 from tasks.render.scene.driven_road import driven_road
 from tasks.render.scene.features import Known
+from tasks.render.settings import FitSettings, RigSettings
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import Array
 from tasks.world.camera import Camera, SensorFile

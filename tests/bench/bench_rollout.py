@@ -15,7 +15,7 @@ from factory.readers.av2.reader import AV2Reader
 from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficSettings, prepare_traffic, roll_out, roll_out_many
 from tasks.world.clip import NOW, Scene, scene_of_clip
-from tasks.world.kinematic_vocabulary import kinematic_trajectories
+from tasks.world.vocabulary import kinematic_trajectories
 from tests.bench.timing import cpu_milliseconds
 
 N_EGOS, NEAREST = 256, 25

@@ -16,10 +16,10 @@ import numpy as np
 
 from factory.stages.sensors import encode_jpeg, load_photos
 from tasks.render.fit.reconstruct import advance, finish
-from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import prepare
 from tasks.render.scene.asset import psnr
 from tasks.render.scene.engine import Vehicles, render
+from tasks.render.settings import FitSettings
 from tasks.world.camera import Pinhole
 from tests.bench.bench_rig import HELD_OUT, read_block
 

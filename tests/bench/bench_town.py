@@ -26,14 +26,14 @@ from factory.readers.town.town import log_name, plan_log
 from factory.readers.town.write import write_log
 from factory.stages.sensors import block_of, load_sensors
 from factory.views.scene_quality import camera_rows
-from tasks.render.fit.lpips import Lpips, lpips_of
-from tasks.render.fit.quality import LEAST_PIXELS as LEAST_OF_CLASS
+from tasks.render.fit.losses import Lpips, lpips_of
+from tasks.render.fit.reconstruct import LEAST_PIXELS as LEAST_OF_CLASS
 from tasks.render.fit.reconstruct import advance, finish
-from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import prepare
 from tasks.render.scene.build import held_out_rows
 from tasks.render.scene.engine import vehicles_at
 from tasks.render.scene.sensed import Photo
+from tasks.render.settings import FitSettings
 from tasks.world.camera import Camera, Pinhole
 from tests.bench.stored_scene import Look, kept, storage_table
 from tests.bench.town_truth import MOVED_M, Compared, Painter, Truth, beside, sideways

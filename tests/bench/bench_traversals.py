@@ -24,10 +24,10 @@ from factory.readers.town.write import write_log
 from factory.stages.assets import own_part
 from factory.stages.sensors import block_cameras, block_of, load_sensors
 from tasks.render.fit.reconstruct import advance, finish
-from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import prepare
 from tasks.render.scene.build import held_out_rows
 from tasks.render.scene.sensed import Photo
+from tasks.render.settings import FitSettings
 from tests.bench.bench_town import CENTRE, SETTINGS, by_class, painter
 from tests.bench.stored_scene import kept
 from tests.bench.town_truth import Painter, Truth, beside, sideways

@@ -17,8 +17,20 @@ from factory.readers.town.drive import TownDrive
 from factory.readers.town.town import log_name, plan_log
 from factory.stages.imaging import GATE_STRIDE
 from factory.stages.pipeline import FactoryWork, payload_of
-from tasks.render.gate import GateSettings, composed, fault_of, measures, seen_beside
-from tasks.render.likeness import Album, expected, eye_in_box, inside_mean, large_vehicles, outline_of, similarity
+from tasks.render.gate import (
+    Album,
+    GateSettings,
+    composed,
+    expected,
+    eye_in_box,
+    fault_of,
+    inside_mean,
+    large_vehicles,
+    measures,
+    outline_of,
+    seen_beside,
+    similarity,
+)
 from tasks.render.scene.asset import RenderAsset
 from tasks.render.scene.engine import Vehicles, render, vehicles_at
 from tasks.render.views import VISIBLE_M, pose_on_ground

@@ -22,21 +22,19 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tasks.render.fit.adam import Learned
 from tasks.render.fit.backend import FitBackend
 from tasks.render.fit.corrections import EXPOSURE_SIZE, POSE_SIZE
-from tasks.render.fit.in_tensors import photo_loss
 from tasks.render.fit.losses import target_of
 from tasks.render.fit.on_cpu import OnCpu
-from tasks.render.fit.on_torch import OnTorch
+from tasks.render.fit.on_torch import OnTorch, photo_loss
 from tasks.render.fit.reconstruct import advance, finish
-from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import PhotoTarget, Problem, Shot
-from tasks.render.fit.state import BACKGROUND, FitState, logits_of
+from tasks.render.fit.state import BACKGROUND, FitState, Learned, logits_of
 from tasks.render.scene.asset import psnr
 from tasks.render.scene.movers import SHIFT_SIZE
 from tasks.render.scene.sensed import Photo, Tracks
 from tasks.render.scene.sky import COLUMNS, ROWS
+from tasks.render.settings import FitSettings
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.gsplat_backend import BackendMissing, rasterize_all, require
 from tasks.render.splatting.raster import View, forward

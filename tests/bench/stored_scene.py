@@ -13,8 +13,7 @@ import numpy as np
 from factory.stages.scene_file import read_scene, write_scene
 from tasks.render.scene.asset import RenderAsset, psnr
 from tasks.render.scene.engine import NOBODY, Vehicles, render
-from tasks.render.scene.settings import SceneDtype
-from tasks.render.settings import RenderSettings
+from tasks.render.settings import RenderSettings, SceneDtype
 from tasks.world.arrays import F32, Bytes
 from tasks.world.camera import Pinhole
 from tests.bench.timing import cpu_milliseconds

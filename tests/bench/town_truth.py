@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tasks.render.fit.losses import ssim, target_of
-from tasks.render.fit.quality import classes_of
-from tasks.render.fit.road import Road
+from tasks.render.fit.reconstruct import classes_of
+from tasks.render.fit.state import Road
 from tasks.render.scene.asset import RenderAsset, psnr
 from tasks.render.scene.engine import Vehicles, render, vehicles_at
 from tasks.render.scene.movers import behind_boxes

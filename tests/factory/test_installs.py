@@ -37,7 +37,6 @@ UNSEEN = {  # declared without an import statement of ours
 }
 RAY_ONLY = {f"factory/graph/on_ray/{name}.py" for name in ("cluster", "graph", "pool")}  # loaded by executor=ray alone
 GPU_ONLY = {  # by render.backend=gsplat alone
-    "tasks/render/fit/in_tensors.py",
     "tasks/render/fit/on_torch.py",
     "tasks/render/splatting/tensors.py",
 }

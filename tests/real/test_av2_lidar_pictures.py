@@ -9,8 +9,8 @@ from factory.readers.av2.reader import AV2Reader
 from factory.stages.assets import Sensing, asset_for, sensing
 from factory.stages.sensors import block_of, load_sweeps
 from tasks.render.scene.asset import RenderAsset
+from tasks.render.scene.build import grey_of
 from tasks.render.scene.engine import render, vehicles_at
-from tasks.render.scene.lidar_only import grey_of
 from tasks.render.scene.sensed import Sweep, on_ego
 from tasks.render.settings import RenderSettings
 from tasks.world.camera import Camera, Pinhole

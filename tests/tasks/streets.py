@@ -12,10 +12,9 @@ from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.chance import stream
 from tasks.world.clip import CLIP_STEPS, NOW, STEP_S, Clip
 from tasks.world.frames import to_world
-from tasks.world.kinematic_vocabulary import kinematic_trajectories
 from tasks.world.lanes import Lane, LightState, MapLayer, MapPolygon, RoadMap, Route, TrafficLights
 from tasks.world.vehicle import EGO_STATE_SIZE, VX, X
-from tasks.world.vocabulary import Vocabulary
+from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
 
 Array = NDArray[np.float64]
 SPEED_MPS = 8.0

@@ -18,7 +18,7 @@ from tasks.stages import END_FAULTS, STAGES, Rejected
 from tasks.subscores import JUDGED
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip, Rollout, Scene, scene_of_clip
 from tasks.world.frames import to_world
-from tasks.world.kinematic_vocabulary import kinematic_trajectories
+from tasks.world.vocabulary import kinematic_trajectories
 from tests.tasks.bad_ends import Aside, Close, shift
 from tests.tasks.streets import moved, perturbed, same_poses, street_clip
 

@@ -27,8 +27,7 @@ from tasks.stages import STAGES, Rejected
 from tasks.world.chance import stream
 from tasks.world.clip import HORIZON_STEPS, NOW, STEP_S, Clip, scene_of_clip
 from tasks.world.frames import to_local, to_world
-from tasks.world.kinematic_vocabulary import kinematic_trajectories
-from tasks.world.vocabulary import OF_LOG, Vocabulary
+from tasks.world.vocabulary import OF_LOG, Vocabulary, kinematic_trajectories
 from tests.tasks.streets import moved, street_clip
 
 SETTINGS = PerturbSettings()

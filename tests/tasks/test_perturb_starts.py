@@ -11,8 +11,7 @@ from tasks.rollout.simulate import TrafficSettings
 from tasks.stages import Rejected
 from tasks.world.arrays import Array
 from tasks.world.chance import stream
-from tasks.world.kinematic_vocabulary import kinematic_trajectories
-from tasks.world.vocabulary import FIRST_START, Vocabulary
+from tasks.world.vocabulary import FIRST_START, Vocabulary, kinematic_trajectories
 from tests.tasks.streets import street_clip
 
 TRAJECTORIES = kinematic_trajectories(500, seed=0)

@@ -21,9 +21,9 @@ from factory.readers.navsim.log import Frame
 from factory.readers.settings import FRAME_STEPS
 from tasks.world.agents import MOVING_KINDS, AgentKind, AgentTracks
 from tasks.world.arrays import Array, Bools
-from tasks.world.boxes import ego_boxes, touching
 from tasks.world.clip import CLIP_STEPS, HISTORY_STEPS, HORIZON_STEPS
 from tasks.world.frames import wrap_angle
+from tasks.world.geometry import ego_boxes, touching
 from tasks.world.lanes import LightState, TrafficLights
 from tasks.world.vehicle import AX, EGO_STATE_SIZE, HEADING, PACIFICA, VX, X
 

@@ -12,10 +12,10 @@ from factory.readers.scenarionet.sidecars import cameras_in, load_sidecar
 from factory.readers.videos import frame_uri
 from factory.wording import shown
 from tasks.world.arrays import Array
-from tasks.world.bounds import all_within
 from tasks.world.camera import ROTATION_SLACK, Camera, Fisheye, SensorFile
 from tasks.world.clip import STEP_S
 from tasks.world.frames import upright, wrap_angle
+from tasks.world.geometry import all_within
 from tasks.world.vehicle import HEADING, X, Y
 
 MAX_ENTRIES = 500_000

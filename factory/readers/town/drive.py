@@ -22,7 +22,7 @@ from factory.readers.town.traffic import (
     path_of_lanes,
 )
 from tasks.world.arrays import Array
-from tasks.world.boxes import ego_boxes
+from tasks.world.geometry import ego_boxes
 from tasks.world.polygons import arc_lengths
 from tasks.world.vehicle import PACIFICA, VX
 

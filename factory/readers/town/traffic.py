@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from factory.readers.town import curves
 from factory.readers.town.streets import Streets
 from tasks.world.arrays import Array, Bools
-from tasks.world.boxes import touching
+from tasks.world.geometry import touching
 from tasks.world.polygons import arc_lengths
 
 STEP_S = 0.1

@@ -30,8 +30,8 @@ from tasks.rollout.lqr import track
 from tasks.stages import Rejected
 from tasks.world.agents import AgentTracks
 from tasks.world.arrays import Array
-from tasks.world.boxes import ego_boxes
 from tasks.world.clip import Scene
+from tasks.world.geometry import ego_boxes
 from tasks.world.lanes import LightState, MapLayer, MapPolygon
 from tasks.world.polygons import polygons_near
 from tasks.world.vehicle import EGO_STATE_SIZE, PACIFICA

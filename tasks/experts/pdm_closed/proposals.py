@@ -18,9 +18,9 @@ from tasks.kernels.compiled import kernel
 from tasks.rollout.polylines import extent
 from tasks.world.agents import AgentKind, AgentTracks
 from tasks.world.arrays import Array, Bools, Indices, Ints
-from tasks.world.boxes import ego_boxes
 from tasks.world.frames import box_corners
 from tasks.world.geometry import (
+    ego_boxes,
     ring_contains,
     rings_distance,
     rings_touch,

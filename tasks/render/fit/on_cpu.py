@@ -6,18 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tasks.render.fit.backdrop import backdrop_gradient
-from tasks.render.fit.backend import Derivatives
-from tasks.render.fit.composition import OwnedGaussians, by_box, parts_of
+from tasks.render.fit.backend import Derivatives, OwnedGaussians, backdrop_gradient, by_box, parts_of
 from tasks.render.fit.corrections import corrected, exposed, exposed_gradient
 from tasks.render.fit.losses import opaque_loss, photo_loss
-from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import Problem
 from tasks.render.fit.state import FitState
 from tasks.render.scene.asset import psnr
 from tasks.render.scene.movers import SHIFT_SIZE
 from tasks.render.scene.sensed import Photo
-from tasks.render.scene.sky_lookup import SkyCells, backdrop, sky_cells
+from tasks.render.scene.sky import SkyCells, backdrop, sky_cells
+from tasks.render.settings import FitSettings
 from tasks.render.splatting.gaussians import Gaussians, concatenate, moved
 from tasks.render.splatting.gradient import Gradients, backward, unmoved
 from tasks.render.splatting.project import DEPTH

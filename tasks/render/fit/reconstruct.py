@@ -2,28 +2,240 @@
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
+from tasks.kernels.compiled import kernel
 from tasks.render.fit.backend import Derivatives, FitBackend, Held
 from tasks.render.fit.corrections import after, between, corrected, exposed, inverse, matrix_of, reference
-from tasks.render.fit.density import refine
-from tasks.render.fit.floaters import clear_floaters
-from tasks.render.fit.lpips import Lpips
+from tasks.render.fit.losses import Lpips, Target, ssim
 from tasks.render.fit.on_cpu import OnCpu, compose, look
-from tasks.render.fit.quality import measured
-from tasks.render.fit.settings import FitSettings
-from tasks.render.fit.start import Problem, prepare
-from tasks.render.fit.state import BACKGROUND, FitState
-from tasks.render.scene.asset import Exposure, RenderAsset, mean_psnr_db
-from tasks.render.scene.movers import SHIFT_SIZE, BoxShifts, knots_at, shifted_boxes, world_from_boxes
-from tasks.render.scene.sensed import Photo, Sweep
-from tasks.render.scene.settings import Backend
-from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
+from tasks.render.fit.start import Problem, Shot, prepare
+from tasks.render.fit.state import BACKGROUND, FitState, Road, above_road, opacities_of, refine
+from tasks.render.scene.asset import ClassQuality, Exposure, RenderAsset, ViewQuality, mean_psnr_db, psnr
+from tasks.render.scene.body import BEFORE_M, bodies_near, nearest_box
+from tasks.render.scene.engine import Vehicles, render
+from tasks.render.scene.movers import (
+    SHIFT_SIZE,
+    BoxShifts,
+    at_knots,
+    behind_boxes,
+    knots_at,
+    shifted_boxes,
+    world_from_boxes,
+)
+from tasks.render.scene.sensed import Photo, Sweep, shifted
+from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap, directions
+from tasks.render.scene.stereo import FAR_M
+from tasks.render.settings import Backend, FitSettings
 from tasks.render.splatting.gaussians import moved
 from tasks.render.splatting.gsplat_backend import require
-from tasks.world.agents import AgentTracks
-from tasks.world.arrays import F32, Array
+from tasks.world.agents import AgentKind, AgentTracks
+from tasks.world.arrays import F32, Array, Bools, Ints
+from tasks.world.camera import Pinhole
+
+# How well a scene shows photos that it was not made of: drawn as pictures at new poses are, and held against them.
+#
+# The classes are told by geometry alone, so that they are the same pixels whatever a scene makes of them: vehicles
+# are what looks at a vehicle's box, road what meets the road's surface within ROAD_M, rest is all else.
+
+ROAD_M = 30.0  # from the camera; farther a pixel is too long a piece of road
+RAY_FROM_M, STEPS = 0.5, 60  # where a ray is followed from, and in how many steps
+LEAST_PIXELS = 40  # of a class in a photo, that it is measured
+SAME_WAY = 0.87  # cosine: photos that look within 30 degrees of each other
+
+
+def measured(
+    asset: RenderAsset,
+    problem: Problem,
+    shot: Shot,
+    scene_from_camera: Array,
+    threads: int = 1,
+    lpips: Lpips | None = None,
+) -> ViewQuality:
+    """Of a photo that was held out, as `asset` shows it from a pose (4, 4) in the problem's frame.
+
+    The camera has the colours that it has at any new pose then, and tracks are where photos say that they were. Pixels
+    without weight say nothing; LPIPS, whose layers see far around, is of the whole picture.
+    """
+    photo, target = shot.photo, shot.compared.target
+    picture = drawn(asset, problem, photo, scene_from_camera, threads)
+    boxes, valid = boxes_in(asset, problem, photo)
+    vehicles = boxes[[j for j in np.flatnonzero(valid) if problem.tracks.kinds[j] == AgentKind.VEHICLE]]
+    classes = classes_of(photo, vehicles, problem.road)
+    found = [_of_class(name, picture, target, inside) for name, inside in classes.items()]
+    counted = target.weight > 0.0
+    return ViewQuality(
+        photo.camera,
+        photo.time_s,
+        psnr(picture[counted], target.rgb[counted]) if counted.any() else float("nan"),
+        ssim(picture, target)[0],
+        held_out=True,
+        lpips=float("nan") if lpips is None else lpips(picture, target.rgb),
+        away_m=away(photo, [other.photo for other in problem.train]),
+        classes=tuple(of for of in found if of is not None),
+    )
+
+
+def drawn(asset: RenderAsset, problem: Problem, photo: Photo, scene_from_camera: Array, threads: int = 1) -> F32:
+    """What `asset` shows (H, W, 3) in place of a photo from a pose (4, 4) in the problem's frame: as pictures of
+    samples are drawn, in the colours of its camera then, its tracks where photos say that they were."""
+    boxes, valid = boxes_in(asset, problem, photo)
+    rows = np.flatnonzero(valid)
+    there = Vehicles(
+        tuple(problem.tracks.ids[j] for j in rows),
+        tuple(problem.tracks.kinds[j] for j in rows),
+        boxes[rows] + np.concatenate([problem.origin, np.zeros(4)]),
+    )
+    height, width = photo.rgb.shape[:2]
+    eye = Pinhole(photo.intrinsics, shifted(scene_from_camera, problem.origin), width, height)
+    affines = [asset.affine_of(photo.camera, photo.time_s)]
+    return render(asset, [eye], there, threads=threads, affines=affines)[0].rgb
+
+
+def boxes_in(asset: RenderAsset, problem: Problem, photo: Photo) -> tuple[Array, Bools]:
+    """Boxes (N, 7) of the problem's tracks when a photo was taken, in its frame, and which of them are there (N,)."""
+    boxes, valid = problem.tracks.at(photo.taken_s)
+    return shifted_boxes(boxes, asset.shifts.at(photo.taken_s, problem.tracks.ids)), valid
+
+
+def classes_of(photo: Photo, vehicles: Array, road: Road | None) -> dict[str, Bools]:
+    """Pixels (H, W) of a photo by class; `vehicles` (N, 7) boxes in its frame."""
+    height, width = photo.rgb.shape[:2]
+    rays = directions(photo.intrinsics, photo.world_from_camera, width, height).reshape(-1, 3)
+    eye = np.ascontiguousarray(photo.world_from_camera[:3, 3])
+    on_vehicle = np.asarray(behind_boxes(eye + FAR_M * rays, eye, np.ascontiguousarray(vehicles)), bool)
+    on_road = np.zeros(len(rays), bool) if road is None else meets(road, eye, rays) & ~on_vehicle
+    classes = {"road": on_road, "vehicles": on_vehicle, "rest": ~(on_road | on_vehicle)}
+    return {name: inside.reshape(height, width) for name, inside in classes.items()}
+
+
+def meets(road: Road, eye: Array, rays: Array) -> Bools:
+    """Which rays (M, 3) from `eye` (3,) go below the known road within ROAD_M, not where it is unknown."""
+    unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    over, found = np.zeros(len(rays), bool), np.zeros(len(rays), bool)
+    for length in np.geomspace(RAY_FROM_M, ROAD_M, STEPS):
+        height = above_road((eye + length * unit).astype(np.float32), road)
+        found |= over & (height <= 0.0)
+        over = ~found & (height > 0.0)
+    return found
+
+
+def away(photo: Photo, others: Sequence[Photo]) -> float:
+    """How far [m] a photo was taken from the nearest of `others` that look the same way; inf where none does."""
+    poses = np.stack([other.world_from_camera for other in others])
+    same = poses[:, :3, 2] @ photo.world_from_camera[:3, 2] > SAME_WAY
+    places = poses[same, :3, 3] - photo.world_from_camera[:3, 3]
+    return float(np.linalg.norm(places, axis=1).min(initial=np.inf))
+
+
+def _of_class(name: str, picture: F32, target: Target, inside: Bools) -> ClassQuality | None:
+    counted = inside & (target.weight > 0.0)
+    if counted.sum() < LEAST_PIXELS:
+        return None
+    of = Target(target.rgb, target.mean, target.variance, counted.astype(np.float32))
+    return ClassQuality(name, float(counted.mean()), psnr(picture[counted], target.rgb[counted]), ssim(picture, of)[0])
+
+
+# Gaussians of the street that hang before a vehicle which drives: they explain a photo or two, and hide it elsewhere.
+#
+# A vehicle that drives past is seen for a few instants, each time against another part of the street. Where its own
+# Gaussians do not match a photo yet, some of the street come to stand between; from the photo's own place the picture
+# is right, from a metre aside there is rubble before the vehicle. What really stands there, other photos show as
+# well.
+
+LEAST_OPACITY = 0.02  # what hides less may stay
+ALIKE = 0.08  # of every colour channel: a photo that differs by less shows the Gaussian
+FARTHER = 2.0  # times the depth at which it hides: photos from farther off see too little of it
+SHOWN_BY = 0.5  # of the photos that look at its place: no more, and it is a floater
+NEAREST_M = 0.3  # to a camera
+GONE_LOGIT = -8.0  # of its opacity
+
+
+def clear_floaters(problem: Problem, state: FitState) -> int:
+    """Makes floaters transparent, in place, for `refine` to put them elsewhere. Returns how many there were."""
+    rows = floaters(problem, state)
+    state.learned["logits"].values[rows] = GONE_LOGIT
+    state.learned["logits"].forget(rows)
+    if state.noted:
+        state.averages["logits"][rows] = GONE_LOGIT
+    return len(rows)
+
+
+def floaters(problem: Problem, state: FitState) -> Ints:
+    """Rows (M,) of Gaussians of the street, not of its road, that hide the body of a vehicle which drives in some photo
+    by BEFORE_M or more, and that at most SHOWN_BY of the other photos which look there show in their own colour.
+
+    No other photo looks there: it goes too. A photo in which such a body hides the place says nothing of it.
+    """
+    n = int(np.searchsorted(state.owner, BACKGROUND + 1))
+    loose = ~state.road[:n] & (opacities_of(state.learned["logits"].values[:n, 0]) > LEAST_OPACITY)
+    rows = np.flatnonzero(loose)
+    means = state.learned["means"].values[rows].astype(np.float64)
+    least_m, silent = np.full(len(rows), np.inf), list[Ints]()
+    for i in range(len(problem.train)):
+        hiding, depths_m, hidden = _at_bodies(problem, state, i, means)
+        least_m[hiding] = np.minimum(least_m[hiding], depths_m)
+        silent.append(np.concatenate([hiding, hidden]))
+    found = np.flatnonzero(np.isfinite(least_m))
+    looked, shown = np.zeros(len(found), np.int64), np.zeros(len(found), np.int64)
+    colours = state.learned["colours"].values[rows[found]]
+    for i, shot in enumerate(problem.train):
+        pixel, depth_m = _in_photo(shot, state.learned["poses"].values[i], means[found])
+        looking = (pixel >= 0) & (depth_m < FARTHER * least_m[found]) & ~np.isin(found, silent[i])
+        if shot.hidden is not None:
+            looking &= ~shot.hidden.ravel()[pixel]
+        mine = exposed(colours[looking], state.learned["exposure"].values[i])
+        theirs = shot.photo.rgb.reshape(-1, 3)[pixel[looking]] / np.float32(255.0)
+        looked += looking
+        shown[looking] += np.abs(np.clip(mine, 0.0, 1.0) - theirs).max(axis=1) < ALIKE
+    return rows[found[shown <= SHOWN_BY * looked]]
+
+
+def _at_bodies(problem: Problem, state: FitState, i: int, means: Array) -> tuple[Ints, Array, Ints]:
+    """Of `means` (M, 3) those that hide the body of a vehicle which drives in photo `i`, their depths in it [m], and
+    those that such a body hides."""
+    shot, tracks, nothing = problem.train[i], problem.tracks, np.zeros(0, np.int64)
+    boxes, valid = tracks.at(shot.photo.taken_s)
+    off = state.learned["boxes"].values.reshape(len(boxes), tracks.n_knots, SHIFT_SIZE)
+    boxes = shifted_boxes(boxes, at_knots(off, shot.photo.taken_s))
+    eye = corrected(shot.photo.world_from_camera, state.learned["poses"].values[i])[:3, 3].copy()
+    bodies, drives = bodies_near(boxes, valid, tracks, eye)
+    if not drives.any():
+        return nothing, np.zeros(0), nothing
+    pixel, depth_m = _in_photo(shot, state.learned["poses"].values[i], means)
+    rows = np.flatnonzero(pixel >= 0)
+    along, first = nearest_box(means[rows] - eye, eye, bodies)
+    on = (first >= 0) & drives[first]
+    rows, along = rows[on], along[on]
+    before_m = (along - 1.0) * np.linalg.norm(means[rows] - eye, axis=1)
+    hiding = rows[before_m > BEFORE_M]
+    return hiding, depth_m[hiding], rows[before_m < 0.0]
+
+
+def _in_photo(shot: Shot, pose: F32, means: Array) -> tuple[Ints, Array]:
+    """Which pixel of the photo shows each mean (M, 3), row by row, -1 where none does; and its depth [m]."""
+    camera_from_scene = np.linalg.inv(corrected(shot.photo.world_from_camera, pose))
+    return project(means, camera_from_scene, shot.photo.intrinsics, *shot.photo.rgb.shape[:2])
+
+
+@kernel
+def project(means: Any, camera_from_scene: Any, k: Any, height: int, width: int) -> Any:
+    """As `_in_photo` has it, for a camera (4, 4) with intrinsics (3, 3)."""
+    pixel, depth = np.full(means.shape[0], -1, np.int64), np.zeros(means.shape[0])
+    m = camera_from_scene
+    for i in range(means.shape[0]):
+        x, y, z = means[i, 0], means[i, 1], means[i, 2]
+        depth[i] = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+        if depth[i] <= NEAREST_M:
+            continue
+        u = k[0, 0] * (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / depth[i] + k[0, 2]
+        v = k[1, 1] * (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth[i] + k[1, 2]
+        if 0.0 <= u < width and 0.0 <= v < height:
+            pixel[i] = int(v) * width + int(u)
+    return pixel, depth
+
 
 REPORT_EVERY = 100
 SH_RATE = 6e-4  # step size of what depends on the direction

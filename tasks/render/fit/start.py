@@ -6,21 +6,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tasks.kernels.threads import in_chunks
-from tasks.render.fit.adam import Learned
 from tasks.render.fit.corrections import EXPOSURE_SIZE, POSE_SIZE, between, exposures_of, in_agreement, instants
 from tasks.render.fit.losses import Target, target_of
-from tasks.render.fit.road import Road, above_road, find_road, lay_flat
-from tasks.render.fit.settings import FitSettings
-from tasks.render.fit.state import BACKGROUND, FitState, logits_of
+from tasks.render.fit.state import BACKGROUND, FitState, Learned, Road, above_road, find_road, lay_flat, logits_of
 from tasks.render.scene.body import on_bodies, unseen_body
 from tasks.render.scene.build import held_out_rows, sky_of, surfaces
-from tasks.render.scene.confirmed import with_confirmed
+from tasks.render.scene.depth import Seen, see, with_confirmed
 from tasks.render.scene.features import NOTHING_KNOWN, Known, Points, known_without_lidar
 from tasks.render.scene.movers import SHIFT_SIZE, behind_boxes
 from tasks.render.scene.sensed import Photo, Sweep, Tracks, fuse, reduced, shifted
-from tasks.render.scene.sight import Seen, see
 from tasks.render.scene.sky import directions
 from tasks.render.scene.stereo import FAR_M
+from tasks.render.settings import FitSettings
 from tasks.render.splatting import sh
 from tasks.render.splatting.gaussians import Gaussians, concatenate, rotations_of
 from tasks.world.agents import AgentKind, AgentTracks

@@ -1,15 +1,241 @@
 """All that the fit has learned so far: plain arrays, to be stored and handed back."""
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
-from tasks.render.fit.adam import Learned
-from tasks.render.fit.road import Road, lay_flat
-from tasks.render.splatting.gaussians import Gaussians
-from tasks.world.arrays import F32, Bools, FloatArray, Ints, ShortInts
+from tasks.kernels.compiled import kernel
+from tasks.render.settings import FitSettings
+from tasks.render.splatting.gaussians import Gaussians, rotations_of
+from tasks.world.arrays import F32, Array, Bools, FloatArray, Ints, ShortInts
+
+# Adam (Kingma and Ba 2015) for rows of an array, each with a count of steps of its own.
+#
+# Only rows that a photo shows are stepped: what is out of sight keeps still, and its moments wait for it.
+
+BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
+
+
+@dataclass
+class Learned:
+    """An array that is learned, with its moments."""
+
+    values: F32  # (N, C)
+    first: F32  # (N, C) running mean of the gradient
+    second: F32  # (N, C) running mean of its square
+    steps: ShortInts  # (N,) how often each row was stepped
+
+    @classmethod
+    def of(cls, values: FloatArray) -> "Learned":
+        """Never stepped yet; `values` (N, C)."""
+        start = np.array(values, np.float32, order="C")
+        return cls(start, np.zeros_like(start), np.zeros_like(start), np.zeros(len(start), np.int32))
+
+    def step(self, rows: Ints, gradient: F32, rate: float, scale: F32 | None = None) -> None:
+        """Moves `rows` (M,), none twice, against `gradient` (M, C) by `rate`, times `scale` (M,) where given."""
+        sizes = np.ones(len(rows), np.float32) if scale is None else scale
+        self.steps[rows] += 1
+        counts = np.arange(self.steps.max(initial=0) + 1)
+        unbiased = np.stack([1.0 - BETA1**counts, 1.0 - BETA2**counts], axis=1)
+        step_rows(self.values, self.first, self.second, self.steps, rows, gradient, rate, sizes, unbiased)
+
+    def take(self, rows: Ints) -> "Learned":
+        """The rows (M,), moments and all."""
+        return Learned(self.values[rows], self.first[rows], self.second[rows], self.steps[rows])
+
+    def forget(self, rows: Ints) -> None:
+        """What `rows` are now has nothing to do with what they were."""
+        self.first[rows], self.second[rows], self.steps[rows] = 0.0, 0.0, 0
+
+
+@kernel
+def step_rows(
+    values: Any, first: Any, second: Any, steps: Any, rows: Any, gradient: Any, rate: float, sizes: Any, unbiased: Any
+) -> None:
+    """One step of `Learned`, in place: x -= rate size m / (sqrt(v) + eps), m and v without their start's bias."""
+    for k in range(rows.shape[0]):
+        i = rows[k]
+        size = rate * sizes[k] / unbiased[steps[i], 0]
+        unbiased2 = unbiased[steps[i], 1]
+        for c in range(values.shape[1]):
+            g = float(gradient[k, c])
+            m = BETA1 * first[i, c] + (1.0 - BETA1) * g
+            v = BETA2 * second[i, c] + (1.0 - BETA2) * g * g
+            first[i, c] = m
+            second[i, c] = v
+            values[i, c] -= size * m / (math.sqrt(v / unbiased2) + EPSILON)
+
+
+# The road as lidar knows it: a smooth height field, and Gaussians that lie flat on it.
+#
+# Seen from one lane only, a road explains its photos just as well with paint that floats or stands; from a metre to
+# the side that paint breaks. Road Gaussians therefore keep to the surface, thin, with their third axis along its
+# normal.
+
+CELL_M = 0.5
+SMOOTH_CELLS = 1.5
+BESIDE_M = 15.0  # how far from where the cameras were a road is looked for
+BELOW_M = (0.8, 3.0)  # of the cameras
+NEAR_PLANE_M = 0.12  # what is further from the local plane is no road
+PLANE_REACH_M = 15.0
+LEAST_POINTS = 30
+ALONG_M = 4.0  # a plane is fitted about this often
+SLACK_M = 0.02  # how far a road Gaussian may leave the lidar's surface
+THICKNESS_M = 0.005  # of a road Gaussian
+# Standard deviation: a rasteriser draws a Gaussian as it looks at its middle, and one that reaches from afar to beneath
+# the camera hangs as a veil before what is above the horizon.
+LONGEST_M = 0.8
+
+
+@dataclass(frozen=True)
+class Road:
+    """Heights on a grid; NaN where no road is known."""
+
+    corner: Array  # (2,) x, y of the first node [m]
+    heights: Array  # (X, Y) [m], every CELL_M
+    slopes: Array  # (X, Y, 2) d height / d x, d y
+
+
+def find_road(points: Array, eyes: Array) -> Road | None:
+    """The road under the cameras: lidar `points` (M, 3), camera centres `eyes` (V, 3); None where there is none.
+
+    Around each few metres of the way a plane is fitted to what lies below the cameras, and fitted again to what is
+    near it; points near any plane make the height field.
+    """
+    on_road = np.zeros(len(points), bool)
+    for eye in _spaced(eyes):
+        away = np.linalg.norm(points[:, :2] - eye[:2], axis=1)
+        below = eye[2] - points[:, 2]
+        use = np.flatnonzero((away < PLANE_REACH_M) & (below > BELOW_M[0]) & (below < BELOW_M[1]))
+        plane = _plane(points[use], eye)
+        if plane is None:
+            continue
+        near = away < BESIDE_M
+        off = points[near, 2] - np.column_stack([points[near, :2] - eye[:2], np.ones(near.sum())]) @ plane
+        on_road[np.flatnonzero(near)[np.abs(off) < NEAR_PLANE_M]] = True
+    if on_road.sum() < LEAST_POINTS:
+        return None
+    return _field(points[on_road])
+
+
+def _spaced(eyes: Array) -> Sequence[Array]:
+    kept = [eyes[0]]
+    for eye in eyes:
+        if np.linalg.norm(np.array(kept)[:, :2] - eye[:2], axis=1).min() >= ALONG_M:
+            kept.append(eye)
+    return kept
+
+
+def _plane(points: Array, eye: Array) -> Array | None:
+    """z = a (x - eye x) + b (y - eye y) + c, (3,), by trimmed least squares from the median height on."""
+    if len(points) < LEAST_POINTS:
+        return None
+    design = np.column_stack([points[:, :2] - eye[:2], np.ones(len(points))])
+    plane = np.array([0.0, 0.0, float(np.median(points[:, 2]))])
+    for limit in (0.6, 0.4, 0.25, 0.15, NEAR_PLANE_M):
+        near = np.abs(points[:, 2] - design @ plane) < limit
+        if near.sum() < LEAST_POINTS:
+            return None
+        plane = np.linalg.lstsq(design[near], points[near, 2], rcond=None)[0]
+    return np.asarray(plane)
+
+
+def _field(points: Array) -> Road:
+    corner = points[:, :2].min(axis=0) - 2.0 * CELL_M
+    size = np.ceil((points[:, :2].max(axis=0) - corner) / CELL_M).astype(int) + 3
+    cells = np.rint((points[:, :2] - corner) / CELL_M).astype(int)
+    flat = cells[:, 0] * size[1] + cells[:, 1]
+    count = np.bincount(flat, minlength=size.prod()).reshape(size).astype(float)
+    base = float(points[:, 2].mean())
+    total = np.bincount(flat, points[:, 2] - base, minlength=size.prod()).reshape(size)
+    weight = gaussian_filter(count, SMOOTH_CELLS, mode="constant")
+    known = weight > 0.02
+    heights = np.where(known, gaussian_filter(total, SMOOTH_CELLS, mode="constant") / np.maximum(weight, 1e-9), np.nan)
+    slope_x, slope_y = np.gradient(heights, CELL_M)
+    slopes = np.stack([slope_x, slope_y], axis=-1)
+    return Road(corner, np.where(np.isfinite(slopes).all(axis=-1), heights + base, np.nan), np.nan_to_num(slopes))
+
+
+@kernel
+def _height(heights: Any, slopes: Any, corner: Any, x: float, y: float) -> Any:
+    """Height and slopes at a place; NaN beyond the road."""
+    u, v = (x - corner[0]) / CELL_M, (y - corner[1]) / CELL_M
+    i, j = int(np.floor(u)), int(np.floor(v))
+    if i < 0 or j < 0 or i + 1 >= heights.shape[0] or j + 1 >= heights.shape[1]:
+        return np.nan, 0.0, 0.0
+    a, b = u - i, v - j
+    z, sx, sy = 0.0, 0.0, 0.0
+    for side in range(4):
+        p, q = i + side // 2, j + side % 2
+        share = (a if side // 2 else 1.0 - a) * (b if side % 2 else 1.0 - b)
+        z += share * heights[p, q]
+        sx += share * slopes[p, q, 0]
+        sy += share * slopes[p, q, 1]
+    return z, sx, sy
+
+
+@kernel
+def _above(means: Any, heights: Any, slopes: Any, corner: Any) -> Any:
+    out = np.empty(means.shape[0])
+    for i in range(means.shape[0]):
+        z, _, _ = _height(heights, slopes, corner, means[i, 0], means[i, 1])
+        out[i] = means[i, 2] - z
+    return out
+
+
+def above_road(means: FloatArray, road: Road) -> Array:
+    """How far points (N, 3) lie above the road [m]; NaN beyond it."""
+    return np.asarray(_above(means, road.heights, road.slopes, road.corner))
+
+
+@kernel
+def _lay(
+    means: Any,
+    quats: Any,
+    log_scales: Any,
+    rows: Any,
+    heights: Any,
+    slopes: Any,
+    corner: Any,
+    thick: float,
+    longest: float,
+) -> None:
+    for k in range(rows.shape[0]):
+        i = rows[k]
+        z, sx, sy = _height(heights, slopes, corner, means[i, 0], means[i, 1])
+        if z != z:
+            continue
+        means[i, 2] = min(max(means[i, 2], z - SLACK_M), z + SLACK_M)
+        for axis in range(3):
+            log_scales[i, axis] = min(log_scales[i, axis], thick if axis == 2 else longest)
+        # Turn the third axis onto the normal the shortest way: q' = (1 + a.n, a x n) q.
+        w, x, y, s = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
+        length = np.sqrt(w * w + x * x + y * y + s * s)
+        w, x, y, s = w / length, x / length, y / length, s / length
+        ax, ay, az = 2.0 * (x * s + w * y), 2.0 * (y * s - w * x), 1.0 - 2.0 * (x * x + y * y)
+        norm = 1.0 / np.sqrt(1.0 + sx * sx + sy * sy)
+        nx, ny, nz = -sx * norm, -sy * norm, norm
+        if ax * nx + ay * ny + az * nz < 0.0:  # the other face of the disc
+            nx, ny, nz = -nx, -ny, -nz
+        tw, tx, ty, tz = 1.0 + ax * nx + ay * ny + az * nz, ay * nz - az * ny, az * nx - ax * nz, ax * ny - ay * nx
+        norm = 1.0 / np.sqrt(tw * tw + tx * tx + ty * ty + tz * tz)
+        tw, tx, ty, tz = tw * norm, tx * norm, ty * norm, tz * norm
+        quats[i, 0] = tw * w - tx * x - ty * y - tz * s
+        quats[i, 1] = tw * x + tx * w + ty * s - tz * y
+        quats[i, 2] = tw * y - tx * s + ty * w + tz * x
+        quats[i, 3] = tw * s + tx * y - ty * x + tz * w
+
+
+def lay_flat(means: F32, quats: F32, log_scales: F32, rows: Ints, road: Road) -> None:
+    """Puts Gaussians at `rows` onto the road, in place: at most SLACK_M off it, no thicker than THICKNESS_M and
+    no longer than LONGEST_M, their third axis along its normal. Those beyond the road stay as they are."""
+    _lay(means, quats, log_scales, rows, road.heights, road.slopes, road.corner, *np.log([THICKNESS_M, LONGEST_M]))
+
 
 BACKGROUND = -1
 SHAPES = ("means", "quats", "log_scales", "logits", "colours", "sh_rest")  # learned, one row per Gaussian
@@ -128,3 +354,78 @@ def opacities_of(logits: F32) -> F32:
 def logits_of(opacities: FloatArray) -> F32:
     """The inverse of `opacities_of`."""
     return np.log(opacities / (1.0 - opacities)).astype(np.float32)
+
+
+# Where Gaussians are needed: relocation and growth of 3DGS-MCMC (Kheradmand et al. 2024).
+#
+# A Gaussian that became transparent is put on top of one that matters, and the number grows by a share until it is
+# full. Both of a pair are made weaker and narrower so that the picture stays the same (their equation 9).
+
+MOST_COPIES = 51  # of one Gaussian at once, as in the authors' code
+LEAST_OPACITY = 0.005
+DEAD_OPACITY = 0.01  # below which a Gaussian is moved elsewhere
+JITTER = 0.5  # how far from its source a copy is put, in standard deviations of it
+
+
+def refine(state: FitState, settings: FitSettings) -> None:
+    """Relocates and grows, in place; a function of seed and iteration alone."""
+    rng = np.random.Generator(np.random.Philox(key=[settings.seed, 2**32 + state.iteration]))
+    opacities = opacities_of(state.learned["logits"].values[:, 0]).astype(np.float64)
+    dead = opacities < DEAD_OPACITY
+    weight = np.where(dead, 0.0, opacities * state.wanted)
+    if weight.sum() > 0.0:
+        free = np.flatnonzero(dead)
+        target = min(settings.most_gaussians, int(len(state) * (1.0 + settings.growth)))
+        n_new = max(target - len(state), 0)
+        sources = rng.choice(len(state), len(free) + n_new, p=weight / weight.sum())
+        _copy(state, np.concatenate([free, np.arange(len(state), len(state) + n_new)]), sources, rng)
+    state.wanted = np.zeros(len(state), np.float32)
+
+
+def _copy(state: FitState, targets: Ints, sources: Ints, rng: np.random.Generator) -> None:
+    """Puts copies of `sources` at the rows `targets` (M,), where rows beyond the last are new."""
+    if len(targets) == 0:
+        return
+    named, counts = np.unique(sources, return_counts=True)
+    logits, log_scales = state.learned["logits"].values, state.learned["log_scales"].values
+    opacities, shrink = shared(opacities_of(logits[named, 0]).astype(np.float64), counts + 1)
+    logits[named, 0] = logits_of(np.maximum(opacities, LEAST_OPACITY))
+    log_scales[named] += np.log(shrink)[:, None].astype(np.float32)
+    rows = np.arange(max(len(state), int(targets.max()) + 1))
+    rows[targets] = sources
+    state.rows(rows)
+    means = state.learned["means"].values
+    means[targets] += JITTER * _within(state, targets, rng)
+    for name in SHAPES:
+        state.learned[name].forget(np.concatenate([named, targets]))
+    state.rows(np.argsort(state.owner, kind="stable"))
+
+
+def _within(state: FitState, rows: Ints, rng: np.random.Generator) -> F32:
+    """Random offsets (M, 3) as far as the Gaussians at `rows` reach."""
+    quats = state.learned["quats"].values[rows]
+    turns = rotations_of(quats / np.linalg.norm(quats, axis=1, keepdims=True))
+    local = rng.standard_normal((len(rows), 3)) * np.exp(state.learned["log_scales"].values[rows])
+    return np.einsum("nij,nj->ni", turns, local).astype(np.float32)
+
+
+@kernel
+def _shrink(opacity: float, shared_opacity: float, n: int) -> float:
+    total = 0.0
+    for i in range(1, n + 1):
+        binomial = 1.0
+        for k in range(i):
+            total += binomial * (-1.0) ** k * shared_opacity ** (k + 1) / math.sqrt(k + 1.0)
+            binomial *= (i - 1 - k) / (k + 1.0)
+    return opacity / total
+
+
+@kernel
+def shared(opacities: Array, counts: Ints) -> tuple[Array, Array]:
+    """Opacity and factor of the scales, (N,) each, of each of `counts` Gaussians that together show what one did."""
+    out, shrink = np.empty(len(opacities)), np.empty(len(opacities))
+    for i in range(len(opacities)):
+        n = min(counts[i], MOST_COPIES)
+        out[i] = 1.0 - (1.0 - opacities[i]) ** (1.0 / n)
+        shrink[i] = _shrink(opacities[i], out[i], n)
+    return out, shrink

@@ -2,19 +2,262 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
+import cv2
 import numpy as np
+from scipy.ndimage import uniform_filter
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation, Slerp
 
-from tasks.render.rig.adjust import Bundle, Matched, adjusted, offsets, read_after_s, triangulated, without
-from tasks.render.rig.corners import Corners
-from tasks.render.rig.late import delays, with_stamps
-from tasks.render.rig.matching import matched_corners, pairs
-from tasks.render.rig.normal import N_CAMERA
-from tasks.render.rig.rig import Rig, Shots, camera_of_rig, given_rig, twists_of
-from tasks.render.rig.settings import RigSettings
-from tasks.world.arrays import Array
+from tasks.render.rig.adjust import (
+    N_CAMERA,
+    STAMP,
+    Bundle,
+    Matched,
+    Rig,
+    Shots,
+    adjusted,
+    camera_of_rig,
+    given_rig,
+    offsets,
+    part_of,
+    rays,
+    read_after_s,
+    triangulated,
+    twists_of,
+    without,
+)
+from tasks.render.scene.driven_road import WIDE_M, driven_roads
+from tasks.render.scene.movers import behind_boxes
+from tasks.render.scene.sensed import Photo, Tracks
+from tasks.render.scene.sky import directions
+from tasks.render.scene.stereo import FAR_M
+from tasks.render.settings import RigSettings
+from tasks.world.agents import AgentTracks
+from tasks.world.arrays import F32, Array, Bools, Bytes, Indices
 from tasks.world.camera import Camera, SensorFile
+
+# Corners of a photo, and which of them two photos share (SIFT, Lowe 2004).
+
+CONTRAST = 0.02  # OpenCV's threshold, half its default: asphalt and facades have faint corners
+RATIO = 0.85  # the second best match must be this much worse
+UNIT = 512.0  # length of a descriptor: whole numbers whose products are exact in float32, in any order of the sum
+EPIPOLAR_PX = 2.0  # of the picture that corners were looked for in: how far a match may miss its line
+LEAST_MATCHES = 12  # that agree with one geometry of two photos
+
+
+@dataclass(frozen=True)
+class Corners:
+    """What is remembered of one photo."""
+
+    at: Array  # (K, 2) pixels of the photo as it was taken, the centre of the first at (0.5, 0.5)
+    descriptors: F32  # (K, 128) whole numbers
+    pixel: float  # pixels of the photo per pixel of the picture that was looked at
+
+
+def corners_of(rgb: Bytes, width: int, most: int, hidden: Bools | None = None) -> Corners:
+    """The corners of a photo (H, W, 3) shrunk to `width`, none where it is `hidden` (h, w), a mask of any size."""
+    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    scale = max(1.0, rgb.shape[1] / width)
+    size = round(rgb.shape[1] / scale), round(rgb.shape[0] / scale)
+    if scale > 1.0:
+        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    mask = None
+    if hidden is not None:
+        mask = 255 - 255 * cv2.resize(hidden.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    sift = cv2.SIFT_create(nfeatures=most, contrastThreshold=CONTRAST)  # type: ignore[attr-defined]
+    found, descriptors = sift.detectAndCompute(grey, mask)
+    if descriptors is None:
+        return Corners(np.zeros((0, 2)), np.zeros((0, 128), np.float32), scale)
+    at = (np.array([corner.pt for corner in found], np.float64) + 0.5) * [
+        rgb.shape[1] / size[0],
+        rgb.shape[0] / size[1],
+    ]
+    # One corner may be found with several orientations; distances of square roots compare better (Arandjelovic 2012).
+    share = descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1.0)
+    return Corners(at, np.rint(UNIT * np.sqrt(share)).astype(np.float32), scale)
+
+
+def matches(a: Corners, b: Corners) -> tuple[Indices, Indices]:
+    """Rows of corners that are each other's best by far and agree with one geometry; none where too few do."""
+    nobody = np.zeros(0, np.intp), np.zeros(0, np.intp)
+    if min(len(a.at), len(b.at)) < LEAST_MATCHES:
+        return nobody
+    alike = a.descriptors @ b.descriptors.T
+    best = alike.argmax(axis=1)
+    rows = np.arange(len(best))
+    first = alike[rows, best]
+    mutual = alike.argmax(axis=0)[best] == rows
+    alike[rows, best] = -1.0
+    second = alike.max(axis=1)
+    norms = [(c.descriptors**2).sum(axis=1) for c in (a, b)]
+    near = norms[0] + norms[1][best] - 2.0 * first
+    next_near = norms[0] + UNIT**2 - 2.0 * second
+    keep = np.flatnonzero(mutual & (near < RATIO**2 * next_near))
+    if len(keep) < LEAST_MATCHES:
+        return nobody
+    pairs = [c.at[r] / c.pixel for c, r in ((a, keep), (b, best[keep]))]
+    _, agree = cv2.findFundamentalMat(pairs[0], pairs[1], cv2.USAC_MAGSAC, EPIPOLAR_PX, 0.999, 2000)
+    if agree is None or agree.sum() < LEAST_MATCHES:
+        return nobody
+    keep = keep[agree.ravel() > 0]
+    return keep, best[keep]
+
+
+# Which photos are compared, and the corners that show one point in several of them.
+
+DEPTHS_M = (5.0, 12.0, 40.0)  # at which it is asked what two photos share
+LIKELY, LIKELY_SHARE = 0.09, 0.5  # 5 degrees that a match may be off as given; share of a pair's that must not be
+GRID = (6, 4)  # pixels of a photo that are asked for, across and down
+LEAST_SHARE = 0.15  # of the first photo that the second must show
+BASELINES_M = (0.3, 20.0)  # less: no parallax; more: nothing looks the same
+BEST_M = (1.0, 3.0, 8.0)  # baselines that partners of the same camera are chosen near; a gap in one is filled by others
+
+
+def pairs(rig: Rig, shots: Shots, cameras: Sequence[Camera], partners: int) -> list[tuple[int, int]]:
+    """Rows of the photos that are compared: of each camera up to `partners` of those that show the same place."""
+    poses = shots.world_from_ego @ rig.ego_from_camera[shots.camera_of]
+    found = set()
+    for i in range(len(poses)):
+        share = _shared(i, poses, rig, shots, cameras)
+        away = np.linalg.norm(poses[:, :3, 3] - poses[i, :3, 3], axis=1)
+        for c in range(len(cameras)):
+            mine = c == shots.camera_of[i]
+            reach = (away > (BASELINES_M[0] if mine else 0.0)) & (away < BASELINES_M[1])
+            rows = np.flatnonzero((shots.camera_of == c) & (share >= LEAST_SHARE) & reach)
+            rows = rows[rows != i]
+            if mine:
+                rows = rows[rows > i]
+                best = [rows[np.argmin(np.abs(np.log(away[rows] / m)))] for m in BEST_M if len(rows)]
+                nearest = rows[np.argsort(away[rows], kind="stable")[:partners]]
+                chosen = {int(j) for j in (*best, *nearest)}
+            else:
+                chosen = {int(j) for j in rows[np.argsort(-share[rows], kind="stable")[:partners]]}
+            found |= {(min(i, j), max(i, j)) for j in chosen}
+    return sorted(found)
+
+
+def _shared(i: int, poses: Array, rig: Rig, shots: Shots, cameras: Sequence[Camera]) -> Array:
+    """(V,) share of photo i that each photo shows, were all of it at DEPTHS_M."""
+    camera, lens = cameras[shots.camera_of[i]], rig.lenses[shots.camera_of[i]]
+    u, v = np.meshgrid((np.arange(GRID[0]) + 0.5) / GRID[0], (np.arange(GRID[1]) + 0.5) / GRID[1])
+    x, y = (u.ravel() * camera.width - lens[2]) / lens[0], (v.ravel() * camera.height - lens[3]) / lens[1]
+    way = np.column_stack([x, y, np.ones(len(x))])
+    points = np.concatenate([depth * way for depth in DEPTHS_M]) @ poses[i, :3, :3].T + poses[i, :3, 3]
+    local = np.einsum("vji,vpj->vpi", poses[:, :3, :3], points - poses[:, None, :3, 3])
+    lenses = rig.lenses[shots.camera_of][:, None]
+    size = np.array([(c.width, c.height) for c in cameras])[shots.camera_of][:, None]
+    ahead = np.maximum(local[..., 2], 0.1)
+    column, row = (lenses[..., k] * local[..., k] / ahead + lenses[..., 2 + k] for k in range(2))
+    inside = (local[..., 2] > 0.5) & (column > 0) & (column < size[..., 0]) & (row > 0) & (row < size[..., 1])
+    return np.asarray(inside.mean(axis=1))
+
+
+def _likely(rig: Rig, shots: Shots, views: tuple[int, int], at_a: Array, at_b: Array) -> float:
+    """Share of two photos' matches (M, 2) that the rig as given explains but for some degrees."""
+    n = len(at_a)
+    at = np.stack([at_a, at_b], axis=1).reshape(-1, 2)
+    focal = rig.lenses[shots.camera_of[list(views)], 0]
+    pair = Matched(2 * np.arange(n + 1), np.tile(views, n), at, np.tile(focal, n))
+    points, there = triangulated(rig, shots, pair)
+    _, ways = rays(rig, shots, pair)
+    near = np.nan_to_num(offsets(rig, shots, pair, points).reshape(-1, 2).max(axis=1), nan=np.inf) < LIKELY
+    far = np.linalg.norm(ways[0::2] - ways[1::2], axis=1) < LIKELY
+    return float(((near & there) | far).mean())
+
+
+def matched_corners(rig: Rig, shots: Shots, corners: Sequence[Corners], compared: Sequence[tuple[int, int]]) -> Matched:
+    """Matches of all pairs of photos, joined where they share a corner; without what has two corners in one photo.
+
+    A pair of photos most of whose matches lie far from where the rig as given has them is left out: one of the two is
+    not what it is said to be.
+    """
+    starts = np.concatenate([[0], np.cumsum([len(c.at) for c in corners])]).astype(np.int64)
+    first, second = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+    for i, j in compared:
+        a, b = matches(corners[i], corners[j])
+        if len(a) and _likely(rig, shots, (i, j), corners[i].at[a], corners[j].at[b]) >= LIKELY_SHARE:
+            first.append(starts[i] + a)
+            second.append(starts[j] + b)
+    edges = np.concatenate(first), np.concatenate(second)
+    n = int(starts[-1])
+    _, label = connected_components(coo_array((np.ones(len(edges[0]), bool), edges), shape=(n, n)), directed=False)
+    view = np.searchsorted(starts, np.arange(n), side="right") - 1
+    matched = np.zeros(n, bool)
+    matched[edges[0]] = matched[edges[1]] = True
+    size = np.bincount(label)
+    # Rows of one point and photo stand side by side: a point with such a pair is a mix of several.
+    order = np.lexsort((view, label))
+    twice = (label[order][1:] == label[order][:-1]) & (view[order][1:] == view[order][:-1])
+    mixed = np.zeros(len(size), bool)
+    mixed[label[order][1:][twice]] = True
+    rows = order[(matched & ~mixed[label])[order]]
+    at = np.concatenate([c.at for c in corners])
+    pixel = np.array([c.pixel for c in corners])
+    ends = np.flatnonzero(np.diff(label[rows], append=-1)) + 1
+    return Matched(np.concatenate([[0], ends]).astype(np.int64), view[rows], at[rows], pixel[view[rows]])
+
+
+# Which cameras took their photos later than their stamps say, where photos can tell.
+#
+# A camera that is late is shifted along the road by the ego's speed: at a steady speed, straight on, a mount that is
+# wrong explains the same photos, and nothing is gained by a delay. So one is believed where corners that were not
+# fitted agree clearly better with it. They can where speeds change or the ego turns.
+
+STAMP_OF_CAMERA = STAMP - 6  # of a camera's parameters
+EVERY = 4  # of so many points one is fitted and another measured: they decide as all do, in a fraction of the time
+LEAST_LATE_S = 0.01  # less is a decimetre at 10 m/s, which mounts have as well
+SURE = 5.0  # standard errors by which corners must agree better
+LEAST_GAIN = 0.02  # share of what they are off
+WIDTHS_PX = (8.0, 4.0, 2.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Delays:
+    """What photos say of their cameras' stamps."""
+
+    late_s: Array  # (C,) that photos are taken later than said, were it so
+    gain: float  # share by which corners that were not fitted are less off then
+    sure: float  # the same in standard errors
+    believed: Bools  # (C,)
+
+
+def delays(given: Rig, shots: Shots, matched: Matched, held: Bundle, sigmas: Array, stamp_s: float) -> Delays:
+    """Whose delay explains what nothing else does; `held` is what `sigmas` (n,), no delays, came to."""
+    every = np.ones(len(given.stamps), np.bool_)
+    fitted, measured = (part_of(matched, matched.point_of % EVERY == k) for k in (0, 1))
+    late = adjusted(given, shots, fitted, with_stamps(sigmas, every, stamp_s), held.rig, WIDTHS_PX).rig
+    found = np.abs(late.stamps) >= LEAST_LATE_S
+    if not found.any():
+        return Delays(late.stamps, 0.0, 0.0, found)
+    on_time = adjusted(given, shots, fitted, sigmas, held.rig, WIDTHS_PX).rig
+    gained, off = _gained(on_time, late, shots, measured)
+    if len(gained) < 2 or off == 0.0:
+        return Delays(late.stamps, 0.0, 0.0, ~every)
+    gain, sure = gained.mean() / off, gained.mean() / (gained.std() / np.sqrt(len(gained)) + 1e-12)
+    return Delays(late.stamps, float(gain), float(sure), found & bool(gain > LEAST_GAIN and sure > SURE))
+
+
+def with_stamps(sigmas: Array, cameras: Bools, stamp_s: float) -> Array:
+    """(n,) the same, the stamps of some cameras (C,) free."""
+    out = sigmas.copy()
+    of_camera = out[len(out) - N_CAMERA * len(cameras) :].reshape(-1, N_CAMERA)
+    of_camera[cameras, STAMP_OF_CAMERA] = stamp_s
+    return out
+
+
+def _gained(one: Rig, other: Rig, shots: Shots, matched: Matched) -> tuple[Array, float]:
+    """(P',) by how much less each point is off with the other rig, and how much all are on average with the first."""
+    costs, there = [], np.ones(len(matched.starts) - 1, np.bool_)
+    for rig in (one, other):
+        points, seen = triangulated(rig, shots, matched)
+        off = np.where(seen[matched.point_of], offsets(rig, shots, matched, points), 0.0)
+        costs.append(np.add.reduceat(np.log1p(np.minimum(off, 1e3) ** 2), matched.starts[:-1]))
+        there &= seen
+    return (costs[0] - costs[1])[there], float(costs[0][there].mean()) if there.any() else 0.0
+
 
 LEAST_CORNERS = 50  # of an instant: with fewer its correction is that between the instants before and after
 TOO_FAR = 10.0  # times what poses are expected to be off by: no pose is
@@ -195,3 +438,99 @@ def _before_and_after(rig: Rig, bundle: Bundle, shots: Shots, matched: Matched) 
 
 def _three(row: Array) -> tuple[float, float, float]:
     return float(row[0]), float(row[1]), float(row[2])
+
+
+# How high above the road a rig drove: at the right height of a plane its photos agree on what lies on it.
+#
+# Corners hardly ever lie on asphalt; its grain and paint still look alike in two photos where they are laid on the
+# road.
+
+HEIGHTS_M = np.arange(-1.2, 0.81, 0.06)  # of the road in the ego's frame: rear axle, ground, or a rig's own origin
+ACROSS_M = 0.1
+REACH_M = (3.0, 14.0)  # from a camera: nearer is the ego's own body, farther no grain is seen
+WINDOW = 9  # cells of ACROSS_M that are compared
+GRAIN = 1.0  # grey levels of deviation, below which a window says nothing
+LEAST_WINDOWS = 500
+LEAST_LIKENESS = 0.3  # correlation at the best height, below which none is right
+
+
+def ground_below(photos: Sequence[Photo], world_from_ego: Array) -> float | None:
+    """z [m] of the road in the frame of the ego, poses (V, 4, 4) of the photos; None where photos do not tell."""
+    order = np.argsort([photo.time_s for photo in photos], kind="stable")
+    times_s = np.array([photo.time_s for photo in photos])
+    greys = [cv2.cvtColor(photo.rgb, cv2.COLOR_RGB2GRAY).astype(np.float32) for photo in photos]
+    pairs: list[tuple[int, int]] = []
+    for name in sorted({photo.camera for photo in photos}):
+        mine = [int(i) for i in order if photos[i].camera == name]
+        pairs += pairwise(mine)
+    likeness = np.zeros(len(HEIGHTS_M))
+    for k, height in enumerate(HEIGHTS_M):
+        points = driven_roads(world_from_ego, times_s, float(height), ACROSS_M)
+        across = round(2.0 * WIDE_M / ACROSS_M) + 1
+        laid = [_laid(photo, grey, points, across) for photo, grey in zip(photos, greys)]
+        found = [_correlations(*laid[a], *laid[b]) for a, b in pairs]
+        every = np.concatenate(found) if found else np.zeros(0)
+        if len(every) >= LEAST_WINDOWS:
+            likeness[k] = every.mean()
+    best = int(likeness.argmax())
+    if likeness[best] < LEAST_LIKENESS or not 0 < best < len(HEIGHTS_M) - 1:
+        return None
+    before, top, after = likeness[best - 1 : best + 2]  # between heights: where the parabola through three is highest
+    part = 0.5 * (before - after) / (before - 2.0 * top + after)
+    return float(HEIGHTS_M[best] + part * (HEIGHTS_M[1] - HEIGHTS_M[0]))
+
+
+def _laid(photo: Photo, grey: F32, points: Array, across: int) -> tuple[F32, Bools]:
+    """The photo's grey (A, across) on the road's points, and where it shows them near enough."""
+    camera_from_world = np.linalg.inv(photo.world_from_camera)
+    x, y, z = photo.intrinsics @ (points @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]).T
+    ahead = np.maximum(z, 0.1)
+    u, v = (x / ahead - 0.5).astype(np.float32), (y / ahead - 0.5).astype(np.float32)
+    height, width = grey.shape
+    away = np.linalg.norm(points - photo.world_from_camera[:3, 3], axis=1)
+    seen = (z > 0.5) & (u > 0) & (v > 0) & (u < width - 1) & (v < height - 1)
+    seen &= (away > REACH_M[0]) & (away < REACH_M[1])
+    picture = cv2.remap(grey, u.reshape(-1, across), v.reshape(-1, across), cv2.INTER_LINEAR)
+    return np.asarray(picture, np.float32), seen.reshape(-1, across)
+
+
+def _correlations(a: F32, in_a: Bools, b: F32, in_b: Bools) -> Array:
+    """(M,) of the windows that both show and that have grain in both."""
+    both = in_a & in_b
+    rows = np.flatnonzero(both.any(axis=1))
+    if len(rows) == 0:
+        return np.zeros(0)
+    part = slice(rows[0], rows[-1] + 1)
+    whole = uniform_filter(both[part].astype(np.float64), WINDOW, mode="constant") > 0.999
+    one, other = a[part].astype(np.float64), b[part].astype(np.float64)
+    means = uniform_filter(one, WINDOW), uniform_filter(other, WINDOW)
+    variances = [uniform_filter(x * x, WINDOW) - m * m for x, m in zip((one, other), means)]
+    use = whole & (variances[0] > GRAIN**2) & (variances[1] > GRAIN**2)
+    shared = uniform_filter(one * other, WINDOW) - means[0] * means[1]
+    return np.asarray(shared[use] / np.sqrt(variances[0][use] * variances[1][use]))
+
+
+# What of a photo is not matched: boxes of what can move, and the own body.
+
+WIDTH = 240  # pixels of the mask
+LARGER_M = 0.6  # than the box: calibration and poses are what is not known yet
+
+
+def hidden_by(
+    agents: AgentTracks | None, camera: Camera, file: SensorFile, own_body: Bools | None = None
+) -> Bools | None:
+    """(h, w) pixels where something movable may be, or of the `own_body` (H, W); None where nothing is."""
+    boxes, there = Tracks(agents, np.zeros(3)).at(file.time_s)
+    if not there.any():
+        return own_body
+    small = camera.resized(WIDTH, round(WIDTH * camera.height / camera.width))
+    pose = file.world_from_ego @ camera.ego_from_camera
+    eye = np.ascontiguousarray(pose[:3, 3])
+    rays = directions(small.intrinsics, pose, small.width, small.height)
+    larger = boxes[there] + np.array([0.0, 0.0, 0.0, 0.0, LARGER_M, LARGER_M, LARGER_M])
+    hidden = behind_boxes((rays * FAR_M).reshape(-1, 3) + eye, eye, larger)
+    hidden = np.asarray(hidden.reshape(small.height, small.width))
+    if own_body is None:
+        return hidden
+    size = (small.width, small.height)
+    return hidden | np.asarray(cv2.resize(own_body.astype(np.uint8), size, interpolation=cv2.INTER_AREA), bool)

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.render.scene.boxes import box_gaussians
 from tasks.render.scene.movers import NO_SHIFTS, BoxShifts, lifted, world_from_boxes
 from tasks.render.scene.sky import SkyMap
+from tasks.render.scene.surfels import box_gaussians
 from tasks.render.splatting.gaussians import Gaussians, concatenate, moved
 from tasks.render.splatting.project import FITTED, ScreenFilter
 from tasks.world.agents import AgentKind, AgentTracks

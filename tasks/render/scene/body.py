@@ -12,9 +12,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from tasks.kernels.compiled import kernel
-from tasks.render.scene.confirmed import STREET
+from tasks.render.scene.depth import SHALLOW, STREET, Seen
 from tasks.render.scene.sensed import Photo, Tracks
-from tasks.render.scene.sight import SHALLOW, Seen
 from tasks.render.scene.sky import directions
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.world.agents import AgentKind

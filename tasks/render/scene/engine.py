@@ -16,7 +16,7 @@ import numpy as np
 from tasks.render.scene.asset import RenderAsset, developed, scene_at
 from tasks.render.scene.movers import boxes_at
 from tasks.render.scene.sensed import shifted
-from tasks.render.scene.settings import Backend
+from tasks.render.settings import Backend
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.project import ScreenFilter
 from tasks.render.splatting.raster import View, forward

@@ -12,7 +12,7 @@ import numpy as np
 from tasks.kernels.compiled import kernel
 from tasks.reward.rules.ego import CENTER_IN_INTERSECTION, ONCOMING, Body
 from tasks.world.arrays import Array, ShortInts
-from tasks.world.bounds import LARGEST
+from tasks.world.geometry import LARGEST
 
 DEVIATION_M = 0.5  # farther than this is off the centreline
 CHUNK = 8  # segments within one circle

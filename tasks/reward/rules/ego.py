@@ -9,8 +9,8 @@ from numba.extending import register_jitable
 from tasks.kernels.compiled import kernel
 from tasks.kernels.trig import sincos
 from tasks.world.arrays import Array, Bytes
-from tasks.world.bounds import LARGEST, all_within
 from tasks.world.clip import HORIZON_STEPS
+from tasks.world.geometry import LARGEST, all_within
 from tasks.world.vehicle import EGO_STATE_SIZE, HEADING, VX, VY, X, Y
 
 # Bits of an instant's flags (docs/reward.md 2a)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from tasks.kernels.compiled import kernel
 from tasks.world.arrays import Array, Bools, Bytes, Ints, ShortInts
-from tasks.world.bounds import LARGEST, all_within
+from tasks.world.geometry import LARGEST, all_within
 from tasks.world.lanes import MapLayer, MapPolygon
 
 # Map polygons as edges, and what is refused of them.

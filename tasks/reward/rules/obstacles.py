@@ -13,8 +13,8 @@ import numpy as np
 
 from tasks.kernels.compiled import inlined, kernel
 from tasks.world.arrays import Array, Bools, ShortInts
-from tasks.world.bounds import LARGEST
 from tasks.world.clip import HORIZON_STEPS
+from tasks.world.geometry import LARGEST
 
 # Oriented boxes in the plane, one pair at a time: whether they touch, and where their centroid is.
 

@@ -30,8 +30,7 @@ from factory.views.splat_files import background_bytes, read_splats
 from tasks.experts.recovery.expert import RecoveryTable
 from tasks.render.splatting.project import CLASSIC
 from tasks.world.camera import SensorFile
-from tasks.world.kinematic_vocabulary import kinematic_trajectories
-from tasks.world.vocabulary import Vocabulary
+from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
 from tests.chaos.damaged_files.mutants_of_files import Rng, of_bytes, of_json, of_pickle, of_text
 from tests.factory.readers import scenarionet_scenarios
 from tests.factory.readers.navsim import scene_pickles

@@ -11,8 +11,8 @@ import pytest
 from factory.commands.table import COMMANDS
 from factory.stages.scene_file import read_scene, write_scene
 from tasks.render.scene.engine import render
+from tasks.render.splatting.formats import from_ply, to_ply
 from tasks.render.splatting.gaussians import EMPTY, Gaussians
-from tasks.render.splatting.ply import from_ply, to_ply
 from tasks.render.splatting.project import ANTIALIASED, CLASSIC, FITTED
 from tasks.world.camera import Pinhole
 from tests.factory.stages.test_scene_file import scene

@@ -16,9 +16,9 @@ from factory.readers.py123d.sources import KINDS_OF_LABELS
 from tasks.trajectories import score_trajectories
 from tasks.world.agents import AgentKind
 from tasks.world.clip import NOW, Clip
-from tasks.world.kinematic_vocabulary import kinematic_trajectories
 from tasks.world.lanes import LightState, MapLayer
 from tasks.world.polygons import polygons_near
+from tasks.world.vocabulary import kinematic_trajectories
 from tests.factory.readers.py123d_logs import (
     CARPARK,
     GENERIC_DRIVABLE,

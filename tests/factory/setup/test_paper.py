@@ -11,8 +11,7 @@ from factory.config.compose import ConfigError
 from factory.config.run import RunConfig, load_config
 from factory.setup.calibrate import beyond_settings, differences, setup_text
 from factory.setup.settings import choose_vocabulary
-from tasks.world.kinematic_vocabulary import kinematic_trajectories
-from tasks.world.vocabulary import Vocabulary
+from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
 
 
 @pytest.fixture(scope="module")

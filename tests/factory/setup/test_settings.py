@@ -14,7 +14,7 @@ from factory.store.schema import RunIdentity
 from tasks.experts.recovery.expert import RecoveryTable
 from tasks.rollout.policy import SeenTraffic
 from tasks.world.arrays import Array
-from tasks.world.kinematic_vocabulary import kinematic_trajectories
+from tasks.world.vocabulary import kinematic_trajectories
 
 BLIND = ("clips.n_clips=1", "clips.settings.cameras=[]", "clips.settings.lidar_beams=0")
 

@@ -18,8 +18,7 @@ from factory.setup.vocabulary import Starts, load_starts
 from factory.store.samples import Store
 from factory.views.lineage import lineage
 from tasks.world.arrays import Array
-from tasks.world.kinematic_vocabulary import kinematic_trajectories
-from tasks.world.vocabulary import FIRST_START, Vocabulary
+from tasks.world.vocabulary import FIRST_START, Vocabulary, kinematic_trajectories
 
 TRAJECTORIES = kinematic_trajectories(256, seed=0)
 

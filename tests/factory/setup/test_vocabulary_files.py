@@ -24,8 +24,7 @@ from factory.setup.vocabulary import (
 )
 from tasks.experts.recovery.expert import RecoveryTable
 from tasks.world.clip import CLIP_STEPS, Clip
-from tasks.world.kinematic_vocabulary import kinematic_trajectories
-from tasks.world.vocabulary import Vocabulary
+from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
 from tests.tasks.streets import street_clip
 
 main = COMMANDS["vocabulary"].load()

@@ -5,7 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from tasks.render.rig.rig import motions
+from tasks.render.rig.adjust import motions
 from tasks.world.agents import AgentTracks
 from tasks.world.camera import Camera, SensorFile
 from tasks.world.clip import Block

@@ -12,12 +12,12 @@ from printed_street import CAMERAS, ROAD_M, WIDTH, photographed
 
 from factory.readers.base import BadClip
 from factory.stages.rig import SAID, corrected_rig, said_again, wanted
-from tasks.render.rig.ground import ground_below
-from tasks.render.rig.rig import motions, twists_of
-from tasks.render.rig.settings import Adjust, RigSettings
+from tasks.render.rig.adjust import motions, twists_of
+from tasks.render.rig.correct import ground_below
 from tasks.render.scene.asset import RenderAsset, TakenFrom
 from tasks.render.scene.sensed import Photo
 from tasks.render.scene.sky import SkyMap
+from tasks.render.settings import Adjust, RigSettings
 from tasks.render.splatting.gaussians import EMPTY
 from tasks.world.camera import Camera, SensorFile
 from tasks.world.clip import Block

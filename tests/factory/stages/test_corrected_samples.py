@@ -17,9 +17,8 @@ from tasks.attempt import Judged, human_sample
 from tasks.experts.human import Human
 from tasks.experts.pdm_closed.settings import PdmSettings
 from tasks.perturb import Candidate
-from tasks.render.rig.rig import motions, twists_of
-from tasks.render.rig.settings import Adjust, RigSettings
-from tasks.render.settings import RenderSettings, SceneFrom
+from tasks.render.rig.adjust import motions, twists_of
+from tasks.render.settings import Adjust, RenderSettings, RigSettings, SceneFrom
 from tasks.sealed import unsealed_json
 from tasks.world.camera import Camera, SensorFile
 from tasks.world.clip import NOW, STEP_S, Clip, scene_of_clip

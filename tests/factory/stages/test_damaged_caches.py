@@ -28,8 +28,7 @@ from tasks.experts.recovery.expert import RecoveryTable
 from tasks.hard_scenes import OneStageClip
 from tasks.kernels.compiled import kernel
 from tasks.sealed import SEAL_BYTES, Damaged, seal, sealed, sealed_json, unsealed_json
-from tasks.world.kinematic_vocabulary import kinematic_trajectories
-from tasks.world.vocabulary import Vocabulary
+from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
 from tests.factory.damage import damaged
 from tests.factory.readers.geopackage_writer import stub_rows, write_root
 from tests.factory.readers.navsim.logs import NAME, frame

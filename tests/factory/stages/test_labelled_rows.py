@@ -26,8 +26,7 @@ from tasks.rollout.lqr import track
 from tasks.stages import HUMAN
 from tasks.world.agents import AgentTracks
 from tasks.world.frames import to_world
-from tasks.world.kinematic_vocabulary import kinematic_trajectories
-from tasks.world.vocabulary import Vocabulary
+from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
 
 STREET = [
     "clips=custom",

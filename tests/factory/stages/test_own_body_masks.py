@@ -9,7 +9,7 @@ import pytest
 
 from factory.stages.own_body import masks_digest, read_masks, refuse_unknown_masks, resized_mask
 from factory.stages.scene_file import read_scene, write_scene
-from tasks.render.rig.masks import hidden_by
+from tasks.render.rig.correct import hidden_by
 from tasks.render.scene.asset import OwnBody, RenderAsset
 from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
 from tasks.render.splatting.gaussians import EMPTY

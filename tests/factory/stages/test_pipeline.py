@@ -22,8 +22,7 @@ from tasks.stages import HUMAN, HUMAN_BEFORE
 from tasks.world.chance import stream
 from tasks.world.clip import HORIZON_STEPS, NOW
 from tasks.world.frames import to_local
-from tasks.world.kinematic_vocabulary import kinematic_trajectories
-from tasks.world.vocabulary import Vocabulary
+from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
 from tests.tasks.streets import street_clip
 
 VOCABULARY = Vocabulary(kinematic_trajectories(3, 0))

@@ -23,8 +23,8 @@ from factory.stages.scene_file import (
 )
 from tasks.render.scene.asset import BlockRange, ClassQuality, Exposure, RenderAsset, TakenFrom, ViewQuality
 from tasks.render.scene.movers import NO_SHIFTS, BoxShifts
-from tasks.render.scene.settings import SceneDtype
 from tasks.render.scene.sky import SkyMap
+from tasks.render.settings import SceneDtype
 from tasks.render.splatting.gaussians import EMPTY, Gaussians
 from tasks.render.splatting.project import CLASSIC
 

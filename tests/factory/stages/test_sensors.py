@@ -19,10 +19,8 @@ from factory.stages.assets import Sensing, asset_for, block_id, sensing
 from factory.stages.scene_file import read_scene, stored_dtype
 from factory.stages.sensors import SAMPLING, block_of, chosen_cameras, decode_image, encode_jpeg, load_sensors
 from tasks.render.fit import reconstruct
-from tasks.render.fit.settings import FitSettings
 from tasks.render.scene.build import AssetSettings, psnr
-from tasks.render.scene.settings import Backend, SceneDtype
-from tasks.render.settings import RenderSettings, SceneFrom
+from tasks.render.settings import Backend, FitSettings, RenderSettings, SceneDtype, SceneFrom
 from tasks.render.splatting.gsplat_backend import BackendMissing
 from tasks.world.agents import AgentTracks
 from tasks.world.camera import Camera, SensorFile

@@ -23,8 +23,7 @@ from tasks.experts.pdm_closed.planner import PdmClosed, PdmSettings
 from tasks.experts.protocol import Plan
 from tasks.experts.recovery.expert import Recovery, RecoveryTable
 from tasks.perturb import Candidate, Perturbation, PerturbSettings, perturb
-from tasks.render.gate import composed, measures
-from tasks.render.likeness import likeness_to_photo
+from tasks.render.gate import composed, likeness_to_photo, measures
 from tasks.render.map_drawing import draw_map_views
 from tasks.render.rigs import RIGS
 from tasks.render.scene.build import AssetSettings, build_asset
@@ -40,9 +39,8 @@ from tasks.world.camera import Camera, Pinhole
 from tasks.world.chance import stream
 from tasks.world.clip import HORIZON_STEPS, NOW, Clip, Rollout, Scene, scene_of_clip
 from tasks.world.frames import to_world
-from tasks.world.kinematic_vocabulary import kinematic_trajectories
 from tasks.world.vehicle import EGO_STATE_SIZE, VX, Y
-from tasks.world.vocabulary import Vocabulary
+from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
 from tests.factory.readers.scenarionet_scenarios import nuscenes, save
 from tests.factory.readers.test_av2 import write_log
 from tests.factory.stages.golden import GOLDEN, Golden, Sums

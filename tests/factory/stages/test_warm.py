@@ -11,8 +11,7 @@ import pytest
 from factory.config.run import load_config, photos_alone
 from factory.stages.warm import compile_kernels, marker, parts_of
 from tasks.kernels.compiled import cache_dir
-from tasks.render.rig.settings import Adjust, RigSettings
-from tasks.render.settings import RenderMode, RenderSettings
+from tasks.render.settings import Adjust, RenderMode, RenderSettings, RigSettings
 from tasks.sealed import unsealed
 
 pytestmark = pytest.mark.slow
@@ -81,7 +80,7 @@ from printed_street import CAMERAS, photographed
 
 from factory.stages.assets import asset_for
 from factory.stages.warm import tiny_clip
-from tasks.render.fit.settings import FitSettings
+from tasks.render.settings import FitSettings
 from tasks.render.settings import RenderSettings
 
 folder = Path({folder!r})

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tasks.render.splatting.gaussians import Gaussians, rotations_of
-from tasks.render.splatting.pixels import MAX_ALPHA
 from tasks.render.splatting.project import BESIDE, FITTED, MIN_ALPHA, NEAR_M, ScreenFilter
+from tasks.render.splatting.raster import MAX_ALPHA
 
 
 @dataclass

@@ -7,9 +7,20 @@ import pytest
 import street
 from numpy.typing import NDArray
 
-from tasks.render.beside_photo import beside_photo, on_box
-from tasks.render.gate import BEHIND_BOX_M, BESIDE_GAP, BESIDE_RAD, GateSettings, seen_beside, unlike
-from tasks.render.likeness import Album, Sightings, VehiclePhoto, eye_in_box
+from tasks.render.gate import (
+    BEHIND_BOX_M,
+    BESIDE_GAP,
+    BESIDE_RAD,
+    Album,
+    GateSettings,
+    Sightings,
+    VehiclePhoto,
+    beside_photo,
+    eye_in_box,
+    on_box,
+    seen_beside,
+    unlike,
+)
 from tasks.render.scene.engine import Vehicles
 from tasks.render.scene.sensed import Photo
 from tasks.render.splatting.raster import View

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tasks.render.block_gate import poor_block
+from tasks.render.gate import poor_block
 from tasks.render.scene.asset import RenderAsset, ViewQuality, camera_psnr_db, mean_psnr_db
 from tasks.render.settings import RenderSettings
 

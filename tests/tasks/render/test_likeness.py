@@ -7,12 +7,12 @@ import pytest
 import street
 from numpy.typing import NDArray
 
-from tasks.render.gate import GateSettings, unfit
-from tasks.render.likeness import (
+from tasks.render.gate import (
     FADING,
     LEAST_HELD_OUT,
     OTHERS_WAY,
     Album,
+    GateSettings,
     Sightings,
     expected,
     eye_in_box,
@@ -22,6 +22,7 @@ from tasks.render.likeness import (
     outline_of,
     sightings,
     similarity,
+    unfit,
 )
 from tasks.render.scene.asset import Exposure, RenderAsset
 from tasks.render.scene.engine import Vehicles, render, vehicles_at

@@ -18,8 +18,7 @@ from tasks.rollout.lqr import track
 from tasks.rollout.simulate import TrafficSettings, simulate
 from tasks.world.clip import NOW, Scene, scene_of_clip
 from tasks.world.frames import to_world
-from tasks.world.kinematic_vocabulary import kinematic_trajectories
-from tasks.world.vocabulary import Vocabulary
+from tasks.world.vocabulary import Vocabulary, kinematic_trajectories
 from tests.tasks.streets import street_clip
 
 REPLAY, IDM = TrafficSettings(mode="replay"), TrafficSettings(yields=False)  # who yields does as in the log here

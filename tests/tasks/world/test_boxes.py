@@ -3,8 +3,8 @@
 import numpy as np
 import shapely
 
-from tasks.world.boxes import ego_boxes, touching
 from tasks.world.frames import box_corners
+from tasks.world.geometry import ego_boxes, touching
 from tasks.world.vehicle import PACIFICA
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tasks.world.kinematic_vocabulary import CURVATURE_MAX_1PM, LATERAL_ACCEL_MAX_MPS2, kinematic_trajectories
+from tasks.world.vocabulary import CURVATURE_MAX_1PM, LATERAL_ACCEL_MAX_MPS2, kinematic_trajectories
 
 
 def test_equal_seeds_give_equal_trajectories() -> None:

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from tasks.world.frames import to_world
-from tasks.world.kinematic_vocabulary import kinematic_trajectories
-from tasks.world.vocabulary import Vocabulary, cluster, human_windows
+from tasks.world.vocabulary import Vocabulary, cluster, human_windows, kinematic_trajectories
 
 
 @pytest.mark.parametrize(

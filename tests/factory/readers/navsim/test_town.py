@@ -16,10 +16,9 @@ from factory.readers.settings import TownSettings
 from factory.readers.town.write import write_logs
 from tasks.trajectories import score_trajectories
 from tasks.world.clip import NOW, Clip
-from tasks.world.command import driving_command
-from tasks.world.kinematic_vocabulary import kinematic_trajectories
 from tasks.world.lanes import LightState, RoadMap
-from tasks.world.route import RouteFinder
+from tasks.world.route import RouteFinder, driving_command
+from tasks.world.vocabulary import kinematic_trajectories
 from tests.factory.readers.geopackage_writer import CITIES, ORIGIN, stub_rows, town_rows, write_geopackage, write_root
 from tests.factory.readers.navsim.twin import thinned
 from tests.factory.readers.openscene_writer import Place, write_openscene

@@ -17,9 +17,9 @@ from factory.readers.town.town import WINDOWS_PER_LOG, plan_log
 from factory.readers.town.traffic import GREEN, RED, YELLOW, DrivingStyle, Signals, TownPath, drive, overlaps
 from factory.readers.town.write import write_town
 from tasks.trajectories import score_trajectories
-from tasks.world.boxes import ego_boxes
 from tasks.world.clip import NOW
 from tasks.world.frames import box_corners, to_local
+from tasks.world.geometry import ego_boxes
 from tasks.world.polygons import arc_lengths
 from tasks.world.vehicle import PACIFICA
 

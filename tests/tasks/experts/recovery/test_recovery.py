@@ -18,8 +18,8 @@ from tasks.experts.recovery.expert import (
 from tasks.stages import Rejected
 from tasks.world.clip import NOW, Scene
 from tasks.world.frames import to_local, to_world
-from tasks.world.kinematic_vocabulary import kinematic_trajectories
 from tasks.world.vehicle import AX, HEADING, PACIFICA, STEERING, VX, VY
+from tasks.world.vocabulary import kinematic_trajectories
 
 Road = Callable[..., Scene]
 RNG = np.random.default_rng(0)

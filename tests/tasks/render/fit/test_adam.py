@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tasks.render.fit.adam import Learned
+from tasks.render.fit.state import Learned
 
 
 def test_rows_move_as_by_plain_adam_over_the_steps_they_were_in() -> None:

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tasks.render.fit.agreement import aligned, brightness, shared
-from tasks.render.fit.corrections import exposed, inverse
+from tasks.render.fit.corrections import aligned, brightness, exposed, inverse, shared
 
 RNG = np.random.default_rng(7)
 POINTS = 4000

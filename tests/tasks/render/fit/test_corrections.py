@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tasks.render.fit.backdrop import backdrop_gradient
+from tasks.render.fit.backend import backdrop_gradient
 from tasks.render.fit.corrections import (
     affine_between,
     after,
@@ -15,8 +15,7 @@ from tasks.render.fit.corrections import (
     reference,
 )
 from tasks.render.fit.reconstruct import decayed, photo_at
-from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap
-from tasks.render.scene.sky_lookup import backdrop, sky_cells
+from tasks.render.scene.sky import COLUMNS, ROWS, SkyMap, backdrop, sky_cells
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.render.splatting.gradient import backward
 from tasks.render.splatting.raster import forward

@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 
-from tasks.render.fit.adam import Learned
-from tasks.render.fit.density import refine, shared
-from tasks.render.fit.settings import FitSettings
-from tasks.render.fit.state import FitState, logits_of, opacities_of
+from tasks.render.fit.state import FitState, Learned, logits_of, opacities_of, refine, shared
+from tasks.render.settings import FitSettings
 from tasks.render.splatting.gaussians import Gaussians, concatenate
 from tasks.render.splatting.raster import forward
 

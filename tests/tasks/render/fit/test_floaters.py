@@ -7,26 +7,27 @@ import numpy as np
 import pytest
 import street
 
-from tasks.render.beside_photo import on_box
 from tasks.render.fit.backend import FitBackend
 from tasks.render.fit.corrections import corrected, exposed
-from tasks.render.fit.floaters import (
+from tasks.render.fit.on_torch import OnTorch
+from tasks.render.fit.reconstruct import (
     ALIKE,
     FARTHER,
     GONE_LOGIT,
     LEAST_OPACITY,
     NEAREST_M,
+    REFINE_UNTIL,
     SHOWN_BY,
+    advance,
     clear_floaters,
     floaters,
 )
-from tasks.render.fit.on_torch import OnTorch
-from tasks.render.fit.reconstruct import REFINE_UNTIL, advance
-from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import Problem, prepare
 from tasks.render.fit.state import BACKGROUND, FitState, logits_of, opacities_of
+from tasks.render.gate import on_box
 from tasks.render.scene.body import BEFORE_M, REACH_M, body_boxes
 from tasks.render.scene.movers import SHIFT_SIZE, at_knots, shifted_boxes
+from tasks.render.settings import FitSettings
 from tasks.render.splatting.tensors import by_kernels
 from tasks.world.agents import AgentTracks
 from tasks.world.arrays import Array

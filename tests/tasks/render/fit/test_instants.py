@@ -7,11 +7,11 @@ import pytest
 import street
 
 from tasks.render.fit.corrections import exposed, exposures_of, in_agreement, instants, inverse
-from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import prepare
+from tasks.render.scene.depth import see
 from tasks.render.scene.features import Points
 from tasks.render.scene.sensed import Photo, Tracks, fuse
-from tasks.render.scene.sight import see
+from tasks.render.settings import FitSettings
 
 DARKER = np.array([-0.3, 0, 0, 0, -0.25, 0, 0, 0, -0.2, 0.02, 0.0, 0.01], np.float32)
 

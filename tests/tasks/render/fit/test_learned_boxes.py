@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import street
 
-from tasks.render.fit.composition import OwnedGaussians, by_box
+from tasks.render.fit.backend import OwnedGaussians, by_box
 from tasks.render.fit.reconstruct import advance, box_shifts, boxes_off, finish, picture_of
-from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import Problem, prepare
 from tasks.render.fit.state import FitState
 from tasks.render.scene.movers import KNOT_S, SHIFT_SIZE, shifted_boxes, world_from_boxes
+from tasks.render.settings import FitSettings
 from tasks.render.splatting.gaussians import quats_of, turned_quats
 from tasks.world.agents import AgentTracks
 from tasks.world.arrays import Array

@@ -9,15 +9,14 @@ from numpy.typing import NDArray
 
 from factory.stages.scene_file import read_scene, write_scene
 from tasks.render.fit.corrections import exposed, reference
-from tasks.render.fit.quality import drawn as drawn_as_samples
 from tasks.render.fit.reconstruct import advance, finish, picture_of, pose_of
-from tasks.render.fit.settings import FitSettings
+from tasks.render.fit.reconstruct import drawn as drawn_as_samples
 from tasks.render.fit.start import Problem, prepare
 from tasks.render.fit.state import FitState
 from tasks.render.gate import unfit
 from tasks.render.scene.asset import RenderAsset, psnr
 from tasks.render.scene.sensed import Photo
-from tasks.render.settings import GateSettings, RenderSettings
+from tasks.render.settings import FitSettings, GateSettings, RenderSettings
 from tasks.render.views import render_views
 from tasks.world.agents import AgentTracks
 from tasks.world.arrays import Bools

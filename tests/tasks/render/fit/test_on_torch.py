@@ -8,19 +8,16 @@ import pytest
 import street
 import torch
 
-from tasks.render.fit.adam import Learned
 from tasks.render.fit.backend import Derivatives
-from tasks.render.fit.in_tensors import LearnedTensor, lay_flat, photo_loss
 from tasks.render.fit.losses import photo_loss as photo_loss_by_hand
 from tasks.render.fit.losses import target_of
 from tasks.render.fit.on_cpu import OnCpu
-from tasks.render.fit.on_torch import OnTorch
+from tasks.render.fit.on_torch import LearnedTensor, OnTorch, lay_flat, photo_loss
 from tasks.render.fit.reconstruct import advance, finish
-from tasks.render.fit.road import find_road
-from tasks.render.fit.road import lay_flat as lay_flat_by_hand
-from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import Problem, prepare
-from tasks.render.fit.state import FitState
+from tasks.render.fit.state import FitState, Learned, find_road
+from tasks.render.fit.state import lay_flat as lay_flat_by_hand
+from tasks.render.settings import FitSettings
 from tasks.render.splatting.gradient import Gradients
 from tasks.render.splatting.tensors import by_kernels, splatted
 from tests.bench import peer_gsplat

@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 import street
 
-from tasks.render.fit.quality import ROAD_M, away, classes_of, measured
-from tasks.render.fit.reconstruct import advance, finish
-from tasks.render.fit.road import CELL_M, Road
-from tasks.render.fit.settings import FitSettings
+from tasks.render.fit.reconstruct import ROAD_M, advance, away, classes_of, finish, measured
 from tasks.render.fit.start import Problem, Shot, prepare
-from tasks.render.fit.state import FitState
+from tasks.render.fit.state import CELL_M, FitState, Road
 from tasks.render.scene.asset import ClassQuality, ViewQuality
+from tasks.render.settings import FitSettings
 
 SETTINGS = FitSettings(iterations=30, start_gaussians=3000, stereo_photos=1)
 

@@ -9,7 +9,6 @@ import street
 from numpy.typing import NDArray
 
 from tasks.render.fit import start
-from tasks.render.fit.adam import BETA1, Learned
 from tasks.render.fit.reconstruct import (
     REFINE_UNTIL,
     advance,
@@ -19,13 +18,12 @@ from tasks.render.fit.reconstruct import (
     picture_of,
     reconstruct,
 )
-from tasks.render.fit.road import SLACK_M, above_road
-from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import Problem, prepare
-from tasks.render.fit.state import SHAPES, FitState
+from tasks.render.fit.state import BETA1, SHAPES, SLACK_M, FitState, Learned, above_road
 from tasks.render.scene.asset import psnr
 from tasks.render.scene.engine import Vehicles, render
 from tasks.render.scene.sensed import Photo, Sweep, Tracks, shifted
+from tasks.render.settings import FitSettings
 from tasks.render.splatting import sh
 from tasks.render.splatting.gaussians import moved, turned_quats
 from tasks.world.agents import AgentKind

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tasks.render.fit.road import LONGEST_M, THICKNESS_M, above_road, find_road, lay_flat
+from tasks.render.fit.state import LONGEST_M, THICKNESS_M, above_road, find_road, lay_flat
 from tasks.render.splatting.gaussians import rotations_of
 
 RNG = np.random.default_rng(0)

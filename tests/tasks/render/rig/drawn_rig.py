@@ -10,9 +10,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from tasks.render.rig.corners import UNIT, Corners
-from tasks.render.rig.normal import residuals
-from tasks.render.rig.rig import Rig, given_rig, motions
+from tasks.render.rig.adjust import Rig, given_rig, motions, residuals
+from tasks.render.rig.correct import UNIT, Corners
 from tasks.world.camera import Camera, SensorFile
 
 Array = NDArray[np.float64]

@@ -9,9 +9,9 @@ import pytest
 from drawn_rig import cameras, corners_seen, files, straight_on
 from scipy.spatial import KDTree
 
+from tasks.render.rig.adjust import motions, twists_of
 from tasks.render.rig.correct import Correction, corrected
-from tasks.render.rig.rig import motions, twists_of
-from tasks.render.rig.settings import RigSettings
+from tasks.render.settings import RigSettings
 from tasks.world.camera import Camera
 
 pytestmark = pytest.mark.slow

@@ -7,9 +7,20 @@ import numpy as np
 import pytest
 from drawn_rig import cameras, files
 
-from tasks.render.rig.adjust import Matched, rays, triangulated
-from tasks.render.rig.normal import N_CAMERA, normal_equations, residuals, solved
-from tasks.render.rig.rig import Rig, Shots, given_rig, motions, twists_of
+from tasks.render.rig.adjust import (
+    N_CAMERA,
+    Matched,
+    Rig,
+    Shots,
+    given_rig,
+    motions,
+    normal_equations,
+    rays,
+    residuals,
+    solved,
+    triangulated,
+    twists_of,
+)
 
 STEP = 1e-6
 

@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 import street
 
-from tasks.render.beside_photo import on_box
-from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import prepare
+from tasks.render.gate import on_box
 from tasks.render.scene import body
 from tasks.render.scene.body import FAR_M, body_boxes, nearest_box, on_bodies, unseen_body
-from tasks.render.scene.confirmed import STREET
+from tasks.render.scene.depth import SHALLOW, STREET, Seen
 from tasks.render.scene.sensed import Tracks
-from tasks.render.scene.sight import SHALLOW, Seen
 from tasks.render.scene.sky import directions
+from tasks.render.settings import FitSettings
 from tasks.render.splatting.gaussians import Gaussians
 from tasks.world.agents import AgentTracks
 

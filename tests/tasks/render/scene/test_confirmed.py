@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from tasks.render.scene.confirmed import ALIKE, ALIKE_PER_M, confirmed, with_confirmed
+from tasks.render.scene.depth import ALIKE, ALIKE_PER_M, SHALLOW, Seen, confirmed, with_confirmed
 from tasks.render.scene.sensed import Photo
-from tasks.render.scene.sight import SHALLOW, Seen
 from tasks.render.scene.stereo import FAR_M
 
 WIDTH, HEIGHT, FOCAL, WALL_M = 60, 40, 50.0, 10.0

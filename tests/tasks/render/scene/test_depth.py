@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from slow_raster import covariances_of
 
-from tasks.render.scene.choose import BACKGROUND, Look, choose
 from tasks.render.scene.depth import dense_depth, sparse_depth
 from tasks.render.scene.sky import directions, sky_of_views
-from tasks.render.scene.surfels import discs_of_photo, gaussians_of
+from tasks.render.scene.surfels import BACKGROUND, Look, choose, discs_of_photo, gaussians_of
 
 INTRINSICS = np.array([[80.0, 0.0, 40.0], [0.0, 80.0, 30.0], [0.0, 0.0, 1.0]])
 WIDTH, HEIGHT = 80, 60

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tasks.render.fit.road import above_road, find_road
+from tasks.render.fit.state import above_road, find_road
 from tasks.render.scene.driven_road import AHEAD_M, SPACING_M, WIDE_M, beside_road, driven_road
 from tasks.render.scene.features import Points
 from tasks.world.arrays import Array

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import street
 
+from tasks.render.scene.build import BRIGHTEST, DARKEST, grey_of, lidar_asset
 from tasks.render.scene.engine import Vehicles, render
-from tasks.render.scene.lidar_only import BRIGHTEST, DARKEST, grey_of, lidar_asset
 from tasks.world.agents import AgentKind
 from tasks.world.camera import Pinhole
 

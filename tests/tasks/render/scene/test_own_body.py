@@ -5,12 +5,11 @@ from dataclasses import replace
 import numpy as np
 import street
 
-from tasks.render.fit.settings import FitSettings
 from tasks.render.fit.start import prepare
 from tasks.render.scene.asset import RenderAsset, psnr
 from tasks.render.scene.build import build_asset
 from tasks.render.scene.sensed import Photo, own_bodies, reduced
-from tasks.render.scene.settings import AssetSettings
+from tasks.render.settings import AssetSettings, FitSettings
 from tasks.render.views import render_views
 from tasks.world.agents import AgentTracks
 from tasks.world.camera import Camera

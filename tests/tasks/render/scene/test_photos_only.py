@@ -5,9 +5,9 @@ import pytest
 import street
 
 from tasks.render.scene.build import AssetSettings, build_asset
+from tasks.render.scene.depth import see
 from tasks.render.scene.features import Points
 from tasks.render.scene.sensed import Photo, Tracks
-from tasks.render.scene.sight import see
 from tasks.world.agents import AgentKind, AgentTracks
 
 

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import street
 
-from tasks.render.scene import choose, depth, movers, stereo
+from tasks.render.scene import depth, movers, stereo, surfels
 from tasks.render.scene.asset import RenderAsset, psnr
 from tasks.render.scene.build import AssetSettings, build_asset
 from tasks.render.scene.engine import NOBODY, Vehicles, render
 from tasks.render.scene.sensed import Photo
-from tasks.render.splatting import pixels, project, tiles
+from tasks.render.splatting import project, raster
 from tasks.render.warm import compile_kernels
 from tasks.world.agents import AgentKind
 from tasks.world.camera import Pinhole
@@ -124,7 +124,7 @@ def test_no_photos_no_scene() -> None:
 
 def test_the_smallest_scene_reaches_every_kernel_of_the_room() -> None:
     compile_kernels()
-    modules = (choose, depth, movers, pixels, project, stereo, tiles)
+    modules = (depth, movers, project, raster, stereo, surfels)
     kernels = [value for module in modules for value in vars(module).values() if hasattr(value, "signatures")]
     assert len(kernels) > 10
     parts = {"_nearer", "aligned"}  # of their callers, like all that is inlined; no entry points

@@ -10,7 +10,7 @@ import street
 from factory.stages.scene_file import read_scene, write_scene
 from tasks.render.scene.asset import RenderAsset, psnr, scene_at
 from tasks.render.scene.engine import render, vehicles_at
-from tasks.render.scene.settings import SceneDtype
+from tasks.render.settings import SceneDtype
 from tasks.render.splatting.gsplat_backend import arguments
 from tasks.world.camera import Pinhole
 

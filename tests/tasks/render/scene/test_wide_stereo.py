@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from tasks.render.scene.sensed import Photo
-from tasks.render.scene.wide_stereo import locally_normalised, partners, wide_depth
+from tasks.render.scene.stereo import locally_normalised, partners, wide_depth
 
 WIDTH, HEIGHT, FOCAL, WALL_M, BOX_M = 240, 160, 180.0, 12.0, 6.0
 K = np.array([[FOCAL, 0.0, WIDTH / 2], [0.0, FOCAL, HEIGHT / 2], [0.0, 0.0, 1.0]])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tasks.render.splatting import sh
-from tasks.render.splatting.checkpoints import LoggedVehicle, from_checkpoint, gauss_params, splatfacto, worldengine
+from tasks.render.splatting.formats import LoggedVehicle, from_checkpoint, gauss_params, splatfacto, worldengine
 from tasks.render.splatting.gaussians import Gaussians, moved, rotations_of
 from tasks.render.splatting.project import ANTIALIASED
 from tasks.world.frames import upright

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tasks.render.splatting import sh
+from tasks.render.splatting.formats import from_ply, to_ply
 from tasks.render.splatting.gaussians import EMPTY, Gaussians
-from tasks.render.splatting.ply import from_ply, to_ply
 
 
 def some(n: int, count: int, seed: int = 0) -> Gaussians:

@@ -13,9 +13,8 @@ from tasks.render.splatting.gaussians import (
     quats_of,
     rotations_of,
 )
-from tasks.render.splatting.pixels import MAX_ALPHA
 from tasks.render.splatting.project import BESIDE, CLASSIC, FITTED, MIN_ALPHA, NEAR_M, ScreenFilter
-from tasks.render.splatting.raster import forward, gather, splat
+from tasks.render.splatting.raster import MAX_ALPHA, forward, gather, splat
 
 INTRINSICS = np.array([[60.0, 0.0, 37.0], [0.0, 58.0, 22.0], [0.0, 0.0, 1.0]])
 WIDTH, HEIGHT = 75, 45  # no multiple of a tile

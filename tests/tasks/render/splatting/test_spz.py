@@ -9,8 +9,8 @@ import pytest
 
 from factory.views.splat_files import zstd
 from tasks.render.splatting import sh
+from tasks.render.splatting.formats import from_spz, to_spz
 from tasks.render.splatting.gaussians import EMPTY, Gaussians, rotations_of
-from tasks.render.splatting.spz import from_spz, to_spz
 from tests.tasks.render.splatting.test_ply import some
 
 # `some(3, 8, seed=5)` by spz 21715c3: loadSplatFromPly of our .ply, then saveSpz with PackOptions.from = RDF.
